@@ -1,0 +1,124 @@
+"""LabelledCloud: the contract between training, which makes one, and the runtime, which answers words from it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from og_pointcloud.errors import OgPointcloudError
+
+__all__ = ["BACKGROUND", "UNOBSERVED", "InstanceTable", "LabelledCloud", "Vocabulary"]
+
+BACKGROUND = -1
+"""Instance id of a point that views saw, but outside every mask more often than missed masks explain."""
+UNOBSERVED = -2
+"""Instance id of a point that nothing is known about: no view saw it, nor does it lie on an observed surface."""
+
+
+@dataclass(frozen=True)
+class InstanceTable:
+    """What is known of K instances; row k of each array is instance id k.
+
+    descriptors: (R, D) float32, unit rows, grouped by instance: an instance has one or more, or none where no mask
+        gave it a feature (it then answers "unknown").
+    descriptor_instance: (R,) int32, the instance of each descriptor, ascending.
+    points: (K,) int32, points with this id. views, masks: (K,) int32, views that saw it and masks joined in it.
+    agreement: (K,) float32 in [-1, 1], mean cosine of its masks' features with their descriptor.
+    visible_area: (K,) float32, pixels of blending weight that its masks put on it, over all views.
+    """
+
+    descriptors: NDArray[np.float32]
+    descriptor_instance: NDArray[np.int32]
+    points: NDArray[np.int32]
+    views: NDArray[np.int32]
+    masks: NDArray[np.int32]
+    agreement: NDArray[np.float32]
+    visible_area: NDArray[np.float32]
+
+    def __post_init__(self) -> None:
+        count = len(self.points)
+        for name in ("views", "masks", "agreement", "visible_area"):
+            if getattr(self, name).shape != (count,):
+                raise OgPointcloudError(f"instance {name} has shape {getattr(self, name).shape}; expected ({count},)")
+        if self.descriptors.ndim != 2 or len(self.descriptors) != len(self.descriptor_instance):
+            raise OgPointcloudError(
+                f"descriptors {self.descriptors.shape} and their instances {self.descriptor_instance.shape} differ"
+            )
+        owner = self.descriptor_instance
+        if owner.size and (owner.min() < 0 or owner.max() >= count or (np.diff(owner) < 0).any()):
+            raise OgPointcloudError(f"descriptor instances must ascend within 0..{count - 1}")
+        if not np.isfinite(self.descriptors).all():
+            raise OgPointcloudError("descriptors hold NaN or infinity; expected unit rows")
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+
+@dataclass(frozen=True)
+class Vocabulary:
+    """Words with their text vectors. names: unique strings; vectors: (len(names), D) float32, any length."""
+
+    names: tuple[str, ...]
+    vectors: NDArray[np.float32]
+
+    def __post_init__(self) -> None:
+        if self.vectors.ndim != 2 or len(self.vectors) != len(self.names):
+            raise OgPointcloudError(
+                f"vocabulary has {len(self.names)} names and vectors of shape {self.vectors.shape}; expected one row a name"
+            )
+        if not np.isfinite(self.vectors).all():
+            raise OgPointcloudError("vocabulary vectors hold NaN or infinity")
+
+
+@dataclass(frozen=True)
+class LabelledCloud:
+    """Points with an instance id each, and one feature row or more per instance.
+
+    xyz: (n, 3) float32, local frame; origin: (3,) float64, world = xyz + origin.
+    instance_ids: (n,) int32, >= 0 a row of ``instances``, else BACKGROUND or UNOBSERVED.
+    feature_space: name of the encoder that mask features and text vectors share.
+    spacing: typical distance between neighbouring points, in the scene's unit.
+    reach: distance from the cloud beyond which a query point is "too far from the map", same unit.
+    rgb: (n, 3) uint8 or None. vocabulary: words that may be asked as strings.
+    provenance: JSON-able record of settings, seed, seconds per stage, and what was left out and why.
+    """
+
+    xyz: NDArray[np.float32]
+    origin: NDArray[np.float64]
+    instance_ids: NDArray[np.int32]
+    instances: InstanceTable
+    feature_space: str
+    spacing: float
+    reach: float
+    rgb: NDArray[np.uint8] | None = None
+    vocabulary: Vocabulary | None = None
+    provenance: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        n = len(self.xyz)
+        if self.xyz.shape != (n, 3) or self.origin.shape != (3,) or self.instance_ids.shape != (n,):
+            raise OgPointcloudError(
+                f"xyz {self.xyz.shape}, origin {self.origin.shape} and instance ids {self.instance_ids.shape} do not "
+                "fit; expected (n, 3), (3,) and (n,)"
+            )
+        if n and (self.instance_ids.min() < UNOBSERVED or self.instance_ids.max() >= len(self.instances)):
+            raise OgPointcloudError(
+                f"instance ids span {self.instance_ids.min()}..{self.instance_ids.max()}; expected "
+                f"{UNOBSERVED}..{len(self.instances) - 1}"
+            )
+        if self.rgb is not None and self.rgb.shape != (n, 3):
+            raise OgPointcloudError(f"rgb has shape {self.rgb.shape}; expected ({n}, 3)")
+        for name in ("spacing", "reach"):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value > 0):
+                raise OgPointcloudError(f"{name} is {value}; expected a positive length")
+
+    def __len__(self) -> int:
+        return len(self.xyz)
+
+    @property
+    def xyz_world(self) -> NDArray[np.float64]:
+        return self.xyz.astype(np.float64) + self.origin

@@ -1,0 +1,226 @@
+"""What training reads: points and views. This file is the only statement of frames and units.
+
+Frames. Cameras are OpenCV (x right, y down, z forward); ``world_to_camera`` maps local world coordinates to the
+camera. Pixel (row i, column j) has its centre at (j + 0.5, i + 0.5). World coordinates are ``local + origin``:
+the origin (float64) takes map offsets of 1e6 away so that everything after reading works in float32 near zero.
+
+Units. Whatever the capture uses; no threshold of the library is a length, all are multiples of the point spacing
+or shares of the scene extent.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from og_pointcloud.errors import SceneError
+
+__all__ = ["Camera", "Points", "Scene", "View"]
+
+FloatArray = NDArray[np.float32]
+DoubleArray = NDArray[np.float64]
+IntArray = NDArray[np.int32]
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera without distortion.
+
+    width, height: pixels. fx, fy, cx, cy: pixels (pixel centres at +0.5).
+    world_to_camera: (4, 4) float64 rigid transform from the scene's local frame, OpenCV axes.
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    world_to_camera: DoubleArray
+
+    def __post_init__(self) -> None:
+        pose = np.asarray(self.world_to_camera, np.float64)
+        object.__setattr__(self, "world_to_camera", pose)
+        if pose.shape != (4, 4) or not np.isfinite(pose).all():
+            raise SceneError(f"camera pose is {pose.tolist()}; expected a finite 4x4 matrix: drop or repair this view")
+        rotation = pose[:3, :3]
+        error = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
+        if error > 1e-2 or np.linalg.det(rotation) < 0:
+            raise SceneError(
+                f"camera rotation is off a rotation matrix by {error:.3g} (det {np.linalg.det(rotation):.3g}); "
+                "expected a rigid right-handed pose: remove scale or mirroring from the pose file"
+            )
+        if self.width < 1 or self.height < 1:
+            raise SceneError(f"camera image is {self.width}x{self.height}; expected at least 1x1 pixel")
+        intrinsics = (self.fx, self.fy, self.cx, self.cy)
+        if not np.isfinite(intrinsics).all() or self.fx <= 0 or self.fy <= 0:
+            raise SceneError(f"camera intrinsics fx, fy, cx, cy are {intrinsics}; expected finite numbers, fx and fy > 0")
+
+    def resized(self, width: int, height: int) -> Camera:
+        """The same camera with its image scaled to width x height pixels."""
+        x, y = width / self.width, height / self.height
+        return replace(
+            self, width=width, height=height, fx=self.fx * x, fy=self.fy * y, cx=self.cx * x, cy=self.cy * y
+        )
+
+    @property
+    def center(self) -> DoubleArray:
+        """Camera centre in the local frame, (3,) float64."""
+        rotation, translation = self.world_to_camera[:3, :3], self.world_to_camera[:3, 3]
+        return -rotation.T @ translation
+
+
+@dataclass(frozen=True)
+class View:
+    """One posed image with its masks.
+
+    name: the image's file stem, unique in the scene.
+    masks: (H, W) int32, -1 outside every mask, else a row of ``mask_features``; or a function that reads it, so that
+        a long capture is streamed. H, W are the camera's.
+    mask_features: (M, D) float32, one row per mask, as the encoder gave it (not normalised).
+    image: (H, W, 3) uint8 RGB, or a function that reads it, or None where the capture has no images.
+    """
+
+    name: str
+    camera: Camera
+    masks: IntArray | Callable[[], IntArray]
+    mask_features: FloatArray
+    image: NDArray[np.uint8] | Callable[[], NDArray[np.uint8]] | None = None
+
+    def __post_init__(self) -> None:
+        features = self.mask_features
+        if features.ndim != 2 or features.dtype != np.float32:
+            raise SceneError(
+                f"view '{self.name}': mask features are {features.dtype} {features.shape}; expected float32 (masks, width)"
+            )
+        finite = np.isfinite(features).all(axis=1)
+        if not finite.all():
+            raise SceneError(
+                f"view '{self.name}': the feature of mask {int(np.argmin(finite)) + 1} holds NaN or infinity; "
+                "expected finite numbers: encode this mask again or remove it"
+            )
+
+    @property
+    def mask_count(self) -> int:
+        return len(self.mask_features)
+
+    def mask_map(self) -> IntArray:
+        """(H, W) int32: -1 or a row of ``mask_features``. Read and checked on every call; keep it if you need it."""
+        ids = self.masks() if callable(self.masks) else self.masks
+        expected = (self.camera.height, self.camera.width)
+        if ids.shape != expected:
+            raise SceneError(
+                f"view '{self.name}': the mask image is {ids.shape[1]}x{ids.shape[0]} pixels, its camera "
+                f"{expected[1]}x{expected[0]}: make the masks at the image's size or fix w and h of the pose file"
+            )
+        if ids.size and int(ids.max()) >= self.mask_count:
+            raise SceneError(
+                f"view '{self.name}': mask id {int(ids.max()) + 1} has no feature row (the features file has "
+                f"{self.mask_count}): write one feature row per mask id"
+            )
+        return np.ascontiguousarray(ids, np.int32)
+
+    def image_rgb(self) -> NDArray[np.uint8] | None:
+        """(H, W, 3) uint8 RGB at the camera's size, or None where the view has no image."""
+        image = self.image() if callable(self.image) else self.image
+        if image is not None and image.shape != (self.camera.height, self.camera.width, 3):
+            raise SceneError(
+                f"view '{self.name}': the image is {image.shape}, its camera "
+                f"({self.camera.height}, {self.camera.width}, 3): fix w and h of the pose file"
+            )
+        return image
+
+
+@dataclass(frozen=True)
+class Points:
+    """A plain cloud, or Gaussians when scale, rotation and opacity are known (all three or none).
+
+    xyz: (n, 3) float32, local frame. origin: (3,) float64, world = xyz + origin. rgb: (n, 3) uint8 or None.
+    normals: (n, 3) float32 unit or None. scale: (n, 3) float32, linear standard deviations.
+    rotation: (n, 4) float32 quaternions wxyz, unit. opacity: (n,) float32 in [0, 1].
+    """
+
+    xyz: FloatArray
+    origin: DoubleArray
+    rgb: NDArray[np.uint8] | None = None
+    normals: FloatArray | None = None
+    scale: FloatArray | None = None
+    rotation: FloatArray | None = None
+    opacity: FloatArray | None = None
+
+    @classmethod
+    def from_world(
+        cls, xyz: NDArray[np.floating], *, rgb: NDArray[np.uint8] | None = None, normals: FloatArray | None = None,
+        scale: FloatArray | None = None, rotation: FloatArray | None = None, opacity: FloatArray | None = None,
+    ) -> Points:
+        """Points from world coordinates (n, 3) of any float type; the median becomes the origin."""
+        world = np.asarray(xyz, np.float64)
+        if world.ndim != 2 or world.shape[1] != 3:
+            raise SceneError(f"points are an array of shape {world.shape}; expected (points, 3)")
+        if len(world) == 0:
+            raise SceneError("the cloud has 0 points; expected at least one: check the geometry file")
+        finite = np.isfinite(world).all(axis=1)
+        if not finite.all():
+            raise SceneError(
+                f"{int((~finite).sum())} of {len(world)} points hold NaN or infinity (the first is row "
+                f"{int(np.argmin(finite))}); expected finite coordinates: remove them from the cloud first"
+            )
+        origin = np.median(world, axis=0)
+        return cls((world - origin).astype(np.float32), origin, rgb, normals, scale, rotation, opacity)
+
+    def __post_init__(self) -> None:
+        n = len(self.xyz)
+        widths = {"rgb": 3, "normals": 3, "scale": 3, "rotation": 4, "opacity": None}
+        for name, width in widths.items():
+            value = getattr(self, name)
+            expected = (n,) if width is None else (n, width)
+            if value is not None and value.shape != expected:
+                raise SceneError(f"{name} has shape {value.shape}; expected {expected}")
+        given = [name for name in ("scale", "rotation", "opacity") if getattr(self, name) is not None]
+        if given and len(given) < 3:
+            raise SceneError(f"Gaussians need scale, rotation and opacity together; got only {', '.join(given)}")
+
+    def __len__(self) -> int:
+        return len(self.xyz)
+
+    @property
+    def are_gaussians(self) -> bool:
+        return self.scale is not None
+
+    @property
+    def xyz_world(self) -> DoubleArray:
+        return self.xyz.astype(np.float64) + self.origin
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Points and the views of them. feature_space names the encoder of the mask features, e.g. ``clip-vit-b32``."""
+
+    points: Points
+    views: tuple[View, ...]
+    feature_space: str
+    name: str = "scene"
+
+    def __post_init__(self) -> None:
+        if not self.views:
+            raise SceneError("the scene has 0 views; expected at least one posed image with a mask")
+        widths = {view.mask_features.shape[1] for view in self.views if view.mask_count}
+        if len(widths) > 1:
+            by_view = {view.name: view.mask_features.shape[1] for view in self.views if view.mask_count}
+            odd = [f"{name}: {width}" for name, width in by_view.items() if width != next(iter(by_view.values()))]
+            raise SceneError(
+                f"mask features have {len(widths)} widths {sorted(widths)} (e.g. {odd[0]}); expected one width: "
+                "encode all masks with the same model"
+            )
+        names = [view.name for view in self.views]
+        if len(set(names)) != len(names):
+            twice = next(name for name in names if names.count(name) > 1)
+            raise SceneError(f"two views are called '{twice}'; expected unique image names")
+
+    @property
+    def feature_width(self) -> int:
+        """Width D of the mask features; 0 where no view has a mask."""
+        return next((view.mask_features.shape[1] for view in self.views if view.mask_count), 0)
