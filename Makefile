@@ -1,0 +1,28 @@
+# `make demo` and `make test` do their whole set-up in .venv; a second run starts at once.
+.PHONY: help setup demo test lint clean
+.DEFAULT_GOAL := help
+
+help:
+	@echo "make demo    build a furnished room, label it and show it: pictures and scores in out/demo"
+	@echo "make test    run the tests"
+	@echo "make lint    ruff and pyright"
+	@echo "make setup   only make .venv, with the libraries that Open3D and PyVista need"
+	@echo "make clean   remove .venv, out and the caches"
+
+setup:
+	@PYTHON="$(PYTHON)" scripts/setup.sh
+
+demo: setup
+	@.venv/bin/og-pointcloud demo -o out/demo
+
+test: setup
+	@.venv/bin/python -m pytest
+
+lint: setup
+	@.venv/bin/ruff check
+	@.venv/bin/ruff format --check
+	@.venv/bin/pyright --pythonpath .venv/bin/python
+
+clean:
+	rm -rf .venv out .pytest_cache .ruff_cache
+	find og_pointcloud export plugins examples tests -name __pycache__ -prune -exec rm -rf {} +
