@@ -4,7 +4,7 @@ set -euo pipefail
 cd "$(dirname "$0")/.."
 
 # Open3D loads the first five on import; PyVista draws off-screen through EGL with Mesa's software renderer.
-debian_packages=(libusb-1.0-0 libgl1 libegl1 libx11-6 libgomp1 libegl-mesa0 libgl1-mesa-dri libxrender1)
+debian_packages=(libusb-1.0-0 libgl1 libegl1 libx11-6 libgomp1 libegl-mesa0 libgl1-mesa-dri)
 supported_python='import sys, venv, ensurepip; sys.exit(not (3, 10) <= sys.version_info[:2] <= (3, 13))'
 stamp=.venv/og-pointcloud-setup
 
@@ -60,7 +60,7 @@ install_environment() {
         "$python" -m venv --clear .venv
     fi
     rm -f "$stamp"
-    .venv/bin/python -m pip install --quiet --disable-pip-version-check -c constraints-cpu.txt -e '.[all,dev]' </dev/null
+    .venv/bin/python -m pip install -qq --disable-pip-version-check -c constraints-cpu.txt -e '.[all,dev]' </dev/null
     fingerprint "$python" >"$stamp"
 }
 

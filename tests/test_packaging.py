@@ -1,0 +1,48 @@
+"""What an installation brings: the names that are imported, and nothing heavy before it is used."""
+
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+HEAVY = {"torch", "open3d", "pyvista", "vtk", "cv2", "numba", "scipy", "onnx", "tqdm"}
+
+
+@pytest.fixture(scope="module")
+def wheel_names(tmp_path_factory) -> list[str]:
+    builder = pytest.importorskip("hatchling.builders.wheel")
+    (wheel,) = builder.WheelBuilder(str(ROOT)).build(
+        directory=str(tmp_path_factory.mktemp("wheel")), versions=["standard"]
+    )
+    return zipfile.ZipFile(wheel).namelist()
+
+
+def test_wheel_has_only_our_top_level_names(wheel_names):
+    top_level = {name.split("/")[0] for name in wheel_names}
+    assert {"og_pointcloud", "og_pointcloud_export", "og_pointcloud_room"} <= top_level
+    strangers = [name for name in top_level if not name.startswith("og_pointcloud")]
+    assert strangers == [], "folders of the repository must not become packages"
+
+
+def test_wheel_has_every_module(wheel_names):
+    sources = {"og_pointcloud": ".", "og_pointcloud_export": "export", "og_pointcloud_room": "examples"}
+    on_disk = {
+        path.relative_to(ROOT / folder).as_posix()
+        for package, folder in sources.items()
+        for path in (ROOT / folder / package).rglob("*.py")
+    } | {path.name for path in (ROOT / "plugins").glob("*.py")}
+    assert "og_pointcloud/scene.py" in on_disk
+    assert on_disk <= set(wheel_names)
+    assert "og_pointcloud/py.typed" in wheel_names
+
+
+@pytest.mark.parametrize("statement", ["import og_pointcloud", "from og_pointcloud.cli import main; main(['--help'])"])
+def test_start_imports_nothing_heavy(statement):
+    code = f"import sys\ntry:\n    {statement}\nexcept SystemExit:\n    pass\nprint('loaded', *sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    loaded = set(done.stdout.split("loaded", 1)[1].split())
+    assert "og_pointcloud" in loaded
+    assert loaded & HEAVY == set()
