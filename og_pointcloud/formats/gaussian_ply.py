@@ -1,0 +1,194 @@
+"""3D Gaussian splatting PLY files -> Points: scales linear, rotations unit wxyz, opacities in [0, 1], base colour.
+
+Two layouts. *Trained* (Inria, gsplat, nerfstudio, OpenGaussian): a float property each, before activation: log scale,
+logit opacity, any quaternion, colour as the constant spherical harmonic. *Compressed* (SuperSplat): an element
+``chunk`` with the bounds of 256 splats each, and four packed 32-bit words per splat. Harmonics above the constant one,
+instance features and normals are not read: nothing here renders colour by direction.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from og_pointcloud.errors import SceneError
+from og_pointcloud.formats.ply import join_columns, read_ply, write_ply
+from og_pointcloud.formats.tables import colors, naming, positions, stack_columns, storable_positions
+from og_pointcloud.scene import Points
+
+__all__ = ["gaussians_from_ply", "holds_gaussians", "read_gaussian_ply", "write_gaussian_ply"]
+
+SH_CONSTANT = 0.28209479177387814
+"""The spherical harmonic of degree 0, 1 / (2 sqrt(pi)): colour = 0.5 + SH_CONSTANT * f_dc."""
+SPLATS_PER_CHUNK = 256
+
+BASE_COLOR = ("f_dc_0", "f_dc_1", "f_dc_2")
+LOG_SCALE = ("scale_0", "scale_1", "scale_2")
+ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
+
+Elements = Mapping[str, NDArray[np.void]]
+
+
+def read_gaussian_ply(path: str | os.PathLike[str]) -> Points:
+    """Gaussians from a trained or compressed 3DGS file; world coordinates, the median as origin.
+
+    A zero quaternion is no rotation. Opacity logits of +-inf are 1 and 0, a log scale of -inf is 0: some converters
+    write them for splats that are fully opaque, invisible or flat. SceneError, beginning with the path, where a
+    property is missing or anything else is not finite, also a log scale above 88.7, whose exponential leaves float32.
+    """
+    path = Path(path)
+    with naming(path):
+        return gaussians_from_ply(read_ply(path))
+
+
+def write_gaussian_ply(path: str | os.PathLike[str], points: Points) -> None:
+    """Write Gaussians in the trained layout of degree 0 (no ``f_rest``), in world coordinates; atomic.
+
+    Positions are float64 where float32 would lose more than 1e-6 of the extent. Scale 0 and opacities 0 and 1 become
+    the nearest finite logarithm and logit, so that any reader survives them. Without rgb the splats are mid-grey.
+    """
+    if points.scale is None or points.rotation is None or points.opacity is None:
+        raise SceneError("the points have no scale, rotation and opacity; expected Gaussians")
+    smallest = np.finfo(np.float32).smallest_normal
+    # 2^-24 below 1 is the last opacity under 1 that float32 knows.
+    opacity = np.clip(points.opacity.astype(np.float64), 2.0**-24, 1 - 2.0**-24)
+    rgb = np.full(points.xyz.shape, 127.5) if points.rgb is None else points.rgb
+    groups = {
+        ("x", "y", "z"): storable_positions(points.xyz_world),
+        ("nx", "ny", "nz"): np.zeros_like(points.xyz),
+        BASE_COLOR: ((rgb / 255 - 0.5) / SH_CONSTANT).astype(np.float32),
+        ("opacity",): np.log(opacity / (1 - opacity)).astype(np.float32)[:, None],
+        LOG_SCALE: np.log(np.maximum(points.scale, smallest)),
+        ROTATION: points.rotation,
+    }
+    columns = {name: values[:, i] for names, values in groups.items() for i, name in enumerate(names)}
+    write_ply(path, {"vertex": join_columns(columns)})
+
+
+def holds_gaussians(elements: Elements) -> bool:
+    """Whether a PLY's elements are Gaussians of either layout, rather than a plain cloud."""
+    return _are_compressed(elements) or not {"scale_0", "rot_0"}.isdisjoint(_names(elements))
+
+
+def gaussians_from_ply(elements: Elements) -> Points:
+    """``read_gaussian_ply`` on elements that are read already."""
+    if "vertex" not in elements:
+        raise SceneError(f"no element 'vertex' of plain properties; the file has {', '.join(elements) or 'none'}")
+    return _compressed(elements) if _are_compressed(elements) else _trained(elements["vertex"])
+
+
+def _are_compressed(elements: Elements) -> bool:
+    return "chunk" in elements and "packed_position" in _names(elements)
+
+
+def _names(elements: Elements) -> tuple[str, ...]:
+    """Properties of the vertices; empty without vertices."""
+    return elements["vertex"].dtype.names or () if "vertex" in elements else ()
+
+
+def _trained(vertex: NDArray[np.void]) -> Points:
+    with np.errstate(over="ignore"):
+        scale = np.exp(stack_columns(vertex, LOG_SCALE, np.float64)).astype(np.float32)
+    # The logistic function as tanh, which cannot overflow.
+    opacity = 0.5 + 0.5 * np.tanh(0.5 * stack_columns(vertex, ("opacity",), np.float64)[:, 0])
+    if "f_dc_0" in (vertex.dtype.names or ()):
+        color = 0.5 + SH_CONSTANT * stack_columns(vertex, BASE_COLOR, np.float64)
+    else:  # nerfstudio's exporter writes red, green, blue instead where it is asked for colours
+        rgb = colors(vertex)
+        color = None if rgb is None else rgb / 255
+    return _gaussians(positions(vertex), scale, stack_columns(vertex, ROTATION, np.float64), opacity, color)
+
+
+def _compressed(elements: Elements) -> Points:
+    vertex, chunk = elements["vertex"], elements["chunk"]
+    expected = -(-len(vertex) // SPLATS_PER_CHUNK)
+    if len(chunk) != expected:
+        raise SceneError(
+            f"{len(vertex)} packed splats in {len(chunk)} chunks of {SPLATS_PER_CHUNK}; expected {expected} chunks: "
+            "the file is damaged"
+        )
+    words = {}
+    for name in ("packed_position", "packed_rotation", "packed_scale", "packed_color"):
+        if name not in (vertex.dtype.names or ()) or vertex.dtype[name] != np.uint32:
+            raise SceneError(f"element 'vertex' has no property '{name}' of type uint; expected a SuperSplat file")
+        words[name] = np.ascontiguousarray(vertex[name])
+
+    xyz = _between(chunk, ("min_x", "min_y", "min_z"), ("max_x", "max_y", "max_z"), _unpack(words["packed_position"]))
+    log_scale = _between(
+        chunk,
+        ("min_scale_x", "min_scale_y", "min_scale_z"),
+        ("max_scale_x", "max_scale_y", "max_scale_z"),
+        _unpack(words["packed_scale"]),
+    )
+    rgba = _unpack(words["packed_color"], bits=(8, 8, 8, 8))
+    color = rgba[:, :3]
+    if "min_r" in (chunk.dtype.names or ()):  # since SuperSplat 2; before it, colours have no bounds
+        color = _between(chunk, ("min_r", "min_g", "min_b"), ("max_r", "max_g", "max_b"), color)
+    with np.errstate(over="ignore"):
+        scale = np.exp(log_scale).astype(np.float32)
+    return _gaussians(xyz, scale, _unpack_rotation(words["packed_rotation"]), rgba[:, 3], color)
+
+
+def _unpack(words: NDArray[np.uint32], bits: tuple[int, ...] = (11, 10, 11)) -> NDArray[np.float64]:
+    """Fields of ``bits`` bits, the first uppermost, as (n, len(bits)) shares in [0, 1] of a field's largest value."""
+    shares = np.empty((len(words), len(bits)))
+    shift = sum(bits)
+    for column, width in enumerate(bits):
+        shift -= width
+        largest = (1 << width) - 1
+        shares[:, column] = (words >> shift & largest) / largest
+    return shares
+
+
+def _between(
+    chunk: NDArray[np.void], low: tuple[str, ...], high: tuple[str, ...], share: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """``share`` of the way from each splat's chunk minimum to its maximum."""
+    minimum, maximum = stack_columns(chunk, low, np.float64), stack_columns(chunk, high, np.float64)
+    of_splat = np.arange(len(share)) // SPLATS_PER_CHUNK
+    with np.errstate(invalid="ignore"):  # infinite bounds give NaN, which is reported as such
+        return minimum[of_splat] + (maximum - minimum)[of_splat] * share
+
+
+def _unpack_rotation(words: NDArray[np.uint32]) -> NDArray[np.float64]:
+    """Smallest three: two bits name the largest of w, x, y, z; ten each the others, in order, in +-1/sqrt(2)."""
+    others = (_unpack(words, bits=(2, 10, 10, 10))[:, 1:] - 0.5) * np.sqrt(2)
+    largest = (words >> 30).astype(np.intp)
+    quaternions = np.empty((len(words), 4))
+    mask = np.arange(4) == largest[:, None]
+    quaternions[mask] = np.sqrt(np.maximum(0.0, 1 - np.square(others).sum(axis=1)))
+    quaternions[~mask] = others.ravel()
+    return quaternions
+
+
+def _gaussians(
+    xyz: NDArray[np.float64],
+    scale: NDArray[np.float32],
+    rotation: NDArray[np.float64],
+    opacity: NDArray[np.float64],
+    color: NDArray[np.float64] | None,
+) -> Points:
+    """Points from activated values, quaternions (n, 4) of any length, and colours around [0, 1]; finite or an error."""
+    parts = {"position": xyz, "scale": scale, "rotation": rotation, "opacity": opacity[:, None]}
+    if color is not None:
+        parts["colour"] = color
+    finite = {name: np.isfinite(values).all(axis=1) for name, values in parts.items()}
+    usable = np.logical_and.reduce(list(finite.values()))
+    if not usable.all():
+        first = int(np.argmin(usable))
+        blamed = next(name for name in finite if not finite[name][first])
+        raise SceneError(
+            f"{int((~usable).sum())} of {len(usable)} Gaussians are not finite (the first is row {first}, in its "
+            f"{blamed}); expected finite values, and log scales below 88.7: remove these Gaussians first"
+        )
+    length = np.linalg.norm(rotation, axis=1, keepdims=True)
+    # A zero quaternion put into the rotation matrix formula gives the identity, so that is how such files are rendered.
+    unit = np.divide(rotation, length, out=np.tile([1.0, 0.0, 0.0, 0.0], (len(rotation), 1)), where=length > 0)
+    rgb = None if color is None else np.rint(np.clip(color, 0, 1) * 255).astype(np.uint8)
+    return Points.from_world(
+        xyz, rgb=rgb, scale=scale, rotation=unit.astype(np.float32), opacity=opacity.astype(np.float32)
+    )

@@ -1,0 +1,284 @@
+"""PLY in and out: ascii and binary, either byte order, as one structured array per element.
+
+Format: Greg Turk, "The PLY Polygon File Format", 1994; type names with bit widths (``float32``) as later tools write.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import struct
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from og_pointcloud.errors import SceneError
+from og_pointcloud.formats.tables import naming, read_text_rows
+
+__all__ = ["join_columns", "read_ply", "write_ply"]
+
+HEADER_LIMIT = 1 << 18
+"""Bytes in which a header must end; the longest known (a 3DGS file with its training record) has 4 kB."""
+
+NUMPY_TYPES = {
+    "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4",
+    "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4",
+    "float32": "f4", "float64": "f8",
+}  # fmt: skip
+PLY_TYPES = {numpy_type: name for name, numpy_type in reversed(NUMPY_TYPES.items())}
+BYTE_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
+
+
+@dataclass(frozen=True)
+class _Property:
+    name: str
+    numpy_type: str
+    length_type: str | None = None
+    """Of a list property, the type of the length that precedes the items; None for a scalar."""
+
+
+@dataclass(frozen=True)
+class _Element:
+    name: str
+    count: int
+    properties: list[_Property]
+
+    @property
+    def has_lists(self) -> bool:
+        return any(prop.length_type for prop in self.properties)
+
+    def dtype(self, byte_order: str) -> np.dtype:
+        return np.dtype([(prop.name, byte_order + prop.numpy_type) for prop in self.properties])
+
+
+@dataclass(frozen=True)
+class _Header:
+    byte_order: str
+    """``<`` or ``>``; empty for ascii."""
+    elements: list[_Element]
+    data_offset: int
+
+    @property
+    def elements_to_read(self) -> list[_Element]:
+        """All up to the last one without lists: the faces of a mesh, written after its vertices, are not touched."""
+        last = max((i for i, element in enumerate(self.elements) if not element.has_lists), default=-1)
+        return self.elements[: last + 1]
+
+
+def read_ply(path: str | os.PathLike[str]) -> dict[str, NDArray[np.void]]:
+    """Element name -> (count,) structured array, one field per property, native byte order.
+
+    Elements with list properties (the faces of a mesh) are left out. SceneError, beginning with the path, for a file
+    that is missing, foreign, truncated, or whose header does not fit its size; nothing is allocated before that check.
+    """
+    path = Path(path)
+    with naming(path), path.open("rb") as file:
+        header = _parse_header(file.read(HEADER_LIMIT))
+        file.seek(header.data_offset)
+        read = _read_binary if header.byte_order else _read_text
+        return read(file, header)
+
+
+def write_ply(
+    path: str | os.PathLike[str], elements: Mapping[str, NDArray[np.void]], comments: Sequence[str] = ()
+) -> None:
+    """Write structured arrays as a binary little-endian PLY, whole or not at all.
+
+    elements: name -> (n,) structured array of scalar fields, int8 to int32 or float32, float64. comments: a line each.
+    SceneError where a field has a type that PLY lacks, or the folder cannot be written.
+    """
+    path = Path(path)
+    with naming(path):
+        packed = {name: _packed(name, rows) for name, rows in elements.items()}
+        header = ["ply", "format binary_little_endian 1.0", *(f"comment {comment}" for comment in comments)]
+        for name, rows in packed.items():
+            header.append(f"element {name} {len(rows)}")
+            header += [f"property {PLY_TYPES[_numpy_type(rows, field)]} {field}" for field in rows.dtype.names or ()]
+        if any("\n" in line or "\r" in line for line in header):
+            raise SceneError("a comment or name holds a line break; expected one line: split the comment")
+        with _replacing(path) as file:
+            file.write("\n".join([*header, "end_header", ""]).encode())
+            for rows in packed.values():
+                rows.tofile(file)
+
+
+def join_columns(columns: Mapping[str, NDArray]) -> NDArray[np.void]:
+    """One-dimensional arrays of one length -> (n,) structured array with a field each, types kept."""
+    lengths = {name: column.shape for name, column in columns.items()}
+    if len(set(lengths.values())) != 1 or any(len(shape) != 1 for shape in lengths.values()):
+        raise SceneError(f"columns have shapes {lengths}; expected one-dimensional arrays of one length")
+    rows = np.empty(next(iter(lengths.values())), [(name, column.dtype) for name, column in columns.items()])
+    for name, column in columns.items():
+        rows[name] = column
+    return rows
+
+
+def _parse_header(head: bytes) -> _Header:
+    if not re.match(rb"ply[ \t]*\r?\n", head):
+        raise SceneError(f"not a PLY file: it starts with {head[:16]!r}; expected a line 'ply'")
+    end = re.search(rb"\nend_header[ \t]*\r?(\n|\Z)", head)
+    if end is None:
+        raise SceneError(f"no line 'end_header' within {len(head)} bytes: the PLY header is truncated or damaged")
+    byte_order: str | None = None
+    elements: list[_Element] = []
+    # Not splitlines(): it would also split a comment at the odd control characters that Unicode counts as line ends.
+    for number, line in enumerate(head[: end.start()].decode("utf-8", "replace").split("\n")[1:], start=2):
+        match line.split():
+            case [] | ["comment" | "obj_info", *_]:
+                continue
+            case ["format", encoding, "1.0"] if encoding in BYTE_ORDERS and byte_order is None:
+                byte_order = BYTE_ORDERS[encoding]
+            case ["element", name, count] if re.fullmatch("[0-9]{1,15}", count):
+                if any(name == element.name for element in elements):
+                    raise SceneError(f"header line {number}: element '{name}' is declared twice")
+                elements.append(_Element(name, int(count), []))
+            case ["property", *words] if elements:
+                _add_property(elements[-1], words, number)
+            case _:
+                raise SceneError(
+                    f"header line {number} is {line.strip()[:80]!r}; expected 'format <encoding> 1.0' (once), 'element "
+                    "<name> <count>', or a 'property' below an element: the file is damaged or not a PLY"
+                )
+    if byte_order is None:
+        raise SceneError(f"the PLY header has no 'format' line; expected one of {', '.join(BYTE_ORDERS)}")
+    for element in elements:
+        if not element.properties:
+            raise SceneError(f"element '{element.name}' has no properties: the PLY header is damaged")
+    return _Header(byte_order, elements, end.end())
+
+
+def _add_property(element: _Element, words: list[str], number: int) -> None:
+    """Append the property that ``words``, the rest of a header line, declare."""
+    match words:
+        case ["list", length_type, item_type, name]:
+            types = [length_type, item_type]
+            prop = _Property(name, NUMPY_TYPES.get(item_type, ""), NUMPY_TYPES.get(length_type, ""))
+        case [item_type, name]:
+            types = [item_type]
+            prop = _Property(name, NUMPY_TYPES.get(item_type, ""))
+        case _:
+            raise SceneError(f"header line {number}: property {' '.join(words)[:80]!r}; expected a type and a name")
+    unknown = [kind for kind in types if kind not in NUMPY_TYPES]
+    if unknown:
+        raise SceneError(f"header line {number}: unknown type {unknown[0]!r}; expected one of {', '.join(NUMPY_TYPES)}")
+    if prop.length_type in ("f4", "f8"):
+        raise SceneError(f"header line {number}: the length of list '{prop.name}' is {types[0]}; expected an integer")
+    if any(prop.name == other.name for other in element.properties):
+        raise SceneError(f"header line {number}: element '{element.name}' has property '{prop.name}' twice")
+    element.properties.append(prop)
+
+
+def _read_binary(file: BinaryIO, header: _Header) -> dict[str, NDArray[np.void]]:
+    size = os.fstat(file.fileno()).st_size
+    arrays: dict[str, NDArray[np.void]] = {}
+    for element in header.elements_to_read:
+        if element.has_lists:
+            _skip_binary_lists(file, element, header.byte_order)
+            continue
+        dtype = element.dtype(header.byte_order)
+        left = size - file.tell()
+        if element.count * dtype.itemsize > left:
+            raise SceneError(
+                f"element '{element.name}': expected {element.count} rows of {dtype.itemsize} bytes "
+                f"({element.count * dtype.itemsize} bytes), the file has {left // dtype.itemsize} rows ({left} bytes): "
+                "it is truncated; copy or write it again"
+            )
+        rows = np.fromfile(file, dtype, element.count)
+        arrays[element.name] = rows.astype(dtype.newbyteorder("="), copy=False)
+    return arrays
+
+
+def _skip_binary_lists(file: BinaryIO, element: _Element, byte_order: str) -> None:
+    """Move past an element with lists. Row by row, since each length decides where the next row starts."""
+    start = file.tell()
+    data = file.read()
+    steps = [
+        (
+            struct.Struct(byte_order + np.dtype(prop.length_type).char) if prop.length_type else None,
+            np.dtype(prop.numpy_type).itemsize,
+        )
+        for prop in element.properties
+    ]
+    at = row = 0
+    while row < element.count and at <= len(data):
+        for length_format, item_size in steps:
+            length = 1
+            if length_format:
+                # Past the end of the data the length does not matter any more: `at` already tells.
+                readable = at + length_format.size <= len(data)
+                length = length_format.unpack_from(data, at)[0] if readable else 0
+                at += length_format.size
+            if length < 0:
+                raise SceneError(
+                    f"element '{element.name}': a list of row {row} has length {length}; the file is damaged"
+                )
+            at += length * item_size
+        row += 1
+    if at > len(data):
+        raise SceneError(
+            f"element '{element.name}': expected {element.count} rows, the file ends in row {row - 1}: "
+            "it is truncated; copy or write it again"
+        )
+    file.seek(start + at)
+
+
+def _read_text(file: BinaryIO, header: _Header) -> dict[str, NDArray[np.void]]:
+    arrays: dict[str, NDArray[np.void]] = {}
+    for element in header.elements_to_read:
+        if element.has_lists:
+            _skip_text_rows(file, element)
+        else:
+            what = f"element '{element.name}'"
+            arrays[element.name] = read_text_rows(file, element.dtype("="), element.count, what)
+    return arrays
+
+
+def _skip_text_rows(file: BinaryIO, element: _Element) -> None:
+    skipped = sum(1 for _ in islice((line for line in file if not line.isspace()), element.count))
+    if skipped < element.count:
+        raise SceneError(
+            f"element '{element.name}': expected {element.count} rows, the file has {skipped}: it is truncated; "
+            "copy or write it again"
+        )
+
+
+def _packed(element: str, rows: NDArray[np.void]) -> NDArray[np.void]:
+    """The same rows, little endian and without padding, each field of a type that PLY has."""
+    names = rows.dtype.names
+    if not names or rows.ndim != 1:
+        raise SceneError(f"element '{element}' is {rows.dtype} {rows.shape}; expected a 1-D structured array")
+    for name in (element, *names):
+        if not re.fullmatch(r"\S+", name):
+            raise SceneError(f"element '{element}': the name {name!r} is empty or has a space; PLY names are one word")
+    for name in names:
+        if _numpy_type(rows, name) not in PLY_TYPES:
+            raise SceneError(
+                f"property '{name}' of element '{element}' is {rows.dtype[name]}; PLY has int8 to int32, uint8 to "
+                "uint32, float32, float64: convert it first"
+            )
+    little_endian = np.dtype([(name, rows.dtype[name].newbyteorder("<")) for name in names])
+    return rows.astype(little_endian, copy=False)
+
+
+def _numpy_type(rows: NDArray[np.void], field: str) -> str:
+    """Type code of a field without its byte order, e.g. ``f4``."""
+    return rows.dtype[field].str.lstrip("<>|=")
+
+
+@contextmanager
+def _replacing(path: Path) -> Iterator[BinaryIO]:
+    """A file to write that takes the place of ``path`` when, and only when, the block ends without an error."""
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        with temporary.open("wb") as file:
+            yield file
+        os.replace(temporary, path)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise

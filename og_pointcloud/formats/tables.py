@@ -1,0 +1,143 @@
+"""What the geometry formats share: rows of text, columns that become positions, colours and normals, errors' paths."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from itertools import chain, islice
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from og_pointcloud.errors import SceneError
+
+__all__ = ["colors", "naming", "normals", "positions", "read_text_rows", "stack_columns", "storable_positions"]
+
+COLOR_COLUMNS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
+PACKED_COLOR_COLUMNS = ("rgb", "rgba")
+NORMAL_COLUMNS = (("nx", "ny", "nz"), ("normal_x", "normal_y", "normal_z"))
+
+
+@contextmanager
+def naming(path: Path) -> Iterator[None]:
+    """Put the file's path, once, before errors raised inside; a failing disk or missing file is a SceneError too."""
+    try:
+        yield
+    except SceneError as error:
+        if str(error).startswith(f"{path}: "):
+            raise
+        raise SceneError(f"{path}: {error}") from error
+    except OSError as error:
+        raise SceneError(f"{path}: {error.strerror or error}: check the path and its permissions") from error
+
+
+def read_text_rows(lines: Iterable[bytes], dtype: np.dtype, count: int, what: str) -> NDArray[np.void]:
+    """The next ``count`` rows of an ascii file, one a line, blank lines skipped, as (count,) records of ``dtype``.
+
+    Takes no line beyond its last row. SceneError where a value does not fit its type, or rows are missing.
+    """
+    if count == 0:
+        return np.empty(0, dtype)
+    rows_text = islice((line for line in lines if not line.isspace()), count)
+    first = next(rows_text, None)
+    if first is None:
+        raise SceneError(f"{what}: expected {count} rows, the file has 0: it is truncated; copy or write it again")
+    try:
+        rows = np.loadtxt(chain([first], rows_text), dtype, comments=None, ndmin=1)
+    except ValueError as error:
+        raise SceneError(
+            f"{what}: {error} (expected {len(dtype.names or ())} values a row, as the header says)"
+        ) from error
+    if len(rows) < count:
+        raise SceneError(
+            f"{what}: expected {count} rows, the file has {len(rows)}: it is truncated; copy or write it again"
+        )
+    return rows
+
+
+def stack_columns(rows: NDArray[np.void], names: Sequence[str], dtype: type[np.floating]) -> NDArray:
+    """Columns side by side: (n, len(names)) of ``dtype``. SceneError names the columns that are not there."""
+    scalar = [name for name in rows.dtype.names or () if rows.dtype[name].shape == ()]
+    missing = [name for name in names if name not in scalar]
+    if missing:
+        raise SceneError(
+            f"no column {', '.join(missing)}; expected {', '.join(names)}, the file has {', '.join(scalar)}"
+        )
+    stacked = np.empty((len(rows), len(names)), dtype)
+    for column, name in enumerate(names):
+        stacked[:, column] = rows[name]
+    return stacked
+
+
+def positions(rows: NDArray[np.void]) -> NDArray[np.float64]:
+    """(n, 3) float64 of columns x, y, z."""
+    return stack_columns(rows, ("x", "y", "z"), np.float64)
+
+
+def colors(rows: NDArray[np.void]) -> NDArray[np.uint8] | None:
+    """(n, 3) uint8 RGB, or None without colour columns.
+
+    Takes uint8; uint16 (full range); other numbers in 0..1 or 0..255, told apart by their maximum; and PCL's packed
+    ``rgb``/``rgba``, 0xAARRGGBB in four bytes, also where the file calls these bytes a float.
+    """
+    packed = _first_present(rows, tuple((name,) for name in PACKED_COLOR_COLUMNS))
+    if packed and rows.dtype[packed[0]].itemsize == 4:
+        bits = rows[packed[0]].view(np.uint32)
+        return np.stack([(bits >> shift & 255).astype(np.uint8) for shift in (16, 8, 0)], axis=1)
+    names = _first_present(rows, COLOR_COLUMNS)
+    if not names:
+        return None
+    types = {rows.dtype[name] for name in names}
+    if types == {np.dtype(np.uint8)}:
+        return np.stack([rows[name] for name in names], axis=1)
+    values = stack_columns(rows, names, np.float64)
+    low, high = values.min(initial=0.0), values.max(initial=0.0)
+    if types == {np.dtype(np.uint16)}:
+        values /= 257.0
+    elif not (low >= 0 and high <= 255):
+        raise SceneError(
+            f"colours {', '.join(names)} span {low:.6g}..{high:.6g}; expected 0..1 or 0..255: rescale or drop them"
+        )
+    elif high <= 1 and rows.dtype[names[0]].kind == "f":
+        values *= 255.0
+    return np.rint(values).astype(np.uint8)
+
+
+def normals(rows: NDArray[np.void]) -> NDArray[np.float32] | None:
+    """(n, 3) float32 unit normals, or None without normal columns or where none of them is usable.
+
+    A zero or non-finite normal means that its writer had none for that point: its row is zero.
+    """
+    names = _first_present(rows, NORMAL_COLUMNS)
+    if not names:
+        return None
+    vectors = stack_columns(rows, names, np.float64)
+    vectors[~np.isfinite(vectors).all(axis=1)] = 0.0
+    # The largest component first: squares of tiny or huge but valid normals would leave the float range.
+    largest = np.abs(vectors).max(axis=1, keepdims=True, initial=0.0)
+    known = largest[:, 0] > 0
+    if not known.any():
+        return None
+    vectors[known] /= largest[known]
+    vectors[known] /= np.linalg.norm(vectors[known], axis=1, keepdims=True)
+    return vectors.astype(np.float32)
+
+
+def storable_positions(xyz_world: NDArray[np.floating]) -> NDArray:
+    """Positions as float32, or as float64 where float32 would move a point by more than 1e-6 of the cloud's extent."""
+    world = np.asarray(xyz_world, np.float64)
+    with np.errstate(over="ignore"):
+        single = world.astype(np.float32)
+    if len(world) == 0:
+        return single
+    with np.errstate(invalid="ignore", over="ignore"):
+        loss = np.abs(single.astype(np.float64) - world).max()
+        extent = np.ptp(world, axis=0).max()
+    return single if loss <= 1e-6 * extent else world
+
+
+def _first_present(rows: NDArray[np.void], choices: Sequence[tuple[str, ...]]) -> tuple[str, ...]:
+    """The first of ``choices`` whose columns are all there, else ()."""
+    present = set(rows.dtype.names or ())
+    return next((names for names in choices if present.issuperset(names)), ())

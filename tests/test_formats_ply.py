@@ -1,0 +1,235 @@
+"""PLY: every encoding against bytes written by hand, and headers that lie."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from og_pointcloud.errors import SceneError
+from og_pointcloud.formats.ply import HEADER_LIMIT, NUMPY_TYPES, join_columns, read_ply, write_ply
+
+ROWS = [(1.5, -2, 250), (0.25, 70000, 0), (-1e-3, 3, 7)]
+FIELDS = [("x", "f4"), ("n", "i4"), ("red", "u1")]
+HEADER = (
+    "ply\nformat {encoding} 1.0\ncomment by hand, Å\nobj_info x\nelement vertex 3\n"
+    "property float x\nproperty int n\nproperty uchar red\n"
+)
+FACES = "element face 2\nproperty list uchar int vertex_indices\nproperty short mark\n"
+FACE_ROWS = [([0, 1, 2], 5), ([2, 1, 0, 1], 6)]
+STRUCT_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
+
+
+def vertex_bytes(encoding: str) -> bytes:
+    if encoding == "ascii":
+        return "".join(f"{x} {n} {red}\n" for x, n, red in ROWS).encode()
+    return b"".join(struct.pack(STRUCT_ORDERS[encoding] + "fiB", *row) for row in ROWS)
+
+
+def face_bytes(encoding: str) -> bytes:
+    if encoding == "ascii":
+        return "".join(f"{len(ids)} {' '.join(map(str, ids))} {mark}\n" for ids, mark in FACE_ROWS).encode()
+    order = STRUCT_ORDERS[encoding]
+    return b"".join(struct.pack(f"{order}B{len(ids)}ih", len(ids), *ids, mark) for ids, mark in FACE_ROWS)
+
+
+def write(path: Path, header: str, body: bytes = b"") -> Path:
+    path.write_bytes(header.encode() + b"end_header\n" + body)
+    return path
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "binary_little_endian", "binary_big_endian"])
+@pytest.mark.parametrize("faces", ["none", "after", "before"])
+def test_every_encoding_gives_the_same_vertices_with_and_without_faces(tmp_path, encoding, faces):
+    header, body = HEADER.format(encoding=encoding), vertex_bytes(encoding)
+    if faces == "after":
+        header, body = header + FACES, body + face_bytes(encoding)
+    elif faces == "before":
+        header = header.replace("element vertex", FACES + "element vertex")
+        body = face_bytes(encoding) + body
+    elements = read_ply(write(tmp_path / "a.ply", header, body))
+    assert list(elements) == ["vertex"]
+    assert elements["vertex"].dtype == np.dtype(FIELDS)
+    np.testing.assert_array_equal(elements["vertex"], np.array(ROWS, FIELDS))
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "binary_little_endian"])
+def test_windows_line_ends_in_the_header(tmp_path, encoding):
+    text = (HEADER.format(encoding=encoding) + "end_header\n").replace("\n", "\r\n")
+    path = tmp_path / "a.ply"
+    path.write_bytes(text.encode() + vertex_bytes(encoding))
+    np.testing.assert_array_equal(read_ply(path)["vertex"], np.array(ROWS, FIELDS))
+
+
+def test_ascii_skips_blank_lines_and_keeps_nan_for_the_caller(tmp_path):
+    header = "ply\nformat ascii 1.0\nelement vertex 2\nproperty double x\nproperty float y\n"
+    rows = read_ply(write(tmp_path / "a.ply", header, b"\n1e300 nan\n\n  -2\t3  \n"))["vertex"]
+    np.testing.assert_array_equal(rows["x"], [1e300, -2])
+    np.testing.assert_array_equal(rows["y"], np.float32([np.nan, 3]))
+
+
+def test_elements_follow_each_other_and_may_be_empty(tmp_path):
+    header = (
+        "ply\nformat binary_little_endian 1.0\nelement chunk 1\nproperty float low\n"
+        "element none 0\nproperty int a\nelement vertex 2\nproperty uint packed\n"
+    )
+    elements = read_ply(write(tmp_path / "a.ply", header, struct.pack("<fII", 2.5, 1, 0xFFFFFFFF) + b"trailing"))
+    assert elements["chunk"]["low"].tolist() == [2.5]
+    assert len(elements["none"]) == 0
+    assert elements["vertex"]["packed"].tolist() == [1, 0xFFFFFFFF]
+
+
+def test_header_without_final_line_end(tmp_path):
+    path = tmp_path / "a.ply"
+    path.write_bytes(b"ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nend_header")
+    assert read_ply(path)["vertex"].shape == (0,)
+
+
+def test_written_files_read_back_and_are_readable_by_the_letter_of_the_format(tmp_path):
+    random = np.random.default_rng(0)
+    codes = sorted(set(NUMPY_TYPES.values()))
+    columns = {f"p_{code}": random.integers(0, 100, 50).astype(code) for code in codes}
+    columns["big"] = random.normal(size=50).astype(">f8")
+    write_ply(tmp_path / "a.ply", {"vertex": join_columns(columns), "extra": np.zeros(0, [("e", "u2")])}, ["hello"])
+    elements = read_ply(tmp_path / "a.ply")
+    assert list(elements) == ["vertex", "extra"]
+    for name, column in columns.items():
+        np.testing.assert_array_equal(elements["vertex"][name], column)
+    first = (tmp_path / "a.ply").read_bytes().split(b"end_header\n", 1)
+    assert first[0].startswith(b"ply\nformat binary_little_endian 1.0\ncomment hello\nelement vertex 50\nproperty ")
+    row_size = sum(np.dtype(code).itemsize for code in codes) + 8
+    assert len(first[1]) == 50 * row_size
+    assert struct.unpack("<d", first[1][row_size - 8 : row_size])[0] == columns["big"][0]
+
+
+def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path, monkeypatch):
+    path = tmp_path / "a.ply"
+    write_ply(path, {"vertex": np.zeros(2, [("x", "f4")])})
+    before = path.read_bytes()
+
+    def fail(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("og_pointcloud.formats.ply.os.replace", fail)
+    with pytest.raises(SceneError, match=r"a\.ply: No space left on device"):
+        write_ply(path, {"vertex": np.ones(5, [("x", "f4")])})
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize(
+    ("elements", "comments", "message"),
+    [
+        ({"vertex": np.zeros(2, [("x", "i8")])}, (), "property 'x' of element 'vertex' is int64"),
+        ({"vertex": np.zeros(2, [("x", "f4", (3,))])}, (), "property 'x'"),
+        ({"vertex": np.zeros((2, 3))}, (), "expected a 1-D structured array"),
+        ({"vertex": np.zeros(2, [("a b", "f4")])}, (), "PLY names are one word"),
+        ({"vertex": np.zeros(2, [("x", "f4")])}, ("one\nelement vertex 9",), "line break"),
+    ],
+)
+def test_what_ply_cannot_hold_is_refused(tmp_path, elements, comments, message):
+    with pytest.raises(SceneError, match=message):
+        write_ply(tmp_path / "a.ply", elements, comments)
+    assert not list(tmp_path.iterdir())
+
+
+def test_columns_of_two_lengths_are_refused():
+    with pytest.raises(SceneError, match="one length"):
+        join_columns({"x": np.zeros(2), "y": np.zeros(3)})
+
+
+VERTEX = "element vertex 3\nproperty float x\n"
+LITTLE = "ply\nformat binary_little_endian 1.0\n"
+
+
+@pytest.mark.parametrize(
+    ("header", "message"),
+    [
+        ("PK\x03\x04", "not a PLY file: it starts with b'PK"),
+        ("plyx\n", "not a PLY file"),
+        ("ply\n" + VERTEX, "no 'format' line"),
+        ("ply\nformat ascii 2.0\n" + VERTEX, "header line 2 is 'format ascii 2.0'"),
+        ("ply\nformat morse 1.0\n" + VERTEX, "header line 2"),
+        (LITTLE + LITTLE[4:] + VERTEX, "header line 3"),
+        (LITTLE + "element vertex -3\nproperty float x\n", "header line 3"),
+        (LITTLE + "element vertex 3.5\nproperty float x\n", "header line 3"),
+        (LITTLE + f"element vertex {'9' * 5000}\nproperty float x\n", "header line 3"),
+        (LITTLE + "property float x\n", "header line 3"),
+        (LITTLE + "element vertex 3\n", "has no properties"),
+        (LITTLE + VERTEX + VERTEX, "element 'vertex' is declared twice"),
+        (LITTLE + VERTEX + "property float x\n", "has property 'x' twice"),
+        (LITTLE + VERTEX + "property quad y\n", "unknown type 'quad'; expected one of char, uchar"),
+        (LITTLE + VERTEX + "property list uchar quad y\n", "unknown type 'quad'"),
+        (LITTLE + VERTEX + "property list float int y\n", "the length of list 'y' is float; expected an integer"),
+        (LITTLE + VERTEX + "property float\n", "expected a type and a name"),
+        (LITTLE + "comment " + "x" * HEADER_LIMIT + "\n" + VERTEX, "no line 'end_header' within"),
+    ],
+)
+def test_damaged_headers(tmp_path, header, message):
+    path = write(tmp_path / "a.ply", header, bytes(12))
+    with pytest.raises(SceneError, match=message) as caught:
+        read_ply(path)
+    assert str(caught.value).startswith(f"{path}: ")
+
+
+def test_a_count_beyond_the_file_is_refused_before_memory_is_taken(tmp_path):
+    header = LITTLE + "element vertex 999999999999999\nproperty double x\n"
+    with pytest.raises(
+        SceneError, match=r"expected 999999999999999 rows of 8 bytes .* the file has 2 rows \(20 bytes\)"
+    ):
+        read_ply(write(tmp_path / "a.ply", header, bytes(20)))
+
+
+def test_truncated_files_say_what_is_missing(tmp_path):
+    with pytest.raises(SceneError, match=r"expected 3 rows of 4 bytes .12 bytes., the file has 2 rows .11 bytes"):
+        read_ply(write(tmp_path / "a.ply", LITTLE + VERTEX, bytes(11)))
+    text = "ply\nformat ascii 1.0\n" + VERTEX
+    with pytest.raises(SceneError, match="expected 3 rows, the file has 2: it is truncated"):
+        read_ply(write(tmp_path / "b.ply", text, b"1\n2\n"))
+    with pytest.raises(SceneError, match="expected 3 rows, the file has 0"):
+        read_ply(write(tmp_path / "c.ply", text, b" \n"))
+
+
+@pytest.mark.parametrize(
+    ("encoding", "body", "message"),
+    [
+        ("binary_little_endian", face_bytes("binary_little_endian")[:-1], "the file ends in row 1"),
+        ("binary_little_endian", b"", "the file ends in row 0"),
+        ("binary_little_endian", struct.pack("<B", 255), "the file ends in row 0"),
+        ("ascii", b"3 0 1 2 5\n", "expected 2 rows, the file has 1"),
+    ],
+)
+def test_truncated_lists_before_the_vertices(tmp_path, encoding, body, message):
+    header = f"ply\nformat {encoding} 1.0\n{FACES}{VERTEX}"
+    with pytest.raises(SceneError, match=message):
+        read_ply(write(tmp_path / "a.ply", header, body))
+
+
+def test_a_negative_list_length_is_refused(tmp_path):
+    header = LITTLE + "element face 1\nproperty list char int ids\n" + VERTEX
+    with pytest.raises(SceneError, match="a list of row 0 has length -1"):
+        read_ply(write(tmp_path / "a.ply", header, struct.pack("<b", -1) + bytes(12)))
+
+
+@pytest.mark.parametrize(
+    ("body", "message"),
+    [(b"1\nabc\n3\n", "'abc'"), (b"1\n2 2\n3\n", "expected 1 values a row"), (b"1 2\n2 3\n3 4\n", "expected 1 values")],
+)
+def test_ascii_rows_that_do_not_fit_the_header(tmp_path, body, message):
+    with pytest.raises(SceneError, match=message):
+        read_ply(write(tmp_path / "a.ply", "ply\nformat ascii 1.0\n" + VERTEX, body))
+
+
+def test_ascii_values_outside_their_type_are_refused(tmp_path):
+    header = "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty uchar red\n"
+    with pytest.raises(SceneError, match="'300' to uint8"):
+        read_ply(write(tmp_path / "a.ply", header, b"1 300\n"))
+
+
+def test_missing_file_and_folder(tmp_path):
+    with pytest.raises(SceneError, match=r"none\.ply: No such file or directory"):
+        read_ply(tmp_path / "none.ply")
+    with pytest.raises(SceneError, match="Is a directory"):
+        read_ply(tmp_path)

@@ -1,0 +1,160 @@
+"""Plain clouds from any file, told apart by content, and the labelled cloud."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from og_pointcloud.errors import SceneError
+from og_pointcloud.formats.ply import join_columns, read_ply, write_ply
+from og_pointcloud.formats.points import read_points, write_labelled_ply
+
+DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+XYZ = np.random.default_rng(6).normal(size=(30, 3))
+RGB = np.random.default_rng(7).integers(0, 256, (30, 3)).astype("u1")
+
+
+def write_cloud(path: Path, xyz: np.ndarray = XYZ, **columns: np.ndarray) -> Path:
+    write_ply(path, {"vertex": join_columns(dict(zip("xyz", xyz.T, strict=True)) | columns)})
+    return path
+
+
+def named(names: tuple[str, str, str], values: np.ndarray) -> dict[str, np.ndarray]:
+    return dict(zip(names, values.T, strict=True))
+
+
+def test_a_cloud_without_colours_or_normals(tmp_path):
+    points = read_points(write_cloud(tmp_path / "a.ply"))
+    np.testing.assert_allclose(points.xyz_world, XYZ, atol=1e-6)
+    assert (points.rgb, points.normals, points.are_gaussians) == (None, None, False)
+
+
+def test_map_coordinates_keep_their_millimetres(tmp_path):
+    offset = np.array([4.5e6, -5.2e6, 300.0])
+    points = read_points(write_cloud(tmp_path / "a.ply", XYZ + offset))
+    np.testing.assert_allclose(points.xyz_world, XYZ + offset, atol=1e-6)
+    np.testing.assert_allclose(points.origin, np.median(XYZ + offset, axis=0))
+
+
+@pytest.mark.parametrize(
+    "names", [("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue")]
+)
+@pytest.mark.parametrize(
+    "values",
+    [RGB, RGB.astype("u2") * 257, RGB.astype("f4") / 255, RGB.astype("f8"), RGB.astype("i4")],
+    ids=["uchar", "ushort", "unit float", "float", "int"],
+)
+def test_colours_of_every_name_and_type(tmp_path, names, values):
+    np.testing.assert_array_equal(read_points(write_cloud(tmp_path / "a.ply", **named(names, values))).rgb, RGB)
+
+
+@pytest.mark.parametrize("bad", [-1.0, 256.0, np.nan])
+def test_colours_out_of_range_are_refused(tmp_path, bad):
+    values = RGB.astype("f4")
+    values[3, 1] = bad
+    with pytest.raises(SceneError, match=r"a\.ply: colours red, green, blue span .*; expected 0\.\.1 or 0\.\.255"):
+        read_points(write_cloud(tmp_path / "a.ply", **named(("red", "green", "blue"), values)))
+
+
+@pytest.mark.parametrize("names", [("nx", "ny", "nz"), ("normal_x", "normal_y", "normal_z")])
+def test_normals_become_unit_and_unknown_ones_zero(tmp_path, names):
+    directions = XYZ / np.linalg.norm(XYZ, axis=1, keepdims=True)
+    normals = directions * np.geomspace(1e-300, 1e300, len(XYZ))[:, None]
+    normals[4], normals[5], normals[6] = 0, np.nan, [np.inf, 0, 0]
+    directions[4:7] = 0
+    read = read_points(write_cloud(tmp_path / "a.ply", **named(names, normals))).normals
+    assert read.dtype == np.float32
+    np.testing.assert_allclose(read, directions, atol=1e-6)
+
+
+def test_normals_that_are_all_zero_are_no_normals(tmp_path):
+    assert read_points(write_cloud(tmp_path / "a.ply", **named(("nx", "ny", "nz"), 0 * XYZ))).normals is None
+
+
+def test_the_content_decides_not_the_name(tmp_path):
+    np.testing.assert_allclose(read_points(write_cloud(tmp_path / "cloud.pcd")).xyz_world, XYZ, atol=1e-6)
+    text = (
+        "# .PCD v.7\nVERSION .7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 1\nHEIGHT 1\nPOINTS 1\nDATA ascii\n1 2 3\n"
+    )
+    (tmp_path / "cloud.ply").write_text(text)
+    assert read_points(tmp_path / "cloud.ply").xyz_world.tolist() == [[1, 2, 3]]
+
+
+@pytest.mark.parametrize("content", [b"", b"LASF\x00\x00", b"version https://git-lfs.github.com/spec/v1\n", b"plywood"])
+def test_other_files_are_refused_with_a_list_of_what_is_readable(tmp_path, content):
+    path = tmp_path / "a.ply"
+    path.write_bytes(content)
+    with pytest.raises(SceneError, match=r"not a geometry file .* expected a PLY .* or a PCD") as caught:
+        read_points(path)
+    assert str(caught.value).startswith(f"{path}: ")
+
+
+def test_missing_file(tmp_path):
+    with pytest.raises(SceneError, match=r"none\.ply: No such file"):
+        read_points(tmp_path / "none.ply")
+
+
+def test_no_points_nan_and_missing_columns_name_the_file_once(tmp_path):
+    broken = XYZ.copy()
+    broken[[3, 9], 1] = np.nan
+    for xyz, message in ((XYZ[:0], "0 points"), (broken, "2 of 30 points hold NaN or infinity .the first is row 3")):
+        path = write_cloud(tmp_path / "a.ply", xyz)
+        with pytest.raises(SceneError, match=message) as caught:
+            read_points(path)
+        assert str(caught.value).count(str(path)) == 1
+    write_ply(path, {"vertex": join_columns({"x": XYZ[:, 0], "y": XYZ[:, 1]})})
+    with pytest.raises(SceneError, match="no column z; expected x, y, z, the file has x, y"):
+        read_points(path)
+    write_ply(path, {"point": join_columns({"x": XYZ[:, 0]})})
+    with pytest.raises(SceneError, match="no element 'vertex' of plain properties; the file has point"):
+        read_points(path)
+
+
+@pytest.mark.parametrize(("offset", "stored"), [(0.0, "f4"), (1e6, "f8")])
+def test_labelled_cloud_reads_back(tmp_path, offset, stored):
+    path = tmp_path / "labelled.ply"
+    instance, label = np.arange(30) - 2, np.arange(30) % 4 - 1
+    score = np.linspace(0, 1, 30)
+    write_labelled_ply(path, XYZ + offset, RGB, instance, label, score)
+    rows = read_ply(path)["vertex"]
+    expected = [(name, stored) for name in "xyz"] + [(name, "u1") for name in ("red", "green", "blue")]
+    assert rows.dtype == np.dtype([*expected, ("instance", "i4"), ("label", "i4"), ("score", "f4")])
+    np.testing.assert_array_equal(rows["instance"], instance)
+    np.testing.assert_array_equal(rows["label"], label)
+    np.testing.assert_allclose(rows["score"], score, atol=1e-7)
+    points = read_points(path)
+    np.testing.assert_allclose(points.xyz_world, XYZ + offset, atol=1e-6 * np.ptp(XYZ, axis=0).max())
+    np.testing.assert_array_equal(points.rgb, RGB)
+
+
+def test_positions_beyond_float32_are_stored_as_double(tmp_path):
+    xyz = np.array([[0, 0, 0], [1e300, 1, 2]])
+    write_labelled_ply(tmp_path / "a.ply", xyz, RGB[:2], np.zeros(2, int), np.zeros(2, int), np.zeros(2))
+    rows = read_ply(tmp_path / "a.ply")["vertex"]
+    assert rows["x"].tolist() == [0, 1e300]
+
+
+def test_a_labelled_cloud_may_be_empty_but_not_uneven(tmp_path):
+    empty = np.zeros(0)
+    write_labelled_ply(tmp_path / "a.ply", np.zeros((0, 3)), RGB[:0], empty.astype(int), empty.astype(int), empty)
+    assert len(read_ply(tmp_path / "a.ply")["vertex"]) == 0
+    with pytest.raises(SceneError, match=r"label has shape \(29,\); expected \(30,\)"):
+        write_labelled_ply(tmp_path / "b.ply", XYZ, RGB, np.zeros(30, int), np.zeros(29, int), np.zeros(30))
+    assert not (tmp_path / "b.ply").exists()
+
+
+@pytest.mark.skipif(not DATA.is_dir(), reason="shared data: capture folders")
+@pytest.mark.parametrize(
+    ("capture", "count"),
+    [("seven_redkitchen", 174687), ("apc_shelf_B", 49093), ("ycb_0050", 103091), ("nuscenes_frame", 34688)],
+)
+def test_real_clouds_agree_with_open3d(capture, count):
+    open3d = pytest.importorskip("open3d")
+    path = DATA / capture / "points.ply"
+    points = read_points(path)
+    assert len(points) == count
+    cloud = open3d.io.read_point_cloud(str(path))
+    np.testing.assert_allclose(points.xyz_world, np.asarray(cloud.points), rtol=1e-6, atol=1e-5)
+    np.testing.assert_array_equal(points.rgb, np.rint(np.asarray(cloud.colors) * 255))
