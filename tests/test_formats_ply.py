@@ -14,7 +14,7 @@ from og_pointcloud.formats.ply import HEADER_LIMIT, NUMPY_TYPES, join_columns, r
 ROWS = [(1.5, -2, 250), (0.25, 70000, 0), (-1e-3, 3, 7)]
 FIELDS = [("x", "f4"), ("n", "i4"), ("red", "u1")]
 HEADER = (
-    "ply\nformat {encoding} 1.0\ncomment by hand, Å\nobj_info x\nelement vertex 3\n"
+    "ply\nformat {encoding} 1.0\ncomment by hand, Å\x0bone line\nobj_info x\nelement vertex 3\n"
     "property float x\nproperty int n\nproperty uchar red\n"
 )
 FACES = "element face 2\nproperty list uchar int vertex_indices\nproperty short mark\n"
@@ -53,6 +53,13 @@ def test_every_encoding_gives_the_same_vertices_with_and_without_faces(tmp_path,
     assert list(elements) == ["vertex"]
     assert elements["vertex"].dtype == np.dtype(FIELDS)
     np.testing.assert_array_equal(elements["vertex"], np.array(ROWS, FIELDS))
+
+
+def test_faces_behind_the_vertices_are_not_even_looked_at(tmp_path):
+    encoding = "binary_little_endian"
+    body = vertex_bytes(encoding) + face_bytes(encoding)[:5]
+    rows = read_ply(write(tmp_path / "a.ply", HEADER.format(encoding=encoding) + FACES, body))["vertex"]
+    np.testing.assert_array_equal(rows, np.array(ROWS, FIELDS))
 
 
 @pytest.mark.parametrize("encoding", ["ascii", "binary_little_endian"])

@@ -104,6 +104,11 @@ def test_no_points_nan_and_missing_columns_name_the_file_once(tmp_path):
         with pytest.raises(SceneError, match=message) as caught:
             read_points(path)
         assert str(caught.value).count(str(path)) == 1
+    write_cloud(path)
+    path.write_bytes(path.read_bytes()[:-1])
+    with pytest.raises(SceneError, match="it is truncated") as caught:
+        read_points(path)
+    assert str(caught.value).count(str(path)) == 1
     write_ply(path, {"vertex": join_columns({"x": XYZ[:, 0], "y": XYZ[:, 1]})})
     with pytest.raises(SceneError, match="no column z; expected x, y, z, the file has x, y"):
         read_points(path)

@@ -176,19 +176,23 @@ def _gaussians(
     parts = {"position": xyz, "scale": scale, "rotation": rotation, "opacity": opacity[:, None]}
     if color is not None:
         parts["colour"] = color
-    finite = {name: np.isfinite(values).all(axis=1) for name, values in parts.items()}
-    usable = np.logical_and.reduce(list(finite.values()))
-    if not usable.all():
-        first = int(np.argmin(usable))
-        blamed = next(name for name in finite if not finite[name][first])
-        raise SceneError(
-            f"{int((~usable).sum())} of {len(usable)} Gaussians are not finite (the first is row {first}, in its "
-            f"{blamed}); expected finite values, and log scales below 88.7: remove these Gaussians first"
-        )
+    if not all(np.isfinite(values).all() for values in parts.values()):
+        raise _not_finite(parts)
     length = np.linalg.norm(rotation, axis=1, keepdims=True)
     # A zero quaternion put into the rotation matrix formula gives the identity, so that is how such files are rendered.
     unit = np.divide(rotation, length, out=np.tile([1.0, 0.0, 0.0, 0.0], (len(rotation), 1)), where=length > 0)
     rgb = None if color is None else np.rint(np.clip(color, 0, 1) * 255).astype(np.uint8)
     return Points.from_world(
         xyz, rgb=rgb, scale=scale, rotation=unit.astype(np.float32), opacity=opacity.astype(np.float32)
+    )
+
+
+def _not_finite(parts: Mapping[str, NDArray[np.floating]]) -> SceneError:
+    finite = {name: np.logical_and.reduce(np.isfinite(values), axis=1) for name, values in parts.items()}
+    usable = np.logical_and.reduce(list(finite.values()))
+    first = int(np.argmin(usable))
+    blamed = next(name for name in finite if not finite[name][first])
+    return SceneError(
+        f"{int((~usable).sum())} of {len(usable)} Gaussians are not finite (the first is row {first}, in its "
+        f"{blamed}); expected finite values, and log scales below 88.7: remove these Gaussians first"
     )
