@@ -1,0 +1,1 @@
+"""A procedural furnished room, ray-cast into a capture folder with exact ground truth: the library's own demo."""

@@ -1,0 +1,266 @@
+"""Walks a camera through the room and writes what it sees as a capture folder, with exact ground truth.
+
+The folder: ``images/`` . ``transforms.json`` (nerfstudio: camera-to-world, OpenGL axes) . ``points.ply`` (a fused
+cloud from noisy depth) . ``masks/<stem>.png`` (uint16, 0 none, ids local to the image) . ``mask_features.npz`` .
+``text_features.npz`` . ``gt.npz`` (for scoring alone).
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from og_pointcloud_room.features import FEATURE_SPACE, FeatureModel
+from og_pointcloud_room.furniture import CLASS_NAMES
+from og_pointcloud_room.masks import MaskNoise, propose_masks
+from og_pointcloud_room.raycast import BACKGROUND, Frame, Intrinsics, RayCaster
+from og_pointcloud_room.room import Room, furnish
+
+__all__ = ["CaptureSettings", "RoomCapture", "make_capture", "write_capture"]
+
+Random = np.random.Generator
+FLYING = -2
+"""Source of a sample that lies on no surface: interpolated across a depth edge, or an outlier."""
+OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+@dataclass(frozen=True)
+class CaptureSettings:
+    """views: images along the path. width, height: pixels. voxel_m: one point is kept per cube of this side.
+
+    mask_noise: 0 for perfect masks and features of the right class, 1 for the default errors of
+    :class:`~og_pointcloud_room.masks.MaskNoise`, more for worse. Masks are numbered at random in every view anyway.
+    depth_noise: multiple of a structured-light sensor's noise, 1.2 mm + 1.9 mm (z - 0.4 m)^2 / m^2 (Nguyen 2012).
+    range_m: depth beyond it is discarded, as fusions do.
+    samples_per_view: pixels of each view that enter the cloud. flying: share of the samples at depth edges that are
+    interpolated between front and back. outliers: share of samples anywhere in the room.
+    """
+
+    views: int = 40
+    width: int = 400
+    height: int = 300
+    voxel_m: float = 0.037
+    mask_noise: float = 1.0
+    depth_noise: float = 1.0
+    range_m: float = 3.5
+    samples_per_view: int = 25_000
+    flying: float = 0.04
+    outliers: float = 5e-5
+
+
+@dataclass(frozen=True)
+class RoomCapture:
+    """All that a capture folder holds, and the truth.
+
+    masks: per view (H, W) uint16. mask_features: per view (M, 512) float32. xyz (n, 3) float32 metres, rgb (n, 3)
+    uint8. cls, instance: (n,) int32 class and object of each point, -1 where it has none; background: (n,) bool, on
+    walls, floor or ceiling. Where ``cls`` is -1 and ``background`` false the truth is ambiguous: a flying pixel, an
+    outlier, or noise that carried the point over to another surface.
+    """
+
+    room: Room
+    intrinsics: Intrinsics
+    frames: tuple[Frame, ...]
+    masks: tuple[NDArray[np.uint16], ...]
+    mask_features: tuple[NDArray[np.float32], ...]
+    text_vectors: NDArray[np.float32]
+    xyz: NDArray[np.float32]
+    rgb: NDArray[np.uint8]
+    cls: NDArray[np.int32]
+    instance: NDArray[np.int32]
+    background: NDArray[np.bool_]
+
+
+def make_capture(seed: int = 0, settings: CaptureSettings | None = None) -> RoomCapture:
+    """Furnish, walk, sense, mask and describe: the same seed and settings give the same arrays."""
+    settings = settings or CaptureSettings()
+    noise = MaskNoise().scaled(settings.mask_noise)
+    streams = [np.random.default_rng([seed, stream]) for stream in range(1, 6)]
+    path_rng, cloud_rng, mask_rng, feature_rng, texture_rng = streams
+    room = furnish(seed)
+    caster = RayCaster(room, texture_rng)
+    intrinsics = Intrinsics(settings.width, settings.height, 0.82 * settings.width)
+    frames = tuple(caster.look(intrinsics, pose) for pose in _walk(room, caster, settings.views, path_rng))
+    xyz, rgb, source = _fused_cloud(room, frames, intrinsics, settings, cloud_rng)
+    instance, background = _ground_truth(caster, xyz, source)
+    class_of_object = np.array([CLASS_NAMES.index(item.name) for item in room.objects], np.int32)
+    masks = tuple(propose_masks(frame.owner, noise, mask_rng) for frame in frames)
+    model = FeatureModel(len(CLASS_NAMES), feature_rng)
+    looks = np.stack([model.object_look(feature_rng) for _ in room.objects])
+    features = tuple(
+        _mask_features(ids, frame.owner, class_of_object, looks, model, noise.wrong_class, feature_rng)
+        for ids, frame in zip(masks, frames, strict=True)
+    )
+    cls = np.where(instance >= 0, class_of_object[instance], -1).astype(np.int32)
+    return RoomCapture(room, intrinsics, frames, masks, features, model.texts, xyz, rgb, cls, instance, background)
+
+
+# The camera's path ----------------------------------------------------------------------------------------------
+
+
+def _walk(room: Room, caster: RayCaster, views: int, rng: Random) -> list[NDArray[np.float64]]:
+    """Two rounds by hand: the first along the furniture looking across, the second in the middle looking outwards."""
+    half = np.array(room.size[:2]) / 2
+    start = rng.uniform(0, 2 * np.pi)
+    poses = []
+    for step in range(views):
+        progress = 2 * step / views
+        outwards = progress >= 1
+        angle = start + 2 * np.pi * progress
+        around = np.array([np.cos(angle), np.sin(angle)])
+        if outwards:
+            eye = np.array([*(-0.25 * half * around), 1.5])
+            target = np.array([*(half * around), 0.75])
+        else:
+            eye = np.array([*(0.66 * half * around), 1.55])
+            target = np.array([*(-0.3 * half * around), 0.55])
+        eye = eye + rng.normal(size=3) * (0.06, 0.06, 0.08)
+        while caster.clearance_m(eye) < 0.35:
+            eye[:2] *= 0.9
+            eye[2] = min(eye[2] + 0.03, 1.8)
+        poses.append(_looking_at(eye, target + rng.normal(size=3) * 0.12, roll=rng.normal() * 0.04))
+    return poses
+
+
+def _looking_at(eye: NDArray[np.float64], target: NDArray[np.float64], roll: float) -> NDArray[np.float64]:
+    """(4, 4) camera-to-world, OpenCV axes, z up in the world."""
+    forward = (target - eye) / np.linalg.norm(target - eye)
+    right = np.cross(forward, (0, 0, 1.0))
+    right /= np.linalg.norm(right)
+    down = np.cross(forward, right)
+    pose = np.eye(4)
+    pose[:3, 0] = np.cos(roll) * right + np.sin(roll) * down
+    pose[:3, 1] = np.cos(roll) * down - np.sin(roll) * right
+    pose[:3, 2], pose[:3, 3] = forward, eye
+    return pose
+
+
+# The cloud ------------------------------------------------------------------------------------------------------
+
+
+def _fused_cloud(
+    room: Room, frames: tuple[Frame, ...], intrinsics: Intrinsics, settings: CaptureSettings, rng: Random
+) -> tuple[NDArray[np.float32], NDArray[np.uint8], NDArray[np.int32]]:
+    """xyz (n, 3) float32, rgb (n, 3) uint8 and the object each point was sensed on: one noisy sample per voxel."""
+    sensed = [_sense(frame, intrinsics, settings, rng) for frame in frames]
+    xyz, rgb, source = (np.concatenate(column) for column in zip(*sensed, strict=True))
+    count = int(settings.outliers * len(xyz))
+    anywhere = rng.uniform((-0.5, -0.5, 0), (0.5, 0.5, 1), (count, 3)) * room.size
+    xyz = np.concatenate([xyz, anywhere])
+    rgb = np.concatenate([rgb, rng.integers(0, 256, (count, 3), np.uint8)])
+    source = np.concatenate([source, np.full(count, FLYING, np.int32)])
+    order = rng.permutation(len(xyz))
+    cell = np.floor(xyz[order] / settings.voxel_m).astype(np.int64) + 2**19
+    key = (cell[:, 0] << 40) | (cell[:, 1] << 20) | cell[:, 2]
+    kept = order[np.unique(key, return_index=True)[1]]
+    return xyz[kept].astype(np.float32), rgb[kept], source[kept]
+
+
+def _sense(
+    frame: Frame, intrinsics: Intrinsics, settings: CaptureSettings, rng: Random
+) -> tuple[NDArray[np.float64], NDArray[np.uint8], NDArray[np.int32]]:
+    """Random pixels of one depth image in the world, with sensor noise and flying pixels at depth edges."""
+    pixel = rng.choice(frame.depth_m.size, min(settings.samples_per_view, frame.depth_m.size), replace=False)
+    window = np.ones((3, 3), np.uint8)
+    near, far = cv2.erode(frame.depth_m, window).ravel()[pixel], cv2.dilate(frame.depth_m, window).ravel()[pixel]
+    depth_m = frame.depth_m.ravel()[pixel].astype(np.float64)
+    flying = (far > 1.05 * near) & (rng.uniform(size=len(pixel)) < settings.flying)
+    depth_m = np.where(flying, near + rng.uniform(size=len(pixel)) * (far - near), depth_m)
+    depth_m += settings.depth_noise * (0.0012 + 0.0019 * (depth_m - 0.4) ** 2) * rng.normal(size=len(pixel))
+    in_camera = intrinsics.directions().reshape(-1, 3)[pixel] * depth_m[:, None]
+    xyz = in_camera @ frame.camera_to_world[:3, :3].T + frame.camera_to_world[:3, 3]
+    source = np.where(flying, FLYING, frame.owner.ravel()[pixel]).astype(np.int32)
+    measured = depth_m < settings.range_m
+    return xyz[measured], frame.image.reshape(-1, 3)[pixel[measured]], source[measured]
+
+
+def _ground_truth(
+    caster: RayCaster, xyz: NDArray[np.float32], source: NDArray[np.int32]
+) -> tuple[NDArray[np.int32], NDArray[np.bool_]]:
+    """instance (n,) int32 and background (n,) bool: known where the ray's target and the nearest surface agree."""
+    nearest, _ = caster.nearest_owner(xyz)
+    known = nearest == source
+    return np.where(known, nearest, -1).astype(np.int32), known & (nearest == BACKGROUND)
+
+
+# Mask features --------------------------------------------------------------------------------------------------
+
+
+def _mask_features(
+    ids: NDArray[np.uint16], owner: NDArray[np.int32], class_of_object: NDArray[np.int32],
+    looks: NDArray[np.float64], model: FeatureModel, wrong_class: float, rng: Random,
+) -> NDArray[np.float32]:  # fmt: skip
+    """(M, 512) float32 unit rows: what an image encoder says of each mask.
+
+    A mask over several objects gets the mean of their features by area (a share below a tenth goes unnoticed); a mask
+    on bare background, or one that the encoder gets wrong, that of a random class.
+    """
+    count, objects = int(ids.max()), len(class_of_object)
+    pair = ids.astype(np.int64) * (objects + 1) + owner + 1
+    area_px = np.bincount(pair.ravel(), minlength=(count + 1) * (objects + 1)).reshape(count + 1, objects + 1)[1:, 1:]
+    features = np.empty((count, model.texts.shape[1]), np.float32)
+    for row, area in enumerate(area_px.astype(np.float64)):
+        shown = np.flatnonzero(area > 0.1 * area.sum())
+        if len(shown) == 0 or rng.uniform() < wrong_class:
+            vector = model.image(int(rng.integers(len(model.texts))), model.object_look(rng), rng)
+        else:
+            vector = sum(area[k] * model.image(int(class_of_object[k]), looks[k], rng) for k in shown)
+        features[row] = vector / np.linalg.norm(vector)
+    return features
+
+
+# The folder -----------------------------------------------------------------------------------------------------
+
+
+def write_capture(capture: RoomCapture, folder: Path) -> Path:
+    """Writes the capture folder (made if absent, its files replaced) and returns it."""
+    (folder / "images").mkdir(parents=True, exist_ok=True)
+    (folder / "masks").mkdir(exist_ok=True)
+    stems = [f"frame-{index:04d}" for index in range(len(capture.frames))]
+    for stem, frame, ids in zip(stems, capture.frames, capture.masks, strict=True):
+        cv2.imwrite(str(folder / "images" / f"{stem}.jpg"), frame.image[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, 93])
+        cv2.imwrite(str(folder / "masks" / f"{stem}.png"), ids)
+    (folder / "transforms.json").write_text(json.dumps(_transforms(capture, stems), indent=1))
+    _write_ply(folder / "points.ply", capture.xyz, capture.rgb)
+    rows: dict[str, Any] = {
+        stem: rows.astype(np.float16) for stem, rows in zip(stems, capture.mask_features, strict=True)
+    }
+    space: dict[str, Any] = {"feature_space": np.array(FEATURE_SPACE)}
+    names = np.array(CLASS_NAMES)
+    np.savez(folder / "mask_features.npz", **rows, **space)
+    np.savez(folder / "text_features.npz", names=names, vectors=capture.text_vectors, **space)
+    truth: dict[str, Any] = {"cls": capture.cls, "instance": capture.instance, "background": capture.background}
+    np.savez(folder / "gt.npz", names=names, **truth)
+    return folder
+
+
+def _transforms(capture: RoomCapture, stems: list[str]) -> dict[str, object]:
+    camera = capture.intrinsics
+    frames = [
+        {"file_path": f"images/{stem}.jpg", "transform_matrix": (frame.camera_to_world @ OPENGL).tolist()}
+        for stem, frame in zip(stems, capture.frames, strict=True)
+    ]
+    return {
+        "camera_model": "PINHOLE", "w": camera.width, "h": camera.height, "fl_x": camera.focal_px,
+        "fl_y": camera.focal_px, "cx": camera.width / 2, "cy": camera.height / 2, "ply_file_path": "points.ply",
+        "frames": frames,
+    }  # fmt: skip
+
+
+def _write_ply(path: Path, xyz: NDArray[np.float32], rgb: NDArray[np.uint8]) -> None:
+    """A binary point cloud. Written here so that the generator shares no code with the reader that it tests."""
+    columns = [(name, "<f4") for name in "xyz"] + [(name, "u1") for name in ("red", "green", "blue")]
+    rows = np.empty(len(xyz), columns)
+    for axis, name in enumerate("xyz"):
+        rows[name] = xyz[:, axis]
+    for channel, name in enumerate(("red", "green", "blue")):
+        rows[name] = rgb[:, channel]
+    properties = [f"property {'float' if kind == '<f4' else 'uchar'} {name}" for name, kind in columns]
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(xyz)}", *properties, "end_header", ""]
+    path.write_bytes("\n".join(header).encode() + rows.tobytes())

@@ -1,0 +1,125 @@
+"""What a mask proposer makes of a view: unnumbered, ragged, split, merged, missing and spurious masks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["MaskNoise", "propose_masks"]
+
+Random = np.random.Generator
+
+
+@dataclass(frozen=True)
+class MaskNoise:
+    """How a proposer errs.
+
+    split: chance that a visible object comes as two or three masks. merge: chance that it is joined with an object it
+    touches in the image. miss: chance that it has no mask. spurious: chance that a view has a mask on bare wall or
+    floor. wrong_class: chance that a mask's feature is that of another class. edge_px: how far edges wander, pixels.
+    smallest_share: masks below this share of the image are dropped.
+    """
+
+    split: float = 0.15
+    merge: float = 0.04
+    miss: float = 0.1
+    spurious: float = 0.05
+    wrong_class: float = 0.05
+    edge_px: float = 1.5
+    smallest_share: float = 2e-4
+
+    def scaled(self, level: float) -> MaskNoise:
+        """The same proposer with every chance and the edges' wandering times ``level`` (0: perfect masks)."""
+        if not level >= 0:
+            raise ValueError(f"mask noise is {level}; expected 0 (perfect masks) or more (1: the default noise)")
+        names = ("split", "merge", "miss", "spurious", "wrong_class")
+        chances = {name: min(level * getattr(self, name), 1.0) for name in names}
+        return replace(self, edge_px=level * self.edge_px, **chances)
+
+
+def propose_masks(owner: NDArray[np.int32], noise: MaskNoise, rng: Random) -> NDArray[np.uint16]:
+    """Ids of one view's masks, (H, W) uint16: 0 none, else 1..M in random order.
+
+    owner: (H, W) int32, the object seen at each pixel, -1 for walls, floor and ceiling.
+    """
+    regions = [owner == instance for instance in np.unique(owner[owner >= 0])]
+    regions = _merged(regions, noise.merge, rng)
+    regions = [region for region in regions if rng.uniform() >= noise.miss]
+    regions = [
+        part for region in regions for part in (_split(region, rng) if rng.uniform() < noise.split else [region])
+    ]
+    if rng.uniform() < noise.spurious:
+        regions.append(_blob(owner, rng))
+    ids = np.zeros(owner.shape, np.uint16)
+    for rank, index in enumerate(rng.permutation(len(regions))):
+        _paint(ids, regions[index], rank + 1, noise.edge_px, rng)
+    return _without_tiny(ids, noise.smallest_share * owner.size)
+
+
+def _merged(regions: list[NDArray[np.bool_]], chance: float, rng: Random) -> list[NDArray[np.bool_]]:
+    """Each region is, by chance, joined with one that it touches."""
+    merged = list(regions)
+    for index in range(len(regions)):
+        if rng.uniform() >= chance:
+            continue
+        rim = cv2.dilate(regions[index].astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)
+        touching = [other for other in range(len(regions)) if other != index and (regions[other] & rim).sum() > 10]
+        if touching:
+            other = touching[rng.integers(len(touching))]
+            merged[other], merged[index] = merged[other] | merged[index], np.zeros_like(merged[index])
+    return [region for region in merged if region.any()]
+
+
+def _split(region: NDArray[np.bool_], rng: Random) -> list[NDArray[np.bool_]]:
+    """Two or three parts: the cells of random pixels of the region."""
+    pixels = np.argwhere(region)
+    seeds = pixels[rng.choice(len(pixels), min(int(rng.integers(2, 4)), len(pixels)), replace=False)]
+    nearest = ((pixels[:, None] - seeds[None]) ** 2).sum(axis=2).argmin(axis=1)
+    parts = []
+    for cell in range(len(seeds)):
+        part = np.zeros_like(region)
+        part[tuple(pixels[nearest == cell].T)] = True
+        parts.append(part)
+    return parts
+
+
+def _blob(owner: NDArray[np.int32], rng: Random) -> NDArray[np.bool_]:
+    """A small ellipse on the background, of one to three hundredths of the image's area."""
+    height, width = owner.shape
+    rows, columns = np.nonzero(owner < 0)
+    blob = np.zeros(owner.shape, np.uint8)
+    if len(rows):
+        pick = rng.integers(len(rows))
+        axes = (rng.uniform(0.05, 0.1, 2) * (width, height)).astype(int)
+        cv2.ellipse(
+            blob, (int(columns[pick]), int(rows[pick])), axes.tolist(), float(rng.uniform(0, 180)), 0, 360, 1, -1
+        )
+    return blob.astype(bool) & (owner < 0)
+
+
+def _paint(ids: NDArray[np.uint16], region: NDArray[np.bool_], number: int, edge_px: float, rng: Random) -> None:
+    """Writes ``number`` over the region, its edge eroded and dilated by a smooth random field of ``edge_px`` pixels."""
+    rows, columns = np.nonzero(region)
+    if len(rows) == 0:
+        return
+    margin = int(np.ceil(3 * edge_px)) + 1
+    top, bottom = max(int(rows.min()) - margin, 0), int(rows.max()) + margin + 1
+    left, right = max(int(columns.min()) - margin, 0), int(columns.max()) + margin + 1
+    inside = region[top:bottom, left:right].astype(np.uint8)
+    signed_px = cv2.distanceTransform(inside, cv2.DIST_L2, 3) - cv2.distanceTransform(1 - inside, cv2.DIST_L2, 3)
+    height, width = inside.shape
+    coarse = rng.normal(size=(height // 8 + 2, width // 8 + 2)) + 0.5 * rng.normal()
+    wander_px = edge_px * np.clip(cv2.resize(coarse, (width, height), interpolation=cv2.INTER_LINEAR), -2.5, 2.5)
+    ids[top:bottom, left:right][signed_px > wander_px] = number
+
+
+def _without_tiny(ids: NDArray[np.uint16], smallest_px: float) -> NDArray[np.uint16]:
+    """Masks below ``smallest_px`` pixels dropped, the others numbered 1..M in the order that they had."""
+    counts = np.bincount(ids.ravel())
+    kept = np.flatnonzero(counts[1:] >= max(smallest_px, 1)) + 1
+    table = np.zeros(len(counts), np.uint16)
+    table[kept] = np.arange(len(kept)) + 1
+    return table[ids]

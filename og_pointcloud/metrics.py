@@ -1,0 +1,113 @@
+"""Scores of point labels against ground truth: a point left unknown is a miss, a label on background a false alarm."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from og_pointcloud.errors import OgPointcloudError
+
+__all__ = ["Score", "adjusted_rand_index", "score_labels"]
+
+
+@dataclass(frozen=True)
+class Score:
+    """One labelling, scored. All shares in [0, 1]; NaN where nothing was there to be scored.
+
+    miou, macc: mean IoU and mean recall over ``classes``. unknown_share: of the scored points, those labelled -1.
+    background_called: of the true background, the share that was given a class; None where no background is known.
+    points: points scored. classes: ids with enough points. class_iou, class_accuracy: per entry of ``classes``.
+    """
+
+    miou: float
+    macc: float
+    unknown_share: float
+    background_called: float | None
+    points: int
+    classes: tuple[int, ...]
+    class_iou: tuple[float, ...]
+    class_accuracy: tuple[float, ...]
+
+
+def score_labels(
+    labels: NDArray[np.integer], truth: NDArray[np.integer], *, background: NDArray[np.bool_] | None = None,
+    scored: NDArray[np.bool_] | None = None, min_points: int = 30,
+) -> Score:  # fmt: skip
+    """Mean IoU and recall over the classes of the truth.
+
+    labels, truth: (n,) class ids, -1 unknown; ids of both mean the same. background: (n,) bool, points known to be of
+    no class: a class called there is a false positive of that class. scored: (n,) bool, labelled points that count
+    (default: all). Classes with fewer than ``min_points`` such points are left out, their points with them.
+
+    Raises OgPointcloudError where the arrays do not have one length.
+
+    >>> score_labels(np.array([0, 0, 1, -1]), np.array([0, 0, 1, 1]), min_points=1).class_iou
+    (1.0, 0.5)
+    """
+    labels, truth = np.asarray(labels), np.asarray(truth)
+    others = {"truth": truth, "background": background, "scored": scored}
+    for name, values in others.items():
+        if values is not None and values.shape != labels.shape:
+            raise OgPointcloudError(
+                f"{name} has shape {values.shape}, the labels {labels.shape}; expected one each point"
+            )
+    evaluated = truth >= 0 if scored is None else (truth >= 0) & scored
+    ids, counts = np.unique(truth[evaluated], return_counts=True)
+    classes = ids[counts >= min_points]
+    evaluated &= np.isin(truth, classes)
+    counted = evaluated if background is None else evaluated | background
+    ious, accuracies = [], []
+    for class_id in classes:
+        called, true = (labels == class_id) & counted, (truth == class_id) & evaluated
+        hits = int((called & true).sum())
+        ious.append(hits / int((called | true).sum()))
+        accuracies.append(hits / int(true.sum()))
+    has_background = background is not None and bool(background.any())
+    return Score(
+        miou=_mean(ious),
+        macc=_mean(accuracies),
+        unknown_share=_mean(labels[evaluated] < 0),
+        background_called=_mean(labels[background] >= 0) if has_background else None,
+        points=int(evaluated.sum()),
+        classes=tuple(classes.tolist()),
+        class_iou=tuple(ious),
+        class_accuracy=tuple(accuracies),
+    )
+
+
+def adjusted_rand_index(first: NDArray[np.integer], second: NDArray[np.integer]) -> float:
+    """Agreement of two partitions of the same points, 1 for equal, about 0 for unrelated ones (Hubert & Arabie 1985).
+
+    first, second: (n,) ids of any value; every id, negative ones too, is a part. NaN for n = 0.
+    """
+    first, second = np.asarray(first), np.asarray(second)
+    if first.shape != second.shape:
+        raise OgPointcloudError(
+            f"partitions have shapes {first.shape} and {second.shape}; expected one id each a point"
+        )
+    _, rows = np.unique(first, return_inverse=True)
+    _, columns = np.unique(second, return_inverse=True)
+    if len(rows) == 0:
+        return float("nan")
+    cells = np.unique(rows.astype(np.int64) * (columns.max() + 1) + columns, return_counts=True)[1]
+    together = _pairs(cells)
+    in_first, in_second, all_pairs = (
+        _pairs(np.bincount(rows)),
+        _pairs(np.bincount(columns)),
+        _pairs(np.array([len(rows)])),
+    )
+    expected = in_first * in_second / all_pairs if all_pairs else 0.0
+    largest = (in_first + in_second) / 2
+    return 1.0 if largest == expected else (together - expected) / (largest - expected)
+
+
+def _pairs(counts: NDArray[np.integer]) -> float:
+    """Pairs of points that share a part, from the parts' sizes; in float64, as a large cloud's overflow 64 bits."""
+    sizes = counts.astype(np.float64)
+    return float((sizes * (sizes - 1) / 2).sum())
+
+
+def _mean(values: list[float] | NDArray[np.bool_]) -> float:
+    return float(np.mean(values)) if len(values) else float("nan")
