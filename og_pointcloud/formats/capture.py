@@ -1,0 +1,251 @@
+"""A capture folder becomes a Scene: poses, masks with features, geometry, and images where there are any.
+
+Each part comes from the first of these that the folder has.
+  poses     ``transforms.json`` (nerfstudio, instant-ngp, Blender), ``transforms_train.json``; COLMAP ``sparse/0``
+  masks     ``mask_features.npz`` with ``masks/``; LangSplat's ``language_features/``
+  geometry  the file given; ``ply_file_path`` of transforms.json; ``points.ply``, ``point_cloud.ply``, the folder's one
+            ``.pcd``; the latest ``point_cloud/iteration_*/point_cloud.ply``; COLMAP's ``points3D``
+  images    optional; where the pose file says, or of that name in ``images/``
+
+A view is called by its image's file stem, and so are its masks and features; where two images share a stem (rigs demand
+it), by the path below the folder that all images share: ``left/000``, ``masks/left/000.png``.
+
+Masks rule the resolution: a camera takes the size of its mask map (shapes must agree), and its image is resized to it.
+"""
+
+from __future__ import annotations
+
+import posixpath
+import re
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from og_pointcloud.errors import SceneError
+from og_pointcloud.formats import colmap
+from og_pointcloud.formats.distortion import Distortion, undistorted
+from og_pointcloud.formats.images import find_image, image_size, read_rgb, same_shape, without_suffix
+from og_pointcloud.formats.langsplat import LANGUAGE_FEATURES_FOLDER, read_language_features
+from og_pointcloud.formats.masks import FEATURES_NAME, MASKS_FOLDER, MaskLayer, read_masks
+from og_pointcloud.formats.nerfstudio import TRANSFORMS_NAMES, read_transforms
+from og_pointcloud.formats.points import read_points
+from og_pointcloud.formats.poses import PosedImage, in_local_frame
+from og_pointcloud.scene import Camera, Points, Scene, View
+
+__all__ = ["read_capture"]
+
+CLOUD_NAMES = ("points.ply", "point_cloud.ply")
+SAME_POSE = 1e-3
+"""Largest difference of poses that mean one world: radians, and a share of the distance from camera to points."""
+
+
+@dataclass(frozen=True)
+class _Poses:
+    """source: the pose file or folder. applied_transform: from COLMAP's world to the poses' (see nerfstudio.py)."""
+
+    images: tuple[PosedImage, ...]
+    source: Path
+    ply_file_path: str | None = None
+    applied_transform: NDArray[np.float64] | None = None
+
+
+def read_capture(folder: str | Path, gaussians: str | Path | None = None, mask_level: str = "large") -> Scene:
+    """Read a capture folder.
+
+    gaussians: a cloud or 3DGS file to use instead of the folder's own geometry.
+    mask_level: of LangSplat's masks: default, small, medium or large (the paper's).
+
+    The scene's masks and images are functions that read on demand; poses, features and points are read, and everything
+    that can be told from headers is checked, here. Raises SceneError with the cause and the cure; warns of images
+    that are listed but absent and of frames without a pose, which are left out.
+    """
+    capture = Path(folder)
+    if not capture.is_dir():
+        raise SceneError(f"{capture} is not a folder; expected a capture folder with poses, masks and points")
+    poses = _read_poses(capture)
+    names = _view_names([image.path for image in poses.images])
+    layers, feature_space = _read_masks(capture, names, mask_level)
+    points = _read_geometry(capture, poses, gaussians)
+    files = _find_images(capture, poses.images)
+    views = tuple(
+        _view(name, image, layer, file, points.origin)
+        for name, image, layer, file in zip(names, poses.images, layers, files, strict=True)
+    )
+    return Scene(points, views, feature_space, name=capture.resolve().name)
+
+
+def _read_poses(capture: Path) -> _Poses:
+    file = next((capture / name for name in TRANSFORMS_NAMES if (capture / name).is_file()), None)
+    if file is not None:
+        transforms = read_transforms(file, partial(_size_of_image, capture))
+        if transforms.dropped:
+            warnings.warn(
+                f"{file}: {len(transforms.dropped)} frames have no finite pose and are left out, e.g. "
+                f"'{transforms.dropped[0]}'",
+                stacklevel=3,
+            )
+        return _Poses(transforms.images, file, transforms.ply_file_path, transforms.applied_transform)
+    model = colmap.find_model(capture)
+    if model is not None:
+        return _Poses(colmap.read_images(model), model)
+    raise SceneError(
+        f"{capture} has no pose file; expected transforms.json (nerfstudio, instant-ngp, Blender) or a COLMAP model in "
+        "sparse/0 (cameras and images, .bin or .txt)"
+    )
+
+
+def _size_of_image(capture: Path, path: str) -> tuple[int, int]:
+    file = find_image(capture, path)
+    if file is None:
+        raise SceneError(
+            f"{capture}: image '{path}' is not found, and the pose file has no w and h: add them or the image"
+        )
+    return image_size(file)
+
+
+def _view_names(paths: Sequence[str]) -> list[str]:
+    """File stems; where two images share one (rigs demand it), paths from the folder that all images share."""
+    paths = [posixpath.normpath(without_suffix(path)) for path in paths]
+    stems = [posixpath.basename(path) for path in paths]
+    if len(set(stems)) == len(stems) or len(set(paths)) < len(paths):
+        return stems
+    paths = [path.lstrip("/") for path in paths]
+    shared = posixpath.commonpath([posixpath.dirname(path) for path in paths])
+    names = [path[len(shared) :].lstrip("/") for path in paths]
+    outside = next((name for name in names if ".." in name.split("/")), None)
+    if outside is not None:
+        raise SceneError(f"image path '{outside}' leads out of its folder; expected paths below one image folder")
+    return names
+
+
+def _read_masks(capture: Path, names: Sequence[str], level: str) -> tuple[list[MaskLayer], str]:
+    if (capture / FEATURES_NAME).is_file():
+        return read_masks(capture, names)
+    if (capture / LANGUAGE_FEATURES_FOLDER).is_dir():
+        return read_language_features(capture, names, level)
+    found = f"{MASKS_FOLDER}/ but no {FEATURES_NAME}" if (capture / MASKS_FOLDER).is_dir() else "no masks at all"
+    raise SceneError(
+        f"{capture} has {found}; expected {MASKS_FOLDER}/<image stem>.png (ids) with {FEATURES_NAME}, or LangSplat's "
+        f"{LANGUAGE_FEATURES_FOLDER}/<image stem>_s.npy and _f.npy: run a mask proposer and an image encoder first"
+    )
+
+
+def _read_geometry(capture: Path, poses: _Poses, gaussians: str | Path | None) -> Points:
+    if gaussians is not None:
+        return read_points(Path(gaussians))
+    if poses.ply_file_path is not None:
+        return read_points(_inside(capture, poses.ply_file_path, poses.source))
+    cloud = _find_cloud(capture)
+    if cloud is not None:
+        return read_points(cloud)
+    model = colmap.find_model(capture)
+    if model is None:
+        raise SceneError(
+            f"{capture} has no geometry; expected {' or '.join(CLOUD_NAMES)}, one .pcd, ply_file_path in "
+            "transforms.json, point_cloud/iteration_*/point_cloud.ply or COLMAP's sparse/0/points3D: add one of them, "
+            "or name a file (--gaussians)"
+        )
+    xyz, rgb = colmap.read_points3d(model)
+    return Points.from_world(_in_world_of(poses, model, xyz), rgb=rgb)
+
+
+def _inside(capture: Path, path: str, source: Path) -> Path:
+    """``path`` inside the capture folder; a pose file may not point elsewhere."""
+    relative = posixpath.normpath(path)
+    file = capture / relative
+    if relative.startswith(("/", "..")) or not file.is_file():
+        raise SceneError(
+            f"{source}: ply_file_path is '{path}', which is no file inside the capture folder; expected one: copy the "
+            "cloud there and fix the path, or name the file (--gaussians)"
+        )
+    return file
+
+
+def _find_cloud(capture: Path) -> Path | None:
+    for name in CLOUD_NAMES:
+        if (capture / name).is_file():
+            return capture / name
+    pcds = sorted(capture.glob("*.pcd"))
+    if len(pcds) > 1:
+        raise SceneError(
+            f"{capture} has {len(pcds)} .pcd files ({pcds[0].name}, {pcds[1].name}, ...); expected one: name the one "
+            "to use (--gaussians)"
+        )
+    if pcds:
+        return pcds[0]
+    iterations = {
+        int(match.group(1)): file
+        for file in capture.glob("point_cloud/iteration_*/point_cloud.ply")
+        if (match := re.fullmatch(r"iteration_(\d+)", file.parent.name))
+    }
+    return iterations[max(iterations)] if iterations else None
+
+
+def _in_world_of(poses: _Poses, model: Path, xyz: NDArray[np.float64]) -> NDArray[np.float64]:
+    """COLMAP's points in the world of the poses.
+
+    Poses of a transforms.json were often rotated, shifted or scaled after COLMAP, and only nerfstudio writes down how.
+    So the two files' poses of the same images are compared: a cloud in a world of its own would be labelled at random.
+    """
+    if poses.source == model:
+        return xyz
+    transform = np.eye(4) if poses.applied_transform is None else poses.applied_transform
+    rotation, translation = transform[:3, :3], transform[:3, 3]
+    moved = xyz @ rotation.T + translation
+    theirs = {_stem(image.path): image.camera for image in colmap.read_images(model)}
+    pairs = [(image.camera, theirs[_stem(image.path)]) for image in poses.images if _stem(image.path) in theirs]
+    if pairs and len(moved):
+        distance = float(np.median(np.linalg.norm(moved - pairs[0][0].center, axis=1)))
+        apart = max(np.linalg.norm(a.center - (rotation @ b.center + translation)) / distance for a, b in pairs)
+        turned = max(np.abs(a.world_to_camera[:3, :3] @ rotation - b.world_to_camera[:3, :3]).max() for a, b in pairs)
+        if max(apart, turned) < SAME_POSE:
+            return moved
+    raise SceneError(
+        f"{model} and {poses.source.name} do not place the same images alike, so points3D is in another world than the "
+        "poses; expected a cloud in the world of transforms.json: add points.ply, or remove transforms.json so that "
+        "COLMAP's poses are used"
+    )
+
+
+def _stem(path: str) -> str:
+    return posixpath.basename(without_suffix(path))
+
+
+def _find_images(capture: Path, images: Sequence[PosedImage]) -> list[Path | None]:
+    files = [find_image(capture, image.path) for image in images]
+    missing = [image.path for image, file in zip(images, files, strict=True) if file is None]
+    if missing:
+        warnings.warn(
+            f"{capture}: {len(missing)} of {len(images)} images are listed but not found, e.g. '{missing[0]}'; "
+            "their views have masks but no colours",
+            stacklevel=3,
+        )
+    return files
+
+
+def _view(name: str, image: PosedImage, layer: MaskLayer, file: Path | None, origin: NDArray[np.float64]) -> View:
+    camera = image.camera
+    if not same_shape(layer.size, (camera.width, camera.height)):
+        raise SceneError(
+            f"view '{name}': the masks are {layer.size[0]}x{layer.size[1]} pixels, the camera "
+            f"{camera.width}x{camera.height}; expected the same size or a scaled one: make the masks on the posed "
+            "images or fix w and h of the pose file"
+        )
+    camera = in_local_frame(camera.resized(*layer.size), origin)
+    read_image = None if file is None else partial(_image, file, camera, image.distortion)
+    return View(name, camera, partial(_masks, layer.read, camera, image.distortion), layer.features, read_image)
+
+
+def _masks(read: Callable[[], NDArray[np.int32]], camera: Camera, distortion: Distortion | None) -> NDArray[np.int32]:
+    ids = read()
+    return ids if distortion is None else undistorted(camera, distortion).mask_ids(ids)
+
+
+def _image(file: Path, camera: Camera, distortion: Distortion | None) -> NDArray[np.uint8]:
+    rgb = read_rgb(file, (camera.width, camera.height))
+    return rgb if distortion is None else undistorted(camera, distortion).image(rgb)

@@ -1,0 +1,126 @@
+"""LangSplat's ``language_features``: ``<view name>_s.npy`` [4, H, W] of ids, ``<view name>_f.npy`` [M, D] of features.
+
+The four levels are SAM's default, small, medium and large masks. Ids are cumulative: the small level goes on counting
+where the default level ended, so an id is a row of the feature file whatever its level; -1 is outside every mask.
+OpenGaussian trains on one level, the large one.
+
+One level is read. Its rows are compacted (rows that no pixel of the level shows are left out), and a view whose level
+holds no mask stays a view without masks: other levels never stand in for it, since one view's small masks
+would contradict its neighbours' large ones.
+"""
+
+from __future__ import annotations
+
+import tokenize
+import warnings
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from og_pointcloud.errors import SceneError
+from og_pointcloud.formats.masks import UNKNOWN_SPACE, MaskLayer, as_float32, require_all
+
+__all__ = ["LANGUAGE_FEATURES_FOLDER", "LEVELS", "read_language_features"]
+
+LANGUAGE_FEATURES_FOLDER = "language_features"
+LEVELS = ("default", "small", "medium", "large")
+SPACE_FILE = "feature_space.txt"
+LANGSPLAT_SPACE = "laion/CLIP-ViT-B-16-laion2B-s34B-b88K"
+"""The encoder of LangSplat's own scripts, 512-d, unless ``feature_space.txt`` in the folder names another."""
+LANGSPLAT_WIDTH = 512
+
+
+def read_language_features(capture: Path, names: Sequence[str], level: str) -> tuple[list[MaskLayer], str]:
+    """The masks of these views at one level and the name of their feature space.
+
+    Each id map is looked through once here (which rows does the level use?) and read again when its layer is. Raises
+    SceneError where a file is missing, an id has no feature row, or no view has a mask at this level.
+    """
+    if level not in LEVELS:
+        raise SceneError(f"mask level is '{level}'; expected one of {', '.join(LEVELS)}")
+    folder = capture / LANGUAGE_FEATURES_FOLDER
+    id_files = [folder / f"{name}_s.npy" for name in names]
+    feature_files = [folder / f"{name}_f.npy" for name in names]
+    cure = "run the mask and feature extraction on all images"
+    require_all(id_files, cure)
+    require_all(feature_files, cure)
+    layers = [_layer(ids, features, level) for ids, features in zip(id_files, feature_files, strict=True)]
+    empty = [name for name, layer in zip(names, layers, strict=True) if not len(layer.features)]
+    if len(empty) == len(names):
+        raise SceneError(
+            f"{folder}: no view has a mask at level '{level}'; expected masks: choose another of {', '.join(LEVELS)}"
+        )
+    if empty:
+        warnings.warn(
+            f"{len(empty)} of {len(names)} views have no mask at level '{level}', e.g. '{empty[0]}'", stacklevel=2
+        )
+    return layers, _feature_space(folder, layers)
+
+
+def _layer(id_file: Path, feature_file: Path, level: str) -> MaskLayer:
+    ids = _level_ids(id_file, level)
+    features = _mapped(feature_file)
+    if features.ndim != 2 or not np.issubdtype(features.dtype, np.floating):
+        raise SceneError(
+            f"{feature_file} is {features.dtype} {features.shape}; expected floats of shape (masks, width)"
+        )
+    highest = int(ids.max(initial=-1))
+    if highest >= len(features):
+        raise SceneError(
+            f"{id_file}: mask id {highest} of level '{level}' has no feature row ({feature_file.name} has "
+            f"{len(features)}): write both files in one run"
+        )
+    used = np.flatnonzero(np.bincount(ids.reshape(-1) + 1, minlength=1)[1:])
+    row_of_id = np.full(highest + 2, -1, np.int32)  # the last entry serves id -1
+    row_of_id[used] = np.arange(len(used), dtype=np.int32)
+    height, width = ids.shape
+    return MaskLayer((width, height), as_float32(features[used]), partial(_rows, id_file, level, row_of_id))
+
+
+def _rows(id_file: Path, level: str, row_of_id: NDArray[np.int32]) -> NDArray[np.int32]:
+    """(H, W): each pixel's row among those that the level uses, -1 outside every mask."""
+    return row_of_id[_level_ids(id_file, level)]
+
+
+def _level_ids(file: Path, level: str) -> NDArray[np.int32]:
+    """(H, W) int32, cumulative ids of one level, -1 for none; the other levels' bytes are not read."""
+    levels = _mapped(file)
+    if levels.ndim != 3 or len(levels) != len(LEVELS) or levels.dtype.kind not in "iuf":
+        raise SceneError(
+            f"{file} is {levels.dtype} {levels.shape}; expected numbers (4, height, width), one map a level: "
+            f"{', '.join(LEVELS)}"
+        )
+    index = LEVELS.index(level)
+    stored = np.asarray(levels[index])
+    with np.errstate(invalid="ignore"):
+        ids = stored.astype(np.int32)
+    if (ids != stored).any():
+        raise SceneError(f"{file}: level '{level}' holds values that are no ids; expected whole numbers, -1 for none")
+    if index and (ids == 0).any() and (levels[:index] >= 0).any():
+        raise SceneError(
+            f"{file}: the ids of level '{level}' start at 0 again; expected ids that count on from level to level, as "
+            "LangSplat writes them, so that an id is a row of the features"
+        )
+    return np.maximum(ids, -1)
+
+
+def _mapped(file: Path) -> NDArray[Any]:
+    """A .npy file's array, mapped: only what is used is read, and numpy checks the claimed size against the file's."""
+    try:
+        return np.load(file, mmap_mode="r", allow_pickle=False)
+    except (ValueError, OSError, EOFError, tokenize.TokenError) as error:
+        raise SceneError(
+            f"{file} cannot be read as a .npy array ({error}): it is damaged or truncated, write it again"
+        ) from None
+
+
+def _feature_space(folder: Path, layers: Sequence[MaskLayer]) -> str:
+    file = folder / SPACE_FILE
+    if file.is_file():
+        return file.read_text(encoding="utf-8").strip() or UNKNOWN_SPACE
+    width = next(layer.features.shape[1] for layer in layers if len(layer.features))
+    return LANGSPLAT_SPACE if width == LANGSPLAT_WIDTH else UNKNOWN_SPACE

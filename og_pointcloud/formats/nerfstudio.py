@@ -1,0 +1,170 @@
+"""``transforms.json`` of nerfstudio, instant-ngp and Blender: camera-to-world, OpenGL axes (x right, y up, z back).
+
+Intrinsics stand at the top or in a frame, which then overrides the top: ``fl_x fl_y cx cy w h`` in pixels, or
+``camera_angle_x`` (radians over the width), with the principal point in the middle unless given. Of the splits that
+Blender writes, ``transforms_train.json`` is read. ``aabb_scale``, ``scale``, ``offset`` and the like concern the
+rendering box of instant-ngp and not the poses; they are ignored.
+
+``applied_transform`` (nerfstudio: from COLMAP's world to the world of this file) is *not* applied to
+``ply_file_path``: nerfstudio writes that cloud in the world of ``transform_matrix``. It is reported for clouds that
+come from COLMAP itself.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from og_pointcloud.errors import SceneError
+from og_pointcloud.formats.distortion import Distortion, lens_distortion
+from og_pointcloud.formats.poses import PosedImage, naming, rigid
+from og_pointcloud.scene import Camera
+
+__all__ = ["TRANSFORMS_NAMES", "Transforms", "read_transforms"]
+
+TRANSFORMS_NAMES = ("transforms.json", "transforms_train.json")
+PERSPECTIVE_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
+FISHEYE_MODELS = ("OPENCV_FISHEYE",)
+LENS_TERMS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+
+
+@dataclass(frozen=True)
+class Transforms:
+    """What a transforms file holds.
+
+    applied_transform: (4, 4) from COLMAP's world to this file's, or None where the file does not say.
+    dropped: paths of frames whose pose is not finite (trackers write those when they are lost).
+    """
+
+    images: tuple[PosedImage, ...]
+    ply_file_path: str | None
+    applied_transform: NDArray[np.float64] | None
+    dropped: tuple[str, ...]
+
+
+def read_transforms(file: Path, image_size: Callable[[str], tuple[int, int]]) -> Transforms:
+    """Read a transforms file; ``image_size(path)`` gives (width, height) where it states none (Blender).
+
+    Raises SceneError for anything that is not such a file, naming the frame and the key.
+    """
+    try:
+        content = json.loads(file.read_text(encoding="utf-8"))
+    except (ValueError, RecursionError) as error:
+        raise SceneError(f"{file} is not valid JSON ({error}): export it again") from None
+    frames = content.get("frames") if isinstance(content, dict) else None
+    if not isinstance(frames, list) or not frames:
+        raise SceneError(
+            f"{file} has no list 'frames' with at least one frame; expected nerfstudio's or instant-ngp's layout"
+        )
+    shared = {key: value for key, value in content.items() if key != "frames"}
+    images, dropped = [], []
+    for index, frame in enumerate(frames):
+        path = frame.get("file_path") if isinstance(frame, dict) else None
+        if not isinstance(path, str) or not path:
+            raise SceneError(f"{file}: frame {index} has file_path {path!r}; expected the path of its image")
+        path = path.replace("\\", "/")
+        with naming(f"{file}, frame '{path}'"):
+            camera_to_world = _matrix(frame, "transform_matrix")
+            if np.isfinite(camera_to_world).all():
+                keys = {**shared, **frame}
+                camera = _camera(keys, _world_to_camera(camera_to_world), partial(image_size, path))
+                images.append(PosedImage(path, camera, _distortion(keys)))
+            else:
+                dropped.append(path)
+    if not images:
+        raise SceneError(
+            f"{file}: none of its {len(frames)} frames has a finite transform_matrix; expected one or more"
+        )
+    with naming(str(file)):
+        applied = _matrix(shared, "applied_transform") if "applied_transform" in shared else None
+    ply = shared.get("ply_file_path")
+    ply_file_path = ply.replace("\\", "/") if isinstance(ply, str) and ply else None
+    return Transforms(tuple(images), ply_file_path, applied, tuple(dropped))
+
+
+def _matrix(keys: dict[str, Any], key: str) -> NDArray[np.float64]:
+    """(4, 4) float64 from nested lists of 3 or 4 rows."""
+    value = keys.get(key)
+    try:
+        matrix = np.array(value, np.float64)
+    except (ValueError, TypeError):
+        matrix = np.empty(0)
+    if matrix.shape == (3, 4):
+        matrix = np.vstack([matrix, [0.0, 0.0, 0.0, 1.0]])
+    if matrix.shape != (4, 4):
+        raise SceneError(f"{key} is {value!r:.80}; expected 4 rows of 4 numbers")
+    if np.isfinite(matrix).all() and np.abs(matrix[3] - [0, 0, 0, 1]).max() > 1e-6:
+        raise SceneError(f"the last row of {key} is {matrix[3].tolist()}; expected [0, 0, 0, 1]")
+    return matrix
+
+
+def _world_to_camera(camera_to_world: NDArray[np.float64]) -> NDArray[np.float64]:
+    """OpenCV world-to-camera from OpenGL camera-to-world: y and z of the camera change sign, then invert."""
+    rotation = (camera_to_world[:3, :3] * [1.0, -1.0, -1.0]).T
+    return rigid(rotation, -rotation @ camera_to_world[:3, 3])
+
+
+def _camera(
+    keys: dict[str, Any], world_to_camera: NDArray[np.float64], image_size: Callable[[], tuple[int, int]]
+) -> Camera:
+    w, h, cx, cy = (_number(keys, key) for key in ("w", "h", "cx", "cy"))
+    width, height = image_size() if w is None or h is None else (round(w), round(h))
+    fx = _focal(keys, "x", width)
+    fy = _focal(keys, "y", height)
+    if fx is None:
+        raise SceneError("neither fl_x (pixels) nor camera_angle_x (radians) is given; expected one of them")
+    return Camera(
+        width,
+        height,
+        fx=fx,
+        fy=fx if fy is None else fy,
+        cx=width / 2 if cx is None else cx,
+        cy=height / 2 if cy is None else cy,
+        world_to_camera=world_to_camera,
+    )
+
+
+def _focal(keys: dict[str, Any], axis: str, extent: int) -> float | None:
+    """Focal length in pixels: as given, else from the field of view (radians over ``extent`` pixels), else None."""
+    pixels, angle = _number(keys, f"fl_{axis}"), _number(keys, f"camera_angle_{axis}")
+    if pixels is not None or angle is None:
+        return pixels
+    if not 0 < angle < np.pi:
+        raise SceneError(f"camera_angle_{axis} is {angle}; expected radians between 0 and pi")
+    return 0.5 * extent / float(np.tan(0.5 * angle))
+
+
+def _number(keys: dict[str, Any], key: str) -> float | None:
+    value = keys.get(key)
+    if value is None:
+        return None
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not np.isfinite(value):
+        raise SceneError(f"{key} is {value!r}; expected a finite number")
+    return float(value)
+
+
+def _distortion(keys: dict[str, Any]) -> Distortion | None:
+    """The lens. As in nerfstudio, perspective models differ only in the terms they name, so all terms given count."""
+    model = str(keys.get("camera_model") or "OPENCV").upper()
+    other = next((key for key in keys if key.startswith(("ftheta", "latlong"))), None)  # lenses of instant-ngp
+    if model not in PERSPECTIVE_MODELS + FISHEYE_MODELS or other:
+        raise SceneError(
+            f"the camera model is {other or model}; expected one of {', '.join(PERSPECTIVE_MODELS + FISHEYE_MODELS)}: "
+            "undistort images and masks to a pinhole camera first"
+        )
+    fisheye = model in FISHEYE_MODELS or bool(keys.get("is_fisheye"))
+    terms = {key: _number(keys, key) or 0.0 for key in LENS_TERMS}
+    if not fisheye and (terms["k4"] or terms["k5"] or terms["k6"]):
+        # nerfstudio takes k4 as the r^8 term of the numerator, OpenCV as the r^2 term of the denominator.
+        raise SceneError(
+            f"k4, k5, k6 are {terms['k4']}, {terms['k5']}, {terms['k6']}; expected 0 for {model}, where programs "
+            "disagree on their meaning: undistort images and masks to a pinhole camera first"
+        )
+    return lens_distortion(terms, fisheye=fisheye)

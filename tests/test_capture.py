@@ -1,0 +1,643 @@
+"""A capture folder becomes the same Scene whatever its format, and each thing that can be wrong has one clear error."""
+
+import json
+import shutil
+import struct
+import sys
+import warnings
+import zipfile
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from capture_files import (
+    HEIGHT,
+    WIDTH,
+    World,
+    make_world,
+    same_camera,
+    write_colmap_binary,
+    write_colmap_text,
+    write_features,
+    write_images,
+    write_masks,
+    write_ply,
+    write_png,
+    write_transforms,
+)
+
+from og_pointcloud.errors import MissingExtraError, SceneError
+from og_pointcloud.formats.capture import read_capture
+
+REAL_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+REAL_CAPTURES = {"seven_redkitchen": 100, "apc_shelf_B": 15, "ycb_0050": 20, "nuscenes_frame": 6}
+
+
+def make_capture(folder: Path, world: World | None = None) -> World:
+    """transforms.json, images, masks, points.ply."""
+    folder.mkdir(exist_ok=True)
+    world = world or make_world()
+    write_transforms(folder, world, ply_file_path="points.ply")
+    write_images(folder, world.names)
+    write_masks(folder, world.names)
+    write_ply(folder / "points.ply", world.xyz, world.rgb)
+    return world
+
+
+@pytest.fixture
+def capture(tmp_path):
+    folder = tmp_path / "scene"
+    world = make_capture(folder)
+    return folder, world
+
+
+def edit(folder, change):
+    content = json.loads((folder / "transforms.json").read_text())
+    change(content)
+    (folder / "transforms.json").write_text(json.dumps(content))
+
+
+def write_nerfstudio(folder, world):
+    write_transforms(folder, world, per_frame=True, ply_file_path="points.ply")
+
+
+def write_blender(folder, world):
+    """Square pixels and a centred principal point are all that this format can say."""
+    write_transforms(folder, world, suffix="", name="transforms_train.json")
+    content = json.loads((folder / "transforms_train.json").read_text())
+    content = {"camera_angle_x": 2 * np.arctan(0.5 * WIDTH / world.intrinsics[0]), "frames": content["frames"]}
+    (folder / "transforms_train.json").write_text(json.dumps(content))
+
+
+def write_sparse_binary(folder, world):
+    write_colmap_binary(folder / "sparse/0", world)
+
+
+def write_sparse_text(folder, world):
+    write_colmap_text(folder / "colmap/sparse/0", world)
+
+
+@pytest.mark.parametrize("offset", [0.0, 1e6])
+@pytest.mark.parametrize(
+    "write", [write_transforms, write_nerfstudio, write_blender, write_sparse_binary, write_sparse_text]
+)
+def test_all_formats_give_the_same_scene(tmp_path, write, offset):
+    shift = np.array([offset, -offset, offset / 3])
+    world = make_world(offset=shift)
+    world.intrinsics = (70.0, 70.0, WIDTH / 2, HEIGHT / 2)
+    write(tmp_path, world)
+    write_images(tmp_path, world.names)
+    write_masks(tmp_path, world.names)
+    write_ply(tmp_path / "points.ply", world.xyz, world.rgb)
+    scene = read_capture(tmp_path)
+    assert [view.name for view in scene.views] == world.names
+    np.testing.assert_allclose(scene.points.xyz_world, world.xyz, atol=1e-6)
+    for view, pose in zip(scene.views, world.poses, strict=True):
+        local = pose.copy()
+        local[:3, 3] += pose[:3, :3] @ scene.points.origin
+        assert same_camera(view.camera, world.camera(local))
+    # And without any frame in between: local points through the local camera land where the world's do.
+    camera, pose = scene.views[0].camera, world.poses[0]
+    theirs = world.xyz @ pose[:3, :3].T + pose[:3, 3]
+    ours = scene.points.xyz @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+    np.testing.assert_allclose(ours, theirs, atol=2e-6)
+
+
+def test_masks_features_and_images_are_what_was_written(tmp_path):
+    world = make_world()
+    write_transforms(tmp_path, world)
+    image = write_images(tmp_path, world.names)
+    ids, features = write_masks(tmp_path, world.names)
+    write_ply(tmp_path / "points.ply", world.xyz, world.rgb)
+    scene = read_capture(str(tmp_path))
+    assert scene.feature_space == "tiny"
+    assert scene.feature_width == 8
+    assert scene.name == tmp_path.name
+    for view in scene.views:
+        np.testing.assert_array_equal(view.mask_map(), ids.astype(int) - 1)
+        np.testing.assert_array_equal(view.mask_features, features[view.name].astype(np.float32))
+        np.testing.assert_array_equal(view.image_rgb(), image)
+
+
+def test_masks_and_images_are_read_when_asked_for(capture):
+    folder, world = capture
+    scene = read_capture(folder)
+    shutil.rmtree(folder / "images")
+    new = np.full((HEIGHT, WIDTH), 2, np.uint8)
+    write_png(folder / "masks" / f"{world.names[0]}.png", new)
+    assert (scene.views[0].mask_map() == 1).all()
+    with pytest.raises(FileNotFoundError):
+        scene.views[0].image_rgb()
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_mask_images_of_8_and_16_bit(tmp_path, dtype):
+    world = make_capture(tmp_path)
+    ids, _ = write_masks(tmp_path, world.names, dtype=dtype)
+    assert ids.dtype == dtype
+    np.testing.assert_array_equal(read_capture(tmp_path).views[0].mask_map(), ids.astype(int) - 1)
+
+
+@pytest.mark.parametrize("empty", [np.zeros((0, 8)), np.zeros((0, 8), int), np.array([])])
+def test_a_view_without_masks_is_legal(capture, empty):
+    folder, world = capture
+    nothing = world.names[1]
+    write_masks(folder, world.names, replaced={nothing: empty})
+    write_png(folder / "masks" / f"{nothing}.png", np.zeros((HEIGHT, WIDTH), np.uint16))
+    view = read_capture(folder).views[1]
+    assert view.mask_count == 0
+    assert (view.mask_map() == -1).all()
+
+
+@pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64])
+def test_features_become_float32(capture, dtype):
+    folder, world = capture
+    values = np.linspace(-1, 1, 16).reshape(2, 8).astype(dtype)
+    write_masks(folder, world.names, replaced={world.names[0]: values})
+    features = read_capture(folder).views[0].mask_features
+    assert features.dtype == np.float32
+    np.testing.assert_array_equal(features, values.astype(np.float32))
+
+
+def test_a_features_file_without_a_space(capture):
+    folder, world = capture
+    write_features(folder, {name: np.ones((2, 8)) for name in world.names})
+    assert read_capture(folder).feature_space == "unknown"
+
+
+def test_language_features_are_found(capture):
+    folder, world = capture
+    (folder / "mask_features.npz").unlink()
+    (folder / "language_features").mkdir()
+    levels = np.full((4, HEIGHT, WIDTH), -1, np.float32)
+    levels[1, :, :10], levels[3, :, 20:] = 0, 1
+    for name in world.names:
+        np.save(folder / "language_features" / f"{name}_s.npy", levels)
+        np.save(folder / "language_features" / f"{name}_f.npy", np.arange(6.0).reshape(2, 3))
+    large, small = read_capture(folder).views[0], read_capture(folder, mask_level="small").views[0]
+    np.testing.assert_array_equal(large.mask_features, [[3, 4, 5]])
+    np.testing.assert_array_equal(small.mask_features, [[0, 1, 2]])
+    np.testing.assert_array_equal(large.mask_map(), np.where(levels[3] < 0, -1, 0))
+
+
+# Resolution and distortion.
+
+
+def test_masks_of_half_size_rule(capture):
+    """The camera shrinks with the masks and the image follows: a pixel's ray stays the same."""
+    folder, world = capture
+    write_masks(folder, world.names, size=(WIDTH // 2, HEIGHT // 2))
+    full = world.camera(world.poses[0])
+    view = read_capture(folder).views[0]
+    assert (view.camera.width, view.camera.height, view.camera.fx) == (WIDTH // 2, HEIGHT // 2, full.fx / 2)
+    image = view.image_rgb()
+    assert image is not None
+    assert image.shape == (HEIGHT // 2, WIDTH // 2, 3)
+    assert abs(int(image[0, 10, 0]) - 250 * 20.5 / (WIDTH - 1)) < 3
+    assert view.mask_map().shape == image.shape[:2]
+
+
+def test_a_shrunken_image_is_averaged(capture):
+    """Stripes a pixel wide become their mean, not one of the two colours."""
+    folder, world = capture
+    write_masks(folder, world.names, size=(WIDTH // 2, HEIGHT // 2))
+    stripes = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+    stripes[:, ::2] = 200
+    write_png(folder / "images/frame_00.png", stripes)
+    image = read_capture(folder).views[0].image_rgb()
+    assert image is not None
+    assert (image == 100).all()
+
+
+def test_a_small_image_beside_full_masks_is_enlarged(capture):
+    folder, world = capture
+    write_images(folder, world.names, size=(WIDTH // 4, HEIGHT // 4))
+    image = read_capture(folder).views[0].image_rgb()
+    assert image is not None
+    assert image.shape == (HEIGHT, WIDTH, 3)
+
+
+def test_masks_of_another_shape_are_refused(capture):
+    folder, world = capture
+    write_masks(folder, world.names, size=(HEIGHT, WIDTH))
+    with pytest.raises(SceneError, match=r"view 'frame_00': the masks are 48x64 pixels, the camera 64x48; expected"):
+        read_capture(folder)
+
+
+def test_an_image_of_another_shape_is_refused_when_read(capture):
+    folder, world = capture
+    write_images(folder, world.names, size=(HEIGHT, WIDTH))
+    with pytest.raises(SceneError, match=r"frame_00.png is 48x64 pixels, its camera 64x48"):
+        read_capture(folder).views[0].image_rgb()
+
+
+def test_distorted_captures_are_undistorted(capture):
+    """The border of the right mask moves out along the row of the principal point, in mask and image alike."""
+    folder, world = capture
+    write_transforms(folder, world, ply_file_path="points.ply", k1=-3.0)
+    straight, view = make_world(), read_capture(folder).views[0]
+    fx, _, cx, cy = straight.intrinsics
+    row = int(cy)
+    border = WIDTH - WIDTH // 3
+    r = next(r for r in np.arange(0, 1 / 3, 1e-4) if r * (1 - 3 * r**2) >= (border - cx) / fx)
+    first = int(np.argmax(view.mask_map()[row] == 1))
+    assert abs(first - (cx + fx * r)) <= 1
+    assert first > border
+    image = view.image_rgb()
+    assert image is not None
+    assert abs(float(image[row, first, 0]) - 250 * border / WIDTH) < 6
+
+
+# Names and files of images.
+
+
+def test_equal_stems_in_two_folders_are_told_apart_by_folder(tmp_path):
+    world = make_capture(tmp_path)
+    names = ["left/000", "right/000", "right/001"]
+    edit(tmp_path, lambda c: [f.update(file_path=f"images/{n}.png") for f, n in zip(c["frames"], names, strict=True)])
+    shutil.rmtree(tmp_path / "images")
+    write_images(tmp_path, names)
+    write_masks(tmp_path, names)
+    scene = read_capture(tmp_path)
+    assert [view.name for view in scene.views] == names
+    assert all(view.image_rgb() is not None for view in scene.views)
+    assert len(world.names) == 3
+
+
+def test_an_image_listed_twice_is_refused(capture):
+    folder, _ = capture
+    edit(folder, lambda content: content["frames"].append(content["frames"][0]))
+    with pytest.raises(SceneError, match="two views are called 'frame_00'"):
+        read_capture(folder)
+
+
+def test_dots_in_names_are_no_suffix(capture):
+    folder, _ = capture
+    edit(folder, lambda content: content["frames"][0].update(file_path="./images/scan.0001"))
+    for kind in ("images", "masks"):
+        (folder / kind / "frame_00.png").rename(folder / kind / "scan.0001.png")
+    write_masks(folder, ["scan.0001", "frame_01", "frame_02"])
+    view = read_capture(folder).views[0]
+    assert view.name == "scan.0001"
+    assert view.image_rgb() is not None
+
+
+def test_images_are_optional_but_missed(capture):
+    folder, world = capture
+    (folder / "images" / f"{world.names[1]}.png").unlink()
+    with pytest.warns(UserWarning, match=r"1 of 3 images are listed but not found, e.g. 'images/frame_01.png'"):
+        scene = read_capture(folder)
+    assert [view.image_rgb() is None for view in scene.views] == [False, True, False]
+
+
+@pytest.mark.parametrize("path", ["/somewhere/else/frame_00.png", "../other/frame_00.png", "../../frame_00"])
+def test_paths_out_of_the_folder_are_looked_for_inside(capture, path):
+    folder, _ = capture
+    outside = folder.parent / "other"
+    write_png(outside / "frame_00.png", np.zeros((HEIGHT, WIDTH, 3), np.uint8))
+    edit(folder, lambda content: content["frames"][0].update(file_path=path))
+    image = read_capture(folder).views[0].image_rgb()
+    assert image is not None
+    assert image.max() > 0, "the black image outside the capture was opened"
+
+
+def test_frames_without_a_pose_are_left_out_aloud(capture):
+    folder, _ = capture
+    lost = np.full((4, 4), np.nan).tolist()
+    edit(folder, lambda content: content["frames"][1].update(transform_matrix=lost))
+    with pytest.warns(UserWarning, match=r"1 frames have no finite pose and are left out, e.g. 'images/frame_01.png'"):
+        scene = read_capture(folder)
+    assert [view.name for view in scene.views] == ["frame_00", "frame_02"]
+
+
+# Geometry.
+
+
+def cloud_at(folder, name, x):
+    """A cloud of two points whose x tells which file was read."""
+    file = folder / name
+    file.parent.mkdir(parents=True, exist_ok=True)
+    write_ply(file, np.array([[x, 0, 0], [x, 1, 1.0]]), np.zeros((2, 3), np.uint8))
+
+
+def test_geometry_is_chosen_in_order(tmp_path):
+    world = make_capture(tmp_path)
+    (tmp_path / "points.ply").unlink()
+    write_transforms(tmp_path, world)
+    write_colmap_text(tmp_path / "sparse/0", world)
+
+    def x_of_cloud(**options):
+        return float(read_capture(tmp_path, **options).points.xyz_world[0, 0])
+
+    assert x_of_cloud() == pytest.approx(world.xyz[0, 0])
+    for x, name in [
+        (1, "point_cloud/iteration_900/point_cloud.ply"),
+        (2, "point_cloud/iteration_30000/point_cloud.ply"),
+    ]:
+        cloud_at(tmp_path, name, x)
+        assert x_of_cloud() == x
+    header = "VERSION .7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH 1\nHEIGHT 1\nPOINTS 1\nDATA ascii\n"
+    (tmp_path / "map.pcd").write_text(header + "3 0 0\n")
+    assert x_of_cloud() == 3
+    for x, name in [(4, "point_cloud.ply"), (5, "points.ply")]:
+        cloud_at(tmp_path, name, x)
+        assert x_of_cloud() == x
+    cloud_at(tmp_path, "fused/dense.ply", 6)
+    edit(tmp_path, lambda content: content.update(ply_file_path="./fused/dense.ply"))
+    assert x_of_cloud() == 6
+    cloud_at(tmp_path.parent, "given.ply", 7)
+    assert x_of_cloud(gaussians=str(tmp_path.parent / "given.ply")) == 7
+
+
+def test_colmap_points_follow_applied_transform(tmp_path):
+    world = make_world()
+    make_capture(tmp_path, world)
+    (tmp_path / "points.ply").unlink()
+    write_colmap_binary(tmp_path / "sparse/0", world)
+    turn = np.array([[1.0, 0, 0, 3], [0, 0, 1, 4], [0, -1, 0, 5]])
+    write_transforms(tmp_path, world, applied_transform=turn.tolist())
+    full = np.vstack([turn, [0, 0, 0, 1]])
+
+    def move(content):
+        for frame in content["frames"]:
+            frame["transform_matrix"] = (full @ frame["transform_matrix"]).tolist()
+
+    edit(tmp_path, move)
+    points = read_capture(tmp_path).points
+    np.testing.assert_allclose(points.xyz_world, world.xyz @ turn[:, :3].T + turn[:, 3], atol=1e-5)
+    edit(tmp_path, lambda content: content.pop("applied_transform"))
+    with pytest.raises(SceneError, match=r"do not place the same images alike, so points3D is in another world"):
+        read_capture(tmp_path)
+
+
+def test_several_pcds_are_ambiguous(capture):
+    folder, world = capture
+    (folder / "points.ply").unlink()
+    write_transforms(folder, world)
+    (folder / "a.pcd").touch()
+    (folder / "b.pcd").touch()
+    with pytest.raises(SceneError, match=r"has 2 .pcd files \(a.pcd, b.pcd, ...\); expected one: name the one"):
+        read_capture(folder)
+
+
+@pytest.mark.parametrize("path", ["../points.ply", "/tmp/points.ply", "sub/../../points.ply", "absent.ply"])
+def test_ply_file_path_stays_inside(capture, path):
+    folder, _ = capture
+    shutil.copy(folder / "points.ply", folder.parent / "points.ply")
+    edit(folder, lambda content: content.update(ply_file_path=path))
+    with pytest.raises(
+        SceneError, match=r"ply_file_path is '.*', which is no file inside the capture folder; .*--gaussians"
+    ):
+        read_capture(folder)
+
+
+def test_no_geometry_names_all_ways(capture):
+    folder, world = capture
+    (folder / "points.ply").unlink()
+    write_transforms(folder, world)
+    with pytest.raises(SceneError, match=r"no geometry; expected points.ply .*points3D.*--gaussians"):
+        read_capture(folder)
+
+
+# Errors at the door.
+
+
+def test_no_folder(tmp_path):
+    with pytest.raises(SceneError, match="is not a folder; expected a capture folder"):
+        read_capture(tmp_path / "nowhere")
+
+
+def test_no_pose_file(capture):
+    folder, _ = capture
+    (folder / "transforms.json").unlink()
+    with pytest.raises(SceneError, match=r"has no pose file; expected transforms.json .* sparse/0"):
+        read_capture(folder)
+
+
+def test_no_masks_at_all(capture):
+    folder, _ = capture
+    (folder / "mask_features.npz").unlink()
+    with pytest.raises(SceneError, match=r"has masks/ but no mask_features.npz; expected"):
+        read_capture(folder)
+    shutil.rmtree(folder / "masks")
+    with pytest.raises(SceneError, match=r"has no masks at all; expected masks/<image stem>.png .*language_features"):
+        read_capture(folder)
+
+
+def test_image_without_mask(capture):
+    folder, _ = capture
+    (folder / "masks/frame_01.png").unlink()
+    with pytest.raises(
+        SceneError, match=r"1 of 3 posed images have no mask: .*masks lacks frame_01.png; .*all-zero mask"
+    ):
+        read_capture(folder)
+
+
+def test_image_without_features(capture):
+    folder, world = capture
+    write_features(folder, {name: np.ones((2, 8)) for name in world.names[:2]})
+    with pytest.raises(
+        SceneError, match=r"no features for 1 of 3 views, e.g. 'frame_02' \(it has 'frame_00', 'frame_01'"
+    ):
+        read_capture(folder)
+
+
+def test_mask_id_without_feature_row(capture):
+    folder, world = capture
+    write_masks(folder, world.names, replaced={world.names[2]: np.ones((1, 8))})
+    view = read_capture(folder).views[2]
+    with pytest.raises(SceneError, match=r"view 'frame_02': mask id 2 has no feature row \(the features file has 1\)"):
+        view.mask_map()
+
+
+def test_features_of_two_widths(capture):
+    folder, world = capture
+    write_masks(folder, world.names, replaced={world.names[2]: np.ones((2, 9))})
+    with pytest.raises(SceneError, match=r"2 widths \[8, 9\] \(e.g. frame_02: 9\)"):
+        read_capture(folder)
+
+
+def test_nan_features(capture):
+    folder, world = capture
+    write_masks(folder, world.names, replaced={world.names[2]: np.full((2, 8), np.nan)})
+    with pytest.raises(SceneError, match="view 'frame_02': the feature of mask 1 holds NaN"):
+        read_capture(folder)
+
+
+@pytest.mark.parametrize("values", [np.ones(8), np.ones((2, 2, 2)), np.ones((2, 8), int)])
+def test_features_of_another_kind(capture, values):
+    folder, world = capture
+    write_masks(folder, world.names, replaced={world.names[2]: values})
+    with pytest.raises(SceneError, match=r"'frame_02': features are .*; expected floats of shape \(masks, width\)"):
+        read_capture(folder)
+
+
+@pytest.mark.parametrize(
+    ("pixels", "kind"),
+    [
+        (np.zeros((HEIGHT, WIDTH, 3), np.uint8), r"RGB \(3 channels\) PNG of 8 bit"),
+        (np.zeros((HEIGHT, WIDTH, 4), np.uint16), r"RGBA \(4 channels\) PNG of 16 bit"),
+    ],
+)
+def test_colour_masks_are_refused(capture, pixels, kind):
+    folder, _ = capture
+    write_png(folder / "masks/frame_01.png", pixels)
+    with pytest.raises(SceneError, match=rf"frame_01.png is a {kind}; expected grey of 8 or 16 bit"):
+        read_capture(folder)
+
+
+def png_with_header(width, height, bit_depth, color_type):
+    header = b"IHDR" + struct.pack(">IIBBBBB", width, height, bit_depth, color_type, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + struct.pack(">I", 13) + header + struct.pack(">I", zlib.crc32(header))
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        (png_with_header(WIDTH, HEIGHT, 8, 3), "is a palette PNG of 8 bit"),
+        (png_with_header(WIDTH, HEIGHT, 4, 0), "is a grey PNG of 4 bit"),
+        (png_with_header(2**31 - 1, 2**31 - 1, 8, 0), "expected at most 268435456 pixels"),
+        (b"\xff\xd8\xff\xe0JFIF" * 10, "is not a PNG"),
+        (b"", "is not a PNG"),
+    ],
+)
+def test_other_mask_files_are_refused(capture, data, message):
+    folder, _ = capture
+    (folder / "masks/frame_01.png").write_bytes(data)
+    with pytest.raises(SceneError, match=r"frame_01.png .*" + message):
+        read_capture(folder)
+
+
+def test_truncated_mask_and_image(capture):
+    folder, _ = capture
+    scene = read_capture(folder)
+    for kind in ("masks", "images"):
+        file = folder / kind / "frame_01.png"
+        file.write_bytes(file.read_bytes()[:60])
+    with pytest.raises(SceneError, match=r"masks/frame_01.png \(60 bytes\) cannot be decoded"):
+        scene.views[1].mask_map()
+    with pytest.raises(SceneError, match=r"images/frame_01.png \(60 bytes\) cannot be decoded"):
+        scene.views[1].image_rgb()
+
+
+def hostile_npz(file, names, payload):
+    with zipfile.ZipFile(file, "w") as archive:
+        for name in names:
+            archive.writestr(f"{name}.npy", payload)
+
+
+def npy(shape, descr="<f4", data=b""):
+    header = f"{{'descr': '{descr}', 'fortran_order': False, 'shape': {shape}, }}".ljust(117) + "\n"
+    return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header.encode() + data
+
+
+@pytest.mark.parametrize(
+    ("payload", "message"),
+    [
+        (npy((10**9, 10**9)), "claims float32 .*1000000000.* bytes, and holds 0"),
+        (npy((2,), "|O", b"cposix\nsystem\n."), "claims object"),
+        (npy((2, 8), data=b"\0" * 63), "claims float32"),
+        (b"garbage", "cannot be read as an .npz of plain arrays"),
+        (b"", "cannot be read as an .npz of plain arrays"),
+    ],
+)
+def test_hostile_features_are_refused(capture, payload, message):
+    folder, world = capture
+    hostile_npz(folder / "mask_features.npz", world.names, payload)
+    with pytest.raises(SceneError, match=message):
+        read_capture(folder)
+
+
+def test_damaged_features_are_refused(capture):
+    folder, _ = capture
+    file = folder / "mask_features.npz"
+    whole = file.read_bytes()
+    for size in (0, 10, len(whole) // 2, len(whole) - 3):
+        file.write_bytes(whole[:size])
+        with pytest.raises(SceneError, match=r"mask_features.npz cannot be read as an .npz of plain arrays"):
+            read_capture(folder)
+    broken = bytearray(whole)
+    broken[200] ^= 0xFF
+    file.write_bytes(bytes(broken))
+    with pytest.raises(SceneError, match=r"cannot be read as an .npz of plain arrays .*CRC"):
+        read_capture(folder)
+
+
+def test_damaged_compressed_features_are_refused(capture):
+    folder, world = capture
+    file = folder / "mask_features.npz"
+    np.savez_compressed(
+        file, allow_pickle=False, **{name: np.random.default_rng(0).normal(size=(9, 64)) for name in world.names}
+    )
+    assert read_capture(folder).views[0].mask_count == 9
+    broken = bytearray(file.read_bytes())
+    broken[60:300] = b"\xff" * 240
+    file.write_bytes(bytes(broken))
+    with pytest.raises(SceneError, match=r"cannot be read as an .npz of plain arrays .*decompressing"):
+        read_capture(folder)
+
+
+def test_a_features_bomb_is_refused(capture, monkeypatch):
+    folder, _ = capture
+    monkeypatch.setattr("og_pointcloud.formats.masks.MAX_FEATURE_BYTES", 500)
+    with pytest.raises(SceneError, match=r"unpacks to \d+ bytes; expected at most 500"):
+        read_capture(folder)
+
+
+def test_blender_without_images_says_what_is_missing(capture):
+    folder, _ = capture
+    shutil.rmtree(folder / "images")
+    edit(folder, lambda content: [content.pop(key) for key in ("w", "h")])
+    with pytest.raises(SceneError, match=r"image 'images/frame_00.png' is not found, and the pose file has no w and h"):
+        read_capture(folder)
+
+
+def test_one_view_is_enough(tmp_path):
+    make_capture(tmp_path, make_world(count=1))
+    assert len(read_capture(tmp_path).views) == 1
+
+
+def test_without_opencv_the_extra_is_named(capture, monkeypatch):
+    folder, _ = capture
+    monkeypatch.setitem(sys.modules, "cv2", None)
+    scene = read_capture(folder)
+    with pytest.raises(MissingExtraError, match=r"og-pointcloud\[fit\]"):
+        scene.views[0].mask_map()
+
+
+# Real captures.
+
+
+@pytest.mark.parametrize(("name", "views"), REAL_CAPTURES.items())
+def test_real_captures(name, views):
+    folder = REAL_DATA / name
+    if not folder.is_dir():
+        pytest.skip(f"{folder} is absent")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        scene = read_capture(folder)
+    assert len(scene.views) == views
+    assert scene.feature_space == "openai/clip-vit-base-patch32"
+    assert scene.feature_width == 512
+    for view in scene.views[:: max(1, views // 6)]:
+        ids = view.mask_map()
+        assert ids.min() >= -1
+        assert ids.max() < view.mask_count
+        assert colour_correlation(scene.points, view) > 0.5
+
+
+def colour_correlation(points, view):
+    """Correlation of the brightness of visible points with that of their pixels."""
+    camera, image = view.camera, view.image_rgb()
+    local = points.xyz @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+    ahead = local[:, 2] > 1e-3
+    depth, gray = local[ahead, 2], points.rgb[ahead].mean(1)
+    pixel = np.floor(local[ahead, :2] / depth[:, None] * [camera.fx, camera.fy] + [camera.cx, camera.cy]).astype(int)
+    inside = ((pixel >= 0) & (pixel < [camera.width, camera.height])).all(1)
+    (j, i), depth, gray = pixel[inside].T, depth[inside], gray[inside]
+    cell = i // 8 * camera.width + j // 8
+    nearest = np.full(cell.max() + 1, np.inf)
+    np.minimum.at(nearest, cell, depth)
+    visible = depth < nearest[cell] * 1.03
+    return np.corrcoef(image[i[visible], j[visible]].mean(1), gray[visible])[0, 1]

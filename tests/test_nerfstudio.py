@@ -1,0 +1,178 @@
+"""transforms.json of nerfstudio, instant-ngp and Blender."""
+
+import json
+
+import numpy as np
+import pytest
+from capture_files import make_world, same_camera, write_transforms
+
+from og_pointcloud.errors import SceneError
+from og_pointcloud.formats.nerfstudio import read_transforms
+from og_pointcloud.scene import Camera
+
+
+def no_size(path):
+    raise AssertionError(f"the size of {path} was asked for, although the file states it")
+
+
+def read(folder, image_size=no_size):
+    return read_transforms(folder / "transforms.json", image_size)
+
+
+def edit(folder, change):
+    file = folder / "transforms.json"
+    content = json.loads(file.read_text())
+    change(content)
+    file.write_text(json.dumps(content))
+
+
+@pytest.mark.parametrize("per_frame", [False, True])
+def test_opengl_camera_to_world_becomes_opencv_world_to_camera(tmp_path, per_frame):
+    world = make_world()
+    write_transforms(tmp_path, world, per_frame)
+    images = read(tmp_path).images
+    assert [image.path for image in images] == [f"images/{name}.png" for name in world.names]
+    for image, pose in zip(images, world.poses, strict=True):
+        assert same_camera(image.camera, world.camera(pose))
+        assert image.distortion is None
+
+
+def test_a_point_in_front_of_the_camera_has_positive_depth(tmp_path):
+    """Independent of any inverse: an OpenGL camera at (1, 2, 3) that looks along world -z, its own."""
+    matrix = [[1, 0, 0, 1], [0, 1, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]]
+    frame = {"file_path": "a.png", "transform_matrix": matrix}
+    content = {"fl_x": 50, "w": 64, "h": 48, "frames": [frame]}
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    camera = read(tmp_path).images[0].camera
+    right_up_ahead = np.array([1 + 0.5, 2 + 0.25, 3 - 4.0, 1.0])
+    np.testing.assert_allclose(camera.world_to_camera @ right_up_ahead, [0.5, -0.25, 4.0, 1.0])
+    assert (camera.fy, camera.cx, camera.cy) == (50, 32, 24)
+
+
+def test_frames_override_the_top(tmp_path):
+    write_transforms(tmp_path, make_world())
+    edit(tmp_path, lambda content: content["frames"][1].update(fl_x=99.0, w=128, h=96, k1=0.1))
+    first, second, _ = read(tmp_path).images
+    assert (first.camera.fx, second.camera.fx) == (70.0, 99.0)
+    assert (second.camera.width, second.camera.height) == (128, 96)
+    assert first.distortion is None
+    assert second.distortion is not None
+
+
+def test_blender_takes_its_size_from_the_image(tmp_path):
+    world = make_world()
+    angle = 2 * np.arctan(0.5 * 200 / 250.0)
+    write_transforms(tmp_path, world, suffix="")
+    drop = ("fl_x", "fl_y", "cx", "cy", "w", "h")
+    edit(tmp_path, lambda content: [content.pop(key) for key in drop] and content.update(camera_angle_x=angle))
+    asked = []
+    images = read(tmp_path, lambda path: asked.append(path) or (200, 100)).images
+    assert asked == [f"images/{name}" for name in world.names]
+    for image, pose in zip(images, world.poses, strict=True):
+        assert same_camera(image.camera, Camera(200, 100, 250, 250, 100, 50, pose))
+
+
+def test_instant_ngp(tmp_path):
+    write_transforms(
+        tmp_path, make_world(), aabb_scale=16, scale=0.33, offset=[0.5, 0.5, 0.5], k1=0.0, is_fisheye=False
+    )
+    edit(tmp_path, lambda content: content["frames"][0].update(file_path=".\\images\\0001", sharpness=3.0))
+    images = read(tmp_path).images
+    assert images[0].path == "./images/0001"
+    assert images[0].distortion is None
+    edit(tmp_path, lambda content: content.update(is_fisheye=True))
+    distortion = read(tmp_path).images[0].distortion
+    assert distortion is not None
+    assert distortion.fisheye
+
+
+@pytest.mark.parametrize("model", ["OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "OPENCV_FISHEYE"])
+def test_distortion_is_never_ignored(tmp_path, model):
+    write_transforms(tmp_path, make_world(), camera_model=model, k1=0.05, p1=0.0)
+    distortion = read(tmp_path).images[0].distortion
+    assert distortion is not None
+    assert distortion.coefficients[0] == 0.05
+    assert distortion.fisheye == (model == "OPENCV_FISHEYE")
+
+
+@pytest.mark.parametrize(
+    ("keys", "message"),
+    [
+        ({"camera_model": "EQUIRECTANGULAR"}, "the camera model is EQUIRECTANGULAR; expected one of OPENCV"),
+        ({"camera_model": "FISHEYE624"}, "the camera model is FISHEYE624"),
+        ({"ftheta_p0": 1.0}, "the camera model is ftheta_p0"),
+        ({"k4": 0.01}, "k4, k5, k6 are 0.01, 0.0, 0.0; expected 0"),
+        ({"camera_model": "OPENCV_FISHEYE", "p1": 0.01}, "the term p1 = 0.01; expected only k1, k2, k3, k4"),
+        ({"fl_x": None, "fl_y": None}, "neither fl_x .* nor camera_angle_x"),
+        ({"fl_x": "wide"}, "fl_x is 'wide'; expected a finite number"),
+        ({"fl_x": float("nan")}, "fl_x is nan; expected a finite number"),
+        ({"fl_x": -3.0}, "intrinsics .* expected finite numbers, fx and fy > 0"),
+        ({"fl_x": None, "camera_angle_x": 0.0}, "camera_angle_x is 0.0; expected radians"),
+        ({"w": 0}, "camera image is 0x48"),
+    ],
+)
+def test_bad_lenses_name_the_frame(tmp_path, keys, message):
+    write_transforms(tmp_path, make_world(), **keys)
+    with pytest.raises(SceneError, match=r"transforms.json, frame 'images/frame_00.png': .*" + message):
+        read(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("matrix", "message"),
+    [
+        (None, "transform_matrix is None; expected 4 rows of 4 numbers"),
+        ([[1, 2], [3, 4]], "expected 4 rows of 4 numbers"),
+        ("identity", "transform_matrix is 'identity'"),
+        ((2 * np.eye(4)).tolist(), r"last row of transform_matrix is \[0.0, 0.0, 0.0, 2.0\]"),
+        (np.diag([2.0, 2, 2, 1]).tolist(), "off a rotation matrix"),
+        (np.diag([1.0, 1, -1, 1]).tolist(), "right-handed"),
+    ],
+)
+def test_bad_poses_name_the_frame(tmp_path, matrix, message):
+    write_transforms(tmp_path, make_world())
+    edit(tmp_path, lambda content: content["frames"][1].update(transform_matrix=matrix))
+    with pytest.raises(SceneError, match=r"frame 'images/frame_01.png': .*" + message):
+        read(tmp_path)
+
+
+def test_three_rows_are_enough(tmp_path):
+    world = make_world()
+    write_transforms(tmp_path, world)
+    edit(tmp_path, lambda content: content["frames"][0]["transform_matrix"].pop())
+    assert same_camera(read(tmp_path).images[0].camera, world.camera(world.poses[0]))
+
+
+def test_frames_without_a_finite_pose_are_dropped_by_name(tmp_path):
+    write_transforms(tmp_path, make_world())
+    lost = np.full((4, 4), -np.inf).tolist()
+    edit(tmp_path, lambda content: content["frames"][1].update(transform_matrix=lost))
+    transforms = read(tmp_path)
+    assert transforms.dropped == ("images/frame_01.png",)
+    assert len(transforms.images) == 2
+    edit(tmp_path, lambda content: [frame.update(transform_matrix=lost) for frame in content["frames"]])
+    with pytest.raises(SceneError, match="none of its 3 frames has a finite transform_matrix"):
+        read(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("{", "is not valid JSON"),
+        ("[" * 100_000, "is not valid JSON"),
+        ("[]", "no list 'frames'"),
+        ('{"frames": []}', "no list 'frames'"),
+        ('{"frames": {}}', "no list 'frames'"),
+        ('{"frames": [3]}', "frame 0 has file_path None"),
+        ('{"frames": [{"file_path": 3}]}', "frame 0 has file_path 3"),
+    ],
+)
+def test_other_files_are_refused(tmp_path, text, message):
+    (tmp_path / "transforms.json").write_text(text)
+    with pytest.raises(SceneError, match=message):
+        read(tmp_path)
+
+
+def test_binary_content_is_refused(tmp_path):
+    (tmp_path / "transforms.json").write_bytes(b"\xff\xfe\x00{")
+    with pytest.raises(SceneError, match="is not valid JSON"):
+        read(tmp_path)
