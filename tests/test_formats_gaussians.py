@@ -34,7 +34,7 @@ def write_columns(path: Path, columns: dict[str, np.ndarray]) -> Path:
 
 
 def assert_same(a: Points, b: Points, atol: float = 0.0) -> None:
-    np.testing.assert_allclose(a.xyz_world, b.xyz_world, atol=atol)
+    np.testing.assert_allclose(a.xyz_world, b.xyz_world, rtol=0, atol=atol)
     for name in ("scale", "rotation", "opacity"):
         np.testing.assert_allclose(getattr(a, name), getattr(b, name), rtol=max(atol, 1e-7), atol=atol)
     np.testing.assert_array_equal(a.rgb, b.rgb)
@@ -250,6 +250,10 @@ def test_compressed_files_that_do_not_fit(tmp_path):
     vertex = {name: elements["vertex"][name] for name in PACKED[:3]}
     write_ply(tmp_path / "b.ply", elements | {"vertex": join_columns(vertex)})
     with pytest.raises(SceneError, match="no property 'packed_color' of type uint"):
+        read_points(tmp_path / "b.ply")
+    signed = {name: elements["vertex"][name].view("i4") for name in PACKED}
+    write_ply(tmp_path / "b.ply", elements | {"vertex": join_columns(signed)})
+    with pytest.raises(SceneError, match="no property 'packed_position' of type uint"):
         read_points(tmp_path / "b.ply")
     elements["chunk"]["max_y"][1] = np.inf
     write_ply(tmp_path / "c.ply", elements)

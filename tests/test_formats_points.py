@@ -34,7 +34,7 @@ def test_a_cloud_without_colours_or_normals(tmp_path):
 def test_map_coordinates_keep_their_millimetres(tmp_path):
     offset = np.array([4.5e6, -5.2e6, 300.0])
     points = read_points(write_cloud(tmp_path / "a.ply", XYZ + offset))
-    np.testing.assert_allclose(points.xyz_world, XYZ + offset, atol=1e-6)
+    np.testing.assert_allclose(points.xyz_world, XYZ + offset, rtol=0, atol=1e-6)
     np.testing.assert_allclose(points.origin, np.median(XYZ + offset, axis=0))
 
 
@@ -82,11 +82,19 @@ def test_the_content_decides_not_the_name(tmp_path):
     assert read_points(tmp_path / "cloud.ply").xyz_world.tolist() == [[1, 2, 3]]
 
 
-@pytest.mark.parametrize("content", [b"", b"LASF\x00\x00", b"version https://git-lfs.github.com/spec/v1\n", b"plywood"])
-def test_other_files_are_refused_with_a_list_of_what_is_readable(tmp_path, content):
+@pytest.mark.parametrize(
+    ("content", "start"),
+    [
+        (b"", "it is empty"),
+        (b"LASF\x00\x00", "it starts with b'LASF"),
+        (b"version https://git-lfs.github.com/spec/v1\n", "it starts with b'version https"),
+        (b"plywood", "it starts with b'plywood'"),
+    ],
+)
+def test_other_files_are_refused_with_a_list_of_what_is_readable(tmp_path, content, start):
     path = tmp_path / "a.ply"
     path.write_bytes(content)
-    with pytest.raises(SceneError, match=r"not a geometry file .* expected a PLY .* or a PCD") as caught:
+    with pytest.raises(SceneError, match=f"not a geometry file .*{start}.* expected a PLY .* or a PCD") as caught:
         read_points(path)
     assert str(caught.value).startswith(f"{path}: ")
 
@@ -117,6 +125,13 @@ def test_no_points_nan_and_missing_columns_name_the_file_once(tmp_path):
         read_points(path)
 
 
+def test_a_signalling_nan_is_that_error_too_without_a_warning(tmp_path):
+    xyz = XYZ.astype("f4")
+    xyz.view("u4")[5, 2] = 0x7F800001
+    with pytest.raises(SceneError, match=r"1 of 30 points hold NaN or infinity .the first is row 5"):
+        read_points(write_cloud(tmp_path / "a.ply", xyz))
+
+
 @pytest.mark.parametrize(("offset", "stored"), [(0.0, "f4"), (1e6, "f8")])
 def test_labelled_cloud_reads_back(tmp_path, offset, stored):
     path = tmp_path / "labelled.ply"
@@ -130,7 +145,7 @@ def test_labelled_cloud_reads_back(tmp_path, offset, stored):
     np.testing.assert_array_equal(rows["label"], label)
     np.testing.assert_allclose(rows["score"], score, atol=1e-7)
     points = read_points(path)
-    np.testing.assert_allclose(points.xyz_world, XYZ + offset, atol=1e-6 * np.ptp(XYZ, axis=0).max())
+    np.testing.assert_allclose(points.xyz_world, XYZ + offset, rtol=0, atol=1e-6 * np.ptp(XYZ, axis=0).max())
     np.testing.assert_array_equal(points.rgb, RGB)
 
 

@@ -65,8 +65,9 @@ def stack_columns(rows: NDArray[np.void], names: Sequence[str], dtype: type[np.f
             f"no column {', '.join(missing)}; expected {', '.join(names)}, the file has {', '.join(scalar)}"
         )
     stacked = np.empty((len(rows), len(names)), dtype)
-    for column, name in enumerate(names):
-        stacked[:, column] = rows[name]
+    with np.errstate(invalid="ignore"):  # widening a signalling NaN warns; NaN is for the caller to judge
+        for column, name in enumerate(names):
+            stacked[:, column] = rows[name]
     return stacked
 
 
