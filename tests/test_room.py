@@ -10,6 +10,7 @@ import pytest
 o3d = pytest.importorskip("open3d")
 cv2 = pytest.importorskip("cv2")
 
+from og_pointcloud_room import pictures  # noqa: E402
 from og_pointcloud_room.baselines import ceiling, direct_uplift  # noqa: E402
 from og_pointcloud_room.capture import CaptureSettings, make_capture, write_capture  # noqa: E402
 from og_pointcloud_room.features import FeatureModel  # noqa: E402
@@ -213,7 +214,7 @@ def test_perfect_masks_are_the_objects_in_random_order():
 
 
 def test_mask_errors_come_as_often_as_they_should():
-    owner, rng, views, objects = _two_rows_of_squares(), np.random.default_rng(0), 300, 16
+    owner, rng, views, objects = _two_rows_of_squares(), np.random.default_rng(0), 200, 16
     counts = dict.fromkeys(("whole", "split", "missed", "merged", "spurious"), 0)
     for _ in range(views):
         ids = propose_masks(owner, MaskNoise(edge_px=0), rng)
@@ -292,9 +293,56 @@ def test_uplift_by_hand():
 
 
 def test_ceiling_by_hand():
-    """Instance 0 has masks 0 and 1, whose mean says text 1; instance 1 has none; mask 2 is mostly on background."""
-    weights = sparse.csr_array(np.array([[3.0, 0, 0.5, 0, 0, 0], [1.0, 1.0, 0, 0, 0, 0], [0, 0.1, 0, 0.2, 5.0, 9.0]]))
+    """Instance 0 has masks 0 and 1, whose mean says text 1; instance 1 has none; mask 2 shows background."""
     features = np.array([[1.0, 0.8], [0.0, 1.0], [1.0, 0.0]])
-    instances = np.array([0, 0, 0, 1, -1, -1])
-    background = np.array([False, False, False, False, True, False])
-    assert ceiling(weights, features, TEXTS, instances, background).tolist() == [1, 1, 1, -1, -1, -1]
+    instances = np.array([0, 0, 1, -1])
+    assert ceiling(features, np.array([0, 0, -1]), TEXTS, instances).tolist() == [1, 1, -1, -1]
+
+
+def test_the_ceiling_knows_what_each_mask_shows(capture):
+    first = int(capture.masks[0].max())
+    for mask in range(first):
+        shown = capture.frames[0].owner[capture.masks[0] == mask + 1]
+        counts = np.bincount(shown[shown >= 0], minlength=1)
+        assert counts[max(capture.mask_instance[mask], 0)] == counts.max()
+    assert len(capture.mask_instance) == sum(len(rows) for rows in capture.mask_features)
+    labels = ceiling(
+        np.concatenate(capture.mask_features), capture.mask_instance, capture.text_vectors, capture.instance
+    )
+    known = (capture.cls >= 0) & (labels >= 0)
+    assert (labels[known] == capture.cls[known]).mean() > 0.8, "eight small views show some objects only once"
+
+
+# The pictures ---------------------------------------------------------------------------------------------------
+
+
+def test_views_stand_above_their_masks(capture, tmp_path):
+    frames, path = capture.frames[:3], tmp_path / "views.png"
+    pictures.draw_views(path, [frame.image for frame in frames], capture.masks[:3])
+    sheet = cv2.imread(str(path))[:, :, ::-1]
+    assert sheet.shape == (2 * SMALL.height + 8, 3 * SMALL.width + 2 * 8, 3)
+    assert (sheet[: SMALL.height, : SMALL.width] == frames[0].image).all()
+    below = sheet[-SMALL.height :, -SMALL.width :].astype(float)
+    bare = capture.masks[2] == 0
+    assert np.abs(below[bare] - (0.35 * frames[2].image[bare] + 0.65 * 255)).max() <= 1
+
+
+def test_a_crash_of_the_renderer_is_found_out_beforehand(monkeypatch):
+    monkeypatch.setattr(pictures, "PROBE", "import os; os.abort()")
+    assert not pictures.can_render()
+
+
+def test_label_picture_shows_the_colours_of_its_classes(capture, tmp_path, monkeypatch):
+    monkeypatch.setattr(pictures, "OVERSAMPLING", 1)
+    if not pictures.can_render():
+        pytest.skip("PyVista cannot render off-screen here")
+    path = tmp_path / "labels.png"
+    white = np.full_like(capture.rgb, 255)
+    nothing = np.full_like(capture.cls, -1)
+    pictures.draw_labels(path, capture.xyz, white, nothing, capture.cls, CLASS_NAMES)
+    picture = cv2.imread(str(path))[:, :, ::-1]
+    sofa = np.abs(picture.astype(int) - pictures.PALETTE[CLASS_NAMES.index("sofa")]).max(axis=2) <= 2
+    width = picture.shape[1]
+    assert not sofa[:, : int(0.45 * width)].any(), "nothing was labelled"
+    assert sofa[:, int(0.45 * width) : int(0.9 * width)].sum() > 200
+    assert sofa[:, int(0.9 * width) :].sum() > 20, "the legend's swatch"

@@ -1,7 +1,7 @@
 """What labelling a point could be at its plainest and at its best: direct uplift, and the ceiling of true instances.
 
-Both read the mask table of the visibility stage: ``weights`` (masks, points) sparse, how much blending weight each
-mask puts on each point, and ``features`` (masks, D), one row per mask in the same order.
+Uplift reads the mask table of the visibility stage: ``weights`` (masks, points) sparse, how much blending weight each
+mask puts on each point, and ``features`` (masks, D), one row per mask in the same order. The ceiling reads the truth.
 """
 
 from __future__ import annotations
@@ -28,24 +28,20 @@ def direct_uplift(
 
 
 def ceiling(
-    weights: sparse.csr_matrix | sparse.csr_array, features: NDArray[np.floating], texts: NDArray[np.floating],
-    instances: NDArray[np.integer], background: NDArray[np.bool_],
+    features: NDArray[np.floating], mask_instance: NDArray[np.integer], texts: NDArray[np.floating],
+    instances: NDArray[np.integer],
 ) -> NDArray[np.int32]:  # fmt: skip
-    """True instances, each with the mean feature of the masks that lie mostly on it, and the text closest to that.
+    """True instances, each with the mean feature of the masks that show mostly it, and the text closest to that.
 
-    instances: (n,) true ids, -1 none; background: (n,) bool. A mask belongs to the instance that holds the largest part
-    of its weight on points of known truth; one that lies mostly on background belongs to none. Returns (n,) int32
-    class ids, -1 off the instances and for an instance without a mask.
+    features: (M, D); mask_instance: (M,) the true instance that each mask mostly shows, -1 for background; texts:
+    (C, D); instances: (n,) true instance of each point, -1 none. Returns (n,) int32 class ids, -1 off the instances and
+    for an instance without a mask.
     """
-    count = int(instances.max(initial=-1)) + 1
-    owner = np.where(background, count, instances)
-    onehot = (owner[:, None] == np.arange(count + 1)).astype(np.float32)
-    overlap = np.asarray(weights @ onehot)
-    of_mask = np.where(overlap.max(axis=1, initial=0) > 0, overlap.argmax(axis=1), count)
+    count = int(max(instances.max(initial=-1), mask_instance.max(initial=-1))) + 1
     label_of = np.full(count + 1, -1, np.int32)
     similarity = _unit(features) @ _unit(texts).T
-    for instance in np.unique(of_mask[of_mask < count]):
-        label_of[instance] = similarity[of_mask == instance].mean(axis=0).argmax()
+    for instance in np.unique(mask_instance[mask_instance >= 0]):
+        label_of[instance] = similarity[mask_instance == instance].mean(axis=0).argmax()
     return label_of[np.where(instances >= 0, instances, count)]
 
 

@@ -50,7 +50,7 @@ class CaptureSettings:
     depth_noise: float = 1.0
     range_m: float = 3.5
     samples_per_view: int = 25_000
-    flying: float = 0.04
+    flying: float = 0.02
     outliers: float = 5e-5
 
 
@@ -75,6 +75,13 @@ class RoomCapture:
     cls: NDArray[np.int32]
     instance: NDArray[np.int32]
     background: NDArray[np.bool_]
+
+    @property
+    def mask_instance(self) -> NDArray[np.int32]:
+        """(masks of all views,) the object that each mask shows most of, -1 where it shows none."""
+        views = zip(self.masks, self.frames, strict=True)
+        areas = np.concatenate([_area_px(ids, frame.owner, len(self.room.objects)) for ids, frame in views])
+        return np.where(areas.any(axis=1), areas.argmax(axis=1), -1).astype(np.int32)
 
 
 def make_capture(seed: int = 0, settings: CaptureSettings | None = None) -> RoomCapture:
@@ -201,10 +208,8 @@ def _mask_features(
     A mask over several objects gets the mean of their features by area (a share below a tenth goes unnoticed); a mask
     on bare background, or one that the encoder gets wrong, that of a random class.
     """
-    count, objects = int(ids.max()), len(class_of_object)
-    pair = ids.astype(np.int64) * (objects + 1) + owner + 1
-    area_px = np.bincount(pair.ravel(), minlength=(count + 1) * (objects + 1)).reshape(count + 1, objects + 1)[1:, 1:]
-    features = np.empty((count, model.texts.shape[1]), np.float32)
+    area_px = _area_px(ids, owner, len(class_of_object))
+    features = np.empty((len(area_px), model.texts.shape[1]), np.float32)
     for row, area in enumerate(area_px.astype(np.float64)):
         shown = np.flatnonzero(area > 0.1 * area.sum())
         if len(shown) == 0 or rng.uniform() < wrong_class:
@@ -213,6 +218,13 @@ def _mask_features(
             vector = sum(area[k] * model.image(int(class_of_object[k]), looks[k], rng) for k in shown)
         features[row] = vector / np.linalg.norm(vector)
     return features
+
+
+def _area_px(ids: NDArray[np.uint16], owner: NDArray[np.int32], objects: int) -> NDArray[np.int64]:
+    """(M, objects): pixels that each mask of a view has on each object."""
+    pair = ids.astype(np.int64) * (objects + 1) + owner + 1
+    masks = int(ids.max()) + 1
+    return np.bincount(pair.ravel(), minlength=masks * (objects + 1)).reshape(masks, objects + 1)[1:, 1:]
 
 
 # The folder -----------------------------------------------------------------------------------------------------

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -42,7 +43,12 @@ Colours = NDArray[np.uint8]
 
 
 def can_render() -> bool:
-    """Whether PyVista can draw off-screen here. Tried in a process of its own: without EGL or OSMesa VTK crashes."""
+    """Whether PyVista can draw off-screen here. Tried in a process of its own: without EGL or OSMesa VTK crashes.
+
+    Raises MissingExtraError where PyVista is not installed.
+    """
+    if importlib.util.find_spec("pyvista") is None:
+        raise MissingExtraError("pyvista", "demo")
     tried = subprocess.run([sys.executable, "-c", PROBE], capture_output=True, timeout=120, check=False)
     return tried.returncode == 0
 
@@ -143,10 +149,8 @@ def _name_instances(
 
 
 def _plotter(window_size: tuple[int, int], **layout: Any) -> pyvista.Plotter:
-    try:
-        import pyvista
-    except ImportError as error:
-        raise MissingExtraError("pyvista", "demo") from error
+    import pyvista
+
     large = [OVERSAMPLING * side for side in window_size]
     theme = pyvista.themes.DocumentTheme()
     return pyvista.Plotter(off_screen=True, window_size=large, border=False, theme=theme, **layout)
