@@ -1,0 +1,343 @@
+"""The command line: ``og-pointcloud fit | segment | info | demo``.
+
+A command imports what it needs when it runs, so that ``--help`` answers at once and ``segment`` works on the base
+install. Progress, warnings and errors go to stderr, results to stdout. Exit codes: 0 done, 2 bad use or bad input,
+130 interrupted.
+"""
+
+from __future__ import annotations
+
+import argparse
+import difflib
+import json
+import os
+import sys
+import time
+import warnings
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NoReturn, get_args, get_type_hints
+
+from og_pointcloud.cli_output import (
+    describe_bundle,
+    describe_fit,
+    describe_segmentation,
+    print_fit,
+    print_info,
+    print_segmentation,
+)
+from og_pointcloud.errors import BundleError, FeatureSpaceError, MissingExtraError, OgPointcloudError
+from og_pointcloud.settings import FitSettings
+
+if TYPE_CHECKING:
+    from og_pointcloud.cloud import LabelledCloud, Vocabulary
+    from og_pointcloud.scene import Scene
+
+__all__ = ["main"]
+
+MODES = get_args(get_type_hints(FitSettings)["mode"])
+MASK_LEVELS = ("default", "small", "medium", "large")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command; argv without the program's name, None for the process's own. Returns the exit code."""
+    parser = build_parser()
+    arguments, unknown = parser.parse_known_args(argv)
+    try:
+        if unknown:
+            raise OgPointcloudError(describe_unknown_option(unknown[0], arguments))
+        with warnings.catch_warnings():
+            warnings.simplefilter("always", UserWarning)
+            warnings.showwarning = print_warning
+            arguments.run(arguments)
+    except (OgPointcloudError, MissingExtraError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("interrupted: the files of this command were not written", file=sys.stderr)
+        return 130
+    return 0
+
+
+def print_warning(message: Warning | str, *_: object) -> None:
+    """In place of Python's two lines with a file name, which say nothing to someone who typed a command."""
+    print(f"warning: {message}", file=sys.stderr)
+
+
+class Parser(argparse.ArgumentParser):
+    """An argparse parser whose errors are one line, like every other error of the program."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        # Abbreviations would make `--mask` mean one thing today and another once an option is added.
+        super().__init__(*args, allow_abbrev=False, formatter_class=argparse.RawDescriptionHelpFormatter, **kwargs)
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(2, f"error: {message} ('{self.prog} --help' explains)\n")
+
+
+def build_parser() -> Parser:
+    parser = Parser(prog="og-pointcloud", description="Ask a point cloud or Gaussian splat for things by name.")
+    parser.add_argument("--version", action=VersionAction, help="print the version and leave")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    add_fit(commands)
+    add_segment(commands)
+    add_info(commands)
+    add_demo(commands)
+    return parser
+
+
+class VersionAction(argparse.Action):
+    """Looks the version up only when it is asked for."""
+
+    def __init__(self, option_strings: Sequence[str], dest: str, help: str | None = None) -> None:
+        super().__init__(option_strings, dest, nargs=0, help=help)
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> NoReturn:
+        from importlib.metadata import version
+
+        print(f"og-pointcloud {version('og-pointcloud')}")
+        parser.exit()
+
+
+def add_command(commands: Any, name: str, run: Any, summary: str, example: str) -> Parser:
+    parser = commands.add_parser(name, help=summary, description=summary, epilog=f"example:\n  {example}")
+    parser.set_defaults(run=run, parser=parser)
+    return parser
+
+
+def add_fit(commands: Any) -> None:
+    parser = add_command(
+        commands, "fit", run_fit, "Turn a capture folder (posed images with masks, and a cloud) into one .ogpc file.",
+        "og-pointcloud fit kitchen -o kitchen.ogpc",
+    )  # fmt: skip
+    parser.add_argument("capture", type=Path, metavar="CAPTURE", help="folder with poses, masks and mask features")
+    parser.add_argument("-o", "--output", type=Path, required=True, metavar="S.ogpc", help="the file to write")
+    parser.add_argument("--gaussians", type=Path, metavar="F.ply", help="geometry, in place of the capture's own")
+    parser.add_argument("--mode", choices=MODES, default="auto", help="which road to take (default: %(default)s)")
+    parser.add_argument(
+        "--mask-level", choices=MASK_LEVELS, default="large", help="level of LangSplat masks (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--vocabulary", type=Path, metavar="F.npz",
+        help="text features whose names can then be asked (default: the capture's text_features.npz)",
+    )  # fmt: skip
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="of everything random (default: %(default)s)")
+    parser.add_argument("--ply", type=Path, metavar="F.ply", help="also write the labelled cloud for other tools")
+    parser.add_argument("--json", type=Path, metavar="F.json", help="also write timings and settings of this run")
+
+
+def add_segment(commands: Any) -> None:
+    parser = add_command(
+        commands, "segment", run_segment, "Label points by words: those of the fitted cloud, or of another one.",
+        "og-pointcloud segment kitchen.ogpc --labels chair,table -o labels.npz",
+    )  # fmt: skip
+    parser.add_argument("bundle", type=Path, metavar="S.ogpc", help="what `fit` wrote")
+    parser.add_argument("--labels", metavar="A,B,C", help="names to choose among (default: all that are known)")
+    parser.add_argument("--text-features", type=Path, metavar="F.npz", help="names and vectors, from the same encoder")
+    parser.add_argument("--points", type=Path, metavar="CLOUD", help="points to label (default: those fitted)")
+    parser.add_argument("-o", "--output", type=Path, metavar="OUT", help="labels as .npz, or a coloured .ply")
+    parser.add_argument("--json", action="store_true", help="print the counts as JSON")
+
+
+def add_info(commands: Any) -> None:
+    parser = add_command(
+        commands, "info", run_info, "Say what a .ogpc file holds and how it was made.",
+        "og-pointcloud info kitchen.ogpc",
+    )  # fmt: skip
+    parser.add_argument("bundle", type=Path, metavar="S.ogpc", help="what `fit` wrote")
+    parser.add_argument("--json", action="store_true", help="print everything as JSON")
+
+
+def add_demo(commands: Any) -> None:
+    parser = add_command(
+        commands, "demo", run_demo_command, "Make a furnished room, fit it, ask it for things, score it and show it.",
+        "og-pointcloud demo -o out/demo",
+    )  # fmt: skip
+    parser.add_argument("-o", "--output", type=Path, default=Path("out/demo"), metavar="DIR", help="folder to fill")
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="another room (default: %(default)s)")
+    parser.add_argument(
+        "--mask-noise", type=float, default=1.0, metavar="X", help="0 clean masks, 1 realistic (default: %(default)s)"
+    )
+
+
+def describe_unknown_option(option: str, arguments: argparse.Namespace) -> str:
+    known = arguments.parser._option_string_actions
+    command = arguments.parser.prog
+    return (
+        f"'{option}' is unknown to '{command}'{did_you_mean(option.split('=')[0], known)} ('{command} --help' explains)"
+    )
+
+
+def did_you_mean(word: str, known: Iterable[str]) -> str:
+    close = difflib.get_close_matches(word, list(known), n=3)
+    return f"; did you mean {' or '.join(repr(match) for match in close)}?" if close else ""
+
+
+def run_fit(arguments: argparse.Namespace) -> None:
+    check_outputs(
+        {
+            "-o": (arguments.output, [".ogpc"]),
+            "--ply": (arguments.ply, [".ply"]),
+            "--json": (arguments.json, [".json"]),
+        },
+        inputs=[arguments.capture, arguments.gaussians, arguments.vocabulary],
+    )
+    from og_pointcloud_export import write_bundle
+
+    from og_pointcloud.fit import fit
+    from og_pointcloud.formats.capture import read_capture
+
+    stages: list[dict[str, Any]] = []
+    with timed(stages, "read capture"):
+        scene = read_capture(arguments.capture, gaussians=arguments.gaussians, mask_level=arguments.mask_level)
+        vocabulary, left_out = vocabulary_for(scene, arguments)
+    settings = FitSettings(mode=arguments.mode, seed=arguments.seed)
+    cloud = fit(scene, settings, progress=sys.stderr.isatty())
+    stages += cloud.provenance["stages"]
+    provenance = {**cloud.provenance, "stages": stages, "left_out": [*cloud.provenance["left_out"], *left_out]}
+    cloud = replace(cloud, vocabulary=vocabulary, provenance=provenance)
+    with timed(stages, "write file"):
+        arguments.output.parent.mkdir(parents=True, exist_ok=True)
+        write_bundle(cloud, arguments.output)
+    if arguments.ply:
+        with timed(stages, "write cloud"):
+            write_cloud(cloud, arguments.output, arguments.ply)
+    report = describe_fit(cloud, arguments.capture, arguments.output)
+    if arguments.json:
+        write_json(arguments.json, report)
+    print_fit(report, cloud)
+
+
+def vocabulary_for(scene: Scene, arguments: argparse.Namespace) -> tuple[Vocabulary | None, list[dict[str, str]]]:
+    """Words for the bundle, and what was left out: those asked for, else the capture's own if their space fits."""
+    from og_pointcloud.text_features import read_text_features
+
+    path = arguments.vocabulary or arguments.capture / "text_features.npz"
+    if not arguments.vocabulary and not path.is_file():
+        return None, []
+    vocabulary, feature_space = read_text_features(path)
+    width = vocabulary.vectors.shape[1]
+    if feature_space == scene.feature_space and width == (scene.feature_width or width):
+        return vocabulary, []
+    why = (
+        f"{path} is of feature space '{feature_space}' (width {width}), the masks are of '{scene.feature_space}' "
+        f"(width {scene.feature_width}): encode the names with the masks' model"
+    )
+    if arguments.vocabulary:
+        raise FeatureSpaceError(why)
+    return None, [{"what": "vocabulary", "why": why}]
+
+
+def write_cloud(cloud: LabelledCloud, bundle: Path, path: Path) -> None:
+    """The fitted cloud as .ply, coloured by the best word of each instance, or by instance where there are no words."""
+    import numpy as np
+
+    from og_pointcloud.formats.points import write_labelled_ply
+    from og_pointcloud.runtime import segment
+    from og_pointcloud.segmentation import UNKNOWN, label_colors
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if cloud.vocabulary:
+        segment(bundle).save(path)
+        return
+    ids, unknown = cloud.instance_ids, np.full(len(cloud), UNKNOWN)
+    colors = label_colors(np.maximum(ids, UNKNOWN))
+    write_labelled_ply(path, cloud.xyz_world, colors, ids, unknown, np.zeros(len(cloud)))
+
+
+def run_segment(arguments: argparse.Namespace) -> None:
+    check_outputs(
+        {"-o": (arguments.output, [".npz", ".ply"])},
+        inputs=[arguments.bundle, arguments.text_features, arguments.points],
+    )
+    from og_pointcloud.runtime import load, segment
+
+    labels = (
+        None if arguments.labels is None else [name.strip() for name in arguments.labels.split(",") if name.strip()]
+    )
+    stages: list[dict[str, Any]] = []
+    with timed(stages, "load"):
+        scene = load(arguments.bundle)
+    with timed(stages, "segment"):
+        result = segment(arguments.points or scene, labels, scene=scene, text_features=arguments.text_features)
+    if arguments.output:
+        with timed(stages, "save"):
+            arguments.output.parent.mkdir(parents=True, exist_ok=True)
+            result.save(arguments.output)
+    report = describe_segmentation(result, stages, arguments.bundle, arguments.output)
+    if arguments.json:
+        print(json.dumps(report, indent=2, ensure_ascii=False))
+    else:
+        print_segmentation(report)
+
+
+def run_info(arguments: argparse.Namespace) -> None:
+    from og_pointcloud.runtime import load
+
+    scene = load(arguments.bundle)
+    if arguments.json:
+        print(json.dumps(describe_bundle(scene, arguments.bundle), indent=2, ensure_ascii=False))
+        return
+    try:
+        print_info(scene, arguments.bundle)
+    except (KeyError, TypeError, ValueError):  # the one part of a file that reading it does not check
+        raise BundleError(
+            f"{arguments.bundle}: its provenance is not in the form that fit writes; see --json"
+        ) from None
+
+
+def run_demo_command(arguments: argparse.Namespace) -> None:
+    from og_pointcloud_room.demo import run_demo
+
+    run_demo(arguments.output, seed=arguments.seed, mask_noise=arguments.mask_noise)
+
+
+def check_outputs(outputs: Mapping[str, tuple[Path | None, Sequence[str]]], inputs: Iterable[Path | None]) -> None:
+    """Refuse, before any work, an output that cannot be written or that would replace an input.
+
+    outputs: option -> (path or None, the endings it may have).
+    """
+    sources = [path.resolve() for path in inputs if path]
+    taken: dict[Path, str] = {}
+    for option, (path, endings) in outputs.items():
+        if path is None:
+            continue
+        resolved = path.resolve()
+        if path.suffix not in endings:
+            raise OgPointcloudError(f"{option} is '{path}'; expected a name that ends in {' or '.join(endings)}")
+        if path.is_dir():
+            raise OgPointcloudError(f"{option} is '{path}', which is a folder; expected a file name")
+        if replaces_input(resolved, sources):
+            raise OgPointcloudError(
+                f"{option} is '{path}', a file that is read; expected another name, so that it stays"
+            )
+        if resolved in taken:
+            raise OgPointcloudError(f"{taken[resolved]} and {option} are both '{path}'; expected two names")
+        taken[resolved] = option
+        existing = next(parent for parent in resolved.parents if parent.exists())
+        if not existing.is_dir() or not os.access(existing, os.W_OK):
+            raise OgPointcloudError(f"{option} is '{path}', but '{existing}' is not a folder that can be written to")
+
+
+def replaces_input(path: Path, sources: Sequence[Path]) -> bool:
+    """Also true for what lies in a capture folder already, except a .ogpc, which is never an input of fit."""
+    in_capture = any(source in path.parents for source in sources) and path.exists() and path.suffix != ".ogpc"
+    return path in sources or in_capture
+
+
+def write_json(path: Path, value: Mapping[str, Any]) -> None:
+    from og_pointcloud._atomic import replacing
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(path) as file:
+        file.write(json.dumps(value, indent=2, ensure_ascii=False).encode() + b"\n")
+
+
+@contextmanager
+def timed(stages: list[dict[str, Any]], name: str) -> Iterator[None]:
+    """Append {"name", "seconds"} for what runs inside."""
+    start = time.perf_counter()
+    yield
+    stages.append({"name": name, "seconds": round(time.perf_counter() - start, 4)})

@@ -1,0 +1,167 @@
+"""What the commands print: a record for --json, and the same as lines for a reader."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from og_pointcloud.cloud import LabelledCloud
+    from og_pointcloud.runtime import LabelledScene
+    from og_pointcloud.segmentation import Segmentation
+
+__all__ = [
+    "describe_bundle",
+    "describe_fit",
+    "describe_segmentation",
+    "print_fit",
+    "print_info",
+    "print_segmentation",
+]
+
+SHOWN = 12
+"""Words, and instances, that a list shows before it ends in dots."""
+
+
+def describe_fit(cloud: LabelledCloud, capture: Path, bundle: Path) -> dict[str, Any]:
+    """What ``fit --json`` writes: counts, the file, and the provenance (stages, settings, what was left out)."""
+    from og_pointcloud.cloud import BACKGROUND, UNOBSERVED
+
+    ids = cloud.instance_ids
+    return {
+        "capture": str(capture),
+        "output": str(bundle),
+        "bytes": bundle.stat().st_size,
+        "points": len(cloud),
+        "instances": len(cloud.instances),
+        "points_in_instances": int((ids >= 0).sum()),
+        "points_background": int((ids == BACKGROUND).sum()),
+        "points_unobserved": int((ids == UNOBSERVED).sum()),
+        "feature_space": cloud.feature_space,
+        "vocabulary": len(cloud.vocabulary.names) if cloud.vocabulary else 0,
+        "seconds": round(sum(stage["seconds"] for stage in cloud.provenance["stages"]), 3),
+        **cloud.provenance,
+    }
+
+
+def print_fit(report: Mapping[str, Any], cloud: LabelledCloud) -> None:
+    """What ``fit`` closes with; ends in the next command."""
+    print_provenance(cloud.provenance)
+    total = report["points"]
+    shares = [report[f"points_{state}"] / total for state in ("in_instances", "background", "unobserved")]
+    print(
+        f"{total:,} points: {shares[0]:.1%} in {report['instances']} instances, {shares[1]:.1%} background, "
+        f"{shares[2]:.1%} unobserved"
+    )
+    print(f"wrote {report['output']} ({report['bytes'] / 1e6:.1f} MB)")
+    print(f"next: {next_segment_command(report['output'], cloud)}")
+
+
+def next_segment_command(bundle: str, cloud: LabelledCloud) -> str:
+    """A segment command that works as it stands, or names what it still needs."""
+    command = ["og-pointcloud", "segment", bundle]
+    if cloud.vocabulary and cloud.vocabulary.names:
+        labels = ["--labels", ",".join(cloud.vocabulary.names[:2])]
+    else:
+        labels = ["--text-features", f"{cloud.feature_space.replace('/', '_')}_names.npz"]
+    return shlex.join([*command, *labels, "-o", str(Path(bundle).with_suffix(".ply"))])
+
+
+def describe_segmentation(
+    result: Segmentation, stages: Sequence[Mapping[str, Any]], bundle: Path, output: Path | None
+) -> dict[str, Any]:
+    """What ``segment --json`` prints: points of each name, and why the others are unknown."""
+    from og_pointcloud.bundle import TOO_FAR
+    from og_pointcloud.cloud import BACKGROUND, UNOBSERVED
+
+    unknown = result.labels < 0
+    states = {"background": BACKGROUND, "unobserved": UNOBSERVED, "too far from the scene": TOO_FAR}
+    reasons = {name: int((result.instances == state).sum()) for name, state in states.items()}
+    reasons["instance without a feature"] = int((unknown & (result.instances >= 0)).sum())
+    return {
+        "bundle": str(bundle),
+        "output": str(output) if output else None,
+        "points": len(result),
+        "counts": result.counts(),
+        "unknown": int(unknown.sum()),
+        "unknown_because": reasons,
+        "seconds": {stage["name"]: stage["seconds"] for stage in stages},
+    }
+
+
+def print_segmentation(report: Mapping[str, Any]) -> None:
+    """The names that were found, in the order asked, and the share that stays unknown."""
+    total = max(report["points"], 1)
+    found = {name: count for name, count in report["counts"].items() if count}
+    rows = [(name, f"{count:,}", f"{count / total:.1%}") for name, count in found.items()]
+    rows.append(("unknown", f"{report['unknown']:,}", f"{report['unknown'] / total:.1%}"))
+    print_table(("label", "points", "share"), rows)
+    absent = [name for name in report["counts"] if name not in found]
+    if absent:
+        print(f"no point: {', '.join(absent[:SHOWN])}{', ...' if len(absent) > SHOWN else ''}")
+    reasons = [f"{count:,} {name}" for name, count in report["unknown_because"].items() if count]
+    if reasons:
+        print(f"unknown: {', '.join(reasons)}")
+    print(", ".join(f"{name} {seconds:.2f} s" for name, seconds in report["seconds"].items()))
+    if report["output"]:
+        print(f"wrote {report['output']}")
+    else:
+        command = ["og-pointcloud", "segment", report["bundle"], "-o", str(Path(report["bundle"]).with_suffix(".ply"))]
+        print(f"next: keep the labels with -o, e.g. {shlex.join(command)}")
+
+
+def describe_bundle(scene: LabelledScene, path: Path) -> dict[str, Any]:
+    """What ``info --json`` prints: the manifest, with the file's size and its words."""
+    words = list(scene.vocabulary.names) if scene.vocabulary else []
+    return {"path": str(path), "bytes": path.stat().st_size, "words": words, **scene.manifest}
+
+
+def print_info(scene: LabelledScene, path: Path) -> None:
+    """The file's size, frame and words, its largest instances, and how it was made."""
+    cloud, manifest = scene.cloud, scene.manifest
+    words = cloud.vocabulary.names if cloud.vocabulary else ()
+    print(f"{path}: {path.stat().st_size / 1e6:.1f} MB, {manifest.get('written_by', 'unknown writer')}")
+    print(f"{len(cloud):,} points, {len(cloud.instances)} instances, feature space '{cloud.feature_space}'")
+    origin = ", ".join(f"{value:g}" for value in cloud.origin)
+    print(f"spacing {cloud.spacing:.4g}, reach {cloud.reach:.4g}, origin ({origin}), in the capture's unit")
+    print(f"{len(words)} words: {', '.join(words[:SHOWN])}{', ...' if len(words) > SHOWN else ''}\n")
+    print_instances(scene)
+    print()
+    print_provenance(cloud.provenance)
+
+
+def print_instances(scene: LabelledScene) -> None:
+    """The largest instances, with the evidence for each and the word that fits it best."""
+    table, vocabulary = scene.instances, scene.vocabulary
+    largest = table.points.argsort(kind="stable")[::-1][:SHOWN]
+    described = set(table.descriptor_instance.tolist())
+    best = scene.instance_scores(vocabulary.vectors).argmax(axis=1) if vocabulary and vocabulary.names else None
+    rows = []
+    for index in largest.tolist():
+        word = vocabulary.names[best[index]] if vocabulary and best is not None and index in described else "-"
+        evidence = (f"{table.points[index]:,}", str(table.views[index]), str(table.masks[index]))
+        rows.append((str(index), *evidence, f"{table.agreement[index]:.2f}", word))
+    print_table(("instance", "points", "views", "masks", "agreement", "best word"), rows)
+    if len(table) > SHOWN:
+        print(f"and {len(table) - SHOWN} smaller ones")
+
+
+def print_provenance(provenance: Mapping[str, Any]) -> None:
+    stages = provenance.get("stages", [])
+    if stages:
+        rows = [(stage["name"], f"{stage['seconds']:.2f}") for stage in stages]
+        print_table(("stage", "seconds"), [*rows, ("total", f"{sum(stage['seconds'] for stage in stages):.2f}")])
+    for entry in provenance.get("left_out", []):
+        print(f"left out: {entry['what']}: {entry['why']}")
+    for text in provenance.get("warnings", []):
+        print(f"warning: {text}")
+
+
+def print_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    """The first column to the left, numbers to the right."""
+    widths = [max(len(row[column]) for row in [header, *rows]) for column in range(len(header))]
+    for row in [header, *rows]:
+        first, *others = (cell.rjust(width) for cell, width in zip(row, widths, strict=True))
+        print("  ".join([first.strip().ljust(widths[0]), *others]))
