@@ -1,3 +1,100 @@
-"""og_pointcloud: open-vocabulary labels for point clouds and Gaussian splats."""
+"""og_pointcloud: open-vocabulary labels for point clouds and Gaussian splats.
+
+    import og_pointcloud as og
+
+    scene = og.load("kitchen.ogpc")
+    result = og.segment(points, ["chair", "desk"], scene)      # points: (N, 3), or an Open3D or PyVista cloud
+    result.labels, result.scores, result.instances, result.mask("chair")
+
+Importing costs little: each name is fetched from its module on first use, and only ``fit``, ``read_capture`` and
+``write_bundle`` need more than numpy and onnxruntime (the extra 'fit').
+"""
 
 from __future__ import annotations
+
+import importlib
+import sys
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from og_pointcloud_export import write_bundle
+
+    from og_pointcloud.bundle import TOO_FAR, read_bundle
+    from og_pointcloud.cloud import BACKGROUND, UNOBSERVED, InstanceTable, LabelledCloud, Vocabulary
+    from og_pointcloud.errors import BundleError, FeatureSpaceError, MissingExtraError, OgPointcloudError, SceneError
+    from og_pointcloud.fit import fit
+    from og_pointcloud.formats.capture import read_capture
+    from og_pointcloud.formats.points import read_points
+    from og_pointcloud.runtime import LabelledScene, Segmenter, load, segment, use
+    from og_pointcloud.segmentation import UNKNOWN, Segmentation
+    from og_pointcloud.settings import FitSettings
+    from og_pointcloud.text_features import read_text_features
+
+__all__ = [
+    "BACKGROUND",
+    "TOO_FAR",
+    "UNKNOWN",
+    "UNOBSERVED",
+    "BundleError",
+    "FeatureSpaceError",
+    "FitSettings",
+    "InstanceTable",
+    "LabelledCloud",
+    "LabelledScene",
+    "MissingExtraError",
+    "OgPointcloudError",
+    "SceneError",
+    "Segmentation",
+    "Segmenter",
+    "Vocabulary",
+    "fit",
+    "load",
+    "read_bundle",
+    "read_capture",
+    "read_points",
+    "read_text_features",
+    "segment",
+    "use",
+    "write_bundle",
+]
+
+_HOMES = {
+    "og_pointcloud.bundle": ("TOO_FAR", "read_bundle"),
+    "og_pointcloud.cloud": ("BACKGROUND", "UNOBSERVED", "InstanceTable", "LabelledCloud", "Vocabulary"),
+    "og_pointcloud.errors": (
+        "BundleError", "FeatureSpaceError", "MissingExtraError", "OgPointcloudError", "SceneError",
+    ),
+    "og_pointcloud.fit": ("fit",),
+    "og_pointcloud.formats.capture": ("read_capture",),
+    "og_pointcloud.formats.points": ("read_points",),
+    "og_pointcloud.runtime": ("LabelledScene", "Segmenter", "load", "segment", "use"),
+    "og_pointcloud.segmentation": ("UNKNOWN", "Segmentation"),
+    "og_pointcloud.settings": ("FitSettings",),
+    "og_pointcloud.text_features": ("read_text_features",),
+    "og_pointcloud_export": ("write_bundle",),
+}  # fmt: skip
+_HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME_OF:
+        raise AttributeError(f"module 'og_pointcloud' has no attribute '{name}'")
+    value = getattr(importlib.import_module(_HOME_OF[name]), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
+
+
+class _Package(ModuleType):
+    """Keeps ``og.fit`` the function: importing the module of that name would otherwise put itself in its place."""
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        is_own_module = isinstance(value, ModuleType) and _HOME_OF.get(name) == value.__name__
+        super().__setattr__(name, getattr(value, name) if is_own_module else value)
+
+
+sys.modules[__name__].__class__ = _Package

@@ -1,0 +1,201 @@
+"""LabelledCloud -> one .ogpc file; og_pointcloud.bundle says what is in it, and reads it."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import os
+import zipfile
+from dataclasses import dataclass, fields
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from og_pointcloud._atomic import replacing
+from og_pointcloud._onnxruntime import open_session
+from og_pointcloud.bundle import FORMAT, SCHEMA_VERSION, TOO_FAR
+from og_pointcloud.cloud import InstanceTable, LabelledCloud, Vocabulary
+from og_pointcloud.errors import OgPointcloudError
+from og_pointcloud.nearest import NONE_WITHIN_REACH, NearestPoint
+from og_pointcloud_export.brick_grid import BrickGrid, build_brick_grid
+from og_pointcloud_export.query_head import OPSET, build_query_head, reference_scores
+
+__all__ = ["query_model", "write_bundle"]
+
+SCORE_TOLERANCE = 1e-5
+"""Largest cosine error of the graph against float64 that is let through; float32 sums of 512 terms reach 1e-6."""
+HALF_PRECISION_TOLERANCE = 1e-3
+"""Words are stored as float16 where no cosine with a descriptor moves by more, and no instance's best word changes."""
+PARITY_TEXTS, PARITY_POINTS = 64, 4096
+
+
+@dataclass(frozen=True)
+class QueryModel:
+    """query.onnx of a cloud. parity: its largest differences from float64; grid: size and share of certain cells."""
+
+    onnx: bytes
+    parity: dict[str, Any]
+    grid: dict[str, Any]
+
+
+def write_bundle(cloud: LabelledCloud, path: str | os.PathLike[str]) -> Path:
+    """Write a cloud as .ogpc, whole or not at all, the same bytes for the same cloud. Returns the path.
+
+    Raises OgPointcloudError where the provenance is no JSON, or where the graph disagrees with numpy: then nothing is
+    written.
+    """
+    path = Path(path)
+    model = query_model(cloud)
+    members = {"query.onnx": model.onnx} | {f"arrays/{name}.npy": _npy(array) for name, array in _arrays(cloud).items()}
+    vocabulary_error = None
+    if cloud.vocabulary is not None:
+        vectors, vocabulary_error = _compact_vectors(cloud.vocabulary, cloud.instances)
+        members["vocabulary/names.json"] = json.dumps(list(cloud.vocabulary.names), ensure_ascii=False).encode()
+        members["vocabulary/vectors.npy"] = _npy(vectors)
+    manifest = _manifest(cloud, model, members, {**model.parity, "vocabulary_cosine_error": vocabulary_error})
+    with replacing(path) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
+        for name, data in {"manifest.json": manifest, **members}.items():
+            archive.writestr(zipfile.ZipInfo(name), data)  # a ZipInfo of its own: the date stays 1980, the bytes too
+    return path
+
+
+def query_model(cloud: LabelledCloud) -> QueryModel:
+    """Build a cloud's query.onnx and hold it against numpy in float64; OgPointcloudError if they differ."""
+    grid = build_brick_grid(cloud)
+    onnx = build_query_head(cloud, grid)
+    parity = _parity(cloud, onnx)
+    if parity["instance_score_error"] > SCORE_TOLERANCE or parity["certain_points_wrong"]:
+        raise OgPointcloudError(
+            f"query.onnx differs from float64: scores by {parity['instance_score_error']:.3g} (expected at most "
+            f"{SCORE_TOLERANCE}), {parity['certain_points_wrong']} certain points wrong (expected 0): descriptors must "
+            "be unit rows; if they are, please report this cloud"
+        )
+    return QueryModel(onnx, parity, _describe_grid(grid))
+
+
+def _arrays(cloud: LabelledCloud) -> dict[str, NDArray[Any]]:
+    """What lies under arrays/; the descriptors lie in query.onnx alone, where the manifest says."""
+    table = {field.name: getattr(cloud.instances, field.name) for field in fields(InstanceTable)}
+    del table["descriptors"]
+    arrays = {"xyz": cloud.xyz, "instance_ids": _smallest_signed(cloud.instance_ids)}
+    if cloud.rgb is not None:
+        arrays["rgb"] = cloud.rgb
+    return arrays | {f"instances/{name}": array for name, array in table.items()}
+
+
+def _smallest_signed(ids: NDArray[np.int32]) -> NDArray[np.signedinteger]:
+    largest = int(ids.max(initial=0))
+    return ids.astype(next(kind for kind in (np.int8, np.int16, np.int32) if largest <= np.iinfo(kind).max))
+
+
+def _npy(array: NDArray[Any]) -> bytes:
+    stream = io.BytesIO()
+    little_endian = array.astype(array.dtype.newbyteorder("<"), copy=False)
+    np.lib.format.write_array(stream, np.ascontiguousarray(little_endian), version=(1, 0), allow_pickle=False)
+    return stream.getvalue()
+
+
+def _compact_vectors(vocabulary: Vocabulary, instances: InstanceTable) -> tuple[NDArray[np.floating], float]:
+    """Unit vectors, as float16 if that changes no answer, and the largest change of a cosine that this makes."""
+    vectors = vocabulary.vectors.astype(np.float64)
+    length = np.linalg.norm(vectors, axis=1, keepdims=True)
+    unit = np.divide(vectors, length, out=np.zeros_like(vectors), where=length > 0)
+    if instances.descriptors.size == 0 or unit.size == 0:
+        return unit.astype(np.float16), 0.0
+    half = unit.astype(np.float16)
+    exact, stored = reference_scores(instances, unit), reference_scores(instances, half)
+    error = float(np.abs(stored - exact).max())
+    if error <= HALF_PRECISION_TOLERANCE and (exact.argmax(axis=1) == stored.argmax(axis=1)).all():
+        return half, error
+    return unit.astype(np.float32), float(np.abs(reference_scores(instances, unit.astype(np.float32)) - exact).max())
+
+
+def _parity(cloud: LabelledCloud, onnx: bytes) -> dict[str, Any]:
+    """Run the graph on the cloud's words and random vectors, on its points and on points about them."""
+    session = open_session(onnx)
+    random = np.random.default_rng(0)
+    width = session.get_inputs()[1].shape[1]
+    text = random.normal(size=(PARITY_TEXTS, width)).astype(np.float32)
+    if cloud.vocabulary is not None and cloud.vocabulary.vectors.shape[1] == width:
+        text = np.concatenate([cloud.vocabulary.vectors, text])
+    points = cloud.xyz[random.integers(0, len(cloud), PARITY_POINTS)] if len(cloud) else cloud.xyz
+    points = points + (random.normal(size=points.shape) * random.choice([0, 0.5, 2], (len(points), 1)) * cloud.spacing)
+    points = points.astype(np.float32)
+
+    names = ["instance_scores", "instance", "certain"]
+    scores, instance, certain = (np.asarray(out) for out in session.run(names, {"points": points, "text": text}))
+    nearest = NearestPoint(cloud.xyz, cloud.spacing, cloud.reach).query(points)
+    exact = np.full(len(points), TOO_FAR, np.int32)
+    exact[nearest != NONE_WITHIN_REACH] = cloud.instance_ids[nearest[nearest != NONE_WITHIN_REACH]]
+    reference = reference_scores(cloud.instances, text)
+    return {
+        "texts": len(text),
+        "instance_score_error": float(np.abs(scores - reference).max(initial=0.0)),
+        "labels_different": int((scores.argmax(axis=1) != reference.argmax(axis=1)).sum()),
+        "points": len(points),
+        "certain_points_wrong": int((certain & (instance != exact)).sum()),
+        "open_points": int((~certain).sum()),
+        "open_points_wrong_without_exact_search": int((~certain & (instance != exact)).sum()),
+    }
+
+
+def _describe_grid(grid: BrickGrid) -> dict[str, Any]:
+    return {
+        "cell_size": float(grid.cell_size),
+        "bricks": list(grid.bricks.shape),
+        "bricks_stored": len(grid.cells),
+        "bytes": grid.bricks.nbytes + grid.cells.nbytes,
+        "certain_cells": round(float((grid.cells < grid.codes).mean()), 4),
+    }
+
+
+def _manifest(cloud: LabelledCloud, model: QueryModel, members: dict[str, bytes], parity: dict[str, Any]) -> bytes:
+    descriptors = np.ascontiguousarray(cloud.instances.descriptors, "<f4")
+    manifest = {
+        "format": FORMAT,
+        "schema_version": SCHEMA_VERSION,
+        "written_by": f"og-pointcloud {_own_version()}",
+        "feature_space": cloud.feature_space,
+        "frame": {
+            "origin": cloud.origin.tolist(), "unit": "of the capture", "spacing": float(cloud.spacing),
+            "reach": float(cloud.reach),
+        },
+        "counts": {
+            "points": len(cloud), "instances": len(cloud.instances), "descriptors": len(descriptors),
+            "words": len(cloud.vocabulary.names) if cloud.vocabulary is not None else 0,
+        },
+        # Stored once, as constants of the graph.
+        "descriptors": {
+            "member": "query.onnx", "offset": model.onnx.index(descriptors.tobytes()) if descriptors.size else 0,
+            "shape": list(descriptors.shape),
+        },
+        "query_head": {"opset": OPSET, "grid": model.grid},
+        "parity": parity,
+        "members": {name: _describe_member(name, data) for name, data in members.items()},
+        "provenance": cloud.provenance,
+    }  # fmt: skip
+    try:
+        return json.dumps(manifest, indent=1, ensure_ascii=False).encode()
+    except TypeError as error:
+        raise OgPointcloudError(
+            f"the cloud's provenance cannot be written as JSON ({error}): use plain types"
+        ) from None
+
+
+def _describe_member(name: str, data: bytes) -> dict[str, Any]:
+    entry: dict[str, Any] = {"bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}
+    if name.endswith(".npy"):
+        array = np.load(io.BytesIO(data), allow_pickle=False)
+        entry |= {"dtype": array.dtype.str, "shape": list(array.shape)}
+    return entry
+
+
+def _own_version() -> str:
+    try:
+        return version("og-pointcloud")
+    except PackageNotFoundError:
+        return "unknown"

@@ -1,0 +1,141 @@
+"""The nearest cloud point within reach, exactly: hashed voxels in plain numpy, for what the brick grid leaves open."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["NONE_WITHIN_REACH", "NearestPoint", "VoxelBuckets"]
+
+NONE_WITHIN_REACH = -1
+"""Index answered for a query that has no cloud point within reach."""
+
+QUERIES_PER_CHUNK = 8192
+CANDIDATES_PER_CHUNK = 1_000_000
+"""What bounds the memory of a search: about 60 MB."""
+LEVEL_FACTOR = 2.0
+"""How much wider each next search is. Most queries lie within one spacing of the cloud and need only the first."""
+EDGE_SLACK = 1e-6
+"""Voxels are that much wider than the radius: rounding must not put a point at that distance two voxels away."""
+
+
+class VoxelBuckets:
+    """Points sorted by a hash of their voxel, voxels that follow one another along z in buckets that follow too.
+
+    Voxels that share a bucket by accident do no harm: their points are farther away, and distances are true ones.
+
+    xyz: (n, 3) float32. edge: of a voxel. run: how many buckets in a row a search reads at once.
+    """
+
+    def __init__(self, xyz: NDArray[np.float32], edge: float, run: int = 3) -> None:
+        self.edge = edge
+        self.mask = (1 << max(6, (2 * len(xyz)).bit_length())) - 1
+        bucket = self.bucket(self.voxel(xyz.astype(np.float64)))
+        order = np.argsort(bucket, kind="stable")  # stable: equal distances are settled for the lowest index
+        starts = np.zeros(self.mask + 2, np.int64)
+        np.cumsum(np.bincount(bucket, minlength=self.mask + 1), out=starts[1:])
+        # The first buckets once more at the end, so that a run may start at the last one.
+        self.starts = np.concatenate([starts, len(xyz) + starts[1:run]])
+        self.point = np.concatenate([order, order[: starts[run - 1]]])
+        """Index of each sorted point in the cloud."""
+        self.x, self.y, self.z = np.ascontiguousarray(xyz[self.point].T, np.float64)
+
+    def voxel(self, xyz: NDArray[np.float64]) -> NDArray[np.int64]:
+        """Integer coordinates of the voxel of each point."""
+        # The clip keeps coordinates of 1e30, which are far from anything, inside int64.
+        return np.floor(np.clip(xyz / self.edge, -1e15, 1e15)).astype(np.int64)
+
+    def bucket(self, voxel: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Bucket of each voxel; integers wrap, which is a hash too."""
+        return (voxel[..., 0] * 73856093 + voxel[..., 1] * 19349663 + voxel[..., 2]) & self.mask
+
+
+class NearestPoint:
+    """Answers, for any point, which cloud point is nearest, if one lies within reach.
+
+    "Nearest" is decided in float64 on the float32 coordinates; of points equally near the lowest index wins; a distance
+    of exactly ``reach`` counts. Time grows with (distance / spacing)^2 of a query, memory stays bounded.
+
+    xyz: (n, 3) float32, local frame. spacing, reach: lengths in its unit.
+    """
+
+    def __init__(self, xyz: NDArray[np.float32], spacing: float, reach: float) -> None:
+        self._xyz = xyz
+        self._reach = reach
+        count = max(0, int(np.ceil(np.log(reach / spacing) / np.log(LEVEL_FACTOR))))
+        self._radii = [spacing * LEVEL_FACTOR**level for level in range(count)] + [reach]
+        self._levels: dict[float, VoxelBuckets] = {}
+
+    def query(self, points: NDArray[np.float32]) -> NDArray[np.int64]:
+        """(m,) index of the nearest cloud point, or NONE_WITHIN_REACH. points: (m, 3) float32, finite, local frame."""
+        nearest = np.full(len(points), NONE_WITHIN_REACH, np.int64)
+        if len(self._xyz) == 0:
+            return nearest
+        pending = np.arange(len(points))
+        for radius in self._radii:
+            if len(pending) == 0:
+                break
+            if radius not in self._levels:
+                self._levels[radius] = VoxelBuckets(self._xyz, radius * (1 + EDGE_SLACK))
+            found = _nearest_within(self._levels[radius], points[pending].astype(np.float64), radius)
+            nearest[pending] = found
+            pending = pending[found == NONE_WITHIN_REACH]
+        return nearest
+
+
+_COLUMNS = np.array([(x, y) for x in (-1, 0, 1) for y in (-1, 0, 1)])
+
+
+def _nearest_within(buckets: VoxelBuckets, points: NDArray[np.float64], radius: float) -> NDArray[np.int64]:
+    """Index of the nearest point no farther than radius (just under the voxels' edge), else NONE_WITHIN_REACH."""
+    nearest = np.full(len(points), NONE_WITHIN_REACH, np.int64)
+    for first in range(0, len(points), QUERIES_PER_CHUNK):
+        chunk = points[first : first + QUERIES_PER_CHUNK]
+        # The 27 voxels around a point are 9 columns of three buckets in a row.
+        voxel = np.repeat(buckets.voxel(chunk)[:, None] - [0, 0, 1], len(_COLUMNS), axis=1)
+        voxel[..., :2] += _COLUMNS
+        bucket = buckets.bucket(voxel)
+        start = buckets.starts[bucket]
+        count = buckets.starts[bucket + 3] - start
+        candidates = np.cumsum(count.sum(axis=1))
+        parts = np.searchsorted(candidates, np.arange(CANDIDATES_PER_CHUNK, candidates[-1], CANDIDATES_PER_CHUNK))
+        edges = np.unique(np.concatenate([[0], parts, [len(chunk)]]))
+        for low, high in itertools.pairwise(edges):
+            rows = slice(low, high)
+            nearest[first + low : first + high] = _settle(buckets, chunk[rows], start[rows], count[rows], radius)
+    return nearest
+
+
+def _settle(
+    buckets: VoxelBuckets,
+    points: NDArray[np.float64],
+    start: NDArray[np.int64],
+    count: NDArray[np.int64],
+    radius: float,
+) -> NDArray[np.int64]:
+    """Nearest of each point's candidates: sorted points start..start + count of each of its columns, (m, 9) both."""
+    nearest = np.full(len(points), NONE_WITHIN_REACH, np.int64)
+    per_query = count.sum(axis=1)
+    per_column = count.ravel()
+    end = np.cumsum(per_column)
+    if end[-1] == 0:
+        return nearest
+    candidate = np.arange(end[-1]) + np.repeat(start.ravel() - end + per_column, per_column)
+    squared = np.zeros(len(candidate))
+    for axis, coordinate in enumerate((buckets.x, buckets.y, buckets.z)):
+        difference = coordinate[candidate]
+        difference -= np.repeat(points[:, axis], per_query)
+        difference *= difference
+        squared += difference
+
+    asked = np.flatnonzero(per_query)
+    first = (np.cumsum(per_query) - per_query)[asked]
+    smallest = np.minimum.reduceat(squared, first)
+    hit = np.flatnonzero(squared == np.repeat(np.where(smallest <= radius * radius, smallest, -1.0), per_query[asked]))
+    if len(hit):
+        owner = asked[np.searchsorted(first, hit, side="right") - 1]
+        ties = np.flatnonzero(np.diff(owner, prepend=-1))
+        nearest[owner[ties]] = np.minimum.reduceat(buckets.point[candidate[hit]], ties)
+    return nearest

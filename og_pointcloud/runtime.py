@@ -1,0 +1,333 @@
+"""Text in, labels out: opens a .ogpc and asks it about points. numpy and onnxruntime, nothing else.
+
+``segment`` is one statement a step: which scene, which words, which instance each point belongs to, which word fits
+each instance best. Scores and the lookup of points are query.onnx's; the few points close to a border, where its table
+does not promise the answer, are settled exactly by ``nearest``.
+"""
+
+from __future__ import annotations
+
+import os
+import warnings
+from functools import cached_property, lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from og_pointcloud.bundle import NO_EVIDENCE, TOO_FAR, Bundle, read_bundle
+from og_pointcloud.cloud import BACKGROUND, UNOBSERVED, InstanceTable, LabelledCloud, Vocabulary
+from og_pointcloud.clouds import carried_scene, world_points
+from og_pointcloud.errors import BundleError, FeatureSpaceError, OgPointcloudError
+from og_pointcloud.nearest import NONE_WITHIN_REACH, NearestPoint
+from og_pointcloud.segmentation import UNKNOWN, Segmentation
+from og_pointcloud.words import Labels, TextFeatures, resolve_labels
+
+if TYPE_CHECKING:
+    from onnxruntime import InferenceSession
+
+__all__ = ["SCENE_VARIABLE", "LabelledScene", "SceneLike", "Segmenter", "load", "segment", "use"]
+
+SceneLike: TypeAlias = "LabelledScene | LabelledCloud | str | os.PathLike[str]"
+
+SCENE_VARIABLE = "OG_POINTCLOUD_SCENE"
+POINTS_PER_RUN = 1 << 20
+"""What bounds the memory of the graph: about 150 MB."""
+
+
+class LabelledScene:
+    """A labelled cloud that can be asked. Make one with ``load``; it is cheap to keep and safe to share by threads."""
+
+    def __init__(self, bundle: Bundle) -> None:
+        self._bundle = bundle
+
+    @classmethod
+    def from_cloud(cls, cloud: LabelledCloud) -> LabelledScene:
+        """A scene of a cloud that was never written; makes its graph, which needs the 'fit' extra and takes seconds."""
+        from og_pointcloud_export import query_model
+
+        return cls(Bundle(None, cloud, query_model(cloud).onnx, {}))
+
+    @property
+    def cloud(self) -> LabelledCloud:
+        """Points in the local frame, their instance ids, and what is known of the instances."""
+        return self._bundle.cloud
+
+    @property
+    def path(self) -> Path | None:
+        """The .ogpc file, None for a scene in memory."""
+        return self._bundle.path
+
+    @property
+    def manifest(self) -> dict[str, Any]:
+        """The file's manifest: counts, parity figures, provenance; empty for a scene in memory."""
+        return self._bundle.manifest
+
+    @cached_property
+    def xyz(self) -> NDArray[np.float64]:
+        """(n, 3) float64, world coordinates."""
+        return self.cloud.xyz_world
+
+    @property
+    def instance_ids(self) -> NDArray[np.int32]:
+        """(n,) int32: row of ``instances``, -1 background, -2 unobserved."""
+        return self.cloud.instance_ids
+
+    @property
+    def instances(self) -> InstanceTable:
+        """Row k is what is known of instance k: points, views, masks, agreement, descriptors."""
+        return self.cloud.instances
+
+    @property
+    def vocabulary(self) -> Vocabulary | None:
+        """The words that may be asked as strings, if it has any."""
+        return self.cloud.vocabulary
+
+    @property
+    def feature_space(self) -> str:
+        """Name of the encoder that label vectors must come from."""
+        return self.cloud.feature_space
+
+    def instance_scores(self, vectors: NDArray[np.floating]) -> NDArray[np.float32]:
+        """(K, L) float32: best cosine of an instance's descriptors with each vector, -2 for one without a descriptor.
+
+        vectors: (L, D) of any length. FeatureSpaceError where D is not the scene's.
+        """
+        width, given = self._text_width, vectors.shape[1]
+        if len(self.instances.descriptors) == 0:  # no width to hold them to
+            vectors = np.zeros((len(vectors), width), np.float32)
+        elif given != width:
+            raise FeatureSpaceError(
+                f"the label vectors have width {given}, the scene's descriptors {width} (feature space "
+                f"'{self.feature_space}'): encode the labels with the scene's encoder"
+            )
+        feed = {"points": np.zeros((0, 3), np.float32), "text": np.ascontiguousarray(vectors, np.float32)}
+        return np.asarray(self._session.run(["instance_scores"], feed)[0])
+
+    def instances_at(self, points: NDArray[np.floating]) -> NDArray[np.int32]:
+        """(N,) int32: instance id of the scene's point nearest to each, -1, -2, or -3 where none is within reach.
+
+        points: (N, 3), world coordinates. A row with NaN or infinity, as depth cameras send them, is out of reach.
+        Exact: of points equally near the first one counts, and a point of the scene finds its own id.
+        """
+        with np.errstate(over="ignore"):  # what leaves float32 is infinitely far
+            local = (np.asarray(points, np.float64) - self.cloud.origin).astype(np.float32)
+        found = np.empty(len(local), np.int32)
+        for start in range(0, len(local), POINTS_PER_RUN):
+            found[start : start + POINTS_PER_RUN] = self._instances_at(local[start : start + POINTS_PER_RUN])
+        return found
+
+    def _instances_at(self, local: NDArray[np.float32]) -> NDArray[np.int32]:
+        feed = {"points": local, "text": np.zeros((0, self._text_width), np.float32)}
+        found, certain = (np.array(output) for output in self._session.run(["instance", "certain"], feed))
+        finite = np.isfinite(local).all(axis=1)
+        found[~finite] = TOO_FAR
+        still_open = np.flatnonzero(~certain & finite)
+        nearest = self._nearest.query(local[still_open])
+        exact = np.where(nearest == NONE_WITHIN_REACH, TOO_FAR, np.append(self.instance_ids, TOO_FAR)[nearest])
+        found[still_open] = exact
+        return found
+
+    @cached_property
+    def _session(self) -> InferenceSession:
+        from og_pointcloud._onnxruntime import open_session
+
+        try:
+            session = open_session(self._bundle.query_onnx)
+        except Exception as error:  # onnxruntime raises types of its own for a graph that it cannot run
+            reason = str(error).strip().splitlines()[0][:200]
+            raise BundleError(f"{self.path}: query.onnx does not run ({reason}): write the file again") from None
+        inputs = {given.name: given for given in session.get_inputs()}
+        outputs = {given.name for given in session.get_outputs()}
+        if set(inputs) != {"points", "text"} or not {"instance", "certain", "instance_scores"} <= outputs:
+            raise BundleError(f"{self.path}: query.onnx takes {sorted(inputs)} and gives {sorted(outputs)}: not ours")
+        return session
+
+    @property
+    def _text_width(self) -> int:
+        return next(given.shape[1] for given in self._session.get_inputs() if given.name == "text")
+
+    @cached_property
+    def _nearest(self) -> NearestPoint:
+        return NearestPoint(self.cloud.xyz, self.cloud.spacing, self.cloud.reach)
+
+
+def load(path: str | os.PathLike[str]) -> LabelledScene:
+    """Open a .ogpc file; BundleError says what is wrong with any other."""
+    return LabelledScene(read_bundle(path))
+
+
+def use(scene: SceneLike | None) -> LabelledScene | None:
+    """Make a scene, or a .ogpc file, the one that ``segment`` asks when it is given none. None forgets it."""
+    global _scene_in_use
+    _scene_in_use = None if scene is None else _as_scene(scene)
+    return _scene_in_use
+
+
+def segment(
+    pcd: Any, labels: Labels = None, scene: SceneLike | None = None, *, text_features: TextFeatures = None
+) -> Segmentation:
+    """Label the points of a cloud by words.
+
+    pcd: an array (N, 3) of world coordinates, an Open3D, PyVista or trimesh cloud, a geometry file; or a scene, a
+        LabelledCloud or a .ogpc file, whose own points are then labelled. Rows with NaN answer unknown.
+    labels: words, found in text_features or in the scene's vocabulary (None: all of them); or name -> vector (D,).
+    scene: what to ask. Left out: the scene that the cloud is or carries, else that of ``use``, else the file that the
+        environment variable OG_POINTCLOUD_SCENE names.
+    text_features: a text-features .npz, or what ``read_text_features`` returned for it.
+
+    Warns where no point gets a label, and says why. Raises OgPointcloudError and its kinds: SceneError (no cloud),
+    BundleError (no scene), FeatureSpaceError (vectors of another space or width).
+    """
+    pcd = _as_scene(pcd) if _is_scene(pcd) else pcd
+    scene = _find_scene(pcd, scene)
+    words = resolve_labels(labels, text_features, scene.vocabulary, scene.feature_space)
+    own = pcd is scene
+    points = scene.xyz if own else pcd.xyz if isinstance(pcd, LabelledScene) else world_points(pcd)
+    instances = scene.instance_ids if own else scene.instances_at(points)
+    result = _label(scene, words, _best_labels(scene, words), points, instances)
+    if reason := _why_nothing(result, scene):
+        warnings.warn(reason, stacklevel=2)
+    return result
+
+
+class Segmenter:
+    """The same labels for many clouds: words are scored once, and a call only looks points up.
+
+    scene, labels, text_features: as for ``segment``.
+    """
+
+    def __init__(self, scene: SceneLike, labels: Labels = None, *, text_features: TextFeatures = None) -> None:
+        self.scene = _as_scene(scene)
+        self._words = resolve_labels(labels, text_features, self.scene.vocabulary, self.scene.feature_space)
+        self._best = _best_labels(self.scene, self._words)
+        self._warned = False
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The labels, in the order of their numbers."""
+        return self._words.names
+
+    def __call__(self, points: Any) -> Segmentation:
+        """points: (N, 3) world coordinates, or any cloud that ``segment`` takes; N may be 0.
+
+        Warns the first time that no point gets a label, not at every empty frame of a stream.
+        """
+        points = world_points(points)
+        result = _label(self.scene, self._words, self._best, points, self.scene.instances_at(points))
+        if not self._warned and (reason := _why_nothing(result, self.scene)):
+            self._warned = True
+            warnings.warn(reason, stacklevel=2)
+        return result
+
+
+_scene_in_use: LabelledScene | None = None
+
+
+def _is_scene(pcd: Any) -> bool:
+    is_file = isinstance(pcd, (str, os.PathLike)) and Path(pcd).suffix == ".ogpc"
+    return is_file or isinstance(pcd, (LabelledScene, LabelledCloud))
+
+
+def _find_scene(pcd: Any, scene: SceneLike | None) -> LabelledScene:
+    if scene is not None:
+        return _as_scene(scene)
+    if isinstance(pcd, LabelledScene):
+        return pcd
+    if (carried := carried_scene(pcd)) is not None:
+        return _as_scene(carried)
+    if _scene_in_use is not None:
+        return _scene_in_use
+    if path := os.environ.get(SCENE_VARIABLE):
+        return _as_scene(path)
+    raise OgPointcloudError(
+        "no scene to ask: pass scene=og.load('S.ogpc') (or its path), or call og.use('S.ogpc') once, or set "
+        f"{SCENE_VARIABLE}, or segment a labelled cloud itself"
+    )
+
+
+def _as_scene(source: SceneLike) -> LabelledScene:
+    if isinstance(source, LabelledScene):
+        return source
+    if isinstance(source, LabelledCloud):
+        return _scene_of_cloud(source)
+    if isinstance(source, (str, os.PathLike)):
+        path = Path(source).resolve()
+        if not path.is_file():
+            return load(source)  # which says what is wrong
+        state = path.stat()
+        return _load_once(path, state.st_mtime_ns, state.st_size)
+    raise OgPointcloudError(
+        f"scene is a {type(source).__name__}; expected a loaded scene, a LabelledCloud or the path of a .ogpc file"
+    )
+
+
+@lru_cache(maxsize=2)
+def _load_once(path: Path, modified: int, size: int) -> LabelledScene:
+    """The scene of a file that has not changed since: naming it again and again costs nothing."""
+    return load(path)
+
+
+def _scene_of_cloud(cloud: LabelledCloud) -> LabelledScene:
+    """The cloud keeps its scene, so that asking it again is quick."""
+    scene = cloud.__dict__.get("_scene")
+    if scene is None:
+        scene = LabelledScene.from_cloud(cloud)
+        cloud.__dict__["_scene"] = scene
+    return scene
+
+
+def _best_labels(scene: LabelledScene, words: Vocabulary) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
+    """Label and score of each instance, and after the last one three more: of instance ids -3, -2 and -1."""
+    scores = scene.instance_scores(words.vectors)
+    best = scores.max(axis=1, initial=NO_EVIDENCE)
+    known = best > NO_EVIDENCE
+    labels = np.where(known, scores.argmax(axis=1), UNKNOWN)
+    no_instance = -TOO_FAR
+    return (
+        np.append(labels, [UNKNOWN] * no_instance).astype(np.int32),
+        np.append(np.where(known, best, 0), [0] * no_instance).astype(np.float32),
+    )
+
+
+def _label(
+    scene: LabelledScene,
+    words: Vocabulary,
+    best: tuple[NDArray[np.int32], NDArray[np.float32]],
+    points: NDArray[np.float64],
+    instances: NDArray[np.int32],
+) -> Segmentation:
+    labels, scores = best
+    return Segmentation(points, labels[instances], scores[instances], instances, words.names, scene.path)
+
+
+def _why_nothing(result: Segmentation, scene: LabelledScene) -> str | None:
+    """Why no point has a label; None if one has."""
+    if len(result) == 0:
+        return "no point has a label: the cloud has 0 points (a file that could not be read may give such a cloud)"
+    if (result.labels != UNKNOWN).any():
+        return None
+    states = {
+        f"farther than {scene.cloud.reach:.4g} from the scene": result.instances == TOO_FAR,
+        "background": result.instances == BACKGROUND,
+        "unobserved": result.instances == UNOBSERVED,
+        "of instances without a feature": result.instances >= 0,
+    }
+    parts = [f"{int(state.sum())} are {name}" for name, state in states.items() if state.any()]
+    advice = ""
+    if (
+        (result.instances == TOO_FAR).all()
+        and len(scene.cloud)
+        and (finite := np.isfinite(result.xyz).all(axis=1)).any()
+    ):
+        advice = (
+            f"; the points span {_box(result.xyz[finite])}, the scene {_box(scene.xyz)}: bring them into the scene's "
+            "frame and unit"
+        )
+    return f"none of {len(result)} points has a label: {', '.join(parts)}{advice}"
+
+
+def _box(points: NDArray[np.float64]) -> str:
+    low, high = points.min(axis=0), points.max(axis=0)
+    return " x ".join(f"{a:.6g}..{b:.6g}" for a, b in zip(low, high, strict=True))

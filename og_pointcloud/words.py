@@ -1,0 +1,122 @@
+"""Labels as a user gives them -> names and text vectors of the scene's feature space."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from og_pointcloud.cloud import Vocabulary
+from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError
+from og_pointcloud.text_features import UNKNOWN_SPACE, read_text_features
+
+__all__ = ["Labels", "TextFeatures", "resolve_labels"]
+
+Labels: TypeAlias = "str | Iterable[str] | Mapping[str, ArrayLike] | Vocabulary | None"
+TextFeatures: TypeAlias = "str | os.PathLike[str] | tuple[Vocabulary, str] | None"
+
+
+def resolve_labels(
+    labels: Labels, text_features: TextFeatures, own_words: Vocabulary | None, feature_space: str
+) -> Vocabulary:
+    """Names, all different, with a finite vector each that is not zero.
+
+    labels: words, looked up in text_features and then in own_words (None: every word of the first that there is); or
+    name -> vector (D,); or a Vocabulary, taken as it is. text_features: a text-features file, or what
+    ``read_text_features`` returned. own_words, feature_space: the scene's.
+    Raises OgPointcloudError for a word without vector or given twice, FeatureSpaceError for text_features of another
+    space and for vectors that cannot be compared.
+    """
+    sources = [source for source in (_of_space(text_features, feature_space), own_words) if source is not None]
+    if labels is None:
+        if not sources:
+            raise OgPointcloudError(f"no labels are given, and the scene has no words of its own: {_WAYS}")
+        return _checked(sources[0])
+    if isinstance(labels, Vocabulary):
+        return _checked(labels)
+    if isinstance(labels, Mapping):
+        return _checked(_from_mapping(labels))
+    words = (labels,) if isinstance(labels, str) else tuple(labels)
+    for word in words:
+        if not isinstance(word, str):
+            raise OgPointcloudError(f"label {word!r:.60} is a {type(word).__name__}; expected words, or name -> vector")
+    return _checked(_looked_up(words, sources))
+
+
+_WAYS = (
+    "pass {name: vector}, or text_features=FILE.npz with 'names', 'vectors' and 'feature_space' from the scene's "
+    "encoder, or fit again with --vocabulary FILE.npz"
+)
+
+
+def _of_space(text_features: TextFeatures, feature_space: str) -> Vocabulary | None:
+    if text_features is None:
+        return None
+    if isinstance(text_features, tuple):
+        source, (vocabulary, space) = "text_features", text_features
+    else:
+        source, (vocabulary, space) = str(Path(text_features)), read_text_features(text_features)
+    if space != feature_space and UNKNOWN_SPACE not in (space, feature_space):
+        raise FeatureSpaceError(
+            f"{source} is of feature space '{space}', the scene of '{feature_space}': encode the names with "
+            "the scene's encoder"
+        )
+    return vocabulary
+
+
+def _from_mapping(labels: Mapping[str, Any]) -> Vocabulary:
+    rows = []
+    for name, vector in labels.items():
+        row = np.asarray(vector)
+        if row.ndim != 1 or row.dtype.kind not in "fiu" or row.shape != (rows[0] if rows else row).shape:
+            raise FeatureSpaceError(
+                f"the vector of '{name}' is {row.dtype} {row.shape}; expected numbers of shape "
+                f"{rows[0].shape if rows else '(D,)'}, one width for all labels"
+            )
+        rows.append(row)
+    with np.errstate(over="ignore"):
+        vectors = np.array(rows).astype(np.float32) if rows else np.zeros((0, 0), np.float32)
+    names = tuple(str(name) for name in labels)
+    return Vocabulary(names, vectors) if np.isfinite(vectors).all() else _refuse_not_finite(names, vectors)
+
+
+def _refuse_not_finite(names: tuple[str, ...], vectors: np.ndarray) -> Vocabulary:
+    name = names[int(np.argmin(np.isfinite(vectors).all(axis=1)))]
+    raise FeatureSpaceError(f"the vector of '{name}' holds NaN or infinity; expected finite numbers: encode it again")
+
+
+def _looked_up(words: tuple[str, ...], sources: list[Vocabulary]) -> Vocabulary:
+    vectors: dict[str, np.ndarray] = {}
+    for source in reversed(sources):
+        vectors |= dict(zip(source.names, source.vectors, strict=True))
+    missing = [word for word in words if word not in vectors]
+    if missing:
+        others = f", nor are {len(missing) - 1} more of the labels" if len(missing) > 1 else ""
+        hint = _close_matches(missing[0], list(vectors))
+        raise OgPointcloudError(f"'{missing[0]}' is not among the {len(vectors)} known words{others}{hint}: {_WAYS}")
+    return Vocabulary(words, np.array([vectors[word] for word in words]) if words else np.zeros((0, 0), np.float32))
+
+
+def _close_matches(word: str, known: list[str]) -> str:
+    import difflib  # only when something went wrong
+
+    by_lower = {name.lower(): name for name in known}
+    close = [by_lower[match] for match in difflib.get_close_matches(word.lower(), by_lower, n=3)]
+    return f"; did you mean {' or '.join(repr(name) for name in close)}? If not" if close else ""
+
+
+def _checked(vocabulary: Vocabulary) -> Vocabulary:
+    if not vocabulary.names:
+        raise OgPointcloudError("0 labels are given; expected at least one word to look for")
+    seen: set[str] = set()
+    for name, vector in zip(vocabulary.names, vocabulary.vectors, strict=True):
+        if name in seen:
+            raise OgPointcloudError(f"the label '{name}' is given twice; expected different names: remove one")
+        if not vector.any():
+            raise FeatureSpaceError(f"the vector of '{name}' is zero, which is like nothing: encode it again")
+        seen.add(name)
+    return vocabulary

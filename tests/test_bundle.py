@@ -1,0 +1,303 @@
+"""The .ogpc file: what goes in comes out, and every way to damage or forge one gives one clear error."""
+
+from __future__ import annotations
+
+import io
+import json
+import zipfile
+from dataclasses import fields, replace
+
+import numpy as np
+import onnx
+import pytest
+from labelled_clouds import instance_table, make_cloud, room, tough_clouds, unit_rows
+from og_pointcloud_export import write_bundle, writer
+
+from og_pointcloud.bundle import read_bundle
+from og_pointcloud.cloud import InstanceTable, Vocabulary
+from og_pointcloud.errors import BundleError, OgPointcloudError
+
+CLOUDS = tough_clouds()
+
+
+@pytest.fixture(scope="module")
+def bundle_file(tmp_path_factory):
+    return write_bundle(room(500), tmp_path_factory.mktemp("bundle") / "room.ogpc")
+
+
+def members_of(path):
+    with zipfile.ZipFile(path) as archive:
+        return {info.filename: archive.read(info) for info in archive.infolist()}
+
+
+def zip_of(path, members, compression=zipfile.ZIP_STORED):
+    with zipfile.ZipFile(path, "w", compression) as archive:
+        for name, data in members.items():
+            archive.writestr(zipfile.ZipInfo(name), data, compression)
+    return path
+
+
+def changed(bundle_file, path, change):
+    """A copy of the file in which change(manifest, members) was made and every length is declared anew."""
+    members = members_of(bundle_file)
+    manifest = json.loads(members.pop("manifest.json"))
+    change(manifest, members)
+    for name, data in members.items():
+        manifest["members"].setdefault(name, {})["bytes"] = len(data)
+    return zip_of(path, {"manifest.json": json.dumps(manifest), **members})
+
+
+def npy(array):
+    stream = io.BytesIO()
+    np.save(stream, array)
+    return stream.getvalue()
+
+
+def refuse(path, says, **options):
+    with pytest.raises(BundleError, match=says) as caught:
+        read_bundle(path, **options)
+    assert str(caught.value).startswith(str(path))
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("name", CLOUDS)
+def test_tough_clouds_come_back_as_they_went(tmp_path, name):
+    cloud = CLOUDS[name]
+    back = read_bundle(write_bundle(cloud, tmp_path / "s.ogpc"), verify_sha256=True).cloud
+    for key in ("xyz", "origin", "instance_ids", "rgb"):
+        assert (getattr(back, key) == getattr(cloud, key)).all()
+        assert getattr(back, key).dtype == getattr(cloud, key).dtype
+    for field in fields(InstanceTable):
+        ours, theirs = getattr(back.instances, field.name), getattr(cloud.instances, field.name)
+        assert ours.shape == theirs.shape
+        assert ours.dtype == theirs.dtype
+        assert (ours == theirs).all()
+    for key in ("feature_space", "spacing", "reach", "provenance"):
+        assert getattr(back, key) == getattr(cloud, key)
+    assert (back.vocabulary is None) == (cloud.vocabulary is None)
+
+
+def test_words_come_back_as_unit_vectors_close_to_their_own(tmp_path):
+    cloud = room(100)
+    back = read_bundle(write_bundle(cloud, tmp_path / "s.ogpc")).cloud.vocabulary
+    assert back.names == cloud.vocabulary.names
+    assert np.abs(back.vectors * 10 - cloud.vocabulary.vectors).max() < 0.01
+
+
+def test_words_that_half_precision_would_confuse_are_kept_in_single(tmp_path):
+    cloud = make_cloud(np.zeros((1, 3)), [0], instances=instance_table(1))
+    row, other = unit_rows(1)[0].astype(np.float64), unit_rows(2, seed=1)[1]
+    # As float16 both become the same row, and the first would win.
+    cloud = replace(cloud, vocabulary=Vocabulary(("close", "same"), np.array([row + 2e-6 * other, row], np.float32)))
+    bundle = read_bundle(write_bundle(cloud, tmp_path / "s.ogpc"))
+    assert bundle.manifest["members"]["vocabulary/vectors.npy"]["dtype"] == "<f4"
+    assert bundle.manifest["parity"]["vocabulary_cosine_error"] < 1e-7
+
+
+def test_half_precision_needs_the_same_best_word(monkeypatch):
+    words = Vocabulary(("a", "b"), unit_rows(2, seed=4))
+    assert writer._compact_vectors(words, instance_table(3))[0].dtype == np.float16
+    monkeypatch.setattr(writer, "HALF_PRECISION_TOLERANCE", 0.0)
+    assert writer._compact_vectors(words, instance_table(3))[0].dtype == np.float32
+
+
+def test_the_same_cloud_gives_the_same_bytes(tmp_path):
+    first, second = (write_bundle(room(300), tmp_path / name).read_bytes() for name in ("a.ogpc", "b.ogpc"))
+    assert first == second
+
+
+def test_manifest_says_what_is_inside(bundle_file):
+    manifest = read_bundle(bundle_file).manifest
+    assert (manifest["format"], manifest["schema_version"]) == ("ogpc", 1)
+    assert manifest["counts"] == {"points": 500, "instances": 9, "descriptors": 9, "words": 5}
+    assert manifest["parity"]["instance_score_error"] < 1e-6
+    assert manifest["parity"]["certain_points_wrong"] == 0
+    assert manifest["members"]["arrays/instance_ids.npy"]["dtype"] == "|i1"
+
+
+def test_descriptors_are_stored_once(bundle_file):
+    row = room(500).instances.descriptors[3].tobytes()
+    assert bundle_file.read_bytes().count(row) == 1
+
+
+@pytest.mark.parametrize(("count", "dtype"), [(127, "|i1"), (200, "<i2"), (40_000, "<i4")])
+def test_ids_take_the_smallest_type(count, dtype):
+    ids = np.array([-2, count - 1], np.int32)
+    assert writer._smallest_signed(ids).dtype.str == dtype
+    assert (writer._smallest_signed(ids) == ids).all()
+
+
+def test_nothing_is_left_behind_when_writing_fails(tmp_path):
+    (tmp_path / "s.ogpc").write_bytes(b"old")
+    cloud = replace(room(50), provenance={"what": object()})
+    with pytest.raises(OgPointcloudError, match="cannot be written as JSON"):
+        write_bundle(cloud, tmp_path / "s.ogpc")
+    assert (tmp_path / "s.ogpc").read_bytes() == b"old"
+    assert [file.name for file in tmp_path.iterdir()] == ["s.ogpc"]
+
+
+def test_missing_file(tmp_path):
+    refuse(tmp_path / "s.ogpc", "is not a file")
+
+
+@pytest.mark.parametrize("content", [b"", b"ply\nformat ascii 1.0\n", b"PK\x03\x04" + bytes(100), bytes(70_000)])
+def test_no_zip(tmp_path, content):
+    (tmp_path / "s.ogpc").write_bytes(content)
+    refuse(tmp_path / "s.ogpc", "not a .ogpc file, or damaged")
+
+
+def test_a_zip_of_something_else(tmp_path):
+    refuse(zip_of(tmp_path / "s.ogpc", {"word/document.xml": b"<xml/>"}), "without manifest.json")
+    refuse(zip_of(tmp_path / "s.ogpc", {"manifest.json": b'{"format": "zarr"}'}), "format 'zarr'")
+    refuse(zip_of(tmp_path / "s.ogpc", {"manifest.json": b"[1]"}), "format 'list'")
+    refuse(zip_of(tmp_path / "s.ogpc", {"manifest.json": b"{"}), "is no JSON")
+    refuse(zip_of(tmp_path / "s.ogpc", {"manifest.json": b"[" * 100_000}), "is no JSON")
+
+
+def test_every_truncation_is_refused(tmp_path, bundle_file):
+    data = bundle_file.read_bytes()
+    for length in np.linspace(0, len(data) - 1, 40).astype(int):
+        (tmp_path / "s.ogpc").write_bytes(data[:length])
+        refuse(tmp_path / "s.ogpc", "not a .ogpc file, or damaged")
+
+
+def test_a_flipped_bit_is_refused_or_changes_nothing(tmp_path, bundle_file):
+    data = bundle_file.read_bytes()
+    whole = members_of(bundle_file)
+    for place in np.random.default_rng(0).integers(0, len(data), 150):
+        damaged = bytearray(data)
+        damaged[place] ^= 1 << int(place % 8)
+        (tmp_path / "s.ogpc").write_bytes(damaged)
+        try:
+            read_bundle(tmp_path / "s.ogpc")
+        except BundleError:
+            continue
+        assert members_of(tmp_path / "s.ogpc") == whole  # a date, or another field that means nothing
+
+
+def test_a_changed_member_with_a_right_crc_is_found_by_its_digest(tmp_path, bundle_file):
+    def recolour(manifest, members):
+        members["arrays/rgb.npy"] = members["arrays/rgb.npy"][:-1] + b"\xff"
+
+    path = changed(bundle_file, tmp_path / "s.ogpc", recolour)
+    assert read_bundle(path).cloud.rgb.max() == 255
+    refuse(path, "sha256", verify_sha256=True)
+
+
+def test_a_newer_schema_names_the_cure(tmp_path, bundle_file):
+    path = changed(bundle_file, tmp_path / "s.ogpc", lambda manifest, _: manifest.update(schema_version=2))
+    refuse(path, "schema_version is 2, newer than the 1.*pip install --upgrade")
+
+
+@pytest.mark.parametrize(
+    "name", ["../escape.npy", "/etc/passwd", "arrays/../x", "C:\\x", "a\\b", "arrays//x", "x\x07y"]
+)
+def test_names_that_are_no_plain_paths(tmp_path, bundle_file, name):
+    path = zip_of(tmp_path / "s.ogpc", {**members_of(bundle_file), name: b"x"})
+    refuse(path, "is not a plain relative path")
+
+
+def test_compressed_members_are_refused_unopened(tmp_path, bundle_file):
+    members = {**members_of(bundle_file), "arrays/xyz.npy": bytes(50_000_000)}
+    refuse(zip_of(tmp_path / "s.ogpc", members, zipfile.ZIP_DEFLATED), "is compressed")
+
+
+def test_members_that_claim_the_same_bytes(tmp_path):
+    """Directory entries that all point to one member with its right CRC: a small file that would unpack big."""
+    with zipfile.ZipFile(tmp_path / "s.ogpc", "w") as archive:
+        archive.writestr("big", bytes(1_000_000))
+        archive.filelist *= 200
+    refuse(tmp_path / "s.ogpc", "claim 200000000 bytes in a file of 1")
+
+
+def test_two_members_of_one_name(tmp_path):
+    with zipfile.ZipFile(tmp_path / "s.ogpc", "w") as archive:
+        archive.writestr("manifest.json", b"first")
+        with pytest.warns(UserWarning, match="Duplicate"):
+            archive.writestr("manifest.json", b"second")
+    refuse(tmp_path / "s.ogpc", "2 members of 1 names")
+
+
+def test_a_graph_that_reads_other_files(tmp_path, bundle_file):
+    graph = onnx.load_from_string(members_of(bundle_file)["query.onnx"])
+    graph.graph.initializer[0].data_location = onnx.TensorProto.EXTERNAL
+    graph.graph.initializer[0].external_data.add(key="location", value="secret.txt")
+    path = changed(bundle_file, tmp_path / "s.ogpc", put("query.onnx", graph.SerializeToString()))
+    refuse(path, "asks for other files")
+
+
+def drop(name):
+    return lambda manifest, members: (members.pop(name), manifest["members"].pop(name))
+
+
+def put(name, data):
+    return lambda manifest, members: members.update({name: data})
+
+
+def say(*keys_and_value):
+    *keys, last, value = keys_and_value
+
+    def change(manifest, members):
+        for key in keys:
+            manifest = manifest[key]
+        manifest[last] = value
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (drop("query.onnx"), "'query.onnx' is missing"),
+        (drop("arrays/xyz.npy"), "'arrays/xyz.npy' is missing"),
+        (drop("arrays/instances/views.npy"), "'arrays/instances/views.npy' is missing"),
+        (drop("vocabulary/vectors.npy"), "'vocabulary/vectors.npy' is missing"),
+        (lambda manifest, members: members.pop("arrays/rgb.npy"), "'arrays/rgb.npy' of the manifest is missing"),
+        (put("arrays/xyz.npy", npy(np.zeros((500, 3)))), "is <f8"),
+        (put("arrays/xyz.npy", npy(np.zeros((499, 3), np.float32))), r"expected <f4 \(500, 3\)"),
+        (put("arrays/xyz.npy", npy(np.full((500, 3), np.nan, np.float32))), "NaN or infinity"),
+        (put("arrays/xyz.npy", npy(np.zeros((500, 3), np.float32))[:-4]), "but 5996 follow"),
+        (put("arrays/xyz.npy", b"junk"), "is no .npy"),
+        (put("arrays/xyz.npy", b"\x93NUMPY\x01\x00\x10\x00(((((((((((((((("), "is no .npy"),
+        (put("arrays/instance_ids.npy", npy(np.array([None] * 500))), "Python objects"),
+        (put("arrays/instance_ids.npy", npy(np.full(500, 9, np.int8))), "instance ids span 9..9"),
+        (put("arrays/instance_ids.npy", npy(np.full(500, -3, np.int8))), "instance ids span -3..-3"),
+        (put("vocabulary/names.json", b'["a", "a", "b", "c", "d"]'), "not a list of 5 different words"),
+        (put("vocabulary/names.json", b"{}"), "not a list of 5 different words"),
+        (say("counts", "points", 501), r"\(501, 3\)"),
+        (say("counts", "points", -1), r"\(-1, 3\)"),
+        (say("counts", "instances", 10), "expected <i4"),
+        (say("counts", "words", 4), "not a list of 4 different words"),
+        (say("counts", "points", True), "'counts/points' is True"),
+        (say("counts", {}), "'counts/points' is None"),
+        (say("descriptors", "offset", -5), "outside query.onnx"),
+        (say("descriptors", "offset", 10**12), "outside query.onnx"),
+        (say("descriptors", "shape", [10**9, 16]), "outside query.onnx"),
+        (say("descriptors", "shape", [8, 16]), r"expected <i4 \(8,\)"),
+        (say("frame", "spacing", 0), "spacing is 0"),
+        (say("frame", "reach", float("nan")), "reach is nan"),
+        (say("frame", "reach", 10**400), "do not fit"),
+        (say("frame", "origin", [0, 1]), "three finite numbers"),
+        (say("frame", "origin", [0, 1, "x"]), "do not fit"),
+        (say("feature_space", None), "'feature_space' is None"),
+        (say("schema_version", "1"), "schema_version is '1'"),
+        (say("schema_version", 0), "schema_version is 0"),
+        (say("members", []), "'members' is"),
+    ],
+)
+def test_each_damage_has_its_own_words(tmp_path, bundle_file, change, says):
+    members = members_of(bundle_file)
+    manifest = json.loads(members.pop("manifest.json"))
+    change(manifest, members)
+    for name, data in members.items():
+        if isinstance(manifest["members"], dict):
+            manifest["members"].setdefault(name, {})["bytes"] = len(data)
+    refuse(zip_of(tmp_path / "s.ogpc", {"manifest.json": json.dumps(manifest), **members}), says)
+
+
+def test_a_length_that_the_manifest_does_not_know(tmp_path, bundle_file):
+    members = members_of(bundle_file)
+    members["query.onnx"] += b"x"
+    refuse(zip_of(tmp_path / "s.ogpc", members), "the manifest says")
+    members["extra.bin"] = b"x"
+    refuse(zip_of(tmp_path / "s.ogpc", members), "'extra.bin' is not in the manifest")

@@ -1,0 +1,104 @@
+"""What importing and asking may touch, tried in processes of their own."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import subprocess
+import sys
+
+import pytest
+from labelled_clouds import room
+from og_pointcloud_export import write_bundle
+
+HEAVY = ("torch", "open3d", "pyvista", "cv2", "numba", "scipy", "onnx", "trimesh", "tqdm")
+ASK = """
+import sys
+import numpy as np
+import og_pointcloud as og
+scene = og.load(sys.argv[1])
+points = scene.xyz + 0.02
+result = og.segment(points, ["apple", "pear"], scene)
+assert (result.labels >= 0).any()
+assert (og.Segmenter(scene, ["plum"])(points).labels >= 0).any()
+result.save(sys.argv[2] + "/out.npz"), result.save(sys.argv[2] + "/out.ply")
+og.read_points(sys.argv[2] + "/out.ply")
+"""
+
+
+@pytest.fixture(scope="module")
+def bundle_file(tmp_path_factory):
+    return write_bundle(room(500), tmp_path_factory.mktemp("bundle") / "room.ogpc")
+
+
+def run(code, *arguments, **environment):
+    command = [sys.executable, "-c", code, *map(str, arguments)]
+    done = subprocess.run(command, capture_output=True, text=True, env=os.environ | environment, timeout=60)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_import_brings_nothing_heavy():
+    loaded = run("import og_pointcloud, sys; print(*sys.modules)").split()
+    assert "og_pointcloud" in loaded
+    assert not {*HEAVY, "numpy", "onnxruntime"} & set(loaded)
+
+
+def test_loading_and_asking_bring_nothing_heavy(bundle_file, tmp_path):
+    loaded = run(ASK + "print(*sys.modules)", bundle_file, tmp_path).split()
+    assert "onnxruntime" in loaded
+    assert not set(HEAVY) & set(loaded)
+
+
+def test_asking_works_where_no_heavy_module_can_be_imported(bundle_file, tmp_path):
+    blocked = f"import sys; sys.modules.update(dict.fromkeys({HEAVY}))\n"
+    run(blocked + ASK, bundle_file, tmp_path)
+
+
+def test_a_missing_extra_is_named(bundle_file):
+    blocked = "import sys; sys.modules.update(numba=None, open3d=None)\nimport og_pointcloud as og\n"
+    tried = """
+for ask in (lambda: og.write_bundle, lambda: og.segment(og.load(sys.argv[1])).to_open3d()):
+    try:
+        ask()
+    except og.MissingExtraError as error:
+        print(error)
+"""
+    assert run(blocked + tried, bundle_file).splitlines() == [
+        "this needs numba, which is not installed: pip install 'og-pointcloud[fit]'",
+        "this needs open3d, which is not installed: pip install 'og-pointcloud[open3d]'",
+    ]
+
+
+def test_asking_writes_nothing_into_the_home_folder(bundle_file, tmp_path):
+    home, out = tmp_path / "home", tmp_path / "out"
+    home.mkdir()
+    out.mkdir()
+    quiet = {"CI", "ORT_DISABLE_TELEMETRY", "XDG_CACHE_HOME", "XDG_DATA_HOME", "XDG_CONFIG_HOME"}
+    environment = {name: value for name, value in os.environ.items() if name not in quiet}
+    command = [sys.executable, "-B", "-c", ASK, str(bundle_file), str(out)]
+    subprocess.run(command, check=True, env=environment | {"HOME": str(home)}, timeout=60)
+    assert list(home.rglob("*")) == []
+
+
+def test_a_users_own_telemetry_choice_stands():
+    code = "import og_pointcloud._onnxruntime, os; print(os.environ['ORT_DISABLE_TELEMETRY'])"
+    assert run(code, ORT_DISABLE_TELEMETRY="0").strip() == "0"
+
+
+def test_every_public_name_resolves_and_is_listed():
+    import og_pointcloud as og
+
+    assert set(og.__all__) <= set(dir(og))
+    for name in og.__all__:
+        home = og._HOME_OF[name]
+        if importlib.util.find_spec(home) is not None:
+            assert getattr(og, name) is not None
+    assert set(og._HOME_OF) == set(og.__all__)
+    with pytest.raises(AttributeError, match="no attribute 'segmnet'"):
+        og.segmnet  # noqa: B018
+
+
+def test_fit_stays_the_function_whichever_way_its_module_is_imported():
+    code = "import og_pointcloud as og, og_pointcloud.fit, sys; print(og.fit is sys.modules['og_pointcloud.fit'].fit)"
+    assert run(code).strip() == "True"

@@ -1,0 +1,164 @@
+"""query.onnx by itself: its table against every distance, its scores against float64, and its empty cases."""
+
+from __future__ import annotations
+
+import numpy as np
+import onnx
+import pytest
+from labelled_clouds import TOO_FAR, WIDTH, instance_table, instances_plainly, make_cloud, queries, room, tough_clouds
+from og_pointcloud_export import brick_grid, writer
+from og_pointcloud_export.brick_grid import build_brick_grid
+from og_pointcloud_export.query_head import build_query_head, reference_scores
+
+from og_pointcloud._onnxruntime import open_session
+
+CLOUDS = tough_clouds()
+OUTPUTS = ["label", "score", "instance", "certain", "instance_scores"]
+
+
+def run(cloud, points, text):
+    session = open_session(build_query_head(cloud, build_brick_grid(cloud)))
+    feed = {"points": np.asarray(points, np.float32).reshape(-1, 3), "text": np.asarray(text, np.float32)}
+    return dict(zip(OUTPUTS, session.run(OUTPUTS, feed), strict=True))
+
+
+def texts(cloud, count=5):
+    width = max(cloud.instances.descriptors.shape[1], 1)
+    return np.random.default_rng(2).normal(size=(count, width))
+
+
+@pytest.mark.parametrize("name", CLOUDS)
+def test_certain_answers_are_exact_on_tough_clouds(name):
+    cloud = CLOUDS[name]
+    points = queries(cloud, 300)
+    found = run(cloud, points, texts(cloud))
+    exact = instances_plainly(cloud, points)
+    assert (found["instance"][found["certain"]] == exact[found["certain"]]).all()
+    assert found["instance"].min() >= TOO_FAR
+    assert found["instance"].max(initial=-1) < max(len(cloud.instances), 1)
+
+
+@pytest.mark.parametrize("name", CLOUDS)
+def test_scores_and_labels_are_those_of_float64(name):
+    cloud = CLOUDS[name]
+    text = texts(cloud)
+    points = queries(cloud, 100)
+    found = run(cloud, points, text)
+    reference = reference_scores(cloud.instances, text)
+    assert found["instance_scores"].shape == (len(cloud.instances), len(text))
+    assert np.abs(found["instance_scores"] - reference).max(initial=0) < 1e-6
+    for label, score, instance in zip(found["label"], found["score"], found["instance"], strict=True):
+        if instance < 0 or reference[instance].max() == -2:
+            assert (label, score) == (-1, 0)
+        else:
+            assert label == reference[instance].argmax()
+            assert score == pytest.approx(reference[instance].max(), abs=1e-6)
+
+
+def test_most_queries_near_the_cloud_are_certain():
+    random = np.random.default_rng(0)
+    xyz = np.append(random.random((20_000, 2)), 0.002 * random.normal(size=(20_000, 1)), axis=1)
+    cloud = make_cloud(xyz, xyz[:, 0] > 0.5, spacing=0.006, reach=0.02)
+    points = xyz[random.integers(0, len(cloud), 5000)] + 0.3 * cloud.spacing * random.normal(size=(5000, 3))
+    # One border, a unit long, with half a cell and about a spacing on either side: a few percent stay open.
+    assert run(cloud, points, texts(cloud))["certain"].mean() > 0.95
+
+
+def test_beyond_the_grid_is_certainly_too_far_unless_points_lie_there():
+    beyond = [[1e6, 0, 0], [0, -1e6, 0], [0, 0, 3e38]]
+    found = run(CLOUDS["room"], beyond, texts(CLOUDS["room"]))
+    assert (found["instance"] == TOO_FAR).all()
+    assert found["certain"].all()
+    assert not run(CLOUDS["far outliers"], beyond, texts(CLOUDS["far outliers"]))["certain"].any()
+
+
+def test_far_outliers_do_not_grow_the_table():
+    room_grid, outlier_grid = (build_brick_grid(CLOUDS[name]) for name in ("room", "far outliers"))
+    assert outlier_grid.bricks.size <= brick_grid.TOP_ENTRIES_AT_LEAST
+    assert len(outlier_grid.cells) <= 2 * len(room_grid.cells)
+
+
+def test_a_table_over_its_budget_leaves_bricks_open_and_stays_right(monkeypatch):
+    cloud = CLOUDS["room"]
+    points = queries(cloud, 300)
+    full = run(cloud, points, texts(cloud))
+    monkeypatch.setattr(brick_grid, "BRICKS_AT_LEAST", 3)
+    monkeypatch.setattr(brick_grid, "BRICKS_PER_POINT", 0)
+    small = run(cloud, points, texts(cloud))
+    assert len(build_brick_grid(cloud).cells) <= 2 + 3
+    assert small["certain"].mean() < full["certain"].mean()
+    assert (small["instance"] == instances_plainly(cloud, points))[small["certain"]].all()
+
+
+def test_a_table_without_any_box_is_all_open(monkeypatch):
+    cloud = CLOUDS["room"]
+    monkeypatch.setattr(brick_grid, "BRICKS_PER_AXIS", 0)
+    assert not run(cloud, [[1e6, 0, 0]], texts(cloud))["certain"].any()
+
+
+def test_nan_is_too_far():
+    cloud = CLOUDS["room"]
+    found = run(cloud, [[np.nan, 0, 0], [0, np.nan, 0], [np.nan] * 3, [np.inf, 0, 0], [-np.inf, 0, 0]], texts(cloud))
+    assert (found["instance"] == TOO_FAR).all()
+    assert (found["label"] == -1).all()
+
+
+@pytest.mark.parametrize("points", [0, 7])
+@pytest.mark.parametrize("labels", [0, 1, 3])
+@pytest.mark.parametrize("instances", [0, 2])
+def test_any_count_may_be_zero(points, labels, instances):
+    cloud = make_cloud(
+        np.zeros((3, 3)), [-1, -2, instances - 1 if instances else -1], instances=instance_table(instances)
+    )
+    found = run(cloud, np.zeros((points, 3)), texts(cloud, labels))
+    assert found["instance_scores"].shape == (instances, labels)
+    assert found["label"].shape == found["score"].shape == found["certain"].shape == (points,)
+
+
+def test_odd_text_vectors():
+    cloud = make_cloud(np.zeros((1, 3)), [0])
+    row = cloud.instances.descriptors[0].astype(np.float64)
+    found = run(cloud, [[0, 0, 0]], [0 * row, 1e-42 * row, 1e30 * row, -3 * row])
+    assert found["instance_scores"][0, [0, 2, 3]] == pytest.approx([0, 1, -1], abs=1e-6)
+    assert np.isfinite(found["instance_scores"]).all()
+    assert found["label"].tolist() == [2]
+
+
+def test_an_instance_answers_with_its_best_descriptor():
+    table = instance_table(2, [0, 0, 1])
+    cloud = make_cloud(np.zeros((1, 3)), [0], instances=table)
+    found = run(cloud, [[0, 0, 0]], table.descriptors[::-1])
+    assert found["instance_scores"][0, 1:] == pytest.approx([1, 1], abs=1e-6)
+    assert found["label"][0] in (1, 2)
+
+
+def test_rotated_and_shuffled_clouds_answer_alike():
+    cloud = room(1500)
+    points = queries(cloud, 300)[:600]
+    order = np.random.default_rng(3).permutation(len(cloud))
+    shuffled = make_cloud(cloud.xyz[order], cloud.instance_ids[order], instances=cloud.instances)
+    turned = make_cloud(cloud.xyz[:, [1, 2, 0]], cloud.instance_ids, instances=cloud.instances)
+    first, second, third = (
+        run(one, at, texts(one)) for one, at in ((cloud, points), (shuffled, points), (turned, points[:, [1, 2, 0]]))
+    )
+    both = first["certain"] & second["certain"] & third["certain"]
+    assert both.mean() > 0.3
+    assert (first["instance"] == second["instance"])[both].all()
+    assert (first["instance"] == third["instance"])[both].all()
+
+
+def test_the_graph_stands_alone_and_is_plain():
+    model = onnx.load_from_string(build_query_head(CLOUDS["room"], build_brick_grid(CLOUDS["room"])))
+    onnx.checker.check_model(model, full_check=True)
+    assert [value.name for value in model.graph.input] == ["points", "text"]
+    assert [value.name for value in model.graph.output] == OUTPUTS
+    assert model.graph.input[1].type.tensor_type.shape.dim[1].dim_value == WIDTH
+    assert not any(tensor.external_data for tensor in model.graph.initializer)
+
+
+def test_a_graph_that_differs_from_float64_is_refused(monkeypatch):
+    from og_pointcloud.errors import OgPointcloudError
+
+    monkeypatch.setattr(writer, "SCORE_TOLERANCE", 1e-12)
+    with pytest.raises(OgPointcloudError, match="differs from float64"):
+        writer.query_model(CLOUDS["room"])

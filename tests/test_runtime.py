@@ -1,0 +1,488 @@
+"""load, use, segment and Segmenter: exact on tough clouds, for each kind of cloud, label and scene; and refusals."""
+
+from __future__ import annotations
+
+import sys
+import types
+import warnings
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from labelled_clouds import (
+    SPACE,
+    TOO_FAR,
+    WIDTH,
+    WORDS,
+    instances_plainly,
+    make_cloud,
+    queries,
+    room,
+    tough_clouds,
+    unit_rows,
+)
+from og_pointcloud_export import write_bundle
+from og_pointcloud_export.query_head import reference_scores
+
+import og_pointcloud as og
+from og_pointcloud import runtime
+from og_pointcloud.cloud import Vocabulary
+from og_pointcloud.errors import BundleError, FeatureSpaceError, MissingExtraError, OgPointcloudError, SceneError
+from og_pointcloud.segmentation import label_colors
+
+CLOUDS = tough_clouds()
+DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+
+
+@pytest.fixture(autouse=True)
+def nothing_in_use(monkeypatch):
+    monkeypatch.delenv("OG_POINTCLOUD_SCENE", raising=False)
+    og.use(None)
+    yield
+    og.use(None)
+
+
+@pytest.fixture(scope="module")
+def bundle_file(tmp_path_factory):
+    return write_bundle(room(), tmp_path_factory.mktemp("bundle") / "room.ogpc")
+
+
+@pytest.fixture(scope="module")
+def scene(bundle_file):
+    return og.load(bundle_file)
+
+
+def quietly(*arguments, **options):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        return og.segment(*arguments, **options)
+
+
+def labels_plainly(cloud, instances, words):
+    """Label and score of each instance id by float64 cosines."""
+    scores = reference_scores(cloud.instances, words)
+    labels, best = np.full(len(instances), -1), np.zeros(len(instances))
+    for row, instance in enumerate(instances):
+        if instance >= 0 and scores[instance].max() > -2:
+            labels[row], best[row] = scores[instance].argmax(), scores[instance].max()
+    return labels, best
+
+
+@pytest.mark.parametrize("name", CLOUDS)
+def test_answers_are_exact_on_tough_clouds(tmp_path, name):
+    cloud = CLOUDS[name]
+    scene = og.load(write_bundle(cloud, tmp_path / "s.ogpc"))
+    local = queries(cloud, 300)
+    vectors = unit_rows(4, max(cloud.instances.descriptors.shape[1], 1), seed=9)
+    result = quietly(local.astype(np.float64) + cloud.origin, dict(zip("abcd", vectors, strict=True)), scene)
+    # What the origin takes away from a world coordinate is compared as the scene sees it.
+    seen = (local.astype(np.float64) + cloud.origin - cloud.origin).astype(np.float32)
+    assert (result.instances == instances_plainly(cloud, seen)).all()
+    labels, scores = labels_plainly(cloud, result.instances, vectors)
+    assert (result.labels == labels).all()
+    assert np.abs(result.scores - scores).max() < 1e-6
+
+
+@pytest.mark.parametrize("name", [name for name in CLOUDS if "coincident" not in name and "one place" not in name])
+def test_a_point_of_the_cloud_finds_its_own_id(name):
+    cloud = CLOUDS[name]
+    scene = runtime._as_scene(cloud)
+    assert (scene.instances_at(scene.xyz) == cloud.instance_ids).all()
+    # The same through the cloud itself, which needs no lookup.
+    words = {"a": np.ones(scene.cloud.instances.descriptors.shape[1] or 1)}
+    assert (quietly(scene, words).labels == quietly(scene.xyz, words, scene).labels).all()
+
+
+def test_of_coincident_points_the_first_answers():
+    cloud = CLOUDS["coincident points of different ids"]
+    scene = runtime._as_scene(cloud)
+    first = {tuple(point): id for point, id in zip(cloud.xyz[::-1], cloud.instance_ids[::-1], strict=True)}
+    expected = [first[tuple(point)] for point in cloud.xyz]
+    assert scene.instances_at(scene.xyz).tolist() == expected
+
+
+def test_metres_millimetres_and_map_coordinates_answer_alike(scene):
+    cloud = scene.cloud
+    points = queries(cloud, 300)[:900].astype(np.float64)
+    metres = scene.instances_at(points)
+    kilo = make_cloud(cloud.xyz * 1024, cloud.instance_ids, cloud.spacing * 1024, cloud.reach * 1024)
+    shifted = replace(cloud, origin=np.array([2.0**20, -(2.0**22), 2.0**9]))
+    assert (runtime._as_scene(kilo).instances_at(points * 1024) == metres).all()
+    assert (runtime._as_scene(shifted).instances_at(points + shifted.origin) == metres).all()
+
+
+def test_many_points_are_asked_in_runs(scene, monkeypatch):
+    points = queries(scene.cloud, 300).astype(np.float64)
+    whole = scene.instances_at(points)
+    monkeypatch.setattr(runtime, "POINTS_PER_RUN", 101)
+    assert (scene.instances_at(points) == whole).all()
+
+
+def test_a_scene_offers_its_parts(scene, bundle_file):
+    cloud = room()
+    assert scene.xyz.dtype == np.float64
+    assert (scene.xyz == cloud.xyz_world).all()
+    assert scene.instance_ids.dtype == np.int32
+    assert (scene.instance_ids == cloud.instance_ids).all()
+    assert len(scene.instances) == 9
+    assert (scene.feature_space, scene.vocabulary.names, scene.path) == (SPACE, WORDS, bundle_file)
+    assert scene.manifest["counts"]["points"] == len(scene.xyz)
+
+
+# Which scene is asked
+
+
+def test_the_scene_is_the_argument_then_the_clouds_then_that_in_use_then_the_environments(
+    scene, bundle_file, monkeypatch, tmp_path
+):
+    points = scene.xyz[:50]
+    expected = og.segment(points, ["apple", "pear"], scene).labels
+    others = [write_bundle(replace(room(), origin=np.full(3, 1e3)), tmp_path / f"{name}.ogpc") for name in "ab"]
+    with pytest.raises(OgPointcloudError, match=r"scene=og.load.*og.use.*OG_POINTCLOUD_SCENE"):
+        og.segment(points, ["apple", "pear"])
+    monkeypatch.setenv("OG_POINTCLOUD_SCENE", str(bundle_file))
+    assert (og.segment(points, ["apple", "pear"]).labels == expected).all()
+    og.use(others[0])
+    assert (quietly(points, ["apple", "pear"]).instances == TOO_FAR).all()
+    og.use(scene)
+    monkeypatch.setenv("OG_POINTCLOUD_SCENE", str(others[1]))
+    assert (og.segment(points, ["apple", "pear"]).labels == expected).all()
+    og.use(others[0])
+    for given in (scene, bundle_file, str(bundle_file), room()):
+        assert (og.segment(points, ["apple", "pear"], given).labels == expected).all()
+
+
+@pytest.mark.parametrize("kind", ["scene", "cloud", "path", "text path"])
+def test_a_scene_may_be_the_cloud(scene, bundle_file, kind):
+    pcd = {"scene": scene, "cloud": room(), "path": bundle_file, "text path": str(bundle_file)}[kind]
+    result = og.segment(pcd, ["apple", "pear"])
+    assert (result.instances == scene.instance_ids).all()
+    assert (result.xyz == scene.xyz).all()
+
+
+def test_a_scene_may_be_the_cloud_that_another_is_asked_about(scene):
+    other = room(700, seed=4)
+    result = og.segment(other, ["apple"], scene)
+    assert (result.instances == instances_plainly(scene.cloud, other.xyz)).all()
+
+
+def test_a_file_that_changes_is_read_again(tmp_path):
+    path = write_bundle(room(100), tmp_path / "s.ogpc")
+    assert len(og.segment(path, ["apple"])) == 100
+    write_bundle(room(200), path)
+    assert len(og.segment(path, ["apple"])) == 200
+
+
+def test_what_is_no_scene(tmp_path):
+    with pytest.raises(OgPointcloudError, match="scene is a int"):
+        og.segment(np.zeros((1, 3)), ["apple"], 3)
+    with pytest.raises(BundleError, match=r"nowhere.ogpc is not a file"):
+        og.segment(np.zeros((1, 3)), ["apple"], tmp_path / "nowhere.ogpc")
+    with pytest.raises(BundleError, match=r"nowhere.ogpc is not a file"):
+        og.load(tmp_path / "nowhere.ogpc")
+
+
+def test_a_graph_that_is_not_ours_is_refused(scene):
+    for graph in (b"junk", b""):
+        broken = runtime.LabelledScene(replace(scene._bundle, query_onnx=graph))
+        with pytest.raises(BundleError, match=r"query\.onnx does not run"):
+            broken.instances_at(np.zeros((1, 3)))
+    import onnx
+
+    value = onnx.helper.make_tensor_value_info("x", onnx.TensorProto.FLOAT, ["N"])
+    out = onnx.helper.make_tensor_value_info("y", onnx.TensorProto.FLOAT, ["N"])
+    graph = onnx.helper.make_graph([onnx.helper.make_node("Neg", ["x"], ["y"])], "g", [value], [out])
+    model = onnx.helper.make_model(graph, opset_imports=[onnx.helper.make_opsetid("", 18)], ir_version=8)
+    other = runtime.LabelledScene(replace(scene._bundle, query_onnx=model.SerializeToString()))
+    with pytest.raises(BundleError, match=r"takes \['x'\]"):
+        other.instances_at(np.zeros((1, 3)))
+
+
+# Which cloud is asked about
+
+
+def test_clouds_of_other_libraries_are_read_without_importing_them(scene, monkeypatch):
+    points = scene.xyz[:40]
+    expected = og.segment(points, ["apple", "pear"], scene)
+
+    def host(module, **attributes):
+        kind = type("Cloud", (), {"__module__": module})
+        return type("Derived", (kind,), {"__module__": "mine", **attributes})()
+
+    class Tensor(np.ndarray):
+        def cpu(self):
+            return self
+
+        def numpy(self):
+            return np.asarray(self)
+
+    clouds = [
+        host("open3d.cpu.pybind.geometry", points=points.tolist()),
+        host("open3d.cpu.pybind.t.geometry", point={"positions": points.view(Tensor)}),
+        host("pyvista.core.pointset", points=points, field_data={}),
+        host("trimesh.points", vertices=points),
+        points.tolist(),
+        points[::-1][::-1],
+    ]
+    for cloud in clouds:
+        assert (og.segment(cloud, ["apple", "pear"], scene).labels == expected.labels).all()
+    with pytest.warns(UserWarning, match="0 points"):
+        assert len(og.segment(host("open3d.x", point={}), ["apple"], scene)) == 0
+    with pytest.raises(SceneError, match="a Derived of open3d has no points"):
+        og.segment(host("open3d.x"), ["apple"], scene)
+    imported = sys.modules.get("trimesh")
+    assert imported is None or isinstance(imported, types.ModuleType)
+
+
+def test_real_open3d_clouds(scene):
+    open3d = pytest.importorskip("open3d")
+    points = scene.xyz[:40]
+    expected = og.segment(points, ["apple", "pear"], scene)
+    legacy = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points))
+    for cloud in (legacy, open3d.t.geometry.PointCloud(open3d.core.Tensor(points)), expected.to_open3d()):
+        assert (og.segment(cloud, ["apple", "pear"], scene).labels == expected.labels).all()
+    with pytest.warns(UserWarning, match="0 points"):
+        assert len(og.segment(open3d.t.geometry.PointCloud(), ["apple"], scene)) == 0
+
+
+def test_open3d_result(scene):
+    pytest.importorskip("open3d")
+    result = og.segment(scene, ["apple", "pear"])
+    cloud = result.to_open3d()
+    for name in ("label", "score", "instance"):
+        assert (cloud.point[name].numpy()[:, 0] == getattr(result, name + "s")).all()
+    assert (np.round(cloud.point["colors"].numpy() * 255) == result.colors).all()
+    assert len(cloud.voxel_down_sample(0.5).point["label"]) > 0
+
+
+def test_pyvista_result_carries_its_scene(scene, bundle_file):
+    pytest.importorskip("pyvista")
+    result = og.segment(scene, ["apple", "pear"])
+    mesh = result.to_pyvista()
+    for name in ("label", "score", "instance"):
+        assert (mesh.point_data[name] == getattr(result, name + "s")).all()
+    assert (mesh.point_data["colors"] == result.colors).all()
+    assert list(mesh.field_data["names"]) == ["apple", "pear"]
+    again = og.segment(mesh, ["plum", "apple"])
+    assert again.scene.samefile(bundle_file)
+    assert (again.instances == scene.instance_ids).all()
+
+
+def test_empty_results_convert_too(scene, tmp_path):
+    result = quietly(np.zeros((0, 3)), ["apple"], scene)
+    assert result.counts() == {"apple": 0}
+    if "pyvista" in sys.modules:
+        assert result.to_pyvista().n_points == 0
+    if "open3d" in sys.modules:
+        assert len(result.to_open3d().point["label"]) == 0
+    assert len(np.load(result.save(tmp_path / "out.npz"))["labels"]) == 0
+
+
+@pytest.mark.parametrize("host", ["open3d", "pyvista"])
+def test_a_missing_host_is_named(scene, monkeypatch, host):
+    monkeypatch.setitem(sys.modules, host, None)
+    with pytest.raises(MissingExtraError, match=rf"og-pointcloud\[{host}\]"):
+        getattr(og.segment(scene, ["apple"]), f"to_{host}")()
+
+
+@pytest.mark.parametrize(
+    ("pcd", "says"),
+    [
+        (np.zeros(3), r"float64 \(3,\)"),
+        (np.zeros((3, 4)), r"\(3, 4\)"),
+        (np.array([["a", "b", "c"]]), "<U1"),
+        ([[1, 2], [3]], "no array of points"),
+        (None, "object"),
+        (np.zeros((1, 3), complex), "complex"),
+    ],
+)
+def test_what_is_no_cloud(scene, pcd, says):
+    with pytest.raises(SceneError, match=says):
+        og.segment(pcd, ["apple"], scene)
+
+
+def test_rows_with_nan_are_too_far_and_the_others_keep_their_answers(scene):
+    points = scene.xyz[:30].copy()
+    expected = og.segment(points, ["apple", "pear"], scene)
+    points[[3, 7, 9], [0, 1, 2]] = [np.nan, np.inf, 1e300]
+    result = og.segment(points, ["apple", "pear"], scene)
+    assert (result.instances[[3, 7, 9]] == TOO_FAR).all()
+    assert (result.labels[[3, 7, 9]] == -1).all()
+    kept = np.delete(np.arange(30), [3, 7, 9])
+    assert (result.labels[kept] == expected.labels[kept]).all()
+
+
+# Which words
+
+
+def test_words_come_from_the_vocabulary_a_mapping_a_file_or_what_was_read(scene, tmp_path):
+    vectors = unit_rows(5, seed=0)
+    np.savez(tmp_path / "t.npz", names=np.array(WORDS), vectors=vectors, feature_space=np.array(SPACE))
+    asked = ["pear", "apple"]
+    expected = og.segment(scene, asked)
+    assert expected.names == ("pear", "apple")
+    mapping = {"pear": vectors[1], "apple": list(vectors[0] * 7)}
+    bare = replace(room(), vocabulary=None)
+    for result in (
+        og.segment(scene, mapping),
+        og.segment(scene, Vocabulary(("pear", "apple"), vectors[[1, 0]])),
+        og.segment(bare, iter(asked), text_features=tmp_path / "t.npz"),
+        og.segment(bare, tuple(asked), text_features=og.read_text_features(tmp_path / "t.npz")),
+    ):
+        assert (result.labels == expected.labels).all()
+        assert result.names == ("pear", "apple")
+    assert og.segment(scene).names == WORDS
+    assert og.segment(bare, text_features=tmp_path / "t.npz").names == WORDS
+    assert og.segment(scene, "café").names == ("café",)
+
+
+def test_a_files_words_come_before_the_scenes(scene):
+    own = Vocabulary(("apple",), -unit_rows(1, seed=0))
+    result = og.segment(scene, ["apple", "pear"], text_features=(own, "unknown"))
+    assert (result.labels != og.segment(scene, ["apple", "pear"]).labels).any()
+
+
+@pytest.mark.parametrize(
+    ("labels", "error", "says"),
+    [
+        (["aple"], OgPointcloudError, "'aple' is not among the 5 known words; did you mean 'apple'"),
+        (["Red Ball"], OgPointcloudError, "did you mean 'red ball'"),
+        (
+            ["zzz", "apple", "yyy"],
+            OgPointcloudError,
+            r"'zzz' is not among.*nor are 1 more of the labels: pass .*text_features=FILE.npz",
+        ),
+        ([], OgPointcloudError, "0 labels"),
+        ({}, OgPointcloudError, "0 labels"),
+        (["apple", "pear", "apple"], OgPointcloudError, "'apple' is given twice"),
+        ([1], OgPointcloudError, "label 1 is a int"),
+        ({"a": np.ones(WIDTH - 1)}, FeatureSpaceError, f"width {WIDTH - 1}, the scene's descriptors {WIDTH}"),
+        ({"a": np.ones(WIDTH), "b": np.ones(3)}, FeatureSpaceError, r"'b' is float64 \(3,\)"),
+        ({"a": np.ones((1, WIDTH))}, FeatureSpaceError, r"'a' is float64 \(1, 16\)"),
+        ({"a": "text"}, FeatureSpaceError, "the vector of 'a'"),
+        ({"a": np.zeros(WIDTH)}, FeatureSpaceError, "'a' is zero"),
+        ({"a": np.ones(WIDTH), "b": np.full(WIDTH, np.nan)}, FeatureSpaceError, "'b' holds NaN"),
+    ],
+)
+def test_labels_that_cannot_be_asked(scene, labels, error, says):
+    with pytest.raises(error, match=says):
+        og.segment(scene, labels)
+
+
+def test_words_without_any_vocabulary():
+    bare = replace(CLOUDS["room"], vocabulary=None)
+    with pytest.raises(OgPointcloudError, match="'chair' is not among the 0 known words: pass"):
+        og.segment(bare, ["chair"])
+    with pytest.raises(OgPointcloudError, match="no labels are given"):
+        og.segment(bare)
+
+
+def test_text_features_of_another_space_are_refused(scene, tmp_path):
+    np.savez(tmp_path / "t.npz", names=np.array(["a"]), vectors=np.ones((1, WIDTH)), feature_space=np.array("other"))
+    with pytest.raises(FeatureSpaceError, match=r"t.npz is of feature space 'other', the scene of 'tiny-test-space'"):
+        og.segment(scene, ["a"], text_features=tmp_path / "t.npz")
+    np.savez(tmp_path / "t.npz", names=np.array(["a"]), vectors=np.ones((1, WIDTH)))
+    assert len(og.segment(scene, ["a"], text_features=tmp_path / "t.npz"))
+
+
+# What comes back
+
+
+def test_result_masks_counts_and_refusals(scene, tmp_path):
+    result = og.segment(scene, ["apple", "pear"])
+    assert (result.labels.dtype, result.scores.dtype, result.instances.dtype) == (np.int32, np.float32, np.int32)
+    assert result.counts() == {"apple": (result.labels == 0).sum(), "pear": (result.labels == 1).sum()}
+    assert (result.mask("pear") == (result.labels == 1)).all()
+    assert (result.scores[result.labels < 0] == 0).all()
+    assert (result.labels[result.instances == 4] == -1).all()  # it has no descriptor
+    with pytest.raises(OgPointcloudError, match="'plum' was not asked for; the labels are apple, pear"):
+        result.mask("plum")
+    with pytest.raises(OgPointcloudError, match=r"expected a name that ends in .npz or .ply"):
+        result.save(tmp_path / "out.txt")
+
+
+def test_result_is_saved_as_npz_and_ply(scene, tmp_path):
+    result = og.segment(scene, ["café", "pear"])
+    saved = np.load(result.save(tmp_path / "out.npz"), allow_pickle=False)
+    assert sorted(saved) == ["instances", "labels", "names", "scores"]
+    assert (saved["labels"] == result.labels).all()
+    assert saved["names"].tolist() == ["café", "pear"]
+    points = og.read_points(result.save(tmp_path / "out.ply"))
+    assert np.abs(points.xyz_world - result.xyz).max() < 1e-5
+    assert (points.rgb == result.colors).all()
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["out.npz", "out.ply"]
+
+
+def test_colours_tell_labels_apart_and_do_not_depend_on_the_others():
+    colours = label_colors(np.arange(-1, 40))
+    assert len(np.unique(colours, axis=0)) == 41
+    assert colours[0].tolist() == [128, 128, 128]
+    assert (label_colors(np.array([5, -1, 2])) == colours[[6, 0, 3]]).all()
+    assert label_colors(np.zeros(0, np.int32)).shape == (0, 3)
+
+
+@pytest.mark.parametrize(
+    ("points", "says"),
+    [
+        (np.zeros((0, 3)), "the cloud has 0 points"),
+        (
+            np.full((4, 3), 50.0),
+            r"none of 4 points has a label: 4 are farther than 0.15 .* span 50..50 x .*frame and unit",
+        ),
+        (np.full((4, 3), np.nan), "4 are farther than 0.15 from the scene$"),
+    ],
+)
+def test_no_label_at_all_is_explained(scene, points, says):
+    with pytest.warns(UserWarning, match=says):
+        og.segment(points, ["apple"], scene)
+
+
+def test_no_label_of_a_clouds_own_points_is_explained():
+    with pytest.warns(UserWarning, match="800 are unobserved"):
+        og.segment(CLOUDS["all unobserved"], ["apple"])
+    with pytest.warns(UserWarning, match=r"are background, .*of instances without a feature"):
+        og.segment(CLOUDS["instances without any descriptor"], ["apple"])
+
+
+def test_segmenter_answers_like_segment_and_warns_once(scene):
+    ask = og.Segmenter(scene, ["apple", "pear"])
+    assert ask.names == ("apple", "pear")
+    points = queries(scene.cloud, 200).astype(np.float64)
+    ours, theirs = ask(points), og.segment(points, ["apple", "pear"], scene)
+    for key in ("labels", "scores", "instances"):
+        assert (getattr(ours, key) == getattr(theirs, key)).all()
+    with pytest.warns(UserWarning, match="0 points"):
+        assert len(ask(np.zeros((0, 3)))) == 0
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        ask(np.full((4, 3), 50.0))
+
+
+def test_ten_thousand_labels(scene):
+    vectors = unit_rows(10_000, seed=11)
+    result = og.segment(scene, {str(row): vector for row, vector in enumerate(vectors)})
+    labels, _ = labels_plainly(scene.cloud, result.instances[:200], vectors)
+    assert (result.labels[:200] == labels).all()
+
+
+@pytest.mark.skipif(not DATA.is_dir(), reason="the recorded captures are absent")
+def test_recorded_kitchen(tmp_path):
+    points = og.read_points(DATA / "seven_redkitchen" / "points.ply")
+    truth = np.load(DATA / "seven_redkitchen" / "gt.npz")["instance"]
+    vocabulary, space = og.read_text_features(DATA / "seven_redkitchen" / "text_features.npz")
+    cloud = make_cloud(points.xyz[::8], truth[::8], 0.03, 0.1, points.origin, words=())
+    descriptors = unit_rows(len(cloud.instances), 512)
+    cloud = replace(
+        cloud,
+        instances=replace(cloud.instances, descriptors=descriptors),
+        feature_space=space,
+        vocabulary=vocabulary,
+        rgb=None,
+    )
+    scene = og.load(write_bundle(cloud, tmp_path / "s.ogpc"))
+    sample = points.xyz[3::400]
+    assert (scene.instances_at(sample + points.origin) == instances_plainly(cloud, sample)).all()
+    assert og.segment(scene, ["chair", "bottle"]).names == ("chair", "bottle")
+    with pytest.raises(OgPointcloudError, match="did you mean 'bottle'"):
+        og.segment(scene, ["botle"])
