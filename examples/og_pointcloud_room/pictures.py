@@ -164,7 +164,7 @@ def _panel(
     middle, size = (lower + upper) / 2, upper - lower
     inside = ((xyz > lower - 0.1) & (xyz < upper + 0.1)).all(axis=1)
     corner = _open_corner(xyz[inside], middle, size)
-    near_wall = ((xyz[:, :2] - middle[:2]) * corner > size[:2] / 2 - 0.12).any(axis=1)
+    near_wall = ((xyz[:, :2] - middle[:2]) * corner > size[:2] / 2 - 0.15).any(axis=1)
     shown = inside & ~near_wall & (xyz[:, 2] < lower[2] + CUT_HEIGHT)
     plotter.subplot(0, column)
     reach = 1.28 * float(np.linalg.norm(size[:2]))

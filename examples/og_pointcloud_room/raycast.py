@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import map_coordinates
+from scipy.ndimage import zoom
 
 from og_pointcloud.errors import MissingExtraError
 from og_pointcloud_room.room import Room
@@ -20,6 +20,8 @@ except ImportError as error:
 __all__ = ["Frame", "Intrinsics", "RayCaster"]
 
 BACKGROUND = -1
+NOISE_SIDE, NOISE_STEPS = 128, 8
+"""Cells along a side of the noise table, and cells to a grain of a material."""
 FILL_LIGHTS = (((0.3, -0.5, 0.8), 0.25), ((-0.8, 0.5, 0.33), 0.14), ((0.6, 0.8, 0.0), 0.08), ((0.1, 0.2, -0.97), 0.08))
 """Directions towards and strengths of the lights that cast no shadow: window, bounce from the wall, from the floor."""
 
@@ -59,7 +61,7 @@ class RayCaster:
     def __init__(self, room: Room, rng: np.random.Generator) -> None:
         self._room = room
         self._light = np.array([0.15 * room.size[0], -0.1 * room.size[1], 0.92 * room.size[2]], np.float32)
-        self._noise_table = rng.uniform(-1, 1, (32, 32, 32)).astype(np.float32)
+        self._noise_table = _value_noise(rng)
         self._scene = o3d.t.geometry.RaycastingScene()
         owners, colours, seconds, grains = [], [], [], []
         items = [*room.objects, *room.shell]
@@ -105,10 +107,8 @@ class RayCaster:
 
     def _albedo(self, xyz: NDArray[np.float32], part: NDArray[np.uint32]) -> NDArray[np.float32]:
         """Two colours of each part's material, mixed by two octaves of value noise of its grain. (n, 3)."""
-        place = np.ascontiguousarray((xyz / self._part_grain[part]).T)
-        noise = 0.75 * map_coordinates(self._noise_table, place, order=1, mode="grid-wrap")
-        place *= 3.1
-        noise += 0.35 * map_coordinates(self._noise_table, place, order=1, mode="grid-wrap")
+        cell = np.floor(xyz * (NOISE_STEPS / self._part_grain[part])).astype(np.int32) % NOISE_SIDE
+        noise = self._noise_table[cell[:, 0], cell[:, 1], cell[:, 2]]
         share = np.clip(0.5 + noise, 0, 1)[:, None]
         first, second = self._part_colours
         return first[part] + (second - first)[part] * share
@@ -125,6 +125,15 @@ class RayCaster:
         for direction, strength in FILL_LIGHTS:
             light += strength * np.maximum(normals @ np.array(direction, np.float32), 0)
         return light
+
+
+def _value_noise(rng: np.random.Generator) -> NDArray[np.float32]:
+    """(128, 128, 128) periodic noise of two octaves; one grain is NOISE_STEPS cells."""
+    octaves = []
+    for steps, strength in ((NOISE_STEPS, 0.75), (NOISE_STEPS // 2, 0.35)):
+        lattice = rng.uniform(-strength, strength, (NOISE_SIDE // steps,) * 3).astype(np.float32)
+        octaves.append(zoom(lattice, steps, order=1, mode="grid-wrap", grid_mode=True))
+    return octaves[0] + octaves[1]
 
 
 def _tensor(values: NDArray[Any], dtype: Any = np.float32) -> Any:

@@ -1,0 +1,161 @@
+"""The whole road on the procedural room: capture, fit, one file, words, a score beside its bounds, and pictures."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+import og_pointcloud as og
+from og_pointcloud.cloud import Vocabulary
+from og_pointcloud.fit import fit, prepare
+from og_pointcloud.formats.capture import read_capture
+from og_pointcloud.metrics import Score, adjusted_rand_index, score_labels
+from og_pointcloud.scene import Scene
+from og_pointcloud.settings import FitSettings
+from og_pointcloud.visibility import MaskTable
+from og_pointcloud_export import write_bundle
+from og_pointcloud_room.baselines import ceiling, direct_uplift
+from og_pointcloud_room.capture import CaptureSettings, RoomCapture, make_capture, write_capture
+from og_pointcloud_room.furniture import CLASS_NAMES
+from og_pointcloud_room.pictures import can_render, draw_instances, draw_labels, draw_views
+
+__all__ = ["DemoResult", "MethodScore", "run_demo"]
+
+SHOWN_VIEWS = (0.0, 0.2, 0.62, 0.82)
+"""Where along the path the views of the contact sheet lie."""
+
+
+@dataclass(frozen=True)
+class MethodScore:
+    """One row of the demo's table. seconds: wall clock from the scene in memory to a label per point; None if given."""
+
+    name: str
+    score: Score
+    seconds: float | None
+
+
+@dataclass(frozen=True)
+class DemoResult:
+    """What the demo wrote and measured.
+
+    methods: direct uplift, og_pointcloud, ceiling. share_of_the_way: of the distance in mIoU from the first to the
+    last, how much og_pointcloud covers (NaN where uplift is already at the ceiling). instance_agreement: adjusted Rand
+    index of its instances with the true ones, on labelled points. seconds: wall clock per stage of the demo.
+    """
+
+    output: Path
+    bundle: Path
+    pictures: tuple[Path, ...]
+    methods: tuple[MethodScore, MethodScore, MethodScore]
+    share_of_the_way: float
+    instance_agreement: float
+    seconds: dict[str, float]
+
+
+def run_demo(output: Path, seed: int = 0, mask_noise: float = 1.0, pictures: bool = True) -> DemoResult:
+    """Makes a room in ``output``/capture, fits it, writes ``output``/room.ogpc, asks it for every class and scores it.
+
+    seed: another room. mask_noise: 0 for a perfect proposer, 1 the default, more for worse. pictures: also draw
+    views.png, instances.png and labels.png, where PyVista can render off-screen. Prints one line per stage and a table.
+    """
+    seconds: dict[str, float] = {}
+    with _stage("make the room", seconds):
+        capture = make_capture(seed, CaptureSettings(mask_noise=mask_noise))
+        folder = write_capture(capture, output / "capture")
+    settings = FitSettings(seed=seed)
+    with _stage("read the capture", seconds):
+        scene = read_capture(folder)
+    with _stage("fit", seconds):
+        cloud = fit(scene, settings)
+    bundle = output / "room.ogpc"
+    with _stage("write one file", seconds):
+        write_bundle(replace(cloud, vocabulary=Vocabulary(CLASS_NAMES, capture.text_vectors)), bundle)
+    with _stage("segment by words", seconds):
+        result = og.segment(capture.xyz, CLASS_NAMES, scene=og.load(bundle))
+    with _stage("baselines", seconds):
+        baselines = _baselines(scene, settings, capture)
+    ours_seconds = seconds["fit"] + seconds["write one file"] + seconds["segment by words"]
+    methods = (baselines[0], MethodScore("og_pointcloud", _score(result.labels, capture), ours_seconds), baselines[1])
+    written: tuple[Path, ...] = ()
+    if pictures:
+        with _stage("draw pictures", seconds):
+            written = _draw(output, capture, result.labels, result.instances)
+    uplift, ours, best = (method.score.miou for method in methods)
+    share = (ours - uplift) / (best - uplift) if best > uplift else float("nan")
+    labelled = capture.instance >= 0
+    agreement = adjusted_rand_index(result.instances[labelled], capture.instance[labelled])
+    demo = DemoResult(output, bundle, written, methods, share, agreement, seconds)
+    _report(demo)
+    return demo
+
+
+def _mask_table(scene: Scene, settings: FitSettings) -> MaskTable:
+    return prepare(scene, settings).table
+
+
+def _baselines(scene: Scene, settings: FitSettings, capture: RoomCapture) -> tuple[MethodScore, MethodScore]:
+    """Direct uplift on the mask table that the fit works on, and the ceiling on the truth."""
+    start = time.perf_counter()
+    table = _mask_table(scene, settings)
+    uplift = direct_uplift(table.weights, table.mask_features, capture.text_vectors)
+    seconds = time.perf_counter() - start
+    features = np.concatenate(capture.mask_features)
+    best = ceiling(features, capture.mask_instance, capture.text_vectors, capture.instance)
+    return (
+        MethodScore("direct uplift", _score(uplift, capture), seconds),
+        MethodScore("ceiling: true instances", _score(best, capture), None),
+    )
+
+
+def _score(labels: np.ndarray, capture: RoomCapture) -> Score:
+    return score_labels(labels, capture.cls, background=capture.background)
+
+
+def _draw(output: Path, capture: RoomCapture, labels: np.ndarray, instances: np.ndarray) -> tuple[Path, ...]:
+    """The three pictures, or the first alone where nothing can be rendered."""
+    views, by_instance, by_label = (output / f"{name}.png" for name in ("views", "instances", "labels"))
+    chosen = [int(place * len(capture.frames)) for place in SHOWN_VIEWS]
+    draw_views(views, [capture.frames[index].image for index in chosen], [capture.masks[index] for index in chosen])
+    if not can_render():
+        print("no pictures of the cloud: off-screen rendering needs EGL or OSMesa (Debian: apt install libegl1 libgl1)")
+        return (views,)
+    draw_instances(by_instance, capture.xyz, capture.rgb, instances)
+    # Flying pixels and outliers have no truth to be held against; they are shown among the instances.
+    known = (capture.cls >= 0) | capture.background
+    draw_labels(
+        by_label, capture.xyz[known], capture.rgb[known], labels[known], capture.cls[known], CLASS_NAMES,
+        instance_ids=instances[known],
+    )  # fmt: skip
+    return (views, by_instance, by_label)
+
+
+@contextmanager
+def _stage(name: str, seconds: dict[str, float]) -> Iterator[None]:
+    start = time.perf_counter()
+    yield
+    seconds[name] = time.perf_counter() - start
+    print(f"{name:<18} {seconds[name]:6.1f} s", flush=True)
+
+
+def _report(demo: DemoResult) -> None:
+    print(f"\n{'method':<24} {'mIoU':>7} {'mAcc':>7} {'unknown':>8} {'background called':>18} {'seconds':>8}")
+    for method in demo.methods:
+        score = method.score
+        called = "-" if score.background_called is None else f"{score.background_called:.4f}"
+        seconds = "-" if method.seconds is None else f"{method.seconds:.1f}"
+        print(
+            f"{method.name:<24} {score.miou:7.4f} {score.macc:7.4f} {score.unknown_share:8.4f} {called:>18} "
+            f"{seconds:>8}"
+        )
+    print(f"og_pointcloud goes {demo.share_of_the_way:.1%} of the way from direct uplift to the ceiling")
+    print(f"agreement of its instances with the true ones (adjusted Rand index): {demo.instance_agreement:.3f}\n")
+    print(f"wrote {demo.bundle} ({demo.bundle.stat().st_size / 1e6:.1f} MB)")
+    for picture in demo.pictures:
+        print(f"wrote {picture}")
+    words = "chair,mug,potted plant"
+    print(f'total {sum(demo.seconds.values()):.1f} s; next: og-pointcloud segment {demo.bundle} --labels "{words}"')
