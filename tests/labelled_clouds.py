@@ -83,6 +83,7 @@ def tough_clouds() -> dict[str, LabelledCloud]:
         "a lattice": make_cloud(np.stack(np.meshgrid(*[np.arange(6)] * 3), -1), random.integers(-2, 5, 216), 1.0, 2.0),
         "reach below the spacing": replace(base, reach=0.02),
         "reach of 20 spacings": replace(base, spacing=0.02, reach=0.4),
+        "scattered points": make_cloud(random.random((60, 3)) * 20, np.arange(60) % 4),
         "300 instances": make_cloud(base.xyz, np.arange(800) % 300),
     }
 

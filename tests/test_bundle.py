@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import io
 import json
 import zipfile
@@ -13,6 +14,7 @@ import pytest
 from labelled_clouds import instance_table, make_cloud, room, tough_clouds, unit_rows
 from og_pointcloud_export import write_bundle, writer
 
+from og_pointcloud._atomic import replacing
 from og_pointcloud.bundle import read_bundle
 from og_pointcloud.cloud import InstanceTable, Vocabulary
 from og_pointcloud.errors import BundleError, OgPointcloudError
@@ -104,6 +106,8 @@ def test_half_precision_needs_the_same_best_word(monkeypatch):
 def test_the_same_cloud_gives_the_same_bytes(tmp_path):
     first, second = (write_bundle(room(300), tmp_path / name).read_bytes() for name in ("a.ogpc", "b.ogpc"))
     assert first == second
+    with zipfile.ZipFile(tmp_path / "a.ogpc") as archive:
+        assert {info.date_time for info in archive.infolist()} == {(1980, 1, 1, 0, 0, 0)}
 
 
 def test_manifest_says_what_is_inside(bundle_file):
@@ -134,6 +138,19 @@ def test_nothing_is_left_behind_when_writing_fails(tmp_path):
         write_bundle(cloud, tmp_path / "s.ogpc")
     assert (tmp_path / "s.ogpc").read_bytes() == b"old"
     assert [file.name for file in tmp_path.iterdir()] == ["s.ogpc"]
+
+
+def test_a_file_is_replaced_whole_or_not_at_all(tmp_path):
+    def write(content, *, fail):
+        with replacing(tmp_path / "file") as file:
+            file.write(content)
+            if fail:
+                raise KeyboardInterrupt
+
+    write(b"old", fail=False)
+    with pytest.raises(KeyboardInterrupt):
+        write(b"new", fail=True)
+    assert [(file.name, file.read_bytes()) for file in tmp_path.iterdir()] == [("file", b"old")]
 
 
 def test_missing_file(tmp_path):
@@ -206,8 +223,10 @@ def test_members_that_claim_the_same_bytes(tmp_path):
     """Directory entries that all point to one member with its right CRC: a small file that would unpack big."""
     with zipfile.ZipFile(tmp_path / "s.ogpc", "w") as archive:
         archive.writestr("big", bytes(1_000_000))
-        archive.filelist *= 200
-    refuse(tmp_path / "s.ogpc", "claim 200000000 bytes in a file of 1")
+        for number in range(199):
+            archive.filelist.append(copy.copy(archive.filelist[0]))
+            archive.filelist[-1].filename = f"big{number}"
+    refuse(tmp_path / "s.ogpc", "200 members of 200 names claim 200000000 bytes in a file of 1")
 
 
 def test_two_members_of_one_name(tmp_path):
