@@ -1,0 +1,89 @@
+"""Instances + masks -> feature rows: what the encoder saw of each instance, over all views (paper, Sec. 3.3).
+
+The paper matches each instance with one mask per view by IoU and feature distance (Eq. 5) and averages. Here the masks
+of an instance are known from grouping, and how much each shows of it is a product with the mask table, with true
+visibility: a mask counts by the pixels it shows of the instance, and masks that disagree with the rest are left out.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+
+from og_pointcloud.cloud import InstanceTable
+from og_pointcloud.settings import AssociationSettings
+from og_pointcloud.visibility import MaskTable
+
+__all__ = ["describe_instances"]
+
+
+def describe_instances(
+    table: MaskTable,
+    group: NDArray[np.int32],
+    instance_ids: NDArray[np.int32],
+    count: int,
+    settings: AssociationSettings,
+) -> InstanceTable:
+    """One unit feature row per instance with its evidence.
+
+    group: (masks,) int32, the instance of each mask, -1 none. instance_ids: (n,) int32, -1 and below none.
+    Masks without a feature (zero rows) count as evidence of the instance but not in its row; an instance of which no
+    mask has a feature gets no row.
+    """
+    shown = _shown_of_instance(table, group, instance_ids)
+    features = table.unit_features.astype(np.float64)
+    rows, owners = [], []
+    agreement = np.zeros(count, np.float32)
+    for instance in range(count):
+        members = np.flatnonzero((group == instance) & (shown > 0) & features.any(axis=1))
+        row, kept, cosines = _robust_mean(features[members], shown[members], settings.outlier_deviations)
+        if row is None:
+            continue
+        rows.append(row)
+        owners.append(instance)
+        agreement[instance] = np.average(cosines[kept], weights=shown[members][kept])
+    grouped = group >= 0
+    pairs = np.unique(np.stack([group[grouped], table.mask_view[grouped]]), axis=1)
+    return InstanceTable(
+        descriptors=np.array(rows, np.float32).reshape(-1, features.shape[1]),
+        descriptor_instance=np.array(owners, np.int32),
+        points=np.bincount(instance_ids[instance_ids >= 0], minlength=count).astype(np.int32),
+        views=np.bincount(pairs[0], minlength=count).astype(np.int32),
+        masks=np.bincount(group[grouped], minlength=count).astype(np.int32),
+        agreement=agreement,
+        visible_area=np.bincount(group[grouped], shown[grouped], count).astype(np.float32),
+    )
+
+
+def _shown_of_instance(
+    table: MaskTable, group: NDArray[np.int32], instance_ids: NDArray[np.int32]
+) -> NDArray[np.float64]:
+    """(masks,) float64: pixels of blending weight that each mask puts on the points of its own instance."""
+    weights: csr_array = table.weights
+    mask = np.repeat(np.arange(weights.shape[0]), np.diff(weights.indptr))
+    own = (group[mask] >= 0) & (instance_ids[weights.indices] == group[mask])
+    return np.bincount(mask[own], weights.data[own], weights.shape[0])
+
+
+def _robust_mean(
+    features: NDArray[np.float64], weight: NDArray[np.float64], deviations: float
+) -> tuple[NDArray[np.float64] | None, NDArray[np.bool_], NDArray[np.float64]]:
+    """Weighted mean direction of unit rows without outliers: the mean (None if there is none), the rows kept, cosines.
+
+    An outlier's cosine with the mean lies more than ``deviations`` robust deviations (1.4826 MAD) below the median.
+    """
+    kept = np.ones(len(features), bool)
+    cosines = np.zeros(len(features))
+    mean = None
+    for _ in range(2):
+        total = weight[kept] @ features[kept]
+        length = np.linalg.norm(total)
+        if length < 1e-12:
+            return None, kept, cosines
+        mean = total / length
+        cosines = features @ mean
+        middle = np.median(cosines)
+        spread = 1.4826 * np.median(np.abs(cosines - middle))
+        kept = cosines >= middle - deviations * max(spread, 1e-6)
+    return mean, kept, cosines

@@ -1,0 +1,228 @@
+"""fit(scene) -> LabelledCloud: the stages in order, timed, skipping what the scene does not need."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from og_pointcloud.association import describe_instances
+from og_pointcloud.cloud import BACKGROUND, UNOBSERVED, InstanceTable, LabelledCloud
+from og_pointcloud.errors import SceneError
+from og_pointcloud.geometry import (
+    Neighbourhood,
+    choose_gaussians,
+    near_plane,
+    neighbourhood,
+    pixels_per_spacing,
+    strided,
+)
+from og_pointcloud.grouping import group_masks
+from og_pointcloud.membership import assign_points, without_see_through
+from og_pointcloud.scene import Points, Scene, View
+from og_pointcloud.settings import FitSettings, GeometrySettings
+from og_pointcloud.visibility import Gaussians, MaskTable, mask_table
+
+__all__ = ["Prepared", "fit", "prepare"]
+
+Item = TypeVar("Item")
+
+
+@dataclass
+class Journal:
+    """What a fit did: seconds per stage, what it left out and why, warnings, notes. Becomes the cloud's provenance."""
+
+    progress: bool
+    stages: list[dict[str, Any]] = field(default_factory=list)
+    left_out: list[dict[str, str]] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+    notes: dict[str, Any] = field(default_factory=dict)
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Time a stage; several stages of one name add up."""
+        start = time.perf_counter()
+        yield
+        seconds = time.perf_counter() - start
+        self.stages.append({"name": name, "seconds": round(seconds, 4)})
+
+    def leave_out(self, what: str, why: str) -> None:
+        self.left_out.append({"what": what, "why": why})
+
+    def steps(self, items: Sequence[Item], name: str) -> Iterable[Item]:
+        """The items, with a progress bar that shows the remaining time."""
+        if not self.progress:
+            return items
+        from tqdm import tqdm
+
+        return tqdm(items, desc=f"{name:<12}", leave=False, dynamic_ncols=True)
+
+    def provenance(self, settings: FitSettings) -> dict[str, Any]:
+        return {
+            "settings": asdict(settings),
+            "stages": self.stages,
+            "left_out": self.left_out,
+            "warnings": self.warnings,
+            "notes": self.notes,
+        }
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """Frozen geometry and what every mask shows of it: all that the stages after rendering need."""
+
+    neighbourhood: Neighbourhood
+    gaussians: Gaussians
+    table: MaskTable
+
+
+def fit(scene: Scene, settings: FitSettings | None = None, *, progress: bool = True) -> LabelledCloud:
+    """Label a scene: which points form one instance, and what the encoder saw of each.
+
+    Deterministic: the same scene and settings give the same ids on every run. Raises SceneError where the scene
+    cannot give an instance at all (no masks, or no camera that sees the cloud).
+    """
+    settings = settings or FitSettings()
+    journal = Journal(progress)
+    _check(scene, journal)
+    prepared = prepare(scene, settings, journal)
+    with journal.stage("grouping"):
+        table = _front_surfaces(scene, prepared, settings, journal)
+        groups = group_masks(table, settings.grouping)
+    with journal.stage("membership"):
+        membership = assign_points(table, groups, prepared.neighbourhood, settings.membership)
+    with journal.stage("association"):
+        ids, group = _without_empty(membership.instance_ids, groups.group)
+        count = int(ids.max(initial=-1)) + 1
+        instances = describe_instances(table, group, ids, count, settings.association)
+    _report(ids, groups.count, membership.dismissed, groups.spanning, instances, journal)
+    typical = float(np.median(prepared.neighbourhood.spacing))
+    return LabelledCloud(
+        xyz=scene.points.xyz,
+        origin=scene.points.origin,
+        instance_ids=ids,
+        instances=instances,
+        feature_space=scene.feature_space,
+        spacing=typical,
+        reach=settings.geometry.reach * typical,
+        rgb=scene.points.rgb,
+        provenance=journal.provenance(settings),
+    )
+
+
+def prepare(scene: Scene, settings: FitSettings | None = None, journal: Journal | None = None) -> Prepared:
+    """The stages that every method shares: point spacing, Gaussians, and the mask table of all views."""
+    settings = settings or FitSettings()
+    journal = journal or Journal(progress=False)
+    with journal.stage("spacing"):
+        near = near_plane(scene.points.xyz, scene.views)
+        around = neighbourhood(scene.points.xyz, settings.geometry)
+    with journal.stage("geometry"):
+        gaussians = _gaussians(scene, around, near, settings.geometry, journal)
+    with journal.stage("visibility"):
+        stride = _stride(scene.points, around.spacing, scene.views, settings.geometry, journal)
+        views = (_thinned(view, stride) for view in journal.steps(scene.views, "visibility"))
+        table = mask_table(gaussians, views, near)
+        table = replace(table, mask_pixels=table.mask_pixels * stride**2)
+    if table.exposure.nnz == 0:
+        raise SceneError(
+            f"no camera sees the cloud: {len(scene.points)} points, {len(scene.views)} views, none in any image; check "
+            "that poses and cloud share one frame and that poses are camera-to-world (transforms.json) as documented"
+        )
+    return Prepared(around, gaussians, table)
+
+
+def _check(scene: Scene, journal: Journal) -> None:
+    masks = sum(view.mask_count for view in scene.views)
+    if masks == 0:
+        raise SceneError(f"none of the {len(scene.views)} views has a mask; expected at least one: make masks first")
+    if len(scene.views) == 1:
+        journal.warnings.append("one view: nothing can contradict its masks, so every mask is an instance")
+    journal.notes.update(points=len(scene.points), views=len(scene.views), masks=masks)
+
+
+def _gaussians(
+    scene: Scene, around: Neighbourhood, near: float, settings: GeometrySettings, journal: Journal
+) -> Gaussians:
+    if scene.points.are_gaussians:
+        journal.leave_out("choice of scale and opacity", "the file holds Gaussians")
+        return Gaussians.from_points(scene.points)
+    choice = choose_gaussians(
+        scene.points, around.spacing, scene.views, near, settings, lambda values: journal.steps(values, "geometry")
+    )
+    journal.notes["gaussian_scale"], journal.notes["gaussian_opacity"] = choice.scale, choice.opacity
+    journal.notes["photometric_trials"] = [list(trial) for trial in choice.trials]
+    if not choice.trials:
+        journal.warnings.append(
+            f"no colours or images to compare with: points are drawn {choice.scale} spacings large, {choice.opacity} "
+            "opaque; add images for a choice by photometric agreement"
+        )
+    return choice.gaussians
+
+
+def _stride(
+    points: Points, spacing: NDArray[np.float32], views: Sequence[View], settings: GeometrySettings, journal: Journal
+) -> int:
+    """Use every stride-th pixel of the masks: pixels much finer than the points see nothing new."""
+    if points.are_gaussians:
+        return 1
+    apart = pixels_per_spacing(points, spacing, views)
+    stride = int(np.clip(apart / settings.pixels_per_spacing, 1, settings.max_stride))
+    if stride > 1:
+        journal.leave_out(
+            f"{1 - 1 / stride**2:.0%} of the pixels",
+            f"points lie {apart:.1f} px apart: every {stride}th row and column",
+        )
+    return stride
+
+
+def _thinned(view: View, stride: int) -> View:
+    if stride == 1:
+        return view
+    first = stride // 2
+    masks = np.ascontiguousarray(view.mask_map()[first::stride, first::stride])
+    return replace(view, camera=strided(view.camera, stride), masks=masks, image=None)
+
+
+def _front_surfaces(scene: Scene, prepared: Prepared, settings: FitSettings, journal: Journal) -> MaskTable:
+    depth_rows = np.stack([view.camera.world_to_camera[2] for view in scene.views])
+    focal = np.sqrt([view.camera.fx * view.camera.fy for view in scene.views])
+    table, share = without_see_through(prepared.table, prepared.gaussians, depth_rows, focal, settings.membership)
+    journal.notes["seen_through"] = round(share, 5)
+    return table
+
+
+def _without_empty(ids: NDArray[np.int32], group: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """Number the groups that have points 0, 1, ... in their order; masks of the others belong to none."""
+    used = np.unique(ids[ids >= 0])
+    number = np.full(int(group.max(initial=-1)) + 2, -1, np.int32)
+    number[used] = np.arange(len(used), dtype=np.int32)
+    return np.where(ids >= 0, number[ids], ids).astype(np.int32), number[group]
+
+
+def _report(
+    ids: NDArray[np.int32],
+    groups: int,
+    dismissed: NDArray[np.bool_],
+    spanning: NDArray[np.bool_],
+    instances: InstanceTable,
+    journal: Journal,
+) -> None:
+    if spanning.any():
+        journal.leave_out(f"{spanning.sum()} masks", "most views show each of them as several things")
+    if dismissed.any():
+        journal.leave_out(
+            f"{dismissed.sum()} of {groups} groups of masks",
+            "views that see their points mostly show no such mask, far more often than the proposer's misses explain",
+        )
+    journal.leave_out("learned features and codebook", "grouping needs no training")
+    states = {"labelled": ids >= 0, "background": ids == BACKGROUND, "unobserved": ids == UNOBSERVED}
+    journal.notes["points_by_state"] = {name: int(state.sum()) for name, state in states.items()}
+    journal.notes["instances"] = len(instances)
+    if len(instances) == 0:
+        journal.warnings.append("no instance was found: every mask is contradicted by other views or shows no point")

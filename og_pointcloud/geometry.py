@@ -1,0 +1,204 @@
+"""Plain cloud -> Gaussians: how large and how opaque a point is, chosen so that the cloud looks like the photographs.
+
+Too large and the cloud becomes fog that hides itself and bleeds over edges; too small and rays pass through. Every
+point becomes an isotropic Gaussian of ``scale`` times its own spacing, with one ``opacity``; the two numbers are those
+with which the points, drawn in their own colours, differ least from the images. It is the paper's stage 0 (scale and
+opacity fitted with frozen positions) reduced to what a plain cloud needs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from og_pointcloud.scene import Camera, Points, View
+from og_pointcloud.settings import GeometrySettings
+from og_pointcloud.visibility import NEAR_SHARE, Gaussians, pixel_weights
+
+__all__ = [
+    "GeometryChoice",
+    "Neighbourhood",
+    "choose_gaussians",
+    "near_plane",
+    "neighbourhood",
+    "pixels_per_spacing",
+    "strided",
+]
+
+
+@dataclass(frozen=True)
+class Neighbourhood:
+    """spacing: (n,) float32, mean distance to the three nearest points, tamed for duplicates and floaters.
+    index: (n, k) int32, nearest points, nearest first, without the point itself. adjoining: (n, k) bool, those within
+    the settings' reach (in spacings)."""
+
+    spacing: NDArray[np.float32]
+    index: NDArray[np.int32]
+    adjoining: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class GeometryChoice:
+    """scale (in spacings) and opacity of every point, and the trials (scale, opacity, photometric error) behind them;
+    no trials where there was nothing to compare with."""
+
+    gaussians: Gaussians
+    scale: float
+    opacity: float
+    trials: tuple[tuple[float, float, float], ...]
+
+
+def neighbourhood(xyz: NDArray[np.float32], settings: GeometrySettings) -> Neighbourhood:
+    """Spacing and neighbours of every point.
+
+    A floater's own spacing says nothing of a surface: it is held to the median spacing of its neighbours.
+    Duplicates have none: they take the scene's. One point alone has spacing 1.
+    """
+    n = len(xyz)
+    k = min(settings.neighbours, n - 1)
+    if k == 0:
+        return Neighbourhood(np.ones(n, np.float32), np.zeros((n, 0), np.int32), np.zeros((n, 0), bool))
+    distance, index = cKDTree(xyz).query(xyz, k=k + 1, workers=-1)
+    # The point itself is usually first, but not always among duplicates.
+    itself = index == np.arange(n)[:, None]
+    itself[~itself.any(axis=1), -1] = True
+    distance, index = distance[~itself].reshape(n, k), index[~itself].reshape(n, k).astype(np.int32)
+    spacing = distance[:, :3].mean(axis=1)
+    typical = float(np.median(spacing[spacing > 0])) if (spacing > 0).any() else 1.0
+    spacing = np.where(spacing > 0, spacing, typical)
+    spacing = np.minimum(spacing, np.median(spacing[index], axis=1)).astype(np.float32)
+    adjoining = distance <= settings.reach * np.maximum(spacing, typical)[:, None]
+    return Neighbourhood(spacing, index, adjoining)
+
+
+def near_plane(xyz: NDArray[np.float32], views: Sequence[View]) -> float:
+    """Depth of the near plane: a share of the median depth at which cameras see the cloud. Never 0."""
+    depths = [_depths(xyz[:: 1 + len(xyz) // 20_000], view.camera) for view in views]
+    front = np.concatenate([depth[depth > 0] for depth in depths])
+    return NEAR_SHARE * float(np.median(front)) if len(front) else 1e-6
+
+
+def pixels_per_spacing(points: Points, spacing: NDArray[np.float32], views: Sequence[View]) -> float:
+    """How many pixels apart neighbouring points lie in the images, median over the points in front of the cameras."""
+    step = 1 + len(points) // 20_000
+    apart = []
+    for view in views:
+        depth = _depths(points.xyz[::step], view.camera)
+        front = depth > 0
+        apart.append(np.sqrt(view.camera.fx * view.camera.fy) * spacing[::step][front] / depth[front])
+    seen = np.concatenate(apart)
+    return float(np.median(seen)) if len(seen) else 1.0
+
+
+def strided(camera: Camera, stride: int) -> Camera:
+    """The camera of every stride-th pixel, ``image[stride // 2 :: stride, stride // 2 :: stride]``."""
+    first = stride // 2
+
+    def center(c: float) -> float:
+        return (c - first - 0.5) / stride + 0.5
+
+    return replace(
+        camera,
+        width=-(-(camera.width - first) // stride),
+        height=-(-(camera.height - first) // stride),
+        fx=camera.fx / stride,
+        fy=camera.fy / stride,
+        cx=center(camera.cx),
+        cy=center(camera.cy),
+    )
+
+
+def choose_gaussians(
+    points: Points,
+    spacing: NDArray[np.float32],
+    views: Sequence[View],
+    near: float,
+    settings: GeometrySettings,
+    progress: Callable[[Sequence[float]], Iterable[float]] = lambda values: values,
+) -> GeometryChoice:
+    """Gaussians of a plain cloud by photometric agreement with a few of its images.
+
+    Scale is swept first, then opacity; then the smallest scale that looks as good is taken, because the error is flat
+    where splats begin to overlap, and smaller ones bleed less over edges.
+    Without colours or images the settings' start values are used.
+    """
+    photographs = _photographs(points, spacing, views, settings)
+    scale, opacity = settings.start_scale, settings.start_opacity
+    trials: dict[tuple[float, float], float] = {}
+    if photographs:
+
+        def error(scale: float, opacity: float) -> float:
+            if (scale, opacity) not in trials:
+                trials[scale, opacity] = _photometric_error(points, spacing, photographs, near, scale, opacity)
+            return trials[scale, opacity]
+
+        scale = min(progress(settings.scales), key=lambda s: error(s, opacity))
+        opacity = min(progress(settings.opacities), key=lambda o: error(scale, o))
+        good = error(scale, opacity) * (1 + settings.error_tolerance)
+        scale = min(s for s in settings.scales if s <= scale and error(s, opacity) <= good)
+    return GeometryChoice(
+        isotropic(points, spacing, scale, opacity), scale, opacity, tuple((*pair, e) for pair, e in trials.items())
+    )
+
+
+def isotropic(points: Points, spacing: NDArray[np.float32], scale: float, opacity: float) -> Gaussians:
+    """Round Gaussians of ``scale`` spacings."""
+    n = len(points)
+    rotation = np.zeros((n, 4), np.float32)
+    rotation[:, 0] = 1
+    size = np.repeat((scale * spacing).astype(np.float32)[:, None], 3, axis=1)
+    return Gaussians(points.xyz, size, rotation, np.full(n, opacity, np.float32))
+
+
+def _photographs(
+    points: Points, spacing: NDArray[np.float32], views: Sequence[View], settings: GeometrySettings
+) -> list[tuple[Camera, NDArray[np.float32]]]:
+    """A few views with their images at about one pixel per spacing: what the cloud can resolve."""
+    if points.rgb is None:
+        return []
+    import cv2
+
+    with_image = [view for view in views if view.image is not None]
+    chosen = (
+        np.unique(np.linspace(0, len(with_image) - 1, settings.photographs).round().astype(int)) if with_image else []
+    )
+    shrink = max(1.0, pixels_per_spacing(points, spacing, views))
+    photographs = []
+    for index in chosen:
+        image, camera = with_image[index].image_rgb(), with_image[index].camera
+        size = max(1, round(camera.width / shrink)), max(1, round(camera.height / shrink))
+        small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+        photographs.append((camera.resized(*size), small.reshape(-1, 3).astype(np.float32) / 255))
+    return photographs
+
+
+def _photometric_error(
+    points: Points,
+    spacing: NDArray[np.float32],
+    photographs: list[tuple[Camera, NDArray[np.float32]]],
+    near: float,
+    scale: float,
+    opacity: float,
+) -> float:
+    """Mean absolute difference of the drawn cloud and the images; what the cloud leaves open shows the median colour.
+
+    So an uncovered pixel costs what a guess costs: a cloud that cannot cover the image is not blown up to do so.
+    """
+    assert points.rgb is not None
+    colors = points.rgb.astype(np.float32) / 255
+    guess = np.median(np.concatenate([image for _, image in photographs]), axis=0)
+    gaussians = isotropic(points, spacing, scale, opacity)
+    errors = []
+    for camera, image in photographs:
+        weights = pixel_weights(gaussians, camera, near)
+        uncovered = 1 - np.asarray(weights.sum(axis=1)).reshape(-1, 1)
+        errors.append(float(np.abs(weights @ colors + uncovered * guess - image).mean()))
+    return float(np.mean(errors))
+
+
+def _depths(xyz: NDArray[np.float32], camera: Camera) -> NDArray[np.float64]:
+    return xyz @ camera.world_to_camera[2, :3] + camera.world_to_camera[2, 3]

@@ -1,0 +1,283 @@
+"""Masks of different views -> instances, without training: masks are one object where most views say so.
+
+Two masks of two views show the same thing as far as they share Gaussians that both views see. Let
+
+    N_ij = sum_g A_ig A_jg            mass that mask i and mask j share
+    N_ib = sum_g A_ig s_bg            mass of mask i that view b sees at all (s = masked + unmasked weight)
+
+so that ``N_ij / N_ib`` is the share of mask i that lies in mask j of view b. From it, per mask and view, its
+*container*: the one mask of that view holding most of it, if there is one. Each view is thus a witness for every pair
+of masks it contains: "one thing" (same container) or "two" (different ones). A view that missed an object says
+nothing. Masks are joined bottom-up while a majority of the witnesses pooled over both groups says "one thing":
+a mask that spans two objects is outvoted, parts of one object come together when other views show it whole.
+The idea of view consensus is that of MaskClustering (Yan et al., CVPR 2024); the soft, visibility-weighted form is ours.
+"""
+
+from __future__ import annotations
+
+import heapq
+from bisect import bisect_left, bisect_right
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+
+from og_pointcloud.settings import GroupingSettings
+from og_pointcloud.visibility import MaskTable
+
+__all__ = ["MaskGroups", "group_masks", "indicator"]
+
+
+@dataclass(frozen=True)
+class MaskGroups:
+    """group: (masks,) int32, the group of each mask, -1 where the mask was left out (it spans objects, or shows
+    nothing). count: number of groups. spanning: (masks,) bool, masks that most views show as several things."""
+
+    group: NDArray[np.int32]
+    count: int
+    spanning: NDArray[np.bool_]
+
+
+def group_masks(table: MaskTable, settings: GroupingSettings) -> MaskGroups:
+    """Group the masks of a table. Ids are ordered by shown mass, largest first, and do not depend on chance."""
+    share = mask_shares(table, settings)
+    spanning = _spanning_masks(share, table.mask_view, settings)
+    container = _containers(share, table.mask_view, spanning, settings)
+    witnesses = _witnesses(share, container, table.mask_view, settings)
+    shown = np.asarray(table.weights.sum(axis=1)).ravel()
+    usable = ~spanning & (shown > 0)
+    group = _agglomerate(witnesses, table.unit_features, table.mask_view, usable, settings)
+    return MaskGroups(*_ordered(group, shown), spanning)
+
+
+def mask_shares(table: MaskTable, settings: GroupingSettings) -> csr_array:
+    """(masks, masks) sparse: entry (i, j) is the share of what mask i shows, and j's view sees, that lies in j."""
+    weights, seen = _surface_shares(table, settings)
+    together = (weights @ weights.T).tocoo()
+    visible = (weights @ seen.T).toarray()
+    own = np.asarray(weights.multiply(weights).sum(axis=1)).ravel()
+    rows, cols = together.row, together.col
+    base = visible[rows, table.mask_view[cols]]
+    # A view that sees only a sliver of a mask is no witness of it.
+    enough = base > settings.witness_share * own[rows]
+    value = together.data[enough] / base[enough]
+    return csr_array((value, (rows[enough], cols[enough])), shape=together.shape)
+
+
+def _surface_shares(table: MaskTable, settings: GroupingSettings) -> tuple[csr_array, csr_array]:
+    """What masks show, and what views see, of surfaces: (masks, n') part of a point inside a mask, (views, n') ones.
+
+    Only points that a view shows about as openly as their best view does. What shines through a gap in front would
+    else outweigh small objects: few points in front of many. Every point counts alike, near or far.
+    """
+    exposure = _thinned(table.exposure, settings.graph_points).tocoo()
+    best = np.zeros(exposure.shape[1])
+    np.maximum.at(best, exposure.col, exposure.data)
+    open_ = exposure.data > settings.open_share * best[exposure.col]
+    rows, cols = exposure.row[open_], exposure.col[open_]
+    seen = csr_array((np.ones(len(rows), np.float32), (rows, cols)), shape=exposure.shape)
+
+    weights = _thinned(table.weights, settings.graph_points)
+    total = csr_array(
+        indicator(table.mask_view, seen.shape[0]) @ weights + _thinned(table.outside, settings.graph_points)
+    )
+    total.data = 1 / total.data
+    part = csr_array(seen.multiply(total))
+    return csr_array(weights.multiply(part[table.mask_view])), seen
+
+
+def _thinned(matrix: csr_array, limit: int) -> csr_array:
+    """Every k-th Gaussian: overlaps are means over thousands of points and need no more than ``limit`` of them."""
+    step = -(-matrix.shape[1] // limit)
+    return matrix if step == 1 else csr_array(matrix[:, ::step])
+
+
+def indicator(owner: NDArray[np.int32], count: int) -> csr_array:
+    """(count, len(owner)) sparse with a one at (owner[i], i); negative owners have none."""
+    index = np.flatnonzero(owner >= 0)
+    return csr_array((np.ones(len(index), np.float32), (owner[index], index)), shape=(count, len(owner)))
+
+
+def _spanning_masks(share: csr_array, mask_view: NDArray[np.int32], settings: GroupingSettings) -> NDArray[np.bool_]:
+    """Masks that most of the witnessing views show as two things or more.
+
+    A view shows mask i as several when no mask of it holds i, while two or more of its masks that lie within i do
+    together cover it.
+    """
+    entries = share.tocoo()
+    views = int(mask_view.max(initial=-1)) + 1
+    inside = _lookup(share, entries.col, entries.row)  # share of j in i
+    part = inside > settings.container_share
+    cell = entries.row.astype(np.int64) * views + mask_view[entries.col]
+    size = len(mask_view) * views
+    largest = np.zeros(size)
+    np.maximum.at(largest, cell, entries.data)
+    parts = np.bincount(cell[part], (entries.data[part] > settings.part_share).astype(float), size)
+    covered = np.bincount(cell[part], entries.data[part], size)
+    split = (largest < settings.container_share) & (parts >= 2) & (covered > settings.container_share)
+    whole = largest >= settings.container_share
+    own = np.arange(len(mask_view)) * views + mask_view
+    whole[own] = False  # a mask is no witness of itself
+    split, whole = split.reshape(-1, views).sum(axis=1), whole.reshape(-1, views).sum(axis=1)
+    return split > whole
+
+
+def _lookup(matrix: csr_array, rows: NDArray[np.int32], cols: NDArray[np.int32]) -> NDArray[np.float64]:
+    """Entries of a sparse matrix, 0 where it has none."""
+    entries = matrix.tocoo()
+    width = np.int64(matrix.shape[1])
+    keys = entries.row * width + entries.col
+    order = np.argsort(keys)
+    wanted = rows * width + cols
+    place = np.minimum(np.searchsorted(keys[order], wanted), len(keys) - 1)
+    if len(keys) == 0:
+        return np.zeros(len(wanted))
+    found = order[place]
+    return np.where(keys[found] == wanted, entries.data[found], 0.0)
+
+
+def _containers(
+    share: csr_array, mask_view: NDArray[np.int32], spanning: NDArray[np.bool_], settings: GroupingSettings
+) -> csr_array:
+    """(masks, masks) sparse of ones: (i, m) where m is the mask of its view that holds most of mask i."""
+    entries = share.tocoo()
+    holds = (entries.data > settings.container_share) & ~spanning[entries.col]
+    rows, cols, value = entries.row[holds], entries.col[holds], entries.data[holds]
+    # More than half of a mask lies in at most one mask of a view, so a container is unique wherever there is one
+    # level of masks; overlapping levels keep the tightest by order of value.
+    order = np.lexsort((cols, -value, mask_view[cols], rows))
+    rows, cols = rows[order], cols[order]
+    first = np.ones(len(rows), bool)
+    first[1:] = (np.diff(rows) != 0) | (np.diff(mask_view[cols]) != 0)
+    rows, cols = rows[first], cols[first]
+    return csr_array((np.ones(len(rows), np.float32), (rows, cols)), shape=share.shape)
+
+
+@dataclass(frozen=True)
+class _Witnesses:
+    """Per pair of masks (rows, cols, both ways) that any view shows as one thing: how many views do, and how many of
+    these if the two masks have the same extent, else 0. speaks: (masks, views), where a mask has a container: views
+    that say anything of a pair are those where both have."""
+
+    rows: NDArray[np.int32]
+    cols: NDArray[np.int32]
+    one: NDArray[np.float64]
+    same_extent: NDArray[np.float64]
+    speaks: NDArray[np.float64]
+
+
+def _witnesses(
+    share: csr_array, container: csr_array, mask_view: NDArray[np.int32], settings: GroupingSettings
+) -> _Witnesses:
+    pairs = csr_array(container @ container.T).tocoo()
+    off_diagonal = pairs.row != pairs.col
+    rows, cols, one = pairs.row[off_diagonal], pairs.col[off_diagonal], pairs.data[off_diagonal].astype(np.float64)
+    speaks = (container @ indicator(mask_view, int(mask_view.max(initial=-1)) + 1).T).toarray().astype(np.float64)
+    smaller = np.minimum(_lookup(share, rows, cols), _lookup(share, cols, rows))
+    return _Witnesses(rows, cols, one, np.where(smaller > settings.container_share, one, 0.0), speaks)
+
+
+def _agglomerate(
+    witnesses: _Witnesses,
+    features: NDArray[np.float32],
+    mask_view: NDArray[np.int32],
+    usable: NDArray[np.bool_],
+    settings: GroupingSettings,
+) -> NDArray[np.int64]:
+    """Join the pair of groups with the most agreement until no majority is left; a group number per mask, -1 unused.
+
+    The agreement of two groups is the share of their pooled witnesses that say "one thing". Masks of the same extent
+    are one thing whatever their features say. Where one only lies within the other it may be a part of it, or a cup on
+    a table whose view missed the cup: then the witnesses count as far as the features are alike.
+    Ties go to the lower mask numbers.
+    """
+    likeness = _Likeness(features, mask_view)
+    links = _link_table(witnesses, usable)
+    speaks = witnesses.speaks.copy()
+    group = np.where(usable, np.arange(len(usable)), -1)
+    version = np.zeros(len(usable), np.int64)
+
+    def agreement(a: int, b: int) -> float:
+        one, same_extent = links[a][b]
+        return (same_extent + (one - same_extent) * likeness(a, b)) / float(speaks[a] @ speaks[b])
+
+    heap = [(-agreement(a, b), a, b, 0, 0) for a in links for b in links[a] if a < b]
+    heapq.heapify(heap)
+    while heap:
+        score, a, b, seen_a, seen_b = heapq.heappop(heap)
+        if -score <= settings.join_majority:
+            break
+        if version[a] != seen_a or version[b] != seen_b or group[a] != a or group[b] != b:
+            continue
+        group[b] = a
+        version[a] += 1
+        likeness.join(a, b)
+        speaks[a] += speaks[b]
+        del links[a][b], links[b][a]
+        for c, more in links.pop(b).items():
+            del links[c][b]
+            have = links[a].get(c, (0.0, 0.0))
+            links[a][c] = links[c][a] = (have[0] + more[0], have[1] + more[1])
+        for c in links[a]:
+            low, high = min(a, c), max(a, c)
+            heapq.heappush(heap, (-agreement(low, high), low, high, version[low], version[high]))
+    return _roots(group)
+
+
+class _Likeness:
+    """How alike the features of two groups are: the share of different masks of one view that are less alike, squared.
+
+    Masks of one view are mostly different things, whatever the encoder: they calibrate its cosines.
+    """
+
+    def __init__(self, features: NDArray[np.float32], mask_view: NDArray[np.int32]) -> None:
+        self.total = features.astype(np.float64)
+        self.length = np.linalg.norm(self.total, axis=1).tolist()
+        cosines = [np.zeros(0)]
+        for view in np.unique(mask_view):
+            rows = features[mask_view == view][:200]
+            cosines.append((rows @ rows.T)[np.triu_indices(len(rows), 1)])
+        self.different = np.sort(np.concatenate(cosines)).tolist()
+
+    def __call__(self, a: int, b: int) -> float:
+        length = self.length[a] * self.length[b]
+        if not self.different or length == 0:
+            return 0.25  # nothing known: the expected square of a uniform share lies near
+        cosine = float(self.total[a] @ self.total[b]) / length
+        below = bisect_left(self.different, cosine - 1e-6) + bisect_right(self.different, cosine + 1e-6)
+        return (0.5 * below / len(self.different)) ** 2
+
+    def join(self, a: int, b: int) -> None:
+        self.total[a] += self.total[b]
+        self.length[a] = float(np.linalg.norm(self.total[a]))
+
+
+def _link_table(witnesses: _Witnesses, usable: NDArray[np.bool_]) -> dict[int, dict[int, tuple[float, float]]]:
+    """links[a][b] = (one, same_extent) of the usable masks, both ways."""
+    w = witnesses
+    links: dict[int, dict[int, tuple[float, float]]] = {int(a): {} for a in np.flatnonzero(usable)}
+    keep = usable[w.rows] & usable[w.cols]
+    columns = (column[keep].tolist() for column in (w.rows, w.cols, w.one, w.same_extent))
+    for a, b, one, same_extent in zip(*columns, strict=True):
+        links[a][b] = (one, same_extent)
+    return links
+
+
+def _roots(group: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Follow each mask to the group it ended in."""
+    while True:
+        parent = np.where(group >= 0, group[group], -1)
+        if (parent == group).all():
+            return group
+        group = parent
+
+
+def _ordered(group: NDArray[np.int64], shown: NDArray[np.floating]) -> tuple[NDArray[np.int32], int]:
+    """Renumber groups by the mass they show, largest first (ties: lowest mask first)."""
+    roots = np.unique(group[group >= 0])
+    mass = np.bincount(group[group >= 0], shown[group >= 0], len(group))[roots]
+    order = roots[np.lexsort((roots, -mass))]
+    number = np.full(len(group), -1, np.int32)
+    number[order] = np.arange(len(order), dtype=np.int32)
+    return np.where(group >= 0, number[group], -1).astype(np.int32), len(order)

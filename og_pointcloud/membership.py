@@ -1,0 +1,229 @@
+"""Groups of masks -> one state per point: an instance, background, or unobserved. Decided from all views together.
+
+A mask covers a point or it does not; what matters is what the *other* views say. Let, for point g and instance k,
+
+    own_k(g)   weight of g inside the masks of k, over all views
+    asked_k(g) weight of g in the views that have a mask of k: the views that could have said so
+    share      own_k / asked_k
+
+A view in which the proposer missed k says nothing about k; a view that has a mask of k and shows g outside it says
+"not k". So a share near 1 means "k", near 0 "seen, and not k", however often the proposer misses. Rays that slip past
+an edge or through a thin surface leave low shares on what lies behind, in many views; torn mask edges leave middling
+shares on the rim of the object itself. The two are told apart by place: a middling share counts only where the
+point adjoins surely labelled points of the same instance (hysteresis, as in Canny's edges).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+
+from og_pointcloud.cloud import BACKGROUND, UNOBSERVED
+from og_pointcloud.geometry import Neighbourhood
+from og_pointcloud.grouping import MaskGroups, indicator
+from og_pointcloud.settings import MembershipSettings
+from og_pointcloud.visibility import Gaussians, MaskTable
+
+__all__ = ["Membership", "assign_points", "without_see_through"]
+
+
+@dataclass(frozen=True)
+class Membership:
+    """instance_ids: (n,) int32, a group, BACKGROUND or UNOBSERVED. share: (n,) float32, the share above for the group
+    that covers the point most. detection_rate: (groups,) float32, the part of a group's visible weight that lies in
+    views that have a mask of it. dismissed: (groups,) bool, groups that the scene's views contradict as a whole."""
+
+    instance_ids: NDArray[np.int32]
+    share: NDArray[np.float32]
+    detection_rate: NDArray[np.float32]
+    dismissed: NDArray[np.bool_]
+
+
+def assign_points(
+    table: MaskTable, groups: MaskGroups, neighbourhood: Neighbourhood, settings: MembershipSettings
+) -> Membership:
+    """Decide the state of every point. Groups keep their numbers; a dismissed group ends with no point."""
+    seen = view_weights_of_points(table)
+    by_point = _by_point(table.weights), _by_point(seen)
+    has_mask = np.zeros((groups.count, table.outside.shape[0]), np.bool_)
+    grouped = groups.group >= 0
+    has_mask[groups.group[grouped], table.mask_view[grouped]] = True
+    every = np.ones(groups.count, np.bool_)
+    best, own, asked, total = _best_group(*by_point, groups.group, has_mask, every)
+    share = own / np.maximum(asked, 1e-12)
+
+    rate, dismissed = _contradicted(best, share, own, asked, total, groups.count, settings)
+    if dismissed.any():
+        best, own, asked, total = _best_group(*by_point, groups.group, has_mask, ~dismissed)
+        share = own / np.maximum(asked, 1e-12)
+
+    ids = np.where((best >= 0) & (share > settings.sure_share), best, -1).astype(np.int32)
+    possible = (best >= 0) & (share > settings.possible_share)
+    ids = _grow(ids, best, possible, neighbourhood.index, neighbourhood.adjoining, settings.growth_votes)
+    observed = total > settings.observed_weight
+    ids = _fill_unobserved(np.where(ids >= 0, ids, np.where(observed, BACKGROUND, UNOBSERVED)), neighbourhood)
+    return Membership(ids.astype(np.int32), share.astype(np.float32), rate.astype(np.float32), dismissed)
+
+
+def view_weights_of_points(table: MaskTable) -> csr_array:
+    """(views, n) sparse: how much each view sees of each point, in masks or not."""
+    views = table.outside.shape[0]
+    return csr_array(indicator(table.mask_view, views) @ table.weights + table.outside)
+
+
+def without_see_through(
+    table: MaskTable,
+    gaussians: Gaussians,
+    depth_rows: NDArray[np.float64],
+    focal: NDArray[np.float64],
+    settings: MembershipSettings,
+) -> tuple[MaskTable, float]:
+    """Take from each mask what lies behind its object, where too few views see a point to contradict the mask.
+
+    A mask shows a front surface. Sorted by depth, its points fall into runs parted by gaps wider than the object
+    looks; the nearest run with a fair part of the mask's weight is the object, what lies behind it was seen through
+    windows, past edges, or, with a LiDAR that looks over a camera's foreground, not seen by the camera at all.
+
+    depth_rows: (views, 4) float64, third row of each world-to-camera matrix. focal: (views,) pixels.
+    Returns the table with those weights moved to ``outside``, and their share of all weight.
+    """
+    witnesses = np.diff(_by_point(view_weights_of_points(table))[0])
+    weights = table.weights
+    row = np.repeat(np.arange(weights.shape[0]), np.diff(weights.indptr))
+    few = witnesses[weights.indices] < settings.few_views
+    if not few.any():
+        return table, 0.0
+    view = table.mask_view[row]
+    depth = np.einsum("ij,ij->i", depth_rows[view, :3], gaussians.xyz[weights.indices]) + depth_rows[view, 3]
+    behind = np.zeros(len(row), bool)
+    for mask in range(weights.shape[0]):
+        part = slice(weights.indptr[mask], weights.indptr[mask + 1])
+        size = np.sqrt(table.mask_pixels[mask]) / focal[table.mask_view[mask]]
+        behind[part] = _behind_front(depth[part], weights.data[part], settings.gap_sizes * size, settings.front_share)
+    behind &= few
+    data = np.where(behind, 0, weights.data)
+    moved = csr_array((weights.data[behind], (view[behind], weights.indices[behind])), shape=table.outside.shape)
+    kept = csr_array((data, weights.indices.copy(), weights.indptr.copy()), shape=weights.shape)
+    kept.eliminate_zeros()
+    share = float(weights.data[behind].sum() / max(weights.data.sum(), 1e-12))
+    outside = csr_array(table.outside + moved)
+    return replace(table, weights=kept, outside=outside), share
+
+
+def _behind_front(
+    depth: NDArray[np.float64], weight: NDArray[np.float32], gap_share: float, front_share: float
+) -> NDArray[np.bool_]:
+    """Entries beyond the first run of depths that holds ``front_share`` of the weight.
+
+    ``gap_share`` times the median depth is the gap that parts runs: the size of the mask at that depth.
+    """
+    if len(depth) == 0:
+        return np.zeros(0, bool)
+    order = np.argsort(depth, kind="stable")
+    reached = np.cumsum(weight[order], dtype=np.float64)
+    middle = depth[order[np.searchsorted(reached, 0.5 * reached[-1])]]
+    run = np.concatenate([[0], np.cumsum(np.diff(depth[order]) > gap_share * middle)])
+    mass = np.bincount(run, weight[order])
+    behind = np.empty(len(depth), bool)
+    behind[order] = run != np.argmax(mass >= front_share * mass.sum())
+    return behind
+
+
+def _by_point(matrix: csr_array) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float32]]:
+    columns = matrix.tocsc()
+    return columns.indptr.astype(np.int64), columns.indices.astype(np.int32), columns.data.astype(np.float32)
+
+
+@njit(cache=True, parallel=True)
+def _best_group(masks, views, group, has_mask, allowed):  # noqa: ANN001, ANN202
+    """Per point: the allowed group with the largest own weight (ties: the lower), own, asked, total weight."""
+    mask_start, mask_index, mask_weight = masks
+    view_start, view_index, view_weight = views
+    n = len(mask_start) - 1
+    best = np.full(n, -1, np.int32)
+    own = np.zeros(n)
+    asked = np.zeros(n)
+    total = np.zeros(n)
+    for g in prange(n):
+        begin, end = mask_start[g], mask_start[g + 1]
+        for e in range(begin, end):
+            k = group[mask_index[e]]
+            if k < 0 or not allowed[k]:
+                continue
+            weight = 0.0
+            for other in range(begin, end):
+                if group[mask_index[other]] == k:
+                    weight += mask_weight[other]
+            if weight > own[g] or (weight == own[g] and k < best[g]):
+                best[g], own[g] = k, weight
+        for e in range(view_start[g], view_start[g + 1]):
+            total[g] += view_weight[e]
+            if best[g] >= 0 and has_mask[best[g], view_index[e]]:
+                asked[g] += view_weight[e]
+    return best, own, asked, total
+
+
+def _contradicted(
+    best: NDArray[np.int32],
+    share: NDArray[np.float64],
+    own: NDArray[np.float64],
+    asked: NDArray[np.float64],
+    total: NDArray[np.float64],
+    count: int,
+    settings: MembershipSettings,
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Detection rate per group, and the groups whose rate is far below what the proposer reaches in this scene.
+
+    How often the proposer misses is a property of the scene's masks: a detector may find a chair in a third of the
+    views, a mask that one view of seventy shows is noise. The rate of the scene is the median over covered weight.
+    """
+    sure = (best >= 0) & (share > 0.5)
+    group = best[sure]
+    visible = np.bincount(group, total[sure], count)
+    rate = np.bincount(group, asked[sure], count) / np.maximum(visible, 1e-12)
+    mass = np.bincount(group, own[sure], count)
+    if mass.sum() == 0:
+        return rate, np.ones(count, bool)
+    order = np.argsort(rate, kind="stable")
+    typical = rate[order[np.searchsorted(np.cumsum(mass[order]), 0.5 * mass.sum())]]
+    return rate, (rate < settings.rate_share * typical) | (mass == 0)
+
+
+@njit(cache=True)
+def _grow(ids, best, possible, neighbours, adjoining, votes):  # noqa: ANN001, ANN202
+    """Hysteresis: possible points join their best group while a share ``votes`` of the adjoining points is in it.
+
+    Rounds, not a flood in index order: the result does not depend on how the points are ordered.
+    """
+    waiting = np.flatnonzero(possible & (ids < 0))
+    while len(waiting):
+        joins = np.zeros(len(waiting), np.bool_)
+        for i in range(len(waiting)):
+            g = waiting[i]
+            count = 0
+            for k in range(neighbours.shape[1]):
+                if adjoining[g, k] and ids[neighbours[g, k]] == best[g]:
+                    count += 1
+            joins[i] = count > 0 and count >= votes * adjoining[g].sum()
+        if not joins.any():
+            break
+        for i in range(len(waiting)):
+            if joins[i]:
+                ids[waiting[i]] = best[waiting[i]]
+        waiting = waiting[~joins]
+    return ids
+
+
+def _fill_unobserved(ids: NDArray[np.int32], neighbourhood: Neighbourhood) -> NDArray[np.int32]:
+    """Points that no view saw copy the state of their nearest adjoining observed point; the rest stay unobserved."""
+    hidden = np.flatnonzero(ids == UNOBSERVED)
+    near = ids[neighbourhood.index[hidden]]
+    usable = neighbourhood.adjoining[hidden] & (near != UNOBSERVED)
+    first = np.argmax(usable, axis=1)
+    filled = ids.copy()
+    filled[hidden] = np.where(usable.any(axis=1), near[np.arange(len(hidden)), first], UNOBSERVED)
+    return filled

@@ -1,0 +1,411 @@
+"""Frozen geometry + camera + id map -> how much each Gaussian shows in each mask, exactly as 3DGS blends.
+
+Rendering a frozen scene is linear: a pixel's value is ``sum_g W[p, g] value_g`` with the alpha-blending weights
+``W[p, g] = T alpha`` of 3D Gaussian Splatting (Kerbl et al. 2023, Eq. 3; paper appendix "splatting"). This file adds
+those weights up over the pixels of each mask, tile by tile while compositing; ``W`` itself is never stored:
+
+    A[i, g] = sum over pixels p of mask i of W[p, g]
+
+It knows nothing of colours or features: what a view shows of any value is a product with these sparse rows. A map
+that gives every pixel its own id makes ``A`` the weights ``W`` themselves (see `pixel_weights`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from numba import njit, prange
+from numpy.typing import NDArray
+from scipy.sparse import csr_array, vstack
+
+from og_pointcloud.errors import SceneError
+from og_pointcloud.scene import Camera, Points, View
+
+__all__ = ["Gaussians", "MaskTable", "mask_table", "pixel_weights", "view_weights"]
+
+TILE = 16
+"""Pixels along a tile's side, as in 3DGS."""
+LOW_PASS = 0.3
+"""Added to the projected covariance, px^2: a splat is never smaller than about a pixel (3DGS)."""
+ALPHA_MIN = 1.0 / 255.0
+"""Contributions below are dropped (3DGS)."""
+ALPHA_MAX = 0.99
+"""Alpha is cut here (3DGS)."""
+TRANSMITTANCE_MIN = 1e-4
+"""A pixel stops before the splat that would bring its transmittance below (3DGS)."""
+FRUSTUM_MARGIN = 0.3
+"""Centres beyond the image by more than this share of the half field of view are clamped when the projection is
+linearised (3DGS's 1.3 tan(fov/2), written for any principal point)."""
+NEAR_SHARE = 0.02
+"""The near plane as a share of the median depth of the scene; 3DGS fixes 0.2 units, which no unitless scene can."""
+
+
+@dataclass(frozen=True)
+class Gaussians:
+    """Geometry ready for splatting. xyz (n, 3), scale (n, 3) linear, rotation (n, 4) unit wxyz, opacity (n,)."""
+
+    xyz: NDArray[np.float32]
+    scale: NDArray[np.float32]
+    rotation: NDArray[np.float32]
+    opacity: NDArray[np.float32]
+
+    @classmethod
+    def from_points(cls, points: Points) -> Gaussians:
+        """The Gaussians of a 3DGS file; SceneError for a plain cloud, whose splats `geometry` has to choose."""
+        if points.scale is None or points.rotation is None or points.opacity is None:
+            raise SceneError("the cloud has no scale, rotation and opacity; choose them with geometry.choose_gaussians")
+        return cls(points.xyz, points.scale, points.rotation, points.opacity)
+
+    def __len__(self) -> int:
+        return len(self.xyz)
+
+
+@dataclass(frozen=True)
+class MaskTable:
+    """What every mask of every view shows of every Gaussian, and what shows outside all masks.
+
+    weights: (masks, n) sparse float32, ``A`` above, masks stacked view by view.
+    outside: (views, n) sparse float32, the same for each view's pixels without a mask.
+    exposure: (views, n) sparse float32, the part of each Gaussian's own splat that reaches the camera: about 1 in
+        front, small behind other splats.
+    mask_view: (masks,) int32, the view of each mask. mask_pixels: (masks,) int32, area in pixels.
+    mask_features: (masks, D) float32, as the encoder gave them.
+    """
+
+    weights: csr_array
+    outside: csr_array
+    exposure: csr_array
+    mask_view: NDArray[np.int32]
+    mask_pixels: NDArray[np.int32]
+    mask_features: NDArray[np.float32]
+
+    @property
+    def unit_features(self) -> NDArray[np.float32]:
+        """(masks, D) mask features of length 1; zero rows stay zero."""
+        length = np.linalg.norm(self.mask_features, axis=1, keepdims=True)
+        return self.mask_features / np.where(length > 0, length, 1)
+
+    @property
+    def seen(self) -> NDArray[np.float64]:
+        """(n,) float64: pixels' worth of blending weight of each Gaussian over all views, masked or not."""
+        return np.asarray(self.weights.sum(axis=0) + self.outside.sum(axis=0), np.float64)
+
+
+def mask_table(gaussians: Gaussians, views: Iterable[View], near: float) -> MaskTable:
+    """The mask table of all views, one pass over each. ``near``: depth of the near plane, scene units."""
+    weights, outside, exposure, mask_view, mask_pixels, features = [], [], [], [], [], []
+    for index, view in enumerate(views):
+        ids = view.mask_map()
+        rows, area = view_weights(gaussians, view.camera, ids, view.mask_count, near)
+        weights.append(rows[:-1])
+        outside.append(rows[-1:])
+        exposure.append(_exposure(rows, area))
+        mask_view.append(np.full(view.mask_count, index, np.int32))
+        mask_pixels.append(np.bincount(ids.ravel() + 1, minlength=view.mask_count + 1)[1:].astype(np.int32))
+        features.append(view.mask_features)
+    width = max((rows.shape[1] for rows in features), default=0)
+    return MaskTable(
+        csr_array(vstack(weights, format="csr")),
+        csr_array(vstack(outside, format="csr")),
+        csr_array(vstack(exposure, format="csr")),
+        np.concatenate(mask_view),
+        np.concatenate(mask_pixels),
+        np.concatenate([rows if len(rows) else np.zeros((0, width), np.float32) for rows in features]),
+    )
+
+
+def pixel_weights(gaussians: Gaussians, camera: Camera, near: float) -> csr_array:
+    """The blending weights ``W`` of one view themselves: (H W, n) sparse float32, pixels row by row."""
+    pixels = camera.width * camera.height
+    ids = np.arange(pixels, dtype=np.int32).reshape(camera.height, camera.width)
+    return view_weights(gaussians, camera, ids, pixels, near)[0][:-1]
+
+
+def _exposure(rows: csr_array, area: NDArray[np.float32]) -> csr_array:
+    """(1, n) sparse: the weight of each Gaussian in a view, as a part of what it would be with nothing in front."""
+    seen = np.bincount(rows.indices, rows.data, rows.shape[1])
+    visible = np.flatnonzero(seen)
+    part = np.minimum(seen[visible] / area[visible], 1).astype(np.float32)
+    return csr_array((part, visible.astype(np.int32), [0, len(visible)]), shape=(1, rows.shape[1]))
+
+
+def view_weights(
+    gaussians: Gaussians, camera: Camera, ids: NDArray[np.int32], id_count: int, near: float
+) -> tuple[csr_array, NDArray[np.float32]]:
+    """Blending weight of every Gaussian summed over the pixels of every id of one view.
+
+    ids: (H, W) int32 in -1..id_count-1, H and W the camera's. Returns (id_count + 1, n) sparse float32 without
+    duplicates; the last row is what shows in pixels with id -1. Rows sum to at most the id's area in pixels.
+    Splats are blended by (float32 depth, index), so that equal depths have one order. Also returns (n,) float32, the
+    pixels each splat would weigh with nothing in front of it; 0 where it is outside the image.
+    """
+    splats, keys = _project(
+        gaussians.xyz,
+        gaussians.scale,
+        gaussians.rotation,
+        gaussians.opacity,
+        camera.world_to_camera,
+        np.array([camera.fx, camera.fy, camera.cx, camera.cy]),
+        camera.width,
+        camera.height,
+        near,
+    )
+    keys = np.sort(keys[keys != _CULLED])
+    order = (keys & np.uint64(0xFFFFFFFF)).astype(np.int32)
+    columns = -(-camera.width // TILE)
+    tiles = columns * -(-camera.height // TILE)
+    starts, members = _bin(splats, order, columns, tiles, numba.get_num_threads())
+    masks = np.where(ids < 0, id_count, ids).astype(np.int32)
+    bounds = _entry_bounds(splats, starts, members, masks, id_count, columns)
+    first = np.concatenate([[0], np.cumsum(bounds)])
+    rows, cols, weights, counts = _composite(
+        splats, starts, members, masks, id_count, columns, first, numba.get_num_threads()
+    )
+    area = np.zeros(len(gaussians), np.float32)
+    area[order] = splats[order, _AREA]
+    merged = _merge(rows, cols, weights, first[:-1], counts, id_count + 1, len(gaussians))
+    return csr_array(merged, shape=(id_count + 1, len(gaussians))), area
+
+
+_CULLED = np.uint64(0xFFFFFFFFFFFFFFFF)
+# Columns of the splat record: centre (px), conic (inverse covariance xx, xy, yy), opacity, pixel box (inclusive), the
+# largest squared Mahalanobis distance that still contributes, exp(-xx), weight in pixels if nothing were in front.
+_U, _V, _XX, _XY, _YY, _OPACITY, _X0, _X1, _Y0, _Y1, _LIMIT, _STEP, _AREA, _SPLAT = range(14)
+
+
+@njit(cache=True, parallel=True, error_model="numpy")
+def _project(xyz, scale, rotation, opacity, pose, intrinsics, width, height, near):  # noqa: ANN001, ANN202
+    """EWA projection of every Gaussian in float64: splat records (n, 13) and depth keys (n,) uint64.
+
+    A key is the float32 depth's bits above the index: sorting keys sorts by depth, ties by index.
+    """
+    n = len(xyz)
+    splats = np.empty((n, _SPLAT))
+    depth = np.empty(n, np.float32)
+    keys = np.empty(n, np.uint64)
+    fx, fy, cx, cy = intrinsics
+    half_x, half_y = 0.5 * width / fx, 0.5 * height / fy
+    x_low, x_high = -cx / fx - FRUSTUM_MARGIN * half_x, (width - cx) / fx + FRUSTUM_MARGIN * half_x
+    y_low, y_high = -cy / fy - FRUSTUM_MARGIN * half_y, (height - cy) / fy + FRUSTUM_MARGIN * half_y
+    for g in prange(n):
+        keys[g] = _CULLED
+        x, y, z = np.float64(xyz[g, 0]), np.float64(xyz[g, 1]), np.float64(xyz[g, 2])
+        cz = pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] * z + pose[2, 3]
+        sigma = np.float64(opacity[g])
+        if not cz > near or not sigma > ALPHA_MIN:
+            continue
+        tx = (pose[0, 0] * x + pose[0, 1] * y + pose[0, 2] * z + pose[0, 3]) / cz
+        ty = (pose[1, 0] * x + pose[1, 1] * y + pose[1, 2] * z + pose[1, 3]) / cz
+        u, v = fx * tx + cx, fy * ty + cy
+        jx, jy = min(max(tx, x_low), x_high), min(max(ty, y_low), y_high)
+        # The projected axes: columns of J R_camera R_gaussian S, a 2x3 matrix whose V V' is the covariance.
+        qw, qx, qy, qz = rotation[g, 0], rotation[g, 1], rotation[g, 2], rotation[g, 3]
+        vx = np.empty(3)
+        vy = np.empty(3)
+        for k in range(3):
+            if k == 0:
+                ax, ay, az = 1 - 2 * (qy * qy + qz * qz), 2 * (qx * qy + qw * qz), 2 * (qx * qz - qw * qy)
+            elif k == 1:
+                ax, ay, az = 2 * (qx * qy - qw * qz), 1 - 2 * (qx * qx + qz * qz), 2 * (qy * qz + qw * qx)
+            else:
+                ax, ay, az = 2 * (qx * qz + qw * qy), 2 * (qy * qz - qw * qx), 1 - 2 * (qx * qx + qy * qy)
+            length = np.float64(scale[g, k])
+            ex = length * (pose[0, 0] * ax + pose[0, 1] * ay + pose[0, 2] * az)
+            ey = length * (pose[1, 0] * ax + pose[1, 1] * ay + pose[1, 2] * az)
+            ez = length * (pose[2, 0] * ax + pose[2, 1] * ay + pose[2, 2] * az)
+            vx[k] = fx / cz * (ex - jx * ez)
+            vy[k] = fy / cz * (ey - jy * ez)
+        sxx = vx[0] * vx[0] + vx[1] * vx[1] + vx[2] * vx[2]
+        syy = vy[0] * vy[0] + vy[1] * vy[1] + vy[2] * vy[2]
+        sxy = vx[0] * vy[0] + vx[1] * vy[1] + vx[2] * vy[2]
+        # det(V V' + c I) as a sum of positive terms (Cauchy-Binet): no cancellation for needles.
+        m01, m02, m12 = vx[0] * vy[1] - vx[1] * vy[0], vx[0] * vy[2] - vx[2] * vy[0], vx[1] * vy[2] - vx[2] * vy[1]
+        det = m01 * m01 + m02 * m02 + m12 * m12 + LOW_PASS * (sxx + syy) + LOW_PASS * LOW_PASS
+        sxx += LOW_PASS
+        syy += LOW_PASS
+        # The ellipse on which alpha falls to ALPHA_MIN; its box holds every pixel that can contribute.
+        reach = 2.0 * np.log(sigma / ALPHA_MIN)
+        rx, ry = np.sqrt(reach * sxx), np.sqrt(reach * syy)
+        x0, x1 = max(np.ceil(u - rx - 0.5), 0.0), min(np.floor(u + rx - 0.5), width - 1.0)
+        y0, y1 = max(np.ceil(v - ry - 0.5), 0.0), min(np.floor(v + ry - 0.5), height - 1.0)
+        if not (x0 <= x1 and y0 <= y1 and det < np.inf):
+            continue
+        s = splats[g]
+        s[_U], s[_V], s[_XX], s[_XY], s[_YY], s[_OPACITY] = u, v, syy / det, -sxy / det, sxx / det, sigma
+        s[_X0], s[_X1], s[_Y0], s[_Y1], s[_LIMIT], s[_STEP] = x0, x1, y0, y1, reach, np.exp(-syy / det)
+        # The integral of alpha over that ellipse.
+        s[_AREA] = 2 * np.pi * np.sqrt(det) * (sigma - ALPHA_MIN)
+        depth[g] = cz
+        keys[g] = (np.uint64(depth.view(np.uint32)[g]) << np.uint64(32)) | np.uint64(g)
+    return splats, keys
+
+
+@njit(cache=True, parallel=True)
+def _bin(splats, order, columns, tiles, bands):  # noqa: ANN001, ANN202
+    """Depth-ordered members of every tile: tile t holds members[starts[t]:starts[t + 1]]."""
+    tile_rows = tiles // columns
+    counts = np.zeros(tiles + 1, np.int64)
+    for band in prange(bands):
+        low, high = band * tile_rows // bands, (band + 1) * tile_rows // bands
+        for g in order:
+            s = splats[g]
+            for row in range(max(int(s[_Y0]) // TILE, low), min(int(s[_Y1]) // TILE + 1, high)):
+                for column in range(int(s[_X0]) // TILE, int(s[_X1]) // TILE + 1):
+                    counts[row * columns + column + 1] += 1
+    starts = np.cumsum(counts)
+    members = np.empty(starts[-1], np.int32)
+    fill = starts[:-1].copy()
+    for band in prange(bands):
+        low, high = band * tile_rows // bands, (band + 1) * tile_rows // bands
+        for g in order:
+            s = splats[g]
+            for row in range(max(int(s[_Y0]) // TILE, low), min(int(s[_Y1]) // TILE + 1, high)):
+                for column in range(int(s[_X0]) // TILE, int(s[_X1]) // TILE + 1):
+                    tile = row * columns + column
+                    members[fill[tile]] = g
+                    fill[tile] += 1
+    return starts, members
+
+
+@njit(cache=True, inline="always")
+def _clip_box(s, tile, columns):  # noqa: ANN001, ANN202
+    """The pixels of splat s within a tile: x0, x1, y0, y1 with exclusive ends."""
+    left, top = tile % columns * TILE, tile // columns * TILE
+    return (
+        max(int(s[_X0]), left),
+        min(int(s[_X1]) + 1, left + TILE),
+        max(int(s[_Y0]), top),
+        min(int(s[_Y1]) + 1, top + TILE),
+    )
+
+
+@njit(cache=True, parallel=True)
+def _entry_bounds(splats, starts, members, masks, id_count, columns):  # noqa: ANN001, ANN202
+    """An upper bound of the (mask, Gaussian) entries each tile will write."""
+    tiles = len(starts) - 1
+    height, width = masks.shape
+    bounds = np.zeros(tiles, np.int64)
+    for tile in prange(tiles):
+        left, top = tile % columns * TILE, tile // columns * TILE
+        distinct, last = 0, -1
+        for y in range(top, min(top + TILE, height)):
+            for x in range(left, min(left + TILE, width)):
+                # Runs of equal ids along rows: at least the number of distinct ids, without a set.
+                if masks[y, x] != last:
+                    distinct, last = distinct + 1, masks[y, x]
+        total = 0
+        for m in range(starts[tile], starts[tile + 1]):
+            x0, x1, y0, y1 = _clip_box(splats[members[m]], tile, columns)
+            total += min(distinct, id_count + 1, (x1 - x0) * (y1 - y0))
+        bounds[tile] = total
+    return bounds
+
+
+@njit(cache=True, parallel=True, error_model="numpy")
+def _composite(splats, starts, members, masks, id_count, columns, first, workers):  # noqa: ANN001, ANN202
+    """Blend every tile front to back and add each splat's weights up by mask; entries of tile t start at first[t]."""
+    tiles = len(starts) - 1
+    height, width = masks.shape
+    rows = np.empty(first[-1], np.int32)
+    cols = np.empty(first[-1], np.int32)
+    weights = np.empty(first[-1], np.float32)
+    counts = np.zeros(tiles, np.int64)
+    sums = np.zeros((workers, id_count + 1))
+    # Each worker takes every workers-th tile (neighbouring tiles cost alike, so the shares are even) and adds up in a
+    # scratch row of its own.
+    for worker in prange(workers):
+        total = sums[worker]
+        touched = np.empty(TILE * TILE, np.int32)
+        for tile in range(worker, tiles, workers):
+            left, top = tile % columns * TILE, tile // columns * TILE
+            transmittance = np.ones((TILE, TILE))
+            open_pixels = (min(top + TILE, height) - top) * (min(left + TILE, width) - left)
+            entry = first[tile]
+            for m in range(starts[tile], starts[tile + 1]):
+                if open_pixels == 0:
+                    break
+                g = members[m]
+                s = splats[g]
+                u, v, xx, xy, yy, sigma = s[_U], s[_V], s[_XX], s[_XY], s[_YY], s[_OPACITY]
+                x0, x1, y0, y1 = _clip_box(s, tile, columns)
+                touches = 0
+                for y in range(y0, y1):
+                    dy = y + 0.5 - v
+                    # The row's chord of the ellipse. The small surplus is settled by the test on alpha below.
+                    chord = xy * dy * xy * dy - xx * (yy * dy * dy - s[_LIMIT])
+                    if chord < 0.0:
+                        continue
+                    half, middle = np.sqrt(chord) / xx + 1e-6, u - xy * dy / xx - 0.5
+                    begin, end = (
+                        max(x0, int(np.ceil(max(middle - half, -1.0)))),
+                        min(x1, int(min(middle + half, 1e9)) + 1),
+                    )
+                    if begin >= end:
+                        continue
+                    # exp of a quadratic along a row, by recurrence: g(x + 1) = g(x) ratio(x), ratio(x + 1) =
+                    # ratio(x) exp(-xx). Between chord ends all factors are within e^6, so nothing over- or underflows.
+                    dx = begin + 0.5 - u
+                    density = sigma * np.exp(-0.5 * (xx * dx * dx + yy * dy * dy) - xy * dx * dy)
+                    ratio = np.exp(-xx * (dx + 0.5) - xy * dy)
+                    for x in range(begin, end):
+                        alpha = min(ALPHA_MAX, density)
+                        density *= ratio
+                        ratio *= s[_STEP]
+                        t = transmittance[y - top, x - left]
+                        if t == 0.0 or alpha < ALPHA_MIN:
+                            continue
+                        rest = t * (1.0 - alpha)
+                        if rest < TRANSMITTANCE_MIN:
+                            transmittance[y - top, x - left] = 0.0  # marks a finished pixel
+                            open_pixels -= 1
+                            continue
+                        mask = masks[y, x]
+                        if total[mask] == 0.0:
+                            touched[touches] = mask
+                            touches += 1
+                        total[mask] += t * alpha
+                        transmittance[y - top, x - left] = rest
+                for k in range(touches):
+                    mask = touched[k]
+                    rows[entry], cols[entry], weights[entry] = mask, g, total[mask]
+                    total[mask] = 0.0
+                    entry += 1
+            counts[tile] = entry - first[tile]
+    return rows, cols, weights, counts
+
+
+@njit(cache=True)
+def _merge(rows, cols, weights, first, counts, row_count, n):  # noqa: ANN001, ANN202
+    """Tiles' entries as CSR (data, indices, indptr), one entry per (mask, Gaussian)."""
+    start = np.zeros(row_count + 1, np.int64)
+    for tile in range(len(first)):
+        for e in range(first[tile], first[tile] + counts[tile]):
+            start[rows[e] + 1] += 1
+    start = np.cumsum(start)
+    place = start[:-1].copy()
+    sorted_cols = np.empty(start[-1], np.int32)
+    sorted_weights = np.empty(start[-1], np.float32)
+    for tile in range(len(first)):
+        for e in range(first[tile], first[tile] + counts[tile]):
+            p = place[rows[e]]
+            sorted_cols[p], sorted_weights[p] = cols[e], weights[e]
+            place[rows[e]] = p + 1
+    # A Gaussian over a tile border has an entry from each tile: fold them together, row by row.
+    where = np.full(n, -1, np.int64)
+    indptr = np.zeros(row_count + 1, np.int64)
+    out = 0
+    for row in range(row_count):
+        begin = out
+        for p in range(start[row], start[row + 1]):
+            g = sorted_cols[p]
+            if where[g] >= begin:
+                sorted_weights[where[g]] += sorted_weights[p]
+            else:
+                where[g] = out
+                sorted_cols[out], sorted_weights[out] = g, sorted_weights[p]
+                out += 1
+        indptr[row + 1] = out
+    return sorted_weights[:out].copy(), sorted_cols[:out].copy(), indptr
