@@ -15,7 +15,7 @@ NONE_WITHIN_REACH = -1
 QUERIES_PER_CHUNK = 8192
 CANDIDATES_PER_CHUNK = 1_000_000
 """What bounds the memory of a search: about 60 MB."""
-LEVEL_FACTOR = 2.0
+LEVEL_FACTOR = 1.5
 """How much wider each next search is. Most queries lie within one spacing of the cloud and need only the first."""
 EDGE_SLACK = 1e-6
 """Voxels are that much wider than the radius: rounding must not put a point at that distance two voxels away."""

@@ -121,7 +121,8 @@ class LabelledScene:
     def _instances_at(self, local: NDArray[np.float32]) -> NDArray[np.int32]:
         feed = {"points": local, "text": np.zeros((0, self._text_width), np.float32)}
         found, certain = (np.array(output) for output in self._session.run(["instance", "certain"], feed))
-        still_open = np.flatnonzero(~certain & np.isfinite(local).all(axis=1))
+        still_open = np.flatnonzero(~certain)
+        still_open = still_open[np.isfinite(local[still_open]).all(axis=1)]  # the others are too far already
         nearest = self._nearest.query(local[still_open])
         exact = np.where(nearest == NONE_WITHIN_REACH, TOO_FAR, np.append(self.instance_ids, TOO_FAR)[nearest])
         found[still_open] = exact

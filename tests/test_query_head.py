@@ -90,6 +90,24 @@ def test_a_table_over_its_budget_leaves_bricks_open_and_stays_right(monkeypatch)
     assert (small["instance"] == instances_plainly(cloud, points))[small["certain"]].all()
 
 
+def test_splitting_open_cells_settles_more_and_changes_no_answer(monkeypatch):
+    cloud = CLOUDS["room"]
+    points = cloud.xyz + np.float32(0.1 * cloud.spacing) * np.random.default_rng(0).normal(size=cloud.xyz.shape)
+    split = run(cloud, points, texts(cloud))
+    exact = instances_plainly(cloud, points.astype(np.float32))
+    monkeypatch.setattr(brick_grid, "SPLIT_CELLS_AT_LEAST", 0)
+    monkeypatch.setattr(brick_grid, "SPLIT_CELLS_PER_POINT", 1 / 16)
+    some = run(cloud, points, texts(cloud))
+    assert len(build_brick_grid(cloud).parts) == 1 + len(cloud) // 16
+    monkeypatch.setattr(brick_grid, "SPLIT_CELLS_PER_POINT", 0)
+    whole = run(cloud, points, texts(cloud))
+    assert whole["certain"].mean() < some["certain"].mean() < split["certain"].mean()
+    for found in (split, some, whole):
+        assert (found["instance"] == exact)[found["certain"]].all()
+    # At the centre of a part the answer is closer to the truth than at that of a cell.
+    assert (split["instance"] == exact).mean() > (whole["instance"] == exact).mean()
+
+
 def test_a_table_without_any_box_is_all_open(monkeypatch):
     cloud = CLOUDS["room"]
     monkeypatch.setattr(brick_grid, "BRICKS_PER_AXIS", 0)

@@ -1,9 +1,9 @@
-"""The table that answers most point queries: a two-level grid of cells, each with its answer and whether it is certain.
+"""The table that answers most point queries: a grid of cells, each with its answer and whether it is certain.
 
 A cell is certain when every point in it has the same answer: the nearest cloud point's instance, or "too far". Cells
-lie in bricks of 8^3, stored only where some point is within reach. What a cell cannot promise (it is cut by the border
-of two instances, or by the reach) is marked, and holds the answer at its centre: ``og_pointcloud.nearest`` settles
-queries there exactly.
+lie in bricks of 8^3, stored only where some point is within reach. An open cell, cut by the border of two instances or
+by the reach, is split into 4^3 parts if cloud points lie in it, as queries come where the cloud is. A cell or part that
+stays open is marked, and holds the answer at its centre: ``og_pointcloud.nearest`` settles queries there exactly.
 """
 
 from __future__ import annotations
@@ -23,11 +23,12 @@ try:
 except ImportError as error:
     raise MissingExtraError("numba", "fit") from error
 
-__all__ = ["BRICK", "CELLS_PER_BRICK", "CODE_OFFSET", "TOO_FAR_CODE", "BrickGrid", "build_brick_grid"]
+__all__ = ["BRICK", "CODE_OFFSET", "PARTS", "TOO_FAR_CODE", "BrickGrid", "build_brick_grid"]
 
 BRICK = 8
 """Cells along the edge of a brick."""
-CELLS_PER_BRICK = BRICK**3
+PARTS = 4
+"""Parts along the edge of a cell that is split."""
 TOO_FAR_CODE = 0
 """Answer code of a query with no cloud point within reach; the others are instance id + CODE_OFFSET."""
 CODE_OFFSET = 1 - UNOBSERVED
@@ -38,6 +39,7 @@ CELLS_PER_REACH = 3.0
 """A far reach makes cells larger, so that the layer of cells around a surface stays at most about eight deep."""
 TOP_ENTRIES_PER_POINT, TOP_ENTRIES_AT_LEAST = 2, 1 << 16
 BRICKS_PER_POINT, BRICKS_AT_LEAST = 1 / 16, 1 << 10
+SPLIT_CELLS_PER_POINT, SPLIT_CELLS_AT_LEAST = 1 / 8, 1 << 10
 """What bounds the table whatever the extent of the scene: the rest is left to the exact search."""
 BRICKS_PER_AXIS = 1 << 16
 """So long a grid still has its cell indices right to half a cell in float32."""
@@ -52,14 +54,18 @@ class BrickGrid:
 
     low: (3,) float32. cell_size: float32. bricks: (bx, by, bz) unsigned, rows of ``cells``; its outermost layer stands
         for everything beyond the grid.
-    cells: (rows, 512) unsigned, C order within the brick. A value below ``codes`` is certain, else ``value - codes`` is
-        the answer at the cell's centre. An answer is TOO_FAR_CODE, or instance id + CODE_OFFSET. codes: their number.
+    cells: (rows, 512) unsigned, C order within the brick. A value below ``codes`` is a certain answer; one below
+        ``2 codes`` is open, and ``value - codes`` the answer at the centre; of any other, ``value - 2 codes`` is a row
+        of ``parts``.
+    parts: (rows, 64) unsigned, C order within the cell: certain answers, or open ones.
+    codes: number of answers. An answer is TOO_FAR_CODE, or instance id + CODE_OFFSET.
     """
 
     low: NDArray[np.float32]
     cell_size: np.float32
     bricks: NDArray[np.unsignedinteger]
     cells: NDArray[np.unsignedinteger]
+    parts: NDArray[np.unsignedinteger]
     codes: int
 
 
@@ -69,15 +75,25 @@ def build_brick_grid(cloud: LabelledCloud) -> BrickGrid:
     cell_size = np.float32(max(CELL_PER_SPACING * cloud.spacing, cloud.reach / CELLS_PER_REACH))
     low, shape, whole = _grid_box(cloud, float(cell_size))
     touched, kept = _bricks_within_reach(cloud, low, shape, float(cell_size))
-    cells = _classify_bricks(cloud, low, shape, float(cell_size), kept)
+    # The graph computes cell indices in float32: every box is inflated by what rounding can move a query.
+    rounding = float(cell_size) * 4 * float(np.finfo(np.float32).eps) * max(shape) * BRICK
+    classify = _Classifier(cloud, float(cell_size), rounding)
+    corners = low.astype(np.float64) + float(cell_size) * BRICK * np.stack(np.unravel_index(kept, shape), axis=1)
+    cells = classify(corners, BRICK, float(cell_size))
+    brick, cell = _cells_worth_splitting(cloud, low, shape, float(cell_size), kept, cells >= codes)
+    place = np.stack(np.unravel_index(cell, (BRICK,) * 3), axis=1)
+    parts = classify(corners[brick] + float(cell_size) * place, PARTS, float(cell_size) / PARTS)
+    cells[brick, cell] = 2 * codes + np.arange(len(parts))
 
-    shared = np.array([[TOO_FAR_CODE], [TOO_FAR_CODE + codes]], np.int32).repeat(CELLS_PER_BRICK, axis=1)
+    shared = np.array([[TOO_FAR_CODE], [TOO_FAR_CODE + codes]], np.int32).repeat(BRICK**3, axis=1)
     stored, row = np.unique(cells, axis=0, return_inverse=True)
     bricks = np.full(shape, _FAR_BRICK if whole else _OPEN_BRICK, np.int64)
     bricks[1:-1, 1:-1, 1:-1] = _FAR_BRICK
     bricks.flat[touched] = _OPEN_BRICK
     bricks.flat[kept] = row.ravel() + len(shared)
-    return BrickGrid(low, cell_size, _compact(bricks), _compact(np.concatenate([shared, stored])), codes)
+    parts = np.concatenate([parts, np.zeros((1, PARTS**3), np.int32)])  # never empty: the graph reads a row of it
+    cells = np.concatenate([shared, stored])
+    return BrickGrid(low, cell_size, _compact(bricks), _compact(cells), _compact(parts), codes)
 
 
 def _compact(values: NDArray[np.integer]) -> NDArray[np.unsignedinteger]:
@@ -124,55 +140,86 @@ def _bricks_within_reach(
     return indices, np.sort(indices[fullest_first[:allowed]])
 
 
-def _inner(brick: NDArray[np.float64], shape: tuple[int, int, int]) -> tuple[NDArray[np.int64], ...]:
-    """Indices of those bricks (n, 3) that lie in the grid and not in its outermost layer."""
-    inside = ((brick >= 1) & (brick <= np.array(shape) - 2)).all(axis=1)
-    return tuple(brick[inside].astype(np.int64).T)
+def _inner(
+    brick: NDArray[np.float64], shape: tuple[int, int, int], rows: NDArray[np.float64] | None = None
+) -> tuple[NDArray[np.int64], ...]:
+    """Three index arrays: of those bricks (n, 3), or of other rows, whose brick lies within the outermost layer."""
+    inside = ((brick >= 1) & (brick < np.array(shape) - 1)).all(axis=1)
+    return tuple((brick if rows is None else rows)[inside].astype(np.int64).T)
 
 
-def _classify_bricks(
-    cloud: LabelledCloud, low: NDArray[np.float32], shape: tuple[int, int, int], cell_size: float, bricks: NDArray
-) -> NDArray[np.int32]:
-    """(len(bricks), 512) values of the cells of bricks, given as flat indices."""
-    # The graph computes cell indices in float32: boxes are inflated by what rounding can move a query.
-    rounding = 4 * float(np.finfo(np.float32).eps) * max(shape) * BRICK
-    half = cell_size * (0.5 + rounding)
-    search = cloud.reach + np.sqrt(3) * half
-    steps = int(np.ceil(search / cell_size))
-    columns = np.array(
-        sorted(product(range(-steps, steps + 1), repeat=2), key=lambda step: step[0] ** 2 + step[1] ** 2)
-    )
-    buckets = VoxelBuckets(cloud.xyz, cell_size, run=2 * steps + 2)
-    corners = np.stack(np.unravel_index(bricks, shape), axis=1) * (cell_size * BRICK) + low.astype(np.float64)
-    values = np.empty((len(bricks), CELLS_PER_BRICK), np.int32)
-    answers = cloud.instance_ids[buckets.point] + np.int32(CODE_OFFSET)
-    points = (buckets.x, buckets.y, buckets.z, answers, buckets.starts, buckets.mask)
-    codes = len(cloud.instances) + CODE_OFFSET
-    _classify(corners, cell_size, half, cloud.reach, search, columns, points, codes, values)
-    return values
+def _cells_worth_splitting(
+    cloud: LabelledCloud,
+    low: NDArray[np.float32],
+    shape: tuple[int, int, int],
+    cell_size: float,
+    kept: NDArray[np.int64],
+    is_open: NDArray[np.bool_],
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Brick (an index of ``kept``) and cell of the open cells that hold points; the fullest, if they are too many."""
+    cell = np.floor((cloud.xyz - low.astype(np.float64)) / cell_size)
+    cell = np.stack(_inner(cell / BRICK, shape, cell), axis=1)
+    brick = np.ravel_multi_index(tuple((cell // BRICK).T), shape)
+    row = np.searchsorted(kept, brick)
+    found = np.append(kept, -1)[row] == brick
+    inside = np.ravel_multi_index(tuple((cell % BRICK).T), (BRICK,) * 3)
+    address, count = np.unique((row * BRICK**3 + inside)[found], return_counts=True)
+    address, count = (values[is_open.flat[address]] for values in (address, count))
+    allowed = int(max(SPLIT_CELLS_PER_POINT * len(cloud), SPLIT_CELLS_AT_LEAST))
+    fullest = np.sort(address[np.argsort(-count, kind="stable")[:allowed]])
+    return fullest // BRICK**3, fullest % BRICK**3
+
+
+class _Classifier:
+    """Finds the answers of boxes in one cloud.
+
+    size: edge of the largest box, and of the voxels that points are sorted into. rounding: length by which every box is
+    inflated on all sides.
+    """
+
+    def __init__(self, cloud: LabelledCloud, size: float, rounding: float) -> None:
+        self._rounding, self._reach = rounding, float(cloud.reach)
+        self._codes = len(cloud.instances) + CODE_OFFSET
+        # Points farther than this from a box's centre are out of reach of all of it.
+        self._search = cloud.reach + np.sqrt(3) * (size / 2 + rounding)
+        steps = int(np.ceil(self._search / size))
+        columns = product(range(-steps, steps + 1), repeat=2)
+        self._columns = np.array(sorted(columns, key=lambda step: step[0] ** 2 + step[1] ** 2))
+        buckets = VoxelBuckets(cloud.xyz, size, run=2 * steps + 2)
+        answers = cloud.instance_ids[buckets.point] + np.int32(CODE_OFFSET)
+        self._points = (buckets.x, buckets.y, buckets.z, answers, buckets.starts, buckets.mask, buckets.edge)
+
+    def __call__(self, corners: NDArray[np.float64], per_edge: int, size: float) -> NDArray[np.int32]:
+        """(m, per_edge^3) int32, values of the boxes of edge ``size`` in the cubes with these low corners (m, 3)."""
+        values = np.empty((len(corners), per_edge**3), np.int32)
+        half = size / 2 + self._rounding
+        _classify(
+            corners, per_edge, size, half, self._reach, self._search, self._columns, self._points, self._codes, values
+        )
+        return values
 
 
 @njit(cache=True, parallel=True)
-def _classify(corners, cell_size, half, reach, search, columns, points, codes, values):  # noqa: ANN001, ANN202
-    """Fill values (bricks, 512): the answer at each cell's centre, plus ``codes`` where it is not the whole cell's."""
-    for brick in prange(len(corners)):
-        for cell in range(values.shape[1]):
-            center_x = corners[brick, 0] + (cell // (BRICK * BRICK) + 0.5) * cell_size
-            center_y = corners[brick, 1] + (cell // BRICK % BRICK + 0.5) * cell_size
-            center_z = corners[brick, 2] + (cell % BRICK + 0.5) * cell_size
+def _classify(corners, per_edge, size, half, reach, search, columns, points, codes, values):  # noqa: ANN001, ANN202
+    """Fill values: the answer at each box's centre, plus ``codes`` where it is not the whole box's."""
+    for cube in prange(len(corners)):
+        for box in range(values.shape[1]):
+            center_x = corners[cube, 0] + (box // (per_edge * per_edge) + 0.5) * size
+            center_y = corners[cube, 1] + (box // per_edge % per_edge + 0.5) * size
+            center_z = corners[cube, 2] + (box % per_edge + 0.5) * size
             center = (center_x, center_y, center_z)
-            values[brick, cell] = _cell_value(center, cell_size, half, reach, search, columns, points, codes)
+            values[cube, box] = _box_value(center, half, reach, search, columns, points, codes)
 
 
 @njit(cache=True)
-def _cell_value(center, cell_size, half, reach, search, columns, points, codes):  # noqa: ANN001, ANN202
-    """Value of the cell with this centre and half edge; see ``BrickGrid.cells``."""
-    x, y, z, answers, _, _ = points
-    # The point nearest to the centre, and whether any point is within reach of any part of the cell.
+def _box_value(center, half, reach, search, columns, points, codes):  # noqa: ANN001, ANN202
+    """Value of the box with this centre and half edge; see ``BrickGrid.parts``."""
+    x, y, z, answers, _, _, _ = points
+    # The point nearest to the centre, and whether any point is within reach of any corner of the box.
     nearest, nearest_squared, met = -1, np.inf, False
     limit_squared = search * search
     for column in range(len(columns)):
-        first, last = _run(center, columns[column], cell_size, limit_squared, points)
+        first, last = _run(center, columns[column], limit_squared, points)
         for point in range(first, last):
             dx, dy, dz = abs(x[point] - center[0]), abs(y[point] - center[1]), abs(z[point] - center[2])
             squared = dx * dx + dy * dy + dz * dz
@@ -188,34 +235,34 @@ def _cell_value(center, cell_size, half, reach, search, columns, points, codes):
     near_x, near_y, near_z = x[nearest] - center[0], y[nearest] - center[1], z[nearest] - center[2]
     far_x, far_y, far_z = abs(near_x) + half, abs(near_y) + half, abs(near_z) + half
     certain = far_x * far_x + far_y * far_y + far_z * far_z <= reach * reach * (1 - 1e-9)
-    # A point p loses to the nearest point q in the whole cell if |u - p|^2 - |u - q|^2, which is linear in u, is
-    # positive at the cell's worst corner: |p|^2 - |q|^2 - 2 half |p - q|_1 > 0, seen from the centre. Points farther
-    # than the cell's diagonal behind q always lose.
+    # A point p loses to the nearest point q in the whole box if |u - p|^2 - |u - q|^2, which is linear in u, is
+    # positive at the box's worst corner: |p|^2 - |q|^2 - 2 half |p - q|_1 > 0, seen from the centre. Points farther
+    # than the box's diagonal behind q always lose.
     limit_squared = min(search, np.sqrt(nearest_squared) + 2 * np.sqrt(3.0) * half) ** 2
     for column in range(len(columns)):
-        first, last = _run(center, columns[column], cell_size, limit_squared, points) if certain else (0, 0)
+        first, last = _run(center, columns[column], limit_squared, points) if certain else (0, 0)
         for point in range(first, last):
             if answers[point] != answers[nearest]:
                 dx, dy, dz = x[point] - center[0], y[point] - center[1], z[point] - center[2]
                 lead = dx * dx + dy * dy + dz * dz - nearest_squared
                 spread = abs(dx - near_x) + abs(dy - near_y) + abs(dz - near_z)
-                certain = certain and lead - 2 * half * spread > 1e-9 * cell_size * cell_size
+                certain = certain and lead - 2 * half * spread > 1e-9 * half * half
     answer = answers[nearest] if nearest_squared <= reach * reach else TOO_FAR_CODE
     return answer if certain else answer + codes
 
 
 @njit(cache=True, inline="always")
-def _run(center, column, cell_size, limit_squared, points):  # noqa: ANN001, ANN202
+def _run(center, column, limit_squared, points):  # noqa: ANN001, ANN202
     """Range of the sorted points in that column of voxels (a step in x and y) that may lie within the limit."""
-    _, _, _, _, starts, mask = points
-    voxel_x = np.int64(np.floor(center[0] / cell_size)) + column[0]
-    voxel_y = np.int64(np.floor(center[1] / cell_size)) + column[1]
-    gap_x = max(voxel_x * cell_size - center[0], center[0] - (voxel_x + 1) * cell_size, 0.0)
-    gap_y = max(voxel_y * cell_size - center[1], center[1] - (voxel_y + 1) * cell_size, 0.0)
+    _, _, _, _, starts, mask, edge = points
+    voxel_x = np.int64(np.floor(center[0] / edge)) + column[0]
+    voxel_y = np.int64(np.floor(center[1] / edge)) + column[1]
+    gap_x = max(voxel_x * edge - center[0], center[0] - (voxel_x + 1) * edge, 0.0)
+    gap_y = max(voxel_y * edge - center[1], center[1] - (voxel_y + 1) * edge, 0.0)
     rest = limit_squared * (1 + 1e-9) - gap_x * gap_x - gap_y * gap_y
     if rest < 0:
         return 0, 0
-    low = np.int64(np.floor((center[2] - np.sqrt(rest)) / cell_size))
-    high = np.int64(np.floor((center[2] + np.sqrt(rest)) / cell_size))
+    low = np.int64(np.floor((center[2] - np.sqrt(rest)) / edge))
+    high = np.int64(np.floor((center[2] + np.sqrt(rest)) / edge))
     bucket = (voxel_x * 73856093 + voxel_y * 19349663 + low) & mask
     return starts[bucket], starts[bucket + high - low + 1]

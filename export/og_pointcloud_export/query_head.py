@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from og_pointcloud.bundle import NO_EVIDENCE
 from og_pointcloud.cloud import InstanceTable, LabelledCloud
 from og_pointcloud.errors import MissingExtraError
-from og_pointcloud_export.brick_grid import BRICK, CELLS_PER_BRICK, CODE_OFFSET, BrickGrid
+from og_pointcloud_export.brick_grid import BRICK, CODE_OFFSET, PARTS, BrickGrid
 
 try:
     import onnx
@@ -118,7 +118,7 @@ def _score_constants(instances: InstanceTable) -> dict[str, Any]:
 
 
 def _lookup_nodes() -> list[onnx.NodeProto]:
-    """points -> answer code through the two-level grid -> instance, certain, label and score.
+    """points -> answer code through the grid -> instance, certain, label and score.
 
     Coordinates are laid out as three rows of N: several times as fast as N rows of three, and, unlike a product with
     the strides, exact in integers wherever it runs.
@@ -126,25 +126,29 @@ def _lookup_nodes() -> list[onnx.NodeProto]:
     return [
         _node("Transpose", "points", "rows", perm=[1, 0]),
         _node("Sub", "rows grid_low", "offset"),
-        _node("Mul", "offset cells_per_unit", "position"),
+        _node("Mul", "offset parts_per_unit", "position"),
         _node("IsNaN", "position", "position_missing"),
         _node("Where", "position_missing zero position", "position_known"),
         _node("Max", "position_known zero", "position_above"),
-        _node("Min", "position_above last_cell", "position_inside"),
-        _node("Cast", "position_inside", "cell", to=TensorProto.INT32),
+        _node("Min", "position_above last_part", "position_inside"),
+        _node("Cast", "position_inside", "part", to=TensorProto.INT32),
+        _node("Div", "part parts", "cell"),
         _node("Div", "cell brick_edge", "brick"),
-        _node("Mul", "brick brick_edge", "brick_first_cell"),
-        _node("Sub", "cell brick_first_cell", "cell_in_brick"),
-        _node("Mul", "brick brick_strides", "brick_terms"),
-        _node("ReduceSum", "brick_terms first_axis", "brick_index", keepdims=0),
-        _node("Mul", "cell_in_brick cell_strides", "cell_terms"),
-        _node("ReduceSum", "cell_terms first_axis", "cell_index", keepdims=0),
-        _node("Gather", "bricks brick_index", "brick_row"),
-        _node("Cast", "brick_row", "brick_row_int32", to=TensorProto.INT32),
-        _node("Mul", "brick_row_int32 cells_per_brick", "row_start"),
-        _node("Add", "row_start cell_index", "address"),
-        _node("Gather", "cells address", "stored"),
-        _node("Cast", "stored", "value", to=TensorProto.INT32),
+        # brick -> its row of cells -> the cell's value
+        *_flat_index("brick", "brick_strides", "brick_index"),
+        _node("Gather", "brick_rows brick_index", "brick_row"),
+        *_remainder("cell", "brick", "brick_edge", "cell_in_brick"),
+        *_flat_index("cell_in_brick", "cell_strides", "cell_index"),
+        *_entry("cell_values", "brick_row", "cells_per_brick", "cell_index", "cell_value"),
+        # a split cell -> its row of parts -> the part's value
+        _node("Sub", "cell_value first_split", "split"),
+        _node("Max", "split zero_int32", "split_row"),
+        *_remainder("part", "cell", "parts", "part_in_cell"),
+        *_flat_index("part_in_cell", "part_strides", "part_index"),
+        *_entry("part_values", "split_row", "parts_per_cell", "part_index", "part_value"),
+        _node("Less", "cell_value first_split", "cell_is_whole"),
+        _node("Where", "cell_is_whole cell_value part_value", "value"),
+        # certain, or open with the answer at the centre
         _node("Less", "value codes", "certain"),
         _node("Sub", "value codes", "value_at_center"),
         _node("Where", "certain value value_at_center", "code"),
@@ -154,19 +158,48 @@ def _lookup_nodes() -> list[onnx.NodeProto]:
     ]
 
 
+def _remainder(fine: str, coarse: str, factor: str, output: str) -> list[onnx.NodeProto]:
+    """fine - coarse * factor: the index within."""
+    return [_node("Mul", f"{coarse} {factor}", f"{output}_start"), _node("Sub", f"{fine} {output}_start", output)]
+
+
+def _flat_index(index: str, strides: str, output: str) -> list[onnx.NodeProto]:
+    """Three rows of indices -> one row."""
+    return [
+        _node("Mul", f"{index} {strides}", f"{output}_terms"),
+        _node("ReduceSum", f"{output}_terms first_axis", output, keepdims=0),
+    ]
+
+
+def _entry(table: str, row: str, width: str, column: str, output: str) -> list[onnx.NodeProto]:
+    """table[row, column] of a flat table of rows of that width, as int32."""
+    return [
+        _node("Cast", row, f"{output}_row", to=TensorProto.INT32),
+        _node("Mul", f"{output}_row {width}", f"{output}_start"),
+        _node("Add", f"{output}_start {column}", f"{output}_address"),
+        _node("Gather", f"{table} {output}_address", f"{output}_stored"),
+        _node("Cast", f"{output}_stored", output, to=TensorProto.INT32),
+    ]
+
+
 def _lookup_constants(grid: BrickGrid) -> dict[str, Any]:
     shape = np.array(grid.bricks.shape, np.int32)
     return {
         "grid_low": grid.low[:, None],
-        "cells_per_unit": np.float32(1) / grid.cell_size,
-        "last_cell": (shape * BRICK - 1).astype(np.float32)[:, None],
+        "parts_per_unit": np.float32(PARTS) / grid.cell_size,
+        "last_part": (shape * BRICK * PARTS - 1).astype(np.float32)[:, None],
+        "parts": np.int32(PARTS),
         "brick_edge": np.int32(BRICK),
         "brick_strides": np.array([[shape[1] * shape[2]], [shape[2]], [1]], np.int32),
-        "cell_strides": np.array([[BRICK * BRICK], [BRICK], [1]], np.int32),
-        "cells_per_brick": np.int32(CELLS_PER_BRICK),
-        "bricks": grid.bricks.ravel(),
-        "cells": grid.cells.ravel(),
+        "cell_strides": np.array([[BRICK**2], [BRICK], [1]], np.int32),
+        "part_strides": np.array([[PARTS**2], [PARTS], [1]], np.int32),
+        "cells_per_brick": np.int32(BRICK**3),
+        "parts_per_cell": np.int32(PARTS**3),
+        "brick_rows": grid.bricks.ravel(),
+        "cell_values": grid.cells.ravel(),
+        "part_values": grid.parts.ravel(),
         "codes": np.int32(grid.codes),
+        "first_split": np.int32(2 * grid.codes),
         "code_offset": np.int32(CODE_OFFSET),
     }
 

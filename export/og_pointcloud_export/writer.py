@@ -148,8 +148,8 @@ def _describe_grid(grid: BrickGrid) -> dict[str, Any]:
         "cell_size": float(grid.cell_size),
         "bricks": list(grid.bricks.shape),
         "bricks_stored": len(grid.cells),
-        "bytes": grid.bricks.nbytes + grid.cells.nbytes,
-        "certain_cells": round(float((grid.cells < grid.codes).mean()), 4),
+        "cells_split": len(grid.parts) - 1,
+        "bytes": grid.bricks.nbytes + grid.cells.nbytes + grid.parts.nbytes,
     }
 
 
