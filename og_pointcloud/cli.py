@@ -17,6 +17,7 @@ import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, get_args, get_type_hints
 
@@ -289,6 +290,10 @@ def run_info(arguments: argparse.Namespace) -> None:
 
 
 def run_demo_command(arguments: argparse.Namespace) -> None:
+    # The room's modules import these as they please: whoever lacks one needs the whole extra.
+    for module in ("numba", "scipy", "cv2", "onnx", "open3d", "pyvista"):
+        if find_spec(module) is None:
+            raise MissingExtraError(module, "demo")
     from og_pointcloud_room.demo import run_demo
 
     run_demo(arguments.output, seed=arguments.seed, mask_noise=arguments.mask_noise)

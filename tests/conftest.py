@@ -57,7 +57,9 @@ def write_tiny_capture(folder: Path, view_count: int = 6) -> TinyCapture:
     frames, features = [], {}
     for index in range(view_count):
         stem = f"view{index}"
-        camera_to_world = look_at(2.6 * angle_vector(2 * np.pi * index / view_count), target=np.array([0, 0, 0.4]))
+        camera_to_world = look_at(
+            2.6 * angle_vector(2 * np.pi * (index + 0.25) / view_count), target=np.array([0, 0, 0.4])
+        )
         object_map = ray_cast(camera_to_world)
         order = random.permutation(len(NAMES))  # mask ids mean nothing across views
         mask = np.append(order + 1, 0)[object_map].astype(np.uint16)
@@ -82,7 +84,7 @@ def sample_surfaces(per_ball: int = 500, floor_side: int = 24) -> tuple[NDArray[
     height, turn = 1 - 2 * step / per_ball, step * np.pi * (3 - np.sqrt(5))
     ring = np.sqrt(1 - height**2)
     sphere = np.stack([ring * np.cos(turn), ring * np.sin(turn), height], axis=1) * RADIUS
-    side = np.linspace(-1.5, 1.5, floor_side)
+    side = np.linspace(-1.2, 1.2, floor_side)
     floor = np.stack([*np.meshgrid(side, side), np.zeros((floor_side, floor_side))], axis=-1).reshape(-1, 3)
     xyz = np.concatenate([sphere + CENTERS[0], sphere + CENTERS[1], floor]).astype(np.float32)
     return xyz, np.repeat(np.array([0, 1, FLOOR], np.int32), [per_ball, per_ball, len(floor)])

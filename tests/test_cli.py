@@ -1,0 +1,298 @@
+"""The commands from end to end on a tiny capture, and what they answer to bad use and bad input."""
+
+import json
+import shlex
+
+import cv2
+import numpy as np
+import pytest
+from conftest import (
+    COLOURS,
+    FEATURE_SPACE,
+    FEATURE_WIDTH,
+    HEIGHT,
+    NAMES,
+    UNUSED_NAME,
+    WIDTH,
+    sample_surfaces,
+    write_ply,
+    write_tiny_capture,
+)
+
+from og_pointcloud.cli import main
+
+
+@pytest.fixture(scope="module")
+def fitted(tmp_path_factory):
+    """(capture, its .ogpc, what fit printed): fitted once, only read by the tests."""
+    folder = tmp_path_factory.mktemp("fitted")
+    capture = write_tiny_capture(folder / "capture")
+    bundle = folder / "new folder" / "tiny.ogpc"
+    assert main(["fit", str(capture.folder), "-o", str(bundle), "--json", str(folder / "run.json")]) == 0
+    return capture, bundle
+
+
+def run(capsys, *arguments):
+    """(exit code, stdout, stderr) of one command."""
+    try:
+        code = main([str(argument) for argument in arguments])
+    except SystemExit as leaving:  # argparse leaves by itself
+        code = leaving.code
+    printed = capsys.readouterr()
+    return code, printed.out, printed.err
+
+
+def error_of(capsys, *arguments):
+    """The one line a command that must fail writes."""
+    code, _, stderr = run(capsys, *arguments)
+    lines = [line for line in stderr.splitlines() if not line.startswith("warning: ")]
+    assert code == 2
+    assert len(lines) == 1, stderr
+    assert lines[0].startswith("error: ")
+    return lines[0]
+
+
+def test_fitted_points_get_their_names(fitted, tmp_path, capsys):
+    capture, bundle = fitted
+    output = tmp_path / "labels.npz"
+    code, stdout, _ = run(capsys, "segment", bundle, "--labels", ",".join(NAMES), "-o", output)
+    assert code == 0
+    assert all(name in stdout for name in NAMES)
+    result = np.load(output)
+    assert result["labels"].dtype == np.int32
+    assert list(result["names"]) == list(NAMES)
+    assert capture.share_correct(result["labels"], list(result["names"])) > 0.9
+    floor = capture.object_ids < 0
+    assert (result["labels"][floor] == -1).mean() > 0.8, "only the floor that a ball hides from every view is doubtful"
+    assert len(result["scores"]) == len(result["instances"]) == len(capture.object_ids)
+
+
+def test_without_labels_all_names_of_the_file_are_asked(fitted, tmp_path, capsys):
+    capture, bundle = fitted
+    output = tmp_path / "labels.npz"
+    code, _, _ = run(capsys, "segment", bundle, "--text-features", capture.text_features, "-o", output)
+    assert code == 0
+    assert list(np.load(output)["names"]) == [*NAMES, UNUSED_NAME]
+
+
+def test_other_points_keep_their_order(fitted, tmp_path, capsys):
+    capture, bundle = fitted
+    order = np.random.default_rng(1).permutation(len(capture.object_ids))
+    xyz, object_ids = sample_surfaces()
+    write_ply(tmp_path / "shuffled.ply", xyz[order], COLOURS[object_ids][order])
+    whole, shuffled = tmp_path / "whole.npz", tmp_path / "shuffled.npz"
+    assert run(capsys, "segment", bundle, "-o", whole)[0] == 0
+    assert run(capsys, "segment", bundle, "--points", tmp_path / "shuffled.ply", "-o", shuffled)[0] == 0
+    assert np.array_equal(np.load(shuffled)["labels"], np.load(whole)["labels"][order])
+
+
+def test_segment_json_counts_every_point(fitted, capsys):
+    capture, bundle = fitted
+    code, stdout, _ = run(capsys, "segment", bundle, "--json")
+    report = json.loads(stdout)
+    assert code == 0
+    assert sum(report["counts"].values()) + report["unknown"] == report["points"] == len(capture.object_ids)
+
+
+def test_fit_reports_its_stages_and_next_command(tiny_capture, tmp_path, capsys):
+    bundle, record = tmp_path / "tiny.ogpc", tmp_path / "run.json"
+    code, stdout, _ = run(capsys, "fit", tiny_capture.folder, "-o", bundle, "--json", record)
+    assert code == 0
+    report = json.loads(record.read_text())
+    assert report["points"] == len(tiny_capture.object_ids)
+    assert report["points"] == sum(report[f"points_{state}"] for state in ("in_instances", "background", "unobserved"))
+    assert report["stages"][0]["name"] == "read capture"
+    assert report["seconds"] == pytest.approx(sum(stage["seconds"] for stage in report["stages"]), abs=0.01)
+    command = next(line for line in stdout.splitlines() if line.startswith("next: og-pointcloud "))
+    assert run(capsys, *shlex.split(command)[2:])[0] == 0, "the next command must work as printed"
+
+
+def test_info_tells_what_is_inside(fitted, capsys):
+    capture, bundle = fitted
+    assert "instances" in run(capsys, "info", bundle)[1]
+    report = json.loads(run(capsys, "info", bundle, "--json")[1])
+    assert report["counts"]["points"] == len(capture.object_ids)
+    assert report["words"] == [*NAMES, UNUSED_NAME]
+
+
+def test_interrupt_leaves_nothing(tiny_capture, tmp_path, capsys, monkeypatch):
+    import og_pointcloud_export
+
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(og_pointcloud_export, "write_bundle", interrupt)
+    out = tmp_path / "out"
+    out.mkdir()
+    code, _, stderr = run(capsys, "fit", tiny_capture.folder, "-o", out / "s.ogpc", "--json", out / "run.json")
+    assert code == 130
+    assert stderr.splitlines()[-1].startswith("interrupted")
+    assert list(out.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        ((), "COMMAND"),
+        (("fitt",), "fit"),
+        (("fit",), "CAPTURE"),
+        (("fit", "capture", "-o", "s.ogpc", "--mask-levle", "large"), "did you mean '--mask-level'"),
+        (("fit", "capture", "-o", "s.ogpc", "--mask", "large"), "'--mask' is unknown"),
+        (("fit", "capture", "-o", "s.ogpc", "--mode", "quick"), "quick"),
+        (("fit", "capture", "-o", "s.zip"), "expected a name that ends in .ogpc"),
+        (("fit", "capture", "-o", "s.ogpc", "--json", "s.ogpc"), "expected a name that ends in .json"),
+        (("segment", "s.ogpc", "-o", "labels.csv"), "ends in .npz or .ply"),
+        (("segment", "absent.ogpc"), "is not a file"),
+    ],
+)  # fmt: skip
+def test_bad_use_is_one_line(arguments, text, capsys):
+    assert text in error_of(capsys, *arguments)
+
+
+def test_inputs_are_not_overwritten(tiny_capture, capsys):
+    folder = tiny_capture.folder
+    before = (folder / "transforms.json").read_bytes()
+    error = error_of(capsys, "fit", folder, "-o", folder / "s.ogpc", "--json", folder / "transforms.json")
+    assert "expected another name" in error
+    error = error_of(capsys, "fit", folder, "-o", folder / "s.ogpc", "--ply", folder / "points.ply")
+    assert "expected another name" in error
+    assert (folder / "transforms.json").read_bytes() == before
+    assert not (folder / "s.ogpc").exists()
+
+
+def test_output_below_a_file_is_refused(tiny_capture, capsys):
+    below_file = tiny_capture.folder / "points.ply" / "s.ogpc"
+    assert "is not a folder that can be written to" in error_of(capsys, "fit", tiny_capture.folder, "-o", below_file)
+
+
+def rewrite_npz(path, **changes):
+    """The same .npz with some entries replaced, or removed where the new value is None."""
+    with np.load(path) as archive:
+        entries = {**archive, **changes}
+    np.savez(path, **{name: values for name, values in entries.items() if values is not None})
+
+
+def remove_poses(folder):
+    (folder / "transforms.json").unlink()
+
+
+def remove_a_mask(folder):
+    (folder / "masks" / "view2.png").unlink()
+
+
+def remove_a_feature_row(folder):
+    rewrite_npz(folder / "mask_features.npz", view1=np.ones((1, FEATURE_WIDTH), np.float32))
+
+
+def widen_a_feature(folder):
+    rewrite_npz(folder / "mask_features.npz", view1=np.ones((2, FEATURE_WIDTH + 1), np.float32))
+
+
+def spoil_a_feature(folder):
+    rewrite_npz(folder / "mask_features.npz", view3=np.full((2, FEATURE_WIDTH), np.nan, np.float32))
+
+
+def spoil_a_point(folder):
+    xyz, object_ids = sample_surfaces()
+    xyz[7, 1] = np.nan
+    write_ply(folder / "points.ply", xyz, COLOURS[object_ids])
+
+
+def truncate_the_cloud(folder):
+    data = (folder / "points.ply").read_bytes()
+    (folder / "points.ply").write_bytes(data[: len(data) // 2])
+
+
+def empty_the_cloud(folder):
+    write_ply(folder / "points.ply", np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8))
+
+
+def empty_the_masks(folder):
+    for path in (folder / "masks").iterdir():
+        cv2.imwrite(str(path), np.zeros((HEIGHT, WIDTH), np.uint16))
+    no_rows = {path.stem: np.zeros((0, FEATURE_WIDTH), np.float32) for path in (folder / "masks").iterdir()}
+    rewrite_npz(folder / "mask_features.npz", **no_rows)
+
+
+def turn_cameras_away(folder):
+    transforms = json.loads((folder / "transforms.json").read_text())
+    for frame in transforms["frames"]:
+        pose = np.array(frame["transform_matrix"])
+        pose[:3, [0, 2]] *= -1
+        frame["transform_matrix"] = pose.tolist()
+    (folder / "transforms.json").write_text(json.dumps(transforms))
+
+
+@pytest.mark.parametrize(
+    ("damage", "texts"),
+    [
+        (remove_poses, ["transforms.json"]),
+        (remove_a_mask, ["view2", "mask"]),
+        (remove_a_feature_row, ["view1", "mask id 2", "feature"]),
+        (widen_a_feature, [str(FEATURE_WIDTH), str(FEATURE_WIDTH + 1)]),
+        (spoil_a_feature, ["view3", "NaN"]),
+        (spoil_a_point, ["points.ply", "NaN", "row 7"]),
+        (truncate_the_cloud, ["points.ply", "bytes"]),
+        (empty_the_cloud, ["points.ply", "0 points"]),
+        (empty_the_masks, ["none of the 6 views has a mask"]),
+        (turn_cameras_away, ["no camera sees the cloud"]),
+    ],
+)
+def test_damaged_captures_are_named_in_one_line(damage, texts, tiny_capture, tmp_path, capsys):
+    damage(tiny_capture.folder)
+    error = error_of(capsys, "fit", tiny_capture.folder, "-o", tmp_path / "new" / "s.ogpc")
+    assert all(text in error for text in texts), error
+    assert not (tmp_path / "new").exists()
+
+
+def test_one_view_is_enough(tmp_path, capsys):
+    capture = write_tiny_capture(tmp_path / "capture", view_count=1)
+    output = tmp_path / "labels.npz"
+    assert run(capsys, "fit", capture.folder, "-o", tmp_path / "s.ogpc")[0] == 0
+    assert run(capsys, "segment", tmp_path / "s.ogpc", "-o", output)[0] == 0
+    labels = np.load(output)["labels"][capture.object_ids >= 0]
+    truth = capture.object_ids[capture.object_ids >= 0]
+    assert (labels >= 0).mean() > 0.2, "what the view sees is labelled"
+    assert (labels[labels >= 0] == truth[labels >= 0]).mean() > 0.9
+
+
+def test_vocabulary_of_another_encoder(tiny_capture, tmp_path, capsys):
+    """The capture's own is left out and said so; one that was asked for is an error."""
+    rewrite_npz(tiny_capture.text_features, feature_space=np.array("another space"))
+    bundle = tmp_path / "s.ogpc"
+    code, stdout, _ = run(capsys, "fit", tiny_capture.folder, "-o", bundle)
+    assert code == 0
+    assert "left out: vocabulary" in stdout
+    assert "another space" in stdout
+    assert json.loads(run(capsys, "info", bundle, "--json")[1])["words"] == []
+    error = error_of(
+        capsys, "fit", tiny_capture.folder, "-o", bundle, "--vocabulary", tiny_capture.text_features
+    )  # fmt: skip
+    assert "another space" in error
+    error = error_of(capsys, "segment", bundle, "--text-features", tiny_capture.text_features)
+    assert "another space" in error
+
+
+def test_text_vectors_of_another_width(fitted, tmp_path, capsys):
+    _, bundle = fitted
+    path = tmp_path / "narrow.npz"
+    np.savez(path, names=np.array(["a"]), vectors=np.ones((1, 5), np.float32), feature_space=np.array(FEATURE_SPACE))
+    error = error_of(capsys, "segment", bundle, "--text-features", path)
+    assert "width 5" in error
+    assert str(FEATURE_WIDTH) in error
+
+
+@pytest.mark.parametrize("damage", ["truncated", "foreign"])
+def test_bad_bundles_are_refused(damage, fitted, tmp_path, capsys):
+    path = tmp_path / "bad.ogpc"
+    data = fitted[1].read_bytes()
+    path.write_bytes(data[: len(data) // 2] if damage == "truncated" else b"not a bundle at all")
+    for command in ("segment", "info"):
+        assert "bad.ogpc" in error_of(capsys, command, path)
+
+
+def test_unknown_and_repeated_labels(fitted, capsys):
+    _, bundle = fitted
+    assert "did you mean 'red ball'" in error_of(capsys, "segment", bundle, "--labels", "red bal")
+    assert "twice" in error_of(capsys, "segment", bundle, "--labels", "lamp,lamp")
+    assert "0 labels" in error_of(capsys, "segment", bundle, "--labels", " , ")
