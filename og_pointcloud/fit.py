@@ -26,6 +26,7 @@ from og_pointcloud.grouping import group_masks
 from og_pointcloud.membership import assign_points, without_see_through
 from og_pointcloud.scene import Points, Scene, View
 from og_pointcloud.settings import FitSettings, GeometrySettings
+from og_pointcloud.testimony import hear_views
 from og_pointcloud.visibility import Gaussians, MaskTable, mask_table
 
 __all__ = ["Prepared", "fit", "prepare"]
@@ -93,9 +94,10 @@ def fit(scene: Scene, settings: FitSettings | None = None, *, progress: bool = T
     prepared = prepare(scene, settings, journal)
     with journal.stage("grouping"):
         table = _front_surfaces(scene, prepared, settings, journal)
-        groups = group_masks(table, settings.grouping)
+        testimony = hear_views(table)
+        groups = group_masks(table, testimony, settings.grouping)
     with journal.stage("membership"):
-        membership = assign_points(table, groups, prepared.neighbourhood, settings.membership)
+        membership = assign_points(table, testimony, groups, prepared.neighbourhood, settings.membership)
     with journal.stage("association"):
         ids, group = _without_empty(membership.instance_ids, groups.group)
         count = int(ids.max(initial=-1)) + 1

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from og_pointcloud.settings import GroupingSettings
+from og_pointcloud.testimony import Testimony
 from og_pointcloud.visibility import MaskTable
 
 __all__ = ["MaskGroups", "group_masks", "indicator"]
@@ -39,9 +40,9 @@ class MaskGroups:
     spanning: NDArray[np.bool_]
 
 
-def group_masks(table: MaskTable, settings: GroupingSettings) -> MaskGroups:
+def group_masks(table: MaskTable, testimony: Testimony, settings: GroupingSettings) -> MaskGroups:
     """Group the masks of a table. Ids are ordered by shown mass, largest first, and do not depend on chance."""
-    share = mask_shares(table, settings)
+    share = mask_shares(testimony, table.mask_view, settings)
     spanning = _spanning_masks(share, table.mask_view, settings)
     container = _containers(share, table.mask_view, spanning, settings)
     witnesses = _witnesses(share, container, table.mask_view, settings)
@@ -51,40 +52,19 @@ def group_masks(table: MaskTable, settings: GroupingSettings) -> MaskGroups:
     return MaskGroups(*_ordered(group, shown), spanning)
 
 
-def mask_shares(table: MaskTable, settings: GroupingSettings) -> csr_array:
+def mask_shares(testimony: Testimony, mask_view: NDArray[np.int32], settings: GroupingSettings) -> csr_array:
     """(masks, masks) sparse: entry (i, j) is the share of what mask i shows, and j's view sees, that lies in j."""
-    weights, seen = _surface_shares(table, settings)
+    weights = _thinned(testimony.inside, settings.graph_points)
+    seen = _thinned(testimony.word, settings.graph_points)
     together = (weights @ weights.T).tocoo()
     visible = (weights @ seen.T).toarray()
     own = np.asarray(weights.multiply(weights).sum(axis=1)).ravel()
     rows, cols = together.row, together.col
-    base = visible[rows, table.mask_view[cols]]
+    base = visible[rows, mask_view[cols]]
     # A view that sees only a sliver of a mask is no witness of it.
     enough = base > settings.witness_share * own[rows]
     value = together.data[enough] / base[enough]
     return csr_array((value, (rows[enough], cols[enough])), shape=together.shape)
-
-
-def _surface_shares(table: MaskTable, settings: GroupingSettings) -> tuple[csr_array, csr_array]:
-    """What masks show, and what views see, of surfaces: (masks, n') part of a point inside a mask, (views, n') ones.
-
-    Only points that a view shows about as openly as their best view does. What shines through a gap in front would
-    else outweigh small objects: few points in front of many. Every point counts alike, near or far.
-    """
-    exposure = _thinned(table.exposure, settings.graph_points).tocoo()
-    best = np.zeros(exposure.shape[1])
-    np.maximum.at(best, exposure.col, exposure.data)
-    open_ = exposure.data > settings.open_share * best[exposure.col]
-    rows, cols = exposure.row[open_], exposure.col[open_]
-    seen = csr_array((np.ones(len(rows), np.float32), (rows, cols)), shape=exposure.shape)
-
-    weights = _thinned(table.weights, settings.graph_points)
-    total = csr_array(
-        indicator(table.mask_view, seen.shape[0]) @ weights + _thinned(table.outside, settings.graph_points)
-    )
-    total.data = 1 / total.data
-    part = csr_array(seen.multiply(total))
-    return csr_array(weights.multiply(part[table.mask_view])), seen
 
 
 def _thinned(matrix: csr_array, limit: int) -> csr_array:

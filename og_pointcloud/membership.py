@@ -2,8 +2,8 @@
 
 A mask covers a point or it does not; what matters is what the *other* views say. Let, for point g and instance k,
 
-    own_k(g)   weight of g inside the masks of k, over all views
-    asked_k(g) weight of g in the views that have a mask of k: the views that could have said so
+    own_k(g)   what views say for "in a mask of k" (see `testimony`)
+    asked_k(g) all that is said of g by the views that have a mask of k: those that could have said so
     share      own_k / asked_k
 
 A view in which the proposer missed k says nothing about k; a view that has a mask of k and shows g outside it says
@@ -24,8 +24,9 @@ from scipy.sparse import csr_array
 
 from og_pointcloud.cloud import BACKGROUND, UNOBSERVED
 from og_pointcloud.geometry import Neighbourhood
-from og_pointcloud.grouping import MaskGroups, indicator
+from og_pointcloud.grouping import MaskGroups
 from og_pointcloud.settings import MembershipSettings
+from og_pointcloud.testimony import Testimony
 from og_pointcloud.visibility import Gaussians, MaskTable
 
 __all__ = ["Membership", "assign_points", "without_see_through"]
@@ -44,11 +45,10 @@ class Membership:
 
 
 def assign_points(
-    table: MaskTable, groups: MaskGroups, neighbourhood: Neighbourhood, settings: MembershipSettings
+    table: MaskTable, testimony: Testimony, groups: MaskGroups, neighbourhood: Neighbourhood, settings: MembershipSettings
 ) -> Membership:
     """Decide the state of every point. Groups keep their numbers; a dismissed group ends with no point."""
-    seen = view_weights_of_points(table)
-    by_point = _by_point(table.weights), _by_point(seen)
+    by_point = _by_point(testimony.inside), _by_point(testimony.word)
     has_mask = np.zeros((groups.count, table.outside.shape[0]), np.bool_)
     grouped = groups.group >= 0
     has_mask[groups.group[grouped], table.mask_view[grouped]] = True
@@ -64,15 +64,8 @@ def assign_points(
     ids = np.where((best >= 0) & (share > settings.sure_share), best, -1).astype(np.int32)
     possible = (best >= 0) & (share > settings.possible_share)
     ids = _grow(ids, best, possible, neighbourhood.index, neighbourhood.adjoining, settings.growth_votes)
-    observed = total > settings.observed_weight
-    ids = _fill_unobserved(np.where(ids >= 0, ids, np.where(observed, BACKGROUND, UNOBSERVED)), neighbourhood)
+    ids = _fill_unobserved(np.where(ids >= 0, ids, np.where(total > 0, BACKGROUND, UNOBSERVED)), neighbourhood)
     return Membership(ids.astype(np.int32), share.astype(np.float32), rate.astype(np.float32), dismissed)
-
-
-def view_weights_of_points(table: MaskTable) -> csr_array:
-    """(views, n) sparse: how much each view sees of each point, in masks or not."""
-    views = table.outside.shape[0]
-    return csr_array(indicator(table.mask_view, views) @ table.weights + table.outside)
 
 
 def without_see_through(
@@ -91,7 +84,7 @@ def without_see_through(
     depth_rows: (views, 4) float64, third row of each world-to-camera matrix. focal: (views,) pixels.
     Returns the table with those weights moved to ``outside``, and their share of all weight.
     """
-    witnesses = np.diff(_by_point(view_weights_of_points(table))[0])
+    witnesses = np.bincount(table.exposure.indices, minlength=table.exposure.shape[1])
     weights = table.weights
     row = np.repeat(np.arange(weights.shape[0]), np.diff(weights.indptr))
     few = witnesses[weights.indices] < settings.few_views

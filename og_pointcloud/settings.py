@@ -43,8 +43,6 @@ class GroupingSettings:
 
     graph_points: int = 60_000
     """Gaussians that mask overlaps are measured on."""
-    open_share: float = 0.5
-    """A view shows a point openly when its exposure is above this share of the point's best."""
     witness_share: float = 0.1
     """A view that sees less than this share of a mask is no witness of it."""
     container_share: float = 0.5
@@ -67,8 +65,6 @@ class MembershipSettings:
     """This share of the adjoining points must be of the instance already."""
     rate_share: float = 0.25
     """An instance detected less often than this share of the scene's typical rate is noise of the proposer."""
-    observed_weight: float = 0.01
-    """Pixels of blending weight, over all views, from which a point counts as seen."""
     few_views: int = 3
     """Points seen by fewer views than this are checked by depth: no other view could contradict a mask."""
     gap_sizes: float = 2.0
