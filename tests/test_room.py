@@ -3,6 +3,7 @@
 import hashlib
 import json
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -346,3 +347,24 @@ def test_label_picture_shows_the_colours_of_its_classes(capture, tmp_path, monke
     assert not sofa[:, : int(0.45 * width)].any(), "nothing was labelled"
     assert sofa[:, int(0.45 * width) : int(0.9 * width)].sum() > 200
     assert sofa[:, int(0.9 * width) :].sum() > 20, "the legend's swatch"
+
+
+# The demo -------------------------------------------------------------------------------------------------------
+
+
+def test_demo_runs_the_whole_road_on_a_coarse_room(tmp_path, monkeypatch, capsys):
+    from og_pointcloud_room import demo
+
+    coarse = partial(CaptureSettings, views=12, width=200, height=150, samples_per_view=6000, voxel_m=0.06)
+    monkeypatch.setattr(demo, "CaptureSettings", coarse)
+    result = demo.run_demo(tmp_path, seed=1, mask_noise=0.5, pictures=False)
+    uplift, ours, best = (method.score for method in result.methods)
+    assert result.bundle.stat().st_size > 0
+    assert (tmp_path / "capture" / "transforms.json").exists()
+    assert uplift.miou < ours.miou < best.miou
+    assert result.share_of_the_way == pytest.approx((ours.miou - uplift.miou) / (best.miou - uplift.miou))
+    assert best.background_called == 0
+    assert ours.points == uplift.points == best.points
+    printed = capsys.readouterr().out
+    assert f"{ours.miou:.4f}" in printed
+    assert f"{result.share_of_the_way:.1%} of the way" in printed

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -9,6 +10,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from og_pointcloud_export import write_bundle
 
 import og_pointcloud as og
 from og_pointcloud.cloud import Vocabulary
@@ -18,7 +20,6 @@ from og_pointcloud.metrics import Score, adjusted_rand_index, score_labels
 from og_pointcloud.scene import Scene
 from og_pointcloud.settings import FitSettings
 from og_pointcloud.visibility import MaskTable
-from og_pointcloud_export import write_bundle
 from og_pointcloud_room.baselines import ceiling, direct_uplift
 from og_pointcloud_room.capture import CaptureSettings, RoomCapture, make_capture, write_capture
 from og_pointcloud_room.furniture import CLASS_NAMES
@@ -71,7 +72,7 @@ def run_demo(output: Path, seed: int = 0, mask_noise: float = 1.0, pictures: boo
     with _stage("read the capture", seconds):
         scene = read_capture(folder)
     with _stage("fit", seconds):
-        cloud = fit(scene, settings)
+        cloud = fit(scene, settings, progress=sys.stderr.isatty())
     bundle = output / "room.ogpc"
     with _stage("write one file", seconds):
         write_bundle(replace(cloud, vocabulary=Vocabulary(CLASS_NAMES, capture.text_vectors)), bundle)
