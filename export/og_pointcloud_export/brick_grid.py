@@ -187,7 +187,8 @@ class _Classifier:
         self._columns = np.array(sorted(columns, key=lambda step: step[0] ** 2 + step[1] ** 2))
         buckets = VoxelBuckets(cloud.xyz, size, run=2 * steps + 2)
         answers = cloud.instance_ids[buckets.point] + np.int32(CODE_OFFSET)
-        self._points = (buckets.x, buckets.y, buckets.z, answers, buckets.starts, buckets.mask, buckets.edge)
+        starts = buckets.starts.astype(np.int32)  # half the memory to run through
+        self._points = (buckets.x, buckets.y, buckets.z, answers, starts, buckets.mask, buckets.edge)
 
     def __call__(self, corners: NDArray[np.float64], per_edge: int, size: float) -> NDArray[np.int32]:
         """(m, per_edge^3) int32, values of the boxes of edge ``size`` in the cubes with these low corners (m, 3)."""
