@@ -50,6 +50,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         if unknown:
             raise OgPointcloudError(describe_unknown_option(unknown[0], arguments))
         with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # what libraries tell programmers
             warnings.simplefilter("always", UserWarning)
             warnings.showwarning = print_warning
             arguments.run(arguments)
