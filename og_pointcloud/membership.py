@@ -21,6 +21,7 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
 
 from og_pointcloud.cloud import BACKGROUND, UNOBSERVED
 from og_pointcloud.geometry import Neighbourhood
@@ -64,7 +65,8 @@ def assign_points(
     ids = np.where((best >= 0) & (share > settings.sure_share), best, -1).astype(np.int32)
     possible = (best >= 0) & (share > settings.possible_share)
     ids = _grow(ids, best, possible, neighbourhood.index, neighbourhood.adjoining, settings.growth_votes)
-    ids = _fill_unobserved(np.where(ids >= 0, ids, np.where(total > 0, BACKGROUND, UNOBSERVED)), neighbourhood)
+    ids = _without_islands(ids, own_area(table, groups.group, ids), neighbourhood, settings.island_share)
+    ids = _fill_unobserved(np.where((ids == -1) & (total == 0), UNOBSERVED, ids), neighbourhood)
     return Membership(ids.astype(np.int32), share.astype(np.float32), rate.astype(np.float32), dismissed)
 
 
@@ -209,6 +211,42 @@ def _grow(ids, best, possible, neighbours, adjoining, votes):  # noqa: ANN001, A
                 ids[waiting[i]] = best[waiting[i]]
         waiting = waiting[~joins]
     return ids
+
+
+def own_area(table: MaskTable, group: NDArray[np.int32], ids: NDArray[np.int32]) -> NDArray[np.float64]:
+    """(n,) float64: pixels of blending weight that the masks of each point's own instance put on it."""
+    weights = table.weights
+    mask = np.repeat(np.arange(weights.shape[0]), np.diff(weights.indptr))
+    own = (group[mask] >= 0) & (group[mask] == ids[weights.indices])
+    return np.bincount(weights.indices[own], weights.data[own], len(ids))
+
+
+def _without_islands(
+    ids: NDArray[np.int32], area: NDArray[np.float64], neighbourhood: Neighbourhood, share: float
+) -> NDArray[np.int32]:
+    """Take from each instance the connected pieces whose points show less than ``share`` of what its main piece's do.
+
+    A floor that no view sees but through the table top above it has only the table's word; but of the pixels of the
+    table's masks nearly all the weight stays on the top. A part of the object cut off by an occluder is seen as openly
+    as the rest of it.
+    """
+    n = len(ids)
+    source = np.repeat(np.arange(n), neighbourhood.index.shape[1])
+    target = neighbourhood.index.ravel()
+    linked = neighbourhood.adjoining.ravel() & (ids[source] >= 0) & (ids[source] == ids[target])
+    links = csr_array((np.ones(linked.sum(), bool), (source[linked], target[linked])), shape=(n, n))
+    pieces, piece = connected_components(links, directed=False)
+    labelled = np.flatnonzero(ids >= 0)
+    piece_area = np.bincount(piece, area, pieces)
+    density = piece_area / np.bincount(piece, minlength=pieces)
+    # The main piece of each instance is the one its masks show most of.
+    order = labelled[np.argsort(piece_area[piece[labelled]], kind="stable")]
+    main = np.zeros(int(ids.max(initial=-1)) + 1, np.int64)
+    main[ids[order]] = piece[order]
+    island = labelled[density[piece[labelled]] < share * density[main[ids[labelled]]]]
+    kept = ids.copy()
+    kept[island] = UNOBSERVED
+    return kept
 
 
 def _fill_unobserved(ids: NDArray[np.int32], neighbourhood: Neighbourhood) -> NDArray[np.int32]:

@@ -65,6 +65,8 @@ class MembershipSettings:
     """This share of the adjoining points must be of the instance already."""
     rate_share: float = 0.25
     """An instance detected less often than this share of the scene's typical rate is noise of the proposer."""
+    island_share: float = 0.15
+    """A separate piece whose points show less than this share of what the main piece's do was seen through it."""
     few_views: int = 3
     """Points seen by fewer views than this are checked by depth: no other view could contradict a mask."""
     gap_sizes: float = 2.0
