@@ -20,6 +20,7 @@ from conftest import (
 )
 
 from og_pointcloud.cli import main
+from og_pointcloud.formats.ply import read_ply
 
 
 @pytest.fixture(scope="module")
@@ -96,14 +97,17 @@ def test_segment_json_counts_every_point(fitted, capsys):
 
 def test_fit_reports_its_stages_and_next_command(tiny_capture, tmp_path, capsys):
     bundle, record = tmp_path / "tiny.ogpc", tmp_path / "run.json"
-    code, stdout, _ = run(capsys, "fit", tiny_capture.folder, "-o", bundle, "--json", record)
+    cloud = tmp_path / "labelled.ply"
+    code, stdout, _ = run(capsys, "fit", tiny_capture.folder, "-o", bundle, "--json", record, "--ply", cloud)
     assert code == 0
+    assert tiny_capture.share_correct(read_ply(cloud)["vertex"]["label"], [*NAMES]) > 0.9
     report = json.loads(record.read_text())
     assert report["points"] == len(tiny_capture.object_ids)
     assert report["points"] == sum(report[f"points_{state}"] for state in ("in_instances", "background", "unobserved"))
     assert report["stages"][0]["name"] == "read capture"
     assert report["seconds"] == pytest.approx(sum(stage["seconds"] for stage in report["stages"]), abs=0.01)
     command = next(line for line in stdout.splitlines() if line.startswith("next: og-pointcloud "))
+    assert ",".join(NAMES) in command
     assert run(capsys, *shlex.split(command)[2:])[0] == 0, "the next command must work as printed"
 
 
@@ -259,9 +263,12 @@ def test_one_view_is_enough(tmp_path, capsys):
 def test_vocabulary_of_another_encoder(tiny_capture, tmp_path, capsys):
     """The capture's own is left out and said so; one that was asked for is an error."""
     rewrite_npz(tiny_capture.text_features, feature_space=np.array("another space"))
-    bundle = tmp_path / "s.ogpc"
-    code, stdout, _ = run(capsys, "fit", tiny_capture.folder, "-o", bundle)
+    bundle, cloud = tmp_path / "s.ogpc", tmp_path / "labelled.ply"
+    code, stdout, _ = run(capsys, "fit", tiny_capture.folder, "-o", bundle, "--ply", cloud)
     assert code == 0
+    points = read_ply(cloud)["vertex"]
+    assert set(points["label"]) == {-1}, "without words there are instances, but no labels"
+    assert {0, 1} <= set(points["instance"])
     assert "left out: vocabulary" in stdout
     assert "another space" in stdout
     assert json.loads(run(capsys, "info", bundle, "--json")[1])["words"] == []
