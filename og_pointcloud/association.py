@@ -63,7 +63,7 @@ def _shown_of_instance(
     weights: csr_array = table.weights
     mask = np.repeat(np.arange(weights.shape[0]), np.diff(weights.indptr))
     own = (group[mask] >= 0) & (instance_ids[weights.indices] == group[mask])
-    return np.bincount(mask[own], weights.data[own], weights.shape[0])
+    return np.bincount(mask[own], weights.data[own], weights.shape[0]).astype(np.float64)
 
 
 def _robust_mean(

@@ -62,7 +62,7 @@ def neighbourhood(xyz: NDArray[np.float32], settings: GeometrySettings) -> Neigh
     k = min(settings.neighbours, n - 1)
     if k == 0:
         return Neighbourhood(np.ones(n, np.float32), np.zeros((n, 0), np.int32), np.zeros((n, 0), bool))
-    distance, index = cKDTree(xyz).query(xyz, k=k + 1, workers=-1)
+    distance, index = map(np.asarray, cKDTree(xyz).query(xyz, k=k + 1, workers=-1))
     # The point itself is usually first, but not always among duplicates.
     itself = index == np.arange(n)[:, None]
     itself[~itself.any(axis=1), -1] = True

@@ -10,7 +10,8 @@ so that ``N_ij / N_ib`` is the share of mask i that lies in mask j of view b. Fr
 of masks it contains: "one thing" (same container) or "two" (different ones). A view that missed an object says
 nothing. Masks are joined bottom-up while a majority of the witnesses pooled over both groups says "one thing":
 a mask that spans two objects is outvoted, parts of one object come together when other views show it whole.
-The idea of view consensus is that of MaskClustering (Yan et al., CVPR 2024); the soft, visibility-weighted form is ours.
+The idea of view consensus is that of MaskClustering (Yan et al., CVPR 2024); the soft, visibility-weighted form is
+ours.
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ def group_masks(table: MaskTable, testimony: Testimony, settings: GroupingSettin
     spanning = _spanning_masks(share, table.mask_view, settings)
     container = _containers(share, table.mask_view, spanning, settings)
     witnesses = _witnesses(share, container, table.mask_view, settings)
-    shown = np.asarray(table.weights.sum(axis=1)).ravel()
+    shown = np.asarray(table.weights.sum(axis=1), np.float64).ravel()
     usable = ~spanning & (shown > 0)
     group = _agglomerate(witnesses, table.unit_features, table.mask_view, usable, settings)
     return MaskGroups(*_ordered(group, shown), spanning)

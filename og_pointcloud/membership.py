@@ -46,7 +46,11 @@ class Membership:
 
 
 def assign_points(
-    table: MaskTable, testimony: Testimony, groups: MaskGroups, neighbourhood: Neighbourhood, settings: MembershipSettings
+    table: MaskTable,
+    testimony: Testimony,
+    groups: MaskGroups,
+    neighbourhood: Neighbourhood,
+    settings: MembershipSettings,
 ) -> Membership:
     """Decide the state of every point. Groups keep their numbers; a dismissed group ends with no point."""
     by_point = _by_point(testimony.inside), _by_point(testimony.word)
@@ -62,11 +66,11 @@ def assign_points(
         best, own, asked, total = _best_group(*by_point, groups.group, has_mask, ~dismissed)
         share = own / np.maximum(asked, 1e-12)
 
-    ids = np.where((best >= 0) & (share > settings.sure_share), best, -1).astype(np.int32)
+    ids = np.where((best >= 0) & (share > settings.sure_share), best, BACKGROUND).astype(np.int32)
     possible = (best >= 0) & (share > settings.possible_share)
     ids = _grow(ids, best, possible, neighbourhood.index, neighbourhood.adjoining, settings.growth_votes)
     ids = _without_islands(ids, own_area(table, groups.group, ids), neighbourhood, settings.island_share)
-    ids = _fill_unobserved(np.where((ids == -1) & (total == 0), UNOBSERVED, ids), neighbourhood)
+    ids = _fill_unobserved(np.where((ids == BACKGROUND) & (total == 0), UNOBSERVED, ids), neighbourhood)
     return Membership(ids.astype(np.int32), share.astype(np.float32), rate.astype(np.float32), dismissed)
 
 
@@ -218,7 +222,7 @@ def own_area(table: MaskTable, group: NDArray[np.int32], ids: NDArray[np.int32])
     weights = table.weights
     mask = np.repeat(np.arange(weights.shape[0]), np.diff(weights.indptr))
     own = (group[mask] >= 0) & (group[mask] == ids[weights.indices])
-    return np.bincount(weights.indices[own], weights.data[own], len(ids))
+    return np.bincount(weights.indices[own], weights.data[own], len(ids)).astype(np.float64)
 
 
 def _without_islands(
