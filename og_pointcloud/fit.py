@@ -56,12 +56,12 @@ class Journal:
         self.left_out.append({"what": what, "why": why})
 
     def steps(self, items: Sequence[Item], name: str) -> Iterable[Item]:
-        """The items, with a progress bar that shows the remaining time."""
+        """The items, with a progress bar that shows the remaining time where stderr is a terminal."""
         if not self.progress:
             return items
         from tqdm import tqdm
 
-        return tqdm(items, desc=f"{name:<12}", leave=False, dynamic_ncols=True)
+        return tqdm(items, desc=f"{name:<12}", leave=False, dynamic_ncols=True, disable=None)
 
     def provenance(self, settings: FitSettings) -> dict[str, Any]:
         return {

@@ -122,8 +122,7 @@ def choose_gaussians(
 ) -> GeometryChoice:
     """Gaussians of a plain cloud by photometric agreement with a few of its images.
 
-    Scale is swept first, then opacity; then the smallest scale that looks as good is taken, because the error is flat
-    where splats begin to overlap, and smaller ones bleed less over edges.
+    Scale is swept first, then opacity, then scale again beside the best: the error is smooth in both.
     Without colours or images the settings' start values are used.
     """
     photographs = _photographs(points, spacing, views, settings)
@@ -138,8 +137,8 @@ def choose_gaussians(
 
         scale = min(progress(settings.scales), key=lambda s: error(s, opacity))
         opacity = min(progress(settings.opacities), key=lambda o: error(scale, o))
-        good = error(scale, opacity) * (1 + settings.error_tolerance)
-        scale = min(s for s in settings.scales if s <= scale and error(s, opacity) <= good)
+        place = settings.scales.index(scale)
+        scale = min(settings.scales[max(place - 1, 0) : place + 2], key=lambda s: error(s, opacity))
     return GeometryChoice(
         isotropic(points, spacing, scale, opacity), scale, opacity, tuple((*pair, e) for pair, e in trials.items())
     )

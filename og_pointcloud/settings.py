@@ -23,8 +23,6 @@ class GeometrySettings:
     """Scale without images to compare with."""
     start_opacity: float = 0.5
     """Opacity without images, and where the search starts."""
-    error_tolerance: float = 0.03
-    """Photometric errors within this share of the best look as good."""
     photographs: int = 4
     """Images compared with, evenly spread over the views."""
     pixels_per_spacing: float = 2.0

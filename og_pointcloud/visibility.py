@@ -12,6 +12,7 @@ that gives every pixel its own id makes ``A`` the weights ``W`` themselves (see 
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -23,6 +24,10 @@ from scipy.sparse import csr_array, vstack
 
 from og_pointcloud.errors import SceneError
 from og_pointcloud.scene import Camera, Points, View
+
+# OpenMP first: numba else tries TBB, and warns where it finds an old one. A user's own choice is kept.
+if "NUMBA_THREADING_LAYER_PRIORITY" not in os.environ:
+    numba.config.THREADING_LAYER_PRIORITY = ["omp", "tbb", "workqueue"]  # pyright: ignore[reportPrivateImportUsage]
 
 __all__ = ["Gaussians", "MaskTable", "mask_table", "pixel_weights", "view_weights"]
 
@@ -86,7 +91,7 @@ class MaskTable:
     def unit_features(self) -> NDArray[np.float32]:
         """(masks, D) mask features of length 1; zero rows stay zero."""
         length = np.linalg.norm(self.mask_features, axis=1, keepdims=True)
-        return self.mask_features / np.where(length > 0, length, 1)
+        return (self.mask_features / np.where(length > 0, length, 1)).astype(np.float32)
 
     @property
     def seen(self) -> NDArray[np.float64]:
@@ -172,13 +177,14 @@ def view_weights(
 
 _CULLED = np.uint64(0xFFFFFFFFFFFFFFFF)
 # Columns of the splat record: centre (px), conic (inverse covariance xx, xy, yy), opacity, pixel box (inclusive), the
-# largest squared Mahalanobis distance that still contributes, exp(-xx), weight in pixels if nothing were in front.
-_U, _V, _XX, _XY, _YY, _OPACITY, _X0, _X1, _Y0, _Y1, _LIMIT, _STEP, _AREA, _SPLAT = range(14)
+# largest squared Mahalanobis distance that still contributes, weight in pixels if nothing were in front, exp(-xx),
+# exp(-yy), exp(-xy), and 1 where no corner of the box is so far out that recurrences from it would underflow.
+_U, _V, _XX, _XY, _YY, _OPACITY, _X0, _X1, _Y0, _Y1, _LIMIT, _AREA, _STEP_X, _STEP_Y, _STEP_XY, _GENTLE, _SPLAT = range(17)
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
 def _project(xyz, scale, rotation, opacity, pose, intrinsics, width, height, near):  # noqa: ANN001, ANN202
-    """EWA projection of every Gaussian in float64: splat records (n, 13) and depth keys (n,) uint64.
+    """EWA projection of every Gaussian in float64: splat records (n, 16) and depth keys (n,) uint64.
 
     A key is the float32 depth's bits above the index: sorting keys sorts by depth, ties by index.
     """
@@ -235,7 +241,10 @@ def _project(xyz, scale, rotation, opacity, pose, intrinsics, width, height, nea
             continue
         s = splats[g]
         s[_U], s[_V], s[_XX], s[_XY], s[_YY], s[_OPACITY] = u, v, syy / det, -sxy / det, sxx / det, sigma
-        s[_X0], s[_X1], s[_Y0], s[_Y1], s[_LIMIT], s[_STEP] = x0, x1, y0, y1, reach, np.exp(-syy / det)
+        s[_X0], s[_X1], s[_Y0], s[_Y1], s[_LIMIT] = x0, x1, y0, y1, reach
+        s[_STEP_X], s[_STEP_Y], s[_STEP_XY] = np.exp(-syy / det), np.exp(-sxx / det), np.exp(sxy / det)
+        # The density at a corner is exp(-reach / (1 - |correlation|)) of the peak.
+        s[_GENTLE] = 1.0 if reach < 300 * (1 - abs(sxy) / np.sqrt(sxx * syy)) else 0.0
         # The integral of alpha over that ellipse.
         s[_AREA] = 2 * np.pi * np.sqrt(det) * (sigma - ALPHA_MIN)
         depth[g] = cz
@@ -247,25 +256,29 @@ def _project(xyz, scale, rotation, opacity, pose, intrinsics, width, height, nea
 def _bin(splats, order, columns, tiles, bands):  # noqa: ANN001, ANN202
     """Depth-ordered members of every tile: tile t holds members[starts[t]:starts[t + 1]]."""
     tile_rows = tiles // columns
+    # The tile ranges side by side: every band reads all of them, twice.
+    ranges = np.empty((len(order), 4), np.int16)
+    for i in prange(len(order)):
+        s = splats[order[i]]
+        ranges[i, 0], ranges[i, 1] = int(s[_X0]) // TILE, int(s[_X1]) // TILE + 1
+        ranges[i, 2], ranges[i, 3] = int(s[_Y0]) // TILE, int(s[_Y1]) // TILE + 1
     counts = np.zeros(tiles + 1, np.int64)
     for band in prange(bands):
         low, high = band * tile_rows // bands, (band + 1) * tile_rows // bands
-        for g in order:
-            s = splats[g]
-            for row in range(max(int(s[_Y0]) // TILE, low), min(int(s[_Y1]) // TILE + 1, high)):
-                for column in range(int(s[_X0]) // TILE, int(s[_X1]) // TILE + 1):
+        for i in range(len(order)):
+            for row in range(max(ranges[i, 2], low), min(ranges[i, 3], high)):
+                for column in range(ranges[i, 0], ranges[i, 1]):
                     counts[row * columns + column + 1] += 1
     starts = np.cumsum(counts)
     members = np.empty(starts[-1], np.int32)
     fill = starts[:-1].copy()
     for band in prange(bands):
         low, high = band * tile_rows // bands, (band + 1) * tile_rows // bands
-        for g in order:
-            s = splats[g]
-            for row in range(max(int(s[_Y0]) // TILE, low), min(int(s[_Y1]) // TILE + 1, high)):
-                for column in range(int(s[_X0]) // TILE, int(s[_X1]) // TILE + 1):
+        for i in range(len(order)):
+            for row in range(max(ranges[i, 2], low), min(ranges[i, 3], high)):
+                for column in range(ranges[i, 0], ranges[i, 1]):
                     tile = row * columns + column
-                    members[fill[tile]] = g
+                    members[fill[tile]] = order[i]
                     fill[tile] += 1
     return starts, members
 
@@ -332,30 +345,41 @@ def _composite(splats, starts, members, masks, id_count, columns, first, workers
                 u, v, xx, xy, yy, sigma = s[_U], s[_V], s[_XX], s[_XY], s[_YY], s[_OPACITY]
                 x0, x1, y0, y1 = _clip_box(s, tile, columns)
                 touches = 0
+                # exp of a quadratic by recurrence, along rows (`density`, `ratio`) and down the box's left edge
+                # (`edge`, `edge_ratio`, `first_ratio`): g(x + 1) = g(x) ratio(x), ratio(x + 1) = ratio(x) exp(-xx).
+                gentle = s[_GENTLE] > 0.0
+                dx, dy = x0 + 0.5 - u, y0 + 0.5 - v
+                edge = sigma * np.exp(-0.5 * (xx * dx * dx + yy * dy * dy) - xy * dx * dy) if gentle else 0.0
+                edge_ratio = np.exp(-yy * (dy + 0.5) - xy * dx) if gentle else 0.0
+                first_ratio = np.exp(-xx * (dx + 0.5) - xy * dy) if gentle else 0.0
                 for y in range(y0, y1):
-                    dy = y + 0.5 - v
-                    # The row's chord of the ellipse. The small surplus is settled by the test on alpha below.
-                    chord = xy * dy * xy * dy - xx * (yy * dy * dy - s[_LIMIT])
-                    if chord < 0.0:
-                        continue
-                    half, middle = np.sqrt(chord) / xx + 1e-6, u - xy * dy / xx - 0.5
-                    begin, end = (
-                        max(x0, int(np.ceil(max(middle - half, -1.0)))),
-                        min(x1, int(min(middle + half, 1e9)) + 1),
-                    )
-                    if begin >= end:
-                        continue
-                    # exp of a quadratic along a row, by recurrence: g(x + 1) = g(x) ratio(x), ratio(x + 1) =
-                    # ratio(x) exp(-xx). Between chord ends all factors are within e^6, so nothing over- or underflows.
-                    dx = begin + 0.5 - u
-                    density = sigma * np.exp(-0.5 * (xx * dx * dx + yy * dy * dy) - xy * dx * dy)
-                    ratio = np.exp(-xx * (dx + 0.5) - xy * dy)
+                    if gentle:
+                        begin, end, density, ratio = x0, x1, edge, first_ratio
+                        edge *= edge_ratio
+                        edge_ratio *= s[_STEP_Y]
+                        first_ratio *= s[_STEP_XY]
+                    else:
+                        # A corner of the box would underflow: start each row on its chord of the ellipse instead.
+                        dy = y + 0.5 - v
+                        chord = xy * dy * xy * dy - xx * (yy * dy * dy - s[_LIMIT])
+                        if chord < 0.0:
+                            continue
+                        half, middle = np.sqrt(chord) / xx + 1e-6, u - xy * dy / xx - 0.5
+                        begin = max(x0, int(np.ceil(max(middle - half, -1.0))))
+                        end = min(x1, int(min(middle + half, 1e9)) + 1)
+                        if begin >= end:
+                            continue
+                        dx = begin + 0.5 - u
+                        density = sigma * np.exp(-0.5 * (xx * dx * dx + yy * dy * dy) - xy * dx * dy)
+                        ratio = np.exp(-xx * (dx + 0.5) - xy * dy)
                     for x in range(begin, end):
                         alpha = min(ALPHA_MAX, density)
                         density *= ratio
-                        ratio *= s[_STEP]
+                        ratio *= s[_STEP_X]
+                        if alpha < ALPHA_MIN:
+                            continue
                         t = transmittance[y - top, x - left]
-                        if t == 0.0 or alpha < ALPHA_MIN:
+                        if t == 0.0:
                             continue
                         rest = t * (1.0 - alpha)
                         if rest < TRANSMITTANCE_MIN:

@@ -61,6 +61,8 @@ install_environment() {
     fi
     rm -f "$stamp"
     .venv/bin/python -m pip install -qq --disable-pip-version-check -c constraints-cpu.txt -e '.[all,dev]' </dev/null
+    say "compiling the kernels"
+    .venv/bin/python -W ignore scripts/warm_up.py
     fingerprint "$python" >"$stamp"
 }
 

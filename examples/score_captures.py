@@ -1,0 +1,66 @@
+"""Fit captures that come with ground truth, ask each file for every name, and print one row each: score and time.
+
+    python examples/score_captures.py CAPTURE [CAPTURE ...]
+
+A capture's ``gt.npz`` holds ``cls`` (a class per point, -1 none) and ``names``, and where known ``background``,
+``views``, ``ratio`` and ``votes``; it is read for the score alone. ``text_features.npz`` holds the names asked.
+"""
+
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+
+import og_pointcloud as og
+from og_pointcloud.metrics import Score, score_labels
+
+FIRST_ANSWER = """
+import sys, time
+start = time.perf_counter()
+import og_pointcloud as og
+scene = og.load(sys.argv[1])
+og.segment(scene, None, text_features=sys.argv[2])
+print(time.perf_counter() - start)
+"""
+
+
+def main(folders: list[str]) -> None:
+    """One row per capture; no setting differs between them."""
+    print("capture            mIoU   mAcc unknown background    fit s  load+segment s     MB  instances")
+    for folder in map(Path, folders):
+        with tempfile.TemporaryDirectory() as temporary:
+            bundle = Path(temporary) / "scene.ogpc"
+            start = time.perf_counter()
+            og.write_bundle(og.fit(og.read_capture(folder), progress=False), bundle)
+            seconds = time.perf_counter() - start
+            words = folder / "text_features.npz"
+            scene = og.load(bundle)
+            result = og.segment(scene, None, text_features=words)
+            score = score_of(result.labels, result.names, folder)
+            first = subprocess.run([sys.executable, "-c", FIRST_ANSWER, bundle, words], capture_output=True, check=True)
+            called = "-" if score.background_called is None else f"{score.background_called:.4f}"
+            print(
+                f"{folder.name:<16} {score.miou:6.4f} {score.macc:6.4f}  {score.unknown_share:6.4f} {called:>10} "
+                f"{seconds:8.1f} {float(first.stdout):15.2f} {bundle.stat().st_size / 1e6:6.1f} {len(scene.instances):10}"
+            )
+
+
+def score_of(labels: np.ndarray, names: tuple[str, ...], folder: Path) -> Score:
+    """Labels that index ``names``, scored against the folder's truth; a name the truth lacks is a wrong answer."""
+    truth = np.load(folder / "gt.npz")
+    classes = [str(name) for name in truth["names"]]
+    number = np.array([classes.index(name) if name in classes else len(classes) for name in names] + [-1])
+    scored = np.ones(len(labels), bool)
+    if "views" in truth.files:
+        scored &= truth["views"] > 0
+    if "ratio" in truth.files:
+        scored &= (truth["ratio"] >= 0.5) & (truth["votes"] >= 2)
+    background = truth["background"] if "background" in truth.files else None
+    return score_labels(number[labels], truth["cls"], background=background, scored=scored)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
