@@ -27,7 +27,7 @@ from og_pointcloud.scene import Camera, Points, View
 
 # OpenMP first: numba else tries TBB, and warns where it finds an old one. A user's own choice is kept.
 if "NUMBA_THREADING_LAYER_PRIORITY" not in os.environ:
-    numba.config.THREADING_LAYER_PRIORITY = ["omp", "tbb", "workqueue"]  # pyright: ignore[reportPrivateImportUsage]
+    numba.config.THREADING_LAYER_PRIORITY = ["omp", "tbb", "workqueue"]  # pyright: ignore
 
 __all__ = ["Gaussians", "MaskTable", "mask_table", "pixel_weights", "view_weights"]
 
@@ -129,22 +129,23 @@ def pixel_weights(gaussians: Gaussians, camera: Camera, near: float) -> csr_arra
     return view_weights(gaussians, camera, ids, pixels, near)[0][:-1]
 
 
-def _exposure(rows: csr_array, area: NDArray[np.float32]) -> csr_array:
+def _exposure(rows: csr_array, area: NDArray[np.float64]) -> csr_array:
     """(1, n) sparse: the weight of each Gaussian in a view, as a part of what it would be with nothing in front."""
     seen = np.bincount(rows.indices, rows.data, rows.shape[1])
     visible = np.flatnonzero(seen)
-    part = np.minimum(seen[visible] / area[visible], 1).astype(np.float32)
+    # Of a huge splat so little is in the image that float32 would call it nothing.
+    part = np.clip(seen[visible] / area[visible], np.finfo(np.float32).tiny, 1).astype(np.float32)
     return csr_array((part, visible.astype(np.int32), [0, len(visible)]), shape=(1, rows.shape[1]))
 
 
 def view_weights(
     gaussians: Gaussians, camera: Camera, ids: NDArray[np.int32], id_count: int, near: float
-) -> tuple[csr_array, NDArray[np.float32]]:
+) -> tuple[csr_array, NDArray[np.float64]]:
     """Blending weight of every Gaussian summed over the pixels of every id of one view.
 
     ids: (H, W) int32 in -1..id_count-1, H and W the camera's. Returns (id_count + 1, n) sparse float32 without
     duplicates; the last row is what shows in pixels with id -1. Rows sum to at most the id's area in pixels.
-    Splats are blended by (float32 depth, index), so that equal depths have one order. Also returns (n,) float32, the
+    Splats are blended by (float32 depth, index), so that equal depths have one order. Also returns (n,) float64, the
     pixels each splat would weigh with nothing in front of it; 0 where it is outside the image.
     """
     splats, keys = _project(
@@ -169,7 +170,7 @@ def view_weights(
     rows, cols, weights, counts = _composite(
         splats, starts, members, masks, id_count, columns, first, numba.get_num_threads()
     )
-    area = np.zeros(len(gaussians), np.float32)
+    area = np.zeros(len(gaussians))
     area[order] = splats[order, _AREA]
     merged = _merge(rows, cols, weights, first[:-1], counts, id_count + 1, len(gaussians))
     return csr_array(merged, shape=(id_count + 1, len(gaussians))), area
@@ -179,7 +180,7 @@ _CULLED = np.uint64(0xFFFFFFFFFFFFFFFF)
 # Columns of the splat record: centre (px), conic (inverse covariance xx, xy, yy), opacity, pixel box (inclusive), the
 # largest squared Mahalanobis distance that still contributes, weight in pixels if nothing were in front, exp(-xx),
 # exp(-yy), exp(-xy), and 1 where no corner of the box is so far out that recurrences from it would underflow.
-_U, _V, _XX, _XY, _YY, _OPACITY, _X0, _X1, _Y0, _Y1, _LIMIT, _AREA, _STEP_X, _STEP_Y, _STEP_XY, _GENTLE, _SPLAT = range(17)
+_U, _V, _XX, _XY, _YY, _SIGMA, _X0, _X1, _Y0, _Y1, _LIMIT, _AREA, _STEP_X, _STEP_Y, _STEP_XY, _GENTLE, _SIZE = range(17)
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
@@ -189,7 +190,7 @@ def _project(xyz, scale, rotation, opacity, pose, intrinsics, width, height, nea
     A key is the float32 depth's bits above the index: sorting keys sorts by depth, ties by index.
     """
     n = len(xyz)
-    splats = np.empty((n, _SPLAT))
+    splats = np.empty((n, _SIZE))
     depth = np.empty(n, np.float32)
     keys = np.empty(n, np.uint64)
     fx, fy, cx, cy = intrinsics
@@ -240,7 +241,7 @@ def _project(xyz, scale, rotation, opacity, pose, intrinsics, width, height, nea
         if not (x0 <= x1 and y0 <= y1 and det < np.inf):
             continue
         s = splats[g]
-        s[_U], s[_V], s[_XX], s[_XY], s[_YY], s[_OPACITY] = u, v, syy / det, -sxy / det, sxx / det, sigma
+        s[_U], s[_V], s[_XX], s[_XY], s[_YY], s[_SIGMA] = u, v, syy / det, -sxy / det, sxx / det, sigma
         s[_X0], s[_X1], s[_Y0], s[_Y1], s[_LIMIT] = x0, x1, y0, y1, reach
         s[_STEP_X], s[_STEP_Y], s[_STEP_XY] = np.exp(-syy / det), np.exp(-sxx / det), np.exp(sxy / det)
         # The density at a corner is exp(-reach / (1 - |correlation|)) of the peak.
@@ -342,7 +343,7 @@ def _composite(splats, starts, members, masks, id_count, columns, first, workers
                     break
                 g = members[m]
                 s = splats[g]
-                u, v, xx, xy, yy, sigma = s[_U], s[_V], s[_XX], s[_XY], s[_YY], s[_OPACITY]
+                u, v, xx, xy, yy, sigma = s[_U], s[_V], s[_XX], s[_XY], s[_YY], s[_SIGMA]
                 x0, x1, y0, y1 = _clip_box(s, tile, columns)
                 touches = 0
                 # exp of a quadratic by recurrence, along rows (`density`, `ratio`) and down the box's left edge
