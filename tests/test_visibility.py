@@ -1,0 +1,421 @@
+"""Weights of masks against a literal reference, on easy and hard scenes, and under changes that must not matter."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+
+import numba
+import numpy as np
+import pytest
+from numpy.random import Generator
+from numpy.typing import NDArray
+from reference_splatting import reference_pixel_weights, reference_view_weights, rotation_matrix
+from scipy.sparse import csr_array
+
+from og_pointcloud.errors import SceneError
+from og_pointcloud.scene import Camera, Points, View
+from og_pointcloud.testimony import hear_views
+from og_pointcloud.visibility import Gaussians, mask_table, pixel_weights, view_weights
+
+NEAR = 0.2
+MASKS = 12
+IDENTITY = np.array([1, 0, 0, 0], np.float32)
+
+
+def camera(width: int = 50, height: int = 37, focal: float = 40.0, **changes: float | NDArray[np.float64]) -> Camera:
+    """At the origin, looking along z; 50 x 37 pixels are not a whole number of tiles."""
+    plain = Camera(width, height, focal, 1.1 * focal, width / 2, height / 2, np.eye(4))
+    return replace(plain, **changes)
+
+
+def cloud(random: Generator, n: int = 150) -> Gaussians:
+    """Blobs from a fifth of a pixel to half the image, in front of the camera and around its view."""
+    quaternions = random.normal(size=(n, 4))
+    return Gaussians(
+        random.uniform([-2, -2, 0.5], [2, 2, 6], (n, 3)).astype(np.float32),
+        (10 ** random.uniform(-2.5, -0.5, (n, 3))).astype(np.float32),
+        (quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)).astype(np.float32),
+        random.uniform(0, 1, n).astype(np.float32),
+    )
+
+
+def stretched(axes: slice, factor: float) -> Callable[[Generator], tuple[Gaussians, Camera]]:
+    def build(random: Generator) -> tuple[Gaussians, Camera]:
+        gaussians = cloud(random)
+        scale = gaussians.scale.copy()
+        scale[:, axes] *= np.float32(factor)
+        return replace(gaussians, scale=scale), camera()
+
+    return build
+
+
+def sized(scale: float) -> Callable[[Generator], tuple[Gaussians, Camera]]:
+    return lambda random: (replace(cloud(random), scale=np.full((150, 3), scale, np.float32)), camera())
+
+
+def moved(move: Callable[[Generator, NDArray[np.float32]], None]) -> Callable[[Generator], tuple[Gaussians, Camera]]:
+    def build(random: Generator) -> tuple[Gaussians, Camera]:
+        gaussians = cloud(random)
+        xyz = gaussians.xyz.copy()
+        move(random, xyz)
+        return replace(gaussians, xyz=xyz), camera()
+
+    return build
+
+
+def about_the_near_plane(random: Generator, xyz: NDArray[np.float32]) -> None:
+    xyz[:, 2] = random.choice(np.array([-1, -1e-3, 0, 1e-30, NEAR, np.nextafter(NEAR, 1), 0.21, 1], np.float32), 150)
+    xyz[:, :2] *= 0.1
+
+
+def far_outside(random: Generator, xyz: NDArray[np.float32]) -> None:
+    xyz[:, :2] *= np.float32(10) ** random.uniform(0, 6, (150, 1)).astype(np.float32)
+
+
+def on_five_spots(random: Generator, xyz: NDArray[np.float32]) -> None:
+    xyz[:] = xyz[random.integers(0, 5, 150)]
+
+
+def on_one_plane(_: Generator, xyz: NDArray[np.float32]) -> None:
+    xyz[:, 2] = 3
+
+
+def long_needles_from_outside(random: Generator) -> tuple[Gaussians, Camera]:
+    gaussians = cloud(random)
+    scale = np.full((150, 3), 1e-3, np.float32)
+    scale[:, 0] = 100
+    return replace(gaussians, xyz=gaussians.xyz * np.array([10, 10, 1], np.float32), scale=scale), camera()
+
+
+HARD_SCENES: dict[str, Callable[[Generator], tuple[Gaussians, Camera]]] = {
+    "plain": lambda random: (cloud(random), camera()),
+    "needles 1e6 long": stretched(slice(0, 1), 1e6),
+    "needles 1e3 long": stretched(slice(0, 1), 1e3),
+    "needles 1e-6 thin": stretched(slice(1, 3), 1e-6),
+    "needles from outside": long_needles_from_outside,
+    "pancakes 1e-6 thick": stretched(slice(0, 1), 1e-6),
+    "pancakes 1e3 wide": stretched(slice(0, 2), 1e3),
+    "opacity 0 and 1": lambda random: (
+        replace(cloud(random), opacity=random.integers(0, 2, 150).astype(np.float32)),
+        camera(),
+    ),
+    "scale 0": sized(0),
+    "scale 1e-30": sized(1e-30),
+    "scale 100": sized(100),
+    "scale 1e6": sized(1e6),
+    "scale 1e18": sized(1e18),
+    "near plane": moved(about_the_near_plane),
+    "far outside": moved(far_outside),
+    "coincident": moved(on_five_spots),
+    "one depth": moved(on_one_plane),
+    "principal point outside": lambda random: (cloud(random), camera(cx=-30.0, cy=70.0)),
+    "one pixel": lambda random: (cloud(random), camera(1, 1, 1.0)),
+    "one row": lambda random: (cloud(random), camera(100, 1)),
+    "exact tiles": lambda random: (cloud(random), camera(64, 32)),
+    "telephoto": lambda random: (cloud(random), camera(focal=4000.0)),
+    "one point": lambda random: (replace(cloud(random, 1), xyz=np.array([[0.1, 0.1, 1]], np.float32)), camera()),
+}
+
+
+@pytest.fixture(params=HARD_SCENES)
+def hard_scene(request: pytest.FixtureRequest) -> tuple[Gaussians, Camera]:
+    return HARD_SCENES[request.param](np.random.default_rng(list(HARD_SCENES).index(request.param)))
+
+
+@pytest.fixture
+def random() -> Generator:
+    return np.random.default_rng(0)
+
+
+def patches(view: Camera, count: int = MASKS, size: int = 5) -> NDArray[np.int32]:
+    """Ids -1..count-1 in square patches."""
+    random = np.random.default_rng(1)
+    coarse = random.integers(-1, count, (view.height // size + 1, view.width // size + 1))
+    return coarse.repeat(size, 0).repeat(size, 1)[: view.height, : view.width].astype(np.int32)
+
+
+def assert_weights(actual: csr_array, expected: NDArray[np.float64]) -> None:
+    """The same entries; float32 weights within 1e-4 of themselves (the rotation of a needle 1e6 pixels long is given
+    in float32) and far better in the mean."""
+    dense = actual.toarray().astype(np.float64)
+    np.testing.assert_array_equal(dense > 0, expected > 0)
+    np.testing.assert_allclose(dense, expected, rtol=1e-4, atol=1e-6)
+    assert np.abs(dense - expected).sum() <= 1e-5 * expected.sum()
+
+
+def image_weights(gaussians: Gaussians, view: Camera, near: float = NEAR) -> NDArray[np.float32]:
+    return view_weights(gaussians, view, patches(view), MASKS, near)[0].toarray()
+
+
+def test_weights_equal_the_reference(hard_scene: tuple[Gaussians, Camera]) -> None:
+    gaussians, view = hard_scene
+    ids = patches(view)
+    actual, _ = view_weights(gaussians, view, ids, MASKS, NEAR)
+    assert_weights(actual, reference_view_weights(gaussians, view, ids, MASKS, NEAR))
+
+
+def test_rows_sum_to_at_most_the_pixels_of_their_mask(hard_scene: tuple[Gaussians, Camera]) -> None:
+    gaussians, view = hard_scene
+    ids = patches(view)
+    rows, _ = view_weights(gaussians, view, ids, MASKS, NEAR)
+    pixels = np.bincount(np.where(ids < 0, MASKS, ids).ravel(), minlength=MASKS + 1)
+    assert (rows.sum(axis=1) <= pixels * (1 + 1e-6)).all()
+    assert (rows.data > 0).all()
+    entries = rows.tocoo()
+    assert len(np.unique(entries.row * len(gaussians) + entries.col)) == rows.nnz
+
+
+def test_exposure_is_a_share(hard_scene: tuple[Gaussians, Camera]) -> None:
+    gaussians, camera = hard_scene
+    table = mask_table(gaussians, [view_of(camera)], NEAR)
+    assert ((table.exposure.data > 0) & (table.exposure.data <= 1)).all()
+    assert set(table.exposure.indices) == set(table.weights.indices) | set(table.outside.indices)
+
+
+def test_hard_scenes_are_not_empty() -> None:
+    drawn = {}
+    for index, (name, build) in enumerate(HARD_SCENES.items()):
+        gaussians, view = build(np.random.default_rng(index))
+        drawn[name] = np.count_nonzero(image_weights(gaussians, view))
+    assert min(drawn.values()) > 0, drawn
+
+
+def test_weights_of_every_pixel_equal_the_reference(random: Generator) -> None:
+    gaussians, view = cloud(random), camera()
+    expected = reference_pixel_weights(gaussians, view, NEAR).reshape(-1, len(gaussians))
+    assert_weights(pixel_weights(gaussians, view, NEAR), expected)
+
+
+@pytest.mark.parametrize("count", [0, 1, 40])
+def test_any_number_of_masks(random: Generator, count: int) -> None:
+    gaussians, view = cloud(random), camera()
+    ids = patches(view, count)
+    rows, _ = view_weights(gaussians, view, ids, count, NEAR)
+    assert rows.shape == (count + 1, len(gaussians))
+    assert_weights(rows, reference_view_weights(gaussians, view, ids, count, NEAR))
+
+
+def test_an_id_without_pixels_has_an_empty_row(random: Generator) -> None:
+    gaussians, view = cloud(random), camera()
+    rows, _ = view_weights(gaussians, view, patches(view, 3), 7, NEAR)
+    assert (rows[[3, 4, 5, 6]].toarray() == 0).all()
+    assert rows[[0, 1, 2, 7]].sum(axis=1).min() > 0
+
+
+def test_nothing_in_view_gives_empty_rows(random: Generator) -> None:
+    behind = replace(cloud(random), xyz=-cloud(random).xyz)
+    rows, area = view_weights(behind, camera(), patches(camera()), MASKS, NEAR)
+    assert rows.shape == (MASKS + 1, 150)
+    assert rows.nnz == 0
+    assert (area == 0).all()
+
+
+def test_one_splat_by_hand() -> None:
+    """A point-like splat on a pixel centre: covariance 0.3, so alpha falls with exp(-d^2 / 0.6)."""
+    view = camera(5, 5, 10.0, fy=10.0)
+    splat = Gaussians(
+        np.array([[0, 0, 1]], np.float32), np.zeros((1, 3), np.float32), IDENTITY[None], np.float32([0.5])
+    )
+    image = pixel_weights(splat, view, NEAR).toarray().reshape(5, 5)
+    np.testing.assert_allclose(image[2, 2], 0.5, rtol=1e-6)
+    np.testing.assert_allclose(image[2, 3], 0.5 * np.exp(-1 / 0.6), rtol=1e-6)
+    np.testing.assert_allclose(image[1, 1], 0.5 * np.exp(-2 / 0.6), rtol=1e-6)
+    assert image[2, 4] == 0  # 0.5 exp(-4 / 0.6) is below 1/255
+
+
+def test_of_coincident_splats_the_lower_index_is_in_front() -> None:
+    xyz = np.zeros((3, 3), np.float32) + np.array([0, 0, 2], np.float32)
+    three = Gaussians(xyz, np.full((3, 3), 10, np.float32), np.tile(IDENTITY, (3, 1)), np.full(3, 0.5, np.float32))
+    weights = pixel_weights(three, camera(3, 3), NEAR)[[4]].toarray().ravel()
+    np.testing.assert_allclose(weights, [0.5, 0.25, 0.125], rtol=1e-3)
+
+
+def test_a_pixel_stops_before_its_transmittance_falls_below_the_limit() -> None:
+    depth = np.linspace(1, 2, 20)
+    xyz = np.stack([0 * depth, 0 * depth, depth], axis=1).astype(np.float32)
+    wall = Gaussians(xyz, np.full((20, 3), 50, np.float32), np.tile(IDENTITY, (20, 1)), np.full(20, 0.9, np.float32))
+    weights = pixel_weights(wall, camera(1, 1), NEAR).toarray().ravel()
+    np.testing.assert_allclose(weights[:4], 0.9 * 0.1 ** np.arange(4), rtol=1e-3)
+    assert (weights[4:] == 0).all()  # the fifth would leave 1e-5
+
+
+def test_order_of_points_does_not_matter(random: Generator) -> None:
+    gaussians, view = cloud(random), camera()
+    order = random.permutation(len(gaussians))
+    shuffled = Gaussians(*(getattr(gaussians, name)[order] for name in ("xyz", "scale", "rotation", "opacity")))
+    np.testing.assert_array_equal(image_weights(shuffled, view), image_weights(gaussians, view)[:, order])
+
+
+def test_order_of_masks_does_not_matter(random: Generator) -> None:
+    gaussians, view = cloud(random), camera()
+    ids = patches(view)
+    number = random.permutation(MASKS).astype(np.int32)
+    renamed = np.where(ids < 0, -1, number[ids])
+    rows, _ = view_weights(gaussians, view, renamed, MASKS, NEAR)
+    np.testing.assert_array_equal(rows.toarray()[[*number, -1]], image_weights(gaussians, view))
+
+
+def test_a_mask_is_the_sum_of_its_halves(random: Generator) -> None:
+    gaussians, view = cloud(random), camera()
+    ids = patches(view)
+    half = random.integers(0, 2, ids.shape).astype(np.int32)
+    rows, _ = view_weights(gaussians, view, np.where(ids < 0, -1, 2 * ids + half), 2 * MASKS, NEAR)
+    halves = rows.toarray()[:-1]
+    np.testing.assert_allclose(halves[::2] + halves[1::2], image_weights(gaussians, view)[:-1], rtol=1e-5, atol=1e-6)
+
+
+def quaternion_product(left: NDArray[np.float64], right: NDArray[np.float32]) -> NDArray[np.float32]:
+    w, x, y, z = left
+    a, b, c, d = right.T
+    return np.stack(
+        [
+            w * a - x * b - y * c - z * d,
+            w * b + x * a + y * d - z * c,
+            w * c - x * d + y * a + z * b,
+            w * d + x * c - y * b + z * a,
+        ],
+        axis=1,
+    ).astype(np.float32)
+
+
+def test_rotation_of_the_world_does_not_matter(random: Generator) -> None:
+    gaussians, view = cloud(random), camera()
+    turn = np.array([0.1, 0.5, -0.7, 0.5])
+    turn /= np.linalg.norm(turn)
+    matrix = rotation_matrix(turn).astype(np.float64)
+    pose = np.eye(4)
+    pose[:3, :3] = matrix.T
+    turned = replace(
+        gaussians,
+        xyz=(gaussians.xyz @ matrix.T).astype(np.float32),
+        rotation=quaternion_product(turn, gaussians.rotation),
+    )
+    actual = image_weights(turned, replace(view, world_to_camera=pose))
+    np.testing.assert_allclose(actual, image_weights(gaussians, view), atol=1e-3)
+
+
+@pytest.mark.parametrize("unit", [1e-3, 1e3, 1e6])
+def test_unit_of_length_does_not_matter(random: Generator, unit: float) -> None:
+    gaussians, view = cloud(random), camera()
+    scaled = replace(
+        gaussians, xyz=(gaussians.xyz * unit).astype(np.float32), scale=(gaussians.scale * unit).astype(np.float32)
+    )
+    actual = image_weights(scaled, view, NEAR * unit)
+    np.testing.assert_allclose(actual, image_weights(gaussians, view), atol=1e-3)
+
+
+def test_map_offset_of_a_million_does_not_matter(random: Generator) -> None:
+    gaussians = cloud(random)
+    images = []
+    for offset in (np.zeros(3), np.array([1e6, -2e6, 300.0])):
+        shape = {name: getattr(gaussians, name) for name in ("scale", "rotation", "opacity")}
+        points = Points.from_world(gaussians.xyz.astype(np.float64) + offset, **shape)
+        pose = np.eye(4)
+        pose[:3, 3] = points.origin - offset  # the camera stays at the offset; world = local + origin
+        images.append(image_weights(Gaussians.from_points(points), camera(world_to_camera=pose)))
+    np.testing.assert_allclose(images[1], images[0], atol=1e-3)
+    assert images[0].sum() > 100
+
+
+@pytest.fixture
+def threads() -> Iterator[Callable[[int], None]]:
+    before = numba.get_num_threads()
+    yield numba.set_num_threads
+    numba.set_num_threads(before)
+
+
+def test_number_of_threads_does_not_matter(random: Generator, threads: Callable[[int], None]) -> None:
+    gaussians, view = cloud(random, 1000), camera(100, 80, 80.0)
+    ids = patches(view)
+    results = []
+    for count in (1, min(2, numba.config.NUMBA_NUM_THREADS), numba.config.NUMBA_NUM_THREADS):
+        threads(count)
+        results.append(view_weights(gaussians, view, ids, MASKS, NEAR))
+    for rows, area in results[1:]:
+        np.testing.assert_array_equal(rows.toarray(), results[0][0].toarray())
+        np.testing.assert_array_equal(area, results[0][1])
+
+
+def view_of(camera: Camera, count: int = MASKS, name: str = "view") -> View:
+    random = np.random.default_rng(count)
+    return View(name, camera, patches(camera, count), random.normal(size=(count, 8)).astype(np.float32))
+
+
+def test_exposure_of_a_lone_splat_is_about_one() -> None:
+    """Not exactly: pixels sample the splat."""
+    for scale, opacity in ((0.01, 0.9), (0.1, 0.3), (0.2, 0.95)):
+        splat = Gaussians(
+            np.array([[0.05, 0.02, 2]], np.float32), np.full((1, 3), scale, np.float32), IDENTITY[None],
+            np.float32([opacity]),
+        )  # fmt: skip
+        table = mask_table(splat, [view_of(camera())], NEAR)
+        np.testing.assert_allclose(table.exposure.toarray(), 1, atol=0.1)
+
+
+def test_exposure_behind_another_splat_is_what_it_lets_through() -> None:
+    xyz = np.array([[0, 0, 1], [0, 0, 2]], np.float32)
+    scale = np.array([[5] * 3, [0.2] * 3], np.float32)
+    two = Gaussians(xyz, scale, np.tile(IDENTITY, (2, 1)), np.array([0.7, 0.9], np.float32))
+    exposure = mask_table(two, [view_of(camera())], NEAR).exposure.toarray().ravel()
+    np.testing.assert_allclose(exposure[1], 0.3, atol=0.03)
+
+
+def test_huge_splats_have_a_word(random: Generator) -> None:
+    huge = replace(cloud(random), scale=np.full((150, 3), 1e30, np.float32))
+    table = mask_table(huge, [view_of(camera())], NEAR)
+    assert table.exposure.nnz > 0
+    assert (table.exposure.data > 0).all()
+    assert np.isfinite(hear_views(table).inside.data).all()
+
+
+def test_table_is_the_views_stacked(random: Generator) -> None:
+    gaussians = cloud(random)
+    pose = np.eye(4)
+    pose[:3, 3] = [0.3, -0.2, 0.5]
+    views = [
+        view_of(camera(), 5, "five"),
+        view_of(camera(), 0, "none"),
+        view_of(camera(40, 30, world_to_camera=pose), 3, "three"),
+    ]
+    table = mask_table(gaussians, iter(views), NEAR)
+    assert table.weights.shape == (8, 150)
+    assert table.outside.shape == table.exposure.shape == (3, 150)
+    np.testing.assert_array_equal(table.mask_view, [0] * 5 + [2] * 3)
+    np.testing.assert_array_equal(table.mask_features, np.concatenate([views[0].mask_features, views[2].mask_features]))
+    seen = np.zeros(150)
+    for index, (view, masks) in enumerate(zip(views, (slice(0, 5), slice(5, 5), slice(5, 8)), strict=True)):
+        ids = view.mask_map()
+        rows, area = view_weights(gaussians, view.camera, ids, view.mask_count, NEAR)
+        np.testing.assert_array_equal(table.weights[masks].toarray(), rows[:-1].toarray())
+        np.testing.assert_array_equal(table.outside[[index]].toarray(), rows[-1:].toarray())
+        np.testing.assert_array_equal(
+            table.mask_pixels[masks], [(ids == number).sum() for number in range(view.mask_count)]
+        )
+        total = rows.sum(axis=0)
+        exposed = total > 0
+        exposure = table.exposure[[index]].toarray().ravel()
+        np.testing.assert_allclose(exposure[exposed], np.minimum(total[exposed] / area[exposed], 1), rtol=1e-5)
+        assert (exposure[~exposed] == 0).all()
+        seen += total
+    np.testing.assert_allclose(table.seen, seen, rtol=1e-5)
+
+
+def test_table_without_any_mask(random: Generator) -> None:
+    table = mask_table(cloud(random), [view_of(camera(), 0), view_of(camera(), 0)], NEAR)
+    assert table.weights.shape == (0, 150)
+    assert len(table.mask_features) == len(table.mask_pixels) == len(table.mask_view) == 0
+    assert table.outside.nnz > 0
+
+
+def test_unit_features_have_length_one_or_stay_zero(random: Generator) -> None:
+    features = np.array([[3, 4], [0, 0], [1e-15, 0]], np.float32)
+    view = View("view", camera(), patches(camera(), 3), features)
+    unit = mask_table(cloud(random), [view], NEAR).unit_features
+    assert unit.dtype == np.float32
+    np.testing.assert_allclose(unit, [[0.6, 0.8], [0, 0], [1, 0]], rtol=1e-6)
+
+
+def test_a_plain_cloud_is_refused() -> None:
+    with pytest.raises(SceneError, match="choose_gaussians"):
+        Gaussians.from_points(Points.from_world(np.zeros((2, 3))))
