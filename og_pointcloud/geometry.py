@@ -122,11 +122,15 @@ def choose_gaussians(
 ) -> GeometryChoice:
     """Gaussians of a plain cloud by photometric agreement with a few of its images.
 
-    Scale is swept first, then opacity, then scale again beside the best: the error is smooth in both.
+    Scale is swept first, then opacity; of scales that look about as good the smallest is taken, because it bleeds
+    least over edges. Splats that are coarse beside the masks are not tried: they cannot tell inside from outside,
+    however well they fill the image (a LiDAR cloud with a person of five points).
     Without colours or images the settings' start values are used.
     """
     photographs = _photographs(points, spacing, views, settings)
-    scale, opacity = settings.start_scale, settings.start_opacity
+    largest = settings.mask_share / max(_spacing_per_mask(points, spacing, views), 1e-12)
+    scales = tuple(scale for scale in settings.scales if scale <= largest) or settings.scales[:1]
+    scale, opacity = min(settings.start_scale, scales[-1]), settings.start_opacity
     trials: dict[tuple[float, float], float] = {}
     if photographs:
 
@@ -135,10 +139,11 @@ def choose_gaussians(
                 trials[scale, opacity] = _photometric_error(points, spacing, photographs, near, scale, opacity)
             return trials[scale, opacity]
 
-        scale = min(progress(settings.scales), key=lambda s: error(s, opacity))
+        opacity = settings.opacities[-1]
+        scale = min(progress(scales), key=lambda s: error(s, opacity))
         opacity = min(progress(settings.opacities), key=lambda o: error(scale, o))
-        place = settings.scales.index(scale)
-        scale = min(settings.scales[max(place - 1, 0) : place + 2], key=lambda s: error(s, opacity))
+        good = error(scale, opacity) * (1 + settings.error_tolerance)
+        scale = min(s for s in scales if s <= scale and error(s, opacity) <= good)
     return GeometryChoice(
         isotropic(points, spacing, scale, opacity), scale, opacity, tuple((*pair, e) for pair, e in trials.items())
     )
@@ -156,7 +161,7 @@ def isotropic(points: Points, spacing: NDArray[np.float32], scale: float, opacit
 def _photographs(
     points: Points, spacing: NDArray[np.float32], views: Sequence[View], settings: GeometrySettings
 ) -> list[tuple[Camera, NDArray[np.float32]]]:
-    """A few views with their images at about one pixel per spacing: what the cloud can resolve."""
+    """A few views with their images at about the cloud's own resolution: finer pixels would show only its gaps."""
     if points.rgb is None:
         return []
     import cv2
@@ -165,7 +170,7 @@ def _photographs(
     chosen = (
         np.unique(np.linspace(0, len(with_image) - 1, settings.photographs).round().astype(int)) if with_image else []
     )
-    shrink = max(1.0, pixels_per_spacing(points, spacing, views))
+    shrink = max(1.0, pixels_per_spacing(points, spacing, views) / settings.photograph_resolution)
     photographs = []
     for index in chosen:
         image, camera = with_image[index].image_rgb(), with_image[index].camera
@@ -173,6 +178,23 @@ def _photographs(
         small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
         photographs.append((camera.resized(*size), small.reshape(-1, 3).astype(np.float32) / 255))
     return photographs
+
+
+def _spacing_per_mask(points: Points, spacing: NDArray[np.float32], views: Sequence[View]) -> float:
+    """Point spacing in an image as a part of a mask's side, median over the masks of a few views; 0 without masks."""
+    parts = []
+    for view in (views[index] for index in np.unique(np.linspace(0, len(views) - 1, 12).round().astype(int))):
+        ids, camera = view.mask_map(), view.camera
+        in_camera = points.xyz @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+        front = in_camera[:, 2] > 0
+        x, y, depth = in_camera[front].T
+        column, row = np.floor(camera.fx * x / depth + camera.cx), np.floor(camera.fy * y / depth + camera.cy)
+        inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+        mask = ids[row[inside].astype(int), column[inside].astype(int)]
+        apart = (np.sqrt(camera.fx * camera.fy) * spacing[front] / depth)[inside]
+        side = np.sqrt(np.bincount(ids.ravel() + 1, minlength=view.mask_count + 1)[1:])
+        parts += [np.median(apart[mask == index]) / side[index] for index in np.unique(mask[mask >= 0])]
+    return float(np.median(parts)) if parts else 0.0
 
 
 def _photometric_error(

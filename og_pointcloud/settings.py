@@ -22,9 +22,15 @@ class GeometrySettings:
     start_scale: float = 0.35
     """Scale without images to compare with."""
     start_opacity: float = 0.5
-    """Opacity without images, and where the search starts."""
+    """Opacity without images."""
+    error_tolerance: float = 0.02
+    """Photometric errors within this share of the best look as good."""
+    mask_share: float = 0.08
+    """A splat's standard deviation is at most this part of a typical mask's side."""
     photographs: int = 4
     """Images compared with, evenly spread over the views."""
+    photograph_resolution: float = 1.2
+    """Pixels per point spacing of the images compared with."""
     pixels_per_spacing: float = 2.0
     """Image pixels used per point spacing: more pixels than that see nothing new of the cloud."""
     max_stride: int = 3
@@ -59,7 +65,7 @@ class MembershipSettings:
     """A point is surely of an instance when this share of the weight asked lies in its masks."""
     possible_share: float = 0.2
     """A point may be of an instance from this share on, if it adjoins sure ones."""
-    growth_votes: float = 0.2
+    growth_votes: float = 0.25
     """This share of the adjoining points must be of the instance already."""
     rate_share: float = 0.25
     """An instance detected less often than this share of the scene's typical rate is noise of the proposer."""
