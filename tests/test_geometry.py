@@ -1,0 +1,250 @@
+"""Point spacing, strided cameras, and the size of splats chosen by photographs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import product
+
+import numpy as np
+import pytest
+from numpy.random import Generator
+from numpy.typing import NDArray
+
+from og_pointcloud.geometry import (
+    choose_gaussians,
+    isotropic,
+    near_plane,
+    neighbourhood,
+    pixels_per_spacing,
+    strided,
+)
+from og_pointcloud.scene import Camera, Points, View
+from og_pointcloud.settings import GeometrySettings
+from og_pointcloud.visibility import NEAR_SHARE, pixel_weights
+
+SETTINGS = GeometrySettings()
+NEAR = 0.1
+
+
+def grid(side: int, step: float = 1.0) -> NDArray[np.float32]:
+    """A square lattice in the plane z = 0."""
+    line = np.arange(side) * step
+    return np.stack([*np.meshgrid(line, line), np.zeros((side, side))], axis=-1).reshape(-1, 3).astype(np.float32)
+
+
+@pytest.fixture
+def random() -> Generator:
+    return np.random.default_rng(0)
+
+
+def test_spacing_of_a_lattice_is_its_step() -> None:
+    around = neighbourhood(grid(10, 0.25), SETTINGS)
+    assert around.spacing.dtype == np.float32
+    np.testing.assert_allclose(np.median(around.spacing), 0.25)
+
+
+def test_neighbours_are_those_of_brute_force(random: Generator) -> None:
+    xyz = random.normal(size=(200, 3)).astype(np.float32)
+    around = neighbourhood(xyz, SETTINGS)
+    apart = np.linalg.norm(xyz[:, None].astype(np.float64) - xyz, axis=2)
+    np.fill_diagonal(apart, np.inf)
+    nearest = np.argsort(apart, axis=1)[:, : SETTINGS.neighbours]
+    np.testing.assert_array_equal(around.index, nearest)
+    own = np.take_along_axis(apart, nearest, axis=1)
+    three = own[:, :3].mean(axis=1)
+    expected = np.minimum(three, np.median(three[nearest], axis=1))
+    np.testing.assert_allclose(around.spacing, expected, rtol=1e-5)
+    floor = np.maximum(around.spacing, np.median(three))
+    np.testing.assert_array_equal(around.adjoining, own <= SETTINGS.reach * floor[:, None])
+
+
+def test_order_of_points_does_not_matter(random: Generator) -> None:
+    xyz = random.normal(size=(300, 3)).astype(np.float32)
+    order = random.permutation(300)
+    plain, shuffled = neighbourhood(xyz, SETTINGS), neighbourhood(xyz[order], SETTINGS)
+    np.testing.assert_array_equal(shuffled.spacing, plain.spacing[order])
+    np.testing.assert_array_equal(order[shuffled.index], plain.index[order])
+    np.testing.assert_array_equal(shuffled.adjoining, plain.adjoining[order])
+
+
+def test_unit_of_length_scales_the_spacing(random: Generator) -> None:
+    xyz = random.normal(size=(300, 3)).astype(np.float32)
+    metres, millimetres = neighbourhood(xyz, SETTINGS), neighbourhood(xyz * np.float32(1024), SETTINGS)
+    np.testing.assert_array_equal(millimetres.spacing, metres.spacing * 1024)
+    np.testing.assert_array_equal(millimetres.adjoining, metres.adjoining)
+
+
+def test_a_floater_has_the_spacing_of_the_surface_it_left() -> None:
+    xyz = np.concatenate([grid(10), [[4, 4, 500]]]).astype(np.float32)
+    around = neighbourhood(xyz, SETTINGS)
+    assert around.spacing[-1] <= 1.5
+    assert not around.adjoining[-1].any()
+    assert not (around.adjoining & (around.index == 100)).any()
+
+
+def test_duplicates_have_the_spacing_of_the_scene() -> None:
+    xyz = np.concatenate([grid(10), np.repeat(grid(1) + 3, 40, axis=0)]).astype(np.float32)
+    around = neighbourhood(xyz, SETTINGS)
+    np.testing.assert_allclose(around.spacing[100:], 1, atol=0.2)
+    assert (around.spacing > 0).all()
+    assert (around.index != np.arange(140)[:, None]).all()
+    assert around.adjoining[100:].all()
+
+
+def test_only_duplicates() -> None:
+    around = neighbourhood(np.ones((50, 3), np.float32), SETTINGS)
+    np.testing.assert_array_equal(around.spacing, 1)
+    assert around.adjoining.all()
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 16, 17, 18])
+def test_few_points_have_all_others_as_neighbours(n: int) -> None:
+    xyz = np.stack([np.arange(n), np.zeros(n), np.zeros(n)], axis=1).astype(np.float32)
+    around = neighbourhood(xyz, SETTINGS)
+    assert around.index.shape == around.adjoining.shape == (n, min(n - 1, SETTINGS.neighbours))
+    assert around.index.dtype == np.int32
+    assert ((around.spacing >= 1) & (around.spacing <= 2)).all()
+    for point, neighbours in enumerate(around.index):
+        assert set(neighbours) <= set(range(n)) - {point}
+        assert len(set(neighbours)) == len(neighbours)
+
+
+@pytest.mark.parametrize(("width", "height", "stride"), [(50, 37, 1), (50, 37, 2), (50, 37, 3), (7, 4, 3), (2, 2, 2)])
+def test_a_strided_camera_sees_the_strided_pixels(width: int, height: int, stride: int) -> None:
+    camera = Camera(width, height, 40.0, 44.0, 0.4 * width, 0.6 * height, np.eye(4))
+    small = strided(camera, stride)
+    first = stride // 2
+    kept = np.zeros((height, width))[first::stride, first::stride]
+    assert (small.height, small.width) == kept.shape
+    # The ray of every pixel centre of the small camera is that of the pixel it stands for.
+    column, row = np.meshgrid(np.arange(small.width), np.arange(small.height))
+    ray_x, ray_y = (column + 0.5 - small.cx) / small.fx, (row + 0.5 - small.cy) / small.fy
+    np.testing.assert_allclose(camera.fx * ray_x + camera.cx, first + stride * column + 0.5, atol=1e-9)
+    np.testing.assert_allclose(camera.fy * ray_y + camera.cy, first + stride * row + 0.5, atol=1e-9)
+
+
+def empty_view(camera: Camera, image: NDArray[np.uint8] | None = None) -> View:
+    masks = np.full((camera.height, camera.width), -1, np.int32)
+    return View("view", camera, masks, np.zeros((0, 4), np.float32), image)
+
+
+def frontal(distance: float, focal: float = 100.0) -> View:
+    pose = np.eye(4)
+    pose[2, 3] = distance
+    return empty_view(Camera(40, 30, focal, focal, 20, 15, pose))
+
+
+def test_pixels_per_spacing_of_a_lattice_seen_from_the_front() -> None:
+    points = Points(grid(20, 0.1), np.zeros(3))
+    spacing = neighbourhood(points.xyz, SETTINGS).spacing
+    np.testing.assert_allclose(pixels_per_spacing(points, spacing, [frontal(4.0)]), 100 * 0.1 / 4, rtol=0.05)
+    assert pixels_per_spacing(points, spacing, [frontal(-4.0)]) == 1.0  # nothing in front
+
+
+def test_near_plane_is_a_share_of_the_depth_of_what_is_in_front() -> None:
+    xyz = np.array([[0, 0, 1], [0, 0, 2], [0, 0, 3], [0, 0, -50]], np.float32)
+    assert near_plane(xyz, [frontal(0.0)]) == pytest.approx(2 * NEAR_SHARE)
+    assert near_plane(xyz * 1000, [frontal(0.0)]) == pytest.approx(2000 * NEAR_SHARE)
+    assert near_plane(xyz, [frontal(-100.0)]) > 0
+
+
+@dataclass(frozen=True)
+class DrawnCloud:
+    """A checked wall before another one, and photographs in which its points are splats of a known size."""
+
+    points: Points
+    spacing: NDArray[np.float32]
+    views: list[View]
+
+    def error(self, scale: float, opacity: float) -> float:
+        """Mean absolute difference between the photographs and the cloud drawn so."""
+        errors = [
+            np.abs(draw(self.points, self.spacing, view.camera, scale, opacity).astype(float) - view.image_rgb()).mean()
+            for view in self.views
+        ]
+        return float(np.mean(errors))
+
+
+def drawn_cloud(scale: float, opacity: float) -> DrawnCloud:
+    random = np.random.default_rng(0)
+    plane = (grid(30, 2 / 29) - [1, 1, 0]) + random.normal(size=(900, 3)) * [0.01, 0.01, 0.02]
+    xyz = np.concatenate([plane + np.array([0, 0, 3]), plane * [1.8, 1.8, 1] + np.array([0, 0, 5])]).astype(np.float32)
+    check = np.floor(xyz[:, :2] * 4).sum(axis=1).astype(int) % 2
+    colours = np.array([[200, 60, 40], [230, 220, 60], [40, 60, 200], [60, 160, 60]], np.uint8)
+    points = Points(xyz, np.zeros(3), colours[check + 2 * (np.arange(1800) >= 900)])
+    spacing = neighbourhood(xyz, SETTINGS).spacing
+    views = []
+    for index in range(4):
+        pose = np.eye(4)
+        pose[:2, 3] = 0.4 * (index - 1.5), 0.2 * (index % 2)
+        camera = Camera(48, 36, 40, 40, 24, 18, pose)  # points are a pixel apart: no photograph is shrunk
+        views.append(replace(empty_view(camera, draw(points, spacing, camera, scale, opacity)), name=f"{index}"))
+    return DrawnCloud(points, spacing, views)
+
+
+def draw(
+    points: Points, spacing: NDArray[np.float32], camera: Camera, scale: float, opacity: float
+) -> NDArray[np.uint8]:
+    """(H, W, 3) uint8: the cloud over grey."""
+    weights = pixel_weights(isotropic(points, spacing, scale, opacity), camera, NEAR)
+    image = weights @ points.rgb.astype(float) + 128 * (1 - weights.sum(axis=1)[:, None])
+    return image.round().astype(np.uint8).reshape(camera.height, camera.width, 3)
+
+
+def choose(cloud: DrawnCloud) -> tuple[float, float]:
+    choice = choose_gaussians(cloud.points, cloud.spacing, cloud.views, NEAR, SETTINGS)
+    np.testing.assert_allclose(choice.gaussians.scale, np.repeat(choice.scale * cloud.spacing[:, None], 3, axis=1))
+    np.testing.assert_array_equal(choice.gaussians.opacity, np.float32(choice.opacity))
+    errors = {(scale, opacity): error for scale, opacity, error in choice.trials}
+    assert errors[choice.scale, choice.opacity] <= 1.05 * min(errors.values())
+    return choice.scale, choice.opacity
+
+
+@pytest.mark.parametrize("scale", [0.25, 0.35, 0.5, 0.7])
+def test_the_size_that_the_photographs_show_is_chosen(scale: float) -> None:
+    chosen, opacity = choose(drawn_cloud(scale, 0.9))
+    place = SETTINGS.scales.index
+    assert abs(place(chosen) - place(scale)) <= 1
+    assert opacity == 0.9
+
+
+def test_the_choice_is_about_as_good_as_the_best_of_all() -> None:
+    cloud = drawn_cloud(0.35, 0.9)
+    best = min(cloud.error(*pair) for pair in product(SETTINGS.scales, SETTINGS.opacities))
+    assert cloud.error(*choose(cloud)) <= 1.1 * best + 1
+
+
+def test_soft_points_are_not_taken_for_opaque_ones() -> None:
+    assert choose(drawn_cloud(0.35, 0.3))[1] < 0.9
+    assert choose(drawn_cloud(0.35, 0.9))[1] == 0.9
+
+
+def test_choice_does_not_depend_on_the_unit_of_length() -> None:
+    cloud = drawn_cloud(0.5, 0.9)
+    views = []
+    for view in cloud.views:
+        pose = view.camera.world_to_camera.copy()
+        pose[:3, 3] *= 1024
+        views.append(replace(view, camera=replace(view.camera, world_to_camera=pose)))
+    points = replace(cloud.points, xyz=cloud.points.xyz * np.float32(1024))
+    choice = choose_gaussians(points, cloud.spacing * 1024, views, NEAR * 1024, SETTINGS)
+    assert (choice.scale, choice.opacity) == choose(cloud)
+
+
+@pytest.mark.parametrize("missing", ["colours", "images"])
+def test_without_colours_or_images_nothing_is_tried(missing: str) -> None:
+    cloud = drawn_cloud(0.5, 0.9)
+    points = replace(cloud.points, rgb=None) if missing == "colours" else cloud.points
+    views = [replace(view, image=None) for view in cloud.views] if missing == "images" else cloud.views
+    choice = choose_gaussians(points, cloud.spacing, views, NEAR, SETTINGS)
+    assert choice.trials == ()
+    assert (choice.scale, choice.opacity) == (SETTINGS.start_scale, SETTINGS.start_opacity)
+
+
+def test_one_coloured_point_can_be_chosen_for() -> None:
+    points = Points(np.array([[0, 0, 2]], np.float32), np.zeros(3), np.array([[255, 0, 0]], np.uint8))
+    image = np.full((30, 40, 3), 90, np.uint8)
+    view = replace(frontal(0.0), image=image)
+    choice = choose_gaussians(points, neighbourhood(points.xyz, SETTINGS).spacing, [view], NEAR, SETTINGS)
+    assert choice.scale in SETTINGS.scales
+    assert len(choice.gaussians) == 1
