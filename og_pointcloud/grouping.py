@@ -100,8 +100,8 @@ def _spanning_masks(share: csr_array, mask_view: NDArray[np.int32], settings: Gr
     whole = largest >= settings.container_share
     own = np.arange(len(mask_view)) * views + mask_view
     whole[own] = False  # a mask is no witness of itself
-    split, whole = split.reshape(-1, views).sum(axis=1), whole.reshape(-1, views).sum(axis=1)
-    return split > whole
+    shape = len(mask_view), views
+    return split.reshape(shape).sum(axis=1) > whole.reshape(shape).sum(axis=1)
 
 
 def _lookup(matrix: csr_array, rows: NDArray[np.int32], cols: NDArray[np.int32]) -> NDArray[np.float64]:

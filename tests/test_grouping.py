@@ -1,0 +1,374 @@
+"""Masks joined into groups: hand-made tables where the right answer is plain, and a slow literal reference."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from itertools import combinations
+
+import numpy as np
+import pytest
+from numpy.random import Generator
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+
+from og_pointcloud.grouping import group_masks, indicator, mask_shares
+from og_pointcloud.settings import GroupingSettings
+from og_pointcloud.testimony import hear_views
+from og_pointcloud.visibility import MaskTable
+
+SETTINGS = GroupingSettings()
+ONE = np.array([1, 0, 0, 0, 0, 0, 0, 0], np.float32)
+OTHER = np.array([0, 1, 0, 0, 0, 0, 0, 0], np.float32)
+
+HandView = Sequence[tuple[Iterable[int], NDArray[np.float32]]]
+"""Masks of a view: the points of each, and its feature."""
+
+
+def hand_table(n: int, views: Sequence[HandView], unseen: Sequence[Iterable[int]] = ()) -> MaskTable:
+    """A table in which every view sees every point openly, one pixel each, but those it is told not to see."""
+    masks = [(index, list(points), feature) for index, view in enumerate(views) for points, feature in view]
+    weights = np.zeros((len(masks), n), np.float32)
+    for row, (_, points, _) in enumerate(masks):
+        weights[row, points] = 1
+    mask_view = np.array([index for index, _, _ in masks], np.int32)
+    exposure = np.ones((len(views), n), np.float32)
+    for index, points in enumerate(unseen):
+        exposure[index, list(points)] = 0
+    weights *= exposure[mask_view]
+    outside = exposure.copy()
+    for view in range(len(views)):
+        outside[view] -= weights[mask_view == view].sum(axis=0)
+    features = np.array([feature for _, _, feature in masks], np.float32).reshape(len(masks), len(ONE))
+    return MaskTable(
+        csr_array(weights),
+        csr_array(np.maximum(outside, 0)),
+        csr_array(exposure),
+        mask_view,
+        weights.sum(axis=1).astype(np.int32),
+        features,
+    )
+
+
+def groups_of(table: MaskTable, settings: GroupingSettings = SETTINGS) -> NDArray[np.int32]:
+    groups = group_masks(table, hear_views(table), settings)
+    assert groups.group.dtype == np.int32
+    assert set(groups.group) - {-1} == set(range(groups.count))
+    assert (groups.group[groups.spanning] == -1).all()
+    return groups.group
+
+
+A, B = range(50), range(50, 100)
+
+
+def test_two_objects_seen_by_all_views_are_two_groups() -> None:
+    table = hand_table(100, [[(A, ONE), (B, OTHER)]] * 4)
+    np.testing.assert_array_equal(groups_of(table), [0, 1] * 4)
+
+
+def test_objects_with_the_same_feature_stay_apart() -> None:
+    table = hand_table(100, [[(A, ONE), (B, ONE)]] * 4)
+    np.testing.assert_array_equal(groups_of(table), [0, 1] * 4)
+
+
+def test_masks_of_the_same_extent_join_whatever_their_features() -> None:
+    table = hand_table(100, [[(A, ONE), (B, OTHER)], [(A, OTHER), (B, ONE)]])
+    np.testing.assert_array_equal(groups_of(table), [0, 1, 0, 1])
+
+
+def test_groups_are_numbered_by_what_they_show() -> None:
+    table = hand_table(100, [[(range(10), ONE), (range(10, 100), OTHER)]] * 3)
+    np.testing.assert_array_equal(groups_of(table), [1, 0] * 3)
+
+
+def test_parts_come_together_where_other_views_show_the_whole() -> None:
+    parts = [(range(25), ONE), (range(25, 50), ONE), (B, OTHER)]
+    table = hand_table(100, [parts, *[[(A, ONE), (B, OTHER)]] * 3])
+    np.testing.assert_array_equal(groups_of(table), [0, 0, 1, 0, 1, 0, 1, 0, 1])
+
+
+def test_parts_that_no_view_shows_whole_stay_apart() -> None:
+    parts = [(range(25), ONE), (range(25, 50), ONE)]
+    assert len(set(groups_of(hand_table(50, [parts] * 4)))) == 2
+
+
+@pytest.mark.parametrize("spanning_views", [1, 2])
+@pytest.mark.parametrize("border", [50, 60, 80])
+def test_masks_that_span_two_objects_in_a_minority_of_views_do_not_weld_them(spanning_views: int, border: int) -> None:
+    separate = [(range(border), ONE), (range(border, 100), OTHER)]
+    table = hand_table(100, [*[[(range(100), ONE)]] * spanning_views, *[separate] * 3])
+    np.testing.assert_array_equal(groups_of(table)[spanning_views:], [0, 1] * 3)
+
+
+def test_a_mask_that_spans_many_things_is_left_out() -> None:
+    thirds = [(range(start, start + 30), ONE) for start in (0, 30, 60)]
+    table = hand_table(90, [[(range(90), ONE)], thirds, thirds])
+    groups = group_masks(table, hear_views(table), SETTINGS)
+    np.testing.assert_array_equal(groups.spanning, [True] + [False] * 6)
+    np.testing.assert_array_equal(groups.group, [-1, 0, 1, 2, 0, 1, 2])
+
+
+def test_one_mask_in_most_views_is_one_object() -> None:
+    """Split by two views of six, and nothing known of the parts' features."""
+    table = hand_table(100, [*[[(range(100), ONE)]] * 4, *[[(A, ONE), (B, ONE)]] * 2])
+    assert set(groups_of(table)[:4]) == {0}
+
+
+def cup_on_table(cup: NDArray[np.float32]) -> NDArray[np.int32]:
+    """Three views missed the cup (points 80..99), two show it; the other masks tell how unlike things are here."""
+    random = np.random.default_rng(3)
+    others = [
+        (range(100 + 10 * index, 110 + 10 * index), np.abs(random.normal(size=8)).astype(np.float32))
+        for index in range(8)
+    ]
+    missed = [(range(100), ONE), *others]
+    shown = [(range(80), ONE), (range(80, 100), cup), *others]
+    group = groups_of(hand_table(180, [missed, missed, missed, shown, shown]))
+    table_masks, cup_masks = [0, 9, 18, 27, 37], [28, 38]
+    assert len(set(group[table_masks])) == 1
+    assert len(set(group[cup_masks])) == 1
+    return group[[0, 28]]
+
+
+def test_a_cup_that_most_views_miss_is_not_welded_to_the_table() -> None:
+    table, cup = cup_on_table(OTHER)
+    assert table != cup
+
+
+def test_a_part_with_the_feature_of_the_whole_is_joined() -> None:
+    table, part = cup_on_table(ONE)
+    assert table == part
+
+
+def test_a_view_that_saw_a_sliver_is_no_witness() -> None:
+    """View 0 sees five points of each object and shows them as one; two views show two objects."""
+    views = [[(range(100), ONE)], [(A, ONE), (B, OTHER)], [(A, ONE), (B, OTHER)]]
+    hidden = [[*range(45), *range(55, 100)]]
+    table = hand_table(100, views, hidden)
+    share = mask_shares(hear_views(table), table.mask_view, replace(SETTINGS, witness_share=0.2)).toarray()
+    assert (share[1:, 0] == 0).all()
+    assert (share[0, 1:] > 0).all()
+    group = groups_of(table)
+    assert group[1] == group[3] != group[2] == group[4]
+
+
+def test_masks_without_common_points_are_groups_of_their_own() -> None:
+    table = hand_table(100, [[(A, ONE)], [(B, ONE)]], [B, A])
+    np.testing.assert_array_equal(groups_of(table), [0, 1])
+
+
+def test_no_mask_at_all() -> None:
+    table = hand_table(10, [[], []])
+    groups = group_masks(table, hear_views(table), SETTINGS)
+    assert groups.count == len(groups.group) == len(groups.spanning) == 0
+
+
+def test_a_mask_that_shows_nothing_belongs_to_no_group() -> None:
+    table = hand_table(100, [[(A, ONE), ([], OTHER)], [(A, ONE)]])
+    np.testing.assert_array_equal(groups_of(table), [0, -1, 0])
+
+
+def test_one_view_gives_one_group_per_mask() -> None:
+    table = hand_table(100, [[(range(0, 100, 3), ONE), (range(1, 100, 3), ONE), (range(2, 100, 3), ONE)]])
+    np.testing.assert_array_equal(groups_of(table), [0, 1, 2])
+
+
+def test_cuts_at_different_places_keep_what_they_agree_on() -> None:
+    left = [(range(60), ONE), (range(60, 100), OTHER)]
+    right = [(range(40), ONE), (range(40, 100), OTHER)]
+    group = groups_of(hand_table(100, [left, right] * 2))
+    assert set(group[::2]) != set(group[1::2])
+    assert len(set(group[::2])) == len(set(group[1::2])) == 1
+
+
+def test_masks_that_contradict_each_other_everywhere_are_not_joined() -> None:
+    even_odd = [(range(0, 100, 2), ONE), (range(1, 100, 2), ONE)]
+    thirds = [(range(start, 100, 4), ONE) for start in range(4)]
+    halves = [(A, ONE), (B, ONE)]
+    group = groups_of(hand_table(100, [halves, even_odd]))
+    assert len(set(group) - {-1}) == 4 or (group == -1).all()
+    assert groups_of(hand_table(100, [thirds, halves])).shape == (6,)
+
+
+def test_zero_features_still_group() -> None:
+    nothing = np.zeros(8, np.float32)
+    table = hand_table(100, [[(A, nothing), (B, nothing)]] * 3)
+    np.testing.assert_array_equal(groups_of(table), [0, 1] * 3)
+
+
+def test_indicator() -> None:
+    matrix = indicator(np.array([1, -1, 0, 1], np.int32), 3)
+    np.testing.assert_array_equal(matrix.toarray(), [[0, 0, 1, 0], [1, 0, 0, 1], [0, 0, 0, 0]])
+
+
+def random_table(random: Generator) -> MaskTable:
+    """Five things, each of seven views with ragged edges, splits, merges, misses, partial sight and soft weights."""
+    n = 120
+    thing = np.sort(random.integers(0, 5, n))
+    hand_views, unseen = [], []
+    for _ in range(7):
+        label = np.where(random.uniform(size=n) < 0.1, random.integers(0, 5, n), thing)
+        if random.uniform() < 0.5:
+            label[label == random.integers(5)] = random.integers(5)
+        if random.uniform() < 0.5:
+            label[(label == random.integers(5)) & (np.arange(n) % 2 == 0)] = 5
+        kept = [value for value in np.unique(label) if random.uniform() < 0.85]
+        features = [np.eye(8)[value] + 0.4 * random.normal(size=8) for value in kept]
+        hand_views.append(
+            [
+                (np.flatnonzero(label == value), feature.astype(np.float32))
+                for value, feature in zip(kept, features, strict=True)
+            ]
+        )
+        unseen.append(np.flatnonzero(random.uniform(size=n) < 0.3))
+    table = hand_table(n, hand_views, unseen)
+    soft = table.weights.copy()
+    soft.data *= random.uniform(0.2, 1, soft.nnz).astype(np.float32)
+    exposure = table.exposure.copy()
+    exposure.data *= random.uniform(0.3, 1, exposure.nnz).astype(np.float32)
+    return replace(table, weights=soft, exposure=exposure)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_groups_are_those_of_the_literal_reference(seed: int) -> None:
+    table = random_table(np.random.default_rng(seed))
+    np.testing.assert_array_equal(groups_of(table), reference_groups(table))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_order_of_views_and_masks_does_not_matter(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    table = HARD_TABLE
+    view_order = random.permutation(table.outside.shape[0])
+    order = np.concatenate([random.permutation(np.flatnonzero(table.mask_view == view)) for view in view_order])
+    shuffled = MaskTable(
+        table.weights[order],
+        table.outside[view_order],
+        table.exposure[view_order],
+        np.argsort(view_order).astype(np.int32)[table.mask_view[order]],
+        table.mask_pixels[order],
+        table.mask_features[order],
+    )
+    assert as_sets(groups_of(shuffled), order) == as_sets(groups_of(table), np.arange(len(order)))
+
+
+HARD_TABLE = hand_table(
+    200,
+    [
+        [(range(100), ONE), (range(100, 150), OTHER), (range(150, 200), ONE)],
+        [(range(100), ONE), (range(100, 150), OTHER), (range(150, 170), ONE), (range(170, 200), ONE)],
+        [(range(80), ONE), (range(80, 100), OTHER), (range(100, 200), ONE)],
+        [(range(80), ONE), (range(80, 100), OTHER), (range(102, 148), OTHER), (range(150, 200), ONE)],
+        [(range(30), ONE), (range(30, 95), ONE), (range(100, 150), OTHER)],
+    ],
+)
+"""A thing missed twice, a split, two welds and a miss."""
+
+
+def as_sets(group: NDArray[np.int32], mask: NDArray[np.integer]) -> set[frozenset[int]]:
+    return {frozenset(mask[group == number].tolist()) for number in np.unique(group[group >= 0])}
+
+
+def test_order_of_points_does_not_matter() -> None:
+    random = np.random.default_rng(0)
+    table = random_table(random)
+    order = random.permutation(table.weights.shape[1])
+    shuffled = replace(
+        table,
+        weights=csr_array(table.weights[:, order]),
+        outside=csr_array(table.outside[:, order]),
+        exposure=csr_array(table.exposure[:, order]),
+    )
+    np.testing.assert_array_equal(groups_of(shuffled), groups_of(table))
+
+
+def test_a_sample_of_the_points_gives_the_same_groups() -> None:
+    table = hand_table(1000, [[(range(500), ONE), (range(500, 1000), OTHER)], [(range(1000), ONE)]] * 3)
+    sampled = groups_of(table, replace(SETTINGS, graph_points=50))
+    np.testing.assert_array_equal(sampled, groups_of(table))
+
+
+# The literal reference: the module's formulas with dense arrays and loops over pairs.
+
+
+def reference_groups(table: MaskTable) -> NDArray[np.int32]:
+    testimony = hear_views(table)
+    inside, word = testimony.inside.toarray().astype(float), testimony.word.toarray().astype(float)
+    view = table.mask_view
+    masks, views = len(view), len(word)
+    share = np.zeros((masks, masks))
+    for i in range(masks):
+        for j in range(masks):
+            visible = inside[i] @ word[view[j]]
+            if visible > SETTINGS.witness_share * (inside[i] @ inside[i]):
+                share[i, j] = inside[i] @ inside[j] / visible
+    spanning = reference_spanning(share, view, views)
+    container = np.zeros((masks, views), int) - 1
+    for i in range(masks):
+        for v in range(views):
+            holders = [
+                j for j in np.flatnonzero(view == v) if share[i, j] > SETTINGS.container_share and not spanning[j]
+            ]
+            if holders:
+                container[i, v] = max(holders, key=lambda j: share[i, j])
+    group = reference_joins(share, container, table.unit_features.astype(float), view, ~spanning)
+    shown = table.weights.toarray().sum(axis=1)
+    by_mass = sorted({frozenset(members) for members in group}, key=lambda members: -shown[list(members)].sum())
+    number = np.full(masks, -1, np.int32)
+    for index, members in enumerate(by_mass):
+        number[list(members)] = index
+    return number
+
+
+def reference_spanning(share: NDArray[np.float64], view: NDArray[np.int32], views: int) -> NDArray[np.bool_]:
+    spanning = np.zeros(len(view), bool)
+    for i in range(len(view)):
+        split = whole = 0
+        for v in range(views):
+            others = np.flatnonzero(view == v)
+            if v == view[i] or len(others) == 0:
+                continue
+            within = [j for j in others if share[j, i] > SETTINGS.container_share and share[i, j] > 0]
+            parts = sum(share[i, j] > SETTINGS.part_share for j in within)
+            if share[i, others].max() >= SETTINGS.container_share:
+                whole += 1
+            elif parts >= 2 and share[i, within].sum() > SETTINGS.container_share:
+                split += 1
+        spanning[i] = split > whole
+    return spanning
+
+
+def reference_joins(
+    share: NDArray[np.float64],
+    container: NDArray[np.int_],
+    features: NDArray[np.float64],
+    view: NDArray[np.int32],
+    usable: NDArray[np.bool_],
+) -> list[list[int]]:
+    pairs = list(combinations(range(len(view)), 2))
+    different = np.array([features[i] @ features[j] for i, j in pairs if view[i] == view[j]])
+
+    def agreement(a: list[int], b: list[int]) -> float:
+        one = same = asked = 0.0
+        for i in a:
+            for j in b:
+                both = (container[i] >= 0) & (container[j] >= 0)
+                together = float((both & (container[i] == container[j])).sum())
+                one += together
+                same += together if min(share[i, j], share[j, i]) > SETTINGS.container_share else 0.0
+                asked += both.sum()
+        if asked == 0:
+            return 0.0
+        mean_a, mean_b = features[a].sum(axis=0), features[b].sum(axis=0)
+        cosine = mean_a @ mean_b / np.linalg.norm(mean_a) / np.linalg.norm(mean_b)
+        below = 0.5 * ((different < cosine - 1e-6).mean() + (different <= cosine + 1e-6).mean())
+        return (same + (one - same) * below**2) / asked
+
+    groups = [[int(i)] for i in np.flatnonzero(usable)]
+    while len(groups) > 1:
+        scores = {(a, b): agreement(groups[a], groups[b]) for a, b in combinations(range(len(groups)), 2)}
+        a, b = max(scores, key=lambda pair: scores[pair])
+        if scores[a, b] <= SETTINGS.join_majority:
+            break
+        groups[a] += groups.pop(b)
+    return groups
