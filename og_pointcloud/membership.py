@@ -71,6 +71,9 @@ def assign_points(
     ids = _grow(ids, best, possible, neighbourhood.index, neighbourhood.adjoining, settings.growth_votes)
     ids = _without_islands(ids, own_area(table, groups.group, ids), neighbourhood, settings.island_share)
     ids = _fill_unobserved(np.where((ids == BACKGROUND) & (total == 0), UNOBSERVED, ids), neighbourhood)
+    ids = _settle_borders(
+        ids, share, neighbourhood.index, neighbourhood.adjoining, *settings.border_shares, settings.own_vote
+    )
     return Membership(ids.astype(np.int32), share.astype(np.float32), rate.astype(np.float32), dismissed)
 
 
@@ -217,6 +220,39 @@ def _grow(ids, best, possible, neighbours, adjoining, votes):  # noqa: ANN001, A
     return ids
 
 
+@njit(cache=True)
+def _settle_borders(ids, share, neighbours, adjoining, low, high, own_vote):  # noqa: ANN001, ANN202
+    """Points between two states take the one that most of their adjoining points are in, counted by how sure these are.
+
+    A neighbour votes for its instance with its squared share, for background with the square of the rest; the point's
+    own state has ``own_vote`` votes. A point of an instance may change to another, not to background: its own share
+    has decided that. All votes are on the states before this step (ties: the point's own, then the nearest's).
+    """
+    settled = ids.copy()
+    width = neighbours.shape[1]
+    states = np.empty(width + 1, np.int64)
+    votes = np.empty(width + 1)
+    for g in range(len(ids)):
+        if not low < share[g] < high or ids[g] < BACKGROUND:
+            continue
+        states[0], votes[0], count = ids[g], own_vote, 1
+        for k in range(width):
+            other = neighbours[g, k]
+            state = ids[other]
+            if not adjoining[g, k] or state < BACKGROUND or (state == BACKGROUND and ids[g] >= 0):
+                continue
+            vote = share[other] ** 2 if state >= 0 else (1 - share[other]) ** 2
+            place = 0
+            while place < count and states[place] != state:
+                place += 1
+            if place == count:
+                states[count], votes[count] = state, 0.0
+                count += 1
+            votes[place] += vote
+        settled[g] = states[np.argmax(votes[:count])]
+    return settled
+
+
 def own_area(table: MaskTable, group: NDArray[np.int32], ids: NDArray[np.int32]) -> NDArray[np.float64]:
     """(n,) float64: pixels of blending weight that the masks of each point's own instance put on it."""
     weights = table.weights
@@ -255,6 +291,8 @@ def _without_islands(
 
 def _fill_unobserved(ids: NDArray[np.int32], neighbourhood: Neighbourhood) -> NDArray[np.int32]:
     """Points that no view saw copy the state of their nearest adjoining observed point; the rest stay unobserved."""
+    if neighbourhood.index.shape[1] == 0:
+        return ids  # one point has no neighbours
     hidden = np.flatnonzero(ids == UNOBSERVED)
     near = ids[neighbourhood.index[hidden]]
     usable = neighbourhood.adjoining[hidden] & (near != UNOBSERVED)

@@ -57,14 +57,14 @@ class Camera:
             raise SceneError(f"camera image is {self.width}x{self.height}; expected at least 1x1 pixel")
         intrinsics = (self.fx, self.fy, self.cx, self.cy)
         if not np.isfinite(intrinsics).all() or self.fx <= 0 or self.fy <= 0:
-            raise SceneError(f"camera intrinsics fx, fy, cx, cy are {intrinsics}; expected finite numbers, fx and fy > 0")
+            raise SceneError(
+                f"camera intrinsics fx, fy, cx, cy are {intrinsics}; expected finite numbers, fx and fy > 0"
+            )
 
     def resized(self, width: int, height: int) -> Camera:
         """The same camera with its image scaled to width x height pixels."""
         x, y = width / self.width, height / self.height
-        return replace(
-            self, width=width, height=height, fx=self.fx * x, fy=self.fy * y, cx=self.cx * x, cy=self.cy * y
-        )
+        return replace(self, width=width, height=height, fx=self.fx * x, fy=self.fy * y, cx=self.cx * x, cy=self.cy * y)
 
     @property
     def center(self) -> DoubleArray:
@@ -153,8 +153,14 @@ class Points:
 
     @classmethod
     def from_world(
-        cls, xyz: NDArray[np.floating], *, rgb: NDArray[np.uint8] | None = None, normals: FloatArray | None = None,
-        scale: FloatArray | None = None, rotation: FloatArray | None = None, opacity: FloatArray | None = None,
+        cls,
+        xyz: NDArray[np.floating],
+        *,
+        rgb: NDArray[np.uint8] | None = None,
+        normals: FloatArray | None = None,
+        scale: FloatArray | None = None,
+        rotation: FloatArray | None = None,
+        opacity: FloatArray | None = None,
     ) -> Points:
         """Points from world coordinates (n, 3) of any float type; the median becomes the origin."""
         world = np.asarray(xyz, np.float64)

@@ -42,15 +42,15 @@ class CaptureSettings:
     interpolated between front and back. outliers: share of samples anywhere in the room.
     """
 
-    views: int = 40
-    width: int = 400
-    height: int = 300
-    voxel_m: float = 0.037
+    views: int = 48
+    width: int = 640
+    height: int = 480
+    voxel_m: float = 0.025
     mask_noise: float = 1.0
     depth_noise: float = 1.0
     range_m: float = 3.5
-    samples_per_view: int = 25_000
-    flying: float = 0.02
+    samples_per_view: int = 40_000
+    flying: float = 0.01
     outliers: float = 5e-5
 
 
