@@ -1,0 +1,296 @@
+"""What views say of points, and the state of every point decided from it: points on a line, masks made by hand."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.random import Generator
+from numpy.typing import NDArray
+from scipy.sparse import csr_array, random_array
+from test_grouping import ONE, HandView, hand_table
+
+from og_pointcloud.cloud import BACKGROUND, UNOBSERVED
+from og_pointcloud.geometry import neighbourhood
+from og_pointcloud.grouping import MaskGroups
+from og_pointcloud.membership import Membership, _best_group, _by_point, assign_points, own_area, without_see_through
+from og_pointcloud.settings import GeometrySettings, MembershipSettings
+from og_pointcloud.testimony import OPENNESS_POWER, hear_views
+from og_pointcloud.visibility import Gaussians, MaskTable
+
+SETTINGS = MembershipSettings()
+N = 100
+OBJECT = range(50)
+
+
+def on_a_line(n: int = N) -> NDArray[np.float32]:
+    """Points one apart, so the three nearest are 4/3 away: each adjoins four on either side."""
+    return np.stack([np.arange(n), np.zeros(n), np.zeros(n)], axis=1).astype(np.float32)
+
+
+def groups(numbers: Sequence[int]) -> MaskGroups:
+    number = np.array(numbers, np.int32)
+    return MaskGroups(number, int(number.max(initial=-1)) + 1, np.zeros(len(number), bool))
+
+
+def decide(table: MaskTable, numbers: Sequence[int], xyz: NDArray[np.float32] | None = None) -> Membership:
+    xyz = on_a_line(table.weights.shape[1]) if xyz is None else xyz
+    around = neighbourhood(xyz, GeometrySettings())
+    result = assign_points(table, hear_views(table), groups(numbers), around, SETTINGS)
+    assert result.instance_ids.dtype == np.int32
+    assert result.share.dtype == result.detection_rate.dtype == np.float32
+    assert result.instance_ids.shape == result.share.shape == (len(xyz),)
+    assert ((result.share >= 0) & (result.share <= 1.0001)).all()
+    return result
+
+
+def ids_of(views: Sequence[HandView], numbers: Sequence[int], unseen: Sequence[Iterable[int]] = ()) -> list[int]:
+    return decide(hand_table(N, views, unseen), numbers).instance_ids.tolist()
+
+
+def test_inside_the_masks_is_the_instance_outside_is_background() -> None:
+    assert ids_of([[(OBJECT, ONE)]] * 4, [0] * 4) == [0] * 50 + [BACKGROUND] * 50
+
+
+def test_two_instances() -> None:
+    ids = ids_of([[(range(30), ONE), (range(30, 70), ONE)]] * 4, [0, 1] * 4)
+    assert ids == [0] * 30 + [1] * 40 + [BACKGROUND] * 30
+
+
+def test_a_detector_that_misses_often_keeps_its_instance() -> None:
+    """Seven views of ten have no mask: they say nothing."""
+    assert ids_of([*[[(OBJECT, ONE)]] * 3, *[[]] * 7], [0] * 3) == [0] * 50 + [BACKGROUND] * 50
+
+
+def test_background_that_few_masks_of_the_instance_cover_stays_background() -> None:
+    """Ten points beside the object slip into its mask in one view of seven, ten far away in three of seven."""
+    wide = [(range(60), ONE)]
+    far = [([*OBJECT, *range(80, 90)], ONE)]
+    ids = ids_of([wide, far, far, far, *[[(OBJECT, ONE)]] * 3], [0] * 7)
+    assert ids == [0] * 50 + [BACKGROUND] * 50
+
+
+def test_a_torn_rim_joins_the_instance_it_adjoins() -> None:
+    """Two views of four cut five points off the end of the object."""
+    torn = [(range(45), ONE)]
+    assert ids_of([torn, torn, [(OBJECT, ONE)], [(OBJECT, ONE)]], [0] * 4) == [0] * 50 + [BACKGROUND] * 50
+
+
+def test_growth_follows_the_surface_but_not_into_less_likely_points() -> None:
+    """Forty points at share 0.5 in a row are reached from the sure ones; those at 0.17 behind them are not."""
+    long, short = [(range(90), ONE)], [(OBJECT, ONE)]
+    views = [[(range(N), ONE)], long, long, short, short, short]
+    assert ids_of(views, [0] * 6) == [0] * 90 + [BACKGROUND] * 10
+
+
+def test_points_that_no_view_sees_copy_their_neighbours_within_reach() -> None:
+    xyz = np.concatenate([on_a_line(50), [[50, 0, 0], [51.5, 0, 0], [70, 0, 0]]]).astype(np.float32)
+    table = hand_table(53, [[(range(40), ONE)]] * 3, [range(50, 53)] * 3)
+    ids = decide(table, [0] * 3, xyz).instance_ids
+    assert ids.tolist() == [0] * 40 + [BACKGROUND] * 12 + [UNOBSERVED]
+    table = hand_table(53, [[(OBJECT, ONE)]] * 3, [range(50, 53)] * 3)
+    ids = decide(table, [0] * 3, xyz).instance_ids
+    assert ids.tolist() == [0] * 52 + [UNOBSERVED]
+
+
+def test_a_group_that_nearly_all_views_contradict_is_dismissed() -> None:
+    """Ten views show the object, one of them a mask of nothing."""
+    views: list[HandView] = [[(OBJECT, ONE)]] * 9 + [[(OBJECT, ONE), (range(70, 90), ONE)]]
+    result = decide(hand_table(N, views), [0] * 10 + [1])
+    assert result.dismissed.tolist() == [False, True]
+    assert result.instance_ids.tolist() == [0] * 50 + [BACKGROUND] * 50
+    np.testing.assert_allclose(result.detection_rate, [1, 0.1], rtol=1e-6)
+
+
+def test_a_group_of_which_no_point_is_sure_is_dismissed() -> None:
+    """Points of group 1 lie in masks of group 0 far more often."""
+    views: list[HandView] = [[(OBJECT, ONE)]] * 4 + [[(range(10), ONE), (range(10, 50), ONE)]]
+    result = decide(hand_table(N, views), [0] * 4 + [1, 0])
+    assert result.dismissed.tolist() == [False, True]
+    assert result.instance_ids.tolist() == [0] * 50 + [BACKGROUND] * 50
+
+
+def test_masks_without_a_group_have_no_say() -> None:
+    assert ids_of([[(OBJECT, ONE), (range(50, N), ONE)]] * 3, [0, -1] * 3) == [0] * 50 + [BACKGROUND] * 50
+
+
+@pytest.mark.parametrize("numbers", [[], [-1, -1]])
+def test_no_group_at_all(numbers: list[int]) -> None:
+    views: list[HandView] = [[(OBJECT, ONE)], [(OBJECT, ONE)]] if numbers else [[], []]
+    hidden = [range(90, 100)] * 2
+    ids = ids_of(views, numbers, hidden)
+    assert ids == [BACKGROUND] * 94 + [UNOBSERVED] * 6
+
+
+@pytest.mark.parametrize("n", [1, 2, 3])
+def test_few_points(n: int) -> None:
+    assert decide(hand_table(n, [[(range(n), ONE)]] * 2), [0, 0]).instance_ids.tolist() == [0] * n
+    assert decide(hand_table(n, [[]] * 2), []).instance_ids.tolist() == [BACKGROUND] * n
+    unseen = hand_table(n, [[([], ONE)]] * 2, [range(n)] * 2)
+    assert decide(unseen, [-1, -1]).instance_ids.tolist() == [UNOBSERVED] * n
+
+
+def two_pieces(shown: float) -> list[int]:
+    """Forty points, and far from them ten that the same masks show ``shown`` as much of."""
+    xyz = on_a_line(50)
+    xyz[40:] += 100
+    table = hand_table(50, [[(range(50), ONE)]] * 4)
+    weights = table.weights.toarray()
+    weights[:, 40:] *= np.float32(shown)
+    exposure = table.exposure.toarray()
+    exposure[:, 40:] *= np.float32(shown)
+    dimmed = replace(table, weights=csr_array(weights), exposure=csr_array(exposure))
+    return decide(dimmed, [0] * 4, xyz).instance_ids.tolist()
+
+
+def test_a_piece_that_was_only_seen_through_its_instance_is_taken_from_it() -> None:
+    assert two_pieces(0.05) == [0] * 40 + [UNOBSERVED] * 10
+
+
+def test_a_piece_that_is_shown_as_openly_as_the_rest_stays() -> None:
+    assert two_pieces(0.5) == [0] * 50
+
+
+def test_order_of_points_does_not_matter() -> None:
+    random = np.random.default_rng(0)
+    table, numbers = random_case(random)
+    xyz = random.normal(size=(table.weights.shape[1], 3)).astype(np.float32)
+    order = random.permutation(len(xyz))
+    shuffled = replace(
+        table,
+        weights=csr_array(table.weights[:, order]),
+        outside=csr_array(table.outside[:, order]),
+        exposure=csr_array(table.exposure[:, order]),
+    )
+    plain, moved = decide(table, numbers, xyz), decide(shuffled, numbers, xyz[order])
+    np.testing.assert_array_equal(moved.instance_ids, plain.instance_ids[order])
+    np.testing.assert_allclose(moved.share, plain.share[order], rtol=1e-6)
+    assert len(set(plain.instance_ids)) > 4
+
+
+def test_order_of_masks_does_not_matter() -> None:
+    random = np.random.default_rng(1)
+    table, numbers = random_case(random)
+    order = np.concatenate([random.permutation(np.flatnonzero(table.mask_view == view)) for view in range(6)])
+    shuffled = replace(table, weights=csr_array(table.weights[order]))
+    plain, moved = decide(table, numbers), decide(shuffled, [numbers[mask] for mask in order])
+    np.testing.assert_array_equal(moved.instance_ids, plain.instance_ids)
+
+
+def random_case(random: Generator, n: int = 200, views: int = 6, masks: int = 4) -> tuple[MaskTable, list[int]]:
+    """Soft random weights of ``masks`` masks in each of the views, of which some have no group."""
+    sparse = [
+        csr_array(random_array((rows, n), density=share, rng=random, dtype=np.float32))
+        for rows, share in ((views * masks, 0.1), (views, 0.5))
+    ]
+    mask_view = np.repeat(np.arange(views), masks).astype(np.int32)
+    seen = sparse[1].toarray() > 0
+    for view in range(views):
+        seen[view] |= (sparse[0].toarray()[mask_view == view] > 0).any(axis=0)
+    exposure = csr_array(np.where(seen, random.uniform(0.05, 1, seen.shape), 0).astype(np.float32))
+    numbers = random.integers(-1, 5, views * masks).tolist()
+    features = np.tile(ONE, (views * masks, 1))
+    return MaskTable(*sparse, exposure, mask_view, np.full(views * masks, 10, np.int32), features), numbers
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_testimony_is_its_formula(seed: int) -> None:
+    table, _ = random_case(np.random.default_rng(seed))
+    testimony = hear_views(table)
+    weights, outside, exposure = (m.toarray().astype(float) for m in (table.weights, table.outside, table.exposure))
+    best = exposure.max(axis=0)
+    word = (exposure / np.where(best > 0, best, 1)) ** OPENNESS_POWER
+    np.testing.assert_allclose(testimony.word.toarray(), word, rtol=1e-5)
+    expected = np.zeros_like(weights)
+    for mask, view in enumerate(table.mask_view):
+        seen = weights[table.mask_view == view].sum(axis=0) + outside[view]
+        expected[mask] = weights[mask] / np.where(seen > 0, seen, 1) * word[view]
+    np.testing.assert_allclose(testimony.inside.toarray(), expected, rtol=1e-5, atol=1e-9)
+    by_view = np.add.reduceat(testimony.inside.toarray(), np.arange(0, 24, 4), axis=0)
+    assert (by_view <= testimony.word.toarray() + 1e-6).all()
+
+
+def test_a_view_that_looks_openly_outweighs_views_through_a_gap() -> None:
+    """Three views glimpse point 0 in a mask, at a tenth of what the fourth sees of it, outside."""
+    table = hand_table(1, [[([0], ONE)]] * 3 + [[([], ONE)]])
+    exposure = csr_array(np.array([[0.1], [0.1], [0.1], [1.0]], np.float32))
+    word = hear_views(replace(table, exposure=exposure)).word.toarray().ravel()
+    np.testing.assert_allclose(word, [0.01, 0.01, 0.01, 1], rtol=1e-5)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_best_group_is_that_of_the_literal_reference(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    table, numbers = random_case(random)
+    group = np.array(numbers, np.int32)
+    testimony = hear_views(table)
+    has_mask = random.uniform(size=(5, 6)) < 0.7
+    allowed = np.array([True, True, False, True, True])
+    actual = _best_group(_by_point(testimony.inside), _by_point(testimony.word), group, has_mask, allowed)
+    inside, word = testimony.inside.toarray().astype(float), testimony.word.toarray().astype(float)
+    per_group = np.array([inside[group == k].sum(axis=0) if allowed[k] else 0 * inside[0] for k in range(5)])
+    best = np.where(per_group.max(axis=0) > 0, per_group.argmax(axis=0), -1)
+    asked = np.where(best >= 0, np.einsum("kv,vn->kn", has_mask, word)[best, np.arange(200)], 0)
+    for value, expected in zip(actual, (best, per_group.max(axis=0), asked, word.sum(axis=0)), strict=True):
+        np.testing.assert_allclose(value, expected, rtol=1e-5, atol=1e-9)
+    assert (best == -1).any()
+
+
+def test_of_groups_that_cover_a_point_alike_the_lower_is_taken() -> None:
+    ids = ids_of([[(OBJECT, ONE)], [(OBJECT, ONE)]], [1, 0])
+    assert ids == [0] * 50 + [BACKGROUND] * 50
+
+
+def test_own_area_is_what_the_masks_of_its_instance_show_of_a_point() -> None:
+    table = hand_table(3, [[([0, 1], ONE), ([2], ONE)], [([0, 1, 2], ONE)]])
+    area = own_area(table, np.array([0, 1, 0], np.int32), np.array([0, BACKGROUND, 1], np.int32))
+    np.testing.assert_array_equal(area, [2, 0, 1])
+
+
+def at_depths(depth: Sequence[float]) -> Gaussians:
+    xyz = np.zeros((len(depth), 3), np.float32)
+    xyz[:, 2] = depth
+    return Gaussians(xyz, np.ones_like(xyz), np.ones((len(xyz), 4), np.float32), np.ones(len(xyz), np.float32))
+
+
+LOOKING_ALONG_Z = np.array([[0.0, 0, 1, 0]])
+
+
+def front_of(depth: Sequence[float], views: int = 1) -> tuple[NDArray[np.float32], NDArray[np.float32], float]:
+    """A mask of n pixels, so sqrt(n) / 10 wide at depth 1 with a focal length of 10 px, over points at these depths."""
+    n = len(depth)
+    table = hand_table(n, [[(range(n), ONE)]] * views)
+    rows, focal = LOOKING_ALONG_Z.repeat(views, axis=0), np.full(views, 10.0)
+    kept, share = without_see_through(table, at_depths(depth), rows, focal, SETTINGS)
+    np.testing.assert_array_equal(
+        kept.weights.toarray().sum(axis=0) + kept.outside.toarray().sum(axis=0), np.full(n, views)
+    )
+    return kept.weights.toarray()[0], kept.outside.toarray()[0], share
+
+
+def test_what_lies_far_behind_the_object_is_taken_from_its_mask() -> None:
+    """Nine pixels: 0.3 wide at depth 1, so a gap of 0.6 times the depth parts object and background."""
+    weights, outside, share = front_of([1, 1.1, 1.2, 1.3, 1.4, 1.2, 5, 5, 6])
+    np.testing.assert_array_equal(weights, [1] * 6 + [0] * 3)
+    np.testing.assert_array_equal(outside, [0] * 6 + [1] * 3)
+    assert share == pytest.approx(3 / 9)
+
+
+def test_a_few_specks_in_front_are_not_the_object() -> None:
+    weights, _, share = front_of([1, 5, 5, 5, 5, 5, 5, 5.5, 30])
+    np.testing.assert_array_equal(weights[1:], [1] * 7 + [0])
+    assert 0 < share < 0.3
+
+
+def test_an_object_in_one_piece_is_kept_whole() -> None:
+    weights, _, share = front_of([1, 1.3, 1.6, 1.9, 2.2, 2.5])
+    assert (weights == 1).all()
+    assert share == 0
+
+
+def test_with_enough_views_depth_is_not_asked() -> None:
+    weights, _, share = front_of([1, 1.1, 1.2, 1.3, 1.4, 1.2, 5, 5, 6], views=SETTINGS.few_views)
+    assert (weights == 1).all()
+    assert share == 0
