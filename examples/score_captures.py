@@ -44,7 +44,8 @@ def main(folders: list[str]) -> None:
             called = "-" if score.background_called is None else f"{score.background_called:.4f}"
             print(
                 f"{folder.name:<16} {score.miou:6.4f} {score.macc:6.4f}  {score.unknown_share:6.4f} {called:>10} "
-                f"{seconds:8.1f} {float(first.stdout):15.2f} {bundle.stat().st_size / 1e6:6.1f} {len(scene.instances):10}"
+                f"{seconds:8.1f} {float(first.stdout):15.2f} {bundle.stat().st_size / 1e6:6.1f} "
+                f"{len(scene.instances):10}"
             )
 
 

@@ -67,7 +67,8 @@ class Vocabulary:
     def __post_init__(self) -> None:
         if self.vectors.ndim != 2 or len(self.vectors) != len(self.names):
             raise OgPointcloudError(
-                f"vocabulary has {len(self.names)} names and vectors of shape {self.vectors.shape}; expected one row a name"
+                f"vocabulary has {len(self.names)} names and vectors of shape {self.vectors.shape}; "
+                "expected one row a name"
             )
         if not np.isfinite(self.vectors).all():
             raise OgPointcloudError("vocabulary vectors hold NaN or infinity")
@@ -121,4 +122,5 @@ class LabelledCloud:
 
     @property
     def xyz_world(self) -> NDArray[np.float64]:
+        """World coordinates, (n, 3) float64."""
         return self.xyz.astype(np.float64) + self.origin

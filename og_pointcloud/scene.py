@@ -94,7 +94,8 @@ class View:
         features = self.mask_features
         if features.ndim != 2 or features.dtype != np.float32:
             raise SceneError(
-                f"view '{self.name}': mask features are {features.dtype} {features.shape}; expected float32 (masks, width)"
+                f"view '{self.name}': mask features are {features.dtype} {features.shape}; "
+                "expected float32 (masks, width)"
             )
         finite = np.isfinite(features).all(axis=1)
         if not finite.all():
@@ -105,6 +106,7 @@ class View:
 
     @property
     def mask_count(self) -> int:
+        """Number of masks, which is the number of feature rows."""
         return len(self.mask_features)
 
     def mask_map(self) -> IntArray:
@@ -139,7 +141,7 @@ class Points:
     """A plain cloud, or Gaussians when scale, rotation and opacity are known (all three or none).
 
     xyz: (n, 3) float32, local frame. origin: (3,) float64, world = xyz + origin. rgb: (n, 3) uint8 or None.
-    normals: (n, 3) float32 unit or None. scale: (n, 3) float32, linear standard deviations.
+    normals: (n, 3) float32 unit (zero rows: unknown) or None. scale: (n, 3) float32, linear standard deviations.
     rotation: (n, 4) float32 quaternions wxyz, unit. opacity: (n,) float32 in [0, 1].
     """
 
@@ -175,6 +177,9 @@ class Points:
                 f"{int(np.argmin(finite))}); expected finite coordinates: remove them from the cloud first"
             )
         origin = np.median(world, axis=0)
+        extent = float(np.abs(world - origin).max())
+        if extent > np.finfo(np.float32).max:
+            raise SceneError(f"points lie up to {extent:.3g} from their median; expected less than float32's 3.4e38")
         return cls((world - origin).astype(np.float32), origin, rgb, normals, scale, rotation, opacity)
 
     def __post_init__(self) -> None:
@@ -194,10 +199,12 @@ class Points:
 
     @property
     def are_gaussians(self) -> bool:
+        """Whether scale, rotation and opacity are known."""
         return self.scale is not None
 
     @property
     def xyz_world(self) -> DoubleArray:
+        """World coordinates, (n, 3) float64."""
         return self.xyz.astype(np.float64) + self.origin
 
 
