@@ -71,9 +71,10 @@ def assign_points(
     ids = _grow(ids, best, possible, neighbourhood.index, neighbourhood.adjoining, settings.growth_votes)
     ids = _without_islands(ids, own_area(table, groups.group, ids), neighbourhood, settings.island_share)
     ids = _fill_unobserved(np.where((ids == BACKGROUND) & (total == 0), UNOBSERVED, ids), neighbourhood)
-    ids = _settle_borders(
-        ids, share, neighbourhood.index, neighbourhood.adjoining, *settings.border_shares, settings.own_vote
-    )
+    for _ in range(settings.border_rounds):
+        ids = _settle_borders(
+            ids, share, neighbourhood.index, neighbourhood.adjoining, *settings.border_shares, settings.own_vote
+        )
     return Membership(ids.astype(np.int32), share.astype(np.float32), rate.astype(np.float32), dismissed)
 
 
@@ -226,7 +227,7 @@ def _settle_borders(ids, share, neighbours, adjoining, low, high, own_vote):  # 
 
     A neighbour votes for its instance with its squared share, for background with the square of the rest; the point's
     own state has ``own_vote`` votes. A point of an instance may change to another, not to background: its own share
-    has decided that. All votes are on the states before this step (ties: the point's own, then the nearest's).
+    has decided that. All votes are on the states before this round (ties: the point's own, then the nearest's).
     """
     settled = ids.copy()
     width = neighbours.shape[1]
