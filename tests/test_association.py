@@ -1,0 +1,114 @@
+"""Feature rows of instances: means weighted by what masks show, without outliers."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from test_grouping import ONE, OTHER, HandView, hand_table
+
+from og_pointcloud.association import describe_instances
+from og_pointcloud.cloud import BACKGROUND, UNOBSERVED, InstanceTable
+from og_pointcloud.settings import AssociationSettings
+
+SETTINGS = AssociationSettings()
+
+
+def describe(views: list[HandView], group: list[int], ids: list[int]) -> InstanceTable:
+    table = hand_table(len(ids), views)
+    count = max([*ids, -1]) + 1
+    return describe_instances(table, np.array(group, np.int32), np.array(ids, np.int32), count, SETTINGS)
+
+
+def unit(vector: NDArray[np.float64]) -> NDArray[np.float64]:
+    return vector / np.linalg.norm(vector)
+
+
+def test_a_row_is_the_mean_weighted_by_what_masks_show_of_the_instance() -> None:
+    """Masks show 3 and 1 of the instance's points; what else they cover does not count, nor does a feature's length."""
+    views: list[HandView] = [[([0, 1, 2], 5 * ONE)], [([2, 3, 4, 5], 0.1 * OTHER)]]
+    result = describe(views, [0, 0], [0, 0, 0, BACKGROUND, BACKGROUND, UNOBSERVED])
+    np.testing.assert_allclose(result.descriptors, [unit(3 * ONE + OTHER)], rtol=1e-6)
+    assert result.descriptors.dtype == np.float32
+    np.testing.assert_allclose(result.agreement, (3 * 3 + 1 * 1) / 4 / np.sqrt(10), rtol=1e-6)
+
+
+def test_evidence_is_counted() -> None:
+    views: list[HandView] = [
+        [([0, 1], ONE), ([2, 3], OTHER)],
+        [([0], ONE), ([1], ONE), ([2, 3, 4], OTHER)],
+        [([0, 1, 4], ONE)],
+    ]
+    result = describe(views, [0, 1, 0, 0, 1, -1], [0, 0, 1, 1, BACKGROUND])
+    np.testing.assert_array_equal(result.points, [2, 2])
+    np.testing.assert_array_equal(result.masks, [3, 2])
+    np.testing.assert_array_equal(result.views, [2, 2])
+    np.testing.assert_allclose(result.visible_area, [4, 4])
+    np.testing.assert_array_equal(result.descriptor_instance, [0, 1])
+    np.testing.assert_allclose(result.agreement, 1, rtol=1e-6)
+    assert len(result) == 2
+
+
+def test_an_outlier_is_left_out() -> None:
+    random = np.random.default_rng(0)
+    near = [(ONE + 0.02 * random.normal(size=8)).astype(np.float32) for _ in range(9)]
+    views: list[HandView] = [[([0, 1], feature)] for feature in [*near, OTHER]]
+    result = describe(views, [0] * 10, [0, 0])
+    without = describe(views[:9], [0] * 9, [0, 0])
+    np.testing.assert_allclose(result.descriptors, without.descriptors, atol=5e-3)
+    assert abs(result.descriptors[0] @ OTHER) < 0.03
+    assert result.agreement[0] > 0.99
+    assert result.masks[0] == 10  # still evidence of the instance
+
+
+def test_masks_that_agree_exactly_are_all_kept() -> None:
+    result = describe([[([0], ONE)]] * 5, [0] * 5, [0])
+    np.testing.assert_allclose(result.descriptors, [ONE])
+    assert result.agreement[0] == pytest.approx(1)
+
+
+def test_masks_without_a_feature_are_evidence_but_not_in_the_row() -> None:
+    nothing = np.zeros(8, np.float32)
+    result = describe([[([0, 1], nothing)], [([0, 1], ONE)]], [0, 0], [0, 0])
+    np.testing.assert_allclose(result.descriptors, [ONE])
+    assert result.masks[0] == 2
+    assert result.visible_area[0] == 4
+
+
+def test_an_instance_without_any_feature_has_no_row() -> None:
+    nothing = np.zeros(8, np.float32)
+    result = describe([[([0], nothing), ([1], ONE)]] * 2, [0, 1, 0, 1], [0, 1])
+    np.testing.assert_array_equal(result.descriptor_instance, [1])
+    assert result.agreement[0] == 0
+    assert len(result) == 2
+
+
+def test_features_that_cancel_give_no_row() -> None:
+    result = describe([[([0], ONE)], [([0], -ONE)]], [0, 0], [0])
+    assert len(result.descriptors) == 0
+    assert np.isfinite(result.agreement).all()
+
+
+def test_an_instance_whose_masks_show_none_of_its_points_has_no_row() -> None:
+    result = describe([[([0], ONE)]], [0], [BACKGROUND, 0])
+    assert len(result.descriptors) == 0
+    assert result.visible_area[0] == 0
+
+
+def test_no_instance() -> None:
+    result = describe([[([0], ONE)]], [-1], [BACKGROUND, UNOBSERVED])
+    assert len(result) == 0
+    assert result.descriptors.shape == (0, 8)
+
+
+def test_order_of_masks_does_not_matter() -> None:
+    random = np.random.default_rng(0)
+    views: list[HandView] = [
+        [(range(3), random.normal(size=8).astype(np.float32)), (range(3, 6), random.normal(size=8).astype(np.float32))]
+        for _ in range(7)
+    ]
+    ids = [0, 0, 0, 1, 1, 1]
+    plain = describe(views, [0, 1] * 7, ids)
+    swapped = describe([view[::-1] for view in views[::-1]], [1, 0] * 7, ids)
+    np.testing.assert_allclose(swapped.descriptors, plain.descriptors, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(swapped.agreement, plain.agreement, rtol=1e-5)

@@ -1,0 +1,378 @@
+"""From a scene to a labelled cloud: boxes on a table, seen and masked exactly, so that the truth is known."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import og_pointcloud as og
+from og_pointcloud.cloud import BACKGROUND, UNOBSERVED, LabelledCloud
+from og_pointcloud.errors import SceneError
+from og_pointcloud.fit import fit, prepare
+from og_pointcloud.scene import Camera, Points, Scene, View
+from og_pointcloud.settings import FitSettings
+
+WIDTH, HEIGHT, FOCAL_PX = 96, 72, 90.0
+LOWER = np.array([[-1.0, -0.9, 0], [0.2, -1.0, 0], [-0.9, 0.3, 0], [0.4, 0.3, 0]])
+SIZE = np.array([[0.7, 0.6, 0.5], [0.7, 0.5, 0.4], [0.6, 0.7, 0.6], [0.5, 0.5, 0.5]])
+BOXES = len(LOWER)
+TABLE = BOXES
+COLOURS = np.array([[200, 40, 40], [40, 160, 40], [40, 60, 200], [210, 190, 40], [120, 110, 100]], np.uint8)
+SPACING = 0.06
+
+
+@dataclass(frozen=True)
+class Known:
+    """scene, and the box of each point, BOXES on the table."""
+
+    scene: Scene
+    truth: NDArray[np.int_]
+
+
+@lru_cache
+def boxes_on_a_table(view_count: int = 8) -> Known:
+    xyz, truth = sample()
+    colours = COLOURS[truth]
+    points = Points.from_world(xyz, rgb=colours)
+    random = np.random.default_rng(0)
+    features = np.eye(8, dtype=np.float32)[:BOXES]
+    views = []
+    for index in range(view_count):
+        angle = 2 * np.pi * (index + 0.3) / view_count
+        pose = look_at(np.array([2.6 * np.cos(angle), 2.6 * np.sin(angle), 1.8]))
+        seen = ray_cast(pose)
+        order = random.permutation(BOXES)  # mask ids mean nothing across views
+        masks = np.append(order, [-1, -1])[seen].astype(np.int32)
+        rows = features[np.argsort(order)] + 0.05 * random.normal(size=(BOXES, 8)).astype(np.float32)
+        image = np.append(COLOURS, [[0, 0, 0]], axis=0).astype(np.uint8)[seen]
+        pose[:3, 3] += pose[:3, :3] @ points.origin
+        camera = Camera(WIDTH, HEIGHT, FOCAL_PX, FOCAL_PX, WIDTH / 2, HEIGHT / 2, pose)
+        views.append(View(f"view{index}", camera, masks, rows, image))
+    return Known(Scene(points, tuple(views), "test-space"), truth)
+
+
+def sample() -> tuple[NDArray[np.float64], NDArray[np.int_]]:
+    """Points on the boxes' sides and tops and on the table top around them."""
+    line = np.arange(SPACING / 2, 1, SPACING)
+    surfaces, truth = [], []
+    for box in range(BOXES):
+        for axis, end in ((0, 0), (0, 1), (1, 0), (1, 1), (2, 1)):
+            sides = [line[line < SIZE[box, other]] for other in range(3) if other != axis]
+            flat = np.stack(np.meshgrid(*sides), axis=-1).reshape(-1, 2)
+            surfaces.append(LOWER[box] + np.insert(flat, axis, end * SIZE[box, axis], axis=1))
+            truth += [box] * len(flat)
+    line = np.arange(-1.5, 1.5, SPACING)
+    top = np.stack([*np.meshgrid(line, line), np.zeros((len(line), len(line)))], axis=-1).reshape(-1, 3)
+    under = ((top[:, None, :2] > LOWER[:, :2]) & (top[:, None, :2] < (LOWER + SIZE)[:, :2])).all(axis=2).any(axis=1)
+    surfaces.append(top[~under])
+    truth += [TABLE] * int((~under).sum())
+    return np.concatenate(surfaces) + np.random.default_rng(1).normal(size=(len(truth), 3)) * 0.003, np.array(truth)
+
+
+def look_at(position: NDArray[np.float64]) -> NDArray[np.float64]:
+    """World-to-camera (4, 4), OpenCV axes, looking at a point above the table's middle; world z is up."""
+    forward = np.array([0, 0, 0.2]) - position
+    forward /= np.linalg.norm(forward)
+    right = np.cross(forward, [0, 0, 1])
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3, :3] = right, np.cross(forward, right), forward
+    pose[:3, 3] = -pose[:3, :3] @ position
+    return pose
+
+
+def ray_cast(pose: NDArray[np.float64]) -> NDArray[np.int_]:
+    """(HEIGHT, WIDTH): the box seen by each pixel, TABLE, or TABLE + 1 where there is nothing."""
+    column, row = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
+    ray = np.stack([(column - WIDTH / 2) / FOCAL_PX, (row - HEIGHT / 2) / FOCAL_PX, np.ones_like(row)], axis=-1)
+    direction, start = ray @ pose[:3, :3], -pose[:3, :3].T @ pose[:3, 3]
+    depth = np.full((BOXES + 2, HEIGHT, WIDTH), np.inf)
+    for box in range(BOXES):
+        ends = np.stack([(LOWER[box] - start) / direction, (LOWER[box] + SIZE[box] - start) / direction])
+        enter, leave = ends.min(axis=0).max(axis=-1), ends.max(axis=0).min(axis=-1)
+        depth[box] = np.where((enter <= leave) & (enter > 0), enter, np.inf)
+    fall = -start[2] / direction[..., 2]
+    hit = start + fall[..., None] * direction
+    depth[TABLE] = np.where((fall > 0) & (np.abs(hit[..., :2]) < 1.5).all(axis=-1), fall, np.inf)
+    depth[TABLE + 1] = 1e9
+    return depth.argmin(axis=0)
+
+
+def share_right(cloud: LabelledCloud, truth: NDArray[np.int_]) -> float:
+    """Share of points with the right state: the instance that holds most of its box, or none on the table."""
+    right = 0
+    for box in range(BOXES):
+        ids = cloud.instance_ids[truth == box]
+        right += np.bincount(ids[ids >= 0], minlength=1).max()
+    right += int((cloud.instance_ids[truth == TABLE] == BACKGROUND).sum())
+    return right / len(truth)
+
+
+def share_alike(ids: NDArray[np.int32], other: NDArray[np.int32]) -> float:
+    """Share of points on which two labellings agree when instances are matched by their largest overlap."""
+    matched = 0
+    for value in np.unique(ids):
+        same = other[ids == value]
+        matched += (same == value).sum() if value < 0 else np.bincount(same[same >= 0], minlength=1).max()
+    return float(matched / len(ids))
+
+
+@pytest.fixture(scope="module")
+def known() -> Known:
+    return boxes_on_a_table()
+
+
+@pytest.fixture(scope="module")
+def labelled(known: Known) -> LabelledCloud:
+    return fit(known.scene, progress=False)
+
+
+def test_boxes_are_found(known: Known, labelled: LabelledCloud) -> None:
+    assert len(labelled.instances) == BOXES
+    assert share_right(labelled, known.truth) > 0.95
+    for box in range(BOXES):
+        assert len(np.unique(labelled.instance_ids[known.truth == box])) <= 3
+
+
+def test_instances_carry_the_feature_of_their_box(known: Known, labelled: LabelledCloud) -> None:
+    table = labelled.instances
+    np.testing.assert_array_equal(table.descriptor_instance, range(BOXES))
+    boxes = [np.bincount(known.truth[labelled.instance_ids == k]).argmax() for k in range(BOXES)]
+    assert sorted(boxes) == list(range(BOXES))
+    assert (table.descriptors[range(BOXES), boxes] > 0.98).all()
+    np.testing.assert_allclose(np.linalg.norm(table.descriptors, axis=1), 1, rtol=1e-5)
+    assert (table.views >= 6).all()
+    np.testing.assert_array_equal(table.points, np.bincount(labelled.instance_ids[labelled.instance_ids >= 0]))
+
+
+def test_the_cloud_keeps_what_the_scene_gave(known: Known, labelled: LabelledCloud) -> None:
+    np.testing.assert_array_equal(labelled.xyz, known.scene.points.xyz)
+    np.testing.assert_array_equal(labelled.origin, known.scene.points.origin)
+    np.testing.assert_array_equal(labelled.rgb, known.scene.points.rgb)
+    assert labelled.feature_space == "test-space"
+    assert 0.8 * SPACING < labelled.spacing < 1.2 * SPACING
+    assert labelled.reach > labelled.spacing
+
+
+def test_provenance_tells_stages_and_what_was_left_out(labelled: LabelledCloud) -> None:
+    provenance = labelled.provenance
+    assert {"spacing", "visibility", "grouping", "membership", "association"} <= {
+        stage["name"] for stage in provenance["stages"]
+    }
+    assert all(stage["seconds"] >= 0 for stage in provenance["stages"])
+    assert {"what", "why"} == set(provenance["left_out"][0])
+    assert "learned features and codebook" in {entry["what"] for entry in provenance["left_out"]}
+    states = provenance["notes"]["points_by_state"]
+    assert sum(states.values()) == len(labelled)
+    assert provenance["notes"]["views"] == 8
+    assert json.loads(json.dumps(provenance))["settings"]["seed"] == 0
+
+
+def test_a_second_run_gives_the_same_bits(known: Known, labelled: LabelledCloud) -> None:
+    again = fit(known.scene, progress=False)
+    np.testing.assert_array_equal(again.instance_ids, labelled.instance_ids)
+    np.testing.assert_array_equal(again.instances.descriptors, labelled.instances.descriptors)
+    np.testing.assert_array_equal(again.instances.visible_area, labelled.instances.visible_area)
+
+
+def test_order_of_points_does_not_matter(known: Known, labelled: LabelledCloud) -> None:
+    order = np.random.default_rng(0).permutation(len(known.truth))
+    points = known.scene.points
+    assert points.rgb is not None
+    shuffled = replace(points, xyz=points.xyz[order], rgb=points.rgb[order])
+    ids = fit(replace(known.scene, points=shuffled), progress=False).instance_ids
+    assert share_alike(ids, labelled.instance_ids[order]) > 0.998
+
+
+def test_order_of_views_does_not_matter(known: Known, labelled: LabelledCloud) -> None:
+    ids = fit(replace(known.scene, views=known.scene.views[::-1]), progress=False).instance_ids
+    assert share_alike(ids, labelled.instance_ids) > 0.99  # the photographs compared with are others
+
+
+def moved(scene: Scene, turn: NDArray[np.float64], unit: float, shift: NDArray[np.float64]) -> Scene:
+    """The scene in another world frame: x -> unit turn x + shift."""
+    old = scene.points
+    points = Points.from_world(unit * old.xyz_world @ turn.T + shift, rgb=old.rgb)
+    views = []
+    for view in scene.views:
+        pose = np.eye(4)
+        pose[:3, :3] = view.camera.world_to_camera[:3, :3] @ turn.T
+        center = unit * turn @ (view.camera.center + old.origin) + shift - points.origin
+        pose[:3, 3] = -pose[:3, :3] @ center
+        views.append(replace(view, camera=replace(view.camera, world_to_camera=pose)))
+    return replace(scene, points=points, views=tuple(views))
+
+
+TURN = np.linalg.qr(np.random.default_rng(5).normal(size=(3, 3)))[0]
+TURN *= np.linalg.det(TURN)
+NO_SHIFT = np.zeros(3)
+
+
+@pytest.mark.parametrize(
+    ("turn", "unit", "shift"),
+    [
+        (TURN, 1.0, NO_SHIFT),
+        (np.eye(3), 1000.0, NO_SHIFT),
+        (np.eye(3), 0.001, NO_SHIFT),
+        (np.eye(3), 1.0, np.array([1e6, -3e6, 500])),
+    ],
+    ids=["rotated", "millimetres", "kilometres", "map offset"],
+)
+def test_world_frame_and_unit_do_not_matter(
+    known: Known, labelled: LabelledCloud, turn: NDArray[np.float64], unit: float, shift: NDArray[np.float64]
+) -> None:
+    cloud = fit(moved(known.scene, turn, unit, shift), progress=False)
+    assert share_alike(cloud.instance_ids, labelled.instance_ids) > 0.998
+    assert cloud.spacing == pytest.approx(unit * labelled.spacing, rel=1e-2)
+
+
+def test_views_given_twice_do_not_matter(known: Known, labelled: LabelledCloud) -> None:
+    twice = (*known.scene.views, *[replace(view, name=f"{view.name} again") for view in known.scene.views])
+    cloud = fit(replace(known.scene, views=twice), progress=False)
+    assert share_alike(cloud.instance_ids, labelled.instance_ids) > 0.99
+    assert len(cloud.instances) == len(labelled.instances)
+
+
+def test_masks_may_be_read_when_needed(known: Known, labelled: LabelledCloud) -> None:
+    def streamed(view: View) -> View:
+        return replace(view, masks=view.mask_map, image=view.image_rgb)
+
+    scene = replace(known.scene, views=tuple(streamed(view) for view in known.scene.views))
+    np.testing.assert_array_equal(fit(scene, progress=False).instance_ids, labelled.instance_ids)
+
+
+def test_gaussians_are_taken_as_they_are(known: Known) -> None:
+    points = known.scene.points
+    n = len(points)
+    gaussians = replace(
+        points,
+        scale=np.full((n, 3), 0.4 * SPACING, np.float32),
+        rotation=np.tile(np.float32([1, 0, 0, 0]), (n, 1)),
+        opacity=np.full(n, 0.9, np.float32),
+    )
+    cloud = fit(replace(known.scene, points=gaussians), progress=False)
+    assert share_right(cloud, known.truth) > 0.95
+    assert "choice of scale and opacity" in {entry["what"] for entry in cloud.provenance["left_out"]}
+    assert "gaussian_scale" not in cloud.provenance["notes"]
+
+
+def test_without_images_a_warning_names_the_cure(known: Known) -> None:
+    scene = replace(known.scene, views=tuple(replace(view, image=None) for view in known.scene.views))
+    cloud = fit(scene, progress=False)
+    assert share_right(cloud, known.truth) > 0.9
+    assert any("add images" in warning for warning in cloud.provenance["warnings"])
+
+
+def test_one_view_works_and_warns(known: Known) -> None:
+    scene = replace(known.scene, views=known.scene.views[:1])
+    cloud = fit(scene, progress=False)
+    assert any("one view" in warning for warning in cloud.provenance["warnings"])
+    assert len(cloud.instances) >= BOXES - 1
+    boxes = [np.bincount(known.truth[cloud.instance_ids == k]).argmax() for k in range(len(cloud.instances))]
+    assert len(set(boxes) - {TABLE}) == len(boxes)
+
+
+def test_views_without_masks_are_heard_as_silence(known: Known) -> None:
+    views = list(known.scene.views)
+    for index in (1, 4):
+        empty = np.full((HEIGHT, WIDTH), -1, np.int32)
+        views[index] = replace(views[index], masks=empty, mask_features=np.zeros((0, 8), np.float32))
+    cloud = fit(replace(known.scene, views=tuple(views)), progress=False)
+    assert share_right(cloud, known.truth) > 0.95
+
+
+def test_no_mask_at_all_is_an_error(known: Known) -> None:
+    views = [
+        replace(view, masks=np.full((HEIGHT, WIDTH), -1, np.int32), mask_features=np.zeros((0, 8), np.float32))
+        for view in known.scene.views
+    ]
+    with pytest.raises(SceneError, match="none of the 8 views has a mask"):
+        fit(replace(known.scene, views=tuple(views)), progress=False)
+
+
+def test_cameras_that_see_nothing_are_an_error(known: Known) -> None:
+    with pytest.raises(SceneError, match="no camera sees the cloud"):
+        fit(replace(known.scene, views=tuple(turned_away(view) for view in known.scene.views)), progress=False)
+
+
+def turned_away(view: View) -> View:
+    half_turn = np.diag([-1.0, 1, -1, 1])
+    return replace(view, camera=replace(view.camera, world_to_camera=half_turn @ view.camera.world_to_camera))
+
+
+def test_a_camera_that_sees_nothing_does_no_harm(known: Known) -> None:
+    views = (turned_away(known.scene.views[0]), *known.scene.views[1:])
+    assert share_right(fit(replace(known.scene, views=views), progress=False), known.truth) > 0.95
+
+
+def test_points_that_no_camera_sees_stay_unobserved(known: Known) -> None:
+    points = known.scene.points
+    far = Points(np.concatenate([points.xyz, points.xyz[:50] + np.float32(40)]), points.origin)
+    cloud = fit(replace(known.scene, points=far), progress=False)
+    assert (cloud.instance_ids[-50:] == UNOBSERVED).all()
+    assert share_right(replace(cloud, instance_ids=cloud.instance_ids), np.append(known.truth, [-1] * 50)) > 0.9
+
+
+def tiny_scene(n: int, width: int = 8, height: int = 8, masked: bool = True) -> Scene:
+    xyz = np.zeros((n, 3))
+    xyz[:, 0] = 0.1 * np.arange(n)
+    pose = np.eye(4)
+    pose[2, 3] = 2
+    masks = np.full((height, width), 0 if masked else -1, np.int32)
+    image = np.full((height, width, 3), 90, np.uint8)
+    views = tuple(
+        View(
+            str(i), Camera(width, height, 8, 8, width / 2, height / 2, pose), masks, np.ones((1, 4), np.float32), image
+        )
+        for i in range(2)
+    )
+    return Scene(Points.from_world(xyz, rgb=np.full((n, 3), 200, np.uint8)), views, "test-space")
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 4])
+def test_a_few_points_in_one_mask_are_one_instance(n: int) -> None:
+    cloud = fit(tiny_scene(n), progress=False)
+    assert cloud.instance_ids.tolist() == [0] * n
+    assert cloud.spacing > 0
+
+
+@pytest.mark.parametrize(("width", "height"), [(1, 1), (1, 8), (2, 2)])
+def test_tiny_images(width: int, height: int) -> None:
+    assert fit(tiny_scene(3, width, height), progress=False).instance_ids.shape == (3,)
+
+
+def test_masks_without_a_pixel_give_no_instance() -> None:
+    cloud = fit(tiny_scene(5, masked=False), progress=False)
+    assert cloud.instance_ids.tolist() == [BACKGROUND] * 5
+    assert len(cloud.instances) == 0
+    assert any("no instance was found" in warning for warning in cloud.provenance["warnings"])
+
+
+def test_duplicated_points_share_their_label(known: Known) -> None:
+    points = known.scene.points
+    assert points.rgb is not None
+    double = replace(points, xyz=np.repeat(points.xyz, 2, axis=0), rgb=np.repeat(points.rgb, 2, axis=0))
+    ids = fit(replace(known.scene, points=double), progress=False).instance_ids
+    assert (ids[::2] == ids[1::2]).mean() > 0.99
+
+
+def test_prepare_gives_what_later_stages_need(known: Known) -> None:
+    prepared = prepare(known.scene)
+    n = len(known.truth)
+    assert prepared.table.weights.shape == (8 * BOXES, n)
+    assert prepared.table.outside.shape == prepared.table.exposure.shape == (8, n)
+    assert len(prepared.gaussians) == len(prepared.neighbourhood.spacing) == n
+    pixels = np.concatenate([np.bincount(view.mask_map()[view.mask_map() >= 0]) for view in known.scene.views])
+    np.testing.assert_allclose(prepared.table.mask_pixels.sum(), pixels.sum(), rtol=0.05)
+
+
+def test_fit_of_the_package_is_the_function() -> None:
+    """Importing the module of that name must not put the module in its place."""
+    assert og.fit is fit
+    assert callable(og.fit)
+    assert og.FitSettings is FitSettings
