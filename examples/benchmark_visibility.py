@@ -45,12 +45,12 @@ def masks(width: int, height: int) -> np.ndarray:
 
 def main() -> None:
     """Print the table: error on a small scene against the literal reference, then time on large ones."""
-    from reference_splatting import reference_weights  # pyright: ignore[reportMissingImports]  (in tests/)
+    from reference_splatting import reference_view_weights  # pyright: ignore[reportMissingImports]  (in tests/)
 
     rng = np.random.default_rng(0)
     small, view = box(2_000, rng), camera(96, 72)
     fast = view_weights(small, view, masks(96, 72), 30, 0.01)[0].toarray()
-    slow = reference_weights(small, view, masks(96, 72), 30, 0.01)
+    slow = reference_view_weights(small, view, masks(96, 72), 30, 0.01)
     error = np.abs(fast - slow).max() / slow.max()
     print("points      image       seconds a view   largest weight error against float64 (2,000 points, relative)")
     for count, width, height in ((100_000, 640, 480), (1_000_000, 1000, 730)):

@@ -82,8 +82,12 @@ class Prepared:
     table: MaskTable
 
 
-def fit(scene: Scene, settings: FitSettings | None = None, *, progress: bool = True) -> LabelledCloud:
+def fit(
+    scene: Scene, settings: FitSettings | None = None, *, progress: bool = True, prepared: Prepared | None = None
+) -> LabelledCloud:
     """Label a scene: which points form one instance, and what the encoder saw of each.
+
+    prepared: what `prepare` made of the same scene and settings, where it is at hand already.
 
     Deterministic: the same scene and settings give the same ids on every run. Raises SceneError where the scene
     cannot give an instance at all (no masks, or no camera that sees the cloud).
@@ -91,7 +95,7 @@ def fit(scene: Scene, settings: FitSettings | None = None, *, progress: bool = T
     settings = settings or FitSettings()
     journal = Journal(progress)
     _check(scene, journal)
-    prepared = prepare(scene, settings, journal)
+    prepared = prepared or prepare(scene, settings, journal)
     with journal.stage("grouping"):
         table = _front_surfaces(scene, prepared, settings, journal)
         testimony = hear_views(table)

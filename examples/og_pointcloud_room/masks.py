@@ -28,7 +28,7 @@ class MaskNoise:
     miss: float = 0.1
     spurious: float = 0.05
     wrong_class: float = 0.05
-    edge_px: float = 1.0
+    edge_px: float = 0.7
     smallest_share: float = 2e-4
 
     def scaled(self, level: float) -> MaskNoise:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import os
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -49,6 +50,9 @@ def can_render() -> bool:
     """
     if importlib.util.find_spec("pyvista") is None:
         raise MissingExtraError("pyvista", "demo")
+    if not os.environ.get("DISPLAY"):
+        # Else VTK looks for an X server first and complains.
+        os.environ.setdefault("VTK_DEFAULT_OPENGL_WINDOW", "vtkEGLRenderWindow")
     tried = subprocess.run([sys.executable, "-c", PROBE], capture_output=True, timeout=120, check=False)
     return tried.returncode == 0
 
