@@ -178,7 +178,8 @@ def _stride(
     if points.are_gaussians:
         return 1
     apart = pixels_per_spacing(points, spacing, views)
-    stride = int(np.clip(apart / settings.pixels_per_spacing, 1, settings.max_stride))
+    smallest = min(min(view.camera.width, view.camera.height) for view in views)
+    stride = int(np.clip(apart / settings.pixels_per_spacing, 1, min(settings.max_stride, smallest)))
     if stride > 1:
         journal.leave_out(
             f"{1 - 1 / stride**2:.0%} of the pixels",

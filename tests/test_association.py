@@ -73,6 +73,7 @@ def test_masks_without_a_feature_are_evidence_but_not_in_the_row() -> None:
     np.testing.assert_allclose(result.descriptors, [ONE])
     assert result.masks[0] == 2
     assert result.visible_area[0] == 4
+    assert result.agreement[0] == pytest.approx(1)
 
 
 def test_an_instance_without_any_feature_has_no_row() -> None:

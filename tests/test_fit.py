@@ -318,7 +318,28 @@ def test_points_that_no_camera_sees_stay_unobserved(known: Known) -> None:
     assert share_right(replace(cloud, instance_ids=cloud.instance_ids), np.append(known.truth, [-1] * 50)) > 0.9
 
 
-def tiny_scene(n: int, width: int = 8, height: int = 8, masked: bool = True) -> Scene:
+def test_instances_keep_their_masks_when_a_group_is_dismissed(known: Known) -> None:
+    """The table, larger than any box, has a mask in one view of eight: noise of the proposer."""
+    first = known.scene.views[0]
+    ids, seen = first.mask_map().copy(), ray_cast_of(first, known.scene.points)
+    ids[seen == TABLE] = BOXES
+    features = np.append(first.mask_features, np.eye(8, dtype=np.float32)[[7]], axis=0)
+    views = (replace(first, masks=ids, mask_features=features), *known.scene.views[1:])
+    cloud = fit(replace(known.scene, views=views), progress=False)
+    assert any("groups of masks" in entry["what"] for entry in cloud.provenance["left_out"])
+    assert share_right(cloud, known.truth) > 0.95
+    assert len(cloud.instances) == BOXES
+    boxes = [np.bincount(known.truth[cloud.instance_ids == k]).argmax() for k in range(BOXES)]
+    assert (cloud.instances.descriptors[range(BOXES), boxes] > 0.98).all()
+
+
+def ray_cast_of(view: View, points: Points) -> NDArray[np.int_]:
+    pose = view.camera.world_to_camera.copy()
+    pose[:3, 3] -= pose[:3, :3] @ points.origin
+    return ray_cast(pose)
+
+
+def tiny_scene(n: int, width: int = 8, height: int = 8, masked: bool = True, focal: float = 8.0) -> Scene:
     xyz = np.zeros((n, 3))
     xyz[:, 0] = 0.1 * np.arange(n)
     pose = np.eye(4)
@@ -327,7 +348,11 @@ def tiny_scene(n: int, width: int = 8, height: int = 8, masked: bool = True) -> 
     image = np.full((height, width, 3), 90, np.uint8)
     views = tuple(
         View(
-            str(i), Camera(width, height, 8, 8, width / 2, height / 2, pose), masks, np.ones((1, 4), np.float32), image
+            str(i),
+            Camera(width, height, focal, focal, width / 2, height / 2, pose),
+            masks,
+            np.ones((1, 4), np.float32),
+            image,
         )
         for i in range(2)
     )
@@ -343,7 +368,17 @@ def test_a_few_points_in_one_mask_are_one_instance(n: int) -> None:
 
 @pytest.mark.parametrize(("width", "height"), [(1, 1), (1, 8), (2, 2)])
 def test_tiny_images(width: int, height: int) -> None:
-    assert fit(tiny_scene(3, width, height), progress=False).instance_ids.shape == (3,)
+    for focal in (8.0, 200.0):  # points less than a pixel apart, and ten pixels
+        assert fit(tiny_scene(3, width, height, focal=focal), progress=False).instance_ids.shape == (3,)
+
+
+def test_pixels_much_finer_than_the_points_are_left_out() -> None:
+    scene = tiny_scene(3, 60, 45, focal=200.0)
+    prepared = prepare(scene)
+    np.testing.assert_array_equal(prepared.table.mask_pixels, [60 * 45] * 2)  # areas are of the whole image
+    cloud = fit(scene, progress=False)
+    assert any("of the pixels" in entry["what"] for entry in cloud.provenance["left_out"])
+    assert cloud.instance_ids.tolist() == [0] * 3
 
 
 def test_masks_without_a_pixel_give_no_instance() -> None:

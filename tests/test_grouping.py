@@ -108,6 +108,24 @@ def test_a_mask_that_spans_many_things_is_left_out() -> None:
     np.testing.assert_array_equal(groups.group, [-1, 0, 1, 2, 0, 1, 2])
 
 
+def test_one_other_view_is_enough_to_show_that_a_mask_spans() -> None:
+    thirds = [(range(start, start + 30), ONE) for start in (0, 30, 60)]
+    np.testing.assert_array_equal(groups_of(hand_table(90, [[(range(90), ONE)], thirds])), [-1, 0, 1, 2])
+
+
+def test_a_spanning_mask_holds_nothing() -> None:
+    """Two views show points 0..79 as one, the only view that sees 0..39 shows two alike things there: without the
+    last view, which parts the rest, it would be outvoted."""
+    features = np.eye(8, dtype=np.float32)
+    spans = [(range(80), ONE)]
+    parts = [(range(20), ONE), (range(20, 40), ONE), (range(40, 60), features[2])]
+    rest = [(range(start, start + 10), features[3 + index]) for index, start in enumerate((40, 50, 60, 70))]
+    table = hand_table(80, [spans, spans, parts, rest], [(), (), range(60, 80), range(40)])
+    group = groups_of(table)
+    np.testing.assert_array_equal(group[:2], -1)
+    assert group[2] != group[3]
+
+
 def test_one_mask_in_most_views_is_one_object() -> None:
     """Split by two views of six, and nothing known of the parts' features."""
     table = hand_table(100, [*[[(range(100), ONE)]] * 4, *[[(A, ONE), (B, ONE)]] * 2])
