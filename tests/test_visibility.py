@@ -18,7 +18,7 @@ from og_pointcloud.scene import Camera, Points, View
 from og_pointcloud.testimony import hear_views
 from og_pointcloud.visibility import Gaussians, mask_table, pixel_weights, view_weights
 
-NEAR = 0.2
+NEAR = 0.25
 MASKS = 12
 IDENTITY = np.array([1, 0, 0, 0], np.float32)
 
@@ -65,7 +65,9 @@ def moved(move: Callable[[Generator, NDArray[np.float32]], None]) -> Callable[[G
 
 
 def about_the_near_plane(random: Generator, xyz: NDArray[np.float32]) -> None:
-    xyz[:, 2] = random.choice(np.array([-1, -1e-3, 0, 1e-30, NEAR, np.nextafter(NEAR, 1), 0.21, 1], np.float32), 150)
+    near = np.float32(NEAR)
+    depths = [-1, -1e-3, 0, 1e-30, 0.24, near, np.nextafter(near, np.float32(1)), 0.26, 1]
+    xyz[:, 2] = random.choice(np.array(depths, np.float32), 150)
     xyz[:, :2] *= 0.1
 
 
