@@ -182,10 +182,12 @@ def _photographs(
 
 def _spacing_per_mask(points: Points, spacing: NDArray[np.float32], views: Sequence[View]) -> float:
     """Point spacing in an image as a part of a mask's side, median over the masks of a few views; 0 without masks."""
+    step = 1 + len(points) // 50_000
+    xyz, spacing = points.xyz[::step], spacing[::step]
     parts = []
     for view in (views[index] for index in np.unique(np.linspace(0, len(views) - 1, 12).round().astype(int))):
         ids, camera = view.mask_map(), view.camera
-        in_camera = points.xyz @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+        in_camera = xyz @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
         front = in_camera[:, 2] > 0
         x, y, depth = in_camera[front].T
         column, row = np.floor(camera.fx * x / depth + camera.cx), np.floor(camera.fy * y / depth + camera.cy)

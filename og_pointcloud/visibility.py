@@ -310,6 +310,10 @@ def _entry_bounds(splats, starts, members, masks, id_count, columns):  # noqa: A
                 # Runs of equal ids along rows: at least the number of distinct ids, without a set.
                 if masks[y, x] != last:
                     distinct, last = distinct + 1, masks[y, x]
+        if distinct <= 4:
+            # Looking at every splat would save little memory here.
+            bounds[tile] = distinct * (starts[tile + 1] - starts[tile])
+            continue
         total = 0
         for m in range(starts[tile], starts[tile + 1]):
             x0, x1, y0, y1 = _clip_box(splats[members[m]], tile, columns)
