@@ -171,7 +171,8 @@ def _agglomerate(
     The agreement of two groups is the share of their pooled witnesses that say "one thing". Masks of the same extent
     are one thing whatever their features say. Where one only lies within the other it may be a part of it, or a cup on
     a table whose view missed the cup: then the witnesses count as far as the features are alike.
-    Ties go to the lower mask numbers.
+    Of pairs that agree alike the one with more witnesses comes first, then the one with more alike features: the order
+    of views and masks does not matter.
     """
     likeness = _Likeness(features, mask_view)
     links = _link_table(witnesses, usable)
@@ -179,14 +180,15 @@ def _agglomerate(
     group = np.where(usable, np.arange(len(usable)), -1)
     version = np.zeros(len(usable), np.int64)
 
-    def agreement(a: int, b: int) -> float:
+    def agreement(a: int, b: int) -> tuple[float, float, float]:
         one, same_extent = links[a][b]
-        return (same_extent + (one - same_extent) * likeness(a, b)) / float(speaks[a] @ speaks[b])
+        asked = float(speaks[a] @ speaks[b])
+        return -(same_extent + (one - same_extent) * likeness(a, b)) / asked, -asked, -likeness.cosine(a, b)
 
-    heap = [(-agreement(a, b), a, b, 0, 0) for a in links for b in links[a] if a < b]
+    heap = [(agreement(a, b), a, b, 0, 0) for a in links for b in links[a] if a < b]
     heapq.heapify(heap)
     while heap:
-        score, a, b, seen_a, seen_b = heapq.heappop(heap)
+        (score, _, _), a, b, seen_a, seen_b = heapq.heappop(heap)
         if -score <= settings.join_majority:
             break
         if version[a] != seen_a or version[b] != seen_b or group[a] != a or group[b] != b:
@@ -202,7 +204,7 @@ def _agglomerate(
             links[a][c] = links[c][a] = (have[0] + more[0], have[1] + more[1])
         for c in links[a]:
             low, high = min(a, c), max(a, c)
-            heapq.heappush(heap, (-agreement(low, high), low, high, version[low], version[high]))
+            heapq.heappush(heap, (agreement(low, high), low, high, version[low], version[high]))
     return _roots(group)
 
 
@@ -222,12 +224,15 @@ class _Likeness:
         self.different = np.sort(np.concatenate(cosines)).tolist()
 
     def __call__(self, a: int, b: int) -> float:
-        length = self.length[a] * self.length[b]
-        if not self.different or length == 0:
+        if not self.different or self.length[a] * self.length[b] == 0:
             return 0.25  # nothing known: the expected square of a uniform share lies near
-        cosine = float(self.total[a] @ self.total[b]) / length
+        cosine = self.cosine(a, b)
         below = bisect_left(self.different, cosine - 1e-6) + bisect_right(self.different, cosine + 1e-6)
         return (0.5 * below / len(self.different)) ** 2
+
+    def cosine(self, a: int, b: int) -> float:
+        length = self.length[a] * self.length[b]
+        return float(self.total[a] @ self.total[b]) / length if length else 0.0
 
     def join(self, a: int, b: int) -> None:
         self.total[a] += self.total[b]

@@ -26,6 +26,8 @@ from og_pointcloud.errors import SceneError
 from og_pointcloud.scene import Camera, Points, View
 
 # OpenMP first: numba else tries TBB, and warns where it finds an old one. A user's own choice is kept.
+# Threads that wait sleep: spinning ones double the time of a fit wherever another program has a core.
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 if "NUMBA_THREADING_LAYER_PRIORITY" not in os.environ:
     numba.config.THREADING_LAYER_PRIORITY = ["omp", "tbb", "workqueue"]  # pyright: ignore
 
@@ -209,7 +211,8 @@ def _project(xyz, scale, rotation, opacity, pose, intrinsics, width, height, nea
         u, v = fx * tx + cx, fy * ty + cy
         jx, jy = min(max(tx, x_low), x_high), min(max(ty, y_low), y_high)
         # The projected axes: columns of J R_camera R_gaussian S, a 2x3 matrix whose V V' is the covariance.
-        qw, qx, qy, qz = rotation[g, 0], rotation[g, 1], rotation[g, 2], rotation[g, 3]
+        qw, qx = np.float64(rotation[g, 0]), np.float64(rotation[g, 1])
+        qy, qz = np.float64(rotation[g, 2]), np.float64(rotation[g, 3])
         vx = np.empty(3)
         vy = np.empty(3)
         for k in range(3):
