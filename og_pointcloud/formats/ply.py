@@ -8,8 +8,7 @@ from __future__ import annotations
 import os
 import re
 import struct
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -18,6 +17,7 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
+from og_pointcloud._atomic import replacing
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.tables import naming, read_text_rows
 
@@ -102,7 +102,7 @@ def write_ply(
             header += [f"property {PLY_TYPES[_numpy_type(rows, field)]} {field}" for field in rows.dtype.names or ()]
         if any("\n" in line or "\r" in line for line in header):
             raise SceneError("a comment or name holds a line break; expected one line: split the comment")
-        with _replacing(path) as file:
+        with replacing(path) as file:
             file.write("\n".join([*header, "end_header", ""]).encode())
             for rows in packed.values():
                 rows.tofile(file)
@@ -269,16 +269,3 @@ def _packed(element: str, rows: NDArray[np.void]) -> NDArray[np.void]:
 def _numpy_type(rows: NDArray[np.void], field: str) -> str:
     """Type code of a field without its byte order, e.g. ``f4``."""
     return rows.dtype[field].str.lstrip("<>|=")
-
-
-@contextmanager
-def _replacing(path: Path) -> Iterator[BinaryIO]:
-    """A file to write that takes the place of ``path`` when, and only when, the block ends without an error."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        with temporary.open("wb") as file:
-            yield file
-        os.replace(temporary, path)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
