@@ -8,7 +8,17 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
-__all__ = ["AssociationSettings", "FitSettings", "GeometrySettings", "GroupingSettings", "MembershipSettings"]
+from og_pointcloud.errors import OgPointcloudError
+
+__all__ = [
+    "AssociationSettings",
+    "FeatureSettings",
+    "FitSettings",
+    "GeometrySettings",
+    "GroupingSettings",
+    "MembershipSettings",
+    "PaperSettings",
+]
 
 
 @dataclass(frozen=True)
@@ -91,6 +101,105 @@ class AssociationSettings:
 
     outlier_deviations: float = 3.0
     """A mask's feature is left out when its cosine lies this many robust deviations below the median."""
+
+
+@dataclass(frozen=True)
+class FeatureSettings:
+    """Instance features from the mask table (features.py; paper, Sec. 3.1, Eq. 1 and 2)."""
+
+    width: int = 6
+    """Columns of a feature (paper, Sec. 3.1)."""
+    formula: Literal["paper", "authors"] = "paper"
+    """Eq. 1 and 2 as printed, or as the authors' code computes them; features.py says what differs."""
+    normalise: bool = True
+    """Read a feature as its direction, mapped to [0, 1] (the authors' code), or as it is, within the unit ball."""
+    intra: bool = True
+    """Use the intra-mask smoothing loss (Eq. 1)."""
+    inter: bool = True
+    """Use the inter-mask contrastive loss (Eq. 2)."""
+    cohesion: Literal["points", "rendered"] = "points"
+    """Eq. 1 asked of every Gaussian that shows in a mask (its Jensen bound), or of the rendered pixels, literally."""
+    cohesion_weight: float = 0.1
+    """Weight of Eq. 1 beside Eq. 2 (the authors' code; the paper gives none), Eq. 1 as a mean over pixels."""
+    closest: float = 0.05
+    """Eq. 2 stops growing where two mask means are nearer than this share of their typical distance."""
+    tolerance: float = 1e-3
+    """Converged when the objective fell by less than this share in the last ten steps."""
+    max_steps: int = 1000
+    """Steps after which it ends without having converged."""
+
+    def __post_init__(self) -> None:
+        _check_losses(self.width, self.intra, self.inter, self.cohesion_weight)
+        if self.formula == "authors" and self.cohesion == "rendered":
+            raise OgPointcloudError(
+                'formula "authors" with cohesion "rendered": an unsquared distance per pixel is no quadratic form of the '
+                'features; take cohesion "points", or train by rendering (paper.py)'
+            )
+
+
+@dataclass(frozen=True)
+class PaperSettings:
+    """The method as published, by rendering (paper.py). Steps are those of the authors' code at schedule_share 1."""
+
+    schedule: Literal["scannet", "lerf"] = "scannet"
+    """Steps of the three stages: 20k, 20k, 20k (ScanNet) or 10k, 10k, 20k (LeRF)."""
+    schedule_share: float = 1.0
+    """Shortens all stages alike."""
+    width: int = 6
+    """Columns of a feature (paper, Sec. 3.1)."""
+    formula: Literal["paper", "authors"] = "authors"
+    """Eq. 1, 2 and 4 as printed, or as the authors' code computes them; paper.py says what differs."""
+    normalise: bool = True
+    """Read a feature as its direction, mapped to [0, 1] (the authors' code), or as it is (the paper)."""
+    intra: bool = True
+    """Use the intra-mask smoothing loss (Eq. 1)."""
+    inter: bool = True
+    """Use the inter-mask contrastive loss (Eq. 2)."""
+    cohesion_weight: float = 0.1
+    """Weight of Eq. 1 beside Eq. 2 (the authors' code; the paper gives none), Eq. 1 as a mean over pixels."""
+    covered_share: float = 0.7
+    """Pixels whose Gaussians cover less than this are no part of their mask (the authors' code)."""
+    feature_rate: float = 1e-3
+    """Adam's step length for the features."""
+    codebook_rate: float = 1e-4
+    """Adam's step length for the features behind the codebook (the authors' code)."""
+    k1: int = 64
+    """Coarse clusters (paper, Eq. 3)."""
+    k2: int = 5
+    """Fine clusters in each coarse one (paper, Eq. 3: 10 or 5)."""
+    adapt_k2: bool = True
+    """Fewer fine clusters where a view shows fewer masks in a coarse one (the authors' code)."""
+    position_weight: float = 1.0
+    """Scene units of position that count as much as one of feature: absolute, as published (1.0 ScanNet, 0.5 LeRF)."""
+    coarse_interval: int = 200
+    """Steps between reassignments to coarse clusters (the authors' code)."""
+    fine_interval: int = 50
+    """Steps between reassignments to fine clusters (the authors' code)."""
+    lloyd_rounds: int = 5
+    """Rounds of k-means per reassignment (the authors' code)."""
+    point_pressure: float = 0.5
+    """Chance per codebook step that all Gaussians shrink by one random factor, so that hidden ones show."""
+    cache_bytes: int = 4 << 30
+    """Blending weights kept between steps; views beyond are rendered anew."""
+
+    def __post_init__(self) -> None:
+        _check_losses(self.width, self.intra, self.inter, self.cohesion_weight)
+        for name in ("k1", "k2", "coarse_interval", "fine_interval", "lloyd_rounds"):
+            if getattr(self, name) < 1:
+                raise OgPointcloudError(f"{name} is {getattr(self, name)}; expected at least 1")
+        if not self.schedule_share > 0:
+            raise OgPointcloudError(
+                f"schedule_share is {self.schedule_share}; expected more than 0, 1 for the published"
+            )
+
+
+def _check_losses(width: int, intra: bool, inter: bool, cohesion_weight: float) -> None:
+    if width < 1:
+        raise OgPointcloudError(f"the width of features is {width}; expected at least 1, 6 as published")
+    if not (intra or inter):
+        raise OgPointcloudError("both losses are off; features need intra (Eq. 1), inter (Eq. 2), or both")
+    if not cohesion_weight >= 0:
+        raise OgPointcloudError(f"cohesion_weight is {cohesion_weight}; expected 0 or more")
 
 
 @dataclass(frozen=True)
