@@ -12,10 +12,12 @@ from og_pointcloud.errors import OgPointcloudError
 
 __all__ = [
     "AssociationSettings",
+    "CodebookSettings",
     "FeatureSettings",
     "FitSettings",
     "GeometrySettings",
     "GroupingSettings",
+    "MatchingSettings",
     "MembershipSettings",
     "PaperSettings",
 ]
@@ -119,8 +121,9 @@ class FeatureSettings:
     """Use the inter-mask contrastive loss (Eq. 2)."""
     cohesion: Literal["points", "rendered"] = "points"
     """Eq. 1 asked of every Gaussian that shows in a mask (its Jensen bound), or of the rendered pixels, literally."""
-    cohesion_weight: float = 0.1
-    """Weight of Eq. 1 beside Eq. 2 (the authors' code; the paper gives none), Eq. 1 as a mean over pixels."""
+    cohesion_weight: float | None = None
+    """Weight of Eq. 1, as a mean over pixels, beside Eq. 2. None: 0.1 with the authors' formula, as in their code; 10
+    with the paper's, which gives none: squared distances are that much smaller."""
     closest: float = 0.05
     """Eq. 2 stops growing where two mask means are nearer than this share of their typical distance."""
     tolerance: float = 1e-3
@@ -132,9 +135,54 @@ class FeatureSettings:
         _check_losses(self.width, self.intra, self.inter, self.cohesion_weight)
         if self.formula == "authors" and self.cohesion == "rendered":
             raise OgPointcloudError(
-                'formula "authors" with cohesion "rendered": an unsquared distance per pixel is no quadratic form of the '
+                'formula "authors" with cohesion "rendered": an unsquared distance per pixel is no quadratic form of '
                 'features; take cohesion "points", or train by rendering (paper.py)'
             )
+
+
+@dataclass(frozen=True)
+class CodebookSettings:
+    """Two-level codebook without rendering (codebook.py; paper, Sec. 3.2, Eq. 3)."""
+
+    levels: Literal[1, 2] = 2
+    """Coarse clusters alone, or fine ones within them where their masks say that they hold several things."""
+    k1: int | None = None
+    """Coarse clusters; None: as many as there are things (the paper's 64 or 32 fit no other scene, its limitation 2)."""
+    k2: int | None = None
+    """Fine clusters in each coarse one; None: as many as masks of one view fall into it."""
+    positions: bool = True
+    """Coarse clusters are of features and positions (Eq. 3), or of features alone."""
+    position_weight: float = 0.5
+    """The scene's extent counts as much as this distance of features; or, absolute, one scene unit does (the paper)."""
+    absolute_positions: bool = False
+    """position_weight is per scene unit, as published (1.0 ScanNet, 0.5 LeRF), not per extent."""
+    fair_share: float = 0.2
+    """A mask counts in a cluster with this share of the mask, or of what its view shows of the cluster (the authors'
+    code: overlap 0.2)."""
+    view_quantile: float = 0.8
+    """Of the views' counts of masks in a cluster, this one is believed: a few views tear a thing into several masks."""
+    rounds: int = 30
+    """Rounds of k-means at most."""
+
+
+@dataclass(frozen=True)
+class MatchingSettings:
+    """Masks of instances that a codebook made (matching.py; paper, Sec. 3.3, Eq. 5)."""
+
+    score: Literal["both", "iou", "feature"] = "both"
+    """Eq. 5, or one of its factors alone (the paper's ablation)."""
+    threshold: float = 0.2
+    """A view's best mask is accepted above this score (the authors' code)."""
+    min_views: int = 1
+    """An instance accepted by fewer views is unknown (the authors' code: 2 on ScanNet, 5 on LeRF)."""
+    integration: Literal["weighted", "equal"] = "weighted"
+    """Accepted masks count by score and by what they show, without outliers; or all alike (the authors' code)."""
+    split: bool = True
+    """Two descriptors where the views of an instance fall into two clearly separate groups."""
+    split_views: int = 4
+    """Each group has at least this many views: fewer are apart by chance too often, or are wrong masks."""
+    split_share: float = 0.3
+    """Each group has at least this share of the weight."""
 
 
 @dataclass(frozen=True)
@@ -155,8 +203,9 @@ class PaperSettings:
     """Use the intra-mask smoothing loss (Eq. 1)."""
     inter: bool = True
     """Use the inter-mask contrastive loss (Eq. 2)."""
-    cohesion_weight: float = 0.1
-    """Weight of Eq. 1 beside Eq. 2 (the authors' code; the paper gives none), Eq. 1 as a mean over pixels."""
+    cohesion_weight: float | None = None
+    """Weight of Eq. 1, as a mean over pixels, beside Eq. 2. None: 0.1 with the authors' formula, as in their code; 10
+    with the paper's, which gives none: squared distances are that much smaller."""
     covered_share: float = 0.7
     """Pixels whose Gaussians cover less than this are no part of their mask (the authors' code)."""
     feature_rate: float = 1e-3
@@ -193,12 +242,12 @@ class PaperSettings:
             )
 
 
-def _check_losses(width: int, intra: bool, inter: bool, cohesion_weight: float) -> None:
+def _check_losses(width: int, intra: bool, inter: bool, cohesion_weight: float | None) -> None:
     if width < 1:
         raise OgPointcloudError(f"the width of features is {width}; expected at least 1, 6 as published")
     if not (intra or inter):
         raise OgPointcloudError("both losses are off; features need intra (Eq. 1), inter (Eq. 2), or both")
-    if not cohesion_weight >= 0:
+    if cohesion_weight is not None and not cohesion_weight >= 0:
         raise OgPointcloudError(f"cohesion_weight is {cohesion_weight}; expected 0 or more")
 
 
