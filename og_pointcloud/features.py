@@ -223,8 +223,7 @@ class FeatureObjective:
     def __init__(self, table: MaskTable, settings: FeatureSettings, gram: MaskGram | None = None) -> None:
         self.settings = settings
         weight = np.asarray(table.weights.sum(axis=1), np.float64).ravel()
-        self.seen: NDArray[np.float64] = np.zeros(table.weights.shape[1])
-        np.add.at(self.seen, table.weights.indices, table.weights.data)
+        self.seen = np.bincount(table.weights.indices, table.weights.data, table.weights.shape[1]).astype(np.float64)
         self.shown = np.flatnonzero(self.seen > 0)
         self.weight = self.seen[self.shown, None].astype(np.float32)
         kept = np.flatnonzero(weight > 0)
@@ -302,7 +301,7 @@ class FeatureObjective:
             return float(value), by_feature, by_mean
         total = self._size.sum()
         if self._gram is None:
-            blended = self.weight * features.astype(np.float64)
+            blended = self.seen[self.shown, None] * features
         else:
             blended = _product(*_arrays(self._gram), features, _columns(features))
         spread = float((features * blended).sum() - (self._size[:, None] * means**2).sum())
