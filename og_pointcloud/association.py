@@ -15,7 +15,7 @@ from og_pointcloud.cloud import InstanceTable
 from og_pointcloud.settings import AssociationSettings
 from og_pointcloud.visibility import MaskTable
 
-__all__ = ["describe_instances"]
+__all__ = ["describe_instances", "robust_mean"]
 
 
 def describe_instances(
@@ -37,7 +37,7 @@ def describe_instances(
     agreement = np.zeros(count, np.float32)
     for instance in range(count):
         members = np.flatnonzero((group == instance) & (shown > 0) & features.any(axis=1))
-        row, kept, cosines = _robust_mean(features[members], shown[members], settings.outlier_deviations)
+        row, kept, cosines = robust_mean(features[members], shown[members], settings.outlier_deviations)
         if row is None:
             continue
         rows.append(row)
@@ -66,7 +66,7 @@ def _shown_of_instance(
     return np.bincount(mask[own], weights.data[own], weights.shape[0]).astype(np.float64)
 
 
-def _robust_mean(
+def robust_mean(
     features: NDArray[np.float64], weight: NDArray[np.float64], deviations: float
 ) -> tuple[NDArray[np.float64] | None, NDArray[np.bool_], NDArray[np.float64]]:
     """Weighted mean direction of unit rows without outliers: the mean (None if there is none), the rows kept, cosines.

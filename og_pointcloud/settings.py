@@ -147,7 +147,7 @@ class CodebookSettings:
     levels: Literal[1, 2] = 2
     """Coarse clusters alone, or fine ones within them where their masks say that they hold several things."""
     k1: int | None = None
-    """Coarse clusters; None: as many as there are things (the paper's 64 or 32 fit no other scene, its limitation 2)."""
+    """Coarse clusters; None: as many as there are things. The paper's 64 or 32 are its limitation 2."""
     k2: int | None = None
     """Fine clusters in each coarse one; None: as many as masks of one view fall into it."""
     positions: bool = True
@@ -164,6 +164,12 @@ class CodebookSettings:
     rounds: int = 30
     """Rounds of k-means at most."""
 
+    def __post_init__(self) -> None:
+        for name in ("levels", "k1", "k2"):
+            value = getattr(self, name)
+            if value is not None and (value < 1 or (name == "levels" and value > 2)):
+                raise OgPointcloudError(f"{name} is {value}; expected {'1 or 2' if name == 'levels' else 'at least 1'}")
+
 
 @dataclass(frozen=True)
 class MatchingSettings:
@@ -171,8 +177,8 @@ class MatchingSettings:
 
     score: Literal["both", "iou", "feature"] = "both"
     """Eq. 5, or one of its factors alone (the paper's ablation)."""
-    threshold: float = 0.2
-    """A view's best mask is accepted above this score (the authors' code)."""
+    threshold: float = 0.1
+    """A view's best mask is accepted above this score (the authors' code: 0.2)."""
     min_views: int = 1
     """An instance accepted by fewer views is unknown (the authors' code: 2 on ScanNet, 5 on LeRF)."""
     integration: Literal["weighted", "equal"] = "weighted"
@@ -183,6 +189,13 @@ class MatchingSettings:
     """Each group has at least this many views: fewer are apart by chance too often, or are wrong masks."""
     split_share: float = 0.3
     """Each group has at least this share of the weight."""
+
+    def __post_init__(self) -> None:
+        if self.score not in ("both", "iou", "feature") or self.integration not in ("weighted", "equal"):
+            raise OgPointcloudError(
+                f'score "{self.score}" with integration "{self.integration}"; expected "both", "iou" or "feature", and '
+                '"weighted" or "equal"'
+            )
 
 
 @dataclass(frozen=True)

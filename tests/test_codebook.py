@@ -1,4 +1,4 @@
-"""The codebook: k-means against Lloyd's rule written out in float64, and what it does with hard input."""
+"""The codebook: k-means against Lloyd's rule in float64, and two levels on things whose clusters are known."""
 
 from __future__ import annotations
 
@@ -6,9 +6,21 @@ import numba
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from test_grouping import ONE, hand_table
 
-from og_pointcloud.codebook import kmeans, seed_centres
+from og_pointcloud.codebook import (
+    Codebook,
+    cluster_weights,
+    kmeans,
+    seed_centres,
+    thing_count,
+    things_together,
+    two_level_codebook,
+)
 from og_pointcloud.errors import OgPointcloudError
+from og_pointcloud.settings import CodebookSettings
+
+DEFAULTS = CodebookSettings()
 
 
 def blobs(count: int = 4000, places: int = 12, width: int = 9, seed: int = 0, spread: float = 0.05):
@@ -150,3 +162,151 @@ def test_seeds_of_few_places_are_few() -> None:
     assert seed_centres(values, np.ones(10), 7, random).shape == (2, 2)
     assert seed_centres(values, np.zeros(10), 7, random).shape == (0, 2)
     assert seed_centres(values[:0], np.zeros(0), 7, random).shape == (0, 2)
+
+
+def room(seed: int = 0, points_each: int = 120, views: int = 6):
+    """Eight things in two corners, four in each, never seen together: things 0 and 4, 1 and 5, ... share a feature.
+
+    Returns features (n, 6), positions (n, 3), the thing of each point, and a table of half the views in either corner.
+    """
+    random = np.random.default_rng(seed)
+    thing = np.repeat(np.arange(8), points_each)
+    features = np.eye(6)[thing % 4] + 0.05 * random.normal(size=(len(thing), 6))
+    corner = thing // 4
+    xyz = 10.0 * corner[:, None] + random.random((len(thing), 3))
+    seen = [[(np.flatnonzero(thing == 4 * (view % 2) + k), ONE) for k in range(4)] for view in range(views)]
+    unseen = [np.flatnonzero(corner != view % 2) for view in range(views)]
+    table = hand_table(len(thing), seen, unseen)
+    return features.astype(np.float32), xyz.astype(np.float32), thing, table
+
+
+def same_partition(labels: NDArray[np.int32], truth: NDArray[np.int64]) -> bool:
+    pairs = np.unique(np.stack([labels, truth]), axis=1)
+    return len(np.unique(labels)) == len(np.unique(truth)) == pairs.shape[1]
+
+
+def build(settings: CodebookSettings = DEFAULTS, seed: int = 0, **changes) -> Codebook:
+    features, xyz, thing, table = room()
+    given = {"features": features, "xyz": xyz, "weight": np.ones(len(thing)), "table": table} | changes
+    return two_level_codebook(given["features"], given["xyz"], given["weight"], given["table"], settings, seed)
+
+
+def test_as_many_things_as_the_masks_show() -> None:
+    _, _, _, table = room()
+    assert thing_count(table) == 8
+    assert thing_count(room(views=14)[3]) == 8
+    assert thing_count(hand_table(5, [[(range(5), ONE)]] * 9)) == 1
+    assert thing_count(hand_table(5, [[], []])) == 1
+
+
+def test_masks_of_one_view_are_counted_in_each_cluster() -> None:
+    _, _, thing, table = room()
+    np.testing.assert_array_equal(things_together(table, (thing // 4).astype(np.int32), 2, DEFAULTS), [4, 4])
+    np.testing.assert_array_equal(things_together(table, thing.astype(np.int32), 9, DEFAULTS), [1] * 9)
+
+
+def test_a_sliver_of_a_mask_is_no_thing_in_a_cluster() -> None:
+    table = hand_table(100, [[(range(52), ONE), (range(52, 100), ONE)]] * 3)
+    halves = np.repeat([0, 1], 50).astype(np.int32)
+    np.testing.assert_array_equal(things_together(table, halves, 2, DEFAULTS), [1, 1])
+
+
+def test_a_few_torn_views_are_outvoted() -> None:
+    whole, torn = [(range(100), ONE)], [(range(50), ONE), (range(50, 100), ONE)]
+    everything = np.zeros(100, np.int32)
+    assert things_together(hand_table(100, [whole] * 9 + [torn]), everything, 1, DEFAULTS) == [1]
+    assert things_together(hand_table(100, [whole] + [torn] * 9), everything, 1, DEFAULTS) == [2]
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_scene_says_how_many_clusters(seed: int) -> None:
+    _, _, thing, _ = room()
+    codebook = build(seed=seed)
+    assert same_partition(codebook.leaf, thing)
+    assert codebook.levels == 1
+    np.testing.assert_array_equal(codebook.leaf, codebook.coarse)
+
+
+def test_fine_clusters_part_what_coarse_ones_hold_together() -> None:
+    _, _, thing, _ = room()
+    codebook = build(CodebookSettings(k1=2, position_weight=5.0))
+    assert same_partition(codebook.coarse, thing // 4)
+    assert same_partition(codebook.leaf, thing)
+    assert codebook.levels == 2
+    np.testing.assert_array_equal(codebook.leaf_coarse[codebook.leaf], codebook.coarse)
+    assert (np.diff(codebook.leaf_coarse) >= 0).all()
+    alone = build(CodebookSettings(k1=2, position_weight=5.0, levels=1))
+    assert len(alone.leaf_centres) == 2
+    at_most_three = build(CodebookSettings(k1=2, position_weight=5.0, k2=3))
+    np.testing.assert_array_equal(at_most_three.leaf_coarse, [0, 0, 0, 1, 1, 1])
+
+
+def test_without_positions_things_never_seen_together_fall_into_one() -> None:
+    """The paper's first challenge of one codebook (Sec. 3.2)."""
+    _, _, thing, _ = room()
+    codebook = build(CodebookSettings(positions=False, k1=4))
+    assert same_partition(codebook.leaf, thing % 4)
+    assert codebook.coarse_centres.shape == (4, 6)
+
+
+def test_centres_are_weighted_means() -> None:
+    features, xyz, thing, _ = room()
+    weight = np.random.default_rng(3).random(len(thing))
+    codebook = build(weight=weight)
+    for leaf in range(len(codebook.leaf_centres)):
+        mine = codebook.leaf == leaf
+        expected = np.average(np.hstack([features, xyz])[mine].astype(np.float64), axis=0, weights=weight[mine])
+        np.testing.assert_allclose(codebook.leaf_centres[leaf], expected[:6], rtol=1e-5, atol=1e-6)
+        np.testing.assert_allclose(codebook.coarse_centres[codebook.leaf_coarse[leaf]], expected, rtol=1e-5, atol=1e-6)
+
+
+def test_points_without_weight_have_no_cluster() -> None:
+    _, _, thing, _ = room()
+    weight = (thing != 3).astype(np.float64)
+    codebook = build(weight=weight)
+    np.testing.assert_array_equal(codebook.leaf[thing == 3], -1)
+    np.testing.assert_array_equal(codebook.coarse[thing == 3], -1)
+    assert (codebook.leaf[thing != 3] >= 0).all()
+
+
+def test_unit_and_place_of_the_scene_do_not_matter() -> None:
+    _, xyz, _, _ = room()
+    one = build()
+    np.testing.assert_array_equal(build(xyz=1000 * xyz + 50_000).leaf, one.leaf)
+    absolute = CodebookSettings(k1=2, absolute_positions=True, position_weight=1.0)
+    assert same_partition(build(absolute).coarse, room()[2] // 4)
+    assert not same_partition(build(absolute, xyz=1e-3 * xyz).coarse, room()[2] // 4)
+
+
+def test_outliers_do_not_set_the_extent() -> None:
+    _, xyz, thing, _ = room()
+    xyz[[5, 700]] = [[1e5, 0, 0], [0, -1e5, 0]]
+    codebook = build(CodebookSettings(k1=10, levels=1), xyz=xyz)
+    plain = np.ones(len(thing), bool)
+    plain[[5, 700]] = False
+    assert same_partition(codebook.leaf[plain], thing[plain])
+
+
+@pytest.mark.parametrize("count", [0, 1, 3])
+@pytest.mark.parametrize("settings", [DEFAULTS, CodebookSettings(k1=64, k2=5), CodebookSettings(positions=False)])
+def test_hardly_any_points_for_two_levels(count: int, settings: CodebookSettings) -> None:
+    """Coincident points in one mask; with 0 of them, nothing takes part."""
+    table = hand_table(3, [[(range(3), ONE)]] * 2)
+    weight = (np.arange(3) < count).astype(np.float64)
+    codebook = two_level_codebook(np.ones((3, 6), np.float32), np.ones((3, 3), np.float32), weight, table, settings)
+    np.testing.assert_array_equal(codebook.leaf, np.where(weight > 0, 0, -1))
+    assert len(codebook.leaf_centres) == len(codebook.coarse_centres) == min(count, 1)
+    assert codebook.levels == 1
+
+
+def test_cluster_weights_are_a_product_with_indicators() -> None:
+    _, _, _, table = room()
+    cluster = np.random.default_rng(0).integers(-1, 5, table.weights.shape[1]).astype(np.int32)
+    onehot = (cluster[:, None] == np.arange(5)).astype(float)
+    np.testing.assert_allclose(cluster_weights(table.weights, cluster, 5), table.weights.toarray() @ onehot)
+
+
+def test_bad_settings_are_refused() -> None:
+    for bad in ({"k1": 0}, {"k2": -1}, {"levels": 3}):
+        with pytest.raises(OgPointcloudError, match=f"{next(iter(bad))} is"):
+            CodebookSettings(**bad)

@@ -1,0 +1,242 @@
+"""Eq. 5: masks matched with instances, against the equation written out over pixels and against the paper's way."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from test_grouping import ONE, OTHER, HandView, hand_table
+from test_visibility import IDENTITY, NEAR, camera, cloud, patches
+
+from og_pointcloud.matching import Evidence, Matching, alone_evidence, eq5_scores, match_masks, visible_evidence
+from og_pointcloud.scene import Camera, View
+from og_pointcloud.settings import MatchingSettings
+from og_pointcloud.visibility import Gaussians, mask_table, pixel_weights
+
+SETTINGS = MatchingSettings()
+RED, GREEN = np.array([1.0, 0.0]), np.array([0.0, 1.0])
+NOTHING = np.zeros(8, np.float32)
+
+
+def match(
+    views: list[HandView],
+    ids: list[int],
+    settings: MatchingSettings = SETTINGS,
+    instance_features: NDArray[np.float64] | None = None,
+    mask_features: NDArray[np.float64] | None = None,
+) -> Matching:
+    """All instance features alike, where none are given."""
+    table = hand_table(len(ids), views)
+    count = max(ids) + 1
+    of_instances = np.ones((count, 2)) if instance_features is None else instance_features
+    of_masks = np.ones((len(table.mask_view), 2)) if mask_features is None else mask_features
+    instance_ids = np.array(ids, np.int32)
+    return match_masks(table, instance_ids, visible_evidence(table, instance_ids, of_instances, of_masks), settings)
+
+
+def turned(angle: float) -> Camera:
+    """A camera one unit before the middle of the test cloud, turned about the vertical."""
+    pose = np.eye(4)
+    pose[:3, :3] = [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
+    pose[2, 3] = 2.0
+    return camera(world_to_camera=pose)
+
+
+def test_visible_evidence_is_the_sum_over_pixels() -> None:
+    """Areas and features of two views, from the weights of every pixel, in float64."""
+    random = np.random.default_rng(0)
+    gaussians = cloud(random)
+    views = [View(f"v{k}", turned(0.2 * k), patches(turned(0.2 * k)), np.ones((12, 3), np.float32)) for k in range(2)]
+    table = mask_table(gaussians, views, NEAR)
+    ids = random.integers(-1, 5, len(gaussians)).astype(np.int32)
+    features, mask_features = random.random((5, 6)), random.random((24, 6))
+    evidence = visible_evidence(table, ids, features, mask_features)
+
+    onehot = (ids[:, None] == np.arange(5)).astype(np.float64)
+    for index, view in enumerate(views):
+        weights = pixel_weights(gaussians, view.camera, NEAR).toarray().astype(np.float64)
+        pixels = view.mask_map().ravel()
+        np.testing.assert_allclose(evidence.instance_area[index], (weights @ onehot).sum(axis=0), rtol=1e-5)
+        for mask in range(12):
+            row, inside = 12 * index + mask, weights[pixels == mask]
+            np.testing.assert_allclose(evidence.shared[row], (inside @ onehot).sum(axis=0), rtol=1e-5, atol=1e-9)
+            np.testing.assert_allclose(evidence.mask_area[row], inside.sum(), rtol=1e-5)
+            apart = np.abs(mask_features[row] - features).sum(axis=1)
+            known = evidence.shared[row] > 0
+            np.testing.assert_allclose(evidence.distance[row, known], apart[known])
+            assert np.isinf(evidence.distance[row, ~known]).all()
+    assert (evidence.shared > 0).any()
+
+
+def test_equation_5_by_hand() -> None:
+    """3 pixels in common of 6 and 5, features 0.25 apart: IoU 3/8, score 3/8 * 3/4."""
+    evidence = Evidence(np.array([[3.0]]), np.array([6.0]), np.array([[5.0]]), np.array([[0.25]]))
+    view = np.zeros(1, np.int32)
+    for score, expected in {"both": 3 / 8 * 3 / 4, "iou": 3 / 8, "feature": 3 / 4}.items():
+        np.testing.assert_allclose(eq5_scores(evidence, view, MatchingSettings(score=score)), [[expected]])
+    far = replace(evidence, distance=np.array([[1.5]]))
+    assert eq5_scores(far, view, SETTINGS)[0, 0] == 0
+
+
+def wall(x: tuple[float, float], depth: float) -> Gaussians:
+    """An opaque upright sheet of splats a pixel apart, seen by `camera`."""
+    step = depth / 40
+    across, down = np.meshgrid(np.arange(x[0], x[1], step), np.arange(-0.2, 0.2, step))
+    xyz = np.stack([across.ravel(), down.ravel(), np.full(across.size, depth)], axis=1).astype(np.float32)
+    flat = np.tile(np.array([step, step, 1e-4], np.float32), (len(xyz), 1))
+    return Gaussians(xyz, flat, np.tile(IDENTITY, (len(xyz), 1)), np.full(len(xyz), 0.99, np.float32))
+
+
+def both(a: Gaussians, b: Gaussians) -> Gaussians:
+    return Gaussians(*(np.concatenate([getattr(a, f), getattr(b, f)]) for f in ("xyz", "scale", "rotation", "opacity")))
+
+
+def test_alone_is_visible_where_nothing_is_in_front() -> None:
+    """Two opaque walls side by side: both ways see the same pixels, to within their soft edges."""
+    left, right = wall((-0.5, -0.1), 1.0), wall((0.15, 0.5), 1.0)
+    gaussians, ids = both(left, right), np.repeat([0, 1], [len(left), len(right)]).astype(np.int32)
+    masks = np.full((37, 50), -1, np.int32)
+    masks[8:28, 3:22], masks[8:28, 28:46] = 0, 1
+    view = View("v", camera(), masks, np.ones((2, 3), np.float32))
+    table = mask_table(gaussians, [view], NEAR)
+    colours = np.stack([RED, GREEN])
+    visible = visible_evidence(table, ids, colours, colours)
+    alone = alone_evidence(gaussians, [view], NEAR, ids, colours, colours)
+    scores = eq5_scores(visible, table.mask_view, SETTINGS), eq5_scores(alone, table.mask_view, SETTINGS)
+    assert scores[0].diagonal().min() > 0.7
+    np.testing.assert_allclose(*scores, atol=0.1)
+    np.testing.assert_allclose(alone.instance_area, visible.instance_area, rtol=0.1)
+
+
+def test_alone_sees_through_what_is_in_front() -> None:
+    """A hidden wall fills the mask of the one before it: IoU cannot tell, the feature can, and true visibility can."""
+    front, behind = wall((-0.4, 0.4), 1.0), wall((-0.8, 0.8), 2.0)
+    gaussians, ids = both(front, behind), np.repeat([0, 1], [len(front), len(behind)]).astype(np.int32)
+    masks = np.full((37, 50), -1, np.int32)
+    masks[10:28, 9:41] = 0
+    view = View("v", camera(), masks, np.ones((1, 3), np.float32))
+    table = mask_table(gaussians, [view], NEAR)
+    colours = np.stack([RED, GREEN])
+    alone = alone_evidence(gaussians, [view], NEAR, ids, colours, RED[None])
+    visible = visible_evidence(table, ids, colours, RED[None])
+    by_iou = MatchingSettings(score="iou")
+    assert eq5_scores(alone, table.mask_view, by_iou)[0, 1] > 0.4
+    assert eq5_scores(alone, table.mask_view, SETTINGS)[0, 1] == 0
+    assert eq5_scores(visible, table.mask_view, by_iou)[0, 1] < 0.1
+
+
+def test_alone_skips_what_is_not_in_the_image() -> None:
+    gaussians = wall((-0.2, 0.2), 1.0)
+    away = replace(gaussians, xyz=gaussians.xyz * np.float32([1, 1, -1]))
+    aside = replace(gaussians, xyz=gaussians.xyz + np.float32([50, 0, 0]))
+    view = View("v", camera(), np.zeros((37, 50), np.int32), np.ones((1, 3), np.float32))
+    for hidden in (away, aside):
+        ids = np.zeros(len(hidden), np.int32)
+        evidence = alone_evidence(hidden, [view], NEAR, ids, RED[None], RED[None])
+        assert evidence.instance_area[0, 0] == 0
+        assert np.isinf(evidence.distance[0, 0])
+
+
+def test_the_best_mask_of_each_view_is_accepted() -> None:
+    views: list[HandView] = [[([0, 1, 2], ONE), ([3, 4, 5], OTHER)], [([0, 1], ONE), ([2, 3, 4, 5], OTHER)]]
+    result = match(views, [0, 0, 0, 1, 1, 1])
+    np.testing.assert_array_equal(result.mask_instance, [0, 1, 0, 1])
+    np.testing.assert_allclose(result.instances.descriptors, [ONE, OTHER], atol=1e-6)
+    np.testing.assert_array_equal(result.instances.masks, [2, 2])
+    np.testing.assert_allclose(result.instances.visible_area, [5, 6])
+    np.testing.assert_array_equal(result.instances.points, [3, 3])
+    np.testing.assert_allclose(result.instances.agreement, 1, rtol=1e-6)
+
+
+def test_features_decide_where_overlaps_do_not() -> None:
+    """Two instances share a mask alike; the one that looks like it takes it."""
+    views: list[HandView] = [[([0, 1], ONE)]]
+    result = match(views, [0, 1], instance_features=np.stack([RED, GREEN]), mask_features=np.stack([0.9 * RED]))
+    np.testing.assert_array_equal(result.mask_instance, [0])
+    np.testing.assert_array_equal(result.instances.descriptor_instance, [0])
+
+
+def test_an_instance_without_an_accepted_mask_has_no_descriptor() -> None:
+    """Unknown, not class 0: here one of 20 points of a mask is no match for the mask."""
+    result = match([[(range(20), ONE)]] * 3, [0] * 19 + [1])
+    np.testing.assert_array_equal(result.instances.descriptor_instance, [0])
+    np.testing.assert_array_equal(result.instances.masks, [3, 0])
+    assert result.instances.agreement[1] == 0
+
+
+def test_few_views_are_not_enough_where_more_are_asked() -> None:
+    views: list[HandView] = [[([0, 1], ONE), ([2, 3], OTHER)], [([0, 1], ONE)]]
+    result = match(views, [0, 0, 1, 1], MatchingSettings(min_views=2))
+    np.testing.assert_array_equal(result.instances.descriptor_instance, [0])
+    np.testing.assert_array_equal(result.mask_instance, [0, -1, 0])
+
+
+def test_views_count_alike_or_by_what_they_show() -> None:
+    """Of 8 points one view's mask has all, the other's 4: weights 1 : 1, or 8 x 1 : 4 x 1/2."""
+    views: list[HandView] = [[(range(8), ONE)], [(range(4), OTHER)]]
+    plain = match(views, [0] * 8, MatchingSettings(integration="equal")).instances.descriptors
+    weighted = match(views, [0] * 8).instances.descriptors
+    np.testing.assert_allclose(plain, [(ONE + OTHER) / np.sqrt(2)], rtol=1e-6)
+    np.testing.assert_allclose(weighted, [(4 * ONE + OTHER) / np.sqrt(17)], rtol=1e-6)
+
+
+def test_masks_without_a_feature_are_evidence_but_describe_nothing() -> None:
+    result = match([[([0, 1], NOTHING)], [([0, 1], ONE)]], [0, 0])
+    np.testing.assert_allclose(result.instances.descriptors, [ONE])
+    assert result.instances.masks[0] == 2
+    nothing = match([[([0, 1], NOTHING)]], [0, 0])
+    assert nothing.instances.descriptors.shape == (0, 8)
+
+
+def noisy(direction: NDArray[np.float32], count: int, random: np.random.Generator) -> list[HandView]:
+    return [[([0, 1], (direction + 0.2 * random.normal(size=8)).astype(np.float32))] for _ in range(count)]
+
+
+def test_views_that_see_two_things_give_two_descriptors() -> None:
+    random = np.random.default_rng(0)
+    result = match(noisy(ONE, 8, random) + noisy(OTHER, 6, random), [0, 0])
+    np.testing.assert_array_equal(result.instances.descriptor_instance, [0, 0])
+    cosines = result.instances.descriptors @ np.stack([ONE, OTHER]).T
+    np.testing.assert_allclose(np.sort(cosines.max(axis=1)), 1, atol=0.1)
+    assert set(cosines.argmax(axis=1)) == {0, 1}
+    assert result.instances.agreement[0] > 0.8
+    off = match(noisy(ONE, 8, random) + noisy(OTHER, 6, random), [0, 0], MatchingSettings(split=False))
+    assert len(off.instances.descriptors) == 1
+
+
+def test_noise_and_a_few_wrong_masks_give_one_descriptor() -> None:
+    for seed in range(40):
+        random = np.random.default_rng(seed)
+        assert len(match(noisy(ONE, 12, random), [0, 0]).instances.descriptors) == 1
+        wrong = match(noisy(ONE, 12, random) + noisy(OTHER, 3, random), [0, 0]).instances.descriptors
+        assert len(wrong) == 1
+        assert wrong[0] @ ONE > wrong[0] @ OTHER + 0.5
+
+
+@pytest.mark.parametrize("score", ["both", "iou", "feature"])
+def test_order_of_views_does_not_matter(score: str) -> None:
+    random = np.random.default_rng(1)
+    views: list[HandView] = [
+        [(random.choice(30, 8, replace=False), random.normal(size=8).astype(np.float32)) for _ in range(2)]
+        for _ in range(6)
+    ]
+    ids = random.integers(0, 4, 30).tolist()
+    mask_features = random.random((12, 2))
+    settings = MatchingSettings(score=score)  # pyright: ignore
+    one = match(views, ids, settings, mask_features=mask_features)
+    order = random.permutation(6)
+    rows = np.concatenate([[2 * view, 2 * view + 1] for view in order])
+    other = match([views[view] for view in order], ids, settings, mask_features=mask_features[rows])
+    np.testing.assert_array_equal(other.mask_instance, one.mask_instance[rows])
+    np.testing.assert_allclose(other.instances.descriptors, one.instances.descriptors, atol=1e-6)
+
+
+def test_no_instance_at_all() -> None:
+    table = hand_table(3, [[([0, 1], ONE)]])
+    ids = np.full(3, -1, np.int32)
+    evidence = visible_evidence(table, ids, np.zeros((0, 2)), np.ones((1, 2)))
+    result = match_masks(table, ids, evidence, SETTINGS)
+    assert len(result.instances) == 0
+    np.testing.assert_array_equal(result.mask_instance, [-1])
