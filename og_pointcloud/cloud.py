@@ -28,6 +28,8 @@ class InstanceTable:
     points: (K,) int32, points with this id. views, masks: (K,) int32, views that saw it and masks joined in it.
     agreement: (K,) float32 in [-1, 1], mean cosine of its masks' features with their descriptor.
     visible_area: (K,) float32, pixels of blending weight that its masks put on it, over all views.
+    coarse: (K,) int32, the coarse cluster that an instance of a codebook lies in, -1 none. whole: (K,) int32, the
+        instance that this one is a part of, -1 none; without cycles. Left empty, both become -1 throughout.
     """
 
     descriptors: NDArray[np.float32]
@@ -37,10 +39,15 @@ class InstanceTable:
     masks: NDArray[np.int32]
     agreement: NDArray[np.float32]
     visible_area: NDArray[np.float32]
+    coarse: NDArray[np.int32] = field(default_factory=lambda: np.zeros(0, np.int32))
+    whole: NDArray[np.int32] = field(default_factory=lambda: np.zeros(0, np.int32))
 
     def __post_init__(self) -> None:
         count = len(self.points)
-        for name in ("views", "masks", "agreement", "visible_area"):
+        for name in ("coarse", "whole"):
+            if len(getattr(self, name)) == 0:
+                object.__setattr__(self, name, np.full(count, -1, np.int32))
+        for name in ("views", "masks", "agreement", "visible_area", "coarse", "whole"):
             if getattr(self, name).shape != (count,):
                 raise OgPointcloudError(f"instance {name} has shape {getattr(self, name).shape}; expected ({count},)")
         if self.descriptors.ndim != 2 or len(self.descriptors) != len(self.descriptor_instance):
@@ -52,9 +59,26 @@ class InstanceTable:
             raise OgPointcloudError(f"descriptor instances must ascend within 0..{count - 1}")
         if not np.isfinite(self.descriptors).all():
             raise OgPointcloudError("descriptors hold NaN or infinity; expected unit rows")
+        _check_hierarchy(self.coarse, self.whole)
 
     def __len__(self) -> int:
         return len(self.points)
+
+
+def _check_hierarchy(coarse: NDArray[np.int32], whole: NDArray[np.int32]) -> None:
+    count = len(whole)
+    if count and (coarse.min() < -1 or whole.min() < -1 or whole.max() >= count):
+        raise OgPointcloudError(
+            f"coarse clusters reach down to {coarse.min()}, wholes span {whole.min()}..{whole.max()}; expected -1 or a "
+            f"number from 0, wholes at most {count - 1}"
+        )
+    parents = np.append(whole, -1)  # row -1 is its own parent: none
+    ancestor = np.arange(count)
+    # Doubling: after k rounds every row has risen 2^k levels, and none rises more than count.
+    for _ in range(count.bit_length()):
+        ancestor, parents = parents[ancestor], parents[parents]
+    if (ancestor >= 0).any():
+        raise OgPointcloudError(f"instance {int(np.argmax(ancestor >= 0))} is a part of itself, through its wholes")
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,134 @@
+"""Part-of relations from masks, and what a table of instances accepts of them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from test_grouping import ONE, OTHER, HandView, hand_table
+
+from og_pointcloud.cloud import InstanceTable
+from og_pointcloud.errors import OgPointcloudError
+from og_pointcloud.hierarchy import part_of
+
+MUG, HANDLE, TABLE = range(60), range(60, 80), range(80, 200)
+IDS = np.repeat([0, 1, 2], [60, 20, 120]).astype(np.int32)
+WHOLE_MUG = [*MUG, *HANDLE]
+TOGETHER: HandView = [(WHOLE_MUG, ONE), (TABLE, OTHER)]
+APART: HandView = [(MUG, ONE), (HANDLE, ONE), (TABLE, OTHER)]
+
+
+def wholes(views: list[HandView], owners: list[int], unseen=(), ids: NDArray[np.int32] = IDS) -> list[int]:
+    table = hand_table(len(ids), views, unseen)
+    whole = part_of(table, np.array(owners, np.int32), ids, int(ids.max()) + 1)
+    assert whole.dtype == np.int32
+    return whole.tolist()
+
+
+def test_what_most_views_show_within_the_mug_is_a_part_of_it() -> None:
+    assert wholes([TOGETHER] * 4 + [APART] * 2, [0, 2] * 4 + [0, 1, 2] * 2) == [-1, 0, -1]
+
+
+def test_what_most_views_show_apart_is_no_part() -> None:
+    assert wholes([TOGETHER] * 2 + [APART] * 4, [0, 2] * 2 + [0, 1, 2] * 4) == [-1, -1, -1]
+    assert wholes([TOGETHER] * 3 + [APART] * 3, [0, 2] * 3 + [0, 1, 2] * 3) == [-1, -1, -1]
+
+
+def test_one_view_alone_makes_no_part() -> None:
+    only_handle: HandView = [(HANDLE, ONE)]
+    assert wholes([TOGETHER, only_handle], [0, 2, 1]) == [-1, -1, -1]
+
+
+def test_what_never_has_a_mask_of_its_own_is_not_known_to_be_a_part() -> None:
+    assert wholes([TOGETHER] * 5, [0, 2] * 5) == [-1, -1, -1]
+
+
+def test_views_without_a_mask_of_the_whole_say_nothing() -> None:
+    """Nine views missed the mug; of the three that did not, two show the handle within it."""
+    missed: HandView = [(HANDLE, ONE), (TABLE, OTHER)]
+    views = [TOGETHER] * 2 + [APART] + [missed] * 9
+    assert wholes(views, [0, 2] * 2 + [0, 1, 2] + [1, 2] * 9) == [-1, 0, -1]
+
+
+def test_views_that_do_not_see_the_part_say_nothing() -> None:
+    """Five views from the other side show the mug, and nothing of its handle."""
+    views = [TOGETHER] * 2 + [APART] + [[(MUG, ONE)]] * 5
+    unseen = [()] * 3 + [HANDLE] * 5
+    assert wholes(views, [0, 2] * 2 + [0, 1, 2] + [0] * 5, unseen) == [-1, 0, -1]
+
+
+def test_the_larger_is_the_whole() -> None:
+    """Masks of the handle that spill over the mug make it no part of its handle."""
+    spilled: HandView = [(WHOLE_MUG, ONE)]
+    assert wholes([spilled] * 4 + [APART] * 2, [1] * 4 + [0, 1, 2] * 2) == [-1, -1, -1]
+
+
+def test_masks_of_no_instance_make_no_whole() -> None:
+    assert wholes([TOGETHER] * 4 + [APART] * 2, [-1, 2] * 4 + [0, 1, 2] * 2) == [-1, -1, -1]
+
+
+def test_a_chain_names_the_nearest_whole() -> None:
+    """All three in one mask of the table, handle and mug in one of the mug: as often, so the smaller whole is named."""
+    everything: HandView = [(range(200), OTHER)]
+    views = [TOGETHER] * 6 + [everything] * 7 + [APART]
+    owners = [0, 2] * 6 + [2] * 7 + [0, 1, 2]
+    # Of the views with a mask of the mug, 6 of 7 hold the handle; of those with one of the table, 7 of 14: no majority.
+    assert wholes(views, owners) == [-1, 0, -1]
+    assert wholes([*views, everything, everything], [*owners, 2, 2]) == [2, 0, -1]
+
+
+def test_order_and_numbers_do_not_matter() -> None:
+    swapped = np.array([1, 0, 2], np.int32)[IDS]
+    assert wholes([TOGETHER] * 4 + [APART] * 2, [1, 2] * 4 + [1, 0, 2] * 2, ids=swapped) == [1, -1, -1]
+    assert wholes([APART, TOGETHER] * 2 + [TOGETHER] * 2, [0, 1, 2, 0, 2] * 2 + [0, 2] * 2) == [-1, 0, -1]
+
+
+def test_points_of_no_instance_and_instances_without_points() -> None:
+    ids = np.where(np.arange(200) >= 80, -1, IDS).astype(np.int32)
+    table = hand_table(200, [TOGETHER] * 4 + [APART] * 2)
+    owners = np.array([0, -1] * 4 + [0, 1, -1] * 2, np.int32)
+    np.testing.assert_array_equal(part_of(table, owners, ids, 5), [-1, 0, -1, -1, -1])
+    assert part_of(table, np.full(14, -1, np.int32), np.full(200, -1, np.int32), 0).shape == (0,)
+
+
+def instances(coarse: list[int] | None = None, whole: list[int] | None = None, count: int = 3) -> InstanceTable:
+    extra = {
+        name: np.array(value, np.int32) for name, value in (("coarse", coarse), ("whole", whole)) if value is not None
+    }
+    numbers, ratios = np.zeros(count, np.int32), np.zeros(count, np.float32)
+    nothing = np.zeros((0, 4), np.float32), np.zeros(0, np.int32)
+    return InstanceTable(*nothing, numbers, numbers, numbers, ratios, ratios, **extra)
+
+
+def test_a_table_without_hierarchy_has_none() -> None:
+    table = instances()
+    np.testing.assert_array_equal(table.coarse, [-1, -1, -1])
+    np.testing.assert_array_equal(table.whole, [-1, -1, -1])
+    assert table.whole.dtype == np.int32
+    assert len(instances(count=0).whole) == 0
+
+
+def test_a_table_keeps_its_hierarchy() -> None:
+    table = instances([4, 4, -1], [1, 2, -1])
+    np.testing.assert_array_equal(table.coarse, [4, 4, -1])
+    np.testing.assert_array_equal(table.whole, [1, 2, -1])
+    longest = instances(whole=[*range(1, 64), -1], count=64)
+    assert longest.whole[0] == 1
+
+
+@pytest.mark.parametrize(
+    ("coarse", "whole", "message"),
+    [
+        (None, [0, -1, -1], "a part of itself"),
+        (None, [1, 2, 0], "a part of itself"),
+        (None, [-1, 2, 1], "instance 1 is a part of itself"),
+        (None, [3, -1, -1], "wholes"),
+        (None, [-2, -1, -1], "wholes"),
+        ([-2, 0, 0], None, "coarse"),
+        ([0, 0], None, "coarse"),
+        (None, [-1, -1], "whole"),
+    ],
+)
+def test_a_hierarchy_that_is_none_is_refused(coarse: list[int] | None, whole: list[int] | None, message: str) -> None:
+    with pytest.raises(OgPointcloudError, match=message):
+        instances(coarse, whole)
