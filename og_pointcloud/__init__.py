@@ -6,8 +6,11 @@
     result = og.segment(points, ["chair", "desk"], scene)      # points: (N, 3), or an Open3D or PyVista cloud
     result.labels, result.scores, result.instances, result.mask("chair")
 
-Importing costs little: each name is fetched from its module on first use, and only ``fit``, ``read_capture`` and
-``write_bundle`` need more than numpy and onnxruntime (the extra 'fit').
+    hit = og.pick(scene, camera, (320, 240))            # or a place: og.pick(scene, (1.2, 0.4, 0.8))
+    hit.instance, hit.point_indices, hit.mask(camera)
+
+Importing costs little: each name is fetched from its module on first use, and only ``fit``, what reads captures and
+results, what writes bundles and what draws pictures need more than numpy and onnxruntime (the extra 'fit').
 """
 
 from __future__ import annotations
@@ -25,8 +28,12 @@ if TYPE_CHECKING:
     from og_pointcloud.errors import BundleError, FeatureSpaceError, MissingExtraError, OgPointcloudError, SceneError
     from og_pointcloud.fit import fit
     from og_pointcloud.formats.capture import read_capture
+    from og_pointcloud.formats.opengaussian import read_opengaussian
     from og_pointcloud.formats.points import read_points
+    from og_pointcloud.picking import Pick, in_world, pick
+    from og_pointcloud.pictures import feature_colors, feature_picture, instance_picture
     from og_pointcloud.runtime import LabelledScene, Segmenter, load, segment, use
+    from og_pointcloud.scene import Camera
     from og_pointcloud.segmentation import UNKNOWN, Segmentation
     from og_pointcloud.settings import FitSettings
     from og_pointcloud.text_features import read_text_features
@@ -37,6 +44,7 @@ __all__ = [
     "UNKNOWN",
     "UNOBSERVED",
     "BundleError",
+    "Camera",
     "FeatureSpaceError",
     "FitSettings",
     "InstanceTable",
@@ -44,14 +52,21 @@ __all__ = [
     "LabelledScene",
     "MissingExtraError",
     "OgPointcloudError",
+    "Pick",
     "SceneError",
     "Segmentation",
     "Segmenter",
     "Vocabulary",
+    "feature_colors",
+    "feature_picture",
     "fit",
+    "in_world",
+    "instance_picture",
     "load",
+    "pick",
     "read_bundle",
     "read_capture",
+    "read_opengaussian",
     "read_points",
     "read_text_features",
     "segment",
@@ -67,8 +82,12 @@ _HOMES = {
     ),
     "og_pointcloud.fit": ("fit",),
     "og_pointcloud.formats.capture": ("read_capture",),
+    "og_pointcloud.formats.opengaussian": ("read_opengaussian",),
     "og_pointcloud.formats.points": ("read_points",),
+    "og_pointcloud.picking": ("Pick", "in_world", "pick"),
+    "og_pointcloud.pictures": ("feature_colors", "feature_picture", "instance_picture"),
     "og_pointcloud.runtime": ("LabelledScene", "Segmenter", "load", "segment", "use"),
+    "og_pointcloud.scene": ("Camera",),
     "og_pointcloud.segmentation": ("UNKNOWN", "Segmentation"),
     "og_pointcloud.settings": ("FitSettings",),
     "og_pointcloud.text_features": ("read_text_features",),

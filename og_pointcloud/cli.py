@@ -1,8 +1,8 @@
-"""The command line: ``og-pointcloud fit | segment | info | demo``.
+"""The command line: ``og-pointcloud fit | import | segment | pick | view | info | demo``.
 
-A command imports what it needs when it runs, so that ``--help`` answers at once and ``segment`` works on the base
-install. Progress, warnings and errors go to stderr, results to stdout. Exit codes: 0 done, 2 bad use or bad input,
-130 interrupted.
+A command imports what it needs when it runs, so that ``--help`` answers at once and ``segment`` and ``pick`` work on
+the base install. Progress, warnings and errors go to stderr, results to stdout. Exit codes: 0 done, 2 bad use or bad
+input, 130 interrupted.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import argparse
 import difflib
 import json
 import os
+import re
 import sys
 import time
 import warnings
@@ -24,17 +25,24 @@ from typing import TYPE_CHECKING, Any, NoReturn, get_args, get_type_hints
 from og_pointcloud.cli_output import (
     describe_bundle,
     describe_fit,
+    describe_pick,
     describe_segmentation,
     print_fit,
+    print_import,
     print_info,
+    print_pick,
     print_segmentation,
+    print_table,
 )
 from og_pointcloud.errors import BundleError, FeatureSpaceError, MissingExtraError, OgPointcloudError
 from og_pointcloud.settings import FitSettings
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from og_pointcloud.cloud import LabelledCloud, Vocabulary
-    from og_pointcloud.scene import Scene
+    from og_pointcloud.scene import Camera, Scene
 
 __all__ = ["main"]
 
@@ -84,7 +92,10 @@ def build_parser() -> Parser:
     parser.add_argument("--version", action=VersionAction, help="print the version and leave")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     add_fit(commands)
+    add_import(commands)
     add_segment(commands)
+    add_pick(commands)
+    add_view(commands)
     add_info(commands)
     add_demo(commands)
     return parser
@@ -130,6 +141,20 @@ def add_fit(commands: Any) -> None:
     parser.add_argument("--json", type=Path, metavar="F.json", help="also write timings and settings of this run")
 
 
+def add_import(commands: Any) -> None:
+    parser = add_command(
+        commands, "import", run_import, "Turn what an OpenGaussian run wrote into one .ogpc file.",
+        "og-pointcloud import output/ramen -o ramen.ogpc",
+    )  # fmt: skip
+    parser.add_argument("result", type=Path, metavar="RESULT", help="folder of the run, or its point_cloud.ply")
+    parser.add_argument("-o", "--output", type=Path, required=True, metavar="S.ogpc", help="the file to write")
+    parser.add_argument(
+        "--cluster-lang", type=Path, metavar="F.npz", help="features of the leaves (default: RESULT/cluster_lang.npz)"
+    )
+    parser.add_argument("--feature-space", metavar="NAME", help="their encoder (default: LangSplat's, if 512 wide)")
+    parser.add_argument("--text-features", type=Path, metavar="F.npz", help="names that can then be asked")
+
+
 def add_segment(commands: Any) -> None:
     parser = add_command(
         commands, "segment", run_segment, "Label points by words: those of the fitted cloud, or of another one.",
@@ -141,6 +166,40 @@ def add_segment(commands: Any) -> None:
     parser.add_argument("--points", type=Path, metavar="CLOUD", help="points to label (default: those fitted)")
     parser.add_argument("-o", "--output", type=Path, metavar="OUT", help="labels as .npz, or a coloured .ply")
     parser.add_argument("--json", action="store_true", help="print the counts as JSON")
+
+
+def add_pick(commands: Any) -> None:
+    parser = add_command(
+        commands, "pick", run_pick, "Select the instance at a pixel of a view, or at a place; render its mask.",
+        "og-pointcloud pick kitchen.ogpc --capture kitchen --view frame7 --pixel 320,240 -o mask.png",
+    )  # fmt: skip
+    parser.add_argument("bundle", type=Path, metavar="S.ogpc", help="what `fit` wrote")
+    click = parser.add_mutually_exclusive_group(required=True)
+    click.add_argument("--xyz", metavar="X,Y,Z", help="a place in world coordinates")
+    click.add_argument("--pixel", metavar="U,V", help="a pixel of the view, column and row")
+    # Else argparse takes -1,2,3 for an option.
+    parser._negative_number_matcher = re.compile(r"-[\d.,-]+$")
+    parser.add_argument("--capture", type=Path, metavar="CAPTURE", help="folder that the view is in")
+    parser.add_argument("--view", metavar="NAME", help="file stem of the view's image")
+    parser.add_argument("-o", "--output", type=Path, metavar="M.png", help="the instance's mask in the view")
+    parser.add_argument("--text-features", type=Path, metavar="F.npz", help="names to rank (default: the file's own)")
+    parser.add_argument("--json", action="store_true", help="print the answer as JSON")
+
+
+def add_view(commands: Any) -> None:
+    parser = add_command(
+        commands, "view", run_view, "Picture of learned features, or of instances, over several views of a capture.",
+        "og-pointcloud view kitchen --features -o features.png",
+    )  # fmt: skip
+    parser.add_argument("capture", type=Path, metavar="CAPTURE", help="folder with poses, masks and mask features")
+    what = parser.add_mutually_exclusive_group(required=True)
+    what.add_argument("--features", action="store_true", help="learn features; show them before and after clustering")
+    what.add_argument("--instances", type=Path, metavar="S.ogpc", help="show the instances of a fit of this capture")
+    parser.add_argument(
+        "-o", "--output", type=Path, metavar="P.png", help="the picture (default: features.png or instances.png)"
+    )
+    parser.add_argument("--columns", type=int, default=4, metavar="N", help="views shown (default: %(default)s)")
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="of everything random (default: %(default)s)")
 
 
 def add_info(commands: Any) -> None:
@@ -273,6 +332,150 @@ def run_segment(arguments: argparse.Namespace) -> None:
         print(json.dumps(report, indent=2, ensure_ascii=False))
     else:
         print_segmentation(report)
+
+
+def run_import(arguments: argparse.Namespace) -> None:
+    check_outputs(
+        {"-o": (arguments.output, [".ogpc"])},
+        inputs=[arguments.result, arguments.cluster_lang, arguments.text_features],
+    )
+    from og_pointcloud_export import write_bundle
+
+    from og_pointcloud.formats.opengaussian import read_opengaussian
+
+    stages: list[dict[str, Any]] = []
+    with timed(stages, "read result"):
+        cloud = read_opengaussian(arguments.result, arguments.cluster_lang, feature_space=arguments.feature_space)
+        vocabulary = vocabulary_of(cloud, arguments.text_features)
+    cloud = replace(cloud, vocabulary=vocabulary, provenance={**cloud.provenance, "stages": stages})
+    with timed(stages, "write file"):
+        arguments.output.parent.mkdir(parents=True, exist_ok=True)
+        write_bundle(cloud, arguments.output)
+    print_import(describe_fit(cloud, arguments.result, arguments.output), cloud)
+
+
+def vocabulary_of(cloud: LabelledCloud, path: Path | None) -> Vocabulary | None:
+    """The words of a text-features file, None without one; FeatureSpaceError unless the cloud can be asked them."""
+    if path is None:
+        return None
+    from og_pointcloud.text_features import UNKNOWN_SPACE, read_text_features
+
+    vocabulary, feature_space = read_text_features(path)
+    spaces = {feature_space, cloud.feature_space}
+    width, expected = vocabulary.vectors.shape[1], cloud.instances.descriptors.shape[1]
+    if (len(spaces) > 1 and UNKNOWN_SPACE not in spaces) or width != expected:
+        raise FeatureSpaceError(
+            f"{path} is of feature space '{feature_space}' (width {width}), the leaves are of '{cloud.feature_space}' "
+            f"(width {expected}): encode the names with the leaves' model, or name their space (--feature-space)"
+        )
+    return vocabulary
+
+
+def run_pick(arguments: argparse.Namespace) -> None:
+    check_outputs(
+        {"-o": (arguments.output, [".png"])},
+        inputs=[arguments.bundle, arguments.capture, arguments.text_features],
+    )
+    from og_pointcloud.picking import pick
+    from og_pointcloud.runtime import load
+
+    uses_view = arguments.pixel is not None or arguments.output is not None
+    if uses_view and not (arguments.capture and arguments.view):
+        raise OgPointcloudError("--pixel and -o need a camera: name it with --capture CAPTURE --view NAME")
+    scene = load(arguments.bundle)
+    camera = world_camera(arguments.capture, arguments.view) if uses_view else None
+    if arguments.pixel is not None and camera is not None:
+        hit = pick(scene, camera, numbers(arguments.pixel, "--pixel", 2))
+    else:
+        hit = pick(scene, numbers(arguments.xyz, "--xyz", 3))
+    words = []
+    if hit.found and (scene.vocabulary or arguments.text_features):
+        words = hit.words(text_features=arguments.text_features)
+    mask_pixels = None
+    if arguments.output and camera is not None:
+        mask = hit.mask(camera)
+        mask_pixels = int(mask.sum())
+        write_mask(arguments.output, mask)
+    report = describe_pick(hit, words, arguments.output, mask_pixels)
+    if arguments.json:
+        print(json.dumps(report, indent=2, ensure_ascii=False))
+    else:
+        print_pick(report)
+
+
+def numbers(text: str, option: str, count: int) -> list[float]:
+    try:
+        values = [float(part) for part in text.split(",")]
+    except ValueError:
+        values = []
+    if len(values) != count:
+        raise OgPointcloudError(f"{option} is '{text}'; expected {count} numbers with commas between them")
+    return values
+
+
+def world_camera(capture: Path, name: str) -> Camera:
+    from og_pointcloud.formats.capture import read_capture
+    from og_pointcloud.picking import in_world
+
+    scene = read_capture(capture)
+    cameras = {view.name: view.camera for view in scene.views}
+    if name not in cameras:
+        raise OgPointcloudError(
+            f"--view is '{name}', which is not among the {len(cameras)} views of {capture}{did_you_mean(name, cameras)}"
+        )
+    return in_world(cameras[name], scene.points.origin)
+
+
+def write_mask(path: Path, mask: NDArray[np.bool_]) -> None:
+    """A grey PNG, 255 inside."""
+    from og_pointcloud._atomic import replacing
+    from og_pointcloud.formats.images import require_cv2
+
+    png = require_cv2().imencode(".png", mask.astype("uint8") * 255)[1]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(path) as file:
+        file.write(png.tobytes())
+
+
+def run_view(arguments: argparse.Namespace) -> None:
+    output = arguments.output or Path("features.png" if arguments.features else "instances.png")
+    check_outputs({"-o": (output, [".png"])}, inputs=[arguments.capture, arguments.instances])
+    if arguments.columns < 1:
+        raise OgPointcloudError(f"--columns is {arguments.columns}; expected at least 1")
+    from og_pointcloud import pictures
+    from og_pointcloud.fit import Journal, prepare
+    from og_pointcloud.formats.capture import read_capture
+    from og_pointcloud.geometry import near_plane
+
+    stages: list[dict[str, Any]] = []
+    with timed(stages, "read capture"):
+        scene = read_capture(arguments.capture)
+        near = near_plane(scene.points.xyz, scene.views)
+    output.parent.mkdir(parents=True, exist_ok=True)
+    with timed(stages, "prepare"):
+        prepared = prepare(scene, journal=Journal(progress=sys.stderr.isatty()))
+    if arguments.features:
+        with timed(stages, "learn"):
+            features = pictures.learned_stages(prepared.table, scene.points.xyz, seed=arguments.seed)
+        with timed(stages, "draw"):
+            pictures.feature_picture(prepared.gaussians, scene.views, near, features, output, arguments.columns)
+    else:
+        ids = instances_of(arguments.instances, scene)
+        with timed(stages, "draw"):
+            pictures.instance_picture(prepared.gaussians, scene.views, near, ids, output, arguments.columns)
+    print_table(("stage", "seconds"), [(stage["name"], f"{stage['seconds']:.2f}") for stage in stages])
+    print(f"wrote {output}")
+
+
+def instances_of(bundle: Path, scene: Scene) -> dict[str, NDArray[np.int32]]:
+    from og_pointcloud.bundle import read_bundle
+
+    cloud = read_bundle(bundle).cloud
+    if len(cloud) != len(scene.points):
+        raise OgPointcloudError(
+            f"{bundle} has {len(cloud)} points, the capture {len(scene.points)}; expected a fit of this capture"
+        )
+    return {f"{len(cloud.instances)} instances": cloud.instance_ids}
 
 
 def run_info(arguments: argparse.Namespace) -> None:

@@ -9,16 +9,21 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from og_pointcloud.cloud import LabelledCloud
+    from og_pointcloud.picking import Pick
     from og_pointcloud.runtime import LabelledScene
     from og_pointcloud.segmentation import Segmentation
 
 __all__ = [
     "describe_bundle",
     "describe_fit",
+    "describe_pick",
     "describe_segmentation",
     "print_fit",
+    "print_import",
     "print_info",
+    "print_pick",
     "print_segmentation",
+    "print_table",
 ]
 
 SHOWN = 12
@@ -57,6 +62,13 @@ def print_fit(report: Mapping[str, Any], cloud: LabelledCloud) -> None:
     )
     print(f"wrote {report['output']} ({report['bytes'] / 1e6:.1f} MB)")
     print(f"next: {next_segment_command(report['output'], cloud)}")
+
+
+def print_import(report: Mapping[str, Any], cloud: LabelledCloud) -> None:
+    """What ``import`` closes with: the files it found, and the rest as ``fit``."""
+    for file in report["files"].values():
+        print(f"read {file}")
+    print_fit(report, cloud)
 
 
 def next_segment_command(bundle: str, cloud: LabelledCloud) -> str:
@@ -110,6 +122,35 @@ def print_segmentation(report: Mapping[str, Any]) -> None:
     else:
         command = ["og-pointcloud", "segment", report["bundle"], "-o", str(Path(report["bundle"]).with_suffix(".ply"))]
         print(f"next: keep the labels with -o, e.g. {shlex.join(command)}")
+
+
+def describe_pick(
+    hit: Pick, words: Sequence[tuple[str, float]], mask: Path | None, mask_pixels: int | None
+) -> dict[str, Any]:
+    """What ``pick --json`` prints: the instance, or why there is none, and where the click hit."""
+    return {
+        "instance": hit.instance,
+        "found": hit.found,
+        "what": str(hit),
+        "point": hit.point,
+        "xyz_world": None if hit.xyz_world is None else hit.xyz_world.tolist(),
+        "points": len(hit.point_indices) if hit.found else 0,
+        "words": [{"name": name, "score": round(score, 4)} for name, score in words],
+        "mask": str(mask) if mask else None,
+        "mask_pixels": mask_pixels,
+    }
+
+
+def print_pick(report: Mapping[str, Any]) -> None:
+    """What was hit and where, the words that fit it best, and the mask."""
+    print(report["what"])
+    if report["xyz_world"]:
+        print(f"hit at {', '.join(f'{value:.6g}' for value in report['xyz_world'])} (point {report['point']})")
+    if report["words"]:
+        best = [f"{word['name']} {word['score']:.2f}" for word in report["words"][:SHOWN]]
+        print(f"best words: {', '.join(best)}{', ...' if len(report['words']) > SHOWN else ''}")
+    if report["mask"]:
+        print(f"wrote {report['mask']} ({report['mask_pixels']:,} pixels)")
 
 
 def describe_bundle(scene: LabelledScene, path: Path) -> dict[str, Any]:

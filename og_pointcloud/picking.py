@@ -29,8 +29,9 @@ from og_pointcloud.words import Labels, TextFeatures, resolve_labels
 
 __all__ = ["Pick", "front_points", "in_world", "pick"]
 
-FOOTPRINT = 1.5
-"""Radius of a point's disc in point spacings: on a surface sampled at random it leaves about 2 % of the pixels open."""
+FOOTPRINT = 1.0
+"""Radius of a point's disc in point spacings. An evenly sampled surface is closed from 0.71 on; of one sampled at
+random a sixth stays open at 1. Wider discs make masks fatter: 1.5 costs up to 0.06 of IoU on noisy RGB-D clouds."""
 NEAR = 1.0
 """Depth of the near plane in point spacings: nearer points would cover half the image each."""
 NEIGHBOURS = 9
@@ -116,7 +117,9 @@ class Pick:
 
     def _require_instance(self) -> None:
         if not self.found:
-            raise OgPointcloudError(f"the click hit {self}, so it selects no points: check found, or click elsewhere")
+            raise OgPointcloudError(
+                f"the click hit {self}; expected an instance (where `found` is true): click elsewhere"
+            )
 
 
 @overload

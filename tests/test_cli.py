@@ -18,8 +18,12 @@ from conftest import (
     write_ply,
     write_tiny_capture,
 )
+from test_opengaussian import WIDTH as LEAF_WIDTH
+from test_opengaussian import write_result
 
+from og_pointcloud.bundle import read_bundle
 from og_pointcloud.cli import main
+from og_pointcloud.formats.capture import read_capture
 from og_pointcloud.formats.ply import read_ply
 
 
@@ -147,6 +151,13 @@ def test_interrupt_leaves_nothing(tiny_capture, tmp_path, capsys, monkeypatch):
         (("fit", "capture", "-o", "s.ogpc", "--json", "s.ogpc"), "expected a name that ends in .json"),
         (("segment", "s.ogpc", "-o", "labels.csv"), "ends in .npz or .ply"),
         (("segment", "absent.ogpc"), "is not a file"),
+        (("pick", "s.ogpc"), "one of the arguments --xyz --pixel is required"),
+        (("pick", "s.ogpc", "--pixel", "3,4"), "--capture CAPTURE --view NAME"),
+        (("pick", "s.ogpc", "--xyz", "1,2,3", "-o", "mask.png"), "--capture CAPTURE --view NAME"),
+        (("pick", "s.ogpc", "--xyz", "1,2,3", "-o", "mask.jpg"), "ends in .png"),
+        (("view", "capture"), "one of the arguments --features --instances is required"),
+        (("view", "capture", "--features", "--columns", "0"), "--columns is 0"),
+        (("import", "absent", "-o", "s.ogpc"), "is not a file; expected a result folder"),
     ],
 )  # fmt: skip
 def test_bad_use_is_one_line(arguments, text, capsys):
@@ -303,3 +314,102 @@ def test_unknown_and_repeated_labels(fitted, capsys):
     assert "did you mean 'red ball'" in error_of(capsys, "segment", bundle, "--labels", "red bal")
     assert "twice" in error_of(capsys, "segment", bundle, "--labels", "lamp,lamp")
     assert "0 labels" in error_of(capsys, "segment", bundle, "--labels", " , ")
+
+
+def views_of(capture):
+    """(name, the middle of each mask in pixels, the mask map) of every view."""
+    scene = read_capture(capture.folder)
+    for view in scene.views:
+        ids = view.mask_map()
+        yield view.name, [np.argwhere(ids == mask).mean(axis=0)[::-1] for mask in range(view.mask_count)], ids
+
+
+def test_a_pixel_selects_the_ball_it_shows(fitted, tmp_path, capsys):
+    capture, bundle = fitted
+    cloud = read_bundle(bundle).cloud
+    name, middles, ids = next(views_of(capture))
+    picked = set()
+    for mask, (u, v) in enumerate(middles):
+        output = tmp_path / f"{mask}.png"
+        click = ("--capture", capture.folder, "--view", name, "--pixel", f"{u},{v}", "-o", output)
+        code, stdout, _ = run(capsys, "pick", bundle, *click, "--json")
+        report = json.loads(stdout)
+        assert code == 0
+        assert report["found"]
+        truth = capture.object_ids[cloud.instance_ids == report["instance"]]
+        ball = int(capture.object_ids[report["point"]])
+        assert (truth == ball).mean() > 0.95
+        assert report["words"][0]["name"] == NAMES[ball]
+        drawn = cv2.imread(str(output), cv2.IMREAD_GRAYSCALE) == 255
+        assert drawn.shape == ids.shape
+        assert drawn.sum() == report["mask_pixels"]
+        # Points lie 4 px apart: a mask is up to that much fatter than what it shows, and hides as much behind it.
+        hidden_by_other = cv2.dilate((ids == 1 - mask).astype(np.uint8), np.ones((11, 11))) > 0
+        assert drawn[(ids == mask) & ~hidden_by_other].all()
+        assert not drawn[cv2.dilate((ids == mask).astype(np.uint8), np.ones((11, 11))) == 0].any()
+        picked.add(ball)
+    assert picked == {0, 1}
+
+
+def test_a_place_selects_the_ball_it_is_on(fitted, capsys):
+    _, bundle = fitted
+    code, stdout, _ = run(capsys, "pick", bundle, "--xyz", "-0.6,0,1.0")
+    assert code == 0
+    assert stdout.startswith("instance ")
+    assert "best words: red ball 1.00" in stdout
+    assert run(capsys, "pick", bundle, "--xyz", "9,9,9")[1] == "no point of the scene\n"
+
+
+def test_clicks_that_give_no_mask(fitted, tmp_path, capsys):
+    capture, bundle = fitted
+    click = ("--capture", capture.folder, "--view", "view0", "-o", tmp_path / "mask.png")
+    assert "the click hit" in error_of(capsys, "pick", bundle, *click, "--pixel", "1,1")
+    assert "expected a pixel" in error_of(capsys, "pick", bundle, *click, "--pixel", "120,1")
+    assert "2 numbers" in error_of(capsys, "pick", bundle, *click, "--pixel", "a,b")
+    click = ("--capture", capture.folder, "--view", "vew0", "-o", tmp_path / "mask.png")
+    assert "did you mean 'view0'" in error_of(capsys, "pick", bundle, *click, "--pixel", "1,1")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_pictures_of_features_and_of_instances(fitted, tmp_path, capsys):
+    capture, bundle = fitted
+    for what in (("--features",), ("--instances", bundle)):
+        output = tmp_path / f"new{what[0]}" / "p.png"
+        code, stdout, _ = run(capsys, "view", capture.folder, *what, "-o", output, "--columns", "3")
+        assert code == 0
+        assert f"wrote {output}" in stdout
+        sheet = cv2.imread(str(output))
+        rows = 4 if what == ("--features",) else 2
+        assert sheet.shape[0] > rows * HEIGHT
+        assert 3 * WIDTH < sheet.shape[1] < 4 * WIDTH
+    other = write_tiny_capture(tmp_path / "other")
+    write_ply(other.folder / "points.ply", *[part[:900] for part in (sample_surfaces()[0], COLOURS[other.object_ids])])
+    error = error_of(capsys, "view", other.folder, "--instances", bundle, "-o", tmp_path / "i.png")
+    assert "expected a fit of this capture" in error
+
+
+def test_results_of_opengaussian_can_be_asked(tmp_path, capsys):
+    write_result(tmp_path / "run")
+    words = tmp_path / "words.npz"
+    vectors = np.eye(2, LEAF_WIDTH, dtype=np.float32)
+    np.savez(words, names=np.array(["cup", "lid"]), vectors=vectors, feature_space=np.array("their space"))
+    bundle = tmp_path / "new" / "run.ogpc"
+    arguments = ("import", tmp_path / "run", "-o", bundle, "--feature-space", "their space", "--text-features", words)
+    code, stdout, _ = run(capsys, *arguments)
+    assert code == 0
+    assert "iteration_90000" in stdout
+    assert "in 4 instances" in stdout
+    assert "2 of 4 instances have no feature" in stdout
+    command = next(line for line in stdout.splitlines() if line.startswith("next: og-pointcloud "))
+    assert run(capsys, *shlex.split(command)[2:])[0] == 0, "the next command must work as printed"
+    assert run(capsys, "info", bundle)[0] == 0
+    error = error_of(capsys, *arguments[:5], "another space", *arguments[6:])
+    assert "encode the names with the leaves' model" in error
+
+
+def test_import_leaves_nothing_of_a_damaged_result(tmp_path, capsys):
+    write_result(tmp_path / "run")
+    path = tmp_path / "run" / "cluster_lang.npz"
+    path.write_bytes(path.read_bytes()[:500])
+    assert "cannot be read" in error_of(capsys, "import", tmp_path / "run", "-o", tmp_path / "new" / "s.ogpc")
+    assert not (tmp_path / "new").exists()

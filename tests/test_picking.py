@@ -1,6 +1,8 @@
 """Clicks select instances: the drawing against loops over pixels and points, invariances, and every kind of miss."""
 
 import itertools
+import subprocess
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -258,6 +260,23 @@ def test_words_are_ranked_as_segment_scores_them():
     assert hit.words({"it": 3 * unit_rows(9)[2]})[0][0] == "it"
     with pytest.raises(FeatureSpaceError, match="width 3"):
         hit.words({"narrow": np.ones(3)})
+
+
+def test_picking_works_on_the_base_install(tmp_path):
+    og.write_bundle(room(), tmp_path / "room.ogpc")
+    heavy = ("torch", "open3d", "pyvista", "cv2", "numba", "scipy", "onnx", "tqdm")
+    code = f"""
+import sys
+sys.modules.update(dict.fromkeys({heavy}))
+import numpy as np, og_pointcloud as og
+scene = og.load(sys.argv[1])
+camera = og.Camera(64, 48, 40, 40, 32, 24, np.array([[1, 0, 0, -1], [0, 0, -1, 1], [0, 1, 0, 3], [0, 0, 0, 1.0]]))
+hit = og.pick(scene, camera, (20, 24))
+assert hit.found, hit
+assert hit.mask(camera)[24, 20] and len(hit.words()) == 5, (hit, hit.words())
+assert og.pick(scene, hit.xyz_world).point == hit.point
+"""
+    subprocess.run([sys.executable, "-c", code, str(tmp_path / "room.ogpc")], check=True, timeout=60)
 
 
 def test_unknown_scenes_are_refused():
