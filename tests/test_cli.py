@@ -405,6 +405,8 @@ def test_results_of_opengaussian_can_be_asked(tmp_path, capsys):
     assert run(capsys, "info", bundle)[0] == 0
     error = error_of(capsys, *arguments[:5], "another space", *arguments[6:])
     assert "encode the names with the leaves' model" in error
+    np.savez(words, names=np.array(["cup"]), vectors=np.ones((1, 3)))
+    assert "(width 3), the leaves are of 'their space' (width 8)" in error_of(capsys, *arguments)
 
 
 def test_import_leaves_nothing_of_a_damaged_result(tmp_path, capsys):

@@ -8,7 +8,7 @@ import pytest
 
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats import opengaussian
-from og_pointcloud.formats.gaussian_ply import BASE_COLOR, LOG_SCALE, ROTATION
+from og_pointcloud.formats.gaussian_ply import BASE_COLOR, LOG_SCALE, ROTATION, read_gaussian_ply
 from og_pointcloud.formats.langsplat import LANGSPLAT_SPACE
 from og_pointcloud.formats.opengaussian import read_opengaussian
 from og_pointcloud.formats.ply import join_columns, write_ply
@@ -78,6 +78,8 @@ def test_leaves_become_instances(tmp_path):
     assert table.views.tolist() == table.masks.tolist() == arrays["occu_count"][used].tolist()
     assert np.allclose(table.agreement, np.clip(arrays["leaf_score"][used], -1, 1))
     assert cloud.feature_space == "a space"
+    ply = tmp_path / "point_cloud" / "iteration_90000" / "point_cloud.ply"
+    assert np.array_equal(cloud.rgb, read_gaussian_ply(ply).rgb[kept])
     assert cloud.provenance["notes"] == {"leaves": LEAVES, "instances": 4, "instances_without_feature": 2}
 
 

@@ -271,10 +271,12 @@ sys.modules.update(dict.fromkeys({heavy}))
 import numpy as np, og_pointcloud as og
 scene = og.load(sys.argv[1])
 camera = og.Camera(64, 48, 40, 40, 32, 24, np.array([[1, 0, 0, -1], [0, 0, -1, 1], [0, 1, 0, 3], [0, 0, 0, 1.0]]))
-hit = og.pick(scene, camera, (20, 24))
-assert hit.found, hit
-assert hit.mask(camera)[24, 20] and len(hit.words()) == 5, (hit, hit.words())
-assert og.pick(scene, hit.xyz_world).point == hit.point
+x, y, z = scene.xyz[np.flatnonzero(scene.instance_ids == 5)[0]]
+u, v = 40 * (x - 1) / (y + 3) + 32, 40 * (1 - z) / (y + 3) + 24
+hit = og.pick(scene, camera, (u, v))
+assert hit.point is not None and og.pick(scene, hit.xyz_world).point == hit.point
+hit = og.pick(scene, (x, y, z))
+assert hit.instance == 5 and hit.mask(camera).any() and len(hit.words()) == 5
 """
     subprocess.run([sys.executable, "-c", code, str(tmp_path / "room.ogpc")], check=True, timeout=60)
 

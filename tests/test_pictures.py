@@ -103,6 +103,24 @@ def test_points_without_weight_or_feature_are_grey_and_move_nothing():
     assert (colors[100:] == GREY).all()
 
 
+def test_weights_count_as_repetitions_and_skewed_values_use_the_whole_range():
+    random = np.random.default_rng(5)
+    features, times = random.exponential(size=(300, 6)) ** 2, random.integers(0, 5, 300)
+    repeated = np.repeat(features, times, axis=0)
+    assert np.array_equal(
+        np.repeat(feature_colors(features, times), times, axis=0), feature_colors(repeated, np.ones(len(repeated)))
+    )
+    widest = np.sort(feature_colors(repeated, np.ones(len(repeated)))[:, 0])
+    assert widest[0] == 0
+    assert widest[-1] == 255
+    assert 0 < (widest == 0).mean() < 0.04
+    assert 0 < (widest == 255).mean() < 0.04
+
+
+def test_a_cloud_that_no_view_sees_is_grey():
+    assert (feature_colors(np.random.default_rng(6).normal(size=(9, 6)), np.zeros(9)) == GREY).all()
+
+
 @pytest.mark.parametrize("features", [np.ones((5, 6)), np.ones((1, 6)), np.zeros((0, 6)), np.full((3, 6), np.nan)])
 def test_features_that_are_all_one_are_mid_grey(features):
     colors = feature_colors(features, np.ones(len(features)))
