@@ -194,6 +194,10 @@ def _instances(manifest: dict[str, Any], members: dict[str, bytes], count: int) 
     def column(name: str, dtype: str, length: int = count) -> NDArray[Any]:
         return _array(members, f"arrays/instances/{name}.npy", (dtype,), (length,))
 
+    def hierarchy(name: str) -> NDArray[np.int32]:
+        """Files from before there was one have none."""
+        return column(name, "<i4") if f"arrays/instances/{name}.npy" in members else np.zeros(0, np.int32)
+
     return InstanceTable(
         descriptors=descriptors,
         descriptor_instance=column("descriptor_instance", "<i4", len(descriptors)),
@@ -202,6 +206,8 @@ def _instances(manifest: dict[str, Any], members: dict[str, bytes], count: int) 
         masks=column("masks", "<i4"),
         agreement=column("agreement", "<f4"),
         visible_area=column("visible_area", "<f4"),
+        coarse=hierarchy("coarse"),
+        whole=hierarchy("whole"),
     )
 
 

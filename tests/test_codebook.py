@@ -281,7 +281,7 @@ def test_unit_and_place_of_the_scene_do_not_matter() -> None:
 def test_outliers_do_not_set_the_extent() -> None:
     _, xyz, thing, _ = room()
     xyz[[5, 700]] = [[1e5, 0, 0], [0, -1e5, 0]]
-    codebook = build(CodebookSettings(k1=10, levels=1), xyz=xyz)
+    codebook = build(CodebookSettings(levels=1), xyz=xyz)
     plain = np.ones(len(thing), bool)
     plain[[5, 700]] = False
     assert same_partition(codebook.leaf[plain], thing[plain])

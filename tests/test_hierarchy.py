@@ -2,18 +2,27 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 import pytest
+from labelled_clouds import room
 from numpy.typing import NDArray
+from og_pointcloud_export import write_bundle
+from test_bundle import changed, npy
 from test_grouping import ONE, OTHER, HandView, hand_table
 
+from og_pointcloud.bundle import read_bundle
 from og_pointcloud.cloud import InstanceTable
-from og_pointcloud.errors import OgPointcloudError
+from og_pointcloud.errors import BundleError, OgPointcloudError
 from og_pointcloud.hierarchy import part_of
 
 MUG, HANDLE, TABLE = range(60), range(60, 80), range(80, 200)
 IDS = np.repeat([0, 1, 2], [60, 20, 120]).astype(np.int32)
 WHOLE_MUG = [*MUG, *HANDLE]
+WHOLE = "arrays/instances/whole.npy"
 TOGETHER: HandView = [(WHOLE_MUG, ONE), (TABLE, OTHER)]
 APART: HandView = [(MUG, ONE), (HANDLE, ONE), (TABLE, OTHER)]
 
@@ -77,6 +86,37 @@ def test_a_chain_names_the_nearest_whole() -> None:
     assert wholes([*views, everything, everything], [*owners, 2, 2]) == [2, 0, -1]
 
 
+def test_of_two_wholes_the_one_that_holds_it_more_often_is_named() -> None:
+    """The table holds the handle in all 4 views that have a mask of the table, the mug in 6 of 7."""
+    on_table: HandView = [([*HANDLE, *TABLE], OTHER)]
+    views = [[(WHOLE_MUG, ONE)]] * 6 + [on_table] * 4 + [[(MUG, ONE), (HANDLE, ONE)]]
+    assert wholes(views, [0] * 6 + [2] * 4 + [0, 1]) == [-1, 2, -1]
+
+
+def test_of_wholes_that_hold_it_as_often_the_smallest_is_named() -> None:
+    on_table: HandView = [([*HANDLE, *TABLE], OTHER)]
+    views = [[(WHOLE_MUG, ONE)]] * 4 + [on_table] * 4 + [[(HANDLE, ONE)]]
+    assert wholes(views, [0] * 4 + [2] * 4 + [1]) == [-1, 0, -1]
+
+
+def test_a_mask_with_less_than_half_of_it_does_not_hold_it() -> None:
+    a_third: HandView = [([*MUG, *range(60, 67)], ONE)]
+    assert wholes([a_third] * 5 + [APART], [0] * 5 + [0, 1, 2]) == [-1, -1, -1]
+
+
+def test_a_view_that_hardly_sees_the_whole_says_nothing() -> None:
+    """A mask over the handle and two points of the mug, of which that view sees no more."""
+    sliver: HandView = [([0, 1, *HANDLE], ONE)]
+    views, unseen = [sliver] * 2 + [APART] * 3, [range(2, 60)] * 2 + [()] * 3
+    assert wholes(views, [0] * 2 + [0, 1, 2] * 3, unseen) == [-1, -1, -1]
+
+
+def test_a_view_that_hardly_sees_the_part_says_nothing() -> None:
+    glimpse: HandView = [([*MUG, 60], ONE)]
+    views, unseen = [glimpse] * 2 + [APART] * 3, [range(61, 80)] * 2 + [()] * 3
+    assert wholes(views, [0] * 2 + [0, 1, 2] * 3, unseen) == [-1, -1, -1]
+
+
 def test_order_and_numbers_do_not_matter() -> None:
     swapped = np.array([1, 0, 2], np.int32)[IDS]
     assert wholes([TOGETHER] * 4 + [APART] * 2, [1, 2] * 4 + [1, 0, 2] * 2, ids=swapped) == [1, -1, -1]
@@ -132,3 +172,30 @@ def test_a_table_keeps_its_hierarchy() -> None:
 def test_a_hierarchy_that_is_none_is_refused(coarse: list[int] | None, whole: list[int] | None, message: str) -> None:
     with pytest.raises(OgPointcloudError, match=message):
         instances(coarse, whole)
+
+
+def test_the_hierarchy_comes_back_from_its_file(tmp_path: Path) -> None:
+    cloud = room(200)
+    coarse, whole = np.arange(9, dtype=np.int32) // 2, np.array([3, -1, 3, 8, -1, -1, 0, -1, -1], np.int32)
+    related = replace(cloud, instances=replace(cloud.instances, coarse=coarse, whole=whole))
+    back = read_bundle(write_bundle(related, tmp_path / "room.ogpc")).cloud.instances
+    np.testing.assert_array_equal(back.coarse, coarse)
+    np.testing.assert_array_equal(back.whole, whole)
+    assert back.coarse.dtype == back.whole.dtype == np.int32
+
+
+def test_files_without_a_hierarchy_are_read_and_damaged_ones_refused(tmp_path: Path) -> None:
+    file = write_bundle(room(200), tmp_path / "room.ogpc")
+
+    def without(manifest: dict[str, Any], members: dict[str, bytes]) -> None:
+        for name in ("coarse", "whole"):
+            del members[f"arrays/instances/{name}.npy"], manifest["members"][f"arrays/instances/{name}.npy"]
+
+    old = read_bundle(changed(file, tmp_path / "old.ogpc", without)).cloud.instances
+    np.testing.assert_array_equal(old.whole, np.full(9, -1))
+    np.testing.assert_array_equal(old.coarse, np.full(9, -1))
+    for bad, says in ((np.arange(9, dtype=np.int32), "a part of itself"), (np.zeros(8, np.int32), "whole.npy")):
+        put = npy(bad)
+        path = changed(file, tmp_path / "bad.ogpc", lambda _, members, data=put: members.update({WHOLE: data}))
+        with pytest.raises(BundleError, match=says):
+            read_bundle(path)

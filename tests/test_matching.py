@@ -110,6 +110,24 @@ def test_alone_is_visible_where_nothing_is_in_front() -> None:
     np.testing.assert_allclose(alone.instance_area, visible.instance_area, rtol=0.1)
 
 
+def test_alone_compares_the_map_with_the_filled_mask_pixel_by_pixel() -> None:
+    """The paper's distance: blended feature against the mask's, mean over the pixels of both."""
+    gaussians = wall((-0.4, 0.2), 1.0)
+    masks = np.full((37, 50), -1, np.int32)
+    masks[12:20, 20:44] = 0
+    view = View("v", camera(), masks, np.ones((1, 3), np.float32))
+    ids = np.zeros(len(gaussians), np.int32)
+    feature, of_mask = np.array([0.9, 0.3]), np.array([0.8, 0.4])
+    evidence = alone_evidence(gaussians, [view], NEAR, ids, feature[None], of_mask[None])
+    alpha = pixel_weights(gaussians, camera(), NEAR).toarray().astype(np.float64).sum(axis=1)
+    common = alpha[(alpha > 0.7) & (masks.ravel() == 0)]
+    distance = np.abs(common[:, None] * feature - of_mask).sum(axis=1).mean()
+    np.testing.assert_allclose(evidence.distance, [[distance]], rtol=1e-5)
+    assert evidence.shared[0, 0] == len(common) > 0
+    assert evidence.mask_area[0] == 8 * 24
+    assert evidence.instance_area[0, 0] == (alpha > 0.7).sum()
+
+
 def test_alone_sees_through_what_is_in_front() -> None:
     """A hidden wall fills the mask of the one before it: IoU cannot tell, the feature can, and true visibility can."""
     front, behind = wall((-0.4, 0.4), 1.0), wall((-0.8, 0.8), 2.0)
@@ -166,6 +184,14 @@ def test_an_instance_without_an_accepted_mask_has_no_descriptor() -> None:
     assert result.instances.agreement[1] == 0
 
 
+def test_a_mask_that_several_accept_is_of_the_best() -> None:
+    """Of a mask of 6 points one instance has 2, the other 4; whichever comes first."""
+    for ids in ([0, 0, 1, 1, 1, 1], [0, 0, 0, 0, 1, 1]):
+        result = match([[(range(6), ONE)]], ids)
+        np.testing.assert_array_equal(result.instances.masks, [1, 1])
+        np.testing.assert_array_equal(result.mask_instance, [np.argmax(np.bincount(ids))])
+
+
 def test_few_views_are_not_enough_where_more_are_asked() -> None:
     views: list[HandView] = [[([0, 1], ONE), ([2, 3], OTHER)], [([0, 1], ONE)]]
     result = match(views, [0, 0, 1, 1], MatchingSettings(min_views=2))
@@ -186,6 +212,7 @@ def test_masks_without_a_feature_are_evidence_but_describe_nothing() -> None:
     result = match([[([0, 1], NOTHING)], [([0, 1], ONE)]], [0, 0])
     np.testing.assert_allclose(result.instances.descriptors, [ONE])
     assert result.instances.masks[0] == 2
+    assert result.instances.agreement[0] == pytest.approx(1)
     nothing = match([[([0, 1], NOTHING)]], [0, 0])
     assert nothing.instances.descriptors.shape == (0, 8)
 
