@@ -53,6 +53,7 @@ __all__ = [
     "cohesion_factor",
     "learn_features",
     "masked_gram",
+    "raw_gradient",
     "read_features",
 ]
 
@@ -196,6 +197,11 @@ def read_features(raw: NDArray[np.floating], normalise: bool) -> NDArray[np.floa
     A zero row has no direction; normalised, it reads 0.5.
     """
     return _read(raw, normalise, _columns(raw))
+
+
+def raw_gradient(raw: NDArray[np.floating], gradient: NDArray[np.floating], normalise: bool) -> NDArray[np.floating]:
+    """The gradient by raw features (n, width), of the one by what `read_features` makes of them."""
+    return _raw_gradient(raw, gradient, normalise, _columns(raw))
 
 
 def _closest_shares(settings: FeatureSettings) -> list[float]:
@@ -351,7 +357,7 @@ class _Descent:
     def _evaluate(self, raw: NDArray[np.float32], closest: float) -> tuple[Terms, NDArray[np.float32]]:
         normalise = self.problem.settings.normalise
         terms = self.problem.terms(read_features(raw, normalise), closest)
-        return terms, _raw_gradient(raw, terms.gradient, normalise, _columns(raw))
+        return terms, raw_gradient(raw, terms.gradient, normalise)
 
     def _step(
         self, gradient: NDArray[np.float32], pairs: list[tuple[NDArray[np.float32], NDArray[np.float32], float]]
@@ -464,7 +470,6 @@ def _read(raw, normalise, columns):  # noqa: ANN001, ANN202
 
 @njit(cache=True, parallel=True)
 def _raw_gradient(raw, gradient, normalise, columns):  # noqa: ANN001, ANN202
-    """The gradient by raw features, of the one by read features."""
     pulled = np.empty_like(raw)
     for g in prange(len(raw)):
         square, along = 0.0, 0.0

@@ -13,7 +13,7 @@ from scipy.sparse import csr_array, random_array, vstack
 
 from og_pointcloud import features
 from og_pointcloud.errors import OgPointcloudError, SceneError
-from og_pointcloud.features import FeatureObjective, MaskGram, learn_features, masked_gram, read_features
+from og_pointcloud.features import FeatureObjective, MaskGram, learn_features, masked_gram, raw_gradient, read_features
 from og_pointcloud.fit import prepare
 from og_pointcloud.formats.capture import read_capture
 from og_pointcloud.settings import FeatureSettings
@@ -190,7 +190,7 @@ def test_gradient_by_raw_features_equals_the_automatic_one(normalise: bool) -> N
     (read * torch.tensor(by_read)).sum().backward()
     assert f.grad is not None
     np.testing.assert_allclose(read_features(raw, normalise), read.detach().numpy(), rtol=1e-14)
-    pulled = features._raw_gradient(raw, by_read, normalise, (0,) * WIDTH)
+    pulled = raw_gradient(raw, by_read, normalise)
     np.testing.assert_allclose(pulled, f.grad.numpy(), rtol=1e-12, atol=1e-14)
 
 

@@ -1,0 +1,222 @@
+"""The published training: its losses against the full-batch ones and literal loops, and what its stages must do."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+from conftest import TinyCapture
+from numpy.typing import NDArray
+
+from og_pointcloud.errors import OgPointcloudError, SceneError
+from og_pointcloud.features import FeatureObjective, masked_gram
+from og_pointcloud.fit import prepare
+from og_pointcloud.formats.capture import read_capture
+from og_pointcloud.scene import View
+from og_pointcloud.settings import FeatureSettings, PaperSettings
+from og_pointcloud.visibility import Gaussians, mask_table
+
+torch = pytest.importorskip("torch")
+paper = pytest.importorskip("og_pointcloud.paper")
+
+NEAR = 0.05
+SHORT = PaperSettings(schedule_share=0.01, covered_share=0.3, feature_rate=1e-2, codebook_rate=1e-3, k1=8, k2=3)
+
+
+@dataclass(frozen=True)
+class Balls:
+    gaussians: Gaussians
+    views: Sequence[View]
+    object_ids: NDArray[np.int32]
+
+
+@pytest.fixture
+def balls(tiny_capture: TinyCapture) -> Balls:
+    scene = read_capture(tiny_capture.folder)
+    return Balls(prepare(scene).gaussians, scene.views, tiny_capture.object_ids)
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_the_mean_of_the_rendered_losses_is_the_objective_of_the_mask_table(balls: Balls, dtype: torch.dtype) -> None:
+    """Value and gradient, every pixel of a mask counted: what a random view expects is what the full batch computes."""
+    settings = PaperSettings(formula="paper", covered_share=0)
+    table, gram = (make(balls.gaussians, balls.views, NEAR) for make in (mask_table, masked_gram))
+    problem = FeatureObjective(table, FeatureSettings(cohesion="rendered"), gram)
+    values = np.random.default_rng(0).random((len(balls.gaussians), 6), np.float32)
+    terms = problem.terms(values[problem.shown].astype(np.float64), paper.SMALLEST_DISTANCE)
+
+    source = paper._Views(balls.gaussians, balls.views, NEAR, settings, whole=False)
+    features = torch.tensor(values, dtype=dtype, requires_grad=True)
+    loss = torch.zeros((), dtype=dtype)
+    for view in source:
+        image = paper._Blend.apply(features, view.forward.to(dtype), view.backward.to(dtype))
+        separation, cohesion = paper.view_losses(image, view.mask, settings)
+        loss = loss + (separation + 10 * cohesion / source.masked_pixels) / len(source)
+    loss.backward()
+    assert features.grad is not None
+    tolerance = 1e-6 if dtype == torch.float64 else 1e-4  # A and S are float32 in both
+    assert loss.item() == pytest.approx(terms.objective, rel=tolerance)
+    ours, largest = features.grad.numpy()[problem.shown], np.abs(terms.gradient).max()
+    np.testing.assert_allclose(ours, terms.gradient, rtol=0, atol=tolerance * largest)
+
+
+def test_blend_has_the_gradient_of_a_dense_product(balls: Balls) -> None:
+    view = paper._Views(balls.gaussians, balls.views[:1], NEAR, SHORT, whole=False)[0]
+    values = torch.rand((len(balls.gaussians), 2), dtype=torch.float64, requires_grad=True)
+    pull = torch.rand((len(view.mask), 2), dtype=torch.float64)
+    dense = torch.tensor(view.weights.toarray(), dtype=torch.float64)
+    image = paper._Blend.apply(values, view.forward.double(), view.backward.double())
+    torch.testing.assert_close(image, dense @ values)
+    (gradient,) = torch.autograd.grad(image, values, pull)
+    torch.testing.assert_close(gradient, dense.T @ pull)
+
+
+def test_reading_has_the_gradient_of_plain_operations() -> None:
+    raw = torch.rand((50, 6), dtype=torch.float64, requires_grad=True)
+    pull = torch.rand((50, 6), dtype=torch.float64)
+    plain = 0.5 + 0.5 * torch.nn.functional.normalize(raw, dim=1)
+    read = paper._read(raw, normalise=True)
+    torch.testing.assert_close(read, plain)
+    torch.testing.assert_close(torch.autograd.grad(read, raw, pull), torch.autograd.grad(plain, raw, pull))
+    assert paper._read(raw, normalise=False) is raw
+
+
+@pytest.mark.parametrize("late", [False, True])
+def test_losses_of_the_authors_pixel_by_pixel(late: bool) -> None:
+    rng = np.random.default_rng(0)
+    image, mask = rng.random((200, 6)), rng.integers(0, 12, 200)
+    separation, cohesion = paper.view_losses(torch.tensor(image), torch.tensor(mask), PaperSettings(), late=late)
+    means = np.array([image[mask == i].mean(axis=0) for i in range(12)])
+    spread = np.mean([np.linalg.norm(image[mask == i] - means[i], axis=1).mean() for i in range(12)])
+    assert cohesion.item() == pytest.approx(spread, rel=1e-5)
+    total = 0.0
+    for i in range(12):
+        near = sorted(1 / (((means[i] - means[j]) ** 2).sum() + 1) for j in range(12) if j != i)
+        weights = [0.1 + 0.9 * rank / 11 for rank in range(1, 12)]
+        total += sum(value * (0.1 if late and w < 0.9 else w) for value, w in zip(near, weights, strict=True))
+    assert separation.item() == pytest.approx(total / (12 * 11), rel=1e-12)
+
+
+def test_equal_means_give_finite_losses_and_gradients() -> None:
+    image = torch.full((20, 6), 0.3, requires_grad=True)
+    mask = torch.arange(20) % 4
+    for formula in ("paper", "authors"):
+        separation, cohesion = paper.view_losses(image, mask, PaperSettings(formula=formula))
+        (gradient,) = torch.autograd.grad(separation + cohesion, image)
+        assert np.isfinite([separation.item(), cohesion.item()]).all()
+        assert torch.isfinite(gradient).all()
+
+
+AS_PRINTED = replace(SHORT, formula="paper", normalise=False, cohesion_weight=3e3, feature_rate=2e-2)
+
+
+@pytest.mark.parametrize("settings", [AS_PRINTED, SHORT], ids=["paper", "authors"])
+def test_both_stages_part_the_balls(balls: Balls, settings: PaperSettings) -> None:
+    trained = paper.train_features(balls.gaussians, balls.views, NEAR, settings)
+    seen = trained.seen > 5
+    assert np.isfinite(trained.features).all()
+    red, blue = (trained.features[seen & (balls.object_ids == ball)] for ball in (0, 1))
+    between = np.linalg.norm(red.mean(axis=0) - blue.mean(axis=0))
+    assert between > 3 * max(np.linalg.norm(ball - ball.mean(axis=0), axis=1).mean() for ball in (red, blue))
+
+    book = paper.train_codebook(balls.gaussians, balls.views, NEAR, trained.features, settings)
+    assert ((book.leaf // settings.k2 == book.coarse) | (book.leaf < 0)).all()
+    np.testing.assert_array_equal(book.leaf >= 0, trained.seen > 0)
+    assert book.centres.shape == (24, 6)
+    sure = seen & (balls.object_ids >= 0)
+    members = np.zeros((24, 2))
+    np.add.at(members, (book.leaf[sure], balls.object_ids[sure]), 1)
+    assert members.max(axis=1).sum() > 0.9 * sure.sum()
+    for leaf in np.unique(book.leaf[book.leaf >= 0]):  # centres are where their features are
+        assert np.abs(book.centres[leaf] - np.median(trained.features[book.leaf == leaf], axis=0)).max() < 0.5
+    assert [stage.steps for stage in (trained.history, *book.histories)] == [200, 200, 200]
+    assert [stage.published_steps for stage in (trained.history, *book.histories)] == [20_000] * 3
+    assert np.mean(trained.history.loss[-20:]) < np.mean(trained.history.loss[:20])
+
+
+def test_training_is_repeatable_and_does_not_depend_on_what_is_kept(balls: Balls) -> None:
+    settings = replace(SHORT, schedule_share=0.001)
+    first = paper.train_features(balls.gaussians, balls.views, NEAR, settings, seed=2)
+    uncached = paper.train_features(balls.gaussians, balls.views, NEAR, replace(settings, cache_bytes=0), seed=2)
+    np.testing.assert_array_equal(first.features, uncached.features)
+    other = paper.train_features(balls.gaussians, balls.views, NEAR, settings, seed=3)
+    assert np.abs(other.features - first.features).max() > 0.1
+    books = [
+        paper.train_codebook(balls.gaussians, balls.views, NEAR, first.features, each, seed=2)
+        for each in (settings, replace(settings, cache_bytes=0))
+    ]
+    np.testing.assert_array_equal(books[0].leaf, books[1].leaf)
+    np.testing.assert_array_equal(books[0].centres, books[1].centres)
+
+
+def test_gaussians_that_no_mask_shows_get_neither_feature_nor_cluster(balls: Balls) -> None:
+    hidden = replace(balls.gaussians, xyz=balls.gaussians.xyz.copy())
+    hidden.xyz[:10] = [0, 0, -50]
+    settings = replace(SHORT, schedule_share=0.0005)
+    trained = paper.train_features(hidden, balls.views, NEAR, settings)
+    book = paper.train_codebook(hidden, balls.views, NEAR, trained.features, settings)
+    assert (trained.seen[:10] == 0).all()
+    assert (trained.features[:10] == 0).all()
+    assert (book.coarse[:10] == -1).all()
+    assert (book.leaf[:10] == -1).all()
+    assert (book.leaf[trained.seen > 0] >= 0).all()
+
+
+def test_fine_clusters_are_at_most_the_masks_held_and_one(balls: Balls) -> None:
+    """Two balls, one coarse cluster: two masks a view, so three leaves of the five allowed."""
+    settings = replace(SHORT, schedule_share=0.0005, k1=1, k2=5)
+    features = np.random.default_rng(0).random((len(balls.gaussians), 6), np.float32)
+    book = paper.train_codebook(balls.gaussians, balls.views, NEAR, features, settings)
+    assert len(np.unique(book.leaf[book.leaf >= 0])) == 3
+    fixed = paper.train_codebook(balls.gaussians, balls.views, NEAR, features, replace(settings, adapt_k2=False))
+    assert len(np.unique(fixed.leaf[fixed.leaf >= 0])) == 5
+
+
+def test_more_clusters_than_gaussians(balls: Balls) -> None:
+    few = Gaussians(*(getattr(balls.gaussians, name)[::100] for name in ("xyz", "scale", "rotation", "opacity")))
+    few = replace(few, scale=few.scale * 6)
+    settings = replace(SHORT, schedule_share=0.0005, k1=64, covered_share=0)
+    trained = paper.train_features(few, balls.views, NEAR, settings)
+    book = paper.train_codebook(few, balls.views, NEAR, trained.features, settings)
+    assert (book.leaf[trained.seen > 0] >= 0).all()
+    assert book.centres.shape == (64 * 3, 6)
+
+
+def test_progress_names_stage_step_and_total(balls: Balls) -> None:
+    heard: list[tuple[str, int, int]] = []
+    settings = replace(SHORT, schedule_share=0.0002, schedule="lerf")
+    trained = paper.train_features(balls.gaussians, balls.views, NEAR, settings, progress=lambda *a: heard.append(a))
+    assert heard == [("features", 1, 2), ("features", 2, 2)]
+    assert trained.history.published_steps == 10_000
+    per_step, setup = trained.history.seconds_per_step, trained.history.setup_seconds
+    assert per_step > 0
+    assert trained.history.published_seconds == pytest.approx(setup + 10_000 * per_step)
+
+
+def test_views_without_covered_masks_are_refused(balls: Balls) -> None:
+    with pytest.raises(SceneError, match="none of the 6 views has a mask that Gaussians cover"):
+        paper.train_features(balls.gaussians, balls.views, NEAR, replace(SHORT, covered_share=1.1))
+
+
+def test_a_view_with_one_mask_has_no_separation() -> None:
+    separation, _ = paper.view_losses(torch.rand(5, 6), torch.zeros(5, dtype=torch.int64), PaperSettings())
+    assert separation.item() == 0
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [({"k1": 0}, "k1 is 0"), ({"schedule_share": 0.0}, "schedule_share is 0"), ({"width": -1}, "width of features")],
+)
+def test_settings_that_mean_nothing_are_refused(options: dict, message: str) -> None:
+    with pytest.raises(OgPointcloudError, match=message):
+        PaperSettings(**options)
+
+
+def test_missing_torch_names_the_extra() -> None:
+    code = "import sys; sys.modules['torch'] = None; import og_pointcloud.paper"
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert "pip install 'og-pointcloud[learn]'" in run.stderr.splitlines()[-1]
