@@ -82,7 +82,7 @@ HALVINGS = 20
 KICK = 0.1
 """Where two means have met, mask-wise random directions of this length are added."""
 MET = 1e-3
-"""Means nearer than this share of `closest` have met."""
+"""Means nearer than this have met. (Features lie on, or in, the unit ball.)"""
 
 
 @dataclass(frozen=True)
@@ -275,9 +275,7 @@ class FeatureObjective:
 
     def have_met(self, features: NDArray[np.floating]) -> bool:
         """Whether two mask means of a view are too near to be told apart by the gradient of Eq. 2."""
-        squares, pairs, nearest = _pair_distances(self.mask_means(features), self._first)
-        typical = np.sqrt(squares / pairs) if pairs else 1.0
-        return bool(pairs and np.sqrt(nearest) <= MET * self.settings.closest * max(typical, MET))
+        return _pair_distances(self.mask_means(features), self._first)[2] <= MET**2
 
     def terms(self, features: NDArray[np.floating], closest: float) -> Terms:
         """Both losses at features (k, width) as read; formula "paper": Eq. 2 bounded below the distance ``closest``."""
