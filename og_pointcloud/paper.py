@@ -58,6 +58,8 @@ LATE_RANK = 0.9
 """Pairs that weigh less than this weigh LEAST_WEIGHT late in training."""
 SMALLEST_DISTANCE = 1e-4
 """Added in quadrature to the distances of the printed Eq. 2: two equal means would give infinity."""
+ADAM_EPSILON = 1e-15
+"""As in 3DGS: gradients of one Gaussian, of a mean over pixels, are small beside the usual 1e-8."""
 MIXED_VARIANCE = 0.006
 """A mask whose features vary more is no target of Eq. 4 (the authors' code), unless it is large."""
 LARGE_SHARE = 0.8
@@ -132,7 +134,7 @@ def train_features(
     source = _Views(gaussians, views, near, settings, whole=False)
     rng = np.random.default_rng(seed)
     raw = torch.tensor(rng.random((len(gaussians), settings.width), np.float32), requires_grad=True)
-    adam = torch.optim.Adam([raw], lr=settings.feature_rate)
+    adam = torch.optim.Adam([raw], lr=settings.feature_rate, eps=ADAM_EPSILON)
     history = StageHistory("features", STEPS[settings.schedule][0], time.perf_counter() - start)
     late = LATE_STEP * settings.schedule_share
     for step in _steps(history, settings, progress):
@@ -265,7 +267,7 @@ class _CodebookTraining:
         """
         counts = counts or [len(centres)]
         features = self.features
-        adam = torch.optim.Adam([features.requires_grad_()], lr=self.settings.codebook_rate)
+        adam = torch.optim.Adam([features.requires_grad_()], lr=self.settings.codebook_rate, eps=ADAM_EPSILON)
         width = features.shape[1]
         own = torch.zeros(len(self.known), dtype=torch.int64)
         squared = history.name.startswith("fine") and self.settings.formula == "authors"

@@ -176,6 +176,53 @@ def test_fine_clusters_are_at_most_the_masks_held_and_one(balls: Balls) -> None:
     assert len(np.unique(fixed.leaf[fixed.leaf >= 0])) == 5
 
 
+def test_a_codebook_step_moves_features_by_the_gradient_of_their_centres(balls: Balls) -> None:
+    """Straight through: Adam's first step is the rate against the sign of W' sign(W c - W f), c the centres' rows."""
+    settings = replace(SHORT, formula="paper", k1=4, schedule_share=1 / 20_000)
+    features = np.random.default_rng(0).random((len(balls.gaussians), 6), np.float32)
+    source = paper._Views(balls.gaussians, balls.views[:1], NEAR, settings, whole=True)
+    known, nothing = np.flatnonzero(source.seen > 0), np.zeros((int((source.seen > 0).sum()), 0), np.float32)
+    training = paper._CodebookTraining(
+        source, torch.from_numpy(features.copy()), known, settings, np.random.default_rng(0)
+    )
+    history = paper.StageHistory("coarse codebook", 20_000, 0)
+    start = features[known[:4]]
+    own, centres = paper.kmeans(features[known], np.ones(len(known)), start, settings.lloyd_rounds, reseed=True)
+    training.run(history, start, [np.arange(len(known))], nothing, 1, None)
+
+    weights, quantised = source[0].weights.astype(np.float64), features.astype(np.float64)
+    quantised[known] = centres[own]
+    image = weights @ quantised - weights @ features.astype(np.float64)
+    gradient = weights.T @ np.sign(image)
+    clear = np.abs(gradient) > 1e-3
+    moved = training.features.numpy() - features
+    np.testing.assert_allclose(moved[clear], -settings.codebook_rate * np.sign(gradient)[clear], atol=1e-7)
+    assert history.loss[0] == pytest.approx(np.abs(image).mean(), rel=1e-5)
+    assert clear[known].mean() > 0.9
+
+
+def test_gaussians_shrunk_to_nothing_leave_the_view_as_it_is(balls: Balls) -> None:
+    class Never:
+        """Draws view 0, then "shrink", then "to nothing"."""
+
+        def integers(self, _: int) -> int:
+            return 0
+
+        def random(self) -> float:
+            return 0.0
+
+    # Half opaque, they cover a pixel by 0.95 only where several overlap.
+    faint = replace(balls.gaussians, opacity=np.full(len(balls.gaussians), 0.5, np.float32))
+    source = paper._Views(faint, balls.views, NEAR, replace(SHORT, covered_share=0.95), whole=False)
+    assert len(source.shrunk(0, 0.0).mask) == 0 < len(source[0].mask)
+    features = torch.rand((len(balls.gaussians), 6))
+    known = np.flatnonzero(source.seen > 0)
+    training = paper._CodebookTraining(source, features, known, SHORT, Never())  # pyright: ignore
+    view, target, rows = training._draw()
+    assert len(target) == int(rows.sum()) > 0
+    assert len(view.mask) == len(source[0].mask)
+
+
 def test_more_clusters_than_gaussians(balls: Balls) -> None:
     few = Gaussians(*(getattr(balls.gaussians, name)[::100] for name in ("xyz", "scale", "rotation", "opacity")))
     few = replace(few, scale=few.scale * 6)
