@@ -49,7 +49,7 @@ def main() -> None:
 
     rng = np.random.default_rng(0)
     small, view = box(2_000, rng), camera(96, 72)
-    fast = view_weights(small, view, masks(96, 72), 30, 0.01)[0].toarray()
+    fast = view_weights(small, view, masks(96, 72), 30, 0.01).rows.toarray()
     slow = reference_view_weights(small, view, masks(96, 72), 30, 0.01)
     error = np.abs(fast - slow).max() / slow.max()
     print("points      image       seconds a view   largest weight error against float64 (2,000 points, relative)")

@@ -133,7 +133,8 @@ def prepare(scene: Scene, settings: FitSettings | None = None, journal: Journal 
     with journal.stage("visibility"):
         stride = _stride(scene.points, around.spacing, scene.views, settings.geometry, journal)
         views = (_thinned(view, stride) for view in journal.steps(scene.views, "visibility"))
-        table = mask_table(gaussians, views, near)
+        thickness = _surface_thickness(gaussians, around, settings.geometry)
+        table = mask_table(gaussians, views, near, thickness)
         table = replace(table, mask_pixels=table.mask_pixels * stride**2)
     if table.exposure.nnz == 0:
         raise SceneError(
@@ -169,6 +170,13 @@ def _gaussians(
             "opaque; add images for a choice by photometric agreement"
         )
     return choice.gaussians
+
+
+def _surface_thickness(gaussians: Gaussians, around: Neighbourhood, settings: GeometrySettings) -> NDArray[np.float32]:
+    """(n,) how far behind the front of its surface a Gaussian may lie: noise and overlap are a few spacings thick."""
+    typical = np.median(around.spacing)
+    thickness = settings.thickness * np.maximum(around.spacing, typical) + 3 * gaussians.scale.max(axis=1)
+    return thickness.astype(np.float32)
 
 
 def _stride(

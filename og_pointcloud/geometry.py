@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 
 from og_pointcloud.scene import Camera, Points, View
 from og_pointcloud.settings import GeometrySettings
-from og_pointcloud.visibility import NEAR_SHARE, Gaussians, pixel_weights
+from og_pointcloud.visibility import NEAR_SHARE, Gaussians, render
 
 __all__ = [
     "GeometryChoice",
@@ -122,9 +122,10 @@ def choose_gaussians(
 ) -> GeometryChoice:
     """Gaussians of a plain cloud by photometric agreement with a few of its images.
 
-    Scale is swept first, then opacity; of scales that look about as good the smallest is taken, because it bleeds
-    least over edges. Splats that are coarse beside the masks are not tried: they cannot tell inside from outside,
-    however well they fill the image (a LiDAR cloud with a person of five points).
+    Scale is swept first, then opacity, then scale again; of scales that look about as good the middle one is taken (of two the smaller,
+    which bleeds less over edges): the ends of the range are where gaps or fog begin. Splats that are coarse beside the
+    masks are not tried: they cannot tell inside from outside, however well they fill the image (a LiDAR cloud with a
+    person of five points).
     Without colours or images the settings' start values are used.
     """
     photographs = _photographs(points, spacing, views, settings)
@@ -142,8 +143,9 @@ def choose_gaussians(
         opacity = settings.opacities[-1]
         scale = min(progress(scales), key=lambda s: error(s, opacity))
         opacity = min(progress(settings.opacities), key=lambda o: error(scale, o))
-        good = error(scale, opacity) * (1 + settings.error_tolerance)
-        scale = min(s for s in scales if s <= scale and error(s, opacity) <= good)
+        good = min(error(s, opacity) for s in scales) * (1 + settings.error_tolerance)
+        alike = [s for s in scales if error(s, opacity) <= good]
+        scale = alike[(len(alike) - 1) // 2]
     return GeometryChoice(
         isotropic(points, spacing, scale, opacity), scale, opacity, tuple((*pair, e) for pair, e in trials.items())
     )
@@ -176,7 +178,7 @@ def _photographs(
         image, camera = with_image[index].image_rgb(), with_image[index].camera
         size = max(1, round(camera.width / shrink)), max(1, round(camera.height / shrink))
         small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-        photographs.append((camera.resized(*size), small.reshape(-1, 3).astype(np.float32) / 255))
+        photographs.append((camera.resized(*size), small.astype(np.float32) / 255))
     return photographs
 
 
@@ -213,13 +215,12 @@ def _photometric_error(
     """
     assert points.rgb is not None
     colors = points.rgb.astype(np.float32) / 255
-    guess = np.median(np.concatenate([image for _, image in photographs]), axis=0)
+    guess = np.median(np.concatenate([image.reshape(-1, 3) for _, image in photographs]), axis=0)
     gaussians = isotropic(points, spacing, scale, opacity)
     errors = []
     for camera, image in photographs:
-        weights = pixel_weights(gaussians, camera, near)
-        uncovered = 1 - np.asarray(weights.sum(axis=1)).reshape(-1, 1)
-        errors.append(float(np.abs(weights @ colors + uncovered * guess - image).mean()))
+        drawn, covered = render(gaussians, colors, camera, near)
+        errors.append(float(np.abs(drawn + (1 - covered[..., None]) * guess - image).mean()))
     return float(np.mean(errors))
 
 

@@ -17,7 +17,6 @@ ours.
 from __future__ import annotations
 
 import heapq
-from bisect import bisect_left, bisect_right
 from dataclasses import dataclass
 
 import numpy as np
@@ -178,19 +177,26 @@ def _agglomerate(
     links = _link_table(witnesses, usable)
     speaks = witnesses.speaks.copy()
     group = np.where(usable, np.arange(len(usable)), -1)
-    version = np.zeros(len(usable), np.int64)
+    version = [0] * len(usable)
+    heap: list[tuple[float, float, float, int, int, int, int]] = []
 
-    def agreement(a: int, b: int) -> tuple[float, float, float]:
-        one, same_extent = links[a][b]
-        asked = float(speaks[a] @ speaks[b])
-        return -(same_extent + (one - same_extent) * likeness(a, b)) / asked, -asked, -likeness.cosine(a, b)
+    def offer(a: int, others: list[int]) -> None:
+        """Put the pairs of a group and others on the heap, with their agreement."""
+        cosine, alike = likeness(a, others)
+        asked = speaks[others] @ speaks[a]
+        one, same_extent = np.array([links[a][b] for b in others]).T
+        agreement = (same_extent + (one - same_extent) * alike) / asked
+        for b, *order in zip(others, (-agreement).tolist(), (-asked).tolist(), (-cosine).tolist(), strict=True):
+            if -order[0] > settings.join_majority:
+                low, high = min(a, b), max(a, b)
+                heapq.heappush(heap, (order[0], order[1], order[2], low, high, version[low], version[high]))
 
-    heap = [(agreement(a, b), a, b, 0, 0) for a in links for b in links[a] if a < b]
-    heapq.heapify(heap)
+    for a in links:
+        later = [b for b in links[a] if b > a]
+        if later:
+            offer(a, later)
     while heap:
-        (score, _, _), a, b, seen_a, seen_b = heapq.heappop(heap)
-        if -score <= settings.join_majority:
-            break
+        _, _, _, a, b, seen_a, seen_b = heapq.heappop(heap)
         if version[a] != seen_a or version[b] != seen_b or group[a] != a or group[b] != b:
             continue
         group[b] = a
@@ -202,41 +208,43 @@ def _agglomerate(
             del links[c][b]
             have = links[a].get(c, (0.0, 0.0))
             links[a][c] = links[c][a] = (have[0] + more[0], have[1] + more[1])
-        for c in links[a]:
-            low, high = min(a, c), max(a, c)
-            heapq.heappush(heap, (agreement(low, high), low, high, version[low], version[high]))
+        if links[a]:
+            offer(a, list(links[a]))
     return _roots(group)
 
 
 class _Likeness:
-    """How alike the features of two groups are: the share of different masks of one view that are less alike, squared.
+    """How alike the features of two groups are: their cosine, and the share of different masks of one view that are
+    less alike, squared.
 
     Masks of one view are mostly different things, whatever the encoder: they calibrate its cosines.
     """
 
     def __init__(self, features: NDArray[np.float32], mask_view: NDArray[np.int32]) -> None:
         self.total = features.astype(np.float64)
-        self.length = np.linalg.norm(self.total, axis=1).tolist()
+        self.length = np.linalg.norm(self.total, axis=1)
         cosines = [np.zeros(0)]
         for view in np.unique(mask_view):
             rows = features[mask_view == view][:200]
             cosines.append((rows @ rows.T)[np.triu_indices(len(rows), 1)])
-        self.different = np.sort(np.concatenate(cosines)).tolist()
+        self.different = np.sort(np.concatenate(cosines))
 
-    def __call__(self, a: int, b: int) -> float:
-        if not self.different or self.length[a] * self.length[b] == 0:
-            return 0.25  # nothing known: the expected square of a uniform share lies near
-        cosine = self.cosine(a, b)
-        below = bisect_left(self.different, cosine - 1e-6) + bisect_right(self.different, cosine + 1e-6)
-        return (0.5 * below / len(self.different)) ** 2
-
-    def cosine(self, a: int, b: int) -> float:
-        length = self.length[a] * self.length[b]
-        return float(self.total[a] @ self.total[b]) / length if length else 0.0
+    def __call__(self, a: int, others: list[int]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """(cosines, likenesses) of a group and others."""
+        length = self.length[others] * self.length[a]
+        known = length > 0
+        cosine = np.where(known, self.total[others] @ self.total[a] / np.where(known, length, 1), 0.0)
+        if not len(self.different):
+            known[:] = False
+        below = np.searchsorted(self.different, cosine - 1e-6, "left")
+        below += np.searchsorted(self.different, cosine + 1e-6, "right")
+        # Nothing known: the expected square of a uniform share lies near a quarter.
+        alike = np.where(known, (0.5 * below / max(len(self.different), 1)) ** 2, 0.25)
+        return cosine, alike
 
     def join(self, a: int, b: int) -> None:
         self.total[a] += self.total[b]
-        self.length[a] = float(np.linalg.norm(self.total[a]))
+        self.length[a] = np.linalg.norm(self.total[a])
 
 
 def _link_table(witnesses: _Witnesses, usable: NDArray[np.bool_]) -> dict[int, dict[int, tuple[float, float]]]:

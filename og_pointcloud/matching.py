@@ -258,4 +258,4 @@ def _alpha(gaussians: Gaussians, camera: Camera, near: float) -> NDArray[np.floa
     """(H W,) float64: how much the Gaussians cover each pixel."""
     pixels = camera.width * camera.height
     ids = np.arange(pixels, dtype=np.int32).reshape(camera.height, camera.width)
-    return np.asarray(view_weights(gaussians, camera, ids, pixels, near)[0][:-1].sum(axis=1), np.float64)
+    return np.asarray(view_weights(gaussians, camera, ids, pixels, near).rows[:-1].sum(axis=1), np.float64)

@@ -69,6 +69,9 @@ def assign_points(
     ids = np.where((best >= 0) & (share > settings.sure_share), best, BACKGROUND).astype(np.int32)
     possible = (best >= 0) & (share > settings.possible_share)
     ids = _grow(ids, best, possible, neighbourhood.index, neighbourhood.adjoining, settings.growth_votes)
+    # Seen, but mostly inside masks: no background, however many instances claim it. Borders are settled below.
+    covered = np.bincount(testimony.inside.indices, testimony.inside.data, len(ids))
+    ids = np.where((ids == BACKGROUND) & possible & (covered > settings.covered_share * total), best, ids)
     ids = _without_islands(ids, own_area(table, groups.group, ids), neighbourhood, settings.island_share)
     ids = _fill_unobserved(np.where((ids == BACKGROUND) & (total == 0), UNOBSERVED, ids), neighbourhood)
     for _ in range(settings.border_rounds):

@@ -49,6 +49,8 @@ class GeometrySettings:
     """Never leave out more pixels than this, whatever the spacing: mask edges are drawn in pixels."""
     neighbours: int = 16
     """Nearest points looked at."""
+    thickness: float = 6.0
+    """A surface is this many spacings thick; what shows farther behind it is seen through it. 3 cuts noisy depth."""
     reach: float = 3.0
     """Points within this many spacings adjoin; farther than this from the cloud is "too far"."""
 
@@ -77,6 +79,8 @@ class MembershipSettings:
     """A point is surely of an instance when this share of the weight asked lies in its masks."""
     possible_share: float = 0.2
     """A point may be of an instance from this share on, if it adjoins sure ones."""
+    covered_share: float = 0.7
+    """A point is no background when views say "in some mask" with more than this share of their words."""
     growth_votes: float = 0.25
     """This share of the adjoining points must be of the instance already."""
     rate_share: float = 0.25
@@ -240,7 +244,8 @@ class PaperSettings:
     lloyd_rounds: int = 5
     """Rounds of k-means per reassignment (the authors' code)."""
     point_pressure: float = 0.5
-    """Chance per codebook step that all Gaussians shrink by one random factor, so that hidden ones show."""
+    """Chance per codebook step that all Gaussians shrink by one random factor, so that hidden ones show (formula
+    "authors" only)."""
     cache_bytes: int = 4 << 30
     """Blending weights kept between steps; views beyond are rendered anew."""
 

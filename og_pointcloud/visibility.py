@@ -8,6 +8,10 @@ those weights up over the pixels of each mask, tile by tile while compositing; `
 
 It knows nothing of colours or features: what a view shows of any value is a product with these sparse rows. A map
 that gives every pixel its own id makes ``A`` the weights ``W`` themselves (see `pixel_weights`).
+
+Blending also shows what a mask does not mean: the floor between the splats of a table top. Given how thick surfaces
+are, exposure counts little what shows *through* one: a splat farther than that behind the one at which a pixel became
+more covered than not. It is a depth test with the accuracy of a surface, not of a point, and takes no second pass.
 """
 
 from __future__ import annotations
@@ -15,6 +19,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Any
 
 import numba
 import numpy as np
@@ -31,7 +36,15 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 if "NUMBA_THREADING_LAYER_PRIORITY" not in os.environ:
     numba.config.THREADING_LAYER_PRIORITY = ["omp", "tbb", "workqueue"]  # pyright: ignore
 
-__all__ = ["Gaussians", "MaskTable", "mask_table", "pixel_weights", "view_weights"]
+__all__ = [
+    "Gaussians",
+    "MaskTable",
+    "ViewWeights",
+    "mask_table",
+    "pixel_weights",
+    "render",
+    "view_weights",
+]
 
 TILE = 16
 """Pixels along a tile's side, as in 3DGS."""
@@ -48,6 +61,9 @@ FRUSTUM_MARGIN = 0.3
 linearised (3DGS's 1.3 tan(fov/2), written for any principal point)."""
 NEAR_SHARE = 0.02
 """The near plane as a share of the median depth of the scene; 3DGS fixes 0.2 units, which no unitless scene can."""
+
+SEEN_THROUGH = 0.1
+"""What a weight through a surface counts as exposure. Not 0: a point that no view sees otherwise keeps its say."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +93,7 @@ class MaskTable:
     weights: (masks, n) sparse float32, ``A`` above, masks stacked view by view.
     outside: (views, n) sparse float32, the same for each view's pixels without a mask.
     exposure: (views, n) sparse float32, the part of each Gaussian's own splat that reaches the camera: about 1 in
-        front, small behind other splats.
+        front, small behind other splats, and smaller still where it only shows through a surface.
     mask_view: (masks,) int32, the view of each mask. mask_pixels: (masks,) int32, area in pixels.
     mask_features: (masks, D) float32, as the encoder gave them.
     """
@@ -101,15 +117,22 @@ class MaskTable:
         return np.asarray(self.weights.sum(axis=0) + self.outside.sum(axis=0), np.float64)
 
 
-def mask_table(gaussians: Gaussians, views: Iterable[View], near: float) -> MaskTable:
-    """The mask table of all views, one pass over each. ``near``: depth of the near plane, scene units."""
+def mask_table(
+    gaussians: Gaussians, views: Iterable[View], near: float, thickness: NDArray[np.float32] | None = None
+) -> MaskTable:
+    """The mask table of all views, one pass over each.
+
+    near: depth of the near plane, scene units. thickness: (n,) how far behind the surface in front of it a Gaussian may
+    lie and still belong to it, scene units; what lies farther is seen through it and counts
+    SEEN_THROUGH. None: all counts alike.
+    """
     weights, outside, exposure, mask_view, mask_pixels, features = [], [], [], [], [], []
     for index, view in enumerate(views):
         ids = view.mask_map()
-        rows, area = view_weights(gaussians, view.camera, ids, view.mask_count, near)
-        weights.append(rows[:-1])
-        outside.append(rows[-1:])
-        exposure.append(_exposure(rows, area))
+        shown = view_weights(gaussians, view.camera, ids, view.mask_count, near, thickness)
+        weights.append(shown.rows[:-1])
+        outside.append(shown.rows[-1:])
+        exposure.append(_exposure(shown))
         mask_view.append(np.full(view.mask_count, index, np.int32))
         mask_pixels.append(np.bincount(ids.ravel() + 1, minlength=view.mask_count + 1)[1:].astype(np.int32))
         features.append(view.mask_features)
@@ -128,33 +151,94 @@ def pixel_weights(gaussians: Gaussians, camera: Camera, near: float) -> csr_arra
     """The blending weights ``W`` of one view themselves: (H W, n) sparse float32, pixels row by row."""
     pixels = camera.width * camera.height
     ids = np.arange(pixels, dtype=np.int32).reshape(camera.height, camera.width)
-    return view_weights(gaussians, camera, ids, pixels, near)[0][:-1]
+    return view_weights(gaussians, camera, ids, pixels, near).rows[:-1]
 
 
-def _exposure(rows: csr_array, area: NDArray[np.float64]) -> csr_array:
-    """(1, n) sparse: the weight of each Gaussian in a view, as a part of what it would be with nothing in front."""
-    seen = np.bincount(rows.indices, rows.data, rows.shape[1])
+def render(
+    gaussians: Gaussians, values: NDArray[np.float32], camera: Camera, near: float
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Values (n, c) of the Gaussians as one view shows them: (H, W, c) float32, and (H, W) float32, how much of each
+    pixel is covered. Uncovered pixels are 0: this is ``W @ values`` without ``W`` in between."""
+    pixels = camera.width * camera.height
+    ids = np.arange(pixels, dtype=np.int32).reshape(camera.height, camera.width)
+    (rows, cols, weights, first, counts), _ = _entries(gaussians, camera, ids, pixels, near, None)
+    with_coverage = np.concatenate([values, np.ones((len(values), 1), np.float32)], axis=1)
+    image = _paint(rows, cols, weights, first, counts, with_coverage, pixels).reshape(camera.height, camera.width, -1)
+    return image[..., :-1], image[..., -1]
+
+
+@njit(cache=True, parallel=True)
+def _paint(rows, cols, weights, first, counts, values, pixels):  # noqa: ANN001, ANN202
+    """Add up the values of every tile's entries by pixel; no pixel belongs to two tiles."""
+    image = np.zeros((pixels, values.shape[1]), np.float32)
+    for tile in prange(len(counts)):
+        for e in range(first[tile], first[tile] + counts[tile]):
+            for c in range(values.shape[1] if rows[e] < pixels else 0):
+                image[rows[e], c] += weights[e] * values[cols[e], c]
+    return image
+
+
+def _exposure(view: ViewWeights) -> csr_array:
+    """(1, n) sparse: the weight of each Gaussian in a view, as a part of what it would be with nothing in front.
+
+    What shows through a surface counts SEEN_THROUGH: the rest of a view's word would be about the surface.
+    """
+    n = view.rows.shape[1]
+    seen = np.bincount(view.rows.indices, view.rows.data, n).astype(np.float64)  # integers where there is nothing
     visible = np.flatnonzero(seen)
+    seen -= (1 - SEEN_THROUGH) * np.bincount(view.through.indices, view.through.data, n)
     # Of a huge splat so little is in the image that float32 would call it nothing.
-    part = np.clip(seen[visible] / area[visible], np.finfo(np.float32).tiny, 1).astype(np.float32)
-    return csr_array((part, visible.astype(np.int32), [0, len(visible)]), shape=(1, rows.shape[1]))
+    part = np.clip(seen[visible] / view.area[visible], np.finfo(np.float32).tiny, 1).astype(np.float32)
+    return csr_array((part, visible.astype(np.int32), [0, len(visible)]), shape=(1, n))
+
+
+@dataclass(frozen=True)
+class ViewWeights:
+    """What one view shows. rows: (id_count + 1, n) sparse float32 without duplicates, the last row what shows in pixels
+    with id -1; they sum to at most the id's area in pixels. area: (n,) float64, the pixels each splat would weigh with
+    nothing in front of it, 0 where it is outside the image. through: (1, n) sparse float32, the part of a splat's
+    weight that shows through a surface."""
+
+    rows: csr_array
+    area: NDArray[np.float64]
+    through: csr_array
 
 
 def view_weights(
-    gaussians: Gaussians, camera: Camera, ids: NDArray[np.int32], id_count: int, near: float
-) -> tuple[csr_array, NDArray[np.float64]]:
+    gaussians: Gaussians,
+    camera: Camera,
+    ids: NDArray[np.int32],
+    id_count: int,
+    near: float,
+    thickness: NDArray[np.float32] | None = None,
+) -> ViewWeights:
     """Blending weight of every Gaussian summed over the pixels of every id of one view.
 
-    ids: (H, W) int32 in -1..id_count-1, H and W the camera's. Returns (id_count + 1, n) sparse float32 without
-    duplicates; the last row is what shows in pixels with id -1. Rows sum to at most the id's area in pixels.
-    Splats are blended by (float32 depth, index), so that equal depths have one order. Also returns (n,) float64, the
-    pixels each splat would weigh with nothing in front of it; 0 where it is outside the image.
+    ids: (H, W) int32 in -1..id_count-1, H and W the camera's. thickness: see `mask_table`.
+    Splats are blended by (float32 depth, index), so that equal depths have one order.
     """
+    (rows, cols, weights, first, counts), area = _entries(gaussians, camera, ids, id_count, near, thickness)
+    merged = _merge(rows, cols, weights, first, counts, id_count + 2, len(gaussians))
+    table = csr_array(merged, shape=(id_count + 2, len(gaussians)))
+    return ViewWeights(table[:-1], area, table[-1:])
+
+
+def _entries(
+    gaussians: Gaussians,
+    camera: Camera,
+    ids: NDArray[np.int32],
+    id_count: int,
+    near: float,
+    thickness: NDArray[np.float32] | None,
+) -> tuple[tuple[NDArray[Any], ...], NDArray[np.float64]]:
+    """What `view_weights` adds up, tile by tile: (rows, cols, weights, first, counts), tile t's entries being
+    first[t] : first[t] + counts[t]; and the area of each splat."""
     splats, keys = _project(
         gaussians.xyz,
         gaussians.scale,
         gaussians.rotation,
         gaussians.opacity,
+        np.full(len(gaussians), np.inf, np.float32) if thickness is None else thickness,
         camera.world_to_camera,
         np.array([camera.fx, camera.fy, camera.cx, camera.cy]),
         camera.width,
@@ -174,20 +258,21 @@ def view_weights(
     )
     area = np.zeros(len(gaussians))
     area[order] = splats[order, _AREA]
-    merged = _merge(rows, cols, weights, first[:-1], counts, id_count + 1, len(gaussians))
-    return csr_array(merged, shape=(id_count + 1, len(gaussians))), area
+    return (rows, cols, weights, first[:-1], counts), area
 
 
 _CULLED = np.uint64(0xFFFFFFFFFFFFFFFF)
 # Columns of the splat record: centre (px), conic (inverse covariance xx, xy, yy), opacity, pixel box (inclusive), the
 # largest squared Mahalanobis distance that still contributes, weight in pixels if nothing were in front, exp(-xx),
-# exp(-yy), exp(-xy), and 1 where no corner of the box is so far out that recurrences from it would underflow.
-_U, _V, _XX, _XY, _YY, _SIGMA, _X0, _X1, _Y0, _Y1, _LIMIT, _AREA, _STEP_X, _STEP_Y, _STEP_XY, _GENTLE, _SIZE = range(17)
+# exp(-yy), exp(-xy), 1 where no corner of the box is so far out that recurrences from it would underflow, depth, and
+# the depth of the nearest surface that it can belong to.
+_U, _V, _XX, _XY, _YY, _SIGMA, _X0, _X1, _Y0, _Y1, _LIMIT, _AREA, _STEP_X, _STEP_Y, _STEP_XY, _GENTLE, *_ = range(19)
+_DEPTH, _SURFACE, _SIZE = 16, 17, 18
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
-def _project(xyz, scale, rotation, opacity, pose, intrinsics, width, height, near):  # noqa: ANN001, ANN202
-    """EWA projection of every Gaussian in float64: splat records (n, 16) and depth keys (n,) uint64.
+def _project(xyz, scale, rotation, opacity, thickness, pose, intrinsics, width, height, near):  # noqa: ANN001, ANN202
+    """EWA projection of every Gaussian in float64: splat records (n, _SIZE) and depth keys (n,) uint64.
 
     A key is the float32 depth's bits above the index: sorting keys sorts by depth, ties by index.
     """
@@ -251,6 +336,7 @@ def _project(xyz, scale, rotation, opacity, pose, intrinsics, width, height, nea
         s[_GENTLE] = 1.0 if reach < 300 * (1 - abs(sxy) / np.sqrt(sxx * syy)) else 0.0
         # The integral of alpha over that ellipse.
         s[_AREA] = 2 * np.pi * np.sqrt(det) * (sigma - ALPHA_MIN)
+        s[_DEPTH], s[_SURFACE] = cz, cz - thickness[g]
         depth[g] = cz
         keys[g] = (np.uint64(depth.view(np.uint32)[g]) << np.uint64(32)) | np.uint64(g)
     return splats, keys
@@ -315,19 +401,21 @@ def _entry_bounds(splats, starts, members, masks, id_count, columns):  # noqa: A
                     distinct, last = distinct + 1, masks[y, x]
         if distinct <= 4:
             # Looking at every splat would save little memory here.
-            bounds[tile] = distinct * (starts[tile + 1] - starts[tile])
+            bounds[tile] = (distinct + 1) * (starts[tile + 1] - starts[tile])
             continue
         total = 0
         for m in range(starts[tile], starts[tile + 1]):
             x0, x1, y0, y1 = _clip_box(splats[members[m]], tile, columns)
-            total += min(distinct, id_count + 1, (x1 - x0) * (y1 - y0))
+            total += min(distinct, id_count + 1, (x1 - x0) * (y1 - y0)) + 1
         bounds[tile] = total
     return bounds
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
 def _composite(splats, starts, members, masks, id_count, columns, first, workers):  # noqa: ANN001, ANN202
-    """Blend every tile front to back and add each splat's weights up by mask; entries of tile t start at first[t]."""
+    """Blend every tile front to back and add each splat's weights up by mask; entries of tile t start at first[t].
+
+    Row id_count holds pixels without a mask, row id_count + 1 what shows through surfaces (counted in its mask too)."""
     tiles = len(starts) - 1
     height, width = masks.shape
     rows = np.empty(first[-1], np.int32)
@@ -343,6 +431,7 @@ def _composite(splats, starts, members, masks, id_count, columns, first, workers
         for tile in range(worker, tiles, workers):
             left, top = tile % columns * TILE, tile // columns * TILE
             transmittance = np.ones((TILE, TILE))
+            surface = np.full((TILE, TILE), np.inf)
             open_pixels = (min(top + TILE, height) - top) * (min(left + TILE, width) - left)
             entry = first[tile]
             for m in range(starts[tile], starts[tile + 1]):
@@ -352,7 +441,7 @@ def _composite(splats, starts, members, masks, id_count, columns, first, workers
                 s = splats[g]
                 u, v, xx, xy, yy, sigma = s[_U], s[_V], s[_XX], s[_XY], s[_YY], s[_SIGMA]
                 x0, x1, y0, y1 = _clip_box(s, tile, columns)
-                touches = 0
+                touches, through = 0, 0.0
                 # exp of a quadratic by recurrence, along rows (`density`, `ratio`) and down the box's left edge
                 # (`edge`, `edge_ratio`, `first_ratio`): g(x + 1) = g(x) ratio(x), ratio(x + 1) = ratio(x) exp(-xx).
                 gentle = s[_GENTLE] > 0.0
@@ -394,16 +483,23 @@ def _composite(splats, starts, members, masks, id_count, columns, first, workers
                             transmittance[y - top, x - left] = 0.0  # marks a finished pixel
                             open_pixels -= 1
                             continue
+                        if t >= 0.5 and rest < 0.5:
+                            surface[y - top, x - left] = s[_DEPTH]
+                        transmittance[y - top, x - left] = rest
+                        if s[_SURFACE] > surface[y - top, x - left]:
+                            through += t * alpha
                         mask = masks[y, x]
                         if total[mask] == 0.0:
                             touched[touches] = mask
                             touches += 1
                         total[mask] += t * alpha
-                        transmittance[y - top, x - left] = rest
                 for k in range(touches):
                     mask = touched[k]
                     rows[entry], cols[entry], weights[entry] = mask, g, total[mask]
                     total[mask] = 0.0
+                    entry += 1
+                if through > 0.0:
+                    rows[entry], cols[entry], weights[entry] = id_count + 1, g, through
                     entry += 1
             counts[tile] = entry - first[tile]
     return rows, cols, weights, counts

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from numpy.random import Generator
 from numpy.typing import NDArray
-from reference_splatting import reference_pixel_weights, reference_view_weights, rotation_matrix
+from reference_splatting import front_to_back, reference_pixel_weights, reference_view_weights, rotation_matrix
 from scipy.sparse import csr_array
 
 from og_pointcloud.errors import SceneError
 from og_pointcloud.scene import Camera, Points, View
 from og_pointcloud.testimony import hear_views
-from og_pointcloud.visibility import Gaussians, mask_table, pixel_weights, view_weights
+from og_pointcloud.visibility import Gaussians, mask_table, pixel_weights, render, view_weights
 
 NEAR = 0.25
 MASKS = 12
@@ -147,20 +147,20 @@ def assert_weights(actual: csr_array, expected: NDArray[np.float64]) -> None:
 
 
 def image_weights(gaussians: Gaussians, view: Camera, near: float = NEAR) -> NDArray[np.float32]:
-    return view_weights(gaussians, view, patches(view), MASKS, near)[0].toarray()
+    return view_weights(gaussians, view, patches(view), MASKS, near).rows.toarray()
 
 
 def test_weights_equal_the_reference(hard_scene: tuple[Gaussians, Camera]) -> None:
     gaussians, view = hard_scene
     ids = patches(view)
-    actual, _ = view_weights(gaussians, view, ids, MASKS, NEAR)
+    actual = view_weights(gaussians, view, ids, MASKS, NEAR).rows
     assert_weights(actual, reference_view_weights(gaussians, view, ids, MASKS, NEAR))
 
 
 def test_rows_sum_to_at_most_the_pixels_of_their_mask(hard_scene: tuple[Gaussians, Camera]) -> None:
     gaussians, view = hard_scene
     ids = patches(view)
-    rows, _ = view_weights(gaussians, view, ids, MASKS, NEAR)
+    rows = view_weights(gaussians, view, ids, MASKS, NEAR).rows
     pixels = np.bincount(np.where(ids < 0, MASKS, ids).ravel(), minlength=MASKS + 1)
     assert (rows.sum(axis=1) <= pixels * (1 + 1e-6)).all()
     assert (rows.data > 0).all()
@@ -193,21 +193,22 @@ def test_weights_of_every_pixel_equal_the_reference(random: Generator) -> None:
 def test_any_number_of_masks(random: Generator, count: int) -> None:
     gaussians, view = cloud(random), camera()
     ids = patches(view, count)
-    rows, _ = view_weights(gaussians, view, ids, count, NEAR)
+    rows = view_weights(gaussians, view, ids, count, NEAR).rows
     assert rows.shape == (count + 1, len(gaussians))
     assert_weights(rows, reference_view_weights(gaussians, view, ids, count, NEAR))
 
 
 def test_an_id_without_pixels_has_an_empty_row(random: Generator) -> None:
     gaussians, view = cloud(random), camera()
-    rows, _ = view_weights(gaussians, view, patches(view, 3), 7, NEAR)
+    rows = view_weights(gaussians, view, patches(view, 3), 7, NEAR).rows
     assert (rows[[3, 4, 5, 6]].toarray() == 0).all()
     assert rows[[0, 1, 2, 7]].sum(axis=1).min() > 0
 
 
 def test_nothing_in_view_gives_empty_rows(random: Generator) -> None:
     behind = replace(cloud(random), xyz=-cloud(random).xyz)
-    rows, area = view_weights(behind, camera(), patches(camera()), MASKS, NEAR)
+    shown = view_weights(behind, camera(), patches(camera()), MASKS, NEAR)
+    rows, area = shown.rows, shown.area
     assert rows.shape == (MASKS + 1, 150)
     assert rows.nnz == 0
     assert (area == 0).all()
@@ -254,7 +255,7 @@ def test_order_of_masks_does_not_matter(random: Generator) -> None:
     ids = patches(view)
     number = random.permutation(MASKS).astype(np.int32)
     renamed = np.where(ids < 0, -1, number[ids])
-    rows, _ = view_weights(gaussians, view, renamed, MASKS, NEAR)
+    rows = view_weights(gaussians, view, renamed, MASKS, NEAR).rows
     np.testing.assert_array_equal(rows.toarray()[[*number, -1]], image_weights(gaussians, view))
 
 
@@ -262,7 +263,7 @@ def test_a_mask_is_the_sum_of_its_halves(random: Generator) -> None:
     gaussians, view = cloud(random), camera()
     ids = patches(view)
     half = random.integers(0, 2, ids.shape).astype(np.int32)
-    rows, _ = view_weights(gaussians, view, np.where(ids < 0, -1, 2 * ids + half), 2 * MASKS, NEAR)
+    rows = view_weights(gaussians, view, np.where(ids < 0, -1, 2 * ids + half), 2 * MASKS, NEAR).rows
     halves = rows.toarray()[:-1]
     np.testing.assert_allclose(halves[::2] + halves[1::2], image_weights(gaussians, view)[:-1], rtol=1e-5, atol=1e-6)
 
@@ -334,9 +335,9 @@ def test_number_of_threads_does_not_matter(random: Generator, threads: Callable[
     for count in (1, min(2, numba.config.NUMBA_NUM_THREADS), numba.config.NUMBA_NUM_THREADS):
         threads(count)
         results.append(view_weights(gaussians, view, ids, MASKS, NEAR))
-    for rows, area in results[1:]:
-        np.testing.assert_array_equal(rows.toarray(), results[0][0].toarray())
-        np.testing.assert_array_equal(area, results[0][1])
+    for result in results[1:]:
+        np.testing.assert_array_equal(result.rows.toarray(), results[0].rows.toarray())
+        np.testing.assert_array_equal(result.area, results[0].area)
 
 
 def view_of(camera: Camera, count: int = MASKS, name: str = "view") -> View:
@@ -361,6 +362,52 @@ def test_exposure_behind_another_splat_is_what_it_lets_through() -> None:
     two = Gaussians(xyz, scale, np.tile(IDENTITY, (2, 1)), np.array([0.7, 0.9], np.float32))
     exposure = mask_table(two, [view_of(camera())], NEAR).exposure.toarray().ravel()
     np.testing.assert_allclose(exposure[1], 0.3, atol=0.03)
+
+
+def test_what_shows_through_a_surface_equals_the_reference(random: Generator) -> None:
+    """Per pixel, the surface is the splat that brings the transmittance below one half."""
+    gaussians, view = cloud(random, 300), camera()
+    gaussians = replace(gaussians, scale=gaussians.scale * 3, opacity=np.full(300, 0.6, np.float32))
+    thickness = random.uniform(0.02, 0.5, 300).astype(np.float32)
+    shown = view_weights(gaussians, view, patches(view), MASKS, NEAR, thickness)
+    weights = reference_pixel_weights(gaussians, view, NEAR).reshape(-1, 300)
+    order = front_to_back(gaussians, view, NEAR)
+    depth = gaussians.xyz.astype(np.float64) @ view.world_to_camera[2, :3] + view.world_to_camera[2, 3]
+    expected = np.zeros(300)
+    for pixel in weights:
+        light, surface = 1.0, np.inf
+        for g in order:
+            if pixel[g] > 0:
+                if light >= 0.5 and light - pixel[g] < 0.5:
+                    surface = depth[g]
+                light -= pixel[g]
+                expected[g] += pixel[g] * (depth[g] - thickness[g] > surface)
+    assert 0.01 < expected.sum() / weights.sum() < 0.5
+    np.testing.assert_allclose(shown.through.toarray().ravel(), expected, rtol=1e-4, atol=1e-6)
+    plain = view_weights(gaussians, view, patches(view), MASKS, NEAR)
+    np.testing.assert_array_equal(shown.rows.toarray(), plain.rows.toarray())
+    assert plain.through.nnz == 0
+
+
+def test_what_is_seen_through_a_surface_has_a_small_exposure() -> None:
+    xyz = np.array([[0, 0, 1], [0, 0, 2]], np.float32)
+    scale = np.array([[5] * 3, [0.2] * 3], np.float32)
+    two = Gaussians(xyz, scale, np.tile(IDENTITY, (2, 1)), np.array([0.7, 0.9], np.float32))
+    far, near = (
+        mask_table(two, [view_of(camera())], NEAR, np.full(2, thickness, np.float32)).exposure.toarray().ravel()
+        for thickness in (0.9, 1.1)
+    )
+    assert far[0] == near[0]
+    np.testing.assert_allclose(far[1], 0.1 * near[1], rtol=1e-5)
+
+
+def test_render_equals_the_weights_times_the_values(hard_scene: tuple[Gaussians, Camera]) -> None:
+    gaussians, view = hard_scene
+    values = np.random.default_rng(3).normal(size=(len(gaussians), 4)).astype(np.float32)
+    image, covered = render(gaussians, values, view, NEAR)
+    weights = reference_pixel_weights(gaussians, view, NEAR)
+    np.testing.assert_allclose(image, weights @ values.astype(np.float64), rtol=1e-3, atol=1e-4)
+    np.testing.assert_allclose(covered, weights.sum(axis=2), rtol=1e-4, atol=1e-5)
 
 
 def test_huge_splats_have_a_word(random: Generator) -> None:
@@ -388,7 +435,8 @@ def test_table_is_the_views_stacked(random: Generator) -> None:
     seen = np.zeros(150)
     for index, (view, masks) in enumerate(zip(views, (slice(0, 5), slice(5, 5), slice(5, 8)), strict=True)):
         ids = view.mask_map()
-        rows, area = view_weights(gaussians, view.camera, ids, view.mask_count, NEAR)
+        shown = view_weights(gaussians, view.camera, ids, view.mask_count, NEAR)
+        rows, area = shown.rows, shown.area
         np.testing.assert_array_equal(table.weights[masks].toarray(), rows[:-1].toarray())
         np.testing.assert_array_equal(table.outside[[index]].toarray(), rows[-1:].toarray())
         np.testing.assert_array_equal(
