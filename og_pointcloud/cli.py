@@ -443,9 +443,10 @@ def run_view(arguments: argparse.Namespace) -> None:
     if arguments.columns < 1:
         raise OgPointcloudError(f"--columns is {arguments.columns}; expected at least 1")
     from og_pointcloud import pictures
-    from og_pointcloud.fit import Journal, prepare
+    from og_pointcloud.fit import prepare
     from og_pointcloud.formats.capture import read_capture
     from og_pointcloud.geometry import near_plane
+    from og_pointcloud.journal import Journal
 
     stages: list[dict[str, Any]] = []
     with timed(stages, "read capture"):

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, replace
-from typing import Any, TypeVar
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud.association import describe_instances
-from og_pointcloud.cloud import BACKGROUND, UNOBSERVED, InstanceTable, LabelledCloud
+from og_pointcloud.cloud import BACKGROUND, UNOBSERVED, LabelledCloud
 from og_pointcloud.errors import SceneError
 from og_pointcloud.geometry import (
     Neighbourhood,
@@ -20,66 +16,16 @@ from og_pointcloud.geometry import (
     near_plane,
     neighbourhood,
     pixels_per_spacing,
-    strided,
+    thinned,
 )
-from og_pointcloud.grouping import group_masks
-from og_pointcloud.membership import assign_points, without_see_through
+from og_pointcloud.journal import Journal
+from og_pointcloud.membership import without_see_through
+from og_pointcloud.modes import Labelling, Prepared, as_published, by_choice, by_features, by_grouping
 from og_pointcloud.scene import Points, Scene, View
 from og_pointcloud.settings import FitSettings, GeometrySettings
-from og_pointcloud.testimony import hear_views
 from og_pointcloud.visibility import Gaussians, MaskTable, mask_table
 
 __all__ = ["Prepared", "fit", "prepare"]
-
-Item = TypeVar("Item")
-
-
-@dataclass
-class Journal:
-    """What a fit did: seconds per stage, what it left out and why, warnings, notes. Becomes the cloud's provenance."""
-
-    progress: bool
-    stages: list[dict[str, Any]] = field(default_factory=list)
-    left_out: list[dict[str, str]] = field(default_factory=list)
-    warnings: list[str] = field(default_factory=list)
-    notes: dict[str, Any] = field(default_factory=dict)
-
-    @contextmanager
-    def stage(self, name: str) -> Iterator[None]:
-        """Time a stage; several stages of one name add up."""
-        start = time.perf_counter()
-        yield
-        seconds = time.perf_counter() - start
-        self.stages.append({"name": name, "seconds": round(seconds, 4)})
-
-    def leave_out(self, what: str, why: str) -> None:
-        self.left_out.append({"what": what, "why": why})
-
-    def steps(self, items: Sequence[Item], name: str) -> Iterable[Item]:
-        """The items, with a progress bar that shows the remaining time where stderr is a terminal."""
-        if not self.progress:
-            return items
-        from tqdm import tqdm
-
-        return tqdm(items, desc=f"{name:<12}", leave=False, dynamic_ncols=True, disable=None)
-
-    def provenance(self, settings: FitSettings) -> dict[str, Any]:
-        return {
-            "settings": asdict(settings),
-            "stages": self.stages,
-            "left_out": self.left_out,
-            "warnings": self.warnings,
-            "notes": self.notes,
-        }
-
-
-@dataclass(frozen=True)
-class Prepared:
-    """Frozen geometry and what every mask shows of it: all that the stages after rendering need."""
-
-    neighbourhood: Neighbourhood
-    gaussians: Gaussians
-    table: MaskTable
 
 
 def fit(
@@ -96,23 +42,15 @@ def fit(
     journal = Journal(progress)
     _check(scene, journal)
     prepared = prepared or prepare(scene, settings, journal)
-    with journal.stage("grouping"):
-        table = _front_surfaces(scene, prepared, settings, journal)
-        testimony = hear_views(table)
-        groups = group_masks(table, testimony, settings.grouping)
-    with journal.stage("membership"):
-        membership = assign_points(table, testimony, groups, prepared.neighbourhood, settings.membership)
-    with journal.stage("association"):
-        ids, group = _without_empty(membership.instance_ids, groups.group)
-        count = int(ids.max(initial=-1)) + 1
-        instances = describe_instances(table, group, ids, count, settings.association)
-    _report(ids, groups.count, membership.dismissed, groups.spanning, instances, journal)
+    road = {"auto": by_choice, "grouping": by_grouping, "fast": by_features, "paper": as_published}[settings.mode]
+    labelling = road(scene, prepared, settings, journal)
+    _report(labelling, journal)
     typical = float(np.median(prepared.neighbourhood.spacing))
     return LabelledCloud(
         xyz=scene.points.xyz,
         origin=scene.points.origin,
-        instance_ids=ids,
-        instances=instances,
+        instance_ids=labelling.instance_ids,
+        instances=labelling.instances,
         feature_space=scene.feature_space,
         spacing=typical,
         reach=settings.geometry.reach * typical,
@@ -132,7 +70,7 @@ def prepare(scene: Scene, settings: FitSettings | None = None, journal: Journal 
         gaussians = _gaussians(scene, around, near, settings.geometry, journal)
     with journal.stage("visibility"):
         stride = _stride(scene.points, around.spacing, scene.views, settings.geometry, journal)
-        views = (_thinned(view, stride) for view in journal.steps(scene.views, "visibility"))
+        views = (thinned(view, stride) for view in journal.steps(scene.views, "visibility"))
         thickness = _surface_thickness(gaussians, around, settings.geometry)
         table = mask_table(gaussians, views, near, thickness)
         table = replace(table, mask_pixels=table.mask_pixels * stride**2)
@@ -141,7 +79,9 @@ def prepare(scene: Scene, settings: FitSettings | None = None, journal: Journal 
             f"no camera sees the cloud: {len(scene.points)} points, {len(scene.views)} views, none in any image; check "
             "that poses and cloud share one frame and that poses are camera-to-world (transforms.json) as documented"
         )
-    return Prepared(around, gaussians, table)
+    with journal.stage("visibility"):
+        table = _front_surfaces(scene, table, gaussians, settings, journal)
+    return Prepared(around, gaussians, near, stride, table)
 
 
 def _check(scene: Scene, journal: Journal) -> None:
@@ -196,48 +136,20 @@ def _stride(
     return stride
 
 
-def _thinned(view: View, stride: int) -> View:
-    if stride == 1:
-        return view
-    first = stride // 2
-    masks = np.ascontiguousarray(view.mask_map()[first::stride, first::stride])
-    return replace(view, camera=strided(view.camera, stride), masks=masks, image=None)
-
-
-def _front_surfaces(scene: Scene, prepared: Prepared, settings: FitSettings, journal: Journal) -> MaskTable:
+def _front_surfaces(
+    scene: Scene, table: MaskTable, gaussians: Gaussians, settings: FitSettings, journal: Journal
+) -> MaskTable:
     depth_rows = np.stack([view.camera.world_to_camera[2] for view in scene.views])
     focal = np.sqrt([view.camera.fx * view.camera.fy for view in scene.views])
-    table, share = without_see_through(prepared.table, prepared.gaussians, depth_rows, focal, settings.membership)
+    table, share = without_see_through(table, gaussians, depth_rows, focal, settings.membership)
     journal.notes["seen_through"] = round(share, 5)
     return table
 
 
-def _without_empty(ids: NDArray[np.int32], group: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Number the groups that have points 0, 1, ... in their order; masks of the others belong to none."""
-    used = np.unique(ids[ids >= 0])
-    number = np.full(int(group.max(initial=-1)) + 2, -1, np.int32)
-    number[used] = np.arange(len(used), dtype=np.int32)
-    return np.where(ids >= 0, number[ids], ids).astype(np.int32), number[group]
-
-
-def _report(
-    ids: NDArray[np.int32],
-    groups: int,
-    dismissed: NDArray[np.bool_],
-    spanning: NDArray[np.bool_],
-    instances: InstanceTable,
-    journal: Journal,
-) -> None:
-    if spanning.any():
-        journal.leave_out(f"{spanning.sum()} masks", "most views show each of them as several things")
-    if dismissed.any():
-        journal.leave_out(
-            f"{dismissed.sum()} of {groups} groups of masks",
-            "views that see their points mostly show no such mask, far more often than the proposer's misses explain",
-        )
-    journal.leave_out("learned features and codebook", "grouping needs no training")
+def _report(labelling: Labelling, journal: Journal) -> None:
+    ids = labelling.instance_ids
     states = {"labelled": ids >= 0, "background": ids == BACKGROUND, "unobserved": ids == UNOBSERVED}
     journal.notes["points_by_state"] = {name: int(state.sum()) for name, state in states.items()}
-    journal.notes["instances"] = len(instances)
-    if len(instances) == 0:
+    journal.notes["instances"] = len(labelling.instances)
+    if len(labelling.instances) == 0:
         journal.warnings.append("no instance was found: every mask is contradicted by other views or shows no point")

@@ -27,6 +27,7 @@ __all__ = [
     "neighbourhood",
     "pixels_per_spacing",
     "strided",
+    "thinned",
 ]
 
 
@@ -112,6 +113,15 @@ def strided(camera: Camera, stride: int) -> Camera:
     )
 
 
+def thinned(view: View, stride: int) -> View:
+    """The view of every stride-th row and column of its masks, without its image."""
+    if stride == 1:
+        return view
+    first = stride // 2
+    masks = np.ascontiguousarray(view.mask_map()[first::stride, first::stride])
+    return replace(view, camera=strided(view.camera, stride), masks=masks, image=None)
+
+
 def choose_gaussians(
     points: Points,
     spacing: NDArray[np.float32],
@@ -120,31 +130,37 @@ def choose_gaussians(
     settings: GeometrySettings,
     progress: Callable[[Sequence[float]], Iterable[float]] = lambda values: values,
 ) -> GeometryChoice:
-    """Gaussians of a plain cloud by photometric agreement with a few of its images.
+    """Gaussians of a plain cloud by photometric agreement with some of its images.
 
-    Scale is swept first, then opacity, then scale again; of scales that look about as good the middle one is taken (of two the smaller,
-    which bleeds less over edges): the ends of the range are where gaps or fog begin. Splats that are coarse beside the
-    masks are not tried: they cannot tell inside from outside, however well they fill the image (a LiDAR cloud with a
-    person of five points).
+    Scale is swept first, then opacity, with a few images; more of them decide between the scales that come close, for
+    which view is compared would decide else. Of scales that then look about as good the middle one is taken (of
+    two the smaller, which bleeds less over edges): the ends of the range are where gaps or fog begin. Splats that are
+    coarse beside the masks are not tried: they cannot tell inside from outside, however well they fill the image (a
+    LiDAR cloud with a person of five points).
     Without colours or images the settings' start values are used.
     """
-    photographs = _photographs(points, spacing, views, settings)
+    few, many = (_photographs(points, spacing, views, count, settings) for count in settings.photographs)
     largest = settings.mask_share / max(_spacing_per_mask(points, spacing, views), 1e-12)
     scales = tuple(scale for scale in settings.scales if scale <= largest) or settings.scales[:1]
     scale, opacity = min(settings.start_scale, scales[-1]), settings.start_opacity
     trials: dict[tuple[float, float], float] = {}
-    if photographs:
+    if few:
 
         def error(scale: float, opacity: float) -> float:
             if (scale, opacity) not in trials:
-                trials[scale, opacity] = _photometric_error(points, spacing, photographs, near, scale, opacity)
+                trials[scale, opacity] = _photometric_error(points, spacing, few, near, scale, opacity)
             return trials[scale, opacity]
 
         opacity = settings.opacities[-1]
         scale = min(progress(scales), key=lambda s: error(s, opacity))
         opacity = min(progress(settings.opacities), key=lambda o: error(scale, o))
-        good = min(error(s, opacity) for s in scales) * (1 + settings.error_tolerance)
-        alike = [s for s in scales if error(s, opacity) <= good]
+        best = min(error(s, opacity) for s in scales)
+        close = [s for s in scales if error(s, opacity) <= best * (1 + settings.close_call)]
+        if len(close) > 1:
+            for s in progress(close):
+                trials[s, opacity] = _photometric_error(points, spacing, many, near, s, opacity)
+        good = min(trials[s, opacity] for s in close) * (1 + settings.error_tolerance)
+        alike = [s for s in close if trials[s, opacity] <= good]
         scale = alike[(len(alike) - 1) // 2]
     return GeometryChoice(
         isotropic(points, spacing, scale, opacity), scale, opacity, tuple((*pair, e) for pair, e in trials.items())
@@ -161,17 +177,15 @@ def isotropic(points: Points, spacing: NDArray[np.float32], scale: float, opacit
 
 
 def _photographs(
-    points: Points, spacing: NDArray[np.float32], views: Sequence[View], settings: GeometrySettings
+    points: Points, spacing: NDArray[np.float32], views: Sequence[View], count: int, settings: GeometrySettings
 ) -> list[tuple[Camera, NDArray[np.float32]]]:
-    """A few views with their images at about the cloud's own resolution: finer pixels would show only its gaps."""
+    """Up to ``count`` views, evenly spread, with their images at about the cloud's own resolution: finer pixels would show only its gaps."""
     if points.rgb is None:
         return []
     import cv2
 
     with_image = [view for view in views if view.image is not None]
-    chosen = (
-        np.unique(np.linspace(0, len(with_image) - 1, settings.photographs).round().astype(int)) if with_image else []
-    )
+    chosen = np.unique(np.linspace(0, len(with_image) - 1, count).round().astype(int)) if with_image else []
     shrink = max(1.0, pixels_per_spacing(points, spacing, views) / settings.photograph_resolution)
     photographs = []
     for index in chosen:
@@ -214,7 +228,7 @@ def _photometric_error(
     So an uncovered pixel costs what a guess costs: a cloud that cannot cover the image is not blown up to do so.
     """
     assert points.rgb is not None
-    colors = points.rgb.astype(np.float32) / 255
+    colors = (points.rgb / 255).astype(np.float32)
     guess = np.median(np.concatenate([image.reshape(-1, 3) for _, image in photographs]), axis=0)
     gaussians = isotropic(points, spacing, scale, opacity)
     errors = []

@@ -39,8 +39,10 @@ class GeometrySettings:
     """Photometric errors within this share of the best look as good."""
     mask_share: float = 0.08
     """A splat's standard deviation is at most this part of a typical mask's side."""
-    photographs: int = 4
-    """Images compared with, evenly spread over the views."""
+    photographs: tuple[int, int] = (4, 12)
+    """Images compared with, evenly spread over the views: at first, and to decide between scales that come close."""
+    close_call: float = 0.06
+    """Photometric errors within this share of the best are compared on more images."""
     photograph_resolution: float = 1.2
     """Pixels per point spacing of the images compared with."""
     pixels_per_spacing: float = 2.0
@@ -187,6 +189,8 @@ class MatchingSettings:
     """An instance accepted by fewer views is unknown (the authors' code: 2 on ScanNet, 5 on LeRF)."""
     integration: Literal["weighted", "equal"] = "weighted"
     """Accepted masks count by score and by what they show, without outliers; or all alike (the authors' code)."""
+    settle: bool = True
+    """All views settle which instance a point is of (membership.py); else it keeps its leaf, as published."""
     split: bool = True
     """Two descriptors where the views of an instance fall into two clearly separate groups."""
     split_views: int = 4
@@ -246,6 +250,14 @@ class PaperSettings:
     point_pressure: float = 0.5
     """Chance per codebook step that all Gaussians shrink by one random factor, so that hidden ones show (formula
     "authors" only)."""
+    association: Literal["alone", "visible"] = "alone"
+    """Instances are matched as each is rendered alone (paper, Sec. 3.3), or as the mask table shows them."""
+    matching: MatchingSettings = field(
+        default_factory=lambda: MatchingSettings(
+            threshold=0.2, min_views=2, integration="equal", split=False, settle=False
+        )
+    )
+    """Eq. 5 as the authors' code applies it on ScanNet."""
     cache_bytes: int = 4 << 30
     """Blending weights kept between steps; views beyond are rendered anew."""
 
@@ -273,9 +285,18 @@ def _check_losses(width: int, intra: bool, inter: bool, cohesion_weight: float |
 class FitSettings:
     """Settings of `fit`. The defaults are meant for every scene; none needs tuning."""
 
-    mode: Literal["auto", "grouping"] = "auto"
+    mode: Literal["auto", "grouping", "fast", "paper"] = "auto"
+    """The road from masks to instances (modes.py)."""
+    agreement_enough: float = 0.5
+    """Mode auto learns features only where instances from grouping agree with less of the masks than this."""
+    agreement_lead: float = 0.02
+    """Mode auto takes learned instances only if they agree with this much more of the masks."""
     seed: int = 0
     geometry: GeometrySettings = field(default_factory=GeometrySettings)
     grouping: GroupingSettings = field(default_factory=GroupingSettings)
     membership: MembershipSettings = field(default_factory=MembershipSettings)
     association: AssociationSettings = field(default_factory=AssociationSettings)
+    features: FeatureSettings = field(default_factory=FeatureSettings)
+    codebook: CodebookSettings = field(default_factory=CodebookSettings)
+    matching: MatchingSettings = field(default_factory=MatchingSettings)
+    paper: PaperSettings = field(default_factory=PaperSettings)

@@ -112,7 +112,10 @@ def make_capture(seed: int = 0, settings: CaptureSettings | None = None) -> Room
 
 
 def _walk(room: Room, caster: RayCaster, views: int, rng: Random) -> list[NDArray[np.float64]]:
-    """Two rounds by hand: the first along the furniture looking across, the second in the middle looking outwards."""
+    """Two rounds by hand: the first along the furniture looking across, the second in the middle looking outwards.
+
+    The hand goes up and down on the way, to look under and onto things, as one does when scanning a room.
+    """
     half = np.array(room.size[:2]) / 2
     start = rng.uniform(0, 2 * np.pi)
     poses = []
@@ -121,11 +124,12 @@ def _walk(room: Room, caster: RayCaster, views: int, rng: Random) -> list[NDArra
         outwards = progress >= 1
         angle = start + 2 * np.pi * progress
         around = np.array([np.cos(angle), np.sin(angle)])
+        lift = 0.35 * np.sin(7 * angle)
         if outwards:
-            eye = np.array([*(-0.25 * half * around), 1.5])
+            eye = np.array([*(-0.25 * half * around), 1.4 + lift])
             target = np.array([*(half * around), 0.75])
         else:
-            eye = np.array([*(0.66 * half * around), 1.55])
+            eye = np.array([*(0.66 * half * around), 1.45 + lift])
             target = np.array([*(-0.3 * half * around), 0.55])
         eye = eye + rng.normal(size=3) * (0.06, 0.06, 0.08)
         while caster.clearance_m(eye) < 0.35:

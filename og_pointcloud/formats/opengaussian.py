@@ -141,7 +141,7 @@ def _read_leaves(file: Path, gaussians: int) -> _Leaves:
         raise SceneError(f"leaf_feat is {features.dtype} {features.shape}; expected floats of shape (leaves, width)")
     score, views = (_per_leaf(name, arrays[name], len(features)) for name in ("leaf_score", "occu_count"))
     if ((views < 0) | (views >= 1 << 31)).any():
-        raise SceneError(f"occu_count spans {views.min():g}..{views.max():g}; expected counts of views: associate again")
+        raise SceneError(f"occu_count spans {views.min():g}..{views.max():g}; expected counts of views: match again")
     with np.errstate(over="ignore", invalid="ignore"):
         length = np.linalg.norm(features.astype(np.float64), axis=1, keepdims=True)
     if not np.isfinite(length).all():
