@@ -42,7 +42,7 @@ class CaptureSettings:
     interpolated between front and back. outliers: share of samples anywhere in the room.
     """
 
-    views: int = 40
+    views: int = 60
     width: int = 640
     height: int = 480
     voxel_m: float = 0.025
