@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -70,7 +71,7 @@ def prepare(scene: Scene, settings: FitSettings | None = None, journal: Journal 
         gaussians = _gaussians(scene, around, near, settings.geometry, journal)
     with journal.stage("visibility"):
         stride = _stride(scene.points, around.spacing, scene.views, settings.geometry, journal)
-        views = (thinned(view, stride) for view in journal.steps(scene.views, "visibility"))
+        views = _ahead(lambda view: thinned(view, stride), journal.steps(scene.views, "visibility"))
         thickness = _surface_thickness(gaussians, around, settings.geometry)
         table = mask_table(gaussians, views, near, thickness)
         table = replace(table, mask_pixels=table.mask_pixels * stride**2)
@@ -82,6 +83,19 @@ def prepare(scene: Scene, settings: FitSettings | None = None, journal: Journal 
     with journal.stage("visibility"):
         table = _front_surfaces(scene, table, gaussians, settings, journal)
     return Prepared(around, gaussians, near, stride, table)
+
+
+def _ahead(read: Callable[[View], View], views: Iterable[View]) -> Iterator[View]:
+    """Read the next view's masks while this one is drawn: decoding a PNG holds no lock."""
+    with ThreadPoolExecutor(max_workers=1) as reader:
+        coming: Future[View] | None = None
+        for view in views:
+            following = reader.submit(read, view)
+            if coming is not None:
+                yield coming.result()
+            coming = following
+        if coming is not None:
+            yield coming.result()
 
 
 def _check(scene: Scene, journal: Journal) -> None:

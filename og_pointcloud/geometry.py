@@ -139,32 +139,29 @@ def choose_gaussians(
     LiDAR cloud with a person of five points).
     Without colours or images the settings' start values are used.
     """
-    few, many = (_photographs(points, spacing, views, count, settings) for count in settings.photographs)
+    photographs = _Photographs(points, spacing, views, near, settings)
     largest = settings.mask_share / max(_spacing_per_mask(points, spacing, views), 1e-12)
     scales = tuple(scale for scale in settings.scales if scale <= largest) or settings.scales[:1]
     scale, opacity = min(settings.start_scale, scales[-1]), settings.start_opacity
-    trials: dict[tuple[float, float], float] = {}
-    if few:
-
-        def error(scale: float, opacity: float) -> float:
-            if (scale, opacity) not in trials:
-                trials[scale, opacity] = _photometric_error(points, spacing, few, near, scale, opacity)
-            return trials[scale, opacity]
-
+    if len(photographs):
+        few, many = settings.photographs
         opacity = settings.opacities[-1]
-        scale = min(progress(scales), key=lambda s: error(s, opacity))
-        opacity = min(progress(settings.opacities), key=lambda o: error(scale, o))
-        best = min(error(s, opacity) for s in scales)
-        close = [s for s in scales if error(s, opacity) <= best * (1 + settings.close_call)]
-        if len(close) > 1:
-            for s in progress(close):
-                trials[s, opacity] = _photometric_error(points, spacing, many, near, s, opacity)
-        good = min(trials[s, opacity] for s in close) * (1 + settings.error_tolerance)
-        alike = [s for s in close if trials[s, opacity] <= good]
+        at_first: dict[float, float] = {}
+        for s in progress(scales):
+            at_first[s] = photographs.error(s, opacity, few)
+            if s > settings.start_scale and at_first[s] > (1 + settings.close_call) * min(at_first.values()):
+                break  # fog from here on
+        scale = min(at_first, key=lambda s: at_first[s])
+        for softer in progress(settings.opacities[-2::-1]):
+            if photographs.error(scale, softer, few) >= photographs.error(scale, opacity, few):
+                break
+            opacity = softer
+        best = min(photographs.error(s, opacity, few) for s in at_first)
+        close = [s for s in at_first if photographs.error(s, opacity, few) <= best * (1 + settings.close_call)]
+        errors = [photographs.error(s, opacity, many) for s in progress(close)] if len(close) > 1 else [best]
+        alike = [s for s, e in zip(close, errors, strict=True) if e <= min(errors) * (1 + settings.error_tolerance)]
         scale = alike[(len(alike) - 1) // 2]
-    return GeometryChoice(
-        isotropic(points, spacing, scale, opacity), scale, opacity, tuple((*pair, e) for pair, e in trials.items())
-    )
+    return GeometryChoice(isotropic(points, spacing, scale, opacity), scale, opacity, photographs.trials)
 
 
 def isotropic(points: Points, spacing: NDArray[np.float32], scale: float, opacity: float) -> Gaussians:
@@ -176,24 +173,57 @@ def isotropic(points: Points, spacing: NDArray[np.float32], scale: float, opacit
     return Gaussians(points.xyz, size, rotation, np.full(n, opacity, np.float32))
 
 
-def _photographs(
-    points: Points, spacing: NDArray[np.float32], views: Sequence[View], count: int, settings: GeometrySettings
-) -> list[tuple[Camera, NDArray[np.float32]]]:
-    """Up to ``count`` views, evenly spread, with their images at about the cloud's own resolution: finer pixels would show only its gaps."""
-    if points.rgb is None:
-        return []
-    import cv2
+class _Photographs:
+    """Images at about the cloud's own resolution (finer pixels would show only its gaps), and how little the cloud
+    drawn with some scale and opacity looks like them. Empty without images or colours."""
 
-    with_image = [view for view in views if view.image is not None]
-    chosen = np.unique(np.linspace(0, len(with_image) - 1, count).round().astype(int)) if with_image else []
-    shrink = max(1.0, pixels_per_spacing(points, spacing, views) / settings.photograph_resolution)
-    photographs = []
-    for index in chosen:
-        image, camera = with_image[index].image_rgb(), with_image[index].camera
-        size = max(1, round(camera.width / shrink)), max(1, round(camera.height / shrink))
-        small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-        photographs.append((camera.resized(*size), small.astype(np.float32) / 255))
-    return photographs
+    def __init__(
+        self,
+        points: Points,
+        spacing: NDArray[np.float32],
+        views: Sequence[View],
+        near: float,
+        settings: GeometrySettings,
+    ) -> None:
+        self.points, self.spacing, self.near = points, spacing, near
+        self.images: list[tuple[Camera, NDArray[np.float32]]] = []
+        self._errors: dict[tuple[float, float], list[float]] = {}
+        with_image = [view for view in views if view.image is not None]
+        if points.rgb is None or not with_image:
+            return
+        import cv2
+
+        # Evenly spread whether only the first few are looked at, or all.
+        few, many = (np.linspace(0, len(with_image) - 1, n).round().astype(int) for n in settings.photographs)
+        shrink = max(1.0, pixels_per_spacing(points, spacing, views) / settings.photograph_resolution)
+        for index in dict.fromkeys([*few.tolist(), *many.tolist()]):
+            image, camera = with_image[index].image_rgb(), with_image[index].camera
+            size = max(1, round(camera.width / shrink)), max(1, round(camera.height / shrink))
+            small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+            self.images.append((camera.resized(*size), small.astype(np.float32) / 255))
+        self.colors = (points.rgb / 255).astype(np.float32)
+        self.guess = np.median(np.concatenate([image.reshape(-1, 3) for _, image in self.images]), axis=0)
+
+    def __len__(self) -> int:
+        return len(self.images)
+
+    @property
+    def trials(self) -> tuple[tuple[float, float, float], ...]:
+        """(scale, opacity, mean error) of all that was tried."""
+        return tuple((*pair, float(np.mean(errors))) for pair, errors in self._errors.items())
+
+    def error(self, scale: float, opacity: float, count: int) -> float:
+        """Mean absolute difference of the drawn cloud and the first ``count`` images; what the cloud leaves open shows
+        the median colour.
+
+        So an uncovered pixel costs what a guess costs: a cloud that cannot cover the image is not blown up to do so.
+        """
+        errors = self._errors.setdefault((scale, opacity), [])
+        gaussians = isotropic(self.points, self.spacing, scale, opacity)
+        for camera, image in self.images[len(errors) : count]:
+            drawn, covered = render(gaussians, self.colors, camera, self.near)
+            errors.append(float(np.abs(drawn + (1 - covered[..., None]) * self.guess - image).mean()))
+        return float(np.mean(errors[:count]))
 
 
 def _spacing_per_mask(points: Points, spacing: NDArray[np.float32], views: Sequence[View]) -> float:
@@ -213,29 +243,6 @@ def _spacing_per_mask(points: Points, spacing: NDArray[np.float32], views: Seque
         side = np.sqrt(np.bincount(ids.ravel() + 1, minlength=view.mask_count + 1)[1:])
         parts += [np.median(apart[mask == index]) / side[index] for index in np.unique(mask[mask >= 0])]
     return float(np.median(parts)) if parts else 0.0
-
-
-def _photometric_error(
-    points: Points,
-    spacing: NDArray[np.float32],
-    photographs: list[tuple[Camera, NDArray[np.float32]]],
-    near: float,
-    scale: float,
-    opacity: float,
-) -> float:
-    """Mean absolute difference of the drawn cloud and the images; what the cloud leaves open shows the median colour.
-
-    So an uncovered pixel costs what a guess costs: a cloud that cannot cover the image is not blown up to do so.
-    """
-    assert points.rgb is not None
-    colors = (points.rgb / 255).astype(np.float32)
-    guess = np.median(np.concatenate([image.reshape(-1, 3) for _, image in photographs]), axis=0)
-    gaussians = isotropic(points, spacing, scale, opacity)
-    errors = []
-    for camera, image in photographs:
-        drawn, covered = render(gaussians, colors, camera, near)
-        errors.append(float(np.abs(drawn + (1 - covered[..., None]) * guess - image).mean()))
-    return float(np.mean(errors))
 
 
 def _depths(xyz: NDArray[np.float32], camera: Camera) -> NDArray[np.float64]:

@@ -39,7 +39,7 @@ class GeometrySettings:
     """Photometric errors within this share of the best look as good."""
     mask_share: float = 0.08
     """A splat's standard deviation is at most this part of a typical mask's side."""
-    photographs: tuple[int, int] = (4, 12)
+    photographs: tuple[int, int] = (4, 10)
     """Images compared with, evenly spread over the views: at first, and to decide between scales that come close."""
     close_call: float = 0.06
     """Photometric errors within this share of the best are compared on more images."""
@@ -121,6 +121,9 @@ class FeatureSettings:
     """Eq. 1 and 2 as printed, or as the authors' code computes them; features.py says what differs."""
     normalise: bool = True
     """Read a feature as its direction, mapped to [0, 1] (the authors' code), or as it is, within the unit ball."""
+    start: Literal["masks", "random"] = "masks"
+    """Each Gaussian starts at the mean of random directions of its masks, which groups it already; or at a random
+    direction of its own (nearly as the authors' code, from U(0, 1))."""
     intra: bool = True
     """Use the intra-mask smoothing loss (Eq. 1)."""
     inter: bool = True
@@ -139,6 +142,8 @@ class FeatureSettings:
 
     def __post_init__(self) -> None:
         _check_losses(self.width, self.intra, self.inter, self.cohesion_weight)
+        if self.start not in ("masks", "random"):
+            raise OgPointcloudError(f'start is "{self.start}"; expected "masks" or "random"')
         if self.formula == "authors" and self.cohesion == "rendered":
             raise OgPointcloudError(
                 'formula "authors" with cohesion "rendered": an unsquared distance per pixel is no quadratic form of '

@@ -52,6 +52,8 @@ LOW_PASS = 0.3
 """Added to the projected covariance, px^2: a splat is never smaller than about a pixel (3DGS)."""
 ALPHA_MIN = 1.0 / 255.0
 """Contributions below are dropped (3DGS)."""
+LARGEST_REACH = 2 * np.log(1 / ALPHA_MIN)
+"""Squared Mahalanobis distance at which alpha falls to ALPHA_MIN, at opacity 1."""
 ALPHA_MAX = 0.99
 """Alpha is cut here (3DGS)."""
 TRANSMITTANCE_MIN = 1e-4
@@ -295,29 +297,26 @@ def _project(xyz, scale, rotation, opacity, thickness, pose, intrinsics, width, 
         ty = (pose[1, 0] * x + pose[1, 1] * y + pose[1, 2] * z + pose[1, 3]) / cz
         u, v = fx * tx + cx, fy * ty + cy
         jx, jy = min(max(tx, x_low), x_high), min(max(ty, y_low), y_high)
+        # Most of a scene lies outside a view: turned away before its ellipse is known, by the largest it could be.
+        largest = np.float64(max(scale[g, 0], scale[g, 1], scale[g, 2])) / cz
+        room_x = np.sqrt(LARGEST_REACH * (fx * fx * largest * largest * (1 + jx * jx) + LOW_PASS)) + 1.0
+        room_y = np.sqrt(LARGEST_REACH * (fy * fy * largest * largest * (1 + jy * jy) + LOW_PASS)) + 1.0
+        if u < -room_x or u > width + room_x or v < -room_y or v > height + room_y:
+            continue
         # The projected axes: columns of J R_camera R_gaussian S, a 2x3 matrix whose V V' is the covariance.
         qw, qx = np.float64(rotation[g, 0]), np.float64(rotation[g, 1])
         qy, qz = np.float64(rotation[g, 2]), np.float64(rotation[g, 3])
-        vx = np.empty(3)
-        vy = np.empty(3)
-        for k in range(3):
-            if k == 0:
-                ax, ay, az = 1 - 2 * (qy * qy + qz * qz), 2 * (qx * qy + qw * qz), 2 * (qx * qz - qw * qy)
-            elif k == 1:
-                ax, ay, az = 2 * (qx * qy - qw * qz), 1 - 2 * (qx * qx + qz * qz), 2 * (qy * qz + qw * qx)
-            else:
-                ax, ay, az = 2 * (qx * qz + qw * qy), 2 * (qy * qz - qw * qx), 1 - 2 * (qx * qx + qy * qy)
-            length = np.float64(scale[g, k])
-            ex = length * (pose[0, 0] * ax + pose[0, 1] * ay + pose[0, 2] * az)
-            ey = length * (pose[1, 0] * ax + pose[1, 1] * ay + pose[1, 2] * az)
-            ez = length * (pose[2, 0] * ax + pose[2, 1] * ay + pose[2, 2] * az)
-            vx[k] = fx / cz * (ex - jx * ez)
-            vy[k] = fy / cz * (ey - jy * ez)
-        sxx = vx[0] * vx[0] + vx[1] * vx[1] + vx[2] * vx[2]
-        syy = vy[0] * vy[0] + vy[1] * vy[1] + vy[2] * vy[2]
-        sxy = vx[0] * vy[0] + vx[1] * vy[1] + vx[2] * vy[2]
+        axis = (1 - 2 * (qy * qy + qz * qz), 2 * (qx * qy + qw * qz), 2 * (qx * qz - qw * qy))
+        vx0, vy0 = _projected_axis(axis, np.float64(scale[g, 0]), pose, fx / cz, fy / cz, jx, jy)
+        axis = (2 * (qx * qy - qw * qz), 1 - 2 * (qx * qx + qz * qz), 2 * (qy * qz + qw * qx))
+        vx1, vy1 = _projected_axis(axis, np.float64(scale[g, 1]), pose, fx / cz, fy / cz, jx, jy)
+        axis = (2 * (qx * qz + qw * qy), 2 * (qy * qz - qw * qx), 1 - 2 * (qx * qx + qy * qy))
+        vx2, vy2 = _projected_axis(axis, np.float64(scale[g, 2]), pose, fx / cz, fy / cz, jx, jy)
+        sxx = vx0 * vx0 + vx1 * vx1 + vx2 * vx2
+        syy = vy0 * vy0 + vy1 * vy1 + vy2 * vy2
+        sxy = vx0 * vy0 + vx1 * vy1 + vx2 * vy2
         # det(V V' + c I) as a sum of positive terms (Cauchy-Binet): no cancellation for needles.
-        m01, m02, m12 = vx[0] * vy[1] - vx[1] * vy[0], vx[0] * vy[2] - vx[2] * vy[0], vx[1] * vy[2] - vx[2] * vy[1]
+        m01, m02, m12 = vx0 * vy1 - vx1 * vy0, vx0 * vy2 - vx2 * vy0, vx1 * vy2 - vx2 * vy1
         det = m01 * m01 + m02 * m02 + m12 * m12 + LOW_PASS * (sxx + syy) + LOW_PASS * LOW_PASS
         sxx += LOW_PASS
         syy += LOW_PASS
@@ -340,6 +339,15 @@ def _project(xyz, scale, rotation, opacity, thickness, pose, intrinsics, width, 
         depth[g] = cz
         keys[g] = (np.uint64(depth.view(np.uint32)[g]) << np.uint64(32)) | np.uint64(g)
     return splats, keys
+
+
+@njit(cache=True, error_model="numpy")
+def _projected_axis(axis, length, pose, px, py, jx, jy):  # noqa: ANN001, ANN202
+    """An axis of a Gaussian (unit, world) of that length in pixels of the image, linearised at (jx, jy)."""
+    ex = length * (pose[0, 0] * axis[0] + pose[0, 1] * axis[1] + pose[0, 2] * axis[2])
+    ey = length * (pose[1, 0] * axis[0] + pose[1, 1] * axis[1] + pose[1, 2] * axis[2])
+    ez = length * (pose[2, 0] * axis[0] + pose[2, 1] * axis[1] + pose[2, 2] * axis[2])
+    return px * (ex - jx * ez), py * (ey - jy * ez)
 
 
 @njit(cache=True, parallel=True)

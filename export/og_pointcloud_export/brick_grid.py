@@ -185,7 +185,7 @@ class _Classifier:
         steps = int(np.ceil(self._search / size))
         columns = product(range(-steps, steps + 1), repeat=2)
         self._columns = np.array(sorted(columns, key=lambda step: step[0] ** 2 + step[1] ** 2))
-        buckets = VoxelBuckets(cloud.xyz, size, run=2 * steps + 2)
+        buckets = VoxelBuckets(cloud.xyz, size, run=2 * steps + BRICK + 2)  # a line of a brick is searched at once
         answers = cloud.instance_ids[buckets.point] + np.int32(CODE_OFFSET)
         starts = buckets.starts.astype(np.int32)  # half the memory to run through
         self._points = (buckets.x, buckets.y, buckets.z, answers, starts, buckets.mask, buckets.edge)
@@ -203,13 +203,36 @@ class _Classifier:
 @njit(cache=True, parallel=True)
 def _classify(corners, per_edge, size, half, reach, search, columns, points, codes, values):  # noqa: ANN001, ANN202
     """Fill values: the answer at each box's centre, plus ``codes`` where it is not the whole box's."""
+    # Boxes in lines along z: most lines of a brick meet no point at all, and say so once for all their boxes.
     for cube in prange(len(corners)):
-        for box in range(values.shape[1]):
-            center_x = corners[cube, 0] + (box // (per_edge * per_edge) + 0.5) * size
-            center_y = corners[cube, 1] + (box // per_edge % per_edge + 0.5) * size
-            center_z = corners[cube, 2] + (box % per_edge + 0.5) * size
-            center = (center_x, center_y, center_z)
-            values[cube, box] = _box_value(center, half, reach, search, columns, points, codes)
+        for line in range(per_edge * per_edge):
+            x = corners[cube, 0] + (line // per_edge + 0.5) * size
+            y = corners[cube, 1] + (line % per_edge + 0.5) * size
+            first = line * per_edge
+            if not _line_meets_a_point(x, y, corners[cube, 2], per_edge * size, search, columns, points):
+                values[cube, first : first + per_edge] = TOO_FAR_CODE
+                continue
+            for box in range(per_edge):
+                center = (x, y, corners[cube, 2] + (box + 0.5) * size)
+                values[cube, first + box] = _box_value(center, half, reach, search, columns, points, codes)
+
+
+@njit(cache=True)
+def _line_meets_a_point(x, y, low, length, search, columns, points):  # noqa: ANN001, ANN202
+    """Whether any point is within the search radius of a line of that length upwards from (x, y, low)."""
+    xs, ys, zs, _, starts, mask, edge = points
+    bottom = np.int64(np.floor((low - search) / edge))
+    top = np.int64(np.floor((low + length + search) / edge))
+    for column in range(len(columns)):
+        voxel_x = np.int64(np.floor(x / edge)) + columns[column, 0]
+        voxel_y = np.int64(np.floor(y / edge)) + columns[column, 1]
+        bucket = (voxel_x * 73856093 + voxel_y * 19349663 + bottom) & mask
+        for point in range(starts[bucket], starts[bucket + top - bottom + 1]):
+            dx, dy = xs[point] - x, ys[point] - y
+            dz = max(low - zs[point], 0.0, zs[point] - low - length)
+            if dx * dx + dy * dy + dz * dz <= search * search:
+                return True
+    return False
 
 
 @njit(cache=True)
