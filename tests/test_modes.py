@@ -1,0 +1,143 @@
+"""The roads from masks to instances, on boxes whose truth is known, and the choice between them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import get_args, get_type_hints
+
+import numpy as np
+import pytest
+from scipy.sparse import csr_array
+from test_fit import BOXES, boxes_on_a_table
+
+from og_pointcloud.cloud import BACKGROUND, UNOBSERVED, InstanceTable, LabelledCloud
+from og_pointcloud.fit import fit, prepare
+from og_pointcloud.journal import Journal
+from og_pointcloud.modes import Labelling, by_choice, by_features, by_grouping, mask_agreement
+from og_pointcloud.settings import CodebookSettings, FitSettings, MatchingSettings, PaperSettings
+from og_pointcloud.visibility import MaskTable
+
+MODES = get_args(get_type_hints(FitSettings)["mode"])
+PAPER = PaperSettings(schedule_share=0.004, k1=8, k2=2, feature_rate=0.02)
+"""Some eighty steps a stage: enough for four boxes that every view sees."""
+
+
+def box_purity(cloud: LabelledCloud, truth: np.ndarray) -> tuple[float, int]:
+    """Of the boxes' points that are in an instance, the share whose instance is mostly of their box; boxes that lead
+    in some instance."""
+    ids = cloud.instance_ids
+    known = (ids >= 0) & (truth < BOXES)
+    votes = np.zeros((len(cloud.instances), BOXES), int)
+    np.add.at(votes, (ids[known], truth[known]), 1)
+    lead = votes.argmax(axis=1)
+    return float((lead[ids[known]] == truth[known]).mean()), len(np.unique(lead[votes.any(axis=1)]))
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_every_mode_finds_the_boxes(mode: str) -> None:
+    if mode == "paper":
+        pytest.importorskip("torch")
+    known = boxes_on_a_table()
+    cloud = fit(known.scene, FitSettings(mode=mode, paper=PAPER), progress=False)  # type: ignore[arg-type]
+    purity, boxes = box_purity(cloud, known.truth)
+    assert boxes == BOXES
+    assert purity > (0.85 if mode == "paper" else 0.97)
+    assert len(cloud.instances.descriptors) >= BOXES
+    assert cloud.provenance["settings"]["mode"] == mode
+    assert {stage["name"] for stage in cloud.provenance["stages"]} >= {"visibility"}
+
+
+@pytest.mark.parametrize("mode", ["grouping", "fast"])
+def test_ids_are_the_same_on_every_run(mode: str) -> None:
+    known = boxes_on_a_table()
+    first, second = (
+        fit(known.scene, FitSettings(mode=mode), progress=False)  # type: ignore[arg-type]
+        for _ in range(2)
+    )
+    np.testing.assert_array_equal(first.instance_ids, second.instance_ids)
+    np.testing.assert_array_equal(first.instances.descriptors, second.instances.descriptors)
+
+
+def test_literal_leaves_know_no_background() -> None:
+    """The paper gives every point that shows in a mask a leaf; what no mask shows is unobserved, not background."""
+    known = boxes_on_a_table()
+    prepared = prepare(known.scene)
+    settings = FitSettings(matching=MatchingSettings(settle=False))
+    literal = by_features(known.scene, prepared, settings, Journal(False))
+    shown = np.asarray(prepared.table.weights.sum(axis=0)).ravel() > 0
+    np.testing.assert_array_equal(literal.instance_ids >= 0, shown)
+    assert (literal.instance_ids[~shown] == UNOBSERVED).all()
+    settled = by_features(known.scene, prepared, FitSettings(), Journal(False))
+    assert (settled.instance_ids[known.truth == BOXES] == BACKGROUND).mean() > 0.5
+
+
+def test_fast_mode_names_the_coarse_cluster_of_every_instance() -> None:
+    known = boxes_on_a_table()
+    cloud = fit(known.scene, FitSettings(mode="fast", codebook=CodebookSettings(k1=2)), progress=False)
+    assert set(np.unique(cloud.instances.coarse)) <= {0, 1}
+    grouped = fit(known.scene, FitSettings(mode="grouping"), progress=False)
+    assert (grouped.instances.coarse == -1).all()
+
+
+def table_of(weights: list[list[float]], outside: list[list[float]], mask_view: list[int]) -> MaskTable:
+    masks = len(weights)
+    return MaskTable(
+        csr_array(np.array(weights, np.float32)), csr_array(np.array(outside, np.float32)),
+        csr_array(np.ones_like(np.array(outside, np.float32))), np.array(mask_view, np.int32),
+        np.ones(masks, np.int32), np.eye(masks, dtype=np.float32),
+    )  # fmt: skip
+
+
+def labelling_of(ids: list[int]) -> Labelling:
+    count = max(ids) + 1
+    zeros = np.zeros(count, np.int32)
+    empty = InstanceTable(
+        np.zeros((0, 2), np.float32), np.zeros(0, np.int32), zeros, zeros, zeros,
+        zeros.astype(np.float32), zeros.astype(np.float32),
+    )  # fmt: skip
+    return Labelling(np.array(ids, np.int32), empty, zeros)
+
+
+def test_mask_agreement_by_hand() -> None:
+    """One view: mask 0 shows points 0 and 1 (3 + 1 px), mask 1 point 2 (4 px); point 1 also shows 2 px outside."""
+    table = table_of([[3, 1, 0], [0, 0, 4]], [[0, 2, 0]], [0, 0])
+    # Instance 0 = points 0, 1: IoU with mask 0 is 4 / 6; instance 1 = point 2: 1. By area 4 and 4.
+    assert mask_agreement(table, labelling_of([0, 0, 1])) == pytest.approx((4 / 6 + 1) / 2)
+    # All one instance: 4 / 10 each.
+    assert mask_agreement(table, labelling_of([0, 0, 0])) == pytest.approx(0.4)
+
+
+def test_auto_learns_nothing_where_grouping_explains_the_masks() -> None:
+    known = boxes_on_a_table()
+    prepared, journal = prepare(known.scene), Journal(False)
+    chosen = by_choice(known.scene, prepared, FitSettings(), journal)
+    grouped = by_grouping(known.scene, prepared, FitSettings(), Journal(False))
+    np.testing.assert_array_equal(chosen.instance_ids, grouped.instance_ids)
+    assert list(journal.notes["mask_agreement"]) == ["grouping"]
+    assert journal.left_out[-1]["what"] == "learned features and codebook"
+
+
+@pytest.mark.parametrize("lead", [-1.0, 1.0])
+def test_auto_takes_what_agrees_with_the_masks(lead: float) -> None:
+    """Asked to look at both, it follows the agreement, and says so."""
+    known = boxes_on_a_table()
+    prepared, journal = prepare(known.scene), Journal(False)
+    settings = FitSettings(agreement_enough=2.0, agreement_lead=lead)
+    chosen = by_choice(known.scene, prepared, settings, journal)
+    road = by_features if lead < 0 else by_grouping
+    expected = road(known.scene, prepared, settings, Journal(False))
+    np.testing.assert_array_equal(chosen.instance_ids, expected.instance_ids)
+    assert set(journal.notes["mask_agreement"]) == {"grouping", "fast"}
+    assert ("grouping" in journal.left_out[-1]["what"]) == (lead < 0)
+
+
+def test_paper_mode_says_how_long_the_published_schedule_would_take() -> None:
+    pytest.importorskip("torch")
+    known = boxes_on_a_table()
+    settings = FitSettings(mode="paper", paper=replace(PAPER, schedule_share=0.0005))
+    training = fit(known.scene, settings, progress=False).provenance["notes"]["training"]
+    assert [stage["stage"] for stage in training] == ["features", "coarse codebook", "fine codebook"]
+    for stage in training:
+        assert stage["steps"] == 10
+        assert stage["published_steps"] == 20_000
+        assert stage["published_seconds"] >= stage["published_steps"] * stage["seconds_per_step"] * 0.99
