@@ -21,7 +21,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from benchmark_scaling import in_own_process, peak_mb, timed_fit, warm_up, write_rows
+from benchmark_scaling import compile_once, in_own_process, peak_mb, timed_fit, warm_up, write_rows
 from score_captures import score_of
 
 import og_pointcloud as og
@@ -42,8 +42,9 @@ class ModeRow:
     """One mode on one capture.
 
     unknown: share of the labelled points without a label. chosen: the road that mode "auto" took. prepare_s, own_s,
-    total_s: seconds of the shared stages, of the mode's own, and of the whole fit. steps: of learning, 0 where nothing
-    is learned. published_steps, published_s: paper mode at its whole schedule, else as they are.
+    total_s, cpu_s: seconds of the shared stages, of the mode's own, of the whole fit, and of all cores together.
+    steps: of learning, 0 where nothing is learned. published_steps, published_s: paper mode at its whole schedule,
+    else as they are.
     """
 
     capture: str
@@ -55,6 +56,7 @@ class ModeRow:
     prepare_s: float
     own_s: float
     total_s: float
+    cpu_s: float
     peak_mb: float
     steps: int
     schedule_share: float
@@ -67,7 +69,7 @@ def measure(folder: Path, mode: Any, share: float) -> ModeRow:
     """Fit and score a capture in this process."""
     settings = FitSettings(mode=mode, paper=PaperSettings(schedule_share=share))
     warm_up(settings)
-    cloud, prepare_s, own_s, total_s = timed_fit(og.read_capture(folder), settings)
+    cloud, seconds = timed_fit(og.read_capture(folder), settings)
     peak = peak_mb()
     with tempfile.TemporaryDirectory() as temporary:
         bundle = Path(temporary) / "scene.ogpc"
@@ -87,15 +89,13 @@ def measure(folder: Path, mode: Any, share: float) -> ModeRow:
         miou=score.miou,
         macc=score.macc,
         unknown=score.unknown_share,
-        prepare_s=prepare_s,
-        own_s=own_s,
-        total_s=total_s,
+        **seconds,
         peak_mb=peak,
         steps=steps,
         schedule_share=share if training else 1.0,
         seconds_per_step=stepping_s / steps if training else 0.0,
         published_steps=steps + sum(missing),
-        published_s=total_s + extra_s,
+        published_s=seconds["total_s"] + extra_s,
     )
 
 
@@ -168,7 +168,7 @@ def print_row(row: ModeRow) -> None:
     mode = f"{row.mode} ({row.chosen})" if row.mode == "auto" else row.mode
     line = (
         f"{row.capture:<17} {mode:<15} {row.miou:6.4f} {row.macc:6.4f} {row.unknown:8.4f} {row.prepare_s:9.1f} "
-        f"{row.own_s:6.1f} {row.total_s:7.1f} {row.peak_mb:7.0f} {row.steps or '-':>6}"
+        f"{row.own_s:6.1f} {row.total_s:7.1f} {row.cpu_s:6.1f} {row.peak_mb:7.0f} {row.steps or '-':>6}"
     )
     if row.published_steps > row.steps:
         line += f" {row.schedule_share:6.3f} {1e3 * row.seconds_per_step:8.1f} {row.published_s:11.0f}"
@@ -208,9 +208,10 @@ def main() -> None:
     seeds = [int(seed) for seed in arguments.rooms.split(",") if seed]
     folders = [*arguments.captures, *rooms(seeds, arguments.output)]
     print(
-        "capture           mode              mIoU   mAcc  unknown prepare s  own s total s peak MB  steps  share "
-        " ms/step published s"
+        "capture           mode              mIoU   mAcc  unknown prepare s  own s total s  cpu s peak MB  steps"
+        "  share  ms/step published s"
     )
+    compile_once(arguments.modes, arguments.threads)
     rows = []
     for folder in folders:
         for mode in arguments.modes:

@@ -53,6 +53,13 @@ NOISE_M = 0.002
 MISSING = 0.1
 """Share of the masks that a proposer does not find."""
 FEATURE_WIDTH = 512
+COMPILE = """
+import sys
+from benchmark_scaling import warm_up
+from og_pointcloud.settings import FitSettings
+for mode in sys.argv[1:]:
+    warm_up(FitSettings(mode=mode))
+"""
 PREPARING = ("spacing", "geometry", "visibility")
 """Stages before the mode's own (fit.py)."""
 
@@ -201,8 +208,9 @@ def _camera(angle: float, image: tuple[int, int], rng: np.random.Generator) -> C
 
 @dataclass(frozen=True)
 class ScalingRow:
-    """Seconds of the shared stages, of the mode's own, and of the whole fit. grown_mb: peak memory above what the
-    process held before the scene was made. agreement: adjusted Rand index on the balls' points."""
+    """Seconds of the shared stages, of the mode's own, and of the whole fit, and of all cores together: with fewer of
+    these than of the whole something else had the machine. grown_mb: peak memory above what the process held before
+    the scene was made. agreement: adjusted Rand index on the balls' points."""
 
     points: int
     views: int
@@ -211,6 +219,7 @@ class ScalingRow:
     prepare_s: float
     own_s: float
     total_s: float
+    cpu_s: float
     peak_mb: float
     grown_mb: float
     agreement: float
@@ -224,16 +233,17 @@ def warm_up(settings: FitSettings) -> None:
     fit(made_scene(**TINY)[0], short, progress=False)
 
 
-def timed_fit(scene: Scene, settings: FitSettings) -> tuple[LabelledCloud, float, float, float]:
-    """The cloud, and seconds of the shared stages, of the mode's own stages, and of the whole."""
+def timed_fit(scene: Scene, settings: FitSettings) -> tuple[LabelledCloud, dict[str, float]]:
+    """The cloud, and what it took: prepare_s, own_s, total_s and cpu_s of a row."""
     from og_pointcloud.fit import fit
 
-    start = time.perf_counter()
+    start, cpu = time.perf_counter(), time.process_time()
     cloud = fit(scene, settings, progress=False)
-    total = time.perf_counter() - start
+    total, cpu = time.perf_counter() - start, time.process_time() - cpu
     stages = cloud.provenance["stages"]
     shared = sum(stage["seconds"] for stage in stages if stage["name"] in PREPARING)
-    return cloud, shared, sum(stage["seconds"] for stage in stages) - shared, total
+    own = sum(stage["seconds"] for stage in stages) - shared
+    return cloud, {"prepare_s": shared, "own_s": own, "total_s": total, "cpu_s": cpu}
 
 
 def peak_mb() -> float:
@@ -248,20 +258,29 @@ def measure(points: int, views: int, mode: Any, image: tuple[int, int] = IMAGE) 
     warm_up(settings)
     before = peak_mb()
     scene, owner = made_scene(points, views, image)
-    cloud, prepare_s, own_s, total_s = timed_fit(scene, settings)
+    cloud, seconds = timed_fit(scene, settings)
     peak = peak_mb()
     on_ball = owner >= 0
     agreement = adjusted_rand_index(cloud.instance_ids[on_ball], owner[on_ball])
     masks = sum(view.mask_count for view in scene.views)
-    return ScalingRow(points, views, mode, masks, prepare_s, own_s, total_s, peak, peak - before, agreement)
+    return ScalingRow(points, views, mode, masks, **seconds, peak_mb=peak, grown_mb=peak - before, agreement=agreement)
 
 
 def in_own_process(script: str, arguments: Sequence[str], threads: int) -> dict[str, Any]:
     """What ``script --row arguments`` prints last, a JSON object. Its messages go to stderr."""
-    environment = {**os.environ, "OMP_NUM_THREADS": str(threads), "NUMBA_NUM_THREADS": str(threads)}
     command = [sys.executable, script, "--row", *arguments]
-    result = subprocess.run(command, stdout=subprocess.PIPE, env=environment, text=True, check=True)
+    result = subprocess.run(command, stdout=subprocess.PIPE, env=_environment(threads), text=True, check=True)
     return json.loads(result.stdout.splitlines()[-1])
+
+
+def compile_once(modes: Sequence[str], threads: int) -> None:
+    """Have all code compiled and stored: a row that had to would hold the compiler's memory."""
+    command = [sys.executable, "-c", COMPILE, *modes]
+    subprocess.run(command, cwd=Path(__file__).parent, env=_environment(threads), check=True)
+
+
+def _environment(threads: int) -> dict[str, str]:
+    return {**os.environ, "OMP_NUM_THREADS": str(threads), "NUMBA_NUM_THREADS": str(threads)}
 
 
 # All rows -------------------------------------------------------------------------------------------------------
@@ -345,7 +364,7 @@ def print_row(row: ScalingRow) -> None:
     """One line of the table."""
     print(
         f"{row.points:>9,} {row.views:>5} {row.masks:>6}  {row.mode:<8} {row.prepare_s:9.2f} {row.own_s:7.2f} "
-        f"{row.total_s:7.2f} {row.peak_mb:8.0f} {row.grown_mb:8.0f} {row.agreement:10.4f}",
+        f"{row.total_s:7.2f} {row.cpu_s:7.2f} {row.peak_mb:8.0f} {row.grown_mb:8.0f} {row.agreement:10.4f}",
         flush=True,
     )
 
@@ -363,7 +382,8 @@ def main() -> None:
         print(json.dumps(asdict(measure(int(points), int(views), mode))))
         return
     sizes = dict.fromkeys([*((n, VIEWS_OF_POINTS) for n in POINTS), *((POINTS_OF_VIEWS, n) for n in VIEWS)])
-    print("   points views  masks  mode     prepare s   own s total s  peak MB grown MB  agreement")
+    print("   points views  masks  mode     prepare s   own s total s   cpu s  peak MB grown MB  agreement")
+    compile_once(MODES, arguments.threads)
     rows = []
     for points, views in sizes:
         for mode in MODES:

@@ -26,7 +26,9 @@ def scored_capture(tiny_capture: TinyCapture) -> Path:
 def grown(points: int, views: int, mode: str) -> ScalingRow:
     """A row of a fit whose seconds grow as points^0.5 views, its memory as points."""
     seconds = 0.01 * points**0.5 * views
-    return ScalingRow(points, views, mode, 10 * views, seconds, 2 * seconds, 3 * seconds, 200 + points, points, 0.9)
+    return ScalingRow(
+        points, views, mode, 10 * views, seconds, 2 * seconds, 3 * seconds, 4 * seconds, 200 + points, points, 0.9
+    )
 
 
 def test_balls_are_drawn_where_rays_meet_them() -> None:
@@ -73,6 +75,7 @@ def test_a_row_adds_up_and_finds_the_balls() -> None:
     assert row.masks == sum(view.mask_count for view in made_scene(4_000, 8, (160, 120))[0].views) > 20
     assert min(row.prepare_s, row.own_s) > 0
     assert row.prepare_s + row.own_s <= row.total_s + 1e-3
+    assert row.cpu_s > 0
     assert 0 <= row.grown_mb < row.peak_mb
     assert row.agreement > 0.7
 
@@ -108,6 +111,7 @@ def test_scaling_writes_what_it_measured(
         return row | {"total_s": row["total_s"] / len(asked)}  # later runs are faster
 
     monkeypatch.setattr(scaling, "in_own_process", pretend)
+    monkeypatch.setattr(scaling, "compile_once", lambda *_: None)
     monkeypatch.setattr("sys.argv", ["benchmark_scaling.py", "-o", str(tmp_path), "--repeats", "2"])
     scaling.main()
     with (tmp_path / "scaling.csv").open() as file:
@@ -158,13 +162,14 @@ def test_modes_compares_what_it_measured(
     def pretend(script: str, arguments: list[str], threads: int) -> dict[str, object]:
         folder, mode = arguments[:2]
         row = modes.ModeRow(
-            Path(folder).name, mode, mode, score[mode], 1, 0, 1, 1, 2, 100, 0, 1.0, 0, 0, 2
+            Path(folder).name, mode, mode, score[mode], 1, 0, 1, 1, 2, 3, 100, 0, 1.0, 0, 0, 2
         )  # fmt: skip
         if mode == "paper":
             row = replace(row, steps=60, seconds_per_step=0.005, published_steps=60_000, published_s=300)
         return asdict(row)
 
     monkeypatch.setattr(modes, "in_own_process", pretend)
+    monkeypatch.setattr(modes, "compile_once", lambda *_: None)
     monkeypatch.setattr(modes.subprocess, "run", lambda command, **_: started.append(command))
     monkeypatch.setattr("sys.argv", ["benchmark_modes.py", "shelf", "--rooms", "4", "-o", str(tmp_path)])
     modes.main()
