@@ -1,4 +1,4 @@
-"""The command line: ``og-pointcloud fit | import | segment | pick | view | info | demo``.
+"""The command line: ``og-pointcloud fit | import | segment | pick | view | info | ablate | demo``.
 
 A command imports what it needs when it runs, so that ``--help`` answers at once and ``segment`` and ``pick`` work on
 the base install. Progress, warnings and errors go to stderr, results to stdout. Exit codes: 0 done, 2 bad use or bad
@@ -27,6 +27,8 @@ from og_pointcloud.cli_output import (
     describe_fit,
     describe_pick,
     describe_segmentation,
+    next_fit_command,
+    print_ablation,
     print_fit,
     print_import,
     print_info,
@@ -35,7 +37,7 @@ from og_pointcloud.cli_output import (
     print_table,
 )
 from og_pointcloud.errors import BundleError, FeatureSpaceError, MissingExtraError, OgPointcloudError
-from og_pointcloud.settings import FitSettings
+from og_pointcloud.settings import FitSettings, PaperSettings
 
 if TYPE_CHECKING:
     import numpy as np
@@ -97,6 +99,7 @@ def build_parser() -> Parser:
     add_pick(commands)
     add_view(commands)
     add_info(commands)
+    add_ablate(commands)
     add_demo(commands)
     return parser
 
@@ -129,6 +132,9 @@ def add_fit(commands: Any) -> None:
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="S.ogpc", help="the file to write")
     parser.add_argument("--gaussians", type=Path, metavar="F.ply", help="geometry, in place of the capture's own")
     parser.add_argument("--mode", choices=MODES, default="auto", help="which road to take (default: %(default)s)")
+    parser.add_argument(
+        "--schedule-share", type=float, metavar="X", help="shorten the published schedule (mode paper; default: 1)"
+    )
     parser.add_argument(
         "--mask-level", choices=MASK_LEVELS, default="large", help="level of LangSplat masks (default: %(default)s)"
     )
@@ -211,6 +217,27 @@ def add_info(commands: Any) -> None:
     parser.add_argument("--json", action="store_true", help="print everything as JSON")
 
 
+def add_ablate(commands: Any) -> None:
+    parser = add_command(
+        commands, "ablate", run_ablate,
+        "The paper's ablations (losses, codebook, association) on captures with known labels: table, CSV and plot.",
+        "og-pointcloud ablate --room 1,2 -o out/ablation",
+    )  # fmt: skip
+    parser.add_argument(
+        "captures", type=Path, nargs="*", metavar="CAPTURE", help="folders that also hold gt.npz and text_features.npz"
+    )
+    parser.add_argument("--room", metavar="SEED[,SEED]", help="made rooms, in place of captures or beside them")
+    parser.add_argument("--seeds", type=int, default=1, metavar="N", help="runs of all that is random (default: 1)")
+    parser.add_argument("--paper", action="store_true", help="also the rows trained by rendering, as published (slow)")
+    parser.add_argument(
+        "--schedule-share", type=float, metavar="X", help="of --paper: part of the published schedule (default: 0.05)"
+    )
+    parser.add_argument(
+        "-o", "--output", type=Path, default=Path("out/ablation"), metavar="DIR",
+        help="folder for ablation.csv, ablation.png and the rooms (default: %(default)s)",
+    )  # fmt: skip
+
+
 def add_demo(commands: Any) -> None:
     parser = add_command(
         commands, "demo", run_demo_command, "Make a furnished room, fit it, ask it for things, score it and show it.",
@@ -245,6 +272,7 @@ def run_fit(arguments: argparse.Namespace) -> None:
         },
         inputs=[arguments.capture, arguments.gaussians, arguments.vocabulary],
     )
+    settings = fit_settings(arguments)
     from og_pointcloud_export import write_bundle
 
     from og_pointcloud.fit import fit
@@ -254,7 +282,6 @@ def run_fit(arguments: argparse.Namespace) -> None:
     with timed(stages, "read capture"):
         scene = read_capture(arguments.capture, gaussians=arguments.gaussians, mask_level=arguments.mask_level)
         vocabulary, left_out = vocabulary_for(scene, arguments)
-    settings = FitSettings(mode=arguments.mode, seed=arguments.seed)
     cloud = fit(scene, settings, progress=sys.stderr.isatty())
     stages += cloud.provenance["stages"]
     provenance = {**cloud.provenance, "stages": stages, "left_out": [*cloud.provenance["left_out"], *left_out]}
@@ -269,6 +296,18 @@ def run_fit(arguments: argparse.Namespace) -> None:
     if arguments.json:
         write_json(arguments.json, report)
     print_fit(report, cloud)
+
+
+def fit_settings(arguments: argparse.Namespace) -> FitSettings:
+    settings = FitSettings(mode=arguments.mode, seed=arguments.seed)
+    if arguments.schedule_share is None:
+        return settings
+    if arguments.mode != "paper":
+        raise OgPointcloudError(
+            f"--schedule-share is {arguments.schedule_share:g} with --mode {arguments.mode}, which has no schedule; "
+            "expected --mode paper: leave the option out, or take that mode"
+        )
+    return replace(settings, paper=PaperSettings(schedule_share=arguments.schedule_share))
 
 
 def vocabulary_for(scene: Scene, arguments: argparse.Namespace) -> tuple[Vocabulary | None, list[dict[str, str]]]:
@@ -494,11 +533,77 @@ def run_info(arguments: argparse.Namespace) -> None:
         ) from None
 
 
-def run_demo_command(arguments: argparse.Namespace) -> None:
+def run_ablate(arguments: argparse.Namespace) -> None:
+    seeds, share = room_seeds(arguments.room), arguments.schedule_share
+    if not arguments.captures and not seeds:
+        raise OgPointcloudError("no CAPTURE and no --room; expected at least one, e.g. --room 1,2")
+    if share is not None and not arguments.paper:
+        raise OgPointcloudError("--schedule-share is of --paper; expected both, or neither")
+    if arguments.seeds < 1:
+        raise OgPointcloudError(f"--seeds is {arguments.seeds}; expected at least 1")
+    table, picture = arguments.output / "ablation.csv", arguments.output / "ablation.png"
+    check_outputs({"-o": (table, [".csv"]), "the plot": (picture, [".png"])}, inputs=arguments.captures)
+    if arguments.paper and find_spec("torch") is None:
+        raise MissingExtraError("torch", "learn")
+    from og_pointcloud import ablation
+    from og_pointcloud.formats.capture import read_capture
+
+    ablation.require_matplotlib()
+    rows_wanted = ablation.cases()
+    if arguments.paper:
+        published = ablation.cases("paper", 0.05 if share is None else share)
+        rows_wanted = [*published[: -len(ablation.references())], *rows_wanted]
+    captures = [*arguments.captures, *(made_room(seed, arguments.output) for seed in seeds)]
+    # All are read before the first is worked on: what is missing in the last is said at once.
+    subjects = []
+    for folder in captures:
+        scene = read_capture(folder)
+        truth, vocabulary = ablation.read_truth(folder), ablation.read_vocabulary(folder, scene.feature_space)
+        ablation.check_subject(scene, truth, vocabulary)
+        subjects.append((folder.name, scene, truth, vocabulary))
+    rows = [
+        ablation.ablate(
+            scene, truth, vocabulary, only=rows_wanted, seeds=range(arguments.seeds), name=name,
+            progress=sys.stderr.isatty(),
+        )
+        for name, scene, truth, vocabulary in subjects
+    ]  # fmt: skip
+    arguments.output.mkdir(parents=True, exist_ok=True)
+    means = ablation.average(rows)
+    every = [row for of_capture in rows for row in of_capture]
+    ablation.write_csv([*every, *means] if len(rows) > 1 else means, table)
+    ablation.plot(means, picture, title=", ".join(name for name, *_ in subjects))
+    print_ablation(means)
+    print(f"wrote {table}\nwrote {picture}")
+    print(f"next: {next_fit_command(captures[0], arguments.output)}")
+
+
+def room_seeds(text: str | None) -> list[int]:
+    if text is None:
+        return []
+    if not re.fullmatch(r"\d{1,9}(,\d{1,9})*", text):
+        raise OgPointcloudError(f"--room is '{text}'; expected whole numbers with commas between them, e.g. 1,2")
+    return list(dict.fromkeys(int(seed) for seed in text.split(",")))
+
+
+def made_room(seed: int, output: Path) -> Path:
+    """A furnished room as a capture folder, small enough for many fits."""
+    require_room()
+    from og_pointcloud_room.capture import CaptureSettings, make_capture, write_capture
+
+    settings = CaptureSettings(views=40, width=320, height=240, samples_per_view=20_000)
+    return write_capture(make_capture(seed, settings), output / f"room-{seed}")
+
+
+def require_room() -> None:
     # The room's modules import these as they please: whoever lacks one needs the whole extra.
     for module in ("numba", "scipy", "cv2", "onnx", "open3d", "pyvista"):
         if find_spec(module) is None:
             raise MissingExtraError(module, "demo")
+
+
+def run_demo_command(arguments: argparse.Namespace) -> None:
+    require_room()
     from og_pointcloud_room.demo import run_demo
 
     run_demo(arguments.output, seed=arguments.seed, mask_noise=arguments.mask_noise)

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from og_pointcloud.ablation import AblationRow
     from og_pointcloud.cloud import LabelledCloud
     from og_pointcloud.picking import Pick
     from og_pointcloud.runtime import LabelledScene
@@ -18,6 +19,8 @@ __all__ = [
     "describe_fit",
     "describe_pick",
     "describe_segmentation",
+    "next_fit_command",
+    "print_ablation",
     "print_fit",
     "print_import",
     "print_info",
@@ -187,6 +190,33 @@ def print_instances(scene: LabelledScene) -> None:
     print_table(("instance", "points", "views", "masks", "agreement", "best word"), rows)
     if len(table) > SHOWN:
         print(f"and {len(table) - SHOWN} smaller ones")
+
+
+def print_ablation(rows: Sequence[AblationRow]) -> None:
+    """A table a method and table of the paper; strict: with a class called on background as wrong."""
+    print("paper: the same row's mIoU as published, on ScanNet: compare the order, not the size\n")
+    header = ("", "mIoU", "+-", "paper", "mAcc", "unknown", "strict mIoU", "background called", "seconds", "clusters")
+    for method, table in dict.fromkeys((row.method if row.table != "reference" else "", row.table) for row in rows):
+        own = [row for row in rows if row.table == table and (table == "reference" or row.method == method)]
+        cells = [
+            (
+                row.name, f"{row.miou:.3f}", number(row.miou_spread), number(row.published_miou), f"{row.macc:.3f}",
+                f"{row.unknown_share:.3f}", number(row.strict_miou), number(row.background_called),
+                f"{row.seconds:.2f}", f"{row.clusters:.0f}",
+            )
+            for row in own
+        ]  # fmt: skip
+        print_table((f"{table} ({method})" if method else table, *header[1:]), cells)
+        print()
+
+
+def number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3f}"
+
+
+def next_fit_command(capture: Path, output: Path) -> str:
+    """A fit of the capture, which takes what an ablation compares."""
+    return shlex.join(["og-pointcloud", "fit", str(capture), "-o", str(output / f"{capture.name}.ogpc")])
 
 
 def print_provenance(provenance: Mapping[str, Any]) -> None:

@@ -142,8 +142,8 @@ def learn_features(
     """Features that agree within masks and differ between the masks of a view, by L-BFGS on all views at once.
 
     gram: of the table's own Gaussians and views; needed for cohesion "rendered" only.
-    start: (n, width), not yet read; else each Gaussian starts at the mean of seeded random directions of its masks.
-        Where two means of a view have met, the gradient vanishes by symmetry: the same directions then part them.
+    start: (n, width), not yet read; else `FeatureSettings.start` says where each Gaussian starts, seeded. Where two
+        means of a view have met, the gradient vanishes by symmetry: random directions of the masks then part them.
     progress: called after each step with its number and the objective.
 
     Steps are preconditioned by each Gaussian's visible weight, shortened until the objective falls enough, and no
@@ -152,8 +152,11 @@ def learn_features(
     """
     settings = settings or FeatureSettings()
     problem = FeatureObjective(table, settings, gram)
-    random = np.random.default_rng(seed).normal(size=(problem.mask_count, settings.width))
+    rng = np.random.default_rng(seed)
+    random = rng.normal(size=(problem.mask_count, settings.width))
     directions = problem.uplift((random / np.linalg.norm(random, axis=1, keepdims=True)).astype(np.float32))
+    if start is None and settings.start == "random":
+        start = rng.normal(size=(table.weights.shape[1], settings.width))
     if start is None:
         begin = directions / np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-6)
     else:
