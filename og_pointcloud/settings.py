@@ -163,7 +163,7 @@ class CodebookSettings:
     """Fine clusters in each coarse one; None: as many as masks of one view fall into it."""
     positions: bool = True
     """Coarse clusters are of features and positions (Eq. 3), or of features alone."""
-    position_weight: float = 0.5
+    position_weight: float = 2.0
     """The scene's extent counts as much as this distance of features; or, absolute, one scene unit does (the paper)."""
     absolute_positions: bool = False
     """position_weight is per scene unit, as published (1.0 ScanNet, 0.5 LeRF), not per extent."""
