@@ -6,7 +6,7 @@
 Each row is a process of its own, after a discarded fit of a tiny scene of the same kind, so that compiled code is
 loaded; the fastest of ``--repeats`` runs is kept. The scene is made on the spot: balls in a furnished-sized room whose
 walls are in the cloud too, posed 640x480 images of it, and masks that are sometimes missing. Its truth is known, so
-error stands beside time: the adjusted Rand index of the instances on the balls' points.
+error stands beside time: the adjusted Rand index of the instances on those points of balls that some view shows.
 """
 
 from __future__ import annotations
@@ -131,6 +131,22 @@ class BallRoom:
         number[balls] = np.arange(len(balls))
         return number[self.look(camera)]
 
+    def in_view(
+        self, camera: Camera, look: NDArray[np.int32], xyz: NDArray[np.float64], ball: NDArray[np.int32]
+    ) -> NDArray[np.bool_]:
+        """(n,) bool: whether points on balls face the camera, in a pixel of its ``look`` that shows their ball."""
+        pose = camera.world_to_camera
+        in_camera = xyz @ pose[:3, :3].T + pose[:3, 3]
+        facing = ((xyz - self.centres[ball]) * (camera.center - xyz)).sum(axis=1) > 0
+        rows = np.flatnonzero(facing & (in_camera[:, 2] > 0))
+        column = np.floor(in_camera[rows, 0] / in_camera[rows, 2] * camera.fx + camera.cx)
+        row = np.floor(in_camera[rows, 1] / in_camera[rows, 2] * camera.fy + camera.cy)
+        inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+        rows, column, row = rows[inside], column[inside].astype(int), row[inside].astype(int)
+        seen = np.zeros(len(xyz), bool)
+        seen[rows] = look[row, column] == ball[rows]
+        return seen
+
     def image(self, camera: Camera) -> NDArray[np.uint8]:
         """(H, W, 3) uint8: what the camera sees, coloured by place and ball."""
         pose = camera.world_to_camera.astype(np.float32)
@@ -139,12 +155,12 @@ class BallRoom:
         direction = [pose[0, axis] * u + pose[1, axis] * v + pose[2, axis] for axis in range(3)]
         # The eye is inside the room: a ray leaves by the nearest of the three walls that it runs towards.
         middle = np.array([0, 0, ROOM_M[2] / 2])
-        depth = np.minimum.reduce(
-            [
+        with np.errstate(divide="ignore"):
+            walls = [
                 (middle[axis] + np.copysign(ROOM_M[axis] / 2, along) - camera.center[axis]) / along
                 for axis, along in enumerate(direction)
             ]
-        )
+        depth = np.minimum.reduce(walls)
         place = np.stack([camera.center[axis] + depth * along for axis, along in enumerate(direction)], axis=-1)
         shown = self.look(camera)
         return colours(place.reshape(-1, 3), shown.ravel()).reshape(*shown.shape, 3)
@@ -169,22 +185,27 @@ def colours(xyz: NDArray[np.floating], owner: NDArray[np.int32]) -> NDArray[np.u
 def made_scene(
     points: int, views: int, image: tuple[int, int] = IMAGE, balls: int = 40, seed: int = 0
 ) -> tuple[Scene, NDArray[np.int32]]:
-    """The scene and the ball of each of its points, -1 none. Masks and images are drawn whenever they are read, as
-    those of a capture are decoded."""
+    """The scene, and the ball that some view shows each point on, -1 none. Masks and images are drawn whenever they
+    are read, as those of a capture are decoded."""
     rng = np.random.default_rng(seed)
     room = BallRoom.make(balls, rng)
     xyz, owner = room.points(points, rng)
+    on_ball = np.flatnonzero(owner >= 0)
+    seen = np.zeros(len(on_ball), bool)
     looks = rng.normal(size=(balls, FEATURE_WIDTH)) / np.sqrt(FEATURE_WIDTH)
     taken = []
     for index in range(views):
         camera = _camera(2 * np.pi * index / views, image, rng)
-        pixels = np.bincount(room.look(camera).ravel() + 1, minlength=balls + 1)[1:]
+        look = room.look(camera)
+        seen |= room.in_view(camera, look, xyz[on_ball], owner[on_ball])
+        pixels = np.bincount(look.ravel() + 1, minlength=balls + 1)[1:]
         shown = np.flatnonzero((pixels > 0) & (rng.random(balls) >= MISSING))
         noise = rng.normal(size=(len(shown), FEATURE_WIDTH)) / np.sqrt(FEATURE_WIDTH)
         features = (looks[shown] + 0.8 * noise).astype(np.float32)
         drawn, pictured = partial(room.masks, camera, shown), partial(room.image, camera)
         taken.append(View(f"view{index}", camera, drawn, features, pictured))
     cloud = Points(xyz.astype(np.float32), np.zeros(3), colours(xyz, owner))
+    owner[on_ball[~seen]] = -1
     return Scene(cloud, tuple(taken), "made-balls", "balls"), owner
 
 
@@ -210,7 +231,7 @@ def _camera(angle: float, image: tuple[int, int], rng: np.random.Generator) -> C
 class ScalingRow:
     """Seconds of the shared stages, of the mode's own, and of the whole fit, and of all cores together: with fewer of
     these than of the whole something else had the machine. grown_mb: peak memory above what the process held before
-    the scene was made. agreement: adjusted Rand index on the balls' points."""
+    the scene was made. agreement: adjusted Rand index on the balls' points that some view shows."""
 
     points: int
     views: int
@@ -394,10 +415,11 @@ def main() -> None:
     arguments.output.mkdir(parents=True, exist_ok=True)
     write_rows(arguments.output / "scaling.csv", rows)
     plot(rows, arguments.output / "scaling.png")
-    print("\nexponents             points  views")
+    print("\nexponents             points  last two    views  last two")
     for name in QUANTITIES:
-        slopes = [exponent(*series(rows, along, name)) for along in ("points", "views")]
-        print(f"{name:<20} {slopes[0]:7.2f} {slopes[1]:6.2f}")
+        both = [series(rows, along, name) for along in ("points", "views")]
+        slopes = [exponent(sizes[first:], values[first:]) for sizes, values in both for first in (0, -2)]
+        print(f"{name:<20} {slopes[0]:7.2f} {slopes[1]:9.2f} {slopes[2]:8.2f} {slopes[3]:9.2f}")
 
 
 if __name__ == "__main__":
