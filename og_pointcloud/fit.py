@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -71,7 +70,7 @@ def prepare(scene: Scene, settings: FitSettings | None = None, journal: Journal 
         gaussians = _gaussians(scene, around, near, settings.geometry, journal)
     with journal.stage("visibility"):
         stride = _stride(scene.points, around.spacing, scene.views, settings.geometry, journal)
-        views = _ahead(lambda view: thinned(view, stride), journal.steps(scene.views, "visibility"))
+        views = (thinned(view, stride) for view in journal.steps(scene.views, "visibility"))
         thickness = _surface_thickness(gaussians, around, settings.geometry)
         table = mask_table(gaussians, views, near, thickness)
         table = replace(table, mask_pixels=table.mask_pixels * stride**2)
@@ -83,19 +82,6 @@ def prepare(scene: Scene, settings: FitSettings | None = None, journal: Journal 
     with journal.stage("visibility"):
         table = _front_surfaces(scene, table, gaussians, settings, journal)
     return Prepared(around, gaussians, near, stride, table)
-
-
-def _ahead(read: Callable[[View], View], views: Iterable[View]) -> Iterator[View]:
-    """Read the next view's masks while this one is drawn: decoding a PNG holds no lock."""
-    with ThreadPoolExecutor(max_workers=1) as reader:
-        coming: Future[View] | None = None
-        for view in views:
-            following = reader.submit(read, view)
-            if coming is not None:
-                yield coming.result()
-            coming = following
-        if coming is not None:
-            yield coming.result()
 
 
 def _check(scene: Scene, journal: Journal) -> None:

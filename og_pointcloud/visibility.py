@@ -17,9 +17,12 @@ more covered than not. It is a depth test with the accuracy of a surface, not of
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Any
+from itertools import islice
+from typing import Any, TypeVar
 
 import numba
 import numpy as np
@@ -45,6 +48,8 @@ __all__ = [
     "render",
     "view_weights",
 ]
+
+Shown = TypeVar("Shown")
 
 TILE = 16
 """Pixels along a tile's side, as in 3DGS."""
@@ -129,12 +134,16 @@ def mask_table(
     SEEN_THROUGH. None: all counts alike.
     """
     weights, outside, exposure, mask_view, mask_pixels, features = [], [], [], [], [], []
-    for index, view in enumerate(views):
+
+    def show(view: View) -> tuple[View, NDArray[np.int32], ViewWeights, csr_array]:
         ids = view.mask_map()
         shown = view_weights(gaussians, view.camera, ids, view.mask_count, near, thickness)
+        return view, ids, shown, _exposure(shown)
+
+    for index, (view, ids, shown, exposed) in enumerate(_side_by_side(show, views)):
         weights.append(shown.rows[:-1])
         outside.append(shown.rows[-1:])
-        exposure.append(_exposure(shown))
+        exposure.append(exposed)
         mask_view.append(np.full(view.mask_count, index, np.int32))
         mask_pixels.append(np.bincount(ids.ravel() + 1, minlength=view.mask_count + 1)[1:].astype(np.int32))
         features.append(view.mask_features)
@@ -147,6 +156,37 @@ def mask_table(
         np.concatenate(mask_pixels),
         np.concatenate([rows if len(rows) else np.zeros((0, width), np.float32) for rows in features]),
     )
+
+
+def _side_by_side(work: Callable[[View], Shown], views: Iterable[View]) -> Iterator[Shown]:
+    """Work on as many views at once as there are threads, each on one: sorting and merging then keep no core waiting.
+
+    Results come in the order of the views; only a few views are held at a time.
+    """
+    coming = iter(views)
+    for view in islice(coming, 1):
+        yield work(view)  # starts numba's threads: only then is their layer known
+    threads = numba.get_num_threads()
+    layer = numba.threading_layer()  # pyright: ignore[reportPrivateImportUsage]
+    if threads == 1 or layer == "workqueue":  # which takes no calls from two threads at once
+        yield from map(work, coming)
+        return
+
+    def alone(view: View) -> Shown:
+        numba.set_num_threads(1)  # of this Python thread
+        return work(view)
+
+    with ThreadPoolExecutor(max_workers=threads) as pool:
+        waiting: deque[Future[Shown]] = deque()
+        try:
+            for view in coming:
+                waiting.append(pool.submit(alone, view))
+                if len(waiting) > threads:
+                    yield waiting.popleft().result()
+            while waiting:
+                yield waiting.popleft().result()
+        finally:
+            pool.shutdown(cancel_futures=True)  # interrupted, or a view failed: no more are begun
 
 
 def pixel_weights(gaussians: Gaussians, camera: Camera, near: float) -> csr_array:
@@ -169,7 +209,7 @@ def render(
     return image[..., :-1], image[..., -1]
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True, parallel=True, nogil=True)
 def _paint(rows, cols, weights, first, counts, values, pixels):  # noqa: ANN001, ANN202
     """Add up the values of every tile's entries by pixel; no pixel belongs to two tiles."""
     image = np.zeros((pixels, values.shape[1]), np.float32)
@@ -272,7 +312,7 @@ _U, _V, _XX, _XY, _YY, _SIGMA, _X0, _X1, _Y0, _Y1, _LIMIT, _AREA, _STEP_X, _STEP
 _DEPTH, _SURFACE, _SIZE = 16, 17, 18
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
+@njit(cache=True, parallel=True, nogil=True, error_model="numpy")
 def _project(xyz, scale, rotation, opacity, thickness, pose, intrinsics, width, height, near):  # noqa: ANN001, ANN202
     """EWA projection of every Gaussian in float64: splat records (n, _SIZE) and depth keys (n,) uint64.
 
@@ -350,7 +390,7 @@ def _projected_axis(axis, length, pose, px, py, jx, jy):  # noqa: ANN001, ANN202
     return px * (ex - jx * ez), py * (ey - jy * ez)
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True, parallel=True, nogil=True)
 def _bin(splats, order, columns, tiles, bands):  # noqa: ANN001, ANN202
     """Depth-ordered members of every tile: tile t holds members[starts[t]:starts[t + 1]]."""
     tile_rows = tiles // columns
@@ -393,7 +433,7 @@ def _clip_box(s, tile, columns):  # noqa: ANN001, ANN202
     )
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True, parallel=True, nogil=True)
 def _entry_bounds(splats, starts, members, masks, id_count, columns):  # noqa: ANN001, ANN202
     """An upper bound of the (mask, Gaussian) entries each tile will write."""
     tiles = len(starts) - 1
@@ -419,7 +459,7 @@ def _entry_bounds(splats, starts, members, masks, id_count, columns):  # noqa: A
     return bounds
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
+@njit(cache=True, parallel=True, nogil=True, error_model="numpy")
 def _composite(splats, starts, members, masks, id_count, columns, first, workers):  # noqa: ANN001, ANN202
     """Blend every tile front to back and add each splat's weights up by mask; entries of tile t start at first[t].
 
@@ -513,7 +553,7 @@ def _composite(splats, starts, members, masks, id_count, columns, first, workers
     return rows, cols, weights, counts
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _merge(rows, cols, weights, first, counts, row_count, n):  # noqa: ANN001, ANN202
     """Tiles' entries as CSR (data, indices, indptr), one entry per (mask, Gaussian)."""
     start = np.zeros(row_count + 1, np.int64)

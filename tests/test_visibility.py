@@ -451,6 +451,34 @@ def test_table_is_the_views_stacked(random: Generator) -> None:
     np.testing.assert_allclose(table.seen, seen, rtol=1e-5)
 
 
+@pytest.mark.parametrize("layer", ["omp", "workqueue"])
+def test_views_side_by_side_are_the_views_one_by_one(
+    random: Generator, threads: Callable[[int], None], layer: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    gaussians = cloud(random)
+    views = [view_of(camera(), count, f"view {count}") for count in (5, 3, 0, 8, 2, 6, 1)]
+    threads(1)
+    one_by_one = mask_table(gaussians, iter(views), NEAR)
+    threads(min(2, numba.config.NUMBA_NUM_THREADS))
+    monkeypatch.setattr(numba, "threading_layer", lambda: layer)
+    table = mask_table(gaussians, iter(views), NEAR)
+    for name in ("weights", "outside", "exposure"):
+        np.testing.assert_array_equal(getattr(table, name).toarray(), getattr(one_by_one, name).toarray())
+    np.testing.assert_array_equal(table.mask_view, one_by_one.mask_view)
+    np.testing.assert_array_equal(table.mask_features, one_by_one.mask_features)
+    assert numba.get_num_threads() == min(2, numba.config.NUMBA_NUM_THREADS)
+
+
+def test_a_view_that_fails_ends_the_table_with_its_error(random: Generator) -> None:
+    def views() -> Iterator[View]:
+        for count in (5, 3, 2, 4):
+            yield view_of(camera(), count)
+        raise SceneError("mask of view 4 is damaged")
+
+    with pytest.raises(SceneError, match="view 4 is damaged"):
+        mask_table(cloud(random), views(), NEAR)
+
+
 def test_table_without_any_mask(random: Generator) -> None:
     table = mask_table(cloud(random), [view_of(camera(), 0), view_of(camera(), 0)], NEAR)
     assert table.weights.shape == (0, 150)
