@@ -46,7 +46,7 @@ try:
     from og_pointcloud.fit import prepare
     from og_pointcloud.journal import Journal
     from og_pointcloud.matching import alone_evidence, match_masks, visible_evidence
-    from og_pointcloud.modes import Prepared, by_features, by_grouping
+    from og_pointcloud.modes import Prepared, by_features, by_grouping, mask_means
 except ImportError as error:
     raise MissingExtraError("scipy and numba", "fit") from error
 
@@ -350,7 +350,7 @@ class _Stages:
         prepared = self.prepared
 
         def evidence() -> Any:
-            shown = _mask_means(prepared, features)
+            shown = mask_means(prepared.table, features)
             if kind == "visible":
                 return visible_evidence(prepared.table, leaf, centres, shown)
             return alone_evidence(prepared.gaussians, self.views, prepared.near, leaf, centres, shown)
@@ -367,13 +367,6 @@ class _Stages:
             value = compute()
             self._done[key] = value, time.perf_counter() - start
         return self._done[key]
-
-
-def _mask_means(prepared: Prepared, features: NDArray[np.float32]) -> NDArray[np.float64]:
-    """(masks, width): the mean feature that each mask shows; zero where it shows nothing."""
-    weights = prepared.table.weights
-    shown = np.asarray(weights.sum(axis=1), np.float64).reshape(-1, 1)
-    return (weights @ features) / np.where(shown > 0, shown, 1)
 
 
 def check_subject(scene: Scene, truth: Truth, vocabulary: Vocabulary) -> None:

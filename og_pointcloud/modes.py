@@ -33,7 +33,16 @@ from og_pointcloud.settings import FitSettings
 from og_pointcloud.testimony import Testimony, hear_views
 from og_pointcloud.visibility import Gaussians, MaskTable
 
-__all__ = ["Labelling", "Prepared", "as_published", "by_choice", "by_features", "by_grouping", "mask_agreement"]
+__all__ = [
+    "Labelling",
+    "Prepared",
+    "as_published",
+    "by_choice",
+    "by_features",
+    "by_grouping",
+    "mask_agreement",
+    "mask_means",
+]
 
 
 @dataclass(frozen=True)
@@ -119,7 +128,7 @@ def by_features(scene: Scene, prepared: Prepared, settings: FitSettings, journal
     journal.notes["feature_steps"], journal.notes["features_converged"] = learned.steps, learned.converged
     journal.notes["clusters"] = [len(book.coarse_centres), len(book.leaf_centres)]
     with journal.stage("matching"):
-        shown = _mask_means(table, learned.features)
+        shown = mask_means(table, learned.features)
         evidence = visible_evidence(table, book.leaf, book.leaf_centres, shown)
         matching = match_masks(table, book.leaf, evidence, settings.matching, settings.association)
     if not settings.matching.settle:
@@ -156,7 +165,7 @@ def as_published(scene: Scene, prepared: Prepared, settings: FitSettings, journa
     ids[book.leaf >= 0] = leaf
     centres = book.centres[used]
     with journal.stage("matching"):
-        shown = _mask_means(prepared.table, trained.features)
+        shown = mask_means(prepared.table, trained.features)
         if paper.association == "alone":
             evidence = alone_evidence(gaussians, views, near, ids, centres, shown, paper.covered_share)
         else:
@@ -226,7 +235,7 @@ def _without_empty(
     return np.where(ids >= 0, number[ids], ids).astype(np.int32), number[group], used
 
 
-def _mask_means(table: MaskTable, features: NDArray[np.float32]) -> NDArray[np.float64]:
+def mask_means(table: MaskTable, features: NDArray[np.float32]) -> NDArray[np.float64]:
     """(masks, width): the mean instance feature that each mask shows; zero where it shows nothing."""
     shown = np.asarray(table.weights.sum(axis=1), np.float64).reshape(-1, 1)
     return (table.weights @ features) / np.where(shown > 0, shown, 1)

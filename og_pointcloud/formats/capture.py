@@ -16,7 +16,6 @@ Masks rule the resolution: a camera takes the size of its mask map (shapes must 
 from __future__ import annotations
 
 import posixpath
-import re
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -29,6 +28,7 @@ from numpy.typing import NDArray
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats import colmap
 from og_pointcloud.formats.distortion import Distortion, undistorted
+from og_pointcloud.formats.gaussian_ply import latest_iteration
 from og_pointcloud.formats.images import find_image, image_size, read_rgb, same_shape, without_suffix
 from og_pointcloud.formats.langsplat import LANGUAGE_FEATURES_FOLDER, read_language_features
 from og_pointcloud.formats.masks import FEATURES_NAME, MASKS_FOLDER, MaskLayer, read_masks
@@ -178,12 +178,7 @@ def _find_cloud(capture: Path) -> Path | None:
         )
     if pcds:
         return pcds[0]
-    iterations = {
-        int(match.group(1)): file
-        for file in capture.glob("point_cloud/iteration_*/point_cloud.ply")
-        if (match := re.fullmatch(r"iteration_(\d+)", file.parent.name))
-    }
-    return iterations[max(iterations)] if iterations else None
+    return latest_iteration(capture)
 
 
 def _in_world_of(poses: _Poses, model: Path, xyz: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -9,6 +9,7 @@ instance features and normals are not read: nothing here renders colour by direc
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -20,7 +21,7 @@ from og_pointcloud.formats.ply import join_columns, read_ply, write_ply
 from og_pointcloud.formats.tables import colors, naming, positions, stack_columns, storable_positions
 from og_pointcloud.scene import Points
 
-__all__ = ["gaussians_from_ply", "holds_gaussians", "read_gaussian_ply", "write_gaussian_ply"]
+__all__ = ["gaussians_from_ply", "holds_gaussians", "latest_iteration", "read_gaussian_ply", "write_gaussian_ply"]
 
 SH_CONSTANT = 0.28209479177387814
 """The spherical harmonic of degree 0, 1 / (2 sqrt(pi)): colour = 0.5 + SH_CONSTANT * f_dc."""
@@ -31,6 +32,16 @@ LOG_SCALE = ("scale_0", "scale_1", "scale_2")
 ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
 
 Elements = Mapping[str, NDArray[np.void]]
+
+
+def latest_iteration(folder: Path) -> Path | None:
+    """The .ply that a training run saved last: point_cloud/iteration_N/point_cloud.ply of the largest N."""
+    iterations = {
+        int(match.group(1)): file
+        for file in folder.glob("point_cloud/iteration_*/point_cloud.ply")
+        if (match := re.fullmatch(r"iteration_(\d+)", file.parent.name))
+    }
+    return iterations[max(iterations)] if iterations else None
 
 
 def read_gaussian_ply(path: str | os.PathLike[str]) -> Points:

@@ -15,7 +15,6 @@ the authors' own evaluation gives it class 0.
 from __future__ import annotations
 
 import os
-import re
 import zipfile
 import zlib
 from dataclasses import dataclass
@@ -28,7 +27,7 @@ from numpy.typing import NDArray
 from og_pointcloud._npy import array_from_npy
 from og_pointcloud.cloud import InstanceTable, LabelledCloud
 from og_pointcloud.errors import MissingExtraError, SceneError
-from og_pointcloud.formats.gaussian_ply import read_gaussian_ply
+from og_pointcloud.formats.gaussian_ply import latest_iteration, read_gaussian_ply
 from og_pointcloud.formats.langsplat import LANGSPLAT_SPACE, LANGSPLAT_WIDTH
 from og_pointcloud.formats.tables import naming
 from og_pointcloud.settings import GeometrySettings
@@ -108,7 +107,7 @@ def read_opengaussian(
 def find_result(result: Path, cluster_lang: Path | None = None) -> tuple[Path, Path]:
     """The .ply and the .npz of a run, given its folder or its .ply. SceneError where one is not there."""
     if result.is_dir():
-        ply, folders = _latest_ply(result), [result]
+        ply, folders = latest_iteration(result) or result / "point_cloud.ply", [result]
     else:
         ply, folders = result, []
     if not ply.is_file():
@@ -123,15 +122,6 @@ def find_result(result: Path, cluster_lang: Path | None = None) -> tuple[Path, P
             "finish the run, or name the file (--cluster-lang)"
         )
     return ply, clusters
-
-
-def _latest_ply(folder: Path) -> Path:
-    iterations = {
-        int(match.group(1)): file
-        for file in folder.glob("point_cloud/iteration_*/point_cloud.ply")
-        if (match := re.fullmatch(r"iteration_(\d+)", file.parent.name))
-    }
-    return iterations[max(iterations)] if iterations else folder / "point_cloud.ply"
 
 
 def _read_leaves(file: Path, gaussians: int) -> _Leaves:
