@@ -1,0 +1,73 @@
+"""``og-pointcloud import``: what an OpenGaussian run wrote to one .ogpc file."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from og_pointcloud.cli.common import add_command, check_outputs, describe_fit, print_fit, timed
+from og_pointcloud.errors import FeatureSpaceError
+
+if TYPE_CHECKING:
+    from og_pointcloud.cloud import LabelledCloud, Vocabulary
+
+
+def add(commands: Any) -> None:
+    parser = add_command(
+        commands, "import", run, "Turn what an OpenGaussian run wrote into one .ogpc file.",
+        "og-pointcloud import output/ramen -o ramen.ogpc",
+    )  # fmt: skip
+    parser.add_argument("result", type=Path, metavar="RESULT", help="folder of the run, or its point_cloud.ply")
+    parser.add_argument("-o", "--output", type=Path, required=True, metavar="S.ogpc", help="the file to write")
+    parser.add_argument(
+        "--cluster-lang", type=Path, metavar="F.npz", help="features of the leaves (default: RESULT/cluster_lang.npz)"
+    )
+    parser.add_argument("--feature-space", metavar="NAME", help="their encoder (default: LangSplat's, if 512 wide)")
+    parser.add_argument("--text-features", type=Path, metavar="F.npz", help="names that can then be asked")
+
+
+def run(arguments: argparse.Namespace) -> None:
+    check_outputs(
+        {"-o": (arguments.output, [".ogpc"])},
+        inputs=[arguments.result, arguments.cluster_lang, arguments.text_features],
+    )
+    from og_pointcloud_export import write_bundle
+
+    from og_pointcloud.formats.opengaussian import read_opengaussian
+
+    stages: list[dict[str, Any]] = []
+    with timed(stages, "read result"):
+        cloud = read_opengaussian(arguments.result, arguments.cluster_lang, feature_space=arguments.feature_space)
+        vocabulary = vocabulary_of(cloud, arguments.text_features)
+    cloud = replace(cloud, vocabulary=vocabulary, provenance={**cloud.provenance, "stages": stages})
+    with timed(stages, "write file"):
+        arguments.output.parent.mkdir(parents=True, exist_ok=True)
+        write_bundle(cloud, arguments.output)
+    print_import(describe_fit(cloud, arguments.result, arguments.output), cloud)
+
+
+def vocabulary_of(cloud: LabelledCloud, path: Path | None) -> Vocabulary | None:
+    """The words of a text-features file, None without one; FeatureSpaceError unless the cloud can be asked them."""
+    if path is None:
+        return None
+    from og_pointcloud.text_features import UNKNOWN_SPACE, read_text_features
+
+    vocabulary, feature_space = read_text_features(path)
+    spaces = {feature_space, cloud.feature_space}
+    width, expected = vocabulary.vectors.shape[1], cloud.instances.descriptors.shape[1]
+    if (len(spaces) > 1 and UNKNOWN_SPACE not in spaces) or width != expected:
+        raise FeatureSpaceError(
+            f"{path} is of feature space '{feature_space}' (width {width}), the leaves are of '{cloud.feature_space}' "
+            f"(width {expected}): encode the names with the leaves' model, or name their space (--feature-space)"
+        )
+    return vocabulary
+
+
+def print_import(report: Mapping[str, Any], cloud: LabelledCloud) -> None:
+    """What ``import`` closes with: the files it found, and the rest as ``fit``."""
+    for file in report["files"].values():
+        print(f"read {file}")
+    print_fit(report, cloud)

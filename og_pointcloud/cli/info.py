@@ -1,0 +1,74 @@
+"""``og-pointcloud info``: what a .ogpc file holds and how it was made."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from og_pointcloud.cli.common import SHOWN, add_command, print_provenance, print_table
+from og_pointcloud.errors import BundleError
+
+if TYPE_CHECKING:
+    from og_pointcloud.runtime import LabelledScene
+
+
+def add(commands: Any) -> None:
+    parser = add_command(
+        commands, "info", run, "Say what a .ogpc file holds and how it was made.",
+        "og-pointcloud info kitchen.ogpc",
+    )  # fmt: skip
+    parser.add_argument("bundle", type=Path, metavar="S.ogpc", help="what `fit` wrote")
+    parser.add_argument("--json", action="store_true", help="print everything as JSON")
+
+
+def run(arguments: argparse.Namespace) -> None:
+    from og_pointcloud.runtime import load
+
+    scene = load(arguments.bundle)
+    if arguments.json:
+        print(json.dumps(describe_bundle(scene, arguments.bundle), indent=2, ensure_ascii=False))
+        return
+    try:
+        print_info(scene, arguments.bundle)
+    except (KeyError, TypeError, ValueError):  # the one part of a file that reading it does not check
+        raise BundleError(
+            f"{arguments.bundle}: its provenance is not in the form that fit writes; see --json"
+        ) from None
+
+
+def describe_bundle(scene: LabelledScene, path: Path) -> dict[str, Any]:
+    """What ``info --json`` prints: the manifest, with the file's size and its words."""
+    words = list(scene.vocabulary.names) if scene.vocabulary else []
+    return {"path": str(path), "bytes": path.stat().st_size, "words": words, **scene.manifest}
+
+
+def print_info(scene: LabelledScene, path: Path) -> None:
+    """The file's size, frame and words, its largest instances, and how it was made."""
+    cloud, manifest = scene.cloud, scene.manifest
+    words = cloud.vocabulary.names if cloud.vocabulary else ()
+    print(f"{path}: {path.stat().st_size / 1e6:.1f} MB, {manifest.get('written_by', 'unknown writer')}")
+    print(f"{len(cloud):,} points, {len(cloud.instances)} instances, feature space '{cloud.feature_space}'")
+    origin = ", ".join(f"{value:g}" for value in cloud.origin)
+    print(f"spacing {cloud.spacing:.4g}, reach {cloud.reach:.4g}, origin ({origin}), in the capture's unit")
+    print(f"{len(words)} words: {', '.join(words[:SHOWN])}{', ...' if len(words) > SHOWN else ''}\n")
+    print_instances(scene)
+    print()
+    print_provenance(cloud.provenance)
+
+
+def print_instances(scene: LabelledScene) -> None:
+    """The largest instances, with the evidence for each and the word that fits it best."""
+    table, vocabulary = scene.instances, scene.vocabulary
+    largest = table.points.argsort(kind="stable")[::-1][:SHOWN]
+    described = set(table.descriptor_instance.tolist())
+    best = scene.instance_scores(vocabulary.vectors).argmax(axis=1) if vocabulary and vocabulary.names else None
+    rows = []
+    for index in largest.tolist():
+        word = vocabulary.names[best[index]] if vocabulary and best is not None and index in described else "-"
+        evidence = (f"{table.points[index]:,}", str(table.views[index]), str(table.masks[index]))
+        rows.append((str(index), *evidence, f"{table.agreement[index]:.2f}", word))
+    print_table(("instance", "points", "views", "masks", "agreement", "best word"), rows)
+    if len(table) > SHOWN:
+        print(f"and {len(table) - SHOWN} smaller ones")

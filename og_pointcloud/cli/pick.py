@@ -1,0 +1,133 @@
+"""``og-pointcloud pick``: the instance at a pixel or a place, and its mask in a view."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from og_pointcloud.cli.common import SHOWN, add_command, check_outputs, did_you_mean
+from og_pointcloud.errors import OgPointcloudError
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from og_pointcloud.picking import Pick
+    from og_pointcloud.scene import Camera
+
+
+def add(commands: Any) -> None:
+    parser = add_command(
+        commands, "pick", run, "Select the instance at a pixel of a view, or at a place; render its mask.",
+        "og-pointcloud pick kitchen.ogpc --capture kitchen --view frame7 --pixel 320,240 -o mask.png",
+    )  # fmt: skip
+    parser.add_argument("bundle", type=Path, metavar="S.ogpc", help="what `fit` wrote")
+    click = parser.add_mutually_exclusive_group(required=True)
+    click.add_argument("--xyz", metavar="X,Y,Z", help="a place in world coordinates")
+    click.add_argument("--pixel", metavar="U,V", help="a pixel of the view, column and row")
+    # Else argparse takes -1,2,3 for an option.
+    parser._negative_number_matcher = re.compile(r"-[\d.,-]+$")
+    parser.add_argument("--capture", type=Path, metavar="CAPTURE", help="folder that the view is in")
+    parser.add_argument("--view", metavar="NAME", help="file stem of the view's image")
+    parser.add_argument("-o", "--output", type=Path, metavar="M.png", help="the instance's mask in the view")
+    parser.add_argument("--text-features", type=Path, metavar="F.npz", help="names to rank (default: the file's own)")
+    parser.add_argument("--json", action="store_true", help="print the answer as JSON")
+
+
+def run(arguments: argparse.Namespace) -> None:
+    check_outputs(
+        {"-o": (arguments.output, [".png"])},
+        inputs=[arguments.bundle, arguments.capture, arguments.text_features],
+    )
+    from og_pointcloud.picking import pick
+    from og_pointcloud.runtime import load
+
+    uses_view = arguments.pixel is not None or arguments.output is not None
+    if uses_view and not (arguments.capture and arguments.view):
+        raise OgPointcloudError("--pixel and -o need a camera: name it with --capture CAPTURE --view NAME")
+    scene = load(arguments.bundle)
+    camera = world_camera(arguments.capture, arguments.view) if uses_view else None
+    if arguments.pixel is not None and camera is not None:
+        hit = pick(scene, camera, numbers(arguments.pixel, "--pixel", 2))
+    else:
+        hit = pick(scene, numbers(arguments.xyz, "--xyz", 3))
+    words = []
+    if hit.found and (scene.vocabulary or arguments.text_features):
+        words = hit.words(text_features=arguments.text_features)
+    mask_pixels = None
+    if arguments.output and camera is not None:
+        mask = hit.mask(camera)
+        mask_pixels = int(mask.sum())
+        write_mask(arguments.output, mask)
+    report = describe_pick(hit, words, arguments.output, mask_pixels)
+    if arguments.json:
+        print(json.dumps(report, indent=2, ensure_ascii=False))
+    else:
+        print_pick(report)
+
+
+def numbers(text: str, option: str, count: int) -> list[float]:
+    try:
+        values = [float(part) for part in text.split(",")]
+    except ValueError:
+        values = []
+    if len(values) != count:
+        raise OgPointcloudError(f"{option} is '{text}'; expected {count} numbers with commas between them")
+    return values
+
+
+def world_camera(capture: Path, name: str) -> Camera:
+    from og_pointcloud.formats.capture import read_capture
+    from og_pointcloud.picking import in_world
+
+    scene = read_capture(capture)
+    cameras = {view.name: view.camera for view in scene.views}
+    if name not in cameras:
+        raise OgPointcloudError(
+            f"--view is '{name}', which is not among the {len(cameras)} views of {capture}{did_you_mean(name, cameras)}"
+        )
+    return in_world(cameras[name], scene.points.origin)
+
+
+def write_mask(path: Path, mask: NDArray[np.bool_]) -> None:
+    """A grey PNG, 255 inside."""
+    from og_pointcloud._atomic import replacing
+    from og_pointcloud.formats.images import require_cv2
+
+    png = require_cv2().imencode(".png", mask.astype("uint8") * 255)[1]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(path) as file:
+        file.write(png.tobytes())
+
+
+def describe_pick(
+    hit: Pick, words: Sequence[tuple[str, float]], mask: Path | None, mask_pixels: int | None
+) -> dict[str, Any]:
+    """What ``pick --json`` prints: the instance, or why there is none, and where the click hit."""
+    return {
+        "instance": hit.instance,
+        "found": hit.found,
+        "what": str(hit),
+        "point": hit.point,
+        "xyz_world": None if hit.xyz_world is None else hit.xyz_world.tolist(),
+        "points": len(hit.point_indices) if hit.found else 0,
+        "words": [{"name": name, "score": round(score, 4)} for name, score in words],
+        "mask": str(mask) if mask else None,
+        "mask_pixels": mask_pixels,
+    }
+
+
+def print_pick(report: Mapping[str, Any]) -> None:
+    """What was hit and where, the words that fit it best, and the mask."""
+    print(report["what"])
+    if report["xyz_world"]:
+        print(f"hit at {', '.join(f'{value:.6g}' for value in report['xyz_world'])} (point {report['point']})")
+    if report["words"]:
+        best = [f"{word['name']} {word['score']:.2f}" for word in report["words"][:SHOWN]]
+        print(f"best words: {', '.join(best)}{', ...' if len(report['words']) > SHOWN else ''}")
+    if report["mask"]:
+        print(f"wrote {report['mask']} ({report['mask_pixels']:,} pixels)")

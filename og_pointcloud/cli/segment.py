@@ -1,0 +1,97 @@
+"""``og-pointcloud segment``: points labelled by words."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shlex
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from og_pointcloud.cli.common import SHOWN, add_command, check_outputs, print_table, timed
+
+if TYPE_CHECKING:
+    from og_pointcloud.segmentation import Segmentation
+
+
+def add(commands: Any) -> None:
+    parser = add_command(
+        commands, "segment", run, "Label points by words: those of the fitted cloud, or of another one.",
+        "og-pointcloud segment kitchen.ogpc --labels chair,table -o labels.npz",
+    )  # fmt: skip
+    parser.add_argument("bundle", type=Path, metavar="S.ogpc", help="what `fit` wrote")
+    parser.add_argument("--labels", metavar="A,B,C", help="names to choose among (default: all that are known)")
+    parser.add_argument("--text-features", type=Path, metavar="F.npz", help="names and vectors, from the same encoder")
+    parser.add_argument("--points", type=Path, metavar="CLOUD", help="points to label (default: those fitted)")
+    parser.add_argument("-o", "--output", type=Path, metavar="OUT", help="labels as .npz, or a coloured .ply")
+    parser.add_argument("--json", action="store_true", help="print the counts as JSON")
+
+
+def run(arguments: argparse.Namespace) -> None:
+    check_outputs(
+        {"-o": (arguments.output, [".npz", ".ply"])},
+        inputs=[arguments.bundle, arguments.text_features, arguments.points],
+    )
+    from og_pointcloud.runtime import load, segment
+
+    labels = (
+        None if arguments.labels is None else [name.strip() for name in arguments.labels.split(",") if name.strip()]
+    )
+    stages: list[dict[str, Any]] = []
+    with timed(stages, "load"):
+        scene = load(arguments.bundle)
+    with timed(stages, "segment"):
+        result = segment(arguments.points or scene, labels, scene=scene, text_features=arguments.text_features)
+    if arguments.output:
+        with timed(stages, "save"):
+            arguments.output.parent.mkdir(parents=True, exist_ok=True)
+            result.save(arguments.output)
+    report = describe_segmentation(result, stages, arguments.bundle, arguments.output)
+    if arguments.json:
+        print(json.dumps(report, indent=2, ensure_ascii=False))
+    else:
+        print_segmentation(report)
+
+
+def describe_segmentation(
+    result: Segmentation, stages: Sequence[Mapping[str, Any]], bundle: Path, output: Path | None
+) -> dict[str, Any]:
+    """What ``segment --json`` prints: points of each name, and why the others are unknown."""
+    from og_pointcloud.bundle import TOO_FAR
+    from og_pointcloud.cloud import BACKGROUND, UNOBSERVED
+
+    unknown = result.labels < 0
+    states = {"background": BACKGROUND, "unobserved": UNOBSERVED, "too far from the scene": TOO_FAR}
+    reasons = {name: int((result.instances == state).sum()) for name, state in states.items()}
+    reasons["instance without a feature"] = int((unknown & (result.instances >= 0)).sum())
+    return {
+        "bundle": str(bundle),
+        "output": str(output) if output else None,
+        "points": len(result),
+        "counts": result.counts(),
+        "unknown": int(unknown.sum()),
+        "unknown_because": reasons,
+        "seconds": {stage["name"]: stage["seconds"] for stage in stages},
+    }
+
+
+def print_segmentation(report: Mapping[str, Any]) -> None:
+    """The names that were found, in the order asked, and the share that stays unknown."""
+    total = max(report["points"], 1)
+    found = {name: count for name, count in report["counts"].items() if count}
+    rows = [(name, f"{count:,}", f"{count / total:.1%}") for name, count in found.items()]
+    rows.append(("unknown", f"{report['unknown']:,}", f"{report['unknown'] / total:.1%}"))
+    print_table(("label", "points", "share"), rows)
+    absent = [name for name in report["counts"] if name not in found]
+    if absent:
+        print(f"no point: {', '.join(absent[:SHOWN])}{', ...' if len(absent) > SHOWN else ''}")
+    reasons = [f"{count:,} {name}" for name, count in report["unknown_because"].items() if count]
+    if reasons:
+        print(f"unknown: {', '.join(reasons)}")
+    print(", ".join(f"{name} {seconds:.2f} s" for name, seconds in report["seconds"].items()))
+    if report["output"]:
+        print(f"wrote {report['output']}")
+    else:
+        command = ["og-pointcloud", "segment", report["bundle"], "-o", str(Path(report["bundle"]).with_suffix(".ply"))]
+        print(f"next: keep the labels with -o, e.g. {shlex.join(command)}")
