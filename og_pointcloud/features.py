@@ -231,7 +231,8 @@ class FeatureObjective:
 
     def __init__(self, table: MaskTable, settings: FeatureSettings, gram: MaskGram | None = None) -> None:
         self.settings = settings
-        weight = np.asarray(table.weights.sum(axis=1), np.float64).ravel()
+        # In float64: where features agree, Eq. 1 is a small difference of large sums. (scipy's own sums stay float32.)
+        weight = table.weights @ np.ones(table.weights.shape[1])
         self.seen = np.bincount(table.weights.indices, table.weights.data, table.weights.shape[1]).astype(np.float64)
         self.shown = np.flatnonzero(self.seen > 0)
         self.weight = self.seen[self.shown, None].astype(np.float32)

@@ -24,6 +24,9 @@ FloatArray = NDArray[np.float32]
 DoubleArray = NDArray[np.float64]
 IntArray = NDArray[np.int32]
 
+UNIT_TOLERANCE = 1e-3
+"""A quaternion's length may differ from 1 by this much: it changes the size of a Gaussian by twice as much."""
+
 
 @dataclass(frozen=True)
 class Camera:
@@ -97,6 +100,11 @@ class View:
                 f"view '{self.name}': mask features are {features.dtype} {features.shape}; "
                 "expected float32 (masks, width)"
             )
+        if features.shape[1] == 0 and len(features):
+            raise SceneError(
+                f"view '{self.name}': the features of its {len(features)} masks have width 0; expected 1 or more: "
+                "encode the masks, or give zero rows for those without a feature"
+            )
         finite = np.isfinite(features).all(axis=1)
         if not finite.all():
             raise SceneError(
@@ -117,6 +125,11 @@ class View:
             raise SceneError(
                 f"view '{self.name}': the mask image is {ids.shape[1]}x{ids.shape[0]} pixels, its camera "
                 f"{expected[1]}x{expected[0]}: make the masks at the image's size or fix w and h of the pose file"
+            )
+        if ids.size and int(ids.min()) < -1:
+            raise SceneError(
+                f"view '{self.name}': the mask map holds {int(ids.min())}; expected rows of mask_features, or -1: "
+                "set pixels without a mask to -1"
             )
         if ids.size and int(ids.max()) >= self.mask_count:
             raise SceneError(
@@ -193,6 +206,13 @@ class Points:
         given = [name for name in ("scale", "rotation", "opacity") if getattr(self, name) is not None]
         if given and len(given) < 3:
             raise SceneError(f"Gaussians need scale, rotation and opacity together; got only {', '.join(given)}")
+        finite = np.isfinite(self.xyz).all(axis=1)
+        if not finite.all():
+            raise SceneError(
+                f"point {int(np.argmin(finite))} holds NaN or infinity; expected finite: remove such points"
+            )
+        if self.scale is not None and self.rotation is not None and self.opacity is not None:
+            _check_gaussians(self.scale, self.rotation, self.opacity)
 
     def __len__(self) -> int:
         return len(self.xyz)
@@ -206,6 +226,32 @@ class Points:
     def xyz_world(self) -> DoubleArray:
         """World coordinates, (n, 3) float64."""
         return self.xyz.astype(np.float64) + self.origin
+
+
+def _check_gaussians(scale: FloatArray, rotation: FloatArray, opacity: FloatArray) -> None:
+    """Files are activated and made unit by their readers; what is made by hand is drawn as it is."""
+    wrong = ~((scale >= 0) & (scale < np.inf)).all(axis=1)
+    if wrong.any():
+        row = int(np.argmax(wrong))
+        raise SceneError(
+            f"scale of Gaussian {row} is {scale[row].tolist()}; expected finite standard deviations, at least 0: take "
+            "the exponential of a 3DGS file's logarithms"
+        )
+    wrong = ~((opacity >= 0) & (opacity <= 1))
+    if wrong.any():
+        row = int(np.argmax(wrong))
+        raise SceneError(
+            f"opacity of Gaussian {row} is {opacity[row]}; expected 0 to 1: activate a 3DGS file's logits, 1 / (1 + "
+            "exp(-x))"
+        )
+    length = np.linalg.norm(rotation.astype(np.float64), axis=1)
+    wrong = ~(np.abs(length - 1) < UNIT_TOLERANCE)
+    if wrong.any():
+        row = int(np.argmax(wrong))
+        raise SceneError(
+            f"rotation of Gaussian {row} has length {length[row]:.6g}; expected unit quaternions wxyz: divide each by "
+            "its length"
+        )
 
 
 @dataclass(frozen=True)
