@@ -191,7 +191,7 @@ class Points:
             )
         origin = np.median(world, axis=0)
         extent = float(np.abs(world - origin).max())
-        if extent > np.finfo(np.float32).max:
+        if extent > float(np.finfo(np.float32).max):
             raise SceneError(f"points lie up to {extent:.3g} from their median; expected less than float32's 3.4e38")
         return cls((world - origin).astype(np.float32), origin, rgb, normals, scale, rotation, opacity)
 
