@@ -309,6 +309,7 @@ class _Stages:
             ),
         )
         outcome = self._matched(
+            self.prepared,
             (settings.features, settings.codebook),
             case.evidence,
             settings.matching,
@@ -319,7 +320,8 @@ class _Stages:
     def _paper(self, paper: PaperSettings) -> _Outcome:
         from og_pointcloud.paper import train_codebook, train_features
 
-        scene = (self.prepared.gaussians, self.views, self.prepared.near)
+        prepared = self._full_gaussians()
+        scene = (prepared.gaussians, self.views, prepared.near)
         # Stages are shared by cases whose settings differ in what comes after them only.
         later = PaperSettings()
         of_codebook = replace(
@@ -334,12 +336,21 @@ class _Stages:
         ids = np.full(len(book.leaf), -1, np.int32)
         ids[book.leaf >= 0] = leaf
         outcome = self._matched(
-            of_codebook, paper.association, paper.matching, (ids, book.centres[used], trained.features)
+            prepared,
+            of_codebook,
+            paper.association,
+            paper.matching,
+            (ids, book.centres[used], trained.features),
         )
         return replace(outcome, seconds=outcome.seconds + first + second)
 
+    def _full_gaussians(self) -> Prepared:
+        """The scene as mode "paper" prepares it; the others' Gaussians are thin."""
+        return self._once("full", lambda: prepare(self.scene, FitSettings(mode="paper"), Journal(progress=False)))[0]
+
     def _matched(
         self,
+        prepared: Prepared,
         key: Any,
         kind: Literal["visible", "alone"],
         matching: MatchingSettings,
@@ -347,7 +358,6 @@ class _Stages:
     ) -> _Outcome:
         """Eq. 5 for clusters: (leaf of each point, centre of each leaf, feature of each point)."""
         leaf, centres, features = clusters
-        prepared = self.prepared
 
         def evidence() -> Any:
             shown = mask_means(prepared.table, features)

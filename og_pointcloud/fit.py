@@ -13,6 +13,7 @@ from og_pointcloud.errors import SceneError
 from og_pointcloud.geometry import (
     Neighbourhood,
     choose_gaussians,
+    isotropic,
     near_plane,
     neighbourhood,
     pixels_per_spacing,
@@ -67,7 +68,7 @@ def prepare(scene: Scene, settings: FitSettings | None = None, journal: Journal 
         near = near_plane(scene.points.xyz, scene.views)
         around = neighbourhood(scene.points.xyz, settings.geometry)
     with journal.stage("geometry"):
-        gaussians = _gaussians(scene, around, near, settings.geometry, journal)
+        gaussians = _gaussians(scene, around, near, settings, journal)
     with journal.stage("visibility"):
         stride = _stride(scene.points, around.spacing, scene.views, settings.geometry, journal)
         views = (thinned(view, stride) for view in journal.steps(scene.views, "visibility"))
@@ -93,14 +94,20 @@ def _check(scene: Scene, journal: Journal) -> None:
     journal.notes.update(points=len(scene.points), views=len(scene.views), masks=masks)
 
 
-def _gaussians(
-    scene: Scene, around: Neighbourhood, near: float, settings: GeometrySettings, journal: Journal
-) -> Gaussians:
+def _gaussians(scene: Scene, around: Neighbourhood, near: float, settings: FitSettings, journal: Journal) -> Gaussians:
     if scene.points.are_gaussians:
         journal.leave_out("choice of scale and opacity", "the file holds Gaussians")
         return Gaussians.from_points(scene.points)
+    if settings.mode == "paper":
+        journal.leave_out("choice of scale and opacity", "mode paper draws points as full as trained Gaussians are")
+        return isotropic(scene.points, around.spacing, settings.paper.scale, settings.paper.opacity)
     choice = choose_gaussians(
-        scene.points, around.spacing, scene.views, near, settings, lambda values: journal.steps(values, "geometry")
+        scene.points,
+        around.spacing,
+        scene.views,
+        near,
+        settings.geometry,
+        lambda values: journal.steps(values, "geometry"),
     )
     journal.notes["gaussian_scale"], journal.notes["gaussian_opacity"] = choice.scale, choice.opacity
     journal.notes["photometric_trials"] = [list(trial) for trial in choice.trials]

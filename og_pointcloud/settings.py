@@ -232,6 +232,11 @@ class PaperSettings:
     cohesion_weight: float | None = None
     """Weight of Eq. 1, as a mean over pixels, beside Eq. 2. None: 0.1 with the authors' formula, as in their code; 10
     with the paper's, which gives none: squared distances are that much smaller."""
+    scale: float = 0.7
+    """Standard deviation of a plain cloud's Gaussians, in point spacings: full ones, as trained Gaussians are. Drawn as
+    thin as the mask table wants them, an instance rendered alone would cover no pixel by covered_share."""
+    opacity: float = 0.95
+    """Their opacity."""
     covered_share: float = 0.7
     """Pixels whose Gaussians cover less than this are no part of their mask (the authors' code)."""
     feature_rate: float = 1e-3

@@ -58,6 +58,22 @@ def test_ids_are_the_same_on_every_run(mode: str) -> None:
     np.testing.assert_array_equal(first.instances.descriptors, second.instances.descriptors)
 
 
+def test_paper_mode_draws_points_as_full_as_trained_gaussians() -> None:
+    """Each rendered alone must cover its pixels; Gaussians of a file stay as they are."""
+    scene = boxes_on_a_table().scene
+    full = prepare(scene, FitSettings(mode="paper"))
+    np.testing.assert_allclose(full.gaussians.scale, np.repeat(0.7 * full.neighbourhood.spacing[:, None], 3, axis=1))
+    np.testing.assert_allclose(full.gaussians.opacity, 0.95)
+    own = {
+        "scale": full.gaussians.scale * 2,
+        "rotation": full.gaussians.rotation,
+        "opacity": full.gaussians.opacity / 2,
+    }
+    trained = prepare(replace(scene, points=replace(scene.points, **own)), FitSettings(mode="paper"))
+    np.testing.assert_array_equal(trained.gaussians.scale, own["scale"])
+    np.testing.assert_array_equal(trained.gaussians.opacity, own["opacity"])
+
+
 def test_literal_leaves_know_no_background() -> None:
     """The paper gives every point that shows in a mask a leaf; what no mask shows is unobserved, not background."""
     known = boxes_on_a_table()
