@@ -34,9 +34,9 @@ from scipy.sparse import csr_array
 from og_pointcloud.codebook import kmeans
 from og_pointcloud.errors import MissingExtraError, SceneError
 from og_pointcloud.features import ROUNDING, cohesion_factor, raw_gradient, read_features
-from og_pointcloud.scene import View
+from og_pointcloud.scene import Camera, View
 from og_pointcloud.settings import PaperSettings
-from og_pointcloud.visibility import Gaussians, pixel_weights
+from og_pointcloud.visibility import Gaussians, view_weights
 
 try:
     import torch
@@ -449,10 +449,11 @@ class _Views:
 
     def _render(self, gaussians: Gaussians, view: View, masks: NDArray[np.int64] | None = None) -> _ViewWeights:
         """The view's weights; masks: only these count as such, all by default."""
-        weights = pixel_weights(gaussians, view.camera, self.near)
         ids = view.mask_map().ravel()
         if masks is not None:
             ids = np.where(np.isin(ids, masks), ids, -1)
+        wanted = np.arange(len(ids)) if self.whole else np.flatnonzero(ids >= 0)
+        weights, ids = self._weights(gaussians, view.camera, wanted), ids[wanted]
         coverage = np.asarray(weights.sum(axis=1)).ravel()
         shown = np.bincount(ids + 1, coverage, minlength=view.mask_count + 1) > 0  # place 0: pixels without a mask
         inside = (ids >= 0) & shown[ids + 1] & (coverage >= self.settings.covered_share)
@@ -461,6 +462,15 @@ class _Views:
         index = (chosen.indices.astype(np.int32), chosen.indptr.astype(np.int32))
         small = csr_array((chosen.data, *index), shape=chosen.shape)
         return _ViewWeights.make(small, np.where(inside, ids, -1)[rows])
+
+    def _weights(self, gaussians: Gaussians, camera: Camera, pixels: NDArray[np.int64]) -> csr_array:
+        """(pixels, n) blending weights of some pixels of the camera's image."""
+        number = np.full(camera.width * camera.height, -1, np.int32)
+        number[pixels] = np.arange(len(pixels))
+        image = number.reshape(camera.height, camera.width)
+        rows = view_weights(gaussians, camera, image, len(pixels), self.near).rows
+        end = rows.indptr[-2]  # the last row holds all other pixels; slicing it off would copy everything
+        return csr_array((rows.data[:end], rows.indices[:end], rows.indptr[:-1]), shape=(len(pixels), len(gaussians)))
 
 
 class _Blend(torch.autograd.Function):
