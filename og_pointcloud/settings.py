@@ -12,6 +12,7 @@ from og_pointcloud.errors import OgPointcloudError
 
 __all__ = [
     "AssociationSettings",
+    "ChoosingSettings",
     "CodebookSettings",
     "FeatureSettings",
     "FitSettings",
@@ -310,3 +311,24 @@ class FitSettings:
     codebook: CodebookSettings = field(default_factory=CodebookSettings)
     matching: MatchingSettings = field(default_factory=MatchingSettings)
     paper: PaperSettings = field(default_factory=PaperSettings)
+
+
+@dataclass(frozen=True)
+class ChoosingSettings:
+    """From text vectors and descriptors to a label or "unknown" (choosing.py). Evidence is in standard deviations of
+    how unrelated words score on an instance."""
+
+    sharpness: float = 3.25
+    """Evidence that a fitting word is taken to have: what the best of a thousand unrelated words has by chance."""
+    kinds: int = 50
+    """Kinds of things that an instance may be, if fewer labels are asked: each label then has one share of so many."""
+    synonym: float = 0.6
+    """A bank word this close to a label (cosine, centred) means the same and does not speak against it: cup and mug."""
+    same_look: float = 0.95
+    """Descriptors this close (cosine) are of one look; CLIP images of different things have about 0.5."""
+
+    def __post_init__(self) -> None:
+        for name in ("sharpness", "kinds", "synonym", "same_look"):
+            value = getattr(self, name)
+            if not value > 0:
+                raise OgPointcloudError(f"{name} is {value}; expected more than 0")
