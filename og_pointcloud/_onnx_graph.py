@@ -89,6 +89,8 @@ def message_fields(message: memoryview | int) -> Iterator[tuple[int, memoryview 
     while position < end:
         key, position = _varint(message, position)
         number, wire = key >> 3, key & 7
+        if not 0 < number < 1 << 29:
+            raise ValueError(f"it is damaged: field number {number}")
         if wire == VARINT:
             value, position = _varint(message, position)
             yield number, value

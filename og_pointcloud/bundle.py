@@ -8,6 +8,7 @@ One zip, every member stored uncompressed, nothing pickled:
   arrays/*.npy             xyz, instance_ids (smallest integer type), rgb if known, instances/*
   vocabulary/names.json    words that may be asked as strings, if any
   vocabulary/vectors.npy   (L, D) float16 or float32 unit vectors
+  text_encoder/*           the three files of a text encoder (see ``text_encoder``), if it carries one; read when needed
 
 ``og_pointcloud_export`` writes it.
 """
@@ -15,6 +16,7 @@ One zip, every member stored uncompressed, nothing pickled:
 from __future__ import annotations
 
 import hashlib
+import io
 import json
 import os
 import re
@@ -27,15 +29,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud._npy import array_from_npy
+from og_pointcloud._onnx_graph import check_graph
 from og_pointcloud.cloud import InstanceTable, LabelledCloud, Vocabulary
 from og_pointcloud.errors import BundleError, OgPointcloudError
 
-__all__ = ["FORMAT", "NO_EVIDENCE", "SCHEMA_VERSION", "TOO_FAR", "Bundle", "read_bundle"]
+__all__ = [
+    "BEYOND", "FORMAT", "NEAR", "NO_EVIDENCE", "ON_SURFACE", "SCHEMA_VERSION", "TOO_FAR", "Bundle", "read_bundle",
+]  # fmt: skip
 
 FORMAT = "ogpc"
 SCHEMA_VERSION = 1
 TOO_FAR = -3
 """Instance answered for a query point with no cloud point within reach."""
+ON_SURFACE, NEAR, BEYOND = 0, 1, 2
+"""How far a query point is from the cloud: within about 1.5 spacings, within reach, or too far."""
 NO_EVIDENCE = -2.0
 """Score of an instance without a descriptor: below every cosine."""
 
@@ -44,9 +51,8 @@ MAX_MANIFEST_BYTES = 1 << 26
 SAFE_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]*(/[A-Za-z0-9_][A-Za-z0-9_.-]*)*")
 INTEGERS, FLOATS = ("|i1", "<i2", "<i4"), ("<f2", "<f4")
 REBUILD = "write the file again with write_bundle"
-ONNX_EXTERNAL_DATA = b"\x0a\x08location"
-"""How a graph begins to name a file that its constants lie in: the key, as protobuf writes it. We have none, and an
-onnxruntime would read any file of this machine that a foreign graph names."""
+CARRIED_ENCODER = "text_encoder/"
+"""What the names of a carried text encoder's members begin with."""
 
 
 @dataclass(frozen=True)
@@ -76,20 +82,44 @@ def read_bundle(path: str | os.PathLike[str], *, verify_sha256: bool = False) ->
         )
     try:
         with path.open("rb") as file:
-            members = _members(file)
+            members, carried = _members(file)
         manifest = _manifest(members)
-        _check_members(manifest, members, verify_sha256)
+        _check_members(manifest, members, carried, verify_sha256)
         return Bundle(path, _cloud(manifest, members), members["query.onnx"], manifest)
     except _Refused as error:
         raise BundleError(f"{path}: {error}") from None
+
+
+def read_carried_encoder(path: str | os.PathLike[str]) -> dict[str, bytes] | None:
+    """The files of the text encoder that a .ogpc carries, by name, unchecked; None where it carries none."""
+    path = Path(path)
+    try:
+        with path.open("rb") as file:
+            _, carried = _members(file)
+            archive = zipfile.ZipFile(file)
+            return {name.removeprefix(CARRIED_ENCODER): archive.read(name) for name in carried} or None
+    except (_Refused, zipfile.BadZipFile, EOFError) as error:
+        raise BundleError(f"{path}: {error}") from None
+
+
+def describe_member(name: str, data: bytes) -> dict[str, Any]:
+    """What the manifest says of a member: bytes, sha256 and, of an array, its type and shape."""
+    entry: dict[str, Any] = {"bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}
+    if name.endswith(".npy"):
+        array = np.load(io.BytesIO(data), allow_pickle=False)
+        entry |= {"dtype": array.dtype.str, "shape": list(array.shape)}
+    return entry
 
 
 class _Refused(Exception):
     """Why a file is refused; read_bundle puts the path before it."""
 
 
-def _members(file: BinaryIO) -> dict[str, bytes]:
-    """All members by name. Stored, apart and inside the file: together they cannot be larger than it is."""
+def _members(file: BinaryIO) -> tuple[dict[str, bytes], dict[str, int]]:
+    """All members by name, but of a carried encoder the sizes only: most who open a file never ask it.
+
+    Stored, apart and inside the file: together they cannot be larger than it is.
+    """
     size = file.seek(0, os.SEEK_END)
     try:
         archive = zipfile.ZipFile(file)
@@ -108,7 +138,8 @@ def _members(file: BinaryIO) -> dict[str, bytes]:
                 f"{len(infos)} members of {len(names)} names claim {total} bytes in a file of {size}; expected unique "
                 f"names, at most {MAX_MEMBERS}, that fit: the file is not to be trusted"
             )
-        return {info.filename: archive.read(info) for info in infos}
+        carried = {info.filename: info.file_size for info in infos if info.filename.startswith(CARRIED_ENCODER)}
+        return {info.filename: archive.read(info) for info in infos if info.filename not in carried}, carried
     except (zipfile.BadZipFile, EOFError, RuntimeError, NotImplementedError, OSError, ValueError) as error:
         raise _Refused(
             f"not a .ogpc file, or damaged ({error}); expected a zip of stored members: copy it again or {REBUILD}"
@@ -140,24 +171,29 @@ def _manifest(members: dict[str, bytes]) -> dict[str, Any]:
     return manifest
 
 
-def _check_members(manifest: dict[str, Any], members: dict[str, bytes], verify_sha256: bool) -> None:
+def _check_members(
+    manifest: dict[str, Any], members: dict[str, bytes], carried: dict[str, int], verify_sha256: bool
+) -> None:
     declared = _field(manifest, "members", dict)
-    if undeclared := sorted(set(members) - set(declared) - {"manifest.json"}):
+    sizes = {name: len(data) for name, data in members.items()} | carried
+    if undeclared := sorted(set(sizes) - set(declared) - {"manifest.json"}):
         raise _Refused(f"member '{undeclared[0]}' is not in the manifest: the file was changed; {REBUILD}")
     for name, entry in declared.items():
-        if name not in members:
+        if name not in sizes:
             raise _Refused(f"member '{name}' of the manifest is missing: {REBUILD}")
         length = _field(entry, "bytes", int, f"members/{name}/")
-        if length != len(members[name]):
-            raise _Refused(f"member '{name}' has {len(members[name])} bytes, the manifest says {length}: {REBUILD}")
-        if verify_sha256:
+        if length != sizes[name]:
+            raise _Refused(f"member '{name}' has {sizes[name]} bytes, the manifest says {length}: {REBUILD}")
+        if verify_sha256 and name in members:  # the encoder's own manifest holds its files' digests
             digest = hashlib.sha256(members[name]).hexdigest()
             if digest != _field(entry, "sha256", str, f"members/{name}/"):
                 raise _Refused(f"member '{name}' has sha256 {digest}, not the manifest's: it was changed; {REBUILD}")
     if "query.onnx" not in members:
         raise _Refused(f"member 'query.onnx' is missing: {REBUILD}")
-    if ONNX_EXTERNAL_DATA in members["query.onnx"]:
-        raise _Refused("query.onnx asks for other files of this machine: the file is not to be trusted")
+    try:
+        check_graph(members["query.onnx"])
+    except ValueError as error:
+        raise _Refused(f"query.onnx: {error}: the file is not to be trusted") from None
 
 
 def _cloud(manifest: dict[str, Any], members: dict[str, bytes]) -> LabelledCloud:

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from og_pointcloud.cloud import Vocabulary
 from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError
+from og_pointcloud.text_encoder import export_command, find_encoder
 from og_pointcloud.text_features import UNKNOWN_SPACE, read_text_features
 
 __all__ = ["Labels", "TextFeatures", "resolve_labels"]
@@ -21,20 +22,27 @@ TextFeatures: TypeAlias = "str | os.PathLike[str] | tuple[Vocabulary, str] | Non
 
 
 def resolve_labels(
-    labels: Labels, text_features: TextFeatures, own_words: Vocabulary | None, feature_space: str
+    labels: Labels,
+    text_features: TextFeatures,
+    own_words: Vocabulary | None,
+    feature_space: str,
+    bundle: Path | None = None,
 ) -> Vocabulary:
     """Names, all different, with a finite vector each that is not zero.
 
-    labels: words, looked up in text_features and then in own_words (None: every word of the first that there is); or
-    name -> vector (D,); or a Vocabulary, taken as it is. text_features: a text-features file, or what
-    ``read_text_features`` returned. own_words, feature_space: the scene's.
+    labels: words, looked up in text_features and then in own_words (None: every word of the first that there is), and
+    encoded where both lack them, if there is an encoder; or name -> vector (D,); or a Vocabulary, taken as it is.
+    text_features: a text-features file, or what ``read_text_features`` returned. own_words, feature_space: the scene's.
+    bundle: the scene's file, which may carry the encoder.
     Raises OgPointcloudError for a word without vector or given twice, FeatureSpaceError for text_features of another
     space and for vectors that cannot be compared.
     """
     sources = [source for source in (_of_space(text_features, feature_space), own_words) if source is not None]
     if labels is None:
         if not sources:
-            raise OgPointcloudError(f"no labels are given, and the scene has no words of its own: {_WAYS}")
+            raise OgPointcloudError(
+                f"no labels are given, and the scene has no words of its own: {_ways(feature_space)}"
+            )
         return _checked(sources[0])
     if isinstance(labels, Vocabulary):
         return _checked(labels)
@@ -44,13 +52,15 @@ def resolve_labels(
     for word in words:
         if not isinstance(word, str):
             raise OgPointcloudError(f"label {word!r:.60} is a {type(word).__name__}; expected words, or name -> vector")
-    return _checked(_looked_up(words, sources))
+    return _checked(_looked_up(words, sources, feature_space, bundle))
 
 
-_WAYS = (
-    "pass {name: vector}, or text_features=FILE.npz with 'names', 'vectors' and 'feature_space' from the scene's "
-    "encoder, or fit again with --vocabulary FILE.npz"
-)
+def _ways(feature_space: str) -> str:
+    return (
+        "pass {name: vector}, or text_features=FILE.npz with 'names', 'vectors' and 'feature_space' from the scene's "
+        "encoder; or store them (og-pointcloud vocabulary add); or, for any word at all, make the encoder once: "
+        f"{export_command(feature_space)}"
+    )
 
 
 def _of_space(text_features: TextFeatures, feature_space: str) -> Vocabulary | None:
@@ -89,16 +99,32 @@ def _refuse_not_finite(names: tuple[str, ...], vectors: np.ndarray) -> Vocabular
     raise FeatureSpaceError(f"the vector of '{name}' holds NaN or infinity; expected finite numbers: encode it again")
 
 
-def _looked_up(words: tuple[str, ...], sources: list[Vocabulary]) -> Vocabulary:
+def _looked_up(
+    words: tuple[str, ...], sources: list[Vocabulary], feature_space: str, bundle: Path | None
+) -> Vocabulary:
     vectors: dict[str, np.ndarray] = {}
     for source in reversed(sources):
         vectors |= dict(zip(source.names, source.vectors, strict=True))
     missing = [word for word in words if word not in vectors]
-    if missing:
+    if missing and (encoder := find_encoder(feature_space, bundle)):
+        vectors |= dict(zip(missing, encoder(missing), strict=True))
+    elif missing:
         others = f", nor are {len(missing) - 1} more of the labels" if len(missing) > 1 else ""
         hint = _close_matches(missing[0], list(vectors))
-        raise OgPointcloudError(f"'{missing[0]}' is not among the {len(vectors)} known words{others}{hint}: {_WAYS}")
+        raise OgPointcloudError(
+            f"'{missing[0]}' is not among the {len(vectors)} known words{others}{hint}: {_ways(feature_space)}"
+        )
+    _check_one_width(words, vectors)
     return Vocabulary(words, np.array([vectors[word] for word in words]) if words else np.zeros((0, 0), np.float32))
+
+
+def _check_one_width(words: tuple[str, ...], vectors: Mapping[str, np.ndarray]) -> None:
+    widths = {len(vectors[word]): word for word in words}
+    if len(widths) > 1:
+        (one, first), (other, second), *_ = widths.items()
+        raise FeatureSpaceError(
+            f"'{first}' has a vector of width {one}, '{second}' of {other}: they come from two encoders under one name"
+        )
 
 
 def _close_matches(word: str, known: list[str]) -> str:
@@ -111,9 +137,13 @@ def _close_matches(word: str, known: list[str]) -> str:
 
 def _checked(vocabulary: Vocabulary) -> Vocabulary:
     if not vocabulary.names:
-        raise OgPointcloudError("0 labels are given; expected at least one word to look for")
+        raise OgPointcloudError(
+            "0 labels are given; expected at least one word to look for: name what you want to find"
+        )
     seen: set[str] = set()
     for name, vector in zip(vocabulary.names, vocabulary.vectors, strict=True):
+        if not name.strip():
+            raise OgPointcloudError(f"label {len(seen)} is an empty name; expected a word: name it or remove it")
         if name in seen:
             raise OgPointcloudError(f"the label '{name}' is given twice; expected different names: remove one")
         if not vector.any():

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import io
 import json
 import os
@@ -17,10 +16,11 @@ from numpy.typing import NDArray
 
 from og_pointcloud._atomic import replacing
 from og_pointcloud._onnxruntime import open_session
-from og_pointcloud.bundle import FORMAT, SCHEMA_VERSION, TOO_FAR
-from og_pointcloud.cloud import InstanceTable, LabelledCloud, Vocabulary
+from og_pointcloud.bundle import FORMAT, SCHEMA_VERSION, TOO_FAR, describe_member
+from og_pointcloud.cloud import InstanceTable, LabelledCloud
 from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.nearest import NONE_WITHIN_REACH, NearestPoint
+from og_pointcloud.vocabulary import encoder_members, vocabulary_members
 from og_pointcloud_export.brick_grid import BrickGrid, build_brick_grid
 from og_pointcloud_export.query_head import OPSET, build_query_head, reference_scores
 
@@ -28,8 +28,6 @@ __all__ = ["query_model", "write_bundle"]
 
 SCORE_TOLERANCE = 1e-5
 """Largest cosine error of the graph against float64 that is let through; float32 sums of 512 terms reach 1e-6."""
-HALF_PRECISION_TOLERANCE = 1e-3
-"""Words are stored as float16 where no cosine with a descriptor moves by more, and no instance's best word changes."""
 PARITY_TEXTS, PARITY_POINTS = 64, 4096
 
 
@@ -42,20 +40,23 @@ class QueryModel:
     grid: dict[str, Any]
 
 
-def write_bundle(cloud: LabelledCloud, path: str | os.PathLike[str]) -> Path:
+def write_bundle(
+    cloud: LabelledCloud, path: str | os.PathLike[str], *, text_encoder: str | os.PathLike[str] | None = None
+) -> Path:
     """Write a cloud as .ogpc, whole or not at all, the same bytes for the same cloud. Returns the path.
 
-    Raises OgPointcloudError where the provenance is no JSON, or where the graph disagrees with numpy: then nothing is
-    written.
+    text_encoder: the folder of an encoder for the file to carry. Raises OgPointcloudError where the provenance is no
+    JSON, where the graph disagrees with numpy, or the encoder is of another feature space: then nothing is written.
     """
     path = Path(path)
     model = query_model(cloud)
     members = {"query.onnx": model.onnx} | {f"arrays/{name}.npy": _npy(array) for name, array in _arrays(cloud).items()}
     vocabulary_error = None
     if cloud.vocabulary is not None:
-        vectors, vocabulary_error = _compact_vectors(cloud.vocabulary, cloud.instances)
-        members["vocabulary/names.json"] = json.dumps(list(cloud.vocabulary.names), ensure_ascii=False).encode()
-        members["vocabulary/vectors.npy"] = _npy(vectors)
+        words, vocabulary_error = vocabulary_members(cloud.vocabulary, cloud.instances)
+        members |= words
+    if text_encoder is not None:
+        members |= encoder_members(text_encoder, cloud.feature_space)[0]
     manifest = _manifest(cloud, model, members, {**model.parity, "vocabulary_cosine_error": vocabulary_error})
     with replacing(path) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
         for name, data in {"manifest.json": manifest, **members}.items():
@@ -97,21 +98,6 @@ def _npy(array: NDArray[Any]) -> bytes:
     little_endian = array.astype(array.dtype.newbyteorder("<"), copy=False)
     np.lib.format.write_array(stream, np.ascontiguousarray(little_endian), version=(1, 0), allow_pickle=False)
     return stream.getvalue()
-
-
-def _compact_vectors(vocabulary: Vocabulary, instances: InstanceTable) -> tuple[NDArray[np.floating], float]:
-    """Unit vectors, as float16 if that changes no answer, and the largest change of a cosine that this makes."""
-    vectors = vocabulary.vectors.astype(np.float64)
-    length = np.linalg.norm(vectors, axis=1, keepdims=True)
-    unit = np.divide(vectors, length, out=np.zeros_like(vectors), where=length > 0)
-    if instances.descriptors.size == 0 or unit.size == 0:
-        return unit.astype(np.float16), 0.0
-    half = unit.astype(np.float16)
-    exact, stored = reference_scores(instances, unit), reference_scores(instances, half)
-    error = float(np.abs(stored - exact).max())
-    if error <= HALF_PRECISION_TOLERANCE and (exact.argmax(axis=1) == stored.argmax(axis=1)).all():
-        return half, error
-    return unit.astype(np.float32), float(np.abs(reference_scores(instances, unit.astype(np.float32)) - exact).max())
 
 
 def _parity(cloud: LabelledCloud, onnx: bytes) -> dict[str, Any]:
@@ -175,7 +161,7 @@ def _manifest(cloud: LabelledCloud, model: QueryModel, members: dict[str, bytes]
         },
         "query_head": {"opset": OPSET, "grid": model.grid},
         "parity": parity,
-        "members": {name: _describe_member(name, data) for name, data in members.items()},
+        "members": {name: describe_member(name, data) for name, data in members.items()},
         "provenance": cloud.provenance,
     }  # fmt: skip
     try:
@@ -184,14 +170,6 @@ def _manifest(cloud: LabelledCloud, model: QueryModel, members: dict[str, bytes]
         raise OgPointcloudError(
             f"the cloud's provenance cannot be written as JSON ({error}): use plain types"
         ) from None
-
-
-def _describe_member(name: str, data: bytes) -> dict[str, Any]:
-    entry: dict[str, Any] = {"bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}
-    if name.endswith(".npy"):
-        array = np.load(io.BytesIO(data), allow_pickle=False)
-        entry |= {"dtype": array.dtype.str, "shape": list(array.shape)}
-    return entry
 
 
 def _own_version() -> str:

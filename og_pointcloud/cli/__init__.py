@@ -1,4 +1,4 @@
-"""The command line: ``og-pointcloud fit | import | segment | pick | view | info | ablate | demo``.
+"""The command line: ``og-pointcloud fit | import | segment | pick | view | info | vocabulary | ...``.
 
 A file a command: ``add`` declares its options, ``run`` does the work. A command imports what it needs when it runs, so
 that ``--help`` answers at once and ``segment`` and ``pick`` work on the base install. Progress, warnings and errors go
@@ -13,13 +13,13 @@ import warnings
 from collections.abc import Sequence
 from typing import NoReturn
 
-from og_pointcloud.cli import ablate, demo, fit, import_, info, pick, segment, view
+from og_pointcloud.cli import ablate, demo, export_text_encoder, fit, import_, info, pick, segment, view, vocabulary
 from og_pointcloud.cli.common import Parser, did_you_mean
 from og_pointcloud.errors import MissingExtraError, OgPointcloudError
 
 __all__ = ["main"]
 
-COMMANDS = (fit, import_, segment, pick, view, info, ablate, demo)
+COMMANDS = (fit, import_, segment, pick, view, info, vocabulary, export_text_encoder, ablate, demo)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -1,0 +1,300 @@
+"""Words -> text vectors of a feature space: an encoder that ``og-pointcloud export-text-encoder`` wrote, run anywhere.
+
+A folder, or the members ``text_encoder/`` of a .ogpc file, nothing in it pickled:
+
+  manifest.json       format, schema_version, feature_space, width, context_length, templates, precision, how texts are
+                      padded, bytes and sha256 of the two files, parity figures against torch
+  text_encoder.onnx   tokens (B, T) int64 -> text (B, D) float32, unit rows
+  tokenizer.json      vocabulary and merges (see ``tokenizer``)
+
+numpy and onnxruntime, nothing else. What is read is checked before it is run: it may come from a stranger.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import sys
+import threading
+from collections import OrderedDict
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from og_pointcloud._onnx_graph import check_graph
+from og_pointcloud.errors import OgPointcloudError
+from og_pointcloud.tokenizer import Tokenizer
+
+if TYPE_CHECKING:
+    from onnxruntime import InferenceSession
+
+__all__ = [
+    "ENCODER_FILES", "FORMAT", "MODELS_VARIABLE", "OPERATORS", "SCHEMA_VERSION", "TextEncoder", "cache_folder",
+    "check_templates", "encoder_for", "export_command", "find_encoder", "read_text_encoder",
+]  # fmt: skip
+
+FORMAT, SCHEMA_VERSION = "og-text-encoder", 1
+MODELS_VARIABLE = "OG_POINTCLOUD_MODELS"
+"""Environment variable: folders, parted as in PATH, that are encoders or hold some."""
+MANIFEST, GRAPH, TOKENIZER = "manifest.json", "text_encoder.onnx", "tokenizer.json"
+ENCODER_FILES = {MANIFEST: 1 << 20, GRAPH: (1 << 31) - 1, TOKENIZER: 1 << 26}
+"""The files of an encoder, and the bytes that each may have; a serialised graph cannot have more."""
+OPERATORS = frozenset({
+    "Add", "ArgMax", "Cast", "Div", "DynamicQuantizeLinear", "Equal", "Erf", "Gather", "GatherND", "LayerNormalization",
+    "MatMul", "MatMulInteger", "Max", "Mul", "ReduceL2", "Reshape", "Shape", "Sigmoid", "Slice", "Softmax", "Split",
+    "Tanh", "Transpose", "Unsqueeze",
+})  # fmt: skip
+"""All that an encoder's graph is made of: none repeats, calls other graphs, or makes an array larger by its values."""
+TEXTS_PER_RUN = 64
+VECTORS_REMEMBERED = 1 << 14
+REMAKE = "make the encoder again with og-pointcloud export-text-encoder"
+
+
+class TextEncoder:
+    """Encodes words; make one with ``read_text_encoder`` or ``encoder_for``. Safe to share by threads.
+
+    The vectors of the last 16,384 texts are remembered: a label that is asked again costs a look-up.
+    """
+
+    def __init__(self, files: Mapping[str, bytes], where: str) -> None:
+        """files: the bytes of ENCODER_FILES. where: what errors begin with, a path. OgPointcloudError if damaged."""
+        self.where = where
+        self.manifest = _checked_manifest(files, where)
+        self.feature_space: str = self.manifest["feature_space"]
+        self.width: int = self.manifest["width"]
+        self.context_length: int = self.manifest["context_length"]
+        self.templates: tuple[str, ...] = tuple(self.manifest["templates"])
+        self.precision: str = self.manifest["precision"]
+        self._graph = files[GRAPH]
+        self._session: InferenceSession | None = None
+        try:
+            self._tokenizer = Tokenizer(files[TOKENIZER])
+        except ValueError as error:
+            raise OgPointcloudError(f"{where}: {TOKENIZER} cannot be used ({error}): {REMAKE}") from None
+        if self._tokenizer.highest_id >= self.manifest["vocabulary"]:
+            raise OgPointcloudError(
+                f"{where}: {TOKENIZER} gives ids up to {self._tokenizer.highest_id}, the encoder has "
+                f"{self.manifest['vocabulary']} tokens: they do not belong together; {REMAKE}"
+            )
+        self._remembered: OrderedDict[str, NDArray[np.float32]] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def __call__(self, names: Sequence[str], templates: Sequence[str] | None = None) -> NDArray[np.float32]:
+        """(len(names), D) float32, unit rows: each name put into every template, the mean of their vectors.
+
+        templates: texts with ``{}`` where the name goes; None: those of the manifest, ("{}",) unless it was made
+        with others.
+        """
+        templates = self.templates if templates is None else check_templates(templates)
+        texts = [template.replace("{}", name) for name in names for template in templates]
+        vectors = self.encode(texts).reshape(len(names), len(templates), self.width).mean(axis=1)
+        length = np.linalg.norm(vectors, axis=1, keepdims=True)
+        return vectors / np.maximum(length, np.finfo(np.float32).tiny)
+
+    def encode(self, texts: Sequence[str]) -> NDArray[np.float32]:
+        """(len(texts), D) float32, unit rows: the texts as they stand."""
+        with self._lock:
+            found = {text: self._remembered[text] for text in texts if text in self._remembered}
+        missing = list(dict.fromkeys(text for text in texts if text not in found))
+        for batch, tokens in self._batches(missing):
+            found |= dict(zip(batch, self._run(tokens), strict=True))
+        with self._lock:
+            for text in dict.fromkeys(texts):
+                self._remembered[text] = found[text]
+                self._remembered.move_to_end(text)
+            while len(self._remembered) > VECTORS_REMEMBERED:
+                self._remembered.popitem(last=False)
+        return np.array([found[text] for text in texts], np.float32).reshape(len(texts), self.width)
+
+    def tokens(self, text: str) -> list[int]:
+        """Token ids of a text as the encoder is given them: cut to the context, padded only where it must be."""
+        ids = self._tokenizer(text, self.context_length)
+        pad = self.manifest["pad_id"]
+        return ids if pad is None else ids + [pad] * (self.context_length - len(ids))
+
+    def _batches(self, texts: Iterable[str]) -> Iterator[tuple[list[str], NDArray[np.int64]]]:
+        """Texts of one number of tokens together: none is padded for another's sake.
+
+        Activations of int8 graphs share one scale a run: a text then runs alone, so that its vector is always the same.
+        """
+        by_length: dict[int, list[tuple[str, list[int]]]] = {}
+        for text in texts:
+            tokens = self.tokens(text)
+            by_length.setdefault(len(tokens), []).append((text, tokens))
+        size = 1 if self.precision == "int8" else TEXTS_PER_RUN
+        for group in by_length.values():
+            for start in range(0, len(group), size):
+                batch = group[start : start + size]
+                yield [text for text, _ in batch], np.array([tokens for _, tokens in batch], np.int64)
+
+    def _run(self, tokens: NDArray[np.int64]) -> NDArray[np.float32]:
+        try:
+            vectors = np.asarray(self._open_session().run(["text"], {"tokens": tokens})[0])
+        except Exception as error:  # onnxruntime raises types of its own
+            raise OgPointcloudError(f"{self.where}: {GRAPH} does not run ({_first_line(error)}): {REMAKE}") from None
+        if vectors.dtype != np.float32 or vectors.shape != (len(tokens), self.width) or not np.isfinite(vectors).all():
+            raise OgPointcloudError(
+                f"{self.where}: {GRAPH} gives {vectors.dtype} {vectors.shape} or NaN; expected finite float32 "
+                f"({len(tokens)}, {self.width}): {REMAKE}"
+            )
+        return vectors
+
+    def _open_session(self) -> InferenceSession:
+        with self._lock:
+            if self._session is None:
+                from og_pointcloud._onnxruntime import open_session
+
+                self._session, self._graph = open_session(self._graph), b""  # the session has its own copy
+            return self._session
+
+
+def read_text_encoder(folder: str | os.PathLike[str]) -> TextEncoder:
+    """Open a folder that export-text-encoder wrote, checked whole; OgPointcloudError for any other.
+
+    Asking for the same unchanged folder again gives the same encoder.
+    """
+    path = Path(folder).resolve()
+    if not (path / MANIFEST).is_file():
+        raise OgPointcloudError(f"{folder} has no {MANIFEST}; expected a folder of og-pointcloud export-text-encoder")
+    states = [(path / name).stat() for name in ENCODER_FILES if (path / name).is_file()]
+    return _read_once(path, tuple((state.st_mtime_ns, state.st_size) for state in states))
+
+
+@lru_cache(maxsize=2)
+def _read_once(folder: Path, _state: tuple[tuple[int, int], ...]) -> TextEncoder:
+    return TextEncoder({name: _read_bounded(folder / name, most) for name, most in ENCODER_FILES.items()}, str(folder))
+
+
+def encoder_for(feature_space: str, bundle: str | os.PathLike[str] | None = None) -> TextEncoder:
+    """As ``find_encoder``, but OgPointcloudError, with the command that makes one, where there is none."""
+    if encoder := find_encoder(feature_space, bundle):
+        return encoder
+    named = os.environ.get(MODELS_VARIABLE)
+    raise OgPointcloudError(
+        f"no text encoder of feature space '{feature_space}' is in {MODELS_VARIABLE} ({named or 'not set'}) or "
+        f"{cache_folder()}; make one from the model's weights: {export_command(feature_space)}"
+    )
+
+
+def find_encoder(feature_space: str, bundle: str | os.PathLike[str] | None = None) -> TextEncoder | None:
+    """The encoder of a feature space: the one that a .ogpc carries, else the first that is found among the models.
+
+    bundle: the scene's file, if it has one. Looked through are the folders of OG_POINTCLOUD_MODELS, then the user's
+    cache folder; each may be an encoder, or hold encoders. None where there is none; OgPointcloudError where there is
+    one that cannot be used.
+    """
+    if bundle is not None and (carried := _carried(Path(bundle).resolve(), Path(bundle).stat().st_mtime_ns)):
+        return carried
+    for folder in _model_folders():
+        candidates = [folder, *sorted(path for path in folder.iterdir() if path.is_dir())] if folder.is_dir() else []
+        for candidate in candidates:
+            if _feature_space_of(candidate) == feature_space:
+                return read_text_encoder(candidate)
+    return None
+
+
+def export_command(feature_space: str) -> str:
+    """The command that makes the encoder of a feature space, where it will be found."""
+    return f"og-pointcloud export-text-encoder MODEL_FOLDER --feature-space '{feature_space}'"
+
+
+def cache_folder() -> Path:
+    """The user's folder for encoders; it need not exist."""
+    if sys.platform == "darwin":
+        return Path.home() / "Library" / "Caches" / "og_pointcloud"
+    if sys.platform == "win32":
+        return Path(os.environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local") / "og_pointcloud" / "Cache"
+    named = Path(os.environ.get("XDG_CACHE_HOME", ""))
+    return (named if named.is_absolute() else Path.home() / ".cache") / "og_pointcloud"
+
+
+def check_templates(templates: Iterable[str]) -> tuple[str, ...]:
+    """At least one text with ``{}`` in it, else OgPointcloudError."""
+    templates = (templates,) if isinstance(templates, str) else tuple(templates)
+    wrong = next((template for template in templates if not isinstance(template, str) or "{}" not in template), None)
+    if wrong is not None or not templates:
+        raise OgPointcloudError(
+            f"the template {wrong!r:.80} has no place for the name; expected {{}} in it, as in 'a photo of a {{}}.'"
+        )
+    return templates
+
+
+def _model_folders() -> list[Path]:
+    named = os.environ.get(MODELS_VARIABLE, "").split(os.pathsep)
+    return [*(Path(folder).expanduser() for folder in named if folder), cache_folder()]
+
+
+def _feature_space_of(folder: Path) -> str | None:
+    """What a folder's manifest says, None where there is none or it cannot be read: others may lie here too."""
+    try:
+        manifest = json.loads(_read_bounded(folder / MANIFEST, ENCODER_FILES[MANIFEST]))
+    except (OgPointcloudError, OSError, ValueError, RecursionError):
+        return None
+    return manifest.get("feature_space") if isinstance(manifest, dict) and manifest.get("format") == FORMAT else None
+
+
+@lru_cache(maxsize=2)
+def _carried(bundle: Path, _modified: int) -> TextEncoder | None:
+    from og_pointcloud.bundle import read_carried_encoder
+
+    files = read_carried_encoder(bundle)
+    return TextEncoder(files, f"{bundle}: text_encoder") if files else None
+
+
+def _read_bounded(path: Path, most: int) -> bytes:
+    try:
+        with path.open("rb") as file:
+            data = file.read(most + 1)
+    except FileNotFoundError:
+        raise OgPointcloudError(f"{path} is missing: {REMAKE}") from None
+    if len(data) > most:
+        raise OgPointcloudError(f"{path} has more than {most} bytes: it is not what export-text-encoder writes")
+    return data
+
+
+def _checked_manifest(files: Mapping[str, bytes], where: str) -> dict[str, Any]:
+    try:
+        for name, most in ENCODER_FILES.items():
+            if len(files[name]) > most:
+                raise ValueError(f"{name} has {len(files[name])} bytes; expected at most {most}")
+        manifest = json.loads(files[MANIFEST])
+        _check_fields(manifest)
+        for name in (GRAPH, TOKENIZER):
+            digest = hashlib.sha256(files[name]).hexdigest()
+            if manifest["files"][name]["sha256"] != digest:
+                raise ValueError(f"{name} has sha256 {digest}, not the manifest's: it is damaged or was changed")
+        check_graph(files[GRAPH], OPERATORS)
+    except KeyError as error:
+        raise OgPointcloudError(f"{where}: {error} is missing: {REMAKE}") from None
+    except (ValueError, TypeError, AttributeError, RecursionError) as error:
+        raise OgPointcloudError(f"{where}: not a text encoder that can be used ({error}): {REMAKE}") from None
+    return manifest
+
+
+def _check_fields(manifest: dict[str, Any]) -> None:
+    if manifest["format"] != FORMAT:
+        raise ValueError(f"its manifest says format {manifest['format']!r:.40}; expected {FORMAT!r}")
+    schema = manifest["schema_version"]
+    if schema != SCHEMA_VERSION:
+        raise ValueError(f"schema_version is {schema!r:.20}; this library reads {SCHEMA_VERSION}")
+    for name, least in (("width", 1), ("context_length", 3), ("vocabulary", 1)):
+        value = manifest[name]
+        if not isinstance(value, int) or isinstance(value, bool) or not least <= value < 1 << 24:
+            raise ValueError(f"{name} is {value!r:.40}; expected a whole number from {least}")
+    if not isinstance(manifest["feature_space"], str) or manifest["precision"] not in ("fp32", "int8"):
+        raise ValueError(f"feature_space {manifest['feature_space']!r:.60} or precision {manifest['precision']!r:.20}")
+    pad = manifest["pad_id"]
+    if pad is not None and not (isinstance(pad, int) and 0 <= pad < manifest["vocabulary"]):
+        raise ValueError(f"pad_id is {pad!r:.40}; expected a token id, or none")
+    if not isinstance(manifest["templates"], list):
+        raise ValueError(f"templates are {manifest['templates']!r:.40}; expected a list of texts")
+    check_templates(manifest["templates"])
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).strip().splitlines() or [type(error).__name__])[0][:200]
