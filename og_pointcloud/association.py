@@ -15,7 +15,7 @@ from og_pointcloud.cloud import InstanceTable
 from og_pointcloud.settings import AssociationSettings
 from og_pointcloud.visibility import MaskTable
 
-__all__ = ["describe_instances", "robust_mean"]
+__all__ = ["describe_instances", "directions", "robust_mean"]
 
 
 def describe_instances(
@@ -32,7 +32,7 @@ def describe_instances(
     mask has a feature gets no row.
     """
     shown = _shown_of_instance(table, group, instance_ids)
-    features = table.unit_features.astype(np.float64)
+    features = directions(table.mask_features)
     rows, owners = [], []
     agreement = np.zeros(count, np.float32)
     for instance in range(count):
@@ -64,6 +64,14 @@ def _shown_of_instance(
     mask = np.repeat(np.arange(weights.shape[0]), np.diff(weights.indptr))
     own = (group[mask] >= 0) & (instance_ids[weights.indices] == group[mask])
     return np.bincount(mask[own], weights.data[own], weights.shape[0]).astype(np.float64)
+
+
+def directions(rows: NDArray[np.floating]) -> NDArray[np.float64]:
+    """(n, D) rows of length 1, zero rows stay zero. In float64: lengths of 1e30 overflow float32, and directions that
+    nearly cancel leave little more than its rounding."""
+    wide = rows.astype(np.float64)
+    length = np.linalg.norm(wide, axis=1, keepdims=True)
+    return np.divide(wide, length, out=np.zeros_like(wide), where=length > 0)
 
 
 def robust_mean(

@@ -266,7 +266,12 @@ def _check(values: NDArray[np.floating], weight: NDArray[np.floating], centres: 
             "(n,) and (k, d)"
         )
     if not np.isfinite(values).all() or not np.isfinite(weight).all() or (weight < 0).any():
-        raise OgPointcloudError("values and weights of a codebook must be finite, weights at least 0")
+        wrong = ~np.isfinite(values).all(axis=1) | ~(weight >= 0) | (weight == np.inf)
+        row = int(np.argmax(wrong)) if len(wrong) else 0
+        raise OgPointcloudError(
+            f"row {row} of a codebook's input is {values[row][:6].tolist()} with weight {weight[row]}; expected finite "
+            "values and weights of at least 0: leave such points out"
+        )
 
 
 def _reseeded(

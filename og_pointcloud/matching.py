@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud.association import robust_mean
+from og_pointcloud.association import directions, robust_mean
 from og_pointcloud.cloud import InstanceTable
 from og_pointcloud.codebook import cluster_weights
 from og_pointcloud.scene import Camera, View
@@ -147,7 +147,7 @@ def match_masks(
     if settings.integration == "weighted":
         weight = evidence.shared[masks, owners] * scores[masks, owners]
     deviations = (association or AssociationSettings()).outlier_deviations
-    features = table.unit_features.astype(np.float64)
+    features = directions(table.mask_features)
     rows, row_owner = [], []
     agreement = np.zeros(count, np.float32)
     for instance in range(count):

@@ -57,11 +57,15 @@ class Camera:
                 "expected a rigid right-handed pose: remove scale or mirroring from the pose file"
             )
         if self.width < 1 or self.height < 1:
-            raise SceneError(f"camera image is {self.width}x{self.height}; expected at least 1x1 pixel")
+            raise SceneError(
+                f"camera image is {self.width}x{self.height}; expected at least 1x1 pixel: check w and h of "
+                "the pose file"
+            )
         intrinsics = (self.fx, self.fy, self.cx, self.cy)
         if not np.isfinite(intrinsics).all() or self.fx <= 0 or self.fy <= 0:
             raise SceneError(
-                f"camera intrinsics fx, fy, cx, cy are {intrinsics}; expected finite numbers, fx and fy > 0"
+                f"camera intrinsics fx, fy, cx, cy are {intrinsics}; expected finite numbers, fx and fy > 0: "
+                "check the camera model in the pose file"
             )
 
     def resized(self, width: int, height: int) -> Camera:
@@ -192,7 +196,10 @@ class Points:
         origin = np.median(world, axis=0)
         extent = float(np.abs(world - origin).max())
         if extent > float(np.finfo(np.float32).max):
-            raise SceneError(f"points lie up to {extent:.3g} from their median; expected less than float32's 3.4e38")
+            raise SceneError(
+                f"points lie up to {extent:.3g} from their median; expected less than float32's 3.4e38: "
+                "remove the outliers, or scale the cloud and its poses"
+            )
         return cls((world - origin).astype(np.float32), origin, rgb, normals, scale, rotation, opacity)
 
     def __post_init__(self) -> None:
