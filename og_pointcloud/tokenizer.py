@@ -27,6 +27,8 @@ WHITESPACE = "\t\n\v\f\r \x85\xa0\u1680\u2000-\u200a\u2028\u2029\u202f\u205f\u30
 """Unicode's White_Space, as the inside of a character class; Python's ``\\s`` has four control characters more."""
 CLIP_WORDS = r"'s|'t|'re|'ve|'m|'ll|'d|[\p{L}]+|[\p{N}]|[^\s\p{L}\p{N}]+"
 CLIP_SPECIALS = r"<\|startoftext\|>|<\|endoftext\|>|"
+SIGN = "[!-/:-@\\[-`{-~ ]"
+"""ASCII's punctuation, and space."""
 UNKNOWN_PENALTY = 10.0
 """What a character without a piece scores below the rarest piece, as sentencepiece has it."""
 PIECES_REMEMBERED = 1 << 14
@@ -158,13 +160,14 @@ def _replaced(pattern: dict[str, str]) -> re.Pattern[str]:
     """What a Replace looks for: a string, or one character class once or more, which no text can make slow."""
     if "String" in pattern:
         return re.compile(re.escape(_text(pattern["String"])))
-    written = pattern["Regex"]
-    parsed = re.fullmatch(r"(?:(\\s| )|\[((?:\\?[!-/:-@\[\\\]-`{-~ ])+)\])(\+|\{2,\})?", written)
-    if parsed is None:
-        raise ValueError(f"its normalizer replaces the pattern {written!r:.80}: not understood")
-    blank, characters, often = parsed.groups()
-    inside = WHITESPACE if blank == r"\s" else blank or re.escape(re.sub(r"\\(.)", r"\1", characters))
-    return re.compile(f"[{inside}]{often or ''}")
+    written = _text(pattern["Regex"])
+    understood = re.fullmatch(rf"(?:\\s| |\[(?:\\{SIGN}|(?![\[\\\]]){SIGN})+\])(?:\+|\{{2,\}})?", written)
+    try:
+        if understood and "&&" not in written:
+            return re.compile(written.replace(r"\s", f"[{WHITESPACE}]"))
+    except re.error:
+        pass
+    raise ValueError(f"its normalizer replaces the pattern {written!r:.80}: not understood")
 
 
 class CharacterMap:
