@@ -7,17 +7,18 @@ import onnx
 import pytest
 from labelled_clouds import TOO_FAR, WIDTH, instance_table, instances_plainly, make_cloud, queries, room, tough_clouds
 from og_pointcloud_export import brick_grid, writer
-from og_pointcloud_export.brick_grid import build_brick_grid
+from og_pointcloud_export.brick_grid import GridSettings, build_brick_grid
 from og_pointcloud_export.query_head import build_query_head, reference_scores
 
 from og_pointcloud._onnxruntime import open_session
+from og_pointcloud.bundle import BEYOND, NEAR, ON_SURFACE
 
 CLOUDS = tough_clouds()
-OUTPUTS = ["label", "score", "instance", "certain", "instance_scores"]
+OUTPUTS = ["label", "score", "instance", "distance", "certain", "instance_scores"]
 
 
-def run(cloud, points, text):
-    session = open_session(build_query_head(cloud, build_brick_grid(cloud)))
+def run(cloud, points, text, settings=None):
+    session = open_session(build_query_head(cloud, build_brick_grid(cloud, settings)))
     feed = {"points": np.asarray(points, np.float32).reshape(-1, 3), "text": np.asarray(text, np.float32)}
     return dict(zip(OUTPUTS, session.run(OUTPUTS, feed), strict=True))
 
@@ -90,22 +91,59 @@ def test_a_table_over_its_budget_leaves_bricks_open_and_stays_right(monkeypatch)
     assert (small["instance"] == instances_plainly(cloud, points))[small["certain"]].all()
 
 
-def test_splitting_open_cells_settles_more_and_changes_no_answer(monkeypatch):
+def test_lists_settle_what_is_open_whether_cells_are_split_or_not():
     cloud = CLOUDS["room"]
-    points = cloud.xyz + np.float32(0.1 * cloud.spacing) * np.random.default_rng(0).normal(size=cloud.xyz.shape)
-    split = run(cloud, points, texts(cloud))
+    points = cloud.xyz + np.float32(0.3 * cloud.spacing) * np.random.default_rng(0).normal(size=cloud.xyz.shape)
     exact = instances_plainly(cloud, points.astype(np.float32))
-    monkeypatch.setattr(brick_grid, "SPLIT_CELLS_AT_LEAST", 0)
-    monkeypatch.setattr(brick_grid, "SPLIT_CELLS_PER_POINT", 1 / 16)
-    some = run(cloud, points, texts(cloud))
-    assert len(build_brick_grid(cloud).parts) == 1 + len(cloud) // 16
+    for settings in (GridSettings(), GridSettings(split=False), GridSettings(cell_per_spacing=0.7)):
+        found = run(cloud, points, texts(cloud), settings)
+        assert found["certain"].all()
+        assert (found["instance"] == exact).all()
+    table = run(cloud, points, texts(cloud), GridSettings(lists=False))
+    assert 0.2 < table["certain"].mean() < 0.8
+    assert (table["instance"] == exact)[table["certain"]].all()
+    # At the centre of the cell the answer is mostly, not always, the right one.
+    assert 0.7 < (table["instance"] == exact).mean() < 1
+
+
+def test_lists_over_their_budget_leave_cells_open_and_every_answer_right(monkeypatch):
+    cloud = CLOUDS["room"]
+    points = queries(cloud, 300)
+    exact = instances_plainly(cloud, points)
+    monkeypatch.setattr(brick_grid, "LISTS_AT_LEAST", 100)
+    monkeypatch.setattr(brick_grid, "LISTS_PER_POINT", 0)
+    monkeypatch.setattr(brick_grid, "SPLIT_CELLS_AT_LEAST", 10)
     monkeypatch.setattr(brick_grid, "SPLIT_CELLS_PER_POINT", 0)
-    whole = run(cloud, points, texts(cloud))
-    assert whole["certain"].mean() < some["certain"].mean() < split["certain"].mean()
-    for found in (split, some, whole):
-        assert (found["instance"] == exact)[found["certain"]].all()
-    # At the centre of a part the answer is closer to the truth than at that of a cell.
-    assert (split["instance"] == exact).mean() > (whole["instance"] == exact).mean()
+    grid = build_brick_grid(cloud)
+    assert (len(grid.list_start) - 1, len(grid.parts)) == (100, 11)
+    found = run(cloud, points, texts(cloud))
+    assert 0.2 < found["certain"].mean() < 0.9
+    assert (found["instance"] == exact)[found["certain"]].all()
+
+
+@pytest.mark.parametrize("longest", [1, 3, 8, 12])
+def test_cells_with_more_candidates_than_a_list_holds_stay_open(monkeypatch, longest):
+    cloud = CLOUDS["room"]
+    points = queries(cloud, 300)
+    monkeypatch.setattr(brick_grid, "LONGEST_LIST", longest)
+    assert np.diff(build_brick_grid(cloud).list_start).max() <= longest
+    found = run(cloud, points, texts(cloud))
+    assert (found["instance"] == instances_plainly(cloud, points))[found["certain"]].all()
+
+
+def test_distance_is_surface_near_or_beyond():
+    cloud = CLOUDS["room"]
+    cell = float(build_brick_grid(cloud).cell_size)
+    points = queries(cloud, 400)[:1200]
+    found = run(cloud, points, texts(cloud))
+    true = np.linalg.norm(points[:, None].astype(np.float64) - cloud.xyz, axis=2).min(axis=1)
+    assert ((found["distance"] == BEYOND) == (found["instance"] == TOO_FAR)).all()
+    assert ((found["distance"] == BEYOND) == (true > cloud.reach)).all()
+    # Between the first two, a cell's centre speaks for the cell.
+    half_diagonal = cell * np.sqrt(3) / 2
+    assert (found["distance"][true <= cell - half_diagonal] == ON_SURFACE).all()
+    assert (found["distance"][(true > cell + half_diagonal) & (true <= cloud.reach)] == NEAR).all()
+    assert set(found["distance"].tolist()) == {ON_SURFACE, NEAR, BEYOND}
 
 
 def test_a_table_without_any_box_is_all_open(monkeypatch):

@@ -7,7 +7,8 @@ Outputs
   label           (N,) int32      row of ``text``, -1 unknown
   score           (N,) float32    cosine of that label, 0 where unknown
   instance        (N,) int32      instance id, -1 background, -2 unobserved, -3 too far from the cloud
-  certain         (N,) bool       false: close to a border, the answer is that of the cell's centre (see brick_grid)
+  distance        (N,) int8       0 on the surface, 1 near it, 2 too far; between 0 and 1 to about a cell (brick_grid)
+  certain         (N,) bool       false, rarely: the table has no room for this cell, the answer is its centre's
   instance_scores (K, L) float32  best cosine of an instance's descriptors with each text, -2 without a descriptor
 Any of N, L and K may be 0.
 """
@@ -19,10 +20,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud.bundle import NO_EVIDENCE
+from og_pointcloud.bundle import BEYOND, NEAR, NO_EVIDENCE, ON_SURFACE
 from og_pointcloud.cloud import InstanceTable, LabelledCloud
 from og_pointcloud.errors import MissingExtraError
-from og_pointcloud_export.brick_grid import BRICK, CODE_OFFSET, PARTS, BrickGrid
+from og_pointcloud_export.brick_grid import BRICK, CODE_OFFSET, LONGEST_LIST, PARTS, TOO_FAR_CODE, BrickGrid
 
 try:
     import onnx
@@ -34,12 +35,14 @@ __all__ = ["OPSET", "build_query_head", "reference_scores"]
 
 OPSET, IR_VERSION = 18, 8
 """The oldest that has everything needed (ScatterElements with max), so that onnxruntime 1.17 and later run it."""
+SHORT_LIST = 8
+"""So many candidates are compared for every point of an open part, LONGEST_LIST where its list is longer."""
 
 
 def build_query_head(cloud: LabelledCloud, grid: BrickGrid) -> bytes:
     """The serialised graph of a cloud; inputs and outputs are described above."""
     nodes = [*_score_nodes(), *_lookup_nodes()]
-    constants = {**_score_constants(cloud.instances), **_lookup_constants(grid)}
+    constants = {**_score_constants(cloud.instances), **_lookup_constants(cloud, grid)}
     inputs = [
         helper.make_tensor_value_info("points", TensorProto.FLOAT, ["N", 3]),
         helper.make_tensor_value_info("text", TensorProto.FLOAT, ["L", constants["descriptors"].shape[1]]),
@@ -48,6 +51,7 @@ def build_query_head(cloud: LabelledCloud, grid: BrickGrid) -> bytes:
         helper.make_tensor_value_info("label", TensorProto.INT32, ["N"]),
         helper.make_tensor_value_info("score", TensorProto.FLOAT, ["N"]),
         helper.make_tensor_value_info("instance", TensorProto.INT32, ["N"]),
+        helper.make_tensor_value_info("distance", TensorProto.INT8, ["N"]),
         helper.make_tensor_value_info("certain", TensorProto.BOOL, ["N"]),
         helper.make_tensor_value_info("instance_scores", TensorProto.FLOAT, [len(cloud.instances), "L"]),
     ]
@@ -60,7 +64,7 @@ def build_query_head(cloud: LabelledCloud, grid: BrickGrid) -> bytes:
 
 
 def _node(operator: str, inputs: str, output: str, **attributes: Any) -> onnx.NodeProto:
-    return helper.make_node(operator, inputs.split(), [output], **attributes)
+    return helper.make_node(operator, inputs.split(), [output], name=output, **attributes)
 
 
 def _score_nodes() -> list[onnx.NodeProto]:
@@ -118,90 +122,213 @@ def _score_constants(instances: InstanceTable) -> dict[str, Any]:
 
 
 def _lookup_nodes() -> list[onnx.NodeProto]:
-    """points -> answer code through the grid -> instance, certain, label and score.
+    """points -> answer code, by the table and, for the few points in open cells, by their lists -> the outputs.
 
     Coordinates are laid out as three rows of N: several times as fast as N rows of three, and, unlike a product with
-    the strides, exact in integers wherever it runs.
+    the strides, exact in integers wherever it runs. Tables are read with GatherElements, which in onnxruntime takes a
+    tenth of Gather's time.
     """
     return [
         _node("Transpose", "points", "rows", perm=[1, 0]),
         _node("Sub", "rows grid_low", "offset"),
-        _node("Mul", "offset parts_per_unit", "position"),
-        _node("IsNaN", "position", "position_missing"),
-        _node("Where", "position_missing zero position", "position_known"),
-        _node("Max", "position_known zero", "position_above"),
-        _node("Min", "position_above last_part", "position_inside"),
-        _node("Cast", "position_inside", "part", to=TensorProto.INT32),
-        _node("Div", "part parts", "cell"),
-        _node("Div", "cell brick_edge", "brick"),
-        # brick -> its row of cells -> the cell's value
-        *_flat_index("brick", "brick_strides", "brick_index"),
-        _node("Gather", "brick_rows brick_index", "brick_row"),
-        *_remainder("cell", "brick", "brick_edge", "cell_in_brick"),
-        *_flat_index("cell_in_brick", "cell_strides", "cell_index"),
-        *_entry("cell_values", "brick_row", "cells_per_brick", "cell_index", "cell_value"),
-        # a split cell -> its row of parts -> the part's value
-        _node("Sub", "cell_value first_split", "split"),
-        _node("Max", "split zero_int32", "split_row"),
-        *_remainder("part", "cell", "parts", "part_in_cell"),
-        *_flat_index("part_in_cell", "part_strides", "part_index"),
-        *_entry("part_values", "split_row", "parts_per_cell", "part_index", "part_value"),
-        _node("Less", "cell_value first_split", "cell_is_whole"),
-        _node("Where", "cell_is_whole cell_value part_value", "value"),
+        _node("Mul", "offset cells_per_unit", "position"),
+        # The clamp is on integers: whatever NaN, infinity or 1e30 become there, they end in the outermost layer.
+        _node("Cast", "position", "cell_unbounded", to=TensorProto.INT32),
+        _node("Max", "cell_unbounded zero_int32", "cell_above"),
+        _node("Min", "cell_above last_cell", "cell"),
+        # Along each axis, cell -> what it adds to (brick's place in the grid) * 512 + (cell's place in the brick).
+        _node("GatherElements", "axis_places cell", "place_terms", axis=1),
+        _node("ReduceSum", "place_terms first_axis", "place", keepdims=0),
+        _node("Div", "place cells_per_brick", "brick"),
+        _node("GatherElements", "place_to_address brick", "address_shift"),
+        _node("Add", "place address_shift", "address"),
+        _node("GatherElements", "cell_values address", "cell_stored"),
+        _node("Cast", "cell_stored", "cell_value", to=TensorProto.INT32),
+        *_open_cell_nodes(),
         # certain, or open with the answer at the centre
         _node("Less", "value codes", "certain"),
-        _node("Sub", "value codes", "value_at_center"),
-        _node("Where", "certain value value_at_center", "code"),
-        _node("Sub", "code code_offset", "instance"),
-        _node("Gather", "code_label code", "label"),
-        _node("Gather", "code_score code", "score"),
+        _node("GatherElements", "value_instance value", "instance"),
+        _node("GatherElements", "value_distance value", "distance"),
+        _node("GatherElements", "value_answer value", "answer"),
+        _node("GatherElements", "code_label answer", "label"),
+        _node("GatherElements", "code_score answer", "score"),
     ]
 
 
-def _remainder(fine: str, coarse: str, factor: str, output: str) -> list[onnx.NodeProto]:
-    """fine - coarse * factor: the index within."""
-    return [_node("Mul", f"{coarse} {factor}", f"{output}_start"), _node("Sub", f"{fine} {output}_start", output)]
-
-
-def _flat_index(index: str, strides: str, output: str) -> list[onnx.NodeProto]:
-    """Three rows of indices -> one row."""
+def _open_cell_nodes() -> list[onnx.NodeProto]:
+    """cell_value -> value: the same, but for cells with a list the answer of the part, or else of the list."""
     return [
-        _node("Mul", f"{index} {strides}", f"{output}_terms"),
-        _node("ReduceSum", f"{output}_terms first_axis", output, keepdims=0),
+        *_where_true("GreaterOrEqual", "cell_value first_listed", "listed"),
+        *_columns_at("rows", "listed", "listed_rows"),
+        helper.make_node("Split", ["listed_rows"], ["row_x", "row_y", "row_z"], axis=0, num_outputs=3),
+        *(_node("Reshape", f"row_{axis} flat", f"point_{axis}") for axis in "xyz"),
+        _node("GatherElements", "cell_value listed", "listed_value"),
+        _node("GatherElements", "address listed", "listed_address"),
+        # brick's first list + the cell's own -> its list
+        _node("Div", "listed_address cells_per_brick", "listed_brick"),
+        _node("GatherElements", "first_list listed_brick", "listed_first"),
+        _node("Sub", "listed_value first_listed", "listed_number"),
+        _node("Add", "listed_first listed_number", "list"),
+        # the part of the cell, and its value
+        _node("Sub", "listed_rows grid_low", "listed_offset"),
+        _node("Mul", "listed_offset cells_per_unit", "listed_position"),
+        _node("Mul", "listed_position parts_per_cell_edge", "part_position"),
+        _node("Cast", "part_position", "part", to=TensorProto.INT32),
+        _node("Mod", "part parts_edge", "part_in_cell"),
+        _node("Mul", "part_in_cell part_strides", "part_terms"),
+        _node("ReduceSum", "part_terms first_axis", "part_index", keepdims=0),
+        _node("GatherElements", "list_parts list", "list_parts_stored"),
+        _node("Cast", "list_parts_stored", "parts_row", to=TensorProto.INT32),
+        _node("Mul", "parts_row parts_per_cell", "parts_start"),
+        _node("Add", "parts_start part_index", "part_address"),
+        _node("GatherElements", "part_values part_address", "part_stored"),
+        _node("Cast", "part_stored", "part_value", to=TensorProto.INT32),
+        # open parts: compare the distances of the list's points, as many as it has at most
+        _node("GatherElements", "list_start list", "listed_start"),
+        _node("Add", "list one_int32", "next_list"),
+        _node("GatherElements", "list_start next_list", "listed_end"),
+        _node("Sub", "listed_end listed_start", "listed_length"),
+        _node("Less", "part_value codes", "part_certain"),
+        _node("Where", "part_certain zero_int32 listed_length", "length_to_search"),
+        *_where_true("Greater", "length_to_search zero_int32", "searched"),
+        *_search_nodes("short", "searched", "short_steps"),
+        _node("ScatterElements", "part_value searched short_code", "value_after_short", axis=0),
+        *_where_true("Greater", "length_to_search short_length", "long_listed"),
+        *_search_nodes("long", "long_listed", "long_steps"),
+        _node("ScatterElements", "value_after_short long_listed long_code", "listed_code", axis=0),
+        _node("ScatterElements", "cell_value listed listed_code", "value", axis=0),
     ]
 
 
-def _entry(table: str, row: str, width: str, column: str, output: str) -> list[onnx.NodeProto]:
-    """table[row, column] of a flat table of rows of that width, as int32."""
+def _search_nodes(name: str, rows: str, steps: str) -> list[onnx.NodeProto]:
+    """Rows of the listed points -> the code of the nearest point of each one's list, decided in float64.
+
+    ``steps`` 0..K-1 reads K entries of every list. Of a shorter one it runs on into the next: farther points, or the
+    same ones again.
+    """
+
+    def own(names: str) -> str:
+        return " ".join(given[1:] if given.startswith("/") else f"{name}_{given}" for given in names.split())
+
+    def node(operator: str, inputs: str, output: str, **attributes: Any) -> onnx.NodeProto:
+        return _node(operator, own(inputs), own(output), **attributes)
+
+    distance = []
+    for axis in "xyz":
+        distance += [
+            node("GatherElements", f"/candidate_{axis} candidate", f"{axis}"),
+            node("Cast", f"{axis}", f"{axis}_double", to=TensorProto.DOUBLE),
+            node("Reshape", f"{axis}_double candidate_shape", f"{axis}_table"),
+            node("GatherElements", f"/point_{axis} /{rows}", f"{axis}_asked"),
+            node("Cast", f"{axis}_asked", f"{axis}_asked_double", to=TensorProto.DOUBLE),
+            node("Unsqueeze", f"{axis}_asked_double /last_axis", f"{axis}_column"),
+            node("Sub", f"{axis}_table {axis}_column", f"{axis}_difference"),
+            node("Mul", f"{axis}_difference {axis}_difference", f"{axis}_squared"),
+        ]
     return [
-        _node("Cast", row, f"{output}_row", to=TensorProto.INT32),
-        _node("Mul", f"{output}_row {width}", f"{output}_start"),
-        _node("Add", f"{output}_start {column}", f"{output}_address"),
-        _node("Gather", f"{table} {output}_address", f"{output}_stored"),
-        _node("Cast", f"{output}_stored", output, to=TensorProto.INT32),
+        node("GatherElements", f"/listed_start /{rows}", "start"),
+        node("Unsqueeze", "start /last_axis", "start_column"),
+        node("Add", f"start_column /{steps}", "candidate_address"),
+        node("Shape", "candidate_address", "candidate_shape"),
+        node("Reshape", "candidate_address /flat", "candidate_address_flat"),
+        node("GatherElements", "/candidates candidate_address_flat", "candidate"),
+        *distance,
+        node("Add", "x_squared y_squared", "xy_squared"),
+        node("Add", "xy_squared z_squared", "squared"),
+        # Lists ascend by point number, so the first of equals is the lowest.
+        node("ArgMin", "squared", "nearest", axis=1),
+        node("GatherElements", "squared nearest", "nearest_squared", axis=1),
+        node("Reshape", "candidate candidate_shape", "candidate_table"),
+        node("GatherElements", "candidate_table nearest", "nearest_candidate", axis=1),
+        node("Reshape", "nearest_candidate /flat", "nearest_flat"),
+        node("Reshape", "nearest_squared /flat", "nearest_squared_flat"),
+        node("GatherElements", "/candidate_answer nearest_flat", "answer_stored"),
+        node("Cast", "answer_stored", "answer", to=TensorProto.INT32),
+        node("Add", "answer /near_codes", "answer_near"),
+        node("LessOrEqual", "nearest_squared_flat /surface_squared", "on_surface"),
+        node("Where", "on_surface answer answer_near", "answer_within"),
+        node("LessOrEqual", "nearest_squared_flat /reach_squared", "within_reach"),
+        node("Where", "within_reach answer_within /too_far", "code"),
     ]
 
 
-def _lookup_constants(grid: BrickGrid) -> dict[str, Any]:
-    shape = np.array(grid.bricks.shape, np.int32)
+def _where_true(comparison: str, inputs: str, output: str) -> list[onnx.NodeProto]:
+    """Indices (m,) int32 where the comparison holds."""
+    return [
+        _node(comparison, inputs, f"{output}_mask"),
+        _node("NonZero", f"{output}_mask", f"{output}_indices"),
+        _node("Reshape", f"{output}_indices flat", f"{output}_flat"),
+        _node("Cast", f"{output}_flat", output, to=TensorProto.INT32),
+    ]
+
+
+def _columns_at(table: str, columns: str, output: str) -> list[onnx.NodeProto]:
+    """Those columns (m,) of a table of three rows, (3, m)."""
+    return [
+        _node("Shape", columns, f"{output}_count"),
+        _node("Concat", f"three {output}_count", f"{output}_shape", axis=0),
+        _node("Expand", f"{columns} {output}_shape", f"{output}_columns"),
+        _node("GatherElements", f"{table} {output}_columns", output, axis=1),
+    ]
+
+
+def _lookup_constants(cloud: LabelledCloud, grid: BrickGrid) -> dict[str, Any]:
+    shape = np.array(grid.bricks.shape, np.int64)
+    codes, near_codes = grid.codes, grid.codes // 2
+    # A search may read LONGEST_LIST entries from the start of the last list.
+    point, candidate = np.unique(grid.candidates, return_inverse=True)
+    xyz = cloud.xyz[point] if len(point) else np.zeros((1, 3), np.float32)
+    answer = cloud.instance_ids[point] + CODE_OFFSET if len(point) else np.zeros(1, np.int64)
+    code = np.arange(2 * codes) % codes
+    code_answer = np.where(code > near_codes, code - near_codes, code)
     return {
         "grid_low": grid.low[:, None],
-        "parts_per_unit": np.float32(PARTS) / grid.cell_size,
-        "last_part": (shape * BRICK * PARTS - 1).astype(np.float32)[:, None],
-        "parts": np.int32(PARTS),
-        "brick_edge": np.int32(BRICK),
-        "brick_strides": np.array([[shape[1] * shape[2]], [shape[2]], [1]], np.int32),
-        "cell_strides": np.array([[BRICK**2], [BRICK], [1]], np.int32),
-        "part_strides": np.array([[PARTS**2], [PARTS], [1]], np.int32),
+        "cells_per_unit": np.float32(1) / grid.cell_size,
+        "last_cell": (shape * BRICK - 1).astype(np.int32)[:, None],
+        "axis_places": _axis_places(shape),
+        "place_to_address": ((grid.bricks.ravel().astype(np.int64) - np.arange(grid.bricks.size)) * BRICK**3).astype(
+            np.int32
+        ),
         "cells_per_brick": np.int32(BRICK**3),
-        "parts_per_cell": np.int32(PARTS**3),
-        "brick_rows": grid.bricks.ravel(),
         "cell_values": grid.cells.ravel(),
+        "codes": np.int32(codes),
+        "first_listed": np.int32(2 * codes),
+        "first_list": grid.first_list,
+        "list_start": grid.list_start,
+        "list_parts": grid.list_parts,
+        "parts_per_cell_edge": np.float32(PARTS),
+        "parts_edge": np.int32(PARTS),
+        "part_strides": np.array([[PARTS**2], [PARTS], [1]], np.int32),
+        "parts_per_cell": np.int32(PARTS**3),
         "part_values": grid.parts.ravel(),
-        "codes": np.int32(grid.codes),
-        "first_split": np.int32(2 * grid.codes),
-        "code_offset": np.int32(CODE_OFFSET),
+        "candidates": np.append(candidate, np.zeros(LONGEST_LIST)).astype(np.int32),
+        **{f"candidate_{axis}": np.ascontiguousarray(xyz[:, row]) for row, axis in enumerate("xyz")},
+        "candidate_answer": answer.astype(np.min_scalar_type(int(answer.max()))),
+        "short_steps": np.arange(SHORT_LIST, dtype=np.int32)[None],
+        "short_length": np.int32(SHORT_LIST),
+        "long_steps": np.arange(LONGEST_LIST, dtype=np.int32)[None],
+        "reach_squared": np.float64(cloud.reach) ** 2,
+        "surface_squared": np.float64(grid.cell_size) ** 2,
+        "near_codes": np.int32(near_codes),
+        "too_far": np.int32(TOO_FAR_CODE),
+        "value_instance": (code_answer - CODE_OFFSET).astype(np.int32),
+        "value_distance": np.where(code == TOO_FAR_CODE, BEYOND, np.where(code > near_codes, NEAR, ON_SURFACE)).astype(
+            np.int8
+        ),
+        "value_answer": code_answer.astype(np.int32),
+        "one_int32": np.int32(1),
+        "three": np.array([3], np.int64),
+        "flat": np.array([-1], np.int64),
     }
+
+
+def _axis_places(shape: NDArray[np.int64]) -> NDArray[np.int32]:
+    """(3, cells along the longest axis) int32; see ``_lookup_nodes``."""
+    cell = np.arange(int(shape.max()) * BRICK)
+    brick_strides = np.array([[shape[1] * shape[2]], [shape[2]], [1]])
+    cell_strides = np.array([[BRICK**2], [BRICK], [1]])
+    inside = (cell // BRICK) < shape[:, None]  # the table's remainder is never read
+    return np.where(inside, cell // BRICK * brick_strides * BRICK**3 + cell % BRICK * cell_strides, 0).astype(np.int32)
 
 
 def reference_scores(instances: InstanceTable, text: NDArray[np.floating]) -> NDArray[np.float64]:

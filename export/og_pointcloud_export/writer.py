@@ -135,7 +135,9 @@ def _describe_grid(grid: BrickGrid) -> dict[str, Any]:
         "bricks": list(grid.bricks.shape),
         "bricks_stored": len(grid.cells),
         "cells_split": len(grid.parts) - 1,
-        "bytes": grid.bricks.nbytes + grid.cells.nbytes + grid.parts.nbytes,
+        "lists": len(grid.list_start) - 1,
+        "candidates": len(grid.candidates),
+        "bytes": grid.nbytes,
     }
 
 
