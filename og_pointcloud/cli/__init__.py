@@ -13,13 +13,25 @@ import warnings
 from collections.abc import Sequence
 from typing import NoReturn
 
-from og_pointcloud.cli import ablate, demo, export_text_encoder, fit, import_, info, pick, segment, view, vocabulary
+from og_pointcloud.cli import (
+    ablate,
+    check,
+    demo,
+    export_text_encoder,
+    fit,
+    import_,
+    info,
+    pick,
+    segment,
+    view,
+    vocabulary,
+)
 from og_pointcloud.cli.common import Parser, did_you_mean
 from og_pointcloud.errors import MissingExtraError, OgPointcloudError
 
 __all__ = ["main"]
 
-COMMANDS = (fit, import_, segment, pick, view, info, vocabulary, export_text_encoder, ablate, demo)
+COMMANDS = (fit, import_, segment, pick, view, info, vocabulary, export_text_encoder, ablate, check, demo)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
