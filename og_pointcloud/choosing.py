@@ -18,7 +18,7 @@ For comparison there is ``relevancy``, as LERF defines it, by canonical negative
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 
 import numpy as np
@@ -80,6 +80,8 @@ class Choice:
         same vector are one hypothesis and have its probability each.
     evidence: (K, L) float32, standard deviations above the bank's words; -inf without descriptor or text.
     reasons: (K,) int8, a ``Reason``.
+    membership: (K,) float32, probability that a point with the instance's id is of it: of v views that agreed on the
+        instance all said so, which makes (v + 1/2) / (v + 1) (Jeffreys' prior).
     calibrated: false where there was no bank: probability is then LERF's relevancy, or NaN without negatives.
     """
 
@@ -89,16 +91,19 @@ class Choice:
     table: NDArray[np.float32]
     evidence: NDArray[np.float32]
     reasons: NDArray[np.int8]
+    membership: NDArray[np.float32]
     calibrated: bool = True
 
     def at(self, instances: NDArray[np.integer]) -> tuple[NDArray[np.int32], NDArray[np.float32], NDArray[np.int8]]:
-        """Label, probability and reason of points, (N,) each, by their instance ids (-1, -2, -3 as the runtime has)."""
-        # Rows -3, -2 and -1 from the end: too far, unobserved, background.
-        beyond = (Reason.TOO_FAR, Reason.UNOBSERVED, Reason.IN_NO_MASK)
-        assert (TOO_FAR, UNOBSERVED, BACKGROUND) == (-3, -2, -1)
-        labels = np.append(self.labels, [UNKNOWN] * 3).astype(np.int32)
-        probability = np.append(self.probability, [0.0] * 3).astype(np.float32)
-        reasons = np.append(self.reasons, beyond).astype(np.int8)
+        """Label, probability and reason of points, (N,) each, by their instance ids (-1, -2, -3 as the runtime has).
+
+        A point's probability is its instance's times the membership: both must be right.
+        """
+        beyond = {UNOBSERVED: Reason.UNOBSERVED, BACKGROUND: Reason.IN_NO_MASK, TOO_FAR: Reason.TOO_FAR}
+        # Negative ids index from the end.
+        labels = np.append(self.labels, [UNKNOWN] * len(beyond)).astype(np.int32)
+        probability = np.append(self.probability * self.membership, [0] * len(beyond)).astype(np.float32)
+        reasons = np.append(self.reasons, [beyond[instance] for instance in sorted(beyond)]).astype(np.int8)
         return labels[instances], probability[instances], reasons[instances]
 
 
@@ -135,6 +140,7 @@ class Chooser:
         self.settings = settings or ChoosingSettings()
         self.bank = bank
         self._count = len(instances)
+        self._membership = ((instances.views + 0.5) / (instances.views + 1)).astype(np.float32)
         self._descriptors = _unit(_finite(instances.descriptors, "descriptors"))
         self._owner = instances.descriptor_instance
         self._described = np.unique(self._owner)
@@ -148,6 +154,7 @@ class Chooser:
         best = self._best_descriptor((scores - self._middle) / self._spread)
         self._best_middle, self._best_spread = _moments(best)
         self._bank_evidence = (best - self._best_middle) / self._best_spread
+        self.sharpness = float(max(self.settings.sharpness, np.quantile(self._bank_evidence.max(axis=1), 0.75)))
 
     def choose(
         self, texts: ArrayLike, negatives: ArrayLike | None = None, text_label: NDArray[np.integer] | None = None
@@ -200,9 +207,10 @@ class Chooser:
         """Probability of each label and of none, (described, L) and (described,), float64.
 
         Likelihoods are those of a linear discriminant: a fitting word's evidence is normal about ``sharpness`` with
-        deviation 1, any other's about 0, so their ratio is exp(sharpness * evidence - sharpness^2 / 2).
+        deviation 1, any other's about 0, so their ratio is exp(sharpness * evidence - sharpness^2 / 2). How far
+        fitting words stand out is seen in the scene: the best words of the bank, at the upper quartile of instances.
         """
-        sharpness = self.settings.sharpness
+        sharpness = self.sharpness
         hypothesis, first = _distinct(texts)
         log_words = np.log(max(len(first), self.settings.kinds))
         log_label = sharpness * evidence[:, first].astype(np.float64)
@@ -219,7 +227,7 @@ class Chooser:
     def _log_none(self, texts: NDArray[np.float32]) -> NDArray[np.float64]:
         """(described,) log of the mean likelihood that a word of the bank other than the labels gives."""
         assert self.bank is not None
-        sharpness = self.settings.sharpness
+        sharpness = self.sharpness
         directions = _unit(_unit(texts) - self.bank.mean)
         other = (self._bank_directions @ directions.T).max(axis=1) < self.settings.synonym
         by_chance = np.full(len(self._bank_evidence), sharpness**2 / 2)
@@ -256,9 +264,7 @@ class Chooser:
         answer.table[rows] = table
         answer.evidence[rows] = evidence
         answer.reasons[rows] = np.where(fits, Reason.LABELLED, Reason.NONE_FITS)
-        return Choice(
-            answer.labels, answer.probability, answer.unknown, answer.table, answer.evidence, answer.reasons, calibrated
-        )
+        return replace(answer, calibrated=calibrated)
 
     def _nothing(self, labels: int) -> Choice:
         reasons = np.full(self._count, Reason.NOT_DESCRIBED, np.int8)
@@ -270,6 +276,7 @@ class Chooser:
             table=np.zeros((self._count, labels), np.float32),
             evidence=np.full((self._count, labels), -np.inf, np.float32),
             reasons=reasons,
+            membership=self._membership,
         )
 
 

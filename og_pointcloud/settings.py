@@ -21,6 +21,7 @@ __all__ = [
     "MatchingSettings",
     "MembershipSettings",
     "PaperSettings",
+    "VisibilitySettings",
 ]
 
 
@@ -293,6 +294,18 @@ def _check_losses(width: int, intra: bool, inter: bool, cohesion_weight: float |
 
 
 @dataclass(frozen=True)
+class VisibilitySettings:
+    """Where the mask table is kept while it grows (visibility.py, table_store.py)."""
+
+    table_share: float = 0.4
+    """Part of the memory left that the table may fill; beyond, it is on disk. What is derived from it takes as much."""
+    views_share: float = 0.3
+    """Part of the memory left that views worked on side by side may fill; one is always."""
+    keep_after_s: float = 20.0
+    """Views are kept for a later start only where all of them take longer than this, seconds."""
+
+
+@dataclass(frozen=True)
 class FitSettings:
     """Settings of `fit`. The defaults are meant for every scene; none needs tuning."""
 
@@ -303,7 +316,10 @@ class FitSettings:
     agreement_lead: float = 0.02
     """Mode auto takes learned instances only if they agree with this much more of the masks."""
     seed: int = 0
+    memory: int | None = None
+    """Bytes that the process may hold; None: half of what is free, beside what it holds already."""
     geometry: GeometrySettings = field(default_factory=GeometrySettings)
+    visibility: VisibilitySettings = field(default_factory=VisibilitySettings)
     grouping: GroupingSettings = field(default_factory=GroupingSettings)
     membership: MembershipSettings = field(default_factory=MembershipSettings)
     association: AssociationSettings = field(default_factory=AssociationSettings)
@@ -319,8 +335,9 @@ class ChoosingSettings:
     how unrelated words score on an instance."""
 
     sharpness: float = 3.25
-    """Evidence that a fitting word is taken to have: what the best of a thousand unrelated words has by chance."""
-    kinds: int = 50
+    """Evidence that a fitting word is taken to have at least: what the best of a thousand unrelated words has by
+    chance. Where the words of the bank that fit a scene's instances have more, as much as those."""
+    kinds: int = 20
     """Kinds of things that an instance may be, if fewer labels are asked: each label then has one share of so many."""
     synonym: float = 0.6
     """A bank word this close to a label (cosine, centred) means the same and does not speak against it: cup and mug."""

@@ -1,0 +1,321 @@
+"""Choosing a label: against a slow literal reference, invariances, and awkward input."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from math import exp
+
+import numpy as np
+import pytest
+from labelled_clouds import instance_table, unit_rows
+
+from og_pointcloud.choosing import TEMPLATES, Chooser, Reason, WordBank, common_part, embed, relevancy
+from og_pointcloud.errors import FeatureSpaceError
+from og_pointcloud.settings import ChoosingSettings
+
+WIDTH = 64
+WORDS = 300
+
+
+def unit(vectors):
+    return (vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)).astype(np.float32)
+
+
+def encoder_like_clip(count: int, seed: int = 0) -> np.ndarray:
+    """(count, 64) texts with a cosine of about 0.74 among themselves."""
+    own = unit_rows(count, WIDTH - 1, seed)
+    return np.concatenate([np.full((count, 1), np.sqrt(0.74)), np.sqrt(0.26) * own], axis=1).astype(np.float32)
+
+
+class Made:
+    """A scene of instances that show words 0, 1, 2 ... of the texts, seen through the gap between the modes."""
+
+    def __init__(self, instances: int = 6, signal: float = 0.5, owners: list[int] | None = None) -> None:
+        self.texts = encoder_like_clip(WORDS + 60)
+        self.bank = WordBank(self.texts[60:])
+        shared = unit(np.r_[0.3, unit_rows(1, WIDTH - 1, seed=7)[0]])
+        noise = unit_rows(instances, WIDTH, seed=8)
+        shown = unit(self.texts[:instances] - self.bank.mean)
+        table = instance_table(max(owners) + 1 if owners else instances, owners, WIDTH)
+        self.table = replace(table, descriptors=unit(0.7 * shared + signal * shown + 0.25 * noise))
+        self.chooser = Chooser(self.table, self.bank)
+
+
+def choose_plainly(descriptors, texts, bank, sharpness, kinds, synonym):
+    """Posterior of different labels on instances of one descriptor each, number by number in float64."""
+    descriptors, texts, bank = (np.asarray(a, float) for a in (descriptors, texts, bank))
+    looks = len(descriptors)  # all different
+    taken = (1 - 1 / looks) * sum(descriptors) / looks
+    middle = sum(bank) / len(bank)
+    word = [(b - middle) / np.linalg.norm(b - middle) for b in bank]
+    label = [(t / np.linalg.norm(t) - middle) for t in texts]
+    label = [t / np.linalg.norm(t) for t in label]
+    evidence, null = [], []
+    for row in descriptors - taken:
+        scores = [row @ w for w in word]
+        mean, spread = np.mean(scores), np.std(scores)
+        evidence.append([(row @ t - mean) / spread for t in label])
+        null.append([(s - mean) / spread for s in scores])
+    s = max(sharpness, float(np.quantile([max(n) for n in null], 0.75)))
+    others = [j for j, w in enumerate(word) if max(w @ t for t in label) < synonym]
+    table = []
+    for e, n in zip(evidence, null, strict=True):
+        none = max(exp(s * s / 2), sum(exp(s * n[j]) for j in others) / len(bank)) * max(len(label), kinds)
+        weights = [exp(s * x) for x in e]
+        table.append([w / (sum(weights) + none) for w in weights])
+    return np.array(table)
+
+
+@pytest.mark.parametrize("labels", [1, 3, 30])
+def test_posterior_is_that_of_the_literal_reference(labels):
+    made = Made()
+    settings = ChoosingSettings()
+    choice = made.chooser.choose(3 * made.texts[:labels])
+    plain = choose_plainly(
+        made.table.descriptors, made.texts[:labels], made.bank.vectors, settings.sharpness, settings.kinds,
+        settings.synonym,
+    )  # fmt: skip
+    np.testing.assert_allclose(choice.table, plain, atol=2e-4)
+    np.testing.assert_allclose(choice.unknown, 1 - plain.sum(axis=1), atol=2e-4)
+
+
+def test_shown_words_are_found_and_absent_ones_are_not():
+    made = Made()
+    choice = made.chooser.choose(made.texts[:6])
+    assert choice.calibrated
+    np.testing.assert_array_equal(choice.labels, np.arange(6))
+    assert choice.probability.min() > 0.9
+    absent = made.chooser.choose(made.texts[10:60])
+    assert (absent.labels == -1).mean() > 0.8
+    np.testing.assert_array_equal(absent.reasons[absent.labels < 0], Reason.NONE_FITS)
+    assert (absent.probability[absent.labels < 0] == 0).all()
+
+
+def test_a_label_of_an_unseen_word_is_unknown_where_the_words_own_is_not():
+    made = Made()
+    choice = made.chooser.choose(made.texts[2:3])
+    np.testing.assert_array_equal(choice.labels, [-1, -1, 0, -1, -1, -1])
+
+
+def test_order_of_labels_and_length_of_vectors_do_not_matter():
+    made = Made()
+    order = np.random.default_rng(0).permutation(12)
+    choice = made.chooser.choose(made.texts[:12])
+    shuffled = made.chooser.choose(made.texts[:12][order] * np.logspace(-30, 30, 12)[:, None].astype(np.float32))
+    np.testing.assert_allclose(shuffled.table, choice.table[:, order], atol=1e-4)
+    np.testing.assert_array_equal(np.append(order, -1)[shuffled.labels], choice.labels)
+
+
+def test_a_duplicate_shares_the_probability_without_halving_it():
+    made = Made()
+    once = made.chooser.choose(made.texts[:4])
+    twice = made.chooser.choose(np.concatenate([made.texts[:4], 2 * made.texts[1:2]]))
+    np.testing.assert_allclose(twice.table[:, :4], once.table, atol=1e-6)
+    np.testing.assert_allclose(twice.table[:, 4], once.table[:, 1], atol=1e-6)
+    np.testing.assert_array_equal(twice.labels, once.labels)  # the first of equals
+    np.testing.assert_allclose(twice.unknown, once.unknown, atol=1e-6)
+
+
+def test_an_irrelevant_label_barely_moves_the_others():
+    made = Made()
+    few, more = made.chooser.choose(made.texts[:4]), made.chooser.choose(made.texts[[0, 1, 2, 3, 40]])
+    np.testing.assert_allclose(more.table[:, :4], few.table, atol=0.02)
+
+
+def test_an_object_in_pieces_does_not_change_what_is_shared():
+    made = Made()
+    pieces = np.concatenate([made.table.descriptors, np.repeat(made.table.descriptors[:1], 5, axis=0)])
+    whole = common_part(made.table.descriptors, 0.95)
+    np.testing.assert_allclose(common_part(pieces, 0.95), whole, atol=1e-6)
+    np.testing.assert_allclose(whole, 5 / 6 * made.table.descriptors.mean(axis=0), atol=1e-6)
+
+
+def test_one_look_alone_keeps_all_that_it_shows():
+    rows = unit_rows(1, WIDTH)
+    np.testing.assert_array_equal(common_part(np.repeat(rows, 4, axis=0), 0.95), np.zeros(WIDTH))
+
+
+def test_a_synonym_in_the_bank_does_not_speak_against_a_label():
+    made = Made(instances=6)
+    near = unit(made.texts[0] - made.bank.mean)
+    synonym = unit(made.bank.mean + 0.5 * (0.7 * near + 0.3 * unit(made.texts[50] - made.bank.mean)))
+    bank = WordBank(np.concatenate([made.bank.vectors, np.repeat(made.texts[:1], 8, axis=0)]))
+    assert Chooser(made.table, bank).choose(synonym[None]).labels[0] == 0
+    deaf = Chooser(made.table, bank, ChoosingSettings(synonym=1.01))
+    assert deaf.choose(synonym[None]).table[0, 0] < Chooser(made.table, bank).choose(synonym[None]).table[0, 0]
+
+
+def test_the_best_of_several_descriptors_counts_for_labels_and_bank_alike():
+    made = Made(instances=6, owners=[0, 0, 1, 2, 2, 3])
+    choice = made.chooser.choose(made.texts[:6])
+    assert choice.labels[0] in (0, 1)
+    assert choice.labels[1] == 2
+    assert choice.labels[2] in (3, 4)
+    # Both things that instance 0 shows are evident, and other words stay at their null.
+    assert choice.evidence[0, :2].min() > 3
+    assert abs(made.chooser._bank_evidence.mean(axis=1)).max() < 1e-3
+
+
+def test_several_vectors_a_label_count_by_the_best():
+    made = Made()
+    vectors = np.concatenate([made.texts[40:41], made.texts[0:1], made.texts[1:2]])
+    choice = made.chooser.choose(vectors, text_label=np.array([0, 0, 1]))
+    assert choice.table.shape == (6, 2)
+    np.testing.assert_array_equal(choice.labels[:2], [0, 1])
+
+
+def test_negatives_take_what_is_theirs():
+    made = Made()
+    free = made.chooser.choose(made.texts[:2])
+    held = made.chooser.choose(made.texts[:2], negatives=made.texts[:1])
+    assert free.labels[0] == 0
+    assert held.table[0, 0] == pytest.approx(0.5, abs=0.01)
+    assert held.table[1, 1] == pytest.approx(free.table[1, 1], abs=1e-3)
+
+
+def test_points_say_why_they_have_no_label():
+    made = Made()
+    table = replace(
+        made.table, descriptors=made.table.descriptors[:5], descriptor_instance=np.arange(5, dtype=np.int32)
+    )
+    choice = Chooser(table, made.bank).choose(made.texts[:3])
+    labels, probability, reasons = choice.at(np.array([0, 2, 4, 5, -1, -2, -3]))
+    np.testing.assert_array_equal(labels, [0, 2, -1, -1, -1, -1, -1])
+    assert [Reason(reason).name for reason in reasons] == [
+        "LABELLED", "LABELLED", "NONE_FITS", "NOT_DESCRIBED", "IN_NO_MASK", "UNOBSERVED", "TOO_FAR",
+    ]  # fmt: skip
+    assert (probability[2:] == 0).all()
+    views = made.table.views[[0, 2]]
+    np.testing.assert_allclose(probability[:2], choice.probability[[0, 2]] * (views + 0.5) / (views + 1), rtol=1e-6)
+
+
+def test_ten_thousand_labels_and_one():
+    made = Made()
+    many = np.concatenate([made.texts[:6], encoder_like_clip(9_994, seed=99)])
+    choice = made.chooser.choose(many)
+    np.testing.assert_array_equal(choice.labels, np.arange(6))
+    assert np.isfinite(choice.table).all()
+    np.testing.assert_allclose(choice.table.sum(axis=1) + choice.unknown, 1, atol=1e-3)
+    assert made.chooser.choose(many[:1]).labels[0] == 0
+
+
+def test_awkward_vectors():
+    made = Made()
+    zero = np.zeros((1, WIDTH), np.float32)
+    choice = made.chooser.choose(np.concatenate([zero, made.texts[:6], made.bank.mean[None]]))
+    np.testing.assert_array_equal(choice.labels, np.arange(1, 7))
+    assert (choice.table[:, 0] == 0).all()
+    assert (choice.table[:, 7] < 0.05).all()
+    assert (made.chooser.choose(zero).labels == -1).all()
+    half = made.chooser.choose(made.texts[:6].astype(np.float16))
+    np.testing.assert_allclose(half.table, made.chooser.choose(made.texts[:6]).table, atol=0.01)
+    alike = made.chooser.choose(np.repeat(made.texts[:1], 5, axis=0))
+    np.testing.assert_array_equal(alike.labels, [0, -1, -1, -1, -1, -1])
+
+
+def test_equal_and_zero_descriptors_give_no_warning_and_no_label_by_chance():
+    made = Made()
+    same = replace(made.table, descriptors=np.repeat(made.table.descriptors[:1], 6, axis=0))
+    assert len(np.unique(Chooser(same, made.bank).choose(made.texts[:6]).labels)) == 1
+    nothing = replace(made.table, descriptors=np.zeros((6, WIDTH), np.float32))
+    assert (Chooser(nothing, made.bank).choose(made.texts[:6]).labels == -1).all()
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_numbers_that_are_none_give_one_error(bad):
+    made = Made()
+    texts = made.texts[:3].copy()
+    texts[1, 5] = bad
+    with pytest.raises(FeatureSpaceError, match=r"row 1 of the label vectors holds NaN or infinity"):
+        made.chooser.choose(texts)
+
+
+def test_widths_must_agree():
+    made = Made()
+    with pytest.raises(FeatureSpaceError, match=r"label vectors have width 3, the descriptors 64"):
+        made.chooser.choose(np.ones((2, 3)))
+    with pytest.raises(FeatureSpaceError, match=r"word bank have width 16"):
+        Chooser(made.table, WordBank(unit_rows(60, 16)))
+    with pytest.raises(FeatureSpaceError, match=r"negatives have width 3"):
+        made.chooser.choose(made.texts[:2], negatives=np.ones((2, 3)))
+    with pytest.raises(FeatureSpaceError, match=r"shape \(64,\); expected \(count, width\)"):
+        made.chooser.choose(made.texts[0])
+    with pytest.raises(FeatureSpaceError, match=r"word bank of 49 words; expected at least 50"):
+        WordBank(unit_rows(49))
+
+
+def test_nothing_to_choose_from():
+    made = Made()
+    empty = made.chooser.choose(np.zeros((0, WIDTH)))
+    assert empty.table.shape == (6, 0)
+    assert (empty.labels == -1).all()
+    bare = Chooser(instance_table(3, []), made.bank).choose(made.texts[:2])
+    np.testing.assert_array_equal(bare.reasons, [Reason.NOT_DESCRIBED] * 3)
+    np.testing.assert_array_equal(bare.unknown, [1, 1, 1])
+
+
+def test_without_a_bank_the_largest_cosine_is_called_and_no_probability_claimed():
+    made = Made()
+    choice = Chooser(made.table).choose(made.texts[:6])
+    cosines = made.table.descriptors @ made.texts[:6].T
+    assert not choice.calibrated
+    np.testing.assert_array_equal(choice.labels, cosines.argmax(axis=1))
+    assert np.isnan(choice.probability).all()
+    assert np.isnan(choice.unknown).all()
+    judged = Chooser(made.table).choose(made.texts[:6], negatives=made.texts[50:54])
+    expected = relevancy(made.table.descriptors, made.texts[:6], made.texts[50:54])
+    np.testing.assert_allclose(judged.table, expected, atol=1e-6)
+    np.testing.assert_array_equal(judged.labels, np.where(expected.max(1) >= 0.5, expected.argmax(1), -1))
+
+
+def test_relevancy_is_lerfs():
+    images, texts, negatives = unit_rows(5, seed=1), unit_rows(3, seed=2), unit_rows(4, seed=3)
+    for i, image in enumerate(images.astype(float)):
+        for j, text in enumerate(texts.astype(float)):
+            pairs = [exp(10 * image @ text) / (exp(10 * image @ text) + exp(10 * image @ n)) for n in negatives]
+            assert relevancy(images, texts, negatives)[i, j] == pytest.approx(min(pairs), abs=1e-6)
+    with pytest.raises(FeatureSpaceError, match="0 negatives"):
+        relevancy(images, texts, np.zeros((0, 16)))
+
+
+def test_prompts_are_filled_in_encoded_once_and_averaged():
+    asked: list[str] = []
+
+    def encoder(texts):
+        asked.extend(texts)
+        return np.array([[len(text), text.count("a"), 1] for text in texts], np.float16)
+
+    vectors = embed(["red_mug", "sofa"], encoder, ("{}", "a photo of a {}"))
+    assert asked == ["red mug", "a photo of a red mug", "sofa", "a photo of a sofa"]
+    rows = unit(np.array([[len(text), text.count("a"), 1] for text in asked], float)).reshape(2, 2, 3)
+    np.testing.assert_allclose(vectors, unit(rows.mean(axis=1)), atol=1e-6)
+    assert all(template.count("{}") == 1 for template in TEMPLATES)
+    with pytest.raises(FeatureSpaceError, match="gave 1 vectors for 2 texts"):
+        embed(["a"], lambda texts: np.ones((1, 3)), ("{}", "a {}"))
+
+
+def test_templates_narrow_what_prompts_scatter():
+    """Each prompt moves a text at random; the mean over prompts finds more words than a single prompt does."""
+    made = Made(instances=40, signal=0.25)
+    random = np.random.default_rng(0)
+    prompts = made.texts[:40, None] + 0.09 * random.normal(size=(40, 6, WIDTH))
+    single = made.chooser.choose(prompts[:, 0])
+    mean = made.chooser.choose(unit(prompts).mean(axis=1))
+    right = [int((choice.labels == np.arange(40)).sum()) for choice in (single, mean)]
+    assert right[1] > right[0]
+
+
+def test_settings_refuse_nonsense():
+    with pytest.raises(ValueError, match="sharpness is 0; expected more than 0"):
+        ChoosingSettings(sharpness=0)
+
+
+def test_choosing_needs_only_numpy():
+    import subprocess
+
+    code = (
+        "import sys, og_pointcloud.choosing; print([m for m in sys.modules if m in ('numba', 'scipy', 'torch', 'cv2')])"
+    )
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert found.stdout.strip() == "[]"
