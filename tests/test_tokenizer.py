@@ -14,11 +14,9 @@ from itertools import pairwise
 from pathlib import Path
 
 import pytest
+from og_pointcloud_export.text_tokenizer import clip_description, siglip_description
 
 from og_pointcloud.tokenizer import BYTE_CHARACTERS, WHITESPACE, BytePairs, CharacterMap, Tokenizer, Unigrams
-
-pytest.importorskip("torch", reason="the exporter's descriptions of tokenizers need the extra 'export-text'")
-from og_pointcloud_export.text_tokenizer import clip_description, siglip_description
 
 CLIP_MERGES = Path(__file__).resolve().parents[2] / "shared" / "data" / "clip" / "bpe_simple_vocab_16e6.txt.gz"
 SMALL_MERGES = [("a", "t</w>"), ("c", "at</w>"), ("l", "o"), ("lo", "w</w>"), ("lo", "w"), ("e", "r</w>")]

@@ -12,7 +12,6 @@ import os
 import re
 import shutil
 from collections.abc import Sequence
-from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -35,8 +34,8 @@ from og_pointcloud.text_encoder import (
 )
 from og_pointcloud.vocabulary import best_cosines
 from og_pointcloud_export.text_graph import build_text_graph
-from og_pointcloud_export.text_tokenizer import find_tokenizer
-from og_pointcloud_export.text_weights import Activation, Affine, Block, TextTower, read_json, read_text_tower
+from og_pointcloud_export.text_tokenizer import find_tokenizer, read_json
+from og_pointcloud_export.text_weights import Activation, Affine, Block, TextTower, read_text_tower
 
 try:
     import torch
@@ -53,6 +52,8 @@ TOLERANCE = 1e-5
 """Largest difference of a unit vector's entry from torch that is let through; float32 reaches about 1e-6."""
 INT8_COSINE = 0.99
 """Smallest cosine of an int8 vector with its float32 one that is let through."""
+EQUAL = 1e-6
+"""Cosines that float32 vectors cannot tell apart."""
 MODEL_NAME = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*")
 """OWNER/MODEL: how feature spaces are named, after where the weights were published."""
 PARITY_TEXTS = (
@@ -182,19 +183,6 @@ def _parity(tower: TextTower, encoder: TextEncoder) -> dict[str, Any]:
     }  # fmt: skip
 
 
-@dataclass(frozen=True)
-class _Choices:
-    """Best word of each instance, and best instance of each word."""
-
-    words: NDArray[np.intp]
-    instances: NDArray[np.intp]
-
-    @classmethod
-    def of(cls, cloud: LabelledCloud, vectors: NDArray[np.float32]) -> _Choices:
-        scores = best_cosines(cloud.instances, vectors)
-        return cls(scores.argmax(axis=1), scores.argmax(axis=0))
-
-
 def _accept_int8(small: TextEncoder, exact: TextEncoder, cloud: LabelledCloud | None) -> dict[str, Any]:
     """What int8 costs; OgPointcloudError where that is too much."""
     own = cloud.vocabulary.names if cloud is not None and cloud.vocabulary is not None else ()
@@ -207,7 +195,11 @@ def _accept_int8(small: TextEncoder, exact: TextEncoder, cloud: LabelledCloud | 
             f"int8 turns the vector of '{names[worst]:.40}' to cosine {cosines[worst]:.4f}; expected at least "
             f"{INT8_COSINE}: leave --int8 out"
         )
-    report: dict[str, Any] = {"texts": len(names), "min_cosine": float(cosines[worst]), "mean_cosine": cosines.mean()}
+    report: dict[str, Any] = {
+        "texts": len(names),
+        "min_cosine": float(cosines[worst]),
+        "mean_cosine": float(cosines.mean()),
+    }
     if cloud is None:
         return report
     width = cloud.instances.descriptors.shape[1]
@@ -217,14 +209,22 @@ def _accept_int8(small: TextEncoder, exact: TextEncoder, cloud: LabelledCloud | 
             f"'{exact.feature_space}' (width {exact.width}): name a scene of the encoder's"
         )
     words = [names.index(name) for name in own] or list(range(len(names)))
-    before, after = _Choices.of(cloud, expected[words]), _Choices.of(cloud, vectors[words])
-    changed = int((before.words != after.words).sum() + (before.instances != after.instances).sum())
+    before, after = (best_cosines(cloud.instances, rows[words]) for rows in (expected, vectors))
+    changed = _choices_changed(before, after) + _choices_changed(before.T, after.T)
     if changed:
         raise OgPointcloudError(
-            f"int8 changes {changed} of the scene's choices (best word of {len(before.words)} instances, best instance "
-            f"of {len(words)} words); expected 0: leave --int8 out"
+            f"int8 changes {changed} of the scene's choices (best word of {len(before)} instances, best instance of "
+            f"{len(words)} words); expected 0: leave --int8 out"
         )
-    return {**report, "instances": len(before.words), "words": len(words), "choices_changed": changed}
+    return {**report, "instances": len(before), "words": len(words), "choices_changed": changed}
+
+
+def _choices_changed(before: NDArray[np.float64], after: NDArray[np.float64]) -> int:
+    """Rows whose best column became one that was worse; among equals there was no choice."""
+    if before.size == 0:
+        return 0
+    chosen = np.take_along_axis(before, after.argmax(axis=1)[:, None], axis=1)[:, 0]
+    return int((chosen < before.max(axis=1) - EQUAL).sum())
 
 
 def _files(manifest: dict[str, Any], graph: bytes, tokenizer_json: bytes) -> dict[str, bytes]:

@@ -8,20 +8,22 @@ Output  text   (B, D) float32  unit rows
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.errors import MissingExtraError, OgPointcloudError
 from og_pointcloud.text_encoder import ENCODER_FILES, GRAPH
-from og_pointcloud_export.text_weights import Affine, Block, TextTower
 
 try:
     import onnx
     from onnx import TensorProto, helper, numpy_helper
 except ImportError as error:
     raise MissingExtraError("onnx", "export-text") from error
+
+if TYPE_CHECKING:
+    from og_pointcloud_export.text_weights import Affine, Block, TextTower
 
 __all__ = ["build_text_graph"]
 

@@ -8,15 +8,17 @@ import struct
 import zlib
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from og_pointcloud._onnx_graph import message_fields
 from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.text_encoder import ENCODER_FILES, TOKENIZER
 from og_pointcloud.tokenizer import BYTE_CHARACTERS, CLIP_WORDS
-from og_pointcloud_export.text_weights import TextTower, read_json
 
-__all__ = ["clip_description", "find_tokenizer", "siglip_description"]
+if TYPE_CHECKING:
+    from og_pointcloud_export.text_weights import TextTower
+
+__all__ = ["clip_description", "find_tokenizer", "read_json", "siglip_description"]
 
 CLIP_START, CLIP_END = "<|startoftext|>", "<|endoftext|>"
 TOKENIZER_FILES = (TOKENIZER, "bpe_simple_vocab_16e6.txt.gz", "merges.txt", "spiece.model")
@@ -103,6 +105,19 @@ def siglip_description(spiece: bytes) -> dict[str, Any]:
         },
         "pad_token": "</s>",
     }
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """A JSON object from a file of bounded size; OgPointcloudError for anything else."""
+    try:
+        if path.stat().st_size > ENCODER_FILES[TOKENIZER]:
+            raise ValueError(f"it has more than {ENCODER_FILES[TOKENIZER]} bytes")
+        value = json.loads(path.read_bytes())
+        if not isinstance(value, dict):
+            raise ValueError(f"it holds a {type(value).__name__}, not an object")
+    except (ValueError, OSError, RecursionError) as error:
+        raise OgPointcloudError(f"{path} cannot be read as JSON ({error}): fetch it again") from None
+    return value
 
 
 def _byte_order() -> list[int]:

@@ -6,7 +6,7 @@ could run. Vision towers are left where they lie.
 
 from __future__ import annotations
 
-import json
+import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.errors import MissingExtraError, OgPointcloudError
+from og_pointcloud_export.text_tokenizer import read_json
 
 try:
     import torch
@@ -39,7 +40,6 @@ OPEN_CLIP_WEIGHTS = ("open_clip_model.safetensors", "open_clip_pytorch_model.bin
 OPEN_CLIP_CONFIG = "open_clip_config.json"
 OPENAI_MARKS = {"input_resolution", "context_length", "vocab_size"}
 """Three numbers that only OpenAI's own state dicts hold."""
-MAX_JSON_BYTES = 1 << 26
 
 
 @dataclass(frozen=True)
@@ -137,19 +137,6 @@ def _find(source: Path) -> tuple[list[Path], dict[str, Any]]:
     )
 
 
-def read_json(path: Path) -> dict[str, Any]:
-    """A JSON object from a file of bounded size; OgPointcloudError for anything else."""
-    try:
-        if path.stat().st_size > MAX_JSON_BYTES:
-            raise ValueError(f"it has more than {MAX_JSON_BYTES} bytes")
-        value = json.loads(path.read_bytes())
-        if not isinstance(value, dict):
-            raise ValueError(f"it holds a {type(value).__name__}, not an object")
-    except (ValueError, OSError, RecursionError) as error:
-        raise OgPointcloudError(f"{path} cannot be read as JSON ({error}): fetch it again") from None
-    return value
-
-
 @dataclass(frozen=True)
 class _Weights:
     """Tensors by name, fetched when asked for."""
@@ -211,7 +198,9 @@ def _open_safetensors(files: list[Path]) -> tuple[frozenset[str], Callable[[str]
 
 def _load_weights_only(path: Path) -> dict[str, torch.Tensor]:
     try:
-        loaded = torch.load(path, map_location="cpu", weights_only=True)
+        with warnings.catch_warnings():  # of TorchScript, which then raises
+            warnings.simplefilter("ignore")
+            loaded = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # torch raises a dozen kinds
         raise OgPointcloudError(
             f"{path} is not a file of weights only ({(str(error).splitlines() or ['?'])[0]:.120}); what is more could "

@@ -1,0 +1,247 @@
+"""Words and encoders stored in a .ogpc: added, listed, carried, and everything else left as it was."""
+
+from __future__ import annotations
+
+import json
+import zipfile
+
+import numpy as np
+import pytest
+from labelled_clouds import SPACE, WIDTH, WORDS, instance_table, room, unit_rows
+from og_pointcloud_export import write_bundle
+from og_pointcloud_export.query_head import reference_scores
+
+import og_pointcloud as og
+from og_pointcloud.bundle import read_bundle, read_carried_encoder
+from og_pointcloud.cli import main
+from og_pointcloud.cloud import Vocabulary
+from og_pointcloud.errors import BundleError, FeatureSpaceError, OgPointcloudError
+from og_pointcloud.text_encoder import encoder_for
+from og_pointcloud.vocabulary import add_words, best_cosines, carry_encoder, read_words
+
+NEW = Vocabulary(("grape", "Größe 40"), 3 * unit_rows(2, seed=9))
+
+
+@pytest.fixture(scope="module")
+def without_words(tmp_path_factory):
+    from dataclasses import replace
+
+    return write_bundle(replace(room(300), vocabulary=None), tmp_path_factory.mktemp("bundle") / "bare.ogpc")
+
+
+@pytest.fixture(scope="module")
+def bundle_file(tmp_path_factory):
+    return write_bundle(room(300), tmp_path_factory.mktemp("bundle") / "room.ogpc")
+
+
+@pytest.fixture
+def path(bundle_file, tmp_path):
+    (tmp_path / "s.ogpc").write_bytes(bundle_file.read_bytes())
+    return tmp_path / "s.ogpc"
+
+
+def members_of(path):
+    with zipfile.ZipFile(path) as archive:
+        return {name: archive.read(name) for name in archive.namelist()}
+
+
+def unit(rows):
+    return rows / np.linalg.norm(rows, axis=1, keepdims=True)
+
+
+def test_added_words_can_be_asked(path):
+    done = add_words(path, NEW, SPACE)
+    assert (done.added, done.replaced, done.total) == (2, 0, len(WORDS) + 2)
+    bundle = read_bundle(path, verify_sha256=True)
+    assert bundle.cloud.vocabulary.names == (*WORDS, *NEW.names)
+    assert np.abs(bundle.cloud.vocabulary.vectors[-2:] - unit(NEW.vectors)).max() < 1e-3
+    assert bundle.manifest["counts"]["words"] == len(WORDS) + 2
+    asked = og.segment(og.load(path), ["grape", "apple"])
+    given = og.segment(og.load(path), {"grape": NEW.vectors[0], "apple": unit_rows(5, seed=0)[0]})
+    assert (asked.labels == given.labels).all()
+
+
+def test_all_else_stays_byte_for_byte(path, bundle_file):
+    add_words(path, NEW, SPACE)
+    before, after = members_of(bundle_file), members_of(path)
+    assert list(before) == list(after)
+    changed = {name for name in before if before[name] != after[name]}
+    assert changed == {"manifest.json", "vocabulary/names.json", "vocabulary/vectors.npy"}
+    old, new = json.loads(before["manifest.json"]), json.loads(after["manifest.json"])
+    assert {key for key in old if old[key] != new[key]} <= {"counts", "members", "parity"}
+
+
+def test_adding_again_gives_the_new_vector_and_no_second_word(path):
+    add_words(path, NEW, SPACE)
+    done = add_words(path, Vocabulary(("grape", "fig"), unit_rows(2, seed=11)), SPACE)
+    assert (done.added, done.replaced, done.total) == (1, 1, len(WORDS) + 3)
+    vocabulary = read_bundle(path).cloud.vocabulary
+    assert vocabulary.names == (*WORDS, *NEW.names, "fig")
+    assert np.abs(vocabulary.vectors[len(WORDS)] - unit_rows(2, seed=11)[0]).max() < 1e-3
+
+
+def test_a_file_without_words_gets_some(without_words, tmp_path):
+    assert add_words(without_words, NEW, SPACE, tmp_path / "t.ogpc").total == 2
+    assert read_bundle(tmp_path / "t.ogpc").cloud.vocabulary.names == NEW.names
+    assert read_bundle(without_words).cloud.vocabulary is None
+
+
+def test_words_of_another_space_or_width_change_nothing(path, bundle_file):
+    with pytest.raises(FeatureSpaceError, match="feature space 'other' \\(width 16\\)"):
+        add_words(path, NEW, "other")
+    with pytest.raises(FeatureSpaceError, match="width 8"):
+        add_words(path, Vocabulary(("a",), unit_rows(1, 8)), SPACE)
+    assert path.read_bytes() == bundle_file.read_bytes()
+    assert add_words(path, NEW, "unknown").added == 2
+
+
+def test_best_cosines_are_those_of_the_graphs_reference():
+    table = instance_table(6, [0, 0, 1, 3, 3, 5])
+    text = np.concatenate([4 * unit_rows(7, seed=3), np.zeros((1, WIDTH), np.float32)])
+    assert np.abs(best_cosines(table, text) - reference_scores(table, text)).max() < 1e-12
+
+
+def test_words_of_a_file(tmp_path):
+    (tmp_path / "w.txt").write_bytes("\ufeffchair\r\n\n  red mug \nchair\nGröße\n".encode())
+    assert read_words(tmp_path / "w.txt") == ("chair", "red mug", "Größe")
+    for content, says in ((b"\n \n", "has no words"), (b"\xff\xfe", "cannot be read as words")):
+        (tmp_path / "w.txt").write_bytes(content)
+        with pytest.raises(OgPointcloudError, match=says):
+            read_words(tmp_path / "w.txt")
+    with pytest.raises(OgPointcloudError, match="cannot be read as words"):
+        read_words(tmp_path / "absent.txt")
+
+
+def run(*arguments):
+    return main(["vocabulary", *map(str, arguments)])
+
+
+def test_the_commands_add_and_list(path, tmp_path, capsys):
+    np.savez(
+        tmp_path / "f.npz", names=np.array([*NEW.names, "apple"]), vectors=unit_rows(3, seed=9), feature_space=SPACE
+    )
+    (tmp_path / "w.txt").write_text("grape\napple\n")
+    assert run("add", path, tmp_path / "w.txt", "--text-features", tmp_path / "f.npz", "-o", tmp_path / "t.ogpc") == 0
+    assert capsys.readouterr().out == f"wrote {tmp_path / 't.ogpc'}: 6 words, 1 new, 1 with a new vector\n"
+    assert run("list", tmp_path / "t.ogpc") == 0
+    assert capsys.readouterr().out.splitlines() == [*WORDS, "grape"]
+    assert run("add", path, "--text-features", tmp_path / "f.npz") == 0
+    assert run("list", path) == 0
+    assert capsys.readouterr().out.splitlines()[1:] == [*WORDS, *NEW.names]
+
+
+def test_what_the_command_cannot_add(path, tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("OG_POINTCLOUD_MODELS", str(tmp_path))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    np.savez(tmp_path / "f.npz", names=np.array(["grape"]), vectors=unit_rows(1), feature_space=SPACE)
+    (tmp_path / "w.txt").write_text("grape\nsofa\nlamp\n")
+    for arguments, says in (
+        ((tmp_path / "w.txt", "--text-features", tmp_path / "f.npz"), "'sofa' is not among the 1 names"),
+        ((tmp_path / "w.txt",), f"export-text-encoder MODEL_FOLDER --feature-space '{SPACE}'"),
+        ((tmp_path / "w.txt", "--text-encoder", tmp_path), "has no manifest.json"),
+        ((tmp_path / "w.txt", "-o", tmp_path / "t.zip"), "expected a name that ends in .ogpc"),
+    ):
+        assert run("add", path, *arguments) == 2
+        assert says in capsys.readouterr().err
+    for arguments in ((), ("--text-features", "a.npz", "--text-encoder", "b")):
+        with pytest.raises(SystemExit):
+            run("add", path, *arguments)
+
+
+# Carried encoders
+
+
+@pytest.fixture(scope="module")
+def encoder_folder(tmp_path_factory):
+    """An encoder of the room's feature space and width."""
+    torch = pytest.importorskip("torch")
+    exporter = pytest.importorskip("og_pointcloud_export.text_encoder")
+    from text_models import openai_state, write_tokenizer
+
+    folder = write_tokenizer(tmp_path_factory.mktemp("weights"))
+    state = openai_state()
+    state["text_projection"] = state["text_projection"][:, :WIDTH].clone()
+    torch.save(state, folder / "clip.pt")
+    return exporter.export_text_encoder(
+        folder / "clip.pt", folder / "encoder", feature_space=SPACE, activation="quick_gelu"
+    )[0]
+
+
+def test_the_command_encodes_words(path, tmp_path, encoder_folder, monkeypatch, capsys):
+    (tmp_path / "w.txt").write_text("cat\nlow\n")
+    assert run("add", path, tmp_path / "w.txt", "--text-encoder", encoder_folder) == 0
+    monkeypatch.setenv("OG_POINTCLOUD_MODELS", str(encoder_folder))
+    vectors = encoder_for(SPACE)(["cat", "low"])
+    assert np.abs(read_bundle(path).cloud.vocabulary.vectors[-2:] - vectors).max() < 1e-3
+    (tmp_path / "w.txt").write_text("lower\n")
+    assert run("add", path, tmp_path / "w.txt") == 0
+    assert "8 words, 1 new" in capsys.readouterr().out
+
+
+def test_a_carried_encoder_answers_and_is_read_only_when_asked(
+    path, encoder_folder, bundle_file, monkeypatch, tmp_path
+):
+    monkeypatch.setattr("og_pointcloud.text_encoder.cache_folder", lambda: tmp_path / "none")
+    assert read_carried_encoder(path) is None
+    assert carry_encoder(path, encoder_folder).feature_space == SPACE
+    bundle = read_bundle(path, verify_sha256=True)
+    assert bundle.cloud.vocabulary.names == WORDS
+    assert encoder_for(SPACE, path).where == f"{path}: text_encoder"
+    assert encoder_for(SPACE, path)(["cat"]).shape == (1, WIDTH)
+    assert add_words(path, NEW, SPACE).added == 2  # which keeps what is carried
+    assert encoder_for(SPACE, path)(["cat"]).shape == (1, WIDTH)
+    assert set(members_of(path)) - set(members_of(bundle_file)) == {
+        f"text_encoder/{name}" for name in ("manifest.json", "text_encoder.onnx", "tokenizer.json")
+    }
+
+
+def test_the_writer_carries_an_encoder_too(encoder_folder, tmp_path, capsys):
+    path = write_bundle(room(100), tmp_path / "s.ogpc", text_encoder=encoder_folder)
+    assert encoder_for(SPACE, path)(["cat"]).shape == (1, WIDTH)
+    assert run("carry", path, encoder_folder, "-o", tmp_path / "t.ogpc") == 0
+    assert "carries its text encoder (fp32" in capsys.readouterr().out
+    assert (tmp_path / "t.ogpc").read_bytes() == path.read_bytes()
+    from dataclasses import replace
+
+    with pytest.raises(FeatureSpaceError, match="encodes to feature space"):
+        write_bundle(replace(room(100), feature_space="other"), tmp_path / "o.ogpc", text_encoder=encoder_folder)
+    assert not (tmp_path / "o.ogpc").exists()
+
+
+def changed_zip(path, out, change):
+    members = members_of(path)
+    manifest = json.loads(members["manifest.json"])
+    change(manifest, members)
+    members["manifest.json"] = json.dumps(manifest).encode()
+    with zipfile.ZipFile(out, "w") as archive:
+        for name, data in members.items():
+            archive.writestr(name, data)
+    return out
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda manifest, members: members.pop("text_encoder/tokenizer.json"), "is missing"),
+        (lambda manifest, members: members.update({"text_encoder/tokenizer.json": b"{}"}), "the manifest says"),
+        (lambda manifest, members: members.update({"text_encoder/extra": b"{}"}), "is not in the manifest"),
+        (lambda manifest, members: manifest["members"].pop("text_encoder/text_encoder.onnx"), "is not in the manifest"),
+    ],
+)
+def test_a_carried_encoder_must_be_as_declared(path, encoder_folder, tmp_path, change, says):
+    carry_encoder(path, encoder_folder)
+    with pytest.raises(BundleError, match=says):
+        read_bundle(changed_zip(path, tmp_path / "t.ogpc", change))
+
+
+def test_a_carried_encoder_is_checked_like_any_other(path, encoder_folder, tmp_path):
+    carry_encoder(path, encoder_folder)
+
+    def tear(manifest, members):
+        name = "text_encoder/text_encoder.onnx"
+        members[name] = members[name][:-1] + b"\0"
+
+    torn = changed_zip(path, tmp_path / "t.ogpc", tear)
+    assert len(read_bundle(torn).cloud) == 300  # the scene itself is whole
+    with pytest.raises(OgPointcloudError, match=r"t\.ogpc: text_encoder: .* was changed"):
+        encoder_for(SPACE, torn)
