@@ -89,8 +89,15 @@ def test_simulated_captures_get_words_of_their_encoder(scored_capture: Path, tmp
     case = bench.load_case(scored_capture, tmp_path, {}, [], "")
     assert case.bank.shape == (800, WIDTH)
     assert all(draw.shape == (bench.ABSENT_WORDS, WIDTH) for draw in case.absent)
-    # They share with each other what the texts share.
-    assert abs((case.bank @ case.texts.T).mean() - (case.texts @ case.texts.T)[np.triu_indices(3, 1)].mean()) < 0.3
+
+
+def test_made_words_share_what_texts_share() -> None:
+    texts = bench.unit(np.concatenate([np.full((9, 1), 2.0), unit_rows(9, 63)], axis=1))
+    made = bench.made_words(texts, 400, np.random.default_rng(0))
+    np.testing.assert_allclose(np.linalg.norm(made, axis=1), 1, atol=1e-5)
+    off_diagonal = ~np.eye(400, dtype=bool)
+    assert (made @ made.T)[off_diagonal].mean() == pytest.approx((made @ texts.T).mean(), abs=0.02)
+    assert (made @ made.T)[off_diagonal].mean() == pytest.approx(0.8, abs=0.05)  # 4 / (4 + 1)
 
 
 def test_calibration_error_by_hand() -> None:

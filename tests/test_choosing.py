@@ -80,6 +80,17 @@ def test_posterior_is_that_of_the_literal_reference(labels):
     np.testing.assert_allclose(choice.unknown, 1 - plain.sum(axis=1), atol=2e-4)
 
 
+def test_how_far_fitting_words_stand_out_is_seen_in_the_scene():
+    made = Made()
+    bank = WordBank(np.concatenate([made.bank.vectors, made.texts[:3]]))
+    chooser, settings = Chooser(made.table, bank), ChoosingSettings()
+    assert made.chooser.sharpness < chooser.sharpness
+    plain = choose_plainly(
+        made.table.descriptors, made.texts[3:9], bank.vectors, settings.sharpness, settings.kinds, settings.synonym
+    )
+    np.testing.assert_allclose(chooser.choose(made.texts[3:9]).table, plain, atol=2e-4)
+
+
 def test_shown_words_are_found_and_absent_ones_are_not():
     made = Made()
     choice = made.chooser.choose(made.texts[:6])
