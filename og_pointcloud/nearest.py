@@ -7,10 +7,12 @@ import itertools
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["NONE_WITHIN_REACH", "NearestPoint", "VoxelBuckets"]
+__all__ = ["NONE_WITHIN_REACH", "NearestPoint", "VoxelBuckets", "surface_distance"]
 
 NONE_WITHIN_REACH = -1
 """Index answered for a query that has no cloud point within reach."""
+
+SURFACE_PER_SPACING, SURFACE_PER_REACH = 1.5, 1 / 3
 
 QUERIES_PER_CHUNK = 8192
 CANDIDATES_PER_CHUNK = 1_000_000
@@ -19,6 +21,11 @@ LEVEL_FACTOR = 1.5
 """How much wider each next search is. Most queries lie within one spacing of the cloud and need only the first."""
 EDGE_SLACK = 1e-6
 """Voxels are that much wider than the radius: rounding must not put a point at that distance two voxels away."""
+
+
+def surface_distance(spacing: float, reach: float) -> float:
+    """Distance from the cloud up to which a query is on its surface; from there to the reach it is near."""
+    return max(SURFACE_PER_SPACING * spacing, SURFACE_PER_REACH * reach)
 
 
 class VoxelBuckets:
@@ -83,6 +90,14 @@ class NearestPoint:
             nearest[pending] = found
             pending = pending[found == NONE_WITHIN_REACH]
         return nearest
+
+    def distance(self, points: NDArray[np.float32], nearest: NDArray[np.int64]) -> NDArray[np.float64]:
+        """(m,) from each query to the cloud point that ``query`` found; infinity where it found none."""
+        found = nearest != NONE_WITHIN_REACH
+        distance = np.full(len(points), np.inf)
+        difference = points[found].astype(np.float64) - self._xyz[nearest[found]]
+        distance[found] = np.sqrt((difference * difference).sum(axis=1))
+        return distance
 
 
 _COLUMNS = np.array([(x, y) for x in (-1, 0, 1) for y in (-1, 0, 1)])

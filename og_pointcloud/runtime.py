@@ -14,13 +14,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from og_pointcloud.bundle import NO_EVIDENCE, TOO_FAR, Bundle, read_bundle
+from og_pointcloud.bundle import BEYOND, NEAR, NO_EVIDENCE, ON_SURFACE, TOO_FAR, Bundle, read_bundle
 from og_pointcloud.cloud import BACKGROUND, UNOBSERVED, InstanceTable, LabelledCloud, Vocabulary
 from og_pointcloud.clouds import carried_scene, world_points
-from og_pointcloud.errors import BundleError, FeatureSpaceError, OgPointcloudError
-from og_pointcloud.nearest import NONE_WITHIN_REACH, NearestPoint
+from og_pointcloud.errors import BundleError, FeatureSpaceError, OgPointcloudError, SceneError
+from og_pointcloud.nearest import NONE_WITHIN_REACH, NearestPoint, surface_distance
 from og_pointcloud.segmentation import UNKNOWN, Segmentation
 from og_pointcloud.words import Labels, TextFeatures, resolve_labels
 
@@ -105,28 +105,57 @@ class LabelledScene:
         feed = {"points": np.zeros((0, 3), np.float32), "text": np.ascontiguousarray(vectors, np.float32)}
         return np.asarray(self._session.run(["instance_scores"], feed)[0])
 
-    def instances_at(self, points: NDArray[np.floating]) -> NDArray[np.int32]:
+    def instances_at(self, points: NDArray[np.floating], *, max_distance: float | None = None) -> NDArray[np.int32]:
         """(N,) int32: instance id of the scene's point nearest to each, -1, -2, or -3 where none is within reach.
 
         points: (N, 3), world coordinates. A row with NaN or infinity, as depth cameras send them, is out of reach.
+        max_distance: a shorter reach, in the scene's unit; costs an exact search of every point.
         Exact: of points equally near the first one counts, and a point of the scene finds its own id.
         """
+        return self.look_up(points, max_distance=max_distance)[0]
+
+    def look_up(
+        self, points: NDArray[np.floating], *, max_distance: float | None = None
+    ) -> tuple[NDArray[np.int32], NDArray[np.int8]]:
+        """What ``instances_at`` answers, and (N,) int8: on the surface, near, or too far, as Segmentation says."""
         with np.errstate(over="ignore"):  # what leaves float32 is infinitely far
             local = (np.asarray(points, np.float64) - self.cloud.origin).astype(np.float32)
-        found = np.empty(len(local), np.int32)
+        instances, distance = np.empty(len(local), np.int32), np.empty(len(local), np.int8)
         for start in range(0, len(local), POINTS_PER_RUN):
-            found[start : start + POINTS_PER_RUN] = self._instances_at(local[start : start + POINTS_PER_RUN])
-        return found
+            run = slice(start, start + POINTS_PER_RUN)
+            instances[run], distance[run] = self._look_up(local[run])
+        if max_distance is not None:
+            cut = self._farther_than(max_distance, local, instances)
+            instances[cut], distance[cut] = TOO_FAR, BEYOND
+        return instances, distance
 
-    def _instances_at(self, local: NDArray[np.float32]) -> NDArray[np.int32]:
+    def _look_up(self, local: NDArray[np.float32]) -> tuple[NDArray[np.int32], NDArray[np.int8]]:
         feed = {"points": local, "text": np.zeros((0, self._text_width), np.float32)}
-        found, certain = (np.array(output) for output in self._session.run(["instance", "certain"], feed))
+        outputs = self._session.run(["instance", "distance", "certain"], feed)
+        instances, distance, certain = (np.asarray(output) for output in outputs)
+        if certain.all():
+            return instances, distance
         still_open = np.flatnonzero(~certain)
         still_open = still_open[np.isfinite(local[still_open]).all(axis=1)]  # the others are too far already
         nearest = self._nearest.query(local[still_open])
-        exact = np.where(nearest == NONE_WITHIN_REACH, TOO_FAR, np.append(self.instance_ids, TOO_FAR)[nearest])
-        found[still_open] = exact
-        return found
+        instances[still_open] = np.append(self.instance_ids, np.int32(TOO_FAR))[nearest]
+        surface = surface_distance(self.cloud.spacing, self.cloud.reach)
+        on_surface = self._nearest.distance(local[still_open], nearest) <= surface
+        distance[still_open] = np.where(nearest == NONE_WITHIN_REACH, BEYOND, np.where(on_surface, ON_SURFACE, NEAR))
+        return instances, distance
+
+    def _farther_than(
+        self, max_distance: float, local: NDArray[np.float32], instances: NDArray[np.int32]
+    ) -> NDArray[np.int64]:
+        """Rows of points within reach, but with no cloud point within that distance."""
+        if not 0 < max_distance <= self.cloud.reach:
+            raise OgPointcloudError(
+                f"max_distance is {max_distance}; expected a length up to the scene's reach, {self.cloud.reach:.4g}: "
+                "points farther than that have no label"
+            )
+        within_reach = np.flatnonzero(instances != TOO_FAR)
+        search = NearestPoint(self.cloud.xyz, self.cloud.spacing, max_distance)
+        return within_reach[search.query(local[within_reach]) == NONE_WITHIN_REACH]
 
     @cached_property
     def _session(self) -> InferenceSession:
@@ -139,8 +168,10 @@ class LabelledScene:
             raise BundleError(f"{self.path}: query.onnx does not run ({reason}): write the file again") from None
         inputs = {given.name: given for given in session.get_inputs()}
         outputs = {given.name for given in session.get_outputs()}
-        if set(inputs) != {"points", "text"} or not {"instance", "certain", "instance_scores"} <= outputs:
-            raise BundleError(f"{self.path}: query.onnx takes {sorted(inputs)} and gives {sorted(outputs)}: not ours")
+        if set(inputs) != {"points", "text"} or not {"instance", "distance", "certain", "instance_scores"} <= outputs:
+            raise BundleError(
+                f"{self.path}: query.onnx takes {sorted(inputs)} and gives {sorted(outputs)}: write the file again"
+            )
         return session
 
     @property
@@ -165,9 +196,15 @@ def use(scene: SceneLike | None) -> LabelledScene | None:
 
 
 def segment(
-    pcd: Any, labels: Labels = None, scene: SceneLike | None = None, *, text_features: TextFeatures = None
+    pcd: Any,
+    labels: Labels = None,
+    scene: SceneLike | None = None,
+    *,
+    text_features: TextFeatures = None,
+    pose: ArrayLike | None = None,
+    max_distance: float | None = None,
 ) -> Segmentation:
-    """Label the points of a cloud by words.
+    """Label the points of a cloud by words. The cloud may be of any density, a crop, noisy, or in a frame of its own.
 
     pcd: an array (N, 3) of world coordinates, an Open3D, PyVista or trimesh cloud, a geometry file; or a scene, a
         LabelledCloud or a .ogpc file, whose own points are then labelled. Rows with NaN answer unknown.
@@ -175,6 +212,8 @@ def segment(
     scene: what to ask. Left out: the scene that the cloud is or carries, else that of ``use``, else the file that the
         environment variable OG_POINTCLOUD_SCENE names.
     text_features: a text-features .npz, or what ``read_text_features`` returned for it.
+    pose: (4, 4), takes the cloud's coordinates to the scene's world. Left out: they are world coordinates.
+    max_distance: points farther than this from the scene's cloud answer unknown; at most, and left out, its reach.
 
     Warns where no point gets a label, and says why. Raises OgPointcloudError and its kinds: SceneError (no cloud),
     BundleError (no scene), FeatureSpaceError (vectors of another space or width).
@@ -182,10 +221,13 @@ def segment(
     pcd = _as_scene(pcd) if _is_scene(pcd) else pcd
     scene = _find_scene(pcd, scene)
     words = resolve_labels(labels, text_features, scene.vocabulary, scene.feature_space)
-    own = pcd is scene
-    points = scene.xyz if own else pcd.xyz if isinstance(pcd, LabelledScene) else world_points(pcd)
-    instances = scene.instance_ids if own else scene.instances_at(points)
-    result = _label(scene, words, _best_labels(scene, words), points, instances)
+    if pcd is scene and pose is None:
+        points, instances = scene.xyz, scene.instance_ids
+        distance = np.full(len(points), ON_SURFACE, np.int8)
+    else:
+        points = _posed(pcd.xyz if isinstance(pcd, LabelledScene) else world_points(pcd), pose)
+        instances, distance = scene.look_up(points, max_distance=max_distance)
+    result = _label(scene, words, _best_labels(scene, words), points, instances, distance)
     if reason := _why_nothing(result, scene):
         warnings.warn(reason, stacklevel=2)
     return result
@@ -194,6 +236,7 @@ def segment(
 class Segmenter:
     """The same labels for many clouds: words are scored once, and a call only looks points up.
 
+    Several threads may call it at once; memory does not grow from call to call.
     scene, labels, text_features: as for ``segment``.
     """
 
@@ -208,13 +251,15 @@ class Segmenter:
         """The labels, in the order of their numbers."""
         return self._words.names
 
-    def __call__(self, points: Any) -> Segmentation:
+    def __call__(self, points: Any, pose: ArrayLike | None = None) -> Segmentation:
         """points: (N, 3) world coordinates, or any cloud that ``segment`` takes; N may be 0.
 
+        pose: (4, 4), takes the points to the scene's world, as a sensor's pose in the map does; ``xyz`` of the result
+        is then in the world too.
         Warns the first time that no point gets a label, not at every empty frame of a stream.
         """
-        points = world_points(points)
-        result = _label(self.scene, self._words, self._best, points, self.scene.instances_at(points))
+        points = _posed(world_points(points), pose)
+        result = _label(self.scene, self._words, self._best, points, *self.scene.look_up(points))
         if not self._warned and (reason := _why_nothing(result, self.scene)):
             self._warned = True
             warnings.warn(reason, stacklevel=2)
@@ -277,6 +322,22 @@ def _scene_of_cloud(cloud: LabelledCloud) -> LabelledScene:
     return scene
 
 
+def _posed(points: NDArray[np.float64], pose: ArrayLike | None) -> NDArray[np.float64]:
+    if pose is None:
+        return points
+    matrix = np.asarray(pose)
+    if matrix.shape != (4, 4) or matrix.dtype.kind not in "fiu" or not np.isfinite(matrix).all():
+        raise SceneError(f"pose is {matrix.dtype} {matrix.shape}; expected a finite 4x4 matrix, cloud to world")
+    matrix = matrix.astype(np.float64)
+    if np.abs(matrix[3] - [0, 0, 0, 1]).max() > 1e-6:
+        raise SceneError(
+            f"the last row of pose is {matrix[3].tolist()}; expected 0 0 0 1: give the matrix whose last column is the "
+            "translation (transposed, perhaps?)"
+        )
+    with np.errstate(invalid="ignore", over="ignore"):  # rows with NaN or infinity stay such
+        return points @ matrix[:3, :3].T + matrix[:3, 3]
+
+
 def _best_labels(scene: LabelledScene, words: Vocabulary) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
     """Label and score of each instance, and after the last one three more: of instance ids -3, -2 and -1."""
     scores = scene.instance_scores(words.vectors)
@@ -296,9 +357,13 @@ def _label(
     best: tuple[NDArray[np.int32], NDArray[np.float32]],
     points: NDArray[np.float64],
     instances: NDArray[np.int32],
+    distance: NDArray[np.int8],
 ) -> Segmentation:
     labels, scores = best
-    return Segmentation(points, labels[instances], scores[instances], instances, words.names, scene.path)
+    # A negative instance counts from the end, where those of no instance lie.
+    return Segmentation(
+        points, labels.take(instances), scores.take(instances), instances, words.names, scene.path, distance
+    )
 
 
 def _why_nothing(result: Segmentation, scene: LabelledScene) -> str | None:

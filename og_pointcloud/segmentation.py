@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +31,8 @@ class Segmentation:
     scores: (N,) float32, cosine of the label's text and the instance's descriptor, 0 where unknown.
     instances: (N,) int32, the scene's instance id, -1 background, -2 unobserved, -3 too far from the scene.
     names: the labels asked for. scene: the .ogpc file that answered, None for one in memory.
+    distance: (N,) int8, 0 on the scene's surface, 1 near it, 2 too far from it; between 0 and 1 to about a point
+        spacing, as one table cell speaks for all points in it.
     """
 
     xyz: NDArray[np.float64]
@@ -39,6 +41,11 @@ class Segmentation:
     instances: NDArray[np.int32]
     names: tuple[str, ...]
     scene: Path | None = None
+    distance: NDArray[np.int8] = field(default_factory=lambda: np.zeros(0, np.int8))
+
+    def __post_init__(self) -> None:
+        if len(self.distance) != len(self.labels):
+            raise OgPointcloudError(f"{len(self.labels)} labels and {len(self.distance)} distances differ in number")
 
     def __len__(self) -> int:
         return len(self.labels)

@@ -12,6 +12,7 @@ from og_pointcloud_export.query_head import build_query_head, reference_scores
 
 from og_pointcloud._onnxruntime import open_session
 from og_pointcloud.bundle import BEYOND, NEAR, ON_SURFACE
+from og_pointcloud.nearest import surface_distance
 
 CLOUDS = tough_clouds()
 OUTPUTS = ["label", "score", "instance", "distance", "certain", "instance_scores"]
@@ -140,9 +141,9 @@ def test_distance_is_surface_near_or_beyond():
     assert ((found["distance"] == BEYOND) == (found["instance"] == TOO_FAR)).all()
     assert ((found["distance"] == BEYOND) == (true > cloud.reach)).all()
     # Between the first two, a cell's centre speaks for the cell.
-    half_diagonal = cell * np.sqrt(3) / 2
-    assert (found["distance"][true <= cell - half_diagonal] == ON_SURFACE).all()
-    assert (found["distance"][(true > cell + half_diagonal) & (true <= cloud.reach)] == NEAR).all()
+    half_diagonal, surface = cell * np.sqrt(3) / 2, surface_distance(cloud.spacing, cloud.reach)
+    assert (found["distance"][true <= surface - half_diagonal] == ON_SURFACE).all()
+    assert (found["distance"][(true > surface + half_diagonal) & (true <= cloud.reach)] == NEAR).all()
     assert set(found["distance"].tolist()) == {ON_SURFACE, NEAR, BEYOND}
 
 

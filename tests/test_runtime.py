@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import sys
+import tracemalloc
 import types
 import warnings
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,13 +24,16 @@ from labelled_clouds import (
     tough_clouds,
     unit_rows,
 )
-from og_pointcloud_export import write_bundle
+from og_pointcloud_export import brick_grid, write_bundle
+from og_pointcloud_export.brick_grid import build_brick_grid
 from og_pointcloud_export.query_head import reference_scores
 
 import og_pointcloud as og
 from og_pointcloud import runtime
+from og_pointcloud.bundle import BEYOND, NEAR, ON_SURFACE
 from og_pointcloud.cloud import Vocabulary
 from og_pointcloud.errors import BundleError, FeatureSpaceError, MissingExtraError, OgPointcloudError, SceneError
+from og_pointcloud.nearest import surface_distance
 from og_pointcloud.segmentation import label_colors
 
 CLOUDS = tough_clouds()
@@ -459,6 +464,133 @@ def test_segmenter_answers_like_segment_and_warns_once(scene):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         ask(np.full((4, 3), 50.0))
+
+
+# Poses, crops, densities, noise, streams
+
+POSE = np.array([[0, -1, 0, 250.5], [1, 0, 0, -3.25], [0, 0, 1, 1e6], [0, 0, 0, 1]])
+
+
+def same(ours, theirs):
+    return all((getattr(ours, key) == getattr(theirs, key)).all() for key in ("labels", "scores", "instances"))
+
+
+def test_a_pose_takes_the_cloud_to_the_scenes_world(scene):
+    world = queries(scene.cloud, 200)[:600].astype(np.float64)
+    sensor = (world - POSE[:3, 3]) @ POSE[:3, :3]
+    result = og.segment(sensor, ["apple", "pear"], scene, pose=POSE)
+    assert np.abs(result.xyz - world).max() < 1e-9
+    assert same(result, og.segment(result.xyz, ["apple", "pear"], scene))
+    assert same(result, og.Segmenter(scene, ["apple", "pear"])(sensor, POSE.tolist()))
+    assert same(og.segment(scene, ["apple"], pose=np.eye(4)), og.segment(scene.xyz, ["apple"], scene))
+    shifted = runtime._as_scene(replace(scene.cloud, origin=np.array([1e6, -2e6, 5e5])))
+    moved = np.eye(4)
+    moved[:3, 3] = shifted.cloud.origin
+    assert same(og.segment(world, ["apple"], shifted, pose=moved), og.segment(world, ["apple"], scene))
+
+
+@pytest.mark.parametrize(
+    ("pose", "says"),
+    [
+        (np.eye(3), r"pose is float64 \(3, 3\)"),
+        (np.full((4, 4), np.nan), "finite 4x4"),
+        (POSE.T, "expected 0 0 0 1"),
+        (np.eye(4, dtype=complex), "complex128"),
+    ],
+)
+def test_poses_that_are_none(scene, pose, says):
+    with pytest.raises(SceneError, match=says):
+        og.segment(np.zeros((1, 3)), ["apple"], scene, pose=pose)
+
+
+def test_rows_that_are_not_finite_are_beyond_and_harm_no_other(scene):
+    points = scene.xyz[:60].copy()
+    clean = og.segment(points, ["apple", "pear"], scene)
+    bad = np.repeat(points, 2, axis=0)
+    bad[1::2] = [[np.nan, 0, 0], [0, np.inf, 0], [0, 0, -np.inf], [1e300, 0, 0], [np.nan, np.inf, -np.inf]] * 12
+    for pose in (None, np.eye(4)):
+        result = og.segment(bad, ["apple", "pear"], scene, pose=pose)
+        assert (result.labels[::2] == clean.labels).all()
+        assert (result.labels[1::2] == -1).all()
+        assert (result.instances[1::2] == TOO_FAR).all()
+        assert (result.distance[1::2] == BEYOND).all()
+
+
+def test_a_crop_a_shuffle_and_another_density_answer_point_by_point(scene):
+    points = queries(scene.cloud, 300).astype(np.float64)
+    whole = scene.instances_at(points)
+    order = np.random.default_rng(0).permutation(len(points))
+    assert (scene.instances_at(points[order]) == whole[order]).all()
+    assert (scene.instances_at(points[::7]) == whole[::7]).all()
+    assert [int(scene.instances_at(point[None])[0]) for point in points[:20]] == whole[:20].tolist()
+    assert (scene.instances_at(np.repeat(points, 3, axis=0)) == np.repeat(whole, 3)).all()
+
+
+def test_noise_below_the_gap_between_objects_changes_no_label():
+    random = np.random.default_rng(0)
+    xyz = random.random((4000, 3)) * [1, 1, 0.01]
+    xyz[:, 0] += np.where(xyz[:, 0] > 0.5, 0.2, 0)  # a gap of ten spacings
+    scene = runtime._as_scene(make_cloud(xyz, xyz[:, 0] > 0.6, 0.02, 0.08))
+    noisy = xyz + random.uniform(-0.04, 0.04, xyz.shape)
+    assert (scene.instances_at(noisy) == (noisy[:, 0] > 0.6)).all()
+
+
+def test_a_shorter_reach_is_exact(scene):
+    points = queries(scene.cloud, 200).astype(np.float64)
+    words = ["apple", "pear"]
+    true = np.sqrt(((points.astype(np.float32)[:, None].astype(np.float64) - scene.cloud.xyz) ** 2).sum(2)).min(1)
+    for limit in (0.01, 0.05, 0.12):
+        result = og.segment(points, words, scene, max_distance=limit)
+        assert ((result.instances == TOO_FAR) == (true > limit)).all()
+        assert (result.instances == scene.instances_at(points))[true <= limit].all()
+    for limit in (0, -1, 0.16, float("nan")):
+        with pytest.raises(OgPointcloudError, match=r"max_distance is .*reach, 0.15"):
+            og.segment(points, words, scene, max_distance=limit)
+
+
+@pytest.mark.parametrize("name", ["room", "far outliers", "coincident points of different ids", "scattered points"])
+def test_distance_of_points_the_table_leaves_open_and_of_the_others(monkeypatch, name):
+    monkeypatch.setattr(brick_grid, "LISTS_AT_LEAST", 50)
+    monkeypatch.setattr(brick_grid, "LISTS_PER_POINT", 0)
+    cloud = replace(CLOUDS[name])
+    scene = runtime._as_scene(cloud)
+    points = queries(cloud, 150)
+    instances, distance = scene.look_up(points.astype(np.float64) + cloud.origin)
+    assert (instances == instances_plainly(cloud, points)).all()
+    assert ((distance == BEYOND) == (instances == TOO_FAR)).all()
+    true = np.sqrt(((points.astype(np.float64)[:, None] - cloud.xyz) ** 2).sum(2)).min(1)
+    surface, cell = surface_distance(cloud.spacing, cloud.reach), float(build_brick_grid(cloud).cell_size)
+    assert (distance[true < surface - cell] == ON_SURFACE).all()
+    assert (distance[(true > surface + cell) & (true <= cloud.reach)] == NEAR).all()
+
+
+def test_threads_share_a_segmenter(scene):
+    ask = og.Segmenter(scene, ["apple", "pear"])
+    frames = [queries(scene.cloud, 200, seed).astype(np.float64) for seed in range(8)]
+    alone = [ask(frame) for frame in frames]
+    with ThreadPoolExecutor(4) as pool:
+        together = list(pool.map(ask, frames * 5))
+    assert all(same(result, alone[index % 8]) for index, result in enumerate(together))
+
+
+def test_a_thousand_frames_leave_nothing_behind(scene):
+    ask = og.Segmenter(scene, ["apple", "pear"])
+    random = np.random.default_rng(0)
+    frames = scene.xyz[random.integers(0, len(scene.xyz), 3000)] + random.normal(size=(3000, 3)) * 0.02
+    for warm_up in range(100):
+        ask(frames[: 100 + 7 * warm_up])
+
+    def resident():
+        return int(Path("/proc/self/statm").read_text().split()[1]) * 4096
+
+    tracemalloc.start()
+    native, (python, _) = resident() if Path("/proc").is_dir() else 0, tracemalloc.get_traced_memory()
+    for frame in range(1000):
+        ask(frames[: 100 + frame % 700])  # sizes that change, as a sensor's do
+    grown = tracemalloc.get_traced_memory()[0] - python
+    tracemalloc.stop()
+    assert grown < 50_000
+    assert not native or resident() - native < 20e6
 
 
 def test_ten_thousand_labels(scene):

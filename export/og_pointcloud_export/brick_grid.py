@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from og_pointcloud.cloud import UNOBSERVED, LabelledCloud
 from og_pointcloud.errors import MissingExtraError
-from og_pointcloud.nearest import VoxelBuckets
+from og_pointcloud.nearest import VoxelBuckets, surface_distance
 
 try:
     from numba import njit, prange
@@ -74,7 +74,7 @@ class GridSettings:
 class BrickGrid:
     """Cell (i, j, k) covers low + (i, j, k) * cell_size and one cell_size more, in the local frame.
 
-    low: (3,) float32. cell_size: float32, also the distance up to which a query counts as on the surface.
+    low: (3,) float32. cell_size: float32.
     bricks: (bx, by, bz) unsigned, rows of ``cells``; its outermost layer stands for everything beyond the grid.
     cells: (rows, 64) unsigned, C order within the brick. A value below ``codes`` is a certain answer; one below
         ``2 codes`` is open, and ``value - codes`` the answer at the centre; of any other, ``value - 2 codes`` plus the
@@ -280,8 +280,8 @@ def _settle_open_cells(
 class _Boxes:
     """Finds the answers of boxes in one cloud.
 
-    cell_size: edge of the largest box, and of the voxels that points are sorted into; a query so near to a point is on
-    the surface. rounding: length by which every box is inflated on all sides.
+    cell_size: edge of the largest box, and of the voxels that points are sorted into. rounding: length by which every
+    box is inflated on all sides.
     """
 
     def __init__(self, cloud: LabelledCloud, cell_size: float, rounding: float, codes: int) -> None:
@@ -289,7 +289,8 @@ class _Boxes:
         self._rounding = rounding
         # Points farther than this from a box's centre are out of reach of all of it.
         search = cloud.reach + np.sqrt(3) * (cell_size / 2 + rounding)
-        self._limits = (float(cloud.reach), float(search), float(cell_size))
+        surface = surface_distance(cloud.spacing, cloud.reach)
+        self._limits = (float(cloud.reach), float(search), float(surface))
         steps = int(np.ceil(search / cell_size))
         columns = product(range(-steps, steps + 1), repeat=2)
         self._columns = np.array(sorted(columns, key=lambda step: step[0] ** 2 + step[1] ** 2))

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from og_pointcloud.bundle import BEYOND, NEAR, NO_EVIDENCE, ON_SURFACE
 from og_pointcloud.cloud import InstanceTable, LabelledCloud
 from og_pointcloud.errors import MissingExtraError
+from og_pointcloud.nearest import surface_distance
 from og_pointcloud_export.brick_grid import BRICK, CODE_OFFSET, LONGEST_LIST, PARTS, TOO_FAR_CODE, BrickGrid
 
 try:
@@ -308,7 +309,7 @@ def _lookup_constants(cloud: LabelledCloud, grid: BrickGrid) -> dict[str, Any]:
         "short_length": np.int32(SHORT_LIST),
         "long_steps": np.arange(LONGEST_LIST, dtype=np.int32)[None],
         "reach_squared": np.float64(cloud.reach) ** 2,
-        "surface_squared": np.float64(grid.cell_size) ** 2,
+        "surface_squared": np.float64(surface_distance(cloud.spacing, cloud.reach)) ** 2,
         "near_codes": np.int32(near_codes),
         "too_far": np.int32(TOO_FAR_CODE),
         "value_instance": (code_answer - CODE_OFFSET).astype(np.int32),
