@@ -61,9 +61,12 @@ def _shown_of_instance(
 ) -> NDArray[np.float64]:
     """(masks,) float64: pixels of blending weight that each mask puts on the points of its own instance."""
     weights: csr_array = table.weights
-    mask = np.repeat(np.arange(weights.shape[0]), np.diff(weights.indptr))
-    own = (group[mask] >= 0) & (instance_ids[weights.indices] == group[mask])
-    return np.bincount(mask[own], weights.data[own], weights.shape[0]).astype(np.float64)
+    shown = np.zeros(weights.shape[0])
+    for mask in np.flatnonzero(group >= 0):  # one by one: the table may be larger than memory
+        part = slice(weights.indptr[mask], weights.indptr[mask + 1])
+        own = instance_ids[weights.indices[part]] == group[mask]
+        shown[mask] = weights.data[part][own].sum(dtype=np.float64)
+    return shown
 
 
 def directions(rows: NDArray[np.floating]) -> NDArray[np.float64]:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
+from numba import get_num_threads
 from numpy.typing import NDArray
 
 from og_pointcloud.cloud import BACKGROUND, UNOBSERVED, LabelledCloud
@@ -21,20 +24,29 @@ from og_pointcloud.geometry import (
 )
 from og_pointcloud.journal import Journal
 from og_pointcloud.membership import without_see_through
+from og_pointcloud.memory import free_memory, memory_in_use
 from og_pointcloud.modes import Labelling, Prepared, as_published, by_choice, by_features, by_grouping
 from og_pointcloud.scene import Points, Scene, View
 from og_pointcloud.settings import FitSettings, GeometrySettings
-from og_pointcloud.visibility import Gaussians, MaskTable, mask_table
+from og_pointcloud.table_store import TableStore, remove_work
+from og_pointcloud.visibility import Gaussians, MaskTable, mask_table, table_key, working_memory
 
 __all__ = ["Prepared", "fit", "prepare"]
 
 
 def fit(
-    scene: Scene, settings: FitSettings | None = None, *, progress: bool = True, prepared: Prepared | None = None
+    scene: Scene,
+    settings: FitSettings | None = None,
+    *,
+    progress: bool = True,
+    prepared: Prepared | None = None,
+    work: str | os.PathLike[str] | None = None,
 ) -> LabelledCloud:
     """Label a scene: which points form one instance, and what the encoder saw of each.
 
     prepared: what `prepare` made of the same scene and settings, where it is at hand already.
+    work: a folder in which the views of a long fit are kept, so that the next call goes on where this one was
+    interrupted or killed; its files are removed at the end. None: nothing is kept.
 
     Deterministic: the same scene and settings give the same ids on every run. Raises SceneError where the scene
     cannot give an instance at all (no masks, or no camera that sees the cloud).
@@ -42,11 +54,13 @@ def fit(
     settings = settings or FitSettings()
     journal = Journal(progress)
     _check(scene, journal)
-    prepared = prepared or prepare(scene, settings, journal)
+    prepared = prepared or prepare(scene, settings, journal, work)
     road = {"auto": by_choice, "grouping": by_grouping, "fast": by_features, "paper": as_published}[settings.mode]
     labelling = road(scene, prepared, settings, journal)
     _report(labelling, journal)
     typical = float(np.median(prepared.neighbourhood.spacing))
+    if work is not None:
+        remove_work(Path(work))
     return LabelledCloud(
         xyz=scene.points.xyz,
         origin=scene.points.origin,
@@ -60,10 +74,17 @@ def fit(
     )
 
 
-def prepare(scene: Scene, settings: FitSettings | None = None, journal: Journal | None = None) -> Prepared:
-    """The stages that every method shares: point spacing, Gaussians, and the mask table of all views."""
+def prepare(
+    scene: Scene,
+    settings: FitSettings | None = None,
+    journal: Journal | None = None,
+    work: str | os.PathLike[str] | None = None,
+) -> Prepared:
+    """The stages that every method shares: point spacing, Gaussians, and the mask table of all views. work: see `fit`;
+    its files hold the table that is returned, and stay."""
     settings = settings or FitSettings()
     journal = journal or Journal(progress=False)
+    memory = settings.memory or memory_in_use() + free_memory() // 2
     with journal.stage("spacing"):
         near = near_plane(scene.points.xyz, scene.views)
         around = neighbourhood(scene.points.xyz, settings.geometry)
@@ -73,7 +94,11 @@ def prepare(scene: Scene, settings: FitSettings | None = None, journal: Journal 
         stride = _stride(scene.points, around.spacing, scene.views, settings.geometry, journal)
         views = (thinned(view, stride) for view in journal.steps(scene.views, "visibility"))
         thickness = _surface_thickness(gaussians, around, settings.geometry)
-        table = mask_table(gaussians, views, near, thickness)
+        store, at_once = _store(scene, gaussians, near, thickness, memory, work, settings)
+        table = mask_table(gaussians, views, near, thickness, store, at_once)
+        journal.notes["table"] = {"entries": store.entries, "on_disk": store.on_disk, "views_side_by_side": at_once}
+        if store.resumed:
+            journal.leave_out(f"rendering of {store.resumed} views", f"an interrupted fit kept them in '{work}'")
         table = replace(table, mask_pixels=table.mask_pixels * stride**2)
     if table.exposure.nnz == 0:
         raise SceneError(
@@ -141,6 +166,27 @@ def _stride(
             f"points lie {apart:.1f} px apart: every {stride}th row and column",
         )
     return stride
+
+
+def _store(
+    scene: Scene,
+    gaussians: Gaussians,
+    near: float,
+    thickness: NDArray[np.float32],
+    memory: int,
+    work: str | os.PathLike[str] | None,
+    settings: FitSettings,
+) -> tuple[TableStore, int]:
+    """Where the table goes, and how many views are worked on side by side, so that neither outgrows its memory."""
+    left = max(0, memory - memory_in_use())
+    visibility = settings.visibility
+    largest = max((view.camera for view in scene.views), key=lambda camera: camera.width * camera.height)
+    one = working_memory(len(gaussians), largest)
+    at_once = int(np.clip(visibility.views_share * left // one, 1, min(get_num_threads(), len(scene.views))))
+    share = visibility.table_share * max(0, left - at_once * one)
+    folder = None if work is None else Path(work)
+    key = "" if folder is None else table_key(gaussians, near, thickness)
+    return TableStore(len(gaussians), share, folder, key, visibility.keep_after_s), at_once
 
 
 def _front_surfaces(

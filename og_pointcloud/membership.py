@@ -15,7 +15,10 @@ point adjoins surely labelled points of the same instance (hysteresis, as in Can
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from numba import njit, prange
@@ -26,11 +29,16 @@ from scipy.sparse.csgraph import connected_components
 from og_pointcloud.cloud import BACKGROUND, UNOBSERVED
 from og_pointcloud.geometry import Neighbourhood
 from og_pointcloud.grouping import MaskGroups
+from og_pointcloud.memory import in_file
 from og_pointcloud.settings import MembershipSettings
+from og_pointcloud.table_store import Rows
 from og_pointcloud.testimony import Testimony
 from og_pointcloud.visibility import Gaussians, MaskTable
 
 __all__ = ["Membership", "assign_points", "without_see_through"]
+
+ENTRIES_AT_ONCE = 1 << 26
+"""Entries of the testimony that are sorted by point at once: half a gigabyte."""
 
 
 @dataclass(frozen=True)
@@ -53,24 +61,23 @@ def assign_points(
     settings: MembershipSettings,
 ) -> Membership:
     """Decide the state of every point. Groups keep their numbers; a dismissed group ends with no point."""
-    by_point = _by_point(testimony.inside), _by_point(testimony.word)
     has_mask = np.zeros((groups.count, table.outside.shape[0]), np.bool_)
     grouped = groups.group >= 0
     has_mask[groups.group[grouped], table.mask_view[grouped]] = True
     every = np.ones(groups.count, np.bool_)
-    best, own, asked, total = _best_group(*by_point, groups.group, has_mask, every)
+    best, own, asked, total = _best_groups(testimony, groups.group, has_mask, every)
     share = own / np.maximum(asked, 1e-12)
 
     rate, dismissed = _contradicted(best, share, own, asked, total, groups.count, settings)
     if dismissed.any():
-        best, own, asked, total = _best_group(*by_point, groups.group, has_mask, ~dismissed)
+        best, own, asked, total = _best_groups(testimony, groups.group, has_mask, ~dismissed)
         share = own / np.maximum(asked, 1e-12)
 
     ids = np.where((best >= 0) & (share > settings.sure_share), best, BACKGROUND).astype(np.int32)
     possible = (best >= 0) & (share > settings.possible_share)
     ids = _grow(ids, best, possible, neighbourhood.index, neighbourhood.adjoining, settings.growth_votes)
     # Seen, but mostly inside masks: no background, however many instances claim it. Borders are settled below.
-    covered = np.bincount(testimony.inside.indices, testimony.inside.data, len(ids))
+    covered = _column_sums(testimony.inside.indices, testimony.inside.data, len(ids))
     ids = np.where((ids == BACKGROUND) & possible & (covered > settings.covered_share * total), best, ids)
     ids = _without_islands(ids, own_area(table, groups.group, ids), neighbourhood, settings.island_share)
     ids = _fill_unobserved(np.where((ids == BACKGROUND) & (total == 0), UNOBSERVED, ids), neighbourhood)
@@ -97,27 +104,51 @@ def without_see_through(
     depth_rows: (views, 4) float64, third row of each world-to-camera matrix. focal: (views,) pixels.
     Returns the table with those weights moved to ``outside``, and their share of all weight.
     """
-    witnesses = np.bincount(table.exposure.indices, minlength=table.exposure.shape[1])
-    weights = table.weights
-    row = np.repeat(np.arange(weights.shape[0]), np.diff(weights.indptr))
-    few = witnesses[weights.indices] < settings.few_views
-    if not few.any():
+    weights, exposure = table.weights, table.exposure
+    witnesses = np.zeros(exposure.shape[1], np.int32)
+    for view in range(exposure.shape[0]):
+        witnesses[exposure.indices[exposure.indptr[view] : exposure.indptr[view + 1]]] += 1
+    few = witnesses < settings.few_views
+    moved: dict[int, list[NDArray[np.intp]]] = {}
+    for mask, view in enumerate(table.mask_view.tolist()):
+        entries = np.arange(weights.indptr[mask], weights.indptr[mask + 1])
+        points = weights.indices[entries]
+        if few[points].any():
+            depth = gaussians.xyz[points] @ depth_rows[view, :3] + depth_rows[view, 3]
+            size = np.sqrt(table.mask_pixels[mask]) / focal[view]
+            behind = _behind_front(depth, weights.data[entries], settings.gap_sizes * size, settings.front_share)
+            moved.setdefault(view, []).append(entries[behind & few[points]])
+    by_view = {view: np.concatenate(entries) for view, entries in moved.items()}
+    if not any(len(entries) for entries in by_view.values()):
         return table, 0.0
-    view = table.mask_view[row]
-    depth = np.einsum("ij,ij->i", depth_rows[view, :3], gaussians.xyz[weights.indices]) + depth_rows[view, 3]
-    behind = np.zeros(len(row), bool)
-    for mask in range(weights.shape[0]):
-        part = slice(weights.indptr[mask], weights.indptr[mask + 1])
-        size = np.sqrt(table.mask_pixels[mask]) / focal[table.mask_view[mask]]
-        behind[part] = _behind_front(depth[part], weights.data[part], settings.gap_sizes * size, settings.front_share)
-    behind &= few
-    data = np.where(behind, 0, weights.data)
-    moved = csr_array((weights.data[behind], (view[behind], weights.indices[behind])), shape=table.outside.shape)
-    kept = csr_array((data, weights.indices.copy(), weights.indptr.copy()), shape=weights.shape)
-    kept.eliminate_zeros()
-    share = float(weights.data[behind].sum() / max(weights.data.sum(), 1e-12))
-    outside = csr_array(table.outside + moved)
-    return replace(table, weights=kept, outside=outside), share
+    taken = sum(float(weights.data[entries].sum(dtype=np.float64)) for entries in by_view.values())
+    share = taken / float(weights.data.sum(dtype=np.float64))
+    outside = _with_entries(table.outside, weights, by_view)
+    return replace(table, weights=_without_entries(weights, by_view.values()), outside=outside), share
+
+
+def _without_entries(matrix: csr_array, dropped: Iterable[NDArray[np.intp]]) -> csr_array:
+    """The matrix without some of its entries, given by their places."""
+    kept = np.ones(matrix.nnz, np.bool_)
+    for entries in dropped:
+        kept[entries] = False
+    rows = Rows(on_disk=in_file(matrix.data))
+    for begin, end in pairwise(matrix.indptr.tolist()):
+        chosen = kept[begin:end]
+        rows.append([np.count_nonzero(chosen)], matrix.indices[begin:end][chosen], matrix.data[begin:end][chosen])
+    return rows.matrix(matrix.shape[1])
+
+
+def _with_entries(matrix: csr_array, source: csr_array, added: Mapping[int, NDArray[np.intp]]) -> csr_array:
+    """The matrix with entries of another added to its rows: row -> their places in the other."""
+    rows = Rows(on_disk=in_file(matrix.data))
+    for row in range(matrix.shape[0]):
+        own = matrix[[row]]
+        if row in added:
+            data, indices = source.data[added[row]], source.indices[added[row]]
+            own = csr_array(own + csr_array((data, indices, [0, len(data)]), shape=own.shape))
+        rows.append([own.nnz], own.indices, own.data)
+    return rows.matrix(matrix.shape[1])
 
 
 def _behind_front(
@@ -139,9 +170,44 @@ def _behind_front(
     return behind
 
 
-def _by_point(matrix: csr_array) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float32]]:
-    columns = matrix.tocsc()
-    return columns.indptr.astype(np.int64), columns.indices.astype(np.int32), columns.data.astype(np.float32)
+def _best_groups(
+    testimony: Testimony, group: NDArray[np.int32], has_mask: NDArray[np.bool_], allowed: NDArray[np.bool_]
+) -> tuple[NDArray[Any], ...]:
+    """`_best_group` of all points, so many at a time that what is said of them, sorted by point, fits into memory."""
+    inside, word = testimony.inside, testimony.word
+    n = inside.shape[1]
+    runs = 1 + (inside.nnz + word.nnz) // ENTRIES_AT_ONCE
+    found = []
+    for run in range(runs):
+        low, high = n * run // runs, n * (run + 1) // runs
+        found.append(_best_group(_by_point(inside, low, high), _by_point(word, low, high), group, has_mask, allowed))
+    return tuple(np.concatenate(parts) for parts in zip(*found, strict=True))
+
+
+def _by_point(
+    matrix: csr_array, low: int = 0, high: int | None = None
+) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float32]]:
+    """Columns low to high of a matrix: (start, rows, data), rows ascending."""
+    high = matrix.shape[1] if high is None else high
+    return _columns(matrix.indptr, matrix.indices, matrix.data, low, high)
+
+
+@njit(cache=True)
+def _columns(indptr, indices, data, low, high):  # noqa: ANN001, ANN202
+    start = np.zeros(high - low + 1, np.int64)
+    for e in range(len(indices)):
+        if low <= indices[e] < high:
+            start[indices[e] - low + 1] += 1
+    start = np.cumsum(start)
+    place = start[:-1].copy()
+    rows, values = np.empty(start[-1], np.int32), np.empty(start[-1], np.float32)
+    for row in range(len(indptr) - 1):
+        for e in range(indptr[row], indptr[row + 1]):
+            if low <= indices[e] < high:
+                p = place[indices[e] - low]
+                rows[p], values[p] = row, data[e]
+                place[indices[e] - low] = p + 1
+    return start, rows, values
 
 
 @njit(cache=True, parallel=True)
@@ -260,9 +326,25 @@ def _settle_borders(ids, share, neighbours, adjoining, low, high, own_vote):  # 
 def own_area(table: MaskTable, group: NDArray[np.int32], ids: NDArray[np.int32]) -> NDArray[np.float64]:
     """(n,) float64: pixels of blending weight that the masks of each point's own instance put on it."""
     weights = table.weights
-    mask = np.repeat(np.arange(weights.shape[0]), np.diff(weights.indptr))
-    own = (group[mask] >= 0) & (group[mask] == ids[weights.indices])
-    return np.bincount(weights.indices[own], weights.data[own], len(ids)).astype(np.float64)
+    area = np.zeros(len(ids))
+    _add_own(weights.indptr, weights.indices, weights.data, group, ids, area)
+    return area
+
+
+@njit(cache=True)
+def _add_own(indptr, indices, data, group, ids, area):  # noqa: ANN001, ANN202
+    for row in range(len(indptr) - 1):
+        for e in range(indptr[row] if group[row] >= 0 else indptr[row + 1], indptr[row + 1]):
+            if ids[indices[e]] == group[row]:
+                area[indices[e]] += data[e]
+
+
+@njit(cache=True)
+def _column_sums(indices, data, n):  # noqa: ANN001, ANN202
+    total = np.zeros(n)
+    for e in range(len(indices)):
+        total[indices[e]] += data[e]
+    return total
 
 
 def _without_islands(

@@ -328,6 +328,10 @@ class FitSettings:
     matching: MatchingSettings = field(default_factory=MatchingSettings)
     paper: PaperSettings = field(default_factory=PaperSettings)
 
+    def __post_init__(self) -> None:
+        if self.memory is not None and not self.memory > 0:
+            raise OgPointcloudError(f"memory is {self.memory} bytes; expected more than 0, or None")
+
 
 @dataclass(frozen=True)
 class ChoosingSettings:

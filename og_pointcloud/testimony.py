@@ -18,6 +18,7 @@ import numpy as np
 from numba import njit
 from scipy.sparse import csr_array
 
+from og_pointcloud.memory import scratch_like
 from og_pointcloud.visibility import MaskTable
 
 __all__ = ["Testimony", "hear_views"]
@@ -37,35 +38,40 @@ class Testimony:
 
 def hear_views(table: MaskTable) -> Testimony:
     """The testimony of all views of a table."""
-    weights, outside, exposure = (_sorted(matrix) for matrix in (table.weights, table.outside, table.exposure))
-    best = np.zeros(exposure.shape[1], np.float32)
-    np.maximum.at(best, exposure.indices, exposure.data)
-    word = (exposure.data / best[exposure.indices]) ** OPENNESS_POWER
+    weights, outside, exposure = table.weights, table.outside, table.exposure
+    word, inside = scratch_like(exposure.data, np.float32), scratch_like(weights.data, np.float32)
+    _relative(exposure.indices, exposure.data, exposure.shape[1], word)
     first_mask = np.searchsorted(table.mask_view, np.arange(exposure.shape[0] + 1))
-    inside = _parts(
+    _parts(
         first_mask,
         (weights.indptr, weights.indices, weights.data),
         (outside.indptr, outside.indices, outside.data),
         (exposure.indptr, exposure.indices, word),
         exposure.shape[1],
+        inside,
     )
     return Testimony(
         csr_array((inside, weights.indices, weights.indptr), shape=weights.shape),
-        csr_array((word.astype(np.float32), exposure.indices, exposure.indptr), shape=exposure.shape),
+        csr_array((word, exposure.indices, exposure.indptr), shape=exposure.shape),
     )
 
 
-def _sorted(matrix: csr_array) -> csr_array:
-    return csr_array((matrix.data, matrix.indices.astype(np.int32), matrix.indptr.astype(np.int64)), shape=matrix.shape)
+@njit(cache=True)
+def _relative(index, exposure, n, word):  # noqa: ANN001, ANN202
+    """Write to ``word`` each exposure as a part of the point's best one, to the power above."""
+    best = np.zeros(n, np.float32)
+    for e in range(len(index)):
+        best[index[e]] = max(best[index[e]], exposure[e])
+    for e in range(len(index)):
+        word[e] = (exposure[e] / best[index[e]]) ** OPENNESS_POWER
 
 
 @njit(cache=True)
-def _parts(first_mask, weights, outside, word, n):  # noqa: ANN001, ANN202
-    """Each mask weight as a part of what its view shows of the point, times the view's word of it."""
+def _parts(first_mask, weights, outside, word, n, inside):  # noqa: ANN001, ANN202
+    """Write to ``inside`` each mask weight as a part of what its view shows of the point, times the view's word."""
     weight_start, weight_index, weight = weights
     outside_start, outside_index, out = outside
     word_start, word_index, said = word
-    inside = np.empty(len(weight), np.float32)
     seen = np.zeros(n)
     factor = np.zeros(n)
     for view in range(len(first_mask) - 1):
@@ -80,4 +86,3 @@ def _parts(first_mask, weights, outside, word, n):  # noqa: ANN001, ANN202
             seen[g] = 0.0
         for e in range(first, last):
             inside[e] = weight[e] * factor[weight_index[e]]
-    return inside

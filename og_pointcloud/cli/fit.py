@@ -40,6 +40,14 @@ def add(commands: Any) -> None:
         help="text features whose names can then be asked (default: the capture's text_features.npz)",
     )  # fmt: skip
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="of everything random (default: %(default)s)")
+    parser.add_argument(
+        "--memory", type=memory, metavar="4GB",
+        help="what the fit may hold in memory; a larger table goes to disk (default: half of what is free)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--work", type=Path, metavar="DIR",
+        help="where the views of a long fit are kept until it ends, for a start after a kill (default: S.ogpc.work)",
+    )  # fmt: skip
     parser.add_argument("--ply", type=Path, metavar="F.ply", help="also write the labelled cloud for other tools")
     parser.add_argument("--json", type=Path, metavar="F.json", help="also write timings and settings of this run")
 
@@ -58,12 +66,19 @@ def run(arguments: argparse.Namespace) -> None:
 
     from og_pointcloud.fit import fit
     from og_pointcloud.formats.capture import read_capture
+    from og_pointcloud.table_store import kept_views
 
     stages: list[dict[str, Any]] = []
     with timed(stages, "read capture"):
         scene = read_capture(arguments.capture, gaussians=arguments.gaussians, mask_level=arguments.mask_level)
         vocabulary, left_out = vocabulary_for(scene, arguments)
-    cloud = fit(scene, settings, progress=sys.stderr.isatty())
+    work = arguments.work or arguments.output.with_name(f"{arguments.output.name}.work")
+    try:
+        cloud = fit(scene, settings, progress=sys.stderr.isatty(), work=work)
+    except KeyboardInterrupt:
+        if views := kept_views(work):
+            print(f"{views} views are kept in '{work}': the same command goes on behind them", file=sys.stderr)
+        raise
     stages += cloud.provenance["stages"]
     provenance = {**cloud.provenance, "stages": stages, "left_out": [*cloud.provenance["left_out"], *left_out]}
     cloud = replace(cloud, vocabulary=vocabulary, provenance=provenance)
@@ -80,7 +95,7 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def fit_settings(arguments: argparse.Namespace) -> FitSettings:
-    settings = FitSettings(mode=arguments.mode, seed=arguments.seed)
+    settings = FitSettings(mode=arguments.mode, seed=arguments.seed, memory=arguments.memory)
     if arguments.schedule_share is None:
         return settings
     if arguments.mode != "paper":
@@ -89,6 +104,15 @@ def fit_settings(arguments: argparse.Namespace) -> FitSettings:
             "expected --mode paper: leave the option out, or take that mode"
         )
     return replace(settings, paper=PaperSettings(schedule_share=arguments.schedule_share))
+
+
+def memory(text: str) -> int:
+    from og_pointcloud.memory import parse_memory
+
+    try:
+        return parse_memory(text)
+    except OgPointcloudError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
 
 
 def vocabulary_for(scene: Scene, arguments: argparse.Namespace) -> tuple[Vocabulary | None, list[dict[str, str]]]:
