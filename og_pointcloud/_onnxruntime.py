@@ -19,5 +19,4 @@ def open_session(model: bytes) -> onnxruntime.InferenceSession:
     options = onnxruntime.SessionOptions()
     options.log_severity_level = ERRORS_ONLY
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-    options.enable_mem_pattern = False  # it keeps a plan for every number of points ever asked about
     return onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])

@@ -2,13 +2,25 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import onnx
 import pytest
-from labelled_clouds import TOO_FAR, WIDTH, instance_table, instances_plainly, make_cloud, queries, room, tough_clouds
+from labelled_clouds import (
+    TOO_FAR,
+    WIDTH,
+    instance_table,
+    instances_plainly,
+    make_cloud,
+    queries,
+    room,
+    tough_clouds,
+    unit_rows,
+)
 from og_pointcloud_export import brick_grid, writer
 from og_pointcloud_export.brick_grid import GridSettings, build_brick_grid
-from og_pointcloud_export.query_head import build_query_head, reference_scores
+from og_pointcloud_export.query_head import ScoreHead, build_query_head, reference_scores
 
 from og_pointcloud._onnxruntime import open_session
 from og_pointcloud.bundle import BEYOND, NEAR, ON_SURFACE
@@ -18,8 +30,8 @@ CLOUDS = tough_clouds()
 OUTPUTS = ["label", "score", "instance", "distance", "certain", "instance_scores"]
 
 
-def run(cloud, points, text, settings=None):
-    session = open_session(build_query_head(cloud, build_brick_grid(cloud, settings)))
+def run(cloud, points, text, settings=None, head=None):
+    session = open_session(build_query_head(cloud, build_brick_grid(cloud, settings), head))
     feed = {"points": np.asarray(points, np.float32).reshape(-1, 3), "text": np.asarray(text, np.float32)}
     return dict(zip(OUTPUTS, session.run(OUTPUTS, feed), strict=True))
 
@@ -179,6 +191,72 @@ def test_odd_text_vectors():
     assert found["instance_scores"][0, [0, 2, 3]] == pytest.approx([0, 1, -1], abs=1e-6)
     assert np.isfinite(found["instance_scores"]).all()
     assert found["label"].tolist() == [2]
+
+
+AWKWARD_TEXT = np.concatenate(
+    [
+        unit_rows(20),
+        unit_rows(4) * 1e30,
+        unit_rows(4) * 1e-30,
+        np.eye(WIDTH)[:3] * -7,
+        instance_table(5).descriptors,
+        -instance_table(5).descriptors,
+        np.full((1, WIDTH), 3e38),
+    ]
+).astype(np.float32)
+
+
+def test_torch_onnxruntime_and_numpy_agree():
+    torch = pytest.importorskip("torch")
+    cloud = make_cloud(np.zeros((1, 3)), [0], instances=instance_table(5, [0, 0, 1, 2, 4]))
+    table = cloud.instances
+    text = torch.nn.functional.normalize(torch.from_numpy(AWKWARD_TEXT).double(), dim=1, eps=1e-300)
+    cosine = torch.from_numpy(table.descriptors).double() @ text.T
+    by_torch = torch.full((5, len(text)), -2.0, dtype=torch.float64)
+    owner = torch.from_numpy(table.descriptor_instance).long()[:, None].expand_as(cosine)
+    by_torch = by_torch.scatter_reduce(0, owner, cosine, "amax").numpy()
+    by_onnxruntime = run(cloud, [[0, 0, 0]], AWKWARD_TEXT)["instance_scores"]
+    assert np.abs(by_onnxruntime - by_torch).max() < 1e-5
+    assert np.abs(reference_scores(table, AWKWARD_TEXT) - by_torch).max() < 1e-5
+
+
+@pytest.mark.parametrize(
+    ("head", "error"),
+    [
+        (ScoreHead(precision="float16"), 1e-3),
+        (ScoreHead(precision="int8"), 2e-2),
+        (ScoreHead(width=9), 1e-6),  # as many as descriptors: nothing is lost
+        (ScoreHead(width=WIDTH), 1e-6),
+        (ScoreHead(width=5), 1.0),
+        (ScoreHead(width=9, precision="int8"), 3e-2),
+    ],
+)
+def test_smaller_tables_cost_what_they_should(head, error):
+    cloud = CLOUDS["room"]
+    found = run(cloud, [[0, 0, 0]], AWKWARD_TEXT, head=head)["instance_scores"]
+    worst = np.abs(found - reference_scores(cloud.instances, AWKWARD_TEXT)).max()
+    assert worst < error
+    assert worst > error / 1e3 or error < 1e-5
+
+
+@pytest.mark.parametrize("width", [None, 9])
+def test_centred_scores_are_cosines_of_what_differs(width):
+    cloud = CLOUDS["room"]
+    text = unit_rows(30, seed=4)
+    found = run(cloud, [[0, 0, 0]], text, head=ScoreHead(width, centred=True))["instance_scores"]
+    center = cloud.instances.descriptors.astype(np.float64).mean(axis=0)
+    moved = cloud.instances.descriptors - center
+    moved = replace(cloud.instances, descriptors=(moved / np.linalg.norm(moved, axis=1, keepdims=True)).astype("f4"))
+    assert np.abs(found - reference_scores(moved, text - center)).max() < 2e-6
+
+
+@pytest.mark.parametrize("head", [ScoreHead(8, True, "int8"), ScoreHead(3), ScoreHead(None, True, "float16")])
+def test_smaller_tables_of_nothing(head):
+    for name in ("no instance, no words, no width", "instances without any descriptor"):
+        cloud = CLOUDS[name]
+        found = run(cloud, cloud.xyz[:3], texts(cloud), head=head)
+        assert (found["label"] == -1).all()
+        assert (found["instance_scores"] == -2).all()
 
 
 def test_an_instance_answers_with_its_best_descriptor():

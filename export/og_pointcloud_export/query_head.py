@@ -15,7 +15,8 @@ Any of N, L and K may be 0.
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,7 +33,7 @@ try:
 except ImportError as error:
     raise MissingExtraError("onnx", "fit") from error
 
-__all__ = ["OPSET", "build_query_head", "reference_scores"]
+__all__ = ["OPSET", "ScoreHead", "build_query_head", "reference_scores"]
 
 OPSET, IR_VERSION = 18, 8
 """The oldest that has everything needed (ScatterElements with max), so that onnxruntime 1.17 and later run it."""
@@ -40,13 +41,30 @@ SHORT_LIST = 8
 """So many candidates are compared for every point of an open part, LONGEST_LIST where its list is longer."""
 
 
-def build_query_head(cloud: LabelledCloud, grid: BrickGrid) -> bytes:
+@dataclass(frozen=True)
+class ScoreHead:
+    """How text meets the descriptors; the default changes nothing, the others trade error for size.
+
+    width: dimensions that text and descriptors are reduced to, those in which the descriptors differ most; with as many
+        as there are descriptors nothing is lost. None: all.
+    centred: the mean descriptor is taken off both first, a different cosine, which spreads scores wider.
+    precision: of the stored descriptors; int8 with a scale each.
+    """
+
+    width: int | None = None
+    centred: bool = False
+    precision: Literal["float32", "float16", "int8"] = "float32"
+
+
+def build_query_head(cloud: LabelledCloud, grid: BrickGrid, head: ScoreHead | None = None) -> bytes:
     """The serialised graph of a cloud; inputs and outputs are described above."""
-    nodes = [*_score_nodes(), *_lookup_nodes()]
-    constants = {**_score_constants(cloud.instances), **_lookup_constants(cloud, grid)}
+    head = head or ScoreHead()
+    nodes = [*_text_nodes(head), *_descriptor_nodes(head), *_score_nodes(), *_lookup_nodes()]
+    text_width = max(cloud.instances.descriptors.shape[1], 1)
+    constants = {**_score_constants(cloud.instances, head), **_lookup_constants(cloud, grid)}
     inputs = [
         helper.make_tensor_value_info("points", TensorProto.FLOAT, ["N", 3]),
-        helper.make_tensor_value_info("text", TensorProto.FLOAT, ["L", constants["descriptors"].shape[1]]),
+        helper.make_tensor_value_info("text", TensorProto.FLOAT, ["L", text_width]),
     ]
     outputs = [
         helper.make_tensor_value_info("label", TensorProto.INT32, ["N"]),
@@ -68,19 +86,47 @@ def _node(operator: str, inputs: str, output: str, **attributes: Any) -> onnx.No
     return helper.make_node(operator, inputs.split(), [output], name=output, **attributes)
 
 
-def _score_nodes() -> list[onnx.NodeProto]:
-    """text -> instance_scores, and the label and score of each answer code (too far, unobserved, background, 0..)."""
+def _text_nodes(head: ScoreHead) -> list[onnx.NodeProto]:
+    """text -> text_columns, what each descriptor is multiplied with."""
+    nodes, last = _unit_nodes("text"), "text_unit"
+    if head.centred:
+        nodes += [_node("Sub", f"{last} center", "text_centred"), *_unit_nodes("text_centred")]
+        last = "text_centred_unit"
+    if head.width is not None:
+        nodes += [_node("MatMul", f"{last} projection", "text_projected")]
+        last = "text_projected"
+    return [*nodes, _node("Transpose", last, "text_columns", perm=[1, 0])]
+
+
+def _unit_nodes(name: str) -> list[onnx.NodeProto]:
+    """Rows of unit length, in two steps so that neither tiny nor huge vectors leave float32."""
     return [
-        # Unit length, in two steps so that neither tiny nor huge vectors leave float32.
-        _node("Abs", "text", "text_magnitude"),
-        _node("ReduceMax", "text_magnitude last_axis", "text_largest"),
-        _node("Max", "text_largest smallest_normal", "text_scale"),
-        _node("Div", "text text_scale", "text_scaled"),
-        _node("ReduceL2", "text_scaled last_axis", "text_length"),
-        _node("Max", "text_length smallest_normal", "text_divisor"),
-        _node("Div", "text_scaled text_divisor", "text_unit"),
-        _node("Transpose", "text_unit", "text_columns", perm=[1, 0]),
-        _node("MatMul", "descriptors text_columns", "similarity"),
+        _node("Abs", name, f"{name}_magnitude"),
+        _node("ReduceMax", f"{name}_magnitude last_axis", f"{name}_largest"),
+        _node("Max", f"{name}_largest smallest_normal", f"{name}_scale"),
+        _node("Div", f"{name} {name}_scale", f"{name}_scaled"),
+        _node("ReduceL2", f"{name}_scaled last_axis", f"{name}_length"),
+        _node("Max", f"{name}_length smallest_normal", f"{name}_divisor"),
+        _node("Div", f"{name}_scaled {name}_divisor", f"{name}_unit"),
+    ]
+
+
+def _descriptor_nodes(head: ScoreHead) -> list[onnx.NodeProto]:
+    """descriptors -> table, in float32."""
+    if head.precision == "float32":
+        return [_node("Identity", "descriptors", "table")]
+    if head.precision == "float16":
+        return [_node("Cast", "descriptors", "table", to=TensorProto.FLOAT)]
+    return [
+        _node("Cast", "descriptors", "descriptor_steps", to=TensorProto.FLOAT),
+        _node("Mul", "descriptor_steps descriptor_scale", "table"),
+    ]
+
+
+def _score_nodes() -> list[onnx.NodeProto]:
+    """table -> instance_scores, and the label and score of each answer code (too far, unobserved, background, 0..)."""
+    return [
+        _node("MatMul", "table text_columns", "similarity"),
         # The best descriptor of each instance; codes without one stay at NO_EVIDENCE.
         _node("Shape", "text", "label_count", end=1),
         _node("Concat", "code_count label_count", "table_shape", axis=0),
@@ -100,13 +146,10 @@ def _score_nodes() -> list[onnx.NodeProto]:
     ]
 
 
-def _score_constants(instances: InstanceTable) -> dict[str, Any]:
+def _score_constants(instances: InstanceTable, head: ScoreHead) -> dict[str, Any]:
     codes = len(instances) + CODE_OFFSET
-    descriptors = instances.descriptors
-    if descriptors.shape[1] == 0:  # nothing was ever described: any one column will do
-        descriptors = np.zeros((0, 1), np.float32)
     return {
-        "descriptors": np.ascontiguousarray(descriptors, np.float32),
+        **_table_constants(instances.descriptors, head),
         "descriptor_code": (instances.descriptor_instance.astype(np.int64) + CODE_OFFSET)[:, None],
         "code_count": np.array([codes], np.int64),
         "no_evidence": np.array(NO_EVIDENCE, np.float32),
@@ -120,6 +163,27 @@ def _score_constants(instances: InstanceTable) -> dict[str, Any]:
         "zero_int32": np.int32(0),
         "one_int64": np.int64(1),
     }
+
+
+def _table_constants(descriptors: NDArray[np.float32], head: ScoreHead) -> dict[str, NDArray[Any]]:
+    if descriptors.shape[1] == 0:  # nothing was ever described: any one column will do
+        descriptors = np.zeros((0, 1), np.float32)
+    constants: dict[str, NDArray[Any]] = {}
+    table = descriptors.astype(np.float64)
+    if head.centred:
+        center = table.mean(axis=0) if len(table) else np.zeros(table.shape[1])
+        length = np.linalg.norm(table - center, axis=1, keepdims=True)
+        table = np.divide(table - center, length, out=np.zeros_like(table), where=length > 0)
+        constants["center"] = center.astype(np.float32)
+    if head.width is not None:
+        directions = np.linalg.svd(table, full_matrices=False)[2][: head.width]
+        table = table @ directions.T
+        constants["projection"] = np.ascontiguousarray(directions.T, np.float32)
+    if head.precision == "int8":
+        scale = np.maximum(np.abs(table).max(axis=1, keepdims=True, initial=0), np.finfo(np.float32).tiny) / 127
+        constants["descriptor_scale"] = scale.astype(np.float32)
+        table = np.round(table / scale)
+    return constants | {"descriptors": np.ascontiguousarray(table, head.precision)}
 
 
 def _lookup_nodes() -> list[onnx.NodeProto]:
