@@ -361,8 +361,11 @@ def test_int8_is_small_close_and_never_depends_on_what_it_runs_with(source, enco
     assert 0.99 < cosines.min() < 0.999999
     assert manifest["parity"]["int8"]["min_cosine"] >= 0.99
     assert manifest["files"]["text_encoder.onnx"]["bytes"] < len(build_text_graph(read_text_tower(source, "gelu"))) / 3
-    alone = [read_text_encoder(folder), TextEncoder({path.name: path.read_bytes() for path in folder.iterdir()}, "x")]
-    assert (alone[1].encode(TEXTS[2:3]) == small.encode(TEXTS)[2:3]).all()
+    alike = ["cat low", "low cat", "12", "lowlow", "cat cat"]
+    assert len({len(small.tokens(text)) for text in alike}) == 1
+    alone = TextEncoder({path.name: path.read_bytes() for path in folder.iterdir()}, "alone")
+    together = small.encode(alike)
+    assert all((alone.encode([text])[0] == vector).all() for text, vector in zip(alike, together, strict=True))
 
 
 def test_int8_that_turns_vectors_too_far(source, tmp_path, monkeypatch):
@@ -412,9 +415,6 @@ def test_names_are_put_into_templates_and_averaged(encoder):
     templates = ("a {}", "low {} cat")
     plain = encoder.encode(["a cat", "low cat cat"]).mean(axis=0)
     assert np.abs(encoder(["cat"], templates)[0] - plain / np.linalg.norm(plain)).max() < 1e-6
-    assert (encoder(["cat"]) == encoder.encode(["cat"])).all() or np.abs(
-        encoder(["cat"]) - encoder.encode(["cat"])
-    ).max() < 1e-6
     assert np.abs(encoder(["{0.__class__}"]) - encoder.encode(["{0.__class__}"])).max() < 1e-6
     assert encoder([]).shape == (0, OUT)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import zipfile
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -18,14 +19,13 @@ from og_pointcloud.cloud import Vocabulary
 from og_pointcloud.errors import BundleError, FeatureSpaceError, OgPointcloudError
 from og_pointcloud.text_encoder import encoder_for
 from og_pointcloud.vocabulary import add_words, best_cosines, carry_encoder, read_words
+from og_pointcloud.words import resolve_labels
 
 NEW = Vocabulary(("grape", "Größe 40"), 3 * unit_rows(2, seed=9))
 
 
 @pytest.fixture(scope="module")
 def without_words(tmp_path_factory):
-    from dataclasses import replace
-
     return write_bundle(replace(room(300), vocabulary=None), tmp_path_factory.mktemp("bundle") / "bare.ogpc")
 
 
@@ -188,6 +188,8 @@ def test_a_carried_encoder_answers_and_is_read_only_when_asked(
     assert bundle.cloud.vocabulary.names == WORDS
     assert encoder_for(SPACE, path).where == f"{path}: text_encoder"
     assert encoder_for(SPACE, path)(["cat"]).shape == (1, WIDTH)
+    asked = resolve_labels(["apple", "cat"], None, bundle.cloud.vocabulary, SPACE, path)
+    assert np.abs(asked.vectors[1] - encoder_for(SPACE, path)(["cat"])[0]).max() == 0
     assert add_words(path, NEW, SPACE).added == 2  # which keeps what is carried
     assert encoder_for(SPACE, path)(["cat"]).shape == (1, WIDTH)
     assert set(members_of(path)) - set(members_of(bundle_file)) == {
@@ -201,8 +203,6 @@ def test_the_writer_carries_an_encoder_too(encoder_folder, tmp_path, capsys):
     assert run("carry", path, encoder_folder, "-o", tmp_path / "t.ogpc") == 0
     assert "carries its text encoder (fp32" in capsys.readouterr().out
     assert (tmp_path / "t.ogpc").read_bytes() == path.read_bytes()
-    from dataclasses import replace
-
     with pytest.raises(FeatureSpaceError, match="encodes to feature space"):
         write_bundle(replace(room(100), feature_space="other"), tmp_path / "o.ogpc", text_encoder=encoder_folder)
     assert not (tmp_path / "o.ogpc").exists()
