@@ -26,7 +26,7 @@ WEIGHTS = 1e-6
 def needle(ratio: float) -> Answer:
     """One axis so many times as long as the others: a line across the image at 1e6."""
     gaussians = scatter()
-    return splatted(replace(gaussians, scale=single([0.02 * ratio, 0.02, 0.02]) * np.ones((10, 1), "f4")), camera())
+    return splatted(replace(gaussians, scale=single([0.1 * ratio, 0.1, 0.1]) * np.ones((10, 1), "f4")), camera())
 
 
 @agrees(WEIGHTS, "axis ratio", powers(0, 6))
@@ -56,10 +56,22 @@ def scale_zero() -> Answer:
 
 
 @agrees(WEIGHTS)
+def needles_across_tile_corners() -> Answer:
+    """Diagonal needles a pixel thin, so far from the corners of their tiles that the density there underflows."""
+    angle, steps = np.pi / 4, np.arange(-14, 15)
+    xyz = single(np.stack([steps / 24, steps / 24, np.full(29, 2.0)], axis=1))
+    rotation = np.tile(single([np.cos(angle / 2), 0, 0, -np.sin(angle / 2)]), (29, 1))
+    opacity = np.full(29, 0.5, np.float32)
+    gaussians = Gaussians(xyz, np.tile(single([2, 1e-6, 1e-6]), (29, 1)), rotation, opacity)
+    return splatted(gaussians, camera(32, 32, 24.0))
+
+
+@agrees(WEIGHTS)
 def opacity_ends() -> Answer:
-    """Opacity exactly 0 and 1, denormal, and just below 1."""
-    opacity = single([0, 1, 1e-40, 0.002, 1, 0.99999994, 0, 1, 0.5, 1])
-    return splatted(replace(scatter(), opacity=opacity), camera())
+    """Opacity exactly 0 and 1, the latter also in the middle of a pixel, denormal, and just below 1."""
+    gaussians = replace(scatter(), opacity=single([0, 1, 1e-40, 0.002, 1, 0.99999994, 0, 1, 0.5, 1]))
+    gaussians.xyz[1] = [0, 0, 1.5]
+    return splatted(gaussians, camera(25, 19))
 
 
 @agrees(WEIGHTS, "length of the quaternion", powers(-36, 36, 9))
