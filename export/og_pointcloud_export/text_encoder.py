@@ -230,7 +230,10 @@ def _choices_changed(before: NDArray[np.float64], after: NDArray[np.float64]) ->
 
 def _files(manifest: dict[str, Any], graph: bytes, tokenizer_json: bytes) -> dict[str, bytes]:
     held = {GRAPH: graph, TOKENIZER: tokenizer_json}
-    described = {name: {"bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()} for name, data in held.items()}
+    described = {
+        name: {"bytes": len(data), "crc32": zlib.crc32(data), "sha256": hashlib.sha256(data).hexdigest()}
+        for name, data in held.items()
+    }
     text = json.dumps({**manifest, "files": described}, indent=1, ensure_ascii=False)
     return {MANIFEST: text.encode(), **held}
 
