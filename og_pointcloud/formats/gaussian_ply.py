@@ -21,7 +21,14 @@ from og_pointcloud.formats.ply import join_columns, read_ply, write_ply
 from og_pointcloud.formats.tables import colors, naming, positions, stack_columns, storable_positions
 from og_pointcloud.scene import Points
 
-__all__ = ["gaussians_from_ply", "holds_gaussians", "latest_iteration", "read_gaussian_ply", "write_gaussian_ply"]
+__all__ = [
+    "gaussian_rows",
+    "gaussians_from_ply",
+    "holds_gaussians",
+    "latest_iteration",
+    "read_gaussian_ply",
+    "write_gaussian_ply",
+]
 
 SH_CONSTANT = 0.28209479177387814
 """The spherical harmonic of degree 0, 1 / (2 sqrt(pi)): colour = 0.5 + SH_CONSTANT * f_dc."""
@@ -59,6 +66,14 @@ def read_gaussian_ply(path: str | os.PathLike[str]) -> Points:
 def write_gaussian_ply(path: str | os.PathLike[str], points: Points) -> None:
     """Write Gaussians in the trained layout of degree 0 (no ``f_rest``), in world coordinates; atomic.
 
+    The rows are those of `gaussian_rows`, where what is not written exactly is told.
+    """
+    write_ply(path, {"vertex": gaussian_rows(points)})
+
+
+def gaussian_rows(points: Points) -> NDArray[np.void]:
+    """(n,) records in the trained layout of degree 0, world coordinates: what a 3DGS file holds of these Gaussians.
+
     Positions are float64 where float32 would lose more than 1e-6 of the extent. Scale 0 and opacities 0 and 1 become
     the nearest finite logarithm and logit, so that any reader survives them. Without rgb the splats are mid-grey.
     """
@@ -76,8 +91,7 @@ def write_gaussian_ply(path: str | os.PathLike[str], points: Points) -> None:
         LOG_SCALE: np.log(np.maximum(points.scale, smallest)),
         ROTATION: points.rotation,
     }
-    columns = {name: values[:, i] for names, values in groups.items() for i, name in enumerate(names)}
-    write_ply(path, {"vertex": join_columns(columns)})
+    return join_columns({name: values[:, i] for names, values in groups.items() for i, name in enumerate(names)})
 
 
 def holds_gaussians(elements: Elements) -> bool:

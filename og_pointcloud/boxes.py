@@ -1,0 +1,438 @@
+"""Boxes around points, axis-aligned and oriented, and which points are strays that no box should reach for. numpy only.
+
+The oriented box has nearly the least volume. A net of rotations, laid in the frame of the points' principal axes, gives
+starts; the best are refined by ever smaller nets and then, axis by axis, by rotating calipers (Toussaint, 1983), which
+lay a face flush with the points. The search looks at a few hundred extreme points; the box then holds all of them.
+
+Every result depends on the set of points alone: not on their order, nor on how often one is given. Work is done in
+float64 around the points' middle, so map coordinates of 1e6 cost nothing but their own rounding.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from og_pointcloud.errors import SceneError
+
+__all__ = ["Box", "axis_aligned_box", "main_part", "oriented_box", "quaternion_of", "typical_spacing"]
+
+DoubleArray = NDArray[np.float64]
+
+EXTREME_DIRECTIONS = 400
+"""Directions whose extreme points stand for the hull; up to that many points all take part."""
+START_ROTATIONS = 6000
+"""Rotations of the net over all of them; a box has 24 names, so about 250 differ, 13 degrees apart."""
+STARTS = 2
+"""Best of the net that are refined, beside the principal axes."""
+NET_ROTATIONS = 120
+FIRST_ANGLE = 0.12
+"""Radius in radians of the first refining net, half of what the starts lie apart."""
+SHRINK, ROUNDS = 0.6, 10
+THIN = 1e-6
+"""Thickness, as a share of the diagonal, that flat things are given while volumes are compared: 0 x 2 x 3 is less than
+0 x 4 x 5."""
+GAIN = 1e-9
+"""Relative gain below which a turned box is not better."""
+CORRECTIONS = 4
+TURNS = 24
+"""Calipers at most per start: from an odd start the gains never end, though they soon no longer matter."""
+
+LINK = 2.0
+"""Edge in spacings of the voxels that connect an instance's points."""
+MAIN_PART = 0.05
+"""Share of the points that a connected part needs to be no stray."""
+MOST = 0.9
+"""Share of the points that main parts must hold, or the points are taken to be sparse and linked more widely."""
+SPACING_SAMPLE = 256
+
+
+@dataclass(frozen=True)
+class Box:
+    """center: (3,) float64. size: (3,) float64, full lengths along the rows of axes. axes: (3, 3) float64, unit rows,
+    right-handed. In the frame and unit of the points it was made from."""
+
+    center: DoubleArray
+    size: DoubleArray
+    axes: DoubleArray
+
+    @property
+    def volume(self) -> float:
+        """Product of the three lengths; 0 for flat things."""
+        return float(np.prod(self.size))
+
+    @cached_property
+    def corners(self) -> DoubleArray:
+        """(8, 3) float64; bit k of a corner's number says on which side of axis k it lies."""
+        sides = (np.arange(8)[:, None] >> np.arange(3) & 1) - 0.5
+        return self.center + (sides * self.size) @ self.axes
+
+    @property
+    def low(self) -> DoubleArray:
+        """(3,) smallest coordinates of the corners."""
+        return self.corners.min(axis=0)
+
+    @property
+    def high(self) -> DoubleArray:
+        """(3,) largest coordinates of the corners."""
+        return self.corners.max(axis=0)
+
+    @property
+    def rotation_wxyz(self) -> DoubleArray:
+        """(4,) unit quaternion, w >= 0, that turns the world's axes into the box's."""
+        return quaternion_of(self.axes.T)
+
+    def contains(self, points: ArrayLike, margin: float = 0.0) -> NDArray[np.bool_]:
+        """(n,) bool, whether each of (n, 3) points lies inside, or outside by no more than margin along every axis."""
+        from_center = np.asarray(points, np.float64) - self.center
+        return (np.abs(from_center @ self.axes.T) <= self.size / 2 + margin).all(axis=1)
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-able: center, size, axes, rotation_wxyz, volume."""
+        names = ("center", "size", "axes", "rotation_wxyz")
+        return {**{name: getattr(self, name).tolist() for name in names}, "volume": self.volume}
+
+
+def axis_aligned_box(points: ArrayLike) -> Box:
+    """The smallest box along the coordinate axes that holds all points (n, 3), n >= 1. SceneError as `oriented_box`."""
+    xyz = _checked(points)
+    low, high = xyz.min(axis=0), xyz.max(axis=0)
+    return Box(low + (high - low) / 2, high - low, np.eye(3))
+
+
+def oriented_box(points: ArrayLike, up: ArrayLike | None = None) -> Box:
+    """A box of nearly the least volume that holds all points (n, 3), n >= 1; axes by falling length.
+
+    Of flat points, nearly the least area; of points on a line, the line. up: (3,) direction that one axis has to have,
+    where it is known: the box then stands upright, is the least one that does, and this axis is its third.
+    SceneError for no points, for NaN or infinity, and for an up of length 0.
+    """
+    xyz, _ = _distinct(_checked(points))
+    middle = xyz.min(axis=0) + np.ptp(xyz, axis=0) / 2
+    local = xyz - middle
+    axes = _least_volume(local) if up is None else _upright(local, _unit(up))
+    along = local @ axes.T
+    low, high = along.min(axis=0), along.max(axis=0)
+    if up is None:
+        order = np.argsort(-(high - low), kind="stable")
+        axes, low, high = axes[order], low[order], high[order]
+    axes = _right_handed(axes, keep_third=up is not None)
+    center = (local @ axes.T).min(axis=0) + (high - low) / 2
+    return Box(middle + center @ axes, high - low, axes)
+
+
+def main_part(points: ArrayLike, spacing: float | None = None) -> NDArray[np.bool_]:
+    """(n,) bool, the points (n, 3) of an object that are not strays; at least nine tenths of them.
+
+    Points are linked through neighbouring voxels, and a connected part counts where it holds a twentieth of the points.
+    If such parts hold less than nine tenths, points lie wider apart than thought, and voxels twice as large are tried.
+    What floats alone is thus left out, and so is a speck of another object; fewer than 20 points all count.
+
+    spacing: typical distance between neighbouring points, None to measure it.
+    """
+    xyz = _checked(points)
+    distinct, which = _distinct(xyz)
+    if MAIN_PART * len(distinct) <= 1:
+        return np.ones(len(xyz), bool)
+    local = distinct - distinct.mean(axis=0)
+    # In the frame of the principal axes, so that a turned object loses the same points.
+    local = local @ _principal_axes(local).T
+    extent = float(np.ptp(local, axis=0).max())
+    edge = LINK * (typical_spacing(local) if spacing is None else spacing)
+    while edge < extent:
+        part = _connected(np.floor(local / max(edge, extent / (1 << 19))).astype(np.int64))
+        held = np.bincount(part)
+        main = (held > MAIN_PART * len(local))[part]
+        if main.mean() >= MOST:
+            return main[which]
+        edge *= 2
+    return np.ones(len(xyz), bool)
+
+
+def quaternion_of(rotation: DoubleArray) -> DoubleArray:
+    """(4,) unit quaternion wxyz, w >= 0, of a rotation matrix (3, 3) that turns column vectors."""
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = rotation
+    products = np.array(  # 4 q q'
+        [
+            [1 + xx + yy + zz, zy - yz, xz - zx, yx - xy],
+            [zy - yz, 1 + xx - yy - zz, xy + yx, xz + zx],
+            [xz - zx, xy + yx, 1 - xx + yy - zz, yz + zy],
+            [yx - xy, xz + zx, yz + zy, 1 - xx - yy + zz],
+        ]
+    )
+    quaternion = products[products.diagonal().argmax()]  # the row of the largest part divides safely
+    return quaternion / np.linalg.norm(quaternion) * (1 if quaternion[0] >= 0 else -1)
+
+
+def typical_spacing(points: ArrayLike) -> float:
+    """Median distance from a point to the third nearest other one, over an even sample of the points (n, 3).
+
+    0 where all points lie in one place.
+    """
+    xyz, _ = _distinct(_checked(points))
+    sample = xyz[np.linspace(0, len(xyz) - 1, min(len(xyz), SPACING_SAMPLE)).round().astype(int)]
+    third = min(3, len(xyz) - 1)
+    squared = [np.partition(np.square(xyz - place).sum(axis=1), third)[third] for place in sample]
+    return float(np.sqrt(np.median(squared)))
+
+
+def _checked(points: ArrayLike) -> DoubleArray:
+    xyz = np.asarray(points, np.float64)
+    if xyz.ndim != 2 or xyz.shape[1] != 3 or len(xyz) == 0:
+        raise SceneError(f"points are of shape {xyz.shape}; expected (n, 3) with at least one point for a box")
+    if not np.isfinite(xyz).all():
+        raise SceneError("points hold NaN or infinity; expected finite coordinates: leave those points out")
+    return xyz
+
+
+def _unit(up: ArrayLike) -> DoubleArray:
+    direction = np.asarray(up, np.float64)
+    if direction.shape != (3,) or not np.isfinite(direction).all() or not direction.any():
+        raise SceneError(f"up is {up}; expected a direction of three numbers, not all 0, e.g. (0, 0, 1)")
+    direction = direction / np.abs(direction).max()
+    return direction / np.linalg.norm(direction)
+
+
+def _distinct(xyz: DoubleArray) -> tuple[DoubleArray, NDArray[np.int64]]:
+    """Each place once, in a fixed order, so that sums do not depend on the order given; and (n,) which one each was."""
+    order = np.lexsort(xyz.T)
+    rows = xyz[order]
+    new = np.append(True, (rows[1:] != rows[:-1]).any(axis=1))
+    which = np.empty(len(xyz), np.int64)
+    which[order] = np.cumsum(new) - 1
+    return rows[new], which
+
+
+def _principal_axes(local: DoubleArray) -> DoubleArray:
+    """(3, 3) orthonormal rows, the widest direction first; signs by the third moment, so that they turn with points."""
+    centered = local - local.mean(axis=0)
+    axes = np.asarray(np.linalg.eigh(centered.T @ centered)[1], np.float64).T[::-1]
+    skew = ((centered @ axes.T) ** 3).sum(axis=0)
+    return np.where(skew < 0, -1.0, 1.0)[:, None] * axes
+
+
+def _right_handed(axes: DoubleArray, keep_third: bool) -> DoubleArray:
+    """Each axis's largest part positive, but the one that is turned about to make the system right-handed."""
+    largest = np.abs(axes).argmax(axis=1)
+    signs = np.sign(axes[np.arange(3), largest])
+    if keep_third:
+        signs[2] = 1.0
+    axes = axes * signs[:, None]
+    flipped = 1 if keep_third else 2
+    axes[flipped] *= np.sign(np.linalg.det(axes))
+    return axes
+
+
+# The oriented box -------------------------------------------------------------------------------------------------
+
+
+def _least_volume(local: DoubleArray) -> DoubleArray:
+    """(3, 3) axes, as rows, of a box of nearly the least volume around distinct points (n, 3) near the origin."""
+    principal = _principal_axes(local)
+    along = local @ principal.T
+    hull = _extreme_points(along)
+    thickness = THIN * float(np.linalg.norm(np.ptp(hull, axis=0)))
+    if thickness == 0:
+        return np.eye(3)
+    starts = _start_rotations()
+    order = np.argsort(_volumes(hull, starts, thickness), kind="stable")
+    found = [_flush(hull, starts[0], thickness)]  # principal axes are exact for flat and straight things
+    found += [_flush(hull, _refined(hull, starts[index], thickness), thickness) for index in order[:STARTS]]
+    volumes = _volumes(hull, np.stack(found), thickness)
+    # A box that is no smaller than that along the principal axes is not worth an odd orientation.
+    best = int(volumes.argmin())
+    axes = found[best if volumes[best] < (1 - GAIN) * volumes[0] else 0]
+    return _corrected(along, hull, axes, thickness) @ principal
+
+
+def _corrected(xyz: DoubleArray, hull: DoubleArray, axes: DoubleArray, thickness: float) -> DoubleArray:
+    """Points that stick out of the box join the hull, and the box is refined, until none does; the best box of all."""
+    found, volumes = [axes], [_volumes(xyz, axes, thickness)[0]]
+    for _ in range(CORRECTIONS):
+        if _volumes(hull, axes, thickness)[0] >= (1 - GAIN) * _volumes(xyz, axes, thickness)[0]:
+            break
+        height = axes @ xyz.T
+        hull = np.concatenate([hull, xyz[height.argmax(axis=1)], xyz[height.argmin(axis=1)]])
+        axes = _flush(hull, _refined(hull, axes, thickness), thickness)
+        found.append(axes)
+        volumes.append(_volumes(xyz, axes, thickness)[0])
+    return found[int(np.argmin(volumes))]
+
+
+def _extreme_points(xyz: DoubleArray) -> DoubleArray:
+    """The points farthest along EXTREME_DIRECTIONS and their opposites; all points where there are no more."""
+    if len(xyz) <= EXTREME_DIRECTIONS:
+        return xyz
+    chosen = []
+    for directions in np.array_split(_directions(EXTREME_DIRECTIONS), EXTREME_DIRECTIONS // 16):
+        height = directions @ xyz.T
+        chosen += [height.argmax(axis=1), height.argmin(axis=1)]
+    return xyz[np.unique(np.concatenate(chosen))]
+
+
+def _volumes(hull: DoubleArray, axes: DoubleArray, thickness: float) -> DoubleArray:
+    """(m,) volume of the box along each of axes (m, 3, 3), every length increased by thickness."""
+    along = axes.reshape(-1, 3) @ hull.T
+    return (along.max(axis=1) - along.min(axis=1) + thickness).reshape(-1, 3).prod(axis=1)
+
+
+def _refined(hull: DoubleArray, axes: DoubleArray, thickness: float) -> DoubleArray:
+    """The best of nets of small rotations, each net finer than the last and around the best so far."""
+    least = _volumes(hull, axes, thickness)[0]
+    angle = FIRST_ANGLE
+    for _ in range(ROUNDS):
+        turned = _rotations(angle * _rotation_vectors()) @ axes
+        volumes = _volumes(hull, turned, thickness)
+        best = int(volumes.argmin())
+        if volumes[best] < least:
+            least, axes = volumes[best], turned[best]
+        angle *= SHRINK
+    return axes
+
+
+def _flush(hull: DoubleArray, axes: DoubleArray, thickness: float) -> DoubleArray:
+    """Turns the box about one of its axes after another, each time to the least area, until none makes it smaller."""
+    least = _volumes(hull, axes, thickness)[0]
+    about, without_gain = 0, 0
+    for _ in range(TURNS):
+        if without_gain == 3:
+            break
+        plane = axes[[(about + 1) % 3, (about + 2) % 3]]
+        turned = np.concatenate([axes[about, None], _least_rectangle(hull @ plane.T, thickness) @ plane])
+        volume = _volumes(hull, turned, thickness)[0]
+        without_gain += 1
+        if volume < (1 - GAIN) * least:
+            least, axes, about, without_gain = volume, turned, 0, 0  # the axis turned about is the first now
+        about = (about + 1) % 3
+    return axes
+
+
+def _upright(local: DoubleArray, up: DoubleArray) -> DoubleArray:
+    """Axes of the least box whose third axis is up."""
+    aside = np.cross(up, np.eye(3)[np.abs(up).argmin()])
+    plane: DoubleArray = np.asarray(np.stack([aside, np.cross(up, aside)]) / np.linalg.norm(aside), np.float64)
+    flat = local @ plane.T
+    height = np.zeros((len(flat), 1))
+    flat = _extreme_points(np.hstack([flat, height]))[:, :2]
+    thickness = THIN * float(np.linalg.norm(np.ptp(flat, axis=0)))
+    return np.concatenate([_least_rectangle(flat, thickness) @ plane, up[None]])
+
+
+def _least_rectangle(flat: DoubleArray, thickness: float) -> DoubleArray:
+    """(2, 2) axes of the rectangle of least area around flat points (n, 2): one side lies on a side of their hull."""
+    hull = _hull_2d(flat)
+    sides = np.roll(hull, -1, axis=0) - hull
+    lengths = np.hypot(sides[:, 0], sides[:, 1])
+    if not lengths.any():
+        return np.eye(2)
+    along = sides[lengths > 0] / lengths[lengths > 0, None]
+    across = np.stack([-along[:, 1], along[:, 0]], axis=1)
+    areas = (np.ptp(along @ hull.T, axis=1) + thickness) * (np.ptp(across @ hull.T, axis=1) + thickness)
+    best = int(areas.argmin())
+    return np.stack([along[best], across[best]])
+
+
+def _hull_2d(flat: DoubleArray) -> DoubleArray:
+    """(m, 2) corners of the convex hull, anticlockwise (Andrew's monotone chain, 1979)."""
+    ordered: list[list[float]] = flat[np.lexsort((flat[:, 1], flat[:, 0]))].tolist()
+    chains = [_lower_chain(ordered), _lower_chain(ordered[::-1])]
+    corners = chains[0][:-1] + chains[1][:-1]
+    return np.array(corners or ordered[:1])
+
+
+def _lower_chain(ordered: list[list[float]]) -> list[list[float]]:
+    chain: list[list[float]] = []
+    for x, y in ordered:
+        while len(chain) > 1:
+            (x0, y0), (x1, y1) = chain[-2:]
+            if (x1 - x0) * (y - y0) > (y1 - y0) * (x - x0):
+                break
+            chain.pop()
+        chain.append([x, y])
+    return chain
+
+
+@lru_cache(maxsize=4)
+def _directions(count: int) -> DoubleArray:
+    """(count, 3) unit vectors, even over the upper half of the sphere: a Fibonacci lattice."""
+    step = np.arange(count) + 0.5
+    height, turn = 1 - step / count, step * np.pi * (3 - np.sqrt(5))
+    ring = np.sqrt(1 - height**2)
+    return np.stack([ring * np.cos(turn), ring * np.sin(turn), height], axis=1)
+
+
+@lru_cache(maxsize=1)
+def _rotation_vectors() -> DoubleArray:
+    """(NET_ROTATIONS, 3) even over the unit ball: directions, with lengths that follow a golden-ratio sequence."""
+    half = _directions(NET_ROTATIONS // 2)
+    share = np.arange(NET_ROTATIONS) * ((np.sqrt(5) - 1) / 2) % 1
+    return np.concatenate([half, -half]) * np.cbrt(share)[:, None]
+
+
+@lru_cache(maxsize=1)
+def _start_rotations() -> DoubleArray:
+    """(m, 3, 3) the identity, and a net over the rotations by which boxes differ: those nearest to the identity of the
+    24 that name the same box (Rodrigues vector within sqrt(2) - 1 along the axes, 1 along the diagonals).
+
+    Even over all rotations by the super-Fibonacci spiral (M. Alexa, "Super-Fibonacci Spirals", CVPR 2022).
+    """
+    phi, psi = np.sqrt(2), 1.533751168755204288118041
+    step = np.arange(START_ROTATIONS) + 0.5
+    inner, outer = np.sqrt(step / START_ROTATIONS), np.sqrt(1 - step / START_ROTATIONS)
+    a, b = 2 * np.pi * step / phi, 2 * np.pi * step / psi
+    x, y, z, w = inner * np.sin(a), inner * np.cos(a), outer * np.sin(b), outer * np.cos(b)
+    rodrigues = np.stack([x, y, z], axis=1) / w[:, None]
+    size = np.abs(rodrigues)
+    rodrigues = rodrigues[(size <= np.sqrt(2) - 1).all(axis=1) & (size.sum(axis=1) <= 1)]
+    length = np.linalg.norm(rodrigues, axis=1, keepdims=True)
+    return np.concatenate([np.eye(3)[None], _rotations(rodrigues * (2 * np.arctan(length) / length))])
+
+
+def _rotations(vectors: DoubleArray) -> DoubleArray:
+    """(n, 3, 3) rotation matrices of rotation vectors (n, 3), by Rodrigues' formula."""
+    angle = np.linalg.norm(vectors, axis=1)
+    x, y, z = (vectors / np.where(angle > 0, angle, 1)[:, None]).T
+    zero = np.zeros_like(x)
+    cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
+    return np.eye(3) + np.sin(angle)[:, None, None] * cross + (1 - np.cos(angle))[:, None, None] * (cross @ cross)
+
+
+# Strays -----------------------------------------------------------------------------------------------------------
+
+
+def _connected(voxel: NDArray[np.int64]) -> NDArray[np.int64]:
+    """(n,) number of the connected part that each voxel (n, 3) belongs to; those that touch are one.
+
+    Coordinates within +-2^19.
+    """
+    key = (voxel + (1 << 20)) @ np.array([1 << 42, 1 << 21, 1])
+    keys, which = np.unique(key, return_inverse=True)
+    part = np.arange(len(keys))
+    pairs = [_neighbours(keys, step) for step in _HALF_OF_26]
+    first, second = (np.concatenate(ends) for ends in zip(*pairs, strict=True))
+    while True:
+        a, b = part[first], part[second]
+        apart = a != b
+        if not apart.any():
+            return np.unique(part, return_inverse=True)[1].ravel()[which.ravel()]
+        # Each larger root is hung below a smaller one; then every voxel is moved up to its root.
+        np.minimum.at(part, np.maximum(a, b)[apart], np.minimum(a, b)[apart])
+        while (part != part[part]).any():
+            part = part[part]
+
+
+def _neighbours(keys: NDArray[np.int64], step: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Places in sorted keys of every pair that lies ``step`` apart."""
+    place = np.minimum(np.searchsorted(keys, keys + step), len(keys) - 1)
+    there = np.flatnonzero(keys[place] == keys + step)
+    return there, place[there]
+
+
+_HALF_OF_26 = [
+    (x << 42) + (y << 21) + z for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if (x, y, z) > (0, 0, 0)
+]
+"""Key differences of neighbouring voxels, one of each opposite pair."""
