@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import argparse
 import csv
-import os
 import re
 import subprocess
 import sys
@@ -29,16 +28,17 @@ from numpy.typing import NDArray
 
 import og_pointcloud as og
 from og_pointcloud.bundle import TOO_FAR, Bundle
-from og_pointcloud.cloud import LabelledCloud
+from og_pointcloud.cloud import LabelledCloud, Vocabulary
 from og_pointcloud.runtime import LabelledScene
 
 if TYPE_CHECKING:
     from og_pointcloud_export.query_head import ScoreHead
 
-CELL_SIZES = (0.75, 1.0, 1.5, 2.0, 3.0, 4.0)
-"""In point spacings."""
+CELL_SIZES = (1.0, 1.5, 2.0, 3.0, 4.0)
+"""In point spacings; a third of the reach is the smallest there is."""
 WAYS = {"table alone": {"lists": False}, "lists": {"split": False}, "lists and parts": {}}
 """A cell's answer at its centre; border cells settled by their candidates; and those that hold points split first."""
+RANDOM_WORDS = 500
 HEAVY = ("torch", "open3d", "pyvista", "cv2", "numba", "scipy")
 FIRST_ANSWER = """
 import sys, time
@@ -99,6 +99,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--noise", type=float, default=0.3, help="standard deviation, in point spacings (0.3)")
     parser.add_argument("--rounds", type=int, default=15)
     parser.add_argument("--cells", type=float, nargs="+", default=CELL_SIZES, help="cell sizes, in point spacings")
+    parser.add_argument("--words", type=Path, help="text-features .npz to ask for; left out: the scene's own words")
     parser.add_argument("--footprint", action="store_true")
     options = parser.parse_args(arguments)
     if options.footprint:
@@ -108,7 +109,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     frame = make_frame(cloud, options.points, options.noise)
     lookups = measure_lookups(cloud, frame, options.cells, options.rounds)
     print_table(lookups)
-    scores = measure_scores(cloud, options.rounds)
+    words = og.read_text_features(options.words)[0] if options.words is not None else cloud.vocabulary
+    scores = measure_scores(cloud, words, options.rounds)
     print_table(scores)
     if options.output is not None:
         options.output.mkdir(parents=True, exist_ok=True)
@@ -165,7 +167,7 @@ class Table:
     way: str
     cell: float
     segmenter: og.Segmenter
-    run: Callable[[NDArray[np.float32]], list[Any]]
+    run: Callable[[NDArray[np.float32]], Sequence[Any]]
     onnx_mb: float
     build_seconds: float
 
@@ -192,16 +194,15 @@ def build_table(cloud: LabelledCloud, way: str, cell: float) -> Table:
     )
 
 
-def measure_scores(cloud: LabelledCloud, rounds: int, words: int = 500) -> list[ScoreRow]:
-    """Precisions and widths of the descriptor table, asked for the scene's words, or random ones."""
+def measure_scores(cloud: LabelledCloud, words: Vocabulary | None, rounds: int) -> list[ScoreRow]:
+    """Precisions and widths of the descriptor table, asked for these words; without any, for random vectors."""
     from og_pointcloud_export.query_head import ScoreHead
 
     width = cloud.instances.descriptors.shape[1]
     if len(cloud.instances.descriptors) == 0:
         return []
-    text = np.random.default_rng(0).normal(size=(words, width)).astype(np.float32)
-    if cloud.vocabulary is not None and cloud.vocabulary.vectors.shape[1] == width:
-        text = cloud.vocabulary.vectors
+    random = np.random.default_rng(0).normal(size=(RANDOM_WORDS, width)).astype(np.float32)
+    text = random if words is None else words.vectors
     heads = [ScoreHead(precision=precision) for precision in ("float32", "float16", "int8")]
     heads += [ScoreHead(reduced) for reduced in (64, 32, 16, 8) if reduced < width]
     heads += [ScoreHead(None, centred=True), ScoreHead(min(64, width), centred=True, precision="int8")]
@@ -330,7 +331,7 @@ def installed_sizes(root: str) -> dict[str, int]:
             found = distribution(name)
         except PackageNotFoundError:
             continue
-        paths = [Path(os.fspath(found.locate_file(file))) for file in found.files or []]
+        paths = [Path(str(found.locate_file(file))) for file in found.files or []]
         sizes[name] = sum(path.stat().st_size for path in paths if path.is_file())
         needed = [line for line in found.requires or [] if "extra ==" not in line]
         waiting += [match.group() for line in needed if (match := re.match(r"[\w.-]+", line))]

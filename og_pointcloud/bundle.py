@@ -50,6 +50,13 @@ MAX_MEMBERS = 256
 MAX_MANIFEST_BYTES = 1 << 26
 SAFE_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]*(/[A-Za-z0-9_][A-Za-z0-9_.-]*)*")
 INTEGERS, FLOATS = ("|i1", "<i2", "<i4"), ("<f2", "<f4")
+QUERY_OPERATORS = frozenset({
+    "Abs", "Add", "ArgMax", "ArgMin", "Cast", "Concat", "Div", "Expand", "GatherElements", "Greater",
+    "GreaterOrEqual", "Identity", "Less", "LessOrEqual", "MatMul", "Max", "Min", "Mod", "Mul", "NonZero",
+    "ReduceL2", "ReduceMax", "ReduceSum", "Reshape", "ScatterElements", "Shape", "Slice", "Split", "Sub",
+    "Transpose", "Unsqueeze", "Where",
+})  # fmt: skip
+"""What a query.onnx is made of: arithmetic and look-ups, nothing that repeats or branches."""
 REBUILD = "write the file again with write_bundle"
 CARRIED_ENCODER = "text_encoder/"
 """What the names of a carried text encoder's members begin with."""
@@ -191,7 +198,7 @@ def _check_members(
     if "query.onnx" not in members:
         raise _Refused(f"member 'query.onnx' is missing: {REBUILD}")
     try:
-        check_graph(members["query.onnx"])
+        check_graph(members["query.onnx"], QUERY_OPERATORS)
     except ValueError as error:
         raise _Refused(f"query.onnx: {error}: the file is not to be trusted") from None
 

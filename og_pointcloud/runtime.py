@@ -103,7 +103,12 @@ class LabelledScene:
                 f"'{self.feature_space}'): encode the labels with the scene's encoder"
             )
         feed = {"points": np.zeros((0, 3), np.float32), "text": np.ascontiguousarray(vectors, np.float32)}
-        return np.asarray(self._session.run(["instance_scores"], feed)[0])
+        scores = self._ask(["instance_scores"], feed)[0]
+        if scores.shape != (len(self.instances), len(vectors)) or scores.dtype != np.float32:
+            raise BundleError(
+                f"{self.path}: query.onnx gives scores {scores.dtype} {scores.shape}: write the file again"
+            )
+        return scores
 
     def instances_at(self, points: NDArray[np.floating], *, max_distance: float | None = None) -> NDArray[np.int32]:
         """(N,) int32: instance id of the scene's point nearest to each, -1, -2, or -3 where none is within reach.
@@ -131,8 +136,8 @@ class LabelledScene:
 
     def _look_up(self, local: NDArray[np.float32]) -> tuple[NDArray[np.int32], NDArray[np.int8]]:
         feed = {"points": local, "text": np.zeros((0, self._text_width), np.float32)}
-        outputs = self._session.run(["instance", "distance", "certain"], feed)
-        instances, distance, certain = (np.asarray(output) for output in outputs)
+        instances, distance, certain = self._ask(["instance", "distance", "certain"], feed)
+        self._check_answers(len(local), instances, distance, certain)
         if certain.all():
             return instances, distance
         still_open = np.flatnonzero(~certain)
@@ -143,6 +148,21 @@ class LabelledScene:
         on_surface = self._nearest.distance(local[still_open], nearest) <= surface
         distance[still_open] = np.where(nearest == NONE_WITHIN_REACH, BEYOND, np.where(on_surface, ON_SURFACE, NEAR))
         return instances, distance
+
+    def _ask(self, outputs: list[str], feed: dict[str, NDArray[np.float32]]) -> list[NDArray[Any]]:
+        try:
+            return [np.asarray(output) for output in self._session.run(outputs, feed)]
+        except Exception as error:  # onnxruntime raises types of its own
+            raise BundleError(f"{self.path}: query.onnx fails ({_first_line(error)}): write the file again") from None
+
+    def _check_answers(
+        self, count: int, instances: NDArray[Any], distance: NDArray[Any], certain: NDArray[Any]
+    ) -> None:
+        """A foreign graph may answer anything; nothing is looked up by a number that is none of ours."""
+        kinds = [(values.shape, values.dtype) for values in (instances, distance, certain)]
+        good = kinds == [((count,), np.dtype(kind)) for kind in (np.int32, np.int8, np.bool_)]
+        if not good or (count and not (instances.min() >= TOO_FAR and instances.max() < len(self.instances))):
+            raise BundleError(f"{self.path}: query.onnx answers what is no instance of this file: write the file again")
 
     def _farther_than(
         self, max_distance: float, local: NDArray[np.float32], instances: NDArray[np.int32]
@@ -164,8 +184,9 @@ class LabelledScene:
         try:
             session = open_session(self._bundle.query_onnx)
         except Exception as error:  # onnxruntime raises types of its own for a graph that it cannot run
-            reason = str(error).strip().splitlines()[0][:200]
-            raise BundleError(f"{self.path}: query.onnx does not run ({reason}): write the file again") from None
+            raise BundleError(
+                f"{self.path}: query.onnx does not run ({_first_line(error)}): write the file again"
+            ) from None
         inputs = {given.name: given for given in session.get_inputs()}
         outputs = {given.name for given in session.get_outputs()}
         if set(inputs) != {"points", "text"} or not {"instance", "distance", "certain", "instance_scores"} <= outputs:
@@ -320,6 +341,10 @@ def _scene_of_cloud(cloud: LabelledCloud) -> LabelledScene:
         scene = LabelledScene.from_cloud(cloud)
         cloud.__dict__["_scene"] = scene
     return scene
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).strip() or type(error).__name__).splitlines()[0][:200]
 
 
 def _posed(points: NDArray[np.float64], pose: ArrayLike | None) -> NDArray[np.float64]:

@@ -44,7 +44,7 @@ def test_a_scene_without_descriptors_has_no_scores():
     from labelled_clouds import instance_table, make_cloud
 
     cloud = make_cloud(np.zeros((3, 3)), [0, 0, -1], instances=instance_table(1, []))
-    assert benchmark.measure_scores(cloud, 1) == []
+    assert benchmark.measure_scores(cloud, None, 1) == []
 
 
 def test_footprint_of_a_fresh_process(bundle_file, capsys, monkeypatch):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import zipfile
 from dataclasses import replace
 
 import numpy as np
@@ -22,8 +24,11 @@ from og_pointcloud_export import brick_grid, writer
 from og_pointcloud_export.brick_grid import GridSettings, build_brick_grid
 from og_pointcloud_export.query_head import ScoreHead, build_query_head, reference_scores
 
+import og_pointcloud as og
+from og_pointcloud._onnx_graph import check_graph
 from og_pointcloud._onnxruntime import open_session
-from og_pointcloud.bundle import BEYOND, NEAR, ON_SURFACE
+from og_pointcloud.bundle import BEYOND, NEAR, ON_SURFACE, QUERY_OPERATORS
+from og_pointcloud.errors import BundleError
 from og_pointcloud.nearest import surface_distance
 
 CLOUDS = tough_clouds()
@@ -289,6 +294,70 @@ def test_the_graph_stands_alone_and_is_plain():
     assert [value.name for value in model.graph.output] == OUTPUTS
     assert model.graph.input[1].type.tensor_type.shape.dim[1].dim_value == WIDTH
     assert not any(tensor.external_data for tensor in model.graph.initializer)
+
+
+HEADS = [ScoreHead(), ScoreHead(4, True, "int8"), ScoreHead(4, precision="float16")]
+
+
+@pytest.mark.parametrize("head", HEADS)
+def test_every_graph_we_write_passes_the_readers_check(head):
+    for cloud in (CLOUDS["room"], CLOUDS["no point"]):
+        check_graph(build_query_head(cloud, build_brick_grid(cloud), head), QUERY_OPERATORS)
+
+
+def as_custom(graph):
+    graph.graph.node[0].domain = "com.stranger"
+
+
+def as_microsofts(graph):
+    graph.opset_import.add(domain="com.microsoft", version=1)
+
+
+def as_loop(graph):
+    graph.graph.node[0].op_type = "Loop"
+
+
+def as_branch(graph):
+    graph.graph.node[0].attribute.add(name="body", type=onnx.AttributeProto.GRAPH).g.name = "inner"
+
+
+def as_function(graph):
+    graph.functions.add(name="f", domain="")
+
+
+def as_huge(graph):
+    graph.graph.initializer[0].dims[:] = [1 << 40]
+
+
+def as_external(graph):
+    graph.graph.initializer[0].data_location = onnx.TensorProto.EXTERNAL
+
+
+def as_sparse(graph):
+    graph.graph.sparse_initializer.add()
+
+
+@pytest.mark.parametrize(
+    "harm", [as_custom, as_microsofts, as_loop, as_branch, as_function, as_huge, as_external, as_sparse]
+)
+def test_hostile_graphs_are_refused_before_a_runtime_sees_them(harm, tmp_path, monkeypatch):
+    model = writer.query_model(CLOUDS["one point"])
+    graph = onnx.load_from_string(model.onnx)
+    harm(graph)
+    with pytest.raises(ValueError):  # before a file holds it
+        check_graph(graph.SerializeToString(), QUERY_OPERATORS)
+    path = writer.write_bundle(CLOUDS["one point"], tmp_path / "s.ogpc")
+    hostile = tmp_path / "hostile.ogpc"
+    with zipfile.ZipFile(path) as archive, zipfile.ZipFile(hostile, "w") as changed:
+        members = {name: archive.read(name) for name in archive.namelist()}
+        manifest = json.loads(members.pop("manifest.json"))
+        members["query.onnx"] = graph.SerializeToString()
+        manifest["members"]["query.onnx"]["bytes"] = len(members["query.onnx"])
+        for name, data in {"manifest.json": json.dumps(manifest), **members}.items():
+            changed.writestr(name, data)
+    monkeypatch.setattr("og_pointcloud._onnxruntime.open_session", None)
+    with pytest.raises(BundleError, match="not to be trusted"):
+        og.load(hostile)
 
 
 def test_a_graph_that_differs_from_float64_is_refused(monkeypatch):

@@ -204,6 +204,26 @@ def test_a_graph_that_is_not_ours_is_refused(scene):
         other.instances_at(np.zeros((1, 3)))
 
 
+@pytest.mark.parametrize("table", ["value_instance", "place_to_address", "candidates", "descriptors"])
+def test_a_graph_whose_tables_lie_gives_an_error_or_an_instance_of_the_scene(scene, table):
+    import onnx
+
+    graph = onnx.load_from_string(scene._bundle.query_onnx)
+    constant = next(constant for constant in graph.graph.initializer if constant.name == table)
+    for byte in (0x7F, 0x33, 0xFF):
+        constant.raw_data = bytes([byte]) * len(constant.raw_data)
+        lies = runtime.LabelledScene(replace(scene._bundle, query_onnx=graph.SerializeToString()))
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                result = og.segment(scene.xyz[:500], ["apple"], lies)
+        except BundleError as error:
+            assert "query.onnx" in str(error)  # noqa: PT017
+        else:
+            assert result.instances.min() >= TOO_FAR
+            assert result.instances.max() < len(scene.instances)
+
+
 # Which cloud is asked about
 
 
