@@ -168,7 +168,7 @@ class Instances(Sequence[Instance]):
         return text
 
     def to_csv(self, path: str | os.PathLike[str] | None = None) -> str:
-        """The records as CSV text, a column a number (center_x, size_0, word_1 ...); also written where path is given."""
+        """The records as CSV text, a column a number; also written to path, whole or not at all."""
         records = [_flat(record) for record in self.to_records()]
         text = io.StringIO()
         # The longest row names all columns: one without points or words has fewer.

@@ -28,19 +28,16 @@ __all__ = ["Match", "Selection", "select"]
 class Match:
     """An instance beside a text. score: their cosine. points: how many it has.
 
+    fits: whether no other word fits it better; where no other word was given, whether it is the best of all.
     rival: the other word that fits it best, with its cosine; None and -2 where no other word was given.
     """
 
     instance: int
     score: float
+    fits: bool
     rival: str | None
     rival_score: float
     points: int
-
-    @property
-    def fits(self) -> bool:
-        """Whether no rival fits the instance better than the text does."""
-        return self.score >= self.rival_score
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-able."""
@@ -87,7 +84,7 @@ class Selection(Sequence[Match]):
     @property
     def fitting(self) -> tuple[Match, ...]:
         """Those that the text fits better than every rival; without rivals the best alone, as nothing tells more."""
-        return tuple(match for match in self.matches if match.fits) if self.rivals else self.matches[:1]
+        return tuple(match for match in self.matches if match.fits)
 
     @property
     def instances(self) -> tuple[int, ...]:
@@ -111,7 +108,7 @@ class Selection(Sequence[Match]):
     def __str__(self) -> str:
         lines = [f"'{self.query}' fits {len(self.fitting)} of {len(self)} instances"]
         for match in self[:SHOWN]:
-            mark = "*" if match in self.fitting else " "
+            mark = "*" if match.fits else " "
             rival = f"{match.rival} {match.rival_score:.3f}" if match.rival else "-"
             lines.append(
                 f"{mark} instance {match.instance:<5} {match.score:.3f}  {match.points:>9,} points  rival {rival}"
@@ -153,9 +150,12 @@ def select(
     points = np.bincount(scene.instance_ids[scene.instance_ids >= 0], minlength=len(scores))
     known = (scores > NO_EVIDENCE) & (points > 0)
     ranked = [int(k) for k in np.argsort(-scores, kind="stable") if known[k]]
+    fits = scores >= rival_scores if rivals else np.isin(np.arange(len(scores)), ranked[:1])
     return Selection(
         query=query.names[0],
-        matches=tuple(Match(k, float(scores[k]), names[k], float(rival_scores[k]), int(points[k])) for k in ranked),
+        matches=tuple(
+            Match(k, float(scores[k]), bool(fits[k]), names[k], float(rival_scores[k]), int(points[k])) for k in ranked
+        ),
         rivals=len(rivals.names) if rivals else 0,
         unknown=int(((points > 0) & ~known).sum()),
         scene=scene,

@@ -17,12 +17,15 @@ from og_pointcloud.cli import (
     ablate,
     check,
     demo,
+    edit,
     export_text_encoder,
     fit,
     import_,
     info,
+    instances,
     pick,
     segment,
+    select,
     view,
     vocabulary,
 )
@@ -31,7 +34,10 @@ from og_pointcloud.errors import MissingExtraError, OgPointcloudError
 
 __all__ = ["main"]
 
-COMMANDS = (fit, import_, segment, pick, view, info, vocabulary, export_text_encoder, ablate, check, demo)
+COMMANDS = (
+    fit, import_, segment, select, pick, instances, edit, view, info, vocabulary, export_text_encoder, ablate, check,
+    demo,
+)  # fmt: skip
 
 
 def main(argv: Sequence[str] | None = None) -> int:
