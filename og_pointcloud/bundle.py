@@ -51,12 +51,12 @@ MAX_MANIFEST_BYTES = 1 << 26
 SAFE_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]*(/[A-Za-z0-9_][A-Za-z0-9_.-]*)*")
 INTEGERS, FLOATS = ("|i1", "<i2", "<i4"), ("<f2", "<f4")
 QUERY_OPERATORS = frozenset({
-    "Abs", "Add", "ArgMax", "ArgMin", "Cast", "Concat", "Div", "Expand", "GatherElements", "Greater",
-    "GreaterOrEqual", "Identity", "Less", "LessOrEqual", "MatMul", "Max", "Min", "Mod", "Mul", "NonZero",
+    "Abs", "Add", "ArgMax", "ArgMin", "Cast", "Concat", "Div", "Expand", "Gather", "GatherElements", "Greater",
+    "GreaterOrEqual", "Identity", "IsNaN", "Less", "LessOrEqual", "MatMul", "Max", "Min", "Mod", "Mul", "NonZero",
     "ReduceL2", "ReduceMax", "ReduceSum", "Reshape", "ScatterElements", "Shape", "Slice", "Split", "Sub",
     "Transpose", "Unsqueeze", "Where",
 })  # fmt: skip
-"""What a query.onnx is made of: arithmetic and look-ups, nothing that repeats or branches."""
+"""What a query.onnx is made of, now or before: arithmetic and look-ups, nothing that repeats or branches."""
 REBUILD = "write the file again with write_bundle"
 CARRIED_ENCODER = "text_encoder/"
 """What the names of a carried text encoder's members begin with."""

@@ -123,8 +123,11 @@ class LabelledScene:
         self, points: NDArray[np.floating], *, max_distance: float | None = None
     ) -> tuple[NDArray[np.int32], NDArray[np.int8]]:
         """What ``instances_at`` answers, and (N,) int8: on the surface, near, or too far, as Segmentation says."""
+        points = np.asarray(points, np.float64)
+        local = np.empty(points.shape, np.float32)
         with np.errstate(over="ignore"):  # what leaves float32 is infinitely far
-            local = (np.asarray(points, np.float64) - self.cloud.origin).astype(np.float32)
+            for axis in range(3):  # three times as fast as all in one, which makes a float64 copy of its own
+                np.subtract(points[:, axis], self.cloud.origin[axis], out=local[:, axis], casting="same_kind")
         instances, distance = np.empty(len(local), np.int32), np.empty(len(local), np.int8)
         for start in range(0, len(local), POINTS_PER_RUN):
             run = slice(start, start + POINTS_PER_RUN)
@@ -386,9 +389,7 @@ def _label(
 ) -> Segmentation:
     labels, scores = best
     # A negative instance counts from the end, where those of no instance lie.
-    return Segmentation(
-        points, labels.take(instances), scores.take(instances), instances, words.names, scene.path, distance
-    )
+    return Segmentation(points, labels[instances], scores[instances], instances, words.names, scene.path, distance)
 
 
 def _why_nothing(result: Segmentation, scene: LabelledScene) -> str | None:

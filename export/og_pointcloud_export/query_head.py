@@ -203,7 +203,7 @@ def _lookup_nodes() -> list[onnx.NodeProto]:
         _node("Min", "cell_above last_cell", "cell"),
         # Along each axis, cell -> what it adds to (brick's place in the grid) * 512 + (cell's place in the brick).
         _node("GatherElements", "axis_places cell", "place_terms", axis=1),
-        _node("ReduceSum", "place_terms first_axis", "place", keepdims=0),
+        *_sum_of_rows("place_terms", "place"),
         _node("Div", "place cells_per_brick", "brick"),
         _node("GatherElements", "place_to_address brick", "address_shift"),
         _node("Add", "place address_shift", "address"),
@@ -225,8 +225,7 @@ def _open_cell_nodes() -> list[onnx.NodeProto]:
     return [
         *_where_true("GreaterOrEqual", "cell_value first_listed", "listed"),
         *_columns_at("rows", "listed", "listed_rows"),
-        helper.make_node("Split", ["listed_rows"], ["row_x", "row_y", "row_z"], axis=0, num_outputs=3),
-        *(_node("Reshape", f"row_{axis} flat", f"point_{axis}") for axis in "xyz"),
+        *_rows_apart("listed_rows", "point"),
         _node("GatherElements", "cell_value listed", "listed_value"),
         _node("GatherElements", "address listed", "listed_address"),
         # brick's first list + the cell's own -> its list
@@ -241,7 +240,7 @@ def _open_cell_nodes() -> list[onnx.NodeProto]:
         _node("Cast", "part_position", "part", to=TensorProto.INT32),
         _node("Mod", "part parts_edge", "part_in_cell"),
         _node("Mul", "part_in_cell part_strides", "part_terms"),
-        _node("ReduceSum", "part_terms first_axis", "part_index", keepdims=0),
+        *_sum_of_rows("part_terms", "part_index"),
         _node("GatherElements", "list_parts list", "list_parts_stored"),
         _node("Cast", "list_parts_stored", "parts_row", to=TensorProto.INT32),
         _node("Mul", "parts_row parts_per_cell", "parts_start"),
@@ -314,6 +313,24 @@ def _search_nodes(name: str, rows: str, steps: str) -> list[onnx.NodeProto]:
         node("Where", "on_surface answer answer_near", "answer_within"),
         node("LessOrEqual", "nearest_squared_flat /reach_squared", "within_reach"),
         node("Where", "within_reach answer_within /too_far", "code"),
+    ]
+
+
+def _rows_apart(table: str, name: str) -> list[onnx.NodeProto]:
+    """(3, m) -> name_x, name_y, name_z, (m,) each."""
+    rows = [f"{name}_row_{axis}" for axis in "xyz"]
+    return [
+        helper.make_node("Split", [table], rows, name=f"{name}_rows", axis=0, num_outputs=3),
+        *(_node("Reshape", f"{row} flat", f"{name}_{axis}") for row, axis in zip(rows, "xyz", strict=True)),
+    ]
+
+
+def _sum_of_rows(table: str, output: str) -> list[onnx.NodeProto]:
+    """(3, m) -> (m,); twice as fast as ReduceSum."""
+    return [
+        *_rows_apart(table, output),
+        _node("Add", f"{output}_x {output}_y", f"{output}_xy"),
+        _node("Add", f"{output}_xy {output}_z", output),
     ]
 
 
