@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import zipfile
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import onnx
@@ -294,6 +295,21 @@ def test_the_graph_stands_alone_and_is_plain():
     assert [value.name for value in model.graph.output] == OUTPUTS
     assert model.graph.input[1].type.tensor_type.shape.dim[1].dim_value == WIDTH
     assert not any(tensor.external_data for tensor in model.graph.initializer)
+
+
+def test_the_documented_program_answers_like_the_library(tmp_path, monkeypatch):
+    writer.write_bundle(CLOUDS["map coordinates"], tmp_path / "scene.ogpc")
+    monkeypatch.chdir(tmp_path)
+    page = (Path(__file__).resolve().parents[1] / "docs" / "query_onnx.md").read_text()
+    program = page.split("```python\n")[1].split("```")[0]
+    origin = CLOUDS["map coordinates"].origin
+    names = {}
+    exec(program.replace("]])  # world", f"]]) + {origin.tolist()}  # world"), names)
+    words = dict(zip("abc", names["text"], strict=True))
+    assert names["labels"].tolist() == og.segment(names["points"], words, tmp_path / "scene.ogpc").labels.tolist()
+    assert names["labels"].tolist()[:2] != [-1, -1]
+    assert names["labels"][2] == -1
+    assert names["instance"].tolist()[2] == TOO_FAR
 
 
 HEADS = [ScoreHead(), ScoreHead(4, True, "int8"), ScoreHead(4, precision="float16")]
