@@ -52,14 +52,17 @@ from og_pointcloud.grouping import MaskGroups, group_masks, indicator
 from og_pointcloud.hierarchy import part_of
 from og_pointcloud.journal import Journal
 from og_pointcloud.membership import assign_points, without_see_through
-from og_pointcloud.memory import free_memory
+from og_pointcloud.memory import free_memory, memory_in_use
 from og_pointcloud.modes import Labelling
 from og_pointcloud.scene import Points, Scene, View
 from og_pointcloud.settings import FitSettings
 from og_pointcloud.testimony import hear_views
 from og_pointcloud.visibility import FRUSTUM_MARGIN, Gaussians, MaskTable, mask_table
 
-__all__ = ["Tiles", "fit_tiles", "needs_tiles", "split"]
+__all__ = ["Tiles", "fit_tiles", "kept_views", "needs_tiles", "split"]
+
+MODES = ("auto", "grouping")
+"""Modes that need no more than masks; the others learn from all points at once."""
 
 MARGIN = 32.0
 """How far a tile looks over its borders, in spacings of its sparser points: what settles a point is seldom farther."""
@@ -71,14 +74,16 @@ MOST_SPLATS = 4_000_000
 """A view that would draw more than this is thinned further; drawing takes about 300 bytes a splat."""
 CHOICE_POINTS = 1_000_000
 """Size and opacity of the splats are chosen on so many points, spread over the cloud."""
-LARGEST_TILE = 2_000_000
-"""More points a tile save no time."""
+LEAST_TILE, LARGEST_TILE = 100_000, 2_000_000
+"""Points of a tile that memory decides: smaller ones are mostly margin, larger ones save no time."""
 TILE_BYTES = 1_500
 """Bytes that a tile takes at its peak, per point."""
 FIT_BYTES = 1_500
 """Bytes that one fit of a whole cloud takes, per point."""
 CLOUD_BYTES = 120
 """Bytes that every point takes, whatever the tiles: positions, colours, spacings, ids, order."""
+SUFFIX = ".tile.npy"
+"""Ends the names of files in a work folder."""
 PROBES = 2_000
 """Points of a tile that are asked for their spacing before its margin is known."""
 
@@ -90,8 +95,13 @@ M + 2 + mask: weight in that mask, but behind its object, which is believed wher
 
 
 def needs_tiles(scene: Scene, settings: FitSettings) -> bool:
-    """Whether one fit of all points would take more memory than it may."""
-    return len(scene.points) * FIT_BYTES > _memory(settings)
+    """Whether one fit of all points would take more memory than it may, and tiles would help it."""
+    return settings.mode in MODES and len(scene.points) * FIT_BYTES > _room(settings)
+
+
+def kept_views(work: Path) -> int:
+    """How many views an interrupted fit in tiles has left in its work folder."""
+    return len(list(work.glob(f"view-*{SUFFIX}")))
 
 
 def fit_tiles(
@@ -146,7 +156,7 @@ def fit_tiles(
 
 
 def _check(scene: Scene, settings: FitSettings, journal: Journal) -> None:
-    if settings.mode not in ("auto", "grouping"):
+    if settings.mode not in MODES:
         raise OgPointcloudError(
             f'mode is "{settings.mode}", which learns from all points at once; expected "auto" or "grouping" for a fit '
             "in tiles: take one of these, or thin the cloud until it fits whole"
@@ -157,17 +167,19 @@ def _check(scene: Scene, settings: FitSettings, journal: Journal) -> None:
     journal.notes.update(points=len(scene.points), views=len(scene.views), masks=masks)
 
 
-def _memory(settings: FitSettings) -> int:
-    return settings.memory or free_memory() // 2
+def _room(settings: FitSettings) -> int:
+    """Bytes that a fit may take beside what the process holds."""
+    return settings.memory - memory_in_use() if settings.memory else free_memory() // 2
 
 
 def _points_per_tile(points: int, settings: FitSettings) -> int:
-    rest = _memory(settings) - points * CLOUD_BYTES
-    most = min(rest // TILE_BYTES, LARGEST_TILE)
-    if most < 1:
+    room = _room(settings)
+    most = min((room - points * CLOUD_BYTES) // TILE_BYTES, LARGEST_TILE)
+    if most < LEAST_TILE:
         raise OgPointcloudError(
-            f"{points:,} points take {points * CLOUD_BYTES / 1e9:.1f} GB in whatever tiles; expected less than the "
-            f"memory of the fit, {_memory(settings) / 1e9:.1f} GB: give it more, or thin the cloud"
+            f"{points:,} points take {points * CLOUD_BYTES / 1e9:.1f} GB beside the scene, and tiles of {LEAST_TILE:,} "
+            f"{LEAST_TILE * TILE_BYTES / 1e9:.1f} GB; the fit has {max(room, 0) / 1e9:.1f} GB: give it more memory, or "
+            "thin the cloud"
         )
     return most
 
@@ -628,14 +640,14 @@ class _Kept:
             return
         folder.mkdir(parents=True, exist_ok=True)
         yield cls(folder, key)
-        for path in folder.glob("*.tile.npy"):
+        for path in [*folder.glob(f"*{SUFFIX}"), *folder.glob(f".*{SUFFIX}.*.tmp")]:  # the latter of a killed fit
             path.unlink()
         with suppress(OSError):
             folder.rmdir()  # there is more in it
 
     def array(self, name: str, make: Callable[[], NDArray[Any]]) -> NDArray[Any]:
         """The array of that name, mapped; made and kept, whole or not at all, where it is not there yet."""
-        path = self.folder / f"{name}-{self.key}.tile.npy"
+        path = self.folder / f"{name}-{self.key}{SUFFIX}"
         if not path.exists():
             try:
                 with replacing(path) as file:

@@ -45,6 +45,10 @@ def add(commands: Any) -> None:
         help="what the fit may hold in memory; a larger table goes to disk (default: half of what is free)",
     )  # fmt: skip
     parser.add_argument(
+        "--tile-points", type=positive, metavar="N",
+        help="fit in tiles of at most so many points (default: only where one fit would not fit into memory)",
+    )  # fmt: skip
+    parser.add_argument(
         "--work", type=Path, metavar="DIR",
         help="where the views of a long fit are kept until it ends, for a start after a kill (default: S.ogpc.work)",
     )  # fmt: skip
@@ -64,9 +68,8 @@ def run(arguments: argparse.Namespace) -> None:
     settings = fit_settings(arguments)
     from og_pointcloud_export import write_bundle
 
-    from og_pointcloud.fit import fit
+    from og_pointcloud import table_store, tiles
     from og_pointcloud.formats.capture import read_capture
-    from og_pointcloud.table_store import kept_views
 
     stages: list[dict[str, Any]] = []
     with timed(stages, "read capture"):
@@ -74,9 +77,9 @@ def run(arguments: argparse.Namespace) -> None:
         vocabulary, left_out = vocabulary_for(scene, arguments)
     work = arguments.work or arguments.output.with_name(f"{arguments.output.name}.work")
     try:
-        cloud = fit(scene, settings, progress=sys.stderr.isatty(), work=work)
+        cloud = labelled(scene, settings, arguments.tile_points, work)
     except KeyboardInterrupt:
-        if views := kept_views(work):
+        if views := table_store.kept_views(work) or tiles.kept_views(work):
             print(f"{views} views are kept in '{work}': the same command goes on behind them", file=sys.stderr)
         raise
     stages += cloud.provenance["stages"]
@@ -94,6 +97,23 @@ def run(arguments: argparse.Namespace) -> None:
     print_fit(report, cloud)
 
 
+def labelled(scene: Scene, settings: FitSettings, tile_points: int | None, work: Path) -> LabelledCloud:
+    """The scene fitted whole, or in tiles where that is asked for or needed."""
+    from og_pointcloud.fit import fit
+    from og_pointcloud.tiles import fit_tiles, needs_tiles
+
+    progress = sys.stderr.isatty()
+    if tile_points is None and not needs_tiles(scene, settings):
+        return fit(scene, settings, progress=progress, work=work)
+    if tile_points is None:
+        print(
+            f"{len(scene.points):,} points are more than one fit holds in memory: fitted in tiles; --memory or "
+            "--tile-points would say how large",
+            file=sys.stderr,
+        )
+    return fit_tiles(scene, settings, points_per_tile=tile_points, work=work, progress=progress)
+
+
 def fit_settings(arguments: argparse.Namespace) -> FitSettings:
     settings = FitSettings(mode=arguments.mode, seed=arguments.seed, memory=arguments.memory)
     if arguments.schedule_share is None:
@@ -104,6 +124,12 @@ def fit_settings(arguments: argparse.Namespace) -> FitSettings:
             "expected --mode paper: leave the option out, or take that mode"
         )
     return replace(settings, paper=PaperSettings(schedule_share=arguments.schedule_share))
+
+
+def positive(text: str) -> int:
+    if not text.isdecimal() or int(text) == 0:
+        raise argparse.ArgumentTypeError(f"'{text}' is no number of points; expected a whole number from 1")
+    return int(text)
 
 
 def memory(text: str) -> int:

@@ -1,0 +1,277 @@
+"""A fit in tiles is the fit of the whole: same labels, same evidence, whatever is cut and interrupted."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+import pytest
+from benchmark_tiles import agreement
+from conftest import TinyCapture
+from make_street import MadeStreet, make_street
+
+import og_pointcloud as og
+from og_pointcloud import tiles
+from og_pointcloud.cli import main
+from og_pointcloud.cloud import LabelledCloud
+from og_pointcloud.errors import OgPointcloudError, SceneError
+from og_pointcloud.fit import fit
+from og_pointcloud.scene import Camera, Points, Scene, View
+from og_pointcloud.settings import FitSettings, GeometrySettings
+from og_pointcloud.tiles import fit_tiles, split
+from og_pointcloud.visibility import mask_table
+
+SETTINGS = FitSettings(mode="grouping", geometry=GeometrySettings(scales=(0.5,), opacities=(0.9,)))
+POINTS = 60_000
+
+
+@lru_cache
+def street() -> MadeStreet:
+    return make_street(POINTS, 12, (320, 180), length_m=40.0)
+
+
+@lru_cache
+def whole() -> LabelledCloud:
+    return fit(street().scene, SETTINGS, progress=False)
+
+
+@lru_cache
+def tiled(most: int) -> LabelledCloud:
+    return fit_tiles(street().scene, SETTINGS, points_per_tile=most, progress=False)
+
+
+@pytest.mark.parametrize("most", [1, 7, 100, 999, 5000])
+def test_tiles_hold_every_point_once_and_none_too_many(most):
+    xyz = np.random.default_rng(0).normal(size=(1000, 3)).astype(np.float32) * [9, 3, 1]
+    cut = split(xyz, most)
+    np.testing.assert_array_equal(np.sort(cut.order), np.arange(1000))
+    sizes = np.diff(cut.start)
+    assert len(cut) == -(-1000 // most)
+    assert 0 < sizes.min() <= sizes.max() <= most
+    assert sizes.max() - sizes.min() <= len(cut).bit_length()
+
+
+def test_tiles_do_not_overlap_and_do_not_depend_on_the_order_of_points():
+    random = np.random.default_rng(1)
+    xyz = random.random((3000, 3)).astype(np.float32)
+    cut = split(xyz, 200)
+    parts = [xyz[cut.order[cut.part(tile)]] for tile in range(len(cut))]
+    boxes = np.array([[part.min(axis=0), part.max(axis=0)] for part in parts])
+    apart = (boxes[:, None, 0] > boxes[None, :, 1]).any(axis=2)
+    assert (apart | apart.T | np.eye(len(cut), dtype=bool)).all()
+    order = random.permutation(3000)
+    other = split(xyz[order], 200)
+    assert [set(order[other.order[other.part(tile)]]) for tile in range(len(other))] == [
+        set(cut.order[cut.part(tile)]) for tile in range(len(cut))
+    ]
+
+
+def test_coincident_points_stay_together():
+    xyz = np.repeat(np.array([[0, 0, 0], [1, 0, 0]], np.float32), 50, axis=0)
+    cut = split(xyz, 10)
+    assert [sorted(cut.order[cut.part(tile)]) for tile in range(len(cut))] == [list(range(50)), list(range(50, 100))]
+
+
+def test_one_tile_is_the_fit_itself(monkeypatch):
+    monkeypatch.setattr(tiles, "FINEST_PX", 1e-6)
+    cloud = fit_tiles(street().scene, SETTINGS, points_per_tile=POINTS, progress=False)
+    assert len(whole().instances) > 20
+    np.testing.assert_array_equal(cloud.instance_ids, whole().instance_ids)
+    for name in ("points", "views", "masks", "whole", "descriptor_instance"):
+        np.testing.assert_array_equal(getattr(cloud.instances, name), getattr(whole().instances, name))
+    for name in ("descriptors", "agreement", "visible_area"):
+        np.testing.assert_allclose(
+            getattr(cloud.instances, name), getattr(whole().instances, name), rtol=1e-3, atol=1e-5
+        )
+    assert (cloud.spacing, cloud.reach) == pytest.approx((whole().spacing, whole().reach))
+
+
+@pytest.mark.parametrize("most", [POINTS // 2, POINTS // 4])
+def test_tiles_label_as_one_fit_does(most):
+    cloud = tiled(most)
+    assert len(cloud.provenance["notes"]["tiles"]) == POINTS // most
+    assert agreement(whole().instance_ids, cloud.instance_ids) > 0.99
+    states = [np.minimum(ids, 0) for ids in (whole().instance_ids, cloud.instance_ids)]
+    assert (states[0] == states[1]).mean() > 0.99
+
+
+def test_evidence_is_summed_over_tiles():
+    cloud, reference = tiled(POINTS // 4), whole()
+    shared = np.zeros((len(reference.instances), len(cloud.instances)))
+    both = (cloud.instance_ids >= 0) & (reference.instance_ids >= 0)
+    np.add.at(shared, (reference.instance_ids[both], cloud.instance_ids[both]), 1)
+    large = np.flatnonzero(reference.instances.points > 500)
+    same = shared[large].argmax(axis=1)
+    for name in ("points", "views", "masks", "visible_area"):
+        ratio = getattr(cloud.instances, name)[same] / getattr(reference.instances, name)[large]
+        assert np.median(np.abs(ratio - 1)) < 0.02, name
+    rows = np.searchsorted(reference.instances.descriptor_instance, large)
+    cosine = (reference.instances.descriptors[rows] * cloud.instances.descriptors[same]).sum(axis=1)
+    assert np.median(cosine) > 0.999
+
+
+def test_an_object_across_a_border_is_one_instance():
+    made, cloud = street(), tiled(POINTS // 6)
+    cut = split(made.scene.points.xyz, POINTS // 6)
+    tile = np.empty(POINTS, int)
+    tile[cut.order] = np.repeat(np.arange(len(cut)), np.diff(cut.start))
+    usable = (whole().instance_ids >= 0) & (cloud.instance_ids >= 0)
+    crossing = 0
+    for instance in range(len(whole().instances)):
+        ids = [
+            np.bincount(cloud.instance_ids[part]).argmax()
+            for part in (
+                np.flatnonzero(usable & (whole().instance_ids == instance) & (tile == t)) for t in range(len(cut))
+            )
+            if len(part) > 100
+        ]
+        crossing += len(ids) > 1
+        assert len(set(ids)) <= 1
+    assert crossing >= 3
+
+
+def test_the_order_of_points_does_not_matter():
+    made = street()
+    order = np.random.default_rng(2).permutation(POINTS)
+    points = made.scene.points
+    shuffled = replace(made.scene, points=Points(points.xyz[order], points.origin, points.rgb[order]))
+    cloud = fit_tiles(shuffled, SETTINGS, points_per_tile=POINTS // 4, progress=False)
+    assert agreement(tiled(POINTS // 4).instance_ids[order], cloud.instance_ids) > 0.999
+
+
+def two_walls() -> Scene:
+    """A wall at depth 2 with a mask all over it, a wall at depth 6 behind it: no camera sees the second."""
+    side = np.linspace(-1, 1, 40)
+    front = np.stack(np.meshgrid(side, side, [2.0]), axis=-1).reshape(-1, 3)
+    back = np.stack(np.meshgrid(1.5 * side, 1.5 * side, [6.0]), axis=-1).reshape(-1, 3)
+    views = []
+    for index, x in enumerate((-0.1, 0.0, 0.1)):
+        pose = np.eye(4)
+        pose[0, 3] = x
+        camera = Camera(60, 60, 80.0, 80.0, 30.0, 30.0, pose)
+        views.append(View(f"view{index}", camera, np.zeros((60, 60), np.int32), np.ones((1, 4), np.float32)))
+    xyz = np.concatenate([front, back]).astype(np.float32)
+    return Scene(Points(xyz, np.zeros(3)), tuple(views), "tiny-test-space")
+
+
+def test_what_stands_in_another_tile_hides_what_is_behind_it():
+    scene = two_walls()
+    cut = split(scene.points.xyz, 1600)
+    assert [set(scene.points.xyz[cut.order[cut.part(tile)], 2].tolist()) for tile in range(2)] == [{2.0}, {6.0}]
+    full = FitSettings(geometry=GeometrySettings(scales=(1.0,), start_scale=1.0, start_opacity=0.95, mask_share=1.0))
+    cloud = fit_tiles(scene, full, points_per_tile=1600, progress=False)
+    assert (cloud.instance_ids[:1600] == 0).mean() > 0.7  # the rest is outside the images
+    assert (cloud.instance_ids[1600:] < 0).all()
+
+
+def tiled_cloud(points: Points, spacing: float) -> tiles._TiledCloud:
+    order = np.arange(len(points))
+    cut = tiles.Tiles(order, np.array([0, len(points)]))
+    return tiles._TiledCloud(cut, points, np.full(len(points), spacing, np.float32), (order.astype(np.int32),))
+
+
+def test_every_point_that_shows_is_worth_drawing(monkeypatch):
+    monkeypatch.setattr(tiles, "FINEST_PX", 1e-6)
+    random = np.random.default_rng(3)
+    points = Points((4 * random.normal(size=(4000, 3))).astype(np.float32), np.zeros(3))
+    camera = Camera(40, 30, 25.0, 40.0, 3.0, 28.0, np.eye(4))
+    view = View("view", camera, np.full((30, 40), -1, np.int32), np.zeros((0, 4), np.float32))
+    cloud = tiled_cloud(points, 0.3)
+    drawing = tiles._Drawing(1.0, 0.01, 0.1, 0.3, 1)  # so faint that nothing hides anything
+    everything = drawing.splats(cloud, np.arange(4000), np.ones(4000, np.float32))
+    shows = np.unique(mask_table(everything, [view], drawing.near).exposure.indices)
+    rows, larger, inside = tiles._worth_drawing(view, cloud, drawing)
+    assert len(shows) > 250
+    assert set(shows) <= set(rows)
+    assert len(rows) == inside < 2000
+    assert (larger == 1).all()
+
+
+def test_points_finer_than_pixels_are_thinned_to_them(monkeypatch):
+    random = np.random.default_rng(4)
+    xyz = np.concatenate([random.uniform(-1, 1, (40_000, 2)), np.full((40_000, 1), 4.0)], axis=1).astype(np.float32)
+    camera = Camera(80, 80, 160.0, 160.0, 40.0, 40.0, np.eye(4))
+    view = View("view", camera, np.full((80, 80), -1, np.int32), np.zeros((0, 4), np.float32))
+    cloud = tiled_cloud(Points(xyz, np.zeros(3)), 0.00625)  # a quarter of a pixel, half of FINEST_PX
+    drawing = tiles._Drawing(0.5, 0.9, 0.1, 0.00625, 1)
+    rows, larger, inside = tiles._worth_drawing(view, cloud, drawing)
+    assert inside == 40_000
+    assert len(rows) == pytest.approx(10_000, rel=0.05)
+    np.testing.assert_allclose(larger, 2, rtol=1e-3)
+    others, _, _ = tiles._worth_drawing(replace(view, name="other"), cloud, drawing)
+    assert len(np.intersect1d(rows, others)) == pytest.approx(2_500, rel=0.1)
+    monkeypatch.setattr(tiles, "MOST_SPLATS", 3_000)
+    rows, larger, _ = tiles._worth_drawing(view, cloud, drawing)
+    assert 2_000 < len(rows) < 3_200
+    assert (larger**2).sum() == pytest.approx(40_000, rel=0.05)
+
+
+def test_an_interrupted_fit_goes_on_behind_its_last_view(tmp_path, monkeypatch):
+    real, rendered = tiles._entries, []
+
+    def interrupted(view, *rest):
+        if len(rendered) == 5:
+            raise KeyboardInterrupt
+        rendered.append(view.name)
+        return real(view, *rest)
+
+    work = tmp_path / "work"
+    monkeypatch.setattr(tiles, "_entries", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        fit_tiles(street().scene, SETTINGS, points_per_tile=POINTS // 4, work=work, progress=False)
+    assert tiles.kept_views(work) == 5
+    monkeypatch.setattr(tiles, "_entries", lambda view, *rest: rendered.append(view.name) or real(view, *rest))
+    cloud = fit_tiles(street().scene, SETTINGS, points_per_tile=POINTS // 4, work=work, progress=False)
+    assert rendered == [view.name for view in street().scene.views]
+    np.testing.assert_array_equal(cloud.instance_ids, tiled(POINTS // 4).instance_ids)
+    assert not work.exists()
+
+
+def test_another_scene_takes_up_nothing(tmp_path, monkeypatch):
+    work = tmp_path / "work"
+    scene = two_walls()
+    monkeypatch.setattr(tiles, "_settle", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+    with pytest.raises(KeyboardInterrupt):
+        fit_tiles(scene, SETTINGS, points_per_tile=1600, work=work, progress=False)
+    before = set(work.iterdir())
+    masks = [np.where(np.arange(60) < 30, -1, view.mask_map()).astype(np.int32) for view in scene.views]
+    other = replace(scene, views=tuple(replace(v, masks=m) for v, m in zip(scene.views, masks, strict=True)))
+    moved = replace(scene, points=Points(scene.points.xyz + np.float32(0.01), np.zeros(3)))
+    for changed, new in ((other, 3), (moved, 2 + 3)):
+        with pytest.raises(KeyboardInterrupt):
+            fit_tiles(changed, SETTINGS, points_per_tile=1600, work=work, progress=False)
+        assert len(set(work.iterdir()) - before) == new
+        before = set(work.iterdir())
+
+
+def test_bad_use_is_told_at_the_door():
+    scene = two_walls()
+    with pytest.raises(OgPointcloudError, match=r'mode is "fast".*expected "auto" or "grouping"'):
+        fit_tiles(scene, FitSettings(mode="fast"), points_per_tile=1600)
+    bare = tuple(
+        replace(view, mask_features=np.zeros((0, 4), np.float32), masks=view.mask_map() - 1) for view in scene.views
+    )
+    with pytest.raises(SceneError, match="has a mask"):
+        fit_tiles(replace(scene, views=bare), points_per_tile=1600)
+    behind = replace(scene, points=Points(-scene.points.xyz, np.zeros(3)))
+    with pytest.raises(SceneError, match="no camera sees the cloud"):
+        fit_tiles(behind, points_per_tile=1600, progress=False)
+    with pytest.raises(OgPointcloudError, match="give it more memory"):
+        fit_tiles(scene, FitSettings(memory=64_000_000), progress=False)
+
+
+def test_tiles_are_needed_where_memory_is_short():
+    scene = two_walls()
+    assert not tiles.needs_tiles(scene, FitSettings())
+    assert tiles.needs_tiles(scene, FitSettings(memory=64_000_000))
+    assert not tiles.needs_tiles(scene, FitSettings(memory=64_000_000, mode="paper"))
+
+
+def test_the_command_fits_in_tiles(tiny_capture: TinyCapture, tmp_path):
+    bundle = tmp_path / "tiny.ogpc"
+    main(["fit", str(tiny_capture.folder), "-o", str(bundle), "--tile-points", "600"])
+    scene = og.load(bundle)
+    result = og.segment(scene.xyz, ["red ball", "blue ball"], scene)
+    assert tiny_capture.share_correct(result.labels, list(result.names)) > 0.95
+    assert not list(tmp_path.glob("*.work"))
