@@ -105,6 +105,11 @@ def prepare(
             f"no camera sees the cloud: {len(scene.points)} points, {len(scene.views)} views, none in any image; check "
             "that poses and cloud share one frame and that poses are camera-to-world (transforms.json) as documented"
         )
+    if table.weights.nnz == 0:
+        raise SceneError(
+            f"none of the {len(table.mask_view)} masks shows a Gaussian; expected at least one: make masks, and check "
+            "that poses and cloud share one frame"
+        )
     with journal.stage("visibility"):
         table = _front_surfaces(scene, table, gaussians, settings, journal)
     return Prepared(around, gaussians, near, stride, table)

@@ -75,9 +75,10 @@ class MaskTable:
 
     @property
     def unit_features(self) -> NDArray[np.float32]:
-        """(masks, D) mask features of length 1; zero rows stay zero."""
-        length = np.linalg.norm(self.mask_features, axis=1, keepdims=True)
-        return (self.mask_features / np.where(length > 0, length, 1)).astype(np.float32)
+        """(masks, D) mask features of length 1; zero rows stay zero. Lengths of 1e30 would overflow float32."""
+        wide = self.mask_features.astype(np.float64)
+        length = np.linalg.norm(wide, axis=1, keepdims=True)
+        return (wide / np.where(length > 0, length, 1)).astype(np.float32)
 
     @property
     def seen(self) -> NDArray[np.float64]:

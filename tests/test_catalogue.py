@@ -12,10 +12,6 @@ from og_pointcloud.catalogue.case import Answer, largest_error, run_case
 from og_pointcloud.cli import main
 from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError, SceneError
 
-KNOWN_DEFECTS: dict[str, str] = {
-    "masks_without_pixels": "modes auto and grouping answer with no instance, or an IndexError, instead of an error",
-    "feature_length_of_a_fit": "MaskTable.unit_features takes lengths in float32",
-}
 NAIVE_BREAKS = {
     "needle": 1e6,
     "pancake": 1e6,
@@ -36,9 +32,7 @@ NAIVE_BREAKS = {
 
 
 def _parameter(case: Case):
-    reason = KNOWN_DEFECTS.get(case.name)
-    marks = [pytest.mark.xfail(strict=True, reason=reason)] if reason else []
-    return pytest.param(case, id=f"{case.family}-{case.name}", marks=marks)
+    return pytest.param(case, id=f"{case.family}-{case.name}")
 
 
 @pytest.mark.parametrize("case", [_parameter(case) for case in find_cases(quick=True)])

@@ -381,11 +381,10 @@ def test_pixels_much_finer_than_the_points_are_left_out() -> None:
     assert cloud.instance_ids.tolist() == [0] * 3
 
 
-def test_masks_without_a_pixel_give_no_instance() -> None:
-    cloud = fit(tiny_scene(5, masked=False), progress=False)
-    assert cloud.instance_ids.tolist() == [BACKGROUND] * 5
-    assert len(cloud.instances) == 0
-    assert any("no instance was found" in warning for warning in cloud.provenance["warnings"])
+@pytest.mark.parametrize("mode", ["auto", "grouping", "fast"])
+def test_masks_that_show_no_point_are_refused(mode: str) -> None:
+    with pytest.raises(SceneError, match=r"none of the \d+ masks shows a Gaussian; expected at least one: make masks"):
+        fit(tiny_scene(5, masked=False), FitSettings(mode=mode), progress=False)  # type: ignore[arg-type]
 
 
 def test_duplicated_points_share_their_label(known: Known) -> None:
