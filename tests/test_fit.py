@@ -15,7 +15,7 @@ from og_pointcloud.cloud import BACKGROUND, UNOBSERVED, LabelledCloud
 from og_pointcloud.errors import SceneError
 from og_pointcloud.fit import fit, prepare
 from og_pointcloud.scene import Camera, Points, Scene, View
-from og_pointcloud.settings import FitSettings
+from og_pointcloud.settings import FitSettings, MembershipSettings
 
 WIDTH, HEIGHT, FOCAL_PX = 96, 72, 90.0
 LOWER = np.array([[-1.0, -0.9, 0], [0.2, -1.0, 0], [-0.9, 0.3, 0], [0.4, 0.3, 0]])
@@ -385,6 +385,13 @@ def test_pixels_much_finer_than_the_points_are_left_out() -> None:
 def test_masks_that_show_no_point_are_refused(mode: str) -> None:
     with pytest.raises(SceneError, match=r"none of the \d+ masks shows a Gaussian; expected at least one: make masks"):
         fit(tiny_scene(5, masked=False), FitSettings(mode=mode), progress=False)  # type: ignore[arg-type]
+
+
+def test_a_fit_without_an_instance_says_so() -> None:
+    never = MembershipSettings(sure_share=2, covered_share=2)  # no share of a point's weight reaches 2
+    cloud = fit(boxes_on_a_table().scene, FitSettings(membership=never), progress=False)
+    assert len(cloud.instances) == 0
+    assert any("no instance was found" in warning for warning in cloud.provenance["warnings"])
 
 
 def test_duplicated_points_share_their_label(known: Known) -> None:
