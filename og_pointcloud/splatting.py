@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from og_pointcloud.errors import SceneError
+from og_pointcloud.lanes import WIDTH, any_of, either, exp2, lesser, load, ramp, spread, store, total
 from og_pointcloud.scene import Camera, Points
 
 # OpenMP first: numba else tries TBB, and warns where it finds an old one. A user's own choice is kept.
@@ -44,18 +45,26 @@ __all__ = [
     "working_memory",
 ]
 
-TILE = 16
-"""Pixels along a tile's side, as in 3DGS."""
+TILE = WIDTH
+"""Pixels along a tile's side: 16 as in 3DGS, so that a row of a tile is one vector."""
+BATCH = 128
+"""Splats of a tile that are fetched at once."""
+ZERO, HALF, ONE = np.float32(0), np.float32(0.5), np.float32(1)
 LOW_PASS = 0.3
 """Added to the projected covariance, px^2: a splat is never smaller than about a pixel (3DGS)."""
 ALPHA_MIN = 1.0 / 255.0
 """Contributions below are dropped (3DGS)."""
+LOG2_E = np.log2(np.e)
+LOG2_OF_ALPHA_MIN = np.log2(ALPHA_MIN)
+LOG2_ALPHA_MIN = np.float32(LOG2_OF_ALPHA_MIN)
 LARGEST_REACH = 2 * np.log(1 / ALPHA_MIN)
 """Squared Mahalanobis distance at which alpha falls to ALPHA_MIN, at opacity 1."""
 ALPHA_MAX = 0.99
 """Alpha is cut here (3DGS)."""
 TRANSMITTANCE_MIN = 1e-4
 """A pixel stops before the splat that would bring its transmittance below (3DGS)."""
+LEAST_LIGHT = np.float32(0.99999 * TRANSMITTANCE_MIN)
+"""By more than rounding below: four splats of opacity 0.9 leave just the limit."""
 FRUSTUM_MARGIN = 0.3
 """Centres beyond the image by more than this share of the half field of view are clamped when the projection is
 linearised (3DGS's 1.3 tan(fov/2), written for any principal point)."""
@@ -164,17 +173,24 @@ def _entries(
 ) -> tuple[tuple[NDArray[Any], ...], NDArray[np.float64]]:
     """What `view_weights` adds up, tile by tile: (rows, cols, weights, first, counts), tile t's entries being
     first[t] : first[t] + counts[t]; and the area of each splat."""
-    splats, keys = _project(
+    pose, near = camera.world_to_camera, float(near)
+    intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
+    size = (camera.width, camera.height)
+    near_image = _near_image(gaussians.xyz, gaussians.scale, gaussians.opacity, pose, intrinsics, size, near)
+    chosen = np.flatnonzero(near_image).astype(np.int32)
+    splats, area = _records(len(chosen)), np.zeros(len(gaussians))
+    keys = _project(
+        chosen,
         gaussians.xyz,
         gaussians.scale,
         gaussians.rotation,
         gaussians.opacity,
-        np.full(len(gaussians), np.inf, np.float32) if thickness is None else thickness,
-        camera.world_to_camera,
-        np.array([camera.fx, camera.fy, camera.cx, camera.cy]),
-        camera.width,
-        camera.height,
-        near,
+        np.full(1, np.inf, np.float32) if thickness is None else thickness,
+        pose,
+        intrinsics,
+        size,
+        splats,
+        area,
     )
     keys = np.sort(keys[keys != _CULLED])
     order = (keys & np.uint64(0xFFFFFFFF)).astype(np.int32)
@@ -187,87 +203,141 @@ def _entries(
     rows, cols, weights, counts = _composite(
         splats, starts, members, masks, id_count, columns, first, numba.get_num_threads()
     )
-    area = np.zeros(len(gaussians))
-    area[order] = splats[order, _AREA]
     return (rows, cols, weights, first[:-1], counts), area
 
 
+def _records(count: int) -> NDArray[Any]:
+    """Splats with undefined values, each within one line of a processor's cache."""
+    room = np.empty((count + 1) * SPLAT.itemsize, np.uint8)
+    ahead = -room.ctypes.data % SPLAT.itemsize
+    return room[ahead : ahead + count * SPLAT.itemsize].view(SPLAT)
+
+
 _CULLED = np.uint64(0xFFFFFFFFFFFFFFFF)
-# Columns of the splat record: centre (px), conic (inverse covariance xx, xy, yy), opacity, pixel box (inclusive), the
-# largest squared Mahalanobis distance that still contributes, weight in pixels if nothing were in front, exp(-xx),
-# exp(-yy), exp(-xy), 1 where no corner of the box is so far out that recurrences from it would underflow, depth, and
-# the depth of the nearest surface that it can belong to.
-_U, _V, _XX, _XY, _YY, _SIGMA, _X0, _X1, _Y0, _Y1, _LIMIT, _AREA, _STEP_X, _STEP_Y, _STEP_XY, _GENTLE, *_ = range(19)
-_DEPTH, _SURFACE, _SIZE = 16, 17, 18
+SPLAT = np.dtype(
+    [
+        ("u", np.float64),  # centre, px
+        ("v", np.float64),
+        ("shear", np.float64),  # px that the middle of a row moves to the left for each row down
+        ("across", np.float32),  # log2 of the density along a row is -(across * distance to the row's middle)^2
+        ("down", np.float32),  # log2 of the density at the rows' middles is -down * (distance to the centre's row)^2
+        ("peak", np.float32),  # log2 of the opacity
+        ("depth", np.float32),
+        ("surface", np.float32),  # depth of the nearest surface that it can belong to
+        ("x0", np.int32),  # the pixels that it may show in, inclusive
+        ("x1", np.int32),
+        ("y0", np.int32),
+        ("y1", np.int32),
+        ("gaussian", np.int32),
+    ],
+    align=True,
+)
+"""A projected Gaussian, in one line of a processor's cache. Split into rows, a quadratic form has no differences of
+large numbers: float32 holds it for any needle."""
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _seen_from(x, y, z, pose):  # noqa: ANN001, ANN202
+    """Depth, and the two slopes of the ray to a point."""
+    depth = pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] * z + pose[2, 3]
+    across = (pose[0, 0] * x + pose[0, 1] * y + pose[0, 2] * z + pose[0, 3]) / depth
+    return depth, across, (pose[1, 0] * x + pose[1, 1] * y + pose[1, 2] * z + pose[1, 3]) / depth
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _linearised_at(tx, ty, intrinsics, size):  # noqa: ANN001, ANN202
+    """The slopes at which the projection is linearised: those of the ray, at most FRUSTUM_MARGIN outside the image."""
+    fx, fy, cx, cy = intrinsics
+    margin_x, margin_y = FRUSTUM_MARGIN * 0.5 * size[0] / fx, FRUSTUM_MARGIN * 0.5 * size[1] / fy
+    return (
+        min(max(tx, -cx / fx - margin_x), (size[0] - cx) / fx + margin_x),
+        min(max(ty, -cy / fy - margin_y), (size[1] - cy) / fy + margin_y),
+    )
 
 
 @njit(cache=True, parallel=True, nogil=True, error_model="numpy")
-def _project(xyz, scale, rotation, opacity, thickness, pose, intrinsics, width, height, near):  # noqa: ANN001, ANN202
-    """EWA projection of every Gaussian in float64: splat records (n, _SIZE) and depth keys (n,) uint64.
-
-    A key is the float32 depth's bits above the index: sorting keys sorts by depth, ties by index.
-    """
+def _near_image(xyz, scale, opacity, pose, intrinsics, size, near):  # noqa: ANN001, ANN202
+    """(n,) bool: Gaussians that may show. Most of a scene lies outside a view: turned away before an ellipse is known,
+    by the largest that it could be."""
     n = len(xyz)
-    splats = np.empty((n, _SIZE))
-    depth = np.empty(n, np.float32)
-    keys = np.empty(n, np.uint64)
+    chosen = np.zeros(n, np.bool_)
     fx, fy, cx, cy = intrinsics
-    half_x, half_y = 0.5 * width / fx, 0.5 * height / fy
-    x_low, x_high = -cx / fx - FRUSTUM_MARGIN * half_x, (width - cx) / fx + FRUSTUM_MARGIN * half_x
-    y_low, y_high = -cy / fy - FRUSTUM_MARGIN * half_y, (height - cy) / fy + FRUSTUM_MARGIN * half_y
     for g in prange(n):
-        keys[g] = _CULLED
-        x, y, z = np.float64(xyz[g, 0]), np.float64(xyz[g, 1]), np.float64(xyz[g, 2])
-        cz = pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] * z + pose[2, 3]
-        sigma = np.float64(opacity[g])
-        if not cz > near or not sigma > ALPHA_MIN:
+        depth, tx, ty = _seen_from(np.float64(xyz[g, 0]), np.float64(xyz[g, 1]), np.float64(xyz[g, 2]), pose)
+        if not depth > near or not opacity[g] > ALPHA_MIN:
             continue
-        tx = (pose[0, 0] * x + pose[0, 1] * y + pose[0, 2] * z + pose[0, 3]) / cz
-        ty = (pose[1, 0] * x + pose[1, 1] * y + pose[1, 2] * z + pose[1, 3]) / cz
-        u, v = fx * tx + cx, fy * ty + cy
-        jx, jy = min(max(tx, x_low), x_high), min(max(ty, y_low), y_high)
-        # Most of a scene lies outside a view: turned away before its ellipse is known, by the largest it could be.
-        largest = np.float64(max(scale[g, 0], scale[g, 1], scale[g, 2])) / cz
-        room_x = np.sqrt(LARGEST_REACH * (fx * fx * largest * largest * (1 + jx * jx) + LOW_PASS)) + 1.0
-        room_y = np.sqrt(LARGEST_REACH * (fy * fy * largest * largest * (1 + jy * jy) + LOW_PASS)) + 1.0
-        if u < -room_x or u > width + room_x or v < -room_y or v > height + room_y:
-            continue
-        # The projected axes: columns of J R_camera R_gaussian S, a 2x3 matrix whose V V' is the covariance.
-        qw, qx = np.float64(rotation[g, 0]), np.float64(rotation[g, 1])
-        qy, qz = np.float64(rotation[g, 2]), np.float64(rotation[g, 3])
-        axis = (1 - 2 * (qy * qy + qz * qz), 2 * (qx * qy + qw * qz), 2 * (qx * qz - qw * qy))
-        vx0, vy0 = _projected_axis(axis, np.float64(scale[g, 0]), pose, fx / cz, fy / cz, jx, jy)
-        axis = (2 * (qx * qy - qw * qz), 1 - 2 * (qx * qx + qz * qz), 2 * (qy * qz + qw * qx))
-        vx1, vy1 = _projected_axis(axis, np.float64(scale[g, 1]), pose, fx / cz, fy / cz, jx, jy)
-        axis = (2 * (qx * qz + qw * qy), 2 * (qy * qz - qw * qx), 1 - 2 * (qx * qx + qy * qy))
-        vx2, vy2 = _projected_axis(axis, np.float64(scale[g, 2]), pose, fx / cz, fy / cz, jx, jy)
-        sxx = vx0 * vx0 + vx1 * vx1 + vx2 * vx2
-        syy = vy0 * vy0 + vy1 * vy1 + vy2 * vy2
-        sxy = vx0 * vy0 + vx1 * vy1 + vx2 * vy2
-        # det(V V' + c I) as a sum of positive terms (Cauchy-Binet): no cancellation for needles.
-        m01, m02, m12 = vx0 * vy1 - vx1 * vy0, vx0 * vy2 - vx2 * vy0, vx1 * vy2 - vx2 * vy1
-        det = m01 * m01 + m02 * m02 + m12 * m12 + LOW_PASS * (sxx + syy) + LOW_PASS * LOW_PASS
-        sxx += LOW_PASS
-        syy += LOW_PASS
+        jx, jy = _linearised_at(tx, ty, intrinsics, size)
+        largest = np.float64(max(scale[g, 0], scale[g, 1], scale[g, 2])) / depth
+        xx = fx * fx * largest * largest * (1 + jx * jx) + LOW_PASS
+        yy = fy * fy * largest * largest * (1 + jy * jy) + LOW_PASS
+        chosen[g] = _reaches(fx * tx + cx, size[0], xx) and _reaches(fy * ty + cy, size[1], yy)
+    return chosen
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _reaches(at, size, variance):  # noqa: ANN001, ANN202
+    """Whether a splat of that largest variance (px^2) about ``at`` may show in pixels 0 to size."""
+    outside = max(-at, at - size) - 1.0
+    return not (outside > 0.0 and outside * outside > LARGEST_REACH * variance)
+
+
+@njit(cache=True, parallel=True, nogil=True, error_model="numpy")
+def _project(chosen, xyz, scale, rotation, opacity, thickness, pose, intrinsics, size, splats, area):  # noqa: ANN001, ANN202
+    """EWA projection of the chosen Gaussians in float64: writes splats (m,) and area (n,), the weight in pixels if
+    nothing were in front; returns depth keys (m,) uint64.
+
+    A key is the float32 depth's bits above the place: sorting keys sorts by depth, ties by Gaussian. Splats without a
+    pixel have the key _CULLED.
+    """
+    m = len(chosen)
+    keys = np.empty(m, np.uint64)
+    fx, fy, cx, cy = intrinsics
+    for i in prange(m):
+        g = chosen[i]
+        depth, tx, ty = _seen_from(np.float64(xyz[g, 0]), np.float64(xyz[g, 1]), np.float64(xyz[g, 2]), pose)
+        jx, jy = _linearised_at(tx, ty, intrinsics, size)
+        sxx, sxy, syy, det = _covariance(scale[g], rotation[g], pose, fx / depth, fy / depth, jx, jy)
+        u, v, sigma = fx * tx + cx, fy * ty + cy, np.float64(opacity[g])
         # The ellipse on which alpha falls to ALPHA_MIN; its box holds every pixel that can contribute.
-        reach = 2.0 * np.log(sigma / ALPHA_MIN)
+        peak = np.log2(sigma)
+        reach = 2.0 / LOG2_E * (peak - LOG2_OF_ALPHA_MIN)
         rx, ry = np.sqrt(reach * sxx), np.sqrt(reach * syy)
-        x0, x1 = max(np.ceil(u - rx - 0.5), 0.0), min(np.floor(u + rx - 0.5), width - 1.0)
-        y0, y1 = max(np.ceil(v - ry - 0.5), 0.0), min(np.floor(v + ry - 0.5), height - 1.0)
+        x0, x1 = max(np.ceil(u - rx - 0.5), 0.0), min(np.floor(u + rx - 0.5), size[0] - 1.0)
+        y0, y1 = max(np.ceil(v - ry - 0.5), 0.0), min(np.floor(v + ry - 0.5), size[1] - 1.0)
+        keys[i] = _CULLED
         if not (x0 <= x1 and y0 <= y1 and det < np.inf):
             continue
-        s = splats[g]
-        s[_U], s[_V], s[_XX], s[_XY], s[_YY], s[_SIGMA] = u, v, syy / det, -sxy / det, sxx / det, sigma
-        s[_X0], s[_X1], s[_Y0], s[_Y1], s[_LIMIT] = x0, x1, y0, y1, reach
-        s[_STEP_X], s[_STEP_Y], s[_STEP_XY] = np.exp(-syy / det), np.exp(-sxx / det), np.exp(sxy / det)
-        # The density at a corner is exp(-reach / (1 - |correlation|)) of the peak.
-        s[_GENTLE] = 1.0 if reach < 300 * (1 - abs(sxy) / np.sqrt(sxx * syy)) else 0.0
-        # The integral of alpha over that ellipse.
-        s[_AREA] = 2 * np.pi * np.sqrt(det) * (sigma - ALPHA_MIN)
-        s[_DEPTH], s[_SURFACE] = cz, cz - thickness[g]
-        depth[g] = cz
-        keys[g] = (np.uint64(depth.view(np.uint32)[g]) << np.uint64(32)) | np.uint64(g)
-    return splats, keys
+        s = splats[i]
+        s.u, s.v, s.shear = u, v, -sxy / syy
+        s.across, s.down = np.sqrt(0.5 * LOG2_E * syy / det), 0.5 * LOG2_E / syy
+        s.peak, s.depth, s.surface = peak, depth, depth - thickness[g if len(thickness) > 1 else 0]
+        s.x0, s.x1, s.y0, s.y1, s.gaussian = int(x0), int(x1), int(y0), int(y1), g
+        area[g] = 2 * np.pi * np.sqrt(det) * (sigma - ALPHA_MIN)  # the integral of alpha over that ellipse
+        keys[i] = (np.uint64(np.float32(depth).view(np.uint32)) << np.uint64(32)) | np.uint64(i)
+    return keys
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _covariance(scale, rotation, pose, px, py, jx, jy):  # noqa: ANN001, ANN202
+    """(xx, xy, yy, determinant) of a splat's covariance, px^2, linearised at slopes (jx, jy).
+
+    The projected axes are the columns of J R_camera R_gaussian S, a 2x3 matrix V; the covariance is V V' + c I.
+    """
+    qw, qx = np.float64(rotation[0]), np.float64(rotation[1])
+    qy, qz = np.float64(rotation[2]), np.float64(rotation[3])
+    axis = (1 - 2 * (qy * qy + qz * qz), 2 * (qx * qy + qw * qz), 2 * (qx * qz - qw * qy))
+    vx0, vy0 = _projected_axis(axis, np.float64(scale[0]), pose, px, py, jx, jy)
+    axis = (2 * (qx * qy - qw * qz), 1 - 2 * (qx * qx + qz * qz), 2 * (qy * qz + qw * qx))
+    vx1, vy1 = _projected_axis(axis, np.float64(scale[1]), pose, px, py, jx, jy)
+    axis = (2 * (qx * qz + qw * qy), 2 * (qy * qz - qw * qx), 1 - 2 * (qx * qx + qy * qy))
+    vx2, vy2 = _projected_axis(axis, np.float64(scale[2]), pose, px, py, jx, jy)
+    sxx = vx0 * vx0 + vx1 * vx1 + vx2 * vx2
+    syy = vy0 * vy0 + vy1 * vy1 + vy2 * vy2
+    sxy = vx0 * vy0 + vx1 * vy1 + vx2 * vy2
+    # det(V V' + c I) as a sum of positive terms (Cauchy-Binet): no cancellation for needles.
+    m01, m02, m12 = vx0 * vy1 - vx1 * vy0, vx0 * vy2 - vx2 * vy0, vx1 * vy2 - vx2 * vy1
+    det = m01 * m01 + m02 * m02 + m12 * m12 + LOW_PASS * (sxx + syy) + LOW_PASS * LOW_PASS
+    return sxx + LOW_PASS, sxy, syy + LOW_PASS, det
 
 
 @njit(cache=True, error_model="numpy")
@@ -279,22 +349,23 @@ def _projected_axis(axis, length, pose, px, py, jx, jy):  # noqa: ANN001, ANN202
     return px * (ex - jx * ez), py * (ey - jy * ez)
 
 
-@njit(cache=True, parallel=True, nogil=True)
+@njit(cache=True, parallel=True, nogil=True, error_model="numpy")
 def _bin(splats, order, columns, tiles, bands):  # noqa: ANN001, ANN202
     """Depth-ordered members of every tile: tile t holds members[starts[t]:starts[t + 1]]."""
     tile_rows = tiles // columns
     # The tile ranges side by side: every band reads all of them, twice.
-    ranges = np.empty((len(order), 4), np.int16)
+    ranges = np.empty((len(order), 4), np.int32)
     for i in prange(len(order)):
         s = splats[order[i]]
-        ranges[i, 0], ranges[i, 1] = int(s[_X0]) // TILE, int(s[_X1]) // TILE + 1
-        ranges[i, 2], ranges[i, 3] = int(s[_Y0]) // TILE, int(s[_Y1]) // TILE + 1
+        ranges[i, 0], ranges[i, 1] = s.x0 // TILE, s.x1 // TILE + 1
+        ranges[i, 2], ranges[i, 3] = s.y0 // TILE, s.y1 // TILE + 1
     counts = np.zeros(tiles + 1, np.int64)
     for band in prange(bands):
         low, high = band * tile_rows // bands, (band + 1) * tile_rows // bands
         for i in range(len(order)):
             for row in range(max(ranges[i, 2], low), min(ranges[i, 3], high)):
-                for column in range(ranges[i, 0], ranges[i, 1]):
+                begin, end = _tiles_of_row(splats, order[i], row, ranges[i, 0], ranges[i, 1])
+                for column in range(begin, end):
                     counts[row * columns + column + 1] += 1
     starts = np.cumsum(counts)
     members = np.empty(starts[-1], np.int32)
@@ -303,23 +374,41 @@ def _bin(splats, order, columns, tiles, bands):  # noqa: ANN001, ANN202
         low, high = band * tile_rows // bands, (band + 1) * tile_rows // bands
         for i in range(len(order)):
             for row in range(max(ranges[i, 2], low), min(ranges[i, 3], high)):
-                for column in range(ranges[i, 0], ranges[i, 1]):
+                begin, end = _tiles_of_row(splats, order[i], row, ranges[i, 0], ranges[i, 1])
+                for column in range(begin, end):
                     tile = row * columns + column
                     members[fill[tile]] = order[i]
                     fill[tile] += 1
     return starts, members
 
 
-@njit(cache=True, inline="always")
-def _clip_box(s, tile, columns):  # noqa: ANN001, ANN202
-    """The pixels of splat s within a tile: x0, x1, y0, y1 with exclusive ends."""
-    left, top = tile % columns * TILE, tile // columns * TILE
-    return (
-        max(int(s[_X0]), left),
-        min(int(s[_X1]) + 1, left + TILE),
-        max(int(s[_Y0]), top),
-        min(int(s[_Y1]) + 1, top + TILE),
-    )
+@njit(cache=True, nogil=True, error_model="numpy")
+def _tiles_of_row(splats, place, row, begin, end):  # noqa: ANN001, ANN202
+    """The columns of tiles that a splat's ellipse touches in a row of tiles, of those that its box does."""
+    if end - begin <= 2:
+        return begin, end
+    s = splats[place]
+    # Along dy, the ellipse's right end lies at u - shear dy + sqrt(room - down dy^2) / across: farthest out at `far`,
+    # within the row of tiles where it comes nearest to that; its left end is the mirror image.
+    room, across, down = np.float64(s.peak) - LOG2_ALPHA_MIN, np.float64(s.across), np.float64(s.down)
+    slant = s.shear * across
+    far = -slant * np.sqrt(room / down / (down + slant * slant))
+    low = max(row * TILE + 0.5 - s.v, -np.sqrt(room / down))
+    high = min(row * TILE + TILE - 0.5 - s.v, np.sqrt(room / down))
+    dy = min(max(far, low), high)
+    right = s.u - s.shear * dy + np.sqrt(max(room - down * dy * dy, 0.0)) / across
+    dy = min(max(-far, low), high)
+    left = s.u - s.shear * dy - np.sqrt(max(room - down * dy * dy, 0.0)) / across
+    if not (left > -1e9 and right < 1e9):  # also where they overflowed
+        return begin, end
+    # A hundredth of a pixel for what rounding may do; pixel centres lie at halves.
+    return max(begin, int(left - 0.51) // TILE), min(end, int(max(right - 0.49, -1.0)) // TILE + 1)
+
+
+@njit(cache=True, nogil=True)
+def _clip_box(s, left, top):  # noqa: ANN001, ANN202
+    """The pixels of splat s within a tile: x0, x1, y0, y1 counted from the tile's corner, with exclusive ends."""
+    return max(s.x0 - left, 0), min(s.x1 + 1 - left, TILE), max(s.y0 - top, 0), min(s.y1 + 1 - top, TILE)
 
 
 @njit(cache=True, parallel=True, nogil=True)
@@ -342,7 +431,7 @@ def _entry_bounds(splats, starts, members, masks, id_count, columns):  # noqa: A
             continue
         total = 0
         for m in range(starts[tile], starts[tile + 1]):
-            x0, x1, y0, y1 = _clip_box(splats[members[m]], tile, columns)
+            x0, x1, y0, y1 = _clip_box(splats[members[m]], left, top)
             total += min(distinct, id_count + 1, (x1 - x0) * (y1 - y0)) + 1
         bounds[tile] = total
     return bounds
@@ -354,92 +443,140 @@ def _composite(splats, starts, members, masks, id_count, columns, first, workers
 
     Row id_count holds pixels without a mask, row id_count + 1 what shows through surfaces (counted in its mask too)."""
     tiles = len(starts) - 1
-    height, width = masks.shape
     rows = np.empty(first[-1], np.int32)
     cols = np.empty(first[-1], np.int32)
     weights = np.empty(first[-1], np.float32)
     counts = np.zeros(tiles, np.int64)
     sums = np.zeros((workers, id_count + 1))
-    # Each worker takes every workers-th tile (neighbouring tiles cost alike, so the shares are even) and adds up in a
-    # scratch row of its own.
+    # Each worker takes every workers-th tile (neighbouring tiles cost alike, so the shares are even) and adds up in
+    # scratch rows of its own.
     for worker in prange(workers):
-        total = sums[worker]
-        touched = np.empty(TILE * TILE, np.int32)
+        sum_of, touched = sums[worker], np.empty(TILE * TILE, np.int32)
+        light, surface, shown = _scratch(), _scratch(), _scratch()
+        runs = np.empty((TILE, TILE), np.uint8)
+        batch = np.empty(BATCH, SPLAT)
         for tile in range(worker, tiles, workers):
             left, top = tile % columns * TILE, tile // columns * TILE
-            transmittance = np.ones((TILE, TILE))
-            surface = np.full((TILE, TILE), np.inf)
-            open_pixels = (min(top + TILE, height) - top) * (min(left + TILE, width) - left)
+            ids = masks[top : top + TILE, left : left + TILE]
+            is_one_mask = _begin_tile(ids, light, surface, runs)
             entry = first[tile]
-            for m in range(starts[tile], starts[tile + 1]):
-                if open_pixels == 0:
-                    break
-                g = members[m]
-                s = splats[g]
-                u, v, xx, xy, yy, sigma = s[_U], s[_V], s[_XX], s[_XY], s[_YY], s[_SIGMA]
-                x0, x1, y0, y1 = _clip_box(s, tile, columns)
-                touches, through = 0, 0.0
-                # exp of a quadratic by recurrence, along rows (`density`, `ratio`) and down the box's left edge
-                # (`edge`, `edge_ratio`, `first_ratio`): g(x + 1) = g(x) ratio(x), ratio(x + 1) = ratio(x) exp(-xx).
-                gentle = s[_GENTLE] > 0.0
-                dx, dy = x0 + 0.5 - u, y0 + 0.5 - v
-                edge = sigma * np.exp(-0.5 * (xx * dx * dx + yy * dy * dy) - xy * dx * dy) if gentle else 0.0
-                edge_ratio = np.exp(-yy * (dy + 0.5) - xy * dx) if gentle else 0.0
-                first_ratio = np.exp(-xx * (dx + 0.5) - xy * dy) if gentle else 0.0
-                for y in range(y0, y1):
-                    if gentle:
-                        begin, end, density, ratio = x0, x1, edge, first_ratio
-                        edge *= edge_ratio
-                        edge_ratio *= s[_STEP_Y]
-                        first_ratio *= s[_STEP_XY]
+            for begin in range(starts[tile], starts[tile + 1], BATCH):
+                count = min(BATCH, starts[tile + 1] - begin)
+                for k in range(count):  # they lie all over memory: fetched at once, they do not wait for each other
+                    batch[k] = splats[members[begin + k]]
+                for k in range(count):
+                    s = batch[k]
+                    weight, through = _blend(s, left, top, light, surface, shown)
+                    if weight == 0.0:
+                        continue
+                    x0, x1, y0, y1 = _clip_box(s, left, top)
+                    if is_one_mask or _shows_one_mask(ids, runs, x0, x1, y0, y1):
+                        rows[entry], cols[entry], weights[entry] = ids[y0, x0], s.gaussian, weight
+                        entry += 1
                     else:
-                        # A corner of the box would underflow: start each row on its chord of the ellipse instead.
-                        dy = y + 0.5 - v
-                        chord = xy * dy * xy * dy - xx * (yy * dy * dy - s[_LIMIT])
-                        if chord < 0.0:
-                            continue
-                        half, middle = np.sqrt(chord) / xx + 1e-6, u - xy * dy / xx - 0.5
-                        begin = max(x0, int(np.ceil(max(middle - half, -1.0))))
-                        end = min(x1, int(min(middle + half, 1e9)) + 1)
-                        if begin >= end:
-                            continue
-                        dx = begin + 0.5 - u
-                        density = sigma * np.exp(-0.5 * (xx * dx * dx + yy * dy * dy) - xy * dx * dy)
-                        ratio = np.exp(-xx * (dx + 0.5) - xy * dy)
-                    for x in range(begin, end):
-                        alpha = min(ALPHA_MAX, density)
-                        density *= ratio
-                        ratio *= s[_STEP_X]
-                        if alpha < ALPHA_MIN:
-                            continue
-                        t = transmittance[y - top, x - left]
-                        if t == 0.0:
-                            continue
-                        rest = t * (1.0 - alpha)
-                        if rest < TRANSMITTANCE_MIN:
-                            transmittance[y - top, x - left] = 0.0  # marks a finished pixel
-                            open_pixels -= 1
-                            continue
-                        if t >= 0.5 and rest < 0.5:
-                            surface[y - top, x - left] = s[_DEPTH]
-                        transmittance[y - top, x - left] = rest
-                        if s[_SURFACE] > surface[y - top, x - left]:
-                            through += t * alpha
-                        mask = masks[y, x]
-                        if total[mask] == 0.0:
-                            touched[touches] = mask
-                            touches += 1
-                        total[mask] += t * alpha
-                for k in range(touches):
-                    mask = touched[k]
-                    rows[entry], cols[entry], weights[entry] = mask, g, total[mask]
-                    total[mask] = 0.0
-                    entry += 1
-                if through > 0.0:
-                    rows[entry], cols[entry], weights[entry] = id_count + 1, g, through
-                    entry += 1
+                        for j in range(_add_by_mask(ids, shown, x0, x1, y0, y1, sum_of, touched)):
+                            rows[entry], cols[entry], weights[entry] = touched[j], s.gaussian, sum_of[touched[j]]
+                            sum_of[touched[j]] = 0.0
+                            entry += 1
+                    if through > 0.0:
+                        rows[entry], cols[entry], weights[entry] = id_count + 1, s.gaussian, through
+                        entry += 1
+                if not _is_open(light):
+                    break
             counts[tile] = entry - first[tile]
     return rows, cols, weights, counts
+
+
+@njit(cache=True, nogil=True)
+def _scratch():  # noqa: ANN202
+    """A number for each pixel of a tile; rows begin where vectors are read fastest."""
+    room = np.empty(TILE * TILE + 16, np.float32)
+    ahead = (64 - room.ctypes.data % 64) % 64 // 4
+    return room[ahead : ahead + TILE * TILE]
+
+
+@njit(cache=True, nogil=True)
+def _begin_tile(ids, light, surface, runs):  # noqa: ANN001, ANN202
+    """All light, no surface; pixels of a tile that are outside the image are dark. runs: (TILE, TILE) how many pixels
+    from each one on to the right have its id. Returns whether all pixels have one id."""
+    one = True
+    light[:] = np.float32(0)
+    surface[:] = np.float32(np.inf)
+    height, width = ids.shape
+    for y in range(height):
+        run = 0
+        for x in range(width - 1, -1, -1):
+            run = run + 1 if x + 1 < width and ids[y, x] == ids[y, x + 1] else 1
+            runs[y, x] = run
+            light[y * TILE + x] = np.float32(1)
+        one &= run == width and ids[y, 0] == ids[0, 0]
+    return one
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _blend(s, left, top, light, surface, shown):  # noqa: ANN001, ANN202
+    """Draw a splat into a tile, a row of pixels at a time. Returns its weight, and that which shows through a surface.
+
+    light: transmittance of each pixel, 0 where it is finished. surface: depth of the splat that brought a pixel's
+    transmittance below a half. shown: set to the weights in the rows of its box.
+    """
+    none, full, half, never = spread(ZERO), spread(ONE), spread(HALF), spread(np.float32(np.inf))
+    across, depth, near_side = spread(s.across), spread(s.depth), spread(s.surface)
+    weight, through = none, none
+    for y in range(max(s.y0 - top, 0), min(s.y1 + 1 - top, TILE)):
+        dy = top + y + 0.5 - s.v
+        distance = (ramp() - spread(np.float32(s.u - s.shear * dy - left - 0.5))) * across
+        log_alpha = spread(np.float32(s.peak - s.down * dy * dy)) - distance * distance
+        covers = log_alpha >= spread(LOG2_ALPHA_MIN)
+        alpha = lesser(exp2(either(covers, log_alpha, spread(LOG2_ALPHA_MIN))), spread(np.float32(ALPHA_MAX)))
+        alpha = either(covers, alpha, none)
+        before = load(light, y * TILE)
+        after = before * (full - alpha)
+        goes_on = after >= spread(LEAST_LIGHT)  # also where it is not covered and not finished
+        here = either(goes_on, before * alpha, none)
+        store(light, y * TILE, either(goes_on, after, none))
+        passed = either((before >= half) & (after < half), depth, never)
+        front = lesser(load(surface, y * TILE), passed)
+        store(surface, y * TILE, front)
+        store(shown, y * TILE, here)
+        weight = weight + here
+        through = through + either(near_side > front, here, none)
+    return total(weight), total(through)
+
+
+@njit(cache=True, nogil=True)
+def _shows_one_mask(ids, runs, x0, x1, y0, y1):  # noqa: ANN001, ANN202
+    """Whether all pixels of a box have one id."""
+    one = True
+    for y in range(y0, y1):
+        one &= runs[y, x0] >= x1 - x0 and ids[y, x0] == ids[y0, x0]
+    return one
+
+
+@njit(cache=True, nogil=True)
+def _add_by_mask(ids, shown, x0, x1, y0, y1, sum_of, touched):  # noqa: ANN001, ANN202
+    """Add the weights of a box up by id; returns how many ids were touched, which ones is in ``touched``."""
+    touches = 0
+    for y in range(y0, y1):
+        for x in range(x0, x1):
+            weight = shown[y * TILE + x]
+            if weight > 0.0:
+                mask = ids[y, x]
+                if sum_of[mask] == 0.0:
+                    touched[touches] = mask
+                    touches += 1
+                sum_of[mask] += weight
+    return touches
+
+
+@njit(cache=True, nogil=True)
+def _is_open(light):  # noqa: ANN001, ANN202
+    """Whether any pixel of a tile is unfinished."""
+    brightest = spread(ZERO)
+    for y in range(TILE):
+        row = load(light, y * TILE)
+        brightest = either(row > brightest, row, brightest)
+    return any_of(brightest > spread(ZERO))
 
 
 @njit(cache=True, nogil=True)

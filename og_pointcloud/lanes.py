@@ -1,0 +1,205 @@
+"""Sixteen float32 numbers as one value in compiled code: a row of a tile's pixels goes through the processor at once.
+
+Numba leaves it to LLVM to find loops that can be done in vectors, and LLVM finds none in a loop with branches, stores
+and a recurrence. Here a vector is a type (``Lanes``) with operators, so that nothing has to be found. The operations
+are those of IEEE 754 in a fixed order: every processor gives the same bits, whatever the width of its registers.
+"""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from llvmlite import ir
+from numba import extending
+from numba.core import types
+from numba.extending import models, overload, register_model
+
+__all__ = ["WIDTH", "any_of", "either", "exp2", "lesser", "load", "ramp", "spread", "store", "total"]
+
+intrinsic: Any = extending.intrinsic  # whose functions are called without the context that they are written with
+
+WIDTH = 16
+"""Numbers in one value."""
+
+FLOAT, INT, BOOL = ir.FloatType(), ir.IntType(32), ir.IntType(1)
+FLOATS, INTS, BOOLS = (ir.VectorType(kind, WIDTH) for kind in (FLOAT, INT, BOOL))
+EXP2_TERMS = np.polynomial.Chebyshev.interpolate(np.exp2, 5, [-0.5, 0.5]).convert(kind=np.polynomial.Polynomial).coef
+"""2^f on [-1/2, 1/2], to the precision of float32."""
+
+
+class Lanes(types.Type):
+    """The numba type of WIDTH float32."""
+
+    def __init__(self) -> None:
+        super().__init__("Lanes")
+
+
+class Truths(types.Type):
+    """The numba type of WIDTH truth values, what comparing Lanes gives."""
+
+    def __init__(self) -> None:
+        super().__init__("Truths")
+
+
+LANES, TRUTHS = Lanes(), Truths()
+
+
+def _register(kind: type[types.Type], vector: ir.VectorType) -> None:
+    class Model(models.PrimitiveModel):
+        def __init__(self, manager: Any, of: Any) -> None:
+            super().__init__(manager, of, vector)
+
+    register_model(kind)(Model)
+
+
+_register(Lanes, FLOATS)
+_register(Truths, BOOLS)
+
+
+def _operator(
+    symbol: Callable[..., Any], operands: types.Type, result: types.Type, instruction: str, *how: str
+) -> None:
+    """Give two values of a type an operator, made of one instruction."""
+
+    @intrinsic
+    def apply(context: Any, left: Any, right: Any) -> Any:
+        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+            return getattr(builder, instruction)(*how, *arguments)
+
+        return result(operands, operands), generate
+
+    @overload(symbol)
+    def of(left, right):  # noqa: ANN001, ANN202
+        if left is operands and right is operands:
+            return lambda left, right: apply(left, right)
+        return None
+
+
+_operator(operator.add, LANES, LANES, "fadd")
+_operator(operator.sub, LANES, LANES, "fsub")
+_operator(operator.mul, LANES, LANES, "fmul")
+_operator(operator.lt, LANES, TRUTHS, "fcmp_ordered", "<")
+_operator(operator.gt, LANES, TRUTHS, "fcmp_ordered", ">")
+_operator(operator.ge, LANES, TRUTHS, "fcmp_ordered", ">=")
+_operator(operator.and_, TRUTHS, TRUTHS, "and_")
+
+
+def _all(value: float, vector: ir.VectorType = FLOATS) -> ir.Constant:
+    return ir.Constant(vector, [float(np.float32(value)) if vector is FLOATS else value] * WIDTH)
+
+
+def _address(context: Any, builder: Any, array_type: Any, array: Any, index: Any) -> Any:
+    data = context.make_array(array_type)(context, builder, array).data
+    return builder.bitcast(builder.gep(data, [index]), FLOATS.as_pointer())
+
+
+@intrinsic
+def spread(context: Any, number: Any) -> Any:
+    """Lanes that all hold one float32."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        undefined = ir.Constant(FLOATS, ir.Undefined)
+        first = builder.insert_element(undefined, arguments[0], ir.Constant(INT, 0))
+        return builder.shuffle_vector(first, undefined, _all(0, INTS))
+
+    return LANES(types.float32), generate
+
+
+@intrinsic
+def ramp(context: Any) -> Any:
+    """Lanes 0, 1, 2, ..."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return ir.Constant(FLOATS, [float(lane) for lane in range(WIDTH)])
+
+    return LANES(), generate
+
+
+@intrinsic
+def load(context: Any, array: Any, index: Any) -> Any:
+    """Lanes from WIDTH elements of a float32 array, the first of them at ``index``, which nothing checks."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return builder.load(_address(context, builder, signature.args[0], *arguments), align=4)
+
+    return LANES(array, types.intp), generate
+
+
+@intrinsic
+def store(context: Any, array: Any, index: Any, lanes: Any) -> Any:
+    """Write Lanes where `load` would read them."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        target = _address(context, builder, signature.args[0], *arguments[:2])
+        builder.store(arguments[2], target).align = 4
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp, lanes), generate
+
+
+@intrinsic
+def either(context: Any, condition: Any, yes: Any, no: Any) -> Any:
+    """Each lane from ``yes`` where the condition holds, else from ``no``."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return builder.select(*arguments)
+
+    return LANES(TRUTHS, LANES, LANES), generate
+
+
+@intrinsic
+def lesser(context: Any, left: Any, right: Any) -> Any:
+    """The lesser of two values in each lane; ``right`` where one is NaN."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return builder.select(builder.fcmp_ordered("<", *arguments), *arguments)
+
+    return LANES(LANES, LANES), generate
+
+
+@intrinsic
+def any_of(context: Any, condition: Any) -> Any:
+    """Whether the condition holds in any lane."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        bits = builder.bitcast(arguments[0], ir.IntType(WIDTH))
+        return builder.icmp_unsigned("!=", bits, ir.Constant(bits.type, 0))
+
+    return types.boolean(TRUTHS), generate
+
+
+@intrinsic
+def exp2(context: Any, lanes: Any) -> Any:
+    """2 to the power of each lane, which must lie in [-126, 0.5]; to 2e-7 of the value."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        # 2^z = 2^i 2^f: cutting z - 1/2 <= 0 towards zero gives the nearest integer i, which becomes the exponent.
+        whole = builder.fptosi(builder.fsub(arguments[0], _all(0.5)), INTS)
+        rest = builder.fsub(arguments[0], builder.sitofp(whole, FLOATS))
+        square = builder.fmul(rest, rest)
+        pairs = [builder.fadd(_all(EXP2_TERMS[k]), builder.fmul(_all(EXP2_TERMS[k + 1]), rest)) for k in (0, 2, 4)]
+        # In pairs: three short chains of operations instead of a long one (Estrin's scheme).
+        value = builder.fadd(pairs[1], builder.fmul(square, pairs[2]))
+        value = builder.fadd(pairs[0], builder.fmul(square, value))
+        exponent = builder.shl(builder.add(whole, _all(127, INTS)), _all(23, INTS))
+        return builder.fmul(value, builder.bitcast(exponent, FLOATS))
+
+    return LANES(LANES), generate
+
+
+@intrinsic
+def total(context: Any, lanes: Any) -> Any:
+    """The sum of all lanes, float32: halves are added until one number is left."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        value, count = arguments[0], WIDTH
+        while count > 1:
+            count //= 2
+            halves = [ir.Constant(ir.VectorType(INT, count), [h * count + k for k in range(count)]) for h in (0, 1)]
+            value = builder.fadd(*(builder.shuffle_vector(value, value, half) for half in halves))
+        return builder.extract_element(value, ir.Constant(INT, 0))
+
+    return types.float32(LANES), generate
