@@ -1,0 +1,451 @@
+"""Scene editing: what is taken, what is kept as it was, colours and harmonics against their definition, refusals."""
+
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from conftest import write_ply as write_other_ply
+from labelled_clouds import WORDS, make_cloud, room
+from scipy.spatial.transform import Rotation
+from scipy.special import lpmv
+
+import og_pointcloud as og
+from og_pointcloud.cli import main
+from og_pointcloud.errors import OgPointcloudError, SceneError
+from og_pointcloud.formats.ply import join_columns, read_ply, write_ply
+from og_pointcloud.harmonics import rotated_harmonics
+from og_pointcloud.runtime import LabelledScene
+
+SH_CONSTANT = 0.28209479177387814
+BASE = ("f_dc_0", "f_dc_1", "f_dc_2")
+FAR = np.array([1000.0, -500.0, 20.0])
+
+
+def gaussian_columns(xyz, degree=3, seed=0):
+    """A trained 3DGS file's columns, and two more that a trainer might add."""
+    random = np.random.default_rng(seed)
+    rest = 3 * ((degree + 1) ** 2 - 1)
+    names = ["nx", "ny", "nz", *BASE, *(f"f_rest_{k}" for k in range(rest)), "opacity"]
+    names += [*(f"scale_{k}" for k in range(3)), *(f"rot_{k}" for k in range(4)), "ins_feat_r"]
+    columns = dict(zip("xyz", np.asarray(xyz, np.float32).T, strict=True))
+    columns |= {name: random.normal(size=len(xyz)).astype(np.float32) * 0.4 for name in names}
+    return columns | {"label": random.integers(0, 99, len(xyz)).astype(np.int32)}
+
+
+@pytest.fixture(scope="module")
+def scene():
+    cloud = replace(room(900), origin=FAR)
+    # What a file of float32 holds: the .ogpc was made from it.
+    xyz = cloud.xyz_world.astype(np.float32)
+    return LabelledScene.from_cloud(replace(cloud, xyz=(xyz - FAR).astype(np.float32)))
+
+
+@pytest.fixture
+def splats(scene, tmp_path):
+    path = tmp_path / "splats.ply"
+    write_ply(
+        path,
+        {
+            "vertex": join_columns(gaussian_columns(scene.xyz)),
+            "extra": join_columns({"a": np.arange(3)[:2].astype(np.int32)}),
+        },
+    )
+    return path
+
+
+def plain_file(path, xyz, **columns):
+    write_ply(path, {"vertex": join_columns(dict(zip("xyz", xyz.T, strict=True)) | columns)})
+    return path
+
+
+def vertices(path):
+    return read_ply(path)["vertex"]
+
+
+def stacked(rows, names):
+    return np.stack([rows[name] for name in names], axis=1).astype(float)
+
+
+# Which points -----------------------------------------------------------------------------------------------------
+
+
+def test_remove_and_extract_share_the_rows_between_them(scene, splats, tmp_path):
+    rows, mine = vertices(splats), scene.instance_ids == 3
+    removed = og.edit.remove(scene, 3, tmp_path / "without.ply", cloud=splats)
+    extracted = og.edit.extract(scene, 3, tmp_path / "alone.ply", cloud=splats)
+    np.testing.assert_array_equal(vertices(removed.path), rows[~mine])
+    np.testing.assert_array_equal(vertices(extracted.path), rows[mine])
+    assert (removed.points, removed.changed, removed.instances, removed.notes) == ((~mine).sum(), mine.sum(), (3,), ())
+    assert (extracted.points, extracted.changed) == (mine.sum(), mine.sum())
+    assert read_ply(removed.path)["extra"]["a"].tolist() == [0, 1]
+    assert b"comment edited by og-pointcloud" in removed.path.read_bytes()[:200]
+
+
+def test_every_way_to_say_what(scene, splats, tmp_path):
+    """A word, ids, a click, a match and a selection take the points that the scene says are theirs."""
+    place = scene.xyz[np.flatnonzero(scene.instance_ids == 2)[5]]
+    selection = og.select(scene, WORDS[1])
+    assert selection.instances
+    meant = [
+        (WORDS[1], selection.instances), (selection, selection.instances), (selection[0], [selection[0].instance]),
+        (og.pick(scene, place), [2]), ([5, 2, 5], [5, 2]), (np.int32(1), [1]), (np.array([0, 1]), [0, 1]),
+    ]  # fmt: skip
+    rows = vertices(splats)
+    for what, ids in meant:
+        done = og.edit.extract(scene, what, tmp_path / "out.ply", cloud=splats)
+        assert done.instances == tuple(ids)
+        np.testing.assert_array_equal(vertices(done.path), rows[np.isin(scene.instance_ids, ids)])
+
+
+@pytest.mark.parametrize("what", [-1, 9, [], [0, 44], [0.0], True, [True]])
+def test_what_is_no_instance_is_refused(scene, splats, tmp_path, what):
+    with pytest.raises(OgPointcloudError, match="ids from 0 to 8"):
+        og.edit.remove(scene, what, tmp_path / "out.ply", cloud=splats)
+    assert not (tmp_path / "out.ply").exists()
+
+
+def test_a_click_that_missed_and_a_word_that_fits_nothing_are_refused(scene, splats, tmp_path):
+    with pytest.raises(OgPointcloudError, match="missed"):
+        og.edit.remove(scene, og.pick(scene, FAR + 500), tmp_path / "out.ply", cloud=splats)
+    nothing = og.select(scene, {"moon": -scene.vocabulary.vectors.sum(axis=0)})
+    assert not nothing.fitting
+    with pytest.raises(OgPointcloudError, match=r"'moon' fits none of 9 instances.*give its id"):
+        og.edit.remove(scene, nothing, tmp_path / "out.ply", cloud=splats)
+
+
+def test_without_a_cloud_the_scenes_own_points_are_edited(scene, tmp_path):
+    done = og.edit.remove(scene, [0, 1], tmp_path / "out.ply")
+    points = og.read_points(done.path)
+    kept = ~np.isin(scene.instance_ids, [0, 1])
+    np.testing.assert_allclose(points.xyz_world, scene.xyz[kept], atol=1e-4)
+    np.testing.assert_array_equal(points.rgb, scene.cloud.rgb[kept])
+
+
+def test_another_cloud_takes_the_instances_of_the_nearest_points(scene, tmp_path):
+    random = np.random.default_rng(0)
+    order = random.permutation(len(scene.xyz))
+    for xyz in (scene.xyz[order], np.concatenate([scene.xyz[::2], [FAR + 90]])):
+        source = plain_file(tmp_path / "other.ply", xyz)
+        done = og.edit.extract(scene, 3, tmp_path / "out.ply", cloud=source)
+        expected = xyz[scene.instances_at(xyz) == 3]
+        np.testing.assert_array_equal(stacked(vertices(done.path), "xyz"), expected)
+        assert len(expected) > 10
+        assert "took the instance of the nearest" in done.notes[0]
+    with pytest.raises(OgPointcloudError, match="none of its 900 points lies within"):
+        og.edit.remove(scene, 3, tmp_path / "out.ply", cloud=plain_file(tmp_path / "far.ply", scene.xyz - FAR))
+
+
+def test_halo_takes_unlabelled_points_near_the_object_alone(scene, splats, tmp_path):
+    halo = 3.0
+    done = og.edit.extract(scene, 8, tmp_path / "out.ply", cloud=splats, halo=halo)
+    ids, xyz = scene.instance_ids, scene.xyz
+    own = xyz[ids == 8]
+    near = np.array([np.linalg.norm(own - place, axis=1).min() for place in xyz]) <= halo * scene.cloud.spacing
+    expected = (ids == 8) | (near & (ids < 0))
+    assert (ids == 8).sum() < expected.sum() < ((ids == 8) | near).sum()
+    np.testing.assert_allclose(stacked(vertices(done.path), "xyz"), xyz[expected], atol=1e-4)
+    with pytest.raises(OgPointcloudError, match="halo is -1"):
+        og.edit.extract(scene, 8, tmp_path / "x.ply", halo=-1)
+
+
+def test_nothing_and_everything_are_refused(scene, tmp_path):
+    part = plain_file(tmp_path / "part.ply", scene.xyz[scene.instance_ids == 3])
+    with pytest.raises(OgPointcloudError, match="belongs to instance 0"):
+        og.edit.remove(scene, 0, tmp_path / "out.ply", cloud=part)
+    with pytest.raises(OgPointcloudError, match="would be removed"):
+        og.edit.remove(scene, 3, tmp_path / "out.ply", cloud=part)
+    assert not (tmp_path / "out.ply").exists()
+
+
+# Files ------------------------------------------------------------------------------------------------------------
+
+
+def test_originals_are_never_overwritten(scene, splats, tmp_path):
+    before = splats.read_bytes()
+    (tmp_path / "link.ply").symlink_to(splats)
+    for output in (splats, tmp_path / "link.ply", tmp_path / "." / "splats.ply"):
+        with pytest.raises(OgPointcloudError, match="originals stay"):
+            og.edit.remove(scene, 3, output, cloud=splats)
+        with pytest.raises(OgPointcloudError, match="originals stay"):
+            og.edit.insert(plain_file(tmp_path / "p.ply", scene.xyz), splats, output)
+    with pytest.raises(OgPointcloudError, match=r"ends in \.ply"):
+        og.edit.remove(scene, 3, tmp_path / "out.npz", cloud=splats)
+    assert splats.read_bytes() == before
+
+
+def test_a_mesh_loses_its_faces_and_says_so(scene, tmp_path):
+    source = plain_file(tmp_path / "mesh.ply", scene.xyz.astype(np.float32))
+    head, _, data = source.read_bytes().partition(b"end_header\n")
+    face = b"element face 1\nproperty list uchar int vertex_indices\n"
+    source.write_bytes(head + face + b"end_header\n" + data + bytes([3]) + np.arange(3, dtype="<i4").tobytes())
+    done = og.edit.remove(scene, 3, tmp_path / "out.ply", cloud=source)
+    assert done.notes == (f"{source}: faces and other lists are left out",)
+    assert b"face" not in done.path.read_bytes()[:300]
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"hello", b"ply\nformat ascii 1.0\nelement vertex 0\nproperty float x\nend_header\n"]
+)
+def test_a_cloud_that_cannot_be_read_is_named(scene, tmp_path, content):
+    (tmp_path / "bad.ply").write_bytes(content)
+    with pytest.raises(SceneError, match=r"bad\.ply"):
+        og.edit.remove(scene, 3, tmp_path / "out.ply", cloud=tmp_path / "bad.ply")
+    with pytest.raises(SceneError, match=r"missing\.ply"):
+        og.edit.remove(scene, 3, tmp_path / "out.ply", cloud=tmp_path / "missing.ply")
+
+
+# Colours ----------------------------------------------------------------------------------------------------------
+
+
+def real_harmonics(directions, count):
+    """(n, count + 1) by associated Legendre functions with the Condon-Shortley sign."""
+    x, y, z = directions.T
+    azimuth, columns = np.arctan2(y, x), []
+    for degree in range(math.isqrt(count + 1)):
+        for m in range(-degree, degree + 1):
+            share = math.factorial(degree - abs(m)) / math.factorial(degree + abs(m))
+            legendre = np.sqrt((2 * degree + 1) / (4 * np.pi) * share) * lpmv(abs(m), degree, z)
+            wave = np.cos(m * azimuth) if m >= 0 else np.sin(-m * azimuth)
+            columns.append(legendre * wave * (np.sqrt(2) if m else 1))
+    return np.stack(columns, axis=1)
+
+
+def colors_seen(rows, directions):
+    """(directions, n, 3) colours of a 3DGS file's splats, straight from the definition."""
+    count = sum(name.startswith("f_rest_") for name in rows.dtype.names) // 3
+    base = stacked(rows, BASE)[:, :, None]
+    rest = stacked(rows, [f"f_rest_{k}" for k in range(3 * count)]).reshape(-1, 3, count) if count else base[:, :, :0]
+    return 0.5 + np.einsum("nck,dk->dnc", np.concatenate([base, rest], axis=2), real_harmonics(directions, count))
+
+
+def some_directions(count=20):
+    directions = np.random.default_rng(1).normal(size=(count, 3))
+    return directions / np.linalg.norm(directions, axis=1, keepdims=True)
+
+
+def test_recoloured_splats_shine_in_the_new_colour_from_everywhere(scene, splats, tmp_path):
+    rows, mine = vertices(splats), scene.instance_ids == 3
+    done = og.edit.recolour(scene, 3, tmp_path / "out.ply", (200, 100, 20), cloud=splats)
+    after = vertices(done.path)
+    np.testing.assert_array_equal(after[~mine], rows[~mine])
+    for name in set(rows.dtype.names) - {*BASE, *(f"f_rest_{k}" for k in range(45))}:
+        np.testing.assert_array_equal(after[name], rows[name])
+    color, luminance = np.array([200, 100, 20]) / 255, np.array([0.2126, 0.7152, 0.0722])
+    mean = (np.clip(0.5 + SH_CONSTANT * stacked(rows, BASE)[mine], 0, 1) @ luminance).mean()
+    before, now = colors_seen(rows[mine], some_directions()), colors_seen(after[mine], some_directions())
+    np.testing.assert_allclose(now, (before @ luminance)[..., None] / mean * color, atol=1e-5)
+
+
+def test_flat_colour_is_the_colour_from_everywhere(scene, splats, tmp_path):
+    done = og.edit.recolour(scene, 3, tmp_path / "out.ply", (200, 100, 20), keep_shading=False, cloud=splats)
+    seen = colors_seen(vertices(done.path)[scene.instance_ids == 3], some_directions())
+    np.testing.assert_allclose(seen * 255, np.broadcast_to([200, 100, 20], seen.shape), atol=1e-4)
+
+
+def test_recoloured_plain_cloud(scene, tmp_path):
+    random, mine = np.random.default_rng(0), scene.instance_ids == 3
+    grey = random.integers(60, 180, len(scene.xyz))
+    rgb = dict.fromkeys(("red", "green", "blue"), grey.astype(np.uint8))
+    normals = {name: random.normal(size=len(grey)).astype(np.float32) for name in ("nx", "ny", "nz")}
+    source = plain_file(tmp_path / "plain.ply", scene.xyz.astype(np.float32), **normals, **rgb)
+    done = og.edit.recolour(scene, 3, tmp_path / "out.ply", (250, 0, 120), cloud=source)
+    after, rows = vertices(done.path), vertices(source)
+    np.testing.assert_array_equal(after[~mine], rows[~mine])
+    assert after.dtype == rows.dtype
+    new = stacked(after, rgb)[mine]
+    shading = grey[mine] / grey[mine].mean()
+    np.testing.assert_allclose(new, np.minimum(shading[:, None] * [250, 0, 120], 255), atol=0.51)
+
+
+def test_colours_of_other_types_become_bytes_and_missing_ones_grey(scene, tmp_path):
+    mine, n = scene.instance_ids == 3, len(scene.xyz)
+    half = dict.fromkeys(("r", "g", "b"), np.linspace(0, 1, n).astype(np.float32))
+    for columns, others in ((half, np.rint(np.linspace(0, 255, n))), ({}, np.full(n, 128))):
+        source = plain_file(tmp_path / "plain.ply", scene.xyz, **columns)
+        done = og.edit.recolour(scene, 3, tmp_path / "out.ply", (9, 8, 7), keep_shading=False, cloud=source)
+        rgb = og.read_points(done.path).rgb
+        np.testing.assert_allclose(rgb[~mine], np.repeat(others[~mine, None], 3, axis=1), atol=1)
+        np.testing.assert_array_equal(rgb[mine], np.tile([9, 8, 7], (mine.sum(), 1)))
+        assert set(vertices(done.path).dtype.names) == {*"xyz", "red", "green", "blue"}
+    assert "became grey" in done.notes[0]
+
+
+@pytest.mark.parametrize("color", [(1, 2), (1, 2, 256), (-1, 0, 0), (np.nan, 0, 0)])
+def test_a_colour_that_is_none_is_refused(scene, tmp_path, color):
+    with pytest.raises(OgPointcloudError, match="0 to 255"):
+        og.edit.recolour(scene, 3, tmp_path / "out.ply", color)
+
+
+# Insertion --------------------------------------------------------------------------------------------------------
+
+
+def similarity(scale=1.0, seed=0):
+    pose = np.eye(4)
+    pose[:3, :3] = scale * Rotation.random(random_state=seed).as_matrix()
+    pose[:3, 3] = [1, -2, 0.5]
+    return pose
+
+
+@pytest.mark.parametrize("degree", [1, 2, 3])
+def test_turned_harmonics_are_seen_from_turned_directions(degree):
+    count = (degree + 1) ** 2 - 1
+    rest = np.random.default_rng(0).normal(size=(7, 3, count))
+    rotation = Rotation.random(random_state=degree).as_matrix()
+    turned, directions = rotated_harmonics(rest, rotation), some_directions()
+    before = real_harmonics(directions, count)[:, 1:] @ rest.transpose(1, 2, 0)
+    after = real_harmonics(directions @ rotation.T, count)[:, 1:] @ turned.transpose(1, 2, 0)
+    np.testing.assert_allclose(after, before, atol=1e-12)
+    np.testing.assert_allclose(rotated_harmonics(rest, np.eye(3)), rest, atol=1e-12)
+
+
+def test_inserted_splats_stand_in_the_other_frame(tmp_path):
+    random = np.random.default_rng(0)
+    files = {}
+    for name, count, seed in (("base", 30, 1), ("other", 20, 2)):
+        files[name] = tmp_path / f"{name}.ply"
+        write_ply(files[name], {"vertex": join_columns(gaussian_columns(random.normal(size=(count, 3)), 3, seed))})
+    pose = similarity(2.5)
+    done = og.edit.insert(files["base"], files["other"], tmp_path / "out.ply", pose)
+    base, other, rows = (vertices(path) for path in (files["base"], files["other"], done.path))
+    np.testing.assert_array_equal(rows[:30], base)
+    new, rotation = rows[30:], pose[:3, :3] / 2.5
+    np.testing.assert_allclose(stacked(new, "xyz"), stacked(other, "xyz") @ pose[:3, :3].T + pose[:3, 3], atol=1e-5)
+    normals = ("nx", "ny", "nz")
+    np.testing.assert_allclose(stacked(new, normals), stacked(other, normals) @ rotation.T, atol=1e-5)
+    np.testing.assert_allclose(
+        covariances(new), pose[:3, :3] @ covariances(other) @ pose[:3, :3].T, rtol=1e-3, atol=1e-4
+    )
+    directions = some_directions()
+    np.testing.assert_allclose(colors_seen(new, directions @ rotation.T), colors_seen(other, directions), atol=1e-5)
+    for name in ("opacity", "ins_feat_r", "label"):
+        np.testing.assert_array_equal(new[name], other[name])
+    assert (done.points, done.changed, done.notes) == (50, 20, ())
+
+
+def covariances(rows):
+    quaternions = stacked(rows, [f"rot_{k}" for k in (1, 2, 3, 0)])
+    axes = (
+        Rotation.from_quat(quaternions).as_matrix() * np.exp(stacked(rows, [f"scale_{k}" for k in range(3)]))[:, None]
+    )
+    return axes @ axes.transpose(0, 2, 1)
+
+
+@pytest.mark.parametrize(("base_degree", "other_degree"), [(0, 3), (3, 0), (1, 2)])
+def test_harmonics_of_different_degree_both_survive(tmp_path, base_degree, other_degree):
+    random = np.random.default_rng(0)
+    base, other = tmp_path / "base.ply", tmp_path / "other.ply"
+    write_ply(base, {"vertex": join_columns(gaussian_columns(random.normal(size=(9, 3)), base_degree))})
+    write_ply(other, {"vertex": join_columns(gaussian_columns(random.normal(size=(5, 3)), other_degree))})
+    done = og.edit.insert(base, other, tmp_path / "out.ply")
+    rows, directions = vertices(done.path), some_directions()
+    highest = max(base_degree, other_degree)
+    assert sum(name.startswith("f_rest_") for name in rows.dtype.names) == 3 * ((highest + 1) ** 2 - 1)
+    for part, source in ((rows[:9], base), (rows[9:], other)):
+        np.testing.assert_allclose(colors_seen(part, directions), colors_seen(vertices(source), directions), atol=1e-6)
+    assert done.notes == ()
+
+
+def test_properties_that_only_one_has_are_told(tmp_path):
+    random = np.random.default_rng(0)
+    base = plain_file(tmp_path / "base.ply", random.random((4, 3)), curvature=np.ones(4, np.float32))
+    other = plain_file(tmp_path / "other.ply", random.random((3, 3)), label=np.ones(3, np.int32))
+    done = og.edit.insert(base, other, tmp_path / "out.ply")
+    assert vertices(done.path)["curvature"].tolist() == [1] * 4 + [0] * 3
+    assert done.notes == (
+        "curvature are 0 for the inserted points, which had none",
+        "label of the inserted points are left out, which the cloud does not have",
+    )
+
+
+def test_plain_points_and_splats_become_what_the_cloud_is(tmp_path):
+    grid = np.stack(np.meshgrid(*[np.arange(8.0)] * 2, [0.0]), -1).reshape(-1, 3).astype(np.float32)
+    plain, splats = tmp_path / "plain.ply", tmp_path / "splats.ply"
+    write_other_ply(plain, 0.1 * grid, np.full((64, 3), 200, np.uint8))
+    write_ply(splats, {"vertex": join_columns(gaussian_columns(grid[:10]))})
+    pose = similarity(1.0)
+    as_splats = og.edit.insert(splats, plain, tmp_path / "a.ply", pose)
+    gaussians = og.read_points(as_splats.path)
+    np.testing.assert_allclose(gaussians.scale[10:], 0.05, rtol=1e-4)
+    np.testing.assert_array_equal(gaussians.rgb[10:], 200)
+    np.testing.assert_allclose(gaussians.xyz_world[10:], 0.1 * grid @ pose[:3, :3].T + pose[:3, 3], atol=1e-5)
+    assert "became Gaussians" in as_splats.notes[0]
+    as_points = og.edit.insert(plain, splats, tmp_path / "b.ply")
+    cloud = og.read_points(as_points.path)
+    assert not cloud.are_gaussians
+    np.testing.assert_array_equal(cloud.rgb[64:], og.read_points(splats).rgb)
+    assert "became plain points" in as_points.notes[0]
+
+
+def test_what_was_extracted_fits_back_where_it_was_removed(scene, splats, tmp_path):
+    without = og.edit.remove(scene, 3, tmp_path / "without.ply", cloud=splats)
+    alone = og.edit.extract(scene, 3, tmp_path / "alone.ply", cloud=splats)
+    there = og.edit.insert(without.path, alone.path, tmp_path / "there.ply", similarity(2.0))
+    part = tmp_path / "part.ply"
+    write_ply(part, {"vertex": vertices(there.path)[without.points :]})
+    back = og.edit.insert(without.path, part, tmp_path / "back.ply", np.linalg.inv(similarity(2.0)))
+    rows, mine = vertices(splats), scene.instance_ids == 3
+    expected = np.concatenate([rows[~mine], rows[mine]])
+    for name in ("x", "y", "z", "nx", "f_dc_1", "f_rest_0", "f_rest_17", "f_rest_44", "scale_2", "opacity", "label"):
+        np.testing.assert_allclose(vertices(back.path)[name], expected[name], atol=2e-4)
+
+
+@pytest.mark.parametrize(
+    ("pose", "message"),
+    [
+        (np.diag([1, 1, 2, 1]), "shears or mirrors"),
+        (np.diag([-1, 1, 1, 1]), "shears or mirrors"),
+        (np.diag([0, 0, 0, 1]), "shears or mirrors"),
+        (np.eye(3), "ends in 0 0 0 1"),
+        (np.diag([1, 1, 1, 2]), "ends in 0 0 0 1"),
+        (np.full((4, 4), np.nan), "finite"),
+    ],
+)
+def test_poses_that_splats_cannot_follow_are_refused(tmp_path, pose, message):
+    path = plain_file(tmp_path / "p.ply", np.eye(3))
+    with pytest.raises(SceneError, match=message):
+        og.edit.insert(path, path, tmp_path / "out.ply", pose)
+
+
+# The command line -------------------------------------------------------------------------------------------------
+
+
+def test_commands(scene, splats, tmp_path, capsys):
+    bundle = og.write_bundle(scene.cloud, tmp_path / "room.ogpc")
+    edit = lambda *words: main(["edit", *map(str, words)])  # noqa: E731
+    place = ",".join(map(str, scene.xyz[np.flatnonzero(scene.instance_ids == 2)[0]]))
+    out = tmp_path / "new" / "out.ply"
+    assert edit("remove", bundle, "--id", "3,5", "--cloud", splats, "-o", out, "--json") == 0
+    record = json.loads(capsys.readouterr().out)
+    assert record["instances"] == [3, 5]
+    assert (
+        record["points"] + record["changed"]
+        == len(scene.xyz)
+        == record["points"] + np.isin(scene.instance_ids, [3, 5]).sum()
+    )
+    assert edit("extract", bundle, f"--xyz={place}", "-o", tmp_path / "two.ply") == 0
+    assert "points extracted (instance 2)" in capsys.readouterr().out
+    assert edit("recolour", bundle, "--word", WORDS[1], "--color", "9,8,7", "--flat", "-o", tmp_path / "c.ply") == 0
+    assert (og.read_points(tmp_path / "c.ply").rgb == [9, 8, 7]).all(axis=1).sum() > 0
+    (tmp_path / "pose.txt").write_text("\n".join(" ".join(map(str, row)) for row in similarity()))
+    capsys.readouterr()
+    assert edit("insert", out, tmp_path / "two.ply", "--pose", tmp_path / "pose.txt", "-o", tmp_path / "i.ply") == 0
+    assert "note: " in capsys.readouterr().out
+    assert edit("insert", out, tmp_path / "two.ply", "--at=-1,0,0", "-o", tmp_path / "i.ply") == 0
+    moved = og.read_points(tmp_path / "i.ply").xyz_world[len(vertices(out)) :]
+    np.testing.assert_allclose(moved, scene.xyz[scene.instance_ids == 2] - [1, 0, 0], atol=1e-3)
+
+
+def test_wrong_commands_name_what_is_wrong(scene, splats, tmp_path, capsys):
+    bundle = og.write_bundle(make_cloud([[0, 0, 0], [1, 0, 0]], [0, 1]), tmp_path / "two.ogpc")
+    out = str(tmp_path / "out.ply")
+    (tmp_path / "pose.txt").write_text("1 2 three")
+    for words, message in (
+        (["remove", str(bundle), "--id", "one", "-o", out], "--id is 'one'"),
+        (["remove", str(bundle), "--id", "0", "--cloud", str(splats), "-o", str(splats)], "a file that is read"),
+        (["insert", str(splats), str(splats), "--pose", str(tmp_path / "pose.txt"), "-o", out], "16 numbers"),
+        (["recolour", str(bundle), "--id", "0", "--color", "1,2", "-o", out], "--color"),
+    ):
+        assert main(["edit", *words]) == 2
+        assert message in capsys.readouterr().err

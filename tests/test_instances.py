@@ -1,0 +1,163 @@
+"""The table of instances: each column against its plain definition, files of it, and what has no points."""
+
+import csv
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from labelled_clouds import WIDTH, WORDS, instance_table, make_cloud, room, unit_rows
+
+import og_pointcloud as og
+from og_pointcloud.boxes import axis_aligned_box, oriented_box
+from og_pointcloud.cli import main
+from og_pointcloud.cloud import Vocabulary
+from og_pointcloud.runtime import LabelledScene
+
+FAR = np.array([1e6, -4e6, 350.25])
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return LabelledScene.from_cloud(replace(room(900), origin=FAR))
+
+
+@pytest.fixture(scope="module")
+def bundle(tmp_path_factory):
+    return og.write_bundle(room(600), tmp_path_factory.mktemp("bundle") / "room.ogpc")
+
+
+def test_each_column_is_what_it_says(scene):
+    table, evidence = og.instance_table(scene), scene.cloud.instances
+    assert [row.id for row in table] == list(range(9))
+    for k, row in enumerate(table):
+        own = scene.xyz[scene.instance_ids == k]
+        np.testing.assert_array_equal(row.xyz, own)
+        main = own[row.main_part]
+        np.testing.assert_allclose(row.centroid, main.mean(axis=0), atol=1e-8)
+        np.testing.assert_allclose(row.axis_aligned_box.low, main.min(axis=0), atol=1e-8)
+        np.testing.assert_allclose(row.axis_aligned_box.high, main.max(axis=0), atol=1e-8)
+        np.testing.assert_array_equal(row.size, oriented_box(main).size)
+        assert row.points == len(own) > 20
+        assert (row.views, row.masks, row.part_of) == (evidence.views[k], evidence.masks[k], evidence.whole[k])
+        assert (row.agreement, row.visible_area) == (evidence.agreement[k], evidence.visible_area[k])
+        assert row.state == ("no feature" if k == 4 else "labelled")
+
+
+def test_strays_are_outside_the_boxes_but_counted():
+    random = np.random.default_rng(0)
+    xyz = np.concatenate([random.random((500, 3)), [[40, 0, 0], [0, 70, 0]]])
+    row = og.instance_table(LabelledScene.from_cloud(make_cloud(xyz, np.zeros(502))))[0]
+    assert (row.points, row.to_dict()["strays"]) == (502, 2)
+    assert row.axis_aligned_box.high.max() <= 1
+    assert row.oriented_box.volume < 1.01
+
+
+def test_best_words_are_the_highest_cosines(scene):
+    table, cloud = og.instance_table(scene, words=2), scene.cloud
+    vectors = cloud.vocabulary.vectors / np.linalg.norm(cloud.vocabulary.vectors, axis=1, keepdims=True)
+    for row in table:
+        own = cloud.instances.descriptors[cloud.instances.descriptor_instance == row.id]
+        if not len(own):
+            assert row.words == ()
+            continue
+        cosines = (own @ vectors.T).max(axis=0)
+        best = np.argsort(-cosines)[:2]
+        assert [name for name, _ in row.words] == [WORDS[index] for index in best]
+        np.testing.assert_allclose([score for _, score in row.words], cosines[best], atol=1e-5)
+
+
+def test_words_may_be_given_or_missing(scene):
+    vectors = unit_rows(2, WIDTH, seed=5)
+    given = og.instance_table(scene, {"one": vectors[0], "two": vectors[1]})
+    assert {name for row in given for name, _ in row.words} == {"one", "two"}
+    wordless = LabelledScene.from_cloud(replace(scene.cloud, vocabulary=None))
+    assert all(row.words == () for row in og.instance_table(wordless))
+    empty = replace(scene.cloud, vocabulary=Vocabulary((), np.zeros((0, WIDTH), np.float32)))
+    assert og.instance_table(LabelledScene.from_cloud(empty))[0].words == ()
+
+
+def test_boxes_stand_upright_where_up_is_known(scene):
+    for row in og.instance_table(scene, up=(0, 0, 1)):
+        np.testing.assert_allclose(row.oriented_box.axes[2], [0, 0, 1], atol=1e-12)
+
+
+def test_an_instance_without_points_has_no_place():
+    cloud = make_cloud([[0, 0, 0], [1, 0, 0]], [2, 2], instances=instance_table(4))
+    table = og.instance_table(LabelledScene.from_cloud(cloud))
+    assert [row.state for row in table] == ["empty", "empty", "labelled", "empty"]
+    assert table[0].centroid is table[0].oriented_box is table[0].axis_aligned_box is table[0].size is None
+    assert len(table[0].main_part) == 0
+    np.testing.assert_allclose(table[2].size, [1, 0, 0], atol=1e-12)
+    records = list(csv.DictReader(table.to_csv().splitlines()))
+    assert [record["low_x"] for record in records] == ["", "", "0.0", ""]
+    assert "empty" in repr(table)
+
+
+def test_ids_do_not_count_from_the_end(scene):
+    table = og.instance_table(scene)
+    for wrong in (-1, -2, 9):
+        with pytest.raises(IndexError, match="background"):
+            table[wrong]
+    assert [row.id for row in table[2:4]] == [2, 3]
+    sizes = [row.points for row in table.largest(3)]
+    assert sizes == sorted((row.points for row in table), reverse=True)[:3]
+
+
+def test_no_instance_at_all():
+    cloud = make_cloud([[0, 0, 0]], [-1], instances=instance_table(0))
+    table = og.instance_table(LabelledScene.from_cloud(cloud))
+    assert len(table) == 0
+    assert table.to_records() == json.loads(table.to_json()) == []
+    assert repr(table).startswith("0 instances")
+    assert table.to_csv() == "\n"
+
+
+def test_json_and_csv_hold_the_same_numbers(scene, tmp_path):
+    table = og.instance_table(scene)
+    table.to_json(tmp_path / "t.json"), table.to_csv(tmp_path / "t.csv")
+    records = json.loads((tmp_path / "t.json").read_text())
+    assert records == table.to_records()
+    with (tmp_path / "t.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == len(records) == 9
+    for record, row in zip(records, rows, strict=True):
+        assert [float(row[f"box_size_{k}"]) for k in range(3)] == record["oriented_box"]["size"]
+        assert [float(row[f"box_rotation_{k}"]) for k in "wxyz"] == record["oriented_box"]["rotation_wxyz"]
+        assert [float(row[f"high_{k}"]) for k in "xyz"] == record["axis_aligned_box"]["high"]
+        assert [row[f"word_{k + 1}"] for k in range(len(record["words"]))] == [word["name"] for word in record["words"]]
+    assert not list(tmp_path.glob("*.tmp"))
+
+
+def test_a_table_costs_nothing_until_it_is_asked(scene, monkeypatch):
+    monkeypatch.setattr("og_pointcloud.instances.oriented_box", lambda *_: pytest.fail("asked too early"))
+    table = og.instance_table(scene)
+    assert table[0].axis_aligned_box is table[0].axis_aligned_box
+    np.testing.assert_array_equal(
+        table[0].axis_aligned_box.size, axis_aligned_box(table[0].xyz[table[0].main_part]).size
+    )
+
+
+def test_printed_table_is_cut_and_starts_with_the_largest():
+    cloud = make_cloud(np.random.default_rng(0).random((300, 3)), np.arange(300) % 30)
+    lines = repr(og.instance_table(LabelledScene.from_cloud(cloud))).splitlines()
+    assert lines[0] == "30 instances"
+    assert lines[-1] == "and 18 smaller ones"
+    assert len(lines) == 15
+
+
+def test_any_way_to_name_a_scene(bundle):
+    for source in (bundle, str(bundle), og.load(bundle), room(600)):
+        assert len(og.instance_table(source)) == 9
+    with pytest.raises(og.OgPointcloudError, match="scene is a int"):
+        og.instance_table(3)
+
+
+def test_command(bundle, tmp_path, capsys):
+    assert main(["instances", str(bundle), "--up", "0,0,1", "-o", str(tmp_path / "new" / "t.csv")]) == 0
+    assert capsys.readouterr().out.startswith("9 instances\nid")
+    assert len((tmp_path / "new" / "t.csv").read_text().splitlines()) == 10
+    assert main(["instances", str(bundle), "--json", "--words", "1"]) == 0
+    assert [len(record["words"]) for record in json.loads(capsys.readouterr().out)] == [1, 1, 1, 1, 0, 1, 1, 1, 1]
+    assert main(["instances", str(bundle), "-o", str(tmp_path / "t.txt")]) == 2
+    assert main(["instances", str(bundle), "--up", "0,0"]) == 2
