@@ -68,17 +68,19 @@ MARGIN = 32.0
 """How far a tile looks over its borders, in spacings of its sparser points: what settles a point is seldom farther."""
 SAMPLE_STEP = 50
 """Masks are grouped by every so manieth point at least, also where that is more than a whole fit would take."""
-FINEST_PX = 0.5
-"""Points closer together than this in an image are thinned to it: four splats a pixel show all that a pixel can."""
+FINEST_PX = 0.35
+"""Points closer together than this in an image are thinned to it. On a street of 600,000 points 0.2 % of the labels
+then differ, 1.4 % at 0.5 and 17 % at 1, where a point no longer has a splat of its own in any image."""
 MOST_SPLATS = 4_000_000
 """A view that would draw more than this is thinned further; drawing takes about 300 bytes a splat."""
 CHOICE_POINTS = 1_000_000
 """Size and opacity of the splats are chosen on so many points, spread over the cloud."""
-LEAST_TILE, LARGEST_TILE = 100_000, 2_000_000
-"""Points of a tile that memory decides: smaller ones are mostly margin, larger ones save no time."""
+LEAST_TILE, LARGEST_TILE = 125_000, 2_000_000
+"""Points of a tile where memory decides, in steps of twice as many: a fit that is taken up finds the same tiles.
+Smaller ones are mostly margin, larger ones save no time."""
 TILE_BYTES = 1_500
 """Bytes that a tile takes at its peak, per point."""
-FIT_BYTES = 1_500
+FIT_BYTES = 1_000
 """Bytes that one fit of a whole cloud takes, per point."""
 CLOUD_BYTES = 120
 """Bytes that every point takes, whatever the tiles: positions, colours, spacings, ids, order."""
@@ -109,7 +111,7 @@ def fit_tiles(
     settings: FitSettings | None = None,
     *,
     points_per_tile: int | None = None,
-    work: Path | None = None,
+    work: str | os.PathLike[str] | None = None,
     progress: bool = True,
 ) -> LabelledCloud:
     """Label a scene as `fit` does by grouping masks, in memory that the tiles bound, not the cloud.
@@ -126,7 +128,7 @@ def fit_tiles(
     journal = Journal(progress)
     _check(scene, settings, journal)
     most = points_per_tile or _points_per_tile(len(scene.points), settings)
-    with _Kept.open(work, _key(scene.points, settings, most)) as kept:
+    with _Kept.open(Path(work) if work else None, _key(scene.points, settings, most)) as kept:
         with journal.stage("spacing"):
             cloud = _tiled(scene.points, most, settings, kept, journal)
         with journal.stage("geometry"):
@@ -164,6 +166,8 @@ def _check(scene: Scene, settings: FitSettings, journal: Journal) -> None:
     masks = sum(view.mask_count for view in scene.views)
     if masks == 0:
         raise SceneError(f"none of the {len(scene.views)} views has a mask; expected at least one: make masks first")
+    if len(scene.views) == 1:
+        journal.warnings.append("one view: nothing can contradict its masks, so every mask is an instance")
     journal.notes.update(points=len(scene.points), views=len(scene.views), masks=masks)
 
 
@@ -174,14 +178,14 @@ def _room(settings: FitSettings) -> int:
 
 def _points_per_tile(points: int, settings: FitSettings) -> int:
     room = _room(settings)
-    most = min((room - points * CLOUD_BYTES) // TILE_BYTES, LARGEST_TILE)
-    if most < LEAST_TILE:
+    fitting = (room - points * CLOUD_BYTES) // TILE_BYTES
+    if fitting < LEAST_TILE:
         raise OgPointcloudError(
             f"{points:,} points take {points * CLOUD_BYTES / 1e9:.1f} GB beside the scene, and tiles of {LEAST_TILE:,} "
             f"{LEAST_TILE * TILE_BYTES / 1e9:.1f} GB; the fit has {max(room, 0) / 1e9:.1f} GB: give it more memory, or "
             "thin the cloud"
         )
-    return most
+    return min(LEAST_TILE << (fitting // LEAST_TILE).bit_length() - 1, LARGEST_TILE)
 
 
 # Tiles ----------------------------------------------------------------------------------------------------------
@@ -347,6 +351,8 @@ def _drawing(views: Sequence[View], cloud: _TiledCloud, settings: FitSettings, j
     choice = choose_gaussians(few, spacing, views, near, geometry, partial(journal.steps, name="geometry"))
     journal.notes["gaussian_scale"], journal.notes["gaussian_opacity"] = choice.scale, choice.opacity
     journal.notes["photometric_trials"] = [list(trial) for trial in choice.trials]
+    if not choice.trials:
+        journal.warnings.append(f"no colours or images to compare with: points are drawn {choice.scale} spacings large")
     apart = pixels_per_spacing(points, cloud.spacing, views)
     smallest = min(min(view.camera.width, view.camera.height) for view in views)
     stride = int(np.clip(apart / geometry.pixels_per_spacing, 1, min(geometry.max_stride, smallest)))

@@ -189,6 +189,7 @@ def test_every_point_that_shows_is_worth_drawing(monkeypatch):
 
 
 def test_points_finer_than_pixels_are_thinned_to_them(monkeypatch):
+    monkeypatch.setattr(tiles, "FINEST_PX", 0.5)
     random = np.random.default_rng(4)
     xyz = np.concatenate([random.uniform(-1, 1, (40_000, 2)), np.full((40_000, 1), 4.0)], axis=1).astype(np.float32)
     camera = Camera(80, 80, 160.0, 160.0, 40.0, 40.0, np.eye(4))
@@ -266,6 +267,17 @@ def test_tiles_are_needed_where_memory_is_short():
     assert not tiles.needs_tiles(scene, FitSettings())
     assert tiles.needs_tiles(scene, FitSettings(memory=64_000_000))
     assert not tiles.needs_tiles(scene, FitSettings(memory=64_000_000, mode="paper"))
+
+
+def test_memory_decides_the_tiles_in_few_steps():
+    def most(points: int, memory: float) -> int:
+        used = tiles.memory_in_use()
+        return tiles._points_per_tile(points, FitSettings(memory=int(memory) + used))
+
+    assert most(20_000_000, 12e9) == 2_000_000
+    assert most(20_000_000, 2.9e9) == most(20_000_000, 3.1e9) == 250_000
+    with pytest.raises(OgPointcloudError, match="20,000,000 points take"):
+        most(20_000_000, 2.45e9)
 
 
 def test_the_command_fits_in_tiles(tiny_capture: TinyCapture, tmp_path):
