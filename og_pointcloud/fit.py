@@ -12,6 +12,7 @@ from numba import get_num_threads
 from numpy.typing import NDArray
 
 from og_pointcloud.cloud import BACKGROUND, UNOBSERVED, LabelledCloud
+from og_pointcloud.coverage import needed_views
 from og_pointcloud.errors import SceneError
 from og_pointcloud.geometry import (
     Neighbourhood,
@@ -29,7 +30,7 @@ from og_pointcloud.modes import Labelling, Prepared, as_published, by_choice, by
 from og_pointcloud.scene import Points, Scene, View
 from og_pointcloud.settings import FitSettings, GeometrySettings
 from og_pointcloud.table_store import TableStore, remove_work
-from og_pointcloud.visibility import Gaussians, MaskTable, mask_table, table_key, working_memory
+from og_pointcloud.visibility import Cutoffs, Gaussians, MaskTable, mask_table, table_key, working_memory
 
 __all__ = ["Prepared", "fit", "prepare"]
 
@@ -54,7 +55,9 @@ def fit(
     settings = settings or FitSettings()
     journal = Journal(progress)
     _check(scene, journal)
-    prepared = prepared or prepare(scene, settings, journal, work)
+    if prepared is None:
+        scene = _with_needed_views(scene, settings, journal)
+        prepared = prepare(scene, settings, journal, work)
     road = {"auto": by_choice, "grouping": by_grouping, "fast": by_features, "paper": as_published}[settings.mode]
     labelling = road(scene, prepared, settings, journal)
     _report(labelling, journal)
@@ -95,7 +98,7 @@ def prepare(
         views = (thinned(view, stride) for view in journal.steps(scene.views, "visibility"))
         thickness = _surface_thickness(gaussians, around, settings.geometry)
         store, at_once = _store(scene, gaussians, near, thickness, memory, work, settings)
-        table = mask_table(gaussians, views, near, thickness, store, at_once)
+        table = mask_table(gaussians, views, near, thickness, store, at_once, _cutoffs(settings))
         journal.notes["table"] = {"entries": store.entries, "on_disk": store.on_disk, "views_side_by_side": at_once}
         if store.resumed:
             journal.leave_out(f"rendering of {store.resumed} views", f"an interrupted fit kept them in '{work}'")
@@ -122,6 +125,18 @@ def _check(scene: Scene, journal: Journal) -> None:
     if len(scene.views) == 1:
         journal.warnings.append("one view: nothing can contradict its masks, so every mask is an instance")
     journal.notes.update(points=len(scene.points), views=len(scene.views), masks=masks)
+
+
+def _with_needed_views(scene: Scene, settings: FitSettings, journal: Journal) -> Scene:
+    enough = settings.visibility.enough_views
+    needed = range(len(scene.views)) if enough is None else needed_views(scene.points.xyz, scene.views, enough)
+    if len(needed) in (0, len(scene.views)):
+        return scene
+    journal.leave_out(
+        f"{len(scene.views) - len(needed)} of {len(scene.views)} views",
+        f"nearly all that they see is seen by {enough} others",
+    )
+    return replace(scene, views=tuple(scene.views[index] for index in needed))
 
 
 def _gaussians(scene: Scene, around: Neighbourhood, near: float, settings: FitSettings, journal: Journal) -> Gaussians:
@@ -190,8 +205,12 @@ def _store(
     at_once = int(np.clip(visibility.views_share * left // one, 1, min(get_num_threads(), len(scene.views))))
     share = visibility.table_share * max(0, left - at_once * one)
     folder = None if work is None else Path(work)
-    key = "" if folder is None else table_key(gaussians, near, thickness)
+    key = "" if folder is None else table_key(gaussians, near, thickness, _cutoffs(settings))
     return TableStore(len(gaussians), share, folder, key, visibility.keep_after_s), at_once
+
+
+def _cutoffs(settings: FitSettings) -> Cutoffs:
+    return Cutoffs(settings.visibility.alpha_min, settings.visibility.transmittance_min)
 
 
 def _front_surfaces(

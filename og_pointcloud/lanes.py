@@ -173,7 +173,7 @@ def any_of(context: Any, condition: Any) -> Any:
 
 @intrinsic
 def exp2(context: Any, lanes: Any) -> Any:
-    """2 to the power of each lane, which must lie in [-126, 0.5]; to 2e-7 of the value."""
+    """2 to the power of each lane, which must lie in [-126, 0.5]; to 3e-7 of the value."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         # 2^z = 2^i 2^f: cutting z - 1/2 <= 0 towards zero gives the nearest integer i, which becomes the exponent.

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
@@ -37,6 +37,8 @@ if "NUMBA_THREADING_LAYER_PRIORITY" not in os.environ:
     numba.config.THREADING_LAYER_PRIORITY = ["omp", "tbb", "workqueue"]  # pyright: ignore
 
 __all__ = [
+    "CUTOFFS",
+    "Cutoffs",
     "Gaussians",
     "ViewWeights",
     "pixel_weights",
@@ -55,21 +57,26 @@ LOW_PASS = 0.3
 ALPHA_MIN = 1.0 / 255.0
 """Contributions below are dropped (3DGS)."""
 LOG2_E = np.log2(np.e)
-LOG2_OF_ALPHA_MIN = np.log2(ALPHA_MIN)
-LOG2_ALPHA_MIN = np.float32(LOG2_OF_ALPHA_MIN)
-LARGEST_REACH = 2 * np.log(1 / ALPHA_MIN)
-"""Squared Mahalanobis distance at which alpha falls to ALPHA_MIN, at opacity 1."""
 ALPHA_MAX = 0.99
 """Alpha is cut here (3DGS)."""
 TRANSMITTANCE_MIN = 1e-4
 """A pixel stops before the splat that would bring its transmittance below (3DGS)."""
-LEAST_LIGHT = np.float32(0.99999 * TRANSMITTANCE_MIN)
-"""By more than rounding below: four splats of opacity 0.9 leave just the limit."""
 FRUSTUM_MARGIN = 0.3
 """Centres beyond the image by more than this share of the half field of view are clamped when the projection is
 linearised (3DGS's 1.3 tan(fov/2), written for any principal point)."""
 NEAR_SHARE = 0.02
 """The near plane as a share of the median depth of the scene; 3DGS fixes 0.2 units, which no unitless scene can."""
+
+
+class Cutoffs(NamedTuple):
+    """What blending leaves out, 3DGS's figures. Larger ones are faster and lose weight: an alpha below ``alpha_min``
+    is dropped, a pixel stops before the splat that would bring its transmittance below ``transmittance_min``."""
+
+    alpha_min: float = ALPHA_MIN
+    transmittance_min: float = TRANSMITTANCE_MIN
+
+
+CUTOFFS = Cutoffs()
 
 
 @dataclass(frozen=True)
@@ -142,13 +149,14 @@ def view_weights(
     id_count: int,
     near: float,
     thickness: NDArray[np.float32] | None = None,
+    cutoffs: Cutoffs = CUTOFFS,
 ) -> ViewWeights:
     """Blending weight of every Gaussian summed over the pixels of every id of one view.
 
     ids: (H, W) int32 in -1..id_count-1, H and W the camera's. thickness: see `visibility.mask_table`.
     Splats are blended by (float32 depth, index), so that equal depths have one order.
     """
-    (rows, cols, weights, first, counts), area = _entries(gaussians, camera, ids, id_count, near, thickness)
+    (rows, cols, weights, first, counts), area = _entries(gaussians, camera, ids, id_count, near, thickness, cutoffs)
     data, indices, indptr = _merge(rows, cols, weights, first, counts, id_count + 2, len(gaussians))
     border, n = indptr[-2], len(gaussians)
     return ViewWeights(
@@ -170,13 +178,14 @@ def _entries(
     id_count: int,
     near: float,
     thickness: NDArray[np.float32] | None,
+    cutoffs: Cutoffs = CUTOFFS,
 ) -> tuple[tuple[NDArray[Any], ...], NDArray[np.float64]]:
     """What `view_weights` adds up, tile by tile: (rows, cols, weights, first, counts), tile t's entries being
     first[t] : first[t] + counts[t]; and the area of each splat."""
     pose, near = camera.world_to_camera, float(near)
     intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
     size = (camera.width, camera.height)
-    near_image = _near_image(gaussians.xyz, gaussians.scale, gaussians.opacity, pose, intrinsics, size, near)
+    near_image = _near_image(gaussians.xyz, gaussians.scale, gaussians.opacity, pose, intrinsics, size, near, cutoffs)
     chosen = np.flatnonzero(near_image).astype(np.int32)
     splats, area = _records(len(chosen)), np.zeros(len(gaussians))
     keys = _project(
@@ -189,6 +198,7 @@ def _entries(
         pose,
         intrinsics,
         size,
+        cutoffs,
         splats,
         area,
     )
@@ -196,12 +206,12 @@ def _entries(
     order = (keys & np.uint64(0xFFFFFFFF)).astype(np.int32)
     columns = -(-camera.width // TILE)
     tiles = columns * -(-camera.height // TILE)
-    starts, members = _bin(splats, order, columns, tiles, numba.get_num_threads())
+    starts, members = _bin(splats, order, columns, tiles, cutoffs, numba.get_num_threads())
     masks = np.where(ids < 0, id_count, ids).astype(np.int32)
     bounds = _entry_bounds(splats, starts, members, masks, id_count, columns)
     first = np.concatenate([[0], np.cumsum(bounds)])
     rows, cols, weights, counts = _composite(
-        splats, starts, members, masks, id_count, columns, first, numba.get_num_threads()
+        splats, starts, members, masks, id_count, columns, first, cutoffs, numba.get_num_threads()
     )
     return (rows, cols, weights, first[:-1], counts), area
 
@@ -256,33 +266,34 @@ def _linearised_at(tx, ty, intrinsics, size):  # noqa: ANN001, ANN202
 
 
 @njit(cache=True, parallel=True, nogil=True, error_model="numpy")
-def _near_image(xyz, scale, opacity, pose, intrinsics, size, near):  # noqa: ANN001, ANN202
+def _near_image(xyz, scale, opacity, pose, intrinsics, size, near, cutoffs):  # noqa: ANN001, ANN202
     """(n,) bool: Gaussians that may show. Most of a scene lies outside a view: turned away before an ellipse is known,
     by the largest that it could be."""
     n = len(xyz)
     chosen = np.zeros(n, np.bool_)
     fx, fy, cx, cy = intrinsics
+    reach = -2.0 * np.log(cutoffs.alpha_min)  # squared Mahalanobis distance at which an opacity of 1 falls so low
     for g in prange(n):
         depth, tx, ty = _seen_from(np.float64(xyz[g, 0]), np.float64(xyz[g, 1]), np.float64(xyz[g, 2]), pose)
-        if not depth > near or not opacity[g] > ALPHA_MIN:
+        if not depth > near or not opacity[g] > cutoffs.alpha_min:
             continue
         jx, jy = _linearised_at(tx, ty, intrinsics, size)
         largest = np.float64(max(scale[g, 0], scale[g, 1], scale[g, 2])) / depth
         xx = fx * fx * largest * largest * (1 + jx * jx) + LOW_PASS
         yy = fy * fy * largest * largest * (1 + jy * jy) + LOW_PASS
-        chosen[g] = _reaches(fx * tx + cx, size[0], xx) and _reaches(fy * ty + cy, size[1], yy)
+        chosen[g] = _reaches(fx * tx + cx, size[0], reach * xx) and _reaches(fy * ty + cy, size[1], reach * yy)
     return chosen
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _reaches(at, size, variance):  # noqa: ANN001, ANN202
-    """Whether a splat of that largest variance (px^2) about ``at`` may show in pixels 0 to size."""
+def _reaches(at, size, reach_squared):  # noqa: ANN001, ANN202
+    """Whether what reaches so far (px^2) about ``at`` may show in pixels 0 to size."""
     outside = max(-at, at - size) - 1.0
-    return not (outside > 0.0 and outside * outside > LARGEST_REACH * variance)
+    return not (outside > 0.0 and outside * outside > reach_squared)
 
 
 @njit(cache=True, parallel=True, nogil=True, error_model="numpy")
-def _project(chosen, xyz, scale, rotation, opacity, thickness, pose, intrinsics, size, splats, area):  # noqa: ANN001, ANN202
+def _project(chosen, xyz, scale, rotation, opacity, thickness, pose, intrinsics, size, cutoffs, splats, area):  # noqa: ANN001, ANN202
     """EWA projection of the chosen Gaussians in float64: writes splats (m,) and area (n,), the weight in pixels if
     nothing were in front; returns depth keys (m,) uint64.
 
@@ -298,9 +309,9 @@ def _project(chosen, xyz, scale, rotation, opacity, thickness, pose, intrinsics,
         jx, jy = _linearised_at(tx, ty, intrinsics, size)
         sxx, sxy, syy, det = _covariance(scale[g], rotation[g], pose, fx / depth, fy / depth, jx, jy)
         u, v, sigma = fx * tx + cx, fy * ty + cy, np.float64(opacity[g])
-        # The ellipse on which alpha falls to ALPHA_MIN; its box holds every pixel that can contribute.
+        # The ellipse on which alpha falls to its least; its box holds every pixel that can contribute.
         peak = np.log2(sigma)
-        reach = 2.0 / LOG2_E * (peak - LOG2_OF_ALPHA_MIN)
+        reach = 2.0 / LOG2_E * (peak - np.log2(cutoffs.alpha_min))
         rx, ry = np.sqrt(reach * sxx), np.sqrt(reach * syy)
         x0, x1 = max(np.ceil(u - rx - 0.5), 0.0), min(np.floor(u + rx - 0.5), size[0] - 1.0)
         y0, y1 = max(np.ceil(v - ry - 0.5), 0.0), min(np.floor(v + ry - 0.5), size[1] - 1.0)
@@ -312,7 +323,7 @@ def _project(chosen, xyz, scale, rotation, opacity, thickness, pose, intrinsics,
         s.across, s.down = np.sqrt(0.5 * LOG2_E * syy / det), 0.5 * LOG2_E / syy
         s.peak, s.depth, s.surface = peak, depth, depth - thickness[g if len(thickness) > 1 else 0]
         s.x0, s.x1, s.y0, s.y1, s.gaussian = int(x0), int(x1), int(y0), int(y1), g
-        area[g] = 2 * np.pi * np.sqrt(det) * (sigma - ALPHA_MIN)  # the integral of alpha over that ellipse
+        area[g] = 2 * np.pi * np.sqrt(det) * (sigma - cutoffs.alpha_min)  # the integral of alpha over that ellipse
         keys[i] = (np.uint64(np.float32(depth).view(np.uint32)) << np.uint64(32)) | np.uint64(i)
     return keys
 
@@ -350,9 +361,9 @@ def _projected_axis(axis, length, pose, px, py, jx, jy):  # noqa: ANN001, ANN202
 
 
 @njit(cache=True, parallel=True, nogil=True, error_model="numpy")
-def _bin(splats, order, columns, tiles, bands):  # noqa: ANN001, ANN202
+def _bin(splats, order, columns, tiles, cutoffs, bands):  # noqa: ANN001, ANN202
     """Depth-ordered members of every tile: tile t holds members[starts[t]:starts[t + 1]]."""
-    tile_rows = tiles // columns
+    tile_rows, log2_least = tiles // columns, np.log2(cutoffs.alpha_min)
     # The tile ranges side by side: every band reads all of them, twice.
     ranges = np.empty((len(order), 4), np.int32)
     for i in prange(len(order)):
@@ -364,7 +375,7 @@ def _bin(splats, order, columns, tiles, bands):  # noqa: ANN001, ANN202
         low, high = band * tile_rows // bands, (band + 1) * tile_rows // bands
         for i in range(len(order)):
             for row in range(max(ranges[i, 2], low), min(ranges[i, 3], high)):
-                begin, end = _tiles_of_row(splats, order[i], row, ranges[i, 0], ranges[i, 1])
+                begin, end = _tiles_of_row(splats, order[i], row, ranges[i, 0], ranges[i, 1], log2_least)
                 for column in range(begin, end):
                     counts[row * columns + column + 1] += 1
     starts = np.cumsum(counts)
@@ -374,7 +385,7 @@ def _bin(splats, order, columns, tiles, bands):  # noqa: ANN001, ANN202
         low, high = band * tile_rows // bands, (band + 1) * tile_rows // bands
         for i in range(len(order)):
             for row in range(max(ranges[i, 2], low), min(ranges[i, 3], high)):
-                begin, end = _tiles_of_row(splats, order[i], row, ranges[i, 0], ranges[i, 1])
+                begin, end = _tiles_of_row(splats, order[i], row, ranges[i, 0], ranges[i, 1], log2_least)
                 for column in range(begin, end):
                     tile = row * columns + column
                     members[fill[tile]] = order[i]
@@ -383,14 +394,14 @@ def _bin(splats, order, columns, tiles, bands):  # noqa: ANN001, ANN202
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _tiles_of_row(splats, place, row, begin, end):  # noqa: ANN001, ANN202
+def _tiles_of_row(splats, place, row, begin, end, log2_least):  # noqa: ANN001, ANN202
     """The columns of tiles that a splat's ellipse touches in a row of tiles, of those that its box does."""
     if end - begin <= 2:
         return begin, end
     s = splats[place]
     # Along dy, the ellipse's right end lies at u - shear dy + sqrt(room - down dy^2) / across: farthest out at `far`,
     # within the row of tiles where it comes nearest to that; its left end is the mirror image.
-    room, across, down = np.float64(s.peak) - LOG2_ALPHA_MIN, np.float64(s.across), np.float64(s.down)
+    room, across, down = np.float64(s.peak) - log2_least, np.float64(s.across), np.float64(s.down)
     slant = s.shear * across
     far = -slant * np.sqrt(room / down / (down + slant * slant))
     low = max(row * TILE + 0.5 - s.v, -np.sqrt(room / down))
@@ -438,7 +449,7 @@ def _entry_bounds(splats, starts, members, masks, id_count, columns):  # noqa: A
 
 
 @njit(cache=True, parallel=True, nogil=True, error_model="numpy")
-def _composite(splats, starts, members, masks, id_count, columns, first, workers):  # noqa: ANN001, ANN202
+def _composite(splats, starts, members, masks, id_count, columns, first, cutoffs, workers):  # noqa: ANN001, ANN202
     """Blend every tile front to back and add each splat's weights up by mask; entries of tile t start at first[t].
 
     Row id_count holds pixels without a mask, row id_count + 1 what shows through surfaces (counted in its mask too)."""
@@ -455,6 +466,9 @@ def _composite(splats, starts, members, masks, id_count, columns, first, workers
         light, surface, shown = _scratch(), _scratch(), _scratch()
         runs = np.empty((TILE, TILE), np.uint8)
         batch = np.empty(BATCH, SPLAT)
+        log2_least = np.float32(np.log2(cutoffs.alpha_min))
+        # By more than rounding below: four splats of opacity 0.9 leave just the limit of 3DGS.
+        least_light = np.float32(0.99999 * cutoffs.transmittance_min)
         for tile in range(worker, tiles, workers):
             left, top = tile % columns * TILE, tile // columns * TILE
             ids = masks[top : top + TILE, left : left + TILE]
@@ -466,7 +480,7 @@ def _composite(splats, starts, members, masks, id_count, columns, first, workers
                     batch[k] = splats[members[begin + k]]
                 for k in range(count):
                     s = batch[k]
-                    weight, through = _blend(s, left, top, light, surface, shown)
+                    weight, through = _blend(s, left, top, log2_least, least_light, light, surface, shown)
                     if weight == 0.0:
                         continue
                     x0, x1, y0, y1 = _clip_box(s, left, top)
@@ -514,25 +528,25 @@ def _begin_tile(ids, light, surface, runs):  # noqa: ANN001, ANN202
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _blend(s, left, top, light, surface, shown):  # noqa: ANN001, ANN202
+def _blend(s, left, top, log2_least, least_light, light, surface, shown):  # noqa: ANN001, ANN202
     """Draw a splat into a tile, a row of pixels at a time. Returns its weight, and that which shows through a surface.
 
     light: transmittance of each pixel, 0 where it is finished. surface: depth of the splat that brought a pixel's
     transmittance below a half. shown: set to the weights in the rows of its box.
     """
     none, full, half, never = spread(ZERO), spread(ONE), spread(HALF), spread(np.float32(np.inf))
-    across, depth, near_side = spread(s.across), spread(s.depth), spread(s.surface)
+    across, depth, near_side, least = spread(s.across), spread(s.depth), spread(s.surface), spread(log2_least)
     weight, through = none, none
     for y in range(max(s.y0 - top, 0), min(s.y1 + 1 - top, TILE)):
         dy = top + y + 0.5 - s.v
         distance = (ramp() - spread(np.float32(s.u - s.shear * dy - left - 0.5))) * across
         log_alpha = spread(np.float32(s.peak - s.down * dy * dy)) - distance * distance
-        covers = log_alpha >= spread(LOG2_ALPHA_MIN)
-        alpha = lesser(exp2(either(covers, log_alpha, spread(LOG2_ALPHA_MIN))), spread(np.float32(ALPHA_MAX)))
+        covers = log_alpha >= least
+        alpha = lesser(exp2(either(covers, log_alpha, least)), spread(np.float32(ALPHA_MAX)))
         alpha = either(covers, alpha, none)
         before = load(light, y * TILE)
         after = before * (full - alpha)
-        goes_on = after >= spread(LEAST_LIGHT)  # also where it is not covered and not finished
+        goes_on = after >= spread(least_light)  # also where it is not covered and not finished
         here = either(goes_on, before * alpha, none)
         store(light, y * TILE, either(goes_on, after, none))
         passed = either((before >= half) & (after < half), depth, never)

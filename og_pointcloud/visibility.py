@@ -21,8 +21,10 @@ from scipy.sparse import csr_array
 
 from og_pointcloud.scene import View
 from og_pointcloud.splatting import (
+    CUTOFFS,
     FRUSTUM_MARGIN,
     NEAR_SHARE,
+    Cutoffs,
     Gaussians,
     ViewWeights,
     pixel_weights,
@@ -35,6 +37,7 @@ from og_pointcloud.table_store import TableStore
 __all__ = [
     "FRUSTUM_MARGIN",
     "NEAR_SHARE",
+    "Cutoffs",
     "Gaussians",
     "MaskTable",
     "ViewWeights",
@@ -93,6 +96,7 @@ def mask_table(
     thickness: NDArray[np.float32] | None = None,
     store: TableStore | None = None,
     at_once: int | None = None,
+    cutoffs: Cutoffs = CUTOFFS,
 ) -> MaskTable:
     """The mask table of all views, one pass over each.
 
@@ -111,7 +115,7 @@ def mask_table(
 
     def show(view: View) -> tuple[View, NDArray[np.int32], str, ViewWeights, csr_array]:
         ids = view.mask_map()
-        shown = view_weights(gaussians, view.camera, ids, view.mask_count, near, thickness)
+        shown = view_weights(gaussians, view.camera, ids, view.mask_count, near, thickness, cutoffs)
         return view, ids, _mark(view, ids) if store.folder else "", shown, _exposure(shown)
 
     coming = iter(views)
@@ -139,10 +143,11 @@ def mask_table(
     )
 
 
-def table_key(gaussians: Gaussians, near: float, thickness: NDArray[np.float32]) -> str:
+def table_key(gaussians: Gaussians, near: float, thickness: NDArray[np.float32], cutoffs: Cutoffs = CUTOFFS) -> str:
     """A fingerprint of all that the rows of a view depend on, but for the view."""
     digest = blake2b(VERSION, digest_size=16)
-    for array in (gaussians.xyz, gaussians.scale, gaussians.rotation, gaussians.opacity, thickness, np.float64(near)):
+    numbers = np.array([near, *cutoffs])
+    for array in (gaussians.xyz, gaussians.scale, gaussians.rotation, gaussians.opacity, thickness, numbers):
         digest.update(np.ascontiguousarray(array).data)
     return digest.hexdigest()
 
