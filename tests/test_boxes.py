@@ -15,10 +15,7 @@ RANDOM_SHAPES = [(count, seed) for count in (5, 8, 20, 60) for seed in range(2)]
 
 
 def least_volume_plainly(xyz):
-    """Every facet of the hull as the floor of the box, and 400 directions more; each with the least rectangle upright.
-
-    Rotating calipers spelled out: each pair of neighbouring hull corners in turn as the direction of a side.
-    """
+    """Every facet of the hull as the floor of the box, and 400 directions more; each with the least rectangle on it."""
     hull = ConvexHull(xyz)
     floors = [*hull.equations[:, :3], *Rotation.random(400, random_state=0).as_matrix()[:, 0]]
     least = np.inf
@@ -26,13 +23,15 @@ def least_volume_plainly(xyz):
         helper = np.eye(3)[np.abs(floor).argmin()]
         u = np.cross(floor, helper) / np.linalg.norm(np.cross(floor, helper))
         v = np.cross(floor, u)
-        flat = xyz @ np.stack([u, v]).T
-        corners = flat[ConvexHull(flat).vertices]
-        for a, b in itertools.pairwise([*corners, corners[0]]):
-            side = (b - a) / np.linalg.norm(b - a)
-            area = np.ptp(corners @ side) * np.ptp(corners @ [-side[1], side[0]])
-            least = min(least, area * np.ptp(xyz @ floor))
+        least = min(least, least_area_plainly(xyz @ np.stack([u, v]).T) * np.ptp(xyz @ floor))
     return least
+
+
+def least_area_plainly(flat):
+    """Each pair of neighbouring hull corners in turn as the direction of a side."""
+    corners = flat[ConvexHull(flat).vertices]
+    sides = [(b - a) / np.linalg.norm(b - a) for a, b in itertools.pairwise([*corners, corners[0]])]
+    return min(np.ptp(corners @ side) * np.ptp(corners @ [-side[1], side[0]]) for side in sides)
 
 
 def turned_box(size=(3.0, 2.0, 0.5), count=2000, seed=0):
@@ -81,6 +80,28 @@ def test_box_of_a_cube_whose_principal_axes_mean_nothing():
     assert oriented_box(xyz).volume == pytest.approx(1, rel=1e-6)
     tetrahedron = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1.0]])
     assert oriented_box(tetrahedron @ Rotation.random(random_state=1).as_matrix().T).volume < 8 * 1.01
+
+
+@pytest.mark.parametrize(("count", "seed"), RANDOM_SHAPES)
+def test_no_turn_about_one_of_its_own_axes_makes_the_box_smaller(count, seed):
+    xyz = np.random.default_rng(seed).normal(size=(count, 3))
+    box = oriented_box(xyz)
+    for axis, (u, v) in zip(box.axes, ((1, 2), (2, 0), (0, 1)), strict=True):
+        assert box.volume <= (1 + 1e-6) * least_area_plainly(xyz @ box.axes[[u, v]].T) * np.ptp(xyz @ axis)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_box_is_exact_where_the_points_inside_pull_the_principal_axes_aside(seed):
+    random, rotation = np.random.default_rng(seed), Rotation.random(random_state=seed).as_matrix()
+    corners = np.array(list(itertools.product([-0.5, 0.5], repeat=3)))
+    inside = np.outer(random.uniform(-0.4, 0.4, 300), random.choice([-1, 1], 3))
+    xyz = np.concatenate([corners, inside]) * [3, 2.5, 2] @ rotation.T
+    np.testing.assert_allclose(oriented_box(xyz).size, [3, 2.5, 2], atol=1e-9)
+
+
+def test_a_full_box_of_points_whose_outermost_ones_few_directions_touch():
+    xyz = np.random.default_rng(0).uniform(-1, 1, (2000, 3)) * [3, 2, 0.3]
+    assert oriented_box(xyz).volume < 1.002 * least_volume_plainly(xyz)
 
 
 def test_many_points_that_few_directions_touch_still_lie_inside_a_small_box():
@@ -227,6 +248,14 @@ def test_strays_are_the_same_whatever_the_order_the_offset_or_the_turn():
     np.testing.assert_array_equal(main_part(np.concatenate([xyz, xyz[:500]]))[: len(xyz)], main)
     turned = xyz @ Rotation.random(random_state=5).as_matrix().T + 1e5
     assert (main_part(turned) == main).mean() > 0.999
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_turned_cloud_that_thins_out_loses_the_same_points(seed):
+    xyz = np.random.default_rng(seed).standard_t(3, (800, 3)) * [3, 2, 1]
+    main = main_part(xyz)
+    assert 0.9 < main.mean() < 1
+    np.testing.assert_array_equal(main_part(xyz @ Rotation.random(random_state=seed).as_matrix().T), main)
 
 
 def test_connected_parts_against_a_search_voxel_by_voxel():
