@@ -26,7 +26,7 @@ capture = make_capture(0, CaptureSettings(views=40))
 room = og.read_capture(write_capture(capture, out / "capture"))
 prepared = prepare(room)
 cloud = replace(og.fit(room, prepared=prepared), vocabulary=Vocabulary(CLASS_NAMES, capture.text_vectors))
-og.write_bundle(cloud, out / "room.ogpc")
+scene = og.load(og.write_bundle(cloud, out / "room.ogpc"))
 splats = prepared.gaussians  # twice as large as the fit draws them, so that a picture has no gaps
 before, removed, recoloured, inserted = (
     out / f"{name}.ply" for name in ("before", "removed", "recoloured", "inserted")
@@ -34,7 +34,6 @@ before, removed, recoloured, inserted = (
 shape = {"scale": 2 * splats.scale, "rotation": splats.rotation, "opacity": splats.opacity}
 write_gaussian_ply(before, replace(room.points, **shape))
 
-scene = og.load(out / "room.ogpc")
 sofas, cushions = og.select(scene, "sofa").instances, og.select(scene, "cushion").instances
 og.edit.remove(scene, [*sofas, *cushions], removed, cloud=before, halo=3)
 tables = og.edit.recolour(scene, "table", recoloured, (170, 40, 35), cloud=removed).instances
@@ -50,9 +49,8 @@ eye = np.append(table + 1.6 * (table - sofa) / np.linalg.norm(table - sofa), 2.2
 forward = np.append(sofa, 0.4) - eye
 forward /= np.linalg.norm(forward)
 right = np.cross(forward, [0, 0, 1]) / np.linalg.norm(forward[:2])
-world_to_camera = np.eye(4)
-world_to_camera[:3, :3] = [right, np.cross(forward, right), forward]
-world_to_camera[:3, 3] = -world_to_camera[:3, :3] @ eye
+rotation = np.stack([right, np.cross(forward, right), forward])
+world_to_camera = np.vstack([np.column_stack([rotation, -rotation @ eye]), [0, 0, 0, 1]])
 camera = og.Camera(640, 480, 420, 420, 320, 240, world_to_camera)
 pictures = []
 for path in (before, removed, recoloured, inserted):
