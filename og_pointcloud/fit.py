@@ -99,7 +99,12 @@ def prepare(
         thickness = _surface_thickness(gaussians, around, settings.geometry)
         store, at_once = _store(scene, gaussians, near, thickness, memory, work, settings)
         table = mask_table(gaussians, views, near, thickness, store, at_once, _cutoffs(settings))
-        journal.notes["table"] = {"entries": store.entries, "on_disk": store.on_disk, "views_side_by_side": at_once}
+        journal.notes["table"] = {
+            "views": len(store.marks),
+            "entries": store.entries,
+            "on_disk": store.on_disk,
+            "views_side_by_side": at_once,
+        }
         if store.resumed:
             journal.leave_out(f"rendering of {store.resumed} views", f"an interrupted fit kept them in '{work}'")
         table = replace(table, mask_pixels=table.mask_pixels * stride**2)

@@ -16,7 +16,7 @@ from scipy.sparse import csr_array
 from og_pointcloud.errors import SceneError
 from og_pointcloud.scene import Camera, Points, View
 from og_pointcloud.testimony import hear_views
-from og_pointcloud.visibility import Gaussians, mask_table, pixel_weights, render, view_weights
+from og_pointcloud.visibility import Cutoffs, Gaussians, mask_table, pixel_weights, render, view_weights
 
 NEAR = 0.25
 MASKS = 12
@@ -241,6 +241,33 @@ def test_a_pixel_stops_before_its_transmittance_falls_below_the_limit() -> None:
     weights = pixel_weights(wall, camera(1, 1), NEAR).toarray().ravel()
     np.testing.assert_allclose(weights[:4], 0.9 * 0.1 ** np.arange(4), rtol=1e-3)
     assert (weights[4:] == 0).all()  # the fifth would leave 1e-5
+
+
+def test_cutoffs_leave_out_what_they_say() -> None:
+    splat = Gaussians(
+        np.array([[0, 0, 1]], np.float32), np.zeros((1, 3), np.float32), IDENTITY[None], np.float32([0.5])
+    )
+    view, ids = camera(5, 5, 10.0, fy=10.0), np.arange(25, dtype=np.int32).reshape(5, 5)
+    shown = view_weights(splat, view, ids, 25, NEAR, cutoffs=Cutoffs(alpha_min=1 / 32)).rows.toarray()[:25]
+    assert (shown.reshape(5, 5) > 0).astype(int).tolist() == [
+        [0] * 5, [0, 0, 1, 0, 0], [0, 1, 1, 1, 0], [0, 0, 1, 0, 0], [0] * 5
+    ]  # fmt: skip
+    xyz = np.stack([np.zeros(20), np.zeros(20), np.linspace(1, 2, 20)], axis=1).astype(np.float32)
+    wall = Gaussians(xyz, np.full((20, 3), 50, np.float32), np.tile(IDENTITY, (20, 1)), np.full(20, 0.9, np.float32))
+    one = camera(1, 1), np.zeros((1, 1), np.int32), 1, NEAR
+    weights = view_weights(wall, *one, cutoffs=Cutoffs(transmittance_min=1e-2)).rows.toarray()[0]
+    np.testing.assert_allclose(weights[:2], [0.9, 0.09], rtol=1e-3)
+    assert (weights[2:] == 0).all()
+
+
+def test_needles_across_many_tiles_equal_the_reference(random: Generator) -> None:
+    gaussians = cloud(random, 60)
+    scale = np.full((60, 3), 1e-3, np.float32)
+    scale[:, 0] = random.uniform(0.1, 3, 60)
+    gaussians, view = replace(gaussians, scale=scale), camera(160, 96, 100.0)
+    expected = reference_pixel_weights(gaussians, view, NEAR).reshape(-1, 60)
+    assert (np.count_nonzero(expected, axis=0) > 100).sum() > 20
+    assert_weights(pixel_weights(gaussians, view, NEAR), expected)
 
 
 def test_order_of_points_does_not_matter(random: Generator) -> None:
