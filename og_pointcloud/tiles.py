@@ -38,6 +38,7 @@ from scipy.spatial import cKDTree
 from og_pointcloud._atomic import replacing
 from og_pointcloud.association import describe_instances
 from og_pointcloud.cloud import BACKGROUND, UNOBSERVED, LabelledCloud
+from og_pointcloud.coverage import needed_views
 from og_pointcloud.errors import OgPointcloudError, SceneError
 from og_pointcloud.geometry import (
     Neighbourhood,
@@ -57,7 +58,7 @@ from og_pointcloud.modes import Labelling
 from og_pointcloud.scene import Points, Scene, View
 from og_pointcloud.settings import FitSettings
 from og_pointcloud.testimony import hear_views
-from og_pointcloud.visibility import FRUSTUM_MARGIN, Gaussians, MaskTable, mask_table
+from og_pointcloud.visibility import FRUSTUM_MARGIN, Cutoffs, Gaussians, MaskTable, mask_table
 
 __all__ = ["Tiles", "fit_tiles", "kept_views", "needs_tiles", "split"]
 
@@ -127,14 +128,15 @@ def fit_tiles(
     settings = settings or FitSettings()
     journal = Journal(progress)
     _check(scene, settings, journal)
+    views = _needed(scene, settings, journal)
     most = points_per_tile or _points_per_tile(len(scene.points), settings)
     with _Kept.open(Path(work) if work else None, _key(scene.points, settings, most)) as kept:
         with journal.stage("spacing"):
             cloud = _tiled(scene.points, most, settings, kept, journal)
         with journal.stage("geometry"):
-            drawing = _drawing(scene.views, cloud, settings, journal)
+            drawing = _drawing(views, cloud, settings, journal)
         with journal.stage("visibility"):
-            shown = _look(scene.views, cloud, drawing, settings, kept, journal)
+            shown = _look(views, cloud, drawing, settings, kept, journal)
         with journal.stage("grouping"):
             groups = _instances(cloud, shown, settings, journal)
         with journal.stage("membership"):
@@ -169,6 +171,17 @@ def _check(scene: Scene, settings: FitSettings, journal: Journal) -> None:
     if len(scene.views) == 1:
         journal.warnings.append("one view: nothing can contradict its masks, so every mask is an instance")
     journal.notes.update(points=len(scene.points), views=len(scene.views), masks=masks)
+
+
+def _needed(scene: Scene, settings: FitSettings, journal: Journal) -> Sequence[View]:
+    """All views, or those that see something new, where the settings ask for that."""
+    enough = settings.visibility.enough_views
+    chosen = [] if enough is None else needed_views(scene.points.xyz, scene.views, enough)
+    if len(chosen) in (0, len(scene.views)):
+        return scene.views
+    left_out = f"{len(scene.views) - len(chosen)} of {len(scene.views)} views"
+    journal.leave_out(left_out, f"nearly all that they see is seen by {enough} others")
+    return [scene.views[index] for index in chosen]
 
 
 def _room(settings: FitSettings) -> int:
@@ -437,14 +450,15 @@ def _entries(
     view: View, cloud: _TiledCloud, drawing: _Drawing, settings: FitSettings, thinning: list[tuple[int, int]]
 ) -> Entries:
     """What one view shows. thinning: gets how many points were drawn, and how many there are in the image."""
-    rows, larger, inside = _worth_drawing(view, cloud, drawing)
+    rows, larger, inside = _worth_drawing(view, cloud, drawing, settings.visibility.alpha_min)
     thinning.append((len(rows), inside))
     if len(rows) == 0:
         return np.zeros(0, ENTRY)
     splats = drawing.splats(cloud, rows, larger)
     apart = np.maximum(cloud.spacing[rows] * larger, drawing.typical)
     thickness = (settings.geometry.thickness * apart + 3 * splats.scale.max(axis=1)).astype(np.float32)
-    whole = mask_table(splats, [view], drawing.near, thickness)
+    cutoffs = Cutoffs(settings.visibility.alpha_min, settings.visibility.transmittance_min)
+    whole = mask_table(splats, [view], drawing.near, thickness, cutoffs=cutoffs)
     camera = view.camera
     # In a table of one view each point has too few of them to contradict a mask: all that is behind is found.
     front, _ = without_see_through(
@@ -464,7 +478,9 @@ def _entries(
     return entries[np.argsort(entries["point"], kind="stable")]
 
 
-def _worth_drawing(view: View, cloud: _TiledCloud, drawing: _Drawing) -> tuple[Rows, NDArray[np.float32], int]:
+def _worth_drawing(
+    view: View, cloud: _TiledCloud, drawing: _Drawing, alpha_min: float
+) -> tuple[Rows, NDArray[np.float32], int]:
     """The points in an image that are drawn, how much larger than they are, and how many there are in it.
 
     Those that lie FINEST_PX apart or more are all drawn; of others a part, by chance, such that they do. Larger in
@@ -473,8 +489,9 @@ def _worth_drawing(view: View, cloud: _TiledCloud, drawing: _Drawing) -> tuple[R
     camera, points = view.camera, cloud.points
     widest = cloud.spacing * np.float32(drawing.scale) if points.scale is None else points.scale.max(axis=1)
     intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
-    size = camera.width, camera.height
-    apart = _apart_px(points.xyz, cloud.spacing, widest, camera.world_to_camera, intrinsics, size, drawing.near)
+    size, reach = (camera.width, camera.height), np.sqrt(-2 * np.log(alpha_min))
+    pose = camera.world_to_camera
+    apart = _apart_px(points.xyz, cloud.spacing, widest, reach, pose, intrinsics, size, drawing.near)
     rows = np.flatnonzero(apart)
     apart, finest = apart[rows], FINEST_PX
     while (part := np.minimum(1, (apart / finest) ** 2, dtype=np.float32)).sum(dtype=np.float64) > MOST_SPLATS:
@@ -484,10 +501,10 @@ def _worth_drawing(view: View, cloud: _TiledCloud, drawing: _Drawing) -> tuple[R
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
-def _apart_px(xyz, spacing, widest, pose, intrinsics, size, near):  # noqa: ANN001, ANN202
+def _apart_px(xyz, spacing, widest, reach, pose, intrinsics, size, near):  # noqa: ANN001, ANN202
     """(n,) float32: how many pixels apart points lie where they are; 0 where they are surely in no pixel.
 
-    A splat reaches less than four of its standard deviations and two pixels (splatting.py).
+    A splat reaches ``reach`` standard deviations, its own and those of the pixels' low-pass (splatting.py).
     """
     apart = np.zeros(len(xyz), np.float32)
     fx, fy, cx, cy = intrinsics
@@ -506,8 +523,8 @@ def _apart_px(xyz, spacing, widest, pose, intrinsics, size, near):  # noqa: ANN0
         ty = (pose[1, 0] * x + pose[1, 1] * y + pose[1, 2] * z + pose[1, 3]) / depth
         # The projection is linearised within a margin of the image: there a round splat is widened by its direction.
         jx, jy = min(max(tx, low_x), high_x), min(max(ty, low_y), high_y)
-        reach_x = 4 * fx * widest[g] / depth * np.sqrt(1 + jx * jx) + 2
-        reach_y = 4 * fy * widest[g] / depth * np.sqrt(1 + jy * jy) + 2
+        reach_x = reach * (fx * widest[g] / depth * np.sqrt(1 + jx * jx) + 0.6) + 1
+        reach_y = reach * (fy * widest[g] / depth * np.sqrt(1 + jy * jy) + 0.6) + 1
         u, v = fx * tx + cx, fy * ty + cy
         if -reach_x < u < width + reach_x and -reach_y < v < height + reach_y:
             apart[g] = np.sqrt(fx * fy) * spacing[g] / depth

@@ -18,7 +18,7 @@ from og_pointcloud.cloud import LabelledCloud
 from og_pointcloud.errors import OgPointcloudError, SceneError
 from og_pointcloud.fit import fit
 from og_pointcloud.scene import Camera, Points, Scene, View
-from og_pointcloud.settings import FitSettings, GeometrySettings
+from og_pointcloud.settings import FitSettings, GeometrySettings, VisibilitySettings
 from og_pointcloud.tiles import fit_tiles, split
 from og_pointcloud.visibility import mask_table
 
@@ -181,7 +181,7 @@ def test_every_point_that_shows_is_worth_drawing(monkeypatch):
     drawing = tiles._Drawing(1.0, 0.01, 0.1, 0.3, 1)  # so faint that nothing hides anything
     everything = drawing.splats(cloud, np.arange(4000), np.ones(4000, np.float32))
     shows = np.unique(mask_table(everything, [view], drawing.near).exposure.indices)
-    rows, larger, inside = tiles._worth_drawing(view, cloud, drawing)
+    rows, larger, inside = tiles._worth_drawing(view, cloud, drawing, 1 / 255)
     assert len(shows) > 250
     assert set(shows) <= set(rows)
     assert len(rows) == inside < 2000
@@ -196,14 +196,14 @@ def test_points_finer_than_pixels_are_thinned_to_them(monkeypatch):
     view = View("view", camera, np.full((80, 80), -1, np.int32), np.zeros((0, 4), np.float32))
     cloud = tiled_cloud(Points(xyz, np.zeros(3)), 0.00625)  # a quarter of a pixel, half of FINEST_PX
     drawing = tiles._Drawing(0.5, 0.9, 0.1, 0.00625, 1)
-    rows, larger, inside = tiles._worth_drawing(view, cloud, drawing)
+    rows, larger, inside = tiles._worth_drawing(view, cloud, drawing, 1 / 255)
     assert inside == 40_000
     assert len(rows) == pytest.approx(10_000, rel=0.05)
     np.testing.assert_allclose(larger, 2, rtol=1e-3)
-    others, _, _ = tiles._worth_drawing(replace(view, name="other"), cloud, drawing)
+    others, _, _ = tiles._worth_drawing(replace(view, name="other"), cloud, drawing, 1 / 255)
     assert len(np.intersect1d(rows, others)) == pytest.approx(2_500, rel=0.1)
     monkeypatch.setattr(tiles, "MOST_SPLATS", 3_000)
-    rows, larger, _ = tiles._worth_drawing(view, cloud, drawing)
+    rows, larger, _ = tiles._worth_drawing(view, cloud, drawing, 1 / 255)
     assert 2_000 < len(rows) < 3_200
     assert (larger**2).sum() == pytest.approx(40_000, rel=0.05)
 
@@ -267,6 +267,17 @@ def test_tiles_are_needed_where_memory_is_short():
     assert not tiles.needs_tiles(scene, FitSettings())
     assert tiles.needs_tiles(scene, FitSettings(memory=64_000_000))
     assert not tiles.needs_tiles(scene, FitSettings(memory=64_000_000, mode="paper"))
+
+
+def test_settings_of_rendering_count_in_tiles_too(monkeypatch):
+    monkeypatch.setattr(tiles, "FINEST_PX", 1e-6)
+    rendering = VisibilitySettings(alpha_min=0.03, transmittance_min=0.02, enough_views=1)
+    settings = replace(SETTINGS, visibility=rendering)
+    again = tuple(replace(view, name=f"{view.name} again") for view in street().scene.views)
+    scene = replace(street().scene, views=street().scene.views + again)
+    cloud = fit_tiles(scene, settings, points_per_tile=POINTS, progress=False)
+    np.testing.assert_array_equal(cloud.instance_ids, fit(scene, settings, progress=False).instance_ids)
+    assert cloud.provenance["left_out"][0]["what"] == "12 of 24 views"
 
 
 def test_memory_decides_the_tiles_in_few_steps():
