@@ -8,6 +8,7 @@ opacity fitted with frozen positions) reduced to what a plain cloud needs.
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 
@@ -22,10 +23,12 @@ from og_pointcloud.visibility import NEAR_SHARE, Gaussians, render
 __all__ = [
     "GeometryChoice",
     "Neighbourhood",
+    "chance_of_place",
     "choose_gaussians",
     "near_plane",
     "neighbourhood",
     "pixels_per_spacing",
+    "sample_of_points",
     "strided",
     "thinned",
 ]
@@ -93,6 +96,25 @@ def pixels_per_spacing(points: Points, spacing: NDArray[np.float32], views: Sequ
         apart.append(np.sqrt(view.camera.fx * view.camera.fy) * spacing[::step][front] / depth[front])
     seen = np.concatenate(apart)
     return float(np.median(seen)) if len(seen) else 1.0
+
+
+def chance_of_place(xyz: NDArray[np.float32], name: str = "") -> NDArray[np.float32]:
+    """(n,) float32 in [0, 1), by place and name alone: a sample drawn by it does not depend on the points' order."""
+    bits = np.ascontiguousarray(xyz + np.float32(0)).view(np.uint32)  # -0 becomes 0
+    value = bits[:, 0] * np.uint32(0x9E3779B1) ^ bits[:, 1] * np.uint32(0x85EBCA77) ^ bits[:, 2] * np.uint32(0xC2B2AE3D)
+    value ^= np.uint32(zlib.crc32(name.encode()))
+    # Each bit of the input changes half of those that are used (finaliser of MurmurHash3, public domain).
+    for shift, factor in ((16, 0x85EBCA6B), (13, 0xC2B2AE35)):
+        value = (value ^ (value >> np.uint32(shift))) * np.uint32(factor)
+    return (((value ^ (value >> np.uint32(16))) >> np.uint32(8)) * 2.0**-24).astype(np.float32)
+
+
+def sample_of_points(xyz: NDArray[np.float32], count: int) -> NDArray[np.int64]:
+    """Ascending rows of about ``count`` points, all if there are no more; the same places whatever the order."""
+    if len(xyz) <= count:
+        return np.arange(len(xyz))
+    chance = chance_of_place(xyz)
+    return np.flatnonzero(chance <= np.partition(chance, count - 1)[count - 1])
 
 
 def strided(camera: Camera, stride: int) -> Camera:

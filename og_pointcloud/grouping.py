@@ -40,9 +40,14 @@ class MaskGroups:
     spanning: NDArray[np.bool_]
 
 
-def group_masks(table: MaskTable, testimony: Testimony, settings: GroupingSettings) -> MaskGroups:
-    """Group the masks of a table. Ids are ordered by shown mass, largest first, and do not depend on chance."""
-    share = mask_shares(testimony, table.mask_view, settings)
+def group_masks(
+    table: MaskTable, testimony: Testimony, settings: GroupingSettings, sample: NDArray[np.int64] | None = None
+) -> MaskGroups:
+    """Group the masks of a table. Ids are ordered by shown mass, largest first, and do not depend on chance.
+
+    sample: columns that overlaps are measured on: means over thousands of points need no more. None: all.
+    """
+    share = mask_shares(testimony, table.mask_view, settings, sample)
     spanning = _spanning_masks(share, table.mask_view, settings)
     container = _containers(share, table.mask_view, spanning, settings)
     witnesses = _witnesses(share, container, table.mask_view, settings)
@@ -52,10 +57,16 @@ def group_masks(table: MaskTable, testimony: Testimony, settings: GroupingSettin
     return MaskGroups(*_ordered(group, shown), spanning)
 
 
-def mask_shares(testimony: Testimony, mask_view: NDArray[np.int32], settings: GroupingSettings) -> csr_array:
+def mask_shares(
+    testimony: Testimony,
+    mask_view: NDArray[np.int32],
+    settings: GroupingSettings,
+    sample: NDArray[np.int64] | None = None,
+) -> csr_array:
     """(masks, masks) sparse: entry (i, j) is the share of what mask i shows, and j's view sees, that lies in j."""
-    weights = _thinned(testimony.inside, settings.graph_points)
-    seen = _thinned(testimony.word, settings.graph_points)
+    weights, seen = testimony.inside, testimony.word
+    if sample is not None and len(sample) < weights.shape[1]:
+        weights, seen = csr_array(weights[:, sample]), csr_array(seen[:, sample])
     together = (weights @ weights.T).tocoo()
     visible = (weights @ seen.T).toarray()
     own = np.asarray(weights.multiply(weights).sum(axis=1)).ravel()
@@ -65,12 +76,6 @@ def mask_shares(testimony: Testimony, mask_view: NDArray[np.int32], settings: Gr
     enough = base > settings.witness_share * own[rows]
     value = together.data[enough] / base[enough]
     return csr_array((value, (rows[enough], cols[enough])), shape=together.shape)
-
-
-def _thinned(matrix: csr_array, limit: int) -> csr_array:
-    """Every k-th Gaussian: overlaps are means over thousands of points and need no more than ``limit`` of them."""
-    step = -(-matrix.shape[1] // limit)
-    return matrix if step == 1 else csr_array(matrix[:, ::step])
 
 
 def indicator(owner: NDArray[np.int32], count: int) -> csr_array:

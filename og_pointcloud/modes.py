@@ -22,7 +22,7 @@ from og_pointcloud.association import describe_instances
 from og_pointcloud.cloud import UNOBSERVED, InstanceTable
 from og_pointcloud.codebook import cluster_weights, two_level_codebook
 from og_pointcloud.features import learn_features
-from og_pointcloud.geometry import Neighbourhood, thinned
+from og_pointcloud.geometry import Neighbourhood, sample_of_points, thinned
 from og_pointcloud.grouping import MaskGroups, group_masks
 from og_pointcloud.hierarchy import part_of
 from og_pointcloud.journal import Journal
@@ -108,7 +108,8 @@ def by_grouping(scene: Scene, prepared: Prepared, settings: FitSettings, journal
     """Masks joined by the Gaussians they share; no training."""
     with journal.stage("grouping"):
         testimony = hear_views(prepared.table)
-        groups = group_masks(prepared.table, testimony, settings.grouping)
+        sample = sample_of_points(prepared.gaussians.xyz, settings.grouping.graph_points)
+        groups = group_masks(prepared.table, testimony, settings.grouping, sample)
     if groups.spanning.any():
         journal.leave_out(f"{groups.spanning.sum()} masks", "most views show each of them as several things")
     return _settled(prepared, testimony, groups, settings, journal)

@@ -20,7 +20,6 @@ from __future__ import annotations
 
 import os
 import tempfile
-import zlib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
@@ -42,11 +41,13 @@ from og_pointcloud.coverage import needed_views
 from og_pointcloud.errors import OgPointcloudError, SceneError
 from og_pointcloud.geometry import (
     Neighbourhood,
+    chance_of_place,
     choose_gaussians,
     isotropic,
     near_plane,
     neighbourhood,
     pixels_per_spacing,
+    sample_of_points,
     thinned,
 )
 from og_pointcloud.grouping import MaskGroups, group_masks, indicator
@@ -68,7 +69,7 @@ MODES = ("auto", "grouping")
 MARGIN = 32.0
 """How far a tile looks over its borders, in spacings of its sparser points: what settles a point is seldom farther."""
 SAMPLE_STEP = 50
-"""Masks are grouped by every so manieth point at least, also where that is more than a whole fit would take."""
+"""Masks are grouped by at least one in so many points, also where that is more than a whole fit would take."""
 FINEST_PX = 0.35
 """Points closer together than this in an image are thinned to it. On a street of 600,000 points 0.2 % of the labels
 then differ, 1.4 % at 0.5 and 17 % at 1, where a point no longer has a splat of its own in any image."""
@@ -496,7 +497,7 @@ def _worth_drawing(
     apart, finest = apart[rows], FINEST_PX
     while (part := np.minimum(1, (apart / finest) ** 2, dtype=np.float32)).sum(dtype=np.float64) > MOST_SPLATS:
         finest *= 1.2
-    drawn = _chance(points.xyz[rows], view.name) < part
+    drawn = chance_of_place(points.xyz[rows], view.name) < part
     return rows[drawn], (1 / np.sqrt(part[drawn])).astype(np.float32), len(rows)
 
 
@@ -531,28 +532,16 @@ def _apart_px(xyz, spacing, widest, reach, pose, intrinsics, size, near):  # noq
     return apart
 
 
-def _chance(xyz: NDArray[np.float32], name: str) -> NDArray[np.float32]:
-    """(n,) float32 in [0, 1), by place and view alone: other ones in each view, whatever the order of the points."""
-    bits = np.ascontiguousarray(xyz).view(np.uint32)
-    seeded = np.uint32(zlib.crc32(name.encode()))
-    value = bits[:, 0] * np.uint32(0x9E3779B1) ^ bits[:, 1] * np.uint32(0x85EBCA77) ^ bits[:, 2] * np.uint32(0xC2B2AE3D)
-    value ^= seeded
-    # Each bit of the input changes half of those that are used (finaliser of MurmurHash3, public domain).
-    for shift, factor in ((16, 0x85EBCA6B), (13, 0xC2B2AE35)):
-        value = (value ^ (value >> np.uint32(shift))) * np.uint32(factor)
-    return (((value ^ (value >> np.uint32(16))) >> np.uint32(8)) * 2.0**-24).astype(np.float32)
-
-
 # Instances and points -------------------------------------------------------------------------------------------
 
 
 def _instances(cloud: _TiledCloud, shown: _Shown, settings: FitSettings, journal: Journal) -> MaskGroups:
     """Masks grouped by a sample of all points; without those groups that the scene's views contradict."""
-    step = min(-(-len(cloud.points) // settings.grouping.graph_points), SAMPLE_STEP)
-    sample = np.flatnonzero(cloud.tiles.order % step == 0)
+    count = max(settings.grouping.graph_points, len(cloud.points) // SAMPLE_STEP)
+    sample = sample_of_points(cloud.points.xyz, count)
     table = shown.table(cloud, sample, settings.membership.few_views)
     testimony = hear_views(table)
-    groups = group_masks(table, testimony, replace(settings.grouping, graph_points=len(sample)))
+    groups = group_masks(table, testimony, settings.grouping)
     if groups.spanning.any():
         journal.leave_out(f"{groups.spanning.sum()} masks", "most views show each of them as several things")
     around = neighbourhood(cloud.points.xyz[sample], settings.geometry)

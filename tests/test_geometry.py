@@ -11,11 +11,13 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 
 from og_pointcloud.geometry import (
+    chance_of_place,
     choose_gaussians,
     isotropic,
     near_plane,
     neighbourhood,
     pixels_per_spacing,
+    sample_of_points,
     strided,
 )
 from og_pointcloud.scene import Camera, Points, View
@@ -248,3 +250,23 @@ def test_one_coloured_point_can_be_chosen_for() -> None:
     choice = choose_gaussians(points, neighbourhood(points.xyz, SETTINGS).spacing, [view], NEAR, SETTINGS)
     assert choice.scale in SETTINGS.scales
     assert len(choice.gaussians) == 1
+
+
+def test_a_sample_of_points_does_not_depend_on_their_order() -> None:
+    rng = np.random.default_rng(0)
+    xyz = rng.normal(size=(5000, 3)).astype(np.float32)
+    xyz[100] = -0.0
+    order = rng.permutation(len(xyz))
+    sample = sample_of_points(xyz, 1000)
+    assert len(sample) == 1000
+    assert (np.diff(sample) > 0).all()
+    np.testing.assert_array_equal(np.sort(order[sample_of_points(xyz[order], 1000)]), sample)
+    np.testing.assert_array_equal(sample_of_points(xyz, 5000), np.arange(5000))
+
+
+def test_chance_of_place_is_even_and_another_for_each_name() -> None:
+    xyz = (np.indices((20, 20, 20)).reshape(3, -1).T * 0.01).astype(np.float32)  # a grid: few bits differ
+    first, second = chance_of_place(xyz, "a"), chance_of_place(xyz, "b")
+    for chance in (first, second):
+        np.testing.assert_allclose(np.histogram(chance, 10, (0, 1))[0], 800, atol=120)
+    assert abs(np.corrcoef(first, second)[0, 1]) < 0.05
