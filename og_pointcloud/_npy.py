@@ -1,4 +1,4 @@
-"""The bytes of a .npy file -> array, without a copy, and without believing its header."""
+"""The bytes of a .npy file -> array, without a copy, and without believing its header; and back."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["array_from_npy"]
+__all__ = ["array_from_npy", "npy_bytes"]
 
 
 def array_from_npy(data: bytes) -> NDArray[Any]:
@@ -31,3 +31,11 @@ def array_from_npy(data: bytes) -> NDArray[Any]:
         return np.zeros(shape, dtype)
     flat = np.frombuffer(data, dtype, count, offset=stream.tell())
     return flat.reshape(shape[::-1]).T if fortran_order else flat.reshape(shape)
+
+
+def npy_bytes(array: NDArray[Any]) -> bytes:
+    """An array as a .npy file: little-endian, rows in C order, the same bytes for the same values everywhere."""
+    stream = io.BytesIO()
+    little_endian = array.astype(array.dtype.newbyteorder("<"), copy=False)
+    np.lib.format.write_array(stream, np.ascontiguousarray(little_endian), version=(1, 0), allow_pickle=False)
+    return stream.getvalue()

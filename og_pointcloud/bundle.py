@@ -8,7 +8,8 @@ One zip, every member stored uncompressed, nothing pickled:
   arrays/*.npy             xyz, instance_ids (smallest integer type), rgb if known, instances/*
   vocabulary/names.json    words that may be asked as strings, if any
   vocabulary/vectors.npy   (L, D) float16 or float32 unit vectors
-  text_encoder/*           the three files of a text encoder (see ``text_encoder``), if it carries one; read when needed
+  bank/vectors.npy         (B, D) float16, everyday words that labels are judged by (see ``choosing``), if it has them
+  text_encoder/*           the files of a text encoder (see ``text_encoder``), if it carries one; read when needed
 
 ``og_pointcloud_export`` writes it.
 """
@@ -30,11 +31,13 @@ from numpy.typing import NDArray
 
 from og_pointcloud._npy import array_from_npy
 from og_pointcloud._onnx_graph import check_graph
+from og_pointcloud.choosing import WordBank
 from og_pointcloud.cloud import InstanceTable, LabelledCloud, Vocabulary
 from og_pointcloud.errors import BundleError, OgPointcloudError
 
 __all__ = [
-    "BEYOND", "FORMAT", "NEAR", "NO_EVIDENCE", "ON_SURFACE", "SCHEMA_VERSION", "TOO_FAR", "Bundle", "read_bundle",
+    "BANK", "BEYOND", "FORMAT", "NEAR", "NO_EVIDENCE", "ON_SURFACE", "SCHEMA_VERSION", "TOO_FAR", "Bundle",
+    "read_bundle",
 ]  # fmt: skip
 
 FORMAT = "ogpc"
@@ -58,6 +61,7 @@ QUERY_OPERATORS = frozenset({
 })  # fmt: skip
 """What a query.onnx is made of, now or before: arithmetic and look-ups, nothing that repeats or branches."""
 REBUILD = "write the file again with write_bundle"
+BANK = "bank/vectors.npy"
 CARRIED_ENCODER = "text_encoder/"
 """What the names of a carried text encoder's members begin with."""
 
@@ -225,6 +229,7 @@ def _cloud(manifest: dict[str, Any], members: dict[str, bytes]) -> LabelledCloud
             reach=float(_field(frame, "reach", (int, float), "frame/")),
             rgb=rgb,
             vocabulary=_vocabulary(manifest, members),
+            word_bank=_word_bank(members),
             provenance=_field(manifest, "provenance", dict),
         )
     except (OgPointcloudError, ValueError, TypeError, OverflowError) as error:
@@ -277,6 +282,10 @@ def _vocabulary(manifest: dict[str, Any], members: dict[str, bytes]) -> Vocabula
         raise _Refused(f"vocabulary/names.json is not a list of {words} different words: {REBUILD}")
     vectors = _array(members, "vocabulary/vectors.npy", FLOATS, (words, None))
     return Vocabulary(tuple(names), vectors.astype(np.float32))
+
+
+def _word_bank(members: dict[str, bytes]) -> WordBank | None:
+    return WordBank(_array(members, BANK, ("<f2",), (None, None))) if BANK in members else None
 
 
 def _array(

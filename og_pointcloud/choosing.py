@@ -18,13 +18,14 @@ For comparison there is ``relevancy``, as LERF defines it, by canonical negative
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import IntEnum
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from og_pointcloud.cloud import BACKGROUND, UNOBSERVED, InstanceTable
+from og_pointcloud.cloud import BACKGROUND, UNOBSERVED, InstanceTable, LabelledCloud
 from og_pointcloud.errors import FeatureSpaceError
 from og_pointcloud.settings import ChoosingSettings
 
@@ -35,6 +36,7 @@ __all__ = [
     "Chooser",
     "Reason",
     "WordBank",
+    "chooser_of",
     "embed",
     "relevancy",
 ]
@@ -49,6 +51,8 @@ TEMPLATES = ("{}", "a {}", "a photo of a {}", "a photo of the {}", "a cropped ph
 """Prompts whose vectors are averaged: what masks show is a crop of one thing, sometimes with its surroundings."""
 MIN_BANK = 50
 """Words that a null distribution takes at least: fewer give no standard deviation worth the name."""
+ROWS_AT_ONCE = 2048
+"""Descriptors compared with all others at once."""
 
 Encoder = Callable[[Sequence[str]], ArrayLike]
 
@@ -94,17 +98,40 @@ class Choice:
     membership: NDArray[np.float32]
     calibrated: bool = True
 
-    def at(self, instances: NDArray[np.integer]) -> tuple[NDArray[np.int32], NDArray[np.float32], NDArray[np.int8]]:
-        """Label, probability and reason of points, (N,) each, by their instance ids (-1, -2, -3 as the runtime has).
+    @property
+    def scores(self) -> NDArray[np.float32]:
+        """(K, L) what words are ranked by: the probability where calibrated, else the cosine (-inf: no descriptor)."""
+        return self.table if self.calibrated else self.evidence
 
-        A point's probability is its instance's times the membership: both must be right.
+    def ranking(self, axis: int) -> NDArray[np.intp]:
+        """(K, L) labels of each instance (axis 1) or instances of each label (axis 0), best first, of equals the first.
+
+        Probabilities that have run up against 0 or 1 are told apart by their evidence.
         """
-        beyond = {UNOBSERVED: Reason.UNOBSERVED, BACKGROUND: Reason.IN_NO_MASK, TOO_FAR: Reason.TOO_FAR}
-        # Negative ids index from the end.
-        labels = np.append(self.labels, [UNKNOWN] * len(beyond)).astype(np.int32)
-        probability = np.append(self.probability * self.membership, [0] * len(beyond)).astype(np.float32)
-        reasons = np.append(self.reasons, [beyond[instance] for instance in sorted(beyond)]).astype(np.int8)
-        return labels[instances], probability[instances], reasons[instances]
+        return np.lexsort((-self.evidence, -self.scores), axis=axis)
+
+    @cached_property
+    def by_id(self) -> tuple[NDArray[np.int32], NDArray[np.float32], NDArray[np.int8]]:
+        """Label, score and reason by instance id, (K + 3,) each: behind the last instance those of ids -3, -2 and -1.
+
+        The score is that of a point with the id. Where calibrated: its instance's probability times the membership, as
+        both must be right; else the cosine. 0 where unknown.
+        """
+        beyond = {TOO_FAR: Reason.TOO_FAR, UNOBSERVED: Reason.UNOBSERVED, BACKGROUND: Reason.IN_NO_MASK}
+        score = self.probability * self.membership
+        if not self.calibrated and self.evidence.shape[1]:
+            cosine = self.evidence[np.arange(len(self.labels)), np.maximum(self.labels, 0)]
+            score = np.where(self.labels == UNKNOWN, 0, cosine)
+        return (
+            np.append(self.labels, [UNKNOWN] * len(beyond)).astype(np.int32),
+            np.append(score, [0] * len(beyond)).astype(np.float32),
+            np.append(self.reasons, list(beyond.values())).astype(np.int8),
+        )
+
+    def at(self, instances: NDArray[np.integer]) -> tuple[NDArray[np.int32], NDArray[np.float32], NDArray[np.int8]]:
+        """Label, score and reason of points, (N,) each, as `by_id` has them, by their instance ids."""
+        labels, scores, reasons = self.by_id
+        return labels[instances], scores[instances], reasons[instances]  # negative ids index from the end
 
 
 @dataclass(frozen=True)
@@ -134,11 +161,18 @@ class Chooser:
     """The instances of one scene, prepared for any number of labels. Cheap to keep, safe to share by threads."""
 
     def __init__(
-        self, instances: InstanceTable, bank: WordBank | None = None, settings: ChoosingSettings | None = None
+        self,
+        instances: InstanceTable,
+        bank: WordBank | None = None,
+        settings: ChoosingSettings | None = None,
+        feature_space: str = "",
     ) -> None:
-        """FeatureSpaceError where bank and descriptors differ in width."""
+        """feature_space: what errors say that texts should be of. FeatureSpaceError where bank and descriptors differ
+        in width.
+        """
         self.settings = settings or ChoosingSettings()
         self.bank = bank
+        self._space = f" (feature space '{feature_space}')" if feature_space else ""
         self._count = len(instances)
         self._membership = ((instances.views + 0.5) / (instances.views + 1)).astype(np.float32)
         self._descriptors = _unit(_finite(instances.descriptors, "descriptors"))
@@ -146,7 +180,7 @@ class Chooser:
         self._described = np.unique(self._owner)
         if bank is None or len(self._descriptors) == 0:
             return
-        _check_width(bank.vectors, self._descriptors, "word bank")
+        _check_width(bank.vectors, self._descriptors, "vectors of the word bank", self._space)
         self._centred = self._descriptors - common_part(self._descriptors, self.settings.same_look)
         self._bank_directions = _unit(bank.vectors - bank.mean)
         scores = self._centred @ self._bank_directions.T
@@ -170,8 +204,8 @@ class Chooser:
         label = np.arange(len(texts)) if text_label is None else np.asarray(text_label)
         others = np.zeros((0, texts.shape[1]), np.float32) if negatives is None else _finite(negatives, "negatives")
         if len(self._descriptors):
-            _check_width(texts, self._descriptors, "label vectors")
-            _check_width(others, self._descriptors, "negatives")
+            _check_width(texts, self._descriptors, "label vectors", self._space)
+            _check_width(others, self._descriptors, "negatives", self._space)
         count = int(label.max(initial=-1)) + 1
         if len(self._descriptors) == 0 or count == 0:
             return self._nothing(count)
@@ -181,7 +215,7 @@ class Chooser:
         rival = self._evidence(others)
         best = _best_by_group(evidence.T, label, count).T
         table, unknown = self._posterior(evidence, rival, texts, label, count)
-        return self._answer(best, table, unknown, calibrated=True)
+        return self._answer(best, table, unknown)
 
     def _evidence(self, texts: NDArray[np.float32]) -> NDArray[np.float32]:
         """(described, T) standard deviations above the bank; of several descriptors the best, as for the bank."""
@@ -244,15 +278,14 @@ class Chooser:
         best = _best_by_group(cosines.T, label, count).T
         if len(negatives) == 0:
             nothing = np.full(best.shape, np.nan)
-            return self._answer(best, nothing, nothing[:, 0], calibrated=False)
+            return self._answer(best, nothing, nothing[:, 0])
         rivals = self._best_descriptor(self._descriptors @ _unit(negatives).T)
         table = _relevancy_of_cosines(best, rivals)
-        return self._answer(best, table, 1 - table.max(axis=1), calibrated=False)
+        return self._answer(best, table, 1 - table.max(axis=1))
 
     def _answer(
-        self, evidence: NDArray[np.floating], table: NDArray[np.floating], unknown: NDArray[np.floating],
-        calibrated: bool,
-    ) -> Choice:  # fmt: skip
+        self, evidence: NDArray[np.floating], table: NDArray[np.floating], unknown: NDArray[np.floating]
+    ) -> Choice:
         """Spread what is known of described instances over all of them."""
         answer = self._nothing(evidence.shape[1])
         best = (evidence if np.isnan(table).all() else table).argmax(axis=1)
@@ -264,7 +297,7 @@ class Chooser:
         answer.table[rows] = table
         answer.evidence[rows] = evidence
         answer.reasons[rows] = np.where(fits, Reason.LABELLED, Reason.NONE_FITS)
-        return replace(answer, calibrated=calibrated)
+        return answer
 
     def _nothing(self, labels: int) -> Choice:
         reasons = np.full(self._count, Reason.NOT_DESCRIBED, np.int8)
@@ -277,7 +310,17 @@ class Chooser:
             evidence=np.full((self._count, labels), -np.inf, np.float32),
             reasons=reasons,
             membership=self._membership,
+            calibrated=self.bank is not None,
         )
+
+
+def chooser_of(cloud: LabelledCloud) -> Chooser:
+    """The chooser of a cloud's instances and its word bank. The cloud keeps it, so that asking again is quick."""
+    chooser = cloud.__dict__.get("_chooser")
+    if chooser is None:
+        chooser = Chooser(cloud.instances, cloud.word_bank, feature_space=cloud.feature_space)
+        cloud.__dict__["_chooser"] = chooser
+    return chooser
 
 
 def common_part(descriptors: NDArray[np.float32], same_look: float) -> NDArray[np.float32]:
@@ -287,7 +330,10 @@ def common_part(descriptors: NDArray[np.float32], same_look: float) -> NDArray[n
     pieces, or a hall of chairs, does not turn what makes a chair into what all things share. And one look alone does
     not say what is shared: nothing is taken off; of two, half.
     """
-    alike = (descriptors @ descriptors.T >= same_look - 1e-6).sum(axis=1)
+    alike = np.ones(len(descriptors))
+    for start in range(0, len(descriptors), ROWS_AT_ONCE):
+        some = slice(start, start + ROWS_AT_ONCE)
+        alike[some] = (descriptors[some] @ descriptors.T >= same_look - 1e-6).sum(axis=1)
     weight = 1 / np.maximum(alike, 1)
     looks = weight.sum()
     return ((1 - 1 / looks) * (weight / looks) @ descriptors).astype(np.float32)
@@ -368,9 +414,9 @@ def _finite(vectors: ArrayLike, what: str) -> NDArray[np.float32]:
     return rows
 
 
-def _check_width(vectors: NDArray[np.float32], descriptors: NDArray[np.float32], what: str) -> None:
+def _check_width(vectors: NDArray[np.float32], descriptors: NDArray[np.float32], what: str, space: str = "") -> None:
     if vectors.shape[1] != descriptors.shape[1]:
         raise FeatureSpaceError(
-            f"the {what} have width {vectors.shape[1]}, the descriptors {descriptors.shape[1]}: encode them with the "
-            "scene's encoder"
+            f"the {what} have width {vectors.shape[1]}, the scene's descriptors {descriptors.shape[1]}{space}: encode "
+            "them with the scene's encoder"
         )

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud.errors import OgPointcloudError
+from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError
+
+if TYPE_CHECKING:
+    from og_pointcloud.choosing import WordBank
 
 __all__ = ["BACKGROUND", "UNOBSERVED", "InstanceTable", "LabelledCloud", "Vocabulary"]
 
@@ -107,7 +110,8 @@ class LabelledCloud:
     feature_space: name of the encoder that mask features and text vectors share.
     spacing: typical distance between neighbouring points, in the scene's unit.
     reach: distance from the cloud beyond which a query point is "too far from the map", same unit.
-    rgb: (n, 3) uint8 or None. vocabulary: words that may be asked as strings.
+    rgb: (n, 3) uint8 or None. vocabulary: words that may be asked as strings. word_bank: everyday words of the same
+    encoder, which labels are judged by; without one, answers are not calibrated.
     provenance: JSON-able record of settings, seed, seconds per stage, and what was left out and why.
     """
 
@@ -121,6 +125,7 @@ class LabelledCloud:
     rgb: NDArray[np.uint8] | None = None
     vocabulary: Vocabulary | None = None
     provenance: dict[str, Any] = field(default_factory=dict)
+    word_bank: WordBank | None = None
 
     def __post_init__(self) -> None:
         n = len(self.xyz)
@@ -140,6 +145,12 @@ class LabelledCloud:
             value = getattr(self, name)
             if not (np.isfinite(value) and value > 0):
                 raise OgPointcloudError(f"{name} is {value}; expected a positive length")
+        width = self.instances.descriptors.shape[1]
+        if self.word_bank is not None and width and self.word_bank.vectors.shape[1] != width:
+            raise FeatureSpaceError(
+                f"the word bank has width {self.word_bank.vectors.shape[1]}, the descriptors {width} (feature space "
+                f"'{self.feature_space}'): encode the bank with the scene's encoder"
+            )
 
     def __len__(self) -> int:
         return len(self.xyz)

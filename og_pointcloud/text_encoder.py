@@ -3,9 +3,10 @@
 A folder, or the members ``text_encoder/`` of a .ogpc file, nothing in it pickled:
 
   manifest.json       format, schema_version, feature_space, width, context_length, templates, precision, how texts are
-                      padded, bytes, crc32 and sha256 of the two files, parity figures against torch
+                      padded, bytes, crc32 and sha256 of the other files, parity figures against torch
   text_encoder.onnx   tokens (B, T) int64 -> text (B, D) float32, unit rows
   tokenizer.json      vocabulary and merges (see ``tokenizer``)
+  word_bank.npy       (B, D) float16, everyday words in the manifest's templates (see ``choosing``)
 
 numpy and onnxruntime, nothing else. What is read is checked before it is run: it may come from a stranger.
 """
@@ -26,8 +27,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from og_pointcloud._npy import array_from_npy
 from og_pointcloud._onnx_graph import check_graph
-from og_pointcloud.errors import OgPointcloudError
+from og_pointcloud.choosing import WordBank
+from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError
 from og_pointcloud.tokenizer import Tokenizer
 
 if TYPE_CHECKING:
@@ -35,15 +38,16 @@ if TYPE_CHECKING:
 
 __all__ = [
     "ENCODER_FILES", "FORMAT", "MODELS_VARIABLE", "OPERATORS", "SCHEMA_VERSION", "TextEncoder", "cache_folder",
-    "check_templates", "encoder_for", "export_command", "find_encoder", "read_text_encoder",
+    "check_templates", "encoder_files", "encoder_for", "export_command", "find_encoder", "read_text_encoder",
 ]  # fmt: skip
 
 FORMAT, SCHEMA_VERSION = "og-text-encoder", 1
 MODELS_VARIABLE = "OG_POINTCLOUD_MODELS"
 """Environment variable: folders, parted as in PATH, that are encoders or hold some."""
-MANIFEST, GRAPH, TOKENIZER = "manifest.json", "text_encoder.onnx", "tokenizer.json"
-ENCODER_FILES = {MANIFEST: 1 << 20, GRAPH: (1 << 31) - 1, TOKENIZER: 1 << 26}
-"""The files of an encoder, and the bytes that each may have; a serialised graph cannot have more."""
+MANIFEST, GRAPH, TOKENIZER, WORD_BANK = "manifest.json", "text_encoder.onnx", "tokenizer.json", "word_bank.npy"
+ENCODER_FILES = {MANIFEST: 1 << 20, GRAPH: (1 << 31) - 1, TOKENIZER: 1 << 26, WORD_BANK: 1 << 26}
+"""The files of an encoder, and the bytes that each may have; a serialised graph cannot have more. One without a word
+bank is an encoder too."""
 OPERATORS = frozenset({
     "Add", "ArgMax", "Cast", "Div", "DynamicQuantizeLinear", "Equal", "Erf", "Gather", "GatherND", "LayerNormalization",
     "MatMul", "MatMulInteger", "Max", "Mul", "ReduceL2", "Reshape", "Shape", "Sigmoid", "Slice", "Softmax", "Split",
@@ -62,7 +66,10 @@ class TextEncoder:
     """
 
     def __init__(self, files: Mapping[str, bytes], where: str) -> None:
-        """files: the bytes of ENCODER_FILES. where: what errors begin with, a path. OgPointcloudError if damaged."""
+        """files: the bytes of ENCODER_FILES. where: what errors begin with, a path. OgPointcloudError if damaged.
+
+        ``word_bank``: everyday words as this encoder has them, None for one that was made without.
+        """
         self.where = where
         self.manifest = _checked_manifest(files, where)
         self.feature_space: str = self.manifest["feature_space"]
@@ -70,6 +77,7 @@ class TextEncoder:
         self.context_length: int = self.manifest["context_length"]
         self.templates: tuple[str, ...] = tuple(self.manifest["templates"])
         self.precision: str = self.manifest["precision"]
+        self.word_bank = _word_bank(files[WORD_BANK], self.width, where) if WORD_BANK in files else None
         self._graph = files[GRAPH]
         self._session: InferenceSession | None = None
         try:
@@ -167,7 +175,13 @@ def read_text_encoder(folder: str | os.PathLike[str]) -> TextEncoder:
 
 @lru_cache(maxsize=2)
 def _read_once(folder: Path, _state: tuple[tuple[int, int], ...]) -> TextEncoder:
-    return TextEncoder({name: _read_bounded(folder / name, most) for name, most in ENCODER_FILES.items()}, str(folder))
+    return TextEncoder(encoder_files(folder), str(folder))
+
+
+def encoder_files(folder: Path) -> dict[str, bytes]:
+    """The bytes of an encoder's files, unchecked but for their size; OgPointcloudError where one is missing."""
+    present = [name for name in ENCODER_FILES if name != WORD_BANK or (folder / name).is_file()]
+    return {name: _read_bounded(folder / name, ENCODER_FILES[name]) for name in present}
 
 
 def encoder_for(feature_space: str, bundle: str | os.PathLike[str] | None = None) -> TextEncoder:
@@ -188,8 +202,10 @@ def find_encoder(feature_space: str, bundle: str | os.PathLike[str] | None = Non
     cache folder; each may be an encoder, or hold encoders. None where there is none; OgPointcloudError where there is
     one that cannot be used.
     """
-    if bundle is not None and (carried := _carried(Path(bundle).resolve(), Path(bundle).stat().st_mtime_ns)):
-        return carried
+    if bundle is not None and Path(bundle).is_file():  # a scene outlives its file
+        carried = _carried(Path(bundle).resolve(), Path(bundle).stat().st_mtime_ns)
+        if carried is not None:
+            return carried
     for folder in _model_folders():
         candidates = [folder, *sorted(path for path in folder.iterdir() if path.is_dir())] if folder.is_dir() else []
         for candidate in candidates:
@@ -259,12 +275,12 @@ def _read_bounded(path: Path, most: int) -> bytes:
 
 def _checked_manifest(files: Mapping[str, bytes], where: str) -> dict[str, Any]:
     try:
-        for name, most in ENCODER_FILES.items():
-            if len(files[name]) > most:
-                raise ValueError(f"{name} has {len(files[name])} bytes; expected at most {most}")
+        for name, data in files.items():
+            if len(data) > ENCODER_FILES[name]:
+                raise ValueError(f"{name} has {len(data)} bytes; expected at most {ENCODER_FILES[name]}")
         manifest = json.loads(files[MANIFEST])
         _check_fields(manifest)
-        for name in (GRAPH, TOKENIZER):
+        for name in sorted({GRAPH, TOKENIZER, *files, *manifest["files"]} - {MANIFEST}):
             # Not the sha256 beside it: that takes eight times as long, and proves no more to one who trusts neither.
             if manifest["files"][name]["crc32"] != zlib.crc32(files[name]):
                 raise ValueError(f"{name} has not the manifest's checksum: it is damaged or was changed")
@@ -294,6 +310,16 @@ def _check_fields(manifest: dict[str, Any]) -> None:
     if not isinstance(manifest["templates"], list):
         raise ValueError(f"templates are {manifest['templates']!r:.40}; expected a list of texts")
     check_templates(manifest["templates"])
+
+
+def _word_bank(data: bytes, width: int, where: str) -> WordBank:
+    try:
+        vectors = array_from_npy(data)
+        if vectors.dtype.str != "<f2" or vectors.ndim != 2 or vectors.shape[1] != width:
+            raise ValueError(f"it is {vectors.dtype.str} {vectors.shape}; expected <f2 (B, {width})")
+        return WordBank(vectors)
+    except (ValueError, FeatureSpaceError) as error:
+        raise OgPointcloudError(f"{where}: {WORD_BANK} cannot be used ({error}): {REMAKE}") from None
 
 
 def _first_line(error: Exception) -> str:

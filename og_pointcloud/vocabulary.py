@@ -1,11 +1,11 @@
-"""Words of a .ogpc file: stored with their vectors, so that whoever asks the file needs no encoder.
+"""Words of a .ogpc file, and the bank that labels are judged by: stored with their vectors, so that whoever asks the
+file needs no encoder.
 
 Only the members that change are written anew, the graph and the arrays are copied: numpy is all this needs.
 """
 
 from __future__ import annotations
 
-import io
 import json
 import os
 import zipfile
@@ -18,15 +18,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud._atomic import replacing
-from og_pointcloud.bundle import CARRIED_ENCODER, NO_EVIDENCE, describe_member, read_bundle
-from og_pointcloud.cloud import InstanceTable, Vocabulary
+from og_pointcloud._npy import npy_bytes
+from og_pointcloud.bundle import BANK, CARRIED_ENCODER, NO_EVIDENCE, describe_member, read_bundle
+from og_pointcloud.choosing import WordBank
+from og_pointcloud.cloud import InstanceTable, LabelledCloud, Vocabulary
 from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError
-from og_pointcloud.text_encoder import ENCODER_FILES, TextEncoder
-from og_pointcloud.text_features import UNKNOWN_SPACE
+from og_pointcloud.text_encoder import TextEncoder, encoder_files
+from og_pointcloud.text_features import UNKNOWN_SPACE, read_text_features
 
 __all__ = [
-    "AddedWords", "add_words", "best_cosines", "carry_encoder", "compact_vectors", "encoder_members", "read_words",
-    "vocabulary_members",
+    "AddedWords", "add_words", "bank_members", "best_cosines", "carry_encoder", "compact_vectors", "encoder_members",
+    "everyday_words", "read_bank", "read_words", "store_bank", "vocabulary_members",
 ]  # fmt: skip
 
 HALF_PRECISION_TOLERANCE = 1e-3
@@ -58,6 +60,11 @@ def read_words(path: str | os.PathLike[str]) -> tuple[str, ...]:
     return words
 
 
+def everyday_words() -> tuple[str, ...]:
+    """The library's own words of everyday things, which an encoder makes a word bank of."""
+    return read_words(Path(__file__).with_name("everyday_words.txt"))
+
+
 def add_words(
     path: str | os.PathLike[str],
     words: Vocabulary,
@@ -70,13 +77,8 @@ def add_words(
     FeatureSpaceError for vectors of another space or width than the file's.
     """
     bundle = read_bundle(path)
-    cloud, width = bundle.cloud, bundle.cloud.instances.descriptors.shape[1]
-    spaces = {feature_space, cloud.feature_space}
-    if (len(spaces) > 1 and UNKNOWN_SPACE not in spaces) or (width and words.vectors.shape[1] != width):
-        raise FeatureSpaceError(
-            f"the words are of feature space '{feature_space}' (width {words.vectors.shape[1]}), {path} of "
-            f"'{cloud.feature_space}' (width {width}): encode them with the scene's encoder"
-        )
+    cloud = bundle.cloud
+    _check_space(path, cloud, words.vectors, feature_space)
     old = cloud.vocabulary or Vocabulary((), np.zeros((0, words.vectors.shape[1]), np.float32))
     vectors = dict(zip(old.names, _unit(old.vectors), strict=True))
     new = dict(zip(words.names, _unit(words.vectors), strict=True))
@@ -93,22 +95,48 @@ def add_words(
     return AddedWords(len(new) - len(known), len(known), len(together.names))
 
 
+def read_bank(path: str | os.PathLike[str]) -> tuple[WordBank, str]:
+    """A text-features file as a bank, and its feature space; FeatureSpaceError where its words are too few."""
+    vocabulary, feature_space = read_text_features(path)
+    try:
+        return WordBank(vocabulary.vectors), feature_space
+    except FeatureSpaceError as error:
+        raise FeatureSpaceError(f"{path}: {error}") from None
+
+
+def store_bank(
+    path: str | os.PathLike[str],
+    bank: WordBank,
+    feature_space: str,
+    output: str | os.PathLike[str] | None = None,
+) -> None:
+    """Store a word bank in a .ogpc file, in place of one that it has; its answers are then calibrated.
+
+    feature_space, output, errors: as for ``add_words``.
+    """
+    bundle = read_bundle(path)
+    _check_space(path, bundle.cloud, bank.vectors, feature_space)
+    _rewrite(Path(path), Path(output or path), bundle.manifest, bank_members(bank), lambda manifest: None)
+
+
 def carry_encoder(
     path: str | os.PathLike[str], folder: str | os.PathLike[str], output: str | os.PathLike[str] | None = None
 ) -> TextEncoder:
     """Store a text encoder in a .ogpc file, which then answers any word wherever it goes. Returns the encoder.
 
-    folder: what export-text-encoder wrote. output: as for ``add_words``.
+    folder: what export-text-encoder wrote; a file without a word bank gets the encoder's. output: as for ``add_words``.
     """
     bundle = read_bundle(path)
     members, encoder = encoder_members(folder, bundle.cloud.feature_space)
+    if bundle.cloud.word_bank is None and encoder.word_bank is not None:
+        members |= bank_members(encoder.word_bank)
     _rewrite(Path(path), Path(output or path), bundle.manifest, members, lambda manifest: None)
     return encoder
 
 
 def encoder_members(folder: str | os.PathLike[str], feature_space: str) -> tuple[dict[str, bytes], TextEncoder]:
     """A folder's files as members of a .ogpc of this feature space; FeatureSpaceError if it is of another."""
-    files = {name: _read(Path(folder) / name) for name in ENCODER_FILES}
+    files = encoder_files(Path(folder))
     encoder = TextEncoder(files, str(folder))
     if encoder.feature_space != feature_space:
         raise FeatureSpaceError(
@@ -121,11 +149,13 @@ def encoder_members(folder: str | os.PathLike[str], feature_space: str) -> tuple
 def vocabulary_members(vocabulary: Vocabulary, instances: InstanceTable) -> tuple[dict[str, bytes], float]:
     """The members that hold words, and the largest change of a cosine that storing them makes."""
     stored, error = compact_vectors(vocabulary, instances)
-    stream = io.BytesIO()
-    little_endian = np.ascontiguousarray(stored, stored.dtype.newbyteorder("<"))
-    np.lib.format.write_array(stream, little_endian, version=(1, 0), allow_pickle=False)
     names = json.dumps(list(vocabulary.names), ensure_ascii=False).encode()
-    return {"vocabulary/names.json": names, "vocabulary/vectors.npy": stream.getvalue()}, error
+    return {"vocabulary/names.json": names, "vocabulary/vectors.npy": npy_bytes(stored)}, error
+
+
+def bank_members(bank: WordBank) -> dict[str, bytes]:
+    """The member that holds a word bank. In float16: a statistic of many words does not feel a word's last digits."""
+    return {BANK: npy_bytes(bank.vectors.astype(np.float16))}
 
 
 def compact_vectors(vocabulary: Vocabulary, instances: InstanceTable) -> tuple[NDArray[np.floating], float]:
@@ -149,6 +179,17 @@ def best_cosines(instances: InstanceTable, vectors: NDArray[np.floating]) -> NDA
     return scores
 
 
+def _check_space(
+    path: str | os.PathLike[str], cloud: LabelledCloud, vectors: NDArray[np.floating], feature_space: str
+) -> None:
+    width, spaces = cloud.instances.descriptors.shape[1], {feature_space, cloud.feature_space}
+    if (len(spaces) > 1 and UNKNOWN_SPACE not in spaces) or (width and vectors.shape[1] != width):
+        raise FeatureSpaceError(
+            f"the words are of feature space '{feature_space}' (width {vectors.shape[1]}), {path} of "
+            f"'{cloud.feature_space}' (width {width}): encode them with the scene's encoder"
+        )
+
+
 def _unit(vectors: NDArray[np.floating]) -> NDArray[np.float64]:
     vectors = vectors.astype(np.float64)
     length = np.linalg.norm(vectors, axis=1, keepdims=True)
@@ -165,10 +206,3 @@ def _rewrite(path: Path, output: Path, manifest: dict[str, Any], changes: Mappin
         target.writestr(zipfile.ZipInfo("manifest.json"), text)  # a ZipInfo of its own: the date stays 1980
         for name in manifest["members"]:
             target.writestr(zipfile.ZipInfo(name), changes[name] if name in changes else source.read(name))
-
-
-def _read(path: Path) -> bytes:
-    most = ENCODER_FILES[path.name]
-    if not path.is_file() or path.stat().st_size > most:
-        raise OgPointcloudError(f"{path} is missing or has more than {most} bytes; expected an encoder's folder")
-    return path.read_bytes()

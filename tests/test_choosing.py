@@ -244,7 +244,7 @@ def test_numbers_that_are_none_give_one_error(bad):
 
 def test_widths_must_agree():
     made = Made()
-    with pytest.raises(FeatureSpaceError, match=r"label vectors have width 3, the descriptors 64"):
+    with pytest.raises(FeatureSpaceError, match=r"label vectors have width 3, the scene.s descriptors 64"):
         made.chooser.choose(np.ones((2, 3)))
     with pytest.raises(FeatureSpaceError, match=r"word bank have width 16"):
         Chooser(made.table, WordBank(unit_rows(60, 16)))

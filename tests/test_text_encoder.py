@@ -35,6 +35,7 @@ from text_models import (
 )
 
 import og_pointcloud as og
+from og_pointcloud._npy import npy_bytes
 from og_pointcloud._onnx_graph import check_graph
 from og_pointcloud._onnxruntime import open_session
 from og_pointcloud.cli import main
@@ -466,7 +467,7 @@ def altered(folder, out, change=None, **files):
         (lambda m: m.update(schema_version=2), "schema_version is 2"),
         (lambda m: m.update(width=0), "width is 0"),
         (lambda m: m.update(width=True), "width is True"),
-        (lambda m: m.update(width=OUT + 1), r"gives float32 \(1, 24\)"),
+        (lambda m: m.update(width=OUT + 1), r"word_bank.npy cannot be used \(it is <f2 .*expected <f2 \(B, 25\)"),
         (lambda m: m.update(context_length=10**12), "context_length is"),
         (lambda m: m.update(context_length="77"), "context_length is '77'"),
         (lambda m: m.update(context_length=5000), None),
@@ -492,6 +493,13 @@ def test_manifests_that_do_not_fit(encoder_folder, tmp_path, change, says):
     with pytest.raises(OgPointcloudError, match=says) as caught:
         read_text_encoder(folder).encode(["cat"])
     assert str(caught.value).startswith(str(folder))
+
+
+def test_a_graph_of_another_width_than_its_manifest_says(encoder_folder, tmp_path):
+    bank = npy_bytes(np.ones((50, OUT + 1), np.float16))
+    folder = altered(encoder_folder, tmp_path / "e", lambda m: m.update(width=OUT + 1), **{"word_bank.npy": bank})
+    with pytest.raises(OgPointcloudError, match=r"gives float32 \(1, 24\).*make the encoder again"):
+        read_text_encoder(folder).encode(["cat"])
 
 
 def graph_with(data, *nodes, **changes):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import zipfile
+import zlib
 from dataclasses import replace
 
 import numpy as np
@@ -13,12 +14,14 @@ from og_pointcloud_export import write_bundle
 from og_pointcloud_export.query_head import reference_scores
 
 import og_pointcloud as og
+from og_pointcloud._npy import npy_bytes
 from og_pointcloud.bundle import read_bundle, read_carried_encoder
+from og_pointcloud.choosing import WordBank
 from og_pointcloud.cli import main
 from og_pointcloud.cloud import Vocabulary
 from og_pointcloud.errors import BundleError, FeatureSpaceError, OgPointcloudError
-from og_pointcloud.text_encoder import encoder_for
-from og_pointcloud.vocabulary import add_words, best_cosines, carry_encoder, read_words
+from og_pointcloud.text_encoder import encoder_for, read_text_encoder
+from og_pointcloud.vocabulary import add_words, best_cosines, carry_encoder, everyday_words, read_words, store_bank
 from og_pointcloud.words import resolve_labels
 
 NEW = Vocabulary(("grape", "Größe 40"), 3 * unit_rows(2, seed=9))
@@ -148,6 +151,60 @@ def test_what_the_command_cannot_add(path, tmp_path, capsys, monkeypatch):
             run("add", path, *arguments)
 
 
+# Word banks
+
+
+def test_the_everyday_words_are_many_plain_and_different():
+    words = everyday_words()
+    assert len(words) >= 800
+    assert all(word == word.strip().lower() and word.isascii() and len(word.split()) <= 4 for word in words)
+    assert not set(words) & {"object", "things", "stuff", "texture"}
+
+
+def test_a_stored_bank_is_the_scenes_and_all_else_stays(path, bundle_file, tmp_path):
+    bank = WordBank(5 * unit_rows(80, seed=20))
+    assert read_bundle(path).cloud.word_bank is None
+    store_bank(path, bank, SPACE, tmp_path / "t.ogpc")
+    assert path.read_bytes() == bundle_file.read_bytes()
+    bundle = read_bundle(tmp_path / "t.ogpc", verify_sha256=True)
+    assert bundle.manifest["members"]["bank/vectors.npy"] | {"sha256": ""} == {
+        "bytes": 128 + 80 * WIDTH * 2, "sha256": "", "dtype": "<f2", "shape": [80, WIDTH],
+    }  # fmt: skip
+    assert np.abs(bundle.cloud.word_bank.vectors - bank.vectors).max() < 1e-3
+    before, after = members_of(bundle_file), members_of(tmp_path / "t.ogpc")
+    assert {name for name in after if before.get(name) != after[name]} == {"manifest.json", "bank/vectors.npy"}
+    again = WordBank(unit_rows(60, seed=21))
+    store_bank(tmp_path / "t.ogpc", again, SPACE)
+    assert len(read_bundle(tmp_path / "t.ogpc").cloud.word_bank.vectors) == 60
+
+
+def test_the_writer_stores_a_clouds_bank(tmp_path):
+    bank = WordBank(unit_rows(80, seed=20))
+    path = write_bundle(replace(room(100), word_bank=bank), tmp_path / "s.ogpc")
+    assert np.abs(read_bundle(path).cloud.word_bank.vectors - bank.vectors).max() < 1e-3
+    with pytest.raises(FeatureSpaceError, match=rf"the word bank has width 8, the descriptors {WIDTH}.*{SPACE}"):
+        replace(room(100), word_bank=WordBank(unit_rows(80, 8)))
+
+
+def test_the_command_stores_a_bank_of_text_features(path, tmp_path, capsys):
+    names = np.array([f"word {number}" for number in range(60)])
+    np.savez(tmp_path / "f.npz", names=names, vectors=unit_rows(60, seed=3), feature_space=SPACE)
+    assert run("bank", path, tmp_path / "f.npz", "-o", tmp_path / "t.ogpc") == 0
+    assert "60 everyday words" in capsys.readouterr().out
+    assert len(read_bundle(tmp_path / "t.ogpc").cloud.word_bank.vectors) == 60
+    before = path.read_bytes()
+    np.savez(tmp_path / "few.npz", names=names[:49], vectors=unit_rows(49), feature_space=SPACE)
+    np.savez(tmp_path / "other.npz", names=names, vectors=unit_rows(60), feature_space="other")
+    for arguments, says in (
+        ((tmp_path / "few.npz",), "few.npz: a word bank of 49 words; expected at least 50"),
+        ((tmp_path / "other.npz",), "the words are of feature space 'other'"),
+        ((), f"export-text-encoder MODEL_FOLDER --feature-space '{SPACE}'"),
+    ):
+        assert run("bank", path, *arguments) == 2
+        assert says in capsys.readouterr().err
+    assert path.read_bytes() == before
+
+
 # Carried encoders
 
 
@@ -178,6 +235,58 @@ def test_the_command_encodes_words(path, tmp_path, encoder_folder, monkeypatch, 
     assert "8 words, 1 new" in capsys.readouterr().out
 
 
+def test_an_encoder_brings_its_bank(path, encoder_folder, tmp_path, monkeypatch, capsys):
+    encoder = read_text_encoder(encoder_folder)
+    assert np.abs(encoder.word_bank.vectors - encoder(everyday_words())).max() < 1e-3
+    assert run("bank", path, "--text-encoder", encoder_folder, "-o", tmp_path / "t.ogpc") == 0
+    assert f"{len(everyday_words())} everyday words" in capsys.readouterr().out
+    monkeypatch.setenv("OG_POINTCLOUD_MODELS", str(encoder_folder))
+    assert run("bank", path) == 0
+    assert path.read_bytes() == (tmp_path / "t.ogpc").read_bytes()
+    found = write_bundle(room(100), tmp_path / "found.ogpc")
+    monkeypatch.delenv("OG_POINTCLOUD_MODELS")
+    for written in (path, found, write_bundle(room(100), tmp_path / "s.ogpc", text_encoder=encoder_folder)):
+        assert np.abs(read_bundle(written).cloud.word_bank.vectors - encoder.word_bank.vectors).max() < 1e-3
+    own = replace(room(100), word_bank=WordBank(unit_rows(80)))
+    assert (
+        len(read_bundle(write_bundle(own, tmp_path / "s.ogpc", text_encoder=encoder_folder)).cloud.word_bank.vectors)
+        == 80
+    )
+
+
+def test_an_encoder_made_without_a_bank_has_none(path, encoder_folder, tmp_path, capsys):
+    folder = tmp_path / "bare"
+    folder.mkdir()
+    for file in encoder_folder.iterdir():
+        if file.name != "word_bank.npy":
+            (folder / file.name).write_bytes(file.read_bytes())
+    with pytest.raises(OgPointcloudError, match=r"'word_bank\.npy' is missing"):
+        read_text_encoder(folder)
+    manifest = json.loads((folder / "manifest.json").read_text())
+    del manifest["files"]["word_bank.npy"]
+    (folder / "manifest.json").write_text(json.dumps(manifest))
+    assert read_text_encoder(folder).word_bank is None
+    assert run("bank", path, "--text-encoder", folder) == 2
+    assert "has no word bank: make it again" in capsys.readouterr().err
+    carry_encoder(path, folder)
+    assert read_bundle(path).cloud.word_bank is None
+
+
+@pytest.mark.parametrize("bank", [b"junk", unit_rows(80), unit_rows(80, 8).astype("<f2"), unit_rows(9).astype("<f2")])
+def test_banks_of_encoders_are_checked(encoder_folder, tmp_path, bank):
+    data = bank if isinstance(bank, bytes) else npy_bytes(bank)
+    manifest = json.loads((encoder_folder / "manifest.json").read_text())
+    manifest["files"]["word_bank.npy"] = {"crc32": zlib.crc32(data)}
+    for file in encoder_folder.iterdir():
+        (tmp_path / file.name).write_bytes(file.read_bytes())
+    (tmp_path / "word_bank.npy").write_bytes(data)
+    with pytest.raises(OgPointcloudError, match=r"word_bank\.npy has not the manifest's checksum"):
+        read_text_encoder(tmp_path)
+    (tmp_path / "manifest.json").write_text(json.dumps(manifest))
+    with pytest.raises(OgPointcloudError, match=r"word_bank\.npy cannot be used"):
+        read_text_encoder(tmp_path)
+
+
 def test_a_carried_encoder_answers_and_is_read_only_when_asked(
     path, encoder_folder, bundle_file, monkeypatch, tmp_path
 ):
@@ -193,7 +302,8 @@ def test_a_carried_encoder_answers_and_is_read_only_when_asked(
     assert add_words(path, NEW, SPACE).added == 2  # which keeps what is carried
     assert encoder_for(SPACE, path)(["cat"]).shape == (1, WIDTH)
     assert set(members_of(path)) - set(members_of(bundle_file)) == {
-        f"text_encoder/{name}" for name in ("manifest.json", "text_encoder.onnx", "tokenizer.json")
+        "bank/vectors.npy",
+        *(f"text_encoder/{name}" for name in ("manifest.json", "text_encoder.onnx", "tokenizer.json", "word_bank.npy")),
     }
 
 

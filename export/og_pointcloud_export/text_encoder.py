@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from og_pointcloud._npy import npy_bytes
 from og_pointcloud.bundle import read_bundle
 from og_pointcloud.errors import FeatureSpaceError, MissingExtraError, OgPointcloudError
 from og_pointcloud.text_encoder import (
@@ -29,11 +30,12 @@ from og_pointcloud.text_encoder import (
     MANIFEST,
     SCHEMA_VERSION,
     TOKENIZER,
+    WORD_BANK,
     TextEncoder,
     cache_folder,
     check_templates,
 )
-from og_pointcloud.vocabulary import best_cosines
+from og_pointcloud.vocabulary import best_cosines, everyday_words
 from og_pointcloud_export.text_graph import build_text_graph
 from og_pointcloud_export.text_tokenizer import find_tokenizer, read_json
 from og_pointcloud_export.text_weights import Activation, Affine, Block, TextTower, read_text_tower
@@ -79,7 +81,9 @@ def export_text_encoder(
     int8: bool = False,
     scene: str | os.PathLike[str] | None = None,
 ) -> tuple[Path, dict[str, Any]]:
-    """Write a model's text tower as a folder of three files, whole or not at all. Returns the folder, and its manifest.
+    """Write a model's text tower as a folder, whole or not at all. Returns the folder, and its manifest.
+
+    The folder also holds the vectors of our everyday words, which scenes judge labels by (`og_pointcloud.choosing`).
 
     source: a transformers CLIP or SigLIP folder, an OpenCLIP folder, or a file of weights with OpenAI's or OpenCLIP's
         names (.safetensors, weights-only .pt). output: None for the user's cache, where it is found without a word.
@@ -110,16 +114,18 @@ def export_text_encoder(
             "causal": tower.causal, "pooling": tower.pooling,
         },
     }  # fmt: skip
-    tokenizer_json = json.dumps(description, ensure_ascii=False).encode()
-    exact = _files({**about, "precision": "fp32"}, build_text_graph(tower), tokenizer_json)
-    encoder = TextEncoder(exact, str(source))
+    held = {GRAPH: build_text_graph(tower), TOKENIZER: json.dumps(description, ensure_ascii=False).encode()}
+    about["precision"] = "fp32"
+    encoder = TextEncoder(_files(about, held), str(source))
     parity = _parity(tower, encoder)
-    files = _files({**about, "precision": "fp32", "parity": parity}, exact[GRAPH], tokenizer_json)
     if int8:
         cloud = read_bundle(scene).cloud if scene is not None else None
-        small = _files({**about, "precision": "int8"}, build_text_graph(tower, int8=True), tokenizer_json)
-        parity["int8"] = _accept_int8(TextEncoder(small, str(source)), encoder, cloud)
-        files = _files({**about, "precision": "int8", "parity": parity}, small[GRAPH], tokenizer_json)
+        held[GRAPH], about["precision"] = build_text_graph(tower, int8=True), "int8"
+        small = TextEncoder(_files(about, held), str(source))
+        parity["int8"] = _accept_int8(small, encoder, cloud)
+        encoder = small
+    held[WORD_BANK] = npy_bytes(encoder(everyday_words()).astype(np.float16))
+    files = _files({**about, "parity": parity}, held)
     folder = Path(output) if output is not None else cache_folder() / re.sub(r"[^\w.-]+", "--", space)
     _write_folder(folder, files)
     return folder, json.loads(files[MANIFEST])
@@ -228,8 +234,8 @@ def _choices_changed(before: NDArray[np.float64], after: NDArray[np.float64]) ->
     return int((chosen < before.max(axis=1) - EQUAL).sum())
 
 
-def _files(manifest: dict[str, Any], graph: bytes, tokenizer_json: bytes) -> dict[str, bytes]:
-    held = {GRAPH: graph, TOKENIZER: tokenizer_json}
+def _files(manifest: dict[str, Any], held: dict[str, bytes]) -> dict[str, bytes]:
+    """The files of an encoder, the manifest among them."""
     described = {
         name: {"bytes": len(data), "crc32": zlib.crc32(data), "sha256": hashlib.sha256(data).hexdigest()}
         for name, data in held.items()

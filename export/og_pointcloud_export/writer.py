@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import io
 import json
 import os
 import zipfile
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -15,12 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud._atomic import replacing
+from og_pointcloud._npy import npy_bytes
 from og_pointcloud._onnxruntime import open_session
 from og_pointcloud.bundle import FORMAT, SCHEMA_VERSION, TOO_FAR, describe_member
 from og_pointcloud.cloud import InstanceTable, LabelledCloud
 from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.nearest import NONE_WITHIN_REACH, NearestPoint
-from og_pointcloud.vocabulary import encoder_members, vocabulary_members
+from og_pointcloud.text_encoder import find_encoder, read_text_encoder
+from og_pointcloud.vocabulary import bank_members, encoder_members, vocabulary_members
 from og_pointcloud_export.brick_grid import BrickGrid, build_brick_grid
 from og_pointcloud_export.query_head import OPSET, build_query_head, reference_scores
 
@@ -45,16 +46,25 @@ def write_bundle(
 ) -> Path:
     """Write a cloud as .ogpc, whole or not at all, the same bytes for the same cloud. Returns the path.
 
-    text_encoder: the folder of an encoder for the file to carry. Raises OgPointcloudError where the provenance is no
-    JSON, where the graph disagrees with numpy, or the encoder is of another feature space: then nothing is written.
+    text_encoder: the folder of an encoder for the file to carry. A cloud without a word bank gets that of this encoder,
+    or of the one that is found for its feature space (`og_pointcloud.text_encoder.find_encoder`), if there is any.
+    Raises OgPointcloudError where the provenance is no JSON, where the graph disagrees with numpy, or the encoder is of
+    another feature space: then nothing is written.
     """
     path = Path(path)
+    encoder = find_encoder(cloud.feature_space) if text_encoder is None else read_text_encoder(text_encoder)
+    if cloud.word_bank is None and encoder is not None and encoder.feature_space == cloud.feature_space:
+        cloud = replace(cloud, word_bank=encoder.word_bank)
     model = query_model(cloud)
-    members = {"query.onnx": model.onnx} | {f"arrays/{name}.npy": _npy(array) for name, array in _arrays(cloud).items()}
+    members = {"query.onnx": model.onnx} | {
+        f"arrays/{name}.npy": npy_bytes(array) for name, array in _arrays(cloud).items()
+    }
     vocabulary_error = None
     if cloud.vocabulary is not None:
         words, vocabulary_error = vocabulary_members(cloud.vocabulary, cloud.instances)
         members |= words
+    if cloud.word_bank is not None:
+        members |= bank_members(cloud.word_bank)
     if text_encoder is not None:
         members |= encoder_members(text_encoder, cloud.feature_space)[0]
     manifest = _manifest(cloud, model, members, {**model.parity, "vocabulary_cosine_error": vocabulary_error})
@@ -91,13 +101,6 @@ def _arrays(cloud: LabelledCloud) -> dict[str, NDArray[Any]]:
 def _smallest_signed(ids: NDArray[np.int32]) -> NDArray[np.signedinteger]:
     largest = int(ids.max(initial=0))
     return ids.astype(next(kind for kind in (np.int8, np.int16, np.int32) if largest <= np.iinfo(kind).max))
-
-
-def _npy(array: NDArray[Any]) -> bytes:
-    stream = io.BytesIO()
-    little_endian = array.astype(array.dtype.newbyteorder("<"), copy=False)
-    np.lib.format.write_array(stream, np.ascontiguousarray(little_endian), version=(1, 0), allow_pickle=False)
-    return stream.getvalue()
 
 
 def _parity(cloud: LabelledCloud, onnx: bytes) -> dict[str, Any]:

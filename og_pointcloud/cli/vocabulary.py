@@ -1,4 +1,4 @@
-"""``og-pointcloud vocabulary add | list | carry``: the words of a .ogpc file, and the encoder of any others."""
+"""``og-pointcloud vocabulary add | list | bank | carry``: a .ogpc file's words, its word bank, and its text encoder."""
 
 from __future__ import annotations
 
@@ -33,6 +33,18 @@ def add(commands: Any) -> None:
         actions, "list", run_list, "Print the words, one a line.", "og-pointcloud vocabulary list kitchen.ogpc"
     )
     add_bundle(listing, writes=False)
+    banking = add_command(
+        actions, "bank", run_bank, "Store everyday words that labels are judged by: answers become probabilities.",
+        "og-pointcloud vocabulary bank kitchen.ogpc --text-encoder clip-vit-b32",
+    )  # fmt: skip
+    add_bundle(banking, writes=True)
+    source = banking.add_mutually_exclusive_group()
+    source.add_argument(
+        "features", type=Path, nargs="?", metavar="F.npz", help="text features of at least 50 everyday words"
+    )
+    source.add_argument(
+        "--text-encoder", type=Path, metavar="DIR", help="whose bank it is (default: the feature space's, if found)"
+    )
     carrying = add_command(
         actions, "carry", run_carry, "Store a text encoder in the file, which then answers any word anywhere.",
         "og-pointcloud vocabulary carry kitchen.ogpc clip-vit-b32 -o kitchen_any_word.ogpc",
@@ -101,6 +113,26 @@ def run_list(arguments: argparse.Namespace) -> None:
     vocabulary = read_bundle(arguments.bundle).cloud.vocabulary
     for name in vocabulary.names if vocabulary else ():
         print(name)
+
+
+def run_bank(arguments: argparse.Namespace) -> None:
+    from og_pointcloud.bundle import read_bundle
+    from og_pointcloud.text_encoder import encoder_for, read_text_encoder
+    from og_pointcloud.vocabulary import read_bank, store_bank
+
+    check_outputs({"-o": (arguments.output, [".ogpc"])}, inputs=[arguments.features])
+    if arguments.features:
+        bank, space = read_bank(arguments.features)
+    else:
+        own_space = read_bundle(arguments.bundle).cloud.feature_space
+        folder = arguments.text_encoder
+        encoder = read_text_encoder(folder) if folder else encoder_for(own_space, arguments.bundle)
+        if encoder.word_bank is None:
+            raise OgPointcloudError(f"{encoder.where} has no word bank: make it again with export-text-encoder")
+        bank, space = encoder.word_bank, encoder.feature_space
+    store_bank(arguments.bundle, bank, space, arguments.output)
+    path = arguments.output or arguments.bundle
+    print(f"wrote {path}: {len(bank.vectors)} everyday words to judge labels by; its answers are probabilities now")
 
 
 def run_carry(arguments: argparse.Namespace) -> None:
