@@ -40,11 +40,14 @@ def test_a_view_of_something_new_is_needed_wherever_it_stands() -> None:
 
 
 def test_what_is_behind_a_wall_is_not_seen() -> None:
-    """A second wall, of which only a view past the first one's end sees anything."""
+    """A camera between two walls sees what the wall in front hides from the others."""
     behind = WALL + np.float32([0, 0, 2])
-    short = WALL[np.abs(WALL[:, 0]) < 2]
-    views = [looking_at(0.0), looking_at(0.0), looking_at(3.5)]
-    assert needed_views(np.concatenate([short, behind]), views, 1) == [0, 2]
+    between = looking_at(0.0)
+    pose = between.camera.world_to_camera.copy()
+    pose[2, 3] = -3
+    between = replace(between, camera=replace(between.camera, world_to_camera=pose))
+    views = [looking_at(0.0), looking_at(0.0), between]
+    assert needed_views(np.concatenate([WALL, behind]), views, 1) == [0, 2]
 
 
 def test_views_that_see_nothing_are_not_needed() -> None:

@@ -260,6 +260,17 @@ def test_cutoffs_leave_out_what_they_say() -> None:
     assert (weights[2:] == 0).all()
 
 
+@pytest.mark.parametrize(("opacity", "size"), [(0.02, 1), (0.9, 20)])
+def test_hundreds_of_splats_in_a_tile_equal_the_reference(random: Generator, opacity: float, size: float) -> None:
+    """Faint ones, all of which show, and dense ones, which finish the tile early."""
+    gaussians, view = cloud(random, 400), camera(20, 12, 8.0)
+    scale = np.minimum(gaussians.scale * np.float32(size), np.float32(3))
+    gaussians = replace(gaussians, scale=scale, opacity=np.full(400, opacity, np.float32))
+    expected = reference_pixel_weights(gaussians, view, NEAR).reshape(-1, 400)
+    assert ((expected > 0).any(axis=0).sum() > 300) == (size == 1)
+    assert_weights(pixel_weights(gaussians, view, NEAR), expected)
+
+
 def test_needles_across_many_tiles_equal_the_reference(random: Generator) -> None:
     gaussians = cloud(random, 60)
     scale = np.full((60, 3), 1e-3, np.float32)
