@@ -93,6 +93,8 @@ PUBLISHED_MIOU = {
 MAX_UNPACKED_BYTES = 1 << 30
 SHORT_BAR = 0.15
 """The number stands beside a bar that is shorter than this."""
+LABEL_WIDTH = 4.0
+"""A label takes the room of this factor of seconds."""
 COLORS = {"losses": "#4c72b0", "codebook": "#dd8452", "association": "#55a868", "reference": "#8c8c8c"}
 
 
@@ -585,17 +587,22 @@ def _error_against_seconds(axes: Any, rows: Sequence[AblationRow]) -> None:
     axes.step([r.seconds for r in best], [1 - r.miou for r in best], where="post", color="#bbbbbb", zorder=1)
     tables = dict.fromkeys(row.table for row in rows)
     leaders = [max((row for row in rows if row.table == table), key=lambda row: row.miou) for table in tables]
-    for row in best + [row for row in leaders if row not in best]:
+    named = sorted(best + [row for row in leaders if row not in best], key=lambda row: (row.seconds, row.miou))
+    place, height = 0.0, 5
+    for row in named:
+        # Labels that would run into each other are stacked.
+        height = height + 10 if place and row.seconds < LABEL_WIDTH * place else 5
+        place = max(row.seconds, 1e-3)
         label = row.name if row.table == "reference" else f"{row.table}: {_named(row, rows)}"
-        axes.annotate(label, (row.seconds, 1 - row.miou), (6, 5), textcoords="offset points", fontsize=8)
+        axes.annotate(label, (row.seconds, 1 - row.miou), (6, height), textcoords="offset points", fontsize=8)
     axes.set(
         xscale="log",
         ylim=(0, 1.08 - min(row.miou for row in rows)),
         xlabel="seconds after visibility (log)",
         ylabel="error, 1 - mIoU",
     )
-    for axis in (axes.xaxis.set_major_formatter, axes.xaxis.set_minor_formatter):
-        axis(lambda value, _: f"{value:g}")
+    axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
+    axes.xaxis.set_minor_formatter(lambda value, _: f"{value:g}" if f"{value:e}"[0] in "25" else "")
     axes.grid(alpha=0.3)
     axes.spines[["top", "right"]].set_visible(False)
     axes.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1, 1), frameon=False)
