@@ -130,8 +130,8 @@ def test_paper_is_extrapolated_to_its_published_schedule(scored_capture: Path) -
     pytest.importorskip("torch")
     from benchmark_modes import measure
 
-    with pytest.warns(UserWarning, match="without a feature"):  # 60 steps teach nothing
-        row = measure(scored_capture, "paper", 0.001)
+    row = measure(scored_capture, "paper", 0.001)
+    assert 0 < row.miou < 1  # 60 steps teach little
     assert (row.steps, row.published_steps) == (60, 60_000)
     assert row.published_s == pytest.approx(row.total_s + 59_940 * row.seconds_per_step, rel=1e-2)
     assert row.steps * row.seconds_per_step < row.own_s < row.total_s
