@@ -46,7 +46,7 @@ start = time.perf_counter()
 import og_pointcloud as og
 imported = time.perf_counter()
 scene = og.load(sys.argv[1])
-points, dimensions = scene.xyz[:1000], scene.instances.descriptors.shape[1] or 1
+points, dimensions = scene.xyz[:1000], scene.cloud.instances.descriptors.shape[1] or 1
 og.Segmenter(scene, {"word": [1.0] * dimensions})(points)
 answered = time.perf_counter()
 import resource

@@ -72,6 +72,20 @@ class Reason(IntEnum):
     TOO_FAR = 5
     """No point of the map within reach."""
 
+    def __str__(self) -> str:
+        """What is said of points, as in "12 are ..."."""
+        return _IN_WORDS[self]
+
+
+_IN_WORDS = {
+    Reason.LABELLED: "labelled",
+    Reason.NONE_FITS: "like none of these labels",
+    Reason.NOT_DESCRIBED: "of instances without a feature",
+    Reason.IN_NO_MASK: "background",
+    Reason.UNOBSERVED: "unobserved",
+    Reason.TOO_FAR: "too far from the scene",
+}
+
 
 @dataclass(frozen=True)
 class Choice:
@@ -103,12 +117,23 @@ class Choice:
         """(K, L) what words are ranked by: the probability where calibrated, else the cosine (-inf: no descriptor)."""
         return self.table if self.calibrated else self.evidence
 
-    def ranking(self, axis: int) -> NDArray[np.intp]:
-        """(K, L) labels of each instance (axis 1) or instances of each label (axis 0), best first, of equals the first.
+    def ranking(self, label: int) -> NDArray[np.intp]:
+        """(K,) instances by how well one label fits them, best first, of equals the first.
 
         Probabilities that have run up against 0 or 1 are told apart by their evidence.
         """
-        return np.lexsort((-self.evidence, -self.scores), axis=axis)
+        return np.lexsort((-self.evidence[:, label], -self.scores[:, label]))
+
+    def words(self, instance: int, names: Sequence[str], count: int | None = None) -> list[tuple[str, float]]:
+        """The labels of one instance with their scores, best first, or the first ``count`` of them.
+
+        names: (L,) of the labels. Empty for an instance without a descriptor.
+        """
+        if self.reasons[instance] == Reason.NOT_DESCRIBED:
+            return []
+        # Of one instance, more evidence is a higher score, also where probabilities have run up against 0.
+        order: list[int] = np.argsort(-self.evidence[instance], kind="stable")[:count].tolist()
+        return [(names[index], float(self.scores[instance, index])) for index in order]
 
     @cached_property
     def by_id(self) -> tuple[NDArray[np.int32], NDArray[np.float32], NDArray[np.int8]]:

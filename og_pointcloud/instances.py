@@ -48,7 +48,8 @@ class Instance:
     id: in the scene's table. point_indices: (n,) int64, its points in the scene, ascending.
     views, masks: how many saw it and how many are joined in it. agreement: mean cosine of its masks' features with
     their descriptor, -1 to 1. visible_area: pixels that its masks put on it, over all views. part_of: the instance
-    that it is a part of, -1 none. state: "labelled", "no feature" or "empty". words: (word, cosine), best first.
+    that it is a part of, -1 none. state: "labelled", "no feature" or "empty". words: (word, score), best first; a score
+    is the probability that the instance is what the word says, where the scene has a word bank, else a cosine.
     """
 
     id: int
@@ -124,7 +125,7 @@ class Instance:
 
 
 class Instances(Sequence[Instance]):
-    """Row k is instance id k. Made by `instance_table`.
+    """Row k is instance id k. ``scene.instances`` is one; `instance_table` makes others, of other words.
 
     Unlike a list's, its indices do not count from the end: -1 is the id of background, not the last instance.
     """
@@ -245,17 +246,13 @@ def as_scene(scene: SceneLike) -> LabelledScene:
 def _best_words(
     scene: LabelledScene, labels: Labels, text_features: TextFeatures, count: int
 ) -> list[tuple[tuple[str, float], ...]]:
-    """Per instance the words with the highest cosines, of equal ones the first given."""
+    """Per instance the words with the highest scores, of equal ones the first given."""
     own = scene.vocabulary
     if labels is None and text_features is None and not (own and own.names):
         return [()] * len(scene.cloud.instances)
     words = resolve_labels(labels, text_features, own, scene.feature_space, scene.path)
-    scores = scene.instance_scores(words.vectors)
-    order = np.argsort(-scores, axis=1, kind="stable")[:, :count]
-    return [
-        tuple((words.names[column], float(row[column])) for column in columns)
-        for row, columns in zip(scores, order.tolist(), strict=True)
-    ]
+    choice = scene.chooser.choose(words.vectors)
+    return [tuple(choice.words(k, words.names, count)) for k in range(len(choice.labels))]
 
 
 def _cells(row: Instance) -> tuple[str, ...]:

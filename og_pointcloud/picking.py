@@ -15,14 +15,16 @@ import itertools
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import overload
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from og_pointcloud.bundle import TOO_FAR, read_bundle
+from og_pointcloud.choosing import chooser_of
 from og_pointcloud.cloud import BACKGROUND, UNOBSERVED, LabelledCloud
-from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError
+from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.runtime import LabelledScene, SceneLike
 from og_pointcloud.scene import Camera
 from og_pointcloud.words import Labels, TextFeatures, resolve_labels
@@ -61,12 +63,14 @@ class Pick:
 
     instance: id in the scene's table; or BACKGROUND (-1), UNOBSERVED (-2) or TOO_FAR (-3), a miss.
     point: index of the scene's point that was hit, None for a miss. xyz_world: (3,) float64, its place, or None.
+    path: the scene's .ogpc file, None for one in memory.
     """
 
     cloud: LabelledCloud = field(repr=False)
     instance: int
     point: int | None
     xyz_world: NDArray[np.float64] | None
+    path: Path | None = None
 
     @property
     def found(self) -> bool:
@@ -89,26 +93,16 @@ class Pick:
         return (front != NO_POINT) & (self.cloud.instance_ids[front] == self.instance)
 
     def words(self, labels: Labels = None, *, text_features: TextFeatures = None) -> list[tuple[str, float]]:
-        """Words with their cosines to the instance, best first; empty for an instance without a descriptor.
+        """Words with their scores on the instance, best first; empty for an instance without a descriptor.
 
-        labels, text_features: as for ``segment``; left out, the scene's own words. OgPointcloudError where no instance
-        was hit, or as ``segment``.
+        A score is the probability that the instance is what the word says, where the scene has a word bank, else a
+        cosine. labels, text_features: as for ``segment``; left out, the scene's own words. OgPointcloudError where no
+        instance was hit, or as ``segment``.
         """
         self._require_instance()
-        words = resolve_labels(labels, text_features, self.cloud.vocabulary, self.cloud.feature_space)
-        table = self.cloud.instances
-        descriptors = table.descriptors[table.descriptor_instance == self.instance].astype(np.float64)
-        if not len(descriptors):
-            return []
-        vectors = words.vectors.astype(np.float64)
-        if vectors.shape[1] != descriptors.shape[1]:
-            raise FeatureSpaceError(
-                f"the label vectors have width {vectors.shape[1]}, the scene's descriptors {descriptors.shape[1]} "
-                f"(feature space '{self.cloud.feature_space}'): encode the labels with the scene's encoder"
-            )
-        scores = (descriptors @ (vectors / np.linalg.norm(vectors, axis=1, keepdims=True)).T).max(axis=0)
-        order = np.argsort(-scores, kind="stable")
-        return [(words.names[index], float(scores[index])) for index in order]
+        cloud = self.cloud
+        words = resolve_labels(labels, text_features, cloud.vocabulary, cloud.feature_space, self.path)
+        return chooser_of(cloud).choose(words.vectors).words(self.instance, words.names)
 
     def __str__(self) -> str:
         if not self.found:
@@ -136,7 +130,7 @@ def pick(scene: SceneLike, where: Camera | ArrayLike, uv_px: ArrayLike | None = 
     A miss is a Pick too: its ``instance`` says which kind, ``str(pick)`` in words. Raises OgPointcloudError for a pixel
     outside the image and for numbers that are not finite.
     """
-    cloud = _cloud_of(scene)
+    cloud, path = _opened(scene)
     if isinstance(where, Camera):
         point = _point_at_pixel(cloud, where, uv_px)
     elif uv_px is not None:
@@ -144,8 +138,8 @@ def pick(scene: SceneLike, where: Camera | ArrayLike, uv_px: ArrayLike | None = 
     else:
         point = _nearest_point(cloud, where)
     if point == NO_POINT:
-        return Pick(cloud, TOO_FAR, None, None)
-    return Pick(cloud, int(cloud.instance_ids[point]), point, cloud.xyz[point].astype(np.float64) + cloud.origin)
+        return Pick(cloud, TOO_FAR, None, None, path)
+    return Pick(cloud, int(cloud.instance_ids[point]), point, cloud.xyz[point].astype(np.float64) + cloud.origin, path)
 
 
 def in_world(camera: Camera, origin: NDArray[np.float64]) -> Camera:
@@ -196,13 +190,13 @@ def _nearest_point(cloud: LabelledCloud, place: ArrayLike) -> int:
     return nearest if len(squared) and squared[nearest] <= cloud.reach**2 else NO_POINT
 
 
-def _cloud_of(scene: SceneLike) -> LabelledCloud:
+def _opened(scene: SceneLike) -> tuple[LabelledCloud, Path | None]:
     if isinstance(scene, LabelledCloud):
-        return scene
+        return scene, None
     if isinstance(scene, LabelledScene):
-        return scene.cloud
+        return scene.cloud, scene.path
     if isinstance(scene, (str, os.PathLike)):
-        return read_bundle(scene).cloud
+        return read_bundle(scene).cloud, Path(scene)
     raise OgPointcloudError(
         f"scene is a {type(scene).__name__}; expected a loaded scene, a LabelledCloud or the path of a .ogpc file"
     )

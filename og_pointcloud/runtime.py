@@ -1,23 +1,26 @@
 """Text in, labels out: opens a .ogpc and asks it about points. numpy and onnxruntime, nothing else.
 
 ``segment`` is one statement a step: which scene, which words, which instance each point belongs to, which word fits
-each instance best. Scores and the lookup of points are query.onnx's; the few points close to a border, where its table
-does not promise the answer, are settled exactly by ``nearest``.
+each instance, if any. Words are judged by ``choosing``, against the scene's word bank if it has one. The lookup of
+points is query.onnx's; the few points close to a border, where its table does not promise the answer, are settled
+exactly by ``nearest``.
 """
 
 from __future__ import annotations
 
 import os
 import warnings
+from collections.abc import Mapping, Sequence
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from og_pointcloud.bundle import BEYOND, NEAR, NO_EVIDENCE, ON_SURFACE, TOO_FAR, Bundle, read_bundle
-from og_pointcloud.cloud import BACKGROUND, UNOBSERVED, InstanceTable, LabelledCloud, Vocabulary
+from og_pointcloud.bundle import BEYOND, NEAR, ON_SURFACE, TOO_FAR, Bundle, read_bundle
+from og_pointcloud.choosing import Chooser, Reason, chooser_of
+from og_pointcloud.cloud import LabelledCloud, Vocabulary
 from og_pointcloud.clouds import carried_scene, world_points
 from og_pointcloud.errors import BundleError, FeatureSpaceError, OgPointcloudError, SceneError
 from og_pointcloud.nearest import NONE_WITHIN_REACH, NearestPoint, surface_distance
@@ -26,6 +29,8 @@ from og_pointcloud.words import Labels, TextFeatures, resolve_labels
 
 if TYPE_CHECKING:
     from onnxruntime import InferenceSession
+
+    from og_pointcloud.instances import Instances
 
 __all__ = ["SCENE_VARIABLE", "LabelledScene", "SceneLike", "Segmenter", "load", "segment", "use"]
 
@@ -74,10 +79,15 @@ class LabelledScene:
         """(n,) int32: row of ``instances``, -1 background, -2 unobserved."""
         return self.cloud.instance_ids
 
-    @property
-    def instances(self) -> InstanceTable:
-        """Row k is what is known of instance k: points, views, masks, agreement, descriptors."""
-        return self.cloud.instances
+    @cached_property
+    def instances(self) -> Instances:
+        """The instances as a table: row k is instance id k, with its place, boxes, size, evidence and best own words.
+
+        Whole columns, and the descriptors, are in ``cloud.instances``.
+        """
+        from og_pointcloud.instances import instance_table  # which imports this module
+
+        return instance_table(self)
 
     @property
     def vocabulary(self) -> Vocabulary | None:
@@ -89,13 +99,18 @@ class LabelledScene:
         """Name of the encoder that label vectors must come from."""
         return self.cloud.feature_space
 
+    @property
+    def chooser(self) -> Chooser:
+        """What tells which label fits each instance, if any; calibrated if the scene has a word bank. Made once."""
+        return chooser_of(self.cloud)
+
     def instance_scores(self, vectors: NDArray[np.floating]) -> NDArray[np.float32]:
         """(K, L) float32: best cosine of an instance's descriptors with each vector, -2 for one without a descriptor.
 
         vectors: (L, D) of any length. FeatureSpaceError where D is not the scene's.
         """
         width, given = self._text_width, vectors.shape[1]
-        if len(self.instances.descriptors) == 0:  # no width to hold them to
+        if len(self.cloud.instances.descriptors) == 0:  # no width to hold them to
             vectors = np.zeros((len(vectors), width), np.float32)
         elif given != width:
             raise FeatureSpaceError(
@@ -104,7 +119,7 @@ class LabelledScene:
             )
         feed = {"points": np.zeros((0, 3), np.float32), "text": np.ascontiguousarray(vectors, np.float32)}
         scores = self._ask(["instance_scores"], feed)[0]
-        if scores.shape != (len(self.instances), len(vectors)) or scores.dtype != np.float32:
+        if scores.shape != (len(self.cloud.instances), len(vectors)) or scores.dtype != np.float32:
             raise BundleError(
                 f"{self.path}: query.onnx gives scores {scores.dtype} {scores.shape}: write the file again"
             )
@@ -164,7 +179,7 @@ class LabelledScene:
         """A foreign graph may answer anything; nothing is looked up by a number that is none of ours."""
         kinds = [(values.shape, values.dtype) for values in (instances, distance, certain)]
         good = kinds == [((count,), np.dtype(kind)) for kind in (np.int32, np.int8, np.bool_)]
-        if not good or (count and not (instances.min() >= TOO_FAR and instances.max() < len(self.instances))):
+        if not good or (count and not (instances.min() >= TOO_FAR and instances.max() < len(self.cloud.instances))):
             raise BundleError(f"{self.path}: query.onnx answers what is no instance of this file: write the file again")
 
     def _farther_than(
@@ -225,17 +240,27 @@ def segment(
     scene: SceneLike | None = None,
     *,
     text_features: TextFeatures = None,
+    templates: Sequence[str] | None = None,
+    negatives: Labels = None,
     pose: ArrayLike | None = None,
     max_distance: float | None = None,
 ) -> Segmentation:
     """Label the points of a cloud by words. The cloud may be of any density, a crop, noisy, or in a frame of its own.
 
+    A scene with a word bank (``scene.cloud.word_bank``) answers probabilities, and unknown where no label is probable;
+    one without answers the label with the largest cosine. The result says which (``calibrated``), and why a point is
+    unknown (``reasons``).
+
     pcd: an array (N, 3) of world coordinates, an Open3D, PyVista or trimesh cloud, a geometry file; or a scene, a
         LabelledCloud or a .ogpc file, whose own points are then labelled. Rows with NaN answer unknown.
-    labels: words, found in text_features or in the scene's vocabulary (None: all of them); or name -> vector (D,).
+    labels: words, found in text_features or in the scene's vocabulary (None: all of them), or encoded, if the scene's
+        text encoder is found; or name -> vector (D,).
     scene: what to ask. Left out: the scene that the cloud is or carries, else that of ``use``, else the file that the
         environment variable OG_POINTCLOUD_SCENE names.
     text_features: a text-features .npz, or what ``read_text_features`` returned for it.
+    templates: texts with ``{}`` ("a photo of a {}"), into which words are put before they are encoded; their vectors'
+        mean counts. Left out: stored vectors, and the encoder's own templates for other words.
+    negatives: labels too, but points that they fit better are unknown.
     pose: (4, 4), takes the cloud's coordinates to the scene's world. Left out: they are world coordinates.
     max_distance: points farther than this from the scene's cloud answer unknown; at most, and left out, its reach.
 
@@ -244,14 +269,14 @@ def segment(
     """
     pcd = _as_scene(pcd) if _is_scene(pcd) else pcd
     scene = _find_scene(pcd, scene)
-    words = resolve_labels(labels, text_features, scene.vocabulary, scene.feature_space)
+    words, answers = _answers(scene, labels, text_features, templates, negatives)
     if pcd is scene and pose is None:
         points, instances = scene.xyz, scene.instance_ids
         distance = np.full(len(points), ON_SURFACE, np.int8)
     else:
         points = _posed(pcd.xyz if isinstance(pcd, LabelledScene) else world_points(pcd), pose)
         instances, distance = scene.look_up(points, max_distance=max_distance)
-    result = _label(scene, words, _best_labels(scene, words), points, instances, distance)
+    result = _label(scene, words, answers, points, instances, distance)
     if reason := _why_nothing(result, scene):
         warnings.warn(reason, stacklevel=2)
     return result
@@ -261,13 +286,20 @@ class Segmenter:
     """The same labels for many clouds: words are scored once, and a call only looks points up.
 
     Several threads may call it at once; memory does not grow from call to call.
-    scene, labels, text_features: as for ``segment``.
+    scene, labels, text_features, templates, negatives: as for ``segment``.
     """
 
-    def __init__(self, scene: SceneLike, labels: Labels = None, *, text_features: TextFeatures = None) -> None:
+    def __init__(
+        self,
+        scene: SceneLike,
+        labels: Labels = None,
+        *,
+        text_features: TextFeatures = None,
+        templates: Sequence[str] | None = None,
+        negatives: Labels = None,
+    ) -> None:
         self.scene = _as_scene(scene)
-        self._words = resolve_labels(labels, text_features, self.scene.vocabulary, self.scene.feature_space)
-        self._best = _best_labels(self.scene, self._words)
+        self._words, self._answers = _answers(self.scene, labels, text_features, templates, negatives)
         self._warned = False
 
     @property
@@ -283,7 +315,7 @@ class Segmenter:
         Warns the first time that no point gets a label, not at every empty frame of a stream.
         """
         points = _posed(world_points(points), pose)
-        result = _label(self.scene, self._words, self._best, points, *self.scene.look_up(points))
+        result = _label(self.scene, self._words, self._answers, points, *self.scene.look_up(points))
         if not self._warned and (reason := _why_nothing(result, self.scene)):
             self._warned = True
             warnings.warn(reason, stacklevel=2)
@@ -366,30 +398,45 @@ def _posed(points: NDArray[np.float64], pose: ArrayLike | None) -> NDArray[np.fl
         return points @ matrix[:3, :3].T + matrix[:3, 3]
 
 
-def _best_labels(scene: LabelledScene, words: Vocabulary) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
-    """Label and score of each instance, and after the last one three more: of instance ids -3, -2 and -1."""
-    scores = scene.instance_scores(words.vectors)
-    best = scores.max(axis=1, initial=NO_EVIDENCE)
-    known = best > NO_EVIDENCE
-    labels = np.where(known, scores.argmax(axis=1), UNKNOWN)
-    no_instance = -TOO_FAR
-    return (
-        np.append(labels, [UNKNOWN] * no_instance).astype(np.int32),
-        np.append(np.where(known, best, 0), [0] * no_instance).astype(np.float32),
-    )
+def _answers(
+    scene: LabelledScene,
+    labels: Labels,
+    text_features: TextFeatures,
+    templates: Sequence[str] | None,
+    negatives: Labels,
+) -> tuple[Vocabulary, Answers]:
+    """The words asked, and what they make of each instance id."""
+    known = (text_features, scene.vocabulary, scene.feature_space, scene.path)
+    words, against = resolve_labels(labels, *known, templates), None
+    if negatives is not None:
+        has_vectors = isinstance(negatives, (Mapping, Vocabulary))
+        against = resolve_labels(negatives, *known, None if has_vectors else templates).vectors
+    choice = scene.chooser.choose(words.vectors, against)
+    return words, Answers(*choice.by_id, choice.calibrated)
+
+
+class Answers(NamedTuple):
+    """Label, score and reason of each instance id (`Choice.by_id`)."""
+
+    labels: NDArray[np.int32]
+    scores: NDArray[np.float32]
+    reasons: NDArray[np.int8]
+    calibrated: bool
 
 
 def _label(
     scene: LabelledScene,
     words: Vocabulary,
-    best: tuple[NDArray[np.int32], NDArray[np.float32]],
+    answers: Answers,
     points: NDArray[np.float64],
     instances: NDArray[np.int32],
     distance: NDArray[np.int8],
 ) -> Segmentation:
-    labels, scores = best
     # A negative instance counts from the end, where those of no instance lie.
-    return Segmentation(points, labels[instances], scores[instances], instances, words.names, scene.path, distance)
+    return Segmentation(
+        points, answers.labels[instances], answers.scores[instances], instances, words.names, scene.path, distance,
+        answers.reasons[instances], answers.calibrated,
+    )  # fmt: skip
 
 
 def _why_nothing(result: Segmentation, scene: LabelledScene) -> str | None:
@@ -398,22 +445,13 @@ def _why_nothing(result: Segmentation, scene: LabelledScene) -> str | None:
         return "no point has a label: the cloud has 0 points (a file that could not be read may give such a cloud)"
     if (result.labels != UNKNOWN).any():
         return None
-    states = {
-        f"farther than {scene.cloud.reach:.4g} from the scene": result.instances == TOO_FAR,
-        "background": result.instances == BACKGROUND,
-        "unobserved": result.instances == UNOBSERVED,
-        "of instances without a feature": result.instances >= 0,
-    }
-    parts = [f"{int(state.sum())} are {name}" for name, state in states.items() if state.any()]
+    counts = result.unknown_because()
+    parts = [f"{count} are {reason}" for reason, count in counts.items()]
     advice = ""
-    if (
-        (result.instances == TOO_FAR).all()
-        and len(scene.cloud)
-        and (finite := np.isfinite(result.xyz).all(axis=1)).any()
-    ):
+    if set(counts) == {Reason.TOO_FAR} and len(scene.cloud) and (finite := np.isfinite(result.xyz).all(axis=1)).any():
         advice = (
-            f"; the points span {_box(result.xyz[finite])}, the scene {_box(scene.xyz)}: bring them into the scene's "
-            "frame and unit"
+            f"; the points span {_box(result.xyz[finite])}, the scene {_box(scene.xyz)}, its reach is "
+            f"{scene.cloud.reach:.4g}: bring them into the scene's frame and unit"
         )
     return f"none of {len(result)} points has a label: {', '.join(parts)}{advice}"
 

@@ -1,7 +1,7 @@
-"""Words select instances: all of them ranked by one text, and which the text fits better than any other word does.
+"""Words select instances: all of them ranked by one text, and which the text fits.
 
-A cosine alone says little: what counts as high differs from scene to scene and word to word. So the text competes: an
-instance is selected where no rival word fits it better, as `segment` would label it.
+A cosine alone says little: what counts as high differs from scene to scene and word to word. So the text competes with
+other words, and with the scene's word bank where it has one: an instance is selected where `segment` would label it so.
 """
 
 from __future__ import annotations
@@ -15,8 +15,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from og_pointcloud.bundle import NO_EVIDENCE
+from og_pointcloud.choosing import Choice, Reason
 from og_pointcloud.cloud import Vocabulary
-from og_pointcloud.errors import OgPointcloudError
+from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError
 from og_pointcloud.instances import SHOWN, as_scene
 from og_pointcloud.runtime import LabelledScene, SceneLike
 from og_pointcloud.words import Labels, TextFeatures, resolve_labels
@@ -26,10 +27,12 @@ __all__ = ["Match", "Selection", "select"]
 
 @dataclass(frozen=True)
 class Match:
-    """An instance beside a text. score: their cosine. points: how many it has.
+    """An instance beside a text. points: how many it has.
 
-    fits: whether no other word fits it better; where no other word was given, whether it is the best of all.
-    rival: the other word that fits it best, with its cosine; None and -2 where no other word was given.
+    score: the probability that it is what the text says, where the selection is calibrated; else their cosine.
+    fits: whether neither another word nor "none of these" is more probable. Where not calibrated: whether no other word
+    has a higher cosine; where no other word was given, whether it is the best of all.
+    rival: the other word that fits it best, with its score; None and -2 where no other word was given.
     """
 
     instance: int
@@ -53,13 +56,14 @@ class Selection(Sequence[Match]):
     """What a text selects: every instance that has points and a feature, best first, of equals the smaller id.
 
     query: the text. rivals: how many other words competed. unknown: instances with points that have no feature, which
-    no text can find.
+    no text can find. calibrated: whether the scene has a word bank, and scores are probabilities.
     """
 
     query: str
     matches: tuple[Match, ...]
     rivals: int
     unknown: int
+    calibrated: bool
     scene: LabelledScene = field(repr=False)
 
     def __len__(self) -> int:
@@ -78,12 +82,12 @@ class Selection(Sequence[Match]):
 
     @property
     def best(self) -> Match | None:
-        """The instance with the highest cosine, whether or not another word fits it better; None without any."""
+        """The instance with the highest score, whether or not the text fits it; None without any."""
         return self.matches[0] if self.matches else None
 
     @property
     def fitting(self) -> tuple[Match, ...]:
-        """Those that the text fits better than every rival; without rivals the best alone, as nothing tells more."""
+        """Those that the text fits; without rivals and word bank the best alone, as nothing tells more."""
         return tuple(match for match in self.matches if match.fits)
 
     @property
@@ -102,8 +106,9 @@ class Selection(Sequence[Match]):
 
     def to_json(self) -> str:
         """The query, and every match in order."""
-        record = {"query": self.query, "rivals": self.rivals, "unknown": self.unknown}
-        return json.dumps({**record, "matches": [match.to_dict() for match in self]}, indent=2, ensure_ascii=False)
+        names = ("query", "rivals", "unknown", "calibrated")
+        record = {name: getattr(self, name) for name in names} | {"matches": [match.to_dict() for match in self]}
+        return json.dumps(record, indent=2, ensure_ascii=False)
 
     def __str__(self) -> str:
         lines = [f"'{self.query}' fits {len(self.fitting)} of {len(self)} instances"]
@@ -130,7 +135,8 @@ def select(
     scene: a loaded scene, a LabelledCloud or the path of a .ogpc file.
     text: a word or phrase, found as for ``segment``; or one name -> vector (D,).
     against: the words that compete, as labels of ``segment``; left out, all others that text_features or the scene
-        know; an empty list for none. Rivals that mean the same ("cup" for "mug") share the instances between them.
+        know; an empty list for none but the word bank. Rivals that mean the same ("cup" for "mug") share the instances
+        between them.
 
     Raises OgPointcloudError where text is not one word, else as ``segment``.
     """
@@ -140,26 +146,40 @@ def select(
         raise OgPointcloudError(f"the text is {shown!r:.80}; expected one word or phrase, or one name -> vector")
     query = resolve_labels(text, text_features, scene.vocabulary, scene.feature_space, scene.path)
     rivals = _rivals(scene, query.names[0], against, text_features)
-    scores = scene.instance_scores(query.vectors)[:, 0]
-    names: list[str | None] = [None] * len(scores)
-    rival_scores = np.full(len(scores), NO_EVIDENCE, np.float32)
-    if rivals is not None:
-        of_each = scene.instance_scores(rivals.vectors)
-        names = [rivals.names[index] for index in of_each.argmax(axis=1)]
-        rival_scores = of_each.max(axis=1)
-    points = np.bincount(scene.instance_ids[scene.instance_ids >= 0], minlength=len(scores))
-    known = (scores > NO_EVIDENCE) & (points > 0)
-    ranked = [int(k) for k in np.argsort(-scores, kind="stable") if known[k]]
-    fits = scores >= rival_scores if rivals else np.isin(np.arange(len(scores)), ranked[:1])
+    choice = scene.chooser.choose(_together(query, rivals))
+    points = np.bincount(scene.instance_ids[scene.instance_ids >= 0], minlength=len(choice.labels))
+    known = (points > 0) & (choice.reasons != Reason.NOT_DESCRIBED)
+    ranked = [int(k) for k in choice.ranking(0) if known[k]]
+    fitting = np.flatnonzero(choice.labels == 0) if rivals or choice.calibrated else ranked[:1]
     return Selection(
         query=query.names[0],
-        matches=tuple(
-            Match(k, float(scores[k]), bool(fits[k]), names[k], float(rival_scores[k]), int(points[k])) for k in ranked
-        ),
+        matches=tuple(_match(k, choice, k in fitting, rivals, int(points[k])) for k in ranked),
         rivals=len(rivals.names) if rivals else 0,
         unknown=int(((points > 0) & ~known).sum()),
+        calibrated=choice.calibrated,
         scene=scene,
     )
+
+
+def _match(instance: int, choice: Choice, fits: bool, rivals: Vocabulary | None, points: int) -> Match:
+    """choice: of the query, label 0, and the rivals behind it."""
+    score = float(choice.scores[instance, 0])
+    if rivals is None:
+        return Match(instance, score, fits, None, NO_EVIDENCE, points)
+    best = int(choice.evidence[instance, 1:].argmax())
+    return Match(instance, score, fits, rivals.names[best], float(choice.scores[instance, 1 + best]), points)
+
+
+def _together(query: Vocabulary, rivals: Vocabulary | None) -> NDArray[np.float32]:
+    """(1 + rivals, D) vectors, the query's first."""
+    if rivals is None:
+        return query.vectors
+    if query.vectors.shape[1] != rivals.vectors.shape[1]:
+        raise FeatureSpaceError(
+            f"the vector of '{query.names[0]}' has width {query.vectors.shape[1]}, those of the words that compete "
+            f"{rivals.vectors.shape[1]}: encode both with the scene's encoder"
+        )
+    return np.concatenate([query.vectors, rivals.vectors])
 
 
 def _rivals(scene: LabelledScene, query: str, against: Labels, text_features: TextFeatures) -> Vocabulary | None:

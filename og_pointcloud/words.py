@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from og_pointcloud.cloud import Vocabulary
 from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError
-from og_pointcloud.text_encoder import export_command, find_encoder
+from og_pointcloud.text_encoder import encoder_for, export_command, find_encoder
 from og_pointcloud.text_features import UNKNOWN_SPACE, read_text_features
 
 __all__ = ["Labels", "TextFeatures", "resolve_labels"]
@@ -27,17 +27,23 @@ def resolve_labels(
     own_words: Vocabulary | None,
     feature_space: str,
     bundle: Path | None = None,
+    templates: Sequence[str] | None = None,
 ) -> Vocabulary:
     """Names, all different, with a finite vector each that is not zero.
 
     labels: words, looked up in text_features and then in own_words (None: every word of the first that there is), and
     encoded where both lack them, if there is an encoder; or name -> vector (D,); or a Vocabulary, taken as it is.
     text_features: a text-features file, or what ``read_text_features`` returned. own_words, feature_space: the scene's.
-    bundle: the scene's file, which may carry the encoder.
+    bundle: the scene's file, which may carry the encoder. templates: texts with ``{}``, which every word is put into
+    and encoded, whatever vectors are stored for it; needs the encoder.
     Raises OgPointcloudError for a word without vector or given twice, FeatureSpaceError for text_features of another
     space and for vectors that cannot be compared.
     """
     sources = [source for source in (_of_space(text_features, feature_space), own_words) if source is not None]
+    if templates is not None and labels is None and sources:
+        labels = sources[0].names
+    if templates is not None and isinstance(labels, (Mapping, Vocabulary)):
+        raise OgPointcloudError("templates are given with vectors; expected words to put into them: leave one of both")
     if labels is None:
         if not sources:
             raise OgPointcloudError(
@@ -52,6 +58,8 @@ def resolve_labels(
     for word in words:
         if not isinstance(word, str):
             raise OgPointcloudError(f"label {word!r:.60} is a {type(word).__name__}; expected words, or name -> vector")
+    if templates is not None:
+        return _checked(Vocabulary(words, encoder_for(feature_space, bundle)(words, templates)))
     return _checked(_looked_up(words, sources, feature_space, bundle))
 
 

@@ -274,7 +274,7 @@ def test_open3d_result(scene):
     pytest.importorskip("open3d")
     result = og.segment(scene, ["apple", "pear"])
     cloud = result.to_open3d()
-    for name in ("label", "score", "instance"):
+    for name in ("label", "score", "instance", "reason"):
         assert (cloud.point[name].numpy()[:, 0] == getattr(result, name + "s")).all()
     assert (np.round(cloud.point["colors"].numpy() * 255) == result.colors).all()
     assert len(cloud.voxel_down_sample(0.5).point["label"]) > 0
@@ -431,8 +431,10 @@ def test_result_masks_counts_and_refusals(scene, tmp_path):
 def test_result_is_saved_as_npz_and_ply(scene, tmp_path):
     result = og.segment(scene, ["café", "pear"])
     saved = np.load(result.save(tmp_path / "out.npz"), allow_pickle=False)
-    assert sorted(saved) == ["instances", "labels", "names", "scores"]
+    assert sorted(saved) == ["calibrated", "instances", "labels", "names", "reasons", "scores"]
     assert (saved["labels"] == result.labels).all()
+    assert (saved["reasons"] == result.reasons).all()
+    assert not saved["calibrated"]
     assert saved["names"].tolist() == ["café", "pear"]
     points = og.read_points(result.save(tmp_path / "out.ply"))
     assert np.abs(points.xyz_world - result.xyz).max() < 1e-5
@@ -454,9 +456,9 @@ def test_colours_tell_labels_apart_and_do_not_depend_on_the_others():
         (np.zeros((0, 3)), "the cloud has 0 points"),
         (
             np.full((4, 3), 50.0),
-            r"none of 4 points has a label: 4 are farther than 0.15 .* span 50..50 x .*frame and unit",
+            r"none of 4 points has a label: 4 are too far .* span 50..50 x .*reach is 0.15: .*frame and unit",
         ),
-        (np.full((4, 3), np.nan), "4 are farther than 0.15 from the scene$"),
+        (np.full((4, 3), np.nan), "4 are too far from the scene$"),
     ],
 )
 def test_no_label_at_all_is_explained(scene, points, says):
@@ -467,7 +469,7 @@ def test_no_label_at_all_is_explained(scene, points, says):
 def test_no_label_of_a_clouds_own_points_is_explained():
     with pytest.warns(UserWarning, match="800 are unobserved"):
         og.segment(CLOUDS["all unobserved"], ["apple"])
-    with pytest.warns(UserWarning, match=r"are background, .*of instances without a feature"):
+    with pytest.warns(UserWarning, match=r"are of instances without a feature, \d+ are background"):
         og.segment(CLOUDS["instances without any descriptor"], ["apple"])
 
 

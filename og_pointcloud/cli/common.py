@@ -145,6 +145,12 @@ def next_segment_command(bundle: str, cloud: LabelledCloud) -> str:
     return shlex.join([*command, *labels, "-o", str(Path(bundle).with_suffix(".ply"))])
 
 
+def calibration_hint(bundle: Path | str) -> str:
+    """How a file without a word bank gets one."""
+    command = shlex.join(["og-pointcloud", "vocabulary", "bank", str(bundle)])
+    return f"For probabilities, and 'unknown' where no label fits: {command} [WORDS.npz]"
+
+
 def print_provenance(provenance: Mapping[str, Any]) -> None:
     stages = provenance.get("stages", [])
     if stages:

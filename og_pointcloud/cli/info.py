@@ -7,7 +7,7 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from og_pointcloud.cli.common import SHOWN, add_command, print_provenance, print_table
+from og_pointcloud.cli.common import SHOWN, add_command, calibration_hint, print_provenance, print_table
 from og_pointcloud.errors import BundleError
 
 if TYPE_CHECKING:
@@ -41,7 +41,11 @@ def run(arguments: argparse.Namespace) -> None:
 def describe_bundle(scene: LabelledScene, path: Path) -> dict[str, Any]:
     """What ``info --json`` prints: the manifest, with the file's size and its words."""
     words = list(scene.vocabulary.names) if scene.vocabulary else []
-    return {"path": str(path), "bytes": path.stat().st_size, "words": words, **scene.manifest}
+    bank = scene.cloud.word_bank
+    return {
+        "path": str(path), "bytes": path.stat().st_size, "words": words,
+        "word_bank": 0 if bank is None else len(bank.vectors), **scene.manifest,
+    }  # fmt: skip
 
 
 def print_info(scene: LabelledScene, path: Path) -> None:
@@ -52,23 +56,26 @@ def print_info(scene: LabelledScene, path: Path) -> None:
     print(f"{len(cloud):,} points, {len(cloud.instances)} instances, feature space '{cloud.feature_space}'")
     origin = ", ".join(f"{value:g}" for value in cloud.origin)
     print(f"spacing {cloud.spacing:.4g}, reach {cloud.reach:.4g}, origin ({origin}), in the capture's unit")
-    print(f"{len(words)} words: {', '.join(words[:SHOWN])}{', ...' if len(words) > SHOWN else ''}\n")
+    print(f"{len(words)} words: {', '.join(words[:SHOWN])}{', ...' if len(words) > SHOWN else ''}")
+    print(f"{describe_bank(scene, path)}\n")
     print_instances(scene)
     print()
     print_provenance(cloud.provenance)
 
 
+def describe_bank(scene: LabelledScene, path: Path) -> str:
+    if scene.cloud.word_bank is None:
+        return f"no word bank: scores are cosines. {calibration_hint(path)}"
+    return f"word bank of {len(scene.cloud.word_bank.vectors)}: scores are probabilities"
+
+
 def print_instances(scene: LabelledScene) -> None:
     """The largest instances, with the evidence for each and the word that fits it best."""
-    table, vocabulary = scene.instances, scene.vocabulary
-    largest = table.points.argsort(kind="stable")[::-1][:SHOWN]
-    described = set(table.descriptor_instance.tolist())
-    best = scene.instance_scores(vocabulary.vectors).argmax(axis=1) if vocabulary and vocabulary.names else None
     rows = []
-    for index in largest.tolist():
-        word = vocabulary.names[best[index]] if vocabulary and best is not None and index in described else "-"
-        evidence = (f"{table.points[index]:,}", str(table.views[index]), str(table.masks[index]))
-        rows.append((str(index), *evidence, f"{table.agreement[index]:.2f}", word))
+    for row in scene.instances.largest(SHOWN):
+        word = "{} {:.2f}".format(*row.words[0]) if row.words else "-"
+        evidence = (f"{row.points:,}", str(row.views), str(row.masks), f"{row.agreement:.2f}")
+        rows.append((str(row.id), *evidence, word))
     print_table(("instance", "points", "views", "masks", "agreement", "best word"), rows)
-    if len(table) > SHOWN:
-        print(f"and {len(table) - SHOWN} smaller ones")
+    if len(scene.instances) > SHOWN:
+        print(f"and {len(scene.instances) - SHOWN} smaller ones; og-pointcloud instances lists them, with boxes")
