@@ -15,6 +15,7 @@ from og_pointcloud.cloud import BACKGROUND, UNOBSERVED, LabelledCloud
 from og_pointcloud.coverage import needed_views
 from og_pointcloud.errors import SceneError
 from og_pointcloud.geometry import (
+    GeometryChoice,
     Neighbourhood,
     choose_gaussians,
     isotropic,
@@ -54,27 +55,15 @@ def fit(
     """
     settings = settings or FitSettings()
     journal = Journal(progress)
-    _check(scene, journal)
+    check_scene(scene, journal)
     if prepared is None:
-        scene = _with_needed_views(scene, settings, journal)
+        scene = with_needed_views(scene, settings, journal)
         prepared = prepare(scene, settings, journal, work)
     road = {"auto": by_choice, "grouping": by_grouping, "fast": by_features, "paper": as_published}[settings.mode]
     labelling = road(scene, prepared, settings, journal)
-    _report(labelling, journal)
-    typical = float(np.median(prepared.neighbourhood.spacing))
     if work is not None:
         remove_work(Path(work))
-    return LabelledCloud(
-        xyz=scene.points.xyz,
-        origin=scene.points.origin,
-        instance_ids=labelling.instance_ids,
-        instances=labelling.instances,
-        feature_space=scene.feature_space,
-        spacing=typical,
-        reach=settings.geometry.reach * typical,
-        rgb=scene.points.rgb,
-        provenance=journal.provenance(settings),
-    )
+    return labelled_cloud(scene, labelling, prepared.neighbourhood.spacing, settings, journal)
 
 
 def prepare(
@@ -94,11 +83,11 @@ def prepare(
     with journal.stage("geometry"):
         gaussians = _gaussians(scene, around, near, settings, journal)
     with journal.stage("visibility"):
-        stride = _stride(scene.points, around.spacing, scene.views, settings.geometry, journal)
+        stride = pixel_stride(scene.points, around.spacing, scene.views, settings.geometry, journal)
         views = (thinned(view, stride) for view in journal.steps(scene.views, "visibility"))
         thickness = _surface_thickness(gaussians, around, settings.geometry)
         store, at_once = _store(scene, gaussians, near, thickness, memory, work, settings)
-        table = mask_table(gaussians, views, near, thickness, store, at_once, _cutoffs(settings))
+        table = mask_table(gaussians, views, near, thickness, store, at_once, cutoffs(settings))
         journal.notes["table"] = {
             "views": len(store.marks),
             "entries": store.entries,
@@ -123,7 +112,8 @@ def prepare(
     return Prepared(around, gaussians, near, stride, table)
 
 
-def _check(scene: Scene, journal: Journal) -> None:
+def check_scene(scene: Scene, journal: Journal) -> None:
+    """Refuse a scene without masks; note its size."""
     masks = sum(view.mask_count for view in scene.views)
     if masks == 0:
         raise SceneError(f"none of the {len(scene.views)} views has a mask; expected at least one: make masks first")
@@ -132,7 +122,8 @@ def _check(scene: Scene, journal: Journal) -> None:
     journal.notes.update(points=len(scene.points), views=len(scene.views), masks=masks)
 
 
-def _with_needed_views(scene: Scene, settings: FitSettings, journal: Journal) -> Scene:
+def with_needed_views(scene: Scene, settings: FitSettings, journal: Journal) -> Scene:
+    """The scene with the views that see something new, where the settings ask for that, else with all."""
     enough = settings.visibility.enough_views
     needed = range(len(scene.views)) if enough is None else needed_views(scene.points.xyz, scene.views, enough)
     if len(needed) in (0, len(scene.views)):
@@ -159,6 +150,12 @@ def _gaussians(scene: Scene, around: Neighbourhood, near: float, settings: FitSe
         settings.geometry,
         lambda values: journal.steps(values, "geometry"),
     )
+    note_choice(choice, journal)
+    return choice.gaussians
+
+
+def note_choice(choice: GeometryChoice, journal: Journal) -> None:
+    """How a plain cloud's points are drawn, and why; a warning where there was nothing to go by."""
     journal.notes["gaussian_scale"], journal.notes["gaussian_opacity"] = choice.scale, choice.opacity
     journal.notes["photometric_trials"] = [list(trial) for trial in choice.trials]
     if not choice.trials:
@@ -166,7 +163,6 @@ def _gaussians(scene: Scene, around: Neighbourhood, near: float, settings: FitSe
             f"no colours or images to compare with: points are drawn {choice.scale} spacings large, {choice.opacity} "
             "opaque; add images for a choice by photometric agreement"
         )
-    return choice.gaussians
 
 
 def _surface_thickness(gaussians: Gaussians, around: Neighbourhood, settings: GeometrySettings) -> NDArray[np.float32]:
@@ -176,7 +172,7 @@ def _surface_thickness(gaussians: Gaussians, around: Neighbourhood, settings: Ge
     return thickness.astype(np.float32)
 
 
-def _stride(
+def pixel_stride(
     points: Points, spacing: NDArray[np.float32], views: Sequence[View], settings: GeometrySettings, journal: Journal
 ) -> int:
     """Use every stride-th pixel of the masks: pixels much finer than the points see nothing new."""
@@ -210,11 +206,12 @@ def _store(
     at_once = int(np.clip(visibility.views_share * left // one, 1, min(get_num_threads(), len(scene.views))))
     share = visibility.table_share * max(0, left - at_once * one)
     folder = None if work is None else Path(work)
-    key = "" if folder is None else table_key(gaussians, near, thickness, _cutoffs(settings))
+    key = "" if folder is None else table_key(gaussians, near, thickness, cutoffs(settings))
     return TableStore(len(gaussians), share, folder, key, visibility.keep_after_s), at_once
 
 
-def _cutoffs(settings: FitSettings) -> Cutoffs:
+def cutoffs(settings: FitSettings) -> Cutoffs:
+    """Where blending stops looking."""
     return Cutoffs(settings.visibility.alpha_min, settings.visibility.transmittance_min)
 
 
@@ -228,10 +225,24 @@ def _front_surfaces(
     return table
 
 
-def _report(labelling: Labelling, journal: Journal) -> None:
-    ids = labelling.instance_ids
+def labelled_cloud(
+    scene: Scene, labelling: Labelling, spacing: NDArray[np.float32], settings: FitSettings, journal: Journal
+) -> LabelledCloud:
+    """The scene's points with their labels, and how they came about; a warning where there is no instance."""
+    ids, typical = labelling.instance_ids, float(np.median(spacing))
     states = {"labelled": ids >= 0, "background": ids == BACKGROUND, "unobserved": ids == UNOBSERVED}
     journal.notes["points_by_state"] = {name: int(state.sum()) for name, state in states.items()}
     journal.notes["instances"] = len(labelling.instances)
     if len(labelling.instances) == 0:
         journal.warnings.append("no instance was found: every mask is contradicted by other views or shows no point")
+    return LabelledCloud(
+        xyz=scene.points.xyz,
+        origin=scene.points.origin,
+        instance_ids=ids,
+        instances=labelling.instances,
+        feature_space=scene.feature_space,
+        spacing=typical,
+        reach=settings.geometry.reach * typical,
+        rgb=scene.points.rgb,
+        provenance=journal.provenance(settings),
+    )

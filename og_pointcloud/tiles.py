@@ -36,9 +36,16 @@ from scipy.spatial import cKDTree
 
 from og_pointcloud._atomic import replacing
 from og_pointcloud.association import describe_instances
-from og_pointcloud.cloud import BACKGROUND, UNOBSERVED, LabelledCloud
-from og_pointcloud.coverage import needed_views
+from og_pointcloud.cloud import LabelledCloud
 from og_pointcloud.errors import OgPointcloudError, SceneError
+from og_pointcloud.fit import (
+    check_scene,
+    cutoffs,
+    labelled_cloud,
+    note_choice,
+    pixel_stride,
+    with_needed_views,
+)
 from og_pointcloud.geometry import (
     Neighbourhood,
     chance_of_place,
@@ -46,7 +53,6 @@ from og_pointcloud.geometry import (
     isotropic,
     near_plane,
     neighbourhood,
-    pixels_per_spacing,
     sample_of_points,
     thinned,
 )
@@ -59,7 +65,7 @@ from og_pointcloud.modes import Labelling
 from og_pointcloud.scene import Points, Scene, View
 from og_pointcloud.settings import FitSettings
 from og_pointcloud.testimony import hear_views
-from og_pointcloud.visibility import FRUSTUM_MARGIN, Cutoffs, Gaussians, MaskTable, mask_table
+from og_pointcloud.visibility import FRUSTUM_MARGIN, Gaussians, MaskTable, mask_table
 
 __all__ = ["Tiles", "fit_tiles", "kept_views", "needs_tiles", "split"]
 
@@ -129,7 +135,7 @@ def fit_tiles(
     settings = settings or FitSettings()
     journal = Journal(progress)
     _check(scene, settings, journal)
-    views = _needed(scene, settings, journal)
+    views = with_needed_views(scene, settings, journal).views
     most = points_per_tile or _points_per_tile(len(scene.points), settings)
     with _Kept.open(Path(work) if work else None, _key(scene.points, settings, most)) as kept:
         with journal.stage("spacing"):
@@ -145,19 +151,11 @@ def fit_tiles(
             settled = [_settle(tile, cloud, shown, groups, settings, kept) for tile in tiles]
         with journal.stage("association"):
             labelling = _evidence(cloud, shown, groups, settled, settings)
-    _report(labelling, settings, journal)
-    typical = float(np.median(cloud.spacing))
-    return LabelledCloud(
-        xyz=scene.points.xyz,
-        origin=scene.points.origin,
-        instance_ids=labelling.instance_ids,
-        instances=labelling.instances,
-        feature_space=scene.feature_space,
-        spacing=typical,
-        reach=settings.geometry.reach * typical,
-        rgb=scene.points.rgb,
-        provenance=journal.provenance(settings),
-    )
+    if settings.mode == "auto":
+        journal.leave_out(
+            "learned features and codebook", "they learn from all points at once, which tiles do not hold"
+        )
+    return labelled_cloud(scene, labelling, cloud.spacing, settings, journal)
 
 
 def _check(scene: Scene, settings: FitSettings, journal: Journal) -> None:
@@ -166,23 +164,7 @@ def _check(scene: Scene, settings: FitSettings, journal: Journal) -> None:
             f'mode is "{settings.mode}", which learns from all points at once; expected "auto" or "grouping" for a fit '
             "in tiles: take one of these, or thin the cloud until it fits whole"
         )
-    masks = sum(view.mask_count for view in scene.views)
-    if masks == 0:
-        raise SceneError(f"none of the {len(scene.views)} views has a mask; expected at least one: make masks first")
-    if len(scene.views) == 1:
-        journal.warnings.append("one view: nothing can contradict its masks, so every mask is an instance")
-    journal.notes.update(points=len(scene.points), views=len(scene.views), masks=masks)
-
-
-def _needed(scene: Scene, settings: FitSettings, journal: Journal) -> Sequence[View]:
-    """All views, or those that see something new, where the settings ask for that."""
-    enough = settings.visibility.enough_views
-    chosen = [] if enough is None else needed_views(scene.points.xyz, scene.views, enough)
-    if len(chosen) in (0, len(scene.views)):
-        return scene.views
-    left_out = f"{len(scene.views) - len(chosen)} of {len(scene.views)} views"
-    journal.leave_out(left_out, f"nearly all that they see is seen by {enough} others")
-    return [scene.views[index] for index in chosen]
+    check_scene(scene, journal)
 
 
 def _room(settings: FitSettings) -> int:
@@ -356,23 +338,15 @@ def _drawing(views: Sequence[View], cloud: _TiledCloud, settings: FitSettings, j
     if points.are_gaussians:
         journal.leave_out("choice of scale and opacity", "the file holds Gaussians")
         return _Drawing(None, None, near, typical, 1)
-    step = -(-len(points) // CHOICE_POINTS)
     few, spacing = points, cloud.spacing
-    if step > 1:
-        journal.leave_out(f"{1 - 1 / step:.0%} of the points in the choice of scale and opacity", "the rest say enough")
-        few = _rows_of(points, np.arange(0, len(points), step))
+    if len(points) > CHOICE_POINTS:
+        left_out = f"{1 - CHOICE_POINTS / len(points):.0%} of the points in the choice of scale and opacity"
+        journal.leave_out(left_out, "the rest say enough")
+        few = _rows_of(points, sample_of_points(points.xyz, CHOICE_POINTS))
         spacing = neighbourhood(few.xyz, geometry).spacing
     choice = choose_gaussians(few, spacing, views, near, geometry, partial(journal.steps, name="geometry"))
-    journal.notes["gaussian_scale"], journal.notes["gaussian_opacity"] = choice.scale, choice.opacity
-    journal.notes["photometric_trials"] = [list(trial) for trial in choice.trials]
-    if not choice.trials:
-        journal.warnings.append(f"no colours or images to compare with: points are drawn {choice.scale} spacings large")
-    apart = pixels_per_spacing(points, cloud.spacing, views)
-    smallest = min(min(view.camera.width, view.camera.height) for view in views)
-    stride = int(np.clip(apart / geometry.pixels_per_spacing, 1, min(geometry.max_stride, smallest)))
-    if stride > 1:
-        why = f"points lie {apart:.1f} px apart: every {stride}th row and column"
-        journal.leave_out(f"{1 - 1 / stride**2:.0%} of the pixels", why)
+    note_choice(choice, journal)
+    stride = pixel_stride(points, cloud.spacing, views, geometry, journal)
     return _Drawing(choice.scale, choice.opacity, near, typical, stride)
 
 
@@ -458,8 +432,7 @@ def _entries(
     splats = drawing.splats(cloud, rows, larger)
     apart = np.maximum(cloud.spacing[rows] * larger, drawing.typical)
     thickness = (settings.geometry.thickness * apart + 3 * splats.scale.max(axis=1)).astype(np.float32)
-    cutoffs = Cutoffs(settings.visibility.alpha_min, settings.visibility.transmittance_min)
-    whole = mask_table(splats, [view], drawing.near, thickness, cutoffs=cutoffs)
+    whole = mask_table(splats, [view], drawing.near, thickness, cutoffs=cutoffs(settings))
     camera = view.camera
     # In a table of one view each point has too few of them to contradict a mask: all that is behind is found.
     front, _ = without_see_through(
@@ -615,19 +588,6 @@ def _table_of_sums(ids: NDArray[np.int32], used: Rows, shown: _Shown, settled: S
     outside = at_first(sum((tile.outside for tile in settled[1:]), settled[0].outside))
     no_pixels = np.zeros(len(shown.mask_view), np.int32)
     return MaskTable(weights, outside, csr_array(outside.shape), shown.mask_view, no_pixels, shown.mask_features)
-
-
-def _report(labelling: Labelling, settings: FitSettings, journal: Journal) -> None:
-    ids = labelling.instance_ids
-    states = {"labelled": ids >= 0, "background": ids == BACKGROUND, "unobserved": ids == UNOBSERVED}
-    journal.notes["points_by_state"] = {name: int(state.sum()) for name, state in states.items()}
-    journal.notes["instances"] = len(labelling.instances)
-    if settings.mode == "auto":
-        journal.leave_out(
-            "learned features and codebook", "they learn from all points at once, which tiles do not hold"
-        )
-    if len(labelling.instances) == 0:
-        journal.warnings.append("no instance was found: every mask is contradicted by other views or shows no point")
 
 
 # The work folder ------------------------------------------------------------------------------------------------

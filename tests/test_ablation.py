@@ -98,7 +98,7 @@ def test_the_share_of_the_schedule_is_said():
 
 def test_rows_trained_by_rendering_score_as_their_fit(subject):
     pytest.importorskip("torch")
-    folder, scene, prepared, truth, _ = subject
+    folder, scene, _, truth, _ = subject
     wanted = []
     for case in cases("paper", 0.0005):
         if case.name in ("both", "IoU only, visible", "two levels"):  # so little training makes no whole things
@@ -108,7 +108,7 @@ def test_rows_trained_by_rendering_score_as_their_fit(subject):
     found = run(subject, only=wanted)
     assert len(found) == 3
     for case, row in zip(wanted, found, strict=True):
-        cloud = fit(scene, case.settings, progress=False, prepared=prepared)
+        cloud = fit(scene, case.settings, progress=False)
         result = og.segment(cloud, text_features=folder / "text_features.npz")
         score = score_labels(result.labels, truth.cls)
         assert (row.miou, row.clusters) == (score.miou, len(cloud.instances))
