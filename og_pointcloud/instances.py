@@ -21,9 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from og_pointcloud._atomic import replacing
 from og_pointcloud.boxes import Box, axis_aligned_box, main_part, oriented_box
-from og_pointcloud.cloud import LabelledCloud
-from og_pointcloud.errors import OgPointcloudError
-from og_pointcloud.runtime import LabelledScene, SceneLike, load
+from og_pointcloud.runtime import LabelledScene, SceneLike, as_scene
 from og_pointcloud.words import Labels, TextFeatures, resolve_labels
 
 __all__ = ["EMPTY", "LABELLED", "NO_FEATURE", "Instance", "Instances", "as_scene", "instance_table"]
@@ -227,19 +225,6 @@ def instance_table(
             )
             for k in range(len(table))
         ]
-    )
-
-
-def as_scene(scene: SceneLike) -> LabelledScene:
-    """A scene that can be asked, of whatever names one."""
-    if isinstance(scene, LabelledScene):
-        return scene
-    if isinstance(scene, LabelledCloud):
-        return LabelledScene.from_cloud(scene)
-    if isinstance(scene, (str, os.PathLike)):
-        return load(scene)
-    raise OgPointcloudError(
-        f"scene is a {type(scene).__name__}; expected a loaded scene, a LabelledCloud or the path of a .ogpc file"
     )
 
 

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
     from og_pointcloud.instances import Instances
 
-__all__ = ["SCENE_VARIABLE", "LabelledScene", "SceneLike", "Segmenter", "load", "segment", "use"]
+__all__ = ["SCENE_VARIABLE", "LabelledScene", "SceneLike", "Segmenter", "as_scene", "load", "segment", "use"]
 
 SceneLike: TypeAlias = "LabelledScene | LabelledCloud | str | os.PathLike[str]"
 
@@ -230,7 +230,7 @@ def load(path: str | os.PathLike[str]) -> LabelledScene:
 def use(scene: SceneLike | None) -> LabelledScene | None:
     """Make a scene, or a .ogpc file, the one that ``segment`` asks when it is given none. None forgets it."""
     global _scene_in_use
-    _scene_in_use = None if scene is None else _as_scene(scene)
+    _scene_in_use = None if scene is None else as_scene(scene)
     return _scene_in_use
 
 
@@ -267,7 +267,7 @@ def segment(
     Warns where no point gets a label, and says why. Raises OgPointcloudError and its kinds: SceneError (no cloud),
     BundleError (no scene), FeatureSpaceError (vectors of another space or width).
     """
-    pcd = _as_scene(pcd) if _is_scene(pcd) else pcd
+    pcd = as_scene(pcd) if _is_scene(pcd) else pcd
     scene = _find_scene(pcd, scene)
     words, answers = _answers(scene, labels, text_features, templates, negatives)
     if pcd is scene and pose is None:
@@ -298,7 +298,7 @@ class Segmenter:
         templates: Sequence[str] | None = None,
         negatives: Labels = None,
     ) -> None:
-        self.scene = _as_scene(scene)
+        self.scene = as_scene(scene)
         self._words, self._answers = _answers(self.scene, labels, text_features, templates, negatives)
         self._warned = False
 
@@ -332,22 +332,23 @@ def _is_scene(pcd: Any) -> bool:
 
 def _find_scene(pcd: Any, scene: SceneLike | None) -> LabelledScene:
     if scene is not None:
-        return _as_scene(scene)
+        return as_scene(scene)
     if isinstance(pcd, LabelledScene):
         return pcd
     if (carried := carried_scene(pcd)) is not None:
-        return _as_scene(carried)
+        return as_scene(carried)
     if _scene_in_use is not None:
         return _scene_in_use
     if path := os.environ.get(SCENE_VARIABLE):
-        return _as_scene(path)
+        return as_scene(path)
     raise OgPointcloudError(
         "no scene to ask: pass scene=og.load('S.ogpc') (or its path), or call og.use('S.ogpc') once, or set "
         f"{SCENE_VARIABLE}, or segment a labelled cloud itself"
     )
 
 
-def _as_scene(source: SceneLike) -> LabelledScene:
+def as_scene(source: SceneLike) -> LabelledScene:
+    """A scene that can be asked, of whatever names one; the same again for a cloud or file that has not changed."""
     if isinstance(source, LabelledScene):
         return source
     if isinstance(source, LabelledCloud):

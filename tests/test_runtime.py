@@ -91,7 +91,7 @@ def test_answers_are_exact_on_tough_clouds(tmp_path, name):
 @pytest.mark.parametrize("name", [name for name in CLOUDS if "coincident" not in name and "one place" not in name])
 def test_a_point_of_the_cloud_finds_its_own_id(name):
     cloud = CLOUDS[name]
-    scene = runtime._as_scene(cloud)
+    scene = runtime.as_scene(cloud)
     assert (scene.instances_at(scene.xyz) == cloud.instance_ids).all()
     # The same through the cloud itself, which needs no lookup.
     words = {"a": np.ones(scene.cloud.instances.descriptors.shape[1] or 1)}
@@ -100,7 +100,7 @@ def test_a_point_of_the_cloud_finds_its_own_id(name):
 
 def test_of_coincident_points_the_first_answers():
     cloud = CLOUDS["coincident points of different ids"]
-    scene = runtime._as_scene(cloud)
+    scene = runtime.as_scene(cloud)
     first = {tuple(point): id for point, id in zip(cloud.xyz[::-1], cloud.instance_ids[::-1], strict=True)}
     expected = [first[tuple(point)] for point in cloud.xyz]
     assert scene.instances_at(scene.xyz).tolist() == expected
@@ -112,8 +112,8 @@ def test_metres_millimetres_and_map_coordinates_answer_alike(scene):
     metres = scene.instances_at(points)
     kilo = make_cloud(cloud.xyz * 1024, cloud.instance_ids, cloud.spacing * 1024, cloud.reach * 1024)
     shifted = replace(cloud, origin=np.array([2.0**20, -(2.0**22), 2.0**9]))
-    assert (runtime._as_scene(kilo).instances_at(points * 1024) == metres).all()
-    assert (runtime._as_scene(shifted).instances_at(points + shifted.origin) == metres).all()
+    assert (runtime.as_scene(kilo).instances_at(points * 1024) == metres).all()
+    assert (runtime.as_scene(shifted).instances_at(points + shifted.origin) == metres).all()
 
 
 def test_many_points_are_asked_in_runs(scene, monkeypatch):
@@ -328,7 +328,7 @@ def test_what_is_no_cloud(scene, pcd, says):
 
 @pytest.mark.parametrize("name", ["room", "far outliers"])  # the latter leaves all beyond its grid open
 def test_rows_with_nan_are_too_far_and_the_others_keep_their_answers(name):
-    scene = runtime._as_scene(CLOUDS[name])
+    scene = runtime.as_scene(CLOUDS[name])
     points = scene.xyz[:30].copy()
     expected = og.segment(points, ["apple", "pear"], scene)
     points[[3, 7, 9], [0, 1, 2]] = [np.nan, np.inf, 1e300]
@@ -504,7 +504,7 @@ def test_a_pose_takes_the_cloud_to_the_scenes_world(scene):
     assert same(result, og.segment(result.xyz, ["apple", "pear"], scene))
     assert same(result, og.Segmenter(scene, ["apple", "pear"])(sensor, POSE.tolist()))
     assert same(og.segment(scene, ["apple"], pose=np.eye(4)), og.segment(scene.xyz, ["apple"], scene))
-    shifted = runtime._as_scene(replace(scene.cloud, origin=np.array([1e6, -2e6, 5e5])))
+    shifted = runtime.as_scene(replace(scene.cloud, origin=np.array([1e6, -2e6, 5e5])))
     moved = np.eye(4)
     moved[:3, 3] = shifted.cloud.origin
     assert same(og.segment(world, ["apple"], shifted, pose=moved), og.segment(world, ["apple"], scene))
@@ -551,7 +551,7 @@ def test_noise_below_the_gap_between_objects_changes_no_label():
     random = np.random.default_rng(0)
     xyz = random.random((4000, 3)) * [1, 1, 0.01]
     xyz[:, 0] += np.where(xyz[:, 0] > 0.5, 0.2, 0)  # a gap of ten spacings
-    scene = runtime._as_scene(make_cloud(xyz, xyz[:, 0] > 0.6, 0.02, 0.08))
+    scene = runtime.as_scene(make_cloud(xyz, xyz[:, 0] > 0.6, 0.02, 0.08))
     noisy = xyz + random.uniform(-0.04, 0.04, xyz.shape)
     assert (scene.instances_at(noisy) == (noisy[:, 0] > 0.6)).all()
 
@@ -574,7 +574,7 @@ def test_distance_of_points_the_table_leaves_open_and_of_the_others(monkeypatch,
     monkeypatch.setattr(brick_grid, "LISTS_AT_LEAST", 50)
     monkeypatch.setattr(brick_grid, "LISTS_PER_POINT", 0)
     cloud = replace(CLOUDS[name])
-    scene = runtime._as_scene(cloud)
+    scene = runtime.as_scene(cloud)
     points = queries(cloud, 150)
     instances, distance = scene.look_up(points.astype(np.float64) + cloud.origin)
     assert (instances == instances_plainly(cloud, points)).all()

@@ -307,6 +307,62 @@ def test_a_carried_encoder_answers_and_is_read_only_when_asked(
     }
 
 
+@pytest.mark.filterwarnings("ignore:none of")
+def test_a_carried_encoder_answers_whoever_asks_the_scene(path, encoder_folder):
+    scene = og.load(path)
+    place = scene.xyz[np.flatnonzero(scene.instance_ids >= 0)[0]]
+    asks = (
+        lambda: og.segment(scene, ["apple", "cat"]),
+        lambda: og.Segmenter(scene, ["apple", "cat"]),
+        lambda: og.segment(scene, ["apple"], negatives=["cat"]),
+        lambda: og.select(scene, "cat"),
+        lambda: og.pick(scene, place).words(["cat"]),
+        lambda: og.pick(path, place).words(["cat"]),
+        lambda: og.instance_table(scene, ["cat"]),
+        lambda: og.segment(scene, ["apple"], templates=["a {}"]),
+    )
+    for ask in asks:
+        with pytest.raises(OgPointcloudError, match=rf"export-text-encoder MODEL_FOLDER --feature-space '{SPACE}'"):
+            ask()
+    carry_encoder(path, encoder_folder)
+    scene = og.load(path)
+    results = [ask() for ask in asks]
+    cat = encoder_for(SPACE, path)(["cat"])[0]
+    assert (results[0].labels == og.segment(scene, {"apple": 10 * unit_rows(5)[0], "cat": cat}).labels).all()
+    assert results[4] == results[5] == og.pick(scene, place).words({"cat": cat})
+    assert len(results[6]) == len(scene.instances)
+
+
+@pytest.mark.filterwarnings("ignore:none of")
+def test_templates_encode_every_word_anew(path, encoder_folder):
+    carry_encoder(path, encoder_folder)
+    scene, templates = og.load(path), ["a {}", "low {} cat"]
+    vectors = dict(zip(WORDS, encoder_for(SPACE, path)(WORDS, templates), strict=True))
+    for labels in (None, list(WORDS)):
+        ours, theirs = og.segment(scene, labels, templates=templates), og.segment(scene, vectors)
+        assert ours.names == WORDS
+        assert (ours.labels == theirs.labels).all()
+        assert (ours.scores == theirs.scores).all()
+    assert (ours.scores != og.segment(scene, list(WORDS)).scores).any()
+    ask = og.Segmenter(scene, list(WORDS), templates=templates, negatives={"x": np.ones(WIDTH)})
+    given = og.Segmenter(scene, vectors, negatives={"x": np.ones(WIDTH)})
+    assert (ask(scene.xyz).scores == given(scene.xyz).scores).all()
+    with pytest.raises(OgPointcloudError, match="templates are given with vectors"):
+        og.segment(scene, vectors, templates=templates)
+    with pytest.raises(OgPointcloudError, match="no place for the name"):
+        og.segment(scene, ["apple"], templates=["a photo"])
+    assert main(["segment", str(path), "--labels", "apple,cat", "--template", "a {}"]) == 0
+
+
+def test_a_scene_outlives_its_file(path, encoder_folder):
+    scene = og.load(path)
+    expected = og.segment(scene, ["apple"]).labels
+    path.unlink()
+    assert (og.segment(scene, ["apple"]).labels == expected).all()
+    with pytest.raises(OgPointcloudError, match="'cat' is not among the 5 known words"):
+        og.segment(scene, ["apple", "cat"])
+
+
 def test_the_writer_carries_an_encoder_too(encoder_folder, tmp_path, capsys):
     path = write_bundle(room(100), tmp_path / "s.ogpc", text_encoder=encoder_folder)
     assert encoder_for(SPACE, path)(["cat"]).shape == (1, WIDTH)

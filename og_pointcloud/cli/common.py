@@ -8,6 +8,7 @@ import json
 import os
 import shlex
 import time
+import zipfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib.util import find_spec
@@ -103,8 +104,11 @@ def require_room() -> None:
 
 def describe_fit(cloud: LabelledCloud, capture: Path, bundle: Path) -> dict[str, Any]:
     """What ``fit --json`` writes: counts, the file, and the provenance (stages, settings, what was left out)."""
+    from og_pointcloud.bundle import BANK
     from og_pointcloud.cloud import BACKGROUND, UNOBSERVED
 
+    with zipfile.ZipFile(bundle) as archive:  # writing may have found a word bank
+        calibrated = BANK in archive.namelist()
     ids = cloud.instance_ids
     return {
         "capture": str(capture),
@@ -117,6 +121,7 @@ def describe_fit(cloud: LabelledCloud, capture: Path, bundle: Path) -> dict[str,
         "points_unobserved": int((ids == UNOBSERVED).sum()),
         "feature_space": cloud.feature_space,
         "vocabulary": len(cloud.vocabulary.names) if cloud.vocabulary else 0,
+        "calibrated": calibrated,
         "seconds": round(sum(stage["seconds"] for stage in cloud.provenance["stages"]), 3),
         **cloud.provenance,
     }
@@ -132,6 +137,8 @@ def print_fit(report: Mapping[str, Any], cloud: LabelledCloud) -> None:
         f"{shares[2]:.1%} unobserved"
     )
     print(f"wrote {report['output']} ({report['bytes'] / 1e6:.1f} MB)")
+    if not report["calibrated"]:
+        print(f"no word bank: scores will be cosines. {calibration_hint(report['output'])}")
     print(f"next: {next_segment_command(report['output'], cloud)}")
 
 
@@ -143,6 +150,11 @@ def next_segment_command(bundle: str, cloud: LabelledCloud) -> str:
     else:
         labels = ["--text-features", f"{cloud.feature_space.replace('/', '_')}_names.npz"]
     return shlex.join([*command, *labels, "-o", str(Path(bundle).with_suffix(".ply"))])
+
+
+def names_in(text: str | None) -> list[str] | None:
+    """The names of an option like A,B,C; None where it is not given."""
+    return None if text is None else [name.strip() for name in text.split(",") if name.strip()]
 
 
 def calibration_hint(bundle: Path | str) -> str:

@@ -13,6 +13,7 @@ from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError
 from og_pointcloud.settings import FitSettings, PaperSettings
 
 if TYPE_CHECKING:
+    from og_pointcloud.choosing import WordBank
     from og_pointcloud.cloud import LabelledCloud, Vocabulary
     from og_pointcloud.scene import Scene
 
@@ -39,6 +40,11 @@ def add(commands: Any) -> None:
         "--vocabulary", type=Path, metavar="F.npz",
         help="text features whose names can then be asked (default: the capture's text_features.npz)",
     )  # fmt: skip
+    parser.add_argument(
+        "--word-bank", type=Path, metavar="F.npz",
+        help="text features of at least 50 everyday words, which labels are judged by (default: those of the feature "
+        "space's text encoder, if it is found)",
+    )  # fmt: skip
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="of everything random (default: %(default)s)")
     parser.add_argument(
         "--memory", type=memory, metavar="4GB",
@@ -63,7 +69,7 @@ def run(arguments: argparse.Namespace) -> None:
             "--ply": (arguments.ply, [".ply"]),
             "--json": (arguments.json, [".json"]),
         },
-        inputs=[arguments.capture, arguments.gaussians, arguments.vocabulary],
+        inputs=[arguments.capture, arguments.gaussians, arguments.vocabulary, arguments.word_bank],
     )
     settings = fit_settings(arguments)
     from og_pointcloud_export import write_bundle
@@ -75,6 +81,7 @@ def run(arguments: argparse.Namespace) -> None:
     with timed(stages, "read capture"):
         scene = read_capture(arguments.capture, gaussians=arguments.gaussians, mask_level=arguments.mask_level)
         vocabulary, left_out = vocabulary_for(scene, arguments)
+        bank = word_bank_for(scene, arguments.word_bank)
     work = arguments.work or arguments.output.with_name(f"{arguments.output.name}.work")
     try:
         cloud = labelled(scene, settings, arguments.tile_points, work)
@@ -84,7 +91,7 @@ def run(arguments: argparse.Namespace) -> None:
         raise
     stages += cloud.provenance["stages"]
     provenance = {**cloud.provenance, "stages": stages, "left_out": [*cloud.provenance["left_out"], *left_out]}
-    cloud = replace(cloud, vocabulary=vocabulary, provenance=provenance)
+    cloud = replace(cloud, vocabulary=vocabulary, word_bank=bank, provenance=provenance)
     with timed(stages, "write file"):
         arguments.output.parent.mkdir(parents=True, exist_ok=True)
         write_bundle(cloud, arguments.output)
@@ -159,6 +166,27 @@ def vocabulary_for(scene: Scene, arguments: argparse.Namespace) -> tuple[Vocabul
     if arguments.vocabulary:
         raise FeatureSpaceError(why)
     return None, [{"what": "vocabulary", "why": why}]
+
+
+def word_bank_for(scene: Scene, path: Path | None) -> WordBank | None:
+    """The bank asked for, else that of the encoder that is found for the scene, if any; checked before the fit."""
+    from og_pointcloud.text_encoder import find_encoder
+    from og_pointcloud.text_features import UNKNOWN_SPACE
+    from og_pointcloud.vocabulary import read_bank
+
+    if path is not None:
+        bank, feature_space = read_bank(path)
+    elif (encoder := find_encoder(scene.feature_space)) and encoder.word_bank:
+        path, bank, feature_space = Path(encoder.where), encoder.word_bank, encoder.feature_space
+    else:
+        return None
+    width, spaces = bank.vectors.shape[1], {feature_space, scene.feature_space}
+    if (len(spaces) > 1 and UNKNOWN_SPACE not in spaces) or width != (scene.feature_width or width):
+        raise FeatureSpaceError(
+            f"{path} is of feature space '{feature_space}' (width {width}), the masks are of '{scene.feature_space}' "
+            f"(width {scene.feature_width}): encode the words with the masks' model"
+        )
+    return bank
 
 
 def write_cloud(cloud: LabelledCloud, bundle: Path, path: Path) -> None:

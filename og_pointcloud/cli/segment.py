@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from og_pointcloud.cli.common import SHOWN, add_command, check_outputs, print_table, timed
+from og_pointcloud.cli.common import SHOWN, add_command, calibration_hint, check_outputs, names_in, print_table, timed
 
 if TYPE_CHECKING:
     from og_pointcloud.segmentation import Segmentation
@@ -23,6 +23,11 @@ def add(commands: Any) -> None:
     parser.add_argument("bundle", type=Path, metavar="S.ogpc", help="what `fit` wrote")
     parser.add_argument("--labels", metavar="A,B,C", help="names to choose among (default: all that are known)")
     parser.add_argument("--text-features", type=Path, metavar="F.npz", help="names and vectors, from the same encoder")
+    parser.add_argument(
+        "--template", action="append", metavar="TEXT",
+        help="what names are put into, such as 'a photo of a {}'; several are averaged; needs the text encoder",
+    )  # fmt: skip
+    parser.add_argument("--negatives", metavar="A,B,C", help="names too, but points that they fit better are unknown")
     parser.add_argument("--points", type=Path, metavar="CLOUD", help="points to label (default: those fitted)")
     parser.add_argument("-o", "--output", type=Path, metavar="OUT", help="labels as .npz, or a coloured .ply")
     parser.add_argument("--json", action="store_true", help="print the counts as JSON")
@@ -35,14 +40,18 @@ def run(arguments: argparse.Namespace) -> None:
     )
     from og_pointcloud.runtime import load, segment
 
-    labels = (
-        None if arguments.labels is None else [name.strip() for name in arguments.labels.split(",") if name.strip()]
-    )
     stages: list[dict[str, Any]] = []
     with timed(stages, "load"):
         scene = load(arguments.bundle)
     with timed(stages, "segment"):
-        result = segment(arguments.points or scene, labels, scene=scene, text_features=arguments.text_features)
+        result = segment(
+            arguments.points or scene,
+            names_in(arguments.labels),
+            scene=scene,
+            text_features=arguments.text_features,
+            templates=arguments.template,
+            negatives=names_in(arguments.negatives),
+        )
     if arguments.output:
         with timed(stages, "save"):
             arguments.output.parent.mkdir(parents=True, exist_ok=True)
@@ -58,20 +67,14 @@ def describe_segmentation(
     result: Segmentation, stages: Sequence[Mapping[str, Any]], bundle: Path, output: Path | None
 ) -> dict[str, Any]:
     """What ``segment --json`` prints: points of each name, and why the others are unknown."""
-    from og_pointcloud.bundle import TOO_FAR
-    from og_pointcloud.cloud import BACKGROUND, UNOBSERVED
-
-    unknown = result.labels < 0
-    states = {"background": BACKGROUND, "unobserved": UNOBSERVED, "too far from the scene": TOO_FAR}
-    reasons = {name: int((result.instances == state).sum()) for name, state in states.items()}
-    reasons["instance without a feature"] = int((unknown & (result.instances >= 0)).sum())
     return {
         "bundle": str(bundle),
         "output": str(output) if output else None,
         "points": len(result),
         "counts": result.counts(),
-        "unknown": int(unknown.sum()),
-        "unknown_because": reasons,
+        "unknown": int((result.labels < 0).sum()),
+        "unknown_because": {str(reason): count for reason, count in result.unknown_because().items()},
+        "calibrated": result.calibrated,
         "seconds": {stage["name"]: stage["seconds"] for stage in stages},
     }
 
@@ -86,9 +89,14 @@ def print_segmentation(report: Mapping[str, Any]) -> None:
     absent = [name for name in report["counts"] if name not in found]
     if absent:
         print(f"no point: {', '.join(absent[:SHOWN])}{', ...' if len(absent) > SHOWN else ''}")
-    reasons = [f"{count:,} {name}" for name, count in report["unknown_because"].items() if count]
+    reasons = [f"{count:,} {reason}" for reason, count in report["unknown_because"].items()]
     if reasons:
         print(f"unknown: {', '.join(reasons)}")
+    if not report["calibrated"]:
+        print(
+            "not calibrated: every instance gets its best label, however badly it fits. "
+            f"{calibration_hint(report['bundle'])}"
+        )
     print(", ".join(f"{name} {seconds:.2f} s" for name, seconds in report["seconds"].items()))
     if report["output"]:
         print(f"wrote {report['output']}")

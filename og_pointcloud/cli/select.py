@@ -7,12 +7,12 @@ import shlex
 from pathlib import Path
 from typing import Any
 
-from og_pointcloud.cli.common import add_command
+from og_pointcloud.cli.common import add_command, calibration_hint, names_in
 
 
 def add(commands: Any) -> None:
     parser = add_command(
-        commands, "select", run, "Rank the instances by a word, and say which it fits better than other words do.",
+        commands, "select", run, "Rank the instances by a word, and say which it fits.",
         'og-pointcloud select kitchen.ogpc "red mug"',
     )  # fmt: skip
     parser.add_argument("bundle", type=Path, metavar="S.ogpc", help="what `fit` wrote")
@@ -27,8 +27,7 @@ def add(commands: Any) -> None:
 def run(arguments: argparse.Namespace) -> None:
     from og_pointcloud.selecting import select
 
-    rivals = arguments.against
-    against = None if rivals is None else [name.strip() for name in rivals.split(",") if name.strip()]
+    against = names_in(arguments.against)
     selection = select(arguments.bundle, arguments.text, against=against, text_features=arguments.text_features)
     if arguments.json:
         print(selection.to_json())
@@ -36,6 +35,8 @@ def run(arguments: argparse.Namespace) -> None:
     print(selection)
     if selection.unknown:
         print(f"{selection.unknown} instances have no feature that a word could be compared with")
+    if not selection.calibrated:
+        print(f"not calibrated: scores are cosines. {calibration_hint(arguments.bundle)}")
     if selection.fitting:
         command = ["og-pointcloud", "edit", "extract", str(arguments.bundle), "--word", arguments.text]
         print(f"next: {shlex.join([*command, '-o', 'selected.ply'])}")
