@@ -46,8 +46,9 @@ class Instance:
     id: in the scene's table. point_indices: (n,) int64, its points in the scene, ascending.
     views, masks: how many saw it and how many are joined in it. agreement: mean cosine of its masks' features with
     their descriptor, -1 to 1. visible_area: pixels that its masks put on it, over all views. part_of: the instance
-    that it is a part of, -1 none. state: "labelled", "no feature" or "empty". words: (word, score), best first; a score
-    is the probability that the instance is what the word says, where the scene has a word bank, else a cosine.
+    that it is a part of, -1 none. coarse: the codebook's coarse cluster that it lies in, -1 none.
+    state: "labelled", "no feature" or "empty". words: (word, score), best first; a score is the probability that the
+    instance is what the word says, where the scene has a word bank, else a cosine.
     """
 
     id: int
@@ -57,6 +58,7 @@ class Instance:
     agreement: float
     visible_area: float
     part_of: int
+    coarse: int
     state: str
     words: tuple[tuple[str, float], ...]
     _scene: LabelledScene = field(repr=False)
@@ -113,6 +115,7 @@ class Instance:
             "agreement": self.agreement,
             "visible_area": self.visible_area,
             "part_of": self.part_of,
+            "coarse": self.coarse,
             "centroid": None if self.centroid is None else self.centroid.tolist(),
             "axis_aligned_box": None
             if aligned is None
@@ -218,6 +221,7 @@ def instance_table(
                 agreement=float(table.agreement[k]),
                 visible_area=float(table.visible_area[k]),
                 part_of=int(table.whole[k]),
+                coarse=int(table.coarse[k]),
                 state=EMPTY if bounds[k] == bounds[k + 1] else LABELLED if described[k] else NO_FEATURE,
                 words=best[k] if described[k] else (),
                 _scene=scene,

@@ -20,6 +20,8 @@ from og_pointcloud_room.masks import MaskNoise, propose_masks  # noqa: E402
 from og_pointcloud_room.room import furnish  # noqa: E402
 from scipy import sparse  # noqa: E402
 
+from og_pointcloud.bundle import read_bundle  # noqa: E402
+
 SMALL = CaptureSettings(views=8, width=160, height=120, samples_per_view=4000)
 
 
@@ -30,6 +32,7 @@ def capture():
 
 def _digest(capture):
     arrays = [capture.xyz, capture.rgb, capture.cls, capture.instance, capture.background, capture.text_vectors]
+    arrays += [capture.bank_vectors, capture.absent_vectors]
     arrays += [*capture.masks, *capture.mask_features, *(frame.image for frame in capture.frames)]
     return hashlib.sha256(b"".join(np.ascontiguousarray(array).tobytes() for array in arrays)).hexdigest()
 
@@ -281,6 +284,17 @@ def test_views_of_one_object_look_alike():
     assert (views[0] @ views[0].T)[np.triu_indices(50, 1)].mean() > (views[0] @ views[1].T).mean() + 0.08
 
 
+def test_other_words_are_like_the_classes_words_and_like_no_image():
+    rng = np.random.default_rng(2)
+    model = FeatureModel(17, rng)
+    words = model.words(200, rng)
+    images = np.stack([model.image(row % 17, model.object_look(rng), rng) for row in range(100)])
+    assert np.linalg.norm(words, axis=1) == pytest.approx(1, abs=1e-5)
+    assert (words @ words.T)[~np.eye(200, dtype=bool)].mean() == pytest.approx(0.74, abs=0.01)
+    assert (words @ model.texts.T).mean() == pytest.approx(0.74, abs=0.01)
+    assert (images @ words.T).mean() == pytest.approx(0.18, abs=0.015)
+
+
 # The baselines --------------------------------------------------------------------------------------------------
 
 TEXTS = np.eye(2)
@@ -367,4 +381,10 @@ def test_demo_runs_the_whole_road_on_a_coarse_room(tmp_path, monkeypatch, capsys
     assert ours.points == uplift.points == best.points
     printed = capsys.readouterr().out
     assert f"{ours.miou:.4f}" in printed
+    uplift_called, ours_called, best_called = (method.absent_called for method in result.methods)
+    assert ours_called < 0.25 < best_called < uplift_called
+    assert f"{ours_called:.4f}" in printed
+    bank = np.load(tmp_path / "capture" / "word_bank.npz")
+    assert bank["vectors"].shape == (800, 512)
+    assert len(read_bundle(result.bundle).cloud.word_bank.vectors) == 800
     assert f"{result.share_of_the_way:.1%} of the way" in printed

@@ -2,7 +2,7 @@
 
 The folder: ``images/`` . ``transforms.json`` (nerfstudio: camera-to-world, OpenGL axes) . ``points.ply`` (a fused
 cloud from noisy depth) . ``masks/<stem>.png`` (uint16, 0 none, ids local to the image) . ``mask_features.npz`` .
-``text_features.npz`` . ``gt.npz`` (for scoring alone).
+``text_features.npz`` . ``word_bank.npz`` . ``gt.npz`` (for scoring alone).
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ Random = np.random.Generator
 FLYING = -2
 """Source of a sample that lies on no surface: interpolated across a depth edge, or an outlier."""
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+BANK_WORDS, ABSENT_WORDS = 800, 50
 
 
 @dataclass(frozen=True)
@@ -61,7 +62,8 @@ class RoomCapture:
     masks: per view (H, W) uint16. mask_features: per view (M, 512) float32. xyz (n, 3) float32 metres, rgb (n, 3)
     uint8. cls, instance: (n,) int32 class and object of each point, -1 where it has none; background: (n,) bool, on
     walls, floor or ceiling. Where ``cls`` is -1 and ``background`` false the truth is ambiguous: a flying pixel, an
-    outlier, or noise that carried the point over to another surface.
+    outlier, or noise that carried the point over to another surface. bank_vectors (800, 512), absent_vectors (50, 512)
+    float32: words that nothing in the room is, the first for judging labels by, the second for asking.
     """
 
     room: Room
@@ -75,6 +77,8 @@ class RoomCapture:
     cls: NDArray[np.int32]
     instance: NDArray[np.int32]
     background: NDArray[np.bool_]
+    bank_vectors: NDArray[np.float32]
+    absent_vectors: NDArray[np.float32]
 
     @property
     def mask_instance(self) -> NDArray[np.int32]:
@@ -88,8 +92,8 @@ def make_capture(seed: int = 0, settings: CaptureSettings | None = None) -> Room
     """Furnish, walk, sense, mask and describe: the same seed and settings give the same arrays."""
     settings = settings or CaptureSettings()
     noise = MaskNoise().scaled(settings.mask_noise)
-    streams = [np.random.default_rng([seed, stream]) for stream in range(1, 6)]
-    path_rng, cloud_rng, mask_rng, feature_rng, texture_rng = streams
+    streams = [np.random.default_rng([seed, stream]) for stream in range(1, 7)]
+    path_rng, cloud_rng, mask_rng, feature_rng, texture_rng, word_rng = streams
     room = furnish(seed)
     caster = RayCaster(room, texture_rng)
     intrinsics = Intrinsics(settings.width, settings.height, 0.82 * settings.width)
@@ -105,7 +109,11 @@ def make_capture(seed: int = 0, settings: CaptureSettings | None = None) -> Room
         for ids, frame in zip(masks, frames, strict=True)
     )
     cls = np.where(instance >= 0, class_of_object[instance], -1).astype(np.int32)
-    return RoomCapture(room, intrinsics, frames, masks, features, model.texts, xyz, rgb, cls, instance, background)
+    words = model.words(BANK_WORDS + ABSENT_WORDS, word_rng)
+    return RoomCapture(
+        room, intrinsics, frames, masks, features, model.texts, xyz, rgb, cls, instance, background,
+        words[:BANK_WORDS], words[BANK_WORDS:],
+    )  # fmt: skip
 
 
 # The camera's path ----------------------------------------------------------------------------------------------
@@ -251,6 +259,8 @@ def write_capture(capture: RoomCapture, folder: Path) -> Path:
     names = np.array(CLASS_NAMES)
     np.savez(folder / "mask_features.npz", **rows, **space)
     np.savez(folder / "text_features.npz", names=names, vectors=capture.text_vectors, **space)
+    bank_names = np.array([f"word {number}" for number in range(BANK_WORDS)])
+    np.savez(folder / "word_bank.npz", names=bank_names, vectors=capture.bank_vectors.astype(np.float16), **space)
     truth: dict[str, Any] = {"cls": capture.cls, "instance": capture.instance, "background": capture.background}
     np.savez(folder / "gt.npz", names=names, **truth)
     return folder

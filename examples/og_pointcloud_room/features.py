@@ -9,6 +9,8 @@ the means of the two modalities lie 0.95 apart. With orthonormal directions T (a
 
 The noise has three parts: what views of one object share, what is new in each mask, and a part that points at other
 classes, which makes single masks err while the mean over the views of an object seldom does.
+
+The encoder knows other words too: of the same form, with a random direction in place of u_c.
 """
 
 from __future__ import annotations
@@ -42,10 +44,17 @@ class FeatureModel:
         self._text_class_weight = np.sqrt(1 - TEXT_TEXT)
         self._image_class_weight = (MATCHED - UNMATCHED) / self._text_class_weight
         self._confusion = CONFUSION / self._text_class_weight
+        self._text_common = text_weight * text_common
         spent = IMAGE_IMAGE + self._image_class_weight**2 + classes * self._confusion**2
         self._noise_weight = np.sqrt(1 - spent)
-        texts = text_weight * text_common + self._text_class_weight * self._class_directions
-        self.texts = texts.astype(np.float32)
+        self.texts = (self._text_common + self._text_class_weight * self._class_directions).astype(np.float32)
+
+    def words(self, count: int, rng: np.random.Generator) -> NDArray[np.float32]:
+        """(count, 512) unit rows: texts that no class is."""
+        own = rng.normal(size=(count, WIDTH))
+        own -= np.outer(own @ self._text_common, self._text_common) / TEXT_TEXT
+        own /= np.linalg.norm(own, axis=1, keepdims=True)
+        return (self._text_common + self._text_class_weight * own).astype(np.float32)
 
     def object_look(self, rng: np.random.Generator) -> NDArray[np.float64]:
         """(512,) the part of the noise that all views of one object share."""
