@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from og_pointcloud.vocabulary import everyday_words
 from og_pointcloud_room.features import FEATURE_SPACE, FeatureModel
 from og_pointcloud_room.furniture import CLASS_NAMES
 from og_pointcloud_room.masks import MaskNoise, propose_masks
@@ -28,7 +29,7 @@ Random = np.random.Generator
 FLYING = -2
 """Source of a sample that lies on no surface: interpolated across a depth edge, or an outlier."""
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
-BANK_WORDS, ABSENT_WORDS = 800, 50
+ABSENT_WORDS = 50
 
 
 @dataclass(frozen=True)
@@ -62,8 +63,8 @@ class RoomCapture:
     masks: per view (H, W) uint16. mask_features: per view (M, 512) float32. xyz (n, 3) float32 metres, rgb (n, 3)
     uint8. cls, instance: (n,) int32 class and object of each point, -1 where it has none; background: (n,) bool, on
     walls, floor or ceiling. Where ``cls`` is -1 and ``background`` false the truth is ambiguous: a flying pixel, an
-    outlier, or noise that carried the point over to another surface. bank_vectors (800, 512), absent_vectors (50, 512)
-    float32: words that nothing in the room is, the first for judging labels by, the second for asking.
+    outlier, or noise that carried the point over to another surface. bank_vectors: (B, 512) float32, our everyday
+    words, those of the room's things among them; absent_vectors: (50, 512) float32, words that nothing in it is.
     """
 
     room: Room
@@ -109,10 +110,14 @@ def make_capture(seed: int = 0, settings: CaptureSettings | None = None) -> Room
         for ids, frame in zip(masks, frames, strict=True)
     )
     cls = np.where(instance >= 0, class_of_object[instance], -1).astype(np.int32)
-    words = model.words(BANK_WORDS + ABSENT_WORDS, word_rng)
+    everyday = everyday_words()
+    bank = model.words(len(everyday), word_rng)
+    for name, vector in zip(CLASS_NAMES, model.texts, strict=True):
+        if name in everyday:
+            bank[everyday.index(name)] = vector
     return RoomCapture(
         room, intrinsics, frames, masks, features, model.texts, xyz, rgb, cls, instance, background,
-        words[:BANK_WORDS], words[BANK_WORDS:],
+        bank, model.words(ABSENT_WORDS, word_rng),
     )  # fmt: skip
 
 
@@ -259,8 +264,8 @@ def write_capture(capture: RoomCapture, folder: Path) -> Path:
     names = np.array(CLASS_NAMES)
     np.savez(folder / "mask_features.npz", **rows, **space)
     np.savez(folder / "text_features.npz", names=names, vectors=capture.text_vectors, **space)
-    bank_names = np.array([f"word {number}" for number in range(BANK_WORDS)])
-    np.savez(folder / "word_bank.npz", names=bank_names, vectors=capture.bank_vectors.astype(np.float16), **space)
+    everyday = np.array(everyday_words())
+    np.savez(folder / "word_bank.npz", names=everyday, vectors=capture.bank_vectors.astype(np.float16), **space)
     truth: dict[str, Any] = {"cls": capture.cls, "instance": capture.instance, "background": capture.background}
     np.savez(folder / "gt.npz", names=names, **truth)
     return folder
