@@ -41,7 +41,8 @@ __all__ = [
 ]  # fmt: skip
 
 FORMAT = "ogpc"
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
+"""Raised when files of before cannot be asked any more: 2 is the graph that settles points at borders itself."""
 TOO_FAR = -3
 """Instance answered for a query point with no cloud point within reach."""
 ON_SURFACE, NEAR, BEYOND = 0, 1, 2
@@ -59,7 +60,7 @@ QUERY_OPERATORS = frozenset({
     "ReduceL2", "ReduceMax", "ReduceSum", "Reshape", "ScatterElements", "Shape", "Slice", "Split", "Sub",
     "Transpose", "Unsqueeze", "Where",
 })  # fmt: skip
-"""What a query.onnx is made of, now or before: arithmetic and look-ups, nothing that repeats or branches."""
+"""What a query.onnx is made of: arithmetic and look-ups, nothing that repeats or branches."""
 REBUILD = "write the file again with write_bundle"
 BANK = "bank/vectors.npy"
 CARRIED_ENCODER = "text_encoder/"
@@ -174,6 +175,11 @@ def _manifest(members: dict[str, bytes]) -> dict[str, Any]:
     schema = manifest.get("schema_version")
     if not isinstance(schema, int) or schema < 1:
         raise _Refused(f"schema_version is {schema!r}; expected a whole number from 1: {REBUILD}")
+    if schema < SCHEMA_VERSION:
+        raise _Refused(
+            f"schema_version is {schema}, written by an older version of this library; this one reads "
+            f"{SCHEMA_VERSION}: fit the capture again (og-pointcloud fit CAPTURE -o S.ogpc)"
+        )
     if schema > SCHEMA_VERSION:
         raise _Refused(
             f"schema_version is {schema}, newer than the {SCHEMA_VERSION} that this library reads: "
@@ -242,10 +248,6 @@ def _instances(manifest: dict[str, Any], members: dict[str, bytes], count: int) 
     def column(name: str, dtype: str, length: int = count) -> NDArray[Any]:
         return _array(members, f"arrays/instances/{name}.npy", (dtype,), (length,))
 
-    def hierarchy(name: str) -> NDArray[np.int32]:
-        """Files from before there was one have none."""
-        return column(name, "<i4") if f"arrays/instances/{name}.npy" in members else np.zeros(0, np.int32)
-
     return InstanceTable(
         descriptors=descriptors,
         descriptor_instance=column("descriptor_instance", "<i4", len(descriptors)),
@@ -254,8 +256,8 @@ def _instances(manifest: dict[str, Any], members: dict[str, bytes], count: int) 
         masks=column("masks", "<i4"),
         agreement=column("agreement", "<f4"),
         visible_area=column("visible_area", "<f4"),
-        coarse=hierarchy("coarse"),
-        whole=hierarchy("whole"),
+        coarse=column("coarse", "<i4"),
+        whole=column("whole", "<i4"),
     )
 
 

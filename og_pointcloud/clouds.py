@@ -23,8 +23,8 @@ SCENE_FIELD = "og_pointcloud_scene"
 def world_points(pcd: Any) -> NDArray[np.float64]:
     """(N, 3) float64 world coordinates of a cloud; rows may be NaN.
 
-    pcd: an array of shape (N, 3); an Open3D point cloud, legacy or tensor; a PyVista dataset; a trimesh cloud or mesh;
-    or the path of a geometry file. SceneError for anything else.
+    pcd: an array of shape (N, 3); an Open3D point cloud or mesh, legacy or tensor; a PyVista dataset; a trimesh cloud
+    or mesh; or the path of a geometry file. A mesh's points are its vertices. SceneError for anything else.
     """
     if isinstance(pcd, (str, os.PathLike)):
         from og_pointcloud.formats.points import read_points
@@ -33,11 +33,12 @@ def world_points(pcd: Any) -> NDArray[np.float64]:
     host = _host(pcd)
     if host == "open3d" and hasattr(pcd, "points"):
         values = pcd.points
-    elif host == "open3d" and hasattr(pcd, "point"):
-        values = pcd.point["positions"].cpu().numpy() if "positions" in pcd.point else np.zeros((0, 3))
+    elif host == "open3d" and (hasattr(pcd, "point") or hasattr(pcd, "vertex")):
+        tensors = pcd.point if hasattr(pcd, "point") else pcd.vertex
+        values = tensors["positions"].cpu().numpy() if "positions" in tensors else np.zeros((0, 3))
     elif host == "pyvista" and hasattr(pcd, "points"):
         values = pcd.points
-    elif host == "trimesh" and hasattr(pcd, "vertices"):
+    elif host in ("open3d", "trimesh") and hasattr(pcd, "vertices"):
         values = pcd.vertices
     elif host is None:
         values = pcd

@@ -251,8 +251,8 @@ def segment(
     one without answers the label with the largest cosine. The result says which (``calibrated``), and why a point is
     unknown (``reasons``).
 
-    pcd: an array (N, 3) of world coordinates, an Open3D, PyVista or trimesh cloud, a geometry file; or a scene, a
-        LabelledCloud or a .ogpc file, whose own points are then labelled. Rows with NaN answer unknown.
+    pcd: an array (N, 3) of world coordinates, a cloud or mesh of Open3D, PyVista or trimesh, a geometry file; or a
+        scene, a LabelledCloud or a .ogpc file, whose own points are then labelled. Rows with NaN answer unknown.
     labels: words, found in text_features or in the scene's vocabulary (None: all of them), or encoded, if the scene's
         text encoder is found; or name -> vector (D,).
     scene: what to ask. Left out: the scene that the cloud is or carries, else that of ``use``, else the file that the

@@ -113,7 +113,7 @@ def test_the_same_cloud_gives_the_same_bytes(tmp_path):
 
 def test_manifest_says_what_is_inside(bundle_file):
     manifest = read_bundle(bundle_file).manifest
-    assert (manifest["format"], manifest["schema_version"]) == ("ogpc", 1)
+    assert (manifest["format"], manifest["schema_version"]) == ("ogpc", 2)
     assert manifest["counts"] == {"points": 500, "instances": 9, "descriptors": 9, "words": 5}
     assert manifest["parity"]["instance_score_error"] < 1e-6
     assert manifest["parity"]["certain_points_wrong"] == 0
@@ -202,9 +202,16 @@ def test_a_changed_member_with_a_right_crc_is_found_by_its_digest(tmp_path, bund
     refuse(path, "sha256", verify_sha256=True)
 
 
-def test_a_newer_schema_names_the_cure(tmp_path, bundle_file):
-    path = changed(bundle_file, tmp_path / "s.ogpc", lambda manifest, _: manifest.update(schema_version=2))
-    refuse(path, "schema_version is 2, newer than the 1.*pip install --upgrade")
+@pytest.mark.parametrize(
+    ("version", "says"),
+    [
+        (3, "schema_version is 3, newer than the 2.*pip install --upgrade"),
+        (1, r"schema_version is 1, written by an older version.*fit the capture again \(og-pointcloud fit CAPTURE"),
+    ],
+)
+def test_another_schema_names_the_cure(tmp_path, bundle_file, version, says):
+    path = changed(bundle_file, tmp_path / "s.ogpc", lambda manifest, _: manifest.update(schema_version=version))
+    refuse(path, says)
 
 
 @pytest.mark.parametrize(

@@ -246,6 +246,8 @@ def test_clouds_of_other_libraries_are_read_without_importing_them(scene, monkey
         host("open3d.cpu.pybind.t.geometry", point={"positions": points.view(Tensor)}),
         host("pyvista.core.pointset", points=points, field_data={}),
         host("trimesh.points", vertices=points),
+        host("open3d.cpu.pybind.geometry", vertices=points.tolist()),
+        host("open3d.cpu.pybind.t.geometry", vertex={"positions": points.view(Tensor)}),
         points.tolist(),
         points[::-1][::-1],
     ]
@@ -266,8 +268,13 @@ def test_real_open3d_clouds(scene):
     legacy = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points))
     for cloud in (legacy, open3d.t.geometry.PointCloud(open3d.core.Tensor(points)), expected.to_open3d()):
         assert (og.segment(cloud, ["apple", "pear"], scene).labels == expected.labels).all()
-    with pytest.warns(UserWarning, match="0 points"):
-        assert len(og.segment(open3d.t.geometry.PointCloud(), ["apple"], scene)) == 0
+    vertices, triangles = open3d.utility.Vector3dVector(points), open3d.utility.Vector3iVector(np.array([[0, 1, 2]]))
+    mesh = open3d.geometry.TriangleMesh(vertices, triangles)
+    for cloud in (mesh, open3d.t.geometry.TriangleMesh.from_legacy(mesh, vertex_dtype=open3d.core.float64)):
+        assert (og.segment(cloud, ["apple", "pear"], scene).labels == expected.labels).all()
+    for empty in (open3d.t.geometry.PointCloud(), open3d.t.geometry.TriangleMesh(), open3d.geometry.TriangleMesh()):
+        with pytest.warns(UserWarning, match="0 points"):
+            assert len(og.segment(empty, ["apple"], scene)) == 0
 
 
 def test_open3d_result(scene):
