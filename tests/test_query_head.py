@@ -24,6 +24,7 @@ from labelled_clouds import (
 from og_pointcloud_export import brick_grid, writer
 from og_pointcloud_export.brick_grid import GridSettings, build_brick_grid
 from og_pointcloud_export.query_head import ScoreHead, build_query_head, reference_scores
+from test_choosing import Made
 
 import og_pointcloud as og
 from og_pointcloud._onnx_graph import check_graph
@@ -310,6 +311,27 @@ def test_the_documented_program_answers_like_the_library(tmp_path, monkeypatch):
     assert names["labels"].tolist()[:2] != [-1, -1]
     assert names["labels"][2] == -1
     assert names["instance"].tolist()[2] == TOO_FAR
+
+
+def test_the_documented_program_of_probabilities_answers_like_the_library(tmp_path, monkeypatch):
+    made = Made(9, owners=[0, 0, 1, 2, 3, 5, 6, 7, 8])
+    cloud = replace(CLOUDS["room"], instances=made.table, word_bank=made.bank, vocabulary=None)
+    writer.write_bundle(cloud, tmp_path / "scene.ogpc")
+    monkeypatch.chdir(tmp_path)
+    page = (Path(__file__).resolve().parents[1] / "docs" / "query_onnx.md").read_text()
+    program = "".join(part.split("```")[0] for part in page.split("```python\n")[1:])
+    texts = made.texts[[0, 2, 3, 6, 30, 31]]
+    asked = program.replace(
+        "text = np.eye(3, width, dtype=np.float32)", f"text = np.array({texts.tolist()}, np.float32)"
+    )
+    asked = asked.replace("points = np.array(", "points = np.array(near + ")
+    names = {"near": queries(cloud, 100).astype(np.float64).tolist()}
+    exec(asked, names)
+    result = og.segment(names["points"], dict(zip("abcdef", texts, strict=True)), tmp_path / "scene.ogpc")
+    assert result.calibrated
+    assert set(result.labels) == {-1, 0, 1, 2, 3}
+    assert names["labels"].tolist() == result.labels.tolist()
+    np.testing.assert_allclose(names["scores"], result.scores, atol=1e-5)
 
 
 HEADS = [ScoreHead(), ScoreHead(4, True, "int8"), ScoreHead(4, precision="float16")]
