@@ -14,6 +14,7 @@ import pytest
 import test_choosing
 from labelled_clouds import SPACE, TOO_FAR, queries, room
 from og_pointcloud_export import write_bundle
+from score_captures import score_of
 from test_choosing import Made, unit
 
 import og_pointcloud as og
@@ -22,6 +23,7 @@ from og_pointcloud.cli import main
 from og_pointcloud.cloud import BACKGROUND, UNOBSERVED, Vocabulary
 from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError
 
+DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 OWNERS = [0, 0, 1, 2, 3, 5, 6, 7, 8]
 SHOWN = tuple(f"shown {row}" for row in range(9))
 ABSENT = tuple(f"absent {row}" for row in range(50))
@@ -337,4 +339,36 @@ def test_a_bank_that_is_added_calibrates(plain, made, tmp_path, capsys):
 
 # Recorded captures
 
-DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+RECORDED = {"nuscenes_frame": 0.55, "apc_shelf_B": 0.93}
+
+
+@pytest.mark.skipif(not DATA.is_dir(), reason="the recorded captures are absent")
+@pytest.mark.parametrize("name", RECORDED)
+def test_recorded_captures_keep_their_labels_and_give_absent_words_hardly_a_point(name, tmp_path, capsys):
+    words = np.load(DATA / "clip" / "text_vitb32.npz")
+    names = np.concatenate([words["oid_names"], words["o365_names"]])
+    vectors = np.concatenate([words["oid_text"], words["o365_text"]])
+    first = np.unique(names, return_index=True)[1]
+    asked, space = og.read_text_features(DATA / name / "text_features.npz")
+    np.savez(tmp_path / "words.npz", names=names[first], vectors=vectors[first], feature_space=space)
+    arguments = ("fit", DATA / name, "-o", tmp_path / "s.ogpc", "--word-bank", tmp_path / "words.npz")
+    assert run(capsys, *arguments)[0] == 0
+    scene = og.load(tmp_path / "s.ogpc")
+    bare = og.LabelledScene(replace(scene._bundle, cloud=replace(scene.cloud, word_bank=None)))
+    judged, plain = og.segment(scene), og.segment(bare)
+    assert judged.calibrated
+    assert not plain.calibrated
+    assert score_of(judged.labels, judged.names, DATA / name).miou > RECORDED[name]
+    np.testing.assert_array_equal(judged.labels, plain.labels)
+    of_instance = scene.instance_ids >= 0
+    present = np.unique(judged.labels[judged.labels >= 0])
+    middle = scene.cloud.word_bank.mean
+    related = unit(unit(words["lvis_text"]) - middle) @ unit(unit(asked.vectors[present]) - middle).T
+    pool = words["lvis_text"][related.max(axis=1) < 0.5]
+    called = []
+    for seed in range(10):
+        rows = np.random.default_rng(seed).choice(len(pool), 50, replace=False)
+        absent = {str(row): pool[row] for row in rows}
+        assert (og.segment(bare, absent).labels[of_instance] >= 0).all()
+        called.append((quietly(scene, absent).labels[of_instance] >= 0).mean())
+    assert np.mean(called) < 0.05

@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from conftest import write_tiny_capture
 from labelled_clouds import SPACE, WIDTH, WORDS, instance_table, room, unit_rows
 from og_pointcloud_export import write_bundle
 from og_pointcloud_export.query_head import reference_scores
@@ -46,6 +47,10 @@ def path(bundle_file, tmp_path):
 def members_of(path):
     with zipfile.ZipFile(path) as archive:
         return {name: archive.read(name) for name in archive.namelist()}
+
+
+def manifest_of(encoder_folder):
+    return json.loads((encoder_folder / "manifest.json").read_text())
 
 
 def unit(rows):
@@ -238,6 +243,7 @@ def test_the_command_encodes_words(path, tmp_path, encoder_folder, monkeypatch, 
 def test_an_encoder_brings_its_bank(path, encoder_folder, tmp_path, monkeypatch, capsys):
     encoder = read_text_encoder(encoder_folder)
     assert np.abs(encoder.word_bank.vectors - encoder(everyday_words())).max() < 1e-3
+    assert manifest_of(encoder_folder)["files"]["word_bank.npy"]["bytes"] == 128 + 2 * WIDTH * len(everyday_words())
     assert run("bank", path, "--text-encoder", encoder_folder, "-o", tmp_path / "t.ogpc") == 0
     assert f"{len(everyday_words())} everyday words" in capsys.readouterr().out
     monkeypatch.setenv("OG_POINTCLOUD_MODELS", str(encoder_folder))
@@ -252,6 +258,38 @@ def test_an_encoder_brings_its_bank(path, encoder_folder, tmp_path, monkeypatch,
         len(read_bundle(write_bundle(own, tmp_path / "s.ogpc", text_encoder=encoder_folder)).cloud.word_bank.vectors)
         == 80
     )
+
+
+def test_fit_stores_the_bank_asked_for_else_the_encoders(encoder_folder, tmp_path, monkeypatch, capsys):
+    folder, path = write_tiny_capture(tmp_path / "capture").folder, tmp_path / "s.ogpc"
+    names = np.array([f"word {number}" for number in range(60)])
+    for name, count, width, space in (("f", 60, WIDTH, SPACE), ("few", 49, WIDTH, SPACE), ("wide", 60, 20, SPACE),
+                                      ("other", 60, WIDTH, "other")):  # fmt: skip
+        np.savez(tmp_path / f"{name}.npz", names=names[:count], vectors=unit_rows(count, width), feature_space=space)
+
+    def fit(*arguments):
+        return main(["fit", str(folder), "-o", str(path), *map(str, arguments)])
+
+    for bank, says in (("few", "a word bank of 49"), ("wide", "(width 20), the masks are"), ("other", "space 'other'")):
+        assert fit("--word-bank", tmp_path / f"{bank}.npz") == 2
+        assert says in capsys.readouterr().err
+        assert not path.exists()
+    assert fit() == 0
+    assert f"og-pointcloud vocabulary bank {path} [WORDS.npz]" in capsys.readouterr().out
+    assert read_bundle(path).cloud.word_bank is None
+    monkeypatch.setenv("OG_POINTCLOUD_MODELS", str(encoder_folder))
+    for arguments, count in (((), len(everyday_words())), (("--word-bank", tmp_path / "f.npz"), 60)):
+        assert fit(*arguments) == 0
+        assert "vocabulary bank" not in capsys.readouterr().out
+        assert len(read_bundle(path).cloud.word_bank.vectors) == count
+    for file in encoder_folder.iterdir():
+        (tmp_path / file.name).write_bytes(file.read_bytes())
+    (tmp_path / "tokenizer.json").write_bytes(b"torn")
+    monkeypatch.setenv("OG_POINTCLOUD_MODELS", str(tmp_path))
+    before = path.read_bytes()
+    assert fit() == 2
+    assert "tokenizer.json has not the manifest's checksum" in capsys.readouterr().err
+    assert path.read_bytes() == before
 
 
 def test_an_encoder_made_without_a_bank_has_none(path, encoder_folder, tmp_path, capsys):
@@ -275,7 +313,7 @@ def test_an_encoder_made_without_a_bank_has_none(path, encoder_folder, tmp_path,
 @pytest.mark.parametrize("bank", [b"junk", unit_rows(80), unit_rows(80, 8).astype("<f2"), unit_rows(9).astype("<f2")])
 def test_banks_of_encoders_are_checked(encoder_folder, tmp_path, bank):
     data = bank if isinstance(bank, bytes) else npy_bytes(bank)
-    manifest = json.loads((encoder_folder / "manifest.json").read_text())
+    manifest = manifest_of(encoder_folder)
     manifest["files"]["word_bank.npy"] = {"crc32": zlib.crc32(data)}
     for file in encoder_folder.iterdir():
         (tmp_path / file.name).write_bytes(file.read_bytes())
