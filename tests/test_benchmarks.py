@@ -218,3 +218,29 @@ def test_fast_forms_equal_rendering_and_a_wrong_table_shows(scored_capture: Path
         patch.setattr(equality, "exact_form", wrong)
         damaged = {row.quantity: row.float64 for row in equality.compare(FEATURE_SPACE, scene)}
     assert all(error > 1e-7 for error in damaged.values()), damaged  # undamaged: below 1e-11
+
+
+def test_labels_follow_every_change_of_a_capture(scored_capture: Path) -> None:
+    from benchmark_invariance import CHANGES, measure
+
+    first, *rows = measure(scored_capture)
+    assert [row.change for row in rows] == list(CHANGES)
+    assert first.miou > 0.8
+    for row in rows:
+        assert row.same_label > 0.98, row.change
+        assert row.instances == first.instances, row.change
+
+
+def test_a_moved_world_shows_the_same_images(scored_capture: Path) -> None:
+    """Points turn, grow and go with their cameras: each falls on the pixel it fell on."""
+    from benchmark_invariance import moved
+
+    scene = read_capture(scored_capture)
+    changed, rows = moved(scene, np.random.default_rng(1), scale=3.0, turned=True, offset=100.0)
+    assert abs(np.linalg.norm(changed.points.xyz_world - scene.points.xyz_world, axis=1)).min() > 50
+    for before, after in zip(scene.views, changed.views, strict=True):
+        at, inside = _pixels(scene.points.xyz, before.camera)
+        moved_at, moved_inside = _pixels(changed.points.xyz[np.argsort(rows)], after.camera)
+        both = inside & moved_inside
+        assert both.sum() > 0.99 * inside.sum() > 0
+        assert (moved_at[both] == at[both]).mean() > 0.99  # but for a few on the border of two pixels
