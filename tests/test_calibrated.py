@@ -292,6 +292,12 @@ def test_scene_instances_is_the_table_with_boxes(scene, cloud):
     assert np.abs(table[2].centroid - scene.xyz[table[2].point_indices][table[2].main_part].mean(axis=0)).max() < 1e-9
     assert json.loads(table.to_json())[2]["words"][0]["name"] == SHOWN[3]
     assert (scene.cloud.instances.views == [row.views for row in table]).all()
+    parts = replace(
+        cloud.instances, coarse=np.arange(9, dtype=np.int32)[::-1], whole=np.array([1] + [-1] * 8, np.int32)
+    )
+    other = og.instance_table(replace(cloud, instances=parts))
+    assert [(row.part_of, row.coarse) for row in other][:3] == [(1, 8), (-1, 7), (-1, 6)]
+    assert json.loads(other.to_json())[0]["coarse"] == 8
 
 
 # Commands

@@ -330,3 +330,21 @@ def test_choosing_needs_only_numpy():
     )
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert found.stdout.strip() == "[]"
+
+
+def test_descriptors_are_compared_in_parts(monkeypatch):
+    descriptors = np.concatenate([unit_rows(7, WIDTH), unit_rows(4, WIDTH), unit_rows(3, WIDTH)])  # some come again
+    whole = common_part(descriptors, 0.95)
+    monkeypatch.setattr("og_pointcloud.choosing.ROWS_AT_ONCE", 3)
+    np.testing.assert_allclose(common_part(descriptors, 0.95), whole, atol=1e-7)
+
+
+def test_a_ranking_tells_saturated_probabilities_apart():
+    made = Made()
+    choice = made.chooser.choose(made.texts[:2])
+    table = np.array([[1, 0], [1, 0], [0.3, 0.6], [1, 0], [0, 0], [0, 0]], np.float32)
+    evidence = np.array([[5, 1], [9, 1], [12, 13], [9, 0], [-2, 3], [-1, 2]], np.float32)
+    choice = replace(choice, table=table, evidence=evidence)
+    assert choice.ranking(0).tolist() == [1, 3, 0, 2, 5, 4]
+    assert choice.words(4, ("a", "b")) == [("b", 0.0), ("a", 0.0)]
+    assert choice.words(2, ("a", "b"), 1) == [("b", pytest.approx(0.6))]

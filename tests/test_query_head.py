@@ -30,6 +30,7 @@ import og_pointcloud as og
 from og_pointcloud._onnx_graph import check_graph
 from og_pointcloud._onnxruntime import open_session
 from og_pointcloud.bundle import BEYOND, NEAR, ON_SURFACE, QUERY_OPERATORS
+from og_pointcloud.choosing import WordBank
 from og_pointcloud.errors import BundleError
 from og_pointcloud.nearest import surface_distance
 
@@ -313,9 +314,11 @@ def test_the_documented_program_answers_like_the_library(tmp_path, monkeypatch):
     assert names["instance"].tolist()[2] == TOO_FAR
 
 
-def test_the_documented_program_of_probabilities_answers_like_the_library(tmp_path, monkeypatch):
+@pytest.mark.parametrize("bank_words", [300, 50])
+def test_the_documented_program_of_probabilities_answers_like_the_library(tmp_path, monkeypatch, bank_words):
     made = Made(9, owners=[0, 0, 1, 2, 3, 5, 6, 7, 8])
-    cloud = replace(CLOUDS["room"], instances=made.table, word_bank=made.bank, vocabulary=None)
+    bank = WordBank(made.bank.vectors[:bank_words])
+    cloud = replace(CLOUDS["room"], instances=made.table, word_bank=bank, vocabulary=None)
     writer.write_bundle(cloud, tmp_path / "scene.ogpc")
     monkeypatch.chdir(tmp_path)
     page = (Path(__file__).resolve().parents[1] / "docs" / "query_onnx.md").read_text()

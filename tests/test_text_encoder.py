@@ -49,6 +49,7 @@ from og_pointcloud.text_encoder import (
     find_encoder,
     read_text_encoder,
 )
+from og_pointcloud.vocabulary import everyday_words
 
 torch = pytest.importorskip("torch")
 safetensors_torch = pytest.importorskip("safetensors.torch")
@@ -691,7 +692,10 @@ def test_the_command_writes_an_encoder_and_says_how_it_is_found(source, tmp_path
     assert "onnxruntime and torch differ by" in printed
     assert "int8 and float32: cosine 0.99" in printed
     assert f"export OG_POINTCLOUD_MODELS='{tmp_path / 'out'}'" in printed
-    assert read_text_encoder(tmp_path / "out").templates == ("a {}",)
+    made = read_text_encoder(tmp_path / "out")
+    assert made.templates == ("a {}",)
+    words = everyday_words()[:30]
+    assert np.abs(made.word_bank.vectors[:30] - made.encode([f"a {word}" for word in words])).max() < 1e-3
     assert main([*arguments, "-o", str(tmp_path / "out"), "--tokenizer", "nowhere.json"]) == 2
     assert "error: nowhere.json is not a file" in capsys.readouterr().err
     with pytest.raises(SystemExit):

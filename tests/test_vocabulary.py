@@ -21,7 +21,7 @@ from og_pointcloud.choosing import WordBank
 from og_pointcloud.cli import main
 from og_pointcloud.cloud import Vocabulary
 from og_pointcloud.errors import BundleError, FeatureSpaceError, OgPointcloudError
-from og_pointcloud.text_encoder import encoder_for, read_text_encoder
+from og_pointcloud.text_encoder import TextEncoder, encoder_for, read_text_encoder
 from og_pointcloud.vocabulary import add_words, best_cosines, carry_encoder, everyday_words, read_words, store_bank
 from og_pointcloud.words import resolve_labels
 
@@ -300,10 +300,13 @@ def test_an_encoder_made_without_a_bank_has_none(path, encoder_folder, tmp_path,
             (folder / file.name).write_bytes(file.read_bytes())
     with pytest.raises(OgPointcloudError, match=r"'word_bank\.npy' is missing"):
         read_text_encoder(folder)
-    manifest = json.loads((folder / "manifest.json").read_text())
+    manifest = manifest_of(folder)
     del manifest["files"]["word_bank.npy"]
     (folder / "manifest.json").write_text(json.dumps(manifest))
     assert read_text_encoder(folder).word_bank is None
+    bank = (encoder_folder / "word_bank.npy").read_bytes()
+    with pytest.raises(OgPointcloudError, match=r"'word_bank\.npy' is missing"):  # of the manifest's files
+        TextEncoder({path.name: path.read_bytes() for path in folder.iterdir()} | {"word_bank.npy": bank}, "here")
     assert run("bank", path, "--text-encoder", folder) == 2
     assert "has no word bank: make it again" in capsys.readouterr().err
     carry_encoder(path, folder)
