@@ -5,11 +5,12 @@
     scene = og.load("kitchen.ogpc")
     result = og.segment(points, ["chair", "desk"], scene)      # points: (N, 3), or an Open3D or PyVista cloud
     result.labels, result.scores, result.instances, result.mask("chair")
+    result.calibrated, result.unknown_because()         # whether scores are probabilities; why points have no label
 
     hit = og.pick(scene, camera, (320, 240))            # or a place: og.pick(scene, (1.2, 0.4, 0.8))
     hit.instance, hit.point_indices, hit.mask(camera)
 
-    og.instance_table(scene)                            # places, boxes, evidence, best words; to_json, to_csv
+    scene.instances                                     # places, boxes, evidence, best words; to_json, to_csv
     og.select(scene, "red mug")                         # instances ranked by a word
     og.edit.remove(scene, "red mug", "without.ply", cloud="kitchen.ply")
 
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
     from og_pointcloud import edit as edit
     from og_pointcloud.boxes import Box, axis_aligned_box, oriented_box
     from og_pointcloud.bundle import TOO_FAR, read_bundle
+    from og_pointcloud.choosing import Reason, WordBank
     from og_pointcloud.cloud import BACKGROUND, UNOBSERVED, InstanceTable, LabelledCloud, Vocabulary
     from og_pointcloud.errors import BundleError, FeatureSpaceError, MissingExtraError, OgPointcloudError, SceneError
     from og_pointcloud.fit import fit
@@ -65,11 +67,13 @@ __all__ = [
     "MissingExtraError",
     "OgPointcloudError",
     "Pick",
+    "Reason",
     "SceneError",
     "Segmentation",
     "Segmenter",
     "Selection",
     "Vocabulary",
+    "WordBank",
     "axis_aligned_box",
     "feature_colors",
     "feature_picture",
@@ -94,6 +98,7 @@ __all__ = [
 _HOMES = {
     "og_pointcloud.boxes": ("Box", "axis_aligned_box", "oriented_box"),
     "og_pointcloud.bundle": ("TOO_FAR", "read_bundle"),
+    "og_pointcloud.choosing": ("Reason", "WordBank"),
     "og_pointcloud.cloud": ("BACKGROUND", "UNOBSERVED", "InstanceTable", "LabelledCloud", "Vocabulary"),
     "og_pointcloud.errors": (
         "BundleError", "FeatureSpaceError", "MissingExtraError", "OgPointcloudError", "SceneError",

@@ -150,7 +150,7 @@ def select(
     points = np.bincount(scene.instance_ids[scene.instance_ids >= 0], minlength=len(choice.labels))
     known = (points > 0) & (choice.reasons != Reason.NOT_DESCRIBED)
     ranked = [int(k) for k in choice.ranking(0) if known[k]]
-    fitting = np.flatnonzero(choice.labels == 0) if rivals or choice.calibrated else ranked[:1]
+    fitting = set(np.flatnonzero(choice.labels == 0).tolist() if rivals or choice.calibrated else ranked[:1])
     return Selection(
         query=query.names[0],
         matches=tuple(_match(k, choice, k in fitting, rivals, int(points[k])) for k in ranked),

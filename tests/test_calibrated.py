@@ -234,6 +234,16 @@ def test_tables_without_much_to_compare(cloud, kind):
     assert (result.labels >= 0).any() == (kind in ("descriptors that are one", "one instance"))
 
 
+@pytest.mark.parametrize(
+    "vectors", [np.zeros((60, 64)), np.ones((60, 64)), np.eye(60, 64) * 1e-30, np.eye(60, 64) * 1e30]
+)
+def test_banks_that_say_little_or_nothing(cloud, made, vectors):
+    result = quietly(replace(cloud, word_bank=og.WordBank(vectors)), SHOWN)
+    assert result.calibrated
+    assert np.isfinite(result.scores).all()
+    assert ((result.scores > 0) == (result.labels >= 0)).all()
+
+
 # Selecting, picking, and the table of instances
 
 
