@@ -205,7 +205,7 @@ class Chooser:
         self._described = np.unique(self._owner)
         if bank is None or len(self._descriptors) == 0:
             return
-        _check_width(bank.vectors, self._descriptors, "vectors of the word bank", self._space)
+        _check_width(bank.vectors, self._descriptors, "bank word", self._space)
         self._centred = self._descriptors - common_part(self._descriptors, self.settings.same_look)
         self._bank_directions = _unit(bank.vectors - bank.mean)
         scores = self._centred @ self._bank_directions.T
@@ -229,8 +229,8 @@ class Chooser:
         label = np.arange(len(texts)) if text_label is None else np.asarray(text_label)
         others = np.zeros((0, texts.shape[1]), np.float32) if negatives is None else _finite(negatives, "negatives")
         if len(self._descriptors):
-            _check_width(texts, self._descriptors, "label vectors", self._space)
-            _check_width(others, self._descriptors, "negatives", self._space)
+            _check_width(texts, self._descriptors, "label", self._space)
+            _check_width(others, self._descriptors, "negative", self._space)
         count = int(label.max(initial=-1)) + 1
         if len(self._descriptors) == 0 or count == 0:
             return self._nothing(count)
@@ -388,7 +388,7 @@ def relevancy(descriptors: ArrayLike, texts: ArrayLike, negatives: ArrayLike) ->
     rivals = _unit(_finite(negatives, "negatives"))
     if len(rivals) == 0:
         raise FeatureSpaceError("relevancy against 0 negatives; expected at least one, as CANONICAL_NEGATIVES")
-    for vectors, what in ((words, "label vectors"), (rivals, "negatives")):
+    for vectors, what in ((words, "label"), (rivals, "negative")):
         _check_width(vectors, images, what)
     return _relevancy_of_cosines(images @ words.T, images @ rivals.T)
 
@@ -442,6 +442,6 @@ def _finite(vectors: ArrayLike, what: str) -> NDArray[np.float32]:
 def _check_width(vectors: NDArray[np.float32], descriptors: NDArray[np.float32], what: str, space: str = "") -> None:
     if vectors.shape[1] != descriptors.shape[1]:
         raise FeatureSpaceError(
-            f"the {what} have width {vectors.shape[1]}, the scene's descriptors {descriptors.shape[1]}{space}: encode "
-            "them with the scene's encoder"
+            f"the {what} vectors have width {vectors.shape[1]}, the scene's descriptors {descriptors.shape[1]}{space}: "
+            f"encode the {what}s with the scene's encoder"
         )

@@ -210,7 +210,7 @@ def test_vectors_that_cannot_be_judged(scene):
         og.segment(scene, {"a": np.zeros(64)})
     with pytest.raises(FeatureSpaceError, match=rf"label vectors have width 3, the scene's descriptors 64 .*'{SPACE}'"):
         og.segment(scene, {"a": np.ones(3)})
-    with pytest.raises(FeatureSpaceError, match=r"negatives have width 3, the scene's descriptors 64"):
+    with pytest.raises(FeatureSpaceError, match=r"negative vectors have width 3, the scene's descriptors 64"):
         og.segment(scene, SHOWN, negatives={"a": np.ones(3)})
 
 

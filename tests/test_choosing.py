@@ -246,9 +246,9 @@ def test_widths_must_agree():
     made = Made()
     with pytest.raises(FeatureSpaceError, match=r"label vectors have width 3, the scene.s descriptors 64"):
         made.chooser.choose(np.ones((2, 3)))
-    with pytest.raises(FeatureSpaceError, match=r"word bank have width 16"):
+    with pytest.raises(FeatureSpaceError, match=r"bank word vectors have width 16"):
         Chooser(made.table, WordBank(unit_rows(60, 16)))
-    with pytest.raises(FeatureSpaceError, match=r"negatives have width 3"):
+    with pytest.raises(FeatureSpaceError, match=r"negative vectors have width 3"):
         made.chooser.choose(made.texts[:2], negatives=np.ones((2, 3)))
     with pytest.raises(FeatureSpaceError, match=r"shape \(64,\); expected \(count, width\)"):
         made.chooser.choose(made.texts[0])
