@@ -24,7 +24,7 @@ from og_pointcloud.cloud import LabelledCloud, Vocabulary
 from og_pointcloud.clouds import carried_scene, world_points
 from og_pointcloud.errors import BundleError, FeatureSpaceError, OgPointcloudError, SceneError
 from og_pointcloud.nearest import NONE_WITHIN_REACH, NearestPoint, surface_distance
-from og_pointcloud.segmentation import UNKNOWN, Segmentation
+from og_pointcloud.segmentation import Segmentation
 from og_pointcloud.words import Labels, TextFeatures, resolve_labels
 
 if TYPE_CHECKING:
@@ -444,7 +444,7 @@ def _why_nothing(result: Segmentation, scene: LabelledScene) -> str | None:
     """Why no point has a label; None if one has."""
     if len(result) == 0:
         return "no point has a label: the cloud has 0 points (a file that could not be read may give such a cloud)"
-    if (result.labels != UNKNOWN).any():
+    if not result.reasons.all():  # Reason.LABELLED is 0
         return None
     counts = result.unknown_because()
     parts = [f"{count} are {reason}" for reason, count in counts.items()]
