@@ -248,7 +248,7 @@ class ScalingRow:
 
 def warm_up(settings: FitSettings) -> None:
     """A discarded fit of a tiny scene: compiled code is then loaded, libraries imported."""
-    from og_pointcloud.fit import fit
+    from og_pointcloud.fitting.fit import fit
 
     short = replace(settings, paper=replace(settings.paper, schedule_share=1e-3))
     fit(made_scene(**TINY)[0], short, progress=False)
@@ -256,7 +256,7 @@ def warm_up(settings: FitSettings) -> None:
 
 def timed_fit(scene: Scene, settings: FitSettings) -> tuple[LabelledCloud, dict[str, float]]:
     """The cloud, and what it took: prepare_s, own_s, total_s and cpu_s of a row."""
-    from og_pointcloud.fit import fit
+    from og_pointcloud.fitting.fit import fit
 
     start, cpu = time.perf_counter(), time.process_time()
     cloud = fit(scene, settings, progress=False)

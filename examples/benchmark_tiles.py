@@ -22,12 +22,12 @@ from make_street import CLASSES, GROUND, MadeStreet, make_street
 from numpy.typing import NDArray
 
 from og_pointcloud.cloud import LabelledCloud
-from og_pointcloud.fit import fit
+from og_pointcloud.fitting.fit import fit
+from og_pointcloud.fitting.tiles import fit_tiles, split
 from og_pointcloud.metrics import adjusted_rand_index, score_labels
 from og_pointcloud.scene import Points, Scene
 from og_pointcloud.segmentation import label_colors
 from og_pointcloud.settings import FitSettings
-from og_pointcloud.tiles import fit_tiles, split
 
 Ids = NDArray[np.integer]
 PICTURE_PX = (300, 2000)

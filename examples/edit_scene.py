@@ -14,9 +14,9 @@ from og_pointcloud_room.furniture import CLASS_NAMES
 
 import og_pointcloud as og
 from og_pointcloud.cloud import Vocabulary
-from og_pointcloud.fit import prepare
+from og_pointcloud.fitting.fit import prepare
+from og_pointcloud.fitting.visibility import Gaussians, render
 from og_pointcloud.formats.gaussian_ply import write_gaussian_ply
-from og_pointcloud.visibility import Gaussians, render
 
 parser = argparse.ArgumentParser(description="Scene editing by words on a made room.")
 parser.add_argument("-o", "--output", type=Path, default=Path("out/edit"), metavar="OUT", help="folder")

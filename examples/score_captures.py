@@ -18,7 +18,7 @@ import numpy as np
 
 import og_pointcloud as og
 from og_pointcloud.metrics import Score, score_labels
-from og_pointcloud.vocabulary import read_bank, store_bank
+from og_pointcloud.text.vocabulary import read_bank, store_bank
 
 FIRST_ANSWER = """
 import sys, time

@@ -20,9 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from og_pointcloud.features import learn_features
+from og_pointcloud.fitting.features import learn_features
+from og_pointcloud.fitting.visibility import MaskTable
 from og_pointcloud.settings import FeatureSettings
-from og_pointcloud.visibility import MaskTable
 
 MASKS, GAUSSIANS, WIDTH = 3, 200, 6
 STARTS = (0.0, 1e-12, 1e-9, 1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1)

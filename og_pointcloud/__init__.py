@@ -21,8 +21,6 @@ results, what writes bundles and what draws pictures need more than numpy and on
 from __future__ import annotations
 
 import importlib
-import sys
-from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -34,19 +32,19 @@ if TYPE_CHECKING:
     from og_pointcloud.choosing import Reason, WordBank
     from og_pointcloud.cloud import BACKGROUND, UNOBSERVED, InstanceTable, LabelledCloud, Vocabulary
     from og_pointcloud.errors import BundleError, FeatureSpaceError, MissingExtraError, OgPointcloudError, SceneError
-    from og_pointcloud.fit import fit
+    from og_pointcloud.fitting.fit import fit
+    from og_pointcloud.fitting.pictures import feature_colors, feature_picture, instance_picture
     from og_pointcloud.formats.capture import read_capture
     from og_pointcloud.formats.opengaussian import read_opengaussian
     from og_pointcloud.formats.points import read_points
     from og_pointcloud.instances import Instance, Instances, instance_table
     from og_pointcloud.picking import Pick, in_world, pick
-    from og_pointcloud.pictures import feature_colors, feature_picture, instance_picture
     from og_pointcloud.runtime import LabelledScene, Segmenter, load, segment, use
     from og_pointcloud.scene import Camera
     from og_pointcloud.segmentation import UNKNOWN, Segmentation
     from og_pointcloud.selecting import Match, Selection, select
     from og_pointcloud.settings import FitSettings
-    from og_pointcloud.text_features import read_text_features
+    from og_pointcloud.text.features import read_text_features
 
 __all__ = [
     "BACKGROUND",
@@ -103,19 +101,19 @@ _HOMES = {
     "og_pointcloud.errors": (
         "BundleError", "FeatureSpaceError", "MissingExtraError", "OgPointcloudError", "SceneError",
     ),
-    "og_pointcloud.fit": ("fit",),
+    "og_pointcloud.fitting.fit": ("fit",),
     "og_pointcloud.formats.capture": ("read_capture",),
     "og_pointcloud.formats.opengaussian": ("read_opengaussian",),
     "og_pointcloud.formats.points": ("read_points",),
     "og_pointcloud.instances": ("Instance", "Instances", "instance_table"),
     "og_pointcloud.picking": ("Pick", "in_world", "pick"),
-    "og_pointcloud.pictures": ("feature_colors", "feature_picture", "instance_picture"),
+    "og_pointcloud.fitting.pictures": ("feature_colors", "feature_picture", "instance_picture"),
     "og_pointcloud.runtime": ("LabelledScene", "Segmenter", "load", "segment", "use"),
     "og_pointcloud.scene": ("Camera",),
     "og_pointcloud.segmentation": ("UNKNOWN", "Segmentation"),
     "og_pointcloud.selecting": ("Match", "Selection", "select"),
     "og_pointcloud.settings": ("FitSettings",),
-    "og_pointcloud.text_features": ("read_text_features",),
+    "og_pointcloud.text.features": ("read_text_features",),
     "og_pointcloud_export": ("write_bundle",),
 }  # fmt: skip
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
@@ -135,14 +133,3 @@ def __getattr__(name: str) -> Any:
 
 def __dir__() -> list[str]:
     return sorted({*globals(), *__all__, *_MODULES})
-
-
-class _Package(ModuleType):
-    """Keeps ``og.fit`` the function: importing the module of that name would otherwise put itself in its place."""
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        is_own_module = isinstance(value, ModuleType) and _HOME_OF.get(name) == value.__name__
-        super().__setattr__(name, getattr(value, name) if is_own_module else value)
-
-
-sys.modules[__name__].__class__ = _Package

@@ -46,7 +46,7 @@ from og_pointcloud.picking import Pick
 from og_pointcloud.runtime import LabelledScene, SceneLike
 from og_pointcloud.scene import Points
 from og_pointcloud.selecting import Match, Selection, select
-from og_pointcloud.words import TextFeatures
+from og_pointcloud.text.words import TextFeatures
 
 __all__ = ["Edit", "What", "extract", "insert", "recolour", "remove"]
 

@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 from og_pointcloud._atomic import replacing
 from og_pointcloud.boxes import Box, axis_aligned_box, main_part, oriented_box
 from og_pointcloud.runtime import LabelledScene, SceneLike, as_scene
-from og_pointcloud.words import Labels, TextFeatures, resolve_labels
+from og_pointcloud.text.words import Labels, TextFeatures, resolve_labels
 
 __all__ = ["EMPTY", "LABELLED", "NO_FEATURE", "Instance", "Instances", "as_scene", "instance_table"]
 

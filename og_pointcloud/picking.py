@@ -27,7 +27,7 @@ from og_pointcloud.cloud import BACKGROUND, UNOBSERVED, LabelledCloud
 from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.runtime import LabelledScene, SceneLike
 from og_pointcloud.scene import Camera
-from og_pointcloud.words import Labels, TextFeatures, resolve_labels
+from og_pointcloud.text.words import Labels, TextFeatures, resolve_labels
 
 __all__ = ["Pick", "front_points", "in_world", "pick"]
 

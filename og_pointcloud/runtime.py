@@ -25,7 +25,7 @@ from og_pointcloud.clouds import carried_scene, world_points
 from og_pointcloud.errors import BundleError, FeatureSpaceError, OgPointcloudError, SceneError
 from og_pointcloud.nearest import NONE_WITHIN_REACH, NearestPoint, surface_distance
 from og_pointcloud.segmentation import Segmentation
-from og_pointcloud.words import Labels, TextFeatures, resolve_labels
+from og_pointcloud.text.words import Labels, TextFeatures, resolve_labels
 
 if TYPE_CHECKING:
     from onnxruntime import InferenceSession

@@ -20,7 +20,7 @@ from og_pointcloud.cloud import Vocabulary
 from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError
 from og_pointcloud.instances import SHOWN, as_scene
 from og_pointcloud.runtime import LabelledScene, SceneLike
-from og_pointcloud.words import Labels, TextFeatures, resolve_labels
+from og_pointcloud.text.words import Labels, TextFeatures, resolve_labels
 
 __all__ = ["Match", "Selection", "select"]
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from og_pointcloud.fit import fit
+from og_pointcloud.fitting.fit import fit
 from og_pointcloud.scene import Camera, Points, Scene, View
 
 

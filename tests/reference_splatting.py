@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from og_pointcloud.fitting.visibility import Gaussians
 from og_pointcloud.scene import Camera
-from og_pointcloud.visibility import Gaussians
 
 Wide = np.longdouble
 

@@ -11,11 +11,19 @@ import pytest
 from conftest import FEATURE_SPACE, NAMES, write_tiny_capture
 
 import og_pointcloud as og
-from og_pointcloud import ablation
-from og_pointcloud.ablation import PUBLISHED_MIOU, ablate, average, cases, read_truth, read_vocabulary, write_csv
 from og_pointcloud.errors import FeatureSpaceError, MissingExtraError, OgPointcloudError, SceneError
-from og_pointcloud.features import learn_features
-from og_pointcloud.fit import fit, prepare
+from og_pointcloud.fitting import ablation
+from og_pointcloud.fitting.ablation import (
+    PUBLISHED_MIOU,
+    ablate,
+    average,
+    cases,
+    read_truth,
+    read_vocabulary,
+    write_csv,
+)
+from og_pointcloud.fitting.features import learn_features
+from og_pointcloud.fitting.fit import fit, prepare
 from og_pointcloud.formats.capture import read_capture
 from og_pointcloud.metrics import score_labels
 from og_pointcloud.settings import FeatureSettings

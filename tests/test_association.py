@@ -7,8 +7,8 @@ import pytest
 from numpy.typing import NDArray
 from test_grouping import ONE, OTHER, HandView, hand_table
 
-from og_pointcloud.association import describe_instances
 from og_pointcloud.cloud import BACKGROUND, UNOBSERVED, InstanceTable
+from og_pointcloud.fitting.association import describe_instances
 from og_pointcloud.settings import AssociationSettings
 
 SETTINGS = AssociationSettings()

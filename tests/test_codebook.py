@@ -8,7 +8,8 @@ import pytest
 from numpy.typing import NDArray
 from test_grouping import ONE, hand_table
 
-from og_pointcloud.codebook import (
+from og_pointcloud.errors import OgPointcloudError
+from og_pointcloud.fitting.codebook import (
     Codebook,
     cluster_weights,
     kmeans,
@@ -17,7 +18,6 @@ from og_pointcloud.codebook import (
     things_together,
     two_level_codebook,
 )
-from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.settings import CodebookSettings
 
 DEFAULTS = CodebookSettings()

@@ -11,13 +11,20 @@ from conftest import TinyCapture
 from numpy.typing import NDArray
 from scipy.sparse import csr_array, random_array, vstack
 
-from og_pointcloud import features
 from og_pointcloud.errors import OgPointcloudError, SceneError
-from og_pointcloud.features import FeatureObjective, MaskGram, learn_features, masked_gram, raw_gradient, read_features
-from og_pointcloud.fit import prepare
+from og_pointcloud.fitting import features
+from og_pointcloud.fitting.features import (
+    FeatureObjective,
+    MaskGram,
+    learn_features,
+    masked_gram,
+    raw_gradient,
+    read_features,
+)
+from og_pointcloud.fitting.fit import prepare
+from og_pointcloud.fitting.visibility import MaskTable, mask_table, pixel_weights
 from og_pointcloud.formats.capture import read_capture
 from og_pointcloud.settings import FeatureSettings
-from og_pointcloud.visibility import MaskTable, mask_table, pixel_weights
 
 torch = pytest.importorskip("torch")
 

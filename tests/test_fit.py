@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 import og_pointcloud as og
 from og_pointcloud.cloud import BACKGROUND, UNOBSERVED, LabelledCloud
 from og_pointcloud.errors import SceneError
-from og_pointcloud.fit import fit, prepare
+from og_pointcloud.fitting.fit import fit, prepare
 from og_pointcloud.scene import Camera, Points, Scene, View
 from og_pointcloud.settings import FitSettings, MembershipSettings
 

@@ -10,7 +10,7 @@ import pytest
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from og_pointcloud.geometry import (
+from og_pointcloud.fitting.geometry import (
     chance_of_place,
     choose_gaussians,
     isotropic,
@@ -20,9 +20,9 @@ from og_pointcloud.geometry import (
     sample_of_points,
     strided,
 )
+from og_pointcloud.fitting.visibility import NEAR_SHARE, pixel_weights
 from og_pointcloud.scene import Camera, Points, View
 from og_pointcloud.settings import GeometrySettings
-from og_pointcloud.visibility import NEAR_SHARE, pixel_weights
 
 SETTINGS = GeometrySettings()
 NEAR = 0.1

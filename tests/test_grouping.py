@@ -12,10 +12,10 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from og_pointcloud.grouping import group_masks, indicator, mask_shares
+from og_pointcloud.fitting.grouping import group_masks, indicator, mask_shares
+from og_pointcloud.fitting.testimony import hear_views
+from og_pointcloud.fitting.visibility import MaskTable
 from og_pointcloud.settings import GroupingSettings
-from og_pointcloud.testimony import hear_views
-from og_pointcloud.visibility import MaskTable
 
 SETTINGS = GroupingSettings()
 ONE = np.array([1, 0, 0, 0, 0, 0, 0, 0], np.float32)

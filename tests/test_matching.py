@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from test_grouping import ONE, OTHER, HandView, hand_table
 from test_visibility import IDENTITY, NEAR, camera, cloud, patches
 
-from og_pointcloud.matching import Evidence, Matching, alone_evidence, eq5_scores, match_masks, visible_evidence
+from og_pointcloud.fitting.matching import Evidence, Matching, alone_evidence, eq5_scores, match_masks, visible_evidence
+from og_pointcloud.fitting.visibility import Gaussians, mask_table, pixel_weights
 from og_pointcloud.scene import Camera, View
 from og_pointcloud.settings import MatchingSettings
-from og_pointcloud.visibility import Gaussians, mask_table, pixel_weights
 
 SETTINGS = MatchingSettings()
 RED, GREEN = np.array([1.0, 0.0]), np.array([0.0, 1.0])

@@ -13,12 +13,19 @@ from scipy.sparse import csr_array, random_array
 from test_grouping import ONE, HandView, hand_table
 
 from og_pointcloud.cloud import BACKGROUND, UNOBSERVED
-from og_pointcloud.geometry import neighbourhood
-from og_pointcloud.grouping import MaskGroups
-from og_pointcloud.membership import Membership, _best_group, _by_point, assign_points, own_area, without_see_through
+from og_pointcloud.fitting.geometry import neighbourhood
+from og_pointcloud.fitting.grouping import MaskGroups
+from og_pointcloud.fitting.membership import (
+    Membership,
+    _best_group,
+    _by_point,
+    assign_points,
+    own_area,
+    without_see_through,
+)
+from og_pointcloud.fitting.testimony import OPENNESS_POWER, hear_views
+from og_pointcloud.fitting.visibility import Gaussians, MaskTable
 from og_pointcloud.settings import GeometrySettings, MembershipSettings
-from og_pointcloud.testimony import OPENNESS_POWER, hear_views
-from og_pointcloud.visibility import Gaussians, MaskTable
 
 SETTINGS = MembershipSettings()
 N = 100

@@ -16,19 +16,27 @@ from test_grouping import hand_table
 from test_membership import groups, on_a_line
 from test_visibility import NEAR, camera, cloud, view_of
 
-from og_pointcloud import membership
-from og_pointcloud import memory as memory_module
 from og_pointcloud.cli import main
 from og_pointcloud.errors import OgPointcloudError
-from og_pointcloud.fit import fit, prepare
-from og_pointcloud.geometry import neighbourhood
-from og_pointcloud.membership import assign_points
-from og_pointcloud.memory import Column, free_memory, in_file, memory_in_use, parse_memory, scratch_file, scratch_like
+from og_pointcloud.fitting import membership
+from og_pointcloud.fitting import memory as memory_module
+from og_pointcloud.fitting.fit import fit, prepare
+from og_pointcloud.fitting.geometry import neighbourhood
+from og_pointcloud.fitting.membership import assign_points
+from og_pointcloud.fitting.memory import (
+    Column,
+    free_memory,
+    in_file,
+    memory_in_use,
+    parse_memory,
+    scratch_file,
+    scratch_like,
+)
+from og_pointcloud.fitting.table_store import PROGRESS, TableStore, kept_views, remove_work
+from og_pointcloud.fitting.testimony import hear_views
+from og_pointcloud.fitting.visibility import Gaussians, MaskTable, mask_table, table_key
 from og_pointcloud.scene import View
 from og_pointcloud.settings import FitSettings, GeometrySettings, MembershipSettings, VisibilitySettings
-from og_pointcloud.table_store import PROGRESS, TableStore, kept_views, remove_work
-from og_pointcloud.testimony import hear_views
-from og_pointcloud.visibility import Gaussians, MaskTable, mask_table, table_key
 
 MATRICES = ("weights", "outside", "exposure")
 TIGHT = FitSettings(memory=1)
@@ -168,7 +176,7 @@ def interrupted(folder: Path, gaussians: Gaussians, after: int = 4) -> int:
 
 def rendered(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """Ids of the masks of every view that is rendered from now on."""
-    import og_pointcloud.visibility as module
+    import og_pointcloud.fitting.visibility as module
 
     counts: list[int] = []
     plain = module.view_weights
@@ -289,7 +297,7 @@ def test_a_full_disk_is_one_clear_error(gaussians: Gaussians, monkeypatch: pytes
     def full() -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("og_pointcloud.table_store.scratch_file", full)
+    monkeypatch.setattr("og_pointcloud.fitting.table_store.scratch_file", full)
     with pytest.raises(OgPointcloudError, match=r"no room for the mask table.*No space left.*larger disk"):
         mask_table(gaussians, views(), NEAR, store=TableStore(len(gaussians), memory=0))
 

@@ -11,11 +11,11 @@ from scipy.sparse import csr_array
 from test_fit import BOXES, boxes_on_a_table
 
 from og_pointcloud.cloud import BACKGROUND, UNOBSERVED, InstanceTable, LabelledCloud
-from og_pointcloud.fit import fit, prepare
-from og_pointcloud.journal import Journal
-from og_pointcloud.modes import Labelling, by_choice, by_features, by_grouping, mask_agreement
+from og_pointcloud.fitting.fit import fit, prepare
+from og_pointcloud.fitting.journal import Journal
+from og_pointcloud.fitting.modes import Labelling, by_choice, by_features, by_grouping, mask_agreement
+from og_pointcloud.fitting.visibility import MaskTable
 from og_pointcloud.settings import CodebookSettings, FitSettings, MatchingSettings, PaperSettings
-from og_pointcloud.visibility import MaskTable
 
 MODES = get_args(get_type_hints(FitSettings)["mode"])
 PAPER = PaperSettings(schedule_share=0.004, k1=8, k2=2, feature_rate=0.02)

@@ -13,7 +13,7 @@ from og_pointcloud.formats.langsplat import LANGSPLAT_SPACE
 from og_pointcloud.formats.opengaussian import read_opengaussian
 from og_pointcloud.formats.ply import join_columns, write_ply
 from og_pointcloud.runtime import LabelledScene, segment
-from og_pointcloud.text_features import UNKNOWN_SPACE
+from og_pointcloud.text.features import UNKNOWN_SPACE
 
 COUNT, LEAVES, WIDTH = 300, 12, 8
 INSTANCE_FEATURES = ("ins_feat_r", "ins_feat_g", "ins_feat_b", "ins_feat_r2", "ins_feat_g2", "ins_feat_b2")

@@ -36,7 +36,7 @@ def test_wheel_has_every_module(wheel_names):
     } | {path.name for path in (ROOT / "plugins").glob("*.py")}
     assert "og_pointcloud/scene.py" in on_disk
     assert on_disk <= set(wheel_names)
-    assert {"og_pointcloud/py.typed", "og_pointcloud/everyday_words.txt"} <= set(wheel_names)
+    assert {"og_pointcloud/py.typed", "og_pointcloud/text/everyday_words.txt"} <= set(wheel_names)
 
 
 @pytest.mark.parametrize("statement", ["import og_pointcloud", "from og_pointcloud.cli import main; main(['--help'])"])

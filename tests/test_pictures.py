@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from og_pointcloud.errors import SceneError
-from og_pointcloud.pictures import (
+from og_pointcloud.fitting.pictures import (
     DARK,
     GAP,
     GREY,
@@ -16,9 +16,9 @@ from og_pointcloud.pictures import (
     feature_picture,
     instance_picture,
 )
+from og_pointcloud.fitting.visibility import Gaussians
 from og_pointcloud.scene import Camera, View
 from og_pointcloud.segmentation import UNKNOWN_COLOR, label_colors
-from og_pointcloud.visibility import Gaussians
 
 WIDTH, HEIGHT = 80, 60
 

@@ -41,7 +41,7 @@ from og_pointcloud._onnxruntime import open_session
 from og_pointcloud.cli import main
 from og_pointcloud.cloud import Vocabulary
 from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError
-from og_pointcloud.text_encoder import (
+from og_pointcloud.text.encoder import (
     OPERATORS,
     TextEncoder,
     cache_folder,
@@ -49,7 +49,7 @@ from og_pointcloud.text_encoder import (
     find_encoder,
     read_text_encoder,
 )
-from og_pointcloud.vocabulary import everyday_words
+from og_pointcloud.text.vocabulary import everyday_words
 
 torch = pytest.importorskip("torch")
 safetensors_torch = pytest.importorskip("safetensors.torch")
@@ -62,7 +62,7 @@ torch.set_num_threads(1)
 @pytest.fixture(autouse=True)
 def no_models_of_this_machine(monkeypatch, tmp_path):
     monkeypatch.delenv("OG_POINTCLOUD_MODELS", raising=False)
-    monkeypatch.setattr("og_pointcloud.text_encoder.cache_folder", lambda: tmp_path / "cache")
+    monkeypatch.setattr("og_pointcloud.text.encoder.cache_folder", lambda: tmp_path / "cache")
 
 
 @pytest.fixture(scope="module")
@@ -427,7 +427,7 @@ def test_a_text_is_encoded_once(encoder, monkeypatch):
     assert (first[0] == first[2]).all()
     monkeypatch.setattr(encoder, "_run", None)
     assert (encoder.encode(["low", "cat"]) == first[[1, 0]]).all()
-    monkeypatch.setattr("og_pointcloud.text_encoder.VECTORS_REMEMBERED", 1)
+    monkeypatch.setattr("og_pointcloud.text.encoder.VECTORS_REMEMBERED", 1)
     encoder.encode(["cat"])
     assert list(encoder._remembered) == ["cat"]
 
@@ -673,7 +673,7 @@ def test_a_damaged_encoder_is_not_passed_over(encoder, encoder_folder, tmp_path,
 
 def test_encoding_brings_nothing_heavy(encoder_folder):
     code = (
-        "import sys\nfrom og_pointcloud.text_encoder import read_text_encoder\n"
+        "import sys\nfrom og_pointcloud.text.encoder import read_text_encoder\n"
         "assert read_text_encoder(sys.argv[1])(['cat']).shape == (1, 24)\nprint(*sys.modules)"
     )
     done = subprocess.run([sys.executable, "-c", code, str(encoder_folder)], capture_output=True, text=True, check=True)

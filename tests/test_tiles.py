@@ -12,15 +12,15 @@ from conftest import TinyCapture
 from make_street import MadeStreet, make_street
 
 import og_pointcloud as og
-from og_pointcloud import tiles
 from og_pointcloud.cli import main
 from og_pointcloud.cloud import LabelledCloud
 from og_pointcloud.errors import OgPointcloudError, SceneError
-from og_pointcloud.fit import fit
+from og_pointcloud.fitting import tiles
+from og_pointcloud.fitting.fit import fit
+from og_pointcloud.fitting.tiles import fit_tiles, split
+from og_pointcloud.fitting.visibility import mask_table
 from og_pointcloud.scene import Camera, Points, Scene, View
 from og_pointcloud.settings import FitSettings, GeometrySettings, VisibilitySettings
-from og_pointcloud.tiles import fit_tiles, split
-from og_pointcloud.visibility import mask_table
 
 SETTINGS = FitSettings(mode="grouping", geometry=GeometrySettings(scales=(0.5,), opacities=(0.9,)))
 POINTS = 60_000

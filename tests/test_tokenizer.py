@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 from og_pointcloud_export.text_tokenizer import clip_description, siglip_description
 
-from og_pointcloud.tokenizer import BYTE_CHARACTERS, WHITESPACE, BytePairs, CharacterMap, Tokenizer, Unigrams
+from og_pointcloud.text.tokenizer import BYTE_CHARACTERS, WHITESPACE, BytePairs, CharacterMap, Tokenizer, Unigrams
 
 CLIP_MERGES = Path(__file__).resolve().parents[2] / "shared" / "data" / "clip" / "bpe_simple_vocab_16e6.txt.gz"
 SMALL_MERGES = [("a", "t</w>"), ("c", "at</w>"), ("l", "o"), ("lo", "w</w>"), ("lo", "w"), ("e", "r</w>")]

@@ -14,9 +14,9 @@ from reference_splatting import front_to_back, reference_pixel_weights, referenc
 from scipy.sparse import csr_array
 
 from og_pointcloud.errors import SceneError
+from og_pointcloud.fitting.testimony import hear_views
+from og_pointcloud.fitting.visibility import Cutoffs, Gaussians, mask_table, pixel_weights, render, view_weights
 from og_pointcloud.scene import Camera, Points, View
-from og_pointcloud.testimony import hear_views
-from og_pointcloud.visibility import Cutoffs, Gaussians, mask_table, pixel_weights, render, view_weights
 
 NEAR = 0.25
 MASKS = 12

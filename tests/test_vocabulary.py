@@ -21,9 +21,9 @@ from og_pointcloud.choosing import WordBank
 from og_pointcloud.cli import main
 from og_pointcloud.cloud import Vocabulary
 from og_pointcloud.errors import BundleError, FeatureSpaceError, OgPointcloudError
-from og_pointcloud.text_encoder import TextEncoder, encoder_for, read_text_encoder
-from og_pointcloud.vocabulary import add_words, best_cosines, carry_encoder, everyday_words, read_words, store_bank
-from og_pointcloud.words import resolve_labels
+from og_pointcloud.text.encoder import TextEncoder, encoder_for, read_text_encoder
+from og_pointcloud.text.vocabulary import add_words, best_cosines, carry_encoder, everyday_words, read_words, store_bank
+from og_pointcloud.text.words import resolve_labels
 
 NEW = Vocabulary(("grape", "Größe 40"), 3 * unit_rows(2, seed=9))
 
@@ -331,7 +331,7 @@ def test_banks_of_encoders_are_checked(encoder_folder, tmp_path, bank):
 def test_a_carried_encoder_answers_and_is_read_only_when_asked(
     path, encoder_folder, bundle_file, monkeypatch, tmp_path
 ):
-    monkeypatch.setattr("og_pointcloud.text_encoder.cache_folder", lambda: tmp_path / "none")
+    monkeypatch.setattr("og_pointcloud.text.encoder.cache_folder", lambda: tmp_path / "none")
     assert read_carried_encoder(path) is None
     assert carry_encoder(path, encoder_folder).feature_space == SPACE
     bundle = read_bundle(path, verify_sha256=True)

@@ -1,4 +1,4 @@
-"""A CLIP or SigLIP model's files -> the folder that og_pointcloud.text_encoder reads, held against torch first.
+"""A CLIP or SigLIP model's files -> the folder that og_pointcloud.text.encoder reads, held against torch first.
 
 The graph is built from the weights (text_graph); ``torch_vectors`` is the same tower written in torch, so that two ways
 must agree before anything is written.
@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from og_pointcloud._npy import npy_bytes
 from og_pointcloud.bundle import read_bundle
 from og_pointcloud.errors import FeatureSpaceError, MissingExtraError, OgPointcloudError
-from og_pointcloud.text_encoder import (
+from og_pointcloud.text.encoder import (
     ENCODER_FILES,
     FORMAT,
     GRAPH,
@@ -35,7 +35,7 @@ from og_pointcloud.text_encoder import (
     cache_folder,
     check_templates,
 )
-from og_pointcloud.vocabulary import best_cosines, everyday_words
+from og_pointcloud.text.vocabulary import best_cosines, everyday_words
 from og_pointcloud_export.text_graph import build_text_graph
 from og_pointcloud_export.text_tokenizer import find_tokenizer, read_json
 from og_pointcloud_export.text_weights import Activation, Affine, Block, TextTower, read_text_tower

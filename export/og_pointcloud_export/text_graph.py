@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.errors import MissingExtraError, OgPointcloudError
-from og_pointcloud.text_encoder import ENCODER_FILES, GRAPH
+from og_pointcloud.text.encoder import ENCODER_FILES, GRAPH
 
 try:
     import onnx

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 from og_pointcloud._onnx_graph import message_fields
 from og_pointcloud.errors import OgPointcloudError
-from og_pointcloud.text_encoder import ENCODER_FILES, TOKENIZER
-from og_pointcloud.tokenizer import BYTE_CHARACTERS, CLIP_WORDS
+from og_pointcloud.text.encoder import ENCODER_FILES, TOKENIZER
+from og_pointcloud.text.tokenizer import BYTE_CHARACTERS, CLIP_WORDS
 
 if TYPE_CHECKING:
     from og_pointcloud_export.text_weights import TextTower

@@ -20,8 +20,8 @@ from og_pointcloud.bundle import FORMAT, SCHEMA_VERSION, TOO_FAR, describe_membe
 from og_pointcloud.cloud import InstanceTable, LabelledCloud
 from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.nearest import NONE_WITHIN_REACH, NearestPoint
-from og_pointcloud.text_encoder import find_encoder, read_text_encoder
-from og_pointcloud.vocabulary import bank_members, encoder_members, vocabulary_members
+from og_pointcloud.text.encoder import find_encoder, read_text_encoder
+from og_pointcloud.text.vocabulary import bank_members, encoder_members, vocabulary_members
 from og_pointcloud_export.brick_grid import BrickGrid, build_brick_grid
 from og_pointcloud_export.query_head import OPSET, build_query_head, reference_scores
 
@@ -47,7 +47,7 @@ def write_bundle(
     """Write a cloud as .ogpc, whole or not at all, the same bytes for the same cloud. Returns the path.
 
     text_encoder: the folder of an encoder for the file to carry. A cloud without a word bank gets that of this encoder,
-    or of the one that is found for its feature space (`og_pointcloud.text_encoder.find_encoder`), if there is any.
+    or of the one that is found for its feature space (`og_pointcloud.text.encoder.find_encoder`), if there is any.
     Raises OgPointcloudError where the provenance is no JSON, where the graph disagrees with numpy, or the encoder is of
     another feature space: then nothing is written.
     """

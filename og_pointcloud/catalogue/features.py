@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud.association import describe_instances
 from og_pointcloud.catalogue import naive
 from og_pointcloud.catalogue.case import Answer, agrees, powers, refuses
 from og_pointcloud.catalogue.inputs import (
@@ -24,7 +23,8 @@ from og_pointcloud.catalogue.inputs import (
 )
 from og_pointcloud.cloud import InstanceTable
 from og_pointcloud.errors import FeatureSpaceError, SceneError
-from og_pointcloud.fit import fit
+from og_pointcloud.fitting.association import describe_instances
+from og_pointcloud.fitting.fit import fit
 from og_pointcloud.runtime import LabelledScene, segment
 from og_pointcloud.scene import Scene, View
 from og_pointcloud.segmentation import UNKNOWN

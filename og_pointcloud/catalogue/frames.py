@@ -24,12 +24,12 @@ from og_pointcloud.catalogue.inputs import (
     write_two_balls,
 )
 from og_pointcloud.errors import SceneError
-from og_pointcloud.fit import fit
+from og_pointcloud.fitting.fit import fit
+from og_pointcloud.fitting.visibility import NEAR_SHARE, view_weights
 from og_pointcloud.formats.capture import read_capture
 from og_pointcloud.formats.poses import in_local_frame, rigid
 from og_pointcloud.runtime import LabelledScene
 from og_pointcloud.scene import Camera, Points
-from og_pointcloud.visibility import NEAR_SHARE, view_weights
 
 TURNED = np.diag([1.0, -1.0, -1.0, 1.0])
 """A camera that looks the other way."""

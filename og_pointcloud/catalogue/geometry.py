@@ -13,10 +13,10 @@ from og_pointcloud.catalogue import naive, reference
 from og_pointcloud.catalogue.case import Answer, agrees, powers, refuses
 from og_pointcloud.catalogue.inputs import NEAR, camera, dense_weights, scatter, single, splatted
 from og_pointcloud.errors import SceneError
+from og_pointcloud.fitting.visibility import Gaussians
 from og_pointcloud.formats.ply import join_columns, write_ply
 from og_pointcloud.formats.points import read_points
 from og_pointcloud.scene import Points
-from og_pointcloud.visibility import Gaussians
 
 WEIGHTS = 1e-6
 """Of blending weights: they are stored as float32, which knows 1 to 6e-8."""

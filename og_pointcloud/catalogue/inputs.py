@@ -13,9 +13,9 @@ from scipy.sparse import csr_array
 from og_pointcloud.catalogue import naive, reference
 from og_pointcloud.catalogue.case import Answer
 from og_pointcloud.cloud import InstanceTable, LabelledCloud, Vocabulary
+from og_pointcloud.fitting.visibility import Gaussians, MaskTable, pixel_weights
 from og_pointcloud.formats.poses import in_local_frame, rigid
 from og_pointcloud.scene import Camera, Points, Scene, View
-from og_pointcloud.visibility import Gaussians, MaskTable, pixel_weights
 
 __all__ = [
     "SPACE", "by_ball", "camera", "dense_weights", "int32", "labelled_cloud", "mask_table_of", "scatter", "single",

@@ -7,18 +7,18 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud.association import describe_instances
 from og_pointcloud.catalogue import naive
 from og_pointcloud.catalogue.case import Answer, agrees, powers, refuses
 from og_pointcloud.catalogue.inputs import by_ball, int32, mask_table_of, single, two_balls, unit_rows
 from og_pointcloud.cloud import UNOBSERVED
-from og_pointcloud.codebook import kmeans, two_level_codebook
 from og_pointcloud.errors import OgPointcloudError, SceneError
-from og_pointcloud.features import FeatureObjective, learn_features
-from og_pointcloud.fit import fit
+from og_pointcloud.fitting.association import describe_instances
+from og_pointcloud.fitting.codebook import kmeans, two_level_codebook
+from og_pointcloud.fitting.features import FeatureObjective, learn_features
+from og_pointcloud.fitting.fit import fit
+from og_pointcloud.fitting.visibility import MaskTable
 from og_pointcloud.scene import Points, Scene
 from og_pointcloud.settings import AssociationSettings, CodebookSettings, FeatureSettings
-from og_pointcloud.visibility import MaskTable
 
 MASKS, EACH = 3, 200
 SEPARATE = np.sqrt(3)

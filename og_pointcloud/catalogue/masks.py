@@ -12,10 +12,10 @@ from og_pointcloud.catalogue import naive, reference
 from og_pointcloud.catalogue.case import Answer, agrees, powers, refuses
 from og_pointcloud.catalogue.inputs import NEAR, by_ball, camera, scatter, two_balls, unit_rows
 from og_pointcloud.errors import SceneError
-from og_pointcloud.fit import fit
+from og_pointcloud.fitting.fit import fit
+from og_pointcloud.fitting.visibility import mask_table
 from og_pointcloud.scene import Scene, View
 from og_pointcloud.settings import FitSettings
-from og_pointcloud.visibility import mask_table
 
 
 @agrees(1e-6, "masks in the view", (0, *powers(0, 4)))

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from og_pointcloud.fitting.visibility import Gaussians
 from og_pointcloud.scene import Camera
-from og_pointcloud.visibility import Gaussians
 
 __all__ = ["blended", "mask_sums", "pixel_weights", "rotation_matrices"]
 

@@ -15,7 +15,7 @@ from og_pointcloud.catalogue.inputs import SPACE, labelled_cloud, unit_rows
 from og_pointcloud.cloud import LabelledCloud, Vocabulary
 from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError
 from og_pointcloud.runtime import LabelledScene, Segmenter, load, segment
-from og_pointcloud.text_features import read_text_features
+from og_pointcloud.text.features import read_text_features
 
 
 @agrees(1e-6, "length of a word's vector", (1e-44, 1e-38, 1e-30, *powers(-20, 20, 10), 1e30, 1e37))

@@ -74,7 +74,7 @@ def run(arguments: argparse.Namespace) -> None:
     settings = fit_settings(arguments)
     from og_pointcloud_export import write_bundle
 
-    from og_pointcloud import table_store, tiles
+    from og_pointcloud.fitting import table_store, tiles
     from og_pointcloud.formats.capture import read_capture
 
     stages: list[dict[str, Any]] = []
@@ -106,8 +106,8 @@ def run(arguments: argparse.Namespace) -> None:
 
 def labelled(scene: Scene, settings: FitSettings, tile_points: int | None, work: Path) -> LabelledCloud:
     """The scene fitted whole, or in tiles where that is asked for or needed."""
-    from og_pointcloud.fit import fit
-    from og_pointcloud.tiles import fit_tiles, needs_tiles
+    from og_pointcloud.fitting.fit import fit
+    from og_pointcloud.fitting.tiles import fit_tiles, needs_tiles
 
     progress = sys.stderr.isatty()
     if tile_points is None and not needs_tiles(scene, settings):
@@ -140,7 +140,7 @@ def positive(text: str) -> int:
 
 
 def memory(text: str) -> int:
-    from og_pointcloud.memory import parse_memory
+    from og_pointcloud.fitting.memory import parse_memory
 
     try:
         return parse_memory(text)
@@ -150,7 +150,7 @@ def memory(text: str) -> int:
 
 def vocabulary_for(scene: Scene, arguments: argparse.Namespace) -> tuple[Vocabulary | None, list[dict[str, str]]]:
     """Words for the bundle, and what was left out: those asked for, else the capture's own if their space fits."""
-    from og_pointcloud.text_features import read_text_features
+    from og_pointcloud.text.features import read_text_features
 
     path = arguments.vocabulary or arguments.capture / "text_features.npz"
     if not arguments.vocabulary and not path.is_file():
@@ -170,9 +170,9 @@ def vocabulary_for(scene: Scene, arguments: argparse.Namespace) -> tuple[Vocabul
 
 def word_bank_for(scene: Scene, path: Path | None) -> WordBank | None:
     """The bank asked for, else that of the encoder that is found for the scene, if any; checked before the fit."""
-    from og_pointcloud.text_encoder import find_encoder
-    from og_pointcloud.text_features import UNKNOWN_SPACE
-    from og_pointcloud.vocabulary import read_bank
+    from og_pointcloud.text.encoder import find_encoder
+    from og_pointcloud.text.features import UNKNOWN_SPACE
+    from og_pointcloud.text.vocabulary import read_bank
 
     if path is not None:
         bank, feature_space = read_bank(path)

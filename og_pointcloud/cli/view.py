@@ -38,11 +38,11 @@ def run(arguments: argparse.Namespace) -> None:
     check_outputs({"-o": (output, [".png"])}, inputs=[arguments.capture, arguments.instances])
     if arguments.columns < 1:
         raise OgPointcloudError(f"--columns is {arguments.columns}; expected at least 1")
-    from og_pointcloud import pictures
-    from og_pointcloud.fit import prepare
+    from og_pointcloud.fitting import pictures
+    from og_pointcloud.fitting.fit import prepare
+    from og_pointcloud.fitting.geometry import near_plane
+    from og_pointcloud.fitting.journal import Journal
     from og_pointcloud.formats.capture import read_capture
-    from og_pointcloud.geometry import near_plane
-    from og_pointcloud.journal import Journal
 
     stages: list[dict[str, Any]] = []
     with timed(stages, "read capture"):

@@ -61,7 +61,7 @@ def add_bundle(parser: argparse.ArgumentParser, writes: bool) -> None:
 
 def run_add(arguments: argparse.Namespace) -> None:
     from og_pointcloud.bundle import read_bundle
-    from og_pointcloud.vocabulary import add_words, read_words
+    from og_pointcloud.text.vocabulary import add_words, read_words
 
     if arguments.words is None and arguments.text_features is None:
         arguments.parser.error("no words: name a file with one a line, or --text-features F.npz")
@@ -80,7 +80,7 @@ def run_add(arguments: argparse.Namespace) -> None:
 def from_features(path: Path, words: tuple[str, ...] | None) -> Any:
     """The vocabulary (of some words only, if any are named) and the feature space of a text-features file."""
     from og_pointcloud.cloud import Vocabulary
-    from og_pointcloud.text_features import read_text_features
+    from og_pointcloud.text.features import read_text_features
 
     vocabulary, space = read_text_features(path)
     if words is None:
@@ -96,7 +96,7 @@ def from_features(path: Path, words: tuple[str, ...] | None) -> Any:
 def encoded(words: tuple[str, ...] | None, folder: Path | None, own_space: str, bundle: Path) -> Any:
     """The words as the scene's encoder, or the one in a folder, has them; and its feature space."""
     from og_pointcloud.cloud import Vocabulary
-    from og_pointcloud.text_encoder import encoder_for, read_text_encoder
+    from og_pointcloud.text.encoder import encoder_for, read_text_encoder
 
     encoder = read_text_encoder(folder) if folder else encoder_for(own_space, bundle)
     if encoder.feature_space != own_space:
@@ -117,8 +117,8 @@ def run_list(arguments: argparse.Namespace) -> None:
 
 def run_bank(arguments: argparse.Namespace) -> None:
     from og_pointcloud.bundle import read_bundle
-    from og_pointcloud.text_encoder import encoder_for, read_text_encoder
-    from og_pointcloud.vocabulary import read_bank, store_bank
+    from og_pointcloud.text.encoder import encoder_for, read_text_encoder
+    from og_pointcloud.text.vocabulary import read_bank, store_bank
 
     check_outputs({"-o": (arguments.output, [".ogpc"])}, inputs=[arguments.features])
     if arguments.features:
@@ -136,7 +136,7 @@ def run_bank(arguments: argparse.Namespace) -> None:
 
 
 def run_carry(arguments: argparse.Namespace) -> None:
-    from og_pointcloud.vocabulary import carry_encoder
+    from og_pointcloud.text.vocabulary import carry_encoder
 
     check_outputs({"-o": (arguments.output, [".ogpc"])}, inputs=[])
     encoder = carry_encoder(arguments.bundle, arguments.encoder, arguments.output)

@@ -31,10 +31,10 @@ from og_pointcloud.formats.gaussian_ply import latest_iteration, read_gaussian_p
 from og_pointcloud.formats.langsplat import LANGSPLAT_SPACE, LANGSPLAT_WIDTH
 from og_pointcloud.formats.tables import naming
 from og_pointcloud.settings import GeometrySettings
-from og_pointcloud.text_features import UNKNOWN_SPACE
+from og_pointcloud.text.features import UNKNOWN_SPACE
 
 try:
-    from og_pointcloud.geometry import neighbourhood
+    from og_pointcloud.fitting.geometry import neighbourhood
 except ImportError as error:
     raise MissingExtraError("scipy and numba", "fit") from error
 

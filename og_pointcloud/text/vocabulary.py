@@ -23,8 +23,8 @@ from og_pointcloud.bundle import BANK, CARRIED_ENCODER, NO_EVIDENCE, describe_me
 from og_pointcloud.choosing import WordBank
 from og_pointcloud.cloud import InstanceTable, LabelledCloud, Vocabulary
 from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError
-from og_pointcloud.text_encoder import TextEncoder, encoder_files
-from og_pointcloud.text_features import UNKNOWN_SPACE, read_text_features
+from og_pointcloud.text.encoder import TextEncoder, encoder_files
+from og_pointcloud.text.features import UNKNOWN_SPACE, read_text_features
 
 __all__ = [
     "AddedWords", "add_words", "bank_members", "best_cosines", "carry_encoder", "compact_vectors", "encoder_members",

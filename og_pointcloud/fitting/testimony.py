@@ -18,8 +18,8 @@ import numpy as np
 from numba import njit
 from scipy.sparse import csr_array
 
-from og_pointcloud.memory import scratch_like
-from og_pointcloud.visibility import MaskTable
+from og_pointcloud.fitting.memory import scratch_like
+from og_pointcloud.fitting.visibility import MaskTable
 
 __all__ = ["Testimony", "hear_views"]
 

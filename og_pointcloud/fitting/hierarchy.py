@@ -15,8 +15,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud.codebook import cluster_weights
-from og_pointcloud.visibility import MaskTable
+from og_pointcloud.fitting.codebook import cluster_weights
+from og_pointcloud.fitting.visibility import MaskTable
 
 __all__ = ["part_of"]
 

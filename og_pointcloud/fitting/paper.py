@@ -31,12 +31,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from og_pointcloud.codebook import kmeans
 from og_pointcloud.errors import MissingExtraError, SceneError
-from og_pointcloud.features import ROUNDING, cohesion_factor, raw_gradient, read_features
+from og_pointcloud.fitting.codebook import kmeans
+from og_pointcloud.fitting.features import ROUNDING, cohesion_factor, raw_gradient, read_features
+from og_pointcloud.fitting.visibility import Gaussians, view_weights
 from og_pointcloud.scene import Camera, View
 from og_pointcloud.settings import PaperSettings
-from og_pointcloud.visibility import Gaussians, view_weights
 
 try:
     import torch

@@ -19,8 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from og_pointcloud.scene import View
-from og_pointcloud.splatting import (
+from og_pointcloud.fitting.splatting import (
     CUTOFFS,
     FRUSTUM_MARGIN,
     NEAR_SHARE,
@@ -32,7 +31,8 @@ from og_pointcloud.splatting import (
     view_weights,
     working_memory,
 )
-from og_pointcloud.table_store import TableStore
+from og_pointcloud.fitting.table_store import TableStore
+from og_pointcloud.scene import View
 
 __all__ = [
     "FRUSTUM_MARGIN",

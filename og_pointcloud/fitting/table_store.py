@@ -23,7 +23,7 @@ from scipy.sparse import csr_array
 
 from og_pointcloud._atomic import replacing
 from og_pointcloud.errors import OgPointcloudError
-from og_pointcloud.memory import Column, scratch_file
+from og_pointcloud.fitting.memory import Column, scratch_file
 
 __all__ = ["Rows", "TableStore", "kept_views", "remove_work"]
 

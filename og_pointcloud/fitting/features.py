@@ -41,9 +41,9 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from og_pointcloud.errors import SceneError
+from og_pointcloud.fitting.visibility import Gaussians, MaskTable, pixel_weights
 from og_pointcloud.scene import View
 from og_pointcloud.settings import FeatureSettings, PaperSettings
-from og_pointcloud.visibility import Gaussians, MaskTable, pixel_weights
 
 __all__ = [
     "FeatureObjective",

@@ -27,9 +27,9 @@ from og_pointcloud.settings import CodebookSettings, FeatureSettings
 try:
     from scipy.sparse import csr_array
 
-    from og_pointcloud.codebook import two_level_codebook
-    from og_pointcloud.features import learn_features
-    from og_pointcloud.visibility import Gaussians, MaskTable, pixel_weights
+    from og_pointcloud.fitting.codebook import two_level_codebook
+    from og_pointcloud.fitting.features import learn_features
+    from og_pointcloud.fitting.visibility import Gaussians, MaskTable, pixel_weights
 except ImportError as error:
     raise MissingExtraError("scipy and numba", "fit") from error
 

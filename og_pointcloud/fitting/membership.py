@@ -27,13 +27,13 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
 from og_pointcloud.cloud import BACKGROUND, UNOBSERVED
-from og_pointcloud.geometry import Neighbourhood
-from og_pointcloud.grouping import MaskGroups
-from og_pointcloud.memory import in_file
+from og_pointcloud.fitting.geometry import Neighbourhood
+from og_pointcloud.fitting.grouping import MaskGroups
+from og_pointcloud.fitting.memory import in_file
+from og_pointcloud.fitting.table_store import Rows
+from og_pointcloud.fitting.testimony import Testimony
+from og_pointcloud.fitting.visibility import Gaussians, MaskTable
 from og_pointcloud.settings import MembershipSettings
-from og_pointcloud.table_store import Rows
-from og_pointcloud.testimony import Testimony
-from og_pointcloud.visibility import Gaussians, MaskTable
 
 __all__ = ["Membership", "assign_points", "without_see_through"]
 

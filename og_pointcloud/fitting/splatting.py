@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from og_pointcloud.errors import SceneError
-from og_pointcloud.lanes import WIDTH, any_of, either, exp2, lesser, load, ramp, spread, store, total
+from og_pointcloud.fitting.lanes import WIDTH, any_of, either, exp2, lesser, load, ramp, spread, store, total
 from og_pointcloud.scene import Camera, Points
 
 # OpenMP first: numba else tries TBB, and warns where it finds an old one. A user's own choice is kept.

@@ -16,12 +16,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud.association import directions, robust_mean
 from og_pointcloud.cloud import InstanceTable
-from og_pointcloud.codebook import cluster_weights
+from og_pointcloud.fitting.association import directions, robust_mean
+from og_pointcloud.fitting.codebook import cluster_weights
+from og_pointcloud.fitting.visibility import FRUSTUM_MARGIN, Gaussians, MaskTable, view_weights
 from og_pointcloud.scene import Camera, View
 from og_pointcloud.settings import AssociationSettings, MatchingSettings
-from og_pointcloud.visibility import FRUSTUM_MARGIN, Gaussians, MaskTable, view_weights
 
 __all__ = ["Evidence", "Matching", "alone_evidence", "eq5_scores", "match_masks", "visible_evidence"]
 

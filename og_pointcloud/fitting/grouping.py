@@ -23,9 +23,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
+from og_pointcloud.fitting.testimony import Testimony
+from og_pointcloud.fitting.visibility import MaskTable
 from og_pointcloud.settings import GroupingSettings
-from og_pointcloud.testimony import Testimony
-from og_pointcloud.visibility import MaskTable
 
 __all__ = ["MaskGroups", "group_masks", "indicator"]
 

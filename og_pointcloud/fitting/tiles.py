@@ -35,10 +35,10 @@ from scipy.sparse import csr_array, vstack
 from scipy.spatial import cKDTree
 
 from og_pointcloud._atomic import replacing
-from og_pointcloud.association import describe_instances
 from og_pointcloud.cloud import LabelledCloud
 from og_pointcloud.errors import OgPointcloudError, SceneError
-from og_pointcloud.fit import (
+from og_pointcloud.fitting.association import describe_instances
+from og_pointcloud.fitting.fit import (
     check_scene,
     cutoffs,
     labelled_cloud,
@@ -46,7 +46,7 @@ from og_pointcloud.fit import (
     pixel_stride,
     with_needed_views,
 )
-from og_pointcloud.geometry import (
+from og_pointcloud.fitting.geometry import (
     Neighbourhood,
     chance_of_place,
     choose_gaussians,
@@ -56,16 +56,16 @@ from og_pointcloud.geometry import (
     sample_of_points,
     thinned,
 )
-from og_pointcloud.grouping import MaskGroups, group_masks, indicator
-from og_pointcloud.hierarchy import part_of
-from og_pointcloud.journal import Journal
-from og_pointcloud.membership import assign_points, without_see_through
-from og_pointcloud.memory import free_memory, memory_in_use
-from og_pointcloud.modes import Labelling
+from og_pointcloud.fitting.grouping import MaskGroups, group_masks, indicator
+from og_pointcloud.fitting.hierarchy import part_of
+from og_pointcloud.fitting.journal import Journal
+from og_pointcloud.fitting.membership import assign_points, without_see_through
+from og_pointcloud.fitting.memory import free_memory, memory_in_use
+from og_pointcloud.fitting.modes import Labelling
+from og_pointcloud.fitting.testimony import hear_views
+from og_pointcloud.fitting.visibility import FRUSTUM_MARGIN, Gaussians, MaskTable, mask_table
 from og_pointcloud.scene import Points, Scene, View
 from og_pointcloud.settings import FitSettings
-from og_pointcloud.testimony import hear_views
-from og_pointcloud.visibility import FRUSTUM_MARGIN, Gaussians, MaskTable, mask_table
 
 __all__ = ["Tiles", "fit_tiles", "kept_views", "needs_tiles", "split"]
 

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from og_pointcloud.errors import OgPointcloudError
-from og_pointcloud.grouping import indicator
+from og_pointcloud.fitting.grouping import indicator
+from og_pointcloud.fitting.visibility import MaskTable
 from og_pointcloud.settings import CodebookSettings
-from og_pointcloud.visibility import MaskTable
 
 __all__ = [
     "Codebook",

@@ -18,20 +18,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud.association import describe_instances
 from og_pointcloud.cloud import UNOBSERVED, InstanceTable
-from og_pointcloud.codebook import cluster_weights, two_level_codebook
-from og_pointcloud.features import learn_features
-from og_pointcloud.geometry import Neighbourhood, sample_of_points, thinned
-from og_pointcloud.grouping import MaskGroups, group_masks
-from og_pointcloud.hierarchy import part_of
-from og_pointcloud.journal import Journal
-from og_pointcloud.matching import Matching, alone_evidence, match_masks, visible_evidence
-from og_pointcloud.membership import assign_points
+from og_pointcloud.fitting.association import describe_instances
+from og_pointcloud.fitting.codebook import cluster_weights, two_level_codebook
+from og_pointcloud.fitting.features import learn_features
+from og_pointcloud.fitting.geometry import Neighbourhood, sample_of_points, thinned
+from og_pointcloud.fitting.grouping import MaskGroups, group_masks
+from og_pointcloud.fitting.hierarchy import part_of
+from og_pointcloud.fitting.journal import Journal
+from og_pointcloud.fitting.matching import Matching, alone_evidence, match_masks, visible_evidence
+from og_pointcloud.fitting.membership import assign_points
+from og_pointcloud.fitting.testimony import Testimony, hear_views
+from og_pointcloud.fitting.visibility import Gaussians, MaskTable
 from og_pointcloud.scene import Scene
 from og_pointcloud.settings import FitSettings
-from og_pointcloud.testimony import Testimony, hear_views
-from og_pointcloud.visibility import Gaussians, MaskTable
 
 __all__ = [
     "Labelling",
@@ -142,7 +142,7 @@ def by_features(scene: Scene, prepared: Prepared, settings: FitSettings, journal
 
 def as_published(scene: Scene, prepared: Prepared, settings: FitSettings, journal: Journal) -> Labelling:
     """The paper's method: features and codebook trained by rendering, instances matched as rendered alone (Eq. 5)."""
-    from og_pointcloud.paper import train_codebook, train_features
+    from og_pointcloud.fitting.paper import train_codebook, train_features
 
     paper, gaussians, near = settings.paper, prepared.gaussians, prepared.near
     views = [thinned(view, prepared.stride) for view in scene.views]

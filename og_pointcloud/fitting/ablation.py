@@ -34,19 +34,19 @@ from numpy.typing import NDArray
 from og_pointcloud._atomic import replacing
 from og_pointcloud.cloud import InstanceTable, Vocabulary
 from og_pointcloud.errors import FeatureSpaceError, MissingExtraError, OgPointcloudError, SceneError
-from og_pointcloud.geometry import thinned
+from og_pointcloud.fitting.geometry import thinned
 from og_pointcloud.metrics import score_labels
 from og_pointcloud.scene import Scene
 from og_pointcloud.settings import CodebookSettings, FeatureSettings, FitSettings, MatchingSettings, PaperSettings
-from og_pointcloud.text_features import read_text_features
+from og_pointcloud.text.features import read_text_features
 
 try:
-    from og_pointcloud.codebook import two_level_codebook
-    from og_pointcloud.features import learn_features
-    from og_pointcloud.fit import prepare
-    from og_pointcloud.journal import Journal
-    from og_pointcloud.matching import alone_evidence, match_masks, visible_evidence
-    from og_pointcloud.modes import Prepared, by_features, by_grouping, mask_means
+    from og_pointcloud.fitting.codebook import two_level_codebook
+    from og_pointcloud.fitting.features import learn_features
+    from og_pointcloud.fitting.fit import prepare
+    from og_pointcloud.fitting.journal import Journal
+    from og_pointcloud.fitting.matching import alone_evidence, match_masks, visible_evidence
+    from og_pointcloud.fitting.modes import Prepared, by_features, by_grouping, mask_means
 except ImportError as error:
     raise MissingExtraError("scipy and numba", "fit") from error
 
@@ -320,7 +320,7 @@ class _Stages:
         return replace(outcome, seconds=outcome.seconds + first + second)
 
     def _paper(self, paper: PaperSettings) -> _Outcome:
-        from og_pointcloud.paper import train_codebook, train_features
+        from og_pointcloud.fitting.paper import train_codebook, train_features
 
         prepared = self._full_gaussians()
         scene = (prepared.gaussians, self.views, prepared.near)

@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from og_pointcloud.fitting.visibility import NEAR_SHARE, Gaussians, render
 from og_pointcloud.scene import Camera, Points, View
 from og_pointcloud.settings import GeometrySettings
-from og_pointcloud.visibility import NEAR_SHARE, Gaussians, render
 
 __all__ = [
     "GeometryChoice",

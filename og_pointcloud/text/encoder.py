@@ -31,7 +31,7 @@ from og_pointcloud._npy import array_from_npy
 from og_pointcloud._onnx_graph import check_graph
 from og_pointcloud.choosing import WordBank
 from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError
-from og_pointcloud.tokenizer import Tokenizer
+from og_pointcloud.text.tokenizer import Tokenizer
 
 if TYPE_CHECKING:
     from onnxruntime import InferenceSession

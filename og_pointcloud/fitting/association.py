@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from og_pointcloud.cloud import InstanceTable
+from og_pointcloud.fitting.visibility import MaskTable
 from og_pointcloud.settings import AssociationSettings
-from og_pointcloud.visibility import MaskTable
 
 __all__ = ["describe_instances", "directions", "robust_mean"]
 
