@@ -231,6 +231,16 @@ def test_world_frame_and_unit_do_not_matter(
     assert cloud.spacing == pytest.approx(unit * labelled.spacing, rel=1e-2)
 
 
+def test_points_given_twice_get_the_labels_they_had(known: Known, labelled: LabelledCloud) -> None:
+    points, count = known.scene.points, len(known.scene.points)
+    assert not points.are_gaussians
+    again = np.concatenate([np.arange(count), np.arange(count)[::-1]])
+    colors = None if points.rgb is None else points.rgb[again]
+    cloud = fit(replace(known.scene, points=replace(points, xyz=points.xyz[again], rgb=colors)), progress=False)
+    np.testing.assert_array_equal(cloud.instance_ids, labelled.instance_ids[again])
+    assert any("exactly where another lies" in str(entry) for entry in cloud.provenance["left_out"])
+
+
 def test_views_given_twice_do_not_matter(known: Known, labelled: LabelledCloud) -> None:
     twice = (*known.scene.views, *[replace(view, name=f"{view.name} again") for view in known.scene.views])
     cloud = fit(replace(known.scene, views=twice), progress=False)

@@ -18,6 +18,7 @@ from og_pointcloud.fitting.geometry import (
     GeometryChoice,
     Neighbourhood,
     choose_gaussians,
+    distinct_places,
     isotropic,
     near_plane,
     neighbourhood,
@@ -56,14 +57,16 @@ def fit(
     settings = settings or FitSettings()
     journal = Journal(progress)
     check_scene(scene, journal)
+    whole, place = scene, None
     if prepared is None:
         scene = with_needed_views(scene, settings, journal)
+        scene, place = with_distinct_points(scene, journal)
         prepared = prepare(scene, settings, journal, work)
     road = {"auto": by_choice, "grouping": by_grouping, "fast": by_features, "paper": as_published}[settings.mode]
     labelling = road(scene, prepared, settings, journal)
     if work is not None:
         remove_work(Path(work))
-    return labelled_cloud(scene, labelling, prepared.neighbourhood.spacing, settings, journal)
+    return labelled_cloud(whole, labelling, place, prepared.neighbourhood.spacing, settings, journal)
 
 
 def prepare(
@@ -133,6 +136,25 @@ def with_needed_views(scene: Scene, settings: FitSettings, journal: Journal) -> 
         f"nearly all that they see is seen by {enough} others",
     )
     return replace(scene, views=tuple(scene.views[index] for index in needed))
+
+
+def with_distinct_points(scene: Scene, journal: Journal) -> tuple[Scene, NDArray[np.int64] | None]:
+    """The scene with one point a place, and which of them speaks for each of its points; None where all differ.
+
+    A point hides another at its very place, which would then seem unseen. Gaussians stay: their overlap is the scene's.
+    """
+    points = scene.points
+    if points.are_gaussians:
+        return scene, None
+    first, place = distinct_places(points.xyz)
+    if len(first) == len(points):
+        return scene, None
+    journal.leave_out(f"{len(points) - len(first)} points", "they lie exactly where another lies, and get its label")
+    columns = {
+        name: None if value is None else value[first]
+        for name, value in (("rgb", points.rgb), ("normals", points.normals))
+    }
+    return replace(scene, points=replace(points, xyz=points.xyz[first], **columns)), place
 
 
 def _gaussians(scene: Scene, around: Neighbourhood, near: float, settings: FitSettings, journal: Journal) -> Gaussians:
@@ -226,10 +248,19 @@ def _front_surfaces(
 
 
 def labelled_cloud(
-    scene: Scene, labelling: Labelling, spacing: NDArray[np.float32], settings: FitSettings, journal: Journal
+    scene: Scene,
+    labelling: Labelling,
+    place: NDArray[np.int64] | None,
+    spacing: NDArray[np.float32],
+    settings: FitSettings,
+    journal: Journal,
 ) -> LabelledCloud:
-    """The scene's points with their labels, and how they came about; a warning where there is no instance."""
-    ids, typical = labelling.instance_ids, float(np.median(spacing))
+    """The scene's points with their labels, and how they came about; a warning where there is no instance.
+
+    place: for each point of the scene the row of the labelling that speaks for it; None: its own.
+    """
+    ids = labelling.instance_ids if place is None else labelling.instance_ids[place]
+    typical = float(np.median(spacing))
     states = {"labelled": ids >= 0, "background": ids == BACKGROUND, "unobserved": ids == UNOBSERVED}
     journal.notes["points_by_state"] = {name: int(state.sum()) for name, state in states.items()}
     journal.notes["instances"] = len(labelling.instances)

@@ -25,6 +25,7 @@ __all__ = [
     "Neighbourhood",
     "chance_of_place",
     "choose_gaussians",
+    "distinct_places",
     "near_plane",
     "neighbourhood",
     "pixels_per_spacing",
@@ -115,6 +116,20 @@ def sample_of_points(xyz: NDArray[np.float32], count: int) -> NDArray[np.int64]:
         return np.arange(len(xyz))
     chance = chance_of_place(xyz)
     return np.flatnonzero(chance <= np.partition(chance, count - 1)[count - 1])
+
+
+def distinct_places(xyz: NDArray[np.float32]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Rows of the first point at each place, ascending, and for every point which of these rows is its place."""
+    everyone = np.arange(len(xyz))
+    bits = np.ascontiguousarray(xyz + np.float32(0)).view(np.uint32).astype(np.uint64)  # -0 becomes 0
+    key = bits @ np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)
+    ordered = np.sort(key)
+    if (ordered[1:] != ordered[:-1]).all():  # nearly every cloud; a fifth of the time that looking closer takes
+        return everyone, everyone
+    _, first, place = np.unique(xyz + np.float32(0), axis=0, return_index=True, return_inverse=True)
+    rank = np.empty(len(first), np.int64)
+    rank[np.argsort(first)] = np.arange(len(first))
+    return np.sort(first), rank[place.ravel()]
 
 
 def strided(camera: Camera, stride: int) -> Camera:

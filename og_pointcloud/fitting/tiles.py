@@ -44,6 +44,7 @@ from og_pointcloud.fitting.fit import (
     labelled_cloud,
     note_choice,
     pixel_stride,
+    with_distinct_points,
     with_needed_views,
 )
 from og_pointcloud.fitting.geometry import (
@@ -135,7 +136,9 @@ def fit_tiles(
     settings = settings or FitSettings()
     journal = Journal(progress)
     _check(scene, settings, journal)
+    whole = scene
     views = with_needed_views(scene, settings, journal).views
+    scene, place = with_distinct_points(scene, journal)
     most = points_per_tile or _points_per_tile(len(scene.points), settings)
     with _Kept.open(Path(work) if work else None, _key(scene.points, settings, most)) as kept:
         with journal.stage("spacing"):
@@ -155,7 +158,7 @@ def fit_tiles(
         journal.leave_out(
             "learned features and codebook", "they learn from all points at once, which tiles do not hold"
         )
-    return labelled_cloud(scene, labelling, cloud.spacing, settings, journal)
+    return labelled_cloud(whole, labelling, place, cloud.spacing, settings, journal)
 
 
 def _check(scene: Scene, settings: FitSettings, journal: Journal) -> None:
