@@ -176,6 +176,7 @@ def choose_gaussians(
     LiDAR cloud with a person of five points).
     Without colours or images the settings' start values are used.
     """
+    views = sorted(views, key=lambda view: view.name)  # the same images whatever order the views came in
     photographs = _Photographs(points, spacing, views, near, settings)
     largest = settings.mask_share / max(_spacing_per_mask(points, spacing, views), 1e-12)
     scales = tuple(scale for scale in settings.scales if scale <= largest) or settings.scales[:1]
