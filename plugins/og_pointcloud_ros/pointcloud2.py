@@ -1,0 +1,189 @@
+"""sensor_msgs/PointCloud2 <-> arrays, in numpy alone.
+
+A message is whatever has a PointCloud2's attributes: one of rclpy, of rosbags (ROS 1 or 2), or of ``messages``. Its
+sizes are believed only where they agree with each other and with the data.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from og_pointcloud.errors import SceneError
+from og_pointcloud.segmentation import Segmentation
+from og_pointcloud_ros.messages import MessageFactory, header, plain_messages
+
+__all__ = ["UNLABELLED", "from_pointcloud2", "is_pointcloud2", "read_fields", "to_pointcloud2"]
+
+UNLABELLED = 65535
+"""Label of a point without one, as vision_msgs/LabelInfo has it for 16-bit ids."""
+ATTRIBUTES = ("height", "width", "fields", "is_bigendian", "point_step", "row_step", "data")
+TYPE_CODES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+"""sensor_msgs/PointField's datatypes."""
+DATATYPES = {np.dtype(code): number for number, code in TYPE_CODES.items()}
+
+
+def is_pointcloud2(value: Any) -> bool:
+    """Whether a value has what makes a PointCloud2, whichever library it is of."""
+    return all(hasattr(value, name) for name in ATTRIBUTES)
+
+
+def from_pointcloud2(message: Any) -> NDArray[np.float64]:
+    """(N, 3) float64, the x y z of every point, row by row for an organised cloud, in the message's own frame.
+
+    N is height * width: invalid points stay, as NaN or infinity, so that row i is point i of the message. x, y and z
+    may be of any of the eight types, in any order, at any offset. SceneError where they are absent, or sizes disagree.
+    """
+    rows = read_fields(message)
+    xyz = np.empty((*rows.shape, 3))
+    for axis, name in enumerate("xyz" if rows.size else ""):
+        values = rows[name] if name in (rows.dtype.names or ()) else None
+        if values is None or values.shape != rows.shape:
+            fields = ", ".join(rows.dtype.names or ()) or "none"
+            what = "is absent" if values is None else f"holds {values.shape[-1]} values a point"
+            raise SceneError(
+                f"field '{name}' of a PointCloud2 {what} (its fields: {fields}); expected one each of x, y, z"
+            )
+        xyz[..., axis] = values
+    return xyz.reshape(-1, 3)
+
+
+def read_fields(message: Any) -> NDArray[Any]:
+    """(height, width) structured array over the message's own bytes: ``read_fields(message)["intensity"]``.
+
+    Nothing is copied, unless data is a plain list; read-only where the message's bytes are. A field of count c has
+    shape (height, width, c). Numbers are in the message's byte order. SceneError where sizes disagree.
+    """
+    if not is_pointcloud2(message):
+        absent = next(name for name in ATTRIBUTES if not hasattr(message, name))
+        raise SceneError(f"a {type(message).__name__} has no '{absent}'; expected a sensor_msgs/PointCloud2")
+    height, width, point_step, row_step = (
+        _size(message, name) for name in ("height", "width", "point_step", "row_step")
+    )
+    kind = _dtype(message.fields, point_step, ">" if message.is_bigendian else "<")
+    data = _bytes_of(message.data)
+    # A single row needs no step, and the last row no padding: some drivers leave them out.
+    needed = max(height - 1, 0) * row_step + width * point_step if height else 0
+    fits = row_step >= width * point_step or height <= 1
+    if not fits or data.size not in (needed, height * row_step) or data.size < needed:
+        raise SceneError(
+            f"a PointCloud2 of {height} x {width} points of {point_step} bytes, rows of {row_step}, holds {data.size} "
+            f"bytes; expected {max(needed, height * max(row_step, width * point_step))}: it was cut off, or is no such "
+            "message"
+        )
+    if height * width == 0 or point_step == 0:
+        if height * width:
+            raise SceneError(f"a PointCloud2 has {height * width} points of 0 bytes; expected x, y and z in each")
+        return np.zeros((height, width), kind)
+    return np.ndarray((height, width), kind, data, strides=(row_step if height > 1 else data.size, point_step))
+
+
+def to_pointcloud2(
+    result: Segmentation,
+    frame_id: str = "map",
+    stamp: Any = None,
+    *,
+    xyz: NDArray[np.floating] | None = None,
+    double: bool = False,
+    messages: MessageFactory = plain_messages,
+) -> Any:
+    """A labelled cloud as sensor_msgs/PointCloud2: fields x y z rgb label instance score, 28 bytes a point.
+
+    label: uint32, row of ``result.names``, 65535 unlabelled (``to_label_info`` tells the names). instance: int32, -1
+    background, -2 unobserved, -3 too far. score: float32. rgb: a colour a label, packed as PCL packs it.
+    stamp: a Time message, or nanoseconds since the epoch. messages: the library whose message is made.
+    xyz: (N, 3) coordinates in frame_id, where that is not the scene's world: the cloud as the sensor gave it.
+    double: write x y z as float64, which few viewers read; for coordinates, like a map's, that float32 would round.
+    """
+    xyz = result.xyz if xyz is None else xyz
+    if xyz.shape != (len(result), 3):
+        raise SceneError(f"xyz has shape {xyz.shape}; expected ({len(result)}, 3), a row a label")
+    columns = {
+        **{name: xyz[:, axis] for axis, name in enumerate("xyz")},
+        "rgb": _packed(result.colors),
+        "label": np.where(result.labels < 0, UNLABELLED, result.labels),
+        "instance": result.instances,
+        "score": result.scores,
+    }
+    place = "<f8" if double else "<f4"
+    kind = np.dtype(
+        [*((axis, place) for axis in "xyz"), ("rgb", "<f4"), ("label", "<u4"), ("instance", "<i4"), ("score", "<f4")]
+    )
+    rows = np.empty(len(result), kind)
+    for name, values in columns.items():
+        rows[name] = values
+    return messages(
+        "sensor_msgs/msg/PointCloud2",
+        header=header(messages, frame_id, stamp),
+        height=1,
+        width=len(rows),
+        fields=_point_fields(kind, messages),
+        is_bigendian=False,
+        point_step=kind.itemsize,
+        row_step=rows.nbytes,
+        data=rows.view(np.uint8) if len(rows) else np.zeros(0, np.uint8),
+        is_dense=bool(np.isfinite(xyz).all()),
+    )
+
+
+def _size(message: Any, name: str) -> int:
+    value = getattr(message, name)
+    if not isinstance(value, (int, np.integer)) or value < 0:
+        raise SceneError(f"{name} of a PointCloud2 is {value!r}; expected a whole number from 0")
+    return int(value)
+
+
+def _dtype(fields: Any, point_step: int, byte_order: str) -> np.dtype[Any]:
+    """The fields as a structured type of point_step bytes; unnamed fields are padding."""
+    kinds: dict[str, tuple[Any, int]] = {}
+    for field in fields:
+        name, offset, count = field.name, int(field.offset), max(int(field.count), 1)  # PCL writes a count of 0 as 1
+        code = TYPE_CODES.get(int(field.datatype))
+        if code is None:
+            raise SceneError(
+                f"field '{name}' of a PointCloud2 has datatype {field.datatype}; expected 1 (int8) to 8 (float64)"
+            )
+        end = offset + count * np.dtype(code).itemsize
+        if offset < 0 or end > point_step:
+            raise SceneError(
+                f"field '{name}' of a PointCloud2 spans bytes {offset} to {end} of a point of {point_step} bytes"
+            )
+        if name in kinds:
+            raise SceneError(f"field '{name}' of a PointCloud2 comes twice; expected every name once")
+        if name:
+            kinds[name] = ((byte_order + code, (count,)) if count > 1 else byte_order + code, offset)
+    formats, offsets = [kind for kind, _ in kinds.values()], [offset for _, offset in kinds.values()]
+    return np.dtype({"names": list(kinds), "formats": formats, "offsets": offsets, "itemsize": point_step})
+
+
+def _bytes_of(data: Any) -> NDArray[np.uint8]:
+    if isinstance(data, (list, tuple)):
+        return np.array(data, np.uint8)
+    try:
+        return np.frombuffer(data, np.uint8)
+    except (TypeError, ValueError, BufferError) as error:
+        raise SceneError(
+            f"data of a PointCloud2 is a {type(data).__name__} ({error}); expected contiguous bytes"
+        ) from None
+
+
+def _packed(rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """(N,) float32 whose bits are 0x00RRGGBB."""
+    red, green, blue = rgb.astype(np.uint32).T
+    return (red << 16 | green << 8 | blue).view(np.float32)
+
+
+def _point_fields(kind: np.dtype[Any], messages: MessageFactory) -> list[Any]:
+    fields = kind.fields or {}
+    return [
+        messages(
+            "sensor_msgs/msg/PointField",
+            name=name,
+            offset=int(fields[name][1]),
+            datatype=DATATYPES[fields[name][0]],
+            count=1,
+        )
+        for name in kind.names or ()
+    ]
