@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.errors import SceneError
-from og_pointcloud.segmentation import Segmentation
+from og_pointcloud.segmentation import UNKNOWN, Segmentation, label_colors
 from og_pointcloud_ros.messages import MessageFactory, header, plain_messages
 
 __all__ = ["UNLABELLED", "from_pointcloud2", "is_pointcloud2", "read_fields", "to_pointcloud2"]
@@ -100,20 +100,15 @@ def to_pointcloud2(
     xyz = result.xyz if xyz is None else xyz
     if xyz.shape != (len(result), 3):
         raise SceneError(f"xyz has shape {xyz.shape}; expected ({len(result)}, 3), a row a label")
-    columns = {
-        **{name: xyz[:, axis] for axis, name in enumerate("xyz")},
-        "rgb": _packed(result.colors),
-        "label": np.where(result.labels < 0, UNLABELLED, result.labels),
-        "instance": result.instances,
-        "score": result.scores,
-    }
     place = "<f8" if double else "<f4"
-    kind = np.dtype(
-        [*((axis, place) for axis in "xyz"), ("rgb", "<f4"), ("label", "<u4"), ("instance", "<i4"), ("score", "<f4")]
-    )
+    kind = np.dtype([("xyz", place, 3), ("rgb", "<f4"), ("label", "<u4"), ("instance", "<i4"), ("score", "<f4")])
     rows = np.empty(len(result), kind)
-    for name, values in columns.items():
-        rows[name] = values
+    with np.errstate(over="ignore"):  # what leaves float32 is infinitely far
+        rows["xyz"] = xyz
+    rows["rgb"] = _packed_colors(len(result.names))[result.labels]
+    rows["label"] = np.where(result.labels < 0, UNLABELLED, result.labels)
+    rows["instance"] = result.instances
+    rows["score"] = result.scores
     return messages(
         "sensor_msgs/msg/PointCloud2",
         header=header(messages, frame_id, stamp),
@@ -169,21 +164,17 @@ def _bytes_of(data: Any) -> NDArray[np.uint8]:
         ) from None
 
 
-def _packed(rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """(N,) float32 whose bits are 0x00RRGGBB."""
-    red, green, blue = rgb.astype(np.uint32).T
+def _packed_colors(names: int) -> NDArray[np.float32]:
+    """(names + 1,) float32 whose bits are 0x00RRGGBB: a colour a label, then unknown's, where label -1 finds it."""
+    red, green, blue = label_colors(np.append(np.arange(names), UNKNOWN)).astype(np.uint32).T
     return (red << 16 | green << 8 | blue).view(np.float32)
 
 
 def _point_fields(kind: np.dtype[Any], messages: MessageFactory) -> list[Any]:
-    fields = kind.fields or {}
+    place = kind["xyz"].base
+    columns = [("x", place, 0), ("y", place, place.itemsize), ("z", place, 2 * place.itemsize)]
+    columns += [(name, column, offset) for name, (column, offset, *_) in (kind.fields or {}).items() if name != "xyz"]
     return [
-        messages(
-            "sensor_msgs/msg/PointField",
-            name=name,
-            offset=int(fields[name][1]),
-            datatype=DATATYPES[fields[name][0]],
-            count=1,
-        )
-        for name in kind.names or ()
+        messages("sensor_msgs/msg/PointField", name=name, offset=offset, datatype=DATATYPES[column], count=1)
+        for name, column, offset in columns
     ]

@@ -1,0 +1,95 @@
+"""Instances as vision_msgs: a Detection3DArray of oriented boxes, and the LabelInfo that names label numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from og_pointcloud.boxes import Box
+from og_pointcloud.errors import OgPointcloudError
+from og_pointcloud.instances import Instance, Instances
+from og_pointcloud.runtime import LabelledScene
+from og_pointcloud.segmentation import Segmentation
+from og_pointcloud_ros.messages import MessageFactory, header, plain_messages
+from og_pointcloud_ros.pointcloud2 import UNLABELLED
+
+__all__ = ["to_detections", "to_label_info"]
+
+
+def to_detections(
+    instances: LabelledScene | Instances,
+    result: Segmentation,
+    frame_id: str = "map",
+    stamp: Any = None,
+    *,
+    minimum_points: int = 1,
+    messages: MessageFactory = plain_messages,
+) -> Any:
+    """The labelled instances that points of ``result`` lie on, as vision_msgs/Detection3DArray.
+
+    Each has its label's name as class id, its score, its instance id as id, and the oriented box of the whole instance
+    as the scene knows it, of which the result may show only a part.
+    instances: a scene, or ``og.instance_table(scene, up=(0, 0, 1))`` of it for boxes that stand upright; keep it, for
+    every box is worked out once. result: what ``segment`` or a ``Segmenter`` said of a cloud of the same scene.
+    frame_id: the scene's frame. stamp: a Time message, or nanoseconds since the epoch.
+    minimum_points: points that an instance has in the result, or it is left out.
+    """
+    table = instances.instances if isinstance(instances, LabelledScene) else instances
+    labelled = result.labels >= 0
+    ids, first, counts = np.unique(result.instances[labelled], return_index=True, return_counts=True)
+    if len(ids) and ids[-1] >= len(table):
+        raise OgPointcloudError(f"the result has instance {ids[-1]}, the table {len(table)}: they are of two scenes")
+    labels, scores = result.labels[labelled][first], result.scores[labelled][first]  # the same all over an instance
+    head = header(messages, frame_id, stamp)
+    detections = [
+        _detection(table[int(k)], result.names[label], float(score), head, messages)
+        for k, label, score, count in zip(ids, labels, scores, counts, strict=True)
+        if count >= minimum_points and table[int(k)].points
+    ]
+    return messages("vision_msgs/msg/Detection3DArray", header=head, detections=detections)
+
+
+def to_label_info(
+    names: Sequence[str],
+    frame_id: str = "",
+    stamp: Any = None,
+    *,
+    threshold: float = 0.0,
+    messages: MessageFactory = plain_messages,
+) -> Any:
+    """What the numbers in the field ``label`` mean, as vision_msgs/LabelInfo, to be published once, latched.
+
+    names: those of the result, at most 65,535. threshold: score below which nothing is labelled.
+    """
+    if len(names) > UNLABELLED:
+        raise OgPointcloudError(f"{len(names)} names; expected at most {UNLABELLED}, for {UNLABELLED} means unlabelled")
+    class_map = [
+        messages("vision_msgs/msg/VisionClass", class_id=number, class_name=name) for number, name in enumerate(names)
+    ]
+    head = header(messages, frame_id, stamp)
+    return messages("vision_msgs/msg/LabelInfo", header=head, class_map=class_map, threshold=float(threshold))
+
+
+def _detection(instance: Instance, name: str, score: float, head: Any, messages: MessageFactory) -> Any:
+    box = instance.oriented_box
+    assert box is not None  # it has points
+    pose = _pose(box, messages)
+    size = messages("geometry_msgs/msg/Vector3", **dict(zip("xyz", box.size.tolist(), strict=True)))
+    hypothesis = messages("vision_msgs/msg/ObjectHypothesis", class_id=name, score=score)
+    uncertain = messages("geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=np.zeros(36))
+    return messages(
+        "vision_msgs/msg/Detection3D",
+        header=head,
+        results=[messages("vision_msgs/msg/ObjectHypothesisWithPose", hypothesis=hypothesis, pose=uncertain)],
+        bbox=messages("vision_msgs/msg/BoundingBox3D", center=pose, size=size),
+        id=str(instance.id),
+    )
+
+
+def _pose(box: Box, messages: MessageFactory) -> Any:
+    w, x, y, z = box.rotation_wxyz.tolist()
+    position = messages("geometry_msgs/msg/Point", **dict(zip("xyz", box.center.tolist(), strict=True)))
+    orientation = messages("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
+    return messages("geometry_msgs/msg/Pose", position=position, orientation=orientation)

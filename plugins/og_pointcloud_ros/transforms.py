@@ -1,0 +1,161 @@
+"""A tree of frames over time, as /tf and /tf_static tell it: where one frame lies in another at a moment.
+
+Offline all transforms are known beforehand, so a moment between two of them is interpolated: places on a straight line,
+rotations on the shortest arc. Before the first and after the last nothing is guessed.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from og_pointcloud.errors import OgPointcloudError
+from og_pointcloud_ros.messages import NANOSECONDS, nanoseconds
+
+__all__ = ["TransformError", "TransformTree", "rotation_matrix", "slerp"]
+
+NEARLY_EQUAL = 1 - 1e-8
+"""Cosine of half the angle between two rotations above which the arc is a straight line, to rounding."""
+
+
+class TransformError(OgPointcloudError):
+    """Two frames are not connected, or not at the moment asked for."""
+
+
+@dataclass
+class _Edge:
+    """A frame in its parent: translation (3,) and unit quaternion x y z w, one each a stamp; static without stamps."""
+
+    parent: str
+    stamps: list[int] = field(default_factory=list)
+    poses: list[tuple[NDArray[np.float64], NDArray[np.float64]]] = field(default_factory=list)
+    static: bool = False
+
+
+class TransformTree:
+    """Frames by name, with a leading slash or without. Every frame has one parent; the last one told counts."""
+
+    def __init__(self) -> None:
+        self._edges: dict[str, _Edge] = {}
+
+    @property
+    def frames(self) -> list[str]:
+        """All names, in alphabetical order."""
+        return sorted({*self._edges, *(edge.parent for edge in self._edges.values())})
+
+    def add(
+        self, parent: str, child: str, translation: ArrayLike, rotation_xyzw: ArrayLike, stamp: int = 0, *,
+        static: bool = False,
+    ) -> None:  # fmt: skip
+        """Tell where child lies in parent: p_parent = R p_child + translation. stamp: nanoseconds.
+
+        A static transform holds at all times. TransformError for NaN, infinity, or a quaternion of length 0.
+        """
+        place, turn = np.asarray(translation, np.float64), np.asarray(rotation_xyzw, np.float64)
+        length = float(np.linalg.norm(turn))
+        if not (np.isfinite(place).all() and np.isfinite(length) and length > 1e-6):
+            raise TransformError(
+                f"the transform from '{child}' to '{parent}' is {place.tolist()}, {turn.tolist()}; expected finite "
+                "numbers and a rotation of length 1"
+            )
+        parent, child = parent.lstrip("/"), child.lstrip("/")
+        edge = self._edges.get(child)
+        if edge is None or edge.parent != parent or edge.static != static or static:
+            edge = self._edges[child] = _Edge(parent, static=static)
+        at = bisect_left(edge.stamps, stamp)
+        repeated = at < len(edge.stamps) and edge.stamps[at] == stamp
+        edge.stamps[at : at + repeated] = [stamp]
+        edge.poses[at : at + repeated] = [(place, turn / length)]
+
+    def add_message(self, message: Any, *, static: bool = False) -> None:
+        """All transforms of a tf2_msgs/TFMessage."""
+        for stamped in message.transforms:
+            place, turn = stamped.transform.translation, stamped.transform.rotation
+            self.add(
+                stamped.header.frame_id, stamped.child_frame_id, (place.x, place.y, place.z),
+                (turn.x, turn.y, turn.z, turn.w), nanoseconds(stamped.header.stamp), static=static,
+            )  # fmt: skip
+
+    def lookup(self, target: str, source: str, stamp: int) -> NDArray[np.float64]:
+        """(4, 4) float64 that takes coordinates of source to target at that moment, nanoseconds."""
+        target, source = target.lstrip("/"), source.lstrip("/")
+        down, up = self._to_root(source), self._to_root(target)
+        if source != target and not set(down) & set(up):
+            missing = [repr(frame) for frame in (target, source) if frame not in self.frames]
+            reason = f"{' and '.join(missing)} unknown" if missing else "they hang on no common frame"
+            raise TransformError(
+                f"no transform from '{source}' to '{target}': {reason}; "
+                f"the frames are {', '.join(self.frames) or 'none'}"
+            )
+        common = next(frame for frame in down if frame in up)
+        return np.linalg.inv(self._chain(up[: up.index(common)], stamp)) @ self._chain(
+            down[: down.index(common)], stamp
+        )
+
+    def _to_root(self, frame: str) -> list[str]:
+        """The frame, its parent, and so on."""
+        path = [frame]
+        while path[-1] in self._edges:
+            parent = self._edges[path[-1]].parent
+            if parent in path:
+                raise TransformError(f"frames hang on each other: {' in '.join([*path, parent])}; expected a tree")
+            path.append(parent)
+        return path
+
+    def _chain(self, frames: list[str], stamp: int) -> NDArray[np.float64]:
+        """Coordinates of the first frame in the parent of the last."""
+        matrix = np.eye(4)
+        for frame in frames:
+            matrix = self._pose(frame, stamp) @ matrix
+        return matrix
+
+    def _pose(self, frame: str, stamp: int) -> NDArray[np.float64]:
+        edge = self._edges[frame]
+        if edge.static:
+            return _matrix(*edge.poses[-1])
+        after = bisect_left(edge.stamps, stamp)
+        if after < len(edge.stamps) and edge.stamps[after] == stamp:
+            return _matrix(*edge.poses[after])
+        if not 0 < after < len(edge.stamps):
+            first, last, asked = (moment / NANOSECONDS for moment in (edge.stamps[0], edge.stamps[-1], stamp))
+            raise TransformError(
+                f"'{frame}' in '{edge.parent}' is known from {first:.3f} to {last:.3f} s, not at {asked:.3f} s"
+            )
+        before = after - 1
+        share = (stamp - edge.stamps[before]) / (edge.stamps[after] - edge.stamps[before])
+        (place, turn), (next_place, next_turn) = edge.poses[before], edge.poses[after]
+        return _matrix(place + share * (next_place - place), slerp(turn, next_turn, share))
+
+
+def slerp(first: NDArray[np.float64], second: NDArray[np.float64], share: float) -> NDArray[np.float64]:
+    """(4,) unit quaternion on the shortest arc between two, the first for share 0, the second for 1 (Shoemake 1985)."""
+    cosine = float(first @ second)
+    if cosine < 0:  # q and -q are one rotation
+        second, cosine = -second, -cosine
+    if cosine > NEARLY_EQUAL:
+        mixed = first + share * (second - first)
+        return mixed / np.linalg.norm(mixed)
+    angle = np.arccos(cosine)
+    return (np.sin((1 - share) * angle) * first + np.sin(share * angle) * second) / np.sin(angle)
+
+
+def rotation_matrix(xyzw: ArrayLike) -> NDArray[np.float64]:
+    """(3, 3) of a unit quaternion."""
+    x, y, z, w = np.asarray(xyzw, np.float64)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def _matrix(translation: NDArray[np.float64], xyzw: NDArray[np.float64]) -> NDArray[np.float64]:
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = rotation_matrix(xyzw), translation
+    return matrix
