@@ -24,6 +24,7 @@ from og_pointcloud.cli import (
     info,
     instances,
     pick,
+    ros_bag,
     segment,
     select,
     view,
@@ -35,8 +36,8 @@ from og_pointcloud.errors import MissingExtraError, OgPointcloudError
 __all__ = ["main"]
 
 COMMANDS = (
-    fit, import_, segment, select, pick, instances, edit, view, info, vocabulary, export_text_encoder, ablate, check,
-    demo,
+    fit, import_, segment, select, pick, instances, edit, view, ros_bag, info, vocabulary, export_text_encoder, ablate,
+    check, demo,
 )  # fmt: skip
 
 

@@ -6,6 +6,7 @@ sizes are believed only where they agree with each other and with the data.
 
 from __future__ import annotations
 
+import sys
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,7 @@ from og_pointcloud.errors import SceneError
 from og_pointcloud.segmentation import UNKNOWN, Segmentation, label_colors
 from og_pointcloud_ros.messages import MessageFactory, header, plain_messages
 
-__all__ = ["UNLABELLED", "from_pointcloud2", "is_pointcloud2", "read_fields", "to_pointcloud2"]
+__all__ = ["UNLABELLED", "from_pointcloud2", "is_pointcloud2", "read_fields", "to_pointcloud2", "write_fields"]
 
 UNLABELLED = 65535
 """Label of a point without one, as vision_msgs/LabelInfo has it for 16-bit ids."""
@@ -101,25 +102,53 @@ def to_pointcloud2(
     if xyz.shape != (len(result), 3):
         raise SceneError(f"xyz has shape {xyz.shape}; expected ({len(result)}, 3), a row a label")
     place = "<f8" if double else "<f4"
-    kind = np.dtype([("xyz", place, 3), ("rgb", "<f4"), ("label", "<u4"), ("instance", "<i4"), ("score", "<f4")])
-    rows = np.empty(len(result), kind)
+    colours = [("rgb", "<f4"), ("label", "<u4"), ("instance", "<i4"), ("score", "<f4")]
+    rows = np.empty(len(result), [("xyz", place, 3), *colours])
     with np.errstate(over="ignore"):  # what leaves float32 is infinitely far
         rows["xyz"] = xyz
     rows["rgb"] = _packed_colors(len(result.names))[result.labels]
     rows["label"] = np.where(result.labels < 0, UNLABELLED, result.labels)
     rows["instance"] = result.instances
     rows["score"] = result.scores
+    return write_fields(rows.view([*((axis, place) for axis in "xyz"), *colours]), frame_id, stamp, messages=messages)
+
+
+def write_fields(
+    rows: NDArray[Any], frame_id: str, stamp: Any = None, *, messages: MessageFactory = plain_messages
+) -> Any:
+    """A PointCloud2 of a structured array (N,) or (height, width), its bytes as they are: ``read_fields`` undoes it.
+
+    SceneError for fields that are no numbers of one of the eight types, and for two byte orders in one array.
+    """
+    rows = np.ascontiguousarray(np.atleast_2d(rows))
+    columns = {name: column[:2] for name, column in (rows.dtype.fields or {}).items()}
+    orders = {kind.base.byteorder for kind, _ in columns.values()} - {"|"}
+    known = all(kind.base.newbyteorder("=") in DATATYPES for kind, _ in columns.values())
+    if not columns or len(orders) > 1 or not known:
+        raise SceneError(f"a PointCloud2 cannot hold {rows.dtype}; expected fields of 8 to 32-bit integers and floats")
+    height, width = rows.shape
+    fields = [
+        messages(
+            "sensor_msgs/msg/PointField",
+            name=name,
+            offset=offset,
+            datatype=DATATYPES[kind.base.newbyteorder("=")],
+            count=int(np.prod(kind.shape)),
+        )
+        for name, (kind, offset) in columns.items()
+    ]
+    coordinates = [rows[axis] for axis in "xyz" if axis in columns]
     return messages(
         "sensor_msgs/msg/PointCloud2",
         header=header(messages, frame_id, stamp),
-        height=1,
-        width=len(rows),
-        fields=_point_fields(kind, messages),
-        is_bigendian=False,
-        point_step=kind.itemsize,
-        row_step=rows.nbytes,
-        data=rows.view(np.uint8) if len(rows) else np.zeros(0, np.uint8),
-        is_dense=bool(np.isfinite(xyz).all()),
+        height=height,
+        width=width,
+        fields=fields,
+        is_bigendian=orders == {">" if sys.byteorder == "little" else "="},
+        point_step=rows.itemsize,
+        row_step=width * rows.itemsize,
+        data=rows.reshape(-1).view(np.uint8) if rows.size else np.zeros(0, np.uint8),
+        is_dense=all(bool(np.isfinite(values).all()) for values in coordinates),
     )
 
 
@@ -168,13 +197,3 @@ def _packed_colors(names: int) -> NDArray[np.float32]:
     """(names + 1,) float32 whose bits are 0x00RRGGBB: a colour a label, then unknown's, where label -1 finds it."""
     red, green, blue = label_colors(np.append(np.arange(names), UNKNOWN)).astype(np.uint32).T
     return (red << 16 | green << 8 | blue).view(np.float32)
-
-
-def _point_fields(kind: np.dtype[Any], messages: MessageFactory) -> list[Any]:
-    place = kind["xyz"].base
-    columns = [("x", place, 0), ("y", place, place.itemsize), ("z", place, 2 * place.itemsize)]
-    columns += [(name, column, offset) for name, (column, offset, *_) in (kind.fields or {}).items() if name != "xyz"]
-    return [
-        messages("sensor_msgs/msg/PointField", name=name, offset=offset, datatype=DATATYPES[column], count=1)
-        for name, column, offset in columns
-    ]

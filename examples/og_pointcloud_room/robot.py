@@ -1,0 +1,209 @@
+"""A robot drives through the room after it was mapped: LiDAR frames with noise, and the truth of every ray.
+
+Since mapping, things have changed: a chair stands elsewhere and two objects are new.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from og_pointcloud.errors import MissingExtraError
+from og_pointcloud_room.furniture import CLASS_NAMES, Item
+from og_pointcloud_room.room import Room, furnish
+from og_pointcloud_room.shapes import Material, box, lathe, rotation_about
+
+try:
+    import open3d as o3d
+except ImportError as error:
+    raise MissingExtraError("open3d", "demo") from error
+
+__all__ = ["BACKGROUND", "MOVED", "NEW", "NO_RETURN", "ChangedRoom", "Drive", "Lidar", "LidarFrame"]
+
+Points = NDArray[np.float64]
+BACKGROUND, NEW, MOVED, NO_RETURN = -1, -2, -3, -4
+"""What a ray hits, where it is no object that stands as it was mapped (a row of CLASS_NAMES)."""
+SENSOR_HEIGHT_M, SPEED_M_S = 0.9, 0.4
+FLOOR_STEP_M = 0.06
+ARRIVAL_CLEARANCE_M = 0.4
+"""From the middle of what was brought in to the path and to all furniture, where there is so much room."""
+
+
+@dataclass(frozen=True)
+class Lidar:
+    """A spinning sensor. beams: between the two elevations, in degrees. columns: a turn. hertz: turns a second.
+
+    noise_m: standard deviation of ranges; dropouts: share of rays without a return; both of a common indoor LiDAR.
+    pose_noise_m, pose_noise_rad: standard deviation of what localisation adds to each pose, per axis.
+    """
+
+    beams: int = 32
+    columns: int = 720
+    lowest: float = -40.0
+    highest: float = 40.0
+    hertz: float = 10.0
+    noise_m: float = 0.01
+    dropouts: float = 0.02
+    pose_noise_m: float = 0.01
+    pose_noise_rad: float = 0.003
+
+    def directions(self) -> Points:
+        """(beams * columns, 3) unit vectors: x forward, z up."""
+        elevation = np.radians(np.linspace(self.lowest, self.highest, self.beams))[:, None]
+        azimuth = np.linspace(-np.pi, np.pi, self.columns, endpoint=False)
+        x, y, z = np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)
+        return np.stack([x, y, np.broadcast_to(z, x.shape)], axis=2).reshape(-1, 3)
+
+
+@dataclass(frozen=True)
+class LidarFrame:
+    """xyz: (N, 3) float32 in the sensor's frame, a row a ray, NaN without a return. truth: (N,) int32.
+
+    stamp: nanoseconds. sensor_to_map: (4, 4), where the robot believes to be. position: (3,), where it is.
+    """
+
+    stamp: int
+    xyz: NDArray[np.float32]
+    sensor_to_map: Points
+    position: Points
+    truth: NDArray[np.int32]
+
+
+@dataclass(frozen=True)
+class ChangedRoom:
+    """items: what stands there now. truth: (items,) int32, what a ray that hits each is to be called."""
+
+    items: tuple[Item, ...]
+    truth: NDArray[np.int32]
+    path: Points
+
+
+class Drive:
+    """One lap around the middle of the room of that seed. Iterating gives its frames; each seed gives the same ones."""
+
+    def __init__(self, seed: int = 0, lidar: Lidar | None = None, frames: int | None = None) -> None:
+        self.lidar, self._seed, self.room = lidar or Lidar(), seed, furnish(seed)
+        self.path = _ring(self.room)
+        lap_s = np.linalg.norm(np.diff(self.path, axis=0, append=self.path[:1]), axis=1).sum() / SPEED_M_S
+        self.frame_count = frames or int(lap_s * self.lidar.hertz)
+        self.now = _changed(self.room, self.path)
+        self._scene = _surfaces(self.now.items)
+        counts = [len(item.parts) for item in self.now.items]
+        self._truth_of_part = np.append(np.repeat(self.now.truth, counts), np.int32(NO_RETURN))
+
+    def __len__(self) -> int:
+        return self.frame_count
+
+    def __iter__(self) -> Iterator[LidarFrame]:
+        rng = np.random.default_rng([self._seed, 10])
+        rays, lidar = self.lidar.directions(), self.lidar
+        for index in range(self.frame_count):
+            pose = self._pose(index)
+            ranges, truth = self._cast(pose, rays)
+            noisy = ranges + lidar.noise_m * rng.normal(size=len(ranges))
+            noisy[rng.uniform(size=len(ranges)) < lidar.dropouts] = np.nan
+            truth = np.where(np.isfinite(noisy), truth, NO_RETURN).astype(np.int32)
+            believed = pose.copy()
+            believed[:3, :3] = rotation_about("z", lidar.pose_noise_rad * rng.normal()) @ pose[:3, :3]
+            believed[:3, 3] += lidar.pose_noise_m * rng.normal(size=3)
+            xyz = (rays * noisy[:, None]).astype(np.float32)
+            yield LidarFrame(round((index + 1) * 1e9 / lidar.hertz), xyz, believed, pose[:3, 3], truth)
+
+    def _pose(self, index: int) -> Points:
+        place = index / self.frame_count * len(self.path)
+        here, ahead = (_on_ring(self.path, place + step) for step in (0.0, 1.0))
+        pose = np.eye(4)
+        pose[:3, :3] = rotation_about("z", float(np.arctan2(*(ahead - here)[::-1])))
+        pose[:3, 3] = (*here, SENSOR_HEIGHT_M)
+        return pose
+
+    def _cast(self, pose: Points, rays: Points) -> tuple[Points, NDArray[np.int32]]:
+        """Range of each ray in metres, infinite without a hit, and what it hits."""
+        world = np.empty((len(rays), 6), np.float32)
+        world[:, :3], world[:, 3:] = pose[:3, 3], rays @ pose[:3, :3].T
+        hit = self._scene.cast_rays(_tensor(world))
+        part = np.minimum(hit["geometry_ids"].numpy(), len(self._truth_of_part) - 1)
+        ranges = hit["t_hit"].numpy().astype(np.float64)
+        return np.where(np.isfinite(ranges), ranges, np.nan), self._truth_of_part[part]
+
+
+def _changed(room: Room, path: Points) -> ChangedRoom:
+    """The room today: one chair moved and a suitcase and a ball brought in, where the floor is free."""
+    chair = next(index for index, item in enumerate(room.objects) if item.name == "chair")
+    others = tuple(item for index, item in enumerate(room.objects) if index != chair)
+    grey = Material((0.4, 0.4, 0.45), (0.3, 0.3, 0.35), (0.1, 0.1, 0.1))
+    angle = np.linspace(-np.pi / 2, np.pi / 2, 12)
+    ball = lathe([(0.2 * np.cos(a), 0.2 + 0.2 * np.sin(a)) for a in angle], (0, 0, 0), grey)
+    arrivals = [
+        (Item("suitcase", (box((0.4, 0.25, 0.6), (0, 0, 0), grey),)), NEW),
+        (Item("ball", (ball,)), NEW),
+        (_centred(room.objects[chair]), MOVED),
+    ]
+    items, taken = [*others, *room.shell], np.full((1, 2), np.inf)
+    truth = [CLASS_NAMES.index(item.name) for item in others] + [BACKGROUND] * len(room.shell)
+    surfaces = _surfaces([*room.objects, *room.shell])
+    for item, what in arrivals:
+        place = _free_floor(room, surfaces, path, taken)
+        taken = np.concatenate([taken, place[None]])
+        items.append(item.moved((*place, 0.0)))
+        truth.append(what)
+    return ChangedRoom(tuple(items), np.array(truth, np.int32), path)
+
+
+def _centred(item: Item) -> Item:
+    """Above the origin."""
+    corners = np.concatenate([part.vertices for part in item.parts])
+    middle = (corners.min(axis=0) + corners.max(axis=0)) / 2
+    return item.moved((-middle[0], -middle[1], 0.0))
+
+
+def _free_floor(room: Room, surfaces: Any, path: Points, taken: Points) -> Points:
+    """(2,) the place on the floor nearest to the path that is clear of it, of all furniture and of places taken."""
+    x, y = (np.arange(-side / 2, side / 2, FLOOR_STEP_M) for side in room.size[:2])
+    floor = np.stack(np.meshgrid(x, y), axis=2).reshape(-1, 2)
+    from_path, from_taken = (np.linalg.norm(floor[:, None] - places, axis=2).min(axis=1) for places in (path, taken))
+    free = np.minimum(_clearance(surfaces, floor), np.minimum(from_path, from_taken))
+    return floor[np.where(free >= min(ARRIVAL_CLEARANCE_M, free.max()), from_path, np.inf).argmin()]
+
+
+def _ring(room: Room, steps: int = 90) -> Points:
+    """(steps, 2) a closed path around the middle, each step where the furniture leaves most room; smoothed."""
+    surfaces, angle = _surfaces([*room.objects, *room.shell]), 2 * np.pi * np.arange(steps) / steps
+    around = np.stack([np.cos(angle), np.sin(angle)], axis=1) * np.array(room.size[:2]) / 2
+    shares = np.linspace(0.3, 0.85, 23)
+    places = around[:, None] * shares[None, :, None]
+    clearance = _clearance(surfaces, places.reshape(-1, 2)).reshape(steps, -1)
+    best = shares[clearance.argmax(axis=1)]
+    window = np.hanning(17)[1:-1]
+    smooth = np.convolve(np.concatenate([best[-7:], best, best[:7]]), window / window.sum(), "valid")
+    return around * smooth[:, None]
+
+
+def _on_ring(path: Points, place: float) -> Points:
+    first, share = int(place), place % 1
+    return (1 - share) * path[first % len(path)] + share * path[(first + 1) % len(path)]
+
+
+def _clearance(surfaces: Any, places: Points) -> Points:
+    """(n,) metres from each place (n, 2) to the nearest surface between knee and sensor."""
+    heights = (0.15, 0.5, SENSOR_HEIGHT_M)
+    distances = [
+        surfaces.compute_distance(_tensor(np.column_stack([places, np.full(len(places), z)]))).numpy() for z in heights
+    ]
+    return np.stack(distances).min(axis=0).astype(np.float64)
+
+
+def _surfaces(items: Any) -> Any:
+    scene = o3d.t.geometry.RaycastingScene()
+    for part in (part for item in items for part in item.parts):
+        scene.add_triangles(_tensor(part.vertices), _tensor(part.triangles, np.uint32))
+    return scene
+
+
+def _tensor(values: NDArray[Any], dtype: Any = np.float32) -> Any:
+    make_tensor: Any = o3d.core.Tensor
+    return make_tensor(np.ascontiguousarray(values, dtype))

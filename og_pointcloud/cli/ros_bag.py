@@ -1,0 +1,92 @@
+"""``og-pointcloud ros-bag``: a ROS 2 bag in, the same bag with labels and boxes out."""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from og_pointcloud.cli.common import add_command, names_in, print_table
+from og_pointcloud.errors import OgPointcloudError
+
+if TYPE_CHECKING:
+    from og_pointcloud_ros.bags import BagReport
+
+SHOWN_REASONS = 3
+
+
+def add(commands: Any) -> None:
+    parser = add_command(
+        commands, "ros-bag", run, "Label the clouds of a ROS 2 bag; needs no ROS.",
+        "og-pointcloud ros-bag drive -o drive_labelled --scene room.ogpc --labels chair,table",
+    )  # fmt: skip
+    parser.add_argument("bag", type=Path, metavar="IN", help="a bag's folder, or one .db3 or .mcap file")
+    parser.add_argument("-o", "--output", type=Path, required=True, metavar="OUT", help="the folder to make")
+    parser.add_argument("--scene", type=Path, required=True, metavar="S.ogpc", help="what `fit` wrote")
+    parser.add_argument("--labels", metavar="A,B,C", help="names to choose among (default: all that are known)")
+    parser.add_argument("--text-features", type=Path, metavar="F.npz", help="names and vectors, from the same encoder")
+    parser.add_argument(
+        "--topic", action="append", metavar="T", help="clouds to label; may be repeated (default: every PointCloud2)"
+    )
+    parser.add_argument("--frame", default="map", metavar="F", help="the scene's frame (default: %(default)s)")
+
+
+def run(arguments: argparse.Namespace) -> None:
+    check_folder(arguments.output)
+    from og_pointcloud_ros.bags import label_bag
+
+    from og_pointcloud.runtime import Segmenter
+
+    start = time.perf_counter()
+    segmenter = Segmenter(arguments.scene, names_in(arguments.labels), text_features=arguments.text_features)
+    report = label_bag(
+        arguments.bag, arguments.output, segmenter, topics=arguments.topic, frame=arguments.frame,
+        progress=progress_line(sys.stderr) if sys.stderr.isatty() else None,
+    )  # fmt: skip
+    print_report(report, arguments.output, time.perf_counter() - start)
+
+
+def check_folder(output: Path) -> None:
+    """Refuse before any work what would be refused after it."""
+    if output.exists():
+        raise OgPointcloudError(f"-o is '{output}', which exists; expected a new name, as bags are never replaced")
+
+
+def progress_line(stream: Any) -> Callable[[int, int], None]:
+    """A line that is written over and over: clouds done, and the seconds that the others will take at this pace."""
+    start = time.perf_counter()
+
+    def show(done: int, total: int) -> None:
+        left = (time.perf_counter() - start) / done * (total - done)
+        end = "\n" if done == total else ""
+        stream.write(f"\rcloud {done:,} of {total:,}, {left:,.0f} s left \033[K{end}")
+        stream.flush()
+
+    return show
+
+
+def print_report(report: BagReport, output: Path, seconds: float) -> None:
+    total = max(report.points, 1)
+    rows = [(name, f"{count:,}", f"{count / total:.1%}") for name, count in report.counts.items() if count]
+    unknown = report.points - report.counts.total()
+    print_table(("label", "points", "share"), [*rows, ("unknown", f"{unknown:,}", f"{unknown / total:.1%}")])
+    reasons = [f"{count:,} {reason}" for reason, count in report.unknown_because.items()]
+    if reasons:
+        print(f"unknown: {', '.join(reasons)}")
+    if report.skipped:
+        print(f"skipped {report.skipped.total():,} clouds, which have no labels:")
+        for reason, count in report.skipped.most_common(SHOWN_REASONS):
+            print(f"  {count:,} x {reason}")
+    pace = report.seconds["clouds"]
+    print(
+        f"{report.clouds:,} clouds, {report.points:,} points, {report.detections:,} detections in {seconds:.1f} s, "
+        f"{pace:.1f} s of it for the clouds: {report.clouds / pace:.1f} clouds, {report.points / pace:,.0f} points a second"
+    )
+    print(f"wrote {output}: {', '.join(report.topics.values())}")
+    shown = next(iter(report.topics.values()))
+    play = shlex.join(["ros2", "bag", "play", str(output)])
+    print(f"next: {play}, and in RViz a PointCloud2 of {shown}, coloured by rgb")

@@ -1,0 +1,283 @@
+"""A ROS 2 bag in, the same bag with labels out, without ROS: rosbags reads and writes, all else is ours.
+
+The new bag holds all that the old one held, byte for byte, and beside each cloud its labels and its detections.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import time
+import warnings
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from og_pointcloud.choosing import Reason
+from og_pointcloud.errors import MissingExtraError, OgPointcloudError, SceneError
+from og_pointcloud.runtime import Segmenter
+from og_pointcloud_ros.detections import to_label_info
+from og_pointcloud_ros.labelling import MINIMUM_POINTS, CloudLabeller, LabelledMessages
+from og_pointcloud_ros.messages import nanoseconds
+from og_pointcloud_ros.transforms import TransformTree
+from og_pointcloud_ros.typestore import ros2_types, rosbags_messages
+
+try:
+    from rosbags.interfaces import Connection, Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
+    from rosbags.rosbag2 import Reader, StoragePlugin, Writer
+except ImportError as error:
+    raise MissingExtraError("rosbags", "ros") from error
+
+__all__ = ["DETECTIONS", "LABELLED", "LABEL_INFO", "BagReport", "label_bag", "open_bag"]
+
+CLOUD, TRANSFORMS = "sensor_msgs/msg/PointCloud2", "tf2_msgs/msg/TFMessage"
+DETECTION_ARRAY, INFO = "vision_msgs/msg/Detection3DArray", "vision_msgs/msg/LabelInfo"
+LABELLED, DETECTIONS = "/labelled", "/detections"
+"""What an output's topic adds to that of its cloud."""
+LABEL_INFO = "/og_pointcloud/label_info"
+BAG_VERSION = 8
+"""Of rosbag2's metadata: read by Humble and by all later releases."""
+NO_TIME = QosTime(2147483647, 4294967295)
+LATCHED = Qos(
+    QosHistory.KEEP_LAST, 1, QosReliability.RELIABLE, QosDurability.TRANSIENT_LOCAL, NO_TIME, NO_TIME,
+    QosLiveliness.AUTOMATIC, NO_TIME, False,
+)  # fmt: skip
+NO_HASH = "RIHS01_" + "0" * 64
+"""Hash of a type that neither the bag nor we know: bags of Humble and older name types without defining them."""
+
+Progress = Callable[[int, int], None]
+
+
+@dataclass
+class BagReport:
+    """What ``label_bag`` did. topics: of each cloud's topic, that of its labels. seconds: wall clock, by stage.
+
+    skipped: clouds that could not be labelled, by reason. counts: points of each name.
+    """
+
+    topics: dict[str, str]
+    clouds: int = 0
+    points: int = 0
+    detections: int = 0
+    counts: Counter[str] = field(default_factory=Counter)
+    unknown_because: Counter[Reason] = field(default_factory=Counter)
+    skipped: Counter[str] = field(default_factory=Counter)
+    seconds: dict[str, float] = field(default_factory=lambda: defaultdict(float))
+
+    def add(self, labelled: LabelledMessages) -> None:
+        """Count one cloud."""
+        self.clouds += 1
+        self.points += len(labelled.result)
+        self.detections += len(labelled.detections.detections)
+        self.counts.update(labelled.result.counts())
+        self.unknown_because.update(labelled.result.unknown_because())
+
+
+def label_bag(
+    source: str | os.PathLike[str],
+    target: str | os.PathLike[str],
+    segmenter: Segmenter,
+    *,
+    topics: Sequence[str] | None = None,
+    frame: str = "map",
+    minimum_points: int = MINIMUM_POINTS,
+    progress: Progress | None = None,
+) -> BagReport:
+    """Copy a ROS 2 bag and label its clouds, each at its place in the scene as /tf and /tf_static tell it.
+
+    source: a bag's folder, .db3 or .mcap, with zstd or without. target: the folder to make, of the same storage; it
+    appears when it is whole. topics: PointCloud2 topics to label, None for all. frame: the scene's frame.
+    progress: called with clouds done and clouds in all.
+    Of a cloud on ``T`` the labels are on ``T/labelled``, in the cloud's own frame, the boxes on ``T/detections`` in the
+    scene's; the names are on /og_pointcloud/label_info, latched. A cloud without a transform, or damaged, is skipped.
+    SceneError for what is no such bag or has no such topic, or where no cloud can be labelled.
+    """
+    source, target = Path(source), Path(target)
+    with open_bag(source) as reader:
+        clouds, store = _cloud_topics(reader, topics), ros2_types()
+        report = BagReport({topic: topic + LABELLED for topic in clouds})
+        with _timed(report, "transforms"):
+            tree = _transforms(reader, store)
+        with _timed(report, "boxes"):
+            labeller = CloudLabeller(segmenter, rosbags_messages(store), frame, minimum_points)
+        total = sum(old.msgcount for old in reader.connections if old.topic in clouds)
+        with (
+            _whole(target) as folder,
+            Writer(folder, version=BAG_VERSION, storage_plugin=_storage(source)) as bag,
+        ):
+            outputs = _Outputs(bag, reader.connections, clouds, store)
+            outputs.write_info(segmenter.names, reader.start_time)
+            for old, stamp, data in _messages(reader):
+                outputs.copy(old, stamp, data)
+                if old.topic not in clouds:
+                    continue
+                if labelled := _label(store, data, tree, frame, labeller, report):
+                    outputs.write(old.topic, stamp, labelled)
+                if progress:
+                    progress(report.clouds + report.skipped.total(), total)
+            if not report.clouds:
+                reason = next(iter(report.skipped), "its topics have no message")
+                raise SceneError(f"{source}: no cloud can be labelled: {reason}")
+    return report
+
+
+def _label(
+    store: Any, data: bytes, tree: TransformTree, frame: str, labeller: CloudLabeller, report: BagReport
+) -> LabelledMessages | None:
+    """One cloud's messages, or None where it was skipped; the report counts both."""
+    try:
+        with _timed(report, "clouds"):
+            message = _decoded(store, data, CLOUD)
+            pose = tree.lookup(frame, message.header.frame_id, nanoseconds(message.header.stamp))
+            labelled = labeller(message, pose)
+    except OgPointcloudError as error:
+        report.skipped[str(error)] += 1
+        return None
+    report.add(labelled)
+    return labelled
+
+
+@contextmanager
+def open_bag(source: str | os.PathLike[str]) -> Iterator[Reader]:
+    """rosbags' reader of a ROS 2 bag; SceneError says what is wrong with any other."""
+    path = Path(source)
+    if path.is_file() and path.suffix == ".bag":
+        raise SceneError(
+            f"{path} is a bag of ROS 1; expected one of ROS 2: "
+            f"rosbags-convert --src {path} --dst {path.with_suffix('')}"
+        )
+    if not path.exists() or (path.is_dir() and not (path / "metadata.yaml").is_file()):
+        raise SceneError(f"{path} is no bag; expected a folder with a metadata.yaml, or a .db3 or .mcap file")
+    try:
+        reader = Reader(path)
+        reader.open()
+    except Exception as error:  # of rosbags, of its databases, of YAML
+        raise SceneError(f"{path} cannot be read as a bag ({_first_line(error)}): record or copy it again") from None
+    try:
+        yield reader
+    finally:
+        reader.close()
+
+
+class _Outputs:
+    """The topics of the new bag: copies of all old ones, and ours."""
+
+    def __init__(self, bag: Writer, connections: Sequence[Connection], clouds: Sequence[str], store: Any) -> None:
+        self._bag, self._store = bag, store
+        by_key = {(old.topic, old.msgtype): old for old in connections}  # publishers that differ in QoS are one topic
+        self._copies = {key: self._copy(old) for key, old in by_key.items()}
+        self._info = bag.add_connection(LABEL_INFO, INFO, typestore=store, offered_qos_profiles=[LATCHED])
+        self._ours = {
+            topic: (
+                bag.add_connection(topic + LABELLED, CLOUD, typestore=store),
+                bag.add_connection(topic + DETECTIONS, DETECTION_ARRAY, typestore=store),
+            )
+            for topic in clouds
+        }
+
+    def _copy(self, old: Connection) -> Connection:
+        ext: Any = old.ext
+        definition: dict[str, Any] = {"msgdef": old.msgdef.data, "rihs01": old.digest or NO_HASH}
+        if not (old.msgdef.data and old.digest) and old.msgtype in self._store.types:
+            definition = {"typestore": self._store}
+        return self._bag.add_connection(
+            old.topic, old.msgtype, **definition, serialization_format=ext.serialization_format,
+            offered_qos_profiles=ext.offered_qos_profiles,
+        )  # fmt: skip
+
+    def copy(self, old: Connection, stamp: int, data: bytes) -> None:
+        self._bag.write(self._copies[old.topic, old.msgtype], stamp, data)
+
+    def write_info(self, names: Sequence[str], stamp: int) -> None:
+        info = to_label_info(names, stamp=stamp, messages=rosbags_messages(self._store))
+        self._bag.write(self._info, stamp, self._store.serialize_cdr(info, INFO))
+
+    def write(self, topic: str, stamp: int, labelled: LabelledMessages) -> None:
+        points, detections = self._ours[topic]
+        self._bag.write(points, stamp, self._store.serialize_cdr(labelled.points, CLOUD))
+        self._bag.write(detections, stamp, self._store.serialize_cdr(labelled.detections, DETECTION_ARRAY))
+
+
+def _cloud_topics(reader: Reader, topics: Sequence[str] | None) -> list[str]:
+    """The topics to label. SceneError for one that is absent or no cloud, and for a bag that has been labelled."""
+    types = {connection.topic: connection.msgtype for connection in reader.connections}
+    all_clouds = sorted(topic for topic, kind in types.items() if kind == CLOUD and not topic.endswith(LABELLED))
+    wanted = list(dict.fromkeys(topics)) if topics else all_clouds
+    known = f"its topics with clouds are {', '.join(all_clouds)}" if all_clouds else "it has no topic with clouds"
+    for topic in wanted:
+        if types.get(topic) != CLOUD:
+            what = f"carries {types[topic]}" if topic in types else "is not in the bag"
+            raise SceneError(f"topic '{topic}' {what}; expected one of {CLOUD}: {known}")
+    taken = [name for topic in wanted for name in (topic + LABELLED, topic + DETECTIONS) if name in types]
+    if taken or LABEL_INFO in types:
+        raise SceneError(
+            f"the bag has a topic '{[*taken, LABEL_INFO][0]}' already; expected one that was not labelled before"
+        )
+    if not wanted:
+        raise SceneError(f"no cloud to label: {known}; it has {', '.join(sorted(types)) or 'nothing at all'}")
+    return wanted
+
+
+def _transforms(reader: Reader, store: Any) -> TransformTree:
+    """All of /tf and /tf_static; messages that make no sense are left out, with a warning."""
+    tree, damaged = TransformTree(), Counter[str]()
+    connections = [old for old in reader.connections if old.msgtype == TRANSFORMS]
+    for connection, _, data in _messages(reader, connections) if connections else ():
+        try:
+            tree.add_message(_decoded(store, data, TRANSFORMS), static=connection.topic.endswith("tf_static"))
+        except OgPointcloudError as error:
+            damaged[str(error)] += 1
+    if damaged:
+        warnings.warn(f"{damaged.total()} messages of transforms left out: {next(iter(damaged))}", stacklevel=3)
+    return tree
+
+
+def _messages(reader: Reader, connections: Sequence[Connection] = ()) -> Iterator[tuple[Connection, int, bytes]]:
+    try:
+        yield from reader.messages(connections)
+    except Exception as error:  # of rosbags or of its databases
+        raise SceneError(f"{reader.path} breaks off ({_first_line(error)}): record or copy it again") from None
+
+
+def _decoded(store: Any, data: bytes, kind: str) -> Any:
+    try:
+        return store.deserialize_cdr(data, kind)
+    except Exception as error:  # a damaged message may end anywhere
+        raise SceneError(f"a {kind} cannot be decoded ({_first_line(error)})") from None
+
+
+def _storage(source: Path) -> StoragePlugin:
+    """That of the source, which is a file of one storage or a folder of them."""
+    files = [source] if source.is_file() else list(source.iterdir())
+    return StoragePlugin.MCAP if any(".mcap" in file.suffixes for file in files) else StoragePlugin.SQLITE3
+
+
+@contextmanager
+def _timed(report: BagReport, stage: str) -> Iterator[None]:
+    start = time.perf_counter()
+    try:
+        yield
+    finally:
+        report.seconds[stage] += time.perf_counter() - start
+
+
+@contextmanager
+def _whole(target: Path) -> Iterator[Path]:
+    """A folder to make that becomes ``target`` when, and only when, the block ends without an error."""
+    if target.exists():
+        raise SceneError(f"'{target}' exists; expected a new name, as bags are never replaced")
+    temporary = target.with_name(f".{target.name}.{os.getpid()}.tmp")
+    try:
+        # A bag names its files after its folder: inside, that has its final name already.
+        temporary.mkdir(parents=True)
+        yield temporary / target.name
+        os.replace(temporary / target.name, target)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).strip() or type(error).__name__).splitlines()[0][:200]

@@ -1,0 +1,71 @@
+"""What a bag and a running node do with each cloud: message in, labelled cloud and detections out."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from og_pointcloud.instances import instance_table
+from og_pointcloud.runtime import Segmenter
+from og_pointcloud.segmentation import Segmentation
+from og_pointcloud_ros.detections import to_detections
+from og_pointcloud_ros.messages import MessageFactory
+from og_pointcloud_ros.pointcloud2 import from_pointcloud2, read_fields, to_pointcloud2
+
+__all__ = ["MINIMUM_POINTS", "UP", "CloudLabeller", "LabelledMessages"]
+
+UP = (0.0, 0.0, 1.0)
+"""Axis that boxes stand upright on: that of REP 103, which ROS frames follow."""
+MINIMUM_POINTS = 10
+"""Points of an instance in a cloud from which it is a detection, and no speck."""
+
+
+class LabelledMessages(NamedTuple):
+    """result: in the scene's world. points: sensor_msgs/PointCloud2. detections: vision_msgs/Detection3DArray."""
+
+    result: Segmentation
+    points: Any
+    detections: Any
+
+
+class CloudLabeller:
+    """Labels PointCloud2 messages one by one; words are scored, and boxes worked out, once.
+
+    frame: the scene's frame, which detections are given in. minimum_points: of an instance, to be a detection.
+    """
+
+    def __init__(
+        self,
+        segmenter: Segmenter,
+        messages: MessageFactory,
+        frame: str = "map",
+        minimum_points: int = MINIMUM_POINTS,
+    ) -> None:
+        self.segmenter = segmenter
+        self._messages, self._frame, self._minimum_points = messages, frame, minimum_points
+        self._instances = instance_table(segmenter.scene, up=UP)
+
+    def __call__(self, message: Any, pose: NDArray[np.float64]) -> LabelledMessages:
+        """message: a cloud in the sensor's frame. pose: (4, 4), takes it to the scene's frame.
+
+        The labelled cloud keeps the frame, stamp and coordinates of the message, so that whatever matches the two by
+        time, or shows them by tf, finds them in one place.
+        """
+        xyz = from_pointcloud2(message)
+        result = self.segmenter(xyz, pose)
+        head = message.header
+        points = to_pointcloud2(
+            result, head.frame_id, head.stamp, xyz=xyz, double=_has_doubles(message), messages=self._messages
+        )
+        detections = to_detections(
+            self._instances, result, self._frame, head.stamp, minimum_points=self._minimum_points,
+            messages=self._messages,
+        )  # fmt: skip
+        return LabelledMessages(result, points, detections)
+
+
+def _has_doubles(message: Any) -> bool:
+    kind = read_fields(message).dtype
+    return any(kind[axis].itemsize > 4 for axis in "xyz" if axis in (kind.names or ()))
