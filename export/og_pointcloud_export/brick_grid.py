@@ -1,60 +1,63 @@
 """The table that answers point queries: a grid of cells, each with its answer, or with the points that settle it.
 
-A cell is certain when every place in it has the same answer: the nearest cloud point's instance, or "too far". Cells
-lie in bricks of 4^3, stored only where some point is within reach. An open cell, cut by the border of two instances or
-by the reach, has a list of candidates: every cloud point that is nearest somewhere in it, a handful. If cloud points
-lie in it, it is split into 4^3 parts as well, as queries come where the cloud is, and only its open parts need the
-list. So answers are exact, and few queries compare distances at all. What the budget leaves without a list is marked,
-and holds the answer at its centre: ``og_pointcloud.nearest`` settles queries there.
+A cell is certain when every place in it has the same answer: the nearest cloud point's instance, or "too far". An open
+cell, cut by the border of two instances or by the reach, has a list of candidates: every cloud point that is nearest
+somewhere in it. Cells of a brick share lists where few candidates do for several. If cloud points lie in an open cell
+it is split into 4^3 parts as well, as queries come where the cloud is, and only its open parts need the list.
+
+Cells lie in bricks of 4^3 and bricks in blocks of 4^3, both stored only where some point is within reach: so a street
+with little in it costs little. A brick that holds no point itself, and few candidates for all of it, is its list alone,
+as about lone points of a sparse scene. So answers are exact, and few queries compare distances at all. What the budget
+leaves without a list is marked, and holds the answer at its centre: ``og_pointcloud.nearest`` settles queries there.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.cloud import UNOBSERVED, LabelledCloud
-from og_pointcloud.errors import MissingExtraError
-from og_pointcloud.nearest import VoxelBuckets, surface_distance
-
-try:
-    from numba import njit, prange
-except ImportError as error:
-    raise MissingExtraError("numba", "fit") from error
+from og_pointcloud.nearest import surface_distance
+from og_pointcloud_export.brick_cells import (
+    BLOCK,
+    BRICK,
+    LIST_ALONE,
+    NO_LIST,
+    PARTS,
+    TOO_FAR_CODE,
+    answer_bricks,
+    mark_bricks,
+)
 
 __all__ = [
-    "BRICK", "CODE_OFFSET", "LONGEST_LIST", "PARTS", "TOO_FAR_CODE", "BrickGrid", "GridSettings", "build_brick_grid",
+    "CELLS", "CODE_OFFSET", "LONGEST_LIST", "PLACES", "SHORT_LIST", "BrickGrid", "GridSettings", "build_brick_grid",
 ]  # fmt: skip
 
-BRICK = 4
-"""Cells along the edge of a brick."""
-PARTS = 4
-"""Parts along the edge of a cell that is split."""
-TOO_FAR_CODE = 0
-"""Answer code of a query with no cloud point within reach; instance id + CODE_OFFSET on the surface, and that plus
-(instances + CODE_OFFSET - 1) near it."""
 CODE_OFFSET = 1 - UNOBSERVED
+"""Answer code of instance id + CODE_OFFSET on the surface; (instances + CODE_OFFSET - 1) more near it."""
+SHORT_LIST = 8
+"""So many candidates are compared at once: cells share a list up to this length, as it costs no time."""
 LONGEST_LIST = 32
 """Candidates of a cell; a cell with more, as where points coincide, has no list."""
-TOO_LONG = -1
 
 CELLS_PER_REACH = 3.0
 """A far reach makes cells larger, so that the layer of cells around a surface stays at most about eight deep."""
-TOP_ENTRIES_PER_POINT, TOP_ENTRIES_AT_LEAST, TOP_ENTRIES_AT_MOST = 4, 1 << 18, 1 << 24  # times 64 fits int32
-BRICKS_PER_POINT, BRICKS_AT_LEAST = 1 / 2, 1 << 13
+BLOCKS_PER_POINT, BLOCKS_AT_LEAST, BLOCKS_AT_MOST = 16, 1 << 15, 1 << 18  # times 64^2, and as much again, fits int32
+BRICKS_PER_POINT, BRICKS_AT_LEAST = 4, 1 << 13
+ROWS_PER_POINT, ROWS_AT_LEAST = 1 / 2, 1 << 13
 SPLIT_CELLS_PER_POINT, SPLIT_CELLS_AT_LEAST = 1 / 8, 1 << 10
 LISTS_PER_POINT, LISTS_AT_LEAST = 1, 1 << 16
 """What bounds the table whatever the extent of the scene: the rest is left to the exact search."""
 BRICKS_PER_AXIS = 1 << 13
 """So long a grid still has its cell indices right to half a cell in float32, and a short table of them per axis."""
-SUBDIVISION = 2
-"""A cell's list is put together from those of so many boxes along its edge, which are shorter than the cell's own."""
+BRICKS_PER_CHUNK = 512
+"""Answered at once, with about 16 MB of scratch."""
 
-# Two bricks that many entries of the top level share: all too far, and all open.
-_FAR_BRICK, _OPEN_BRICK = 0, 1
+CELLS, PLACES = BRICK**3, BLOCK**3
+# Rows of cells that bricks share, and rows of bricks that blocks share: all too far, and all open.
+_FAR, _OPEN = 0, 1
 
 
 @dataclass(frozen=True)
@@ -74,20 +77,24 @@ class GridSettings:
 class BrickGrid:
     """Cell (i, j, k) covers low + (i, j, k) * cell_size and one cell_size more, in the local frame.
 
-    low: (3,) float32. cell_size: float32.
-    bricks: (bx, by, bz) unsigned, rows of ``cells``; its outermost layer stands for everything beyond the grid.
+    low: (3,) float32. cell_size: float32. shape: bricks along each axis; the outermost ones stand for everything beyond.
+    blocks: (bx, by, bz) unsigned, rows of ``bricks``.
+    bricks: (rows, 64) unsigned, C order within the block: a row of ``cells``, or, less the number of those rows, the
+        list that settles the whole brick.
     cells: (rows, 64) unsigned, C order within the brick. A value below ``codes`` is a certain answer; one below
         ``2 codes`` is open, and ``value - codes`` the answer at the centre; of any other, ``value - 2 codes`` plus the
-        brick's ``first_list`` is its list.
+        row's ``first_list`` is its list.
     first_list: (rows,) int32. list_start: (lists + 1,) int32, where each list begins in ``candidates``.
     candidates: (m,) int32, points of the cloud, ascending within a list.
     list_parts: (lists,) unsigned, row of ``parts`` of the list's cell; row 0, all open, for a cell that is not split.
     parts: (rows, 64) unsigned, C order within the cell: certain answers, or ``codes`` where the list settles it.
-    codes: number of answer codes, see TOO_FAR_CODE.
+    codes: number of answer codes: TOO_FAR_CODE, those on the surface, those near it; see CODE_OFFSET.
     """
 
     low: NDArray[np.float32]
     cell_size: np.float32
+    shape: tuple[int, int, int]
+    blocks: NDArray[np.unsignedinteger]
     bricks: NDArray[np.unsignedinteger]
     cells: NDArray[np.unsignedinteger]
     first_list: NDArray[np.int32]
@@ -100,48 +107,25 @@ class BrickGrid:
     @property
     def nbytes(self) -> int:
         """Bytes of the table."""
-        tables = (self.bricks, self.cells, self.first_list, self.list_start, self.candidates, self.list_parts)
-        return sum(table.nbytes for table in (*tables, self.parts))
+        places = (self.blocks, self.bricks, self.cells, self.first_list)
+        lists = (self.list_start, self.candidates, self.list_parts, self.parts)
+        return sum(table.nbytes for table in (*places, *lists))
 
 
 def build_brick_grid(cloud: LabelledCloud, settings: GridSettings | None = None) -> BrickGrid:
     """The grid of a cloud. Its size is bounded by the number of points, not by the extent of the scene."""
     settings = settings or GridSettings()
-    codes = 2 * (len(cloud.instances) + CODE_OFFSET) - 1
     cell_size = np.float32(max(settings.cell_per_spacing * cloud.spacing, cloud.reach / CELLS_PER_REACH))
     low, shape, whole = _grid_box(cloud, float(cell_size))
-    touched, kept = _bricks_within_reach(cloud, low, shape, float(cell_size))
-    # The graph computes cell indices in float32: every box is inflated by what rounding can move a query.
-    rounding = float(cell_size) * 4 * float(np.finfo(np.float32).eps) * max(shape) * BRICK
-    boxes = _Boxes(cloud, float(cell_size), rounding, codes)
-    corners = low.astype(np.float64) + float(cell_size) * BRICK * np.stack(np.unravel_index(kept, shape), axis=1)
-    cells = boxes.classify(corners)
-    lists = _Lists.none(len(cells), codes)
-    if settings.lists:
-        full = _cells_that_hold_points(cloud, low, shape, float(cell_size), kept, cells >= codes)
-        lists = _settle_open_cells(cloud, boxes, corners, cells, full if settings.split else full[:0])
-
-    shared = np.array([[TOO_FAR_CODE], [TOO_FAR_CODE + codes]], np.int32).repeat(BRICK**3, axis=1)
-    bricks = np.full(shape, _FAR_BRICK if whole else _OPEN_BRICK, np.int64)
-    bricks[1:-1, 1:-1, 1:-1] = _FAR_BRICK
-    bricks.flat[touched] = _OPEN_BRICK
-    bricks.flat[kept] = np.arange(len(cells)) + len(shared)
-    return BrickGrid(
-        low,
-        cell_size,
-        _compact(bricks),
-        _compact(np.concatenate([shared, cells])),
-        np.concatenate([np.zeros(len(shared), np.int32), lists.first]),
-        lists.start,
-        lists.candidates,
-        _compact(lists.parts_row),
-        _compact(lists.parts),
-        codes,
-    )
+    bricks = _Bricks(cloud, low, float(cell_size), shape)
+    table = _Table(cloud, bricks, settings)
+    for first in range(0, len(bricks.kept), BRICKS_PER_CHUNK):
+        table.answer(bricks.kept[first : first + BRICKS_PER_CHUNK])
+    return table.grid(whole)
 
 
 def _compact(values: NDArray[np.integer]) -> NDArray[np.unsignedinteger]:
-    return values.astype(np.min_scalar_type(int(values.max())))
+    return values.astype(np.min_scalar_type(int(values.max(initial=0))))
 
 
 def _grid_box(cloud: LabelledCloud, cell_size: float) -> tuple[NDArray[np.float32], tuple[int, int, int], bool]:
@@ -151,12 +135,12 @@ def _grid_box(cloud: LabelledCloud, cell_size: float) -> tuple[NDArray[np.float3
     """
     if len(cloud) == 0:
         return np.zeros(3, np.float32), (3, 3, 3), True
-    allowed = min(max(TOP_ENTRIES_PER_POINT * len(cloud), TOP_ENTRIES_AT_LEAST), TOP_ENTRIES_AT_MOST)
+    allowed = min(max(BLOCKS_PER_POINT * len(cloud), BLOCKS_AT_LEAST), BLOCKS_AT_MOST)
     border = cloud.reach + cell_size  # the cell more takes up all rounding
     for left_out in (0.0, 1e-4, 1e-3, 1e-2, 0.05, 0.2, 0.4):
         ends = np.quantile(cloud.xyz, [left_out, 1 - left_out], axis=0, method="nearest").astype(np.float64)
         shape = np.ceil((ends[1] - ends[0] + 2 * border) / (cell_size * BRICK)) + 2
-        if shape.prod() <= allowed and shape.max() <= BRICKS_PER_AXIS:
+        if np.ceil(shape / BLOCK).prod() <= allowed and shape.max() <= BRICKS_PER_AXIS:
             break
     else:
         shape = np.full(3, 3.0)
@@ -164,380 +148,159 @@ def _grid_box(cloud: LabelledCloud, cell_size: float) -> tuple[NDArray[np.float3
     return low, (int(shape[0]), int(shape[1]), int(shape[2])), bool(left_out == 0)
 
 
-def _bricks_within_reach(
-    cloud: LabelledCloud, low: NDArray[np.float32], shape: tuple[int, int, int], cell_size: float
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Flat indices of the inner bricks that some point's reach touches, and of those that are worth a table."""
-    edge = cell_size * BRICK
-    relative = (cloud.xyz - low.astype(np.float64)) / edge
-    # Half a cell for rounding. Half the box around a point is shorter than a brick: these places meet all its bricks.
-    reach = (cloud.reach + 0.5 * cell_size) / edge
-    touched = np.zeros(shape, np.int64)
-    for step in product((-reach, 0.0, reach), repeat=3):
-        touched[_inner(np.floor(relative + step), shape)] = 1
-    own, count = np.unique(np.ravel_multi_index(_inner(np.floor(relative), shape), shape), return_counts=True)
-    touched.flat[own] = 1 + count
+class _Bricks:
+    """The bricks within reach of points, and the points sorted by the brick in which they lie.
 
-    indices = np.flatnonzero(touched)
-    allowed = int(max(BRICKS_PER_POINT * len(cloud), BRICKS_AT_LEAST))
-    fullest_first = np.argsort(-touched.flat[indices], kind="stable")
-    return indices, np.sort(indices[fullest_first[:allowed]])
-
-
-def _inner(
-    brick: NDArray[np.float64], shape: tuple[int, int, int], rows: NDArray[np.float64] | None = None
-) -> tuple[NDArray[np.int64], ...]:
-    """Three index arrays: of those bricks (n, 3), or of other rows, whose brick lies within the outermost layer."""
-    inside = ((brick >= 1) & (brick < np.array(shape) - 1)).all(axis=1)
-    return tuple((brick if rows is None else rows)[inside].astype(np.int64).T)
-
-
-def _cells_that_hold_points(
-    cloud: LabelledCloud,
-    low: NDArray[np.float32],
-    shape: tuple[int, int, int],
-    cell_size: float,
-    kept: NDArray[np.int64],
-    is_open: NDArray[np.bool_],
-) -> NDArray[np.int64]:
-    """Flat indices (brick of ``kept``, cell) of the open cells that hold points, the fullest first."""
-    cell = np.floor((cloud.xyz - low.astype(np.float64)) / cell_size)
-    cell = np.stack(_inner(cell / BRICK, shape, cell), axis=1)
-    brick = np.ravel_multi_index(tuple((cell // BRICK).T), shape)
-    row = np.searchsorted(kept, brick)
-    found = np.append(kept, -1)[row] == brick
-    inside = np.ravel_multi_index(tuple((cell % BRICK).T), (BRICK,) * 3)
-    address, count = np.unique((row * BRICK**3 + inside)[found], return_counts=True)
-    address, count = (values[is_open.flat[address]] for values in (address, count))
-    return address[np.argsort(-count, kind="stable")]
-
-
-@dataclass(frozen=True)
-class _Lists:
-    """The lists of all open cells, brick after brick; see ``BrickGrid``. first: (bricks,) int32."""
-
-    first: NDArray[np.int32]
-    start: NDArray[np.int32]
-    candidates: NDArray[np.int32]
-    parts_row: NDArray[np.int64]
-    parts: NDArray[np.int32]
-
-    @classmethod
-    def none(cls, bricks: int, codes: int) -> _Lists:
-        """No list, and nothing in a table that is never empty: the graph reads a row of it."""
-        empty = np.zeros(0, np.int32)
-        return cls(np.zeros(bricks, np.int32), np.zeros(1, np.int32), empty, np.zeros(1, np.int64), _all_open(codes))
-
-
-def _all_open(codes: int) -> NDArray[np.int32]:
-    return np.full((1, PARTS**3), codes, np.int32)
-
-
-def _settle_open_cells(
-    cloud: LabelledCloud,
-    boxes: _Boxes,
-    corners: NDArray[np.float64],
-    cells: NDArray[np.int32],
-    holding_points: NDArray[np.int64],
-) -> _Lists:
-    """Give open cells their lists, and write into ``cells`` which list is theirs; those that hold points come first."""
-    codes = boxes.codes
-    is_open = cells >= codes
-    is_open.flat[holding_points] = False
-    # Then those where a cloud point is within reach of the centre, and last the far side of the reach.
-    between, outside = np.flatnonzero(is_open & (cells > codes)), np.flatnonzero(is_open & (cells == codes))
-    allowed = int(max(LISTS_PER_POINT * len(cloud), LISTS_AT_LEAST))
-    split_allowed = int(max(SPLIT_CELLS_PER_POINT * len(cloud), SPLIT_CELLS_AT_LEAST))
-    address = np.concatenate([holding_points, between, outside])[:allowed]
-    is_split = np.arange(len(address)) < min(split_allowed, len(holding_points))
-    order = np.argsort(address)
-    address, is_split = address[order], is_split[order]
-
-    brick, cell = address // BRICK**3, address % BRICK**3
-    low = corners[brick] + boxes.cell_size * np.stack(np.unravel_index(cell, (BRICK,) * 3), axis=1)
-    length = np.zeros(len(address), np.int32)
-    candidates = np.empty((len(address), LONGEST_LIST), np.int32)
-    length[~is_split], candidates[~is_split], _ = boxes.settle(low[~is_split], SUBDIVISION, only_open=False)
-    length[is_split], candidates[is_split], parts = boxes.settle(low[is_split], PARTS, only_open=True)
-
-    settled = length != TOO_LONG
-    parts_row = np.zeros(len(address), np.int64)
-    parts_row[is_split] = 1 + np.arange(len(parts))
-    brick, cell, length, candidates, parts_row = (
-        values[settled] for values in (brick, cell, length, candidates, parts_row)
-    )
-    first = np.searchsorted(brick, np.arange(len(cells))).astype(np.int32)
-    cells[brick, cell] = 2 * codes + np.arange(len(brick)) - first[brick]
-    return _Lists(
-        first,
-        np.append(0, np.cumsum(length)).astype(np.int32),
-        candidates[np.arange(LONGEST_LIST) < length[:, None]],
-        np.append(parts_row, 0),
-        np.concatenate([_all_open(codes), parts]),
-    )
-
-
-class _Boxes:
-    """Finds the answers of boxes in one cloud.
-
-    cell_size: edge of the largest box, and of the voxels that points are sorted into. rounding: length by which every
-    box is inflated on all sides.
+    top: (bx, by, bz) int32, per block its row, -1 for one that nothing touches. A brick's slot is its row * 64 + its
+    place in the block. touched: (slots,) bool, inner bricks within reach of some point. start: (slots + 1,), where a
+    brick's points begin in ``order``. kept: (m, 3) int32, the bricks that are worth a table, the fullest first.
     """
 
-    def __init__(self, cloud: LabelledCloud, cell_size: float, rounding: float, codes: int) -> None:
-        self.cell_size, self.codes = cell_size, codes
-        self._rounding = rounding
-        # Points farther than this from a box's centre are out of reach of all of it.
-        search = cloud.reach + np.sqrt(3) * (cell_size / 2 + rounding)
+    def __init__(
+        self, cloud: LabelledCloud, low: NDArray[np.float32], cell_size: float, shape: tuple[int, int, int]
+    ) -> None:
+        self.low, self.cell_size, self.shape = low.astype(np.float64), cell_size, shape
+        edge = cell_size * BRICK
+        position = (cloud.xyz - self.low) / edge
+        reach = (cloud.reach + 0.5 * cell_size) / edge  # half a cell for rounding
+        inside = ((position >= -reach) & (position < np.array(shape) + reach)).all(axis=1)
+        index, position = np.flatnonzero(inside), position[inside]
+        last = np.array(shape) - 1
+        lower, own, upper = (
+            np.clip(np.floor(position + step), 0, last).astype(np.int32) for step in (-reach, 0.0, reach)
+        )
+        self.top = np.full([-(-length // BLOCK) for length in shape], -1, np.int32)
+        mark_bricks(lower, upper, self.top, np.zeros((0, PLACES), np.bool_))
+        blocks = np.flatnonzero(self.top == 0)
+        self.top.flat[blocks] = np.arange(len(blocks))
+        slots = np.zeros((len(blocks), PLACES), np.bool_)
+        if len(blocks):
+            mark_bricks(lower, upper, self.top, slots)
+
+        within = (np.floor(position) == own).all(axis=1)  # the others lie beyond the grid
+        own, index = own[within], index[within]
+        slot = self.top[tuple((own // BLOCK).T)].astype(np.int64) * PLACES + (
+            own % BLOCK @ np.array([BLOCK**2, BLOCK, 1])
+        )
+        self.order = index[np.argsort(slot, kind="stable")]
+        count = np.bincount(slot, minlength=slots.size)
+        self.start = np.append(0, np.cumsum(count))
+        self.coordinates = self._coordinates_of_slots(blocks)
+        self.touched = slots.ravel() & ((self.coordinates > 0) & (self.coordinates < last)).all(axis=1)
+        fullest_first = np.flatnonzero(self.touched)[np.argsort(-count[self.touched], kind="stable")]
+        self.kept = fullest_first[: int(max(BRICKS_PER_POINT * len(cloud), BRICKS_AT_LEAST))]
+
+    def _coordinates_of_slots(self, blocks: NDArray[np.int64]) -> NDArray[np.int32]:
+        """(slots, 3): the brick of each slot."""
+        block = np.stack(np.unravel_index(blocks, self.top.shape), axis=1)
+        place = np.stack(np.unravel_index(np.arange(PLACES), (BLOCK,) * 3), axis=1)
+        return (block[:, None] * BLOCK + place).reshape(-1, 3).astype(np.int32)
+
+
+class _Table:
+    """The rows of a grid as they are made, chunk after chunk of bricks, until what is allowed is used up."""
+
+    def __init__(self, cloud: LabelledCloud, bricks: _Bricks, settings: GridSettings) -> None:
+        self._bricks = bricks
+        self.codes = 2 * (len(cloud.instances) + CODE_OFFSET) - 1
+        # The graph computes cell indices in float32: every box is inflated by what rounding can move a query.
+        rounding = bricks.cell_size * 4 * float(np.finfo(np.float32).eps) * max(bricks.shape) * BRICK
+        self._lattice = (bricks.low, bricks.cell_size, rounding)
         surface = surface_distance(cloud.spacing, cloud.reach)
-        self._limits = (float(cloud.reach), float(search), float(surface))
-        steps = int(np.ceil(search / cell_size))
-        columns = product(range(-steps, steps + 1), repeat=2)
-        self._columns = np.array(sorted(columns, key=lambda step: step[0] ** 2 + step[1] ** 2))
-        buckets = VoxelBuckets(cloud.xyz, cell_size, run=2 * steps + BRICK + 2)  # a brick's line is searched at once
-        answers = cloud.instance_ids[buckets.point] + np.int32(CODE_OFFSET)
-        starts = buckets.starts.astype(np.int32)  # half the memory to run through
-        index = buckets.point.astype(np.int32)
-        self._points = (buckets.x, buckets.y, buckets.z, answers, starts, buckets.mask, buckets.edge, index)
+        self._limits = (float(cloud.reach), float(surface), self.codes)
+        xyz = cloud.xyz[bricks.order].astype(np.float64)
+        answers = cloud.instance_ids[bricks.order] + np.int32(CODE_OFFSET)
+        index = bricks.order.astype(np.int32)
+        x, y, z = (np.ascontiguousarray(xyz[:, axis]) for axis in range(3))
+        self._points = (x, y, z, answers, index, bricks.start)
 
-    def classify(self, corners: NDArray[np.float64]) -> NDArray[np.int32]:
-        """(m, 64) int32, values of the cells of the bricks with these low corners (m, 3): answers, or open ones."""
-        values = np.empty((len(corners), BRICK**3), np.int32)
-        half = self.cell_size / 2 + self._rounding
-        _classify(corners, self.cell_size, half, self._limits, self._columns, self._points, self.codes, values)
-        return values
+        def allowed(per_point: float, at_least: int) -> int:
+            return int(max(per_point * len(cloud), at_least))
 
-    def settle(
-        self, corners: NDArray[np.float64], per_edge: int, *, only_open: bool
-    ) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]:
-        """Lists of the cells with these low corners (m, 3), looked at in per_edge^3 boxes each.
+        self._rows_allowed = allowed(ROWS_PER_POINT, ROWS_AT_LEAST)
+        self._lists_allowed = allowed(LISTS_PER_POINT, LISTS_AT_LEAST) if settings.lists else 0
+        self._parts_allowed = allowed(SPLIT_CELLS_PER_POINT, SPLIT_CELLS_AT_LEAST) if settings.split else 0
+        shared = np.array([[TOO_FAR_CODE], [TOO_FAR_CODE + self.codes]], np.int32).repeat(CELLS, axis=1)
+        self._cells, self._first_list = [shared], [np.zeros(len(shared), np.int32)]
+        self._lengths, self._candidates = [np.zeros(0, np.int32)], [np.zeros(0, np.int32)]
+        self._list_parts, self._parts = [np.zeros(0, np.int64)], [np.full((1, CELLS), self.codes, np.int32)]
+        self._rows_made, self._lists_made, self._parts_made = len(shared), 0, 1
+        # By slot: its row of cells, or -1 - its list.
+        self._brick_rows = np.where(bricks.touched, _OPEN, _FAR)
 
-        Returns their lengths (m,), or TOO_LONG; the candidates (m, LONGEST_LIST), ascending; and the boxes' values
-        (m, per_edge^3): a certain answer, or ``codes``. only_open: the list need not hold in boxes that are certain.
-        """
-        lengths = np.full(len(corners), TOO_LONG, np.int32)
-        lists = np.empty((len(corners), LONGEST_LIST), np.int32)
-        values = np.empty((len(corners), per_edge**3), np.int32)
-        edges = (self.cell_size, self._rounding)
-        _settle(
-            corners, per_edge, only_open, edges, self._limits, self._columns, self._points, self.codes, lengths, lists,
-            values,
+    def answer(self, slots: NDArray[np.int64]) -> None:
+        """Add the bricks in these slots."""
+        count = len(slots)
+        values, lengths = np.empty((count, CELLS), np.int32), np.empty((count, CELLS), np.int32)
+        lists = np.empty((count, CELLS, LONGEST_LIST), np.int32)
+        first_part, parts = np.empty((count, CELLS), np.int32), np.empty((count, CELLS, PARTS**3), np.int32)
+        room_for = (self._lists_allowed > self._lists_made, self._parts_allowed > self._parts_made)
+        alone = self._rows_made >= self._rows_allowed
+        answer_bricks(
+            self._bricks.coordinates[slots], self._lattice, self._limits, self._points, self._bricks.top,
+            (min(SHORT_LIST, LONGEST_LIST), *room_for, alone), values, lengths, lists, first_part, parts,
         )  # fmt: skip
-        return lengths, lists, values
+        is_list, is_far = values[:, 0] == LIST_ALONE, (values == TOO_FAR_CODE).all(axis=1)
+        is_row = ~is_list & ~is_far
+        is_row &= self._rows_made + np.cumsum(is_row) <= self._rows_allowed
+        lengths[~is_list & ~is_row] = NO_LIST
 
+        exists = lengths != NO_LIST
+        first_list = (self._lists_made + np.cumsum(exists.sum(axis=1)) - exists.sum(axis=1)).astype(np.int32)
+        self._brick_rows[slots[is_far]] = _FAR
+        self._brick_rows[slots[is_list]] = -1 - first_list[is_list]
+        self._brick_rows[slots[is_row]] = self._rows_made + np.arange(is_row.sum())
+        self._add_rows(values[is_row], first_list[is_row])
+        self._add_lists(lengths[exists], lists[exists], first_part[exists], parts, np.nonzero(exists)[0])
 
-@njit(cache=True, parallel=True)
-def _classify(corners, size, half, limits, columns, points, codes, values):  # noqa: ANN001, ANN202
-    """Fill values: the answer at each cell's centre, plus ``codes`` where it is not the whole cell's."""
-    # Cells in lines along z: most lines of a brick meet no point at all, and say so once for all their cells.
-    for brick in prange(len(corners)):
-        for line in range(BRICK * BRICK):
-            x = corners[brick, 0] + (line // BRICK + 0.5) * size
-            y = corners[brick, 1] + (line % BRICK + 0.5) * size
-            first = line * BRICK
-            if not _line_meets_a_point(x, y, corners[brick, 2], BRICK * size, limits[1], columns, points):
-                values[brick, first : first + BRICK] = TOO_FAR_CODE
-                continue
-            for cell in range(BRICK):
-                center = (x, y, corners[brick, 2] + (cell + 0.5) * size)
-                values[brick, first + cell] = _cell_value(center, half, limits, columns, points, codes)
+    def _add_rows(self, values: NDArray[np.int32], first_list: NDArray[np.int32]) -> None:
+        self._cells.append(values)
+        self._first_list.append(first_list)
+        self._rows_made += len(values)
 
+    def _add_lists(
+        self,
+        lengths: NDArray[np.int32],
+        lists: NDArray[np.int32],
+        first_part: NDArray[np.int32],
+        parts: NDArray[np.int32],
+        brick: NDArray[np.int64],
+    ) -> None:
+        is_split = first_part >= 0
+        row = np.zeros(len(lengths), np.int64)
+        row[is_split] = self._parts_made + np.arange(is_split.sum())
+        self._lengths.append(lengths)
+        self._candidates.append(lists[np.arange(LONGEST_LIST) < lengths[:, None]])
+        self._list_parts.append(row)
+        self._parts.append(parts[brick[is_split], first_part[is_split]])
+        self._lists_made += len(lengths)
+        self._parts_made += int(is_split.sum())
 
-@njit(cache=True)
-def _line_meets_a_point(x, y, low, length, search, columns, points):  # noqa: ANN001, ANN202
-    """Whether any point is within the search radius of a line of that length upwards from (x, y, low)."""
-    xs, ys, zs, _, starts, mask, edge, _ = points
-    bottom = np.int64(np.floor((low - search) / edge))
-    top = np.int64(np.floor((low + length + search) / edge))
-    for column in range(len(columns)):
-        voxel_x = np.int64(np.floor(x / edge)) + columns[column, 0]
-        voxel_y = np.int64(np.floor(y / edge)) + columns[column, 1]
-        bucket = (voxel_x * 73856093 + voxel_y * 19349663 + bottom) & mask
-        for point in range(starts[bucket], starts[bucket + top - bottom + 1]):
-            dx, dy = xs[point] - x, ys[point] - y
-            dz = max(low - zs[point], 0.0, zs[point] - low - length)
-            if dx * dx + dy * dy + dz * dz <= search * search:
-                return True
-    return False
-
-
-@njit(cache=True)
-def _cell_value(center, half, limits, columns, points, codes):  # noqa: ANN001, ANN202
-    """Value of the cell with this centre and half edge; see ``BrickGrid.cells``."""
-    x, y, z, answers = points[:4]
-    reach, search, _ = limits
-    # The point nearest to the centre, and whether any point is within reach of any corner of the cell.
-    nearest, nearest_squared, met = -1, np.inf, False
-    limit_squared = search * search
-    for column in range(len(columns)):
-        first, last = _run(center, columns[column], limit_squared, points)
-        for point in range(first, last):
-            dx, dy, dz = x[point] - center[0], y[point] - center[1], z[point] - center[2]
-            squared = dx * dx + dy * dy + dz * dz
-            if squared < nearest_squared:
-                nearest, nearest_squared = point, squared
-            met = met or _gap_squared(dx, dy, dz, half) <= reach * reach * (1 + 1e-9)
-        if met:
-            limit_squared = min(limit_squared, nearest_squared)
-    if not met:
-        return TOO_FAR_CODE
-
-    near = (x[nearest] - center[0], y[nearest] - center[1], z[nearest] - center[2])
-    certain = _within_reach(near, half, reach)
-    limit_squared = _rival_limit_squared(nearest_squared, half, search)
-    for column in range(len(columns)):
-        first, last = _run(center, columns[column], limit_squared, points) if certain else (0, 0)
-        for point in range(first, last):
-            if answers[point] != answers[nearest]:
-                rival = (x[point] - center[0], y[point] - center[1], z[point] - center[2])
-                certain = certain and _loses(rival, near, nearest_squared, half)
-    code = _code(answers[nearest], nearest_squared, limits, codes)
-    return code if certain else code + codes
-
-
-@njit(cache=True, parallel=True)
-def _settle(corners, per_edge, only_open, edges, limits, columns, points, codes, lengths, lists, values):  # noqa: ANN001, ANN202
-    """Fill lengths, lists and values; see ``_Boxes.settle``."""
-    cell_size, rounding = edges
-    size = cell_size / per_edge
-    for cell in prange(len(corners)):
-        center = (
-            corners[cell, 0] + cell_size / 2, corners[cell, 1] + cell_size / 2, corners[cell, 2] + cell_size / 2,
-        )  # fmt: skip
-        rivals = _rivals(center, cell_size / 2 + rounding, limits, columns, points)
-        needed = np.zeros(len(rivals), np.bool_)
-        for box in range(per_edge**3):
-            middle = (
-                corners[cell, 0] + (box // per_edge**2 + 0.5) * size,
-                corners[cell, 1] + (box // per_edge % per_edge + 0.5) * size,
-                corners[cell, 2] + (box % per_edge + 0.5) * size,
-            )
-            values[cell, box] = _settle_box(
-                middle, size / 2 + rounding, only_open, limits, points, codes, rivals, needed
-            )
-        chosen = np.sort(points[7][rivals[needed]])
-        if len(chosen) <= lists.shape[1]:
-            lengths[cell] = len(chosen)
-            lists[cell, : len(chosen)] = chosen
-
-
-@njit(cache=True)
-def _rivals(center, half, limits, columns, points):  # noqa: ANN001, ANN202
-    """Sorted points that may be the nearest one, and within reach, somewhere in the box."""
-    x, y, z = points[:3]
-    reach, search, _ = limits
-    nearest, nearest_squared = -1, np.inf
-    for column in range(len(columns)):
-        first, last = _run(center, columns[column], min(search * search, nearest_squared), points)
-        for point in range(first, last):
-            dx, dy, dz = x[point] - center[0], y[point] - center[1], z[point] - center[2]
-            squared = dx * dx + dy * dy + dz * dz
-            if squared < nearest_squared:
-                nearest, nearest_squared = point, squared
-    near = (x[nearest] - center[0], y[nearest] - center[1], z[nearest] - center[2])
-    limit_squared = _rival_limit_squared(nearest_squared, half, search)
-    found = np.empty(256, np.int64)
-    count = 0
-    for column in range(len(columns)):
-        first, last = _run(center, columns[column], limit_squared, points)
-        for point in range(first, last):
-            rival = (x[point] - center[0], y[point] - center[1], z[point] - center[2])
-            in_reach = _gap_squared(rival[0], rival[1], rival[2], half) <= reach * reach * (1 + 1e-9)
-            if in_reach and not _loses(rival, near, nearest_squared, half):
-                if count == len(found):
-                    found = np.append(found, np.empty(count, np.int64))
-                found[count] = point
-                count += 1
-    return found[:count]
-
-
-@njit(cache=True)
-def _settle_box(center, half, only_open, limits, points, codes, rivals, needed):  # noqa: ANN001, ANN202
-    """The box's answer if certain, else ``codes``; marks those of a cell's rivals that are nearest somewhere in it."""
-    x, y, z, answers = points[:4]
-    reach = limits[0]
-    nearest, nearest_squared, met = -1, np.inf, False
-    for point in rivals:
-        dx, dy, dz = x[point] - center[0], y[point] - center[1], z[point] - center[2]
-        squared = dx * dx + dy * dy + dz * dz
-        if squared < nearest_squared:
-            nearest, nearest_squared = point, squared
-        met = met or _gap_squared(dx, dy, dz, half) <= reach * reach * (1 + 1e-9)
-    if not met:
-        return TOO_FAR_CODE
-    near = (x[nearest] - center[0], y[nearest] - center[1], z[nearest] - center[2])
-    certain = _within_reach(near, half, reach)
-    wins = np.empty(len(rivals), np.bool_)
-    for row, point in enumerate(rivals):
-        rival = (x[point] - center[0], y[point] - center[1], z[point] - center[2])
-        in_reach = _gap_squared(rival[0], rival[1], rival[2], half) <= reach * reach * (1 + 1e-9)
-        wins[row] = in_reach and not _loses(rival, near, nearest_squared, half)
-    for row, point in enumerate(rivals):
-        rival = (x[point] - center[0], y[point] - center[1], z[point] - center[2])
-        for other, winner in enumerate(rivals):
-            if wins[row] and wins[other] and other != row:
-                better = (x[winner] - center[0], y[winner] - center[1], z[winner] - center[2])
-                better_squared = better[0] * better[0] + better[1] * better[1] + better[2] * better[2]
-                wins[row] = not _loses(rival, better, better_squared, half)
-        certain = certain and not (wins[row] and answers[point] != answers[nearest])
-    if not (certain and only_open):
-        needed |= wins
-    return _code(answers[nearest], nearest_squared, limits, codes) if certain else codes
-
-
-@njit(cache=True, inline="always")
-def _code(answer, squared, limits, codes):  # noqa: ANN001, ANN202
-    """Code of an answer at that distance: too far, near, or on the surface."""
-    reach, _, surface = limits
-    if squared > reach * reach:
-        return TOO_FAR_CODE
-    return answer if squared <= surface * surface else answer + codes // 2
-
-
-@njit(cache=True, inline="always")
-def _gap_squared(dx, dy, dz, half):  # noqa: ANN001, ANN202
-    """Squared distance of a point, seen from a box's centre, to the box."""
-    gap_x, gap_y, gap_z = max(abs(dx) - half, 0.0), max(abs(dy) - half, 0.0), max(abs(dz) - half, 0.0)
-    return gap_x * gap_x + gap_y * gap_y + gap_z * gap_z
-
-
-@njit(cache=True, inline="always")
-def _within_reach(near, half, reach):  # noqa: ANN001, ANN202
-    """Whether that point, seen from the centre, is within reach of every place in the box."""
-    far_x, far_y, far_z = abs(near[0]) + half, abs(near[1]) + half, abs(near[2]) + half
-    return far_x * far_x + far_y * far_y + far_z * far_z <= reach * reach * (1 - 1e-9)
-
-
-@njit(cache=True, inline="always")
-def _loses(p, q, q_squared, half):  # noqa: ANN001, ANN202
-    """Whether a point p is farther than a point q everywhere in the box.
-
-    |u - p|^2 - |u - q|^2 is linear in u, so the box's worst corner decides: |p|^2 - |q|^2 - 2 half |p - q|_1 > 0, seen
-    from the centre. A tie does not lose.
-    """
-    lead = p[0] * p[0] + p[1] * p[1] + p[2] * p[2] - q_squared
-    spread = abs(p[0] - q[0]) + abs(p[1] - q[1]) + abs(p[2] - q[2])
-    return lead - 2 * half * spread > 1e-9 * half * half
-
-
-@njit(cache=True, inline="always")
-def _rival_limit_squared(nearest_squared, half, search):  # noqa: ANN001, ANN202
-    """Points farther than the box's diagonal behind the nearest one always lose."""
-    return min(search, np.sqrt(nearest_squared) + 2 * np.sqrt(3.0) * half) ** 2
-
-
-@njit(cache=True, inline="always")
-def _run(center, column, limit_squared, points):  # noqa: ANN001, ANN202
-    """Range of the sorted points in that column of voxels (a step in x and y) that may lie within the limit."""
-    starts, mask, edge = points[4:7]
-    voxel_x = np.int64(np.floor(center[0] / edge)) + column[0]
-    voxel_y = np.int64(np.floor(center[1] / edge)) + column[1]
-    gap_x = max(voxel_x * edge - center[0], center[0] - (voxel_x + 1) * edge, 0.0)
-    gap_y = max(voxel_y * edge - center[1], center[1] - (voxel_y + 1) * edge, 0.0)
-    rest = limit_squared * (1 + 1e-9) - gap_x * gap_x - gap_y * gap_y
-    if rest < 0:
-        return 0, 0
-    low = np.int64(np.floor((center[2] - np.sqrt(rest)) / edge))
-    high = np.int64(np.floor((center[2] + np.sqrt(rest)) / edge))
-    bucket = (voxel_x * 73856093 + voxel_y * 19349663 + low) & mask
-    return starts[bucket], starts[bucket + high - low + 1]
+    def grid(self, whole: bool) -> BrickGrid:
+        """All that was added. whole: whether no point lies beyond the grid."""
+        listed = np.full((1, CELLS), 2 * self.codes, np.int32)
+        cells = _compact(np.concatenate([*self._cells, listed]))
+        bricks = np.where(self._brick_rows < 0, len(cells) - 1 - self._brick_rows, self._brick_rows)
+        blocks = np.where(self._bricks.top < 0, _FAR, self._bricks.top + 2)
+        if not whole:
+            last = np.array(self._bricks.shape) - 1
+            outermost = ((self._bricks.coordinates == 0) | (self._bricks.coordinates == last)).any(axis=1)
+            bricks[outermost] = _OPEN
+            untouched = self._bricks.top < 0
+            untouched[tuple(slice(1, (length - 1) // BLOCK) for length in self._bricks.shape)] = False
+            blocks[untouched] = _OPEN
+        shared = np.array([[_FAR], [_OPEN]]).repeat(PLACES, axis=1)
+        return BrickGrid(
+            self._bricks.low.astype(np.float32),
+            np.float32(self._bricks.cell_size),
+            self._bricks.shape,
+            _compact(blocks),
+            _compact(np.concatenate([shared, bricks.reshape(-1, PLACES)])),
+            cells,
+            np.concatenate([*self._first_list, np.full(1, -1, np.int32)]),
+            np.append(0, np.cumsum(np.concatenate(self._lengths))).astype(np.int32),
+            np.concatenate(self._candidates),
+            _compact(np.append(np.concatenate(self._list_parts), 0)),  # never empty: the graph reads it
+            _compact(np.concatenate(self._parts)),
+            self.codes,
+        )

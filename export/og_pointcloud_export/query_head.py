@@ -25,7 +25,8 @@ from og_pointcloud.bundle import BEYOND, NEAR, NO_EVIDENCE, ON_SURFACE
 from og_pointcloud.cloud import InstanceTable, LabelledCloud
 from og_pointcloud.errors import MissingExtraError
 from og_pointcloud.nearest import surface_distance
-from og_pointcloud_export.brick_grid import BRICK, CODE_OFFSET, LONGEST_LIST, PARTS, TOO_FAR_CODE, BrickGrid
+from og_pointcloud_export.brick_cells import BLOCK, BRICK, PARTS, TOO_FAR_CODE
+from og_pointcloud_export.brick_grid import CELLS, CODE_OFFSET, LONGEST_LIST, PLACES, SHORT_LIST, BrickGrid
 
 try:
     import onnx
@@ -37,8 +38,6 @@ __all__ = ["OPSET", "ScoreHead", "build_query_head", "reference_scores"]
 
 OPSET, IR_VERSION = 18, 8
 """The oldest that has everything needed (ScatterElements with max), so that onnxruntime 1.17 and later run it."""
-SHORT_LIST = 8
-"""So many candidates are compared for every point of an open part, LONGEST_LIST where its list is longer."""
 
 
 @dataclass(frozen=True)
@@ -201,11 +200,19 @@ def _lookup_nodes() -> list[onnx.NodeProto]:
         _node("Cast", "position", "cell_unbounded", to=TensorProto.INT32),
         _node("Max", "cell_unbounded zero_int32", "cell_above"),
         _node("Min", "cell_above last_cell", "cell"),
-        # Along each axis, cell -> what it adds to (brick's place in the grid) * 512 + (cell's place in the brick).
+        # Along each axis, cell -> what it adds to (block * 64 + the brick's place in it) * 64 + the cell's in the brick.
         _node("GatherElements", "axis_places cell", "place_terms", axis=1),
         *_sum_of_rows("place_terms", "place"),
+        _node("Div", "place cells_per_block", "block"),
         _node("Div", "place cells_per_brick", "brick"),
-        _node("GatherElements", "place_to_address brick", "address_shift"),
+        _node("GatherElements", "block_shifts block", "brick_shift"),
+        _node("Add", "brick brick_shift", "brick_address"),
+        _node("GatherElements", "brick_values brick_address", "brick_stored"),
+        _node("Cast", "brick_stored", "brick_value", to=TensorProto.INT32),
+        # A brick that is a list alone has the last row, which says so for all its cells.
+        _node("Min", "brick_value last_row", "cells_row"),
+        _node("Sub", "cells_row brick", "row_shift"),
+        _node("Mul", "row_shift cells_per_brick", "address_shift"),
         _node("Add", "place address_shift", "address"),
         _node("GatherElements", "cell_values address", "cell_stored"),
         _node("Cast", "cell_stored", "cell_value", to=TensorProto.INT32),
@@ -227,18 +234,23 @@ def _open_cell_nodes() -> list[onnx.NodeProto]:
         *_columns_at("rows", "listed", "listed_rows"),
         *_rows_apart("listed_rows", "point"),
         _node("GatherElements", "cell_value listed", "listed_value"),
-        _node("GatherElements", "address listed", "listed_address"),
-        # brick's first list + the cell's own -> its list
-        _node("Div", "listed_address cells_per_brick", "listed_brick"),
-        _node("GatherElements", "first_list listed_brick", "listed_first"),
+        # row's first list + the cell's own -> its list; of a list alone, both come to -1
+        _node("GatherElements", "cells_row listed", "listed_row"),
+        _node("GatherElements", "first_list listed_row", "listed_first"),
         _node("Sub", "listed_value first_listed", "listed_number"),
-        _node("Add", "listed_first listed_number", "list"),
+        _node("Add", "listed_first listed_number", "list_of_cell"),
+        _node("GatherElements", "brick_value listed", "listed_brick_value"),
+        _node("Sub", "listed_brick_value last_row", "listed_beyond_rows"),
+        _node("Max", "listed_beyond_rows zero_int32", "list_alone"),
+        _node("Add", "list_of_cell list_alone", "list"),
         # the part of the cell, and its value
         _node("Sub", "listed_rows grid_low", "listed_offset"),
         _node("Mul", "listed_offset cells_per_unit", "listed_position"),
         _node("Mul", "listed_position parts_per_cell_edge", "part_position"),
         _node("Cast", "part_position", "part", to=TensorProto.INT32),
-        _node("Mod", "part parts_edge", "part_in_cell"),
+        _node("Cast", "listed_position", "listed_cell", to=TensorProto.INT32),
+        _node("Mul", "listed_cell parts_edge", "first_part"),
+        _node("Sub", "part first_part", "part_in_cell"),  # Mod takes ten times as long
         _node("Mul", "part_in_cell part_strides", "part_terms"),
         *_sum_of_rows("part_terms", "part_index"),
         _node("GatherElements", "list_parts list", "list_parts_stored"),
@@ -295,7 +307,12 @@ def _search_nodes(name: str, rows: str, steps: str) -> list[onnx.NodeProto]:
         node("Add", f"start_column /{steps}", "candidate_address"),
         node("Shape", "candidate_address", "candidate_shape"),
         node("Reshape", "candidate_address /flat", "candidate_address_flat"),
-        node("GatherElements", "/candidates candidate_address_flat", "candidate"),
+        node("GatherElements", "/candidates_low candidate_address_flat", "candidate_low_stored"),
+        node("Cast", "candidate_low_stored", "candidate_low", to=TensorProto.INT32),
+        node("GatherElements", "/candidates_high candidate_address_flat", "candidate_high_stored"),
+        node("Cast", "candidate_high_stored", "candidate_high_steps", to=TensorProto.INT32),
+        node("Mul", "candidate_high_steps /high_step", "candidate_high"),
+        node("Add", "candidate_low candidate_high", "candidate"),
         *distance,
         node("Add", "x_squared y_squared", "xy_squared"),
         node("Add", "xy_squared z_squared", "squared"),
@@ -355,7 +372,7 @@ def _columns_at(table: str, columns: str, output: str) -> list[onnx.NodeProto]:
 
 
 def _lookup_constants(cloud: LabelledCloud, grid: BrickGrid) -> dict[str, Any]:
-    shape = np.array(grid.bricks.shape, np.int64)
+    shape = np.array(grid.shape, np.int64)
     codes, near_codes = grid.codes, grid.codes // 2
     # A search may read LONGEST_LIST entries from the start of the last list.
     point, candidate = np.unique(grid.candidates, return_inverse=True)
@@ -367,11 +384,14 @@ def _lookup_constants(cloud: LabelledCloud, grid: BrickGrid) -> dict[str, Any]:
         "grid_low": grid.low[:, None],
         "cells_per_unit": np.float32(1) / grid.cell_size,
         "last_cell": (shape * BRICK - 1).astype(np.int32)[:, None],
-        "axis_places": _axis_places(shape),
-        "place_to_address": ((grid.bricks.ravel().astype(np.int64) - np.arange(grid.bricks.size)) * BRICK**3).astype(
+        "axis_places": _axis_places(grid),
+        "block_shifts": ((grid.blocks.ravel().astype(np.int64) - np.arange(grid.blocks.size)) * PLACES).astype(
             np.int32
         ),
-        "cells_per_brick": np.int32(BRICK**3),
+        "brick_values": grid.bricks.ravel(),
+        "last_row": np.int32(len(grid.cells) - 1),
+        "cells_per_block": np.int32(CELLS * PLACES),
+        "cells_per_brick": np.int32(CELLS),
         "cell_values": grid.cells.ravel(),
         "codes": np.int32(codes),
         "first_listed": np.int32(2 * codes),
@@ -383,7 +403,7 @@ def _lookup_constants(cloud: LabelledCloud, grid: BrickGrid) -> dict[str, Any]:
         "part_strides": np.array([[PARTS**2], [PARTS], [1]], np.int32),
         "parts_per_cell": np.int32(PARTS**3),
         "part_values": grid.parts.ravel(),
-        "candidates": np.append(candidate, np.zeros(LONGEST_LIST)).astype(np.int32),
+        **_in_three_bytes("candidates", np.append(candidate, np.zeros(LONGEST_LIST, np.int64))),
         **{f"candidate_{axis}": np.ascontiguousarray(xyz[:, row]) for row, axis in enumerate("xyz")},
         "candidate_answer": answer.astype(np.min_scalar_type(int(answer.max()))),
         "short_steps": np.arange(SHORT_LIST, dtype=np.int32)[None],
@@ -404,13 +424,26 @@ def _lookup_constants(cloud: LabelledCloud, grid: BrickGrid) -> dict[str, Any]:
     }
 
 
-def _axis_places(shape: NDArray[np.int64]) -> NDArray[np.int32]:
+def _in_three_bytes(name: str, values: NDArray[np.integer]) -> dict[str, NDArray[Any]]:
+    """Indices below 2^24, as almost all are, in three bytes instead of four; the high part takes what it needs."""
+    high = values >> 16
+    return {
+        f"{name}_low": (values & 0xFFFF).astype(np.uint16),
+        f"{name}_high": high.astype(np.min_scalar_type(int(high.max()))),
+        "high_step": np.int32(1 << 16),
+    }
+
+
+def _axis_places(grid: BrickGrid) -> NDArray[np.int32]:
     """(3, cells along the longest axis) int32; see ``_lookup_nodes``."""
-    cell = np.arange(int(shape.max()) * BRICK)
-    brick_strides = np.array([[shape[1] * shape[2]], [shape[2]], [1]])
-    cell_strides = np.array([[BRICK**2], [BRICK], [1]])
-    inside = (cell // BRICK) < shape[:, None]  # the table's remainder is never read
-    return np.where(inside, cell // BRICK * brick_strides * BRICK**3 + cell % BRICK * cell_strides, 0).astype(np.int32)
+    _, blocks_y, blocks_z = grid.blocks.shape
+    cell = np.arange(max(grid.shape) * BRICK)
+    block, brick, inside = cell // (BRICK * BLOCK), cell // BRICK % BLOCK, cell % BRICK
+    block_strides = np.array([[blocks_y * blocks_z], [blocks_z], [1]])
+    brick_strides, cell_strides = (np.array([[edge**2], [edge], [1]]) for edge in (BLOCK, BRICK))
+    place = (block * block_strides * PLACES + brick * brick_strides) * CELLS + inside * cell_strides
+    in_grid = cell < np.array(grid.shape)[:, None] * BRICK  # the table's remainder is never read
+    return np.where(in_grid, place, 0).astype(np.int32)
 
 
 def reference_scores(instances: InstanceTable, text: NDArray[np.floating]) -> NDArray[np.float64]:

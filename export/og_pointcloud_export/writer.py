@@ -135,7 +135,8 @@ def _parity(cloud: LabelledCloud, onnx: bytes) -> dict[str, Any]:
 def _describe_grid(grid: BrickGrid) -> dict[str, Any]:
     return {
         "cell_size": float(grid.cell_size),
-        "bricks": list(grid.bricks.shape),
+        "bricks": list(grid.shape),
+        "blocks_stored": len(grid.bricks),
         "bricks_stored": len(grid.cells),
         "cells_split": len(grid.parts) - 1,
         "lists": len(grid.list_start) - 1,

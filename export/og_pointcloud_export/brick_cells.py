@@ -1,0 +1,354 @@
+"""The cells of one brick, from the cloud's points about it: which answer each has, and which points settle the others.
+
+Points are gathered once for the brick, once more for each octant of it, and then compared cell by cell. Every test is
+of a box against points: a point that is farther than another everywhere in the box cannot be the nearest there.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from og_pointcloud.errors import MissingExtraError
+
+try:
+    from numba import njit, prange
+except ImportError as error:
+    raise MissingExtraError("numba", "fit") from error
+
+__all__ = ["BLOCK", "BRICK", "LIST_ALONE", "NO_LIST", "PARTS", "TOO_FAR_CODE", "answer_bricks", "mark_bricks"]
+
+BLOCK = 4
+"""Bricks along the edge of a block."""
+BRICK = 4
+"""Cells along the edge of a brick."""
+PARTS = 4
+"""Parts along the edge of a cell that is split."""
+TOO_FAR_CODE = 0
+"""Answer code of a query with no cloud point within reach."""
+LIST_ALONE = -1
+"""Value of the first cell of a brick whose list settles all of it."""
+NO_LIST = -1
+"""Length of a list that is none."""
+SUBDIVISION = 2
+"""A long list is put together anew from those of so many boxes along the cell's edge, which are shorter."""
+OCTANTS = 2
+
+# Throughout: ``lattice`` is (low (3,), cell_size, rounding), the length by which every box is inflated on all sides;
+# ``limits`` is (reach, surface distance, codes); ``near`` is (x, y, z, answer, number), the points about one brick.
+
+
+@njit(cache=True)
+def mark_bricks(lower, upper, top, slots):  # noqa: ANN001, ANN201
+    """Mark what points touch: from brick ``lower`` to brick ``upper``, (n, 3) int32 each, of the grid.
+
+    top: of blocks. slots: (rows, 64) bool, the bricks of the block whose top is that row; without any rows, the top of
+    each block that is touched becomes 0.
+    """
+    for point in range(len(lower)):
+        for i in range(lower[point, 0], upper[point, 0] + 1):
+            for j in range(lower[point, 1], upper[point, 1] + 1):
+                for k in range(lower[point, 2], upper[point, 2] + 1):
+                    if len(slots) == 0:
+                        top[i // BLOCK, j // BLOCK, k // BLOCK] = 0
+                    else:
+                        row = top[i // BLOCK, j // BLOCK, k // BLOCK]
+                        slots[row, (i % BLOCK * BLOCK + j % BLOCK) * BLOCK + k % BLOCK] = True
+
+
+@njit(cache=True, parallel=True)
+def answer_bricks(bricks, lattice, limits, points, top, wanted, values, lengths, lists, first_part, parts):  # noqa: ANN001, ANN201
+    """Fill, for each of the bricks (m, 3):
+
+    values (m, 64): a certain answer; that at the centre + codes where open; or 2 codes + the number of its list.
+        LIST_ALONE first: list 0 settles the whole brick.
+    lengths (m, 64): of the lists, NO_LIST after the last. lists (m, 64, longest): their candidates, ascending.
+    first_part (m, 64): of lists, -1, or for a cell that is split the number of its row in parts.
+    parts (m, 64, 64): answers of the parts, ``codes`` where the list settles them.
+
+    points: (x, y, z, answer, index, start): sorted by slot, ``start[slot]`` its first. wanted: (short, lists, split,
+    alone): the length up to which lists are shared, whether there are lists, parts, and a list alone also where the
+    brick holds points.
+    """
+    for row in prange(len(bricks)):
+        _answer_brick(
+            bricks[row], lattice, limits, points, top, wanted,
+            values[row], lengths[row], lists[row], first_part[row], parts[row],
+        )  # fmt: skip
+
+
+@njit(cache=True)
+def _answer_brick(brick, lattice, limits, points, top, wanted, values, lengths, lists, first_part, parts):  # noqa: ANN001, ANN202
+    low, size, rounding = lattice
+    short, with_lists, with_parts, alone = wanted
+    corner = (low[0] + brick[0] * BRICK * size, low[1] + brick[1] * BRICK * size, low[2] + brick[2] * BRICK * size)
+    near, holds = _points_about(brick, corner, size, rounding, limits[0], points, top)
+    lengths[:] = NO_LIST
+    first_part[:] = -1
+    found = np.empty(len(near[0]), np.int32)
+    whole, whole_length = np.empty(short, np.int32), 0  # of the list that settles the whole brick; -1: none does
+    if not with_lists or (holds.any() and not alone):
+        whole_length = -1
+    lists_made, parts_made = 0, 0
+    for octant in range(OCTANTS**3):
+        some = _within_octant(octant, corner, size, rounding, limits[0], near)
+        for cell in _cells_of_octant(octant):
+            low_corner = _corner(corner, cell, BRICK, size)
+            center = (low_corner[0] + size / 2, low_corner[1] + size / 2, low_corner[2] + size / 2)
+            half = size / 2 + rounding
+            code, certain, count = _answer_box(center, half, limits, near, some, found, whole_length >= 0)
+            values[cell] = code if certain else code + limits[2]
+            if whole_length >= 0:
+                whole_length = _join(whole, whole_length, found[:count], short)
+            if certain or not with_lists:
+                continue
+            splits = holds[cell] and with_parts
+            if splits:
+                boxes = parts[parts_made]
+                count = _settle_boxes(low_corner, size, rounding, PARTS, True, limits, near, found, count, boxes)
+            elif count > short // 2:
+                boxes = np.empty(SUBDIVISION**3, np.int32)
+                count = _settle_boxes(low_corner, size, rounding, SUBDIVISION, False, limits, near, found, count, boxes)
+            if count > lists.shape[1]:
+                continue
+            number = lists_made
+            if not splits:
+                number = _list_to_share(lists, lengths, first_part, lists_made, found[:count], short)
+            if number == lists_made:
+                lists_made += 1
+            if splits:
+                first_part[number] = parts_made
+                parts_made += 1
+            lengths[number] = _join(lists[number], max(lengths[number], 0), found[:count], lists.shape[1])
+            values[cell] = 2 * limits[2] + number
+    if whole_length > 0:
+        values[0], lists_made, lengths[0] = LIST_ALONE, 1, whole_length
+        lengths[1:], first_part[0] = NO_LIST, -1
+        lists[0, :whole_length] = whole[:whole_length]
+    for number in range(lists_made):
+        lists[number, : lengths[number]] = np.sort(near[4][lists[number, : lengths[number]]])
+
+
+@njit(cache=True)
+def _points_about(brick, corner, size, rounding, reach, points, top):  # noqa: ANN001, ANN202
+    """The points within reach of the brick, and (64,) bool, which of its cells hold points."""
+    x, y, z, answer, index, start = points
+    half = BRICK * size / 2 + rounding
+    center = (corner[0] + BRICK * size / 2, corner[1] + BRICK * size / 2, corner[2] + BRICK * size / 2)
+    chosen, count = np.empty(256, np.int32), 0
+    holds = np.zeros(BRICK**3, np.bool_)
+    for neighbour in range(27):
+        i, j, k = brick[0] + neighbour // 9 - 1, brick[1] + neighbour // 3 % 3 - 1, brick[2] + neighbour % 3 - 1
+        row = top[i // BLOCK, j // BLOCK, k // BLOCK]  # no brick of the outermost layer is asked: all indices are right
+        if row < 0:
+            continue
+        slot = row * BLOCK**3 + (i % BLOCK * BLOCK + j % BLOCK) * BLOCK + k % BLOCK
+        for point in range(start[slot], start[slot + 1]):
+            if _gap_squared(x[point] - center[0], y[point] - center[1], z[point] - center[2], half) <= _grown(reach):
+                if count == len(chosen):
+                    chosen = np.append(chosen, np.empty(count, np.int32))
+                chosen[count] = point
+                count += 1
+            if neighbour == 13:
+                cell_x = min(max(int((x[point] - corner[0]) / size), 0), BRICK - 1)
+                cell_y = min(max(int((y[point] - corner[1]) / size), 0), BRICK - 1)
+                cell_z = min(max(int((z[point] - corner[2]) / size), 0), BRICK - 1)
+                holds[(cell_x * BRICK + cell_y) * BRICK + cell_z] = True
+    chosen = chosen[:count]
+    return (x[chosen], y[chosen], z[chosen], answer[chosen], index[chosen]), holds
+
+
+@njit(cache=True)
+def _within_octant(octant, corner, size, rounding, reach, near):  # noqa: ANN001, ANN202
+    """Rows of the points about the brick that are within reach of that octant."""
+    edge = BRICK // OCTANTS * size
+    low = _corner(corner, octant, OCTANTS, edge)
+    some, count = np.empty(len(near[0]), np.int32), 0
+    for row in range(len(near[0])):
+        dx, dy, dz = (
+            near[0][row] - low[0] - edge / 2, near[1][row] - low[1] - edge / 2, near[2][row] - low[2] - edge / 2,
+        )  # fmt: skip
+        some[count] = row
+        count += _gap_squared(dx, dy, dz, edge / 2 + rounding) <= _grown(reach)
+    return some[:count]
+
+
+@njit(cache=True)
+def _cells_of_octant(octant):  # noqa: ANN001, ANN202
+    """(8,) numbers of its cells in the brick."""
+    edge = BRICK // OCTANTS
+    cells = np.empty(edge**3, np.int64)
+    for part in range(edge**3):
+        x = octant // OCTANTS**2 * edge + part // edge**2
+        y = octant // OCTANTS % OCTANTS * edge + part // edge % edge
+        cells[part] = (x * BRICK + y) * BRICK + octant % OCTANTS * edge + part % edge
+    return cells
+
+
+@njit(cache=True, inline="always")
+def _corner(corner, number, per_edge, size):  # noqa: ANN001, ANN202
+    """Low corner of the part with that number, of per_edge^3 of that size in C order."""
+    return (
+        corner[0] + number // per_edge**2 * size,
+        corner[1] + number // per_edge % per_edge * size,
+        corner[2] + number % per_edge * size,
+    )
+
+
+@njit(cache=True)
+def _answer_box(center, half, limits, near, some, found, always):  # noqa: ANN001, ANN202
+    """(code at the centre, whether it is the whole box's, count): the points nearest somewhere in the box lie in
+    ``found``, unless it is certain and not ``always`` asked for. some: rows that may be; found may be the same array.
+    """
+    reach, _, codes = limits
+    best, best_squared = -1, np.inf
+    for row in some:
+        dx, dy, dz = near[0][row] - center[0], near[1][row] - center[1], near[2][row] - center[2]
+        squared = dx * dx + dy * dy + dz * dz
+        if squared < best_squared:
+            best, best_squared = row, squared
+    if best < 0 or best_squared > (reach + np.sqrt(3.0) * half) ** 2:
+        return TOO_FAR_CODE, True, 0
+    nearest = _seen_from(center, near, best)
+    limit = (np.sqrt(best_squared) + 2 * np.sqrt(3.0) * half) ** 2  # farther points always lose
+    count, one_answer = 0, True
+    for row in some:
+        rival = _seen_from(center, near, row)
+        squared = rival[0] * rival[0] + rival[1] * rival[1] + rival[2] * rival[2]
+        if squared <= limit and not _loses(rival, squared, nearest, best_squared, half):
+            if _gap_squared(rival[0], rival[1], rival[2], half) <= _grown(reach):
+                found[count] = row
+                count += 1
+                one_answer = one_answer and near[3][row] == near[3][best]
+    if count == 0:
+        return TOO_FAR_CODE, True, 0
+    within = _all_within_reach(nearest, half, reach)
+    if not (within and one_answer) or always:
+        count, one_answer = _keep_winners(center, half, near, found, count, best)
+    return _code(near[3][best], best_squared, limits), within and one_answer, count
+
+
+@njit(cache=True)
+def _keep_winners(center, half, near, found, count, best):  # noqa: ANN001, ANN202
+    """Drop rivals that lose to any other; how many are left, and whether all have the answer of the best."""
+    row = 0
+    while row < count:
+        rival = _seen_from(center, near, found[row])
+        squared = rival[0] * rival[0] + rival[1] * rival[1] + rival[2] * rival[2]
+        lost = False
+        for other in range(count):
+            if other != row and not lost:
+                better = _seen_from(center, near, found[other])
+                better_squared = better[0] * better[0] + better[1] * better[1] + better[2] * better[2]
+                lost = better_squared < squared and _loses(rival, squared, better, better_squared, half)
+        if lost:
+            count -= 1
+            found[row] = found[count]
+        else:
+            row += 1
+    one_answer = True
+    for row in range(count):
+        one_answer = one_answer and near[3][found[row]] == near[3][best]
+    return count, one_answer
+
+
+@njit(cache=True)
+def _settle_boxes(corner, size, rounding, per_edge, only_open, limits, near, found, count, values):  # noqa: ANN001, ANN202
+    """Look at a cell in per_edge^3 boxes, and keep those of its ``found`` that are nearest somewhere in one.
+
+    values: filled with the boxes' certain answers, or codes. only_open: what certain boxes need is not kept. Returns
+    the new count.
+    """
+    edge = size / per_edge
+    among, winners = found[:count].copy(), np.empty(count, np.int32)
+    needed = np.zeros(len(near[0]), np.bool_)
+    for box in range(per_edge**3):
+        low = _corner(corner, box, per_edge, edge)
+        center = (low[0] + edge / 2, low[1] + edge / 2, low[2] + edge / 2)
+        code, certain, wins = _answer_box(center, edge / 2 + rounding, limits, near, among, winners, not only_open)
+        values[box] = code if certain else limits[2]
+        if not (certain and only_open):
+            for row in winners[:wins]:
+                needed[row] = True
+    kept = 0
+    for row in among:
+        found[kept] = row
+        kept += needed[row]
+    return kept
+
+
+@njit(cache=True)
+def _list_to_share(lists, lengths, first_part, made, found, short):  # noqa: ANN001, ANN202
+    """Number of the list that grows least by what is found, and not beyond ``short``; ``made`` if there is none."""
+    chosen, least = made, short + 1
+    for number in range(made):
+        length, grown = lengths[number], lengths[number]
+        if first_part[number] >= 0:
+            continue
+        for row in found:
+            known = False
+            for place in range(length):
+                known = known or lists[number, place] == row
+            grown += not known
+        if grown - length < least and grown <= max(short, length):
+            chosen, least = number, grown - length
+    return chosen
+
+
+@njit(cache=True)
+def _join(members, length, more, longest):  # noqa: ANN001, ANN202
+    """Add what is new to the members; the new length, or -1 where there is no room."""
+    for row in more:
+        known = False
+        for place in range(length):
+            known = known or members[place] == row
+        if not known:
+            if length == longest:
+                return -1
+            members[length] = row
+            length += 1
+    return length
+
+
+@njit(cache=True, inline="always")
+def _seen_from(center, near, row):  # noqa: ANN001, ANN202
+    return near[0][row] - center[0], near[1][row] - center[1], near[2][row] - center[2]
+
+
+@njit(cache=True, inline="always")
+def _code(answer, squared, limits):  # noqa: ANN001, ANN202
+    """Code of an answer at that distance: too far, near, or on the surface."""
+    reach, surface, codes = limits
+    if squared > reach * reach:
+        return TOO_FAR_CODE
+    return answer if squared <= surface * surface else answer + codes // 2
+
+
+@njit(cache=True, inline="always")
+def _grown(reach):  # noqa: ANN001, ANN202
+    """The squared reach, and a little more for rounding."""
+    return reach * reach * (1 + 1e-9)
+
+
+@njit(cache=True, inline="always")
+def _gap_squared(dx, dy, dz, half):  # noqa: ANN001, ANN202
+    """Squared distance of a point, seen from a box's centre, to the box."""
+    gap_x, gap_y, gap_z = max(abs(dx) - half, 0.0), max(abs(dy) - half, 0.0), max(abs(dz) - half, 0.0)
+    return gap_x * gap_x + gap_y * gap_y + gap_z * gap_z
+
+
+@njit(cache=True, inline="always")
+def _all_within_reach(nearest, half, reach):  # noqa: ANN001, ANN202
+    """Whether that point, seen from the centre, is within reach of every place in the box."""
+    far_x, far_y, far_z = abs(nearest[0]) + half, abs(nearest[1]) + half, abs(nearest[2]) + half
+    return far_x * far_x + far_y * far_y + far_z * far_z <= reach * reach * (1 - 1e-9)
+
+
+@njit(cache=True, inline="always")
+def _loses(p, p_squared, q, q_squared, half):  # noqa: ANN001, ANN202
+    """Whether a point p is farther than a point q everywhere in the box.
+
+    |u - p|^2 - |u - q|^2 is linear in u, so the box's worst corner decides: |p|^2 - |q|^2 - 2 half |p - q|_1 > 0, seen
+    from the centre. A tie does not lose.
+    """
+    spread = abs(p[0] - q[0]) + abs(p[1] - q[1]) + abs(p[2] - q[2])
+    return p_squared - q_squared - 2 * half * spread > 1e-9 * half * half
