@@ -46,6 +46,7 @@ class LabelledScene:
 
     def __init__(self, bundle: Bundle) -> None:
         self._bundle = bundle
+        self._nearest_within: dict[float, NearestPoint] = {}
 
     @classmethod
     def from_cloud(cls, cloud: LabelledCloud) -> LabelledScene:
@@ -192,7 +193,10 @@ class LabelledScene:
                 "points farther than that have no label"
             )
         within_reach = np.flatnonzero(instances != TOO_FAR)
-        search = NearestPoint(self.cloud.xyz, self.cloud.spacing, max_distance)
+        search = self._nearest_within.get(max_distance)
+        if search is None:  # only the last one is kept: a stream asks for the same again and again
+            search = NearestPoint(self.cloud.xyz, self.cloud.spacing, max_distance)
+            self._nearest_within = {max_distance: search}
         return within_reach[search.query(local[within_reach]) == NONE_WITHIN_REACH]
 
     @cached_property
@@ -286,7 +290,7 @@ class Segmenter:
     """The same labels for many clouds: words are scored once, and a call only looks points up.
 
     Several threads may call it at once; memory does not grow from call to call.
-    scene, labels, text_features, templates, negatives: as for ``segment``.
+    scene, labels, text_features, templates, negatives, max_distance: as for ``segment``.
     """
 
     def __init__(
@@ -297,8 +301,9 @@ class Segmenter:
         text_features: TextFeatures = None,
         templates: Sequence[str] | None = None,
         negatives: Labels = None,
+        max_distance: float | None = None,
     ) -> None:
-        self.scene = as_scene(scene)
+        self.scene, self._max_distance = as_scene(scene), max_distance
         self._words, self._answers = _answers(self.scene, labels, text_features, templates, negatives)
         self._warned = False
 
@@ -315,7 +320,8 @@ class Segmenter:
         Warns the first time that no point gets a label, not at every empty frame of a stream.
         """
         points = _posed(world_points(points), pose)
-        result = _label(self.scene, self._words, self._answers, points, *self.scene.look_up(points))
+        found = self.scene.look_up(points, max_distance=self._max_distance)
+        result = _label(self.scene, self._words, self._answers, points, *found)
         if not self._warned and (reason := _why_nothing(result, self.scene)):
             self._warned = True
             warnings.warn(reason, stacklevel=2)

@@ -179,7 +179,7 @@ def _ring(room: Room, steps: int = 90) -> Points:
     clearance = _clearance(surfaces, places.reshape(-1, 2)).reshape(steps, -1)
     best = shares[clearance.argmax(axis=1)]
     window = np.hanning(17)[1:-1]
-    smooth = np.convolve(np.concatenate([best[-7:], best, best[:7]]), window / window.sum(), "valid")
+    smooth = np.asarray(np.convolve(np.concatenate([best[-7:], best, best[:7]]), window / window.sum(), "valid"), float)
     return around * smooth[:, None]
 
 
@@ -191,10 +191,10 @@ def _on_ring(path: Points, place: float) -> Points:
 def _clearance(surfaces: Any, places: Points) -> Points:
     """(n,) metres from each place (n, 2) to the nearest surface between knee and sensor."""
     heights = (0.15, 0.5, SENSOR_HEIGHT_M)
-    distances = [
+    distances: list[NDArray[np.float32]] = [
         surfaces.compute_distance(_tensor(np.column_stack([places, np.full(len(places), z)]))).numpy() for z in heights
     ]
-    return np.stack(distances).min(axis=0).astype(np.float64)
+    return np.min(np.array(distances, np.float64), axis=0)
 
 
 def _surfaces(items: Any) -> Any:

@@ -82,9 +82,9 @@ def print_report(report: BagReport, output: Path, seconds: float) -> None:
         for reason, count in report.skipped.most_common(SHOWN_REASONS):
             print(f"  {count:,} x {reason}")
     pace = report.seconds["clouds"]
+    print(f"{report.clouds:,} clouds, {report.points:,} points, {report.detections:,} detections in {seconds:.1f} s")
     print(
-        f"{report.clouds:,} clouds, {report.points:,} points, {report.detections:,} detections in {seconds:.1f} s, "
-        f"{pace:.1f} s of it for the clouds: {report.clouds / pace:.1f} clouds, {report.points / pace:,.0f} points a second"
+        f"clouds alone {pace:.1f} s: {report.clouds / pace:.1f} clouds and {report.points / pace:,.0f} points a second"
     )
     print(f"wrote {output}: {', '.join(report.topics.values())}")
     shown = next(iter(report.topics.values()))

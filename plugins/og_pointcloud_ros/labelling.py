@@ -33,6 +33,7 @@ class LabelledMessages(NamedTuple):
 class CloudLabeller:
     """Labels PointCloud2 messages one by one; words are scored, and boxes worked out, once.
 
+    segmenter: of the scene, may be replaced by one of other labels.
     frame: the scene's frame, which detections are given in. minimum_points: of an instance, to be a detection.
     """
 
@@ -46,6 +47,12 @@ class CloudLabeller:
         self.segmenter = segmenter
         self._messages, self._frame, self._minimum_points = messages, frame, minimum_points
         self._instances = instance_table(segmenter.scene, up=UP)
+
+    def warm_up(self) -> None:
+        """Work out all boxes and open the graph now, not while the first clouds wait."""
+        for instance in self._instances:
+            _ = instance.oriented_box
+        self.segmenter.scene.look_up(np.zeros((1, 3)))
 
     def __call__(self, message: Any, pose: NDArray[np.float64]) -> LabelledMessages:
         """message: a cloud in the sensor's frame. pose: (4, 4), takes it to the scene's frame.

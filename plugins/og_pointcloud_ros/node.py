@@ -1,0 +1,205 @@
+"""The ROS 2 node: clouds in, labelled clouds and detections out. The only module that needs ROS.
+
+Subscribes ~/input/points (sensor_msgs/PointCloud2, best effort, the newest alone) and ~/set_labels (std_msgs/String).
+Publishes ~/output/points, ~/output/detections and, latched, ~/label_info. A cloud is placed in the scene by tf.
+
+Work is left out rather than queued: a cloud is dropped when nobody listens, when a newer one has come, or when its
+transform does not come in time.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import rclpy  # pyright: ignore[reportMissingImports]
+import rclpy.executors  # pyright: ignore[reportMissingImports]
+import rclpy.logging  # pyright: ignore[reportMissingImports]
+from numpy.typing import NDArray
+from rcl_interfaces.msg import SetParametersResult  # pyright: ignore[reportMissingImports]
+from rclpy.node import Node  # pyright: ignore[reportMissingImports]
+from rclpy.parameter import Parameter  # pyright: ignore[reportMissingImports]
+from rclpy.qos import (  # pyright: ignore[reportMissingImports]
+    QoSDurabilityPolicy,
+    QoSHistoryPolicy,
+    QoSProfile,
+    QoSReliabilityPolicy,
+)
+from rclpy.time import Time  # pyright: ignore[reportMissingImports]
+from sensor_msgs.msg import PointCloud2  # pyright: ignore[reportMissingImports]
+from std_msgs.msg import String  # pyright: ignore[reportMissingImports]
+from tf2_ros import Buffer, TransformException, TransformListener  # pyright: ignore[reportMissingImports]
+from vision_msgs.msg import Detection3DArray, LabelInfo  # pyright: ignore[reportMissingImports]
+
+from og_pointcloud.errors import OgPointcloudError
+from og_pointcloud.runtime import LabelledScene, Segmenter, load
+from og_pointcloud_ros.detections import to_label_info
+from og_pointcloud_ros.labelling import MINIMUM_POINTS, CloudLabeller
+from og_pointcloud_ros.messages import ros_messages
+from og_pointcloud_ros.transforms import rotation_matrix
+
+__all__ = ["SegmentNode", "main"]
+
+PARAMETERS = {
+    "scene": "",
+    "labels": [""],
+    "text_features": "",
+    "target_frame": "map",
+    "max_distance": 0.0,
+    "max_age": 0.5,
+    "minimum_points": MINIMUM_POINTS,
+}
+"""With their defaults; config/parameters.yaml explains them. An empty list has no type in ROS, hence [""]."""
+RETRY_S = 0.02
+"""How often a waiting cloud asks for its transform: tf is often a little later than the cloud."""
+QUIET_S = 5.0
+"""Seconds between two warnings."""
+
+
+class SegmentNode(Node):
+    """See the module. The parameter ``labels`` may be set while it runs; the others are read at the start.
+
+    SceneError, BundleError or FeatureSpaceError where the scene or the words cannot be used.
+    """
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__("og_pointcloud", **options)
+        for name, default in PARAMETERS.items():
+            self.declare_parameter(name, default)
+        self._target_frame, self._max_age = self._value("target_frame"), self._value("max_age")
+        self._scene = self._load()
+        reliable, best_effort = QoSReliabilityPolicy.RELIABLE, QoSReliabilityPolicy.BEST_EFFORT
+        self._points = self.create_publisher(PointCloud2, "~/output/points", _latest(reliable))
+        self._detections = self.create_publisher(Detection3DArray, "~/output/detections", _latest(reliable))
+        self._info = self.create_publisher(LabelInfo, "~/label_info", _latest(reliable, latched=True))
+        self._labeller = CloudLabeller(
+            self._segmenter(self._value("labels")), ros_messages, self._target_frame, self._value("minimum_points")
+        )
+        self._labeller.warm_up()
+        self._announce()
+        self.add_on_set_parameters_callback(self._on_parameters)
+        self._waiting: tuple[Any, float] | None = None
+        self._transforms = Buffer()
+        self._listener = TransformListener(self._transforms, self)
+        self.create_subscription(PointCloud2, "~/input/points", self._on_cloud, _latest(best_effort))
+        self.create_subscription(String, "~/set_labels", self._on_labels, 10)
+        self.create_timer(RETRY_S, self._work)
+
+    def _load(self) -> LabelledScene:
+        path = self._value("scene")
+        if not path:
+            raise OgPointcloudError(
+                "the parameter 'scene' is empty; expected a .ogpc file: --ros-args -p scene:=/maps/room.ogpc"
+            )
+        return load(path)
+
+    def _segmenter(self, labels: Sequence[str]) -> Segmenter:
+        return Segmenter(
+            self._scene,
+            [label for label in labels if label] or None,
+            text_features=self._value("text_features") or None,
+            max_distance=self._value("max_distance") or None,
+        )
+
+    def _value(self, name: str) -> Any:
+        return self.get_parameter(name).value
+
+    def _announce(self) -> None:
+        names = self._labeller.segmenter.names
+        stamp = self.get_clock().now().to_msg()
+        self._info.publish(to_label_info(names, self._target_frame, stamp, messages=ros_messages))
+        self.get_logger().info(f"{len(names)} labels: {', '.join(names)}")
+
+    def _on_labels(self, message: Any) -> None:
+        """A JSON list of words, or words with commas between them; the same as setting the parameter."""
+        try:
+            labels = json.loads(message.data)
+        except ValueError:
+            labels = message.data.split(",")
+        if not (isinstance(labels, list) and labels and all(isinstance(label, str) for label in labels)):
+            self.get_logger().error(f"set_labels got {message.data!r}; expected words like: chair, table")
+            return
+        result = self.set_parameters([Parameter("labels", value=[label.strip() for label in labels])])[0]
+        if not result.successful:
+            self.get_logger().error(f"the labels stay as they are: {result.reason}")
+
+    def _on_parameters(self, parameters: Sequence[Any]) -> Any:
+        """Refuses what cannot be used, with the reason, before it is set."""
+        for parameter in parameters:
+            if parameter.name in PARAMETERS and parameter.name != "labels":
+                return SetParametersResult(successful=False, reason=f"{parameter.name} is read at the start only")
+        for labels in (parameter.value for parameter in parameters if parameter.name == "labels"):
+            try:
+                self._labeller.segmenter = self._segmenter(labels or [])
+            except (OgPointcloudError, OSError) as error:
+                return SetParametersResult(successful=False, reason=str(error))
+            self._announce()
+        return SetParametersResult(successful=True)
+
+    def _on_cloud(self, message: Any) -> None:
+        if not (self._points.get_subscription_count() or self._detections.get_subscription_count()):
+            self._waiting = None
+            return
+        self._waiting = (message, time.monotonic())  # in place of an older one that still waits
+        self._work()
+
+    def _work(self) -> None:
+        """Label the waiting cloud, if there is one and its transform has come."""
+        if self._waiting is None:
+            return
+        message, arrived = self._waiting
+        try:
+            pose = self._pose(message.header)
+        except TransformException as error:
+            if time.monotonic() - arrived > self._max_age:
+                self._waiting = None
+                self._warn(f"a cloud was dropped, its transform did not come within {self._max_age} s: {error}")
+            return
+        self._waiting = None
+        try:
+            labelled = self._labeller(message, pose)
+        except OgPointcloudError as error:
+            self._warn(f"a cloud was dropped: {error}")
+            return
+        self._points.publish(labelled.points)
+        self._detections.publish(labelled.detections)
+
+    def _pose(self, head: Any) -> NDArray[np.float64]:
+        """(4, 4) from the cloud's frame to the scene's, at the cloud's time; tf2's TransformException without one."""
+        found = self._transforms.lookup_transform(self._target_frame, head.frame_id, Time.from_msg(head.stamp))
+        place, turn = found.transform.translation, found.transform.rotation
+        pose = np.eye(4)
+        pose[:3, :3] = rotation_matrix((turn.x, turn.y, turn.z, turn.w))
+        pose[:3, 3] = place.x, place.y, place.z
+        return pose
+
+    def _warn(self, text: str) -> None:
+        self.get_logger().warning(text, throttle_duration_sec=QUIET_S)
+
+
+def _latest(reliability: Any, latched: bool = False) -> Any:
+    """The newest message alone. A reliable publisher serves subscribers of both kinds."""
+    durability = QoSDurabilityPolicy.TRANSIENT_LOCAL if latched else QoSDurabilityPolicy.VOLATILE
+    return QoSProfile(history=QoSHistoryPolicy.KEEP_LAST, depth=1, reliability=reliability, durability=durability)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the node until it is stopped. Returns the exit code, 2 for a scene or words that cannot be used."""
+    rclpy.init(args=arguments)
+    try:
+        node = SegmentNode()
+    except (OgPointcloudError, OSError) as error:
+        rclpy.logging.get_logger("og_pointcloud").fatal(str(error))
+        rclpy.try_shutdown()
+        return 2
+    try:
+        rclpy.spin(node)
+    except (KeyboardInterrupt, rclpy.executors.ExternalShutdownException):
+        pass
+    finally:
+        node.destroy_node()
+        rclpy.try_shutdown()
+    return 0
