@@ -1,10 +1,12 @@
 """Point clouds of other libraries -> an array of points, without importing any of them.
 
-A cloud is told by the module of its type: whoever has such an object has imported its library already.
+A cloud is told by the module of its type: whoever has such an object has imported its library already. Rows stay rows:
+row i of what is answered belongs to row i of the cloud, also where it holds NaN.
 """
 
 from __future__ import annotations
 
+import importlib
 import os
 from pathlib import Path
 from typing import Any
@@ -12,39 +14,36 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud.errors import SceneError
+from og_pointcloud.errors import MissingExtraError, SceneError
 
-__all__ = ["SCENE_FIELD", "carried_scene", "world_points"]
+__all__ = ["NAMES_FIELD", "SCENE_FIELD", "carried_scene", "import_plugin", "require_finite", "world_points"]
 
 SCENE_FIELD = "og_pointcloud_scene"
 """Field of a PyVista dataset that names the .ogpc file its labels came from."""
+NAMES_FIELD = "og_names"
+"""Where hosts and files that can keep texts hold the names that ``og_label`` counts."""
 
 
 def world_points(pcd: Any) -> NDArray[np.float64]:
     """(N, 3) float64 world coordinates of a cloud; rows may be NaN.
 
-    pcd: an array of shape (N, 3); an Open3D point cloud or mesh, legacy or tensor; a PyVista dataset; a trimesh cloud
-    or mesh; or the path of a geometry file. A mesh's points are its vertices. SceneError for anything else.
+    pcd: an array of shape (N, 3); a torch tensor of that shape, wherever it lies; an Open3D point cloud or mesh, legacy
+    or tensor; a PyVista dataset; a trimesh cloud or mesh; laspy's LasData; a PointCloud2 message; or the path of a
+    geometry file (PLY, PCD, LAS, LAZ). A mesh's points are its vertices. SceneError for anything else;
+    MissingExtraError where reading needs a library that is not installed.
     """
     if isinstance(pcd, (str, os.PathLike)):
-        from og_pointcloud.formats.points import read_points
-
-        return read_points(Path(pcd)).xyz_world
+        return _of_file(Path(pcd))
+    kind = type(pcd).__name__
+    if kind.endswith("PointCloud2"):  # rclpy's type, and rosbags' sensor_msgs__msg__PointCloud2
+        return _checked(import_plugin("og_pointcloud_ros", "ros").from_pointcloud2(pcd), kind)
     host = _host(pcd)
-    if host == "open3d" and hasattr(pcd, "points"):
-        values = pcd.points
-    elif host == "open3d" and (hasattr(pcd, "point") or hasattr(pcd, "vertex")):
-        tensors = pcd.point if hasattr(pcd, "point") else pcd.vertex
-        values = tensors["positions"].cpu().numpy() if "positions" in tensors else np.zeros((0, 3))
-    elif host == "pyvista" and hasattr(pcd, "points"):
-        values = pcd.points
-    elif host in ("open3d", "trimesh") and hasattr(pcd, "vertices"):
-        values = pcd.vertices
-    elif host is None:
-        values = pcd
-    else:
-        raise SceneError(f"a {type(pcd).__name__} of {host} has no points that can be asked: give its points as (N, 3)")
-    return _checked(values, type(pcd).__name__)
+    if host is None:
+        return _checked(pcd, kind)
+    values = _READERS[host](pcd)
+    if values is None:
+        raise SceneError(f"a {kind} of {host} has no points that can be asked: give its points as (N, 3)")
+    return _checked(values, kind)
 
 
 def carried_scene(pcd: Any) -> Path | None:
@@ -54,13 +53,65 @@ def carried_scene(pcd: Any) -> Path | None:
     return None
 
 
+def import_plugin(module: str, extra: str) -> Any:
+    """A plugin of ours, og_pointcloud_*; MissingExtraError names the extra where its host library is not installed."""
+    try:
+        return importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        raise MissingExtraError(error.name or module, extra) from None
+
+
+def require_finite(xyz_world: NDArray[np.floating], why: str) -> None:
+    """SceneError for points (n, 3) with NaN or infinity, on their way into a format that cannot hold them."""
+    finite = np.logical_and.reduce(np.isfinite(xyz_world), axis=1)
+    if not finite.all():
+        raise SceneError(
+            f"{int((~finite).sum())} of {len(finite)} points hold NaN or infinity (the first is row "
+            f"{int(np.argmin(finite))}); expected finite coordinates, {why}: label the finite points alone, "
+            "points[np.isfinite(points).all(axis=1)]"
+        )
+
+
 def _host(pcd: Any) -> str | None:
     """Library of a cloud's type or of one it is derived from."""
     for kind in type(pcd).__mro__:
         root = kind.__module__.partition(".")[0]
-        if root in ("open3d", "pyvista", "trimesh"):
+        if root in _READERS:
             return root
     return None
+
+
+def _of_file(path: Path) -> NDArray[np.float64]:
+    from og_pointcloud.formats.las import looks_like_las, read_las_positions
+    from og_pointcloud.formats.points import read_points
+
+    return read_las_positions(path) if looks_like_las(path) else read_points(path).xyz_world
+
+
+def _of_open3d(cloud: Any) -> Any:
+    for name in ("points", "vertices"):  # legacy
+        if hasattr(cloud, name):
+            return getattr(cloud, name)
+    for name in ("point", "vertex"):  # tensor
+        if hasattr(cloud, name):
+            tensors = getattr(cloud, name)
+            return tensors["positions"].cpu().numpy() if "positions" in tensors else np.zeros((0, 3))
+    return None
+
+
+def _of_torch(tensor: Any) -> Any:
+    tensor = tensor.detach().cpu()
+    return (tensor.double() if tensor.is_floating_point() else tensor).numpy()  # numpy has no bfloat16
+
+
+_READERS = {
+    "open3d": _of_open3d,
+    "pyvista": lambda dataset: getattr(dataset, "points", None),
+    "trimesh": lambda geometry: getattr(geometry, "vertices", None),
+    "laspy": lambda las: getattr(las, "xyz", None),
+    "torch": lambda tensor: _of_torch(tensor) if hasattr(tensor, "detach") else None,
+}
+"""Root module of a cloud's type -> what finds its points, None where it has none."""
 
 
 def _checked(values: Any, kind: str) -> NDArray[np.float64]:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import importlib
 import os
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -13,15 +13,17 @@ from numpy.typing import NDArray
 
 from og_pointcloud._atomic import replacing
 from og_pointcloud.choosing import Reason
-from og_pointcloud.clouds import SCENE_FIELD
-from og_pointcloud.errors import MissingExtraError, OgPointcloudError
+from og_pointcloud.clouds import import_plugin
+from og_pointcloud.errors import OgPointcloudError
 
-__all__ = ["UNKNOWN", "UNKNOWN_COLOR", "Reason", "Segmentation", "label_colors"]
+__all__ = ["SAVED_AS", "UNKNOWN", "UNKNOWN_COLOR", "Reason", "Segmentation", "label_colors"]
 
 UNKNOWN = -1
 """Label of a point that none of the names is known to fit."""
 UNKNOWN_COLOR = (128, 128, 128)
 GOLDEN_RATIO = 0.618033988749895
+SAVED_AS = (".npz", ".ply", ".las", ".laz", ".glb", ".gltf")
+"""Endings of the files that a result is written to."""
 
 
 @dataclass(frozen=True)
@@ -82,57 +84,76 @@ class Segmentation:
         """(N, 3) uint8 RGB: a colour a label, grey where unknown."""
         return label_colors(self.labels)
 
+    @property
+    def attributes(self) -> dict[str, NDArray[Any]]:
+        """What hosts and files keep of each point, (N,) arrays by the names that they have everywhere."""
+        return {
+            "og_label": self.labels,
+            "og_instance": self.instances,
+            "og_score": self.scores,
+            "og_reason": self.reasons,
+        }
+
     def to_open3d(self) -> Any:
-        """An Open3D tensor cloud: positions, colors, and label, score, instance, reason as (N, 1) attributes."""
-        open3d = _import_host("open3d")
-        cloud = open3d.t.geometry.PointCloud()
-        cloud.point["positions"] = open3d.core.Tensor(self.xyz)
-        cloud.point["colors"] = open3d.core.Tensor(self.colors.astype(np.float32) / 255)
-        for name, values in self._columns().items():
-            # A one-dimensional attribute makes Open3D's own filters fail.
-            cloud.point[name] = open3d.core.Tensor(np.ascontiguousarray(values[:, None]))
-        return cloud
+        """An Open3D tensor cloud: positions, colors, and the `attributes` as (N, 1). Needs the extra 'open3d'."""
+        return import_plugin("og_pointcloud_open3d", "open3d").to_open3d(self)
 
     def to_pyvista(self) -> Any:
-        """A PyVista PolyData: point arrays label, score, instance, reason and colors, field array names."""
-        pyvista = _import_host("pyvista")
-        mesh = pyvista.PolyData(self.xyz) if len(self) else pyvista.PolyData()
-        if len(self):  # empty arrays are refused
-            for name, values in self._columns().items():
-                mesh.point_data[name] = values
-            mesh.point_data["colors"] = self.colors
-        mesh.field_data["names"] = list(self.names)
-        if self.scene is not None:
-            mesh.field_data[SCENE_FIELD] = [str(self.scene.resolve())]
-        return mesh
+        """A PyVista PolyData with the `attributes`, colours, names and scene. Needs the extra 'pyvista'."""
+        return import_plugin("og_pointcloud_pyvista", "pyvista").to_pyvista(self)
+
+    def to_pointcloud2(self, frame_id: str = "map", stamp: Any = None) -> Any:
+        """A sensor_msgs/PointCloud2 message with the labels in its fields. Needs the extra 'ros'."""
+        return import_plugin("og_pointcloud_ros", "ros").to_pointcloud2(self, frame_id=frame_id, stamp=stamp)
+
+    def to_las(self) -> Any:
+        """A laspy LasData, laid out as ``save`` writes .las. Needs the extra 'las'."""
+        from og_pointcloud.formats.las import labelled_las
+
+        return labelled_las(self.xyz, self.colors, self.attributes, self.names)
 
     def save(self, path: str | os.PathLike[str]) -> Path:
-        """Write an .npz of labels, scores, instances, reasons, names and calibrated, or a coloured .ply.
+        """Write the result, whole or not at all, as what the path's ending says.
 
-        Whole or not at all.
+        .npz: labels, scores, instances, reasons, names and calibrated. .ply: a coloured cloud with the `attributes`.
+        .las, .laz: with colours, classification and the attributes as extra bytes (needs the extra 'las').
+        .glb, .gltf: coloured points with feature ids.
+        OgPointcloudError for another ending; SceneError where the format cannot hold the points: .las and .glb have no
+        room for NaN, .glb none for an empty cloud.
         """
         path = Path(path)
+        if path.suffix not in SAVED_AS:
+            raise OgPointcloudError(
+                f"'{path}' ends in '{path.suffix}'; expected a name that ends in {', '.join(SAVED_AS)}"
+            )
         if path.suffix == ".npz":
-            with replacing(path) as file:
-                np.savez(
-                    file,
-                    labels=self.labels,
-                    scores=self.scores,
-                    instances=self.instances,
-                    reasons=self.reasons,
-                    names=np.array(self.names, str),
-                    calibrated=np.array(self.calibrated),
-                )
-        elif path.suffix == ".ply":
-            from og_pointcloud.formats.points import write_labelled_ply
-
-            write_labelled_ply(path, self.xyz, self.colors, self.instances, self.labels, self.scores)
+            self._save_arrays(path)
         else:
-            raise OgPointcloudError(f"'{path}' ends in '{path.suffix}'; expected a name that ends in .npz or .ply")
+            _writer(path.suffix)(path, self.xyz, self.colors, self.attributes, self.names)
         return path
 
-    def _columns(self) -> dict[str, NDArray[Any]]:
-        return {"label": self.labels, "score": self.scores, "instance": self.instances, "reason": self.reasons}
+    def _save_arrays(self, path: Path) -> None:
+        with replacing(path) as file:
+            np.savez(
+                file,
+                labels=self.labels,
+                scores=self.scores,
+                instances=self.instances,
+                reasons=self.reasons,
+                names=np.array(self.names, str),
+                calibrated=np.array(self.calibrated),
+            )
+
+
+def _writer(ending: str) -> Callable[..., None]:
+    """What writes a labelled cloud of that ending."""
+    if ending == ".ply":
+        from og_pointcloud.formats.points import write_labelled_ply as write
+    elif ending in (".las", ".laz"):
+        from og_pointcloud.formats.las import write_las as write
+    else:
+        from og_pointcloud.formats.gltf import write_gltf as write
+    return write
 
 
 def label_colors(labels: NDArray[np.integer]) -> NDArray[np.uint8]:
@@ -149,10 +170,3 @@ def _color(label: int) -> tuple[int, int, int]:
     saturation, value = ((0.75, 0.95), (0.45, 0.95), (0.85, 0.65))[label // 8 % 3]
     red, green, blue = colorsys.hsv_to_rgb(hue, saturation, value)
     return round(255 * red), round(255 * green), round(255 * blue)
-
-
-def _import_host(name: str) -> Any:
-    try:
-        return importlib.import_module(name)
-    except ImportError:
-        raise MissingExtraError(name, extra=name) from None

@@ -105,7 +105,7 @@ def test_fit_reports_its_stages_and_next_command(tiny_capture, tmp_path, capsys)
     cloud = tmp_path / "labelled.ply"
     code, stdout, _ = run(capsys, "fit", tiny_capture.folder, "-o", bundle, "--json", record, "--ply", cloud)
     assert code == 0
-    assert tiny_capture.share_correct(read_ply(cloud)["vertex"]["label"], [*NAMES]) > 0.9
+    assert tiny_capture.share_correct(read_ply(cloud)["vertex"]["og_label"], [*NAMES]) > 0.9
     report = json.loads(record.read_text())
     assert report["points"] == len(tiny_capture.object_ids)
     assert report["points"] == sum(report[f"points_{state}"] for state in ("in_instances", "background", "unobserved"))
@@ -285,8 +285,8 @@ def test_vocabulary_of_another_encoder(tiny_capture, tmp_path, capsys):
     code, stdout, _ = run(capsys, "fit", tiny_capture.folder, "-o", bundle, "--ply", cloud)
     assert code == 0
     points = read_ply(cloud)["vertex"]
-    assert set(points["label"]) == {-1}, "without words there are instances, but no labels"
-    assert {0, 1} <= set(points["instance"])
+    assert set(points["og_label"]) == {-1}, "without words there are instances, but no labels"
+    assert {0, 1} <= set(points["og_instance"])
     assert "left out: vocabulary" in stdout
     assert "another space" in stdout
     assert json.loads(run(capsys, "info", bundle, "--json")[1])["words"] == []

@@ -86,7 +86,7 @@ def test_the_content_decides_not_the_name(tmp_path):
     ("content", "start"),
     [
         (b"", "it is empty"),
-        (b"LASF\x00\x00", "it starts with b'LASF"),
+        (b"glTF\x00\x00", "it starts with b'glTF"),
         (b"version https://git-lfs.github.com/spec/v1\n", "it starts with b'version https"),
         (b"plywood", "it starts with b'plywood'"),
     ],
@@ -94,7 +94,9 @@ def test_the_content_decides_not_the_name(tmp_path):
 def test_other_files_are_refused_with_a_list_of_what_is_readable(tmp_path, content, start):
     path = tmp_path / "a.ply"
     path.write_bytes(content)
-    with pytest.raises(SceneError, match=f"not a geometry file .*{start}.* expected a PLY .* or a PCD") as caught:
+    with pytest.raises(
+        SceneError, match=f"not a geometry file .*{start}.* expected a PLY .* a PCD .* or a LAZ"
+    ) as caught:
         read_points(path)
     assert str(caught.value).startswith(f"{path}: ")
 
@@ -132,18 +134,27 @@ def test_a_signalling_nan_is_that_error_too_without_a_warning(tmp_path):
         read_points(write_cloud(tmp_path / "a.ply", xyz))
 
 
+def labels_of(count):
+    return {
+        "og_label": (np.arange(count) % 4 - 1).astype(np.int32),
+        "og_instance": np.arange(-2, count - 2, dtype=np.int32),
+        "og_score": np.linspace(0, 1, count, dtype=np.float32),
+        "og_reason": (np.arange(count) % 6).astype(np.int8),
+    }
+
+
 @pytest.mark.parametrize(("offset", "stored"), [(0.0, "f4"), (1e6, "f8")])
 def test_labelled_cloud_reads_back(tmp_path, offset, stored):
     path = tmp_path / "labelled.ply"
-    instance, label = np.arange(30) - 2, np.arange(30) % 4 - 1
-    score = np.linspace(0, 1, 30)
-    write_labelled_ply(path, XYZ + offset, RGB, instance, label, score)
+    attributes = labels_of(30)
+    write_labelled_ply(path, XYZ + offset, RGB, attributes, ["a cup", "line\nbreak"])
     rows = read_ply(path)["vertex"]
     expected = [(name, stored) for name in "xyz"] + [(name, "u1") for name in ("red", "green", "blue")]
-    assert rows.dtype == np.dtype([*expected, ("instance", "i4"), ("label", "i4"), ("score", "f4")])
-    np.testing.assert_array_equal(rows["instance"], instance)
-    np.testing.assert_array_equal(rows["label"], label)
-    np.testing.assert_allclose(rows["score"], score, atol=1e-7)
+    labels = [("og_label", "i4"), ("og_instance", "i4"), ("og_score", "f4"), ("og_reason", "i1")]
+    assert rows.dtype == np.dtype([*expected, *labels])
+    for name, values in attributes.items():
+        np.testing.assert_array_equal(rows[name], values)
+    assert rb'comment og_names ["a cup", "line\nbreak"]' in path.read_bytes()[:1000]
     points = read_points(path)
     np.testing.assert_allclose(points.xyz_world, XYZ + offset, rtol=0, atol=1e-6 * np.ptp(XYZ, axis=0).max())
     np.testing.assert_array_equal(points.rgb, RGB)
@@ -151,17 +162,16 @@ def test_labelled_cloud_reads_back(tmp_path, offset, stored):
 
 def test_positions_beyond_float32_are_stored_as_double(tmp_path):
     xyz = np.array([[0, 0, 0], [1e300, 1, 2]])
-    write_labelled_ply(tmp_path / "a.ply", xyz, RGB[:2], np.zeros(2, int), np.zeros(2, int), np.zeros(2))
+    write_labelled_ply(tmp_path / "a.ply", xyz, RGB[:2], labels_of(2))
     rows = read_ply(tmp_path / "a.ply")["vertex"]
     assert rows["x"].tolist() == [0, 1e300]
 
 
 def test_a_labelled_cloud_may_be_empty_but_not_uneven(tmp_path):
-    empty = np.zeros(0)
-    write_labelled_ply(tmp_path / "a.ply", np.zeros((0, 3)), RGB[:0], empty.astype(int), empty.astype(int), empty)
+    write_labelled_ply(tmp_path / "a.ply", np.zeros((0, 3)), RGB[:0], labels_of(0))
     assert len(read_ply(tmp_path / "a.ply")["vertex"]) == 0
-    with pytest.raises(SceneError, match=r"label has shape \(29,\); expected \(30,\)"):
-        write_labelled_ply(tmp_path / "b.ply", XYZ, RGB, np.zeros(30, int), np.zeros(29, int), np.zeros(30))
+    with pytest.raises(SceneError, match=r"og_label has shape \(29,\); expected \(30,\)"):
+        write_labelled_ply(tmp_path / "b.ply", XYZ, RGB, labels_of(30) | {"og_label": np.zeros(29, np.int32)})
     assert not (tmp_path / "b.ply").exists()
 
 
@@ -178,3 +188,10 @@ def test_real_clouds_agree_with_open3d(capture, count):
     cloud = open3d.io.read_point_cloud(str(path))
     np.testing.assert_allclose(points.xyz_world, np.asarray(cloud.points), rtol=1e-6, atol=1e-5)
     np.testing.assert_array_equal(points.rgb, np.rint(np.asarray(cloud.colors) * 255))
+
+
+def test_names_that_no_header_holds_are_left_out(tmp_path):
+    names = [f"word number {index}" for index in range(20_000)]
+    write_labelled_ply(tmp_path / "a.ply", XYZ, RGB, labels_of(30), names)
+    assert b"og_names" not in (tmp_path / "a.ply").read_bytes()
+    assert len(read_points(tmp_path / "a.ply")) == 30

@@ -11,7 +11,7 @@ import pytest
 from labelled_clouds import room
 from og_pointcloud_export import write_bundle
 
-HEAVY = ("torch", "open3d", "pyvista", "cv2", "numba", "scipy", "onnx", "trimesh", "tqdm")
+HEAVY = ("torch", "open3d", "pyvista", "cv2", "numba", "scipy", "onnx", "trimesh", "laspy", "tqdm")
 ASK = """
 import sys
 import numpy as np
@@ -55,18 +55,32 @@ def test_asking_works_where_no_heavy_module_can_be_imported(bundle_file, tmp_pat
     run(blocked + ASK, bundle_file, tmp_path)
 
 
-def test_a_missing_extra_is_named(bundle_file):
-    blocked = "import sys; sys.modules.update(numba=None, open3d=None)\nimport og_pointcloud as og\n"
+def test_a_missing_extra_is_named(bundle_file, tmp_path):
+    blocked = """import sys
+sys.modules.update(dict.fromkeys(["numba", "open3d", "pyvista", "laspy"]))
+import og_pointcloud as og
+"""
     tried = """
-for ask in (lambda: og.write_bundle, lambda: og.segment(og.load(sys.argv[1])).to_open3d()):
+result = og.segment(og.load(sys.argv[1]))
+open(sys.argv[2] + "/a.las", "wb").write(b"LASF")
+for ask in (
+    lambda: og.write_bundle,
+    lambda: result.to_open3d(),
+    lambda: result.to_pyvista(),
+    lambda: result.to_las(),
+    lambda: result.save(sys.argv[2] + "/b.laz"),
+    lambda: og.segment(sys.argv[2] + "/a.las", scene=sys.argv[1]),
+):
     try:
         ask()
     except og.MissingExtraError as error:
         print(error)
 """
-    assert run(blocked + tried, bundle_file).splitlines() == [
-        "this needs numba, which is not installed: pip install 'og-pointcloud[fit]'",
-        "this needs open3d, which is not installed: pip install 'og-pointcloud[open3d]'",
+    modules = ("numba", "open3d", "pyvista", "laspy", "laspy", "laspy")
+    extras = ("fit", "open3d", "pyvista", "las", "las", "las")
+    assert run(blocked + tried, bundle_file, tmp_path).splitlines() == [
+        f"this needs {module}, which is not installed: pip install 'og-pointcloud[{extra}]'"
+        for module, extra in zip(modules, extras, strict=True)
     ]
 
 

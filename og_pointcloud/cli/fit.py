@@ -201,6 +201,6 @@ def write_cloud(cloud: LabelledCloud, bundle: Path, path: Path) -> None:
     if cloud.vocabulary:
         segment(bundle).save(path)
         return
-    ids, unknown = cloud.instance_ids, np.full(len(cloud), UNKNOWN)
+    ids, unknown = cloud.instance_ids, np.full(len(cloud), UNKNOWN, np.int32)
     colors = label_colors(np.maximum(ids, UNKNOWN))
-    write_labelled_ply(path, cloud.xyz_world, colors, ids, unknown, np.zeros(len(cloud)))
+    write_labelled_ply(path, cloud.xyz_world, colors, {"og_label": unknown, "og_instance": ids})

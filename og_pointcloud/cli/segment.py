@@ -29,13 +29,15 @@ def add(commands: Any) -> None:
     )  # fmt: skip
     parser.add_argument("--negatives", metavar="A,B,C", help="names too, but points that they fit better are unknown")
     parser.add_argument("--points", type=Path, metavar="CLOUD", help="points to label (default: those fitted)")
-    parser.add_argument("-o", "--output", type=Path, metavar="OUT", help="labels as .npz, or a coloured .ply")
+    parser.add_argument("-o", "--output", type=Path, metavar="OUT", help="labels as .npz, or a coloured .ply, .las, .laz, .glb")
     parser.add_argument("--json", action="store_true", help="print the counts as JSON")
 
 
 def run(arguments: argparse.Namespace) -> None:
+    from og_pointcloud.segmentation import SAVED_AS
+
     check_outputs(
-        {"-o": (arguments.output, [".npz", ".ply"])},
+        {"-o": (arguments.output, SAVED_AS)},
         inputs=[arguments.bundle, arguments.text_features, arguments.points],
     )
     from og_pointcloud.runtime import load, segment

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import os
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -10,8 +12,10 @@ from numpy.typing import NDArray
 
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.gaussian_ply import gaussians_from_ply, holds_gaussians
+from og_pointcloud.formats.las import SIGNATURE as LAS_SIGNATURE
+from og_pointcloud.formats.las import read_las
 from og_pointcloud.formats.pcd import looks_like_pcd, read_pcd
-from og_pointcloud.formats.ply import join_columns, read_ply, write_ply
+from og_pointcloud.formats.ply import HEADER_LIMIT, join_columns, read_ply, write_ply
 from og_pointcloud.formats.tables import colors, naming, normals, positions, storable_positions
 from og_pointcloud.scene import Points
 
@@ -19,11 +23,12 @@ __all__ = ["read_points", "write_labelled_ply"]
 
 
 def read_points(path: str | os.PathLike[str]) -> Points:
-    """A plain cloud (PLY, PCD) or Gaussians (3DGS PLY, SuperSplat compressed PLY), whatever the file is called.
+    """A plain cloud (PLY, PCD, LAS, LAZ) or Gaussians (3DGS PLY, SuperSplat compressed PLY), whatever the file's name.
 
     World coordinates are read as float64; their median becomes the origin. Colours come as uint8 RGB, normals as unit
     vectors, a zero row where the file has none for that point; either is None where the file has none at all.
-    SceneError, beginning with the path, for what cannot be read, has no points, or holds NaN.
+    SceneError, beginning with the path, for what cannot be read, has no points, or holds NaN. LAS and LAZ need the
+    extra 'las'.
     """
     path = Path(path)
     with naming(path):
@@ -40,10 +45,12 @@ def read_points(path: str | os.PathLike[str]) -> Points:
             return _cloud(elements["vertex"])
         if looks_like_pcd(head):
             return _cloud(read_pcd(path))
+        if head.startswith(LAS_SIGNATURE):
+            return read_las(path)
         start = f"it starts with {head[:16]!r}" if head else "it is empty"
         raise SceneError(
             f"not a geometry file that can be read ({start}); expected a PLY (plain cloud, 3D Gaussians, or SuperSplat "
-            "compressed) or a PCD (ascii, binary, binary_compressed): convert it first"
+            "compressed), a PCD (ascii, binary, binary_compressed), a LAS or a LAZ: convert it first"
         )
 
 
@@ -51,27 +58,26 @@ def write_labelled_ply(
     path: str | os.PathLike[str],
     xyz_world: NDArray[np.floating],
     rgb: NDArray[np.uint8],
-    instance: NDArray[np.integer],
-    label: NDArray[np.integer],
-    score: NDArray[np.floating],
+    attributes: Mapping[str, NDArray],
+    names: Sequence[str] = (),
 ) -> None:
-    """Write a cloud with its labels: x y z, red green blue (uchar), instance and label (int), score (float); atomic.
+    """Write a cloud with its labels: x y z, red green blue (uchar), and the attributes as they are; atomic.
 
     xyz_world: (n, 3); written as float, or as double where float would move a point by more than 1e-6 of the cloud's
-    extent. rgb: (n, 3) uint8. instance, label: (n,), -1 and below for none. score: (n,).
+    extent. rgb: (n, 3) uint8. attributes: name -> (n,): og_label, og_instance (int32), og_score (float32), og_reason
+    (int8). names: what og_label counts; a comment "og_names", JSON, unless they would not fit into a header.
     """
     n = len(xyz_world)
     shapes = {"rgb": (rgb, (n, 3)), "xyz_world": (xyz_world, (n, 3))}
-    shapes |= {name: (values, (n,)) for name, values in (("instance", instance), ("label", label), ("score", score))}
+    shapes |= {name: (values, (n,)) for name, values in attributes.items()}
     for name, (values, expected) in shapes.items():
         if values.shape != expected:
             raise SceneError(f"{path}: {name} has shape {values.shape}; expected {expected}")
     columns = dict(zip("xyz", storable_positions(xyz_world).T, strict=True))
     columns |= dict(zip(("red", "green", "blue"), np.asarray(rgb, np.uint8).T, strict=True))
-    columns["instance"] = np.asarray(instance, np.int32)
-    columns["label"] = np.asarray(label, np.int32)
-    columns["score"] = np.asarray(score, np.float32)
-    write_ply(path, {"vertex": join_columns(columns)})
+    comment = f"og_names {json.dumps(list(names))}"
+    fits = names and len(comment) < HEADER_LIMIT // 2
+    write_ply(path, {"vertex": join_columns(columns | dict(attributes))}, [comment] if fits else [])
 
 
 def _cloud(rows: NDArray[np.void]) -> Points:

@@ -1,0 +1,184 @@
+"""Labelled clouds as glTF 2.0: .glb, or .gltf with everything inside. Out only.
+
+Points with colours, label and instance as feature ids (EXT_mesh_features, attributes _FEATURE_ID_0 and _FEATURE_ID_1),
+score and reason as attributes of our own, names in the mesh's extras. Gaussians travel beside them as
+KHR_gaussian_splatting, whose viewers draw splats where others draw the labels' points.
+
+Format: Khronos, "glTF 2.0 Specification", and the two extensions' texts.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import os
+import struct
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from og_pointcloud._atomic import replacing
+from og_pointcloud.clouds import require_finite
+from og_pointcloud.errors import SceneError
+from og_pointcloud.formats.gaussian_ply import SH_CONSTANT
+from og_pointcloud.formats.tables import naming
+from og_pointcloud.scene import Points
+
+__all__ = ["write_gltf"]
+
+POINTS_MODE, ARRAY_BUFFER = 0, 34962
+COMPONENT_TYPES = {"f": 5126, "H": 5123}
+"""FLOAT and UNSIGNED_SHORT. Ids are floats, exact up to 2^24: glTF has no 32-bit integers for vertices."""
+VECTOR_TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
+GLB_MAGIC, GLB_VERSION, JSON_CHUNK, BINARY_CHUNK = b"glTF", 2, b"JSON", b"BIN\0"
+FEATURES, SPLATTING = "EXT_mesh_features", "KHR_gaussian_splatting"
+
+
+def write_gltf(
+    path: str | os.PathLike[str],
+    xyz_world: NDArray[np.floating],
+    rgb: NDArray[np.uint8],
+    attributes: Mapping[str, NDArray],
+    names: Sequence[str],
+    splats: Points | None = None,
+) -> None:
+    """Write a labelled cloud as .glb or .gltf; whole or not at all.
+
+    xyz_world: (n, 3), n at least 1; stored as float32 around their median, which is the node's translation. Axes stay
+        as they are: glTF takes y to be up, so turn a scene with z up in the viewer.
+    rgb: (n, 3) uint8 sRGB; stored linear, as the format wants colours.
+    attributes: og_label, og_instance (n,) int32, og_score (n,) float32, og_reason (n,) int8. Ids below 0 become the
+        feature id that says "none"; og_reason tells which none.
+    names: what og_label counts. splats: Gaussians, row for row with xyz_world, which become splats of this file.
+    SceneError where there are no points, a coordinate is not finite, or the splats are other points.
+    """
+    path = Path(path)
+    with naming(path):
+        if len(xyz_world) == 0:
+            raise SceneError("0 points; expected at least one: glTF has no empty clouds")
+        require_finite(xyz_world, "glTF allows no others")
+        origin = np.median(np.asarray(xyz_world, np.float64), axis=0)
+        columns = {
+            "POSITION": (xyz_world - origin).astype(np.float32),
+            "COLOR_0": _linear_colors(rgb),
+            "_FEATURE_ID_0": _feature_ids(attributes["og_label"], len(names)),
+            "_FEATURE_ID_1": _feature_ids(attributes["og_instance"], _id_count(attributes["og_instance"])),
+            "_OG_SCORE": attributes["og_score"].astype(np.float32),
+            "_OG_REASON": attributes["og_reason"].astype(np.float32),
+        }
+        extensions: dict[str, Any] = {FEATURES: {"featureIds": _feature_sets(attributes, len(names))}}
+        if splats is not None:
+            columns |= _splat_columns(splats, xyz_world)
+            extensions[SPLATTING] = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
+        document, binary = _document(columns, origin, extensions, names)
+        with replacing(path) as file:
+            file.write(_as_glb(document, binary) if path.suffix == ".glb" else _as_text(document, binary))
+
+
+def _feature_ids(ids: NDArray[np.integer], none: int) -> NDArray[np.float32]:
+    return np.where(ids >= 0, ids, none).astype(np.float32)
+
+
+def _id_count(ids: NDArray[np.integer]) -> int:
+    return int(ids.max(initial=-1)) + 1
+
+
+def _feature_sets(attributes: Mapping[str, NDArray], name_count: int) -> list[dict[str, Any]]:
+    sets = []
+    for index, (label, none) in enumerate(
+        (("og_label", name_count), ("og_instance", _id_count(attributes["og_instance"])))
+    ):
+        ids = attributes[label]
+        present = max(len(np.unique(ids[ids >= 0])), 1)  # the schema's minimum
+        sets.append({"featureCount": present, "nullFeatureId": none, "attribute": index, "label": label})
+    return sets
+
+
+def _linear_colors(rgb: NDArray[np.uint8]) -> NDArray[np.uint16]:
+    """(n, 4) sRGB -> linear, opaque. 16 bits, since 8 linear ones would lose the dark colours."""
+    share = np.arange(256) / 255
+    linear = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
+    table = np.rint(linear * 65535).astype(np.uint16)
+    return np.column_stack([table[rgb], np.full(len(rgb), 65535, np.uint16)])
+
+
+def _splat_columns(splats: Points, xyz_world: NDArray[np.floating]) -> dict[str, NDArray[np.float32]]:
+    if splats.scale is None or splats.rotation is None or splats.opacity is None:
+        raise SceneError("the splats have no scale, rotation and opacity; expected Gaussians, as read from a 3DGS file")
+    if len(splats) != len(xyz_world) or not np.allclose(splats.xyz_world, xyz_world, rtol=1e-6, atol=1e-6):
+        raise SceneError(
+            f"{len(splats)} splats, {len(xyz_world)} labelled points, or others; expected the same points in the same "
+            "order: segment the splats' own xyz_world"
+        )
+    rgb = np.full(splats.xyz.shape, 127.5) if splats.rgb is None else splats.rgb
+    values = {
+        "ROTATION": np.roll(splats.rotation, -1, axis=1),  # wxyz -> xyzw
+        "SCALE": splats.scale,
+        "OPACITY": splats.opacity,
+        "SH_DEGREE_0_COEF_0": (rgb / 255 - 0.5) / SH_CONSTANT,
+    }
+    return {f"{SPLATTING}:{name}": column.astype(np.float32) for name, column in values.items()}
+
+
+def _document(
+    columns: Mapping[str, NDArray], origin: NDArray[np.float64], extensions: Mapping[str, Any], names: Sequence[str]
+) -> tuple[dict[str, Any], bytes]:
+    """The JSON document, its buffer without a place, and the buffer's bytes: one column behind the other."""
+    views, accessors, start = [], [], 0
+    for name, column in columns.items():
+        size = column.nbytes  # a multiple of 4 throughout, as alignment asks
+        views.append({"buffer": 0, "byteOffset": start, "byteLength": size, "target": ARRAY_BUFFER})
+        accessors.append(_accessor(len(views) - 1, column, with_bounds=name == "POSITION"))
+        start += size
+    primitive = {
+        "attributes": {name: index for index, name in enumerate(columns)},
+        "mode": POINTS_MODE,
+        "extensions": dict(extensions),
+    }
+    document = {
+        "asset": {"version": "2.0", "generator": "og-pointcloud"},
+        "extensionsUsed": list(extensions),
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0, "translation": origin.tolist()}],
+        "meshes": [{"primitives": [primitive], "extras": {"og_names": list(names)}}],
+        "accessors": accessors,
+        "bufferViews": views,
+        "buffers": [{"byteLength": start}],
+    }
+    little_endian = (column.astype(column.dtype.newbyteorder("<"), copy=False) for column in columns.values())
+    return document, b"".join(column.tobytes() for column in little_endian)
+
+
+def _accessor(view: int, column: NDArray, *, with_bounds: bool) -> dict[str, Any]:
+    width = column.shape[1] if column.ndim == 2 else 1
+    accessor: dict[str, Any] = {
+        "bufferView": view,
+        "componentType": COMPONENT_TYPES[column.dtype.char],
+        "count": len(column),
+        "type": VECTOR_TYPES[width],
+    }
+    if column.dtype == np.uint16:
+        accessor["normalized"] = True
+    if with_bounds:
+        accessor |= {"min": column.min(axis=0).tolist(), "max": column.max(axis=0).tolist()}
+    return accessor
+
+
+def _as_glb(document: Mapping[str, Any], binary: bytes) -> bytes:
+    text = json.dumps(document, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 4)
+    chunks = [
+        struct.pack("<I4s", len(data), kind) + data for kind, data in ((JSON_CHUNK, text), (BINARY_CHUNK, binary))
+    ]
+    length = 12 + sum(map(len, chunks))
+    return b"".join([struct.pack("<4sII", GLB_MAGIC, GLB_VERSION, length), *chunks])
+
+
+def _as_text(document: Mapping[str, Any], binary: bytes) -> bytes:
+    uri = "data:application/octet-stream;base64," + base64.b64encode(binary).decode()
+    (buffer,) = document["buffers"]
+    return json.dumps({**document, "buffers": [{**buffer, "uri": uri}]}).encode()

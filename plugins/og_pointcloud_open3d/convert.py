@@ -1,0 +1,121 @@
+"""Open3D geometry in, labelled geometry of the same kind out."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+import og_pointcloud as og
+from og_pointcloud.clouds import world_points
+from og_pointcloud.errors import OgPointcloudError, SceneError
+from og_pointcloud.runtime import SceneLike
+from og_pointcloud.segmentation import Segmentation
+from og_pointcloud.text.words import Labels, TextFeatures
+from og_pointcloud_open3d.host import open3d
+
+__all__ = ["Segmented", "read", "segment", "to_open3d"]
+
+
+class Segmented(NamedTuple):
+    """cloud: a copy of what was given, of the same kind, painted. result: the labels, row by row of its points."""
+
+    cloud: Any
+    result: Segmentation
+
+
+def read(path: str | os.PathLike[str]) -> Any:
+    """Open3D's tensor cloud of a file, Gaussians with their attributes.
+
+    SceneError where Open3D would return an empty cloud and a warning: no file, no points, nothing that it can read.
+    """
+    host, path = open3d(), Path(path)
+    if not path.is_file():
+        raise SceneError(f"{path}: no such file; expected a point cloud")
+    with host.utility.VerbosityContextManager(host.utility.VerbosityLevel.Error):  # the error below says it
+        cloud = host.t.io.read_point_cloud(str(path))
+    if cloud.is_empty():
+        raise SceneError(
+            f"{path}: Open3D reads no point of it; expected a point cloud that it knows (.ply, .pcd, .xyz, .pts): the "
+            "file is damaged, empty, or of another kind than its name says"
+        )
+    return cloud
+
+
+def segment(
+    pcd: Any,
+    labels: Labels = None,
+    scene: SceneLike | None = None,
+    *,
+    text_features: TextFeatures = None,
+    templates: Sequence[str] | None = None,
+    negatives: Labels = None,
+    pose: ArrayLike | None = None,
+    max_distance: float | None = None,
+) -> Segmented:
+    """Label a cloud, or a mesh by its vertices, and paint a copy of it.
+
+    pcd: Open3D's PointCloud or TriangleMesh, legacy or tensor, on any device, in the scene's world coordinates. What
+    comes back is of the same kind with all its attributes; its colours are the labels', grey where unknown. A tensor
+    geometry has og_label, og_instance (int32), og_score (float32) and og_reason (int8) too, (N, 1) each, as Open3D's
+    own filters want them.
+    Other arguments: as for ``og_pointcloud.segment``. Raises as that, and SceneError for an empty cloud.
+    """
+    if len(world_points(pcd)) == 0:
+        raise SceneError(
+            "the cloud has 0 points; Open3D returns such a cloud for a file that it cannot read: read it with "
+            "og_pointcloud_open3d.read, which says so"
+        )
+    result = og.segment(
+        pcd, labels, scene, text_features=text_features, templates=templates, negatives=negatives, pose=pose,
+        max_distance=max_distance,
+    )  # fmt: skip
+    return Segmented(_painted(pcd, result), result)
+
+
+def to_open3d(result: Segmentation) -> Any:
+    """A tensor cloud: positions float64, colors float32 in [0, 1], and og_label, og_instance, og_score, og_reason as
+    (N, 1)."""
+    host = open3d()
+    cloud = host.t.geometry.PointCloud()
+    cloud.point["positions"] = host.core.Tensor(np.ascontiguousarray(result.xyz))
+    _set_attributes(cloud.point, result, cloud.device)
+    return cloud
+
+
+def _painted(pcd: Any, result: Segmentation) -> Any:
+    """A copy of any of the four kinds, with the result's colours, and its attributes where they can be kept."""
+    host = open3d()
+    colors = result.colors / 255
+    if isinstance(pcd, host.geometry.PointCloud):
+        copy = host.geometry.PointCloud(pcd)
+        copy.colors = host.utility.Vector3dVector(colors)
+    elif isinstance(pcd, host.geometry.TriangleMesh):
+        copy = host.geometry.TriangleMesh(pcd)
+        copy.vertex_colors = host.utility.Vector3dVector(colors)
+    elif isinstance(pcd, host.t.geometry.PointCloud):
+        copy = pcd.clone()
+        _set_attributes(copy.point, result, copy.device)
+    elif isinstance(pcd, host.t.geometry.TriangleMesh):
+        copy = pcd.clone()
+        _set_attributes(copy.vertex, result, copy.device)
+    else:
+        raise OgPointcloudError(
+            f"a {type(pcd).__name__} of {type(pcd).__module__} cannot be painted; expected Open3D's PointCloud or "
+            "TriangleMesh: for anything else, og_pointcloud.segment(pcd, ...).to_open3d()"
+        )
+    return copy
+
+
+def _set_attributes(tensors: Any, result: Segmentation, device: Any) -> None:
+    """tensors: the ``point`` or ``vertex`` of a tensor geometry."""
+    core = open3d().core
+    columns: dict[str, NDArray[Any]] = {"colors": (result.colors / 255).astype(np.float32)}
+    # A one-dimensional attribute makes Open3D's own filters fail.
+    columns |= {name: values[:, None] for name, values in result.attributes.items()}
+    for name, values in columns.items():
+        tensors[name] = core.Tensor(np.ascontiguousarray(values)).to(device)
