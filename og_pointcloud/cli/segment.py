@@ -29,7 +29,9 @@ def add(commands: Any) -> None:
     )  # fmt: skip
     parser.add_argument("--negatives", metavar="A,B,C", help="names too, but points that they fit better are unknown")
     parser.add_argument("--points", type=Path, metavar="CLOUD", help="points to label (default: those fitted)")
-    parser.add_argument("-o", "--output", type=Path, metavar="OUT", help="labels as .npz, or a coloured .ply, .las, .laz, .glb")
+    parser.add_argument(
+        "-o", "--output", type=Path, metavar="OUT", help="labels as .npz, or a coloured .ply, .las, .laz or .glb"
+    )
     parser.add_argument("--json", action="store_true", help="print the counts as JSON")
 
 
