@@ -19,8 +19,9 @@ def array_from_npy(data: bytes) -> NDArray[Any]:
     read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
     try:
         shape, fortran_order, dtype = read(stream)
-    except (tokenize.TokenError, TypeError, RecursionError) as error:  # numpy lets its parser's own errors through
-        raise ValueError(f"its header cannot be parsed ({error})") from None
+        shape = tuple(map(int, shape))  # True is an int to numpy, until it counts bytes
+    except (ValueError, tokenize.TokenError, TypeError, RecursionError) as error:  # its parser's own errors come through
+        raise ValueError(f"its header cannot be parsed ({str(error).partition(chr(10))[0]:.80})") from None
     if dtype.hasobject:
         raise ValueError(f"it holds Python objects ({dtype}), which are never loaded")
     count = int(np.prod(shape, dtype=object))

@@ -29,7 +29,7 @@ def check_graph(model: bytes, operators: frozenset[str] | None = None) -> None:
         if number == 25:
             raise ValueError("it defines functions of its own")
         if number == 8 and (domain := _string(_last(value, 1))) not in STANDARD_DOMAINS:
-            raise ValueError(f"it uses operators of '{domain:.40}', not of the standard")
+            raise ValueError(f"it uses operators of {domain!r:.40}, not of the standard")
         if number == 7:
             _check_contents(_message(value), operators)
 
@@ -47,17 +47,17 @@ def _check_contents(graph: memoryview, operators: frozenset[str] | None) -> None
 def _check_node(node: memoryview, operators: frozenset[str] | None) -> None:
     operator, domain = _string(_last(node, 4)), _string(_last(node, 7))
     if domain not in STANDARD_DOMAINS:
-        raise ValueError(f"it uses the operator '{operator:.40}' of '{domain:.40}', not of the standard")
+        raise ValueError(f"it uses the operator {operator!r:.40} of {domain!r:.40}, not of the standard")
     if operators is not None and operator not in operators:
-        raise ValueError(f"it uses the operator '{operator:.40}', which it has no need of")
+        raise ValueError(f"it uses the operator {operator!r:.40}, which it has no need of")
     for number, attribute in message_fields(node):
         if number != 5:
             continue
         for kind, value in message_fields(_message(attribute)):
             if kind in (6, 11):
-                raise ValueError(f"its node '{operator:.40}' holds a graph of its own")
+                raise ValueError(f"its node {operator!r:.40} holds a graph of its own")
             if kind in (10, 22, 23):
-                raise ValueError(f"its node '{operator:.40}' holds lists of constants")
+                raise ValueError(f"its node {operator!r:.40} holds lists of constants")
             if kind == 5:
                 _check_tensor(_message(value))
 

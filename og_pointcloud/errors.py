@@ -6,7 +6,13 @@ __all__ = ["BundleError", "FeatureSpaceError", "MissingExtraError", "OgPointclou
 
 
 class OgPointcloudError(ValueError):
-    """Base of all errors raised by og_pointcloud for bad input; the command line prints it as one line."""
+    """Base of all errors raised by og_pointcloud for bad input; the command line prints it as one line.
+
+    The message is printable whatever a file put into it: control characters and half characters become escapes.
+    """
+
+    def __init__(self, message: str) -> None:
+        super().__init__("".join(sign if sign.isprintable() else repr(sign)[1:-1] for sign in message))
 
 
 class SceneError(OgPointcloudError):

@@ -50,8 +50,9 @@ class Camera:
         if pose.shape != (4, 4) or not np.isfinite(pose).all():
             raise SceneError(f"camera pose is {pose.tolist()}; expected a finite 4x4 matrix: drop or repair this view")
         rotation = pose[:3, :3]
-        error = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
-        if error > 1e-2 or np.linalg.det(rotation) < 0:
+        with np.errstate(over="ignore", invalid="ignore"):
+            error = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
+        if not error <= 1e-2 or np.linalg.det(rotation) < 0:
             raise SceneError(
                 f"camera rotation is off a rotation matrix by {error:.3g} (det {np.linalg.det(rotation):.3g}); "
                 "expected a rigid right-handed pose: remove scale or mirroring from the pose file"

@@ -535,8 +535,8 @@ def npy(shape, descr="<f4", data=b""):
 @pytest.mark.parametrize(
     ("payload", "message"),
     [
-        (npy((10**9, 10**9)), "claims float32 .*1000000000.* bytes, and holds 0"),
-        (npy((2,), "|O", b"cposix\nsystem\n."), "claims object"),
+        (npy((10**9, 10**9)), "claims float32 .*1000000000.* bytes, but 0 follow"),
+        (npy((2,), "|O", b"cposix\nsystem\n."), "Python objects"),
         (npy((2, 8), data=b"\0" * 63), "claims float32"),
         (b"garbage", "cannot be read as an .npz of plain arrays"),
         (b"", "cannot be read as an .npz of plain arrays"),

@@ -102,7 +102,7 @@ def holds_gaussians(elements: Elements) -> bool:
 def gaussians_from_ply(elements: Elements) -> Points:
     """``read_gaussian_ply`` on elements that are read already."""
     if "vertex" not in elements:
-        raise SceneError(f"no element 'vertex' of plain properties; the file has {', '.join(elements) or 'none'}")
+        raise SceneError(f"no element 'vertex' of plain properties; the file has {', '.join(elements) or 'none':.200}")
     return _compressed(elements) if _are_compressed(elements) else _trained(elements["vertex"])
 
 

@@ -111,10 +111,11 @@ def _level_ids(file: Path, level: str) -> NDArray[np.int32]:
 def _mapped(file: Path) -> NDArray[Any]:
     """A .npy file's array, mapped: only what is used is read, and numpy checks the claimed size against the file's."""
     try:
-        return np.load(file, mmap_mode="r", allow_pickle=False)
-    except (ValueError, OSError, EOFError, tokenize.TokenError) as error:
+        with np.errstate(over="ignore"):  # of sizes, which mmap refuses
+            return np.load(file, mmap_mode="r", allow_pickle=False)
+    except (ValueError, OSError, EOFError, tokenize.TokenError, TypeError, OverflowError, RecursionError) as error:
         raise SceneError(
-            f"{file} cannot be read as a .npy array ({error}): it is damaged or truncated, write it again"
+            f"{file} cannot be read as a .npy array ({error!s:.120}): it is damaged or truncated, write it again"
         ) from None
 
 

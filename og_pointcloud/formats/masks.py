@@ -7,18 +7,18 @@ the name of the encoder. A view without masks has an all-zero image and an empty
 
 from __future__ import annotations
 
-import tokenize
 import zipfile
 import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from og_pointcloud._npy import array_from_npy
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.images import decoded, png_header, require_cv2
 
@@ -117,8 +117,9 @@ def _read_features(file: Path, names: Sequence[str]) -> tuple[dict[str, NDArray[
                     f"{', '.join(repr(key) for key in list(entries)[:3])}, ...); expected an array (masks, D) under "
                     "each image's stem"
                 )
-            features = {name: _as_features(_entry(archive, entries[name]), f"{file}, '{name}'") for name in names}
-            space = str(_entry(archive, entries["feature_space"])) if "feature_space" in entries else UNKNOWN_SPACE
+            features = {name: _as_features(array_from_npy(archive.read(entries[name])), f"{file}, '{name}'") for name in names}
+            named = "feature_space" in entries
+            space = str(array_from_npy(archive.read(entries["feature_space"]))) if named else UNKNOWN_SPACE
     except SceneError:
         raise
     except (zipfile.BadZipFile, zlib.error, ValueError, OSError, EOFError, RuntimeError) as error:
@@ -126,27 +127,6 @@ def _read_features(file: Path, names: Sequence[str]) -> tuple[dict[str, NDArray[
             f"{file} cannot be read as an .npz of plain arrays ({error}): write it again with numpy.savez"
         ) from None
     return features, space
-
-
-def _entry(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> NDArray[Any]:
-    with archive.open(info) as stream:
-        shape, dtype = _npy_header(stream)
-        claimed, held = int(np.prod(shape, dtype=object)) * dtype.itemsize, info.file_size - stream.tell()
-        if dtype.hasobject or claimed > held:
-            raise ValueError(f"'{info.filename}' claims {dtype} {shape}, {claimed} bytes, and holds {held}")
-    with archive.open(info) as stream:
-        return np.lib.format.read_array(stream, allow_pickle=False)
-
-
-def _npy_header(stream: IO[bytes]) -> tuple[tuple[int, ...], np.dtype]:
-    """Shape and type that a .npy stream claims; ValueError if it is no such stream."""
-    version = np.lib.format.read_magic(stream)
-    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-    try:
-        shape, _, dtype = read(stream)
-    except tokenize.TokenError as error:  # numpy lets its parser's own error through
-        raise ValueError(f"its header cannot be parsed: {error}") from None
-    return shape, dtype
 
 
 def _as_features(values: NDArray[Any], source: str) -> NDArray[np.float32]:

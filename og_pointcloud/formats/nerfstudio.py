@@ -33,6 +33,7 @@ TRANSFORMS_NAMES = ("transforms.json", "transforms_train.json")
 PERSPECTIVE_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
 FISHEYE_MODELS = ("OPENCV_FISHEYE",)
 LENS_TERMS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+LARGEST = float(np.finfo(np.float64).max)
 
 
 @dataclass(frozen=True)
@@ -70,7 +71,7 @@ def read_transforms(file: Path, image_size: Callable[[str], tuple[int, int]]) ->
         if not isinstance(path, str) or not path:
             raise SceneError(f"{file}: frame {index} has file_path {path!r}; expected the path of its image")
         path = path.replace("\\", "/")
-        with naming(f"{file}, frame '{path}'"):
+        with naming(f"{file}, frame '{path:.80}'"):
             camera_to_world = _matrix(frame, "transform_matrix")
             if np.isfinite(camera_to_world).all():
                 keys = {**shared, **frame}
@@ -108,7 +109,8 @@ def _matrix(keys: dict[str, Any], key: str) -> NDArray[np.float64]:
 def _world_to_camera(camera_to_world: NDArray[np.float64]) -> NDArray[np.float64]:
     """OpenCV world-to-camera from OpenGL camera-to-world: y and z of the camera change sign, then invert."""
     rotation = (camera_to_world[:3, :3] * [1.0, -1.0, -1.0]).T
-    return rigid(rotation, -rotation @ camera_to_world[:3, 3])
+    with np.errstate(over="ignore", invalid="ignore"):  # the camera refuses what comes of it
+        return rigid(rotation, -rotation @ camera_to_world[:3, 3])
 
 
 def _camera(
@@ -145,8 +147,8 @@ def _number(keys: dict[str, Any], key: str) -> float | None:
     value = keys.get(key)
     if value is None:
         return None
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not np.isfinite(value):
-        raise SceneError(f"{key} is {value!r}; expected a finite number")
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) <= LARGEST:
+        raise SceneError(f"{key} is {value!r:.80}; expected a finite number")
     return float(value)
 
 

@@ -142,7 +142,7 @@ def _parse_header(head: bytes) -> _Header:
                 _add_property(elements[-1], words, number)
             case _:
                 raise SceneError(
-                    f"header line {number} is {line.strip()[:80]!r}; expected 'format <encoding> 1.0' (once), 'element "
+                    f"header line {number} is {line.strip()[:40]!r}; expected 'format <encoding> 1.0' (once), 'element "
                     "<name> <count>', or a 'property' below an element: the file is damaged or not a PLY"
                 )
     if byte_order is None:
@@ -166,7 +166,7 @@ def _add_property(element: _Element, words: list[str], number: int) -> None:
             raise SceneError(f"header line {number}: property {' '.join(words)[:80]!r}; expected a type and a name")
     unknown = [kind for kind in types if kind not in NUMPY_TYPES]
     if unknown:
-        raise SceneError(f"header line {number}: unknown type {unknown[0]!r}; expected one of {', '.join(NUMPY_TYPES)}")
+        raise SceneError(f"header line {number}: unknown type {unknown[0]!r:.60}; expected one of {', '.join(NUMPY_TYPES)}")
     if prop.length_type in ("f4", "f8"):
         raise SceneError(f"header line {number}: the length of list '{prop.name}' is {types[0]}; expected an integer")
     if any(prop.name == other.name for other in element.properties):

@@ -232,10 +232,10 @@ def cache_folder() -> Path:
 def check_templates(templates: Iterable[str]) -> tuple[str, ...]:
     """At least one text with ``{}`` in it, else OgPointcloudError."""
     templates = (templates,) if isinstance(templates, str) else tuple(templates)
-    wrong = next((template for template in templates if not isinstance(template, str) or "{}" not in template), None)
-    if wrong is not None or not templates:
+    wrong = [template for template in templates if not isinstance(template, str) or "{}" not in template]
+    if wrong or not templates:
         raise OgPointcloudError(
-            f"the template {wrong!r:.80} has no place for the name; expected {{}} in it, as in 'a photo of a {{}}.'"
+            f"the template {wrong[0] if wrong else None!r:.80} has no place for the name; expected {{}} in it, as in 'a photo of a {{}}.'"
         )
     return templates
 
@@ -265,12 +265,12 @@ def _carried(bundle: Path, _modified: int) -> TextEncoder | None:
 def _read_bounded(path: Path, most: int) -> bytes:
     try:
         with path.open("rb") as file:
-            data = file.read(most + 1)
+            size = os.fstat(file.fileno()).st_size
+            if size <= most:
+                return file.read(size)  # not the bound, which it would allocate
     except FileNotFoundError:
         raise OgPointcloudError(f"{path} is missing: {REMAKE}") from None
-    if len(data) > most:
-        raise OgPointcloudError(f"{path} has more than {most} bytes: it is not what export-text-encoder writes")
-    return data
+    raise OgPointcloudError(f"{path} has {size}, more than {most} bytes: it is not what export-text-encoder writes")
 
 
 def _checked_manifest(files: Mapping[str, bytes], where: str) -> dict[str, Any]:
