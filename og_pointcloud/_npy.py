@@ -20,7 +20,7 @@ def array_from_npy(data: bytes) -> NDArray[Any]:
     try:
         shape, fortran_order, dtype = read(stream)
         shape = tuple(map(int, shape))  # True is an int to numpy, until it counts bytes
-    except (ValueError, tokenize.TokenError, TypeError, RecursionError) as error:  # its parser's own errors come through
+    except (ValueError, tokenize.TokenError, TypeError, RecursionError) as error:  # its parser's own come through
         raise ValueError(f"its header cannot be parsed ({str(error).partition(chr(10))[0]:.80})") from None
     if dtype.hasobject:
         raise ValueError(f"it holds Python objects ({dtype}), which are never loaded")

@@ -117,9 +117,8 @@ def _read_features(file: Path, names: Sequence[str]) -> tuple[dict[str, NDArray[
                     f"{', '.join(repr(key) for key in list(entries)[:3])}, ...); expected an array (masks, D) under "
                     "each image's stem"
                 )
-            features = {name: _as_features(array_from_npy(archive.read(entries[name])), f"{file}, '{name}'") for name in names}
-            named = "feature_space" in entries
-            space = str(array_from_npy(archive.read(entries["feature_space"]))) if named else UNKNOWN_SPACE
+            features = {name: _as_features(_entry(archive, entries[name]), f"{file}, '{name}'") for name in names}
+            space = str(_entry(archive, entries["feature_space"])) if "feature_space" in entries else UNKNOWN_SPACE
     except SceneError:
         raise
     except (zipfile.BadZipFile, zlib.error, ValueError, OSError, EOFError, RuntimeError) as error:
@@ -127,6 +126,10 @@ def _read_features(file: Path, names: Sequence[str]) -> tuple[dict[str, NDArray[
             f"{file} cannot be read as an .npz of plain arrays ({error}): write it again with numpy.savez"
         ) from None
     return features, space
+
+
+def _entry(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> NDArray[Any]:
+    return array_from_npy(archive.read(info))
 
 
 def _as_features(values: NDArray[Any], source: str) -> NDArray[np.float32]:

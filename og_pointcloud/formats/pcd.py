@@ -100,8 +100,8 @@ def _dtype(entries: dict[str, list[str]]) -> np.dtype:
     for name, kind, size, count in zip(names, types, sizes, counts, strict=True):
         if size not in SIZES.get(kind, ()) or count < 1:
             raise SceneError(
-                f"PCD field '{name:.40}' has TYPE {kind:.20} SIZE {size} COUNT {count}; expected F with 4 or 8, I or U with 1, "
-                "2, 4 or 8, and a count of 1 or more"
+                f"PCD field '{name:.40}' has TYPE {kind:.20} SIZE {size} COUNT {count}; expected F with 4 or 8, I or U "
+                "with 1, 2, 4 or 8, and a count of 1 or more"
             )
     point_size = sum(size * count for size, count in zip(sizes, counts, strict=True))
     if point_size > POINT_SIZE_LIMIT:

@@ -166,7 +166,8 @@ def _add_property(element: _Element, words: list[str], number: int) -> None:
             raise SceneError(f"header line {number}: property {' '.join(words)[:80]!r}; expected a type and a name")
     unknown = [kind for kind in types if kind not in NUMPY_TYPES]
     if unknown:
-        raise SceneError(f"header line {number}: unknown type {unknown[0]!r:.60}; expected one of {', '.join(NUMPY_TYPES)}")
+        expected = ", ".join(NUMPY_TYPES)
+        raise SceneError(f"header line {number}: unknown type {unknown[0]!r:.60}; expected one of {expected}")
     if prop.length_type in ("f4", "f8"):
         raise SceneError(f"header line {number}: the length of list '{prop.name}' is {types[0]}; expected an integer")
     if any(prop.name == other.name for other in element.properties):

@@ -235,7 +235,8 @@ def check_templates(templates: Iterable[str]) -> tuple[str, ...]:
     wrong = [template for template in templates if not isinstance(template, str) or "{}" not in template]
     if wrong or not templates:
         raise OgPointcloudError(
-            f"the template {wrong[0] if wrong else None!r:.80} has no place for the name; expected {{}} in it, as in 'a photo of a {{}}.'"
+            f"the template {(wrong or [None])[0]!r:.80} has no place for the name; expected {{}} in it, as in 'a photo "
+            "of a {}.'"
         )
     return templates
 
