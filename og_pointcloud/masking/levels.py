@@ -1,0 +1,138 @@
+"""Overlapping proposals -> one id map per level: small, middle and large.
+
+Proposals that nearly coincide become one, the better scored. What lies inside another is its child: a forest. A level
+is a cut through the forest: a mask is used instead of its parts where its area times its score is more than what the
+best choice among its parts adds up to, times what the level asks for (`PREFERENCE`). A level that asks for less cuts
+higher or equally high everywhere, so a small mask lies in a middle one and that in a large one. Where the masks of one
+level still overlap, the better score has the pixels.
+
+Everything is counted on atoms, the sets of pixels with the same masks over them: exact, and independent of the image's
+size after one pass.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from og_pointcloud.masking.contracts import Proposals
+
+__all__ = ["LEVELS", "Level", "settle"]
+
+PREFERENCE = {"small": 1.6, "middle": 1.0, "large": 0.6}
+"""Level -> how often the parts of a mask count: more prefers parts, less prefers wholes."""
+LEVELS = tuple(PREFERENCE)
+SAME = 0.8
+"""Two masks whose intersection over union is more are one."""
+INSIDE = 0.9
+"""A mask of which more than this part lies in a larger one is its child."""
+VISIBLE = 0.3
+"""A mask of which better ones leave less than this part is left out."""
+
+
+@dataclass(frozen=True)
+class Level:
+    """One id map. ids: (H, W) int32, -1 outside every mask, else 0..K-1. proposals: (K,) int32, where each is in the
+    proposals. scores: (K,) float32."""
+
+    ids: NDArray[np.int32]
+    proposals: NDArray[np.int32]
+    scores: NDArray[np.float32]
+
+    def masks(self) -> NDArray[np.bool_]:
+        """(K, H, W): the masks that the map shows."""
+        return self.ids == np.arange(len(self.proposals), dtype=np.int32)[:, None, None]
+
+
+def settle(proposals: Proposals, smallest_px: int = 1) -> dict[str, Level]:
+    """A map for each of `LEVELS`. smallest_px: masks that show fewer pixels are left out. Same input, same output."""
+    atom_of_pixel, member, area_px = _atoms(proposals.masks)
+    order = np.lexsort((member @ area_px, -proposals.scores.astype(np.float64)))  # the better, then the smaller
+    member, scores = member[order], proposals.scores[order].astype(np.float64)
+    shared_px = (member * area_px) @ member.T.astype(np.float64)
+    kept = _distinct(shared_px)
+    member, scores, order, shared_px = member[kept], scores[kept], order[kept], shared_px[np.ix_(kept, kept)]
+    parent = _parents(shared_px)
+    levels = {}
+    for level, preference in PREFERENCE.items():
+        used = _cut(np.diag(shared_px) * scores, parent, preference)
+        owner = _owners(member, area_px, used, smallest_px)
+        shown, ids = np.unique(owner, return_inverse=True)
+        ids = (ids - (shown[:1] < 0).sum()).astype(np.int32)
+        chosen = order[shown[shown >= 0]]
+        levels[level] = Level(ids[atom_of_pixel], chosen.astype(np.int32), proposals.scores[chosen])
+    return levels
+
+
+def _atoms(masks: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.bool_], NDArray[np.float64]]:
+    """(H, W) the atom of each pixel; (M, atoms) which masks cover it; (atoms,) its pixels."""
+    rng = np.random.default_rng(0)
+    signature = np.zeros(masks.shape[1:], np.uint64)  # two sets of masks collide once in 2^64 draws
+    for mask in masks:
+        signature[mask] += rng.integers(1 << 63, dtype=np.uint64)
+    _, first, atom_of_pixel, area_px = np.unique(signature, return_index=True, return_inverse=True, return_counts=True)
+    member = masks.reshape(len(masks), -1)[:, first]
+    return atom_of_pixel.reshape(masks.shape[1:]), member, area_px.astype(np.float64)
+
+
+def _distinct(shared_px: NDArray[np.float64]) -> NDArray[np.intp]:
+    """Masks, best first, without empty ones and those that nearly coincide with one before them."""
+    area_px = np.diag(shared_px)
+    kept: list[int] = []
+    for mask in np.flatnonzero(area_px > 0):
+        shared = shared_px[mask, kept]
+        if not (shared > SAME * (area_px[mask] + area_px[kept] - shared)).any():
+            kept.append(mask)
+    return np.array(kept, np.intp)
+
+
+def _parents(shared_px: NDArray[np.float64]) -> NDArray[np.intp]:
+    """(M,) the smallest larger mask that each lies in, -1 for none."""
+    area_px = np.diag(shared_px)
+    parent = np.full(len(area_px), -1)
+    for mask, area in enumerate(area_px):
+        around = np.flatnonzero((shared_px[mask] > INSIDE * area) & (area_px > area))
+        if len(around):
+            parent[mask] = around[np.argmin(area_px[around])]
+    return parent
+
+
+def _cut(value: NDArray[np.float64], parent: NDArray[np.intp], preference: float) -> NDArray[np.intp]:
+    """The masks of one level, best first: none lies inside another in the forest.
+
+    value: (M,) area times score. A whole that ties with its parts is used.
+    """
+    depth = np.zeros(len(parent), np.int64)
+    for mask in range(len(parent)):
+        above = parent[mask]
+        while above >= 0:
+            depth[mask] += 1
+            above = parent[above]
+    best, parts = value.copy(), np.zeros(len(value))
+    whole = np.ones(len(value), bool)
+    for mask in np.argsort(-depth, kind="stable"):
+        whole[mask] = value[mask] >= preference * parts[mask]
+        best[mask] = max(value[mask], preference * parts[mask])
+        if parent[mask] >= 0:
+            parts[parent[mask]] += best[mask]
+    used = np.zeros(len(value), bool)
+    covered = np.zeros(len(value), bool)
+    for mask in np.argsort(depth, kind="stable"):
+        above = parent[mask]
+        covered[mask] = above >= 0 and (covered[above] or used[above])
+        used[mask] = whole[mask] and not covered[mask]
+    return np.flatnonzero(used)
+
+
+def _owners(
+    member: NDArray[np.bool_], area_px: NDArray[np.float64], used: NDArray[np.intp], smallest_px: int
+) -> NDArray[np.intp]:
+    """(atoms,) the best of the used masks over each atom, -1 for none. Masks are numbered best first."""
+    owner = np.full(member.shape[1], -1)
+    for mask in used[::-1]:
+        owner[member[mask]] = mask
+    shown_px = np.bincount(owner + 1, area_px, len(member) + 1)[1:]
+    hidden = (shown_px < VISIBLE * (member @ area_px)) | (shown_px < smallest_px)
+    return np.where((owner >= 0) & hidden[owner], -1, owner)

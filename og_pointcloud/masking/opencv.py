@@ -1,0 +1,287 @@
+"""Masks without a model: superpixels merged by colour, contrast and, where it is known, depth, into a tree of regions.
+
+1. Superpixels: graph segmentation (Felzenszwalb and Huttenlocher, 2004) cut by compact SLIC cells, so that no superpixel
+   runs from one surface into another of its colour.
+2. Merging: in every round, pairs of neighbours that are each other's nearest become one region. How far apart two
+   are is told by their mean colours, by the contrast along their common border and, with depth, by a step of depth there.
+   Small regions are near to all their neighbours, and texture brings regions nearer.
+3. Proposals: the regions that lasted: the distance at which a region was merged away against that at which it
+   was made is its score. They overlap only by containing one another; `levels` settles which to use.
+
+All lengths are shares of the image's; distances are in 8-bit CIE Lab. Nothing is tuned to a scene.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from og_pointcloud.errors import MissingExtraError, SceneError
+from og_pointcloud.formats.images import require_cv2
+from og_pointcloud.masking.contracts import Proposals
+
+__all__ = ["OpenCVProposer", "RegionTree", "region_tree"]
+
+Labels = NDArray[np.int32]
+Floats = NDArray[np.float64]
+Pairs = tuple[Labels, Labels, Floats, Floats, Floats]
+
+WORKING_SIDE = 480
+"""Pixels of the longer side at which regions are found; more finds texture, not things."""
+FEWEST_PIXELS = 8
+"""An image whose shorter side is less shows nothing."""
+GRAPH_SIGMA, GRAPH_K = 0.6, 15.0
+"""Of the graph segmentation: blur in pixels, and how large superpixels are; fine, since merging comes after."""
+SMALLEST_SUPERPIXEL = 1e-4
+"""Share of the image."""
+CELL_SHARE = 1 / 40
+"""Side of a SLIC cell, of the image's longer side."""
+LIGHTNESS = 0.5
+"""Weight of lightness beside the two colour channels: shading and shadows change lightness first."""
+TEXTURE = 0.03
+"""Per unit of the standard deviation inside both regions, distances count so much less."""
+REACH_PX = 2
+"""Borders are compared so many pixels to either side: the border itself is blurred."""
+STEP = 0.04
+"""Relative step of depth, beyond what the slope explains, that is one for certain."""
+STEP_DISTANCE = 12.0
+"""What a certain step all along a border counts as, in units of colour."""
+SMALL_REGION = 4e-3
+"""Share of the image: a region of this size is nearer to its neighbours by the root of 2 than a large one."""
+NOISE = 5.0
+"""Distances below this say nothing: it is added to both sides of the score's ratio."""
+SMALLEST_SHARE, LARGEST_SHARE = 4e-4, 0.6
+"""Of the image's pixels: smaller is no thing that a word names, larger is the surroundings."""
+TYPICAL_SHARE = 6e-3
+"""Scores of regions much smaller than this share are lowered: of two that last alike the larger is the thing."""
+LEAST_SCORE = 0.1
+ALIKE = 0.85
+"""A region that is more than this part of one above it in the tree is the same thing; the higher score stays."""
+MOST = 250
+"""Proposals of an image, the best by score."""
+
+
+@dataclass(frozen=True)
+class OpenCVProposer:
+    """The embedded proposer: OpenCV's contrib modules, no weights. It also takes depth (`DepthMaskProposer`).
+
+    working_side: the image is shrunk to this many pixels along its longer side first.
+    """
+
+    working_side: int = WORKING_SIDE
+    name: str = field(default="opencv", init=False)
+
+    def propose(self, image: NDArray[np.uint8]) -> Proposals:
+        """image: (H, W, 3) uint8 RGB."""
+        return self.propose_with_depth(image, None)
+
+    def propose_with_depth(self, image: NDArray[np.uint8], depth: NDArray[np.float32] | None) -> Proposals:
+        """depth: (H, W) float32 along the optical axis in any unit, 0 where it is not known; None: colour alone."""
+        cv2 = require_cv2()
+        height, width = image.shape[:2]
+        if depth is not None and depth.shape != (height, width):
+            raise SceneError(f"depth is {depth.shape}, the image {image.shape}; expected one depth a pixel")
+        scale = min(1.0, self.working_side / max(height, width))
+        size = round(width * scale), round(height * scale)
+        if min(size) < FEWEST_PIXELS:
+            return Proposals(np.zeros((0, height, width), np.bool_), np.zeros(0, np.float32))
+        small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+        tree = region_tree(small, None if depth is None else cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST))
+        chosen, scores = tree.lasting()
+        place, runs = tree.runs()
+        rank = place[tree.superpixels]
+        masks = np.zeros((len(chosen), height, width), np.bool_)
+        for mask, (first, end) in zip(masks, runs[chosen], strict=True):
+            drawn = ((rank >= first) & (rank < end)).astype(np.uint8) * 255
+            mask[:] = cv2.resize(drawn, (width, height), interpolation=cv2.INTER_LINEAR) >= 128
+        return Proposals(masks, scores)
+
+
+@dataclass(frozen=True)
+class RegionTree:
+    """Superpixels and what they were merged into.
+
+    superpixels: (H, W) int32, 0..n-1. parent: (m,) int32 of the n superpixels, then of merged regions in the order of
+    their making, so that a parent comes after its children; -1 a root. made, gone: (m,) the distance at which a region
+    was made (0 for superpixels) and merged away (infinite for roots). area: (m,) pixels.
+    """
+
+    superpixels: Labels
+    parent: Labels
+    made: Floats
+    gone: Floats
+    area: Floats
+
+    def runs(self) -> tuple[Labels, Labels]:
+        """Superpixels in an order in which every region is a run: (n,) the place of each, (m, 2) first and end."""
+        leaves = int(self.superpixels.max()) + 1
+        size = np.concatenate([np.ones(leaves, np.int32), np.zeros(len(self.parent) - leaves, np.int32)])
+        for region, above in enumerate(self.parent.tolist()):
+            if above >= 0:
+                size[above] += size[region]
+        first = np.zeros(len(size), np.int32)
+        free = np.zeros(len(size) + 1, np.int32)  # the last entry serves roots, whose parent is -1
+        for region in range(len(size) - 1, -1, -1):
+            above = self.parent[region]
+            first[region] = free[region] = free[above]
+            free[above] += size[region]
+        return first[:leaves], np.stack([first, first + size], axis=1)
+
+    def lasting(self) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
+        """Regions worth a proposal, best first, and their scores in [0, 1)."""
+        gone = np.minimum(self.gone, 1.5 * self.made.max())  # as if a root were merged away a little later
+        share = self.area / self.superpixels.size
+        score = 1 - (self.made + NOISE) / (np.maximum(gone, self.made) + NOISE)
+        score *= np.sqrt(share / (share + TYPICAL_SHARE))
+        kept = (share > SMALLEST_SHARE) & (share < LARGEST_SHARE) & (score > LEAST_SCORE)
+        for region in np.flatnonzero(kept):
+            above = self.parent[region]
+            while above >= 0 and ALIKE * self.area[above] < self.area[region]:
+                if kept[above] and kept[region]:
+                    kept[region if score[region] < score[above] else above] = False
+                above = self.parent[above]
+        chosen = np.flatnonzero(kept)
+        chosen = chosen[np.argsort(-score[chosen], kind="stable")][:MOST]
+        return chosen, score[chosen].astype(np.float32)
+
+
+def region_tree(image: NDArray[np.uint8], depth: NDArray[np.float32] | None) -> RegionTree:
+    """image: (H, W, 3) uint8 RGB. depth: (H, W) float32, 0 unknown, or None."""
+    cv2 = require_cv2()
+    lab = cv2.cvtColor(cv2.bilateralFilter(image, 5, 20, 5), cv2.COLOR_RGB2LAB).astype(np.float32)
+    lab[:, :, 0] *= LIGHTNESS
+    superpixels = _superpixels(lab)
+    regions, borders = _Regions.of(superpixels, lab), _Borders.of(superpixels, lab, depth)
+    count = len(regions.area)
+    number, made = np.arange(count), np.zeros(2 * count - 1)
+    parent, area = np.full(2 * count - 1, -1, np.int32), np.zeros(2 * count - 1)
+    area[:count] = regions.area
+    while len(borders.a):
+        distance = _distances(regions, borders, superpixels.size)
+        pairs = _nearest_pairs(borders, distance, len(regions.area))
+        a, b = borders.a[pairs], borders.b[pairs]
+        new = np.arange(count, count + len(pairs))
+        parent[number[a]] = parent[number[b]] = new
+        # What two regions became lies at least as far up as they: nested regions have nested heights.
+        made[new] = np.maximum(distance[pairs], np.maximum(made[number[a]], made[number[b]]))
+        area[new] = regions.area[a] + regions.area[b]
+        count += len(pairs)
+        number[a] = new
+        into = np.arange(len(number))
+        into[b] = a
+        left, into = np.unique(into, return_inverse=True)
+        number = number[left]
+        regions, borders = regions.gathered(into, len(left)), borders.gathered(into)
+    parent, made, area = parent[:count], made[:count], area[:count]
+    return RegionTree(superpixels, parent, made, np.where(parent >= 0, made[parent], np.inf), area)
+
+
+def _superpixels(lab: NDArray[np.float32]) -> Labels:
+    """(H, W) int32, 0..n-1: graph segments cut by compact cells."""
+    cv2 = require_cv2()
+    if not hasattr(cv2, "ximgproc"):
+        raise MissingExtraError("opencv-contrib-python-headless (this OpenCV has no ximgproc)", "fit")
+    height, width = lab.shape[:2]
+    smallest = max(4, round(SMALLEST_SUPERPIXEL * height * width))
+    segments = cv2.ximgproc.segmentation.createGraphSegmentation(GRAPH_SIGMA, GRAPH_K, smallest).processImage(lab)
+    side = max(4, round(CELL_SHARE * max(height, width)))
+    cells = cv2.ximgproc.createSuperpixelSLIC(lab.astype(np.uint8), cv2.ximgproc.SLICO, side, 10.0)
+    cells.iterate(4)
+    both = segments.astype(np.int64) * cells.getNumberOfSuperpixels() + cells.getLabels()
+    return np.unique(both, return_inverse=True)[1].reshape(height, width).astype(np.int32)
+
+
+@dataclass(frozen=True)
+class _Regions:
+    """Sums over the pixels of each region, so that a merger is an addition. area: (n,). lab, lab_squared: (n, 3)."""
+
+    area: Floats
+    lab: Floats
+    lab_squared: Floats
+
+    @classmethod
+    def of(cls, labels: Labels, lab: NDArray[np.float32]) -> _Regions:
+        flat, pixels = labels.ravel(), lab.reshape(-1, 3).astype(np.float64)
+        sums = [
+            np.stack([np.bincount(flat, column) for column in values.T], axis=1) for values in (pixels, pixels**2)
+        ]
+        return cls(np.bincount(flat).astype(np.float64), *sums)
+
+    def gathered(self, into: NDArray[np.intp], count: int) -> _Regions:
+        """Regions with the same number in ``into`` become one."""
+        sums = [np.zeros((count, *values.shape[1:])) for values in (self.area, self.lab, self.lab_squared)]
+        for total, values in zip(sums, (self.area, self.lab, self.lab_squared), strict=True):
+            np.add.at(total, into, values)
+        return _Regions(*sums)
+
+
+@dataclass(frozen=True)
+class _Borders:
+    """Neighbours a < b, (e,), and sums over the pixel pairs of their border: how many, contrast, steps of depth."""
+
+    a: NDArray[np.integer]
+    b: NDArray[np.integer]
+    length: Floats
+    contrast: Floats
+    step: Floats
+
+    @classmethod
+    def of(cls, labels: Labels, lab: NDArray[np.float32], depth: NDArray[np.float32] | None) -> _Borders:
+        across = _pixel_pairs(labels, lab, depth)
+        down = _pixel_pairs(labels.T, lab.transpose(1, 0, 2), None if depth is None else depth.T)
+        pairs = cls(*(np.concatenate(both) for both in zip(across, down, strict=True)))
+        return pairs.gathered(np.arange(int(labels.max()) + 1))
+
+    def gathered(self, into: NDArray[np.intp]) -> _Borders:
+        """The borders between what the regions became; a border inside one is gone."""
+        count = int(into.max()) + 1
+        a, b = into[self.a], into[self.b]
+        between = a != b
+        key = np.minimum(a, b)[between] * count + np.maximum(a, b)[between]
+        pair, place = np.unique(key, return_inverse=True)
+        sums = [np.bincount(place, v[between], len(pair)) for v in (self.length, self.contrast, self.step)]
+        return _Borders(pair // count, pair % count, *sums)
+
+
+def _pixel_pairs(labels: Labels, lab: NDArray[np.float32], depth: NDArray[np.float32] | None) -> Pairs:
+    """Of every pixel whose right neighbour is in another region: the regions, 1, contrast, and 0 to 1 a step."""
+    row, column = np.nonzero(labels[:, :-1] != labels[:, 1:])
+    last = labels.shape[1] - 1
+    left, right = np.maximum(column + 1 - REACH_PX, 0), np.minimum(column + REACH_PX, last)
+    contrast = np.linalg.norm(lab[row, left] - lab[row, right], axis=1).astype(np.float64)
+    step = np.zeros(len(row))
+    if depth is not None:
+        z_left, z_right = depth[row, left], depth[row, right]
+        span = right - left
+        slope_left = np.abs(depth[row, np.maximum(left - span, 0)] - z_left)
+        slope_right = np.abs(depth[row, np.minimum(right + span, last)] - z_right)
+        beyond_slope = np.abs(z_left - z_right) - np.minimum(slope_left, slope_right)
+        nearer = np.minimum(z_left, z_right)
+        step = np.where(nearer > 0, np.clip(beyond_slope / np.where(nearer > 0, STEP * nearer, 1), 0, 1), 0)
+    return labels[row, column], labels[row, column + 1], np.ones(len(row)), contrast, step.astype(np.float64)
+
+
+def _distances(regions: _Regions, borders: _Borders, pixels: int) -> Floats:
+    """(e,): how far apart the two regions of each border are."""
+    a, b = borders.a, borders.b
+    mean = regions.lab / regions.area[:, None]
+    texture = np.sqrt(np.maximum(regions.lab_squared / regions.area[:, None] - mean**2, 0).sum(axis=1))
+    color = np.linalg.norm(mean[a] - mean[b], axis=1)
+    color = (color + borders.contrast / borders.length) / 2 / (1 + TEXTURE * np.minimum(texture[a], texture[b]))
+    share = np.minimum(regions.area[a], regions.area[b]) / pixels
+    return (color + STEP_DISTANCE * borders.step / borders.length) * np.sqrt(share / (share + SMALL_REGION))
+
+
+def _nearest_pairs(borders: _Borders, distance: Floats, count: int) -> NDArray[np.intp]:
+    """Borders whose two regions are each other's nearest, and of these the nearer third, so that the order of mergers
+    stays close to one at a time, nearest first. At least one."""
+    order = np.argsort(distance, kind="stable")
+    rank = np.empty(len(order), np.int64)
+    rank[order] = np.arange(len(order))
+    nearest = np.full(count, len(order))
+    np.minimum.at(nearest, borders.a, rank)
+    np.minimum.at(nearest, borders.b, rank)
+    mutual = np.sort(rank[(nearest[borders.a] == rank) & (nearest[borders.b] == rank)])
+    return order[mutual[: -(-len(mutual) // 3)]]
