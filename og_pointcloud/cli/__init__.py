@@ -18,12 +18,14 @@ from og_pointcloud.cli import (
     check,
     demo,
     edit,
+    export_image_encoder,
     export_text_encoder,
     fit,
     import_,
     info,
     instances,
     pick,
+    report,
     ros_bag,
     segment,
     select,
@@ -36,8 +38,8 @@ from og_pointcloud.errors import MissingExtraError, OgPointcloudError
 __all__ = ["main"]
 
 COMMANDS = (
-    fit, import_, segment, select, pick, instances, edit, view, ros_bag, info, vocabulary, export_text_encoder, ablate,
-    check, demo,
+    fit, import_, segment, select, pick, instances, edit, view, ros_bag, info, vocabulary, export_text_encoder, export_image_encoder, ablate, report,
+    report, check, demo,
 )  # fmt: skip
 
 
