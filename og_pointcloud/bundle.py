@@ -61,6 +61,8 @@ QUERY_OPERATORS = frozenset({
     "Transpose", "Unsqueeze", "Where",
 })  # fmt: skip
 """What a query.onnx is made of: arithmetic and look-ups, nothing that repeats or branches."""
+ZIP_ERRORS = (zipfile.BadZipFile, EOFError, RuntimeError, NotImplementedError, OSError, ValueError)
+"""All that zipfile raises for damaged archives, encrypted ones, and those of methods that it lacks."""
 REBUILD = "write the file again with write_bundle"
 BANK = "bank/vectors.npy"
 CARRIED_ENCODER = "text_encoder/"
@@ -110,8 +112,10 @@ def read_carried_encoder(path: str | os.PathLike[str]) -> dict[str, bytes] | Non
             _, carried = _members(file)
             archive = zipfile.ZipFile(file)
             return {name.removeprefix(CARRIED_ENCODER): archive.read(name) for name in carried} or None
-    except (_Refused, zipfile.BadZipFile, EOFError) as error:
+    except _Refused as error:
         raise BundleError(f"{path}: {error}") from None
+    except ZIP_ERRORS as error:
+        raise BundleError(f"{path}: the text encoder in it is damaged ({error!s:.120}): {REBUILD}") from None
 
 
 def describe_member(name: str, data: bytes) -> dict[str, Any]:
@@ -139,10 +143,10 @@ def _members(file: BinaryIO) -> tuple[dict[str, bytes], dict[str, int]]:
         for info in infos:
             if not SAFE_NAME.fullmatch(info.filename):
                 raise _Refused(
-                    f"member name {info.filename!r} is not a plain relative path: the file is not to be trusted"
+                    f"member name {info.filename!r:.80} is not a plain relative path: the file is not to be trusted"
                 )
             if info.compress_type != zipfile.ZIP_STORED or info.compress_size != info.file_size:
-                raise _Refused(f"member '{info.filename}' is compressed; expected stored members: {REBUILD}")
+                raise _Refused(f"member '{info.filename:.80}' is compressed; expected stored members: {REBUILD}")
         names = {info.filename for info in infos}
         total = sum(info.file_size for info in infos)
         if len(names) != len(infos) or len(infos) > MAX_MEMBERS or total > size:
@@ -152,9 +156,9 @@ def _members(file: BinaryIO) -> tuple[dict[str, bytes], dict[str, int]]:
             )
         carried = {info.filename: info.file_size for info in infos if info.filename.startswith(CARRIED_ENCODER)}
         return {info.filename: archive.read(info) for info in infos if info.filename not in carried}, carried
-    except (zipfile.BadZipFile, EOFError, RuntimeError, NotImplementedError, OSError, ValueError) as error:
+    except ZIP_ERRORS as error:
         raise _Refused(
-            f"not a .ogpc file, or damaged ({error}); expected a zip of stored members: copy it again or {REBUILD}"
+            f"not a .ogpc file, or damaged ({error!s:.120}); expected a zip of stored members: copy it again or {REBUILD}"
         ) from None
 
 
@@ -194,10 +198,10 @@ def _check_members(
     declared = _field(manifest, "members", dict)
     sizes = {name: len(data) for name, data in members.items()} | carried
     if undeclared := sorted(set(sizes) - set(declared) - {"manifest.json"}):
-        raise _Refused(f"member '{undeclared[0]}' is not in the manifest: the file was changed; {REBUILD}")
+        raise _Refused(f"member '{undeclared[0]:.80}' is not in the manifest: the file was changed; {REBUILD}")
     for name, entry in declared.items():
         if name not in sizes:
-            raise _Refused(f"member '{name}' of the manifest is missing: {REBUILD}")
+            raise _Refused(f"member '{name:.80}' of the manifest is missing: {REBUILD}")
         length = _field(entry, "bytes", int, f"members/{name}/")
         if length != sizes[name]:
             raise _Refused(f"member '{name}' has {sizes[name]} bytes, the manifest says {length}: {REBUILD}")
