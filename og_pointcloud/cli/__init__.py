@@ -21,9 +21,11 @@ from og_pointcloud.cli import (
     export_image_encoder,
     export_text_encoder,
     fit,
+    fuse,
     import_,
     info,
     instances,
+    masks,
     pick,
     report,
     ros_bag,
@@ -38,8 +40,8 @@ from og_pointcloud.errors import MissingExtraError, OgPointcloudError
 __all__ = ["main"]
 
 COMMANDS = (
-    fit, import_, segment, select, pick, instances, edit, view, ros_bag, info, vocabulary, export_text_encoder, export_image_encoder, ablate, report,
-    report, check, demo,
+    fit, fuse, import_, segment, select, pick, instances, edit, view, ros_bag, info, vocabulary, export_text_encoder,
+    export_image_encoder, ablate, report, check, demo,
 )  # fmt: skip
 
 

@@ -30,6 +30,8 @@ COLOURS = (
 )
 MARKERS = "osD^vPX*<>hp"
 
+TICKS = (0, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1)
+
 
 def require_matplotlib() -> Any:
     """The class matplotlib.figure.Figure; MissingExtraError where matplotlib is not installed."""
@@ -78,7 +80,9 @@ def fit_plot(rows: Sequence[Row], capture: str) -> bytes:
     )
     known = default.miou is not None
     axes.set_yscale("symlog", linthresh=1e-3)  # 0 where there is nothing but the default to compare with
-    axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
+    errors = [error(row) for row in own]
+    axes.set_yticks(TICKS, [f"{tick:g}" for tick in TICKS])
+    axes.set_ylim(min(errors) / 1.3, max(errors) * 1.3 + 1e-4)
     _finish(axes, capture, "seconds of the whole fit", "error, 1 - mIoU" if known else "disagreement with the default")
     return _png(figure)
 
