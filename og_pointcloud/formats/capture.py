@@ -1,10 +1,13 @@
 """A capture folder becomes a Scene: poses, masks with features, geometry, and images where there are any.
 
 Each part comes from the first of these that the folder has.
-  poses     ``transforms.json`` (nerfstudio, instant-ngp, Blender), ``transforms_train.json``; COLMAP ``sparse/0``
+  poses     ``transforms.json`` (nerfstudio, instant-ngp, Blender), ``transforms_train.json``; COLMAP ``sparse/0``; the
+            folders of ScanNet, 7-Scenes, Replica and Record3D
   masks     ``mask_features.npz`` with ``masks/``; LangSplat's ``language_features/``
   geometry  the file given; ``ply_file_path`` of transforms.json; ``points.ply``, ``point_cloud.ply``, the folder's one
-            ``.pcd``; the latest ``point_cloud/iteration_*/point_cloud.ply``; COLMAP's ``points3D``
+            ``.pcd``; the latest ``point_cloud/iteration_*/point_cloud.ply``; ScanNet's ``*_vh_clean_2.ply``; COLMAP's
+            ``points3D``; depth images, fused
+  depth     optional; ``depth_file_path`` of a frame; where the data set has it; ``depth/`` beside ``images/``
   images    optional; where the pose file says, or of that name in ``images/``
 
 A view is called by its image's file stem, and so are its masks and features; where two images share a stem (rigs demand
@@ -18,15 +21,17 @@ from __future__ import annotations
 import posixpath
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud.errors import SceneError
-from og_pointcloud.formats import colmap
+from og_pointcloud.errors import MissingExtraError, SceneError
+from og_pointcloud.formats import colmap, record3d, replica, scannet, seven_scenes
+from og_pointcloud.formats.depth import DepthFile, DepthFrame, find_depth, resampled
 from og_pointcloud.formats.distortion import Distortion, undistorted
 from og_pointcloud.formats.gaussian_ply import latest_iteration
 from og_pointcloud.formats.images import find_image, image_size, read_rgb, same_shape, without_suffix
@@ -34,24 +39,38 @@ from og_pointcloud.formats.langsplat import LANGUAGE_FEATURES_FOLDER, read_langu
 from og_pointcloud.formats.masks import FEATURES_NAME, MASKS_FOLDER, MaskLayer, read_masks
 from og_pointcloud.formats.nerfstudio import TRANSFORMS_NAMES, read_transforms
 from og_pointcloud.formats.points import read_points
-from og_pointcloud.formats.poses import PosedImage, in_local_frame
+from og_pointcloud.formats.poses import PosedFrames, PosedImage, in_local_frame
 from og_pointcloud.scene import Camera, Points, Scene, View
 
-__all__ = ["read_capture"]
+if TYPE_CHECKING:
+    from og_pointcloud.fitting.fusion import FusedCloud
+
+__all__ = ["depth_files", "fuse_capture", "read_capture", "read_depth"]
 
 CLOUD_NAMES = ("points.ply", "point_cloud.ply")
+LAYOUTS = (
+    (scannet.holds_scannet, scannet.read_scannet),
+    (seven_scenes.holds_seven_scenes, seven_scenes.read_seven_scenes),
+    (replica.holds_replica, replica.read_replica),
+    (record3d.holds_record3d, record3d.read_record3d),
+)
+FUSED_FRAMES = 300
+"""Depth images that are fused at most, evenly spread over a recording, whose neighbours show almost the same."""
 SAME_POSE = 1e-3
 """Largest difference of poses that mean one world: radians, and a share of the distance from camera to points."""
 
 
 @dataclass(frozen=True)
 class _Poses:
-    """source: the pose file or folder. applied_transform: from COLMAP's world to the poses' (see nerfstudio.py)."""
+    """names: the views', an image each. source: the pose file or folder. applied_transform: from COLMAP's world to the
+    poses' (see nerfstudio.py). is_recording: every frame of a video has a pose, and some of them masks."""
 
+    names: tuple[str, ...]
     images: tuple[PosedImage, ...]
     source: Path
     ply_file_path: str | None = None
     applied_transform: NDArray[np.float64] | None = None
+    is_recording: bool = False
 
 
 def read_capture(folder: str | Path, gaussians: str | Path | None = None, mask_level: str = "large") -> Scene:
@@ -68,13 +87,13 @@ def read_capture(folder: str | Path, gaussians: str | Path | None = None, mask_l
     if not capture.is_dir():
         raise SceneError(f"{capture} is not a folder; expected a capture folder with poses, masks and points")
     poses = _read_poses(capture)
-    names = _view_names([image.path for image in poses.images])
-    layers, feature_space = _read_masks(capture, names, mask_level)
+    shown = _with_masks(capture, poses) if poses.is_recording else poses
+    layers, feature_space = _read_masks(capture, shown.names, mask_level)
     points = _read_geometry(capture, poses, gaussians)
-    files = _find_images(capture, poses.images)
+    files = _find_images(capture, shown.images)
     views = tuple(
         _view(name, image, layer, file, points.origin)
-        for name, image, layer, file in zip(names, poses.images, layers, files, strict=True)
+        for name, image, layer, file in zip(shown.names, shown.images, layers, files, strict=True)
     )
     return Scene(points, views, feature_space, name=capture.resolve().name)
 
@@ -83,20 +102,32 @@ def _read_poses(capture: Path) -> _Poses:
     file = next((capture / name for name in TRANSFORMS_NAMES if (capture / name).is_file()), None)
     if file is not None:
         transforms = read_transforms(file, partial(_size_of_image, capture))
-        if transforms.dropped:
-            warnings.warn(
-                f"{file}: {len(transforms.dropped)} frames have no finite pose and are left out, e.g. "
-                f"'{transforms.dropped[0]}'",
-                stacklevel=3,
-            )
-        return _Poses(transforms.images, file, transforms.ply_file_path, transforms.applied_transform)
+        _warn_of_dropped(file, transforms.dropped)
+        names = _view_names(transforms.images)
+        return _Poses(names, transforms.images, file, transforms.ply_file_path, transforms.applied_transform)
     model = colmap.find_model(capture)
     if model is not None:
-        return _Poses(colmap.read_images(model), model)
+        images = colmap.read_images(model)
+        return _Poses(_view_names(images), images, model)
+    for holds, read in LAYOUTS:
+        if holds(capture):
+            frames: PosedFrames = read(capture)
+            if not frames.images:
+                raise SceneError(f"{capture}: none of its {len(frames.dropped)} frames has a finite pose")
+            _warn_of_dropped(capture, frames.dropped)
+            return _Poses(_view_names(frames.images), frames.images, capture, is_recording=True)
     raise SceneError(
-        f"{capture} has no pose file; expected transforms.json (nerfstudio, instant-ngp, Blender) or a COLMAP model in "
-        "sparse/0 (cameras and images, .bin or .txt)"
+        f"{capture} has no pose file; expected transforms.json (nerfstudio, instant-ngp, Blender), a COLMAP model in "
+        "sparse/0 (cameras and images, .bin or .txt), or the layout of ScanNet (color/, pose/, intrinsic/), 7-Scenes "
+        "(frame-*.pose.txt), Replica (results/, traj.txt) or Record3D (rgb/, metadata.json)"
     )
+
+
+def _warn_of_dropped(source: Path, paths: Sequence[str]) -> None:
+    if paths:
+        warnings.warn(
+            f"{source}: {len(paths)} frames have no finite pose and are left out, e.g. '{paths[0]}'", stacklevel=4
+        )
 
 
 def _size_of_image(capture: Path, path: str) -> tuple[int, int]:
@@ -108,19 +139,34 @@ def _size_of_image(capture: Path, path: str) -> tuple[int, int]:
     return image_size(file)
 
 
-def _view_names(paths: Sequence[str]) -> list[str]:
+def _view_names(images: Sequence[PosedImage]) -> tuple[str, ...]:
     """File stems; where two images share one (rigs demand it), paths from the folder that all images share."""
-    paths = [posixpath.normpath(without_suffix(path)) for path in paths]
+    paths = [posixpath.normpath(without_suffix(image.path)) for image in images]
     stems = [posixpath.basename(path) for path in paths]
     if len(set(stems)) == len(stems) or len(set(paths)) < len(paths):
-        return stems
+        return tuple(stems)
     paths = [path.lstrip("/") for path in paths]
     shared = posixpath.commonpath([posixpath.dirname(path) for path in paths])
     names = [path[len(shared) :].lstrip("/") for path in paths]
     outside = next((name for name in names if ".." in name.split("/")), None)
     if outside is not None:
         raise SceneError(f"image path '{outside}' leads out of its folder; expected paths below one image folder")
-    return names
+    return tuple(names)
+
+
+def _with_masks(capture: Path, poses: _Poses) -> _Poses:
+    """Of a recording's frames, those with masks; all of them if none has (the error is another's to raise)."""
+    files = ((f"{MASKS_FOLDER}/{name}.png", f"{LANGUAGE_FEATURES_FOLDER}/{name}_s.npy") for name in poses.names)
+    has_mask = [any((capture / file).is_file() for file in pair) for pair in files]
+    if all(has_mask) or not any(has_mask):
+        return poses
+    warnings.warn(
+        f"{capture}: {len(has_mask) - sum(has_mask)} of {len(has_mask)} frames have no masks and are left out",
+        stacklevel=3,
+    )
+    kept = [pair for pair, has in zip(zip(poses.names, poses.images, strict=True), has_mask, strict=True) if has]
+    names, images = zip(*kept, strict=True)
+    return replace(poses, names=names, images=images)
 
 
 def _read_masks(capture: Path, names: Sequence[str], level: str) -> tuple[list[MaskLayer], str]:
@@ -145,11 +191,14 @@ def _read_geometry(capture: Path, poses: _Poses, gaussians: str | Path | None) -
         return read_points(cloud)
     model = colmap.find_model(capture)
     if model is None:
-        raise SceneError(
-            f"{capture} has no geometry; expected {' or '.join(CLOUD_NAMES)}, one .pcd, ply_file_path in "
-            "transforms.json, point_cloud/iteration_*/point_cloud.ply or COLMAP's sparse/0/points3D: add one of them, "
-            "or name a file (--gaussians)"
-        )
+        frames = _depth_frames(capture, poses)
+        if not frames:
+            raise SceneError(
+                f"{capture} has no geometry; expected {' or '.join(CLOUD_NAMES)}, one .pcd, ply_file_path in "
+                "transforms.json, point_cloud/iteration_*/point_cloud.ply, COLMAP's sparse/0/points3D or depth images "
+                "in depth/: add one of them, or name a file (--gaussians)"
+            )
+        return _fused(capture, frames).points
     xyz, rgb = colmap.read_points3d(model)
     return Points.from_world(_in_world_of(poses, model, xyz), rgb=rgb)
 
@@ -178,7 +227,85 @@ def _find_cloud(capture: Path) -> Path | None:
         )
     if pcds:
         return pcds[0]
-    return latest_iteration(capture)
+    return latest_iteration(capture) or scannet.find_mesh(capture)
+
+
+def depth_files(folder: str | Path) -> dict[str, DepthFile]:
+    """The depth images of a capture by view name; views without one are absent. Cameras are in world coordinates."""
+    capture = Path(folder)
+    return _depth_files(capture, _read_poses(capture))
+
+
+def read_depth(folder: str | Path, name: str) -> NDArray[np.float32] | None:
+    """The depth of one view at the pixels of its pinhole camera, (H, W) float32, 0 unmeasured; None without an image.
+
+    Lengths of the world along the optical axis. For many views, take ``depth_files`` once: this reads the poses anew.
+    """
+    capture = Path(folder)
+    poses = _read_poses(capture)
+    file = _depth_files(capture, poses).get(name)
+    camera = next((image.camera for other, image in zip(poses.names, poses.images, strict=True) if other == name), None)
+    return None if file is None or camera is None else file.read().seen_by(camera)
+
+
+def fuse_capture(folder: str | Path, depth_unit: float | None = None) -> FusedCloud:
+    """The cloud of a capture's depth images, whether or not the folder has another; warns of what is doubtful.
+
+    depth_unit: world lengths of a stored step, where the files do not say. Raises SceneError where there are none.
+    """
+    capture = Path(folder)
+    frames = _depth_frames(capture, _read_poses(capture))
+    if not frames:
+        raise SceneError(f"{capture} has no depth images; expected depth/<image stem>.png, or depth_file_path in poses")
+    if depth_unit is not None:
+        frames = [replace(frame, depth=replace(frame.depth, unit=depth_unit)) for frame in frames]
+    return _fused(capture, frames)
+
+
+def _depth_files(capture: Path, poses: _Poses) -> dict[str, DepthFile]:
+    files = {}
+    for name, image in zip(poses.names, poses.images, strict=True):
+        if image.depth is not None:
+            files[name] = image.depth
+        elif path := find_depth(capture, name):
+            files[name] = DepthFile(path, image.camera, distortion=image.distortion)
+    return files
+
+
+def _depth_frames(capture: Path, poses: _Poses) -> list[DepthFrame]:
+    """What is fused: of a long recording so many frames, evenly, as show every surface often enough."""
+    files = _depth_files(capture, poses)
+    images = dict(zip(poses.names, poses.images, strict=True))
+    frames = []
+    for name in list(files)[:: 1 + len(files) // FUSED_FRAMES]:
+        file = find_image(capture, images[name].path)
+        colors = None if file is None else partial(_colors_at, file, images[name])
+        frames.append(DepthFrame(name, files[name], colors))
+    return frames
+
+
+def _fused(capture: Path, frames: Sequence[DepthFrame]) -> FusedCloud:
+    # The fusion brings numba, which whoever has a cloud need not load here.
+    try:
+        from og_pointcloud.fitting.depth_checks import doubts
+        from og_pointcloud.fitting.fusion import fuse
+    except ImportError as error:
+        raise MissingExtraError("numba", "fit") from error
+    fused = fuse(frames)
+    found = doubts(frames)
+    if fused.empty:
+        found.append(f"nothing is measured in {len(fused.empty)} of them, e.g. '{fused.empty[0]}'")
+    for text in found:
+        warnings.warn(f"{capture}: depth images: {text}", stacklevel=4)
+    return fused
+
+
+def _colors_at(file: Path, image: PosedImage, camera: Camera) -> NDArray[np.uint8]:
+    """(H, W, 3): the photograph's colours at the pixels of the depth camera, averaged down to its resolution first."""
+    scale = min(1.0, camera.fx / image.camera.fx)
+    size = max(1, round(image.camera.width * scale)), max(1, round(image.camera.height * scale))
+    own = image.camera.resized(*size)
+    return resampled(_image(file, own, image.distortion), own, camera)
 
 
 def _in_world_of(poses: _Poses, model: Path, xyz: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -5,6 +5,9 @@ Intrinsics stand at the top or in a frame, which then overrides the top: ``fl_x 
 Blender writes, ``transforms_train.json`` is read. ``aabb_scale``, ``scale``, ``offset`` and the like concern the
 rendering box of instant-ngp and not the poses; they are ignored.
 
+A frame's ``depth_file_path`` names its depth image inside the capture folder; a stored whole number is a millimetre
+unless ``integer_depth_scale`` (instant-ngp) or ``depth_unit_scale_factor`` says what it is.
+
 ``applied_transform`` (nerfstudio: from COLMAP's world to the world of this file) is *not* applied to
 ``ply_file_path``: nerfstudio writes that cloud in the world of ``transform_matrix``. It is reported for clouds that
 come from COLMAP itself.
@@ -13,6 +16,7 @@ come from COLMAP itself.
 from __future__ import annotations
 
 import json
+import posixpath
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -23,6 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.errors import SceneError
+from og_pointcloud.formats.depth import DepthFile
 from og_pointcloud.formats.distortion import Distortion, lens_distortion
 from og_pointcloud.formats.poses import PosedImage, naming, rigid
 from og_pointcloud.scene import Camera
@@ -32,6 +37,7 @@ __all__ = ["TRANSFORMS_NAMES", "Transforms", "read_transforms"]
 TRANSFORMS_NAMES = ("transforms.json", "transforms_train.json")
 PERSPECTIVE_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
 FISHEYE_MODELS = ("OPENCV_FISHEYE",)
+DEPTH_UNIT_KEYS = ("integer_depth_scale", "depth_unit_scale_factor")
 LENS_TERMS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 LARGEST = float(np.finfo(np.float64).max)
 
@@ -76,7 +82,8 @@ def read_transforms(file: Path, image_size: Callable[[str], tuple[int, int]]) ->
             if np.isfinite(camera_to_world).all():
                 keys = {**shared, **frame}
                 camera = _camera(keys, _world_to_camera(camera_to_world), partial(image_size, path))
-                images.append(PosedImage(path, camera, _distortion(keys)))
+                distortion = _distortion(keys)
+                images.append(PosedImage(path, camera, distortion, _depth(file.parent, keys, camera, distortion)))
             else:
                 dropped.append(path)
     if not images:
@@ -150,6 +157,19 @@ def _number(keys: dict[str, Any], key: str) -> float | None:
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) <= LARGEST:
         raise SceneError(f"{key} is {value!r:.80}; expected a finite number")
     return float(value)
+
+
+def _depth(capture: Path, keys: dict[str, Any], camera: Camera, distortion: Distortion | None) -> DepthFile | None:
+    path = keys.get("depth_file_path")
+    if not path:
+        return None
+    inside = posixpath.normpath(str(path).replace("\\", "/"))
+    if inside.startswith(("/", "..")) or "\0" in inside:
+        raise SceneError(f"depth_file_path is {path!r:.80}, which leads out of the capture folder: copy it there")
+    unit = next((unit for key in DEPTH_UNIT_KEYS if (unit := _number(keys, key)) is not None), None)
+    if unit is not None and unit <= 0:
+        raise SceneError(f"the depth unit is {unit}; expected lengths a stored step, above 0, such as 0.001")
+    return DepthFile(capture / inside, camera, unit, distortion=distortion)
 
 
 def _distortion(keys: dict[str, Any]) -> Distortion | None:

@@ -2,18 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import re
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.errors import SceneError
+from og_pointcloud.formats.depth import DepthFile
 from og_pointcloud.formats.distortion import Distortion
 from og_pointcloud.scene import Camera
 
-__all__ = ["PosedImage", "in_local_frame", "naming", "rigid"]
+__all__ = [
+    "PosedFrames",
+    "PosedImage",
+    "camera_from_pose",
+    "in_local_frame",
+    "naming",
+    "numbered",
+    "read_numbers",
+    "rigid",
+]
+
+MAX_TEXT_BYTES = 1 << 26
 
 
 @dataclass(frozen=True)
@@ -22,12 +36,21 @@ class PosedImage:
 
     path: as written there, with forward slashes; relative to the capture folder or to its image folder.
     camera: its ``world_to_camera`` still starts from world coordinates (float64), not from the scene's local frame.
-    distortion: None for a pinhole lens.
+    distortion: None for a pinhole lens. depth: the depth image that the pose file or data set has for it.
     """
 
     path: str
     camera: Camera
     distortion: Distortion | None = None
+    depth: DepthFile | None = None
+
+
+@dataclass(frozen=True)
+class PosedFrames:
+    """What a data set's folder holds. dropped: paths of images without a finite pose (trackers get lost)."""
+
+    images: tuple[PosedImage, ...]
+    dropped: tuple[str, ...]
 
 
 @contextmanager
@@ -54,3 +77,40 @@ def in_local_frame(camera: Camera, origin: NDArray[np.float64]) -> Camera:
     """
     rotation, translation = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]
     return replace(camera, world_to_camera=rigid(rotation, rotation @ origin + translation))
+
+
+def numbered(files: Iterable[Path]) -> list[Path]:
+    """Files in the order of the numbers in their names: 2.jpg before 10.jpg."""
+    return sorted(files, key=lambda file: ([int(digits) for digits in re.findall(r"\d+", file.name)], file.name))
+
+
+def read_numbers(file: Path, columns: int) -> NDArray[np.float64]:
+    """(rows, columns) float64 of a text file of numbers, ``nan`` and ``inf`` among them."""
+    try:
+        if (size := file.stat().st_size) > MAX_TEXT_BYTES:
+            raise SceneError(f"{file} has {size} bytes; expected a text file of numbers, at most {MAX_TEXT_BYTES}")
+        rows = [line.split() for line in file.read_text(encoding="utf-8").splitlines() if line.strip()]
+        numbers = np.array([[float(word) for word in row] for row in rows], np.float64)
+    except (ValueError, OSError) as error:
+        if isinstance(error, SceneError):
+            raise
+        raise SceneError(f"{file} cannot be read as rows of numbers ({error}): export it again") from None
+    if numbers.ndim != 2 or numbers.shape[1] != columns:
+        raise SceneError(f"{file} has numbers of shape {numbers.shape}; expected rows of {columns}")
+    return numbers
+
+
+def camera_from_pose(
+    camera_to_world: NDArray[np.float64], size: tuple[int, int], intrinsics: tuple[float, float, float, float]
+) -> Camera:
+    """The camera of a data set with OpenCV axes that counts pixel centres at whole numbers, as most RGB-D sets do.
+
+    camera_to_world: (4, 4), finite. size: (width, height). intrinsics: fx, fy, cx, cy with the first pixel's centre at
+    0; the scene has it at 0.5.
+    """
+    if camera_to_world.shape != (4, 4):
+        raise SceneError(f"the pose has shape {camera_to_world.shape}; expected a 4x4 matrix, camera to world")
+    rotation = camera_to_world[:3, :3].T
+    fx, fy, cx, cy = intrinsics
+    pose = rigid(rotation, -rotation @ camera_to_world[:3, 3])
+    return Camera(*size, fx=fx, fy=fy, cx=cx + 0.5, cy=cy + 0.5, world_to_camera=pose)

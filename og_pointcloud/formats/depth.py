@@ -1,0 +1,177 @@
+"""Depth images: each pixel's distance along the optical axis (z, not the length of the ray), 0 where none was measured.
+
+16-bit grey PNG and TIFF, float TIFF, ``.npy``, and ``.exr`` where OpenCV was started with it. Stored whole numbers are
+millimetres in a world of metres unless the data set says otherwise, stored floats are lengths of the world.
+"""
+
+from __future__ import annotations
+
+import tokenize
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from og_pointcloud.errors import SceneError
+from og_pointcloud.formats.distortion import Distortion, undistorted
+from og_pointcloud.formats.images import MAX_PIXELS, decoded, png_header, require_cv2, same_shape
+from og_pointcloud.scene import Camera
+
+__all__ = ["MILLIMETRE", "DepthFile", "DepthFrame", "DepthImage", "find_depth", "resampled"]
+
+DEPTH_FOLDERS = ("depth", "depths", "depth_images")
+DEPTH_SUFFIXES = (".png", ".npy", ".tif", ".tiff", ".exr")
+MILLIMETRE = 1e-3
+
+
+@dataclass(frozen=True)
+class DepthImage:
+    """depth: (H, W) float32, lengths of the world along the optical axis, 0 unmeasured. camera: its own, of that size,
+    from world coordinates."""
+
+    depth: NDArray[np.float32]
+    camera: Camera
+
+    def seen_by(self, camera: Camera) -> NDArray[np.float32]:
+        """The depth at the pixels of a camera with the same pose, (camera.height, camera.width), by nearest pixel."""
+        return resampled(self.depth, self.camera, camera)
+
+
+@dataclass(frozen=True)
+class DepthFile:
+    """A depth image that is read on demand.
+
+    camera: the depth sensor's, from world coordinates; a file of another size scales it. unit: world lengths of a
+    stored step, None for the rule by type (whole numbers: millimetres of a world in metres; floats: as they are).
+    invalid: a stored value that means "not measured", beside 0, negative numbers, NaN and infinity.
+    """
+
+    path: Path
+    camera: Camera
+    unit: float | None = None
+    invalid: int | None = None
+    distortion: Distortion | None = None
+
+    def read(self) -> DepthImage:
+        """Decode, scale and undistort. SceneError names the file, what it holds and what was expected."""
+        stored = _stored(self.path)
+        height, width = stored.shape
+        if not same_shape((width, height), (self.camera.width, self.camera.height)):
+            raise SceneError(
+                f"{self.path} is {width}x{height} pixels, its camera {self.camera.width}x{self.camera.height}; "
+                "expected the same size or a scaled one: fix the width and height of the pose file"
+            )
+        whole = np.issubdtype(stored.dtype, np.integer)
+        unit = (MILLIMETRE if whole else 1.0) if self.unit is None else self.unit
+        with np.errstate(invalid="ignore", over="ignore"):
+            depth = np.asarray(stored, np.float32) * np.float32(unit)
+            measured = np.isfinite(depth) & (depth > 0)
+        if self.invalid is not None:
+            measured &= stored != self.invalid
+        depth = np.where(measured, depth, np.float32(0))
+        camera = self.camera.resized(width, height)
+        if self.distortion is not None:
+            nearest = undistorted(camera, self.distortion).nearest
+            depth = np.where(nearest < 0, np.float32(0), depth.reshape(-1)[nearest])
+        return DepthImage(depth, camera)
+
+
+@dataclass(frozen=True)
+class DepthFrame:
+    """A depth image with the colours of its view.
+
+    colors: gives them at the pixels of a camera with the view's pose, (H, W, 3) uint8; None where there is no image.
+    """
+
+    name: str
+    depth: DepthFile
+    colors: Callable[[Camera], NDArray[np.uint8]] | None = None
+
+
+def find_depth(capture: Path, name: str) -> Path | None:
+    """The depth image of the view called ``name``: ``depth/<name>.png`` and the like, or None."""
+    files = (capture / folder / f"{name}{suffix}" for folder in DEPTH_FOLDERS for suffix in DEPTH_SUFFIXES)
+    return next((file for file in files if file.is_file()), None)
+
+
+def resampled(values: NDArray, source: Camera, target: Camera) -> NDArray:
+    """(H, W, ...) pixels of one camera at the pixels of another with the same pose; 0 where it does not look.
+
+    Two pinholes with one centre and one orientation see a ray in columns and rows that depend on nothing but column
+    and row, so whole lines are picked, by nearest pixel: depths must not be blended over an edge.
+    """
+    columns = _positions(target.width, target.fx, target.cx, source.fx, source.cx)
+    rows = _positions(target.height, target.fy, target.cy, source.fy, source.cy)
+    seen = (columns >= 0) & (columns < source.width), (rows >= 0) & (rows < source.height)
+    picked = values[np.ix_(np.clip(rows, 0, source.height - 1), np.clip(columns, 0, source.width - 1))]
+    picked[:, ~seen[0]] = 0
+    picked[~seen[1]] = 0
+    return picked
+
+
+def _positions(count: int, focal: float, center: float, source_focal: float, source_center: float) -> NDArray[np.intp]:
+    along = (np.arange(count) + 0.5 - center) / focal
+    return np.floor(along * source_focal + source_center).astype(np.intp)
+
+
+def _stored(file: Path) -> NDArray:
+    """(H, W) numbers as the file holds them."""
+    suffix = file.suffix.lower()
+    if suffix not in DEPTH_SUFFIXES:
+        raise SceneError(f"{file} ends in '{suffix}'; expected a depth image: {', '.join(DEPTH_SUFFIXES)}")
+    if not file.is_file():
+        raise SceneError(f"{file} is listed as a depth image but is no file: add it or fix the pose file")
+    if suffix == ".npy":
+        values = _mapped(file)
+    elif suffix == ".exr":
+        values = _exr(file)
+    else:
+        header = png_header(file)
+        if header is not None and (header.bit_depth != 16 or header.color_type != 0):
+            raise SceneError(
+                f"{file} is a PNG of {header.bit_depth} bit and colour type {header.color_type}; expected grey of 16 "
+                "bit: pictures of depth in colours or 8 bit have lost the lengths"
+            )
+        values = decoded(file, require_cv2().IMREAD_UNCHANGED)
+    if values.ndim == 3:
+        values = _first_channel(values)
+    kind = values.dtype.kind
+    if values.ndim != 2 or not (kind == "f" or (kind in "iu" and values.dtype.itemsize > 1)) or not values.size:
+        raise SceneError(
+            f"{file} is {values.dtype} {values.shape}; expected (height, width) of floats or of whole numbers of 16 "
+            "bit and more"
+        )
+    return values
+
+
+def _mapped(file: Path) -> NDArray:
+    """A .npy file's array; numpy checks the claimed size against the file's."""
+    try:
+        values = np.load(file, mmap_mode="r", allow_pickle=False)
+    except (ValueError, OSError, EOFError, tokenize.TokenError) as error:
+        raise SceneError(
+            f"{file} cannot be read as a .npy array ({error}): it is damaged or truncated, write it again"
+        ) from None
+    if values.size > MAX_PIXELS:
+        raise SceneError(f"{file} holds {values.size} numbers; expected a depth image of at most {MAX_PIXELS} pixels")
+    return values
+
+
+def _exr(file: Path) -> NDArray:
+    try:
+        return decoded(file, require_cv2().IMREAD_UNCHANGED)
+    except SceneError:
+        raise SceneError(
+            f"{file} cannot be decoded: it is damaged, or OpenCV was started without OpenEXR; set "
+            "OPENCV_IO_ENABLE_OPENEXR=1 in the environment, or convert it to .npy"
+        ) from None
+
+
+def _first_channel(values: NDArray) -> NDArray:
+    """Depth written as (H, W, 1), or grey in three equal channels, as EXR writers do."""
+    channels = [values[..., index] for index in range(min(values.shape[-1], 4))]
+    first = channels[0]
+    same = values.shape[-1] <= 4 and all(np.array_equal(first, other) for other in channels[1:3])
+    return np.asarray(first) if same else values

@@ -1,0 +1,294 @@
+"""RGB-D data sets in their own layouts, written on the spot: cameras, depth, and the fused cloud of each."""
+
+import json
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+from capture_files import write_masks
+from depth_rooms import HEIGHT, WIDTH, distance_to_surface, look, poses, write_depth, write_rgb
+
+from og_pointcloud.cli import main
+from og_pointcloud.errors import SceneError
+from og_pointcloud.formats.capture import depth_files, fuse_capture, read_capture, read_depth
+from og_pointcloud.formats.points import read_points
+from og_pointcloud.formats.seven_scenes import COLOR_FOCAL_PX, DEPTH_FOCAL_PX
+
+COUNT = 6
+LENS = (130.0, 131.0, 79.0, 60.5)
+"""fx fy cx cy with pixel centres at whole numbers, as these data sets state them; the scene adds 0.5 to cx, cy."""
+OURS = (LENS[0], LENS[1], LENS[2] + 0.5, LENS[3] + 0.5)
+SIZE = (WIDTH, HEIGHT)
+
+
+def matrix(lens, size=4):
+    made = np.eye(size)
+    made[0, 0], made[1, 1], made[0, 2], made[1, 2] = lens
+    return made
+
+
+def write_scannet(folder: Path):
+    """Colour at twice the depth's size with a lens of its own, as in the data set."""
+    color_lens, color_size = (260.0, 262.0, 158.0, 121.0), (2 * WIDTH, 2 * HEIGHT)
+    for name in ("pose", "intrinsic"):
+        (folder / name).mkdir(parents=True)
+    for index, pose in enumerate(poses(COUNT)):
+        centred = (color_lens[0], color_lens[1], color_lens[2] + 0.5, color_lens[3] + 0.5)
+        write_rgb(folder / f"color/{index * 5}.jpg", look(pose, size=color_size, intrinsics=centred)[1])
+        write_depth(folder / f"depth/{index * 5}.png", look(pose, intrinsics=OURS)[0])
+        np.savetxt(folder / f"pose/{index * 5}.txt", pose)
+    np.savetxt(folder / "intrinsic/intrinsic_color.txt", matrix(color_lens))
+    np.savetxt(folder / "intrinsic/intrinsic_depth.txt", matrix(LENS))
+    np.savetxt(folder / "intrinsic/extrinsic_depth.txt", np.eye(4))
+    return [str(5 * index) for index in range(COUNT)], color_size
+
+
+def write_seven_scenes(folder: Path, intrinsics: bool = True):
+    for index, pose in enumerate(poses(COUNT)):
+        depth, rgb = look(pose, intrinsics=OURS)
+        depth[:3] = 65.535
+        write_depth(folder / f"frame-{index:06d}.depth.png", depth)
+        write_rgb(folder / f"frame-{index:06d}.color.png", rgb)
+        np.savetxt(folder / f"frame-{index:06d}.pose.txt", pose, fmt="%.7e", delimiter="\t")
+    if intrinsics:
+        np.savetxt(folder / "camera-intrinsics.txt", matrix(LENS, 3))
+    return [f"frame-{index:06d}.color" for index in range(COUNT)], SIZE
+
+
+def write_replica(folder: Path):
+    for index, pose in enumerate(poses(COUNT)):
+        depth, rgb = look(pose, intrinsics=OURS)
+        write_depth(folder / f"results/depth{index:06d}.png", depth, 1 / 6553.5)
+        write_rgb(folder / f"results/frame{index:06d}.jpg", rgb)
+    np.savetxt(folder / "traj.txt", [pose.ravel() for pose in poses(COUNT)])
+    lens = dict(zip(("fx", "fy", "cx", "cy"), LENS, strict=True))
+    parameters = {"camera": {"w": WIDTH, "h": HEIGHT, **lens, "scale": 6553.5}}
+    (folder.parent / "cam_params.json").write_text(json.dumps(parameters))
+    return [f"frame{index:06d}" for index in range(COUNT)], SIZE
+
+
+def write_record3d(folder: Path):
+    """Quaternions xyzw and OpenGL axes; depth at half size, as .npy in the place of .exr."""
+    rows = []
+    for index, pose in enumerate(poses(COUNT)):
+        write_rgb(folder / f"rgb/{index}.jpg", look(pose, intrinsics=LENS)[1])
+        (folder / "depth").mkdir(exist_ok=True)
+        half = tuple(value / 2 for value in LENS)
+        np.save(folder / f"depth/{index}.npy", look(pose, size=(WIDTH // 2, HEIGHT // 2), intrinsics=half)[0])
+        rows.append([*quaternion_xyzw(pose[:3, :3] * [1, -1, -1]), *pose[:3, 3]])
+    content = {"w": WIDTH, "h": HEIGHT, "K": matrix(LENS, 3).T.ravel().tolist(), "poses": rows, "fps": 60}
+    (folder / "metadata.json").write_text(json.dumps(content))
+    return [str(index) for index in range(COUNT)], SIZE
+
+
+def quaternion_xyzw(rotation):
+    """By the axis that the rotation keeps and the angle about it."""
+    values, vectors = np.linalg.eig(rotation)
+    axis = vectors[:, np.argmin(np.abs(values - 1))].real
+    skew = np.array([rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]])
+    angle = np.arctan2(skew @ axis, np.trace(rotation) - 1)
+    return [*(np.sin(angle / 2) * axis), np.cos(angle / 2)]
+
+
+LAYOUTS = {
+    "scannet": (write_scannet, OURS),
+    "seven_scenes": (write_seven_scenes, OURS),
+    "replica": (write_replica, OURS),
+    "record3d": (write_record3d, LENS),
+}
+
+
+@pytest.fixture(params=LAYOUTS)
+def dataset(request, tmp_path):
+    write, lens = LAYOUTS[request.param]
+    folder = tmp_path / "set" / "scene"
+    folder.mkdir(parents=True)
+    names, size = write(folder)
+    return folder, names, size, lens
+
+
+def add_masks(folder, names, size):
+    write_masks(folder, names, size)
+
+
+def test_every_layout_becomes_a_scene_with_a_fused_cloud(dataset):
+    folder, names, size, _ = dataset
+    add_masks(folder, names, size)
+    scene = read_capture(folder)
+    assert [view.name for view in scene.views] == names
+    fused = fuse_capture(folder)
+    assert distance_to_surface(scene.points.xyz_world).max() < fused.survey.voxel / 2
+    assert len(scene.points) == len(fused.points) > 3000
+    for view, pose in zip(scene.views, poses(COUNT), strict=True):
+        np.testing.assert_allclose(view.camera.center + scene.points.origin, pose[:3, 3], atol=1e-5)
+        np.testing.assert_allclose(view.camera.world_to_camera[:3, :3].T, pose[:3, :3], atol=1e-5)
+        assert (view.camera.width, view.camera.height) == size
+        image = view.image_rgb()
+        assert image is not None
+        assert image.shape == (size[1], size[0], 3)
+
+
+def test_depth_of_a_view_is_given_at_the_pixels_of_its_image(dataset):
+    folder, names, size, lens = dataset
+    scale = size[0] / WIDTH
+    depth = read_depth(folder, names[2])
+    assert depth is not None
+    assert depth.shape == (size[1], size[0])
+    intrinsics = (260.0, 262.0, 158.5, 121.5) if scale == 2 else lens
+    truth, _ = look(poses(COUNT)[2], size=size, intrinsics=intrinsics)
+    measured = depth > 0
+    assert measured.mean() > 0.9
+    # Nearest pixels: exact to a pixel's slope, but at the edges of things.
+    assert np.quantile(np.abs(depth - truth)[measured], 0.9) < 0.05
+    assert list(depth_files(folder)) == names
+    assert read_depth(folder, "nothing") is None
+
+
+def test_frames_without_a_pose_are_left_out_and_counted_once(tmp_path):
+    folder = tmp_path / "scene"
+    names, size = write_scannet(folder)
+    (folder / "pose/5.txt").write_text("\n".join(["-inf -inf -inf -inf"] * 4))
+    (folder / "pose/15.txt").write_text("\n".join(["nan 0 0 0"] * 4))
+    add_masks(folder, names, size)
+    with pytest.warns(UserWarning, match=r"2 frames have no finite pose and are left out, e.g. 'color/5.jpg'") as said:
+        scene = read_capture(folder)
+    assert len(said) == 1
+    assert [view.name for view in scene.views] == ["0", "10", "20", "25"]
+
+
+def test_frames_of_a_recording_without_masks_are_left_out_but_fused(tmp_path):
+    folder = tmp_path / "scene"
+    folder.mkdir()
+    names, size = write_seven_scenes(folder)
+    add_masks(folder, names[::2], size)
+    with pytest.warns(UserWarning, match="3 of 6 frames have no masks and are left out"):
+        scene = read_capture(folder)
+    assert [view.name for view in scene.views] == names[::2]
+    assert fuse_capture(folder).frames == COUNT
+
+
+def test_uncalibrated_seven_scenes_have_two_lenses_and_sequences_of_their_own(tmp_path):
+    for sequence in ("seq-01", "seq-02"):
+        (tmp_path / sequence).mkdir()
+        write_seven_scenes(tmp_path / sequence, intrinsics=False)
+    files = depth_files(tmp_path)
+    assert list(files)[COUNT] == "seq-02/frame-000000.color"
+    assert files["seq-01/frame-000003.color"].camera.fx == DEPTH_FOCAL_PX * WIDTH / 640
+    names = list(files)
+    add_masks(tmp_path, names, SIZE)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # colour and depth are of one lens here, and said to be of two
+        scene = read_capture(tmp_path)
+    assert scene.views[0].camera.fx == COLOR_FOCAL_PX * WIDTH / 640
+    # 65535 is "not measured", not 65 m.
+    assert files[names[0]].read().depth.max() < 6
+
+
+def test_scannets_mesh_is_the_cloud_where_it_is_there(tmp_path):
+    folder = tmp_path / "scene"
+    names, size = write_scannet(folder)
+    add_masks(folder, names, size)
+    text = "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
+    text += "element face 1\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"
+    (folder / "scene_vh_clean_2.ply").write_text(text)
+    assert len(read_capture(folder).points) == 3
+
+
+def nerfstudio(folder: Path, **keys):
+    """transforms.json with depth_file_path."""
+    frames = []
+    for index, pose in enumerate(poses(COUNT)):
+        depth, rgb = look(pose, intrinsics=LENS)
+        write_rgb(folder / f"images/{index}.png", rgb)
+        write_depth(folder / f"depths/d{index}.png", depth, keys.get("integer_depth_scale", 1e-3))
+        frame = {"file_path": f"images/{index}.png", "depth_file_path": f"depths/d{index}.png"}
+        frames.append({**frame, "transform_matrix": (pose @ np.diag([1, -1, -1, 1])).tolist()})
+    lens = dict(zip(("fl_x", "fl_y", "cx", "cy"), LENS, strict=True))
+    content = {**lens, "w": WIDTH, "h": HEIGHT, "frames": frames, **keys}
+    (folder / "transforms.json").write_text(json.dumps(content))
+    return [str(index) for index in range(COUNT)]
+
+
+@pytest.mark.parametrize("keys", [{}, {"integer_depth_scale": 2e-4}])
+def test_nerfstudios_depth_files_are_fused(tmp_path, keys):
+    add_masks(tmp_path, nerfstudio(tmp_path, **keys), SIZE)
+    scene = read_capture(tmp_path)
+    assert distance_to_surface(scene.points.xyz_world).max() < fuse_capture(tmp_path).survey.voxel / 2
+
+
+def test_a_depth_file_outside_the_capture_is_not_opened(tmp_path):
+    nerfstudio(tmp_path)
+    content = json.loads((tmp_path / "transforms.json").read_text())
+    content["frames"][0]["depth_file_path"] = "../d0.png"
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    with pytest.raises(SceneError, match="leads out of the capture folder"):
+        depth_files(tmp_path)
+
+
+def test_a_depth_folder_beside_the_images_is_found(tmp_path):
+    names = nerfstudio(tmp_path)
+    content = json.loads((tmp_path / "transforms.json").read_text())
+    for index, frame in enumerate(content["frames"]):
+        del frame["depth_file_path"]
+        np.save(tmp_path / f"{index}.npy", look(poses(COUNT)[index], intrinsics=LENS)[0])
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    add_masks(tmp_path, names, SIZE)
+    with pytest.raises(SceneError, match=r"no geometry; .*depth images in depth/"):
+        read_capture(tmp_path)
+    (tmp_path / "depth").mkdir()
+    for index in range(COUNT):
+        (tmp_path / f"{index}.npy").rename(tmp_path / f"depth/{index}.npy")
+    assert distance_to_surface(read_capture(tmp_path).points.xyz_world).max() < 0.03
+
+
+def test_poses_in_millimetres_with_depth_in_metres_are_doubted(tmp_path):
+    nerfstudio(tmp_path)
+    content = json.loads((tmp_path / "transforms.json").read_text())
+    for frame in content["frames"]:
+        for row in frame["transform_matrix"][:3]:
+            row[3] *= 1000
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    with pytest.warns(UserWarning, match="if all depths are taken times 1000: give the depth unit"):
+        fuse_capture(tmp_path)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        fused = fuse_capture(tmp_path, depth_unit=1.0)
+    assert distance_to_surface(fused.points.xyz_world / 1000).max() < fused.survey.voxel / 2000
+
+
+@pytest.mark.parametrize(
+    ("write", "file", "content", "said"),
+    [
+        (write_scannet, "pose/0.txt", "1 2 3", r"shape \(1, 3\); expected rows of 4"),
+        (write_scannet, "pose/0.txt", "1 0 0 0\n0 2 0 0\n0 0 1 0\n0 0 0 1", "off a rotation"),
+        (write_scannet, "pose/0.txt", "1 0 0 0\n", r"shape \(1, 4\); expected a 4x4 matrix"),
+        (write_scannet, "intrinsic/intrinsic_color.txt", "a b", "cannot be read as rows of numbers"),
+        (write_scannet, "intrinsic/intrinsic_depth.txt", "1 0 0 0", "expected a 4x4 matrix"),
+        (write_seven_scenes, "camera-intrinsics.txt", "1 0 0", "expected a 3x3 matrix"),
+        (write_replica, "traj.txt", "1 " * 16, "6 images in results/ and 1 poses"),
+        (write_replica, "../cam_params.json", '{"camera": {"w": 1}}', "is not"),
+        (write_record3d, "metadata.json", '{"w": 1}', "is not Record3D's metadata"),
+        (write_record3d, "metadata.json", "[" * 100000, "is not Record3D's metadata"),
+    ],
+)
+def test_damaged_data_sets_name_the_file_and_the_cure(tmp_path, write, file, content, said):
+    folder = tmp_path / "scene"
+    folder.mkdir()
+    write(folder)
+    (folder / file).write_text(content)
+    with pytest.raises(SceneError, match=said):
+        depth_files(folder)
+
+
+def test_the_command_writes_the_cloud_that_fit_then_takes(tmp_path, capsys):
+    names = nerfstudio(tmp_path)
+    add_masks(tmp_path, names, SIZE)
+    assert main(["fuse", str(tmp_path)]) == 0
+    assert "6 depth images" in capsys.readouterr().out
+    cloud = read_points(tmp_path / "points.ply")
+    assert distance_to_surface(cloud.xyz_world).max() < 0.03
+    assert cloud.rgb is not None
+    assert len(read_capture(tmp_path).points) == len(cloud)
+    assert main(["fuse", str(tmp_path)]) == 2  # it stays
+    assert main(["fuse", str(tmp_path), "--depth-unit", "0", "-o", str(tmp_path / "b.ply")]) == 2

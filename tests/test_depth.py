@@ -1,0 +1,282 @@
+"""Depth files as they are stored, the cloud that fusion makes of them, and what is said of those that do not fit."""
+
+import cv2
+import numpy as np
+import pytest
+from depth_rooms import (
+    CRATE,
+    HEIGHT,
+    THING,
+    WIDTH,
+    camera,
+    distance_to_surface,
+    look,
+    poses,
+    write_depth,
+    write_frames,
+)
+
+from og_pointcloud.errors import SceneError
+from og_pointcloud.fitting.depth_checks import doubts
+from og_pointcloud.fitting.fusion import _slot, evenly, fuse, on_surface, survey, to_world
+from og_pointcloud.formats.depth import DepthFile, DepthFrame, DepthImage, resampled
+from og_pointcloud.formats.distortion import lens_distortion
+
+POSE = poses()[0]
+
+
+def read(path, **keys):
+    return DepthFile(path, camera(POSE), **keys).read()
+
+
+# Files ----------------------------------------------------------------------------------------------------------
+
+
+def test_whole_numbers_are_millimetres_and_floats_are_lengths(tmp_path):
+    depth, _ = look(POSE)
+    write_depth(tmp_path / "a.png", depth)
+    np.save(tmp_path / "b.npy", depth.astype(np.float32))
+    np.save(tmp_path / "c.npy", np.round(depth * 1000).astype(np.uint16)[..., None])
+    cv2.imwrite(str(tmp_path / "d.tiff"), depth.astype(np.float32))
+    cv2.imwrite(str(tmp_path / "e.tif"), np.round(depth * 1000).astype(np.uint16))
+    for name in ("a.png", "b.npy", "c.npy", "d.tiff", "e.tif"):
+        np.testing.assert_allclose(read(tmp_path / name).depth, depth, atol=6e-4, err_msg=name)
+
+
+def test_what_was_not_measured_is_zero(tmp_path):
+    depth = np.full((HEIGHT, WIDTH), 2.0, np.float32)
+    depth[0, :4] = np.nan, np.inf, -np.inf, -1
+    np.save(tmp_path / "a.npy", depth)
+    assert read(tmp_path / "a.npy").depth[0, :5].tolist() == [0, 0, 0, 0, 2]
+    write_depth(tmp_path / "b.png", np.where(depth == 2, 2.0, 65.535))
+    assert read(tmp_path / "b.png", invalid=65535).depth[0, :5].tolist() == [0, 0, 0, 0, 2]
+    assert read(tmp_path / "b.png").depth[0, 0] == pytest.approx(65.535)
+
+
+def test_a_smaller_file_scales_its_camera_and_another_shape_is_refused(tmp_path):
+    write_depth(tmp_path / "small.png", np.full((HEIGHT // 2, WIDTH // 2), 1.5))
+    image = read(tmp_path / "small.png", unit=0.002)
+    assert (image.camera.width, image.camera.fx) == (WIDTH // 2, camera(POSE).fx / 2)
+    assert image.depth[3, 3] == pytest.approx(3.0)
+    write_depth(tmp_path / "wide.png", np.ones((HEIGHT // 2, WIDTH)))
+    with pytest.raises(SceneError, match=f"{WIDTH}x{HEIGHT // 2} pixels, its camera {WIDTH}x{HEIGHT}"):
+        read(tmp_path / "wide.png")
+
+
+def test_a_distorted_depth_image_becomes_a_pinholes(tmp_path):
+    depth = np.full((HEIGHT, WIDTH), 2.0)
+    depth[:, WIDTH // 4 :] = 3.0
+    write_depth(tmp_path / "a.png", depth)
+    plain = read(tmp_path / "a.png")
+    bent = read(tmp_path / "a.png", distortion=lens_distortion({"k1": 0.3}, fisheye=False))
+    edge = [int(np.argmax(image.depth[HEIGHT // 2] > 2.5)) for image in (plain, bent)]
+    # r_d = r (1 + 0.3 r^2): the distorted edge at 40 px from the middle stands at a smaller radius in the pinhole.
+    radius = np.roots([0.3, 0, 1, -(WIDTH / 4) / camera(POSE).fx])
+    radius = float(radius[np.isreal(radius)].real[0])
+    assert edge[0] == WIDTH // 4
+    assert abs(edge[1] - (WIDTH / 2 - radius * camera(POSE).fx)) <= 1
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "said"),
+    [
+        ("a.png", b"", "cannot be decoded"),
+        ("a.npy", b"\x93NUMPY", "cannot be read as a .npy"),
+        ("a.exr", b"v/1\x01", "OPENCV_IO_ENABLE_OPENEXR"),
+        ("a.jpg", b"x", "expected a depth image"),
+        ("a.tiff", b"II*\0", "cannot be decoded"),
+    ],
+)
+def test_damaged_files_name_the_cure(tmp_path, name, content, said):
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(SceneError, match=said):
+        read(tmp_path / name)
+
+
+def test_pictures_of_depth_and_objects_are_refused(tmp_path):
+    cv2.imwrite(str(tmp_path / "grey.png"), np.zeros((HEIGHT, WIDTH), np.uint8))
+    with pytest.raises(SceneError, match="grey of 16 bit"):
+        read(tmp_path / "grey.png")
+    np.save(tmp_path / "o.npy", np.array([{"a": 1}], object), allow_pickle=True)
+    with pytest.raises(SceneError, match="cannot be read"):
+        read(tmp_path / "o.npy")
+    np.save(tmp_path / "flat.npy", np.zeros(5, np.float32))
+    with pytest.raises(SceneError, match=r"float32 \(5,\)"):
+        read(tmp_path / "flat.npy")
+    with pytest.raises(SceneError, match="is no file"):
+        read(tmp_path / "gone.png")
+
+
+def test_resampling_picks_the_pixel_a_ray_falls_into():
+    source, target = camera(POSE), camera(POSE, (100, 90), (70.0, 65.0, 41.0, 48.0))
+    values = np.arange(HEIGHT * WIDTH, dtype=np.float32).reshape(HEIGHT, WIDTH) + 1
+    picked = resampled(values, source, target)
+    for row, column in [(0, 0), (10, 90), (48, 41), (89, 99), (60, 3)]:
+        x, y = (column + 0.5 - 41) / 70, (row + 0.5 - 48) / 65
+        u, v = int(np.floor(x * source.fx + source.cx)), int(np.floor(y * source.fy + source.cy))
+        inside = 0 <= u < WIDTH and 0 <= v < HEIGHT
+        assert picked[row, column] == (values[v, u] if inside else 0)
+
+
+# Fusion ---------------------------------------------------------------------------------------------------------
+
+
+def test_a_pixel_of_the_cloud_lies_where_it_was_seen():
+    depth, _ = look(POSE)
+    xyz = to_world(DepthImage(depth.astype(np.float32), camera(POSE)), np.ones(depth.shape, bool))
+    assert distance_to_surface(xyz).max() < 1e-6
+    x, y = (7 + 0.5 - 80) / 130, (3 + 0.5 - 60) / 130
+    np.testing.assert_allclose(
+        xyz[3 * WIDTH + 7], POSE[:3, :3] @ np.array([x, y, 1]) * depth[3, 7] + POSE[:3, 3], atol=1e-6
+    )
+
+
+def test_the_fused_cloud_lies_on_the_surface_and_covers_it(tmp_path):
+    frames = write_frames(tmp_path)
+    fused = fuse(frames)
+    voxel = fused.survey.voxel
+    xyz = fused.points.xyz_world
+    assert distance_to_surface(xyz).max() < voxel / 2
+    seen = np.concatenate(
+        [to_world(image, image.depth > 0)[::37] for image in (frame.depth.read() for frame in frames)]
+    )
+    missing = [np.linalg.norm(xyz - point, axis=1).min() > 2 * voxel for point in seen[::20]]
+    assert np.mean(missing) < 0.02
+    assert fused.points.rgb is not None
+    inner = (np.abs(xyz - CRATE.mean(axis=0)) < (CRATE[1] - CRATE[0]) / 2 + 1e-3).all(axis=1) & (xyz[:, 2] > voxel)
+    assert (np.abs(fused.points.rgb[inner].astype(int) - THING).max(axis=1) < 8).mean() > 0.9
+
+
+def test_noise_makes_one_layer_and_flying_pixels_none(tmp_path):
+    rng = np.random.default_rng(0)
+
+    def spoil(_, depth):
+        near, far = cv2.erode(depth, np.ones((3, 3))), cv2.dilate(depth, np.ones((3, 3)))
+        flying = (far > 1.05 * near) & (rng.uniform(size=depth.shape) < 0.5)
+        return np.where(
+            flying, near + rng.uniform(size=depth.shape) * (far - near), depth + rng.normal(0, 0.01, depth.shape)
+        )
+
+    fused = fuse(write_frames(tmp_path, spoiled=spoil))
+    off = distance_to_surface(fused.points.xyz_world)
+    assert 0.006 < fused.survey.noise < 0.02  # 0.01, and what slanted pixels add
+    assert np.median(off) < 0.006
+    assert (off > 3 * fused.survey.voxel).mean() < 0.002
+    assert fused.refused > 0
+
+
+def test_large_map_offsets_cost_nothing(tmp_path):
+    offset = np.array([4.5e6, -1.2e6, 3e5])
+    near = fuse(write_frames(tmp_path / "near", 4))
+    far = fuse(write_frames(tmp_path / "far", 4, offset))
+    assert distance_to_surface(far.points.xyz_world - offset).max() < far.survey.voxel / 2
+    assert abs(len(far.points) - len(near.points)) < 0.02 * len(near.points)
+
+
+def test_one_view_is_enough(tmp_path):
+    fused = fuse(write_frames(tmp_path, 1))
+    assert len(fused.points) > 500
+    assert distance_to_surface(fused.points.xyz_world).max() < fused.survey.voxel / 2
+    assert fused.survey.noise == 0
+
+
+def test_order_of_frames_and_metres_or_millimetres_do_not_matter(tmp_path):
+    frames = write_frames(tmp_path, 6)
+    fused = fuse(frames)
+    turned = fuse(frames[::-1])
+    np.testing.assert_allclose(np.sort(turned.points.xyz_world, 0), np.sort(fused.points.xyz_world, 0), atol=1e-5)
+
+    def in_millimetres(frame):
+        pose = frame.depth.camera.world_to_camera.copy()
+        pose[:3, 3] *= 1000
+        lens = frame.depth.camera
+        moved = camera(np.linalg.inv(pose), (lens.width, lens.height), (lens.fx, lens.fy, lens.cx, lens.cy))
+        return DepthFrame(frame.name, DepthFile(frame.depth.path, moved, 1.0), frame.colors)
+
+    large = fuse([in_millimetres(frame) for frame in frames])
+    assert large.survey.voxel == pytest.approx(1000 * fused.survey.voxel, rel=1e-4)
+    assert abs(len(large.points) - len(fused.points)) < 0.01 * len(fused.points)
+
+
+def test_empty_images_are_named_and_all_empty_ones_refused(tmp_path):
+    frames = write_frames(tmp_path, 4, spoiled=lambda index, depth: depth * (index != 2))
+    assert fuse(frames).empty == ("view2",)
+    nothing = write_frames(tmp_path / "no", 3, spoiled=lambda _, depth: depth * 0)
+    with pytest.raises(SceneError, match="none of the 3 depth images has a measured pixel"):
+        fuse(nothing)
+
+
+def test_a_view_far_away_is_named(tmp_path):
+    frames = write_frames(tmp_path, 3)
+    pose = poses(3)[1].copy()
+    pose[0, 3] = 1e7
+    frames[1] = DepthFrame("lost", DepthFile(frames[1].depth.path, camera(pose), 1e-3), frames[1].colors)
+    with pytest.raises(SceneError, match="view 'lost' has points 1e\\+07 from the middle"):
+        fuse(frames)
+
+
+def test_without_images_there_are_no_colours(tmp_path):
+    assert fuse(write_frames(tmp_path, 2, colors=False)).points.rgb is None
+
+
+def test_a_pixel_between_two_surfaces_is_none_and_a_slanted_surface_is_one():
+    depth = np.full((5, 7), 2.0, np.float32)
+    depth[:, 4:] = 3.0
+    depth[2, 3] = 2.5  # between
+    kept = on_surface(DepthImage(depth, camera(POSE, (7, 5), (100.0, 100.0, 3.5, 2.5))), 0.0)
+    assert not kept[2, 3]
+    assert kept.sum() == 34
+    slanted = np.broadcast_to(2 + 0.1 * np.arange(7, dtype=np.float32), (5, 7))  # 79 degrees: 0.1 a pixel of 0.02
+    assert on_surface(DepthImage(slanted, camera(POSE, (7, 5), (100.0, 100.0, 3.5, 2.5))), 0.0)[:, 1:].all()
+
+
+def test_evenly_takes_first_and_last():
+    assert evenly([1, 2, 3, 4, 5], 3) == [1, 3, 5]
+    assert evenly([1, 2], 5) == [1, 2]
+    assert evenly([], 3) == []
+
+
+def test_keys_that_meet_in_the_table_find_slots_of_their_own():
+    table = np.full(8, -1, np.int64)
+    slots = []
+    for key in range(7):
+        slot = int(_slot(key, table))
+        table[slot] = key
+        slots.append(slot)
+    assert len(set(slots)) == 7
+    assert [int(_slot(key, table)) for key in range(7)] == slots
+
+
+# Doubts ---------------------------------------------------------------------------------------------------------
+
+
+def test_depth_that_fits_raises_no_doubt(tmp_path):
+    assert doubts(write_frames(tmp_path)) == []
+
+
+def test_a_wrong_unit_is_named(tmp_path):
+    frames = [
+        DepthFrame(frame.name, DepthFile(frame.depth.path, frame.depth.camera, 1.0), frame.colors)
+        for frame in write_frames(tmp_path)
+    ]
+    (said,) = doubts(frames)
+    assert "times 0.001" in said
+
+
+@pytest.mark.parametrize(("shift", "magnification"), [((14, 0), 1.0), ((0, -9), 1.0), ((0, 0), 1.12)])
+def test_colours_seen_through_another_lens_are_noticed(tmp_path, shift, magnification):
+    frames = []
+    for index, frame in enumerate(write_frames(tmp_path)):
+        pose = poses()[index]
+        focal = magnification * camera(pose).fx
+        rgb = look(pose, intrinsics=(focal, focal, WIDTH / 2 + shift[0], HEIGHT / 2 + shift[1]))[1]
+        frames.append(DepthFrame(frame.name, frame.depth, lambda _, rgb=rgb: rgb))
+    (said,) = doubts(frames)
+    assert f"{shift[0] / WIDTH:+.1%} of the width to the right"[:3] in said
+    assert f"magnified {magnification:.2f} times" in said
+
+
+def test_survey_of_exact_depth_knows_the_pixel(tmp_path):
+    found = survey(write_frames(tmp_path))
+    assert found.footprint == pytest.approx(found.depth / camera(POSE).fx, rel=1e-3)
+    assert found.noise < found.footprint
