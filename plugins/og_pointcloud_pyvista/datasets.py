@@ -1,0 +1,306 @@
+"""What ``mesh.og`` does: labels as point arrays, words that select points, instances as blocks, boxes as lines.
+
+Point arrays: og_label (int32, row of og_names, -1 unknown), og_instance (int32, the scene's id, negative for none),
+og_score (float32), og_reason (int8, a ``Reason``), og_color (uint8 RGB). Field data: og_names, and the scene's file.
+Labels are of points. Where cells should carry them too, ``mesh.point_data_to_cell_data(categorical=True)`` has each
+cell's points vote.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import pyvista as pv
+from numpy.typing import ArrayLike, NDArray
+
+import og_pointcloud as og
+from og_pointcloud import runtime
+from og_pointcloud.clouds import SCENE_FIELD
+from og_pointcloud.errors import MissingExtraError, OgPointcloudError
+from og_pointcloud.instances import Instance
+from og_pointcloud.runtime import LabelledScene, SceneLike
+from og_pointcloud.segmentation import Segmentation, label_colors
+from og_pointcloud.text.words import Labels, TextFeatures
+
+__all__ = [
+    "COLOR", "INSTANCE", "LABEL", "NAMES", "REASON", "SCORE", "OgDataSet", "best_words", "box_lines", "label_names",
+    "scene_of", "set_strings", "to_pyvista",
+]  # fmt: skip
+
+LABEL, INSTANCE, SCORE, REASON, COLOR = "og_label", "og_instance", "og_score", "og_reason", "og_color"
+NAMES = "og_names"
+RANK = "og_rank"
+SHOWN = 8
+"""Names that a warning lists."""
+BOX_EDGES = [(a, a | 1 << axis) for a in range(8) for axis in range(3) if not a >> axis & 1]
+"""Pairs of `Box.corners`: they differ in one bit."""
+
+
+def to_pyvista(result: Segmentation) -> pv.PolyData:
+    """A segmentation as a cloud of vertices in world coordinates, float64, with the arrays named above."""
+    mesh = pv.PolyData(result.xyz) if len(result) else pv.PolyData()
+    _attach(mesh, result)
+    return mesh
+
+
+@pv.register_dataset_accessor("og", pv.DataSet)
+class OgDataSet:
+    """``mesh.og``: ask what the points of any dataset are, by words.
+
+    The scene that answers is the one passed, else the file that the dataset says it came from, else that of
+    ``og_pointcloud.use``, else what the environment variable OG_POINTCLOUD_SCENE names. ``mesh.points`` are taken to be
+    in the scene's world coordinates.
+    """
+
+    def __init__(self, mesh: pv.DataSet) -> None:
+        self._mesh = mesh
+
+    def segment(
+        self,
+        labels: Labels = None,
+        scene: SceneLike | None = None,
+        *,
+        text_features: TextFeatures = None,
+        templates: Sequence[str] | None = None,
+        negatives: Labels = None,
+        pose: ArrayLike | None = None,
+        max_distance: float | None = None,
+        inplace: bool = False,
+        progress_bar: bool = False,
+    ) -> Any:
+        """Label every point; returns a dataset of the same type with the arrays that this module names.
+
+        labels, scene, text_features, templates, negatives, pose, max_distance: as for ``og_pointcloud.segment``.
+        inplace: add the arrays to this dataset, and return it. progress_bar: needs tqdm.
+        Warns where no point gets a label, and names the labels asked for that no point got.
+        """
+        with _progress("Segmenting", 2, progress_bar) as advance:
+            found = scene_of(self._mesh, scene)
+            advance()
+            result = og.segment(
+                self._mesh, labels, found, text_features=text_features, templates=templates, negatives=negatives,
+                pose=pose, max_distance=max_distance,
+            )  # fmt: skip
+            advance()
+        absent = [name for name, count in result.counts().items() if not count]
+        if labels is not None and absent and len(absent) < len(result.names):
+            _warn(f"no point is labelled {_listed(absent)}")
+        mesh = self._mesh if inplace else self._mesh.copy()
+        _attach(mesh, result)
+        return mesh
+
+    def select(
+        self,
+        text: str | Mapping[str, ArrayLike],
+        scene: SceneLike | None = None,
+        *,
+        against: Labels = None,
+        text_features: TextFeatures = None,
+    ) -> pv.UnstructuredGrid:
+        """The points of the instances that a text fits, and the cells that lie wholly among them.
+
+        Point arrays: og_rank (int32, 0 for the instance that it fits best), og_score (its score), og_instance.
+        text, against, text_features: as for ``og_pointcloud.select``. Warns where nothing is selected, and names what
+        is closest.
+        """
+        found = scene_of(self._mesh, scene)
+        selection = og.select(found, text, against=against, text_features=text_features)
+        mesh = self._with_instances(found)
+        points = _extracted(mesh, selection.instances)
+        if points.n_points == 0:
+            _warn(_why_none(selection))
+            return points
+        ids = np.asarray(points.point_data[INSTANCE])
+        rank, score = (np.zeros(len(found.cloud.instances), kind) for kind in (np.int32, np.float32))
+        for place, match in enumerate(selection.fitting):
+            rank[match.instance], score[match.instance] = place, match.score
+        points.point_data[SCORE] = score[ids]
+        points.point_data[RANK] = rank[ids]
+        return points
+
+    def instances(self, scene: SceneLike | None = None) -> pv.MultiBlock:
+        """A block an instance that has points here, by id; named by its id and label, or the scene's best word for it.
+
+        Warns where there is none.
+        """
+        mesh = self._with_instances(scene)
+        words = best_words(mesh, scene)
+        if not words:
+            _warn(f"none of {mesh.n_points:,} points belongs to an instance: there is no block")
+            return pv.MultiBlock()
+        blocks = {f"{instance} {word}".strip(): instance for instance, word in words.items()}
+        return mesh.split_values(blocks, scalars=INSTANCE, adjacent_cells=False)
+
+    def boxes(self, scene: SceneLike | None = None, *, up: ArrayLike | None = None) -> pv.PolyData:
+        """Oriented boxes of the scene's instances that have points here, as lines: 12 cells each.
+
+        Of a segmented dataset, only labelled instances, in their label's colour. Cell arrays: og_instance, og_color.
+        up: (3,) direction that boxes stand upright on, where it is known.
+        """
+        found = scene_of(self._mesh, scene)
+        mesh = self._with_instances(found)
+        segmented = LABEL in mesh.point_data
+        wanted = mesh.point_data[LABEL] >= 0 if segmented else np.ones(mesh.n_points, bool)
+        ids = _present(mesh.point_data[INSTANCE][wanted])
+        colors = _instance_colors(mesh, ids) if segmented and COLOR in mesh.point_data else None
+        return box_lines([og.instance_table(found, up=up)[instance] for instance in ids], colors)
+
+    def color(
+        self, by: str = "label", colors: Any = None, *, output_scalars: str = COLOR, inplace: bool = False
+    ) -> Any:
+        """Colours by "label" or by "instance", through ``color_labels``; returns a dataset of the same type.
+
+        colors: what ``color_labels`` takes; left out, this library's colours, grey where there is neither.
+        """
+        scalars = {"label": LABEL, "instance": INSTANCE}.get(by, "")
+        if not scalars:
+            raise OgPointcloudError(f"by is {by!r:.40}; expected 'label' or 'instance'")
+        _require(self._mesh, scalars)
+        if colors is None:
+            ids = np.unique(self._mesh.point_data[scalars])
+            colors = dict(zip(ids.tolist(), label_colors(ids).tolist(), strict=True))
+        return self._mesh.color_labels(
+            colors, scalars=scalars, preference="point", output_scalars=output_scalars, inplace=inplace
+        )
+
+    def _with_instances(self, scene: SceneLike | None) -> Any:
+        """This dataset, or, where it has no instance ids, a shallow copy with the scene's."""
+        if INSTANCE in self._mesh.point_data:
+            return self._mesh
+        mesh = self._mesh.copy(deep=False)
+        if mesh.n_points:
+            points = np.asarray(self._mesh.points)
+            mesh.point_data[INSTANCE] = scene_of(self._mesh, scene).instances_at(points)
+        return mesh
+
+
+def scene_of(mesh: Any, scene: SceneLike | None = None) -> LabelledScene:
+    """The scene to ask about a dataset; OgPointcloudError says which ways there are to name one."""
+    return runtime._find_scene(mesh, scene)
+
+
+def label_names(mesh: pv.DataSet) -> tuple[str, ...]:
+    """Names of the labels in og_label."""
+    _require(mesh, LABEL)
+    return tuple(str(name) for name in np.asarray(mesh.field_data[NAMES]).ravel())
+
+
+def best_words(mesh: pv.DataSet, scene: SceneLike | None = None) -> dict[int, str]:
+    """Instance id -> its label, or the scene's best own word for it where it has none, of instances with points here.
+
+    An empty string where nothing is known.
+    """
+    ids = _present(mesh.point_data[INSTANCE]) if INSTANCE in mesh.point_data else []
+    if LABEL in mesh.point_data:
+        names, labels = (*label_names(mesh), "unknown"), mesh.point_data[LABEL]
+        where = _first_rows(mesh.point_data[INSTANCE], ids)
+        return {instance: names[labels[row]] for instance, row in zip(ids, where, strict=True)}
+    if not ids:
+        return {}
+    table = scene_of(mesh, scene).instances
+    return {instance: table[instance].words[0][0] if table[instance].words else "" for instance in ids}
+
+
+def box_lines(rows: Iterable[Instance], colors: Mapping[int, Sequence[int]] | None = None) -> pv.PolyData:
+    """Oriented boxes as lines, those of instances without points left out. colors: instance id -> RGB, else by id."""
+    shown = [row for row in rows if row.oriented_box is not None]
+    if not shown:
+        return pv.PolyData()
+    ids = np.array([row.id for row in shown], np.int32)
+    corners = np.concatenate([row.oriented_box.corners for row in shown if row.oriented_box is not None])
+    edges = (np.array(BOX_EDGES) + 8 * np.arange(len(shown))[:, None, None]).reshape(-1, 2)
+    lines = pv.PolyData(corners, lines=np.insert(edges, 0, 2, axis=1).ravel())
+    rgb = label_colors(ids) if colors is None else np.array([colors[instance] for instance in ids.tolist()], np.uint8)
+    lines.cell_data[INSTANCE] = np.repeat(ids, len(BOX_EDGES))
+    lines.cell_data[COLOR] = np.repeat(rgb, len(BOX_EDGES), axis=0)
+    return lines
+
+
+def set_strings(mesh: pv.DataObject, name: str, values: Iterable[str]) -> None:
+    """Strings as field data. PyVista's own way refuses all that is not ASCII; VTK takes it, and so do its files."""
+    from vtkmodules.vtkCommonCore import vtkStringArray
+
+    strings = vtkStringArray()
+    strings.SetName(name)
+    for value in values:
+        strings.InsertNextValue(value)
+    mesh.GetFieldData().AddArray(strings)
+
+
+def _attach(mesh: Any, result: Segmentation) -> None:
+    if len(result):  # PyVista refuses empty arrays
+        mesh.point_data[INSTANCE], mesh.point_data[SCORE] = result.instances, result.scores
+        mesh.point_data[REASON], mesh.point_data[COLOR] = result.reasons, result.colors
+        mesh.point_data[LABEL] = result.labels
+        mesh.set_active_scalars(LABEL, preference="point")
+    set_strings(mesh, NAMES, result.names)
+    if result.scene is not None:
+        set_strings(mesh, SCENE_FIELD, [str(result.scene.resolve())])
+    elif SCENE_FIELD in mesh.field_data:  # of an earlier answer
+        mesh.field_data.remove(SCENE_FIELD)
+
+
+def _extracted(mesh: Any, ids: Sequence[int]) -> pv.UnstructuredGrid:
+    if not ids or mesh.n_points == 0:
+        return pv.UnstructuredGrid()
+    return mesh.extract_values(list(ids), scalars=INSTANCE, preference="point", adjacent_cells=False)
+
+
+def _why_none(selection: og.Selection) -> str:
+    if selection.fitting:
+        return (
+            f"'{selection.query}' fits {len(selection.fitting)} of {len(selection)} instances of the scene, but no "
+            "point of this dataset belongs to one of them"
+        )
+    best = selection.best
+    closest = f"; the closest is instance {best.instance} with {best.score:.2f}" if best else ""
+    rival = f", which is rather '{best.rival}' ({best.rival_score:.2f})" if best and best.rival else ""
+    return f"'{selection.query}' fits none of {len(selection)} instances{closest}{rival}"
+
+
+def _present(ids: ArrayLike) -> list[int]:
+    return [instance for instance in np.unique(np.asarray(ids)).tolist() if instance >= 0]
+
+
+def _first_rows(ids: ArrayLike, wanted: Sequence[int]) -> NDArray[np.intp]:
+    """Row of the first point of each id; all points of an instance have the same label."""
+    unique, first = np.unique(np.asarray(ids), return_index=True)
+    return first[np.searchsorted(unique, wanted)]
+
+
+def _instance_colors(mesh: pv.DataSet, ids: Sequence[int]) -> dict[int, Sequence[int]]:
+    rows = _first_rows(mesh.point_data[INSTANCE], ids)
+    return dict(zip(ids, np.asarray(mesh.point_data[COLOR])[rows].tolist(), strict=True))
+
+
+def _require(mesh: pv.DataSet, array: str) -> None:
+    if array not in mesh.point_data:
+        raise OgPointcloudError(
+            f"the {type(mesh).__name__} of {mesh.n_points:,} points has no point array '{array}'; expected a segmented "
+            "dataset: mesh = mesh.og.segment(['chair', 'table'])"
+        )
+
+
+def _listed(names: Sequence[str]) -> str:
+    return ", ".join(f"'{name}'" for name in names[:SHOWN]) + (", ..." if len(names) > SHOWN else "")
+
+
+def _warn(text: str) -> None:
+    warnings.warn(text, stacklevel=3)
+
+
+@contextmanager
+def _progress(what: str, steps: int, shown: bool) -> Iterator[Any]:
+    if not shown:
+        yield lambda: None
+        return
+    try:
+        from tqdm import tqdm
+    except ImportError:
+        raise MissingExtraError("tqdm", extra="fit") from None
+    with tqdm(total=steps, desc=what) as bar:
+        yield bar.update

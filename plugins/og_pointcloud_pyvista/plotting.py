@@ -1,0 +1,314 @@
+"""What ``plotter.og`` does: a segmented dataset in categories, boxes, and clicks that are answered in words."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import warnings
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import pyvista as pv
+from numpy.typing import ArrayLike, NDArray
+
+import og_pointcloud as og
+from og_pointcloud.errors import OgPointcloudError
+from og_pointcloud.picking import Pick
+from og_pointcloud.runtime import LabelledScene, SceneLike
+from og_pointcloud.segmentation import label_colors
+from og_pointcloud.text.words import Labels, TextFeatures
+from og_pointcloud.viewpoint import FOCAL, Viewpoint, choose_viewpoint
+from og_pointcloud_pyvista.datasets import COLOR, INSTANCE, LABEL, best_words, box_lines, label_names, scene_of
+from og_pointcloud_pyvista.files import RGB
+
+__all__ = ["OgPlotter", "can_render"]
+
+UNKNOWN_COLOR = (205, 205, 205)
+"""Lighter than in the data: most of a scene may be unknown, and what is known should stand out."""
+LEGEND_ENTRIES = 20
+"""Names that a legend has at most, the most frequent ones; one more entry counts the others."""
+LEGEND_MARGIN = 0.015
+HIGHLIGHT = "magenta"
+SHADE = 0.5
+"""How much darker a label's colour may become where the dataset's own colours are dark: keeps shape and shadow."""
+PROBE = "import pyvista as pv; pv.Plotter(off_screen=True, window_size=(32, 32)).screenshot(return_img=True)"
+TEXT_SIZE = 11
+
+
+def can_render() -> bool:
+    """Whether VTK can draw off-screen here. Tried in a process of its own: with neither EGL nor OSMesa VTK crashes."""
+    if not os.environ.get("DISPLAY"):  # else VTK looks for an X server first, and complains
+        os.environ.setdefault("VTK_DEFAULT_OPENGL_WINDOW", "vtkEGLRenderWindow")
+    return subprocess.run([sys.executable, "-c", PROBE], capture_output=True, timeout=120, check=False).returncode == 0
+
+
+@pv.register_plotter_component("og")
+class OgPlotter:
+    """``plotter.og``: draws what ``mesh.og`` answers."""
+
+    def __init__(self, plotter: pv.Plotter) -> None:
+        self._plotter: Any = plotter
+        self._scene: LabelledScene | None = None
+        self._point_size = 5.0
+        self._words: dict[str, Any] = {}
+        self._on_click: Callable[[Pick], None] | None = None
+
+    def __plotter_close__(self) -> None:
+        self._scene, self._on_click = None, None
+
+    def add_segmentation(
+        self,
+        mesh: Any,
+        *,
+        by: str = "label",
+        legend: bool = True,
+        names: bool = True,
+        point_size: float = 5.0,
+        name: str = "og_segmentation",
+        **options: Any,
+    ) -> pv.Actor:
+        """Draw a segmented dataset: a colour a label, or ``by="instance"``, light grey where there is none.
+
+        legend: the labels with their numbers of points. names: a label's name on each of its instances; names that
+        would cover others are left out, those of large instances go first. point_size: pixels, for datasets of points.
+        options: of ``add_mesh``. Where the dataset has its own colours (RGB), they shade those of the labels.
+
+        Returns the actor. Warns where no point has a label; OgPointcloudError for a dataset without points or labels.
+        """
+        mesh = _drawable(mesh)
+        words = label_names(mesh)
+        labels = np.asarray(mesh.point_data[LABEL])
+        if (labels < 0).all():
+            warnings.warn(f"none of {mesh.n_points:,} points has a label: all are drawn grey", stacklevel=2)
+        colors = np.asarray(mesh.og.color(by, _palette(mesh, by)).point_data[COLOR])
+        kind = {"style": "points", "point_size": point_size} if _is_cloud(mesh) else {}
+        self._point_size = point_size
+        actor = self._plotter.add_mesh(
+            mesh.copy(deep=False), scalars=_shaded(colors, mesh), rgb=True, name=name,
+            **{"lighting": not kind, **kind, **options},
+        )  # fmt: skip
+        if legend:
+            self._add_legend(labels, words, colored=by == "label")
+        if names and INSTANCE in mesh.point_data:
+            self._add_names(mesh, labels, name)
+        try:
+            self._scene = scene_of(mesh)
+        except OgPointcloudError:  # drawing needs none
+            self._scene = None
+        return actor
+
+    def add_boxes(
+        self,
+        of: Any,
+        *,
+        up: ArrayLike | None = None,
+        names: bool = False,
+        line_width: float = 2.5,
+        name: str = "og_boxes",
+        **options: Any,
+    ) -> pv.Actor | None:
+        """Draw oriented boxes around the labelled instances of a segmented dataset, or around all of a scene.
+
+        of: a dataset with og_instance, or a scene, a LabelledCloud or the path of a .ogpc file. up: (3,) direction
+        that boxes stand upright on. names: the best word beside each. options: of ``add_mesh``.
+        Returns the actor; warns, and returns None, where there is no instance to put a box around.
+        """
+        if isinstance(of, pv.DataSet):
+            lines, words = of.og.boxes(up=up), best_words(of) if names else {}
+        else:
+            table = og.instance_table(of, up=up)
+            lines = box_lines(table)
+            words = {row.id: row.words[0][0] if row.words else f"instance {row.id}" for row in table}
+        if lines.n_cells == 0:
+            warnings.warn("there is no instance with points to draw a box around", stacklevel=2)
+            return None
+        if names:
+            ids, first = np.unique(lines.cell_data[INSTANCE], return_index=True)
+            corners = np.asarray(lines.points).reshape(len(ids), 8, 3)
+            order = np.argsort(first)  # boxes lie in the order of their lines
+            self._add_texts(corners.mean(axis=1), [words[int(k)] for k in ids[order]], f"{name}_names")
+        return self._plotter.add_mesh(
+            lines, scalars=COLOR, rgb=True, name=name, preference="cell", pickable=False,
+            **{"line_width": line_width, "lighting": False, **options},
+        )  # fmt: skip
+
+    def show_labelled(self, mesh: Any, *, up: ArrayLike = (0, 0, 1)) -> None:
+        """Look from obliquely above, from where the most labelled points of a segmented dataset are in sight.
+
+        up: (3,) direction that is up in the picture.
+        """
+        mesh = _drawable(mesh)
+        axis = np.asarray(up, np.float64) / np.linalg.norm(up)
+        points = np.asarray(mesh.points, np.float64)
+        self.look(choose_viewpoint(points, np.asarray(mesh.point_data[LABEL]) >= 0, axis))
+
+    def look(self, view: Viewpoint) -> None:
+        """Put the camera where a `Viewpoint` says."""
+        self._plotter.camera_position = [view.eye.tolist(), view.target.tolist(), view.up.tolist()]
+        self._plotter.camera.view_angle = float(np.rad2deg(2 * np.arctan(1 / FOCAL)))
+        self._plotter.reset_camera_clipping_range()
+
+    def enable_click_query(
+        self,
+        scene: SceneLike | None = None,
+        labels: Labels = None,
+        *,
+        text_features: TextFeatures = None,
+        words: int = 5,
+        callback: Callable[[Pick], None] | None = None,
+        left_clicking: bool = True,
+        **options: Any,
+    ) -> None:
+        """A click shows which instance it hit: its points and box highlighted, its best words and scores in a corner.
+
+        scene: what to ask; left out, that of the dataset drawn last, else as for ``og_pointcloud.segment``.
+        labels, text_features: the words to rank; left out, the scene's own. words: how many are shown.
+        callback: called with each ``Pick``, also one that hit no instance. options: of ``enable_point_picking``.
+        """
+        self._scene = scene_of(None, scene if scene is not None else self._scene)
+        self._words = {"labels": labels, "text_features": text_features, "count": words}
+        self._on_click = callback
+        self._plotter.enable_point_picking(
+            self.query,
+            **{"left_clicking": left_clicking, "show_point": False, "tolerance": 0.01, "font_size": TEXT_SIZE,
+               "show_message": "click a point, or P over it: what is it?", **options},
+        )  # fmt: skip
+
+    def query(self, point: ArrayLike) -> Pick:
+        """Answer a click at a place, (3,) world coordinates, as ``enable_click_query`` does for the mouse."""
+        if self._scene is None:
+            raise OgPointcloudError("no scene to ask yet: call plotter.og.enable_click_query(scene) first")
+        hit = og.pick(self._scene, np.asarray(point, np.float64))
+        if hit.found:
+            self._highlight(hit)
+        else:
+            self._plotter.remove_actor(["og_highlight", "og_highlight_box"])
+        self._plotter.add_text(self._answer(hit), position="lower_left", font_size=TEXT_SIZE, name="og_answer")
+        if self._on_click is not None:
+            self._on_click(hit)
+        return hit
+
+    def _answer(self, hit: Pick) -> str:
+        if not hit.found:
+            return str(hit)
+        cloud, options = hit.cloud, self._words or {"labels": None, "text_features": None, "count": 5}
+        has_words = options["labels"] is not None or options["text_features"] is not None or cloud.vocabulary
+        if not has_words:
+            return f"{hit}\n(the scene has no words of its own: pass labels)"
+        ranked = hit.words(options["labels"], text_features=options["text_features"])[: options["count"]]
+        lines = [f"{score:5.2f}  {word}" for word, score in ranked] or ["no mask gave it a feature: unknown"]
+        return "\n".join([str(hit), *lines])
+
+    def _highlight(self, hit: Pick) -> None:
+        assert self._scene is not None
+        row = self._scene.instances[hit.instance]
+        self._plotter.add_points(
+            row.xyz, color=HIGHLIGHT, point_size=self._point_size + 3, lighting=False, name="og_highlight",
+            pickable=False, reset_camera=False,
+        )  # fmt: skip
+        self._plotter.add_mesh(
+            box_lines([row]), color=HIGHLIGHT, line_width=3, lighting=False, name="og_highlight_box", pickable=False,
+            reset_camera=False,
+        )  # fmt: skip
+
+    def _add_legend(self, labels: NDArray[np.integer], words: Sequence[str], colored: bool) -> None:
+        counts = np.bincount(labels + 1, minlength=len(words) + 1)
+        order = [int(label) for label in np.argsort(-counts[1:], kind="stable") if counts[1 + label]]
+        entries = [(f"{words[label]}  {counts[1 + label]:,}", _colors(np.array([label]))[0]) for label in order]
+        if len(entries) > LEGEND_ENTRIES:
+            others = sum(counts[1 + label] for label in order[LEGEND_ENTRIES:])
+            entries = entries[:LEGEND_ENTRIES]
+            entries.append((f"{len(order) - LEGEND_ENTRIES} more  {others:,}", np.array((255, 255, 255))))
+        if counts[0]:
+            entries.append((f"unknown  {counts[0]:,}", np.array(UNKNOWN_COLOR)))
+        text = self._plotter.theme.font.color
+        longest = max(len(entry) for entry, _ in entries)
+        size = (min(0.02 + 0.007 * longest, 0.4), min(0.026 * len(entries), 0.9))
+        legend: Any = self._plotter.add_legend(
+            [[entry, text] for entry, _ in entries], face="none", loc=None, font_family="arial",
+            bcolor=self._plotter.background_color, background_opacity=0.8,
+        )  # fmt: skip
+        legend.SetPosition(1 - size[0] - LEGEND_MARGIN, 1 - size[1] - LEGEND_MARGIN)  # `loc` leaves wide legends inside
+        legend.SetPosition2(*size)
+        # Words in the text's colour beside a swatch: VTK by itself gives both the colour of the swatch.
+        for index, (_, color) in enumerate(entries if colored else []):
+            legend.SetEntryIcon(index, _swatch(color))
+
+    def _add_names(self, mesh: Any, labels: NDArray[np.integer], name: str) -> None:
+        ids, words = np.asarray(mesh.point_data[INSTANCE]), best_words(mesh)
+        labelled = (labels >= 0) & (ids >= 0)
+        order = np.argsort(ids[labelled], kind="stable")
+        points, sorted_ids = np.asarray(mesh.points)[labelled][order], ids[labelled][order]
+        present, first = np.unique(sorted_ids, return_index=True)
+        parts = np.split(points, first[1:]) if len(present) else []
+        largest = sorted(range(len(parts)), key=lambda part: -len(parts[part]))
+        self._add_texts(
+            np.array([_middle_point(parts[part]) for part in largest]).reshape(-1, 3),
+            [words[int(present[part])] for part in largest],
+            f"{name}_names",
+        )
+
+    def _add_texts(self, places: NDArray[np.floating], texts: Sequence[str], name: str) -> None:
+        if len(texts):
+            self._plotter.add_point_labels(
+                places, list(texts), font_size=13, bold=False, font_family="arial", text_color="black",
+                shape_color="white", shape_opacity=0.8, margin=3, show_points=False, always_visible=True, name=name,
+                reset_camera=False,
+            )  # fmt: skip
+
+
+def _colors(ids: NDArray[np.integer]) -> NDArray[np.uint8]:
+    return np.where((ids >= 0)[:, None], label_colors(ids), np.array(UNKNOWN_COLOR)).astype(np.uint8)
+
+
+def _shaded(colors: NDArray[np.uint8], mesh: pv.DataSet) -> NDArray[np.uint8]:
+    rgb = mesh.point_data.get(RGB)
+    if rgb is None:
+        return colors
+    luminance = np.asarray(rgb)[:, :3] @ np.array([0.3, 0.59, 0.11])
+    bright = max(float(np.percentile(luminance, 95)), 1.0)
+    light = 1 - SHADE + SHADE * np.clip(luminance / bright, 0, 1)
+    return (colors * light[:, None]).astype(np.uint8)
+
+
+def _palette(mesh: Any, by: str) -> dict[int, list[int]]:
+    ids = np.unique(np.asarray(mesh.point_data[LABEL if by == "label" else INSTANCE]))
+    return dict(zip(ids.tolist(), _colors(ids).tolist(), strict=True))
+
+
+def _drawable(mesh: Any) -> Any:
+    """Without the points that have no place, as VTK would draw nothing at all. OgPointcloudError where none is left."""
+    finite = np.logical_and.reduce(np.isfinite(np.asarray(mesh.points)), axis=1)
+    if not finite.any():
+        raise OgPointcloudError(
+            f"a {type(mesh).__name__} of {mesh.n_points} points, 0 of them finite, cannot be drawn; expected points: "
+            "was its file read, does the selection hold any?"
+        )
+    if finite.all():
+        return mesh
+    warnings.warn(
+        f"{(~finite).sum():,} of {len(finite):,} points hold NaN or infinity: they are not drawn", stacklevel=3
+    )
+    return mesh.extract_points(finite, adjacent_cells=False)
+
+
+def _is_cloud(mesh: Any) -> bool:
+    """Whether it has no cells but vertices."""
+    if isinstance(mesh, pv.PolyData):
+        return mesh.n_verts == mesh.n_cells
+    kinds = getattr(mesh, "celltypes", None)
+    clouds = (pv.CellType.VERTEX, pv.CellType.POLY_VERTEX)
+    return mesh.n_cells == 0 or (kinds is not None and bool(np.isin(kinds, clouds).all()))
+
+
+def _middle_point(points: NDArray[np.floating]) -> NDArray[np.floating]:
+    """The point nearest to the median of all: on the object, where the mean of a ring would lie beside it."""
+    return points[((points - np.median(points, axis=0)) ** 2).sum(axis=1).argmin()]
+
+
+def _swatch(color: NDArray[np.integer]) -> pv.ImageData:
+    image = pv.ImageData(dimensions=(8, 8, 1))
+    image.point_data["color"] = np.tile(color.astype(np.uint8), (64, 1))
+    return image
