@@ -29,8 +29,8 @@ BACKGROUND, NEW, MOVED, NO_RETURN = -1, -2, -3, -4
 """What a ray hits, where it is no object that stands as it was mapped (a row of CLASS_NAMES)."""
 SENSOR_HEIGHT_M, SPEED_M_S = 0.9, 0.4
 FLOOR_STEP_M = 0.06
-ARRIVAL_CLEARANCE_M = 0.4
-"""From the middle of what was brought in to the path and to all furniture, where there is so much room."""
+CLEAR_OF_FURNITURE_M, CLEAR_OF_PATH_M, APART_M = 0.35, 0.6, 0.8
+"""What the middle of a thing that was brought in keeps free around it, where there is so much room."""
 
 
 @dataclass(frozen=True)
@@ -166,8 +166,9 @@ def _free_floor(room: Room, surfaces: Any, path: Points, taken: Points) -> Point
     x, y = (np.arange(-side / 2, side / 2, FLOOR_STEP_M) for side in room.size[:2])
     floor = np.stack(np.meshgrid(x, y), axis=2).reshape(-1, 2)
     from_path, from_taken = (np.linalg.norm(floor[:, None] - places, axis=2).min(axis=1) for places in (path, taken))
-    free = np.minimum(_clearance(surfaces, floor), np.minimum(from_path, from_taken))
-    return floor[np.where(free >= min(ARRIVAL_CLEARANCE_M, free.max()), from_path, np.inf).argmin()]
+    asked = (_clearance(surfaces, floor) / CLEAR_OF_FURNITURE_M, from_path / CLEAR_OF_PATH_M, from_taken / APART_M)
+    free = np.min(np.array(asked), axis=0)
+    return floor[np.where(free >= min(1.0, free.max()), from_path, np.inf).argmin()]
 
 
 def _ring(room: Room, steps: int = 90) -> Points:
@@ -189,8 +190,8 @@ def _on_ring(path: Points, place: float) -> Points:
 
 
 def _clearance(surfaces: Any, places: Points) -> Points:
-    """(n,) metres from each place (n, 2) to the nearest surface between knee and sensor."""
-    heights = (0.15, 0.5, SENSOR_HEIGHT_M)
+    """(n,) metres from each place (n, 2) to the nearest surface between knee and sensor; the floor is one too."""
+    heights = (0.4, 0.65, SENSOR_HEIGHT_M)
     distances: list[NDArray[np.float32]] = [
         surfaces.compute_distance(_tensor(np.column_stack([places, np.full(len(places), z)]))).numpy() for z in heights
     ]

@@ -21,6 +21,8 @@ UP = (0.0, 0.0, 1.0)
 MINIMUM_POINTS = 10
 """Points of an instance in a cloud from which it is a detection, and no speck."""
 
+WARM_UP_POINTS = 10_000
+
 
 class LabelledMessages(NamedTuple):
     """result: in the scene's world. points: sensor_msgs/PointCloud2. detections: vision_msgs/Detection3DArray."""
@@ -52,7 +54,8 @@ class CloudLabeller:
         """Work out all boxes and open the graph now, not while the first clouds wait."""
         for instance in self._instances:
             _ = instance.oriented_box
-        self.segmenter.scene.look_up(np.zeros((1, 3)))
+        scene = self.segmenter.scene
+        self.segmenter(scene.xyz[:WARM_UP_POINTS] + scene.cloud.reach / 2)  # beside the cloud: the exact search too
 
     def __call__(self, message: Any, pose: NDArray[np.float64]) -> LabelledMessages:
         """message: a cloud in the sensor's frame. pose: (4, 4), takes it to the scene's frame.
