@@ -12,7 +12,7 @@ import os
 import re
 import shutil
 import zlib
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -49,7 +49,10 @@ except ImportError as error:
 if TYPE_CHECKING:
     from og_pointcloud.cloud import LabelledCloud
 
-__all__ = ["PARITY_TEXTS", "export_text_encoder", "torch_vectors"]
+__all__ = [
+    "PARITY_TEXTS", "activated", "export_text_encoder", "files_with_manifest", "own_name", "own_version",
+    "torch_vectors", "write_folder",
+]  # fmt: skip
 
 TOLERANCE = 1e-5
 """Largest difference of a unit vector's entry from torch that is let through; float32 reaches about 1e-6."""
@@ -97,12 +100,12 @@ def export_text_encoder(
     source = Path(source)
     templates = check_templates(templates)
     tower = read_text_tower(source, activation)
-    space = feature_space or _own_name(source)
+    space = feature_space or own_name(source)
     description, pad_id = find_tokenizer(source, Path(tokenizer) if tokenizer else None, tower)
     about = {
         "format": FORMAT,
         "schema_version": SCHEMA_VERSION,
-        "written_by": f"og-pointcloud {_own_version()}",
+        "written_by": f"og-pointcloud {own_version()}",
         "feature_space": space,
         "width": tower.width,
         "context_length": len(tower.position_embedding),
@@ -116,18 +119,18 @@ def export_text_encoder(
     }  # fmt: skip
     held = {GRAPH: build_text_graph(tower), TOKENIZER: json.dumps(description, ensure_ascii=False).encode()}
     about["precision"] = "fp32"
-    encoder = TextEncoder(_files(about, held), str(source))
+    encoder = TextEncoder(files_with_manifest(about, held), str(source))
     parity = _parity(tower, encoder)
     if int8:
         cloud = read_bundle(scene).cloud if scene is not None else None
         held[GRAPH], about["precision"] = build_text_graph(tower, int8=True), "int8"
-        small = TextEncoder(_files(about, held), str(source))
+        small = TextEncoder(files_with_manifest(about, held), str(source))
         parity["int8"] = _accept_int8(small, encoder, cloud)
         encoder = small
     held[WORD_BANK] = npy_bytes(encoder(everyday_words()).astype(np.float16))
-    files = _files({**about, "parity": parity}, held)
+    files = files_with_manifest({**about, "parity": parity}, held)
     folder = Path(output) if output is not None else cache_folder() / re.sub(r"[^\w.-]+", "--", space)
-    _write_folder(folder, files)
+    write_folder(folder, files, known=ENCODER_FILES)
     return folder, json.loads(files[MANIFEST])
 
 
@@ -139,7 +142,7 @@ def torch_vectors(tower: TextTower, tokens: NDArray[np.int64]) -> NDArray[np.flo
     for block in tower.blocks:
         x = x + _attention(x, block, tower)
         hidden = _linear(_norm(x, block.norm_2, tower), block.expand)
-        x = x + _linear(_activated(hidden, tower.activation), block.contract)
+        x = x + _linear(activated(hidden, tower.activation), block.contract)
     if tower.pooling == "last":
         place = torch.full((len(ids),), ids.shape[1] - 1)
     else:
@@ -166,7 +169,8 @@ def _norm(x: torch.Tensor, affine: Affine, tower: TextTower) -> torch.Tensor:
     return F.layer_norm(x, x.shape[-1:], gain, offset, tower.epsilon)
 
 
-def _activated(x: torch.Tensor, activation: Activation) -> torch.Tensor:
+def activated(x: torch.Tensor, activation: Activation) -> torch.Tensor:
+    """One of the three bends that CLIP and SigLIP have between a block's two matrices."""
     if activation == "quick_gelu":
         return x * torch.sigmoid(1.702 * x)
     return F.gelu(x, approximate="none" if activation == "gelu" else "tanh")
@@ -234,8 +238,8 @@ def _choices_changed(before: NDArray[np.float64], after: NDArray[np.float64]) ->
     return int((chosen < before.max(axis=1) - EQUAL).sum())
 
 
-def _files(manifest: dict[str, Any], held: dict[str, bytes]) -> dict[str, bytes]:
-    """The files of an encoder, the manifest among them."""
+def files_with_manifest(manifest: dict[str, Any], held: dict[str, bytes]) -> dict[str, bytes]:
+    """The files of an encoder, the manifest among them, which says their sizes and checksums."""
     described = {
         name: {"bytes": len(data), "crc32": zlib.crc32(data), "sha256": hashlib.sha256(data).hexdigest()}
         for name, data in held.items()
@@ -244,7 +248,8 @@ def _files(manifest: dict[str, Any], held: dict[str, bytes]) -> dict[str, bytes]
     return {MANIFEST: text.encode(), **held}
 
 
-def _own_name(source: Path) -> str:
+def own_name(source: Path) -> str:
+    """OWNER/MODEL as a model's configuration has it; OgPointcloudError where it says none."""
     config = source / "config.json"
     name = read_json(config).get("_name_or_path") if config.is_file() else None
     if not isinstance(name, str) or not MODEL_NAME.fullmatch(name):
@@ -255,9 +260,9 @@ def _own_name(source: Path) -> str:
     return name
 
 
-def _write_folder(folder: Path, files: dict[str, bytes]) -> None:
-    """Put a folder in place whole; one that is there already must be an encoder, which it replaces."""
-    if folder.exists() and (not folder.is_dir() or {path.name for path in folder.iterdir()} - set(ENCODER_FILES)):
+def write_folder(folder: Path, files: Mapping[str, bytes], known: Collection[str]) -> None:
+    """Put a folder in place whole; one that is there already must hold known names only, which it replaces."""
+    if folder.exists() and (not folder.is_dir() or {path.name for path in folder.iterdir()} - set(known)):
         raise OgPointcloudError(f"{folder} holds other things than an encoder; expected a new or an encoder's folder")
     folder.parent.mkdir(parents=True, exist_ok=True)
     new, old = (folder.with_name(f".{folder.name}.{os.getpid()}.{kind}") for kind in ("new", "old"))
@@ -276,7 +281,8 @@ def _write_folder(folder: Path, files: dict[str, bytes]) -> None:
     shutil.rmtree(old, ignore_errors=True)
 
 
-def _own_version() -> str:
+def own_version() -> str:
+    """Of this library, for manifests."""
     try:
         return version("og-pointcloud")
     except PackageNotFoundError:

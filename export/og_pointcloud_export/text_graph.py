@@ -25,7 +25,7 @@ except ImportError as error:
 if TYPE_CHECKING:
     from og_pointcloud_export.text_weights import Affine, Block, TextTower
 
-__all__ = ["build_text_graph"]
+__all__ = ["IR_VERSION", "OPSET", "Graph", "add_activation", "build_text_graph"]
 
 OPSET, IR_VERSION = 18, 8
 INT8_ZERO = 128
@@ -37,7 +37,7 @@ def build_text_graph(tower: TextTower, *, int8: bool = False) -> bytes:
     int8: matrices of the blocks in 8 bits, a scale a column, activations quantised as they come (a scale a run);
     embeddings in 8 bits, a scale a row. Norms, attention and projection stay float32.
     """
-    graph = _Graph(int8)
+    graph = Graph(int8)
     x = _embed(graph, tower)
     for number, block in enumerate(tower.blocks):
         x = _block(graph, f"block{number}", x, block, tower)
@@ -52,7 +52,7 @@ def build_text_graph(tower: TextTower, *, int8: bool = False) -> bytes:
     return graph.serialized(tower.width)
 
 
-class _Graph:
+class Graph:
     """Nodes and constants as they are added; a value is known by its name."""
 
     def __init__(self, int8: bool) -> None:
@@ -61,6 +61,7 @@ class _Graph:
         self.constants: dict[str, NDArray[Any]] = {}
 
     def constant(self, name: str, value: Any) -> str:
+        """Keep a value under a name, which is given back."""
         self.constants[name] = np.ascontiguousarray(value) if np.ndim(value) else np.asarray(value)
         return name
 
@@ -70,6 +71,7 @@ class _Graph:
         return output.split()[0]
 
     def linear(self, name: str, x: str, affine: Affine, *, exact: bool = False) -> str:
+        """x times a matrix, plus the bias if there is one; in 8 bits where the graph is, unless exact."""
         if self.int8 and not exact:
             product = self._int8_product(name, x, affine.weight)
         else:
@@ -91,10 +93,12 @@ class _Graph:
         return self.add("Mul", f"{name}.sum_float {name}.step", f"{name}.product")
 
     def norm(self, name: str, x: str, affine: Affine, epsilon: float) -> str:
+        """Layer norm over the last axis."""
         constants = f"{self.constant(f'{name}.gain', affine.weight)} {self.constant(f'{name}.offset', affine.bias)}"
         return self.add("LayerNormalization", f"{x} {constants}", name, axis=-1, epsilon=epsilon)
 
     def serialized(self, width: int) -> bytes:
+        """The bytes of text_encoder.onnx. width: of a vector."""
         graph = helper.make_graph(
             self.nodes,
             "text_encoder",
@@ -108,7 +112,7 @@ class _Graph:
         return model.SerializeToString()
 
 
-def _embed(graph: _Graph, tower: TextTower) -> str:
+def _embed(graph: Graph, tower: TextTower) -> str:
     table = tower.token_embedding
     if graph.int8:
         scale = np.maximum(np.abs(table).max(axis=1, keepdims=True), np.finfo(np.float32).tiny) / 127
@@ -132,16 +136,16 @@ def _embed(graph: _Graph, tower: TextTower) -> str:
     return graph.add("Add", "embedded positions_used", "x")
 
 
-def _block(graph: _Graph, name: str, x: str, block: Block, tower: TextTower) -> str:
+def _block(graph: Graph, name: str, x: str, block: Block, tower: TextTower) -> str:
     normed = graph.norm(f"{name}.norm_1", x, block.norm_1, tower.epsilon)
     attended = _attend(graph, f"{name}.attention", normed, block, tower)
     x = graph.add("Add", f"{x} {attended}", f"{name}.attended")
     hidden = graph.linear(f"{name}.expand", graph.norm(f"{name}.norm_2", x, block.norm_2, tower.epsilon), block.expand)
-    active = _activate(graph, f"{name}.active", hidden, tower.activation)
+    active = add_activation(graph, f"{name}.active", hidden, tower.activation)
     return graph.add("Add", f"{x} {graph.linear(f'{name}.contract', active, block.contract)}", f"{name}.x")
 
 
-def _attend(graph: _Graph, name: str, x: str, block: Block, tower: TextTower) -> str:
+def _attend(graph: Graph, name: str, x: str, block: Block, tower: TextTower) -> str:
     width = tower.token_embedding.shape[1]
     graph.constant("by_head", np.array([0, 0, tower.heads, width // tower.heads]))
     graph.constant("together", np.array([0, 0, width]))
@@ -163,7 +167,8 @@ def _attend(graph: _Graph, name: str, x: str, block: Block, tower: TextTower) ->
     return graph.linear(f"{name}.out", f"{name}.mixed_flat", block.attend_out)
 
 
-def _activate(graph: _Graph, name: str, x: str, activation: str) -> str:
+def add_activation(graph: Graph, name: str, x: str, activation: str) -> str:
+    """One of the three bends that CLIP and SigLIP have between a block's two matrices."""
     if activation == "quick_gelu":  # x sigmoid(1.702 x)
         graph.add("Mul", f"{x} {graph.constant('quick', np.float32(1.702))}", f"{name}.steep")
         graph.add("Sigmoid", f"{name}.steep", f"{name}.share")
@@ -185,7 +190,7 @@ def _activate(graph: _Graph, name: str, x: str, activation: str) -> str:
     return graph.add("Mul", f"{name}.doubled half", name)
 
 
-def _pool(graph: _Graph, x: str, tower: TextTower) -> None:
+def _pool(graph: Graph, x: str, tower: TextTower) -> None:
     """The text's token, normed and projected alone: norms act a token at a time."""
     if tower.pooling == "last":
         pooled = graph.add("Gather", f"{x} {graph.constant('last', np.int64(-1))}", "pooled", axis=1)

@@ -1,7 +1,7 @@
 """A CLIP or SigLIP text tower, read from the files that people have: transformers folders, OpenCLIP's, OpenAI's.
 
 Weights come from ``.safetensors``, or from ``.pt`` / ``.bin`` files that hold weights only: nothing is unpickled that
-could run. Vision towers are left where they lie.
+could run. Vision towers are left where they lie: see image_weights.
 """
 
 from __future__ import annotations
@@ -23,7 +23,10 @@ try:
 except ImportError as error:
     raise MissingExtraError("torch", "export-text") from error
 
-__all__ = ["Activation", "Affine", "Block", "TextTower", "read_text_tower"]
+__all__ = [
+    "Activation", "Affine", "Block", "TextTower", "Weights", "find_weights", "named_activation", "open_clip_activation",
+    "open_clip_block", "own_settings", "read_text_tower", "transformers_block", "whole_number",
+]  # fmt: skip
 
 Activation = Literal["quick_gelu", "gelu", "gelu_pytorch_tanh"]
 Pooling = Literal["argmax", "eos", "last"]
@@ -98,8 +101,8 @@ def read_text_tower(source: Path, activation: Activation | None = None) -> TextT
     activation: of a file that does not say; OpenCLIP's own models use "gelu", those after OpenAI's "quick_gelu".
     OgPointcloudError where the source is none of these, or holds what is not understood.
     """
-    files, config = _find(source)
-    weights = _Weights.read(files)
+    files, config = find_weights(source)
+    weights = Weights.read(files)
     try:
         if "text_model.embeddings.token_embedding.weight" in weights.names:
             tower = _from_transformers(weights, config)
@@ -116,7 +119,7 @@ def read_text_tower(source: Path, activation: Activation | None = None) -> TextT
     return tower
 
 
-def _find(source: Path) -> tuple[list[Path], dict[str, Any]]:
+def find_weights(source: Path) -> tuple[list[Path], dict[str, Any]]:
     """The files of weights, and the configuration beside them ({} if there is none)."""
     if source.is_file():
         beside = source.with_name(OPEN_CLIP_CONFIG)
@@ -138,7 +141,7 @@ def _find(source: Path) -> tuple[list[Path], dict[str, Any]]:
 
 
 @dataclass(frozen=True)
-class _Weights:
+class Weights:
     """Tensors by name, fetched when asked for."""
 
     where: str
@@ -146,7 +149,8 @@ class _Weights:
     fetch: Callable[[str], torch.Tensor]
 
     @classmethod
-    def read(cls, files: list[Path]) -> _Weights:
+    def read(cls, files: list[Path]) -> Weights:
+        """Open .safetensors, or load one .pt or .bin that holds weights only."""
         if all(path.suffix == ".safetensors" for path in files):
             return cls(str(files[0]), *_open_safetensors(files))
         if len(files) == 1 and files[0].suffix in (".pt", ".pth", ".bin"):
@@ -157,7 +161,7 @@ class _Weights:
     def array(self, name: str, *shape: int | None) -> Array:
         """The tensor as float32; OgPointcloudError unless it is there, finite and of this shape (None: any length)."""
         if name not in self.names:
-            raise OgPointcloudError(f"{self.where} lacks '{name}'; expected the weights of a CLIP or SigLIP text tower")
+            raise OgPointcloudError(f"{self.where} lacks '{name}'; expected the weights of a CLIP or SigLIP tower")
         tensor = self.fetch(name)
         fits = tensor.ndim == len(shape) and all(
             want in (None, have) for want, have in zip(shape, tensor.shape, strict=True)
@@ -174,9 +178,11 @@ class _Weights:
         return Affine(np.ascontiguousarray(weight), self.array(f"{name}.bias", weight.shape[1]) if bias else None)
 
     def norm(self, name: str, width: int) -> Affine:
+        """A torch LayerNorm."""
         return Affine(self.array(f"{name}.weight", width), self.array(f"{name}.bias", width))
 
     def count_layers(self, prefix: str) -> int:
+        """How many numbers stand behind a prefix."""
         numbers = {name.removeprefix(prefix).split(".")[0] for name in self.names if name.startswith(prefix)}
         return len(numbers)
 
@@ -214,18 +220,13 @@ def _load_weights_only(path: Path) -> dict[str, torch.Tensor]:
     return {name.removeprefix("module."): value for name, value in tensors.items()}
 
 
-def _from_transformers(weights: _Weights, config: dict[str, Any]) -> TextTower:
+def _from_transformers(weights: Weights, config: dict[str, Any]) -> TextTower:
     family = str(config.get("model_type")).removesuffix("_text_model")
     if family not in ("clip", "siglip", "siglip2"):
         raise OgPointcloudError(
             f"{weights.where}: model_type is {config.get('model_type')!r:.40}; expected clip, siglip or siglip2"
         )
-    # CLIP's early configurations hold the text tower's twice; their own class believes the second.
-    text = (
-        config
-        if family != config["model_type"]
-        else {**config["text_config"], **(config.get("text_config_dict") or {})}
-    )
+    text = own_settings(config, family, "text")
     is_clip = family == "clip"
     tokens = weights.array("text_model.embeddings.token_embedding.weight", None, None)
     width = tokens.shape[1]
@@ -240,22 +241,31 @@ def _from_transformers(weights: _Weights, config: dict[str, Any]) -> TextTower:
         token_embedding=tokens,
         position_embedding=weights.array("text_model.embeddings.position_embedding.weight", None, width),
         blocks=tuple(
-            _transformers_block(weights, f"text_model.encoder.layers.{layer}", width) for layer in range(layers)
+            transformers_block(weights, f"text_model.encoder.layers.{layer}", width) for layer in range(layers)
         ),
         final_norm=weights.norm("text_model.final_layer_norm", width),
         projection=weights.affine("text_projection", width, None, bias=False)
         if is_clip
         else weights.affine("text_model.head", width, None),
-        heads=_whole(weights, "num_attention_heads", text.get("num_attention_heads", 8 if is_clip else 12)),
-        activation=_activation(weights, text.get("hidden_act", "quick_gelu" if is_clip else "gelu_pytorch_tanh")),
+        heads=whole_number(weights, "num_attention_heads", text.get("num_attention_heads", 8 if is_clip else 12)),
+        activation=named_activation(weights, text.get("hidden_act", "quick_gelu" if is_clip else "gelu_pytorch_tanh")),
         epsilon=float(text.get("layer_norm_eps", 1e-5 if is_clip else 1e-6)),
         causal=is_clip,
         pooling=("argmax" if eos == EARLY_EOS else "eos") if is_clip else "last",
-        eos_id=_whole(weights, "eos_token_id", eos) if is_clip else 0,
+        eos_id=whole_number(weights, "eos_token_id", eos) if is_clip else 0,
     )
 
 
-def _transformers_block(weights: _Weights, name: str, width: int) -> Block:
+def own_settings(config: dict[str, Any], family: str, tower: str) -> dict[str, Any]:
+    """One tower's part of a transformers configuration, "text" or "vision": all of it where it is the tower's alone."""
+    if family != config["model_type"]:
+        return config
+    # CLIP's early configurations hold a tower's twice; their own class believes the second.
+    return {**config[f"{tower}_config"], **(config.get(f"{tower}_config_dict") or {})}
+
+
+def transformers_block(weights: Weights, name: str, width: int) -> Block:
+    """A block of a transformers CLIP or SigLIP tower, text or vision."""
     parts = [weights.affine(f"{name}.self_attn.{part}_proj", width, width) for part in "qkv"]
     expand = weights.affine(f"{name}.mlp.fc1", width, None)
     return Block(
@@ -271,7 +281,7 @@ def _transformers_block(weights: _Weights, name: str, width: int) -> Block:
     )
 
 
-def _from_open_clip(weights: _Weights, config: dict[str, Any], activation: Activation | None) -> TextTower:
+def _from_open_clip(weights: Weights, config: dict[str, Any], activation: Activation | None) -> TextTower:
     prefix = "text." if "text.token_embedding.weight" in weights.names else ""
     tokens = weights.array(f"{prefix}token_embedding.weight", None, None)
     width = tokens.shape[1]
@@ -283,7 +293,7 @@ def _from_open_clip(weights: _Weights, config: dict[str, Any], activation: Activ
         token_embedding=tokens,
         position_embedding=weights.array(f"{prefix}positional_embedding", None, width),
         blocks=tuple(
-            _open_clip_block(weights, f"{prefix}transformer.resblocks.{layer}", width) for layer in range(layers)
+            open_clip_block(weights, f"{prefix}transformer.resblocks.{layer}", width) for layer in range(layers)
         ),
         final_norm=weights.norm(f"{prefix}ln_final", width),
         projection=weights.affine(
@@ -291,8 +301,8 @@ def _from_open_clip(weights: _Weights, config: dict[str, Any], activation: Activ
         )
         if is_linear
         else Affine(weights.array(f"{prefix}text_projection", width, None), None),
-        heads=_whole(weights, "heads", text.get("heads", max(1, width // HEAD_WIDTH))),
-        activation=_open_clip_activation(weights, model, text, activation),
+        heads=whole_number(weights, "heads", text.get("heads", max(1, width // HEAD_WIDTH))),
+        activation=open_clip_activation(weights, model, text, activation),
         epsilon=float((text.get("norm_kwargs") or {}).get("eps", 1e-5)),
         causal=not text.get("no_causal_mask", False),
         pooling=text.get("pool_type", "argmax"),
@@ -300,7 +310,8 @@ def _from_open_clip(weights: _Weights, config: dict[str, Any], activation: Activ
     )
 
 
-def _open_clip_block(weights: _Weights, name: str, width: int) -> Block:
+def open_clip_block(weights: Weights, name: str, width: int) -> Block:
+    """A block of a tower with OpenAI's or OpenCLIP's names, text or vision."""
     expand = weights.affine(f"{name}.mlp.c_fc", width, None)
     together = weights.array(f"{name}.attn.in_proj_weight", 3 * width, width).T
     return Block(
@@ -313,7 +324,7 @@ def _open_clip_block(weights: _Weights, name: str, width: int) -> Block:
     )
 
 
-def _known_settings(weights: _Weights, text: dict[str, Any]) -> dict[str, Any]:
+def _known_settings(weights: Weights, text: dict[str, Any]) -> dict[str, Any]:
     """OpenCLIP's text_cfg, refused where it asks for what the tower here does not do."""
     free = {"context_length", "vocab_size", "width", "layers", "mlp_ratio", "hf_tokenizer_name", "tokenizer_kwargs"}
     used = {"heads", "no_causal_mask", "pool_type", "proj_bias", "norm_kwargs", "act_kwargs", "final_ln_after_pool"}
@@ -327,9 +338,10 @@ def _known_settings(weights: _Weights, text: dict[str, Any]) -> dict[str, Any]:
     return text
 
 
-def _open_clip_activation(
-    weights: _Weights, model: dict[str, Any], text: dict[str, Any], chosen: Activation | None
+def open_clip_activation(
+    weights: Weights, model: dict[str, Any], text: dict[str, Any], chosen: Activation | None
 ) -> Activation:
+    """What an OpenCLIP configuration, OpenAI's marks or the caller say; OgPointcloudError where none or two do."""
     if model:
         tanh = (text.get("act_kwargs") or {}).get("approximate") == "tanh"
         said = "quick_gelu" if model.get("quick_gelu") else "gelu_pytorch_tanh" if tanh else "gelu"
@@ -343,10 +355,11 @@ def _open_clip_activation(
         )
     if said and chosen and said != chosen:
         raise OgPointcloudError(f"{weights.where} says its activation is {said}; expected no --activation, or this one")
-    return _activation(weights, said or chosen)
+    return named_activation(weights, said or chosen)
 
 
-def _activation(weights: _Weights, name: Any) -> Activation:
+def named_activation(weights: Weights, name: Any) -> Activation:
+    """One of the three that are understood, else OgPointcloudError."""
     if name not in get_args(Activation):
         raise OgPointcloudError(
             f"{weights.where}: its activation is {name!r:.40}; expected {' or '.join(get_args(Activation))}"
@@ -354,7 +367,8 @@ def _activation(weights: _Weights, name: Any) -> Activation:
     return name
 
 
-def _whole(weights: _Weights, name: str, value: Any) -> int:
+def whole_number(weights: Weights, name: str, value: Any) -> int:
+    """A setting that counts something, else OgPointcloudError."""
     if not isinstance(value, int) or isinstance(value, bool) or value < 1:
         raise OgPointcloudError(f"{weights.where}: its {name} is {value!r:.40}; expected a whole number")
     return value

@@ -38,7 +38,8 @@ if TYPE_CHECKING:
 
 __all__ = [
     "ENCODER_FILES", "FORMAT", "MODELS_VARIABLE", "OPERATORS", "SCHEMA_VERSION", "TextEncoder", "cache_folder",
-    "check_templates", "encoder_files", "encoder_for", "export_command", "find_encoder", "read_text_encoder",
+    "check_templates", "encoder_files", "encoder_for", "export_command", "find_encoder", "model_folders",
+    "read_text_encoder",
 ]  # fmt: skip
 
 FORMAT, SCHEMA_VERSION = "og-text-encoder", 1
@@ -54,6 +55,8 @@ OPERATORS = frozenset({
     "Tanh", "Transpose", "Unsqueeze",
 })  # fmt: skip
 """All that an encoder's graph is made of: none repeats, calls other graphs, or makes an array larger by its values."""
+DEMO_ENCODER = Path(__file__).parents[1] / "masking" / "demo_encoder"
+"""The encoder that comes with the library: it knows the demo's room and nothing else of the world."""
 TEXTS_PER_RUN = 64
 VECTORS_REMEMBERED = 1 << 14
 REMAKE = "make the encoder again with og-pointcloud export-text-encoder"
@@ -199,14 +202,14 @@ def find_encoder(feature_space: str, bundle: str | os.PathLike[str] | None = Non
     """The encoder of a feature space: the one that a .ogpc carries, else the first that is found among the models.
 
     bundle: the scene's file, if it has one. Looked through are the folders of OG_POINTCLOUD_MODELS, then the user's
-    cache folder; each may be an encoder, or hold encoders. None where there is none; OgPointcloudError where there is
-    one that cannot be used.
+    cache folder, then the library's own; each may be an encoder, or hold encoders. None where there is none;
+    OgPointcloudError where there is one that cannot be used.
     """
     if bundle is not None and Path(bundle).is_file():  # a scene outlives its file
         carried = _carried(Path(bundle).resolve(), Path(bundle).stat().st_mtime_ns)
         if carried is not None:
             return carried
-    for folder in _model_folders():
+    for folder in model_folders():
         candidates = [folder, *sorted(path for path in folder.iterdir() if path.is_dir())] if folder.is_dir() else []
         for candidate in candidates:
             if _feature_space_of(candidate) == feature_space:
@@ -241,9 +244,10 @@ def check_templates(templates: Iterable[str]) -> tuple[str, ...]:
     return templates
 
 
-def _model_folders() -> list[Path]:
+def model_folders() -> list[Path]:
+    """Where encoders are looked for, in this order: OG_POINTCLOUD_MODELS, the cache, the library's demo encoder."""
     named = os.environ.get(MODELS_VARIABLE, "").split(os.pathsep)
-    return [*(Path(folder).expanduser() for folder in named if folder), cache_folder()]
+    return [*(Path(folder).expanduser() for folder in named if folder), cache_folder(), DEMO_ENCODER]
 
 
 def _feature_space_of(folder: Path) -> str | None:

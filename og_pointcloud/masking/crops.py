@@ -1,0 +1,152 @@
+"""Square cut-outs of an image, one a mask, as image encoders want them.
+
+LangSplat's: the mask's tight box with black outside the mask, padded to a square. Better ones show where the thing
+stands: a larger window, and outside the mask a blend of the image with an even colour, so that the encoder sees a
+table's chairs, and still which of them is meant. Several are weighted into one vector by the encoder.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from og_pointcloud.errors import SceneError
+
+__all__ = ["CROP_STYLES", "LANGSPLAT", "WITH_CONTEXT", "Crop", "Resample", "mask_box", "mask_crops", "resized"]
+
+Resample = Literal["bilinear", "bicubic"]
+CUBIC = -0.5
+"""Keys' parameter, as Pillow has it; OpenCV's is -0.75, and OpenCV's does not smooth what it shrinks."""
+
+
+@dataclass(frozen=True)
+class Crop:
+    """One way to cut a mask out.
+
+    scale: side of the window, over the longer side of the mask's box. outside: how much of the image is left outside
+    the mask, 0 none, 1 all of it. weight: of this crop's vector in the mask's.
+    """
+
+    scale: float = 1.0
+    outside: float = 0.0
+    weight: float = 1.0
+
+    def __post_init__(self) -> None:
+        if not (1 <= self.scale <= 16 and 0 <= self.outside <= 1 and 0 < self.weight < np.inf):
+            raise SceneError(f"{self} cannot be cut; expected scale 1 to 16, outside 0 to 1 and a weight above 0")
+
+
+LANGSPLAT = (Crop(),)
+WITH_CONTEXT = (Crop(1.0, 0.0, 1.0), Crop(1.2, 0.35, 1.0), Crop(2.0, 0.6, 0.5))
+CROP_STYLES = {"langsplat": LANGSPLAT, "context": WITH_CONTEXT}
+
+
+def mask_crops(
+    image: NDArray[np.uint8],
+    masks: NDArray[np.bool_],
+    crop: Crop,
+    size: int,
+    fill: Sequence[int] = (0, 0, 0),
+    resample: Resample = "bicubic",
+) -> NDArray[np.uint8]:
+    """(M, size, size, 3) uint8 RGB.
+
+    image: (H, W, 3) uint8 RGB. masks: (M, H, W) bool; one without a pixel is an error. fill: the colour outside the
+    mask and beyond the image's edge. SceneError for arrays that do not fit together.
+    """
+    if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
+        raise SceneError(f"the image is {image.dtype} {image.shape}; expected uint8 (H, W, 3), red first")
+    if masks.shape[1:] != image.shape[:2] or masks.dtype != np.bool_:
+        raise SceneError(
+            f"masks are {masks.dtype} {masks.shape}; expected bool (masks, {image.shape[0]}, {image.shape[1]}), as "
+            "large as the image"
+        )
+    crops = np.empty((len(masks), size, size, 3), np.uint8)
+    for row, mask in enumerate(masks):
+        crops[row] = resized(_window(image, mask, crop, np.asarray(fill, np.float32)), size, size, resample)
+    return crops
+
+
+def mask_box(mask: NDArray[np.bool_]) -> tuple[int, int, int, int]:
+    """(top, left, height, width) of the smallest box with all of the mask's pixels; SceneError where it has none."""
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    if len(rows) == 0:
+        raise SceneError("a mask has no pixel; expected at least one: leave empty masks out")
+    return int(rows[0]), int(columns[0]), int(rows[-1] - rows[0]) + 1, int(columns[-1] - columns[0]) + 1
+
+
+def _window(
+    image: NDArray[np.uint8], mask: NDArray[np.bool_], crop: Crop, fill: NDArray[np.float32]
+) -> NDArray[np.uint8]:
+    """(side, side, 3) the square about the mask's box, before it is resized."""
+    top, left, height, width = mask_box(mask)
+    side = max(round(crop.scale * max(height, width)), 1)
+    top, left = top - (side - height) // 2, left - (side - width) // 2
+    rows = slice(max(top, 0), min(top + side, image.shape[0]))
+    columns = slice(max(left, 0), min(left + side, image.shape[1]))
+    seen, inside = image[rows, columns], mask[rows, columns, None]
+    blend = np.where(inside, seen, crop.outside * seen + (1 - crop.outside) * fill)
+    window = np.empty((side, side, 3), np.uint8)
+    window[:] = fill
+    place = (slice(rows.start - top, rows.stop - top), slice(columns.start - left, columns.stop - left))
+    window[place] = np.rint(blend)
+    return window
+
+
+def resized(image: NDArray[np.uint8], height: int, width: int, resample: Resample = "bicubic") -> NDArray[np.uint8]:
+    """The image (H, W, C) uint8 at another size, smoothed where it shrinks, as Pillow does.
+
+    One direction after the other, rounded to whole numbers after each, the one first that leaves less for the second:
+    what the processors of published models do, but for a last bit here and there.
+    """
+    if len(image) * width <= height * image.shape[1]:
+        return np.ascontiguousarray(_rows_resized(_columns_resized(image, width, resample), height, resample))
+    return np.ascontiguousarray(_columns_resized(_rows_resized(image, height, resample), width, resample))
+
+
+def _columns_resized(image: NDArray[np.uint8], width: int, resample: Resample) -> NDArray[np.uint8]:
+    return _rows_resized(image.transpose(1, 0, 2), width, resample).transpose(1, 0, 2)
+
+
+def _rows_resized(image: NDArray[np.uint8], height: int, resample: Resample) -> NDArray[np.uint8]:
+    rows, columns, channels = image.shape
+    if rows == height:
+        return image
+    return _resampled(image.reshape(rows, columns * channels), height, resample).reshape(height, columns, channels)
+
+
+def _resampled(lines: NDArray[np.uint8], count: int, resample: Resample) -> NDArray[np.uint8]:
+    """(count, K) from (n, K) lines."""
+    mixed = _weights(len(lines), count, resample) @ lines.astype(np.float32)
+    return np.clip(np.floor(mixed + 0.5), 0, 255).astype(np.uint8)
+
+
+@lru_cache(maxsize=64)
+def _weights(before: int, after: int, resample: Resample) -> NDArray[np.float32]:
+    """(after, before): how much of each old line is in each new one; rows add up to 1.
+
+    The kernel is stretched by the shrinking, so that every old line counts, and cut off where it is zero.
+    """
+    step = before / after
+    stretch = max(step, 1.0)
+    centre = (np.arange(after) + 0.5) * step
+    reach = (2.0 if resample == "bicubic" else 1.0) * stretch
+    first = np.maximum(np.floor(centre - reach + 0.5), 0)[:, None]
+    last = np.minimum(np.floor(centre + reach + 0.5), before)[:, None]
+    line = np.arange(before)
+    distance = np.abs(line + 0.5 - centre[:, None]) / stretch
+    weight = _cubic(distance) if resample == "bicubic" else np.maximum(1 - distance, 0)
+    weight = np.where((line >= first) & (line < last), weight, 0)
+    return (weight / weight.sum(axis=1, keepdims=True)).astype(np.float32)
+
+
+def _cubic(x: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Keys' cubic kernel at distances x >= 0."""
+    near = ((CUBIC + 2) * x - (CUBIC + 3)) * x * x + 1
+    far = (((x - 5) * x + 8) * x - 4) * CUBIC
+    return np.where(x < 1, near, np.where(x < 2, far, 0))
