@@ -23,11 +23,11 @@ from og_pointcloud.runtime import SceneLike
 from og_pointcloud.scene import Camera, Points
 from og_pointcloud.segmentation import Segmentation, label_colors
 from og_pointcloud.text.words import Labels, TextFeatures
+from og_pointcloud.viewpoint import Viewpoint, choose_viewpoint
 from og_pointcloud_open3d.host import WITH_SPLATS, open3d, require_version
 
-__all__ = ["draw_png", "highlight_png", "look_at"]
+__all__ = ["draw_png", "highlight_png", "look_at", "viewpoint"]
 
-WHITE = (1.0, 1.0, 1.0)
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 """Of RGB, ITU-R BT.709."""
 FADED = 0.35
@@ -148,12 +148,15 @@ def _faded_but(points: Points, found: NDArray[np.bool_], color: NDArray[np.float
     return np.rint(np.where(found[:, None], (1 - TINT) * rgb + TINT * color, grey)).astype(np.uint8)
 
 
-def _camera_for(xyz: NDArray[np.float64], wanted: NDArray[np.bool_]) -> Camera:
-    from og_pointcloud.cli.viewpoint import choose_viewpoint
-
+def viewpoint(xyz: NDArray[np.float64], wanted: NDArray[np.bool_]) -> Viewpoint:
+    """Where most of the wanted points are seen from. xyz: (n, 3), finite; SceneError without any."""
     if len(xyz) == 0:
         raise SceneError("the cloud has 0 points with finite coordinates; expected some to draw")
-    view = choose_viewpoint(xyz, wanted, np.array([0.0, 0.0, 1.0]))
+    return choose_viewpoint(xyz, wanted, np.array([0.0, 0.0, 1.0]))
+
+
+def _camera_for(xyz: NDArray[np.float64], wanted: NDArray[np.bool_]) -> Camera:
+    view = viewpoint(xyz, wanted)
     return look_at(view.eye, view.target, view.up)
 
 
@@ -174,7 +177,6 @@ def _render(
         "camera": np.array([camera.fx, camera.fy, camera.cx, camera.cy]),
         "size": np.array([camera.width, camera.height]),
         "world_to_camera": pose,
-        "background": np.array(WHITE),
     }
     with tempfile.TemporaryDirectory() as folder:
         job_file, picture = Path(folder) / "job.npz", Path(folder) / "picture.png"

@@ -14,14 +14,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+WHITE = [1.0, 1.0, 1.0, 1.0]
 SHIFTS_PX = ((0, 0), (5, 3), (11, 9))
-"""Splats are drawn in tiles of 16 pixels, of which software drivers lose one in some hundreds. So splats are drawn
-three times with other tiles under them; a pixel is the median of the three."""
+"""Splats are drawn in tiles of 16 pixels, of which software drivers leave one in some hundreds white. So splats are
+drawn three times with other tiles under them, and the darkest of the three pixels counts."""
 
 
 def main(job_file: str, picture_file: str) -> None:
     """job_file: arrays positions (n, 3) float32, camera (4,) fx fy cx cy, size (2,) width height, world_to_camera
-    (4, 4), background (3,) in [0, 1]; colors (n, 3) float32 and point_size for points, or scale, rot, opacity, f_dc as
+    (4, 4); colors (n, 3) float32 and point_size for points, or scale, rot, opacity, f_dc as
     Open3D has them for splats."""
     os.environ.setdefault("EGL_PLATFORM", "surfaceless")
     open3d: Any = importlib.import_module("open3d")
@@ -38,13 +39,13 @@ def main(job_file: str, picture_file: str) -> None:
         _aim(renderer, job, right, down, margin)
         image = np.asarray(renderer.render_to_image())
         frames.append(image[down : down + height, right : right + width])
-    picture = np.ascontiguousarray(np.median(frames, axis=0).astype(np.uint8))
+    picture = np.ascontiguousarray(np.min(frames, axis=0))
     if not open3d.io.write_image(picture_file, open3d.geometry.Image(picture)):
         sys.exit("the picture could not be written")
 
 
 def _fill(open3d: Any, scene: Any, job: Mapping[str, NDArray]) -> None:
-    """The geometry and the background; without post-processing, so that colours stay what they are."""
+    """The geometry on white; without post-processing, so that colours stay what they are."""
     material = open3d.visualization.rendering.MaterialRecord()
     cloud = open3d.t.geometry.PointCloud()
     for name in {"positions", "colors", "scale", "rot", "opacity", "f_dc"} & set(job):
@@ -55,7 +56,7 @@ def _fill(open3d: Any, scene: Any, job: Mapping[str, NDArray]) -> None:
     else:
         material.shader = "defaultUnlit"
         material.point_size = float(job["point_size"])
-    scene.set_background([*map(float, job["background"]), 1.0])
+    scene.set_background(WHITE)
     scene.add_geometry("cloud", cloud, material)
     scene.view.set_post_processing(False)
 

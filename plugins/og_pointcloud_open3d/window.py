@@ -16,13 +16,13 @@ from og_pointcloud.runtime import SceneLike, as_scene
 from og_pointcloud.segmentation import UNKNOWN, Segmentation
 from og_pointcloud.text.words import Labels, TextFeatures
 from og_pointcloud_open3d.host import open3d
+from og_pointcloud_open3d.offscreen import viewpoint
 
 __all__ = ["draw"]
 
 UNKNOWN_GROUP = "unknown"
-QUERY = "query"
+QUERY = "Query"
 QUERY_COLOR = (1.0, 0.85, 0.0)
-QUERY_POINT_SIZE = 6
 
 
 def draw(
@@ -48,7 +48,7 @@ def draw(
     if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         raise OgPointcloudError("no display (DISPLAY is not set); expected one for a window: draw_png needs none")
     result = og.segment(pcd, labels, scene, text_features=text_features)
-    view = _View(result, scene if scene is not None else result.scene, text_features, Path(export))
+    view = _View(result, scene if scene is not None else result.scene, text_features, Path(export), point_size)
     host.visualization.draw(
         view.geometries(),
         title=title,
@@ -56,8 +56,10 @@ def draw(
         height=size[1],
         actions=[("Query", view.ask), ("Export", view.export)],
         show_ui=True,
+        show_skybox=False,
         point_size=point_size,
-        on_init=view.name_instances,
+        on_init=view.prepare,
+        **view.first_look(),
     )
     return result
 
@@ -66,23 +68,37 @@ class _View:
     """What the window shows, and what its buttons do. ``window``: Open3D's O3DVisualizer."""
 
     def __init__(
-        self, result: Segmentation, scene: SceneLike | None, text_features: TextFeatures, export_path: Path
+        self,
+        result: Segmentation,
+        scene: SceneLike | None,
+        text_features: TextFeatures,
+        export_path: Path,
+        point_size: int,
     ) -> None:
         self._finite = np.isfinite(result.xyz).all(axis=1)
         if not self._finite.any():
             raise SceneError(f"none of {len(result)} points has finite coordinates; expected some to draw")
         self._result, self._scene, self._text_features, self._path = result, scene, text_features, export_path
+        self._point_size = point_size
         self._origin = np.median(result.xyz[self._finite], axis=0)  # the viewer draws in float32
 
-    def geometries(self) -> list[dict[str, Any]]:
-        """One a labelled instance, in the group of its class, and one of the points without a label."""
-        return [
-            {"name": name, "group": group, "geometry": self._cloud(rows, self._result.colors[rows] / 255)}
-            for name, group, rows in self._parts()
-        ]
+    def geometries(self, highlighted: NDArray[np.int64] | None = None) -> list[dict[str, Any]]:
+        """One a labelled instance, in the group of its class, and one of the points without a label.
 
-    def name_instances(self, window: Any) -> None:
-        """Each instance's class, written where its middle is."""
+        highlighted: rows that are yellow."""
+        colors = self._result.colors / 255
+        if highlighted is not None:
+            colors[highlighted] = QUERY_COLOR
+        return [self._geometry(name, group, rows, colors[rows]) for name, group, rows in self._parts()]
+
+    def first_look(self) -> dict[str, Any]:
+        """Where the window looks from at first: arguments of Open3D's draw."""
+        look = viewpoint(self._result.xyz[self._finite], self._result.labels[self._finite] != UNKNOWN)
+        return {"lookat": look.target - self._origin, "eye": look.eye - self._origin, "up": look.up}
+
+    def prepare(self, window: Any) -> None:
+        """Each instance's class, written where its middle is; and colours that stay what they are."""
+        window.scene.view.set_post_processing(False)
         for _, group, rows in self._parts():
             if group != UNKNOWN_GROUP:
                 window.add_3d_label(self._local(rows).mean(axis=0), group)
@@ -101,21 +117,19 @@ class _View:
         window.show_dialog(dialog)
 
     def answer(self, window: Any, text: str) -> None:
-        """Show the instances that a text fits, in place of those of the query before."""
+        """Make the instances that a text fits yellow, in place of those of the query before."""
         window.close_dialog()
         try:
             rows = self.found(text)
         except (OgPointcloudError, MissingExtraError) as error:
             window.show_message_box(QUERY, str(error))
             return
-        window.remove_geometry(QUERY)
         if not len(rows):
             window.show_message_box(QUERY, f"nothing here is called '{text}'")
             return
-        material = open3d().visualization.rendering.MaterialRecord()
-        material.shader, material.point_size = "defaultUnlit", QUERY_POINT_SIZE * window.scaling
-        cloud = self._cloud(rows, np.tile(QUERY_COLOR, (len(rows), 1)))
-        window.add_geometry({"name": QUERY, "group": f"{QUERY}: {text}", "geometry": cloud, "material": material})
+        for geometry in self.geometries(highlighted=rows):
+            window.remove_geometry(geometry["name"])
+            window.add_geometry(geometry)
         window.post_redraw()
 
     def found(self, text: str) -> NDArray[np.int64]:
@@ -147,8 +161,10 @@ class _View:
     def _local(self, rows: NDArray[np.int64]) -> NDArray[np.float32]:
         return (self._result.xyz[rows] - self._origin).astype(np.float32)
 
-    def _cloud(self, rows: NDArray[np.int64], colors: NDArray[np.floating]) -> Any:
+    def _geometry(self, name: str, group: str, rows: NDArray[np.int64], colors: NDArray[np.floating]) -> dict[str, Any]:
         host = open3d()
         cloud = host.t.geometry.PointCloud(host.core.Tensor(self._local(rows)))
         cloud.point["colors"] = host.core.Tensor(colors.astype(np.float32))
-        return cloud
+        material = host.visualization.rendering.MaterialRecord()
+        material.shader, material.point_size = "defaultUnlit", float(self._point_size)
+        return {"name": name, "group": group, "geometry": cloud, "material": material}
