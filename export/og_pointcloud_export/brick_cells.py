@@ -82,49 +82,61 @@ def _answer_brick(brick, lattice, limits, points, top, wanted, values, lengths, 
     short, with_lists, with_parts, alone = wanted
     corner = (low[0] + brick[0] * BRICK * size, low[1] + brick[1] * BRICK * size, low[2] + brick[2] * BRICK * size)
     near, holds = _points_about(brick, corner, size, rounding, limits[0], points, top)
-    lengths[:] = NO_LIST
-    first_part[:] = -1
-    found = np.empty(len(near[0]), np.int32)
+    lengths[:], first_part[:] = NO_LIST, -1
+    if len(near[0]) <= short and with_lists and (alone or not holds.any()):
+        values[:] = TOO_FAR_CODE
+        if len(near[0]) > 0:
+            values[0], lengths[0] = LIST_ALONE, len(near[0])
+            lists[0, : len(near[0])] = np.sort(near[4])
+        return
+    number_of_list = np.zeros(len(near[0]), np.uint64)  # bit k of a point: it is in list k, which may be shared
     whole, whole_length = np.empty(short, np.int32), 0  # of the list that settles the whole brick; -1: none does
     if not with_lists or (holds.any() and not alone):
         whole_length = -1
-    lists_made, parts_made = 0, 0
+    squared, rows = np.empty(len(near[0])), np.empty(len(near[0]), np.int32)
+    made, split = 0, 0
     for octant in range(OCTANTS**3):
-        some = _within_octant(octant, corner, size, rounding, limits[0], near)
+        edge = BRICK // OCTANTS * size
+        some = _chosen(
+            near, _rivals_in_box(_middle(corner, octant, OCTANTS, edge), edge / 2 + rounding, limits[0], near)
+        )
+        alike = _alike(some)
         for cell in _cells_of_octant(octant):
-            low_corner = _corner(corner, cell, BRICK, size)
-            center = (low_corner[0] + size / 2, low_corner[1] + size / 2, low_corner[2] + size / 2)
-            half = size / 2 + rounding
-            code, certain, count = _answer_box(center, half, limits, near, some, found, whole_length >= 0)
+            if len(some[0]) == 0:
+                values[cell] = TOO_FAR_CODE
+                continue
+            center, half = _middle(corner, cell, BRICK, size), size / 2 + rounding
+            code, certain, count = _answer_box(center, half, limits, some, alike, whole_length >= 0, squared, rows)
             values[cell] = code if certain else code + limits[2]
             if whole_length >= 0:
-                whole_length = _join(whole, whole_length, found[:count], short)
+                whole_length = _join(whole, whole_length, some[4][rows[:count]])
             if certain or not with_lists:
                 continue
             splits = holds[cell] and with_parts
+            found = rows[:count]
             if splits:
-                boxes = parts[parts_made]
-                count = _settle_boxes(low_corner, size, rounding, PARTS, True, limits, near, found, count, boxes)
-            elif count > short // 2:
-                boxes = np.empty(SUBDIVISION**3, np.int32)
-                count = _settle_boxes(low_corner, size, rounding, SUBDIVISION, False, limits, near, found, count, boxes)
-            if count > lists.shape[1]:
+                found = _settle_boxes(center, size, rounding, PARTS, True, limits, some, found, parts[split])
+            elif count > short:
+                unused = np.empty(SUBDIVISION**3, np.int32)
+                found = _settle_boxes(center, size, rounding, SUBDIVISION, False, limits, some, found, unused)
+            if len(found) > lists.shape[1]:
                 continue
-            number = lists_made
-            if not splits:
-                number = _list_to_share(lists, lengths, first_part, lists_made, found[:count], short)
-            if number == lists_made:
-                lists_made += 1
-            if splits:
-                first_part[number] = parts_made
-                parts_made += 1
-            lengths[number] = _join(lists[number], max(lengths[number], 0), found[:count], lists.shape[1])
+            found = some[4][found]
+            number = made if splits else _list_to_share(found, number_of_list, lengths[:made], short)
+            lengths[number] = _join(lists[number], max(lengths[number], 0), found)
             values[cell] = 2 * limits[2] + number
+            made = max(made, number + 1)
+            if splits:
+                first_part[number] = split
+                split += 1
+            else:
+                for row in found:
+                    number_of_list[row] |= np.uint64(1) << np.uint64(number)
     if whole_length > 0:
-        values[0], lists_made, lengths[0] = LIST_ALONE, 1, whole_length
+        values[0], lengths[0], made = LIST_ALONE, whole_length, 1
         lengths[1:], first_part[0] = NO_LIST, -1
         lists[0, :whole_length] = whole[:whole_length]
-    for number in range(lists_made):
+    for number in range(made):
         lists[number, : lengths[number]] = np.sort(near[4][lists[number, : lengths[number]]])
 
 
@@ -158,18 +170,48 @@ def _points_about(brick, corner, size, rounding, reach, points, top):  # noqa: A
 
 
 @njit(cache=True)
-def _within_octant(octant, corner, size, rounding, reach, near):  # noqa: ANN001, ANN202
-    """Rows of the points about the brick that are within reach of that octant."""
-    edge = BRICK // OCTANTS * size
-    low = _corner(corner, octant, OCTANTS, edge)
-    some, count = np.empty(len(near[0]), np.int32), 0
+def _rivals_in_box(center, half, reach, near):  # noqa: ANN001, ANN202
+    """Rows of the points that are within reach of the box, and not farther everywhere than that nearest to its centre."""
+    squared, rows, count = np.empty(len(near[0])), np.empty(len(near[0]), np.int32), 0
+    best = _nearest(center, near, squared)
+    if best < 0:
+        return rows
+    nearest = _seen_from(center, near, best)
+    for row in range(len(squared)):
+        rival = _seen_from(center, near, row)
+        rows[count] = row
+        count += _gap_squared(rival[0], rival[1], rival[2], half) <= _grown(reach) and not _loses(
+            rival, squared[row], nearest, squared[best], half
+        )
+    return rows[:count]
+
+
+@njit(cache=True)
+def _chosen(near, rows):  # noqa: ANN001, ANN202
+    """Those points of ``near``, each with its row there instead of its number in the cloud."""
+    return near[0][rows], near[1][rows], near[2][rows], near[3][rows], rows
+
+
+@njit(cache=True)
+def _alike(near):  # noqa: ANN001, ANN202
+    """Whether all points have the same answer."""
+    alike = True
+    for answer in near[3]:
+        alike = alike and answer == near[3][0]
+    return alike
+
+
+@njit(cache=True)
+def _nearest(center, near, squared):  # noqa: ANN001, ANN202
+    """Fill the squared distances of all points; the row of the nearest, -1 if there is none."""
     for row in range(len(near[0])):
-        dx, dy, dz = (
-            near[0][row] - low[0] - edge / 2, near[1][row] - low[1] - edge / 2, near[2][row] - low[2] - edge / 2,
-        )  # fmt: skip
-        some[count] = row
-        count += _gap_squared(dx, dy, dz, edge / 2 + rounding) <= _grown(reach)
-    return some[:count]
+        dx, dy, dz = near[0][row] - center[0], near[1][row] - center[1], near[2][row] - center[2]
+        squared[row] = dx * dx + dy * dy + dz * dz
+    best, best_squared = -1, np.inf
+    for row in range(len(near[0])):
+        if squared[row] < best_squared:
+            best, best_squared = row, squared[row]
+    return best
 
 
 @njit(cache=True)
@@ -185,124 +227,116 @@ def _cells_of_octant(octant):  # noqa: ANN001, ANN202
 
 
 @njit(cache=True, inline="always")
-def _corner(corner, number, per_edge, size):  # noqa: ANN001, ANN202
-    """Low corner of the part with that number, of per_edge^3 of that size in C order."""
+def _middle(corner, number, per_edge, size):  # noqa: ANN001, ANN202
+    """Centre of the part with that number, of per_edge^3 of that size in C order."""
     return (
-        corner[0] + number // per_edge**2 * size,
-        corner[1] + number // per_edge % per_edge * size,
-        corner[2] + number % per_edge * size,
+        corner[0] + (number // per_edge**2 + 0.5) * size,
+        corner[1] + (number // per_edge % per_edge + 0.5) * size,
+        corner[2] + (number % per_edge + 0.5) * size,
     )
 
 
 @njit(cache=True)
-def _answer_box(center, half, limits, near, some, found, always):  # noqa: ANN001, ANN202
-    """(code at the centre, whether it is the whole box's, count): the points nearest somewhere in the box lie in
-    ``found``, unless it is certain and not ``always`` asked for. some: rows that may be; found may be the same array.
+def _answer_box(center, half, limits, near, alike, always, squared, rows):  # noqa: ANN001, ANN202
+    """(code at the centre, whether it is the whole box's, count): so many rows are nearest somewhere in the box.
+
+    near: the points that may be; alike: all have one answer. rows: filled, rightly only for boxes that are not certain, or if ``always`` asked for.
+    squared: scratch; both as long as near, or longer.
     """
-    reach, _, codes = limits
-    best, best_squared = -1, np.inf
-    for row in some:
-        dx, dy, dz = near[0][row] - center[0], near[1][row] - center[1], near[2][row] - center[2]
-        squared = dx * dx + dy * dy + dz * dz
-        if squared < best_squared:
-            best, best_squared = row, squared
-    if best < 0 or best_squared > (reach + np.sqrt(3.0) * half) ** 2:
+    reach = limits[0]
+    best = _nearest(center, near, squared)
+    if best < 0 or squared[best] > (reach + np.sqrt(3.0) * half) ** 2:
         return TOO_FAR_CODE, True, 0
-    nearest = _seen_from(center, near, best)
+    nearest, best_squared = _seen_from(center, near, best), squared[best]
+    within = _all_within_reach(nearest, half, reach)
+    if within and alike and not always:
+        return _code(near[3][best], best_squared, limits), True, 0
     limit = (np.sqrt(best_squared) + 2 * np.sqrt(3.0) * half) ** 2  # farther points always lose
     count, one_answer = 0, True
-    for row in some:
-        rival = _seen_from(center, near, row)
-        squared = rival[0] * rival[0] + rival[1] * rival[1] + rival[2] * rival[2]
-        if squared <= limit and not _loses(rival, squared, nearest, best_squared, half):
+    for row in range(len(near[0])):
+        if squared[row] <= limit:
+            rival = _seen_from(center, near, row)
+            if _loses(rival, squared[row], nearest, best_squared, half):
+                continue
             if _gap_squared(rival[0], rival[1], rival[2], half) <= _grown(reach):
-                found[count] = row
+                rows[count] = row
                 count += 1
                 one_answer = one_answer and near[3][row] == near[3][best]
     if count == 0:
         return TOO_FAR_CODE, True, 0
-    within = _all_within_reach(nearest, half, reach)
     if not (within and one_answer) or always:
-        count, one_answer = _keep_winners(center, half, near, found, count, best)
+        count = _winners(center, half, near, squared, rows, count)
+        one_answer = True
+        for row in rows[:count]:
+            one_answer = one_answer and near[3][row] == near[3][best]
     return _code(near[3][best], best_squared, limits), within and one_answer, count
 
 
 @njit(cache=True)
-def _keep_winners(center, half, near, found, count, best):  # noqa: ANN001, ANN202
-    """Drop rivals that lose to any other; how many are left, and whether all have the answer of the best."""
+def _winners(center, half, near, squared, rows, count):  # noqa: ANN001, ANN202
+    """Keep the rows that do not lose to another; how many. (What loses to a loser, loses to the other's winner too.)"""
     row = 0
     while row < count:
-        rival = _seen_from(center, near, found[row])
-        squared = rival[0] * rival[0] + rival[1] * rival[1] + rival[2] * rival[2]
-        lost = False
-        for other in range(count):
-            if other != row and not lost:
-                better = _seen_from(center, near, found[other])
-                better_squared = better[0] * better[0] + better[1] * better[1] + better[2] * better[2]
-                lost = better_squared < squared and _loses(rival, squared, better, better_squared, half)
+        rival, rival_squared, lost = _seen_from(center, near, rows[row]), squared[rows[row]], False
+        for other in rows[:count]:
+            if squared[other] < rival_squared and not lost:
+                lost = _loses(rival, rival_squared, _seen_from(center, near, other), squared[other], half)
         if lost:
             count -= 1
-            found[row] = found[count]
+            rows[row] = rows[count]
         else:
             row += 1
-    one_answer = True
-    for row in range(count):
-        one_answer = one_answer and near[3][found[row]] == near[3][best]
-    return count, one_answer
+    return count
 
 
 @njit(cache=True)
-def _settle_boxes(corner, size, rounding, per_edge, only_open, limits, near, found, count, values):  # noqa: ANN001, ANN202
-    """Look at a cell in per_edge^3 boxes, and keep those of its ``found`` that are nearest somewhere in one.
+def _settle_boxes(center, size, rounding, per_edge, only_open, limits, near, rows, values):  # noqa: ANN001, ANN202
+    """Look at a cell in per_edge^3 boxes: those of its rows that are nearest somewhere in one.
 
-    values: filled with the boxes' certain answers, or codes. only_open: what certain boxes need is not kept. Returns
-    the new count.
+    values: filled with the boxes' certain answers, or codes. only_open: what certain boxes need is left out.
     """
     edge = size / per_edge
-    among, winners = found[:count].copy(), np.empty(count, np.int32)
-    needed = np.zeros(len(near[0]), np.bool_)
+    corner = (center[0] - size / 2, center[1] - size / 2, center[2] - size / 2)
+    some, needed = _chosen(near, rows), np.zeros(len(rows), np.bool_)
+    alike = _alike(some)
+    squared, wins = np.empty(len(rows)), np.empty(len(rows), np.int32)
     for box in range(per_edge**3):
-        low = _corner(corner, box, per_edge, edge)
-        center = (low[0] + edge / 2, low[1] + edge / 2, low[2] + edge / 2)
-        code, certain, wins = _answer_box(center, edge / 2 + rounding, limits, near, among, winners, not only_open)
+        middle = _middle(corner, box, per_edge, edge)
+        code, certain, count = _answer_box(
+            middle, edge / 2 + rounding, limits, some, alike, not only_open, squared, wins
+        )
         values[box] = code if certain else limits[2]
         if not (certain and only_open):
-            for row in winners[:wins]:
+            for row in wins[:count]:
                 needed[row] = True
-    kept = 0
-    for row in among:
-        found[kept] = row
-        kept += needed[row]
-    return kept
+    return rows[needed]
 
 
 @njit(cache=True)
-def _list_to_share(lists, lengths, first_part, made, found, short):  # noqa: ANN001, ANN202
-    """Number of the list that grows least by what is found, and not beyond ``short``; ``made`` if there is none."""
-    chosen, least = made, short + 1
-    for number in range(made):
-        length, grown = lengths[number], lengths[number]
-        if first_part[number] >= 0:
-            continue
-        for row in found:
-            known = False
-            for place in range(length):
-                known = known or lists[number, place] == row
-            grown += not known
-        if grown - length < least and grown <= max(short, length):
-            chosen, least = number, grown - length
+def _list_to_share(rows, number_of_list, lengths, short):  # noqa: ANN001, ANN202
+    """Number of the list that grows least by these rows, and not beyond ``short``; the next number if there is none.
+
+    A list that may not be shared has no bit in ``number_of_list``, so that it would grow by all rows, as an empty one.
+    """
+    chosen, least = len(lengths), short + 1
+    for number in range(len(lengths)):
+        growth = len(rows)
+        for row in rows:
+            growth -= np.int64((number_of_list[row] >> np.uint64(number)) & np.uint64(1))
+        if growth < least and growth < len(rows) and lengths[number] + growth <= max(short, lengths[number]):
+            chosen, least = number, growth
     return chosen
 
 
 @njit(cache=True)
-def _join(members, length, more, longest):  # noqa: ANN001, ANN202
+def _join(members, length, more):  # noqa: ANN001, ANN202
     """Add what is new to the members; the new length, or -1 where there is no room."""
     for row in more:
         known = False
         for place in range(length):
             known = known or members[place] == row
         if not known:
-            if length == longest:
+            if length == len(members):
                 return -1
             members[length] = row
             length += 1
