@@ -1,16 +1,16 @@
-"""What a mask proposer and a mask encoder are: the two protocols of the front end."""
+"""What a mask proposer and a mask encoder are: the protocols of the front end."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.errors import SceneError
 
-__all__ = ["MaskEncoder", "MaskProposer", "Proposals"]
+__all__ = ["DepthMaskProposer", "MaskEncoder", "MaskProposer", "Proposals"]
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,10 @@ class Proposals:
 class MaskProposer(Protocol):
     """Where things are in an image. ``name`` says which one it was, for the record that lies with the masks."""
 
-    name: str
+    @property
+    def name(self) -> str:
+        """Which proposer it is."""
+        ...
 
     def propose(self, image: NDArray[np.uint8]) -> Proposals:
         """image: (H, W, 3) uint8 RGB. No thing found is a Proposals of length 0, not an error."""
@@ -56,4 +59,18 @@ class MaskEncoder(Protocol):
 
     def embed(self, image: NDArray[np.uint8], masks: NDArray[np.bool_]) -> NDArray[np.float32]:
         """image (H, W, 3) uint8 RGB, masks (M, H, W) bool -> (M, width) float32, L2-normalised rows."""
+        ...
+
+
+@runtime_checkable
+class DepthMaskProposer(Protocol):
+    """A `MaskProposer` that can also use depth."""
+
+    @property
+    def name(self) -> str:
+        """Which proposer it is."""
+        ...
+
+    def propose_with_depth(self, image: NDArray[np.uint8], depth: NDArray[np.float32] | None) -> Proposals:
+        """depth: (H, W) float32 along the optical axis, any unit, 0 where it is not known; None: there is none."""
         ...

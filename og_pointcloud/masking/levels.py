@@ -81,7 +81,7 @@ def _distinct(shared_px: NDArray[np.float64]) -> NDArray[np.intp]:
     """Masks, best first, without empty ones and those that nearly coincide with one before them."""
     area_px = np.diag(shared_px)
     kept: list[int] = []
-    for mask in np.flatnonzero(area_px > 0):
+    for mask in np.flatnonzero(area_px > 0).tolist():
         shared = shared_px[mask, kept]
         if not (shared > SAME * (area_px[mask] + area_px[kept] - shared)).any():
             kept.append(mask)

@@ -1,10 +1,10 @@
-"""Masks without a model: superpixels merged by colour, contrast and, where it is known, depth, into a tree of regions.
+"""Masks without a model: superpixels merged by colour, contrast and, where it is known, depth, into a region tree.
 
-1. Superpixels: graph segmentation (Felzenszwalb and Huttenlocher, 2004) cut by compact SLIC cells, so that no superpixel
-   runs from one surface into another of its colour.
+1. Superpixels: graph segmentation (Felzenszwalb and Huttenlocher, 2004) cut by compact SLIC cells, so that none runs
+   from one surface into another of its colour.
 2. Merging: in every round, pairs of neighbours that are each other's nearest become one region. How far apart two
-   are is told by their mean colours, by the contrast along their common border and, with depth, by a step of depth there.
-   Small regions are near to all their neighbours, and texture brings regions nearer.
+   are is told by their mean colours, by the contrast along their common border and, with depth, by steps of depth
+   there. Small regions are near to all their neighbours, and texture brings regions nearer.
 3. Proposals: the regions that lasted: the distance at which a region was merged away against that at which it
    was made is its score. They overlap only by containing one another; `levels` settles which to use.
 
@@ -26,7 +26,7 @@ __all__ = ["OpenCVProposer", "RegionTree", "region_tree"]
 
 Labels = NDArray[np.int32]
 Floats = NDArray[np.float64]
-Pairs = tuple[Labels, Labels, Floats, Floats, Floats]
+Pairs = tuple[Labels, Labels, Floats]
 
 WORKING_SIDE = 480
 """Pixels of the longer side at which regions are found; more finds texture, not things."""
@@ -204,10 +204,8 @@ class _Regions:
     @classmethod
     def of(cls, labels: Labels, lab: NDArray[np.float32]) -> _Regions:
         flat, pixels = labels.ravel(), lab.reshape(-1, 3).astype(np.float64)
-        sums = [
-            np.stack([np.bincount(flat, column) for column in values.T], axis=1) for values in (pixels, pixels**2)
-        ]
-        return cls(np.bincount(flat).astype(np.float64), *sums)
+        ones = np.ones((len(flat), 1))
+        return cls(_sums(flat, ones)[:, 0], _sums(flat, pixels), _sums(flat, pixels**2))
 
     def gathered(self, into: NDArray[np.intp], count: int) -> _Regions:
         """Regions with the same number in ``into`` become one."""
@@ -231,8 +229,9 @@ class _Borders:
     def of(cls, labels: Labels, lab: NDArray[np.float32], depth: NDArray[np.float32] | None) -> _Borders:
         across = _pixel_pairs(labels, lab, depth)
         down = _pixel_pairs(labels.T, lab.transpose(1, 0, 2), None if depth is None else depth.T)
-        pairs = cls(*(np.concatenate(both) for both in zip(across, down, strict=True)))
-        return pairs.gathered(np.arange(int(labels.max()) + 1))
+        a, b = np.concatenate([across[0], down[0]]), np.concatenate([across[1], down[1]])
+        length, contrast, step = np.concatenate([across[2], down[2]], axis=1)
+        return cls(a, b, length, contrast, step).gathered(np.arange(int(labels.max()) + 1))
 
     def gathered(self, into: NDArray[np.intp]) -> _Borders:
         """The borders between what the regions became; a border inside one is gone."""
@@ -241,12 +240,18 @@ class _Borders:
         between = a != b
         key = np.minimum(a, b)[between] * count + np.maximum(a, b)[between]
         pair, place = np.unique(key, return_inverse=True)
-        sums = [np.bincount(place, v[between], len(pair)) for v in (self.length, self.contrast, self.step)]
-        return _Borders(pair // count, pair % count, *sums)
+        length, contrast, step = _sums(place, np.stack([self.length, self.contrast, self.step], axis=1)[between]).T
+        return _Borders(pair // count, pair % count, length, contrast, step)
+
+
+def _sums(labels: NDArray[np.integer], values: Floats) -> Floats:
+    """(groups, c): sums of the rows of ``values`` (k, c) with the same label."""
+    count = int(labels.max(initial=-1)) + 1
+    return np.stack([np.bincount(labels, column, count) for column in values.T], axis=1).astype(np.float64)
 
 
 def _pixel_pairs(labels: Labels, lab: NDArray[np.float32], depth: NDArray[np.float32] | None) -> Pairs:
-    """Of every pixel whose right neighbour is in another region: the regions, 1, contrast, and 0 to 1 a step."""
+    """Of the p pixels whose right neighbour is in another region: both regions, and (3, p): 1, contrast, 0 to 1 a step."""
     row, column = np.nonzero(labels[:, :-1] != labels[:, 1:])
     last = labels.shape[1] - 1
     left, right = np.maximum(column + 1 - REACH_PX, 0), np.minimum(column + REACH_PX, last)
@@ -260,7 +265,7 @@ def _pixel_pairs(labels: Labels, lab: NDArray[np.float32], depth: NDArray[np.flo
         beyond_slope = np.abs(z_left - z_right) - np.minimum(slope_left, slope_right)
         nearer = np.minimum(z_left, z_right)
         step = np.where(nearer > 0, np.clip(beyond_slope / np.where(nearer > 0, STEP * nearer, 1), 0, 1), 0)
-    return labels[row, column], labels[row, column + 1], np.ones(len(row)), contrast, step.astype(np.float64)
+    return labels[row, column], labels[row, column + 1], np.stack([np.ones(len(row)), contrast, step])
 
 
 def _distances(regions: _Regions, borders: _Borders, pixels: int) -> Floats:

@@ -1,0 +1,79 @@
+"""``og-pointcloud masks``: photographs -> masks and mask features, ready for ``fit``."""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+from pathlib import Path
+from typing import Any
+
+from og_pointcloud.cli.common import add_command
+from og_pointcloud.errors import OgPointcloudError
+
+ENOUGH_VIEWS = 6
+"""--views auto: an image is left out when nearly all that it sees is seen by so many others."""
+
+
+def add(commands: Any) -> None:
+    parser = add_command(
+        commands, "masks", run, "Make masks and mask features from a capture's images.",
+        "og-pointcloud masks CAPTURE --proposer sam:facebook/sam-vit-base --encoder openai/clip-vit-base-patch16",
+    )  # fmt: skip
+    parser.add_argument("capture", type=Path, metavar="CAPTURE", help="folder with images and poses")
+    parser.add_argument(
+        "--proposer", default="opencv", metavar="P",
+        help="opencv (default, no weights), sam:FOLDER, sam:OWNER/MODEL, onnx:DETECTOR.onnx, onnx:ENCODER.onnx,"
+        "DECODER.onnx, or a folder of id PNGs or COCO .json files",
+    )  # fmt: skip
+    parser.add_argument(
+        "--encoder", default="demo", metavar="E",
+        help="demo (default; knows the demo room alone), a model's folder, OWNER/MODEL, or none: masks alone",
+    )  # fmt: skip
+    parser.add_argument("--level", default="middle", choices=("small", "middle", "large"), help="how much is one mask")
+    parser.add_argument("--langsplat", action="store_true", help="write LangSplat's language_features/, all levels")
+    parser.add_argument("--every", type=int, default=1, metavar="N", help="use every N-th image; needs -o")
+    parser.add_argument(
+        "--views", choices=("all", "auto"), default="all", help="auto: leave out images that add nothing; needs -o"
+    )
+    parser.add_argument("--seconds-per-image", type=float, metavar="S", help="SAM stops adding prompts after so long")
+    parser.add_argument("--longest-side", type=int, default=1024, metavar="PX", help="larger images are shrunk to this")
+    parser.add_argument("--depth", action="store_true", help="let the proposer use the points' depth as well")
+    parser.add_argument("--split", action="store_true", help="split masks where the points' depth breaks off")
+    parser.add_argument("--keep-tiny", action="store_true", help="keep masks that the points do not resolve")
+    parser.add_argument("--processes", type=int, default=1, metavar="N", help="images worked on side by side")
+    parser.add_argument("--overwrite", action="store_true", help="replace masks that this command did not make")
+    parser.add_argument("--download", action="store_true", help="fetch a SAM model that is not there yet")
+    parser.add_argument("-o", "--output", type=Path, metavar="DIR", help="a capture of its own (default: CAPTURE)")
+
+
+def run(arguments: argparse.Namespace) -> None:
+    if arguments.processes < 1:
+        raise OgPointcloudError(f"--processes is {arguments.processes}; expected at least 1")
+    if arguments.seconds_per_image is not None and not arguments.seconds_per_image > 0:
+        raise OgPointcloudError(f"--seconds-per-image is {arguments.seconds_per_image}; expected more than 0")
+    from og_pointcloud.masking.make_masks import MaskSettings, make_masks
+
+    settings = MaskSettings(
+        proposer=arguments.proposer,
+        encoder=None if arguments.encoder == "none" else arguments.encoder,
+        level=arguments.level,
+        langsplat=arguments.langsplat,
+        longest_side=arguments.longest_side,
+        seconds_per_image=arguments.seconds_per_image,
+        use_depth=arguments.depth,
+        split=arguments.split,
+        drop_tiny=not arguments.keep_tiny,
+        every=arguments.every,
+        enough_views=ENOUGH_VIEWS if arguments.views == "auto" else None,
+        download=arguments.download,
+    )
+    made = make_masks(
+        arguments.capture, settings, arguments.output, processes=arguments.processes, overwrite=arguments.overwrite
+    )
+    print(
+        f"{made.masks} masks in {made.images} images ({made.seconds:.1f} s, {made.done_before} images done before), "
+        f"feature space {made.feature_space}"
+    )
+    level = ["--mask-level", "large"] if arguments.langsplat else []
+    fit = ["og-pointcloud", "fit", str(made.output), *level, "-o", f"{made.output.resolve().name}.ogpc"]
+    print(f"next: {shlex.join(fit)}")

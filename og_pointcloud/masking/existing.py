@@ -1,0 +1,249 @@
+"""Masks that exist already: id images, COCO annotations, detections, and whatever a function of the user's returns."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from og_pointcloud.errors import SceneError
+from og_pointcloud.formats.images import MAX_PIXELS, decoded, png_header, require_cv2, without_suffix
+from og_pointcloud.masking.contracts import Proposals
+
+__all__ = ["CallableProposer", "ExistingMasks", "as_proposals", "decode_rle", "from_ids"]
+
+MAX_JSON_BYTES = 1 << 30
+MAX_MASKS_PX = 1 << 33
+"""Masks of one image together: more is refused before anything is allocated."""
+
+
+def from_ids(ids: NDArray[np.integer], none: int = 0) -> Proposals:
+    """An id map (H, W) as proposals of score 1, by ascending id. none: the id outside every mask."""
+    names = np.unique(ids)
+    names = names[names != none]
+    _check_room(len(names), ids.shape, "the id map")
+    return Proposals(ids == names[:, None, None], np.ones(len(names), np.float32))
+
+
+def as_proposals(said: Any, shape: tuple[int, int]) -> Proposals:
+    """What a function or library gave, as proposals for an image of ``shape`` (H, W).
+
+    Taken: Proposals; bool (M, H, W); an id map of integers (H, W), negative outside every mask, and 0 as well where
+    nothing is negative; a pair (masks, scores); anything with ``.mask`` (M, H, W) or None, and perhaps ``.confidence``
+    (M,), as supervision's detections.
+    """
+    scores: Any = None
+    if isinstance(said, Proposals):
+        proposals = said
+    else:
+        if hasattr(said, "mask"):
+            said, scores = said.mask, getattr(said, "confidence", None)
+            said = np.zeros((0, *shape), np.bool_) if said is None else said
+        elif isinstance(said, tuple) and len(said) == 2:
+            said, scores = said
+        masks = np.asarray(said)
+        if masks.ndim == 2 and masks.dtype.kind in "iu":
+            proposals = from_ids(np.maximum(masks, -1), none=-1 if masks.min(initial=0) < 0 else 0)
+        elif masks.ndim == 3 and masks.dtype == np.bool_:
+            given = np.ones(len(masks)) if scores is None else np.asarray(scores)
+            proposals = Proposals(masks, np.clip(given.astype(np.float32), 0, 1))
+        else:
+            raise SceneError(
+                f"a mask proposer gave {type(said).__name__} {masks.dtype} {masks.shape}; expected bool (masks, H, W), "
+                "or an id map of whole numbers (H, W)"
+            )
+    if proposals.masks.shape[1:] != shape:
+        raise SceneError(f"masks are {proposals.masks.shape[1:]}, their image {shape}; expected the same (H, W)")
+    return proposals
+
+
+@dataclass(frozen=True)
+class CallableProposer:
+    """A function of the user's, image (H, W, 3) uint8 RGB -> what `as_proposals` takes, as a proposer."""
+
+    function: Callable[[NDArray[np.uint8]], Any]
+    name: str = "callable"
+
+    def propose(self, image: NDArray[np.uint8]) -> Proposals:
+        """SceneError where the function gives something else."""
+        height, width = image.shape[:2]
+        return as_proposals(self.function(image), (height, width))
+
+
+@dataclass(frozen=True)
+class ExistingMasks:
+    """A folder of masks by image name: ``<name>.png`` of ids (8 or 16 bit grey, 0 none), ``<name>.json`` (a list of RLE
+    annotations, as segment-anything's script writes), or one COCO ``.json`` for all images."""
+
+    folder: Path
+    name: str = field(default="existing", init=False)
+
+    def of(self, image_name: str, shape: tuple[int, int]) -> Proposals:
+        """The masks of one image, resized to ``shape`` (H, W). SceneError where it has none."""
+        png, single = self.folder / f"{image_name}.png", self.folder / f"{image_name}.json"
+        if png.is_file():
+            return _resized(_read_ids(png), shape)
+        if single.is_file():
+            return _resized(_from_annotations(_annotations(_read_json(single)), str(single)), shape)
+        stem = image_name.rsplit("/", 1)[-1]
+        for key in (image_name, stem):
+            if key in self._coco:
+                return _resized(_from_annotations(self._coco[key], f"{self.folder}, image '{key}'"), shape)
+        raise SceneError(
+            f"{self.folder} has no masks for image '{image_name}'; expected {png.name}, {single.name}, or a COCO .json "
+            "that lists it"
+        )
+
+    @cached_property
+    def _coco(self) -> dict[str, list[dict[str, Any]]]:
+        """Annotations by image stem, each with the image's size, from all COCO files of the folder."""
+        found: dict[str, list[dict[str, Any]]] = {}
+        for file in sorted(self.folder.glob("*.json")):
+            content = _read_json(file)
+            if not (isinstance(content, dict) and isinstance(content.get("images"), list)):
+                continue
+            stems: dict[Any, tuple[str, list[Any]]] = {}
+            for image in content["images"]:
+                if not isinstance(image, dict) or not isinstance(image.get("file_name"), str):
+                    raise SceneError(f"{file}: an image is {image!r:.60}; expected id, file_name, height and width")
+                stem = without_suffix(image["file_name"]).rsplit("/", 1)[-1]
+                stems[image.get("id")] = stem, [image.get("height"), image.get("width")]
+                found.setdefault(stem, [])
+            for annotation in _annotations(content.get("annotations")):
+                image_id = annotation.get("image_id")
+                if isinstance(image_id, (int, str)) and image_id in stems:
+                    stem, size = stems[image_id]
+                    found[stem].append({**annotation, "size": size})
+        return found
+
+
+def decode_rle(rle: Any, source: str = "RLE") -> NDArray[np.bool_]:
+    """COCO's run-length code -> (H, W) bool. rle: {"size": [H, W], "counts": list of runs, or COCO's compressed text}.
+
+    Runs alternate, background first, down the columns. SceneError where sizes are absurd, or runs do not add up.
+    """
+    size = rle.get("size") if isinstance(rle, dict) else None
+    if not (isinstance(size, list) and len(size) == 2 and all(type(length) is int and length > 0 for length in size)):
+        raise SceneError(f"{source}: size is {size!r:.60}; expected [height, width] in pixels")
+    height, width = size
+    if height * width > MAX_PIXELS:
+        raise SceneError(f"{source}: size is {height}x{width}; expected at most {MAX_PIXELS} pixels")
+    counts = rle.get("counts")
+    if isinstance(counts, (str, bytes)):
+        counts = _decompressed(counts, source)
+    elif not (isinstance(counts, list) and all(type(run) is int for run in counts)):
+        raise SceneError(f"{source}: counts are {type(counts).__name__}; expected whole numbers or COCO's text")
+    if any(run < 0 for run in counts) or sum(counts) != height * width:
+        raise SceneError(
+            f"{source}: runs add up to {sum(counts)} pixels (least {min(counts, default=0)}), the image has "
+            f"{height * width}; expected runs that fill it: it is damaged or of another image"
+        )
+    values = np.arange(len(counts)) % 2 == 1
+    return np.repeat(values, counts).reshape(width, height).T
+
+
+def _decompressed(text: str | bytes, source: str) -> list[int]:
+    """COCO's text: 5 bits a character from 48 on, the sixth says that more follow, the last one's fifth is the sign;
+    from the fourth run on, differences to the run before the last."""
+    data = text.encode("latin-1", "replace") if isinstance(text, str) else text
+    runs: list[int] = []
+    value = shift = 0
+    for byte in data:
+        bits = byte - 48
+        if not 0 <= bits < 64 or shift > 50:
+            raise SceneError(f"{source}: counts hold the byte {byte}; expected COCO's compressed run lengths")
+        value |= (bits & 31) << shift
+        shift += 5
+        if not bits & 32:
+            if bits & 16:
+                value -= 1 << shift
+            runs.append(value + runs[-2] if len(runs) > 2 else value)
+            value = shift = 0
+    if shift:
+        raise SceneError(f"{source}: counts end in the middle of a run: they are truncated")
+    return runs
+
+
+def _annotations(found: Any) -> list[dict[str, Any]]:
+    found = found.get("annotations") if isinstance(found, dict) else found
+    if not isinstance(found, list) or not all(isinstance(entry, dict) for entry in found):
+        raise SceneError(f"annotations are {type(found).__name__}; expected a list of records with a segmentation")
+    return found
+
+
+def _from_annotations(annotations: Sequence[dict[str, Any]], source: str) -> Proposals | None:
+    """None where there are none: nothing says how large they would be."""
+    masks, scores = [], []
+    for index, annotation in enumerate(annotations):
+        where = f"{source}, annotation {index}"
+        segmentation = annotation.get("segmentation")
+        if isinstance(segmentation, list):
+            masks.append(_polygons(segmentation, annotation.get("size"), where))
+        else:
+            masks.append(decode_rle(segmentation, where))
+        if masks[-1].shape != masks[0].shape:
+            raise SceneError(f"{where} is {masks[-1].shape}, the first {masks[0].shape}; expected masks of one image")
+        _check_room(len(masks), masks[0].shape, source)
+        score = annotation.get("score", annotation.get("predicted_iou", 1.0))
+        scores.append(float(np.clip(score, 0, 1)) if isinstance(score, (int, float)) and np.isfinite(score) else 1.0)
+    return Proposals(np.array(masks), np.array(scores, np.float32)) if masks else None
+
+
+def _polygons(polygons: list[Any], size: Any, source: str) -> NDArray[np.bool_]:
+    """Rings of x, y in pixels. size: [height, width]."""
+    empty = decode_rle({"size": size, "counts": [size[0] * size[1]] if _is_size(size) else []}, source)
+    drawn = empty.astype(np.uint8)
+    for ring in polygons:
+        try:
+            corners = np.array(ring, np.float64).reshape(-1, 2)
+        except (ValueError, TypeError):
+            corners = np.empty((0, 2))
+        if len(corners) < 3 or not (np.abs(corners) < 1e6).all():
+            raise SceneError(f"{source}: a polygon is {ring!r:.60}; expected x, y, x, y ... of three corners or more")
+        require_cv2().fillPoly(drawn, [np.rint(corners).astype(np.int32)], 1)
+    return drawn.astype(np.bool_)
+
+
+def _is_size(size: Any) -> bool:
+    return isinstance(size, list) and len(size) == 2 and all(type(length) is int for length in size)
+
+
+def _read_json(file: Path) -> Any:
+    if file.stat().st_size > MAX_JSON_BYTES:
+        raise SceneError(f"{file} has {file.stat().st_size} bytes; expected at most {MAX_JSON_BYTES}")
+    try:
+        return json.loads(file.read_text(encoding="utf-8"))
+    except (ValueError, RecursionError) as error:
+        raise SceneError(f"{file} is not valid JSON ({error}): export it again") from None
+
+
+def _read_ids(file: Path) -> Proposals:
+    header = png_header(file)
+    if header is None or header.color_type not in (0, 3) or header.bit_depth not in (8, 16):
+        raise SceneError(f"{file} is no grey PNG of 8 or 16 bit; expected mask ids (0 none, 1..M)")
+    ids = decoded(file, require_cv2().IMREAD_UNCHANGED)
+    if ids.ndim != 2:
+        raise SceneError(f"{file} has shape {ids.shape}; expected one channel of mask ids")
+    return from_ids(ids.astype(np.int32))
+
+
+def _resized(proposals: Proposals | None, shape: tuple[int, int]) -> Proposals:
+    """Masks at the size of the image that they are used on, nearest pixel."""
+    if proposals is None or not len(proposals):
+        return Proposals(np.zeros((0, *shape), np.bool_), np.zeros(0, np.float32))
+    height, width = proposals.masks.shape[1:]
+    rows = (np.arange(shape[0]) + 0.5) * height / shape[0]
+    columns = (np.arange(shape[1]) + 0.5) * width / shape[1]
+    masks = proposals.masks[:, rows.astype(np.int64)[:, None], columns.astype(np.int64)]
+    return Proposals(masks, proposals.scores)
+
+
+def _check_room(masks: int, shape: tuple[int, ...], source: str) -> None:
+    if masks * int(np.prod(shape)) > MAX_MASKS_PX:
+        raise SceneError(f"{source} has {masks} masks of {shape}; expected at most {MAX_MASKS_PX} pixels together")

@@ -1,0 +1,88 @@
+"""The posed images of a capture folder, before there are masks."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from og_pointcloud.errors import SceneError
+from og_pointcloud.fitting.coverage import needed_views
+from og_pointcloud.formats import capture as captures
+from og_pointcloud.formats.distortion import Distortion
+from og_pointcloud.formats.images import image_size, read_rgb, same_shape
+from og_pointcloud.formats.poses import in_local_frame
+from og_pointcloud.scene import Camera, Points, View
+
+__all__ = ["Photograph", "choose_by_coverage", "read_cloud", "read_photographs"]
+
+
+@dataclass(frozen=True)
+class Photograph:
+    """A posed image. name: its view's. path: as the pose file says. file: where it is. camera: from world coordinates.
+    distortion: None for a pinhole lens; masks are made on the image as it is, and undistorted when they are read."""
+
+    name: str
+    path: str
+    file: Path
+    camera: Camera
+    distortion: Distortion | None
+
+    def read(self, longest_side: int) -> NDArray[np.uint8]:
+        """(h, w, 3) uint8 RGB, shrunk so that neither side is longer. Grey, 16-bit and alpha become RGB of 8 bit; EXIF
+        orientation is ignored, as poses ignore it."""
+        width, height = image_size(self.file)
+        scale = min(1.0, longest_side / max(width, height))
+        size = (width, height) if scale == 1 else (max(1, round(width * scale)), max(1, round(height * scale)))
+        return read_rgb(self.file, size)
+
+
+def read_photographs(capture: Path) -> tuple[Photograph, ...]:
+    """All posed images of a capture, checked by their headers. SceneError where one is missing or cannot be used."""
+    if not capture.is_dir():
+        raise SceneError(f"{capture} is not a folder; expected a capture folder with images and poses")
+    poses = captures._read_poses(capture)
+    files = captures._find_images(capture, poses.images)
+    missing = [image.path for image, file in zip(poses.images, files, strict=True) if file is None]
+    if missing:
+        raise SceneError(
+            f"{capture}: {len(missing)} of {len(files)} posed images are not found, e.g. '{missing[0]}'; expected all: "
+            "masks are made from images, so copy them there or take them out of the pose file"
+        )
+    photographs = tuple(
+        Photograph(name, image.path, file, image.camera, image.distortion)
+        for name, image, file in zip(poses.names, poses.images, files, strict=True)
+        if file is not None
+    )
+    for photograph in photographs:
+        _check_size(photograph)
+    return photographs
+
+
+def _check_size(photograph: Photograph) -> None:
+    size, camera = image_size(photograph.file), photograph.camera
+    if not same_shape(size, (camera.width, camera.height)):
+        raise SceneError(
+            f"{photograph.file} is {size[0]}x{size[1]} pixels, its camera {camera.width}x{camera.height}; expected the "
+            "same size or a scaled one: fix the width and height of the pose file, or turn the image (EXIF "
+            "orientation is ignored, poses are of the pixels as stored)"
+        )
+
+
+def read_cloud(capture: Path) -> Points:
+    """The capture's points."""
+    return captures._read_geometry(capture, captures._read_poses(capture), None)
+
+
+def choose_by_coverage(capture: Path, photographs: Sequence[Photograph], enough: int) -> list[int]:
+    """Indices of the photographs that see what fewer than ``enough`` others see, ascending."""
+    points = read_cloud(capture)
+    nothing = np.zeros((0, 1), np.float32)
+    views = [
+        View(photograph.name, in_local_frame(photograph.camera, points.origin), np.zeros((0, 0), np.int32), nothing)
+        for photograph in photographs
+    ]
+    return needed_views(points.xyz, views, enough)
