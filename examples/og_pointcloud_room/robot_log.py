@@ -102,7 +102,7 @@ def draw_drive(path: Path, log: DriveLog, instances: Instances) -> Path:
             axes.set_ylim(-0.03, 1.03)
         axes.set(ylabel=title, xlabel="seconds of the drive" if row == len(curves) - 1 else "")
         axes.grid(alpha=0.3)
-        axes.legend(loc="center right", fontsize=8)
+        axes.legend(loc="best", fontsize=8)
     figure.savefig(path, dpi=100)
     return path
 
@@ -114,7 +114,9 @@ def _draw_map(axes: Axes, log: DriveLog, instances: Instances) -> None:
     known = labels >= 0
     for chosen, colors, size in ((~known & ~odd, "0.85", 0.5), (known, label_colors(labels[known]) / 255, 0.8)):
         axes.scatter(*xyz[chosen, :2].T, s=size, c=colors, linewidths=0, rasterized=True)
-    axes.scatter(*xyz[odd, :2].T, s=4, color=CHANGED_COLOR, linewidths=0, label="too far from the map: new or moved")
+    axes.scatter(
+        *xyz[odd, :2].T, s=4, color=CHANGED_COLOR, linewidths=0, label="too far from the map: new, moved or never seen"
+    )
     axes.plot(*np.array(log.path)[:, :2].T, color="black", linewidth=1, label="path of the robot")
     often = [k for k, frames in log.seen.items() if frames > SEEN_OFTEN * len(log.path)]
     for instance in (instances[k] for k in sorted(often)):

@@ -37,16 +37,20 @@ def to_detections(
     minimum_points: points that an instance has in the result, or it is left out.
     """
     table = instances.instances if isinstance(instances, LabelledScene) else instances
-    labelled = result.labels >= 0
-    ids, first, counts = np.unique(result.instances[labelled], return_index=True, return_counts=True)
-    if len(ids) and ids[-1] >= len(table):
-        raise OgPointcloudError(f"the result has instance {ids[-1]}, the table {len(table)}: they are of two scenes")
-    labels, scores = result.labels[labelled][first], result.scores[labelled][first]  # the same all over an instance
+    labelled = np.flatnonzero(result.labels >= 0)
+    owners = result.instances[labelled]
+    if len(owners) and owners.max() >= len(table):
+        raise OgPointcloudError(
+            f"the result has instance {owners.max()}, the table {len(table)}: they are of two scenes"
+        )
+    example = np.zeros(len(table), np.int64)
+    example[owners] = labelled  # any point will do: all of an instance have one label and score
+    seen = np.flatnonzero(np.bincount(owners, minlength=len(table)) >= max(minimum_points, 1))
     head = header(messages, frame_id, stamp)
     detections = [
-        _detection(table[int(k)], result.names[label], float(score), head, messages)
-        for k, label, score, count in zip(ids, labels, scores, counts, strict=True)
-        if count >= minimum_points and table[int(k)].points
+        _detection(table[k], result.names[result.labels[row]], float(result.scores[row]), head, messages)
+        for k, row in zip(seen.tolist(), example[seen], strict=True)
+        if table[k].points
     ]
     return messages("vision_msgs/msg/Detection3DArray", header=head, detections=detections)
 
