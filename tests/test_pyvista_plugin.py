@@ -1,0 +1,399 @@
+"""The PyVista plugin: what datasets and plotters answer, held against numpy and the core; drawing is looked at."""
+
+import runpy
+import subprocess
+import sys
+import warnings
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from labelled_clouds import WORDS, make_cloud, room
+from og_pointcloud_export import write_bundle
+
+import og_pointcloud as og
+from og_pointcloud.segmentation import label_colors
+
+pv = pytest.importorskip("pyvista")
+
+from og_pointcloud_pyvista import can_render, to_pyvista  # noqa: E402
+from og_pointcloud_pyvista.plotting import HIGHLIGHT, UNKNOWN_COLOR  # noqa: E402
+
+EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
+
+
+@pytest.fixture(scope="module")
+def bundle(tmp_path_factory):
+    return write_bundle(room(), tmp_path_factory.mktemp("scène") / "room.ogpc")
+
+
+@pytest.fixture(scope="module")
+def drawing():
+    if not can_render():
+        pytest.skip("VTK cannot draw off-screen here")
+
+
+@pytest.fixture
+def scene(bundle):
+    return og.load(bundle)
+
+
+@pytest.fixture
+def plotter(drawing):
+    plotter = pv.Plotter(off_screen=True, window_size=[400, 300])
+    yield plotter
+    plotter.close()
+
+
+def grids(scene):
+    """Datasets of every kind in the scene's frame."""
+    low, high = scene.xyz.min(axis=0), scene.xyz.max(axis=0)
+    image = pv.ImageData(dimensions=(9, 8, 5), spacing=(high - low) / [8, 7, 4], origin=low)
+    return {
+        "cloud": pv.PolyData(scene.xyz),
+        "points alone": pv.PointSet(scene.xyz),
+        "surface": pv.Plane(center=(1, 1, 0), i_size=2, j_size=2, i_resolution=9, j_resolution=9),
+        "image": image,
+        "structured": image.cast_to_structured_grid(),
+        "unstructured": image.cast_to_unstructured_grid(),
+    }
+
+
+def test_entry_points_bring_everything_without_an_import(bundle):
+    code = f"""
+import sys, pyvista as pv
+assert "og_pointcloud" not in sys.modules and "og_pointcloud_pyvista" not in sys.modules
+mesh = pv.read({str(bundle)!r})
+print(mesh.n_points, (mesh.og.segment(["apple", "pear"])["og_label"] >= 0).sum(), hasattr(pv.Plotter, "og"))
+print(type(pv.Plotter(off_screen=True).og).__name__)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    expected = og.segment(bundle, ["apple", "pear"])
+    assert done.stdout.splitlines() == [f"{len(expected)} {(expected.labels >= 0).sum()} True", "OgPlotter"]
+
+
+@pytest.mark.parametrize("kind", ["cloud", "points alone", "surface", "image", "structured", "unstructured"])
+def test_every_kind_of_dataset_answers_as_arrays_do(scene, kind):
+    mesh = grids(scene)[kind]
+    before = list(mesh.array_names)
+    labelled = mesh.og.segment(["plum", "apple"], scene)
+    expected = og.segment(np.asarray(mesh.points), ["plum", "apple"], scene)
+    assert type(labelled) is type(mesh)
+    assert (labelled.n_points, labelled.n_cells) == (mesh.n_points, mesh.n_cells)
+    assert mesh.array_names == before, "the dataset asked stays as it is"
+    for name in ("labels", "instances", "scores", "reasons", "colors"):
+        array, column = np.asarray(labelled.point_data[f"og_{name[:-1]}"]), getattr(expected, name)
+        assert array.dtype == column.dtype
+        assert np.array_equal(array, column), name
+    assert tuple(labelled.field_data["og_names"]) == ("plum", "apple")
+    assert (expected.labels >= 0).any()
+    assert mesh.og.segment(["plum"], scene, inplace=True) is mesh
+    assert "og_label" in mesh.point_data
+
+
+def test_names_and_the_scene_travel_with_the_dataset_and_its_files(bundle, tmp_path):
+    mesh = pv.PolyData(og.load(bundle).xyz[::3]).og.segment(["café", "red ball"], bundle)
+    mesh.save(tmp_path / "labelled.vtp")
+    again = pv.read(tmp_path / "labelled.vtp")
+    assert tuple(again.field_data["og_names"]) == ("café", "red ball")
+    assert np.array_equal(again.og.segment(["pear"])["og_instance"], mesh["og_instance"]), "no scene is given"
+    in_memory = mesh.og.segment(["pear"], og.LabelledScene.from_cloud(room()))
+    assert "og_pointcloud_scene" not in in_memory.field_data, "another scene answered"
+    assert tuple(in_memory.field_data["og_names"]) == ("pear",)
+
+
+def test_a_result_converts_with_and_without_points(scene):
+    result = og.segment(scene.xyz[:50], None, scene)
+    mesh = to_pyvista(result)
+    assert mesh.points.dtype == np.float64
+    assert np.array_equal(mesh.points, result.xyz)
+    assert tuple(mesh.field_data["og_names"]) == WORDS
+    with pytest.warns(UserWarning, match="0 points"):
+        empty = to_pyvista(og.segment(np.zeros((0, 3)), ["apple"], scene))
+    assert empty.n_points == 0
+    assert tuple(empty.field_data["og_names"]) == ("apple",)
+
+
+def test_nothing_labelled_and_labels_without_points_are_said(scene):
+    far = pv.PolyData(scene.xyz + 100)
+    with pytest.warns(UserWarning, match="too far from the scene"):
+        assert (far.og.segment(["apple"], scene)["og_label"] == -1).all()
+    with pytest.warns(UserWarning, match="0 points"):
+        pv.PolyData().og.segment(["apple"], scene)
+    one = scene.instances.largest(1)[0]
+    best, worst = [
+        max(WORDS, key=lambda word: sign * dict(og.pick(scene, one.xyz[0]).words())[word]) for sign in (1, -1)
+    ]
+    with pytest.warns(UserWarning, match=f"no point is labelled '{worst}'"):
+        pv.PolyData(one.xyz).og.segment([best, worst], scene)
+    with pytest.raises(og.OgPointcloudError, match=r"'pairs' is not among the 5 known words.*did you mean 'pear'"):
+        far.og.segment(["pairs"], scene)
+
+
+def test_the_scene_is_found_as_everywhere(scene, bundle, monkeypatch):
+    mesh = pv.PolyData(scene.xyz[:20])
+    monkeypatch.delenv("OG_POINTCLOUD_SCENE", raising=False)
+    with pytest.raises(og.OgPointcloudError, match="no scene to ask"):
+        mesh.og.segment(["apple"])
+    monkeypatch.setenv("OG_POINTCLOUD_SCENE", str(bundle))
+    assert np.array_equal(mesh.og.segment(["apple"])["og_instance"], scene.instance_ids[:20])
+
+
+def test_progress_bar_is_shown_when_asked_for(scene, capsys):
+    pv.PolyData(scene.xyz[:20]).og.segment(["apple"], scene, progress_bar=True)
+    assert "Segmenting: 100%" in capsys.readouterr().err
+    pv.PolyData(scene.xyz[:20]).og.segment(["apple"], scene)
+    assert capsys.readouterr().err == ""
+
+
+def test_select_extracts_the_fitting_instances_with_their_rank(scene):
+    mesh = pv.PolyData(scene.xyz)
+    selection = og.select(scene, "plum")
+    points = mesh.og.select("plum", scene)
+    assert len(selection.instances) > 1
+    expected = np.flatnonzero(np.isin(scene.instance_ids, selection.instances))
+    assert np.allclose(points.points, scene.xyz[expected])
+    for rank, match in enumerate(selection.fitting):
+        rows = points["og_instance"] == match.instance
+        assert (points["og_rank"][rows] == rank).all()
+        assert (points["og_score"][rows] == np.float32(match.score)).all()
+    assert "og_instance" not in mesh.point_data
+
+
+def test_selecting_nothing_says_what_is_closest(scene):
+    mesh = pv.PolyData(scene.xyz)
+    vectors = {"nothing": -scene.cloud.instances.descriptors.sum(axis=0)}
+    with pytest.warns(UserWarning, match=r"'nothing' fits none of 8 instances; the closest is instance \d with"):
+        assert mesh.og.select(vectors, scene).n_points == 0
+    with pytest.warns(UserWarning, match="no point of this dataset belongs to one"):
+        assert pv.PolyData(scene.xyz + 50).og.select("plum", scene).n_points == 0
+
+
+def test_instances_are_blocks_named_by_id_and_word(scene):
+    mesh = pv.PolyData(scene.xyz).og.segment(["apple", "pear", "plum"], scene)
+    blocks = mesh.og.instances()
+    names = list(blocks.keys())  # a MultiBlock iterates over blocks
+    ids = [int(name.split()[0]) for name in names]
+    assert ids == [k for k in range(9) if (scene.instance_ids == k).any()]
+    for instance, name, block in zip(ids, names, blocks, strict=True):
+        rows = scene.instance_ids == instance
+        assert np.allclose(block.points, scene.xyz[rows])
+        label = int(mesh["og_label"][rows][0])
+        assert name == f"{instance} {'unknown' if label < 0 else mesh.field_data['og_names'][label]}"
+    own = pv.PolyData(scene.xyz).og.instances(scene)
+    assert own.keys()[0] == f"0 {scene.instances[0].words[0][0]}", "not segmented: the scene's own word"
+    with pytest.warns(UserWarning, match="there is no block"):
+        assert pv.PolyData(scene.xyz + 50).og.instances(scene).n_blocks == 0
+
+
+def test_boxes_are_the_instances_own(scene):
+    mesh = pv.PolyData(scene.xyz).og.segment(["apple", "pear", "plum"], scene)
+    lines = mesh.og.boxes(scene, up=(0, 0, 1))
+    labelled = np.unique(mesh["og_instance"][mesh["og_label"] >= 0])
+    assert np.array_equal(np.unique(lines["og_instance"]), labelled)
+    assert lines.n_cells == 12 * len(labelled)
+    for number, instance in enumerate(labelled):
+        box = og.instance_table(scene, up=(0, 0, 1))[int(instance)].oriented_box
+        corners = lines.points[8 * number : 8 * number + 8]
+        assert np.allclose(corners, box.corners)
+        ends = lines.extract_cells(np.flatnonzero(lines["og_instance"] == instance))
+        lengths = np.sort(ends.compute_cell_sizes()["Length"])
+        assert np.allclose(lengths, np.sort(np.repeat(box.size, 4)))
+        color = mesh["og_color"][mesh["og_instance"] == instance][0]
+        assert (lines["og_color"][lines["og_instance"] == instance] == color).all()
+    assert pv.PolyData(scene.xyz + 50).og.boxes(scene).n_cells == 0
+
+
+def test_color_goes_through_color_labels(scene):
+    mesh = pv.PolyData(scene.xyz).og.segment(["apple", "pear"], scene)
+    assert np.array_equal(mesh.og.color("label")["og_color"], mesh["og_color"])
+    by_instance = mesh.og.color("instance", output_scalars="by_instance")
+    assert np.array_equal(by_instance["by_instance"], label_colors(scene.instance_ids))
+    red = mesh.og.color("label", {-1: "white", 0: "red", 1: "blue"})["og_color"]
+    assert np.array_equal(red[mesh["og_label"] == 0][0], [255, 0, 0])
+    with pytest.raises(og.OgPointcloudError, match="expected 'label' or 'instance'"):
+        mesh.og.color("colour")
+    with pytest.raises(og.OgPointcloudError, match=r"no point array 'og_label'.*mesh.og.segment"):
+        pv.PolyData(scene.xyz).og.color()
+
+
+def test_a_scene_is_read_cropped_and_saved_as_a_scene(bundle, tmp_path):
+    mesh = pv.read(bundle)
+    scene = og.load(bundle)
+    assert np.array_equal(mesh.points, scene.xyz)
+    assert np.array_equal(mesh["RGB"], scene.cloud.rgb)
+    part = mesh.clip_box([0, 1, 0, 1, -1, 1], invert=False)
+    part.save(tmp_path / "part.ogpc")
+    kept = og.load(tmp_path / "part.ogpc")
+    assert 0 < len(kept.xyz) == part.n_points < len(scene.xyz)
+    assert np.array_equal(kept.instances_at(kept.xyz), scene.instances_at(kept.xyz))
+    assert (
+        kept.cloud.instances.points.tolist()
+        == np.bincount(kept.instance_ids[kept.instance_ids >= 0], minlength=9).tolist()
+    )
+    assert og.select(kept, "plum").instances == tuple(
+        k for k in og.select(scene, "plum").instances if (kept.instance_ids == k).any()
+    )
+
+
+def test_what_is_no_scene_is_not_saved_as_one(bundle, tmp_path):
+    mesh, target = pv.read(bundle), tmp_path / "out.ogpc"
+    with pytest.raises(
+        og.OgPointcloudError, match=r"PolyData of 842 points without point array 'og_instance' is no scene"
+    ):
+        pv.Sphere().save(target)
+    mesh.field_data.remove("og_pointcloud_scene")
+    with pytest.raises(og.OgPointcloudError, match="without field 'og_pointcloud_scene'"):
+        mesh.save(target)
+    with pytest.raises(og.OgPointcloudError, match="expected another name"):
+        pv.read(bundle).save(bundle)
+    wrong = pv.read(bundle)
+    wrong["og_instance"] = wrong["og_instance"] + 5
+    with pytest.raises(og.OgPointcloudError, match="has 9 instances: segment it again"):
+        wrong.save(target)
+    assert list(tmp_path.iterdir()) == []
+    (tmp_path / "damaged.ogpc").write_bytes(b"PK nothing")
+    with pytest.raises(og.BundleError):
+        pv.read(tmp_path / "damaged.ogpc")
+
+
+def colors_seen(plotter):
+    image = np.asarray(plotter.screenshot(return_img=True))[..., :3]
+    return {tuple(color) for color in np.unique(image.reshape(-1, 3), axis=0).tolist()}
+
+
+def test_a_segmentation_is_drawn_in_its_colours_with_a_legend(plotter, scene):
+    mesh = pv.PolyData(scene.xyz).og.segment(["apple", "pear", "plum"], scene)
+    plotter.og.add_segmentation(mesh, names=False, legend=False)
+    plotter.view_isometric()
+    wanted = {tuple(color) for color in label_colors(np.unique(mesh["og_label"][mesh["og_label"] >= 0])).tolist()}
+    assert wanted | {UNKNOWN_COLOR} <= colors_seen(plotter)
+    assert plotter.renderer.legend is None
+    plotter.og.add_segmentation(mesh)
+    legend = plotter.renderer.legend
+    counts = og.segment(scene, ["apple", "pear", "plum"]).counts()
+    entries = [legend.GetEntryString(k) for k in range(legend.GetNumberOfEntries())]
+    ordered = sorted((name for name in counts if counts[name]), key=lambda name: -counts[name])
+    assert entries == [*(f"{name}  {counts[name]:,}" for name in ordered), f"unknown  {(mesh['og_label'] < 0).sum():,}"]
+    assert len([name for name in plotter.actors if name.startswith("og_segmentation")]) == 2, "drawn again, not twice"
+
+
+def test_the_datasets_own_colours_shade_those_of_the_labels(plotter, scene):
+    mesh = pv.PolyData(scene.xyz).og.segment(["plum"], scene)
+    mesh["RGB"] = np.where(np.arange(mesh.n_points)[:, None] % 2, 255, 0).astype(np.uint8) * np.ones(3, np.uint8)
+    plotter.og.add_segmentation(mesh, names=False, legend=False)
+    plotter.view_isometric()
+    full = label_colors(np.array([0]))[0]
+    assert {tuple(full.tolist()), tuple((full * 0.5).astype(int).tolist())} <= colors_seen(plotter)
+
+
+def test_what_cannot_be_drawn_is_said(plotter, scene):
+    mesh = pv.PolyData(scene.xyz)
+    with pytest.raises(og.OgPointcloudError, match="no point array 'og_label'"):
+        plotter.og.add_segmentation(mesh)
+    with pytest.raises(og.OgPointcloudError, match=r"0 points.*cannot be drawn"):
+        plotter.og.add_segmentation(pv.PolyData())
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        unknown = pv.PolyData(scene.xyz + 50).og.segment(["plum"], scene)
+    with pytest.warns(UserWarning, match="has a label: all are drawn grey"):
+        plotter.og.add_segmentation(unknown)
+    with pytest.warns(UserWarning, match="no instance with points to draw a box around"):
+        assert plotter.og.add_boxes(unknown) is None
+    holes = mesh.og.segment(["plum"], scene)
+    holes.points[:7] = np.nan
+    with pytest.warns(UserWarning, match="7 of 3,000 points hold NaN"):
+        plotter.og.add_segmentation(holes, names=False, legend=False)
+    plotter.view_isometric()
+    assert tuple(label_colors(np.array([0]))[0].tolist()) in colors_seen(plotter)
+
+
+def test_boxes_of_a_scene_and_of_a_dataset(plotter, scene):
+    mesh = pv.PolyData(scene.xyz).og.segment(["plum"], scene)
+    of_mesh, of_scene = plotter.og.add_boxes(mesh), plotter.og.add_boxes(scene, names=True, name="all")
+    assert of_mesh.mapper.dataset.n_cells < of_scene.mapper.dataset.n_cells == 12 * len(scene.instances)
+    assert "all_names-labels" in plotter.actors
+
+
+def click_on(plotter, point):
+    plotter.renderer.SetWorldPoint(*point, 1)
+    plotter.renderer.WorldToDisplay()
+    plotter.iren._mouse_left_button_click(*np.rint(plotter.renderer.GetDisplayPoint()[:2]).astype(int).tolist())
+
+
+def test_a_click_shows_the_instance_and_its_words(plotter, scene):
+    hits = []
+    plotter.og.add_segmentation(pv.PolyData(scene.xyz).og.segment(["plum", "apple"], scene), legend=False, names=False)
+    plotter.og.enable_click_query(scene, callback=hits.append, words=2)
+    plotter.view_isometric()
+    plotter.show(auto_close=False)
+    magenta = tuple(pv.Color(HIGHLIGHT).int_rgb)
+    assert magenta not in colors_seen(plotter)
+    wanted = scene.instances[7]
+    toward_eye = np.asarray(plotter.camera.position) - np.asarray(plotter.camera.focal_point)
+    click_on(plotter, wanted.xyz[(wanted.xyz @ toward_eye).argmax()])
+    assert [hit.instance for hit in hits] == [7]
+    assert magenta in colors_seen(plotter)
+    assert plotter.actors["og_highlight"].mapper.dataset.n_points == wanted.points
+    answer = plotter.actors["og_answer"].GetText(0)
+    words = og.pick(scene, wanted.xyz[0]).words()[:2]
+    assert answer.split("\n") == [str(hits[0]), *(f"{score:5.2f}  {word}" for word, score in words)]
+    background = scene.xyz[np.flatnonzero(scene.instance_ids == og.BACKGROUND)[0]]
+    assert not plotter.og.query(background).found
+    assert plotter.actors["og_answer"].GetText(0).startswith("background")
+    assert magenta not in colors_seen(plotter)
+
+
+def test_a_click_asks_the_scene_drawn_last(plotter, bundle, monkeypatch):
+    monkeypatch.delenv("OG_POINTCLOUD_SCENE", raising=False)
+    with pytest.raises(og.OgPointcloudError, match="no scene to ask"):
+        plotter.og.enable_click_query()
+    with pytest.raises(og.OgPointcloudError, match=r"call plotter\.og\.enable_click_query"):
+        plotter.og.query((0, 0, 0))
+    mesh = pv.read(bundle).og.segment(["plum"])
+    plotter.og.add_segmentation(mesh)
+    plotter.og.enable_click_query()
+    row = int(np.argmax(mesh["og_instance"] >= 0))
+    assert plotter.og.query(mesh.points[row]).instance == mesh["og_instance"][row]
+
+
+def test_a_scene_without_words_still_answers_clicks(plotter, tmp_path):
+    bare = write_bundle(replace(room(), vocabulary=None), tmp_path / "bare.ogpc")
+    plotter.og.enable_click_query(bare)
+    row = int(np.argmax(og.load(bare).instance_ids >= 0))
+    plotter.og.query(og.load(bare).xyz[row])
+    assert "no words of its own: pass labels" in plotter.actors["og_answer"].GetText(0)
+
+
+def balls(folder):
+    """Three balls of one instance each, on background: what the examples are run on."""
+    random = np.random.default_rng(0)
+    middle = np.repeat([[0, 0, 0.5], [2, 0, 0.5], [1, 1.6, 0.5]], 800, axis=0)
+    surface = random.normal(size=middle.shape)
+    floor = np.c_[random.random((1500, 2)) * [4, 3.6] - 1, np.zeros(1500)]
+    xyz = np.concatenate([middle + 0.5 * surface / np.linalg.norm(surface, axis=1, keepdims=True), floor])
+    return write_bundle(make_cloud(xyz, np.append(np.repeat([0, 1, 2], 800), [-1] * 1500)), folder / "balls.ogpc")
+
+
+@pytest.mark.parametrize(
+    ("example", "files"),
+    [
+        ("01_label_a_cloud.py", ["labels.png", "labels.vtp"]),
+        ("02_instances_and_boxes.py", ["instances.csv", "instances.png"]),
+        ("03_click_query.py", ["after.png", "before.png"]),
+    ],
+)
+def test_examples_leave_their_pictures(drawing, tmp_path, monkeypatch, capsys, example, files):
+    assert len((EXAMPLES / example).read_text().splitlines()) < 60
+    monkeypatch.setattr(sys, "argv", [example, str(balls(tmp_path)), "-o", str(tmp_path / "out")])
+    runpy.run_path(str(EXAMPLES / example), run_name="__main__")
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == files
+    pictures = [np.asarray(pv.read(tmp_path / "out" / name).active_scalars) for name in files if name.endswith(".png")]
+    for picture in pictures:
+        assert len(np.unique(picture.reshape(len(picture), -1), axis=0)) > 3, "not a blank picture"
+    if example.startswith("03"):
+        assert "instance" in capsys.readouterr().out
+        assert (pictures[0] == pv.Color(HIGHLIGHT).int_rgb).all(axis=-1).sum() > 500
+        assert not (pictures[1] == pv.Color(HIGHLIGHT).int_rgb).all(axis=-1).any()

@@ -1,0 +1,233 @@
+"""`og-pointcloud view` of a scene: what the page holds, what the picture shows, and what is refused."""
+
+import base64
+import json
+import re
+import shutil
+import subprocess
+import zlib
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from conftest import write_ply
+from labelled_clouds import make_cloud, room
+from og_pointcloud_export import write_bundle
+
+import og_pointcloud as og
+from og_pointcloud.cli import main
+from og_pointcloud.cloud import Vocabulary
+from og_pointcloud.page import write_page
+from og_pointcloud.viewpoint import FOCAL, Viewpoint, choose_viewpoint
+
+Z_UP = np.array([0.0, 0, 1])
+
+
+@pytest.fixture(scope="module")
+def bundle(tmp_path_factory):
+    return write_bundle(room(), tmp_path_factory.mktemp("room") / "room.ogpc")
+
+
+def content(page):
+    """What is shown: the JSON in a page, with its arrays unpacked."""
+    text = page.read_text(encoding="utf-8")
+    data = json.loads(re.search(r'<script id="scene" type="application/json">(.*?)</script>', text, re.DOTALL)[1])
+    for name, kind in (("place", "<u2"), ("rgb", "u1"), ("instance", "<i4"), ("word_scores", "<u2")):
+        if data[name]:
+            data[name] = np.frombuffer(zlib.decompress(base64.b64decode(data[name])), kind)
+    return data
+
+
+def run(capsys, *arguments):
+    try:
+        code = main([str(argument) for argument in arguments])
+    except SystemExit as leaving:
+        code = leaving.code
+    printed = capsys.readouterr()
+    return code, printed.out, printed.err
+
+
+def test_the_page_holds_what_segment_answers(bundle, tmp_path, capsys):
+    page = tmp_path / "new folder" / "room.html"
+    code, stdout, _ = run(capsys, "view", bundle, "--labels", "plum,apple", "--html", page, "--boxes", "--cut", "0.25")
+    assert code == 0
+    assert f"wrote {page}" in stdout
+    scene, data = og.load(bundle), content(page)
+    result = og.segment(scene, ["plum", "apple"])
+    assert data["names"] == ["plum", "apple"]
+    assert dict(zip(data["names"], data["counts"], strict=True)) == result.counts()
+    assert (data["boxes"], data["cut"], data["mode"], data["calibrated"]) == (True, 0.25, "labels", False)
+    place = data["place"].reshape(-1, 3) / 65535 * data["size"] + data["low"]
+    middle = (scene.xyz.min(axis=0) + scene.xyz.max(axis=0)) / 2
+    assert np.abs(place + middle - scene.xyz).max() <= np.ptp(scene.xyz, axis=0).max() / 131000
+    assert np.array_equal(data["instance"], result.instances)
+    assert np.array_equal(data["rgb"].reshape(-1, 3), scene.cloud.rgb)
+    label = np.append([row["label"] for row in data["instances"]], [-1, -1, -1])
+    assert np.array_equal(label[data["instance"]], result.labels)
+    table = og.instance_table(scene, up=Z_UP, words=6)
+    for row, shown in zip(table, data["instances"], strict=True):
+        assert [tuple(word) for word in shown["words"]] == list(row.words)
+        assert np.allclose(np.array(shown["box"]) + middle, row.oriented_box.corners)
+    scores = scene.chooser.choose(scene.vocabulary.vectors).scores
+    stored = data["lowest"] + data["word_scores"].reshape(scores.shape) / 65535 * (data["highest"] - data["lowest"])
+    known = np.isfinite(scores)
+    assert np.abs(stored - scores)[known].max() < 1e-4
+
+
+def test_the_page_needs_nothing_from_elsewhere(bundle, tmp_path, capsys):
+    page = tmp_path / "room.html"
+    run(capsys, "view", bundle, "--html", page)
+    text = page.read_text(encoding="utf-8")
+    assert not re.search(r"https?:|src=|href=|import\(|fetch\(|@import|url\(", text)
+
+
+def test_names_cannot_break_out_of_the_page(tmp_path):
+    name = "</script><script>alert(1)</script><!--"
+    cloud = room(300)
+    assert cloud.vocabulary is not None
+    cloud = replace(cloud, vocabulary=Vocabulary((name, *cloud.vocabulary.names[1:]), cloud.vocabulary.vectors))
+    scene = og.LabelledScene.from_cloud(cloud)
+    page = tmp_path / "page.html"
+    result = og.segment(scene)
+    write_page(page, scene, result, Viewpoint(np.ones(3), np.zeros(3), Z_UP), title=name)
+    assert "alert(1)</script>" not in page.read_text(encoding="utf-8")
+    assert content(page)["names"][0] == content(page)["title"] == name
+
+
+def test_other_points_by_instance_with_rows_that_are_no_number(bundle, tmp_path, capsys):
+    scene = og.load(bundle)
+    xyz = np.concatenate([scene.xyz[::2], [[9, 9, 9]]]).astype(np.float32)
+    write_ply(tmp_path / "other.ply", xyz, np.tile(np.arange(len(xyz))[:, None] % 256, 3).astype(np.uint8))
+    page = tmp_path / "other.html"
+    assert run(capsys, "view", bundle, "--cloud", tmp_path / "other.ply", "--html", page, "--instances")[0] == 0
+    data = content(page)
+    assert (data["title"], data["mode"], data["points"]) == ("other", "instances", len(xyz))
+    assert np.array_equal(data["instance"], og.segment(xyz, None, scene).instances)
+    assert np.array_equal(data["rgb"].reshape(-1, 3)[:, 0], np.arange(len(xyz)) % 256)
+    result = og.segment(np.concatenate([scene.xyz[:9], [[np.nan] * 3]]), None, scene)
+    left_out = write_page(page, scene, result, Viewpoint(np.ones(3), np.zeros(3), Z_UP), title="")
+    assert left_out == "1 of 10 points"
+    assert content(page)["points"] == 9
+
+
+def test_nothing_found_is_said(bundle, tmp_path, capsys):
+    write_ply(tmp_path / "far.ply", np.full((5, 3), 50, np.float32), np.zeros((5, 3), np.uint8))
+    code, _, stderr = run(capsys, "view", bundle, "--cloud", tmp_path / "far.ply", "--html", tmp_path / "far.html")
+    assert code == 0
+    assert "none of 5 points has a label: 5 are too far from the scene" in stderr
+    empty = write_bundle(make_cloud(np.zeros((0, 3)), []), tmp_path / "empty.ogpc")
+    code, _, stderr = run(capsys, "view", empty, "--html", tmp_path / "empty.html")
+    assert code == 2
+    assert "has no point to show" in stderr
+    assert not (tmp_path / "empty.html").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--features"], "--features is for a capture, but"),
+        (["-o", "x.png"], "a picture is --png, a page --html"),
+        (["--html", "x.png"], "expected a name that ends in .html or .htm"),
+        (["--html", "x.html", "--cut", "1"], "--cut is 1.0; expected a share"),
+        (["--html", "x.html", "--labels", "appel"], "did you mean 'apple'"),
+        (["--html", "x.html", "--instances", "s.ogpc"], "expected no value where a scene is shown"),
+        ([], "there is no display for a window"),
+    ],
+)
+def test_bad_use_is_refused_in_one_line(bundle, tmp_path, capsys, monkeypatch, options, said):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sys.platform", "linux")
+    monkeypatch.delenv("DISPLAY", raising=False)
+    if not options:
+        pytest.importorskip("pyvista")
+    code, _, stderr = run(capsys, "view", bundle, *options)
+    assert code == 2
+    assert said in stderr
+    assert len(stderr.splitlines()) == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_capture_is_told_from_a_scene(tmp_path, capsys):
+    (tmp_path / "capture").mkdir()
+    for options, said in [
+        (["--html", "x.html"], "--html is for a scene (.ogpc), but"),
+        ([], "one of the arguments --features --instances is required"),
+        (["--features", "--instances", "s.ogpc"], "not allowed with"),
+        (["--instances"], "--instances has no value; expected the fit of"),
+    ]:
+        code, _, stderr = run(capsys, "view", tmp_path / "capture", *options)
+        assert code == 2
+        assert said in stderr
+
+
+def test_where_nothing_can_draw_the_cure_is_named(bundle, tmp_path, capsys, monkeypatch):
+    plugin = pytest.importorskip("og_pointcloud_pyvista")
+    monkeypatch.setattr(plugin, "can_render", lambda: False)
+    code, _, stderr = run(capsys, "view", bundle, "--png", tmp_path / "room.png")
+    assert code == 2
+    assert "apt-get install libegl1, or libosmesa6), or write a page (--html" in stderr
+    monkeypatch.setattr("og_pointcloud.cli.view.find_spec", lambda name: None)
+    assert "og-pointcloud[pyvista]" in run(capsys, "view", bundle, "--png", tmp_path / "room.png")[2]
+    assert run(capsys, "view", bundle, "--html", tmp_path / "room.html")[0] == 0, "a page needs no PyVista"
+
+
+def test_a_picture_shows_the_labels(bundle, tmp_path, capsys):
+    plugin = pytest.importorskip("og_pointcloud_pyvista")
+    if not plugin.can_render():
+        pytest.skip("VTK cannot draw off-screen here")
+    import cv2
+
+    code, stdout, _ = run(capsys, "view", bundle, "--labels", "plum,apple", "--boxes", "--png", tmp_path / "room.png")
+    assert code == 0
+    assert f"wrote {tmp_path / 'room.png'}" in stdout
+    picture = cv2.imread(str(tmp_path / "room.png"))[..., ::-1].astype(int)
+    assert picture.shape == (1000, 1600, 3)
+    assert 0.05 < (picture < 250).any(axis=-1).mean() < 0.9
+    hue_of = og.segmentation.label_colors(np.arange(2)).astype(float)
+    colored = picture[np.ptp(picture, axis=-1) > 40]
+    direction = colored / np.linalg.norm(colored, axis=1, keepdims=True)
+    for color in hue_of:  # shaded by the cloud's own colours: the same hue, darker
+        assert (direction @ (color / np.linalg.norm(color)) > 0.999).mean() > 0.05
+
+
+def test_the_view_is_from_where_labelled_points_are_in_sight():
+    random = np.random.default_rng(0)
+    wall = np.c_[np.full(4000, 0.0), random.random((4000, 2)) * [4, 3] - [2, 0]]
+    thing = np.array([0.4, 0, 0.4]) + 0.2 * random.random((400, 3))
+    for side in (1, -1):
+        xyz = np.concatenate([wall, thing]) * [side, 1, 1]
+        view = choose_viewpoint(xyz, np.arange(len(xyz)) >= len(wall), Z_UP)
+        assert side * (view.eye - view.target)[0] > 0, "the wall would hide it"
+        assert (view.eye - view.target)[2] > 0
+        back = (view.eye - view.target) / np.linalg.norm(view.eye - view.target)
+        right = np.cross(Z_UP, back) / np.linalg.norm(np.cross(Z_UP, back))
+        x, y, depth = np.stack([right, np.cross(back, right), -back]) @ (xyz - view.eye).T
+        assert np.mean((np.abs(FOCAL * y / depth) < 1) & (np.abs(FOCAL * x / depth) < 1.6)) > 0.97
+        assert np.abs(FOCAL * y / depth).max() > 0.7, "it fills the picture"
+    one = choose_viewpoint(np.ones((1, 3)), np.zeros(1, bool), Z_UP)
+    assert np.isfinite(one.eye).all()
+
+
+def test_a_browser_opens_the_page_and_answers(bundle, tmp_path, capsys):
+    browser = shutil.which("chromium") or shutil.which("google-chrome")
+    if browser is None:
+        pytest.skip("no Chromium here")
+    page = tmp_path / "room.html"
+    run(capsys, "view", bundle, "--labels", "plum,apple", "--html", page)
+    command = [
+        browser, "--headless", "--no-sandbox", "--no-first-run", "--disable-background-networking", "--disable-sync",
+        "--disable-component-update", f"--user-data-dir={tmp_path / 'profile'}", "--use-angle=swiftshader",
+        "--enable-unsafe-swiftshader", "--window-size=500,400", "--virtual-time-budget=5000", "--dump-dom",
+    ]  # fmt: skip
+    done = subprocess.run([*command, f"file://{page}#instance=3"], capture_output=True, text=True, timeout=100)
+    dom = done.stdout.split("<script id=")[0] + done.stdout.split("</script>")[-1]
+    if "has no WebGL 2" in dom.split("<canvas")[-1]:
+        pytest.skip("this Chromium has no WebGL 2")
+    assert 'data-ready="yes"' in done.stdout, done.stderr[-500:]
+    counts = og.segment(bundle, ["plum", "apple"]).counts()
+    for name, count in counts.items():
+        assert re.search(rf"<span class=\"\">{name}</span><small class=\"number\">{count:,}</small>", dom)
+    words = og.load(bundle).instances[3].words
+    assert re.search(
+        rf"<h2>.*?instance 3 · .*?<span class=\"\">{words[0][0]}</span><span class=\"number\">{words[0][1]:.2f}", dom
+    )
