@@ -158,7 +158,8 @@ def _members(file: BinaryIO) -> tuple[dict[str, bytes], dict[str, int]]:
         return {info.filename: archive.read(info) for info in infos if info.filename not in carried}, carried
     except ZIP_ERRORS as error:
         raise _Refused(
-            f"not a .ogpc file, or damaged ({error!s:.120}); expected a zip of stored members: copy it again or {REBUILD}"
+            f"not a .ogpc file, or damaged ({error!s:.120}); expected a zip of stored members: copy it again or "
+            f"{REBUILD}"
         ) from None
 
 

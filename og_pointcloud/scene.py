@@ -52,9 +52,10 @@ class Camera:
         rotation = pose[:3, :3]
         with np.errstate(over="ignore", invalid="ignore"):
             error = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
-        if not error <= 1e-2 or np.linalg.det(rotation) < 0:
+            determinant = float(np.linalg.det(rotation))
+        if not error <= 1e-2 or determinant < 0:  # also where the error is NaN
             raise SceneError(
-                f"camera rotation is off a rotation matrix by {error:.3g} (det {np.linalg.det(rotation):.3g}); "
+                f"camera rotation is off a rotation matrix by {error:.3g} (det {determinant:.3g}); "
                 "expected a rigid right-handed pose: remove scale or mirroring from the pose file"
             )
         if self.width < 1 or self.height < 1:

@@ -123,7 +123,7 @@ def _read_features(file: Path, names: Sequence[str]) -> tuple[dict[str, NDArray[
         raise
     except (zipfile.BadZipFile, zlib.error, ValueError, OSError, EOFError, RuntimeError) as error:
         raise SceneError(
-            f"{file} cannot be read as an .npz of plain arrays ({error}): write it again with numpy.savez"
+            f"{file} cannot be read as an .npz of plain arrays ({error!s:.120}): write it again with numpy.savez"
         ) from None
     return features, space
 

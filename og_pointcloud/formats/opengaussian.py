@@ -156,7 +156,7 @@ def _arrays(file: Path) -> dict[str, NDArray[Any]]:
             missing = [name for name in wanted if name not in entries]
             if missing:
                 raise SceneError(
-                    f"no '{missing[0]}' (it has {', '.join(entries) or 'nothing'}); expected {', '.join(wanted)}: "
+                    f"no '{missing[0]}' (it has {', '.join(entries) or 'nothing':.120}); expected {', '.join(wanted)}: "
                     "name the file that OpenGaussian wrote last"
                 )
             size = sum(entries[name].file_size for name in wanted)
@@ -167,7 +167,7 @@ def _arrays(file: Path) -> dict[str, NDArray[Any]]:
         raise
     except (zipfile.BadZipFile, zlib.error, ValueError, EOFError, RuntimeError) as error:
         raise SceneError(
-            f"cannot be read as an .npz of plain arrays ({error}): associate again or copy it anew"
+            f"cannot be read as an .npz of plain arrays ({error!s:.120}): associate again or copy it anew"
         ) from None
 
 

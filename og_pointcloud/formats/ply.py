@@ -26,6 +26,8 @@ __all__ = ["join_columns", "read_ply", "write_ply"]
 HEADER_LIMIT = 1 << 18
 """Bytes in which a header must end; the longest known (a 3DGS file with its training record) has 4 kB."""
 
+LONGEST_NAME = 80
+
 NUMPY_TYPES = {
     "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4",
     "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4",
@@ -134,11 +136,11 @@ def _parse_header(head: bytes) -> _Header:
                 continue
             case ["format", encoding, "1.0"] if encoding in BYTE_ORDERS and byte_order is None:
                 byte_order = BYTE_ORDERS[encoding]
-            case ["element", name, count] if re.fullmatch("[0-9]{1,15}", count):
+            case ["element", name, count] if re.fullmatch("[0-9]{1,15}", count) and len(name) <= LONGEST_NAME:
                 if any(name == element.name for element in elements):
                     raise SceneError(f"header line {number}: element '{name}' is declared twice")
                 elements.append(_Element(name, int(count), []))
-            case ["property", *words] if elements:
+            case ["property", *words] if elements and all(len(word) <= LONGEST_NAME for word in words):
                 _add_property(elements[-1], words, number)
             case _:
                 raise SceneError(

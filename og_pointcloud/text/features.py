@@ -64,7 +64,7 @@ def _entries(path: Path) -> dict[str, NDArray[Any]]:
             return {name: array_from_npy(archive.read(infos[name])) for name in wanted}
     except (zipfile.BadZipFile, zlib.error, ValueError, EOFError, RuntimeError, OSError) as error:
         raise FeatureSpaceError(
-            f"{path} cannot be read as an .npz of plain arrays ({error}): write it again with numpy.savez"
+            f"{path} cannot be read as an .npz of plain arrays ({error!s:.120}): write it again with numpy.savez"
         ) from None
 
 

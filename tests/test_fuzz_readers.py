@@ -1,0 +1,273 @@
+"""Damaged and lying files: a few hundred for every reader, and those, by name, that once got through."""
+
+from __future__ import annotations
+
+import json
+import struct
+import zipfile
+from itertools import count
+from random import Random
+
+import fuzz_readers
+import numpy as np
+import pytest
+from fuzz_changes import BY_SUFFIX, changed, mended, packed, unpacked
+from fuzz_files import READERS, Reader, bundle_members, encoders, language_features, transforms
+from fuzz_readers import make_input, try_input
+from hypothesis import given, settings
+from hypothesis import strategies as some
+
+from og_pointcloud._npy import array_from_npy, npy_bytes
+from og_pointcloud.bundle import read_bundle, read_carried_encoder
+from og_pointcloud.cli import main
+from og_pointcloud.errors import BundleError, OgPointcloudError, SceneError
+from og_pointcloud.formats.langsplat import read_language_features
+from og_pointcloud.formats.nerfstudio import read_transforms
+from og_pointcloud.formats.pcd import read_pcd
+from og_pointcloud.formats.ply import read_ply
+from og_pointcloud.scene import Camera
+from og_pointcloud.text.encoder import TextEncoder, check_templates, encoder_files
+
+INPUTS = {"scene file": 120, "scene file, its members": 80, "scene file, asked": 40, "graph": 120, "text encoder": 100}
+INPUTS |= {"LangSplat": 120, "OpenGaussian result": 60, "masks": 120, "capture": 60}
+"""Of the readers that take milliseconds; 150 of each of the others."""
+
+
+@pytest.mark.parametrize("name", READERS)
+def test_every_input_is_read_or_refused(name, tmp_path):
+    reader = READERS[name]
+    seeds = reader.seeds()
+    outcomes = {"read": 0, "refused": 0}
+    for number in range(INPUTS.get(name, 150)):
+        outcome, says = try_input(reader, make_input(reader, seeds, 7, number), tmp_path)
+        assert outcome != "unexpected", f"input {number}: {says}"
+        outcomes[outcome] += 1
+    assert min(outcomes.values()) > 0  # changes that all readers refuse, or none, would say nothing
+
+
+@pytest.mark.parametrize("name", READERS)
+def test_the_files_that_are_changed_are_valid(name, tmp_path):
+    reader = READERS[name]
+    for files in reader.seeds():
+        whole = {"scene.ogpc": packed(files)} if reader.whole else files
+        assert try_input(reader, whole, tmp_path) == ("read", "")
+
+
+# What tries the readers must see what they do wrong.
+
+
+def test_what_is_unexpected_is_told(tmp_path):
+    def outcome(read):
+        return try_input(Reader("", list, read), {"a.txt": b"x"}, tmp_path)
+
+    def fail(error):
+        raise error
+
+    assert outcome(lambda at: (at / "a.txt").read_bytes()) == ("read", "")
+    assert outcome(lambda at: fail(SceneError(f"{at}: no"))) == ("refused", ": no")
+    assert outcome(lambda at: (at / "b.txt").read_bytes())[0] == "refused"
+    for error in (KeyError("x"), MemoryError(), RecursionError(), AssertionError(), ValueError("x"), OSError("x")):
+        assert outcome(lambda at, error=error: fail(error))[0] == "unexpected"
+    assert "RuntimeWarning" in outcome(lambda at: np.float32(3e38) * np.float32(3e38))[1]
+    assert outcome(lambda at: fail(SceneError("x" * 401))) == (
+        "unexpected",
+        f"a message of 401 characters: {'x' * 120!r}",
+    )
+    assert outcome(lambda at: fail(FileNotFoundError("a\nb")))[0] == "unexpected"
+
+
+def test_what_takes_long_is_told(tmp_path, monkeypatch):
+    monkeypatch.setattr(fuzz_readers, "MOST_SECONDS", 0.01)
+    reader = Reader("", list, lambda at: next(number for number in count() if number > 1_000_000))
+    assert "of processor time; then read" in try_input(reader, {}, tmp_path)[1]
+
+
+def test_an_input_is_the_same_again_and_others_differ():
+    reader = READERS["text features"]
+    seeds = reader.seeds()
+    first = [make_input(reader, seeds, 3, number) for number in range(20)]
+    assert first == [make_input(reader, seeds, 3, number) for number in range(20)]
+    assert len({json.dumps(files, default=bytes.hex) for files in first}) > 15
+    assert make_input(reader, seeds, 4, 0) != first[0]
+
+
+@pytest.mark.parametrize("suffix", sorted(BY_SUFFIX))
+def test_changes_survive_any_content(suffix):
+    for number in range(60):
+        random = Random(number)
+        data = random.randbytes(number)
+        assert isinstance(changed(random, f"a{suffix}", data), bytes)
+
+
+def test_crashes_and_hangs_of_a_reader_are_survived(capsys):
+    tally = fuzz_readers.fuzz(READERS["words"], 30, 0, 60)
+    assert (tally.tried, tally.unexpected) == (30, [])
+    assert fuzz_readers.main(["--reader", "words", "--count", "5"]) == 0
+    assert capsys.readouterr().out.splitlines()[1].split()[:2] == ["words", "5"]
+    assert fuzz_readers.main(["--reader", "words", "--only", "3"]) == 0
+
+
+# What once got through.
+
+
+def test_messages_are_printable_whatever_the_file_says(capsys, tmp_path):
+    error = SceneError("a\x1b[31m b\ud800\r\n\u202e café \U0001f44d")
+    assert str(error) == "a\\x1b[31m b\\ud800\\r\\n\\u202e café \U0001f44d"
+    (tmp_path / "\x1b[2J.ogpc").write_bytes(b"")
+    assert main(["info", str(tmp_path / "\x1b[2J.ogpc")]) != 0
+    assert "\x1b" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        "{'descr': '<f4', 'fortran_order': False, 'shape': (True, 3), }",
+        "{'descr': '<f4', 'fortran_order': False, 'shape': (9999999999999999999999,), }",
+        "{'descr': '<f4', 'fortran_order': False, 'shape': (" + "1, " * 5000 + "), }",
+        "x" * 5000,
+    ],
+)
+def test_array_headers(tmp_path, header):
+    data = b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header.encode() + bytes(12)
+    if "True" in header:  # counts as one
+        assert array_from_npy(data).shape == (1, 3)
+        return
+    with pytest.raises(ValueError, match="header") as caught:
+        array_from_npy(data)
+    assert str(caught.value).isprintable()
+    assert len(str(caught.value)) < 200
+    for name, content in language_features()[0].items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(data if name.endswith("a_s.npy") else content)
+    with pytest.raises(SceneError, match=r"a_s\.npy cannot be read as a \.npy array"):
+        read_language_features(tmp_path, ("a", "b"), "large")
+
+
+@pytest.mark.parametrize("value", [10**400, -(10**400), 1e400, float("nan"), "y" * 3000, True, []])
+def test_numbers_of_a_pose_file(tmp_path, value):
+    content = json.loads(transforms()[0]["transforms.json"])
+    content["fl_x"] = value
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    with pytest.raises(SceneError, match=r"fl_x is .*; expected a finite number") as caught:
+        read_transforms(tmp_path / "transforms.json", lambda _: (48, 36))
+    assert len(str(caught.value)) < 400 + len(str(tmp_path))
+
+
+def test_a_pose_that_overflows_is_refused():
+    pose = np.eye(4)
+    pose[:3, :3] = [[1e200, -1e200, 0], [1e200, 1e200, 0], [0, 0, 1]]  # its product with itself is inf - inf
+    with pytest.raises(SceneError, match="rigid right-handed pose"):
+        Camera(4, 4, 1.0, 1.0, 2.0, 2.0, pose)
+
+
+def test_an_encoder_is_read_without_allocating_what_it_might_be(tmp_path):
+    import tracemalloc
+
+    for name, data in encoders()[0].items():
+        (tmp_path / name).write_bytes(data)
+    tracemalloc.start()
+    try:
+        encoder_files(tmp_path)
+        assert tracemalloc.get_traced_memory()[1] < 1 << 22
+    finally:
+        tracemalloc.stop()
+
+
+def test_templates_that_are_no_texts(tmp_path):
+    for templates in ([None], ["{}", None], [3], []):
+        with pytest.raises(OgPointcloudError, match="has no place for the name"):
+            check_templates(templates)
+    files = encoders()[0]
+    manifest = {**json.loads(files["manifest.json"]), "templates": [None]}
+    files = mended({**files, "manifest.json": json.dumps(manifest).encode()}, files)
+    with pytest.raises(OgPointcloudError, match="has no place for the name"):
+        TextEncoder(files, "encoder")
+
+
+def test_a_carried_encoder_that_is_encrypted(tmp_path):
+    data = bytearray(packed(bundle_members()[1]))
+    at = max(place for place in (data.find(b"PK\x01\x02", start) for start in range(0, len(data), 64)) if place >= 0)
+    data[at + 8] |= 1
+    (tmp_path / "scene.ogpc").write_bytes(data)
+    with zipfile.ZipFile(tmp_path / "scene.ogpc") as archive:
+        assert [info.filename for info in archive.infolist() if info.flag_bits & 1] == ["text_encoder/word_bank.npy"]
+    with pytest.raises(BundleError, match=r"text encoder in it is damaged .*encrypted"):
+        read_carried_encoder(tmp_path / "scene.ogpc")
+
+
+def test_long_names_do_not_make_long_messages(tmp_path):
+    members = bundle_members()[0]
+    for name in ("z" * 3000, "\x1b" * 3000):
+        (tmp_path / "scene.ogpc").write_bytes(packed({**members, name: b""}))
+        with pytest.raises(BundleError) as caught:
+            read_bundle(tmp_path / "scene.ogpc")
+        assert len(str(caught.value)) < 600 + len(str(tmp_path))
+
+
+def test_archives_are_packed_and_unpacked_alike():
+    members = {"a": b"1", "b/c.npy": npy_bytes(np.arange(3))}
+    assert unpacked(packed(members)) == members
+    assert unpacked(packed(members, zipfile.ZIP_DEFLATED)) == members
+    assert unpacked(b"no zip") == {}
+
+
+# Headers of any form
+
+NUMBERS = some.one_of(some.integers(-3, 40), some.sampled_from((2**31, 2**32, 2**63, 10**12, 10**14, 10**20)))
+TYPES = some.sampled_from(("char", "uchar", "short", "int", "uint", "float", "double", "float32", "half", ""))
+WORDS = some.one_of(some.sampled_from(("x", "y", "z", "red", "vertex", "chunk", "a b")), some.text(max_size=4))
+PROPERTY = some.one_of(
+    some.builds("property {} {}".format, TYPES, WORDS),
+    some.builds("property list {} {} {}".format, TYPES, TYPES, WORDS),
+)
+ELEMENT = some.builds(
+    lambda name, rows, properties: "\n".join([f"element {name} {rows}", *properties]),
+    WORDS,
+    NUMBERS,
+    some.lists(PROPERTY),
+)
+
+
+def read_or_refused(read, path):
+    try:
+        return read(path), ""
+    except SceneError as error:
+        return None, str(error)
+
+
+@settings(max_examples=150, derandomize=True, deadline=None)
+@given(
+    some.sampled_from(("ascii", "binary_little_endian", "binary_big_endian", "binary")),
+    some.lists(ELEMENT, max_size=4),
+    some.binary(max_size=200),
+)
+def test_ply_headers(tmp_path_factory, encoding, elements, data):
+    header = "\n".join(["ply", f"format {encoding} 1.0", *elements, "end_header", ""]).encode("utf-8", "replace")
+    path = tmp_path_factory.getbasetemp() / "any.ply"
+    path.write_bytes(header + data)
+    arrays, refused = read_or_refused(read_ply, path)
+    assert len(refused) < 400 + len(str(path))
+    if encoding != "ascii":
+        assert sum(rows.nbytes for rows in (arrays or {}).values()) <= len(data)
+
+
+PCD_FIELD = some.tuples(WORDS, some.sampled_from("FIUX"), some.sampled_from((1, 2, 4, 8, 3)), some.integers(0, 5))
+
+
+@settings(max_examples=150, derandomize=True, deadline=None)
+@given(
+    some.lists(PCD_FIELD, min_size=1, max_size=6),
+    NUMBERS,
+    NUMBERS,
+    some.sampled_from(("ascii", "binary", "binary_compressed")),
+    some.binary(max_size=200),
+)
+def test_pcd_headers(tmp_path_factory, fields, width, height, encoding, data):
+    names, types, sizes, counts = (" ".join(map(str, column)) for column in zip(*fields, strict=True))
+    lines = ("VERSION 0.7", f"FIELDS {names}", f"SIZE {sizes}", f"TYPE {types}", f"COUNT {counts}", f"WIDTH {width}")
+    lines = (*lines, f"HEIGHT {height}", f"POINTS {width * height}", f"DATA {encoding}", "")
+    path = tmp_path_factory.getbasetemp() / "any.pcd"
+    path.write_bytes("\n".join(lines).encode("utf-8", "replace") + data)
+    rows, refused = read_or_refused(read_pcd, path)
+    assert len(refused) < 400 + len(str(path))
+    assert rows is None or rows.nbytes <= (88 * len(data) if encoding == "binary_compressed" else 8 * len(data))
