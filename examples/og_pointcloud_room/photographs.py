@@ -1,0 +1,74 @@
+"""The demo from photographs alone: images -> masks -> features -> fit -> one file -> typed words -> labels.
+
+Masks come from a proposer that needs no weights, features and words from the demo encoder that comes with the library:
+nothing is simulated but the room, and nothing is fetched. The truth is used for scoring alone.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from og_pointcloud_export import write_bundle
+
+import og_pointcloud as og
+from og_pointcloud.fitting.fit import fit
+from og_pointcloud.formats.capture import read_capture
+from og_pointcloud.masking.make_masks import MaskSettings, make_masks
+from og_pointcloud.metrics import Score, score_labels
+from og_pointcloud.settings import FitSettings
+from og_pointcloud.text.encoder import DEMO_ENCODER
+from og_pointcloud_room.furniture import CLASS_NAMES
+
+__all__ = ["FromPhotographs", "label_from_photographs"]
+
+
+@dataclass(frozen=True)
+class FromPhotographs:
+    """What came of it. masks: of all images. seconds: wall clock per stage."""
+
+    bundle: Path
+    masks: int
+    instances: int
+    labels: np.ndarray
+    score: Score
+    seconds: dict[str, float]
+
+
+def label_from_photographs(capture: Path, output: Path, proposer: str = "opencv", seed: int = 0) -> FromPhotographs:
+    """Label a room's capture, as ``write_capture`` wrote it, by the names of its classes as someone types them.
+
+    Of the capture only images, poses, points and the truth are used; ``output`` becomes a capture of its own, with the
+    masks made here, and gets ``room.ogpc``, which carries the words' encoder. proposer: as of `og-pointcloud masks`; or
+    the capture's own ``masks`` folder for those of the demo's simulated proposer.
+    """
+    seconds: dict[str, float] = {}
+    output.mkdir(parents=True, exist_ok=True)
+    with _stage("masks and features", seconds):
+        made = make_masks(capture, MaskSettings(proposer=proposer, encoder="demo"), output, overwrite=True)
+    with _stage("read the capture", seconds):
+        scene = read_capture(output)
+    with _stage("fit", seconds):
+        cloud = fit(scene, FitSettings(seed=seed), progress=sys.stderr.isatty())
+    bundle = output / "room.ogpc"
+    with _stage("write one file", seconds):
+        write_bundle(cloud, bundle, text_encoder=DEMO_ENCODER / "text")
+    truth = np.load(capture / "gt.npz")
+    with _stage("typed words to labels", seconds):
+        loaded = og.load(bundle)
+        labels = og.segment(loaded.xyz, CLASS_NAMES, scene=loaded).labels
+    score = score_labels(labels, truth["cls"], background=truth["background"])
+    return FromPhotographs(bundle, made.masks, len(cloud.instances), labels, score, seconds)
+
+
+@contextmanager
+def _stage(name: str, seconds: dict[str, float]) -> Iterator[None]:
+    start = time.perf_counter()
+    yield
+    seconds[name] = time.perf_counter() - start
+    print(f"{name:<22} {seconds[name]:6.1f} s", flush=True)
