@@ -18,6 +18,7 @@ from og_pointcloud.cli import (
     check,
     demo,
     edit,
+    eval_,
     export_image_encoder,
     export_text_encoder,
     fit,
@@ -41,7 +42,7 @@ __all__ = ["main"]
 
 COMMANDS = (
     fit, fuse, import_, segment, select, pick, instances, edit, view, ros_bag, info, vocabulary, export_text_encoder,
-    export_image_encoder, ablate, report, check, demo,
+    export_image_encoder, ablate, eval_, report, check, demo,
 )  # fmt: skip
 
 
