@@ -86,12 +86,15 @@ class Segmentation:
 
     @property
     def attributes(self) -> dict[str, NDArray[Any]]:
-        """What hosts and files keep of each point, (N,) arrays by the names that they have everywhere."""
+        """What hosts and files keep of each point, (N,) arrays by the names that they have everywhere.
+
+        og_label, og_instance int32, og_score float32, og_reason uint8, which more of them can hold than int8.
+        """
         return {
             "og_label": self.labels,
             "og_instance": self.instances,
             "og_score": self.scores,
-            "og_reason": self.reasons,
+            "og_reason": self.reasons.astype(np.uint8),
         }
 
     def to_open3d(self) -> Any:

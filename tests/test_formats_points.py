@@ -139,7 +139,7 @@ def labels_of(count):
         "og_label": (np.arange(count) % 4 - 1).astype(np.int32),
         "og_instance": np.arange(-2, count - 2, dtype=np.int32),
         "og_score": np.linspace(0, 1, count, dtype=np.float32),
-        "og_reason": (np.arange(count) % 6).astype(np.int8),
+        "og_reason": (np.arange(count) % 6).astype(np.uint8),
     }
 
 
@@ -150,7 +150,7 @@ def test_labelled_cloud_reads_back(tmp_path, offset, stored):
     write_labelled_ply(path, XYZ + offset, RGB, attributes, ["a cup", "line\nbreak"])
     rows = read_ply(path)["vertex"]
     expected = [(name, stored) for name in "xyz"] + [(name, "u1") for name in ("red", "green", "blue")]
-    labels = [("og_label", "i4"), ("og_instance", "i4"), ("og_score", "f4"), ("og_reason", "i1")]
+    labels = [("og_label", "i4"), ("og_instance", "i4"), ("og_score", "f4"), ("og_reason", "u1")]
     assert rows.dtype == np.dtype([*expected, *labels])
     for name, values in attributes.items():
         np.testing.assert_array_equal(rows[name], values)

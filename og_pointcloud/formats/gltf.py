@@ -50,7 +50,7 @@ def write_gltf(
     xyz_world: (n, 3), n at least 1; stored as float32 around their median, which is the node's translation. Axes stay
         as they are: glTF takes y to be up, so turn a scene with z up in the viewer.
     rgb: (n, 3) uint8 sRGB; stored linear, as the format wants colours.
-    attributes: og_label, og_instance (n,) int32, og_score (n,) float32, og_reason (n,) int8. Ids below 0 become the
+    attributes: og_label, og_instance (n,) int32, og_score (n,) float32, og_reason (n,) uint8. Ids below 0 become the
         feature id that says "none"; og_reason tells which none.
     names: what og_label counts. splats: Gaussians, row for row with xyz_world, which become splats of this file.
     SceneError where there are no points, a coordinate is not finite, or the splats are other points.

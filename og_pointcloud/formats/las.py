@@ -83,7 +83,7 @@ def labelled_las(
     for name, values in attributes.items():
         las[name] = values
     las.classification = _classes(attributes["og_label"])
-    las.user_data = attributes["og_reason"].astype(np.uint8)
+    las.user_data = attributes["og_reason"]
     record = json.dumps(list(names)).encode()
     names_record = laspy.VLR(RECORD_OWNER, NAMES_RECORD, "og_names", record)
     if len(record) <= SHORT_RECORD:
@@ -103,7 +103,7 @@ def write_las(
     """Write a labelled cloud, compressed where the path ends in .laz; whole or not at all.
 
     xyz_world: (n, 3); kept to a hundred-millionth of the cloud's extent, whatever its offset. rgb: (n, 3) uint8.
-    attributes: og_label, og_instance (n,) int32, og_score (n,) float32, og_reason (n,) int8: as they are in extra
+    attributes: og_label, og_instance (n,) int32, og_score (n,) float32, og_reason (n,) uint8: as they are in extra
         bytes; og_label + 64 also as the classification, 1 without a label or beyond 255; og_reason also as user data.
     names: what og_label counts; JSON, in a record.
     SceneError where a coordinate is not finite; MissingExtraError without laspy.

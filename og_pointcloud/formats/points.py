@@ -65,7 +65,7 @@ def write_labelled_ply(
 
     xyz_world: (n, 3); written as float, or as double where float would move a point by more than 1e-6 of the cloud's
     extent. rgb: (n, 3) uint8. attributes: name -> (n,): og_label, og_instance (int32), og_score (float32), og_reason
-    (int8). names: what og_label counts; a comment "og_names", JSON, unless they would not fit into a header.
+    (uint8). names: what og_label counts; a comment "og_names", JSON, unless they would not fit into a header.
     """
     n = len(xyz_world)
     shapes = {"rgb": (rgb, (n, 3)), "xyz_world": (xyz_world, (n, 3))}

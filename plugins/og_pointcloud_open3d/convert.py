@@ -13,6 +13,9 @@ from numpy.typing import ArrayLike, NDArray
 import og_pointcloud as og
 from og_pointcloud.clouds import world_points
 from og_pointcloud.errors import OgPointcloudError, SceneError
+from og_pointcloud.formats.pcd import read_pcd
+from og_pointcloud.formats.ply import read_ply
+from og_pointcloud.formats.tables import naming, positions
 from og_pointcloud.runtime import SceneLike
 from og_pointcloud.segmentation import Segmentation
 from og_pointcloud.text.words import Labels, TextFeatures
@@ -31,11 +34,13 @@ class Segmented(NamedTuple):
 def read(path: str | os.PathLike[str]) -> Any:
     """Open3D's tensor cloud of a file, Gaussians with their attributes.
 
-    SceneError where Open3D would return an empty cloud and a warning: no file, no points, nothing that it can read.
+    SceneError where Open3D would return an empty cloud and a warning: no file, no points, nothing that it can read;
+    and for a damaged PLY or PCD, of which it returns whatever lies in memory.
     """
     host, path = open3d(), Path(path)
     if not path.is_file():
         raise SceneError(f"{path}: no such file; expected a point cloud")
+    _check_columns(path)
     with host.utility.VerbosityContextManager(host.utility.VerbosityLevel.Error):  # the error below says it
         cloud = host.t.io.read_point_cloud(str(path))
     if cloud.is_empty():
@@ -44,6 +49,18 @@ def read(path: str | os.PathLike[str]) -> Any:
             "file is damaged, empty, or of another kind than its name says"
         )
     return cloud
+
+
+def _check_columns(path: Path) -> None:
+    """SceneError for a PLY or PCD that is truncated or lacks x, y or z."""
+    with naming(path):
+        if path.suffix == ".ply":
+            elements = read_ply(path)
+            if "vertex" not in elements:
+                raise SceneError(f"no element 'vertex'; the file has {', '.join(elements) or 'none'}")
+            positions(elements["vertex"])
+        elif path.suffix == ".pcd":
+            positions(read_pcd(path))
 
 
 def segment(
@@ -61,7 +78,7 @@ def segment(
 
     pcd: Open3D's PointCloud or TriangleMesh, legacy or tensor, on any device, in the scene's world coordinates. What
     comes back is of the same kind with all its attributes; its colours are the labels', grey where unknown. A tensor
-    geometry has og_label, og_instance (int32), og_score (float32) and og_reason (int8) too, (N, 1) each, as Open3D's
+    geometry has og_label, og_instance (int32), og_score (float32) and og_reason (uint8) too, (N, 1) each, as Open3D's
     own filters want them.
     Other arguments: as for ``og_pointcloud.segment``. Raises as that, and SceneError for an empty cloud.
     """

@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 import tempfile
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -96,7 +97,7 @@ def draw_png(
 def highlight_png(
     path: str | os.PathLike[str],
     splats: Points | str | os.PathLike[str],
-    text: str,
+    text: str | Mapping[str, ArrayLike],
     scene: SceneLike,
     *,
     camera: Camera | None = None,
@@ -106,7 +107,8 @@ def highlight_png(
 ) -> Path:
     """Draw 3D Gaussians as .png, what a text finds in a colour of its own and all else faded. Needs Open3D 0.20.
 
-    splats: a 3DGS file, or Gaussians read from one. text: a word or phrase; against, text_features: as for ``select``.
+    splats: a 3DGS file, or Gaussians read from one.
+    text: a word or phrase, or one name -> vector. against, text_features: as for ``select``.
     scene: where the text is looked for; each splat belongs to the instance of the scene's nearest point.
     camera: as for `draw_png`. color: (3,) RGB, 0 to 255.
     OgPointcloudError where the text fits no instance, Open3D is older, or no driver draws off-screen.
@@ -117,7 +119,9 @@ def highlight_png(
         raise SceneError(f"{splats}: plain points; expected 3D Gaussians (scale, rotation, opacity): use draw_png")
     selection = og.select(scene, text, against=against, text_features=text_features)
     if not selection.fitting:
-        raise OgPointcloudError(f"'{text}' fits none of {len(selection)} instances; expected one to show: try others")
+        raise OgPointcloudError(
+            f"'{selection.query}' fits none of {len(selection)} instances; expected one to show: try others"
+        )
     found = np.isin(selection.scene.instances_at(points.xyz_world), selection.instances)
     rgb = _faded_but(points, found, np.asarray(color, np.float64))
     rows = gaussian_rows(replace(points, rgb=rgb))

@@ -1,0 +1,29 @@
+"""An Open3D cloud in, the same cloud painted by labels out, and a picture of it.
+
+python examples/04_open3d_cloud.py kitchen.ogpc points.ply --labels chair,table -o painted.png
+"""
+
+import argparse
+from pathlib import Path
+
+import og_pointcloud_open3d as og3
+import open3d as o3d
+
+parser = argparse.ArgumentParser(description="An Open3D cloud in, the same cloud painted by labels out.")
+parser.add_argument("scene", metavar="S.ogpc", help="what `og-pointcloud fit` wrote")
+parser.add_argument("cloud", metavar="CLOUD", help="a cloud of the same place, in the scene's frame")
+parser.add_argument("--labels", required=True, metavar="A,B,C")
+parser.add_argument("-o", "--output", type=Path, default=Path("painted.png"), metavar="P.png")
+arguments = parser.parse_args()
+
+cloud = og3.read(arguments.cloud)  # where Open3D would return an empty cloud, this says why
+painted, result = og3.segment(cloud, arguments.labels.split(","), arguments.scene)
+
+# Open3D's own verbs keep the labels: they are attributes (N, 1) of the tensor cloud.
+thinned = painted.voxel_down_sample(0.05)
+first = result.names[0]
+mine = thinned.select_by_mask(thinned.point["og_label"].flatten() == 0)
+print(f"{result.counts()}; {len(mine.point['positions'])} voxels of {first}")
+
+o3d.t.io.write_point_cloud(str(arguments.output.with_suffix(".ply")), painted)
+print(f"wrote {og3.draw_png(arguments.output, painted)}")

@@ -1,0 +1,333 @@
+"""The same points through every library that carries them, and labels out to files: the same answers, bit for bit."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+from labelled_clouds import make_cloud, room
+from og_pointcloud_export import write_bundle
+
+import og_pointcloud as og
+from og_pointcloud.errors import SceneError
+from og_pointcloud.formats.gltf import write_gltf
+from og_pointcloud.formats.ply import read_ply
+from og_pointcloud.scene import Points
+
+KITCHEN = Path(__file__).resolve().parents[2] / "shared" / "data" / "seven_redkitchen"
+WORDS = ["apple", "pear", "plum"]
+COMPONENTS = {5123: "<u2", 5126: "<f4"}
+WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
+
+
+def scene_of(name, folder):
+    if name == "made":
+        return og.load(write_bundle(room(), folder / "room.ogpc"))
+    if not KITCHEN.is_dir():
+        pytest.skip("shared data: seven_redkitchen")
+    xyz = og.read_points(KITCHEN / "points.ply").xyz_world
+    cells = np.unique(np.floor(xyz / 0.9).astype(int), axis=0, return_inverse=True)[1].ravel()
+    ids = np.where(cells % 5 == 0, -1, cells % 23).astype(np.int32)
+    return og.load(write_bundle(make_cloud(xyz, ids, 0.02, 0.06), folder / "kitchen.ogpc"))
+
+
+@pytest.fixture(scope="module", params=["made", "seven_redkitchen"])
+def asked(request, tmp_path_factory):
+    """A scene, points that carriers of float32 and of whole tenths of millimetres hold exactly, and their labels."""
+    scene = scene_of(request.param, tmp_path_factory.mktemp("scene"))
+    random = np.random.default_rng(1)
+    points = scene.xyz + random.normal(size=scene.xyz.shape) * 0.3 * scene.cloud.spacing
+    points = (np.round(points * 8192) / 8192).astype(np.float32).astype(np.float64)
+    expected = og.segment(points, WORDS, scene)
+    assert len(set(expected.labels.tolist())) > 2
+    return scene, points, expected
+
+
+def through_torch(points, _):
+    return pytest.importorskip("torch").from_numpy(points.copy()).requires_grad_()
+
+
+def through_torch_float32(points, _):
+    torch = pytest.importorskip("torch")
+    return torch.nn.Parameter(torch.from_numpy(points.astype(np.float32)))
+
+
+def through_cuda(points, _):
+    torch = pytest.importorskip("torch")
+    if not torch.cuda.is_available():
+        pytest.skip("no CUDA device")
+    return torch.from_numpy(points.copy()).cuda()
+
+
+def through_open3d_legacy(points, _):
+    open3d = pytest.importorskip("open3d")
+    return open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points))
+
+
+def through_open3d_tensor(points, _):
+    open3d = pytest.importorskip("open3d")
+    return open3d.t.geometry.PointCloud(open3d.core.Tensor(points.astype(np.float32)))
+
+
+def through_pyvista(points, _):
+    return pytest.importorskip("pyvista").PolyData(points)
+
+
+def through_trimesh(points, _):
+    return pytest.importorskip("trimesh").PointCloud(points)
+
+
+def through_trimesh_mesh(points, _):
+    return pytest.importorskip("trimesh").Trimesh(points, [[0, 1, 2]], process=False)
+
+
+def through_las_data(points, _):
+    laspy = pytest.importorskip("laspy")
+    header = laspy.LasHeader(point_format=3, version="1.2")
+    header.scales, header.offsets = np.full(3, 2.0**-13), np.zeros(3)
+    las = laspy.LasData(header)
+    las.xyz = points
+    return las
+
+
+def through_las_file(points, folder):
+    path = folder / "points.las"
+    through_las_data(points, folder).write(path)
+    return path
+
+
+def through_laz_file(points, folder):
+    path = folder / "points.laz"
+    through_las_data(points, folder).write(str(path))
+    return str(path)
+
+
+def through_pointcloud2(points, _):
+    ros = pytest.importorskip("og_pointcloud_ros", exc_type=ImportError)
+    empty = og.Segmentation(
+        points, *(np.full(len(points), -1, kind) for kind in (np.int32, np.float32, np.int32)), names=("nothing",),
+        distance=np.zeros(len(points), np.int8), reasons=np.zeros(len(points), np.int8),
+    )  # fmt: skip
+    return ros.to_pointcloud2(empty)
+
+
+CARRIERS = [value for name, value in list(globals().items()) if name.startswith("through_")]
+
+
+@pytest.mark.parametrize("carrier", CARRIERS, ids=lambda carrier: carrier.__name__.removeprefix("through_"))
+def test_every_carrier_gives_the_same_labels(asked, carrier, tmp_path):
+    scene, points, expected = asked
+    got = og.segment(carrier(points, tmp_path), WORDS, scene)
+    for name, values in expected.attributes.items():
+        assert np.array_equal(got.attributes[name], values), name
+    assert np.array_equal(got.xyz, points)
+
+
+def test_rows_with_nan_stay_rows(asked, tmp_path):
+    scene, points, expected = asked
+    broken = points[:50].copy()
+    broken[[3, 7]] = np.nan
+    for carrier in (through_torch, through_open3d_legacy, through_open3d_tensor, through_pyvista, through_pointcloud2):
+        got = og.segment(carrier(broken, tmp_path), WORDS, scene)
+        kept = ~np.isnan(broken[:, 0])
+        assert np.array_equal(got.labels[kept], expected.labels[:50][kept])
+        assert (got.labels[~kept] == -1).all()
+
+
+@pytest.mark.parametrize("asked", ["made"], indirect=True)
+def test_integer_and_half_precision_tensors(asked):
+    torch = pytest.importorskip("torch")
+    scene = asked[0]
+    whole = np.round(asked[1][:30]).astype(int)
+    expected = og.segment(whole, WORDS, scene).labels
+    for tensor in (torch.from_numpy(whole), torch.from_numpy(whole).half(), torch.from_numpy(whole).bfloat16()):
+        assert np.array_equal(og.segment(tensor, WORDS, scene).labels, expected)
+    with pytest.raises(SceneError, match=r"Tensor of float64 \(3,\)"):
+        og.segment(torch.zeros(3), WORDS, scene)
+    with pytest.raises(SceneError, match="no points"):
+        og.segment(torch.device("cpu"), WORDS, scene)
+
+
+# LAS out
+
+
+def test_las_keeps_labels_and_a_millimetre_at_a_million(tmp_path):
+    laspy = pytest.importorskip("laspy")
+    cloud = make_cloud(room(800).xyz * 300, room(800).instance_ids, 15.0, 45.0, origin=(1e6, -4e6, 350.25))
+    result = og.segment(og.load(write_bundle(cloud, tmp_path / "map.ogpc")), WORDS)
+    for ending in (".las", ".laz"):
+        las = laspy.read(result.save(tmp_path / f"out{ending}"))
+        assert np.abs(las.xyz - result.xyz).max() < 1e-3
+        for name, values in result.attributes.items():
+            assert las[name].dtype == values.dtype
+            assert np.array_equal(las[name], values)
+        assert np.array_equal(las.classification, np.where(result.labels < 0, 1, 64 + result.labels))
+        assert np.array_equal(las.user_data, result.reasons)
+        assert np.array_equal(np.column_stack([las.red, las.green, las.blue]) // 257, result.colors)
+        assert json.loads(las.header.vlrs.get_by_id("og_pointcloud")[0].record_data_bytes()) == WORDS
+    assert (tmp_path / "out.laz").stat().st_size < 0.7 * (tmp_path / "out.las").stat().st_size
+    points = og.read_points(tmp_path / "out.laz")
+    assert np.abs(points.xyz_world - result.xyz).max() < 1e-3
+    assert np.array_equal(points.rgb, result.colors)
+
+
+def segmentation(labels, names, xyz=None):
+    labels = np.asarray(labels, np.int32)
+    count = len(labels)
+    xyz = np.arange(3.0 * count).reshape(count, 3) if xyz is None else xyz
+    scores = np.linspace(0, 1, count, dtype=np.float32)
+    zeros = np.zeros(count, np.int8)
+    return og.Segmentation(xyz, labels, scores, labels * 2 - 1, tuple(names), distance=zeros, reasons=zeros)
+
+
+def test_las_with_more_labels_than_classes_and_than_a_record_holds(tmp_path):
+    laspy = pytest.importorskip("laspy")
+    names = [f"a word that is number {index}" for index in range(5000)]
+    las = laspy.read(segmentation([0, 191, 192, 4999, -1], names).save(tmp_path / "many.las"))
+    assert las.classification.tolist() == [64, 255, 1, 1, 1]
+    assert las.og_label.tolist() == [0, 191, 192, 4999, -1]
+    assert json.loads(las.evlrs[0].record_data_bytes()) == names
+
+
+def test_las_of_no_point_and_of_one(tmp_path):
+    laspy = pytest.importorskip("laspy")
+    assert len(laspy.read(segmentation([], ["a"]).save(tmp_path / "none.las"))) == 0
+    assert laspy.read(segmentation([0], ["a"]).save(tmp_path / "one.laz")).xyz.tolist() == [[0, 1, 2]]
+    with pytest.raises(SceneError, match=r"none.las: expected 0 points, the file has 0: it is empty"):
+        og.read_points(tmp_path / "none.las")
+
+
+@pytest.mark.parametrize("ending", [".las", ".glb"])
+def test_formats_of_finite_points_refuse_others_and_leave_nothing(tmp_path, ending):
+    pytest.importorskip("laspy")
+    xyz = np.array([[0, 0, 0], [np.nan, 0, 0], [1, np.inf, 0]])
+    with pytest.raises(SceneError, match=r"2 of 3 points hold NaN or infinity \(the first is row 1\)"):
+        segmentation([0, 0, 0], ["a"], xyz).save(tmp_path / f"out{ending}")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("ending", [".las", ".laz"])
+def test_damaged_las_files_give_one_error(tmp_path, ending):
+    pytest.importorskip("laspy")
+    path = segmentation(np.arange(300) % 3, "abc").save(tmp_path / f"a{ending}")
+    data = path.read_bytes()
+    random = np.random.default_rng(0)
+    lying = bytearray(data)
+    lying[247:255] = struct.pack("<Q", 10**12)
+    versions = [data[:4], data[:100], data[: len(data) // 2], data[:-40], bytes(lying)]
+    for _ in range(60):
+        changed = bytearray(data)
+        for place in random.integers(4, 400, 3):
+            changed[place] = random.integers(256)
+        versions.append(bytes(changed))
+    for version in versions[:5]:
+        path.write_bytes(version)
+        with pytest.raises(SceneError) as caught:
+            og.read_points(path)
+        assert str(caught.value).startswith(f"{path}: ")
+    for version in versions[5:]:
+        path.write_bytes(version)
+        with contextlib.suppress(SceneError):  # nothing else; a changed coordinate is no damage
+            assert len(og.read_points(path)) > 0
+
+
+# glTF out
+
+
+def parsed(path):
+    """A .glb the slow plain way: its document, and its attributes as arrays."""
+    data = path.read_bytes()
+    magic, version, length = struct.unpack_from("<4sII", data)
+    assert (magic, version, length) == (b"glTF", 2, len(data))
+    size, kind = struct.unpack_from("<I4s", data, 12)
+    assert (kind, size % 4) == (b"JSON", 0)
+    document = json.loads(data[20 : 20 + size])
+    binary_size, kind = struct.unpack_from("<I4s", data, 20 + size)
+    assert kind == b"BIN\0"
+    assert binary_size == document["buffers"][0]["byteLength"] == length - 28 - size
+    binary = data[28 + size :]
+    arrays = {}
+    for name, index in document["meshes"][0]["primitives"][0]["attributes"].items():
+        accessor = document["accessors"][index]
+        view = document["bufferViews"][accessor["bufferView"]]
+        assert view["byteOffset"] % 4 == 0
+        part = np.frombuffer(binary[view["byteOffset"] :][: view["byteLength"]], COMPONENTS[accessor["componentType"]])
+        arrays[name] = part.reshape(accessor["count"], WIDTHS[accessor["type"]])
+        if "min" in accessor:
+            assert arrays[name].min(axis=0).tolist() == accessor["min"]
+            assert arrays[name].max(axis=0).tolist() == accessor["max"]
+    assert sum(view["byteLength"] for view in document["bufferViews"]) == binary_size
+    return document, arrays
+
+
+def test_glb_holds_points_colours_and_feature_ids(tmp_path):
+    xyz = [*np.random.default_rng(0).normal(size=(40, 3)), 1000000.0, -4000000.0, 300]
+    result = segmentation(np.arange(40) % 4 - 1, ["a", "b", "c"], xyz)
+    document, arrays = parsed(result.save(tmp_path / "out.glb"))
+    origin = np.array(document["nodes"][0]["translation"])
+    assert np.abs(arrays["POSITION"] + origin - xyz).max() < 1e-6
+    first, second = document["meshes"][0]["primitives"][0]["extensions"]["EXT_mesh_features"]["featureIds"]
+    assert first == {"attribute": 0, "featureCount": 3, "nullFeatureId": 3, "label": "og_label"}
+    assert second == {"attribute": 1, "featureCount": 2, "nullFeatureId": 4, "label": "og_instance"}
+    labels = arrays["_FEATURE_ID_0"][:, 0]
+    assert np.array_equal(np.where(labels == 3, -1, labels), result.labels)
+    instances = arrays["_FEATURE_ID_1"][:, 0]
+    assert np.array_equal(np.where(instances == 4, -1, instances), np.maximum(result.instances, -1))
+    assert np.array_equal(arrays["_OG_SCORE"][:, 0], result.scores)
+    linear = arrays["COLOR_0"][:, :3] / 65535
+    srgb = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+    assert np.array_equal(np.rint(255 * srgb), result.colors)
+    assert document["meshes"][0]["extras"]["og_names"] == ["a", "b", "c"]
+    assert document["extensionsUsed"] == ["EXT_mesh_features"]
+
+
+def test_trimesh_opens_both_kinds(tmp_path):
+    trimesh = pytest.importorskip("trimesh")
+    xyz = [*np.random.default_rng(0).normal(size=(40, 3)), 1000000.0, -4000000.0, 300]
+    for name in ("out.glb", "out.gltf"):
+        cloud = trimesh.load(segmentation(np.arange(40) % 4 - 1, "abc", xyz).save(tmp_path / name)).to_geometry()
+        assert np.abs(cloud.vertices - xyz).max() < 1e-6
+        assert len(np.unique(cloud.colors, axis=0)) == 4
+
+
+def test_gaussians_travel_in_a_glb(tmp_path):
+    random = np.random.default_rng(0)
+    rotation = random.normal(size=(9, 4))
+    splats = Points.from_world(
+        random.normal(size=(9, 3)),
+        rgb=random.integers(0, 256, (9, 3)).astype(np.uint8),
+        scale=random.random((9, 3)).astype(np.float32),
+        rotation=(rotation / np.linalg.norm(rotation, axis=1, keepdims=True)).astype(np.float32),
+        opacity=random.random(9).astype(np.float32),
+    )
+    result = segmentation(np.zeros(9), ["a"], splats.xyz_world)
+    given = (result.xyz, result.colors, result.attributes, result.names)
+    write_gltf(tmp_path / "out.glb", *given, splats=splats)
+    document, arrays = parsed(tmp_path / "out.glb")
+    prefix = "KHR_gaussian_splatting"
+    assert prefix in document["extensionsUsed"]
+    assert document["meshes"][0]["primitives"][0]["extensions"][prefix]["kernel"] == "ellipse"
+    assert np.array_equal(arrays[f"{prefix}:ROTATION"], splats.rotation[:, [1, 2, 3, 0]])
+    assert np.array_equal(arrays[f"{prefix}:SCALE"], splats.scale)
+    assert np.array_equal(arrays[f"{prefix}:OPACITY"][:, 0], splats.opacity)
+    color = 0.5 + 0.28209479177387814 * arrays[f"{prefix}:SH_DEGREE_0_COEF_0"]
+    assert np.array_equal(np.rint(255 * color), splats.rgb)
+    fewer = segmentation(np.zeros(8), ["a"], splats.xyz_world[:8])
+    with pytest.raises(SceneError, match="9 splats, 8 labelled points"):
+        write_gltf(tmp_path / "b.glb", fewer.xyz, fewer.colors, fewer.attributes, fewer.names, splats=splats)
+
+
+def test_gltf_has_no_empty_clouds(tmp_path):
+    with pytest.raises(SceneError, match=r"out.glb: 0 points; expected at least one"):
+        segmentation([], ["a"]).save(tmp_path / "out.glb")
+
+
+def test_ply_keeps_labels(tmp_path):
+    result = segmentation(np.arange(9) % 3 - 1, ["a", "b"])
+    rows = read_ply(result.save(tmp_path / "out.ply"))["vertex"]
+    for name, values in result.attributes.items():
+        assert np.array_equal(rows[name], values)
