@@ -72,7 +72,7 @@ def _parse_header(head: bytes) -> _Header:
         raise SceneError(f"no line 'DATA' within {len(head)} bytes: the PCD header is truncated or damaged")
     encoding = last_line[1].decode("ascii", "replace")
     if encoding not in ENCODINGS:
-        raise SceneError(f"PCD data is {encoding!r}; expected one of {', '.join(ENCODINGS)}")
+        raise SceneError(f"PCD data is {encoding!r:.40}; expected one of {', '.join(ENCODINGS)}")
     entries: dict[str, list[str]] = {}
     for line in head[: last_line.start()].decode("utf-8", "replace").split("\n"):
         keyword, *values = line.split() or ["#"]
