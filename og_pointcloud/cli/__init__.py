@@ -27,6 +27,7 @@ from og_pointcloud.cli import (
     info,
     instances,
     masks,
+    models,
     pick,
     report,
     ros_bag,
@@ -41,8 +42,8 @@ from og_pointcloud.errors import MissingExtraError, OgPointcloudError
 __all__ = ["main"]
 
 COMMANDS = (
-    fit, fuse, import_, segment, select, pick, instances, edit, view, ros_bag, info, vocabulary, export_text_encoder,
-    export_image_encoder, ablate, eval_, report, check, demo,
+    masks, models, fit, fuse, import_, segment, select, pick, instances, edit, view, ros_bag, info, vocabulary,
+    export_text_encoder, export_image_encoder, ablate, eval_, report, check, demo,
 )  # fmt: skip
 
 

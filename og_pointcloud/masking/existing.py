@@ -16,7 +16,7 @@ from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.images import MAX_PIXELS, decoded, png_header, require_cv2, without_suffix
 from og_pointcloud.masking.contracts import Proposals
 
-__all__ = ["CallableProposer", "ExistingMasks", "as_proposals", "decode_rle", "from_ids"]
+__all__ = ["CallableProposer", "ExistingMasks", "as_proposals", "decode_rle", "from_ids", "read_json"]
 
 MAX_JSON_BYTES = 1 << 30
 MAX_MASKS_PX = 1 << 33
@@ -90,7 +90,7 @@ class ExistingMasks:
         if png.is_file():
             return _resized(_read_ids(png), shape)
         if single.is_file():
-            return _resized(_from_annotations(_annotations(_read_json(single)), str(single)), shape)
+            return _resized(_from_annotations(_annotations(read_json(single)), str(single)), shape)
         stem = image_name.rsplit("/", 1)[-1]
         for key in (image_name, stem):
             if key in self._coco:
@@ -105,7 +105,7 @@ class ExistingMasks:
         """Annotations by image stem, each with the image's size, from all COCO files of the folder."""
         found: dict[str, list[dict[str, Any]]] = {}
         for file in sorted(self.folder.glob("*.json")):
-            content = _read_json(file)
+            content = read_json(file)
             if not (isinstance(content, dict) and isinstance(content.get("images"), list)):
                 continue
             stems: dict[Any, tuple[str, list[Any]]] = {}
@@ -214,7 +214,8 @@ def _is_size(size: Any) -> bool:
     return isinstance(size, list) and len(size) == 2 and all(type(length) is int for length in size)
 
 
-def _read_json(file: Path) -> Any:
+def read_json(file: Path) -> Any:
+    """A JSON file of bounded size. SceneError where it is none."""
     if file.stat().st_size > MAX_JSON_BYTES:
         raise SceneError(f"{file} has {file.stat().st_size} bytes; expected at most {MAX_JSON_BYTES}")
     try:

@@ -251,7 +251,7 @@ def _sums(labels: NDArray[np.integer], values: Floats) -> Floats:
 
 
 def _pixel_pairs(labels: Labels, lab: NDArray[np.float32], depth: NDArray[np.float32] | None) -> Pairs:
-    """Of the p pixels whose right neighbour is in another region: both regions, and (3, p): 1, contrast, 0 to 1 a step."""
+    """Of the p pixels whose right neighbour is another region: both, and (3, p): 1, contrast, 0 to 1 for a step."""
     row, column = np.nonzero(labels[:, :-1] != labels[:, 1:])
     last = labels.shape[1] - 1
     left, right = np.maximum(column + 1 - REACH_PX, 0), np.minimum(column + REACH_PX, last)

@@ -1,0 +1,133 @@
+"""``og-pointcloud models``: which mask and word models are here, what a capture needs, and the commands that get it."""
+
+from __future__ import annotations
+
+import argparse
+import os
+from collections.abc import Iterator
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from og_pointcloud.cli.common import add_command, print_table
+
+PARTS = (
+    ("fit, opencv masks", ("cv2", "numba", "scipy"), "fit"),
+    ("SAM, CLIP, SigLIP masks", ("torch", "transformers", "safetensors"), "masks"),
+    ("learned modes", ("torch",), "learn"),
+)
+"""What for, modules, extra."""
+KINDS = {"sam": "proposer", "sam_hq": "proposer", "sam2": "proposer", "sam2_video": "proposer", "sam3": "proposer",
+         "sam3_video": "proposer", "sam3_tracker": "proposer", "clip": "encoder", "siglip": "encoder",
+         "siglip2": "encoder"}  # fmt: skip
+"""config.json's model_type -> what it is for."""
+USUAL = (
+    ("proposer", "facebook/sam-vit-base", "SAM, 94 M parameters"),
+    ("proposer", "facebook/sam2.1-hiera-small", "SAM 2.1, 46 M"),
+    ("encoder", "openai/clip-vit-base-patch16", "CLIP, 150 M"),
+    ("encoder", "google/siglip-base-patch16-224", "SigLIP, 203 M"),
+)
+"""What most want first; sizes as published."""
+
+
+def add(commands: Any) -> None:
+    parser = add_command(
+        commands, "models", run, "List what is installed, and what a capture needs. Downloads nothing.",
+        "og-pointcloud models CAPTURE",
+    )  # fmt: skip
+    parser.add_argument("capture", type=Path, nargs="?", metavar="CAPTURE", help="also say what this capture needs")
+
+
+def run(arguments: argparse.Namespace) -> None:
+    rows = []
+    for purpose, modules, extra in PARTS:
+        missing = [module for module in modules if find_spec(module) is None]
+        rows.append((purpose, f"pip install 'og-pointcloud[{extra}]'" if missing else "installed"))
+    print_table(("part", "state"), rows)
+    found = sorted({(kind, name, where) for kind, name, where in found_models()})
+    print()
+    if found:
+        print_table(("model", "for", "where"), [(name, kind, str(where)) for kind, name, where in found])
+    else:
+        print("no models found (looked in OG_POINTCLOUD_MODELS, the user's cache, and Hugging Face's)")
+    print("\nto fetch one (nothing was downloaded):")
+    here = {name for _, name, _ in found}
+    for kind, name, size in USUAL:
+        if name not in here:
+            print(f"  hf download {name}    # {kind}, {size}")
+    if arguments.capture:
+        print()
+        for line in needs(arguments.capture, any(kind == "proposer" for kind, _, _ in found)):
+            print(line)
+
+
+def found_models() -> Iterator[tuple[str, str, Path]]:
+    """(purpose, name, folder) of exported encoders and of transformers models, in all places that are looked in."""
+    from og_pointcloud.text.encoder import model_folders
+
+    for parent in model_folders():
+        for folder in sorted(parent.iterdir()) if parent.is_dir() else ():
+            if (folder / "manifest.json").is_file():
+                yield exported_kind(folder), folder.name, folder
+            elif kind := model_kind(folder):
+                yield kind, folder.name, folder
+    for snapshots in sorted(hub_cache().glob("models--*/snapshots")):
+        name = snapshots.parent.name.removeprefix("models--").replace("--", "/", 1)
+        for folder in sorted(snapshots.iterdir()):
+            if kind := model_kind(folder):
+                yield kind, name, folder
+
+
+def exported_kind(folder: Path) -> str:
+    return "encoder" if (folder / "image_encoder.onnx").is_file() else "words"
+
+
+def model_kind(folder: Path) -> str | None:
+    """What a transformers folder with weights is for, None for one of another kind."""
+    from og_pointcloud.errors import SceneError
+    from og_pointcloud.masking.existing import read_json
+
+    config = folder / "config.json"
+    if not config.is_file() or (not any(folder.glob("*.safetensors*")) and not any(folder.glob("*.bin"))):
+        return None
+    try:
+        content = read_json(config)
+    except (SceneError, OSError):
+        return None
+    return KINDS.get(str(content.get("model_type"))) if isinstance(content, dict) else None
+
+
+def hub_cache() -> Path:
+    """Where Hugging Face's tools keep what they fetch, by their own variables."""
+    if hub := os.environ.get("HF_HUB_CACHE"):
+        return Path(hub)
+    home = os.environ.get("HF_HOME")
+    return Path(home) / "hub" if home else Path.home() / ".cache" / "huggingface" / "hub"
+
+
+def needs(capture: Path, has_proposer: bool) -> Iterator[str]:
+    """What stands between a capture folder and a fit, line by line."""
+    from og_pointcloud.errors import OgPointcloudError
+    from og_pointcloud.formats.capture import read_capture
+
+    if not (capture / "mask_features.npz").is_file() and not (capture / "language_features").is_dir():
+        proposer = "sam:OWNER/MODEL" if has_proposer else "opencv"
+        yield f"{capture} has no masks:"
+        yield f"  og-pointcloud masks {capture} --proposer {proposer} --encoder OWNER/MODEL"
+        return
+    try:
+        scene = read_capture(capture)
+    except OgPointcloudError as error:
+        yield f"{capture} cannot be read: {error}"
+        return
+    space = scene.feature_space
+    from og_pointcloud.text.encoder import find_encoder
+
+    yield f"{capture} has masks with features of '{space}' (width {scene.feature_width})"
+    if find_encoder(space):
+        yield "  its words can be typed: the text encoder is here"
+    elif "/" in space:
+        yield f"  typed words need its text encoder: hf download {space}, then"
+        yield "  og-pointcloud export-text-encoder --help says how to make the file that the base install runs"
+    else:
+        yield "  its space names no public model: words come from a features file (--text-features)"

@@ -1,0 +1,200 @@
+"""Everything in an image by a model that answers points: a grid of prompts, and of its answers the good ones once.
+
+After segment-anything's automatic generator: masks with a low predicted IoU or an unstable border are dropped, of
+masks with nearly the same box the best stays, small holes are filled and small islands removed; crops repeat it for
+small things. Where there is a time budget, prompts come in an order that covers the image evenly at any moment.
+"""
+
+from __future__ import annotations
+
+import time
+import warnings
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from og_pointcloud.formats.images import require_cv2
+from og_pointcloud.masking.contracts import Proposals
+
+__all__ = ["AutomaticMasks", "PointPredictor", "best_boxes", "mask_boxes", "stability", "without_specks"]
+
+Masks = NDArray[np.bool_]
+Floats = NDArray[np.float32]
+
+CROP_OVERLAP = 512 / 1500
+"""Of a crop's shorter side, as segment-anything has it."""
+EDGE_PX = 2
+"""A mask that ends so near a crop's edge, inside the image, is cut off there and is left to another crop."""
+
+
+class PointPredictor(Protocol):
+    """A segment-anything model, whatever runs it. Coordinates are pixels of the image, x before y."""
+
+    def set_image(self, image: NDArray[np.uint8]) -> None:
+        """Encode (H, W, 3) uint8 RGB, once for all prompts."""
+        ...
+
+    def at_points(self, points: Floats) -> tuple[Floats, Floats]:
+        """points (k, 2) -> logits (k, m, h, w) of the m masks that each may mean, at the model's own size without
+        padding, so that they cover the image; and predicted IoU (k, m)."""
+        ...
+
+
+@dataclass(frozen=True)
+class AutomaticMasks:
+    """A proposer around a `PointPredictor`.
+
+    points_per_side: of the grid. batch: prompts at once. least_iou, least_stability: below, a mask is dropped.
+    stability_offset: logits by which the border is moved. same_box: box IoU from which two masks are one.
+    speck_share: holes and islands of less of the image go. crop_layers: n adds 4^1 to 4^n crops with coarser grids.
+    seconds_per_image: no prompt is begun after so long; None: no limit. Encoding counts, and is never cut short.
+    """
+
+    predictor: PointPredictor
+    name: str
+    points_per_side: int = 32
+    batch: int = 64
+    least_iou: float = 0.88
+    least_stability: float = 0.95
+    stability_offset: float = 1.0
+    same_box: float = 0.7
+    speck_share: float = 1e-4
+    crop_layers: int = 0
+    seconds_per_image: float | None = None
+
+    def propose(self, image: NDArray[np.uint8]) -> Proposals:
+        """image: (H, W, 3) uint8 RGB. Warns where the time did not suffice for all prompts."""
+        deadline = np.inf if self.seconds_per_image is None else time.perf_counter() + self.seconds_per_image
+        masks, scores, asked, planned = [], [], 0, 0
+        for layer in range(self.crop_layers + 1):
+            per_side = max(1, self.points_per_side >> layer)
+            for left, top, right, bottom in crops(image.shape[1], image.shape[0], layer):
+                planned += per_side**2
+                if layer and time.perf_counter() > deadline:
+                    continue
+                found, found_scores, count = self._in_crop(image[top:bottom, left:right], per_side, deadline)
+                asked += count
+                whole = _uncut(found, (left, top, right, bottom), image.shape[1], image.shape[0])
+                for mask, score in zip(found[whole], found_scores[whole], strict=True):
+                    placed = np.zeros(image.shape[:2], np.bool_)
+                    placed[top:bottom, left:right] = mask
+                    masks.append(placed)
+                    scores.append(score)
+        if asked < planned:
+            warnings.warn(
+                f"{self.name}: {asked} of {planned} prompts in {self.seconds_per_image:g} s; small things may be "
+                "missing: allow more seconds per image",
+                stacklevel=2,
+            )
+        stacked = np.array(masks, np.bool_).reshape(-1, *image.shape[:2])
+        kept = best_boxes(mask_boxes(stacked), np.array(scores, np.float32), self.same_box)
+        return Proposals(stacked[kept], np.array(scores, np.float32)[kept])
+
+    def _in_crop(self, image: NDArray[np.uint8], per_side: int, deadline: float) -> tuple[Masks, Floats, int]:
+        """Masks of one crop, their scores, and how many prompts were asked."""
+        height, width = image.shape[:2]
+        points = grid(per_side, width, height)
+        self.predictor.set_image(image)
+        kept_logits, kept_scores, asked = [np.zeros((0, 1, 1), np.float32)], [np.zeros(0, np.float32)], 0
+        for first in range(0, len(points), self.batch):
+            if first and time.perf_counter() > deadline:
+                break
+            logits, iou = self.predictor.at_points(points[first : first + self.batch])
+            asked += len(logits)
+            logits, iou = logits.reshape(-1, *logits.shape[2:]), iou.reshape(-1)
+            good = (iou > self.least_iou) & (logits > 0).any(axis=(1, 2))
+            good[good] = stability(logits[good], self.stability_offset) >= self.least_stability
+            kept_logits.append(logits[good])
+            kept_scores.append(np.clip(iou[good], 0, 1))
+        logits = np.concatenate(kept_logits[1:] if asked else kept_logits)
+        scores = np.concatenate(kept_scores)
+        best = best_boxes(mask_boxes(logits > 0), scores, self.same_box)
+        speck_px = round(self.speck_share * width * height)
+        masks = np.zeros((len(best), height, width), np.bool_)
+        for mask, chosen in zip(masks, best, strict=True):
+            full = require_cv2().resize(logits[chosen], (width, height), interpolation=require_cv2().INTER_LINEAR)
+            mask[:] = without_specks(full > 0, speck_px)
+        return masks, scores[best], asked
+
+
+def grid(per_side: int, width: int, height: int) -> Floats:
+    """(per_side^2, 2) points x, y in the middles of equal cells, shuffled the same way every time."""
+    at = (np.arange(per_side) + 0.5) / per_side
+    points = np.stack(np.meshgrid(at * width, at * height), axis=-1).reshape(-1, 2).astype(np.float32)
+    return points[np.random.default_rng(0).permutation(len(points))]
+
+
+def crops(width: int, height: int, layer: int) -> Iterator[tuple[int, int, int, int]]:
+    """left, top, right, bottom of the 2^layer x 2^layer overlapping crops of a layer; layer 0 is the image."""
+    count = 1 << layer
+    overlap = 0 if layer == 0 else int(CROP_OVERLAP * min(width, height) * 2 / count)
+    step_x, step_y = -(-(overlap * (count - 1) + width) // count), -(-(overlap * (count - 1) + height) // count)
+    for row in range(count):
+        for column in range(count):
+            left, top = column * (step_x - overlap), row * (step_y - overlap)
+            yield left, top, min(left + step_x, width), min(top + step_y, height)
+
+
+def stability(logits: Floats, offset: float) -> Floats:
+    """(n,): IoU of each mask (n, h, w) at a stricter and at a laxer threshold; 0 where both are empty."""
+    strict = (logits > offset).sum(axis=(1, 2))
+    lax = (logits > -offset).sum(axis=(1, 2))
+    return (strict / np.maximum(lax, 1)).astype(np.float32)
+
+
+def mask_boxes(masks: Masks) -> Floats:
+    """(n, 4) left, top, right, bottom (exclusive) of masks (n, h, w); zeros for an empty one."""
+    columns, rows = masks.any(axis=1), masks.any(axis=2)
+    if not masks.size:
+        return np.zeros((len(masks), 4), np.float32)
+    left, top = columns.argmax(axis=1), rows.argmax(axis=1)
+    right = columns.shape[1] - columns[:, ::-1].argmax(axis=1)
+    bottom = rows.shape[1] - rows[:, ::-1].argmax(axis=1)
+    return np.where(columns.any(axis=1)[:, None], np.stack([left, top, right, bottom], axis=1), 0).astype(np.float32)
+
+
+def best_boxes(boxes: Floats, scores: Floats, same: float) -> NDArray[np.intp]:
+    """Non-maximum suppression: indices, best score first, of boxes whose IoU with no better one is above ``same``."""
+    order = np.argsort(-scores, kind="stable")
+    area = (boxes[:, 2] - boxes[:, 0]) * (boxes[:, 3] - boxes[:, 1])
+    kept: list[int] = []
+    for box in order.tolist():
+        low, high = np.maximum(boxes[kept, :2], boxes[box, :2]), np.minimum(boxes[kept, 2:], boxes[box, 2:])
+        shared = np.prod(np.maximum(high - low, 0), axis=1)
+        if not (shared > same * (area[kept] + area[box] - shared)).any():
+            kept.append(box)
+    return np.array(kept, np.intp)
+
+
+def without_specks(mask: Masks, smallest_px: int) -> Masks:
+    """The mask (h, w) with holes of fewer pixels filled, then islands of fewer removed; the largest always stays."""
+    filled = mask | _specks(~mask, smallest_px, spare_largest=False)
+    return filled & ~_specks(filled, smallest_px, spare_largest=True)
+
+
+def _specks(mask: Masks, smallest_px: int, spare_largest: bool) -> Masks:
+    _, labels, stats, _ = require_cv2().connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
+    area = stats[:, require_cv2().CC_STAT_AREA]
+    small = area < smallest_px
+    small[0] = False
+    if spare_largest and len(area) > 1:
+        small[1 + int(np.argmax(area[1:]))] = False
+    return small[labels]
+
+
+def _uncut(masks: Masks, crop: tuple[int, int, int, int], width: int, height: int) -> Masks:
+    """(n,): whether a mask stays off those edges of its crop that lie inside the image."""
+    left, top, right, bottom = crop
+    near = np.zeros(masks.shape[1:], np.bool_)
+    if left > 0:
+        near[:, :EDGE_PX] = True
+    if top > 0:
+        near[:EDGE_PX] = True
+    if right < width:
+        near[:, -EDGE_PX:] = True
+    if bottom < height:
+        near[-EDGE_PX:] = True
+    return ~(masks & near).any(axis=(1, 2))

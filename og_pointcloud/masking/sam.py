@@ -1,0 +1,168 @@
+"""SAM, SAM-HQ, SAM 2 and SAM 3 through transformers, without its image processors and without torchvision.
+
+What the processors would do is a few lines (`prepared`), with the numbers of the model's ``preprocessor_config.json``:
+SAM and SAM-HQ scale the longer side and pad, SAM 2 and 3 scale both sides to a square. SAM 3's points are answered by
+its tracker half; its text half is not used, since words are asked later, of the points.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from og_pointcloud.errors import MissingExtraError, SceneError
+from og_pointcloud.masking.automatic import AutomaticMasks
+
+try:
+    import torch
+    import transformers
+except ImportError as error:
+    raise MissingExtraError("torch and transformers", "masks") from error
+
+__all__ = ["SamPredictor", "open_sam", "prepared"]
+
+Tensor = torch.Tensor
+
+CLASSES = {
+    "sam": "SamModel",
+    "sam_hq": "SamHQModel",
+    "sam2": "Sam2Model",
+    "sam2_video": "Sam2Model",
+    "sam3": "Sam3TrackerModel",
+    "sam3_video": "Sam3TrackerModel",
+    "sam3_tracker": "Sam3TrackerModel",
+    "sam3_tracker_video": "Sam3TrackerModel",
+}
+"""config.json's model_type -> the class that answers points."""
+PADDED = ("sam", "sam_hq")
+IMAGENET = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+HALVES = (0.5, 0.5, 0.5), (0.5, 0.5, 0.5)
+
+
+@dataclass(frozen=True)
+class Preparation:
+    """side: pixels of the square that the model takes. padded: the longer side is scaled to it and the rest is 0;
+    else both sides are scaled. mean, std: of channels in [0, 1]."""
+
+    side: int
+    padded: bool
+    mean: tuple[float, ...]
+    std: tuple[float, ...]
+
+
+def open_sam(
+    name: str | os.PathLike[str], *, seconds_per_image: float | None = None, download: bool = False
+) -> AutomaticMasks:
+    """A proposer from a model's folder or OWNER/MODEL. download: fetch it where it is not there yet; else it must be.
+
+    SceneError where there is none, or it is of another kind.
+    """
+    predictor = SamPredictor(name, download=download)
+    return AutomaticMasks(predictor, f"sam:{name}", seconds_per_image=seconds_per_image)
+
+
+class SamPredictor:
+    """A `PointPredictor` on any of the four. On a GPU where torch has one."""
+
+    def __init__(self, name: str | os.PathLike[str], *, download: bool = False) -> None:
+        where = str(Path(name).expanduser()) if Path(name).expanduser().is_dir() else str(name)
+        try:
+            config = transformers.AutoConfig.from_pretrained(where, local_files_only=not download)
+            if config.model_type not in CLASSES or not hasattr(transformers, CLASSES[config.model_type]):
+                raise SceneError(
+                    f"{name} is a model of type '{config.model_type}'; expected one of {', '.join(CLASSES)} that the "
+                    f"installed transformers {transformers.__version__} has"
+                )
+            model = getattr(transformers, CLASSES[config.model_type])
+            self.model: Any = model.from_pretrained(where, local_files_only=not download)
+        except (OSError, ValueError) as error:
+            if isinstance(error, SceneError):
+                raise
+            raise SceneError(
+                f"no SAM model '{name}' ({str(error).splitlines()[0]:.120}); expected a transformers folder with "
+                "config.json and weights, or a fetched model: --download, or hf download OWNER/MODEL"
+            ) from None
+        self.device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+        self.model = self.model.eval().to(self.device)
+        self.kind = config.model_type
+        self.preparation = _preparation(where, self.kind, self.model.config, download)
+        self.size = (0, 0)
+        self.encoded: dict[str, Any] = {}
+
+    @torch.inference_mode()
+    def set_image(self, image: NDArray[np.uint8]) -> None:
+        """image: (H, W, 3) uint8 RGB."""
+        self.size = image.shape[0], image.shape[1]
+        pixels = prepared(image, self.preparation).to(self.device)
+        if self.kind == "sam_hq":
+            embeddings, intermediate = self.model.get_image_embeddings(pixels)
+            self.encoded = {"image_embeddings": embeddings, "intermediate_embeddings": intermediate}
+        else:
+            self.encoded = {"image_embeddings": self.model.get_image_embeddings(pixels)}
+
+    @torch.inference_mode()
+    def at_points(self, points: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """points: (k, 2) pixels of the image. Logits (k, 3, h, w) that cover the image, and predicted IoU (k, 3)."""
+        height, width = scaled_size(self.size, self.preparation)
+        scale = np.array([width / self.size[1], height / self.size[0]], np.float32)
+        asked = torch.from_numpy(points * scale)[None, :, None].to(self.device)
+        labels = torch.ones(asked.shape[:3], dtype=torch.int32, device=self.device)
+        answer = self.model(input_points=asked, input_labels=labels, multimask_output=True, **self.encoded)
+        logits = answer.pred_masks[0].float()
+        rows = max(1, round(logits.shape[-2] * height / self.preparation.side))
+        columns = max(1, round(logits.shape[-1] * width / self.preparation.side))
+        return logits[..., :rows, :columns].cpu().numpy(), answer.iou_scores[0].float().cpu().numpy()
+
+
+def scaled_size(size: tuple[int, int], preparation: Preparation) -> tuple[int, int]:
+    """(height, width) of the image inside the model's square."""
+    if not preparation.padded:
+        return preparation.side, preparation.side
+    scale = preparation.side / max(size)
+    return int(size[0] * scale + 0.5), int(size[1] * scale + 0.5)
+
+
+def prepared(image: NDArray[np.uint8], preparation: Preparation) -> Tensor:
+    """(H, W, 3) uint8 RGB -> (1, 3, side, side) float32 as transformers' own processors make it: bilinear with
+    antialiasing, rounded to 8 bit, scaled to [0, 1], normalised, then padded with 0 to the right and below."""
+    pixels = torch.from_numpy(np.ascontiguousarray(image)).permute(2, 0, 1)[None].float()
+    size = scaled_size((image.shape[0], image.shape[1]), preparation)
+    pixels = torch.nn.functional.interpolate(pixels, size, mode="bilinear", align_corners=False, antialias=True)
+    pixels = pixels.round().clamp(0, 255) / 255
+    mean, std = (torch.tensor(values)[None, :, None, None] for values in (preparation.mean, preparation.std))
+    pixels = (pixels - mean) / std
+    return torch.nn.functional.pad(pixels, (0, preparation.side - size[1], 0, preparation.side - size[0]))
+
+
+def _preparation(where: str, kind: str, config: Any, download: bool) -> Preparation:
+    """Side from the vision configuration, colours from the preprocessor's file where the model has one."""
+    side = config.vision_config.image_size if kind in PADDED else _square_side(config)
+    mean, std = HALVES if kind.startswith("sam3") else IMAGENET
+    said = _preprocessor_config(where, download)
+    said = said.get("image_processor", said)
+    mean, std = said.get("image_mean", mean), said.get("image_std", std)
+    return Preparation(int(side), kind in PADDED, tuple(map(float, mean)), tuple(map(float, std)))
+
+
+def _square_side(config: Any) -> int:
+    side = config.prompt_encoder_config.image_size
+    return int(side[0] if isinstance(side, (list, tuple)) else side)
+
+
+def _preprocessor_config(where: str, download: bool) -> dict[str, Any]:
+    from transformers.utils import cached_file
+
+    for name in ("preprocessor_config.json", "processor_config.json"):
+        file = cached_file(
+            where, name, local_files_only=not download, _raise_exceptions_for_missing_entries=False,
+            _raise_exceptions_for_connection_errors=False,
+        )  # fmt: skip
+        if file is not None:
+            return json.loads(Path(file).read_text(encoding="utf-8"))
+    return {}
