@@ -10,6 +10,7 @@ from og_pointcloud.cli import main
 from og_pointcloud.errors import OgPointcloudError, SceneError
 from og_pointcloud.formats.ply import write_ply
 from og_pointcloud.scoring.instances import average_precision, panoptic_quality
+from og_pointcloud.scoring.lerf import pair_ious, read_frame, score_scenes
 from og_pointcloud.scoring.overlap import aligned_iou, oriented_iou
 from og_pointcloud.scoring.scannet import NAMES, TASKS, average, read_truth, score_scene
 from og_pointcloud.scoring.spread import bootstrap, paired_bootstrap, risk_coverage
@@ -143,6 +144,51 @@ def test_labels_that_are_not_nyu40_are_refused(tmp_path):
     write_labels(tmp_path, "a", [1, 1191])
     with pytest.raises(SceneError, match=r"labels span 1\.\.1191; expected NYU40"):
         read_truth(tmp_path / "a/a_vh_clean_2.labels.ply")
+
+
+# LeRF-OVS -------------------------------------------------------------------------------------------------------
+
+
+def write_lerf(file, objects):
+    info = {"name": "frame_00041.jpg", "width": 20, "height": 10}
+    file.write_text(json.dumps({"info": info, "objects": [{"category": c, "segmentation": o} for c, o in objects]}))
+
+
+def square(x, y, side):
+    """A polygon whose filled pixels, border included, are side x side."""
+    return [[x, y], [x + side - 1, y], [x + side - 1, y + side - 1], [x, y + side - 1]]
+
+
+def test_selection_by_hand(tmp_path):
+    write_lerf(tmp_path / "f.json", [("cup", square(0, 0, 4)), ("cup", square(10, 0, 2)), ("fork", square(5, 5, 3))])
+    frame = read_frame(tmp_path / "f.json")
+    assert frame.name == "frame_00041"
+    # Two cups are one object of 16 + 4 pixels.
+    assert {name: int(mask.sum()) for name, mask in frame.objects.items()} == {"cup": 20, "fork": 9}
+    alpha = np.zeros((10, 20))
+    alpha[0:4, 0:4], alpha[9, 0:5], alpha[0, 10] = 0.71, 0.9, 0.7
+    # Shown: 16 of the cups and 5 elsewhere; 0.7 is not above 0.7. IoU 16 / 25. Nothing is said of the fork: 0.
+    assert pair_ious(frame, {"cup": alpha}) == {"cup": 16 / 25, "fork": 0.0}
+    with pytest.raises(SceneError, match=r"render is \(2, 2\), the label \(10, 20\)"):
+        pair_ious(frame, {"cup": np.zeros((2, 2))})
+
+
+def test_scenes_are_averaged_as_in_the_table():
+    score = score_scenes({"a": np.array([0.64, 0.0, 0.25]), "b": np.array([1.0]), "c": np.array([])})
+    # a: mean 0.89 / 3, one of three above 0.25 (0.25 is not). b: 1, 1.
+    assert score.miou == pytest.approx((0.89 / 3 + 1) / 2)
+    assert score.accuracy == pytest.approx((1 / 3 + 1) / 2)
+    assert (score.flat_miou, score.flat_accuracy, score.pairs) == (pytest.approx(1.89 / 4), 2 / 4, 4)
+
+
+@pytest.mark.parametrize("content", ["{", "[]", '{"info": {"name": "a", "width": 1e9, "height": 1e9}, "objects": []}'])
+def test_damaged_label_files_are_refused(tmp_path, content):
+    (tmp_path / "f.json").write_text(content)
+    with pytest.raises(SceneError, match=r"f\.json"):
+        read_frame(tmp_path / "f.json")
+    write_lerf(tmp_path / "f.json", [("cup", [[0, 0], [1, 1]])])
+    with pytest.raises(SceneError, match="object 'cup': the outline is"):
+        read_frame(tmp_path / "f.json")
 
 
 # Spread ---------------------------------------------------------------------------------------------------------
