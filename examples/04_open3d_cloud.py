@@ -25,5 +25,5 @@ first = result.names[0]
 mine = thinned.select_by_mask(thinned.point["og_label"].flatten() == 0)
 print(f"{result.counts()}; {len(mine.point['positions'])} voxels of {first}")
 
-o3d.t.io.write_point_cloud(str(arguments.output.with_suffix(".ply")), painted)
+o3d.t.io.write_point_cloud(arguments.output.with_suffix(".ply"), painted)
 print(f"wrote {og3.draw_png(arguments.output, painted)}")

@@ -34,6 +34,6 @@ for label, name in enumerate(names):
     print(f"{name}: {(las.og_label == label).sum()} points, class {64 + label}")
 
 # The .glb is a cloud of coloured points wherever it is opened; here it is asked again, in the same coordinates.
-again = og.segment(trimesh.load(glb).to_geometry(), names, arguments.scene)
+again = og.segment(trimesh.load_scene(glb).to_geometry(), names, arguments.scene)
 print(f"{(again.labels == result.labels).mean():.2%} of labels agree after a round trip through float32")
 print(f"wrote {og3.draw_png(arguments.output.with_suffix('.png'), again)}")

@@ -265,7 +265,7 @@ def parsed(path):
 
 
 def test_glb_holds_points_colours_and_feature_ids(tmp_path):
-    xyz = [*np.random.default_rng(0).normal(size=(40, 3)), 1000000.0, -4000000.0, 300]
+    xyz = np.random.default_rng(0).normal((1e6, -4e6, 300), 1, (40, 3))
     result = segmentation(np.arange(40) % 4 - 1, ["a", "b", "c"], xyz)
     document, arrays = parsed(result.save(tmp_path / "out.glb"))
     origin = np.array(document["nodes"][0]["translation"])
@@ -287,7 +287,7 @@ def test_glb_holds_points_colours_and_feature_ids(tmp_path):
 
 def test_trimesh_opens_both_kinds(tmp_path):
     trimesh = pytest.importorskip("trimesh")
-    xyz = [*np.random.default_rng(0).normal(size=(40, 3)), 1000000.0, -4000000.0, 300]
+    xyz = np.random.default_rng(0).normal((1e6, -4e6, 300), 1, (40, 3))
     for name in ("out.glb", "out.gltf"):
         cloud = trimesh.load(segmentation(np.arange(40) % 4 - 1, "abc", xyz).save(tmp_path / name)).to_geometry()
         assert np.abs(cloud.vertices - xyz).max() < 1e-6
