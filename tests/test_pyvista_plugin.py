@@ -228,6 +228,7 @@ def test_a_scene_is_read_cropped_and_saved_as_a_scene(bundle, tmp_path):
     part.save(tmp_path / "part.ogpc")
     kept = og.load(tmp_path / "part.ogpc")
     assert 0 < len(kept.xyz) == part.n_points < len(scene.xyz)
+    assert (kept.cloud.reach, kept.cloud.spacing) == (scene.cloud.reach, scene.cloud.spacing)
     assert np.array_equal(kept.instances_at(kept.xyz), scene.instances_at(kept.xyz))
     assert (
         kept.cloud.instances.points.tolist()

@@ -226,8 +226,6 @@ def test_a_browser_opens_the_page_and_answers(bundle, tmp_path, capsys):
     assert 'data-ready="yes"' in done.stdout, done.stderr[-500:]
     counts = og.segment(bundle, ["plum", "apple"]).counts()
     for name, count in counts.items():
-        assert re.search(rf"<span class=\"\">{name}</span><small class=\"number\">{count:,}</small>", dom)
+        assert re.search(rf"<span[^>]*>{name}</span><small class=\"number\">{count:,}</small>", dom)
     words = og.load(bundle).instances[3].words
-    assert re.search(
-        rf"<h2>.*?instance 3 · .*?<span class=\"\">{words[0][0]}</span><span class=\"number\">{words[0][1]:.2f}", dom
-    )
+    assert re.search(rf"instance 3 · .*?<span[^>]*>{words[0][0]}</span><span class=\"number\">{words[0][1]:.2f}", dom)
