@@ -165,6 +165,20 @@ def test_noise_makes_one_layer_and_flying_pixels_none(tmp_path):
     assert fused.refused > 0
 
 
+def test_a_ghost_that_two_views_saw_and_more_looked_through_is_refused(tmp_path):
+    def haunted(index, depth):
+        depth = depth.copy()
+        if index == 0:
+            depth[50:80, 60:100] = 0.6  # in the air, before the crate
+        return depth
+
+    frames = write_frames(tmp_path, spoiled=haunted)
+    off = distance_to_surface(fuse([frames[0], *frames]).points.xyz_world)
+    assert off.max() < 0.1
+    alone = distance_to_surface(fuse([frames[0], frames[0]]).points.xyz_world)
+    assert (alone > 0.1).sum() > 8  # nobody else was there to say otherwise
+
+
 def test_large_map_offsets_cost_nothing(tmp_path):
     offset = np.array([4.5e6, -1.2e6, 3e5])
     near = fuse(write_frames(tmp_path / "near", 4))
