@@ -17,7 +17,7 @@ def _ellipse(top, left, height, width):
     return (((rows - top - height / 2 + 0.5) / height) ** 2 + ((columns - left - width / 2 + 0.5) / width) ** 2) <= 0.25
 
 
-@pytest.mark.parametrize(("height", "width"), [(20, 32), (32, 20), (32, 32), (31, 32)])
+@pytest.mark.parametrize(("height", "width"), [(20, 32), (32, 20), (32, 32), (31, 32), (32, 31)])
 def test_langsplats_crop_is_black_outside_tight_and_padded_to_a_square(height, width):
     mask = _ellipse(5, 9, height, width)
     alone = np.where(mask[..., None], IMAGE, 0)
