@@ -129,7 +129,7 @@ HOSTILE = {
     "cut off": ({"data": b"123"}, "holds 3 bytes; expected 24"),
     "too long": ({"data": bytes(25)}, "holds 25 bytes; expected 24"),
     "more points than bytes": ({"width": 2**32 - 1}, "expected 51539607540"),
-    "rows that overlap": ({"height": 2, "width": 2, "row_step": 12, "data": bytes(24)}, "rows of 12"),
+    "rows that overlap": ({"height": 2, "width": 2, "row_step": 12, "data": bytes(36)}, "rows of 12"),
     "a field beyond the point": ({"point_step": 11}, "field 'z' of a PointCloud2 spans bytes 8 to 12"),
     "a huge count": ({"fields": [PointField("x", 0, 7, 2**32 - 1)]}, "spans bytes 0 to 17179869180"),
     "no such type": ({"fields": [PointField("x", 0, 9, 1)]}, "datatype 9; expected 1"),

@@ -55,7 +55,7 @@ class CloudLabeller:
         for instance in self._instances:
             _ = instance.oriented_box
         scene = self.segmenter.scene
-        self.segmenter(scene.xyz[:WARM_UP_POINTS] + scene.cloud.reach / 2)  # beside the cloud: the exact search too
+        scene.look_up(scene.xyz[:WARM_UP_POINTS] + scene.cloud.reach / 2)  # beside the cloud: the exact search too
 
     def __call__(self, message: Any, pose: NDArray[np.float64]) -> LabelledMessages:
         """message: a cloud in the sensor's frame. pose: (4, 4), takes it to the scene's frame.
