@@ -183,14 +183,17 @@ def _read_text_features(folder: Path) -> None:
 
 
 def plain_plys(encoding: str) -> list[Files]:
-    """Positions, colours, normals and a mesh's faces; faces first, so that lists are in the way; doubles alone."""
+    """Positions, colours, normals and a mesh's faces; faces first, whose lists are in the way; doubles alone."""
     random = np.random.default_rng(0)
     columns = {name: random.normal(size=12).astype(np.float32) for name in ("x", "y", "z", "nx", "ny", "nz")}
     columns |= {name: random.integers(0, 256, 12).astype(np.uint8) for name in ("red", "green", "blue")}
     faces = [(3, 0, 1, 2), (4, 3, 4, 5, 6)]
     made = []
     for first in ("vertex", "face"):
-        parts = {"vertex": _rows(columns, encoding), "face": _faces(faces, encoding)}
+        parts = {
+            "vertex": _rows(columns, encoding),
+            "face": _faces(faces, encoding, "uchar" if first == "vertex" else "int"),
+        }
         order = [first, "face" if first == "vertex" else "vertex"]
         made.append(_ply(encoding, {name: parts[name] for name in order}))
     doubles = {name: 1e6 + random.normal(size=12) for name in ("x", "y", "z")}
@@ -212,12 +215,14 @@ def _rows(columns: dict[str, NDArray], encoding: str) -> Part:
     return len(rows), lines, np.array(rows, types).tobytes()
 
 
-def _faces(faces: list[tuple[int, ...]], encoding: str) -> Part:
-    lines = ["property list uchar int vertex_indices"]
+def _faces(faces: list[tuple[int, ...]], encoding: str, length: str) -> Part:
+    """faces: each the number of its corners, and these."""
+    lines = [f"property list {length} int vertex_indices"]
     if encoding == "ascii":
         return len(faces), lines, "".join(" ".join(map(str, face)) + "\n" for face in faces).encode()
     order = ">" if encoding.endswith("big_endian") else "<"
-    data = b"".join(struct.pack(f"{order}B{len(face) - 1}i", *face) for face in faces)
+    code = {"uchar": "B", "int": "i"}[length]
+    data = b"".join(struct.pack(f"{order}{code}{len(face) - 1}i", *face) for face in faces)
     return len(faces), lines, data
 
 
