@@ -1,0 +1,117 @@
+"""docs/gallery.md and its pictures: the numbered examples, run on the demo room, each with its code.
+
+    python scripts/make_gallery.py [--scene out/demo/room.ogpc]     # without a scene the demo is run first
+
+Pictures are shrunk to WIDTH and written as JPEG, so that the repository stays small.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import subprocess
+import sys
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+
+from og_pointcloud.cli import main as command
+
+ROOT = Path(__file__).parents[1]
+GALLERY = ROOT / "docs" / "gallery"
+WIDTH = 1000
+QUALITY = 82
+LABELS = "sofa,table,chair,bed,shelf,lamp"
+
+
+@dataclass(frozen=True)
+class Exhibit:
+    """An example, its arguments ({scene}, {cloud} and {out} are filled in), and the pictures of it that are shown."""
+
+    example: str
+    arguments: tuple[str, ...]
+    pictures: tuple[str, ...]
+    seen: str
+
+
+EXHIBITS = (
+    Exhibit("01_label_a_cloud", ("{scene}", "-o", "{out}"), ("labels.png",), "The room by words."),
+    Exhibit("02_instances_and_boxes", ("{scene}", "-o", "{out}"), ("instances.png",), "Objects, and boxes."),
+    Exhibit("03_click_query", ("{scene}", "-o", "{out}"), ("before.png", "after.png"), "Before and after a click."),
+    Exhibit(
+        "04_open3d_cloud", ("{scene}", "{cloud}", "--labels", LABELS, "-o", "{out}/painted.png"), ("painted.png",),
+        "An Open3D cloud, painted.",
+    ),
+    Exhibit(
+        "05_highlight_in_splats", ("{scene}", "{splats}", "chair", "-o", "{out}/chairs.png"), ("chairs.png",),
+        "One word lit in a rendering of the splat.",
+    ),
+    Exhibit("07_robot", ("--scene", "{scene}", "-o", "{out}"), ("07_robot.png",),
+            "A robot drives through the room after a chair was moved and two things were brought in."),
+    Exhibit("08_edit_a_scene", ("{scene}", "-o", "{out}"), ("edited.png",),
+            "As it was; sofa and cushions removed; the table red; one more chair. White is what no camera ever saw."),
+)  # fmt: skip
+
+
+def main() -> None:
+    """Run all, keep the pictures, write the page."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scene", type=Path, help="the demo's room.ogpc, beside its capture")
+    arguments = parser.parse_args()
+    GALLERY.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory() as temporary:
+        work = Path(temporary)
+        scene = arguments.scene or demo(work / "demo")
+        # The edited room comes first: its splat file is what another example lights a word in.
+        order = sorted(EXHIBITS, key=lambda exhibit: exhibit.example != "08_edit_a_scene")
+        for exhibit in order:
+            print(exhibit.example, flush=True)
+            run(exhibit, scene, work)
+    (ROOT / "docs" / "gallery.md").write_text(page())
+    print(f"wrote {ROOT / 'docs' / 'gallery.md'}")
+
+
+def demo(folder: Path) -> Path:
+    """The demo room, fitted."""
+    if command(["demo", "-o", str(folder)]):
+        raise SystemExit("the demo failed: what it printed says why")
+    return folder / "room.ogpc"
+
+
+def run(exhibit: Exhibit, scene: Path, work: Path) -> None:
+    """Run an example in a folder of its own, and keep its pictures."""
+    out = work / exhibit.example
+    out.mkdir(exist_ok=True)
+    splats = work / "08_edit_a_scene" / "before.ply"
+    places = {"scene": scene, "cloud": splats, "splats": splats, "out": out}
+    arguments = [argument.format(**places) for argument in exhibit.arguments]
+    subprocess.run([sys.executable, str(ROOT / "examples" / f"{exhibit.example}.py"), *arguments], check=True)
+    for name in exhibit.pictures:
+        image = cv2.imread(str(out / name))
+        assert image is not None, f"{exhibit.example} left no {name}"
+        height = round(image.shape[0] * WIDTH / image.shape[1])
+        small = cv2.resize(image, (WIDTH, height), interpolation=cv2.INTER_AREA)
+        kept = GALLERY / f"{exhibit.example[:2]}_{Path(name).stem}.jpg"
+        cv2.imwrite(str(kept), small, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
+
+
+def page() -> str:
+    """The page's text: a picture, what is seen, and the code, an example."""
+    parts = ["# Gallery\n\nThe numbered examples on the demo room, made by `python scripts/make_gallery.py`.\n"]
+    for exhibit in EXHIBITS:
+        code = (ROOT / "examples" / f"{exhibit.example}.py").read_text()
+        title = (ast.get_docstring(ast.parse(code)) or "").splitlines()[0]
+        parts.append(f"## {exhibit.example[:2]} {title}\n")
+        parts += [
+            f"![{exhibit.seen}](gallery/{exhibit.example[:2]}_{Path(name).stem}.jpg)" for name in exhibit.pictures
+        ]
+        body = code[code.index('"""', 3) + 3 :].strip()
+        parts.append(f"\n{exhibit.seen}\n\n<details><summary>{exhibit.example}.py</summary>\n")
+        parts.append(f"```python\n{body}\n```\n\n</details>\n")
+    return "\n".join(parts)
+
+
+if __name__ == "__main__":
+    main()
