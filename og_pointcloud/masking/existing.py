@@ -128,12 +128,9 @@ def decode_rle(rle: Any, source: str = "RLE") -> NDArray[np.bool_]:
 
     Runs alternate, background first, down the columns. SceneError where sizes are absurd, or runs do not add up.
     """
-    size = rle.get("size") if isinstance(rle, dict) else None
-    if not (isinstance(size, list) and len(size) == 2 and all(type(length) is int and length > 0 for length in size)):
-        raise SceneError(f"{source}: size is {size!r:.60}; expected [height, width] in pixels")
-    height, width = size
-    if height * width > MAX_PIXELS:
-        raise SceneError(f"{source}: size is {height}x{width}; expected at most {MAX_PIXELS} pixels")
+    if not isinstance(rle, dict):
+        raise SceneError(f"{source} is {type(rle).__name__}; expected a record with size and counts")
+    height, width = _size(rle.get("size"), source)
     counts = rle.get("counts")
     if isinstance(counts, (str, bytes)):
         counts = _decompressed(counts, source)
@@ -146,6 +143,15 @@ def decode_rle(rle: Any, source: str = "RLE") -> NDArray[np.bool_]:
         )
     values = np.arange(len(counts)) % 2 == 1
     return np.repeat(values, counts).reshape(width, height).T
+
+
+def _size(size: Any, source: str) -> tuple[int, int]:
+    """[height, width] of a mask, checked before anything of that size is made."""
+    if not (isinstance(size, list) and len(size) == 2 and all(type(length) is int and length > 0 for length in size)):
+        raise SceneError(f"{source}: size is {size!r:.60}; expected [height, width] in pixels")
+    if size[0] * size[1] > MAX_PIXELS:
+        raise SceneError(f"{source}: size is {size[0]}x{size[1]}; expected at most {MAX_PIXELS} pixels")
+    return size[0], size[1]
 
 
 def _decompressed(text: str | bytes, source: str) -> list[int]:
@@ -197,8 +203,7 @@ def _from_annotations(annotations: Sequence[dict[str, Any]], source: str) -> Pro
 
 def _polygons(polygons: list[Any], size: Any, source: str) -> NDArray[np.bool_]:
     """Rings of x, y in pixels. size: [height, width]."""
-    empty = decode_rle({"size": size, "counts": [size[0] * size[1]] if _is_size(size) else []}, source)
-    drawn = empty.astype(np.uint8)
+    drawn = np.zeros(_size(size, source), np.uint8)
     for ring in polygons:
         try:
             corners = np.array(ring, np.float64).reshape(-1, 2)
@@ -208,10 +213,6 @@ def _polygons(polygons: list[Any], size: Any, source: str) -> NDArray[np.bool_]:
             raise SceneError(f"{source}: a polygon is {ring!r:.60}; expected x, y, x, y ... of three corners or more")
         require_cv2().fillPoly(drawn, [np.rint(corners).astype(np.int32)], 1)
     return drawn.astype(np.bool_)
-
-
-def _is_size(size: Any) -> bool:
-    return isinstance(size, list) and len(size) == 2 and all(type(length) is int for length in size)
 
 
 def read_json(file: Path) -> Any:

@@ -73,7 +73,7 @@ def _atoms(masks: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.bool_
     for mask in masks:
         signature[mask] += rng.integers(1 << 63, dtype=np.uint64)
     _, first, atom_of_pixel, area_px = np.unique(signature, return_index=True, return_inverse=True, return_counts=True)
-    member = masks.reshape(len(masks), -1)[:, first]
+    member = masks.reshape(len(masks), signature.size)[:, first]
     return atom_of_pixel.reshape(masks.shape[1:]), member, area_px.astype(np.float64)
 
 
@@ -135,4 +135,4 @@ def _owners(
         owner[member[mask]] = mask
     shown_px = np.bincount(owner + 1, area_px, len(member) + 1)[1:]
     hidden = (shown_px < VISIBLE * (member @ area_px)) | (shown_px < smallest_px)
-    return np.where((owner >= 0) & hidden[owner], -1, owner)
+    return np.where(np.append(hidden, False)[owner], -1, owner)  # the last entry serves -1

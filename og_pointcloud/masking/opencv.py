@@ -259,12 +259,12 @@ def _pixel_pairs(labels: Labels, lab: NDArray[np.float32], depth: NDArray[np.flo
     step = np.zeros(len(row))
     if depth is not None:
         z_left, z_right = depth[row, left], depth[row, right]
-        span = right - left
-        slope_left = np.abs(depth[row, np.maximum(left - span, 0)] - z_left)
-        slope_right = np.abs(depth[row, np.minimum(right + span, last)] - z_right)
+        before, after = left - (right - left), right + (right - left)
+        slope_left = np.where(before >= 0, np.abs(depth[row, np.maximum(before, 0)] - z_left), np.inf)
+        slope_right = np.where(after <= last, np.abs(depth[row, np.minimum(after, last)] - z_right), np.inf)
         beyond_slope = np.abs(z_left - z_right) - np.minimum(slope_left, slope_right)
         nearer = np.minimum(z_left, z_right)
-        step = np.where(nearer > 0, np.clip(beyond_slope / np.where(nearer > 0, STEP * nearer, 1), 0, 1), 0)
+        step = np.clip(beyond_slope / np.where(nearer > 0, STEP * nearer, np.inf), 0, 1)
     return labels[row, column], labels[row, column + 1], np.stack([np.ones(len(row)), contrast, step])
 
 

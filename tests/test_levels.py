@@ -1,0 +1,154 @@
+"""Levels against a slow literal reference on pixels; invariances."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from og_pointcloud.errors import SceneError
+from og_pointcloud.masking.contracts import Proposals
+from og_pointcloud.masking.levels import INSIDE, LEVELS, PREFERENCE, SAME, VISIBLE, settle
+
+
+def rectangle(top, left, bottom, right, size=(24, 32)):
+    mask = np.zeros(size, bool)
+    mask[top:bottom, left:right] = True
+    return mask
+
+
+def proposals(*pairs):
+    return Proposals(np.array([mask for mask, _ in pairs]), np.array([score for _, score in pairs], np.float32))
+
+
+def random_proposals(seed, count=25, size=(24, 32)):
+    rng = np.random.default_rng(seed)
+    masks = []
+    for _ in range(count):
+        top, left = rng.integers(0, size[0] - 2), rng.integers(0, size[1] - 2)
+        bottom, right = rng.integers(top + 1, size[0] + 1), rng.integers(left + 1, size[1] + 1)
+        masks.append(rectangle(top, left, bottom, right, size))
+    return Proposals(np.array(masks), rng.uniform(0.1, 1, count).astype(np.float32))
+
+
+def literal(said: Proposals, preference: float, smallest_px: int = 1):
+    """The rules as written, pixel by pixel and mask by mask: the map of proposal numbers, -1 for none."""
+    order = sorted(range(len(said)), key=lambda k: (-float(said.scores[k]), said.masks[k].sum(), k))
+    kept: list[int] = []
+    for k in order:
+        mask = said.masks[k]
+        same = [(mask & said.masks[o]).sum() > SAME * (mask | said.masks[o]).sum() for o in kept]
+        if mask.any() and not any(same):
+            kept.append(k)
+
+    def parent(k):
+        mask = said.masks[k]
+        around = [
+            o for o in kept
+            if said.masks[o].sum() > mask.sum() and (mask & said.masks[o]).sum() > INSIDE * mask.sum()
+        ]  # fmt: skip
+        return min(around, key=lambda o: (said.masks[o].sum(), kept.index(o))) if around else None
+
+    parents = {k: parent(k) for k in kept}
+
+    def value(k):
+        return max(own(k), preference * parts(k))
+
+    def own(k):
+        return float(said.masks[k].sum()) * float(said.scores[k])
+
+    def parts(k):
+        return sum(value(child) for child in kept if parents[child] == k)
+
+    def chosen(k):
+        return [k] if own(k) >= preference * parts(k) else [x for c in kept if parents[c] == k for x in chosen(c)]
+
+    used = [x for k in kept if parents[k] is None for x in chosen(k)]
+    used.sort(key=kept.index)
+    result = np.full(said.masks.shape[1:], -1)
+    for k in reversed(used):
+        result[said.masks[k]] = k
+    for k in used:
+        if (result == k).sum() < max(VISIBLE * said.masks[k].sum(), smallest_px):
+            result = np.where(result == k, -1 - len(said), result)
+    return np.where(result < 0, -1, result)
+
+
+def shown(level):
+    return np.append(level.proposals, -1)[level.ids]
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_the_literal_reference(seed):
+    said = random_proposals(seed)
+    levels = settle(said, smallest_px=6)
+    for name in LEVELS:
+        assert np.array_equal(shown(levels[name]), literal(said, PREFERENCE[name], 6)), name
+        assert np.array_equal(levels[name].scores, said.scores[levels[name].proposals])
+
+
+def test_a_box_of_two_halves_on_three_levels():
+    whole, left, right = rectangle(4, 4, 20, 28), rectangle(4, 4, 20, 16), rectangle(4, 16, 20, 28)
+    levels = settle(proposals((whole, 0.8), (left, 0.75), (right, 0.75)))
+    assert np.array_equal(shown(levels["large"]) == 0, whole)
+    assert np.array_equal(shown(levels["middle"]) == 0, whole)
+    assert np.array_equal(shown(levels["small"]) == 1, left)
+    assert np.array_equal(shown(levels["small"]) == 2, right)
+
+
+def test_scores_decide_where_masks_overlap():
+    a, b = rectangle(0, 0, 10, 20), rectangle(0, 12, 10, 32)
+    both = a & b
+    assert (shown(settle(proposals((a, 0.9), (b, 0.5)))["large"])[both] == 0).all()
+    assert (shown(settle(proposals((a, 0.5), (b, 0.9)))["large"])[both] == 1).all()
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_levels_are_contained_in_one_another_in_a_tree(seed):
+    rng = np.random.default_rng(seed)
+    masks, todo = [], [(0, 0, 24, 32)]
+    while todo:
+        top, left, bottom, right = todo.pop()
+        masks.append(rectangle(top, left, bottom, right))
+        if bottom - top > 4 and right - left > 4:
+            middle = int(rng.integers(left + 2, right - 1))
+            todo += [(top, left, bottom, middle), (top, middle, bottom, right)]
+    levels = settle(Proposals(np.array(masks), rng.uniform(0.2, 1, len(masks)).astype(np.float32)))
+    for finer, coarser in (("small", "middle"), ("middle", "large")):
+        for mask in levels[finer].masks():
+            owners = np.unique(levels[coarser].ids[mask])
+            assert len(owners) == 1
+            assert owners[0] >= 0
+
+
+def test_the_order_of_proposals_does_not_matter():
+    said = random_proposals(3)
+    order = np.random.default_rng(0).permutation(len(said))
+    shuffled = settle(Proposals(said.masks[order], said.scores[order]))
+    for name, level in settle(said).items():
+        assert np.array_equal(shown(level), np.append(order, -1)[shown(shuffled[name])])
+
+
+def test_a_near_copy_is_one_mask_the_better_scored():
+    a, b = rectangle(2, 2, 20, 20), rectangle(2, 2, 20, 21)
+    assert settle(proposals((a, 0.5), (b, 0.6)))["large"].proposals.tolist() == [1]
+
+
+def test_nothing_and_empty_masks():
+    none = settle(Proposals(np.zeros((0, 5, 7), bool), np.zeros(0, np.float32)))
+    empty = settle(Proposals(np.zeros((2, 5, 7), bool), np.ones(2, np.float32)))
+    for level in [*none.values(), *empty.values()]:
+        assert level.ids.shape == (5, 7)
+        assert (level.ids == -1).all()
+        assert len(level.proposals) == len(level.masks()) == 0
+
+
+def test_tiny_masks_are_left_out():
+    levels = settle(proposals((rectangle(0, 0, 2, 2), 1.0), (rectangle(5, 5, 15, 15), 0.5)), smallest_px=5)
+    assert levels["small"].proposals.tolist() == [1]
+
+
+def test_proposals_are_checked():
+    with pytest.raises(SceneError, match="expected bool"):
+        Proposals(np.zeros((2, 3, 4), np.uint8), np.ones(2, np.float32))
+    with pytest.raises(SceneError, match="a finite one each"):
+        Proposals(np.zeros((2, 3, 4), bool), np.full(2, np.nan, np.float32))

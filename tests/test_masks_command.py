@@ -1,0 +1,347 @@
+"""``og-pointcloud masks``: what it writes, what it takes up after a kill, what it refuses, what it survives."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from capture_files import HEIGHT, WIDTH, make_world, write_colmap_text, write_ply, write_transforms
+
+from og_pointcloud.cli import main
+from og_pointcloud.errors import OgPointcloudError, SceneError
+from og_pointcloud.formats.capture import read_capture
+from og_pointcloud.masking.make_masks import PREVIEW_NAME, WORK_FOLDER, MaskSettings, make_masks
+
+ALONE = MaskSettings(encoder=None, drop_tiny=False)
+
+
+def silent(_: str) -> None:
+    pass
+
+
+def scenery(shift=0, size=(HEIGHT, WIDTH)):
+    """A picture (BGR) with two things on a ground."""
+    height, width = size
+    image = np.full((height, width, 3), 120, np.uint8)
+    image[height // 4 : height // 2, width // 8 + shift : width // 2 + shift] = (40, 40, 210)
+    image[height // 2 + 4 : -4, width // 2 : -8] = (60, 190, 60)
+    return image
+
+
+def make_capture(folder: Path, count=4, encode=None):
+    """A capture without masks. encode: image number and BGR picture -> the bytes of its file, None for plain PNG."""
+    world = make_world(count=count)
+    folder.mkdir(parents=True, exist_ok=True)
+    write_transforms(folder, world, ply_file_path="points.ply")
+    write_ply(folder / "points.ply", world.xyz, world.rgb)
+    (folder / "images").mkdir()
+    for k, name in enumerate(world.names):
+        data = (encode or plain)(k, scenery(k))
+        (folder / "images" / f"{name}.png").write_bytes(data)
+    return world
+
+
+def plain(_, picture):
+    return cv2.imencode(".png", picture)[1].tobytes()
+
+
+def ids_of(folder: Path, name: str):
+    return cv2.imread(str(folder / "masks" / f"{name}.png"), cv2.IMREAD_UNCHANGED)
+
+
+def test_a_capture_gets_masks_that_can_be_read(tmp_path):
+    world = make_capture(tmp_path / "c")
+    made = make_masks(tmp_path / "c", ALONE, say=silent)
+    scene = read_capture(tmp_path / "c")
+    assert made.images == 4
+    assert made.done_before == 0
+    assert made.masks == sum(view.mask_count for view in scene.views) >= 8
+    for k, view in enumerate(scene.views):
+        ids = view.mask_map()
+        thing = (scenery(k) == (40, 40, 210)).all(axis=2)
+        found = ids == np.bincount(ids[thing] + 1).argmax() - 1
+        assert (found & thing).sum() / (found | thing).sum() > 0.7  # of 24x12 pixels, a rim of one is a quarter
+    assert (tmp_path / "c" / PREVIEW_NAME).stat().st_size > 1000
+    assert not (tmp_path / "c" / WORK_FOLDER).exists()
+    assert json.loads((tmp_path / "c" / "masks" / "made.json").read_text())["proposer"] == "opencv"
+    assert [view.name for view in scene.views] == world.names
+
+
+def test_the_demo_encoder_gives_the_features(tmp_path):
+    make_capture(tmp_path / "c", 2)
+    made = make_masks(tmp_path / "c", MaskSettings(drop_tiny=False), say=silent)
+    scene = read_capture(tmp_path / "c")
+    assert scene.feature_space == made.feature_space == "og_pointcloud/demo-room-encoder"
+    features = np.concatenate([view.mask_features for view in scene.views])
+    assert np.allclose(np.linalg.norm(features, axis=1), 1, atol=1e-2)
+
+
+@pytest.mark.parametrize("processes", [1, 2])
+def test_langsplat_files_have_three_levels(tmp_path, processes):
+    world = make_capture(tmp_path / "c")
+    settings = MaskSettings(encoder=None, drop_tiny=False, langsplat=True)
+    make_masks(tmp_path / "c", settings, say=silent, processes=processes)
+    assert not (tmp_path / "c" / "masks").exists()
+    for level in ("default", "small", "medium", "large"):
+        scene = read_capture(tmp_path / "c", mask_level=level)
+        assert all(view.mask_count for view in scene.views)
+        assert all(view.mask_map().max() == view.mask_count - 1 for view in scene.views)
+    ids = np.load(tmp_path / "c" / "language_features" / f"{world.names[0]}_s.npy")
+    assert ids.shape == (4, HEIGHT, WIDTH)
+    starts = [level[level >= 0].min() for level in ids]
+    assert starts == sorted(starts)
+    assert starts[0] == 0
+
+
+def test_two_processes_give_the_same_files(tmp_path):
+    world = make_capture(tmp_path / "c")
+    make_masks(tmp_path / "c", ALONE, tmp_path / "one", say=silent)
+    make_masks(tmp_path / "c", ALONE, tmp_path / "two", say=silent, processes=2)
+    for name in world.names:
+        assert (tmp_path / "one" / "masks" / f"{name}.png").read_bytes() == (
+            tmp_path / "two" / "masks" / f"{name}.png"
+        ).read_bytes()
+
+
+# Long work -------------------------------------------------------------------------------------------------------
+
+SLOWLY = """
+import sys, time
+from og_pointcloud.masking import make_masks as m
+settle = m.settle
+def slow(*arguments):
+    with open(sys.argv[2], "a") as log:
+        log.write("x")
+    time.sleep(float(sys.argv[3]))
+    return settle(*arguments)
+m.settle = slow
+m.make_masks(sys.argv[1], m.MaskSettings(encoder=None, drop_tiny=False))
+"""
+
+
+def run_slowly(capture, log, seconds):
+    return subprocess.Popen(
+        [sys.executable, "-c", SLOWLY, str(capture), str(log), str(seconds)], stderr=subprocess.PIPE
+    )
+
+
+def test_killed_in_the_middle_nothing_is_lost_and_nothing_done_twice(tmp_path):
+    world = make_capture(tmp_path / "c", 5)
+    make_masks(tmp_path / "c", ALONE, tmp_path / "whole", say=silent)
+    process = run_slowly(tmp_path / "c", tmp_path / "log1", 0.25)
+    deadline = time.monotonic() + 60
+    while len(list((tmp_path / "c").glob(f"{WORK_FOLDER}/*/*.npz"))) < 2 and time.monotonic() < deadline:
+        time.sleep(0.02)
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    process.stderr.close()
+    kept = {path: path.stat().st_mtime_ns for path in (tmp_path / "c").glob(f"{WORK_FOLDER}/*/[0-9a-f]*.npz")}
+    assert 2 <= len(kept) < 5
+    assert not (tmp_path / "c" / "mask_features.npz").exists()
+    second = run_slowly(tmp_path / "c", tmp_path / "log2", 0)
+    said = second.communicate()[1].decode()
+    assert second.returncode == 0, said
+    assert f"{len(kept)} of 5 images are done already" in said
+    assert len((tmp_path / "log2").read_text()) == 5 - len(kept)
+    for name in world.names:
+        assert np.array_equal(ids_of(tmp_path / "c", name), ids_of(tmp_path / "whole", name))
+
+
+def test_other_settings_and_other_images_are_done_anew(tmp_path):
+    world = make_capture(tmp_path / "c", 2)
+    broken = tmp_path / "c" / "images" / f"{world.names[1]}.png"
+    good = broken.read_bytes()
+    broken.write_bytes(good[: len(good) // 2])
+    with pytest.raises(SceneError, match="1 of 2 images cannot be used"):
+        make_masks(tmp_path / "c", ALONE, say=silent)
+    first = next((tmp_path / "c" / "images").glob(f"{world.names[0]}*"))
+    first.write_bytes(plain(0, scenery(9)))
+    os.utime(first, ns=(1, 1))
+    broken.write_bytes(good)
+    made = make_masks(tmp_path / "c", ALONE, say=silent)
+    assert made.done_before == 0
+    ids = ids_of(tmp_path / "c", world.names[0])
+    thing = (scenery(9) == (40, 40, 210)).all(axis=2)
+    assert (ids == np.bincount(ids[thing]).argmax())[thing].mean() > 0.7
+
+
+def test_masks_of_others_are_not_overwritten(tmp_path, capsys):
+    world = make_capture(tmp_path / "c", 2)
+    (tmp_path / "c" / "masks").mkdir()
+    theirs = tmp_path / "c" / "masks" / f"{world.names[0]}.png"
+    theirs.write_bytes(b"mine")
+    assert main(["masks", str(tmp_path / "c"), "--encoder", "none"]) == 2
+    assert "was not made by this command" in capsys.readouterr().err
+    assert theirs.read_bytes() == b"mine"
+    assert main(["masks", str(tmp_path / "c"), "--encoder", "none", "--overwrite"]) == 0
+    assert main(["masks", str(tmp_path / "c"), "--encoder", "none", "--level", "small"]) == 0
+    out = capsys.readouterr().out
+    assert "next: og-pointcloud fit" in out
+
+
+# Which images ----------------------------------------------------------------------------------------------------
+
+
+def test_left_out_images_need_a_folder_and_are_named(tmp_path, capsys):
+    world = make_capture(tmp_path / "c", 5)
+    assert main(["masks", str(tmp_path / "c"), "--encoder", "none", "--every", "2"]) == 2
+    assert "(-o DIR)" in capsys.readouterr().err
+    output = tmp_path / "half"
+    assert main(["masks", str(tmp_path / "c"), "--encoder", "none", "--every", "2", "-o", str(output)]) == 0
+    said = capsys.readouterr().err
+    assert f"left out: 2 of 5 images (every 2 is used): {world.names[1]}, {world.names[3]}" in said
+    scene = read_capture(output)
+    assert [view.name for view in scene.views] == world.names[::2]
+    assert scene.views[0].image_rgb() is not None
+    assert len(scene.points) == 50
+    assert not (tmp_path / "c" / "masks").exists()
+
+
+def test_views_that_add_nothing_are_left_out(tmp_path):
+    world = make_world(count=9)
+    world.quaternions[:], world.translations[:] = world.quaternions[0], world.translations[0]
+    world.xyz[:] = world.xyz @ np.diag([0.1, 0.1, 0.1]) - world.poses[0, :3, :3].T @ (world.translations[0] - [0, 0, 5])
+    folder = tmp_path / "c"
+    make_capture(folder, 9)
+    write_transforms(folder, world, ply_file_path="points.ply")
+    write_ply(folder / "points.ply", world.xyz, world.rgb)
+    said: list[str] = []
+    made = make_masks(
+        folder, MaskSettings(encoder=None, enough_views=3, drop_tiny=False), tmp_path / "few", say=said.append
+    )
+    assert made.images == 3
+    assert len(made.left_out) == 6
+    assert "seen by 3 others" in said[0]
+
+
+def test_colmap_captures_in_place(tmp_path):
+    world = make_world(count=2)
+    write_colmap_text(tmp_path / "sparse" / "0", world)
+    (tmp_path / "images").mkdir()
+    for name in world.names:
+        (tmp_path / "images" / f"{name}.png").write_bytes(plain(0, scenery()))
+    make_masks(tmp_path, ALONE, say=silent)
+    assert all(view.mask_count for view in read_capture(tmp_path).views)
+
+
+def test_an_existing_folder_of_masks_as_proposer(tmp_path):
+    world = make_capture(tmp_path / "c", 2)
+    for name in world.names:
+        ids = np.zeros((HEIGHT, WIDTH), np.uint8)
+        ids[10:30, 10:30], ids[5:9, 40:60] = 9, 200
+        (tmp_path / f"{name}.png").write_bytes(cv2.imencode(".png", ids)[1].tobytes())
+    made = make_masks(tmp_path / "c", MaskSettings(str(tmp_path), encoder=None, level="large"), say=silent)
+    assert made.masks == 4
+    ids = ids_of(tmp_path / "c", world.names[0])
+    assert sorted(np.bincount(ids.ravel())[1:].tolist()) == [80, 400]
+
+
+# Images as they come ----------------------------------------------------------------------------------------------
+
+
+def grey(_, picture):
+    return cv2.imencode(".png", cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY))[1].tobytes()
+
+
+def sixteen_bit(_, picture):
+    return cv2.imencode(".png", picture.astype(np.uint16) * 257)[1].tobytes()
+
+
+def alpha(_, picture):
+    return cv2.imencode(".png", np.dstack([picture, np.full(picture.shape[:2], 90, np.uint8)]))[1].tobytes()
+
+
+def rotated_by_exif(_, picture):
+    """A JPEG that says orientation 6: viewers turn it, poses do not."""
+    data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes()
+    tiff = b"II*\0\x08\0\0\0\x01\0\x12\x01\x03\0\x01\0\0\0\x06\0\0\0\0\0\0\0"
+    exif = b"Exif\0\0" + tiff
+    return data[:2] + b"\xff\xe1" + (len(exif) + 2).to_bytes(2, "big") + exif + data[2:]
+
+
+@pytest.mark.parametrize("encode", [grey, sixteen_bit, alpha, rotated_by_exif])
+def test_images_of_every_kind(tmp_path, encode):
+    world = make_capture(tmp_path / "c", 1, encode)
+    make_masks(tmp_path / "c", ALONE, say=silent)
+    ids = ids_of(tmp_path / "c", world.names[0])
+    thing = (scenery() == (40, 40, 210)).all(axis=2)
+    found = ids == np.bincount(ids[thing]).argmax()
+    assert ids.shape == (HEIGHT, WIDTH)
+    assert (found & thing).sum() / (found | thing).sum() > 0.7
+
+
+def test_a_large_image_is_shrunk_and_its_camera_with_it(tmp_path):
+    make_capture(tmp_path / "c", 1, lambda *_: plain(0, scenery(size=(HEIGHT * 120, WIDTH * 120))))
+    make_masks(tmp_path / "c", ALONE, say=silent)
+    view = read_capture(tmp_path / "c").views[0]
+    assert (view.camera.width, view.camera.height) == (1024, 768)
+    assert view.camera.fx == pytest.approx(70 * 16)
+    assert view.mask_count >= 2
+
+
+@pytest.mark.parametrize(
+    "data", [b"", b"not an image", plain(0, scenery())[:60], plain(0, np.zeros((7, 90, 3), np.uint8))]
+)
+def test_an_image_that_cannot_be_used_is_named(tmp_path, data):
+    world = make_capture(tmp_path / "c", 3, lambda k, picture: data if k == 1 else plain(k, picture))
+    with pytest.raises(SceneError, match=world.names[1]):
+        make_masks(tmp_path / "c", ALONE, say=silent)
+    assert not (tmp_path / "c" / "masks").exists()
+
+
+def test_a_missing_image_and_a_missing_folder(tmp_path):
+    world = make_capture(tmp_path / "c", 2)
+    (tmp_path / "c" / "images" / f"{world.names[0]}.png").unlink()
+    with (
+        pytest.warns(UserWarning, match="not found"),
+        pytest.raises(SceneError, match="1 of 2 posed images are not found"),
+    ):
+        make_masks(tmp_path / "c", ALONE, say=silent)
+    with pytest.raises(SceneError, match="is not a folder"):
+        make_masks(tmp_path / "none", ALONE, say=silent)
+
+
+@pytest.mark.parametrize("processes", [1, 2])
+def test_a_proposer_that_is_not_there_is_one_error(tmp_path, processes):
+    make_capture(tmp_path / "c", 2)
+    settings = MaskSettings(proposer=f"onnx:{tmp_path / 'none.onnx'}", encoder=None)
+    with pytest.raises(OgPointcloudError, match=r"none\.onnx is no file"):
+        make_masks(tmp_path / "c", settings, say=silent, processes=processes)
+
+
+def test_settings_are_checked():
+    with pytest.raises(OgPointcloudError, match="mask level is 'huge'"):
+        MaskSettings(level="huge")
+    with pytest.raises(OgPointcloudError, match="every is 0"):
+        MaskSettings(every=0)
+
+
+# Models -----------------------------------------------------------------------------------------------------------
+
+
+def test_models_lists_and_downloads_nothing(tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("HF_HUB_CACHE", str(tmp_path / "hub"))
+    snapshot = tmp_path / "hub" / "models--facebook--sam-vit-base" / "snapshots" / "abc"
+    snapshot.mkdir(parents=True)
+    (snapshot / "config.json").write_text('{"model_type": "sam"}')
+    (snapshot / "model.safetensors").write_bytes(b"")
+    make_capture(tmp_path / "c", 1)
+    before = sorted(tmp_path.rglob("*"))
+    assert main(["models", str(tmp_path / "c")]) == 0
+    out = capsys.readouterr().out
+    assert "facebook/sam-vit-base  proposer" in out
+    assert "hf download facebook/sam-vit-base" not in out
+    assert "hf download openai/clip-vit-base-patch16" in out
+    assert f"og-pointcloud masks {tmp_path / 'c'} --proposer sam:OWNER/MODEL" in out
+    make_masks(tmp_path / "c", ALONE, say=silent)
+    assert main(["models", str(tmp_path / "c")]) == 0
+    assert "features of 'unknown' (width 1)" in capsys.readouterr().out
+    assert before == [path for path in sorted(tmp_path.rglob("*")) if path in before]

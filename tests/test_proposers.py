@@ -1,0 +1,400 @@
+"""OpenCV's region tree, the automatic grid of prompts, masks that exist already, and what points know of masks."""
+
+from __future__ import annotations
+
+import json
+import time
+
+import cv2
+import numpy as np
+import pytest
+
+from og_pointcloud.errors import SceneError
+from og_pointcloud.masking.automatic import (
+    AutomaticMasks,
+    best_boxes,
+    crops,
+    grid,
+    mask_boxes,
+    stability,
+    without_specks,
+)
+from og_pointcloud.masking.contracts import DepthMaskProposer, Proposals
+from og_pointcloud.masking.existing import CallableProposer, ExistingMasks, as_proposals, decode_rle, from_ids
+from og_pointcloud.masking.opencv import OpenCVProposer, region_tree
+from og_pointcloud.masking.opening import open_proposer
+from og_pointcloud.masking.refine import depth_edges, rendered_depth, smallest_mask_px, split_at_depth_edges
+from og_pointcloud.scene import Camera
+
+
+def painted(noise=4.0, size=(120, 160)):
+    """Three flat things on a grey ground, and the map of which is where (0 ground)."""
+    ids = np.zeros(size, np.int32)
+    ids[20:60, 15:60] = 1
+    cv2.circle(ids, (110, 40), 25, 2, -1)
+    ids[80:108, 40:128] = 3
+    colors = np.array([(130, 130, 130), (200, 60, 60), (60, 90, 200), (70, 160, 80)], np.float32)
+    image = colors[ids] + np.random.default_rng(0).normal(0, noise, (*size, 3))
+    return np.clip(image, 0, 255).astype(np.uint8), ids
+
+
+def iou(a, b):
+    return (a & b).sum() / max(1, (a | b).sum())
+
+
+# OpenCV ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("size", [(120, 160), (480, 640)])
+def test_opencv_finds_flat_things(size):
+    image, ids = painted()
+    image = cv2.resize(image, size[::-1], interpolation=cv2.INTER_NEAREST)
+    ids = cv2.resize(ids, size[::-1], interpolation=cv2.INTER_NEAREST)
+    proposals = OpenCVProposer().propose(image)
+    assert proposals.masks.shape[1:] == size
+    for thing in (1, 2, 3):
+        assert max(iou(mask, ids == thing) for mask in proposals.masks[:12]) > 0.9
+
+
+def test_opencv_is_deterministic():
+    image, _ = painted(noise=20)
+    first, second = OpenCVProposer().propose(image), OpenCVProposer().propose(image)
+    assert np.array_equal(first.masks, second.masks)
+    assert np.array_equal(first.scores, second.scores)
+
+
+def test_depth_parts_what_colour_does_not():
+    image = np.full((120, 160, 3), 120, np.uint8)
+    image += np.random.default_rng(0).integers(0, 8, image.shape, np.uint8)
+    thing = np.zeros((120, 160), bool)
+    thing[36:84, 48:112] = True
+    depth = np.where(thing, 1.0, 1.5).astype(np.float32)
+    proposer = OpenCVProposer()
+    assert isinstance(proposer, DepthMaskProposer)
+    with_depth = proposer.propose_with_depth(image, depth)
+    without = proposer.propose(image)
+    assert max(iou(mask, thing) for mask in with_depth.masks) > 0.8
+    assert max([iou(mask, thing) for mask in without.masks], default=0) < 0.6
+
+
+def test_a_slope_of_depth_is_no_step():
+    image = np.full((60, 80, 3), 120, np.uint8)
+    slope = np.tile(np.linspace(1, 3, 80, dtype=np.float32), (60, 1))
+    assert region_tree(image, slope).made.max() == pytest.approx(region_tree(image, None).made.max(), abs=0.5)
+
+
+def test_the_tree_is_a_tree_and_runs_are_its_regions():
+    tree = region_tree(painted()[0], None)
+    n, m = int(tree.superpixels.max()) + 1, len(tree.parent)
+    assert m == 2 * n - 1
+    assert (tree.parent < 0).sum() == 1
+    assert (tree.parent[:-1] > np.arange(m - 1)).all()
+    assert (tree.gone >= tree.made).all()
+    place, runs = tree.runs()
+    rank = place[tree.superpixels]
+    inside: list[set[int]] = [{k} for k in range(n)] + [set() for _ in range(m - n)]
+    for child, above in enumerate(tree.parent.tolist()):
+        if above >= 0:
+            inside[above] |= inside[child]
+    for region in range(m):
+        literal = np.isin(tree.superpixels, list(inside[region]))
+        assert np.array_equal((rank >= runs[region, 0]) & (rank < runs[region, 1]), literal)
+        assert tree.area[region] == literal.sum()
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (3, 500), (9, 9), (7, 7)])
+def test_opencv_on_almost_nothing(shape):
+    proposals = OpenCVProposer().propose(np.zeros((*shape, 3), np.uint8))
+    assert proposals.masks.shape[1:] == shape
+
+
+def test_opencv_refuses_depth_of_another_size():
+    with pytest.raises(SceneError, match="one depth a pixel"):
+        OpenCVProposer().propose_with_depth(painted()[0], np.zeros((5, 5), np.float32))
+
+
+# A grid of prompts ----------------------------------------------------------------------------------------------
+
+
+class Oracle:
+    """Answers a point with the things there at a quarter of the size: itself, a blur of it, and noise."""
+
+    def __init__(self):
+        self.image, self.prompts, self.pause = np.zeros(0), 0, 0.0
+
+    def set_image(self, image):
+        self.image = image[:, :, 0]
+
+    def at_points(self, points):
+        time.sleep(self.pause)
+        self.prompts += len(points)
+        height, width = self.image.shape
+        logits, iou = [], []
+        for x, y in points:
+            here = self.image == self.image[int(y), int(x)]
+            small = cv2.resize(
+                here.astype(np.float32), (max(1, width // 4), max(1, height // 4)), interpolation=cv2.INTER_AREA
+            )
+            soft = cv2.blur(small, (9, 9))
+            logits.append([20 * small - 10, 3 * soft - 1.5, np.full_like(small, -5)])
+            iou.append([0.97, 0.95, 0.99])
+        return np.array(logits, np.float32), np.array(iou, np.float32)
+
+
+def test_the_grid_finds_each_thing_once():
+    _, ids = painted()
+    image = np.repeat((ids * 60).astype(np.uint8)[:, :, None], 3, axis=2)
+    oracle = Oracle()
+    proposals = AutomaticMasks(oracle, "oracle", points_per_side=8, batch=7).propose(image)
+    assert oracle.prompts == 64
+    assert len(proposals) == 4
+    for thing in range(4):
+        assert max(iou(mask, ids == thing) for mask in proposals.masks) > 0.9
+
+
+def test_the_time_budget_stops_adding_prompts_and_says_so():
+    image = np.repeat((painted()[1] * 60).astype(np.uint8)[:, :, None], 3, axis=2)
+    oracle = Oracle()
+    oracle.pause = 0.05
+    with pytest.warns(UserWarning, match=r"8 of 64 prompts in 0.01 s"):
+        proposals = AutomaticMasks(oracle, "oracle", points_per_side=8, batch=8, seconds_per_image=0.01).propose(image)
+    assert oracle.prompts == 8
+    assert len(proposals) > 0
+
+
+def test_crops_find_the_same_things_and_drop_what_they_cut():
+    _, ids = painted()
+    image = np.repeat((ids * 60).astype(np.uint8)[:, :, None], 3, axis=2)
+    proposals = AutomaticMasks(Oracle(), "oracle", points_per_side=8, crop_layers=1).propose(image)
+    assert len(proposals) == 4
+    covered = np.zeros(ids.shape, int)
+    for left, top, right, bottom in crops(160, 120, 1):
+        covered[top:bottom, left:right] += 1
+    assert covered.min() == 1
+    assert list(crops(160, 120, 0)) == [(0, 0, 160, 120)]
+
+
+def test_the_grid_lies_in_the_middles_of_cells():
+    points = grid(4, 80, 40)
+    assert sorted({tuple(p) for p in points.tolist()})[:2] == [(10.0, 5.0), (10.0, 15.0)]
+    assert len({tuple(p) for p in points.tolist()}) == 16
+
+
+def test_boxes_and_suppression_against_loops():
+    rng = np.random.default_rng(0)
+    low = rng.uniform(0, 50, (60, 2))
+    boxes = np.concatenate([low, low + rng.uniform(5, 40, (60, 2))], axis=1).astype(np.float32)
+    scores = rng.uniform(0, 1, 60).astype(np.float32)
+    kept: list[int] = []
+    for k in sorted(range(60), key=lambda k: -scores[k]):
+
+        def box_iou(o, k=k):
+            w = min(boxes[o, 2], boxes[k, 2]) - max(boxes[o, 0], boxes[k, 0])
+            h = min(boxes[o, 3], boxes[k, 3]) - max(boxes[o, 1], boxes[k, 1])
+            shared = max(w, 0) * max(h, 0)
+            area = [(boxes[j, 2] - boxes[j, 0]) * (boxes[j, 3] - boxes[j, 1]) for j in (o, k)]
+            return shared / (sum(area) - shared)
+
+        if all(box_iou(o) <= 0.3 for o in kept):
+            kept.append(k)
+    assert best_boxes(boxes, scores, 0.3).tolist() == kept
+    masks = np.zeros((3, 10, 12), bool)
+    masks[0, 2:5, 3:9] = masks[1, 9, 11] = True
+    assert mask_boxes(masks).tolist() == [[3, 2, 9, 5], [11, 9, 12, 10], [0, 0, 0, 0]]
+    assert mask_boxes(np.zeros((0, 4, 4), bool)).shape == (0, 4)
+
+
+def test_stability_by_hand():
+    logits = np.array([[[2.0, 0.5, -0.5, -2.0]], [[-3.0, -3.0, -3.0, -3.0]]], np.float32)
+    assert stability(logits, 1.0).tolist() == [pytest.approx(1 / 3), 0.0]
+
+
+def test_specks_go_and_the_largest_island_stays():
+    mask = np.zeros((30, 30), bool)
+    mask[5:20, 5:20] = True
+    mask[10, 10] = False
+    mask[25:27, 25:27] = True
+    mask[12:17, 12:17] = False
+    clean = without_specks(mask, 10)
+    assert clean[10, 10]
+    assert not clean[25, 25]
+    assert not clean[14, 14]
+    lone = np.zeros((30, 30), bool)
+    lone[3, 3] = True
+    assert np.array_equal(without_specks(lone, 10), lone)
+
+
+# Masks that exist -----------------------------------------------------------------------------------------------
+
+
+def compressed(counts):
+    """COCO's text, written from its description."""
+    text = ""
+    for k, count in enumerate(counts):
+        value = count - counts[k - 2] if k > 2 else count
+        more = True
+        while more:
+            bits = value & 31
+            value >>= 5
+            more = value != (-1 if bits & 16 else 0)
+            text += chr((bits | (32 if more else 0)) + 48)
+    return text
+
+
+def runs_of(mask):
+    flat = mask.T.ravel()
+    edges = np.flatnonzero(np.diff(flat.astype(int))) + 1
+    bounds = [0, *edges.tolist(), len(flat)]
+    runs = np.diff(bounds).tolist()
+    return [0, *runs] if flat[0] else runs
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_rle_both_ways(seed):
+    mask = cv2.blur(np.random.default_rng(seed).random((37, 53)), (5, 5)) > 0.5
+    runs = runs_of(mask)
+    size = [37, 53]
+    assert np.array_equal(decode_rle({"size": size, "counts": runs}), mask)
+    assert np.array_equal(decode_rle({"size": size, "counts": compressed(runs)}), mask)
+    assert np.array_equal(decode_rle({"size": size, "counts": compressed(runs).encode()}), mask)
+
+
+def test_rle_of_a_known_text():
+    """3x3 with the middle column set: runs 3 3 3."""
+    assert decode_rle({"size": [3, 3], "counts": "333"}).tolist() == [[False, True, False]] * 3
+
+
+@pytest.mark.parametrize(
+    ("rle", "message"),
+    [
+        ({"size": [3, 3], "counts": [3, 3]}, "add up to 6"),
+        ({"size": [3, 3], "counts": [12, -3]}, "least -3"),
+        ({"size": [3, 3], "counts": "33"}, "add up to 6"),
+        ({"size": [3, 3], "counts": "3 3"}, "byte 32"),
+        ({"size": [3, 3], "counts": "o" * 40}, "byte"),
+        ({"size": [3, 3], "counts": "33S"}, "truncated"),
+        ({"size": [1 << 20, 1 << 20], "counts": [1 << 40]}, "at most"),
+        ({"size": [0, 3], "counts": []}, "size is"),
+        ({"size": [3.5, 3], "counts": []}, "size is"),
+        ({"size": [3, 3], "counts": None}, "expected whole numbers"),
+        ({"size": [3, 3], "counts": [1.5, 7.5]}, "expected whole numbers"),
+        ([1, 2], "is list; expected a record"),
+    ],
+)
+def test_hostile_rle(rle, message):
+    with pytest.raises(SceneError, match=message):
+        decode_rle(rle, "here")
+
+
+def test_a_folder_by_image_name(tmp_path):
+    _, ids = painted()
+    cv2.imwrite(str(tmp_path / "a.png"), ids.astype(np.uint16))
+    annotations = [
+        {"segmentation": {"size": [120, 160], "counts": runs_of(ids == k)}, "predicted_iou": 0.5} for k in (1, 2)
+    ]
+    (tmp_path / "b.json").write_text(json.dumps(annotations))
+    coco = {
+        "images": [{"id": 7, "file_name": "rgb/c.jpg", "height": 120, "width": 160}, {"id": 8, "file_name": "d.jpg"}],
+        "annotations": [{"image_id": 7, "score": 0.25, "segmentation": [[10, 10, 50, 10, 50, 40, 10, 40]]}],
+    }
+    (tmp_path / "all.json").write_text(json.dumps(coco))
+    folder = ExistingMasks(tmp_path)
+    png, single = folder.of("a", (120, 160)), folder.of("b", (120, 160))
+    assert [iou(mask, ids == k + 1) for k, mask in enumerate(png.masks)] == [1, 1, 1]
+    assert [iou(mask, ids == k + 1) for k, mask in enumerate(single.masks)] == [1, 1]
+    assert single.scores.tolist() == [0.5, 0.5]
+    polygon = folder.of("c", (60, 80))
+    assert polygon.scores.tolist() == [0.25]
+    assert polygon.masks[0][5:20, 5:25].all()
+    assert polygon.masks[0].mean() == pytest.approx(31 * 41 / 120 / 160, rel=0.1)
+    assert len(folder.of("d", (4, 5))) == 0
+    with pytest.raises(SceneError, match="no masks for image 'e'"):
+        folder.of("e", (4, 5))
+
+
+@pytest.mark.parametrize(
+    "text", ["{", "[1]", '[{"segmentation": 3}]', '[{"segmentation": [[1, 2]], "size": [9, 9]}]', '{"a": 1}']
+)
+def test_broken_annotation_files(tmp_path, text):
+    (tmp_path / "a.json").write_text(text)
+    with pytest.raises(SceneError):
+        ExistingMasks(tmp_path).of("a", (9, 9))
+
+
+def test_a_colour_png_is_refused(tmp_path):
+    cv2.imwrite(str(tmp_path / "a.png"), np.zeros((5, 5, 3), np.uint8))
+    with pytest.raises(SceneError, match="no grey PNG"):
+        ExistingMasks(tmp_path).of("a", (5, 5))
+
+
+class Detections:
+    def __init__(self, mask, confidence=None):
+        self.mask, self.confidence = mask, confidence
+
+
+def test_any_callable():
+    image, ids = painted()
+    masks = ids == np.arange(1, 4)[:, None, None]
+    said = [masks, ids, ids - 1, (masks, [0.2, 0.3, 0.4]), Detections(masks, np.array([0.2, 0.3, 0.4])), from_ids(ids)]
+    for answer in said:
+        proposals = CallableProposer(lambda _, answer=answer: answer).propose(image)
+        assert np.array_equal(proposals.masks, masks)
+    assert as_proposals(said[3], (120, 160)).scores.tolist() == pytest.approx([0.2, 0.3, 0.4])
+    assert len(as_proposals(Detections(None), (120, 160))) == 0
+    with pytest.raises(SceneError, match="expected the same"):
+        as_proposals(masks, (5, 5))
+    with pytest.raises(SceneError, match="expected bool"):
+        as_proposals(masks.astype(float), (120, 160))
+
+
+def test_unknown_proposers_name_the_known():
+    with pytest.raises(SceneError, match="expected opencv, sam:FOLDER"):
+        open_proposer("magic")
+
+
+# What points know -----------------------------------------------------------------------------------------------
+
+
+def two_planes():
+    """A square at depth 1 in front of a plane at depth 2, seen straight on by an 80x60 camera."""
+    step = 0.01
+    far = np.stack(np.meshgrid(np.arange(-1, 1, step), np.arange(-0.8, 0.8, step)), -1).reshape(-1, 2)
+    near = far[(np.abs(far) < 0.2).all(axis=1)]
+    xyz = np.concatenate([np.c_[far, np.full(len(far), 2.0)], np.c_[near, np.ones(len(near))]]).astype(np.float32)
+    return xyz, np.full(len(xyz), step, np.float32), Camera(80, 60, 80, 80, 40, 30, np.eye(4))
+
+
+def test_depth_of_points():
+    depth = rendered_depth(*two_planes())
+    assert depth[30, 40] == 1
+    assert depth[30, 5] == 2
+    assert (depth[16:44, 26:54] == 1).all()
+    xyz, spacing, camera = two_planes()
+    behind = xyz * [1, 1, -1]
+    assert (rendered_depth(behind.astype(np.float32), spacing, camera) == 0).all()
+
+
+def test_masks_are_split_at_depth_edges():
+    depth = rendered_depth(*two_planes())
+    across = np.zeros((60, 80), bool)
+    across[20:40, 30:75] = True
+    flat = np.zeros((60, 80), bool)
+    flat[2:9, 2:70] = True
+    split = split_at_depth_edges(Proposals(np.stack([across, flat]), np.array([0.5, 0.7], np.float32)), depth)
+    assert split.scores.tolist() == pytest.approx([0.5, 0.5, 0.7])
+    assert iou(split.masks[0] | split.masks[1], across) > 0.9
+    near = max(split.masks[:2], key=lambda mask: mask[30, 35])
+    assert (depth[near] == 1).mean() > 0.9
+    assert np.array_equal(split.masks[2], flat)
+
+
+def test_a_slope_is_no_edge():
+    slope = np.tile(np.linspace(1, 4, 80, dtype=np.float32), (60, 1))
+    assert not depth_edges(slope).any()
+    assert not depth_edges(np.zeros((3, 3), np.float32)).any()
+
+
+def test_smallest_mask_follows_the_points():
+    xyz, spacing, camera = two_planes()
+    assert smallest_mask_px(xyz, spacing * 10, camera) == 4 * 4**2
+    assert smallest_mask_px(xyz * [1, 1, -1], spacing, camera) == 1

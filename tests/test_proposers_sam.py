@@ -1,0 +1,168 @@
+"""SAM, SAM-HQ, SAM 2 and SAM 3: tiny models with random weights in transformers' own formats, made on the spot."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from og_pointcloud.errors import SceneError
+from og_pointcloud.masking.opening import open_proposer
+
+torch = pytest.importorskip("torch")
+transformers = pytest.importorskip("transformers")
+
+from og_pointcloud.masking.sam import SamPredictor, open_sam, prepared, scaled_size  # noqa: E402
+
+KINDS = ("sam", "sam_hq", "sam2", "sam3")
+PROMPT = {"hidden_size": 32, "mask_input_channels": 4}
+DECODER = {
+    "hidden_size": 32,
+    "mlp_dim": 32,
+    "num_hidden_layers": 1,
+    "num_attention_heads": 2,
+    "iou_head_hidden_dim": 32,
+}
+SQUARE = {"image_mean": [0.5] * 3, "image_std": [0.5] * 3}
+
+
+def tiny_sam(kind: str):
+    """A model of a few thousand weights that takes 64x64 pixels."""
+    torch.manual_seed(0)
+    t = transformers
+    if kind in ("sam", "sam_hq"):
+        vision = {
+            "hidden_size": 24, "output_channels": 32, "num_hidden_layers": 2, "num_attention_heads": 2,
+            "image_size": 64, "patch_size": 16, "window_size": 2, "global_attn_indexes": [1], "mlp_dim": 32,
+            "num_pos_feats": 16,
+        }  # fmt: skip
+        prompt = {**PROMPT, "image_size": 64, "patch_size": 16, "image_embedding_size": 4}
+        if kind == "sam":
+            return t.SamModel(
+                t.SamConfig(vision_config=vision, prompt_encoder_config=prompt, mask_decoder_config=DECODER)
+            )
+        return t.SamHQModel(
+            t.SamHQConfig(
+                vision_config=vision, prompt_encoder_config=prompt, mask_decoder_config={**DECODER, "vit_dim": 24}
+            )
+        )
+    prompt = {**PROMPT, "image_size": 64, "patch_size": 16}
+    if kind == "sam2":
+        backbone = {
+            "hidden_size": 8, "image_size": [64, 64],
+            "blocks_per_stage": [1, 1, 2, 1], "window_size_per_stage": [8] * 4,
+            "embed_dim_per_stage": [8, 16, 32, 64], "num_attention_heads_per_stage": [1, 1, 2, 2],
+            "global_attention_blocks": [3], "window_positional_embedding_background_size": [4, 4],
+        }  # fmt: skip
+        vision = {
+            "backbone_config": {"model_type": "sam2_hiera_det_model", **backbone},
+            "backbone_channel_list": [64, 32, 16, 8], "backbone_feature_sizes": [[16, 16], [8, 8], [4, 4]],
+            "fpn_hidden_size": 32,
+        }  # fmt: skip
+        return t.Sam2Model(
+            t.Sam2Config(vision_config=vision, prompt_encoder_config=prompt, mask_decoder_config=DECODER)
+        )
+    backbone = {
+        "model_type": "sam3_vit_model", "hidden_size": 32, "intermediate_size": 32, "num_hidden_layers": 2,
+        "num_attention_heads": 2, "image_size": 56, "patch_size": 14, "window_size": 2, "global_attn_indexes": [1],
+        "pretrain_image_size": 56,
+    }  # fmt: skip
+    vision = {
+        "model_type": "sam3_vision_model", "backbone_config": backbone, "fpn_hidden_size": 32,
+        "backbone_feature_sizes": [[16, 16], [8, 8], [4, 4]],
+    }  # fmt: skip
+    prompt = {**PROMPT, "image_size": 56, "patch_size": 14}
+    return t.Sam3TrackerModel(
+        t.Sam3TrackerConfig(vision_config=vision, prompt_encoder_config=prompt, mask_decoder_config=DECODER)
+    )
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory):
+    made = {}
+    for kind in KINDS:
+        made[kind] = tmp_path_factory.mktemp(kind)
+        tiny_sam(kind).save_pretrained(made[kind])
+    return made
+
+
+@pytest.fixture(scope="module")
+def image():
+    return np.random.default_rng(0).integers(0, 256, (36, 60, 3)).astype(np.uint8)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_loads_and_answers_as_the_model_itself(folders, image, kind):
+    predictor = SamPredictor(folders[kind])
+    predictor.set_image(image)
+    points = np.array([[10, 20], [50, 5], [0, 0]], np.float32)
+    logits, iou = predictor.at_points(points)
+    assert logits.shape[:2] == iou.shape == (3, 3)
+    reloaded = predictor.model
+    height, width = scaled_size((36, 60), predictor.preparation)
+    scaled = torch.tensor(points * np.array([width / 60, height / 36], np.float32))[None, :, None]
+    with torch.inference_mode():
+        said = reloaded(pixel_values=prepared(image, predictor.preparation), input_points=scaled)
+    rows, columns = logits.shape[2:]
+    assert np.allclose(logits, said.pred_masks[0, :, :, :rows, :columns].numpy(), atol=1e-4)
+    assert np.allclose(iou, said.iou_scores[0].numpy(), atol=1e-5)
+    padded = predictor.preparation.padded
+    assert (rows, columns) == ((10, 16) if padded else (16, 16))
+
+
+@pytest.mark.parametrize("shape", [(36, 60), (90, 33), (64, 64), (5, 200)])
+def test_preparation_is_what_transformers_own_sam_processor_does(folders, shape):
+    from transformers.models.sam.image_processing_pil_sam import SamImageProcessorPil
+
+    own = SamImageProcessorPil(size={"longest_edge": 64}, pad_size={"height": 64, "width": 64})
+    image = np.random.default_rng(1).integers(0, 256, (*shape, 3)).astype(np.uint8)
+    expected = own(image, return_tensors="np")["pixel_values"]
+    ours = prepared(image, SamPredictor(folders["sam"]).preparation).numpy()
+    one_step = 1 / 255 / 0.224
+    assert ours.shape == expected.shape
+    assert np.abs(ours - expected).max() < 1.01 * one_step
+    assert np.abs(ours - expected).mean() < 0.15 * one_step  # Pillow rounds between its two passes
+
+
+@pytest.mark.parametrize("kind", ["sam2", "sam3"])
+def test_squares_are_resized_as_pillow_does_and_colours_come_from_the_models_file(folders, image, kind):
+    from PIL import Image
+
+    said = folders[kind] / "preprocessor_config.json"
+    said.write_text(json.dumps({"image_mean": [0.1, 0.2, 0.3], "image_std": [0.5, 0.6, 0.7]}))
+    preparation = SamPredictor(folders[kind]).preparation
+    said.unlink()
+    side = preparation.side
+    resized = np.asarray(Image.fromarray(image).resize((side, side), Image.Resampling.BILINEAR), np.float32) / 255
+    expected = ((resized - [0.1, 0.2, 0.3]) / [0.5, 0.6, 0.7]).transpose(2, 0, 1)
+    assert side == {"sam2": 64, "sam3": 56}[kind]
+    assert np.abs(prepared(image, preparation)[0].numpy() - expected).max() < 1.01 / 255 / 0.5
+
+
+def test_colours_without_a_file_are_the_familys(folders):
+    assert SamPredictor(folders["sam2"]).preparation.mean[0] == 0.485
+    assert SamPredictor(folders["sam3"]).preparation.mean[0] == 0.5
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_proposes_masks_of_the_images_size(folders, image, kind):
+    from dataclasses import replace
+
+    proposer = replace(open_sam(folders[kind]), points_per_side=4, batch=5, least_iou=-9, least_stability=0)
+    proposals = proposer.propose(image)
+    assert proposals.masks.shape[1:] == (36, 60)
+    assert len(proposals) > 0
+    assert (np.diff(proposals.scores) <= 0).all()
+
+
+def test_a_folder_of_another_model_is_refused(tmp_path):
+    transformers.BertConfig().save_pretrained(tmp_path)
+    with pytest.raises(SceneError, match="type 'bert'; expected one of sam"):
+        open_proposer(f"sam:{tmp_path}")
+
+
+def test_nothing_is_downloaded_unasked(tmp_path, monkeypatch):
+    monkeypatch.setenv("HF_HUB_OFFLINE", "0")
+    with pytest.raises(SceneError, match="no SAM model 'nobody/nothing'"):
+        open_proposer("sam:nobody/nothing")
