@@ -17,7 +17,8 @@ from pathlib import Path
 import numpy as np
 
 import og_pointcloud as og
-from og_pointcloud.metrics import Score, score_labels
+from og_pointcloud.metrics import Score
+from og_pointcloud.scoring.truth import read_truth
 from og_pointcloud.text.vocabulary import read_bank, store_bank
 
 FIRST_ANSWER = """
@@ -67,16 +68,7 @@ def print_row(folder: Path, bundle: Path, seconds: float) -> None:
 
 def score_of(labels: np.ndarray, names: tuple[str, ...], folder: Path) -> Score:
     """Labels that index ``names``, scored against the folder's truth; a name the truth lacks is a wrong answer."""
-    truth = np.load(folder / "gt.npz")
-    classes = [str(name) for name in truth["names"]]
-    number = np.array([classes.index(name) if name in classes else len(classes) for name in names] + [-1])
-    scored = np.ones(len(labels), bool)
-    if "views" in truth.files:
-        scored &= truth["views"] > 0
-    if "ratio" in truth.files:
-        scored &= (truth["ratio"] >= 0.5) & (truth["votes"] >= 2)
-    background = truth["background"] if "background" in truth.files else None
-    return score_labels(number[labels], truth["cls"], background=background, scored=scored)
+    return read_truth(folder).score(labels, names)
 
 
 if __name__ == "__main__":

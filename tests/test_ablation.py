@@ -18,7 +18,6 @@ from og_pointcloud.fitting.ablation import (
     ablate,
     average,
     cases,
-    read_truth,
     read_vocabulary,
     write_csv,
 )
@@ -26,6 +25,7 @@ from og_pointcloud.fitting.features import learn_features
 from og_pointcloud.fitting.fit import fit, prepare
 from og_pointcloud.formats.capture import read_capture
 from og_pointcloud.metrics import score_labels
+from og_pointcloud.scoring.truth import read_truth
 from og_pointcloud.settings import FeatureSettings
 
 

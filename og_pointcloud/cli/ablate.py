@@ -53,6 +53,7 @@ def run(arguments: argparse.Namespace) -> None:
         raise MissingExtraError("torch", "learn")
     from og_pointcloud.fitting import ablation
     from og_pointcloud.formats.capture import read_capture
+    from og_pointcloud.scoring.truth import read_truth
 
     ablation.require_matplotlib()
     rows_wanted = ablation.cases()
@@ -64,7 +65,7 @@ def run(arguments: argparse.Namespace) -> None:
     subjects = []
     for folder in captures:
         scene = read_capture(folder)
-        truth, vocabulary = ablation.read_truth(folder), ablation.read_vocabulary(folder, scene.feature_space)
+        truth, vocabulary = read_truth(folder), ablation.read_vocabulary(folder, scene.feature_space)
         ablation.check_subject(scene, truth, vocabulary)
         subjects.append((folder.name, scene, truth, vocabulary))
     rows = [

@@ -21,8 +21,6 @@ import io
 import json
 import os
 import time
-import zipfile
-import zlib
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -37,6 +35,7 @@ from og_pointcloud.errors import FeatureSpaceError, MissingExtraError, OgPointcl
 from og_pointcloud.fitting.geometry import thinned
 from og_pointcloud.metrics import score_labels
 from og_pointcloud.scene import Scene
+from og_pointcloud.scoring.truth import Truth
 from og_pointcloud.settings import CodebookSettings, FeatureSettings, FitSettings, MatchingSettings, PaperSettings
 from og_pointcloud.text.features import read_text_features
 
@@ -53,13 +52,11 @@ except ImportError as error:
 __all__ = [
     "AblationRow",
     "Case",
-    "Truth",
     "ablate",
     "average",
     "cases",
     "check_subject",
     "plot",
-    "read_truth",
     "read_vocabulary",
     "references",
     "require_matplotlib",
@@ -90,23 +87,11 @@ PUBLISHED_MIOU = {
     "association": {"IoU only, alone": 0.3528, "feature only, alone": 0.3401, "both, alone": 0.3829},
 }
 """Of the same row in the paper: 10 classes of ScanNet. Other data: the order is to be compared, not the size."""
-MAX_UNPACKED_BYTES = 1 << 30
 SHORT_BAR = 0.15
 """The number stands beside a bar that is shorter than this."""
 LABEL_WIDTH = 4.0
 """A label takes the room of this factor of seconds."""
 COLORS = {"losses": "#4c72b0", "codebook": "#dd8452", "association": "#55a868", "reference": "#8c8c8c"}
-
-
-@dataclass(frozen=True)
-class Truth:
-    """cls: (n,) int, row of ``names`` that each point is, -1 none. scored: (n,) bool, whether its truth can be relied
-    on. background: (n,) bool, known to be of no class; None where that is not known."""
-
-    cls: NDArray[np.integer]
-    names: tuple[str, ...]
-    scored: NDArray[np.bool_]
-    background: NDArray[np.bool_] | None
 
 
 @dataclass(frozen=True)
@@ -397,12 +382,9 @@ def check_subject(scene: Scene, truth: Truth, vocabulary: Vocabulary) -> None:
 def _scored(case: Case, outcome: _Outcome, truth: Truth, vocabulary: Vocabulary, name: str) -> AblationRow:
     """A case's labels against the truth. A name that the truth lacks is a wrong answer, not an unknown."""
     labels = _labels(outcome, vocabulary)
-    numbers = {known: number for number, known in enumerate(truth.names)}
-    number = np.array([numbers.get(word, len(numbers)) for word in vocabulary.names] + [-1])
-    score = score_labels(number[labels], truth.cls, scored=truth.scored)
-    strict = None
-    if truth.background is not None:
-        strict = score_labels(number[labels], truth.cls, scored=truth.scored, background=truth.background)
+    called = truth.class_of(labels, vocabulary.names)
+    score = score_labels(called, truth.cls, scored=truth.scored)
+    strict = truth.score(labels, vocabulary.names) if truth.background is not None else None
     return AblationRow(
         case.table, case.name, case.method, case.differs, name, 1, score.miou, score.macc, score.unknown_share, None,
         strict.miou if strict else None, strict.background_called if strict else None, outcome.seconds,
@@ -444,49 +426,6 @@ def _mean(rows: Sequence[AblationRow]) -> AblationRow:
         known = [getattr(row, name) for row in rows if getattr(row, name) is not None]
         means[name] = float(np.mean(known)) if known else None
     return replace(rows[0], **means)  # pyright: ignore[reportArgumentType]
-
-
-def read_truth(folder: str | os.PathLike[str]) -> Truth:
-    """A capture's ``gt.npz``: ``cls`` (n,), ``names``, and where known ``background``, ``views``, ``ratio``, ``votes``.
-
-    Points that no view shows (views 0), or whose class half of the votes or fewer, or a single one, agree on, are not
-    scored. Raises SceneError where the file is absent, damaged, or lacks what is needed.
-    """
-    path = Path(folder) / "gt.npz"
-    if not path.is_file():
-        raise SceneError(
-            f"{path} is not a file; an ablation is scored against it: 'cls' (n,) a class per point, -1 none, and "
-            "'names'. Without one, take a made room: --room 1"
-        )
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            size = sum(info.file_size for info in archive.zip.infolist())
-            if size > MAX_UNPACKED_BYTES:
-                raise ValueError(f"it unpacks to {size} bytes, more than {MAX_UNPACKED_BYTES}")
-            entries = {name: archive[name] for name in archive.files}
-    except (OSError, ValueError, EOFError, AttributeError, zipfile.BadZipFile, zlib.error) as error:
-        raise SceneError(f"{path} cannot be read as an .npz of plain arrays ({error}): write it again") from None
-    missing = [name for name in ("cls", "names") if name not in entries]
-    if missing:
-        raise SceneError(
-            f"{path} lacks '{missing[0]}' (it has {', '.join(entries) or 'nothing'}); expected 'cls', 'names'"
-        )
-    cls, names = entries["cls"], entries["names"]
-    if cls.ndim != 1 or cls.dtype.kind not in "iu" or names.dtype.kind != "U" or cls.max(initial=-1) >= len(names):
-        raise SceneError(
-            f"{path}: cls is {cls.dtype} {cls.shape} up to {cls.max(initial=-1)}, names {names.dtype} {names.shape}; "
-            "expected whole numbers (n,) that index the names, and strings (L,)"
-        )
-    for name in ("background", "views", "ratio", "votes"):
-        if name in entries and entries[name].shape != cls.shape:
-            raise SceneError(f"{path}: {name} has shape {entries[name].shape}, cls {cls.shape}; expected one a point")
-    scored = np.ones(len(cls), bool)
-    if "views" in entries:
-        scored &= entries["views"] > 0
-    if "ratio" in entries and "votes" in entries:
-        scored &= (entries["ratio"] >= 0.5) & (entries["votes"] >= 2)
-    background = entries["background"].astype(bool) if "background" in entries else None
-    return Truth(cls, tuple(names.tolist()), scored, background)
 
 
 def read_vocabulary(folder: str | os.PathLike[str], feature_space: str) -> Vocabulary:

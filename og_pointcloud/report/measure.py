@@ -21,13 +21,13 @@ from numpy.typing import NDArray
 
 from og_pointcloud.choosing import chooser_of
 from og_pointcloud.cloud import LabelledCloud, Vocabulary
-from og_pointcloud.errors import OgPointcloudError, SceneError
-from og_pointcloud.fitting.ablation import Truth, read_truth
+from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.fitting.fit import fit
 from og_pointcloud.formats.capture import read_capture
-from og_pointcloud.metrics import adjusted_rand_index, score_labels
+from og_pointcloud.metrics import adjusted_rand_index
 from og_pointcloud.report.knobs import Setting, find_setting
 from og_pointcloud.scene import Points, Scene
+from og_pointcloud.scoring.truth import GT_NAME, Truth, read_truth
 from og_pointcloud.text.features import read_text_features
 
 __all__ = ["Row", "Subject", "disagreement", "error_of", "labels_of", "measure", "measure_apart", "read_subject"]
@@ -84,7 +84,7 @@ def read_subject(folder: Path) -> Subject:
     """The words and the truth of a capture, as far as it has them."""
     words = folder / "text_features.npz"
     vocabulary = read_text_features(words)[0] if words.is_file() else None
-    truth = read_truth(folder) if vocabulary and (folder / "gt.npz").is_file() else None
+    truth = read_truth(folder) if vocabulary and (folder / GT_NAME).is_file() else None
     return Subject(folder, vocabulary, truth)
 
 
@@ -133,12 +133,7 @@ def error_of(labels: NDArray[np.integer], subject: Subject) -> dict[str, Any]:
     truth, vocabulary = subject.truth, subject.vocabulary
     if truth is None or vocabulary is None:
         return {}
-    if len(truth.cls) != len(labels):
-        raise SceneError(f"gt.npz of {subject.folder} has {len(truth.cls)} points, its cloud {len(labels)}")
-    numbers = {name: number for number, name in enumerate(truth.names)}
-    # A word that the truth lacks is a wrong answer, not an unknown.
-    number = np.array([numbers.get(word, len(numbers)) for word in vocabulary.names] + [-1])
-    score = score_labels(number[labels], truth.cls, scored=truth.scored, background=truth.background)
+    score = truth.score(labels, vocabulary.names)
     return {
         "miou": score.miou,
         "macc": score.macc,
