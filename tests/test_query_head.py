@@ -144,6 +144,99 @@ def test_lists_over_their_budget_leave_cells_open_and_every_answer_right(monkeyp
     assert (found["instance"] == exact)[found["certain"]].all()
 
 
+def value_of_cell(grid, cell):
+    """What the grid says of a cell: (certain answer, None), or (None, the points of its list); (None, None) if open."""
+    block, place = cell // (brick_grid.BLOCK * brick_grid.BRICK), cell // brick_grid.BRICK % brick_grid.BLOCK
+    row = int(grid.bricks[grid.blocks[tuple(block)], np.ravel_multi_index(tuple(place), (brick_grid.BLOCK,) * 3)])
+    if row >= len(grid.cells):
+        return None, points_of_list(grid, row - len(grid.cells))
+    inside = np.ravel_multi_index(tuple(cell % brick_grid.BRICK), (brick_grid.BRICK,) * 3)
+    value = int(grid.cells[row, inside])
+    if value < grid.codes:
+        return value, None
+    return None, points_of_list(grid, int(grid.first_list[row]) + value - 2 * grid.codes)
+
+
+def points_of_list(grid, number):
+    return set(grid.candidates[grid.list_start[number] : grid.list_start[number + 1]].tolist())
+
+
+def cell_plainly(cloud, center, half):
+    """(answer of the instance, or -3; points nearest somewhere): the box against every point and every pair of them."""
+    seen = cloud.xyz.astype(np.float64) - center
+    squared = (seen**2).sum(axis=1)
+    reach = float(cloud.reach)
+    in_reach = (np.maximum(np.abs(seen) - half, 0) ** 2).sum(axis=1) <= reach**2
+    spread = np.abs(seen[:, None] - seen).sum(axis=2)
+    loses = (squared[:, None] - squared - 2 * half * spread > 1e-9 * half**2).any(axis=1)
+    winners = np.flatnonzero(in_reach & ~loses)
+    if len(winners) == 0:
+        return TOO_FAR, set()
+    everywhere = ((np.abs(seen[squared.argmin()]) + half) ** 2).sum() <= reach**2
+    same = len(set(cloud.instance_ids[winners].tolist())) == 1
+    return (int(cloud.instance_ids[winners[0]]) if everywhere and same else None), set(winners.tolist())
+
+
+@pytest.mark.parametrize("lone", [0, 25])
+def test_every_cell_is_that_of_the_plain_reference(lone):
+    base, random = room(120), np.random.default_rng(3)
+    ids = np.append(base.instance_ids, np.arange(lone) % 9)
+    cloud = make_cloud(np.concatenate([base.xyz, 3 * random.random((lone, 3))]), ids, instances=base.instances)
+    grid = build_brick_grid(cloud, GridSettings(split=False))
+    size, near_codes = float(grid.cell_size), grid.codes // 2
+    rounding = size * 4 * float(np.finfo(np.float32).eps) * max(grid.shape) * brick_grid.BRICK
+    kinds = {"certain": 0, "list": 0}
+    touched = np.unique(np.floor((cloud.xyz - grid.low) / size).astype(int), axis=0)
+    for cell in np.unique((touched[:, None] + random.integers(-3, 4, (1, 12, 3))).reshape(-1, 3), axis=0):
+        center = grid.low.astype(np.float64) + (cell + 0.5) * size
+        expected, winners = cell_plainly(cloud, center, size / 2 + rounding)
+        code, points = value_of_cell(grid, cell)
+        if code is None:
+            kinds["list"] += 1
+            assert points is not None
+            # A cell's list may be refined in smaller boxes; what wins in none of them may be left out.
+            assert len(winners) > brick_grid.SHORT_LIST or winners <= points
+        else:
+            kinds["certain"] += 1
+            found = (
+                TOO_FAR if code == 0 else (code - near_codes if code > near_codes else code) - brick_grid.CODE_OFFSET
+            )
+            assert found == expected
+        alone = expected is not None and code is None  # only a brick that is a list alone asks for what is certain
+        assert not alone or points is not None
+    assert min(kinds.values()) > 100
+
+
+def test_a_sparse_scene_is_settled_whole_however_far_it_reaches():
+    random = np.random.default_rng(4)
+    spread = np.append(random.random((3000, 2)) * 1500, random.random((3000, 1)) * 100, axis=1)
+    cloud = make_cloud(spread, np.arange(3000) % 7, spacing=1.0, reach=3.0)
+    points = (spread + random.normal(size=spread.shape) * random.choice([0.3, 1.5], (3000, 1))).astype(np.float32)
+    found = run(cloud, points, texts(cloud))
+    assert found["certain"].all()
+    assert (found["instance"] == instances_plainly(cloud, points)).all()
+    grid = build_brick_grid(cloud)
+    # Hardly a brick without a point needs cells: it is the list of the points about it.
+    assert (grid.bricks >= len(grid.cells)).sum() > 2 * len(grid.cells)
+    assert grid.nbytes < 400 * len(cloud)
+
+
+def test_cells_with_very_many_points_have_lists_in_their_parts():
+    random = np.random.default_rng(6)
+    xyz = np.concatenate([random.random((1000, 3)) * 0.12, 3 * random.random((500, 3))])
+    cloud = make_cloud(xyz, random.integers(0, 5, 1500))
+    points = (xyz[:1000] + 0.01 * random.normal(size=(1000, 3))).astype(np.float32)
+    found = run(cloud, points, texts(cloud))
+    assert (found["instance"] == instances_plainly(cloud, points))[found["certain"]].all()
+    assert found["certain"].mean() > 0.2
+    assert run(cloud, points, texts(cloud), GridSettings(split=False))["certain"].mean() < 0.1
+
+
+def test_of_coincident_points_one_is_kept():
+    cloud = CLOUDS["coincident points of different ids"]
+    assert build_brick_grid(cloud).candidates.max() < 800
+
+
 @pytest.mark.parametrize("longest", [1, 3, 8, 12])
 def test_cells_with_more_candidates_than_a_list_holds_stay_open(monkeypatch, longest):
     cloud = CLOUDS["room"]

@@ -32,6 +32,10 @@ NO_LIST = -1
 SUBDIVISION = 2
 """A long list is put together anew from those of so many boxes along the cell's edge, which are shorter."""
 OCTANTS = 2
+BITS = 64
+"""Lists of a brick that cells may share."""
+BYTE = 256
+"""Values of cells that a byte holds; lists of parts are not made where the number of a list would leave it."""
 
 # Throughout: ``lattice`` is (low (3,), cell_size, rounding), the length by which every box is inflated on all sides;
 # ``limits`` is (reach, surface distance, codes); ``near`` is (x, y, z, answer, number), the points about one brick.
@@ -61,9 +65,9 @@ def answer_bricks(bricks, lattice, limits, points, top, wanted, values, lengths,
 
     values (m, 64): a certain answer; that at the centre + codes where open; or 2 codes + the number of its list.
         LIST_ALONE first: list 0 settles the whole brick.
-    lengths (m, 64): of the lists, NO_LIST after the last. lists (m, 64, longest): their candidates, ascending.
-    first_part (m, 64): of lists, -1, or for a cell that is split the number of its row in parts.
-    parts (m, 64, 64): answers of the parts, ``codes`` where the list settles them.
+    lengths (m, most): of the lists, NO_LIST after the last. lists (m, most, longest): their candidates, ascending.
+    first_part (m, most): of lists, -1, or for a cell that is split the number of its row in parts.
+    parts (m, 64, 64): answers of the parts, or ``codes`` + how many lists after the cell's is the one that settles it.
 
     points: (x, y, z, answer, index, start): sorted by slot, ``start[slot]`` its first. wanted: (short, lists, split,
     alone): the length up to which lists are shared, whether there are lists, parts, and a list alone also where the
@@ -87,57 +91,79 @@ def _answer_brick(brick, lattice, limits, points, top, wanted, values, lengths, 
         values[:] = TOO_FAR_CODE
         if len(near[0]) > 0:
             values[0], lengths[0] = LIST_ALONE, len(near[0])
-            lists[0, : len(near[0])] = np.sort(near[4])
+            for row in range(len(near[0])):
+                lists[0, row] = row
+            _sort_as_points(near[4], lists[0, : len(near[0])])
         return
     number_of_list = np.zeros(len(near[0]), np.uint64)  # bit k of a point: it is in list k, which may be shared
     whole, whole_length = np.empty(short, np.int32), 0  # of the list that settles the whole brick; -1: none does
     if not with_lists or (holds.any() and not alone):
         whole_length = -1
     squared, rows = np.empty(len(near[0])), np.empty(len(near[0]), np.int32)
-    made, split = 0, 0
+    made, split, left = 0, 0, BRICK**3
+    edge, half = BRICK // OCTANTS * size, size / 2 + rounding
     for octant in range(OCTANTS**3):
-        edge = BRICK // OCTANTS * size
-        some = _chosen(
-            near, _rivals_in_box(_middle(corner, octant, OCTANTS, edge), edge / 2 + rounding, limits[0], near)
-        )
+        rivals = _rivals_in_box(_middle(corner, octant, OCTANTS, edge), edge / 2 + rounding, limits[0], near)
+        some = _chosen(near, rivals)
         alike = _alike(some)
         for cell in _cells_of_octant(octant):
-            if len(some[0]) == 0:
+            left -= 1
+            if len(rivals) == 0:
                 values[cell] = TOO_FAR_CODE
                 continue
-            center, half = _middle(corner, cell, BRICK, size), size / 2 + rounding
+            center = _middle(corner, cell, BRICK, size)
             code, certain, count = _answer_box(center, half, limits, some, alike, whole_length >= 0, squared, rows)
             values[cell] = code if certain else code + limits[2]
             if whole_length >= 0:
-                whole_length = _join(whole, whole_length, some[4][rows[:count]])
-            if certain or not with_lists:
-                continue
-            splits = holds[cell] and with_parts
-            found = rows[:count]
-            if splits:
-                found = _settle_boxes(center, size, rounding, PARTS, True, limits, some, found, parts[split])
-            elif count > short:
-                unused = np.empty(SUBDIVISION**3, np.int32)
-                found = _settle_boxes(center, size, rounding, SUBDIVISION, False, limits, some, found, unused)
-            if len(found) > lists.shape[1]:
-                continue
-            found = some[4][found]
-            number = made if splits else _list_to_share(found, number_of_list, lengths[:made], short)
-            lengths[number] = _join(lists[number], max(lengths[number], 0), found)
-            values[cell] = 2 * limits[2] + number
-            made = max(made, number + 1)
-            if splits:
-                first_part[number] = split
-                split += 1
-            else:
-                for row in found:
-                    number_of_list[row] |= np.uint64(1) << np.uint64(number)
+                whole_length = _join(whole, whole_length, rows[:count], rivals)
+            if not certain and with_lists:
+                most = min(len(lengths), max(BRICK**3, BYTE - 2 * limits[2])) - left
+                number, made, split = _give_list(
+                    center, size, rounding, limits, some, rows[:count], short, holds[cell], with_parts,
+                    made, split, most, number_of_list, lengths, lists, first_part, parts,
+                )  # fmt: skip
+                if number >= 0:
+                    values[cell] = 2 * limits[2] + number
     if whole_length > 0:
         values[0], lengths[0], made = LIST_ALONE, whole_length, 1
         lengths[1:], first_part[0] = NO_LIST, -1
         lists[0, :whole_length] = whole[:whole_length]
     for number in range(made):
-        lists[number, : lengths[number]] = np.sort(near[4][lists[number, : lengths[number]]])
+        _sort_as_points(near[4], lists[number, : lengths[number]])
+
+
+@njit(cache=True)
+def _give_list(  # noqa: ANN202
+    center, size, rounding, limits, near, rows, short, holds, with_parts,  # noqa: ANN001
+    made, split, most, number_of_list, lengths, lists, first_part, parts,  # noqa: ANN001
+):  # fmt: skip
+    """Find the list of an open cell, or make it: its number, or -1, and how many lists and split cells there are now.
+
+    rows: of the points that are nearest somewhere in the cell. most: lists that may be made, but for those of parts.
+    """
+    splits = holds and with_parts
+    found = rows
+    if splits or len(rows) > short:
+        per_edge = PARTS if splits else SUBDIVISION  # what is not split needs no values, only the shorter list
+        found = _settle_boxes(center, size, rounding, per_edge, splits, limits, near, rows, parts[split])
+    if len(found) > lists.shape[1]:
+        if not with_parts:
+            return -1, made, split
+        room = most - made
+        more = _list_parts(center, size, rounding, limits, near, rows, lists[made:], lengths[made:], room, parts[split])
+        if more == 0:
+            return -1, made, split
+        first_part[made] = split
+        return made, made + more, split + 1
+    number = made if splits else _list_to_share(found, near[4], number_of_list, lengths[:made], short)
+    lengths[number] = _join(lists[number], max(lengths[number], 0), found, near[4])
+    if splits:
+        first_part[number] = split
+        split += 1
+    elif number < BITS:
+        for row in found:
+            number_of_list[near[4][row]] |= np.uint64(1) << np.uint64(number)
+    return number, max(made, number + 1), split
 
 
 @njit(cache=True)
@@ -157,7 +183,9 @@ def _points_about(brick, corner, size, rounding, reach, points, top):  # noqa: A
         for point in range(start[slot], start[slot + 1]):
             if _gap_squared(x[point] - center[0], y[point] - center[1], z[point] - center[2], half) <= _grown(reach):
                 if count == len(chosen):
-                    chosen = np.append(chosen, np.empty(count, np.int32))
+                    longer = np.empty(2 * count, np.int32)
+                    longer[:count] = chosen
+                    chosen = longer
                 chosen[count] = point
                 count += 1
             if neighbour == 13:
@@ -166,12 +194,15 @@ def _points_about(brick, corner, size, rounding, reach, points, top):  # noqa: A
                 cell_z = min(max(int((z[point] - corner[2]) / size), 0), BRICK - 1)
                 holds[(cell_x * BRICK + cell_y) * BRICK + cell_z] = True
     chosen = chosen[:count]
-    return (x[chosen], y[chosen], z[chosen], answer[chosen], index[chosen]), holds
+    near = _chosen((x, y, z, answer, index), chosen)
+    for row in range(count):
+        chosen[row] = index[chosen[row]]
+    return near, holds
 
 
 @njit(cache=True)
 def _rivals_in_box(center, half, reach, near):  # noqa: ANN001, ANN202
-    """Rows of the points that are within reach of the box, and not farther everywhere than that nearest to its centre."""
+    """Rows of the points within reach of the box, but for those farther everywhere than that nearest to its centre."""
     squared, rows, count = np.empty(len(near[0])), np.empty(len(near[0]), np.int32), 0
     best = _nearest(center, near, squared)
     if best < 0:
@@ -189,7 +220,11 @@ def _rivals_in_box(center, half, reach, near):  # noqa: ANN001, ANN202
 @njit(cache=True)
 def _chosen(near, rows):  # noqa: ANN001, ANN202
     """Those points of ``near``, each with its row there instead of its number in the cloud."""
-    return near[0][rows], near[1][rows], near[2][rows], near[3][rows], rows
+    x, y, z = np.empty(len(rows)), np.empty(len(rows)), np.empty(len(rows))
+    answer = np.empty(len(rows), np.int32)
+    for place, row in enumerate(rows):
+        x[place], y[place], z[place], answer[place] = near[0][row], near[1][row], near[2][row], near[3][row]
+    return x, y, z, answer, rows
 
 
 @njit(cache=True)
@@ -226,7 +261,7 @@ def _cells_of_octant(octant):  # noqa: ANN001, ANN202
     return cells
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True)
 def _middle(corner, number, per_edge, size):  # noqa: ANN001, ANN202
     """Centre of the part with that number, of per_edge^3 of that size in C order."""
     return (
@@ -240,7 +275,8 @@ def _middle(corner, number, per_edge, size):  # noqa: ANN001, ANN202
 def _answer_box(center, half, limits, near, alike, always, squared, rows):  # noqa: ANN001, ANN202
     """(code at the centre, whether it is the whole box's, count): so many rows are nearest somewhere in the box.
 
-    near: the points that may be; alike: all have one answer. rows: filled, rightly only for boxes that are not certain, or if ``always`` asked for.
+    near: the points that may be; alike: all have one answer. rows: filled, rightly only for boxes that are not certain,
+        or if ``always`` asked for.
     squared: scratch; both as long as near, or longer.
     """
     reach = limits[0]
@@ -309,32 +345,78 @@ def _settle_boxes(center, size, rounding, per_edge, only_open, limits, near, row
         if not (certain and only_open):
             for row in wins[:count]:
                 needed[row] = True
-    return rows[needed]
+    kept = np.empty(len(rows), np.int32)
+    count = 0
+    for place in range(len(rows)):
+        kept[count] = rows[place]
+        count += needed[place]
+    return kept[:count]
 
 
 @njit(cache=True)
-def _list_to_share(rows, number_of_list, lengths, short):  # noqa: ANN001, ANN202
+def _list_parts(center, size, rounding, limits, near, rows, lists, lengths, room, values):  # noqa: ANN001, ANN202
+    """Give each open part of a cell a list: for cells of so many candidates that one list does not hold them.
+
+    values: filled with the parts' certain answers, or codes + the number of a list. Returns how many lists were made;
+    0 where there is no room for them, or even a part has too many candidates.
+    """
+    edge = size / PARTS
+    corner = (center[0] - size / 2, center[1] - size / 2, center[2] - size / 2)
+    some = _chosen(near, rows)
+    alike, squared, wins = _alike(some), np.empty(len(rows)), np.empty(len(rows), np.int32)
+    made = 0
+    for box in range(PARTS**3):
+        middle = _middle(corner, box, PARTS, edge)
+        code, certain, count = _answer_box(middle, edge / 2 + rounding, limits, some, alike, False, squared, wins)
+        values[box] = code if certain else limits[2] + made
+        if certain:
+            continue
+        if made >= room or count > lists.shape[1]:
+            lengths[: made + 1] = NO_LIST
+            return 0
+        lengths[made] = count
+        for place in range(count):
+            lists[made, place] = near[4][some[4][wins[place]]]
+        made += 1
+    return made
+
+
+@njit(cache=True)
+def _list_to_share(rows, names, number_of_list, lengths, short):  # noqa: ANN001, ANN202
     """Number of the list that grows least by these rows, and not beyond ``short``; the next number if there is none.
 
     A list that may not be shared has no bit in ``number_of_list``, so that it would grow by all rows, as an empty one.
     """
     chosen, least = len(lengths), short + 1
-    for number in range(len(lengths)):
+    for number in range(min(len(lengths), BITS)):
         growth = len(rows)
         for row in rows:
-            growth -= np.int64((number_of_list[row] >> np.uint64(number)) & np.uint64(1))
+            growth -= np.int64((number_of_list[names[row]] >> np.uint64(number)) & np.uint64(1))
         if growth < least and growth < len(rows) and lengths[number] + growth <= max(short, lengths[number]):
             chosen, least = number, growth
     return chosen
 
 
 @njit(cache=True)
-def _join(members, length, more):  # noqa: ANN001, ANN202
-    """Add what is new to the members; the new length, or -1 where there is no room."""
-    for row in more:
+def _sort_as_points(index, rows):  # noqa: ANN001, ANN202
+    """Replace the rows, a handful, by the points' numbers in the cloud, ascending."""
+    for place in range(len(rows)):
+        point = index[rows[place]]
+        before = place
+        while before > 0 and rows[before - 1] > point:
+            rows[before] = rows[before - 1]
+            before -= 1
+        rows[before] = point
+
+
+@njit(cache=True)
+def _join(members, length, more, names):  # noqa: ANN001, ANN202
+    """Add the names of more rows, where new, to the members; the new length, or -1 where there is no room."""
+    for place in more:
+        row = names[place]
         known = False
-        for place in range(length):
-            known = known or members[place] == row
+        for member in members[:length]:
+            known = known or member == row
         if not known:
             if length == len(members):
                 return -1
@@ -343,12 +425,12 @@ def _join(members, length, more):  # noqa: ANN001, ANN202
     return length
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True)
 def _seen_from(center, near, row):  # noqa: ANN001, ANN202
     return near[0][row] - center[0], near[1][row] - center[1], near[2][row] - center[2]
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True)
 def _code(answer, squared, limits):  # noqa: ANN001, ANN202
     """Code of an answer at that distance: too far, near, or on the surface."""
     reach, surface, codes = limits
@@ -357,27 +439,27 @@ def _code(answer, squared, limits):  # noqa: ANN001, ANN202
     return answer if squared <= surface * surface else answer + codes // 2
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True)
 def _grown(reach):  # noqa: ANN001, ANN202
     """The squared reach, and a little more for rounding."""
     return reach * reach * (1 + 1e-9)
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True)
 def _gap_squared(dx, dy, dz, half):  # noqa: ANN001, ANN202
     """Squared distance of a point, seen from a box's centre, to the box."""
     gap_x, gap_y, gap_z = max(abs(dx) - half, 0.0), max(abs(dy) - half, 0.0), max(abs(dz) - half, 0.0)
     return gap_x * gap_x + gap_y * gap_y + gap_z * gap_z
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True)
 def _all_within_reach(nearest, half, reach):  # noqa: ANN001, ANN202
     """Whether that point, seen from the centre, is within reach of every place in the box."""
     far_x, far_y, far_z = abs(nearest[0]) + half, abs(nearest[1]) + half, abs(nearest[2]) + half
     return far_x * far_x + far_y * far_y + far_z * far_z <= reach * reach * (1 - 1e-9)
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True)
 def _loses(p, p_squared, q, q_squared, half):  # noqa: ANN001, ANN202
     """Whether a point p is farther than a point q everywhere in the box.
 

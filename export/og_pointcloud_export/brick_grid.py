@@ -39,20 +39,23 @@ CODE_OFFSET = 1 - UNOBSERVED
 """Answer code of instance id + CODE_OFFSET on the surface; (instances + CODE_OFFSET - 1) more near it."""
 SHORT_LIST = 8
 """So many candidates are compared at once: cells share a list up to this length, as it costs no time."""
-LONGEST_LIST = 32
-"""Candidates of a cell; a cell with more, as where points coincide, has no list."""
+LONGEST_LIST = 64
+"""Candidates of a cell; of a cell with more, each open part has a list; if even that has more, as where points
+coincide, there is none."""
+LISTS_PER_BRICK = 192
+"""One for each cell, and for the parts of a cell or two with very many points."""
 
 CELLS_PER_REACH = 3.0
 """A far reach makes cells larger, so that the layer of cells around a surface stays at most about eight deep."""
 BLOCKS_PER_POINT, BLOCKS_AT_LEAST, BLOCKS_AT_MOST = 16, 1 << 15, 1 << 18  # times 64^2, and as much again, fits int32
-BRICKS_PER_POINT, BRICKS_AT_LEAST = 4, 1 << 13
+BRICKS_PER_POINT, BRICKS_AT_LEAST = 16, 1 << 13
 ROWS_PER_POINT, ROWS_AT_LEAST = 1 / 2, 1 << 13
 SPLIT_CELLS_PER_POINT, SPLIT_CELLS_AT_LEAST = 1 / 8, 1 << 10
-LISTS_PER_POINT, LISTS_AT_LEAST = 1, 1 << 16
+LISTS_PER_POINT, LISTS_AT_LEAST = 4, 1 << 16
 """What bounds the table whatever the extent of the scene: the rest is left to the exact search."""
 BRICKS_PER_AXIS = 1 << 13
 """So long a grid still has its cell indices right to half a cell in float32, and a short table of them per axis."""
-BRICKS_PER_CHUNK = 512
+BRICKS_PER_CHUNK = 256
 """Answered at once, with about 16 MB of scratch."""
 
 CELLS, PLACES = BRICK**3, BLOCK**3
@@ -77,7 +80,8 @@ class GridSettings:
 class BrickGrid:
     """Cell (i, j, k) covers low + (i, j, k) * cell_size and one cell_size more, in the local frame.
 
-    low: (3,) float32. cell_size: float32. shape: bricks along each axis; the outermost ones stand for everything beyond.
+    low: (3,) float32. cell_size: float32. shape: bricks along each axis; the outermost ones stand for all
+        beyond.
     blocks: (bx, by, bz) unsigned, rows of ``bricks``.
     bricks: (rows, 64) unsigned, C order within the block: a row of ``cells``, or, less the number of those rows, the
         list that settles the whole brick.
@@ -87,7 +91,8 @@ class BrickGrid:
     first_list: (rows,) int32. list_start: (lists + 1,) int32, where each list begins in ``candidates``.
     candidates: (m,) int32, points of the cloud, ascending within a list.
     list_parts: (lists,) unsigned, row of ``parts`` of the list's cell; row 0, all open, for a cell that is not split.
-    parts: (rows, 64) unsigned, C order within the cell: certain answers, or ``codes`` where the list settles it.
+    parts: (rows, 64) unsigned, C order within the cell: certain answers, or ``codes`` + how many lists after the cell's
+        is the one that settles the part.
     codes: number of answer codes: TOO_FAR_CODE, those on the surface, those near it; see CODE_OFFSET.
     """
 
@@ -177,7 +182,9 @@ class _Bricks:
         if len(blocks):
             mark_bricks(lower, upper, self.top, slots)
 
-        within = (np.floor(position) == own).all(axis=1)  # the others lie beyond the grid
+        within = (np.floor(position) == own).all(axis=1) & _first_of_equal(
+            cloud.xyz[index]
+        )  # others lie beyond the grid
         own, index = own[within], index[within]
         slot = self.top[tuple((own // BLOCK).T)].astype(np.int64) * PLACES + (
             own % BLOCK @ np.array([BLOCK**2, BLOCK, 1])
@@ -195,6 +202,15 @@ class _Bricks:
         block = np.stack(np.unravel_index(blocks, self.top.shape), axis=1)
         place = np.stack(np.unravel_index(np.arange(PLACES), (BLOCK,) * 3), axis=1)
         return (block[:, None] * BLOCK + place).reshape(-1, 3).astype(np.int32)
+
+
+def _first_of_equal(xyz: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """(n,) bool: False where a point before it has the same coordinates, and so answers for both."""
+    bits = (xyz + np.float32(0)).view(np.uint32).astype(np.uint64)  # -0 becomes 0
+    key = (bits * np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)).sum(axis=1)
+    _, first, same = np.unique(key, return_index=True, return_inverse=True)
+    first = first[same]
+    return (first == np.arange(len(xyz))) | (xyz[first] != xyz).any(axis=1)
 
 
 class _Table:
@@ -231,9 +247,9 @@ class _Table:
     def answer(self, slots: NDArray[np.int64]) -> None:
         """Add the bricks in these slots."""
         count = len(slots)
-        values, lengths = np.empty((count, CELLS), np.int32), np.empty((count, CELLS), np.int32)
-        lists = np.empty((count, CELLS, LONGEST_LIST), np.int32)
-        first_part, parts = np.empty((count, CELLS), np.int32), np.empty((count, CELLS, PARTS**3), np.int32)
+        values, lengths = np.empty((count, CELLS), np.int32), np.empty((count, LISTS_PER_BRICK), np.int32)
+        lists = np.empty((count, LISTS_PER_BRICK, LONGEST_LIST), np.int32)
+        first_part, parts = np.empty((count, LISTS_PER_BRICK), np.int32), np.empty((count, CELLS, PARTS**3), np.int32)
         room_for = (self._lists_allowed > self._lists_made, self._parts_allowed > self._parts_made)
         alone = self._rows_made >= self._rows_allowed
         answer_bricks(

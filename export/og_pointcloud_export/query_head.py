@@ -36,6 +36,8 @@ except ImportError as error:
 
 __all__ = ["OPSET", "ScoreHead", "build_query_head", "reference_scores"]
 
+MIDDLE_LIST = 20
+"""So many candidates are compared where the list is longer than SHORT_LIST, LONGEST_LIST where it is longer still."""
 OPSET, IR_VERSION = 18, 8
 """The oldest that has everything needed (ScatterElements with max), so that onnxruntime 1.17 and later run it."""
 
@@ -200,7 +202,7 @@ def _lookup_nodes() -> list[onnx.NodeProto]:
         _node("Cast", "position", "cell_unbounded", to=TensorProto.INT32),
         _node("Max", "cell_unbounded zero_int32", "cell_above"),
         _node("Min", "cell_above last_cell", "cell"),
-        # Along each axis, cell -> what it adds to (block * 64 + the brick's place in it) * 64 + the cell's in the brick.
+        # Along each axis, cell -> what it adds to (block * 64 + place of the brick in it) * 64 + that of the cell.
         _node("GatherElements", "axis_places cell", "place_terms", axis=1),
         *_sum_of_rows("place_terms", "place"),
         _node("Div", "place cells_per_block", "block"),
@@ -260,26 +262,32 @@ def _open_cell_nodes() -> list[onnx.NodeProto]:
         _node("GatherElements", "part_values part_address", "part_stored"),
         _node("Cast", "part_stored", "part_value", to=TensorProto.INT32),
         # open parts: compare the distances of the list's points, as many as it has at most
-        _node("GatherElements", "list_start list", "listed_start"),
-        _node("Add", "list one_int32", "next_list"),
+        _node("Sub", "part_value codes", "part_beyond_codes"),
+        _node("Max", "part_beyond_codes zero_int32", "list_of_part"),
+        _node("Add", "list list_of_part", "part_list"),
+        _node("GatherElements", "list_start part_list", "listed_start"),
+        _node("Add", "part_list one_int32", "next_list"),
         _node("GatherElements", "list_start next_list", "listed_end"),
         _node("Sub", "listed_end listed_start", "listed_length"),
         _node("Less", "part_value codes", "part_certain"),
         _node("Where", "part_certain zero_int32 listed_length", "length_to_search"),
-        *_where_true("Greater", "length_to_search zero_int32", "searched"),
-        *_search_nodes("short", "searched", "short_steps"),
-        _node("ScatterElements", "part_value searched short_code", "value_after_short", axis=0),
-        *_where_true("Greater", "length_to_search short_length", "long_listed"),
-        *_search_nodes("long", "long_listed", "long_steps"),
-        _node("ScatterElements", "value_after_short long_listed long_code", "listed_code", axis=0),
+        *_where_true("Greater", "length_to_search zero_int32", "short_rows"),
+        *_search_nodes("short"),
+        _node("ScatterElements", "part_value short_rows short_code", "value_after_short", axis=0),
+        *_where_true("Greater", "length_to_search short_length", "middle_rows"),
+        *_search_nodes("middle"),
+        _node("ScatterElements", "value_after_short middle_rows middle_code", "value_after_middle", axis=0),
+        *_where_true("Greater", "length_to_search middle_length", "long_rows"),
+        *_search_nodes("long"),
+        _node("ScatterElements", "value_after_middle long_rows long_code", "listed_code", axis=0),
         _node("ScatterElements", "cell_value listed listed_code", "value", axis=0),
     ]
 
 
-def _search_nodes(name: str, rows: str, steps: str) -> list[onnx.NodeProto]:
-    """Rows of the listed points -> the code of the nearest point of each one's list, decided in float64.
+def _search_nodes(name: str) -> list[onnx.NodeProto]:
+    """{name}_rows of the listed points -> {name}_code, that of the nearest in each one's list, decided in float64.
 
-    ``steps`` 0..K-1 reads K entries of every list. Of a shorter one it runs on into the next: farther points, or the
+    {name}_steps 0..K-1 reads K entries of every list. Of a shorter one it runs on into the next: farther points, or the
     same ones again.
     """
 
@@ -295,16 +303,16 @@ def _search_nodes(name: str, rows: str, steps: str) -> list[onnx.NodeProto]:
             node("GatherElements", f"/candidate_{axis} candidate", f"{axis}"),
             node("Cast", f"{axis}", f"{axis}_double", to=TensorProto.DOUBLE),
             node("Reshape", f"{axis}_double candidate_shape", f"{axis}_table"),
-            node("GatherElements", f"/point_{axis} /{rows}", f"{axis}_asked"),
+            node("GatherElements", f"/point_{axis} rows", f"{axis}_asked"),
             node("Cast", f"{axis}_asked", f"{axis}_asked_double", to=TensorProto.DOUBLE),
             node("Unsqueeze", f"{axis}_asked_double /last_axis", f"{axis}_column"),
             node("Sub", f"{axis}_table {axis}_column", f"{axis}_difference"),
             node("Mul", f"{axis}_difference {axis}_difference", f"{axis}_squared"),
         ]
     return [
-        node("GatherElements", f"/listed_start /{rows}", "start"),
+        node("GatherElements", "/listed_start rows", "start"),
         node("Unsqueeze", "start /last_axis", "start_column"),
-        node("Add", f"start_column /{steps}", "candidate_address"),
+        node("Add", "start_column steps", "candidate_address"),
         node("Shape", "candidate_address", "candidate_shape"),
         node("Reshape", "candidate_address /flat", "candidate_address_flat"),
         node("GatherElements", "/candidates_low candidate_address_flat", "candidate_low_stored"),
@@ -408,6 +416,8 @@ def _lookup_constants(cloud: LabelledCloud, grid: BrickGrid) -> dict[str, Any]:
         "candidate_answer": answer.astype(np.min_scalar_type(int(answer.max()))),
         "short_steps": np.arange(SHORT_LIST, dtype=np.int32)[None],
         "short_length": np.int32(SHORT_LIST),
+        "middle_steps": np.arange(MIDDLE_LIST, dtype=np.int32)[None],
+        "middle_length": np.int32(MIDDLE_LIST),
         "long_steps": np.arange(LONGEST_LIST, dtype=np.int32)[None],
         "reach_squared": np.float64(cloud.reach) ** 2,
         "surface_squared": np.float64(surface_distance(cloud.spacing, cloud.reach)) ** 2,
@@ -424,14 +434,15 @@ def _lookup_constants(cloud: LabelledCloud, grid: BrickGrid) -> dict[str, Any]:
     }
 
 
-def _in_three_bytes(name: str, values: NDArray[np.integer]) -> dict[str, NDArray[Any]]:
+def _in_three_bytes(name: str, values: NDArray[np.integer]) -> dict[str, Any]:
     """Indices below 2^24, as almost all are, in three bytes instead of four; the high part takes what it needs."""
     high = values >> 16
-    return {
+    constants: dict[str, Any] = {
         f"{name}_low": (values & 0xFFFF).astype(np.uint16),
         f"{name}_high": high.astype(np.min_scalar_type(int(high.max()))),
         "high_step": np.int32(1 << 16),
     }
+    return constants
 
 
 def _axis_places(grid: BrickGrid) -> NDArray[np.int32]:
