@@ -73,7 +73,9 @@ def require_finite(xyz_world: NDArray[np.floating], why: str) -> None:
 
 
 def _host(pcd: Any) -> str | None:
-    """Library of a cloud's type or of one it is derived from."""
+    """Library of a cloud's type or of one it is derived from; None for arrays, of whatever kind."""
+    if isinstance(pcd, np.ndarray):  # PyVista and trimesh have kinds of their own: mesh.points, mesh.vertices
+        return None
     for kind in type(pcd).__mro__:
         root = kind.__module__.partition(".")[0]
         if root in _READERS:

@@ -3,8 +3,9 @@
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
-# Open3D loads the first five on import; PyVista draws off-screen through EGL with Mesa's software renderer.
-debian_packages=(libusb-1.0-0 libgl1 libegl1 libx11-6 libgomp1 libegl-mesa0 libgl1-mesa-dri)
+# Open3D loads the first five on import; PyVista draws off-screen through EGL, Open3D through Vulkan, both with Mesa's
+# software renderers.
+debian_packages=(libusb-1.0-0 libgl1 libegl1 libx11-6 libgomp1 libegl-mesa0 libgl1-mesa-dri libvulkan1 mesa-vulkan-drivers)
 supported_python='import sys, venv, ensurepip; sys.exit(not (3, 10) <= sys.version_info[:2] <= (3, 13))'
 stamp=.venv/og-pointcloud-setup
 

@@ -77,6 +77,14 @@ def through_pyvista(points, _):
     return pytest.importorskip("pyvista").PolyData(points)
 
 
+def through_pyvista_array(points, _):
+    return pytest.importorskip("pyvista").PolyData(points).points
+
+
+def through_trimesh_array(points, _):
+    return pytest.importorskip("trimesh").PointCloud(points).vertices
+
+
 def through_trimesh(points, _):
     return pytest.importorskip("trimesh").PointCloud(points)
 

@@ -83,8 +83,8 @@ def test_every_kind_of_dataset_answers_as_arrays_do(scene, kind):
     assert type(labelled) is type(mesh)
     assert (labelled.n_points, labelled.n_cells) == (mesh.n_points, mesh.n_cells)
     assert mesh.array_names == before, "the dataset asked stays as it is"
-    for name in ("labels", "instances", "scores", "reasons", "colors"):
-        array, column = np.asarray(labelled.point_data[f"og_{name[:-1]}"]), getattr(expected, name)
+    for name, column in {**expected.attributes, "og_color": expected.colors}.items():
+        array = np.asarray(labelled.point_data[name])
         assert array.dtype == column.dtype
         assert np.array_equal(array, column), name
     assert tuple(labelled.field_data["og_names"]) == ("plum", "apple")

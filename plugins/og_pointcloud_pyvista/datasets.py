@@ -1,7 +1,7 @@
 """What ``mesh.og`` does: labels as point arrays, words that select points, instances as blocks, boxes as lines.
 
 Point arrays: og_label (int32, row of og_names, -1 unknown), og_instance (int32, the scene's id, negative for none),
-og_score (float32), og_reason (int8, a ``Reason``), og_color (uint8 RGB). Field data: og_names, and the scene's file.
+og_score (float32), og_reason (uint8, a ``Reason``), og_color (uint8 RGB). Field data: og_names, and the scene's file.
 Labels are of points. Where cells should carry them too, ``mesh.point_data_to_cell_data(categorical=True)`` has each
 cell's points vote.
 """
@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 import og_pointcloud as og
 from og_pointcloud import runtime
-from og_pointcloud.clouds import SCENE_FIELD
+from og_pointcloud.clouds import NAMES_FIELD, SCENE_FIELD
 from og_pointcloud.errors import MissingExtraError, OgPointcloudError
 from og_pointcloud.instances import Instance
 from og_pointcloud.runtime import LabelledScene, SceneLike
@@ -27,12 +27,11 @@ from og_pointcloud.segmentation import Segmentation, label_colors
 from og_pointcloud.text.words import Labels, TextFeatures
 
 __all__ = [
-    "COLOR", "INSTANCE", "LABEL", "NAMES", "REASON", "SCORE", "OgDataSet", "best_words", "box_lines", "label_names",
+    "COLOR", "INSTANCE", "LABEL", "SCORE", "OgDataSet", "best_words", "box_lines", "label_names",
     "scene_of", "set_strings", "to_pyvista",
 ]  # fmt: skip
 
-LABEL, INSTANCE, SCORE, REASON, COLOR = "og_label", "og_instance", "og_score", "og_reason", "og_color"
-NAMES = "og_names"
+LABEL, INSTANCE, SCORE, COLOR = "og_label", "og_instance", "og_score", "og_color"
 RANK = "og_rank"
 SHOWN = 8
 """Names that a warning lists."""
@@ -186,7 +185,7 @@ def scene_of(mesh: Any, scene: SceneLike | None = None) -> LabelledScene:
 def label_names(mesh: pv.DataSet) -> tuple[str, ...]:
     """Names of the labels in og_label."""
     _require(mesh, LABEL)
-    return tuple(str(name) for name in np.asarray(mesh.field_data[NAMES]).ravel())
+    return tuple(str(name) for name in np.asarray(mesh.field_data[NAMES_FIELD]).ravel())
 
 
 def best_words(mesh: pv.DataSet, scene: SceneLike | None = None) -> dict[int, str]:
@@ -233,11 +232,10 @@ def set_strings(mesh: pv.DataObject, name: str, values: Iterable[str]) -> None:
 
 def _attach(mesh: Any, result: Segmentation) -> None:
     if len(result):  # PyVista refuses empty arrays
-        mesh.point_data[INSTANCE], mesh.point_data[SCORE] = result.instances, result.scores
-        mesh.point_data[REASON], mesh.point_data[COLOR] = result.reasons, result.colors
-        mesh.point_data[LABEL] = result.labels
+        for name, values in {**result.attributes, COLOR: result.colors}.items():
+            mesh.point_data[name] = values
         mesh.set_active_scalars(LABEL, preference="point")
-    set_strings(mesh, NAMES, result.names)
+    set_strings(mesh, NAMES_FIELD, result.names)
     if result.scene is not None:
         set_strings(mesh, SCENE_FIELD, [str(result.scene.resolve())])
     elif SCENE_FIELD in mesh.field_data:  # of an earlier answer
