@@ -147,13 +147,15 @@ def stability(logits: Floats, offset: float) -> Floats:
 
 def mask_boxes(masks: Masks) -> Floats:
     """(n, 4) left, top, right, bottom (exclusive) of masks (n, h, w); zeros for an empty one."""
-    columns, rows = masks.any(axis=1), masks.any(axis=2)
+    columns, rows = np.asarray(masks.any(axis=1)), np.asarray(masks.any(axis=2))
     if not masks.size:
         return np.zeros((len(masks), 4), np.float32)
     left, top = columns.argmax(axis=1), rows.argmax(axis=1)
-    right = columns.shape[1] - columns[:, ::-1].argmax(axis=1)
-    bottom = rows.shape[1] - rows[:, ::-1].argmax(axis=1)
-    return np.where(columns.any(axis=1)[:, None], np.stack([left, top, right, bottom], axis=1), 0).astype(np.float32)
+    right = masks.shape[2] - columns[:, ::-1].argmax(axis=1)
+    bottom = masks.shape[1] - rows[:, ::-1].argmax(axis=1)
+    boxes = np.stack([left, top, right, bottom], axis=1)
+    boxes[~np.asarray(columns.any(axis=1))] = 0
+    return boxes.astype(np.float32)
 
 
 def best_boxes(boxes: Floats, scores: Floats, same: float) -> NDArray[np.intp]:
@@ -197,4 +199,4 @@ def _uncut(masks: Masks, crop: tuple[int, int, int, int], width: int, height: in
         near[:, -EDGE_PX:] = True
     if bottom < height:
         near[-EDGE_PX:] = True
-    return ~(masks & near).any(axis=(1, 2))
+    return ~np.asarray((masks & near).any(axis=(1, 2)))

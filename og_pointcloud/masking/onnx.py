@@ -149,9 +149,9 @@ class OnnxDetector:
                 "prototypes (1, c, h, w)"
             )
         masks = np.zeros((len(boxes), *image.shape[:2]), np.bool_)
-        for mask, values in zip(masks, probability, strict=True):
-            mask[:] = frame.back(values) > self.threshold
-        seen = masks.any(axis=(1, 2))
+        for index, values in enumerate(probability):
+            masks[index] = frame.back(values) > self.threshold
+        seen = np.asarray(masks.any(axis=(1, 2)))
         return Proposals(masks[seen], np.clip(scores[seen], 0, 1).astype(np.float32))
 
     def _plain(self, outputs: dict[str, NDArray[Any]]) -> tuple[Floats, Floats, list[Floats]]:

@@ -156,7 +156,7 @@ def _square_side(config: Any) -> int:
 
 
 def _preprocessor_config(where: str, download: bool) -> dict[str, Any]:
-    from transformers.utils import cached_file
+    from transformers.utils.hub import cached_file
 
     for name in ("preprocessor_config.json", "processor_config.json"):
         file = cached_file(
