@@ -37,6 +37,9 @@ BITS = 64
 BYTE = 256
 """Values of cells that a byte holds; lists of parts are not made where the number of a list would leave it."""
 
+# Helpers are called by kernels alone: without wrappers of their own they compile sooner.
+_helper = njit(no_cpython_wrapper=True, no_cfunc_wrapper=True)  # pyright: ignore[reportCallIssue]
+
 # Throughout: ``lattice`` is (low (3,), cell_size, rounding), the length by which every box is inflated on all sides;
 # ``limits`` is (reach, surface distance, codes); ``near`` is (x, y, z, answer, number), the points about one brick.
 
@@ -80,7 +83,7 @@ def answer_bricks(bricks, lattice, limits, points, top, wanted, values, lengths,
         )  # fmt: skip
 
 
-@njit(cache=True)
+@_helper
 def _answer_brick(brick, lattice, limits, points, top, wanted, values, lengths, lists, first_part, parts):  # noqa: ANN001, ANN202
     low, size, rounding = lattice
     short, with_lists, with_parts, alone = wanted
@@ -132,7 +135,7 @@ def _answer_brick(brick, lattice, limits, points, top, wanted, values, lengths, 
         _sort_as_points(near[4], lists[number, : lengths[number]])
 
 
-@njit(cache=True)
+@_helper
 def _give_list(  # noqa: ANN202
     center, size, rounding, limits, near, rows, short, holds, with_parts,  # noqa: ANN001
     made, split, most, number_of_list, lengths, lists, first_part, parts,  # noqa: ANN001
@@ -166,7 +169,7 @@ def _give_list(  # noqa: ANN202
     return number, max(made, number + 1), split
 
 
-@njit(cache=True)
+@_helper
 def _points_about(brick, corner, size, rounding, reach, points, top):  # noqa: ANN001, ANN202
     """The points within reach of the brick, and (64,) bool, which of its cells hold points."""
     x, y, z, answer, index, start = points
@@ -200,7 +203,7 @@ def _points_about(brick, corner, size, rounding, reach, points, top):  # noqa: A
     return near, holds
 
 
-@njit(cache=True)
+@_helper
 def _rivals_in_box(center, half, reach, near):  # noqa: ANN001, ANN202
     """Rows of the points within reach of the box, but for those farther everywhere than that nearest to its centre."""
     squared, rows, count = np.empty(len(near[0])), np.empty(len(near[0]), np.int32), 0
@@ -217,7 +220,7 @@ def _rivals_in_box(center, half, reach, near):  # noqa: ANN001, ANN202
     return rows[:count]
 
 
-@njit(cache=True)
+@_helper
 def _chosen(near, rows):  # noqa: ANN001, ANN202
     """Those points of ``near``, each with its row there instead of its number in the cloud."""
     x, y, z = np.empty(len(rows)), np.empty(len(rows)), np.empty(len(rows))
@@ -227,7 +230,7 @@ def _chosen(near, rows):  # noqa: ANN001, ANN202
     return x, y, z, answer, rows
 
 
-@njit(cache=True)
+@_helper
 def _alike(near):  # noqa: ANN001, ANN202
     """Whether all points have the same answer."""
     alike = True
@@ -236,7 +239,7 @@ def _alike(near):  # noqa: ANN001, ANN202
     return alike
 
 
-@njit(cache=True)
+@_helper
 def _nearest(center, near, squared):  # noqa: ANN001, ANN202
     """Fill the squared distances of all points; the row of the nearest, -1 if there is none."""
     for row in range(len(near[0])):
@@ -249,7 +252,7 @@ def _nearest(center, near, squared):  # noqa: ANN001, ANN202
     return best
 
 
-@njit(cache=True)
+@_helper
 def _cells_of_octant(octant):  # noqa: ANN001, ANN202
     """(8,) numbers of its cells in the brick."""
     edge = BRICK // OCTANTS
@@ -261,7 +264,7 @@ def _cells_of_octant(octant):  # noqa: ANN001, ANN202
     return cells
 
 
-@njit(cache=True)
+@_helper
 def _middle(corner, number, per_edge, size):  # noqa: ANN001, ANN202
     """Centre of the part with that number, of per_edge^3 of that size in C order."""
     return (
@@ -271,7 +274,7 @@ def _middle(corner, number, per_edge, size):  # noqa: ANN001, ANN202
     )
 
 
-@njit(cache=True)
+@_helper
 def _answer_box(center, half, limits, near, alike, always, squared, rows):  # noqa: ANN001, ANN202
     """(code at the centre, whether it is the whole box's, count): so many rows are nearest somewhere in the box.
 
@@ -308,7 +311,7 @@ def _answer_box(center, half, limits, near, alike, always, squared, rows):  # no
     return _code(near[3][best], best_squared, limits), within and one_answer, count
 
 
-@njit(cache=True)
+@_helper
 def _winners(center, half, near, squared, rows, count):  # noqa: ANN001, ANN202
     """Keep the rows that do not lose to another; how many. (What loses to a loser, loses to the other's winner too.)"""
     row = 0
@@ -325,7 +328,7 @@ def _winners(center, half, near, squared, rows, count):  # noqa: ANN001, ANN202
     return count
 
 
-@njit(cache=True)
+@_helper
 def _settle_boxes(center, size, rounding, per_edge, only_open, limits, near, rows, values):  # noqa: ANN001, ANN202
     """Look at a cell in per_edge^3 boxes: those of its rows that are nearest somewhere in one.
 
@@ -353,7 +356,7 @@ def _settle_boxes(center, size, rounding, per_edge, only_open, limits, near, row
     return kept[:count]
 
 
-@njit(cache=True)
+@_helper
 def _list_parts(center, size, rounding, limits, near, rows, lists, lengths, room, values):  # noqa: ANN001, ANN202
     """Give each open part of a cell a list: for cells of so many candidates that one list does not hold them.
 
@@ -381,7 +384,7 @@ def _list_parts(center, size, rounding, limits, near, rows, lists, lengths, room
     return made
 
 
-@njit(cache=True)
+@_helper
 def _list_to_share(rows, names, number_of_list, lengths, short):  # noqa: ANN001, ANN202
     """Number of the list that grows least by these rows, and not beyond ``short``; the next number if there is none.
 
@@ -397,7 +400,7 @@ def _list_to_share(rows, names, number_of_list, lengths, short):  # noqa: ANN001
     return chosen
 
 
-@njit(cache=True)
+@_helper
 def _sort_as_points(index, rows):  # noqa: ANN001, ANN202
     """Replace the rows, a handful, by the points' numbers in the cloud, ascending."""
     for place in range(len(rows)):
@@ -409,7 +412,7 @@ def _sort_as_points(index, rows):  # noqa: ANN001, ANN202
         rows[before] = point
 
 
-@njit(cache=True)
+@_helper
 def _join(members, length, more, names):  # noqa: ANN001, ANN202
     """Add the names of more rows, where new, to the members; the new length, or -1 where there is no room."""
     for place in more:
@@ -425,12 +428,12 @@ def _join(members, length, more, names):  # noqa: ANN001, ANN202
     return length
 
 
-@njit(cache=True)
+@_helper
 def _seen_from(center, near, row):  # noqa: ANN001, ANN202
     return near[0][row] - center[0], near[1][row] - center[1], near[2][row] - center[2]
 
 
-@njit(cache=True)
+@_helper
 def _code(answer, squared, limits):  # noqa: ANN001, ANN202
     """Code of an answer at that distance: too far, near, or on the surface."""
     reach, surface, codes = limits
@@ -439,27 +442,27 @@ def _code(answer, squared, limits):  # noqa: ANN001, ANN202
     return answer if squared <= surface * surface else answer + codes // 2
 
 
-@njit(cache=True)
+@_helper
 def _grown(reach):  # noqa: ANN001, ANN202
     """The squared reach, and a little more for rounding."""
     return reach * reach * (1 + 1e-9)
 
 
-@njit(cache=True)
+@_helper
 def _gap_squared(dx, dy, dz, half):  # noqa: ANN001, ANN202
     """Squared distance of a point, seen from a box's centre, to the box."""
     gap_x, gap_y, gap_z = max(abs(dx) - half, 0.0), max(abs(dy) - half, 0.0), max(abs(dz) - half, 0.0)
     return gap_x * gap_x + gap_y * gap_y + gap_z * gap_z
 
 
-@njit(cache=True)
+@_helper
 def _all_within_reach(nearest, half, reach):  # noqa: ANN001, ANN202
     """Whether that point, seen from the centre, is within reach of every place in the box."""
     far_x, far_y, far_z = abs(nearest[0]) + half, abs(nearest[1]) + half, abs(nearest[2]) + half
     return far_x * far_x + far_y * far_y + far_z * far_z <= reach * reach * (1 - 1e-9)
 
 
-@njit(cache=True)
+@_helper
 def _loses(p, p_squared, q, q_squared, half):  # noqa: ANN001, ANN202
     """Whether a point p is farther than a point q everywhere in the box.
 
