@@ -182,9 +182,8 @@ class _Bricks:
         if len(blocks):
             mark_bricks(lower, upper, self.top, slots)
 
-        within = (np.floor(position) == own).all(axis=1) & _first_of_equal(
-            cloud.xyz[index]
-        )  # others lie beyond the grid
+        within = (np.floor(position) == own).all(axis=1)  # the others lie beyond the grid
+        within &= _first_of_equal(cloud.xyz[index])
         own, index = own[within], index[within]
         slot = self.top[tuple((own // BLOCK).T)].astype(np.int64) * PLACES + (
             own % BLOCK @ np.array([BLOCK**2, BLOCK, 1])
