@@ -66,9 +66,11 @@ def mask_crops(
             f"masks are {masks.dtype} {masks.shape}; expected bool (masks, {image.shape[0]}, {image.shape[1]}), as "
             "large as the image"
         )
+    colour = np.asarray(fill, np.float32)
+    faded = np.rint(crop.outside * image + (1 - crop.outside) * colour).astype(np.uint8)  # once, not for every mask
     crops = np.empty((len(masks), size, size, 3), np.uint8)
     for row, mask in enumerate(masks):
-        crops[row] = resized(_window(image, mask, crop, np.asarray(fill, np.float32)), size, size, resample)
+        crops[row] = resized(_window(image, faded, mask, crop.scale, colour), size, size, resample)
     return crops
 
 
@@ -81,20 +83,23 @@ def mask_box(mask: NDArray[np.bool_]) -> tuple[int, int, int, int]:
 
 
 def _window(
-    image: NDArray[np.uint8], mask: NDArray[np.bool_], crop: Crop, fill: NDArray[np.float32]
+    image: NDArray[np.uint8],
+    faded: NDArray[np.uint8],
+    mask: NDArray[np.bool_],
+    scale: float,
+    fill: NDArray[np.float32],
 ) -> NDArray[np.uint8]:
-    """(side, side, 3) the square about the mask's box, before it is resized."""
+    """(side, side, 3) the square about the mask's box, before it is resized: faded outside the mask."""
     top, left, height, width = mask_box(mask)
-    side = max(round(crop.scale * max(height, width)), 1)
+    side = max(round(scale * max(height, width)), 1)
     top, left = top - (side - height) // 2, left - (side - width) // 2
     rows = slice(max(top, 0), min(top + side, image.shape[0]))
     columns = slice(max(left, 0), min(left + side, image.shape[1]))
-    seen, inside = image[rows, columns], mask[rows, columns, None]
-    blend = np.where(inside, seen, crop.outside * seen + (1 - crop.outside) * fill)
     window = np.empty((side, side, 3), np.uint8)
     window[:] = fill
     place = (slice(rows.start - top, rows.stop - top), slice(columns.start - left, columns.stop - left))
-    window[place] = np.rint(blend)
+    window[place] = faded[rows, columns]
+    np.copyto(window[place], image[rows, columns], where=mask[rows, columns, None])
     return window
 
 
