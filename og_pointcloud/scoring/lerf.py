@@ -27,9 +27,11 @@ ALPHA_SHOWN, IOU_FOUND = 0.7, 0.25
 
 @dataclass(frozen=True)
 class LabelledFrame:
-    """name: file stem of the image. objects: category -> (H, W) bool."""
+    """name: file stem of the image. width, height: its pixels. objects: category -> (H, W) bool."""
 
     name: str
+    width: int
+    height: int
     objects: dict[str, NDArray[np.bool_]]
 
 
@@ -61,7 +63,7 @@ def read_frame(file: str | Path) -> LabelledFrame:
     for category, outline in outlines:
         mask = _filled(outline, (height, width), f"{file}, object '{category}'")
         masks[category] = masks[category] | mask if category in masks else mask
-    return LabelledFrame(Path(name).stem, masks)
+    return LabelledFrame(Path(name).stem, width, height, masks)
 
 
 def pair_ious(frame: LabelledFrame, alphas: Mapping[str, NDArray[np.floating]]) -> dict[str, float]:

@@ -23,7 +23,17 @@ from og_pointcloud.formats.ply import read_ply
 from og_pointcloud.formats.tables import positions
 from og_pointcloud.metrics import Score, score_labels
 
-__all__ = ["NAMES", "SCENES", "TASKS", "SceneScore", "TaskMean", "average", "read_truth", "score_scene"]
+__all__ = [
+    "NAMES",
+    "SCENES",
+    "TASKS",
+    "SceneScore",
+    "TaskMean",
+    "average",
+    "read_truth",
+    "score_scene",
+    "scored_answers",
+]
 
 NAMES: Mapping[int, str] = {
     1: "wall", 2: "floor", 3: "cabinet", 4: "bed", 5: "chair", 6: "sofa", 7: "table", 8: "door", 9: "window",
@@ -117,6 +127,17 @@ def score_scene(
         hits=hits,
         union=union,
     )
+
+
+def scored_answers(
+    predicted: NDArray[np.integer], confidence: NDArray[np.floating], truth: NDArray[np.integer], task: int,
+    opacity: NDArray[np.floating] | None = None,
+) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:  # fmt: skip
+    """Of the protocol's points, whether each is right, and how sure it is, -inf where unknown: what
+    `spread.risk_coverage` takes. Arguments as for `score_scene`; confidence: (n,)."""
+    counted = np.isin(truth, TASKS[task]) & (True if opacity is None else opacity >= OPACITY_COUNTED)
+    surely = np.where(predicted > 0, np.asarray(confidence, np.float64), -np.inf)
+    return (predicted == truth)[counted], surely[counted]
 
 
 def average(scores: Sequence[SceneScore]) -> TaskMean:

@@ -1,0 +1,275 @@
+"""``og-pointcloud eval scannet``: the table of ScanNet scenes, from the data set's own files."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from og_pointcloud.cli.common import add_command, check_outputs, names_in, print_table, write_json
+from og_pointcloud.cli.eval_.common import percent, prediction_file, signed, spread
+from og_pointcloud.errors import OgPointcloudError
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from og_pointcloud.scoring.scannet import SceneScore
+    from og_pointcloud.scoring.spread import RiskCoverage
+
+LABELS = "_vh_clean_2.labels.ply"
+NOT_OF_THE_TABLE = 40
+"""NYU40's "other property", which no task asks for."""
+MAX_LABEL_BYTES = 1 << 31
+
+
+@dataclass(frozen=True)
+class Predicted:
+    """ids: (n,) NYU40, 0 unknown. confidence: (n,), None where a file of labels has none."""
+
+    ids: NDArray[np.int64]
+    confidence: NDArray[np.floating] | None
+
+
+@dataclass(frozen=True)
+class TaskResult:
+    """scenes: by name. curve: of the points of all scenes together, None without confidences. answered: their share."""
+
+    scenes: dict[str, SceneScore]
+    curve: RiskCoverage | None
+    answered: float
+
+
+def add(protocols: Any) -> None:
+    scannet = add_command(
+        protocols, "scannet", run,
+        "ScanNet point segmentation with 19, 15 and 10 classes; unknown counts as wrong, and beside it as abstention.",
+        "og-pointcloud eval scannet scans --predictions fitted --json scores.json",
+    )  # fmt: skip
+    scannet.add_argument("folder", type=Path, metavar="DIR", help=f"folder of scene folders with <scene>{LABELS}")
+    scannet.add_argument(
+        "--predictions", type=Path, required=True, metavar="P",
+        help="folder with <scene>.ogpc, which is asked, or <scene>.npz, from `segment -o` for the labels' points",
+    )  # fmt: skip
+    scannet.add_argument("--against", type=Path, metavar="Q", help="as P: also give the difference, P less Q, paired")
+    scannet.add_argument("--text-features", type=Path, metavar="F.npz", help="names and vectors for .ogpc predictions")
+    scannet.add_argument(
+        "--gaussians",
+        type=Path,
+        metavar="G",
+        help="folder with <scene>.ply, whose points of opacity below 0.1 are ignored",
+    )
+    scannet.add_argument("--scenes", metavar="A,B", help="these scenes (default: all in DIR)")
+    scannet.add_argument("--plot", type=Path, metavar="F.png", help="risk against coverage of the 19 classes")
+    scannet.add_argument("--json", type=Path, metavar="F.json", help="also write every score")
+
+
+def run(arguments: argparse.Namespace) -> None:
+    outputs = {"--json": (arguments.json, [".json"]), "--plot": (arguments.plot, [".png"])}
+    check_outputs(outputs, inputs=[arguments.text_features])
+    from og_pointcloud.scoring.plots import plot_risk_coverage, require_matplotlib
+    from og_pointcloud.scoring.scannet import SCENES
+
+    if arguments.plot:
+        require_matplotlib()
+    files = truth_files(arguments.folder, names_in(arguments.scenes))
+    folders = [folder for folder in (arguments.predictions, arguments.against) if folder]
+    predictions = [{scene: prediction_file(folder, scene) for scene in files} for folder in folders]
+    own, *others = (score_files(files, found, arguments) for found in predictions)
+    rows, report = [], {}
+    for task, result in own.items():
+        row, report[str(task)] = described(task, result, others[0][task] if others else None)
+        rows.append(row)
+    print_table(HEADER + (("less the other",) if others else ()), rows)
+    published = sum(scene in SCENES for scene in files)
+    print(f"{len(files)} scenes, {published} of the {len(SCENES)} of the published table; intervals are over scenes")
+    if arguments.gaussians is None:
+        print("no --gaussians: transparent points are not ignored, so mIoU is that of all points")
+    if arguments.plot:
+        largest = max(own)
+        results = [(str(folder), of[largest]) for folder, of in zip(folders, (own, *others), strict=True)]
+        curves = {name: result.curve for name, result in results if result.curve}
+        if not curves:
+            raise OgPointcloudError("no prediction has scores, so there is no risk against coverage to plot (--plot)")
+        title = f"ScanNet, {largest} classes"
+        plot_risk_coverage(curves, {name: result.answered for name, result in results}, arguments.plot, title)
+        print(f"wrote {arguments.plot}")
+    if arguments.json:
+        write_json(arguments.json, report)
+        print(f"wrote {arguments.json}")
+
+
+HEADER = (
+    "", "mIoU", "mAcc", "flat mIoU", "all points", "answered", "share answered", "risk area", "95 % of mIoU",
+)  # fmt: skip
+
+
+def score_files(
+    files: dict[str, Path], predictions: dict[str, Path], arguments: argparse.Namespace
+) -> dict[int, TaskResult]:
+    """Every task over all scenes."""
+    import numpy as np
+
+    from og_pointcloud.scoring.scannet import TASKS, read_truth, score_scene, scored_answers
+    from og_pointcloud.scoring.spread import risk_coverage
+
+    scores: dict[int, dict[str, SceneScore]] = {task: {} for task in TASKS}
+    answers: dict[int, list[tuple[NDArray[np.bool_], NDArray[np.float64]]]] = {task: [] for task in TASKS}
+    unsaid = set()
+    for scene, file in files.items():
+        xyz, truth = read_truth(file)
+        opacity = opacities(arguments.gaussians, scene, len(truth))
+        for task in TASKS:
+            found = predicted(predictions[scene], xyz, task, arguments.text_features)
+            scores[task][scene] = score_scene(found.ids, truth, task, opacity)
+            unsaid |= {scene} if found.confidence is None else set()
+            confidence = np.zeros(len(truth)) if found.confidence is None else found.confidence
+            answers[task].append(scored_answers(found.ids, confidence, truth, task, opacity))
+    results = {}
+    for task in TASKS:
+        correct, confidence = (np.concatenate(column) for column in zip(*answers[task], strict=True))
+        curve = risk_coverage(correct, confidence) if len(correct) and not unsaid else None
+        share = float(np.isfinite(confidence).mean()) if len(correct) else float("nan")
+        results[task] = TaskResult(scores[task], curve, share)
+    return results
+
+
+def described(task: int, result: TaskResult, other: TaskResult | None) -> tuple[tuple[str, ...], dict[str, Any]]:
+    """A row of the table, and the same with every scene as JSON. other: of the predictions to compare with."""
+    import numpy as np
+
+    from og_pointcloud.scoring.scannet import average
+    from og_pointcloud.scoring.spread import bootstrap, paired_bootstrap
+
+    values = list(result.scenes.values())
+    mean = average(values)
+    per_scene = np.array([score.protocol.miou for score in values])
+    known = bool(np.isfinite(per_scene).any())
+    interval = bootstrap(per_scene) if known else None
+    change = None
+    if other and known:
+        change = paired_bootstrap(per_scene, np.array([score.protocol.miou for score in other.scenes.values()]))
+    area = result.curve.area if result.curve else None
+    row = (
+        f"{task} classes", *map(percent, columns(values, mean)), "-" if area is None else f"{area:.4f}",
+        spread(interval), *([] if other is None else [signed(change) if change else "-"]),
+    )  # fmt: skip
+    entry = {
+        "miou": mean.miou if known else None,
+        "macc": mean.macc if known else None,
+        "flat_miou": mean.flat_miou if known else None,
+        "risk_area": area,
+        "interval": [interval.low, interval.high] if interval else None,
+        "less_the_other": [change.mean, change.low, change.high] if change else None,
+        "scenes": {scene: describe(score) for scene, score in result.scenes.items()},
+    }
+    return row, entry
+
+
+def columns(scores: Sequence[SceneScore], mean: Any) -> list[float]:
+    import numpy as np
+
+    def over_scenes(values: list[float]) -> float:
+        finite = [value for value in values if np.isfinite(value)]
+        return float(np.mean(finite)) if finite else float("nan")
+
+    others = (
+        [s.all_points.miou for s in scores],
+        [s.answered.miou for s in scores],
+        [s.answered_share for s in scores],
+    )
+    return [mean.miou, mean.macc, mean.flat_miou, *map(over_scenes, others)]
+
+
+def describe(score: SceneScore) -> dict[str, Any]:
+    """One scene's scores as JSON: by class, and the means."""
+    classes = dict(zip(map(str, score.protocol.classes), score.protocol.class_iou, strict=True))
+    return {
+        "miou": score.protocol.miou if classes else None,
+        "macc": score.protocol.macc if classes else None,
+        "class_iou": classes,
+        "points": score.protocol.points,
+        "all_points_miou": score.all_points.miou if score.all_points.classes else None,
+        "answered_miou": score.answered.miou if score.answered.classes else None,
+        "answered_share": score.answered_share if classes else None,
+    }
+
+
+def truth_files(folder: Path, scenes: list[str] | None) -> dict[str, Path]:
+    """Scene name -> its labels, in the folder or in the scene's own folder below it."""
+    found = {
+        file.name.removesuffix(LABELS): file for file in (*folder.glob(f"*{LABELS}"), *folder.glob(f"*/*{LABELS}"))
+    }
+    if not found:
+        raise OgPointcloudError(f"{folder} has no <scene>/<scene>{LABELS}; expected ScanNet's folder of scenes")
+    missing = [scene for scene in scenes or () if scene not in found]
+    if missing:
+        raise OgPointcloudError(f"{folder} has no labels of '{missing[0]}'; it has {', '.join(sorted(found)[:3])}, ...")
+    return {scene: found[scene] for scene in scenes or sorted(found)}
+
+
+def predicted(file: Path, xyz: NDArray[np.float64], task: int, text_features: Path | None) -> Predicted:
+    """A bundle is asked for the task's names, stored labels are taken by their names."""
+    import numpy as np
+
+    from og_pointcloud.scoring.scannet import NAMES, TASKS
+
+    if file.suffix == ".ogpc":
+        from og_pointcloud.runtime import segment
+
+        asked = [NAMES[class_id] for class_id in TASKS[task]]
+        result = segment(xyz, asked, scene=file, text_features=text_features)
+        labels, confidence = result.labels, result.scores
+    else:
+        labels, confidence, asked = stored_labels(file)
+    if len(labels) != len(xyz):
+        raise OgPointcloudError(f"{file} has {len(labels)} labels, the scene {len(xyz)} points; expected one each")
+    if len(labels) and labels.max() >= len(asked):
+        raise OgPointcloudError(f"{file}: label {labels.max()} has no name (there are {len(asked)})")
+    ids = {name: class_id for class_id, name in NAMES.items()}
+    # A name that is no class of the table stays an answer, and a wrong one.
+    table = np.array([*(ids.get(name, NOT_OF_THE_TABLE) for name in asked), 0])
+    return Predicted(table[np.maximum(labels, -1)], confidence)
+
+
+def stored_labels(file: Path) -> tuple[NDArray[np.int32], NDArray[np.floating] | None, list[str]]:
+    """(n,) indices of names, below 0 unknown; (n,) scores, if there are any; the names. As ``segment -o`` writes."""
+    import zipfile
+
+    import numpy as np
+
+    try:
+        with zipfile.ZipFile(file) as archive:
+            if (total := sum(entry.file_size for entry in archive.infolist())) > MAX_LABEL_BYTES:
+                raise OgPointcloudError(f"{file} unpacks to {total} bytes; expected at most {MAX_LABEL_BYTES}")
+        with np.load(file, allow_pickle=False) as arrays:
+            labels, names = arrays["labels"], [str(name) for name in arrays["names"]]
+            scores = arrays["scores"] if "scores" in arrays.files else None
+    except (zipfile.BadZipFile, KeyError, ValueError, OSError) as error:
+        if isinstance(error, OgPointcloudError):
+            raise
+        raise OgPointcloudError(
+            f"{file} cannot be read as labels and names ({error}): segment the scene again"
+        ) from None
+    if labels.ndim != 1 or labels.dtype.kind not in "iu":
+        raise OgPointcloudError(f"{file}: labels are {labels.dtype} {labels.shape}; expected whole numbers (points,)")
+    if scores is not None and (scores.shape != labels.shape or scores.dtype.kind != "f" or np.isnan(scores).any()):
+        raise OgPointcloudError(f"{file}: scores are {scores.dtype} {scores.shape}; expected numbers {labels.shape}")
+    return labels.astype(np.int32), scores, names
+
+
+def opacities(folder: Path | None, scene: str, count: int) -> NDArray[np.floating] | None:
+    if folder is None:
+        return None
+    from og_pointcloud.formats.points import read_points
+
+    points = read_points(folder / f"{scene}.ply")
+    if points.opacity is None or len(points) != count:
+        kind = "Gaussians" if points.are_gaussians else "points without opacity"
+        raise OgPointcloudError(
+            f"{folder / scene}.ply has {len(points)} {kind}; expected a Gaussian for each of the scene's {count} "
+            "points, in their order"
+        )
+    return points.opacity

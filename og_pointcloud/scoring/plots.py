@@ -1,0 +1,51 @@
+"""Risk against coverage as a picture: a line each method, a ring where it stops answering."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from og_pointcloud._atomic import replacing
+from og_pointcloud.errors import MissingExtraError
+from og_pointcloud.scoring.spread import RiskCoverage
+
+__all__ = ["plot_risk_coverage", "require_matplotlib"]
+
+
+def require_matplotlib() -> Any:
+    """The class matplotlib.figure.Figure; MissingExtraError where matplotlib is not installed."""
+    try:
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise MissingExtraError("matplotlib", "report") from error
+    return Figure
+
+
+def plot_risk_coverage(
+    curves: Mapping[str, RiskCoverage], answered: Mapping[str, float], path: str | os.PathLike[str], title: str = ""
+) -> Path:
+    """Write a PNG. curves: by method. answered: share of the points that each method answers of itself; beyond it lie
+    the unknown ones, which count as wrong."""
+    figure = require_matplotlib()(figsize=(7, 4.2), layout="constrained")
+    axes = figure.subplots()
+    for name, curve in curves.items():
+        # From the first point on: with nothing answered there is no risk to speak of.
+        coverage, risk = np.append(curve.coverage[:1] * 0, curve.coverage), np.append(curve.risk[:1], curve.risk)
+        (line,) = axes.plot(100 * coverage, 100 * risk, label=f"{name} (area {curve.area:.4f})")
+        share = answered[name]
+        at = float(np.interp(share, coverage, risk))
+        axes.plot([100 * share], [100 * at], "o", ms=9, mfc="none", mew=1.8, color=line.get_color())
+    axes.plot([], [], "o", ms=9, mfc="none", mew=1.8, color="0.3", label="answers no more: unknown counts as wrong")
+    axes.set(xlabel="% of the points answered, surest first", ylabel="% of these that are wrong", title=title)
+    axes.set_xlim(0, 101)
+    axes.set_ylim(bottom=0)
+    axes.grid(alpha=0.3)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.legend(fontsize=8, frameon=False)
+    with replacing(Path(path)) as file:
+        figure.savefig(file, format="png", dpi=110)
+    return Path(path)

@@ -1,0 +1,203 @@
+"""``og-pointcloud eval capture`` and ``eval scannet`` from files to table, JSON and plot."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import NAMES, write_tiny_capture
+from labelled_clouds import SPACE, WIDTH, instance_table, make_cloud
+
+import og_pointcloud as og
+from og_pointcloud.cli import main
+from og_pointcloud.cloud import BACKGROUND
+from og_pointcloud.formats.ply import write_ply
+from og_pointcloud.scoring.plots import plot_risk_coverage
+from og_pointcloud.scoring.scannet import NAMES as NYU40
+from og_pointcloud.scoring.spread import risk_coverage
+
+WALL, FLOOR, CHAIR = 1, 2, 5
+PNG = b"\x89PNG\r\n"
+
+
+# Captures -------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def fitted(tmp_path_factory) -> Path:
+    """A folder with the tiny capture, its truth, S.ogpc, and worse.ogpc, in which the second ball is background."""
+    folder = tmp_path_factory.mktemp("eval")
+    capture = write_tiny_capture(folder / "tiny")
+    ids = capture.object_ids
+    np.savez(capture.folder / "gt.npz", names=np.array(NAMES), cls=ids, background=ids < 0, instance=ids)
+    cloud = og.fit(og.read_capture(capture.folder), progress=False)
+    og.write_bundle(cloud, folder / "S.ogpc")
+    missed = np.where(ids == 1, BACKGROUND, cloud.instance_ids).astype(np.int32)
+    og.write_bundle(replace(cloud, instance_ids=missed), folder / "worse.ogpc")
+    return folder
+
+
+def test_a_capture_is_scored_against_its_own_truth(fitted, tmp_path, capsys):
+    pytest.importorskip("matplotlib")
+    command = ["eval", "capture", str(fitted / "tiny"), str(fitted / "S.ogpc")]
+    outputs = ["--json", str(tmp_path / "s.json"), "--plot", str(tmp_path / "r.png")]
+    assert main([*command, "--against", str(fitted / "worse.ogpc"), *outputs]) == 0
+    out = capsys.readouterr().out
+    entry = json.loads((tmp_path / "s.json").read_text())["tiny"]
+    words = fitted / "tiny/text_features.npz"
+    result = og.segment(og.load(fitted / "S.ogpc"), None, text_features=words)
+    cls = np.load(fitted / "tiny/gt.npz")["cls"]
+    said = np.array([*result.names, ""])[result.labels]
+    hits = [((said == name) & (cls == k)).sum() / ((said == name) | (cls == k)).sum() for k, name in enumerate(NAMES)]
+    assert entry["labels"]["class_iou"] == pytest.approx(hits)
+    assert entry["labels"]["miou"] == entry["interval"]["mean"] > 0.8
+    assert f"{100 * np.mean(hits):.1f}" in out
+    assert entry["interval"]["low"] <= entry["interval"]["mean"] <= entry["interval"]["high"]
+    assert entry["instances"]["any_panoptic"]["recognition"] == 1
+    # The other lacks one ball of two: about half of the score, in every draw.
+    less = entry["less_the_other"]
+    assert less["mean"] == pytest.approx(hits[1] / 2)
+    assert 0.3 < less["low"] < less["mean"] < less["high"]
+    assert (tmp_path / "r.png").read_bytes().startswith(PNG)
+    assert "cubes of" in out
+
+
+def test_folders_of_captures_and_scenes(fitted, tmp_path, capsys):
+    (tmp_path / "p").mkdir()
+    (tmp_path / "p/tiny.ogpc").write_bytes((fitted / "S.ogpc").read_bytes())
+    assert main(["eval", "capture", str(fitted / "tiny"), str(tmp_path / "p")]) == 0
+    assert "tiny" in capsys.readouterr().out
+    other = tmp_path / "other"
+    other.mkdir()
+    (other / "gt.npz").write_bytes((fitted / "tiny/gt.npz").read_bytes())
+    both = ["eval", "capture", str(fitted / "tiny"), str(other)]
+    assert main([*both, str(tmp_path / "p")]) == 2
+    assert "has no other.ogpc" in capsys.readouterr().err
+    assert main([*both, str(fitted / "S.ogpc")]) == 2
+    assert "is one file for 2 captures" in capsys.readouterr().err
+    assert main([*both, str(other), str(tmp_path / "p")]) == 2
+    assert "two captures are called 'other'" in capsys.readouterr().err
+
+
+def test_what_cannot_be_scored_is_one_error(fitted, tmp_path, capsys):
+    (tmp_path / "bare").mkdir()
+    assert main(["eval", "capture", str(tmp_path / "bare"), str(fitted / "S.ogpc")]) == 2
+    assert "gt.npz is not a file" in capsys.readouterr().err
+    assert main(["eval", "capture", str(fitted / "tiny"), str(fitted / "none.ogpc")]) == 2
+    assert "is no .ogpc file" in capsys.readouterr().err
+    np.savez(tmp_path / "bare/gt.npz", names=np.array(NAMES), cls=np.zeros(3, int))
+    assert main(["eval", "capture", str(tmp_path / "bare"), str(fitted / "S.ogpc")]) == 2
+    captured = capsys.readouterr()
+    assert "points, the truth 3" in captured.err
+    assert captured.err.count("\n") == 1
+
+
+def test_a_score_of_nothing_is_null_in_json(fitted, tmp_path):
+    """No point is answered: precision has no value, which JSON has no word for."""
+    cloud = og.load(fitted / "S.ogpc").cloud
+    silent = replace(cloud, instance_ids=np.full(len(cloud), BACKGROUND, np.int32))
+    og.write_bundle(silent, tmp_path / "silent.ogpc")
+    command = ["eval", "capture", str(fitted / "tiny"), str(tmp_path / "silent.ogpc")]
+    assert main([*command, "--json", str(tmp_path / "s.json")]) == 0
+    entry = json.loads((tmp_path / "s.json").read_text(), parse_constant=lambda name: pytest.fail(name))["tiny"]
+    assert entry["labels"]["miou"] == 0
+    assert entry["answered"]["miou"] is None
+
+
+def test_the_plot_takes_several_methods(tmp_path):
+    pytest.importorskip("matplotlib")
+    rng = np.random.default_rng(0)
+    curves = {name: risk_coverage(rng.random(50) < 0.8, rng.random(50)) for name in ("one", "two")}
+    path = plot_risk_coverage(curves, {"one": 0.9, "two": 1.0}, tmp_path / "r.png", "title")
+    assert path.read_bytes().startswith(PNG)
+
+
+# ScanNet --------------------------------------------------------------------------------------------------------
+
+
+def write_labels(folder: Path, scene: str, xyz, truth) -> None:
+    """As ScanNet's *_vh_clean_2.labels.ply: x y z red green blue alpha label."""
+    (folder / scene).mkdir(parents=True)
+    fields = [(name, "f4") for name in "xyz"] + [(name, "u1") for name in ("red", "green", "blue", "alpha")]
+    rows = np.zeros(len(truth), [*fields, ("label", "u2")])
+    for axis, name in enumerate("xyz"):
+        rows[name] = xyz[:, axis]
+    rows["label"] = truth
+    write_ply(folder / scene / f"{scene}_vh_clean_2.labels.ply", {"vertex": rows})
+
+
+@pytest.fixture
+def scannet(tmp_path) -> Path:
+    """Two scenes of four points, 1 apart. Instances 0, 1 and 2 look like wall, floor and chair: they are what the .ogpc
+    answers. Scene 0: wall, wall, chair, chair, of which the last is said to be floor. Scene 62: wall, unknown, floor,
+    floor, of walls and floors."""
+    vectors = np.eye(3, WIDTH, dtype=np.float32)
+    table = replace(instance_table(3), descriptors=vectors)
+    names = list(NYU40.values())
+    texts = np.random.default_rng(1).normal(size=(len(names), WIDTH)).astype(np.float32) * 0.01
+    for row, class_id in enumerate((WALL, FLOOR, CHAIR)):
+        texts[names.index(NYU40[class_id])] = vectors[row]
+    np.savez(tmp_path / "w.npz", names=names, vectors=texts, feature_space=np.array(SPACE))
+    xyz = np.arange(4)[:, None] * np.array([1.0, 0, 0])
+    (tmp_path / "p").mkdir()
+    for scene, ids, truth in (
+        ("scene0000_00", [0, 0, 2, 1], [WALL, WALL, CHAIR, CHAIR]),
+        ("scene0062_00", [0, -1, 1, 1], [WALL, WALL, FLOOR, FLOOR]),
+    ):
+        write_labels(tmp_path / "scans", scene, xyz, truth)
+        og.write_bundle(make_cloud(xyz, ids, 1.0, 0.5, instances=table, words=()), tmp_path / f"p/{scene}.ogpc")
+    return tmp_path
+
+
+def command(scannet, *more):
+    folders = ["--predictions", str(scannet / "p"), "--text-features", str(scannet / "w.npz")]
+    return ["eval", "scannet", str(scannet / "scans"), *folders, *more]
+
+
+def test_scenes_are_asked_for_the_names_of_the_table(scannet, capsys):
+    pytest.importorskip("matplotlib")
+    outputs = ["--json", str(scannet / "s.json"), "--plot", str(scannet / "r.png")]
+    assert main(command(scannet, *outputs)) == 0
+    out = capsys.readouterr().out
+    report = json.loads((scannet / "s.json").read_text())["19"]
+    # Scene 0: wall 2 of 2, chair 1 of 2. Scene 62: wall 1 of 2, floor 2 of 2; unknown as abstention 1 and 1.
+    assert report["scenes"]["scene0000_00"]["class_iou"] == {"1": 1.0, "5": 0.5}
+    assert report["scenes"]["scene0062_00"]["class_iou"] == {"1": 0.5, "2": 1.0}
+    assert report["scenes"]["scene0062_00"]["answered_miou"] == 1
+    assert report["miou"] == pytest.approx(0.75)
+    # All cosines are 1, so the 7 answered points come together, one wrong; then the unknown one: (1/7) 7/8 + (2/8) 1/8.
+    assert report["risk_area"] == pytest.approx(1 / 8 + 1 / 32, abs=1e-6)
+    assert "risk area" in out
+    assert (scannet / "r.png").read_bytes().startswith(PNG)
+
+
+def test_two_methods_are_compared_over_scenes(scannet, capsys):
+    (scannet / "q").mkdir()
+    names = np.array(["wall", "floor", "chair"])
+    np.savez(scannet / "q/scene0000_00.npz", labels=np.array([0, 0, 2, 1]), names=names)
+    np.savez(scannet / "q/scene0062_00.npz", labels=np.array([-1, -1, 1, 1]), names=names)
+    outputs = ["--json", str(scannet / "s.json")]
+    assert main(command(scannet, "--against", str(scannet / "q"), *outputs)) == 0
+    # The same in scene 0; in scene 62 a wall less, 1/4 of a point. Draws of two scenes hold it never, once or twice.
+    for task in ("19", "15", "10"):
+        less = json.loads((scannet / "s.json").read_text())[task]["less_the_other"]
+        assert less == pytest.approx([1 / 8, 0, 1 / 4])
+    assert "+12.5 (+0.0 to +25.0)" in capsys.readouterr().out
+
+
+def test_labels_without_scores_have_no_curve(scannet, capsys):
+    names = np.array(["wall", "floor", "chair"])
+    np.savez(scannet / "p/scene0062_00.npz", labels=np.array([0, 0, 1, 1]), names=names)
+    (scannet / "p/scene0062_00.ogpc").unlink()
+    assert main(command(scannet, "--json", str(scannet / "s.json"))) == 0
+    assert json.loads((scannet / "s.json").read_text())["19"]["risk_area"] is None
+    pytest.importorskip("matplotlib")
+    assert main(command(scannet, "--plot", str(scannet / "r.png"))) == 2
+    assert "no prediction has scores" in capsys.readouterr().err
+    scores = np.array([0.9, 0.8, 0.7, np.nan], np.float32)
+    np.savez(scannet / "p/scene0062_00.npz", labels=np.array([0, 0, 1, 1]), names=names, scores=scores)
+    assert main(command(scannet)) == 2
+    assert "scores are float32 (4,); expected numbers" in capsys.readouterr().err

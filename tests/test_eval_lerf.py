@@ -1,0 +1,219 @@
+"""``eval lerf`` on a miniature of LeRF-OVS whose scores are worked out by hand.
+
+Every Gaussian sits in the middle of one pixel of a camera that looks along z from depth 10 at focal length 10, so that
+a step of 1 in the world is 1 pixel. Its alpha is 0.99 there and below 0.25 on the next pixel: what is above 0.7 is a
+selection's own pixels.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from labelled_clouds import SPACE, make_cloud
+
+import og_pointcloud as og
+from og_pointcloud.choosing import WordBank
+from og_pointcloud.cli import main
+from og_pointcloud.cloud import InstanceTable
+from og_pointcloud.errors import SceneError
+from og_pointcloud.formats.gaussian_ply import write_gaussian_ply
+from og_pointcloud.scene import Points
+from og_pointcloud.scoring.lerf_selection import gaussians_of, read_scene, score_pairs
+
+WIDTH, HEIGHT, DEPTH = 20, 10, 10.0
+SMALL = 0.01
+"""Standard deviation of a Gaussian: what is drawn is the low-pass filter alone."""
+WORDS = ("cup", "fork", "duck")
+
+
+def block(column, row, side):
+    """World places of the pixels of a square."""
+    x, y = np.meshgrid(np.arange(side) + column + 0.5, np.arange(side) + row + 0.5)
+    return np.stack([x.ravel() - WIDTH / 2, y.ravel() - HEIGHT / 2, np.full(side * side, DEPTH)], axis=1)
+
+
+def outline(column, row, side):
+    """A polygon whose filled pixels, border included, are side x side."""
+    last = side - 1
+    return [[column, row], [column + last, row], [column + last, row + last], [column, row + last]]
+
+
+def write_labels(folder: Path, scene: str, frame: str, objects) -> None:
+    (folder / "label" / scene).mkdir(parents=True, exist_ok=True)
+    info = {"name": f"{frame}.jpg", "width": WIDTH, "height": HEIGHT}
+    entries = [{"category": name, "segmentation": corners} for name, corners in objects]
+    (folder / "label" / scene / f"{frame}.json").write_text(json.dumps({"info": info, "objects": entries}))
+
+
+def write_poses(folder: Path, scene: str, shifts: dict[str, float], scale: int = 1) -> None:
+    """COLMAP's text model: cameras moved along x. scale: of the image that the model knows, over the labelled one."""
+    model = folder / scene / "sparse/0"
+    model.mkdir(parents=True)
+    width, height, focal = scale * WIDTH, scale * HEIGHT, scale * DEPTH
+    (model / "cameras.txt").write_text(f"1 PINHOLE {width} {height} {focal} {focal} {width / 2} {height / 2}\n")
+    lines = [f"{i + 1} 1 0 0 0 {-x} 0 0 1 {name}.jpg\n\n" for i, (name, x) in enumerate(shifts.items())]
+    (model / "images.txt").write_text("".join(lines))
+
+
+def scene_of(blocks, descriptors, origin=(0, 0, 0)):
+    """A cloud of one instance a block; descriptors (instances, 3) over the axes of WORDS. The cloud knows no words."""
+    xyz = np.concatenate(blocks)
+    ids = np.repeat(np.arange(len(blocks)), [len(part) for part in blocks])
+    count = np.bincount(ids).astype(np.int32)
+    rows = np.array(descriptors, np.float32)
+    rows /= np.linalg.norm(rows, axis=1, keepdims=True)
+    ones = np.ones(len(blocks), np.int32)
+    owner = np.arange(len(blocks), dtype=np.int32)
+    table = InstanceTable(rows, owner, count, ones, ones, ones.astype(np.float32), count.astype(np.float32))
+    return make_cloud(xyz - np.array(origin), ids, 1.0, 2.0, origin, table, words=())
+
+
+def write_gaussians(path: Path, cloud, opacity=0.99) -> None:
+    n = len(cloud)
+    rotation = np.tile(np.array([1, 0, 0, 0], np.float32), (n, 1))
+    points = Points(
+        cloud.xyz, cloud.origin, rgb=np.full((n, 3), 9, np.uint8), scale=np.full((n, 3), SMALL, np.float32),
+        rotation=rotation, opacity=np.full(n, opacity, np.float32),
+    )  # fmt: skip
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_gaussian_ply(path, points)
+
+
+@pytest.fixture
+def data(tmp_path):
+    """Two scenes. figurines: two instances, a cup and a fork (a little like a duck), seen from two places. teatime: one
+    instance, a cup, in map coordinates; its poses are of images twice as large as the labelled ones."""
+    write_poses(tmp_path / "d", "figurines", {"frame_00001": 0.0, "frame_00041": 1.0, "frame_00099": 3.0})
+    squares = [("cup", outline(0, 0, 4)), ("fork", outline(11, 5, 3)), ("duck", outline(10, 5, 1))]
+    write_labels(tmp_path / "d", "figurines", "frame_00001", squares)
+    write_labels(tmp_path / "d", "figurines", "frame_00041", squares[:1])
+    figurines = scene_of([block(0, 0, 4), block(10, 5, 3)], [[1, 0, 0], [0, 1, 0.5]])
+    write_gaussians(tmp_path / "g/figurines/point_cloud/iteration_7/point_cloud.ply", figurines)
+
+    write_poses(tmp_path / "d", "teatime", {"frame_00002": 0.0}, scale=2)
+    write_labels(tmp_path / "d", "teatime", "frame_00002", [("cup", outline(4, 2, 2))])
+    teatime = scene_of([block(4, 2, 4)], [[1, 0, 0]], origin=(0, 0, 3))
+    write_gaussians(tmp_path / "g/teatime.ply", teatime)
+
+    (tmp_path / "p").mkdir()
+    og.write_bundle(figurines, tmp_path / "p/figurines.ogpc")
+    og.write_bundle(teatime, tmp_path / "p/teatime.ogpc")
+    np.savez(tmp_path / "w.npz", names=np.array(WORDS), vectors=np.eye(3, 16)[:, :3], feature_space=np.array(SPACE))
+    return tmp_path
+
+
+def command(data, *more):
+    paths = ["--predictions", "p", "--gaussians", "g", "--text-features", "w.npz"]
+    return ["eval", "lerf", str(data / "d"), *[str(data / x) if not x.startswith("-") else x for x in paths], *more]
+
+
+def test_a_miniature_data_set_by_hand(data, capsys):
+    assert main(command(data, "--oracle", "--json", str(data / "s.json"))) == 0
+    out = capsys.readouterr().out
+    report = json.loads((data / "s.json").read_text())
+    pairs = {(p["frame"], p["object"]): p["iou"] for p in report["scenes"]["figurines"]}
+    # The cup is outlined as it is: 16 of 16. From 1 to the right it is seen 1 to the left, its first column outside the
+    # image: 12 pixels within the outline's 16.
+    assert pairs["frame_00001", "cup"] == {"best": 1, "calibrated": 1, "among": 1, "oracle": 1}
+    assert pairs["frame_00041", "cup"]["best"] == 12 / 16
+    # The fork is outlined 1 too far to the right: 6 pixels of 9 + 3.
+    assert pairs["frame_00001", "fork"]["best"] == 6 / 12
+    # The duck was missed; the text finds the fork, 9 pixels of which 1 is the duck's. Beside "fork" it finds nothing.
+    assert pairs["frame_00001", "duck"] == {"best": 1 / 9, "calibrated": 1 / 9, "among": 0, "oracle": 1 / 9}
+    # Half as large an outline within the cup: 4 of 16, which is not above 0.25.
+    (teatime,) = report["scenes"]["teatime"]
+    assert teatime["iou"]["best"] == 4 / 16
+    best, among = report["means"]["best"], report["means"]["among"]
+    assert best["miou"] == pytest.approx(((1 + 1 / 2 + 1 / 9 + 3 / 4) / 4 + 1 / 4) / 2)
+    assert best["accuracy"] == pytest.approx((3 / 4 + 0) / 2)
+    assert best["flat_miou"] == pytest.approx((1 + 1 / 2 + 1 / 9 + 3 / 4 + 1 / 4) / 5)
+    assert among["miou"] == pytest.approx(best["miou"] - (1 / 9) / 4 / 2)
+    assert "among: nothing selected for 1 of 5 pairs" in out
+    # Of 5 differences one is -1/9: the mean is -2.2 percent, and some draws never have it.
+    assert "among less best, mIoU of all pairs: -2.2 (-6.7 to +0.0)" in out
+
+
+def test_a_word_bank_lets_a_text_select_nothing(data):
+    """Bank words fill the space evenly; the duck's text fits the fork less than many of them do."""
+    scene = og.load(data / "p/figurines.ogpc")
+    bank = np.random.default_rng(0).normal(size=(200, 3)).astype(np.float32)
+    calibrated = og.LabelledScene.from_cloud(replace(scene.cloud, word_bank=WordBank(bank)))
+    labels = read_scene(data / "d", "figurines")
+    gaussians = gaussians_of(scene.cloud, data / "g/figurines/point_cloud/iteration_7/point_cloud.ply")
+    pairs = score_pairs(calibrated, labels, gaussians, data / "w.npz")
+    duck = next(pair for pair in pairs if pair.object == "duck")
+    assert (duck.iou["best"], duck.iou["calibrated"], duck.selected["calibrated"]) == (1 / 9, 0, 0)
+
+
+def test_transparent_gaussians_show_nothing(data):
+    """An alpha of 0.7 is asked for: at opacity 0.4, 0.59 with its neighbours, even the right instance has no pixel."""
+    scene = og.load(data / "p/figurines.ogpc")
+    write_gaussians(data / "soft.ply", scene.cloud, 0.4)
+    labels = read_scene(data / "d", "figurines")
+    pairs = score_pairs(scene, labels, gaussians_of(scene.cloud, data / "soft.ply"), data / "w.npz")
+    assert {pair.iou["best"] for pair in pairs} == {0.0}
+
+
+def test_points_of_a_plain_cloud_are_drawn_as_the_fit_drew_them(data):
+    cloud = og.load(data / "p/figurines.ogpc").cloud
+    with pytest.raises(SceneError, match="it was fitted from Gaussians, which its file does not hold"):
+        gaussians_of(cloud, None)
+    drawn = gaussians_of(replace(cloud, provenance={"notes": {"gaussian_scale": 0.5, "gaussian_opacity": 0.9}}), None)
+    np.testing.assert_allclose(drawn.scale, 0.5, rtol=1e-4)  # all points lie 1 apart
+    assert set(drawn.opacity) == {np.float32(0.9)}
+
+
+def test_another_method_is_compared_on_the_same_pairs(data, capsys):
+    (data / "q").mkdir()
+    figurines = og.load(data / "p/figurines.ogpc").cloud
+    swapped = replace(
+        figurines, instances=replace(figurines.instances, descriptors=figurines.instances.descriptors[::-1])
+    )
+    og.write_bundle(swapped, data / "q/figurines.ogpc")
+    assert main(command(data, "--scenes", "figurines", "--against", str(data / "q"))) == 0
+    # The swapped one finds the fork for the cup, and the cup for the others: 0 everywhere.
+    assert f"best: less {data / 'q'}, all pairs: +59.0" in capsys.readouterr().out  # (1 + 1/2 + 1/9 + 3/4) / 4
+
+
+@pytest.mark.parametrize(
+    ("remove", "text"),
+    [
+        ("d/label", "has no label/<scene>/frame_*.json"),
+        ("d/teatime/sparse/0/cameras.txt", "teatime has no poses; expected COLMAP's sparse/0"),
+        ("p/teatime.ogpc", "has no teatime.ogpc"),
+        ("g/teatime.ply", "has neither teatime.ply nor teatime/point_cloud"),
+    ],
+)
+def test_a_missing_file_is_one_error(remove, text, data, capsys):
+    gone = data / remove
+    gone.rename(data / "gone")
+    assert main(command(data)) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert text in captured.err
+    assert captured.err.count("\n") == 1
+
+
+def test_labels_that_fit_no_pose_are_refused(data, capsys):
+    write_labels(data / "d", "teatime", "frame_00003", [("cup", outline(0, 0, 4))])
+    assert main(command(data)) == 2
+    assert "is of frame 'frame_00003', of which" in capsys.readouterr().err
+    assert main(command(data, "--scenes", "ramen")) == 2
+    assert "has no labels of 'ramen'; it has figurines, teatime" in capsys.readouterr().err
+    camera = data / "d/figurines/sparse/0/cameras.txt"
+    camera.write_text(camera.read_text().replace("20 10", "20 20"))
+    assert main(command(data, "--scenes", "figurines")) == 2
+    assert "expected one shape, scaled" in capsys.readouterr().err
+
+
+def test_gaussians_of_another_cloud_are_refused(data):
+    cloud = og.load(data / "p/figurines.ogpc").cloud
+    with pytest.raises(SceneError, match="has 16 Gaussians, the scene 25 points"):
+        gaussians_of(cloud, data / "g/teatime.ply")
+    write_gaussians(data / "moved.ply", replace(cloud, origin=np.array([0, 0.5, 0])))
+    with pytest.raises(SceneError, match=r"lie up to 0\.5 from the scene's points"):
+        gaussians_of(cloud, data / "moved.ply")
