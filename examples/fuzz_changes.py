@@ -14,6 +14,7 @@ import struct
 import zipfile
 import zlib
 from collections.abc import Callable
+from copy import deepcopy
 from functools import lru_cache
 from pathlib import PurePath
 from random import Random
@@ -160,7 +161,7 @@ def change_json(random: Random, data: bytes) -> bytes:
     elif random.random() < 0.1:
         holder[key] = [[holder[key]]]
     else:
-        holder[key] = random.choice(VALUES)
+        holder[key] = deepcopy(random.choice(VALUES))  # a later change may reach into it
     return json.dumps(content).encode()
 
 

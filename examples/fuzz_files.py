@@ -20,15 +20,17 @@ from og_pointcloud.bundle import QUERY_OPERATORS, read_bundle, read_carried_enco
 from og_pointcloud.catalogue.inputs import labelled_cloud, unit_rows, write_two_balls
 from og_pointcloud.choosing import WordBank
 from og_pointcloud.errors import OgPointcloudError
-from og_pointcloud.formats import colmap
+from og_pointcloud.formats import colmap, record3d, replica, scannet, seven_scenes
 from og_pointcloud.formats.capture import read_capture
 from og_pointcloud.formats.gaussian_ply import gaussian_rows
 from og_pointcloud.formats.images import read_rgb
 from og_pointcloud.formats.langsplat import read_language_features
+from og_pointcloud.formats.las import write_las
 from og_pointcloud.formats.masks import MaskLayer, read_masks
 from og_pointcloud.formats.nerfstudio import read_transforms
 from og_pointcloud.formats.opengaussian import read_opengaussian
 from og_pointcloud.formats.points import read_points
+from og_pointcloud.formats.poses import PosedFrames
 from og_pointcloud.runtime import LabelledScene
 from og_pointcloud.scene import Points
 from og_pointcloud.text.encoder import TextEncoder, encoder_files
@@ -298,6 +300,16 @@ def _lzf(data: bytes) -> bytes:
     return bytes(out)
 
 
+def las_files(suffix: str) -> list[Files]:
+    """Labelled as the library writes it."""
+    ids, score = np.arange(12, dtype=np.int32) % 3 - 1, np.linspace(0, 1, 12, dtype=np.float32)
+    attributes = {"og_label": ids, "og_instance": ids, "og_score": score, "og_reason": np.zeros(12, np.uint8)}
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / f"cloud{suffix}"
+        write_las(path, _positions(), np.full((12, 3), 99, np.uint8), attributes, ("chair", "desk"))
+        return [{path.name: path.read_bytes()}]
+
+
 def _positions() -> NDArray[np.float64]:
     return np.random.default_rng(0).normal(size=(12, 3))
 
@@ -409,6 +421,39 @@ def _colmap_text(lenses: Lenses, pose: tuple[float, ...]) -> Files:
     return {stem: "\n".join(["# written by hand", *lines, ""]).encode() for stem, lines in parts.items()}
 
 
+def rgbd_folders() -> dict[str, Files]:
+    """Two frames as each RGB-D data set has them, by the data set's name."""
+    import cv2
+
+    def encoded(suffix: str, pixels: NDArray) -> bytes:
+        return cv2.imencode(suffix, pixels)[1].tobytes()
+
+    depth = np.linspace(500, 3000, SIZE[0] * SIZE[1]).reshape(SIZE[::-1])
+    image, millimetres = np.full((*SIZE[::-1], 3), 99, np.uint8), encoded(".png", depth.astype(np.uint16))
+    jpg, png = encoded(".jpg", image), encoded(".png", image)
+    pose = b"1 0 0 0.1\n0 1 0 0.2\n0 0 1 0.3\n0 0 0 1\n"
+    lens = b"40 0 24 0\n0 40 18 0\n0 0 1 0\n0 0 0 1\n"
+    camera = {"w": SIZE[0], "h": SIZE[1], "fx": 40.0, "fy": 40.0, "cx": 23.5, "cy": 17.5, "scale": 1000.0}
+    quaternions = [[0, 0, 0, 1, 0.1 * number, 0, 0] for number in range(2)]
+    record = {"w": SIZE[0], "h": SIZE[1], "K": [40, 0, 0, 0, 40, 0, 24, 18, 1], "poses": quaternions}
+    made: dict[str, Files] = {
+        "ScanNet": {f"intrinsic/intrinsic_{sensor}.txt": lens for sensor in ("color", "depth")},
+        "7-Scenes": {},
+        "Replica": {
+            "traj.txt": (pose.replace(b"\n", b" ") + b"\n") * 2,
+            "cam_params.json": json.dumps({"camera": camera}).encode(),
+        },
+        "Record3D": {"metadata.json": json.dumps(record).encode()},
+    }
+    for n in range(2):
+        made["ScanNet"] |= {f"color/{n}.jpg": jpg, f"depth/{n}.png": millimetres, f"pose/{n}.txt": pose}
+        frame = f"frame-{n:06}"
+        made["7-Scenes"] |= {f"{frame}.color.png": png, f"{frame}.depth.png": millimetres, f"{frame}.pose.txt": pose}
+        made["Replica"] |= {f"results/frame{n:06}.jpg": jpg, f"results/depth{n:06}.png": millimetres}
+        made["Record3D"] |= {f"rgb/{n}.jpg": jpg, f"depth/{n}.npy": npy_bytes(depth.astype(np.float32) / 1000)}
+    return made
+
+
 def opengaussian_results() -> list[Files]:
     """A .ply of 40 Gaussians and the four arrays of six leaves."""
     ply = gaussian_plys(40)[0]["cloud.ply"]
@@ -430,6 +475,14 @@ def _read_layers(layers: list[MaskLayer]) -> None:
         ids = layer.read()
         assert ids.ndim == 2
         assert ids.min(initial=-1) >= -1
+
+
+def _read_frames(frames: PosedFrames) -> None:
+    for image in frames.images:
+        if image.depth is not None:
+            depth = image.depth.read().depth
+            assert np.isfinite(depth).all()
+            assert depth.min() >= 0
 
 
 def _read_colmap(folder: Path) -> None:
@@ -461,6 +514,8 @@ def _readers() -> Iterator[Reader]:
     yield Reader("compressed 3DGS PLY", compressed_plys, _read_points)
     for encoding in ("ascii", "binary", "binary_compressed"):
         yield Reader(f"PCD, {encoding}", lambda encoding=encoding: pcds(encoding), _read_points)
+    for suffix in (".las", ".laz"):
+        yield Reader(suffix[1:].upper(), lambda suffix=suffix: las_files(suffix), _read_points)
     for suffix in ("bin", "txt"):
         yield Reader(f"COLMAP, .{suffix}", lambda suffix=suffix: colmap_models(suffix), _read_colmap)
     yield Reader("transforms.json", transforms, lambda at: read_transforms(at / "transforms.json", lambda _: SIZE))
@@ -469,6 +524,13 @@ def _readers() -> Iterator[Reader]:
         "LangSplat", language_features, lambda at: _read_layers(read_language_features(at, ("a", "b"), "large")[0])
     )
     yield Reader("image", images, lambda at: read_rgb(_only(at), SIZE))
+    for name, read in (
+        ("ScanNet", scannet.read_scannet),
+        ("7-Scenes", seven_scenes.read_seven_scenes),
+        ("Replica", replica.read_replica),
+        ("Record3D", record3d.read_record3d),
+    ):
+        yield Reader(name, lambda name=name: [rgbd_folders()[name]], lambda at, read=read: _read_frames(read(at)))
     yield Reader("OpenGaussian result", opengaussian_results, read_opengaussian)
     yield Reader("capture", captures, _read_capture)
 

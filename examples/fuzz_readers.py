@@ -102,7 +102,9 @@ def _outcome(reader: Reader, folder: Path) -> tuple[str, str]:
         if len(says) > LONGEST_MESSAGE or not says.isprintable():
             return "unexpected", f"a message of {len(says)} characters: {says[:120]!r}"
         return "refused", says
-    except Exception as error:
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:  # a panic of compiled code is no Exception
         frames = [frame for frame in traceback.extract_tb(error.__traceback__) if "og_pointcloud" in frame.filename]
         where = f"{Path(frames[-1].filename).name}:{frames[-1].lineno}" if frames else "fuzz_files.py"
         return "unexpected", f"{type(error).__name__} at {where}: {str(error).replace(str(folder), '')[:160]!r}"

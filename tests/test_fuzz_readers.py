@@ -13,7 +13,7 @@ import fuzz_readers
 import numpy as np
 import pytest
 from fuzz_changes import BY_SUFFIX, changed, mended, packed, unpacked
-from fuzz_files import READERS, Reader, bundle_members, encoders, language_features, transforms
+from fuzz_files import READERS, Reader, bundle_members, encoders, language_features, las_files, transforms
 from fuzz_readers import make_input, try_input
 from hypothesis import given, settings
 from hypothesis import strategies as some
@@ -26,11 +26,13 @@ from og_pointcloud.formats.langsplat import read_language_features
 from og_pointcloud.formats.nerfstudio import read_transforms
 from og_pointcloud.formats.pcd import read_pcd
 from og_pointcloud.formats.ply import read_ply
+from og_pointcloud.formats.points import read_points
 from og_pointcloud.scene import Camera
 from og_pointcloud.text.encoder import TextEncoder, check_templates, encoder_files
 
 INPUTS = {"scene file": 60, "scene file, its members": 60, "scene file, asked": 30, "graph": 60, "text encoder": 60}
 INPUTS |= {"LangSplat": 80, "OpenGaussian result": 40, "masks": 60, "capture": 40}
+INPUTS |= dict.fromkeys(("ScanNet", "7-Scenes", "Replica", "Record3D"), 60)
 """Of the readers that take milliseconds; 120 of each of the others."""
 
 
@@ -41,6 +43,8 @@ def seeds_of(name):
 
 @pytest.mark.parametrize("name", READERS)
 def test_every_input_is_read_or_refused(name, tmp_path):
+    if name in ("LAS", "LAZ"):
+        pytest.importorskip("lazrs")
     reader = READERS[name]
     seeds = seeds_of(name)
     outcomes = {"read": 0, "refused": 0}
@@ -53,6 +57,8 @@ def test_every_input_is_read_or_refused(name, tmp_path):
 
 @pytest.mark.parametrize("name", READERS)
 def test_the_files_that_are_changed_are_valid(name, tmp_path):
+    if name in ("LAS", "LAZ"):
+        pytest.importorskip("lazrs")
     reader = READERS[name]
     for files in seeds_of(name):
         whole = {"scene.ogpc": packed(files)} if reader.whole else files
@@ -278,3 +284,69 @@ def test_pcd_headers(tmp_path_factory, fields, width, height, encoding, data):
     assert len(refused) < 400 + len(str(path))
     assert rows is None or len(rows) == width * height
     assert rows is None or rows.nbytes <= (88 * len(data) if encoding == "binary_compressed" else 8 * len(data))
+
+
+# LAS
+
+
+def las_header(data, **numbers):
+    """The file with other numbers in its header, by name: records, points, table_chunks, layer, chunk_points."""
+    edit = bytearray(data)
+    first = struct.unpack_from("<I", edit, 96)[0]
+    laszip = edit.find(struct.pack("<16sH", b"laszip encoded", 22204)) + 52
+    table = struct.unpack_from("<q", edit, first)[0] if laszip > 52 else 0
+    places = {"records": (100, "<I"), "points": (247, "<Q"), "late_records": (243, "<I")}
+    places["chunk_points"] = (laszip + 12, "<I")
+    places |= {"table": (first, "<q"), "table_chunks": (table + 4, "<I"), "layer": (first + 8 + 49 + 4, "<I")}
+    for name, number in numbers.items():
+        struct.pack_into(places[name][1], edit, places[name][0], number)
+    return bytes(edit)
+
+
+@pytest.mark.parametrize(
+    ("suffix", "numbers", "says"),
+    [
+        (".las", {"records": 2**32 - 1}, "4294967295 records before the points"),
+        (".las", {"late_records": 2**32 - 1}, "4294967295 late records"),
+        (".las", {"points": 10**12}, "1000000000000 points of 49 bytes"),
+        (".las", {"points": 13}, "13 points of 49 bytes"),
+        (".laz", {"points": 13}, "cannot be read as LAS|expected 13 points"),
+        (".laz", {"table": 10**12}, "a chunk table at byte 1000000000000"),
+        (".laz", {"table_chunks": 2**32 - 1}, "a table of 4294967295 chunks"),
+        (".laz", {"layer": 2**32 - 1}, "layers of chunk 0 beyond the chunk table"),
+    ],
+)
+def test_las_headers_that_count_too_much(tmp_path, suffix, numbers, says):
+    pytest.importorskip("lazrs")
+    (data,) = las_files(suffix)[0].values()
+    path = tmp_path / f"cloud{suffix}"
+    path.write_bytes(las_header(data))
+    assert len(read_points(path)) == 12
+    path.write_bytes(las_header(data, **numbers))
+    with pytest.raises(SceneError, match=says):
+        read_points(path)
+
+
+def test_chunks_of_two_billion_points_make_no_room_for_them(tmp_path):
+    pytest.importorskip("lazrs")
+    (data,) = las_files(".laz")[0].values()
+    (tmp_path / "cloud.laz").write_bytes(las_header(data, chunk_points=2**31 - 1))  # once ended the process
+    assert len(read_points(tmp_path / "cloud.laz")) == 12
+
+
+@pytest.mark.parametrize("version", ["1.2", "1.4"])
+@pytest.mark.parametrize("point_format", [0, 3, 6, 7, 8])
+@pytest.mark.parametrize("suffix", [".las", ".laz"])
+def test_las_of_any_kind_counts_right(tmp_path, version, point_format, suffix):
+    laspy = pytest.importorskip("laspy")
+    pytest.importorskip("lazrs")
+    if version == "1.2" and point_format > 3:
+        pytest.skip("1.2 ends at point format 3")
+    for points in (1, 50_001):  # of which a chunk holds 50,000
+        header = laspy.LasHeader(point_format=point_format, version=version)
+        header.scales = [0.001] * 3
+        header.add_extra_dims([laspy.ExtraBytesParams("extra", "u2")])
+        las = laspy.LasData(header)
+        las.xyz = np.random.default_rng(0).random((points, 3))
+        las.write(tmp_path / f"cloud{suffix}")
+        assert len(read_points(tmp_path / f"cloud{suffix}")) == points

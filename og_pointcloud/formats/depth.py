@@ -149,10 +149,11 @@ def _stored(file: Path) -> NDArray:
 def _mapped(file: Path) -> NDArray:
     """A .npy file's array; numpy checks the claimed size against the file's."""
     try:
-        values = np.load(file, mmap_mode="r", allow_pickle=False)
-    except (ValueError, OSError, EOFError, tokenize.TokenError) as error:
+        with np.errstate(over="ignore"):  # of sizes, which mmap refuses
+            values = np.load(file, mmap_mode="r", allow_pickle=False)
+    except (ValueError, OSError, EOFError, tokenize.TokenError, TypeError, OverflowError, MemoryError) as error:
         raise SceneError(
-            f"{file} cannot be read as a .npy array ({error}): it is damaged or truncated, write it again"
+            f"{file} cannot be read as a .npy array ({error!s:.120}): it is damaged or truncated, write it again"
         ) from None
     if values.size > MAX_PIXELS:
         raise SceneError(f"{file} holds {values.size} numbers; expected a depth image of at most {MAX_PIXELS} pixels")

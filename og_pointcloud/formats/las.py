@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from og_pointcloud._atomic import replacing
 from og_pointcloud.clouds import require_finite
 from og_pointcloud.errors import MissingExtraError, SceneError
+from og_pointcloud.formats.las_counts import check_las_counts
 from og_pointcloud.formats.tables import naming
 from og_pointcloud.scene import Points
 
@@ -132,18 +133,20 @@ def _read(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8] | None]:
     xyz: list[NDArray[np.float64]] = []
     rgb: list[NDArray[np.uint16]] = []
     with naming(path):
+        check_las_counts(path)
         try:
-            with laspy.open(path) as reader:
+            # Of the two backends this one makes no room for points that a chunk only claims to have.
+            with laspy.open(path, laz_backend=laspy.LazBackend.Lazrs) as reader:
                 promised = reader.header.point_count
                 has_colors = "red" in reader.header.point_format.dimension_names
                 for chunk in reader.chunk_iterator(POINTS_PER_CHUNK):
                     xyz.append(np.column_stack([chunk.x, chunk.y, chunk.z]))
                     if has_colors:
                         rgb.append(np.column_stack([chunk.red, chunk.green, chunk.blue]))
-        except OSError:
+        except (OSError, KeyboardInterrupt, SystemExit):
             raise
-        except Exception as error:  # laspy raises types of its own, lazrs others
-            raise SceneError(f"cannot be read as LAS ({error}): copy or write it again") from error
+        except BaseException as error:  # laspy raises types of its own; a panic of lazrs is no Exception
+            raise SceneError(f"cannot be read as LAS ({error!s:.120}): copy or write it again") from error
         count = sum(map(len, xyz))
         if count != promised or not count:
             raise SceneError(

@@ -94,7 +94,7 @@ def read_numbers(file: Path, columns: int) -> NDArray[np.float64]:
     except (ValueError, OSError) as error:
         if isinstance(error, SceneError):
             raise
-        raise SceneError(f"{file} cannot be read as rows of numbers ({error}): export it again") from None
+        raise SceneError(f"{file} cannot be read as rows of numbers ({error!s:.80}): export it again") from None
     if numbers.ndim != 2 or numbers.shape[1] != columns:
         raise SceneError(f"{file} has numbers of shape {numbers.shape}; expected rows of {columns}")
     return numbers

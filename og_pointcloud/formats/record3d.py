@@ -48,7 +48,9 @@ def read_record3d(folder: Path) -> PosedFrames:
             continue
         fx, fy, cx, cy = intrinsics[min(index, len(intrinsics) - 1)].tolist()
         with naming(f"{file}, pose {index}"):
-            camera = Camera(*size, fx, fy, cx, cy, _world_to_camera(pose))
+            with np.errstate(over="ignore", invalid="ignore"):  # the camera refuses what comes of it
+                world_to_camera = _world_to_camera(pose)
+            camera = Camera(*size, fx, fy, cx, cy, world_to_camera)
         depth_file = find_depth(folder, image.stem)
         posed.append(PosedImage(path, camera, depth=DepthFile(depth_file, camera) if depth_file else None))
     return PosedFrames(tuple(posed), tuple(dropped))
@@ -66,7 +68,7 @@ def _metadata(file: Path) -> tuple[tuple[int, int], NDArray[np.float64], NDArray
         intrinsics = np.array(per_frame or shared, np.float64)
     except (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError) as error:
         raise SceneError(
-            f"{file} is not Record3D's metadata with w, h, K and poses ({error}): export it again"
+            f"{file} is not Record3D's metadata with w, h, K and poses ({error!s:.80}): export it again"
         ) from None
     if poses.ndim != 2 or poses.shape[1] != 7 or intrinsics.ndim != 2 or intrinsics.shape[1] < 4:
         raise SceneError(

@@ -63,7 +63,7 @@ def _parameters(folder: Path) -> list[float]:
         content: Any = json.loads(file.read_text(encoding="utf-8"))
         values = [float(content["camera"][key]) for key in KEYS]
     except (ValueError, TypeError, KeyError, RecursionError) as error:
-        raise SceneError(f'{file} is not {{"camera": {{{", ".join(KEYS)}}}}} ({error}): copy it again') from None
+        raise SceneError(f'{file} is not {{"camera": {{{", ".join(KEYS)}}}}} ({error!s:.80}): copy it again') from None
     if not np.isfinite(values).all() or min(values[0], values[1], values[-1]) <= 0 or max(values[:2]) > 1 << 16:
         raise SceneError(f"{file}: {', '.join(KEYS)} are {values}; expected positive sizes and scale")
     return values
