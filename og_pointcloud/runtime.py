@@ -32,7 +32,17 @@ if TYPE_CHECKING:
 
     from og_pointcloud.instances import Instances
 
-__all__ = ["SCENE_VARIABLE", "LabelledScene", "SceneLike", "Segmenter", "as_scene", "load", "segment", "use"]
+__all__ = [
+    "SCENE_VARIABLE",
+    "LabelledScene",
+    "SceneLike",
+    "Segmenter",
+    "as_scene",
+    "find_scene",
+    "load",
+    "segment",
+    "use",
+]
 
 SceneLike: TypeAlias = "LabelledScene | LabelledCloud | str | os.PathLike[str]"
 
@@ -272,7 +282,7 @@ def segment(
     BundleError (no scene), FeatureSpaceError (vectors of another space or width).
     """
     pcd = as_scene(pcd) if _is_scene(pcd) else pcd
-    scene = _find_scene(pcd, scene)
+    scene = find_scene(pcd, scene)
     words, answers = _answers(scene, labels, text_features, templates, negatives)
     if pcd is scene and pose is None:
         points, instances = scene.xyz, scene.instance_ids
@@ -336,7 +346,9 @@ def _is_scene(pcd: Any) -> bool:
     return is_file or isinstance(pcd, (LabelledScene, LabelledCloud))
 
 
-def _find_scene(pcd: Any, scene: SceneLike | None) -> LabelledScene:
+def find_scene(pcd: Any, scene: SceneLike | None) -> LabelledScene:
+    """The scene that answers for a cloud: the one given, else that the cloud is or carries, else that of ``use``, else
+    that of the environment; OgPointcloudError names these ways."""
     if scene is not None:
         return as_scene(scene)
     if isinstance(pcd, LabelledScene):

@@ -45,7 +45,10 @@ from og_pointcloud.scene import Camera, Points, Scene, View
 if TYPE_CHECKING:
     from og_pointcloud.fitting.fusion import FusedCloud
 
-__all__ = ["depth_files", "fuse_capture", "read_capture", "read_depth"]
+__all__ = [
+    "CapturePoses", "depth_files", "find_images", "fuse_capture", "read_capture", "read_depth", "read_geometry",
+    "read_poses",
+]  # fmt: skip
 
 CLOUD_NAMES = ("points.ply", "point_cloud.ply")
 LAYOUTS = (
@@ -61,7 +64,7 @@ SAME_POSE = 1e-3
 
 
 @dataclass(frozen=True)
-class _Poses:
+class CapturePoses:
     """names: the views', an image each. source: the pose file or folder. applied_transform: from COLMAP's world to the
     poses' (see nerfstudio.py). is_recording: every frame of a video has a pose, and some of them masks."""
 
@@ -86,11 +89,11 @@ def read_capture(folder: str | Path, gaussians: str | Path | None = None, mask_l
     capture = Path(folder)
     if not capture.is_dir():
         raise SceneError(f"{capture} is not a folder; expected a capture folder with poses, masks and points")
-    poses = _read_poses(capture)
+    poses = read_poses(capture)
     shown = _with_masks(capture, poses) if poses.is_recording else poses
     layers, feature_space = _read_masks(capture, shown.names, mask_level)
-    points = _read_geometry(capture, poses, gaussians)
-    files = _find_images(capture, shown.images)
+    points = read_geometry(capture, poses, gaussians)
+    files = find_images(capture, shown.images)
     views = tuple(
         _view(name, image, layer, file, points.origin)
         for name, image, layer, file in zip(shown.names, shown.images, layers, files, strict=True)
@@ -98,24 +101,25 @@ def read_capture(folder: str | Path, gaussians: str | Path | None = None, mask_l
     return Scene(points, views, feature_space, name=capture.resolve().name)
 
 
-def _read_poses(capture: Path) -> _Poses:
+def read_poses(capture: Path) -> CapturePoses:
+    """Every posed image of a capture folder; SceneError where there are no poses."""
     file = next((capture / name for name in TRANSFORMS_NAMES if (capture / name).is_file()), None)
     if file is not None:
         transforms = read_transforms(file, partial(_size_of_image, capture))
         _warn_of_dropped(file, transforms.dropped)
         names = _view_names(transforms.images)
-        return _Poses(names, transforms.images, file, transforms.ply_file_path, transforms.applied_transform)
+        return CapturePoses(names, transforms.images, file, transforms.ply_file_path, transforms.applied_transform)
     model = colmap.find_model(capture)
     if model is not None:
         images = colmap.read_images(model)
-        return _Poses(_view_names(images), images, model)
+        return CapturePoses(_view_names(images), images, model)
     for holds, read in LAYOUTS:
         if holds(capture):
             frames: PosedFrames = read(capture)
             if not frames.images:
                 raise SceneError(f"{capture}: none of its {len(frames.dropped)} frames has a finite pose")
             _warn_of_dropped(capture, frames.dropped)
-            return _Poses(_view_names(frames.images), frames.images, capture, is_recording=True)
+            return CapturePoses(_view_names(frames.images), frames.images, capture, is_recording=True)
     raise SceneError(
         f"{capture} has no pose file; expected transforms.json (nerfstudio, instant-ngp, Blender), a COLMAP model in "
         "sparse/0 (cameras and images, .bin or .txt), or the layout of ScanNet (color/, pose/, intrinsic/), 7-Scenes "
@@ -154,7 +158,7 @@ def _view_names(images: Sequence[PosedImage]) -> tuple[str, ...]:
     return tuple(names)
 
 
-def _with_masks(capture: Path, poses: _Poses) -> _Poses:
+def _with_masks(capture: Path, poses: CapturePoses) -> CapturePoses:
     """Of a recording's frames, those with masks; all of them if none has (the error is another's to raise)."""
     files = ((f"{MASKS_FOLDER}/{name}.png", f"{LANGUAGE_FEATURES_FOLDER}/{name}_s.npy") for name in poses.names)
     has_mask = [any((capture / file).is_file() for file in pair) for pair in files]
@@ -181,7 +185,8 @@ def _read_masks(capture: Path, names: Sequence[str], level: str) -> tuple[list[M
     )
 
 
-def _read_geometry(capture: Path, poses: _Poses, gaussians: str | Path | None) -> Points:
+def read_geometry(capture: Path, poses: CapturePoses, gaussians: str | Path | None = None) -> Points:
+    """The points of a capture folder, or of the file given; fused from depth images where there is nothing else."""
     if gaussians is not None:
         return read_points(Path(gaussians))
     if poses.ply_file_path is not None:
@@ -233,7 +238,7 @@ def _find_cloud(capture: Path) -> Path | None:
 def depth_files(folder: str | Path) -> dict[str, DepthFile]:
     """The depth images of a capture by view name; views without one are absent. Cameras are in world coordinates."""
     capture = Path(folder)
-    return _depth_files(capture, _read_poses(capture))
+    return _depth_files(capture, read_poses(capture))
 
 
 def read_depth(folder: str | Path, name: str) -> NDArray[np.float32] | None:
@@ -242,7 +247,7 @@ def read_depth(folder: str | Path, name: str) -> NDArray[np.float32] | None:
     Lengths of the world along the optical axis. For many views, take ``depth_files`` once: this reads the poses anew.
     """
     capture = Path(folder)
-    poses = _read_poses(capture)
+    poses = read_poses(capture)
     file = _depth_files(capture, poses).get(name)
     camera = next((image.camera for other, image in zip(poses.names, poses.images, strict=True) if other == name), None)
     return None if file is None or camera is None else file.read().seen_by(camera)
@@ -254,7 +259,7 @@ def fuse_capture(folder: str | Path, depth_unit: float | None = None) -> FusedCl
     depth_unit: world lengths of a stored step, where the files do not say. Raises SceneError where there are none.
     """
     capture = Path(folder)
-    frames = _depth_frames(capture, _read_poses(capture))
+    frames = _depth_frames(capture, read_poses(capture))
     if not frames:
         raise SceneError(f"{capture} has no depth images; expected depth/<image stem>.png, or depth_file_path in poses")
     if depth_unit is not None:
@@ -262,7 +267,7 @@ def fuse_capture(folder: str | Path, depth_unit: float | None = None) -> FusedCl
     return _fused(capture, frames)
 
 
-def _depth_files(capture: Path, poses: _Poses) -> dict[str, DepthFile]:
+def _depth_files(capture: Path, poses: CapturePoses) -> dict[str, DepthFile]:
     files = {}
     for name, image in zip(poses.names, poses.images, strict=True):
         if image.depth is not None:
@@ -272,7 +277,7 @@ def _depth_files(capture: Path, poses: _Poses) -> dict[str, DepthFile]:
     return files
 
 
-def _depth_frames(capture: Path, poses: _Poses) -> list[DepthFrame]:
+def _depth_frames(capture: Path, poses: CapturePoses) -> list[DepthFrame]:
     """What is fused: of a long recording so many frames, evenly, as show every surface often enough."""
     files = _depth_files(capture, poses)
     images = dict(zip(poses.names, poses.images, strict=True))
@@ -308,7 +313,7 @@ def _colors_at(file: Path, image: PosedImage, camera: Camera) -> NDArray[np.uint
     return resampled(_image(file, own, image.distortion), own, camera)
 
 
-def _in_world_of(poses: _Poses, model: Path, xyz: NDArray[np.float64]) -> NDArray[np.float64]:
+def _in_world_of(poses: CapturePoses, model: Path, xyz: NDArray[np.float64]) -> NDArray[np.float64]:
     """COLMAP's points in the world of the poses.
 
     Poses of a transforms.json were often rotated, shifted or scaled after COLMAP, and only nerfstudio writes down how.
@@ -338,7 +343,8 @@ def _stem(path: str) -> str:
     return posixpath.basename(without_suffix(path))
 
 
-def _find_images(capture: Path, images: Sequence[PosedImage]) -> list[Path | None]:
+def find_images(capture: Path, images: Sequence[PosedImage]) -> list[Path | None]:
+    """Where the posed images are, None for one that is not found; warns of those."""
     files = [find_image(capture, image.path) for image in images]
     missing = [image.path for image, file in zip(images, files, strict=True) if file is None]
     if missing:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from og_pointcloud.errors import SceneError
 from og_pointcloud.fitting.coverage import needed_views
-from og_pointcloud.formats import capture as captures
+from og_pointcloud.formats.capture import find_images, read_geometry, read_poses
 from og_pointcloud.formats.distortion import Distortion
 from og_pointcloud.formats.images import image_size, read_rgb, same_shape
 from og_pointcloud.formats.poses import in_local_frame
@@ -44,8 +44,8 @@ def read_photographs(capture: Path) -> tuple[Photograph, ...]:
     """All posed images of a capture, checked by their headers. SceneError where one is missing or cannot be used."""
     if not capture.is_dir():
         raise SceneError(f"{capture} is not a folder; expected a capture folder with images and poses")
-    poses = captures._read_poses(capture)
-    files = captures._find_images(capture, poses.images)
+    poses = read_poses(capture)
+    files = find_images(capture, poses.images)
     missing = [image.path for image, file in zip(poses.images, files, strict=True) if file is None]
     if missing:
         raise SceneError(
@@ -74,7 +74,7 @@ def _check_size(photograph: Photograph) -> None:
 
 def read_cloud(capture: Path) -> Points:
     """The capture's points."""
-    return captures._read_geometry(capture, captures._read_poses(capture), None)
+    return read_geometry(capture, read_poses(capture))
 
 
 def choose_by_coverage(capture: Path, photographs: Sequence[Photograph], enough: int) -> list[int]:

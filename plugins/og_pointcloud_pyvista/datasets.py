@@ -179,7 +179,7 @@ class OgDataSet:
 
 def scene_of(mesh: Any, scene: SceneLike | None = None) -> LabelledScene:
     """The scene to ask about a dataset; OgPointcloudError says which ways there are to name one."""
-    return runtime._find_scene(mesh, scene)
+    return runtime.find_scene(mesh, scene)
 
 
 def label_names(mesh: pv.DataSet) -> tuple[str, ...]:
