@@ -1,11 +1,12 @@
 # `make demo` and `make test` do their whole set-up in .venv; a second run starts at once.
-.PHONY: help setup demo test lint clean
+.PHONY: help setup demo test lint bench bench-baseline clean
 .DEFAULT_GOAL := help
 
 help:
 	@echo "make demo    build a furnished room, label it and show it: pictures and scores in out/demo"
 	@echo "make test    run the tests"
 	@echo "make lint    ruff and pyright"
+	@echo "make bench   time and error of the main pieces of work, beside the stored run"
 	@echo "make setup   only make .venv, with the libraries that Open3D and PyVista need"
 	@echo "make clean   remove .venv, out and the caches"
 
@@ -22,6 +23,12 @@ lint: setup
 	@.venv/bin/ruff check
 	@.venv/bin/ruff format --check
 	@.venv/bin/pyright --pythonpath .venv/bin/python
+
+bench: setup
+	@.venv/bin/python examples/bench.py
+
+bench-baseline: setup
+	@.venv/bin/python examples/bench.py --save
 
 clean:
 	rm -rf .venv out .pytest_cache .ruff_cache
