@@ -17,6 +17,7 @@ from og_pointcloud.cloud import BACKGROUND
 from og_pointcloud.formats.ply import write_ply
 from og_pointcloud.scoring.plots import plot_risk_coverage
 from og_pointcloud.scoring.scannet import NAMES as NYU40
+from og_pointcloud.scoring.scannet import scored_answers
 from og_pointcloud.scoring.spread import risk_coverage
 
 WALL, FLOOR, CHAIR = 1, 2, 5
@@ -172,6 +173,15 @@ def test_scenes_are_asked_for_the_names_of_the_table(scannet, capsys):
     assert report["risk_area"] == pytest.approx(1 / 8 + 1 / 32, abs=1e-6)
     assert "risk area" in out
     assert (scannet / "r.png").read_bytes().startswith(PNG)
+
+
+def test_answers_are_those_of_the_points_that_count():
+    """Point 1 is transparent, point 2 of no class of the ten (a picture), point 4 of none at all."""
+    truth, predicted = np.array([WALL, WALL, 11, CHAIR, 40, CHAIR]), np.array([WALL, WALL, 11, FLOOR, WALL, 0])
+    opacity = np.array([1, 0.05, 1, 1, 1, 1])
+    correct, confidence = scored_answers(predicted, np.linspace(0, 1, 6), truth, 10, opacity)
+    assert correct.tolist() == [True, False, False]
+    assert confidence.tolist() == [0, pytest.approx(0.6), -np.inf]
 
 
 def test_two_methods_are_compared_over_scenes(scannet, capsys):

@@ -52,6 +52,9 @@ def test_instances_of_the_truth_are_read_and_checked(tmp_path):
     np.savez(tmp_path / "gt.npz", **entries, instance=np.array([0.5, 1]))
     with pytest.raises(SceneError, match="instance is float64"):
         read_truth(tmp_path)
+    np.savez(tmp_path / "gt.npz", **entries, instance=np.array([1, 2, 3]))
+    with pytest.raises(SceneError, match=r"instance has shape \(3,\)"):
+        read_truth(tmp_path)
 
 
 # Intervals ------------------------------------------------------------------------------------------------------
@@ -148,10 +151,11 @@ def test_draws_in_parts_are_draws(monkeypatch):
 @pytest.fixture
 def answer():
     """Two cups and a pot of 120 points each, and 40 of background. Instance 0 is the first cup, 100 of its points and
-    20 of background; 1 is both the second cup and the pot, called a pot; the rest is unknown."""
-    instances = np.repeat([0, -1, 1, 1, 0, -2], [100, 20, 120, 120, 20, 20])
-    called = np.array([0, 1, -1])[np.maximum(instances, -1)]
-    confidence = np.array([0.9, 0.6, 0.0], np.float32)[np.maximum(instances, -1)]
+    20 of background; 1 is both the second cup and the pot, called a pot with a cosine below 0; 2 is the other 20 points
+    of the first cup, and no word fits it; the rest is unknown."""
+    instances = np.repeat([0, 2, 1, 1, 0, -2], [100, 20, 120, 120, 20, 20])
+    called = np.array([0, 1, -1, -1])[np.maximum(instances, -1)]
+    confidence = np.array([0.9, -0.1, 0.0, 0.0], np.float32)[np.maximum(instances, -1)]
     return Answer(called, confidence, instances, far_apart(400).astype(np.float32), 1.0)
 
 
@@ -180,9 +184,9 @@ def test_instances_by_hand(answer, truth):
     # Things of any kind: 0 is the first cup, 100 of its 120 points; background has no class and is no thing. 1 is two
     # things in one, IoU 120 / 240 with each: found at 0.25, where it serves one, not above 0.5.
     assert things.any_panoptic.segmentation == pytest.approx(100 / 120)  # background is void, taken out of 0
-    # One match, one predicted and two true ones without: 1 / (1 + 3 / 2).
-    assert things.any_panoptic.recognition == pytest.approx(1 / 2.5)
-    # Of the right class. Cups: one found, one not. Pots: found at no threshold from 0.5 on.
+    # One match, two predicted and two true ones without: 1 / (1 + 4 / 2).
+    assert things.any_panoptic.recognition == pytest.approx(1 / 3)
+    # Of the right class. Cups: one found, one not; what has no name is no cup. Pots: found at no threshold from 0.5 on.
     assert things.panoptic.recognition == pytest.approx((1 / 1.5 + 0) / 2)
     # Cups at 0.5: precision 1 up to recall 1/2, so 1/2; pots 0.
     assert things.of_class.ap50 == pytest.approx(1 / 4)
