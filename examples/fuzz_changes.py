@@ -168,7 +168,7 @@ def change_json(random: Random, data: bytes) -> bytes:
 def _places(content: Any) -> list[tuple[Any, Any]]:
     """(container, key) of every value; of long containers the first few."""
     found: list[tuple[Any, Any]] = []
-    waiting = [content]
+    waiting = [content] if isinstance(content, (dict, list)) else []
     while waiting:
         holder = waiting.pop()
         keys = list(holder)[:40] if isinstance(holder, dict) else range(min(len(holder), 40))
@@ -310,7 +310,7 @@ def _lying_directory(random: Random, data: bytes) -> bytes:
     at, size = random.choice(fields)
     at += random.choice(starts)
     held = int.from_bytes(data[at : at + size], "little")
-    number = random.choice((*NUMBERS, held + 1, held - 1, 8, 12)) % (1 << 8 * size)
+    number = random.choice((*NUMBERS, held + 1, held - 1, 8, 12, 14)) % (1 << 8 * size)
     return data[:at] + number.to_bytes(size, "little") + data[at + size :]
 
 

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import io
 import tokenize
+import zipfile
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["array_from_npy", "npy_bytes"]
+__all__ = ["array_from_npy", "array_from_zip", "npy_bytes"]
+
+LAST_CHARACTER = 0x10FFFF
 
 
 def array_from_npy(data: bytes) -> NDArray[Any]:
@@ -31,7 +34,18 @@ def array_from_npy(data: bytes) -> NDArray[Any]:
     if claimed == 0:
         return np.zeros(shape, dtype)
     flat = np.frombuffer(data, dtype, count, offset=stream.tell())
+    if dtype.kind == "U" and (flat.view(f"{dtype.byteorder}u4") > LAST_CHARACTER).any():
+        raise ValueError(f"it holds {dtype} text of characters that there are not")
     return flat.reshape(shape[::-1]).T if fortran_order else flat.reshape(shape)
+
+
+def array_from_zip(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> NDArray[Any]:
+    """A member of an .npz; ValueError also where it is packed as numpy packs none, or claims to end beyond the file."""
+    if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+        raise ValueError(f"a member is packed by method {info.compress_type}, which numpy does not use")
+    if info.header_offset + info.compress_size > archive.start_dir:
+        raise ValueError(f"a member claims {info.compress_size} bytes, more than the file has")
+    return array_from_npy(archive.read(info))
 
 
 def npy_bytes(array: NDArray[Any]) -> bytes:

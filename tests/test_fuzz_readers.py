@@ -21,7 +21,7 @@ from hypothesis import strategies as some
 from og_pointcloud._npy import array_from_npy, npy_bytes
 from og_pointcloud.bundle import read_bundle, read_carried_encoder
 from og_pointcloud.cli import main
-from og_pointcloud.errors import BundleError, OgPointcloudError, SceneError
+from og_pointcloud.errors import BundleError, FeatureSpaceError, OgPointcloudError, SceneError
 from og_pointcloud.formats.langsplat import read_language_features
 from og_pointcloud.formats.nerfstudio import read_transforms
 from og_pointcloud.formats.pcd import read_pcd
@@ -29,6 +29,7 @@ from og_pointcloud.formats.ply import read_ply
 from og_pointcloud.formats.points import read_points
 from og_pointcloud.scene import Camera
 from og_pointcloud.text.encoder import TextEncoder, check_templates, encoder_files
+from og_pointcloud.text.features import read_text_features
 
 INPUTS = {"scene file": 60, "scene file, its members": 60, "scene file, asked": 30, "graph": 60, "text encoder": 60}
 INPUTS |= {"LangSplat": 80, "OpenGaussian result": 40, "masks": 60, "capture": 40}
@@ -214,6 +215,31 @@ def test_long_names_do_not_make_long_messages(tmp_path):
         with pytest.raises(BundleError) as caught:
             read_bundle(tmp_path / "scene.ogpc")
         assert len(str(caught.value)) < 600 + len(str(tmp_path))
+
+
+def test_text_of_characters_that_there_are_not(tmp_path):
+    """A str made of them breaks the interpreter."""
+    data = npy_bytes(np.array(["chair"]))
+    for last, fine in ((b"\xff\xff\x10\0", True), (b"\0\0\x11\0", False), (b"\xff\xff\xff\xff", False)):
+        if fine:
+            assert array_from_npy(data[:-4] + last)[0] == "chai\U0010ffff"
+        else:
+            with pytest.raises(ValueError, match="characters that there are not"):
+                array_from_npy(data[:-4] + last)
+
+
+@pytest.mark.parametrize(
+    ("place", "number", "says"), [(10, 14, "packed by method 14"), (20, 2**30 - 999, "claims 1073740825 bytes")]
+)
+def test_members_of_an_npz_that_numpy_would_not_write(tmp_path, place, number, says):
+    data = bytearray(READERS["text features"].seeds()[0]["words.npz"])
+    directory = data.find(b"PK\x01\x02")
+    data[directory + place : directory + place + 2 + 2 * (place == 20)] = number.to_bytes(
+        2 + 2 * (place == 20), "little"
+    )
+    (tmp_path / "words.npz").write_bytes(data)
+    with pytest.raises(FeatureSpaceError, match=says):
+        read_text_features(tmp_path / "words.npz")
 
 
 def test_archives_are_packed_and_unpacked_alike():

@@ -113,7 +113,7 @@ def _mapped(file: Path) -> NDArray[Any]:
     try:
         with np.errstate(over="ignore"):  # of sizes, which mmap refuses
             return np.load(file, mmap_mode="r", allow_pickle=False)
-    except (ValueError, OSError, EOFError, tokenize.TokenError, TypeError, OverflowError, RecursionError) as error:
+    except (ValueError, OSError, EOFError, tokenize.TokenError, TypeError, OverflowError, MemoryError) as error:
         raise SceneError(
             f"{file} cannot be read as a .npy array ({error!s:.120}): it is damaged or truncated, write it again"
         ) from None

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud._npy import array_from_npy
+from og_pointcloud._npy import array_from_zip
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.images import decoded, png_header, require_cv2
 
@@ -114,11 +114,13 @@ def _read_features(file: Path, names: Sequence[str]) -> tuple[dict[str, NDArray[
             if missing:
                 raise SceneError(
                     f"{file} has no features for {len(missing)} of {len(names)} views, e.g. '{missing[0]}' (it has "
-                    f"{', '.join(repr(key) for key in list(entries)[:3])}, ...); expected an array (masks, D) under "
+                    f"{', '.join(map(repr, list(entries)[:3])):.120}, ...); expected an array (masks, D) under "
                     "each image's stem"
                 )
-            features = {name: _as_features(_entry(archive, entries[name]), f"{file}, '{name}'") for name in names}
-            space = str(_entry(archive, entries["feature_space"])) if "feature_space" in entries else UNKNOWN_SPACE
+            arrays = {name: array_from_zip(archive, entries[name]) for name in names}
+            features = {name: _as_features(array, f"{file}, '{name}'") for name, array in arrays.items()}
+            named = entries.get("feature_space")
+            space = str(array_from_zip(archive, named)) if named else UNKNOWN_SPACE
     except SceneError:
         raise
     except (zipfile.BadZipFile, zlib.error, ValueError, OSError, EOFError, RuntimeError) as error:
@@ -126,10 +128,6 @@ def _read_features(file: Path, names: Sequence[str]) -> tuple[dict[str, NDArray[
             f"{file} cannot be read as an .npz of plain arrays ({error!s:.120}): write it again with numpy.savez"
         ) from None
     return features, space
-
-
-def _entry(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> NDArray[Any]:
-    return array_from_npy(archive.read(info))
 
 
 def _as_features(values: NDArray[Any], source: str) -> NDArray[np.float32]:

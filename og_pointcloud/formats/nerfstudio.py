@@ -178,8 +178,8 @@ def _distortion(keys: dict[str, Any]) -> Distortion | None:
     other = next((key for key in keys if key.startswith(("ftheta", "latlong"))), None)  # lenses of instant-ngp
     if model not in PERSPECTIVE_MODELS + FISHEYE_MODELS or other:
         raise SceneError(
-            f"the camera model is {other or model}; expected one of {', '.join(PERSPECTIVE_MODELS + FISHEYE_MODELS)}: "
-            "undistort images and masks to a pinhole camera first"
+            f"the camera model is {other or model:.40}; expected one of "
+            f"{', '.join(PERSPECTIVE_MODELS + FISHEYE_MODELS)}: undistort images and masks to a pinhole camera first"
         )
     fisheye = model in FISHEYE_MODELS or bool(keys.get("is_fisheye"))
     terms = {key: _number(keys, key) or 0.0 for key in LENS_TERMS}

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud._npy import array_from_npy
+from og_pointcloud._npy import array_from_zip
 from og_pointcloud.cloud import InstanceTable, LabelledCloud
 from og_pointcloud.errors import MissingExtraError, SceneError
 from og_pointcloud.formats.gaussian_ply import latest_iteration, read_gaussian_ply
@@ -162,7 +162,7 @@ def _arrays(file: Path) -> dict[str, NDArray[Any]]:
             size = sum(entries[name].file_size for name in wanted)
             if size > MAX_UNPACKED_BYTES:
                 raise SceneError(f"its arrays unpack to {size} bytes; expected at most {MAX_UNPACKED_BYTES}")
-            return {name: array_from_npy(archive.read(entries[name])) for name in wanted}
+            return {name: array_from_zip(archive, entries[name]) for name in wanted}
     except SceneError:
         raise
     except (zipfile.BadZipFile, zlib.error, ValueError, EOFError, RuntimeError) as error:

@@ -79,7 +79,7 @@ def _parse_header(head: bytes) -> _Header:
         if keyword.startswith("#"):
             continue
         if keyword in entries:
-            raise SceneError(f"the PCD header has two lines {keyword!r}; expected one: the file is damaged")
+            raise SceneError(f"the PCD header has two lines {keyword!r:.40}; expected one: the file is damaged")
         entries[keyword] = values
     width, height = _whole_numbers(entries, "WIDTH", 1)[0], _whole_numbers(entries, "HEIGHT", 1)[0]
     points = _whole_numbers(entries, "POINTS", 1)[0] if "POINTS" in entries else width * height

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud._npy import array_from_npy
+from og_pointcloud._npy import array_from_zip
 from og_pointcloud.cloud import Vocabulary
 from og_pointcloud.errors import FeatureSpaceError
 
@@ -61,7 +61,7 @@ def _entries(path: Path) -> dict[str, NDArray[Any]]:
                 raise ValueError(f"it unpacks to {total} bytes, more than {MAX_UNPACKED_BYTES}")
             infos = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
             wanted = [name for name in infos if name in ("names", "vectors", "feature_space")]
-            return {name: array_from_npy(archive.read(infos[name])) for name in wanted}
+            return {name: array_from_zip(archive, infos[name]) for name in wanted}
     except (zipfile.BadZipFile, zlib.error, ValueError, EOFError, RuntimeError, OSError) as error:
         raise FeatureSpaceError(
             f"{path} cannot be read as an .npz of plain arrays ({error!s:.120}): write it again with numpy.savez"
