@@ -211,3 +211,22 @@ def test_labels_without_scores_have_no_curve(scannet, capsys):
     np.savez(scannet / "p/scene0062_00.npz", labels=np.array([0, 0, 1, 1]), names=names, scores=scores)
     assert main(command(scannet)) == 2
     assert "scores are float32 (4,); expected numbers" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("entries", "text"),
+    [
+        ({"labels": np.zeros(4, int)}, "lacks 'names'; expected labels and names"),
+        ({"labels": np.zeros(4), "names": np.array(["wall"])}, "labels are float64 (4,)"),
+        ({"labels": np.zeros(4, int), "names": np.array([1])}, "names int64 (1,)"),
+        ({"labels": np.zeros(4, int), "names": np.array(["a", None], object)}, "cannot be read as an .npz"),
+        ({"labels": np.full(4, 2**32), "names": np.array(["wall"])}, "label 4294967296 has no name"),
+    ],
+)
+def test_labels_that_cannot_be_scored_are_one_error(entries, text, scannet, capsys):
+    (scannet / "p/scene0062_00.ogpc").unlink()
+    np.savez(scannet / "p/scene0062_00.npz", **entries)
+    assert main(command(scannet)) == 2
+    captured = capsys.readouterr()
+    assert text in captured.err
+    assert captured.err.count("\n") == 1

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import os
-import zipfile
-import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,11 +12,11 @@ from numpy.typing import NDArray
 
 from og_pointcloud.errors import SceneError
 from og_pointcloud.metrics import Score, score_labels
+from og_pointcloud.scoring.arrays import read_arrays
 
 __all__ = ["GT_NAME", "Truth", "read_truth"]
 
 GT_NAME = "gt.npz"
-MAX_UNPACKED_BYTES = 1 << 30
 AGREED, VOTES = 0.5, 2
 """Of a class found by votes: the share that agreed on it, and how many there were, at least."""
 
@@ -67,7 +65,7 @@ def read_truth(folder: str | os.PathLike[str]) -> Truth:
             f"{path} is not a file; a score needs it: 'cls' (n,) a class per point, -1 none, and 'names'. Without one, "
             "take a made room: og-pointcloud demo"
         )
-    entries = _entries(path)
+    entries = read_arrays(path)
     missing = [name for name in ("cls", "names") if name not in entries]
     if missing:
         raise SceneError(
@@ -92,14 +90,3 @@ def read_truth(folder: str | os.PathLike[str]) -> Truth:
         scored &= (entries["ratio"] >= AGREED) & (entries["votes"] >= VOTES)
     background = entries["background"].astype(bool) if "background" in entries else None
     return Truth(cls, tuple(names.tolist()), scored, background, instance)
-
-
-def _entries(path: Path) -> dict[str, NDArray]:
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            size = sum(info.file_size for info in archive.zip.infolist())
-            if size > MAX_UNPACKED_BYTES:
-                raise ValueError(f"it unpacks to {size} bytes, more than {MAX_UNPACKED_BYTES}")
-            return {name: archive[name] for name in archive.files}
-    except (OSError, ValueError, EOFError, AttributeError, zipfile.BadZipFile, zlib.error) as error:
-        raise SceneError(f"{path} cannot be read as an .npz of plain arrays ({error}): write it again") from None

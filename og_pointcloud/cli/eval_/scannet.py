@@ -22,7 +22,6 @@ if TYPE_CHECKING:
 LABELS = "_vh_clean_2.labels.ply"
 NOT_OF_THE_TABLE = 40
 """NYU40's "other property", which no task asks for."""
-MAX_LABEL_BYTES = 1 << 31
 
 
 @dataclass(frozen=True)
@@ -234,30 +233,25 @@ def predicted(file: Path, xyz: NDArray[np.float64], task: int, text_features: Pa
     return Predicted(table[np.maximum(labels, -1)], confidence)
 
 
-def stored_labels(file: Path) -> tuple[NDArray[np.int32], NDArray[np.floating] | None, list[str]]:
+def stored_labels(file: Path) -> tuple[NDArray[np.integer], NDArray[np.floating] | None, list[str]]:
     """(n,) indices of names, below 0 unknown; (n,) scores, if there are any; the names. As ``segment -o`` writes."""
-    import zipfile
-
     import numpy as np
 
-    try:
-        with zipfile.ZipFile(file) as archive:
-            if (total := sum(entry.file_size for entry in archive.infolist())) > MAX_LABEL_BYTES:
-                raise OgPointcloudError(f"{file} unpacks to {total} bytes; expected at most {MAX_LABEL_BYTES}")
-        with np.load(file, allow_pickle=False) as arrays:
-            labels, names = arrays["labels"], [str(name) for name in arrays["names"]]
-            scores = arrays["scores"] if "scores" in arrays.files else None
-    except (zipfile.BadZipFile, KeyError, ValueError, OSError) as error:
-        if isinstance(error, OgPointcloudError):
-            raise
+    from og_pointcloud.scoring.arrays import read_arrays
+
+    arrays = read_arrays(file)
+    missing = [name for name in ("labels", "names") if name not in arrays]
+    if missing:
+        raise OgPointcloudError(f"{file} lacks '{missing[0]}'; expected labels and names: segment the scene again")
+    labels, names, scores = arrays["labels"], arrays["names"], arrays.get("scores")
+    if labels.ndim != 1 or labels.dtype.kind not in "iu" or names.ndim != 1 or names.dtype.kind != "U":
         raise OgPointcloudError(
-            f"{file} cannot be read as labels and names ({error}): segment the scene again"
-        ) from None
-    if labels.ndim != 1 or labels.dtype.kind not in "iu":
-        raise OgPointcloudError(f"{file}: labels are {labels.dtype} {labels.shape}; expected whole numbers (points,)")
+            f"{file}: labels are {labels.dtype} {labels.shape}, names {names.dtype} {names.shape}; expected whole "
+            "numbers (points,) and strings (names,)"
+        )
     if scores is not None and (scores.shape != labels.shape or scores.dtype.kind != "f" or np.isnan(scores).any()):
         raise OgPointcloudError(f"{file}: scores are {scores.dtype} {scores.shape}; expected numbers {labels.shape}")
-    return labels.astype(np.int32), scores, names
+    return labels.astype(np.int64), scores, names.tolist()
 
 
 def opacities(folder: Path | None, scene: str, count: int) -> NDArray[np.floating] | None:
