@@ -1,7 +1,11 @@
-"""The whole road on the procedural room: capture, fit, one file, words, a score beside its bounds, and pictures."""
+"""The whole road on the procedural room: capture, fit, one file, words, a score beside its bounds, and pictures.
+
+Twice: with the masks and features of a simulated proposer and encoder, and from the photographs alone.
+"""
 
 from __future__ import annotations
 
+import os
 import sys
 import time
 import warnings
@@ -24,6 +28,7 @@ from og_pointcloud.settings import FitSettings
 from og_pointcloud_room.baselines import ceiling, direct_uplift
 from og_pointcloud_room.capture import ABSENT_WORDS, CaptureSettings, RoomCapture, make_capture, write_capture
 from og_pointcloud_room.furniture import CLASS_NAMES
+from og_pointcloud_room.photographs import ABSENT, FromPhotographs, label_from_photographs
 from og_pointcloud_room.pictures import can_render, draw_instances, draw_labels, draw_views
 
 __all__ = ["DemoResult", "MethodScore", "run_demo"]
@@ -50,25 +55,30 @@ class MethodScore:
 class DemoResult:
     """What the demo wrote and measured.
 
-    methods: direct uplift, og_pointcloud, ceiling. share_of_the_way: of the distance in mIoU from the first to the
-    last, how much og_pointcloud covers (NaN where uplift is already at the ceiling). instance_agreement: adjusted Rand
-    index of its instances with the true ones, on labelled points. seconds: wall clock per stage of the demo.
+    methods: direct uplift, og_pointcloud, ceiling, and, if asked for, og_pointcloud from photographs.
+    share_of_the_way: of the distance in mIoU from uplift to ceiling, how much og_pointcloud covers (NaN where uplift is
+    already at the ceiling). instance_agreement: adjusted Rand index of its instances with the true ones, on labelled
+    points. seconds: wall clock per stage of the demo.
     """
 
     output: Path
     bundle: Path
     pictures: tuple[Path, ...]
-    methods: tuple[MethodScore, MethodScore, MethodScore]
+    methods: tuple[MethodScore, ...]
     share_of_the_way: float
     instance_agreement: float
     seconds: dict[str, float]
 
 
-def run_demo(output: Path, seed: int = 0, mask_noise: float = 1.0, pictures: bool = True) -> DemoResult:
+def run_demo(
+    output: Path, seed: int = 0, mask_noise: float = 1.0, pictures: bool = True, photographs: bool = False
+) -> DemoResult:
     """Makes a room in ``output``/capture, fits it, writes ``output``/room.ogpc, asks it for every class and scores it.
 
     seed: another room. mask_noise: 0 for a perfect proposer, 1 the default, more for worse. pictures: also draw
-    views.png, instances.png and labels.png, where PyVista can render off-screen. Prints one line per stage and a table.
+    views.png, instances.png and labels.png, where PyVista can render off-screen. photographs: also label the room from
+    its images alone, masks by OpenCV, features and typed words by the demo encoder, into ``output``/photographs.
+    Prints one line per stage and a table.
     """
     seconds: dict[str, float] = {}
     with _stage("make the room", seconds):
@@ -95,11 +105,19 @@ def run_demo(output: Path, seed: int = 0, mask_noise: float = 1.0, pictures: boo
     ours_seconds = sum(seconds[name] for name in ("render the masks", "fit", "write one file", "segment by words"))
     ours_row = MethodScore("og_pointcloud", _score(result.labels, capture), called, ours_seconds)
     methods = (baselines[0], ours_row, baselines[1])
+    uplift, ours, best = (method.score.miou for method in methods)
+    seen = None
+    if photographs:
+        print("\nfrom photographs alone: masks by OpenCV, features and typed words by the demo encoder", flush=True)
+        seen = label_from_photographs(folder, output / "photographs", seed=seed, processes=min(2, os.cpu_count() or 1))
+        seconds |= {f"photographs: {name}": value for name, value in seen.seconds.items()}
+        own_seconds = sum(seen.seconds.values())
+        methods += (MethodScore("from photographs alone", seen.score, seen.absent_called, own_seconds),)
     written: tuple[Path, ...] = ()
     if pictures:
         with _stage("draw pictures", seconds):
             written = _draw(output, capture, result.labels, result.instances)
-    uplift, ours, best = (method.score.miou for method in methods)
+            written += _draw_photographs(output, capture, seen) if seen else ()
     share = (ours - uplift) / (best - uplift) if best > uplift else float("nan")
     labelled = capture.instance >= 0
     agreement = adjusted_rand_index(result.instances[labelled], capture.instance[labelled])
@@ -157,6 +175,17 @@ def _draw(output: Path, capture: RoomCapture, labels: np.ndarray, instances: np.
     return (views, by_instance, by_label)
 
 
+def _draw_photographs(output: Path, capture: RoomCapture, seen: FromPhotographs) -> tuple[Path, ...]:
+    if not can_render():
+        return (seen.preview,)
+    path, known = output / "from_photographs.png", (capture.cls >= 0) | capture.background
+    draw_labels(
+        path, capture.xyz[known], capture.rgb[known], seen.labels[known], capture.cls[known], CLASS_NAMES,
+        instance_ids=seen.instance_ids[known],
+    )  # fmt: skip
+    return seen.preview, path
+
+
 @contextmanager
 def _stage(name: str, seconds: dict[str, float]) -> Iterator[None]:
     start = time.perf_counter()
@@ -179,8 +208,8 @@ def _report(demo: DemoResult) -> None:
             f"{method.absent_called:14.4f} {seconds:>8}"
         )
     print(
-        f"absent called: of all points, the share that gets one of {ABSENT_WORDS} words that nothing in the room is; "
-        "og_pointcloud judges them by its word bank"
+        f"absent called: of all points, the share that gets one of {ABSENT_WORDS} words that nothing in the room is "
+        f"(from photographs: one of {len(ABSENT)} typed ones); og_pointcloud judges them by its word bank"
     )
     print(f"og_pointcloud goes {demo.share_of_the_way:.1%} of the way from direct uplift to the ceiling")
     print(f"agreement of its instances with the true ones (adjusted Rand index): {demo.instance_agreement:.3f}\n")

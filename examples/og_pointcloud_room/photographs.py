@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import sys
 import time
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -19,38 +20,61 @@ from og_pointcloud_export import write_bundle
 import og_pointcloud as og
 from og_pointcloud.fitting.fit import fit
 from og_pointcloud.formats.capture import read_capture
-from og_pointcloud.masking.make_masks import MaskSettings, make_masks
+from og_pointcloud.masking.make_masks import PREVIEW_NAME, MaskSettings, make_masks
 from og_pointcloud.metrics import Score, score_labels
 from og_pointcloud.settings import FitSettings
 from og_pointcloud.text.encoder import DEMO_ENCODER
 from og_pointcloud_room.furniture import CLASS_NAMES
 
-__all__ = ["FromPhotographs", "label_from_photographs"]
+__all__ = ["ABSENT", "FromPhotographs", "label_from_photographs"]
+
+ABSENT = (
+    "accordion",
+    "anvil",
+    "canoe",
+    "excavator",
+    "giraffe",
+    "hammock",
+    "lighthouse",
+    "penguin",
+    "saxophone",
+    "tractor",
+)
+"""Words for nothing in the room, typed as well."""
 
 
 @dataclass(frozen=True)
 class FromPhotographs:
-    """What came of it. masks: of all images. seconds: wall clock per stage."""
+    """What came of it. masks: of all images. absent_called: of all points, the share that gets one of ABSENT when these
+    are asked. preview: some images with their masks drawn in. seconds: wall clock per stage."""
 
     bundle: Path
     masks: int
     instances: int
     labels: np.ndarray
+    instance_ids: np.ndarray
     score: Score
+    absent_called: float
+    preview: Path
     seconds: dict[str, float]
 
 
-def label_from_photographs(capture: Path, output: Path, proposer: str = "opencv", seed: int = 0) -> FromPhotographs:
+def label_from_photographs(
+    capture: Path, output: Path, proposer: str = "opencv", seed: int = 0, processes: int = 1
+) -> FromPhotographs:
     """Label a room's capture, as ``write_capture`` wrote it, by the names of its classes as someone types them.
 
     Of the capture only images, poses, points and the truth are used; ``output`` becomes a capture of its own, with the
     masks made here, and gets ``room.ogpc``, which carries the words' encoder. proposer: as of `og-pointcloud masks`; or
-    the capture's own ``masks`` folder for those of the demo's simulated proposer.
+    the capture's own ``masks`` folder for those of the demo's simulated proposer. processes: images worked on side by
+    side.
     """
     seconds: dict[str, float] = {}
     output.mkdir(parents=True, exist_ok=True)
     with _stage("masks and features", seconds):
-        made = make_masks(capture, MaskSettings(proposer=proposer, encoder="demo"), output, overwrite=True)
+        made = make_masks(
+            capture, MaskSettings(proposer=proposer, encoder="demo"), output, processes=processes, overwrite=True
+        )
     with _stage("read the capture", seconds):
         scene = read_capture(output)
     with _stage("fit", seconds):
@@ -62,8 +86,21 @@ def label_from_photographs(capture: Path, output: Path, proposer: str = "opencv"
     with _stage("typed words to labels", seconds):
         loaded = og.load(bundle)
         labels = og.segment(loaded.xyz, CLASS_NAMES, scene=loaded).labels
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # that no point has a label is what is hoped for
+        called = float((og.segment(loaded, ABSENT).labels >= 0).mean())
     score = score_labels(labels, truth["cls"], background=truth["background"])
-    return FromPhotographs(bundle, made.masks, len(cloud.instances), labels, score, seconds)
+    return FromPhotographs(
+        bundle,
+        made.masks,
+        len(cloud.instances),
+        labels,
+        cloud.instance_ids,
+        score,
+        called,
+        output / PREVIEW_NAME,
+        seconds,
+    )
 
 
 @contextmanager

@@ -53,9 +53,10 @@ def run(arguments: argparse.Namespace) -> None:
         raise MissingExtraError("torch", "learn")
     from og_pointcloud.fitting import ablation
     from og_pointcloud.formats.capture import read_capture
+    from og_pointcloud.scoring.plots import require_matplotlib
     from og_pointcloud.scoring.truth import read_truth
 
-    ablation.require_matplotlib()
+    require_matplotlib()
     rows_wanted = ablation.cases()
     if arguments.paper:
         published = ablation.cases("paper", 0.05 if share is None else share)

@@ -19,10 +19,14 @@ def add(commands: Any) -> None:
     parser.add_argument(
         "--mask-noise", type=float, default=1.0, metavar="X", help="0 clean masks, 1 realistic (default: %(default)s)"
     )
+    parser.add_argument(
+        "--photographs", action=argparse.BooleanOptionalAction, default=True,
+        help="also label the room from its images alone, without ready masks and features",
+    )  # fmt: skip
 
 
 def run(arguments: argparse.Namespace) -> None:
     require_room()
     from og_pointcloud_room.demo import run_demo
 
-    run_demo(arguments.output, seed=arguments.seed, mask_noise=arguments.mask_noise)
+    run_demo(arguments.output, seed=arguments.seed, mask_noise=arguments.mask_noise, photographs=arguments.photographs)

@@ -49,8 +49,9 @@ def run(arguments: argparse.Namespace) -> None:
     page, table = output / "report.html", output / "report.csv"
     check_outputs({"the page": (page, [".html"]), "the table": (table, [".csv"])}, inputs=arguments.captures)
     from og_pointcloud.report.page import write_page
-    from og_pointcloud.report.plots import fit_plot, require_matplotlib
+    from og_pointcloud.report.plots import fit_plot
     from og_pointcloud.report.sweep import QUICK, Sweep, report_on, write_rows
+    from og_pointcloud.scoring.plots import require_matplotlib
 
     require_matplotlib()
     output.mkdir(parents=True, exist_ok=True)

@@ -35,6 +35,7 @@ from og_pointcloud.errors import FeatureSpaceError, MissingExtraError, OgPointcl
 from og_pointcloud.fitting.geometry import thinned
 from og_pointcloud.metrics import score_labels
 from og_pointcloud.scene import Scene
+from og_pointcloud.scoring.plots import require_matplotlib
 from og_pointcloud.scoring.truth import Truth
 from og_pointcloud.settings import CodebookSettings, FeatureSettings, FitSettings, MatchingSettings, PaperSettings
 from og_pointcloud.text.features import read_text_features
@@ -59,7 +60,6 @@ __all__ = [
     "plot",
     "read_vocabulary",
     "references",
-    "require_matplotlib",
     "write_csv",
 ]
 
@@ -459,15 +459,6 @@ def write_csv(rows: Iterable[AblationRow], path: str | os.PathLike[str]) -> Path
     with replacing(path) as file:
         file.write(text.getvalue().encode())
     return path
-
-
-def require_matplotlib() -> Any:
-    """The class matplotlib.figure.Figure; MissingExtraError where matplotlib is not installed."""
-    try:
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise MissingExtraError("matplotlib", "report") from error
-    return Figure
 
 
 def plot(rows: Sequence[AblationRow], path: str | os.PathLike[str], title: str = "") -> Path:

@@ -6,11 +6,11 @@ import io
 from collections.abc import Sequence
 from typing import Any
 
-from og_pointcloud.errors import MissingExtraError
 from og_pointcloud.report.measure import Row
 from og_pointcloud.report.sweep import error, front
+from og_pointcloud.scoring.plots import require_matplotlib
 
-__all__ = ["asking_plot", "fit_plot", "is_asking", "require_matplotlib"]
+__all__ = ["asking_plot", "fit_plot", "is_asking"]
 
 ASKING = ("lookup", "descriptors", "text")
 """Knobs of the finished file, whose seconds are of one frame."""
@@ -31,15 +31,6 @@ COLOURS = (
 MARKERS = "osD^vPX*<>hp"
 
 TICKS = (0, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1)
-
-
-def require_matplotlib() -> Any:
-    """The class matplotlib.figure.Figure; MissingExtraError where matplotlib is not installed."""
-    try:
-        from matplotlib.figure import Figure
-    except ImportError as error_:
-        raise MissingExtraError("matplotlib", "report") from error_
-    return Figure
 
 
 def is_asking(row: Row) -> bool:
