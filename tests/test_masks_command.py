@@ -13,14 +13,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from capture_files import HEIGHT, WIDTH, make_world, write_colmap_text, write_ply, write_transforms
+from capture_files import HEIGHT, WIDTH, make_world, write_colmap_text, write_ply, write_png, write_transforms
 
 from og_pointcloud.cli import main
 from og_pointcloud.errors import OgPointcloudError, SceneError
 from og_pointcloud.formats.capture import read_capture
 from og_pointcloud.masking.make_masks import PREVIEW_NAME, WORK_FOLDER, MaskSettings, make_masks
 
-ALONE = MaskSettings(encoder=None, drop_tiny=False)
+ALONE = MaskSettings(encoder=None)
 
 
 def silent(_: str) -> None:
@@ -77,7 +77,7 @@ def test_a_capture_gets_masks_that_can_be_read(tmp_path):
 
 def test_the_demo_encoder_gives_the_features(tmp_path):
     make_capture(tmp_path / "c", 2)
-    made = make_masks(tmp_path / "c", MaskSettings(drop_tiny=False), say=silent)
+    made = make_masks(tmp_path / "c", MaskSettings(), say=silent)
     scene = read_capture(tmp_path / "c")
     assert scene.feature_space == made.feature_space == "og_pointcloud/demo-room-encoder"
     features = np.concatenate([view.mask_features for view in scene.views])
@@ -87,7 +87,7 @@ def test_the_demo_encoder_gives_the_features(tmp_path):
 @pytest.mark.parametrize("processes", [1, 2])
 def test_langsplat_files_have_three_levels(tmp_path, processes):
     world = make_capture(tmp_path / "c")
-    settings = MaskSettings(encoder=None, drop_tiny=False, langsplat=True)
+    settings = MaskSettings(encoder=None, langsplat=True)
     make_masks(tmp_path / "c", settings, say=silent, processes=processes)
     assert not (tmp_path / "c" / "masks").exists()
     for level in ("default", "small", "medium", "large"):
@@ -123,7 +123,7 @@ def slow(*arguments):
     time.sleep(float(sys.argv[3]))
     return settle(*arguments)
 m.settle = slow
-m.make_masks(sys.argv[1], m.MaskSettings(encoder=None, drop_tiny=False))
+m.make_masks(sys.argv[1], m.MaskSettings(encoder=None))
 """
 
 
@@ -187,6 +187,58 @@ def test_masks_of_others_are_not_overwritten(tmp_path, capsys):
     assert "next: og-pointcloud fit" in out
 
 
+def test_a_run_that_finds_all_done_does_nothing(tmp_path, capsys):
+    make_capture(tmp_path / "c", 3)
+    command = ["masks", str(tmp_path / "c"), "--encoder", "none"]
+    assert main(command) == 0
+    first = capsys.readouterr()
+    state = {file: file.stat().st_mtime_ns for file in sorted((tmp_path / "c").rglob("*")) if file.is_file()}
+    assert main(command) == 0
+    second = capsys.readouterr()
+    assert "all 3 images have these masks already: nothing to do" in second.err
+    assert second.out.split(" (")[0] == first.out.split(" (")[0]  # so many masks in so many images
+    assert {file: file.stat().st_mtime_ns for file in sorted((tmp_path / "c").rglob("*")) if file.is_file()} == state
+
+
+@pytest.mark.parametrize("change", ["--overwrite", "--level", "image", "mask", "features", "record", "made.json"])
+def test_what_changed_is_made_again(tmp_path, capsys, change):
+    world = make_capture(tmp_path / "c", 3)
+    masks = tmp_path / "c" / "masks"
+    command = ["masks", str(tmp_path / "c"), "--encoder", "none"]
+    assert main(command) == 0
+    before = {name: ids_of(tmp_path / "c", name) for name in world.names}
+    if change.startswith("--"):
+        command += [change] if change == "--overwrite" else [change, "large"]
+    elif change == "image":
+        os.utime(tmp_path / "c" / "images" / f"{world.names[1]}.png", ns=(1, 1))
+    elif change == "mask":
+        (masks / f"{world.names[1]}.png").unlink()
+    elif change == "features":
+        (tmp_path / "c" / "mask_features.npz").unlink()
+    elif change == "record":  # killed while the files were put in place
+        made = json.loads((masks / "made.json").read_text())
+        del made["key"]
+        (masks / "made.json").write_text(json.dumps(made))
+    else:
+        (masks / "made.json").write_text("{")
+    capsys.readouterr()
+    assert main(command) == 0
+    assert "nothing to do" not in capsys.readouterr().err
+    if change != "--level":
+        assert all(np.array_equal(ids, ids_of(tmp_path / "c", name)) for name, ids in before.items())
+
+
+def test_other_masks_in_the_folder_of_the_proposer_are_taken_up(tmp_path):
+    world = make_capture(tmp_path / "c", 2)
+    for fill in (9, 200):
+        ids = np.zeros((HEIGHT, WIDTH), np.uint8)
+        ids[10:30, 10 : 30 + fill // 20] = fill
+        for name in world.names:
+            write_png(tmp_path / "given" / f"{name}.png", ids)
+        make_masks(tmp_path / "c", MaskSettings(str(tmp_path / "given"), encoder=None), say=silent)
+        assert ((ids_of(tmp_path / "c", world.names[0]) > 0) == (ids > 0)).all()
+
+
 # Which images ----------------------------------------------------------------------------------------------------
 
 
@@ -214,9 +266,7 @@ def test_views_that_add_nothing_are_left_out(tmp_path):
     write_transforms(folder, world, ply_file_path="points.ply")
     write_ply(folder / "points.ply", world.xyz, world.rgb)
     said: list[str] = []
-    made = make_masks(
-        folder, MaskSettings(encoder=None, enough_views=3, drop_tiny=False), tmp_path / "few", say=said.append
-    )
+    made = make_masks(folder, MaskSettings(encoder=None, enough_views=3), tmp_path / "few", say=said.append)
     assert made.images == 3
     assert len(made.left_out) == 6
     assert "seen by 3 others" in said[0]

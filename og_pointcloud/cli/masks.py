@@ -39,9 +39,9 @@ def add(commands: Any) -> None:
     parser.add_argument("--longest-side", type=int, default=1024, metavar="PX", help="larger images are shrunk to this")
     parser.add_argument("--depth", action="store_true", help="let the proposer use the points' depth as well")
     parser.add_argument("--split", action="store_true", help="split masks where the points' depth breaks off")
-    parser.add_argument("--keep-tiny", action="store_true", help="keep masks that the points do not resolve")
+    parser.add_argument("--drop-tiny", action="store_true", help="drop masks that the points do not resolve")
     parser.add_argument("--processes", type=int, default=1, metavar="N", help="images worked on side by side")
-    parser.add_argument("--overwrite", action="store_true", help="replace masks that this command did not make")
+    parser.add_argument("--overwrite", action="store_true", help="replace masks of others, or make all again")
     parser.add_argument("--download", action="store_true", help="fetch a SAM model that is not there yet")
     parser.add_argument("-o", "--output", type=Path, metavar="DIR", help="a capture of its own (default: CAPTURE)")
 
@@ -62,7 +62,7 @@ def run(arguments: argparse.Namespace) -> None:
         seconds_per_image=arguments.seconds_per_image,
         use_depth=arguments.depth,
         split=arguments.split,
-        drop_tiny=not arguments.keep_tiny,
+        drop_tiny=arguments.drop_tiny,
         every=arguments.every,
         enough_views=ENOUGH_VIEWS if arguments.views == "auto" else None,
         download=arguments.download,

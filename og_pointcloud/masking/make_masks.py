@@ -2,7 +2,8 @@
 
 What each image gives is first an atomic file of its own in ``masks.work/``; when all are there they become ``masks/``
 with ``mask_features.npz``, or LangSplat's ``language_features/``, and the folder goes. Killed at any moment, the same
-command goes on behind the last image. ``made.json`` beside the masks says that they were made here, and how.
+command goes on behind the last image; where all is made already it does nothing. ``made.json`` beside the masks says
+that they were made here, and how.
 """
 
 from __future__ import annotations
@@ -62,7 +63,8 @@ class MaskSettings:
     alone, with zero features. level: small, middle or large, for ``masks/`` (LangSplat's files have all).
     longest_side: larger images are shrunk to this; masks have the shrunk size.
     seconds_per_image: where SAM stops adding prompts. use_depth: colour and the points' depth, where the proposer
-    takes it. split: masks are cut at depth edges. drop_tiny: masks that the points do not resolve are dropped.
+    takes it. split: masks are cut at depth edges. drop_tiny: masks that the points do not resolve are dropped
+    (a proposer that makes none, such as opencv, then need not read the cloud).
     every: of so many images one is used. enough_views: images are left out whose content so many others show.
     """
 
@@ -74,7 +76,7 @@ class MaskSettings:
     seconds_per_image: float | None = None
     use_depth: bool = False
     split: bool = False
-    drop_tiny: bool = True
+    drop_tiny: bool = False
     every: int = 1
     enough_views: int | None = None
     download: bool = False
@@ -125,6 +127,7 @@ def make_masks(
 
     output: where they go; None: into the capture. Another folder becomes a capture of its own: poses of the images that
     are used, and links to everything else. It is needed where images are left out.
+    overwrite: replace masks that were not made here, and make again what is complete.
     Raises SceneError where images are broken (after the others are done and kept), and OgPointcloudError where masks
     that were not made here would be overwritten.
     """
@@ -141,10 +144,17 @@ def make_masks(
         )
     if left_out:
         say(f"left out: {len(left_out)} of {len(photographs)} images ({_reason(settings)}): {', '.join(left_out)}")
-    _refuse_foreign(target, settings.langsplat, overwrite)
+    _refuse_foreign(target, settings, overwrite)
     work = target / WORK_FOLDER / _fingerprint(settings)
-    work.mkdir(parents=True, exist_ok=True)
     tasks = [_Task(photograph, work / _work_name(photograph)) for photograph in chosen]
+    key = _digest([str(task.work_file.relative_to(target)) for task in tasks])
+    if not overwrite and (made := _made_before(target, settings, tasks, key)):
+        if target.resolve() != capture.resolve():
+            _make_capture_of(capture, target, chosen)  # poses may be new
+        say(f"all {len(tasks)} images have these masks already: nothing to do (--overwrite makes them again)")
+        masks, space = made["masks"], str(made.get("feature_space", UNKNOWN_SPACE))
+        return MasksMade(target, len(tasks), len(tasks), masks, left_out, space, time.perf_counter() - start)
+    work.mkdir(parents=True, exist_ok=True)
     waiting = [task for task in tasks if not task.work_file.exists()]
     if len(waiting) < len(tasks):
         say(f"{len(tasks) - len(waiting)} of {len(tasks)} images are done already")
@@ -152,6 +162,7 @@ def make_masks(
     masks, space = _assemble(target, settings, tasks)
     if target.resolve() != capture.resolve():
         _make_capture_of(capture, target, chosen)
+    _write_made(target, settings, tasks, key=key, masks=masks, feature_space=space)
     shutil.rmtree(target / WORK_FOLDER)
     done_before, seconds = len(tasks) - len(waiting), time.perf_counter() - start
     return MasksMade(target, len(tasks), done_before, masks, left_out, space, seconds)
@@ -173,8 +184,8 @@ def _reason(settings: MaskSettings) -> str:
     return ", ".join(filter(None, (every, enough)))
 
 
-def _refuse_foreign(target: Path, langsplat: bool, overwrite: bool) -> None:
-    folder = target / (LANGUAGE_FEATURES_FOLDER if langsplat else MASKS_FOLDER)
+def _refuse_foreign(target: Path, settings: MaskSettings, overwrite: bool) -> None:
+    folder = _folder(target, settings)
     features = target / FEATURES_NAME
     if overwrite or (folder / MADE_NAME).is_file():
         return
@@ -189,13 +200,41 @@ def _refuse_foreign(target: Path, langsplat: bool, overwrite: bool) -> None:
 def _fingerprint(settings: MaskSettings) -> str:
     """Work files of other settings are not taken up. Which images are used does not matter to an image."""
     of_image = replace(settings, every=1, enough_views=None, download=False)
-    return blake2b(json.dumps([VERSION, asdict(of_image)]).encode(), digest_size=8).hexdigest()
+    given = Path(settings.proposer)
+    masks = [_state(file) for file in sorted(given.rglob("*"))] if given.is_dir() else []
+    return _digest([VERSION, asdict(of_image), masks])
 
 
 def _work_name(photograph: Photograph) -> str:
-    state = photograph.file.stat()
-    key = f"{photograph.name}\0{state.st_size}\0{state.st_mtime_ns}"
-    return f"{blake2b(key.encode(), digest_size=12).hexdigest()}.npz"
+    return f"{_digest([photograph.name, *_state(photograph.file)])}.npz"
+
+
+def _state(file: Path) -> tuple[str, int, int]:
+    """What changes when a file does."""
+    state = file.stat()
+    return file.name, state.st_size, state.st_mtime_ns
+
+
+def _digest(value: list[Any]) -> str:
+    return blake2b(json.dumps(value).encode(), digest_size=12).hexdigest()
+
+
+def _made_before(target: Path, settings: MaskSettings, tasks: Sequence[_Task], key: str) -> dict[str, Any] | None:
+    """The record of a run that made the same masks of the same images, if all its files are still there."""
+    folder = _folder(target, settings)
+    try:
+        made = json.loads((folder / MADE_NAME).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    endings = ("_s.npy", "_f.npy") if settings.langsplat else (".png",)
+    files = [folder / f"{task.photograph.name}{ending}" for task in tasks for ending in endings]
+    files += [] if settings.langsplat else [target / FEATURES_NAME]
+    same = isinstance(made, dict) and made.get("key") == key and isinstance(made.get("masks"), int)
+    return made if same and all(file.is_file() for file in files) else None
+
+
+def _folder(target: Path, settings: MaskSettings) -> Path:
+    return target / (LANGUAGE_FEATURES_FOLDER if settings.langsplat else MASKS_FOLDER)
 
 
 # The work ---------------------------------------------------------------------------------------------------------
@@ -400,10 +439,9 @@ def _read_work(task: _Task) -> dict[str, NDArray[Any]]:
 
 def _assemble(target: Path, settings: MaskSettings, tasks: Sequence[_Task]) -> tuple[int, str]:
     """Work files -> the capture's files. Number of masks on the level of `settings`, and the feature space."""
-    folder = target / (LANGUAGE_FEATURES_FOLDER if settings.langsplat else MASKS_FOLDER)
+    folder = _folder(target, settings)
     folder.mkdir(parents=True, exist_ok=True)
-    made = {"made_by": "og-pointcloud masks", **asdict(settings), "images": len(tasks)}
-    _write_json(folder / MADE_NAME, made)  # first: killed here, the next run knows the folder as ours
+    _write_made(target, settings, tasks)  # first: killed here, the next run knows the folder as ours, but not as whole
     write = _write_langsplat if settings.langsplat else _write_mask_image
     features: dict[str, Any] = {}
     masks, space = 0, UNKNOWN_SPACE
@@ -420,6 +458,12 @@ def _assemble(target: Path, settings: MaskSettings, tasks: Sequence[_Task]) -> t
         with replacing(target / FEATURES_NAME) as file:
             np.savez(file, feature_space=np.array(space), **features)
     return masks, space
+
+
+def _write_made(target: Path, settings: MaskSettings, tasks: Sequence[_Task], **whole: Any) -> None:
+    """whole: what a run leaves that came to its end."""
+    made = {"made_by": "og-pointcloud masks", **asdict(settings), "images": len(tasks), **whole}
+    _write_json(_folder(target, settings) / MADE_NAME, made)
 
 
 def _write_mask_image(stem: Path, work: dict[str, NDArray[Any]], level: str) -> None:
