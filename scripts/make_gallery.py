@@ -45,7 +45,9 @@ EXHIBITS = (
         "An Open3D cloud, painted.",
     ),
     Exhibit(
-        "05_highlight_in_splats", ("{scene}", "{splats}", "chair", "-o", "{out}/chairs.png"), ("chairs.png",),
+        "05_highlight_in_splats",
+        ("{scene}", "{splats}", "chair", "--eye=-1.7,-1.5,1.9", "--target=0.1,0.1,0.4", "-o", "{out}/chairs.png"),
+        ("chairs.png",),
         "One word lit in a rendering of the splat.",
     ),
     Exhibit("07_robot", ("--scene", "{scene}", "-o", "{out}"), ("07_robot.png",),
