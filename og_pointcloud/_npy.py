@@ -3,33 +3,37 @@
 from __future__ import annotations
 
 import io
+import mmap
 import tokenize
 import zipfile
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["array_from_npy", "array_from_zip", "npy_bytes"]
+__all__ = ["array_from_npy", "array_from_zip", "mapped_array", "npy_bytes"]
 
+LONGEST_HEADER = 1 << 17
+"""Bytes in which a header ends; numpy reads none of more than 10,000 characters."""
 LAST_CHARACTER = 0x10FFFF
 
 
-def array_from_npy(data: bytes) -> NDArray[Any]:
+def array_from_npy(data: bytes | mmap.mmap) -> NDArray[Any]:
     """A read-only array that lies in ``data``; ValueError where it is no .npy, holds objects, or differs in length."""
-    stream = io.BytesIO(data)
+    stream = io.BytesIO(data[:LONGEST_HEADER])
     version = np.lib.format.read_magic(stream)
     read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
     try:
         shape, fortran_order, dtype = read(stream)
         shape = tuple(map(int, shape))  # True is an int to numpy, until it counts bytes
-    except (ValueError, tokenize.TokenError, TypeError, RecursionError) as error:  # its parser's own come through
+    except (ValueError, SyntaxError, tokenize.TokenError, TypeError, RecursionError) as error:  # its parser's own
         raise ValueError(f"its header cannot be parsed ({str(error).partition(chr(10))[0]:.80})") from None
     if dtype.hasobject:
         raise ValueError(f"it holds Python objects ({dtype}), which are never loaded")
     count = int(np.prod(shape, dtype=object))
     claimed, held = count * dtype.itemsize, len(data) - stream.tell()
-    if any(length < 0 for length in shape) or claimed != held:
+    if any(length < 0 for length in shape) or claimed != held or (count and not dtype.itemsize):
         raise ValueError(f"its header claims {dtype} {shape}, {claimed} bytes, but {held} follow")
     if claimed == 0:
         return np.zeros(shape, dtype)
@@ -37,6 +41,15 @@ def array_from_npy(data: bytes) -> NDArray[Any]:
     if dtype.kind == "U" and (flat.view(f"{dtype.byteorder}u4") > LAST_CHARACTER).any():
         raise ValueError(f"it holds {dtype} text of characters that there are not")
     return flat.reshape(shape[::-1]).T if fortran_order else flat.reshape(shape)
+
+
+def mapped_array(file: Path) -> NDArray[Any]:
+    """The array of a .npy file, of which only what is used is read. ValueError as above, OSError where it cannot be.
+
+    Not by numpy.load, which divides by zero, and with it ends the process, where a type has no bytes.
+    """
+    with file.open("rb") as stream:
+        return array_from_npy(mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ))
 
 
 def array_from_zip(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> NDArray[Any]:

@@ -24,6 +24,8 @@ FloatArray = NDArray[np.float32]
 DoubleArray = NDArray[np.float64]
 IntArray = NDArray[np.int32]
 
+LONGEST_SIDE = 1 << 17
+"""Pixels; no camera has more."""
 UNIT_TOLERANCE = 1e-3
 """A quaternion's length may differ from 1 by this much: it changes the size of a Gaussian by twice as much."""
 
@@ -58,10 +60,10 @@ class Camera:
                 f"camera rotation is off a rotation matrix by {error:.3g} (det {determinant:.3g}); "
                 "expected a rigid right-handed pose: remove scale or mirroring from the pose file"
             )
-        if self.width < 1 or self.height < 1:
+        if not (1 <= self.width <= LONGEST_SIDE and 1 <= self.height <= LONGEST_SIDE):
             raise SceneError(
-                f"camera image is {self.width}x{self.height}; expected at least 1x1 pixel: check w and h of "
-                "the pose file"
+                f"camera image is {self.width!s:.12}x{self.height!s:.12}; expected at least 1x1 pixel, and at "
+                f"most {LONGEST_SIDE} a side: check w and h of the pose file"
             )
         intrinsics = (self.fx, self.fy, self.cx, self.cy)
         if not np.isfinite(intrinsics).all() or self.fx <= 0 or self.fy <= 0:

@@ -138,6 +138,9 @@ def test_messages_are_printable_whatever_the_file_says(capsys, tmp_path):
         "{'descr': '<f4', 'fortran_order': False, 'shape': (9999999999999999999999,), }",
         "{'descr': '<f4', 'fortran_order': False, 'shape': (" + "1, " * 5000 + "), }",
         "x" * 5000,
+        "{'descr': '<f4)', 'fortran_order': False, 'shape': (3, 4)), }",
+        "{'descr': '|S0', 'fortran_order': False, 'shape': (-1,), }",  # numpy.load divides by it
+        "{'descr': '|S0', 'fortran_order': False, 'shape': (1000000000000,), }",
     ],
 )
 def test_array_headers(tmp_path, header):

@@ -96,11 +96,11 @@ def read_images(model: Path) -> tuple[PosedImage, ...]:
         lens = lenses.get(image.camera_id)
         if lens is None:
             raise SceneError(
-                f"{model}: image '{image.name}' has camera {image.camera_id}, but the cameras file has only "
+                f"{model}: image '{image.name:.60}' has camera {image.camera_id}, but the cameras file has only "
                 f"{sorted(lenses)[:10]}; expected files of one reconstruction: export the model again"
             )
         pose = poses.get(image.image_id, image.world_to_camera)
-        with naming(f"{model}, image '{image.name}'"):
+        with naming(f"{model}, image '{image.name:.60}'"):
             camera = Camera(lens.width, lens.height, *lens.intrinsics, pose)
         images.append(PosedImage(image.name.replace("\\", "/"), camera, lens.distortion))
     if not images:

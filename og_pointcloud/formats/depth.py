@@ -6,7 +6,6 @@ millimetres in a world of metres unless the data set says otherwise, stored floa
 
 from __future__ import annotations
 
-import tokenize
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from og_pointcloud._npy import mapped_array
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.distortion import Distortion, undistorted
 from og_pointcloud.formats.images import MAX_PIXELS, decoded, png_header, require_cv2, same_shape
@@ -147,11 +147,10 @@ def _stored(file: Path) -> NDArray:
 
 
 def _mapped(file: Path) -> NDArray:
-    """A .npy file's array; numpy checks the claimed size against the file's."""
+    """A .npy file's array, of the size that a depth image may have."""
     try:
-        with np.errstate(over="ignore"):  # of sizes, which mmap refuses
-            values = np.load(file, mmap_mode="r", allow_pickle=False)
-    except (ValueError, OSError, EOFError, tokenize.TokenError, TypeError, OverflowError, MemoryError) as error:
+        values = mapped_array(file)
+    except (ValueError, OSError) as error:
         raise SceneError(
             f"{file} cannot be read as a .npy array ({error!s:.120}): it is damaged or truncated, write it again"
         ) from None

@@ -11,7 +11,6 @@ would contradict its neighbours' large ones.
 
 from __future__ import annotations
 
-import tokenize
 import warnings
 from collections.abc import Sequence
 from functools import partial
@@ -21,6 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from og_pointcloud._npy import mapped_array
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.masks import UNKNOWN_SPACE, MaskLayer, as_float32, require_all
 
@@ -109,11 +109,10 @@ def _level_ids(file: Path, level: str) -> NDArray[np.int32]:
 
 
 def _mapped(file: Path) -> NDArray[Any]:
-    """A .npy file's array, mapped: only what is used is read, and numpy checks the claimed size against the file's."""
+    """A .npy file's array, mapped: only what is used is read."""
     try:
-        with np.errstate(over="ignore"):  # of sizes, which mmap refuses
-            return np.load(file, mmap_mode="r", allow_pickle=False)
-    except (ValueError, OSError, EOFError, tokenize.TokenError, TypeError, OverflowError, MemoryError) as error:
+        return mapped_array(file)
+    except (ValueError, OSError) as error:
         raise SceneError(
             f"{file} cannot be read as a .npy array ({error!s:.120}): it is damaged or truncated, write it again"
         ) from None

@@ -62,7 +62,7 @@ def stack_columns(rows: NDArray[np.void], names: Sequence[str], dtype: type[np.f
     missing = [name for name in names if name not in scalar]
     if missing:
         raise SceneError(
-            f"no column {', '.join(missing)}; expected {', '.join(names)}, the file has {', '.join(scalar):.200}"
+            f"no column {', '.join(missing)}; expected {', '.join(names)}, the file has {', '.join(scalar):.60}"
         )
     stacked = np.empty((len(rows), len(names)), dtype)
     with np.errstate(invalid="ignore"):  # widening a signalling NaN warns; NaN is for the caller to judge
