@@ -3,9 +3,10 @@
     python examples/benchmark_masks.py CAPTURE [CAPTURE ...] [--proposer opencv] [--options depth split ...]
 
 The captures have masks and features of their own. Coverage: for each of these masks the best IoU with any proposal,
-and with any mask of a level; its mean, and the share over a half. Fit: the own features are handed to the proposals by
-overlap (means weighted by shared pixels; proposals of which less than half lies in masks get none and are left out),
-fitted, and scored against ``gt.npz``. Only every N-th image is used where --every says so.
+and with any mask of a level (agreed: the scale that other views confirm); its mean, and the share over a half. Fit: the
+own features are handed to the proposals by overlap (means weighted by shared pixels; proposals of which less than half
+lies in masks get none and are left out), fitted, and scored against ``gt.npz``. Only every N-th image is used where
+--every says so.
 """
 
 from __future__ import annotations
@@ -19,9 +20,11 @@ import numpy as np
 from score_captures import score_of
 
 import og_pointcloud as og
-from og_pointcloud.fitting.geometry import neighbourhood
+from og_pointcloud.fitting.geometry import neighbourhood, sample_of_points
+from og_pointcloud.masking.agreement import agreement, points_of_proposals, rescored
 from og_pointcloud.masking.contracts import DepthMaskProposer, Proposals
-from og_pointcloud.masking.levels import LEVELS, Level, settle
+from og_pointcloud.masking.levels import AGREED, LEVELS, Level, settle
+from og_pointcloud.masking.make_masks import AGREEMENT_POINTS
 from og_pointcloud.masking.opening import open_proposer
 from og_pointcloud.masking.refine import rendered_depth, smallest_mask_px, split_at_depth_edges
 from og_pointcloud.scene import Scene, View
@@ -48,7 +51,7 @@ def main(arguments: list[str] | None = None) -> None:
         scene = replace(scene, views=scene.views[:: options.every])
         for way in options.ways:
             settled = print_coverage(scene, folder.name, way, options.proposer)
-            for level in LEVELS if options.fit else ():
+            for level in (*LEVELS, *AGREED) if options.fit else ():
                 print_fit(scene, folder, [levels[level] for levels in settled], level)
 
 
@@ -56,7 +59,7 @@ def print_coverage(scene: Scene, name: str, way: str, proposer: str) -> list[dic
     """The levels of every view, and a row: mean best IoU / share over a half."""
     model, spacing = open_proposer(proposer), neighbourhood(scene.points.xyz, GeometrySettings()).spacing
     best: dict[str, list[float]] = {key: [] for key in ("all", *LEVELS)}
-    settled, seconds = [], 0.0
+    settled, kept, seconds = [], [], 0.0
     for view in scene.views:
         image = view.image_rgb()
         assert image is not None
@@ -71,14 +74,49 @@ def print_coverage(scene: Scene, name: str, way: str, proposer: str) -> list[dic
         smallest = smallest_mask_px(scene.points.xyz, spacing, view.camera) if way == "tiny" else 1
         settled.append(settle(proposals, smallest))
         seconds += time.perf_counter() - start
+        kept.append((np.packbits(proposals.masks, axis=2), proposals.scores, smallest))
         best["all"] += best_iou(proposals, view)
         for level in LEVELS:
-            masks = settled[-1][level].masks()
-            best[level] += best_iou(Proposals(masks, np.ones(len(masks), np.float32)), view)
+            best[level] += level_iou(settled[-1][level], view)
     cells = "".join(f"{np.mean(iou):6.3f} /{np.mean(np.array(iou) > 0.5):5.2f}  " for iou in best.values())
     masks = np.mean([len(levels["middle"].proposals) for levels in settled])
     print(f"{name:<16} {way:<6} {cells} {seconds / len(settled):6.2f} {masks:6.0f}", flush=True)
+    add_agreed(scene, spacing, kept, settled)
     return settled
+
+
+def add_agreed(scene: Scene, spacing: np.ndarray, kept: list[tuple], settled: list[dict[str, Level]]) -> None:
+    """The level on which views agree, and a row for it. kept: packed masks, scores and the fewest pixels of a view."""
+    start = time.perf_counter()
+    asked = sample_of_points(scene.points.xyz, AGREEMENT_POINTS)
+
+    def proposals(index: int) -> Proposals:
+        packed, scores, _ = kept[index]
+        return Proposals(np.unpackbits(packed, axis=2, count=scene.views[index].camera.width).astype(bool), scores)
+
+    points = [
+        points_of_proposals(proposals(index), scene.points.xyz, spacing, asked, view.camera)
+        for index, view in enumerate(scene.views)
+    ]
+    found = agreement(points, len(asked))
+    usual = float(np.nanmedian(np.concatenate(found)))
+    for index, (_, scores, smallest) in enumerate(kept):
+        again = replace(proposals(index), scores=rescored(scores, found[index], usual))
+        settled[index] |= settle(again, smallest, AGREED)
+    seconds = (time.perf_counter() - start) / len(kept)
+    best = [iou for view, levels in zip(scene.views, settled, strict=True) for iou in level_iou(levels["agreed"], view)]
+    masks = np.mean([len(levels["agreed"].proposals) for levels in settled])
+    print(
+        f"  agreed {np.mean(best):6.3f} /{np.mean(np.array(best) > 0.5):5.2f}, {masks:.0f} masks, median agreement "
+        f"{usual:.2f}, {seconds:.2f} s/image more",
+        flush=True,
+    )
+
+
+def level_iou(level: Level, view: View) -> list[float]:
+    """As `best_iou`, of the masks that a level shows."""
+    masks = level.masks()
+    return best_iou(Proposals(masks, np.ones(len(masks), np.float32)), view)
 
 
 def best_iou(proposals: Proposals, view: View) -> list[float]:
@@ -117,7 +155,8 @@ def print_fit(scene: Scene, folder: Path, levels: list[Level], name: str) -> Non
     result = og.segment(replace(cloud, vocabulary=words), list(words.names))
     score = score_of(result.labels, result.names, folder)
     print(
-        f"  fit on {name:<7} mIoU {score.miou:.3f}  mAcc {score.macc:.3f}  {len(cloud.instances)} instances, "
+        f"  fit on {name:<7} mIoU {score.miou:.3f}  mAcc {score.macc:.3f}  "
+        f"{np.mean([len(level.proposals) for level in levels]):.0f} masks, {len(cloud.instances)} instances, "
         f"{seconds:.1f} s",
         flush=True,
     )

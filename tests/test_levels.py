@@ -7,7 +7,7 @@ import pytest
 
 from og_pointcloud.errors import SceneError
 from og_pointcloud.masking.contracts import Proposals
-from og_pointcloud.masking.levels import INSIDE, LEVELS, PREFERENCE, SAME, VISIBLE, settle
+from og_pointcloud.masking.levels import AGREED, INSIDE, LEVELS, PREFERENCE, SAME, VISIBLE, settle
 
 
 def rectangle(top, left, bottom, right, size=(24, 32)):
@@ -152,3 +152,10 @@ def test_proposals_are_checked():
         Proposals(np.zeros((2, 3, 4), np.uint8), np.ones(2, np.float32))
     with pytest.raises(SceneError, match="a finite one each"):
         Proposals(np.zeros((2, 3, 4), bool), np.full(2, np.nan, np.float32))
+
+
+def test_other_preferences_give_other_levels():
+    said = random_proposals(5)
+    levels = settle(said, preferences=AGREED)
+    assert list(levels) == ["agreed"]
+    assert np.array_equal(shown(levels["agreed"]), literal(said, AGREED["agreed"]))

@@ -18,6 +18,7 @@ from capture_files import HEIGHT, WIDTH, make_world, write_colmap_text, write_pl
 from og_pointcloud.cli import main
 from og_pointcloud.errors import OgPointcloudError, SceneError
 from og_pointcloud.formats.capture import read_capture
+from og_pointcloud.masking import make_masks as module
 from og_pointcloud.masking.make_masks import PREVIEW_NAME, WORK_FOLDER, MaskSettings, make_masks
 
 ALONE = MaskSettings(encoder=None)
@@ -109,6 +110,71 @@ def test_two_processes_give_the_same_files(tmp_path):
         assert (tmp_path / "one" / "masks" / f"{name}.png").read_bytes() == (
             tmp_path / "two" / "masks" / f"{name}.png"
         ).read_bytes()
+
+
+def make_turned_capture(folder: Path, count=4):
+    """A wall with two things, looked at from places side by side."""
+    world = make_world(count=count)
+    world.quaternions[:] = (1, 0, 0, 0)
+    world.translations[:] = [(0.3 * k, 0, 4) for k in range(count)]
+    x, y = np.meshgrid(np.linspace(-3, 3, 90), np.linspace(-2, 2, 60))
+    world.xyz = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
+    world.rgb = np.zeros(world.xyz.shape, np.uint8)
+    (folder / "images").mkdir(parents=True)
+    write_transforms(folder, world, ply_file_path="points.ply")
+    write_ply(folder / "points.ply", world.xyz, world.rgb)
+    for k, name in enumerate(world.names):
+        (folder / "images" / f"{name}.png").write_bytes(plain(k, scenery(5 * k)))
+    return world
+
+
+AGREED = MaskSettings(encoder=None, level="agreed")
+
+
+@pytest.mark.parametrize("processes", [1, 2])
+def test_masks_that_other_views_confirm(tmp_path, processes):
+    make_turned_capture(tmp_path / "c")
+    said: list[str] = []
+    make_masks(tmp_path / "c", AGREED, say=said.append, processes=processes)
+    confirmed = next(text for text in said if "which confirm them by" in text)
+    assert float(confirmed.split("confirm them by ")[1].split()[0]) > 0.4  # one thing moves with the wall, one does not
+    for k, view in enumerate(read_capture(tmp_path / "c").views):
+        ids, thing = view.mask_map(), (scenery(5 * k) == (40, 40, 210)).all(axis=2)
+        found = ids == np.bincount(ids[thing] + 1).argmax() - 1
+        assert (found & thing).sum() / (found | thing).sum() > 0.7
+    assert not (tmp_path / "c" / WORK_FOLDER).exists()
+    make_masks(tmp_path / "c", AGREED, say=said.append)
+    assert "nothing to do" in said[-1]
+
+
+def test_two_passes_killed_after_the_first_go_on(tmp_path, monkeypatch):
+    make_turned_capture(tmp_path / "c")
+    make_masks(tmp_path / "c", AGREED, tmp_path / "whole", say=silent)
+
+    def killed(*_):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(module, "_kept_proposals", killed)
+        with pytest.raises(KeyboardInterrupt):
+            make_masks(tmp_path / "c", AGREED, say=silent)
+    made = make_masks(tmp_path / "c", AGREED, say=silent)
+    assert made.done_before == 4
+    for file in sorted((tmp_path / "whole" / "masks").glob("*.png")):
+        assert (tmp_path / "c" / "masks" / file.name).read_bytes() == file.read_bytes()
+
+
+@pytest.mark.parametrize("lacking", ["views", "cloud"])
+def test_nothing_to_agree_with(tmp_path, lacking):
+    make_turned_capture(tmp_path / "c", 1 if lacking == "views" else 2)
+    if lacking == "cloud":
+        (tmp_path / "c" / "points.ply").unlink()
+    said: list[str] = []
+    make_masks(tmp_path / "c", AGREED, tmp_path / "agreed", say=said.append)
+    make_masks(tmp_path / "c", MaskSettings(encoder=None, level="small"), tmp_path / "small", say=silent)
+    assert "no other view can confirm masks" in said[0]
+    for file in sorted((tmp_path / "small" / "masks").glob("*.png")):
+        assert (tmp_path / "agreed" / "masks" / file.name).read_bytes() == file.read_bytes()
 
 
 # Long work -------------------------------------------------------------------------------------------------------
@@ -370,6 +436,8 @@ def test_a_proposer_that_is_not_there_is_one_error(tmp_path, processes):
 def test_settings_are_checked():
     with pytest.raises(OgPointcloudError, match="mask level is 'huge'"):
         MaskSettings(level="huge")
+    with pytest.raises(OgPointcloudError, match="LangSplat's files hold small, middle, large"):
+        MaskSettings(level="agreed", langsplat=True)
     with pytest.raises(OgPointcloudError, match="every is 0"):
         MaskSettings(every=0)
 

@@ -29,7 +29,10 @@ def add(commands: Any) -> None:
         "--encoder", default="demo", metavar="E",
         help="demo (default; knows the demo room alone), a model's folder, OWNER/MODEL, or none: masks alone",
     )  # fmt: skip
-    parser.add_argument("--level", default="middle", choices=("small", "middle", "large"), help="how much is one mask")
+    parser.add_argument(
+        "--level", default="middle", choices=("small", "middle", "large", "agreed"),
+        help="how much is one mask; agreed: fine masks on the scale that other views confirm, by the cloud",
+    )  # fmt: skip
     parser.add_argument("--langsplat", action="store_true", help="write LangSplat's language_features/, all levels")
     parser.add_argument("--every", type=int, default=1, metavar="N", help="use every N-th image; needs -o")
     parser.add_argument(

@@ -1,4 +1,4 @@
-"""Overlapping proposals -> one id map per level: small, middle and large.
+"""Overlapping proposals -> one id map per level: small, middle and large; and agreed, where other views were asked.
 
 Proposals that nearly coincide become one, the better scored. What lies inside another is its child: a forest. A level
 is a cut through the forest: a mask is used instead of its parts where its area times its score is more than what the
@@ -12,6 +12,7 @@ size after one pass.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,11 +20,13 @@ from numpy.typing import NDArray
 
 from og_pointcloud.masking.contracts import Proposals
 
-__all__ = ["LEVELS", "Level", "settle"]
+__all__ = ["AGREED", "LEVELS", "Level", "settle"]
 
 PREFERENCE = {"small": 1.6, "middle": 1.0, "large": 0.6}
 """Level -> how often the parts of a mask count: more prefers parts, less prefers wholes."""
 LEVELS = tuple(PREFERENCE)
+AGREED = {"agreed": 2.0}
+"""The same for scores of `agreement`: wholes agree more than parts, whose borders are more of them."""
 SAME = 0.8
 """Two masks whose intersection over union is more are one."""
 INSIDE = 0.9
@@ -46,8 +49,11 @@ class Level:
         return self.ids == np.arange(len(self.proposals), dtype=np.int32)[:, None, None]
 
 
-def settle(proposals: Proposals, smallest_px: int = 1) -> dict[str, Level]:
-    """A map for each of `LEVELS`. smallest_px: masks that show fewer pixels are left out. Same input, same output."""
+def settle(
+    proposals: Proposals, smallest_px: int = 1, preferences: Mapping[str, float] = PREFERENCE
+) -> dict[str, Level]:
+    """A map for each of `LEVELS`, or of other preferences. smallest_px: masks that show fewer pixels are left out.
+    Same input, same output."""
     atom_of_pixel, member, area_px = _atoms(proposals.masks)
     order = np.lexsort((member @ area_px, -proposals.scores.astype(np.float64)))  # the better, then the smaller
     member, scores = member[order], proposals.scores[order].astype(np.float64)
@@ -56,7 +62,7 @@ def settle(proposals: Proposals, smallest_px: int = 1) -> dict[str, Level]:
     member, scores, order, shared_px = member[kept], scores[kept], order[kept], shared_px[np.ix_(kept, kept)]
     parent = _parents(shared_px)
     levels = {}
-    for level, preference in PREFERENCE.items():
+    for level, preference in preferences.items():
         used = _cut(np.diag(shared_px) * scores, parent, preference)
         owner = _owners(member, area_px, used, smallest_px)
         shown, ids = np.unique(owner, return_inverse=True)

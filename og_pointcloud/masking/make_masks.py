@@ -33,10 +33,11 @@ from og_pointcloud.formats.langsplat import LANGUAGE_FEATURES_FOLDER
 from og_pointcloud.formats.masks import FEATURES_NAME, MASKS_FOLDER, UNKNOWN_SPACE
 from og_pointcloud.formats.nerfstudio import TRANSFORMS_NAMES
 from og_pointcloud.formats.poses import in_local_frame
+from og_pointcloud.masking.agreement import ProposedPoints, agreement, points_of_proposals, rescored
 from og_pointcloud.masking.contact_sheet import write_contact_sheet
 from og_pointcloud.masking.contracts import DepthMaskProposer, MaskEncoder, MaskProposer, Proposals
 from og_pointcloud.masking.existing import ExistingMasks
-from og_pointcloud.masking.levels import LEVELS, settle
+from og_pointcloud.masking.levels import AGREED, LEVELS, PREFERENCE, settle
 from og_pointcloud.masking.opening import open_proposer
 from og_pointcloud.masking.photographs import Photograph, choose_by_coverage, read_cloud, read_photographs
 from og_pointcloud.masking.refine import rendered_depth, smallest_mask_px, split_at_depth_edges
@@ -51,6 +52,8 @@ MADE_NAME = "made.json"
 PREVIEW_NAME = "masks_preview.png"
 PREVIEW_IMAGES = 6
 REPORT_SECONDS = 10.0
+AGREEMENT_POINTS = 60_000
+"""So many points of the cloud tell how far views agree."""
 LANGSPLAT_LEVELS = ("middle", "small", "middle", "large")
 """Our levels in the order of LangSplat's: default, small, medium, large."""
 
@@ -60,7 +63,8 @@ class MaskSettings:
     """How masks are made; what changes one of these starts anew.
 
     proposer: see `opening.open_proposer`, or a folder of masks. encoder: see `encoders.open_encoder`; None: masks
-    alone, with zero features. level: small, middle or large, for ``masks/`` (LangSplat's files have all).
+    alone, with zero features. level: small, middle or large, for ``masks/`` (LangSplat's files have all); or agreed:
+    all images are proposed for first, and proposals count by how far other views confirm them (`agreement`).
     longest_side: larger images are shrunk to this; masks have the shrunk size.
     seconds_per_image: where SAM stops adding prompts. use_depth: colour and the points' depth, where the proposer
     takes it. split: masks are cut at depth edges. drop_tiny: masks that the points do not resolve are dropped
@@ -82,8 +86,10 @@ class MaskSettings:
     download: bool = False
 
     def __post_init__(self) -> None:
-        if self.level not in LEVELS:
-            raise OgPointcloudError(f"mask level is '{self.level}'; expected one of {', '.join(LEVELS)}")
+        if self.level not in (*LEVELS, *AGREED):
+            raise OgPointcloudError(f"mask level is '{self.level}'; expected one of {', '.join((*LEVELS, *AGREED))}")
+        if self.langsplat and self.level in AGREED:
+            raise OgPointcloudError(f"mask level is '{self.level}'; LangSplat's files hold {', '.join(LEVELS)}")
         if self.every < 1 or self.longest_side < 16:
             raise OgPointcloudError(
                 f"every is {self.every} and longest_side {self.longest_side}; expected at least 1 and 16"
@@ -92,7 +98,7 @@ class MaskSettings:
     @property
     def needs_points(self) -> bool:
         """Whether the cloud is read: a proposer of colour alone needs none."""
-        return self.use_depth or self.split or self.drop_tiny
+        return self.use_depth or self.split or self.drop_tiny or self.level in AGREED
 
 
 @dataclass(frozen=True)
@@ -110,8 +116,12 @@ class MasksMade:
 
 
 class _Task(NamedTuple):
+    """proposals, scores: of a first pass, and what other views made of its scores; none in a first or only pass."""
+
     photograph: Photograph
     work_file: Path
+    proposals: Path | None = None
+    scores: NDArray[np.float32] | None = None
 
 
 def make_masks(
@@ -135,6 +145,7 @@ def make_masks(
     capture = Path(capture)
     target = capture if output is None else Path(output)
     photographs = read_photographs(capture)
+    settings = _possible(settings, capture, len(photographs), say)
     chosen = _chosen(capture, photographs, settings)
     left_out = tuple(photograph.name for photograph in photographs if photograph not in chosen)
     if left_out and target.resolve() == capture.resolve():
@@ -159,6 +170,10 @@ def make_masks(
     if len(waiting) < len(tasks):
         say(f"{len(tasks) - len(waiting)} of {len(tasks)} images are done already")
     _work_through(capture, settings, tasks, waiting, processes, target, say)
+    if settings.level in AGREED:
+        tasks = _confirmed(tasks, say)
+        left = [task for task in tasks if not task.work_file.exists()]
+        _work_through(capture, settings, tasks, left, processes, target, say)
     masks, space = _assemble(target, settings, tasks)
     if target.resolve() != capture.resolve():
         _make_capture_of(capture, target, chosen)
@@ -176,6 +191,21 @@ def _chosen(capture: Path, photographs: Sequence[Photograph], settings: MaskSett
     if settings.enough_views is None:
         return chosen
     return [chosen[index] for index in choose_by_coverage(capture, chosen, settings.enough_views)]
+
+
+def _possible(settings: MaskSettings, capture: Path, images: int, say: Callable[[str], None]) -> MaskSettings:
+    """Without other views or a cloud nothing can agree: the small level is then nearest to it."""
+    if settings.level not in AGREED:
+        return settings
+    reason = "there is one image" if images == 1 else ""
+    try:
+        read_cloud(capture)
+    except SceneError as error:
+        reason = str(error)
+    if not reason:
+        return settings
+    say(f"level agreed: no other view can confirm masks ({reason}); the small level is used")
+    return replace(settings, level="small")
 
 
 def _reason(settings: MaskSettings) -> str:
@@ -246,22 +276,48 @@ class _Worker:
     def __init__(self, capture: Path, settings: MaskSettings) -> None:
         self.settings = settings
         self.levels = LEVELS if settings.langsplat else (settings.level,)
+        self.preferences = AGREED if settings.level in AGREED else PREFERENCE
         self.proposer = _open_proposer(settings)
         self.encoder = _open_encoder(settings.encoder)
         self.cloud = _SpacedCloud(capture) if settings.needs_points else None
 
     def __call__(self, task: _Task) -> None:
-        """Masks of one image on the levels asked for, and their features, into its work file."""
+        """Masks of one image on the levels asked for, and their features, into its work file; in a first pass its
+        proposals."""
         image = task.photograph.read(self.settings.longest_side)
-        proposals, smallest_px = self._proposals(image, task.photograph)
-        settled = settle(proposals, smallest_px)
-        arrays: dict[str, Any] = {}
+        if task.scores is not None:
+            arrays = self._masks(image, *_kept_proposals(task))
+        elif self.settings.level in AGREED:
+            arrays = self._first_pass(image, task.photograph)
+        else:
+            arrays = self._masks(image, *self._proposals(image, task.photograph))
+        with replacing(task.work_file) as file:
+            np.savez_compressed(file, **arrays)
+
+    def _masks(self, image: NDArray[np.uint8], proposals: Proposals, smallest_px: int) -> dict[str, Any]:
+        settled = settle(proposals, smallest_px, self.preferences)
+        space = self.encoder.feature_space if self.encoder else UNKNOWN_SPACE
+        arrays: dict[str, Any] = {"feature_space": np.array(space)}
         for level in self.levels:
             arrays[f"{level}_ids"] = settled[level].ids
             arrays[f"{level}_features"] = self._features(image, settled[level].masks())
-        space = self.encoder.feature_space if self.encoder else UNKNOWN_SPACE
-        with replacing(task.work_file) as file:
-            np.savez_compressed(file, feature_space=np.array(space), **arrays)
+        return arrays
+
+    def _first_pass(self, image: NDArray[np.uint8], photograph: Photograph) -> dict[str, Any]:
+        """Proposals, the points that show in them, and for the preview a map by the proposer's scores alone."""
+        proposals, smallest_px = self._proposals(image, photograph)
+        points = ProposedPoints(np.zeros(0, np.int32), np.zeros((len(proposals), 0), np.bool_))
+        if self.cloud is not None and photograph.distortion is None:
+            points = self.cloud.in_proposals(proposals, photograph.camera.resized(image.shape[1], image.shape[0]))
+        level = self.settings.level
+        return {
+            "masks": np.packbits(proposals.masks, axis=2),
+            "scores": proposals.scores,
+            "smallest_px": np.array(smallest_px),
+            "seen": points.seen,
+            "inside": points.inside,
+            f"{level}_ids": settle(proposals, smallest_px, self.preferences)[level].ids,
+        }
 
     def _proposals(self, image: NDArray[np.uint8], photograph: Photograph) -> tuple[Proposals, int]:
         """What the proposer says, after geometry, and the fewest pixels of a mask."""
@@ -292,15 +348,21 @@ class _SpacedCloud:
     """The points in their local frame, with their spacing."""
 
     def __init__(self, capture: Path) -> None:
-        from og_pointcloud.fitting.geometry import neighbourhood
+        from og_pointcloud.fitting.geometry import neighbourhood, sample_of_points
         from og_pointcloud.settings import GeometrySettings
 
         self.points = read_cloud(capture)
         self.spacing = neighbourhood(self.points.xyz, GeometrySettings()).spacing
+        self.asked = sample_of_points(self.points.xyz, AGREEMENT_POINTS)
 
     def depth(self, camera: Camera) -> NDArray[np.float32]:
         """camera: from world coordinates."""
         return rendered_depth(self.points.xyz, self.spacing, in_local_frame(camera, self.points.origin))
+
+    def in_proposals(self, proposals: Proposals, camera: Camera) -> ProposedPoints:
+        """camera: from world coordinates."""
+        camera = in_local_frame(camera, self.points.origin)
+        return points_of_proposals(proposals, self.points.xyz, self.spacing, self.asked, camera)
 
     def smallest_mask_px(self, camera: Camera) -> int:
         """camera: from world coordinates."""
@@ -406,6 +468,41 @@ def _work_through(
         )
 
 
+def _confirmed(tasks: Sequence[_Task], say: Callable[[str], None]) -> list[_Task]:
+    """The second pass over images whose proposals are all there, with scores that all of them had a say in."""
+    start = time.perf_counter()
+    kept = [_read_work(task.work_file, "scores", "seen", "inside") for task in tasks]
+    views = [ProposedPoints(work["seen"], work["inside"]) for work in kept]
+    agreed = agreement(views, 1 + max((int(view.seen.max(initial=-1)) for view in views), default=0))
+    told = np.concatenate(agreed)
+    told = told[~np.isnan(told)]
+    usual = float(np.median(told)) if len(told) else 1.0
+    say(
+        f"{len(told)} of {sum(map(len, agreed))} proposals were seen by other views, which confirm them by {usual:.2f} "
+        f"(median IoU; {(time.perf_counter() - start) / len(tasks):.2f} s an image)"
+    )
+    everyone = _digest(sorted(task.work_file.name for task in tasks))
+    return [
+        _Task(
+            task.photograph,
+            task.work_file.with_name(f"{task.work_file.stem}.{everyone}.npz"),
+            task.work_file,
+            rescored(work["scores"], found, usual),
+        )
+        for task, work, found in zip(tasks, kept, agreed, strict=True)
+    ]
+
+
+def _kept_proposals(task: _Task) -> tuple[Proposals, int]:
+    """What the first pass kept, with the scores of the second."""
+    assert task.proposals is not None
+    assert task.scores is not None
+    work = _read_work(task.proposals)
+    width = next(work[name] for name in work if name.endswith("_ids")).shape[1]
+    masks = np.unpackbits(work["masks"], axis=2, count=width).astype(np.bool_)
+    return Proposals(masks, task.scores), int(work["smallest_px"])
+
+
 def _spoken(seconds: float) -> str:
     return (
         f"{seconds:.0f} s"
@@ -418,7 +515,8 @@ def _spoken(seconds: float) -> str:
 
 def _write_preview(target: Path, settings: MaskSettings, tasks: Sequence[_Task]) -> None:
     pictures = [
-        (task.photograph.read(settings.longest_side), _read_work(task)[f"{settings.level}_ids"]) for task in tasks
+        (task.photograph.read(settings.longest_side), _read_work(task.work_file)[f"{settings.level}_ids"])
+        for task in tasks
     ]
     write_contact_sheet(target / PREVIEW_NAME, pictures)
 
@@ -426,15 +524,13 @@ def _write_preview(target: Path, settings: MaskSettings, tasks: Sequence[_Task])
 # The folder -------------------------------------------------------------------------------------------------------
 
 
-def _read_work(task: _Task) -> dict[str, NDArray[Any]]:
-    """Our own file, whole since it was renamed into place; another disk error is named."""
+def _read_work(file: Path, *names: str) -> dict[str, NDArray[Any]]:
+    """All arrays, or those named, of our own file, whole since it was renamed into place; disk errors are named."""
     try:
-        with np.load(task.work_file, allow_pickle=False) as arrays:
-            return {name: arrays[name] for name in arrays.files}
+        with np.load(file, allow_pickle=False) as arrays:
+            return {name: arrays[name] for name in names or arrays.files}
     except (ValueError, OSError, EOFError, KeyError, zipfile.BadZipFile) as error:
-        raise SceneError(
-            f"{task.work_file} cannot be read ({error}): remove it, and the same command makes it again"
-        ) from None
+        raise SceneError(f"{file} cannot be read ({error}): remove it, and the same command makes it again") from None
 
 
 def _assemble(target: Path, settings: MaskSettings, tasks: Sequence[_Task]) -> tuple[int, str]:
@@ -446,7 +542,7 @@ def _assemble(target: Path, settings: MaskSettings, tasks: Sequence[_Task]) -> t
     features: dict[str, Any] = {}
     masks, space = 0, UNKNOWN_SPACE
     for task in tasks:
-        work = _read_work(task)
+        work = _read_work(task.work_file)
         space, rows = str(work["feature_space"]), work[f"{settings.level}_features"]
         masks += len(rows)
         features[task.photograph.name] = rows

@@ -1,4 +1,4 @@
-"""What the points know about masks: where depth breaks off, how small a mask they still resolve, who agrees."""
+"""What the points know about masks: where depth breaks off, how small a mask they still resolve."""
 
 from __future__ import annotations
 
