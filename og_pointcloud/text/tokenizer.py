@@ -61,7 +61,8 @@ class Tokenizer:
             self._before, self._after = _frame(description.get("post_processor"))
             self._piece_ids = lru_cache(PIECES_REMEMBERED)(_model(description["model"]))
         except (KeyError, TypeError, AttributeError, IndexError, RecursionError, struct.error) as error:
-            raise ValueError(f"it is not in the form of a tokenizer.json ({type(error).__name__}: {error})") from None
+            what = f"{type(error).__name__}: {error!s:.80}"
+            raise ValueError(f"it is not in the form of a tokenizer.json ({what})") from None
         self._special_pattern = _any_of(self._specials)
         self._normalized_pattern = _any_of(self._normalized_specials)
         model = description["model"]
