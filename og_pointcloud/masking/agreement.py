@@ -95,14 +95,14 @@ def agreement(views: Sequence[ProposedPoints], count: int) -> list[NDArray[np.fl
         theirs_seen = every @ sight[[index]].toarray()[0]
         union = mine_seen[:, view_of] + theirs_seen - shared
         iou = shared / np.maximum(union, 1)
-        best = np.zeros(mine_seen.shape)
+        best = np.zeros(mine_seen.shape)  # float64 adds up float32 without rounding: views may come in any order
         if len(first):
             best[:, with_proposals] = np.maximum.reduceat(iou, first, axis=1)
         size = mine_seen[:, index : index + 1]
         told = (mine_seen >= ENOUGH_SHARE * size) & (mine_seen >= ENOUGH_POINTS)
         told[:, index] = False
         words = told.sum(axis=1)
-        total = np.sort(np.where(told, best, 0), axis=1).sum(axis=1)  # sorted: rounds alike in any order of views
+        total = np.where(told, best, 0).sum(axis=1)
         found.append(np.where(words > 0, total / np.maximum(words, 1), np.nan))
     return found
 
