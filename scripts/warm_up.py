@@ -1,13 +1,17 @@
-"""Compiles the kernels into numba's cache, so that the first fit of a new installation does not wait for it."""
+"""Compiles the kernels into numba's cache, so that the first fit and file of a new installation do not wait for it."""
+
+import tempfile
+from pathlib import Path
 
 import numpy as np
+from og_pointcloud_export import write_bundle
 
 from og_pointcloud.fitting.fit import fit
 from og_pointcloud.scene import Camera, Points, Scene, View
 
 
 def main() -> None:
-    """Fit a few points that three cameras see."""
+    """Fit a few points that three cameras see, and write them."""
     rng = np.random.default_rng(0)
     points = Points.from_world(rng.uniform(-1, 1, (200, 3)), rgb=rng.integers(0, 256, (200, 3), np.uint8))
     views = []
@@ -18,7 +22,9 @@ def main() -> None:
         masks[:, 32:] = 0
         image = np.zeros((48, 64, 3), np.uint8)
         views.append(View(str(index), Camera(64, 48, 60, 60, 32, 24, pose), masks, np.ones((1, 4), np.float32), image))
-    fit(Scene(points, tuple(views), "none"), progress=False)
+    cloud = fit(Scene(points, tuple(views), "none"), progress=False)
+    with tempfile.TemporaryDirectory() as folder:
+        write_bundle(cloud, Path(folder) / "warm_up.ogpc")
 
 
 if __name__ == "__main__":

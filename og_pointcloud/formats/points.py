@@ -40,7 +40,7 @@ def read_points(path: str | os.PathLike[str]) -> Points:
                 return gaussians_from_ply(elements)
             if "vertex" not in elements:
                 raise SceneError(
-                    f"no element 'vertex' of plain properties; the file has {', '.join(elements) or 'none'}"
+                    f"no element 'vertex' of plain properties; the file has {', '.join(elements) or 'none':.200}"
                 )
             return _cloud(elements["vertex"])
         if looks_like_pcd(head):
