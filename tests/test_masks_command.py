@@ -253,6 +253,14 @@ def test_masks_of_others_are_not_overwritten(tmp_path, capsys):
     assert "next: og-pointcloud fit" in out
 
 
+def test_the_demo_encoder_is_not_taken_without_a_word(tmp_path, capsys):
+    make_capture(tmp_path / "c", 1)
+    assert main(["masks", str(tmp_path / "c")]) == 0
+    assert "knows the demo room's furniture alone" in capsys.readouterr().err
+    assert main(["masks", str(tmp_path / "c"), "--encoder", "none"]) == 0
+    assert "demo room" not in capsys.readouterr().err
+
+
 def test_a_run_that_finds_all_done_does_nothing(tmp_path, capsys):
     make_capture(tmp_path / "c", 3)
     command = ["masks", str(tmp_path / "c"), "--encoder", "none"]

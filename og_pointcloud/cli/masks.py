@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import shlex
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -70,6 +71,12 @@ def run(arguments: argparse.Namespace) -> None:
         enough_views=ENOUGH_VIEWS if arguments.views == "auto" else None,
         download=arguments.download,
     )
+    if arguments.encoder == "demo":
+        warnings.warn(
+            "the demo encoder knows the demo room's furniture alone: words asked of other photographs mean little; take "
+            "a model's folder, --encoder FOLDER ('og-pointcloud models' lists them), or none",
+            stacklevel=1,
+        )
     made = make_masks(
         arguments.capture, settings, arguments.output, processes=arguments.processes, overwrite=arguments.overwrite
     )
