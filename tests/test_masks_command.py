@@ -471,3 +471,14 @@ def test_models_lists_and_downloads_nothing(tmp_path, capsys, monkeypatch):
     assert main(["models", str(tmp_path / "c")]) == 0
     assert "features of 'unknown' (width 1)" in capsys.readouterr().out
     assert before == [path for path in sorted(tmp_path.rglob("*")) if path in before]
+
+
+def test_processes_find_one_thread_each_and_the_environment_is_as_before(monkeypatch):
+    from og_pointcloud.masking.make_masks import _one_thread_each
+
+    monkeypatch.setenv("OMP_NUM_THREADS", "7")
+    monkeypatch.delenv("OPENBLAS_NUM_THREADS", raising=False)
+    before = dict(os.environ)
+    with _one_thread_each():
+        assert os.environ["OMP_NUM_THREADS"] == os.environ["OPENBLAS_NUM_THREADS"] == "1"
+    assert dict(os.environ) == before

@@ -17,6 +17,7 @@ import zipfile
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from hashlib import blake2b
 from multiprocessing import get_context
@@ -50,6 +51,7 @@ VERSION = 1
 WORK_FOLDER = "masks.work"
 MADE_NAME = "made.json"
 PREVIEW_NAME = "masks_preview.png"
+THREAD_VARIABLES = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 PREVIEW_IMAGES = 6
 REPORT_SECONDS = 10.0
 AGREEMENT_POINTS = 60_000
@@ -412,6 +414,22 @@ def _tried(worker: _Worker, task: _Task) -> str | None:
     return None
 
 
+@contextmanager
+def _one_thread_each() -> Iterator[None]:
+    """Processes started within multiply matrices on one thread: two that take two threads each on two cores are slower
+    than one alone. Read when a process imports numpy, so it must stand in the environment before."""
+    before = {name: os.environ.get(name) for name in THREAD_VARIABLES}
+    os.environ.update(dict.fromkeys(THREAD_VARIABLES, "1"))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
 def _results(
     capture: Path, settings: MaskSettings, tasks: Sequence[_Task], processes: int
 ) -> Iterator[tuple[_Task, str | None]]:
@@ -425,7 +443,8 @@ def _results(
         min(processes, len(tasks)), get_context("spawn"), initializer=_open_worker, initargs=(capture, settings)
     )
     try:
-        futures = {pool.submit(_work_on, task): task for task in tasks}
+        with _one_thread_each():
+            futures = {pool.submit(_work_on, task): task for task in tasks}  # which starts the processes
         for future in as_completed(futures):
             yield futures[future], future.result()
     except BrokenProcessPool:
