@@ -166,10 +166,19 @@ def methods(case: Case) -> dict[str, Answers]:
         "bank of 300": with_bank(WordBank(case.bank[some[:300]])),
         "bank of 100": with_bank(WordBank(case.bank[some[:100]])),
         "bank, two names a label": closest_pair,
+        "bank, one descriptor": Chooser(one_descriptor_each(table), bank).choose,
     }
     if len(case.negatives):
         chosen["bank and negatives"] = lambda texts: Chooser(table, bank).choose(texts, case.negatives)
     return chosen
+
+
+def one_descriptor_each(table: og.InstanceTable) -> og.InstanceTable:
+    """The table with the mean of each instance's descriptors, where its views disagreed and left it several."""
+    owners, row = np.unique(table.descriptor_instance, return_inverse=True)
+    total = np.zeros((len(owners), table.descriptors.shape[1]), np.float32)
+    np.add.at(total, row, table.descriptors)
+    return replace(table, descriptors=unit(total), descriptor_instance=owners.astype(np.int32))
 
 
 def fixed_sharpness(table: og.InstanceTable, bank: WordBank) -> Answers:
