@@ -9,6 +9,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
+from scipy.sparse import csr_array
+
+from og_pointcloud.report.baselines import uplift
 
 __all__ = ["ceiling", "direct_uplift"]
 
@@ -21,10 +24,7 @@ def direct_uplift(
     weights: (M, n), features: (M, D), texts: (C, D). Returns (n,) int32 class ids. A point is -1 only where no mask
     reaches it: uplift knows no background, and labels what a mask's rays slip through to.
     """
-    similarity = _unit(features) @ _unit(texts).T
-    scores = np.asarray(weights.T @ similarity)
-    reached = np.asarray(weights.sum(axis=0)).ravel() > 0
-    return np.where(reached, scores.argmax(axis=1), -1).astype(np.int32)
+    return uplift(csr_array(weights), _unit(features), texts).astype(np.int32)
 
 
 def ceiling(

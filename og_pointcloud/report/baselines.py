@@ -27,7 +27,7 @@ from og_pointcloud.fitting.testimony import hear_views
 from og_pointcloud.scene import Scene
 from og_pointcloud.settings import FitSettings
 
-__all__ = ["BASELINES", "centre_sampling", "compressed_uplift", "direct_uplift", "mask_graph", "nearest_view"]
+__all__ = ["BASELINES", "centre_sampling", "compressed_uplift", "direct_uplift", "mask_graph", "nearest_view", "uplift"]
 
 COMPRESSED_WIDTH = 3
 """Numbers a feature in LangSplat's scenes (its Sec. 4)."""
@@ -39,7 +39,7 @@ Baseline = Callable[[Scene, Prepared, Words], Labels]
 
 def direct_uplift(scene: Scene, prepared: Prepared, words: Words) -> Labels:
     """Each point takes the word nearest to the mean feature of the masks that show it."""
-    return _uplifted(prepared.table.weights, prepared.table.unit_features, words)
+    return uplift(prepared.table.weights, prepared.table.unit_features, words)
 
 
 def compressed_uplift(scene: Scene, prepared: Prepared, words: Words) -> Labels:
@@ -48,7 +48,7 @@ def compressed_uplift(scene: Scene, prepared: Prepared, words: Words) -> Labels:
     middle = features.mean(axis=0)
     _, _, directions = np.linalg.svd(features - middle, full_matrices=False)
     basis = directions[:COMPRESSED_WIDTH]
-    return _uplifted(prepared.table.weights, (features - middle) @ basis.T @ basis + middle, words)
+    return uplift(prepared.table.weights, (features - middle) @ basis.T @ basis + middle, words)
 
 
 def nearest_view(scene: Scene, prepared: Prepared, words: Words) -> Labels:
@@ -113,7 +113,8 @@ BASELINES: dict[str, Baseline] = {
 }
 
 
-def _uplifted(weights: csr_array, features: NDArray[np.floating], words: Words) -> Labels:
+def uplift(weights: csr_array, features: NDArray[np.floating], words: Words) -> Labels:
+    """(n,) the word nearest to the mean of the features (M, D) by the weights (M, n); -1 where no mask reaches."""
     # A mean's cosines are in the order of its products with the words: it need not be made, nor be of length 1.
     scores = np.asarray(weights.T @ (features @ _unit(words).T))
     reached = np.asarray(weights.sum(axis=0)).ravel() > 0
