@@ -18,7 +18,7 @@ from capture_files import HEIGHT, WIDTH, make_world, write_colmap_text, write_pl
 from og_pointcloud.cli import main
 from og_pointcloud.errors import OgPointcloudError, SceneError
 from og_pointcloud.formats.capture import read_capture
-from og_pointcloud.masking import make_masks as module
+from og_pointcloud.masking import image_worker
 from og_pointcloud.masking.make_masks import PREVIEW_NAME, WORK_FOLDER, MaskSettings, make_masks
 
 ALONE = MaskSettings(encoder=None)
@@ -155,7 +155,7 @@ def test_two_passes_killed_after_the_first_go_on(tmp_path, monkeypatch):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(module, "_kept_proposals", killed)
+        patch.setattr(image_worker, "_kept_proposals", killed)
         with pytest.raises(KeyboardInterrupt):
             make_masks(tmp_path / "c", AGREED, say=silent)
     made = make_masks(tmp_path / "c", AGREED, say=silent)
@@ -181,14 +181,15 @@ def test_nothing_to_agree_with(tmp_path, lacking):
 
 SLOWLY = """
 import sys, time
+from og_pointcloud.masking import image_worker as w
 from og_pointcloud.masking import make_masks as m
-settle = m.settle
+settle = w.settle
 def slow(*arguments):
     with open(sys.argv[2], "a") as log:
         log.write("x")
     time.sleep(float(sys.argv[3]))
     return settle(*arguments)
-m.settle = slow
+w.settle = slow
 m.make_masks(sys.argv[1], m.MaskSettings(encoder=None))
 """
 
@@ -473,12 +474,20 @@ def test_models_lists_and_downloads_nothing(tmp_path, capsys, monkeypatch):
     assert before == [path for path in sorted(tmp_path.rglob("*")) if path in before]
 
 
+def test_light_work_takes_a_process_a_core_and_models_take_one(monkeypatch, tmp_path):
+    monkeypatch.setattr(os, "cpu_count", lambda: 4)
+    assert [ALONE.processes_for(images) for images in (1, 8, 16, 31, 1000)] == [1, 1, 2, 3, 4]
+    assert MaskSettings(proposer=str(tmp_path)).processes_for(1000) == 4  # a folder of masks
+    assert MaskSettings(proposer="sam:facebook/sam-vit-base").processes_for(1000) == 1
+    assert MaskSettings(encoder="openai/clip-vit-base-patch16").processes_for(1000) == 1
+
+
 def test_processes_find_one_thread_each_and_the_environment_is_as_before(monkeypatch):
-    from og_pointcloud.masking.make_masks import _one_thread_each
+    from og_pointcloud.masking.side_by_side import one_thread_each
 
     monkeypatch.setenv("OMP_NUM_THREADS", "7")
     monkeypatch.delenv("OPENBLAS_NUM_THREADS", raising=False)
     before = dict(os.environ)
-    with _one_thread_each():
+    with one_thread_each():
         assert os.environ["OMP_NUM_THREADS"] == os.environ["OPENBLAS_NUM_THREADS"] == "1"
     assert dict(os.environ) == before

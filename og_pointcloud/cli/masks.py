@@ -44,14 +44,17 @@ def add(commands: Any) -> None:
     parser.add_argument("--depth", action="store_true", help="let the proposer use the points' depth as well")
     parser.add_argument("--split", action="store_true", help="split masks where the points' depth breaks off")
     parser.add_argument("--drop-tiny", action="store_true", help="drop masks that the points do not resolve")
-    parser.add_argument("--processes", type=int, default=1, metavar="N", help="images worked on side by side")
+    parser.add_argument(
+        "--processes", type=int, metavar="N",
+        help="images worked on side by side (default: a core each, one alone with models of their own)",
+    )  # fmt: skip
     parser.add_argument("--overwrite", action="store_true", help="replace masks of others, or make all again")
     parser.add_argument("--download", action="store_true", help="fetch a SAM model that is not there yet")
     parser.add_argument("-o", "--output", type=Path, metavar="DIR", help="a capture of its own (default: CAPTURE)")
 
 
 def run(arguments: argparse.Namespace) -> None:
-    if arguments.processes < 1:
+    if arguments.processes is not None and arguments.processes < 1:
         raise OgPointcloudError(f"--processes is {arguments.processes}; expected at least 1")
     if arguments.seconds_per_image is not None and not arguments.seconds_per_image > 0:
         raise OgPointcloudError(f"--seconds-per-image is {arguments.seconds_per_image}; expected more than 0")
