@@ -41,6 +41,25 @@ def add_command(commands: Any, name: str, run: Any, summary: str, example: str) 
     return parser
 
 
+def add_model_options(parser: Parser) -> None:
+    """What exporting either half of a model is told: whose weights, where to, in which feature space."""
+    parser.add_argument(
+        "source", type=Path, metavar="SOURCE",
+        help="transformers or OpenCLIP folder, or a file of weights (.safetensors, weights-only .pt)",
+    )  # fmt: skip
+    parser.add_argument(
+        "-o", "--output", type=Path, metavar="DIR",
+        help="the folder to write (default: in the user's cache, where it is found by its feature space)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--feature-space", metavar="OWNER/MODEL",
+        help="as scenes name it (og-pointcloud info S.ogpc); default: what the model's configuration calls itself",
+    )  # fmt: skip
+    parser.add_argument(
+        "--activation", choices=("quick_gelu", "gelu", "gelu_pytorch_tanh"), help="of weights that do not say"
+    )
+
+
 def did_you_mean(word: str, known: Iterable[str]) -> str:
     close = difflib.get_close_matches(word, list(known), n=3)
     return f"; did you mean {' or '.join(repr(match) for match in close)}?" if close else ""

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 from typing import Any
 
-from og_pointcloud.cli.common import add_command
+from og_pointcloud.cli.common import add_command, add_model_options
 
 
 def add(commands: Any) -> None:
@@ -14,21 +13,7 @@ def add(commands: Any) -> None:
         commands, "export-image-encoder", run, "Make a model's image encoder usable without torch.",
         "og-pointcloud export-image-encoder clip-vit-base-patch32 --feature-space openai/clip-vit-base-patch32",
     )  # fmt: skip
-    parser.add_argument(
-        "source", type=Path, metavar="SOURCE",
-        help="transformers or OpenCLIP folder, or a file of weights (.safetensors, weights-only .pt)",
-    )  # fmt: skip
-    parser.add_argument(
-        "-o", "--output", type=Path, metavar="DIR",
-        help="the folder to write (default: in the user's cache, where it is found by its feature space)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--feature-space", metavar="OWNER/MODEL",
-        help="the text encoder's; default: what the model's configuration calls itself",
-    )  # fmt: skip
-    parser.add_argument(
-        "--activation", choices=("quick_gelu", "gelu", "gelu_pytorch_tanh"), help="of weights that do not say"
-    )
+    add_model_options(parser)
     parser.add_argument(
         "--crops", choices=("context", "langsplat"), default="context",
         help="how masks are cut out unless a caller says otherwise (default: %(default)s)",

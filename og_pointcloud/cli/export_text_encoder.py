@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from og_pointcloud.cli.common import add_command
+from og_pointcloud.cli.common import add_command, add_model_options
 
 
 def add(commands: Any) -> None:
@@ -15,25 +15,11 @@ def add(commands: Any) -> None:
         commands, "export-text-encoder", run, "Make a model's text encoder usable without torch.",
         "og-pointcloud export-text-encoder clip-vit-base-patch32 --feature-space openai/clip-vit-base-patch32",
     )  # fmt: skip
-    parser.add_argument(
-        "source", type=Path, metavar="SOURCE",
-        help="transformers or OpenCLIP folder, or a file of weights (.safetensors, weights-only .pt)",
-    )  # fmt: skip
-    parser.add_argument(
-        "-o", "--output", type=Path, metavar="DIR",
-        help="the folder to write (default: in the user's cache, where every scene of this feature space finds it)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--feature-space", metavar="OWNER/MODEL",
-        help="as scenes name it (og-pointcloud info S.ogpc); default: what the model's configuration calls itself",
-    )  # fmt: skip
+    add_model_options(parser)
     parser.add_argument(
         "--template", action="append", metavar="TEXT",
         help="what a name is put into, such as 'a photo of a {}.'; several are averaged (default: {})",
     )  # fmt: skip
-    parser.add_argument(
-        "--activation", choices=("quick_gelu", "gelu", "gelu_pytorch_tanh"), help="of weights that do not say"
-    )
     parser.add_argument(
         "--tokenizer", type=Path, metavar="FILE",
         help="tokenizer.json, merges.txt, bpe_simple_vocab_16e6.txt.gz or spiece.model (default: beside the weights)",
