@@ -3,13 +3,21 @@
 import ast
 import doctest
 import importlib
+import inspect
 import re
+import shlex
 import sys
 from pathlib import Path
 
 import pytest
 
+import og_pointcloud as og
 from og_pointcloud.cli import build_parser
+from og_pointcloud.cli.eval_ import capture, scannet
+from og_pointcloud.metrics import score_labels
+from og_pointcloud.scoring import blocks as spatial_blocks
+from og_pointcloud.scoring import instances, lerf, lerf_selection, truth
+from og_pointcloud.scoring import scannet as scannet_rules
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -43,6 +51,16 @@ def test_commands_and_options_exist(page, commands):
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_whole_commands_are_understood(page):
+    """Lines of shell blocks: every argument that is needed is there, and every choice is one."""
+    for block in blocks(page, "bash"):
+        for line in block.replace("\\\n", " ").splitlines():
+            program, *words = shlex.split(re.sub(r"\[[^\]]*\]", "", line), comments=True) or [""]
+            if program == "og-pointcloud":
+                assert build_parser().parse_known_args(words)[1] == [], line
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_links_lead_somewhere(page):
     for target in re.findall(r"\]\(([^)#]+?)(?:#[^)]*)?\)", page.read_text()):
         if not target.startswith("http"):
@@ -57,6 +75,49 @@ def test_python_in_pages_is_python_and_imports_what_exists(page):
                 module = importlib.import_module(node.module)
                 for alias in node.names:
                     assert hasattr(module, alias.name), f"{node.module}.{alias.name}"
+            if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "og":
+                assert hasattr(og, node.attr), f"og.{node.attr}"
+
+
+def section(page, title):
+    """The text between a heading of the second level and the next."""
+    return re.search(rf"^## {title}\n(.*?)(?=^## |\Z)", (ROOT / page).read_text(), re.S | re.M).group(1)
+
+
+def first_cells(text):
+    """What the first column of the section's tables has in backquotes."""
+    return [name for row in re.findall(r"^\| (`.+?) \|", text, re.M) for name in re.findall(r"`([^`]+)`", row)]
+
+
+def test_columns_on_the_page_of_scores_are_the_commands_own():
+    for title, header, change in (
+        ("eval capture", capture.HEADER, ["less the other"]),
+        ("eval scannet", scannet.HEADER, []),
+    ):
+        text = section("docs/scores.md", title)
+        assert sorted(first_cells(text)) == sorted([*header[1:], *change])
+    assert first_cells(section("docs/scores.md", "eval lerf")) == [*lerf_selection.WAYS, lerf_selection.ORACLE]
+
+
+def test_rules_on_the_page_of_scores_are_the_codes_own():
+    for title, said in {
+        "eval capture": (f"fewer than {truth.VOTES}, agree", "fewer than half of the votes", "fewer than 30 counted"),
+        "eval scannet": (
+            f"opacity below {scannet_rules.OPACITY_COUNTED}",
+            f"Tasks of {', '.join(map(str, list(scannet_rules.TASKS)[:2]))} and {list(scannet_rules.TASKS)[2]} classes",
+            f"<scene>{scannet.LABELS}",
+        ),
+        "eval lerf": (f"alpha above {lerf.ALPHA_SHOWN}", f"`over {lerf.IOU_FOUND}`", lerf_selection.LABEL_FOLDER),
+        "Intervals": (
+            f"{spatial_blocks.SMALLEST_EDGE:g}\npoint spacings",
+            f"at least {spatial_blocks.FEWEST_BLOCKS} cubes",
+        ),
+        "Instances and boxes": (f"fewer than {instances.SMALLEST_INSTANCE} points", f"above\n{instances.MATCHED}"),
+    }.items():
+        for words in said:
+            assert words in section("docs/scores.md", title), words
+    assert truth.AGREED == 0.5
+    assert inspect.signature(score_labels).parameters["min_points"].default == 30
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)

@@ -12,6 +12,7 @@ from conftest import NAMES, write_tiny_capture
 from labelled_clouds import SPACE, WIDTH, instance_table, make_cloud
 
 import og_pointcloud as og
+from og_pointcloud.choosing import WordBank
 from og_pointcloud.cli import main
 from og_pointcloud.cloud import BACKGROUND
 from og_pointcloud.formats.ply import write_ply
@@ -169,10 +170,92 @@ def test_scenes_are_asked_for_the_names_of_the_table(scannet, capsys):
     assert report["scenes"]["scene0062_00"]["class_iou"] == {"1": 0.5, "2": 1.0}
     assert report["scenes"]["scene0062_00"]["answered_miou"] == 1
     assert report["miou"] == pytest.approx(0.75)
+    # Without a bank no instance may abstain: as asked and as forced are one.
+    assert report["forced_miou"] == report["miou"]
     # All cosines are 1, so the 7 answered points come together, one wrong; then the unknown one: (1/7) 7/8 + (2/8) 1/8.
     assert report["risk_area"] == pytest.approx(1 / 8 + 1 / 32, abs=1e-6)
     assert "risk area" in out
     assert (scannet / "r.png").read_bytes().startswith(PNG)
+
+
+def test_a_scene_that_abstains_is_also_scored_as_if_it_might_not(scannet, capsys):
+    """In the bank are 60 words as like the floor's descriptor as "floor" is: instance 1 says that none fits. Made to
+    choose, it says floor, as it does without the bank."""
+    bank = np.random.default_rng(2).normal(size=(60, WIDTH)).astype(np.float32)
+    bank[:20] = np.eye(3, WIDTH, dtype=np.float32)[1] + 0.3 * bank[:20] / np.linalg.norm(bank[:20], axis=1)[:, None]
+    for file in (scannet / "p").glob("*.ogpc"):
+        og.write_bundle(replace(og.load(file).cloud, word_bank=WordBank(bank)), file)
+    assert main(command(scannet, "--json", str(scannet / "s.json"))) == 0
+    report = json.loads((scannet / "s.json").read_text())["19"]
+    assert report["scenes"]["scene0062_00"]["class_iou"]["2"] == 0
+    assert report["forced_miou"] == pytest.approx(0.75)  # as without a bank, above
+    assert report["miou"] < 0.75
+    assert "forced" in capsys.readouterr().out
+
+
+def test_names_that_are_no_class_are_told(scannet, capsys):
+    names = np.array(["Wall", "floor", "unicorn"])  # the last is never said
+    np.savez(scannet / "p/scene0062_00.npz", labels=np.array([0, -1, 1, 1]), names=names)
+    (scannet / "p/scene0062_00.ogpc").unlink()
+    assert main(command(scannet, "--json", str(scannet / "s.json"))) == 0
+    assert "said, but no class of the table, so wrong everywhere: Wall\n" in capsys.readouterr().out
+    report = json.loads((scannet / "s.json").read_text())["19"]
+    assert report["scenes"]["scene0062_00"]["class_iou"] == {"1": 0.0, "2": 1.0}
+    assert report["forced_miou"] is None  # of stored labels it is not known what else they might have said
+
+
+def test_scenes_without_a_point_of_the_task_are_left_out(scannet, capsys):
+    """Bathtubs are among the 19 classes, not among the 10; nothing is where all scenes are of other things."""
+    write_labels(scannet / "other", "scene0000_00", np.zeros((4, 3)), [36, 36, 40, 0])
+    write_labels(scannet / "other", "scene0062_00", np.zeros((4, 3)), [WALL, WALL, 40, 0])
+    for scene, said in (("scene0000_00", "bathtub"), ("scene0062_00", "wall")):
+        (scannet / f"p/{scene}.ogpc").unlink()
+        np.savez(scannet / f"p/{scene}.npz", labels=np.array([0, -1, 0, 0]), names=np.array([said]), scores=np.ones(4))
+    folders = ["eval", "scannet", str(scannet / "other"), "--predictions", str(scannet / "p")]
+    assert main([*folders, "--json", str(scannet / "s.json"), "--against", str(scannet / "p")]) == 0
+    report = json.loads((scannet / "s.json").read_text())
+    assert (report["19"]["miou"], report["10"]["miou"]) == (0.5, 0.5)  # 1 of 2 each
+    assert report["10"]["scenes"]["scene0000_00"] == {
+        "miou": None, "macc": None, "class_iou": {}, "points": 0, "all_points_miou": None, "answered_miou": None,
+        "answered_share": None,
+    }  # fmt: skip
+    assert report["10"]["interval"] == [0.5, 0.5]
+    capsys.readouterr()
+    assert main([*folders, "--scenes", "scene0000_00", "--json", str(scannet / "s.json")]) == 0
+    ten = json.loads((scannet / "s.json").read_text(), parse_constant=lambda name: pytest.fail(name))["10"]
+    assert (ten["miou"], ten["flat_miou"], ten["risk_area"], ten["interval"]) == (None,) * 4
+    row = next(line for line in capsys.readouterr().out.splitlines() if line.startswith("10 classes"))
+    assert set(row.split()[2:]) == {"-"}
+
+
+@pytest.mark.parametrize("ending", ["npz", "ogpc"])
+def test_an_empty_prediction_file_is_one_error(ending, scannet, capsys):
+    (scannet / "p/scene0062_00.ogpc").unlink()
+    (scannet / f"p/scene0062_00.{ending}").write_bytes(b"")
+    assert main(command(scannet)) == 2
+    captured = capsys.readouterr()
+    assert f"scene0062_00.{ending}" in captured.err
+    assert (captured.out, captured.err.count("\n")) == ("", 1)
+
+
+def test_predictions_of_no_points_are_one_error(scannet, capsys):
+    (scannet / "p/scene0062_00.ogpc").unlink()
+    np.savez(scannet / "p/scene0062_00.npz", labels=np.zeros(0, int), names=np.array(["wall"]))
+    assert main(command(scannet)) == 2
+    assert "has 0 labels, the scene 4 points; expected one each" in capsys.readouterr().err
+
+
+def test_points_that_lie_in_one_place_count_each(scannet):
+    """ScanNet's meshes repeat vertices: three floors in one place, of which one is labelled wall, are three points."""
+    truth = [WALL, WALL, FLOOR, FLOOR, FLOOR, WALL]
+    xyz = np.array([0, 1, 2, 3, 3, 3])[:, None] * np.array([1.0, 0, 0])
+    write_labels(scannet / "twice", "scene0062_00", xyz, truth)
+    folders = ["--predictions", str(scannet / "p"), "--text-features", str(scannet / "w.npz")]
+    assert main(["eval", "scannet", str(scannet / "twice"), *folders, "--json", str(scannet / "s.json")]) == 0
+    scene = json.loads((scannet / "s.json").read_text())["19"]["scenes"]["scene0062_00"]
+    # Said are wall, nothing, floor, floor, floor, floor. Wall: 1 of 3. Floor: 3 of 3 + 1.
+    assert scene["class_iou"] == {"1": pytest.approx(1 / 3), "2": 3 / 4}
+    assert scene["points"] == 6
 
 
 def test_answers_are_those_of_the_points_that_count():

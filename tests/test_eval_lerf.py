@@ -18,7 +18,7 @@ from labelled_clouds import SPACE, make_cloud
 import og_pointcloud as og
 from og_pointcloud.choosing import WordBank
 from og_pointcloud.cli import main
-from og_pointcloud.cloud import InstanceTable
+from og_pointcloud.cloud import BACKGROUND, InstanceTable
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.gaussian_ply import write_gaussian_ply
 from og_pointcloud.scene import Points
@@ -177,6 +177,55 @@ def test_another_method_is_compared_on_the_same_pairs(data, capsys):
     assert main(command(data, "--scenes", "figurines", "--against", str(data / "q"))) == 0
     # The swapped one finds the fork for the cup, and the cup for the others: 0 everywhere.
     assert f"best: less {data / 'q'}, all pairs: +59.0" in capsys.readouterr().out  # (1 + 1/2 + 1/9 + 3/4) / 4
+
+
+def test_frames_without_objects_and_objects_outside_the_image(data, capsys):
+    """A frame with nothing outlined has no pair; a scene of such frames is no part of the mean. What is outlined beside
+    the image has no pixel: nothing can be found of it, and it scores 0."""
+    write_labels(data / "d", "figurines", "frame_00099", [("duck", outline(-30, -30, 4))])
+    write_labels(data / "d", "teatime", "frame_00002", [])
+    assert main(command(data, "--json", str(data / "s.json"))) == 0
+    report = json.loads((data / "s.json").read_text())
+    assert report["scenes"]["teatime"] == []
+    (outside,) = [pair for pair in report["scenes"]["figurines"] if pair["frame"] == "frame_00099"]
+    assert set(outside["iou"].values()) == {0}
+    best = report["means"]["best"]
+    assert best["miou"] == best["flat_miou"] == pytest.approx((1 + 1 / 2 + 1 / 9 + 3 / 4 + 0) / 5)
+    row = next(line for line in capsys.readouterr().out.splitlines() if line.startswith("teatime"))
+    assert row.split() == ["teatime", "0", *"-" * 6]
+    assert main(command(data, "--scenes", "teatime")) == 2
+    assert "no labelled object in any frame" in capsys.readouterr().err
+
+
+def test_a_scene_without_instances_selects_nothing(data):
+    """Nothing is an answer, and scores 0; a file of no bytes is none."""
+    cloud = og.load(data / "p/teatime.ogpc").cloud
+    og.write_bundle(replace(cloud, instance_ids=np.full(len(cloud), BACKGROUND, np.int32)), data / "p/teatime.ogpc")
+    assert main(command(data, "--scenes", "teatime", "--oracle", "--json", str(data / "s.json"))) == 0
+    (pair,) = json.loads((data / "s.json").read_text())["scenes"]["teatime"]
+    assert pair["iou"] == {"best": 0, "calibrated": 0, "among": 0, "oracle": 0}
+    assert pair["selected"] == {"best": 0, "calibrated": 0, "among": 0}
+
+
+def test_an_empty_prediction_is_one_error(data, capsys):
+    (data / "p/teatime.ogpc").write_bytes(b"")
+    assert main(command(data)) == 2
+    captured = capsys.readouterr()
+    assert "teatime.ogpc" in captured.err
+    assert (captured.out, captured.err.count("\n")) == ("", 1)
+
+
+def test_gaussians_that_lie_in_one_place_are_one_to_the_eye(data):
+    """Every Gaussian twice: what is covered at 0.99 is covered, and the scores are the same."""
+    figurines = og.load(data / "p/figurines.ogpc").cloud
+    doubled = {"xyz": np.tile(figurines.xyz, (2, 1)), "instance_ids": np.tile(figurines.instance_ids, 2)}
+    twice = replace(figurines, **doubled, rgb=None)
+    write_gaussians(data / "twice.ply", twice)
+    labels, words = read_scene(data / "d", "figurines"), data / "w.npz"
+    once = data / "g/figurines/point_cloud/iteration_7/point_cloud.ply"
+    found = score_pairs(og.LabelledScene.from_cloud(twice), labels, gaussians_of(twice, data / "twice.ply"), words)
+    known = score_pairs(og.LabelledScene.from_cloud(figurines), labels, gaussians_of(figurines, once), words)
+    assert [pair.iou for pair in found] == [pair.iou for pair in known]
 
 
 @pytest.mark.parametrize(

@@ -145,6 +145,41 @@ def test_draws_in_parts_are_draws(monkeypatch):
         miou_interval(*arguments[:-1], ())
 
 
+def test_points_in_one_place_are_one_block_and_a_length_of_zero_is_refused():
+    """Copies of one point say nothing new: no draw differs from another. Copied once each, all is as before."""
+    rng = np.random.default_rng(5)
+    called, truth = rng.integers(-1, 2, 400), truth_of(rng.integers(0, 2, 400))
+    classes = (0, 1)
+    whole = score_labels(called, truth.cls)
+    one_place = miou_interval(called, truth, np.zeros((400, 3)), 1.0, classes)
+    assert one_place.blocks == 1
+    assert one_place.low == one_place.mean == one_place.high == pytest.approx(whole.miou)
+    xyz = rng.random((400, 3))
+    found = miou_interval(called, truth, xyz, 0.02, classes)
+    twice = [np.tile(array, 2) for array in (called, truth.cls)]
+    assert miou_interval(twice[0], truth_of(twice[1]), np.tile(xyz, (2, 1)), 0.02, classes) == found
+    for spacing in (0.0, np.nan, np.inf):
+        with pytest.raises(OgPointcloudError, match="expected a length above 0"):
+            miou_interval(called, truth, xyz, spacing, classes)
+
+
+def test_a_class_that_is_not_there_has_no_score_and_is_a_miss_where_it_is_said():
+    """The truth has cups alone. 20 of 50 are called pots, as are 10 points of background and 5 whose truth is not
+    relied on."""
+    cls = np.repeat([0, -1, 0], [50, 30, 5])
+    called = np.repeat([1, 0, -1, 1, -1, 1], [20, 20, 10, 10, 20, 5])
+    scored = np.arange(85) < 80
+    truth = truth_of(cls, cls < 0, scored=scored)
+    score = score_labels(called, cls, scored=scored, background=truth.background)
+    assert (score.classes, score.class_iou, score.class_accuracy) == ((0,), (20 / 50,), (20 / 50,))
+    assert (score.unknown_share, score.background_called) == (10 / 50, 10 / 30)
+    answer = Answer(called, np.ones(85, np.float32), np.zeros(85, int), far_apart(85).astype(np.float32), 1.0)
+    whole = score_capture(answer, truth)
+    assert whole.labels == score
+    assert whole.interval.mean == pytest.approx(20 / 50)
+    assert (whole.answered.class_iou, whole.answered_share) == ((20 / 40,), 40 / 50)
+
+
 # A whole answer -------------------------------------------------------------------------------------------------
 
 

@@ -62,7 +62,7 @@ def miou_interval(
     """Of the mean IoU that `score_labels` gives.
 
     called: (n,) classes of the truth, below 0 unknown (`Truth.class_of`). xyz: (n, 3). spacing: of its points, same
-    unit. classes: those that the score is a mean over. Raises OgPointcloudError where there are none.
+    unit. classes: those that the score is a mean over. Raises OgPointcloudError where there are none, or no spacing.
     """
     return _widest([called], truth, xyz, spacing, classes, seed)
 
@@ -82,6 +82,8 @@ def _widest(
 ) -> BlockInterval:  # fmt: skip
     if not classes:
         raise OgPointcloudError("no class has enough points to be scored; expected one or more")
+    if not (np.isfinite(spacing) and spacing > 0):
+        raise OgPointcloudError(f"the point spacing is {spacing:g}; expected a length above 0, in the points' unit")
     evaluated = truth.scored & np.isin(truth.cls, classes)
     counted = evaluated if truth.background is None else evaluated | truth.background
     points, own = np.asarray(xyz, np.float64)[counted], evaluated[counted]

@@ -26,19 +26,37 @@ NOT_OF_THE_TABLE = 40
 
 @dataclass(frozen=True)
 class Predicted:
-    """ids: (n,) NYU40, 0 unknown. confidence: (n,), None where a file of labels has none."""
+    """ids: (n,) NYU40, 0 unknown. confidence: (n,), None where a file of labels has none. forced: (n,) as ids, but
+    every instance with a feature takes a class; None for stored labels. strange: names said that are no class."""
 
     ids: NDArray[np.int64]
     confidence: NDArray[np.floating] | None
+    forced: NDArray[np.int64] | None
+    strange: frozenset[str]
+
+
+@dataclass(frozen=True)
+class SceneResult:
+    """One scene, one task. forced: mIoU of `Predicted.forced`. correct, confidence: of the protocol's points."""
+
+    score: SceneScore
+    forced: float | None
+    correct: NDArray[np.bool_]
+    confidence: NDArray[np.float64]
+    has_confidence: bool
+    strange: frozenset[str]
 
 
 @dataclass(frozen=True)
 class TaskResult:
-    """scenes: by name. curve: of the points of all scenes together, None without confidences. answered: their share."""
+    """scenes: by name. forced: its mean over scenes, None with stored labels. curve: of the points of all scenes
+    together, None without confidences. answered: their share. strange: names said that are no class."""
 
     scenes: dict[str, SceneScore]
+    forced: float | None
     curve: RiskCoverage | None
     answered: float
+    strange: frozenset[str]
 
 
 def add(protocols: Any) -> None:
@@ -84,6 +102,8 @@ def run(arguments: argparse.Namespace) -> None:
     print_table(HEADER + (("less the other",) if others else ()), rows)
     published = sum(scene in SCENES for scene in files)
     print(f"{len(files)} scenes, {published} of the {len(SCENES)} of the published table; intervals are over scenes")
+    if strange := sorted(frozenset().union(*(result.strange for result in own.values()))):
+        print(f"said, but no class of the table, so wrong everywhere: {', '.join(strange[:5])}")
     if arguments.gaussians is None:
         print("no --gaussians: transparent points are not ignored, so mIoU is that of all points")
     if arguments.plot:
@@ -101,7 +121,7 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 HEADER = (
-    "", "mIoU", "mAcc", "flat mIoU", "all points", "answered", "share answered", "risk area", "95 % of mIoU",
+    "", "mIoU", "mAcc", "forced", "flat mIoU", "all points", "answered", "share answered", "risk area", "95 % of mIoU",
 )  # fmt: skip
 
 
@@ -109,30 +129,53 @@ def score_files(
     files: dict[str, Path], predictions: dict[str, Path], arguments: argparse.Namespace
 ) -> dict[int, TaskResult]:
     """Every task over all scenes."""
+    from og_pointcloud.scoring.scannet import TASKS
+
+    scenes = {scene: score_file(scene, file, predictions[scene], arguments) for scene, file in files.items()}
+    return {task: over_all({scene: of_task[task] for scene, of_task in scenes.items()}) for task in TASKS}
+
+
+def score_file(scene: str, file: Path, prediction: Path, arguments: argparse.Namespace) -> dict[int, SceneResult]:
+    """Every task of one scene."""
     import numpy as np
 
     from og_pointcloud.scoring.scannet import TASKS, read_truth, score_scene, scored_answers
-    from og_pointcloud.scoring.spread import risk_coverage
 
-    scores: dict[int, dict[str, SceneScore]] = {task: {} for task in TASKS}
-    answers: dict[int, list[tuple[NDArray[np.bool_], NDArray[np.float64]]]] = {task: [] for task in TASKS}
-    unsaid = set()
-    for scene, file in files.items():
-        xyz, truth = read_truth(file)
-        opacity = opacities(arguments.gaussians, scene, len(truth))
-        for task in TASKS:
-            found = predicted(predictions[scene], xyz, task, arguments.text_features)
-            scores[task][scene] = score_scene(found.ids, truth, task, opacity)
-            unsaid |= {scene} if found.confidence is None else set()
-            confidence = np.zeros(len(truth)) if found.confidence is None else found.confidence
-            answers[task].append(scored_answers(found.ids, confidence, truth, task, opacity))
+    xyz, truth = read_truth(file)
+    opacity = opacities(arguments.gaussians, scene, len(truth))
     results = {}
     for task in TASKS:
-        correct, confidence = (np.concatenate(column) for column in zip(*answers[task], strict=True))
-        curve = risk_coverage(correct, confidence) if len(correct) and not unsaid else None
-        share = float(np.isfinite(confidence).mean()) if len(correct) else float("nan")
-        results[task] = TaskResult(scores[task], curve, share)
+        found = predicted(prediction, xyz, task, arguments.text_features)
+        forced = None if found.forced is None else score_scene(found.forced, truth, task, opacity).protocol.miou
+        confidence = np.zeros(len(truth)) if found.confidence is None else found.confidence
+        results[task] = SceneResult(
+            score_scene(found.ids, truth, task, opacity),
+            forced,
+            *scored_answers(found.ids, confidence, truth, task, opacity),
+            found.confidence is not None,
+            found.strange,
+        )
     return results
+
+
+def over_all(scenes: dict[str, SceneResult]) -> TaskResult:
+    """One task over its scenes."""
+    import numpy as np
+
+    from og_pointcloud.scoring.spread import risk_coverage
+
+    results = list(scenes.values())
+    correct = np.concatenate([result.correct for result in results])
+    confidence = np.concatenate([result.confidence for result in results])
+    has_curve = len(correct) > 0 and all(result.has_confidence for result in results)
+    forced = [result.forced for result in results if result.forced is not None]
+    return TaskResult(
+        scenes={scene: result.score for scene, result in scenes.items()},
+        forced=over_scenes(forced) if len(forced) == len(results) else None,
+        curve=risk_coverage(correct, confidence) if has_curve else None,
+        answered=float(np.isfinite(confidence).mean()) if len(correct) else float("nan"),
+        strange=frozenset().union(*(result.strange for result in results)),
+    )
 
 
 def described(task: int, result: TaskResult, other: TaskResult | None) -> tuple[tuple[str, ...], dict[str, Any]]:
@@ -152,12 +195,14 @@ def described(task: int, result: TaskResult, other: TaskResult | None) -> tuple[
         change = paired_bootstrap(per_scene, np.array([score.protocol.miou for score in other.scenes.values()]))
     area = result.curve.area if result.curve else None
     row = (
-        f"{task} classes", *map(percent, columns(values, mean)), "-" if area is None else f"{area:.4f}",
+        f"{task} classes", percent(mean.miou), percent(mean.macc), percent(result.forced), percent(mean.flat_miou),
+        *map(percent, variants(values)), "-" if area is None else f"{area:.4f}",
         spread(interval), *([] if other is None else [signed(change) if change else "-"]),
     )  # fmt: skip
     entry = {
         "miou": mean.miou if known else None,
         "macc": mean.macc if known else None,
+        "forced_miou": result.forced if known else None,
         "flat_miou": mean.flat_miou if known else None,
         "risk_area": area,
         "interval": [interval.low, interval.high] if interval else None,
@@ -167,19 +212,21 @@ def described(task: int, result: TaskResult, other: TaskResult | None) -> tuple[
     return row, entry
 
 
-def columns(scores: Sequence[SceneScore], mean: Any) -> list[float]:
+def variants(scores: Sequence[SceneScore]) -> list[float]:
+    """Means over scenes: mIoU of all points, of the answered ones, and the share of these."""
+    return [
+        over_scenes([score.all_points.miou for score in scores]),
+        over_scenes([score.answered.miou for score in scores]),
+        over_scenes([score.answered_share for score in scores]),
+    ]
+
+
+def over_scenes(values: Sequence[float]) -> float:
+    """The mean of those scenes that have the figure."""
     import numpy as np
 
-    def over_scenes(values: list[float]) -> float:
-        finite = [value for value in values if np.isfinite(value)]
-        return float(np.mean(finite)) if finite else float("nan")
-
-    others = (
-        [s.all_points.miou for s in scores],
-        [s.answered.miou for s in scores],
-        [s.answered_share for s in scores],
-    )
-    return [mean.miou, mean.macc, mean.flat_miou, *map(over_scenes, others)]
+    finite = [value for value in values if np.isfinite(value)]
+    return float(np.mean(finite)) if finite else float("nan")
 
 
 def describe(score: SceneScore) -> dict[str, Any]:
@@ -215,12 +262,10 @@ def predicted(file: Path, xyz: NDArray[np.float64], task: int, text_features: Pa
 
     from og_pointcloud.scoring.scannet import NAMES, TASKS
 
+    forced = None
     if file.suffix == ".ogpc":
-        from og_pointcloud.runtime import segment
-
         asked = [NAMES[class_id] for class_id in TASKS[task]]
-        result = segment(xyz, asked, scene=file, text_features=text_features)
-        labels, confidence = result.labels, result.scores
+        labels, confidence, forced = asked_labels(file, xyz, asked, text_features)
     else:
         labels, confidence, asked = stored_labels(file)
     if len(labels) != len(xyz):
@@ -230,7 +275,25 @@ def predicted(file: Path, xyz: NDArray[np.float64], task: int, text_features: Pa
     ids = {name: class_id for class_id, name in NAMES.items()}
     # A name that is no class of the table stays an answer, and a wrong one.
     table = np.array([*(ids.get(name, NOT_OF_THE_TABLE) for name in asked), 0])
-    return Predicted(table[np.maximum(labels, -1)], confidence)
+    strange = frozenset(asked[label] for label in np.unique(labels[labels >= 0]) if asked[label] not in ids)
+    return Predicted(
+        table[np.maximum(labels, -1)], confidence, None if forced is None else table[np.maximum(forced, -1)], strange
+    )
+
+
+def asked_labels(
+    file: Path, xyz: NDArray[np.float64], names: list[str], text_features: Path | None
+) -> tuple[NDArray[np.integer], NDArray[np.floating], NDArray[np.integer]]:
+    """(n,) labels, their scores, and the labels of a scene that may not say that none fits: the largest cosine."""
+    from og_pointcloud.choosing import Chooser
+    from og_pointcloud.runtime import as_scene, segment
+    from og_pointcloud.text.words import resolve_labels
+
+    scene = as_scene(file)
+    words = resolve_labels(names, text_features, scene.vocabulary, scene.feature_space, scene.path)
+    result = segment(xyz, words, scene=scene)
+    forced = Chooser(scene.cloud.instances).choose(words.vectors).at(result.instances)[0]
+    return result.labels, result.scores, forced
 
 
 def stored_labels(file: Path) -> tuple[NDArray[np.integer], NDArray[np.floating] | None, list[str]]:
