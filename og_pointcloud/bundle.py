@@ -65,6 +65,7 @@ ZIP_ERRORS = (zipfile.BadZipFile, EOFError, RuntimeError, NotImplementedError, O
 """All that zipfile raises for damaged archives, encrypted ones, and those of methods that it lacks."""
 REBUILD = "write the file again with write_bundle"
 BANK = "bank/vectors.npy"
+RGB, CERTAINTY = "arrays/rgb.npy", "arrays/certainty.npy"
 CARRIED_ENCODER = "text_encoder/"
 """What the names of a carried text encoder's members begin with."""
 
@@ -225,7 +226,8 @@ def _cloud(manifest: dict[str, Any], members: dict[str, bytes]) -> LabelledCloud
     if not np.isfinite(xyz).all():
         raise _Refused(f"arrays/xyz.npy holds NaN or infinity; expected finite coordinates: {REBUILD}")
     ids = _array(members, "arrays/instance_ids.npy", INTEGERS, (points,)).astype(np.int32)
-    rgb = _array(members, "arrays/rgb.npy", ("|u1",), (points, 3)) if "arrays/rgb.npy" in members else None
+    rgb = _array(members, RGB, ("|u1",), (points, 3)) if RGB in members else None
+    certainty = _array(members, CERTAINTY, ("|u1",), (points,)) if CERTAINTY in members else None
     try:
         origin = np.array(_field(frame, "origin", list, "frame/"), np.float64)
         if origin.shape != (3,) or not np.isfinite(origin).all():
@@ -239,6 +241,7 @@ def _cloud(manifest: dict[str, Any], members: dict[str, bytes]) -> LabelledCloud
             spacing=float(_field(frame, "spacing", (int, float), "frame/")),
             reach=float(_field(frame, "reach", (int, float), "frame/")),
             rgb=rgb,
+            certainty=certainty,
             vocabulary=_vocabulary(manifest, members),
             word_bank=_word_bank(members),
             provenance=_field(manifest, "provenance", dict),

@@ -110,8 +110,11 @@ class LabelledCloud:
     feature_space: name of the encoder that mask features and text vectors share.
     spacing: typical distance between neighbouring points, in the scene's unit.
     reach: distance from the cloud beyond which a query point is "too far from the map", same unit.
-    rgb: (n, 3) uint8 or None. vocabulary: words that may be asked as strings. word_bank: everyday words of the same
-    encoder, which labels are judged by; without one, answers are not calibrated.
+    rgb: (n, 3) uint8 or None.
+    certainty: (n,) uint8, in 255ths, how far views and neighbours bear out that a point is in its instance, or in none;
+    0 where no view saw it. None where that is not known, as in results of others.
+    vocabulary: words that may be asked as strings. word_bank: everyday words of the same encoder, which labels are
+    judged by; without one, answers are not calibrated.
     provenance: JSON-able record of settings, seed, seconds per stage, and what was left out and why.
     """
 
@@ -123,6 +126,7 @@ class LabelledCloud:
     spacing: float
     reach: float
     rgb: NDArray[np.uint8] | None = None
+    certainty: NDArray[np.uint8] | None = None
     vocabulary: Vocabulary | None = None
     provenance: dict[str, Any] = field(default_factory=dict)
     word_bank: WordBank | None = None
@@ -141,6 +145,10 @@ class LabelledCloud:
             )
         if self.rgb is not None and self.rgb.shape != (n, 3):
             raise OgPointcloudError(f"rgb has shape {self.rgb.shape}; expected ({n}, 3)")
+        if self.certainty is not None and (self.certainty.shape != (n,) or self.certainty.dtype != np.uint8):
+            raise OgPointcloudError(
+                f"certainty is {self.certainty.dtype} {self.certainty.shape}; expected uint8 ({n},)"
+            )
         for name in ("spacing", "reach"):
             value = getattr(self, name)
             if not (np.isfinite(value) and value > 0):

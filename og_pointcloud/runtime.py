@@ -91,6 +91,12 @@ class LabelledScene:
         return self.cloud.instance_ids
 
     @cached_property
+    def certainty(self) -> NDArray[np.float32] | None:
+        """(n,) float32 in [0, 1], as ``LabelledCloud.certainty``; None where that is not known."""
+        stored = self.cloud.certainty
+        return None if stored is None else (stored / 255).astype(np.float32)
+
+    @cached_property
     def instances(self) -> Instances:
         """The instances as a table: row k is instance id k, with its place, boxes, size, evidence and best own words.
 
@@ -162,6 +168,18 @@ class LabelledScene:
             cut = self._farther_than(max_distance, local, instances)
             instances[cut], distance[cut] = TOO_FAR, BEYOND
         return instances, distance
+
+    def certainty_at(self, points: NDArray[np.floating]) -> NDArray[np.float32] | None:
+        """(N,) float32, the certainty of the scene's point nearest to each, 0 where none is within reach; None where
+        the scene does not know it. points: (N, 3), world coordinates. An exact search of every point."""
+        if self.certainty is None:
+            return None
+        of_points = np.append(self.certainty, np.float32(0))
+        certainty = np.zeros(len(points), np.float32)
+        finite = np.isfinite(points).all(axis=1)
+        local = (np.asarray(points, np.float64)[finite] - self.cloud.origin).astype(np.float32)
+        certainty[finite] = of_points[self._nearest.query(local)]  # NONE_WITHIN_REACH is the last
+        return certainty
 
     def _look_up(self, local: NDArray[np.float32]) -> tuple[NDArray[np.int32], NDArray[np.int8]]:
         feed = {"points": local, "text": np.zeros((0, self._text_width), np.float32)}
@@ -451,10 +469,16 @@ def _label(
     instances: NDArray[np.int32],
     distance: NDArray[np.int8],
 ) -> Segmentation:
+    def certainty() -> NDArray[np.float32] | None:
+        if points is scene.xyz:
+            return scene.certainty
+        found = scene.certainty_at(points)
+        return None if found is None else np.where(instances == TOO_FAR, np.float32(0), found)
+
     # A negative instance counts from the end, where those of no instance lie.
     return Segmentation(
         points, answers.labels[instances], answers.scores[instances], instances, words.names, scene.path, distance,
-        answers.reasons[instances], answers.calibrated,
+        answers.reasons[instances], answers.calibrated, certainty,
     )  # fmt: skip
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +41,7 @@ class Segmentation:
     reasons: (N,) int8, why a point is unknown: a ``Reason``, 0 where it has a label.
     calibrated: whether the scene has a word bank to judge labels by. Without one the best label is answered, however
         badly it fits: then nothing is unknown for Reason.NONE_FITS, unless negatives were asked against.
+    certainty: (N,) float32, see there; looked up when it is first read.
     """
 
     xyz: NDArray[np.float64]
@@ -51,6 +53,7 @@ class Segmentation:
     distance: NDArray[np.int8] = field(default_factory=lambda: np.zeros(0, np.int8))
     reasons: NDArray[np.int8] = field(default_factory=lambda: np.zeros(0, np.int8))
     calibrated: bool = False
+    find_certainty: Callable[[], NDArray[np.float32] | None] = field(default=lambda: None, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         for name in ("distance", "reasons"):
@@ -62,6 +65,16 @@ class Segmentation:
 
     def __len__(self) -> int:
         return len(self.labels)
+
+    @cached_property
+    def certainty(self) -> NDArray[np.float32] | None:
+        """(N,) float32 in [0, 1]: how far views and neighbours bear out that a point is in its instance, or in none, as
+        the scene's nearest point has it; 0 where no view saw it or the scene is too far.
+
+        ``scores`` say whether the instance is what the word means, this whether the point is part of it: low at
+        borders, and where masks disagree. None where the scene does not know it.
+        """
+        return self.find_certainty()
 
     def mask(self, name: str) -> NDArray[np.bool_]:
         """(N,) bool, the points with this label."""
@@ -118,7 +131,8 @@ class Segmentation:
     def save(self, path: str | os.PathLike[str]) -> Path:
         """Write the result, whole or not at all, as what the path's ending says.
 
-        .npz: labels, scores, instances, reasons, names and calibrated. .ply: a coloured cloud with the `attributes`.
+        .npz: labels, scores, instances, reasons, names and calibrated, and certainty if it is known.
+        .ply: a coloured cloud with the `attributes`.
         .las, .laz: with colours, classification and the attributes as extra bytes (needs the extra 'las').
         .glb, .gltf: coloured points with feature ids.
         OgPointcloudError for another ending; SceneError where the format cannot hold the points: .las and .glb have no
@@ -136,16 +150,18 @@ class Segmentation:
         return path
 
     def _save_arrays(self, path: Path) -> None:
+        arrays: dict[str, Any] = {
+            "labels": self.labels,
+            "scores": self.scores,
+            "instances": self.instances,
+            "reasons": self.reasons,
+            "names": np.array(self.names, str),
+            "calibrated": np.array(self.calibrated),
+        }
+        if self.certainty is not None:
+            arrays["certainty"] = self.certainty
         with replacing(path) as file:
-            np.savez(
-                file,
-                labels=self.labels,
-                scores=self.scores,
-                instances=self.instances,
-                reasons=self.reasons,
-                names=np.array(self.names, str),
-                calibrated=np.array(self.calibrated),
-            )
+            np.savez(file, **arrays)
 
 
 def _writer(ending: str) -> Callable[..., None]:

@@ -57,7 +57,8 @@ def room(count: int = 3000, seed: int = 0) -> LabelledCloud:
     lone = random.random(count) < 0.01
     ids[lone] = random.integers(-2, 9, lone.sum())
     # Instance 0 has two descriptors, 4 has none.
-    return make_cloud(xyz, ids, instances=instance_table(9, [0, 0, 1, 2, 3, 5, 6, 7, 8]))
+    cloud = make_cloud(xyz, ids, instances=instance_table(9, [0, 0, 1, 2, 3, 5, 6, 7, 8]))
+    return replace(cloud, certainty=random.integers(0, 256, count).astype(np.uint8))
 
 
 def tough_clouds() -> dict[str, LabelledCloud]:

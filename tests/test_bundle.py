@@ -78,6 +78,9 @@ def test_tough_clouds_come_back_as_they_went(tmp_path, name):
     for key in ("feature_space", "spacing", "reach", "provenance"):
         assert getattr(back, key) == getattr(cloud, key)
     assert (back.vocabulary is None) == (cloud.vocabulary is None)
+    assert (back.certainty is None) == (cloud.certainty is None)
+    if cloud.certainty is not None:
+        assert back.certainty.tolist() == cloud.certainty.tolist()
 
 
 def test_words_come_back_as_unit_vectors_close_to_their_own(tmp_path):
@@ -289,6 +292,8 @@ def say(*keys_and_value):
         (put("arrays/instance_ids.npy", npy(np.array([None] * 500))), "Python objects"),
         (put("arrays/instance_ids.npy", npy(np.full(500, 9, np.int8))), "instance ids span 9..9"),
         (put("arrays/instance_ids.npy", npy(np.full(500, -3, np.int8))), "instance ids span -3..-3"),
+        (put("arrays/certainty.npy", npy(np.zeros(500, np.float32))), r"is <f4 \(500,\); expected |u1"),
+        (put("arrays/certainty.npy", npy(np.zeros(499, np.uint8))), r"expected |u1 \(500,\)"),
         (put("vocabulary/names.json", b'["a", "a", "b", "c", "d"]'), "not a list of 5 different words"),
         (put("vocabulary/names.json", b"{}"), "not a list of 5 different words"),
         (put("bank/vectors.npy", npy(unit_rows(60))), "is <f4"),

@@ -48,7 +48,9 @@ def decide(table: MaskTable, numbers: Sequence[int], xyz: NDArray[np.float32] | 
     result = assign_points(table, hear_views(table), groups(numbers), around, SETTINGS)
     assert result.instance_ids.dtype == np.int32
     assert result.share.dtype == result.detection_rate.dtype == np.float32
-    assert result.instance_ids.shape == result.share.shape == (len(xyz),)
+    assert result.instance_ids.shape == result.share.shape == result.certainty.shape == (len(xyz),)
+    assert result.certainty.dtype == np.float32
+    assert ((result.certainty >= 0) & (result.certainty <= 1)).all()
     assert ((result.share >= 0) & (result.share <= 1.0001)).all()
     return result
 
@@ -184,6 +186,36 @@ def test_order_of_points_does_not_matter() -> None:
     np.testing.assert_array_equal(moved.instance_ids, plain.instance_ids[order])
     np.testing.assert_allclose(moved.share, plain.share[order], rtol=1e-6)
     assert len(set(plain.instance_ids)) > 4
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_certainty_is_what_views_say_times_how_far_neighbours_agree(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    table, numbers = random_case(random)
+    xyz = random.uniform(0, 8, (200, 3)).astype(np.float32)
+    around, testimony = neighbourhood(xyz, GeometrySettings()), hear_views(table)
+    result = assign_points(table, testimony, groups(numbers), around, replace(SETTINGS, rate_share=0.0))
+    inside, word = testimony.inside.toarray().astype(float), testimony.word.toarray().astype(float)
+    group, said = np.array(numbers), []
+    for point, state in enumerate(result.instance_ids):
+        of_groups = [inside[group == k, point].sum() for k in range(max(numbers) + 1)]
+        best = int(np.argmax(of_groups)) if max(of_groups) > 0 else -1
+        asked = sum(word[view, point] for view in range(6) if best in group[table.mask_view == view])
+        share = of_groups[best] / asked if best >= 0 else 0.0
+        of_views = share if best >= 0 and state == best else 1 - share
+        near = around.index[point][around.adjoining[point]]
+        agree = np.mean([result.instance_ids[other] == state for other in near]) if len(near) else 1.0
+        said.append(of_views * agree if word[:, point].any() else 0.0)
+    assert len(set(result.instance_ids)) > 4
+    np.testing.assert_allclose(result.certainty, said, rtol=1e-5, atol=1e-6)
+
+
+def test_points_are_surest_inside_and_not_at_all_where_no_view_looks() -> None:
+    unseen = [range(95, 100)] * 4
+    result = decide(hand_table(N, [[(OBJECT, ONE)]] * 4, unseen), [0] * 4)
+    assert result.certainty[[10, 80]].tolist() == [1, 1]
+    assert result.certainty[49] == result.certainty[50] < 0.6
+    assert (result.certainty[95:] == 0).all()
 
 
 def test_order_of_masks_does_not_matter() -> None:

@@ -19,6 +19,7 @@ from labelled_clouds import (
     WORDS,
     instances_plainly,
     make_cloud,
+    nearest_plainly,
     queries,
     room,
     tough_clouds,
@@ -432,7 +433,8 @@ def test_result_masks_counts_and_refusals(scene, tmp_path):
 def test_result_is_saved_as_npz_and_ply(scene, tmp_path):
     result = og.segment(scene, ["café", "pear"])
     saved = np.load(result.save(tmp_path / "out.npz"), allow_pickle=False)
-    assert sorted(saved) == ["calibrated", "instances", "labels", "names", "reasons", "scores"]
+    assert sorted(saved) == ["calibrated", "certainty", "instances", "labels", "names", "reasons", "scores"]
+    assert (saved["certainty"] == result.certainty).all()
     assert (saved["labels"] == result.labels).all()
     assert (saved["reasons"] == result.reasons).all()
     assert not saved["calibrated"]
@@ -546,6 +548,35 @@ def test_a_crop_a_shuffle_and_another_density_answer_point_by_point(scene):
     assert (scene.instances_at(points[::7]) == whole[::7]).all()
     assert [int(scene.instances_at(point[None])[0]) for point in points[:20]] == whole[:20].tolist()
     assert (scene.instances_at(np.repeat(points, 3, axis=0)) == np.repeat(whole, 3)).all()
+
+
+def test_certainty_is_that_of_the_nearest_point(scene):
+    own = scene.cloud.certainty / 255
+    points = queries(scene.cloud, 300).astype(np.float64)
+    points[:3] = np.nan
+    nearest = nearest_plainly(scene.cloud, points.astype(np.float32))
+    nearest[:3] = -1
+    expected = np.append(own, 0)[nearest]
+    segmenter = og.Segmenter(scene, ["apple", "pear"], max_distance=0.05)
+    far = segmenter(points).instances == TOO_FAR
+    assert 0 < far.sum() < len(points)
+    for result, wanted in (
+        (og.segment(scene, ["apple"]), own),
+        (og.segment(points, ["apple"], scene), expected),
+        (segmenter(points), np.where(far, 0, expected)),
+    ):
+        assert result.certainty.dtype == np.float32
+        np.testing.assert_allclose(result.certainty, wanted, rtol=1e-6)
+
+
+def test_a_scene_that_knows_no_certainty_says_none(scene, tmp_path):
+    unknown = og.load(write_bundle(replace(scene.cloud, certainty=None), tmp_path / "s.ogpc"))
+    for pcd in (unknown, scene.xyz[:5]):
+        result = og.segment(pcd, ["apple"], unknown)
+        assert result.certainty is None
+        assert "certainty" not in np.load(result.save(tmp_path / "out.npz"), allow_pickle=False)
+    with pytest.raises(OgPointcloudError, match=r"certainty is float32 \(3000,\); expected uint8 \(3000,\)"):
+        replace(scene.cloud, certainty=np.zeros(3000, np.float32))
 
 
 def test_noise_below_the_gap_between_objects_changes_no_label():

@@ -214,6 +214,16 @@ def test_a_whole_answer_by_hand(answer, truth):
     assert score.interval.mean == score.labels.miou
 
 
+def test_the_surest_points_of_an_instance_come_first(answer, truth):
+    """Of instance 1 the half that is right is surer than the half that is wrong, and less sure than instance 0."""
+    answer = replace(answer, confidence=np.where(answer.called == 1, 0.5, answer.confidence).astype(np.float32))
+    certainty = np.where((answer.instances == 1) & (truth.cls == 0), 0.5, 1).astype(np.float32)
+    curve = score_capture(replace(answer, certainty=certainty), truth).curve
+    np.testing.assert_allclose(curve.coverage, [100 / 360, 220 / 360, 340 / 360, 1])
+    np.testing.assert_allclose(curve.risk, [0, 0, 120 / 340, 140 / 360])
+    assert curve.area < score_capture(answer, truth).curve.area
+
+
 def test_instances_by_hand(answer, truth):
     things = score_capture(answer, truth).instances
     # Things of any kind: 0 is the first cup, 100 of its 120 points; background has no class and is no thing. 1 is two
@@ -260,6 +270,10 @@ def test_a_scene_is_asked_for_the_names(tmp_path):
     scene = LabelledScene.from_cloud(cloud)
     found = ask(scene, truth_of([0, 1, 1, 1]), tmp_path / "w.npz")
     assert found.called.tolist() == [0, 1, -1, 1]
-    np.testing.assert_allclose(found.confidence, [1, 1, 0, 1], atol=1e-5)
+    np.testing.assert_allclose(found.confidence[[0, 1, 3]], 1, atol=1e-5)
+    assert found.certainty is None
+    doubtful = replace(cloud, certainty=np.array([255, 51, 255, 0], np.uint8))
+    found = ask(LabelledScene.from_cloud(doubtful), truth_of([0, 1, 1, 1]), tmp_path / "w.npz")
+    np.testing.assert_allclose(found.sureness, [1, 0.2, -np.inf, 0], atol=1e-5)
     with pytest.raises(SceneError, match="has 4 points, the truth 3"):
         ask(scene, truth_of([0, 1, 1]), tmp_path / "w.npz")

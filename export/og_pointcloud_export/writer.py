@@ -95,6 +95,8 @@ def _arrays(cloud: LabelledCloud) -> dict[str, NDArray[Any]]:
     arrays = {"xyz": cloud.xyz, "instance_ids": _smallest_signed(cloud.instance_ids)}
     if cloud.rgb is not None:
         arrays["rgb"] = cloud.rgb
+    if cloud.certainty is not None:
+        arrays["certainty"] = cloud.certainty
     return arrays | {f"instances/{name}": array for name, array in table.items()}
 
 

@@ -259,7 +259,9 @@ def labelled_cloud(
 
     place: for each point of the scene the row of the labelling that speaks for it; None: its own.
     """
-    ids = labelling.instance_ids if place is None else labelling.instance_ids[place]
+    ids, certainty = labelling.instance_ids, labelling.certainty
+    if place is not None:
+        ids, certainty = ids[place], None if certainty is None else certainty[place]
     typical = float(np.median(spacing))
     states = {"labelled": ids >= 0, "background": ids == BACKGROUND, "unobserved": ids == UNOBSERVED}
     journal.notes["points_by_state"] = {name: int(state.sum()) for name, state in states.items()}
@@ -275,5 +277,6 @@ def labelled_cloud(
         spacing=typical,
         reach=settings.geometry.reach * typical,
         rgb=scene.points.rgb,
+        certainty=None if certainty is None else np.rint(255 * certainty).astype(np.uint8),
         provenance=journal.provenance(settings),
     )

@@ -44,11 +44,14 @@ ENTRIES_AT_ONCE = 1 << 26
 @dataclass(frozen=True)
 class Membership:
     """instance_ids: (n,) int32, a group, BACKGROUND or UNOBSERVED. share: (n,) float32, the share above for the group
-    that covers the point most. detection_rate: (groups,) float32, the part of a group's visible weight that lies in
-    views that have a mask of it. dismissed: (groups,) bool, groups that the scene's views contradict as a whole."""
+    that covers the point most. certainty: (n,) float32 in [0, 1], how far views and neighbours bear out the state that
+    a point is given, the product of both; 0 where no view sees it. detection_rate: (groups,) float32, the part of a
+    group's visible weight that lies in views that have a mask of it. dismissed: (groups,) bool, groups that the scene's
+    views contradict as a whole."""
 
     instance_ids: NDArray[np.int32]
     share: NDArray[np.float32]
+    certainty: NDArray[np.float32]
     detection_rate: NDArray[np.float32]
     dismissed: NDArray[np.bool_]
 
@@ -85,7 +88,11 @@ def assign_points(
         ids = _settle_borders(
             ids, share, neighbourhood.index, neighbourhood.adjoining, *settings.border_shares, settings.own_vote
         )
-    return Membership(ids.astype(np.int32), share.astype(np.float32), rate.astype(np.float32), dismissed)
+    for_its_state = np.where((best >= 0) & (ids == best), share, 1 - share)
+    certainty = np.where(total > 0, np.clip(for_its_state, 0, 1), 0) * _in_agreement(ids, neighbourhood)
+    return Membership(
+        ids.astype(np.int32), share.astype(np.float32), certainty.astype(np.float32), rate.astype(np.float32), dismissed
+    )
 
 
 def without_see_through(
@@ -321,6 +328,25 @@ def _settle_borders(ids, share, neighbours, adjoining, low, high, own_vote):  # 
             votes[place] += vote
         settled[g] = states[np.argmax(votes[:count])]
     return settled
+
+
+def _in_agreement(ids: NDArray[np.int32], neighbourhood: Neighbourhood) -> NDArray[np.float64]:
+    """(n,) the part of each point's adjoining points that have its state; 1 where none adjoins."""
+    return _agreeing(ids, neighbourhood.index, neighbourhood.adjoining)
+
+
+@njit(cache=True, parallel=True)
+def _agreeing(ids, neighbours, adjoining):  # noqa: ANN001, ANN202
+    agreeing = np.ones(len(ids))
+    for g in prange(len(ids)):
+        same, count = 0, 0
+        for k in range(neighbours.shape[1]):
+            if adjoining[g, k]:
+                count += 1
+                same += ids[neighbours[g, k]] == ids[g]
+        if count:
+            agreeing[g] = same / count
+    return agreeing
 
 
 def own_area(table: MaskTable, group: NDArray[np.int32], ids: NDArray[np.int32]) -> NDArray[np.float64]:

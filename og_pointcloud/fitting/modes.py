@@ -63,11 +63,13 @@ class Prepared:
 @dataclass(frozen=True)
 class Labelling:
     """instance_ids: (n,) int32, a row of ``instances``, BACKGROUND or UNOBSERVED. mask_instance: (masks,) int32, the
-    instance that each mask shows, -1 none."""
+    instance that each mask shows, -1 none. certainty: (n,) float32 as of `Membership`; None where views did not settle
+    every point."""
 
     instance_ids: NDArray[np.int32]
     instances: InstanceTable
     mask_instance: NDArray[np.int32]
+    certainty: NDArray[np.float32] | None = None
 
 
 def by_choice(scene: Scene, prepared: Prepared, settings: FitSettings, journal: Journal) -> Labelling:
@@ -213,7 +215,7 @@ def _settled(
         instances = replace(instances, whole=part_of(table, group, ids, len(used)))
         if coarse is not None:
             instances = replace(instances, coarse=coarse[used])
-    return Labelling(ids, instances, group)
+    return Labelling(ids, instances, group, membership.certainty)
 
 
 def _literal(

@@ -534,10 +534,11 @@ def _instances(cloud: _TiledCloud, shown: _Shown, settings: FitSettings, journal
 
 @dataclass(frozen=True)
 class _Settled:
-    """Of a tile's own points: ids, the group of each, BACKGROUND or UNOBSERVED; in_masks (masks, groups) and outside
-    (views, groups), sparse, what shows of each group's points there."""
+    """Of a tile's own points: ids, the group of each, BACKGROUND or UNOBSERVED, and certainty; in_masks (masks, groups)
+    and outside (views, groups), sparse, what shows of each group's points there."""
 
     ids: NDArray[np.int32]
+    certainty: NDArray[np.float32]
     in_masks: csr_array
     outside: csr_array
 
@@ -550,11 +551,13 @@ def _settle(
     around = _neighbours(tile, cloud, settings, kept)
     # Which groups are noise was decided for all tiles.
     membership = replace(settings.membership, rate_share=0.0)
-    ids = assign_points(table, hear_views(table), groups, around, membership).instance_ids
+    decided = assign_points(table, hear_views(table), groups, around, membership)
+    ids, mine = decided.instance_ids, cloud.own(tile)
     own = np.full(len(ids), -1, np.int32)
-    own[cloud.own(tile)] = ids[cloud.own(tile)]
+    own[mine] = ids[mine]
     of_groups = indicator(own, groups.count).T
-    return _Settled(ids[cloud.own(tile)], csr_array(table.weights @ of_groups), csr_array(table.outside @ of_groups))
+    in_masks, outside = csr_array(table.weights @ of_groups), csr_array(table.outside @ of_groups)
+    return _Settled(ids[mine], decided.certainty[mine], in_masks, outside)
 
 
 def _evidence(
@@ -567,10 +570,12 @@ def _evidence(
     number[used] = np.arange(len(used), dtype=np.int32)
     ids = np.empty(len(in_order), np.int32)
     ids[cloud.tiles.order] = np.where(in_order >= 0, number[in_order], in_order)
+    certainty = np.empty(len(ids), np.float32)
+    certainty[cloud.tiles.order] = np.concatenate([tile.certainty for tile in settled])
     group = number[groups.group]
     table = _table_of_sums(ids, used, shown, settled)
     instances = describe_instances(table, group, ids, len(used), settings.association)
-    return Labelling(ids, replace(instances, whole=part_of(table, group, ids, len(used))), group)
+    return Labelling(ids, replace(instances, whole=part_of(table, group, ids, len(used))), group, certainty)
 
 
 def _table_of_sums(ids: NDArray[np.int32], used: Rows, shown: _Shown, settled: Sequence[_Settled]) -> MaskTable:

@@ -30,13 +30,22 @@ Integers = NDArray[np.integer]
 @dataclass(frozen=True)
 class Answer:
     """What a scene says of each of its points. called: (n,) classes of the truth, -1 unknown, len(names) a word that
-    the truth lacks. confidence: (n,) float32. instances: (n,), below 0 none. xyz: (n, 3); spacing: of the points."""
+    the truth lacks. confidence: (n,) float32, 0 to 1, that the instance is what it is called. instances: (n,), below 0
+    none. xyz: (n, 3); spacing: of the points. certainty: (n,) float32, 0 to 1, that a point is part of its instance;
+    None where the scene does not know it."""
 
     called: Integers
     confidence: NDArray[np.float32]
     instances: Integers
     xyz: NDArray[np.float32]
     spacing: float
+    certainty: NDArray[np.float32] | None = None
+
+    @property
+    def sureness(self) -> NDArray[np.float32]:
+        """(n,) that the point is what it is called, -inf where it is called nothing."""
+        sure = self.confidence if self.certainty is None else self.confidence * self.certainty
+        return np.where(self.called >= 0, sure, np.float32(-np.inf))
 
 
 @dataclass(frozen=True)
@@ -76,7 +85,9 @@ def ask(scene: SceneLike, truth: Truth, text_features: Path | None = None) -> An
         )
     result = segment(scene, None, text_features=text_features)
     called = truth.class_of(result.labels, result.names)
-    return Answer(called, result.scores, result.instances, cloud.xyz, cloud.spacing)
+    # Of cosines only the order counts.
+    confidence = result.scores if result.calibrated else ((1 + result.scores) / 2).astype(np.float32)
+    return Answer(called, confidence, result.instances, cloud.xyz, cloud.spacing, result.certainty)
 
 
 def score_capture(answer: Answer, truth: Truth, seed: int = 0) -> CaptureScore:
@@ -86,13 +97,12 @@ def score_capture(answer: Answer, truth: Truth, seed: int = 0) -> CaptureScore:
         raise SceneError("no class of the truth has 30 points that can be scored; expected one or more")
     counted = truth.scored & np.isin(truth.cls, labels.classes)
     answered = answer.called >= 0
-    surely = np.where(answered, answer.confidence, -np.inf)
     return CaptureScore(
         labels=labels,
         interval=miou_interval(answer.called, truth, answer.xyz, answer.spacing, labels.classes, seed),
         answered=score_labels(answer.called, truth.cls, scored=counted & answered, min_points=1),
         answered_share=float(answered[counted].mean()),
-        curve=risk_coverage((answer.called == truth.cls)[counted], surely[counted]),
+        curve=risk_coverage((answer.called == truth.cls)[counted], answer.sureness[counted]),
         instances=None if truth.instance is None else score_instances(answer, truth),
     )
 

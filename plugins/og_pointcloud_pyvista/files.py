@@ -70,6 +70,7 @@ def write_ogpc(mesh: Any, path: str) -> None:
         instance_ids=np.maximum(ids, UNOBSERVED),
         instances=replace(table, points=points),
         rgb=None if rgb is None else np.asarray(rgb, np.uint8)[:, :3],
+        certainty=None,
         provenance=cloud.provenance | {"points_of": str(source)},
     )
     og.write_bundle(part, path)
