@@ -1,7 +1,8 @@
-"""The report: knobs, the front, baselines against literal loops, what the finished file trades, the page and files."""
+"""The report: knobs, the front, what shares a table against whole fits, baselines against literal loops, the page."""
 
 import csv
 import re
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,9 +15,14 @@ from og_pointcloud.cloud import Vocabulary
 from og_pointcloud.errors import OgPointcloudError, SceneError
 from og_pointcloud.fitting.fit import fit, prepare
 from og_pointcloud.formats.capture import read_capture
-from og_pointcloud.report import asking, knobs, page, sweep
-from og_pointcloud.report.baselines import BASELINES
-from og_pointcloud.report.measure import Row, disagreement, error_of, labels_of, measure, measure_apart, read_subject
+from og_pointcloud.report import asking, judging, knobs, page, sweep
+from og_pointcloud.report.baselines import BASELINES, only_where_masked
+from og_pointcloud.report.judging import disagreement, error, judged, mean_over_captures, verdict
+from og_pointcloud.report.knobs import find_setting
+from og_pointcloud.report.measure import Row, digest_of, error_of, labels_of, measure, measure_apart, read_subject
+from og_pointcloud.report.plots import fit_plot, knob_plot, mean_plot
+from og_pointcloud.report.shared import ON_SHARED, Measured, SharedFit
+from og_pointcloud.settings import FitSettings
 
 
 @pytest.fixture(scope="module")
@@ -42,32 +48,67 @@ def cloud(folder):
     return fit(read_capture(folder), progress=False)
 
 
+@pytest.fixture(scope="module")
+def shared(subject):
+    return SharedFit(subject)
+
+
 def row(seconds, miou, knob="k", value="v", **more):
-    return Row("c", knob, value, seconds, 1.0, miou=miou, seconds_most=seconds, **more)
+    return Row("c", knob, value, seconds, more.pop("seconds_most", seconds), miou=miou, **more)
 
 
-def test_every_knob_of_the_default_road_tries_the_default():
+def test_every_knob_stands_at_its_base_by_default():
     for knob in knobs.KNOBS:
-        modes = {setting.settings.mode for setting in knob.values}
-        assert modes == {"fast"} or any(setting.is_default for setting in knob.values), knob.name
+        assert [knob.is_base(value) for value in knob.values].count(True) == 1, knob.name
         assert len({setting.value for setting in knob.values}) == len(knob.values)
         assert knob.why
+        assert knob.base in (knobs.DEFAULT, knobs.FAST)
 
 
 def test_settings_are_found_by_their_names_and_differ():
-    tried = [*knobs.settings_to_try(paper=True), *(setting for _, setting in knobs.FORCED)]
+    forced = [entry.setting for entry in (*knobs.FORCED, *knobs.ALWAYS_FORCED)]
+    tried = dict.fromkeys([knobs.DEFAULT, knobs.EXACT, *knobs.SEEDS, *knobs.settings_to_try(paper=True), *forced])
     assert len({(setting.knob, setting.value) for setting in tried}) == len(tried)
     for setting in tried:
-        assert knobs.find_setting(setting.knob, setting.value) == setting
+        assert find_setting(setting.knob, setting.value) == setting
     assert [setting.is_default for setting in tried].count(True) == 1
     with pytest.raises(OgPointcloudError, match="'mode' has no value 'slow'"):
-        knobs.find_setting("mode", "slow")
+        find_setting("mode", "slow")
 
 
 def test_only_the_knobs_asked_for_are_tried():
     tried = knobs.settings_to_try(only=lambda knob: knob.name == "views")
-    assert [setting.knob for setting in tried] == ["default", "views", "views", "views"]
-    assert [setting.every for setting in tried] == [1, 2, 4, 8]
+    assert [(setting.knob, setting.every) for setting in tried] == [("views", 2), ("views", 4), ("views", 8)]
+    of_fast = knobs.settings_to_try(only=lambda knob: knob.name == "feature width")
+    assert [setting.value for setting in of_fast] == ["fast", "3", "12"]  # what the widths are held against comes first
+
+
+def test_what_shares_a_stage_changes_nothing_of_it():
+    """A setting may take over the table only if nothing before grouping reads what it changes."""
+    before = ("geometry", "visibility", "memory")
+    for setting in knobs.settings_to_try():
+        changed = [name for name in before if getattr(setting.settings, name) != getattr(FitSettings(), name)]
+        if setting.shares == "table":
+            assert changed == [], setting
+        if setting.shares == "geometry":
+            photographs = replace(setting.settings.geometry, pixels_per_spacing=2.0, max_stride=3)
+            assert photographs == FitSettings().geometry, setting
+
+
+def test_all_that_a_fit_can_leave_out_is_forced_back_or_says_why_not():
+    fitting = Path(knobs.__file__).parents[1] / "fitting"
+    sources = "".join((fitting / name).read_text() for name in ("fit.py", "modes.py"))
+    said = re.findall(r'leave_out\(\s*f?"([^"]+)"', sources)
+    assert len(said) > 10
+    for what in said:
+        what = re.sub(r"\{[^}]*%\}", "75%", what)
+        what = re.sub(r"\{[^}]*\}", "12", what)
+        assert knobs.forced_by(what) != knobs.NOT_FORCED[""], what
+    assert knobs.forced_by("75% of the pixels").value == "all pixels"
+    assert knobs.forced_by("16 of 34 groups of masks").value == "dismissed groups"
+    assert knobs.forced_by("3 masks").value == "spanning masks"
+    assert knobs.forced_by("3 points").value == "coincident points"
+    assert knobs.forced_by("a new kind of thing") == knobs.NOT_FORCED[""]
 
 
 def test_front_is_what_no_row_beats():
@@ -81,18 +122,86 @@ def test_front_is_what_no_row_beats():
             for o in rows
         )
     ]
-    assert {(r.seconds, r.miou) for r in sweep.front(rows)} == {(r.seconds, r.miou) for r in literal}
+    assert {(r.seconds, r.miou) for r in judging.front(rows)} == {(r.seconds, r.miou) for r in literal}
 
 
 def test_error_without_truth_is_the_disagreement():
-    assert sweep.error(row(1.0, 0.75)) == 0.25
-    assert sweep.error(row(1.0, None, disagreement=0.1)) == 0.1
+    assert error(row(1.0, 0.75, off_exact=0.3)) == 0.25
+    assert error(row(1.0, None, disagreement=0.1)) == 0.1
+    assert error(row(1.0, None, disagreement=0.1, off_exact=0.3)) == 0.3
+    assert error(row(1.0, 0.75, knob="lookup", off_exact=0.3)) == 0.3
+
+
+def stands(*others, runs_differ=1.0):
+    default = row(10.0, 0.9, "default", "", seconds_most=10.0 * runs_differ, gain_low=0.0, gain_high=0.0)
+    return verdict([default, *others], "c", "views")
+
+
+def test_a_default_is_off_the_front_only_beyond_the_noise():
+    def other(seconds, miou, low, high):
+        return row(seconds, miou, "views", "one of 2", gain=miou - 0.9, gain_low=low, gain_high=high)
+
+    assert stands(other(5.0, 0.89, -0.02, 0.01)).state == "front"  # faster, and worse
+    assert stands(other(9.7, 0.9, 0.0, 0.0)).state == "noise"
+    off = stands(other(9.0, 0.9, 0.0, 0.0))
+    assert (off.state, round(off.saved, 3), off.error) == ("off", 0.1, 0.0)
+    assert stands(other(9.0, 0.9, 0.0, 0.0), runs_differ=1.2).state == "noise"  # its own runs differ by more
+    assert stands(other(10.2, 0.93, 0.01, 0.05)).state == "off"  # surely better, and hardly slower
+    assert stands(other(9.9, 0.93, -0.01, 0.07)).state == "noise"  # better, not surely
+    assert stands(other(12.0, 0.93, 0.01, 0.05)).state == "front"
+    worst = stands(other(9.7, 0.9, 0.0, 0.0), replace(other(6.0, 0.9, 0.0, 0.0), value="one of 4"))
+    assert (worst.state, worst.by.value) == ("off", "one of 4")
+    assert stands() is None
+
+
+def test_values_are_held_against_what_was_measured_the_same_way():
+    whole = row(10.0, 0.9, "default", "")
+    table = row(9.0, 0.9, "default", ON_SHARED.value, shared_seconds=8.0)
+    fast = row(20.0, 0.8, "mode", "fast", shared_seconds=8.0)
+    wide = row(21.0, 0.8, "feature width", "12", shared_seconds=8.0)
+    file = row(1.0, 0.9, "lookup", "graph and search", off_exact=0.0)
+    tree = row(5.0, 0.9, "lookup", "KD-tree, all cores", off_exact=0.0)
+    rows = [whole, table, fast, wide, file, tree]
+    views = row(5.0, 0.9, "views", "one of 2")
+    assert judging.base_row(rows, views) is whole
+    assert judging.base_row(rows, fast) is table
+    assert judging.base_row(rows, wide) is fast
+    assert judging.base_row(rows, tree) is file
+
+
+def test_means_are_over_captures():
+    rows = []
+    for name, factor, more in (("a", 0.5, 0.1), ("b", 2.0, 0.3)):
+        rows.append(replace(row(10.0, 0.9, "default", ""), capture=name))
+        rows.append(replace(row(10.0 * factor, 0.9 - more, "views", "one of 2"), capture=name))
+    (mean,) = mean_over_captures(rows, "views")
+    assert mean.ratio == pytest.approx(1.0)
+    assert mean.error.mean == pytest.approx(0.2)
+    assert mean.error.low == pytest.approx(0.1)
+
+
+def test_rows_are_judged_by_their_labels(folder, subject, cloud):
+    default = labels_of(cloud, subject.vocabulary)
+    worse, exact = default.copy(), default.copy()
+    worse[:: len(worse) // 40] = -1
+    exact[:3] = -1
+    given = {("default", ""): default, ("views", "one of 2"): worse, (knobs.EXACT.knob, knobs.EXACT.value): exact}
+    measured = [Measured(row(1.0, None, *name), labels) for name, labels in given.items()]
+    rows = {one.knob: one for one in judged(subject, measured)}
+    assert rows["default"].gain == rows["default"].disagreement == 0
+    assert rows["default"].off_exact == pytest.approx((default[:3] != -1).mean() * 3 / len(default))
+    assert rows["views"].disagreement == pytest.approx((worse != default).mean())
+    assert rows["views"].off_exact == pytest.approx((worse != exact).mean())
+    literal = error_of(worse, subject)["miou"] - error_of(default, subject)["miou"]
+    assert rows["views"].gain == pytest.approx(literal)
+    assert rows["views"].gain_low <= literal <= rows["views"].gain_high < 0
 
 
 def test_a_fit_is_measured_as_it_is_made(folder, subject, cloud):
     measured, labels = measure(subject, knobs.DEFAULT)
     np.testing.assert_array_equal(labels, labels_of(cloud, subject.vocabulary))
     assert measured.instances == len(cloud.instances)
+    assert measured.digest == digest_of(cloud)
     assert measured.miou > 0.8
     assert measured.miou == error_of(labels, subject)["miou"]
     assert list(measured.left_out) == cloud.provenance["left_out"]
@@ -100,16 +209,72 @@ def test_a_fit_is_measured_as_it_is_made(folder, subject, cloud):
 
 
 def test_a_process_of_its_own_measures_the_same(folder, subject, tmp_path):
-    setting = knobs.find_setting("views", "one of 2")
+    setting = find_setting("views", "one of 2")
     apart = measure_apart(folder, setting, tmp_path / "labels.npy")
     here, labels = measure(subject, setting)
     np.testing.assert_array_equal(np.load(tmp_path / "labels.npy"), labels)
-    assert (apart.miou, apart.instances, apart.knob, apart.value) == (here.miou, here.instances, "views", "one of 2")
+    assert (apart.digest, apart.knob, apart.value) == (here.digest, "views", "one of 2")
+    assert apart.peak_mb > 10
 
 
 def test_a_fit_that_fails_is_told_by_its_last_line(tmp_path):
     with pytest.raises(OgPointcloudError, match=r"nowhere, default : the fit failed: .*nowhere"):
         measure_apart(tmp_path / "nowhere", knobs.DEFAULT, tmp_path / "labels.npy")
+
+
+@pytest.mark.parametrize(
+    ("knob", "value"),
+    [
+        ("mode", "auto"),
+        ("mode", "fast"),
+        ("grouping sample", "5,000"),
+        ("pixels per spacing", "4"),
+        ("alpha cut-off", "1/16"),
+        ("transmittance cut-off", "1e-1"),
+        (knobs.EXACT.knob, knobs.EXACT.value),
+    ],
+)
+def test_what_shares_stages_is_what_a_whole_fit_makes(subject, shared, knob, value):
+    setting = find_setting(knob, value)
+    setting = replace(setting, shares="table") if setting.is_default else setting
+    found = shared.measure(setting)[0]
+    whole, labels = measure(subject, setting)
+    assert found.row.digest == whole.digest
+    np.testing.assert_array_equal(found.labels, labels)
+    assert found.row.seconds > found.row.shared_seconds > 0
+    assert found.row.left_out[-len(whole.left_out) :] == whole.left_out
+
+
+def test_a_table_through_float16_is_told_from_the_table(shared):
+    weights = shared.prepared.table.weights.copy()
+    for value in ("weights through float16", "features through float16"):
+        rounded = shared.measure(find_setting("mask table", value))[0].row
+        assert rounded.digest != shared.measure(ON_SHARED)[0].row.digest
+        assert rounded.miou > 0.8
+    assert (shared.prepared.table.weights != weights).nnz == 0
+
+
+def test_points_at_one_place_are_counted_each(folder, subject, tmp_path):
+    from conftest import COLOURS, write_ply
+
+    twice = tmp_path / "twice"
+    shutil.copytree(folder, twice)
+    xyz = read_capture(folder).points
+    place = np.concatenate([np.arange(len(xyz)), np.arange(0, len(xyz), 3)])
+    world = xyz.xyz.astype(np.float64) + xyz.origin
+    write_ply(twice / "points.ply", world[place].astype(np.float32), np.broadcast_to(COLOURS[0], (len(place), 3)))
+    with np.load(folder / "gt.npz") as truth:
+        np.savez(twice / "gt.npz", names=truth["names"], cls=truth["cls"][place], background=truth["background"][place])
+    again = read_subject(twice)
+    fitted = SharedFit(again)
+    found = fitted.measure(ON_SHARED)[0]
+    whole, labels = measure(again, knobs.DEFAULT)
+    np.testing.assert_array_equal(found.labels, labels)
+    assert found.row.miou == whole.miou
+    forced = next(knobs.forced_by(entry["what"]) for entry in whole.left_out if "points" in entry["what"])
+    kept, labels = measure(again, forced)
+    assert len(labels) == len(place)
+    assert not any("points" in entry["what"] for entry in kept.left_out)
 
 
 def test_disagreement_of_words_and_of_instances(subject):
@@ -199,13 +364,25 @@ def test_mask_graph_labels_what_masks_show(folder, subject, prepared):
     assert error_of(labels, subject)["macc"] > 0.8
 
 
+def test_points_shown_mostly_outside_of_masks_lose_their_label(prepared):
+    inside, outside = prepared.table.weights.toarray().sum(axis=0), prepared.table.outside.toarray().sum(axis=0)
+    labels = only_where_masked(np.zeros(len(inside), int), prepared)
+    for point in range(0, len(inside), 5):
+        assert labels[point] == (0 if inside[point] > 0.5 * (inside[point] + outside[point]) else -1)
+    assert {*labels} == {0, -1}
+
+
 def test_lookups_are_exact_and_coarser_numbers_are_not_hidden(cloud, subject, monkeypatch):
     monkeypatch.setattr(asking, "ASKED", 5_000)
     monkeypatch.setattr(asking, "REPEATS", 1)
     rows = {(row.knob, row.value): row for row in asking.measure_asking(cloud, subject)}
-    for value in ("graph and search", "search alone", "scipy KD-tree"):
-        assert rows["lookup", value].disagreement == 0
-    assert rows["descriptors", "float32"].disagreement == 0
+    for value in ("graph and search", "graph, cells of 1", "graph, cells of 3", "search alone", "KD-tree, all cores"):
+        assert rows["lookup", value].off_exact == 0
+    assert rows["lookup", "graph, no lists"].off_exact > 0
+    assert rows["lookup", "graph, cells of 1"].megabytes > rows["lookup", "graph, cells of 3"].megabytes
+    for knob, value in asking.DEFAULTS.items():
+        assert rows[knob, value].off_exact == 0
+    assert rows["descriptors", "int8"].megabytes * 4 == pytest.approx(rows["descriptors", "float32"].megabytes)
     texts = subject.vocabulary.vectors
     assert rows["text", "float16"].miou == rows["descriptors", "float32"].miou
     swapped = replace(subject, vocabulary=Vocabulary(subject.vocabulary.names, texts[::-1].copy()))
@@ -213,30 +390,60 @@ def test_lookups_are_exact_and_coarser_numbers_are_not_hidden(cloud, subject, mo
     assert wrong["descriptors", "float32"].miou < 0.5 < rows["descriptors", "float32"].miou
 
 
-def test_command_writes_page_table_and_plot(folder, tmp_path, monkeypatch, capsys):
-    few = tuple(knob for knob in knobs.KNOBS if knob.name == "views")
-    monkeypatch.setattr(knobs, "KNOBS", (replace(few[0], values=few[0].values[:2]),))
-    monkeypatch.setattr(page, "KNOBS", knobs.KNOBS)
-    monkeypatch.setattr(asking, "ASKED", 2_000)
-    assert main(["report", str(folder), "--quick", "-o", str(tmp_path / "r")]) == 0
+def test_command_writes_page_table_and_plots(folder, tmp_path, monkeypatch, capsys):
+    kept = {"views": 2, "mode": 2, "feature width": 2}
+    few = tuple(replace(k, values=k.values[: kept[k.name]]) for k in knobs.KNOBS if k.name in kept)
+    monkeypatch.setattr(knobs, "KNOBS", few)
+    assert main(["report", str(folder), "-o", str(tmp_path / "r")]) == 0
     assert "next: open" in capsys.readouterr().out
     html = (tmp_path / "r" / "report.html").read_text()
     assert re.findall(r'(?:src|href)="(?!data:)', html) == []
-    for words in ("the default", "views: one of 2", "baseline: direct uplift", "lookup: graph and search", "left out"):
+    for words in (
+        "views: one of 2",
+        "direct uplift, where masked",
+        "lookup: graph and search",
+        "left out",
+        "same bits",
+    ):
         assert words in html
-    rows = list(csv.DictReader((tmp_path / "r" / "report.csv").open()))
-    assert rows[0]["knob"] == "default"
-    assert float(rows[0]["miou"]) > 0.8
-    assert (tmp_path / "r" / "capture.png").read_bytes().startswith(b"\x89PNG")
+    assert "DIFFERENT" not in html
+    rows = {(r["knob"], r["value"]): r for r in csv.DictReader((tmp_path / "r" / "report.csv").open())}
+    default = rows["default", ""]
+    assert float(default["miou"]) > 0.8
+    assert default["runs"] == "2"
+    assert "cores" in default["machine"]
+    assert default["version"]
+    assert rows["default", ON_SHARED.value]["digest"] == rows["seed", "1"]["digest"] == default["digest"]
+    assert rows["feature width", "3"]["seed"] == "0"
+    assert rows["seed of mode fast", "2"]["seed"] == "2"
+    assert float(rows["mode", "fast"]["shared_seconds"]) > 0
+    assert float(rows[knobs.EXACT.knob, knobs.EXACT.value]["off_exact"]) == 0
+    for name in ("settings", "capture-fits", "capture-settings"):
+        assert (tmp_path / "r" / f"{name}.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_page_says_where_runs_differ(folder, cloud, subject, tmp_path):
-    rows = (row(2.0, 0.9, "default", "", runs=2), row(1.0, 0.95, "mode", "fast", runs_alike=False))
-    rows = tuple(replace(one, capture=folder.name) for one in rows)
-    report = sweep.Report(rows, {folder.name: cloud}, {folder.name: folder}, "here", 1.0)
+def test_page_says_what_is_off_the_front_and_where_runs_differ(tmp_path):
+    rows = (
+        row(2.0, 0.9, "default", "", runs=2, left_out=({"what": "75% of the pixels", "why": "they are fine"},)),
+        row(1.0, 0.95, "views", "one of 2", gain=0.05, gain_low=0.01, gain_high=0.09, runs_alike=False),
+        row(2.5, 0.92, "left out", "all pixels", gain=0.02, gain_low=0.01, gain_high=0.03),
+        row(2.2, 0.6, "baseline", "direct uplift", gain=-0.3, gain_low=-0.4, gain_high=-0.2),
+    )
+    dot = mean_plot(rows)
+    report = sweep.Report(rows, {"c": dot}, {}, {"c: mode fast": "no mask shows an instance"}, "here", 1.0)
     html = page.write_page(report, tmp_path / "r.html").read_text()
-    assert "Runs differ in their labels: mode fast" in html
-    assert "fast is as good or better on capture" in html
+    assert "Runs differ in their answer: c, views one of 2" in html
+    assert "off</span> c: one of 2 -50.0%, -0.0500" in html
+    assert "+0.300 (+0.200 to +0.400)" in html  # ours less direct uplift
+    assert "<td>+0.50</td><td>+0.0200 (+0.0100 to +0.0300)</td>" in html  # the pixels: half a second, two points
+    assert "Nothing was left out of: views, points" in html
+    assert "no mask shows an instance" in html
+
+
+def test_plots_stand_without_truth_and_with_one_row():
+    rows = (row(2.0, None, "default", ""), row(1.0, None, "views", "one of 2", disagreement=0.1))
+    for png in (mean_plot(rows), knob_plot(rows, "c"), fit_plot(rows, "c"), fit_plot(rows[:1], "c")):
+        assert png.startswith(b"\x89PNG")
 
 
 def test_bad_use_is_one_error(tmp_path, capsys):
@@ -244,3 +451,7 @@ def test_bad_use_is_one_error(tmp_path, capsys):
     assert "no CAPTURE and no --room" in capsys.readouterr().err
     assert main(["report", str(tmp_path), "--runs", "0"]) == 2
     assert "--runs is 0; expected at least 1" in capsys.readouterr().err
+    (tmp_path / "a" / "x").mkdir(parents=True)
+    (tmp_path / "b" / "x").mkdir(parents=True)
+    assert main(["report", str(tmp_path / "a" / "x"), str(tmp_path / "b" / "x"), "-o", str(tmp_path / "r")]) == 2
+    assert "two captures are in folders named 'x'" in capsys.readouterr().err

@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 import shlex
 import sys
-import tempfile
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,8 +15,8 @@ from og_pointcloud.cli.common import add_command, check_outputs, print_table
 from og_pointcloud.errors import OgPointcloudError
 
 if TYPE_CHECKING:
-    from og_pointcloud.report.knobs import Setting
     from og_pointcloud.report.measure import Row
+    from og_pointcloud.report.sweep import Tick
 
 
 def add(commands: Any) -> None:
@@ -30,8 +30,10 @@ def add(commands: Any) -> None:
         help="folders; with gt.npz and text_features.npz errors are known, else all is held against the default",
     )  # fmt: skip
     parser.add_argument("--room", metavar="SEED[,SEED]", help="made rooms, in place of captures or beside them")
-    parser.add_argument("--quick", action="store_true", help="the knobs that matter most, one run each")
-    parser.add_argument("--runs", type=int, metavar="N", help="runs of every setting (default: 2, with --quick 1)")
+    parser.add_argument("--quick", action="store_true", help="the knobs that matter most")
+    parser.add_argument(
+        "--runs", type=int, default=1, metavar="N", help="runs of every setting, of the default at least 2 (default: 1)"
+    )
     parser.add_argument("--paper", action="store_true", help="also the paper's training, 3 %% of its steps (minutes)")
     parser.add_argument(
         "-o", "--output", type=Path, default=Path("out/report"), metavar="DIR",
@@ -40,16 +42,15 @@ def add(commands: Any) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    seeds, output = room_seeds(arguments.room), arguments.output
+    seeds, output, runs = room_seeds(arguments.room), arguments.output, arguments.runs
     if not arguments.captures and not seeds:
         raise OgPointcloudError("no CAPTURE and no --room; expected at least one, e.g. --room 1")
-    runs = arguments.runs if arguments.runs is not None else 1 if arguments.quick else 2
     if runs < 1:
         raise OgPointcloudError(f"--runs is {runs}; expected at least 1")
     page, table = output / "report.html", output / "report.csv"
     check_outputs({"the page": (page, [".html"]), "the table": (table, [".csv"])}, inputs=arguments.captures)
     from og_pointcloud.report.page import write_page
-    from og_pointcloud.report.plots import fit_plot
+    from og_pointcloud.report.plots import fit_plot, knob_plot, mean_plot
     from og_pointcloud.report.sweep import QUICK, Sweep, report_on, write_rows
     from og_pointcloud.scoring.plots import require_matplotlib
 
@@ -57,22 +58,49 @@ def run(arguments: argparse.Namespace) -> None:
     output.mkdir(parents=True, exist_ok=True)
     folders = [*arguments.captures, *(made_room(seed, output) for seed in seeds)]
     sweep = Sweep(knobs=QUICK if arguments.quick else None, runs=runs, paper=arguments.paper)
-    with tempfile.TemporaryDirectory() as work:
-        report = report_on(folders, Path(work), sweep, steps)
+    check_names(folders)
+    with progress() as tick:
+        report = report_on(folders, sweep, tick)
     write_rows(report.rows, table)
-    for name in report.clouds:
-        (output / f"{name}.png").write_bytes(fit_plot(report.rows, name))
+    plots = {f"{name}-fits": fit_plot(report.rows, name) for name in report.pictures}
+    plots |= {f"{name}-settings": knob_plot(report.rows, name) for name in report.pictures}
+    plots["settings"] = mean_plot(report.rows)
+    for name, png in plots.items():
+        (output / f"{name}.png").write_bytes(png)
     write_page(report, page)
     print_defaults(report.rows)
-    print(f"wrote {page}, {table} and {len(report.clouds)} plots")
+    print(f"wrote {page}, {table} and {len(plots)} plots")
     print(f"next: open {shlex.quote(str(page))} in a browser")
 
 
-def steps(settings: list[Setting], capture: str) -> Iterable[Setting]:
-    """The settings, with a bar and the remaining time where stderr is a terminal."""
+def check_names(folders: Sequence[Path]) -> None:
+    """Captures are told apart by their folders' names."""
+    names = [folder.absolute().name for folder in folders]
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        raise OgPointcloudError(f"two captures are in folders named '{twice}'; expected different names")
+
+
+@contextmanager
+def progress() -> Iterator[Tick]:
+    """A bar a capture, of the settings it still has to come, where stderr is a terminal."""
     from tqdm import tqdm
 
-    return tqdm(settings, desc=capture, file=sys.stderr, disable=None, dynamic_ncols=True)
+    bars: dict[str, Any] = {}
+
+    def tick(capture: str, what: str, left: int) -> None:
+        if capture not in bars:
+            for done in bars.values():
+                done.close()
+            bars[capture] = tqdm(total=left + 1, desc=capture, file=sys.stderr, disable=None, dynamic_ncols=True)
+        bars[capture].set_postfix_str(what, refresh=False)
+        bars[capture].update(bars[capture].total - left - bars[capture].n)
+
+    try:
+        yield tick
+    finally:
+        for bar in bars.values():
+            bar.close()
 
 
 def print_defaults(rows: Iterable[Row]) -> None:

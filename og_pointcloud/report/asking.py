@@ -9,7 +9,8 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
+from functools import partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,44 +22,61 @@ from og_pointcloud.cloud import LabelledCloud
 from og_pointcloud.nearest import NONE_WITHIN_REACH, NearestPoint
 from og_pointcloud.report.measure import Row, Subject, error_of
 from og_pointcloud.runtime import LabelledScene
+from og_pointcloud.scoring.truth import Truth
 
-__all__ = ["ASKED", "measure_asking"]
+if TYPE_CHECKING:
+    from onnxruntime import InferenceSession
+
+__all__ = ["ASKED", "DEFAULTS", "REASONS", "measure_asking", "truth_of_rows"]
 
 ASKED = 300_000
 """Points of a frame: a depth camera's 640x480."""
 MOVED = 0.25
 """Spacings that the points asked are off the cloud's, standard deviation."""
+CELLS = (1.0, 1.5, 2.0, 3.0)
+"""Edges of the bricks' cells, in point spacings."""
 WIDTHS = (256, 64, 16, 4)
 REPEATS = 5
+DEFAULTS = {"lookup": "graph and search", "descriptors": "float32", "text": "float32"}
+"""The value of each knob of the finished file where nothing is set."""
+REASONS = {
+    "lookup": "the graph alone is right where its table has room; the search answers the rest, so that none is wrong",
+    "descriptors": "a table of a scene is small: rounding it saves little",
+    "text": "as the encoder gives them; a file keeps words in float16 where that changes no answer",
+}
 
 Labels = NDArray[np.integer]
 
 
 def measure_asking(cloud: LabelledCloud, subject: Subject, seed: int = 0) -> list[Row]:
-    """Rows of the knobs "lookup", "descriptors" and "text"; seconds are of one frame, or of one choice of words."""
+    """Rows of the knobs "lookup", "descriptors" and "text"; seconds are of one frame, or of one choice of words.
+
+    subject: its truth is of the cloud's rows.
+    """
     if subject.vocabulary is None:
         return []
     random = np.random.default_rng(seed)
     source = random.integers(0, len(cloud), ASKED)
     points = (cloud.xyz[source] + MOVED * cloud.spacing * random.standard_normal((ASKED, 3))).astype(np.float32)
-    asked = subject if subject.truth is None else replace(subject, truth=_of_rows(subject.truth, source))
+    asked = subject if subject.truth is None else replace(subject, truth=truth_of_rows(subject.truth, source))
     word_of_id = _words(cloud, subject.vocabulary.vectors)
-    exact = word_of_id[_searched(cloud, points)]
-    rows = []
-    for value, look_up in _lookups(cloud).items():
-        seconds, ids = _timed(lambda look_up=look_up: look_up(points))
-        rows.append(_row("lookup", value, seconds, word_of_id[ids], exact, asked))
     ids = _searched(cloud, points)
-    for knob, value, descriptors, texts in _precisions(cloud, subject.vocabulary.vectors):
+    exact = word_of_id[ids]
+    rows = []
+    for value, (look_up, megabytes) in _lookups(cloud).items():
+        seconds, found = _timed(lambda look_up=look_up: look_up(points))
+        rows.append(_row("lookup", value, seconds, word_of_id[found], exact, asked, megabytes))
+    for knob, value, descriptors, texts, megabytes in _precisions(cloud, subject.vocabulary.vectors):
         kept = replace(cloud, instances=replace(cloud.instances, descriptors=descriptors), word_bank=None)
         seconds, words = _timed(lambda kept=kept, texts=texts: _words(kept, texts))
-        rows.append(_row(knob, value, seconds, words[ids], exact, asked))
+        rows.append(_row(knob, value, seconds, words[ids], exact, asked, megabytes))
     return rows
 
 
-def _of_rows(truth: Any, rows: NDArray[np.integer]) -> Any:
+def truth_of_rows(truth: Truth, rows: NDArray[np.integer]) -> Truth:
+    """The truth of some of its points, in that order."""
     background = None if truth.background is None else truth.background[rows]
-    return replace(truth, cls=truth.cls[rows], scored=truth.scored[rows], background=background)
+    return replace(truth, cls=truth.cls[rows], scored=truth.scored[rows], background=background, instance=None)
 
 
 def _words(cloud: LabelledCloud, texts: NDArray[np.floating]) -> Labels:
@@ -71,19 +89,13 @@ def _searched(cloud: LabelledCloud, points: NDArray[np.float32]) -> Labels:
     return np.append(cloud.instance_ids, np.int32(TOO_FAR))[np.where(nearest == NONE_WITHIN_REACH, -1, nearest)]
 
 
-def _lookups(cloud: LabelledCloud) -> dict[str, Callable[[NDArray[np.float32]], Labels]]:
-    """Ways to the instance of a point; all are made ready before they are timed."""
-    from og_pointcloud_export import query_model
+def _lookups(cloud: LabelledCloud) -> dict[str, tuple[Callable[[NDArray[np.float32]], Labels], float | None]]:
+    """Ways to the instance of a point, with the MB of their tables; all are made ready before they are timed."""
     from scipy.spatial import cKDTree
 
-    graph = open_session(query_model(cloud).onnx)
-    width = graph.get_inputs()[1].shape[1]
     scene = LabelledScene.from_cloud(cloud)
     tree, ids = cKDTree(cloud.xyz), np.append(cloud.instance_ids, np.int32(TOO_FAR))
     search = NearestPoint(cloud.xyz, cloud.spacing, cloud.reach)
-
-    def graph_alone(points: NDArray[np.float32]) -> Labels:
-        return np.asarray(graph.run(["instance"], {"points": points, "text": np.zeros((0, width), np.float32)})[0])
 
     def graph_and_search(points: NDArray[np.float32]) -> Labels:
         return scene.instances_at(points + cloud.origin)
@@ -96,29 +108,50 @@ def _lookups(cloud: LabelledCloud) -> dict[str, Callable[[NDArray[np.float32]], 
         return ids[tree.query(points, distance_upper_bound=cloud.reach, workers=-1)[1]]
 
     return {
-        "graph alone": graph_alone,
-        "graph and search": graph_and_search,
-        "search alone": search_alone,
-        "scipy KD-tree": kd_tree,
+        DEFAULTS["lookup"]: (graph_and_search, None),
+        **_graphs(cloud),
+        "search alone": (search_alone, None),
+        "KD-tree, all cores": (kd_tree, None),
     }
+
+
+def _graphs(cloud: LabelledCloud) -> dict[str, tuple[Callable[[NDArray[np.float32]], Labels], float | None]]:
+    """query.onnx alone, with bricks of several cell sizes, and without the lists that settle cells at borders."""
+    from og_pointcloud_export.brick_grid import GridSettings, build_brick_grid
+    from og_pointcloud_export.query_head import build_query_head
+
+    width = max(cloud.instances.descriptors.shape[1], 1)
+
+    def ask(graph: InferenceSession, points: NDArray[np.float32]) -> Labels:
+        return np.asarray(graph.run(["instance"], {"points": points, "text": np.zeros((0, width), np.float32)})[0])
+
+    ways = {f"graph, cells of {cell:g}": GridSettings(cell_per_spacing=cell) for cell in CELLS}
+    ways["graph, no lists"] = GridSettings(lists=False)
+    graphs = {}
+    for value, settings in ways.items():
+        onnx = build_query_head(cloud, build_brick_grid(cloud, settings))
+        graphs[value] = partial(ask, open_session(onnx)), len(onnx) / 1e6
+    return graphs
 
 
 def _precisions(
     cloud: LabelledCloud, texts: NDArray[np.floating]
-) -> list[tuple[str, str, NDArray[np.float32], NDArray[np.float32]]]:
-    """(knob, value, descriptors, texts) as they would be kept."""
+) -> list[tuple[str, str, NDArray[np.float32], NDArray[np.float32], float]]:
+    """(knob, value, descriptors, texts, MB) as they would be kept."""
     table, texts = cloud.instances.descriptors, np.asarray(texts, np.float32)
     texts = texts / np.linalg.norm(texts, axis=1, keepdims=True)
-    kept = [("descriptors", "float32", table, texts)]
-    kept += [("descriptors", name, rounded(table), texts) for name, rounded in ROUNDED.items()]
-    kept += [("text", name, table, rounded(texts)) for name, rounded in ROUNDED.items()]
+    kept = [("descriptors", "float32", table, texts, table.size * 4e-6)]
+    kept += [("descriptors", name, rounded(table), texts, table.size * size) for name, rounded, size in ROUNDED]
+    kept.append(("text", "float32", table, texts, texts.size * 4e-6))
+    kept += [("text", name, table, rounded(texts), texts.size * size) for name, rounded, size in ROUNDED]
     # Words and instances differ along few directions; these are the instances' own.
-    middle = table.mean(axis=0)
+    middle = table.mean(axis=0) if len(table) else np.zeros(table.shape[1], np.float32)
     directions = np.linalg.svd(table - middle, full_matrices=False)[2]
     for width in WIDTHS:
         if width < min(len(directions), table.shape[1]):
             basis = np.concatenate([_unit(middle[None]), directions[:width]]).T.astype(np.float32)
-            kept.append(("descriptors", f"{width} directions", _unit(table @ basis), texts @ basis))
+            value = f"projected to {width} directions"
+            kept.append(("descriptors", value, _unit(table @ basis), texts @ basis, len(table) * (width + 1) * 4e-6))
     return kept
 
 
@@ -128,10 +161,11 @@ def _eight_bits(rows: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.round(rows / scale).astype(np.float32) * scale
 
 
-ROUNDED: dict[str, Callable[[NDArray[np.float32]], NDArray[np.float32]]] = {
-    "float16": lambda rows: rows.astype(np.float16).astype(np.float32),
-    "int8": _eight_bits,
-}
+ROUNDED: tuple[tuple[str, Callable[[NDArray[np.float32]], NDArray[np.float32]], float], ...] = (
+    ("float16", lambda rows: rows.astype(np.float16).astype(np.float32), 2e-6),
+    ("int8", _eight_bits, 1e-6),
+)
+"""A name, what it does to rows, and MB a number."""
 
 
 def _unit(rows: NDArray[np.floating]) -> NDArray[np.float32]:
@@ -147,15 +181,19 @@ def _timed(call: Callable[[], Labels]) -> tuple[list[float], Labels]:
     return seconds, answer
 
 
-def _row(knob: str, value: str, seconds: list[float], labels: Labels, exact: Labels, asked: Subject) -> Row:
+def _row(
+    knob: str, value: str, seconds: list[float], labels: Labels, exact: Labels, asked: Subject, megabytes: float | None
+) -> Row:
+    off = float((labels != exact).mean())
     return Row(
         capture=asked.folder.name,
         knob=knob,
         value=value,
         seconds=min(seconds),
         seconds_most=max(seconds),
-        peak_mb=float("nan"),
-        disagreement=float((labels != exact).mean()),
+        disagreement=off,
+        off_exact=off,
+        megabytes=megabytes,
         runs=len(seconds),
         **error_of(labels, asked),
     )

@@ -1,7 +1,8 @@
 """Other ways from masks to labelled points, on the same mask table: what the whole method is worth beside them.
 
 Each takes what the stages that all share have prepared, and vectors of words; it returns a word a point, (n,) int, -1
-where it says nothing. None knows background: a point that a mask's rays reach gets a word.
+where it says nothing. None knows background: a point that a mask's rays reach gets a word. `only_where_masked` is the
+plain remedy, and is reported beside each: points that views show mostly outside of masks get none.
 
     direct uplift      every point the mean feature of the masks that show it, by blending weight
     nearest view       the feature of the mask that the closest view shows it in
@@ -27,10 +28,22 @@ from og_pointcloud.fitting.testimony import hear_views
 from og_pointcloud.scene import Scene
 from og_pointcloud.settings import FitSettings
 
-__all__ = ["BASELINES", "centre_sampling", "compressed_uplift", "direct_uplift", "mask_graph", "nearest_view", "uplift"]
+__all__ = [
+    "BASELINES",
+    "centre_sampling",
+    "compressed_uplift",
+    "direct_uplift",
+    "mask_graph",
+    "nearest_view",
+    "only_where_masked",
+    "uplift",
+]
 
 COMPRESSED_WIDTH = 3
 """Numbers a feature in LangSplat's scenes (its Sec. 4)."""
+
+MOSTLY = 0.5
+"""Share of a point's weight in masks from which it belongs to them."""
 
 Words = NDArray[np.floating]
 Labels = NDArray[np.integer]
@@ -111,6 +124,13 @@ BASELINES: dict[str, Baseline] = {
     "centre sampling": centre_sampling,
     "mask graph": mask_graph,
 }
+
+
+def only_where_masked(labels: Labels, prepared: Prepared) -> Labels:
+    """The labels without those of points of whose visible weight less than MOSTLY lies in masks."""
+    table = prepared.table
+    inside, outside = (np.asarray(part.sum(axis=0), np.float64).ravel() for part in (table.weights, table.outside))
+    return np.where(inside > MOSTLY * (inside + outside), labels, -1)
 
 
 def uplift(weights: csr_array, features: NDArray[np.floating], words: Words) -> Labels:

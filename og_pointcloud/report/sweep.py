@@ -6,141 +6,158 @@ import csv
 import io
 import os
 import platform
+import tempfile
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from og_pointcloud._atomic import replacing
-from og_pointcloud.cloud import LabelledCloud
-from og_pointcloud.fitting.fit import fit, prepare
-from og_pointcloud.formats.capture import read_capture
-from og_pointcloud.report.asking import measure_asking
-from og_pointcloud.report.baselines import BASELINES
-from og_pointcloud.report.knobs import DEFAULT, FORCED, Setting, settings_to_try
-from og_pointcloud.report.measure import Row, Subject, disagreement, error_of, labels_of, measure_apart, read_subject
+from og_pointcloud.report.judging import judged
+from og_pointcloud.report.knobs import (
+    ALWAYS_FORCED,
+    DEFAULT,
+    EXACT,
+    FAST,
+    SEEDS,
+    Setting,
+    forced_by,
+    settings_to_try,
+)
+from og_pointcloud.report.measure import Row, Subject, measure_apart, read_subject
+from og_pointcloud.report.shared import Measured, measure_shared
+from og_pointcloud.scoring.spread import RiskCoverage
 
-__all__ = ["QUICK", "Report", "Sweep", "error", "front", "machine", "report_on", "write_rows"]
+__all__ = ["QUICK", "Report", "Risk", "Sweep", "machine", "own_version", "report_on", "rows_as_csv", "write_rows"]
 
 QUICK = ("mode", "views", "pixels per spacing", "grouping sample")
 """Knobs of a report in a hurry."""
-NAN = float("nan")
+DEFAULT_RUNS = 2
+"""Of the default at least: what its seconds differ by is the noise that others are read with."""
+
+Tick = Callable[[str, str, int], None]
+"""Told of each row: the capture, what was measured, and how many rows of that capture are still to come."""
 
 
 @dataclass(frozen=True)
 class Sweep:
-    """What is tried. knobs: names, None for all. runs: of every setting, least and most seconds are kept."""
+    """What is tried. knobs: names, None for all, and with them the exact setting and other seeds. runs: of every
+    setting, least and most seconds are kept."""
 
     knobs: tuple[str, ...] | None = None
-    runs: int = 2
+    runs: int = 1
     paper: bool = False
 
 
 @dataclass(frozen=True)
+class Risk:
+    """The default's answers, surest first. answered: share of the points that it answers."""
+
+    curve: RiskCoverage
+    answered: float
+
+
+@dataclass(frozen=True)
 class Report:
-    """rows: of every capture and setting. clouds: what the default makes of each capture, by its name."""
+    """rows: of every capture and setting. pictures: PNG of each capture's default fit, by name. risks: where the truth
+    is known. failed: what could not be run, with the reason."""
 
     rows: tuple[Row, ...]
-    clouds: dict[str, LabelledCloud]
-    folders: dict[str, Path]
+    pictures: dict[str, bytes]
+    risks: dict[str, Risk]
+    failed: dict[str, str]
     machine: str
     seconds: float
 
 
-def report_on(
-    folders: Sequence[Path], work: Path, sweep: Sweep, steps: Callable[[list[Setting], str], Iterable[Setting]]
-) -> Report:
-    """Measure all captures. work: a folder for labels in passing. steps: wraps a list, for progress.
+def report_on(folders: Sequence[Path], sweep: Sweep, tick: Tick) -> Report:
+    """Measure all captures.
 
-    Deterministic but for seconds. OgPointcloudError where a fit fails, SceneError for a folder that is no capture.
+    Deterministic but for seconds and memory. OgPointcloudError where the default fails, SceneError for a folder that is
+    no capture.
     """
-    start, rows, clouds = time.perf_counter(), [], {}
-    for subject in [read_subject(folder) for folder in folders]:  # all are read before the first is measured
-        rows += measure_settings(subject, work, sweep, steps)
-        scene = read_capture(subject.folder)
-        cloud = fit(scene, progress=False)
-        clouds[subject.folder.name] = cloud
-        rows += measure_baselines(subject, labels_of(cloud, subject.vocabulary))
-        rows += measure_asking(cloud, subject)
-    return Report(
-        tuple(rows), clouds, {folder.name: folder for folder in folders}, machine(), time.perf_counter() - start
-    )
-
-
-def measure_settings(
-    subject: Subject, work: Path, sweep: Sweep, steps: Callable[[list[Setting], str], Iterable[Setting]]
-) -> list[Row]:
-    """A row for the default, for every other setting, and for each thing that the default left out, forced back in."""
-    default = _repeated(subject, DEFAULT, work, sweep.runs)
-    rows = [default[0]]
-    only = sweep.knobs
-    tried = settings_to_try(paper=sweep.paper, only=lambda knob: only is None or knob.name in only)[1:]
-    left_out = " ".join(entry["what"] for entry in rows[0].left_out)
-    tried += [setting for words, setting in FORCED if words in left_out]
-    for setting in steps(tried, subject.folder.name):
-        runs = 1 if setting.settings.mode == "paper" else sweep.runs
-        row, labels = _repeated(subject, setting, work, runs)
-        rows.append(replace(row, disagreement=disagreement(labels, default[1], subject)))
-    return rows
-
-
-def _repeated(subject: Subject, setting: Setting, work: Path, runs: int) -> tuple[Row, NDArray[Any]]:
-    """The row of several runs, and the labels. Runs that differ in their labels are a defect, and said."""
-    rows, labels = [], []
-    for _ in range(runs):
-        file = work / "labels.npy"
-        rows.append(measure_apart(subject.folder, setting, file))
-        labels.append(np.load(file, allow_pickle=False))
-    same = all((other == labels[0]).all() for other in labels[1:])
-    seconds = [row.seconds for row in rows]
-    row = replace(min(rows, key=lambda row: row.seconds), runs=runs, seconds_most=max(seconds), runs_alike=same)
-    return row, labels[0]
-
-
-def measure_baselines(subject: Subject, default: NDArray[Any]) -> list[Row]:
-    """Other methods on the mask table of the default; seconds with those of the stages that all share."""
-    if subject.vocabulary is None:
-        return []
-    scene = read_capture(subject.folder)
     start = time.perf_counter()
-    prepared = prepare(scene)
-    shared = time.perf_counter() - start
-    rows = []
-    for name, baseline in BASELINES.items():
-        start = time.perf_counter()
-        labels = baseline(scene, prepared, subject.vocabulary.vectors)
-        seconds = shared + time.perf_counter() - start
-        errors = error_of(labels, subject)
-        off = disagreement(labels, default, subject)
-        rows.append(Row(subject.folder.name, "baseline", name, seconds, NAN, **errors, disagreement=off))
-    return [replace(row, seconds_most=row.seconds) for row in rows]
+    report = Report((), {}, {}, {}, machine(), 0.0)
+    for subject in [read_subject(folder) for folder in folders]:  # all are read before the first is measured
+        name = subject.folder.name
+        with tempfile.TemporaryDirectory() as work:
+            measured, failed = measure_capture(subject, Path(work), sweep, tick)
+            picture, risk = Path(work) / "picture.png", Path(work) / "risk.npz"
+            report = replace(
+                report,
+                rows=(*report.rows, *judged(subject, measured)),
+                pictures=report.pictures | {name: picture.read_bytes()},
+                risks=report.risks | ({name: _read_risk(risk)} if risk.is_file() else {}),
+                failed=report.failed | {f"{name}: {what}": why for what, why in failed.items()},
+            )
+    return replace(report, seconds=time.perf_counter() - start)
 
 
-def error(row: Row) -> float:
-    """1 - mIoU; the disagreement with the default where the truth is not known."""
-    return row.disagreement if row.miou is None else 1 - row.miou
+def measure_capture(subject: Subject, work: Path, sweep: Sweep, tick: Tick) -> tuple[list[Measured], dict[str, str]]:
+    """The default first, then settings with a process of their own, then those that share one; and what failed."""
+    only, name = sweep.knobs, subject.folder.name
+    default = _repeated(subject, DEFAULT, work, max(DEFAULT_RUNS, sweep.runs))
+    tried = settings_to_try(paper=sweep.paper, only=lambda knob: only is None or knob.name in only)
+    forced = (forced_by(entry["what"]) for entry in default.row.left_out)
+    tried += [setting for setting in forced if isinstance(setting, Setting)]
+    tried += [entry.setting for entry in ALWAYS_FORCED]
+    if only is None:
+        tried += [EXACT, *(seed for seed in SEEDS if seed.settings.mode == "auto" or FAST in tried)]
+    tried = list(dict.fromkeys(tried))
+    apart = [setting for setting in tried if setting.shares == "nothing"]
+    together = [setting for setting in tried if setting.shares != "nothing"]
+    measured, left = [default], len(tried)
+    for setting in apart:
+        left -= 1
+        tick(name, f"{setting.knob} {setting.value}", left)
+        measured.append(_repeated(subject, setting, work, 1 if setting.settings.mode == "paper" else sweep.runs))
+
+    def done(what: str) -> None:
+        nonlocal left
+        left = max(0, left - 1)
+        tick(name, what, left)
+
+    shared, failed = measure_shared(subject.folder, together, work, sweep.runs, done)
+    return [*measured, *shared], failed
 
 
-def front(rows: Sequence[Row]) -> list[Row]:
-    """Rows that no other beats in both seconds and error, by seconds (Pareto)."""
-    best: list[Row] = []
-    for row in sorted(rows, key=lambda row: (row.seconds, error(row))):
-        if not best or error(row) < error(best[-1]):
-            best.append(row)
-    return best
+def _repeated(subject: Subject, setting: Setting, work: Path, runs: int) -> Measured:
+    """The row of several runs, and the labels. Runs that differ in their answer are a defect, and said."""
+    rows, file = [], work / "labels.npy"
+    for _ in range(runs):
+        rows.append(measure_apart(subject.folder, setting, file))
+    seconds = [row.seconds for row in rows]
+    alike = len({row.digest for row in rows}) == 1
+    row = replace(min(rows, key=lambda row: row.seconds), runs=runs, seconds_most=max(seconds), runs_alike=alike)
+    return Measured(row, np.load(file, allow_pickle=False))
+
+
+def _read_risk(path: Path) -> Risk:
+    with np.load(path, allow_pickle=False) as stored:
+        curve = RiskCoverage(stored["coverage"], stored["risk"], float(stored["area"]))
+        return Risk(curve, float(stored["answered"]))
 
 
 def machine() -> str:
-    """What the seconds are of."""
-    versions = ", ".join(f"{name} {version(name)}" for name in ("numpy", "numba", "scipy", "onnxruntime"))
-    return (
-        f"{_processor()}, {os.cpu_count()} cores, {platform.system()}, Python {platform.python_version()}, {versions}"
-    )
+    """What the seconds are of: processor, cores, system, and the versions of what computes."""
+    return f"{_processor()}, {os.cpu_count()} cores, {platform.system()}, {versions()}"
+
+
+def versions() -> str:
+    """Python's, and of what computes."""
+    names = ("numpy", "numba", "scipy", "onnxruntime")
+    return ", ".join([f"Python {platform.python_version()}", *(f"{name} {version(name)}" for name in names)])
+
+
+def own_version() -> str:
+    """Of this library as installed."""
+    try:
+        return version("og-pointcloud")
+    except PackageNotFoundError:
+        return "unknown"
 
 
 def _processor() -> str:
@@ -152,14 +169,20 @@ def _processor() -> str:
     return platform.processor() or platform.machine()
 
 
-def write_rows(rows: Iterable[Row], path: Path) -> Path:
-    """A CSV, a line a row; written whole or not at all."""
+def rows_as_csv(rows: Iterable[Row]) -> str:
+    """A line a row, with the machine and the versions in each."""
     text = io.StringIO()
-    lines = csv.DictWriter(text, list(Row.__dataclass_fields__), lineterminator="\n")
+    where = {"version": own_version(), "machine": machine()}
+    lines = csv.DictWriter(text, [*Row.__dataclass_fields__, *where], lineterminator="\n")
     lines.writeheader()
     for row in rows:
-        values = asdict(row) | {"left_out": "; ".join(entry["what"] for entry in row.left_out)}
+        values = asdict(row) | {"left_out": "; ".join(entry["what"] for entry in row.left_out)} | where
         lines.writerow({name: f"{v:.6g}" if isinstance(v, float) else v for name, v in values.items()})
+    return text.getvalue()
+
+
+def write_rows(rows: Iterable[Row], path: Path) -> Path:
+    """`rows_as_csv` in a file, written whole or not at all."""
     with replacing(path) as file:
-        file.write(text.getvalue().encode())
+        file.write(rows_as_csv(rows).encode())
     return path

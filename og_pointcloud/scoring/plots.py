@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -13,7 +14,7 @@ from og_pointcloud._atomic import replacing
 from og_pointcloud.errors import MissingExtraError
 from og_pointcloud.scoring.spread import RiskCoverage
 
-__all__ = ["plot_risk_coverage", "require_matplotlib"]
+__all__ = ["plot_risk_coverage", "require_matplotlib", "risk_coverage_png"]
 
 
 def require_matplotlib() -> Any:
@@ -28,8 +29,16 @@ def require_matplotlib() -> Any:
 def plot_risk_coverage(
     curves: Mapping[str, RiskCoverage], answered: Mapping[str, float], path: str | os.PathLike[str], title: str = ""
 ) -> Path:
-    """Write a PNG. curves: by method. answered: share of the points that each method answers of itself; beyond it lie
-    the unknown ones, which count as wrong."""
+    """Write `risk_coverage_png`, whole or not at all."""
+    png = risk_coverage_png(curves, answered, title)
+    with replacing(Path(path)) as file:
+        file.write(png)
+    return Path(path)
+
+
+def risk_coverage_png(curves: Mapping[str, RiskCoverage], answered: Mapping[str, float], title: str = "") -> bytes:
+    """A PNG. curves: by method. answered: share of the points that each method answers of itself; beyond it lie the
+    unknown ones, which count as wrong."""
     figure = require_matplotlib()(figsize=(7, 4.2), layout="constrained")
     axes = figure.subplots()
     for name, curve in curves.items():
@@ -46,6 +55,6 @@ def plot_risk_coverage(
     axes.grid(alpha=0.3)
     axes.spines[["top", "right"]].set_visible(False)
     axes.legend(fontsize=8, frameon=False)
-    with replacing(Path(path)) as file:
-        figure.savefig(file, format="png", dpi=110)
-    return Path(path)
+    data = io.BytesIO()
+    figure.savefig(data, format="png", dpi=110)
+    return data.getvalue()
