@@ -172,8 +172,8 @@ class LabelledScene:
     def certainty_at(self, points: NDArray[np.floating]) -> NDArray[np.float32] | None:
         """(N,) float32, the certainty of the scene's point nearest to each, 0 where none is within reach; None where
         the scene does not know it. points: (N, 3), world coordinates. An exact search of every point."""
-        if self.certainty is None:
-            return None
+        if self.certainty is None or points is self.xyz:
+            return self.certainty
         of_points = np.append(self.certainty, np.float32(0))
         certainty = np.zeros(len(points), np.float32)
         finite = np.isfinite(points).all(axis=1)
@@ -469,16 +469,10 @@ def _label(
     instances: NDArray[np.int32],
     distance: NDArray[np.int8],
 ) -> Segmentation:
-    def certainty() -> NDArray[np.float32] | None:
-        if points is scene.xyz:
-            return scene.certainty
-        found = scene.certainty_at(points)
-        return None if found is None else np.where(instances == TOO_FAR, np.float32(0), found)
-
     # A negative instance counts from the end, where those of no instance lie.
     return Segmentation(
         points, answers.labels[instances], answers.scores[instances], instances, words.names, scene.path, distance,
-        answers.reasons[instances], answers.calibrated, certainty,
+        answers.reasons[instances], answers.calibrated, scene.certainty_at,
     )  # fmt: skip
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud._atomic import replacing
+from og_pointcloud.bundle import TOO_FAR
 from og_pointcloud.choosing import Reason
 from og_pointcloud.clouds import import_plugin
 from og_pointcloud.errors import OgPointcloudError
@@ -41,7 +42,7 @@ class Segmentation:
     reasons: (N,) int8, why a point is unknown: a ``Reason``, 0 where it has a label.
     calibrated: whether the scene has a word bank to judge labels by. Without one the best label is answered, however
         badly it fits: then nothing is unknown for Reason.NONE_FITS, unless negatives were asked against.
-    certainty: (N,) float32, see there; looked up when it is first read.
+    certainty: (N,) float32, see there; looked up by ``certainty_at``, the scene's, when it is first read.
     """
 
     xyz: NDArray[np.float64]
@@ -53,7 +54,9 @@ class Segmentation:
     distance: NDArray[np.int8] = field(default_factory=lambda: np.zeros(0, np.int8))
     reasons: NDArray[np.int8] = field(default_factory=lambda: np.zeros(0, np.int8))
     calibrated: bool = False
-    find_certainty: Callable[[], NDArray[np.float32] | None] = field(default=lambda: None, repr=False, compare=False)
+    certainty_at: Callable[[NDArray[np.float64]], NDArray[np.float32] | None] = field(
+        default=lambda points: None, repr=False, compare=False
+    )
 
     def __post_init__(self) -> None:
         for name in ("distance", "reasons"):
@@ -74,7 +77,8 @@ class Segmentation:
         ``scores`` say whether the instance is what the word means, this whether the point is part of it: low at
         borders, and where masks disagree. None where the scene does not know it.
         """
-        return self.find_certainty()
+        found = self.certainty_at(self.xyz)
+        return None if found is None else np.where(self.instances == TOO_FAR, np.float32(0), found)
 
     def mask(self, name: str) -> NDArray[np.bool_]:
         """(N,) bool, the points with this label."""

@@ -567,6 +567,10 @@ def test_certainty_is_that_of_the_nearest_point(scene):
     ):
         assert result.certainty.dtype == np.float32
         np.testing.assert_allclose(result.certainty, wanted, rtol=1e-6)
+    columns = {
+        name: getattr(result, name)[::3] for name in ("xyz", "labels", "scores", "instances", "distance", "reasons")
+    }
+    np.testing.assert_array_equal(replace(result, **columns).certainty, result.certainty[::3])
 
 
 def test_a_scene_that_knows_no_certainty_says_none(scene, tmp_path):

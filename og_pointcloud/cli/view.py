@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from og_pointcloud.viewpoint import Viewpoint
 
 AXES = {"x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1), "-x": (-1, 0, 0), "-y": (0, -1, 0), "-z": (0, 0, -1)}
-OF_SCENE = ("labels", "text_features", "cloud", "html", "png", "boxes", "up", "cut")
+OF_SCENE = ("labels", "text_features", "cloud", "html", "png", "boxes", "certainty", "up", "cut")
 OF_CAPTURE = ("features", "output", "columns", "seed")
 
 
@@ -41,6 +41,7 @@ def add(commands: Any) -> None:
     scene.add_argument("--html", type=Path, metavar="P.html", help="a page that any browser opens, without a network")
     scene.add_argument("--png", type=Path, metavar="P.png", help="a picture")
     scene.add_argument("--boxes", action="store_true", help="boxes around what has a label")
+    scene.add_argument("--certainty", action="store_true", help="colours by how sure each point's instance is")
     scene.add_argument("--up", choices=AXES, metavar="AXIS", help="which of x, y, z, -x, -y, -z points up (default: z)")
     scene.add_argument(
         "--cut", type=float, metavar="SHARE", help="hide this share of the height, from the top: ceilings"
@@ -80,6 +81,8 @@ def view_scene(arguments: argparse.Namespace) -> None:
 
     stages: list[dict[str, Any]] = []
     scene, result, rgb = labelled(arguments, stages)
+    if arguments.certainty and result.certainty is None:
+        raise OgPointcloudError(f"{arguments.source} does not know how sure its points are: fit the capture again")
     with timed(stages, "choose view"):
         shown, view = chosen_view(result, arguments)
     outputs = [path for path in (arguments.html, arguments.png) if path]
@@ -95,7 +98,7 @@ def view_scene(arguments: argparse.Namespace) -> None:
         from og_pointcloud_pyvista.screening import draw
 
         with timed(stages, "draw"):
-            by = "instance" if arguments.instances else "label"
+            by = "certainty" if arguments.certainty else "instance" if arguments.instances else "label"
             plotter = draw(scene, result, rgb, shown, view, by=by, boxes=arguments.boxes, window=not outputs)
             if arguments.png:
                 plotter.screenshot(arguments.png)
@@ -113,6 +116,10 @@ def check_scene_options(arguments: argparse.Namespace) -> None:
     )
     if isinstance(arguments.instances, Path):
         raise OgPointcloudError(f"--instances is '{arguments.instances}'; expected no value where a scene is shown")
+    if arguments.certainty and (arguments.instances or arguments.html):
+        raise OgPointcloudError(
+            "--certainty is drawn alone, in a window or with --png; leave out --instances and --html"
+        )
     if arguments.cut is not None and not 0 <= arguments.cut < 1:
         raise OgPointcloudError(f"--cut is {arguments.cut}; expected a share of the height, from 0 to below 1")
     if arguments.html is not None and arguments.png is None:
