@@ -22,7 +22,7 @@ from og_pointcloud.scoring.instances import AveragePrecision, PanopticQuality, a
 from og_pointcloud.scoring.spread import RiskCoverage, risk_coverage
 from og_pointcloud.scoring.truth import Truth
 
-__all__ = ["Answer", "CaptureScore", "InstanceScore", "ask", "difference", "score_capture"]
+__all__ = ["Answer", "CaptureScore", "InstanceScore", "ask", "difference", "score_capture", "sure"]
 
 Integers = NDArray[np.integer]
 
@@ -44,8 +44,7 @@ class Answer:
     @property
     def sureness(self) -> NDArray[np.float32]:
         """(n,) that the point is what it is called, -inf where it is called nothing."""
-        sure = self.confidence if self.certainty is None else self.confidence * self.certainty
-        return np.where(self.called >= 0, sure, np.float32(-np.inf))
+        return np.where(self.called >= 0, sure(self.confidence, True, self.certainty), np.float32(-np.inf))
 
 
 @dataclass(frozen=True)
@@ -85,9 +84,17 @@ def ask(scene: SceneLike, truth: Truth, text_features: Path | None = None) -> An
         )
     result = segment(scene, None, text_features=text_features)
     called = truth.class_of(result.labels, result.names)
-    # Of cosines only the order counts.
-    confidence = result.scores if result.calibrated else ((1 + result.scores) / 2).astype(np.float32)
+    confidence = sure(result.scores, result.calibrated)
     return Answer(called, confidence, result.instances, cloud.xyz, cloud.spacing, result.certainty)
+
+
+def sure(
+    scores: NDArray[np.floating], calibrated: bool, certainty: NDArray[np.floating] | None = None
+) -> NDArray[np.float32]:
+    """(n,) float32 in [0, 1], larger where an answer is surer. scores: (n,) probabilities if ``calibrated``, else
+    cosines, of which only the order counts. certainty: (n,) that a point is part of its instance, None if not known."""
+    confidence = scores if calibrated else (1 + scores) / 2
+    return np.asarray(confidence if certainty is None else confidence * certainty, np.float32)
 
 
 def score_capture(answer: Answer, truth: Truth, seed: int = 0) -> CaptureScore:

@@ -284,23 +284,26 @@ def predicted(file: Path, xyz: NDArray[np.float64], task: int, text_features: Pa
 def asked_labels(
     file: Path, xyz: NDArray[np.float64], names: list[str], text_features: Path | None
 ) -> tuple[NDArray[np.integer], NDArray[np.floating], NDArray[np.integer]]:
-    """(n,) labels, their scores, and the labels of a scene that may not say that none fits: the largest cosine."""
+    """(n,) labels, how sure they are, and the labels of a scene that may not say that none fits: the largest cosine."""
     from og_pointcloud.choosing import Chooser
     from og_pointcloud.runtime import as_scene, segment
+    from og_pointcloud.scoring.captures import sure
     from og_pointcloud.text.words import resolve_labels
 
     scene = as_scene(file)
     words = resolve_labels(names, text_features, scene.vocabulary, scene.feature_space, scene.path)
     result = segment(xyz, words, scene=scene)
     forced = Chooser(scene.cloud.instances).choose(words.vectors).at(result.instances)[0]
-    return result.labels, result.scores, forced
+    return result.labels, sure(result.scores, result.calibrated, result.certainty), forced
 
 
 def stored_labels(file: Path) -> tuple[NDArray[np.integer], NDArray[np.floating] | None, list[str]]:
-    """(n,) indices of names, below 0 unknown; (n,) scores, if there are any; the names. As ``segment -o`` writes."""
+    """(n,) indices of names, below 0 unknown; (n,) how sure they are, if that is said; the names. As ``segment -o``
+    writes: scores, and where it is known the certainty of each point."""
     import numpy as np
 
     from og_pointcloud.scoring.arrays import read_arrays
+    from og_pointcloud.scoring.captures import sure
 
     arrays = read_arrays(file)
     missing = [name for name in ("labels", "names") if name not in arrays]
@@ -312,8 +315,16 @@ def stored_labels(file: Path) -> tuple[NDArray[np.integer], NDArray[np.floating]
             f"{file}: labels are {labels.dtype} {labels.shape}, names {names.dtype} {names.shape}; expected whole "
             "numbers (points,) and strings (names,)"
         )
-    if scores is not None and (scores.shape != labels.shape or scores.dtype.kind != "f" or np.isnan(scores).any()):
-        raise OgPointcloudError(f"{file}: scores are {scores.dtype} {scores.shape}; expected numbers {labels.shape}")
+    certainty = arrays.get("certainty")
+    for name, numbers in (("scores", scores), ("certainty", certainty)):
+        if numbers is None:
+            continue
+        if numbers.shape != labels.shape or numbers.dtype.kind != "f" or np.isnan(numbers).any():
+            raise OgPointcloudError(
+                f"{file}: {name} are {numbers.dtype} {numbers.shape}; expected numbers {labels.shape}"
+            )
+    if scores is not None and certainty is not None:
+        scores = sure(scores, bool(arrays.get("calibrated", False)), certainty)
     return labels.astype(np.int64), scores, names.tolist()
 
 
