@@ -247,7 +247,7 @@ def test_what_shares_stages_is_what_a_whole_fit_makes(subject, shared, knob, val
 
 def test_a_table_through_float16_is_told_from_the_table(shared):
     weights = shared.prepared.table.weights.copy()
-    for value in ("weights through float16", "features through float16"):
+    for value in ("weights in float16", "features in float16"):
         rounded = shared.measure(find_setting("mask table", value))[0].row
         assert rounded.digest != shared.measure(ON_SHARED)[0].row.digest
         assert rounded.miou > 0.8
@@ -391,10 +391,9 @@ def test_lookups_are_exact_and_coarser_numbers_are_not_hidden(cloud, subject, mo
 
 
 def test_command_writes_page_table_and_plots(folder, tmp_path, monkeypatch, capsys):
-    kept = {"views": 2, "mode": 2, "feature width": 2}
-    few = tuple(replace(k, values=k.values[: kept[k.name]]) for k in knobs.KNOBS if k.name in kept)
+    few = tuple(replace(knob, values=knob.values[:2]) for knob in knobs.KNOBS if knob.name in ("views", "mode"))
     monkeypatch.setattr(knobs, "KNOBS", few)
-    assert main(["report", str(folder), "-o", str(tmp_path / "r")]) == 0
+    assert main(["report", str(folder), "--quick", "-o", str(tmp_path / "r")]) == 0
     assert "next: open" in capsys.readouterr().out
     html = (tmp_path / "r" / "report.html").read_text()
     assert re.findall(r'(?:src|href)="(?!data:)', html) == []
@@ -410,16 +409,40 @@ def test_command_writes_page_table_and_plots(folder, tmp_path, monkeypatch, caps
     rows = {(r["knob"], r["value"]): r for r in csv.DictReader((tmp_path / "r" / "report.csv").open())}
     default = rows["default", ""]
     assert float(default["miou"]) > 0.8
-    assert default["runs"] == "2"
+    assert (default["runs"], default["seed"]) == ("2", "0")
     assert "cores" in default["machine"]
     assert default["version"]
-    assert rows["default", ON_SHARED.value]["digest"] == rows["seed", "1"]["digest"] == default["digest"]
-    assert rows["feature width", "3"]["seed"] == "0"
-    assert rows["seed of mode fast", "2"]["seed"] == "2"
+    assert rows["default", ON_SHARED.value]["digest"] == default["digest"]
     assert float(rows["mode", "fast"]["shared_seconds"]) > 0
-    assert float(rows[knobs.EXACT.knob, knobs.EXACT.value]["off_exact"]) == 0
     for name in ("settings", "capture-fits", "capture-settings"):
         assert (tmp_path / "r" / f"{name}.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_whole_sweep_tries_everything_once(subject, monkeypatch, tmp_path):
+    """Nothing is fitted: only who measures what."""
+    apart, together = [], []
+    left_out = ({"what": "75% of the pixels", "why": ""}, {"what": "learned features and codebook", "why": ""})
+
+    def alone(_, setting, work, runs):
+        apart.append((setting, runs))
+        return Measured(row(1.0, 0.9, setting.knob, setting.value, left_out=left_out), np.zeros(1))
+
+    monkeypatch.setattr(sweep, "_repeated", alone)
+    monkeypatch.setattr(sweep, "measure_shared", lambda _, tried, *rest: (together.extend(tried), ({}, {}))[1])
+    sweep.measure_capture(subject, tmp_path, sweep.Sweep(runs=3, paper=True), lambda *told: None)
+    assert apart[0] == (knobs.DEFAULT, 3)
+    assert (knobs.PAPER, 1) in apart  # it takes minutes
+    tried = [setting for setting, _ in apart[1:]] + together
+    assert len(tried) == len(set(tried))
+    wanted = {*knobs.settings_to_try(paper=True), knobs.EXACT, *knobs.SEEDS, find_setting("left out", "all pixels")}
+    assert {*tried} == wanted | {entry.setting for entry in knobs.ALWAYS_FORCED}
+    assert all(setting.shares == "nothing" for setting, _ in apart)
+    apart.clear()
+    together.clear()
+    sweep.measure_capture(subject, tmp_path, sweep.Sweep(knobs=("views",)), lambda *told: None)
+    assert apart[0] == (knobs.DEFAULT, 2)
+    assert {setting.knob for setting, _ in apart[1:]} == {"views"}
+    assert knobs.EXACT not in together
 
 
 def test_page_says_what_is_off_the_front_and_where_runs_differ(tmp_path):

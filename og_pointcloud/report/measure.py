@@ -76,8 +76,8 @@ class Row:
     setting; of rows of the finished file, from the exact nearest point's. Where there are no words, 1 minus the
     adjusted Rand index of the instances. off_exact is None where the exact setting was not run.
     megabytes: of what is kept, for rows of the finished file: query.onnx, or the table of vectors.
-    seed: of the fit. digest: of instance ids and descriptors. runs_alike: whether those of all runs were the same, bit
-    for bit. left_out: as the fit noted it.
+    seed: of the fit. digest: of instance ids, descriptors and certainty. runs_alike: whether those of all runs were the
+    same, bit for bit. left_out: as the fit noted it.
     """
 
     capture: str
@@ -190,10 +190,11 @@ def labels_of(cloud: LabelledCloud, vocabulary: Vocabulary | None) -> NDArray[np
 
 
 def digest_of(cloud: LabelledCloud) -> str:
-    """A fingerprint of the answer: equal for clouds whose instances and descriptors are the same bit for bit."""
+    """A fingerprint of the answer: equal where instances, descriptors and certainty are the same bit for bit."""
     digest = blake2b(digest_size=8)
-    for array in (cloud.instance_ids, cloud.instances.descriptors, cloud.instances.descriptor_instance):
-        digest.update(np.ascontiguousarray(array).tobytes())
+    instances, certainty = cloud.instances, cloud.certainty
+    for array in (cloud.instance_ids, instances.descriptors, instances.descriptor_instance, certainty):
+        digest.update(b"" if array is None else np.ascontiguousarray(array).tobytes())
     return digest.hexdigest()
 
 

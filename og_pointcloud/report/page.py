@@ -40,6 +40,7 @@ table { border-collapse: collapse; font-size: 13px; margin: .6em 0 1.4em }
 td, th { padding: 2px 10px; text-align: right; vertical-align: top }
 .word { text-align: left } tr:nth-child(even) { background: #f6f6f6 }
 tr.default td { font-weight: 600 } tr.front td:first-child::after { content: " \\25cf"; color: #2a7 }
+.others { font-size: 12px; white-space: nowrap } .why { min-width: 14em; max-width: 20em; display: inline-block }
 .off { color: #b30; font-weight: 600 } .on { color: #175 } .noise { color: #777 }
 th { border-bottom: 1px solid #999 } img { max-width: 100% } figure { margin: 1em 0 }
 p.small, figcaption { color: #666; font-size: 13px } summary { cursor: pointer; color: #246 }
@@ -98,7 +99,10 @@ def _defaults(rows: Sequence[Row], captures: Sequence[str]) -> str:
         verdicts = [found for name in captures if (found := verdict(rows, name, knob)) is not None]
         if verdicts:
             others = "<br>".join(_mean_line(mean) for mean in mean_over_captures(rows, knob))
-            lines.append((escape(knob), escape(value), escape(why), others, _verdicts(verdicts)))
+            reason = f"<span class=why>{escape(why)}</span>"
+            lines.append(
+                (escape(knob), escape(value), reason, f"<div class=others>{others}</div>", _verdicts(verdicts))
+            )
     header = ("setting", "default", "why there", "other values: seconds, error, over all captures", "on the front")
     return (
         "<h2>Why each default is where it is</h2>"
@@ -111,7 +115,8 @@ def _defaults(rows: Sequence[Row], captures: Sequence[str]) -> str:
 
 
 def _mean_line(mean: Mean) -> str:
-    interval = f" ({mean.error.low:+.4f} to {mean.error.high:+.4f})" if len(mean.points) > 1 else ""
+    known = len(mean.points) > 1 and mean.error.low < mean.error.high
+    interval = f" ({mean.error.low:+.4f} to {mean.error.high:+.4f})" if known else ""
     return f"{escape(mean.value)}: {mean.ratio - 1:+.0%}, {mean.error.mean:+.4f}{interval}"
 
 
@@ -165,8 +170,10 @@ def _repeats(rows: Sequence[Row], captures: Sequence[str]) -> str:
     header = ("capture", "seconds of the default (runs)", "its runs", "a table shared", "another seed",
               "mode fast, mIoU of seeds 0, 1, 2")  # fmt: skip
     return (
-        "<h2>Repeats</h2><p>Instance ids and descriptors, compared bit for bit with the default's. By default no stage "
-        "draws by the seed; features and codebook of mode fast do.</p>" + warning + _table(header, body)
+        "<h2>Repeats</h2><p>Instance ids, descriptors and certainty, compared bit for bit with the default's. By "
+        "default no stage draws by the seed; features and codebook of mode fast do.</p>"
+        + warning
+        + _table(header, body)
     )
 
 
@@ -212,7 +219,7 @@ def _capture(report: Report, capture: str) -> str:
     if capture in report.risks:
         risk = report.risks[capture]
         png = risk_coverage_png({"the default": risk.curve}, {"the default": risk.answered})
-        parts.append(_figure(png, "Risk against coverage, surest points first, by cosine and agreement of views."))
+        parts.append(_figure(png, "Risk against coverage, surest points first: cosine times certainty of the point."))
     if asking:
         parts += [
             "<h3>Asking the finished file</h3>",

@@ -18,10 +18,12 @@ __all__ = ["asking_plot", "fit_plot", "knob_plot", "mean_plot"]
 COLUMNS = 4
 WIDTH, PANEL_HEIGHT = 11.0, 2.3
 """Inches; at 110 dots each the page's width."""
+NOT_IN_ALL = ("seed", "seed of mode fast")
+"""Knobs that would only repeat others' dots in the figure of all fits."""
 DOT, RING, LINE, FAINT = "tab:blue", "black", "0.75", "0.8"
 COLOURS = ("tab:blue", "tab:orange", "tab:green", "tab:red", "tab:purple", "tab:brown", "tab:pink", "tab:olive",
            "tab:cyan", "navy", "gold", "teal", "orchid", "slategrey", "lime")  # fmt: skip
-MARKERS = "osD^vPX*<>hpd8H"
+MARKERS = "osD^vPX*<>hpd8"
 NARROWEST_FACTOR, LEAST_RANGE = 1.25, 0.004
 """Of an axis of seconds and of errors: what differs by less than this is drawn close together."""
 TICKS = (0, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1)
@@ -61,8 +63,8 @@ def knob_plot(rows: Sequence[Row], capture: str) -> bytes:
 
 def fit_plot(rows: Sequence[Row], capture: str) -> bytes:
     """PNG of all fits of a capture and the other methods, in one: the default ringed, the front joined."""
-    own = [row for row in rows if row.capture == capture and not is_asking(row)]
-    figure = require_matplotlib()(figsize=(WIDTH, 5), layout="constrained")
+    own = [row for row in rows if row.capture == capture and not is_asking(row) and row.knob not in NOT_IN_ALL]
+    figure = require_matplotlib()(figsize=(WIDTH, 5.6), layout="constrained")
     axes = figure.subplots()
     for index, knob in enumerate(dict.fromkeys(row.knob for row in own if row.knob != "default")):
         of_knob = [row for row in own if row.knob == knob]
@@ -85,7 +87,7 @@ def fit_plot(rows: Sequence[Row], capture: str) -> bytes:
     _plain(axes)
     names = {key: row.value if row.knob == "baseline" else f"{row.knob} {row.value}" for key, row in named.items()}
     _name_dots(axes, [_Dot(names[key], row.seconds, error(row)) for key, row in named.items()], 7)
-    axes.legend(fontsize=8, loc="center left", bbox_to_anchor=(1, 0.5), frameon=False)
+    axes.legend(fontsize=7.5, loc="center left", bbox_to_anchor=(1, 0.5), frameon=False)
     return _png(figure)
 
 
@@ -134,8 +136,9 @@ def _panel(axes: Any, title: str, dots: Sequence[_Dot]) -> None:
     base = [dot for dot in dots if dot.is_base]
     ring = {"s": 90, "facecolors": "none", "edgecolors": RING, "linewidths": 1.6, "zorder": 4}
     axes.scatter([dot.x for dot in base], [dot.y for dot in base], **ring)
-    _log_seconds(axes, [dot.x for dot in dots])
-    low, high = min(dot.y for dot in dots), max(dot.y for dot in dots)
+    every = [place for dot in dots for place in ((dot.x, dot.y), *dot.others)]
+    _log_seconds(axes, [x for x, _ in every])
+    low, high = min(y for _, y in every), max(y for _, y in every)
     room = max(LEAST_RANGE, high - low)
     middle = (low + high) / 2
     axes.set_ylim(middle - 0.68 * room, middle + 0.78 * room)
@@ -167,7 +170,7 @@ def _name_dots(axes: Any, dots: Sequence[_Dot], size: float) -> None:
         axes.text(
             x + (-aside if leftwards else aside), height, names, transform=axes.transAxes, fontsize=size, va="center",
             ha="right" if leftwards else "left", zorder=5, color=RING if is_base else "0.3",
-            fontweight="bold" if is_base else "normal",
+            fontweight="bold" if is_base else "normal", in_layout=False,
         )  # fmt: skip
 
 

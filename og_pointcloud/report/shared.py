@@ -70,6 +70,7 @@ class SharedFit:
         whole = read_capture(subject.folder)
         journal = Journal(progress=False)
         warm_up(whole, FitSettings())
+        self.warm = {"auto", "grouping"}
         reset_peak()
         start = time.perf_counter()
         check_scene(whole, journal)
@@ -82,7 +83,9 @@ class SharedFit:
 
     def measure(self, setting: Setting) -> tuple[Measured, LabelledCloud]:
         """The row of a setting that shares the geometry or the table, and its cloud. SceneError where it fails."""
-        warm_up(self.scene, setting.settings)
+        if setting.settings.mode not in self.warm:
+            warm_up(self.scene, setting.settings)
+            self.warm.add(setting.settings.mode)
         again = self._from_table if setting.shares == "table" else self._from_geometry
         seconds, clouds, peak = self._repeated(lambda: again(setting))
         shared = self.table_seconds if setting.shares == "table" else self.geometry_seconds
@@ -129,13 +132,16 @@ class SharedFit:
         truth, vocabulary = self.subject.truth, self.subject.vocabulary
         if truth is None or vocabulary is None:
             return
-        labels, confidence, _ = chooser_of(cloud).choose(vocabulary.vectors).at(cloud.instance_ids)
-        labels, confidence = self._of_whole(labels), self._of_whole(confidence)
+        labels, score, _ = chooser_of(cloud).choose(vocabulary.vectors).at(cloud.instance_ids)
+        certainty = np.ones(len(cloud)) if cloud.certainty is None else cloud.certainty / 255
+        labels, sure = (
+            self._of_whole(labels),
+            self._of_whole((1 + score) / 2 * certainty),
+        )  # of cosines the order counts
         called, classes = truth.class_of(labels, vocabulary.names), truth.score(labels, vocabulary.names).classes
         counted = truth.scored & np.isin(truth.cls, classes)
         if counted.any():
-            surely = np.where(called >= 0, confidence, -np.inf)[counted]
-            curve = risk_coverage((called == truth.cls)[counted], surely)
+            curve = risk_coverage((called == truth.cls)[counted], np.where(called >= 0, sure, -np.inf)[counted])
             answered = (called >= 0)[counted].mean()
             np.savez(path, coverage=curve.coverage, risk=curve.risk, area=curve.area, answered=answered)
 
