@@ -9,11 +9,16 @@ import shlex
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import og_pointcloud as og
-from og_pointcloud.cli import build_parser
+from og_pointcloud import clouds
+from og_pointcloud.cli import build_parser, main
 from og_pointcloud.cli.eval_ import capture, scannet
+from og_pointcloud.clouds import world_points
+from og_pointcloud.errors import SceneError
+from og_pointcloud.formats import capture as capture_format
 from og_pointcloud.metrics import score_labels
 from og_pointcloud.scoring import blocks as spatial_blocks
 from og_pointcloud.scoring import instances, lerf, lerf_selection, truth
@@ -126,6 +131,81 @@ def test_scripts_and_files_named_in_pages_exist(page):
         r"\b(?:examples|scripts|og_pointcloud|plugins|export|tests)/[\w/.-]*\w\.(?:py|md|txt|yaml)", page.read_text()
     ):
         assert (ROOT / name).exists(), name
+
+
+def extending(title):
+    """The first block of Python below a heading of docs/extending.md."""
+    text = section("docs/extending.md", title) if title else (ROOT / "docs/extending.md").read_text()
+    return re.search(r"```python\n(.*?)```", text, re.S).group(1)
+
+
+def test_a_scene_of_ones_own_arrays(tiny_capture, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    known = og.read_capture(tiny_capture.folder)
+    camera = known.views[0].camera
+    frames = []
+    for view in known.views:
+        to_local = np.eye(4)
+        to_local[:3, 3] = -known.points.origin
+        pose = view.camera.world_to_camera @ to_local
+        frames.append((view.name, pose, view.mask_map(), view.mask_features, view.image()))
+    names = {"xyz": known.points.xyz_world, "rgb": known.points.rgb, "frames": frames}
+    exec(extending(""), names | {name: getattr(camera, name) for name in ("fx", "fy", "cx", "cy")})
+    found = og.load("mine.ogpc")
+    assert found.cloud.feature_space == "openai/clip-vit-base-patch16"
+    np.testing.assert_array_equal(found.instance_ids, og.fit(known, progress=False).instance_ids)
+
+
+def test_a_format_of_ones_own(tiny_capture, monkeypatch):
+    """The tiny capture's poses as rows of numbers are read as its transforms.json is."""
+    names = {}
+    exec(extending("A format"), names)
+    monkeypatch.setattr(capture_format, "LAYOUTS", ((names["holds_rows"], names["read_rows"]),))
+    folder, known = tiny_capture.folder, og.read_capture(tiny_capture.folder)
+    (folder / "transforms.json").unlink()
+    rows = []
+    for view in known.views:
+        rotation, translation = view.camera.world_to_camera[:3, :3], view.camera.world_to_camera[:3, 3]
+        rows.append(np.column_stack([rotation.T, -rotation.T @ translation + known.points.origin]).ravel())
+    np.savetxt(folder / "poses.txt", rows, fmt="%.17g")
+    camera = known.views[0].camera
+    # Data sets count pixel centres at whole numbers.
+    numbers = (camera.width, camera.height, camera.fx, camera.fy, camera.cx - 0.5, camera.cy - 0.5)
+    np.savetxt(folder / "intrinsics.txt", [numbers], fmt="%.17g")
+    for view, same in zip(og.read_capture(folder).views, known.views, strict=True):
+        np.testing.assert_allclose(view.camera.world_to_camera, same.camera.world_to_camera, atol=1e-12)
+        assert (view.name, view.camera.fx, view.camera.cx) == (same.name, same.camera.fx, same.camera.cx)
+    (folder / "images" / "view0.png").unlink()
+    with pytest.raises(SceneError, match="has 5 images and 6 poses"):
+        og.read_capture(folder)
+
+
+def test_a_proposer_of_ones_own(tiny_capture, monkeypatch, capsys):
+    """The balls are vivid, floor and sky are not: the masks are those of the capture."""
+    folder = tiny_capture.folder.rename(tiny_capture.folder.with_name("kitchen"))
+    known = {view.name: view.mask_map() >= 0 for view in og.read_capture(folder).views}
+    monkeypatch.chdir(folder.parent)
+    exec(extending("A mask proposer"), {})
+    command = re.search(r"```bash\nog-pointcloud (.*?)\n", section("docs/extending.md", "A mask proposer")).group(1)
+    words = command.replace("openai/clip-vit-base-patch16", "none").split()
+    assert main([*words, "--overwrite"]) == 0, capsys.readouterr().err
+    for view in og.read_capture(folder).views:
+        np.testing.assert_array_equal(view.mask_map() >= 0, known[view.name])
+
+
+def test_a_host_of_ones_own(monkeypatch):
+    class Cloud:
+        vertices = np.array([[1.0, 2, 3], [4, 5, 6]])
+
+    Cloud.__module__ = "somelibrary.geometry"
+    name, reader = re.search(
+        r'`"(trimesh)": (lambda geometry: [\w.]+)`', section("docs/extending.md", "A host")
+    ).groups()
+    with pytest.raises(SceneError):
+        world_points(Cloud())
+    monkeypatch.setitem(clouds._READERS, "somelibrary", eval(reader))
+    np.testing.assert_array_equal(world_points(Cloud()), Cloud.vertices)
+    assert name in clouds._READERS
 
 
 def test_settings_page_is_that_of_the_code():
