@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import argparse
 import csv
-import os
 import subprocess
 import sys
 import time
@@ -113,8 +112,8 @@ def photograph(room: Path, folder: Path) -> float:
     """Make a capture of a room's images alone, with the words and the truth to score it; seconds of its masks."""
     truth = read_truth(room)
     start = time.perf_counter()
-    options = ["--encoder", "demo", "--overwrite", "--processes", str(min(2, os.cpu_count() or 1)), "-o", str(folder)]
-    subprocess.run([sys.executable, "-c", COMMAND, "masks", str(room), *options], stdout=subprocess.DEVNULL, check=True)
+    command = [sys.executable, "-c", COMMAND, "masks", str(room), "--encoder", "demo", "--overwrite", "-o", str(folder)]
+    subprocess.run(command, stdout=subprocess.DEVNULL, check=True)
     seconds = time.perf_counter() - start
     encoder = read_text_encoder(DEMO_ENCODER / "text")
     space = np.array(encoder.feature_space)
