@@ -265,7 +265,8 @@ def _cost(rows: Sequence[Row], forced: Setting | str) -> tuple[str, str, str]:
     if row.gain_low is not None and row.gain_high is not None:
         interval = f" ({row.gain_low:+.4f} to {row.gain_high:+.4f})"
     doubt = "" if row.shared_seconds or abs(saved) > noise else " (noise)"
-    return f"{forced.knob}: {forced.value}", f"{saved:+.2f}{doubt}", f"{cost:+.4f}{interval}"
+    name = forced.value if forced.knob == "left out" else f"{forced.knob} {forced.value}"
+    return name, f"{saved:+.2f}{doubt}", f"{cost:+.4f}{interval}"
 
 
 def _default(rows: Sequence[Row], capture: str) -> Row:
