@@ -226,6 +226,14 @@ def test_examples_of_docstrings(path):
     assert result.failed == 0
 
 
+def test_the_session_in_python(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    options = doctest.NORMALIZE_WHITESPACE | doctest.ELLIPSIS
+    result = doctest.testfile(str(ROOT / "docs/python.md"), module_relative=False, optionflags=options)
+    assert result.attempted > 20
+    assert result.failed == 0
+
+
 def test_messages_on_the_page_of_errors_are_the_codes_own():
     """The first column's quotes, numbers and names aside, are found in the source."""
     source = re.sub(r'"\s*\n\s*f?"', "", "\n".join(path.read_text() for path in SOURCES))
