@@ -4,25 +4,33 @@ import ast
 import doctest
 import importlib
 import inspect
+import json
 import re
 import shlex
-import sys
+import zipfile
+from dataclasses import replace
+from fnmatch import fnmatch
 from pathlib import Path
 
 import numpy as np
 import pytest
+from labelled_clouds import instance_table, make_cloud
 
 import og_pointcloud as og
 from og_pointcloud import clouds
+from og_pointcloud.bundle import SCHEMA_VERSION
 from og_pointcloud.cli import build_parser, main
 from og_pointcloud.cli.eval_ import capture, scannet
+from og_pointcloud.cloud import Vocabulary
 from og_pointcloud.clouds import world_points
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats import capture as capture_format
 from og_pointcloud.metrics import score_labels
+from og_pointcloud.report.measure import Row
 from og_pointcloud.scoring import blocks as spatial_blocks
 from og_pointcloud.scoring import instances, lerf, lerf_selection, truth
 from og_pointcloud.scoring import scannet as scannet_rules
+from og_pointcloud.text.encoder import DEMO_ENCODER, read_text_encoder
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -102,6 +110,7 @@ def test_columns_on_the_page_of_scores_are_the_commands_own():
         text = section("docs/scores.md", title)
         assert sorted(first_cells(text)) == sorted([*header[1:], *change])
     assert first_cells(section("docs/scores.md", "eval lerf")) == [*lerf_selection.WAYS, lerf_selection.ORACLE]
+    assert sorted(first_cells(section("docs/scores.md", "The report"))) == sorted(Row.__dataclass_fields__)
 
 
 def test_rules_on_the_page_of_scores_are_the_codes_own():
@@ -208,13 +217,38 @@ def test_a_host_of_ones_own(monkeypatch):
     assert name in clouds._READERS
 
 
-def test_settings_page_is_that_of_the_code():
-    sys.path.insert(0, str(ROOT / "scripts"))
-    try:
-        from write_settings_page import PAGE, page
-    finally:
-        sys.path.pop(0)
-    assert PAGE.read_text() == page()
+def test_pages_that_scripts_write_are_those_of_the_code(monkeypatch):
+    monkeypatch.syspath_prepend(str(ROOT / "scripts"))
+    import make_gallery
+    import write_settings_page
+
+    assert write_settings_page.PAGE.read_text() == write_settings_page.page()
+    assert (ROOT / "docs/gallery.md").read_text() == make_gallery.page()
+
+
+def test_members_of_a_file_are_on_the_page_of_formats(tmp_path):
+    """Of a file that has everything a file may have."""
+    encoder = read_text_encoder(DEMO_ENCODER / "text")
+    texts = encoder(["chair", "table"])
+    none = np.full(2, -1, np.int32)
+    cloud = replace(
+        make_cloud([[0, 0, 0], [1, 0, 0]], [0, 1], words=()),
+        instances=replace(instance_table(2), descriptors=texts, coarse=none, whole=none),
+        feature_space=encoder.feature_space,
+        certainty=np.full(2, 9, np.uint8),
+        vocabulary=Vocabulary(("chair", "table"), texts),
+        word_bank=encoder.word_bank,
+    )
+    path = og.write_bundle(cloud, tmp_path / "s.ogpc", text_encoder=DEMO_ENCODER / "text")
+    with zipfile.ZipFile(path) as archive:
+        names, manifest = archive.namelist(), json.loads(archive.read("manifest.json"))
+    text = section("docs/formats.md", "The `.ogpc` file")
+    patterns = first_cells(text)
+    assert all(any(fnmatch(name, pattern) for pattern in patterns) for name in names), names
+    assert all(any(fnmatch(name, pattern) for name in names) for pattern in patterns), patterns
+    fields = next(row for row in text.splitlines() if row.startswith("| `manifest.json`"))
+    assert set(manifest) - set(re.findall(r"`(\w+)`", fields)) == set()
+    assert f"Schema {SCHEMA_VERSION}." in text
 
 
 @pytest.mark.parametrize("path", WITH_EXAMPLES, ids=lambda path: path.stem)
