@@ -69,7 +69,7 @@ def main(arguments: list[str] | None = None) -> None:
     options.output.mkdir(parents=True, exist_ok=True)
     lines = [line(about(row), row) for row in measured(options.captures, options.runs)]
     made = measured(rooms(options.rooms, options.output), options.runs)
-    lines += [line_of_rooms(made, options.rooms)] if made else []
+    lines += [line_of_rooms(made)] if made else []
     for seed, room in zip(options.photographs, rooms(options.photographs, options.output), strict=True):
         seconds = photograph(room, options.output / f"photographs{seed}")
         (row,) = measured([options.output / f"photographs{seed}"], options.runs)
@@ -141,16 +141,16 @@ def line(said: str, row: CaptureRow) -> tuple[str, ...]:
     )  # fmt: skip
 
 
-def line_of_rooms(rows: Sequence[CaptureRow], seeds: Sequence[int]) -> tuple[str, ...]:
+def line_of_rooms(rows: Sequence[CaptureRow]) -> tuple[str, ...]:
     """Rooms as one: means, and intervals over rooms."""
 
     def over(value: Callable[[CaptureRow], float]) -> Interval:
         return bootstrap(np.array([value(row) for row in rows]))
 
     miou, gain = over(lambda row: row.miou.mean), over(lambda row: row.gain.mean)
-    said = f"mean of demo rooms {', '.join(map(str, seeds))}, {rows[0].views} views, "
+    points = np.mean([row.points for row in rows])
     return (
-        f"{said}{np.mean([row.points for row in rows]):,.0f} points",
+        f"mean of {len(rows)} demo rooms, {rows[0].views} views, {points:,.0f} points",
         f"**{miou.mean:.3f}** ({_spread(miou)})", f"{over(lambda row: row.uplift.mean).mean:.3f}",
         f"{gain.mean:+.3f} ({_spread(gain, '+')})", f"{over(lambda row: row.score.macc).mean:.3f}",
         f"{over(lambda row: row.score.unknown_share).mean:.3f}",

@@ -106,8 +106,8 @@ def test_rooms_share_a_line(script):
         uplift, gain = (replace(spread, mean=mean) for mean in (plain, miou - plain))
         return script.CaptureRow("room", 90, 1000, 5, score, spread, uplift, gain, 8.0, 0.3, 4.0)
 
-    line = script.line_of_rooms([row(0.9, 0.5), row(0.8, 0.5)], [3, 4])
-    assert line[0].startswith("mean of demo rooms 3, 4, 90 views, 1,000 points")
+    line = script.line_of_rooms([row(0.9, 0.5), row(0.8, 0.5)])
+    assert line[0].startswith("mean of 2 demo rooms, 90 views, 1,000 points")
     # Draws of two rooms: both the one, both the other, or one each.
     assert line[1:4] == ("**0.850** (0.800 to 0.900)", "0.500", "+0.350 (+0.300 to +0.400)")
 
