@@ -39,6 +39,22 @@ def test_a_window_beyond_the_images_edge_is_filled():
     assert (crop[5:, 5:] == IMAGE[:15, :15]).all(), "outside 1: the image as it is"
 
 
+@pytest.mark.parametrize("name", ["bilinear", "bicubic"])
+@pytest.mark.parametrize("place", [(0, 0), (20, 50), (35, 3)])
+def test_a_shrunk_window_beyond_the_edge_is_the_filled_image_shrunk(place, name):
+    top, left = place
+    mask = np.zeros((50, 70), bool)
+    mask[top : top + 15, left : left + 15] = True
+    crop, fill = Crop(6.0, 1.0), (7, 80, 200)
+    canvas = np.full((250, 270, 3), fill, np.uint8)
+    canvas[100:150, 100:170] = IMAGE
+    corner = [100 + at - (90 - 15) // 2 for at in place]
+    window = canvas[corner[0] : corner[0] + 90, corner[1] : corner[1] + 90]
+    apart = np.abs(mask_crops(IMAGE, mask[None], crop, 12, fill, name)[0].astype(int) - resized(window, 12, 12, name))
+    assert apart.max() <= 1
+    assert (apart > 0).mean() < 0.05
+
+
 def test_outside_the_mask_the_image_is_blended():
     mask = _ellipse(10, 10, 20, 20)
     top, left, tall, wide = mask_box(mask)

@@ -70,7 +70,7 @@ def mask_crops(
     faded = np.rint(crop.outside * image + (1 - crop.outside) * colour).astype(np.uint8)  # once, not for every mask
     crops = np.empty((len(masks), size, size, 3), np.uint8)
     for row, mask in enumerate(masks):
-        crops[row] = resized(_window(image, faded, mask, crop.scale, colour), size, size, resample)
+        crops[row] = _square(image, faded, mask, crop.scale, size, colour, resample)
     return crops
 
 
@@ -82,25 +82,21 @@ def mask_box(mask: NDArray[np.bool_]) -> tuple[int, int, int, int]:
     return int(rows[0]), int(columns[0]), int(rows[-1] - rows[0]) + 1, int(columns[-1] - columns[0]) + 1
 
 
-def _window(
-    image: NDArray[np.uint8],
-    faded: NDArray[np.uint8],
-    mask: NDArray[np.bool_],
-    scale: float,
-    fill: NDArray[np.float32],
-) -> NDArray[np.uint8]:
-    """(side, side, 3) the square about the mask's box, before it is resized: faded outside the mask."""
+def _square(
+    image: NDArray[np.uint8], faded: NDArray[np.uint8], mask: NDArray[np.bool_], scale: float, size: int,
+    fill: NDArray[np.float32], resample: Resample,
+) -> NDArray[np.uint8]:  # fmt: skip
+    """(size, size, 3) the window about the mask's box, faded outside the mask, resized. What lies beyond the image's
+    edge is not made: its even colour is added where lines are mixed."""
     top, left, height, width = mask_box(mask)
     side = max(round(scale * max(height, width)), 1)
     top, left = top - (side - height) // 2, left - (side - width) // 2
     rows = slice(max(top, 0), min(top + side, image.shape[0]))
     columns = slice(max(left, 0), min(left + side, image.shape[1]))
-    window = np.empty((side, side, 3), np.uint8)
-    window[:] = fill
-    place = (slice(rows.start - top, rows.stop - top), slice(columns.start - left, columns.stop - left))
-    window[place] = faded[rows, columns]
-    np.copyto(window[place], image[rows, columns], where=mask[rows, columns, None])
-    return window
+    shown, inside = faded[rows, columns].copy(), mask[rows, columns]
+    shown[inside] = image[rows, columns][inside]
+    down = _resampled(shown, size, resample, side, rows.start - top, fill)  # first: rows lie together in memory
+    return _resampled(down.transpose(1, 0, 2), size, resample, side, columns.start - left, fill).transpose(1, 0, 2)
 
 
 def resized(image: NDArray[np.uint8], height: int, width: int, resample: Resample = "bicubic") -> NDArray[np.uint8]:
@@ -119,21 +115,30 @@ def _columns_resized(image: NDArray[np.uint8], width: int, resample: Resample) -
 
 
 def _rows_resized(image: NDArray[np.uint8], height: int, resample: Resample) -> NDArray[np.uint8]:
-    rows, columns, channels = image.shape
-    if rows == height:
+    if len(image) == height:
         return image
-    return _resampled(image.reshape(rows, columns * channels), height, resample).reshape(height, columns, channels)
+    return _resampled(image, height, resample, len(image), 0, np.zeros(image.shape[2], np.float32))
 
 
-def _resampled(lines: NDArray[np.uint8], count: int, resample: Resample) -> NDArray[np.uint8]:
-    """(count, K) from (n, K) lines."""
-    mixed = _weights(len(lines), count, resample) @ lines.astype(np.float32)
-    return np.clip(np.floor(mixed + 0.5), 0, 255).astype(np.uint8)
+def _resampled(
+    lines: NDArray[np.uint8], count: int, resample: Resample, before: int, start: int, fill: NDArray[np.float32]
+) -> NDArray[np.uint8]:
+    """(count, K, C) of ``before`` lines: those given (n, K, C) begin at ``start``, all others are of the fill (C,)."""
+    values = lines.astype(np.float32, order="C").reshape(len(lines), -1)
+    beyond = np.tile(fill, lines.shape[1])
+    mixed = np.empty((count, values.shape[1]), np.float32)
+    for row, (first, weights) in enumerate(_weights(before, count, resample)):
+        inside = weights[max(start - first, 0) : max(start + len(lines) - first, 0)]
+        place = max(first - start, 0)
+        mixed[row] = inside @ values[place : place + len(inside)]
+        if len(inside) < len(weights):
+            mixed[row] += (1 - inside.sum()) * beyond
+    return np.clip(np.floor(mixed + 0.5), 0, 255).astype(np.uint8).reshape(count, *lines.shape[1:])
 
 
 @lru_cache(maxsize=64)
-def _weights(before: int, after: int, resample: Resample) -> NDArray[np.float32]:
-    """(after, before): how much of each old line is in each new one; rows add up to 1.
+def _weights(before: int, after: int, resample: Resample) -> tuple[tuple[int, NDArray[np.float32]], ...]:
+    """For each new line the first old line that is in it, and how much of that and of those behind it; sums are 1.
 
     The kernel is stretched by the shrinking, so that every old line counts, and cut off where it is zero.
     """
@@ -147,7 +152,9 @@ def _weights(before: int, after: int, resample: Resample) -> NDArray[np.float32]
     distance = np.abs(line + 0.5 - centre[:, None]) / stretch
     weight = _cubic(distance) if resample == "bicubic" else np.maximum(1 - distance, 0)
     weight = np.where((line >= first) & (line < last), weight, 0)
-    return (weight / weight.sum(axis=1, keepdims=True)).astype(np.float32)
+    weight = (weight / weight.sum(axis=1, keepdims=True)).astype(np.float32)
+    runs = zip(first[:, 0].astype(int).tolist(), last[:, 0].astype(int).tolist(), strict=True)
+    return tuple((start, row[start:end].copy()) for (start, end), row in zip(runs, weight, strict=True))
 
 
 def _cubic(x: NDArray[np.float64]) -> NDArray[np.float64]:
