@@ -18,6 +18,7 @@ from labelled_clouds import SPACE, make_cloud
 import og_pointcloud as og
 from og_pointcloud.choosing import WordBank
 from og_pointcloud.cli import main
+from og_pointcloud.cli.eval_.lerf import print_set
 from og_pointcloud.cloud import BACKGROUND, InstanceTable
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.gaussian_ply import write_gaussian_ply
@@ -133,8 +134,18 @@ def test_a_miniature_data_set_by_hand(data, capsys):
     assert best["flat_miou"] == pytest.approx((1 + 1 / 2 + 1 / 9 + 3 / 4 + 1 / 4) / 5)
     assert among["miou"] == pytest.approx(best["miou"] - (1 / 9) / 4 / 2)
     assert "among: nothing selected for 1 of 5 pairs" in out
+    assert "not the set of the published table, whose pairs are figurines 56, ramen 71" in out
     # Of 5 differences one is -1/9: the mean is -2.2 percent, and some draws never have it.
     assert "among less best, mIoU of all pairs: -2.2 (-6.7 to +0.0)" in out
+
+
+def test_the_published_set_is_known(capsys):
+    scenes = {"ramen": [None] * 71, "figurines": [None] * 56, "teatime": [None] * 59, "waldo_kitchen": [None] * 22}
+    assert sum(map(len, scenes.values())) == 208
+    print_set(scenes)
+    assert capsys.readouterr().out == "the scenes and pairs of the published table\n"
+    print_set(scenes | {"ramen": [None] * 70})
+    assert "not the set" in capsys.readouterr().out
 
 
 def test_a_word_bank_lets_a_text_select_nothing(data):

@@ -20,9 +20,11 @@ from numpy.typing import NDArray
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.images import MAX_PIXELS, require_cv2
 
-__all__ = ["LabelledFrame", "LerfScore", "pair_ious", "read_frame", "score_scenes"]
+__all__ = ["PAIRS", "LabelledFrame", "LerfScore", "pair_ious", "read_frame", "score_scenes"]
 
 ALPHA_SHOWN, IOU_FOUND = 0.7, 0.25
+PAIRS: Mapping[str, int] = {"figurines": 56, "ramen": 71, "teatime": 59, "waldo_kitchen": 22}
+"""The (frame, object) pairs of the published table, by scene."""
 
 
 @dataclass(frozen=True)

@@ -56,6 +56,7 @@ def run(arguments: argparse.Namespace) -> None:
     ways = (*WAYS, ORACLE) if arguments.oracle else WAYS
     own, *others = (score(labels, of_folder, splats, arguments) for of_folder in files)
     print_scores(own, ways)
+    print_set(own)
     compare(own, ways)
     for other in others:
         for way in ways:
@@ -114,6 +115,17 @@ def print_scores(scenes: Scenes, ways: tuple[str, ...]) -> None:
         intervals += [spread(bootstrap(values)), spread(bootstrap((values > IOU_FOUND).astype(float)))]
     rows.append(("95 % of all pairs", "", *intervals))
     print_table(("", "pairs", *(f"{way} {what}" for way in ways for what in ("mIoU", "over 0.25"))), rows)
+
+
+def print_set(scenes: Scenes) -> None:
+    """Whether the pairs are those of the published table."""
+    from og_pointcloud.scoring.lerf import PAIRS
+
+    if {name: len(pairs) for name, pairs in scenes.items()} == dict(PAIRS):
+        print("the scenes and pairs of the published table")
+    else:
+        published = ", ".join(f"{name} {count}" for name, count in PAIRS.items())
+        print(f"not the set of the published table, whose pairs are {published}: its means are of others")
 
 
 def compare(scenes: Scenes, ways: tuple[str, ...]) -> None:
