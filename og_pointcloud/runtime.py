@@ -243,6 +243,9 @@ class LabelledScene:
             raise BundleError(
                 f"{self.path}: query.onnx takes {sorted(inputs)} and gives {sorted(outputs)}: write the file again"
             )
+        shape = inputs["text"].shape
+        if len(shape) != 2 or not isinstance(shape[1], int):
+            raise BundleError(f"{self.path}: query.onnx takes text of shape {shape}, of no width: write the file again")
         return session
 
     @property

@@ -202,6 +202,12 @@ def test_a_graph_that_is_not_ours_is_refused(scene):
     other = runtime.LabelledScene(replace(scene._bundle, query_onnx=model.SerializeToString()))
     with pytest.raises(BundleError, match=r"takes \['x'\]"):
         other.instances_at(np.zeros((1, 3)))
+    model = onnx.load_from_string(scene._bundle.query_onnx)
+    text = next(given for given in model.graph.input if given.name == "text")
+    text.type.tensor_type.shape.dim[1].dim_param = "any"
+    other = runtime.LabelledScene(replace(scene._bundle, query_onnx=model.SerializeToString()))
+    with pytest.raises(BundleError, match=r"takes text of shape \[.*, 'any'\], of no width"):
+        other.instances_at(np.zeros((1, 3)))
 
 
 @pytest.mark.parametrize(
