@@ -19,6 +19,7 @@ from og_pointcloud.fitting.geometry import neighbourhood
 from og_pointcloud.formats.capture import read_capture
 from og_pointcloud.metrics import adjusted_rand_index
 from og_pointcloud.report.asking import DEFAULTS as ASKED_DEFAULTS
+from og_pointcloud.report.asking import REASONS
 from og_pointcloud.report.knobs import EXACT, FAST, KNOBS, base_of
 from og_pointcloud.report.measure import Row, Subject
 from og_pointcloud.report.shared import ON_SHARED, Measured
@@ -36,6 +37,7 @@ __all__ = [
     "front",
     "is_asking",
     "judged",
+    "knob_reasons",
     "mean_over_captures",
     "noise_of",
     "verdict",
@@ -204,7 +206,5 @@ def mean_over_captures(rows: Sequence[Row], knob: str) -> list[Mean]:
 
 def knob_reasons() -> dict[str, tuple[str, str]]:
     """knob -> (its default, why it is there), of fits and of the finished file, in the order of the pipeline."""
-    from og_pointcloud.report.asking import REASONS
-
     of_fits = {knob.name: (knob.default_value, knob.why) for knob in KNOBS}
     return of_fits | {knob: (value, REASONS[knob]) for knob, value in ASKED_DEFAULTS.items()}

@@ -203,40 +203,41 @@ def _method(report: Report) -> str:
 
 def _capture(report: Report, capture: str) -> str:
     rows = [row for row in report.rows if row.capture == capture]
-    default = _default(rows, capture)
-    fits = [row for row in rows if not is_asking(row)]
-    asking = [row for row in rows if is_asking(row)]
-    best = {id(row) for row in front(fits)}
-    marks = [("default " if row.is_default else "") + ("front" if id(row) in best else "") for row in fits]
     parts = [
         f"<h2 id={escape(capture)}>{escape(capture)}</h2>",
         _figure(report.pictures[capture], "The default fit over several views; grey is background or without truth."),
         _figure(fit_plot(rows, capture), "All fits and the other methods; the front and those methods are named."),
         _figure(knob_plot(rows, capture), "A panel a setting: its default (ring), its values, their front."),
         "<h3>What this fit left out, and what it costs to force it back in</h3>",
-        _left_out(rows, default),
+        _left_out(rows, _default(rows, capture)),
     ]
     if capture in report.risks:
         risk = report.risks[capture]
         png = risk_coverage_png({"the default": risk.curve}, {"the default": risk.answered})
         parts.append(_figure(png, "Risk against coverage, surest points first: cosine times certainty of the point."))
-    if asking:
+    if any(row.knob == "lookup" for row in rows):
         parts += [
             "<h3>Asking the finished file</h3>",
             _figure(asking_plot(rows, capture), "The instance of a point, against the exact nearest point's."),
         ]
+    return "\n".join([*parts, _all_rows(rows)])
+
+
+def _all_rows(rows: Sequence[Row]) -> str:
+    fits, asking = [row for row in rows if not is_asking(row)], [row for row in rows if is_asking(row)]
+    best = {id(row) for row in front(fits)}
+    marks = [("default " if row.is_default else "") + ("front" if id(row) in best else "") for row in fits]
     header = ("setting", *SCORES, "mIoU less the default's", "differs", "off exact", "instances", "peak MB", "runs",
               "seed")  # fmt: skip
-    parts.append(
+    of_file = _table(
+        ("the finished file", "mIoU", "off exact", "ms", "MB"),
+        [_asking_cells(row) for row in asking],
+        marks=["default" if base_row(rows, row) is row else "" for row in asking],
+    )
+    return (
         f"<details><summary>All {len(rows)} rows; a dot marks the front of all fits</summary>"
-        + _table(header, [_fit_cells(row) for row in fits], marks=marks)
-        + _table(
-            ("the finished file", "mIoU", "off exact", "ms", "MB"), [_asking_cells(row, rows) for row in asking],
-            marks=["default" if base_row(rows, row) is row else "" for row in asking],
-        )
-        + "</details>"
-    )  # fmt: skip
-    return "\n".join(parts)
+        f"{_table(header, [_fit_cells(row) for row in fits], marks=marks)}{of_file}</details>"
+    )
 
 
 def _left_out(rows: Sequence[Row], default: Row) -> str:
@@ -289,7 +290,7 @@ def _fit_cells(row: Row) -> tuple[str, ...]:
     )  # fmt: skip
 
 
-def _asking_cells(row: Row, rows: Sequence[Row]) -> tuple[str, ...]:
+def _asking_cells(row: Row) -> tuple[str, ...]:
     size = "-" if row.megabytes is None else f"{row.megabytes:.3g}"
     times = f"{1e3 * row.seconds:.2f} to {1e3 * row.seconds_most:.2f}"
     return f"{row.knob}: {row.value}", _number(row.miou), f"{error(row):.4%}", times, size
