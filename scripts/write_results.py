@@ -50,7 +50,7 @@ ABOUT = {
 """What is said of a capture, by the name of its folder."""
 SHORT = {"seven_redkitchen": "kitchen", "apc_shelf_B": "shelf", "ycb_0050": "table", "nuscenes_frame": "nuScenes"}
 HEADER = (
-    "scene", "mIoU (95 %)", "direct uplift", "gain (95 %)", "mAcc", "unknown", "background called",
+    "scene", "mIoU (95 %)", "direct uplift", "where masked", "gain (95 %)", "mAcc", "unknown", "background called",
     "folder to file", "file", "first answer",
 )  # fmt: skip
 
@@ -135,7 +135,7 @@ def line(said: str, row: CaptureRow) -> tuple[str, ...]:
     score = row.score
     called = "-" if score.background_called is None else f"{score.background_called:.3f}"
     return (
-        said, f"**{row.miou.mean:.3f}** ({_spread(row.miou)})", f"{row.uplift.mean:.3f}",
+        said, f"**{row.miou.mean:.3f}** ({_spread(row.miou)})", f"{row.uplift:.3f}", f"{row.masked:.3f}",
         f"{row.gain.mean:+.3f} ({_spread(row.gain, '+')})", f"{score.macc:.3f}", f"{score.unknown_share:.3f}", called,
         f"{row.fit_s:.1f} s", f"{row.file_mb:.1f} MB", f"{row.first_s:.2f} s",
     )  # fmt: skip
@@ -151,7 +151,8 @@ def line_of_rooms(rows: Sequence[CaptureRow]) -> tuple[str, ...]:
     points = np.mean([row.points for row in rows])
     return (
         f"mean of {len(rows)} demo rooms, {rows[0].views} views, {points:,.0f} points",
-        f"**{miou.mean:.3f}** ({_spread(miou)})", f"{over(lambda row: row.uplift.mean).mean:.3f}",
+        f"**{miou.mean:.3f}** ({_spread(miou)})", f"{over(lambda row: row.uplift).mean:.3f}",
+        f"{over(lambda row: row.masked).mean:.3f}",
         f"{gain.mean:+.3f} ({_spread(gain, '+')})", f"{over(lambda row: row.score.macc).mean:.3f}",
         f"{over(lambda row: row.score.unknown_share).mean:.3f}",
         f"{over(lambda row: row.score.background_called or 0.0).mean:.3f}", f"{over(lambda row: row.fit_s).mean:.1f} s",
