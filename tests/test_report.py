@@ -158,15 +158,18 @@ def test_a_default_is_off_the_front_only_beyond_the_noise():
 
 def test_values_are_held_against_what_was_measured_the_same_way():
     whole = row(10.0, 0.9, "default", "")
-    table = row(9.0, 0.9, "default", ON_SHARED.value, shared_seconds=8.0)
-    fast = row(20.0, 0.8, "mode", "fast", shared_seconds=8.0)
-    wide = row(21.0, 0.8, "feature width", "12", shared_seconds=8.0)
+    table = row(9.0, 0.9, "default", ON_SHARED["table"].value, shares="table")
+    geometry = row(9.0, 0.9, "default", ON_SHARED["geometry"].value, shares="geometry")
+    fast = row(20.0, 0.8, "mode", "fast", shares="table")
+    wide = row(21.0, 0.8, "feature width", "12", shares="table")
+    pixels = row(7.0, 0.8, "pixels per spacing", "1", shares="geometry")
     file = row(1.0, 0.9, "lookup", "graph and search", off_exact=0.0)
     tree = row(5.0, 0.9, "lookup", "KD-tree, all cores", off_exact=0.0)
-    rows = [whole, table, fast, wide, file, tree]
+    rows = [whole, table, geometry, fast, wide, pixels, file, tree]
     views = row(5.0, 0.9, "views", "one of 2")
     assert judging.base_row(rows, views) is whole
     assert judging.base_row(rows, fast) is table
+    assert judging.base_row(rows, pixels) is geometry
     assert judging.base_row(rows, wide) is fast
     assert judging.base_row(rows, tree) is file
 
@@ -255,7 +258,7 @@ def test_a_table_through_float16_is_told_from_the_table(shared):
     weights = shared.prepared.table.weights.copy()
     for value in ("weights in float16", "features in float16"):
         rounded = shared.measure(find_setting("mask table", value))[0].row
-        assert rounded.digest != shared.measure(ON_SHARED)[0].row.digest
+        assert rounded.digest != shared.measure(ON_SHARED["table"])[0].row.digest
         assert rounded.miou > 0.8
     assert (shared.prepared.table.weights != weights).nnz == 0
 
@@ -273,7 +276,7 @@ def test_points_at_one_place_are_counted_each(folder, subject, tmp_path):
         np.savez(twice / "gt.npz", names=truth["names"], cls=truth["cls"][place], background=truth["background"][place])
     again = read_subject(twice)
     fitted = SharedFit(again)
-    found = fitted.measure(ON_SHARED)[0]
+    found = fitted.measure(ON_SHARED["table"])[0]
     whole, labels = measure(again, knobs.DEFAULT)
     np.testing.assert_array_equal(found.labels, labels)
     assert found.row.miou == whole.miou
@@ -417,7 +420,9 @@ def test_command_writes_page_table_and_plots(folder, tmp_path, monkeypatch, caps
     assert (default["runs"], default["seed"]) == ("2", "0")
     assert "cores" in default["machine"]
     assert default["version"]
-    assert rows["default", ON_SHARED.value]["digest"] == default["digest"]
+    for setting in ON_SHARED.values():
+        assert rows["default", setting.value]["digest"] == default["digest"]
+        assert rows["default", setting.value]["runs"] == "2"  # first and last
     assert float(rows["mode", "fast"]["shared_seconds"]) > 0
     for name in ("settings", "capture-fits", "capture-settings"):
         assert (tmp_path / "r" / f"{name}.png").read_bytes().startswith(b"\x89PNG")
@@ -462,7 +467,7 @@ def test_page_says_what_is_off_the_front_and_where_runs_differ(tmp_path):
     html = page.write_page(report, tmp_path / "r.html").read_text()
     assert "Runs differ in their answer: c, views one of 2" in html
     assert "off</span> c: one of 2 -50.0%, -0.0500" in html
-    assert "+0.300 (+0.200 to +0.400)" in html  # ours less direct uplift
+    assert "+0.300<br><small>+0.200 to +0.400" in html  # ours less direct uplift
     assert "<td>+0.50</td><td>+0.0200 (+0.0100 to +0.0300)</td>" in html  # the pixels: half a second, two points
     assert "Nothing was left out of: views, points" in html
     assert "no mask shows an instance" in html

@@ -41,12 +41,14 @@ REPEATS, LONG = 5, 1.0
 DEFAULTS = {"lookup": "graph and search", "descriptors": "float32", "text": "float32"}
 """The value of each knob of the finished file where nothing is set."""
 REASONS = {
-    "lookup": "the graph alone is right where its table has room; the search answers the rest, so that none is wrong",
-    "descriptors": "a table of a scene is small: rounding it saves little",
+    "lookup": "the graph alone is right where its table has room; seeing that it was, and else searching, takes more",
+    "descriptors": "a scene's table is small: rounding saves little; projecting costs words where things are many",
     "text": "as the encoder gives them; a file keeps words in float16 where that changes no answer",
 }
 
 Labels = NDArray[np.integer]
+Frame = NDArray[np.float64]
+"""(n, 3) world coordinates, as a sensor's pose gives them: bringing them to the map is part of each way."""
 
 
 def measure_asking(cloud: LabelledCloud, subject: Subject, seed: int = 0) -> list[Row]:
@@ -58,7 +60,7 @@ def measure_asking(cloud: LabelledCloud, subject: Subject, seed: int = 0) -> lis
         return []
     random = np.random.default_rng(seed)
     source = random.integers(0, len(cloud), ASKED)
-    points = (cloud.xyz[source] + MOVED * cloud.spacing * random.standard_normal((ASKED, 3))).astype(np.float32)
+    points = cloud.xyz_world[source] + MOVED * cloud.spacing * random.standard_normal((ASKED, 3))
     asked = subject if subject.truth is None else replace(subject, truth=truth_of_rows(subject.truth, source))
     word_of_id = _words(cloud, subject.vocabulary.vectors)
     ids = _searched(cloud, points)
@@ -85,12 +87,12 @@ def _words(cloud: LabelledCloud, texts: NDArray[np.floating]) -> Labels:
     return Chooser(cloud.instances).choose(texts).by_id[0]
 
 
-def _searched(cloud: LabelledCloud, points: NDArray[np.float32]) -> Labels:
-    nearest = NearestPoint(cloud.xyz, cloud.spacing, cloud.reach).query(points)
+def _searched(cloud: LabelledCloud, points: Frame) -> Labels:
+    nearest = NearestPoint(cloud.xyz, cloud.spacing, cloud.reach).query(_local(cloud, points))
     return np.append(cloud.instance_ids, np.int32(TOO_FAR))[np.where(nearest == NONE_WITHIN_REACH, -1, nearest)]
 
 
-def _lookups(cloud: LabelledCloud) -> dict[str, tuple[Callable[[NDArray[np.float32]], Labels], float | None]]:
+def _lookups(cloud: LabelledCloud) -> dict[str, tuple[Callable[[Frame], Labels], float | None]]:
     """Ways to the instance of a point, with the MB of their tables; all are made ready before they are timed."""
     from scipy.spatial import cKDTree
 
@@ -98,15 +100,15 @@ def _lookups(cloud: LabelledCloud) -> dict[str, tuple[Callable[[NDArray[np.float
     tree, ids = cKDTree(cloud.xyz), np.append(cloud.instance_ids, np.int32(TOO_FAR))
     search = NearestPoint(cloud.xyz, cloud.spacing, cloud.reach)
 
-    def graph_and_search(points: NDArray[np.float32]) -> Labels:
-        return scene.instances_at(points + cloud.origin)
+    def graph_and_search(points: Frame) -> Labels:
+        return scene.instances_at(points)
 
-    def search_alone(points: NDArray[np.float32]) -> Labels:
-        nearest = search.query(points)
+    def search_alone(points: Frame) -> Labels:
+        nearest = search.query(_local(cloud, points))
         return ids[np.where(nearest == NONE_WITHIN_REACH, -1, nearest)]
 
-    def kd_tree(points: NDArray[np.float32]) -> Labels:
-        return ids[tree.query(points, distance_upper_bound=cloud.reach, workers=-1)[1]]
+    def kd_tree(points: Frame) -> Labels:
+        return ids[tree.query(_local(cloud, points), distance_upper_bound=cloud.reach, workers=-1)[1]]
 
     return {
         DEFAULTS["lookup"]: (graph_and_search, None),
@@ -116,15 +118,20 @@ def _lookups(cloud: LabelledCloud) -> dict[str, tuple[Callable[[NDArray[np.float
     }
 
 
-def _graphs(cloud: LabelledCloud) -> dict[str, tuple[Callable[[NDArray[np.float32]], Labels], float | None]]:
+def _local(cloud: LabelledCloud, points: Frame) -> NDArray[np.float32]:
+    return (points - cloud.origin).astype(np.float32)
+
+
+def _graphs(cloud: LabelledCloud) -> dict[str, tuple[Callable[[Frame], Labels], float | None]]:
     """query.onnx alone, with bricks of several cell sizes, and without the lists that settle cells at borders."""
     from og_pointcloud_export.brick_grid import GridSettings, build_brick_grid
     from og_pointcloud_export.query_head import build_query_head
 
     width = max(cloud.instances.descriptors.shape[1], 1)
 
-    def ask(graph: InferenceSession, points: NDArray[np.float32]) -> Labels:
-        return np.asarray(graph.run(["instance"], {"points": points, "text": np.zeros((0, width), np.float32)})[0])
+    def ask(graph: InferenceSession, points: Frame) -> Labels:
+        inputs = {"points": _local(cloud, points), "text": np.zeros((0, width), np.float32)}
+        return np.asarray(graph.run(["instance"], inputs)[0])
 
     ways = {f"graph, cells of {cell:g}": GridSettings(cell_per_spacing=cell) for cell in CELLS}
     ways["graph, no lists"] = GridSettings(lists=False)

@@ -70,9 +70,10 @@ def nearest_view(scene: Scene, prepared: Prepared, words: Words) -> Labels:
     closest, mask = np.full(len(xyz), np.inf), np.full(len(xyz), -1)
     for view in np.unique(table.mask_view):
         rows = np.flatnonzero(table.mask_view == view)
-        shown = csr_array(table.weights[rows]).tocsc()
-        points = np.flatnonzero(np.diff(shown.indptr))
-        most = np.asarray(shown[:, points].argmax(axis=0)).ravel()
+        shown = csr_array(table.weights[rows]).tocoo()
+        order = np.lexsort((-shown.row, shown.data, shown.col))
+        last = order[np.append(np.diff(shown.col[order]) > 0, True)] if len(order) else order
+        points, most = shown.col[last], shown.row[last]
         distance = np.linalg.norm(xyz[points] - scene.views[view].camera.center, axis=1)
         nearer = distance < closest[points]
         closest[points[nearer]], mask[points[nearer]] = distance[nearer], rows[most[nearer]]

@@ -133,7 +133,7 @@ def base_row(rows: Sequence[Row], row: Row) -> Row:
     elif base_of(row.knob) == FAST:
         name = FAST.knob, FAST.value
     else:
-        name = ("default", ON_SHARED.value if row.shared_seconds else "")
+        name = ("default", ON_SHARED[row.shares].value if row.shares in ON_SHARED else "")
     own = [other for other in rows if other.capture == row.capture]
     found = {(other.knob, other.value): other for other in own}
     return found.get(name) or found["default", ""]

@@ -41,6 +41,7 @@ td, th { padding: 2px 10px; text-align: right; vertical-align: top }
 .word { text-align: left } tr:nth-child(even) { background: #f6f6f6 }
 tr.default td { font-weight: 600 } tr.front td:first-child::after { content: " \\25cf"; color: #2a7 }
 .others { font-size: 12px; white-space: nowrap } .why { min-width: 14em; max-width: 20em; display: inline-block }
+small { color: #666; white-space: nowrap }
 .off { color: #b30; font-weight: 600 } .on { color: #175 } .noise { color: #777 }
 th { border-bottom: 1px solid #999 } img { max-width: 100% } figure { margin: 1em 0 }
 p.small, figcaption { color: #666; font-size: 13px } summary { cursor: pointer; color: #246 }
@@ -137,19 +138,20 @@ def _baselines(rows: Sequence[Row], captures: Sequence[str]) -> str:
     found = {(row.capture, row.value): row for row in rows if row.knob in ("baseline", "mode")}
     if not names or not any(row.gain is not None for row in found.values()):
         return ""
-    body = [(name, *(_ahead(found.get((capture, name))) for capture in captures)) for name in names]
+    body = [(escape(name), *(_ahead(found.get((capture, name))) for capture in captures)) for name in names]
     return (
         "<h2>Ours less other methods, mIoU</h2>"
-        "<p>On the same mask table, words and machine; in brackets the paired 95&nbsp;% bootstrap interval over blocks "
-        "of space. The methods know no background and name whatever a mask's rays reach; <i>where masked</i> leaves "
-        "out points whose visible weight lies mostly outside of masks.</p>" + _table(("method", *captures), body)
+        "<p>On the same mask table, words and machine; below it the paired 95&nbsp;% bootstrap interval over "
+        "blocks of space. The methods know no background and name whatever a mask's rays reach; <i>where masked</i> "
+        "leaves out points whose visible weight lies mostly outside of masks.</p>"
+        + _table(("method", *captures), body, clean=True)
     )
 
 
 def _ahead(row: Row | None) -> str:
     if row is None or row.gain is None or row.gain_low is None or row.gain_high is None:
         return "-"
-    return f"{-row.gain:+.3f} ({-row.gain_high:+.3f} to {-row.gain_low:+.3f})"
+    return f"{-row.gain:+.3f}<br><small>{-row.gain_high:+.3f} to {-row.gain_low:+.3f}</small>"
 
 
 def _repeats(rows: Sequence[Row], captures: Sequence[str]) -> str:
@@ -157,7 +159,7 @@ def _repeats(rows: Sequence[Row], captures: Sequence[str]) -> str:
     body = []
     for name in captures:
         own = {(row.knob, row.value): row for row in fits_of(rows, name)}
-        default, shared = own["default", ""], own.get(("default", ON_SHARED.value))
+        default, shared = own["default", ""], own.get(("default", ON_SHARED["table"].value))
         fast = [own[key] for key in ((FAST.knob, FAST.value), *((s.knob, s.value) for s in SEEDS[1:])) if key in own]
         seed = own.get((SEEDS[0].knob, SEEDS[0].value))
         body.append((
