@@ -1,4 +1,4 @@
-"""Where the time goes, held against a stored run: `make bench`, under three minutes on two cores.
+"""Where the time goes, held against a stored run: `make bench`, under a minute on two cores.
 
     python examples/bench.py                 # the table, beside bench_baseline.json
     python examples/bench.py --save          # three rounds, stored as the new baseline
@@ -7,7 +7,8 @@ Every row has seconds, error, and *units*: seconds over those of a fixed piece o
 timed in the same run, so that a faster machine, or a slower one, has about the same figure. "against" is the seconds of
 the plain way to the same answer, over ours, in the same run too. A row is marked slower where its units exceed the
 baseline's by more than a quarter, or by more than the stored rounds differed among themselves; that is a hint, no
-failure. Rows that use all cores compare only where there are as many.
+failure. Rows that use all cores compare only where there are as many, and on a machine with nothing else to do: the unit is of
+processor time, they are not.
 
     kernel        one view of 100,000 Gaussians at 640x480, a core's seconds; error: largest weight against float64, in
                   a window, relative; against the literal form in numpy, that window
@@ -252,11 +253,13 @@ def write_baseline(path: Path, kept: dict[str, Kept]) -> None:
 
 def print_rows(rows: Iterable[Row], baseline: dict[str, Kept]) -> None:
     """The table."""
-    print(f"{'':<18} {'seconds':>9} {'units':>8} {'error':>9} {'against':>8}  baseline")
+    print(f"{'':<18} {'seconds':>9} {'error':>9} {'against':>8} {'units':>8} {'stored':>8}  of stored")
     for row in rows:
         against = "-" if row.against is None else f"{row.against:.1f}x"
-        said = verdict(row, baseline.get(row.name)) if baseline else "-"
-        print(f"{row.name:<18} {row.seconds:9.4f} {row.units:8.2f} {row.error:9.2g} {against:>8}  {said}", flush=True)
+        kept = baseline.get(row.name)
+        stored, said = "-" if kept is None else f"{kept.units:.2f}", verdict(row, kept) if baseline else "-"
+        figures = f"{row.seconds:9.4f} {row.error:9.2g} {against:>8} {row.units:8.2f} {stored:>8}"
+        print(f"{row.name:<18} {figures}  {said}", flush=True)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 
 import bench
@@ -107,5 +108,5 @@ def test_the_command_compares_and_stores(tmp_path, monkeypatch, capsys):
     assert read_baseline(path)["kernel"] == Kept(4.5, 0.0, 1.25, 1)
     bench.main(["--baseline", str(path)])
     out = capsys.readouterr().out
-    assert "2.00 slower" in out
+    assert re.search(r"9\.00 +4\.50  2\.00 slower", out)  # units, those stored, their ratio
     assert "slower than the baseline, beyond its noise: kernel" in out

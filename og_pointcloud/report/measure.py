@@ -67,8 +67,8 @@ class Row:
     """One setting on one capture.
 
     seconds, seconds_most: least and most of the runs. shares: what was taken over from the default's fit in the same
-    process, nothing, geometry or table; shared_seconds: how many of the seconds are of that. peak_mb: of the process while
-    it ran, NaN where that is not known.
+    process, nothing, geometry or table; shared_seconds: how many of the seconds are of that. peak_mb: of the process
+    while it ran, NaN where that is not known.
     miou, macc, unknown: over the points with a known class, a point without a label being a miss; background: the share
     of known background that was given a class. None where the capture does not know them.
     gain, gain_low, gain_high: the mIoU less that of the default (of mode fast for what only that has), and the 95 %
