@@ -7,8 +7,8 @@ Every row has seconds, error, and *units*: seconds over those of a fixed piece o
 timed in the same run, so that a faster machine, or a slower one, has about the same figure. "against" is the seconds of
 the plain way to the same answer, over ours, in the same run too. A row is marked slower where its units exceed the
 baseline's by more than a quarter, or by more than the stored rounds differed among themselves; that is a hint, no
-failure. Rows that use all cores compare only where there are as many, and on a machine with nothing else to do: the unit is of
-processor time, they are not.
+failure. Rows that use all cores compare only where there are as many, and nothing else to do: they are wall-clock time,
+the unit is the processor's.
 
     kernel        one view of 100,000 Gaussians at 640x480, a core's seconds; error: largest weight against float64, in
                   a window, relative; against the literal form in numpy, that window
