@@ -262,12 +262,14 @@ def _cost(rows: Sequence[Row], forced: Setting | str) -> tuple[str, str, str]:
     if row is None:
         return f"{forced.value}: could not be run", "-", "-"
     base = base_row(rows, replace(row, knob="left out"))  # whatever knob it is also a value of
-    saved, noise = row.seconds - base.seconds, noise_of(base, rows) * base.seconds
+    saved = row.seconds - base.seconds
+    # What is shared does not vary: of a shared table only the base's own runs tell how sure a difference is.
+    own, whole = base.seconds_most - base.seconds, noise_of(base, rows) * base.seconds
+    doubt = " (noise)" if abs(saved) <= (own if row.shares == "table" else whole) else ""
     cost = error(base) - error(row)
     interval = ""
     if row.gain_low is not None and row.gain_high is not None:
         interval = f" ({row.gain_low:+.4f} to {row.gain_high:+.4f})"
-    doubt = "" if row.shared_seconds or abs(saved) > noise else " (noise)"
     name = forced.value if forced.knob == "left out" else f"{forced.knob} {forced.value}"
     return name, f"{saved:+.2f}{doubt}", f"{cost:+.4f}{interval}"
 
