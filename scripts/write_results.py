@@ -27,6 +27,7 @@ sys.path.insert(0, str(ROOT / "examples"))
 
 from benchmark_modes import rooms  # noqa: E402  # pyright: ignore[reportMissingImports]
 from score_captures import (  # noqa: E402  # pyright: ignore[reportMissingImports]
+    BANK,
     COMMAND,
     WORDS,
     CaptureRow,
@@ -37,7 +38,7 @@ from score_captures import (  # noqa: E402  # pyright: ignore[reportMissingImpor
 from og_pointcloud._atomic import replacing  # noqa: E402
 from og_pointcloud.cli.eval_.common import Spread  # noqa: E402
 from og_pointcloud.scoring.spread import Interval, bootstrap  # noqa: E402
-from og_pointcloud.scoring.truth import GT_NAME, read_truth  # noqa: E402
+from og_pointcloud.scoring.truth import read_truth  # noqa: E402
 from og_pointcloud.text.encoder import DEMO_ENCODER, read_text_encoder  # noqa: E402
 
 README = ROOT / "README.md"
@@ -109,16 +110,17 @@ def measured(folders: Iterable[Path], runs: int) -> list[CaptureRow]:
 
 
 def photograph(room: Path, folder: Path) -> float:
-    """Make a capture of a room's images alone, with the words and the truth to score it; seconds of its masks."""
+    """Make a capture of a room's images alone, with the words to score it by; seconds of its masks."""
     truth = read_truth(room)
     start = time.perf_counter()
     command = [sys.executable, "-c", COMMAND, "masks", str(room), "--encoder", "demo", "--overwrite", "-o", str(folder)]
     subprocess.run(command, stdout=subprocess.DEVNULL, check=True)
     seconds = time.perf_counter() - start
+    for name in (WORDS, BANK):  # links to the room's, which are of another encoder
+        (folder / name).unlink(missing_ok=True)
     encoder = read_text_encoder(DEMO_ENCODER / "text")
     space = np.array(encoder.feature_space)
     np.savez(folder / WORDS, names=np.array(truth.names), vectors=encoder(truth.names), feature_space=space)
-    (folder / GT_NAME).write_bytes((room / GT_NAME).read_bytes())
     return seconds
 
 

@@ -119,8 +119,13 @@ def test_rooms_share_a_line(script):
 
 
 def test_photographs_become_a_capture_that_can_be_scored(script, capture, tmp_path):
-    folder = tmp_path / "photographs"
+    folder, space = tmp_path / "photographs", np.array("tiny-test-space")
+    bank = np.random.default_rng(0).normal(size=(60, 16))
+    np.savez(capture.folder / "word_bank.npz", names=np.arange(60).astype(str), vectors=bank, feature_space=space)
+    before = {file: file.read_bytes() for file in capture.folder.rglob("*") if file.is_file()}
     assert script.photograph(capture.folder, folder) > 0
+    assert {file: file.read_bytes() for file in capture.folder.rglob("*") if file.is_file()} == before
+    assert not (folder / "word_bank.npz").exists()  # it was of another encoder
     scene = og.read_capture(folder)
     assert scene.feature_space != og.read_capture(capture.folder).feature_space
     assert sum(view.mask_count for view in scene.views) > 0
