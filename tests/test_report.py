@@ -23,7 +23,7 @@ from og_pointcloud.report.judging import disagreement, error, judged, mean_over_
 from og_pointcloud.report.knobs import find_setting
 from og_pointcloud.report.measure import Row, digest_of, error_of, labels_of, measure, measure_apart, read_subject
 from og_pointcloud.report.plots import fit_plot, knob_plot, mean_plot
-from og_pointcloud.report.shared import ON_SHARED, Measured, SharedFit
+from og_pointcloud.report.shared import ON_SHARED, Measured, SharedFit, rows_of
 from og_pointcloud.settings import FitSettings
 
 
@@ -261,6 +261,21 @@ def test_a_table_through_float16_is_told_from_the_table(shared):
         assert rounded.digest != shared.measure(ON_SHARED["table"])[0].row.digest
         assert rounded.miou > 0.8
     assert (shared.prepared.table.weights != weights).nnz == 0
+
+
+def test_a_setting_that_fails_does_not_cost_the_others(shared, tmp_path, monkeypatch):
+    real = SharedFit._from_table
+
+    def fails(self, setting):
+        if setting.value == "grouping":
+            raise ZeroDivisionError("division by zero")
+        return real(self, setting)
+
+    monkeypatch.setattr(SharedFit, "_from_table", fails)
+    tried = [find_setting("mode", "grouping"), find_setting("grouping sample", "5,000")]
+    rows = rows_of(shared, tried, tmp_path)
+    assert next(rows) == {"knob": "mode", "value": "grouping", "failed": "ZeroDivisionError: division by zero"}
+    assert next(rows).row.value == "5,000"
 
 
 def test_points_at_one_place_are_counted_each(folder, subject, tmp_path):

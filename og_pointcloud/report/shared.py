@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from og_pointcloud.choosing import chooser_of
 from og_pointcloud.cloud import LabelledCloud
-from og_pointcloud.errors import OgPointcloudError, SceneError
+from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.fitting.fit import check_scene, fit, prepare, with_distinct_points
 from og_pointcloud.fitting.journal import Journal
 from og_pointcloud.fitting.pictures import instance_picture
@@ -85,7 +85,7 @@ class SharedFit:
         self.chosen = journal.notes.get("gaussian_scale"), journal.notes.get("gaussian_opacity")
 
     def measure(self, setting: Setting) -> tuple[Measured, LabelledCloud]:
-        """The row of a setting that shares the geometry or the table, and its cloud. SceneError where it fails."""
+        """The row of a setting that shares the geometry or the table, and its cloud."""
         if setting.settings.mode not in self.warm:
             warm_up(self.scene, setting.settings)
             self.warm.add(setting.settings.mode)
@@ -202,9 +202,10 @@ class SharedFit:
 
 
 def _through_half(matrix: Any) -> Any:
-    """A sparse matrix whose values went through float16."""
+    """A sparse matrix whose values went through float16, without those that became 0."""
     rounded = matrix.copy()
     rounded.data = rounded.data.astype(np.float16).astype(np.float32)
+    rounded.eliminate_zeros()
     return rounded
 
 
@@ -242,8 +243,8 @@ def rows_of(shared: SharedFit, tried: Sequence[Setting], work: Path) -> Iterator
     for setting in tried:
         try:
             yield shared.measure(setting)[0]
-        except SceneError as error:
-            yield {"knob": setting.knob, "value": setting.value, "failed": str(error)}
+        except Exception as error:  # one setting must not cost the report; the page names it
+            yield {"knob": setting.knob, "value": setting.value, "failed": f"{type(error).__name__}: {error}"}
     for name, (before, _) in first.items():
         yield _both(before, shared.measure(ON_SHARED[name])[0])
     yield from shared.measure_baselines()

@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from og_pointcloud._atomic import replacing
+from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.report.judging import judged
 from og_pointcloud.report.knobs import (
     ALWAYS_FORCED,
@@ -109,19 +110,22 @@ def measure_capture(subject: Subject, work: Path, sweep: Sweep, tick: Tick) -> t
     tried = list(dict.fromkeys(tried))
     apart = [setting for setting in tried if setting.shares == "nothing"]
     together = [setting for setting in tried if setting.shares != "nothing"]
-    measured, left = [default], len(tried)
+    measured, failed, left = [default], {}, len(tried)
     for setting in apart:
         left -= 1
         tick(name, f"{setting.knob} {setting.value}", left)
-        measured.append(_repeated(subject, setting, work, 1 if setting.settings.mode == "paper" else sweep.runs))
+        try:
+            measured.append(_repeated(subject, setting, work, 1 if setting.settings.mode == "paper" else sweep.runs))
+        except OgPointcloudError as error:
+            failed[f"{setting.knob} {setting.value}"] = str(error)
 
     def done(what: str) -> None:
         nonlocal left
         left = max(0, left - 1)
         tick(name, what, left)
 
-    shared, failed = measure_shared(subject.folder, together, work, sweep.runs, done)
-    return [*measured, *shared], failed
+    shared, failed_there = measure_shared(subject.folder, together, work, sweep.runs, done)
+    return [*measured, *shared], failed | failed_there
 
 
 def _repeated(subject: Subject, setting: Setting, work: Path, runs: int) -> Measured:
