@@ -442,6 +442,44 @@ def test_a_proposer_that_is_not_there_is_one_error(tmp_path, processes):
         make_masks(tmp_path / "c", settings, say=silent, processes=processes)
 
 
+OWN = """
+import numpy as np
+def bright(image):
+    return image.max(axis=2) > 150, 7
+def halves(image):
+    left = np.arange(image.shape[1]) < image.shape[1] // 2
+    return np.broadcast_to([[left], [~left]], (2, *image.shape[:2])).copy()
+class Nothing:
+    name = "nothing"
+    def propose(self, image):
+        from og_pointcloud.masking.contracts import Proposals
+        return Proposals(np.zeros((0, *image.shape[:2]), bool), np.zeros(0, np.float32))
+number = 3
+"""
+
+
+@pytest.mark.parametrize("processes", [1, 2])
+def test_a_proposer_of_ones_own(tmp_path, monkeypatch, processes):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "own_masks.py").write_text(OWN)
+    make_capture(tmp_path / "c", 2)
+    settings = MaskSettings(proposer="python:own_masks:halves", encoder=None)
+    assert make_masks("c", settings, "halves", say=silent, processes=processes).masks == 4
+    settings = MaskSettings(proposer="python:own_masks:Nothing", encoder=None)
+    assert make_masks("c", settings, "nothing", say=silent, processes=processes).masks == 0
+    for place, says in {
+        "own_masks:number": "'python:own_masks:number' is a int; expected a function",
+        "own_masks:none": "no proposer 'python:own_masks:none'",
+        "no_module:bright": "no proposer 'python:no_module:bright'",
+        "own_masks": "expected python:MODULE:NAME",
+        "own_masks:bright": "a mask proposer gave",
+    }.items():
+        settings = MaskSettings(proposer=f"python:{place}", encoder=None)
+        with pytest.raises(OgPointcloudError, match=says):
+            make_masks("c", settings, "out", say=silent, processes=processes)
+    assert str(tmp_path) not in sys.path
+
+
 def test_settings_are_checked():
     with pytest.raises(OgPointcloudError, match="mask level is 'huge'"):
         MaskSettings(level="huge")
@@ -456,7 +494,7 @@ def test_settings_are_checked():
 
 def test_models_lists_and_downloads_nothing(tmp_path, capsys, monkeypatch):
     monkeypatch.setenv("HF_HUB_CACHE", str(tmp_path / "hub"))
-    snapshot = tmp_path / "hub" / "models--facebook--sam-vit-base" / "snapshots" / "abc"
+    snapshot = tmp_path / "hub" / "models--facebook--sam-vit-base" / "snapshots" / f"{5:040}"
     snapshot.mkdir(parents=True)
     (snapshot / "config.json").write_text('{"model_type": "sam"}')
     (snapshot / "model.safetensors").write_bytes(b"")

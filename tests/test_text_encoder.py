@@ -624,9 +624,7 @@ def test_encoders_are_found_among_the_models_and_in_the_cache(encoder_folder, tm
 
 
 def test_a_missing_encoder_names_the_command_that_makes_it():
-    with pytest.raises(
-        OgPointcloudError, match=r"export-text-encoder MODEL_FOLDER --feature-space 'laion/CLIP-ViT-B-16'"
-    ):
+    with pytest.raises(OgPointcloudError, match=r"export-text-encoder laion/CLIP-ViT-B-16$"):
         encoder_for("laion/CLIP-ViT-B-16")
 
 
@@ -700,6 +698,23 @@ def test_the_command_writes_an_encoder_and_says_how_it_is_found(source, tmp_path
     assert "error: nowhere.json is not a file" in capsys.readouterr().err
     with pytest.raises(SystemExit):
         main([*arguments, "--scene", "s.ogpc"])
+
+
+def test_a_fetched_model_is_found_by_its_name(tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("HF_HUB_CACHE", str(tmp_path / "hub"))
+    model = tmp_path / "hub" / f"models--{SPACE.replace('/', '--')}"
+    for revision in ("a" * 40, "b" * 40):
+        (model / "snapshots" / revision).mkdir(parents=True)
+    (model / "refs").mkdir()
+    arguments = ["-o", str(tmp_path / "out")]
+    for main_is in ("", "../../..", "c" * 40):
+        (model / "refs" / "main").write_text(main_is)
+        assert main(["export-text-encoder", SPACE, *arguments]) == 2
+        assert f"'{SPACE}' is no folder, no file and no model that was fetched" in capsys.readouterr().err
+    (model / "refs" / "main").write_text("b" * 40 + "\n")
+    transformers_model("clip").save_pretrained(write_tokenizer(model / "snapshots" / ("b" * 40)))
+    assert main(["export-text-encoder", SPACE, *arguments]) == 0
+    assert read_text_encoder(tmp_path / "out").feature_space == SPACE
 
 
 def test_without_an_output_it_lands_where_it_is_found(source, tmp_path, monkeypatch):

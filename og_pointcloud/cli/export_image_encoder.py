@@ -5,13 +5,13 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from og_pointcloud.cli.common import add_command, add_model_options
+from og_pointcloud.cli.common import add_command, add_model_options, given_model
 
 
 def add(commands: Any) -> None:
     parser = add_command(
         commands, "export-image-encoder", run, "Make a model's image encoder usable without torch.",
-        "og-pointcloud export-image-encoder clip-vit-base-patch32 --feature-space openai/clip-vit-base-patch32",
+        "og-pointcloud export-image-encoder openai/clip-vit-base-patch32",
     )  # fmt: skip
     add_model_options(parser)
     parser.add_argument(
@@ -21,14 +21,15 @@ def add(commands: Any) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
+    source, feature_space = given_model(arguments.source, arguments.feature_space)
     from og_pointcloud_export.image_encoder import export_image_encoder
 
     from og_pointcloud.masking.crops import CROP_STYLES
 
     folder, manifest = export_image_encoder(
-        arguments.source,
+        source,
         arguments.output,
-        feature_space=arguments.feature_space,
+        feature_space=feature_space,
         activation=arguments.activation,
         crops=CROP_STYLES[arguments.crops],
     )

@@ -7,13 +7,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from og_pointcloud.cli.common import add_command, add_model_options
+from og_pointcloud.cli.common import add_command, add_model_options, given_model
 
 
 def add(commands: Any) -> None:
     parser = add_command(
         commands, "export-text-encoder", run, "Make a model's text encoder usable without torch.",
-        "og-pointcloud export-text-encoder clip-vit-base-patch32 --feature-space openai/clip-vit-base-patch32",
+        "og-pointcloud export-text-encoder openai/clip-vit-base-patch32",
     )  # fmt: skip
     add_model_options(parser)
     parser.add_argument(
@@ -33,12 +33,13 @@ def add(commands: Any) -> None:
 def run(arguments: argparse.Namespace) -> None:
     if arguments.scene and not arguments.int8:
         arguments.parser.error("--scene is asked only what --int8 would change: give both, or neither")
+    source, feature_space = given_model(arguments.source, arguments.feature_space)
     from og_pointcloud_export.text_encoder import export_text_encoder
 
     folder, manifest = export_text_encoder(
-        arguments.source,
+        source,
         arguments.output,
-        feature_space=arguments.feature_space,
+        feature_space=feature_space,
         templates=arguments.template or ("{}",),
         activation=arguments.activation,
         tokenizer=arguments.tokenizer,

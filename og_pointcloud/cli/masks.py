@@ -24,7 +24,7 @@ def add(commands: Any) -> None:
     parser.add_argument(
         "--proposer", default="opencv", metavar="P",
         help="opencv (default, no weights), sam:FOLDER, sam:OWNER/MODEL, onnx:DETECTOR.onnx, onnx:ENCODER.onnx,"
-        "DECODER.onnx, or a folder of id PNGs or COCO .json files",
+        "DECODER.onnx, python:MODULE:NAME (your own), or a folder of id PNGs or COCO .json files",
     )  # fmt: skip
     parser.add_argument(
         "--encoder", default="demo", metavar="E",

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import os
 from collections.abc import Iterator
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+from og_pointcloud._hub import fetched_model, hub_cache
 from og_pointcloud.cli.common import add_command, print_table
 
 PARTS = (
@@ -97,14 +97,6 @@ def model_kind(folder: Path) -> str | None:
     return KINDS.get(str(content.get("model_type"))) if isinstance(content, dict) else None
 
 
-def hub_cache() -> Path:
-    """Where Hugging Face's tools keep what they fetch, by their own variables."""
-    if hub := os.environ.get("HF_HUB_CACHE"):
-        return Path(hub)
-    home = os.environ.get("HF_HOME")
-    return Path(home) / "hub" if home else Path.home() / ".cache" / "huggingface" / "hub"
-
-
 def needs(capture: Path, has_proposer: bool) -> Iterator[str]:
     """What stands between a capture folder and a fit, line by line."""
     from og_pointcloud.errors import OgPointcloudError
@@ -121,13 +113,15 @@ def needs(capture: Path, has_proposer: bool) -> Iterator[str]:
         yield f"{capture} cannot be read: {error}"
         return
     space = scene.feature_space
-    from og_pointcloud.text.encoder import find_encoder
+    from og_pointcloud.text.encoder import export_command, find_encoder
 
     yield f"{capture} has masks with features of '{space}' (width {scene.feature_width})"
     if find_encoder(space):
         yield "  its words can be typed: the text encoder is here"
     elif "/" in space:
-        yield f"  typed words need its text encoder: hf download {space}, then"
-        yield "  og-pointcloud export-text-encoder --help says how to make the file that the base install runs"
+        yield "  typed words need its text encoder, which the base install then runs:"
+        if fetched_model(space) is None:
+            yield f"  hf download {space}"
+        yield f"  {export_command(space)}"
     else:
         yield "  its space names no public model: words come from a features file (--text-features)"

@@ -99,7 +99,13 @@ def prepare(
         }
         if store.resumed:
             journal.leave_out(f"rendering of {store.resumed} views", f"an interrupted fit kept them in '{work}'")
+        _check_sight(scene, table)
         table = replace(table, mask_pixels=table.mask_pixels * stride**2)
+        table = _front_surfaces(scene, table, gaussians, settings, journal)
+    return Prepared(around, gaussians, near, stride, table)
+
+
+def _check_sight(scene: Scene, table: MaskTable) -> None:
     if table.exposure.nnz == 0:
         raise SceneError(
             f"no camera sees the cloud: {len(scene.points)} points, {len(scene.views)} views, none in any image; check "
@@ -110,9 +116,6 @@ def prepare(
             f"none of the {len(table.mask_view)} masks shows a Gaussian; expected at least one: make masks, and check "
             "that poses and cloud share one frame"
         )
-    with journal.stage("visibility"):
-        table = _front_surfaces(scene, table, gaussians, settings, journal)
-    return Prepared(around, gaussians, near, stride, table)
 
 
 def check_scene(scene: Scene, journal: Journal) -> None:
@@ -206,7 +209,7 @@ def pixel_stride(
     if stride > 1:
         journal.leave_out(
             f"{1 - 1 / stride**2:.0%} of the pixels",
-            f"points lie {apart:.1f} px apart: every {stride}th row and column",
+            f"points lie {apart:.1f} px apart: one row and column in {stride} is enough",
         )
     return stride
 

@@ -181,7 +181,7 @@ def _read_masks(capture: Path, names: Sequence[str], level: str) -> tuple[list[M
     found = f"{MASKS_FOLDER}/ but no {FEATURES_NAME}" if (capture / MASKS_FOLDER).is_dir() else "no masks at all"
     raise SceneError(
         f"{capture} has {found}; expected {MASKS_FOLDER}/<image stem>.png (ids) with {FEATURES_NAME}, or LangSplat's "
-        f"{LANGUAGE_FEATURES_FOLDER}/<image stem>_s.npy and _f.npy: run a mask proposer and an image encoder first"
+        f"{LANGUAGE_FEATURES_FOLDER}/<image stem>_s.npy and _f.npy: og-pointcloud masks {capture} makes them"
     )
 
 

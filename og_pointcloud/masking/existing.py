@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import importlib
 import json
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -14,9 +16,9 @@ from numpy.typing import NDArray
 
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.images import MAX_PIXELS, decoded, png_header, require_cv2, without_suffix
-from og_pointcloud.masking.contracts import Proposals
+from og_pointcloud.masking.contracts import MaskProposer, Proposals
 
-__all__ = ["CallableProposer", "ExistingMasks", "as_proposals", "decode_rle", "from_ids", "read_json"]
+__all__ = ["CallableProposer", "ExistingMasks", "as_proposals", "decode_rle", "from_ids", "own_proposer", "read_json"]
 
 MAX_JSON_BYTES = 1 << 30
 MAX_MASKS_PX = 1 << 33
@@ -74,6 +76,32 @@ class CallableProposer:
         """SceneError where the function gives something else."""
         height, width = image.shape[:2]
         return as_proposals(self.function(image), (height, width))
+
+
+def own_proposer(place: str) -> MaskProposer:
+    """What ``MODULE:NAME`` holds: a function as of `CallableProposer`, a proposer, or a class of proposers, which is
+    called without arguments. The module is looked for in the working directory too. SceneError where it is not there.
+    """
+    module, _, name = place.partition(":")
+    if not name:
+        raise SceneError(f"the proposer is 'python:{place}'; expected python:MODULE:NAME")
+    sys.path.insert(0, str(Path.cwd()))
+    try:
+        found = getattr(importlib.import_module(module), name)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise SceneError(
+            f"no proposer 'python:{place}' ({error}); expected a name in a module that Python finds from here"
+        ) from error
+    finally:
+        sys.path.remove(str(Path.cwd()))
+    made = found() if isinstance(found, type) else found
+    if hasattr(made, "propose") and hasattr(made, "name"):
+        return made
+    if callable(made):
+        return CallableProposer(made, f"python:{place}")
+    raise SceneError(
+        f"'python:{place}' is a {type(made).__name__}; expected a function, or an object with propose and name"
+    )
 
 
 @dataclass(frozen=True)

@@ -27,6 +27,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from og_pointcloud._hub import MODEL_NAME
 from og_pointcloud._npy import array_from_npy
 from og_pointcloud._onnx_graph import check_graph
 from og_pointcloud.choosing import WordBank
@@ -219,6 +220,8 @@ def find_encoder(feature_space: str, bundle: str | os.PathLike[str] | None = Non
 
 def export_command(feature_space: str) -> str:
     """The command that makes the encoder of a feature space, where it will be found."""
+    if MODEL_NAME.fullmatch(feature_space):  # OWNER/MODEL, found where it was fetched to
+        return f"og-pointcloud export-text-encoder {feature_space}"
     return f"og-pointcloud export-text-encoder MODEL_FOLDER --feature-space '{feature_space}'"
 
 
