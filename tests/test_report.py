@@ -256,7 +256,7 @@ def test_what_shares_stages_is_what_a_whole_fit_makes(subject, shared, knob, val
 
 def test_a_table_through_float16_is_told_from_the_table(shared):
     weights = shared.prepared.table.weights.copy()
-    for value in ("weights in float16", "features in float16"):
+    for value in ("weights float16", "features float16"):
         rounded = shared.measure(find_setting("mask table", value))[0].row
         assert rounded.digest != shared.measure(ON_SHARED["table"])[0].row.digest
         assert rounded.miou > 0.8

@@ -158,7 +158,7 @@ def _precisions(
     for width in WIDTHS:
         if width < min(len(directions), table.shape[1]):
             basis = np.concatenate([_unit(middle[None]), directions[:width]]).T.astype(np.float32)
-            value = f"projected to {width} directions"
+            value = f"projected to {width}"
             kept.append(("descriptors", value, _unit(table @ basis), texts @ basis, len(table) * (width + 1) * 4e-6))
     return kept
 

@@ -173,8 +173,8 @@ KNOBS = (
         "weights of 24 bits are what the kernel makes; half of that would do, and would halve the table",
         (
             Setting("mask table", "float32", shares="table"),
-            Setting("mask table", "weights in float16", shares="table", special="float16 weights"),
-            Setting("mask table", "features in float16", shares="table", special="float16 features"),
+            Setting("mask table", "weights float16", shares="table", special="float16 weights"),
+            Setting("mask table", "features float16", shares="table", special="float16 features"),
         ),
         DEFAULT,
     ),
