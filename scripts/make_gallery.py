@@ -54,6 +54,8 @@ EXHIBITS = (
             "A robot drives through the room after a chair was moved and two things were brought in."),
     Exhibit("08_edit_a_scene", ("{scene}", "-o", "{out}"), ("edited.png",),
             "As it was; sofa and cushions removed; the table red; one more chair. White is what no camera ever saw."),
+    Exhibit("09_how_sure", ("{scene}", "-o", "{out}"), ("how_sure.png",),
+            "Dark is where views or neighbours disagree: borders, and the floor seen between legs."),
 )  # fmt: skip
 
 

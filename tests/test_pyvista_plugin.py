@@ -375,7 +375,9 @@ def balls(folder):
     surface = random.normal(size=middle.shape)
     floor = np.c_[random.random((1500, 2)) * [4, 3.6] - 1, np.zeros(1500)]
     xyz = np.concatenate([middle + 0.5 * surface / np.linalg.norm(surface, axis=1, keepdims=True), floor])
-    return write_bundle(make_cloud(xyz, np.append(np.repeat([0, 1, 2], 800), [-1] * 1500)), folder / "balls.ogpc")
+    cloud = make_cloud(xyz, np.append(np.repeat([0, 1, 2], 800), [-1] * 1500))
+    certainty = np.clip(80 + 170 * xyz[:, 2], 0, 255).astype(np.uint8)  # sure above, less so near the floor
+    return write_bundle(replace(cloud, certainty=certainty), folder / "balls.ogpc")
 
 
 @pytest.mark.parametrize(
@@ -384,6 +386,7 @@ def balls(folder):
         ("01_label_a_cloud.py", ["labels.png", "labels.vtp"]),
         ("02_instances_and_boxes.py", ["instances.csv", "instances.png"]),
         ("03_click_query.py", ["after.png", "before.png"]),
+        ("09_how_sure.py", ["how_sure.png"]),
     ],
 )
 def test_examples_leave_their_pictures(drawing, tmp_path, monkeypatch, capsys, example, files):
@@ -394,6 +397,10 @@ def test_examples_leave_their_pictures(drawing, tmp_path, monkeypatch, capsys, e
     pictures = [np.asarray(pv.read(tmp_path / "out" / name).active_scalars) for name in files if name.endswith(".png")]
     for picture in pictures:
         assert len(np.unique(picture.reshape(len(picture), -1), axis=0)) > 3, "not a blank picture"
+    if example.startswith("09"):
+        shares = [float(line.split()[-1].rstrip("%")) for line in capsys.readouterr().out.splitlines()[1:]]
+        assert len(shares) == 3
+        assert all(60 < share < 95 for share in shares), "of a ball what lies above 0.28 is sure, seven tenths of it"
     if example.startswith("03"):
         assert "instance" in capsys.readouterr().out
         assert (pictures[0] == pv.Color(HIGHLIGHT).int_rgb).all(axis=-1).sum() > 500
