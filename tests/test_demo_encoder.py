@@ -102,10 +102,11 @@ def test_its_script_makes_the_same_weights_from_the_same_seed(tmp_path, monkeypa
     import train_demo_encoder as script
 
     torch.set_num_threads(1)
-    crops, kinds = script.room_crops(1000, 1, np.random.default_rng(0))
     words = script.Words.drawn(np.random.default_rng(0))
-    for run in ("first", "second"):
-        script.export(*script.train(crops, kinds, words, steps=2, seed=3), tmp_path / run)
+    for run, crops in (("first", script.room_crops(1000, 1)), ("second", script.rendered([1000], 1, processes=1))):
+        assert crops.proposed.any()
+        assert not crops.proposed.all()
+        script.export(*script.train(crops, words, steps=2, seed=3), words, tmp_path / run)
     files = [path.relative_to(tmp_path / "first") for path in (tmp_path / "first").rglob("*") if path.is_file()]
     assert len(files) == 6
     for file in files:
@@ -126,3 +127,16 @@ def test_a_coarse_room_from_photographs_alone(proposer, tmp_path):
     assert result.masks > 0
     assert result.score.miou > (0.3 if proposer == "truth" else 0.05)
     assert (result.labels >= 0).any()
+
+
+def test_the_benchmark_sets_better_masks_beside_opencvs(tmp_path, capsys, monkeypatch):
+    monkeypatch.syspath_prepend(str(EXAMPLES))
+    from benchmark_photographs import main
+
+    main([str(UNSEEN_ROOM), "--views", "2", "--level", "large", "--work", str(tmp_path)])
+    printed = capsys.readouterr().out.splitlines()
+    rows = [line.split() for line in printed if line.startswith((str(UNSEEN_ROOM), "mean"))]
+    assert [row[0] for row in rows] == [str(UNSEEN_ROOM)] * 3 + ["mean"] * 3
+    assert rows[0][1:] == rows[3][1:], "the mean of one room is that room"
+    miou = [float(row[-8]) for row in rows]
+    assert miou[0] > miou[2] > 0, "perfect masks are better than OpenCV's"

@@ -11,7 +11,7 @@ import time
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -29,18 +29,11 @@ from og_pointcloud_room.furniture import CLASS_NAMES
 __all__ = ["ABSENT", "FromPhotographs", "label_from_photographs"]
 
 ABSENT = (
-    "accordion",
-    "anvil",
-    "canoe",
-    "excavator",
-    "giraffe",
-    "hammock",
-    "lighthouse",
-    "penguin",
-    "saxophone",
-    "tractor",
-)
-"""Words for nothing in the room, typed as well."""
+    "anvil", "armadillo", "bagpipes", "bobsled", "boomerang", "catapult", "chainsaw", "geyser", "gondola", "harpoon",
+    "hovercraft", "iceberg", "igloo", "jellyfish", "parachute", "periscope", "pyramid", "rocket", "snorkel",
+    "stethoscope", "tarantula", "unicycle", "volcano", "walrus", "zeppelin",
+)  # fmt: skip
+"""Words for nothing in the room, typed as well. The demo encoder was not trained on any of them."""
 
 
 @dataclass(frozen=True)
@@ -60,21 +53,26 @@ class FromPhotographs:
 
 
 def label_from_photographs(
-    capture: Path, output: Path, proposer: str = "opencv", seed: int = 0, processes: int = 1
+    capture: Path,
+    output: Path,
+    proposer: str = "opencv",
+    seed: int = 0,
+    processes: int = 1,
+    level: str | None = None,
 ) -> FromPhotographs:
     """Label a room's capture, as ``write_capture`` wrote it, by the names of its classes as someone types them.
 
     Of the capture only images, poses, points and the truth are used; ``output`` becomes a capture of its own, with the
     masks made here, and gets ``room.ogpc``, which carries the words' encoder. proposer: as of `og-pointcloud masks`; or
     the capture's own ``masks`` folder for those of the demo's simulated proposer. processes: images worked on side by
-    side.
+    side. level: of the masks; None: that command's own.
     """
     seconds: dict[str, float] = {}
     output.mkdir(parents=True, exist_ok=True)
+    settings = MaskSettings(proposer=proposer, encoder="demo")
+    settings = settings if level is None else replace(settings, level=level)
     with _stage("masks and features", seconds):
-        made = make_masks(
-            capture, MaskSettings(proposer=proposer, encoder="demo"), output, processes=processes, overwrite=True
-        )
+        made = make_masks(capture, settings, output, processes=processes, overwrite=True)
     with _stage("read the capture", seconds):
         scene = read_capture(output)
     with _stage("fit", seconds):
