@@ -64,7 +64,7 @@ def draw(
 
 def add_certainty(plotter: pv.Plotter, mesh: Any, certainty: NDArray[np.float32], point_size: float) -> None:
     """The points from dark, where nothing is sure, to bright, with the scale beside them."""
-    bar = {"title": "certainty", "vertical": True, "position_x": 0.86, "position_y": 0.25, "height": 0.5, "fmt": "%.1f"}
+    bar: Any = {"title": "certainty", "vertical": True, "position_x": 0.86, "position_y": 0.25, "height": 0.5}
     plotter.add_mesh(
         mesh.copy(deep=False), scalars=certainty, cmap="viridis", clim=(0, 1), style="points", point_size=point_size,
         lighting=False, scalar_bar_args=bar, name="og_certainty",
