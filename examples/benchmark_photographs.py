@@ -57,7 +57,7 @@ def label_with_each(seed: int, views: int, level: str | None, folder: Path) -> l
         print(f"\nroom {seed}, masks of {name}", flush=True)
         output = folder / name.replace(" ", "_")
         chosen = level if proposer == "opencv" else None
-        found.append((name, label_from_photographs(careless, output, proposer, seed=seed, level=chosen)))
+        found.append((name, label_from_photographs(careless, output, proposer, seed=seed, processes=1, level=chosen)))
     return found
 
 

@@ -5,7 +5,6 @@ Twice: with the masks and features of a simulated proposer and encoder, and from
 
 from __future__ import annotations
 
-import os
 import sys
 import time
 import warnings
@@ -109,7 +108,7 @@ def run_demo(
     seen = None
     if photographs:
         print("\nfrom photographs alone: masks by OpenCV, features and typed words by the demo encoder", flush=True)
-        seen = label_from_photographs(folder, output / "photographs", seed=seed, processes=min(2, os.cpu_count() or 1))
+        seen = label_from_photographs(folder, output / "photographs", seed=seed)
         seconds |= {f"photographs: {name}": value for name, value in seen.seconds.items()}
         own_seconds = sum(seen.seconds.values())
         methods += (MethodScore("from photographs alone", seen.score, seen.absent_called, own_seconds),)

@@ -22,6 +22,7 @@ from og_pointcloud.fitting.fit import fit
 from og_pointcloud.formats.capture import read_capture
 from og_pointcloud.masking.make_masks import PREVIEW_NAME, MaskSettings, make_masks
 from og_pointcloud.metrics import Score, score_labels
+from og_pointcloud.scoring.truth import read_truth
 from og_pointcloud.settings import FitSettings
 from og_pointcloud.text.encoder import DEMO_ENCODER
 from og_pointcloud_room.furniture import CLASS_NAMES
@@ -57,7 +58,7 @@ def label_from_photographs(
     output: Path,
     proposer: str = "opencv",
     seed: int = 0,
-    processes: int = 1,
+    processes: int | None = None,
     level: str | None = None,
 ) -> FromPhotographs:
     """Label a room's capture, as ``write_capture`` wrote it, by the names of its classes as someone types them.
@@ -65,7 +66,7 @@ def label_from_photographs(
     Of the capture only images, poses, points and the truth are used; ``output`` becomes a capture of its own, with the
     masks made here, and gets ``room.ogpc``, which carries the words' encoder. proposer: as of `og-pointcloud masks`; or
     the capture's own ``masks`` folder for those of the demo's simulated proposer. processes: images worked on side by
-    side. level: of the masks; None: that command's own.
+    side; None: `make_masks` chooses. level: of the masks; None: that command's own.
     """
     seconds: dict[str, float] = {}
     output.mkdir(parents=True, exist_ok=True)
@@ -80,14 +81,14 @@ def label_from_photographs(
     bundle = output / "room.ogpc"
     with _stage("write one file", seconds):
         write_bundle(cloud, bundle, text_encoder=DEMO_ENCODER / "text")
-    truth = np.load(capture / "gt.npz")
+    truth = read_truth(capture)
     with _stage("typed words to labels", seconds):
         loaded = og.load(bundle)
         labels = og.segment(loaded.xyz, CLASS_NAMES, scene=loaded).labels
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # that no point has a label is what is hoped for
         called = float((og.segment(loaded, ABSENT).labels >= 0).mean())
-    score = score_labels(labels, truth["cls"], background=truth["background"])
+    score = score_labels(labels, truth.cls, background=truth.background)
     return FromPhotographs(
         bundle,
         made.masks,

@@ -89,7 +89,9 @@ def assign_points(
             ids, share, neighbourhood.index, neighbourhood.adjoining, *settings.border_shares, settings.own_vote
         )
     for_its_state = np.where((best >= 0) & (ids == best), share, 1 - share)
-    certainty = np.where(total > 0, np.clip(for_its_state, 0, 1), 0) * _in_agreement(ids, neighbourhood)
+    certainty = np.where(total > 0, np.clip(for_its_state, 0, 1), 0) * _agreeing(
+        ids, neighbourhood.index, neighbourhood.adjoining
+    )
     return Membership(
         ids.astype(np.int32), share.astype(np.float32), certainty.astype(np.float32), rate.astype(np.float32), dismissed
     )
@@ -330,13 +332,9 @@ def _settle_borders(ids, share, neighbours, adjoining, low, high, own_vote):  # 
     return settled
 
 
-def _in_agreement(ids: NDArray[np.int32], neighbourhood: Neighbourhood) -> NDArray[np.float64]:
-    """(n,) the part of each point's adjoining points that have its state; 1 where none adjoins."""
-    return _agreeing(ids, neighbourhood.index, neighbourhood.adjoining)
-
-
 @njit(cache=True, parallel=True)
 def _agreeing(ids, neighbours, adjoining):  # noqa: ANN001, ANN202
+    """(n,) float64: the part of each point's adjoining points that have its state; 1 where none adjoins."""
     agreeing = np.ones(len(ids))
     for g in prange(len(ids)):
         same, count = 0, 0

@@ -43,6 +43,7 @@ from og_pointcloud.report.measure import (
     reset_peak,
     warm_up,
 )
+from og_pointcloud.scoring.captures import sure
 from og_pointcloud.scoring.spread import risk_coverage
 from og_pointcloud.settings import FitSettings
 
@@ -138,15 +139,12 @@ class SharedFit:
         if truth is None or vocabulary is None:
             return
         labels, score, _ = chooser_of(cloud).choose(vocabulary.vectors).at(cloud.instance_ids)
-        certainty = np.ones(len(cloud)) if cloud.certainty is None else cloud.certainty / 255
-        labels, sure = (
-            self._of_whole(labels),
-            self._of_whole((1 + score) / 2 * certainty),
-        )  # of cosines the order counts
+        certainty = None if cloud.certainty is None else cloud.certainty / 255
+        labels, sureness = self._of_whole(labels), self._of_whole(sure(score, False, certainty))
         called, classes = truth.class_of(labels, vocabulary.names), truth.score(labels, vocabulary.names).classes
         counted = truth.scored & np.isin(truth.cls, classes)
         if counted.any():
-            curve = risk_coverage((called == truth.cls)[counted], np.where(called >= 0, sure, -np.inf)[counted])
+            curve = risk_coverage((called == truth.cls)[counted], np.where(called >= 0, sureness, -np.inf)[counted])
             answered = (called >= 0)[counted].mean()
             np.savez(path, coverage=curve.coverage, risk=curve.risk, area=curve.area, answered=answered)
 
