@@ -38,10 +38,9 @@ from benchmark_scaling import made_scene, warm_up
 from benchmark_visibility import box_case, errors, window_of
 
 import og_pointcloud as og
-from og_pointcloud.bundle import TOO_FAR
-from og_pointcloud.cloud import LabelledCloud
-from og_pointcloud.metrics import adjusted_rand_index
-from og_pointcloud.report.sweep import machine
+from og_pointcloud.cloud import TOO_FAR, LabelledCloud
+from og_pointcloud.evaluate.metrics import adjusted_rand_index
+from og_pointcloud.evaluate.report.sweep import machine
 
 Answer = TypeVar("Answer")
 
@@ -116,7 +115,7 @@ def bench_kernel(unit: float, points: int = KERNEL_POINTS, image: tuple[int, int
     import numba
     from reference_splatting import reference_view_weights  # pyright: ignore[reportMissingImports]  (in tests/)
 
-    from og_pointcloud.fitting.visibility import view_weights
+    from og_pointcloud.fitting.mask_table import view_weights
 
     threads = numba.get_num_threads()
     numba.set_num_threads(1)

@@ -29,8 +29,8 @@ from numpy.typing import NDArray
 from score_captures import score_of
 
 import og_pointcloud as og
-from og_pointcloud.choosing import Choice, Chooser, WordBank, relevancy
-from og_pointcloud.cloud import UNOBSERVED, LabelledCloud
+from og_pointcloud.ask.choosing import Choice, Chooser, relevancy
+from og_pointcloud.cloud import UNOBSERVED, LabelledCloud, WordBank
 from og_pointcloud.errors import MissingExtraError, OgPointcloudError
 from og_pointcloud.settings import ChoosingSettings
 

@@ -21,14 +21,20 @@ from benchmark_scaling import made_scene, write_rows
 from numpy.typing import NDArray
 from scipy.sparse import csr_array, vstack
 
-from og_pointcloud.fitting.codebook import two_level_codebook
-from og_pointcloud.fitting.features import FeatureObjective, MaskGram, cohesion_factor, learn_features, masked_gram
 from og_pointcloud.fitting.fit import prepare
-from og_pointcloud.fitting.geometry import thinned
-from og_pointcloud.fitting.matching import Evidence, eq5_scores, visible_evidence
-from og_pointcloud.fitting.paper import view_losses
-from og_pointcloud.fitting.visibility import MaskTable, mask_table, pixel_weights
+from og_pointcloud.fitting.learned.codebook import two_level_codebook
+from og_pointcloud.fitting.learned.instance_features import (
+    FeatureObjective,
+    MaskGram,
+    cohesion_factor,
+    learn_features,
+    masked_gram,
+)
+from og_pointcloud.fitting.learned.matching import Evidence, eq5_scores, visible_evidence
+from og_pointcloud.fitting.learned.paper import view_losses
+from og_pointcloud.fitting.mask_table import MaskTable, mask_table, pixel_weights
 from og_pointcloud.formats.capture import read_capture
+from og_pointcloud.rendering.geometry import thinned
 from og_pointcloud.scene import Scene
 from og_pointcloud.settings import CodebookSettings, FeatureSettings, MatchingSettings, PaperSettings
 

@@ -22,7 +22,7 @@ from score_captures import score_of
 import og_pointcloud as og
 from og_pointcloud.cloud import LabelledCloud
 from og_pointcloud.scene import Points, Scene, View
-from og_pointcloud.text.features import read_text_features
+from og_pointcloud.text.text_features import read_text_features
 
 Change = Callable[[Scene, np.random.Generator], tuple[Scene, NDArray[np.int64]]]
 """Scene -> the changed one, and the row of each of its points in the former."""

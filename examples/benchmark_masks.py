@@ -20,16 +20,16 @@ import numpy as np
 from score_captures import score_of
 
 import og_pointcloud as og
-from og_pointcloud.fitting.geometry import neighbourhood, sample_of_points
 from og_pointcloud.masking.agreement import agreement, points_of_proposals, rescored
 from og_pointcloud.masking.contracts import DepthMaskProposer, Proposals
 from og_pointcloud.masking.image_worker import AGREEMENT_POINTS
 from og_pointcloud.masking.levels import AGREED, LEVELS, Level, settle
 from og_pointcloud.masking.opening import open_proposer
 from og_pointcloud.masking.refine import rendered_depth, smallest_mask_px, split_at_depth_edges
+from og_pointcloud.rendering.geometry import neighbourhood, sample_of_points
 from og_pointcloud.scene import Scene, View
 from og_pointcloud.settings import GeometrySettings
-from og_pointcloud.text.features import read_text_features
+from og_pointcloud.text.text_features import read_text_features
 
 WAYS = ("plain", "depth", "split", "tiny")
 SMALLEST_SHARE = 8e-4

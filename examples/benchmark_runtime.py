@@ -27,9 +27,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 import og_pointcloud as og
-from og_pointcloud.bundle import TOO_FAR, Bundle
-from og_pointcloud.cloud import LabelledCloud, Vocabulary
-from og_pointcloud.runtime import LabelledScene
+from og_pointcloud.ask.labelled_scene import LabelledScene
+from og_pointcloud.bundle.read import Bundle
+from og_pointcloud.cloud import TOO_FAR, LabelledCloud, Vocabulary
 
 if TYPE_CHECKING:
     from og_pointcloud_export.query_head import ScoreHead
@@ -177,7 +177,7 @@ def build_table(cloud: LabelledCloud, way: str, cell: float) -> Table:
     from og_pointcloud_export.brick_grid import GridSettings, build_brick_grid
     from og_pointcloud_export.query_head import build_query_head
 
-    from og_pointcloud._onnxruntime import open_session
+    from og_pointcloud.models import open_session
 
     start = time.perf_counter()
     graph = build_query_head(cloud, build_brick_grid(cloud, GridSettings(cell_per_spacing=cell, **WAYS[way])))
@@ -214,7 +214,7 @@ def measure_head(cloud: LabelledCloud, text: NDArray[np.float32], head: ScoreHea
     from og_pointcloud_export.brick_grid import GridSettings, build_brick_grid
     from og_pointcloud_export.query_head import build_query_head, reference_scores
 
-    from og_pointcloud._onnxruntime import open_session
+    from og_pointcloud.models import open_session
 
     session = open_session(build_query_head(cloud, build_brick_grid(cloud, GridSettings(lists=False)), head))
     feed = {"points": np.zeros((0, 3), np.float32), "text": text}

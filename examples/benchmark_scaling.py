@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.cloud import LabelledCloud
-from og_pointcloud.metrics import adjusted_rand_index
+from og_pointcloud.evaluate.metrics import adjusted_rand_index
 from og_pointcloud.scene import Camera, Points, Scene, View
 from og_pointcloud.settings import FitSettings
 

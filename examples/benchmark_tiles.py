@@ -22,11 +22,11 @@ from make_street import CLASSES, GROUND, MadeStreet, make_street
 from numpy.typing import NDArray
 
 from og_pointcloud.cloud import LabelledCloud
+from og_pointcloud.evaluate.metrics import adjusted_rand_index, score_labels
 from og_pointcloud.fitting.fit import fit
 from og_pointcloud.fitting.tiles import fit_tiles, split
-from og_pointcloud.metrics import adjusted_rand_index, score_labels
+from og_pointcloud.formats.colors import label_colors
 from og_pointcloud.scene import Points, Scene
-from og_pointcloud.segmentation import label_colors
 from og_pointcloud.settings import FitSettings
 
 Ids = NDArray[np.integer]

@@ -26,7 +26,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud.fitting.visibility import Gaussians, ViewWeights, view_weights
+from og_pointcloud.fitting.mask_table import Gaussians, ViewWeights, view_weights
 from og_pointcloud.scene import Camera, Points, Scene
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
@@ -100,8 +100,8 @@ def box_case(count: int, width: int, height: int) -> Case:
 def capture_case(folder: Path) -> Case:
     """The middle view of a capture, as `fit` draws it."""
     from og_pointcloud.fitting.fit import prepare
-    from og_pointcloud.fitting.geometry import thinned
     from og_pointcloud.formats.capture import read_capture
+    from og_pointcloud.rendering.geometry import thinned
 
     scene = read_capture(folder)
     middle = scene.views[len(scene.views) // 2]
@@ -203,7 +203,7 @@ def print_kernel(cases: list[Case], against: Path | None) -> None:
 
 def print_cutoffs(cases: list[Case]) -> None:
     """Weight that is lost and time that is won by leaving more out than 3DGS does; errors of whole images."""
-    from og_pointcloud.fitting.visibility import Cutoffs  # which another checkout may lack
+    from og_pointcloud.fitting.mask_table import Cutoffs  # which another checkout may lack
 
     print(f"\n{'cut-offs':<30} {'scene':<26} {'s a view':>8} {'weight lost':>12} {'largest error, pixels':>22}")
     for case in cases:
@@ -280,7 +280,7 @@ def gaussian_room(points: int, views: int, size: tuple[int, int]) -> Scene:
 @contextmanager
 def stages_with_peaks() -> Iterator[None]:
     """Print each stage of a fit with the most memory held during it."""
-    from og_pointcloud.fitting.journal import Journal
+    from og_pointcloud.journal import Journal
 
     plain = Journal.stage
 

@@ -24,7 +24,7 @@ folder = sys.argv[1]
 
 def trimesh_in():
     import trimesh
-    from og_pointcloud.clouds import world_points
+    from og_pointcloud.ask.hosts import world_points
     assert world_points(trimesh.PointCloud(np.eye(3))).shape == (3, 3)
 
 

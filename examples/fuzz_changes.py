@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from og_pointcloud._npy import npy_bytes
+from og_pointcloud.formats.npy import npy_bytes
 
 __all__ = ["changed", "mended", "packed", "unpacked"]
 

@@ -12,30 +12,30 @@ from pathlib import Path
 
 import numpy as np
 from fuzz_changes import mended, packed, unpacked
+from hard_cases.inputs import labelled_cloud, unit_rows, write_two_balls
 from numpy.typing import NDArray
 
-from og_pointcloud._npy import array_from_npy, npy_bytes
-from og_pointcloud._onnx_graph import check_graph
-from og_pointcloud.bundle import QUERY_OPERATORS, read_bundle, read_carried_encoder
-from og_pointcloud.catalogue.inputs import labelled_cloud, unit_rows, write_two_balls
-from og_pointcloud.choosing import WordBank
+from og_pointcloud.ask.labelled_scene import LabelledScene
+from og_pointcloud.bundle.read import QUERY_OPERATORS, read_bundle, read_carried_encoder
+from og_pointcloud.bundle.vocabulary import read_words
+from og_pointcloud.cloud import WordBank
 from og_pointcloud.errors import OgPointcloudError
+from og_pointcloud.fitting.opengaussian import read_opengaussian
 from og_pointcloud.formats import colmap, record3d, replica, scannet, seven_scenes
 from og_pointcloud.formats.capture import read_capture
 from og_pointcloud.formats.gaussian_ply import gaussian_rows
 from og_pointcloud.formats.images import read_rgb
 from og_pointcloud.formats.langsplat import read_language_features
 from og_pointcloud.formats.las import write_las
-from og_pointcloud.formats.masks import MaskLayer, read_masks
+from og_pointcloud.formats.mask_files import MaskLayer, read_masks
 from og_pointcloud.formats.nerfstudio import read_transforms
-from og_pointcloud.formats.opengaussian import read_opengaussian
+from og_pointcloud.formats.npy import array_from_npy, npy_bytes
 from og_pointcloud.formats.points import read_points
 from og_pointcloud.formats.poses import PosedFrames
-from og_pointcloud.runtime import LabelledScene
+from og_pointcloud.models import check_graph
 from og_pointcloud.scene import Points
 from og_pointcloud.text.encoder import TextEncoder, encoder_files
-from og_pointcloud.text.features import read_text_features
-from og_pointcloud.text.vocabulary import read_words
+from og_pointcloud.text.text_features import read_text_features
 
 __all__ = ["READERS", "Files", "Reader"]
 

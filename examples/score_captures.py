@@ -26,14 +26,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 import og_pointcloud as og
+from og_pointcloud.evaluate.baselines import direct_uplift, only_where_masked
+from og_pointcloud.evaluate.blocks import BlockInterval, miou_difference, miou_interval
+from og_pointcloud.evaluate.captures import ask
+from og_pointcloud.evaluate.metrics import Score, score_labels
+from og_pointcloud.evaluate.truth import Truth, read_truth
 from og_pointcloud.fitting.fit import prepare
 from og_pointcloud.formats.capture import read_capture
-from og_pointcloud.metrics import Score, score_labels
-from og_pointcloud.report.baselines import direct_uplift, only_where_masked
-from og_pointcloud.scoring.blocks import BlockInterval, miou_difference, miou_interval
-from og_pointcloud.scoring.captures import ask
-from og_pointcloud.scoring.truth import Truth, read_truth
-from og_pointcloud.text.features import read_text_features
+from og_pointcloud.text.text_features import read_text_features
 
 WORDS, BANK = "text_features.npz", "word_bank.npz"
 COMMAND = "from og_pointcloud.cli import main; raise SystemExit(main())"

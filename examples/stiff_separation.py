@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from og_pointcloud.fitting.features import learn_features
-from og_pointcloud.fitting.visibility import MaskTable
+from og_pointcloud.fitting.learned.instance_features import learn_features
+from og_pointcloud.fitting.mask_table import MaskTable
 from og_pointcloud.settings import FeatureSettings
 
 MASKS, GAUSSIANS, WIDTH = 3, 200, 6

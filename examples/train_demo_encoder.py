@@ -46,6 +46,7 @@ from og_pointcloud_room.words import RELATED, SYNONYMS
 from safetensors.torch import save_file
 from torch import nn
 
+from og_pointcloud.bundle.vocabulary import everyday_words
 from og_pointcloud.masking.crops import Crop, mask_crops
 from og_pointcloud.masking.encoders import DEMO_FOLDER, DEMO_SPACE, open_encoder
 from og_pointcloud.masking.encoders.preprocessing import Preprocessing
@@ -54,7 +55,6 @@ from og_pointcloud.masking.opencv import OpenCVProposer
 from og_pointcloud.text.encoder import TextEncoder as TrainedTextEncoder
 from og_pointcloud.text.encoder import read_text_encoder
 from og_pointcloud.text.tokenizer import Tokenizer
-from og_pointcloud.text.vocabulary import everyday_words
 
 Random = np.random.Generator
 

@@ -26,25 +26,34 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from og_pointcloud_export import write_bundle
 
-    from og_pointcloud import edit as edit
-    from og_pointcloud.boxes import Box, axis_aligned_box, oriented_box
-    from og_pointcloud.bundle import TOO_FAR, read_bundle
-    from og_pointcloud.choosing import Reason, WordBank
-    from og_pointcloud.cloud import BACKGROUND, UNOBSERVED, InstanceTable, LabelledCloud, Vocabulary
+    from og_pointcloud.ask.boxes import Box, axis_aligned_box, oriented_box
+    from og_pointcloud.ask.choosing import Reason
+    from og_pointcloud.ask.instances import Instance, Instances
+    from og_pointcloud.ask.labelled_scene import LabelledScene, Segmenter, instance_table, load, segment, use
+    from og_pointcloud.ask.picking import Pick, in_world, pick
+    from og_pointcloud.ask.segmentation import Segmentation
+    from og_pointcloud.ask.selecting import Match, Selection, select
+    from og_pointcloud.bundle.read import read_bundle
+    from og_pointcloud.cloud import (
+        BACKGROUND,
+        TOO_FAR,
+        UNKNOWN,
+        UNOBSERVED,
+        InstanceTable,
+        LabelledCloud,
+        Vocabulary,
+        WordBank,
+    )
     from og_pointcloud.errors import BundleError, FeatureSpaceError, MissingExtraError, OgPointcloudError, SceneError
     from og_pointcloud.fitting.fit import fit
-    from og_pointcloud.fitting.pictures import feature_colors, feature_picture, instance_picture
+    from og_pointcloud.fitting.opengaussian import read_opengaussian
     from og_pointcloud.formats.capture import read_capture
-    from og_pointcloud.formats.opengaussian import read_opengaussian
     from og_pointcloud.formats.points import read_points
-    from og_pointcloud.instances import Instance, Instances, instance_table
-    from og_pointcloud.picking import Pick, in_world, pick
-    from og_pointcloud.runtime import LabelledScene, Segmenter, load, segment, use
     from og_pointcloud.scene import Camera
-    from og_pointcloud.segmentation import UNKNOWN, Segmentation
-    from og_pointcloud.selecting import Match, Selection, select
     from og_pointcloud.settings import FitSettings
-    from og_pointcloud.text.features import read_text_features
+    from og_pointcloud.show import edit as edit
+    from og_pointcloud.show.fit_pictures import feature_colors, feature_picture, instance_picture
+    from og_pointcloud.text.text_features import read_text_features
 
 __all__ = [
     "BACKGROUND",
@@ -94,36 +103,38 @@ __all__ = [
 ]
 
 _HOMES = {
-    "og_pointcloud.boxes": ("Box", "axis_aligned_box", "oriented_box"),
-    "og_pointcloud.bundle": ("TOO_FAR", "read_bundle"),
-    "og_pointcloud.choosing": ("Reason", "WordBank"),
-    "og_pointcloud.cloud": ("BACKGROUND", "UNOBSERVED", "InstanceTable", "LabelledCloud", "Vocabulary"),
+    "og_pointcloud.ask.boxes": ("Box", "axis_aligned_box", "oriented_box"),
+    "og_pointcloud.ask.choosing": ("Reason",),
+    "og_pointcloud.ask.instances": ("Instance", "Instances"),
+    "og_pointcloud.ask.labelled_scene": ("LabelledScene", "Segmenter", "instance_table", "load", "segment", "use"),
+    "og_pointcloud.ask.picking": ("Pick", "in_world", "pick"),
+    "og_pointcloud.ask.segmentation": ("Segmentation",),
+    "og_pointcloud.ask.selecting": ("Match", "Selection", "select"),
+    "og_pointcloud.bundle.read": ("read_bundle",),
+    "og_pointcloud.cloud": (
+        "BACKGROUND", "TOO_FAR", "UNKNOWN", "UNOBSERVED", "InstanceTable", "LabelledCloud", "Vocabulary", "WordBank",
+    ),
     "og_pointcloud.errors": (
         "BundleError", "FeatureSpaceError", "MissingExtraError", "OgPointcloudError", "SceneError",
     ),
     "og_pointcloud.fitting.fit": ("fit",),
+    "og_pointcloud.fitting.opengaussian": ("read_opengaussian",),
     "og_pointcloud.formats.capture": ("read_capture",),
-    "og_pointcloud.formats.opengaussian": ("read_opengaussian",),
     "og_pointcloud.formats.points": ("read_points",),
-    "og_pointcloud.instances": ("Instance", "Instances", "instance_table"),
-    "og_pointcloud.picking": ("Pick", "in_world", "pick"),
-    "og_pointcloud.fitting.pictures": ("feature_colors", "feature_picture", "instance_picture"),
-    "og_pointcloud.runtime": ("LabelledScene", "Segmenter", "load", "segment", "use"),
     "og_pointcloud.scene": ("Camera",),
-    "og_pointcloud.segmentation": ("UNKNOWN", "Segmentation"),
-    "og_pointcloud.selecting": ("Match", "Selection", "select"),
     "og_pointcloud.settings": ("FitSettings",),
-    "og_pointcloud.text.features": ("read_text_features",),
+    "og_pointcloud.show.fit_pictures": ("feature_colors", "feature_picture", "instance_picture"),
+    "og_pointcloud.text.text_features": ("read_text_features",),
     "og_pointcloud_export": ("write_bundle",),
 }  # fmt: skip
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
-_MODULES = frozenset({"edit"})
+_MODULES = {"edit": "og_pointcloud.show.edit"}
 """Modules used as they are: og.edit.remove."""
 
 
 def __getattr__(name: str) -> Any:
     if name in _MODULES:
-        return importlib.import_module(f"{__name__}.{name}")
+        return importlib.import_module(_MODULES[name])
     if name not in _HOME_OF:
         raise AttributeError(f"module 'og_pointcloud' has no attribute '{name}'")
     value = getattr(importlib.import_module(_HOME_OF[name]), name)

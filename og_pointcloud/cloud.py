@@ -3,22 +3,29 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError
 
-if TYPE_CHECKING:
-    from og_pointcloud.choosing import WordBank
-
-__all__ = ["BACKGROUND", "UNOBSERVED", "InstanceTable", "LabelledCloud", "Vocabulary"]
+__all__ = [
+    "BACKGROUND", "TOO_FAR", "UNKNOWN", "UNOBSERVED", "InstanceTable", "LabelledCloud", "Vocabulary", "WordBank",
+    "finite_rows", "unit_rows",
+]  # fmt: skip
 
 BACKGROUND = -1
 """Instance id of a point that views saw, but outside every mask more often than missed masks explain."""
 UNOBSERVED = -2
 """Instance id of a point that nothing is known about: no view saw it, nor does it lie on an observed surface."""
+
+TOO_FAR = -3
+"""Instance answered for a query point with no cloud point within reach."""
+UNKNOWN = -1
+"""Label of a point that none of the names is known to fit."""
+MIN_BANK = 50
+"""Words that a null distribution takes at least: fewer give no standard deviation worth the name."""
 
 
 @dataclass(frozen=True)
@@ -102,6 +109,29 @@ class Vocabulary:
 
 
 @dataclass(frozen=True)
+class WordBank:
+    """Everyday words of the scene's encoder: how a text that does not fit scores, and what else a thing may be.
+
+    vectors: (B, D) float32 unit rows, B at least 50; they may be stored as float16.
+    """
+
+    vectors: NDArray[np.float32]
+
+    def __post_init__(self) -> None:
+        vectors = finite_rows(self.vectors, "word bank")
+        if len(vectors) < MIN_BANK:
+            raise FeatureSpaceError(
+                f"a word bank of {len(vectors)} words; expected at least {MIN_BANK} everyday words, encoded like labels"
+            )
+        object.__setattr__(self, "vectors", unit_rows(vectors))
+
+    @property
+    def mean(self) -> NDArray[np.float32]:
+        """(D,) what all words share."""
+        return self.vectors.mean(axis=0)
+
+
+@dataclass(frozen=True)
 class LabelledCloud:
     """Points with an instance id each, and one feature row or more per instance.
 
@@ -167,3 +197,24 @@ class LabelledCloud:
     def xyz_world(self) -> NDArray[np.float64]:
         """World coordinates, (n, 3) float64."""
         return self.xyz.astype(np.float64) + self.origin
+
+
+def unit_rows(vectors: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Rows of length one, float32; a zero row stays zero."""
+    # In two steps, so that neither tiny nor huge vectors leave float32.
+    largest = np.abs(vectors).max(axis=-1, keepdims=True, initial=0)
+    scaled = vectors / np.where(largest > 0, largest, 1)
+    length = np.linalg.norm(scaled, axis=-1, keepdims=True)
+    return (scaled / np.where(length > 0, length, 1)).astype(np.float32)
+
+
+def finite_rows(vectors: ArrayLike, what: str) -> NDArray[np.float32]:
+    """The vectors as (count, width) float32; FeatureSpaceError, which calls them ``what``, where they are not that."""
+    with np.errstate(over="ignore"):
+        rows = np.asarray(vectors).astype(np.float32)
+    if rows.ndim != 2:
+        raise FeatureSpaceError(f"the {what} have shape {rows.shape}; expected (count, width)")
+    if not np.isfinite(rows).all():
+        row = int(np.argmin(np.isfinite(rows).all(axis=1)))
+        raise FeatureSpaceError(f"row {row} of the {what} holds NaN or infinity; expected numbers: encode it again")
+    return rows

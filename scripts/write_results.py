@@ -35,10 +35,10 @@ from score_captures import (  # noqa: E402  # pyright: ignore[reportMissingImpor
     print_row,
 )
 
-from og_pointcloud._atomic import replacing  # noqa: E402
 from og_pointcloud.cli.eval_.common import Spread  # noqa: E402
-from og_pointcloud.scoring.spread import Interval, bootstrap  # noqa: E402
-from og_pointcloud.scoring.truth import read_truth  # noqa: E402
+from og_pointcloud.evaluate.spread import Interval, bootstrap  # noqa: E402
+from og_pointcloud.evaluate.truth import read_truth  # noqa: E402
+from og_pointcloud.formats.atomic import replacing  # noqa: E402
 from og_pointcloud.text.encoder import DEMO_ENCODER, read_text_encoder  # noqa: E402
 
 README = ROOT / "README.md"

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud.fitting.visibility import Gaussians
+from og_pointcloud.fitting.mask_table import Gaussians
 from og_pointcloud.scene import Camera
 
 Wide = np.longdouble

@@ -12,8 +12,8 @@ from conftest import FEATURE_SPACE, NAMES, write_tiny_capture
 
 import og_pointcloud as og
 from og_pointcloud.errors import FeatureSpaceError, MissingExtraError, OgPointcloudError, SceneError
-from og_pointcloud.fitting import ablation
-from og_pointcloud.fitting.ablation import (
+from og_pointcloud.evaluate import ablation
+from og_pointcloud.evaluate.ablation import (
     PUBLISHED_MIOU,
     ablate,
     average,
@@ -21,11 +21,11 @@ from og_pointcloud.fitting.ablation import (
     read_vocabulary,
     write_csv,
 )
-from og_pointcloud.fitting.features import learn_features
+from og_pointcloud.evaluate.metrics import score_labels
+from og_pointcloud.evaluate.truth import read_truth
 from og_pointcloud.fitting.fit import fit, prepare
+from og_pointcloud.fitting.learned.instance_features import learn_features
 from og_pointcloud.formats.capture import read_capture
-from og_pointcloud.metrics import score_labels
-from og_pointcloud.scoring.truth import read_truth
 from og_pointcloud.settings import FeatureSettings
 
 

@@ -55,8 +55,8 @@ def test_the_kernel_is_held_against_float64(monkeypatch):
     assert plain.units == pytest.approx(plain.seconds / 0.5)
     assert plain.against > 1
     # A kernel that drops every alpha below 0.3 is told from one that does not.
-    from og_pointcloud.fitting import visibility
-    from og_pointcloud.fitting.visibility import Cutoffs
+    from og_pointcloud.fitting import mask_table as visibility
+    from og_pointcloud.fitting.mask_table import Cutoffs
 
     coarse = visibility.view_weights
     monkeypatch.setattr("benchmark_visibility.view_weights", lambda *a: coarse(*a, cutoffs=Cutoffs(alpha_min=0.3)))

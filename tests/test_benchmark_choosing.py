@@ -12,7 +12,8 @@ import pytest
 from conftest import FEATURE_SPACE, NAMES, TinyCapture
 from labelled_clouds import unit_rows
 
-from og_pointcloud.choosing import Choice, Chooser, WordBank
+from og_pointcloud.ask.choosing import Choice, Chooser
+from og_pointcloud.cloud import WordBank
 from og_pointcloud.errors import OgPointcloudError
 
 WIDTH = 16

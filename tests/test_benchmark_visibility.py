@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from reference_splatting import reference_view_weights
 
-from og_pointcloud.fitting.visibility import view_weights
+from og_pointcloud.fitting.mask_table import view_weights
 
 
 def tiny() -> benchmark.Case:

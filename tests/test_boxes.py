@@ -7,8 +7,8 @@ import pytest
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
-from og_pointcloud import boxes
-from og_pointcloud.boxes import Box, axis_aligned_box, main_part, oriented_box, quaternion_of, typical_spacing
+from og_pointcloud.ask import boxes
+from og_pointcloud.ask.boxes import Box, axis_aligned_box, main_part, oriented_box, quaternion_of, typical_spacing
 from og_pointcloud.errors import SceneError
 
 RANDOM_SHAPES = [(count, seed) for count in (5, 8, 20, 60) for seed in range(2)]

@@ -14,11 +14,11 @@ import pytest
 from labelled_clouds import instance_table, make_cloud, room, tough_clouds, unit_rows
 from og_pointcloud_export import write_bundle, writer
 
-from og_pointcloud._atomic import replacing
-from og_pointcloud.bundle import read_bundle
+from og_pointcloud.bundle.read import read_bundle
+from og_pointcloud.bundle.vocabulary import compact_vectors
 from og_pointcloud.cloud import InstanceTable, Vocabulary
 from og_pointcloud.errors import BundleError, OgPointcloudError
-from og_pointcloud.text.vocabulary import compact_vectors
+from og_pointcloud.formats.atomic import replacing
 
 CLOUDS = tough_clouds()
 
@@ -103,7 +103,7 @@ def test_words_that_half_precision_would_confuse_are_kept_in_single(tmp_path):
 def test_half_precision_needs_the_same_best_word(monkeypatch):
     words = Vocabulary(("a", "b"), unit_rows(2, seed=4))
     assert compact_vectors(words, instance_table(3))[0].dtype == np.float16
-    monkeypatch.setattr("og_pointcloud.text.vocabulary.HALF_PRECISION_TOLERANCE", 0.0)
+    monkeypatch.setattr("og_pointcloud.bundle.vocabulary.HALF_PRECISION_TOLERANCE", 0.0)
     assert compact_vectors(words, instance_table(3))[0].dtype == np.float32
 
 

@@ -18,7 +18,7 @@ from score_captures import score_of
 from test_choosing import Made, unit
 
 import og_pointcloud as og
-from og_pointcloud.choosing import Chooser, Reason
+from og_pointcloud.ask.choosing import Chooser, Reason
 from og_pointcloud.cli import main
 from og_pointcloud.cloud import BACKGROUND, UNOBSERVED, Vocabulary
 from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError

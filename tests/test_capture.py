@@ -580,7 +580,7 @@ def test_damaged_compressed_features_are_refused(capture):
 
 def test_a_features_bomb_is_refused(capture, monkeypatch):
     folder, _ = capture
-    monkeypatch.setattr("og_pointcloud.formats.masks.MAX_FEATURE_BYTES", 500)
+    monkeypatch.setattr("og_pointcloud.formats.mask_files.MAX_FEATURE_BYTES", 500)
     with pytest.raises(SceneError, match=r"unpacks to \d+ bytes; expected at most 500"):
         read_capture(folder)
 

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hard_cases import Case, find_cases, inputs, run_catalogue, text
+from hard_cases.case import Answer, largest_error, run_case
 
-from og_pointcloud.catalogue import Case, find_cases, inputs, run_catalogue, text
-from og_pointcloud.catalogue.case import Answer, largest_error, run_case
 from og_pointcloud.cli import main
 from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError, SceneError
 

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from labelled_clouds import instance_table, unit_rows
 
-from og_pointcloud.choosing import TEMPLATES, Chooser, Reason, WordBank, common_part, embed, relevancy
+from og_pointcloud.ask.choosing import TEMPLATES, Chooser, Reason, common_part, embed, relevancy
+from og_pointcloud.cloud import WordBank
 from og_pointcloud.errors import FeatureSpaceError
 from og_pointcloud.settings import ChoosingSettings
 
@@ -326,7 +327,8 @@ def test_choosing_needs_only_numpy():
     import subprocess
 
     code = (
-        "import sys, og_pointcloud.choosing; print([m for m in sys.modules if m in ('numba', 'scipy', 'torch', 'cv2')])"
+        "import sys, og_pointcloud.ask.choosing;"
+        "print([m for m in sys.modules if m in ('numba', 'scipy', 'torch', 'cv2')])"
     )
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert found.stdout.strip() == "[]"
@@ -335,7 +337,7 @@ def test_choosing_needs_only_numpy():
 def test_descriptors_are_compared_in_parts(monkeypatch):
     descriptors = np.concatenate([unit_rows(7, WIDTH), unit_rows(4, WIDTH), unit_rows(3, WIDTH)])  # some come again
     whole = common_part(descriptors, 0.95)
-    monkeypatch.setattr("og_pointcloud.choosing.ROWS_AT_ONCE", 3)
+    monkeypatch.setattr("og_pointcloud.ask.choosing.ROWS_AT_ONCE", 3)
     np.testing.assert_allclose(common_part(descriptors, 0.95), whole, atol=1e-7)
 
 

@@ -22,7 +22,7 @@ from conftest import (
 from test_opengaussian import WIDTH as LEAF_WIDTH
 from test_opengaussian import write_result
 
-from og_pointcloud.bundle import read_bundle
+from og_pointcloud.bundle.read import read_bundle
 from og_pointcloud.cli import main
 from og_pointcloud.formats.capture import read_capture
 from og_pointcloud.formats.ply import read_ply

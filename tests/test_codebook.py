@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from test_grouping import ONE, hand_table
 
 from og_pointcloud.errors import OgPointcloudError
-from og_pointcloud.fitting.codebook import (
+from og_pointcloud.fitting.learned.codebook import (
     Codebook,
     cluster_weights,
     kmeans,

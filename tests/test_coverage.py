@@ -9,8 +9,8 @@ import pytest
 from test_fit import boxes_on_a_table, share_right
 
 from og_pointcloud.errors import OgPointcloudError
-from og_pointcloud.fitting.coverage import _spread_order, needed_views
 from og_pointcloud.fitting.fit import fit
+from og_pointcloud.rendering.coverage import _spread_order, needed_views
 from og_pointcloud.scene import Camera, View
 from og_pointcloud.settings import FitSettings, VisibilitySettings
 

@@ -17,19 +17,20 @@ import pytest
 from labelled_clouds import instance_table, make_cloud
 
 import og_pointcloud as og
-from og_pointcloud import clouds
-from og_pointcloud.bundle import SCHEMA_VERSION
+from og_pointcloud.ask import hosts as clouds
+from og_pointcloud.ask.hosts import world_points
+from og_pointcloud.bundle.read import SCHEMA_VERSION
 from og_pointcloud.cli import build_parser, main
 from og_pointcloud.cli.eval_ import capture, scannet
 from og_pointcloud.cloud import Vocabulary
-from og_pointcloud.clouds import world_points
 from og_pointcloud.errors import SceneError
+from og_pointcloud.evaluate import blocks as spatial_blocks
+from og_pointcloud.evaluate import instance_scores as instances
+from og_pointcloud.evaluate import lerf, lerf_selection, truth
+from og_pointcloud.evaluate import scannet as scannet_rules
+from og_pointcloud.evaluate.metrics import score_labels
+from og_pointcloud.evaluate.report.measure import Row
 from og_pointcloud.formats import capture as capture_format
-from og_pointcloud.metrics import score_labels
-from og_pointcloud.report.measure import Row
-from og_pointcloud.scoring import blocks as spatial_blocks
-from og_pointcloud.scoring import instances, lerf, lerf_selection, truth
-from og_pointcloud.scoring import scannet as scannet_rules
 from og_pointcloud.text.encoder import DEMO_ENCODER, read_text_encoder
 
 ROOT = Path(__file__).parents[1]

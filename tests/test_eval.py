@@ -12,14 +12,13 @@ from conftest import NAMES, write_tiny_capture
 from labelled_clouds import SPACE, WIDTH, instance_table, make_cloud
 
 import og_pointcloud as og
-from og_pointcloud.choosing import WordBank
 from og_pointcloud.cli import main
-from og_pointcloud.cloud import BACKGROUND
+from og_pointcloud.cloud import BACKGROUND, WordBank
+from og_pointcloud.evaluate.plots import plot_risk_coverage
+from og_pointcloud.evaluate.scannet import NAMES as NYU40
+from og_pointcloud.evaluate.scannet import scored_answers
+from og_pointcloud.evaluate.spread import risk_coverage
 from og_pointcloud.formats.ply import write_ply
-from og_pointcloud.scoring.plots import plot_risk_coverage
-from og_pointcloud.scoring.scannet import NAMES as NYU40
-from og_pointcloud.scoring.scannet import scored_answers
-from og_pointcloud.scoring.spread import risk_coverage
 
 WALL, FLOOR, CHAIR = 1, 2, 5
 PNG = b"\x89PNG\r\n"

@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array, random_array, vstack
 
 from og_pointcloud.errors import OgPointcloudError, SceneError
-from og_pointcloud.fitting import features
-from og_pointcloud.fitting.features import (
+from og_pointcloud.fitting.fit import prepare
+from og_pointcloud.fitting.learned import instance_features as features
+from og_pointcloud.fitting.learned.instance_features import (
     FeatureObjective,
     MaskGram,
     learn_features,
@@ -21,8 +22,7 @@ from og_pointcloud.fitting.features import (
     raw_gradient,
     read_features,
 )
-from og_pointcloud.fitting.fit import prepare
-from og_pointcloud.fitting.visibility import MaskTable, mask_table, pixel_weights
+from og_pointcloud.fitting.mask_table import MaskTable, mask_table, pixel_weights
 from og_pointcloud.formats.capture import read_capture
 from og_pointcloud.settings import FeatureSettings
 

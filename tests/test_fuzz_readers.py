@@ -18,18 +18,18 @@ from fuzz_readers import make_input, try_input
 from hypothesis import given, settings
 from hypothesis import strategies as some
 
-from og_pointcloud._npy import array_from_npy, npy_bytes
-from og_pointcloud.bundle import read_bundle, read_carried_encoder
+from og_pointcloud.bundle.read import read_bundle, read_carried_encoder
 from og_pointcloud.cli import main
 from og_pointcloud.errors import BundleError, FeatureSpaceError, OgPointcloudError, SceneError
 from og_pointcloud.formats.langsplat import read_language_features
 from og_pointcloud.formats.nerfstudio import read_transforms
+from og_pointcloud.formats.npy import array_from_npy, npy_bytes
 from og_pointcloud.formats.pcd import read_pcd
 from og_pointcloud.formats.ply import read_ply
 from og_pointcloud.formats.points import read_points
 from og_pointcloud.scene import Camera
 from og_pointcloud.text.encoder import TextEncoder, check_templates, encoder_files
-from og_pointcloud.text.features import read_text_features
+from og_pointcloud.text.text_features import read_text_features
 
 INPUTS = {"scene file": 60, "scene file, its members": 60, "scene file, asked": 30, "graph": 60, "text encoder": 60}
 INPUTS |= {"LangSplat": 80, "OpenGaussian result": 40, "masks": 60, "capture": 40}

@@ -10,7 +10,8 @@ import pytest
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from og_pointcloud.fitting.geometry import (
+from og_pointcloud.fitting.mask_table import NEAR_SHARE, pixel_weights
+from og_pointcloud.rendering.geometry import (
     chance_of_place,
     choose_gaussians,
     isotropic,
@@ -20,7 +21,6 @@ from og_pointcloud.fitting.geometry import (
     sample_of_points,
     strided,
 )
-from og_pointcloud.fitting.visibility import NEAR_SHARE, pixel_weights
 from og_pointcloud.scene import Camera, Points, View
 from og_pointcloud.settings import GeometrySettings
 

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from og_pointcloud.fitting.grouping import group_masks, indicator, mask_shares
-from og_pointcloud.fitting.testimony import hear_views
-from og_pointcloud.fitting.visibility import MaskTable
+from og_pointcloud.fitting.mask_table import MaskTable
+from og_pointcloud.fitting.view_votes import hear_views
 from og_pointcloud.settings import GroupingSettings
 
 SETTINGS = GroupingSettings()

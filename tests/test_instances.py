@@ -9,10 +9,10 @@ import pytest
 from labelled_clouds import WIDTH, WORDS, instance_table, make_cloud, room, unit_rows
 
 import og_pointcloud as og
-from og_pointcloud.boxes import axis_aligned_box, oriented_box
+from og_pointcloud.ask.boxes import axis_aligned_box, oriented_box
+from og_pointcloud.ask.labelled_scene import LabelledScene
 from og_pointcloud.cli import main
 from og_pointcloud.cloud import Vocabulary
-from og_pointcloud.runtime import LabelledScene
 
 FAR = np.array([1e6, -4e6, 350.25])
 
@@ -130,7 +130,7 @@ def test_json_and_csv_hold_the_same_numbers(scene, tmp_path):
 
 
 def test_a_table_costs_nothing_until_it_is_asked(scene, monkeypatch):
-    monkeypatch.setattr("og_pointcloud.instances.oriented_box", lambda *_: pytest.fail("asked too early"))
+    monkeypatch.setattr("og_pointcloud.ask.instances.oriented_box", lambda *_: pytest.fail("asked too early"))
     table = og.instance_table(scene)
     assert table[0].axis_aligned_box is table[0].axis_aligned_box
     np.testing.assert_array_equal(

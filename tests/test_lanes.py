@@ -7,7 +7,7 @@ import pytest
 from numba import njit
 from numpy.random import Generator
 
-from og_pointcloud.fitting.lanes import WIDTH, any_of, either, exp2, lesser, load, ramp, spread, store, total
+from og_pointcloud.rendering.lanes import WIDTH, any_of, either, exp2, lesser, load, ramp, spread, store, total
 
 
 @njit

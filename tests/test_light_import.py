@@ -96,7 +96,7 @@ def test_asking_writes_nothing_into_the_home_folder(bundle_file, tmp_path):
 
 
 def test_a_users_own_telemetry_choice_stands():
-    code = "import og_pointcloud._onnxruntime, os; print(os.environ['ORT_DISABLE_TELEMETRY'])"
+    code = "import og_pointcloud.models, os; print(os.environ['ORT_DISABLE_TELEMETRY'])"
     assert run(code, ORT_DISABLE_TELEMETRY="0").strip() == "0"
 
 

@@ -10,8 +10,15 @@ from numpy.typing import NDArray
 from test_grouping import ONE, OTHER, HandView, hand_table
 from test_visibility import IDENTITY, NEAR, camera, cloud, patches
 
-from og_pointcloud.fitting.matching import Evidence, Matching, alone_evidence, eq5_scores, match_masks, visible_evidence
-from og_pointcloud.fitting.visibility import Gaussians, mask_table, pixel_weights
+from og_pointcloud.fitting.learned.matching import (
+    Evidence,
+    Matching,
+    alone_evidence,
+    eq5_scores,
+    match_masks,
+    visible_evidence,
+)
+from og_pointcloud.fitting.mask_table import Gaussians, mask_table, pixel_weights
 from og_pointcloud.scene import Camera, View
 from og_pointcloud.settings import MatchingSettings
 

@@ -13,8 +13,8 @@ from scipy.sparse import csr_array, random_array
 from test_grouping import ONE, HandView, hand_table
 
 from og_pointcloud.cloud import BACKGROUND, UNOBSERVED
-from og_pointcloud.fitting.geometry import neighbourhood
 from og_pointcloud.fitting.grouping import MaskGroups
+from og_pointcloud.fitting.mask_table import Gaussians, MaskTable
 from og_pointcloud.fitting.membership import (
     Membership,
     _best_group,
@@ -23,8 +23,8 @@ from og_pointcloud.fitting.membership import (
     own_area,
     without_see_through,
 )
-from og_pointcloud.fitting.testimony import OPENNESS_POWER, hear_views
-from og_pointcloud.fitting.visibility import Gaussians, MaskTable
+from og_pointcloud.fitting.view_votes import OPENNESS_POWER, hear_views
+from og_pointcloud.rendering.geometry import neighbourhood
 from og_pointcloud.settings import GeometrySettings, MembershipSettings
 
 SETTINGS = MembershipSettings()

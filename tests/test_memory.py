@@ -21,7 +21,7 @@ from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.fitting import membership
 from og_pointcloud.fitting import memory as memory_module
 from og_pointcloud.fitting.fit import fit, prepare
-from og_pointcloud.fitting.geometry import neighbourhood
+from og_pointcloud.fitting.mask_table import Gaussians, MaskTable, mask_table, table_key
 from og_pointcloud.fitting.membership import assign_points
 from og_pointcloud.fitting.memory import (
     Column,
@@ -33,8 +33,8 @@ from og_pointcloud.fitting.memory import (
     scratch_like,
 )
 from og_pointcloud.fitting.table_store import PROGRESS, TableStore, kept_views, remove_work
-from og_pointcloud.fitting.testimony import hear_views
-from og_pointcloud.fitting.visibility import Gaussians, MaskTable, mask_table, table_key
+from og_pointcloud.fitting.view_votes import hear_views
+from og_pointcloud.rendering.geometry import neighbourhood
 from og_pointcloud.scene import View
 from og_pointcloud.settings import FitSettings, GeometrySettings, MembershipSettings, VisibilitySettings
 
@@ -176,7 +176,7 @@ def interrupted(folder: Path, gaussians: Gaussians, after: int = 4) -> int:
 
 def rendered(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """Ids of the masks of every view that is rendered from now on."""
-    import og_pointcloud.fitting.visibility as module
+    import og_pointcloud.fitting.mask_table as module
 
     counts: list[int] = []
     plain = module.view_weights

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from og_pointcloud.errors import OgPointcloudError
-from og_pointcloud.metrics import adjusted_rand_index, score_labels
+from og_pointcloud.evaluate.metrics import adjusted_rand_index, score_labels
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 

@@ -12,9 +12,9 @@ from test_fit import BOXES, boxes_on_a_table
 
 from og_pointcloud.cloud import BACKGROUND, UNOBSERVED, InstanceTable, LabelledCloud
 from og_pointcloud.fitting.fit import fit, prepare
-from og_pointcloud.fitting.journal import Journal
-from og_pointcloud.fitting.modes import Labelling, by_choice, by_features, by_grouping, mask_agreement
-from og_pointcloud.fitting.visibility import MaskTable
+from og_pointcloud.fitting.labellers import Labelling, by_choice, by_features, by_grouping, mask_agreement
+from og_pointcloud.fitting.mask_table import MaskTable
+from og_pointcloud.journal import Journal
 from og_pointcloud.settings import CodebookSettings, FitSettings, MatchingSettings, PaperSettings
 
 MODES = get_args(get_type_hints(FitSettings)["mode"])

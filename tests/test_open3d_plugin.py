@@ -15,9 +15,9 @@ from og_pointcloud_export import write_bundle
 
 import og_pointcloud as og
 from og_pointcloud.errors import OgPointcloudError, SceneError
+from og_pointcloud.formats.colors import UNKNOWN_COLOR, label_colors
 from og_pointcloud.formats.gaussian_ply import write_gaussian_ply
 from og_pointcloud.scene import Points
-from og_pointcloud.segmentation import UNKNOWN_COLOR, label_colors
 
 open3d = pytest.importorskip("open3d")
 og3 = pytest.importorskip("og_pointcloud_open3d")

@@ -13,15 +13,15 @@ from conftest import TinyCapture
 from numpy.typing import NDArray
 
 from og_pointcloud.errors import OgPointcloudError, SceneError
-from og_pointcloud.fitting.features import FeatureObjective, masked_gram
 from og_pointcloud.fitting.fit import prepare
-from og_pointcloud.fitting.visibility import Gaussians, mask_table
+from og_pointcloud.fitting.learned.instance_features import FeatureObjective, masked_gram
+from og_pointcloud.fitting.mask_table import Gaussians, mask_table
 from og_pointcloud.formats.capture import read_capture
 from og_pointcloud.scene import View
 from og_pointcloud.settings import FeatureSettings, PaperSettings
 
 torch = pytest.importorskip("torch")
-paper = pytest.importorskip("og_pointcloud.fitting.paper")
+paper = pytest.importorskip("og_pointcloud.fitting.learned.paper")
 
 NEAR = 0.05
 SHORT = PaperSettings(schedule_share=0.01, covered_share=0.3, feature_rate=1e-2, codebook_rate=1e-3, k1=8, k2=3)
@@ -264,6 +264,6 @@ def test_settings_that_mean_nothing_are_refused(options: dict, message: str) -> 
 
 
 def test_missing_torch_names_the_extra() -> None:
-    code = "import sys; sys.modules['torch'] = None; import og_pointcloud.fitting.paper"
+    code = "import sys; sys.modules['torch'] = None; import og_pointcloud.fitting.learned.paper"
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert "pip install 'og-pointcloud[learn]'" in run.stderr.splitlines()[-1]

@@ -10,12 +10,11 @@ import pytest
 from labelled_clouds import WORDS, make_cloud, queries, room, unit_rows
 
 import og_pointcloud as og
-from og_pointcloud import picking
-from og_pointcloud.bundle import TOO_FAR
-from og_pointcloud.cloud import BACKGROUND, UNOBSERVED
+from og_pointcloud.ask import picking
+from og_pointcloud.ask.labelled_scene import LabelledScene
+from og_pointcloud.ask.picking import NO_POINT, front_points, in_world, pick
+from og_pointcloud.cloud import BACKGROUND, TOO_FAR, UNOBSERVED
 from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError
-from og_pointcloud.picking import NO_POINT, front_points, in_world, pick
-from og_pointcloud.runtime import LabelledScene
 from og_pointcloud.scene import Camera
 
 

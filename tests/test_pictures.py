@@ -5,7 +5,10 @@ import numpy as np
 import pytest
 
 from og_pointcloud.errors import SceneError
-from og_pointcloud.fitting.pictures import (
+from og_pointcloud.fitting.mask_table import Gaussians
+from og_pointcloud.formats.colors import UNKNOWN_COLOR, label_colors
+from og_pointcloud.scene import Camera, View
+from og_pointcloud.show.fit_pictures import (
     DARK,
     GAP,
     GREY,
@@ -16,9 +19,6 @@ from og_pointcloud.fitting.pictures import (
     feature_picture,
     instance_picture,
 )
-from og_pointcloud.fitting.visibility import Gaussians
-from og_pointcloud.scene import Camera, View
-from og_pointcloud.segmentation import UNKNOWN_COLOR, label_colors
 
 WIDTH, HEIGHT = 80, 60
 

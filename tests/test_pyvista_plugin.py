@@ -13,7 +13,7 @@ from labelled_clouds import WORDS, make_cloud, room
 from og_pointcloud_export import write_bundle
 
 import og_pointcloud as og
-from og_pointcloud.segmentation import label_colors
+from og_pointcloud.formats.colors import label_colors
 
 pv = pytest.importorskip("pyvista")
 

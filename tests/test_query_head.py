@@ -27,12 +27,11 @@ from og_pointcloud_export.query_head import ScoreHead, build_query_head, referen
 from test_choosing import Made
 
 import og_pointcloud as og
-from og_pointcloud._onnx_graph import check_graph
-from og_pointcloud._onnxruntime import open_session
-from og_pointcloud.bundle import BEYOND, NEAR, ON_SURFACE, QUERY_OPERATORS
-from og_pointcloud.choosing import WordBank
+from og_pointcloud.bundle.nearest import surface_distance
+from og_pointcloud.bundle.read import BEYOND, NEAR, ON_SURFACE, QUERY_OPERATORS
+from og_pointcloud.cloud import WordBank
 from og_pointcloud.errors import BundleError
-from og_pointcloud.nearest import surface_distance
+from og_pointcloud.models import check_graph, open_session
 
 CLOUDS = tough_clouds()
 OUTPUTS = ["label", "score", "instance", "distance", "certain", "instance_scores"]
@@ -491,7 +490,7 @@ def test_hostile_graphs_are_refused_before_a_runtime_sees_them(harm, tmp_path, m
         manifest["members"]["query.onnx"]["bytes"] = len(members["query.onnx"])
         for name, data in {"manifest.json": json.dumps(manifest), **members}.items():
             changed.writestr(name, data)
-    monkeypatch.setattr("og_pointcloud._onnxruntime.open_session", None)
+    monkeypatch.setattr("og_pointcloud.models.open_session", None)
     with pytest.raises(BundleError, match="not to be trusted"):
         og.load(hostile)
 

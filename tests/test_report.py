@@ -15,15 +15,23 @@ from scipy.sparse import csr_array
 from og_pointcloud.cli import main
 from og_pointcloud.cloud import Vocabulary
 from og_pointcloud.errors import OgPointcloudError, SceneError
+from og_pointcloud.evaluate.baselines import BASELINES, only_where_masked
+from og_pointcloud.evaluate.report import asking, judging, knobs, page, sweep
+from og_pointcloud.evaluate.report.judging import disagreement, error, judged, mean_over_captures, verdict
+from og_pointcloud.evaluate.report.knobs import find_setting
+from og_pointcloud.evaluate.report.measure import (
+    Row,
+    digest_of,
+    error_of,
+    labels_of,
+    measure,
+    measure_apart,
+    read_subject,
+)
+from og_pointcloud.evaluate.report.plots import fit_plot, knob_plot, mean_plot
+from og_pointcloud.evaluate.report.shared import ON_SHARED, Measured, SharedFit, rows_of
 from og_pointcloud.fitting.fit import fit, prepare
 from og_pointcloud.formats.capture import read_capture
-from og_pointcloud.report import asking, judging, knobs, page, sweep
-from og_pointcloud.report.baselines import BASELINES, only_where_masked
-from og_pointcloud.report.judging import disagreement, error, judged, mean_over_captures, verdict
-from og_pointcloud.report.knobs import find_setting
-from og_pointcloud.report.measure import Row, digest_of, error_of, labels_of, measure, measure_apart, read_subject
-from og_pointcloud.report.plots import fit_plot, knob_plot, mean_plot
-from og_pointcloud.report.shared import ON_SHARED, Measured, SharedFit, rows_of
 from og_pointcloud.settings import FitSettings
 
 

@@ -13,8 +13,8 @@ import pytest
 from conftest import NAMES, write_tiny_capture
 
 import og_pointcloud as og
+from og_pointcloud.evaluate.baselines import direct_uplift, only_where_masked
 from og_pointcloud.fitting.fit import prepare
-from og_pointcloud.report.baselines import direct_uplift, only_where_masked
 
 ROOT = Path(__file__).parents[1]
 README = ROOT / "README.md"
@@ -103,8 +103,8 @@ def test_a_row_is_what_the_scorers_say(script, capture, tmp_path, capsys):
 
 
 def test_rooms_share_a_line(script):
-    from og_pointcloud.metrics import Score
-    from og_pointcloud.scoring.blocks import BlockInterval
+    from og_pointcloud.evaluate.blocks import BlockInterval
+    from og_pointcloud.evaluate.metrics import Score
 
     def row(miou, plain):
         spread = BlockInterval(miou, miou - 0.1, miou + 0.1, 1.0, 50)

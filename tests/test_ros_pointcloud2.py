@@ -24,7 +24,7 @@ from og_pointcloud_ros import (
 from og_pointcloud_ros.messages import PointCloud2, PointField, Time, nanoseconds
 
 import og_pointcloud as og
-from og_pointcloud.segmentation import label_colors
+from og_pointcloud.formats.colors import label_colors
 
 STRUCT_CODES = {1: "b", 2: "B", 3: "h", 4: "H", 5: "i", 6: "I", 7: "f", 8: "d"}
 SIZES = {number: struct.calcsize("<" + code) for number, code in STRUCT_CODES.items()}

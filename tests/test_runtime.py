@@ -29,12 +29,12 @@ from og_pointcloud_export import brick_grid, write_bundle
 from og_pointcloud_export.query_head import reference_scores
 
 import og_pointcloud as og
-from og_pointcloud import runtime
-from og_pointcloud.bundle import BEYOND, NEAR, ON_SURFACE
+from og_pointcloud.ask import labelled_scene as runtime
+from og_pointcloud.bundle.nearest import surface_distance
+from og_pointcloud.bundle.read import BEYOND, NEAR, ON_SURFACE
 from og_pointcloud.cloud import Vocabulary
 from og_pointcloud.errors import BundleError, FeatureSpaceError, OgPointcloudError, SceneError
-from og_pointcloud.nearest import surface_distance
-from og_pointcloud.segmentation import label_colors
+from og_pointcloud.formats.colors import label_colors
 
 CLOUDS = tough_clouds()
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"

@@ -5,15 +5,15 @@ import json
 import numpy as np
 import pytest
 
-from og_pointcloud.boxes import Box
+from og_pointcloud.ask.boxes import Box
 from og_pointcloud.cli import main
 from og_pointcloud.errors import OgPointcloudError, SceneError
+from og_pointcloud.evaluate.instance_scores import average_precision, panoptic_quality
+from og_pointcloud.evaluate.lerf import pair_ious, read_frame, score_scenes
+from og_pointcloud.evaluate.overlap import aligned_iou, oriented_iou
+from og_pointcloud.evaluate.scannet import NAMES, TASKS, average, read_truth, score_scene
+from og_pointcloud.evaluate.spread import bootstrap, paired_bootstrap, risk_coverage
 from og_pointcloud.formats.ply import write_ply
-from og_pointcloud.scoring.instances import average_precision, panoptic_quality
-from og_pointcloud.scoring.lerf import pair_ious, read_frame, score_scenes
-from og_pointcloud.scoring.overlap import aligned_iou, oriented_iou
-from og_pointcloud.scoring.scannet import NAMES, TASKS, average, read_truth, score_scene
-from og_pointcloud.scoring.spread import bootstrap, paired_bootstrap, risk_coverage
 
 WALL, FLOOR, CHAIR, PICTURE, OTHER = 1, 2, 5, 11, 40
 

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from labelled_clouds import make_cloud, unit_rows
 
+from og_pointcloud.ask.labelled_scene import LabelledScene
 from og_pointcloud.errors import OgPointcloudError, SceneError
-from og_pointcloud.metrics import score_labels
-from og_pointcloud.runtime import LabelledScene
-from og_pointcloud.scoring import blocks
-from og_pointcloud.scoring.blocks import miou_difference, miou_interval
-from og_pointcloud.scoring.captures import Answer, ask, score_capture
-from og_pointcloud.scoring.spread import bootstrap, paired_bootstrap
-from og_pointcloud.scoring.truth import Truth, read_truth
+from og_pointcloud.evaluate import blocks
+from og_pointcloud.evaluate.blocks import miou_difference, miou_interval
+from og_pointcloud.evaluate.captures import Answer, ask, score_capture
+from og_pointcloud.evaluate.metrics import score_labels
+from og_pointcloud.evaluate.spread import bootstrap, paired_bootstrap
+from og_pointcloud.evaluate.truth import Truth, read_truth
 
 NAMES = ("cup", "pot")
 

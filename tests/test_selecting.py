@@ -8,10 +8,10 @@ import pytest
 from labelled_clouds import WIDTH, WORDS, make_cloud, room, unit_rows
 
 import og_pointcloud as og
+from og_pointcloud.ask.labelled_scene import LabelledScene
 from og_pointcloud.cli import main
 from og_pointcloud.cloud import InstanceTable, Vocabulary
 from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError
-from og_pointcloud.runtime import LabelledScene
 
 AXES = np.eye(WIDTH, dtype=np.float32)
 

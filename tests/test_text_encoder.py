@@ -35,12 +35,12 @@ from text_models import (
 )
 
 import og_pointcloud as og
-from og_pointcloud._npy import npy_bytes
-from og_pointcloud._onnx_graph import check_graph
-from og_pointcloud._onnxruntime import open_session
+from og_pointcloud.bundle.vocabulary import everyday_words
 from og_pointcloud.cli import main
 from og_pointcloud.cloud import Vocabulary
 from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError
+from og_pointcloud.formats.npy import npy_bytes
+from og_pointcloud.models import check_graph, open_session
 from og_pointcloud.text.encoder import (
     OPERATORS,
     TextEncoder,
@@ -49,7 +49,6 @@ from og_pointcloud.text.encoder import (
     find_encoder,
     read_text_encoder,
 )
-from og_pointcloud.text.vocabulary import everyday_words
 
 torch = pytest.importorskip("torch")
 safetensors_torch = pytest.importorskip("safetensors.torch")

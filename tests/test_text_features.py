@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from og_pointcloud.errors import FeatureSpaceError
-from og_pointcloud.text.features import read_text_features
+from og_pointcloud.text.text_features import read_text_features
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 
@@ -93,7 +93,7 @@ def test_a_header_that_claims_more_than_the_file_holds(tmp_path):
 
 
 def test_a_file_that_unpacks_to_too_much(tmp_path, monkeypatch):
-    monkeypatch.setattr("og_pointcloud.text.features.MAX_UNPACKED_BYTES", 100)
+    monkeypatch.setattr("og_pointcloud.text.text_features.MAX_UNPACKED_BYTES", 100)
     with pytest.raises(FeatureSpaceError, match="more than 100"):
         read_text_features(save(tmp_path / "t.npz", **good()))
 

@@ -17,8 +17,8 @@ from og_pointcloud.cloud import LabelledCloud
 from og_pointcloud.errors import OgPointcloudError, SceneError
 from og_pointcloud.fitting import tiles
 from og_pointcloud.fitting.fit import fit
+from og_pointcloud.fitting.mask_table import mask_table
 from og_pointcloud.fitting.tiles import fit_tiles, split
-from og_pointcloud.fitting.visibility import mask_table
 from og_pointcloud.scene import Camera, Points, Scene, View
 from og_pointcloud.settings import FitSettings, GeometrySettings, VisibilitySettings
 

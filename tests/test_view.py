@@ -17,8 +17,8 @@ from og_pointcloud_export import write_bundle
 import og_pointcloud as og
 from og_pointcloud.cli import main
 from og_pointcloud.cloud import Vocabulary
-from og_pointcloud.page import write_page
-from og_pointcloud.viewpoint import FOCAL, Viewpoint, choose_viewpoint
+from og_pointcloud.show.page import write_page
+from og_pointcloud.show.viewpoint import FOCAL, Viewpoint, choose_viewpoint
 
 Z_UP = np.array([0.0, 0, 1])
 

@@ -14,8 +14,8 @@ from reference_splatting import front_to_back, reference_pixel_weights, referenc
 from scipy.sparse import csr_array
 
 from og_pointcloud.errors import SceneError
-from og_pointcloud.fitting.testimony import hear_views
-from og_pointcloud.fitting.visibility import Cutoffs, Gaussians, mask_table, pixel_weights, render, view_weights
+from og_pointcloud.fitting.mask_table import Cutoffs, Gaussians, mask_table, pixel_weights, render, view_weights
+from og_pointcloud.fitting.view_votes import hear_views
 from og_pointcloud.scene import Camera, Points, View
 
 NEAR = 0.25

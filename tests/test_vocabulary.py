@@ -15,14 +15,20 @@ from og_pointcloud_export import write_bundle
 from og_pointcloud_export.query_head import reference_scores
 
 import og_pointcloud as og
-from og_pointcloud._npy import npy_bytes
-from og_pointcloud.bundle import read_bundle, read_carried_encoder
-from og_pointcloud.choosing import WordBank
+from og_pointcloud.bundle.read import read_bundle, read_carried_encoder
+from og_pointcloud.bundle.vocabulary import (
+    add_words,
+    best_cosines,
+    carry_encoder,
+    everyday_words,
+    read_words,
+    store_bank,
+)
 from og_pointcloud.cli import main
-from og_pointcloud.cloud import Vocabulary
+from og_pointcloud.cloud import Vocabulary, WordBank
 from og_pointcloud.errors import BundleError, FeatureSpaceError, OgPointcloudError
+from og_pointcloud.formats.npy import npy_bytes
 from og_pointcloud.text.encoder import TextEncoder, encoder_for, read_text_encoder
-from og_pointcloud.text.vocabulary import add_words, best_cosines, carry_encoder, everyday_words, read_words, store_bank
 from og_pointcloud.text.words import resolve_labels
 
 NEW = Vocabulary(("grape", "Größe 40"), 3 * unit_rows(2, seed=9))

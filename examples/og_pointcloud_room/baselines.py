@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse import csr_array
 
-from og_pointcloud.report.baselines import uplift
+from og_pointcloud.evaluate.baselines import uplift
 
 __all__ = ["ceiling", "direct_uplift"]
 

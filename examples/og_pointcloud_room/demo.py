@@ -17,12 +17,11 @@ import numpy as np
 from og_pointcloud_export import write_bundle
 
 import og_pointcloud as og
-from og_pointcloud.choosing import WordBank
-from og_pointcloud.cloud import Vocabulary
+from og_pointcloud.cloud import Vocabulary, WordBank
+from og_pointcloud.evaluate.metrics import Score, adjusted_rand_index, score_labels
 from og_pointcloud.fitting.fit import fit, prepare
-from og_pointcloud.fitting.visibility import MaskTable
+from og_pointcloud.fitting.mask_table import MaskTable
 from og_pointcloud.formats.capture import read_capture
-from og_pointcloud.metrics import Score, adjusted_rand_index, score_labels
 from og_pointcloud.settings import FitSettings
 from og_pointcloud_room.baselines import ceiling, direct_uplift
 from og_pointcloud_room.capture import ABSENT_WORDS, CaptureSettings, RoomCapture, make_capture, write_capture

@@ -18,11 +18,11 @@ import numpy as np
 from og_pointcloud_export import write_bundle
 
 import og_pointcloud as og
+from og_pointcloud.evaluate.metrics import Score, score_labels
+from og_pointcloud.evaluate.truth import read_truth
 from og_pointcloud.fitting.fit import fit
 from og_pointcloud.formats.capture import read_capture
 from og_pointcloud.masking.make_masks import PREVIEW_NAME, MaskSettings, make_masks
-from og_pointcloud.metrics import Score, score_labels
-from og_pointcloud.scoring.truth import read_truth
 from og_pointcloud.settings import FitSettings
 from og_pointcloud.text.encoder import DEMO_ENCODER
 from og_pointcloud_room.furniture import CLASS_NAMES

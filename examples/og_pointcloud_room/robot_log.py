@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud.instances import Instances
-from og_pointcloud.segmentation import Reason, Segmentation, label_colors
+from og_pointcloud.ask.instances import Instances
+from og_pointcloud.ask.segmentation import Reason, Segmentation
+from og_pointcloud.formats.colors import label_colors
 from og_pointcloud_room.robot import BACKGROUND, MOVED, NEW, NO_RETURN, Drive, LidarFrame
 
 if TYPE_CHECKING:

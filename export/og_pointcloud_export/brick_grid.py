@@ -8,7 +8,7 @@ it is split into 4^3 parts as well, as queries come where the cloud is, and only
 Cells lie in bricks of 4^3 and bricks in blocks of 4^3, both stored only where some point is within reach: so a street
 with little in it costs little. A brick that holds no point itself, and few candidates for all of it, is its list alone,
 as about lone points of a sparse scene. So answers are exact, and few queries compare distances at all. What the budget
-leaves without a list is marked, and holds the answer at its centre: ``og_pointcloud.nearest`` settles queries there.
+leaves without a list is marked, and holds the answer at its centre: ``bundle.nearest`` settles queries there.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from og_pointcloud.bundle.nearest import surface_distance
 from og_pointcloud.cloud import UNOBSERVED, LabelledCloud
-from og_pointcloud.nearest import surface_distance
 from og_pointcloud_export.brick_cells import (
     BLOCK,
     BRICK,

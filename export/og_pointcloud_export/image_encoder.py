@@ -195,7 +195,7 @@ def write_image_encoder(
 
 def _parity(graph: bytes, model: Any) -> dict[str, Any]:
     """How far the graph is from torch, on images of noise and of even colours; OgPointcloudError where too far."""
-    from og_pointcloud._onnxruntime import open_session
+    from og_pointcloud.models import open_session
 
     size = model.preprocessing.size
     random = np.random.default_rng(0)

@@ -20,9 +20,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud._npy import npy_bytes
-from og_pointcloud.bundle import read_bundle
+from og_pointcloud.bundle.read import read_bundle
+from og_pointcloud.bundle.vocabulary import best_cosines, everyday_words
 from og_pointcloud.errors import FeatureSpaceError, MissingExtraError, OgPointcloudError
+from og_pointcloud.formats.npy import npy_bytes
 from og_pointcloud.text.encoder import (
     ENCODER_FILES,
     FORMAT,
@@ -35,7 +36,6 @@ from og_pointcloud.text.encoder import (
     cache_folder,
     check_templates,
 )
-from og_pointcloud.text.vocabulary import best_cosines, everyday_words
 from og_pointcloud_export.text_graph import build_text_graph
 from og_pointcloud_export.text_tokenizer import find_tokenizer, read_json
 from og_pointcloud_export.text_weights import Activation, Affine, Block, TextTower, read_text_tower
@@ -86,7 +86,7 @@ def export_text_encoder(
 ) -> tuple[Path, dict[str, Any]]:
     """Write a model's text tower as a folder, whole or not at all. Returns the folder, and its manifest.
 
-    The folder also holds the vectors of our everyday words, which scenes judge labels by (`og_pointcloud.choosing`).
+    The folder also holds the vectors of our everyday words, which scenes judge labels by (`ask.choosing`).
 
     source: a transformers CLIP or SigLIP folder, an OpenCLIP folder, or a file of weights with OpenAI's or OpenCLIP's
         names (.safetensors, weights-only .pt). output: None for the user's cache, where it is found without a word.

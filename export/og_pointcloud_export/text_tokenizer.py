@@ -10,8 +10,8 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from og_pointcloud._onnx_graph import message_fields
 from og_pointcloud.errors import OgPointcloudError
+from og_pointcloud.models import message_fields
 from og_pointcloud.text.encoder import ENCODER_FILES, TOKENIZER
 from og_pointcloud.text.tokenizer import BYTE_CHARACTERS, CLIP_WORDS
 

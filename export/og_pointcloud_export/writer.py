@@ -1,4 +1,4 @@
-"""LabelledCloud -> one .ogpc file; og_pointcloud.bundle says what is in it, and reads it."""
+"""LabelledCloud -> one .ogpc file; og_pointcloud.bundle.read says what is in it, and reads it."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud._atomic import replacing
-from og_pointcloud._npy import npy_bytes
-from og_pointcloud._onnxruntime import open_session
-from og_pointcloud.bundle import FORMAT, SCHEMA_VERSION, TOO_FAR, describe_member
-from og_pointcloud.cloud import InstanceTable, LabelledCloud
+from og_pointcloud.bundle.nearest import NONE_WITHIN_REACH, NearestPoint
+from og_pointcloud.bundle.read import FORMAT, SCHEMA_VERSION, describe_member
+from og_pointcloud.bundle.vocabulary import bank_members, encoder_members, vocabulary_members
+from og_pointcloud.cloud import TOO_FAR, InstanceTable, LabelledCloud
 from og_pointcloud.errors import OgPointcloudError
-from og_pointcloud.nearest import NONE_WITHIN_REACH, NearestPoint
+from og_pointcloud.formats.atomic import replacing
+from og_pointcloud.formats.npy import npy_bytes
+from og_pointcloud.models import open_session
 from og_pointcloud.text.encoder import find_encoder, read_text_encoder
-from og_pointcloud.text.vocabulary import bank_members, encoder_members, vocabulary_members
 from og_pointcloud_export.brick_grid import BrickGrid, build_brick_grid
 from og_pointcloud_export.query_head import OPSET, build_query_head, reference_scores
 

@@ -15,7 +15,7 @@ from og_pointcloud.cli.common import add_command, check_outputs, print_table, re
 from og_pointcloud.errors import MissingExtraError, OgPointcloudError
 
 if TYPE_CHECKING:
-    from og_pointcloud.fitting.ablation import AblationRow
+    from og_pointcloud.evaluate.ablation import AblationRow
 
 
 def add(commands: Any) -> None:
@@ -51,10 +51,10 @@ def run(arguments: argparse.Namespace) -> None:
     check_outputs({"-o": (table, [".csv"]), "the plot": (picture, [".png"])}, inputs=arguments.captures)
     if arguments.paper and find_spec("torch") is None:
         raise MissingExtraError("torch", "learn")
-    from og_pointcloud.fitting import ablation
+    from og_pointcloud.evaluate import ablation
+    from og_pointcloud.evaluate.plots import require_matplotlib
+    from og_pointcloud.evaluate.truth import read_truth
     from og_pointcloud.formats.capture import read_capture
-    from og_pointcloud.scoring.plots import require_matplotlib
-    from og_pointcloud.scoring.truth import read_truth
 
     require_matplotlib()
     rows_wanted = ablation.cases()

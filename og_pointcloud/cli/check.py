@@ -13,7 +13,7 @@ from og_pointcloud.cli.common import add_command, check_outputs
 from og_pointcloud.errors import MissingExtraError, OgPointcloudError
 
 if TYPE_CHECKING:
-    from og_pointcloud.catalogue import Case, Row
+    from hard_cases import Case, Row
 
 
 def add(commands: Any) -> None:
@@ -34,8 +34,8 @@ def run(arguments: argparse.Namespace) -> None:
     for module in ("numba", "scipy", "cv2", "onnx"):
         if find_spec(module) is None:
             raise MissingExtraError(module, "fit")
-    from og_pointcloud.catalogue import find_cases, run_catalogue
-    from og_pointcloud.catalogue.report import plot, write_csv
+    from hard_cases import find_cases, run_catalogue
+    from hard_cases.report import plot, write_csv
 
     only = [word.strip() for word in arguments.only.split(",")] if arguments.only else ()
     cases = find_cases(only, quick=arguments.quick)

@@ -63,7 +63,7 @@ def add_model_options(parser: Parser) -> None:
 
 def given_model(source: Path, feature_space: str | None) -> tuple[Path, str | None]:
     """The folder or file of the SOURCE that was given, and its feature space, as far as both are known by now."""
-    from og_pointcloud._hub import fetched_model
+    from og_pointcloud.models import fetched_model
 
     if source.exists():
         return source, feature_space
@@ -115,7 +115,7 @@ def replaces_input(path: Path, sources: Sequence[Path]) -> bool:
 
 
 def write_json(path: Path, value: Mapping[str, Any]) -> None:
-    from og_pointcloud._atomic import replacing
+    from og_pointcloud.formats.atomic import replacing
 
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as file:
@@ -139,7 +139,7 @@ def require_room() -> None:
 
 def describe_fit(cloud: LabelledCloud, capture: Path, bundle: Path) -> dict[str, Any]:
     """What ``fit --json`` writes: counts, the file, and the provenance (stages, settings, what was left out)."""
-    from og_pointcloud.bundle import BANK
+    from og_pointcloud.bundle.read import BANK
     from og_pointcloud.cloud import BACKGROUND, UNOBSERVED
 
     with zipfile.ZipFile(bundle) as archive:  # writing may have found a word bank

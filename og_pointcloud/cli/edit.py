@@ -13,7 +13,7 @@ from og_pointcloud.cli.pick import numbers
 from og_pointcloud.errors import OgPointcloudError
 
 if TYPE_CHECKING:
-    from og_pointcloud.edit import Edit, What
+    from og_pointcloud.show.edit import Edit, What
 
 VERBS = {"remove": "removed", "extract": "extracted", "recolour": "recoloured", "insert": "inserted"}
 
@@ -68,8 +68,8 @@ def _add_output(parser: Parser) -> None:
 def run(arguments: argparse.Namespace) -> None:
     inputs = [arguments.bundle, arguments.cloud, arguments.text_features]
     check_outputs({"-o": (arguments.output, [".ply"])}, inputs)
-    from og_pointcloud import edit
-    from og_pointcloud.runtime import load
+    from og_pointcloud.ask.labelled_scene import load
+    from og_pointcloud.show import edit
 
     scene = load(arguments.bundle)
     what = meant(arguments)
@@ -88,7 +88,7 @@ def run_insert(arguments: argparse.Namespace) -> None:
     check_outputs({"-o": (arguments.output, [".ply"])}, [arguments.cloud, arguments.other, arguments.pose])
     import numpy as np
 
-    from og_pointcloud import edit
+    from og_pointcloud.show import edit
 
     pose = np.eye(4)
     if arguments.at is not None:
@@ -100,7 +100,7 @@ def run_insert(arguments: argparse.Namespace) -> None:
 
 
 def meant(arguments: argparse.Namespace) -> What:
-    from og_pointcloud.picking import pick
+    from og_pointcloud.ask.picking import pick
 
     if arguments.word is not None:
         return arguments.word

@@ -13,8 +13,7 @@ from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError
 from og_pointcloud.settings import FitSettings, PaperSettings
 
 if TYPE_CHECKING:
-    from og_pointcloud.choosing import WordBank
-    from og_pointcloud.cloud import LabelledCloud, Vocabulary
+    from og_pointcloud.cloud import LabelledCloud, Vocabulary, WordBank
     from og_pointcloud.scene import Scene
 
 MODES = get_args(get_type_hints(FitSettings)["mode"])
@@ -150,7 +149,7 @@ def memory(text: str) -> int:
 
 def vocabulary_for(scene: Scene, arguments: argparse.Namespace) -> tuple[Vocabulary | None, list[dict[str, str]]]:
     """Words for the bundle, and what was left out: those asked for, else the capture's own if their space fits."""
-    from og_pointcloud.text.features import read_text_features
+    from og_pointcloud.text.text_features import read_text_features
 
     path = arguments.vocabulary or arguments.capture / "text_features.npz"
     if not arguments.vocabulary and not path.is_file():
@@ -170,9 +169,9 @@ def vocabulary_for(scene: Scene, arguments: argparse.Namespace) -> tuple[Vocabul
 
 def word_bank_for(scene: Scene, path: Path | None) -> WordBank | None:
     """The bank asked for, else that of the encoder that is found for the scene, if any; checked before the fit."""
+    from og_pointcloud.bundle.vocabulary import read_bank
     from og_pointcloud.text.encoder import find_encoder
-    from og_pointcloud.text.features import UNKNOWN_SPACE
-    from og_pointcloud.text.vocabulary import read_bank
+    from og_pointcloud.text.text_features import UNKNOWN_SPACE
 
     if path is not None:
         bank, feature_space = read_bank(path)
@@ -193,9 +192,10 @@ def write_cloud(cloud: LabelledCloud, bundle: Path, path: Path) -> None:
     """The fitted cloud as .ply, coloured by the best word of each instance, or by instance where there are no words."""
     import numpy as np
 
+    from og_pointcloud.ask.labelled_scene import segment
+    from og_pointcloud.cloud import UNKNOWN
+    from og_pointcloud.formats.colors import label_colors
     from og_pointcloud.formats.points import write_labelled_ply
-    from og_pointcloud.runtime import segment
-    from og_pointcloud.segmentation import UNKNOWN, label_colors
 
     path.parent.mkdir(parents=True, exist_ok=True)
     if cloud.vocabulary:

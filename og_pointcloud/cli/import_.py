@@ -36,7 +36,7 @@ def run(arguments: argparse.Namespace) -> None:
     )
     from og_pointcloud_export import write_bundle
 
-    from og_pointcloud.formats.opengaussian import read_opengaussian
+    from og_pointcloud.fitting.opengaussian import read_opengaussian
 
     stages: list[dict[str, Any]] = []
     with timed(stages, "read result"):
@@ -53,7 +53,7 @@ def vocabulary_of(cloud: LabelledCloud, path: Path | None) -> Vocabulary | None:
     """The words of a text-features file, None without one; FeatureSpaceError unless the cloud can be asked them."""
     if path is None:
         return None
-    from og_pointcloud.text.features import UNKNOWN_SPACE, read_text_features
+    from og_pointcloud.text.text_features import UNKNOWN_SPACE, read_text_features
 
     vocabulary, feature_space = read_text_features(path)
     spaces = {feature_space, cloud.feature_space}

@@ -11,7 +11,7 @@ from og_pointcloud.cli.common import SHOWN, add_command, calibration_hint, print
 from og_pointcloud.errors import BundleError
 
 if TYPE_CHECKING:
-    from og_pointcloud.runtime import LabelledScene
+    from og_pointcloud.ask.labelled_scene import LabelledScene
 
 
 def add(commands: Any) -> None:
@@ -24,7 +24,7 @@ def add(commands: Any) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    from og_pointcloud.runtime import load
+    from og_pointcloud.ask.labelled_scene import load
 
     scene = load(arguments.bundle)
     if arguments.json:

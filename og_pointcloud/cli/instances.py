@@ -28,8 +28,8 @@ def run(arguments: argparse.Namespace) -> None:
     check_outputs(
         {"-o": (arguments.output, [".json", ".csv"])}, inputs=[arguments.bundle, arguments.text_features]
     )  # fmt: skip
+    from og_pointcloud.ask.labelled_scene import instance_table
     from og_pointcloud.errors import OgPointcloudError
-    from og_pointcloud.instances import instance_table
 
     if arguments.words < 0:
         raise OgPointcloudError(f"--words is {arguments.words}; expected 0 or more")

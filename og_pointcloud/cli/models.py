@@ -8,8 +8,8 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from og_pointcloud._hub import fetched_model, hub_cache
 from og_pointcloud.cli.common import add_command, print_table
+from og_pointcloud.models import fetched_model, hub_cache
 
 PARTS = (
     ("fit, opencv masks", ("cv2", "numba", "scipy"), "fit"),

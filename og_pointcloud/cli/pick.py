@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from og_pointcloud.picking import Pick
+    from og_pointcloud.ask.picking import Pick
     from og_pointcloud.scene import Camera
 
 
@@ -43,8 +43,8 @@ def run(arguments: argparse.Namespace) -> None:
         {"-o": (arguments.output, [".png"])},
         inputs=[arguments.bundle, arguments.capture, arguments.text_features],
     )
-    from og_pointcloud.picking import pick
-    from og_pointcloud.runtime import load
+    from og_pointcloud.ask.labelled_scene import load
+    from og_pointcloud.ask.picking import pick
 
     uses_view = arguments.pixel is not None or arguments.output is not None
     if uses_view and not (arguments.capture and arguments.view):
@@ -81,8 +81,8 @@ def numbers(text: str, option: str, count: int) -> list[float]:
 
 
 def world_camera(capture: Path, name: str) -> Camera:
+    from og_pointcloud.ask.picking import in_world
     from og_pointcloud.formats.capture import read_capture
-    from og_pointcloud.picking import in_world
 
     scene = read_capture(capture)
     cameras = {view.name: view.camera for view in scene.views}
@@ -95,7 +95,7 @@ def world_camera(capture: Path, name: str) -> Camera:
 
 def write_mask(path: Path, mask: NDArray[np.bool_]) -> None:
     """A grey PNG, 255 inside."""
-    from og_pointcloud._atomic import replacing
+    from og_pointcloud.formats.atomic import replacing
     from og_pointcloud.formats.images import require_cv2
 
     png = require_cv2().imencode(".png", mask.astype("uint8") * 255)[1]

@@ -15,8 +15,8 @@ from og_pointcloud.cli.common import add_command, check_outputs, print_table
 from og_pointcloud.errors import OgPointcloudError
 
 if TYPE_CHECKING:
-    from og_pointcloud.report.measure import Row
-    from og_pointcloud.report.sweep import Tick
+    from og_pointcloud.evaluate.report.measure import Row
+    from og_pointcloud.evaluate.report.sweep import Tick
 
 
 def add(commands: Any) -> None:
@@ -49,10 +49,10 @@ def run(arguments: argparse.Namespace) -> None:
         raise OgPointcloudError(f"--runs is {runs}; expected at least 1")
     page, table = output / "report.html", output / "report.csv"
     check_outputs({"the page": (page, [".html"]), "the table": (table, [".csv"])}, inputs=arguments.captures)
-    from og_pointcloud.report.page import write_page
-    from og_pointcloud.report.plots import fit_plot, knob_plot, mean_plot
-    from og_pointcloud.report.sweep import QUICK, Sweep, report_on, write_rows
-    from og_pointcloud.scoring.plots import require_matplotlib
+    from og_pointcloud.evaluate.plots import require_matplotlib
+    from og_pointcloud.evaluate.report.page import write_page
+    from og_pointcloud.evaluate.report.plots import fit_plot, knob_plot, mean_plot
+    from og_pointcloud.evaluate.report.sweep import QUICK, Sweep, report_on, write_rows
 
     require_matplotlib()
     output.mkdir(parents=True, exist_ok=True)

@@ -39,7 +39,7 @@ def run(arguments: argparse.Namespace) -> None:
     check_folder(arguments.output)
     from og_pointcloud_ros.bags import label_bag
 
-    from og_pointcloud.runtime import Segmenter
+    from og_pointcloud.ask.labelled_scene import Segmenter
 
     start = time.perf_counter()
     segmenter = Segmenter(arguments.scene, names_in(arguments.labels), text_features=arguments.text_features)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from og_pointcloud.cli.common import SHOWN, add_command, calibration_hint, check_outputs, names_in, print_table, timed
 
 if TYPE_CHECKING:
-    from og_pointcloud.segmentation import Segmentation
+    from og_pointcloud.ask.segmentation import Segmentation
 
 
 def add(commands: Any) -> None:
@@ -36,13 +36,13 @@ def add(commands: Any) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    from og_pointcloud.segmentation import SAVED_AS
+    from og_pointcloud.ask.segmentation import SAVED_AS
 
     check_outputs(
         {"-o": (arguments.output, SAVED_AS)},
         inputs=[arguments.bundle, arguments.text_features, arguments.points],
     )
-    from og_pointcloud.runtime import load, segment
+    from og_pointcloud.ask.labelled_scene import load, segment
 
     stages: list[dict[str, Any]] = []
     with timed(stages, "load"):

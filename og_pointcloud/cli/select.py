@@ -25,7 +25,7 @@ def add(commands: Any) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    from og_pointcloud.selecting import select
+    from og_pointcloud.ask.selecting import select
 
     against = names_in(arguments.against)
     selection = select(arguments.bundle, arguments.text, against=against, text_features=arguments.text_features)

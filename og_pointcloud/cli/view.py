@@ -16,10 +16,10 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from og_pointcloud.runtime import LabelledScene
+    from og_pointcloud.ask.labelled_scene import LabelledScene
+    from og_pointcloud.ask.segmentation import Segmentation
     from og_pointcloud.scene import Scene
-    from og_pointcloud.segmentation import Segmentation
-    from og_pointcloud.viewpoint import Viewpoint
+    from og_pointcloud.show.viewpoint import Viewpoint
 
 AXES = {"x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1), "-x": (-1, 0, 0), "-y": (0, -1, 0), "-z": (0, 0, -1)}
 OF_SCENE = ("labels", "text_features", "cloud", "html", "png", "boxes", "certainty", "up", "cut")
@@ -144,8 +144,8 @@ def labelled(
     arguments: argparse.Namespace, stages: list[dict[str, Any]]
 ) -> tuple[LabelledScene, Segmentation, NDArray[np.uint8] | None]:
     """The scene, its answer, and the colours of the points asked about."""
+    from og_pointcloud.ask.labelled_scene import load, segment
     from og_pointcloud.formats.points import read_points
-    from og_pointcloud.runtime import load, segment
 
     with timed(stages, "load"):
         scene = load(arguments.source)
@@ -164,7 +164,7 @@ def chosen_view(result: Segmentation, arguments: argparse.Namespace) -> tuple[ND
     """(N,) which points are shown, what --cut hides left out; and where from."""
     import numpy as np
 
-    from og_pointcloud.viewpoint import choose_viewpoint
+    from og_pointcloud.show.viewpoint import choose_viewpoint
 
     up = np.array(AXES[arguments.up or "z"], np.float64)
     shown = np.logical_and.reduce(np.isfinite(result.xyz), axis=1)
@@ -183,7 +183,7 @@ def make_page(
     rgb: NDArray[np.uint8] | None,
     arguments: argparse.Namespace,
 ) -> str:
-    from og_pointcloud.page import write_page
+    from og_pointcloud.show.page import write_page
 
     return write_page(
         arguments.html, scene, result, view, title=(arguments.cloud or arguments.source).stem, rgb=rgb,
@@ -205,11 +205,11 @@ def view_capture(arguments: argparse.Namespace) -> None:
     check_outputs({"-o": (output, [".png"])}, inputs=[arguments.source, arguments.instances])
     if columns < 1:
         raise OgPointcloudError(f"--columns is {columns}; expected at least 1")
-    from og_pointcloud.fitting import pictures
     from og_pointcloud.fitting.fit import prepare
-    from og_pointcloud.fitting.geometry import near_plane
-    from og_pointcloud.fitting.journal import Journal
     from og_pointcloud.formats.capture import read_capture
+    from og_pointcloud.journal import Journal
+    from og_pointcloud.rendering.geometry import near_plane
+    from og_pointcloud.show import fit_pictures as pictures
 
     stages: list[dict[str, Any]] = []
     with timed(stages, "read capture"):
@@ -232,7 +232,7 @@ def view_capture(arguments: argparse.Namespace) -> None:
 
 
 def instances_of(bundle: Any, scene: Scene) -> dict[str, NDArray[np.int32]]:
-    from og_pointcloud.bundle import read_bundle
+    from og_pointcloud.bundle.read import read_bundle
 
     cloud = read_bundle(bundle).cloud
     if len(cloud) != len(scene.points):

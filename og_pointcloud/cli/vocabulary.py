@@ -60,8 +60,8 @@ def add_bundle(parser: argparse.ArgumentParser, writes: bool) -> None:
 
 
 def run_add(arguments: argparse.Namespace) -> None:
-    from og_pointcloud.bundle import read_bundle
-    from og_pointcloud.text.vocabulary import add_words, read_words
+    from og_pointcloud.bundle.read import read_bundle
+    from og_pointcloud.bundle.vocabulary import add_words, read_words
 
     if arguments.words is None and arguments.text_features is None:
         arguments.parser.error("no words: name a file with one a line, or --text-features F.npz")
@@ -80,7 +80,7 @@ def run_add(arguments: argparse.Namespace) -> None:
 def from_features(path: Path, words: tuple[str, ...] | None) -> Any:
     """The vocabulary (of some words only, if any are named) and the feature space of a text-features file."""
     from og_pointcloud.cloud import Vocabulary
-    from og_pointcloud.text.features import read_text_features
+    from og_pointcloud.text.text_features import read_text_features
 
     vocabulary, space = read_text_features(path)
     if words is None:
@@ -108,7 +108,7 @@ def encoded(words: tuple[str, ...] | None, folder: Path | None, own_space: str, 
 
 
 def run_list(arguments: argparse.Namespace) -> None:
-    from og_pointcloud.bundle import read_bundle
+    from og_pointcloud.bundle.read import read_bundle
 
     vocabulary = read_bundle(arguments.bundle).cloud.vocabulary
     for name in vocabulary.names if vocabulary else ():
@@ -116,9 +116,9 @@ def run_list(arguments: argparse.Namespace) -> None:
 
 
 def run_bank(arguments: argparse.Namespace) -> None:
-    from og_pointcloud.bundle import read_bundle
+    from og_pointcloud.bundle.read import read_bundle
+    from og_pointcloud.bundle.vocabulary import read_bank, store_bank
     from og_pointcloud.text.encoder import encoder_for, read_text_encoder
-    from og_pointcloud.text.vocabulary import read_bank, store_bank
 
     check_outputs({"-o": (arguments.output, [".ogpc"])}, inputs=[arguments.features])
     if arguments.features:
@@ -136,7 +136,7 @@ def run_bank(arguments: argparse.Namespace) -> None:
 
 
 def run_carry(arguments: argparse.Namespace) -> None:
-    from og_pointcloud.text.vocabulary import carry_encoder
+    from og_pointcloud.bundle.vocabulary import carry_encoder
 
     check_outputs({"-o": (arguments.output, [".ogpc"])}, inputs=[])
     encoder = carry_encoder(arguments.bundle, arguments.encoder, arguments.output)

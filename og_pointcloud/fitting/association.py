@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from og_pointcloud.cloud import InstanceTable
-from og_pointcloud.fitting.visibility import MaskTable
+from og_pointcloud.fitting.mask_table import MaskTable
 from og_pointcloud.settings import AssociationSettings
 
 __all__ = ["describe_instances", "directions", "robust_mean"]

@@ -8,13 +8,19 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from numba import get_num_threads
 from numpy.typing import NDArray
 
 from og_pointcloud.cloud import BACKGROUND, UNOBSERVED, LabelledCloud
 from og_pointcloud.errors import SceneError
-from og_pointcloud.fitting.coverage import needed_views
-from og_pointcloud.fitting.geometry import (
+from og_pointcloud.fitting.labellers import Labelling, Prepared, as_published, by_choice, by_features, by_grouping
+from og_pointcloud.fitting.mask_table import Cutoffs, Gaussians, MaskTable, mask_table, table_key, working_memory
+from og_pointcloud.fitting.membership import without_see_through
+from og_pointcloud.fitting.memory import free_memory, memory_in_use
+from og_pointcloud.fitting.table_store import TableStore, remove_work
+from og_pointcloud.journal import Journal
+from og_pointcloud.kernels import get_num_threads
+from og_pointcloud.rendering.coverage import needed_views
+from og_pointcloud.rendering.geometry import (
     GeometryChoice,
     Neighbourhood,
     choose_gaussians,
@@ -25,12 +31,6 @@ from og_pointcloud.fitting.geometry import (
     pixels_per_spacing,
     thinned,
 )
-from og_pointcloud.fitting.journal import Journal
-from og_pointcloud.fitting.membership import without_see_through
-from og_pointcloud.fitting.memory import free_memory, memory_in_use
-from og_pointcloud.fitting.modes import Labelling, Prepared, as_published, by_choice, by_features, by_grouping
-from og_pointcloud.fitting.table_store import TableStore, remove_work
-from og_pointcloud.fitting.visibility import Cutoffs, Gaussians, MaskTable, mask_table, table_key, working_memory
 from og_pointcloud.scene import Points, Scene, View
 from og_pointcloud.settings import FitSettings, GeometrySettings
 

@@ -23,8 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from og_pointcloud.fitting.testimony import Testimony
-from og_pointcloud.fitting.visibility import MaskTable
+from og_pointcloud.fitting.mask_table import MaskTable
+from og_pointcloud.fitting.view_votes import Testimony
 from og_pointcloud.settings import GroupingSettings
 
 __all__ = ["MaskGroups", "group_masks", "indicator"]

@@ -21,18 +21,18 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from numba import njit, prange
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
 from og_pointcloud.cloud import BACKGROUND, UNOBSERVED
-from og_pointcloud.fitting.geometry import Neighbourhood
 from og_pointcloud.fitting.grouping import MaskGroups
+from og_pointcloud.fitting.mask_table import Gaussians, MaskTable
 from og_pointcloud.fitting.memory import in_file
 from og_pointcloud.fitting.table_store import Rows
-from og_pointcloud.fitting.testimony import Testimony
-from og_pointcloud.fitting.visibility import Gaussians, MaskTable
+from og_pointcloud.fitting.view_votes import Testimony
+from og_pointcloud.kernels import njit, prange
+from og_pointcloud.rendering.geometry import Neighbourhood
 from og_pointcloud.settings import MembershipSettings
 
 __all__ = ["Membership", "assign_points", "without_see_through"]

@@ -21,9 +21,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csr_array
 
-from og_pointcloud._atomic import replacing
 from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.fitting.memory import Column, scratch_file
+from og_pointcloud.formats.atomic import replacing
 
 __all__ = ["Rows", "TableStore", "kept_views", "remove_work"]
 

@@ -29,12 +29,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numba import njit, prange
 from numpy.typing import NDArray
 from scipy.sparse import csr_array, vstack
 from scipy.spatial import cKDTree
 
-from og_pointcloud._atomic import replacing
 from og_pointcloud.cloud import LabelledCloud
 from og_pointcloud.errors import OgPointcloudError, SceneError
 from og_pointcloud.fitting.association import describe_instances
@@ -47,7 +45,17 @@ from og_pointcloud.fitting.fit import (
     with_distinct_points,
     with_needed_views,
 )
-from og_pointcloud.fitting.geometry import (
+from og_pointcloud.fitting.grouping import MaskGroups, group_masks, indicator
+from og_pointcloud.fitting.labellers import Labelling
+from og_pointcloud.fitting.mask_table import FRUSTUM_MARGIN, Gaussians, MaskTable, mask_table
+from og_pointcloud.fitting.membership import assign_points, without_see_through
+from og_pointcloud.fitting.memory import free_memory, memory_in_use
+from og_pointcloud.fitting.parts import part_of
+from og_pointcloud.fitting.view_votes import hear_views
+from og_pointcloud.formats.atomic import replacing
+from og_pointcloud.journal import Journal
+from og_pointcloud.kernels import njit, prange
+from og_pointcloud.rendering.geometry import (
     Neighbourhood,
     chance_of_place,
     choose_gaussians,
@@ -57,14 +65,6 @@ from og_pointcloud.fitting.geometry import (
     sample_of_points,
     thinned,
 )
-from og_pointcloud.fitting.grouping import MaskGroups, group_masks, indicator
-from og_pointcloud.fitting.hierarchy import part_of
-from og_pointcloud.fitting.journal import Journal
-from og_pointcloud.fitting.membership import assign_points, without_see_through
-from og_pointcloud.fitting.memory import free_memory, memory_in_use
-from og_pointcloud.fitting.modes import Labelling
-from og_pointcloud.fitting.testimony import hear_views
-from og_pointcloud.fitting.visibility import FRUSTUM_MARGIN, Gaussians, MaskTable, mask_table
 from og_pointcloud.scene import Points, Scene, View
 from og_pointcloud.settings import FitSettings
 

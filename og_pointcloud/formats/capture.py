@@ -36,14 +36,14 @@ from og_pointcloud.formats.distortion import Distortion, undistorted
 from og_pointcloud.formats.gaussian_ply import latest_iteration
 from og_pointcloud.formats.images import find_image, image_size, read_rgb, same_shape, without_suffix
 from og_pointcloud.formats.langsplat import LANGUAGE_FEATURES_FOLDER, read_language_features
-from og_pointcloud.formats.masks import FEATURES_NAME, MASKS_FOLDER, MaskLayer, read_masks
+from og_pointcloud.formats.mask_files import FEATURES_NAME, MASKS_FOLDER, MaskLayer, read_masks
 from og_pointcloud.formats.nerfstudio import TRANSFORMS_NAMES, read_transforms
 from og_pointcloud.formats.points import read_points
 from og_pointcloud.formats.poses import PosedFrames, PosedImage, in_local_frame
 from og_pointcloud.scene import Camera, Points, Scene, View
 
 if TYPE_CHECKING:
-    from og_pointcloud.fitting.fusion import FusedCloud
+    from og_pointcloud.formats.fusion import FusedCloud
 
 __all__ = [
     "CapturePoses", "depth_files", "find_images", "fuse_capture", "read_capture", "read_depth", "read_geometry",
@@ -292,8 +292,8 @@ def _depth_frames(capture: Path, poses: CapturePoses) -> list[DepthFrame]:
 def _fused(capture: Path, frames: Sequence[DepthFrame]) -> FusedCloud:
     # The fusion brings numba, which whoever has a cloud need not load here.
     try:
-        from og_pointcloud.fitting.depth_checks import doubts
-        from og_pointcloud.fitting.fusion import fuse
+        from og_pointcloud.formats.depth_checks import doubts
+        from og_pointcloud.formats.fusion import fuse
     except ImportError as error:
         raise MissingExtraError("numba", "fit") from error
     fused = fuse(frames)

@@ -13,10 +13,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud._npy import mapped_array
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.distortion import Distortion, undistorted
 from og_pointcloud.formats.images import MAX_PIXELS, decoded, png_header, require_cv2, same_shape
+from og_pointcloud.formats.npy import mapped_array
 from og_pointcloud.scene import Camera
 
 __all__ = ["MILLIMETRE", "DepthFile", "DepthFrame", "DepthImage", "find_depth", "resampled"]

@@ -20,11 +20,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud._atomic import replacing
-from og_pointcloud.clouds import require_finite
 from og_pointcloud.errors import SceneError
+from og_pointcloud.formats.atomic import replacing
 from og_pointcloud.formats.gaussian_ply import SH_CONSTANT
-from og_pointcloud.formats.tables import naming
+from og_pointcloud.formats.tables import naming, require_finite
 from og_pointcloud.scene import Points
 
 __all__ = ["write_gltf"]

@@ -17,11 +17,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud._atomic import replacing
-from og_pointcloud.clouds import require_finite
 from og_pointcloud.errors import MissingExtraError, SceneError
+from og_pointcloud.formats.atomic import replacing
 from og_pointcloud.formats.las_counts import check_las_counts
-from og_pointcloud.formats.tables import naming
+from og_pointcloud.formats.tables import naming, require_finite
 from og_pointcloud.scene import Points
 
 if TYPE_CHECKING:

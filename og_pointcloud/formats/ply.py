@@ -17,8 +17,8 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud._atomic import replacing
 from og_pointcloud.errors import SceneError
+from og_pointcloud.formats.atomic import replacing
 from og_pointcloud.formats.tables import naming, read_text_rows
 
 __all__ = ["join_columns", "read_ply", "write_ply"]

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud._atomic import replacing
+from og_pointcloud.formats.atomic import replacing
+from og_pointcloud.formats.colors import label_colors
 from og_pointcloud.formats.images import require_cv2
-from og_pointcloud.segmentation import label_colors
 
 __all__ = ["drawn", "write_contact_sheet"]
 

@@ -9,9 +9,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud._atomic import replacing
 from og_pointcloud.errors import SceneError
-from og_pointcloud.formats.masks import UNKNOWN_SPACE
+from og_pointcloud.formats.atomic import replacing
+from og_pointcloud.formats.mask_files import UNKNOWN_SPACE
 from og_pointcloud.formats.poses import in_local_frame
 from og_pointcloud.masking.agreement import ProposedPoints, points_of_proposals
 from og_pointcloud.masking.contracts import DepthMaskProposer, MaskEncoder, MaskProposer, Proposals
@@ -135,7 +135,7 @@ class _SpacedCloud:
     """The points in their local frame, with their spacing."""
 
     def __init__(self, capture: Path) -> None:
-        from og_pointcloud.fitting.geometry import neighbourhood, sample_of_points
+        from og_pointcloud.rendering.geometry import neighbourhood, sample_of_points
         from og_pointcloud.settings import GeometrySettings
 
         self.points = read_cloud(capture)

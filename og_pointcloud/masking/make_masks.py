@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from og_pointcloud.errors import OgPointcloudError, SceneError
-from og_pointcloud.formats.masks import UNKNOWN_SPACE
+from og_pointcloud.formats.mask_files import UNKNOWN_SPACE
 from og_pointcloud.masking.agreement import ProposedPoints, agreement, rescored
 from og_pointcloud.masking.contact_sheet import write_contact_sheet
 from og_pointcloud.masking.image_worker import ImageTask, read_work

@@ -22,11 +22,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud._onnxruntime import open_session
 from og_pointcloud.errors import OgPointcloudError, SceneError
 from og_pointcloud.formats.images import require_cv2
 from og_pointcloud.masking.automatic import AutomaticMasks, best_boxes
 from og_pointcloud.masking.contracts import MaskProposer, Proposals
+from og_pointcloud.models import open_session
 
 __all__ = ["OnnxDetector", "OnnxSamPredictor", "open_onnx"]
 

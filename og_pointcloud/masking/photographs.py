@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.errors import SceneError
-from og_pointcloud.fitting.coverage import needed_views
 from og_pointcloud.formats.capture import find_images, read_geometry, read_poses
 from og_pointcloud.formats.distortion import Distortion
 from og_pointcloud.formats.images import image_size, read_rgb, same_shape
 from og_pointcloud.formats.poses import in_local_frame
+from og_pointcloud.rendering.coverage import needed_views
 from og_pointcloud.scene import Camera, Points, View
 
 __all__ = ["Photograph", "choose_by_coverage", "read_cloud", "read_photographs"]

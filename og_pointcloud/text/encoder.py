@@ -27,11 +27,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud._hub import MODEL_NAME
-from og_pointcloud._npy import array_from_npy
-from og_pointcloud._onnx_graph import check_graph
-from og_pointcloud.choosing import WordBank
+from og_pointcloud.cloud import WordBank
 from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError
+from og_pointcloud.formats.npy import array_from_npy
+from og_pointcloud.models import MODEL_NAME, check_graph
 from og_pointcloud.text.tokenizer import Tokenizer
 
 if TYPE_CHECKING:
@@ -159,7 +158,7 @@ class TextEncoder:
     def _open_session(self) -> InferenceSession:
         with self._lock:
             if self._session is None:
-                from og_pointcloud._onnxruntime import open_session
+                from og_pointcloud.models import open_session
 
                 self._session, self._graph = open_session(self._graph), b""  # the session has its own copy
             return self._session
@@ -264,7 +263,7 @@ def _feature_space_of(folder: Path) -> str | None:
 
 @lru_cache(maxsize=2)
 def _carried(bundle: Path, _modified: int) -> TextEncoder | None:
-    from og_pointcloud.bundle import read_carried_encoder
+    from og_pointcloud.bundle.read import read_carried_encoder
 
     files = read_carried_encoder(bundle)
     return TextEncoder(files, f"{bundle}: text_encoder") if files else None

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from og_pointcloud.cloud import Vocabulary
 from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError
 from og_pointcloud.text.encoder import encoder_for, export_command, find_encoder
-from og_pointcloud.text.features import UNKNOWN_SPACE, read_text_features
+from og_pointcloud.text.text_features import UNKNOWN_SPACE, read_text_features
 
 __all__ = ["Labels", "TextFeatures", "resolve_labels"]
 

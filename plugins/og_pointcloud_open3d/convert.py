@@ -11,13 +11,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 import og_pointcloud as og
-from og_pointcloud.clouds import world_points
+from og_pointcloud.ask.hosts import world_points
+from og_pointcloud.ask.labelled_scene import SceneLike
+from og_pointcloud.ask.segmentation import Segmentation
 from og_pointcloud.errors import OgPointcloudError, SceneError
 from og_pointcloud.formats.pcd import read_pcd
 from og_pointcloud.formats.ply import read_ply
 from og_pointcloud.formats.tables import naming, positions
-from og_pointcloud.runtime import SceneLike
-from og_pointcloud.segmentation import Segmentation
 from og_pointcloud.text.words import Labels, TextFeatures
 from og_pointcloud_open3d.host import open3d
 

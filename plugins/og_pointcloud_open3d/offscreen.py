@@ -15,16 +15,17 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 import og_pointcloud as og
-from og_pointcloud._atomic import replacing
-from og_pointcloud.clouds import world_points
+from og_pointcloud.ask.hosts import world_points
+from og_pointcloud.ask.labelled_scene import SceneLike
+from og_pointcloud.ask.segmentation import Segmentation
 from og_pointcloud.errors import OgPointcloudError, SceneError
+from og_pointcloud.formats.atomic import replacing
+from og_pointcloud.formats.colors import label_colors
 from og_pointcloud.formats.gaussian_ply import BASE_COLOR, LOG_SCALE, ROTATION, gaussian_rows
 from og_pointcloud.formats.tables import stack_columns
-from og_pointcloud.runtime import SceneLike
 from og_pointcloud.scene import Camera, Points
-from og_pointcloud.segmentation import Segmentation, label_colors
+from og_pointcloud.show.viewpoint import Viewpoint, choose_viewpoint
 from og_pointcloud.text.words import Labels, TextFeatures
-from og_pointcloud.viewpoint import Viewpoint, choose_viewpoint
 from og_pointcloud_open3d.host import WITH_SPLATS, open3d, require_version
 
 __all__ = ["draw_png", "highlight_png", "look_at", "viewpoint"]

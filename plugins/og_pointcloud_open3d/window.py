@@ -11,9 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 import og_pointcloud as og
+from og_pointcloud.ask.labelled_scene import SceneLike, as_scene
+from og_pointcloud.ask.segmentation import Segmentation
+from og_pointcloud.cloud import UNKNOWN
 from og_pointcloud.errors import MissingExtraError, OgPointcloudError, SceneError
-from og_pointcloud.runtime import SceneLike, as_scene
-from og_pointcloud.segmentation import UNKNOWN, Segmentation
 from og_pointcloud.text.words import Labels, TextFeatures
 from og_pointcloud_open3d.host import open3d
 from og_pointcloud_open3d.offscreen import viewpoint

@@ -18,12 +18,13 @@ import pyvista as pv
 from numpy.typing import ArrayLike, NDArray
 
 import og_pointcloud as og
-from og_pointcloud import runtime
-from og_pointcloud.clouds import NAMES_FIELD, SCENE_FIELD
+from og_pointcloud.ask import labelled_scene as runtime
+from og_pointcloud.ask.hosts import NAMES_FIELD, SCENE_FIELD
+from og_pointcloud.ask.instances import Instance
+from og_pointcloud.ask.labelled_scene import LabelledScene, SceneLike
+from og_pointcloud.ask.segmentation import Segmentation
 from og_pointcloud.errors import MissingExtraError, OgPointcloudError
-from og_pointcloud.instances import Instance
-from og_pointcloud.runtime import LabelledScene, SceneLike
-from og_pointcloud.segmentation import Segmentation, label_colors
+from og_pointcloud.formats.colors import label_colors
 from og_pointcloud.text.words import Labels, TextFeatures
 
 __all__ = [

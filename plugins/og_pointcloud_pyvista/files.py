@@ -10,10 +10,10 @@ import numpy as np
 import pyvista as pv
 
 import og_pointcloud as og
+from og_pointcloud.ask.hosts import SCENE_FIELD, carried_scene
+from og_pointcloud.ask.labelled_scene import as_scene
 from og_pointcloud.cloud import UNOBSERVED
-from og_pointcloud.clouds import SCENE_FIELD, carried_scene
 from og_pointcloud.errors import OgPointcloudError
-from og_pointcloud.runtime import as_scene
 from og_pointcloud_pyvista.datasets import INSTANCE, set_strings
 
 __all__ = ["RGB", "read_ogpc", "write_ogpc"]

@@ -14,12 +14,12 @@ import pyvista as pv
 from numpy.typing import ArrayLike, NDArray
 
 import og_pointcloud as og
+from og_pointcloud.ask.labelled_scene import LabelledScene, SceneLike
+from og_pointcloud.ask.picking import Pick
 from og_pointcloud.errors import OgPointcloudError
-from og_pointcloud.picking import Pick
-from og_pointcloud.runtime import LabelledScene, SceneLike
-from og_pointcloud.segmentation import label_colors
+from og_pointcloud.formats.colors import label_colors
+from og_pointcloud.show.viewpoint import FOCAL, Viewpoint, choose_viewpoint
 from og_pointcloud.text.words import Labels, TextFeatures
-from og_pointcloud.viewpoint import FOCAL, Viewpoint, choose_viewpoint
 from og_pointcloud_pyvista.datasets import COLOR, INSTANCE, LABEL, best_words, box_lines, label_names, scene_of
 from og_pointcloud_pyvista.files import RGB
 

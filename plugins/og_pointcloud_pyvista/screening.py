@@ -9,9 +9,9 @@ import numpy as np
 import pyvista as pv
 from numpy.typing import NDArray
 
-from og_pointcloud.runtime import LabelledScene
-from og_pointcloud.segmentation import Segmentation
-from og_pointcloud.viewpoint import FOCAL, Viewpoint
+from og_pointcloud.ask.labelled_scene import LabelledScene
+from og_pointcloud.ask.segmentation import Segmentation
+from og_pointcloud.show.viewpoint import FOCAL, Viewpoint
 from og_pointcloud_pyvista.datasets import to_pyvista
 from og_pointcloud_pyvista.files import RGB
 

@@ -16,9 +16,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from og_pointcloud.choosing import Reason
+from og_pointcloud.ask.choosing import Reason
+from og_pointcloud.ask.labelled_scene import Segmenter
 from og_pointcloud.errors import MissingExtraError, OgPointcloudError, SceneError
-from og_pointcloud.runtime import Segmenter
 from og_pointcloud_ros.detections import to_label_info
 from og_pointcloud_ros.labelling import MINIMUM_POINTS, CloudLabeller, LabelledMessages
 from og_pointcloud_ros.messages import nanoseconds

@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from og_pointcloud.boxes import Box
+from og_pointcloud.ask.boxes import Box
+from og_pointcloud.ask.instances import Instance, Instances
+from og_pointcloud.ask.labelled_scene import LabelledScene
+from og_pointcloud.ask.segmentation import Segmentation
 from og_pointcloud.errors import OgPointcloudError
-from og_pointcloud.instances import Instance, Instances
-from og_pointcloud.runtime import LabelledScene
-from og_pointcloud.segmentation import Segmentation
 from og_pointcloud_ros.messages import MessageFactory, header, plain_messages
 from og_pointcloud_ros.pointcloud2 import UNLABELLED
 

@@ -7,9 +7,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud.instances import instance_table
-from og_pointcloud.runtime import Segmenter
-from og_pointcloud.segmentation import Segmentation
+from og_pointcloud.ask.labelled_scene import Segmenter, instance_table
+from og_pointcloud.ask.segmentation import Segmentation
 from og_pointcloud_ros.detections import to_detections
 from og_pointcloud_ros.messages import MessageFactory
 from og_pointcloud_ros.pointcloud2 import from_pointcloud2, read_fields, to_pointcloud2

@@ -34,8 +34,8 @@ from std_msgs.msg import String  # pyright: ignore[reportMissingImports]
 from tf2_ros import Buffer, TransformException, TransformListener  # pyright: ignore[reportMissingImports]
 from vision_msgs.msg import Detection3DArray, LabelInfo  # pyright: ignore[reportMissingImports]
 
+from og_pointcloud.ask.labelled_scene import LabelledScene, Segmenter, load
 from og_pointcloud.errors import OgPointcloudError
-from og_pointcloud.runtime import LabelledScene, Segmenter, load
 from og_pointcloud_ros.detections import to_label_info
 from og_pointcloud_ros.labelling import MINIMUM_POINTS, CloudLabeller
 from og_pointcloud_ros.messages import ros_messages

@@ -12,8 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from og_pointcloud.ask.segmentation import Segmentation
+from og_pointcloud.cloud import UNKNOWN
 from og_pointcloud.errors import SceneError
-from og_pointcloud.segmentation import UNKNOWN, Segmentation, label_colors
+from og_pointcloud.formats.colors import label_colors
 from og_pointcloud_ros.messages import MessageFactory, header, plain_messages
 
 __all__ = ["UNLABELLED", "from_pointcloud2", "is_pointcloud2", "read_fields", "to_pointcloud2", "write_fields"]

@@ -12,8 +12,8 @@ from og_pointcloud.cli.eval_.common import percent, prediction_file, signed, spr
 from og_pointcloud.errors import OgPointcloudError
 
 if TYPE_CHECKING:
-    from og_pointcloud.scoring.blocks import BlockInterval
-    from og_pointcloud.scoring.captures import Answer, CaptureScore
+    from og_pointcloud.evaluate.blocks import BlockInterval
+    from og_pointcloud.evaluate.captures import Answer, CaptureScore
 
 
 def add(protocols: Any) -> None:
@@ -36,9 +36,9 @@ def add(protocols: Any) -> None:
 def run(arguments: argparse.Namespace) -> None:
     outputs = {"--json": (arguments.json, [".json"]), "--plot": (arguments.plot, [".png"])}
     check_outputs(outputs, inputs=[arguments.text_features, arguments.predictions, arguments.against])
-    from og_pointcloud.scoring.captures import ask, difference, score_capture
-    from og_pointcloud.scoring.plots import plot_risk_coverage, require_matplotlib
-    from og_pointcloud.scoring.truth import read_truth
+    from og_pointcloud.evaluate.captures import ask, difference, score_capture
+    from og_pointcloud.evaluate.plots import plot_risk_coverage, require_matplotlib
+    from og_pointcloud.evaluate.truth import read_truth
 
     if arguments.plot:
         require_matplotlib()

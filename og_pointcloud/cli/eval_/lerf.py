@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from og_pointcloud.scoring.lerf_selection import PairScore
+    from og_pointcloud.evaluate.lerf_selection import PairScore
 
     Scenes = dict[str, list[PairScore]]
 
@@ -42,7 +42,7 @@ def add(protocols: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     check_outputs({"--json": (arguments.json, [".json"])}, inputs=[arguments.text_features])
-    from og_pointcloud.scoring.lerf_selection import ORACLE, WAYS, read_scene, scene_names
+    from og_pointcloud.evaluate.lerf_selection import ORACLE, WAYS, read_scene, scene_names
 
     known, wanted = scene_names(arguments.folder), names_in(arguments.scenes)
     missing = [name for name in wanted or () if name not in known]
@@ -68,8 +68,8 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def score(labels: Any, files: list[Path], splats: list[Path | None], arguments: argparse.Namespace) -> Scenes:
-    from og_pointcloud.runtime import load
-    from og_pointcloud.scoring.lerf_selection import gaussians_of, score_pairs
+    from og_pointcloud.ask.labelled_scene import load
+    from og_pointcloud.evaluate.lerf_selection import gaussians_of, score_pairs
 
     scenes: Scenes = {}
     for of_scene, file, splat in zip(labels, files, splats, strict=True):
@@ -87,7 +87,7 @@ def ious(scenes: Scenes, way: str) -> NDArray[np.float64]:
 
 
 def paired(first: NDArray[np.float64], second: NDArray[np.float64]) -> Any:
-    from og_pointcloud.scoring.spread import paired_bootstrap
+    from og_pointcloud.evaluate.spread import paired_bootstrap
 
     return paired_bootstrap(first, second)
 
@@ -95,8 +95,8 @@ def paired(first: NDArray[np.float64], second: NDArray[np.float64]) -> Any:
 def print_scores(scenes: Scenes, ways: tuple[str, ...]) -> None:
     import numpy as np
 
-    from og_pointcloud.scoring.lerf import IOU_FOUND, score_scenes
-    from og_pointcloud.scoring.spread import bootstrap
+    from og_pointcloud.evaluate.lerf import IOU_FOUND, score_scenes
+    from og_pointcloud.evaluate.spread import bootstrap
 
     by_way = {way: {name: np.array([p.iou[way] for p in pairs]) for name, pairs in scenes.items()} for way in ways}
     rows = []
@@ -119,7 +119,7 @@ def print_scores(scenes: Scenes, ways: tuple[str, ...]) -> None:
 
 def print_set(scenes: Scenes) -> None:
     """Whether the pairs are those of the published table."""
-    from og_pointcloud.scoring.lerf import PAIRS
+    from og_pointcloud.evaluate.lerf import PAIRS
 
     if {name: len(pairs) for name, pairs in scenes.items()} == dict(PAIRS):
         print("the scenes and pairs of the published table")
@@ -144,7 +144,7 @@ def described(scenes: Scenes, ways: tuple[str, ...]) -> dict[str, Any]:
 
     import numpy as np
 
-    from og_pointcloud.scoring.lerf import score_scenes
+    from og_pointcloud.evaluate.lerf import score_scenes
 
     means = {
         way: asdict(score_scenes({name: np.array([p.iou[way] for p in pairs]) for name, pairs in scenes.items()}))

@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from og_pointcloud.scoring.scannet import SceneScore
-    from og_pointcloud.scoring.spread import RiskCoverage
+    from og_pointcloud.evaluate.scannet import SceneScore
+    from og_pointcloud.evaluate.spread import RiskCoverage
 
 LABELS = "_vh_clean_2.labels.ply"
 NOT_OF_THE_TABLE = 40
@@ -86,8 +86,8 @@ def add(protocols: Any) -> None:
 def run(arguments: argparse.Namespace) -> None:
     outputs = {"--json": (arguments.json, [".json"]), "--plot": (arguments.plot, [".png"])}
     check_outputs(outputs, inputs=[arguments.text_features])
-    from og_pointcloud.scoring.plots import plot_risk_coverage, require_matplotlib
-    from og_pointcloud.scoring.scannet import SCENES
+    from og_pointcloud.evaluate.plots import plot_risk_coverage, require_matplotlib
+    from og_pointcloud.evaluate.scannet import SCENES
 
     if arguments.plot:
         require_matplotlib()
@@ -129,7 +129,7 @@ def score_files(
     files: dict[str, Path], predictions: dict[str, Path], arguments: argparse.Namespace
 ) -> dict[int, TaskResult]:
     """Every task over all scenes."""
-    from og_pointcloud.scoring.scannet import TASKS
+    from og_pointcloud.evaluate.scannet import TASKS
 
     scenes = {scene: score_file(scene, file, predictions[scene], arguments) for scene, file in files.items()}
     return {task: over_all({scene: of_task[task] for scene, of_task in scenes.items()}) for task in TASKS}
@@ -139,7 +139,7 @@ def score_file(scene: str, file: Path, prediction: Path, arguments: argparse.Nam
     """Every task of one scene."""
     import numpy as np
 
-    from og_pointcloud.scoring.scannet import TASKS, read_truth, score_scene, scored_answers
+    from og_pointcloud.evaluate.scannet import TASKS, read_truth, score_scene, scored_answers
 
     xyz, truth = read_truth(file)
     opacity = opacities(arguments.gaussians, scene, len(truth))
@@ -162,7 +162,7 @@ def over_all(scenes: dict[str, SceneResult]) -> TaskResult:
     """One task over its scenes."""
     import numpy as np
 
-    from og_pointcloud.scoring.spread import risk_coverage
+    from og_pointcloud.evaluate.spread import risk_coverage
 
     results = list(scenes.values())
     correct = np.concatenate([result.correct for result in results])
@@ -182,8 +182,8 @@ def described(task: int, result: TaskResult, other: TaskResult | None) -> tuple[
     """A row of the table, and the same with every scene as JSON. other: of the predictions to compare with."""
     import numpy as np
 
-    from og_pointcloud.scoring.scannet import average
-    from og_pointcloud.scoring.spread import bootstrap, paired_bootstrap
+    from og_pointcloud.evaluate.scannet import average
+    from og_pointcloud.evaluate.spread import bootstrap, paired_bootstrap
 
     values = list(result.scenes.values())
     mean = average(values)
@@ -260,7 +260,7 @@ def predicted(file: Path, xyz: NDArray[np.float64], task: int, text_features: Pa
     """A bundle is asked for the task's names, stored labels are taken by their names."""
     import numpy as np
 
-    from og_pointcloud.scoring.scannet import NAMES, TASKS
+    from og_pointcloud.evaluate.scannet import NAMES, TASKS
 
     forced = None
     if file.suffix == ".ogpc":
@@ -285,9 +285,9 @@ def asked_labels(
     file: Path, xyz: NDArray[np.float64], names: list[str], text_features: Path | None
 ) -> tuple[NDArray[np.integer], NDArray[np.floating], NDArray[np.integer]]:
     """(n,) labels, how sure they are, and the labels of a scene that may not say that none fits: the largest cosine."""
-    from og_pointcloud.choosing import Chooser
-    from og_pointcloud.runtime import as_scene, segment
-    from og_pointcloud.scoring.captures import sure
+    from og_pointcloud.ask.choosing import Chooser
+    from og_pointcloud.ask.labelled_scene import as_scene, segment
+    from og_pointcloud.evaluate.captures import sure
     from og_pointcloud.text.words import resolve_labels
 
     scene = as_scene(file)
@@ -302,8 +302,8 @@ def stored_labels(file: Path) -> tuple[NDArray[np.integer], NDArray[np.floating]
     writes: scores, and where it is known the certainty of each point."""
     import numpy as np
 
-    from og_pointcloud.scoring.arrays import read_arrays
-    from og_pointcloud.scoring.captures import sure
+    from og_pointcloud.evaluate.arrays import read_arrays
+    from og_pointcloud.evaluate.captures import sure
 
     arrays = read_arrays(file)
     missing = [name for name in ("labels", "names") if name not in arrays]

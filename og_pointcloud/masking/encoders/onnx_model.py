@@ -22,10 +22,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud._onnx_graph import check_graph
 from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.masking.crops import Crop
 from og_pointcloud.masking.encoders.preprocessing import Preprocessing
+from og_pointcloud.models import check_graph
 
 if TYPE_CHECKING:
     from onnxruntime import InferenceSession
@@ -80,7 +80,7 @@ class OnnxModel:
 
     @cached_property
     def _session(self) -> InferenceSession:
-        from og_pointcloud._onnxruntime import open_session
+        from og_pointcloud.models import open_session
 
         return open_session(self._graph)
 

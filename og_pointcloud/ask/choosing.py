@@ -1,0 +1,410 @@
+"""Which label fits an instance, how surely, and whether any does: text vectors and descriptors -> Choice.
+
+A cosine of an image with a text says little by itself. On real CLIP a fitting text has about 0.33 and any other 0.18,
+texts have 0.74 among themselves and images 0.53: all images share one large direction, all texts another, and some
+words are close to every image. So a score is read against what it would be by chance, in three steps:
+
+1. Centre. What all descriptors of the scene share is taken off them, what all words share off the words.
+2. Standardise. A bank of a few hundred everyday words (``WordBank``) shows how the words that do not fit score on this
+   instance; a label's evidence is its distance from their mean, in their standard deviations.
+3. Weigh. An instance is one of the labels, or what another word of the bank says, or nothing that a word stands out
+   for. Their posterior probabilities add up to one; the last two are "unknown".
+
+No threshold is in cosines, none is tuned to a scene: the null distribution is the instance's own.
+
+For comparison there is ``relevancy``, as LERF defines it, by canonical negatives.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from og_pointcloud.cloud import (
+    BACKGROUND,
+    TOO_FAR,
+    UNKNOWN,
+    UNOBSERVED,
+    InstanceTable,
+    LabelledCloud,
+    WordBank,
+    finite_rows,
+    unit_rows,
+)  # fmt: skip
+from og_pointcloud.errors import FeatureSpaceError
+from og_pointcloud.settings import ChoosingSettings
+
+__all__ = [
+    "CANONICAL_NEGATIVES",
+    "TEMPLATES",
+    "Choice",
+    "Chooser",
+    "Reason",
+    "chooser_of",
+    "embed",
+    "relevancy",
+]
+
+CANONICAL_NEGATIVES = ("object", "things", "stuff", "texture")
+"""What LERF holds a text against (Kerr et al. 2023, Sec. 3.4)."""
+RELEVANCY_TEMPERATURE = 10.0
+"""Factor of the cosines in LERF's pairwise softmax: of its released code, the paper gives none."""
+TEMPLATES = ("{}", "a {}", "a photo of a {}", "a photo of the {}", "a cropped photo of a {}", "a {} in a scene")
+"""Prompts whose vectors are averaged: what masks show is a crop of one thing, sometimes with its surroundings."""
+ROWS_AT_ONCE = 2048
+"""Descriptors compared with all others at once."""
+
+Encoder = Callable[[Sequence[str]], ArrayLike]
+
+
+class Reason(IntEnum):
+    """Why a point or instance has no label."""
+
+    LABELLED = 0
+    NONE_FITS = 1
+    """Observed, but none of these labels is more probable than something else."""
+    NOT_DESCRIBED = 2
+    """An instance that no mask gave a feature."""
+    IN_NO_MASK = 3
+    """Seen outside every mask."""
+    UNOBSERVED = 4
+    """No view saw it."""
+    TOO_FAR = 5
+    """No point of the map within reach."""
+
+    def __str__(self) -> str:
+        """What is said of points, as in "12 are ..."."""
+        return _IN_WORDS[self]
+
+
+_IN_WORDS = {
+    Reason.LABELLED: "labelled",
+    Reason.NONE_FITS: "like none of these labels",
+    Reason.NOT_DESCRIBED: "of instances without a feature",
+    Reason.IN_NO_MASK: "background",
+    Reason.UNOBSERVED: "unobserved",
+    Reason.TOO_FAR: "too far from the scene",
+}
+
+
+@dataclass(frozen=True)
+class Choice:
+    """The answer for K instances and L labels.
+
+    labels: (K,) int32, the most probable label, -1 where "none of these" is more probable than all together.
+    probability: (K,) float32, of that label; 0 where unknown.
+    unknown: (K,) float32, probability that none of the labels fits; 1 for an instance without descriptor.
+    table: (K, L) float32, probability of each label: rows of different labels add up to 1 - unknown. Labels with the
+        same vector are one hypothesis and have its probability each.
+    evidence: (K, L) float32, standard deviations above the bank's words; -inf without descriptor or text.
+    reasons: (K,) int8, a ``Reason``.
+    membership: (K,) float32, probability that a point with the instance's id is of it: of v views that agreed on the
+        instance all said so, which makes (v + 1/2) / (v + 1) (Jeffreys' prior).
+    calibrated: false where there was no bank: probability is then LERF's relevancy, or NaN without negatives.
+    """
+
+    labels: NDArray[np.int32]
+    probability: NDArray[np.float32]
+    unknown: NDArray[np.float32]
+    table: NDArray[np.float32]
+    evidence: NDArray[np.float32]
+    reasons: NDArray[np.int8]
+    membership: NDArray[np.float32]
+    calibrated: bool = True
+
+    @property
+    def scores(self) -> NDArray[np.float32]:
+        """(K, L) what words are ranked by: the probability where calibrated, else the cosine (-inf: no descriptor)."""
+        return self.table if self.calibrated else self.evidence
+
+    def ranking(self, label: int) -> NDArray[np.intp]:
+        """(K,) instances by how well one label fits them, best first, of equals the first.
+
+        Probabilities that have run up against 0 or 1 are told apart by their evidence.
+        """
+        return np.lexsort((-self.evidence[:, label], -self.scores[:, label]))
+
+    def words(self, instance: int, names: Sequence[str], count: int | None = None) -> list[tuple[str, float]]:
+        """The labels of one instance with their scores, best first, or the first ``count`` of them.
+
+        names: (L,) of the labels. Empty for an instance without a descriptor.
+        """
+        if self.reasons[instance] == Reason.NOT_DESCRIBED:
+            return []
+        # Of one instance, more evidence is a higher score, also where probabilities have run up against 0.
+        order: list[int] = np.argsort(-self.evidence[instance], kind="stable")[:count].tolist()
+        return [(names[index], float(self.scores[instance, index])) for index in order]
+
+    @cached_property
+    def by_id(self) -> tuple[NDArray[np.int32], NDArray[np.float32], NDArray[np.int8]]:
+        """Label, score and reason by instance id, (K + 3,) each: behind the last instance those of ids -3, -2 and -1.
+
+        The score is that of a point with the id. Where calibrated: its instance's probability times the membership, as
+        both must be right; else the cosine. 0 where unknown.
+        """
+        beyond = {TOO_FAR: Reason.TOO_FAR, UNOBSERVED: Reason.UNOBSERVED, BACKGROUND: Reason.IN_NO_MASK}
+        score = self.probability * self.membership
+        if not self.calibrated and self.evidence.shape[1]:
+            cosine = self.evidence[np.arange(len(self.labels)), np.maximum(self.labels, 0)]
+            score = np.where(self.labels == UNKNOWN, 0, cosine)
+        return (
+            np.append(self.labels, [UNKNOWN] * len(beyond)).astype(np.int32),
+            np.append(score, [0] * len(beyond)).astype(np.float32),
+            np.append(self.reasons, list(beyond.values())).astype(np.int8),
+        )
+
+    def at(self, instances: NDArray[np.integer]) -> tuple[NDArray[np.int32], NDArray[np.float32], NDArray[np.int8]]:
+        """Label, score and reason of points, (N,) each, as `by_id` has them, by their instance ids."""
+        labels, scores, reasons = self.by_id
+        return labels[instances], scores[instances], reasons[instances]  # negative ids index from the end
+
+
+class Chooser:
+    """The instances of one scene, prepared for any number of labels. Cheap to keep, safe to share by threads."""
+
+    def __init__(
+        self,
+        instances: InstanceTable,
+        bank: WordBank | None = None,
+        settings: ChoosingSettings | None = None,
+        feature_space: str = "",
+    ) -> None:
+        """feature_space: what errors say that texts should be of. FeatureSpaceError where bank and descriptors differ
+        in width.
+        """
+        self.settings = settings or ChoosingSettings()
+        self.bank = bank
+        self._space = f" (feature space '{feature_space}')" if feature_space else ""
+        self._count = len(instances)
+        self._membership = ((instances.views + 0.5) / (instances.views + 1)).astype(np.float32)
+        self._descriptors = unit_rows(finite_rows(instances.descriptors, "descriptors"))
+        self._owner = instances.descriptor_instance
+        self._described = np.unique(self._owner)
+        if bank is None or len(self._descriptors) == 0:
+            return
+        _check_width(bank.vectors, self._descriptors, "bank word", self._space)
+        self._centred = self._descriptors - common_part(self._descriptors, self.settings.same_look)
+        self._bank_directions = unit_rows(bank.vectors - bank.mean)
+        scores = self._centred @ self._bank_directions.T
+        self._middle, self._spread = _moments(scores)
+        best = self._best_descriptor((scores - self._middle) / self._spread)
+        self._best_middle, self._best_spread = _moments(best)
+        self._bank_evidence = (best - self._best_middle) / self._best_spread
+        self.sharpness = float(max(self.settings.sharpness, np.quantile(self._bank_evidence.max(axis=1), 0.75)))
+
+    def choose(
+        self, texts: ArrayLike, negatives: ArrayLike | None = None, text_label: NDArray[np.integer] | None = None
+    ) -> Choice:
+        """The label of each instance.
+
+        texts: (T, D) text vectors of any length, float16 to float64; a zero row fits nothing. text_label: (T,) the
+        label of each, ascending from 0, where labels have several; the best one counts. negatives: (M, D) texts that
+        compete with the labels and mean "unknown".
+        FeatureSpaceError for NaN or infinity, or another width than the descriptors'.
+        """
+        texts = finite_rows(texts, "label vectors")
+        label = np.arange(len(texts)) if text_label is None else np.asarray(text_label)
+        others = np.zeros((0, texts.shape[1]), np.float32) if negatives is None else finite_rows(negatives, "negatives")
+        if len(self._descriptors):
+            _check_width(texts, self._descriptors, "label", self._space)
+            _check_width(others, self._descriptors, "negative", self._space)
+        count = int(label.max(initial=-1)) + 1
+        if len(self._descriptors) == 0 or count == 0:
+            return self._nothing(count)
+        if self.bank is None:
+            return self._uncalibrated(texts, label, count, others)
+        evidence = self._evidence(texts)
+        rival = self._evidence(others)
+        best = _best_by_group(evidence.T, label, count).T
+        table, unknown = self._posterior(evidence, rival, texts, label, count)
+        return self._answer(best, table, unknown)
+
+    def _evidence(self, texts: NDArray[np.float32]) -> NDArray[np.float32]:
+        """(described, T) standard deviations above the bank; of several descriptors the best, as for the bank."""
+        assert self.bank is not None
+        directions = unit_rows(unit_rows(texts) - self.bank.mean)
+        scores = (self._centred @ directions.T - self._middle) / self._spread
+        evidence = (self._best_descriptor(scores) - self._best_middle) / self._best_spread
+        evidence[:, ~texts.any(axis=1)] = -np.inf
+        return evidence
+
+    def _best_descriptor(self, scores: NDArray[np.float32]) -> NDArray[np.float32]:
+        rows = np.searchsorted(self._described, self._owner)
+        return _best_by_group(scores, rows, len(self._described))
+
+    def _posterior(
+        self,
+        evidence: NDArray[np.float32],
+        rival: NDArray[np.float32],
+        texts: NDArray[np.float32],
+        label: NDArray[np.integer],
+        count: int,
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Probability of each label and of none, (described, L) and (described,), float64.
+
+        Likelihoods are those of a linear discriminant: a fitting word's evidence is normal about ``sharpness`` with
+        deviation 1, any other's about 0, so their ratio is exp(sharpness * evidence - sharpness^2 / 2). How far
+        fitting words stand out is seen in the scene: the best words of the bank, at the upper quartile of instances.
+        """
+        sharpness = self.sharpness
+        hypothesis, first = _distinct(texts)
+        log_words = np.log(max(len(first), self.settings.kinds))
+        log_label = sharpness * evidence[:, first].astype(np.float64)
+        log_none = self._log_none(texts) + log_words
+        if rival.shape[1]:
+            log_none = np.logaddexp(log_none, np.logaddexp.reduce(sharpness * rival.astype(np.float64), axis=1))
+        top = np.maximum(log_none, log_label.max(axis=1))
+        weight, none = np.exp(log_label - top[:, None]), np.exp(log_none - top)
+        total = weight.sum(axis=1) + none
+        share = weight / total[:, None]
+        table = _best_by_group(share[:, hypothesis].T, label, count).T if len(texts) != count else share[:, hypothesis]
+        return table, none / total
+
+    def _log_none(self, texts: NDArray[np.float32]) -> NDArray[np.float64]:
+        """(described,) log of the mean likelihood that a word of the bank other than the labels gives."""
+        assert self.bank is not None
+        sharpness = self.sharpness
+        directions = unit_rows(unit_rows(texts) - self.bank.mean)
+        other = (self._bank_directions @ directions.T).max(axis=1) < self.settings.synonym
+        by_chance = np.full(len(self._bank_evidence), sharpness**2 / 2)
+        if not other.any():
+            return by_chance
+        exponents = sharpness * self._bank_evidence[:, other].astype(np.float64)
+        return np.maximum(by_chance, np.logaddexp.reduce(exponents, axis=1) - np.log(len(other)))
+
+    def _uncalibrated(
+        self, texts: NDArray[np.float32], label: NDArray[np.integer], count: int, negatives: NDArray[np.float32]
+    ) -> Choice:
+        """Without a bank: the largest cosine, judged by LERF's relevancy where there are negatives."""
+        cosines = self._best_descriptor(self._descriptors @ unit_rows(texts).T)
+        best = _best_by_group(cosines.T, label, count).T
+        if len(negatives) == 0:
+            nothing = np.full(best.shape, np.nan)
+            return self._answer(best, nothing, nothing[:, 0])
+        rivals = self._best_descriptor(self._descriptors @ unit_rows(negatives).T)
+        table = _relevancy_of_cosines(best, rivals)
+        return self._answer(best, table, 1 - table.max(axis=1))
+
+    def _answer(
+        self, evidence: NDArray[np.floating], table: NDArray[np.floating], unknown: NDArray[np.floating]
+    ) -> Choice:
+        """Spread what is known of described instances over all of them."""
+        answer = self._nothing(evidence.shape[1])
+        best = (evidence if np.isnan(table).all() else table).argmax(axis=1)
+        fits = ~(unknown > 0.5) & (evidence[np.arange(len(best)), best] > -np.inf)
+        rows = self._described
+        answer.labels[rows] = np.where(fits, best, UNKNOWN)
+        answer.probability[rows] = np.where(fits, table[np.arange(len(best)), best], 0)
+        answer.unknown[rows] = unknown
+        answer.table[rows] = table
+        answer.evidence[rows] = evidence
+        answer.reasons[rows] = np.where(fits, Reason.LABELLED, Reason.NONE_FITS)
+        return answer
+
+    def _nothing(self, labels: int) -> Choice:
+        reasons = np.full(self._count, Reason.NOT_DESCRIBED, np.int8)
+        reasons[self._described] = Reason.NONE_FITS
+        return Choice(
+            labels=np.full(self._count, UNKNOWN, np.int32),
+            probability=np.zeros(self._count, np.float32),
+            unknown=np.ones(self._count, np.float32),
+            table=np.zeros((self._count, labels), np.float32),
+            evidence=np.full((self._count, labels), -np.inf, np.float32),
+            reasons=reasons,
+            membership=self._membership,
+            calibrated=self.bank is not None,
+        )
+
+
+def chooser_of(cloud: LabelledCloud) -> Chooser:
+    """The chooser of a cloud's instances and its word bank. The cloud keeps it, so that asking again is quick."""
+    chooser = cloud.__dict__.get("_chooser")
+    if chooser is None:
+        chooser = Chooser(cloud.instances, cloud.word_bank, feature_space=cloud.feature_space)
+        cloud.__dict__["_chooser"] = chooser
+    return chooser
+
+
+def common_part(descriptors: NDArray[np.float32], same_look: float) -> NDArray[np.float32]:
+    """(D,) what is taken off each descriptor: the mean over different looks, times 1 - 1 / (number of looks).
+
+    Descriptors that are nearly one (cosine of ``same_look`` or more) count as one look together, so that an object in
+    pieces, or a hall of chairs, does not turn what makes a chair into what all things share. And one look alone does
+    not say what is shared: nothing is taken off; of two, half.
+    """
+    alike = np.ones(len(descriptors))
+    for start in range(0, len(descriptors), ROWS_AT_ONCE):
+        some = slice(start, start + ROWS_AT_ONCE)
+        alike[some] = (descriptors[some] @ descriptors.T >= same_look - 1e-6).sum(axis=1)
+    weight = 1 / np.maximum(alike, 1)
+    looks = weight.sum()
+    return ((1 - 1 / looks) * (weight / looks) @ descriptors).astype(np.float32)
+
+
+def embed(names: Sequence[str], encoder: Encoder, templates: Sequence[str] = TEMPLATES) -> NDArray[np.float32]:
+    """(L, D) unit text vectors: the normalised mean over the templates of each name's normalised vectors.
+
+    encoder: texts -> (count, D) vectors. templates: with one ``{}`` each. Underscores of a name become spaces.
+    For the best instead of the mean, give every vector to ``Chooser.choose`` with ``text_label``.
+    """
+    texts = [template.format(name.replace("_", " ")) for name in names for template in templates]
+    if not texts:
+        raise FeatureSpaceError(f"{len(names)} names and {len(templates)} templates; expected at least one of each")
+    vectors = finite_rows(encoder(texts), "text vectors")
+    if len(vectors) != len(texts):
+        raise FeatureSpaceError(f"the encoder gave {len(vectors)} vectors for {len(texts)} texts; expected one a text")
+    return unit_rows(unit_rows(vectors).reshape(len(names), len(templates), -1).mean(axis=1))
+
+
+def relevancy(descriptors: ArrayLike, texts: ArrayLike, negatives: ArrayLike) -> NDArray[np.float32]:
+    """(R, L) LERF's relevancy in (0, 1): min over negatives n of exp(10 s) / (exp(10 s) + exp(10 n)), s, n cosines.
+
+    Kerr et al., LERF: Language Embedded Radiance Fields, ICCV 2023, Sec. 3.4. 0.5: as close as the closest negative.
+    """
+    images, words = unit_rows(finite_rows(descriptors, "descriptors")), unit_rows(finite_rows(texts, "label vectors"))
+    rivals = unit_rows(finite_rows(negatives, "negatives"))
+    if len(rivals) == 0:
+        raise FeatureSpaceError("relevancy against 0 negatives; expected at least one, as CANONICAL_NEGATIVES")
+    for vectors, what in ((words, "label"), (rivals, "negative")):
+        _check_width(vectors, images, what)
+    return _relevancy_of_cosines(images @ words.T, images @ rivals.T)
+
+
+def _relevancy_of_cosines(scores: NDArray[np.float32], rivals: NDArray[np.float32]) -> NDArray[np.float32]:
+    # The minimum over negatives is that of the closest one.
+    margin = scores - rivals.max(axis=1, keepdims=True)
+    return (1 / (1 + np.exp(-RELEVANCY_TEMPERATURE * margin))).astype(np.float32)
+
+
+def _distinct(texts: NDArray[np.float32]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """(T,) number of each text among the different ones, and (different,) where each comes first."""
+    rounded = np.round(unit_rows(texts), 5) + 0.0  # -0 becomes 0
+    rows = np.ascontiguousarray(rounded).view(np.dtype((np.void, rounded.dtype.itemsize * rounded.shape[1]))).ravel()
+    _, first, number = np.unique(rows, return_index=True, return_inverse=True)
+    return number.reshape(-1), first
+
+
+def _best_by_group(values: NDArray, group: NDArray[np.integer], count: int) -> NDArray:
+    """(count, ...) maximum over the rows of each group, -inf for an empty one."""
+    best = np.full((count, *values.shape[1:]), -np.inf, values.dtype)
+    np.maximum.at(best, group, values)
+    return best
+
+
+def _moments(scores: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Mean and standard deviation of each row, as columns; a row without spread gets no evidence at all."""
+    spread = scores.std(axis=1, keepdims=True)
+    return scores.mean(axis=1, keepdims=True), np.where(spread > 1e-7, spread, np.float32(np.inf))
+
+
+def _check_width(vectors: NDArray[np.float32], descriptors: NDArray[np.float32], what: str, space: str = "") -> None:
+    if vectors.shape[1] != descriptors.shape[1]:
+        raise FeatureSpaceError(
+            f"the {what} vectors have width {vectors.shape[1]}, the scene's descriptors {descriptors.shape[1]}{space}: "
+            f"encode the {what}s with the scene's encoder"
+        )

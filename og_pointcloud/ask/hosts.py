@@ -1,0 +1,118 @@
+"""Point clouds of other libraries -> an array of points, without importing any of them.
+
+A cloud is told by the module of its type: whoever has such an object has imported its library already. Rows stay rows:
+row i of what is answered belongs to row i of the cloud, also where it holds NaN.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from og_pointcloud.errors import MissingExtraError, SceneError
+
+__all__ = ["NAMES_FIELD", "SCENE_FIELD", "carried_scene", "import_plugin", "world_points"]
+
+SCENE_FIELD = "og_pointcloud_scene"
+"""Field of a PyVista dataset that names the .ogpc file its labels came from."""
+NAMES_FIELD = "og_names"
+"""Where hosts and files that can keep texts hold the names that ``og_label`` counts."""
+
+
+def world_points(pcd: Any) -> NDArray[np.float64]:
+    """(N, 3) float64 world coordinates of a cloud; rows may be NaN.
+
+    pcd: an array of shape (N, 3); a torch tensor of that shape, wherever it lies; an Open3D point cloud or mesh, legacy
+    or tensor; a PyVista dataset; a trimesh cloud or mesh; laspy's LasData; a PointCloud2 message; or the path of a
+    geometry file (PLY, PCD, LAS, LAZ). A mesh's points are its vertices. SceneError for anything else;
+    MissingExtraError where reading needs a library that is not installed.
+    """
+    if isinstance(pcd, (str, os.PathLike)):
+        return _of_file(Path(pcd))
+    kind = type(pcd).__name__
+    if kind.endswith("PointCloud2"):  # rclpy's type, and rosbags' sensor_msgs__msg__PointCloud2
+        return _checked(import_plugin("og_pointcloud_ros", "ros").from_pointcloud2(pcd), kind)
+    host = _host(pcd)
+    if host is None:
+        return _checked(pcd, kind)
+    values = _READERS[host](pcd)
+    if values is None:
+        raise SceneError(f"a {kind} of {host} has no points that can be asked: give its points as (N, 3)")
+    return _checked(values, kind)
+
+
+def carried_scene(pcd: Any) -> Path | None:
+    """The .ogpc file that a cloud says its labels came from, if it says so."""
+    if _host(pcd) == "pyvista" and SCENE_FIELD in pcd.field_data:
+        return Path(str(np.asarray(pcd.field_data[SCENE_FIELD]).ravel()[0]))
+    return None
+
+
+def import_plugin(module: str, extra: str) -> Any:
+    """A plugin of ours, og_pointcloud_*; MissingExtraError names the extra where its host library is not installed."""
+    try:
+        return importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        raise MissingExtraError(error.name or module, extra) from None
+
+
+def _host(pcd: Any) -> str | None:
+    """Library of a cloud's type or of one it is derived from; None for arrays, of whatever kind."""
+    if isinstance(pcd, np.ndarray):  # PyVista and trimesh have kinds of their own: mesh.points, mesh.vertices
+        return None
+    for kind in type(pcd).__mro__:
+        root = kind.__module__.partition(".")[0]
+        if root in _READERS:
+            return root
+    return None
+
+
+def _of_file(path: Path) -> NDArray[np.float64]:
+    from og_pointcloud.formats.las import looks_like_las, read_las_positions
+    from og_pointcloud.formats.points import read_points
+
+    return read_las_positions(path) if looks_like_las(path) else read_points(path).xyz_world
+
+
+def _of_open3d(cloud: Any) -> Any:
+    for name in ("points", "vertices"):  # legacy
+        if hasattr(cloud, name):
+            return getattr(cloud, name)
+    for name in ("point", "vertex"):  # tensor
+        if hasattr(cloud, name):
+            tensors = getattr(cloud, name)
+            return tensors["positions"].cpu().numpy() if "positions" in tensors else np.zeros((0, 3))
+    return None
+
+
+def _of_torch(tensor: Any) -> Any:
+    tensor = tensor.detach().cpu()
+    return (tensor.double() if tensor.is_floating_point() else tensor).numpy()  # numpy has no bfloat16
+
+
+_READERS = {
+    "open3d": _of_open3d,
+    "pyvista": lambda dataset: getattr(dataset, "points", None),
+    "trimesh": lambda geometry: getattr(geometry, "vertices", None),
+    "laspy": lambda las: getattr(las, "xyz", None),
+    "torch": lambda tensor: _of_torch(tensor) if hasattr(tensor, "detach") else None,
+}
+"""Root module of a cloud's type -> what finds its points, None where it has none."""
+
+
+def _checked(values: Any, kind: str) -> NDArray[np.float64]:
+    try:
+        points = np.asarray(values)
+    except ValueError as error:
+        raise SceneError(f"a {kind} is no array of points ({error}); expected shape (N, 3)") from None
+    if points.ndim != 2 or points.shape[1] != 3 or points.dtype.kind not in "fiu":
+        raise SceneError(
+            f"points are a {kind} of {points.dtype} {points.shape}; expected numbers of shape (N, 3), x y z in the "
+            "scene's world coordinates: select or transpose the columns"
+        )
+    return points.astype(np.float64)

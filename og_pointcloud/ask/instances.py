@@ -1,0 +1,280 @@
+"""The instances of a scene as a table: where each is, how large, what shows it, and which words fit it best.
+
+Places and boxes are of an instance's main part, without its strays (`boxes.main_part`). Each row works its own out when
+it is first asked, so that a table costs nothing until then.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any, overload
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from og_pointcloud.ask.boxes import Box, axis_aligned_box, main_part, oriented_box
+from og_pointcloud.ask.choosing import Chooser
+from og_pointcloud.cloud import LabelledCloud, Vocabulary
+from og_pointcloud.formats.atomic import replacing
+
+__all__ = ["EMPTY", "LABELLED", "NO_FEATURE", "Instance", "Instances", "list_instances"]
+
+LABELLED = "labelled"
+"""State of an instance that words can be compared with."""
+NO_FEATURE = "no feature"
+"""State of an instance that no mask gave a feature: it answers every word with unknown."""
+EMPTY = "empty"
+"""State of an instance without points."""
+
+WORDS = 3
+"""Words that a row names."""
+SHOWN = 12
+"""Rows that a printed table shows before it says how many more there are."""
+
+
+@dataclass(frozen=True, eq=False)
+class Instance:
+    """What is known of one instance. Lengths and places in the scene's world frame and unit, float64.
+
+    id: in the scene's table. point_indices: (n,) int64, its points in the scene, ascending.
+    views, masks: how many saw it and how many are joined in it. agreement: mean cosine of its masks' features with
+    their descriptor, -1 to 1. visible_area: pixels that its masks put on it, over all views. part_of: the instance
+    that it is a part of, -1 none. coarse: the codebook's coarse cluster that it lies in, -1 none.
+    state: "labelled", "no feature" or "empty". words: (word, score), best first; a score is the probability that the
+    instance is what the word says, where the scene has a word bank, else a cosine.
+    """
+
+    id: int
+    point_indices: NDArray[np.int64] = field(repr=False)
+    views: int
+    masks: int
+    agreement: float
+    visible_area: float
+    part_of: int
+    coarse: int
+    state: str
+    words: tuple[tuple[str, float], ...]
+    _cloud: LabelledCloud = field(repr=False)
+    _up: ArrayLike | None = field(repr=False)
+
+    @property
+    def points(self) -> int:
+        """How many points of the scene belong to it."""
+        return len(self.point_indices)
+
+    @property
+    def xyz(self) -> NDArray[np.float64]:
+        """(n, 3) float64, its points in world coordinates, strays among them."""
+        return self._cloud.xyz[self.point_indices].astype(np.float64) + self._cloud.origin
+
+    @cached_property
+    def main_part(self) -> NDArray[np.bool_]:
+        """(n,) bool, which of its points are not strays."""
+        return main_part(self.xyz, self._cloud.spacing) if self.points else np.zeros(0, bool)
+
+    @cached_property
+    def centroid(self) -> NDArray[np.float64] | None:
+        """(3,) mean of its main part; None without points."""
+        if not self.points:
+            return None
+        main = self.xyz[self.main_part]
+        return main[0] + (main - main[0]).mean(axis=0)
+
+    @cached_property
+    def axis_aligned_box(self) -> Box | None:
+        """The box of its main part along the world's axes; None without points."""
+        return axis_aligned_box(self.xyz[self.main_part]) if self.points else None
+
+    @cached_property
+    def oriented_box(self) -> Box | None:
+        """A box of nearly the least volume around its main part (`boxes.oriented_box`); None without points."""
+        return oriented_box(self.xyz[self.main_part], self._up) if self.points else None
+
+    @property
+    def size(self) -> NDArray[np.float64] | None:
+        """(3,) lengths of the oriented box; None without points."""
+        return None if self.oriented_box is None else self.oriented_box.size
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-able: everything but the points themselves; of those, how many, and how many are strays."""
+        aligned, oriented = self.axis_aligned_box, self.oriented_box
+        return {
+            "id": self.id,
+            "state": self.state,
+            "points": self.points,
+            "strays": int((~self.main_part).sum()),
+            "views": self.views,
+            "masks": self.masks,
+            "agreement": self.agreement,
+            "visible_area": self.visible_area,
+            "part_of": self.part_of,
+            "coarse": self.coarse,
+            "centroid": None if self.centroid is None else self.centroid.tolist(),
+            "axis_aligned_box": None
+            if aligned is None
+            else {"low": aligned.low.tolist(), "high": aligned.high.tolist()},
+            "oriented_box": None if oriented is None else oriented.to_dict(),
+            "words": [{"name": name, "score": score} for name, score in self.words],
+        }
+
+
+class Instances(Sequence[Instance]):
+    """Row k is instance id k. ``scene.instances`` is one; `instance_table` makes others, of other words.
+
+    Unlike a list's, its indices do not count from the end: -1 is the id of background, not the last instance.
+    """
+
+    def __init__(self, rows: Sequence[Instance]) -> None:
+        self._rows = tuple(rows)
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def __iter__(self) -> Iterator[Instance]:
+        return iter(self._rows)
+
+    @overload
+    def __getitem__(self, index: int) -> Instance: ...
+    @overload
+    def __getitem__(self, index: slice) -> Instances: ...
+    def __getitem__(self, index: int | slice) -> Instance | Instances:
+        """The instance with this id, or a table of several. IndexError for an id that is no instance's."""
+        if isinstance(index, slice):
+            return Instances(self._rows[index])
+        if not 0 <= index < len(self):
+            raise IndexError(
+                f"{index} is no instance id of {len(self)}; expected 0 to {len(self) - 1}: -1 is background, "
+                "-2 unobserved, -3 too far from the scene"
+            )
+        return self._rows[index]
+
+    def largest(self, count: int | None = None) -> Instances:
+        """By falling number of points, of equals the smaller id first; only the first ``count``."""
+        return Instances(sorted(self._rows, key=lambda row: (-row.points, row.id))[:count])
+
+    def to_records(self) -> list[dict[str, Any]]:
+        """A JSON-able dictionary a row (`Instance.to_dict`)."""
+        return [row.to_dict() for row in self]
+
+    def to_json(self, path: str | os.PathLike[str] | None = None) -> str:
+        """The records as JSON text; also written to path, whole or not at all, where one is given."""
+        text = json.dumps(self.to_records(), indent=2, ensure_ascii=False) + "\n"
+        _write(path, text)
+        return text
+
+    def to_csv(self, path: str | os.PathLike[str] | None = None) -> str:
+        """The records as CSV text, a column a number; also written to path, whole or not at all."""
+        records = [_flat(record) for record in self.to_records()]
+        text = io.StringIO()
+        # The longest row names all columns: one without points or words has fewer.
+        writer = csv.DictWriter(text, dict.fromkeys(name for record in records for name in record), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(records)
+        _write(path, text.getvalue())
+        return text.getvalue()
+
+    def __repr__(self) -> str:
+        header = ("id", "points", "views", "agreement", "state", "centroid", "size along x, y, z", "best words")
+        shown = self.largest(SHOWN)
+        rows = [header, *(_cells(row) for row in shown)]
+        widths = [max(len(row[column]) for row in rows) for column in range(len(header))]
+        lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+        if len(self) > len(shown):
+            lines.append(f"and {len(self) - len(shown)} smaller ones")
+        return "\n".join([f"{len(self)} instances", *lines])
+
+
+def list_instances(
+    cloud: LabelledCloud,
+    chooser: Chooser,
+    labels: Vocabulary | None = None,
+    *,
+    up: ArrayLike | None = None,
+    words: int = WORDS,
+) -> Instances:
+    """The instances of a cloud as a table (`instance_table` takes whatever names a scene).
+
+    chooser: of the same cloud. labels: the words to choose among, None for none. up: (3,) direction that the oriented
+    boxes stand upright on, where it is known. words: how many a row names.
+    """
+    table, order = cloud.instances, np.argsort(cloud.instance_ids, kind="stable")
+    bounds = np.searchsorted(cloud.instance_ids[order], np.arange(len(table) + 1))
+    described = np.zeros(len(table), bool)
+    described[table.descriptor_instance] = True
+    best = _best_words(len(table), chooser, labels, words)
+    return Instances(
+        [
+            Instance(
+                id=k,
+                point_indices=order[bounds[k] : bounds[k + 1]],
+                views=int(table.views[k]),
+                masks=int(table.masks[k]),
+                agreement=float(table.agreement[k]),
+                visible_area=float(table.visible_area[k]),
+                part_of=int(table.whole[k]),
+                coarse=int(table.coarse[k]),
+                state=EMPTY if bounds[k] == bounds[k + 1] else LABELLED if described[k] else NO_FEATURE,
+                words=best[k] if described[k] else (),
+                _cloud=cloud,
+                _up=up,
+            )
+            for k in range(len(table))
+        ]
+    )
+
+
+def _best_words(
+    instances: int, chooser: Chooser, labels: Vocabulary | None, count: int
+) -> list[tuple[tuple[str, float], ...]]:
+    """Per instance the words with the highest scores, of equal ones the first given."""
+    if labels is None:
+        return [()] * instances
+    choice = chooser.choose(labels.vectors)
+    return [tuple(choice.words(k, labels.names, count)) for k in range(len(choice.labels))]
+
+
+def _cells(row: Instance) -> tuple[str, ...]:
+    box = row.axis_aligned_box
+    return (
+        str(row.id),
+        f"{row.points:,}",
+        str(row.views),
+        f"{row.agreement:.2f}",
+        row.state,
+        "-" if row.centroid is None else " ".join(f"{value:.4g}" for value in row.centroid),
+        "-" if box is None else " x ".join(f"{value:.3g}" for value in box.size),
+        ", ".join(f"{name} {score:.2f}" for name, score in row.words) or "-",
+    )
+
+
+def _flat(record: dict[str, Any]) -> dict[str, Any]:
+    """A record without nesting. Columns of places and boxes are empty where there are no points."""
+    aligned, oriented = record.pop("axis_aligned_box"), record.pop("oriented_box")
+    vectors = {
+        "centroid": (record.pop("centroid"), "xyz"),
+        "low": (aligned and aligned["low"], "xyz"),
+        "high": (aligned and aligned["high"], "xyz"),
+        "box_center": (oriented and oriented["center"], "xyz"),
+        "box_size": (oriented and oriented["size"], "012"),
+        "box_rotation": (oriented and oriented["rotation_wxyz"], "wxyz"),
+    }
+    words = record.pop("words")
+    flat = dict(record)
+    for name, (values, parts) in vectors.items():
+        flat |= {f"{name}_{part}": values[index] if values else "" for index, part in enumerate(parts)}
+    for rank, word in enumerate(words, start=1):
+        flat |= {f"word_{rank}": word["name"], f"score_{rank}": word["score"]}
+    return flat
+
+
+def _write(path: str | os.PathLike[str] | None, text: str) -> None:
+    if path is not None:
+        with replacing(Path(path)) as file:
+            file.write(text.encode())

@@ -1,0 +1,176 @@
+"""What a segment call returns: a label, score and instance per point, and ways to look at it."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from og_pointcloud.ask.choosing import Reason
+from og_pointcloud.ask.hosts import import_plugin
+from og_pointcloud.cloud import TOO_FAR
+from og_pointcloud.errors import OgPointcloudError
+from og_pointcloud.formats.atomic import replacing
+from og_pointcloud.formats.colors import label_colors
+
+__all__ = ["SAVED_AS", "Reason", "Segmentation"]
+
+SAVED_AS = (".npz", ".ply", ".las", ".laz", ".glb", ".gltf")
+"""Endings of the files that a result is written to."""
+
+
+@dataclass(frozen=True)
+class Segmentation:
+    """One row a point, in the order of the points asked about.
+
+    xyz: (N, 3) float64, world coordinates. labels: (N,) int32, row of ``names``, -1 unknown.
+    scores: (N,) float32, 0 where unknown; else, if ``calibrated``, the probability that the point is what its label
+        says; if not, the cosine of the label's text with the instance's descriptor, which has no such meaning.
+    instances: (N,) int32, the scene's instance id, -1 background, -2 unobserved, -3 too far from the scene.
+    names: the labels asked for. scene: the .ogpc file that answered, None for one in memory.
+    distance: (N,) int8, 0 on the scene's surface, 1 near it, 2 too far from it; between 0 and 1 to about a point
+        spacing, as one table cell speaks for all points in it.
+    reasons: (N,) int8, why a point is unknown: a ``Reason``, 0 where it has a label.
+    calibrated: whether the scene has a word bank to judge labels by. Without one the best label is answered, however
+        badly it fits: then nothing is unknown for Reason.NONE_FITS, unless negatives were asked against.
+    certainty: (N,) float32, see there; looked up by ``certainty_at``, the scene's, when it is first read.
+    """
+
+    xyz: NDArray[np.float64]
+    labels: NDArray[np.int32]
+    scores: NDArray[np.float32]
+    instances: NDArray[np.int32]
+    names: tuple[str, ...]
+    scene: Path | None = None
+    distance: NDArray[np.int8] = field(default_factory=lambda: np.zeros(0, np.int8))
+    reasons: NDArray[np.int8] = field(default_factory=lambda: np.zeros(0, np.int8))
+    calibrated: bool = False
+    certainty_at: Callable[[NDArray[np.float64]], NDArray[np.float32] | None] = field(
+        default=lambda points: None, repr=False, compare=False
+    )
+
+    def __post_init__(self) -> None:
+        for name in ("distance", "reasons"):
+            count = len(getattr(self, name))
+            if count != len(self.labels):
+                raise OgPointcloudError(
+                    f"{len(self.labels)} labels and {count} {name} differ in number; expected one of each a point"
+                )
+
+    def __len__(self) -> int:
+        return len(self.labels)
+
+    @cached_property
+    def certainty(self) -> NDArray[np.float32] | None:
+        """(N,) float32 in [0, 1]: how far views and neighbours bear out that a point is in its instance, or in none, as
+        the scene's nearest point has it; 0 where no view saw it or the scene is too far.
+
+        ``scores`` say whether the instance is what the word means, this whether the point is part of it: low at
+        borders, and where masks disagree. None where the scene does not know it.
+        """
+        found = self.certainty_at(self.xyz)
+        return None if found is None else np.where(self.instances == TOO_FAR, np.float32(0), found)
+
+    def mask(self, name: str) -> NDArray[np.bool_]:
+        """(N,) bool, the points with this label."""
+        if name not in self.names:
+            raise OgPointcloudError(f"'{name}' was not asked for; the labels are {', '.join(self.names)}")
+        return self.labels == self.names.index(name)
+
+    def counts(self) -> dict[str, int]:
+        """Points of each name, in the order of ``names``; the remaining ones are unknown."""
+        counts = np.bincount(self.labels + 1, minlength=len(self.names) + 1)[1:]
+        return dict(zip(self.names, counts.tolist(), strict=True))
+
+    def unknown_because(self) -> dict[Reason, int]:
+        """Points without a label by the reason for it, reasons that no point has left out."""
+        counts = np.bincount(self.reasons, minlength=len(Reason))
+        return {reason: int(counts[reason]) for reason in Reason if reason != Reason.LABELLED and counts[reason]}
+
+    @property
+    def colors(self) -> NDArray[np.uint8]:
+        """(N, 3) uint8 RGB: a colour a label, grey where unknown."""
+        return label_colors(self.labels)
+
+    @property
+    def attributes(self) -> dict[str, NDArray[Any]]:
+        """What hosts and files keep of each point, (N,) arrays by the names that they have everywhere.
+
+        og_label, og_instance int32, og_score float32, og_reason uint8, which more of them can hold than int8.
+        """
+        return {
+            "og_label": self.labels,
+            "og_instance": self.instances,
+            "og_score": self.scores,
+            "og_reason": self.reasons.astype(np.uint8),
+        }
+
+    def to_open3d(self) -> Any:
+        """An Open3D tensor cloud: positions, colors, and the `attributes` as (N, 1). Needs the extra 'open3d'."""
+        return import_plugin("og_pointcloud_open3d", "open3d").to_open3d(self)
+
+    def to_pyvista(self) -> Any:
+        """A PyVista PolyData with the `attributes`, colours, names and scene. Needs the extra 'pyvista'."""
+        return import_plugin("og_pointcloud_pyvista", "pyvista").to_pyvista(self)
+
+    def to_pointcloud2(self, frame_id: str = "map", stamp: Any = None) -> Any:
+        """A sensor_msgs/PointCloud2 message with the labels in its fields. Needs the extra 'ros'."""
+        return import_plugin("og_pointcloud_ros", "ros").to_pointcloud2(self, frame_id=frame_id, stamp=stamp)
+
+    def to_las(self) -> Any:
+        """A laspy LasData, laid out as ``save`` writes .las. Needs the extra 'las'."""
+        from og_pointcloud.formats.las import labelled_las
+
+        return labelled_las(self.xyz, self.colors, self.attributes, self.names)
+
+    def save(self, path: str | os.PathLike[str]) -> Path:
+        """Write the result, whole or not at all, as what the path's ending says.
+
+        .npz: labels, scores, instances, reasons, names and calibrated, and certainty if it is known.
+        .ply: a coloured cloud with the `attributes`.
+        .las, .laz: with colours, classification and the attributes as extra bytes (needs the extra 'las').
+        .glb, .gltf: coloured points with feature ids.
+        OgPointcloudError for another ending; SceneError where the format cannot hold the points: .las and .glb have no
+        room for NaN, .glb none for an empty cloud.
+        """
+        path = Path(path)
+        if path.suffix not in SAVED_AS:
+            raise OgPointcloudError(
+                f"'{path}' ends in '{path.suffix}'; expected a name that ends in {', '.join(SAVED_AS)}"
+            )
+        if path.suffix == ".npz":
+            self._save_arrays(path)
+        else:
+            _writer(path.suffix)(path, self.xyz, self.colors, self.attributes, self.names)
+        return path
+
+    def _save_arrays(self, path: Path) -> None:
+        arrays: dict[str, Any] = {
+            "labels": self.labels,
+            "scores": self.scores,
+            "instances": self.instances,
+            "reasons": self.reasons,
+            "names": np.array(self.names, str),
+            "calibrated": np.array(self.calibrated),
+        }
+        if self.certainty is not None:
+            arrays["certainty"] = self.certainty
+        with replacing(path) as file:
+            np.savez(file, **arrays)
+
+
+def _writer(ending: str) -> Callable[..., None]:
+    """What writes a labelled cloud of that ending."""
+    if ending == ".ply":
+        from og_pointcloud.formats.points import write_labelled_ply as write
+    elif ending in (".las", ".laz"):
+        from og_pointcloud.formats.las import write_las as write
+    else:
+        from og_pointcloud.formats.gltf import write_gltf as write
+    return write

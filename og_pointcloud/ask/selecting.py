@@ -1,0 +1,194 @@
+"""Words select instances: all of them ranked by one text, and which the text fits.
+
+A cosine alone says little: what counts as high differs from scene to scene and word to word. So the text competes with
+other words, and with the scene's word bank where it has one: an instance is selected where `segment` would label it so.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, overload
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from og_pointcloud.ask.choosing import Choice, Reason
+from og_pointcloud.ask.instances import SHOWN
+from og_pointcloud.ask.labelled_scene import LabelledScene, SceneLike, as_scene
+from og_pointcloud.bundle.read import NO_EVIDENCE
+from og_pointcloud.cloud import Vocabulary
+from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError
+from og_pointcloud.text.words import Labels, TextFeatures, resolve_labels
+
+__all__ = ["Match", "Selection", "select"]
+
+
+@dataclass(frozen=True)
+class Match:
+    """An instance beside a text. points: how many it has.
+
+    score: the probability that it is what the text says, where the selection is calibrated; else their cosine.
+    fits: whether neither another word nor "none of these" is more probable. Where not calibrated: whether no other word
+    has a higher cosine; where no other word was given, whether it is the best of all.
+    rival: the other word that fits it best, with its score; None and -2 where no other word was given.
+    """
+
+    instance: int
+    score: float
+    fits: bool
+    rival: str | None
+    rival_score: float
+    points: int
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-able."""
+        rival_score = None if self.rival is None else self.rival_score
+        return {
+            "instance": self.instance, "score": self.score, "fits": self.fits, "rival": self.rival,
+            "rival_score": rival_score, "points": self.points,
+        }  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Selection(Sequence[Match]):
+    """What a text selects: every instance that has points and a feature, best first, of equals the smaller id.
+
+    query: the text. rivals: how many other words competed. unknown: instances with points that have no feature, which
+    no text can find. calibrated: whether the scene has a word bank, and scores are probabilities.
+    """
+
+    query: str
+    matches: tuple[Match, ...]
+    rivals: int
+    unknown: int
+    calibrated: bool
+    scene: LabelledScene = field(repr=False)
+
+    def __len__(self) -> int:
+        return len(self.matches)
+
+    def __iter__(self) -> Iterator[Match]:
+        return iter(self.matches)
+
+    @overload
+    def __getitem__(self, index: int) -> Match: ...
+    @overload
+    def __getitem__(self, index: slice) -> tuple[Match, ...]: ...
+    def __getitem__(self, index: int | slice) -> Match | tuple[Match, ...]:
+        """By rank: 0 is the best."""
+        return self.matches[index]
+
+    @property
+    def best(self) -> Match | None:
+        """The instance with the highest score, whether or not the text fits it; None without any."""
+        return self.matches[0] if self.matches else None
+
+    @property
+    def fitting(self) -> tuple[Match, ...]:
+        """Those that the text fits; without rivals and word bank the best alone, as nothing tells more."""
+        return tuple(match for match in self.matches if match.fits)
+
+    @property
+    def instances(self) -> tuple[int, ...]:
+        """Ids of the fitting instances, best first."""
+        return tuple(match.instance for match in self.fitting)
+
+    @property
+    def point_indices(self) -> NDArray[np.int64]:
+        """(m,) the scene's points that belong to fitting instances, ascending."""
+        return np.flatnonzero(np.isin(self.scene.instance_ids, self.instances))
+
+    def points_of(self, match: Match) -> NDArray[np.int64]:
+        """(m,) the scene's points that belong to one match, ascending."""
+        return np.flatnonzero(self.scene.instance_ids == match.instance)
+
+    def to_json(self) -> str:
+        """The query, and every match in order."""
+        names = ("query", "rivals", "unknown", "calibrated")
+        record = {name: getattr(self, name) for name in names} | {"matches": [match.to_dict() for match in self]}
+        return json.dumps(record, indent=2, ensure_ascii=False)
+
+    def __str__(self) -> str:
+        lines = [f"'{self.query}' fits {len(self.fitting)} of {len(self)} instances"]
+        for match in self[:SHOWN]:
+            mark = "*" if match.fits else " "
+            rival = f"{match.rival} {match.rival_score:.3f}" if match.rival else "-"
+            lines.append(
+                f"{mark} instance {match.instance:<5} {match.score:.3f}  {match.points:>9,} points  rival {rival}"
+            )
+        if len(self) > SHOWN:
+            lines.append(f"and {len(self) - SHOWN} that it fits less")
+        return "\n".join(lines)
+
+
+def select(
+    scene: SceneLike,
+    text: str | Mapping[str, ArrayLike],
+    *,
+    against: Labels = None,
+    text_features: TextFeatures = None,
+) -> Selection:
+    """Rank the instances of a scene by a text, and say which it fits.
+
+    scene: a loaded scene, a LabelledCloud or the path of a .ogpc file.
+    text: a word or phrase, found as for ``segment``; or one name -> vector (D,).
+    against: the words that compete, as labels of ``segment``; left out, all others that text_features or the scene
+        know; an empty list for none but the word bank. Rivals that mean the same ("cup" for "mug") share the instances
+        between them.
+
+    Raises OgPointcloudError where text is not one word, else as ``segment``.
+    """
+    scene = as_scene(scene)
+    if not isinstance(text, str) and (not isinstance(text, Mapping) or len(text) != 1):
+        shown = list(text) if isinstance(text, Mapping) else text
+        raise OgPointcloudError(f"the text is {shown!r:.80}; expected one word or phrase, or one name -> vector")
+    query = resolve_labels(text, text_features, scene.vocabulary, scene.feature_space, scene.path)
+    rivals = _rivals(scene, query.names[0], against, text_features)
+    choice = scene.chooser.choose(_together(query, rivals))
+    points = np.bincount(scene.instance_ids[scene.instance_ids >= 0], minlength=len(choice.labels))
+    known = (points > 0) & (choice.reasons != Reason.NOT_DESCRIBED)
+    ranked = [int(k) for k in choice.ranking(0) if known[k]]
+    fitting = set(np.flatnonzero(choice.labels == 0).tolist() if rivals or choice.calibrated else ranked[:1])
+    return Selection(
+        query=query.names[0],
+        matches=tuple(_match(k, choice, k in fitting, rivals, int(points[k])) for k in ranked),
+        rivals=len(rivals.names) if rivals else 0,
+        unknown=int(((points > 0) & ~known).sum()),
+        calibrated=choice.calibrated,
+        scene=scene,
+    )
+
+
+def _match(instance: int, choice: Choice, fits: bool, rivals: Vocabulary | None, points: int) -> Match:
+    """choice: of the query, label 0, and the rivals behind it."""
+    score = float(choice.scores[instance, 0])
+    if rivals is None:
+        return Match(instance, score, fits, None, NO_EVIDENCE, points)
+    best = int(choice.evidence[instance, 1:].argmax())
+    return Match(instance, score, fits, rivals.names[best], float(choice.scores[instance, 1 + best]), points)
+
+
+def _together(query: Vocabulary, rivals: Vocabulary | None) -> NDArray[np.float32]:
+    """(1 + rivals, D) vectors, the query's first."""
+    if rivals is None:
+        return query.vectors
+    if query.vectors.shape[1] != rivals.vectors.shape[1]:
+        raise FeatureSpaceError(
+            f"the vector of '{query.names[0]}' has width {query.vectors.shape[1]}, those of the words that compete "
+            f"{rivals.vectors.shape[1]}: encode both with the scene's encoder"
+        )
+    return np.concatenate([query.vectors, rivals.vectors])
+
+
+def _rivals(scene: LabelledScene, query: str, against: Labels, text_features: TextFeatures) -> Vocabulary | None:
+    """The words that compete with the query, without itself; None without any."""
+    own = scene.vocabulary
+    if against is None and text_features is None and not (own and own.names):
+        return None
+    if isinstance(against, Sequence) and not len(against):
+        return None
+    words = resolve_labels(against, text_features, own, scene.feature_space, scene.path)
+    others = [index for index, name in enumerate(words.names) if name != query]
+    return Vocabulary(tuple(words.names[index] for index in others), words.vectors[others]) if others else None

@@ -1,0 +1,319 @@
+"""The .ogpc file: what is in it, and how it is read without believing it.
+
+One zip, every member stored uncompressed, nothing pickled:
+
+  manifest.json            format, schema_version, feature_space, frame (origin, unit, spacing, reach), counts,
+                           members (bytes, sha256, dtype, shape of each), parity figures of the graph, provenance
+  query.onnx               the graph that answers text; the instance table's descriptors (R, D) are its constants
+  arrays/*.npy             xyz, instance_ids (smallest integer type), rgb if known, instances/*
+  vocabulary/names.json    words that may be asked as strings, if any
+  vocabulary/vectors.npy   (L, D) float16 or float32 unit vectors
+  bank/vectors.npy         (B, D) float16, everyday words that labels are judged by (see ``choosing``), if it has them
+  text_encoder/*           the files of a text encoder (see ``text_encoder``), if it carries one; read when needed
+
+``og_pointcloud_export`` writes it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import os
+import re
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from og_pointcloud.cloud import InstanceTable, LabelledCloud, Vocabulary, WordBank
+from og_pointcloud.errors import BundleError, OgPointcloudError
+from og_pointcloud.formats.npy import array_from_npy
+from og_pointcloud.models import check_graph
+
+__all__ = [
+    "BANK", "BEYOND", "FORMAT", "NEAR", "NO_EVIDENCE", "ON_SURFACE", "SCHEMA_VERSION", "Bundle", "read_bundle",
+]  # fmt: skip
+
+FORMAT = "ogpc"
+SCHEMA_VERSION = 2
+"""Raised when files of before cannot be asked any more: 2 is the graph that settles points at borders itself."""
+ON_SURFACE, NEAR, BEYOND = 0, 1, 2
+"""How far a query point is from the cloud: within about 1.5 spacings, within reach, or too far."""
+NO_EVIDENCE = -2.0
+"""Score of an instance without a descriptor: below every cosine."""
+
+MAX_MEMBERS = 256
+MAX_MANIFEST_BYTES = 1 << 26
+SAFE_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]*(/[A-Za-z0-9_][A-Za-z0-9_.-]*)*")
+INTEGERS, FLOATS = ("|i1", "<i2", "<i4"), ("<f2", "<f4")
+QUERY_OPERATORS = frozenset({
+    "Abs", "Add", "ArgMax", "ArgMin", "Cast", "Concat", "Div", "Expand", "Gather", "GatherElements", "Greater",
+    "GreaterOrEqual", "Identity", "IsNaN", "Less", "LessOrEqual", "MatMul", "Max", "Min", "Mod", "Mul", "NonZero",
+    "ReduceL2", "ReduceMax", "ReduceSum", "Reshape", "ScatterElements", "Shape", "Slice", "Split", "Sub",
+    "Transpose", "Unsqueeze", "Where",
+})  # fmt: skip
+"""What a query.onnx is made of: arithmetic and look-ups, nothing that repeats or branches."""
+ZIP_ERRORS = (zipfile.BadZipFile, EOFError, RuntimeError, NotImplementedError, OSError, ValueError)
+"""All that zipfile raises for damaged archives, encrypted ones, and those of methods that it lacks."""
+REBUILD = "write the file again with write_bundle"
+BANK = "bank/vectors.npy"
+RGB, CERTAINTY = "arrays/rgb.npy", "arrays/certainty.npy"
+CARRIED_ENCODER = "text_encoder/"
+"""What the names of a carried text encoder's members begin with."""
+
+
+@dataclass(frozen=True)
+class Bundle:
+    """What a .ogpc holds.
+
+    path: None for one that was never a file. query_onnx: the serialised graph. manifest: as read; what this library
+    uses of it is checked.
+    """
+
+    path: Path | None
+    cloud: LabelledCloud
+    query_onnx: bytes
+    manifest: dict[str, Any]
+
+
+def read_bundle(path: str | os.PathLike[str], *, verify_sha256: bool = False) -> Bundle:
+    """Read and check a .ogpc file; BundleError, beginning with the path, for any other or damaged file.
+
+    Each member's CRC-32 is always checked. verify_sha256 checks the manifest's digests too, which takes about as long
+    as the rest of reading; as anyone can write them, they show which file this is, not that it is to be trusted.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise BundleError(
+            f"{path} is not a file; expected a .ogpc file: check the name, or make it with og-pointcloud fit"
+        )
+    try:
+        with path.open("rb") as file:
+            members, carried = _members(file)
+        manifest = _manifest(members)
+        _check_members(manifest, members, carried, verify_sha256)
+        return Bundle(path, _cloud(manifest, members), members["query.onnx"], manifest)
+    except _Refused as error:
+        raise BundleError(f"{path}: {error}") from None
+
+
+def read_carried_encoder(path: str | os.PathLike[str]) -> dict[str, bytes] | None:
+    """The files of the text encoder that a .ogpc carries, by name, unchecked; None where it carries none."""
+    path = Path(path)
+    try:
+        with path.open("rb") as file:
+            _, carried = _members(file)
+            archive = zipfile.ZipFile(file)
+            return {name.removeprefix(CARRIED_ENCODER): archive.read(name) for name in carried} or None
+    except _Refused as error:
+        raise BundleError(f"{path}: {error}") from None
+    except ZIP_ERRORS as error:
+        raise BundleError(f"{path}: the text encoder in it is damaged ({error!s:.120}): {REBUILD}") from None
+
+
+def describe_member(name: str, data: bytes) -> dict[str, Any]:
+    """What the manifest says of a member: bytes, sha256 and, of an array, its type and shape."""
+    entry: dict[str, Any] = {"bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}
+    if name.endswith(".npy"):
+        array = np.load(io.BytesIO(data), allow_pickle=False)
+        entry |= {"dtype": array.dtype.str, "shape": list(array.shape)}
+    return entry
+
+
+class _Refused(Exception):
+    """Why a file is refused; read_bundle puts the path before it."""
+
+
+def _members(file: BinaryIO) -> tuple[dict[str, bytes], dict[str, int]]:
+    """All members by name, but of a carried encoder the sizes only: most who open a file never ask it.
+
+    Stored, apart and inside the file: together they cannot be larger than it is.
+    """
+    size = file.seek(0, os.SEEK_END)
+    try:
+        archive = zipfile.ZipFile(file)
+        infos = archive.infolist()
+        for info in infos:
+            if not SAFE_NAME.fullmatch(info.filename):
+                raise _Refused(
+                    f"member name {info.filename!r:.80} is not a plain relative path: the file is not to be trusted"
+                )
+            if info.compress_type != zipfile.ZIP_STORED or info.compress_size != info.file_size:
+                raise _Refused(f"member '{info.filename:.80}' is compressed; expected stored members: {REBUILD}")
+        names = {info.filename for info in infos}
+        total = sum(info.file_size for info in infos)
+        if len(names) != len(infos) or len(infos) > MAX_MEMBERS or total > size:
+            raise _Refused(
+                f"{len(infos)} members of {len(names)} names claim {total} bytes in a file of {size}; expected unique "
+                f"names, at most {MAX_MEMBERS}, that fit: the file is not to be trusted"
+            )
+        carried = {info.filename: info.file_size for info in infos if info.filename.startswith(CARRIED_ENCODER)}
+        return {info.filename: archive.read(info) for info in infos if info.filename not in carried}, carried
+    except ZIP_ERRORS as error:
+        raise _Refused(
+            f"not a .ogpc file, or damaged ({error!s:.120}); expected a zip of stored members: copy it again or "
+            f"{REBUILD}"
+        ) from None
+
+
+def _manifest(members: dict[str, bytes]) -> dict[str, Any]:
+    if "manifest.json" not in members:
+        found = ", ".join(list(members)[:3]) or "nothing"
+        raise _Refused(f"a zip without manifest.json (it holds {found}): not a .ogpc file; give the one that fit wrote")
+    data = members["manifest.json"]
+    if len(data) > MAX_MANIFEST_BYTES:
+        raise _Refused(f"manifest.json has {len(data)} bytes; expected at most {MAX_MANIFEST_BYTES}: {REBUILD}")
+    try:
+        manifest = json.loads(data)
+    except (ValueError, RecursionError) as error:
+        raise _Refused(f"manifest.json is no JSON ({error}): {REBUILD}") from None
+    if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
+        seen = manifest.get("format") if isinstance(manifest, dict) else type(manifest).__name__
+        raise _Refused(f"its manifest says format {seen!r}; expected {FORMAT!r}: give the file that fit wrote")
+    schema = manifest.get("schema_version")
+    if not isinstance(schema, int) or schema < 1:
+        raise _Refused(f"schema_version is {schema!r}; expected a whole number from 1: {REBUILD}")
+    if schema < SCHEMA_VERSION:
+        raise _Refused(
+            f"schema_version is {schema}, written by an older version of this library; this one reads "
+            f"{SCHEMA_VERSION}: fit the capture again (og-pointcloud fit CAPTURE -o S.ogpc)"
+        )
+    if schema > SCHEMA_VERSION:
+        raise _Refused(
+            f"schema_version is {schema}, newer than the {SCHEMA_VERSION} that this library reads: "
+            "pip install --upgrade og-pointcloud"
+        )
+    return manifest
+
+
+def _check_members(
+    manifest: dict[str, Any], members: dict[str, bytes], carried: dict[str, int], verify_sha256: bool
+) -> None:
+    declared = _field(manifest, "members", dict)
+    sizes = {name: len(data) for name, data in members.items()} | carried
+    if undeclared := sorted(set(sizes) - set(declared) - {"manifest.json"}):
+        raise _Refused(f"member '{undeclared[0]:.80}' is not in the manifest: the file was changed; {REBUILD}")
+    for name, entry in declared.items():
+        if name not in sizes:
+            raise _Refused(f"member '{name:.80}' of the manifest is missing: {REBUILD}")
+        length = _field(entry, "bytes", int, f"members/{name}/")
+        if length != sizes[name]:
+            raise _Refused(f"member '{name}' has {sizes[name]} bytes, the manifest says {length}: {REBUILD}")
+        if verify_sha256 and name in members:  # the encoder's own manifest holds its files' digests
+            digest = hashlib.sha256(members[name]).hexdigest()
+            if digest != _field(entry, "sha256", str, f"members/{name}/"):
+                raise _Refused(f"member '{name}' has sha256 {digest}, not the manifest's: it was changed; {REBUILD}")
+    if "query.onnx" not in members:
+        raise _Refused(f"member 'query.onnx' is missing: {REBUILD}")
+    try:
+        check_graph(members["query.onnx"], QUERY_OPERATORS)
+    except ValueError as error:
+        raise _Refused(f"query.onnx: {error}: the file is not to be trusted") from None
+
+
+def _cloud(manifest: dict[str, Any], members: dict[str, bytes]) -> LabelledCloud:
+    counts, frame = _field(manifest, "counts", dict), _field(manifest, "frame", dict)
+    points, instances = _field(counts, "points", int, "counts/"), _field(counts, "instances", int, "counts/")
+    xyz = _array(members, "arrays/xyz.npy", ("<f4",), (points, 3))
+    if not np.isfinite(xyz).all():
+        raise _Refused(f"arrays/xyz.npy holds NaN or infinity; expected finite coordinates: {REBUILD}")
+    ids = _array(members, "arrays/instance_ids.npy", INTEGERS, (points,)).astype(np.int32)
+    rgb = _array(members, RGB, ("|u1",), (points, 3)) if RGB in members else None
+    certainty = _array(members, CERTAINTY, ("|u1",), (points,)) if CERTAINTY in members else None
+    try:
+        origin = np.array(_field(frame, "origin", list, "frame/"), np.float64)
+        if origin.shape != (3,) or not np.isfinite(origin).all():
+            raise ValueError(f"origin is {frame['origin']}; expected three finite numbers")
+        return LabelledCloud(
+            xyz=xyz,
+            origin=origin,
+            instance_ids=ids,
+            instances=_instances(manifest, members, instances),
+            feature_space=_field(manifest, "feature_space", str),
+            spacing=float(_field(frame, "spacing", (int, float), "frame/")),
+            reach=float(_field(frame, "reach", (int, float), "frame/")),
+            rgb=rgb,
+            certainty=certainty,
+            vocabulary=_vocabulary(manifest, members),
+            word_bank=_word_bank(members),
+            provenance=_field(manifest, "provenance", dict),
+        )
+    except (OgPointcloudError, ValueError, TypeError, OverflowError) as error:
+        raise _Refused(f"its parts do not fit together ({error}): {REBUILD}") from None
+
+
+def _instances(manifest: dict[str, Any], members: dict[str, bytes], count: int) -> InstanceTable:
+    descriptors = _descriptors(_field(manifest, "descriptors", dict), members)
+
+    def column(name: str, dtype: str, length: int = count) -> NDArray[Any]:
+        return _array(members, f"arrays/instances/{name}.npy", (dtype,), (length,))
+
+    return InstanceTable(
+        descriptors=descriptors,
+        descriptor_instance=column("descriptor_instance", "<i4", len(descriptors)),
+        points=column("points", "<i4"),
+        views=column("views", "<i4"),
+        masks=column("masks", "<i4"),
+        agreement=column("agreement", "<f4"),
+        visible_area=column("visible_area", "<f4"),
+        coarse=column("coarse", "<i4"),
+        whole=column("whole", "<i4"),
+    )
+
+
+def _descriptors(place: dict[str, Any], members: dict[str, bytes]) -> NDArray[np.float32]:
+    """(R, D) float32, a view into the constants of the graph."""
+    graph = members["query.onnx"]
+    offset, shape = _field(place, "offset", int, "descriptors/"), _field(place, "shape", list, "descriptors/")
+    sizes_fit = len(shape) == 2 and all(isinstance(length, int) and length >= 0 for length in shape)
+    if not sizes_fit or not 0 <= offset <= len(graph) - 4 * shape[0] * shape[1]:
+        raise _Refused(f"descriptors of shape {shape} at byte {offset} lie outside query.onnx: {REBUILD}")
+    return np.frombuffer(graph, "<f4", shape[0] * shape[1], offset).reshape(shape)
+
+
+def _vocabulary(manifest: dict[str, Any], members: dict[str, bytes]) -> Vocabulary | None:
+    if "vocabulary/names.json" not in members:
+        return None
+    try:
+        names = json.loads(members["vocabulary/names.json"])
+    except (ValueError, RecursionError) as error:
+        raise _Refused(f"vocabulary/names.json is no JSON ({error}): {REBUILD}") from None
+    words = _field(_field(manifest, "counts", dict), "words", int, "counts/")
+    unique = isinstance(names, list) and all(isinstance(name, str) for name in names) and len(set(names)) == len(names)
+    if not unique or len(names) != words:
+        raise _Refused(f"vocabulary/names.json is not a list of {words} different words: {REBUILD}")
+    vectors = _array(members, "vocabulary/vectors.npy", FLOATS, (words, None))
+    return Vocabulary(tuple(names), vectors.astype(np.float32))
+
+
+def _word_bank(members: dict[str, bytes]) -> WordBank | None:
+    return WordBank(_array(members, BANK, ("<f2",), (None, None))) if BANK in members else None
+
+
+def _array(
+    members: dict[str, bytes], name: str, dtypes: tuple[str, ...], shape: tuple[int | None, ...]
+) -> NDArray[Any]:
+    """A read-only array over a member's bytes, of one of these types and this shape (None: any length)."""
+    if name not in members:
+        raise _Refused(f"member '{name}' is missing: {REBUILD}")
+    try:
+        array = array_from_npy(members[name])
+    except ValueError as error:
+        raise _Refused(f"member '{name}' is no .npy that can be read ({error}): {REBUILD}") from None
+    fits = array.ndim == len(shape) and all(want in (None, have) for want, have in zip(shape, array.shape, strict=True))
+    if array.dtype.str not in dtypes or not fits:
+        raise _Refused(
+            f"member '{name}' is {array.dtype.str} {array.shape}; expected {' or '.join(dtypes)} {shape}: {REBUILD}"
+        )
+    return array
+
+
+def _field(record: Any, name: str, kind: type | tuple[type, ...], where: str = "") -> Any:
+    value = record.get(name) if isinstance(record, dict) else None
+    if not isinstance(value, kind) or isinstance(value, bool):
+        raise _Refused(f"manifest field '{where}{name}' is {value!r:.60}; {REBUILD}")
+    return value

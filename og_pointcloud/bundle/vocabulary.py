@@ -1,0 +1,207 @@
+"""Words of a .ogpc file, and the bank that labels are judged by: stored with their vectors, so that whoever asks the
+file needs no encoder.
+
+Only the members that change are written anew, the graph and the arrays are copied: numpy is all this needs.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import zipfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from og_pointcloud.bundle.read import BANK, CARRIED_ENCODER, NO_EVIDENCE, describe_member, read_bundle
+from og_pointcloud.cloud import InstanceTable, LabelledCloud, Vocabulary, WordBank
+from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError
+from og_pointcloud.formats.atomic import replacing
+from og_pointcloud.formats.npy import npy_bytes
+from og_pointcloud.text.encoder import TextEncoder, encoder_files
+from og_pointcloud.text.text_features import UNKNOWN_SPACE, read_text_features
+
+__all__ = [
+    "AddedWords", "add_words", "bank_members", "best_cosines", "carry_encoder", "compact_vectors", "encoder_members",
+    "everyday_words", "read_bank", "read_words", "store_bank", "vocabulary_members",
+]  # fmt: skip
+
+HALF_PRECISION_TOLERANCE = 1e-3
+"""Words are stored as float16 where no cosine with a descriptor moves by more, and no instance's best word changes."""
+MAX_WORDS_BYTES = 1 << 24
+
+
+@dataclass(frozen=True)
+class AddedWords:
+    """How many words came new, how many got another vector, and how many the file has now."""
+
+    added: int
+    replaced: int
+    total: int
+
+
+def read_words(path: str | os.PathLike[str]) -> tuple[str, ...]:
+    """The words of a text file, one a line, UTF-8; empty lines and words that come again are left out."""
+    path = Path(path)
+    try:
+        if path.stat().st_size > MAX_WORDS_BYTES:
+            raise ValueError(f"it has {path.stat().st_size} bytes, more than {MAX_WORDS_BYTES}")
+        lines = path.read_bytes().decode("utf-8-sig").splitlines()
+    except (OSError, ValueError) as error:
+        raise OgPointcloudError(f"{path} cannot be read as words, one a line, in UTF-8 ({error})") from None
+    words = tuple(dict.fromkeys(filter(None, (line.strip() for line in lines))))
+    if not words:
+        raise OgPointcloudError(f"{path} has no words; expected one a line")
+    return words
+
+
+def everyday_words() -> tuple[str, ...]:
+    """The library's own words of everyday things, which an encoder makes a word bank of."""
+    return read_words(Path(__file__).with_name("everyday_words.txt"))
+
+
+def add_words(
+    path: str | os.PathLike[str],
+    words: Vocabulary,
+    feature_space: str,
+    output: str | os.PathLike[str] | None = None,
+) -> AddedWords:
+    """Store words with their vectors in a .ogpc file, behind those that it has; a word that it has gets the new vector.
+
+    feature_space: of the vectors. output: another file to write; None: the same one, replaced whole or not at all.
+    FeatureSpaceError for vectors of another space or width than the file's.
+    """
+    bundle = read_bundle(path)
+    cloud = bundle.cloud
+    _check_space(path, cloud, words.vectors, feature_space)
+    old = cloud.vocabulary or Vocabulary((), np.zeros((0, words.vectors.shape[1]), np.float32))
+    vectors = dict(zip(old.names, _unit(old.vectors), strict=True))
+    new = dict(zip(words.names, _unit(words.vectors), strict=True))
+    known = [name for name in new if name in vectors]
+    vectors |= new
+    together = Vocabulary(tuple(vectors), np.array(list(vectors.values()), np.float32))
+    members, error = vocabulary_members(together, cloud.instances)
+
+    def edit(manifest: dict[str, Any]) -> None:
+        manifest["counts"]["words"] = len(together.names)
+        manifest.setdefault("parity", {})["vocabulary_cosine_error"] = error
+
+    _rewrite(Path(path), Path(output or path), bundle.manifest, members, edit)
+    return AddedWords(len(new) - len(known), len(known), len(together.names))
+
+
+def read_bank(path: str | os.PathLike[str]) -> tuple[WordBank, str]:
+    """A text-features file as a bank, and its feature space; FeatureSpaceError where its words are too few."""
+    vocabulary, feature_space = read_text_features(path)
+    try:
+        return WordBank(vocabulary.vectors), feature_space
+    except FeatureSpaceError as error:
+        raise FeatureSpaceError(f"{path}: {error}") from None
+
+
+def store_bank(
+    path: str | os.PathLike[str],
+    bank: WordBank,
+    feature_space: str,
+    output: str | os.PathLike[str] | None = None,
+) -> None:
+    """Store a word bank in a .ogpc file, in place of one that it has; its answers are then calibrated.
+
+    feature_space, output, errors: as for ``add_words``.
+    """
+    bundle = read_bundle(path)
+    _check_space(path, bundle.cloud, bank.vectors, feature_space)
+    _rewrite(Path(path), Path(output or path), bundle.manifest, bank_members(bank), lambda manifest: None)
+
+
+def carry_encoder(
+    path: str | os.PathLike[str], folder: str | os.PathLike[str], output: str | os.PathLike[str] | None = None
+) -> TextEncoder:
+    """Store a text encoder in a .ogpc file, which then answers any word wherever it goes. Returns the encoder.
+
+    folder: what export-text-encoder wrote; a file without a word bank gets the encoder's. output: as for ``add_words``.
+    """
+    bundle = read_bundle(path)
+    members, encoder = encoder_members(folder, bundle.cloud.feature_space)
+    if bundle.cloud.word_bank is None and encoder.word_bank is not None:
+        members |= bank_members(encoder.word_bank)
+    _rewrite(Path(path), Path(output or path), bundle.manifest, members, lambda manifest: None)
+    return encoder
+
+
+def encoder_members(folder: str | os.PathLike[str], feature_space: str) -> tuple[dict[str, bytes], TextEncoder]:
+    """A folder's files as members of a .ogpc of this feature space; FeatureSpaceError if it is of another."""
+    files = encoder_files(Path(folder))
+    encoder = TextEncoder(files, str(folder))
+    if encoder.feature_space != feature_space:
+        raise FeatureSpaceError(
+            f"{folder} encodes to feature space '{encoder.feature_space}', the scene is of '{feature_space}': name the "
+            "encoder of the scene's"
+        )
+    return {CARRIED_ENCODER + name: data for name, data in files.items()}, encoder
+
+
+def vocabulary_members(vocabulary: Vocabulary, instances: InstanceTable) -> tuple[dict[str, bytes], float]:
+    """The members that hold words, and the largest change of a cosine that storing them makes."""
+    stored, error = compact_vectors(vocabulary, instances)
+    names = json.dumps(list(vocabulary.names), ensure_ascii=False).encode()
+    return {"vocabulary/names.json": names, "vocabulary/vectors.npy": npy_bytes(stored)}, error
+
+
+def bank_members(bank: WordBank) -> dict[str, bytes]:
+    """The member that holds a word bank. In float16: a statistic of many words does not feel a word's last digits."""
+    return {BANK: npy_bytes(bank.vectors.astype(np.float16))}
+
+
+def compact_vectors(vocabulary: Vocabulary, instances: InstanceTable) -> tuple[NDArray[np.floating], float]:
+    """Unit vectors, as float16 if that changes no answer, and the largest change of a cosine that this makes."""
+    unit = _unit(vocabulary.vectors)
+    half = unit.astype(np.float16)
+    if instances.descriptors.size == 0 or unit.size == 0:
+        return half, 0.0
+    exact, stored = best_cosines(instances, unit), best_cosines(instances, half)
+    error = float(np.abs(stored - exact).max())
+    if error <= HALF_PRECISION_TOLERANCE and (exact.argmax(axis=1) == stored.argmax(axis=1)).all():
+        return half, error
+    return unit.astype(np.float32), float(np.abs(best_cosines(instances, unit.astype(np.float32)) - exact).max())
+
+
+def best_cosines(instances: InstanceTable, vectors: NDArray[np.floating]) -> NDArray[np.float64]:
+    """(K, L) float64: best cosine of an instance's descriptors with each vector, -2 for one without a descriptor."""
+    cosines = instances.descriptors.astype(np.float64) @ _unit(vectors).T
+    scores = np.full((len(instances), len(vectors)), NO_EVIDENCE)
+    np.maximum.at(scores, instances.descriptor_instance, cosines)
+    return scores
+
+
+def _check_space(
+    path: str | os.PathLike[str], cloud: LabelledCloud, vectors: NDArray[np.floating], feature_space: str
+) -> None:
+    width, spaces = cloud.instances.descriptors.shape[1], {feature_space, cloud.feature_space}
+    if (len(spaces) > 1 and UNKNOWN_SPACE not in spaces) or (width and vectors.shape[1] != width):
+        raise FeatureSpaceError(
+            f"the words are of feature space '{feature_space}' (width {vectors.shape[1]}), {path} of "
+            f"'{cloud.feature_space}' (width {width}): encode them with the scene's encoder"
+        )
+
+
+def _unit(vectors: NDArray[np.floating]) -> NDArray[np.float64]:
+    vectors = vectors.astype(np.float64)
+    length = np.linalg.norm(vectors, axis=1, keepdims=True)
+    return np.divide(vectors, length, out=np.zeros_like(vectors), where=length > 0)
+
+
+def _rewrite(path: Path, output: Path, manifest: dict[str, Any], changes: Mapping[str, bytes], edit: Any) -> None:
+    """A bundle with some members replaced or added, and its manifest to match; the others are copied as they are."""
+    manifest = json.loads(json.dumps(manifest))  # the reader's stays as it is
+    edit(manifest)
+    manifest["members"] |= {name: describe_member(name, data) for name, data in changes.items()}
+    text = json.dumps(manifest, indent=1, ensure_ascii=False).encode()
+    with zipfile.ZipFile(path) as source, replacing(output) as file, zipfile.ZipFile(file, "w") as target:
+        target.writestr(zipfile.ZipInfo("manifest.json"), text)  # a ZipInfo of its own: the date stays 1980
+        for name in manifest["members"]:
+            target.writestr(zipfile.ZipInfo(name), changes[name] if name in changes else source.read(name))

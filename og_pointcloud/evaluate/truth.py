@@ -1,0 +1,92 @@
+"""A capture's own ground truth: ``gt.npz`` beside its cloud. It is read for scores alone, never by a fit."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from og_pointcloud.errors import SceneError
+from og_pointcloud.evaluate.arrays import read_arrays
+from og_pointcloud.evaluate.metrics import Score, score_labels
+
+__all__ = ["GT_NAME", "Truth", "read_truth"]
+
+GT_NAME = "gt.npz"
+AGREED, VOTES = 0.5, 2
+"""Of a class found by votes: the share that agreed on it, and how many there were, at least."""
+
+
+@dataclass(frozen=True)
+class Truth:
+    """cls: (n,) int, row of ``names`` that each point is, -1 none. scored: (n,) bool, whether its truth can be relied
+    on. background: (n,) bool, known to be of no class; None where that is not known. instance: (n,) int, the thing that
+    a point is part of, below 0 none; None where that is not known."""
+
+    cls: NDArray[np.integer]
+    names: tuple[str, ...]
+    scored: NDArray[np.bool_]
+    background: NDArray[np.bool_] | None
+    instance: NDArray[np.integer] | None = None
+
+    def class_of(self, labels: NDArray[np.integer], words: Sequence[str]) -> NDArray[np.int64]:
+        """(n,) classes of labels that index ``words``, -1 unknown; a word that the truth lacks is a wrong answer.
+
+        >>> truth = Truth(np.array([0, 1]), ("cup", "pot"), np.array([True, True]), None)
+        >>> truth.class_of(np.array([0, 1, -1]), ["pot", "lamp"]).tolist()
+        [1, 2, -1]
+        """
+        numbers = {name: number for number, name in enumerate(self.names)}
+        number = np.array([*(numbers.get(word, len(numbers)) for word in words), -1])
+        return number[np.maximum(labels, -1)]
+
+    def score(self, labels: NDArray[np.integer], words: Sequence[str]) -> Score:
+        """Labels that index ``words``, -1 unknown, scored; SceneError where they are not one each point."""
+        if len(labels) != len(self.cls):
+            raise SceneError(f"{GT_NAME} has {len(self.cls)} points, the labels are {len(labels)}; expected one each")
+        called = self.class_of(labels, words)
+        return score_labels(called, self.cls, scored=self.scored, background=self.background)
+
+
+def read_truth(folder: str | os.PathLike[str]) -> Truth:
+    """A capture's ``gt.npz``: ``cls`` (n,), ``names``, and where known ``instance``, ``background``, ``views``,
+    ``ratio``, ``votes``.
+
+    Points that no view shows (views 0), or whose class less than half of the votes, or a single one, agree on, are not
+    scored. Raises SceneError where the file is absent, damaged, or lacks what is needed.
+    """
+    path = Path(folder) / GT_NAME
+    if not path.is_file():
+        raise SceneError(
+            f"{path} is not a file; a score needs it: 'cls' (n,) a class per point, -1 none, and 'names'. Without one, "
+            "take a made room: og-pointcloud demo"
+        )
+    entries = read_arrays(path)
+    missing = [name for name in ("cls", "names") if name not in entries]
+    if missing:
+        raise SceneError(
+            f"{path} lacks '{missing[0]}' (it has {', '.join(entries) or 'nothing'}); expected 'cls', 'names'"
+        )
+    cls, names = entries["cls"], entries["names"]
+    if cls.ndim != 1 or cls.dtype.kind not in "iu" or names.dtype.kind != "U" or cls.max(initial=-1) >= len(names):
+        raise SceneError(
+            f"{path}: cls is {cls.dtype} {cls.shape} up to {cls.max(initial=-1)}, names {names.dtype} {names.shape}; "
+            "expected whole numbers (n,) that index the names, and strings (L,)"
+        )
+    for name in ("background", "views", "ratio", "votes", "instance"):
+        if name in entries and entries[name].shape != cls.shape:
+            raise SceneError(f"{path}: {name} has shape {entries[name].shape}, cls {cls.shape}; expected one a point")
+    instance = entries.get("instance")
+    if instance is not None and instance.dtype.kind not in "iu":
+        raise SceneError(f"{path}: instance is {instance.dtype}; expected whole numbers, below 0 for none")
+    scored = np.ones(len(cls), bool)
+    if "views" in entries:
+        scored &= entries["views"] > 0
+    if "ratio" in entries and "votes" in entries:
+        scored &= (entries["ratio"] >= AGREED) & (entries["votes"] >= VOTES)
+    background = entries["background"].astype(bool) if "background" in entries else None
+    return Truth(cls, tuple(names.tolist()), scored, background, instance)

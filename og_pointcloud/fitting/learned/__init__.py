@@ -1,0 +1,1 @@
+"""OpenGaussian's method: instance features and a codebook, learned; as published, and without rendering."""

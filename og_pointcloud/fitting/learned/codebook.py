@@ -1,0 +1,373 @@
+"""Instance features -> clusters: the two-level codebook (paper, Sec. 3.2, Eq. 3 and 4), without rendering.
+
+Eq. 4 asks that the map rendered from cluster centres c is near the one rendered from the features f themselves. As
+blending is linear and its weights are positive, ``|W f - W c| <= sum_g w_g |f_g - c_g|``: a k-means weighted by how
+much each Gaussian shows, which needs neither pixels nor gradients.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+
+from og_pointcloud.errors import OgPointcloudError
+from og_pointcloud.fitting.grouping import indicator
+from og_pointcloud.fitting.mask_table import MaskTable
+from og_pointcloud.kernels import njit, prange
+from og_pointcloud.settings import CodebookSettings
+
+__all__ = [
+    "Codebook",
+    "cluster_weights",
+    "kmeans",
+    "seed_centres",
+    "thing_count",
+    "things_together",
+    "two_level_codebook",
+]
+
+CHUNKS = 64
+"""Partial sums of `kmeans`: a fixed number, so that the result does not depend on the number of threads."""
+BLOCK = 256
+"""Points whose distances are taken side by side."""
+SLACK = np.float32(1e-5)
+"""Distances of values in -1..1 are known to better than this in float32."""
+SEED_POINTS = 1 << 15
+"""At most this many of the points are enough to find first centres."""
+STARTS = 4
+"""Seeds tried; those with the smallest spread are taken. An unlucky one puts two things in one cluster."""
+
+
+@dataclass(frozen=True)
+class Codebook:
+    """Clusters of n Gaussians on two levels; the leaves are the finer ones, numbered by their coarse cluster.
+
+    coarse, leaf: (n,) int32, -1 for Gaussians without weight. coarse_centres: (k1, width + 3) float32, mean feature and
+    mean position (scene units; width columns alone where positions were left out). leaf_centres: (k, width) float32,
+    mean feature. leaf_coarse: (k,) int32, ascending. levels: 1 where each coarse cluster is one leaf.
+    No cluster is empty.
+    """
+
+    coarse: NDArray[np.int32]
+    leaf: NDArray[np.int32]
+    coarse_centres: NDArray[np.float32]
+    leaf_centres: NDArray[np.float32]
+    leaf_coarse: NDArray[np.int32]
+    levels: int
+
+
+def two_level_codebook(
+    features: NDArray[np.float32],
+    xyz: NDArray[np.float32],
+    weight: NDArray[np.floating],
+    table: MaskTable,
+    settings: CodebookSettings,
+    seed: int = 0,
+) -> Codebook:
+    """Eq. 3: coarse clusters of [features; positions], then clusters of the features alone within each.
+
+    features: (n, width), as the losses saw them. xyz: (n, 3). weight: (n,), how much each Gaussian shows; 0: it takes
+    no part. table: of the same Gaussians; it says how many clusters there are to be, where the settings do not.
+    Deterministic in the seed.
+    """
+    taking_part = np.flatnonzero(weight > 0)
+    coarse, leaf = np.full(len(features), -1, np.int32), np.full(len(features), -1, np.int32)
+    values, mass = np.ascontiguousarray(features[taking_part], np.float32), weight[taking_part].astype(np.float64)
+    placed = values
+    if settings.positions and len(taking_part):
+        placed = np.concatenate([values, _scaled_positions(xyz[taking_part], settings)], axis=1)
+    rng = np.random.default_rng(seed)
+    k1 = settings.k1 or thing_count(table)
+    coarse[taking_part], k1 = _clusters(placed, mass, k1, settings.rounds, rng)
+
+    parts = np.ones(k1, np.int64)
+    if settings.levels == 2:
+        together = things_together(table, coarse, k1, settings)
+        parts = np.minimum(together, settings.k2) if settings.k2 else together
+    leaf_coarse: list[int] = []
+    for cluster in range(k1):
+        members = np.flatnonzero(coarse[taking_part] == cluster)
+        fine, k2 = _clusters(values[members], mass[members], int(parts[cluster]), settings.rounds, rng)
+        leaf[taking_part[members]] = fine + len(leaf_coarse)
+        leaf_coarse += [cluster] * k2
+    described = np.concatenate([values, xyz[taking_part]], axis=1) if settings.positions else values
+    return Codebook(
+        coarse,
+        leaf,
+        _means(described, mass, coarse[taking_part], k1),
+        _means(values, mass, leaf[taking_part], len(leaf_coarse)),
+        np.array(leaf_coarse, np.int32),
+        2 if len(leaf_coarse) > k1 else 1,
+    )
+
+
+def thing_count(table: MaskTable) -> int:
+    """About how many things the masks of all views show: each mask counts one over the views that mask its points.
+
+    A thing shown by ten masks, one a view, is ten times a tenth. No correspondence between views is needed.
+    """
+    views = table.outside.shape[0]
+    of_view = csr_array(indicator(table.mask_view, views) @ table.weights)
+    part = csr_array(of_view + table.outside)
+    part.eliminate_zeros()
+    part.data = 1 / part.data
+    views_masking = np.asarray(of_view.multiply(part).sum(axis=0), np.float64)
+    shown = np.asarray(table.weights.sum(axis=1), np.float64)
+    shows = shown > 0
+    times_masked = (table.weights @ views_masking)[shows] / shown[shows]
+    return max(1, round(float((1 / np.maximum(times_masked, 1)).sum())))
+
+
+def things_together(
+    table: MaskTable, cluster: NDArray[np.int32], count: int, settings: CodebookSettings
+) -> NDArray[np.int64]:
+    """(count,) at least 1: how many different masks of one view fall into each cluster, in most of the views.
+
+    Masks of one view are different things (Eq. 2 rests on this too). A mask falls into a cluster when a fair share of
+    the mask lies in it, or it makes up a fair share of what the view shows of the cluster.
+    """
+    inside = cluster_weights(table.weights, cluster, count)
+    of_view = np.zeros((int(table.mask_view.max(initial=-1)) + 1, count))
+    np.add.at(of_view, table.mask_view, inside)
+    whole = np.asarray(table.weights.sum(axis=1), np.float64).reshape(-1, 1)
+    share = settings.fair_share
+    falls = (inside > share * whole) | (inside > share * of_view[table.mask_view])
+    masks = np.zeros_like(of_view)
+    np.add.at(masks, table.mask_view, falls)
+    seen = np.where(masks > 0, masks, np.nan)
+    together = np.ones(count, np.int64)
+    known = (masks > 0).any(axis=0)
+    together[known] = np.nanquantile(seen[:, known], settings.view_quantile, axis=0, method="higher")
+    return together
+
+
+def cluster_weights(matrix: csr_array, cluster: NDArray[np.int32], count: int) -> NDArray[np.float64]:
+    """(rows, count) float64: each row's sum over the columns of every cluster, those of negative ones left out.
+
+    Of the mask table: what every mask shows of every cluster, ``A @ onehot(cluster)``.
+    """
+    return _cluster_weights(matrix.indptr, matrix.indices, matrix.data, cluster, count)
+
+
+def kmeans(
+    values: NDArray[np.float32],
+    weight: NDArray[np.floating],
+    centres: NDArray[np.floating],
+    rounds: int,
+    *,
+    reseed: bool,
+) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
+    """Lloyd's weighted k-means from the given centres, until nothing changes or ``rounds`` updates are done.
+
+    values: (n, d) finite. weight: (n,) not negative; points of weight 0 are assigned but move no centre.
+    centres: (k, d). reseed: a cluster without weight starts again at the point that is farthest from its own centre,
+    distance squared times weight; it stays where it is where no point is off its centre, or without ``reseed``.
+
+    Returns (n,) int32, the nearest of the returned centres (lowest of equals), and those centres (k, d) float32.
+    The same input gives the same answer on any number of threads. Distances are taken about the middle of the values,
+    in units of the largest: neither offset nor unit matters.
+    """
+    _check(values, weight, centres)
+    if len(centres) == 0:
+        raise OgPointcloudError("k-means got 0 centres; expected at least one: do all points have weight 0?")
+    n = len(values)
+    if n == 0:
+        return np.zeros(0, np.int32), centres.astype(np.float32)
+    weight = np.ascontiguousarray(weight, np.float64)
+    middle = np.median(values[:: -(-n // 1000)], axis=0)
+    points = np.subtract(values, middle, dtype=np.float32)
+    unit = max(float(points.max()), -float(points.min())) or 1.0
+    points /= np.float32(unit)
+    moving = (centres.astype(np.float64) - middle) / unit
+    own, upper, lower = np.zeros(n, np.int32), np.full(n, np.inf, np.float32), np.zeros(n, np.float32)
+    _reassign(points, moving.astype(np.float32), np.zeros(len(moving), np.float32), own, upper, lower)
+    for _ in range(rounds):
+        sums, mass = _cluster_sums(points, weight, own, len(moving))
+        filled = mass > 0
+        moved = moving.copy()
+        moved[filled] = sums[filled] / mass[filled, None]
+        if reseed and not filled.all():
+            moved = _reseeded(points, weight, own, moved, np.flatnonzero(~filled))
+        shift = np.linalg.norm(moved.astype(np.float32) - moving.astype(np.float32), axis=1)
+        moving = moved
+        if not shift.any():
+            break
+        _reassign(points, moving.astype(np.float32), shift, own, upper, lower)
+    return own, (moving * unit + middle).astype(np.float32)
+
+
+def seed_centres(
+    values: NDArray[np.float32], weight: NDArray[np.floating], k: int, rng: np.random.Generator
+) -> NDArray[np.float32]:
+    """Up to k of the values as first centres, each drawn with a chance of weight x squared distance to the others.
+
+    That is k-means++ (Arthur & Vassilvitskii 2007), weighted. Fewer than k, (m, d) with m < k, where the points that
+    have weight lie in only m places; none if no point has weight.
+    """
+    _check(values, weight, values[:0])
+    candidates = np.flatnonzero(weight > 0)
+    if len(candidates) > SEED_POINTS:
+        candidates = np.sort(rng.choice(candidates, SEED_POINTS, replace=False))
+    points = values[candidates].astype(np.float64)
+    chance = weight[candidates].astype(np.float64)
+    squared = np.full(len(points), np.inf)
+    chosen: list[int] = []
+    while len(chosen) < k and chance.any():
+        reached = np.cumsum(chance)
+        chosen.append(int(np.searchsorted(reached, rng.random() * reached[-1], side="right")))
+        squared = np.minimum(squared, ((points - points[chosen[-1]]) ** 2).sum(axis=1))
+        chance = weight[candidates] * squared
+    return values[candidates[chosen]]
+
+
+def _clusters(
+    values: NDArray[np.float32], weight: NDArray[np.float64], k: int, rounds: int, rng: np.random.Generator
+) -> tuple[NDArray[np.int32], int]:
+    """At most k clusters of values that have weight, numbered without gaps: (n,) int32 and their number."""
+    if k <= 1 or len(values) == 0:
+        return np.zeros(len(values), np.int32), min(1, len(values))
+    sample = slice(None, None, -(-len(values) // SEED_POINTS))
+    least, best = np.inf, values[:0]
+    for _ in range(STARTS):
+        start = seed_centres(values[sample], weight[sample], k, rng)
+        own, centres = kmeans(values[sample], weight[sample], start, rounds, reseed=True)
+        spread = float(weight[sample] @ ((values[sample] - centres[own]) ** 2).sum(axis=1))
+        if spread < least:
+            least, best = spread, centres
+    own, _ = kmeans(values, weight, best, rounds, reseed=True)
+    used, own = np.unique(own, return_inverse=True)
+    return own.astype(np.int32), len(used)
+
+
+def _scaled_positions(xyz: NDArray[np.float32], settings: CodebookSettings) -> NDArray[np.float32]:
+    """Positions in units that compare with features. Outliers neither set the extent nor get clusters of their own."""
+    if settings.absolute_positions:
+        return (settings.position_weight * xyz).astype(np.float32)
+    low, middle, high = np.quantile(xyz, [0.05, 0.5, 0.95], axis=0)
+    extent = float(np.linalg.norm(high - low)) or float(np.linalg.norm(np.ptp(xyz, axis=0))) or 1.0
+    return (settings.position_weight * np.clip((xyz - middle) / extent, -1, 1)).astype(np.float32)
+
+
+def _means(
+    values: NDArray[np.float32], weight: NDArray[np.float64], own: NDArray[np.int32], count: int
+) -> NDArray[np.float32]:
+    columns = [np.bincount(own, weight * column, count) for column in values.T]
+    mass = np.bincount(own, weight, count)
+    return (np.stack(columns, axis=1) / mass[:, None]).astype(np.float32)
+
+
+def _check(values: NDArray[np.floating], weight: NDArray[np.floating], centres: NDArray[np.floating]) -> None:
+    if values.ndim != 2 or weight.shape != (len(values),) or centres.shape[1:] != values.shape[1:]:
+        raise OgPointcloudError(
+            f"values {values.shape}, weight {weight.shape} and centres {centres.shape} do not fit; expected (n, d), "
+            "(n,) and (k, d)"
+        )
+    if not np.isfinite(values).all() or not np.isfinite(weight).all() or (weight < 0).any():
+        wrong = ~np.isfinite(values).all(axis=1) | ~(weight >= 0) | (weight == np.inf)
+        row = int(np.argmax(wrong)) if len(wrong) else 0
+        raise OgPointcloudError(
+            f"row {row} of a codebook's input is {values[row][:6].tolist()} with weight {weight[row]}; expected finite "
+            "values and weights of at least 0: leave such points out"
+        )
+
+
+def _reseeded(
+    points: NDArray[np.float32],
+    weight: NDArray[np.float64],
+    own: NDArray[np.int32],
+    centres: NDArray[np.float64],
+    empty: NDArray[np.intp],
+) -> NDArray[np.float64]:
+    """The centres with empty clusters moved to the worst represented points, one after the other."""
+    squared = ((points - centres[own]) ** 2).sum(axis=1)
+    for cluster in empty:
+        worst = int(np.argmax(weight * squared))
+        if not weight[worst] * squared[worst] > 0:
+            break
+        centres[cluster] = points[worst]
+        squared = np.minimum(squared, ((points - centres[cluster]) ** 2).sum(axis=1))
+    return centres
+
+
+@njit(cache=True, fastmath={"contract"})
+def _two_nearest(points, block, centres, own, upper, lower):  # noqa: ANN001, ANN202
+    """Set own centre, its distance and the second nearest's for the points listed in ``block``.
+
+    Points side by side, without branches: the compiler makes vector code of that.
+    """
+    size, d = len(block), points.shape[1]
+    columns = np.empty((d, size), np.float32)
+    for b in range(size):
+        for i in range(d):
+            columns[i, b] = points[block[b], i]
+    best = np.zeros(size, np.int32)
+    first, second = np.full(size, np.float32(np.inf)), np.full(size, np.float32(np.inf))
+    squared = np.empty(size, np.float32)
+    for j in range(len(centres)):
+        squared[:] = 0.0
+        for i in range(d):
+            value, column = centres[j, i], columns[i]
+            for b in range(size):
+                difference = column[b] - value
+                squared[b] += difference * difference
+        for b in range(size):
+            this, least, next_least = squared[b], first[b], second[b]
+            nearer = this < least
+            loser = least if nearer else this
+            second[b] = loser if loser < next_least else next_least
+            best[b] = np.int32(j) if nearer else best[b]
+            first[b] = this if nearer else least
+    for b in range(size):
+        own[block[b]], upper[block[b]], lower[block[b]] = best[b], np.sqrt(first[b]), np.sqrt(second[b])
+
+
+@njit(cache=True, parallel=True)
+def _reassign(points, centres, shift, own, upper, lower):  # noqa: ANN001, ANN202
+    """Nearest centres after these have moved by ``shift``, in place.
+
+    upper, lower: at least the distance to the own centre, at most that to any other. A point whose own centre is surely
+    still the nearest is not looked at (Hamerly 2010).
+    """
+    n = len(points)
+    farthest = shift.max()
+    for chunk in prange(CHUNKS):
+        block, size = np.empty(BLOCK, np.int32), 0
+        for p in range(chunk * n // CHUNKS, (chunk + 1) * n // CHUNKS):
+            upper[p] += shift[own[p]]
+            lower[p] -= farthest
+            if upper[p] >= lower[p] - SLACK:
+                block[size] = p
+                size += 1
+            if size == BLOCK:
+                _two_nearest(points, block, centres, own, upper, lower)
+                size = 0
+        _two_nearest(points, block[:size], centres, own, upper, lower)
+
+
+@njit(cache=True, parallel=True)
+def _cluster_sums(points, weight, own, k):  # noqa: ANN001, ANN202
+    """Weighted sum (k, d) and weight (k,) of every cluster in float64, in an order that threads do not change."""
+    n, d = points.shape
+    sums = np.zeros((CHUNKS, k, d))
+    mass = np.zeros((CHUNKS, k))
+    for chunk in prange(CHUNKS):
+        for p in range(chunk * n // CHUNKS, (chunk + 1) * n // CHUNKS):
+            mass[chunk, own[p]] += weight[p]
+            for i in range(d):
+                sums[chunk, own[p], i] += weight[p] * points[p, i]
+    return sums.sum(axis=0), mass.sum(axis=0)
+
+
+@njit(cache=True)
+def _cluster_weights(indptr, indices, data, cluster, count):  # noqa: ANN001, ANN202
+    rows = len(indptr) - 1
+    sums = np.zeros((rows, count))
+    for row in range(rows):
+        for e in range(indptr[row], indptr[row + 1]):
+            own = cluster[indices[e]]
+            if own >= 0:
+                sums[row, own] += data[e]
+    return sums

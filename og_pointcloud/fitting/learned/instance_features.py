@@ -1,0 +1,574 @@
+"""Instance features of all Gaussians (paper, Sec. 3.1, Eq. 1 and 2), from the mask table instead of by rendering.
+
+Blending is linear: with the weights ``W`` of a view and features ``F`` a pixel shows ``M = W F``, and a mask's mean is
+a row of ``diag(1 / N) A F``, where ``A`` (visibility.py) sums W over the mask's pixels. So both losses of all views
+follow from two sparse products, ``A F`` for the value and ``A' G`` for the gradient; nothing is rendered meanwhile.
+
+    objective = mean over views of L_c  +  cohesion_weight * L_s
+
+``L_c``, inter-mask contrast (Eq. 2), over the pairs i != j of a view's m masks. A view without two masks has none.
+    paper    1 / (m (m - 1)) sum of 1 / (d_ij^2 + e^2). The printed form has e = 0 and is infinite where two means
+             meet; here e is `FeatureSettings.closest` of the typical distance, reached from 1 in steps of 4.
+    authors  the same with e = 1; pair ij also counts 0.1 + 0.9 r / (m - 1), r the rank of j by nearness to i. (Their
+             change of these weights late in training has no counterpart without a step count.)
+``L_s``, intra-mask smoothness (Eq. 1), in one of two senses; N_i is a mask's size, P the sum of all N_i.
+    rendered the printed loss: squares ``|M_p - Mbar_i|^2`` summed over the pixels p of all masks, over P. N_i is
+             ``|B_i|``, a mask's *pixels*. As ``sum_p M_p = |B_i| Mbar_i`` whatever the rows of W sum to, it is
+             exactly ``tr(F' S F) - sum_i |B_i| |Mbar_i|^2`` with ``S = sum_p W_p' W_p``. A pixel that Gaussians cover
+             in part counts as a pixel of smaller feature, in the mean and in the sum, as it does when rendered.
+    points   squares ``|f_g - Mbar_i|^2`` weighted by A_ig, over P. N_i is the mask's *blended weight*, the sum of row i
+             of A, so that coverage does not look like feature: it is ``sum_g c_g |f_g|^2 - sum_i N_i |Mbar_i|^2`` with
+             ``c = A' 1``. By Jensen's inequality it bounds the sum over pixels of ``|M_p - a_p Mbar_i|^2``, a_p the
+             pixel's coverage, which is the printed loss where a_p = 1; it asks for more: each Gaussian agrees, not only
+             each blend.
+    authors  (with "points") distances not squared: mean over a mask's weight, then over a view's masks, then views.
+             Below ROUNDING the distance is rounded off, as it has no gradient at zero. (Their code takes the distances
+             of pixels that are covered by 0.7 or more: not a function of A.)
+
+Dividing Eq. 1 by P makes its weight mean the same at any image size; it is else the paper's sum over a random view.
+With raw features the weight sets the features' scale only: Eq. 1 grows as its square, Eq. 2 falls as its square.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+
+from og_pointcloud.errors import SceneError
+from og_pointcloud.fitting.mask_table import Gaussians, MaskTable, pixel_weights
+from og_pointcloud.kernels import njit, prange
+from og_pointcloud.scene import View
+from og_pointcloud.settings import FeatureSettings, PaperSettings
+
+__all__ = [
+    "FeatureObjective",
+    "LearnedFeatures",
+    "MaskGram",
+    "Terms",
+    "cohesion_factor",
+    "learn_features",
+    "masked_gram",
+    "raw_gradient",
+    "read_features",
+]
+
+COHESION_WEIGHT = {"paper": 10.0, "authors": 0.1}
+"""Of Eq. 1 where none is set: the authors' own, and one that weighs squares, which are that much smaller, alike."""
+ROUNDING = 1e-3
+"""Distances are rounded off below this where they are not squared: sqrt(d^2 + ROUNDING^2)."""
+HOMOTOPY = 4.0
+"""The closest distance that Eq. 2 tells apart shrinks by this factor between rounds."""
+COARSE_TOLERANCE = 10.0
+"""Rounds before the last need not converge as far, by this factor."""
+WINDOW = 10
+"""Steps over which the fall of the objective is measured."""
+LEVEL = 0.01
+"""The fall is relative to the objective, but to no less than this share of its first value: it may tend to zero."""
+MEMORY = 6
+"""Steps remembered by L-BFGS (Nocedal & Wright 2006, Sec. 7.2; 3 to 20 are usual)."""
+DOT_PART = 8192
+"""Length of the partial sums of dot products, each in float32."""
+REACH = 0.5
+"""No feature moves farther than this in a step; they lie on, or in, the unit ball."""
+SUFFICIENT = 1e-4
+"""Armijo's share of the fall that the slope promises (Nocedal & Wright, Eq. 3.4)."""
+HALVINGS = 20
+"""A step is halved at most so often."""
+KICK = 0.1
+"""Where two means have met, mask-wise random directions of this length are added."""
+MET = 1e-3
+"""Means nearer than this have met. (Features lie on, or in, the unit ball.)"""
+
+
+@dataclass(frozen=True)
+class MaskGram:
+    """matrix: (n, n) sparse float32, symmetric, ``sum W_p' W_p`` over the pixels p in a mask, all views.
+    pixels: (masks,) int64, pixels of each mask at the resolution of those views, stacked view by view."""
+
+    matrix: csr_array
+    pixels: NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Terms:
+    """separation: mean over views of Eq. 2. cohesion: Eq. 1 over all masked pixels. objective: their weighted sum,
+    without the terms that are off. gradient: of the objective, (n, width) in the features' dtype."""
+
+    separation: float
+    cohesion: float
+    objective: float
+    gradient: NDArray[np.floating]
+
+
+@dataclass(frozen=True)
+class LearnedFeatures:
+    """Features of n Gaussians and how they were found.
+
+    features: (n, width) float32 as read (see `read_features`); rows of zeros where no mask sees the Gaussian.
+    seen: (n,) float64, pixels of blending weight in masks; 0: the feature says nothing.
+    objective, separation, cohesion: (steps + 1,) float64, before the first and after every step.
+    closest: (steps + 1,) float64, the distance below which Eq. 2 was bounded. The objective falls while it is constant.
+    converged: False where `FeatureSettings.max_steps` came first.
+    """
+
+    features: NDArray[np.float32]
+    seen: NDArray[np.float64]
+    objective: NDArray[np.float64]
+    separation: NDArray[np.float64]
+    cohesion: NDArray[np.float64]
+    closest: NDArray[np.float64]
+    converged: bool
+
+    @property
+    def steps(self) -> int:
+        """Accepted steps."""
+        return len(self.objective) - 1
+
+
+def learn_features(
+    table: MaskTable,
+    settings: FeatureSettings | None = None,
+    seed: int = 0,
+    *,
+    gram: MaskGram | None = None,
+    start: NDArray[np.floating] | None = None,
+    progress: Callable[[int, float], None] | None = None,
+) -> LearnedFeatures:
+    """Features that agree within masks and differ between the masks of a view, by L-BFGS on all views at once.
+
+    gram: of the table's own Gaussians and views; needed for cohesion "rendered" only.
+    start: (n, width), not yet read; else `FeatureSettings.start` says where each Gaussian starts, seeded. Where two
+        means of a view have met, the gradient vanishes by symmetry: random directions of the masks then part them.
+    progress: called after each step with its number and the objective.
+
+    Steps are preconditioned by each Gaussian's visible weight, shortened until the objective falls enough, and no
+    feature moves farther than REACH in one. The same input and seed give the same features. Raises SceneError if no
+    mask shows a Gaussian, or if the gram is missing or of other masks.
+    """
+    settings = settings or FeatureSettings()
+    problem = FeatureObjective(table, settings, gram)
+    rng = np.random.default_rng(seed)
+    random = rng.normal(size=(problem.mask_count, settings.width))
+    directions = problem.uplift((random / np.linalg.norm(random, axis=1, keepdims=True)).astype(np.float32))
+    if start is None and settings.start == "random":
+        start = rng.normal(size=(table.weights.shape[1], settings.width))
+    if start is None:
+        begin = directions / np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-6)
+    else:
+        begin = np.array(start, np.float32)[problem.shown]
+        if settings.inter and problem.have_met(read_features(begin, settings.normalise)):
+            begin += KICK * directions
+    descent = _Descent(problem, begin, progress)
+    for share in _closest_shares(settings):
+        typical = problem.typical_distance(read_features(descent.raw, settings.normalise))
+        descent.run(share * typical, last=share == settings.closest)
+    features = np.zeros((table.weights.shape[1], settings.width), np.float32)
+    features[problem.shown] = read_features(descent.raw, settings.normalise)
+    objective, separation, cohesion, closest = np.array(descent.history).T
+    return LearnedFeatures(features, problem.seen, objective, separation, cohesion, closest, descent.converged)
+
+
+def masked_gram(gaussians: Gaussians, views: Iterable[View], near: float) -> MaskGram:
+    """S of Eq. 1 as a quadratic form: which Gaussians share the pixels of masks, and how much, over all views.
+
+    Gaussians, views and near plane are those of the mask table, thinned alike. One view's pixels are held at a time,
+    and sums of two to the power of k views, so that each product is added log(views) times.
+    """
+    sums: list[Any] = []  # scipy's sums lose the number of dimensions
+    pixels = [np.zeros(0, np.int64)]
+    for count, view in enumerate(views, start=1):
+        ids = view.mask_map().ravel()
+        weights = pixel_weights(gaussians, view.camera, near)[np.flatnonzero(ids >= 0)]
+        sums.append(weights.T @ weights)
+        pixels.append(np.bincount(ids[ids >= 0], minlength=view.mask_count))
+        while count % 2 == 0:
+            sums[-2:] = [sums[-2] + sums[-1]]
+            count //= 2
+    matrix: Any = sum(sums, csr_array((len(gaussians), len(gaussians)), dtype=np.float32))
+    return MaskGram(csr_array(matrix), np.concatenate(pixels))
+
+
+def read_features(raw: NDArray[np.floating], normalise: bool) -> NDArray[np.floating]:
+    """What the losses see of a raw feature (n, width): its direction mapped to [0, 1], or itself within the unit ball.
+
+    The ball: with raw features Eq. 2 alone, and with Eq. 1 wherever masks share no Gaussian, is smallest at infinity.
+    A zero row has no direction; normalised, it reads 0.5.
+    """
+    return _read(raw, normalise, _columns(raw))
+
+
+def raw_gradient(raw: NDArray[np.floating], gradient: NDArray[np.floating], normalise: bool) -> NDArray[np.floating]:
+    """The gradient by raw features (n, width), of the one by what `read_features` makes of them."""
+    return _raw_gradient(raw, gradient, normalise, _columns(raw))
+
+
+def _closest_shares(settings: FeatureSettings) -> list[float]:
+    """Shares of the typical distance below which Eq. 2 is bounded, from the easiest problem to the one asked for."""
+    shares = [settings.closest]
+    while settings.inter and settings.formula == "paper" and shares[0] < 1:
+        shares.insert(0, min(1.0, shares[0] * HOMOTOPY))
+    return shares
+
+
+def cohesion_factor(settings: FeatureSettings | PaperSettings) -> float:
+    """What Eq. 1 is multiplied with beside Eq. 2; 0 where it is off."""
+    weight = settings.cohesion_weight
+    return settings.intra * (COHESION_WEIGHT[settings.formula] if weight is None else weight)
+
+
+class FeatureObjective:
+    """Value and gradient of the losses over all views, for features as read.
+
+    Only Gaussians that a mask shows take part: ``shown`` (k,) are their rows, all features here are (k, width).
+    ``seen`` (n,) float64 is the blending weight of all Gaussians in masks, ``weight`` (k, 1) float32 that of the shown.
+    Masks that show none are left out.
+    """
+
+    def __init__(self, table: MaskTable, settings: FeatureSettings, gram: MaskGram | None = None) -> None:
+        self.settings = settings
+        # In float64: where features agree, Eq. 1 is a small difference of large sums. (scipy's own sums stay float32.)
+        weight = table.weights @ np.ones(table.weights.shape[1])
+        self.seen = np.bincount(table.weights.indices, table.weights.data, table.weights.shape[1]).astype(np.float64)
+        self.shown = np.flatnonzero(self.seen > 0)
+        self.weight = self.seen[self.shown, None].astype(np.float32)
+        kept = np.flatnonzero(weight > 0)
+        if len(kept) == 0:
+            raise SceneError(
+                f"none of the {len(weight)} masks shows a Gaussian; expected at least one: make masks, and check that "
+                "poses and cloud share one frame"
+            )
+        self._weights = _int32(table.weights[kept][:, self.shown])
+        self._weights.sort_indices()  # neighbouring rows of the features are then read one after another
+        self._transposed = _int32(csr_array(self._weights.T))
+        self._first = np.flatnonzero(np.diff(table.mask_view[kept], prepend=-1, append=-2))
+        self._gram, self._size = None, weight[kept]
+        if settings.cohesion == "rendered":
+            if gram is None or gram.pixels.shape != weight.shape or gram.matrix.shape[0] != len(self.seen):
+                found = "none" if gram is None else f"one of {len(gram.pixels)} masks, {gram.matrix.shape[0]} Gaussians"
+                raise SceneError(
+                    f'cohesion "rendered" needs the gram of {len(weight)} masks and {len(self.seen)} Gaussians; got '
+                    f"{found}: make it with masked_gram from the table's Gaussians and views"
+                )
+            self._gram, self._size = (
+                _int32(gram.matrix[self.shown][:, self.shown]),
+                gram.pixels[kept].astype(np.float64),
+            )
+
+    @property
+    def mask_count(self) -> int:
+        """Masks that show a Gaussian."""
+        return len(self._size)
+
+    def mask_means(self, features: NDArray[np.floating]) -> NDArray[np.float64]:
+        """(masks, width) float64, ``diag(1 / N) A F``."""
+        return _product(*_arrays(self._weights), features, _columns(features)) / self._size[:, None]
+
+    def uplift(self, of_masks: NDArray[np.float32]) -> NDArray[np.float32]:
+        """(k, width): the mean of rows of masks, by how much each shows of a Gaussian."""
+        return (_product(*_arrays(self._transposed), of_masks, _columns(of_masks)) / self.weight).astype(np.float32)
+
+    def typical_distance(self, features: NDArray[np.floating]) -> float:
+        """Root mean square distance between the mask means of a view, over all pairs; 1 where there is no pair."""
+        squares, pairs, _ = _pair_distances(self.mask_means(features), self._first)
+        return float(np.sqrt(squares / pairs)) if pairs and squares > 0 else 1.0
+
+    def have_met(self, features: NDArray[np.floating]) -> bool:
+        """Whether two mask means of a view are too near to be told apart by the gradient of Eq. 2."""
+        return _pair_distances(self.mask_means(features), self._first)[2] <= MET**2
+
+    def terms(self, features: NDArray[np.floating], closest: float) -> Terms:
+        """Both losses at features (k, width) as read; formula "paper": Eq. 2 bounded below the distance ``closest``."""
+        settings, views = self.settings, len(self._first) - 1
+        features = np.ascontiguousarray(features)
+        means = self.mask_means(features)
+        rank_weights = settings.formula == "authors"
+        bound = 1.0 if rank_weights else closest**2
+        separation, pull = _separation(means, self._first, bound, rank_weights)
+        separation, pull = float(separation) / views, pull * (settings.inter / views)
+        factor = cohesion_factor(settings)
+        cohesion, own, mean_pull = self._cohesion(features, means)
+        pull = (pull + factor * mean_pull) / self._size[:, None]
+        gradient = _product(*_arrays(self._transposed), pull, _columns(pull)) + factor * own
+        objective = settings.inter * separation + factor * cohesion
+        return Terms(separation, cohesion, objective, gradient.astype(features.dtype))
+
+    def _cohesion(
+        self, features: NDArray[np.floating], means: NDArray[np.float64]
+    ) -> tuple[float, NDArray[np.float64], NDArray[np.float64]]:
+        """Eq. 1, its gradient by features with the means held, and its gradient by the means (masks, width)."""
+        if self.settings.formula == "authors":
+            masks_of_view = np.repeat(np.diff(self._first), np.diff(self._first))
+            share = 1 / (self._size * masks_of_view * (len(self._first) - 1))
+            value, by_mean = _distances(*_arrays(self._weights), features, means, share, _columns(features))
+            by_feature = _distance_gradient(*_arrays(self._transposed), features, means, share, _columns(features))
+            return float(value), by_feature, by_mean
+        total = self._size.sum()
+        if self._gram is None:
+            blended = self.seen[self.shown, None] * features
+        else:
+            blended = _product(*_arrays(self._gram), features, _columns(features))
+        spread = float((features * blended).sum() - (self._size[:, None] * means**2).sum())
+        return float(spread / total), 2 / total * blended, -2 / total * self._size[:, None] * means
+
+
+class _Descent:
+    """Limited-memory BFGS with a diagonal preconditioner, a bound on each feature's step, and backtracking."""
+
+    def __init__(
+        self, problem: FeatureObjective, raw: NDArray[np.float32], progress: Callable[[int, float], None] | None
+    ) -> None:
+        self.problem, self.raw, self.progress = problem, np.ascontiguousarray(raw), progress
+        self.history: list[tuple[float, float, float, float]] = []
+        self.converged = False
+
+    def run(self, closest: float, *, last: bool) -> None:
+        """Descend until the objective hardly falls. ``closest`` changes the objective, so curvature is forgotten."""
+        settings = self.problem.settings
+        tolerance = settings.tolerance * (1 if last else COARSE_TOLERANCE)
+        pairs: list[tuple[NDArray[np.float32], NDArray[np.float32], float]] = []
+        value, gradient = self._evaluate(self.raw, closest)
+        values = [value.objective]
+        if not self.history:
+            self.history.append((value.objective, value.separation, value.cohesion, closest))
+        while len(self.history) <= settings.max_steps:
+            step = self._step(gradient, pairs)
+            moved = self._backtrack(step, gradient, values[-1], closest)
+            if moved is None and pairs:
+                pairs.clear()  # the remembered curvature misled: try the plain gradient before giving up
+                continue
+            if moved is None:
+                self.converged = last  # no step lowers the objective by more than rounding
+                return
+            raw, value, new_gradient = moved
+            _remember(pairs, raw - self.raw, new_gradient - gradient)
+            self.raw, gradient = raw, new_gradient
+            values.append(value.objective)
+            self.history.append((value.objective, value.separation, value.cohesion, closest))
+            if self.progress:
+                self.progress(len(self.history) - 1, value.objective)
+            least = tolerance * max(values[-1], LEVEL * self.history[0][0])
+            if len(values) > WINDOW and values[-1 - WINDOW] - values[-1] < least:
+                self.converged = last
+                return
+
+    def _evaluate(self, raw: NDArray[np.float32], closest: float) -> tuple[Terms, NDArray[np.float32]]:
+        normalise = self.problem.settings.normalise
+        terms = self.problem.terms(read_features(raw, normalise), closest)
+        return terms, raw_gradient(raw, terms.gradient, normalise)
+
+    def _step(
+        self, gradient: NDArray[np.float32], pairs: list[tuple[NDArray[np.float32], NDArray[np.float32], float]]
+    ) -> NDArray[np.float32]:
+        """A direction of descent that moves no feature farther than REACH."""
+        steepest = -gradient / self.problem.weight
+        if not pairs:
+            longest = float(np.linalg.norm(steepest, axis=1).max())
+            return steepest * np.float32(REACH / longest if longest > 0 else 0)
+        step = _within_reach(_two_loops(gradient, pairs, np.float32(1) / self.problem.weight))
+        # Shortening single rows can turn a direction of descent; rows of the gradient itself cannot turn.
+        return step if _dot(step, gradient) < 0 else _within_reach(steepest)
+
+    def _backtrack(
+        self, step: NDArray[np.float32], gradient: NDArray[np.float32], value: float, closest: float
+    ) -> tuple[NDArray[np.float32], Terms, NDArray[np.float32]] | None:
+        slope = _dot(step, gradient)
+        length = 1.0
+        for _ in range(HALVINGS):
+            raw = self.raw + np.float32(length) * step
+            terms, raw_gradient = self._evaluate(raw, closest)
+            if terms.objective < value + SUFFICIENT * length * slope:
+                return raw, terms, raw_gradient
+            length /= 2
+        return None
+
+
+def _two_loops(
+    gradient: NDArray[np.float32],
+    pairs: list[tuple[NDArray[np.float32], NDArray[np.float32], float]],
+    preconditioner: NDArray[np.float32],
+) -> NDArray[np.float32]:
+    """Minus the remembered inverse Hessian times the gradient (Nocedal & Wright, Algorithm 7.4)."""
+    direction = -gradient
+    shares = []
+    for moved, turned, curvature in reversed(pairs):
+        share = _dot(moved, direction) / curvature
+        shares.append(share)
+        _add(direction, np.float32(-share), turned)
+    _, turned, curvature = pairs[-1]
+    direction *= preconditioner * np.float32(curvature / _dot(turned, turned * preconditioner))
+    for (moved, turned, curvature), share in zip(pairs, reversed(shares), strict=True):
+        _add(direction, np.float32(share - _dot(turned, direction) / curvature), moved)
+    return direction
+
+
+def _remember(
+    pairs: list[tuple[NDArray[np.float32], NDArray[np.float32], float]],
+    moved: NDArray[np.float32],
+    turned: NDArray[np.float32],
+) -> None:
+    """Keep a step and its change of gradient, unless the objective curved downward or hardly at all along it."""
+    curvature = _dot(moved, turned)
+    if curvature > 1e-6 * np.sqrt(_dot(moved, moved) * _dot(turned, turned)):
+        pairs.append((moved, turned, curvature))
+        del pairs[:-MEMORY]
+
+
+def _within_reach(step: NDArray[np.float32]) -> NDArray[np.float32]:
+    return step * np.minimum(1, REACH / np.maximum(np.linalg.norm(step, axis=1, keepdims=True), REACH))
+
+
+def _dot(a: NDArray[np.float32], b: NDArray[np.float32]) -> float:
+    """Sum of products, in parts that no library spreads over threads: the order is always the same."""
+    a, b = a.ravel(), b.ravel()
+    return sum(float(a[i : i + DOT_PART] @ b[i : i + DOT_PART]) for i in range(0, len(a), DOT_PART))
+
+
+def _int32(matrix: csr_array) -> csr_array:
+    index = (matrix.indices.astype(np.int32), matrix.indptr.astype(np.int64))
+    return csr_array((matrix.data, *index), shape=matrix.shape)
+
+
+def _arrays(matrix: csr_array) -> tuple[NDArray[np.integer], NDArray[np.integer], NDArray[np.floating]]:
+    return matrix.indptr, matrix.indices, matrix.data
+
+
+def _columns(values: NDArray[np.floating]) -> tuple[int, ...]:
+    """A tuple as long as a row: its length is part of its type, so that the kernels' inner loops are unrolled."""
+    return (0,) * values.shape[1]
+
+
+@njit(cache=True, parallel=True)
+def _product(indptr, indices, data, dense, columns):  # noqa: ANN001, ANN202
+    """CSR matrix times (n, width), summed in float64: (rows, width) float64."""
+    out = np.zeros((len(indptr) - 1, len(columns)))
+    for row in prange(len(indptr) - 1):
+        for e in range(indptr[row], indptr[row + 1]):
+            other, weight = indices[e], np.float64(data[e])
+            for c in range(len(columns)):
+                out[row, c] += weight * dense[other, c]
+    return out
+
+
+@njit(cache=True, parallel=True)
+def _read(raw, normalise, columns):  # noqa: ANN001, ANN202
+    read = np.empty_like(raw)
+    for g in prange(len(raw)):
+        square = 0.0
+        for c in range(len(columns)):
+            square += np.float64(raw[g, c]) ** 2
+        length = np.sqrt(square)
+        for c in range(len(columns)):
+            if normalise:
+                read[g, c] = 0.5 + 0.5 * raw[g, c] / length if length > 0 else 0.5
+            else:
+                read[g, c] = raw[g, c] / max(length, 1.0)
+    return read
+
+
+@njit(cache=True, parallel=True)
+def _raw_gradient(raw, gradient, normalise, columns):  # noqa: ANN001, ANN202
+    pulled = np.empty_like(raw)
+    for g in prange(len(raw)):
+        square, along = 0.0, 0.0
+        for c in range(len(columns)):
+            square += np.float64(raw[g, c]) ** 2
+            along += np.float64(raw[g, c]) * gradient[g, c]
+        length = np.sqrt(square)
+        for c in range(len(columns)):
+            across = gradient[g, c] - raw[g, c] * along / square if square > 0 else 0.0
+            if normalise:
+                pulled[g, c] = 0.5 * across / length if length > 0 else 0.0
+            else:
+                pulled[g, c] = across / length if length > 1 else gradient[g, c]
+    return pulled
+
+
+@njit(cache=True, parallel=True)
+def _add(values, factor, others):  # noqa: ANN001, ANN202
+    """values += factor * others, in place; factor float32."""
+    values, others = values.ravel(), others.ravel()
+    for i in prange(len(values)):
+        values[i] += factor * others[i]
+
+
+@njit(cache=True)
+def _pair_distances(means, first):  # noqa: ANN001, ANN202
+    """Sum of squared distances over the pairs of each view, number of pairs, smallest squared distance."""
+    total, pairs, nearest = 0.0, 0, np.inf
+    for view in range(len(first) - 1):
+        for i in range(first[view], first[view + 1]):
+            for j in range(first[view], i):
+                square = 0.0
+                for c in range(means.shape[1]):
+                    square += (means[i, c] - means[j, c]) ** 2
+                total += square
+                pairs += 1
+                nearest = min(nearest, square)
+    return total, pairs, nearest
+
+
+@njit(cache=True)
+def _separation(means, first, bound, rank_weights):  # noqa: ANN001, ANN202
+    """Eq. 2 summed over views, 1 / (d^2 + bound), and its gradient by the means (masks, width)."""
+    total = 0.0
+    gradient = np.zeros_like(means)
+    for view in range(len(first) - 1):
+        begin, count = first[view], first[view + 1] - first[view]
+        if count < 2:
+            continue
+        near = np.zeros(count)
+        for i in range(begin, begin + count):
+            for j in range(begin, begin + count):
+                square = 0.0
+                for c in range(means.shape[1]):
+                    square += (means[i, c] - means[j, c]) ** 2
+                near[j - begin] = 1.0 / (square + bound) if j != i else 0.0
+            weight = np.full(count, 1.0 / (count * (count - 1)))
+            if rank_weights:
+                weight[np.argsort(near, kind="mergesort")] *= 0.1 + 0.9 * np.arange(count) / (count - 1)
+            for j in range(begin, begin + count):
+                part = near[j - begin] * weight[j - begin]
+                total += part
+                slope = -2.0 * part * near[j - begin]
+                for c in range(means.shape[1]):
+                    turn = slope * (means[i, c] - means[j, c])
+                    gradient[i, c] += turn
+                    gradient[j, c] -= turn
+    return total, gradient
+
+
+@njit(cache=True, parallel=True)
+def _distances(indptr, indices, data, features, means, share, columns):  # noqa: ANN001, ANN202
+    """Sum over masks of share times the weighted rounded distances to the mean; its gradient by the means."""
+    values = np.zeros(len(means))
+    gradient = np.zeros(means.shape)
+    for mask in prange(len(means)):
+        for e in range(indptr[mask], indptr[mask + 1]):
+            g, square = indices[e], ROUNDING**2
+            for c in range(len(columns)):
+                square += (features[g, c] - means[mask, c]) ** 2
+            distance, weight = np.sqrt(square), share[mask] * data[e]
+            values[mask] += weight * distance
+            for c in range(len(columns)):
+                gradient[mask, c] -= weight * (features[g, c] - means[mask, c]) / distance
+    return values.sum(), gradient
+
+
+@njit(cache=True, parallel=True)
+def _distance_gradient(indptr, indices, data, features, means, share, columns):  # noqa: ANN001, ANN202
+    """The gradient of `_distances` by the features, the means held. The matrix is transposed: a row per Gaussian."""
+    gradient = np.zeros((len(features), len(columns)))
+    for g in prange(len(features)):
+        for e in range(indptr[g], indptr[g + 1]):
+            mask, square = indices[e], ROUNDING**2
+            for c in range(len(columns)):
+                square += (features[g, c] - means[mask, c]) ** 2
+            factor = share[mask] * data[e] / np.sqrt(square)
+            for c in range(len(columns)):
+                gradient[g, c] += factor * (features[g, c] - means[mask, c])
+    return gradient

@@ -1,0 +1,261 @@
+"""Instances + masks -> which masks show which instance (paper, Sec. 3.3, Eq. 5), where no grouping says it already.
+
+    S_ij = IoU(pi(M_i), B_j) * (1 - |M_i - P_j|_1)
+
+of the map M_i of instance i, binarised by pi, and mask j of a view, B_j, filled with its feature, P_j. The paper
+renders each instance by itself in every view (`alone_evidence`). What an instance shows among the others, with true
+occlusion, is a product with the mask table and needs no rendering at all (`visible_evidence`). Per view the mask with
+the best score is accepted, if that is good enough; the encoder's features of accepted masks describe the instance.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from og_pointcloud.cloud import InstanceTable
+from og_pointcloud.fitting.association import directions, robust_mean
+from og_pointcloud.fitting.learned.codebook import cluster_weights
+from og_pointcloud.fitting.mask_table import FRUSTUM_MARGIN, Gaussians, MaskTable, view_weights
+from og_pointcloud.scene import Camera, View
+from og_pointcloud.settings import AssociationSettings, MatchingSettings
+
+__all__ = ["Evidence", "Matching", "alone_evidence", "eq5_scores", "match_masks", "visible_evidence"]
+
+
+SPLIT_ROUNDS = 10
+"""Rounds of 2-means over the views of one instance; two or three settle it."""
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What Eq. 5 compares, of all masks and K instances. Areas in pixels.
+
+    shared: (masks, K) float64, what mask and instance have in common. mask_area: (masks,) float64.
+    instance_area: (views, K) float64. distance: (masks, K) float64, L1 distance of their features, summed over the
+    channels; infinite where they have nothing in common.
+    """
+
+    shared: NDArray[np.float64]
+    mask_area: NDArray[np.float64]
+    instance_area: NDArray[np.float64]
+    distance: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Matching:
+    """instances: K rows of evidence; an instance that no mask was accepted for has no descriptor, it is unknown.
+    mask_instance: (masks,) int32, the instance that accepted the mask, with the best score where several did, -1 none.
+    """
+
+    instances: InstanceTable
+    mask_instance: NDArray[np.int32]
+
+
+def visible_evidence(
+    table: MaskTable,
+    instance_ids: NDArray[np.int32],
+    instance_features: NDArray[np.floating],
+    mask_features: NDArray[np.floating],
+) -> Evidence:
+    """What each mask shows of each instance among all others, in pixels of blending weight.
+
+    instance_ids: (n,) int32, below 0 none. instance_features: (K, width), one per instance. mask_features:
+    (masks, width), the mean instance feature that each mask shows (not the encoder's).
+    A mask's area is what it shows of the cloud: pixels in which it has no point do not count.
+    """
+    count = len(instance_features)
+    shared = cluster_weights(table.weights, instance_ids, count)
+    instance_area = cluster_weights(table.outside, instance_ids, count)
+    np.add.at(instance_area, table.mask_view, shared)
+    distance = np.zeros_like(shared)
+    for of_masks, of_instances in zip(mask_features.T, instance_features.T, strict=True):
+        distance += np.abs(of_masks[:, None].astype(np.float64) - of_instances)
+    distance[shared == 0] = np.inf
+    return Evidence(shared, np.asarray(table.weights.sum(axis=1), np.float64), instance_area, distance)
+
+
+def alone_evidence(
+    gaussians: Gaussians,
+    views: Sequence[View],
+    near: float,
+    instance_ids: NDArray[np.int32],
+    instance_features: NDArray[np.floating],
+    mask_features: NDArray[np.floating],
+    covered_share: float = 0.7,
+) -> Evidence:
+    """The paper's evidence: each instance rendered by itself in every view, as if nothing stood before it.
+
+    Its pixels are those it covers by more than ``covered_share`` (pi; 0.7 in the authors' code); the distance is the
+    mean over those of them that lie in the mask. Instances without a Gaussian before the camera are not rendered.
+    One rendering per instance and view: slow. near: depth of the near plane; the rest as in `visible_evidence`.
+    """
+    count = len(instance_features)
+    first = np.cumsum([0, *(view.mask_count for view in views)])
+    shared = np.zeros((first[-1], count))
+    distance = np.full((first[-1], count), np.inf)
+    mask_area = np.zeros(first[-1])
+    instance_area = np.zeros((len(views), count))
+    members = [_subset(gaussians, np.flatnonzero(instance_ids == instance)) for instance in range(count)]
+    for index, view in enumerate(views):
+        rows = slice(first[index], first[index + 1])
+        ids = view.mask_map().ravel()
+        mask_area[rows] = np.bincount(ids[ids >= 0], minlength=view.mask_count)
+        for instance, own in enumerate(members):
+            if not _in_image(own, view.camera, near):
+                continue
+            alpha = _alpha(own, view.camera, near)
+            covered = alpha > covered_share
+            instance_area[index, instance] = covered.sum()
+            both = covered & (ids >= 0)
+            common = np.bincount(ids[both], minlength=view.mask_count)
+            rendered = alpha[both, None] * instance_features[instance]
+            apart = np.abs(rendered - mask_features[rows][ids[both]]).sum(axis=1)
+            total = np.bincount(ids[both], apart, view.mask_count)
+            shared[rows, instance] = common
+            distance[rows, instance] = np.where(common > 0, total / np.maximum(common, 1), np.inf)
+    return Evidence(shared, mask_area, instance_area, distance)
+
+
+def eq5_scores(evidence: Evidence, mask_view: NDArray[np.int32], settings: MatchingSettings) -> NDArray[np.float64]:
+    """(masks, K) float64 in [0, 1]: Eq. 5, or one of its factors alone."""
+    union = evidence.instance_area[mask_view] + evidence.mask_area[:, None] - evidence.shared
+    iou = np.divide(evidence.shared, union, out=np.zeros_like(union), where=union > 0)
+    likeness = np.maximum(1 - evidence.distance, 0)
+    return {"both": iou * likeness, "iou": iou, "feature": likeness}[settings.score]
+
+
+def match_masks(
+    table: MaskTable,
+    instance_ids: NDArray[np.int32],
+    evidence: Evidence,
+    settings: MatchingSettings,
+    association: AssociationSettings | None = None,
+) -> Matching:
+    """Accept masks for instances and describe these by what the encoder saw in their masks.
+
+    In every view an instance takes the mask with its best score, if that exceeds the threshold; with fewer than
+    ``min_views`` of them it has none. Masks without a feature (zero rows) are evidence, but in no descriptor.
+    """
+    scores = eq5_scores(evidence, table.mask_view, settings)
+    masks, owners = _accepted(scores, table.mask_view, settings)
+    count = scores.shape[1]
+    weight = np.ones(len(masks))
+    if settings.integration == "weighted":
+        weight = evidence.shared[masks, owners] * scores[masks, owners]
+    deviations = (association or AssociationSettings()).outlier_deviations
+    features = directions(table.mask_features)
+    rows, row_owner = [], []
+    agreement = np.zeros(count, np.float32)
+    for instance in range(count):
+        mine = (owners == instance) & features[masks].any(axis=1)
+        descriptors, agreement[instance] = _describe(features[masks[mine]], weight[mine], deviations, settings)
+        rows += descriptors
+        row_owner += [instance] * len(descriptors)
+    area = np.bincount(owners, evidence.shared[masks, owners], count)
+    accepted = np.bincount(owners, minlength=count).astype(np.int32)
+    instances = InstanceTable(
+        descriptors=np.array(rows, np.float32).reshape(-1, features.shape[1]),
+        descriptor_instance=np.array(row_owner, np.int32),
+        points=np.bincount(instance_ids[instance_ids >= 0], minlength=count).astype(np.int32),
+        views=accepted,
+        masks=accepted.copy(),
+        agreement=agreement,
+        visible_area=area.astype(np.float32),
+    )
+    return Matching(instances, _best_owner(masks, owners, scores))
+
+
+def _accepted(
+    scores: NDArray[np.float64], mask_view: NDArray[np.int32], settings: MatchingSettings
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Pairs (mask, instance), at most one for each view and instance, by instance and view."""
+    best = []
+    for view in np.unique(mask_view):
+        rows = np.flatnonzero(mask_view == view)
+        best.append(rows[scores[rows].argmax(axis=0)])
+    if not best or scores.shape[1] == 0:
+        return np.zeros(0, np.int64), np.zeros(0, np.int64)
+    masks = np.stack(best, axis=1)  # (K, views that have masks)
+    good = np.take_along_axis(scores.T, masks, axis=1) > settings.threshold
+    good[good.sum(axis=1) < settings.min_views] = False
+    return masks[good], np.nonzero(good)[0]
+
+
+def _best_owner(masks: NDArray[np.int64], owners: NDArray[np.int64], scores: NDArray[np.float64]) -> NDArray[np.int32]:
+    owner = np.full(len(scores), -1, np.int32)
+    by_score = np.argsort(scores[masks, owners], kind="stable")
+    owner[masks[by_score]] = owners[by_score]
+    return owner
+
+
+def _describe(
+    features: NDArray[np.float64], weight: NDArray[np.float64], deviations: float, settings: MatchingSettings
+) -> tuple[list[NDArray[np.float64]], float]:
+    """The descriptors of one instance, none, one or two, and the mean cosine of its masks with theirs."""
+    groups = [np.arange(len(features))]
+    if settings.split:
+        groups = _split(features, weight, settings) or groups
+    rows, cosines, weights = [], [], []
+    for group in groups:
+        allowed = np.inf if settings.integration == "equal" else deviations
+        row, kept, cosine = robust_mean(features[group], weight[group], allowed)
+        if row is not None:
+            rows.append(row)
+            cosines.append(cosine[kept])
+            weights.append(weight[group][kept])
+    return rows, float(np.average(np.concatenate(cosines), weights=np.concatenate(weights))) if rows else 0.0
+
+
+def _split(
+    features: NDArray[np.float64], weight: NDArray[np.float64], settings: MatchingSettings
+) -> list[NDArray[np.int64]] | None:
+    """Two groups of views that clearly see different things, or None, as for most instances.
+
+    2-means on the sphere from the least alike pair. The groups are separate when views of one group are more alike
+    (all but a tenth of their pairs) than views of different groups (all but a tenth): a comparison of ranks, so that
+    it holds for any encoder's cosines. Noise spreads views evenly and fails it; a few wrong masks do not reach
+    ``split_views`` and ``split_share`` and are outliers, not a second look.
+    """
+    if len(features) < 2 * settings.split_views:
+        return None
+    cosines = features @ features.T
+    centres = features[list(np.unravel_index(cosines.argmin(), cosines.shape))]
+    second = features @ centres[1] > features @ centres[0]
+    for _ in range(SPLIT_ROUNDS):
+        centres = np.stack([weight[~second] @ features[~second], weight[second] @ features[second]])
+        centres /= np.maximum(np.linalg.norm(centres, axis=1, keepdims=True), 1e-12)
+        second = features @ centres[1] > features @ centres[0]
+    views = min(second.sum(), (~second).sum())
+    share = min(weight[second].sum(), weight[~second].sum()) / max(weight.sum(), 1e-300)
+    if views < settings.split_views or share < settings.split_share:
+        return None
+    same = second[:, None] == second
+    within = cosines[same & ~np.eye(len(features), dtype=bool)]
+    if np.quantile(within, 0.1) <= np.quantile(cosines[~same], 0.9):
+        return None
+    return [np.flatnonzero(~second), np.flatnonzero(second)]
+
+
+def _subset(gaussians: Gaussians, index: NDArray[np.int64]) -> Gaussians:
+    return Gaussians(gaussians.xyz[index], gaussians.scale[index], gaussians.rotation[index], gaussians.opacity[index])
+
+
+def _in_image(gaussians: Gaussians, camera: Camera, near: float) -> bool:
+    """Whether any centre lies before the camera and in the image, or within the margin that splats reach in from."""
+    x, y, depth = camera.world_to_camera[:3, :3] @ gaussians.xyz.T + camera.world_to_camera[:3, 3:]
+    before = depth > near
+    u = camera.fx * x[before] / depth[before] + camera.cx - 0.5 * camera.width
+    v = camera.fy * y[before] / depth[before] + camera.cy - 0.5 * camera.height
+    reach = 0.5 + 0.5 * FRUSTUM_MARGIN
+    return bool(((np.abs(u) < reach * camera.width) & (np.abs(v) < reach * camera.height)).any())
+
+
+def _alpha(gaussians: Gaussians, camera: Camera, near: float) -> NDArray[np.float64]:
+    """(H W,) float64: how much the Gaussians cover each pixel."""
+    pixels = camera.width * camera.height
+    ids = np.arange(pixels, dtype=np.int32).reshape(camera.height, camera.width)
+    return np.asarray(view_weights(gaussians, camera, ids, pixels, near).rows[:-1].sum(axis=1), np.float64)

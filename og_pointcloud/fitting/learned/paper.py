@@ -1,0 +1,523 @@
+"""OpenGaussian as published (paper, Sec. 3.1 and 3.2): features and codebook trained by rendering, one view a step.
+
+The reference that the fast forms (features.py, codebook.py) are held against, in error and in time. A step draws a
+view, renders the feature map ``M = W F`` with the view's frozen blending weights, takes the losses on its pixels, and
+lets Adam move all features. ``formula`` chooses between the printed equations and what the authors' code computes:
+
+    Eq. 1    paper: squares summed over the pixels of all masks, over the pixels that a view's masks have on average.
+             authors: distances not squared, mean over a mask's pixels, then over masks.
+    Eq. 2    paper: mean of 1 / d^2. authors: 1 / (d^2 + 1), each row weighted 0.1 to 1 by rank of nearness; after
+             LATE_STEP only the nearest tenth keeps its weight, the others the least.
+    Eq. 4    paper: L1 between the map of cluster centres and that of the features of stage 1, over the image.
+             authors: the target is each mask's mean painted back, L1 in the coarse stage, squares in the fine one;
+             masks of mixed features are left out; in some steps all Gaussians are drawn smaller, so that hidden ones
+             show and features become right per point, not only per blend.
+
+Where published behaviour is a defect this does it right: centres follow their clusters at every step, not only when
+points are reassigned; fine centres start inside their coarse cluster, and empty ones again elsewhere in it; pixels
+without a mask are no target; points that no mask shows get no cluster. Clusters are of features as read, not of their
+raw vectors, whose length means nothing.
+"""
+
+from __future__ import annotations
+
+import time
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+
+from og_pointcloud.errors import MissingExtraError, SceneError
+from og_pointcloud.fitting.learned.codebook import kmeans
+from og_pointcloud.fitting.learned.instance_features import ROUNDING, cohesion_factor, raw_gradient, read_features
+from og_pointcloud.fitting.mask_table import Gaussians, view_weights
+from og_pointcloud.scene import Camera, View
+from og_pointcloud.settings import PaperSettings
+
+try:
+    import torch
+except ImportError as error:
+    raise MissingExtraError("torch", "learn") from error
+
+Progress = Callable[[str, int, int], None]
+"""Called after every step with the stage's name, the step's number and the number of steps."""
+
+__all__ = ["StageHistory", "TrainedCodebook", "TrainedFeatures", "train_codebook", "train_features", "view_losses"]
+
+STEPS = {"scannet": (20_000, 20_000, 20_000), "lerf": (10_000, 10_000, 20_000)}
+"""Steps of the features, the coarse and the fine codebook (the authors' code; the sums are the paper's)."""
+LATE_STEP = 5_000
+"""From this step on, times schedule_share, the authors' Eq. 2 is about the nearest pairs."""
+LEAST_WEIGHT = 0.1
+"""Weight of a row's farthest pair in the authors' Eq. 2; the nearest weighs 1."""
+LATE_RANK = 0.9
+"""Pairs that weigh less than this weigh LEAST_WEIGHT late in training."""
+SMALLEST_DISTANCE = 1e-4
+"""Added in quadrature to the distances of the printed Eq. 2: two equal means would give infinity."""
+ADAM_EPSILON = 1e-15
+"""As in 3DGS: gradients of one Gaussian, of a mean over pixels, are small beside the usual 1e-8."""
+MIXED_VARIANCE = 0.006
+"""A mask whose features vary more is no target of Eq. 4 (the authors' code), unless it is large."""
+LARGE_SHARE = 0.8
+"""Masks of this share of the largest's pixels or more are targets all the same."""
+OWN_MASK_SHARE = 0.2
+"""A coarse cluster holds a mask when it has this share of the mask's blended weight or more."""
+
+
+@dataclass
+class StageHistory:
+    """A stage's cost and losses. setup_seconds: before the first step (rendering the weights that are kept).
+    seconds: of all steps. loss: one number per step done. published_steps: steps at schedule_share 1."""
+
+    name: str
+    published_steps: int
+    setup_seconds: float
+    seconds: float = 0.0
+    loss: list[float] = field(default_factory=list)
+
+    @property
+    def steps(self) -> int:
+        """Steps done."""
+        return len(self.loss)
+
+    @property
+    def seconds_per_step(self) -> float:
+        """Mean over the steps done."""
+        return self.seconds / max(self.steps, 1)
+
+    @property
+    def published_seconds(self) -> float:
+        """What the stage would take at its published number of steps."""
+        return self.setup_seconds + self.published_steps * self.seconds_per_step
+
+
+@dataclass(frozen=True)
+class TrainedFeatures:
+    """features: (n, width) float32 as read, zero where unseen. seen: (n,) float64, pixels of blending weight in masks;
+    0: the feature was never trained."""
+
+    features: NDArray[np.float32]
+    seen: NDArray[np.float64]
+    history: StageHistory
+
+
+@dataclass(frozen=True)
+class TrainedCodebook:
+    """coarse: (n,) int32 in 0..k1-1. leaf: (n,) int32, ``coarse * k2 + fine``; both -1 where no mask shows the point.
+    centres: (k1 k2, width) float32; rows of leaves without Gaussians are zero. histories: coarse and fine stage."""
+
+    coarse: NDArray[np.int32]
+    leaf: NDArray[np.int32]
+    centres: NDArray[np.float32]
+    histories: tuple[StageHistory, StageHistory]
+
+
+def train_features(
+    gaussians: Gaussians,
+    views: Sequence[View],
+    near: float,
+    settings: PaperSettings | None = None,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> TrainedFeatures:
+    """Stage 1: features of all Gaussians from random ones in [0, 1], by Eq. 1 and 2 of one random view a step.
+
+    views: thinned to the resolution that is to be rendered. near: depth of the near plane, scene units.
+    Raises SceneError where no view has a mask with a Gaussian in it.
+    """
+    settings = settings or PaperSettings()
+    start = time.perf_counter()
+    source = _Views(gaussians, views, near, settings, whole=False)
+    rng = np.random.default_rng(seed)
+    raw = torch.tensor(rng.random((len(gaussians), settings.width), np.float32), requires_grad=True)
+    adam = torch.optim.Adam([raw], lr=settings.feature_rate, eps=ADAM_EPSILON)
+    history = StageHistory("features", STEPS[settings.schedule][0], time.perf_counter() - start)
+    late = LATE_STEP * settings.schedule_share
+    for step in _steps(history, settings, progress):
+        view = source[int(rng.integers(len(source)))]
+        image = view.render(_read(raw, settings.normalise))
+        separation, cohesion = view_losses(image, view.mask, settings, late=step >= late)
+        scale = 1 if settings.formula == "authors" else 1 / source.masked_pixels
+        loss = settings.inter * separation + cohesion_factor(settings) * scale * cohesion
+        adam.zero_grad(set_to_none=True)
+        loss.backward()
+        adam.step()
+        history.loss.append(loss.item())
+    features = _read(raw.detach(), settings.normalise).numpy()
+    return TrainedFeatures(np.where(source.seen[:, None] > 0, features, 0).astype(np.float32), source.seen, history)
+
+
+def view_losses(
+    image: torch.Tensor, mask: torch.Tensor, settings: PaperSettings, *, late: bool = False
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Eq. 2 and Eq. 1 of one view. image: (pixels, width) rendered features of the pixels in masks. mask: (pixels,)
+    int64, their masks 0..m-1, each at least once. Eq. 1 of formula "paper" is the sum over pixels, as printed."""
+    pixels = torch.bincount(mask)
+    means = _mask_means(image, mask, pixels)
+    square = (image - means.index_select(0, mask)).square().sum(dim=1)  # indexing has a far slower gradient
+    if settings.formula == "authors":
+        distance = (square + ROUNDING**2).sqrt()  # the distance itself has no gradient at zero
+        cohesion = _mask_means(distance[:, None], mask, pixels).mean()
+    else:
+        cohesion = square.sum()
+    return _separation(means, settings.formula, late), cohesion
+
+
+def _mask_means(values: torch.Tensor, mask: torch.Tensor, pixels: torch.Tensor) -> torch.Tensor:
+    return values.new_zeros((len(pixels), values.shape[1])).index_add(0, mask, values) / pixels[:, None]
+
+
+def _separation(means: torch.Tensor, formula: str, late: bool) -> torch.Tensor:
+    m = len(means)
+    if m < 2:
+        return means.sum() * 0
+    square = (means[:, None] - means[None]).square().sum(dim=2)
+    near = 1 / (square + (1.0 if formula == "authors" else SMALLEST_DISTANCE**2))
+    near = near * (1 - torch.eye(m, dtype=means.dtype))
+    if formula == "authors":
+        rank = near.detach().argsort(dim=1, stable=True).argsort(dim=1).to(means.dtype)
+        weight = LEAST_WEIGHT + (1 - LEAST_WEIGHT) * rank / (m - 1)
+        if late:
+            weight = torch.where(weight < LATE_RANK, LEAST_WEIGHT, weight)
+        near = near * weight
+    return near.sum() / (m * (m - 1))
+
+
+def train_codebook(
+    gaussians: Gaussians,
+    views: Sequence[View],
+    near: float,
+    features: NDArray[np.float32],
+    settings: PaperSettings | None = None,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> TrainedCodebook:
+    """Stage 2: a coarse codebook of features and positions, then a fine one of features inside each coarse cluster.
+
+    features: (n, width) as read, of stage 1. A step renders cluster centres in place of features, takes Eq. 4, and
+    moves each feature by the gradient of its centre (straight through). Positions count in scene units, as published.
+    """
+    settings = settings or PaperSettings()
+    start = time.perf_counter()
+    rng = np.random.default_rng(seed)
+    source = _Views(gaussians, views, near, settings, whole=settings.formula == "paper")
+    known = np.flatnonzero(source.seen > 0)
+    training = _CodebookTraining(source, torch.from_numpy(np.array(features, np.float32)), known, settings, rng)
+    places = settings.position_weight * gaussians.xyz[known]
+    setup = time.perf_counter() - start
+
+    coarse = StageHistory("coarse codebook", STEPS[settings.schedule][1], setup)
+    first = rng.permutation(len(known))[: settings.k1]
+    centres = np.concatenate([features[known[first]], places[first]], axis=1)
+    own, _ = training.run(coarse, centres, [np.arange(len(known))], places, settings.coarse_interval, progress)
+
+    start = time.perf_counter()
+    members = [np.flatnonzero(own == cluster) for cluster in range(len(centres))]
+    allowed = _fine_counts(source, known, own, len(centres), settings)
+    seeds = [rng.permutation(rows)[:count] for rows, count in zip(members, allowed, strict=True)]
+    fine = StageHistory("fine codebook", STEPS[settings.schedule][2], time.perf_counter() - start)
+    fine_centres = training.features.numpy()[known[np.concatenate(seeds)]]
+    nothing = np.zeros((len(known), 0), np.float32)
+    own_fine, fine_centres = training.run(
+        fine, fine_centres, members, nothing, settings.fine_interval, progress, [len(rows) for rows in seeds]
+    )
+    # Leaf numbers leave room for k2 in every coarse cluster, as published.
+    leaf_of_centre = np.concatenate([c * settings.k2 + np.arange(len(rows)) for c, rows in enumerate(seeds)])
+    coarse_ids, leaf = np.full(len(gaussians), -1, np.int32), np.full(len(gaussians), -1, np.int32)
+    coarse_ids[known], leaf[known] = own, leaf_of_centre[own_fine]
+    table = np.zeros((settings.k1 * settings.k2, features.shape[1]), np.float32)
+    table[leaf_of_centre] = fine_centres
+    return TrainedCodebook(coarse_ids, leaf, table, (coarse, fine))
+
+
+class _CodebookTraining:
+    """Features that move behind their cluster centres; both codebook stages are runs of it."""
+
+    def __init__(
+        self,
+        source: _Views,
+        features: torch.Tensor,
+        known: NDArray[np.int64],
+        settings: PaperSettings,
+        rng: np.random.Generator,
+    ) -> None:
+        self.source, self.known, self.settings, self.rng = source, torch.from_numpy(known), settings, rng
+        self.pseudo = features.clone()  # of stage 1: never changed
+        self.features = features
+        self.targets: dict[int, tuple[torch.Tensor, torch.Tensor]] = {}
+
+    def run(
+        self,
+        history: StageHistory,
+        centres: NDArray[np.float32],
+        parts: list[NDArray[np.int64]],
+        places: NDArray[np.float32],
+        interval: int,
+        progress: Progress | None,
+        counts: list[int] | None = None,
+    ) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
+        """Train until the stage's steps are done; own centre of each known Gaussian and the centres (k, width).
+
+        parts: rows of the known Gaussians that are clustered apart from each other, counts their numbers of centres,
+        all of them by default. places: (known, 3 or 0), clustered with the features but not rendered.
+        """
+        counts = counts or [len(centres)]
+        features = self.features
+        adam = torch.optim.Adam([features.requires_grad_()], lr=self.settings.codebook_rate, eps=ADAM_EPSILON)
+        width = features.shape[1]
+        own = torch.zeros(len(self.known), dtype=torch.int64)
+        squared = history.name.startswith("fine") and self.settings.formula == "authors"
+        for step in _steps(history, self.settings, progress):
+            if step % interval == 0:
+                own, centres = self._reassigned(centres, parts, places, counts)
+            view, target, rows = self._draw()
+            quantised = features.detach().clone()
+            quantised[self.known] = torch.from_numpy(centres[:, :width].copy())[own]
+            quantised.requires_grad_()
+            error = view.render(quantised)[rows] - target
+            loss = error.square().mean() if squared else error.abs().mean()
+            (features.grad,) = torch.autograd.grad(loss, quantised)
+            adam.step()
+            centres[:, :width] = _cluster_means(features.detach()[self.known], own, centres[:, :width])
+            history.loss.append(loss.item())
+        features.requires_grad_(False)
+        own, centres = self._reassigned(centres, parts, places, counts)
+        return own.numpy().astype(np.int32), centres[:, :width]
+
+    def _reassigned(
+        self,
+        centres: NDArray[np.float32],
+        parts: list[NDArray[np.int64]],
+        places: NDArray[np.float32],
+        counts: list[int],
+    ) -> tuple[torch.Tensor, NDArray[np.float32]]:
+        """Every point's nearest centre of its part after a few rounds of Lloyd's algorithm, and the centres."""
+        values = np.concatenate([self.features.detach().numpy()[self.known], places], axis=1)
+        own, centres, first = np.zeros(len(values), np.int64), centres.copy(), 0
+        for rows, count in zip(parts, counts, strict=True):
+            if count:
+                mine = slice(first, first + count)
+                weight = np.ones(len(rows))
+                found, centres[mine] = kmeans(
+                    values[rows], weight, centres[mine], self.settings.lloyd_rounds, reseed=True
+                )
+                own[rows] = first + found
+            first += count
+        return torch.from_numpy(own), centres
+
+    def _draw(self) -> tuple[_ViewWeights, torch.Tensor, torch.Tensor | slice]:
+        """A random view, perhaps with smaller Gaussians; what its pixels should show, and which of them."""
+        index = int(self.rng.integers(len(self.source)))
+        view = self.source[index]
+        if self.settings.formula == "paper":
+            return view, view.render(self.pseudo), slice(None)
+        if index not in self.targets:
+            self.targets[index] = _mask_targets(view.render(self.pseudo), view.mask)
+        means, kept = self.targets[index]
+        if self.rng.random() < self.settings.point_pressure:
+            smaller = self.source.shrunk(index, self.rng.random())
+            place = torch.searchsorted(view.mask_names, smaller.mask_names)[smaller.mask]
+            if kept[place].any():  # else too little is left to cover a pixel of a target
+                return smaller, means[place][kept[place]], kept[place]
+        rows = kept[view.mask]
+        return view, means[view.mask][rows], rows
+
+
+def _mask_targets(image: torch.Tensor, mask: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """The mean feature of each mask, and whether it is a target: of one feature, or large."""
+    pixels = torch.bincount(mask)
+    means = _mask_means(image, mask, pixels)
+    variance = _mask_means((image - means[mask]).square(), mask, pixels).mean(dim=1)
+    return means, (variance <= MIXED_VARIANCE) | (pixels >= LARGE_SHARE * pixels.max())
+
+
+def _cluster_means(features: torch.Tensor, own: torch.Tensor, centres: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Means of the clusters' features; an empty cluster stays where it is."""
+    points = torch.bincount(own, minlength=len(centres))[:, None]
+    sums = torch.zeros(centres.shape).index_add_(0, own, features)
+    return torch.where(points > 0, sums / points.clamp(min=1), torch.from_numpy(centres.copy())).numpy()
+
+
+def _fine_counts(
+    source: _Views, known: NDArray[np.int64], own: NDArray[np.int32], k1: int, settings: PaperSettings
+) -> list[int]:
+    """Fine clusters of each coarse one: k2, or one more than the masks of a view that it holds, if that is fewer."""
+    if not settings.adapt_k2:
+        return [settings.k2] * k1
+    cluster = np.full(len(source.seen), k1)
+    cluster[known] = own
+    most = np.zeros(k1, np.int64)
+    for view in source:
+        mask = np.repeat(view.mask.numpy(), np.diff(view.weights.indptr))
+        inside = mask >= 0
+        shares = np.zeros((len(view.mask_names), k1 + 1))
+        np.add.at(shares, (mask[inside], cluster[view.weights.indices[inside]]), view.weights.data[inside])
+        shares /= shares.sum(axis=1, keepdims=True)
+        most = np.maximum(most, (shares[:, :k1] > OWN_MASK_SHARE).sum(axis=0))
+    return [int(count) for count in np.minimum(most + 1, settings.k2)]
+
+
+@dataclass(frozen=True)
+class _ViewWeights:
+    """One view's blending weights, ready for products.
+
+    weights: (pixels, n) CSR float32, index int32. mask: (pixels,) int64, a row of mask_names, -1 outside masks.
+    mask_names: (m,) int64 ascending, the view's own mask ids.
+    """
+
+    weights: csr_array
+    mask: torch.Tensor
+    mask_names: torch.Tensor
+    forward: torch.Tensor
+    backward: torch.Tensor
+
+    @classmethod
+    def make(cls, weights: csr_array, ids: NDArray[np.int32]) -> _ViewWeights:
+        names, mask = np.unique(ids, return_inverse=True)
+        outside = int(names[0] < 0) if len(names) else 0
+        return cls(
+            weights,
+            torch.from_numpy(mask.astype(np.int64) - outside),
+            torch.from_numpy(names[outside:].astype(np.int64)),
+            _torch_csr(weights),
+            _torch_csr(csr_array(weights.T)),
+        )
+
+    def render(self, values: torch.Tensor) -> torch.Tensor:
+        """(pixels, width) blended values of all Gaussians (n, width)."""
+        return _Blend.apply(values, self.forward, self.backward)
+
+    @property
+    def nbytes(self) -> int:
+        """Both matrices; the scipy one shares its arrays with ``forward``."""
+        return 2 * 8 * self.weights.nnz + 4 * sum(self.weights.shape)
+
+
+class _Views:
+    """Blending weights of all views that have a mask, kept as far as ``cache_bytes`` go, else rendered anew.
+
+    whole: with all pixels, else those in masks that are covered enough. seen: (n,) blending weight in masks.
+    masked_pixels: pixels in masks of a view, on average.
+    """
+
+    def __init__(
+        self, gaussians: Gaussians, views: Sequence[View], near: float, settings: PaperSettings, *, whole: bool
+    ) -> None:
+        self.gaussians, self.near, self.settings, self.whole = gaussians, near, settings, whole
+        self.seen = np.zeros(len(gaussians))
+        self.views: list[View] = []
+        self._kept: dict[int, _ViewWeights] = {}
+        pixels, room = 0, settings.cache_bytes
+        for view in views:
+            weights = self._render(gaussians, view)
+            inside = weights.mask.numpy() >= 0
+            if not inside.any():
+                continue
+            shown = np.repeat(inside, np.diff(weights.weights.indptr))
+            self.seen += np.bincount(
+                weights.weights.indices[shown], weights.weights.data[shown], minlength=len(gaussians)
+            )
+            pixels += int(inside.sum())
+            if weights.nbytes <= room:
+                self._kept[len(self.views)] = weights
+                room -= weights.nbytes
+            self.views.append(view)
+        if not self.views:
+            raise SceneError(
+                f"none of the {len(views)} views has a mask that Gaussians cover by {settings.covered_share} or more; "
+                "expected at least one: make masks, check poses, or lower covered_share"
+            )
+        self.masked_pixels = pixels / len(self.views)
+
+    def __len__(self) -> int:
+        return len(self.views)
+
+    def __getitem__(self, index: int) -> _ViewWeights:
+        return self._kept[index] if index in self._kept else self._render(self.gaussians, self.views[index])
+
+    def __iter__(self) -> Iterator[_ViewWeights]:
+        return (self[index] for index in range(len(self)))
+
+    def shrunk(self, index: int, factor: float) -> _ViewWeights:
+        """The view with all Gaussians' standard deviations times factor; its masks are among those at full size."""
+        smaller = replace(self.gaussians, scale=(self.gaussians.scale * np.float32(factor)).astype(np.float32))
+        return self._render(smaller, self.views[index], self[index].mask_names.numpy())
+
+    def _render(self, gaussians: Gaussians, view: View, masks: NDArray[np.int64] | None = None) -> _ViewWeights:
+        """The view's weights; masks: only these count as such, all by default."""
+        ids = view.mask_map().ravel()
+        if masks is not None:
+            ids = np.where(np.isin(ids, masks), ids, -1)
+        wanted = np.arange(len(ids)) if self.whole else np.flatnonzero(ids >= 0)
+        weights, ids = self._weights(gaussians, view.camera, wanted), ids[wanted]
+        coverage = np.asarray(weights.sum(axis=1)).ravel()
+        shown = np.bincount(ids + 1, coverage, minlength=view.mask_count + 1) > 0  # place 0: pixels without a mask
+        inside = (ids >= 0) & shown[ids + 1] & (coverage >= self.settings.covered_share)
+        rows = np.flatnonzero(inside | (coverage > 0)) if self.whole else np.flatnonzero(inside)
+        chosen = weights[rows]
+        index = (chosen.indices.astype(np.int32), chosen.indptr.astype(np.int32))
+        small = csr_array((chosen.data, *index), shape=chosen.shape)
+        return _ViewWeights.make(small, np.where(inside, ids, -1)[rows])
+
+    def _weights(self, gaussians: Gaussians, camera: Camera, pixels: NDArray[np.int64]) -> csr_array:
+        """(pixels, n) blending weights of some pixels of the camera's image."""
+        number = np.full(camera.width * camera.height, -1, np.int32)
+        number[pixels] = np.arange(len(pixels))
+        image = number.reshape(camera.height, camera.width)
+        rows = view_weights(gaussians, camera, image, len(pixels), self.near).rows
+        end = rows.indptr[-2]  # the last row holds all other pixels; slicing it off would copy everything
+        return csr_array((rows.data[:end], rows.indices[:end], rows.indptr[:-1]), shape=(len(pixels), len(gaussians)))
+
+
+class _Blend(torch.autograd.Function):
+    """W F with the gradient W' G from a transpose kept beside it: torch's own for CSR is a hundred times slower."""
+
+    @staticmethod
+    def forward(ctx: Any, values: torch.Tensor, weights: torch.Tensor, transposed: torch.Tensor) -> torch.Tensor:
+        ctx.transposed = transposed
+        return weights @ values
+
+    @staticmethod
+    def backward(ctx: Any, gradient: torch.Tensor) -> tuple[torch.Tensor, None, None]:  # pyright: ignore
+        return ctx.transposed @ gradient.contiguous(), None, None
+
+
+def _torch_csr(matrix: csr_array) -> torch.Tensor:
+    parts = [torch.from_numpy(np.ascontiguousarray(array)) for array in (matrix.indptr, matrix.indices, matrix.data)]
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Sparse CSR tensor support is in beta")
+        return torch.sparse_csr_tensor(*parts, size=matrix.shape, check_invariants=False)
+
+
+class _Read(torch.autograd.Function):
+    """Directions mapped to [0, 1] (`features.read_features`); in plain torch their gradient is most of a step."""
+
+    @staticmethod
+    def forward(ctx: Any, raw: torch.Tensor) -> torch.Tensor:
+        ctx.save_for_backward(raw)
+        return torch.from_numpy(read_features(raw.numpy(), normalise=True))
+
+    @staticmethod
+    def backward(ctx: Any, gradient: torch.Tensor) -> torch.Tensor:  # pyright: ignore
+        (raw,) = ctx.saved_tensors
+        return torch.from_numpy(raw_gradient(raw.detach().numpy(), gradient.contiguous().numpy(), normalise=True))
+
+
+def _read(raw: torch.Tensor, normalise: bool) -> torch.Tensor:
+    """Features as rendered; raw ones are read as they are."""
+    return _Read.apply(raw) if normalise else raw
+
+
+def _steps(history: StageHistory, settings: PaperSettings, progress: Progress | None) -> Iterator[int]:
+    """The numbers of a stage's steps, timed and reported."""
+    count = max(1, round(history.published_steps * settings.schedule_share))
+    for step in range(count):
+        start = time.perf_counter()
+        yield step
+        history.seconds += time.perf_counter() - start
+        if progress:
+            progress(history.name, step + 1, count)

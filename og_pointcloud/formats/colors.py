@@ -1,0 +1,29 @@
+"""One colour a label, the same in every file, window and page."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from og_pointcloud.cloud import UNKNOWN
+
+__all__ = ["UNKNOWN_COLOR", "label_colors"]
+
+UNKNOWN_COLOR = (128, 128, 128)
+GOLDEN_RATIO = 0.618033988749895
+
+
+def label_colors(labels: NDArray[np.integer]) -> NDArray[np.uint8]:
+    """(N, 3) uint8 RGB. The colour of a label depends on its number alone; neighbours in number differ in hue."""
+    count = int(labels.max(initial=UNKNOWN)) + 1
+    palette = np.array([UNKNOWN_COLOR, *(_color(label) for label in range(count))], np.uint8)
+    return palette[np.maximum(labels, UNKNOWN) + 1]
+
+
+def _color(label: int) -> tuple[int, int, int]:
+    import colorsys
+
+    hue = (0.02 + label * GOLDEN_RATIO) % 1.0
+    saturation, value = ((0.75, 0.95), (0.45, 0.95), (0.85, 0.65))[label // 8 % 3]
+    red, green, blue = colorsys.hsv_to_rgb(hue, saturation, value)
+    return round(255 * red), round(255 * green), round(255 * blue)

@@ -1,0 +1,342 @@
+"""Depth images -> a cloud, for captures without one: what all views measured, averaged in voxels and judged by all.
+
+First pass: pixels that lie on a surface (flying pixels, between two, are left out) are averaged in voxels. Second pass:
+every view says of every voxel's point whether it measured that surface, looked through it, or could not see it. A point
+stays if more views confirm than refute it, and if two confirm it where three or more could have. It then moves to where
+the confirming views, on average, measured the surface: along each view's ray by the difference of the depths, one step
+to the surface that a signed distance volume would have there. So a noisy surface becomes one layer, and not as many as
+the noise fills voxels; what then shares a voxel is averaged once more.
+
+The voxel follows from the images: two pixels wide at the median depth, and not finer than the noise with which views
+contradict each other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from og_pointcloud.errors import SceneError
+from og_pointcloud.formats.depth import DepthFrame, DepthImage
+from og_pointcloud.formats.images import require_cv2
+from og_pointcloud.kernels import njit, prange
+from og_pointcloud.scene import Camera, Points
+
+__all__ = ["FusedCloud", "Survey", "agreement", "evenly", "fuse", "on_surface", "survey", "to_world"]
+
+Doubles = NDArray[np.float64]
+
+SURVEYED = 16
+"""Views, spread evenly, that are compared with each other before the fusion."""
+SAMPLES = 1000
+"""Pixels of a surveyed view that are looked up in the others."""
+COMPARABLE = 0.05
+"""Depths that differ by less than this share may be of one surface: its noise is measured on these."""
+AGREEING = 0.02
+"""Depths that differ by less than this share agree."""
+
+PIXELS_PER_VOXEL, NOISE_PER_VOXEL = 2.0, 1.0
+GRAZING = 5.7
+"""A surface's depth changes by at most so many pixel widths a pixel: it is seen 80 degrees off its normal (tan 80)."""
+VOXEL_TOLERANCE, NOISE_TOLERANCE = 1.5, 3.0
+"""A point and a measured depth of its surface may lie so many voxels, or deviations of the noise, apart."""
+ROUNDS = 2
+VOXELS_ACROSS = 1 << 21
+"""Along each axis, so that a voxel's three indices fit one 64-bit key."""
+FREE = -1
+FIBONACCI = np.uint64(0x9E3779B97F4A7C15)
+
+
+@dataclass(frozen=True)
+class Survey:
+    """What some frames say of all. depth: median measured depth. footprint: width of a pixel on what it sees, median.
+    noise: standard deviation between two views' depths of one surface, 0 where no two views overlap."""
+
+    depth: float
+    footprint: float
+    noise: float
+
+    @property
+    def voxel(self) -> float:
+        """Edge of the fusion's voxels."""
+        return max(PIXELS_PER_VOXEL * self.footprint, NOISE_PER_VOXEL * self.noise)
+
+    @property
+    def tolerance(self) -> float:
+        """Distance along the ray, at the median depth, up to which a measured depth is that of a point's surface."""
+        return max(VOXEL_TOLERANCE * self.voxel, NOISE_TOLERANCE * self.noise)
+
+
+@dataclass(frozen=True)
+class FusedCloud:
+    """points: with colours where every frame has them. frames: fused. refused: voxels that other views looked through
+    or that one alone saw. empty: names of frames in which nothing was measured."""
+
+    points: Points
+    survey: Survey
+    frames: int
+    refused: int
+    empty: tuple[str, ...]
+
+
+def fuse(frames: Sequence[DepthFrame]) -> FusedCloud:
+    """Fuse posed depth images; each is read twice, so that memory holds one at a time.
+
+    Raises SceneError where no frame measures anything, or a file cannot be read.
+    """
+    found = survey(frames)
+    origin = np.median([frame.depth.camera.center for frame in frames], axis=0)
+    voxels = _Voxels(found.voxel)
+    empty = []
+    for frame in frames:
+        image = frame.depth.read()
+        if not image.depth.any():
+            empty.append(frame.name)
+        kept = on_surface(image, found.noise)
+        colors = frame.colors(image.camera)[kept] if frame.colors else np.zeros((int(kept.sum()), 3), np.uint8)
+        voxels.add(to_world(image, kept) - origin, colors, f"view '{frame.name}'")
+    refused = 0
+    for _ in range(ROUNDS):
+        xyz, rgb = voxels.means()
+        stays, moved = _judge(xyz, origin, frames, found)
+        if not stays.any():
+            raise SceneError(
+                f"none of the {len(xyz)} points that {len(frames)} depth images measured is confirmed by their views: "
+                "check the poses and the depth unit"
+            )
+        refused += int((~stays).sum())
+        voxels = _Voxels(found.voxel)
+        voxels.add(moved[stays], rgb[stays], "the fused cloud")
+    xyz, rgb = voxels.means()
+    colored = all(frame.colors for frame in frames)
+    points = Points.from_world(xyz + origin, rgb=np.rint(rgb).astype(np.uint8) if colored else None)
+    return FusedCloud(points, found, len(frames), refused, tuple(empty))
+
+
+def survey(frames: Sequence[DepthFrame]) -> Survey:
+    """Depth, pixel width and noise, from evenly spread frames (from all, if those are empty)."""
+    images = [image for frame in evenly(frames, SURVEYED) if (image := frame.depth.read()).depth.any()]
+    if not images:
+        images = [image for frame in frames if (image := frame.depth.read()).depth.any()][:SURVEYED]
+    if not images:
+        raise SceneError(
+            f"none of the {len(frames)} depth images has a measured pixel (e.g. {frames[0].depth.path}); expected "
+            "depths above 0: check that they are depth images, or add a cloud"
+        )
+    depths = [image.depth[image.depth > 0] for image in images]
+    widths = [depth / np.float32(np.sqrt(i.camera.fx * i.camera.fy)) for depth, i in zip(depths, images, strict=True)]
+    typical = float(np.median(np.concatenate(depths)))
+    off = np.abs(_differences(images))
+    comparable = off[off < COMPARABLE]
+    # 1.4826: median of the absolute value to standard deviation; two views' noise differs by the root of two.
+    noise = 1.4826 / np.sqrt(2) * float(np.median(comparable)) * typical if len(comparable) else 0.0
+    return Survey(typical, float(np.median(np.concatenate(widths))), float(noise))
+
+
+def agreement(images: Sequence[DepthImage], factor: float) -> float:
+    """Share of depths that another view confirms if all are taken times ``factor``; NaN where no views overlap."""
+    off = _differences(images, factor)
+    return float((np.abs(off) < AGREEING).mean()) if len(off) else float("nan")
+
+
+def evenly(items: Sequence[Any], count: int) -> list[Any]:
+    """At most ``count`` items, spread evenly over the sequence."""
+    rows = np.unique(np.linspace(0, len(items) - 1, min(count, len(items))).round().astype(int)) if items else ()
+    return [items[row] for row in rows]
+
+
+def on_surface(image: DepthImage, noise: float) -> NDArray[np.bool_]:
+    """(H, W) bool: measured, and in each image direction on one surface with at least one neighbour."""
+    depth = image.depth
+    kept = depth > 0
+    for axis, focal in ((0, image.camera.fy), (1, image.camera.fx)):
+        if depth.shape[axis] == 1:
+            continue
+        along = np.moveaxis(depth, axis, 0)
+        nearer = np.minimum(along[1:], along[:-1])
+        step = nearer * np.float32(GRAZING / focal) + np.float32(NOISE_TOLERANCE * noise)
+        joined = (nearer > 0) & (np.abs(np.diff(along, axis=0)) <= step)
+        has_neighbour = np.zeros(along.shape, bool)
+        has_neighbour[1:] |= joined
+        has_neighbour[:-1] |= joined
+        kept &= np.moveaxis(has_neighbour, 0, axis)
+    return kept
+
+
+def to_world(image: DepthImage, chosen: NDArray[np.bool_], factor: float = 1.0) -> Doubles:
+    """(n, 3) float64 world coordinates of the chosen pixels, row by row, their depths times ``factor``."""
+    camera = image.camera
+    lens = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
+    return _unprojected(image.depth, chosen, lens, camera.world_to_camera[:3, :3], camera.center, factor)
+
+
+@njit(cache=True)
+def _unprojected(depth, chosen, lens, rotation, center, factor):  # noqa: ANN001, ANN202
+    fx, fy, cx, cy = lens
+    xyz = np.empty((np.count_nonzero(chosen), 3))
+    i = 0
+    for row in range(depth.shape[0]):
+        for column in range(depth.shape[1]):
+            if chosen[row, column]:
+                z = depth[row, column] * factor
+                x, y = (column + 0.5 - cx) / fx * z, (row + 0.5 - cy) / fy * z
+                for axis in range(3):
+                    along = rotation[0, axis] * x + rotation[1, axis] * y + rotation[2, axis] * z
+                    xyz[i, axis] = along + center[axis]
+                i += 1
+    return xyz
+
+
+def _differences(images: Sequence[DepthImage], factor: float = 1.0) -> Doubles:
+    """Relative differences between depths of some pixels and what the other images measured at the same places."""
+    found = [np.zeros(0)]
+    for index, image in enumerate(images):
+        sampled = np.zeros(image.depth.shape, bool)
+        rows = np.flatnonzero(image.depth)
+        sampled.reshape(-1)[rows[:: 1 + len(rows) // SAMPLES]] = True
+        xyz = to_world(image, sampled, factor)
+        for other in [*images[:index], *images[index + 1 :]]:
+            pixel, depth = _seen(xyz, other.camera)
+            measured = other.depth.reshape(-1)[pixel].astype(np.float64) * factor
+            found.append(((measured - depth) / depth)[measured > 0])
+    return np.concatenate(found)
+
+
+def _seen(xyz: Doubles, camera: Camera) -> tuple[NDArray[np.intp], Doubles]:
+    """Flat pixels and depths of the world points that fall into the image."""
+    x, y, z = camera.world_to_camera[:3, :3] @ (xyz - camera.center).T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        column, row = np.floor(x / z * camera.fx + camera.cx), np.floor(y / z * camera.fy + camera.cy)
+    inside = (z > 0) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+    return row[inside].astype(np.intp) * camera.width + column[inside].astype(np.intp), z[inside]
+
+
+def _judge(
+    xyz: Doubles, origin: Doubles, frames: Sequence[DepthFrame], found: Survey
+) -> tuple[NDArray[np.bool_], Doubles]:
+    """(n,) bool, which points the views confirm, and (n, 3), where these then lie. xyz: relative to the origin."""
+    cv2 = require_cv2()
+    votes, shift = np.zeros((len(xyz), 3), np.int32), np.zeros((len(xyz), 4))
+    for frame in frames:
+        image = frame.depth.read()
+        camera = image.camera
+        surface = np.where(on_surface(image, found.noise), image.depth, np.float32(0))
+        # Looked through only if all pixels around did: a thin thing half a pixel off is still there.
+        nearest = np.asarray(cv2.erode(image.depth, np.ones((3, 3), np.uint8)), np.float32)
+        lens = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
+        _add_votes(
+            xyz, camera.world_to_camera[:3, :3], camera.center - origin, lens, image.depth, surface, nearest,
+            found.tolerance, found.depth, votes, shift,
+        )  # fmt: skip
+    confirmed, refuted, could_see = votes.T
+    stays = (confirmed > refuted) & (confirmed >= np.where(could_see >= 3, 2, 1))
+    return stays, xyz + shift[:, :3] / np.maximum(shift[:, 3:], np.finfo(np.float64).tiny)
+
+
+@njit(cache=True, parallel=True)
+def _add_votes(xyz, rotation, center, lens, depth, surface, nearest, tolerance, typical, votes, shift):  # noqa: ANN001, ANN202
+    """One view's votes on all points: confirmed, refuted, could see; and the weighted way to the surface it measured.
+
+    surface: depth without flying pixels. nearest: the smallest depth of 3x3 pixels, 0 if one of them is unmeasured.
+    """
+    fx, fy, cx, cy = lens
+    height, width = depth.shape
+    for i in prange(len(xyz)):
+        x, y, z = xyz[i, 0] - center[0], xyz[i, 1] - center[1], xyz[i, 2] - center[2]
+        along = rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * z
+        if along <= 0.0:
+            continue
+        column = np.floor((rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * z) / along * fx + cx)
+        row = np.floor((rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2] * z) / along * fy + cy)
+        if not (0 <= column < width and 0 <= row < height):
+            continue
+        v, u = int(row), int(column)
+        # Noise and pixels grow with depth.
+        allowed = tolerance * max(1.0, along / typical)
+        votes[i, 2] += depth[v, u] >= along - allowed
+        votes[i, 1] += nearest[v, u] > along + allowed
+        difference = surface[v, u] - along
+        if surface[v, u] > 0 and abs(difference) <= allowed:
+            votes[i, 0] += 1
+            weight = 1.0 / (along * along)
+            shift[i, 0] += weight * difference * x / along
+            shift[i, 1] += weight * difference * y / along
+            shift[i, 2] += weight * difference * z / along
+            shift[i, 3] += weight
+
+
+class _Voxels:
+    """Mean position and colour by voxel: a hash table of keys with open addressing, grown as it fills."""
+
+    def __init__(self, edge: float) -> None:
+        self._edge = edge
+        self._keys = np.full(1 << 16, FREE, np.int64)
+        self._sums = np.zeros((1 << 16, 7))
+        self._filled = 0
+
+    def add(self, xyz: Doubles, rgb: NDArray[Any], source: str) -> None:
+        """xyz: (n, 3), within VOXELS_ACROSS / 2 voxels of 0. rgb: (n, 3). source: of the points, for the error."""
+        farthest = float(np.abs(xyz).max(initial=0.0))
+        if farthest >= (VOXELS_ACROSS // 2 - 1) * self._edge:
+            raise SceneError(
+                f"{source} has points {farthest:.3g} from the middle of the cameras, in voxels of {self._edge:.3g}; "
+                f"expected fewer than {VOXELS_ACROSS // 2} voxels: check its pose and the depth unit"
+            )
+        while 2 * (self._filled + len(xyz)) > len(self._keys):
+            self._grow()
+        self._filled += _insert_points(xyz, rgb, self._edge, self._keys, self._sums)
+
+    def means(self) -> tuple[Doubles, Doubles]:
+        """(n, 3) positions and (n, 3) colours, in the order of the voxels."""
+        used = np.flatnonzero(self._keys != FREE)
+        sums = self._sums[used[np.argsort(self._keys[used])]]
+        means = sums[:, :6] / sums[:, 6:]
+        return means[:, :3], means[:, 3:]
+
+    def _grow(self) -> None:
+        used = self._keys != FREE
+        keys, sums = self._keys[used], self._sums[used]
+        size = 2 * len(self._keys)
+        self._keys, self._sums = np.full(size, FREE, np.int64), np.zeros((size, 7))
+        _insert_sums(keys, sums, self._keys, self._sums)
+
+
+@njit(cache=True)
+def _slot(key, table):  # noqa: ANN001, ANN202
+    """Where the key is, or belongs. The table must have a free slot."""
+    mask = np.uint64(len(table) - 1)
+    slot = ((np.uint64(key) * FIBONACCI) >> np.uint64(20)) & mask
+    while table[slot] != FREE and table[slot] != key:
+        slot = (slot + np.uint64(1)) & mask
+    return slot
+
+
+@njit(cache=True)
+def _insert_points(xyz, rgb, edge, table, sums):  # noqa: ANN001, ANN202
+    """Add points to the sums of their voxels; the number of voxels that are new."""
+    new = 0
+    for i in range(len(xyz)):
+        key = 0
+        for axis in range(3):
+            key = key * VOXELS_ACROSS + int(np.floor(xyz[i, axis] / edge)) + VOXELS_ACROSS // 2
+        slot = _slot(key, table)
+        if table[slot] == FREE:
+            table[slot] = key
+            new += 1
+        for axis in range(3):
+            sums[slot, axis] += xyz[i, axis]
+            sums[slot, 3 + axis] += rgb[i, axis]
+        sums[slot, 6] += 1
+    return new
+
+
+@njit(cache=True)
+def _insert_sums(keys, rows, table, sums):  # noqa: ANN001, ANN202
+    for i in range(len(keys)):
+        slot = _slot(keys[i], table)
+        table[slot] = keys[i]
+        sums[slot] = rows[i]

@@ -1,0 +1,146 @@
+"""The project's own mask format: ``masks/<view name>.png`` and ``mask_features.npz``.
+
+A mask image is grey, 8 or 16 bit, 0 outside every mask, else an id 1..M that means something in this image only. The
+features file holds ``<view name>`` -> (M, D), any float type, where row i belongs to id i + 1, and ``feature_space``,
+the name of the encoder. A view without masks has an all-zero image and an empty (0, D) array.
+"""
+
+from __future__ import annotations
+
+import zipfile
+import zlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from og_pointcloud.errors import SceneError
+from og_pointcloud.formats.images import decoded, png_header, require_cv2
+from og_pointcloud.formats.npy import array_from_zip
+
+__all__ = [
+    "FEATURES_NAME",
+    "MASKS_FOLDER",
+    "UNKNOWN_SPACE",
+    "MaskLayer",
+    "as_float32",
+    "read_masks",
+    "require_all",
+]
+
+MASKS_FOLDER = "masks"
+FEATURES_NAME = "mask_features.npz"
+UNKNOWN_SPACE = "unknown"
+MAX_FEATURE_BYTES = 1 << 32
+GREY = 0
+PNG_COLOR_TYPES = {0: "grey", 2: "RGB (3 channels)", 3: "palette", 4: "grey with alpha", 6: "RGBA (4 channels)"}
+
+
+@dataclass(frozen=True)
+class MaskLayer:
+    """One view's masks before they meet a camera.
+
+    size: (width, height) of the mask map. features: (M, D) float32.
+    read: gives the map, (height, width) int32, -1 outside every mask, else a row of ``features``.
+    """
+
+    size: tuple[int, int]
+    features: NDArray[np.float32]
+    read: Callable[[], NDArray[np.int32]]
+
+
+def read_masks(capture: Path, names: Sequence[str]) -> tuple[list[MaskLayer], str]:
+    """The masks of these views and the name of their feature space (``unknown`` where the file names none).
+
+    Features are read, of the images only the headers; each image is decoded when its layer's ``read`` is called. Raises
+    SceneError where a view has no mask image or no features, or an image is not grey.
+    """
+    files = [capture / MASKS_FOLDER / f"{name}.png" for name in names]
+    require_all(files, "write an all-zero mask and an empty (0, D) feature array for an image without masks")
+    features, feature_space = _read_features(capture / FEATURES_NAME, names)
+    layers = [
+        MaskLayer(_mask_size(file), features[name], partial(_read_ids, file))
+        for name, file in zip(names, files, strict=True)
+    ]
+    return layers, feature_space
+
+
+def require_all(files: Sequence[Path], cure: str) -> None:
+    """Raise one SceneError for all mask files that are missing: how many, the first three, and the cure."""
+    missing = [file for file in files if not file.is_file()]
+    if missing:
+        folder = missing[0].parents[0]
+        names = ", ".join(file.name for file in missing[:3]) + (", ..." if len(missing) > 3 else "")
+        raise SceneError(
+            f"{len(missing)} of {len(files)} posed images have no mask: {folder} lacks {names}; expected one an image: "
+            f"{cure}, or take the image out of the pose file"
+        )
+
+
+def _mask_size(file: Path) -> tuple[int, int]:
+    header = png_header(file)
+    if header is None:
+        raise SceneError(f"{file} is not a PNG; expected a grey PNG of 8 or 16 bit: write the ids losslessly")
+    if header.color_type != GREY or header.bit_depth not in (8, 16):
+        kind = PNG_COLOR_TYPES.get(header.color_type, f"color type {header.color_type}")
+        raise SceneError(
+            f"{file} is a {kind} PNG of {header.bit_depth} bit; expected grey of 8 or 16 bit, whose values are mask "
+            "ids (0 none, 1..M): write ids instead of colours"
+        )
+    return header.width, header.height
+
+
+def _read_ids(file: Path) -> NDArray[np.int32]:
+    ids = decoded(file, require_cv2().IMREAD_UNCHANGED)
+    if ids.ndim != 2:
+        raise SceneError(f"{file} has shape {ids.shape}; expected one channel of mask ids")
+    return ids.astype(np.int32) - 1
+
+
+def _read_features(file: Path, names: Sequence[str]) -> tuple[dict[str, NDArray[np.float32]], str]:
+    """Features by view name. Nothing is unpickled, and no entry is unpacked before its size is checked."""
+    try:
+        with zipfile.ZipFile(file) as archive:
+            entries = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
+            if (total := sum(info.file_size for info in entries.values())) > MAX_FEATURE_BYTES:
+                raise SceneError(
+                    f"{file} unpacks to {total} bytes; expected at most {MAX_FEATURE_BYTES}: it is no features file"
+                )
+            missing = [name for name in names if name not in entries]
+            if missing:
+                raise SceneError(
+                    f"{file} has no features for {len(missing)} of {len(names)} views, e.g. '{missing[0]}' (it has "
+                    f"{', '.join(map(repr, list(entries)[:3])):.120}, ...); expected an array (masks, D) under "
+                    "each image's stem"
+                )
+            arrays = {name: array_from_zip(archive, entries[name]) for name in names}
+            features = {name: _as_features(array, f"{file}, '{name}'") for name, array in arrays.items()}
+            named = entries.get("feature_space")
+            space = str(array_from_zip(archive, named)) if named else UNKNOWN_SPACE
+    except SceneError:
+        raise
+    except (zipfile.BadZipFile, zlib.error, ValueError, OSError, EOFError, RuntimeError) as error:
+        raise SceneError(
+            f"{file} cannot be read as an .npz of plain arrays ({error!s:.120}): write it again with numpy.savez"
+        ) from None
+    return features, space
+
+
+def _as_features(values: NDArray[Any], source: str) -> NDArray[np.float32]:
+    if values.size == 0:
+        return np.zeros((0, values.shape[-1] if values.ndim == 2 else 0), np.float32)
+    if values.ndim != 2 or not np.issubdtype(values.dtype, np.floating):
+        raise SceneError(
+            f"{source}: features are {values.dtype} {values.shape}; expected floats of shape (masks, width)"
+        )
+    return as_float32(values)
+
+
+def as_float32(values: NDArray[np.floating]) -> NDArray[np.float32]:
+    """The features in single precision; what overflows becomes infinite, which the scene reports by mask."""
+    with np.errstate(over="ignore"):
+        return values.astype(np.float32)

@@ -1,0 +1,16 @@
+"""numba as every kernel here uses it: import it from this module, so that its threads are chosen before they start."""
+
+from __future__ import annotations
+
+import os
+
+import numba
+from numba import get_num_threads, njit, prange
+
+__all__ = ["get_num_threads", "njit", "prange"]
+
+# OpenMP first: numba else tries TBB, and warns where it finds an old one. A user's own choice is kept.
+# Threads that wait sleep: spinning ones double the time of a fit wherever another program has a core.
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+if "NUMBA_THREADING_LAYER_PRIORITY" not in os.environ:
+    numba.config.THREADING_LAYER_PRIORITY = ["omp", "tbb", "workqueue"]  # pyright: ignore

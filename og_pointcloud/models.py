@@ -1,0 +1,195 @@
+"""ONNX models: found where they were fetched to, checked before they are trusted, opened the same quiet way.
+
+Nothing is fetched here, and onnxruntime is imported nowhere else.
+
+What a stranger's ONNX graph may do, found out from its bytes before any runtime is given them.
+
+onnxruntime reads whatever file of this machine a graph names as the place of its constants, and fills constants of any
+size that a header claims. So only graphs pass whose constants lie in their own bytes, at the length that their shape
+asks for, and whose nodes are standard operators: no other domain, no functions, no graphs inside nodes.
+
+Field numbers are those of onnx.proto3; the file is walked over, not copied.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from onnxruntime import InferenceSession
+
+__all__ = ["MODEL_NAME", "check_graph", "fetched_model", "hub_cache", "message_fields", "open_session"]
+
+MODEL_NAME = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*", re.ASCII)
+REVISION = re.compile(r"[0-9a-f]{40}")
+ERRORS_ONLY = 3
+"""Severity of onnxruntime's log."""
+STANDARD_DOMAINS = ("", "ai.onnx")
+TYPE_BYTES = {1: 4, 2: 1, 3: 1, 4: 2, 5: 2, 6: 4, 7: 8, 9: 1, 10: 2, 11: 8, 12: 4, 13: 8, 16: 2}
+"""Bytes an element, by TensorProto.DataType."""
+VARINT, FIXED_64, BYTES, FIXED_32 = 0, 1, 2, 5
+
+
+def hub_cache() -> Path:
+    """The folder of fetched models, by the variables that Hugging Face's tools go by; it need not exist."""
+    if hub := os.environ.get("HF_HUB_CACHE"):
+        return Path(hub)
+    home = os.environ.get("HF_HOME")
+    return Path(home) / "hub" if home else Path.home() / ".cache" / "huggingface" / "hub"
+
+
+def fetched_model(name: str) -> Path | None:
+    """The folder of OWNER/MODEL as it was last fetched; None where it was not, or the name is none of that kind."""
+    if not MODEL_NAME.fullmatch(name):
+        return None
+    model = hub_cache() / f"models--{name.replace('/', '--')}"
+    main = model / "refs" / "main"
+    revision = main.read_text(encoding="utf-8", errors="replace").strip()[:64] if main.is_file() else ""
+    folder = model / "snapshots" / revision
+    return folder if REVISION.fullmatch(revision) and folder.is_dir() else None
+
+
+def open_session(model: bytes) -> InferenceSession:
+    """A CPU session that leaves the cores idle between runs. model: a serialised ONNX graph."""
+    # Read on import, when it would otherwise write a device id and a usage database into the user's cache folder.
+    os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
+    import onnxruntime
+
+    options = onnxruntime.SessionOptions()
+    options.log_severity_level = ERRORS_ONLY
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    return onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
+
+
+def check_graph(model: bytes, operators: frozenset[str] | None = None) -> None:
+    """ValueError, which says why, for a graph that is damaged or may do more than compute with its own constants.
+
+    operators: those that it may use; None for any of the standard.
+    """
+    for number, value in message_fields(memoryview(model)):
+        if number == 25:
+            raise ValueError("it defines functions of its own")
+        if number == 8 and (domain := _string(_last(value, 1))) not in STANDARD_DOMAINS:
+            raise ValueError(f"it uses operators of {domain!r:.40}, not of the standard")
+        if number == 7:
+            _check_contents(_message(value), operators)
+
+
+def _check_contents(graph: memoryview, operators: frozenset[str] | None) -> None:
+    for number, value in message_fields(graph):
+        if number == 1:
+            _check_node(_message(value), operators)
+        elif number == 5:
+            _check_tensor(_message(value))
+        elif number == 15:
+            raise ValueError("it holds sparse constants")
+
+
+def _check_node(node: memoryview, operators: frozenset[str] | None) -> None:
+    operator, domain = _string(_last(node, 4)), _string(_last(node, 7))
+    if domain not in STANDARD_DOMAINS:
+        raise ValueError(f"it uses the operator {operator!r:.40} of {domain!r:.40}, not of the standard")
+    if operators is not None and operator not in operators:
+        raise ValueError(f"it uses the operator {operator!r:.40}, which it has no need of")
+    for number, attribute in message_fields(node):
+        if number != 5:
+            continue
+        for kind, value in message_fields(_message(attribute)):
+            if kind in (6, 11):
+                raise ValueError(f"its node {operator!r:.40} holds a graph of its own")
+            if kind in (10, 22, 23):
+                raise ValueError(f"its node {operator!r:.40} holds lists of constants")
+            if kind == 5:
+                _check_tensor(_message(value))
+
+
+def _check_tensor(tensor: memoryview) -> None:
+    shape: list[int] = []
+    kind, held, typed = 0, 0, False
+    for number, value in message_fields(tensor):
+        if number == 13 or (number == 14 and value):
+            raise ValueError("it asks for other files of this machine")
+        if number == 1:
+            shape += _integers(value)
+        elif number == 2:
+            kind = value
+        elif number == 9:
+            held = len(_message(value))
+        elif number in (4, 5, 6, 7, 10, 11):
+            typed = True
+    if typed or kind not in TYPE_BYTES:
+        raise ValueError(f"it holds a constant of type {kind} that is not stored as plain bytes")
+    if any(length < 0 for length in shape) or math.prod(shape) * TYPE_BYTES[int(kind)] != held:
+        raise ValueError(f"a constant of shape {shape} and type {kind} has {held} bytes")
+
+
+def message_fields(message: memoryview | int) -> Iterator[tuple[int, memoryview | int]]:
+    """(field number, value) of a protobuf message, in order: an int of a varint, else its bytes, not copied."""
+    message = _message(message)
+    position, end = 0, len(message)
+    while position < end:
+        key, position = _varint(message, position)
+        number, wire = key >> 3, key & 7
+        if not 0 < number < 1 << 29:
+            raise ValueError(f"it is damaged: field number {number}")
+        if wire == VARINT:
+            value, position = _varint(message, position)
+            yield number, value
+            continue
+        if wire == BYTES:
+            length, position = _varint(message, position)
+        elif wire in (FIXED_64, FIXED_32):
+            length = 8 if wire == FIXED_64 else 4
+        else:
+            raise ValueError(f"it is damaged: wire type {wire}")
+        if length > end - position:
+            raise ValueError(f"it is damaged: a field of {length} bytes where {end - position} are left")
+        yield number, message[position : position + length]
+        position += length
+
+
+def _varint(data: memoryview, position: int) -> tuple[int, int]:
+    value = 0
+    for shift in range(0, 70, 7):
+        if position >= len(data):
+            break
+        byte = data[position]
+        position += 1
+        value |= (byte & 0x7F) << shift
+        if byte < 0x80:
+            return value & (1 << 64) - 1, position
+    raise ValueError("it is damaged: a number does not end")
+
+
+def _message(value: memoryview | int) -> memoryview:
+    if isinstance(value, int):
+        raise ValueError("it is damaged: a number stands where a message should")
+    return value
+
+
+def _last(message: memoryview | int, number: int) -> memoryview | int:
+    return ([value for found, value in message_fields(message) if found == number] or [memoryview(b"")])[-1]
+
+
+def _string(value: memoryview | int) -> str:
+    return bytes(_message(value)).decode("utf-8", "replace")
+
+
+def _integers(value: memoryview | int) -> list[int]:
+    """A repeated int64, which may come one by one or packed."""
+    if isinstance(value, int):
+        return [_signed(value)]
+    numbers, position = [], 0
+    while position < len(value):
+        number, position = _varint(value, position)
+        numbers.append(_signed(number))
+    return numbers
+
+
+def _signed(value: int) -> int:
+    return value - (1 << 64) if value >> 63 else value

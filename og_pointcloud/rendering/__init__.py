@@ -1,0 +1,1 @@
+"""Points -> what each view shows of them: which views are needed, Gaussians of a plain cloud, blending weights."""

@@ -1,0 +1,619 @@
+"""Frozen geometry + camera + id map -> how much each Gaussian shows in each id's pixels, exactly as 3DGS blends.
+
+Rendering a frozen scene is linear: a pixel's value is ``sum_g W[p, g] value_g`` with the alpha-blending weights
+``W[p, g] = T alpha`` of 3D Gaussian Splatting (Kerbl et al. 2023, Eq. 3; paper appendix "splatting"). This file adds
+those weights up over the pixels of each mask, tile by tile while compositing; ``W`` itself is never stored:
+
+    A[i, g] = sum over pixels p of mask i of W[p, g]
+
+It knows nothing of colours or features: what a view shows of any value is a product with these sparse rows. A map
+that gives every pixel its own id makes ``A`` the weights ``W`` themselves (see `pixel_weights`).
+
+Blending also shows what a mask does not mean: the floor between the splats of a table top. Given how thick surfaces
+are, exposure counts little what shows *through* one: a splat farther than that behind the one at which a pixel became
+more covered than not. It is a depth test with the accuracy of a surface, not of a point, and takes no second pass.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+
+from og_pointcloud.errors import SceneError
+from og_pointcloud.kernels import get_num_threads, njit, prange
+from og_pointcloud.rendering.lanes import WIDTH, any_of, either, exp2, lesser, load, ramp, spread, store, total
+from og_pointcloud.scene import Camera, Points
+
+__all__ = [
+    "CUTOFFS",
+    "Cutoffs",
+    "Gaussians",
+    "ViewWeights",
+    "pixel_weights",
+    "render",
+    "view_weights",
+    "working_memory",
+]
+
+TILE = WIDTH
+"""Pixels along a tile's side: 16 as in 3DGS, so that a row of a tile is one vector."""
+BATCH = 128
+"""Splats of a tile that are fetched at once."""
+ZERO, HALF, ONE = np.float32(0), np.float32(0.5), np.float32(1)
+LOW_PASS = 0.3
+"""Added to the projected covariance, px^2: a splat is never smaller than about a pixel (3DGS)."""
+ALPHA_MIN = 1.0 / 255.0
+"""Contributions below are dropped (3DGS)."""
+LOG2_E = np.log2(np.e)
+ALPHA_MAX = 0.99
+"""Alpha is cut here (3DGS)."""
+TRANSMITTANCE_MIN = 1e-4
+"""A pixel stops before the splat that would bring its transmittance below (3DGS)."""
+FRUSTUM_MARGIN = 0.3
+"""Centres beyond the image by more than this share of the half field of view are clamped when the projection is
+linearised (3DGS's 1.3 tan(fov/2), written for any principal point)."""
+NEAR_SHARE = 0.02
+"""The near plane as a share of the median depth of the scene; 3DGS fixes 0.2 units, which no unitless scene can."""
+
+
+class Cutoffs(NamedTuple):
+    """What blending leaves out, 3DGS's figures. Larger ones are faster and lose weight: an alpha below ``alpha_min``
+    is dropped, a pixel stops before the splat that would bring its transmittance below ``transmittance_min``."""
+
+    alpha_min: float = ALPHA_MIN
+    transmittance_min: float = TRANSMITTANCE_MIN
+
+
+CUTOFFS = Cutoffs()
+
+
+@dataclass(frozen=True)
+class Gaussians:
+    """Geometry ready for splatting. xyz (n, 3), scale (n, 3) linear, rotation (n, 4) unit wxyz, opacity (n,)."""
+
+    xyz: NDArray[np.float32]
+    scale: NDArray[np.float32]
+    rotation: NDArray[np.float32]
+    opacity: NDArray[np.float32]
+
+    @classmethod
+    def from_points(cls, points: Points) -> Gaussians:
+        """The Gaussians of a 3DGS file; SceneError for a plain cloud, whose splats `geometry` has to choose."""
+        if points.scale is None or points.rotation is None or points.opacity is None:
+            raise SceneError("the cloud has no scale, rotation and opacity; choose them with geometry.choose_gaussians")
+        return cls(points.xyz, points.scale, points.rotation, points.opacity)
+
+    def __len__(self) -> int:
+        return len(self.xyz)
+
+
+def pixel_weights(gaussians: Gaussians, camera: Camera, near: float) -> csr_array:
+    """The blending weights ``W`` of one view themselves: (H W, n) sparse float32, pixels row by row."""
+    pixels = camera.width * camera.height
+    ids = np.arange(pixels, dtype=np.int32).reshape(camera.height, camera.width)
+    return view_weights(gaussians, camera, ids, pixels, near).rows[:-1]
+
+
+def render(
+    gaussians: Gaussians, values: NDArray[np.float32], camera: Camera, near: float
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Values (n, c) of the Gaussians as one view shows them: (H, W, c) float32, and (H, W) float32, how much of each
+    pixel is covered. Uncovered pixels are 0: this is ``W @ values`` without ``W`` in between."""
+    pixels = camera.width * camera.height
+    ids = np.arange(pixels, dtype=np.int32).reshape(camera.height, camera.width)
+    (rows, cols, weights, first, counts), _ = _entries(gaussians, camera, ids, pixels, near, None)
+    with_coverage = np.concatenate([values, np.ones((len(values), 1), np.float32)], axis=1)
+    image = _paint(rows, cols, weights, first, counts, with_coverage, pixels).reshape(camera.height, camera.width, -1)
+    return image[..., :-1], image[..., -1]
+
+
+@njit(cache=True, parallel=True, nogil=True)
+def _paint(rows, cols, weights, first, counts, values, pixels):  # noqa: ANN001, ANN202
+    """Add up the values of every tile's entries by pixel; no pixel belongs to two tiles."""
+    image = np.zeros((pixels, values.shape[1]), np.float32)
+    for tile in prange(len(counts)):
+        for e in range(first[tile], first[tile] + counts[tile]):
+            for c in range(values.shape[1] if rows[e] < pixels else 0):
+                image[rows[e], c] += weights[e] * values[cols[e], c]
+    return image
+
+
+@dataclass(frozen=True)
+class ViewWeights:
+    """What one view shows. rows: (id_count + 1, n) sparse float32 without duplicates, the last row what shows in pixels
+    with id -1; they sum to at most the id's area in pixels. area: (n,) float64, the pixels each splat would weigh with
+    nothing in front of it, 0 where it is outside the image. through: (1, n) sparse float32, the part of a splat's
+    weight that shows through a surface."""
+
+    rows: csr_array
+    area: NDArray[np.float64]
+    through: csr_array
+
+
+def view_weights(
+    gaussians: Gaussians,
+    camera: Camera,
+    ids: NDArray[np.int32],
+    id_count: int,
+    near: float,
+    thickness: NDArray[np.float32] | None = None,
+    cutoffs: Cutoffs = CUTOFFS,
+) -> ViewWeights:
+    """Blending weight of every Gaussian summed over the pixels of every id of one view.
+
+    ids: (H, W) int32 in -1..id_count-1, H and W the camera's. thickness: see `visibility.mask_table`.
+    Splats are blended by (float32 depth, index), so that equal depths have one order.
+    """
+    (rows, cols, weights, first, counts), area = _entries(gaussians, camera, ids, id_count, near, thickness, cutoffs)
+    data, indices, indptr = _merge(rows, cols, weights, first, counts, id_count + 2, len(gaussians))
+    border, n = indptr[-2], len(gaussians)
+    return ViewWeights(
+        csr_array((data[:border], indices[:border], indptr[:-1]), shape=(id_count + 1, n)),
+        area,
+        csr_array((data[border:], indices[border:], indptr[-2:] - border), shape=(1, n)),
+    )
+
+
+def working_memory(n: int, camera: Camera) -> int:
+    """About how many bytes `view_weights` holds at once for n Gaussians and that image."""
+    return 250 * n + 60 * camera.width * camera.height
+
+
+def _entries(
+    gaussians: Gaussians,
+    camera: Camera,
+    ids: NDArray[np.int32],
+    id_count: int,
+    near: float,
+    thickness: NDArray[np.float32] | None,
+    cutoffs: Cutoffs = CUTOFFS,
+) -> tuple[tuple[NDArray[Any], ...], NDArray[np.float64]]:
+    """What `view_weights` adds up, tile by tile: (rows, cols, weights, first, counts), tile t's entries being
+    first[t] : first[t] + counts[t]; and the area of each splat."""
+    pose, near = camera.world_to_camera, float(near)
+    intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
+    size = (camera.width, camera.height)
+    near_image = _near_image(gaussians.xyz, gaussians.scale, gaussians.opacity, pose, intrinsics, size, near, cutoffs)
+    chosen = np.flatnonzero(near_image).astype(np.int32)
+    splats, area = _records(len(chosen)), np.zeros(len(gaussians))
+    keys = _project(
+        chosen,
+        gaussians.xyz,
+        gaussians.scale,
+        gaussians.rotation,
+        gaussians.opacity,
+        np.full(1, np.inf, np.float32) if thickness is None else thickness,
+        pose,
+        intrinsics,
+        size,
+        cutoffs,
+        splats,
+        area,
+    )
+    keys = np.sort(keys[keys != _CULLED])
+    order = (keys & np.uint64(0xFFFFFFFF)).astype(np.int32)
+    columns = -(-camera.width // TILE)
+    tiles = columns * -(-camera.height // TILE)
+    starts, members = _bin(splats, order, columns, tiles, cutoffs, get_num_threads())
+    masks = np.where(ids < 0, id_count, ids).astype(np.int32)
+    bounds = _entry_bounds(splats, starts, members, masks, id_count, columns)
+    first = np.concatenate([[0], np.cumsum(bounds)])
+    rows, cols, weights, counts = _composite(
+        splats, starts, members, masks, id_count, columns, first, cutoffs, get_num_threads()
+    )
+    return (rows, cols, weights, first[:-1], counts), area
+
+
+def _records(count: int) -> NDArray[Any]:
+    """Splats with undefined values, each within one line of a processor's cache."""
+    room = np.empty((count + 1) * SPLAT.itemsize, np.uint8)
+    ahead = -room.ctypes.data % SPLAT.itemsize
+    return room[ahead : ahead + count * SPLAT.itemsize].view(SPLAT)
+
+
+_CULLED = np.uint64(0xFFFFFFFFFFFFFFFF)
+SPLAT = np.dtype(
+    [
+        ("u", np.float64),  # centre, px
+        ("v", np.float64),
+        ("shear", np.float64),  # px that the middle of a row moves to the left for each row down
+        ("across", np.float32),  # log2 of the density along a row is -(across * distance to the row's middle)^2
+        ("down", np.float32),  # log2 of the density at the rows' middles is -down * (distance to the centre's row)^2
+        ("peak", np.float32),  # log2 of the opacity
+        ("depth", np.float32),
+        ("surface", np.float32),  # depth of the nearest surface that it can belong to
+        ("x0", np.int32),  # the pixels that it may show in, inclusive
+        ("x1", np.int32),
+        ("y0", np.int32),
+        ("y1", np.int32),
+        ("gaussian", np.int32),
+    ],
+    align=True,
+)
+"""A projected Gaussian, in one line of a processor's cache. Split into rows, a quadratic form has no differences of
+large numbers: float32 holds it for any needle."""
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _seen_from(x, y, z, pose):  # noqa: ANN001, ANN202
+    """Depth, and the two slopes of the ray to a point."""
+    depth = pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] * z + pose[2, 3]
+    across = (pose[0, 0] * x + pose[0, 1] * y + pose[0, 2] * z + pose[0, 3]) / depth
+    return depth, across, (pose[1, 0] * x + pose[1, 1] * y + pose[1, 2] * z + pose[1, 3]) / depth
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _linearised_at(tx, ty, intrinsics, size):  # noqa: ANN001, ANN202
+    """The slopes at which the projection is linearised: those of the ray, at most FRUSTUM_MARGIN outside the image."""
+    fx, fy, cx, cy = intrinsics
+    margin_x, margin_y = FRUSTUM_MARGIN * 0.5 * size[0] / fx, FRUSTUM_MARGIN * 0.5 * size[1] / fy
+    return (
+        min(max(tx, -cx / fx - margin_x), (size[0] - cx) / fx + margin_x),
+        min(max(ty, -cy / fy - margin_y), (size[1] - cy) / fy + margin_y),
+    )
+
+
+@njit(cache=True, parallel=True, nogil=True, error_model="numpy")
+def _near_image(xyz, scale, opacity, pose, intrinsics, size, near, cutoffs):  # noqa: ANN001, ANN202
+    """(n,) bool: Gaussians that may show. Most of a scene lies outside a view: turned away before an ellipse is known,
+    by the largest that it could be."""
+    n = len(xyz)
+    chosen = np.zeros(n, np.bool_)
+    fx, fy, cx, cy = intrinsics
+    reach = -2.0 * np.log(cutoffs.alpha_min)  # squared Mahalanobis distance at which an opacity of 1 falls so low
+    for g in prange(n):
+        depth, tx, ty = _seen_from(np.float64(xyz[g, 0]), np.float64(xyz[g, 1]), np.float64(xyz[g, 2]), pose)
+        if not depth > near or not opacity[g] > cutoffs.alpha_min:
+            continue
+        jx, jy = _linearised_at(tx, ty, intrinsics, size)
+        largest = np.float64(max(scale[g, 0], scale[g, 1], scale[g, 2])) / depth
+        xx = fx * fx * largest * largest * (1 + jx * jx) + LOW_PASS
+        yy = fy * fy * largest * largest * (1 + jy * jy) + LOW_PASS
+        chosen[g] = _reaches(fx * tx + cx, size[0], reach * xx) and _reaches(fy * ty + cy, size[1], reach * yy)
+    return chosen
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _reaches(at, size, reach_squared):  # noqa: ANN001, ANN202
+    """Whether what reaches so far (px^2) about ``at`` may show in pixels 0 to size."""
+    outside = max(-at, at - size) - 1.0
+    return not (outside > 0.0 and outside * outside > reach_squared)
+
+
+@njit(cache=True, parallel=True, nogil=True, error_model="numpy")
+def _project(chosen, xyz, scale, rotation, opacity, thickness, pose, intrinsics, size, cutoffs, splats, area):  # noqa: ANN001, ANN202
+    """EWA projection of the chosen Gaussians in float64: writes splats (m,) and area (n,), the weight in pixels if
+    nothing were in front; returns depth keys (m,) uint64.
+
+    A key is the float32 depth's bits above the place: sorting keys sorts by depth, ties by Gaussian. Splats without a
+    pixel have the key _CULLED.
+    """
+    m = len(chosen)
+    keys = np.empty(m, np.uint64)
+    fx, fy, cx, cy = intrinsics
+    for i in prange(m):
+        g = chosen[i]
+        depth, tx, ty = _seen_from(np.float64(xyz[g, 0]), np.float64(xyz[g, 1]), np.float64(xyz[g, 2]), pose)
+        jx, jy = _linearised_at(tx, ty, intrinsics, size)
+        sxx, sxy, syy, det = _covariance(scale[g], rotation[g], pose, fx / depth, fy / depth, jx, jy)
+        u, v, sigma = fx * tx + cx, fy * ty + cy, np.float64(opacity[g])
+        # The ellipse on which alpha falls to its least; its box holds every pixel that can contribute.
+        peak = np.log2(sigma)
+        reach = 2.0 / LOG2_E * (peak - np.log2(cutoffs.alpha_min))
+        rx, ry = np.sqrt(reach * sxx), np.sqrt(reach * syy)
+        x0, x1 = max(np.ceil(u - rx - 0.5), 0.0), min(np.floor(u + rx - 0.5), size[0] - 1.0)
+        y0, y1 = max(np.ceil(v - ry - 0.5), 0.0), min(np.floor(v + ry - 0.5), size[1] - 1.0)
+        keys[i] = _CULLED
+        if not (x0 <= x1 and y0 <= y1 and det < np.inf):
+            continue
+        s = splats[i]
+        s.u, s.v, s.shear = u, v, -sxy / syy
+        s.across, s.down = np.sqrt(0.5 * LOG2_E * syy / det), 0.5 * LOG2_E / syy
+        s.peak, s.depth, s.surface = peak, depth, depth - thickness[g if len(thickness) > 1 else 0]
+        s.x0, s.x1, s.y0, s.y1, s.gaussian = int(x0), int(x1), int(y0), int(y1), g
+        area[g] = 2 * np.pi * np.sqrt(det) * (sigma - cutoffs.alpha_min)  # the integral of alpha over that ellipse
+        keys[i] = (np.uint64(np.float32(depth).view(np.uint32)) << np.uint64(32)) | np.uint64(i)
+    return keys
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _covariance(scale, rotation, pose, px, py, jx, jy):  # noqa: ANN001, ANN202
+    """(xx, xy, yy, determinant) of a splat's covariance, px^2, linearised at slopes (jx, jy).
+
+    The projected axes are the columns of J R_camera R_gaussian S, a 2x3 matrix V; the covariance is V V' + c I.
+    """
+    qw, qx = np.float64(rotation[0]), np.float64(rotation[1])
+    qy, qz = np.float64(rotation[2]), np.float64(rotation[3])
+    axis = (1 - 2 * (qy * qy + qz * qz), 2 * (qx * qy + qw * qz), 2 * (qx * qz - qw * qy))
+    vx0, vy0 = _projected_axis(axis, np.float64(scale[0]), pose, px, py, jx, jy)
+    axis = (2 * (qx * qy - qw * qz), 1 - 2 * (qx * qx + qz * qz), 2 * (qy * qz + qw * qx))
+    vx1, vy1 = _projected_axis(axis, np.float64(scale[1]), pose, px, py, jx, jy)
+    axis = (2 * (qx * qz + qw * qy), 2 * (qy * qz - qw * qx), 1 - 2 * (qx * qx + qy * qy))
+    vx2, vy2 = _projected_axis(axis, np.float64(scale[2]), pose, px, py, jx, jy)
+    sxx = vx0 * vx0 + vx1 * vx1 + vx2 * vx2
+    syy = vy0 * vy0 + vy1 * vy1 + vy2 * vy2
+    sxy = vx0 * vy0 + vx1 * vy1 + vx2 * vy2
+    # det(V V' + c I) as a sum of positive terms (Cauchy-Binet): no cancellation for needles.
+    m01, m02, m12 = vx0 * vy1 - vx1 * vy0, vx0 * vy2 - vx2 * vy0, vx1 * vy2 - vx2 * vy1
+    det = m01 * m01 + m02 * m02 + m12 * m12 + LOW_PASS * (sxx + syy) + LOW_PASS * LOW_PASS
+    return sxx + LOW_PASS, sxy, syy + LOW_PASS, det
+
+
+@njit(cache=True, error_model="numpy")
+def _projected_axis(axis, length, pose, px, py, jx, jy):  # noqa: ANN001, ANN202
+    """An axis of a Gaussian (unit, world) of that length in pixels of the image, linearised at (jx, jy)."""
+    ex = length * (pose[0, 0] * axis[0] + pose[0, 1] * axis[1] + pose[0, 2] * axis[2])
+    ey = length * (pose[1, 0] * axis[0] + pose[1, 1] * axis[1] + pose[1, 2] * axis[2])
+    ez = length * (pose[2, 0] * axis[0] + pose[2, 1] * axis[1] + pose[2, 2] * axis[2])
+    return px * (ex - jx * ez), py * (ey - jy * ez)
+
+
+@njit(cache=True, parallel=True, nogil=True, error_model="numpy")
+def _bin(splats, order, columns, tiles, cutoffs, bands):  # noqa: ANN001, ANN202
+    """Depth-ordered members of every tile: tile t holds members[starts[t]:starts[t + 1]]."""
+    tile_rows, log2_least = tiles // columns, np.log2(cutoffs.alpha_min)
+    # The tile ranges side by side: every band reads all of them, twice.
+    ranges = np.empty((len(order), 4), np.int32)
+    for i in prange(len(order)):
+        s = splats[order[i]]
+        ranges[i, 0], ranges[i, 1] = s.x0 // TILE, s.x1 // TILE + 1
+        ranges[i, 2], ranges[i, 3] = s.y0 // TILE, s.y1 // TILE + 1
+    counts = np.zeros(tiles + 1, np.int64)
+    for band in prange(bands):
+        low, high = band * tile_rows // bands, (band + 1) * tile_rows // bands
+        for i in range(len(order)):
+            for row in range(max(ranges[i, 2], low), min(ranges[i, 3], high)):
+                begin, end = _tiles_of_row(splats, order[i], row, ranges[i, 0], ranges[i, 1], log2_least)
+                for column in range(begin, end):
+                    counts[row * columns + column + 1] += 1
+    starts = np.cumsum(counts)
+    members = np.empty(starts[-1], np.int32)
+    fill = starts[:-1].copy()
+    for band in prange(bands):
+        low, high = band * tile_rows // bands, (band + 1) * tile_rows // bands
+        for i in range(len(order)):
+            for row in range(max(ranges[i, 2], low), min(ranges[i, 3], high)):
+                begin, end = _tiles_of_row(splats, order[i], row, ranges[i, 0], ranges[i, 1], log2_least)
+                for column in range(begin, end):
+                    tile = row * columns + column
+                    members[fill[tile]] = order[i]
+                    fill[tile] += 1
+    return starts, members
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _tiles_of_row(splats, place, row, begin, end, log2_least):  # noqa: ANN001, ANN202
+    """The columns of tiles that a splat's ellipse touches in a row of tiles, of those that its box does."""
+    if end - begin <= 2:
+        return begin, end
+    s = splats[place]
+    # Along dy, the ellipse's right end lies at u - shear dy + sqrt(room - down dy^2) / across: farthest out at `far`,
+    # within the row of tiles where it comes nearest to that; its left end is the mirror image.
+    room, across, down = np.float64(s.peak) - log2_least, np.float64(s.across), np.float64(s.down)
+    slant = s.shear * across
+    far = -slant * np.sqrt(room / down / (down + slant * slant))
+    low = max(row * TILE + 0.5 - s.v, -np.sqrt(room / down))
+    high = min(row * TILE + TILE - 0.5 - s.v, np.sqrt(room / down))
+    dy = min(max(far, low), high)
+    right = s.u - s.shear * dy + np.sqrt(max(room - down * dy * dy, 0.0)) / across
+    dy = min(max(-far, low), high)
+    left = s.u - s.shear * dy - np.sqrt(max(room - down * dy * dy, 0.0)) / across
+    if not (left > -1e9 and right < 1e9):  # also where they overflowed
+        return begin, end
+    # A hundredth of a pixel for what rounding may do; pixel centres lie at halves.
+    return max(begin, int(left - 0.51) // TILE), min(end, int(max(right - 0.49, -1.0)) // TILE + 1)
+
+
+@njit(cache=True, nogil=True)
+def _clip_box(s, left, top):  # noqa: ANN001, ANN202
+    """The pixels of splat s within a tile: x0, x1, y0, y1 counted from the tile's corner, with exclusive ends."""
+    return max(s.x0 - left, 0), min(s.x1 + 1 - left, TILE), max(s.y0 - top, 0), min(s.y1 + 1 - top, TILE)
+
+
+@njit(cache=True, parallel=True, nogil=True)
+def _entry_bounds(splats, starts, members, masks, id_count, columns):  # noqa: ANN001, ANN202
+    """An upper bound of the (mask, Gaussian) entries each tile will write."""
+    tiles = len(starts) - 1
+    height, width = masks.shape
+    bounds = np.zeros(tiles, np.int64)
+    for tile in prange(tiles):
+        left, top = tile % columns * TILE, tile // columns * TILE
+        distinct, last = 0, -1
+        for y in range(top, min(top + TILE, height)):
+            for x in range(left, min(left + TILE, width)):
+                # Runs of equal ids along rows: at least the number of distinct ids, without a set.
+                if masks[y, x] != last:
+                    distinct, last = distinct + 1, masks[y, x]
+        if distinct <= 4:
+            # Looking at every splat would save little memory here.
+            bounds[tile] = (distinct + 1) * (starts[tile + 1] - starts[tile])
+            continue
+        total = 0
+        for m in range(starts[tile], starts[tile + 1]):
+            x0, x1, y0, y1 = _clip_box(splats[members[m]], left, top)
+            total += min(distinct, id_count + 1, (x1 - x0) * (y1 - y0)) + 1
+        bounds[tile] = total
+    return bounds
+
+
+@njit(cache=True, parallel=True, nogil=True, error_model="numpy")
+def _composite(splats, starts, members, masks, id_count, columns, first, cutoffs, workers):  # noqa: ANN001, ANN202
+    """Blend every tile front to back and add each splat's weights up by mask; entries of tile t start at first[t].
+
+    Row id_count holds pixels without a mask, row id_count + 1 what shows through surfaces (counted in its mask too)."""
+    tiles = len(starts) - 1
+    rows = np.empty(first[-1], np.int32)
+    cols = np.empty(first[-1], np.int32)
+    weights = np.empty(first[-1], np.float32)
+    counts = np.zeros(tiles, np.int64)
+    sums = np.zeros((workers, id_count + 1))
+    # Each worker takes every workers-th tile (neighbouring tiles cost alike, so the shares are even) and adds up in
+    # scratch rows of its own.
+    for worker in prange(workers):
+        sum_of, touched = sums[worker], np.empty(TILE * TILE, np.int32)
+        light, surface, shown = _scratch(), _scratch(), _scratch()
+        runs = np.empty((TILE, TILE), np.uint8)
+        batch = np.empty(BATCH, SPLAT)
+        log2_least = np.float32(np.log2(cutoffs.alpha_min))
+        # By more than rounding below: four splats of opacity 0.9 leave just the limit of 3DGS.
+        least_light = np.float32(0.99999 * cutoffs.transmittance_min)
+        for tile in range(worker, tiles, workers):
+            left, top = tile % columns * TILE, tile // columns * TILE
+            ids = masks[top : top + TILE, left : left + TILE]
+            is_one_mask = _begin_tile(ids, light, surface, runs)
+            entry = first[tile]
+            for begin in range(starts[tile], starts[tile + 1], BATCH):
+                count = min(BATCH, starts[tile + 1] - begin)
+                for k in range(count):  # they lie all over memory: fetched at once, they do not wait for each other
+                    batch[k] = splats[members[begin + k]]
+                for k in range(count):
+                    s = batch[k]
+                    weight, through = _blend(s, left, top, log2_least, least_light, light, surface, shown)
+                    if weight == 0.0:
+                        continue
+                    x0, x1, y0, y1 = _clip_box(s, left, top)
+                    if is_one_mask or _shows_one_mask(ids, runs, x0, x1, y0, y1):
+                        rows[entry], cols[entry], weights[entry] = ids[y0, x0], s.gaussian, weight
+                        entry += 1
+                    else:
+                        for j in range(_add_by_mask(ids, shown, x0, x1, y0, y1, sum_of, touched)):
+                            rows[entry], cols[entry], weights[entry] = touched[j], s.gaussian, sum_of[touched[j]]
+                            sum_of[touched[j]] = 0.0
+                            entry += 1
+                    if through > 0.0:
+                        rows[entry], cols[entry], weights[entry] = id_count + 1, s.gaussian, through
+                        entry += 1
+                if not _is_open(light):
+                    break
+            counts[tile] = entry - first[tile]
+    return rows, cols, weights, counts
+
+
+@njit(cache=True, nogil=True)
+def _scratch():  # noqa: ANN202
+    """A number for each pixel of a tile; rows begin where vectors are read fastest."""
+    room = np.empty(TILE * TILE + 16, np.float32)
+    ahead = (64 - room.ctypes.data % 64) % 64 // 4
+    return room[ahead : ahead + TILE * TILE]
+
+
+@njit(cache=True, nogil=True)
+def _begin_tile(ids, light, surface, runs):  # noqa: ANN001, ANN202
+    """All light, no surface; pixels of a tile that are outside the image are dark. runs: (TILE, TILE) how many pixels
+    from each one on to the right have its id. Returns whether all pixels have one id."""
+    one = True
+    light[:] = np.float32(0)
+    surface[:] = np.float32(np.inf)
+    height, width = ids.shape
+    for y in range(height):
+        run = 0
+        for x in range(width - 1, -1, -1):
+            run = run + 1 if x + 1 < width and ids[y, x] == ids[y, x + 1] else 1
+            runs[y, x] = run
+            light[y * TILE + x] = np.float32(1)
+        one &= run == width and ids[y, 0] == ids[0, 0]
+    return one
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _blend(s, left, top, log2_least, least_light, light, surface, shown):  # noqa: ANN001, ANN202
+    """Draw a splat into a tile, a row of pixels at a time. Returns its weight, and that which shows through a surface.
+
+    light: transmittance of each pixel, 0 where it is finished. surface: depth of the splat that brought a pixel's
+    transmittance below a half. shown: set to the weights in the rows of its box.
+    """
+    none, full, half, never = spread(ZERO), spread(ONE), spread(HALF), spread(np.float32(np.inf))
+    across, depth, near_side, least = spread(s.across), spread(s.depth), spread(s.surface), spread(log2_least)
+    weight, through = none, none
+    for y in range(max(s.y0 - top, 0), min(s.y1 + 1 - top, TILE)):
+        dy = top + y + 0.5 - s.v
+        distance = (ramp() - spread(np.float32(s.u - s.shear * dy - left - 0.5))) * across
+        log_alpha = spread(np.float32(s.peak - s.down * dy * dy)) - distance * distance
+        covers = log_alpha >= least
+        alpha = lesser(exp2(either(covers, log_alpha, least)), spread(np.float32(ALPHA_MAX)))
+        alpha = either(covers, alpha, none)
+        before = load(light, y * TILE)
+        after = before * (full - alpha)
+        goes_on = after >= spread(least_light)  # also where it is not covered and not finished
+        here = either(goes_on, before * alpha, none)
+        store(light, y * TILE, either(goes_on, after, none))
+        passed = either((before >= half) & (after < half), depth, never)
+        front = lesser(load(surface, y * TILE), passed)
+        store(surface, y * TILE, front)
+        store(shown, y * TILE, here)
+        weight = weight + here
+        through = through + either(near_side > front, here, none)
+    return total(weight), total(through)
+
+
+@njit(cache=True, nogil=True)
+def _shows_one_mask(ids, runs, x0, x1, y0, y1):  # noqa: ANN001, ANN202
+    """Whether all pixels of a box have one id."""
+    one = True
+    for y in range(y0, y1):
+        one &= runs[y, x0] >= x1 - x0 and ids[y, x0] == ids[y0, x0]
+    return one
+
+
+@njit(cache=True, nogil=True)
+def _add_by_mask(ids, shown, x0, x1, y0, y1, sum_of, touched):  # noqa: ANN001, ANN202
+    """Add the weights of a box up by id; returns how many ids were touched, which ones is in ``touched``."""
+    touches = 0
+    for y in range(y0, y1):
+        for x in range(x0, x1):
+            weight = shown[y * TILE + x]
+            if weight > 0.0:
+                mask = ids[y, x]
+                if sum_of[mask] == 0.0:
+                    touched[touches] = mask
+                    touches += 1
+                sum_of[mask] += weight
+    return touches
+
+
+@njit(cache=True, nogil=True)
+def _is_open(light):  # noqa: ANN001, ANN202
+    """Whether any pixel of a tile is unfinished."""
+    brightest = spread(ZERO)
+    for y in range(TILE):
+        row = load(light, y * TILE)
+        brightest = either(row > brightest, row, brightest)
+    return any_of(brightest > spread(ZERO))
+
+
+@njit(cache=True, nogil=True)
+def _merge(rows, cols, weights, first, counts, row_count, n):  # noqa: ANN001, ANN202
+    """Tiles' entries as CSR (data, indices, indptr), one entry per (mask, Gaussian)."""
+    start = np.zeros(row_count + 1, np.int64)
+    for tile in range(len(first)):
+        for e in range(first[tile], first[tile] + counts[tile]):
+            start[rows[e] + 1] += 1
+    start = np.cumsum(start)
+    place = start[:-1].copy()
+    sorted_cols = np.empty(start[-1], np.int32)
+    sorted_weights = np.empty(start[-1], np.float32)
+    for tile in range(len(first)):
+        for e in range(first[tile], first[tile] + counts[tile]):
+            p = place[rows[e]]
+            sorted_cols[p], sorted_weights[p] = cols[e], weights[e]
+            place[rows[e]] = p + 1
+    # A Gaussian over a tile border has an entry from each tile: fold them together, row by row.
+    where = np.full(n, -1, np.int64)
+    indptr = np.zeros(row_count + 1, np.int32)
+    out = 0
+    for row in range(row_count):
+        begin = out
+        for p in range(start[row], start[row + 1]):
+            g = sorted_cols[p]
+            if where[g] >= begin:
+                sorted_weights[where[g]] += sorted_weights[p]
+            else:
+                where[g] = out
+                sorted_cols[out], sorted_weights[out] = g, sorted_weights[p]
+                out += 1
+        indptr[row + 1] = out
+    return sorted_weights[:out].copy(), sorted_cols[:out].copy(), indptr

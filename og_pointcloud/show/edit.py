@@ -1,0 +1,547 @@
+"""Scene editing (A.2.1): objects taken out, kept alone, recoloured, or put into a cloud or 3DGS file.
+
+    og.edit.remove(scene, "red mug", "without.ply", cloud="kitchen.ply")
+    og.edit.recolour(scene, "chair", "blue.ply", (40, 70, 220), cloud="kitchen.ply")
+    og.edit.extract(scene, og.pick(scene, (1.2, 0.4, 0.8)), "mug.ply", cloud="kitchen.ply")
+    og.edit.insert("kitchen.ply", "mug.ply", "two_mugs.ply", pose)
+
+Results are PLY files of the layout that the cloud had, which any viewer opens. Points that an edit does not concern
+keep every property and value they had: spherical harmonics, normals, whatever a trainer added. Originals stay.
+
+Which points an object has is decided by the .ogpc file. Where the cloud is the one it was made from, point by point,
+their ids count; else each point of the cloud takes the id of the nearest one of the scene, within its reach.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from og_pointcloud.ask.boxes import quaternion_of, typical_spacing
+from og_pointcloud.ask.labelled_scene import LabelledScene, SceneLike, as_scene
+from og_pointcloud.ask.picking import Pick
+from og_pointcloud.ask.selecting import Match, Selection, select
+from og_pointcloud.bundle.nearest import NearestPoint
+from og_pointcloud.cloud import TOO_FAR
+from og_pointcloud.errors import OgPointcloudError, SceneError
+from og_pointcloud.formats.gaussian_ply import (
+    BASE_COLOR,
+    LOG_SCALE,
+    ROTATION,
+    SH_CONSTANT,
+    gaussian_rows,
+    gaussians_from_ply,
+    holds_gaussians,
+)
+from og_pointcloud.formats.ply import HEADER_LIMIT, join_columns, read_ply, write_ply
+from og_pointcloud.formats.points import read_points
+from og_pointcloud.formats.tables import NORMAL_COLUMNS, colors, naming, positions, stack_columns, storable_positions
+from og_pointcloud.scene import Points
+from og_pointcloud.show.harmonics import MAX_DEGREE, rotated_harmonics
+from og_pointcloud.text.words import TextFeatures
+
+__all__ = ["Edit", "What", "extract", "insert", "recolour", "remove"]
+
+What: TypeAlias = "str | int | Iterable[int] | Pick | Match | Selection"
+"""What to edit: a text, for the instances that it fits (`select`); ids of instances; what a click or `select` gave."""
+
+Rows = NDArray[np.void]
+
+SAME_PLACE = 1e-3
+"""Distance in spacings up to which a point of the cloud is the scene's: .ogpc files hold float32."""
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
+"""Of linear RGB, ITU-R BT.709; good enough a weight for any."""
+DARK = 0.05
+"""Mean luminance below which an object's shading is too faint to be kept in a new colour."""
+SPLAT_SCALE, SPLAT_OPACITY = 0.5, 0.95
+"""What a plain point becomes among Gaussians: its standard deviation in spacings, just closing surfaces."""
+RIGID = 1e-4
+"""How far a pose may be off a rotation with one scale."""
+
+
+@dataclass(frozen=True)
+class Edit:
+    """What an edit wrote. path: the file. points: how many it has. changed: how many were removed, extracted,
+    recoloured or inserted. instances: ids of the scene's instances concerned. notes: what could not be kept."""
+
+    path: Path
+    points: int
+    changed: int
+    instances: tuple[int, ...] = ()
+    notes: tuple[str, ...] = ()
+
+
+def remove(
+    scene: SceneLike,
+    what: What,
+    output: str | os.PathLike[str],
+    *,
+    cloud: str | os.PathLike[str] | None = None,
+    halo: float = 0.0,
+    text_features: TextFeatures = None,
+) -> Edit:
+    """Write the cloud without some instances.
+
+    scene: a loaded scene, a LabelledCloud or the path of a .ogpc file. what: see `What`. output: a .ply, not an input.
+    cloud: the plain cloud or 3DGS file to edit (PLY, PCD); None for the scene's own points and colours.
+    halo: points of no instance that lie this near to the object, in spacings, go with it: what surrounds an object in
+        a 3DGS file often has no label. text_features: as for ``segment``.
+    Raises OgPointcloudError where no instance is meant or none of the cloud's points belongs to it, SceneError for
+    a cloud that cannot be read.
+    """
+    subject = _subject(scene, what, output, cloud, halo, text_features)
+    if subject.chosen.all():
+        raise OgPointcloudError(f"all {len(subject.chosen)} points would be removed; expected some to stay")
+    return subject.write(output, subject.rows[~subject.chosen], "removed")
+
+
+def extract(
+    scene: SceneLike,
+    what: What,
+    output: str | os.PathLike[str],
+    *,
+    cloud: str | os.PathLike[str] | None = None,
+    halo: float = 0.0,
+    text_features: TextFeatures = None,
+) -> Edit:
+    """Write some instances alone. Arguments and errors as for `remove`."""
+    subject = _subject(scene, what, output, cloud, halo, text_features)
+    return subject.write(output, subject.rows[subject.chosen], "extracted")
+
+
+def recolour(
+    scene: SceneLike,
+    what: What,
+    output: str | os.PathLike[str],
+    color: ArrayLike,
+    *,
+    keep_shading: bool = True,
+    cloud: str | os.PathLike[str] | None = None,
+    halo: float = 0.0,
+    text_features: TextFeatures = None,
+) -> Edit:
+    """Write the cloud with some instances in another colour.
+
+    color: (3,) RGB, 0 to 255. keep_shading: the object keeps its light and dark, whose mean becomes the colour, and
+    Gaussians also how theirs changes with direction; else it becomes flat. Other arguments and errors as for `remove`.
+    """
+    rgb = np.asarray(color, np.float64)
+    if rgb.shape != (3,) or not ((rgb >= 0) & (rgb <= 255)).all():
+        raise OgPointcloudError(f"color is {color}; expected three numbers from 0 to 255: red, green, blue")
+    subject = _subject(scene, what, output, cloud, halo, text_features)
+    rows, notes = _recoloured(subject.rows, subject.chosen, rgb / 255, keep_shading)
+    return replace(subject, notes=(*subject.notes, *notes)).write(output, rows, "recoloured")
+
+
+def insert(
+    cloud: str | os.PathLike[str],
+    other: str | os.PathLike[str],
+    output: str | os.PathLike[str],
+    pose: ArrayLike | None = None,
+) -> Edit:
+    """Write a cloud with another one put into it, each a plain cloud or a 3DGS file.
+
+    pose: (4, 4), takes the other's coordinates to the cloud's: a rotation, one scale for all axes, and a translation.
+    Left out: they share a frame. Positions, normals, rotations and scales of Gaussians follow it, and so do spherical
+    harmonics, exactly, up to degree 3. The result has the cloud's properties (and the other's harmonics where they go
+    higher); those that the other lacks are 0 for its points.
+    SceneError for a pose that shears or mirrors, and for clouds that cannot be read.
+    """
+    rotation, scale, translation = _similarity(pose)
+    _check_output(output, [cloud, other])
+    base, added = _read(Path(cloud)), _read(Path(other))
+    notes = [*base.notes, *added.notes]
+    rows = added.rows
+    if base.are_gaussians != added.are_gaussians:
+        kind = "Gaussians" if base.are_gaussians else "plain points"
+        notes.append(f"{other}: its points became {kind}, like those of {cloud}")
+        points = read_points(other)
+        rows = _as_gaussians(points) if base.are_gaussians else _plain_rows(points.xyz_world, points.rgb)
+    placed, lost = _placed(rows, rotation, scale, translation)
+    merged, differing = _appended(base.rows, placed)
+    elements = {**base.elements, "vertex": merged}
+    write_ply(output, elements, [f"edited by og-pointcloud: {len(rows)} points inserted"])
+    return Edit(Path(output), len(merged), len(rows), (), (*notes, *lost, *differing))
+
+
+# What is edited ---------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Cloud:
+    """A file as its elements, rows of ``vertex`` in the layout that is written. notes: what reading it lost."""
+
+    elements: Mapping[str, Rows]
+    notes: tuple[str, ...] = ()
+
+    @property
+    def rows(self) -> Rows:
+        return self.elements["vertex"]
+
+    @property
+    def are_gaussians(self) -> bool:
+        return holds_gaussians(self.elements)
+
+
+@dataclass(frozen=True)
+class _Subject:
+    """rows: of the cloud. chosen: (n,) bool, which of them an edit concerns. instances: to whom they belong."""
+
+    elements: Mapping[str, Rows]
+    chosen: NDArray[np.bool_]
+    instances: tuple[int, ...]
+    notes: tuple[str, ...]
+
+    @property
+    def rows(self) -> Rows:
+        return self.elements["vertex"]
+
+    def write(self, output: str | os.PathLike[str], rows: Rows, verb: str) -> Edit:
+        changed = int(self.chosen.sum())
+        write_ply(output, {**self.elements, "vertex": rows}, [f"edited by og-pointcloud: {changed} points {verb}"])
+        return Edit(Path(output), len(rows), changed, self.instances, self.notes)
+
+
+def _subject(
+    scene: SceneLike,
+    what: What,
+    output: str | os.PathLike[str],
+    cloud: str | os.PathLike[str] | None,
+    halo: float,
+    text_features: TextFeatures,
+) -> _Subject:
+    """Reads the cloud and finds the points that are meant."""
+    if not (np.isfinite(halo) and halo >= 0):
+        raise OgPointcloudError(f"halo is {halo}; expected a number of spacings, at least 0")
+    scene = as_scene(scene)
+    _check_output(output, [path for path in (cloud, scene.path) if path is not None])
+    instances = _instances_meant(scene, what, text_features)
+    source = _Cloud({"vertex": _plain_rows(scene.xyz, scene.cloud.rgb)}) if cloud is None else _read(Path(cloud))
+    xyz = positions(source.rows)
+    ids, notes = _ids_of_points(scene, xyz, cloud)
+    chosen = np.isin(ids, instances)
+    if not chosen.any():
+        raise OgPointcloudError(
+            f"none of the {len(xyz)} points belongs to instance {', '.join(map(str, instances))}: it has no points, or "
+            "the cloud does not show it"
+        )
+    if halo > 0:
+        chosen |= _halo(scene, xyz, ids, chosen, halo)
+    return _Subject(source.elements, chosen, instances, (*source.notes, *notes))
+
+
+def _instances_meant(scene: LabelledScene, what: What, text_features: TextFeatures) -> tuple[int, ...]:
+    count = len(scene.cloud.instances)
+    if isinstance(what, str):
+        what = select(scene, what, text_features=text_features)
+    if isinstance(what, Selection):
+        if not what.fitting:
+            best = (
+                f"the nearest is {what.best.instance}, which is rather '{what.best.rival}'" if what.best else "none has"
+            )
+            raise OgPointcloudError(
+                f"'{what.query}' fits none of {count} instances better than other words do ({best}): give its id"
+            )
+        ids: Sequence[int] = what.instances
+    elif isinstance(what, (Pick, Match)):
+        ids = (what.instance,)
+    else:
+        ids = (what,) if isinstance(what, (int, np.integer)) else tuple(what)
+    wrong = [k for k in ids if isinstance(k, bool) or not isinstance(k, (int, np.integer)) or not 0 <= k < count]
+    if wrong or not ids:
+        raise OgPointcloudError(
+            f"the instances to edit are {[*ids]!r:.80}; expected ids from 0 to {count - 1}, at least one: a click may "
+            "have missed"
+        )
+    return tuple(int(k) for k in dict.fromkeys(ids))
+
+
+def _ids_of_points(
+    scene: LabelledScene, xyz: NDArray[np.float64], cloud: str | os.PathLike[str] | None
+) -> tuple[NDArray[np.int32], tuple[str, ...]]:
+    """Instance id of each point of the cloud: the scene's own where it is the same cloud, else the nearest point's."""
+    if len(xyz) == len(scene.cloud) and (np.abs(xyz - scene.xyz) <= SAME_PLACE * scene.cloud.spacing).all():
+        return scene.instance_ids, ()
+    ids = scene.instances_at(xyz)
+    far = int((ids == TOO_FAR).sum())
+    if far == len(ids):
+        raise OgPointcloudError(
+            f"{cloud}: none of its {len(xyz)} points lies within {scene.cloud.reach:.4g} of the scene; expected the "
+            "cloud that the .ogpc was made from, or another of the same place in the same frame"
+        )
+    return ids, (
+        f"{cloud} has {len(xyz)} points, the scene {len(scene.cloud)}, or others: each took the instance of the "
+        f"nearest one, and {far} have none within reach",
+    )
+
+
+def _halo(
+    scene: LabelledScene,
+    xyz: NDArray[np.float64],
+    ids: NDArray[np.int32],
+    chosen: NDArray[np.bool_],
+    halo: float,
+) -> NDArray[np.bool_]:
+    """(n,) bool, points of no instance that lie within ``halo`` spacings of a chosen one."""
+    local = (xyz - scene.cloud.origin).astype(np.float32)
+    loose = np.flatnonzero((ids < 0) & np.isfinite(local).all(axis=1))
+    spacing = scene.cloud.spacing
+    found = NearestPoint(local[chosen], spacing, halo * spacing).query(local[loose])
+    near = np.zeros(len(xyz), bool)
+    near[loose[found >= 0]] = True
+    return near
+
+
+def _check_output(output: str | os.PathLike[str], inputs: Iterable[str | os.PathLike[str]]) -> None:
+    path = Path(output)
+    if path.suffix != ".ply":
+        raise OgPointcloudError(f"the output is '{path}'; expected a name that ends in .ply")
+    for source in inputs:
+        if path.exists() and Path(source).exists() and path.samefile(source):
+            raise OgPointcloudError(
+                f"the output is '{path}', a file that is read; expected another name: originals stay"
+            )
+
+
+# Reading ----------------------------------------------------------------------------------------------------------
+
+
+def _read(path: Path) -> _Cloud:
+    """A cloud's elements: those of a PLY as they are, anything else as a PLY would hold it."""
+    with naming(path), path.open("rb") as file:
+        head = file.read(HEADER_LIMIT)
+    if not re.match(rb"ply[ \t\r\n]", head):
+        points = read_points(path)
+        columns = f"{path}: only positions, colours and normals are kept, as a PLY"
+        return _Cloud({"vertex": _plain_rows(points.xyz_world, points.rgb, points.normals)}, (columns,))
+    with naming(path):
+        elements = read_ply(path)
+        if "vertex" not in elements or len(elements["vertex"]) == 0:
+            raise SceneError("no points; expected an element 'vertex' of plain properties")
+        if "chunk" in elements and "packed_position" in (elements["vertex"].dtype.names or ()):
+            rows = gaussian_rows(gaussians_from_ply(elements))
+            return _Cloud({"vertex": rows}, (f"{path}: unpacked; harmonics above the constant one are left out",))
+        if not np.isfinite(positions(elements["vertex"])).all():
+            raise SceneError("positions hold NaN or infinity; expected finite ones: remove those points first")
+    lists = re.search(rb"^property\s+list\s", head.partition(b"end_header")[0], re.MULTILINE)
+    notes = (f"{path}: faces and other lists are left out",) if lists else ()
+    return _Cloud(elements, notes)
+
+
+def _plain_rows(
+    xyz_world: NDArray[np.float64], rgb: NDArray[np.uint8] | None, normals: NDArray[np.float32] | None = None
+) -> Rows:
+    columns = dict(zip("xyz", storable_positions(xyz_world).T, strict=True))
+    if normals is not None:
+        columns |= dict(zip(NORMAL_COLUMNS[0], normals.T, strict=True))
+    if rgb is not None:
+        columns |= dict(zip(("red", "green", "blue"), rgb.T, strict=True))
+    return join_columns(columns)
+
+
+def _as_gaussians(points: Points) -> Rows:
+    """A plain cloud as Gaussians that just close its surfaces."""
+    n = len(points)
+    spacing = typical_spacing(points.xyz) or np.finfo(np.float32).tiny
+    return gaussian_rows(
+        replace(
+            points,
+            scale=np.full((n, 3), SPLAT_SCALE * spacing, np.float32),
+            rotation=np.tile(np.array([1, 0, 0, 0], np.float32), (n, 1)),
+            opacity=np.full(n, SPLAT_OPACITY, np.float32),
+        )
+    )
+
+
+# Colours ----------------------------------------------------------------------------------------------------------
+
+
+def _recoloured(
+    rows: Rows, chosen: NDArray[np.bool_], color: NDArray[np.float64], keep_shading: bool
+) -> tuple[Rows, tuple[str, ...]]:
+    """The rows with those chosen in another colour (3,), 0 to 1: as harmonics, as red green blue, or both."""
+    rows, notes = rows.copy(), ()
+    names = rows.dtype.names or ()
+    gaussians = set(BASE_COLOR) <= set(names)
+    if gaussians:
+        _recolour_harmonics(rows, chosen, color, keep_shading)
+    known = colors(rows)
+    if known is None and not gaussians:
+        known, notes = np.full((len(rows), 3), 128, np.uint8), ("the cloud has no colours: the rest became grey",)
+    if known is not None:
+        base = known[chosen] / 255
+        turned = base @ _color_map(base, color, keep_shading).T + (0 if keep_shading else color)
+        known[chosen] = np.rint(255 * np.clip(turned, 0, 1)).astype(np.uint8)
+        rows = _with_rgb(rows, known)
+    return rows, notes
+
+
+def _color_map(base: NDArray[np.float64], color: NDArray[np.float64], keep_shading: bool) -> NDArray[np.float64]:
+    """(3, 3): luminance times the new colour, so that the mean of the object becomes that colour; 0 where flat."""
+    if not keep_shading:
+        return np.zeros((3, 3))
+    mean = float((base @ LUMINANCE).mean())
+    return np.outer(color, LUMINANCE) / max(mean, DARK)
+
+
+def _recolour_harmonics(rows: Rows, chosen: NDArray[np.bool_], color: NDArray[np.float64], keep_shading: bool) -> None:
+    """In place. Colour is linear in the coefficients, so what a linear map does to colours it does to them."""
+    base = 0.5 + SH_CONSTANT * stack_columns(rows, BASE_COLOR, np.float64)[chosen]
+    mapping = _color_map(np.clip(base, 0, 1), color, keep_shading)
+    turned = base @ mapping.T + (0 if keep_shading else color)
+    _set_columns(rows, chosen, BASE_COLOR, (turned - 0.5) / SH_CONSTANT)
+    rest = _rest(rows[chosen])
+    if rest.shape[2]:
+        _set_rest(rows, chosen, np.einsum("dc,nck->ndk", mapping, rest))
+
+
+def _with_rgb(rows: Rows, rgb: NDArray[np.uint8]) -> Rows:
+    """The rows with these colours as red, green, blue; colour columns of another type give way to uchar ones."""
+    names = ("red", "green", "blue")
+    columns = {name: rows[name] for name in rows.dtype.names or ()}
+    if not all(name in columns and columns[name].dtype == np.uint8 for name in names):
+        for name in (*names, "r", "g", "b", "diffuse_red", "diffuse_green", "diffuse_blue", "rgb", "rgba"):
+            columns.pop(name, None)
+    columns |= {name: rgb[:, index] for index, name in enumerate(names)}
+    return join_columns(columns)
+
+
+# Placing ----------------------------------------------------------------------------------------------------------
+
+
+def _similarity(pose: ArrayLike | None) -> tuple[NDArray[np.float64], float, NDArray[np.float64]]:
+    """Rotation (3, 3), scale and translation (3,) of a pose."""
+    matrix = np.eye(4) if pose is None else np.asarray(pose, np.float64)
+    if matrix.shape != (4, 4) or not np.isfinite(matrix).all() or not np.allclose(matrix[3], [0, 0, 0, 1]):
+        raise SceneError(f"pose is {matrix.tolist()!r:.120}; expected a finite (4, 4) matrix that ends in 0 0 0 1")
+    determinant = float(np.linalg.det(matrix[:3, :3]))
+    scale = np.cbrt(determinant)
+    rotation = matrix[:3, :3] / (scale if scale > 0 else 1)
+    if scale <= 0 or np.abs(rotation @ rotation.T - np.eye(3)).max() > RIGID:
+        raise SceneError(
+            f"pose has a determinant of {determinant:.4g} and shears or mirrors; expected a rotation times one "
+            "positive scale: Gaussians cannot follow any other"
+        )
+    return rotation, float(scale), matrix[:3, 3]
+
+
+def _placed(
+    rows: Rows, rotation: NDArray[np.float64], scale: float, translation: NDArray[np.float64]
+) -> tuple[Rows, tuple[str, ...]]:
+    """The rows in the frame of the cloud that they are put into. Positions become float64."""
+    names = rows.dtype.names or ()
+    columns = {name: rows[name].copy() for name in names}
+    xyz = positions(rows) @ (scale * rotation).T + translation
+    columns |= dict(zip("xyz", xyz.T, strict=True))
+    for normal in NORMAL_COLUMNS:
+        if set(normal) <= set(names):
+            turned = stack_columns(rows, normal, np.float64) @ rotation.T
+            columns |= {name: turned[:, index].astype(rows.dtype[name]) for index, name in enumerate(normal)}
+    placed = join_columns(columns)
+    everything = np.ones(len(rows), bool)
+    if set(LOG_SCALE) <= set(names):
+        _set_columns(placed, everything, LOG_SCALE, stack_columns(rows, LOG_SCALE, np.float64) + np.log(scale))
+    if set(ROTATION) <= set(names):
+        _set_columns(placed, everything, ROTATION, _turned(quaternion_of(rotation), rows))
+    rest = _rest(rows)
+    if rest.shape[2] > _coefficients(MAX_DEGREE):
+        return placed, (f"harmonics above degree {MAX_DEGREE} are not turned",)
+    if rest.shape[2]:
+        _set_rest(placed, everything, rotated_harmonics(rest, rotation))
+    return placed, ()
+
+
+def _turned(turn: NDArray[np.float64], rows: Rows) -> NDArray[np.float64]:
+    """(n, 4) the rows' quaternions wxyz after another turn; their lengths, which mean nothing, stay."""
+    quaternions = stack_columns(rows, ROTATION, np.float64)
+    quaternions[~quaternions.any(axis=1), 0] = 1.0  # a zero quaternion is no rotation
+    (a, b, c, d), (w, x, y, z) = turn, quaternions.T
+    product = [
+        a * w - b * x - c * y - d * z,
+        a * x + b * w + c * z - d * y,
+        a * y - b * z + c * w + d * x,
+        a * z + b * y - c * x + d * w,
+    ]
+    return np.stack(product, axis=1)
+
+
+def _appended(base: Rows, added: Rows) -> tuple[Rows, tuple[str, ...]]:
+    """The rows of both, in the layout of the first, with as many harmonics as either has."""
+    if set(BASE_COLOR) <= set(base.dtype.names or ()):
+        harmonics = max(len(_rest_names(rows)) // 3 for rows in (base, added))
+        base, added = _with_harmonics(base, harmonics), _with_harmonics(added, harmonics)
+    names = base.dtype.names or ()
+    merged = np.zeros(len(base) + len(added), base.dtype)
+    merged[: len(base)] = base
+    theirs = set(added.dtype.names or ())
+    for name in names:
+        if name in theirs:
+            merged[name][len(base) :] = added[name]
+    notes = []
+    if lacking := [name for name in names if name not in theirs]:
+        notes.append(f"{_listed(lacking)} are 0 for the inserted points, which had none")
+    if dropped := [name for name in added.dtype.names or () if name not in names]:
+        notes.append(f"{_listed(dropped)} of the inserted points are left out, which the cloud does not have")
+    return merged, tuple(notes)
+
+
+def _listed(names: Sequence[str]) -> str:
+    return ", ".join(names[:6]) + (f" and {len(names) - 6} more" if len(names) > 6 else "")
+
+
+# Columns ----------------------------------------------------------------------------------------------------------
+
+
+def _set_columns(rows: Rows, chosen: NDArray[np.bool_], names: Sequence[str], values: NDArray[np.floating]) -> None:
+    for index, name in enumerate(names):
+        rows[name][chosen] = values[:, index]
+
+
+def _coefficients(degree: int) -> int:
+    """Harmonics of a channel above the constant one."""
+    return (degree + 1) ** 2 - 1
+
+
+def _rest_names(rows: Rows) -> list[str]:
+    """f_rest_0, f_rest_1, ..: all harmonics of red, then of green, then of blue."""
+    present = set(rows.dtype.names or ())
+    names = []
+    while f"f_rest_{len(names)}" in present:
+        names.append(f"f_rest_{len(names)}")
+    if len(names) % 3:
+        raise SceneError(f"{len(names)} properties f_rest; expected three times as many as a channel has")
+    return names
+
+
+def _rest(rows: Rows) -> NDArray[np.float64]:
+    """(n, 3, k) harmonics above the constant one; k is 0 where there are none."""
+    names = _rest_names(rows)
+    return stack_columns(rows, names, np.float64).reshape(len(rows), 3, len(names) // 3)
+
+
+def _set_rest(rows: Rows, chosen: NDArray[np.bool_], rest: NDArray[np.float64]) -> None:
+    _set_columns(rows, chosen, _rest_names(rows), rest.reshape(len(rest), -1))
+
+
+def _with_harmonics(rows: Rows, count: int) -> Rows:
+    """The rows with ``count`` harmonics a channel, new ones 0, after the constant ones, where files have them."""
+    rest = _rest(rows)
+    if rest.shape[2] == count:
+        return rows
+    padded = np.zeros((len(rows), 3, count), np.float32)
+    padded[:, :, : rest.shape[2]] = rest
+    new = {f"f_rest_{index}": column for index, column in enumerate(padded.reshape(len(rows), -1).T)}
+    columns: dict[str, NDArray] = {}
+    for name in rows.dtype.names or ():
+        if not name.startswith("f_rest_"):
+            columns[name] = rows[name]
+        if name == BASE_COLOR[-1]:
+            columns |= new
+    return join_columns(columns)

@@ -1,0 +1,295 @@
+"""Pictures of features and instances, as in the paper's figures: rendered over several views, stage below stage.
+
+Features become colours by one linear map, fitted once and used for every stage, so that equal colours mean equal
+features before and after discretisation. Maps are rendered with the blending weights of `visibility` (``W F``), the
+same that the features are learned with.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from og_pointcloud.cloud import UNKNOWN, UNOBSERVED
+from og_pointcloud.errors import MissingExtraError, SceneError
+from og_pointcloud.formats.atomic import replacing
+from og_pointcloud.formats.colors import label_colors
+from og_pointcloud.formats.images import require_cv2
+from og_pointcloud.scene import View
+from og_pointcloud.settings import CodebookSettings, FeatureSettings
+
+try:
+    from scipy.sparse import csr_array
+
+    from og_pointcloud.fitting.learned.codebook import two_level_codebook
+    from og_pointcloud.fitting.learned.instance_features import learn_features
+    from og_pointcloud.fitting.mask_table import Gaussians, MaskTable, pixel_weights
+except ImportError as error:
+    raise MissingExtraError("scipy and numba", "fit") from error
+
+__all__ = ["FeatureColors", "feature_colors", "feature_picture", "instance_picture", "learned_stages"]
+
+GREY = (128, 128, 128)
+"""A point without a feature, because no view sees it."""
+DARK = (64, 64, 64)
+"""A point that is not observed, where instances are shown."""
+OUTLIERS = 0.02
+"""Share of the weight at each end of a colour channel that may be cut off."""
+LEAST_RANGE = 0.25
+"""A channel is stretched no further than to show this part of the widest one's range at full contrast: the rest of the
+variance may be noise."""
+OPAQUE = 0.5
+"""Pixels with this much blending weight show their value alone, emptier ones fade to white."""
+CELL_WIDTH = 360
+"""Pixels; views that are narrower keep their size."""
+GAP, STRIP, MARGIN = 6, 26, 10
+TEXT_SCALE = 0.5
+
+Colors = NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class FeatureColors:
+    """A linear map of features to RGB: ``0.5 + (f - center) @ axes``, cut to 0..1. center: (w,). axes: (w, 3)."""
+
+    center: NDArray[np.float64]
+    axes: NDArray[np.float64]
+
+    @classmethod
+    def fit(cls, features: NDArray[np.floating], weight: NDArray[np.floating]) -> FeatureColors:
+        """The three main directions of the features become red, green and blue.
+
+        features: (n, w); rows with NaN are left out. weight: (n,), how much each counts: its visibility. Each direction
+        points to where its largest component is positive, so that the same features always have the same colours.
+        """
+        used = _known(features) & (weight > 0)
+        rows, mass = features[used].astype(np.float64), weight[used].astype(np.float64)
+        width = features.shape[1]
+        axes = np.zeros((width, 3))
+        if not len(rows):
+            return cls(np.zeros(width), axes)
+        mass /= mass.sum()
+        centered = rows - mass @ rows
+        directions = np.linalg.eigh((centered * mass[:, None]).T @ centered)[1][:, ::-1][:, :3]
+        directions *= np.sign(directions[np.abs(directions).argmax(axis=0), np.arange(directions.shape[1])])
+        low, high = _robust_range(centered @ directions, mass)
+        shown = np.maximum(high - low, LEAST_RANGE * (high - low).max(initial=0))
+        axes[:, : directions.shape[1]] = directions / np.where(shown > 0, shown, np.inf)
+        return cls(mass @ rows + directions @ ((low + high) / 2), axes)
+
+    def __call__(self, features: NDArray[np.floating]) -> Colors:
+        """(n, 3) uint8 RGB of features (n, w), grey where they are NaN."""
+        share = 0.5 + (features.astype(np.float64) - self.center) @ self.axes
+        known = _known(features)[:, None]
+        return np.where(known, np.rint(255 * np.clip(np.where(known, share, 0), 0, 1)), GREY).astype(np.uint8)
+
+
+def feature_colors(features: NDArray[np.floating], weight: NDArray[np.floating]) -> Colors:
+    """(n, 3) uint8 RGB of features (n, w), grey for points without weight (n,), which no view sees, and for NaN."""
+    colors = FeatureColors.fit(features, weight)(features)
+    colors[weight <= 0] = GREY
+    return colors
+
+
+def feature_picture(
+    gaussians: Gaussians,
+    views: Sequence[View],
+    near: float,
+    stages: Mapping[str, NDArray[np.floating]],
+    path: str | os.PathLike[str],
+    columns: int = 4,
+) -> Path:
+    """Write a PNG of features over several views: a row of photographs, where there are any, then a row a stage.
+
+    near: depth of the near plane (`geometry.near_plane`). stages: title -> (n, w) features, NaN rows for points without
+    one; colours are fitted to the first stage, as the views shown see it. columns: views shown, evenly spread.
+    SceneError where the stages do not fit the Gaussians.
+    """
+    _check(stages, (len(gaussians), None))
+    shown, weights = _weights(gaussians, views, near, columns)
+    visible = np.sum([np.asarray(rows.sum(axis=0)) for rows in weights], axis=0)
+    colors = FeatureColors.fit(next(iter(stages.values())), visible)
+    rows = {title: [_rendered_features(w, features, colors) for w in weights] for title, features in stages.items()}
+    return _write_grid(Path(path), shown, rows)
+
+
+def learned_stages(
+    table: MaskTable,
+    xyz: NDArray[np.float32],
+    feature_settings: FeatureSettings | None = None,
+    codebook_settings: CodebookSettings | None = None,
+    seed: int = 0,
+) -> dict[str, NDArray[np.float32]]:
+    """Learn features, and discretise them on both levels: title -> (n, w), NaN rows where no mask shows the Gaussian.
+
+    table: of the Gaussians at xyz (n, 3). What `feature_picture` shows as the paper's figures do.
+    """
+    learned = learn_features(table, feature_settings, seed)
+    codebook = two_level_codebook(
+        learned.features, xyz, learned.seen, table, codebook_settings or CodebookSettings(), seed
+    )
+    width = learned.features.shape[1]
+    coarse, leaf = codebook.coarse_centres[:, :width], codebook.leaf_centres
+    shown = (learned.seen > 0)[:, None]
+    return {
+        f"{width}-D features": np.where(shown, learned.features, np.float32(np.nan)),
+        f"coarse: {len(coarse)} clusters": _centre_of_each(coarse, codebook.coarse),
+        f"fine: {len(leaf)} clusters": _centre_of_each(leaf, codebook.leaf),
+    }
+
+
+def instance_picture(
+    gaussians: Gaussians,
+    views: Sequence[View],
+    near: float,
+    stages: Mapping[str, NDArray[np.integer]],
+    path: str | os.PathLike[str],
+    columns: int = 4,
+) -> Path:
+    """Write a PNG of instance ids over several views, each pixel in the colour of the id that shows most in it.
+
+    stages: title -> (n,) ids, >= 0 an instance, whose colour depends on its number alone; -1 background (grey) and -2
+    unobserved (dark). The rest as `feature_picture`.
+    """
+    _check(stages, (len(gaussians),))
+    shown, weights = _weights(gaussians, views, near, columns)
+    rows = {title: [_rendered_ids(w, ids) for w in weights] for title, ids in stages.items()}
+    return _write_grid(Path(path), shown, rows)
+
+
+def _centre_of_each(centres: NDArray[np.float32], cluster: NDArray[np.int32]) -> NDArray[np.float32]:
+    none = np.full((1, centres.shape[1]), np.nan, np.float32)
+    return np.concatenate([centres, none])[cluster]  # -1, no cluster, is the last row
+
+
+def _check(stages: Mapping[str, NDArray[Any]], shape: tuple[int | None, ...]) -> None:
+    if not stages:
+        raise SceneError("a picture has 0 stages; expected at least one title with its values")
+    for title, values in stages.items():
+        if values.ndim != len(shape) or len(values) != shape[0]:
+            raise SceneError(
+                f"stage '{title}' has shape {values.shape}; expected {shape[0]} rows, one a Gaussian"
+                + (", of features" if len(shape) > 1 else "")
+            )
+    if len({values.shape for values in stages.values()}) > 1:
+        shapes = ", ".join(f"{title} {values.shape}" for title, values in stages.items())
+        raise SceneError(f"the stages differ in shape ({shapes}); expected one, since they share their colours")
+
+
+def _known(features: NDArray[np.floating]) -> NDArray[np.bool_]:
+    return np.logical_and.reduce(np.isfinite(features), axis=1)
+
+
+def _robust_range(
+    values: NDArray[np.float64], mass: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Of each column, the values below and above which a share OUTLIERS of the mass lies."""
+    order = values.argsort(axis=0, kind="stable")
+    reached = np.cumsum(mass[order], axis=0)
+    at = [(reached < share).sum(axis=0).clip(max=len(values) - 1) for share in (OUTLIERS, 1 - OUTLIERS)]
+    low, high = (np.take_along_axis(values, np.take_along_axis(order, row[None], axis=0), axis=0)[0] for row in at)
+    return low, high
+
+
+def _weights(
+    gaussians: Gaussians, views: Sequence[View], near: float, columns: int
+) -> tuple[list[View], list[csr_array]]:
+    """The views to show, at the size they are shown in, and the blending weights (pixels, n) of each."""
+    if not views or columns < 1:
+        raise SceneError(f"{columns} columns of {len(views)} views; expected at least one of each")
+    chosen = np.unique(np.linspace(0, len(views) - 1, columns).round().astype(int))
+    shown = [_shrunk(views[index]) for index in chosen]
+    return shown, [pixel_weights(gaussians, view.camera, near) for view in shown]
+
+
+def _shrunk(view: View) -> View:
+    """The view at most CELL_WIDTH wide; of its masks nothing is kept."""
+    cv2, camera = require_cv2(), view.camera
+    width = min(camera.width, CELL_WIDTH)
+    size = width, max(1, round(camera.height * width / camera.width))
+    image = view.image_rgb()
+    small = None if image is None else np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+    none = np.full(size[::-1], -1, np.int32)
+    return View(view.name, camera.resized(*size), none, np.zeros((0, 1), np.float32), small)
+
+
+def _rendered_features(weights: csr_array, features: NDArray[np.floating], colors: FeatureColors) -> NDArray:
+    """(pixels, 3) colours of the rendered feature; what blends in without a feature does so as grey."""
+    known = _known(features)
+    mass = np.asarray(weights @ known.astype(np.float64))
+    blend = weights @ np.asarray(np.where(known[:, None], features, 0), np.float64)
+    total = np.asarray(weights.sum(axis=1), np.float64)
+    part = np.divide(mass, total, out=np.zeros_like(mass), where=total > 0)[:, None]
+    mean = blend / np.where(mass > 0, mass, 1)[:, None]
+    return _on_white(part * colors(mean) + (1 - part) * GREY, total)
+
+
+def _rendered_ids(weights: csr_array, ids: NDArray[np.integer]) -> NDArray:
+    """(pixels, 3) colours of the id that holds most of a pixel's weight."""
+    column = ids.astype(np.int64) - UNOBSERVED
+    count = int(column.max(initial=0)) + 1
+    of_point = csr_array((np.ones(len(ids)), column, np.arange(len(ids) + 1)), shape=(len(ids), count))
+    shares = csr_array(weights @ of_point)
+    pixel = np.repeat(np.arange(len(shares.indptr) - 1), np.diff(shares.indptr))
+    order = np.lexsort([-shares.indices, shares.data])
+    most = np.zeros(weights.shape[0], np.int64)
+    most[pixel[order]] = shares.indices[order]  # of several writes the last one, the heaviest, stays
+    palette = np.concatenate([[DARK], label_colors(np.arange(UNKNOWN, count + UNOBSERVED))])
+    return _on_white(palette[most], np.asarray(weights.sum(axis=1), np.float64))
+
+
+def _on_white(colors: NDArray, total: NDArray[np.float64]) -> NDArray:
+    opacity = np.clip(total / OPAQUE, 0, 1)[:, None]
+    return opacity * colors + (1 - opacity) * 255
+
+
+def _write_grid(path: Path, views: Sequence[View], rows: Mapping[str, Sequence[NDArray]]) -> Path:
+    """One column a view under its name, one row a stage under its title, photographs first."""
+    cv2 = require_cv2()
+    photographs = [view.image_rgb() for view in views]
+    if any(image is not None for image in photographs):
+        white = [np.full((view.camera.height, view.camera.width, 3), 255, np.uint8) for view in views]
+        photos = [blank if image is None else image for image, blank in zip(photographs, white, strict=True)]
+        rows = {"photograph": photos, **rows}
+    cells = {
+        title: [image.reshape(view.camera.height, view.camera.width, 3) for image, view in zip(row, views, strict=True)]
+        for title, row in rows.items()
+    }
+    lefts = np.cumsum([MARGIN, *(view.camera.width + GAP for view in views)])
+    height = max(view.camera.height for view in views)
+    sheet = np.full((STRIP + len(cells) * (STRIP + height + GAP), int(lefts[-1]) + MARGIN - GAP, 3), 255, np.uint8)
+    for left, view in zip(lefts, views, strict=False):
+        _write_text(sheet, _fitting(view.name, view.camera.width), int(left), STRIP)
+    for index, (title, row) in enumerate(cells.items()):
+        top = STRIP + index * (STRIP + height + GAP)
+        _write_text(sheet, title, MARGIN, top + STRIP)
+        for left, image in zip(lefts, row, strict=False):
+            sheet[top + STRIP : top + STRIP + image.shape[0], left : left + image.shape[1]] = np.rint(image)
+    written, png = cv2.imencode(".png", sheet[:, :, ::-1])
+    if not written:
+        raise SceneError(f"{path}: OpenCV cannot write a PNG of {sheet.shape[1]}x{sheet.shape[0]} pixels")
+    with replacing(path) as file:
+        file.write(png.tobytes())
+    return path
+
+
+def _fitting(text: str, width: int) -> str:
+    """The end of a text that is too long for a width in pixels: names of images differ at their ends."""
+    cv2 = require_cv2()
+    while len(text) > 1 and cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, TEXT_SCALE, 1)[0][0] > width:
+        text = text[1:]
+    return text
+
+
+def _write_text(sheet: Colors, text: str, left: int, bottom: int) -> None:
+    """Black text in a strip that ends at row ``bottom``; OpenCV's font is ASCII only."""
+    cv2 = require_cv2()
+    ascii_text = text.encode("ascii", "replace").decode()
+    place = (left, bottom - 8)
+    cv2.putText(sheet, ascii_text, place, cv2.FONT_HERSHEY_SIMPLEX, TEXT_SCALE, (0, 0, 0), 1, cv2.LINE_AA)

@@ -1,0 +1,140 @@
+"""A scene as one HTML page that needs nothing else: turn it, ask it by clicks and words, switch labels on and off.
+
+page.html is the page; what it shows is put into it as JSON, arrays as deflated base64. Needs numpy alone.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import os
+import zlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from og_pointcloud.ask.choosing import Reason
+from og_pointcloud.ask.labelled_scene import LabelledScene, instance_table
+from og_pointcloud.ask.segmentation import Segmentation
+from og_pointcloud.errors import OgPointcloudError
+from og_pointcloud.formats.atomic import replacing
+from og_pointcloud.formats.colors import label_colors
+from og_pointcloud.show.viewpoint import Viewpoint
+
+__all__ = ["MOST_POINTS", "write_page"]
+
+TEMPLATE = Path(__file__).with_name("page.html")
+MOST_POINTS = 2_000_000
+"""Points that a page holds; of larger clouds an even choice, about 16 MB."""
+MOST_SCORES = 4_000_000
+"""Scores of words on instances that a page holds; beyond, it has no words to search for."""
+WORDS = 6
+"""Words that a click shows."""
+LEVELS = 65535
+"""Steps of 16-bit coordinates and scores: a place is right to 1/131,000 of the cloud's extent."""
+
+
+def write_page(
+    path: str | os.PathLike[str],
+    scene: LabelledScene,
+    result: Segmentation,
+    view: Viewpoint,
+    *,
+    title: str,
+    rgb: NDArray[np.uint8] | None = None,
+    mode: str = "labels",
+    boxes: bool = False,
+    cut: float = 0.0,
+) -> str:
+    """Write the page, whole or not at all; returns what it leaves out, in words, empty if nothing.
+
+    result: of ``scene``, at least one finite point. rgb: (N, 3) of its points. mode: what colours show first, "labels",
+    "instances" or "photo". boxes: whether they are shown first. cut: share of the height hidden from the top, 0 to 1.
+    """
+    finite = np.flatnonzero(np.isfinite(result.xyz).all(axis=1))
+    if len(finite) == 0:
+        raise OgPointcloudError(f"none of {len(result)} points has finite coordinates; expected points to show")
+    shown = finite[np.linspace(0, len(finite) - 1, min(len(finite), MOST_POINTS)).astype(np.int64)]
+    left_out = [f"{len(result) - len(shown):,} of {len(result):,} points"] if len(shown) < len(result) else []
+    words, word_data = _words(scene)
+    if not words and scene.vocabulary and scene.vocabulary.names:
+        left_out.append(
+            f"the search for {len(scene.vocabulary.names):,} words: too many for {len(scene.instances)} instances"
+        )
+    xyz = result.xyz[shown]
+    low, high = xyz.min(axis=0), xyz.max(axis=0)
+    middle = low + (high - low) / 2
+    data = {
+        "title": title,
+        "subtitle": f"{len(shown):,} points · {len(scene.instances)} instances",
+        "mode": mode, "boxes": boxes, "cut": cut, "calibrated": result.calibrated,
+        "spacing": scene.cloud.spacing * (len(finite) / len(shown)) ** 0.5,
+        "low": (low - middle).tolist(), "size": (high - low).tolist(),
+        "corners": _corners(low - middle, high - middle).tolist(), "extent": float(np.linalg.norm(high - low)) or 1.0,
+        "eye": (view.eye - middle).tolist(), "target": (view.target - middle).tolist(), "up": view.up.tolist(),
+        "names": list(result.names), "colors": label_colors(np.arange(len(result.names))).tolist(),
+        "counts": list(result.counts().values()), "unknown": int((result.labels < 0).sum()),
+        "reasons": [str(Reason.TOO_FAR), str(Reason.UNOBSERVED), str(Reason.IN_NO_MASK)],  # of ids -3, -2, -1
+        "instances": _instances(scene, result, view.up, middle, word_data.pop("choice")),
+        "points": len(shown), "has_rgb": rgb is not None,
+        "place": _packed(_levels(xyz, low, high)), "instance": _packed(result.instances[shown].astype("<i4")),
+        "rgb": _packed(np.full((len(shown), 3), 200, np.uint8) if rgb is None else np.asarray(rgb, np.uint8)[shown]),
+        "words": words, **word_data,
+    }  # fmt: skip
+    # Names come from files: no text of theirs may end the element that holds it.
+    text = json.dumps(data, ensure_ascii=False, allow_nan=False).replace("<", "\\u003c")
+    with replacing(path) as file:
+        file.write(TEMPLATE.read_text(encoding="utf-8").replace("/*SCENE*/", text).encode())
+    return " and ".join(left_out)
+
+
+def _words(scene: LabelledScene) -> tuple[list[str], dict[str, Any]]:
+    """The scene's own words; their score on each instance, and which of them, if any, an instance is."""
+    own, count = scene.vocabulary, len(scene.instances)
+    nothing = {"choice": np.full(count, -1), "word_scores": "", "lowest": 0.0, "highest": 1.0}
+    if own is None or not own.names or count * len(own.names) > MOST_SCORES:
+        return [], nothing
+    choice = scene.chooser.choose(own.vectors)
+    scores = np.where(np.isfinite(choice.scores), choice.scores, 0).astype(np.float64)
+    low, high = float(scores.min(initial=0)), float(scores.max(initial=1))
+    packed = _packed(_levels(scores, np.float64(low), np.float64(high)))
+    return list(own.names), {"choice": choice.labels, "word_scores": packed, "lowest": low, "highest": high}
+
+
+def _instances(
+    scene: LabelledScene,
+    result: Segmentation,
+    up: NDArray[np.float64],
+    middle: NDArray[np.float64],
+    choice: NDArray[np.integer],
+) -> list[dict[str, Any]]:
+    present, first = np.unique(result.instances, return_index=True)
+    label = dict(zip(present.tolist(), result.labels[first].tolist(), strict=True))
+    points = dict(zip(*(part.tolist() for part in np.unique(result.instances, return_counts=True)), strict=True))
+    rows = []
+    for row in instance_table(scene, up=up, words=WORDS):
+        record: dict[str, Any] = {
+            "id": row.id, "label": label.get(row.id, -1), "points": points.get(row.id, 0), "views": row.views,
+            "words": row.words, "choice": int(choice[row.id]),
+        }  # fmt: skip
+        if row.id in label and row.oriented_box is not None and row.centroid is not None:
+            record |= {
+                "box": (row.oriented_box.corners - middle).tolist(), "extent": row.oriented_box.size.tolist(),
+                "center": (row.centroid - middle).tolist(), "world": row.centroid.tolist(),
+            }  # fmt: skip
+        rows.append(record)
+    return rows
+
+
+def _corners(low: NDArray[np.float64], high: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.stack(np.meshgrid(*np.stack([low, high], axis=1), indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+def _levels(values: NDArray[np.float64], low: Any, high: Any) -> NDArray[np.uint16]:
+    return np.rint((values - low) / np.where(high > low, high - low, 1) * LEVELS).astype("<u2")
+
+
+def _packed(array: NDArray[Any]) -> str:
+    return base64.b64encode(zlib.compress(np.ascontiguousarray(array).tobytes(), 6)).decode()

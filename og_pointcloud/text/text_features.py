@@ -1,0 +1,86 @@
+"""Text-feature files: names with their vectors, as an encoder gave them.
+
+An .npz with ``names`` (L,) strings, ``vectors`` (L, D) floats, and ``feature_space``, the name of the encoder.
+"""
+
+from __future__ import annotations
+
+import os
+import zipfile
+import zlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from og_pointcloud.cloud import Vocabulary
+from og_pointcloud.errors import FeatureSpaceError
+from og_pointcloud.formats.npy import array_from_zip
+
+__all__ = ["MAX_UNPACKED_BYTES", "UNKNOWN_SPACE", "read_text_features"]
+
+UNKNOWN_SPACE = "unknown"
+"""Feature space of a file that names none; it is compared by width only."""
+MAX_UNPACKED_BYTES = 1 << 30
+
+
+def read_text_features(path: str | os.PathLike[str]) -> tuple[Vocabulary, str]:
+    """The names and vectors of a text-features .npz, and the name of its feature space.
+
+    Raises FeatureSpaceError, beginning with the path, where the file cannot be read, an entry is missing, or a name
+    comes twice, is empty, or has a vector that is zero, NaN or infinite. Nothing is unpickled.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FeatureSpaceError(f"{path} is not a file; expected an .npz with 'names', 'vectors' and 'feature_space'")
+    entries = _entries(path)
+    missing = [name for name in ("names", "vectors") if name not in entries]
+    if missing:
+        raise FeatureSpaceError(
+            f"{path} lacks '{missing[0]}' (it has {', '.join(entries) or 'nothing'}); expected 'names' (L,), 'vectors' "
+            "(L, D) and 'feature_space': write it with numpy.savez"
+        )
+    names, vectors = entries["names"], entries["vectors"]
+    if names.dtype.kind != "U" or names.ndim != 1:
+        raise FeatureSpaceError(f"{path}: names are {names.dtype} {names.shape}; expected strings of shape (L,)")
+    if vectors.dtype.kind != "f" or vectors.ndim != 2 or len(vectors) != len(names) or 0 in vectors.shape:
+        raise FeatureSpaceError(
+            f"{path}: vectors are {vectors.dtype} {vectors.shape}; expected floats of shape ({len(names)}, D), one row "
+            "a name, and at least one"
+        )
+    vocabulary = Vocabulary(tuple(names.tolist()), _checked(path, names.tolist(), vectors))
+    return vocabulary, str(entries.get("feature_space", UNKNOWN_SPACE))
+
+
+def _entries(path: Path) -> dict[str, NDArray[Any]]:
+    try:
+        with zipfile.ZipFile(path) as archive:
+            total = sum(info.file_size for info in archive.infolist())
+            if total > MAX_UNPACKED_BYTES:
+                raise ValueError(f"it unpacks to {total} bytes, more than {MAX_UNPACKED_BYTES}")
+            infos = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
+            wanted = [name for name in infos if name in ("names", "vectors", "feature_space")]
+            return {name: array_from_zip(archive, infos[name]) for name in wanted}
+    except (zipfile.BadZipFile, zlib.error, ValueError, EOFError, RuntimeError, OSError) as error:
+        raise FeatureSpaceError(
+            f"{path} cannot be read as an .npz of plain arrays ({error!s:.120}): write it again with numpy.savez"
+        ) from None
+
+
+def _checked(path: Path, names: list[str], vectors: NDArray[np.floating]) -> NDArray[np.float32]:
+    with np.errstate(over="ignore"):
+        vectors = vectors.astype(np.float32)
+    seen: set[str] = set()
+    for name, vector in zip(names, vectors, strict=True):
+        if name in seen:
+            raise FeatureSpaceError(f"{path}: the name '{name}' comes twice; expected unique names: remove one")
+        if not name.strip():
+            raise FeatureSpaceError(f"{path}: row {len(seen)} has an empty name; expected a word: name or remove it")
+        if not np.isfinite(vector).all() or not vector.any():
+            kind = "zero" if np.isfinite(vector).all() else "NaN or infinite"
+            raise FeatureSpaceError(
+                f"{path}: the vector of '{name}' is {kind}; expected finite numbers, not all zero: encode it again"
+            )
+        seen.add(name)
+    return vectors

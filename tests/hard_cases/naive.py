@@ -1,0 +1,118 @@
+"""What a plain float32 implementation computes: formulas as printed, single precision throughout, nothing rearranged.
+
+These are what the library is compared with, to see where the printed form breaks; nothing else uses them.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hard_cases.reference import ALPHA_MAX, LOW_PASS, blended, rotation_matrices
+from og_pointcloud.scene import Camera
+
+__all__ = [
+    "cosines", "eq1", "eq2_adam", "eq2_gradient", "mean_direction", "nearest", "nearest_centre", "pixel_weights",
+    "unit",
+]  # fmt: skip
+
+Single = np.float32
+
+
+def pixel_weights(
+    xyz: NDArray[np.floating], scale: NDArray[np.floating], rotation: NDArray[np.floating],
+    opacity: NDArray[np.floating], camera: Camera, near: float,
+) -> NDArray[np.floating]:  # fmt: skip
+    """(H, W, n): J W Sigma W' J' + 0.3 I, its plain determinant and inverse, sorted by float32 depth.
+
+    J is taken at most 1.3 tan(fov / 2) from the axis, as in 3DGS.
+    """
+    pose = camera.world_to_camera.astype(Single)
+    fx, fy, cx, cy = np.array([camera.fx, camera.fy, camera.cx, camera.cy], Single)
+    x, y, z = pose[:3, :3] @ xyz.astype(Single).T + pose[:3, 3:]
+    u, v = fx * x / z + cx, fy * y / z + cy
+    limit_x, limit_y = Single(1.3) * camera.width / (2 * fx), Single(1.3) * camera.height / (2 * fy)
+    jx, jy = np.clip(x / z, -limit_x, limit_x) * z, np.clip(y / z, -limit_y, limit_y) * z
+    zero = np.zeros_like(z)
+    jacobian = np.moveaxis(np.array([[fx / z, zero, -fx * jx / (z * z)], [zero, fy / z, -fy * jy / (z * z)]]), -1, 0)
+    axes = rotation_matrices(rotation.astype(Single)) * scale.astype(Single)[:, None, :]
+    world = axes @ np.swapaxes(axes, 1, 2)
+    half = jacobian @ pose[:3, :3]
+    covariance = half @ world @ np.swapaxes(half, 1, 2) + Single(LOW_PASS) * np.eye(2, dtype=Single)
+    a, b, c = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
+    determinant = a * c - b * b
+    column = (np.arange(camera.width, dtype=Single) + Single(0.5))[None, :]
+    row = (np.arange(camera.height, dtype=Single) + Single(0.5))[:, None]
+
+    def alpha(g: int) -> NDArray[np.floating]:
+        dx, dy = column - u[g], row - v[g]
+        power = -(c[g] * dx * dx - 2 * b[g] * dx * dy + a[g] * dy * dy) / (2 * determinant[g])
+        return np.minimum(Single(ALPHA_MAX), opacity[g].astype(Single) * np.exp(power))
+
+    front = np.flatnonzero(z > Single(near))
+    order = front[np.argsort(z[front])]
+    return blended(order, alpha, (camera.height, camera.width, len(xyz)), Single)
+
+
+def unit(rows: NDArray[np.floating], dtype: type = Single) -> NDArray[np.floating]:
+    """Rows over the square root of their sum of squares."""
+    rows = rows.astype(dtype)
+    return rows / np.sqrt((rows * rows).sum(axis=1, keepdims=True, dtype=dtype))
+
+
+def cosines(a: NDArray[np.floating], b: NDArray[np.floating], dtype: type = Single) -> NDArray[np.floating]:
+    """(len(a), len(b)): products over lengths."""
+    a, b = a.astype(dtype), b.astype(dtype)
+    squares_a, squares_b = (a * a).sum(axis=1, dtype=dtype), (b * b).sum(axis=1, dtype=dtype)
+    return (a @ b.T) / np.sqrt(squares_a[:, None] * squares_b[None, :])
+
+
+def mean_direction(rows: NDArray[np.floating]) -> NDArray[np.floating]:
+    """The mean of unit rows, of length 1."""
+    return unit(unit(rows).mean(axis=0, keepdims=True, dtype=Single))[0]
+
+
+def nearest(points: NDArray[np.floating], queries: NDArray[np.floating]) -> NDArray[np.int64]:
+    """Index of the nearest point to each query, in world coordinates."""
+    points, queries = points.astype(Single), queries.astype(Single)
+    return np.array([((points - query) ** 2).sum(axis=1).argmin() for query in queries])
+
+
+def nearest_centre(values: NDArray[np.floating], centres: NDArray[np.floating]) -> NDArray[np.int64]:
+    """k-means' assignment by |x|^2 - 2 x c + |c|^2."""
+    x, c = values.astype(Single), centres.astype(Single)
+    return ((x * x).sum(axis=1)[:, None] - 2 * x @ c.T + (c * c).sum(axis=1)).argmin(axis=1)
+
+
+def eq1(weights: NDArray[np.floating], features: NDArray[np.floating]) -> np.floating:
+    """Eq. 1 as a quadratic form: the sum of c |f|^2 less N |mean|^2, over the sum of N."""
+    weights, features = weights.astype(Single), features.astype(Single)
+    size = weights.sum(axis=1)
+    means = weights @ features / size[:, None]
+    squares = (weights.sum(axis=0)[:, None] * features * features).sum()
+    return (squares - (size[:, None] * means * means).sum()) / size.sum()
+
+
+def eq2_gradient(means: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Of the mean of 1 / d^2 over the pairs of (m, width) means, by the means."""
+    means = means.astype(Single)
+    apart = means[:, None] - means[None]
+    square = (apart * apart).sum(axis=2)
+    np.fill_diagonal(square, np.inf)
+    pairs = Single(len(means) * (len(means) - 1))
+    return (-4 * apart / (square * square)[..., None]).sum(axis=1) / pairs
+
+
+def eq2_adam(means: NDArray[np.floating], steps: int = 3000, rate: float = 1e-3) -> NDArray[np.floating]:
+    """Means after Adam (Kingma & Ba 2015, its usual constants) on the printed Eq. 2, from these."""
+    means = means.astype(Single)
+    first, second = np.zeros_like(means), np.zeros_like(means)
+    for step in range(1, steps + 1):
+        gradient = eq2_gradient(means)
+        first = Single(0.9) * first + Single(0.1) * gradient
+        second = Single(0.999) * second + Single(0.001) * gradient * gradient
+        moved = first / Single(1 - 0.9**step) / (np.sqrt(second / Single(1 - 0.999**step)) + Single(1e-8))
+        means = means - Single(rate) * moved
+        if not np.isfinite(means).all():
+            break
+    return means
