@@ -7,7 +7,7 @@ import pytest
 from labelled_clouds import make_cloud, nearest_plainly, queries, room, tough_clouds
 
 from og_pointcloud.bundle.nearest import NearestPoint
-from og_pointcloud.bundle.read import nearest
+from og_pointcloud.bundle import nearest
 
 CLOUDS = tough_clouds()
 

@@ -61,7 +61,7 @@ def read_words(path: str | os.PathLike[str]) -> tuple[str, ...]:
 
 def everyday_words() -> tuple[str, ...]:
     """The library's own words of everyday things, which an encoder makes a word bank of."""
-    return read_words(Path(__file__).with_name("everyday_words.txt"))
+    return read_words(Path(__file__).parents[1] / "text" / "everyday_words.txt")
 
 
 def add_words(
