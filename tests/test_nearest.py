@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from labelled_clouds import make_cloud, nearest_plainly, queries, room, tough_clouds
 
-from og_pointcloud.bundle.nearest import NearestPoint
 from og_pointcloud.bundle import nearest
+from og_pointcloud.bundle.nearest import NearestPoint
 
 CLOUDS = tough_clouds()
 
