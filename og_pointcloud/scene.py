@@ -77,6 +77,23 @@ class Camera:
         x, y = width / self.width, height / self.height
         return replace(self, width=width, height=height, fx=self.fx * x, fy=self.fy * y, cx=self.cx * x, cy=self.cy * y)
 
+    def project(self, xyz: NDArray[np.floating]) -> tuple[DoubleArray, DoubleArray]:
+        """Where points appear: uv_px (n, 2) column and row, pixel centres at +0.5, and depth (n,) along the view axis.
+
+        xyz: (n, 3) in the frame that ``world_to_camera`` starts from. Computed in float64. Points that are not before
+        the camera (depth <= 0) have NaN for uv_px, which no comparison takes for a pixel; points beside the image have
+        the pixel they would have in a wider one.
+        """
+        in_camera = xyz @ self.world_to_camera[:3, :3].T + self.world_to_camera[:3, 3]
+        x, y, depth = in_camera.T
+        in_front = np.where(depth > 0, depth, np.nan)
+        return np.stack([self.fx * x / in_front + self.cx, self.fy * y / in_front + self.cy], axis=1), depth
+
+    def shows(self, uv_px: DoubleArray) -> NDArray[np.bool_]:
+        """(n,) bool: which of `project`'s pixel coordinates (n, 2) fall into the image; NaN does not."""
+        u, v = uv_px.T
+        return (u >= 0) & (u < self.width) & (v >= 0) & (v < self.height)
+
     @property
     def center(self) -> DoubleArray:
         """Camera centre in the local frame, (3,) float64."""

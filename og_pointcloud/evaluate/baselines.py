@@ -88,14 +88,12 @@ def centre_sampling(scene: Scene, prepared: Prepared, words: Words) -> Labels:
     scores, reached = np.zeros((len(xyz), len(words))), np.zeros(len(xyz), bool)
     for index, view in enumerate(scene.views):
         camera = view.camera
-        in_camera = xyz @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+        uv_px, _ = camera.project(xyz)
         exposure = csr_array(table.exposure[[index]])
-        points = exposure.indices[in_camera[exposure.indices, 2] > 0]
-        x, y, depth = in_camera[points].T
-        column, row = np.floor(camera.fx * x / depth + camera.cx), np.floor(camera.fy * y / depth + camera.cy)
-        inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
-        mask = np.full(len(points), -1)
-        mask[inside] = view.mask_map()[row[inside].astype(int), column[inside].astype(int)]
+        points = exposure.indices
+        points = points[camera.shows(uv_px[points])]
+        column, row = uv_px[points].astype(int).T
+        mask = view.mask_map()[row, column]
         visible = np.zeros(len(xyz))
         visible[exposure.indices] = exposure.data
         points, mask = points[mask >= 0], mask[mask >= 0]

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.distortion import Distortion, lens_distortion
-from og_pointcloud.formats.poses import PosedImage, naming, rigid
+from og_pointcloud.formats.poses import PosedImage, naming, rigid, rotation_of_quaternion
 from og_pointcloud.scene import Camera
 
 __all__ = ["find_model", "read_images", "read_points3d"]
@@ -200,19 +200,10 @@ def _records(model: Path, stem: str, minimum_bytes: int) -> Iterator[_Binary | _
 
 def _pose(values: tuple[float, ...], source: str) -> Pose:
     """(4, 4) from qw qx qy qz tx ty tz (Hamilton)."""
-    w, x, y, z = values[:4]
-    norm = math.hypot(w, x, y, z)
+    norm = math.hypot(*values[:4])
     if not np.isfinite(values).all() or not 1e-8 < norm < math.inf:
         raise SceneError(f"{source}: pose {values} has no rotation; expected a finite quaternion of length 1")
-    w, x, y, z = w / norm, x / norm, y / norm, z / norm
-    rotation = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-    return rigid(rotation, np.array(values[4:]))
+    return rigid(rotation_of_quaternion(np.array(values[:4]) / norm), np.array(values[4:]))
 
 
 class _Binary:

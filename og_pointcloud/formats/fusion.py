@@ -208,11 +208,10 @@ def _differences(images: Sequence[DepthImage], factor: float = 1.0) -> Doubles:
 
 def _seen(xyz: Doubles, camera: Camera) -> tuple[NDArray[np.intp], Doubles]:
     """Flat pixels and depths of the world points that fall into the image."""
-    x, y, z = camera.world_to_camera[:3, :3] @ (xyz - camera.center).T
-    with np.errstate(divide="ignore", invalid="ignore"):
-        column, row = np.floor(x / z * camera.fx + camera.cx), np.floor(y / z * camera.fy + camera.cy)
-    inside = (z > 0) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
-    return row[inside].astype(np.intp) * camera.width + column[inside].astype(np.intp), z[inside]
+    uv_px, depth = camera.project(xyz)
+    inside = camera.shows(uv_px)
+    column, row = uv_px[inside].astype(np.intp).T
+    return row * camera.width + column, depth[inside]
 
 
 def _judge(

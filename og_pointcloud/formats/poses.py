@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.depth import DepthFile
@@ -25,6 +25,7 @@ __all__ = [
     "numbered",
     "read_numbers",
     "rigid",
+    "rotation_of_quaternion",
 ]
 
 MAX_TEXT_BYTES = 1 << 26
@@ -68,6 +69,18 @@ def rigid(rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> ND
     transform[:3, :3] = rotation
     transform[:3, 3] = translation
     return transform
+
+
+def rotation_of_quaternion(wxyz: ArrayLike) -> NDArray[np.float64]:
+    """(3, 3) rotation matrix, for column vectors, of a unit quaternion w x y z (Hamilton)."""
+    w, x, y, z = np.asarray(wxyz, np.float64)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
 
 
 def in_local_frame(camera: Camera, origin: NDArray[np.float64]) -> Camera:

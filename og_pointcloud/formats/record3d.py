@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.depth import DepthFile, find_depth
-from og_pointcloud.formats.poses import PosedFrames, PosedImage, naming, numbered, rigid
+from og_pointcloud.formats.poses import PosedFrames, PosedImage, naming, numbered, rigid, rotation_of_quaternion
 from og_pointcloud.scene import Camera
 
 __all__ = ["holds_record3d", "read_record3d"]
@@ -78,13 +78,6 @@ def _metadata(file: Path) -> tuple[tuple[int, int], NDArray[np.float64], NDArray
 
 
 def _world_to_camera(pose: NDArray[np.float64]) -> NDArray[np.float64]:
-    x, y, z, w = pose[:4] / np.linalg.norm(pose[:4])
-    camera_to_world = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    camera_to_world = rotation_of_quaternion(np.roll(pose[:4] / np.linalg.norm(pose[:4]), 1))  # xyzw to wxyz
     rotation = (camera_to_world * [1.0, -1.0, -1.0]).T  # OpenGL's y and z to OpenCV's
     return rigid(rotation, -rotation @ pose[4:])

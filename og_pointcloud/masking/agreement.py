@@ -57,12 +57,9 @@ def points_of_proposals(
     shrink = min(1.0, DEPTH_SIDE / max(camera.width, camera.height))
     small = camera.resized(max(1, round(camera.width * shrink)), max(1, round(camera.height * shrink)))
     depth = rendered_depth(xyz, spacing, small)
-    in_camera = xyz[asked] @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
-    front = np.flatnonzero(in_camera[:, 2] > 0)
-    x, y, z = in_camera[front].T
-    u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
-    shown = (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
-    front, u, v, z = front[shown], u[shown], v[shown], z[shown]
+    uv_px, z = camera.project(xyz[asked])
+    front = np.flatnonzero(camera.shows(uv_px))
+    (u, v), z = uv_px[front].T, z[front]
     column, row = (u * small.width / camera.width).astype(np.int64), (v * small.height / camera.height).astype(np.int64)
     surface = depth[row, column]
     seen = (surface > 0) & (z <= (1 + BEHIND) * surface + SPACINGS_BEHIND * spacing[asked][front])

@@ -30,14 +30,12 @@ def rendered_depth(xyz: NDArray[np.float32], spacing: NDArray[np.float32], camer
     xyz: (n, 3) in the frame that ``camera.world_to_camera`` starts from. spacing: (n,).
     """
     xyz, spacing = xyz[spacing <= FLOATER * np.median(spacing)], spacing[spacing <= FLOATER * np.median(spacing)]
-    in_camera = xyz @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
-    front = in_camera[:, 2] > 0
-    (x, y, z), size = in_camera[front].T, spacing[front]
-    u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+    uv_px, z = camera.project(xyz)
+    u, v = uv_px.T
     inside = (u >= -WIDEST_PX) & (u < camera.width + WIDEST_PX) & (v >= -WIDEST_PX) & (v < camera.height + WIDEST_PX)
     order = np.flatnonzero(inside)[np.argsort(-z[inside], kind="stable")]  # far to near: the last one drawn stays
     column, row, z = u[order].astype(np.int64), v[order].astype(np.int64), z[order]
-    reach = np.clip(np.ceil(0.7 * size[order] * camera.fx / z - 0.5), 0, WIDEST_PX)
+    reach = np.clip(np.ceil(0.7 * spacing[order] * camera.fx / z - 0.5), 0, WIDEST_PX)
     depth = np.full((camera.height, camera.width), np.inf, np.float32)
     for shift_y in range(-WIDEST_PX, WIDEST_PX + 1):
         for shift_x in range(-WIDEST_PX, WIDEST_PX + 1):
@@ -89,12 +87,9 @@ def _grown(part: NDArray[np.bool_], mask: NDArray[np.bool_]) -> NDArray[np.bool_
 
 def smallest_mask_px(xyz: NDArray[np.float32], spacing: NDArray[np.float32], camera: Camera) -> int:
     """Pixels that a mask needs for `POINTS_PER_MASK` points to have room on it, at the depth of the median point."""
-    in_camera = xyz @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
-    front = in_camera[:, 2] > 0
-    (x, y, z), size = in_camera[front].T, spacing[front]
-    u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
-    shown = (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
+    uv_px, depth = camera.project(xyz)
+    shown = camera.shows(uv_px)
     if not shown.any():
         return 1
-    px_per_spacing = float(np.median(camera.fx * size[shown] / z[shown]))
+    px_per_spacing = float(np.median(camera.fx * spacing[shown] / depth[shown]))
     return max(1, round(POINTS_PER_MASK * px_per_spacing**2))

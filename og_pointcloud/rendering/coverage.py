@@ -48,13 +48,11 @@ def _spread_order(count: int) -> list[int]:
 
 def _seen(xyz: NDArray[np.float32], camera: Camera) -> NDArray[np.intp]:
     """Indices of the points that are in the image and not far behind the nearest one of their cell."""
-    in_camera = xyz @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
-    front = np.flatnonzero(in_camera[:, 2] > 0)
-    x, y, depth = in_camera[front].T
-    u, v = camera.fx * x / depth + camera.cx, camera.fy * y / depth + camera.cy
-    inside = (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
+    uv_px, depth = camera.project(xyz)
+    inside = np.flatnonzero(camera.shows(uv_px))
     cell_px = max(camera.width, camera.height) / CELLS
-    cell = (v[inside] // cell_px).astype(np.int64) * CELLS + (u[inside] // cell_px).astype(np.int64)
+    column, row = (uv_px[inside] // cell_px).astype(np.int64).T
+    cell = row * CELLS + column
     nearest = np.full(CELLS * CELLS, np.inf)
     np.minimum.at(nearest, cell, depth[inside])
-    return front[inside][depth[inside] <= BEHIND * nearest[cell]]
+    return inside[depth[inside] <= BEHIND * nearest[cell]]

@@ -271,13 +271,11 @@ def _spacing_per_mask(points: Points, spacing: NDArray[np.float32], views: Seque
     parts = []
     for view in (views[index] for index in np.unique(np.linspace(0, len(views) - 1, 12).round().astype(int))):
         ids, camera = view.mask_map(), view.camera
-        in_camera = xyz @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
-        front = in_camera[:, 2] > 0
-        x, y, depth = in_camera[front].T
-        column, row = np.floor(camera.fx * x / depth + camera.cx), np.floor(camera.fy * y / depth + camera.cy)
-        inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
-        mask = ids[row[inside].astype(int), column[inside].astype(int)]
-        apart = (np.sqrt(camera.fx * camera.fy) * spacing[front] / depth)[inside]
+        uv_px, depth = camera.project(xyz)
+        inside = camera.shows(uv_px)
+        column, row = uv_px[inside].astype(int).T
+        mask = ids[row, column]
+        apart = np.sqrt(camera.fx * camera.fy) * spacing[inside] / depth[inside]
         side = np.sqrt(np.bincount(ids.ravel() + 1, minlength=view.mask_count + 1)[1:])
         parts += [np.median(apart[mask == index]) / side[index] for index in np.unique(mask[mask >= 0])]
     return float(np.median(parts)) if parts else 0.0

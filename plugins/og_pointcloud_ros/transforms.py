@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from og_pointcloud.errors import OgPointcloudError
+from og_pointcloud.formats.poses import rigid, rotation_of_quaternion
 from og_pointcloud_ros.messages import NANOSECONDS, nanoseconds
 
 __all__ = ["TransformError", "TransformTree", "rotation_matrix", "slerp"]
@@ -144,18 +145,9 @@ def slerp(first: NDArray[np.float64], second: NDArray[np.float64], share: float)
 
 
 def rotation_matrix(xyzw: ArrayLike) -> NDArray[np.float64]:
-    """(3, 3) of a unit quaternion."""
-    x, y, z, w = np.asarray(xyzw, np.float64)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    """(3, 3) of a unit quaternion x y z w, ROS's order."""
+    return rotation_of_quaternion(np.roll(np.asarray(xyzw, np.float64), 1))
 
 
 def _matrix(translation: NDArray[np.float64], xyzw: NDArray[np.float64]) -> NDArray[np.float64]:
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = rotation_matrix(xyzw), translation
-    return matrix
+    return rigid(rotation_matrix(xyzw), translation)

@@ -246,12 +246,10 @@ def _subset(gaussians: Gaussians, index: NDArray[np.int64]) -> Gaussians:
 
 def _in_image(gaussians: Gaussians, camera: Camera, near: float) -> bool:
     """Whether any centre lies before the camera and in the image, or within the margin that splats reach in from."""
-    x, y, depth = camera.world_to_camera[:3, :3] @ gaussians.xyz.T + camera.world_to_camera[:3, 3:]
-    before = depth > near
-    u = camera.fx * x[before] / depth[before] + camera.cx - 0.5 * camera.width
-    v = camera.fy * y[before] / depth[before] + camera.cy - 0.5 * camera.height
-    reach = 0.5 + 0.5 * FRUSTUM_MARGIN
-    return bool(((np.abs(u) < reach * camera.width) & (np.abs(v) < reach * camera.height)).any())
+    uv_px, depth = camera.project(gaussians.xyz)
+    size = np.array([camera.width, camera.height])
+    reach = (0.5 + 0.5 * FRUSTUM_MARGIN) * size
+    return bool((np.abs(uv_px[depth > near] - 0.5 * size) < reach).all(axis=1).any())
 
 
 def _alpha(gaussians: Gaussians, camera: Camera, near: float) -> NDArray[np.float64]:
