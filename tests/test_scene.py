@@ -37,7 +37,7 @@ def test_the_middle_of_the_first_pixel_is_at_a_half():
 
 def test_no_points_are_projected_to_no_pixels():
     uv_px, depth = Camera(4, 3, 2.0, 2.0, 2.0, 1.5, np.eye(4)).project(np.empty((0, 3), np.float32))
-    assert uv_px.shape == (0, 2) and depth.shape == (0,)
+    assert (uv_px.shape, depth.shape) == ((0, 2), (0,))
 
 
 @pytest.mark.parametrize("seed", range(5))
