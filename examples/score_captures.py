@@ -27,8 +27,8 @@ from numpy.typing import NDArray
 
 import og_pointcloud as og
 from og_pointcloud.evaluate.baselines import direct_uplift, only_where_masked
-from og_pointcloud.evaluate.blocks import BlockInterval, miou_difference, miou_interval
 from og_pointcloud.evaluate.captures import ask
+from og_pointcloud.evaluate.intervals import BlockInterval, miou_difference, miou_interval
 from og_pointcloud.evaluate.metrics import Score, score_labels
 from og_pointcloud.evaluate.truth import Truth, read_truth
 from og_pointcloud.fitting.fit import prepare

@@ -35,8 +35,8 @@ from score_captures import (  # noqa: E402  # pyright: ignore[reportMissingImpor
     print_row,
 )
 
-from og_pointcloud.cli.eval_.common import Spread  # noqa: E402
-from og_pointcloud.evaluate.spread import Interval, bootstrap  # noqa: E402
+from og_pointcloud.evaluate.intervals import Interval, bootstrap  # noqa: E402
+from og_pointcloud.evaluate.intervals import Interval as Spread  # noqa: E402
 from og_pointcloud.evaluate.truth import read_truth  # noqa: E402
 from og_pointcloud.formats.atomic import replacing  # noqa: E402
 from og_pointcloud.text.encoder import DEMO_ENCODER, read_text_encoder  # noqa: E402

@@ -3,7 +3,6 @@
 import ast
 import doctest
 import importlib
-import inspect
 import json
 import re
 import shlex
@@ -21,15 +20,8 @@ from og_pointcloud.ask import hosts as clouds
 from og_pointcloud.ask.hosts import world_points
 from og_pointcloud.bundle.read import SCHEMA_VERSION
 from og_pointcloud.cli import build_parser, main
-from og_pointcloud.cli.eval_ import capture, scannet
 from og_pointcloud.cloud import Vocabulary
 from og_pointcloud.errors import SceneError
-from og_pointcloud.evaluate import blocks as spatial_blocks
-from og_pointcloud.evaluate import instance_scores as instances
-from og_pointcloud.evaluate import lerf, lerf_selection, truth
-from og_pointcloud.evaluate import scannet as scannet_rules
-from og_pointcloud.evaluate.metrics import score_labels
-from og_pointcloud.evaluate.report.measure import Row
 from og_pointcloud.formats import capture as capture_format
 from og_pointcloud.text.encoder import DEMO_ENCODER, read_text_encoder
 
@@ -101,38 +93,6 @@ def section(page, title):
 def first_cells(text):
     """What the first column of the section's tables has in backquotes."""
     return [name for row in re.findall(r"^\| (`.+?) \|", text, re.M) for name in re.findall(r"`([^`]+)`", row)]
-
-
-def test_columns_on_the_page_of_scores_are_the_commands_own():
-    for title, header, change in (
-        ("eval capture", capture.HEADER, ["less the other"]),
-        ("eval scannet", scannet.HEADER, []),
-    ):
-        text = section("docs/scores.md", title)
-        assert sorted(first_cells(text)) == sorted([*header[1:], *change])
-    assert first_cells(section("docs/scores.md", "eval lerf")) == [*lerf_selection.WAYS, lerf_selection.ORACLE]
-    assert sorted(first_cells(section("docs/scores.md", "The report"))) == sorted(Row.__dataclass_fields__)
-
-
-def test_rules_on_the_page_of_scores_are_the_codes_own():
-    for title, said in {
-        "eval capture": (f"fewer than {truth.VOTES}, agree", "fewer than half of the votes", "fewer than 30 counted"),
-        "eval scannet": (
-            f"opacity below {scannet_rules.OPACITY_COUNTED}",
-            f"Tasks of {', '.join(map(str, list(scannet_rules.TASKS)[:2]))} and {list(scannet_rules.TASKS)[2]} classes",
-            f"<scene>{scannet.LABELS}",
-        ),
-        "eval lerf": (f"alpha above {lerf.ALPHA_SHOWN}", f"`over {lerf.IOU_FOUND}`", lerf_selection.LABEL_FOLDER),
-        "Intervals": (
-            f"{spatial_blocks.SMALLEST_EDGE:g}\npoint spacings",
-            f"at least {spatial_blocks.FEWEST_BLOCKS} cubes",
-        ),
-        "Instances and boxes": (f"fewer than {instances.SMALLEST_INSTANCE} points", f"above\n{instances.MATCHED}"),
-    }.items():
-        for words in said:
-            assert words in section("docs/scores.md", title), words
-    assert truth.AGREED == 0.5
-    assert inspect.signature(score_labels).parameters["min_points"].default == 30
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)

@@ -14,10 +14,10 @@ from labelled_clouds import SPACE, WIDTH, instance_table, make_cloud
 import og_pointcloud as og
 from og_pointcloud.cli import main
 from og_pointcloud.cloud import BACKGROUND, WordBank
+from og_pointcloud.evaluate.intervals import risk_coverage
 from og_pointcloud.evaluate.plots import plot_risk_coverage
 from og_pointcloud.evaluate.scannet import NAMES as NYU40
-from og_pointcloud.evaluate.scannet import scored_answers
-from og_pointcloud.evaluate.spread import risk_coverage
+from og_pointcloud.evaluate.scannet import score_scene
 from og_pointcloud.formats.ply import write_ply
 
 WALL, FLOOR, CHAIR = 1, 2, 5
@@ -280,9 +280,9 @@ def test_answers_are_those_of_the_points_that_count():
     """Point 1 is transparent, point 2 of no class of the ten (a picture), point 4 of none at all."""
     truth, predicted = np.array([WALL, WALL, 11, CHAIR, 40, CHAIR]), np.array([WALL, WALL, 11, FLOOR, WALL, 0])
     opacity = np.array([1, 0.05, 1, 1, 1, 1])
-    correct, confidence = scored_answers(predicted, np.linspace(0, 1, 6), truth, 10, opacity)
-    assert correct.tolist() == [True, False, False]
-    assert confidence.tolist() == [0, pytest.approx(0.6), -np.inf]
+    score = score_scene(predicted, truth, 10, opacity, np.linspace(0, 1, 6))
+    assert score.correct.tolist() == [True, False, False]
+    assert score.confidence.tolist() == [0, pytest.approx(0.6), -np.inf]
 
 
 def test_two_methods_are_compared_over_scenes(scannet, capsys):

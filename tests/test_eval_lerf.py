@@ -17,10 +17,10 @@ from labelled_clouds import SPACE, make_cloud
 
 import og_pointcloud as og
 from og_pointcloud.cli import main
-from og_pointcloud.cli.eval_.lerf import print_set
+from og_pointcloud.cli.evaluate import print_set
 from og_pointcloud.cloud import BACKGROUND, InstanceTable, WordBank
 from og_pointcloud.errors import SceneError
-from og_pointcloud.evaluate.lerf_selection import gaussians_of, read_scene, score_pairs
+from og_pointcloud.evaluate.lerf import gaussians_of, read_scene, score_pairs
 from og_pointcloud.formats.gaussian_ply import write_gaussian_ply
 from og_pointcloud.scene import Points
 

@@ -103,7 +103,7 @@ def test_a_row_is_what_the_scorers_say(script, capture, tmp_path, capsys):
 
 
 def test_rooms_share_a_line(script):
-    from og_pointcloud.evaluate.blocks import BlockInterval
+    from og_pointcloud.evaluate.intervals import BlockInterval
     from og_pointcloud.evaluate.metrics import Score
 
     def row(miou, plain):

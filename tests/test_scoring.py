@@ -5,14 +5,12 @@ import json
 import numpy as np
 import pytest
 
-from og_pointcloud.ask.boxes import Box
 from og_pointcloud.cli import main
 from og_pointcloud.errors import OgPointcloudError, SceneError
 from og_pointcloud.evaluate.instance_scores import average_precision, panoptic_quality
+from og_pointcloud.evaluate.intervals import bootstrap, paired_bootstrap, risk_coverage
 from og_pointcloud.evaluate.lerf import pair_ious, read_frame, score_scenes
-from og_pointcloud.evaluate.overlap import aligned_iou, oriented_iou
 from og_pointcloud.evaluate.scannet import NAMES, TASKS, average, read_truth, score_scene
-from og_pointcloud.evaluate.spread import bootstrap, paired_bootstrap, risk_coverage
 from og_pointcloud.formats.ply import write_ply
 
 WALL, FLOOR, CHAIR, PICTURE, OTHER = 1, 2, 5, 11, 40
@@ -312,52 +310,3 @@ def test_panoptic_quality_by_hand():
     assert panoptic_quality(truth, truth).quality == 1
     with pytest.raises(OgPointcloudError, match="classes of one side alone"):
         panoptic_quality(predicted, truth, np.zeros(3, int))
-
-
-# Boxes ----------------------------------------------------------------------------------------------------------
-
-
-def turned(angle, axis=(0.3, -0.5, 0.8)):
-    """Rotation by Rodrigues' formula."""
-    x, y, z = np.array(axis) / np.linalg.norm(axis)
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
-
-
-def test_aligned_boxes_by_hand():
-    unit, half = [[0, 0, 0], [1, 1, 1]], [[0.5, 0, 0], [1.5, 1, 1]]
-    flat, away = [[0, 0, 0], [1, 1, 0]], [[5, 5, 5], [6, 6, 6]]
-    found = aligned_iou(np.array([unit, flat]), np.array([unit, half, away, flat]))
-    np.testing.assert_allclose(found, [[1, 0.5 / 1.5, 0, 0], [0, 0, 0, 0]])
-    with pytest.raises(OgPointcloudError, match="lowest corners"):
-        aligned_iou(np.array([unit[::-1]]), np.array([unit]))
-
-
-def test_turned_boxes_by_hand():
-    square = Box(np.zeros(3), np.ones(3), np.eye(3))
-    # A unit square and itself turned by 45 degrees share a regular octagon of area 2 (sqrt 2 - 1).
-    octagon = 2 * (np.sqrt(2) - 1)
-    assert oriented_iou(square, Box(np.zeros(3), np.ones(3), turned(np.pi / 4, (0, 0, 1)))) == pytest.approx(
-        octagon / (2 - octagon)
-    )
-    assert oriented_iou(square, square) == pytest.approx(1)
-    assert oriented_iou(square, Box(np.array([0.5, 0, 0]), np.ones(3), np.eye(3))) == pytest.approx(1 / 3)
-    assert oriented_iou(square, Box(np.array([1.0, 0, 0]), np.ones(3), np.eye(3))) == pytest.approx(0)
-    assert oriented_iou(square, Box(np.array([0.1, 0, 0]), np.full(3, 0.5), np.eye(3))) == pytest.approx(1 / 8)
-    assert oriented_iou(square, Box(np.zeros(3), np.array([1, 1, 0.0]), np.eye(3))) == 0
-
-
-@pytest.mark.parametrize("seed", range(6))
-def test_turned_boxes_against_counted_points_and_far_from_the_origin(seed):
-    rng = np.random.default_rng(seed)
-    boxes = [
-        Box(rng.normal(0, 0.3, 3), rng.uniform(0.5, 2, 3), turned(rng.uniform(0, 3), rng.normal(size=3))) for _ in "ab"
-    ]
-    points = rng.uniform(-2.5, 2.5, (300_000, 3))
-    inside = [(np.abs((points - box.center) @ box.axes.T) <= box.size / 2).all(axis=1) for box in boxes]
-    counted = (inside[0] & inside[1]).sum() / (inside[0] | inside[1]).sum()
-    found = oriented_iou(*boxes)
-    assert found == pytest.approx(counted, abs=0.03)
-    assert oriented_iou(*boxes[::-1]) == pytest.approx(found)
-    moved = [Box(box.center + 1e6, box.size, box.axes) for box in boxes]
-    assert oriented_iou(*moved) == pytest.approx(found, abs=1e-6)

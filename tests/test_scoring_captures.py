@@ -10,11 +10,10 @@ from labelled_clouds import make_cloud, unit_rows
 
 from og_pointcloud.ask.labelled_scene import LabelledScene
 from og_pointcloud.errors import OgPointcloudError, SceneError
-from og_pointcloud.evaluate import blocks
-from og_pointcloud.evaluate.blocks import miou_difference, miou_interval
+from og_pointcloud.evaluate import intervals
 from og_pointcloud.evaluate.captures import Answer, ask, score_capture
+from og_pointcloud.evaluate.intervals import bootstrap, miou_difference, miou_interval, paired_bootstrap
 from og_pointcloud.evaluate.metrics import score_labels
-from og_pointcloud.evaluate.spread import bootstrap, paired_bootstrap
 from og_pointcloud.evaluate.truth import Truth, read_truth
 
 NAMES = ("cup", "pot")
@@ -139,7 +138,7 @@ def test_draws_in_parts_are_draws(monkeypatch):
     right = np.random.default_rng(1).random(60) < 0.7
     arguments = (np.where(right, 0, -1), truth_of(np.zeros(60, int)), far_apart(60), 1.0, (0,))
     whole = miou_interval(*arguments)
-    monkeypatch.setattr(blocks, "CHUNK", 600)
+    monkeypatch.setattr(intervals, "CHUNK", 600)
     assert miou_interval(*arguments) == whole
     with pytest.raises(OgPointcloudError, match="no class has enough points"):
         miou_interval(*arguments[:-1], ())

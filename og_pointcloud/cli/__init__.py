@@ -18,7 +18,7 @@ from og_pointcloud.cli import (
     check,
     demo,
     edit,
-    eval_,
+    evaluate,
     export_image_encoder,
     export_text_encoder,
     fit,
@@ -43,7 +43,7 @@ __all__ = ["main"]
 
 COMMANDS = (
     masks, models, fit, fuse, import_, segment, select, pick, instances, edit, view, ros_bag, info, vocabulary,
-    export_text_encoder, export_image_encoder, ablate, eval_, report, check, demo,
+    export_text_encoder, export_image_encoder, ablate, evaluate, report, check, demo,
 )  # fmt: skip
 
 

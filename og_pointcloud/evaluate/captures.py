@@ -2,7 +2,7 @@
 
 Labels are scored as everywhere in this library: a point without a label is a miss, a class called on known background
 a false alarm. Beside that stands unknown as abstention: the answered points alone, and risk against coverage. Intervals
-are over blocks of space (`blocks`). Where the truth knows instances, those of the scene are scored as things of any
+are over blocks of space (`intervals`). Where the truth knows instances, those of the scene are scored as things of any
 kind, and as things of the right class.
 """
 
@@ -16,15 +16,20 @@ from numpy.typing import NDArray
 
 from og_pointcloud.ask.labelled_scene import SceneLike, as_scene, segment
 from og_pointcloud.errors import SceneError
-from og_pointcloud.evaluate.blocks import BlockInterval, miou_difference, miou_interval
 from og_pointcloud.evaluate.instance_scores import (
     AveragePrecision,
     PanopticQuality,
     average_precision,
     panoptic_quality,
 )
+from og_pointcloud.evaluate.intervals import (
+    BlockInterval,
+    RiskCoverage,
+    miou_difference,
+    miou_interval,
+    risk_coverage,
+)
 from og_pointcloud.evaluate.metrics import Score, adjusted_rand_index, score_labels
-from og_pointcloud.evaluate.spread import RiskCoverage, risk_coverage
 from og_pointcloud.evaluate.truth import Truth
 
 __all__ = ["Answer", "CaptureScore", "InstanceScore", "ask", "difference", "score_capture", "sure"]

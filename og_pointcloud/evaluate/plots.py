@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from og_pointcloud.errors import MissingExtraError
-from og_pointcloud.evaluate.spread import RiskCoverage
+from og_pointcloud.evaluate.intervals import RiskCoverage
 from og_pointcloud.formats.atomic import replacing
 
 __all__ = ["plot_risk_coverage", "require_matplotlib", "risk_coverage_png"]

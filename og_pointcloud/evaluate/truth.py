@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 import os
+import zipfile
+import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.errors import SceneError
-from og_pointcloud.evaluate.arrays import read_arrays
 from og_pointcloud.evaluate.metrics import Score, score_labels
+from og_pointcloud.formats.npy import array_from_zip
 
-__all__ = ["GT_NAME", "Truth", "read_truth"]
+__all__ = ["GT_NAME", "Truth", "read_arrays", "read_truth"]
 
 GT_NAME = "gt.npz"
+MAX_UNPACKED_BYTES = 1 << 31
 AGREED, VOTES = 0.5, 2
 """Of a class found by votes: the share that agreed on it, and how many there were, at least."""
 
@@ -90,3 +94,16 @@ def read_truth(folder: str | os.PathLike[str]) -> Truth:
         scored &= (entries["ratio"] >= AGREED) & (entries["votes"] >= VOTES)
     background = entries["background"].astype(bool) if "background" in entries else None
     return Truth(cls, tuple(names.tolist()), scored, background, instance)
+
+
+def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
+    """All arrays of an .npz, read-only; SceneError where it is damaged, holds objects, or is larger than 2 GiB."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            infos = archive.infolist()
+            size = sum(info.file_size for info in infos)
+            if size > MAX_UNPACKED_BYTES:
+                raise ValueError(f"it unpacks to {size} bytes, more than {MAX_UNPACKED_BYTES}")
+            return {info.filename.removesuffix(".npy"): array_from_zip(archive, info) for info in infos}
+    except (OSError, ValueError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error) as error:
+        raise SceneError(f"{path} cannot be read as an .npz of plain arrays ({error!s:.120}): write it again") from None

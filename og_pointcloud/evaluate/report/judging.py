@@ -15,14 +15,13 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud.evaluate.blocks import miou_difference
+from og_pointcloud.evaluate.intervals import Interval, bootstrap, miou_difference
 from og_pointcloud.evaluate.metrics import adjusted_rand_index
 from og_pointcloud.evaluate.report.asking import DEFAULTS as ASKED_DEFAULTS
 from og_pointcloud.evaluate.report.asking import REASONS
 from og_pointcloud.evaluate.report.knobs import EXACT, FAST, KNOBS, base_of
 from og_pointcloud.evaluate.report.measure import Row, Subject
 from og_pointcloud.evaluate.report.shared import ON_SHARED, Measured
-from og_pointcloud.evaluate.spread import Interval, bootstrap
 from og_pointcloud.formats.capture import read_capture
 from og_pointcloud.rendering.geometry import neighbourhood
 from og_pointcloud.settings import GeometrySettings

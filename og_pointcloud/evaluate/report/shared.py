@@ -27,6 +27,7 @@ from og_pointcloud.cloud import LabelledCloud
 from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.evaluate.baselines import BASELINES, only_where_masked
 from og_pointcloud.evaluate.captures import sure
+from og_pointcloud.evaluate.intervals import risk_coverage
 from og_pointcloud.evaluate.report.asking import measure_asking, truth_of_rows
 from og_pointcloud.evaluate.report.knobs import DEFAULT, Setting, find_setting
 from og_pointcloud.evaluate.report.measure import (
@@ -40,7 +41,6 @@ from og_pointcloud.evaluate.report.measure import (
     reset_peak,
     warm_up,
 )
-from og_pointcloud.evaluate.spread import risk_coverage
 from og_pointcloud.fitting.fit import check_scene, fit, prepare, with_distinct_points
 from og_pointcloud.formats.capture import read_capture
 from og_pointcloud.journal import Journal

@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from og_pointcloud.errors import OgPointcloudError
+from og_pointcloud.evaluate.intervals import RiskCoverage
 from og_pointcloud.evaluate.report.judging import judged
 from og_pointcloud.evaluate.report.knobs import (
     ALWAYS_FORCED,
@@ -29,7 +30,6 @@ from og_pointcloud.evaluate.report.knobs import (
 )
 from og_pointcloud.evaluate.report.measure import Row, Subject, measure_apart, read_subject
 from og_pointcloud.evaluate.report.shared import Measured, measure_shared
-from og_pointcloud.evaluate.spread import RiskCoverage
 from og_pointcloud.formats.atomic import replacing
 
 __all__ = ["QUICK", "Report", "Risk", "Sweep", "machine", "own_version", "report_on", "rows_as_csv", "write_rows"]

@@ -1,0 +1,218 @@
+"""How sure a score is, and what abstaining buys: bootstrap intervals, risk against coverage.
+
+Scenes, or pairs of frame and object, are items that are drawn again one by one (`bootstrap`). The points of one cloud
+are not: an instance with a wrong label is wrong at all of its points, and an interval from points drawn one by one
+would be many times too narrow. For the mean IoU of one cloud whole cubes of space are drawn again instead
+(`miou_interval`). How large a cube must be to hold what errs together is not known, so it is tried: edges double from 8
+point spacings while half of the classes or more lie in at least 20 cubes each, and the widest of their intervals is the
+one given. With larger cubes many draws would hold nothing of a class but its fringe, and their mean would be another
+figure than the score. Classes are those of the whole cloud; a draw without a point of a class, called or true, leaves
+that class out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from og_pointcloud.errors import OgPointcloudError
+from og_pointcloud.evaluate.truth import Truth
+
+__all__ = [
+    "BlockInterval",
+    "Interval",
+    "RiskCoverage",
+    "bootstrap",
+    "miou_difference",
+    "miou_interval",
+    "paired_bootstrap",
+    "risk_coverage",
+]
+
+Doubles = NDArray[np.float64]
+
+DRAWS, BLOCK_DRAWS = 10_000, 2_000
+CHUNK = 1 << 21
+"""Numbers drawn at once."""
+SMALLEST_EDGE = 8.0
+"""Of a cube, in point spacings."""
+FEWEST_BLOCKS = 20
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A mean and the middle 95 % of its bootstrap distribution (Efron's percentile interval)."""
+
+    mean: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class BlockInterval(Interval):
+    """mean: of all points. edge: of a cube, in scene units. blocks: how many cubes."""
+
+    edge: float
+    blocks: int
+
+
+@dataclass(frozen=True)
+class RiskCoverage:
+    """coverage: (k,) share of points answered, ascending to 1. risk: (k,) share of these that is wrong. area: of the
+    curve, the mean risk over all coverages; lower is better, and confidences that order well lower it."""
+
+    coverage: Doubles
+    risk: Doubles
+    area: float
+
+
+def bootstrap(scores: NDArray[np.floating], seed: int = 0, draws: int = DRAWS) -> Interval:
+    """Of the mean of n items' scores (scenes, or frame-object pairs): items are drawn again, with replacement.
+
+    A NaN item has no score and is left out before. One item alone has no spread; none at all is an error.
+    """
+    values = np.asarray(scores, np.float64)
+    values = values[np.isfinite(values)]
+    if values.ndim != 1 or len(values) == 0:
+        raise OgPointcloudError("no finite score to draw from; expected one or more")
+    means = [values[drawn].mean(axis=1) for drawn in _draws(len(values), draws, seed)]
+    low, high = np.percentile(np.concatenate(means), (2.5, 97.5))
+    return Interval(float(values.mean()), float(low), float(high))
+
+
+def paired_bootstrap(
+    first: NDArray[np.floating], second: NDArray[np.floating], seed: int = 0, draws: int = DRAWS
+) -> Interval:
+    """Of the mean difference ``first - second`` of two methods on the same items; far narrower than two intervals,
+    since hard items are hard for both. Items that either has no score for are left out."""
+    a, b = np.asarray(first, np.float64), np.asarray(second, np.float64)
+    if a.shape != b.shape:
+        raise OgPointcloudError(f"scores have shapes {a.shape} and {b.shape}; expected both methods on the same items")
+    return bootstrap(a - b, seed, draws)
+
+
+def risk_coverage(correct: NDArray[np.bool_], confidence: NDArray[np.floating]) -> RiskCoverage:
+    """Answering the surest points first: share answered against share wrong. Equal confidences are answered together.
+
+    correct: (n,) bool. confidence: (n,), larger is surer; -inf for what is answered last of all.
+    """
+    if correct.shape != confidence.shape or correct.ndim != 1 or len(correct) == 0:
+        raise OgPointcloudError(f"{correct.shape} answers with confidences {confidence.shape}; expected n >= 1 of both")
+    order = np.argsort(-confidence, kind="stable")
+    ordered = confidence[order]
+    last = np.flatnonzero(np.append(ordered[1:] != ordered[:-1], True))
+    answered = last + 1
+    wrong = np.cumsum(~correct[order])[last]
+    risk = wrong / answered
+    # Within a group of equal confidence any order is as likely: the curve runs straight from group to group.
+    coverage = answered / len(correct)
+    area = float(np.sum(risk * np.diff(coverage, prepend=0.0)))
+    return RiskCoverage(coverage, risk, area)
+
+
+def miou_interval(
+    called: NDArray[np.integer], truth: Truth, xyz: NDArray[np.floating], spacing: float, classes: tuple[int, ...],
+    seed: int = 0,
+) -> BlockInterval:  # fmt: skip
+    """Of the mean IoU that `score_labels` gives.
+
+    called: (n,) classes of the truth, below 0 unknown (`Truth.class_of`). xyz: (n, 3). spacing: of its points, same
+    unit. classes: those that the score is a mean over. Raises OgPointcloudError where there are none, or no spacing.
+    """
+    return _widest([called], truth, xyz, spacing, classes, seed)
+
+
+def miou_difference(
+    first: NDArray[np.integer], second: NDArray[np.integer], truth: Truth, xyz: NDArray[np.floating], spacing: float,
+    classes: tuple[int, ...], seed: int = 0,
+) -> BlockInterval:  # fmt: skip
+    """Of the difference first - second of two labellings of one cloud: both are scored on the same draws, since what is
+    hard is hard for both. Arguments as for `miou_interval`."""
+    return _widest([first, second], truth, xyz, spacing, classes, seed)
+
+
+@dataclass(frozen=True)
+class _Counts:
+    """(blocks, classes) points of each block: hits, and union = true + called - hits."""
+
+    hits: Doubles
+    union: Doubles
+
+    def miou(self, weights: Doubles) -> Doubles:
+        """(draws,) for weights (draws, blocks), how often each block was drawn."""
+        union = weights @ self.union
+        iou = np.divide(weights @ self.hits, union, out=np.zeros_like(union), where=union > 0)
+        return iou.sum(axis=1) / np.maximum((union > 0).sum(axis=1), 1)
+
+
+def _widest(
+    labellings: list[NDArray[np.integer]], truth: Truth, xyz: NDArray[np.floating], spacing: float,
+    classes: tuple[int, ...], seed: int,
+) -> BlockInterval:  # fmt: skip
+    if not classes:
+        raise OgPointcloudError("no class has enough points to be scored; expected one or more")
+    if not (np.isfinite(spacing) and spacing > 0):
+        raise OgPointcloudError(f"the point spacing is {spacing:g}; expected a length above 0, in the points' unit")
+    evaluated = truth.scored & np.isin(truth.cls, classes)
+    counted = evaluated if truth.background is None else evaluated | truth.background
+    points, own = np.asarray(xyz, np.float64)[counted], evaluated[counted]
+    intervals = []
+    edge = SMALLEST_EDGE * spacing
+    while True:
+        block = _cubes(points, edge)
+        spread = [len(np.unique(block[own & (truth.cls[counted] == class_id)])) for class_id in classes]
+        if intervals and np.median(spread) < FEWEST_BLOCKS:
+            return max(intervals, key=lambda interval: interval.high - interval.low)
+        counts = [_count(called, truth.cls, evaluated, counted, block, classes) for called in labellings]
+        intervals.append(_interval(counts, edge, seed))
+        edge *= 2
+
+
+def _cubes(xyz: Doubles, edge: float) -> NDArray[np.intp]:
+    """(n,) the cube that each point lies in, numbered from 0."""
+    cube = np.floor(np.minimum((xyz - xyz.min(axis=0)) / edge, 1 << 20)).astype(np.int64)
+    return np.unique((cube[:, 0] << 42) | (cube[:, 1] << 21) | cube[:, 2], return_inverse=True)[1]
+
+
+def _count(
+    called: NDArray[np.integer], cls: NDArray[np.integer], evaluated: NDArray[np.bool_], counted: NDArray[np.bool_],
+    block: NDArray[np.intp], classes: tuple[int, ...],
+) -> _Counts:  # fmt: skip
+    blocks, width = int(block.max()) + 1, len(classes)
+    order = np.asarray(classes)  # ascending, as score_labels has them
+
+    def tally(rows: NDArray[np.bool_], ids: NDArray[np.integer]) -> Doubles:
+        rows = rows[counted] & np.isin(ids[counted], order)
+        cell = block[rows] * width + np.searchsorted(order, ids[counted][rows])
+        return np.bincount(cell, minlength=blocks * width).reshape(blocks, width).astype(np.float64)
+
+    hits = tally(evaluated & (called == cls), cls)
+    return _Counts(hits, tally(evaluated, cls) + tally(counted, called) - hits)
+
+
+def _interval(counts: list[_Counts], edge: float, seed: int) -> BlockInterval:
+    """Of the one mean IoU, or of the first less the second."""
+    blocks = len(counts[0].hits)
+
+    def score(weights: Doubles) -> Doubles:
+        scores = [one.miou(weights) for one in counts]
+        return scores[0] if len(scores) == 1 else scores[0] - scores[1]
+
+    drawn = []
+    for picked in _draws(blocks, BLOCK_DRAWS, seed):
+        rows = np.arange(len(picked))[:, None] * blocks + picked
+        weights = np.bincount(rows.ravel(), minlength=picked.size).reshape(picked.shape)
+        drawn.append(score(weights.astype(np.float64)))
+    low, high = np.percentile(np.concatenate(drawn), (2.5, 97.5))
+    return BlockInterval(float(score(np.ones((1, blocks)))[0]), float(low), float(high), edge, blocks)
+
+
+def _draws(items: int, draws: int, seed: int) -> Iterator[NDArray[np.int64]]:
+    """(some draws, items) rows of items drawn with replacement, in parts that fit into memory."""
+    random = np.random.default_rng(seed)
+    step = max(1, CHUNK // items)
+    for start in range(0, draws, step):
+        yield random.integers(0, items, (min(step, draws - start), items))
