@@ -21,7 +21,7 @@ from og_pointcloud.bundle.vocabulary import read_words
 from og_pointcloud.cloud import WordBank
 from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.fitting.opengaussian import read_opengaussian
-from og_pointcloud.formats import colmap, record3d, replica, scannet, seven_scenes
+from og_pointcloud.formats import colmap, rgbd
 from og_pointcloud.formats.capture import read_capture
 from og_pointcloud.formats.gaussian_ply import gaussian_rows
 from og_pointcloud.formats.images import read_rgb
@@ -525,10 +525,10 @@ def _readers() -> Iterator[Reader]:
     )
     yield Reader("image", images, lambda at: read_rgb(_only(at), SIZE))
     for name, read in (
-        ("ScanNet", scannet.read_scannet),
-        ("7-Scenes", seven_scenes.read_seven_scenes),
-        ("Replica", replica.read_replica),
-        ("Record3D", record3d.read_record3d),
+        ("ScanNet", rgbd.read_scannet),
+        ("7-Scenes", rgbd.read_seven_scenes),
+        ("Replica", rgbd.read_replica),
+        ("Record3D", rgbd.read_record3d),
     ):
         yield Reader(name, lambda name=name: [rgbd_folders()[name]], lambda at, read=read: _read_frames(read(at)))
     yield Reader("OpenGaussian result", opengaussian_results, read_opengaussian)

@@ -11,9 +11,10 @@ from depth_rooms import HEIGHT, WIDTH, distance_to_surface, look, poses, write_d
 
 from og_pointcloud.cli import main
 from og_pointcloud.errors import SceneError
-from og_pointcloud.formats.capture import depth_files, fuse_capture, read_capture, read_depth
+from og_pointcloud.formats.capture import depth_files, fuse_capture, read_capture, read_poses
+from og_pointcloud.formats.depth import resampled
 from og_pointcloud.formats.points import read_points
-from og_pointcloud.formats.seven_scenes import COLOR_FOCAL_PX, DEPTH_FOCAL_PX
+from og_pointcloud.formats.rgbd import COLOR_FOCAL_PX, DEPTH_FOCAL_PX
 
 COUNT = 6
 LENS = (130.0, 131.0, 79.0, 60.5)
@@ -132,8 +133,10 @@ def test_every_layout_becomes_a_scene_with_a_fused_cloud(dataset):
 def test_depth_of_a_view_is_given_at_the_pixels_of_its_image(dataset):
     folder, names, size, lens = dataset
     scale = size[0] / WIDTH
-    depth = read_depth(folder, names[2])
-    assert depth is not None
+    posed = read_poses(folder)
+    files = depth_files(folder, posed)
+    image = files[names[2]].read()
+    depth = resampled(image.depth, image.camera, posed.images[2].camera)
     assert depth.shape == (size[1], size[0])
     intrinsics = (260.0, 262.0, 158.5, 121.5) if scale == 2 else lens
     truth, _ = look(poses(COUNT)[2], size=size, intrinsics=intrinsics)
@@ -141,8 +144,7 @@ def test_depth_of_a_view_is_given_at_the_pixels_of_its_image(dataset):
     assert measured.mean() > 0.9
     # Nearest pixels: exact to a pixel's slope, but at the edges of things.
     assert np.quantile(np.abs(depth - truth)[measured], 0.9) < 0.05
-    assert list(depth_files(folder)) == names
-    assert read_depth(folder, "nothing") is None
+    assert list(files) == names
 
 
 def test_frames_without_a_pose_are_left_out_and_counted_once(tmp_path):
@@ -172,7 +174,7 @@ def test_uncalibrated_seven_scenes_have_two_lenses_and_sequences_of_their_own(tm
     for sequence in ("seq-01", "seq-02"):
         (tmp_path / sequence).mkdir()
         write_seven_scenes(tmp_path / sequence, intrinsics=False)
-    files = depth_files(tmp_path)
+    files = depth_files(tmp_path, read_poses(tmp_path))
     assert list(files)[COUNT] == "seq-02/frame-000000.color"
     assert files["seq-01/frame-000003.color"].camera.fx == DEPTH_FOCAL_PX * WIDTH / 640
     names = list(files)
@@ -223,7 +225,7 @@ def test_a_depth_file_outside_the_capture_is_not_opened(tmp_path):
     content["frames"][0]["depth_file_path"] = "../d0.png"
     (tmp_path / "transforms.json").write_text(json.dumps(content))
     with pytest.raises(SceneError, match="leads out of the capture folder"):
-        depth_files(tmp_path)
+        read_poses(tmp_path)
 
 
 def test_a_depth_folder_beside_the_images_is_found(tmp_path):
@@ -278,7 +280,7 @@ def test_damaged_data_sets_name_the_file_and_the_cure(tmp_path, write, file, con
     write(folder)
     (folder / file).write_text(content)
     with pytest.raises(SceneError, match=said):
-        depth_files(folder)
+        read_poses(folder)
 
 
 def test_the_command_writes_the_cloud_that_fit_then_takes(tmp_path, capsys):

@@ -18,9 +18,8 @@ from depth_rooms import (
 
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.depth import DepthFile, DepthFrame, DepthImage, resampled
-from og_pointcloud.formats.depth_checks import doubts
 from og_pointcloud.formats.distortion import lens_distortion
-from og_pointcloud.formats.fusion import _slot, evenly, fuse, on_surface, survey, to_world
+from og_pointcloud.formats.fusion import _slot, doubts, evenly, fuse, on_surface, survey, to_world
 
 POSE = poses()[0]
 

@@ -30,7 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.errors import MissingExtraError, SceneError
-from og_pointcloud.formats import colmap, record3d, replica, scannet, seven_scenes
+from og_pointcloud.formats import colmap
 from og_pointcloud.formats.depth import DepthFile, DepthFrame, find_depth, resampled
 from og_pointcloud.formats.distortion import Distortion, undistorted
 from og_pointcloud.formats.gaussian_ply import latest_iteration
@@ -39,24 +39,18 @@ from og_pointcloud.formats.langsplat import LANGUAGE_FEATURES_FOLDER, read_langu
 from og_pointcloud.formats.mask_files import FEATURES_NAME, MASKS_FOLDER, MaskLayer, read_masks
 from og_pointcloud.formats.nerfstudio import TRANSFORMS_NAMES, read_transforms
 from og_pointcloud.formats.points import read_points
-from og_pointcloud.formats.poses import PosedFrames, PosedImage, in_local_frame
+from og_pointcloud.formats.poses import PosedImage, in_local_frame
+from og_pointcloud.formats.rgbd import find_mesh, read_rgbd
 from og_pointcloud.scene import Camera, Points, Scene, View
 
 if TYPE_CHECKING:
     from og_pointcloud.formats.fusion import FusedCloud
 
 __all__ = [
-    "CapturePoses", "depth_files", "find_images", "fuse_capture", "read_capture", "read_depth", "read_geometry",
-    "read_poses",
+    "CapturePoses", "depth_files", "find_images", "fuse_capture", "read_capture", "read_geometry", "read_poses",
 ]  # fmt: skip
 
 CLOUD_NAMES = ("points.ply", "point_cloud.ply")
-LAYOUTS = (
-    (scannet.holds_scannet, scannet.read_scannet),
-    (seven_scenes.holds_seven_scenes, seven_scenes.read_seven_scenes),
-    (replica.holds_replica, replica.read_replica),
-    (record3d.holds_record3d, record3d.read_record3d),
-)
 FUSED_FRAMES = 300
 """Depth images that are fused at most, evenly spread over a recording, whose neighbours show almost the same."""
 SAME_POSE = 1e-3
@@ -113,13 +107,12 @@ def read_poses(capture: Path) -> CapturePoses:
     if model is not None:
         images = colmap.read_images(model)
         return CapturePoses(_view_names(images), images, model)
-    for holds, read in LAYOUTS:
-        if holds(capture):
-            frames: PosedFrames = read(capture)
-            if not frames.images:
-                raise SceneError(f"{capture}: none of its {len(frames.dropped)} frames has a finite pose")
-            _warn_of_dropped(capture, frames.dropped)
-            return CapturePoses(_view_names(frames.images), frames.images, capture, is_recording=True)
+    frames = read_rgbd(capture)
+    if frames is not None:
+        if not frames.images:
+            raise SceneError(f"{capture}: none of its {len(frames.dropped)} frames has a finite pose")
+        _warn_of_dropped(capture, frames.dropped)
+        return CapturePoses(_view_names(frames.images), frames.images, capture, is_recording=True)
     raise SceneError(
         f"{capture} has no pose file; expected transforms.json (nerfstudio, instant-ngp, Blender), a COLMAP model in "
         "sparse/0 (cameras and images, .bin or .txt), or the layout of ScanNet (color/, pose/, intrinsic/), 7-Scenes "
@@ -232,25 +225,7 @@ def _find_cloud(capture: Path) -> Path | None:
         )
     if pcds:
         return pcds[0]
-    return latest_iteration(capture) or scannet.find_mesh(capture)
-
-
-def depth_files(folder: str | Path) -> dict[str, DepthFile]:
-    """The depth images of a capture by view name; views without one are absent. Cameras are in world coordinates."""
-    capture = Path(folder)
-    return _depth_files(capture, read_poses(capture))
-
-
-def read_depth(folder: str | Path, name: str) -> NDArray[np.float32] | None:
-    """The depth of one view at the pixels of its pinhole camera, (H, W) float32, 0 unmeasured; None without an image.
-
-    Lengths of the world along the optical axis. For many views, take ``depth_files`` once: this reads the poses anew.
-    """
-    capture = Path(folder)
-    poses = read_poses(capture)
-    file = _depth_files(capture, poses).get(name)
-    camera = next((image.camera for other, image in zip(poses.names, poses.images, strict=True) if other == name), None)
-    return None if file is None or camera is None else file.read().seen_by(camera)
+    return latest_iteration(capture) or find_mesh(capture)
 
 
 def fuse_capture(folder: str | Path, depth_unit: float | None = None) -> FusedCloud:
@@ -267,7 +242,8 @@ def fuse_capture(folder: str | Path, depth_unit: float | None = None) -> FusedCl
     return _fused(capture, frames)
 
 
-def _depth_files(capture: Path, poses: CapturePoses) -> dict[str, DepthFile]:
+def depth_files(capture: Path, poses: CapturePoses) -> dict[str, DepthFile]:
+    """The depth images of a capture by view name; views without one are absent. Cameras are in world coordinates."""
     files = {}
     for name, image in zip(poses.names, poses.images, strict=True):
         if image.depth is not None:
@@ -279,7 +255,7 @@ def _depth_files(capture: Path, poses: CapturePoses) -> dict[str, DepthFile]:
 
 def _depth_frames(capture: Path, poses: CapturePoses) -> list[DepthFrame]:
     """What is fused: of a long recording so many frames, evenly, as show every surface often enough."""
-    files = _depth_files(capture, poses)
+    files = depth_files(capture, poses)
     images = dict(zip(poses.names, poses.images, strict=True))
     frames = []
     for name in list(files)[:: 1 + len(files) // FUSED_FRAMES]:
@@ -292,8 +268,7 @@ def _depth_frames(capture: Path, poses: CapturePoses) -> list[DepthFrame]:
 def _fused(capture: Path, frames: Sequence[DepthFrame]) -> FusedCloud:
     # The fusion brings numba, which whoever has a cloud need not load here.
     try:
-        from og_pointcloud.formats.depth_checks import doubts
-        from og_pointcloud.formats.fusion import fuse
+        from og_pointcloud.formats.fusion import doubts, fuse
     except ImportError as error:
         raise MissingExtraError("numba", "fit") from error
     fused = fuse(frames)

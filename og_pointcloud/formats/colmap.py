@@ -22,7 +22,8 @@ from numpy.typing import NDArray
 
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.distortion import Distortion, lens_distortion
-from og_pointcloud.formats.poses import PosedImage, naming, rigid, rotation_of_quaternion
+from og_pointcloud.formats.poses import PosedImage, rigid, rotation_of_quaternion
+from og_pointcloud.formats.tables import naming
 from og_pointcloud.scene import Camera
 
 __all__ = ["find_model", "read_images", "read_points3d"]

@@ -34,10 +34,6 @@ class DepthImage:
     depth: NDArray[np.float32]
     camera: Camera
 
-    def seen_by(self, camera: Camera) -> NDArray[np.float32]:
-        """The depth at the pixels of a camera with the same pose, (camera.height, camera.width), by nearest pixel."""
-        return resampled(self.depth, self.camera, camera)
-
 
 @dataclass(frozen=True)
 class DepthFile:

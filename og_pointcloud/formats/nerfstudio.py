@@ -29,7 +29,8 @@ from numpy.typing import NDArray
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.depth import DepthFile
 from og_pointcloud.formats.distortion import Distortion, lens_distortion
-from og_pointcloud.formats.poses import PosedImage, naming, rigid
+from og_pointcloud.formats.poses import PosedImage, rigid
+from og_pointcloud.formats.tables import naming
 from og_pointcloud.scene import Camera
 
 __all__ = ["TRANSFORMS_NAMES", "Transforms", "read_transforms"]

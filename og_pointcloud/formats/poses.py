@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -19,9 +18,7 @@ from og_pointcloud.scene import Camera
 __all__ = [
     "PosedFrames",
     "PosedImage",
-    "camera_from_pose",
     "in_local_frame",
-    "naming",
     "numbered",
     "read_numbers",
     "rigid",
@@ -52,15 +49,6 @@ class PosedFrames:
 
     images: tuple[PosedImage, ...]
     dropped: tuple[str, ...]
-
-
-@contextmanager
-def naming(source: str) -> Iterator[None]:
-    """Put the place in a pose file in front of what is wrong with a camera there."""
-    try:
-        yield
-    except SceneError as error:
-        raise SceneError(f"{source}: {error}") from None
 
 
 def rigid(rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -111,19 +99,3 @@ def read_numbers(file: Path, columns: int) -> NDArray[np.float64]:
     if numbers.ndim != 2 or numbers.shape[1] != columns:
         raise SceneError(f"{file} has numbers of shape {numbers.shape}; expected rows of {columns}")
     return numbers
-
-
-def camera_from_pose(
-    camera_to_world: NDArray[np.float64], size: tuple[int, int], intrinsics: tuple[float, float, float, float]
-) -> Camera:
-    """The camera of a data set with OpenCV axes that counts pixel centres at whole numbers, as most RGB-D sets do.
-
-    camera_to_world: (4, 4), finite. size: (width, height). intrinsics: fx, fy, cx, cy with the first pixel's centre at
-    0; the scene has it at 0.5.
-    """
-    if camera_to_world.shape != (4, 4):
-        raise SceneError(f"the pose has shape {camera_to_world.shape}; expected a 4x4 matrix, camera to world")
-    rotation = camera_to_world[:3, :3].T
-    fx, fy, cx, cy = intrinsics
-    pose = rigid(rotation, -rotation @ camera_to_world[:3, 3])
-    return Camera(*size, fx=fx, fy=fy, cx=cx + 0.5, cy=cy + 0.5, world_to_camera=pose)

@@ -23,16 +23,16 @@ NORMAL_COLUMNS = (("nx", "ny", "nz"), ("normal_x", "normal_y", "normal_z"))
 
 
 @contextmanager
-def naming(path: Path) -> Iterator[None]:
-    """Put the file's path, once, before errors raised inside; a failing disk or missing file is a SceneError too."""
+def naming(place: str | Path) -> Iterator[None]:
+    """Put a file's path, or a place in it, once, before errors raised inside; what the disk refuses is a SceneError."""
     try:
         yield
     except SceneError as error:
-        if str(error).startswith(f"{path}: "):
+        if str(error).startswith(f"{place}: "):
             raise
-        raise SceneError(f"{path}: {error}") from error
+        raise SceneError(f"{place}: {error}") from error
     except OSError as error:
-        raise SceneError(f"{path}: {error.strerror or error}: check the path and its permissions") from error
+        raise SceneError(f"{place}: {error.strerror or error}: check the path and its permissions") from error
 
 
 def read_text_rows(lines: Iterable[bytes], dtype: np.dtype, count: int, what: str) -> NDArray[np.void]:

@@ -1,0 +1,322 @@
+"""Folders of RGB-D data sets: ScanNet, 7-Scenes, Replica and Record3D, each as its exporter writes it.
+
+ScanNet   ``color/0.jpg``, ``depth/0.png``, ``pose/0.txt``, ``intrinsic/`` (or, in the 25k-frame subset,
+          ``intrinsics_color.txt`` beside the folders). Depth is 16-bit millimetres with intrinsics of its own. A pose
+          is all ``-inf`` where tracking was lost. Colour and depth share a pose: the extrinsics are the identity.
+7-Scenes  ``frame-000000.color.png``, ``.depth.png``, ``.pose.txt``, in the folder or in ``seq-01/``, ``seq-02/``, ...
+          Depth is 16-bit millimetres, 65535 (and 0) unmeasured. The Kinect was never calibrated: the data set's authors
+          used, and the poses belong to, a depth camera of focal length 585 pixels about the image's middle; colour has
+          the wider lens of 525 pixels that the sensor's driver states. ``camera-intrinsics.txt`` (3x3, as TSDF-fusion's
+          copies have, where colour and depth are registered) replaces both.
+Replica   as NICE-SLAM renders it: ``results/frame000000.jpg``, ``results/depth000000.png``; line i of ``traj.txt`` is
+          the pose of frame i, 16 numbers. ``cam_params.json`` lies in the folder or beside it: ``{"camera": {"w", "h",
+          "fx", "fy", "cx", "cy", "scale"}}``; a stored depth of ``scale`` is a metre.
+Record3D  exported as "EXR + JPG": ``rgb/0.jpg``, ``depth/0.exr``, ``metadata.json`` with ``K``, the 3x3 intrinsics
+          column by column for images of ``w`` x ``h``, or one a frame in ``perFrameIntrinsicCoeffs`` (fx, fy, cx, cy),
+          and ``poses``, qx qy qz qw tx ty tz a frame. Depth is float metres, smaller than the image; OpenCV reads EXR
+          only if it is started with ``OPENCV_IO_ENABLE_OPENEXR=1``.
+
+Poses are camera-to-world with OpenCV axes, Record3D's with ARKit's (x right, y up, z back). All but Record3D count
+pixel centres at whole numbers; the scene has them at +0.5.
+"""
+
+from __future__ import annotations
+
+import json
+import warnings
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from og_pointcloud.errors import SceneError
+from og_pointcloud.formats.depth import MILLIMETRE, DepthFile, find_depth
+from og_pointcloud.formats.images import IMAGE_SUFFIXES, image_size
+from og_pointcloud.formats.poses import (
+    PosedFrames,
+    PosedImage,
+    numbered,
+    read_numbers,
+    rigid,
+    rotation_of_quaternion,
+)
+from og_pointcloud.formats.tables import naming
+from og_pointcloud.scene import Camera
+
+__all__ = ["find_mesh", "read_record3d", "read_replica", "read_rgbd", "read_scannet", "read_seven_scenes"]
+
+DEPTH_FOCAL_PX, COLOR_FOCAL_PX, FOCAL_WIDTH = 585.0, 525.0, 640
+"""Focal lengths of 7-Scenes in pixels of an image of that width."""
+SEVEN_SCENES_INVALID = 65535
+SEVEN_SCENES_IMAGES = ("frame-*.color.png", "frame-*.color.jpg")
+SEVEN_SCENES_INTRINSICS = "camera-intrinsics.txt"
+REPLICA_PARAMETERS = "cam_params.json"
+REPLICA_KEYS = ("w", "h", "fx", "fy", "cx", "cy", "scale")
+RECORD3D_METADATA = "metadata.json"
+
+
+@dataclass(frozen=True)
+class _Lens:
+    """A camera without its pose: pixels, pixel centres at +0.5."""
+
+    size: tuple[int, int]
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+
+    @classmethod
+    def from_matrix(cls, size: tuple[int, int], matrix: NDArray[np.float64]) -> _Lens:
+        """From intrinsics (3 or 4, 3 or 4) that count pixel centres at whole numbers, as most RGB-D sets do."""
+        return cls(size, matrix[0, 0].item(), matrix[1, 1].item(), matrix[0, 2].item() + 0.5, matrix[1, 2].item() + 0.5)
+
+    def at(self, camera_to_world: NDArray[np.float64]) -> Camera:
+        """The camera with this lens; camera_to_world: (4, 4), finite, OpenCV axes."""
+        if camera_to_world.shape != (4, 4):
+            raise SceneError(f"the pose has shape {camera_to_world.shape}; expected a 4x4 matrix, camera to world")
+        rotation = camera_to_world[:3, :3].T
+        pose = rigid(rotation, -rotation @ camera_to_world[:3, 3])
+        return Camera(*self.size, self.fx, self.fy, self.cx, self.cy, pose)
+
+
+@dataclass(frozen=True)
+class _Depth:
+    """A depth image without its pose. unit, invalid: as `DepthFile` has them."""
+
+    file: Path
+    lens: _Lens
+    unit: float | None = None
+    invalid: int | None = None
+
+
+@dataclass(frozen=True)
+class _Frame:
+    """An image of a recording.
+
+    path: in the capture folder. pose: camera to world, NaN or infinite where tracking was lost. source: where the pose
+    was read, for errors.
+    """
+
+    path: str
+    pose: NDArray[np.float64]
+    source: str
+    lens: _Lens
+    depth: _Depth | None
+
+    def posed(self) -> PosedImage:
+        with naming(self.source):
+            camera, depth = self.lens.at(self.pose), self.depth
+            file = DepthFile(depth.file, depth.lens.at(self.pose), depth.unit, depth.invalid) if depth else None
+        return PosedImage(self.path, camera, depth=file)
+
+
+def read_rgbd(folder: Path) -> PosedFrames | None:
+    """Poses, cameras and depth files of a data set's folder, frames in order; None where it has no layout of these.
+
+    SceneError names the file that is wrong, and the cure.
+    """
+    if (folder / "color").is_dir() and (folder / "pose").is_dir() and _scannet_file(folder, "color") is not None:
+        return read_scannet(folder)
+    if any(next(sequence.glob("frame-*.pose.txt"), None) is not None for sequence in _sequences(folder)):
+        return read_seven_scenes(folder)
+    if (folder / "traj.txt").is_file() and (folder / "results").is_dir():
+        return read_replica(folder)
+    if (folder / RECORD3D_METADATA).is_file() and (folder / "rgb").is_dir():
+        return read_record3d(folder)
+    return None
+
+
+def _posed_frames(frames: Iterable[_Frame]) -> PosedFrames:
+    """Frames with a finite pose as posed images, the others' paths as dropped."""
+    posed, dropped = [], []
+    for frame in frames:
+        if np.isfinite(frame.pose).all():
+            posed.append(frame.posed())
+        else:
+            dropped.append(frame.path)
+    return PosedFrames(tuple(posed), tuple(dropped))
+
+
+def _pose_in(file: Path) -> NDArray[np.float64]:
+    return read_numbers(file, 4) if file.is_file() else np.full((4, 4), np.nan)
+
+
+def _matrix_in(file: Path, side: int) -> NDArray[np.float64]:
+    matrix = read_numbers(file, side)
+    if matrix.shape != (side, side):
+        raise SceneError(f"{file} is {matrix.shape}; expected a {side}x{side} matrix with fx, fy, cx, cy")
+    return matrix
+
+
+def _in_or_above(folder: Path, name: str) -> Path | None:
+    return next((place / name for place in (folder, folder.parent) if (place / name).is_file()), None)
+
+
+def read_scannet(folder: Path) -> PosedFrames:
+    """As `read_rgbd`, of ScanNet's layout."""
+    images = numbered(file for file in (folder / "color").iterdir() if file.suffix in IMAGE_SUFFIXES)
+    if not images:
+        raise SceneError(f"{folder / 'color'} has no image; expected 0.jpg, 1.jpg, ...: export the colour frames")
+    color = _scannet_lens(folder, "color", images[0])
+    depth_files = {file.stem: file for file in (folder / "depth").glob("*.png")}
+    depth = _scannet_lens(folder, "depth", next(iter(depth_files.values()))) if depth_files else color
+    _warn_of_extrinsics(folder)
+    frames = []
+    for file in images:
+        pose_file, depth_file = folder / "pose" / f"{file.stem}.txt", depth_files.get(file.stem)
+        of_depth = _Depth(depth_file, depth, MILLIMETRE) if depth_file else None
+        frames.append(_Frame(f"color/{file.name}", _pose_in(pose_file), str(pose_file), color, of_depth))
+    return _posed_frames(frames)
+
+
+def find_mesh(folder: Path) -> Path | None:
+    """ScanNet's decimated mesh, whose vertices are the points that its labels belong to, or None."""
+    return next(iter(sorted(folder.glob("*_vh_clean_2.ply"))), None)
+
+
+def _scannet_file(folder: Path, sensor: str, kind: str = "intrinsic") -> Path | None:
+    files = (folder / "intrinsic" / f"{kind}_{sensor}.txt", folder / f"{kind}s_{sensor}.txt")
+    return next((file for file in files if file.is_file()), None)
+
+
+def _scannet_lens(folder: Path, sensor: str, image: Path) -> _Lens:
+    file = _scannet_file(folder, sensor)
+    if file is None:
+        raise SceneError(f"{folder} has no intrinsic/intrinsic_{sensor}.txt: export the intrinsics again")
+    return _Lens.from_matrix(image_size(image), _matrix_in(file, 4))
+
+
+def _warn_of_extrinsics(folder: Path) -> None:
+    for sensor in ("color", "depth"):
+        file = _scannet_file(folder, sensor, "extrinsic")
+        if file is not None and np.abs(read_numbers(file, 4) - np.eye(4)).max() > 1e-3:
+            warnings.warn(
+                f"{file} is not the identity and is not applied: depth and colours are taken to share a pose",
+                stacklevel=6,
+            )
+
+
+def read_seven_scenes(folder: Path) -> PosedFrames:
+    """As `read_rgbd`, of 7-Scenes' layout, sequence by sequence."""
+    images = [
+        file
+        for sequence in _sequences(folder)
+        for file in numbered(file for names in SEVEN_SCENES_IMAGES for file in sequence.glob(names))
+    ]
+    if not images:
+        raise SceneError(f"{folder} has poses but no frame-*.color.png or .color.jpg: add the colour images")
+    color, depth = _seven_scenes_lenses(folder, image_size(images[0]))
+    frames = []
+    for file in images:
+        frame = file.name.split(".")[0]
+        pose_file, depth_file = file.with_name(f"{frame}.pose.txt"), file.with_name(f"{frame}.depth.png")
+        of_depth = _Depth(depth_file, depth, MILLIMETRE, SEVEN_SCENES_INVALID) if depth_file.is_file() else None
+        path = file.relative_to(folder).as_posix()
+        frames.append(_Frame(path, _pose_in(pose_file), str(pose_file), color, of_depth))
+    return _posed_frames(frames)
+
+
+def _sequences(folder: Path) -> list[Path]:
+    return [folder, *sorted(path for path in folder.glob("seq-*") if path.is_dir())]
+
+
+def _seven_scenes_lenses(folder: Path, size: tuple[int, int]) -> tuple[_Lens, _Lens]:
+    """The lenses of colour and of depth."""
+    file = _in_or_above(folder, SEVEN_SCENES_INTRINSICS)
+    if file is not None:
+        both = _Lens.from_matrix(size, _matrix_in(file, 3))
+        return both, both
+    width, height = size
+    color, depth = (focal * width / FOCAL_WIDTH for focal in (COLOR_FOCAL_PX, DEPTH_FOCAL_PX))
+    middle = width / 2 + 0.5, height / 2 + 0.5
+    return _Lens(size, color, color, *middle), _Lens(size, depth, depth, *middle)
+
+
+def read_replica(folder: Path) -> PosedFrames:
+    """As `read_rgbd`, of Replica's layout."""
+    results = folder / "results"
+    images = numbered([*results.glob("frame*.jpg"), *results.glob("frame*.png")])
+    poses = read_numbers(folder / "traj.txt", 16).reshape(-1, 4, 4)
+    if not images or len(images) > len(poses):
+        raise SceneError(
+            f"{folder} has {len(images)} images in results/ and {len(poses)} poses in traj.txt; expected at least one "
+            "image and a pose for each: copy both from one run"
+        )
+    width, height, fx, fy, cx, cy, scale = _replica_parameters(folder)
+    lens = _Lens((round(width), round(height)), fx, fy, cx + 0.5, cy + 0.5)
+    frames = []
+    for line, (file, pose) in enumerate(zip(images, poses, strict=False), 1):
+        depth_file = results / f"{file.stem.replace('frame', 'depth', 1)}.png"
+        depth = _Depth(depth_file, lens, 1 / scale) if depth_file.is_file() else None
+        frames.append(_Frame(f"results/{file.name}", pose, f"{folder / 'traj.txt'}, line {line}", lens, depth))
+    return _posed_frames(frames)
+
+
+def _replica_parameters(folder: Path) -> list[float]:
+    file = _in_or_above(folder, REPLICA_PARAMETERS)
+    if file is None:
+        raise SceneError(
+            f"{folder} has no {REPLICA_PARAMETERS}, nor has the folder above; expected it with w h fx fy cx cy scale"
+        )
+    try:
+        content: Any = json.loads(file.read_text(encoding="utf-8"))
+        values = [float(content["camera"][key]) for key in REPLICA_KEYS]
+    except (ValueError, TypeError, KeyError, RecursionError) as error:
+        raise SceneError(
+            f'{file} is not {{"camera": {{{", ".join(REPLICA_KEYS)}}}}} ({error!s:.80}): copy it again'
+        ) from None
+    if not np.isfinite(values).all() or min(values[0], values[1], values[-1]) <= 0 or max(values[:2]) > 1 << 16:
+        raise SceneError(f"{file}: {', '.join(REPLICA_KEYS)} are {values}; expected positive sizes and scale")
+    return values
+
+
+def read_record3d(folder: Path) -> PosedFrames:
+    """As `read_rgbd`, of Record3D's layout."""
+    file = folder / RECORD3D_METADATA
+    images = numbered([*(folder / "rgb").glob("*.jpg"), *(folder / "rgb").glob("*.png")])
+    size, intrinsics, poses = _record3d_metadata(file)
+    if not images or len(images) > len(poses):
+        raise SceneError(
+            f"{folder} has {len(images)} images in rgb/ and {len(poses)} poses in {RECORD3D_METADATA}; expected at "
+            "least one image and a pose for each: export the recording again"
+        )
+    frames = []
+    for index, image in enumerate(images):
+        lens = _Lens(size, *intrinsics[min(index, len(intrinsics) - 1)].tolist())
+        depth_file = find_depth(folder, image.stem)
+        depth = _Depth(depth_file, lens) if depth_file else None
+        frames.append(_Frame(f"rgb/{image.name}", _arkit_pose(poses[index]), f"{file}, pose {index}", lens, depth))
+    return _posed_frames(frames)
+
+
+def _record3d_metadata(file: Path) -> tuple[tuple[int, int], NDArray[np.float64], NDArray[np.float64]]:
+    """(width, height), intrinsics (1 or frames, 4), poses (frames, 7)."""
+    try:
+        content: Any = json.loads(file.read_text(encoding="utf-8"))
+        size = int(content["w"]), int(content["h"])
+        poses = np.array(content["poses"], np.float64)
+        matrix = np.array(content["K"], np.float64).reshape(3, 3).T
+        per_frame = content.get("perFrameIntrinsicCoeffs")
+        shared = [[matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]]]
+        intrinsics = np.array(per_frame or shared, np.float64)
+    except (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError) as error:
+        raise SceneError(
+            f"{file} is not Record3D's metadata with w, h, K and poses ({error!s:.80}): export it again"
+        ) from None
+    if poses.ndim != 2 or poses.shape[1] != 7 or intrinsics.ndim != 2 or intrinsics.shape[1] < 4:
+        raise SceneError(
+            f"{file}: poses are {poses.shape}, intrinsics {intrinsics.shape}; expected (frames, 7) and (_, 4)"
+        )
+    return size, intrinsics[:, :4], poses
+
+
+def _arkit_pose(pose: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(4, 4) camera to world with OpenCV axes, NaN where qx qy qz qw tx ty tz is no pose."""
+    if not np.isfinite(pose).all() or not pose[:4].any():
+        return np.full((4, 4), np.nan)
+    with np.errstate(all="ignore"):  # what comes of absurd lengths is dropped or refused like other bad poses
+        wxyz = np.roll(pose[:4] / np.linalg.norm(pose[:4]), 1)
+        return rigid(rotation_of_quaternion(wxyz) * [1.0, -1.0, -1.0], pose[4:])  # OpenGL's y and z to OpenCV's
