@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from score_captures import score_of
 
 import og_pointcloud as og
-from og_pointcloud.ask.choosing import Choice, Chooser, relevancy
+from og_pointcloud.ask.choosing import Choice, Chooser
 from og_pointcloud.cloud import UNOBSERVED, LabelledCloud, WordBank
 from og_pointcloud.errors import MissingExtraError, OgPointcloudError
 from og_pointcloud.settings import ChoosingSettings
@@ -143,10 +143,8 @@ def methods(case: Case) -> dict[str, Answers]:
         return answer(choice, np.exp(shifted) / np.exp(shifted).sum(axis=1, keepdims=True), threshold=0)
 
     def lerf(texts: NDArray[np.float32]) -> Choice:
-        choice = plain.choose(texts)
-        scores = np.zeros(choice.table.shape, np.float32)
-        np.maximum.at(scores, table.descriptor_instance, relevancy(table.descriptors, texts, case.negatives))
-        return answer(choice, scores, threshold=0.5)
+        choice = plain.choose(texts, case.negatives)
+        return answer(choice, choice.table, threshold=0.5)
 
     def closest_pair(texts: NDArray[np.float32]) -> Choice:
         """Each label with its nearest word of the bank, as an ensemble of names for want of an encoder."""

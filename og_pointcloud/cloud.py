@@ -11,8 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError
 
 __all__ = [
-    "BACKGROUND", "TOO_FAR", "UNKNOWN", "UNOBSERVED", "InstanceTable", "LabelledCloud", "Vocabulary", "WordBank",
-    "finite_rows", "unit_rows",
+    "BACKGROUND", "TOO_FAR", "UNKNOWN", "UNKNOWN_SPACE", "UNOBSERVED", "FeatureSpace", "InstanceTable", "LabelledCloud",
+    "Vocabulary", "WordBank", "best_of_rows", "finite_rows", "unit_rows",
 ]  # fmt: skip
 
 BACKGROUND = -1
@@ -24,8 +24,37 @@ TOO_FAR = -3
 """Instance answered for a query point with no cloud point within reach."""
 UNKNOWN = -1
 """Label of a point that none of the names is known to fit."""
+UNKNOWN_SPACE = "unknown"
+"""Feature space of vectors whose encoder nobody named: they are compared by width alone."""
+NO_EVIDENCE = -2.0
+"""Cosine of an instance without a descriptor: below every true one."""
 MIN_BANK = 50
 """Words that a null distribution takes at least: fewer give no standard deviation worth the name."""
+
+
+@dataclass(frozen=True)
+class FeatureSpace:
+    """What makes vectors comparable: the encoder that they come from, and their width.
+
+    name: of the encoder, e.g. "openai/clip-vit-base-patch16"; UNKNOWN_SPACE where nobody named it, which fits any.
+    width: numbers a vector; 0 where there is none yet, which fits any.
+    """
+
+    name: str
+    width: int
+
+    def accepts(self, other: FeatureSpace) -> bool:
+        """Whether vectors of the other space can be compared with vectors of this one."""
+        same_encoder = self.name == other.name or UNKNOWN_SPACE in (self.name, other.name)
+        return same_encoder and (self.width == other.width or 0 in (self.width, other.width))
+
+    def require(self, other: FeatureSpace, what: str) -> None:
+        """FeatureSpaceError, which calls the other space's vectors ``what``, unless the two can be compared."""
+        if not self.accepts(other):
+            raise FeatureSpaceError(f"the {what} are of {other}; expected {self}: encode them with that encoder")
+
+    def __str__(self) -> str:
+        return f"feature space '{self.name}' (width {self.width})"
 
 
 @dataclass(frozen=True)
@@ -38,7 +67,7 @@ class InstanceTable:
     points: (K,) int32, points with this id. views, masks: (K,) int32, views that saw it and masks joined in it.
     agreement: (K,) float32 in [-1, 1], mean cosine of its masks' features with their descriptor.
     visible_area: (K,) float32, pixels of blending weight that its masks put on it, over all views.
-    coarse: (K,) int32, the coarse cluster that an instance of a codebook lies in, -1 none. whole: (K,) int32, the
+    coarse: (K,) int32, the coarse cluster that an instance of a codebook lies in, -1 none. part_of: (K,) int32, the
         instance that this one is a part of, -1 none; without cycles. Left empty, both become -1 throughout.
     """
 
@@ -50,14 +79,14 @@ class InstanceTable:
     agreement: NDArray[np.float32]
     visible_area: NDArray[np.float32]
     coarse: NDArray[np.int32] = field(default_factory=lambda: np.zeros(0, np.int32))
-    whole: NDArray[np.int32] = field(default_factory=lambda: np.zeros(0, np.int32))
+    part_of: NDArray[np.int32] = field(default_factory=lambda: np.zeros(0, np.int32))
 
     def __post_init__(self) -> None:
         count = len(self.points)
-        for name in ("coarse", "whole"):
+        for name in ("coarse", "part_of"):
             if len(getattr(self, name)) == 0:
                 object.__setattr__(self, name, np.full(count, -1, np.int32))
-        for name in ("views", "masks", "agreement", "visible_area", "coarse", "whole"):
+        for name in ("views", "masks", "agreement", "visible_area", "coarse", "part_of"):
             if getattr(self, name).shape != (count,):
                 raise OgPointcloudError(f"instance {name} has shape {getattr(self, name).shape}; expected ({count},)")
         if self.descriptors.ndim != 2 or len(self.descriptors) != len(self.descriptor_instance):
@@ -69,26 +98,37 @@ class InstanceTable:
             raise OgPointcloudError(f"descriptor instances must ascend within 0..{count - 1}")
         if not np.isfinite(self.descriptors).all():
             raise OgPointcloudError("descriptors hold NaN or infinity; expected unit rows")
-        _check_hierarchy(self.coarse, self.whole)
+        _check_hierarchy(self.coarse, self.part_of)
 
     def __len__(self) -> int:
         return len(self.points)
 
+    def cosines(self, vectors: NDArray[np.floating]) -> NDArray[np.floating]:
+        """(K, L) best cosine of an instance's descriptors with each of vectors (L, D), -2 for one without a descriptor.
 
-def _check_hierarchy(coarse: NDArray[np.int32], whole: NDArray[np.int32]) -> None:
-    count = len(whole)
-    if count and (coarse.min() < -1 or whole.min() < -1 or whole.max() >= count):
+        In the vectors' precision, at least float32. A zero vector has cosine 0 with everything.
+        """
+        vectors = unit_rows(vectors)
+        if len(self.descriptors) == 0:  # no width to hold the vectors to
+            return np.full((len(self), len(vectors)), NO_EVIDENCE, vectors.dtype)
+        cosines = self.descriptors.astype(vectors.dtype, copy=False) @ vectors.T
+        return best_of_rows(cosines, self.descriptor_instance, len(self), NO_EVIDENCE)
+
+
+def _check_hierarchy(coarse: NDArray[np.int32], part_of: NDArray[np.int32]) -> None:
+    count = len(part_of)
+    if count and (coarse.min() < -1 or part_of.min() < -1 or part_of.max() >= count):
         raise OgPointcloudError(
-            f"coarse clusters reach down to {coarse.min()}, wholes span {whole.min()}..{whole.max()}; expected -1 or a "
-            f"number from 0, wholes at most {count - 1}"
+            f"coarse clusters reach down to {coarse.min()}, part_of spans {part_of.min()}..{part_of.max()}; expected "
+            f"-1 or a number from 0, part_of at most {count - 1}"
         )
-    parents = np.append(whole, -1)  # row -1 is its own parent: none
+    parents = np.append(part_of, -1)  # row -1 is its own parent: none
     ancestor = np.arange(count)
     # Doubling: after k rounds every row has risen 2^k levels, and none rises more than count.
     for _ in range(count.bit_length()):
         ancestor, parents = parents[ancestor], parents[parents]
     if (ancestor >= 0).any():
-        raise OgPointcloudError(f"instance {int(np.argmax(ancestor >= 0))} is a part of itself, through its wholes")
+        raise OgPointcloudError(f"instance {int(np.argmax(ancestor >= 0))} is a part of itself, through part_of")
 
 
 @dataclass(frozen=True)
@@ -183,15 +223,17 @@ class LabelledCloud:
             value = getattr(self, name)
             if not (np.isfinite(value) and value > 0):
                 raise OgPointcloudError(f"{name} is {value}; expected a positive length")
-        width = self.instances.descriptors.shape[1]
-        if self.word_bank is not None and width and self.word_bank.vectors.shape[1] != width:
-            raise FeatureSpaceError(
-                f"the word bank has width {self.word_bank.vectors.shape[1]}, the descriptors {width} (feature space "
-                f"'{self.feature_space}'): encode the bank with the scene's encoder"
-            )
+        if self.word_bank is not None:
+            self.space.require(FeatureSpace(self.feature_space, self.word_bank.vectors.shape[1]), "word bank's vectors")
 
     def __len__(self) -> int:
         return len(self.xyz)
+
+    @property
+    def space(self) -> FeatureSpace:
+        """The feature space with its width: that of the descriptors, 0 where no instance has one."""
+        descriptors = self.instances.descriptors
+        return FeatureSpace(self.feature_space, descriptors.shape[1] if len(descriptors) else 0)
 
     @property
     def xyz_world(self) -> NDArray[np.float64]:
@@ -199,13 +241,23 @@ class LabelledCloud:
         return self.xyz.astype(np.float64) + self.origin
 
 
-def unit_rows(vectors: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Rows of length one, float32; a zero row stays zero."""
-    # In two steps, so that neither tiny nor huge vectors leave float32.
+def unit_rows(vectors: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Rows of length one, in the vectors' precision, at least float32; a zero row stays zero."""
+    vectors = vectors.astype(np.result_type(vectors, np.float32), copy=False)
+    # In two steps, so that neither tiny nor huge vectors leave the float type.
     largest = np.abs(vectors).max(axis=-1, keepdims=True, initial=0)
     scaled = vectors / np.where(largest > 0, largest, 1)
     length = np.linalg.norm(scaled, axis=-1, keepdims=True)
-    return (scaled / np.where(length > 0, length, 1)).astype(np.float32)
+    return scaled / np.where(length > 0, length, 1)
+
+
+def best_of_rows(
+    values: NDArray[np.floating], group: NDArray[np.integer], count: int, empty: float = -np.inf
+) -> NDArray[np.floating]:
+    """(count, ...) maximum over the rows of each group, ``empty`` for a group without rows. group: (rows,)."""
+    best = np.full((count, *values.shape[1:]), empty, values.dtype)
+    np.maximum.at(best, group, values)
+    return best
 
 
 def finite_rows(vectors: ArrayLike, what: str) -> NDArray[np.float32]:

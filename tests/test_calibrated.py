@@ -208,9 +208,9 @@ def test_vectors_of_any_length(scene, made, size):
 def test_vectors_that_cannot_be_judged(scene):
     with pytest.raises(FeatureSpaceError, match="the vector of 'a' is zero"):
         og.segment(scene, {"a": np.zeros(64)})
-    with pytest.raises(FeatureSpaceError, match=rf"label vectors have width 3, the scene's descriptors 64 .*'{SPACE}'"):
+    with pytest.raises(FeatureSpaceError, match=rf"label vectors are of .*\(width 3\).*'{SPACE}' \(width 64\)"):
         og.segment(scene, {"a": np.ones(3)})
-    with pytest.raises(FeatureSpaceError, match=r"negative vectors have width 3, the scene's descriptors 64"):
+    with pytest.raises(FeatureSpaceError, match=r"negative vectors are of .*\(width 3\); expected .*\(width 64\)"):
         og.segment(scene, SHOWN, negatives={"a": np.ones(3)})
 
 
@@ -303,7 +303,7 @@ def test_scene_instances_is_the_table_with_boxes(scene, cloud):
     assert json.loads(table.to_json())[2]["words"][0]["name"] == SHOWN[3]
     assert (scene.cloud.instances.views == [row.views for row in table]).all()
     parts = replace(
-        cloud.instances, coarse=np.arange(9, dtype=np.int32)[::-1], whole=np.array([1] + [-1] * 8, np.int32)
+        cloud.instances, coarse=np.arange(9, dtype=np.int32)[::-1], part_of=np.array([1] + [-1] * 8, np.int32)
     )
     other = og.instance_table(replace(cloud, instances=parts))
     assert [(row.part_of, row.coarse) for row in other][:3] == [(1, 8), (-1, 7), (-1, 6)]

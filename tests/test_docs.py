@@ -194,7 +194,7 @@ def test_members_of_a_file_are_on_the_page_of_formats(tmp_path):
     none = np.full(2, -1, np.int32)
     cloud = replace(
         make_cloud([[0, 0, 0], [1, 0, 0]], [0, 1], words=()),
-        instances=replace(instance_table(2), descriptors=texts, coarse=none, whole=none),
+        instances=replace(instance_table(2), descriptors=texts, coarse=none, part_of=none),
         feature_space=encoder.feature_space,
         certainty=np.full(2, 9, np.uint8),
         vocabulary=Vocabulary(("chair", "table"), texts),

@@ -132,7 +132,7 @@ def test_points_of_no_instance_and_instances_without_points() -> None:
 
 def instances(coarse: list[int] | None = None, whole: list[int] | None = None, count: int = 3) -> InstanceTable:
     extra = {
-        name: np.array(value, np.int32) for name, value in (("coarse", coarse), ("whole", whole)) if value is not None
+        name: np.array(value, np.int32) for name, value in (("coarse", coarse), ("part_of", whole)) if value is not None
     }
     numbers, ratios = np.zeros(count, np.int32), np.zeros(count, np.float32)
     nothing = np.zeros((0, 4), np.float32), np.zeros(0, np.int32)
@@ -142,17 +142,17 @@ def instances(coarse: list[int] | None = None, whole: list[int] | None = None, c
 def test_a_table_without_hierarchy_has_none() -> None:
     table = instances()
     np.testing.assert_array_equal(table.coarse, [-1, -1, -1])
-    np.testing.assert_array_equal(table.whole, [-1, -1, -1])
-    assert table.whole.dtype == np.int32
-    assert len(instances(count=0).whole) == 0
+    np.testing.assert_array_equal(table.part_of, [-1, -1, -1])
+    assert table.part_of.dtype == np.int32
+    assert len(instances(count=0).part_of) == 0
 
 
 def test_a_table_keeps_its_hierarchy() -> None:
     table = instances([4, 4, -1], [1, 2, -1])
     np.testing.assert_array_equal(table.coarse, [4, 4, -1])
-    np.testing.assert_array_equal(table.whole, [1, 2, -1])
+    np.testing.assert_array_equal(table.part_of, [1, 2, -1])
     longest = instances(whole=[*range(1, 64), -1], count=64)
-    assert longest.whole[0] == 1
+    assert longest.part_of[0] == 1
 
 
 @pytest.mark.parametrize(
@@ -161,11 +161,11 @@ def test_a_table_keeps_its_hierarchy() -> None:
         (None, [0, -1, -1], "a part of itself"),
         (None, [1, 2, 0], "a part of itself"),
         (None, [-1, 2, 1], "instance 1 is a part of itself"),
-        (None, [3, -1, -1], "wholes"),
-        (None, [-2, -1, -1], "wholes"),
+        (None, [3, -1, -1], "part_of spans"),
+        (None, [-2, -1, -1], "part_of spans"),
         ([-2, 0, 0], None, "coarse"),
         ([0, 0], None, "coarse"),
-        (None, [-1, -1], "whole"),
+        (None, [-1, -1], "part_of"),
     ],
 )
 def test_a_hierarchy_that_is_none_is_refused(coarse: list[int] | None, whole: list[int] | None, message: str) -> None:
@@ -176,11 +176,11 @@ def test_a_hierarchy_that_is_none_is_refused(coarse: list[int] | None, whole: li
 def test_the_hierarchy_comes_back_from_its_file(tmp_path: Path) -> None:
     cloud = room(200)
     coarse, whole = np.arange(9, dtype=np.int32) // 2, np.array([3, -1, 3, 8, -1, -1, 0, -1, -1], np.int32)
-    related = replace(cloud, instances=replace(cloud.instances, coarse=coarse, whole=whole))
+    related = replace(cloud, instances=replace(cloud.instances, coarse=coarse, part_of=whole))
     back = read_bundle(write_bundle(related, tmp_path / "room.ogpc")).cloud.instances
     np.testing.assert_array_equal(back.coarse, coarse)
-    np.testing.assert_array_equal(back.whole, whole)
-    assert back.coarse.dtype == back.whole.dtype == np.int32
+    np.testing.assert_array_equal(back.part_of, whole)
+    assert back.coarse.dtype == back.part_of.dtype == np.int32
 
 
 def test_files_with_a_damaged_hierarchy_are_refused(tmp_path: Path) -> None:

@@ -39,7 +39,7 @@ def test_each_column_is_what_it_says(scene):
         np.testing.assert_allclose(row.axis_aligned_box.high, main.max(axis=0), atol=1e-8)
         np.testing.assert_array_equal(row.size, oriented_box(main).size)
         assert row.points == len(own) > 20
-        assert (row.views, row.masks, row.part_of) == (evidence.views[k], evidence.masks[k], evidence.whole[k])
+        assert (row.views, row.masks, row.part_of) == (evidence.views[k], evidence.masks[k], evidence.part_of[k])
         assert (row.agreement, row.visible_area) == (evidence.agreement[k], evidence.visible_area[k])
         assert row.state == ("no feature" if k == 4 else "labelled")
 

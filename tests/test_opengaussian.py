@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from og_pointcloud.ask.labelled_scene import LabelledScene, segment
+from og_pointcloud.cloud import UNKNOWN_SPACE
 from og_pointcloud.errors import SceneError
 from og_pointcloud.fitting import opengaussian
 from og_pointcloud.fitting.opengaussian import read_opengaussian
 from og_pointcloud.formats.gaussian_ply import BASE_COLOR, LOG_SCALE, ROTATION, read_gaussian_ply
 from og_pointcloud.formats.langsplat import LANGSPLAT_SPACE
 from og_pointcloud.formats.ply import join_columns, write_ply
-from og_pointcloud.text.text_features import UNKNOWN_SPACE
 
 COUNT, LEAVES, WIDTH = 300, 12, 8
 INSTANCE_FEATURES = ("ins_feat_r", "ins_feat_g", "ins_feat_b", "ins_feat_r2", "ins_feat_g2", "ins_feat_b2")

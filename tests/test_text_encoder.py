@@ -403,7 +403,7 @@ def test_int8_must_not_change_what_a_scene_answers(source, encoder, tmp_path):
 
     with pytest.raises(OgPointcloudError, match=r"int8 changes \d+ of the scene's choices"):
         export(close)
-    with pytest.raises(FeatureSpaceError, match="name a scene of the encoder's"):
+    with pytest.raises(FeatureSpaceError, match="the scene's descriptors are of feature space"):
         export(write_bundle(room(100), tmp_path / "other.ogpc"))
     assert not (tmp_path / "out").exists()
     report = export(clear)[1]["parity"]["int8"]

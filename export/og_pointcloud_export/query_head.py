@@ -22,8 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.bundle.nearest import surface_distance
-from og_pointcloud.bundle.read import BEYOND, NEAR, NO_EVIDENCE, ON_SURFACE
-from og_pointcloud.cloud import InstanceTable, LabelledCloud
+from og_pointcloud.bundle.read import BEYOND, NEAR, ON_SURFACE
+from og_pointcloud.cloud import NO_EVIDENCE, InstanceTable, LabelledCloud
 from og_pointcloud.errors import MissingExtraError
 from og_pointcloud_export.brick_cells import BLOCK, BRICK, PARTS, TOO_FAR_CODE
 from og_pointcloud_export.brick_grid import CELLS, CODE_OFFSET, LONGEST_LIST, PLACES, SHORT_LIST, BrickGrid

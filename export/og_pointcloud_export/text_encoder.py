@@ -21,8 +21,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.bundle.read import read_bundle
-from og_pointcloud.bundle.vocabulary import best_cosines, everyday_words
-from og_pointcloud.errors import FeatureSpaceError, MissingExtraError, OgPointcloudError
+from og_pointcloud.bundle.vocabulary import everyday_words
+from og_pointcloud.cloud import FeatureSpace
+from og_pointcloud.errors import MissingExtraError, OgPointcloudError
 from og_pointcloud.formats.npy import npy_bytes
 from og_pointcloud.text.encoder import (
     ENCODER_FILES,
@@ -213,14 +214,9 @@ def _accept_int8(small: TextEncoder, exact: TextEncoder, cloud: LabelledCloud | 
     }
     if cloud is None:
         return report
-    width = cloud.instances.descriptors.shape[1]
-    if cloud.feature_space != exact.feature_space or width != exact.width:
-        raise FeatureSpaceError(
-            f"the scene is of feature space '{cloud.feature_space}' (width {width}), the encoder of "
-            f"'{exact.feature_space}' (width {exact.width}): name a scene of the encoder's"
-        )
+    FeatureSpace(exact.feature_space, exact.width).require(cloud.space, "scene's descriptors")
     words = [names.index(name) for name in own] or list(range(len(names)))
-    before, after = (best_cosines(cloud.instances, rows[words]) for rows in (expected, vectors))
+    before, after = (cloud.instances.cosines(rows[words].astype(np.float64)) for rows in (expected, vectors))
     changed = _choices_changed(before, after) + _choices_changed(before.T, after.T)
     if changed:
         raise OgPointcloudError(
@@ -230,7 +226,7 @@ def _accept_int8(small: TextEncoder, exact: TextEncoder, cloud: LabelledCloud | 
     return {**report, "instances": len(before), "words": len(words), "choices_changed": changed}
 
 
-def _choices_changed(before: NDArray[np.float64], after: NDArray[np.float64]) -> int:
+def _choices_changed(before: NDArray[np.floating], after: NDArray[np.floating]) -> int:
     """Rows whose best column became one that was worse; among equals there was no choice."""
     if before.size == 0:
         return 0

@@ -66,7 +66,7 @@ def write_bundle(
     if cloud.word_bank is not None:
         members |= bank_members(cloud.word_bank)
     if text_encoder is not None:
-        members |= encoder_members(text_encoder, cloud.feature_space)[0]
+        members |= encoder_members(text_encoder, cloud.space)[0]
     manifest = _manifest(cloud, model, members, {**model.parity, "vocabulary_cosine_error": vocabulary_error})
     with replacing(path) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
         for name, data in {"manifest.json": manifest, **members}.items():
@@ -92,6 +92,7 @@ def _arrays(cloud: LabelledCloud) -> dict[str, NDArray[Any]]:
     """What lies under arrays/; the descriptors lie in query.onnx alone, where the manifest says."""
     table = {field.name: getattr(cloud.instances, field.name) for field in fields(InstanceTable)}
     del table["descriptors"]
+    table["whole"] = table.pop("part_of")  # the member's name since schema 2
     arrays = {"xyz": cloud.xyz, "instance_ids": _smallest_signed(cloud.instance_ids)}
     if cloud.rgb is not None:
         arrays["rgb"] = cloud.rgb

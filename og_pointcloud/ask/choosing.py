@@ -12,12 +12,13 @@ words are close to every image. So a score is read against what it would be by c
 
 No threshold is in cosines, none is tuned to a scene: the null distribution is the instance's own.
 
-For comparison there is ``relevancy``, as LERF defines it, by canonical negatives.
+Without a word bank the largest cosine wins; against negatives it is judged by LERF's relevancy (Kerr et al., LERF:
+Language Embedded Radiance Fields, ICCV 2023, Sec. 3.4).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import cached_property
@@ -29,37 +30,24 @@ from og_pointcloud.cloud import (
     BACKGROUND,
     TOO_FAR,
     UNKNOWN,
+    UNKNOWN_SPACE,
     UNOBSERVED,
+    FeatureSpace,
     InstanceTable,
     LabelledCloud,
     WordBank,
+    best_of_rows,
     finite_rows,
     unit_rows,
 )  # fmt: skip
-from og_pointcloud.errors import FeatureSpaceError
 from og_pointcloud.settings import ChoosingSettings
 
-__all__ = [
-    "CANONICAL_NEGATIVES",
-    "TEMPLATES",
-    "Choice",
-    "Chooser",
-    "Reason",
-    "chooser_of",
-    "embed",
-    "relevancy",
-]
+__all__ = ["Choice", "Chooser", "Reason", "chooser_of"]
 
-CANONICAL_NEGATIVES = ("object", "things", "stuff", "texture")
-"""What LERF holds a text against (Kerr et al. 2023, Sec. 3.4)."""
 RELEVANCY_TEMPERATURE = 10.0
 """Factor of the cosines in LERF's pairwise softmax: of its released code, the paper gives none."""
-TEMPLATES = ("{}", "a {}", "a photo of a {}", "a photo of the {}", "a cropped photo of a {}", "a {} in a scene")
-"""Prompts whose vectors are averaged: what masks show is a crop of one thing, sometimes with its surroundings."""
 ROWS_AT_ONCE = 2048
 """Descriptors compared with all others at once."""
-
-Encoder = Callable[[Sequence[str]], ArrayLike]
 
 
 class Reason(IntEnum):
@@ -172,22 +160,20 @@ class Chooser:
         instances: InstanceTable,
         bank: WordBank | None = None,
         settings: ChoosingSettings | None = None,
-        feature_space: str = "",
+        feature_space: str = UNKNOWN_SPACE,
     ) -> None:
-        """feature_space: what errors say that texts should be of. FeatureSpaceError where bank and descriptors differ
-        in width.
-        """
+        """feature_space: of the descriptors. FeatureSpaceError where bank and descriptors differ in width."""
         self.settings = settings or ChoosingSettings()
         self.bank = bank
-        self._space = f" (feature space '{feature_space}')" if feature_space else ""
         self._count = len(instances)
         self._membership = ((instances.views + 0.5) / (instances.views + 1)).astype(np.float32)
         self._descriptors = unit_rows(finite_rows(instances.descriptors, "descriptors"))
+        self._space = FeatureSpace(feature_space, self._descriptors.shape[1] if len(self._descriptors) else 0)
         self._owner = instances.descriptor_instance
         self._described = np.unique(self._owner)
         if bank is None or len(self._descriptors) == 0:
             return
-        _check_width(bank.vectors, self._descriptors, "bank word", self._space)
+        self._require_width(bank.vectors, "word bank's vectors")
         self._centred = self._descriptors - common_part(self._descriptors, self.settings.same_look)
         self._bank_directions = unit_rows(bank.vectors - bank.mean)
         scores = self._centred @ self._bank_directions.T
@@ -197,34 +183,28 @@ class Chooser:
         self._bank_evidence = (best - self._best_middle) / self._best_spread
         self.sharpness = float(max(self.settings.sharpness, np.quantile(self._bank_evidence.max(axis=1), 0.75)))
 
-    def choose(
-        self, texts: ArrayLike, negatives: ArrayLike | None = None, text_label: NDArray[np.integer] | None = None
-    ) -> Choice:
+    def choose(self, texts: ArrayLike, negatives: ArrayLike | None = None) -> Choice:
         """The label of each instance.
 
-        texts: (T, D) text vectors of any length, float16 to float64; a zero row fits nothing. text_label: (T,) the
-        label of each, ascending from 0, where labels have several; the best one counts. negatives: (M, D) texts that
-        compete with the labels and mean "unknown".
+        texts: (L, D) one text vector a label, of any length, float16 to float64; a zero row fits nothing.
+        negatives: (M, D) texts that compete with the labels and mean "unknown".
         FeatureSpaceError for NaN or infinity, or another width than the descriptors'.
         """
         texts = finite_rows(texts, "label vectors")
-        label = np.arange(len(texts)) if text_label is None else np.asarray(text_label)
         others = np.zeros((0, texts.shape[1]), np.float32) if negatives is None else finite_rows(negatives, "negatives")
-        if len(self._descriptors):
-            _check_width(texts, self._descriptors, "label", self._space)
-            _check_width(others, self._descriptors, "negative", self._space)
-        count = int(label.max(initial=-1)) + 1
-        if len(self._descriptors) == 0 or count == 0:
-            return self._nothing(count)
+        self._require_width(texts, "label vectors")
+        self._require_width(others, "negative vectors")
+        if len(self._descriptors) == 0 or len(texts) == 0:
+            return self._nothing(len(texts))
         if self.bank is None:
-            return self._uncalibrated(texts, label, count, others)
+            return self._uncalibrated(texts, others)
         evidence = self._evidence(texts)
-        rival = self._evidence(others)
-        best = _best_by_group(evidence.T, label, count).T
-        table, unknown = self._posterior(evidence, rival, texts, label, count)
-        return self._answer(best, table, unknown)
+        return self._answer(evidence, *self._posterior(evidence, self._evidence(others), texts))
 
-    def _evidence(self, texts: NDArray[np.float32]) -> NDArray[np.float32]:
+    def _require_width(self, vectors: NDArray[np.floating], what: str) -> None:
+        self._space.require(FeatureSpace(UNKNOWN_SPACE, vectors.shape[1]), what)
+
+    def _evidence(self, texts: NDArray[np.float32]) -> NDArray[np.floating]:
         """(described, T) standard deviations above the bank; of several descriptors the best, as for the bank."""
         assert self.bank is not None
         directions = unit_rows(unit_rows(texts) - self.bank.mean)
@@ -233,17 +213,15 @@ class Chooser:
         evidence[:, ~texts.any(axis=1)] = -np.inf
         return evidence
 
-    def _best_descriptor(self, scores: NDArray[np.float32]) -> NDArray[np.float32]:
-        rows = np.searchsorted(self._described, self._owner)
-        return _best_by_group(scores, rows, len(self._described))
+    def _best_descriptor(self, scores: NDArray[np.floating]) -> NDArray[np.floating]:
+        """(described, ...) of the scores of all descriptors, the best of each instance."""
+        return best_of_rows(scores, np.searchsorted(self._described, self._owner), len(self._described))
 
     def _posterior(
         self,
-        evidence: NDArray[np.float32],
-        rival: NDArray[np.float32],
+        evidence: NDArray[np.floating],
+        rival: NDArray[np.floating],
         texts: NDArray[np.float32],
-        label: NDArray[np.integer],
-        count: int,
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Probability of each label and of none, (described, L) and (described,), float64.
 
@@ -261,9 +239,7 @@ class Chooser:
         top = np.maximum(log_none, log_label.max(axis=1))
         weight, none = np.exp(log_label - top[:, None]), np.exp(log_none - top)
         total = weight.sum(axis=1) + none
-        share = weight / total[:, None]
-        table = _best_by_group(share[:, hypothesis].T, label, count).T if len(texts) != count else share[:, hypothesis]
-        return table, none / total
+        return (weight / total[:, None])[:, hypothesis], none / total
 
     def _log_none(self, texts: NDArray[np.float32]) -> NDArray[np.float64]:
         """(described,) log of the mean likelihood that a word of the bank other than the labels gives."""
@@ -277,17 +253,14 @@ class Chooser:
         exponents = sharpness * self._bank_evidence[:, other].astype(np.float64)
         return np.maximum(by_chance, np.logaddexp.reduce(exponents, axis=1) - np.log(len(other)))
 
-    def _uncalibrated(
-        self, texts: NDArray[np.float32], label: NDArray[np.integer], count: int, negatives: NDArray[np.float32]
-    ) -> Choice:
+    def _uncalibrated(self, texts: NDArray[np.float32], negatives: NDArray[np.float32]) -> Choice:
         """Without a bank: the largest cosine, judged by LERF's relevancy where there are negatives."""
-        cosines = self._best_descriptor(self._descriptors @ unit_rows(texts).T)
-        best = _best_by_group(cosines.T, label, count).T
+        best = self._best_descriptor(self._descriptors @ unit_rows(texts).T)
         if len(negatives) == 0:
             nothing = np.full(best.shape, np.nan)
             return self._answer(best, nothing, nothing[:, 0])
         rivals = self._best_descriptor(self._descriptors @ unit_rows(negatives).T)
-        table = _relevancy_of_cosines(best, rivals)
+        table = _relevancy(best, rivals)
         return self._answer(best, table, 1 - table.max(axis=1))
 
     def _answer(
@@ -346,36 +319,11 @@ def common_part(descriptors: NDArray[np.float32], same_look: float) -> NDArray[n
     return ((1 - 1 / looks) * (weight / looks) @ descriptors).astype(np.float32)
 
 
-def embed(names: Sequence[str], encoder: Encoder, templates: Sequence[str] = TEMPLATES) -> NDArray[np.float32]:
-    """(L, D) unit text vectors: the normalised mean over the templates of each name's normalised vectors.
+def _relevancy(scores: NDArray[np.floating], rivals: NDArray[np.floating]) -> NDArray[np.float32]:
+    """LERF's relevancy in (0, 1): min over negatives n of exp(10 s) / (exp(10 s) + exp(10 n)), s and n cosines.
 
-    encoder: texts -> (count, D) vectors. templates: with one ``{}`` each. Underscores of a name become spaces.
-    For the best instead of the mean, give every vector to ``Chooser.choose`` with ``text_label``.
+    0.5: as close as the closest negative. scores: (rows, L). rivals: (rows, M).
     """
-    texts = [template.format(name.replace("_", " ")) for name in names for template in templates]
-    if not texts:
-        raise FeatureSpaceError(f"{len(names)} names and {len(templates)} templates; expected at least one of each")
-    vectors = finite_rows(encoder(texts), "text vectors")
-    if len(vectors) != len(texts):
-        raise FeatureSpaceError(f"the encoder gave {len(vectors)} vectors for {len(texts)} texts; expected one a text")
-    return unit_rows(unit_rows(vectors).reshape(len(names), len(templates), -1).mean(axis=1))
-
-
-def relevancy(descriptors: ArrayLike, texts: ArrayLike, negatives: ArrayLike) -> NDArray[np.float32]:
-    """(R, L) LERF's relevancy in (0, 1): min over negatives n of exp(10 s) / (exp(10 s) + exp(10 n)), s, n cosines.
-
-    Kerr et al., LERF: Language Embedded Radiance Fields, ICCV 2023, Sec. 3.4. 0.5: as close as the closest negative.
-    """
-    images, words = unit_rows(finite_rows(descriptors, "descriptors")), unit_rows(finite_rows(texts, "label vectors"))
-    rivals = unit_rows(finite_rows(negatives, "negatives"))
-    if len(rivals) == 0:
-        raise FeatureSpaceError("relevancy against 0 negatives; expected at least one, as CANONICAL_NEGATIVES")
-    for vectors, what in ((words, "label"), (rivals, "negative")):
-        _check_width(vectors, images, what)
-    return _relevancy_of_cosines(images @ words.T, images @ rivals.T)
-
-
-def _relevancy_of_cosines(scores: NDArray[np.float32], rivals: NDArray[np.float32]) -> NDArray[np.float32]:
     # The minimum over negatives is that of the closest one.
     margin = scores - rivals.max(axis=1, keepdims=True)
     return (1 / (1 + np.exp(-RELEVANCY_TEMPERATURE * margin))).astype(np.float32)
@@ -389,22 +337,7 @@ def _distinct(texts: NDArray[np.float32]) -> tuple[NDArray[np.intp], NDArray[np.
     return number.reshape(-1), first
 
 
-def _best_by_group(values: NDArray, group: NDArray[np.integer], count: int) -> NDArray:
-    """(count, ...) maximum over the rows of each group, -inf for an empty one."""
-    best = np.full((count, *values.shape[1:]), -np.inf, values.dtype)
-    np.maximum.at(best, group, values)
-    return best
-
-
 def _moments(scores: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Mean and standard deviation of each row, as columns; a row without spread gets no evidence at all."""
     spread = scores.std(axis=1, keepdims=True)
     return scores.mean(axis=1, keepdims=True), np.where(spread > 1e-7, spread, np.float32(np.inf))
-
-
-def _check_width(vectors: NDArray[np.float32], descriptors: NDArray[np.float32], what: str, space: str = "") -> None:
-    if vectors.shape[1] != descriptors.shape[1]:
-        raise FeatureSpaceError(
-            f"the {what} vectors have width {vectors.shape[1]}, the scene's descriptors {descriptors.shape[1]}{space}: "
-            f"encode the {what}s with the scene's encoder"
-        )

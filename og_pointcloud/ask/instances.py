@@ -218,7 +218,7 @@ def list_instances(
                 masks=int(table.masks[k]),
                 agreement=float(table.agreement[k]),
                 visible_area=float(table.visible_area[k]),
-                part_of=int(table.whole[k]),
+                part_of=int(table.part_of[k]),
                 coarse=int(table.coarse[k]),
                 state=EMPTY if bounds[k] == bounds[k + 1] else LABELLED if described[k] else NO_FEATURE,
                 words=best[k] if described[k] else (),

@@ -24,8 +24,8 @@ from og_pointcloud.ask.instances import WORDS, Instances, list_instances
 from og_pointcloud.ask.segmentation import Segmentation
 from og_pointcloud.bundle.nearest import NONE_WITHIN_REACH, NearestPoint, surface_distance
 from og_pointcloud.bundle.read import BEYOND, NEAR, ON_SURFACE, Bundle, read_bundle
-from og_pointcloud.cloud import TOO_FAR, LabelledCloud, Vocabulary
-from og_pointcloud.errors import BundleError, FeatureSpaceError, OgPointcloudError, SceneError
+from og_pointcloud.cloud import TOO_FAR, UNKNOWN_SPACE, FeatureSpace, LabelledCloud, Vocabulary
+from og_pointcloud.errors import BundleError, OgPointcloudError, SceneError
 from og_pointcloud.text.words import Labels, TextFeatures, resolve_labels
 
 if TYPE_CHECKING:
@@ -124,14 +124,9 @@ class LabelledScene:
 
         vectors: (L, D) of any length. FeatureSpaceError where D is not the scene's.
         """
-        width, given = self._text_width, vectors.shape[1]
+        self.cloud.space.require(FeatureSpace(UNKNOWN_SPACE, vectors.shape[1]), "label vectors")
         if len(self.cloud.instances.descriptors) == 0:  # no width to hold them to
-            vectors = np.zeros((len(vectors), width), np.float32)
-        elif given != width:
-            raise FeatureSpaceError(
-                f"the label vectors have width {given}, the scene's descriptors {width} (feature space "
-                f"'{self.feature_space}'): encode the labels with the scene's encoder"
-            )
+            vectors = np.zeros((len(vectors), self._text_width), np.float32)
         feed = {"points": np.zeros((0, 3), np.float32), "text": np.ascontiguousarray(vectors, np.float32)}
         scores = self._ask(["instance_scores"], feed)[0]
         if scores.shape != (len(self.cloud.instances), len(vectors)) or scores.dtype != np.float32:

@@ -17,9 +17,8 @@ from numpy.typing import ArrayLike, NDArray
 from og_pointcloud.ask.choosing import Choice, Reason
 from og_pointcloud.ask.instances import SHOWN
 from og_pointcloud.ask.labelled_scene import LabelledScene, SceneLike, as_scene
-from og_pointcloud.bundle.read import NO_EVIDENCE
-from og_pointcloud.cloud import Vocabulary
-from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError
+from og_pointcloud.cloud import NO_EVIDENCE, FeatureSpace, Vocabulary
+from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.text.words import Labels, TextFeatures, resolve_labels
 
 __all__ = ["Match", "Selection", "select"]
@@ -146,7 +145,7 @@ def select(
         raise OgPointcloudError(f"the text is {shown!r:.80}; expected one word or phrase, or one name -> vector")
     query = resolve_labels(text, text_features, scene.vocabulary, scene.feature_space, scene.path)
     rivals = _rivals(scene, query.names[0], against, text_features)
-    choice = scene.chooser.choose(_together(query, rivals))
+    choice = scene.chooser.choose(_together(query, rivals, scene.feature_space))
     points = np.bincount(scene.instance_ids[scene.instance_ids >= 0], minlength=len(choice.labels))
     known = (points > 0) & (choice.reasons != Reason.NOT_DESCRIBED)
     ranked = [int(k) for k in choice.ranking(0) if known[k]]
@@ -170,15 +169,12 @@ def _match(instance: int, choice: Choice, fits: bool, rivals: Vocabulary | None,
     return Match(instance, score, fits, rivals.names[best], float(choice.scores[instance, 1 + best]), points)
 
 
-def _together(query: Vocabulary, rivals: Vocabulary | None) -> NDArray[np.float32]:
+def _together(query: Vocabulary, rivals: Vocabulary | None, space: str) -> NDArray[np.float32]:
     """(1 + rivals, D) vectors, the query's first."""
     if rivals is None:
         return query.vectors
-    if query.vectors.shape[1] != rivals.vectors.shape[1]:
-        raise FeatureSpaceError(
-            f"the vector of '{query.names[0]}' has width {query.vectors.shape[1]}, those of the words that compete "
-            f"{rivals.vectors.shape[1]}: encode both with the scene's encoder"
-        )
+    query_space, rival_space = (FeatureSpace(space, words.vectors.shape[1]) for words in (query, rivals))
+    query_space.require(rival_space, f"words that compete with '{query.names[0]}'")
     return np.concatenate([query.vectors, rivals.vectors])
 
 

@@ -35,7 +35,7 @@ from og_pointcloud.formats.npy import array_from_npy
 from og_pointcloud.models import check_graph
 
 __all__ = [
-    "BANK", "BEYOND", "FORMAT", "NEAR", "NO_EVIDENCE", "ON_SURFACE", "SCHEMA_VERSION", "Bundle", "read_bundle",
+    "BANK", "BEYOND", "FORMAT", "NEAR", "ON_SURFACE", "SCHEMA_VERSION", "Bundle", "read_bundle",
 ]  # fmt: skip
 
 FORMAT = "ogpc"
@@ -43,8 +43,6 @@ SCHEMA_VERSION = 2
 """Raised when files of before cannot be asked any more: 2 is the graph that settles points at borders itself."""
 ON_SURFACE, NEAR, BEYOND = 0, 1, 2
 """How far a query point is from the cloud: within about 1.5 spacings, within reach, or too far."""
-NO_EVIDENCE = -2.0
-"""Score of an instance without a descriptor: below every cosine."""
 
 MAX_MEMBERS = 256
 MAX_MANIFEST_BYTES = 1 << 26
@@ -261,7 +259,7 @@ def _instances(manifest: dict[str, Any], members: dict[str, bytes], count: int) 
         agreement=column("agreement", "<f4"),
         visible_area=column("visible_area", "<f4"),
         coarse=column("coarse", "<i4"),
-        whole=column("whole", "<i4"),
+        part_of=column("whole", "<i4"),  # the member's name since schema 2
     )
 
 

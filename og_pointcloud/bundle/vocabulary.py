@@ -17,16 +17,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud.bundle.read import BANK, CARRIED_ENCODER, NO_EVIDENCE, describe_member, read_bundle
-from og_pointcloud.cloud import InstanceTable, LabelledCloud, Vocabulary, WordBank
+from og_pointcloud.bundle.read import BANK, CARRIED_ENCODER, describe_member, read_bundle
+from og_pointcloud.cloud import FeatureSpace, InstanceTable, Vocabulary, WordBank, unit_rows
 from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError
 from og_pointcloud.formats.atomic import replacing
 from og_pointcloud.formats.npy import npy_bytes
 from og_pointcloud.text.encoder import TextEncoder, encoder_files
-from og_pointcloud.text.text_features import UNKNOWN_SPACE, read_text_features
+from og_pointcloud.text.text_features import read_text_features
 
 __all__ = [
-    "AddedWords", "add_words", "bank_members", "best_cosines", "carry_encoder", "compact_vectors", "encoder_members",
+    "AddedWords", "add_words", "bank_members", "carry_encoder", "compact_vectors", "encoder_members",
     "everyday_words", "read_bank", "read_words", "store_bank", "vocabulary_members",
 ]  # fmt: skip
 
@@ -77,10 +77,10 @@ def add_words(
     """
     bundle = read_bundle(path)
     cloud = bundle.cloud
-    _check_space(path, cloud, words.vectors, feature_space)
+    cloud.space.require(FeatureSpace(feature_space, words.vectors.shape[1]), "words")
     old = cloud.vocabulary or Vocabulary((), np.zeros((0, words.vectors.shape[1]), np.float32))
-    vectors = dict(zip(old.names, _unit(old.vectors), strict=True))
-    new = dict(zip(words.names, _unit(words.vectors), strict=True))
+    vectors = dict(zip(old.names, unit_rows(old.vectors), strict=True))
+    new = dict(zip(words.names, unit_rows(words.vectors), strict=True))
     known = [name for name in new if name in vectors]
     vectors |= new
     together = Vocabulary(tuple(vectors), np.array(list(vectors.values()), np.float32))
@@ -114,7 +114,7 @@ def store_bank(
     feature_space, output, errors: as for ``add_words``.
     """
     bundle = read_bundle(path)
-    _check_space(path, bundle.cloud, bank.vectors, feature_space)
+    bundle.cloud.space.require(FeatureSpace(feature_space, bank.vectors.shape[1]), "words of the bank")
     _rewrite(Path(path), Path(output or path), bundle.manifest, bank_members(bank), lambda manifest: None)
 
 
@@ -126,22 +126,18 @@ def carry_encoder(
     folder: what export-text-encoder wrote; a file without a word bank gets the encoder's. output: as for ``add_words``.
     """
     bundle = read_bundle(path)
-    members, encoder = encoder_members(folder, bundle.cloud.feature_space)
+    members, encoder = encoder_members(folder, bundle.cloud.space)
     if bundle.cloud.word_bank is None and encoder.word_bank is not None:
         members |= bank_members(encoder.word_bank)
     _rewrite(Path(path), Path(output or path), bundle.manifest, members, lambda manifest: None)
     return encoder
 
 
-def encoder_members(folder: str | os.PathLike[str], feature_space: str) -> tuple[dict[str, bytes], TextEncoder]:
+def encoder_members(folder: str | os.PathLike[str], space: FeatureSpace) -> tuple[dict[str, bytes], TextEncoder]:
     """A folder's files as members of a .ogpc of this feature space; FeatureSpaceError if it is of another."""
     files = encoder_files(Path(folder))
     encoder = TextEncoder(files, str(folder))
-    if encoder.feature_space != feature_space:
-        raise FeatureSpaceError(
-            f"{folder} encodes to feature space '{encoder.feature_space}', the scene is of '{feature_space}': name the "
-            "encoder of the scene's"
-        )
+    space.require(FeatureSpace(encoder.feature_space, encoder.width), f"texts that {folder} encodes")
     return {CARRIED_ENCODER + name: data for name, data in files.items()}, encoder
 
 
@@ -159,40 +155,16 @@ def bank_members(bank: WordBank) -> dict[str, bytes]:
 
 def compact_vectors(vocabulary: Vocabulary, instances: InstanceTable) -> tuple[NDArray[np.floating], float]:
     """Unit vectors, as float16 if that changes no answer, and the largest change of a cosine that this makes."""
-    unit = _unit(vocabulary.vectors)
+    unit = unit_rows(vocabulary.vectors.astype(np.float64))
     half = unit.astype(np.float16)
     if instances.descriptors.size == 0 or unit.size == 0:
         return half, 0.0
-    exact, stored = best_cosines(instances, unit), best_cosines(instances, half)
+    exact, stored = instances.cosines(unit), instances.cosines(half.astype(np.float64))
     error = float(np.abs(stored - exact).max())
     if error <= HALF_PRECISION_TOLERANCE and (exact.argmax(axis=1) == stored.argmax(axis=1)).all():
         return half, error
-    return unit.astype(np.float32), float(np.abs(best_cosines(instances, unit.astype(np.float32)) - exact).max())
-
-
-def best_cosines(instances: InstanceTable, vectors: NDArray[np.floating]) -> NDArray[np.float64]:
-    """(K, L) float64: best cosine of an instance's descriptors with each vector, -2 for one without a descriptor."""
-    cosines = instances.descriptors.astype(np.float64) @ _unit(vectors).T
-    scores = np.full((len(instances), len(vectors)), NO_EVIDENCE)
-    np.maximum.at(scores, instances.descriptor_instance, cosines)
-    return scores
-
-
-def _check_space(
-    path: str | os.PathLike[str], cloud: LabelledCloud, vectors: NDArray[np.floating], feature_space: str
-) -> None:
-    width, spaces = cloud.instances.descriptors.shape[1], {feature_space, cloud.feature_space}
-    if (len(spaces) > 1 and UNKNOWN_SPACE not in spaces) or (width and vectors.shape[1] != width):
-        raise FeatureSpaceError(
-            f"the words are of feature space '{feature_space}' (width {vectors.shape[1]}), {path} of "
-            f"'{cloud.feature_space}' (width {width}): encode them with the scene's encoder"
-        )
-
-
-def _unit(vectors: NDArray[np.floating]) -> NDArray[np.float64]:
-    vectors = vectors.astype(np.float64)
-    length = np.linalg.norm(vectors, axis=1, keepdims=True)
-    return np.divide(vectors, length, out=np.zeros_like(vectors), where=length > 0)
+    single = unit.astype(np.float32)
+    return single, float(np.abs(instances.cosines(single.astype(np.float64)) - exact).max())
 
 
 def _rewrite(path: Path, output: Path, manifest: dict[str, Any], changes: Mapping[str, bytes], edit: Any) -> None:

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from og_pointcloud.cli.common import add_command, check_outputs, describe_fit, print_fit, timed
-from og_pointcloud.errors import FeatureSpaceError
 
 if TYPE_CHECKING:
     from og_pointcloud.cloud import LabelledCloud, Vocabulary
@@ -53,16 +52,11 @@ def vocabulary_of(cloud: LabelledCloud, path: Path | None) -> Vocabulary | None:
     """The words of a text-features file, None without one; FeatureSpaceError unless the cloud can be asked them."""
     if path is None:
         return None
-    from og_pointcloud.text.text_features import UNKNOWN_SPACE, read_text_features
+    from og_pointcloud.cloud import FeatureSpace
+    from og_pointcloud.text.text_features import read_text_features
 
     vocabulary, feature_space = read_text_features(path)
-    spaces = {feature_space, cloud.feature_space}
-    width, expected = vocabulary.vectors.shape[1], cloud.instances.descriptors.shape[1]
-    if (len(spaces) > 1 and UNKNOWN_SPACE not in spaces) or width != expected:
-        raise FeatureSpaceError(
-            f"{path} is of feature space '{feature_space}' (width {width}), the leaves are of '{cloud.feature_space}' "
-            f"(width {expected}): encode the names with the leaves' model, or name their space (--feature-space)"
-        )
+    cloud.space.require(FeatureSpace(feature_space, vocabulary.vectors.shape[1]), f"names of {path}")
     return vocabulary
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from og_pointcloud.cli.common import add_command, check_outputs
-from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError
+from og_pointcloud.errors import OgPointcloudError
 
 
 def add(commands: Any) -> None:
@@ -95,15 +95,13 @@ def from_features(path: Path, words: tuple[str, ...] | None) -> Any:
 
 def encoded(words: tuple[str, ...] | None, folder: Path | None, own_space: str, bundle: Path) -> Any:
     """The words as the scene's encoder, or the one in a folder, has them; and its feature space."""
-    from og_pointcloud.cloud import Vocabulary
+    from og_pointcloud.cloud import FeatureSpace, Vocabulary
     from og_pointcloud.text.encoder import encoder_for, read_text_encoder
 
     encoder = read_text_encoder(folder) if folder else encoder_for(own_space, bundle)
-    if encoder.feature_space != own_space:
-        raise FeatureSpaceError(
-            f"{encoder.where} encodes to feature space '{encoder.feature_space}', {bundle} is of '{own_space}': name "
-            "the encoder of the scene's"
-        )
+    FeatureSpace(own_space, 0).require(
+        FeatureSpace(encoder.feature_space, encoder.width), f"texts that {encoder.where} encodes"
+    )
     return Vocabulary(words or (), encoder(words or ())), encoder.feature_space
 
 

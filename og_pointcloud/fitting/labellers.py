@@ -212,7 +212,7 @@ def _settled(
     with journal.stage("association"):
         ids, group, used = _without_empty(membership.instance_ids, groups.group)
         instances = describe_instances(table, group, ids, len(used), settings.association)
-        instances = replace(instances, whole=part_of(table, group, ids, len(used)))
+        instances = replace(instances, part_of=part_of(table, group, ids, len(used)))
         if coarse is not None:
             instances = replace(instances, coarse=coarse[used])
     return Labelling(ids, instances, group, membership.certainty)
@@ -224,7 +224,7 @@ def _literal(
     """Points keep the leaf they are in; those that no mask shows are unobserved."""
     whole = part_of(table, matching.mask_instance, leaf, len(leaf_coarse))
     ids = np.where(leaf >= 0, leaf, UNOBSERVED).astype(np.int32)
-    return Labelling(ids, replace(matching.instances, whole=whole, coarse=leaf_coarse), matching.mask_instance)
+    return Labelling(ids, replace(matching.instances, part_of=whole, coarse=leaf_coarse), matching.mask_instance)
 
 
 def _without_empty(

@@ -575,7 +575,7 @@ def _evidence(
     group = number[groups.group]
     table = _table_of_sums(ids, used, shown, settled)
     instances = describe_instances(table, group, ids, len(used), settings.association)
-    return Labelling(ids, replace(instances, whole=part_of(table, group, ids, len(used))), group, certainty)
+    return Labelling(ids, replace(instances, part_of=part_of(table, group, ids, len(used))), group, certainty)
 
 
 def _table_of_sums(ids: NDArray[np.int32], used: Rows, shown: _Shown, settled: Sequence[_Settled]) -> MaskTable:

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from og_pointcloud.cloud import UNKNOWN_SPACE
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.images import decoded, png_header, require_cv2
 from og_pointcloud.formats.npy import array_from_zip
@@ -25,7 +26,6 @@ from og_pointcloud.formats.npy import array_from_zip
 __all__ = [
     "FEATURES_NAME",
     "MASKS_FOLDER",
-    "UNKNOWN_SPACE",
     "MaskLayer",
     "as_float32",
     "read_masks",
@@ -34,7 +34,6 @@ __all__ = [
 
 MASKS_FOLDER = "masks"
 FEATURES_NAME = "mask_features.npz"
-UNKNOWN_SPACE = "unknown"
 MAX_FEATURE_BYTES = 1 << 32
 GREY = 0
 PNG_COLOR_TYPES = {0: "grey", 2: "RGB (3 channels)", 3: "palette", 4: "grey with alpha", 6: "RGBA (4 channels)"}

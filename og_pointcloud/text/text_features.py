@@ -14,14 +14,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud.cloud import Vocabulary
+from og_pointcloud.cloud import UNKNOWN_SPACE, Vocabulary
 from og_pointcloud.errors import FeatureSpaceError
 from og_pointcloud.formats.npy import array_from_zip
 
-__all__ = ["MAX_UNPACKED_BYTES", "UNKNOWN_SPACE", "read_text_features"]
+__all__ = ["MAX_UNPACKED_BYTES", "read_text_features"]
 
-UNKNOWN_SPACE = "unknown"
-"""Feature space of a file that names none; it is compared by width only."""
 MAX_UNPACKED_BYTES = 1 << 30
 
 

@@ -10,10 +10,10 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike
 
-from og_pointcloud.cloud import Vocabulary
+from og_pointcloud.cloud import FeatureSpace, Vocabulary
 from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError
 from og_pointcloud.text.encoder import encoder_for, export_command, find_encoder
-from og_pointcloud.text.text_features import UNKNOWN_SPACE, read_text_features
+from og_pointcloud.text.text_features import read_text_features
 
 __all__ = ["Labels", "TextFeatures", "resolve_labels"]
 
@@ -78,11 +78,7 @@ def _of_space(text_features: TextFeatures, feature_space: str) -> Vocabulary | N
         source, (vocabulary, space) = "text_features", text_features
     else:
         source, (vocabulary, space) = str(Path(text_features)), read_text_features(text_features)
-    if space != feature_space and UNKNOWN_SPACE not in (space, feature_space):
-        raise FeatureSpaceError(
-            f"{source} is of feature space '{space}', the scene of '{feature_space}': encode the names with "
-            "the scene's encoder"
-        )
+    FeatureSpace(feature_space, 0).require(FeatureSpace(space, vocabulary.vectors.shape[1]), f"names of {source}")
     return vocabulary
 
 
