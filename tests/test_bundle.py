@@ -300,7 +300,7 @@ def say(*keys_and_value):
         (put("bank/vectors.npy", npy(unit_rows(49).astype(np.float16))), "a word bank of 49 words"),
         (
             put("bank/vectors.npy", npy(unit_rows(60, 8).astype(np.float16))),
-            "word bank's vectors are of feature space .* .width 8.",
+            r"word bank's vectors are of .*\(width 8\)",
         ),
         (put("bank/vectors.npy", npy(np.full((60, 16), np.nan, np.float16))), "the word bank holds NaN"),
         (put("bank/vectors.npy", npy(np.zeros(60, np.float16))), r"expected <f2 \(None, None\)"),

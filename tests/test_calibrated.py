@@ -140,7 +140,9 @@ def test_negatives_compete_and_mean_unknown(scene, made):
     by_vector = og.segment(scene, SHOWN[:4], negatives={"x": 9 * made.texts[3], "y": made.texts[11]})
     assert (by_vector.labels == against.labels).all()
     ask = og.Segmenter(scene, SHOWN[:4], negatives=["absent 1", SHOWN[3]])
-    assert (ask(scene.xyz).reasons == og.segment(scene.xyz, SHOWN[:4], scene, negatives=[SHOWN[3]]).reasons).all()
+    assert (
+        ask(scene.xyz).reasons == og.segment(scene.xyz, SHOWN[:4], scene, negatives=[SHOWN[3], "absent 1"]).reasons
+    ).all()
     with pytest.raises(OgPointcloudError, match="0 labels are given"):
         og.segment(scene, SHOWN[:4], negatives=[])
 

@@ -193,7 +193,7 @@ def test_the_writer_stores_a_clouds_bank(tmp_path):
     path = write_bundle(replace(room(100), word_bank=bank), tmp_path / "s.ogpc")
     assert np.abs(read_bundle(path).cloud.word_bank.vectors - bank.vectors).max() < 1e-3
     with pytest.raises(
-        FeatureSpaceError, match=rf"word bank's vectors .*\(width 8\); expected .*{SPACE}' \(width {WIDTH}\)"
+        FeatureSpaceError, match=rf"bank's vectors .*\(width 8\); expected .*{SPACE}' \(width {WIDTH}\)"
     ):
         replace(room(100), word_bank=WordBank(unit_rows(80, 8)))
 
@@ -209,7 +209,7 @@ def test_the_command_stores_a_bank_of_text_features(path, tmp_path, capsys):
     np.savez(tmp_path / "other.npz", names=names, vectors=unit_rows(60), feature_space="other")
     for arguments, says in (
         ((tmp_path / "few.npz",), "few.npz: a word bank of 49 words; expected at least 50"),
-        ((tmp_path / "other.npz",), "the words are of feature space 'other'"),
+        ((tmp_path / "other.npz",), "words of the bank are of feature space 'other'"),
         ((), f"export-text-encoder MODEL_FOLDER --feature-space '{SPACE}'"),
     ):
         assert run("bank", path, *arguments) == 2
