@@ -1,12 +1,13 @@
 # `make demo` and `make test` do their whole set-up in .venv; a second run starts at once.
-.PHONY: help setup demo test lint bench bench-baseline clean
+.PHONY: help setup demo test test-all lint check bench clean
 .DEFAULT_GOAL := help
 
 help:
 	@echo "make demo    build a furnished room, label it and show it: pictures and scores in out/demo"
-	@echo "make test    run the tests"
+	@echo "make test    run the fast tests; make test-all runs all, as CI does"
 	@echo "make lint    ruff and pyright"
-	@echo "make bench   time and error of the main pieces of work, beside the stored run"
+	@echo "make check   stiff and extreme cases beside references: table, CSV and picture in out/check"
+	@echo "make bench   seconds and error of the main pieces of work, beside another revision (AGAINST=REV)"
 	@echo "make setup   only make .venv, with the libraries that Open3D and PyVista need"
 	@echo "make clean   remove .venv, out and the caches"
 
@@ -17,6 +18,9 @@ demo: setup
 	@.venv/bin/og-pointcloud demo -o out/demo
 
 test: setup
+	@.venv/bin/python -m pytest -m "not slow"
+
+test-all: setup
 	@.venv/bin/python -m pytest
 
 lint: setup
@@ -24,11 +28,11 @@ lint: setup
 	@.venv/bin/ruff format --check
 	@.venv/bin/pyright --pythonpath .venv/bin/python
 
-bench: setup
-	@.venv/bin/python examples/bench.py
+check: setup
+	@.venv/bin/python tests/hard_cases -o out/check
 
-bench-baseline: setup
-	@.venv/bin/python examples/bench.py --save
+bench: setup
+	@.venv/bin/python examples/bench.py $(if $(AGAINST),--against $(AGAINST))
 
 clean:
 	rm -rf .venv out .pytest_cache .ruff_cache

@@ -15,7 +15,6 @@ from typing import NoReturn
 
 from og_pointcloud.cli import (
     ablate,
-    check,
     demo,
     edit,
     evaluate,
@@ -43,7 +42,7 @@ __all__ = ["main"]
 
 COMMANDS = (
     masks, models, fit, fuse, import_, segment, select, pick, instances, edit, view, ros_bag, info, vocabulary,
-    export_text_encoder, export_image_encoder, ablate, evaluate, report, check, demo,
+    export_text_encoder, export_image_encoder, ablate, evaluate, report, demo,
 )  # fmt: skip
 
 

@@ -1,16 +1,18 @@
-"""What a case of the catalogue is, how it is judged, and what is reported of it.
+"""What a hard case is, and how it is judged.
 
-A case is a function that builds a hard input and asks the library about it. Either both it and a float64 reference have
-an answer, which agree to a stated bound (`agrees`), or the library refuses the input with one clear error (`refuses`).
-Whatever else happens, a NaN, a warning of numpy, an exception of another type, fails the case.
+A case is a function that builds a hard input and asks the library about it. Its kind says what the answer is compared
+with: "float64", numbers of a reference in float64 or wider, to a bound; "exact", labels, ids or counts that are known,
+of which none may differ; "refused", one clear error. Whatever else happens, a NaN, a warning of numpy, an exception of
+another type, fails the case.
 """
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,13 +21,11 @@ from og_pointcloud.errors import MissingExtraError, OgPointcloudError
 
 __all__ = ["CASES", "Answer", "Case", "Row", "agrees", "largest_error", "powers", "refuses", "run_case"]
 
-Outcome: TypeAlias = Literal["agrees", "one clear error", "FAILS"]
-
 
 @dataclass(frozen=True)
 class Answer:
-    """ours: what the library says. reference: what is right, in float64 or wider, or exact integers. naive: computes
-    what a plain float32 implementation says (naive.py), where there is one. All of one shape."""
+    """ours: what the library says. reference: what is right. naive: computes what a plain float32 implementation says
+    (naive.py), where there is one. All of one shape."""
 
     ours: ArrayLike
     reference: ArrayLike
@@ -38,18 +38,23 @@ class Case:
 
     compute: takes one of ``values``, or nothing where there is no condition; its docstring says what the case is.
     condition: what ``values`` are; empty where the case is a single one. bound: largest error that passes.
-    refusal: of a case that must be refused, the exact error and what its text must hold: the value seen, the value
+    refusal: the exact error of a case that must be refused, and what its text must hold: the value seen, the value
     expected, the cure. slow: takes more than a second or so, and is no part of the quick run.
     """
 
     name: str
     family: str
-    compute: Callable[..., Answer | None]
+    compute: Callable[..., Any]
     bound: float = 0.0
     condition: str = ""
     values: tuple[float, ...] = ()
     refusal: tuple[type[OgPointcloudError], tuple[str, str, str]] | None = None
     slow: bool = False
+
+    @property
+    def kind(self) -> Literal["float64", "exact", "refused"]:
+        """What the answer is compared with."""
+        return "refused" if self.refusal else "float64" if self.bound > 0 else "exact"
 
     @property
     def title(self) -> str:
@@ -69,7 +74,7 @@ class Row:
     value: float | None
     error: float | None
     naive: float | None
-    outcome: Outcome
+    holds: bool
     note: str = ""
 
 
@@ -80,7 +85,8 @@ CASES: list[Case] = []
 def agrees(
     bound: float, condition: str = "", values: Sequence[float] = (), *, slow: bool = False
 ) -> Callable[[Callable[..., Answer]], Callable[..., Answer]]:
-    """A case whose answer differs from the reference by ``bound`` at most, at every value of its condition."""
+    """A case whose answer differs from the reference by ``bound`` at most, at every value of its condition.
+    bound 0: not at all, kind "exact"."""
 
     def add(compute: Callable[..., Answer]) -> Callable[..., Answer]:
         CASES.append(Case(compute.__name__, _family(compute), compute, bound, condition, tuple(values), slow=slow))
@@ -94,14 +100,14 @@ def refuses(
 ) -> Callable[[Callable[[], object]], Callable[[], object]]:
     """A case that raises exactly this error, in one line that holds these three texts."""
 
-    def add(compute: Callable[[], Any]) -> Callable[[], object]:
+    def add(compute: Callable[[], object]) -> Callable[[], object]:
         CASES.append(Case(compute.__name__, _family(compute), compute, refusal=(error, (seen, expected, cure))))
         return compute
 
     return add
 
 
-def _family(compute: Callable[..., Any]) -> str:
+def _family(compute: Callable[..., object]) -> str:
     return compute.__module__.rpartition(".")[2]
 
 
@@ -126,58 +132,54 @@ def largest_error(value: ArrayLike, reference: ArrayLike) -> float:
 
 def run_case(case: Case, *, quick: bool = False) -> list[Row]:
     """A row for every value of the condition, or one. quick: only of the first, the middle and the last value."""
-    judge = _agreement if case.refusal is None else _refusal
     values = case.values or (None,)
     if quick:
         values = [values[index] for index in sorted({0, len(values) // 2, len(values) - 1})]
-    return [judge(case, value) for value in values]
+    return [(_refusal if case.refusal else _agreement)(case, value) for value in values]
+
+
+@contextmanager
+def _strict_numpy() -> Iterator[None]:
+    """Warnings of numpy are errors; what a user is warned of is not."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        warnings.simplefilter("error", RuntimeWarning)
+        yield
 
 
 def _agreement(case: Case, value: float | None) -> Row:
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # what a user is told of bad input
-            warnings.simplefilter("error", RuntimeWarning)
+        with _strict_numpy():
             answer = case.compute() if value is None else case.compute(value)
     except MissingExtraError:
         raise
     except Exception as error:  # whatever a hard case brings about is to be seen in the table
-        return Row(case, value, float("nan"), None, "FAILS", f"{type(error).__name__}: {error}")
-    assert answer is not None
+        return Row(case, value, float("nan"), None, False, f"{type(error).__name__}: {error}")
     error, naive = largest_error(answer.ours, answer.reference), None
     if answer.naive is not None:
         with np.errstate(all="ignore"), warnings.catch_warnings():
             warnings.simplefilter("ignore")
             naive = largest_error(answer.naive(), answer.reference)
-    agreed = error <= case.bound
-    return Row(case, value, error, naive, "agrees" if agreed else "FAILS", "" if agreed else _why(answer, error, case))
-
-
-def _why(answer: Answer, error: float, case: Case) -> str:
-    ours, reference = np.asarray(answer.ours), np.asarray(answer.reference)
-    if ours.shape != reference.shape:
-        return f"the answer has shape {ours.shape}, the reference {reference.shape}"
-    if not np.isfinite(error):
-        return f"{int((~np.isfinite(ours)).sum())} of {ours.size} numbers are not finite"
-    return f"error {error:.2g}, at most {case.bound:.2g} is allowed"
+    holds = error <= case.bound
+    shapes = f"the answer has shape {np.shape(answer.ours)}, the reference {np.shape(answer.reference)}"
+    return Row(case, value, error, naive, holds, "" if holds else f"error {error:.2g} > {case.bound:.2g}; {shapes}")
 
 
 def _refusal(case: Case, _: float | None) -> Row:
     assert case.refusal is not None
     kind, texts = case.refusal
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)
-            warnings.simplefilter("error", RuntimeWarning)
+        with _strict_numpy():
             case.compute()
     except MissingExtraError:
         raise
     except Exception as error:
-        said = str(error)
-        missing = [text for text in texts if text not in said]
+        text = str(error)
+        missing = [part for part in texts if part not in text]
+        note = text
         if type(error) is not kind:
-            return Row(case, None, None, None, "FAILS", f"{type(error).__name__} instead of {kind.__name__}: {said}")
-        if missing or "\n" in said:
-            return Row(case, None, None, None, "FAILS", f"the error does not say '{(*missing, 'one line')[0]}': {said}")
-        return Row(case, None, None, None, "one clear error", said)
-    return Row(case, None, None, None, "FAILS", f"no error; expected {kind.__name__}")
+            note = f"{type(error).__name__} instead of {kind.__name__}: {text}"
+        elif missing or "\n" in text:
+            note = f"the error does not say '{(*missing, 'one line')[0]}': {text}"
+        return Row(case, None, None, None, note == text, note)
+    return Row(case, None, None, None, False, f"no error; expected {kind.__name__}")

@@ -7,8 +7,9 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from reference_splatting import reference_pixel_weights
 
-from hard_cases import naive, reference
+from hard_cases import naive
 from hard_cases.case import Answer, agrees, powers, refuses
 from hard_cases.inputs import (
     NEAR,
@@ -47,7 +48,7 @@ def offset(distance: float) -> Answer:
     shape = gaussians.scale, gaussians.rotation, gaussians.opacity
     return Answer(
         dense_weights(local, in_local_frame(seen, points.origin)),
-        reference.pixel_weights(gaussians, camera(), NEAR),
+        reference_pixel_weights(gaussians, camera(), NEAR),
         lambda: naive.pixel_weights(world, *shape, seen, NEAR),
     )
 
@@ -151,8 +152,9 @@ def image_of_8k() -> Answer:
     for mask, (top, left) in enumerate(_CORNERS):
         ids[top : top + 128, left : left + 160] = mask
     ours = view_weights(gaussians, large, ids, 3, NEAR).rows.toarray()[:-1]
-    windows = (reference.pixel_weights(gaussians, large, NEAR, (left, top, 160, 128)) for top, left in _CORNERS)
-    return Answer(ours, np.array([window.sum(axis=(0, 1)) for window in windows]))
+    windows = (replace(large, width=160, height=128, cx=large.cx - left, cy=large.cy - top) for top, left in _CORNERS)
+    exact = [reference_pixel_weights(gaussians, window, NEAR).sum(axis=(0, 1)) for window in windows]
+    return Answer(ours, np.array(exact))
 
 
 _CORNERS = ((4100, 7500), (100, 20), (2100, 3760))

@@ -8,9 +8,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from reference_splatting import reference_pixel_weights
 from scipy.sparse import csr_array
 
-from hard_cases import naive, reference
+from hard_cases import naive
 from hard_cases.case import Answer
 from og_pointcloud.cloud import InstanceTable, LabelledCloud, Vocabulary
 from og_pointcloud.fitting.mask_table import Gaussians, MaskTable, pixel_weights
@@ -19,7 +20,7 @@ from og_pointcloud.scene import Camera, Points, Scene, View
 
 __all__ = [
     "SPACE", "by_ball", "camera", "dense_weights", "int32", "labelled_cloud", "mask_table_of", "scatter", "single",
-    "splatted", "two_balls", "unit_rows", "write_two_balls",
+    "solid", "splatted", "two_balls", "unit_rows", "write_two_balls",
 ]  # fmt: skip
 
 NEAR = 0.05
@@ -58,6 +59,12 @@ def scatter(count: int = 10, seed: int = 0) -> Gaussians:
     )
 
 
+def solid(xyz: NDArray[np.float32]) -> Gaussians:
+    """Round, nearly opaque Gaussians at these points."""
+    rotation = np.tile(single([1, 0, 0, 0]), (len(xyz), 1))
+    return Gaussians(xyz, np.full((len(xyz), 3), 0.06, np.float32), rotation, np.full(len(xyz), 0.9, np.float32))
+
+
 def unit_rows(count: int, width: int, seed: int = 0) -> NDArray[np.float32]:
     """Random rows of length 1."""
     rows = np.random.default_rng(seed).normal(size=(count, width))
@@ -75,7 +82,7 @@ def splatted(gaussians: Gaussians, view: Camera, near: float = NEAR, naive_near:
     parts = gaussians.xyz, gaussians.scale, gaussians.rotation, gaussians.opacity
     return Answer(
         dense_weights(gaussians, view, near),
-        reference.pixel_weights(gaussians, view, near),
+        reference_pixel_weights(gaussians, view, near),
         lambda: naive.pixel_weights(*parts, view, plain_near),
     )
 

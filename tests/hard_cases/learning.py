@@ -1,4 +1,4 @@
-"""Features whose means meet, codebooks larger than their data, instances without evidence."""
+"""Features whose means meet, codebooks larger than their data, instances without evidence, the published losses."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from hard_cases import naive
+from hard_cases import literal, naive
 from hard_cases.case import Answer, agrees, powers, refuses
-from hard_cases.inputs import by_ball, int32, mask_table_of, single, two_balls, unit_rows
+from hard_cases.inputs import NEAR, by_ball, int32, mask_table_of, single, solid, two_balls, unit_rows
 from og_pointcloud.cloud import UNOBSERVED
 from og_pointcloud.errors import OgPointcloudError, SceneError
 from og_pointcloud.fitting.association import describe_instances
@@ -18,7 +18,7 @@ from og_pointcloud.fitting.learned.codebook import kmeans, two_level_codebook
 from og_pointcloud.fitting.learned.instance_features import FeatureObjective, learn_features
 from og_pointcloud.fitting.mask_table import MaskTable
 from og_pointcloud.scene import Points, Scene
-from og_pointcloud.settings import AssociationSettings, CodebookSettings, FeatureSettings
+from og_pointcloud.settings import AssociationSettings, CodebookSettings, FeatureSettings, PaperSettings
 
 MASKS, EACH = 3, 200
 SEPARATE = np.sqrt(3)
@@ -155,11 +155,11 @@ def few_points(count: float) -> Answer:
 
 @agrees(0)
 def coincident_cloud() -> Answer:
-    """Every point of the cloud twice in one place: both get the same label."""
-    scene, _ = two_balls()
+    """Every point of the cloud twice in one place: both are of their ball."""
+    scene, balls = two_balls()
     twice = Points(np.concatenate([scene.points.xyz] * 2), scene.points.origin)
     ids = fit(Scene(twice, scene.views, "s"), progress=False).instance_ids
-    return Answer(ids[:600], ids[600:])
+    return Answer(by_ball(ids, np.tile(balls, 2)), np.tile(balls, 2))
 
 
 @agrees(0)
@@ -179,6 +179,51 @@ def instance_no_mask_shows() -> Answer:
     ids = np.repeat(int32([0, 1, 2]), 10)
     instances = describe_instances(table, int32([0, 1]), ids, 3, AssociationSettings())
     return Answer(instances.descriptor_instance, int32([0]))
+
+
+@agrees(1e-9, "distance of two mask means", powers(0, -8, -1), slow=True)
+def paper_losses(distance: float) -> Answer:
+    """Eq. 1 and 2 of the paper mode and their gradients, where the means of masks of one view meet."""
+    means = 0.5 + distance * np.eye(MASKS, 6)
+    return _losses(means.repeat(EACH, axis=0), np.arange(MASKS).repeat(EACH))
+
+
+@agrees(1e-9, slow=True)
+def paper_losses_of_one_mask() -> Answer:
+    """A view with a single mask: Eq. 2 has no pair."""
+    return _losses(np.full((EACH, 6), 0.5), np.zeros(EACH, np.int64))
+
+
+@agrees(1e-6, slow=True)
+def paper_codebook_with_empty_clusters() -> Answer:
+    """Two features in all and eight clusters of eight: the centre of each point's leaf is its feature."""
+    from og_pointcloud.fitting.learned.paper import train_codebook
+
+    scene, balls = two_balls(points=40)
+    features = (np.where(balls[:, None] == 0, 0.2, 0.7) * np.ones((1, 6))).astype(np.float32)
+    still = PaperSettings(k1=8, k2=8, codebook_rate=0.0, schedule_share=1e-3)
+    book = train_codebook(solid(scene.points.xyz), scene.views, NEAR, features, still)
+    known = np.flatnonzero(book.leaf >= 0)
+    return Answer(np.r_[book.centres[book.leaf[known]].ravel(), len(known) > 40], np.r_[features[known].ravel(), 1])
+
+
+def _losses(image: NDArray[np.float64], mask: NDArray[np.int64]) -> Answer:
+    """Both losses of an image of features, with some noise, and their gradients, each as a part of the largest."""
+    import torch
+
+    from og_pointcloud.fitting.learned.paper import SMALLEST_DISTANCE, view_losses
+
+    image = image + 1e-3 * np.random.default_rng(0).normal(size=image.shape)
+    values = torch.tensor(image, requires_grad=True)
+    losses = view_losses(values, torch.from_numpy(mask), PaperSettings(formula="paper"))
+    gradients = [torch.autograd.grad(loss, values, retain_graph=True)[0].numpy() for loss in losses]
+    ours = [losses[0].item(), losses[1].item(), *gradients]
+    exact = literal.paper_losses(image, mask, SMALLEST_DISTANCE)
+    size = [max(np.abs(part).max(), 1e-300) for part in exact]
+    return Answer(
+        np.concatenate([np.ravel(part) / by for part, by in zip(ours, size, strict=True)]),
+        np.concatenate([np.ravel(part) / by for part, by in zip(exact, size, strict=True)]),
+    )
 
 
 def _apart() -> MaskTable:

@@ -5,10 +5,11 @@ These are what the library is compared with, to see where the printed form break
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 
-from hard_cases.reference import ALPHA_MAX, LOW_PASS, blended, rotation_matrices
 from og_pointcloud.scene import Camera
 
 __all__ = [
@@ -17,6 +18,7 @@ __all__ = [
 ]  # fmt: skip
 
 Single = np.float32
+ALPHA_MIN, ALPHA_MAX, TRANSMITTANCE_MIN, LOW_PASS = 1 / 255, 0.99, 1e-4, 0.3
 
 
 def pixel_weights(
@@ -35,7 +37,7 @@ def pixel_weights(
     jx, jy = np.clip(x / z, -limit_x, limit_x) * z, np.clip(y / z, -limit_y, limit_y) * z
     zero = np.zeros_like(z)
     jacobian = np.moveaxis(np.array([[fx / z, zero, -fx * jx / (z * z)], [zero, fy / z, -fy * jy / (z * z)]]), -1, 0)
-    axes = rotation_matrices(rotation.astype(Single)) * scale.astype(Single)[:, None, :]
+    axes = _rotation_matrices(rotation.astype(Single)) * scale.astype(Single)[:, None, :]
     world = axes @ np.swapaxes(axes, 1, 2)
     half = jacobian @ pose[:3, :3]
     covariance = half @ world @ np.swapaxes(half, 1, 2) + Single(LOW_PASS) * np.eye(2, dtype=Single)
@@ -51,7 +53,35 @@ def pixel_weights(
 
     front = np.flatnonzero(z > Single(near))
     order = front[np.argsort(z[front])]
-    return blended(order, alpha, (camera.height, camera.width, len(xyz)), Single)
+    return _blended(order, alpha, (camera.height, camera.width, len(xyz)))
+
+
+def _blended(
+    order: NDArray[np.intp], alpha: Callable[[int], NDArray[np.floating]], shape: tuple[int, int, int]
+) -> NDArray[np.floating]:
+    """(h, w, n) weights ``T alpha``, front to back in the order given; alpha(g) is the (h, w) opacity of g."""
+    weights, transmittance = np.zeros(shape, Single), np.ones(shape[:2], Single)
+    stopped = np.zeros(shape[:2], bool)
+    for g in order:
+        opacity = alpha(g)
+        drawn = ~stopped & (opacity >= ALPHA_MIN)
+        rest = transmittance * (1 - opacity)
+        stopped |= drawn & (rest < TRANSMITTANCE_MIN)
+        drawn &= ~stopped
+        weights[drawn, g] = (transmittance * opacity)[drawn]
+        transmittance[drawn] = rest[drawn]
+    return weights
+
+
+def _rotation_matrices(quaternion: NDArray[np.floating]) -> NDArray[np.floating]:
+    """(n, 3, 3) of unit quaternions (n, 4) wxyz, in their own precision."""
+    w, x, y, z = quaternion.T
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.moveaxis(np.array(rows, quaternion.dtype), -1, 0)
 
 
 def unit(rows: NDArray[np.floating], dtype: type = Single) -> NDArray[np.floating]:

@@ -1,0 +1,241 @@
+"""Votes, membership, matching, choosing and losses written straight from their definitions, in float64, in loops.
+
+Slow and short: dense arrays, one point, mask, view or word at a time, nothing shared with the library but its settings.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from og_pointcloud.cloud import BACKGROUND, UNOBSERVED
+from og_pointcloud.settings import ChoosingSettings, MembershipSettings
+
+__all__ = ["Votes", "choice", "eq5", "membership", "paper_losses", "view_votes"]
+
+Array = NDArray[np.float64]
+Ids = NDArray[np.int32]
+
+
+# View votes ------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Votes:
+    """inside: (masks, n), what a view says for "in this mask". weight: (views, n), all that it says of a point."""
+
+    inside: Array
+    weight: Array
+
+
+def view_votes(weights: Array, outside: Array, exposure: Array, mask_view: Sequence[int]) -> Votes:
+    """A view counts by the square of its exposure of a point over the best view's; what shows is shared by weight."""
+    inside, weight = np.zeros_like(weights), np.zeros_like(outside)
+    for view, point in np.ndindex(*outside.shape):
+        if exposure[view, point] == 0:
+            continue
+        weight[view, point] = (exposure[view, point] / exposure[:, point].max()) ** 2
+        masks = [mask for mask, of in enumerate(mask_view) if of == view]
+        shown = outside[view, point] + sum(weights[mask, point] for mask in masks)
+        for mask in masks:
+            inside[mask, point] = weights[mask, point] / shown * weight[view, point]
+    return Votes(inside, weight)
+
+
+# Membership ------------------------------------------------------------------------------------------------------
+
+
+def membership(
+    votes: Votes, weights: Array, mask_view: Sequence[int], group: Sequence[int], neighbours: list[list[int]],
+    settings: MembershipSettings,
+) -> tuple[Ids, Array, Array]:  # fmt: skip
+    """Ids, share and certainty of every point. weights: (masks, n) pixels; neighbours: of each point, nearest first."""
+    points, count = range(weights.shape[1]), 1 + max(group)
+    own, asked = np.zeros((count, len(points))), np.zeros((count, len(points)))
+    for k in range(count):
+        masks = [mask for mask in range(len(group)) if group[mask] == k]
+        own[k] = votes.inside[masks].sum(axis=0)
+        asked[k] = votes.weight[sorted({mask_view[mask] for mask in masks})].sum(axis=0)
+    total = votes.weight.sum(axis=0)
+
+    def best_of(allowed: Sequence[int]) -> tuple[Ids, Array]:
+        best, share = np.full(len(points), -1, np.int32), np.zeros(len(points))
+        for g, k in product(points, allowed):
+            if own[k, g] > (own[best[g], g] if best[g] >= 0 else 0):  # ties: the lower group
+                best[g], share[g] = k, own[k, g] / asked[k, g]
+        return best, share
+
+    best, share = best_of(range(count))
+    sure = [[g for g in points if best[g] == k and share[g] > 0.5] for k in range(count)]
+    rates = [asked[k, sure[k]].sum() / max(total[sure[k]].sum(), 1e-12) for k in range(count)]
+    masses = [own[k, sure[k]].sum() for k in range(count)]
+    ascending = sorted(range(count), key=lambda k: rates[k])
+    half = [k for i, k in enumerate(ascending) if sum(masses[a] for a in ascending[: i + 1]) >= sum(masses) / 2]
+    kept = [k for k in range(count) if masses[k] > 0 and rates[k] >= settings.rate_share * rates[half[0]]]
+    best, share = best_of(kept)
+
+    ids = np.where((best >= 0) & (share > settings.sure_share), best, BACKGROUND).astype(np.int32)
+    possible = (best >= 0) & (share > settings.possible_share)
+    while True:  # a middling share counts where it adjoins points that are in already
+        beside = [sum(ids[other] == best[g] for other in neighbours[g]) for g in points]
+        joins = [
+            g for g in points
+            if possible[g] and ids[g] < 0 and beside[g] and beside[g] >= settings.growth_votes * len(neighbours[g])
+        ]  # fmt: skip
+        if not joins:
+            break
+        ids[joins] = best[joins]
+    covered = votes.inside.sum(axis=0) > settings.covered_share * total
+    ids = np.where((ids == BACKGROUND) & possible & covered, best, ids)
+    ids = _without_islands(ids, weights, group, neighbours, settings.island_share)
+    ids[(ids == BACKGROUND) & (total == 0)] = UNOBSERVED
+    seen = ids.copy()
+    for g in np.flatnonzero(ids == UNOBSERVED):
+        ids[g] = next((seen[other] for other in neighbours[g] if seen[other] != UNOBSERVED), UNOBSERVED)
+    for _ in range(settings.border_rounds):
+        ids = _settled(ids, share, neighbours, settings)
+    certainty = np.zeros(len(points))
+    for g in points:
+        alike = np.mean([ids[other] == ids[g] for other in neighbours[g]]) if neighbours[g] else 1.0
+        certainty[g] = (share[g] if ids[g] == best[g] >= 0 else 1 - share[g]) * alike if total[g] > 0 else 0
+    return ids, share, certainty
+
+
+def _without_islands(
+    ids: Ids, weights: Array, group: Sequence[int], neighbours: list[list[int]], least: float
+) -> NDArray[np.int32]:
+    """Pieces of an instance whose points show less than ``least`` of what those of its main piece do, unobserved."""
+    area = [sum(weights[mask, g] for mask in range(len(group)) if group[mask] == ids[g]) for g in range(len(ids))]
+    kept = ids.copy()
+    for k in set(ids[ids >= 0].tolist()):
+        left, pieces = set(np.flatnonzero(ids == k).tolist()), []
+        while left:
+            piece = {min(left)}
+            while grown := {o for g in left for o in (g, *neighbours[g]) if _linked(g, o, piece, left, neighbours)}:
+                piece |= grown
+            pieces.append(sorted(piece))
+            left -= piece
+        main = max(pieces, key=lambda piece: sum(area[g] for g in piece))
+        for piece in pieces:
+            if np.mean([area[g] for g in piece]) < least * np.mean([area[g] for g in main]):
+                kept[piece] = UNOBSERVED
+    return kept
+
+
+def _linked(g: int, other: int, piece: set[int], left: set[int], neighbours: list[list[int]]) -> bool:
+    """Whether ``other`` is of the instance, not yet in the piece, and adjoins it in either direction."""
+    if other not in left or other in piece:
+        return False
+    return any(p in neighbours[other] or other in neighbours[p] for p in piece)
+
+
+def _settled(ids: Ids, share: Array, neighbours: list[list[int]], settings: MembershipSettings) -> NDArray[np.int32]:
+    """One round: points between two states take the one that their neighbours are in, by the square of their shares."""
+    low, high = settings.border_shares
+    after = ids.copy()
+    for g in range(len(ids)):
+        if ids[g] == UNOBSERVED or not low < share[g] < high:
+            continue
+        votes = {int(ids[g]): settings.own_vote}  # in order of nearness: ties are won by the first
+        for other in neighbours[g]:
+            state = int(ids[other])
+            if state == UNOBSERVED or (state == BACKGROUND and ids[g] >= 0):
+                continue
+            votes[state] = votes.get(state, 0.0) + (share[other] if state >= 0 else 1 - share[other]) ** 2
+        after[g] = max(votes, key=lambda state: votes[state])
+    return after
+
+
+# Matching, paper, Eq. 5 --------------------------------------------------------------------------------------------
+
+
+def eq5(
+    weights: Array, outside: Array, mask_view: Sequence[int], ids: Ids, of_instances: Array, of_masks: Array
+) -> Array:
+    """(masks, instances): IoU of a mask with what its view shows of an instance, times 1 - L1 of their features."""
+    scores = np.zeros((len(weights), len(of_instances)))
+    for mask, k in np.ndindex(*scores.shape):
+        points = np.flatnonzero(ids == k)
+        of_view = [other for other in range(len(weights)) if mask_view[other] == mask_view[mask]]
+        both = weights[mask, points].sum()
+        area = sum(weights[other, points].sum() for other in of_view) + outside[mask_view[mask], points].sum()
+        union = area + weights[mask].sum() - both
+        apart = np.abs(of_masks[mask] - of_instances[k]).sum()
+        scores[mask, k] = both / union * max(1 - apart, 0) if both > 0 else 0
+    return scores
+
+
+# Choosing ----------------------------------------------------------------------------------------------------------
+
+
+def choice(
+    descriptors: Array, owner: Sequence[int], texts: Array, bank: Array, settings: ChoosingSettings
+) -> tuple[Array, Array]:
+    """(K, L) probability of each label and (K,) of none. owner: the instance of each descriptor, 0 to K - 1."""
+    descriptors, texts, bank = _unit(descriptors), _unit(texts), _unit(bank)
+    looks = np.array(
+        [1 / sum(row @ other >= settings.same_look - 1e-6 for other in descriptors) for row in descriptors]
+    )
+    shared = (1 - 1 / looks.sum()) * (looks @ descriptors) / looks.sum()
+    words, labels = _unit(bank - bank.mean(axis=0)), _unit(texts - bank.mean(axis=0))
+    evidence, against = [], []
+    for k in range(1 + max(owner)):
+        of_words, of_labels = [], []
+        for row in (descriptors - shared)[np.array(owner) == k]:
+            scores = words @ row
+            of_words.append((scores - scores.mean()) / scores.std())
+            of_labels.append((labels @ row - scores.mean()) / scores.std())
+        best = np.max(of_words, axis=0)  # the best of several descriptors, by how bank words do in that too
+        evidence.append((np.max(of_labels, axis=0) - best.mean()) / best.std())
+        against.append((best - best.mean()) / best.std())
+    sharpness = max(settings.sharpness, np.quantile(np.max(against, axis=1), 0.75))
+    different, first = np.unique(np.round(texts, 5), axis=0, return_index=True)
+    others = np.flatnonzero((words @ labels.T).max(axis=1) < settings.synonym)
+    table, none = np.zeros((len(evidence), len(texts))), np.zeros(len(evidence))
+    for k in range(len(evidence)):
+        # The mean over the bank, in which words that mean a label count as nothing; no less than chance.
+        mean = _log_sum(sharpness * against[k][others]) - np.log(len(bank)) if len(others) else -np.inf
+        no_label = max(mean, sharpness**2 / 2) + np.log(max(len(different), settings.kinds))
+        total = _log_sum(np.append(sharpness * evidence[k][first], no_label))
+        table[k], none[k] = np.exp(sharpness * evidence[k] - total), np.exp(no_label - total)
+    return table, none
+
+
+def _unit(rows: Array) -> Array:
+    """Rows of length 1; a zero row stays zero."""
+    rows = rows.astype(np.float64)
+    largest = np.abs(rows).max(axis=1, keepdims=True)
+    rows = rows / np.where(largest > 0, largest, 1)
+    length = np.linalg.norm(rows, axis=1, keepdims=True)
+    return rows / np.where(length > 0, length, 1)
+
+
+def _log_sum(exponents: Array) -> float:
+    return float(exponents.max() + np.log(np.exp(exponents - exponents.max()).sum()))
+
+
+# Losses of one view, paper, Eq. 1 and 2 ----------------------------------------------------------------------------
+
+
+def paper_losses(image: Array, mask: NDArray[np.int64], bound: float) -> tuple[float, float, Array, Array]:
+    """Eq. 2 (mean over pairs of 1 / (d^2 + bound^2)) and Eq. 1 (sum of squares), and their gradients by the image."""
+    image = image.astype(np.longdouble)
+    count = int(mask.max()) + 1
+    means = np.stack([image[mask == k].mean(axis=0) for k in range(count)])
+    cohesion, of_cohesion = np.longdouble(0), np.zeros_like(image)
+    for pixel, k in enumerate(mask):
+        cohesion += ((image[pixel] - means[k]) ** 2).sum()
+        of_cohesion[pixel] = 2 * (image[pixel] - means[k])  # the means' own part adds up to zero
+    separation, by_mean = np.longdouble(0), np.zeros_like(means)
+    for i, j in product(range(count), repeat=2):
+        if i != j:
+            apart = means[i] - means[j]
+            near = 1 / (apart @ apart + np.longdouble(bound) ** 2)
+            separation += near / (count * (count - 1))
+            by_mean[i] -= 4 * near**2 * apart / (count * (count - 1))
+    of_separation = np.stack([by_mean[k] / (mask == k).sum() for k in mask])
+    return float(separation), float(cohesion), of_separation.astype(float), of_cohesion.astype(float)

@@ -1,0 +1,206 @@
+"""What views say of points and what becomes of it: exposures of any size, ties, conflicts, borders; and Eq. 5."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+
+from hard_cases import literal
+from hard_cases.case import Answer, agrees, powers
+from hard_cases.inputs import int32, single, unit_rows
+from og_pointcloud.cloud import BACKGROUND, UNOBSERVED
+from og_pointcloud.fitting.grouping import MaskGroups
+from og_pointcloud.fitting.learned.matching import eq5_scores, match_masks, visible_evidence
+from og_pointcloud.fitting.mask_table import MaskTable
+from og_pointcloud.fitting.membership import Membership, assign_points
+from og_pointcloud.fitting.view_votes import hear_views
+from og_pointcloud.rendering.geometry import Neighbourhood
+from og_pointcloud.settings import MatchingSettings, MembershipSettings
+
+POINTS, REACH = 80, 3
+
+
+@agrees(1e-6, "exposure of the other views", (1e-30, *powers(-18, 0, 3)))
+def exposure(share: float) -> Answer:
+    """One view sees every point openly, the others that much of it: what shines through hardly counts."""
+    table = _table(seed=0)
+    shown = table.exposure.toarray()
+    shown[1:] *= np.float32(share)
+    return _votes(replace(table, exposure=csr_array(shown)))
+
+
+@agrees(1e-6)
+def exposure_zero_and_one() -> Answer:
+    """Views that see a point fully or not at all; what no view sees has no vote."""
+    table = _table(seed=1)
+    seen = (np.random.default_rng(2).random((4, POINTS)) < 0.5) & (table.exposure.toarray() > 0)
+    seen[:, :5] = False
+    masked = table.weights.toarray() * seen[table.mask_view]
+    parts = masked, table.outside.toarray() * seen, np.where(seen, 1, 0).astype(np.float32)
+    return _votes(_made(*parts, table.mask_view.tolist()))
+
+
+@agrees(1e-6)
+def votes_of_one_view() -> Answer:
+    """A single view: what it shows counts in full, however little of a point it sees."""
+    return _votes(_table(seed=3, views=1))
+
+
+@agrees(0)
+def conflicting_views() -> Answer:
+    """Of views that show a point in and out of a mask the majority decides; of two that differ, "possible" does."""
+    inside = single([[1, 1, 1, 0], [1, 1, 0, 0], [1, 0, 0, 0]])
+    table = _made(inside, 1 - inside, np.ones((3, 4), np.float32), [0, 1, 2])
+    ids = _assigned(table, [0, 0, 0], _lone(4)).instance_ids
+    return Answer(ids, int32([0, 0, BACKGROUND, BACKGROUND]))
+
+
+@agrees(0)
+def tied_groups() -> Answer:
+    """Two instances with the same right to every point: the lower number has them."""
+    table = _made(np.ones((2, 6)), np.zeros((2, 6)), np.ones((2, 6)), [0, 1])
+    return Answer(_assigned(table, [0, 1], _lone(6)).instance_ids, np.zeros(6, np.int32))
+
+
+@agrees(0, "seed", tuple(range(8)))
+def membership_of_any_votes(seed: float) -> Answer:
+    """Points on a line whose masks are torn at random: the state of each, against the literal form."""
+    ours, (ids, *_) = _both(int(seed), MembershipSettings())
+    return Answer(ours.instance_ids, ids)
+
+
+@agrees(1e-6, "seed", tuple(range(4)))
+def certainty_of_any_votes(seed: float) -> Answer:
+    """Share and certainty of the same points."""
+    ours, (_, share, certainty) = _both(int(seed), MembershipSettings())
+    return Answer(np.stack([ours.share, ours.certainty]), np.stack([share, certainty]))
+
+
+@agrees(0, "rounds", (0, 1, 2, 10))
+def border_rounds(rounds: float) -> Answer:
+    """Points whose share says little are settled by their neighbours' squared shares, round by round."""
+    settings = MembershipSettings(border_rounds=int(rounds), own_vote=0.4, border_shares=(0.1, 0.97))
+    ours, (ids, *_) = _both(11, settings)
+    return Answer(ours.instance_ids, ids)
+
+
+@agrees(0)
+def border_tie() -> Answer:
+    """A point between two instances with equal votes keeps its own; one with a surer neighbour changes."""
+    share = np.array([[0.9, 0.5, 0.1, 0.9, 0.5, 0.0], [0.1, 0.4, 0.9, 0.1, 0.4, 1.0]])
+    table = _made(share, 1 - share.sum(axis=0, keepdims=True), np.ones((1, 6)), [0, 0])
+    neighbours = [[1], [0, 2], [1], [4], [3, 5, 5, 5], [4]]
+    settings = MembershipSettings(sure_share=0.45, own_vote=0.2, border_shares=(0.4, 0.6))
+    ids = _assigned(table, [0, 1], neighbours, settings).instance_ids
+    return Answer(ids, int32([0, 0, 1, 0, 1, 1]))
+
+
+@agrees(0)
+def seen_by_no_view() -> Answer:
+    """Points that no view sees take the state of the nearest that one does; without one, they stay unobserved."""
+    inside = single([[1, 0, 0, 0, 0]])
+    table = _made(inside, single([[0, 1, 0, 0, 0]]), single([[1, 1, 0, 0, 0]]), [0])
+    neighbours = [[1], [0], [0, 1], [1, 0], []]
+    return Answer(_assigned(table, [0], neighbours).instance_ids, int32([0, BACKGROUND, 0, BACKGROUND, UNOBSERVED]))
+
+
+@agrees(1e-6, "seed", (0, 1, 2))
+def eq5(seed: float) -> Answer:
+    """Eq. 5 of masks with instances, of which one has no point."""
+    table, random = _table(int(seed), views=3), np.random.default_rng(int(seed))
+    ids = random.integers(-1, 4, POINTS).astype(np.int32)  # instance 4 is empty
+    return _eq5(table, ids, random.random((5, 6)) / 9, random.random((len(table.mask_view), 6)) / 9)
+
+
+@agrees(1e-6)
+def eq5_of_zero_features() -> Answer:
+    """Features that are all zero are alike: the score is the IoU."""
+    table = _table(seed=4, views=2)
+    return _eq5(table, (np.arange(POINTS) % 3).astype(np.int32), np.zeros((3, 6)), np.zeros((len(table.mask_view), 6)))
+
+
+@agrees(0)
+def eq5_of_equal_iou() -> Answer:
+    """Two masks of a view that show an instance equally well: the first is accepted, and the same in every view."""
+    weights = np.array([[1, 0], [0, 1], [1, 0], [0, 1]]).repeat(5, axis=1).astype(np.float32)
+    table = _made(weights, np.zeros((2, 10)), np.ones((2, 10)), [0, 0, 1, 1])
+    ids = np.zeros(10, np.int32)
+    evidence = visible_evidence(table, ids, np.zeros((1, 6)), np.zeros((4, 6)))
+    matched = match_masks(table, ids, evidence, MatchingSettings(threshold=0.2))
+    return Answer(matched.mask_instance, int32([0, -1, 0, -1]))
+
+
+def _eq5(table: MaskTable, ids: NDArray[np.int32], of_instances: NDArray, of_masks: NDArray) -> Answer:
+    ours = eq5_scores(visible_evidence(table, ids, of_instances, of_masks), table.mask_view, MatchingSettings())
+    dense = table.weights.toarray().astype(float), table.outside.toarray().astype(float)
+    return Answer(ours, literal.eq5(*dense, table.mask_view.tolist(), ids, of_instances, of_masks))
+
+
+def _made(weights: NDArray, outside: NDArray, exposure: NDArray, mask_view: list[int]) -> MaskTable:
+    dense = (csr_array(np.asarray(part, np.float32)) for part in (weights, outside, exposure))
+    return MaskTable(*dense, int32(mask_view), np.ones(len(mask_view), np.int32), unit_rows(len(mask_view), 4))
+
+
+def _table(seed: int, views: int = 4) -> MaskTable:
+    """Points on a line in three stretches; each view masks them, torn, sometimes wrong, sometimes missing."""
+    random = np.random.default_rng(seed)
+    stretch = np.arange(POINTS) * 3 // POINTS
+    weights, mask_view, shown = [], [], random.uniform(0.1, 9, (views, POINTS))
+    for view, instance in np.ndindex(views, 3):
+        torn = np.where(random.random(POINTS) < 0.35, random.random(POINTS), 1)
+        noise = 0.3 * random.random(POINTS) * (random.random(POINTS) < 0.3)
+        weights.append(np.where(stretch == instance, torn, noise) * shown[view] / 1.7)
+        mask_view.append(view)
+    masked = np.array(weights)
+    of_view = np.array([masked[np.array(mask_view) == view].sum(axis=0) for view in range(views)])
+    seen = random.random((views, POINTS)) < 0.85
+    visible = seen[np.array(mask_view)]
+    outside = np.maximum(shown - of_view, 0.05) * seen
+    return _made(masked * visible, outside, random.uniform(0.02, 1, (views, POINTS)) * seen, mask_view)
+
+
+def _votes(table: MaskTable) -> Answer:
+    ours, exact = hear_views(table), _literal(table)
+    return Answer(
+        np.concatenate([ours.inside.toarray(), ours.word.toarray()]), np.concatenate([exact.inside, exact.weight])
+    )
+
+
+def _literal(table: MaskTable) -> literal.Votes:
+    parts = (part.toarray().astype(float) for part in (table.weights, table.outside, table.exposure))
+    return literal.view_votes(*parts, table.mask_view.tolist())
+
+
+def _lone(count: int) -> list[list[int]]:
+    return [[] for _ in range(count)]
+
+
+def _assigned(
+    table: MaskTable, group: list[int], neighbours: list[list[int]], settings: MembershipSettings | None = None
+) -> Membership:
+    """The library's answer; neighbours of each point, nearest first."""
+    width = max(1, *map(len, neighbours))
+    index, adjoining = np.zeros((len(neighbours), width), np.int32), np.zeros((len(neighbours), width), bool)
+    for point, near in enumerate(neighbours):
+        index[point, : len(near)], adjoining[point, : len(near)] = near, True
+    around = Neighbourhood(np.ones(len(neighbours), np.float32), index, adjoining)
+    groups = MaskGroups(int32(group), max(group) + 1, np.zeros(len(group), bool))
+    return assign_points(table, hear_views(table), groups, around, settings or MembershipSettings())
+
+
+def _both(seed: int, settings: MembershipSettings) -> tuple[Membership, tuple[NDArray, NDArray, NDArray]]:
+    """Membership of a torn table by the library and by the literal form. A fourth group is noise of a single mask."""
+    table = _table(seed)
+    group = [mask % 3 for mask in range(12)]
+    group[3 + seed % 3] = 3
+    near = [
+        sorted((o for o in range(max(0, g - REACH), min(POINTS, g + REACH + 1)) if o != g), key=lambda o: abs(o - g))
+        for g in range(POINTS)
+    ]
+    exact = literal.membership(
+        _literal(table), table.weights.toarray().astype(float), table.mask_view.tolist(), group, near, settings
+    )
+    return _assigned(table, group, near, settings), exact
