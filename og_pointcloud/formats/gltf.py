@@ -1,10 +1,9 @@
 """Labelled clouds as glTF 2.0: .glb, or .gltf with everything inside. Out only.
 
 Points with colours, label and instance as feature ids (EXT_mesh_features, attributes _FEATURE_ID_0 and _FEATURE_ID_1),
-score and reason as attributes of our own, names in the mesh's extras. Gaussians travel beside them as
-KHR_gaussian_splatting, whose viewers draw splats where others draw the labels' points.
+score and reason as attributes of our own, names in the mesh's extras.
 
-Format: Khronos, "glTF 2.0 Specification", and the two extensions' texts.
+Format: Khronos, "glTF 2.0 Specification", and the extension's text.
 """
 
 from __future__ import annotations
@@ -22,9 +21,7 @@ from numpy.typing import NDArray
 
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.atomic import replacing
-from og_pointcloud.formats.gaussian_ply import SH_CONSTANT
 from og_pointcloud.formats.tables import naming, require_finite
-from og_pointcloud.scene import Points
 
 __all__ = ["write_gltf"]
 
@@ -33,7 +30,7 @@ COMPONENT_TYPES = {"f": 5126, "H": 5123}
 """FLOAT and UNSIGNED_SHORT. Ids are floats, exact up to 2^24: glTF has no 32-bit integers for vertices."""
 VECTOR_TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 GLB_MAGIC, GLB_VERSION, JSON_CHUNK, BINARY_CHUNK = b"glTF", 2, b"JSON", b"BIN\0"
-FEATURES, SPLATTING = "EXT_mesh_features", "KHR_gaussian_splatting"
+FEATURES = "EXT_mesh_features"
 
 
 def write_gltf(
@@ -42,7 +39,6 @@ def write_gltf(
     rgb: NDArray[np.uint8],
     attributes: Mapping[str, NDArray],
     names: Sequence[str],
-    splats: Points | None = None,
 ) -> None:
     """Write a labelled cloud as .glb or .gltf; whole or not at all.
 
@@ -51,8 +47,8 @@ def write_gltf(
     rgb: (n, 3) uint8 sRGB; stored linear, as the format wants colours.
     attributes: og_label, og_instance (n,) int32, og_score (n,) float32, og_reason (n,) uint8. Ids below 0 become the
         feature id that says "none"; og_reason tells which none.
-    names: what og_label counts. splats: Gaussians, row for row with xyz_world, which become splats of this file.
-    SceneError where there are no points, a coordinate is not finite, or the splats are other points.
+    names: what og_label counts.
+    SceneError where there are no points or a coordinate is not finite.
     """
     path = Path(path)
     with naming(path):
@@ -68,10 +64,7 @@ def write_gltf(
             "_OG_SCORE": attributes["og_score"].astype(np.float32),
             "_OG_REASON": attributes["og_reason"].astype(np.float32),
         }
-        extensions: dict[str, Any] = {FEATURES: {"featureIds": _feature_sets(attributes, len(names))}}
-        if splats is not None:
-            columns |= _splat_columns(splats, xyz_world)
-            extensions[SPLATTING] = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
+        extensions = {FEATURES: {"featureIds": _feature_sets(attributes, len(names))}}
         document, binary = _document(columns, origin, extensions, names)
         with replacing(path) as file:
             file.write(_as_glb(document, binary) if path.suffix == ".glb" else _as_text(document, binary))
@@ -102,24 +95,6 @@ def _linear_colors(rgb: NDArray[np.uint8]) -> NDArray[np.uint16]:
     linear = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
     table = np.rint(linear * 65535).astype(np.uint16)
     return np.column_stack([table[rgb], np.full(len(rgb), 65535, np.uint16)])
-
-
-def _splat_columns(splats: Points, xyz_world: NDArray[np.floating]) -> dict[str, NDArray[np.float32]]:
-    if splats.scale is None or splats.rotation is None or splats.opacity is None:
-        raise SceneError("the splats have no scale, rotation and opacity; expected Gaussians, as read from a 3DGS file")
-    if len(splats) != len(xyz_world) or not np.allclose(splats.xyz_world, xyz_world, rtol=1e-6, atol=1e-6):
-        raise SceneError(
-            f"{len(splats)} splats, {len(xyz_world)} labelled points, or others; expected the same points in the same "
-            "order: segment the splats' own xyz_world"
-        )
-    rgb = np.full(splats.xyz.shape, 127.5) if splats.rgb is None else splats.rgb
-    values = {
-        "ROTATION": np.roll(splats.rotation, -1, axis=1),  # wxyz -> xyzw
-        "SCALE": splats.scale,
-        "OPACITY": splats.opacity,
-        "SH_DEGREE_0_COEF_0": (rgb / 255 - 0.5) / SH_CONSTANT,
-    }
-    return {f"{SPLATTING}:{name}": column.astype(np.float32) for name, column in values.items()}
 
 
 def _document(

@@ -3,13 +3,19 @@
 Out: LAS 1.4, point format 7, with labels where each kind of reader looks for them: ``classification`` for viewers, and
 extra bytes og_label, og_instance, og_score, og_reason for programs. Names are JSON in a record of user og_pointcloud.
 
-Format: ASPRS, "LAS Specification 1.4 R15".
+Before a file is read, what its header counts is held against its size: laspy reads as many records as the header says,
+if need be four billion empty ones, and lazrs makes room for every chunk and layer that a LAZ file announces, and ends
+the process where there is none.
+
+Format: ASPRS, "LAS Specification 1.4 R15"; Isenburg, "LASzip: lossless compression of LiDAR data", 2013.
 """
 
 from __future__ import annotations
 
 import json
+import mmap
 import os
+import struct
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,7 +25,6 @@ from numpy.typing import NDArray
 
 from og_pointcloud.errors import MissingExtraError, SceneError
 from og_pointcloud.formats.atomic import replacing
-from og_pointcloud.formats.las_counts import check_las_counts
 from og_pointcloud.formats.tables import naming, require_finite
 from og_pointcloud.scene import Points
 
@@ -42,6 +47,12 @@ FULL_RANGE = 257
 RECORD_OWNER, NAMES_RECORD = "og_pointcloud", 1
 SHORT_RECORD = 65_535
 """Bytes that a record before the points holds; a longer one goes behind them."""
+SMALLEST_HEADER, RECORD_HEADER = 227, 54
+LAYERED = 3
+"""LASzip's compressor whose chunks hold each field as a layer of its own."""
+LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}
+"""Layers of an item by its type; extra bytes, type 14, have one each."""
+EXTRA_BYTES = 14
 
 
 def looks_like_las(path: str | os.PathLike[str]) -> bool:
@@ -132,17 +143,17 @@ def _read(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8] | None]:
     xyz: list[NDArray[np.float64]] = []
     rgb: list[NDArray[np.uint16]] = []
     with naming(path):
-        check_las_counts(path)
         try:
+            _check_counts(path)
             # Of the two backends this one makes no room for points that a chunk only claims to have.
-            with laspy.open(path, laz_backend=laspy.LazBackend.Lazrs) as reader:
+            with laspy.open(path, laz_backend=laspy.LazBackend.Lazrs, read_evlrs=False) as reader:
                 promised = reader.header.point_count
                 has_colors = "red" in reader.header.point_format.dimension_names
                 for chunk in reader.chunk_iterator(POINTS_PER_CHUNK):
                     xyz.append(np.column_stack([chunk.x, chunk.y, chunk.z]))
                     if has_colors:
                         rgb.append(np.column_stack([chunk.red, chunk.green, chunk.blue]))
-        except (OSError, KeyboardInterrupt, SystemExit):
+        except (SceneError, OSError, KeyboardInterrupt, SystemExit):
             raise
         except BaseException as error:  # laspy raises types of its own; a panic of lazrs is no Exception
             raise SceneError(f"cannot be read as LAS ({error!s:.120}): copy or write it again") from error
@@ -152,6 +163,58 @@ def _read(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8] | None]:
                 f"expected {promised} points, the file has {count}: it is empty or truncated; copy or write it again"
             )
     return np.concatenate(xyz), _eight_bits(np.concatenate(rgb)) if rgb else None
+
+
+def _check_counts(path: Path) -> None:
+    """SceneError where the records, points, chunks or layers that a file announces would not fit into it."""
+    size = path.stat().st_size
+    _require(size >= SMALLEST_HEADER, f"a file of {size} bytes has no whole header")
+    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        header_size, first_point, records, _, point_size = struct.unpack_from("<HIIBH", data, 94)
+        _require(header_size + RECORD_HEADER * records <= first_point <= size, f"{records} records before the points")
+        header = _laspy().LasHeader.read_from(file)
+        if header.are_points_compressed:
+            _check_chunks(data, _layers(header.vlrs.get("LasZipVlr")), first_point, point_size)
+        else:
+            room = size - first_point
+            _require(header.point_count * point_size <= room, f"{header.point_count} points of {point_size} bytes")
+
+
+def _require(fits: bool, what: str) -> None:
+    if not fits:
+        raise SceneError(f"{what}: the file is damaged or truncated; copy or write it again")
+
+
+def _layers(laszip_records: Sequence[Any]) -> int:
+    """Number of layers of a point, 0 where the points are not layered."""
+    _require(bool(laszip_records), "compressed points without a LASzip record")
+    content = laszip_records[0].record_data
+    _require(len(content) >= 34, f"a LASzip record of {len(content)} bytes")
+    compressor, items = struct.unpack_from("<H30xH", content)
+    _require(len(content) >= 34 + 6 * items, f"{items} items in a LASzip record of {len(content)} bytes")
+    kinds = [struct.unpack_from("<HH", content, 34 + 6 * item) for item in range(items)]
+    layers = sum(size if kind == EXTRA_BYTES else LAYERS.get(kind, 0) for kind, size in kinds)
+    return layers if compressor == LAYERED else 0
+
+
+def _check_chunks(data: mmap.mmap, layers: int, first_point: int, point_size: int) -> None:
+    """The chunks lie one behind the other, and then comes their table, which says how many there are.
+
+    A layered chunk: its first point, its number of points, the lengths of its layers, the layers.
+    """
+    _require(first_point + 8 <= len(data), "a chunk table beyond the end")
+    table, at, chunks = struct.unpack_from("<q", data, first_point)[0], first_point + 8, 0
+    if table == -1:  # written to a stream: its place stands at the end
+        table = struct.unpack_from("<q", data, len(data) - 8)[0]
+    _require(at <= table <= len(data) - 8, f"a chunk table at byte {table} of {len(data)}")
+    while layers and at < table:
+        sizes = at + point_size + 4
+        _require(sizes + 4 * layers <= table, f"chunk {chunks} beyond the chunk table")
+        at = sizes + 4 * layers + sum(struct.unpack_from(f"<{layers}I", data, sizes))
+        _require(at <= table, f"layers of chunk {chunks} beyond the chunk table")
+        chunks += 1
+    counted = struct.unpack_from("<I", data, table + 4)[0]
+    _require(counted == chunks if layers else counted <= table - at, f"a table of {counted} chunks")
 
 
 def _eight_bits(rgb: NDArray[np.uint16]) -> NDArray[np.uint8]:
