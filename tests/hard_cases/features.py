@@ -137,7 +137,7 @@ def features_of_two_widths() -> object:
     return Scene(scene.points, (*scene.views, replace(_one_view(unit_rows(2, 16)), name="other")), SPACE)
 
 
-@refuses(FeatureSpaceError, "label vectors are of", "(width 8); expected", "(width 16)", "encode them with")
+@refuses(FeatureSpaceError, "(width 8); expected", "(width 16)", "encode them with")
 def text_of_another_width() -> object:
     """Words of another encoder than the scene's."""
     return segment(labelled_cloud(), {"chair": unit_rows(1, 8)[0]})
