@@ -1,0 +1,83 @@
+"""LAS and LAZ headers: what they count is compared with the file, before room is made for it."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from og_pointcloud.errors import SceneError
+from og_pointcloud.formats.las import write_las
+from og_pointcloud.formats.points import read_points
+
+
+def labelled(path: Path) -> bytes:
+    """Twelve labelled points as the library writes them."""
+    ids = np.zeros(12, np.int32)
+    attributes = {"og_label": ids, "og_instance": ids, "og_score": np.ones(12, np.float32)}
+    attributes["og_reason"] = np.zeros(12, np.uint8)
+    write_las(path, np.random.default_rng(0).normal(size=(12, 3)), np.full((12, 3), 99, np.uint8), attributes, ("a",))
+    return path.read_bytes()
+
+
+def las_header(data, **numbers):
+    """The file with other numbers in its header, by name: records, points, table_chunks, layer, chunk_points."""
+    edit = bytearray(data)
+    first = struct.unpack_from("<I", edit, 96)[0]
+    laszip = edit.find(struct.pack("<16sH", b"laszip encoded", 22204)) + 52
+    table = struct.unpack_from("<q", edit, first)[0] if laszip > 52 else 0
+    places = {"records": (100, "<I"), "points": (247, "<Q")}
+    places["chunk_points"] = (laszip + 12, "<I")
+    places |= {"table": (first, "<q"), "table_chunks": (table + 4, "<I"), "layer": (first + 8 + 49 + 4, "<I")}
+    for name, number in numbers.items():
+        struct.pack_into(places[name][1], edit, places[name][0], number)
+    return bytes(edit)
+
+
+@pytest.mark.parametrize(
+    ("suffix", "numbers", "says"),
+    [
+        (".las", {"records": 2**32 - 1}, "4294967295 records before the points"),
+        (".las", {"points": 10**12}, "1000000000000 points of 49 bytes"),
+        (".las", {"points": 13}, "13 points of 49 bytes"),
+        (".laz", {"points": 13}, "cannot be read as LAS|expected 13 points"),
+        (".laz", {"table": 10**12}, "a chunk table at byte 1000000000000"),
+        (".laz", {"table_chunks": 2**32 - 1}, "a table of 4294967295 chunks"),
+        (".laz", {"layer": 2**32 - 1}, "layers of chunk 0 beyond the chunk table"),
+    ],
+)
+def test_las_headers_that_count_too_much(tmp_path, suffix, numbers, says):
+    pytest.importorskip("lazrs")
+    data = labelled(tmp_path / f"cloud{suffix}")
+    path = tmp_path / f"cloud{suffix}"
+    assert len(read_points(path)) == 12
+    path.write_bytes(las_header(data, **numbers))
+    with pytest.raises(SceneError, match=says):
+        read_points(path)
+
+
+def test_chunks_of_two_billion_points_make_no_room_for_them(tmp_path):
+    pytest.importorskip("lazrs")
+    data = labelled(tmp_path / "cloud.laz")
+    (tmp_path / "cloud.laz").write_bytes(las_header(data, chunk_points=2**31 - 1))  # once ended the process
+    assert len(read_points(tmp_path / "cloud.laz")) == 12
+
+
+@pytest.mark.parametrize("version", ["1.2", "1.4"])
+@pytest.mark.parametrize("point_format", [0, 3, 6, 7, 8])
+@pytest.mark.parametrize("suffix", [".las", ".laz"])
+def test_las_of_any_kind_counts_right(tmp_path, version, point_format, suffix):
+    laspy = pytest.importorskip("laspy")
+    pytest.importorskip("lazrs")
+    if version == "1.2" and point_format > 3:
+        pytest.skip("1.2 ends at point format 3")
+    for points in (1, 50_001):  # of which a chunk holds 50,000
+        header = laspy.LasHeader(point_format=point_format, version=version)
+        header.scales = [0.001] * 3
+        header.add_extra_dims([laspy.ExtraBytesParams("extra", "u2")])
+        las = laspy.LasData(header)
+        las.xyz = np.random.default_rng(0).random((points, 3))
+        las.write(tmp_path / f"cloud{suffix}")
+        assert len(read_points(tmp_path / f"cloud{suffix}")) == points

@@ -1,0 +1,365 @@
+"""Files from strangers: any bytes, and valid files that are damaged or lie, are read or refused with one error.
+
+Never another exception, a numpy warning, a result that is not finite, or more memory than a small file can need.
+Below, by name, files that once got through.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import re
+import struct
+import tracemalloc
+import warnings
+import zipfile
+import zlib
+from collections.abc import Callable
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hard_cases.inputs import labelled_cloud, scatter, write_two_balls
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as some
+
+from og_pointcloud.bundle.read import read_bundle
+from og_pointcloud.cli import main
+from og_pointcloud.errors import BundleError, FeatureSpaceError, OgPointcloudError, SceneError
+from og_pointcloud.formats import colmap
+from og_pointcloud.formats.las import write_las
+from og_pointcloud.formats.nerfstudio import read_transforms
+from og_pointcloud.formats.npy import array_from_npy, npy_bytes
+from og_pointcloud.formats.ply import join_columns, write_ply
+from og_pointcloud.formats.points import read_points
+from og_pointcloud.scene import Camera
+from og_pointcloud.text.text_features import read_text_features
+
+MOST_BYTES = 1 << 26
+"""What reading a file of some kilobytes may take."""
+LONGEST_MESSAGE = 600
+INTEGERS = (0, 1, 127, 255, 65535, 2**31 - 1, 2**31, 2**32 - 1, 2**63 - 1, 2**64 - 1)
+WORDS = (b"", b"-1", b"1e400", b"nan", b"9" * 25, b"1000000000000", b"\x00", b"list", b"{}", b'"', b"\xff\xfe", b"..")
+
+
+# Readers, each with valid files -----------------------------------------------------------------------------------
+
+
+def _xyz(count: int = 12) -> np.ndarray:
+    return np.random.default_rng(0).normal(size=(count, 3))
+
+
+def _npy(folder: Path) -> list[bytes]:
+    return [npy_bytes(array) for array in (_xyz(), np.ones((2, 3), np.int16), np.array(["a", "bc"]))]
+
+
+def _ogpc(folder: Path) -> list[bytes]:
+    from og_pointcloud_export import write_bundle
+
+    return [write_bundle(labelled_cloud(count=60), folder / "made.ogpc").read_bytes()]
+
+
+def _ply(folder: Path) -> list[bytes]:
+    xyz = dict(zip("xyz", _xyz().T.astype(np.float32), strict=True))
+    write_ply(folder / "made.ply", {"vertex": join_columns({**xyz, "red": np.full(12, 9, np.uint8)})})
+    gaussians = scatter()
+    names = ("x", "y", "z", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3", "opacity")
+    rows = np.c_[gaussians.xyz, np.log(gaussians.scale), gaussians.rotation, gaussians.opacity]
+    write_ply(folder / "splats.ply", {"vertex": join_columns(dict(zip(names, rows.T, strict=True)))})
+    header = "ply\nformat ascii 1.0\nelement face 1\nproperty list uchar int vertex_indices\nelement vertex 2\n"
+    header += "".join(f"property double {axis}\n" for axis in "xyz") + "end_header\n3 0 1 1\n0 1 2\n1e6 2 3\n"
+    return [(folder / "made.ply").read_bytes(), (folder / "splats.ply").read_bytes(), header.encode()]
+
+
+def _pcd(folder: Path) -> list[bytes]:
+    header = "VERSION 0.7\nFIELDS x y z _ rgb\nSIZE 4 4 4 1 4\nTYPE F F F U U\nCOUNT 1 1 1 4 1\nWIDTH 12\nHEIGHT 1\n"
+    header += "VIEWPOINT 0 0 0 1 0 0 0\nPOINTS 12\nDATA "
+    rows = [np.float32(point).tobytes() + bytes(4) + struct.pack("<I", 1000) for point in _xyz()]
+    text = "".join(f"{x} {y} {z} 0 0 0 0 1000\n" for x, y, z in _xyz())
+    columns = [_xyz().astype("<f4").tobytes("F"), bytes(48), struct.pack("<12I", *range(12))]
+    data = b"".join(columns)
+    packed = b"".join(bytes([len(data[at : at + 32]) - 1]) + data[at : at + 32] for at in range(0, len(data), 32))
+    compressed = struct.pack("<II", len(packed), len(data)) + packed  # LZF without a copy
+    ends = (b"ascii\n" + text.encode(), b"binary\n" + b"".join(rows), b"binary_compressed\n" + compressed)
+    return [header.encode() + end for end in ends]
+
+
+def _las(folder: Path) -> list[bytes]:
+    pytest.importorskip("laspy")
+    ids = np.zeros(12, np.int32)
+    attributes = {"og_label": ids, "og_instance": ids, "og_score": np.ones(12, np.float32)}
+    attributes["og_reason"] = np.zeros(12, np.uint8)
+    write_las(folder / "made.las", _xyz(), np.full((12, 3), 99, np.uint8), attributes, ("chair",))
+    return [(folder / "made.las").read_bytes()]
+
+
+def _images_bin(folder: Path) -> list[bytes]:
+    image = struct.pack("<I7dI", 1, 1.0, 0, 0, 0, 0.1, 0.2, 0.3, 1) + b"image.png\0" + struct.pack("<Q", 2)
+    return [struct.pack("<Q", 1) + image + 2 * struct.pack("<ddq", 1.5, 2.5, -1)]
+
+
+def _points_bin(folder: Path) -> list[bytes]:
+    points = [struct.pack("<Q3d3BdQ", row, *xyz, 9, 8, 7, 0.5, 1) + bytes(8) for row, xyz in enumerate(_xyz())]
+    return [struct.pack("<Q", len(points)) + b"".join(points)]
+
+
+def _transforms(folder: Path) -> list[bytes]:
+    write_two_balls(folder / "capture", views=2, points=20)
+    content = json.loads((folder / "capture" / "transforms.json").read_text())
+    lens = {"camera_model": "OPENCV", "k1": 0.1, "applied_transform": np.eye(4)[:3].tolist()}
+    return [json.dumps(made).encode() for made in (content, {**content, **lens})]
+
+
+def _read_npy(path: Path) -> list[np.ndarray]:
+    try:
+        array_from_npy(path.read_bytes())  # may hold anything
+    except ValueError as error:  # whoever calls it names the file
+        raise OgPointcloudError(str(error)) from error
+    return []
+
+
+def _read_images_bin(path: Path) -> list[np.ndarray]:
+    (path.parent / "cameras.bin").write_bytes(struct.pack("<QIiQQ4d", 1, 1, 1, 48, 36, 70.0, 72.0, 24.0, 18.0))
+    return [image.camera.world_to_camera for image in colmap.read_images(path.parent)]
+
+
+def _read_ogpc(path: Path) -> list[np.ndarray]:
+    cloud = read_bundle(path).cloud
+    assert cloud.instance_ids.max(initial=-1) < len(cloud.instances)
+    return [cloud.xyz, cloud.instances.descriptors]
+
+
+def _read_transforms(path: Path) -> list[np.ndarray]:
+    return [image.camera.world_to_camera for image in read_transforms(path, lambda _: (48, 36)).images]
+
+
+READERS: dict[str, tuple[Callable, Callable]] = {
+    "array.npy": (_npy, _read_npy),
+    "scene.ogpc": (_ogpc, _read_ogpc),
+    "cloud.ply": (_ply, lambda path: [read_points(path).xyz]),
+    "cloud.pcd": (_pcd, lambda path: [read_points(path).xyz]),
+    "cloud.las": (_las, lambda path: [read_points(path).xyz]),
+    "images.bin": (_images_bin, _read_images_bin),
+    "points3D.bin": (_points_bin, lambda path: [colmap.read_points3d(path.parent)[0]]),
+    "transforms.json": (_transforms, _read_transforms),
+}
+"""By the file's name: what makes valid ones, and what reads one and returns arrays that must be finite."""
+
+
+@lru_cache
+def valid_files(name: str, folder: Path) -> list[bytes]:
+    (folder / name).mkdir()
+    return READERS[name][0](folder / name)
+
+
+def read_or_refused(name: str, path: Path, data: bytes) -> str:
+    """What the reader says against the file, "" where it is read. Fails for everything that must not happen."""
+    path.write_bytes(data)
+    tracemalloc.start()
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            warnings.simplefilter("error", RuntimeWarning)
+            assert all(np.isfinite(array).all() for array in READERS[name][1](path))
+        message = ""
+    except OgPointcloudError as error:
+        message = str(error)
+    finally:
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+    assert peak < MOST_BYTES
+    assert message.isprintable()
+    assert len(message) < LONGEST_MESSAGE + len(str(path))
+    return message
+
+
+# Any bytes, and damage --------------------------------------------------------------------------------------------
+
+
+@some.composite
+def damages(draw: some.DrawFn) -> list[tuple[str, float, bytes]]:
+    """Changes of a file: what, where (a share of its length), and the bytes to write."""
+    written = some.one_of(
+        some.binary(min_size=1, max_size=8),
+        some.sampled_from(WORDS),
+        some.builds(lambda n, size: n.to_bytes(8, "little")[:size], some.sampled_from(INTEGERS), some.integers(1, 8)),
+    )
+    kinds = some.sampled_from(("write", "write", "insert", "cut", "end", "number", "number"))
+    return draw(some.lists(some.tuples(kinds, some.floats(0, 1), written), min_size=1, max_size=3))
+
+
+def damaged(data: bytes, changes: list[tuple[str, float, bytes]]) -> bytes:
+    """A file after these changes; "number" replaces the number in its text that lies nearest behind the place."""
+    for kind, share, written in changes:
+        at = int(share * len(data))
+        if kind == "number" and (found := re.compile(rb"-?\d[\d.e+-]*").search(data, at)):
+            data = data[: found.start()] + written + data[found.end() :]
+        elif kind in ("write", "number"):
+            data = data[:at] + written + data[at + len(written) :]
+        else:
+            data = data[:at] + {"insert": written + data[at:], "cut": data[at + 8 :], "end": b""}.get(kind, b"")
+    return data
+
+
+def damaged_member(data: bytes, member: float, changes: list[tuple[str, float, bytes]]) -> bytes:
+    """A .ogpc with one file in it damaged and the manifest's checksums made right again."""
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        files = {name: archive.read(name) for name in archive.namelist()}
+    name = sorted(files)[int(member * (len(files) - 1))]
+    files[name] = damaged(files[name], changes)
+    if name != "manifest.json":
+        manifest = json.loads(files["manifest.json"])
+        sums = {"crc32": zlib.crc32(files[name]), "sha256": hashlib.sha256(files[name]).hexdigest()}
+        manifest["members"][name] |= {"bytes": len(files[name]), **sums}
+        files["manifest.json"] = json.dumps(manifest).encode()
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w") as archive:
+        for name, content in files.items():
+            archive.writestr(name, content)
+    return stream.getvalue()
+
+
+everything = settings(
+    max_examples=100, derandomize=True, deadline=None, database=None, suppress_health_check=list(HealthCheck)
+)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("fuzz")
+
+
+@pytest.mark.parametrize("name", READERS)
+def test_valid_files_are_read(name: str, folder: Path, tmp_path: Path):
+    for data in valid_files(name, folder):
+        assert read_or_refused(name, tmp_path / name, data) == ""
+
+
+@pytest.mark.parametrize("name", READERS)
+@everything
+@given(data=some.binary(max_size=300), start=some.integers(0, 60))
+def test_any_bytes_are_read_or_refused(name: str, folder: Path, data: bytes, start: int):
+    valid = valid_files(name, folder)[0]
+    read_or_refused(name, folder / name / name, valid[:start] + data)
+
+
+@pytest.mark.parametrize("name", READERS)
+@everything
+@given(which=some.integers(0, 9), member=some.floats(0, 1), changes=damages())
+def test_damaged_files_are_read_or_refused(
+    name: str, folder: Path, which: int, member: float, changes: list[tuple[str, float, bytes]]
+):
+    valid = valid_files(name, folder)
+    data = valid[which % len(valid)]
+    changed = damaged_member(data, member, changes) if name.endswith(".ogpc") and which else damaged(data, changes)
+    read_or_refused(name, folder / name / name, changed)
+
+
+def test_what_must_not_happen_fails_the_tests(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    def outcome(read: Callable[[Path], object]) -> str:
+        monkeypatch.setitem(READERS, "cloud.ply", (_ply, read))
+        return read_or_refused("cloud.ply", tmp_path / "cloud.ply", b"x")
+
+    def fail(error: Exception):
+        raise error
+
+    assert outcome(lambda _: []) == ""
+    assert outcome(lambda _: fail(SceneError("no"))) == "no"
+    for error in (KeyError("x"), MemoryError(), RecursionError(), OSError("x"), ZeroDivisionError()):
+        with pytest.raises(type(error)):
+            outcome(lambda _, error=error: fail(error))
+    with pytest.raises(RuntimeWarning):
+        outcome(lambda _: [np.float32(3e38) * np.float32(3e38)])
+    for wrong in (lambda _: [np.nan], lambda _: [np.zeros(1 << 24)], lambda _: fail(SceneError("x" * 5000))):
+        with pytest.raises(AssertionError):
+            outcome(wrong)
+
+
+# What once got through --------------------------------------------------------------------------------------------
+
+
+def test_messages_are_printable_whatever_the_file_says(capsys, tmp_path):
+    error = SceneError("a\x1b[31m b\ud800\r\n\u202e café \U0001f44d")
+    assert str(error) == "a\\x1b[31m b\\ud800\\r\\n\\u202e café \U0001f44d"
+    (tmp_path / "\x1b[2J.ogpc").write_bytes(b"")
+    assert main(["info", str(tmp_path / "\x1b[2J.ogpc")]) != 0
+    assert "\x1b" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        "{'descr': '<f4', 'fortran_order': False, 'shape': (9999999999999999999999,), }",
+        "{'descr': '<f4', 'fortran_order': False, 'shape': (" + "1, " * 5000 + "), }",
+        "x" * 5000,
+        "{'descr': '<f4)', 'fortran_order': False, 'shape': (3, 4)), }",
+        "{'descr': '|S0', 'fortran_order': False, 'shape': (-1,), }",  # numpy.load divides by it
+        "{'descr': '|S0', 'fortran_order': False, 'shape': (1000000000000,), }",
+    ],
+)
+def test_array_headers(header):
+    data = b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header.encode() + bytes(12)
+    with pytest.raises(ValueError, match="header") as caught:
+        array_from_npy(data)
+    assert str(caught.value).isprintable()
+    assert len(str(caught.value)) < 200
+
+
+def test_text_of_characters_that_there_are_not():
+    """A str made of them breaks the interpreter."""
+    data = npy_bytes(np.array(["chair"]))
+    assert array_from_npy(data[:-4] + b"\xff\xff\x10\0")[0] == "chai\U0010ffff"
+    for last in (b"\0\0\x11\0", b"\xff\xff\xff\xff"):
+        with pytest.raises(ValueError, match="characters that there are not"):
+            array_from_npy(data[:-4] + last)
+
+
+@pytest.mark.parametrize("value", [10**400, -(10**400), 1e400, float("nan"), "y" * 3000, True, []])
+def test_numbers_of_a_pose_file(folder, tmp_path, value):
+    content = {**json.loads(valid_files("transforms.json", folder)[0]), "fl_x": value}
+    said = read_or_refused("transforms.json", tmp_path / "transforms.json", json.dumps(content).encode())
+    assert re.search(r"fl_x is .*; expected a finite number", said)
+
+
+def test_a_pose_that_overflows_is_refused():
+    pose = np.eye(4)
+    pose[:3, :3] = [[1e200, -1e200, 0], [1e200, 1e200, 0], [0, 0, 1]]  # its product with itself is inf - inf
+    with pytest.raises(SceneError, match="rigid right-handed pose"):
+        Camera(4, 4, 1.0, 1.0, 2.0, 2.0, pose)
+
+
+def test_a_scene_file_that_is_encrypted(folder, tmp_path):
+    data = bytearray(valid_files("scene.ogpc", folder)[0])
+    data[data.find(b"PK\x01\x02") + 8] |= 1
+    assert read_or_refused("scene.ogpc", tmp_path / "scene.ogpc", bytes(data))
+
+
+def test_long_names_do_not_make_long_messages(folder, tmp_path):
+    for name in ("z" * 3000, "\x1b" * 3000):
+        path = tmp_path / "scene.ogpc"
+        path.write_bytes(valid_files("scene.ogpc", folder)[0])
+        with zipfile.ZipFile(path, "a") as archive:
+            archive.writestr(name, b"")
+        with pytest.raises(BundleError) as caught:
+            read_bundle(path)
+        assert len(str(caught.value)) < LONGEST_MESSAGE + len(str(path))
+
+
+@pytest.mark.parametrize(
+    ("place", "number", "says"),
+    [
+        (10, struct.pack("<H", 14), "packed by method 14"),
+        (20, struct.pack("<I", 2**30 - 999), "claims 1073740825 bytes"),
+    ],
+)
+def test_members_of_an_npz_that_numpy_would_not_write(tmp_path, place, number, says):
+    stream = io.BytesIO()
+    np.savez(stream, names=np.array(["chair"]), vectors=_xyz(1), feature_space=np.array("fuzz"))
+    data = bytearray(stream.getvalue())
+    directory = data.find(b"PK\x01\x02")
+    data[directory + place : directory + place + len(number)] = number
+    (tmp_path / "words.npz").write_bytes(data)
+    with pytest.raises(FeatureSpaceError, match=says):
+        read_text_features(tmp_path / "words.npz")
