@@ -1,5 +1,8 @@
 """Walks a camera through the room and writes what it sees as a capture folder, with exact ground truth.
 
+The same seed gives the same room on every machine: what is drawn at random never depends on what was seen before, so
+that the one pixel in a million that a processor rounds to another object changes itself alone.
+
 The folder: ``images/`` . ``transforms.json`` (nerfstudio: camera-to-world, OpenGL axes) . ``points.ply`` (a fused
 cloud from noisy depth) . ``masks/<stem>.png`` (uint16, 0 none, ids local to the image) . ``mask_features.npz`` .
 ``text_features.npz`` . ``word_bank.npz`` . ``gt.npz`` (for scoring alone).
@@ -20,8 +23,9 @@ from og_pointcloud.bundle.vocabulary import everyday_words
 from og_pointcloud_room.features import FEATURE_SPACE, FeatureModel
 from og_pointcloud_room.furniture import CLASS_NAMES
 from og_pointcloud_room.masks import MaskNoise, propose_masks
-from og_pointcloud_room.raycast import BACKGROUND, Frame, Intrinsics, RayCaster
+from og_pointcloud_room.raycast import BACKGROUND, Frame, Intrinsics, RayCaster, Surfaces
 from og_pointcloud_room.room import Room, furnish
+from og_pointcloud_room.shapes import rotated
 
 __all__ = ["CaptureSettings", "RoomCapture", "make_capture", "write_capture"]
 
@@ -30,6 +34,10 @@ FLYING = -2
 """Source of a sample that lies on no surface: interpolated across a depth edge, or an outlier."""
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 ABSENT_WORDS = 50
+TOUCHING_M = 1e-4
+"""Two surfaces whose distances from a point differ by less are equally near."""
+PATH, CLOUD, MASKS, FEATURES, TEXTURE, WORDS = range(1, 7)
+"""Streams of random numbers, beside that of the furniture; cloud, masks and features have one a view."""
 
 
 @dataclass(frozen=True)
@@ -93,21 +101,23 @@ def make_capture(seed: int = 0, settings: CaptureSettings | None = None) -> Room
     """Furnish, walk, sense, mask and describe: the same seed and settings give the same arrays."""
     settings = settings or CaptureSettings()
     noise = MaskNoise().scaled(settings.mask_noise)
-    streams = [np.random.default_rng([seed, stream]) for stream in range(1, 7)]
-    path_rng, cloud_rng, mask_rng, feature_rng, texture_rng, word_rng = streams
     room = furnish(seed)
-    caster = RayCaster(room, texture_rng)
+    caster = RayCaster(room, _stream(seed, TEXTURE))
     intrinsics = Intrinsics(settings.width, settings.height, 0.82 * settings.width)
-    frames = tuple(caster.look(intrinsics, pose) for pose in _walk(room, caster, settings.views, path_rng))
-    xyz, rgb, source = _fused_cloud(room, frames, intrinsics, settings, cloud_rng)
-    instance, background = _ground_truth(caster, xyz, source)
+    path = _walk(room, caster.surfaces, settings.views, _stream(seed, PATH))
+    frames = tuple(caster.look(intrinsics, pose) for pose in path)
+    xyz, rgb, source = _fused_cloud(room, frames, intrinsics, settings, seed)
+    instance, background = _ground_truth(room, caster.surfaces, xyz, source)
     class_of_object = np.array([CLASS_NAMES.index(item.name) for item in room.objects], np.int32)
-    masks = tuple(propose_masks(frame.owner, noise, mask_rng) for frame in frames)
+    masks = tuple(propose_masks(frame.owner, noise, _stream(seed, MASKS, view)) for view, frame in enumerate(frames))
+    feature_rng, word_rng = _stream(seed, FEATURES), _stream(seed, WORDS)
     model = FeatureModel(len(CLASS_NAMES), feature_rng)
     looks = np.stack([model.object_look(feature_rng) for _ in room.objects])
     features = tuple(
-        _mask_features(ids, frame.owner, class_of_object, looks, model, noise.wrong_class, feature_rng)
-        for ids, frame in zip(masks, frames, strict=True)
+        _mask_features(
+            ids, frame.owner, class_of_object, looks, model, noise.wrong_class, _stream(seed, FEATURES, view)
+        )
+        for view, (ids, frame) in enumerate(zip(masks, frames, strict=True))
     )
     cls = np.where(instance >= 0, class_of_object[instance], -1).astype(np.int32)
     everyday = everyday_words()
@@ -121,10 +131,14 @@ def make_capture(seed: int = 0, settings: CaptureSettings | None = None) -> Room
     )  # fmt: skip
 
 
+def _stream(seed: int, purpose: int, *view: int) -> Random:
+    return np.random.default_rng([seed, purpose, *view])
+
+
 # The camera's path ----------------------------------------------------------------------------------------------
 
 
-def _walk(room: Room, caster: RayCaster, views: int, rng: Random) -> list[NDArray[np.float64]]:
+def _walk(room: Room, surfaces: Surfaces, views: int, rng: Random) -> list[NDArray[np.float64]]:
     """Two rounds by hand: the first along the furniture looking across, the second in the middle looking outwards.
 
     The hand goes up and down on the way, to look under and onto things, as one does when scanning a room.
@@ -145,7 +159,7 @@ def _walk(room: Room, caster: RayCaster, views: int, rng: Random) -> list[NDArra
             eye = np.array([*(0.66 * half * around), 1.45 + lift])
             target = np.array([*(-0.3 * half * around), 0.55])
         eye = eye + rng.normal(size=3) * (0.06, 0.06, 0.08)
-        while caster.clearance_m(eye) < 0.35:
+        while surfaces.distance_m(eye[None])[0] < 0.35:
             eye[:2] *= 0.9
             eye[2] = min(eye[2] + 0.03, 1.8)
         poses.append(_looking_at(eye, target + rng.normal(size=3) * 0.12, roll=rng.normal() * 0.04))
@@ -153,7 +167,7 @@ def _walk(room: Room, caster: RayCaster, views: int, rng: Random) -> list[NDArra
 
 
 def _looking_at(eye: NDArray[np.float64], target: NDArray[np.float64], roll: float) -> NDArray[np.float64]:
-    """(4, 4) camera-to-world, OpenCV axes, z up in the world."""
+    """(4, 4) camera-to-world, OpenCV axes, z up in the world; rounded to what sines of all processors agree on."""
     forward = (target - eye) / np.linalg.norm(target - eye)
     right = np.cross(forward, (0, 0, 1.0))
     right /= np.linalg.norm(right)
@@ -162,24 +176,26 @@ def _looking_at(eye: NDArray[np.float64], target: NDArray[np.float64], roll: flo
     pose[:3, 0] = np.cos(roll) * right + np.sin(roll) * down
     pose[:3, 1] = np.cos(roll) * down - np.sin(roll) * right
     pose[:3, 2], pose[:3, 3] = forward, eye
-    return pose
+    return np.round(pose * 2**32) / 2**32
 
 
 # The cloud ------------------------------------------------------------------------------------------------------
 
 
 def _fused_cloud(
-    room: Room, frames: tuple[Frame, ...], intrinsics: Intrinsics, settings: CaptureSettings, rng: Random
+    room: Room, frames: tuple[Frame, ...], intrinsics: Intrinsics, settings: CaptureSettings, seed: int
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8], NDArray[np.int32]]:
     """xyz (n, 3) float32, rgb (n, 3) uint8 and the object each point was sensed on: one noisy sample per voxel."""
-    sensed = [_sense(frame, intrinsics, settings, rng) for frame in frames]
-    xyz, rgb, source = (np.concatenate(column) for column in zip(*sensed, strict=True))
-    count = int(settings.outliers * len(xyz))
+    sensed = [_sense(frame, intrinsics, settings, _stream(seed, CLOUD, view)) for view, frame in enumerate(frames)]
+    xyz, rgb, source, in_range = (np.concatenate(column) for column in zip(*sensed, strict=True))
+    rng, count = _stream(seed, CLOUD), int(settings.outliers * len(xyz))
     anywhere = rng.uniform((-0.5, -0.5, 0), (0.5, 0.5, 1), (count, 3)) * room.size
     xyz = np.concatenate([xyz, anywhere])
     rgb = np.concatenate([rgb, rng.integers(0, 256, (count, 3), np.uint8)])
     source = np.concatenate([source, np.full(count, FLYING, np.int32)])
+    in_range = np.concatenate([in_range, np.ones(count, bool)])
     order = rng.permutation(len(xyz))
+    order = order[in_range[order]]
     cell = np.floor(xyz[order] / settings.voxel_m).astype(np.int64) + 2**19
     key = (cell[:, 0] << 40) | (cell[:, 1] << 20) | cell[:, 2]
     kept = order[np.unique(key, return_index=True)[1]]
@@ -188,8 +204,11 @@ def _fused_cloud(
 
 def _sense(
     frame: Frame, intrinsics: Intrinsics, settings: CaptureSettings, rng: Random
-) -> tuple[NDArray[np.float64], NDArray[np.uint8], NDArray[np.int32]]:
-    """Random pixels of one depth image in the world, with sensor noise and flying pixels at depth edges."""
+) -> tuple[NDArray[np.float64], NDArray[np.uint8], NDArray[np.int32], NDArray[np.bool_]]:
+    """Random pixels of one depth image in the world, with sensor noise and flying pixels at depth edges.
+
+    xyz (k, 3), rgb (k, 3), the object that each was sensed on, and whether it lies within the sensor's range.
+    """
     pixel = rng.choice(frame.depth_m.size, min(settings.samples_per_view, frame.depth_m.size), replace=False)
     window = np.ones((3, 3), np.uint8)
     near, far = cv2.erode(frame.depth_m, window).ravel()[pixel], cv2.dilate(frame.depth_m, window).ravel()[pixel]
@@ -197,20 +216,22 @@ def _sense(
     flying = (far > 1.05 * near) & (rng.uniform(size=len(pixel)) < settings.flying)
     depth_m = np.where(flying, near + rng.uniform(size=len(pixel)) * (far - near), depth_m)
     depth_m += settings.depth_noise * (0.0012 + 0.0019 * (depth_m - 0.4) ** 2) * rng.normal(size=len(pixel))
-    in_camera = intrinsics.directions().reshape(-1, 3)[pixel] * depth_m[:, None]
-    xyz = in_camera @ frame.camera_to_world[:3, :3].T + frame.camera_to_world[:3, 3]
+    in_camera = intrinsics.directions()[pixel] * depth_m[:, None]
+    xyz = rotated(in_camera, frame.camera_to_world[:3, :3]) + frame.camera_to_world[:3, 3]
     source = np.where(flying, FLYING, frame.owner.ravel()[pixel]).astype(np.int32)
-    measured = depth_m < settings.range_m
-    return xyz[measured], frame.image.reshape(-1, 3)[pixel[measured]], source[measured]
+    return xyz, frame.image.reshape(-1, 3)[pixel], source, depth_m < settings.range_m
 
 
 def _ground_truth(
-    caster: RayCaster, xyz: NDArray[np.float32], source: NDArray[np.int32]
+    room: Room, surfaces: Surfaces, xyz: NDArray[np.float32], source: NDArray[np.int32]
 ) -> tuple[NDArray[np.int32], NDArray[np.bool_]]:
-    """instance (n,) int32 and background (n,) bool: known where the ray's target and the nearest surface agree."""
-    nearest, _ = caster.nearest_owner(xyz)
-    known = nearest == source
-    return np.where(known, nearest, -1).astype(np.int32), known & (nearest == BACKGROUND)
+    """instance (n,) int32 and background (n,) bool: known where no surface is nearer than that of the ray's target."""
+    nearest_m, own_m = surfaces.distance_m(xyz), np.full(len(xyz), np.inf, np.float32)
+    for owner in np.unique(source[source != FLYING]):
+        items = room.shell if owner == BACKGROUND else (room.objects[owner],)
+        own_m[source == owner] = Surfaces(items).distance_m(xyz[source == owner])
+    known = own_m <= nearest_m + TOUCHING_M
+    return np.where(known, source, -1).astype(np.int32), known & (source == BACKGROUND)
 
 
 # Mask features --------------------------------------------------------------------------------------------------

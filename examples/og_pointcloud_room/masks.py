@@ -1,4 +1,7 @@
-"""What a mask proposer makes of a view: unnumbered, ragged, split, merged, missing and spurious masks."""
+"""What a mask proposer makes of a view: unnumbered, ragged, split, merged, missing and spurious masks.
+
+Distances and the wandering of edges are exact or elementwise here, not OpenCV's, which rounds as the processor likes.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +10,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
 
 __all__ = ["MaskNoise", "propose_masks"]
 
@@ -76,7 +80,8 @@ def _merged(regions: list[NDArray[np.bool_]], chance: float, rng: Random) -> lis
 def _split(region: NDArray[np.bool_], rng: Random) -> list[NDArray[np.bool_]]:
     """Two or three parts: the cells of random pixels of the region."""
     pixels = np.argwhere(region)
-    seeds = pixels[rng.choice(len(pixels), min(int(rng.integers(2, 4)), len(pixels)), replace=False)]
+    places = rng.uniform(size=rng.integers(2, 4))  # shares of the list, so that a pixel more moves no seed far
+    seeds = pixels[(places * len(pixels)).astype(int)]
     nearest = ((pixels[:, None] - seeds[None]) ** 2).sum(axis=2).argmin(axis=1)
     parts = []
     for cell in range(len(seeds)):
@@ -108,12 +113,27 @@ def _paint(ids: NDArray[np.uint16], region: NDArray[np.bool_], number: int, edge
     margin = int(np.ceil(3 * edge_px)) + 1
     top, bottom = max(int(rows.min()) - margin, 0), int(rows.max()) + margin + 1
     left, right = max(int(columns.min()) - margin, 0), int(columns.max()) + margin + 1
-    inside = region[top:bottom, left:right].astype(np.uint8)
-    signed_px = cv2.distanceTransform(inside, cv2.DIST_L2, 3) - cv2.distanceTransform(1 - inside, cv2.DIST_L2, 3)
-    height, width = inside.shape
-    coarse = rng.normal(size=(height // 8 + 2, width // 8 + 2)) + 0.5 * rng.normal()
-    wander_px = edge_px * np.clip(cv2.resize(coarse, (width, height), interpolation=cv2.INTER_LINEAR), -2.5, 2.5)
+    inside = region[top:bottom, left:right]
+    signed_px = np.where(inside, _distance_px(inside), -_distance_px(~inside))
+    coarse = np.clip(
+        rng.normal(size=(region.shape[0] // 8 + 2, region.shape[1] // 8 + 2)) + 0.5 * rng.normal(), -2.5, 2.5
+    )
+    wander_px = edge_px * _enlarged(coarse, np.arange(top, top + len(inside)), np.arange(left, left + inside.shape[1]))
     ids[top:bottom, left:right][signed_px > wander_px] = number
+
+
+def _distance_px(inside: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Of each pixel to the nearest one outside; as far as the picture is large where none is."""
+    return distance_transform_edt(inside) if not inside.all() else np.full(inside.shape, float(sum(inside.shape)))
+
+
+def _enlarged(coarse: NDArray[np.float64], rows: NDArray[np.int64], columns: NDArray[np.int64]) -> NDArray[np.float64]:
+    """(rows, columns) between the values of ``coarse``, which stand 8 pixels apart, by linear interpolation."""
+    (row, down), (column, right) = (np.divmod(at, 8) for at in (rows, columns))
+    down, right = down[:, None] / 8, right[None] / 8
+    upper = coarse[np.ix_(row, column)] * (1 - right) + coarse[np.ix_(row, column + 1)] * right
+    lower = coarse[np.ix_(row + 1, column)] * (1 - right) + coarse[np.ix_(row + 1, column + 1)] * right
+    return upper * (1 - down) + lower * down
 
 
 def _without_tiny(ids: NDArray[np.uint16], smallest_px: float) -> NDArray[np.uint16]:

@@ -1,29 +1,91 @@
-"""Sees the room: ray casting with Open3D, shading, and the distance from any point to the true surfaces."""
+"""Sees the room: ray casting with Open3D, shading, and the distance from any point to the true surfaces.
+
+Embree, inside Open3D, rounds as the processor likes. So it only says which triangle a ray meets; where on it is worked
+out here in float64, without matrix products, whose order of summation depends on the processor too. That makes depth,
+colour and all that follows the same on every machine, but for single pixels on an object's outline.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import zoom
 
 from og_pointcloud.errors import MissingExtraError
+from og_pointcloud_room.furniture import Item
 from og_pointcloud_room.room import Room
+from og_pointcloud_room.shapes import rotated
 
 try:
     import open3d as o3d
 except ImportError as error:
     raise MissingExtraError("open3d", "demo") from error
 
-__all__ = ["Frame", "Intrinsics", "RayCaster"]
+__all__ = ["Frame", "Hits", "Intrinsics", "RayCaster", "Surfaces"]
 
+Points = NDArray[np.float64]
 BACKGROUND = -1
 NOISE_SIDE, NOISE_STEPS = 128, 8
 """Cells along a side of the noise table, and cells to a grain of a material."""
 FILL_LIGHTS = (((0.3, -0.5, 0.8), 0.25), ((-0.8, 0.5, 0.33), 0.14), ((0.6, 0.8, 0.0), 0.08), ((0.1, 0.2, -0.97), 0.08))
 """Directions towards and strengths of the lights that cast no shadow: window, bounce from the wall, from the floor."""
+
+
+class Hits(NamedTuple):
+    """What n rays meet. part: (n,) int64 among all parts of all items, -1 for nothing; distance: (n,) float64 in
+    lengths of the ray's direction, NaN for nothing; normal: (n, 3) float64 unit, against the ray."""
+
+    part: NDArray[np.int64]
+    distance: Points
+    normal: Points
+
+
+class Surfaces:
+    """The triangles of some items. part_item: (parts,) int64, the item that each part belongs to."""
+
+    def __init__(self, items: Iterable[Item]) -> None:
+        self._scene = o3d.t.geometry.RaycastingScene()
+        owners, corners = [], []
+        for index, item in enumerate(items):
+            for part in item.parts:
+                self._scene.add_triangles(_tensor(part.vertices), _tensor(part.triangles, np.uint32))
+                owners.append(index)
+                corners.append(part.vertices[part.triangles])
+        self.part_item = np.array(owners)
+        self._first_triangle = np.cumsum([0, *map(len, corners)])
+        first, second, third = np.concatenate(corners).transpose(1, 0, 2)
+        across = np.cross(second - first, third - first)
+        self._normal = across / np.maximum(np.sqrt(_dot(across, across)), 1e-12)[:, None]
+        self._offset = _dot(self._normal, first)
+
+    def cast(self, origin: ArrayLike, directions: Points) -> Hits:
+        """The nearest surface along rays from ``origin`` (3,) in ``directions`` (n, 3)."""
+        rays = np.concatenate([np.broadcast_to(origin, directions.shape), directions], axis=1)
+        found = self._scene.cast_rays(_tensor(rays))
+        part = found["geometry_ids"].numpy().astype(np.int64)
+        missed = part >= len(self.part_item)
+        part[missed] = -1
+        triangle = self._first_triangle[part] + np.where(missed, 0, found["primitive_ids"].numpy())
+        triangle[missed] = 0
+        normal, offset = self._normal[triangle], self._offset[triangle]
+        steepness = _dot(normal, directions)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            distance = (offset - _dot(normal, np.asarray(origin))) / steepness
+        distance[missed] = np.nan
+        return Hits(part, distance, normal * -np.sign(steepness)[:, None])
+
+    def is_blocked(self, starts: Points, steps: Points) -> NDArray[np.bool_]:
+        """(n,) whether a surface lies between ``starts`` and ``starts + steps``, both (n, 3)."""
+        rays = _tensor(np.concatenate([starts, steps], axis=1))
+        return self._scene.test_occlusions(rays, tnear=0.0, tfar=1.0).numpy()
+
+    def distance_m(self, xyz: Points | NDArray[np.float32]) -> NDArray[np.float32]:
+        """(n,) metres from points (n, 3) to the nearest surface."""
+        return self._scene.compute_distance(_tensor(xyz)).numpy()
 
 
 @dataclass(frozen=True)
@@ -34,11 +96,11 @@ class Intrinsics:
     height: int
     focal_px: float
 
-    def directions(self) -> NDArray[np.float32]:
-        """(H, W, 3) ray directions in the camera's frame (OpenCV), z = 1, through pixel centres."""
+    def directions(self) -> Points:
+        """(H * W, 3) ray directions in the camera's frame (OpenCV), z = 1, through pixel centres, row by row."""
         x = (np.arange(self.width) + 0.5 - self.width / 2) / self.focal_px
         y = (np.arange(self.height) + 0.5 - self.height / 2) / self.focal_px
-        return np.stack([*np.meshgrid(x, y), np.ones((self.height, self.width))], axis=2).astype(np.float32)
+        return np.stack([*np.meshgrid(x, y), np.ones((self.height, self.width))], axis=2).reshape(-1, 3)
 
 
 @dataclass(frozen=True)
@@ -49,81 +111,58 @@ class Frame:
     image: (H, W, 3) uint8 RGB.
     """
 
-    camera_to_world: NDArray[np.float64]
+    camera_to_world: Points
     depth_m: NDArray[np.float32]
     owner: NDArray[np.int32]
     image: NDArray[np.uint8]
 
 
 class RayCaster:
-    """The room's surfaces, ready to be looked at."""
+    """The room under a ceiling light. surfaces: of its objects, then of its shell."""
 
     def __init__(self, room: Room, rng: np.random.Generator) -> None:
-        self._room = room
-        self._light = np.array([0.15 * room.size[0], -0.1 * room.size[1], 0.92 * room.size[2]], np.float32)
-        self._noise_table = _value_noise(rng)
-        self._scene = o3d.t.geometry.RaycastingScene()
-        owners, colours, seconds, grains = [], [], [], []
         items = [*room.objects, *room.shell]
-        for index, item in enumerate(items):
-            for part in item.parts:
-                self._scene.add_triangles(_tensor(part.vertices), _tensor(part.triangles, np.uint32))
-                owners.append(index if index < len(room.objects) else BACKGROUND)
-                colours.append(part.material.colour)
-                seconds.append(part.material.second)
-                grains.append(part.material.grain)
-        self._part_owner = np.array(owners, np.int32)
-        self._part_colours = np.array([colours, seconds], np.float32)
-        self._part_grain = np.array(grains, np.float32)
+        self.surfaces = Surfaces(items)
+        self._light = np.array([0.15 * room.size[0], -0.1 * room.size[1], 0.92 * room.size[2]])
+        self._noise_table = _value_noise(rng)
+        item = self.surfaces.part_item
+        self._part_owner = np.where(item < len(room.objects), item, BACKGROUND).astype(np.int32)
+        materials = [part.material for item in items for part in item.parts]
+        self._first, self._second, self._grain = (
+            np.array([getattr(material, name) for material in materials]) for name in ("colour", "second", "grain")
+        )
 
-    def look(self, intrinsics: Intrinsics, camera_to_world: NDArray[np.float64]) -> Frame:
-        """Depth, object ids and a shaded picture from one pose (OpenCV camera-to-world)."""
-        shape = (intrinsics.height, intrinsics.width)
-        pose = camera_to_world.astype(np.float32)
-        rays = np.empty((shape[0] * shape[1], 6), np.float32)
-        rays[:, :3] = pose[:3, 3]
-        rays[:, 3:] = intrinsics.directions().reshape(-1, 3) @ pose[:3, :3].T
-        hit = self._scene.cast_rays(_tensor(rays))
-        depth_m, part = hit["t_hit"].numpy(), hit["geometry_ids"].numpy()
-        if not np.isfinite(depth_m).all():
-            raise ValueError(f"{int((~np.isfinite(depth_m)).sum())} rays leave the room; expected a camera inside it")
-        xyz = rays[:, :3] + rays[:, 3:] * depth_m[:, None]
-        normals = hit["primitive_normals"].numpy()
-        normals *= -np.sign(np.einsum("nd,nd->n", normals, rays[:, 3:]))[:, None]
-        shaded = self._albedo(xyz, part) * self._light_at(xyz, normals)[:, None]
+    def look(self, intrinsics: Intrinsics, camera_to_world: Points) -> Frame:
+        """Depth, object ids and a shaded picture from one pose (OpenCV camera-to-world).
+
+        ValueError where a ray leaves the room.
+        """
+        shape, eye = (intrinsics.height, intrinsics.width), camera_to_world[:3, 3]
+        directions = rotated(intrinsics.directions(), camera_to_world[:3, :3])
+        hits = self.surfaces.cast(eye, directions)
+        if (hits.part < 0).any():
+            raise ValueError(f"{int((hits.part < 0).sum())} rays leave the room; expected a camera inside it")
+        xyz = eye + directions * hits.distance[:, None]
+        shaded = self._albedo(xyz, hits.part) * self._light_at(xyz, hits.normal)[:, None]
         image = (255 * np.sqrt(np.minimum(shaded, 1))).astype(np.uint8)
-        owner = self._part_owner[part]
-        return Frame(camera_to_world, depth_m.reshape(shape), owner.reshape(shape), image.reshape(*shape, 3))
+        depth_m = hits.distance.astype(np.float32).reshape(shape)
+        return Frame(camera_to_world, depth_m, self._part_owner[hits.part].reshape(shape), image.reshape(*shape, 3))
 
-    def nearest_owner(self, xyz: NDArray[np.float32]) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
-        """Object id (-1 for the shell) of the surface nearest to each point (n, 3), and its distance in metres."""
-        found = self._scene.compute_closest_points(_tensor(xyz))
-        distance_m = np.linalg.norm(found["points"].numpy() - xyz, axis=1)
-        return self._part_owner[found["geometry_ids"].numpy()], distance_m.astype(np.float32)
-
-    def clearance_m(self, xyz: NDArray[np.float64]) -> float:
-        """Distance from one point (3,) to the nearest surface."""
-        return float(self._scene.compute_distance(_tensor(xyz[None])).numpy()[0])
-
-    def _albedo(self, xyz: NDArray[np.float32], part: NDArray[np.uint32]) -> NDArray[np.float32]:
+    def _albedo(self, xyz: Points, part: NDArray[np.int64]) -> Points:
         """Two colours of each part's material, mixed by two octaves of value noise of its grain. (n, 3)."""
-        cell = np.floor(xyz * (NOISE_STEPS / self._part_grain[part])).astype(np.int32) % NOISE_SIDE
-        noise = self._noise_table[cell[:, 0], cell[:, 1], cell[:, 2]]
-        share = np.clip(0.5 + noise, 0, 1)[:, None]
-        first, second = self._part_colours
-        return first[part] + (second - first)[part] * share
+        cell = np.floor(xyz * (NOISE_STEPS / self._grain[part])).astype(np.int64) % NOISE_SIDE
+        share = np.clip(0.5 + self._noise_table[cell[:, 0], cell[:, 1], cell[:, 2]], 0, 1)[:, None]
+        return self._first[part] + (self._second - self._first)[part] * share
 
-    def _light_at(self, xyz: NDArray[np.float32], normals: NDArray[np.float32]) -> NDArray[np.float32]:
+    def _light_at(self, xyz: Points, normals: Points) -> Points:
         """Lambert: a ceiling light that casts shadows, fill lights and a little ambient light. (n,)."""
         start = xyz + 2e-3 * normals
         towards = self._light - start
-        rays = _tensor(np.concatenate([start, towards], axis=1))
-        lit = ~self._scene.test_occlusions(rays, tnear=0.0, tfar=1.0).numpy()
-        distance = np.sqrt(np.einsum("nd,nd->n", towards, towards))
-        facing = np.maximum(np.einsum("nd,nd->n", normals, towards), 0) / distance
-        light = 0.12 + lit * facing / (0.75 + 0.2 * distance**2)
+        distance = np.sqrt(_dot(towards, towards))
+        facing = np.maximum(_dot(normals, towards), 0) / distance
+        light = 0.12 + ~self.surfaces.is_blocked(start, towards) * facing / (0.75 + 0.2 * distance**2)
         for direction, strength in FILL_LIGHTS:
-            light += strength * np.maximum(normals @ np.array(direction, np.float32), 0)
+            light += strength * np.maximum(_dot(normals, np.array(direction)), 0)
         return light
 
 
@@ -134,6 +173,11 @@ def _value_noise(rng: np.random.Generator) -> NDArray[np.float32]:
         lattice = rng.uniform(-strength, strength, (NOISE_SIDE // steps,) * 3).astype(np.float32)
         octaves.append(zoom(lattice, steps, order=1, mode="grid-wrap", grid_mode=True))
     return octaves[0] + octaves[1]
+
+
+def _dot(first: Points, second: Points) -> Points:
+    """(n,) products of rows (n, 3), summed in one order everywhere."""
+    return first[..., 0] * second[..., 0] + first[..., 1] * second[..., 1] + first[..., 2] * second[..., 2]
 
 
 def _tensor(values: NDArray[Any], dtype: Any = np.float32) -> Any:
