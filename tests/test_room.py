@@ -2,6 +2,9 @@
 
 import hashlib
 import json
+import os
+import subprocess
+import sys
 from dataclasses import replace
 from functools import partial
 
@@ -32,10 +35,15 @@ def capture():
 
 
 def _digest(capture):
-    arrays = [capture.xyz, capture.rgb, capture.cls, capture.instance, capture.background, capture.text_vectors]
-    arrays += [capture.bank_vectors, capture.absent_vectors]
-    arrays += [*capture.masks, *capture.mask_features, *(frame.image for frame in capture.frames)]
+    arrays = [capture.xyz, capture.rgb, capture.cls, capture.instance, capture.background, *capture.masks]
+    for frame in capture.frames:
+        arrays += [frame.camera_to_world, frame.depth_m, frame.owner, frame.image]
     return hashlib.sha256(b"".join(np.ascontiguousarray(array).tobytes() for array in arrays)).hexdigest()
+
+
+def _sums(capture):
+    vectors = (capture.text_vectors, capture.bank_vectors, capture.absent_vectors, *capture.mask_features)
+    return [float(np.abs(rows, dtype=np.float64).sum()) for rows in vectors]
 
 
 def _tensor(values, dtype=np.float32):
@@ -58,11 +66,33 @@ def _sampled(part, rng, count=40):
 
 
 def test_a_seed_gives_one_room(capture):
-    assert _digest(make_capture(3, SMALL)) == _digest(capture)
+    again = make_capture(3, SMALL)
+    assert (_digest(again), _sums(again)) == (_digest(capture), _sums(capture))
     assert _digest(make_capture(4, SMALL)) != _digest(capture)
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
+PROCESSORS = {
+    "old": {"OPENBLAS_CORETYPE": "Nehalem", "NPY_DISABLE_CPU_FEATURES": "X86_V3 X86_V4 AVX512_ICL AVX512_SPR"},
+    "new": {"OPENBLAS_CORETYPE": "SkylakeX"},
+    "alone": {"OMP_NUM_THREADS": "1", "OPENCV_IPP": "disabled", "PYTHONHASHSEED": "7"},
+}
+"""What makes numpy, its matrix products and OpenCV round as on another x86 processor than this."""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("processor", PROCESSORS)
+def test_another_processor_gives_the_same_room(capture, processor):
+    """Down to the bit but for the features, whose sums over 512 values may end in another last digit."""
+    code = "import test_room as t; c = t.make_capture(3, t.SMALL); print(t._digest(c), *t._sums(c))"
+    paths = os.pathsep.join([os.path.dirname(__file__), *sys.path])
+    settings = {**os.environ, **PROCESSORS[processor], "PYTHONPATH": paths}
+    done = subprocess.run([sys.executable, "-W", "ignore", "-c", code], env=settings, capture_output=True, check=True)
+    digest, *sums = done.stdout.split()
+    assert digest.decode() == _digest(capture)
+    np.testing.assert_allclose([float(value) for value in sums], _sums(capture), rtol=1e-5)
+
+
+@pytest.mark.parametrize("seed", range(20))
 def test_objects_do_not_interpenetrate(seed):
     room, rng = furnish(seed), np.random.default_rng(0)
     points = [np.concatenate([_sampled(part, rng) for part in item.parts]) for item in room.objects]
@@ -78,8 +108,9 @@ def test_objects_do_not_interpenetrate(seed):
                 assert depth.max() < 0.003, f"a {intruder} reaches {depth.max():.3f} m into a {item.name}"
 
 
-def test_objects_rest_on_something_and_pictures_hang_on_walls():
-    room = furnish(1)
+@pytest.mark.parametrize("seed", range(10))
+def test_objects_rest_on_something_and_pictures_hang_on_walls(seed):
+    room = furnish(seed)
     walls = _surface(room.shell[1].parts)
     for item in room.objects:
         vertices = np.concatenate([part.vertices for part in item.parts])
@@ -94,7 +125,7 @@ def test_objects_rest_on_something_and_pictures_hang_on_walls():
 
 
 def test_rooms_hold_many_objects_of_many_classes_and_differ():
-    rooms = [furnish(seed) for seed in range(4)]
+    rooms = [furnish(seed) for seed in range(20)]
     for room in rooms:
         names = [item.name for item in room.objects]
         assert 25 <= len(names) <= 45
@@ -102,7 +133,8 @@ def test_rooms_hold_many_objects_of_many_classes_and_differ():
         assert set(names) <= set(CLASS_NAMES)
         assert names.count("chair") >= 4
         assert names.count("mug") >= 2
-    assert len({len(room.objects) for room in rooms} | {room.size for room in rooms}) > 4
+    assert len({room.size for room in rooms}) == len(rooms)
+    assert len({tuple(item.name for item in room.objects) for room in rooms}) > 10
 
 
 # The capture ----------------------------------------------------------------------------------------------------
@@ -132,13 +164,17 @@ def test_truth_is_complete_and_consistent(capture):
     assert 0.0 < (~on_object & ~capture.background).mean() < 0.1, "some points are ambiguous, few are"
 
 
-def test_noise_that_carries_points_to_another_surface_makes_them_ambiguous():
+@pytest.mark.parametrize("seed", range(5))
+def test_noise_that_carries_points_to_another_surface_makes_them_ambiguous(seed):
+    """Over 24 seeds: no point without noise, 0.03 % to 0.4 % with the sensor's, 0.9 % to 5 % with five times that."""
     settings = CaptureSettings(views=3, width=160, height=120, samples_per_view=4000, flying=0, outliers=0)
-    capture = make_capture(1, settings)
-    exact = make_capture(1, replace(settings, depth_noise=0))
-    share, share_exact = (((made.cls < 0) & ~made.background).mean() for made in (capture, exact))
-    assert share_exact < 0.002, "two surfaces that touch may be equally near"
-    assert 0.005 < share < 0.05
+    exact, usual, rough = (
+        ((made.cls < 0) & ~made.background).mean()
+        for made in (make_capture(seed, replace(settings, depth_noise=noise)) for noise in (0, 1, 5))
+    )
+    assert exact == 0, "of two surfaces that touch, the one that was seen counts"
+    assert 0 < usual < 0.02
+    assert max(0.002, 2 * usual) < rough < 0.1
 
 
 def test_without_noise_points_lie_on_surfaces_and_masks_are_objects():
