@@ -7,7 +7,7 @@ import pytest
 
 from og_pointcloud.errors import SceneError
 from og_pointcloud.masking.contracts import Proposals
-from og_pointcloud.masking.levels import AGREED, INSIDE, LEVELS, PREFERENCE, SAME, VISIBLE, settle
+from og_pointcloud.masking.levels import AGREED_PREFERENCE, INSIDE, PREFERENCE, SAME, VISIBLE, settle
 
 
 def rectangle(top, left, bottom, right, size=(24, 32)):
@@ -81,7 +81,7 @@ def shown(level):
 def test_the_literal_reference(seed):
     said = random_proposals(seed)
     levels = settle(said, smallest_px=6)
-    for name in LEVELS:
+    for name in PREFERENCE:
         assert np.array_equal(shown(levels[name]), literal(said, PREFERENCE[name], 6)), name
         assert np.array_equal(levels[name].scores, said.scores[levels[name].proposals])
 
@@ -90,7 +90,7 @@ def test_a_box_of_two_halves_on_three_levels():
     whole, left, right = rectangle(4, 4, 20, 28), rectangle(4, 4, 20, 16), rectangle(4, 16, 20, 28)
     levels = settle(proposals((whole, 0.8), (left, 0.75), (right, 0.75)))
     assert np.array_equal(shown(levels["large"]) == 0, whole)
-    assert np.array_equal(shown(levels["middle"]) == 0, whole)
+    assert np.array_equal(shown(levels["medium"]) == 0, whole)
     assert np.array_equal(shown(levels["small"]) == 1, left)
     assert np.array_equal(shown(levels["small"]) == 2, right)
 
@@ -113,7 +113,7 @@ def test_levels_are_contained_in_one_another_in_a_tree(seed):
             middle = int(rng.integers(left + 2, right - 1))
             todo += [(top, left, bottom, middle), (top, middle, bottom, right)]
     levels = settle(Proposals(np.array(masks), rng.uniform(0.2, 1, len(masks)).astype(np.float32)))
-    for finer, coarser in (("small", "middle"), ("middle", "large")):
+    for finer, coarser in (("small", "medium"), ("medium", "large")):
         for mask in levels[finer].masks():
             owners = np.unique(levels[coarser].ids[mask])
             assert len(owners) == 1
@@ -156,6 +156,6 @@ def test_proposals_are_checked():
 
 def test_other_preferences_give_other_levels():
     said = random_proposals(5)
-    levels = settle(said, preferences=AGREED)
+    levels = settle(said, preferences=AGREED_PREFERENCE)
     assert list(levels) == ["agreed"]
-    assert np.array_equal(shown(levels["agreed"]), literal(said, AGREED["agreed"]))
+    assert np.array_equal(shown(levels["agreed"]), literal(said, AGREED_PREFERENCE["agreed"]))

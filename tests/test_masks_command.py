@@ -18,7 +18,7 @@ from capture_files import HEIGHT, WIDTH, make_world, write_colmap_text, write_pl
 from og_pointcloud.cli import main
 from og_pointcloud.errors import OgPointcloudError, SceneError
 from og_pointcloud.formats.capture import read_capture
-from og_pointcloud.masking import image_worker
+from og_pointcloud.masking import worker
 from og_pointcloud.masking.make_masks import PREVIEW_NAME, WORK_FOLDER, MaskSettings, make_masks
 
 ALONE = MaskSettings(encoder=None)
@@ -155,7 +155,7 @@ def test_two_passes_killed_after_the_first_go_on(tmp_path, monkeypatch):
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(image_worker, "_kept_proposals", killed)
+        patch.setattr(worker, "_kept_proposals", killed)
         with pytest.raises(KeyboardInterrupt):
             make_masks(tmp_path / "c", AGREED, say=silent)
     made = make_masks(tmp_path / "c", AGREED, say=silent)
@@ -177,11 +177,97 @@ def test_nothing_to_agree_with(tmp_path, lacking):
         assert (tmp_path / "agreed" / "masks" / file.name).read_bytes() == file.read_bytes()
 
 
+@pytest.mark.parametrize("processes", [1, 2])
+def test_images_that_are_all_done_are_only_assembled(tmp_path, monkeypatch, processes):
+    """A run that ended between its last image and `assemble`."""
+    world = make_capture(tmp_path / "c")
+    make_masks(tmp_path / "c", ALONE, tmp_path / "whole", say=silent)
+    with monkeypatch.context() as patch:
+        patch.setattr("og_pointcloud.masking.make_masks._assemble", killed)
+        with pytest.raises(KeyboardInterrupt):
+            make_masks(tmp_path / "c", ALONE, say=silent)
+    assert not (tmp_path / "c" / "masks").exists()
+    made = make_masks(tmp_path / "c", ALONE, say=silent, processes=processes)
+    assert made.done_before == made.images == 4
+    for name in world.names:
+        assert np.array_equal(ids_of(tmp_path / "c", name), ids_of(tmp_path / "whole", name))
+
+
+def killed(*_):
+    raise KeyboardInterrupt
+
+
+@pytest.mark.slow
+def test_a_worker_that_is_killed_is_one_error_and_the_same_command_goes_on(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "own_masks.py").write_text(LAST_WORDS)
+    make_capture(tmp_path / "c", 5)
+    settings = MaskSettings(proposer="python:own_masks:once_killed", encoder=None)
+    with pytest.raises(OgPointcloudError, match=r"ended early .* --processes 1 goes on"):
+        make_masks("c", settings, say=silent, processes=2)
+    made = make_masks("c", settings, say=silent)
+    assert made.images == 5
+    assert made.masks == 5
+
+
+LAST_WORDS = """
+import os, signal
+from pathlib import Path
+import numpy as np
+def once_killed(image):
+    if not Path("killed").exists():
+        Path("killed").touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return np.ones(image.shape[:2], int)
+"""
+
+
+@pytest.mark.slow
+def test_workers_end_with_their_parent(tmp_path):
+    (tmp_path / "own_masks.py").write_text(TELLS_ITS_PROCESS)
+    make_capture(tmp_path / "c", 6)
+    parent = subprocess.Popen([sys.executable, "-c", WITH_WORKERS], cwd=tmp_path)
+    deadline = time.monotonic() + 60
+    while len(list(tmp_path.glob("process-*"))) < 2 and time.monotonic() < deadline:
+        time.sleep(0.02)
+    workers = [int(file.name.split("-")[1]) for file in tmp_path.glob("process-*")]
+    os.kill(parent.pid, signal.SIGKILL)
+    parent.wait()
+    assert len(workers) == 2
+    while any(runs(worker) for worker in workers) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert not any(runs(worker) for worker in workers)
+
+
+TELLS_ITS_PROCESS = """
+import os, time
+from pathlib import Path
+import numpy as np
+def told(image):
+    Path(f"process-{os.getpid()}").touch()
+    time.sleep(0.5)
+    return np.ones(image.shape[:2], int)
+"""
+WITH_WORKERS = """
+from og_pointcloud.masking.make_masks import MaskSettings, make_masks
+if __name__ == "__main__":
+    make_masks("c", MaskSettings(proposer="python:own_masks:told", encoder=None), processes=2)
+"""
+
+
+def runs(process: int) -> bool:
+    """Whether a process is there and no zombie that nobody has waited for."""
+    try:
+        return Path(f"/proc/{process}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
+    except OSError:
+        return False
+
+
 # Long work -------------------------------------------------------------------------------------------------------
 
 SLOWLY = """
 import sys, time
-from og_pointcloud.masking import image_worker as w
+from og_pointcloud.masking import worker as w
 from og_pointcloud.masking import make_masks as m
 settle = w.settle
 def slow(*arguments):
@@ -437,7 +523,7 @@ def test_a_missing_image_and_a_missing_folder(tmp_path):
 @pytest.mark.parametrize("processes", [1, 2])
 def test_a_proposer_that_is_not_there_is_one_error(tmp_path, processes):
     make_capture(tmp_path / "c", 2)
-    settings = MaskSettings(proposer=f"onnx:{tmp_path / 'none.onnx'}", encoder=None)
+    settings = MaskSettings(proposer=f"onnx:{tmp_path / 'none.onnx'},b.onnx", encoder=None)
     with pytest.raises(OgPointcloudError, match=r"none\.onnx is no file"):
         make_masks(tmp_path / "c", settings, say=silent, processes=processes)
 
@@ -483,7 +569,7 @@ def test_a_proposer_of_ones_own(tmp_path, monkeypatch, processes):
 def test_settings_are_checked():
     with pytest.raises(OgPointcloudError, match="mask level is 'huge'"):
         MaskSettings(level="huge")
-    with pytest.raises(OgPointcloudError, match="LangSplat's files hold small, middle, large"):
+    with pytest.raises(OgPointcloudError, match="LangSplat's files hold small, medium, large"):
         MaskSettings(level="agreed", langsplat=True)
     with pytest.raises(OgPointcloudError, match="every is 0"):
         MaskSettings(every=0)
@@ -521,7 +607,7 @@ def test_light_work_takes_a_process_a_core_and_models_take_one(monkeypatch, tmp_
 
 
 def test_processes_find_one_thread_each_and_the_environment_is_as_before(monkeypatch):
-    from og_pointcloud.masking.side_by_side import one_thread_each
+    from og_pointcloud.masking.worker import one_thread_each
 
     monkeypatch.setenv("OMP_NUM_THREADS", "7")
     monkeypatch.delenv("OPENBLAS_NUM_THREADS", raising=False)

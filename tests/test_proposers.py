@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from og_pointcloud.errors import SceneError
+from og_pointcloud.masking.agreement import depth_edges, rendered_depth, smallest_mask_px, split_at_depth_edges
 from og_pointcloud.masking.automatic import (
     AutomaticMasks,
     best_boxes,
@@ -19,11 +20,9 @@ from og_pointcloud.masking.automatic import (
     stability,
     without_specks,
 )
-from og_pointcloud.masking.contracts import DepthMaskProposer, Proposals
+from og_pointcloud.masking.contracts import DepthMaskProposer, Proposals, open_proposer
 from og_pointcloud.masking.existing import CallableProposer, ExistingMasks, as_proposals, decode_rle, from_ids
 from og_pointcloud.masking.opencv import OpenCVProposer, region_tree
-from og_pointcloud.masking.opening import open_proposer
-from og_pointcloud.masking.refine import depth_edges, rendered_depth, smallest_mask_px, split_at_depth_edges
 from og_pointcloud.scene import Camera
 
 

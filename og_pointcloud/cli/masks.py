@@ -23,15 +23,15 @@ def add(commands: Any) -> None:
     parser.add_argument("capture", type=Path, metavar="CAPTURE", help="folder with images and poses")
     parser.add_argument(
         "--proposer", default="opencv", metavar="P",
-        help="opencv (default, no weights), sam:FOLDER, sam:OWNER/MODEL, onnx:DETECTOR.onnx, onnx:ENCODER.onnx,"
-        "DECODER.onnx, python:MODULE:NAME (your own), or a folder of id PNGs or COCO .json files",
+        help="opencv (default, no weights), sam:FOLDER, sam:OWNER/MODEL, onnx:ENCODER.onnx,DECODER.onnx,"
+        " python:MODULE:NAME (your own), or a folder of id PNGs or COCO .json files",
     )  # fmt: skip
     parser.add_argument(
         "--encoder", default="demo", metavar="E",
         help="demo (default; knows the demo room alone), a model's folder, OWNER/MODEL, or none: masks alone",
     )  # fmt: skip
     parser.add_argument(
-        "--level", default="middle", choices=("small", "middle", "large", "agreed"),
+        "--level", default="medium", choices=("small", "medium", "large", "agreed"),
         help="how much is one mask; agreed: fine masks on the scale that other views confirm, by the cloud",
     )  # fmt: skip
     parser.add_argument("--langsplat", action="store_true", help="write LangSplat's language_features/, all levels")

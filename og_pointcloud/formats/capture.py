@@ -152,7 +152,7 @@ def _view_names(images: Sequence[PosedImage]) -> tuple[str, ...]:
 
 
 def _with_masks(capture: Path, poses: CapturePoses) -> CapturePoses:
-    """Of a recording's frames, those with masks; all of them if none has (the error is another's to raise)."""
+    """The frames of a recording that have masks; all of them if none has, since reading the masks says that."""
     files = ((f"{MASKS_FOLDER}/{name}.png", f"{LANGUAGE_FEATURES_FOLDER}/{name}_s.npy") for name in poses.names)
     has_mask = [any((capture / file).is_file() for file in pair) for pair in files]
     if all(has_mask) or not any(has_mask):

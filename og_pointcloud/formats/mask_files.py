@@ -28,6 +28,7 @@ __all__ = [
     "MASKS_FOLDER",
     "MaskLayer",
     "as_float32",
+    "read_ids",
     "read_masks",
     "require_all",
 ]
@@ -62,7 +63,7 @@ def read_masks(capture: Path, names: Sequence[str]) -> tuple[list[MaskLayer], st
     require_all(files, "write an all-zero mask and an empty (0, D) feature array for an image without masks")
     features, feature_space = _read_features(capture / FEATURES_NAME, names)
     layers = [
-        MaskLayer(_mask_size(file), features[name], partial(_read_ids, file))
+        MaskLayer(_mask_size(file), features[name], partial(read_ids, file))
         for name, file in zip(names, files, strict=True)
     ]
     return layers, feature_space
@@ -93,7 +94,8 @@ def _mask_size(file: Path) -> tuple[int, int]:
     return header.width, header.height
 
 
-def _read_ids(file: Path) -> NDArray[np.int32]:
+def read_ids(file: Path) -> NDArray[np.int32]:
+    """A mask image, (H, W) int32: -1 outside every mask, else the row of the features (the stored id less 1)."""
     ids = decoded(file, require_cv2().IMREAD_UNCHANGED)
     if ids.ndim != 2:
         raise SceneError(f"{file} has shape {ids.shape}; expected one channel of mask ids")

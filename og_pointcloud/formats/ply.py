@@ -42,7 +42,7 @@ class _Property:
     name: str
     numpy_type: str
     length_type: str | None = None
-    """Of a list property, the type of the length that precedes the items; None for a scalar."""
+    """Type of the length that precedes the items of a list property; None for a scalar."""
 
 
 @dataclass(frozen=True)

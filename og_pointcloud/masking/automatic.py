@@ -25,7 +25,7 @@ Masks = NDArray[np.bool_]
 Floats = NDArray[np.float32]
 
 CROP_OVERLAP = 512 / 1500
-"""Of a crop's shorter side, as segment-anything has it."""
+"""Overlap of crops as a share of the shorter side, as segment-anything has it."""
 EDGE_PX = 2
 """A mask that ends so near a crop's edge, inside the image, is cut off there and is left to another crop."""
 

@@ -1,16 +1,28 @@
-"""What a mask proposer and a mask encoder are: the protocols of the front end."""
+"""What the front end agrees on: proposers and encoders as protocols, the settings, and how a proposer is named."""
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud.errors import SceneError
+from og_pointcloud.errors import OgPointcloudError, SceneError
 
-__all__ = ["DepthMaskProposer", "MaskEncoder", "MaskProposer", "Proposals"]
+__all__ = [
+    "AGREED", "LEVELS", "DepthMaskProposer", "MaskEncoder", "MaskProposer", "MaskSettings", "Proposals",
+    "open_proposer",
+]  # fmt: skip
+
+LEVELS = ("small", "medium", "large")
+"""How much is one mask, as SAM and LangSplat call it."""
+AGREED = "agreed"
+"""The level on which other views confirm proposals (`agreement`)."""
+IMAGES_A_PROCESS = 8
+"""A process takes a second or two to begin: with fewer images each it saves nothing."""
 
 
 @dataclass(frozen=True)
@@ -74,3 +86,83 @@ class DepthMaskProposer(Protocol):
     def propose_with_depth(self, image: NDArray[np.uint8], depth: NDArray[np.float32] | None) -> Proposals:
         """depth: (H, W) float32 along the optical axis, any unit, 0 where it is not known; None: there is none."""
         ...
+
+
+@dataclass(frozen=True)
+class MaskSettings:
+    """How masks are made; what changes one of these starts anew.
+
+    proposer: see `open_proposer`, or a folder of masks. encoder: see `encoders.open_encoder`; None: masks alone, with
+    zero features. level: small, medium or large, for ``masks/`` (LangSplat's files have all); or agreed: all images
+    are proposed for first, and proposals count by how far other views confirm them (`agreement`).
+    longest_side: larger images are shrunk to this; masks have the shrunk size.
+    seconds_per_image: where SAM stops adding prompts. use_depth: colour and the points' depth, where the proposer
+    takes it. split: masks are cut at depth edges. drop_tiny: masks that the points do not resolve are dropped
+    (a proposer that makes none, such as opencv, then need not read the cloud).
+    every: of so many images one is used. enough_views: images are left out whose content so many others show.
+    """
+
+    proposer: str = "opencv"
+    encoder: str | None = "demo"
+    level: str = "medium"
+    langsplat: bool = False
+    longest_side: int = 1024
+    seconds_per_image: float | None = None
+    use_depth: bool = False
+    split: bool = False
+    drop_tiny: bool = False
+    every: int = 1
+    enough_views: int | None = None
+    download: bool = False
+
+    def __post_init__(self) -> None:
+        if self.level not in (*LEVELS, AGREED):
+            raise OgPointcloudError(f"mask level is '{self.level}'; expected one of {', '.join(LEVELS)}, {AGREED}")
+        if self.langsplat and self.level == AGREED:
+            raise OgPointcloudError(f"mask level is '{self.level}'; LangSplat's files hold {', '.join(LEVELS)}")
+        if self.every < 1 or self.longest_side < 16:
+            raise OgPointcloudError(
+                f"every is {self.every} and longest_side {self.longest_side}; expected at least 1 and 16"
+            )
+
+    @property
+    def needs_points(self) -> bool:
+        """Whether the cloud is read: a proposer of colour alone needs none."""
+        return self.use_depth or self.split or self.drop_tiny or self.level == AGREED
+
+    def processes_for(self, images: int) -> int:
+        """How many processes to use where nobody says: a core each, but one alone for models that fill memory and
+        cores by themselves."""
+        light = (self.proposer == "opencv" or Path(self.proposer).is_dir()) and self.encoder in (None, "demo")
+        return min(os.cpu_count() or 1, max(1, images // IMAGES_A_PROCESS)) if light else 1
+
+
+def open_proposer(text: str, *, seconds_per_image: float | None = None, download: bool = False) -> MaskProposer:
+    """``opencv``; ``sam:FOLDER`` or ``sam:OWNER/MODEL``; ``onnx:ENCODER,DECODER``, SAM as two ONNX files;
+    ``python:MODULE:NAME``, a function or proposer of the user's own (`existing.own_proposer`).
+
+    seconds_per_image: where SAM stops adding prompts; None: never. download: let transformers fetch the model.
+    Nothing is downloaded otherwise. SceneError names what is known. A folder of masks is no proposer of this kind: it
+    goes by the image's name (`existing.ExistingMasks`).
+    """
+    kind, _, name = text.partition(":")
+    if text == "opencv":
+        from og_pointcloud.masking.opencv import OpenCVProposer
+
+        return OpenCVProposer()
+    if kind == "sam" and name:
+        from og_pointcloud.masking.sam import open_sam
+
+        return open_sam(name, seconds_per_image=seconds_per_image, download=download)
+    if kind == "onnx" and name:
+        from og_pointcloud.masking.onnx import open_onnx
+
+        return open_onnx([Path(part) for part in name.split(",")], seconds_per_image=seconds_per_image)
+    if kind == "python" and name:
+        from og_pointcloud.masking.existing import own_proposer
+
+        return own_proposer(name)
+    raise SceneError(
+        f"proposer is '{text}'; expected opencv, sam:FOLDER, sam:OWNER/MODEL, "
+        "onnx:ENCODER.onnx,DECODER.onnx, python:MODULE:NAME, or a folder of id PNGs or COCO JSON files"
+    )

@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
-import importlib
+import importlib.util
 import json
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.errors import SceneError
-from og_pointcloud.formats.images import MAX_PIXELS, decoded, png_header, require_cv2, without_suffix
+from og_pointcloud.formats.images import MAX_PIXELS, png_header, require_cv2, without_suffix
+from og_pointcloud.formats.mask_files import read_ids
 from og_pointcloud.masking.contracts import MaskProposer, Proposals
 
 __all__ = ["CallableProposer", "ExistingMasks", "as_proposals", "decode_rle", "from_ids", "own_proposer", "read_json"]
@@ -79,21 +81,21 @@ class CallableProposer:
 
 
 def own_proposer(place: str) -> MaskProposer:
-    """What ``MODULE:NAME`` holds: a function as of `CallableProposer`, a proposer, or a class of proposers, which is
-    called without arguments. The module is looked for in the working directory too. SceneError where it is not there.
+    """What ``MODULE:NAME`` holds: a function as `CallableProposer` takes it, a proposer, or a class of proposers, which
+    is called without arguments. SceneError where it is not there.
+
+    MODULE is the file ``MODULE.py`` in the working directory (dots are folders), else a module that Python finds. The
+    import path stays as it is: a file that imports its neighbours needs their folder in PYTHONPATH.
     """
     module, _, name = place.partition(":")
-    if not name:
+    if not name or not all(part.isidentifier() for part in module.split(".")):
         raise SceneError(f"the proposer is 'python:{place}'; expected python:MODULE:NAME")
-    sys.path.insert(0, str(Path.cwd()))
     try:
-        found = getattr(importlib.import_module(module), name)
-    except (ImportError, AttributeError, ValueError) as error:
+        found = getattr(_module(module), name)
+    except (ImportError, AttributeError) as error:
         raise SceneError(
-            f"no proposer 'python:{place}' ({error}); expected a name in a module that Python finds from here"
+            f"no proposer 'python:{place}' ({error}); expected a name in {module}.py here, or in an installed module"
         ) from error
-    finally:
-        sys.path.remove(str(Path.cwd()))
     made = found() if isinstance(found, type) else found
     if hasattr(made, "propose") and hasattr(made, "name"):
         return made
@@ -102,6 +104,19 @@ def own_proposer(place: str) -> MaskProposer:
     raise SceneError(
         f"'python:{place}' is a {type(made).__name__}; expected a function, or an object with propose and name"
     )
+
+
+def _module(name: str) -> ModuleType:
+    file = Path.cwd().joinpath(*name.split(".")).with_suffix(".py")
+    if not file.is_file():
+        return importlib.import_module(name)
+    private = f"_og_pointcloud_proposer.{name}"  # a file called numpy.py takes nobody's place
+    spec = importlib.util.spec_from_file_location(private, file)
+    assert spec is not None
+    assert spec.loader is not None
+    module = sys.modules[private] = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
 
 
 @dataclass(frozen=True)
@@ -116,7 +131,7 @@ class ExistingMasks:
         """The masks of one image, resized to ``shape`` (H, W). SceneError where it has none."""
         png, single = self.folder / f"{image_name}.png", self.folder / f"{image_name}.json"
         if png.is_file():
-            return _resized(_read_ids(png), shape)
+            return _resized(from_ids(_read_ids(png), none=-1), shape)
         if single.is_file():
             return _resized(_from_annotations(_annotations(read_json(single)), str(single)), shape)
         stem = image_name.rsplit("/", 1)[-1]
@@ -253,14 +268,11 @@ def read_json(file: Path) -> Any:
         raise SceneError(f"{file} is not valid JSON ({error}): export it again") from None
 
 
-def _read_ids(file: Path) -> Proposals:
+def _read_ids(file: Path) -> NDArray[np.int32]:
     header = png_header(file)
     if header is None or header.color_type not in (0, 3) or header.bit_depth not in (8, 16):
         raise SceneError(f"{file} is no grey PNG of 8 or 16 bit; expected mask ids (0 none, 1..M)")
-    ids = decoded(file, require_cv2().IMREAD_UNCHANGED)
-    if ids.ndim != 2:
-        raise SceneError(f"{file} has shape {ids.shape}; expected one channel of mask ids")
-    return from_ids(ids.astype(np.int32))
+    return read_ids(file)
 
 
 def _resized(proposals: Proposals | None, shape: tuple[int, int]) -> Proposals:

@@ -1,9 +1,9 @@
-"""Overlapping proposals -> one id map per level: small, middle and large; and agreed, where other views were asked.
+"""Overlapping proposals -> one id map per level: small, medium and large; and agreed, where other views were asked.
 
 Proposals that nearly coincide become one, the better scored. What lies inside another is its child: a forest. A level
 is a cut through the forest: a mask is used instead of its parts where its area times its score is more than what the
 best choice among its parts adds up to, times what the level asks for (`PREFERENCE`). A level that asks for less cuts
-higher or equally high everywhere, so a small mask lies in a middle one and that in a large one. Where the masks of one
+higher or equally high everywhere, so a small mask lies in a medium one and that in a large one. Where the masks of one
 level still overlap, the better score has the pixels.
 
 Everything is counted on atoms, the sets of pixels with the same masks over them: exact, and independent of the image's
@@ -18,14 +18,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud.masking.contracts import Proposals
+from og_pointcloud.masking.contracts import AGREED, Proposals
 
-__all__ = ["AGREED", "LEVELS", "Level", "settle"]
+__all__ = ["AGREED_PREFERENCE", "PREFERENCE", "Level", "settle"]
 
-PREFERENCE = {"small": 1.6, "middle": 1.0, "large": 0.6}
+PREFERENCE = {"small": 1.6, "medium": 1.0, "large": 0.6}
 """Level -> how often the parts of a mask count: more prefers parts, less prefers wholes."""
-LEVELS = tuple(PREFERENCE)
-AGREED = {"agreed": 2.0}
+AGREED_PREFERENCE = {AGREED: 2.0}
 """The same for scores of `agreement`: wholes agree more than parts, whose borders are more of them."""
 SAME = 0.8
 """Two masks whose intersection over union is more are one."""
@@ -52,8 +51,10 @@ class Level:
 def settle(
     proposals: Proposals, smallest_px: int = 1, preferences: Mapping[str, float] = PREFERENCE
 ) -> dict[str, Level]:
-    """A map for each of `LEVELS`, or of other preferences. smallest_px: masks that show fewer pixels are left out.
-    Same input, same output."""
+    """A map for each level of `PREFERENCE`, or of other preferences; the same input gives the same maps.
+
+    smallest_px: masks that show fewer pixels are left out.
+    """
     atom_of_pixel, member, area_px = _atoms(proposals.masks)
     order = np.lexsort((member @ area_px, -proposals.scores.astype(np.float64)))  # the better, then the smaller
     member, scores = member[order], proposals.scores[order].astype(np.float64)

@@ -20,29 +20,33 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from og_pointcloud.errors import OgPointcloudError, SceneError
-from og_pointcloud.formats.mask_files import UNKNOWN_SPACE
+from og_pointcloud.formats.atomic import replacing
+from og_pointcloud.formats.images import require_cv2
+from og_pointcloud.formats.langsplat import LANGUAGE_FEATURES_FOLDER
+from og_pointcloud.formats.mask_files import FEATURES_NAME, MASKS_FOLDER, UNKNOWN_SPACE
+from og_pointcloud.formats.nerfstudio import TRANSFORMS_NAMES
 from og_pointcloud.masking.agreement import ProposedPoints, agreement, rescored
-from og_pointcloud.masking.contact_sheet import write_contact_sheet
-from og_pointcloud.masking.image_worker import ImageTask, read_work
-from og_pointcloud.masking.levels import AGREED
-from og_pointcloud.masking.mask_files import (
-    WORK_FOLDER,
-    assemble,
-    made_before,
-    make_capture_of,
-    refuse_foreign,
-    write_made,
+from og_pointcloud.masking.contracts import AGREED, MaskSettings
+from og_pointcloud.masking.photographs import (
+    Photograph,
+    choose_by_coverage,
+    read_cloud,
+    read_photographs,
+    write_contact_sheet,
 )
-from og_pointcloud.masking.photographs import Photograph, choose_by_coverage, read_cloud, read_photographs
-from og_pointcloud.masking.settings import MaskSettings
-from og_pointcloud.masking.side_by_side import results
+from og_pointcloud.masking.worker import ImageTask, read_work, results
 
 __all__ = ["MaskSettings", "MasksMade", "make_masks"]
 
 VERSION = 1
-"""Of what an image's work file holds; files of another are made again."""
+"""Counts changes of what an image's work file holds; files of another version are made again."""
+WORK_FOLDER = "masks.work"
+MADE_NAME = "made.json"
+LANGSPLAT_LEVELS = ("medium", "small", "medium", "large")
+"""The levels that stand for LangSplat's: default, small, medium, large."""
 PREVIEW_NAME = "masks_preview.png"
 PREVIEW_IMAGES = 6
 REPORT_SECONDS = 10.0
@@ -85,24 +89,24 @@ def make_masks(
     settings, start = settings or MaskSettings(), time.perf_counter()
     capture = Path(capture)
     target = capture if output is None else Path(output)
-    apart = target.resolve() != capture.resolve()
+    separate = target.resolve() != capture.resolve()
     photographs = read_photographs(capture)
-    settings = _possible(settings, capture, len(photographs), say)
+    settings = _with_possible_level(settings, capture, len(photographs), say)
     chosen = _chosen(capture, photographs, settings)
-    left_out = _left_out(photographs, chosen, settings, apart, say)
-    refuse_foreign(target, settings, overwrite)
+    left_out = _left_out(photographs, chosen, settings, separate, say)
+    _refuse_foreign(target, settings, overwrite)
     work = target / WORK_FOLDER / _fingerprint(settings)
     tasks = [ImageTask(photograph, work / _work_name(photograph)) for photograph in chosen]
     key = _digest([str(task.work_file.relative_to(target)) for task in tasks])
-    made, done_before = None if overwrite else made_before(target, settings, tasks, key), len(tasks)
+    made, done_before = None if overwrite else _made_before(target, settings, tasks, key), len(tasks)
     if made:
         say(f"all {len(tasks)} images have these masks already: nothing to do (--overwrite makes them again)")
     else:
         work.mkdir(parents=True, exist_ok=True)
         done_before = sum(task.work_file.exists() for task in tasks)
         made = _make(capture, target, settings, tasks, processes or settings.processes_for(len(tasks)), key, say)
-    if apart:
-        make_capture_of(capture, target, chosen)  # poses may be new
+    if separate:
+        _make_capture_of(capture, target, chosen)  # poses may be new
     space = str(made.get("feature_space", UNKNOWN_SPACE))
     return MasksMade(target, len(tasks), done_before, made["masks"], left_out, space, time.perf_counter() - start)
 
@@ -117,9 +121,9 @@ def _chosen(capture: Path, photographs: Sequence[Photograph], settings: MaskSett
     return [chosen[index] for index in choose_by_coverage(capture, chosen, settings.enough_views)]
 
 
-def _possible(settings: MaskSettings, capture: Path, images: int, say: Say) -> MaskSettings:
+def _with_possible_level(settings: MaskSettings, capture: Path, images: int, say: Say) -> MaskSettings:
     """Without other views or a cloud nothing can agree: the small level is then nearest to it."""
-    if settings.level not in AGREED:
+    if settings.level != AGREED:
         return settings
     reason = "there is one image" if images == 1 else ""
     try:
@@ -139,12 +143,12 @@ def _reason(settings: MaskSettings) -> str:
 
 
 def _left_out(
-    photographs: Sequence[Photograph], chosen: Sequence[Photograph], settings: MaskSettings, apart: bool, say: Say
+    photographs: Sequence[Photograph], chosen: Sequence[Photograph], settings: MaskSettings, separate: bool, say: Say
 ) -> tuple[str, ...]:
     """Names of the images that are not used, which needs a folder of its own."""
     used = {photograph.name for photograph in chosen}
     names = tuple(photograph.name for photograph in photographs if photograph.name not in used)
-    if names and not apart:
+    if names and not separate:
         raise OgPointcloudError(
             f"{len(names)} of {len(photographs)} images would be left out, but the pose file names them all; "
             "expected a folder for a capture of the others (-o DIR)"
@@ -184,12 +188,12 @@ def _make(
 ) -> dict[str, Any]:
     """Masks of all images, in one pass or two, and what the record says of them."""
     _work_through(capture, settings, tasks, processes, target, say)
-    if settings.level in AGREED:
+    if settings.level == AGREED:
         tasks = _confirmed(tasks, say)
         _work_through(capture, settings, tasks, processes, target, say)
-    masks, space = assemble(target, settings, tasks)
+    masks, space = _assemble(target, settings, tasks)
     made = {"key": key, "masks": masks, "feature_space": space}
-    write_made(target, settings, tasks, **made)
+    _write_made(target, settings, tasks, **made)
     shutil.rmtree(target / WORK_FOLDER)
     return made
 
@@ -215,7 +219,8 @@ def _work_through(
         now = time.perf_counter()
         if now - last_said > REPORT_SECONDS or count == len(waiting):
             each = (now - start) / count
-            say(f"{len(done)} of {len(tasks)} images, {each:.1f} s each, {_spoken(each * (len(waiting) - count))} left")
+            left = _duration(each * (len(waiting) - count))
+            say(f"{len(done)} of {len(tasks)} images, {each:.1f} s each, {left} left")
             last_said = now
     if broken:
         more = f" (and {len(broken) - 1} more)" if len(broken) > 1 else ""
@@ -226,17 +231,17 @@ def _work_through(
 
 
 def _confirmed(tasks: Sequence[ImageTask], say: Say) -> list[ImageTask]:
-    """The second pass over images whose proposals are all there, with scores that all of them had a say in."""
+    """Tasks of the second pass over images whose proposals are all there, with scores from all views' agreement."""
     start = time.perf_counter()
     kept = [read_work(task.work_file, "scores", "seen", "inside") for task in tasks]
     views = [ProposedPoints(work["seen"], work["inside"]) for work in kept]
     agreed = agreement(views, 1 + max((int(view.seen.max(initial=-1)) for view in views), default=0))
-    told = np.concatenate(agreed)
-    told = told[~np.isnan(told)]
-    usual = float(np.median(told)) if len(told) else 1.0
+    known = np.concatenate(agreed)
+    known = known[~np.isnan(known)]
+    usual = float(np.median(known)) if len(known) else 1.0
     say(
-        f"{len(told)} of {sum(map(len, agreed))} proposals were seen by other views, which confirm them by {usual:.2f} "
-        f"(median IoU; {(time.perf_counter() - start) / len(tasks):.2f} s an image)"
+        f"{len(known)} of {sum(map(len, agreed))} proposals were seen by other views, which confirm them by "
+        f"{usual:.2f} (median IoU; {(time.perf_counter() - start) / len(tasks):.2f} s an image)"
     )
     everyone = _digest(sorted(task.work_file.name for task in tasks))
     return [
@@ -250,7 +255,7 @@ def _confirmed(tasks: Sequence[ImageTask], say: Say) -> list[ImageTask]:
     ]
 
 
-def _spoken(seconds: float) -> str:
+def _duration(seconds: float) -> str:
     return (
         f"{seconds:.0f} s"
         if seconds < 100
@@ -266,3 +271,108 @@ def _write_preview(target: Path, settings: MaskSettings, tasks: Sequence[ImageTa
         for task in tasks
     ]
     write_contact_sheet(target / PREVIEW_NAME, pictures)
+
+
+# The files that masks end in, and the record by which the next run knows them -------------------------------------
+
+
+def _folder(target: Path, settings: MaskSettings) -> Path:
+    return target / (LANGUAGE_FEATURES_FOLDER if settings.langsplat else MASKS_FOLDER)
+
+
+def _refuse_foreign(target: Path, settings: MaskSettings, overwrite: bool) -> None:
+    """OgPointcloudError where masks or features of somebody else would be replaced."""
+    folder = _folder(target, settings)
+    features = target / FEATURES_NAME
+    if overwrite or (folder / MADE_NAME).is_file():
+        return
+    found = folder if folder.is_dir() and any(folder.iterdir()) else features
+    if found.exists():
+        raise OgPointcloudError(
+            f"{found} was not made by this command and would be replaced; expected none: give another folder (-o DIR), "
+            "or --overwrite"
+        )
+
+
+def _made_before(target: Path, settings: MaskSettings, tasks: Sequence[ImageTask], key: str) -> dict[str, Any] | None:
+    """The record of a run that made the same masks of the same images, if all its files are still there."""
+    folder = _folder(target, settings)
+    try:
+        made = json.loads((folder / MADE_NAME).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    endings = ("_s.npy", "_f.npy") if settings.langsplat else (".png",)
+    files = [folder / f"{task.photograph.name}{ending}" for task in tasks for ending in endings]
+    files += [] if settings.langsplat else [target / FEATURES_NAME]
+    same = isinstance(made, dict) and made.get("key") == key and isinstance(made.get("masks"), int)
+    return made if same and all(file.is_file() for file in files) else None
+
+
+def _assemble(target: Path, settings: MaskSettings, tasks: Sequence[ImageTask]) -> tuple[int, str]:
+    """Work files -> the capture's files. Number of masks on the level of `settings`, and the feature space."""
+    folder = _folder(target, settings)
+    folder.mkdir(parents=True, exist_ok=True)
+    _write_made(target, settings, tasks)  # first: killed here, the next run knows the folder as ours, but not as whole
+    write = _write_langsplat if settings.langsplat else _write_mask_image
+    features: dict[str, Any] = {}
+    masks, space = 0, UNKNOWN_SPACE
+    for task in tasks:
+        work = read_work(task.work_file)
+        space, rows = str(work["feature_space"]), work[f"{settings.level}_features"]
+        masks += len(rows)
+        features[task.photograph.name] = rows
+        write(folder / task.photograph.name, work, settings.level)
+    if settings.langsplat:
+        with replacing(folder / "feature_space.txt") as file:
+            file.write(f"{space}\n".encode())
+    else:
+        with replacing(target / FEATURES_NAME) as file:
+            np.savez(file, feature_space=np.array(space), **features)
+    return masks, space
+
+
+def _write_made(target: Path, settings: MaskSettings, tasks: Sequence[ImageTask], **record: Any) -> None:
+    """record: what a run leaves that came to its end."""
+    made = {"made_by": "og-pointcloud masks", **asdict(settings), "images": len(tasks), **record}
+    _write_json(_folder(target, settings) / MADE_NAME, made)
+
+
+def _write_mask_image(stem: Path, work: dict[str, NDArray[Any]], level: str) -> None:
+    """``<stem>.png``: 0 outside every mask, else the row of the features + 1."""
+    stem.parent.mkdir(parents=True, exist_ok=True)
+    png = require_cv2().imencode(".png", (work[f"{level}_ids"] + 1).astype(np.uint16))[1]
+    with replacing(stem.with_name(f"{stem.name}.png")) as file:
+        file.write(png.tobytes())
+
+
+def _write_langsplat(stem: Path, work: dict[str, NDArray[Any]], _: str) -> None:
+    """``<stem>_s.npy`` (4, H, W) float32 of ids that count on from level to level, ``<stem>_f.npy`` (M, D) float16."""
+    stem.parent.mkdir(parents=True, exist_ok=True)
+    rows = [work[f"{level}_features"] for level in LANGSPLAT_LEVELS]
+    firsts = np.cumsum([0, *map(len, rows[:-1])])
+    maps = [work[f"{level}_ids"] for level in LANGSPLAT_LEVELS]
+    ids = np.stack([np.where(level >= 0, level + first, -1) for level, first in zip(maps, firsts, strict=True)])
+    for ending, array in (("_s", ids.astype(np.float32)), ("_f", np.concatenate(rows))):
+        with replacing(stem.with_name(f"{stem.name}{ending}.npy")) as file:
+            np.save(file, array, allow_pickle=False)
+
+
+def _make_capture_of(capture: Path, target: Path, chosen: Sequence[Photograph]) -> None:
+    """Poses of the chosen images, and links to all else that the capture has and the target lacks."""
+    kept = {photograph.path for photograph in chosen}
+    for source in sorted(capture.resolve().iterdir()):
+        if source.name in (MASKS_FOLDER, FEATURES_NAME, LANGUAGE_FEATURES_FOLDER, WORK_FOLDER):
+            continue
+        place = target / source.name
+        if source.name in TRANSFORMS_NAMES:
+            content = json.loads(source.read_text(encoding="utf-8"))
+            frames = content["frames"]
+            content["frames"] = [frame for frame in frames if frame["file_path"].replace("\\", "/") in kept]
+            _write_json(place, content)
+        elif not place.exists():
+            place.symlink_to(source)
+
+
+def _write_json(path: Path, value: dict[str, Any]) -> None:
+    with replacing(path) as file:
+        file.write(json.dumps(value, indent=1).encode() + b"\n")

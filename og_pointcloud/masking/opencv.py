@@ -33,7 +33,7 @@ WORKING_SIDE = 480
 FEWEST_PIXELS = 8
 """An image whose shorter side is less shows nothing."""
 GRAPH_SIGMA, GRAPH_K = 0.6, 15.0
-"""Of the graph segmentation: blur in pixels, and how large superpixels are; fine, since merging comes after."""
+"""Blur of the graph segmentation in pixels, and how large superpixels are; fine, since merging comes after."""
 SMALLEST_SUPERPIXEL = 1e-4
 """Share of the image."""
 CELL_SHARE = 1 / 40
@@ -53,7 +53,7 @@ SMALL_REGION = 4e-3
 NOISE = 5.0
 """Distances below this say nothing: it is added to both sides of the score's ratio."""
 SMALLEST_SHARE, LARGEST_SHARE = 4e-4, 0.6
-"""Of the image's pixels: smaller is no thing that a word names, larger is the surroundings."""
+"""Shares of the image's pixels: smaller is no thing that a word names, larger is the surroundings."""
 TYPICAL_SHARE = 6e-3
 """Scores of regions much smaller than this share are lowered: of two that last alike the larger is the thing."""
 LEAST_SCORE = 0.1
@@ -251,7 +251,7 @@ def _sums(labels: NDArray[np.integer], values: Floats) -> Floats:
 
 
 def _pixel_pairs(labels: Labels, lab: NDArray[np.float32], depth: NDArray[np.float32] | None) -> Pairs:
-    """Of the p pixels whose right neighbour is another region: both, and (3, p): 1, contrast, 0 to 1 for a step."""
+    """Pixels whose right neighbour is another region, p of them: both regions, (3, p): 1, contrast, step in 0 to 1."""
     row, column = np.nonzero(labels[:, :-1] != labels[:, 1:])
     last = labels.shape[1] - 1
     left, right = np.maximum(column + 1 - REACH_PX, 0), np.minimum(column + REACH_PX, last)

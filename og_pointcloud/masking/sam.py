@@ -73,14 +73,11 @@ class SamPredictor:
     def __init__(self, name: str | os.PathLike[str], *, download: bool = False) -> None:
         where = str(Path(name).expanduser()) if Path(name).expanduser().is_dir() else str(name)
         try:
-            config = transformers.AutoConfig.from_pretrained(where, local_files_only=not download)
-            if config.model_type not in CLASSES or not hasattr(transformers, CLASSES[config.model_type]):
-                raise SceneError(
-                    f"{name} is a model of type '{config.model_type}'; expected one of {', '.join(CLASSES)} that the "
-                    f"installed transformers {transformers.__version__} has"
-                )
-            model = getattr(transformers, CLASSES[config.model_type])
-            self.model: Any = model.from_pretrained(where, local_files_only=not download)
+            self.kind = _known_type(name, _read_json(where, "config.json", download))
+            # A known type is a class of transformers: no code of the folder's (auto_map) is looked at.
+            self.model: Any = getattr(transformers, CLASSES[self.kind]).from_pretrained(
+                where, local_files_only=not download, trust_remote_code=False, attn_implementation="sdpa"
+            )
         except (OSError, ValueError) as error:
             if isinstance(error, SceneError):
                 raise
@@ -90,7 +87,6 @@ class SamPredictor:
             ) from None
         self.device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
         self.model = self.model.eval().to(self.device)
-        self.kind = config.model_type
         self.preparation = _preparation(where, self.kind, self.model.config, download)
         self.size = (0, 0)
         self.encoded: dict[str, Any] = {}
@@ -140,13 +136,27 @@ def prepared(image: NDArray[np.uint8], preparation: Preparation) -> Tensor:
     return torch.nn.functional.pad(pixels, (0, preparation.side - size[1], 0, preparation.side - size[0]))
 
 
+def _known_type(name: str | os.PathLike[str], config: dict[str, Any] | None) -> str:
+    """The model_type of a config.json, if it is one of `CLASSES`."""
+    if config is None:
+        raise OSError("there is no config.json")
+    kind = config.get("model_type")
+    if kind not in CLASSES or not hasattr(transformers, CLASSES[kind]):
+        raise SceneError(
+            f"{name} is a model of type '{kind!s:.40}'; expected one of {', '.join(CLASSES)} that the installed "
+            f"transformers {transformers.__version__} has"
+        )
+    return kind
+
+
 def _preparation(where: str, kind: str, config: Any, download: bool) -> Preparation:
     """Side from the vision configuration, colours from the preprocessor's file where the model has one."""
     side = config.vision_config.image_size if kind in PADDED else _square_side(config)
     mean, std = HALVES if kind.startswith("sam3") else IMAGENET
-    said = _preprocessor_config(where, download)
-    said = said.get("image_processor", said)
-    mean, std = said.get("image_mean", mean), said.get("image_std", std)
+    stated = _read_json(where, "preprocessor_config.json", download)
+    stated = stated or _read_json(where, "processor_config.json", download) or {}
+    stated = stated.get("image_processor", stated)
+    mean, std = stated.get("image_mean", mean), stated.get("image_std", std)
     return Preparation(int(side), kind in PADDED, tuple(map(float, mean)), tuple(map(float, std)))
 
 
@@ -155,14 +165,15 @@ def _square_side(config: Any) -> int:
     return int(side[0] if isinstance(side, (list, tuple)) else side)
 
 
-def _preprocessor_config(where: str, download: bool) -> dict[str, Any]:
+def _read_json(where: str, name: str, download: bool) -> dict[str, Any] | None:
+    """A JSON file of the model, None where it has none. ValueError where it is not a JSON object."""
     from transformers.utils.hub import cached_file
 
-    for name in ("preprocessor_config.json", "processor_config.json"):
-        file = cached_file(
-            where, name, local_files_only=not download, _raise_exceptions_for_missing_entries=False,
-            _raise_exceptions_for_connection_errors=False,
-        )  # fmt: skip
-        if file is not None:
-            return json.loads(Path(file).read_text(encoding="utf-8"))
-    return {}
+    file = cached_file(
+        where, name, local_files_only=not download, _raise_exceptions_for_missing_entries=False,
+        _raise_exceptions_for_connection_errors=False,
+    )  # fmt: skip
+    content = json.loads(Path(file).read_text(encoding="utf-8")) if file is not None else None
+    if content is not None and not isinstance(content, dict):
+        raise ValueError(f"{name} holds no JSON object")
+    return content

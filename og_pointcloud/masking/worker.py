@@ -1,32 +1,59 @@
-"""What is done for one image: proposals, their maps on each level, features; all of it into one atomic work file."""
+"""What is done for one image: proposals, a map for each level, features, all in one atomic work file; and this for many
+images side by side.
+
+Each process opens its models once and serves one pipe: it takes a task, answers with what is wrong with the image, and
+takes the next. A pipe ends with the process at its other end, so a worker stops when its parent is gone, and the parent
+notices a worker that was killed. One broken image stops no other.
+"""
 
 from __future__ import annotations
 
+import os
 import zipfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from multiprocessing import get_context
+from multiprocessing.connection import Connection, wait
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud.errors import SceneError
+from og_pointcloud.errors import OgPointcloudError, SceneError
 from og_pointcloud.formats.atomic import replacing
+from og_pointcloud.formats.images import require_cv2
 from og_pointcloud.formats.mask_files import UNKNOWN_SPACE
 from og_pointcloud.formats.poses import in_local_frame
-from og_pointcloud.masking.agreement import ProposedPoints, points_of_proposals
-from og_pointcloud.masking.contracts import DepthMaskProposer, MaskEncoder, MaskProposer, Proposals
+from og_pointcloud.masking.agreement import (
+    ProposedPoints,
+    points_of_proposals,
+    rendered_depth,
+    smallest_mask_px,
+    split_at_depth_edges,
+)
+from og_pointcloud.masking.contracts import (
+    AGREED,
+    LEVELS,
+    DepthMaskProposer,
+    MaskEncoder,
+    MaskProposer,
+    MaskSettings,
+    Proposals,
+    open_proposer,
+)
 from og_pointcloud.masking.existing import ExistingMasks
-from og_pointcloud.masking.levels import AGREED, LEVELS, PREFERENCE, settle
-from og_pointcloud.masking.opening import open_proposer
+from og_pointcloud.masking.levels import AGREED_PREFERENCE, PREFERENCE, settle
 from og_pointcloud.masking.photographs import Photograph, read_cloud
-from og_pointcloud.masking.refine import rendered_depth, smallest_mask_px, split_at_depth_edges
-from og_pointcloud.masking.settings import MaskSettings
 from og_pointcloud.scene import Camera
 
-__all__ = ["AGREEMENT_POINTS", "ImageTask", "ImageWorker", "read_work"]
+__all__ = ["AGREEMENT_POINTS", "ImageTask", "read_work", "results"]
+
+THREAD_VARIABLES = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 
 AGREEMENT_POINTS = 60_000
-"""So many points of the cloud tell how far views agree."""
+"""Points of the cloud, at most, on which it is counted how far views agree."""
 
 
 class ImageTask(NamedTuple):
@@ -44,18 +71,25 @@ class ImageWorker:
     def __init__(self, capture: Path, settings: MaskSettings) -> None:
         self.settings = settings
         self.levels = LEVELS if settings.langsplat else (settings.level,)
-        self.preferences = AGREED if settings.level in AGREED else PREFERENCE
+        self.preferences = AGREED_PREFERENCE if settings.level == AGREED else PREFERENCE
         self.proposer = _open_proposer(settings)
         self.encoder = _open_encoder(settings.encoder)
         self.cloud = _SpacedCloud(capture) if settings.needs_points else None
 
-    def __call__(self, task: ImageTask) -> None:
-        """Masks of one image on the levels asked for, and their features, into its work file; in a first pass its
-        proposals."""
+    def __call__(self, task: ImageTask) -> str | None:
+        """Make the image's work file; what is wrong with the image, or None."""
+        try:
+            self._make(task)
+        except SceneError as error:
+            return str(error)
+        return None
+
+    def _make(self, task: ImageTask) -> None:
+        """Masks on the levels asked for, and their features; in a first pass the proposals."""
         image = task.photograph.read(self.settings.longest_side)
         if task.scores is not None:
             arrays = self._masks(image, *_kept_proposals(task))
-        elif self.settings.level in AGREED:
+        elif self.settings.level == AGREED:
             arrays = self._first_pass(image, task.photograph)
         else:
             arrays = self._masks(image, *self._proposals(image, task.photograph))
@@ -169,3 +203,96 @@ def _open_encoder(name: str | None) -> MaskEncoder | None:
     from og_pointcloud.masking.encoders import open_encoder
 
     return open_encoder(name)
+
+
+def results(
+    capture: Path, settings: MaskSettings, tasks: Sequence[ImageTask], processes: int
+) -> Iterator[tuple[ImageTask, str | None]]:
+    """Each task when it is done, and what is wrong with its image (None: nothing). No task is no work, and no error.
+
+    OgPointcloudError where a worker cannot open its models, or a process ends early.
+    """
+    if not tasks:
+        return
+    if processes <= 1 or len(tasks) == 1:
+        work = ImageWorker(capture, settings)
+        for task in tasks:
+            yield task, work(task)
+        return
+    waiting = list(reversed(tasks))
+    workers = _started(min(processes, len(tasks)), capture, settings)
+    try:
+        at_work = {pipe: _sent(pipe, waiting.pop()) for _, pipe in workers}
+        while at_work:
+            for pipe in wait(list(at_work)):
+                assert isinstance(pipe, Connection)
+                task, wrong = at_work.pop(pipe), _answer(pipe)
+                if waiting:
+                    at_work[pipe] = _sent(pipe, waiting.pop())
+                yield task, wrong
+    finally:
+        for process, pipe in workers:
+            pipe.close()  # the worker ends after the image that it is at
+            process.join()
+
+
+def _started(count: int, capture: Path, settings: MaskSettings) -> list[tuple[BaseProcess, Connection]]:
+    """Processes that serve the other end of a pipe each."""
+    context, workers = get_context("spawn"), []
+    with one_thread_each():
+        for _ in range(count):
+            ours, theirs = context.Pipe()
+            process = context.Process(target=_serve, args=(theirs, capture, settings), daemon=True)
+            process.start()
+            theirs.close()
+            workers.append((process, ours))
+    return workers
+
+
+def _serve(pipe: Connection, capture: Path, settings: MaskSettings) -> None:
+    """In a process of its own: answer tasks until the other end of the pipe is closed, or gone."""
+    require_cv2().setNumThreads(1)
+    with suppress(EOFError, ConnectionError, KeyboardInterrupt):
+        try:
+            work = ImageWorker(capture, settings)
+        except (OgPointcloudError, ImportError, OSError) as error:
+            pipe.recv()
+            pipe.send(OgPointcloudError(str(error)))
+            return
+        while True:
+            pipe.send(work(pipe.recv()))
+
+
+def _sent(pipe: Connection, task: ImageTask) -> ImageTask:
+    with suppress(OSError):  # a worker that has ended: waiting for its answer says so
+        pipe.send(task)
+    return task
+
+
+def _answer(pipe: Connection) -> str | None:
+    try:
+        answer = pipe.recv()
+    except (EOFError, OSError):
+        raise OgPointcloudError(
+            "a process that makes masks ended early (out of memory?); the images that are done are kept: the same "
+            "command with --processes 1 goes on behind them, and says what is wrong"
+        ) from None
+    if isinstance(answer, OgPointcloudError):
+        raise answer
+    return answer
+
+
+@contextmanager
+def one_thread_each() -> Iterator[None]:
+    """Processes started within multiply matrices on one thread: two that take two threads each on two cores are slower
+    than one alone. Read when a process imports numpy, so it must stand in the environment before."""
+    before = {name: os.environ.get(name) for name in THREAD_VARIABLES}
+    os.environ.update(dict.fromkeys(THREAD_VARIABLES, "1"))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
