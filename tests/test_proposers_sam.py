@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -166,3 +167,31 @@ def test_nothing_is_downloaded_unasked(tmp_path, monkeypatch):
     monkeypatch.setenv("HF_HUB_OFFLINE", "0")
     with pytest.raises(SceneError, match="no SAM model 'nobody/nothing'"):
         open_proposer("sam:nobody/nothing")
+
+
+@pytest.mark.parametrize("kind", ["sam", "their_own"])
+def test_no_code_of_a_models_folder_runs(folders, image, tmp_path, kind):
+    """Neither for a known model_type nor for one that only the folder's code knows."""
+    shutil.copytree(folders["sam"], tmp_path / "model")
+    ran = tmp_path / "ran"
+    (tmp_path / "model" / "theirs.py").write_text(f"open({str(ran)!r}, 'w')\nclass Config: pass\nclass Model: pass\n")
+    file = tmp_path / "model" / "config.json"
+    config = json.loads(file.read_text())
+    code = {"AutoConfig": "theirs.Config", "AutoModel": "theirs.Model", "SamModel": "theirs.Model"}
+    file.write_text(json.dumps({**config, "model_type": kind, "auto_map": code}))
+    if kind == "sam":
+        SamPredictor(tmp_path / "model").set_image(image)
+    else:
+        with pytest.raises(SceneError, match="type 'their_own'; expected one of sam"):
+            SamPredictor(tmp_path / "model")
+    assert not ran.exists()
+
+
+@pytest.mark.parametrize("content", ["[]", "{", "", '{"model_type": ["sam"]}'])
+def test_a_folder_with_another_config_is_one_error(tmp_path, content):
+    (tmp_path / "config.json").write_text(content)
+    with pytest.raises(SceneError, match="expected"):
+        SamPredictor(tmp_path)
+    (tmp_path / "config.json").unlink()
+    with pytest.raises(SceneError, match=r"there is no config.json"):
+        SamPredictor(tmp_path)

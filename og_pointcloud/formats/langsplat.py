@@ -20,8 +20,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from og_pointcloud.cloud import UNKNOWN_SPACE
 from og_pointcloud.errors import SceneError
-from og_pointcloud.formats.mask_files import UNKNOWN_SPACE, MaskLayer, as_float32, require_all
+from og_pointcloud.formats.mask_files import MaskLayer, as_float32, require_all
 from og_pointcloud.formats.npy import mapped_array
 
 __all__ = ["LANGUAGE_FEATURES_FOLDER", "LEVELS", "read_language_features"]

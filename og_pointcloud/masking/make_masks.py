@@ -22,11 +22,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from og_pointcloud.cloud import UNKNOWN_SPACE
 from og_pointcloud.errors import OgPointcloudError, SceneError
 from og_pointcloud.formats.atomic import replacing
 from og_pointcloud.formats.images import require_cv2
 from og_pointcloud.formats.langsplat import LANGUAGE_FEATURES_FOLDER
-from og_pointcloud.formats.mask_files import FEATURES_NAME, MASKS_FOLDER, UNKNOWN_SPACE
+from og_pointcloud.formats.mask_files import FEATURES_NAME, MASKS_FOLDER
 from og_pointcloud.formats.nerfstudio import TRANSFORMS_NAMES
 from og_pointcloud.masking.agreement import ProposedPoints, agreement, rescored
 from og_pointcloud.masking.contracts import AGREED, MaskSettings

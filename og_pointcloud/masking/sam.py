@@ -140,10 +140,10 @@ def _known_type(name: str | os.PathLike[str], config: dict[str, Any] | None) -> 
     """The model_type of a config.json, if it is one of `CLASSES`."""
     if config is None:
         raise OSError("there is no config.json")
-    kind = config.get("model_type")
+    kind = str(config.get("model_type"))
     if kind not in CLASSES or not hasattr(transformers, CLASSES[kind]):
         raise SceneError(
-            f"{name} is a model of type '{kind!s:.40}'; expected one of {', '.join(CLASSES)} that the installed "
+            f"{name} is a model of type '{kind:.40}'; expected one of {', '.join(CLASSES)} that the installed "
             f"transformers {transformers.__version__} has"
         )
     return kind

@@ -21,10 +21,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from og_pointcloud.cloud import UNKNOWN_SPACE
 from og_pointcloud.errors import OgPointcloudError, SceneError
 from og_pointcloud.formats.atomic import replacing
 from og_pointcloud.formats.images import require_cv2
-from og_pointcloud.formats.mask_files import UNKNOWN_SPACE
 from og_pointcloud.formats.poses import in_local_frame
 from og_pointcloud.masking.agreement import (
     ProposedPoints,
