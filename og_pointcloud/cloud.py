@@ -171,7 +171,7 @@ class WordBank:
         return self.vectors.mean(axis=0)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class LabelledCloud:
     """Points with an instance id each, and one feature row or more per instance.
 

@@ -34,7 +34,6 @@ from og_pointcloud.cloud import (
     UNOBSERVED,
     FeatureSpace,
     InstanceTable,
-    LabelledCloud,
     WordBank,
     best_of_rows,
     finite_rows,
@@ -42,7 +41,7 @@ from og_pointcloud.cloud import (
 )  # fmt: skip
 from og_pointcloud.settings import ChoosingSettings
 
-__all__ = ["Choice", "Chooser", "Reason", "chooser_of"]
+__all__ = ["Choice", "Chooser", "Reason"]
 
 RELEVANCY_TEMPERATURE = 10.0
 """Factor of the cosines in LERF's pairwise softmax: of its released code, the paper gives none."""
@@ -292,15 +291,6 @@ class Chooser:
             membership=self._membership,
             calibrated=self.bank is not None,
         )
-
-
-def chooser_of(cloud: LabelledCloud) -> Chooser:
-    """The chooser of a cloud's instances and its word bank. The cloud keeps it, so that asking again is quick."""
-    chooser = cloud.__dict__.get("_chooser")
-    if chooser is None:
-        chooser = Chooser(cloud.instances, cloud.word_bank, feature_space=cloud.feature_space)
-        cloud.__dict__["_chooser"] = chooser
-    return chooser
 
 
 def common_part(descriptors: NDArray[np.float32], same_look: float) -> NDArray[np.float32]:

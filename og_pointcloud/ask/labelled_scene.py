@@ -1,9 +1,9 @@
 """Text in, labels out: opens a .ogpc and asks it about points. numpy and onnxruntime, nothing else.
 
 ``segment`` is one statement a step: which scene, which words, which instance each point belongs to, which word fits
-each instance, if any. Words are judged by ``choosing``, against the scene's word bank if it has one. The lookup of
-points is query.onnx's; the few points close to a border, where its table does not promise the answer, are settled
-exactly by ``nearest``.
+each instance, if any. Words are judged by ``choosing``, against the scene's word bank if it has one. Points are looked
+up by query.onnx; the few close to a border, where its table does not promise the answer, are settled exactly by
+``nearest``. A scene in memory has no graph: all its points are settled so, with the same answers.
 """
 
 from __future__ import annotations
@@ -13,28 +13,30 @@ import warnings
 from collections.abc import Mapping, Sequence
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias, TypedDict
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from og_pointcloud.ask.choosing import Chooser, Reason, chooser_of
+from og_pointcloud.ask.choosing import Chooser, Reason
 from og_pointcloud.ask.hosts import carried_scene, world_points
 from og_pointcloud.ask.instances import WORDS, Instances, list_instances
+from og_pointcloud.ask.query_graph import QueryGraph
 from og_pointcloud.ask.segmentation import Segmentation
 from og_pointcloud.bundle.nearest import NONE_WITHIN_REACH, NearestPoint, surface_distance
 from og_pointcloud.bundle.read import BEYOND, NEAR, ON_SURFACE, Bundle, read_bundle
 from og_pointcloud.cloud import TOO_FAR, UNKNOWN_SPACE, FeatureSpace, LabelledCloud, Vocabulary
-from og_pointcloud.errors import BundleError, OgPointcloudError, SceneError
+from og_pointcloud.errors import OgPointcloudError, SceneError
 from og_pointcloud.text.words import Labels, TextFeatures, resolve_labels
 
 if TYPE_CHECKING:
-    from onnxruntime import InferenceSession
+    from typing_extensions import Unpack
 
 __all__ = [
     "SCENE_VARIABLE",
     "LabelledScene",
     "SceneLike",
+    "SegmentOptions",
     "Segmenter",
     "as_scene",
     "find_scene",
@@ -56,14 +58,12 @@ class LabelledScene:
 
     def __init__(self, bundle: Bundle) -> None:
         self._bundle = bundle
-        self._nearest_within: dict[float, NearestPoint] = {}
 
     @classmethod
     def from_cloud(cls, cloud: LabelledCloud) -> LabelledScene:
-        """A scene of a cloud that was never written; makes its graph, which needs the 'fit' extra and takes seconds."""
-        from og_pointcloud_export import query_model
-
-        return cls(Bundle(None, cloud, query_model(cloud).onnx, {}))
+        """A scene of a cloud that was never written. It answers as its file would, the first time without delay, many
+        points at a time more slowly: every point is searched for."""
+        return cls(Bundle(None, cloud, None, {}))
 
     @property
     def cloud(self) -> LabelledCloud:
@@ -114,26 +114,18 @@ class LabelledScene:
         """Name of the encoder that label vectors must come from."""
         return self.cloud.feature_space
 
-    @property
+    @cached_property
     def chooser(self) -> Chooser:
-        """What tells which label fits each instance, if any; calibrated if the scene has a word bank. Made once."""
-        return chooser_of(self.cloud)
+        """What tells which label fits each instance, if any; calibrated if the scene has a word bank."""
+        return Chooser(self.cloud.instances, self.cloud.word_bank, feature_space=self.feature_space)
 
-    def instance_scores(self, vectors: NDArray[np.floating]) -> NDArray[np.float32]:
-        """(K, L) float32: best cosine of an instance's descriptors with each vector, -2 for one without a descriptor.
+    def instance_scores(self, vectors: NDArray[np.floating]) -> NDArray[np.floating]:
+        """(K, L) best cosine of an instance's descriptors with each vector, -2 for one without a descriptor.
 
         vectors: (L, D) of any length. FeatureSpaceError where D is not the scene's.
         """
         self.cloud.space.require(FeatureSpace(UNKNOWN_SPACE, vectors.shape[1]), "label vectors")
-        if len(self.cloud.instances.descriptors) == 0:  # no width to hold them to
-            vectors = np.zeros((len(vectors), self._text_width), np.float32)
-        feed = {"points": np.zeros((0, 3), np.float32), "text": np.ascontiguousarray(vectors, np.float32)}
-        scores = self._ask(["instance_scores"], feed)[0]
-        if scores.shape != (len(self.cloud.instances), len(vectors)) or scores.dtype != np.float32:
-            raise BundleError(
-                f"{self.path}: query.onnx gives scores {scores.dtype} {scores.shape}: write the file again"
-            )
-        return scores
+        return self.cloud.instances.cosines(vectors)
 
     def instances_at(self, points: NDArray[np.floating], *, max_distance: float | None = None) -> NDArray[np.int32]:
         """(N,) int32: instance id of the scene's point nearest to each, -1, -2, or -3 where none is within reach.
@@ -148,19 +140,26 @@ class LabelledScene:
         self, points: NDArray[np.floating], *, max_distance: float | None = None
     ) -> tuple[NDArray[np.int32], NDArray[np.int8]]:
         """What ``instances_at`` answers, and (N,) int8: on the surface, near, or too far, as Segmentation says."""
-        points = np.asarray(points, np.float64)
-        local = np.empty(points.shape, np.float32)
-        with np.errstate(over="ignore"):  # what leaves float32 is infinitely far
-            for axis in range(3):  # three times as fast as all in one, which makes a float64 copy of its own
-                np.subtract(points[:, axis], self.cloud.origin[axis], out=local[:, axis], casting="same_kind")
+        self.check_distance(max_distance)
+        local = self._local(points)
         instances, distance = np.empty(len(local), np.int32), np.empty(len(local), np.int8)
         for start in range(0, len(local), POINTS_PER_RUN):
             run = slice(start, start + POINTS_PER_RUN)
             instances[run], distance[run] = self._look_up(local[run])
         if max_distance is not None:
-            cut = self._farther_than(max_distance, local, instances)
+            within_reach = np.flatnonzero(instances != TOO_FAR)
+            nearest = self._nearest.query(local[within_reach])
+            cut = within_reach[self._nearest.distance(local[within_reach], nearest) > max_distance]
             instances[cut], distance[cut] = TOO_FAR, BEYOND
         return instances, distance
+
+    def check_distance(self, max_distance: float | None) -> None:
+        """OgPointcloudError for a distance that is none, or beyond the reach, within which points are looked up."""
+        if max_distance is not None and not 0 < max_distance <= self.cloud.reach:
+            raise OgPointcloudError(
+                f"max_distance is {max_distance}; expected a length up to the scene's reach, {self.cloud.reach:.4g}: "
+                "points farther than that have no label"
+            )
 
     def certainty_at(self, points: NDArray[np.floating]) -> NDArray[np.float32] | None:
         """(N,) float32, the certainty of the scene's point nearest to each, 0 where none is within reach; None where
@@ -169,18 +168,30 @@ class LabelledScene:
             return self.certainty
         of_points = np.append(self.certainty, np.float32(0))
         certainty = np.zeros(len(points), np.float32)
-        finite = np.isfinite(points).all(axis=1)
-        local = (np.asarray(points, np.float64)[finite] - self.cloud.origin).astype(np.float32)
-        certainty[finite] = of_points[self._nearest.query(local)]  # NONE_WITHIN_REACH is the last
+        local = self._local(points)
+        finite = np.isfinite(local).all(axis=1)
+        certainty[finite] = of_points[self._nearest.query(local[finite])]  # NONE_WITHIN_REACH is the last
         return certainty
 
+    def _local(self, points: NDArray[np.floating]) -> NDArray[np.float32]:
+        """(N, 3) in the cloud's frame; infinite where that leaves float32."""
+        points = np.asarray(points, np.float64)
+        local = np.empty(points.shape, np.float32)
+        with np.errstate(over="ignore"):
+            for axis in range(3):  # three times as fast as all in one, which makes a float64 copy of its own
+                np.subtract(points[:, axis], self.cloud.origin[axis], out=local[:, axis], casting="same_kind")
+        return local
+
     def _look_up(self, local: NDArray[np.float32]) -> tuple[NDArray[np.int32], NDArray[np.int8]]:
-        feed = {"points": local, "text": np.zeros((0, self._text_width), np.float32)}
-        instances, distance, certain = self._ask(["instance", "distance", "certain"], feed)
-        self._check_answers(len(local), instances, distance, certain)
-        if certain.all():
-            return instances, distance
-        still_open = np.flatnonzero(~certain)
+        """Instance and distance class of each point: the graph's where it is certain, else by exact search."""
+        if self._graph is None:
+            instances, distance = np.full(len(local), TOO_FAR, np.int32), np.full(len(local), BEYOND, np.int8)
+            still_open = np.arange(len(local))
+        else:
+            instances, distance, certain = self._graph.look_up(local)
+            if certain.all():
+                return instances, distance
+            still_open = np.flatnonzero(~certain)
         still_open = still_open[np.isfinite(local[still_open]).all(axis=1)]  # the others are too far already
         nearest = self._nearest.query(local[still_open])
         instances[still_open] = np.append(self.instance_ids, np.int32(TOO_FAR))[nearest]
@@ -189,61 +200,10 @@ class LabelledScene:
         distance[still_open] = np.where(nearest == NONE_WITHIN_REACH, BEYOND, np.where(on_surface, ON_SURFACE, NEAR))
         return instances, distance
 
-    def _ask(self, outputs: list[str], feed: dict[str, NDArray[np.float32]]) -> list[NDArray[Any]]:
-        try:
-            return [np.asarray(output) for output in self._session.run(outputs, feed)]
-        except Exception as error:  # onnxruntime raises types of its own
-            raise BundleError(f"{self.path}: query.onnx fails ({_first_line(error)}): write the file again") from None
-
-    def _check_answers(
-        self, count: int, instances: NDArray[Any], distance: NDArray[Any], certain: NDArray[Any]
-    ) -> None:
-        """A foreign graph may answer anything; nothing is looked up by a number that is none of ours."""
-        kinds = [(values.shape, values.dtype) for values in (instances, distance, certain)]
-        good = kinds == [((count,), np.dtype(kind)) for kind in (np.int32, np.int8, np.bool_)]
-        if not good or (count and not (instances.min() >= TOO_FAR and instances.max() < len(self.cloud.instances))):
-            raise BundleError(f"{self.path}: query.onnx answers what is no instance of this file: write the file again")
-
-    def _farther_than(
-        self, max_distance: float, local: NDArray[np.float32], instances: NDArray[np.int32]
-    ) -> NDArray[np.int64]:
-        """Rows of points within reach, but with no cloud point within that distance."""
-        if not 0 < max_distance <= self.cloud.reach:
-            raise OgPointcloudError(
-                f"max_distance is {max_distance}; expected a length up to the scene's reach, {self.cloud.reach:.4g}: "
-                "points farther than that have no label"
-            )
-        within_reach = np.flatnonzero(instances != TOO_FAR)
-        search = self._nearest_within.get(max_distance)
-        if search is None:  # only the last one is kept: a stream asks for the same again and again
-            search = NearestPoint(self.cloud.xyz, self.cloud.spacing, max_distance)
-            self._nearest_within = {max_distance: search}
-        return within_reach[search.query(local[within_reach]) == NONE_WITHIN_REACH]
-
     @cached_property
-    def _session(self) -> InferenceSession:
-        from og_pointcloud.models import open_session
-
-        try:
-            session = open_session(self._bundle.query_onnx)
-        except Exception as error:  # onnxruntime raises types of its own for a graph that it cannot run
-            raise BundleError(
-                f"{self.path}: query.onnx does not run ({_first_line(error)}): write the file again"
-            ) from None
-        inputs = {given.name: given for given in session.get_inputs()}
-        outputs = {given.name for given in session.get_outputs()}
-        if set(inputs) != {"points", "text"} or not {"instance", "distance", "certain", "instance_scores"} <= outputs:
-            raise BundleError(
-                f"{self.path}: query.onnx takes {sorted(inputs)} and gives {sorted(outputs)}: write the file again"
-            )
-        shape = inputs["text"].shape
-        if len(shape) != 2 or not isinstance(shape[1], int):
-            raise BundleError(f"{self.path}: query.onnx takes text of shape {shape}, of no width: write the file again")
-        return session
-
-    @property
-    def _text_width(self) -> int:
-        return next(given.shape[1] for given in self._session.get_inputs() if given.name == "text")
+    def _graph(self) -> QueryGraph | None:
+        graph = self._bundle.query_onnx
+        return None if graph is None else QueryGraph(graph, self.path, len(self.cloud.instances))
 
     @cached_property
     def _nearest(self) -> NearestPoint:
@@ -262,16 +222,22 @@ def use(scene: SceneLike | None) -> LabelledScene | None:
     return _scene_in_use
 
 
+class SegmentOptions(TypedDict, total=False):
+    """Options of ``segment`` and ``Segmenter``, which says what they mean."""
+
+    text_features: TextFeatures
+    templates: Sequence[str] | None
+    negatives: Labels
+    max_distance: float | None
+
+
 def segment(
     pcd: Any,
     labels: Labels = None,
     scene: SceneLike | None = None,
     *,
-    text_features: TextFeatures = None,
-    templates: Sequence[str] | None = None,
-    negatives: Labels = None,
     pose: ArrayLike | None = None,
-    max_distance: float | None = None,
+    **options: Unpack[SegmentOptions],
 ) -> Segmentation:
     """Label the points of a cloud by words. The cloud may be of any density, a crop, noisy, or in a frame of its own.
 
@@ -281,40 +247,30 @@ def segment(
 
     pcd: an array (N, 3) of world coordinates, a cloud or mesh of Open3D, PyVista or trimesh, a geometry file; or a
         scene, a LabelledCloud or a .ogpc file, whose own points are then labelled. Rows with NaN answer unknown.
-    labels: words, found in text_features or in the scene's vocabulary (None: all of them), or encoded, if the scene's
-        text encoder is found; or name -> vector (D,).
     scene: what to ask. Left out: the scene that the cloud is or carries, else that of ``use``, else the file that the
         environment variable OG_POINTCLOUD_SCENE names.
-    text_features: a text-features .npz, or what ``read_text_features`` returned for it.
-    templates: texts with ``{}`` ("a photo of a {}"), into which words are put before they are encoded; their vectors'
-        mean counts. Left out: stored vectors, and the encoder's own templates for other words.
-    negatives: labels too, but points that they fit better are unknown.
     pose: (4, 4), takes the cloud's coordinates to the scene's world. Left out: they are world coordinates.
-    max_distance: points farther than this from the scene's cloud answer unknown; at most, and left out, its reach.
+    labels, options: as for ``Segmenter``, which asks the same of many clouds.
 
     Warns where no point gets a label, and says why. Raises OgPointcloudError and its kinds: SceneError (no cloud),
     BundleError (no scene), FeatureSpaceError (vectors of another space or width).
     """
-    pcd = as_scene(pcd) if _is_scene(pcd) else pcd
-    scene = find_scene(pcd, scene)
-    words, answers = _answers(scene, labels, text_features, templates, negatives)
-    if pcd is scene and pose is None:
-        points, instances = scene.xyz, scene.instance_ids
-        distance = np.full(len(points), ON_SURFACE, np.int8)
-    else:
-        points = _posed(pcd.xyz if isinstance(pcd, LabelledScene) else world_points(pcd), pose)
-        instances, distance = scene.look_up(points, max_distance=max_distance)
-    result = _label(scene, words, answers, points, instances, distance)
-    if reason := _why_nothing(result, scene):
-        warnings.warn(reason, stacklevel=2)
-    return result
+    return Segmenter(find_scene(pcd, scene), labels, **options)._answer(pcd, pose)
 
 
 class Segmenter:
     """The same labels for many clouds: words are scored once, and a call only looks points up.
 
     Several threads may call it at once; memory does not grow from call to call.
-    scene, labels, text_features, templates, negatives, max_distance: as for ``segment``.
+
+    scene: a loaded scene, a LabelledCloud or the path of a .ogpc file.
+    labels: words, found in text_features or in the scene's vocabulary (None: all of them), or encoded, if the scene's
+        text encoder is found; or name -> vector (D,).
+    text_features: a text-features .npz, or what ``read_text_features`` returned for it.
+    templates: texts with ``{}`` ("a photo of a {}"), into which words are put before they are encoded; their vectors'
+        mean counts. Left out: stored vectors, and the encoder's own templates for other words.
+    negatives: labels too, but points that they fit better are unknown.
+    max_distance: points farther than this from the scene's cloud answer unknown; at most, and left out, its reach.
     """
 
     def __init__(
@@ -327,14 +283,17 @@ class Segmenter:
         negatives: Labels = None,
         max_distance: float | None = None,
     ) -> None:
-        self.scene, self._max_distance = as_scene(scene), max_distance
-        self._words, self._answers = _answers(self.scene, labels, text_features, templates, negatives)
-        self._warned = False
-
-    @property
-    def names(self) -> tuple[str, ...]:
+        self.scene = scene = as_scene(scene)
+        scene.check_distance(max_distance)
+        known = (text_features, scene.vocabulary, scene.feature_space, scene.path)
+        words, against = resolve_labels(labels, *known, templates), None
+        if negatives is not None:
+            has_vectors = isinstance(negatives, (Mapping, Vocabulary))
+            against = resolve_labels(negatives, *known, None if has_vectors else templates).vectors
+        self.names = words.names
         """The labels, in the order of their numbers."""
-        return self._words.names
+        self._max_distance, self._warned = max_distance, False
+        self._choice = scene.chooser.choose(words.vectors, against)
 
     def __call__(self, points: Any, pose: ArrayLike | None = None) -> Segmentation:
         """points: (N, 3) world coordinates, or any cloud that ``segment`` takes; N may be 0.
@@ -343,12 +302,24 @@ class Segmenter:
         is then in the world too.
         Warns the first time that no point gets a label, not at every empty frame of a stream.
         """
-        points = _posed(world_points(points), pose)
-        found = self.scene.look_up(points, max_distance=self._max_distance)
-        result = _label(self.scene, self._words, self._answers, points, *found)
-        if not self._warned and (reason := _why_nothing(result, self.scene)):
+        return self._answer(points, pose)
+
+    def _answer(self, pcd: Any, pose: ArrayLike | None) -> Segmentation:
+        scene, own = self.scene, as_scene(pcd) if _is_scene(pcd) else None
+        if own is not None and own.cloud is scene.cloud and pose is None:  # its own points need no look-up
+            points, instances = scene.xyz, scene.instance_ids
+            distance = np.full(len(points), ON_SURFACE, np.int8)
+        else:
+            points = _posed(world_points(pcd) if own is None else own.xyz, pose)
+            instances, distance = scene.look_up(points, max_distance=self._max_distance)
+        labels, scores, reasons = self._choice.at(instances)
+        result = Segmentation(
+            points, labels, scores, instances, self.names, scene.path, distance, reasons, self._choice.calibrated,
+            scene.certainty_at,
+        )  # fmt: skip
+        if not self._warned and (reason := _why_nothing(result, scene)):
             self._warned = True
-            warnings.warn(reason, stacklevel=2)
+            warnings.warn(reason, stacklevel=3)  # where segment, or the segmenter, is called
         return result
 
 
@@ -386,8 +357,8 @@ def find_scene(pcd: Any, scene: SceneLike | None) -> LabelledScene:
     that of the environment; OgPointcloudError names these ways."""
     if scene is not None:
         return as_scene(scene)
-    if isinstance(pcd, LabelledScene):
-        return pcd
+    if _is_scene(pcd):
+        return as_scene(pcd)
     if (carried := carried_scene(pcd)) is not None:
         return as_scene(carried)
     if _scene_in_use is not None:
@@ -405,7 +376,7 @@ def as_scene(source: SceneLike) -> LabelledScene:
     if isinstance(source, LabelledScene):
         return source
     if isinstance(source, LabelledCloud):
-        return _scene_of_cloud(source)
+        return _scene_once(source)
     if isinstance(source, (str, os.PathLike)):
         path = Path(source).resolve()
         if not path.is_file():
@@ -423,17 +394,10 @@ def _load_once(path: Path, modified: int, size: int) -> LabelledScene:
     return load(path)
 
 
-def _scene_of_cloud(cloud: LabelledCloud) -> LabelledScene:
-    """The cloud keeps its scene, so that asking it again is quick."""
-    scene = cloud.__dict__.get("_scene")
-    if scene is None:
-        scene = LabelledScene.from_cloud(cloud)
-        cloud.__dict__["_scene"] = scene
-    return scene
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error).strip() or type(error).__name__).splitlines()[0][:200]
+@lru_cache(maxsize=2)
+def _scene_once(cloud: LabelledCloud) -> LabelledScene:
+    """The scene of a cloud in memory: asking it again is quick."""
+    return LabelledScene.from_cloud(cloud)
 
 
 def _posed(points: NDArray[np.float64], pose: ArrayLike | None) -> NDArray[np.float64]:
@@ -450,47 +414,6 @@ def _posed(points: NDArray[np.float64], pose: ArrayLike | None) -> NDArray[np.fl
         )
     with np.errstate(invalid="ignore", over="ignore"):  # rows with NaN or infinity stay such
         return points @ matrix[:3, :3].T + matrix[:3, 3]
-
-
-def _answers(
-    scene: LabelledScene,
-    labels: Labels,
-    text_features: TextFeatures,
-    templates: Sequence[str] | None,
-    negatives: Labels,
-) -> tuple[Vocabulary, Answers]:
-    """The words asked, and what they make of each instance id."""
-    known = (text_features, scene.vocabulary, scene.feature_space, scene.path)
-    words, against = resolve_labels(labels, *known, templates), None
-    if negatives is not None:
-        has_vectors = isinstance(negatives, (Mapping, Vocabulary))
-        against = resolve_labels(negatives, *known, None if has_vectors else templates).vectors
-    choice = scene.chooser.choose(words.vectors, against)
-    return words, Answers(*choice.by_id, choice.calibrated)
-
-
-class Answers(NamedTuple):
-    """Label, score and reason of each instance id (`Choice.by_id`)."""
-
-    labels: NDArray[np.int32]
-    scores: NDArray[np.float32]
-    reasons: NDArray[np.int8]
-    calibrated: bool
-
-
-def _label(
-    scene: LabelledScene,
-    words: Vocabulary,
-    answers: Answers,
-    points: NDArray[np.float64],
-    instances: NDArray[np.int32],
-    distance: NDArray[np.int8],
-) -> Segmentation:
-    # A negative instance counts from the end, where those of no instance lie.
-    return Segmentation(
-        points, answers.labels[instances], answers.scores[instances], instances, words.names, scene.path, distance,
-        answers.reasons[instances], answers.calibrated, scene.certainty_at,
-    )  # fmt: skip
 
 
 def _why_nothing(result: Segmentation, scene: LabelledScene) -> str | None:

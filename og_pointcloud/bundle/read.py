@@ -68,13 +68,13 @@ CARRIED_ENCODER = "text_encoder/"
 class Bundle:
     """What a .ogpc holds.
 
-    path: None for one that was never a file. query_onnx: the serialised graph. manifest: as read; what this library
-    uses of it is checked.
+    path, query_onnx: the file, and its serialised graph; None for a cloud that was never a file. manifest: as read;
+    what this library uses of it is checked.
     """
 
     path: Path | None
     cloud: LabelledCloud
-    query_onnx: bytes
+    query_onnx: bytes | None
     manifest: dict[str, Any]
 
 

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud.ask.choosing import chooser_of
+from og_pointcloud.ask.labelled_scene import as_scene
 from og_pointcloud.cloud import LabelledCloud, Vocabulary
 from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.evaluate.report.knobs import Setting, find_setting
@@ -188,7 +188,7 @@ def labels_of(cloud: LabelledCloud, vocabulary: Vocabulary | None) -> NDArray[np
     """(n,) the word of each point, -1 unknown; its instance where there are no words."""
     if vocabulary is None:
         return cloud.instance_ids
-    return chooser_of(cloud).choose(vocabulary.vectors).at(cloud.instance_ids)[0]
+    return as_scene(cloud).chooser.choose(vocabulary.vectors).at(cloud.instance_ids)[0]
 
 
 def digest_of(cloud: LabelledCloud) -> str:

@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud.ask.choosing import chooser_of
+from og_pointcloud.ask.labelled_scene import as_scene
 from og_pointcloud.cloud import LabelledCloud
 from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.evaluate.baselines import BASELINES, only_where_masked
@@ -138,7 +138,7 @@ class SharedFit:
         truth, vocabulary = self.subject.truth, self.subject.vocabulary
         if truth is None or vocabulary is None:
             return
-        labels, score, _ = chooser_of(cloud).choose(vocabulary.vectors).at(cloud.instance_ids)
+        labels, score, _ = as_scene(cloud).chooser.choose(vocabulary.vectors).at(cloud.instance_ids)
         certainty = None if cloud.certainty is None else cloud.certainty / 255
         labels, sureness = self._of_whole(labels), self._of_whole(sure(score, False, certainty))
         called, classes = truth.class_of(labels, vocabulary.names), truth.score(labels, vocabulary.names).classes
