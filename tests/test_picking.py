@@ -34,37 +34,25 @@ FROM_ABOVE = looking([1, 3, 2], [1, 0.7, 0.3])
 """Of the room: its floor at z = 0 and its wall at y = 0, both 2 x 2."""
 
 
-def local_spacing_plainly(cloud):
-    """Level of every point, and whether it is a stray, point by point and pair by pair."""
-    found = [picking.LEVELS] * len(cloud)
-    level = list(found)
-    for size in range(picking.LEVELS):
-        voxel = np.floor(cloud.xyz.astype(float) / (2 * cloud.spacing * 2**size))
-        pending = [i for i in range(len(cloud)) if found[i] == picking.LEVELS]
-        news = {}
-        for i in pending:
-            around = [j for j in range(len(cloud)) if np.abs(voxel[i] - voxel[j]).max() <= 1]
-            if len(around) >= picking.NEIGHBOURS:
-                news[i] = min(size, *(level[j] for j in around))
-        for i, value in news.items():
-            found[i], level[i] = size, value
-    stray = [sum(other >= own for other in found) / len(cloud) <= picking.STRAY_SHARE for own in found]
-    return [0 if value == picking.LEVELS else value for value in level], stray
+def lone_plainly(cloud):
+    """Whether each point has next to no others in the voxels around it, pair by pair."""
+    voxel = np.floor(cloud.xyz.astype(float) / (2 * cloud.spacing))
+    return [sum(np.abs(voxel[i] - voxel).max(axis=1) <= 1) < picking.LONE for i in range(len(cloud))]
 
 
 def front_points_plainly(cloud, camera):
     """front_points, written from its description for images no finer than the cloud."""
-    level, stray = local_spacing_plainly(cloud)
+    lone = lone_plainly(cloud)
     in_camera = cloud.xyz_world @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
     front = np.full((camera.height, camera.width), NO_POINT)
     for row, column in itertools.product(range(camera.height), range(camera.width)):
-        for stray_wanted in (False, True):
+        for lone_wanted in (False, True):
             covering = []
             for point, (x, y, depth) in enumerate(in_camera):
-                if depth <= cloud.spacing or stray[point] != stray_wanted:
+                if depth <= cloud.spacing or lone[point] != lone_wanted:
                     continue
                 u, v = camera.fx * x / depth + camera.cx, camera.fy * y / depth + camera.cy
-                spacing_px = np.sqrt(camera.fx * camera.fy) * cloud.spacing * 2 ** level[point] / depth
+                spacing_px = np.sqrt(camera.fx * camera.fy) * cloud.spacing / depth
                 distance = (column + 0.5 - u) ** 2 + (row + 0.5 - v) ** 2
                 if distance <= max(picking.FOOTPRINT * spacing_px, picking.HALF_DIAGONAL) ** 2:
                     covering.append((distance, point, depth))
@@ -83,10 +71,10 @@ def test_the_drawing_is_that_of_loops_over_pixels_and_points(monkeypatch):
     plain = front_points_plainly(cloud, camera)
     assert len(np.unique(plain)) > 100
     assert 0.05 < (plain == NO_POINT).mean() < 0.9
-    assert sum(local_spacing_plainly(cloud)[1]) >= 1, "a stray is drawn too"
+    assert any(lone_plainly(cloud)), "a point that floats alone is drawn too"
     assert np.array_equal(front_points(cloud, camera), plain)
-    monkeypatch.setattr(picking, "PAIRS_PER_CHUNK", 40)
-    assert np.array_equal(front_points(cloud, camera), plain), "chunks change nothing"
+    monkeypatch.setattr(picking, "PAIRS_AT_ONCE", 40)
+    assert np.array_equal(front_points(cloud, camera), plain), "bands change nothing"
 
 
 @pytest.mark.parametrize("zoom", [1, 20])
@@ -257,7 +245,7 @@ def test_words_are_ranked_as_segment_scores_them():
         assert [score for _, score in words] == sorted((score for _, score in words), reverse=True)
     hit = pick(scene, scene.xyz[np.argmax(scene.instance_ids == 1)])
     assert hit.words({"it": 3 * unit_rows(9)[2]})[0][0] == "it"
-    with pytest.raises(FeatureSpaceError, match="width 3"):
+    with pytest.raises(FeatureSpaceError, match=r"width 3"):
         hit.words({"narrow": np.ones(3)})
 
 

@@ -89,6 +89,28 @@ def test_answers_are_exact_on_tough_clouds(tmp_path, name):
     assert np.abs(result.scores - scores).max() < 1e-6
 
 
+@pytest.mark.parametrize("name", CLOUDS)
+def test_a_cloud_in_memory_answers_as_its_file_does(tmp_path, name):
+    cloud = CLOUDS[name]
+    local = queries(cloud, 500, seed=7)
+    vectors = unit_rows(3, max(cloud.instances.descriptors.shape[1], 1), seed=8)
+    words, points = dict(zip("abc", vectors, strict=True)), local.astype(np.float64) + cloud.origin
+    file = quietly(points, words, og.load(write_bundle(cloud, tmp_path / "s.ogpc")))
+    memory = quietly(points, words, runtime.LabelledScene.from_cloud(cloud))
+    for part in ("labels", "scores", "instances", "reasons"):
+        assert (getattr(file, part) == getattr(memory, part)).all(), part
+    # Of the file one table cell speaks for all points in it: it may be off by about a cell.
+    differ = file.distance != memory.distance
+    assert ((file.distance == BEYOND) == (memory.distance == BEYOND)).all()
+    true = distance_plainly(cloud, local[differ])
+    assert (np.abs(true - surface_distance(cloud.spacing, cloud.reach)) <= max(cloud.spacing, cloud.reach / 3)).all()
+
+
+def distance_plainly(cloud, points):
+    """Distance to the nearest point of the cloud, every one computed."""
+    return np.array([np.linalg.norm(cloud.xyz.astype(np.float64) - point, axis=1).min() for point in points])
+
+
 @pytest.mark.parametrize("name", [name for name in CLOUDS if "coincident" not in name and "one place" not in name])
 def test_a_point_of_the_cloud_finds_its_own_id(name):
     cloud = CLOUDS[name]
@@ -612,19 +634,18 @@ def test_a_shorter_reach_is_exact(scene):
 
 
 @pytest.mark.parametrize("name", ["room", "far outliers", "coincident points of different ids", "scattered points"])
-def test_distance_of_points_the_table_leaves_open_and_of_the_others(monkeypatch, name):
+def test_distance_of_points_the_table_leaves_open_and_of_the_others(monkeypatch, tmp_path, name):
     monkeypatch.setattr(brick_grid, "LISTS_AT_LEAST", 0)
     monkeypatch.setattr(brick_grid, "LISTS_PER_POINT", 0)
-    cloud = replace(CLOUDS[name])
-    scene = runtime.as_scene(cloud)
+    cloud = CLOUDS[name]
+    scene = og.load(write_bundle(cloud, tmp_path / "s.ogpc"))
     points = queries(cloud, 150)
     instances, distance = scene.look_up(points.astype(np.float64) + cloud.origin)
     assert (instances == instances_plainly(cloud, points)).all()
     assert ((distance == BEYOND) == (instances == TOO_FAR)).all()
     true = np.sqrt(((points.astype(np.float64)[:, None] - cloud.xyz) ** 2).sum(2)).min(1)
     # What the table leaves open is settled exactly, the distance too.
-    feed = {"points": points, "text": np.zeros((0, WIDTH), np.float32)}
-    still_open = ~scene._ask(["certain"], feed)[0] & (true <= cloud.reach)
+    still_open = ~scene._graph.look_up(points)[2] & (true <= cloud.reach)
     assert still_open.sum() > 20
     expected = np.where(true <= surface_distance(cloud.spacing, cloud.reach), ON_SURFACE, NEAR)
     assert (distance == expected)[still_open].all()

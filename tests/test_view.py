@@ -17,6 +17,7 @@ from og_pointcloud_export import write_bundle
 import og_pointcloud as og
 from og_pointcloud.cli import main
 from og_pointcloud.cloud import Vocabulary
+from og_pointcloud.formats.colors import label_colors
 from og_pointcloud.show.page import write_page
 from og_pointcloud.show.viewpoint import FOCAL, Viewpoint, choose_viewpoint
 
@@ -185,7 +186,7 @@ def test_a_picture_shows_the_labels(bundle, tmp_path, capsys):
     picture = cv2.imread(str(tmp_path / "room.png"))[..., ::-1].astype(int)
     assert picture.shape == (1000, 1600, 3)
     assert 0.05 < (picture < 250).any(axis=-1).mean() < 0.9
-    hue_of = og.segmentation.label_colors(np.arange(2)).astype(float)
+    hue_of = label_colors(np.arange(2)).astype(float)
     colored = picture[np.ptp(picture, axis=-1) > 40]
     direction = colored / np.linalg.norm(colored, axis=1, keepdims=True)
     for color in hue_of:  # shaded by the cloud's own colours: the same hue, darker

@@ -1,8 +1,8 @@
 """Boxes around points, axis-aligned and oriented, and which points are strays that no box should reach for. numpy only.
 
-The oriented box has nearly the least volume. A net of rotations, laid in the frame of the points' principal axes, gives
-starts; the best are refined by ever smaller nets and then, axis by axis, by rotating calipers (Toussaint, 1983), which
-lay a face flush with the points. The search looks at a few hundred extreme points; the box then holds all of them.
+An upright box is exact: rotating calipers (Toussaint, 1983) lay one side flush with the points' hull seen from above. A
+free one starts at the principal axes, and at a few turns of them, and is turned by calipers about one of its axes after
+another until none makes it smaller: within a few percent of the least volume.
 
 Every result depends on the set of points alone: not on their order, nor on how often one is given. Work is done in
 float64 around the points' middle, so map coordinates of 1e6 cost nothing but their own rounding.
@@ -19,26 +19,17 @@ from numpy.typing import ArrayLike, NDArray
 
 from og_pointcloud.errors import SceneError
 
-__all__ = ["Box", "axis_aligned_box", "main_part", "oriented_box", "quaternion_of", "typical_spacing"]
+__all__ = ["Box", "axis_aligned_box", "main_part", "oriented_box", "points_around", "quaternion_of", "typical_spacing"]
 
 DoubleArray = NDArray[np.float64]
 
 EXTREME_DIRECTIONS = 400
 """Directions whose extreme points stand for the hull; up to that many points all take part."""
-START_ROTATIONS = 6000
-"""Rotations of the net over all of them; a box has 24 names, so about 250 differ, 13 degrees apart."""
-STARTS = 2
-"""Best of the net that are refined, beside the principal axes."""
-NET_ROTATIONS = 120
-FIRST_ANGLE = 0.12
-"""Radius in radians of the first refining net, half of what the starts lie apart."""
-SHRINK, ROUNDS = 0.6, 10
 THIN = 1e-6
 """Thickness, as a share of the diagonal, that flat things are given while volumes are compared: 0 x 2 x 3 is less than
 0 x 4 x 5."""
 GAIN = 1e-9
 """Relative gain below which a turned box is not better."""
-CORRECTIONS = 4
 TURNS = 24
 """Calipers at most per start: from an odd start the gains never end, though they soon no longer matter."""
 
@@ -49,6 +40,8 @@ MAIN_PART = 0.05
 MOST = 0.9
 """Share of the points that main parts must hold, or the points are taken to be sparse and linked more widely."""
 SPACING_SAMPLE = 256
+WIDEST = 1 << 19
+"""Voxels to either side of the origin."""
 
 
 @dataclass(frozen=True)
@@ -144,7 +137,7 @@ def main_part(points: ArrayLike, spacing: float | None = None) -> NDArray[np.boo
     extent = float(np.ptp(local, axis=0).max())
     edge = LINK * (typical_spacing(local) if spacing is None else spacing)
     while edge < extent:
-        part = _connected(np.floor(local / max(edge, extent / (1 << 19))).astype(np.int64))
+        part = _connected(np.floor(local / max(edge, extent / WIDEST)).astype(np.int64))
         held = np.bincount(part)
         main = (held > MAIN_PART * len(local))[part]
         if main.mean() >= MOST:
@@ -233,77 +226,32 @@ def _right_handed(axes: DoubleArray, keep_third: bool) -> DoubleArray:
 def _least_volume(local: DoubleArray) -> DoubleArray:
     """(3, 3) axes, as rows, of a box of nearly the least volume around distinct points (n, 3) near the origin."""
     principal = _principal_axes(local)
-    along = local @ principal.T
-    hull = _extreme_points(along)
+    hull = _extreme_points(local @ principal.T, _half_sphere())
     thickness = THIN * float(np.linalg.norm(np.ptp(hull, axis=0)))
     if thickness == 0:
         return np.eye(3)
-    starts = _start_rotations()
-    order = np.argsort(_volumes(hull, starts, thickness), kind="stable")
-    found = [_flush(hull, starts[0], thickness)]  # principal axes are exact for flat and straight things
-    found += [_flush(hull, _refined(hull, starts[index], thickness), thickness) for index in order[:STARTS]]
-    volumes = _volumes(hull, np.stack(found), thickness)
+    found = [_flush(hull, start, thickness) for start in _STARTS]
+    volumes = [_volume(hull, axes, thickness) for axes in found]
     # A box that is no smaller than that along the principal axes is not worth an odd orientation.
-    best = int(volumes.argmin())
-    axes = found[best if volumes[best] < (1 - GAIN) * volumes[0] else 0]
-    return _corrected(along, hull, axes, thickness) @ principal
+    best = int(np.argmin(volumes))
+    return found[best if volumes[best] < (1 - GAIN) * volumes[0] else 0] @ principal
 
 
-def _corrected(xyz: DoubleArray, hull: DoubleArray, axes: DoubleArray, thickness: float) -> DoubleArray:
-    """Points that stick out of the box join the hull, and the box is refined, until none does; the best box of all."""
-    found, volumes = [axes], [_volumes(xyz, axes, thickness)[0]]
-    for _ in range(CORRECTIONS):
-        if _volumes(hull, axes, thickness)[0] >= (1 - GAIN) * _volumes(xyz, axes, thickness)[0]:
-            break
-        height = axes @ xyz.T
-        hull = np.concatenate([hull, xyz[height.argmax(axis=1)], xyz[height.argmin(axis=1)]])
-        axes = _flush(hull, _refined(hull, axes, thickness), thickness)
-        found.append(axes)
-        volumes.append(_volumes(xyz, axes, thickness)[0])
-    return found[int(np.argmin(volumes))]
-
-
-def _extreme_points(xyz: DoubleArray) -> DoubleArray:
-    """The points farthest along EXTREME_DIRECTIONS and their opposites; all points where there are no more."""
-    if len(xyz) <= EXTREME_DIRECTIONS:
-        return xyz
-    chosen = []
-    for directions in np.array_split(_directions(EXTREME_DIRECTIONS), EXTREME_DIRECTIONS // 16):
-        height = directions @ xyz.T
-        chosen += [height.argmax(axis=1), height.argmin(axis=1)]
-    return xyz[np.unique(np.concatenate(chosen))]
-
-
-def _volumes(hull: DoubleArray, axes: DoubleArray, thickness: float) -> DoubleArray:
-    """(m,) volume of the box along each of axes (m, 3, 3), every length increased by thickness."""
-    along = axes.reshape(-1, 3) @ hull.T
-    return (along.max(axis=1) - along.min(axis=1) + thickness).reshape(-1, 3).prod(axis=1)
-
-
-def _refined(hull: DoubleArray, axes: DoubleArray, thickness: float) -> DoubleArray:
-    """The best of nets of small rotations, each net finer than the last and around the best so far."""
-    least = _volumes(hull, axes, thickness)[0]
-    angle = FIRST_ANGLE
-    for _ in range(ROUNDS):
-        turned = _rotations(angle * _rotation_vectors()) @ axes
-        volumes = _volumes(hull, turned, thickness)
-        best = int(volumes.argmin())
-        if volumes[best] < least:
-            least, axes = volumes[best], turned[best]
-        angle *= SHRINK
-    return axes
+def _volume(hull: DoubleArray, axes: DoubleArray, thickness: float) -> float:
+    """Volume of the box along some axes, every length increased by thickness."""
+    return float(np.prod(np.ptp(hull @ axes.T, axis=0) + thickness))
 
 
 def _flush(hull: DoubleArray, axes: DoubleArray, thickness: float) -> DoubleArray:
     """Turns the box about one of its axes after another, each time to the least area, until none makes it smaller."""
-    least = _volumes(hull, axes, thickness)[0]
+    least = _volume(hull, axes, thickness)
     about, without_gain = 0, 0
     for _ in range(TURNS):
         if without_gain == 3:
             break
         plane = axes[[(about + 1) % 3, (about + 2) % 3]]
         turned = np.concatenate([axes[about, None], _least_rectangle(hull @ plane.T, thickness) @ plane])
-        volume = _volumes(hull, turned, thickness)[0]
+        volume = _volume(hull, turned, thickness)
         without_gain += 1
         if volume < (1 - GAIN) * least:
             least, axes, about, without_gain = volume, turned, 0, 0  # the axis turned about is the first now
@@ -315,9 +263,8 @@ def _upright(local: DoubleArray, up: DoubleArray) -> DoubleArray:
     """Axes of the least box whose third axis is up."""
     aside = np.cross(up, np.eye(3)[np.abs(up).argmin()])
     plane: DoubleArray = np.asarray(np.stack([aside, np.cross(up, aside)]) / np.linalg.norm(aside), np.float64)
-    flat = local @ plane.T
-    height = np.zeros((len(flat), 1))
-    flat = _extreme_points(np.hstack([flat, height]))[:, :2]
+    angle = np.arange(EXTREME_DIRECTIONS) * np.pi / EXTREME_DIRECTIONS
+    flat = _extreme_points(local @ plane.T, np.stack([np.cos(angle), np.sin(angle)], axis=1))
     thickness = THIN * float(np.linalg.norm(np.ptp(flat, axis=0)))
     return np.concatenate([_least_rectangle(flat, thickness) @ plane, up[None]])
 
@@ -356,61 +303,57 @@ def _lower_chain(ordered: list[list[float]]) -> list[list[float]]:
     return chain
 
 
-@lru_cache(maxsize=4)
-def _directions(count: int) -> DoubleArray:
-    """(count, 3) unit vectors, even over the upper half of the sphere: a Fibonacci lattice."""
-    step = np.arange(count) + 0.5
-    height, turn = 1 - step / count, step * np.pi * (3 - np.sqrt(5))
+def _extreme_points(points: DoubleArray, directions: DoubleArray) -> DoubleArray:
+    """The points farthest along some directions and their opposites; all points where there are no more."""
+    if len(points) <= EXTREME_DIRECTIONS:
+        return points
+    chosen = []
+    for some in np.array_split(directions, EXTREME_DIRECTIONS // 16):  # which bounds the memory
+        height = some @ points.T
+        chosen += [height.argmax(axis=1), height.argmin(axis=1)]
+    return points[np.unique(np.concatenate(chosen))]
+
+
+@lru_cache(maxsize=1)
+def _half_sphere() -> DoubleArray:
+    """(EXTREME_DIRECTIONS, 3) unit vectors, even over the upper half of the sphere: a Fibonacci lattice."""
+    step = np.arange(EXTREME_DIRECTIONS) + 0.5
+    height, turn = 1 - step / EXTREME_DIRECTIONS, step * np.pi * (3 - np.sqrt(5))
     ring = np.sqrt(1 - height**2)
     return np.stack([ring * np.cos(turn), ring * np.sin(turn), height], axis=1)
 
 
-@lru_cache(maxsize=1)
-def _rotation_vectors() -> DoubleArray:
-    """(NET_ROTATIONS, 3) even over the unit ball: directions, with lengths that follow a golden-ratio sequence."""
-    half = _directions(NET_ROTATIONS // 2)
-    share = np.arange(NET_ROTATIONS) * ((np.sqrt(5) - 1) / 2) % 1
-    return np.concatenate([half, -half]) * np.cbrt(share)[:, None]
-
-
-@lru_cache(maxsize=1)
-def _start_rotations() -> DoubleArray:
-    """(m, 3, 3) the identity, and a net over the rotations by which boxes differ: those nearest to the identity of the
-    24 that name the same box (Rodrigues vector within sqrt(2) - 1 along the axes, 1 along the diagonals).
-
-    Even over all rotations by the super-Fibonacci spiral (M. Alexa, "Super-Fibonacci Spirals", CVPR 2022).
-    """
-    phi, psi = np.sqrt(2), 1.533751168755204288118041
-    step = np.arange(START_ROTATIONS) + 0.5
-    inner, outer = np.sqrt(step / START_ROTATIONS), np.sqrt(1 - step / START_ROTATIONS)
-    a, b = 2 * np.pi * step / phi, 2 * np.pi * step / psi
-    x, y, z, w = inner * np.sin(a), inner * np.cos(a), outer * np.sin(b), outer * np.cos(b)
-    rodrigues = np.stack([x, y, z], axis=1) / w[:, None]
-    size = np.abs(rodrigues)
-    rodrigues = rodrigues[(size <= np.sqrt(2) - 1).all(axis=1) & (size.sum(axis=1) <= 1)]
-    length = np.linalg.norm(rodrigues, axis=1, keepdims=True)
-    return np.concatenate([np.eye(3)[None], _rotations(rodrigues * (2 * np.arctan(length) / length))])
-
-
-def _rotations(vectors: DoubleArray) -> DoubleArray:
-    """(n, 3, 3) rotation matrices of rotation vectors (n, 3), by Rodrigues' formula."""
-    angle = np.linalg.norm(vectors, axis=1)
-    x, y, z = (vectors / np.where(angle > 0, angle, 1)[:, None]).T
-    zero = np.zeros_like(x)
-    cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
-    return np.eye(3) + np.sin(angle)[:, None, None] * cross + (1 - np.cos(angle))[:, None, None] * (cross @ cross)
+_HALF = np.sqrt(0.5)
+_STARTS = np.array([
+    np.eye(3),
+    [[1, 0, 0], [0, _HALF, _HALF], [0, -_HALF, _HALF]],
+    [[_HALF, 0, -_HALF], [0, 1, 0], [_HALF, 0, _HALF]],
+    [[_HALF, _HALF, 0], [-_HALF, _HALF, 0], [0, 0, 1]],
+])  # fmt: skip
+"""Rotations of the principal axes that the search starts from: none, and an eighth of a turn about each."""
 
 
 # Strays -----------------------------------------------------------------------------------------------------------
 
 
-def _connected(voxel: NDArray[np.int64]) -> NDArray[np.int64]:
-    """(n,) number of the connected part that each voxel (n, 3) belongs to; those that touch are one.
+def points_around(xyz: NDArray[np.floating], edge: float) -> NDArray[np.int64]:
+    """(n,) how many points lie in the 27 voxels around each, itself among them. edge: of a voxel."""
+    keys, which, counts = np.unique(
+        _voxel_keys(np.floor(np.clip(xyz.astype(np.float64) / edge, -WIDEST, WIDEST)).astype(np.int64)),
+        return_inverse=True,
+        return_counts=True,
+    )
+    around = counts.copy()
+    for step in _HALF_OF_26:
+        here, there = _neighbours(keys, step)
+        around[here] += counts[there]
+        around[there] += counts[here]
+    return around[which.ravel()]
 
-    Coordinates within +-2^19.
-    """
-    key = (voxel + (1 << 20)) @ np.array([1 << 42, 1 << 21, 1])
-    keys, which = np.unique(key, return_inverse=True)
+
+def _connected(voxel: NDArray[np.int64]) -> NDArray[np.int64]:
+    """(n,) number of the connected part that each voxel (n, 3) belongs to; those that touch are one."""
+    keys, which = np.unique(_voxel_keys(voxel), return_inverse=True)
     part = np.arange(len(keys))
     pairs = [_neighbours(keys, step) for step in _HALF_OF_26]
     first, second = (np.concatenate(ends) for ends in zip(*pairs, strict=True))
@@ -423,6 +366,11 @@ def _connected(voxel: NDArray[np.int64]) -> NDArray[np.int64]:
         np.minimum.at(part, np.maximum(a, b)[apart], np.minimum(a, b)[apart])
         while (part != part[part]).any():
             part = part[part]
+
+
+def _voxel_keys(voxel: NDArray[np.int64]) -> NDArray[np.int64]:
+    """(n,) one number a voxel (n, 3), 21 bits a coordinate, which lie within +-WIDEST."""
+    return (voxel + (1 << 20)) @ np.array([1 << 42, 1 << 21, 1])
 
 
 def _neighbours(keys: NDArray[np.int64], step: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
