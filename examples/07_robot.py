@@ -50,7 +50,7 @@ print(f"wrote {draw_drive(out / '07_robot.png', log, instances)}")
 for name in ("drive", "drive_labelled"):
     shutil.rmtree(out / name, ignore_errors=True)
 report = label_bag(write_drive(out / "drive", drive), out / "drive_labelled", segmenter)
-print(f"bag: {report.clouds} clouds, {report.points / report.seconds['clouds']:,.0f} points a second")
+print(f"bag: {report.clouds} clouds, {report.points / report.seconds:,.0f} points a second")
 store, same = ros2_types(), []
 with open_bag(out / "drive_labelled") as bag:
     topic = [connection for connection in bag.connections if connection.topic == "/points/labelled"]

@@ -12,38 +12,37 @@ from dataclasses import dataclass, field, fields
 from types import ModuleType, SimpleNamespace
 
 import numpy as np
-from og_pointcloud_ros import messages as ours
+from og_pointcloud_ros.messages import nanoseconds
+from og_pointcloud_ros.typestore import ros2_types
+
+NUMBERS = {"int": int, "float": float, "str": str, "bool": bool}
+"""What rosbags calls the type of a single value -> that of Python."""
+TYPES = ros2_types().types
 
 
 class Message:
     """A message of rclpy's kind: keywords only, unknown ones refused, numbers and bytes of the right type."""
 
     def __init__(self, **values):
-        known = {entry.name for entry in fields(self.plain)}
-        assert set(values) <= known, f"{type(self).__name__} has no {set(values) - known}"
-        defaults = self.plain()
-        for name in known:
-            value = values.get(name, getattr(defaults, name))
-            self._check(name, value, getattr(defaults, name))
+        kinds = {entry.name: entry.type for entry in fields(TYPES[self.type_name])}
+        assert set(values) <= set(kinds), f"{self.type_name} has no {set(values) - set(kinds)}"
+        for name, kind in kinds.items():
+            value = values[name] if name in values else NUMBERS.get(kind, lambda: None)()
+            self._check(name, value, NUMBERS.get(kind))
             setattr(self, name, value)
 
-    def _check(self, name, value, default):
+    def _check(self, name, value, number):
         if name == "data":
             assert isinstance(value, (array.array, bytes)), "uint8[] of another type is checked byte by byte: slow"
         elif name == "covariance":
             assert isinstance(value, np.ndarray)
             assert (value.dtype, value.shape) == (np.float64, (36,))
-        elif isinstance(default, (bool, int, float, str)):
-            assert type(value) is type(default), f"{name} is a {type(value).__name__}, not a {type(default).__name__}"
+        elif number:
+            assert type(value) is number, f"{name} is a {type(value).__name__}, not a {number.__name__}"
 
 
-class String:
-    def __init__(self, data=""):
-        self.data = data
-
-
-def message_package(name, *kinds):
-    made = {kind.__name__: type(kind.__name__, (Message,), {"plain": kind}) for kind in kinds}
+def message_package(name, kinds):
+    made = {kind: type(kind, (Message,), {"type_name": f"{name}/msg/{kind}"}) for kind in kinds.split()}
     return {name: module(name), f"{name}.msg": module(f"{name}.msg", **made)}
 
 
@@ -143,7 +142,7 @@ class Node:
         self.timers.append(callback)
 
     def get_clock(self):
-        return SimpleNamespace(now=lambda: SimpleNamespace(to_msg=lambda: ours.Time(12, 34)))
+        return SimpleNamespace(now=lambda: SimpleNamespace(to_msg=lambda: SimpleNamespace(sec=12, nanosec=34)))
 
     def get_logger(self):
         return self.logger
@@ -167,7 +166,8 @@ class Buffer:
         return found
 
     def tell(self, target, source, stamp, translation, xyzw):
-        transform = SimpleNamespace(translation=ours.Vector3(*translation), rotation=ours.Quaternion(*xyzw))
+        place, turn = (SimpleNamespace(**dict(zip("xyzw", at, strict=False))) for at in (translation, xyzw))
+        transform = SimpleNamespace(translation=place, rotation=turn)
         self.told[target, source, stamp] = SimpleNamespace(transform=transform)
 
 
@@ -177,7 +177,9 @@ class Time:
 
     @classmethod
     def from_msg(cls, stamp):
-        return cls(ours.nanoseconds(stamp))
+        if stamp.sec < 0:
+            raise ValueError("Seconds value must not be negative")
+        return cls(nanoseconds(stamp))
 
 
 def install(monkeypatch):
@@ -222,20 +224,16 @@ def install(monkeypatch):
             TransformException=TransformException,
             TransformListener=lambda buffer, node: SimpleNamespace(buffer=buffer, node=node),
         ),
-        "std_msgs": module("std_msgs"),
-        "std_msgs.msg": module(
-            "std_msgs.msg", String=String, Header=type("Header", (Message,), {"plain": ours.Header})
-        ),
-        **message_package("builtin_interfaces", ours.Time),
-        **message_package("sensor_msgs", ours.PointCloud2, ours.PointField),
+        **message_package("std_msgs", "Header String"),
+        **message_package("builtin_interfaces", "Time"),
+        **message_package("sensor_msgs", "PointCloud2 PointField"),
+        **message_package("geometry_msgs", "Point Vector3 Quaternion Pose PoseWithCovariance"),
         **message_package(
-            "geometry_msgs", ours.Point, ours.Vector3, ours.Quaternion, ours.Pose, ours.PoseWithCovariance
+            "vision_msgs",
+            "Detection3DArray Detection3D ObjectHypothesis ObjectHypothesisWithPose BoundingBox3D "
+            "LabelInfo VisionClass",
         ),
-        **message_package(
-            "vision_msgs", ours.Detection3DArray, ours.Detection3D, ours.ObjectHypothesis,
-            ours.ObjectHypothesisWithPose, ours.BoundingBox3D, ours.LabelInfo, ours.VisionClass,
-        ),
-    }  # fmt: skip
+    }
     for name, stand_in in modules.items():
         monkeypatch.setitem(sys.modules, name, stand_in)
     monkeypatch.delitem(sys.modules, "og_pointcloud_ros.node", raising=False)

@@ -236,6 +236,21 @@ def test_an_interruption_leaves_nothing(scene, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["drive"]
 
 
+def test_a_cloud_that_breaks_the_labeller_is_skipped_and_counted(scene, tmp_path, monkeypatch):
+    usual, calls = og.Segmenter.__call__, []
+
+    def breaks_once(segmenter, *arguments):
+        calls.append(arguments)
+        if len(calls) == 2:
+            raise ZeroDivisionError("float division by zero")
+        return usual(segmenter, *arguments)
+
+    monkeypatch.setattr(og.Segmenter, "__call__", breaks_once)
+    report = label_bag(write_drive(tmp_path / "drive", scene), tmp_path / "out", og.Segmenter(scene, WORDS))
+    assert report.clouds == CLOUDS - 1
+    assert dict(report.skipped) == {"ZeroDivisionError: float division by zero": 1}
+
+
 def test_transforms_without_sense_are_left_out(scene, tmp_path):
     source = write_drive(tmp_path / "drive", scene)
     with Writer(tmp_path / "odd", version=8) as bag, open_bag(source) as reader:

@@ -5,10 +5,14 @@ import json
 import sys
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
+from types import SimpleNamespace
 
-import fake_ros
 import numpy as np
 import pytest
+
+pytest.importorskip("rosbags")
+
+import fake_ros
 from labelled_clouds import room
 from og_pointcloud_export import write_bundle
 from og_pointcloud_ros import from_pointcloud2, read_fields, ros_messages, write_fields
@@ -99,7 +103,7 @@ def test_names_are_told_at_once(node):
 
 @pytest.mark.parametrize("text", ['["pear", "plum"]', "pear, plum"])
 def test_labels_change_while_it_runs(node, scene, text):
-    send(node, "~/set_labels", fake_ros.String(text))
+    send(node, "~/set_labels", SimpleNamespace(data=text))
     assert names(node) == [WORDS, ["pear", "plum"]]
     assert node.get_parameter("labels").value == ["pear", "plum"]
     send(node, "~/input/points", cloud(scene))
@@ -110,7 +114,7 @@ def test_labels_change_while_it_runs(node, scene, text):
     ("text", "said"), [('["pear", "unicorn"]', "unicorn"), ("[1]", "expected words"), ("{}", "expected")]
 )
 def test_words_that_cannot_be_used_change_nothing(node, text, said):
-    send(node, "~/set_labels", fake_ros.String(text))
+    send(node, "~/set_labels", SimpleNamespace(data=text))
     assert names(node) == [WORDS]
     assert node.get_parameter("labels").value == WORDS
     level, line = node.logger.lines[-1]
@@ -180,13 +184,31 @@ def test_a_cloud_that_waits_too_long_is_dropped(node, scene, module, monkeypatch
     assert sent(node) == []
 
 
-def test_a_damaged_cloud_is_dropped_and_the_next_is_not(node, scene):
+DAMAGES = {
+    "cut off": (lambda cloud: setattr(cloud, "width", cloud.width + 1), "it was cut off"),
+    "no fields": (lambda cloud: setattr(cloud, "fields", None), "fields of a PointCloud2 are damaged"),
+    "before 1970": (lambda cloud: setattr(cloud.header.stamp, "sec", -3), "Seconds value must not be negative"),
+    "no header": (lambda cloud: setattr(cloud, "header", None), "AttributeError"),
+}
+
+
+@pytest.mark.parametrize(("damage", "text"), DAMAGES.values(), ids=DAMAGES)
+def test_a_damaged_cloud_is_dropped_and_the_next_is_not(node, scene, damage, text):
     damaged = cloud(scene)
-    damaged.width += 1
+    damage(damaged)
     send(node, "~/input/points", damaged)
-    assert "it was cut off" in node.logger.lines[-1][1]
+    assert text in node.logger.lines[-1][1]
     send(node, "~/input/points", cloud(scene))
     assert len(sent(node)) == 1
+
+
+def test_words_that_cannot_be_scored_change_nothing(node, module, monkeypatch):
+    def broken(*_, **__):
+        raise RuntimeError("the graph ended")
+
+    monkeypatch.setattr(module, "Segmenter", broken)
+    send(node, "~/set_labels", SimpleNamespace(data="chair"))
+    assert node.logger.lines[-1] == ("error", "the labels stay as they are: RuntimeError: the graph ended")
 
 
 def test_max_distance_shortens_the_reach(module, scene):

@@ -1,9 +1,10 @@
 """The tree of frames: chains, moments between two stamps, and what it says of frames that are missing."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from og_pointcloud_ros import TransformError, TransformTree
-from og_pointcloud_ros.messages import Header, Point, Quaternion, Time
 from og_pointcloud_ros.transforms import rotation_matrix, slerp
 from scipy.spatial.transform import Rotation, Slerp
 
@@ -93,17 +94,13 @@ def test_the_last_word_counts():
 
 
 def test_messages():
-    class Stamped:
-        header, child_frame_id = Header(Time(2, 0), "map"), "base"
-
-        class transform:
-            translation, rotation = Point(1, 2, 3), Quaternion(0, 0, 0, 1)
-
-    class Message:
-        transforms = (Stamped, Stamped)
-
+    head = SimpleNamespace(stamp=SimpleNamespace(sec=2, nanosec=0), frame_id="map")
+    turn, place = SimpleNamespace(x=0, y=0, z=0, w=1), SimpleNamespace(x=1, y=2, z=3)
+    stamped = SimpleNamespace(
+        header=head, child_frame_id="base", transform=SimpleNamespace(translation=place, rotation=turn)
+    )
     tree = TransformTree()
-    tree.add_message(Message)
+    tree.add_message(SimpleNamespace(transforms=[stamped, stamped]))
     np.testing.assert_array_equal(tree.lookup("map", "base", 2 * SECOND)[:3, 3], [1, 2, 3])
 
 

@@ -9,7 +9,7 @@ import os
 import shutil
 import time
 import warnings
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -53,7 +53,7 @@ Progress = Callable[[int, int], None]
 
 @dataclass
 class BagReport:
-    """What ``label_bag`` did. topics: of each cloud's topic, that of its labels. seconds: wall clock, by stage.
+    """What ``label_bag`` did. topics: of each cloud's topic, that of its labels. seconds: wall clock spent on clouds.
 
     skipped: clouds that could not be labelled, by reason. counts: points of each name.
     """
@@ -65,7 +65,7 @@ class BagReport:
     counts: Counter[str] = field(default_factory=Counter)
     unknown_because: Counter[Reason] = field(default_factory=Counter)
     skipped: Counter[str] = field(default_factory=Counter)
-    seconds: dict[str, float] = field(default_factory=lambda: defaultdict(float))
+    seconds: float = 0.0
 
     def add(self, labelled: LabelledMessages) -> None:
         """Count one cloud."""
@@ -99,10 +99,8 @@ def label_bag(
     with open_bag(source) as reader:
         clouds, store = _cloud_topics(reader, topics), ros2_types()
         report = BagReport({topic: topic + LABELLED for topic in clouds})
-        with _timed(report, "transforms"):
-            tree = _transforms(reader, store)
-        with _timed(report, "boxes"):
-            labeller = CloudLabeller(segmenter, rosbags_messages(store), frame, minimum_points)
+        tree = _transforms(reader, store)
+        labeller = CloudLabeller(segmenter, rosbags_messages(store), frame, minimum_points)
         total = sum(old.msgcount for old in reader.connections if old.topic in clouds)
         with (
             _whole(target) as folder,
@@ -128,14 +126,17 @@ def _label(
     store: Any, data: bytes, tree: TransformTree, frame: str, labeller: CloudLabeller, report: BagReport
 ) -> LabelledMessages | None:
     """One cloud's messages, or None where it was skipped; the report counts both."""
+    start = time.perf_counter()
     try:
-        with _timed(report, "clouds"):
-            message = _decoded(store, data, CLOUD)
-            pose = tree.lookup(frame, message.header.frame_id, nanoseconds(message.header.stamp))
-            labelled = labeller(message, pose)
-    except OgPointcloudError as error:
-        report.skipped[str(error)] += 1
+        message = _decoded(store, data, CLOUD)
+        pose = tree.lookup(frame, message.header.frame_id, nanoseconds(message.header.stamp))
+        labelled = labeller(message, pose)
+    except Exception as error:  # one cloud, whatever is in it, does not cost the others
+        kind = "" if isinstance(error, OgPointcloudError) else f"{type(error).__name__}: "
+        report.skipped[kind + _first_line(error)] += 1
         return None
+    finally:
+        report.seconds += time.perf_counter() - start
     report.add(labelled)
     return labelled
 
@@ -170,13 +171,11 @@ class _Outputs:
         by_key = {(old.topic, old.msgtype): old for old in connections}  # publishers that differ in QoS are one topic
         self._copies = {key: self._copy(old) for key, old in by_key.items()}
         self._info = bag.add_connection(LABEL_INFO, INFO, typestore=store, offered_qos_profiles=[LATCHED])
-        self._ours = {
-            topic: (
-                bag.add_connection(topic + LABELLED, CLOUD, typestore=store),
-                bag.add_connection(topic + DETECTIONS, DETECTION_ARRAY, typestore=store),
-            )
-            for topic in clouds
-        }
+        self._ours = {topic: (self._new(topic + LABELLED, CLOUD), self._new(topic + DETECTIONS, DETECTION_ARRAY))
+                      for topic in clouds}  # fmt: skip
+
+    def _new(self, topic: str, kind: str) -> Connection:
+        return self._bag.add_connection(topic, kind, typestore=self._store)
 
     def _copy(self, old: Connection) -> Connection:
         ext: Any = old.ext
@@ -228,8 +227,8 @@ def _transforms(reader: Reader, store: Any) -> TransformTree:
     for connection, _, data in _messages(reader, connections) if connections else ():
         try:
             tree.add_message(_decoded(store, data, TRANSFORMS), static=connection.topic.endswith("tf_static"))
-        except OgPointcloudError as error:
-            damaged[str(error)] += 1
+        except Exception as error:  # decoded, but a nonsense still
+            damaged[_first_line(error)] += 1
     if damaged:
         warnings.warn(f"{damaged.total()} messages of transforms left out: {next(iter(damaged))}", stacklevel=3)
     return tree
@@ -253,15 +252,6 @@ def _storage(source: Path) -> StoragePlugin:
     """That of the source, which is a file of one storage or a folder of them."""
     files = [source] if source.is_file() else list(source.iterdir())
     return StoragePlugin.MCAP if any(".mcap" in file.suffixes for file in files) else StoragePlugin.SQLITE3
-
-
-@contextmanager
-def _timed(report: BagReport, stage: str) -> Iterator[None]:
-    start = time.perf_counter()
-    try:
-        yield
-    finally:
-        report.seconds[stage] += time.perf_counter() - start
 
 
 @contextmanager

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from og_pointcloud.ask.boxes import Box
 from og_pointcloud.ask.instances import Instance, Instances
@@ -79,21 +80,19 @@ def to_label_info(
 def _detection(instance: Instance, name: str, score: float, head: Any, messages: MessageFactory) -> Any:
     box = instance.oriented_box
     assert box is not None  # it has points
-    pose = _pose(box, messages)
-    size = messages("geometry_msgs/msg/Vector3", **dict(zip("xyz", box.size.tolist(), strict=True)))
+    pose, size = _pose(box, messages), messages("geometry_msgs/msg/Vector3", **_named(box.size, "xyz"))
     hypothesis = messages("vision_msgs/msg/ObjectHypothesis", class_id=name, score=score)
     uncertain = messages("geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=np.zeros(36))
-    return messages(
-        "vision_msgs/msg/Detection3D",
-        header=head,
-        results=[messages("vision_msgs/msg/ObjectHypothesisWithPose", hypothesis=hypothesis, pose=uncertain)],
-        bbox=messages("vision_msgs/msg/BoundingBox3D", center=pose, size=size),
-        id=str(instance.id),
-    )
+    result = messages("vision_msgs/msg/ObjectHypothesisWithPose", hypothesis=hypothesis, pose=uncertain)
+    bbox = messages("vision_msgs/msg/BoundingBox3D", center=pose, size=size)
+    return messages("vision_msgs/msg/Detection3D", header=head, results=[result], bbox=bbox, id=str(instance.id))
 
 
 def _pose(box: Box, messages: MessageFactory) -> Any:
-    w, x, y, z = box.rotation_wxyz.tolist()
-    position = messages("geometry_msgs/msg/Point", **dict(zip("xyz", box.center.tolist(), strict=True)))
-    orientation = messages("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
+    position = messages("geometry_msgs/msg/Point", **_named(box.center, "xyz"))
+    orientation = messages("geometry_msgs/msg/Quaternion", **_named(box.rotation_wxyz, "wxyz"))
     return messages("geometry_msgs/msg/Pose", position=position, orientation=orientation)
+
+
+def _named(values: NDArray[np.floating], names: str) -> dict[str, float]:
+    return dict(zip(names, values.tolist(), strict=True))

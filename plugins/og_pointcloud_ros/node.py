@@ -4,7 +4,7 @@ Subscribes ~/input/points (sensor_msgs/PointCloud2, best effort, the newest alon
 Publishes ~/output/points, ~/output/detections and, latched, ~/label_info. A cloud is placed in the scene by tf.
 
 Work is left out rather than queued: a cloud is dropped when nobody listens, when a newer one has come, or when its
-transform does not come in time.
+transform does not come in time. No message ends the node: what it cannot use is logged.
 """
 
 from __future__ import annotations
@@ -134,8 +134,8 @@ class SegmentNode(Node):
         for labels in (parameter.value for parameter in parameters if parameter.name == "labels"):
             try:
                 self._labeller.segmenter = self._segmenter(labels or [])
-            except (OgPointcloudError, OSError) as error:
-                return SetParametersResult(successful=False, reason=str(error))
+            except Exception as error:  # words come from outside, and a robot goes on with those that it had
+                return SetParametersResult(successful=False, reason=_told(error))
             self._announce()
         return SetParametersResult(successful=True)
 
@@ -151,21 +151,19 @@ class SegmentNode(Node):
         if self._waiting is None:
             return
         message, arrived = self._waiting
-        try:
-            pose = self._pose(message.header)
-        except TransformException as error:
-            if time.monotonic() - arrived > self._max_age:
-                self._waiting = None
-                self._warn(f"a cloud was dropped, its transform did not come within {self._max_age} s: {error}")
-            return
         self._waiting = None
         try:
-            labelled = self._labeller(message, pose)
-        except OgPointcloudError as error:
-            self._warn(f"a cloud was dropped: {error}")
-            return
-        self._points.publish(labelled.points)
-        self._detections.publish(labelled.detections)
+            labelled = self._labeller(message, self._pose(message.header))
+        except TransformException as error:
+            if time.monotonic() - arrived <= self._max_age:
+                self._waiting = message, arrived
+            else:
+                self._warn(f"a cloud was dropped, its transform did not come within {self._max_age} s: {error}")
+        except Exception as error:  # whatever a message holds, the node goes on
+            self._warn(f"a cloud was dropped: {_told(error)}")
+        else:
+            self._points.publish(labelled.points)
+            self._detections.publish(labelled.detections)
 
     def _pose(self, head: Any) -> NDArray[np.float64]:
         """(4, 4) from the cloud's frame to the scene's, at the cloud's time; tf2's TransformException without one."""
@@ -178,6 +176,11 @@ class SegmentNode(Node):
 
     def _warn(self, text: str) -> None:
         self.get_logger().warning(text, throttle_duration_sec=QUIET_S)
+
+
+def _told(error: Exception) -> str:
+    """An error of ours says what is wrong and what helps; of another the kind is worth knowing."""
+    return str(error) if isinstance(error, (OgPointcloudError, OSError)) else f"{type(error).__name__}: {error}"
 
 
 def _latest(reliability: Any, latched: bool = False) -> Any:

@@ -1,6 +1,6 @@
 """sensor_msgs/PointCloud2 <-> arrays, in numpy alone.
 
-A message is whatever has a PointCloud2's attributes: one of rclpy, of rosbags (ROS 1 or 2), or of ``messages``. Its
+A message is whatever has a PointCloud2's attributes: one of rclpy, of rosbags (ROS 1 or 2), or a plain object. Its
 sizes are believed only where they agree with each other and with the data.
 """
 
@@ -65,7 +65,14 @@ def read_fields(message: Any) -> NDArray[Any]:
     height, width, point_step, row_step = (
         _size(message, name) for name in ("height", "width", "point_step", "row_step")
     )
-    kind = _dtype(message.fields, point_step, ">" if message.is_bigendian else "<")
+    try:
+        kind = _dtype(message.fields, point_step, ">" if message.is_bigendian else "<")
+    except SceneError:
+        raise
+    except (AttributeError, TypeError, ValueError, OverflowError) as error:
+        raise SceneError(
+            f"the fields of a PointCloud2 are damaged ({error}); expected each with name, offset, datatype and count"
+        ) from None
     data = _bytes_of(message.data)
     # A single row needs no step, and the last row no padding: some drivers leave them out.
     needed = max(height - 1, 0) * row_step + width * point_step if height else 0
@@ -76,10 +83,10 @@ def read_fields(message: Any) -> NDArray[Any]:
             f"bytes; expected {max(needed, height * max(row_step, width * point_step))}: it was cut off, or is no such "
             "message"
         )
-    if height * width == 0 or point_step == 0:
-        if height * width:
-            raise SceneError(f"a PointCloud2 has {height * width} points of 0 bytes; expected x, y and z in each")
+    if height * width == 0:
         return np.zeros((height, width), kind)
+    if point_step == 0:
+        raise SceneError(f"a PointCloud2 has {height * width} points of 0 bytes; expected x, y and z in each")
     return np.ndarray((height, width), kind, data, strides=(row_step if height > 1 else data.size, point_step))
 
 
@@ -130,28 +137,18 @@ def write_fields(
         raise SceneError(f"a PointCloud2 cannot hold {rows.dtype}; expected fields of 8 to 32-bit integers and floats")
     height, width = rows.shape
     fields = [
-        messages(
-            "sensor_msgs/msg/PointField",
-            name=name,
-            offset=offset,
-            datatype=DATATYPES[kind.base.newbyteorder("=")],
-            count=int(np.prod(kind.shape)),
-        )
+        messages("sensor_msgs/msg/PointField", name=name, offset=offset, datatype=datatype, count=count)
         for name, (kind, offset) in columns.items()
+        for datatype, count in [(DATATYPES[kind.base.newbyteorder("=")], int(np.prod(kind.shape)))]
     ]
     coordinates = [rows[axis] for axis in "xyz" if axis in columns]
     return messages(
-        "sensor_msgs/msg/PointCloud2",
-        header=header(messages, frame_id, stamp),
-        height=height,
-        width=width,
-        fields=fields,
-        is_bigendian=orders == {">" if sys.byteorder == "little" else "="},
-        point_step=rows.itemsize,
+        "sensor_msgs/msg/PointCloud2", header=header(messages, frame_id, stamp), height=height, width=width,
+        fields=fields, is_bigendian=orders == {">" if sys.byteorder == "little" else "="}, point_step=rows.itemsize,
         row_step=width * rows.itemsize,
         data=rows.reshape(-1).view(np.uint8) if rows.size else np.zeros(0, np.uint8),
         is_dense=all(bool(np.isfinite(values).all()) for values in coordinates),
-    )
+    )  # fmt: skip
 
 
 def _size(message: Any, name: str) -> int:
