@@ -1,21 +1,17 @@
-"""Where the time goes, held against a stored run: `make bench`, under a minute on two cores.
+"""Has it become slower, or less exact? This tree beside another revision, run in turn: `make bench [AGAINST=REV]`.
 
-    python examples/bench.py                 # the table, beside bench_baseline.json
-    python examples/bench.py --save          # three rounds, stored as the new baseline
+    python examples/bench.py                  # beside HEAD where there are changes, else beside the last tag or HEAD~1
+    python examples/bench.py --against v1.0 --rounds 9
 
-Every row has seconds, error, and *units*: seconds over those of a fixed piece of work in numpy (one core, no BLAS)
-timed in the same run, so that a faster machine, or a slower one, has about the same figure. "against" is the seconds of
-the plain way to the same answer, over ours, in the same run too. A row is marked slower where its units exceed the
-baseline's by more than a quarter, or by more than the stored rounds differed among themselves; that is a hint, no
-failure. Rows that use all cores compare only where there are as many, and nothing else to do: they are wall-clock time,
-the unit is the processor's.
+The other revision is checked out into a temporary folder. Each round is a fresh process of A (the other), then one of B
+(this tree), on the same files; a first round, which compiles, is discarded. Printed are medians, the ratio B / A with
+its range over the rounds, and the errors of both:
 
-    kernel        one view of 100,000 Gaussians at 640x480, a core's seconds; error: largest weight against float64, in
-                  a window, relative; against the literal form in numpy, that window
-    fit           a made room of 60,000 points and 30 images, stage by stage; error: 1 - adjusted Rand index
-    segment       300,000 points in a scene; error: share with another instance than scipy's KD-tree (all cores) finds
-    first answer  a fresh process: import, load, label 1,000 points; error: share of labels that differ from ours
-    write         that scene as .ogpc; error: share of points whose instance differs when it is read back
+    kernel        one view of 100,000 Gaussians, seconds of one core; largest weight error against float64, relative
+    fit           a capture of a furnished room; 1 - adjusted Rand index against the room's own instances
+    write         that fit as a .ogpc; share of points whose instance differs when it is read back
+    first answer  import, load and label 1,000 points; share of instances that differ from the file's
+    segment       300,000 points; share of instances that differ from those scipy's KD-tree finds
 """
 
 from __future__ import annotations
@@ -26,261 +22,165 @@ import os
 import subprocess
 import sys
 import tempfile
-import time
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
-from benchmark_runtime import make_frame
-from benchmark_scaling import made_scene, warm_up
-from benchmark_visibility import box_case, errors, window_of
 
-import og_pointcloud as og
-from og_pointcloud.cloud import TOO_FAR, LabelledCloud
-from og_pointcloud.evaluate.metrics import adjusted_rand_index
-from og_pointcloud.evaluate.report.sweep import machine
-
-Answer = TypeVar("Answer")
-
-BASELINE = Path(__file__).with_name("bench_baseline.json")
-NOISE = 1.25
-"""Units may differ by this factor from run to run on a machine that has other things to do."""
-ROUNDS_SAVED = 3
-RUNS = 5
-UNIT_SORTED, UNIT_SQUARE = 4_000_000, 500
-KERNEL_POINTS, KERNEL_IMAGE = 100_000, (640, 480)
-ROOM_POINTS, ROOM_VIEWS, ROOM_IMAGE = 60_000, 30, (640, 480)
-FRAME_POINTS, FRAME_NOISE = 300_000, 0.3
-"""The frame's points lie so many point spacings off the scene's, standard deviation."""
-FIRST_POINTS = 1_000
-FIRST_ANSWER = """
-import sys, time
-start = time.perf_counter()
+ROOT = Path(__file__).resolve().parents[1]
+PIECES = ("kernel", "fit", "write", "first answer", "segment")
+MEASURE = '''
+"""One round of one revision, by public names: any revision has them. argv: folder of the files, folder for results."""
+import importlib, json, sys, time
+from pathlib import Path
 import numpy as np
-import og_pointcloud as og
-scene = og.load(sys.argv[1])
-words = {str(row): vector for row, vector in enumerate(np.load(sys.argv[2]))}
-labels = og.Segmenter(scene, words)(scene.xyz[: int(sys.argv[3])]).labels
-print(time.perf_counter() - start, *labels)
-"""
+files, out = map(Path, sys.argv[1:])
+seconds, error = {}, {}
 
-
-@dataclass(frozen=True)
-class Row:
-    """seconds: the least of several runs. units: of the calibration. error: see above. against: None where there is no
-    plain way. cores: that the work may use."""
-
-    name: str
-    seconds: float
-    units: float
-    error: float
-    against: float | None = None
-    cores: int = 1
-
-
-@dataclass(frozen=True)
-class Kept:
-    """A row of the baseline: the median of its rounds, and the largest over the smallest."""
-
-    units: float
-    error: float
-    spread: float
-    cores: int
-
-
-def fastest(work: Callable[[], Answer], runs: int = RUNS, clock: Callable[[], float] = time.perf_counter) -> tuple:
-    """Seconds, the least of several runs after a discarded one, and the last answer."""
-    answer, taken = work(), []
+def timed(name, work, runs=1, clock=time.perf_counter):
+    taken = []
     for _ in range(runs):
         start = clock()
         answer = work()
         taken.append(clock() - start)
-    return min(taken), answer
+    seconds[name] = min(taken)
+    return answer
 
+def first_answer():
+    import og_pointcloud as og
+    scene = og.load(out / "first.ogpc")
+    asked = scene.xyz[:: max(1, len(scene.xyz) // 1000)]
+    words = {"thing": np.ones(scene.cloud.instances.descriptors.shape[1])}
+    return og.Segmenter(scene, words)(asked).instances, scene
 
-def calibration_seconds() -> float:
-    """Of the unit: a sort and a product, about 0.1 s of one core. einsum without BLAS stays on that core."""
-    values = np.random.default_rng(0).random(UNIT_SORTED)
-    square = values[: UNIT_SQUARE**2].reshape(UNIT_SQUARE, UNIT_SQUARE)
-    return fastest(lambda: (np.sort(values), np.einsum("ij,jk->ik", square, square)), clock=time.process_time)[0]
+if (out / "first.ogpc").exists():  # not in the round that compiles
+    found, scene = timed("first answer", first_answer)
+    exact = scene.cloud.instance_ids[:: max(1, len(scene.xyz) // 1000)]
+    error["first answer"] = float((found != exact).mean())
+import og_pointcloud as og
 
+cloud = timed("fit", lambda: og.fit(og.read_capture(files / "room"), progress=False))
+np.save(out / "ids.npy", cloud.instance_ids)
+timed("write", lambda: og.write_bundle(cloud, out / "room.ogpc"))
+scene = og.load(out / "room.ogpc")
+error["write"] = float((scene.cloud.instance_ids != cloud.instance_ids).mean())
+(out / "room.ogpc").replace(out / "first.ogpc")
 
-# The pieces of work ---------------------------------------------------------------------------------------------
+random = np.random.default_rng(0)
+frame = cloud.xyz_world[random.integers(0, len(cloud), 300_000)]
+frame = frame + 0.3 * cloud.spacing * random.normal(size=frame.shape)
+segmenter = og.Segmenter(scene, {"thing": np.ones(cloud.instances.descriptors.shape[1])})
+found = timed("segment", lambda: segmenter(frame).instances, runs=5)
+from scipy.spatial import cKDTree
+local = (frame - cloud.origin).astype(np.float32)
+near = cKDTree(cloud.xyz).query(local, distance_upper_bound=cloud.reach, workers=-1)[1]
+error["segment"] = float((found != np.append(cloud.instance_ids, og.TOO_FAR)[near]).mean())
 
-
-def bench_kernel(unit: float, points: int = KERNEL_POINTS, image: tuple[int, int] = KERNEL_IMAGE) -> list[Row]:
-    """One row."""
-    import numba
-    from reference_splatting import reference_view_weights  # pyright: ignore[reportMissingImports]  (in tests/)
-
-    from og_pointcloud.fitting.mask_table import view_weights
-
-    threads = numba.get_num_threads()
-    numba.set_num_threads(1)
+for name in ("rendering", "fitting"):  # the one piece without a public name; its folder has moved
     try:
-        case = box_case(points, *image)
-        window = window_of(case)
-        seconds, _ = fastest(lambda: view_weights(*case.arguments), clock=time.process_time)
-        ours, _ = fastest(lambda: view_weights(*window.arguments), clock=time.process_time)
-        start = time.process_time()
-        reference = reference_view_weights(window.gaussians, window.camera, window.ids, window.mask_count, window.near)
-        plain = time.process_time() - start
-        return [Row("kernel", seconds, seconds / unit, errors(window, reference)[0], plain / ours)]
-    finally:
-        numba.set_num_threads(threads)
-
-
-def bench_fit(
-    unit: float, points: int = ROOM_POINTS, views: int = ROOM_VIEWS, image: tuple[int, int] = ROOM_IMAGE, runs: int = 2
-) -> tuple[list[Row], LabelledCloud]:
-    """A row a stage, and the cloud of the last run."""
-    warm_up(og.FitSettings())
-    scene, owner = made_scene(points, views, image)
-    clouds = [og.fit(scene, progress=False) for _ in range(runs)]
-    stages: dict[str, list[float]] = {}
-    for cloud in clouds:
-        of_run: dict[str, float] = {}
-        for stage in cloud.provenance["stages"]:
-            of_run[stage["name"]] = of_run.get(stage["name"], 0.0) + stage["seconds"]
-        for name, seconds in of_run.items():
-            stages.setdefault(name, []).append(seconds)
-    known = owner >= 0
-    error = 1 - adjusted_rand_index(clouds[-1].instance_ids[known], owner[known])
-    rows = [_of_all_cores(f"fit: {name}", min(seconds), unit, error) for name, seconds in stages.items()]
-    total = min(sum(stage["seconds"] for stage in cloud.provenance["stages"]) for cloud in clouds)
-    return [*rows, _of_all_cores("fit, all", total, unit, error)], clouds[-1]
-
-
-def bench_segment(unit: float, cloud: LabelledCloud, path: Path, points: int = FRAME_POINTS) -> list[Row]:
-    """One row. path: the cloud's .ogpc."""
-    from scipy.spatial import cKDTree
-
-    frame = make_frame(cloud, points, FRAME_NOISE)
-    local, tree = (frame - cloud.origin).astype(np.float32), cKDTree(cloud.xyz)
-    ids = np.append(cloud.instance_ids, np.int32(TOO_FAR))
-    segmenter = og.Segmenter(path, _words(cloud))
-    seconds, result = fastest(lambda: segmenter(frame))
-    plain, found = fastest(lambda: ids[tree.query(local, distance_upper_bound=cloud.reach, workers=-1)[1]])
-    error = float((result.instances != found).mean())
-    return [_of_all_cores("segment", seconds, unit, error, plain / seconds)]
-
-
-def bench_first_answer(unit: float, cloud: LabelledCloud, path: Path, runs: int = RUNS) -> list[Row]:
-    """One row."""
-    words, count = _words(cloud), min(FIRST_POINTS, len(cloud))
-    vectors = path.with_suffix(".words.npy")
-    np.save(vectors, np.stack(list(words.values())))
-    command = [sys.executable, "-c", FIRST_ANSWER, str(path), str(vectors), str(count)]
-    printed = [subprocess.run(command, capture_output=True, text=True, check=True).stdout.split() for _ in range(runs)]
-    ours = og.Segmenter(cloud, words)(cloud.xyz_world[:count]).labels
-    error = float((np.array(printed[-1][1:], int) != ours).mean())
-    seconds = min(float(line[0]) for line in printed)
-    return [_of_all_cores("first answer", seconds, unit, error)]
-
-
-def bench_write(unit: float, cloud: LabelledCloud, path: Path, runs: int = 3) -> list[Row]:
-    """One row; leaves the file."""
-    seconds, _ = fastest(lambda: og.write_bundle(cloud, path), runs)
-    read = og.load(path).cloud
-    return [_of_all_cores("write", seconds, unit, float((read.instance_ids != cloud.instance_ids).mean()))]
-
-
-def measure() -> list[Row]:
-    """All rows once. The unit is timed before and after; the lesser counts, as with all others."""
-    unit = calibration_seconds()
-    rows = bench_kernel(unit)
-    of_fit, cloud = bench_fit(unit)
-    rows += of_fit
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "room.ogpc"
-        rows += bench_write(unit, cloud, path)
-        rows += bench_segment(unit, cloud, path)
-        rows += bench_first_answer(unit, cloud, path)
-    least = min(unit, calibration_seconds())
-    return [Row(**{**asdict(row), "units": row.seconds / least}) for row in rows]
-
-
-def _of_all_cores(name: str, seconds: float, unit: float, error: float, against: float | None = None) -> Row:
-    return Row(name, seconds, seconds / unit, error, against, os.cpu_count() or 1)
-
-
-def _words(cloud: LabelledCloud) -> dict[str, np.ndarray]:
-    """Some instances' own looks, as labels."""
-    return {f"thing {row}": vector for row, vector in enumerate(cloud.instances.descriptors[:8])}
-
-
-# The baseline ---------------------------------------------------------------------------------------------------
-
-
-def baseline_of(rounds: Sequence[Sequence[Row]]) -> dict[str, Kept]:
-    """What is kept of several rounds."""
-    kept = {}
-    for same in zip(*rounds, strict=True):
-        units = [row.units for row in same]
-        error = max(row.error for row in same)
-        kept[same[0].name] = Kept(float(np.median(units)), error, max(units) / min(units), same[0].cores)
-    return kept
-
-
-def verdict(row: Row, kept: Kept | None) -> str:
-    """What a row is beside the baseline: a factor, and a mark where it is out of the noise."""
-    if kept is None:
-        return "new"
-    if kept.cores != row.cores:
-        return f"(of {kept.cores} cores)"
-    factor, band = row.units / kept.units, max(NOISE, kept.spread)
-    mark = "slower" if factor > band else "faster" if factor < 1 / band else ""
-    worse = "larger error" if row.error > kept.error * (1 + 1e-3) + 1e-9 else ""
-    return " ".join(filter(None, (f"{factor:.2f}", mark, worse)))
-
-
-def read_baseline(path: Path) -> dict[str, Kept]:
-    """Rows by name; none where nothing is stored."""
-    if not path.is_file():
-        return {}
-    stored = json.loads(path.read_text(encoding="utf-8"))
-    return {name: Kept(**row) for name, row in stored["rows"].items()}
-
-
-def write_baseline(path: Path, kept: dict[str, Kept]) -> None:
-    """JSON, with the machine it was measured on."""
-    content = {"machine": machine(), "rows": {name: asdict(row) for name, row in kept.items()}}
-    path.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
-
-
-def print_rows(rows: Iterable[Row], baseline: dict[str, Kept]) -> None:
-    """The table."""
-    print(f"{'':<18} {'seconds':>9} {'error':>9} {'against':>8} {'units':>8} {'stored':>8}  of stored")
-    for row in rows:
-        against = "-" if row.against is None else f"{row.against:.1f}x"
-        kept = baseline.get(row.name)
-        stored, said = "-" if kept is None else f"{kept.units:.2f}", verdict(row, kept) if baseline else "-"
-        figures = f"{row.seconds:9.4f} {row.error:9.2g} {against:>8} {row.units:8.2f} {stored:>8}"
-        print(f"{row.name:<18} {figures}  {said}", flush=True)
+        splatting = importlib.import_module(f"og_pointcloud.{name}.splatting")
+    except ImportError:
+        continue
+    import numba
+    numba.set_num_threads(1)
+    data = np.load(files / "kernel.npz")
+    def draw(which):
+        gaussians = splatting.Gaussians(*(data[f"{which}_{part}"] for part in ("xyz", "scale", "rotation", "opacity")))
+        width, height, fx, fy, cx, cy = data[f"{which}_camera"].tolist()
+        camera = og.Camera(int(width), int(height), fx, fy, cx, cy, np.eye(4))
+        return splatting.view_weights(gaussians, camera, data[f"{which}_ids"], 30, float(data["near"])).rows
+    draw("view")
+    timed("kernel", lambda: draw("view"), runs=5, clock=time.process_time)
+    error["kernel"] = float(np.abs(draw("window").toarray() - data["exact"]).max() / data["exact"].max())
+    break
+(out / "round.json").write_text(json.dumps([seconds, error]))
+'''
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Measure, print, compare; with --save store."""
+    """Check out, measure in turn, print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--baseline", type=Path, default=BASELINE, help="what to compare with (default: beside this)")
-    parser.add_argument("--save", action="store_true", help=f"measure {ROUNDS_SAVED} rounds and store them there")
+    parser.add_argument("--against", metavar="REV", help="the other revision")
+    parser.add_argument("--rounds", type=int, default=5)
     options = parser.parse_args(arguments)
-    baseline = read_baseline(options.baseline)
-    print(machine())
-    rounds = []
-    for _ in range(ROUNDS_SAVED if options.save else 1):
-        rounds.append(measure())
-        print_rows(rounds[-1], baseline)
-    slower = [row.name for row in rounds[-1] if row.name in baseline and "slower" in verdict(row, baseline[row.name])]
-    if slower:
-        print(f"slower than the baseline, beyond its noise: {', '.join(slower)}")
-    if options.save:
-        write_baseline(options.baseline, baseline_of(rounds))
-        print(f"wrote {options.baseline}")
-    elif not baseline:
-        print(f"nothing to compare with: {options.baseline} is made with --save")
+    revision = options.against or default_revision()
+    with tempfile.TemporaryDirectory() as temporary:
+        folder, other = Path(temporary), Path(temporary) / "other"
+        git("worktree", "add", "--detach", str(other), revision)
+        try:
+            truth = write_files(folder / "files")
+            print(f"A: {git('log', '-1', '--format=%h %s', revision)}\nB: this tree", flush=True)
+            rounds = [[measure(tree, folder, truth) for tree in (other, ROOT)] for _ in range(options.rounds + 1)]
+        finally:
+            git("worktree", "remove", "--force", str(other))
+    print_table([[dict(zip(("seconds", "error"), of, strict=True)) for of in both] for both in rounds[1:]])
+
+
+def git(*arguments: str) -> str:
+    """What git prints in this tree."""
+    command = ["git", "-C", str(ROOT), *arguments]
+    return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+
+
+def default_revision() -> str:
+    """HEAD where the tree has changes; else the last tag before it, or the commit before."""
+    if git("status", "--porcelain", "--untracked-files=no"):
+        return "HEAD"
+    return git("tag", "--merged", "HEAD~1", "--sort=-creatordate").partition("\n")[0] or "HEAD~1"
+
+
+def write_files(folder: Path) -> np.ndarray:
+    """What both revisions read: a room's capture, and a view for the kernel with its float64 answer in a window.
+    Returns the instance of each of the room's points."""
+    from benchmark_visibility import Case, reference_of, room_case, window_of
+    from og_pointcloud_room.capture import CaptureSettings, make_capture, write_capture
+
+    capture = make_capture(0, CaptureSettings(views=20, width=480, height=360))
+    write_capture(capture, folder / "room")
+    view = room_case(100_000)
+    window = window_of(view)
+
+    def arrays(name: str, case: Case) -> dict[str, np.ndarray]:
+        at = case.camera
+        numbers = np.array([at.width, at.height, at.fx, at.fy, at.cx, at.cy])
+        parts = {f"{name}_{part}": getattr(case.gaussians, part) for part in ("xyz", "scale", "rotation", "opacity")}
+        return {**parts, f"{name}_camera": numbers, f"{name}_ids": case.ids}
+
+    exact = {"exact": reference_of(window), "near": np.array(view.near)}
+    np.savez(folder / "kernel.npz", **arrays("view", view), **arrays("window", window), **exact)
+    return capture.instance
+
+
+def measure(tree: Path, folder: Path, truth: np.ndarray) -> tuple[dict[str, float], dict[str, float]]:
+    """Seconds and error of each piece, in a process that imports from this tree."""
+    from og_pointcloud.evaluate.metrics import adjusted_rand_index
+
+    out = folder / f"out-{tree.name}"
+    out.mkdir(exist_ok=True)
+    paths = (tree, tree / "export", tree / "plugins", tree / "examples")
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, paths))}
+    command = [sys.executable, "-c", MEASURE, str(folder / "files"), str(out)]
+    subprocess.run(command, env=environment, cwd=folder, check=True)
+    seconds, error = json.loads((out / "round.json").read_text())
+    ids = np.load(out / "ids.npy")
+    error["fit"] = 1 - adjusted_rand_index(ids[truth >= 0], truth[truth >= 0])
+    return seconds, error
+
+
+def print_table(rounds: Sequence[Sequence[dict[str, dict[str, float]]]]) -> None:
+    """A row a piece. rounds: of A and B each "seconds" and "error" by piece."""
+    print(f"{'':<14} {'A, s':>9} {'B, s':>9} {'B / A':>6} {'range':>12} {'A, error':>9} {'B, error':>9}")
+    for name in PIECES:
+        if not all(name in of["seconds"] for both in rounds for of in both):
+            print(f"{name:<14} not in both revisions")
+            continue
+        seconds = np.array([[of["seconds"][name] for of in both] for both in rounds])
+        before, after = np.median(seconds, axis=0)
+        ratio = seconds[:, 1] / seconds[:, 0]
+        errors = [rounds[-1][side]["error"][name] for side in (0, 1)]
+        spread = f"{ratio.min():.2f}-{ratio.max():.2f}"
+        of_seconds = f"{before:9.4f} {after:9.4f} {np.median(ratio):6.2f} {spread:>12}"
+        print(f"{name:<14} {of_seconds} {errors[0]:9.2g} {errors[1]:9.2g}")
 
 
 if __name__ == "__main__":

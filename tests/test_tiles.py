@@ -7,9 +7,9 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
-from benchmark_tiles import agreement
 from conftest import TinyCapture
 from make_street import MadeStreet, make_street
+from scipy.optimize import linear_sum_assignment
 
 import og_pointcloud as og
 from og_pointcloud.cli import main
@@ -24,6 +24,15 @@ from og_pointcloud.settings import FitSettings, GeometrySettings, VisibilitySett
 
 SETTINGS = FitSettings(mode="grouping", geometry=GeometrySettings(scales=(0.5,), opacities=(0.9,)))
 POINTS = 60_000
+
+
+def agreement(first: np.ndarray, second: np.ndarray) -> float:
+    """Of the points that either labelling gives an instance, the share with the same, under the one-to-one matching of
+    instances that makes it largest."""
+    either, both = (first >= 0) | (second >= 0), (first >= 0) & (second >= 0)
+    shared = np.zeros((first.max(initial=-1) + 1, second.max(initial=-1) + 1))
+    np.add.at(shared, (first[both], second[both]), 1)
+    return float(shared[linear_sum_assignment(-shared)].sum() / either.sum())
 
 
 @lru_cache
