@@ -178,15 +178,6 @@ def test_a_host_of_ones_own(monkeypatch):
     assert name in clouds._READERS
 
 
-def test_pages_that_scripts_write_are_those_of_the_code(monkeypatch):
-    monkeypatch.syspath_prepend(str(ROOT / "scripts"))
-    import make_gallery
-    import write_settings_page
-
-    assert write_settings_page.PAGE.read_text() == write_settings_page.page()
-    assert (ROOT / "docs/gallery.md").read_text() == make_gallery.page()
-
-
 def test_members_of_a_file_are_on_the_page_of_formats(tmp_path):
     """Of a file that has everything a file may have."""
     encoder = read_text_encoder(DEMO_ENCODER / "text")
