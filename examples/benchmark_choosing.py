@@ -2,7 +2,7 @@
 
     python examples/benchmark_choosing.py CAPTURE [CAPTURE ...] --words WORDS.npz -o FOLDER [--fitted FOLDER]
 
-A capture has ``gt.npz`` (for scoring alone) and ``text_features.npz``, as for ``score_captures.py``. WORDS.npz holds
+A capture has ``gt.npz`` (for scoring alone) and ``text_features.npz``, see docs/scores.md. WORDS.npz holds
 text vectors of the same encoder: arrays ``<set>_names`` and ``<set>_text``; --bank names the sets of the word bank,
 --absent the set that absent words are drawn from. A capture with a simulated feature space gets simulated words.
 
@@ -10,7 +10,7 @@ Absent words: 50 drawn with a fixed seed, 40 times, from those whose centred vec
 label of the truth (armchair and sofa have 0.54, mug and cup 0.61, chair and bench 0.48); none of them is in the bank,
 up to words that two sets share.
 
-Columns: miou, unknown and background as ``score_captures.py`` has them, with all labels asked; miou_beside with the
+Columns: miou, unknown and background as ``og-pointcloud eval capture`` has them, with all labels asked; miou_beside with the
 absent words asked at once with the labels; called_absent: of the points of instances, the share that gets a label when
 absent words alone are asked; ece: expected calibration error over labelled points, ten bins, the labels asked;
 ece_all: the same with as many points again that are asked absent words alone; unobserved_called must be 0.
@@ -26,12 +26,12 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from score_captures import score_of
 
 import og_pointcloud as og
 from og_pointcloud.ask.choosing import Choice, Chooser
 from og_pointcloud.cloud import UNOBSERVED, LabelledCloud, WordBank
 from og_pointcloud.errors import MissingExtraError, OgPointcloudError
+from og_pointcloud.evaluate.truth import read_truth
 from og_pointcloud.settings import ChoosingSettings
 
 ABSENT_WORDS, DRAWS, DRAWS_BESIDE, BINS = 50, 40, 5, 10
@@ -209,12 +209,12 @@ def measure(case: Case, method: str, answers: Answers) -> tuple[Row, NDArray[np.
     ids = case.cloud.instance_ids
     asked = answers(case.texts)
     labels = asked.at(ids)[0]
-    score = score_of(labels, case.names, case.folder)
+    score = read_truth(case.folder).score(labels, case.names)
     beside, called, absent_confidence = [], [], []
     for words in case.absent[:DRAWS_BESIDE]:
         both = answers(np.concatenate([case.texts, words])).at(ids)[0]
         more = (*case.names, *(f"absent {index}" for index in range(len(words))))
-        beside.append(score_of(both, more, case.folder).miou)
+        beside.append(read_truth(case.folder).score(both, more).miou)
     points = np.bincount(ids[ids >= 0], minlength=len(case.cloud.instances))
     for words in case.absent:
         alone = answers(words)

@@ -18,9 +18,9 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from score_captures import score_of
 
 import og_pointcloud as og
+from og_pointcloud.evaluate.truth import read_truth
 from og_pointcloud.masking.contracts import AGREED, LEVELS, MaskSettings
 from og_pointcloud.masking.make_masks import MasksMade, make_masks
 from og_pointcloud.scene import Scene, View
@@ -104,7 +104,7 @@ def fit_cells(scene: Scene, folder: Path) -> str:
     seconds = time.perf_counter() - start
     words, _ = read_text_features(folder / "text_features.npz")
     result = og.segment(replace(cloud, vocabulary=words), list(words.names))
-    score = score_of(result.labels, result.names, folder)
+    score = read_truth(folder).score(result.labels, result.names)
     return f" {score.miou:7.3f} {score.macc:6.3f} {len(cloud.instances):10} {seconds:6.1f}"
 
 

@@ -14,7 +14,6 @@ import pytest
 import test_choosing
 from labelled_clouds import SPACE, TOO_FAR, queries, room
 from og_pointcloud_export import write_bundle
-from score_captures import score_of
 from test_choosing import Made, unit
 
 import og_pointcloud as og
@@ -22,6 +21,7 @@ from og_pointcloud.ask.choosing import Chooser, Reason
 from og_pointcloud.cli import main
 from og_pointcloud.cloud import BACKGROUND, UNOBSERVED, Vocabulary
 from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError
+from og_pointcloud.evaluate.truth import read_truth
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 OWNERS = [0, 0, 1, 2, 3, 5, 6, 7, 8]
@@ -376,7 +376,7 @@ def test_recorded_captures_keep_their_labels_and_give_absent_words_hardly_a_poin
     judged, plain = og.segment(scene), og.segment(bare)
     assert judged.calibrated
     assert not plain.calibrated
-    assert score_of(judged.labels, judged.names, DATA / name).miou > RECORDED[name]
+    assert read_truth(DATA / name).score(judged.labels, judged.names).miou > RECORDED[name]
     np.testing.assert_array_equal(judged.labels, plain.labels)
     of_instance = scene.instance_ids >= 0
     present = np.unique(judged.labels[judged.labels >= 0])

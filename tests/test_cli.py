@@ -1,6 +1,5 @@
 """The commands from end to end on a tiny capture, and what they answer to bad use and bad input."""
 
-import csv
 import json
 import shlex
 
@@ -160,10 +159,6 @@ def test_interrupt_leaves_nothing(tiny_capture, tmp_path, capsys, monkeypatch):
         (("view", "capture", "--features", "--columns", "0"), "--columns is 0"),
         (("fit", "capture", "-o", "s.ogpc", "--schedule-share", "0.1"), "--mode auto, which has no schedule"),
         (("fit", "capture", "-o", "s.ogpc", "--mode", "paper", "--schedule-share", "-1"), "schedule_share is -1"),
-        (("ablate",), "no CAPTURE and no --room"),
-        (("ablate", "--room", "1;2"), "--room is '1;2'"),
-        (("ablate", "capture", "--seeds", "0"), "--seeds is 0"),
-        (("ablate", "capture", "--schedule-share", "0.1"), "--schedule-share is of --paper"),
         (("import", "absent", "-o", "s.ogpc"), "is not a file; expected a result folder"),
     ],
 )  # fmt: skip
@@ -422,38 +417,6 @@ def test_import_leaves_nothing_of_a_damaged_result(tmp_path, capsys):
     path.write_bytes(path.read_bytes()[:500])
     assert "cannot be read" in error_of(capsys, "import", tmp_path / "run", "-o", tmp_path / "new" / "s.ogpc")
     assert not (tmp_path / "new").exists()
-
-
-def write_truth(capture):
-    truth = {"cls": capture.object_ids, "background": capture.object_ids < 0}
-    np.savez(capture.folder / "gt.npz", names=np.array(NAMES), **truth)
-
-
-def test_ablation_tables_are_printed_and_written(tiny_capture, tmp_path, capsys):
-    pytest.importorskip("matplotlib")
-    write_truth(tiny_capture)
-    code, stdout, _ = run(capsys, "ablate", tiny_capture.folder, "--seeds", "2", "-o", tmp_path / "out")
-    assert code == 0
-    for text in ("losses (fast)", "codebook (fast)", "association (fast)", "inter only", "grouping"):
-        assert text in stdout
-    with (tmp_path / "out" / "ablation.csv").open() as file:
-        rows = list(csv.DictReader(file))
-    assert {row["table"] for row in rows} == {"losses", "codebook", "association", "reference"}
-    assert all(row["runs"] == "2" and row["miou_spread"] for row in rows)
-    assert float(rows[-1]["miou"]) > 0.9
-    assert cv2.imread(str(tmp_path / "out" / "ablation.png")).shape[2] == 3
-    command = next(line for line in stdout.splitlines() if line.startswith("next: og-pointcloud "))
-    assert run(capsys, *shlex.split(command)[2:])[0] == 0, "the next command must work as printed"
-
-
-def test_an_ablation_needs_truth_and_words(tiny_capture, tmp_path, capsys):
-    pytest.importorskip("matplotlib")
-    command = ("ablate", tiny_capture.folder, "-o", tmp_path / "out")
-    assert "gt.npz is not a file" in error_of(capsys, *command)
-    write_truth(tiny_capture)
-    tiny_capture.text_features.unlink()
-    assert "text_features.npz is not a file" in error_of(capsys, *command)
-    assert not (tmp_path / "out").exists()
 
 
 def test_the_published_schedule_can_be_shortened(tiny_capture, tmp_path, capsys):

@@ -14,7 +14,6 @@ from collections.abc import Sequence
 from typing import NoReturn
 
 from og_pointcloud.cli import (
-    ablate,
     demo,
     edit,
     evaluate,
@@ -42,7 +41,7 @@ __all__ = ["main"]
 
 COMMANDS = (
     masks, models, fit, fuse, import_, segment, select, pick, instances, edit, view, ros_bag, info, vocabulary,
-    export_text_encoder, export_image_encoder, ablate, evaluate, report, demo,
+    export_text_encoder, export_image_encoder, evaluate, report, demo,
 )  # fmt: skip
 
 

@@ -1,120 +1,117 @@
-"""``og-pointcloud report``: error against run time of every setting, on captures and made rooms, as one page."""
+"""``og-pointcloud report``: error against run time of every setting, on captures and made rooms."""
 
 from __future__ import annotations
 
 import argparse
+import re
 import shlex
 import sys
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
+from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from og_pointcloud.cli.ablate import made_room, room_seeds
-from og_pointcloud.cli.common import add_command, check_outputs, print_table
-from og_pointcloud.errors import OgPointcloudError
+from og_pointcloud.cli.common import add_command, check_outputs, print_table, require_room
+from og_pointcloud.errors import MissingExtraError, OgPointcloudError
 
-if TYPE_CHECKING:
-    from og_pointcloud.evaluate.report.measure import Row
-    from og_pointcloud.evaluate.report.sweep import Tick
+SHARE = 0.05
+"""Of the published schedule, where --paper names none: the whole of it takes hours on a CPU."""
 
 
 def add(commands: Any) -> None:
     parser = add_command(
         commands, "report", run,
-        "Every setting that trades error for time, tried: a table, plots and one page.",
+        "Every setting that trades error for time, tried: one table, one chart, one page.",
         "og-pointcloud report kitchen shelf --quick -o report",
     )  # fmt: skip
     parser.add_argument(
         "captures", type=Path, nargs="*", metavar="CAPTURE",
-        help="folders; with gt.npz and text_features.npz errors are known, else all is held against the default",
+        help="folders; with gt.npz and text_features.npz the error is 1 - mIoU, else 1 - agreement with the masks",
     )  # fmt: skip
     parser.add_argument("--room", metavar="SEED[,SEED]", help="made rooms, in place of captures or beside them")
-    parser.add_argument("--quick", action="store_true", help="the knobs that matter most")
     parser.add_argument(
-        "--runs", type=int, default=1, metavar="N", help="runs of every setting, of the default at least 2 (default: 1)"
+        "--knob", action="append", metavar="NAME", help="only this setting (may be given several times)"
     )
-    parser.add_argument("--paper", action="store_true", help="also the paper's training, 3 %% of its steps (minutes)")
+    parser.add_argument("--quick", action="store_true", help="only the settings that matter most")
+    parser.add_argument("--seeds", type=int, default=1, metavar="N", help="runs of every setting (default: 1)")
+    parser.add_argument(
+        "--ablation", action="store_true", help="instead, the paper's tables: losses, codebook, association"
+    )
+    parser.add_argument("--paper", action="store_true", help="of --ablation: trained by rendering, as published (slow)")
+    parser.add_argument(
+        "--schedule-share", type=float, metavar="X", help=f"of --paper: part of its schedule (default: {SHARE})"
+    )
     parser.add_argument(
         "-o", "--output", type=Path, default=Path("out/report"), metavar="DIR",
-        help="folder for report.html, report.csv and the plots (default: %(default)s)",
+        help="folder for report.html, .csv and .png, or ablation.* (default: %(default)s)",
     )  # fmt: skip
 
 
 def run(arguments: argparse.Namespace) -> None:
-    seeds, output, runs = room_seeds(arguments.room), arguments.output, arguments.runs
-    if not arguments.captures and not seeds:
-        raise OgPointcloudError("no CAPTURE and no --room; expected at least one, e.g. --room 1")
-    if runs < 1:
-        raise OgPointcloudError(f"--runs is {runs}; expected at least 1")
-    page, table = output / "report.html", output / "report.csv"
-    check_outputs({"the page": (page, [".html"]), "the table": (table, [".csv"])}, inputs=arguments.captures)
+    rooms, output, captures = room_seeds(arguments.room), arguments.output, arguments.captures
+    check_options(arguments, rooms)
+    stem = output / ("ablation" if arguments.ablation else "report")
+    page, table, picture = (stem.with_suffix(ending) for ending in (".html", ".csv", ".png"))
+    outputs = {"page": (page, [".html"]), "table": (table, [".csv"]), "chart": (picture, [".png"])}
+    check_outputs(outputs, inputs=captures)
+    from og_pointcloud.evaluate.knobs import QUICK, ablations, settings_of
     from og_pointcloud.evaluate.plots import require_matplotlib
-    from og_pointcloud.evaluate.report.page import write_page
-    from og_pointcloud.evaluate.report.plots import fit_plot, knob_plot, mean_plot
-    from og_pointcloud.evaluate.report.sweep import QUICK, Sweep, report_on, write_rows
+    from og_pointcloud.evaluate.sweep import read_subject, sweep, write_rows
+    from og_pointcloud.evaluate.sweep_page import COLUMNS, cells, chart, write_page
+    from og_pointcloud.formats.atomic import replacing
 
     require_matplotlib()
+    if arguments.ablation:
+        settings = ablations((arguments.schedule_share or SHARE) if arguments.paper else None)
+    else:
+        settings = settings_of(tuple(arguments.knob) if arguments.knob else QUICK if arguments.quick else None)
+    # All are read before the first is worked on: what is missing in the last is told at once.
+    folders = [*captures, *(made_room(seed, output) for seed in rooms)]
+    found = sweep([read_subject(folder) for folder in folders], settings, seeds=arguments.seeds)
     output.mkdir(parents=True, exist_ok=True)
-    folders = [*arguments.captures, *(made_room(seed, output) for seed in seeds)]
-    sweep = Sweep(knobs=QUICK if arguments.quick else None, runs=runs, paper=arguments.paper)
-    check_names(folders)
-    with progress() as tick:
-        report = report_on(folders, sweep, tick)
-    write_rows(report.rows, table)
-    plots = {f"{name}-fits": fit_plot(report.rows, name) for name in report.pictures}
-    plots |= {f"{name}-settings": knob_plot(report.rows, name) for name in report.pictures}
-    plots["settings"] = mean_plot(report.rows)
-    for name, png in plots.items():
-        (output / f"{name}.png").write_bytes(png)
-    write_page(report, page)
-    print_defaults(report.rows)
-    print(f"wrote {page}, {table} and {len(plots)} plots")
+    write_rows(found.rows, table)
+    with replacing(picture) as file:
+        file.write(chart(found))
+    write_page(found, page, "Ablations" if arguments.ablation else "Error against run time")
+    for capture in found.captures:
+        print_table((capture, *COLUMNS[1:]), [cells(row) for row in found.rows if row.capture == capture])
+    for what, why in found.failed.items():
+        print(f"warning: could not be run: {what}: {why}", file=sys.stderr)
+    print(f"wrote {page}, {table} and {picture}")
     print(f"next: open {shlex.quote(str(page))} in a browser")
 
 
-def check_names(folders: Sequence[Path]) -> None:
-    """Captures are told apart by their folders' names."""
-    names = [folder.absolute().name for folder in folders]
-    twice = next((name for name in names if names.count(name) > 1), None)
-    if twice is not None:
+def check_options(arguments: argparse.Namespace, rooms: Sequence[int]) -> None:
+    if not arguments.captures and not rooms:
+        raise OgPointcloudError("no CAPTURE and no --room; expected at least one, e.g. --room 1")
+    if arguments.seeds < 1:
+        raise OgPointcloudError(f"--seeds is {arguments.seeds}; expected at least 1")
+    if arguments.paper and not arguments.ablation:
+        raise OgPointcloudError("--paper is of --ablation; expected both, or neither")
+    if arguments.schedule_share is not None and not arguments.paper:
+        raise OgPointcloudError("--schedule-share is of --paper; expected both, or neither")
+    if arguments.ablation and (arguments.knob or arguments.quick):
+        raise OgPointcloudError("--ablation has settings of its own; expected no --knob and no --quick beside it")
+    names = [folder.absolute().name for folder in arguments.captures]
+    if len(set(names)) < len(names):
+        twice = max(names, key=names.count)
         raise OgPointcloudError(f"two captures are in folders named '{twice}'; expected different names")
+    if arguments.paper and find_spec("torch") is None:
+        raise MissingExtraError("torch", "learn")
 
 
-@contextmanager
-def progress() -> Iterator[Tick]:
-    """A bar a capture, of the settings it still has to come, where stderr is a terminal."""
-    from tqdm import tqdm
-
-    bars: dict[str, Any] = {}
-
-    def tick(capture: str, what: str, left: int) -> None:
-        if capture not in bars:
-            for done in bars.values():
-                done.close()
-            bars[capture] = tqdm(total=left + 1, desc=capture, file=sys.stderr, disable=None, dynamic_ncols=True)
-        bars[capture].set_postfix_str(what, refresh=False)
-        bars[capture].update(bars[capture].total - left - bars[capture].n)
-
-    try:
-        yield tick
-    finally:
-        for bar in bars.values():
-            bar.close()
+def room_seeds(text: str | None) -> list[int]:
+    if text is None:
+        return []
+    if not re.fullmatch(r"\d{1,9}(,\d{1,9})*", text):
+        raise OgPointcloudError(f"--room is '{text}'; expected whole numbers with commas between them, e.g. 1,2")
+    return list(dict.fromkeys(int(seed) for seed in text.split(",")))
 
 
-def print_defaults(rows: Iterable[Row]) -> None:
-    """The default of each capture, and the method that does without instances."""
-    shown = [row for row in rows if row.is_default or row.value == "direct uplift"]
-    cells = [
-        (
-            row.capture, row.value or "the default", f"{row.seconds:.1f}", _number(row.miou), _number(row.macc),
-            _number(row.unknown), _number(row.background),
-        )
-        for row in shown
-    ]  # fmt: skip
-    print_table(("capture", "method", "seconds", "mIoU", "mAcc", "unknown", "background called"), cells)
+def made_room(seed: int, output: Path) -> Path:
+    """A furnished room as a capture folder, small enough for many fits."""
+    require_room()
+    from og_pointcloud_room.capture import CaptureSettings, make_capture, write_capture
 
-
-def _number(value: float | None) -> str:
-    return "-" if value is None else f"{value:.4f}"
+    settings = CaptureSettings(views=40, width=320, height=240, samples_per_view=20_000)
+    return write_capture(make_capture(seed, settings), output / f"room-{seed}")

@@ -1,0 +1,383 @@
+"""Error against run time: settings x captures x seeds -> one table, with error and seconds in the same row.
+
+A fit of a few points comes first in each mode and is discarded, so that compiled code is loaded. Settings of the stages
+after rendering take over the mask table, which is made once a capture; its seconds are added to theirs. Seconds are the
+least of the runs. Beside the settings stand other methods on the same table (`baselines`).
+
+    with gt.npz and text_features.npz      error = 1 - mIoU; a point without a label is a miss, a class called on known
+                                           background a false alarm
+    without                                error = 1 - mask agreement: how badly the instances reproduce the masks they
+                                           were made from. It sees what is torn, merged or missed, not wrong words
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import os
+import platform
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field, fields, replace
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from og_pointcloud.ask.choosing import chooser_of
+from og_pointcloud.cloud import LabelledCloud, Vocabulary
+from og_pointcloud.errors import FeatureSpaceError, MissingExtraError, OgPointcloudError, SceneError
+from og_pointcloud.evaluate.intervals import miou_difference
+from og_pointcloud.evaluate.knobs import DEFAULT, PUBLISHED_MIOU, Setting
+from og_pointcloud.evaluate.metrics import score_labels
+from og_pointcloud.evaluate.truth import GT_NAME, Truth, read_truth
+from og_pointcloud.formats.atomic import replacing
+from og_pointcloud.formats.capture import read_capture
+from og_pointcloud.journal import Journal
+from og_pointcloud.scene import Points, Scene
+from og_pointcloud.settings import FitSettings
+from og_pointcloud.text.text_features import UNKNOWN_SPACE, read_text_features
+
+try:
+    from og_pointcloud.evaluate.baselines import BASELINES, only_where_masked
+    from og_pointcloud.fitting.fit import fit, prepare
+    from og_pointcloud.fitting.labellers import Labelling, mask_agreement
+    from og_pointcloud.rendering.geometry import distinct_places
+except ImportError as error:
+    raise MissingExtraError("scipy and numba", "fit") from error
+
+__all__ = ["BASELINE", "Row", "Subject", "Sweep", "front", "machine", "read_subject", "sweep", "write_rows"]
+
+BASELINE = "baseline"
+"""The knob of rows of other methods."""
+WARM_UP_POINTS = 2_000
+
+Labels = NDArray[np.integer]
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A capture, the words that are asked of it, and what its points are. Both None where the folder lacks either."""
+
+    name: str
+    scene: Scene
+    vocabulary: Vocabulary | None
+    truth: Truth | None
+
+
+@dataclass(frozen=True)
+class Row:
+    """One setting on one capture, over ``runs`` seeds; or the mean of all captures.
+
+    seconds, seconds_most: of a whole fit, least and most of the runs. error: 1 - mIoU, or where the truth is not known
+    1 - agreement; mean of the runs, and their standard deviation (None for a single run).
+    miou, macc, unknown: over the points with a known class; background: the share of known background that was given a
+    class. labelled_miou: mIoU with background left out, as published tables have it. None without truth.
+    gain, gain_low, gain_high: mIoU less the default's, with its paired 95 % interval over blocks of space.
+    agreement: of the instances with the masks, None for other methods. published: the same row's mIoU in the paper.
+    left_out: what the fit left out and why, as its provenance has it.
+    """
+
+    capture: str
+    knob: str
+    value: str
+    seconds: float
+    seconds_most: float
+    runs: int
+    error: float
+    error_spread: float | None = None
+    miou: float | None = None
+    labelled_miou: float | None = None
+    macc: float | None = None
+    unknown: float | None = None
+    background: float | None = None
+    gain: float | None = None
+    gain_low: float | None = None
+    gain_high: float | None = None
+    agreement: float | None = None
+    instances: float | None = None
+    published: float | None = None
+    left_out: tuple[dict[str, Any], ...] = field(default=(), repr=False)
+
+    @property
+    def name(self) -> str:
+        """The setting, as tables and charts show it."""
+        return Setting(self.knob, self.value).name
+
+    @property
+    def is_default(self) -> bool:
+        """Whether this is what a fit without settings does."""
+        return self.knob == DEFAULT.knob
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """rows: of every capture in turn, the default first; where there are several captures their means come first.
+    failed: what could not be run -> why."""
+
+    rows: tuple[Row, ...]
+    failed: dict[str, str]
+
+    @property
+    def captures(self) -> list[str]:
+        """Names of the captures, the mean among them, in order."""
+        return list(dict.fromkeys(row.capture for row in self.rows))
+
+
+def read_subject(folder: Path) -> Subject:
+    """A capture with its words and its truth, as far as it has them.
+
+    Raises SceneError where the truth is of another cloud, FeatureSpaceError where the words are of another encoder than
+    the masks.
+    """
+    folder = folder.absolute()  # "." has no name
+    scene, words = read_capture(folder), folder / "text_features.npz"
+    if not (words.is_file() and (folder / GT_NAME).is_file()):
+        return Subject(folder.name, scene, None, None)
+    (vocabulary, space), truth = read_text_features(words), read_truth(folder)
+    if len(truth.cls) != len(scene.points):
+        raise SceneError(
+            f"{folder.name}: the truth is of {len(truth.cls)} points, the cloud has {len(scene.points)}; expected one "
+            "each"
+        )
+    if scene.feature_width not in (0, vocabulary.vectors.shape[1]) or (
+        space != scene.feature_space and UNKNOWN_SPACE not in (space, scene.feature_space)
+    ):
+        raise FeatureSpaceError(
+            f"{words} is of feature space '{space}', width {vocabulary.vectors.shape[1]}; the masks are of "
+            f"'{scene.feature_space}', width {scene.feature_width}: encode the names with the masks' model"
+        )
+    return Subject(folder.name, scene, vocabulary, truth)
+
+
+def sweep(subjects: Sequence[Subject], settings: Sequence[Setting], *, seeds: int = 1, progress: bool = True) -> Sweep:
+    """Try all settings on all captures. settings: the default (knobs.DEFAULT) first. seeds: runs of each setting.
+
+    A setting that fails is named in the result and costs no other. Deterministic but for seconds. OgPointcloudError
+    where not even the default could be run on any capture.
+    """
+    from tqdm import tqdm
+
+    rows, failed = [], {}
+    total = len(subjects) * len(settings)
+    with tqdm(total=total, desc="report", dynamic_ncols=True, disable=None if progress else True) as bar:
+        for number, subject in enumerate(subjects):
+            try:
+                trial = _Trial(subject, seeds)
+                for setting in settings:
+                    bar.set_postfix_str(f"{subject.name}, {setting.name}")
+                    try:
+                        rows.append(trial.row(setting))
+                    except Exception as error:  # one setting must not cost the report; the page names it
+                        if setting == DEFAULT:
+                            raise
+                        failed[f"{subject.name}, {setting.name}"] = f"{type(error).__name__}: {error}"
+                    bar.update()
+                rows += trial.baselines()
+            except OgPointcloudError as error:
+                failed[subject.name] = str(error)
+            bar.update((number + 1) * len(settings) - bar.n)
+    if not rows:
+        raise OgPointcloudError(f"no capture could be fitted: {next(iter(failed.values()), 'none was given')}")
+    return Sweep((*_means(rows), *rows), failed)
+
+
+class _Trial:
+    """One capture while settings are tried on it. What they share is made once."""
+
+    def __init__(self, subject: Subject, seeds: int) -> None:
+        self.subject, self.seeds, scene = subject, seeds, subject.scene
+        self.warm: set[str] = set()
+        self.rows: dict[tuple[FitSettings, int], Row] = {}
+        self.default_labels: Labels | None = None
+        self._warm_up(DEFAULT.settings)
+        journal, start = Journal(progress=False), time.perf_counter()
+        self.prepared = prepare(scene, journal=journal)
+        self.shared_seconds = time.perf_counter() - start
+        self.shared_left_out = tuple(journal.left_out)
+        # A whole fit labels coincident points once; from the table of all of them its result would differ.
+        self.can_share = scene.points.are_gaussians or len(distinct_places(scene.points.xyz)[0]) == len(scene.points)
+
+    def row(self, setting: Setting) -> Row:
+        """The row of one setting; settings that several tables name are run once."""
+        key = setting.settings, setting.every
+        if key not in self.rows:
+            self.rows[key] = self._measured(setting)
+        published = PUBLISHED_MIOU.get(setting.knob, {}).get(setting.value)
+        return replace(self.rows[key], knob=setting.knob, value=setting.value, published=published)
+
+    def baselines(self) -> Iterator[Row]:
+        """Other methods, as they are, and with points that masks mostly pass by left out; none without truth."""
+        if self.subject.truth is None or self.subject.vocabulary is None:
+            return
+        for name, method in BASELINES.items():
+            start = time.perf_counter()
+            labels = method(self.subject.scene, self.prepared, self.subject.vocabulary.vectors)
+            seconds = self.shared_seconds + time.perf_counter() - start
+            for value, found in ((name, labels), (f"{name}, where masked", only_where_masked(labels, self.prepared))):
+                scores = self._scores(found)
+                yield Row(self.subject.name, BASELINE, value, seconds, seconds, 1, 1 - scores["miou"], **scores)
+
+    def _measured(self, setting: Setting) -> Row:
+        runs = [self._run(setting, seed) for seed in range(self.seeds)]
+        seconds, clouds = [seconds for seconds, _ in runs], [cloud for _, cloud in runs]
+        labels = [self._labels(cloud) for cloud in clouds]
+        if setting == DEFAULT:
+            self.default_labels = labels[0]
+        scores = [self._scores(found) | self._of_instances(c) for found, c in zip(labels, clouds, strict=True)]
+        mean: dict[str, Any] = {name: _mean([score[name] for score in scores]) for name in scores[0]}
+        errors = [1 - score.get("miou", score["agreement"]) for score in scores]
+        shared = self.shared_left_out if self._shares(setting) else ()
+        return Row(
+            capture=self.subject.name,
+            knob=setting.knob,
+            value=setting.value,
+            seconds=min(seconds),
+            seconds_most=max(seconds),
+            runs=self.seeds,
+            error=float(np.mean(errors)),
+            error_spread=float(np.std(errors, ddof=1)) if len(errors) > 1 else None,
+            left_out=(*shared, *clouds[0].provenance["left_out"]),
+            **mean,
+        )
+
+    def _run(self, setting: Setting, seed: int) -> tuple[float, LabelledCloud]:
+        """Seconds of a whole fit, and what it gives."""
+        settings, scene = replace(setting.settings, seed=seed), self.subject.scene
+        scene = replace(scene, views=scene.views[:: setting.every])
+        self._warm_up(settings)
+        prepared = self.prepared if self._shares(setting) else None
+        start = time.perf_counter()
+        cloud = fit(scene, settings, prepared=prepared, progress=False)
+        return time.perf_counter() - start + (self.shared_seconds if prepared else 0.0), cloud
+
+    def _shares(self, setting: Setting) -> bool:
+        """Whether a setting changes nothing up to the mask table, and can take that over."""
+        same_table = _before_table(setting.settings) == _before_table(DEFAULT.settings)
+        return self.can_share and same_table and setting.every == 1 and setting.settings.mode != "paper"
+
+    def _warm_up(self, settings: FitSettings) -> None:
+        """Fit two views of a few points in this mode: what they are labelled does not matter."""
+        if settings.mode in self.warm:
+            return
+        self.warm.add(settings.mode)
+        scene = self.subject.scene
+        points, rows = scene.points, slice(None, None, 1 + len(scene.points) // WARM_UP_POINTS)
+        columns = {name: getattr(points, name) for name in ("rgb", "normals", "scale", "rotation", "opacity")}
+        kept = {name: None if column is None else column[rows] for name, column in columns.items()}
+        views = tuple(view for view in scene.views if view.mask_count)[:2]
+        thin = replace(scene, points=Points(points.xyz[rows], points.origin, **kept), views=views)
+        with suppress(OgPointcloudError):  # two views may show nothing; the fit itself will tell
+            fit(thin, replace(settings, paper=replace(settings.paper, schedule_share=1e-4)), progress=False)
+
+    def _labels(self, cloud: LabelledCloud) -> Labels:
+        """(n,) the word of each point, -1 unknown; its instance where there are no words."""
+        vocabulary = self.subject.vocabulary
+        if vocabulary is None:
+            return cloud.instance_ids
+        return chooser_of(cloud).choose(vocabulary.vectors).at(cloud.instance_ids)[0]
+
+    def _of_instances(self, cloud: LabelledCloud) -> dict[str, Any]:
+        labelling = Labelling(cloud.instance_ids, cloud.instances, np.zeros(0, np.int32))
+        return {
+            "agreement": mask_agreement(self.prepared.table, labelling),
+            "instances": float(len(cloud.instances)),
+        }
+
+    def _scores(self, labels: Labels) -> dict[str, Any]:
+        """mIoU, recall and shares, as Row has them; nothing where the capture does not know its classes."""
+        truth, vocabulary = self.subject.truth, self.subject.vocabulary
+        if truth is None or vocabulary is None:
+            return {}
+        called = truth.class_of(labels, vocabulary.names)
+        score = truth.score(labels, vocabulary.names)
+        found: dict[str, Any] = {
+            "miou": score.miou,
+            "labelled_miou": score_labels(called, truth.cls, scored=truth.scored).miou,
+            "macc": score.macc,
+            "unknown": score.unknown_share,
+            "background": score.background_called,
+        }
+        if self.default_labels is not None and score.classes:
+            default = truth.class_of(self.default_labels, vocabulary.names)
+            spacing = float(np.median(self.prepared.neighbourhood.spacing))
+            gain = miou_difference(called, default, truth, self.subject.scene.points.xyz, spacing, score.classes)
+            found |= {"gain": gain.mean, "gain_low": gain.low, "gain_high": gain.high}
+        return found
+
+
+def _before_table(settings: FitSettings) -> tuple[Any, ...]:
+    """All that the mask table depends on (fit.prepare)."""
+    membership = settings.membership
+    see_through = membership.few_views, membership.gap_sizes, membership.front_share
+    return settings.geometry, settings.visibility, settings.memory, see_through
+
+
+def _means(rows: Sequence[Row]) -> list[Row]:
+    """One row a setting that ran on every capture: means, of seconds the geometric one. Nothing for one capture, or
+    where errors are of two kinds."""
+    captures = list(dict.fromkeys(row.capture for row in rows))
+    if len(captures) < 2 or len({row.miou is None for row in rows}) > 1:
+        return []
+    means = []
+    for setting in dict.fromkeys((row.knob, row.value) for row in rows):
+        own = [row for row in rows if (row.knob, row.value) == setting]
+        if len(own) < len(captures):
+            continue
+        numbers = {
+            one.name: _mean([getattr(row, one.name) for row in own])
+            for one in fields(Row) if one.name not in ("capture", "knob", "value", "runs", "left_out", "published")
+        }  # fmt: skip
+        for name in ("seconds", "seconds_most"):
+            numbers[name] = float(np.exp(np.mean(np.log([getattr(row, name) for row in own]))))
+        unknown = dict.fromkeys(("error_spread", "gain_low", "gain_high"), None)
+        means.append(replace(own[0], capture=f"mean of {len(captures)}", left_out=(), **(numbers | unknown)))
+    return means
+
+
+def _mean(values: Sequence[float | None]) -> float | None:
+    """None where a value is."""
+    known = [value for value in values if value is not None]
+    return float(np.mean(known)) if len(known) == len(values) else None
+
+
+def front(rows: Sequence[Row]) -> list[Row]:
+    """Rows that no other beats in both seconds and error, by seconds (Pareto)."""
+    best: list[Row] = []
+    for row in sorted(rows, key=lambda row: (row.seconds, row.error)):
+        if not best or row.error < best[-1].error:
+            best.append(row)
+    return best
+
+
+def write_rows(rows: Iterable[Row], path: Path) -> Path:
+    """A CSV with a line a row, the machine and the versions in each; written whole or not at all."""
+    text = io.StringIO()
+    where = {"machine": machine()}
+    lines = csv.DictWriter(text, [*(one.name for one in fields(Row)), *where], lineterminator="\n")
+    lines.writeheader()
+    for row in rows:
+        values = asdict(row) | {"left_out": "; ".join(str(entry["what"]) for entry in row.left_out)} | where
+        lines.writerow({name: f"{value:.6g}" if isinstance(value, float) else value for name, value in values.items()})
+    with replacing(path) as file:
+        file.write(text.getvalue().encode())
+    return path
+
+
+def machine() -> str:
+    """What seconds are of: processor, cores, system, and the versions of what computes."""
+    names = ("numpy", "numba", "scipy", "onnxruntime")
+    versions = ", ".join([f"Python {platform.python_version()}", *(f"{name} {version(name)}" for name in names)])
+    return f"{_processor()}, {os.cpu_count()} cores, {platform.system()}, {versions}"
+
+
+def _processor() -> str:
+    information = Path("/proc/cpuinfo")
+    if information.is_file():
+        for line in information.read_text().splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor() or platform.machine()
