@@ -10,8 +10,8 @@ Absent words: 50 drawn with a fixed seed, 40 times, from those whose centred vec
 label of the truth (armchair and sofa have 0.54, mug and cup 0.61, chair and bench 0.48); none of them is in the bank,
 up to words that two sets share.
 
-Columns: miou, unknown and background as ``og-pointcloud eval capture`` has them, with all labels asked; miou_beside with the
-absent words asked at once with the labels; called_absent: of the points of instances, the share that gets a label when
+Columns: miou, unknown and background as ``eval capture`` has them, with all labels asked; miou_beside with the absent
+words asked at once with the labels; called_absent: of the points of instances, the share that gets a label when
 absent words alone are asked; ece: expected calibration error over labelled points, ten bins, the labels asked;
 ece_all: the same with as many points again that are asked absent words alone; unobserved_called must be 0.
 """

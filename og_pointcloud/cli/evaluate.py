@@ -347,10 +347,9 @@ def print_selections(scenes: LerfScores, ways: Sequence[str]) -> dict[str, dict[
     total = str(means[0].pairs)
     rows.append(("mean of scenes", total, *(percent(v) for mean in means for v in (mean.miou, mean.accuracy))))
     rows.append(("all pairs", total, *(percent(v) for mean in means for v in (mean.flat_miou, mean.flat_accuracy))))
-    columns = [
-        column for way in ways for values in [pair_column(scenes, way)] for column in (values, values > IOU_FOUND)
-    ]
-    rows.append(("95 % of all pairs", "", *(spread(bootstrap(column)) for column in columns)))
+    pooled = [pair_column(scenes, way) for way in ways]
+    intervals = [bootstrap(column) for ious in pooled for column in (ious, (ious > IOU_FOUND).astype(float))]
+    rows.append(("95 % of all pairs", "", *map(spread, intervals)))
     print_table(("", "pairs", *(f"{way} {what}" for way in ways for what in ("mIoU", "over 0.25"))), rows)
     return {way: asdict(mean) for way, mean in zip(ways, means, strict=True)}
 

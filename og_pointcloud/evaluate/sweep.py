@@ -28,8 +28,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.ask.choosing import chooser_of
-from og_pointcloud.cloud import LabelledCloud, Vocabulary
-from og_pointcloud.errors import FeatureSpaceError, MissingExtraError, OgPointcloudError, SceneError
+from og_pointcloud.cloud import FeatureSpace, LabelledCloud, Vocabulary
+from og_pointcloud.errors import MissingExtraError, OgPointcloudError, SceneError
 from og_pointcloud.evaluate.intervals import miou_difference
 from og_pointcloud.evaluate.knobs import DEFAULT, PUBLISHED_MIOU, Setting
 from og_pointcloud.evaluate.metrics import score_labels
@@ -39,7 +39,7 @@ from og_pointcloud.formats.capture import read_capture
 from og_pointcloud.journal import Journal
 from og_pointcloud.scene import Points, Scene
 from og_pointcloud.settings import FitSettings
-from og_pointcloud.text.text_features import UNKNOWN_SPACE, read_text_features
+from og_pointcloud.text.text_features import read_text_features
 
 try:
     from og_pointcloud.evaluate.baselines import BASELINES, only_where_masked
@@ -143,13 +143,8 @@ def read_subject(folder: Path) -> Subject:
             f"{folder.name}: the truth is of {len(truth.cls)} points, the cloud has {len(scene.points)}; expected one "
             "each"
         )
-    if scene.feature_width not in (0, vocabulary.vectors.shape[1]) or (
-        space != scene.feature_space and UNKNOWN_SPACE not in (space, scene.feature_space)
-    ):
-        raise FeatureSpaceError(
-            f"{words} is of feature space '{space}', width {vocabulary.vectors.shape[1]}; the masks are of "
-            f"'{scene.feature_space}', width {scene.feature_width}: encode the names with the masks' model"
-        )
+    masks, names = (scene.feature_space, scene.feature_width), (space, vocabulary.vectors.shape[1])
+    FeatureSpace(*masks).require(FeatureSpace(*names), f"names of {words}")
     return Subject(folder.name, scene, vocabulary, truth)
 
 
