@@ -15,6 +15,7 @@ import pytest
 from conftest import COLOURS, NAMES, write_ply, write_tiny_capture
 from scipy.sparse import csr_array
 
+from og_pointcloud.ask.labelled_scene import LabelledScene
 from og_pointcloud.cli import main
 from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError, SceneError
 from og_pointcloud.evaluate import knobs
@@ -110,7 +111,7 @@ def test_rows_have_error_and_seconds_and_a_setting_that_fails_costs_no_other(sub
     assert list(rows)[:3] == [("default", ""), ("views", "one of 2"), ("mode", "fast")]
     cloud = fit(subject.scene, progress=False)
     default = rows["default", ""]
-    labels = sweeping.chooser_of(cloud).choose(subject.vocabulary.vectors).at(cloud.instance_ids)[0]
+    labels = LabelledScene.from_cloud(cloud).chooser.choose(subject.vocabulary.vectors).at(cloud.instance_ids)[0]
     assert default.miou == 1 - default.error == subject.truth.score(labels, subject.vocabulary.names).miou > 0.8
     assert (default.runs, default.error_spread, default.gain) == (2, 0.0, 0.0)
     assert list(default.left_out) == cloud.provenance["left_out"]

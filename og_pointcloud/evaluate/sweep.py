@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud.ask.choosing import chooser_of
+from og_pointcloud.ask.labelled_scene import LabelledScene
 from og_pointcloud.cloud import FeatureSpace, LabelledCloud, Vocabulary
 from og_pointcloud.errors import MissingExtraError, OgPointcloudError, SceneError
 from og_pointcloud.evaluate.intervals import miou_difference
@@ -273,7 +273,7 @@ class _Trial:
         vocabulary = self.subject.vocabulary
         if vocabulary is None:
             return cloud.instance_ids
-        return chooser_of(cloud).choose(vocabulary.vectors).at(cloud.instance_ids)[0]
+        return LabelledScene.from_cloud(cloud).chooser.choose(vocabulary.vectors).at(cloud.instance_ids)[0]
 
     def _of_instances(self, cloud: LabelledCloud) -> dict[str, Any]:
         labelling = Labelling(cloud.instance_ids, cloud.instances, np.zeros(0, np.int32))
