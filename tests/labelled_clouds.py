@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud.cloud import BACKGROUND, UNOBSERVED, InstanceTable, LabelledCloud, Vocabulary
+from og_pointcloud.cloud import BACKGROUND, NO_EVIDENCE, UNOBSERVED, InstanceTable, LabelledCloud, Vocabulary
 
 TOO_FAR = -3
 WIDTH = 16
@@ -116,3 +116,16 @@ def nearest_plainly(cloud: LabelledCloud, points: NDArray[np.float32]) -> NDArra
 
 def instances_plainly(cloud: LabelledCloud, points: NDArray[np.float32]) -> NDArray[np.int32]:
     return np.append(cloud.instance_ids, np.int32(TOO_FAR))[nearest_plainly(cloud, points)]
+
+
+def reference_scores(instances: InstanceTable, text: NDArray[np.floating]) -> NDArray[np.float64]:
+    """(K, L) float64: best cosine of each instance's descriptors with each text, -2 without a descriptor."""
+    scores = np.full((len(instances), len(text)), NO_EVIDENCE, np.float64)
+    text = text.astype(np.float64)
+    length = np.linalg.norm(text, axis=1, keepdims=True)
+    unit = np.divide(text, length, out=np.zeros_like(text), where=length > 0)
+    for descriptor, instance in zip(
+        instances.descriptors.astype(np.float64), instances.descriptor_instance, strict=True
+    ):
+        scores[instance] = np.maximum(scores[instance], unit @ descriptor)
+    return scores

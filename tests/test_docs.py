@@ -18,7 +18,7 @@ from labelled_clouds import instance_table, make_cloud
 import og_pointcloud as og
 from og_pointcloud.ask import hosts as clouds
 from og_pointcloud.ask.hosts import world_points
-from og_pointcloud.bundle.read import SCHEMA_VERSION
+from og_pointcloud.bundle.format import SCHEMA_VERSION
 from og_pointcloud.cli import build_parser, main
 from og_pointcloud.cloud import Vocabulary
 from og_pointcloud.errors import SceneError

@@ -21,17 +21,17 @@ from labelled_clouds import (
     make_cloud,
     nearest_plainly,
     queries,
+    reference_scores,
     room,
     tough_clouds,
     unit_rows,
 )
-from og_pointcloud_export import brick_grid, write_bundle
-from og_pointcloud_export.query_head import reference_scores
+from og_pointcloud_export import lookup_grid, write_bundle
 
 import og_pointcloud as og
 from og_pointcloud.ask import labelled_scene as runtime
+from og_pointcloud.bundle.format import BEYOND, NEAR, ON_SURFACE
 from og_pointcloud.bundle.nearest import surface_distance
-from og_pointcloud.bundle.read import BEYOND, NEAR, ON_SURFACE
 from og_pointcloud.cloud import Vocabulary
 from og_pointcloud.errors import BundleError, FeatureSpaceError, OgPointcloudError, SceneError
 from og_pointcloud.formats.colors import label_colors
@@ -233,8 +233,12 @@ def test_a_graph_that_is_not_ours_is_refused(scene):
 
 
 @pytest.mark.parametrize(
-    "table", ["value_instance", "block_shifts", "brick_values", "list_start", "candidates_high", "descriptors"]
-)
+    "table",
+    [
+        "value_instance", "block_shifts", "brick_values", "node_values", "child_start", "child_length",
+        "candidates_high", "descriptors",
+    ],
+)  # fmt: skip
 def test_a_graph_whose_tables_lie_gives_an_error_or_an_instance_of_the_scene(scene, table):
     import onnx
 
@@ -635,8 +639,8 @@ def test_a_shorter_reach_is_exact(scene):
 
 @pytest.mark.parametrize("name", ["room", "far outliers", "coincident points of different ids", "scattered points"])
 def test_distance_of_points_the_table_leaves_open_and_of_the_others(monkeypatch, tmp_path, name):
-    monkeypatch.setattr(brick_grid, "LISTS_AT_LEAST", 0)
-    monkeypatch.setattr(brick_grid, "LISTS_PER_POINT", 0)
+    monkeypatch.setattr(lookup_grid, "LISTS_AT_LEAST", 0)
+    monkeypatch.setattr(lookup_grid, "LISTS_PER_POINT", 0)
     cloud = CLOUDS[name]
     scene = og.load(write_bundle(cloud, tmp_path / "s.ogpc"))
     points = queries(cloud, 150)

@@ -1,4 +1,4 @@
-"""LabelledCloud -> one .ogpc file; og_pointcloud.bundle.read says what is in it, and reads it."""
+"""LabelledCloud -> one .ogpc file; og_pointcloud.bundle.format says what is in it."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from og_pointcloud.bundle.format import FORMAT, SCHEMA_VERSION, describe_member
 from og_pointcloud.bundle.nearest import NONE_WITHIN_REACH, NearestPoint
-from og_pointcloud.bundle.read import FORMAT, SCHEMA_VERSION, describe_member
 from og_pointcloud.bundle.vocabulary import bank_members, encoder_members, vocabulary_members
 from og_pointcloud.cloud import TOO_FAR, InstanceTable, LabelledCloud
 from og_pointcloud.errors import OgPointcloudError
@@ -22,8 +22,8 @@ from og_pointcloud.formats.atomic import replacing
 from og_pointcloud.formats.npy import npy_bytes
 from og_pointcloud.models import open_session
 from og_pointcloud.text.encoder import find_encoder, read_text_encoder
-from og_pointcloud_export.brick_grid import BrickGrid, build_brick_grid
-from og_pointcloud_export.query_head import OPSET, build_query_head, reference_scores
+from og_pointcloud_export.lookup_grid import LookupGrid, build_lookup_grid
+from og_pointcloud_export.query_graph import OPSET, build_query_graph
 
 __all__ = ["query_model", "write_bundle"]
 
@@ -76,8 +76,8 @@ def write_bundle(
 
 def query_model(cloud: LabelledCloud) -> QueryModel:
     """Build a cloud's query.onnx and hold it against numpy in float64; OgPointcloudError if they differ."""
-    grid = build_brick_grid(cloud)
-    onnx = build_query_head(cloud, grid)
+    grid = build_lookup_grid(cloud)
+    onnx = build_query_graph(cloud, grid)
     parity = _parity(cloud, onnx)
     if parity["instance_score_error"] > SCORE_TOLERANCE or parity["certain_points_wrong"]:
         raise OgPointcloudError(
@@ -123,7 +123,7 @@ def _parity(cloud: LabelledCloud, onnx: bytes) -> dict[str, Any]:
     nearest = NearestPoint(cloud.xyz, cloud.spacing, cloud.reach).query(points)
     exact = np.full(len(points), TOO_FAR, np.int32)
     exact[nearest != NONE_WITHIN_REACH] = cloud.instance_ids[nearest[nearest != NONE_WITHIN_REACH]]
-    reference = reference_scores(cloud.instances, text)
+    reference = cloud.instances.cosines(text.astype(np.float64))
     return {
         "texts": len(text),
         "instance_score_error": float(np.abs(scores - reference).max(initial=0.0)),
@@ -135,14 +135,13 @@ def _parity(cloud: LabelledCloud, onnx: bytes) -> dict[str, Any]:
     }
 
 
-def _describe_grid(grid: BrickGrid) -> dict[str, Any]:
+def _describe_grid(grid: LookupGrid) -> dict[str, Any]:
     return {
         "cell_size": float(grid.cell_size),
         "bricks": list(grid.shape),
         "blocks_stored": len(grid.bricks),
-        "bricks_stored": len(grid.cells),
-        "cells_split": len(grid.parts) - 1,
-        "lists": len(grid.list_start) - 1,
+        "boxes_split": len(grid.nodes),
+        "lists": int((grid.child_length > 0).sum()),
         "candidates": len(grid.candidates),
         "bytes": grid.nbytes,
     }

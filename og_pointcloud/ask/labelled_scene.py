@@ -23,8 +23,9 @@ from og_pointcloud.ask.hosts import carried_scene, world_points
 from og_pointcloud.ask.instances import WORDS, Instances, list_instances
 from og_pointcloud.ask.query_graph import QueryGraph
 from og_pointcloud.ask.segmentation import Segmentation
+from og_pointcloud.bundle.format import BEYOND, NEAR, ON_SURFACE
 from og_pointcloud.bundle.nearest import NONE_WITHIN_REACH, NearestPoint, surface_distance
-from og_pointcloud.bundle.read import BEYOND, NEAR, ON_SURFACE, Bundle, read_bundle
+from og_pointcloud.bundle.read import Bundle, read_bundle
 from og_pointcloud.cloud import TOO_FAR, UNKNOWN_SPACE, FeatureSpace, LabelledCloud, Vocabulary
 from og_pointcloud.errors import OgPointcloudError, SceneError
 from og_pointcloud.text.words import Labels, TextFeatures, resolve_labels

@@ -1,26 +1,10 @@
-"""The .ogpc file: what is in it, and how it is read without believing it.
-
-One zip, every member stored uncompressed, nothing pickled:
-
-  manifest.json            format, schema_version, feature_space, frame (origin, unit, spacing, reach), counts,
-                           members (bytes, sha256, dtype, shape of each), parity figures of the graph, provenance
-  query.onnx               the graph that answers text; the instance table's descriptors (R, D) are its constants
-  arrays/*.npy             xyz, instance_ids (smallest integer type), rgb if known, instances/*
-  vocabulary/names.json    words that may be asked as strings, if any
-  vocabulary/vectors.npy   (L, D) float16 or float32 unit vectors
-  bank/vectors.npy         (B, D) float16, everyday words that labels are judged by (see ``choosing``), if it has them
-  text_encoder/*           the files of a text encoder (see ``text_encoder``), if it carries one; read when needed
-
-``og_pointcloud_export`` writes it.
-"""
+"""A .ogpc file read without believing it; ``bundle.format`` says what is in one."""
 
 from __future__ import annotations
 
 import hashlib
-import io
 import json
 import os
-import re
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,39 +13,30 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
+from og_pointcloud.bundle.format import (
+    BANK,
+    CARRIED_ENCODER,
+    CERTAINTY,
+    FLOATS,
+    FORMAT,
+    INTEGERS,
+    MAX_MANIFEST_BYTES,
+    MAX_MEMBERS,
+    QUERY_OPERATORS,
+    REBUILD,
+    RGB,
+    SAFE_NAME,
+    SCHEMA_VERSION,
+)
 from og_pointcloud.cloud import InstanceTable, LabelledCloud, Vocabulary, WordBank
 from og_pointcloud.errors import BundleError, OgPointcloudError
 from og_pointcloud.formats.npy import array_from_npy
 from og_pointcloud.models import check_graph
 
-__all__ = [
-    "BANK", "BEYOND", "FORMAT", "NEAR", "ON_SURFACE", "SCHEMA_VERSION", "Bundle", "read_bundle",
-]  # fmt: skip
+__all__ = ["Bundle", "read_bundle", "read_carried_encoder"]
 
-FORMAT = "ogpc"
-SCHEMA_VERSION = 2
-"""Raised when files of before cannot be asked any more: 2 is the graph that settles points at borders itself."""
-ON_SURFACE, NEAR, BEYOND = 0, 1, 2
-"""How far a query point is from the cloud: within about 1.5 spacings, within reach, or too far."""
-
-MAX_MEMBERS = 256
-MAX_MANIFEST_BYTES = 1 << 26
-SAFE_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]*(/[A-Za-z0-9_][A-Za-z0-9_.-]*)*")
-INTEGERS, FLOATS = ("|i1", "<i2", "<i4"), ("<f2", "<f4")
-QUERY_OPERATORS = frozenset({
-    "Abs", "Add", "ArgMax", "ArgMin", "Cast", "Concat", "Div", "Expand", "Gather", "GatherElements", "Greater",
-    "GreaterOrEqual", "Identity", "IsNaN", "Less", "LessOrEqual", "MatMul", "Max", "Min", "Mod", "Mul", "NonZero",
-    "ReduceL2", "ReduceMax", "ReduceSum", "Reshape", "ScatterElements", "Shape", "Slice", "Split", "Sub",
-    "Transpose", "Unsqueeze", "Where",
-})  # fmt: skip
-"""What a query.onnx is made of: arithmetic and look-ups, nothing that repeats or branches."""
 ZIP_ERRORS = (zipfile.BadZipFile, EOFError, RuntimeError, NotImplementedError, OSError, ValueError)
 """All that zipfile raises for damaged archives, encrypted ones, and those of methods that it lacks."""
-REBUILD = "write the file again with write_bundle"
-BANK = "bank/vectors.npy"
-RGB, CERTAINTY = "arrays/rgb.npy", "arrays/certainty.npy"
-CARRIED_ENCODER = "text_encoder/"
-"""What the names of a carried text encoder's members begin with."""
 
 
 @dataclass(frozen=True)
@@ -111,15 +86,6 @@ def read_carried_encoder(path: str | os.PathLike[str]) -> dict[str, bytes] | Non
         raise BundleError(f"{path}: {error}") from None
     except ZIP_ERRORS as error:
         raise BundleError(f"{path}: the text encoder in it is damaged ({error!s:.120}): {REBUILD}") from None
-
-
-def describe_member(name: str, data: bytes) -> dict[str, Any]:
-    """What the manifest says of a member: bytes, sha256 and, of an array, its type and shape."""
-    entry: dict[str, Any] = {"bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}
-    if name.endswith(".npy"):
-        array = np.load(io.BytesIO(data), allow_pickle=False)
-        entry |= {"dtype": array.dtype.str, "shape": list(array.shape)}
-    return entry
 
 
 class _Refused(Exception):

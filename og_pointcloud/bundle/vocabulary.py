@@ -17,7 +17,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud.bundle.read import BANK, CARRIED_ENCODER, describe_member, read_bundle
+from og_pointcloud.bundle.format import BANK, CARRIED_ENCODER, describe_member
+from og_pointcloud.bundle.read import read_bundle
 from og_pointcloud.cloud import FeatureSpace, InstanceTable, Vocabulary, WordBank, unit_rows
 from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError
 from og_pointcloud.formats.atomic import replacing

@@ -139,7 +139,7 @@ def require_room() -> None:
 
 def describe_fit(cloud: LabelledCloud, capture: Path, bundle: Path) -> dict[str, Any]:
     """What ``fit --json`` writes: counts, the file, and the provenance (stages, settings, what was left out)."""
-    from og_pointcloud.bundle.read import BANK
+    from og_pointcloud.bundle.format import BANK
     from og_pointcloud.cloud import BACKGROUND, UNOBSERVED
 
     with zipfile.ZipFile(bundle) as archive:  # writing may have found a word bank

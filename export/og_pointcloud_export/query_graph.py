@@ -7,7 +7,7 @@ Outputs
   label           (N,) int32      row of ``text``, -1 unknown
   score           (N,) float32    cosine of that label, 0 where unknown
   instance        (N,) int32      instance id, -1 background, -2 unobserved, -3 too far from the cloud
-  distance        (N,) int8       0 on the surface, 1 near it, 2 too far; between 0 and 1 to about a cell (brick_grid)
+  distance        (N,) int8       0 on the surface, 1 near it, 2 too far; between 0 and 1 to about a cell (lookup_grid)
   certain         (N,) bool       false, rarely: the table has no room for this cell, the answer is its centre's
   instance_scores (K, L) float32  best cosine of an instance's descriptors with each text, -2 without a descriptor
 Any of N, L and K may be 0.
@@ -15,18 +15,17 @@ Any of N, L and K may be 0.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from og_pointcloud.bundle.format import BEYOND, NEAR, ON_SURFACE
 from og_pointcloud.bundle.nearest import surface_distance
-from og_pointcloud.bundle.read import BEYOND, NEAR, ON_SURFACE
 from og_pointcloud.cloud import NO_EVIDENCE, InstanceTable, LabelledCloud
 from og_pointcloud.errors import MissingExtraError
-from og_pointcloud_export.brick_cells import BLOCK, BRICK, PARTS, TOO_FAR_CODE
-from og_pointcloud_export.brick_grid import CELLS, CODE_OFFSET, LONGEST_LIST, PLACES, SHORT_LIST, BrickGrid
+from og_pointcloud_export.lookup_boxes import CHILDREN, EDGE, LONGEST_LIST, SHORT_LIST, TOO_FAR_CODE
+from og_pointcloud_export.lookup_grid import CODE_OFFSET, LookupGrid
 
 try:
     import onnx
@@ -34,7 +33,7 @@ try:
 except ImportError as error:
     raise MissingExtraError("onnx", "fit") from error
 
-__all__ = ["OPSET", "ScoreHead", "build_query_head", "reference_scores"]
+__all__ = ["OPSET", "build_query_graph"]
 
 MIDDLE_LIST = 20
 """So many candidates are compared where the list is longer than SHORT_LIST, LONGEST_LIST where it is longer still."""
@@ -42,27 +41,11 @@ OPSET, IR_VERSION = 18, 8
 """The oldest that has everything needed (ScatterElements with max), so that onnxruntime 1.17 and later run it."""
 
 
-@dataclass(frozen=True)
-class ScoreHead:
-    """How text meets the descriptors; the default changes nothing, the others trade error for size.
-
-    width: dimensions that text and descriptors are reduced to, those in which the descriptors differ most; with as many
-        as there are descriptors nothing is lost. None: all.
-    centred: the mean descriptor is taken off both first, a different cosine, which spreads scores wider.
-    precision: of the stored descriptors; int8 with a scale each.
-    """
-
-    width: int | None = None
-    centred: bool = False
-    precision: Literal["float32", "float16", "int8"] = "float32"
-
-
-def build_query_head(cloud: LabelledCloud, grid: BrickGrid, head: ScoreHead | None = None) -> bytes:
+def build_query_graph(cloud: LabelledCloud, grid: LookupGrid) -> bytes:
     """The serialised graph of a cloud; inputs and outputs are described above."""
-    head = head or ScoreHead()
-    nodes = [*_text_nodes(head), *_descriptor_nodes(head), *_score_nodes(), *_lookup_nodes()]
+    nodes = [*_unit_nodes("text"), *_score_nodes(), *_lookup_nodes()]
     text_width = max(cloud.instances.descriptors.shape[1], 1)
-    constants = {**_score_constants(cloud.instances, head), **_lookup_constants(cloud, grid)}
+    constants = {**_score_constants(cloud.instances), **_lookup_constants(cloud, grid)}
     inputs = [
         helper.make_tensor_value_info("points", TensorProto.FLOAT, ["N", 3]),
         helper.make_tensor_value_info("text", TensorProto.FLOAT, ["L", text_width]),
@@ -87,18 +70,6 @@ def _node(operator: str, inputs: str, output: str, **attributes: Any) -> onnx.No
     return helper.make_node(operator, inputs.split(), [output], name=output, **attributes)
 
 
-def _text_nodes(head: ScoreHead) -> list[onnx.NodeProto]:
-    """text -> text_columns, what each descriptor is multiplied with."""
-    nodes, last = _unit_nodes("text"), "text_unit"
-    if head.centred:
-        nodes += [_node("Sub", f"{last} center", "text_centred"), *_unit_nodes("text_centred")]
-        last = "text_centred_unit"
-    if head.width is not None:
-        nodes += [_node("MatMul", f"{last} projection", "text_projected")]
-        last = "text_projected"
-    return [*nodes, _node("Transpose", last, "text_columns", perm=[1, 0])]
-
-
 def _unit_nodes(name: str) -> list[onnx.NodeProto]:
     """Rows of unit length, in two steps so that neither tiny nor huge vectors leave float32."""
     return [
@@ -112,22 +83,11 @@ def _unit_nodes(name: str) -> list[onnx.NodeProto]:
     ]
 
 
-def _descriptor_nodes(head: ScoreHead) -> list[onnx.NodeProto]:
-    """descriptors -> table, in float32."""
-    if head.precision == "float32":
-        return [_node("Identity", "descriptors", "table")]
-    if head.precision == "float16":
-        return [_node("Cast", "descriptors", "table", to=TensorProto.FLOAT)]
-    return [
-        _node("Cast", "descriptors", "descriptor_steps", to=TensorProto.FLOAT),
-        _node("Mul", "descriptor_steps descriptor_scale", "table"),
-    ]
-
-
 def _score_nodes() -> list[onnx.NodeProto]:
-    """table -> instance_scores, and the label and score of each answer code (too far, unobserved, background, 0..)."""
+    """text_unit -> instance_scores; label and score of each answer code: too far, unobserved, background, 0.."""
     return [
-        _node("MatMul", "table text_columns", "similarity"),
+        _node("Transpose", "text_unit", "text_columns", perm=[1, 0]),
+        _node("MatMul", "descriptors text_columns", "similarity"),
         # The best descriptor of each instance; codes without one stay at NO_EVIDENCE.
         _node("Shape", "text", "label_count", end=1),
         _node("Concat", "code_count label_count", "table_shape", axis=0),
@@ -147,10 +107,11 @@ def _score_nodes() -> list[onnx.NodeProto]:
     ]
 
 
-def _score_constants(instances: InstanceTable, head: ScoreHead) -> dict[str, Any]:
+def _score_constants(instances: InstanceTable) -> dict[str, Any]:
     codes = len(instances) + CODE_OFFSET
+    described = instances.descriptors.shape[1] > 0  # if nothing was ever described, any one column will do
     return {
-        **_table_constants(instances.descriptors, head),
+        "descriptors": np.ascontiguousarray(instances.descriptors if described else np.zeros((0, 1)), np.float32),
         "descriptor_code": (instances.descriptor_instance.astype(np.int64) + CODE_OFFSET)[:, None],
         "code_count": np.array([codes], np.int64),
         "no_evidence": np.array(NO_EVIDENCE, np.float32),
@@ -166,29 +127,9 @@ def _score_constants(instances: InstanceTable, head: ScoreHead) -> dict[str, Any
     }
 
 
-def _table_constants(descriptors: NDArray[np.float32], head: ScoreHead) -> dict[str, NDArray[Any]]:
-    if descriptors.shape[1] == 0:  # nothing was ever described: any one column will do
-        descriptors = np.zeros((0, 1), np.float32)
-    constants: dict[str, NDArray[Any]] = {}
-    table = descriptors.astype(np.float64)
-    if head.centred:
-        center = table.mean(axis=0) if len(table) else np.zeros(table.shape[1])
-        length = np.linalg.norm(table - center, axis=1, keepdims=True)
-        table = np.divide(table - center, length, out=np.zeros_like(table), where=length > 0)
-        constants["center"] = center.astype(np.float32)
-    if head.width is not None:
-        directions = np.linalg.svd(table, full_matrices=False)[2][: head.width]
-        table = table @ directions.T
-        constants["projection"] = np.ascontiguousarray(directions.T, np.float32)
-    if head.precision == "int8":
-        scale = np.maximum(np.abs(table).max(axis=1, keepdims=True, initial=0), np.finfo(np.float32).tiny) / 127
-        constants["descriptor_scale"] = scale.astype(np.float32)
-        table = np.round(table / scale)
-    return constants | {"descriptors": np.ascontiguousarray(table, head.precision)}
-
-
 def _lookup_nodes() -> list[onnx.NodeProto]:
-    """points -> answer code, by the table and, for the few points in open cells, by their lists -> the outputs.
+    """points -> answer code, by the tables of ``LookupGrid`` and, for the few points in boxes that have one, by their
+    list -> the outputs.
 
     Coordinates are laid out as three rows of N: several times as fast as N rows of three, and, unlike a product with
     the strides, exact in integers wherever it runs. Tables are read with GatherElements, which in onnxruntime takes a
@@ -202,23 +143,28 @@ def _lookup_nodes() -> list[onnx.NodeProto]:
         _node("Cast", "position", "cell_unbounded", to=TensorProto.INT32),
         _node("Max", "cell_unbounded zero_int32", "cell_above"),
         _node("Min", "cell_above last_cell", "cell"),
-        # Along each axis, cell -> what it adds to (block * 64 + place of the brick in it) * 64 + that of the cell.
+        # Along each axis, cell -> what it adds to (block * 64 + brick in the block) * 64 + cell in the brick.
         _node("GatherElements", "axis_places cell", "place_terms", axis=1),
         *_sum_of_rows("place_terms", "place"),
         _node("Div", "place cells_per_block", "block"),
-        _node("Div", "place cells_per_brick", "brick"),
+        _node("Div", "place children", "brick"),
+        # block -> its row of brick_values, less its number, times 64; brick -> its reference
         _node("GatherElements", "block_shifts block", "brick_shift"),
         _node("Add", "brick brick_shift", "brick_address"),
         _node("GatherElements", "brick_values brick_address", "brick_stored"),
-        _node("Cast", "brick_stored", "brick_value", to=TensorProto.INT32),
-        # A brick that is a list alone has the last row, which says so for all its cells.
-        _node("Min", "brick_value last_row", "cells_row"),
-        _node("Sub", "cells_row brick", "row_shift"),
-        _node("Mul", "row_shift cells_per_brick", "address_shift"),
-        _node("Add", "place address_shift", "address"),
-        _node("GatherElements", "cell_values address", "cell_stored"),
+        _node("Cast", "brick_stored", "brick_reference", to=TensorProto.INT32),
+        # cell -> its value; the last row stands for bricks that have a list
+        _node("Min", "brick_reference last_row", "brick_row"),
+        _node("Sub", "brick_row brick", "row_shift"),
+        _node("Mul", "row_shift children", "address_shift"),
+        _node("Add", "place address_shift", "cell_address"),
+        _node("GatherElements", "node_values cell_address", "cell_stored"),
         _node("Cast", "cell_stored", "cell_value", to=TensorProto.INT32),
-        *_open_cell_nodes(),
+        # The few points whose cell is split or has a list; for the others that value is the answer.
+        *_where_true("GreaterOrEqual", "cell_value first_child_value", "pending"),
+        *_part_nodes(),
+        *_list_nodes(),
+        _node("ScatterElements", "cell_value pending pending_value", "value", axis=0),
         # certain, or open with the answer at the centre
         _node("Less", "value codes", "certain"),
         _node("GatherElements", "value_instance value", "instance"),
@@ -229,63 +175,79 @@ def _lookup_nodes() -> list[onnx.NodeProto]:
     ]
 
 
-def _open_cell_nodes() -> list[onnx.NodeProto]:
-    """cell_value -> value: the same, but for cells with a list the answer of the part, or else of the list."""
+def _part_nodes() -> list[onnx.NodeProto]:
+    """pending, indices of points -> part_value, of the part of the cell; child, number of what settles it, if any."""
     return [
-        *_where_true("GreaterOrEqual", "cell_value first_listed", "listed"),
-        *_columns_at("rows", "listed", "listed_rows"),
-        *_rows_apart("listed_rows", "point"),
-        _node("GatherElements", "cell_value listed", "listed_value"),
-        # row's first list + the cell's own -> its list; of a list alone, both come to -1
-        _node("GatherElements", "cells_row listed", "listed_row"),
-        _node("GatherElements", "first_list listed_row", "listed_first"),
-        _node("Sub", "listed_value first_listed", "listed_number"),
-        _node("Add", "listed_first listed_number", "list_of_cell"),
-        _node("GatherElements", "brick_value listed", "listed_brick_value"),
-        _node("Sub", "listed_brick_value last_row", "listed_beyond_rows"),
-        _node("Max", "listed_beyond_rows zero_int32", "list_alone"),
-        _node("Add", "list_of_cell list_alone", "list"),
-        # the part of the cell, and its value
-        _node("Sub", "listed_rows grid_low", "listed_offset"),
-        _node("Mul", "listed_offset cells_per_unit", "listed_position"),
-        _node("Mul", "listed_position parts_per_cell_edge", "part_position"),
+        *_columns_at("rows", "pending", "pending_rows"),
+        *_rows_apart("pending_rows", "point"),
+        _node("GatherElements", "cell_value pending", "pending_cell_value"),
+        _node("GatherElements", "brick_reference pending", "pending_brick_reference"),
+        *_child_nodes("pending_brick_reference", "pending_cell_value", "cell_child"),
+        # A reference, as a brick's: the cell's row if it is split, else beyond the last row for its list.
+        _node("GatherElements", "child_length cell_child", "cell_child_length"),
+        _node("GatherElements", "child_start cell_child", "cell_child_start"),
+        _node("Cast", "cell_child_length", "cell_child_length_int32", to=TensorProto.INT32),
+        _node("Less", "cell_child_length_int32 one_int32", "cell_split"),
+        _node("Add", "cell_child row_count", "cell_list_reference"),
+        _node("Where", "cell_split cell_child_start cell_list_reference", "cell_reference"),
+        # Where in the cell the point is, in parts.
+        _node("Sub", "pending_rows grid_low", "pending_offset"),
+        _node("Mul", "pending_offset cells_per_unit", "pending_position"),
+        _node("Mul", "pending_position edge", "part_position"),
         _node("Cast", "part_position", "part", to=TensorProto.INT32),
-        _node("Cast", "listed_position", "listed_cell", to=TensorProto.INT32),
-        _node("Mul", "listed_cell parts_edge", "first_part"),
+        _node("Cast", "pending_position", "pending_cell", to=TensorProto.INT32),
+        _node("Mul", "pending_cell edge_int32", "first_part"),
         _node("Sub", "part first_part", "part_in_cell"),  # Mod takes ten times as long
         _node("Mul", "part_in_cell part_strides", "part_terms"),
-        *_sum_of_rows("part_terms", "part_index"),
-        _node("GatherElements", "list_parts list", "list_parts_stored"),
-        _node("Cast", "list_parts_stored", "parts_row", to=TensorProto.INT32),
-        _node("Mul", "parts_row parts_per_cell", "parts_start"),
-        _node("Add", "parts_start part_index", "part_address"),
-        _node("GatherElements", "part_values part_address", "part_stored"),
+        *_sum_of_rows("part_terms", "part_place"),
+        _node("Min", "cell_reference last_row", "cell_row"),
+        _node("Mul", "cell_row children", "cell_start"),
+        _node("Add", "cell_start part_place", "part_address"),
+        _node("GatherElements", "node_values part_address", "part_stored"),
         _node("Cast", "part_stored", "part_value", to=TensorProto.INT32),
-        # open parts: compare the distances of the list's points, as many as it has at most
-        _node("Sub", "part_value codes", "part_beyond_codes"),
-        _node("Max", "part_beyond_codes zero_int32", "list_of_part"),
-        _node("Add", "list list_of_part", "part_list"),
-        _node("GatherElements", "list_start part_list", "listed_start"),
-        _node("Add", "part_list one_int32", "next_list"),
-        _node("GatherElements", "list_start next_list", "listed_end"),
-        _node("Sub", "listed_end listed_start", "listed_length"),
-        _node("Less", "part_value codes", "part_certain"),
-        _node("Where", "part_certain zero_int32 listed_length", "length_to_search"),
-        *_where_true("Greater", "length_to_search zero_int32", "short_rows"),
+        *_child_nodes("cell_reference", "part_value", "child_or_less"),
+        _node("Max", "child_or_less zero_int32", "child"),  # below 0, and unused, for parts that are answered
+    ]
+
+
+def _child_nodes(reference: str, value: str, output: str) -> list[onnx.NodeProto]:
+    """A box's reference, and the value in it -> number of the child: first of the row + value - 2 codes, or, of a
+    reference to a list, for which the last row says -1 and 2 codes, how far it lies beyond that row."""
+    return [
+        _node("Min", f"{reference} last_row", f"{output}_row"),
+        _node("GatherElements", f"first_child {output}_row", f"{output}_first"),
+        _node("Sub", f"{value} first_child_value", f"{output}_in_box"),
+        _node("Add", f"{output}_first {output}_in_box", f"{output}_of_row"),
+        _node("Sub", f"{reference} {output}_row", f"{output}_beyond"),
+        _node("Add", f"{output}_of_row {output}_beyond", output),
+    ]
+
+
+def _list_nodes() -> list[onnx.NodeProto]:
+    """part_value, child -> pending_value: of points with a list, the code of the nearest candidate.
+
+    Lists are read to the same length by all: first SHORT_LIST entries, then, where there are more, again to the next.
+    """
+    return [
+        _node("GatherElements", "child_start child", "list_start"),
+        _node("GatherElements", "child_length child", "list_length_stored"),
+        _node("Cast", "list_length_stored", "list_length", to=TensorProto.INT32),
+        _node("Less", "part_value first_child_value", "part_answered"),
+        _node("Where", "part_answered zero_int32 list_length", "length"),
+        *_where_true("Greater", "length zero_int32", "short_rows"),
         *_search_nodes("short"),
         _node("ScatterElements", "part_value short_rows short_code", "value_after_short", axis=0),
-        *_where_true("Greater", "length_to_search short_length", "middle_rows"),
+        *_where_true("Greater", "length short_length", "middle_rows"),
         *_search_nodes("middle"),
         _node("ScatterElements", "value_after_short middle_rows middle_code", "value_after_middle", axis=0),
-        *_where_true("Greater", "length_to_search middle_length", "long_rows"),
+        *_where_true("Greater", "length middle_length", "long_rows"),
         *_search_nodes("long"),
-        _node("ScatterElements", "value_after_middle long_rows long_code", "listed_code", axis=0),
-        _node("ScatterElements", "cell_value listed listed_code", "value", axis=0),
+        _node("ScatterElements", "value_after_middle long_rows long_code", "pending_value", axis=0),
     ]
 
 
 def _search_nodes(name: str) -> list[onnx.NodeProto]:
-    """{name}_rows of the listed points -> {name}_code, that of the nearest in each one's list, decided in float64.
+    """{name}_rows of the pending points -> {name}_code, that of the nearest in each one's list, decided in float64.
 
     {name}_steps 0..K-1 reads K entries of every list. Of a shorter one it runs on into the next: farther points, or the
     same ones again.
@@ -310,7 +272,7 @@ def _search_nodes(name: str) -> list[onnx.NodeProto]:
             node("Mul", f"{axis}_difference {axis}_difference", f"{axis}_squared"),
         ]
     return [
-        node("GatherElements", "/listed_start rows", "start"),
+        node("GatherElements", "/list_start rows", "start"),
         node("Unsqueeze", "start /last_axis", "start_column"),
         node("Add", "start_column steps", "candidate_address"),
         node("Shape", "candidate_address", "candidate_shape"),
@@ -379,38 +341,38 @@ def _columns_at(table: str, columns: str, output: str) -> list[onnx.NodeProto]:
     ]
 
 
-def _lookup_constants(cloud: LabelledCloud, grid: BrickGrid) -> dict[str, Any]:
-    shape = np.array(grid.shape, np.int64)
+def _lookup_constants(cloud: LabelledCloud, grid: LookupGrid) -> dict[str, Any]:
     codes, near_codes = grid.codes, grid.codes // 2
-    # A search may read LONGEST_LIST entries from the start of the last list.
     point, candidate = np.unique(grid.candidates, return_inverse=True)
     xyz = cloud.xyz[point] if len(point) else np.zeros((1, 3), np.float32)
     answer = cloud.instance_ids[point] + CODE_OFFSET if len(point) else np.zeros(1, np.int64)
     code = np.arange(2 * codes) % codes
     code_answer = np.where(code > near_codes, code - near_codes, code)
+    distance = np.where(code == TOO_FAR_CODE, BEYOND, np.where(code > near_codes, NEAR, ON_SURFACE))
+    block_row = grid.blocks.ravel().astype(np.int64)
     return {
+        # where a point is
         "grid_low": grid.low[:, None],
         "cells_per_unit": np.float32(1) / grid.cell_size,
-        "last_cell": (shape * BRICK - 1).astype(np.int32)[:, None],
+        "last_cell": (np.array(grid.shape) * EDGE - 1).astype(np.int32)[:, None],
         "axis_places": _axis_places(grid),
-        "block_shifts": ((grid.blocks.ravel().astype(np.int64) - np.arange(grid.blocks.size)) * PLACES).astype(
-            np.int32
-        ),
+        "cells_per_block": np.int32(CHILDREN**2),
+        "children": np.int32(CHILDREN),
+        "edge": np.float32(EDGE),
+        "edge_int32": np.int32(EDGE),
+        "part_strides": np.array([[EDGE**2], [EDGE], [1]], np.int32),
+        # boxes
+        "block_shifts": ((block_row - np.arange(len(block_row))) * CHILDREN).astype(np.int32),
         "brick_values": grid.bricks.ravel(),
-        "last_row": np.int32(len(grid.cells) - 1),
-        "cells_per_block": np.int32(CELLS * PLACES),
-        "cells_per_brick": np.int32(CELLS),
-        "cell_values": grid.cells.ravel(),
+        "node_values": grid.nodes.ravel(),
+        "last_row": np.int32(len(grid.nodes) - 1),
+        "row_count": np.int32(len(grid.nodes)),
         "codes": np.int32(codes),
-        "first_listed": np.int32(2 * codes),
-        "first_list": grid.first_list,
-        "list_start": grid.list_start,
-        "list_parts": grid.list_parts,
-        "parts_per_cell_edge": np.float32(PARTS),
-        "parts_edge": np.int32(PARTS),
-        "part_strides": np.array([[PARTS**2], [PARTS], [1]], np.int32),
-        "parts_per_cell": np.int32(PARTS**3),
-        "part_values": grid.parts.ravel(),
+        "first_child_value": np.int32(2 * codes),
+        "first_child": grid.first_child,
+        "child_length": grid.child_length,
+        "child_start": grid.child_start,
+        # candidates; a search may read LONGEST_LIST entries from the start of the last list
         **_in_three_bytes("candidates", np.append(candidate, np.zeros(LONGEST_LIST, np.int64))),
         **{f"candidate_{axis}": np.ascontiguousarray(xyz[:, row]) for row, axis in enumerate("xyz")},
         "candidate_answer": answer.astype(np.min_scalar_type(int(answer.max()))),
@@ -421,12 +383,11 @@ def _lookup_constants(cloud: LabelledCloud, grid: BrickGrid) -> dict[str, Any]:
         "long_steps": np.arange(LONGEST_LIST, dtype=np.int32)[None],
         "reach_squared": np.float64(cloud.reach) ** 2,
         "surface_squared": np.float64(surface_distance(cloud.spacing, cloud.reach)) ** 2,
+        # answers
         "near_codes": np.int32(near_codes),
         "too_far": np.int32(TOO_FAR_CODE),
         "value_instance": (code_answer - CODE_OFFSET).astype(np.int32),
-        "value_distance": np.where(code == TOO_FAR_CODE, BEYOND, np.where(code > near_codes, NEAR, ON_SURFACE)).astype(
-            np.int8
-        ),
+        "value_distance": distance.astype(np.int8),
         "value_answer": code_answer.astype(np.int32),
         "one_int32": np.int32(1),
         "three": np.array([3], np.int64),
@@ -445,26 +406,12 @@ def _in_three_bytes(name: str, values: NDArray[np.integer]) -> dict[str, Any]:
     return constants
 
 
-def _axis_places(grid: BrickGrid) -> NDArray[np.int32]:
+def _axis_places(grid: LookupGrid) -> NDArray[np.int32]:
     """(3, cells along the longest axis) int32; see ``_lookup_nodes``."""
     _, blocks_y, blocks_z = grid.blocks.shape
-    cell = np.arange(max(grid.shape) * BRICK)
-    block, brick, inside = cell // (BRICK * BLOCK), cell // BRICK % BLOCK, cell % BRICK
-    block_strides = np.array([[blocks_y * blocks_z], [blocks_z], [1]])
-    brick_strides, cell_strides = (np.array([[edge**2], [edge], [1]]) for edge in (BLOCK, BRICK))
-    place = (block * block_strides * PLACES + brick * brick_strides) * CELLS + inside * cell_strides
-    in_grid = cell < np.array(grid.shape)[:, None] * BRICK  # the table's remainder is never read
+    cell = np.arange(max(grid.shape) * EDGE)
+    block, brick, inside = cell // EDGE**2, cell // EDGE % EDGE, cell % EDGE
+    block_strides, strides = (np.array([[x], [y], [1]]) for x, y in ((blocks_y * blocks_z, blocks_z), (EDGE**2, EDGE)))
+    place = (block * block_strides * CHILDREN + brick * strides) * CHILDREN + inside * strides
+    in_grid = cell < np.array(grid.shape)[:, None] * EDGE  # the table's remainder is never read
     return np.where(in_grid, place, 0).astype(np.int32)
-
-
-def reference_scores(instances: InstanceTable, text: NDArray[np.floating]) -> NDArray[np.float64]:
-    """(K, L) float64: what ``instance_scores`` should be, written down plainly in numpy."""
-    scores = np.full((len(instances), len(text)), NO_EVIDENCE, np.float64)
-    text = text.astype(np.float64)
-    length = np.linalg.norm(text, axis=1, keepdims=True)
-    unit = np.divide(text, length, out=np.zeros_like(text), where=length > 0)
-    for descriptor, instance in zip(
-        instances.descriptors.astype(np.float64), instances.descriptor_instance, strict=True
-    ):
-        scores[instance] = np.maximum(scores[instance], unit @ descriptor)
-    return scores

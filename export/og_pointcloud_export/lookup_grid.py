@@ -1,0 +1,317 @@
+"""The table in query.onnx that finds the nearest cloud point's instance: boxes in boxes, each split in 4^3 at most.
+
+    block = 4^3 bricks     brick = 4^3 cells      cell = 4^3 parts       a query reads one value a level,
+    +---+---+---+---+      +---+---+---+---+      +---+---+---+---+      until it is an answer or a list:
+    |far|far|far|far|      | a | a | a | a |      | a | a |L1 | b |
+    +---+---+---+---+      +---+---+---+---+      +---+---+---+---+        far, a, b   certain: the nearest point's
+    |L0 | # | # |far|  ->  | a | a |L0 | b |  ->  | a |L1 |L1 | b |                    answer in all of the box
+    +---+---+---+---+   #  +---+---+---+---+   #  +---+---+---+---+        L0, L1      list: every cloud point that is
+    |far| # | # |far|      | a | # |L0 | b |      | a |L1 | b | b |                    nearest somewhere in the box;
+    +---+---+---+---+      +---+---+---+---+      +---+---+---+---+                    the query compares distances
+    |far|far|far|far|      | # | # | # | # |      |L1 |L1 | b | b |        #           split: read the next level
+    +---+---+---+---+      +---+---+---+---+      +---+---+---+---+
+
+One rule decides at every level (``lookup_boxes``): certain if all of the box has one answer; else split if it holds
+cloud points, as queries come where the cloud is, or has too many candidates for a list; else the list, which boxes
+beside it share where few candidates do for several. Answers are exact, most queries compare no distances, and a street
+with little in it costs little. What a budget leaves out is marked open, with the answer at the box's centre:
+``bundle.nearest`` settles queries there. Cells are 1.5 point spacings wide.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from og_pointcloud.bundle.nearest import surface_distance
+from og_pointcloud.cloud import UNOBSERVED, LabelledCloud
+from og_pointcloud_export.lookup_boxes import (
+    CHILDREN,
+    EDGE,
+    LONGEST_LIST,
+    NOTHING,
+    SHORT_LIST,
+    SPLIT,
+    TOO_FAR_CODE,
+    answer_children,
+)
+
+__all__ = ["CODE_OFFSET", "LookupGrid", "build_lookup_grid"]
+
+CODE_OFFSET = 1 - UNOBSERVED
+"""Answer code of instance id + CODE_OFFSET on the surface; (instances + CODE_OFFSET - 1) more near it."""
+CELL_PER_SPACING = 1.5
+"""Size of a cell. Smaller ones need lists less often, and cost file size with the second to third power."""
+CELLS_PER_REACH = 3.0
+"""A far reach makes cells larger, so that the layer of cells around a surface stays at most about eight deep."""
+BLOCKS_PER_POINT, BLOCKS_AT_LEAST, BLOCKS_AT_MOST = 16, 1 << 15, 1 << 18  # times 64^2, and as much again, fits int32
+NODES_PER_POINT, NODES_AT_LEAST = 1, 1 << 13
+LISTS_PER_POINT, LISTS_AT_LEAST = 4, 1 << 16
+"""What bounds the table whatever the extent of the scene: the rest is left to the exact search."""
+BRICKS_PER_AXIS = 1 << 13
+"""So long a grid still has its cell indices right to half a cell in float32, and a short table of them per axis."""
+BOXES_PER_CHUNK = 256
+"""Answered at once, with about 4 MB of scratch."""
+
+# The first rows of nodes, that bricks share, and of bricks, that blocks share: all too far, and all open.
+_FAR, _OPEN = 0, 1
+
+
+@dataclass(frozen=True)
+class LookupGrid:
+    """Cell (i, j, k) covers low + (i, j, k) * cell_size and one cell_size more, in the local frame.
+
+    low: (3,) float32. cell_size: float32. shape: bricks along each axis; the outermost ones stand for all beyond.
+    blocks: (bx, by, bz) unsigned, rows of ``bricks``.
+    bricks: (rows, 64) unsigned, C order within the block. A *reference*: below ``len(nodes)`` the row of ``nodes`` of a
+        brick that is split; from there on, less that number, the child whose list settles the brick.
+    nodes: (rows, 64) unsigned, the boxes that are split; C order within the box. A value below ``codes`` is a certain
+        answer; one below ``2 codes`` is open, and ``value - codes`` the answer at the centre; any other is the box's
+        child ``value - 2 codes``. The last row stands for references to lists: all 2 codes.
+    first_child: (rows,) int32, number of the box's first child; -1 in the last row.
+    child_length: (children,) unsigned, candidates in the child's list; 0: the child is split.
+    child_start: (children,) int32, where its list begins in ``candidates``; its row of ``nodes`` if it is split.
+    candidates: (m,) int32, points of the cloud, ascending within a list.
+    codes: number of answer codes: TOO_FAR_CODE, those on the surface, those near it; see CODE_OFFSET.
+    """
+
+    low: NDArray[np.float32]
+    cell_size: np.float32
+    shape: tuple[int, int, int]
+    blocks: NDArray[np.unsignedinteger]
+    bricks: NDArray[np.unsignedinteger]
+    nodes: NDArray[np.unsignedinteger]
+    first_child: NDArray[np.int32]
+    child_length: NDArray[np.unsignedinteger]
+    child_start: NDArray[np.int32]
+    candidates: NDArray[np.int32]
+    codes: int
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the table."""
+        boxes = (self.blocks, self.bricks, self.nodes, self.first_child)
+        return sum(table.nbytes for table in (*boxes, self.child_length, self.child_start, self.candidates))
+
+
+def build_lookup_grid(cloud: LabelledCloud) -> LookupGrid:
+    """The grid of a cloud. Its size is bounded by the number of points, not by the extent of the scene."""
+    frame = _grid_frame(cloud)
+    points, blocks = _points_by_brick(cloud, frame)
+    table = _Table(cloud, frame, points)
+    bricks, split_bricks = table.bricks(blocks)
+    split_cells = table.nodes(split_bricks, frame.cell_size, last=False)
+    table.nodes(split_cells, frame.cell_size / EDGE, last=True)
+    return table.grid(blocks, bricks)
+
+
+@dataclass(frozen=True)
+class _Frame:
+    """Where the grid lies: low (3,) float64, its low corner, a float32 number; shape: bricks along each axis. Both with
+    an outermost layer, which stands for all beyond. whole: every point lies inside, that layer holds none."""
+
+    low: NDArray[np.float64]
+    cell_size: float
+    shape: tuple[int, int, int]
+    whole: bool
+
+    @property
+    def brick_edge(self) -> float:
+        return self.cell_size * EDGE
+
+    @property
+    def blocks(self) -> tuple[int, int, int]:
+        """Blocks along each axis."""
+        x, y, z = (-(-length // EDGE) for length in self.shape)
+        return x, y, z
+
+
+def _grid_frame(cloud: LabelledCloud) -> _Frame:
+    """A grid around all points; of a scene with far outliers, around its bulk only."""
+    cell_size = float(np.float32(max(CELL_PER_SPACING * cloud.spacing, cloud.reach / CELLS_PER_REACH)))
+    if len(cloud) == 0:
+        return _Frame(np.zeros(3), cell_size, (3, 3, 3), True)
+    allowed = min(max(BLOCKS_PER_POINT * len(cloud), BLOCKS_AT_LEAST), BLOCKS_AT_MOST)
+    border = cloud.reach + cell_size  # the cell more takes up all rounding
+    for left_out in (0.0, 1e-4, 1e-3, 1e-2, 0.05, 0.2, 0.4):
+        ends = np.quantile(cloud.xyz, [left_out, 1 - left_out], axis=0, method="nearest").astype(np.float64)
+        shape = np.ceil((ends[1] - ends[0] + 2 * border) / (cell_size * EDGE)) + 2
+        if np.ceil(shape / EDGE).prod() <= allowed and shape.max() <= BRICKS_PER_AXIS:
+            break
+    else:
+        shape = np.full(3, 3.0)
+    low = (ends[0] - border - cell_size * EDGE).astype(np.float32)
+    return _Frame(low.astype(np.float64), cell_size, (int(shape[0]), int(shape[1]), int(shape[2])), left_out == 0)
+
+
+def _points_by_brick(cloud: LabelledCloud, frame: _Frame) -> tuple[tuple, NDArray[np.int64]]:
+    """The points in the grid as the kernel reads them, and (m, 3) the blocks within reach of one, the fullest first.
+
+    The kernel's record: (low, brick edge, block_row, start, x, y, z, answer code, number in the cloud). block_row:
+    (bx, by, bz) int32, row of a block in reach, else -1. Brick p of it has the points ``start[row * 64 + p]`` up to
+    ``start[row * 64 + p + 1]``.
+    """
+    position = (cloud.xyz - frame.low) / frame.brick_edge
+    inside = ((position >= 0) & (position < frame.shape)).all(axis=1) & _first_of_equal(cloud.xyz)
+    number, position = np.flatnonzero(inside), position[inside]
+
+    reach = (cloud.reach + 0.5 * frame.cell_size) / frame.brick_edge  # half a cell for rounding; together below 1
+    last = np.array(frame.blocks) - 1
+    lower, upper = (np.clip((position + step) // EDGE, 0, last).astype(np.int64) for step in (-reach, reach))
+    in_reach = np.zeros(frame.blocks, np.bool_)
+    for x, y, z in itertools.product((lower, upper), repeat=3):  # at most two blocks along each axis
+        in_reach[x[:, 0], y[:, 1], z[:, 2]] = True
+    blocks = np.argwhere(in_reach)
+    block_row = np.full(frame.blocks, -1, np.int32)
+
+    brick = position.astype(np.int64)
+    count = np.zeros(frame.blocks, np.int64)
+    np.add.at(count, tuple((brick // EDGE).T), 1)
+    blocks = blocks[np.argsort(-count[in_reach], kind="stable")]
+    block_row[tuple(blocks.T)] = np.arange(len(blocks))
+    slot = block_row[tuple((brick // EDGE).T)] * CHILDREN + brick % EDGE @ np.array([EDGE**2, EDGE, 1])
+    start = np.append(0, np.cumsum(np.bincount(slot, minlength=len(blocks) * CHILDREN)))
+    number = number[np.argsort(slot, kind="stable")]
+    x, y, z = np.ascontiguousarray(cloud.xyz[number].T, np.float64)
+    answer = cloud.instance_ids[number] + np.int32(CODE_OFFSET)
+    return (frame.low, frame.brick_edge, block_row, start, x, y, z, answer, number.astype(np.int32)), blocks
+
+
+def _first_of_equal(xyz: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """(n,) bool: False where a point before it has the same coordinates, and so answers for both."""
+    bits = (xyz + np.float32(0)).view(np.uint32).astype(np.uint64)  # -0 becomes 0
+    key = (bits * np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)).sum(axis=1)
+    _, first, same = np.unique(key, return_index=True, return_inverse=True)
+    first = first[same]
+    return (first == np.arange(len(xyz))) | (xyz[first] != xyz).any(axis=1)
+
+
+class _Table:
+    """The rows of a grid as they are made, level after level, until what is allowed is used up."""
+
+    def __init__(self, cloud: LabelledCloud, frame: _Frame, points: tuple) -> None:
+        self._frame, self._points = frame, points
+        self._codes = 2 * (len(cloud.instances) + CODE_OFFSET) - 1
+        self._limits = (float(cloud.reach), surface_distance(float(cloud.spacing), float(cloud.reach)), self._codes)
+        # The graph computes cell indices in float32: every box is inflated by what rounding can move a query.
+        self._rounding = frame.cell_size * 4 * float(np.finfo(np.float32).eps) * max(frame.shape) * EDGE
+        self._nodes_allowed = max(NODES_PER_POINT * len(cloud), NODES_AT_LEAST)
+        self._lists_allowed = max(LISTS_PER_POINT * len(cloud), LISTS_AT_LEAST)
+        shared = np.array([[TOO_FAR_CODE], [TOO_FAR_CODE + self._codes]], np.int32).repeat(CHILDREN, axis=1)
+        self._nodes, self._first_child = [shared], [np.zeros(len(shared), np.int64)]
+        self._child_length, self._child_start = [np.zeros(0, np.int32)], [np.zeros(0, np.int64)]
+        self._candidates = [np.zeros(0, np.int32)]
+        self._rows_promised, self._lists_made = len(shared), 0
+        self._children_made, self._candidates_made = 0, 0
+
+    def bricks(self, blocks: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """References of the bricks in these blocks (m, 3), a child with a list as -1 - its number; low corners of
+        those that are split."""
+        edge = self._frame.brick_edge
+        references, split_low = [np.zeros((0, CHILDREN), np.int64)], [np.zeros((0, 3))]
+        for boxes in self._answer(self._frame.low + blocks * (EDGE * edge), edge, SHORT_LIST, last=False):
+            certain = np.where(boxes.answers == TOO_FAR_CODE, _FAR, _OPEN)  # no brick lies in reach of one point
+            unsplit = np.where(boxes.child >= 0, -1 - boxes.child, certain)
+            references.append(np.where(boxes.row >= 0, boxes.row, unsplit))
+            split_low.append(boxes.split_low)
+        return np.concatenate(references), np.concatenate(split_low)
+
+    def nodes(self, low: NDArray[np.float64], size: float, *, last: bool) -> NDArray[np.float64]:
+        """Add the nodes of boxes with these low corners and children of that size; low corners of those split again."""
+        split_low = [np.zeros((0, 3))]
+        for boxes in self._answer(low, size, LONGEST_LIST, last=last):
+            child = boxes.child - boxes.first_child[:, None] + 2 * self._codes
+            self._nodes.append(np.where(boxes.child >= 0, child, boxes.answers).astype(np.int32))
+            self._first_child.append(boxes.first_child)
+            split_low.append(boxes.split_low)
+        return np.concatenate(split_low)
+
+    def _answer(self, low: NDArray[np.float64], size: float, longest: int, *, last: bool) -> Iterator[_Boxes]:
+        """Answer boxes, chunk after chunk, and add their children; what is over the budget is left open."""
+        for first in range(0, len(low), BOXES_PER_CHUNK):
+            corners = low[first : first + BOXES_PER_CHUNK]
+            answers, child, lengths = (np.empty((len(corners), CHILDREN), np.int32) for _ in range(3))
+            lists = np.empty((*child.shape, LONGEST_LIST), np.int32)
+            level = (size, self._rounding, longest, last)
+            answer_children(corners, level, self._limits, self._points, answers, child, lengths, lists)
+            if self._lists_made >= self._lists_allowed:
+                child[child != SPLIT], lengths[:] = NOTHING, 0
+            split = child == SPLIT
+            split &= self._rows_promised + np.cumsum(split).reshape(split.shape) <= self._nodes_allowed
+            child[(child == SPLIT) & ~split] = NOTHING
+            box, place = np.nonzero(split)
+            split_low = corners[box] + _PLACES[place] * size
+            yield _Boxes(answers, *self._add_children(child, split, lengths, lists), split_low)
+
+    def _add_children(
+        self, child: NDArray[np.int32], split: NDArray[np.bool_], lengths: NDArray[np.int32], lists: NDArray[np.int32]
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+        """Number the children of boxes: of each one its lists, then its splits. What ``_Boxes`` says of them."""
+        listed = lengths > 0
+        count_lists, count_splits = listed.sum(axis=1), split.sum(axis=1)
+        first_child = self._children_made + np.cumsum(count_lists + count_splits) - (count_lists + count_splits)
+        in_box = np.where(split, count_lists[:, None] + np.cumsum(split, axis=1) - 1, child)
+        row = np.where(split, self._rows_promised + np.cumsum(split).reshape(split.shape) - 1, -1)
+        list_start = (self._candidates_made + np.cumsum(lengths) - lengths.ravel()).reshape(lengths.shape)
+
+        exists = np.concatenate([listed, split], axis=1)
+        self._child_length.append(np.concatenate([lengths, np.zeros_like(lengths)], axis=1)[exists])
+        self._child_start.append(np.concatenate([list_start, row], axis=1)[exists])
+        self._candidates.append(lists[np.arange(LONGEST_LIST) < lengths[..., None]])
+        self._children_made += int(exists.sum())
+        self._lists_made += int(listed.sum())
+        self._rows_promised += int(split.sum())
+        self._candidates_made += int(lengths.sum())
+        return first_child, np.where(child == NOTHING, -1, first_child[:, None] + in_box), row
+
+    def grid(self, blocks: NDArray[np.int64], references: NDArray[np.int64]) -> LookupGrid:
+        """All that was added, with the references of the bricks in these blocks."""
+        listed = np.full((1, CHILDREN), 2 * self._codes, np.int32)
+        nodes = _compact(np.concatenate([*self._nodes, listed]))
+        bricks = np.where(references < 0, len(nodes) - 1 - references, references)
+        block_row = np.full(self._frame.blocks, _FAR, np.int64)
+        if not self._frame.whole:  # the outermost bricks stand for points that lie beyond
+            last = np.array(self._frame.shape) - 1
+            brick = blocks[:, None] * EDGE + _PLACES
+            bricks[((brick == 0) | (brick == last)).any(axis=2)] = _OPEN
+            block_row[:] = _OPEN
+            block_row[tuple(slice(1, end // EDGE) for end in last)] = _FAR
+        block_row[tuple(blocks.T)] = 2 + np.arange(len(blocks))
+        shared = np.array([[_FAR], [_OPEN]]).repeat(CHILDREN, axis=1)
+        return LookupGrid(
+            low=self._frame.low.astype(np.float32),
+            cell_size=np.float32(self._frame.cell_size),
+            shape=self._frame.shape,
+            blocks=_compact(block_row),
+            bricks=_compact(np.concatenate([shared, bricks])),
+            nodes=nodes,
+            first_child=np.append(np.concatenate(self._first_child), -1).astype(np.int32),
+            child_length=_compact(np.append(np.concatenate(self._child_length), 0)),  # never empty: the graph reads it
+            child_start=np.append(np.concatenate(self._child_start), 0).astype(np.int32),
+            candidates=np.concatenate(self._candidates),
+            codes=self._codes,
+        )
+
+
+@dataclass(frozen=True)
+class _Boxes:
+    """A chunk of boxes as answered: answers (m, 64) as the kernel's; first_child (m,); child (m, 64), number of each
+    list or split, else -1; row (m, 64), of nodes for what is split, else -1; split_low (s, 3), low corners of those."""
+
+    answers: NDArray[np.int32]
+    first_child: NDArray[np.int64]
+    child: NDArray[np.int64]
+    row: NDArray[np.int64]
+    split_low: NDArray[np.float64]
+
+
+_PLACES = np.stack(np.unravel_index(np.arange(CHILDREN), (EDGE,) * 3), axis=1)
+"""(64, 3): along each axis, the children of a box in C order."""
+
+
+def _compact(values: NDArray[np.integer]) -> NDArray[np.unsignedinteger]:
+    return values.astype(np.min_scalar_type(int(values.max(initial=0))))
