@@ -7,20 +7,35 @@ import io
 import json
 import zipfile
 from dataclasses import fields, replace
+from pathlib import Path
 
 import numpy as np
 import onnx
 import pytest
-from labelled_clouds import instance_table, make_cloud, room, tough_clouds, unit_rows
+from labelled_clouds import (
+    instance_table,
+    instances_plainly,
+    make_cloud,
+    queries,
+    reference_scores,
+    room,
+    tough_clouds,
+    unit_rows,
+)
 from og_pointcloud_export import write_bundle, writer
 
+import og_pointcloud as og
 from og_pointcloud.bundle.read import read_bundle
 from og_pointcloud.bundle.vocabulary import compact_vectors
 from og_pointcloud.cloud import InstanceTable, Vocabulary
 from og_pointcloud.errors import BundleError, OgPointcloudError
 from og_pointcloud.formats.atomic import replacing
+from og_pointcloud.models import open_session
 
 CLOUDS = tough_clouds()
+SCHEMA_2 = Path(__file__).parent / "data" / "schema_2.ogpc"
+"""Two balls of 100 points each, "apple" and "pear", on 40 points of a floor: 35 background, 5 unobserved. Written by the
+first version of schema 2, with words and a bank of 60; never written anew."""
 
 
 @pytest.fixture(scope="module")
@@ -81,6 +96,40 @@ def test_tough_clouds_come_back_as_they_went(tmp_path, name):
     assert (back.certainty is None) == (cloud.certainty is None)
     if cloud.certainty is not None:
         assert back.certainty.tolist() == cloud.certainty.tolist()
+
+
+def test_a_file_of_an_older_library_opens_and_answers():
+    scene = og.load(SCHEMA_2)
+    ids = np.repeat([0, 1, -1, -2], [100, 100, 35, 5])
+    assert read_bundle(SCHEMA_2, verify_sha256=True).manifest["schema_version"] == 2
+    assert scene.cloud.instance_ids.tolist() == ids.tolist()
+    for words in (["apple", "pear"], None):
+        result = og.segment(scene.xyz, words, scene)
+        assert result.calibrated
+        assert result.instances.tolist() == ids.tolist()
+        assert result.labels.tolist() == np.maximum(ids, -1).tolist()
+        assert result.scores[[0, 100, 200]].tolist() == pytest.approx([0.8939, 0.8612, 0], abs=1e-3)
+    points = scene.cloud.origin + [[0.31, 0, 0], [0.36, 0, 0], [0.28, 0, 0], [0, 0, 0.42], [0, 0, 0.5]]
+    asked = og.segment(points, ["pear", "chair"], scene)
+    assert asked.instances.tolist() == [1, 1, 0, 0, -3]
+    assert asked.labels.tolist() == [0, 0, -1, -1, -1]
+
+
+def test_graph_and_arrays_of_an_older_file_agree():
+    bundle = read_bundle(SCHEMA_2)
+    cloud, points = bundle.cloud, queries(bundle.cloud, 500)
+    text = unit_rows(7)
+    names = ["instance", "certain", "instance_scores"]
+    instance, certain, scores = open_session(bundle.query_onnx).run(names, {"points": points, "text": text})
+    assert certain.all()
+    assert instance.tolist() == instances_plainly(cloud, points).tolist()
+    assert np.abs(scores - reference_scores(cloud.instances, text)).max() < 1e-6
+
+
+def test_a_file_written_anew_has_the_same_arrays(tmp_path):
+    old, new = (members_of(path) for path in (SCHEMA_2, write_bundle(read_bundle(SCHEMA_2).cloud, tmp_path / "s.ogpc")))
+    assert list(old) == list(new)
+    assert [name for name in old if old[name] != new[name]] == ["manifest.json", "query.onnx"]
 
 
 def test_words_come_back_as_unit_vectors_close_to_their_own(tmp_path):
