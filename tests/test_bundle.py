@@ -34,8 +34,8 @@ from og_pointcloud.models import open_session
 
 CLOUDS = tough_clouds()
 SCHEMA_2 = Path(__file__).parent / "data" / "schema_2.ogpc"
-"""Two balls of 100 points each, "apple" and "pear", on 40 points of a floor: 35 background, 5 unobserved. Written by the
-first version of schema 2, with words and a bank of 60; never written anew."""
+"""Two balls of 100 points each, "apple" and "pear", on 40 points of a floor: 35 background, 5 unobserved. Written by an
+older library, with words and a bank of 60; never written anew."""
 
 
 @pytest.fixture(scope="module")
@@ -109,7 +109,7 @@ def test_a_file_of_an_older_library_opens_and_answers():
         assert result.instances.tolist() == ids.tolist()
         assert result.labels.tolist() == np.maximum(ids, -1).tolist()
         assert result.scores[[0, 100, 200]].tolist() == pytest.approx([0.8939, 0.8612, 0], abs=1e-3)
-    points = scene.cloud.origin + [[0.31, 0, 0], [0.36, 0, 0], [0.28, 0, 0], [0, 0, 0.42], [0, 0, 0.5]]
+    points = scene.cloud.origin + np.array([[0.31, 0, 0], [0.36, 0, 0], [0.28, 0, 0], [0, 0, 0.42], [0, 0, 0.5]])
     asked = og.segment(points, ["pear", "chair"], scene)
     assert asked.instances.tolist() == [1, 1, 0, 0, -3]
     assert asked.labels.tolist() == [0, 0, -1, -1, -1]
