@@ -5,6 +5,7 @@ import json
 import re
 import shutil
 import subprocess
+import sys
 import zlib
 from dataclasses import replace
 
@@ -18,7 +19,7 @@ import og_pointcloud as og
 from og_pointcloud.cli import main
 from og_pointcloud.cloud import Vocabulary
 from og_pointcloud.formats.colors import label_colors
-from og_pointcloud.show.page import write_page
+from og_pointcloud.show.page import Look, write_page
 from og_pointcloud.show.viewpoint import FOCAL, Viewpoint, choose_viewpoint
 
 Z_UP = np.array([0.0, 0, 1])
@@ -90,7 +91,7 @@ def test_names_cannot_break_out_of_the_page(tmp_path):
     scene = og.LabelledScene.from_cloud(cloud)
     page = tmp_path / "page.html"
     result = og.segment(scene)
-    write_page(page, scene, result, Viewpoint(np.ones(3), np.zeros(3), Z_UP), title=name)
+    write_page(page, scene, result, Viewpoint(np.ones(3), np.zeros(3), Z_UP), Look(name))
     assert "alert(1)</script>" not in page.read_text(encoding="utf-8")
     assert content(page)["names"][0] == content(page)["title"] == name
 
@@ -106,7 +107,7 @@ def test_other_points_by_instance_with_rows_that_are_no_number(bundle, tmp_path,
     assert np.array_equal(data["instance"], og.segment(xyz, None, scene).instances)
     assert np.array_equal(data["rgb"].reshape(-1, 3)[:, 0], np.arange(len(xyz)) % 256)
     result = og.segment(np.concatenate([scene.xyz[:9], [[np.nan] * 3]]), None, scene)
-    left_out = write_page(page, scene, result, Viewpoint(np.ones(3), np.zeros(3), Z_UP), title="")
+    left_out = write_page(page, scene, result, Viewpoint(np.ones(3), np.zeros(3), Z_UP), Look(""))
     assert left_out == "1 of 10 points"
     assert content(page)["points"] == 9
 
@@ -169,7 +170,7 @@ def test_where_nothing_can_draw_the_cure_is_named(bundle, tmp_path, capsys, monk
     code, _, stderr = run(capsys, "view", bundle, "--png", tmp_path / "room.png")
     assert code == 2
     assert "apt-get install libegl1, or libosmesa6), or write a page (--html" in stderr
-    monkeypatch.setattr("og_pointcloud.cli.view.find_spec", lambda name: None)
+    monkeypatch.setitem(sys.modules, "og_pointcloud_pyvista", None)
     assert "og-pointcloud[pyvista]" in run(capsys, "view", bundle, "--png", tmp_path / "room.png")[2]
     assert run(capsys, "view", bundle, "--html", tmp_path / "room.html")[0] == 0, "a page needs no PyVista"
 

@@ -353,7 +353,7 @@ def _is_scene(pcd: Any) -> bool:
     return is_file or isinstance(pcd, (LabelledScene, LabelledCloud))
 
 
-def find_scene(pcd: Any, scene: SceneLike | None) -> LabelledScene:
+def find_scene(pcd: Any, scene: SceneLike | None = None) -> LabelledScene:
     """The scene that answers for a cloud: the one given, else that the cloud is or carries, else that of ``use``, else
     that of the environment; OgPointcloudError names these ways."""
     if scene is not None:

@@ -5,12 +5,11 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from og_pointcloud.cli.common import add_command, check_outputs, names_in, print_table, timed
-from og_pointcloud.errors import MissingExtraError, OgPointcloudError
+from og_pointcloud.errors import OgPointcloudError
 
 if TYPE_CHECKING:
     import numpy as np
@@ -77,6 +76,7 @@ def run(arguments: argparse.Namespace) -> None:
 
 def view_scene(arguments: argparse.Namespace) -> None:
     check_scene_options(arguments)
+    from og_pointcloud.ask.hosts import import_plugin
     from og_pointcloud.cli.segment import describe_segmentation, print_segmentation
 
     stages: list[dict[str, Any]] = []
@@ -95,10 +95,9 @@ def view_scene(arguments: argparse.Namespace) -> None:
             print(f"left out of the page: {left_out}")
     plotter = None
     if arguments.png or not outputs:
-        from og_pointcloud_pyvista.screening import draw
-
         with timed(stages, "draw"):
             by = "certainty" if arguments.certainty else "instance" if arguments.instances else "label"
+            draw = import_plugin("og_pointcloud_pyvista.screening", "pyvista").draw
             plotter = draw(scene, result, rgb, shown, view, by=by, boxes=arguments.boxes, window=not outputs)
             if arguments.png:
                 plotter.screenshot(arguments.png)
@@ -124,16 +123,15 @@ def check_scene_options(arguments: argparse.Namespace) -> None:
         raise OgPointcloudError(f"--cut is {arguments.cut}; expected a share of the height, from 0 to below 1")
     if arguments.html is not None and arguments.png is None:
         return
-    if find_spec("pyvista") is None:
-        raise MissingExtraError("pyvista", "pyvista")
+    from og_pointcloud.ask.hosts import import_plugin
+
+    plugin = import_plugin("og_pointcloud_pyvista", "pyvista")
     if arguments.png is None and sys.platform.startswith("linux") and not os.environ.get("DISPLAY"):
         raise OgPointcloudError(
             "there is no display for a window (DISPLAY is not set): write a page (--html P.html) or a picture (--png "
             "P.png)"
         )
-    from og_pointcloud_pyvista import can_render
-
-    if arguments.png is not None and not can_render():
+    if arguments.png is not None and not plugin.can_render():
         raise OgPointcloudError(
             "VTK cannot draw off-screen here, it finds neither EGL nor OSMesa: install one of them (Debian: apt-get "
             "install libegl1, or libosmesa6), or write a page (--html P.html), which needs neither"
@@ -183,12 +181,11 @@ def make_page(
     rgb: NDArray[np.uint8] | None,
     arguments: argparse.Namespace,
 ) -> str:
-    from og_pointcloud.show.page import write_page
+    from og_pointcloud.show.page import Look, write_page
 
-    return write_page(
-        arguments.html, scene, result, view, title=(arguments.cloud or arguments.source).stem, rgb=rgb,
-        mode="instances" if arguments.instances else "labels", boxes=arguments.boxes, cut=arguments.cut or 0.0,
-    )  # fmt: skip
+    title, mode = (arguments.cloud or arguments.source).stem, "instances" if arguments.instances else "labels"
+    look = Look(title, mode, arguments.boxes, arguments.cut or 0.0)
+    return write_page(arguments.html, scene, result, view, look, rgb)
 
 
 def view_capture(arguments: argparse.Namespace) -> None:

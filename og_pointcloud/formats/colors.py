@@ -7,9 +7,11 @@ from numpy.typing import NDArray
 
 from og_pointcloud.cloud import UNKNOWN
 
-__all__ = ["UNKNOWN_COLOR", "label_colors"]
+__all__ = ["LUMINANCE", "UNKNOWN_COLOR", "label_colors"]
 
 UNKNOWN_COLOR = (128, 128, 128)
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
+"""Weights of red, green and blue in how light a colour is, ITU-R BT.709."""
 GOLDEN_RATIO = 0.618033988749895
 
 

@@ -17,9 +17,9 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TypeAlias
+from typing import TYPE_CHECKING, TypeAlias, TypedDict
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -31,6 +31,7 @@ from og_pointcloud.ask.selecting import Match, Selection, select
 from og_pointcloud.bundle.nearest import NearestPoint
 from og_pointcloud.cloud import TOO_FAR
 from og_pointcloud.errors import OgPointcloudError, SceneError
+from og_pointcloud.formats.colors import LUMINANCE
 from og_pointcloud.formats.gaussian_ply import (
     BASE_COLOR,
     LOG_SCALE,
@@ -47,7 +48,10 @@ from og_pointcloud.scene import Points
 from og_pointcloud.show.harmonics import MAX_DEGREE, rotated_harmonics
 from og_pointcloud.text.words import TextFeatures
 
-__all__ = ["Edit", "What", "extract", "insert", "recolour", "remove"]
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
+__all__ = ["Edit", "EditOptions", "What", "extract", "insert", "recolour", "remove"]
 
 What: TypeAlias = "str | int | Iterable[int] | Pick | Match | Selection"
 """What to edit: a text, for the instances that it fits (`select`); ids of instances; what a click or `select` gave."""
@@ -56,14 +60,23 @@ Rows = NDArray[np.void]
 
 SAME_PLACE = 1e-3
 """Distance in spacings up to which a point of the cloud is the scene's: .ogpc files hold float32."""
-LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
-"""Of linear RGB, ITU-R BT.709; good enough a weight for any."""
 DARK = 0.05
 """Mean luminance below which an object's shading is too faint to be kept in a new colour."""
 SPLAT_SCALE, SPLAT_OPACITY = 0.5, 0.95
 """What a plain point becomes among Gaussians: its standard deviation in spacings, just closing surfaces."""
 RIGID = 1e-4
 """How far a pose may be off a rotation with one scale."""
+
+
+class EditOptions(TypedDict, total=False):
+    """cloud: the plain cloud or 3DGS file to edit (PLY, PCD); None for the scene's own points and colours.
+    halo: points of no instance that lie this near to the object, in spacings, go with it: what surrounds an object in
+        a 3DGS file often has no label; default 0. text_features: as for ``segment``.
+    """
+
+    cloud: str | os.PathLike[str] | None
+    halo: float
+    text_features: TextFeatures
 
 
 @dataclass(frozen=True)
@@ -82,21 +95,16 @@ def remove(
     scene: SceneLike,
     what: What,
     output: str | os.PathLike[str],
-    *,
-    cloud: str | os.PathLike[str] | None = None,
-    halo: float = 0.0,
-    text_features: TextFeatures = None,
+    **options: Unpack[EditOptions],
 ) -> Edit:
     """Write the cloud without some instances.
 
     scene: a loaded scene, a LabelledCloud or the path of a .ogpc file. what: see `What`. output: a .ply, not an input.
-    cloud: the plain cloud or 3DGS file to edit (PLY, PCD); None for the scene's own points and colours.
-    halo: points of no instance that lie this near to the object, in spacings, go with it: what surrounds an object in
-        a 3DGS file often has no label. text_features: as for ``segment``.
+    options: see `EditOptions`.
     Raises OgPointcloudError where no instance is meant or none of the cloud's points belongs to it, SceneError for
     a cloud that cannot be read.
     """
-    subject = _subject(scene, what, output, cloud, halo, text_features)
+    subject = _subject(scene, what, output, **options)
     if subject.chosen.all():
         raise OgPointcloudError(f"all {len(subject.chosen)} points would be removed; expected some to stay")
     return subject.write(output, subject.rows[~subject.chosen], "removed")
@@ -106,13 +114,10 @@ def extract(
     scene: SceneLike,
     what: What,
     output: str | os.PathLike[str],
-    *,
-    cloud: str | os.PathLike[str] | None = None,
-    halo: float = 0.0,
-    text_features: TextFeatures = None,
+    **options: Unpack[EditOptions],
 ) -> Edit:
     """Write some instances alone. Arguments and errors as for `remove`."""
-    subject = _subject(scene, what, output, cloud, halo, text_features)
+    subject = _subject(scene, what, output, **options)
     return subject.write(output, subject.rows[subject.chosen], "extracted")
 
 
@@ -123,9 +128,7 @@ def recolour(
     color: ArrayLike,
     *,
     keep_shading: bool = True,
-    cloud: str | os.PathLike[str] | None = None,
-    halo: float = 0.0,
-    text_features: TextFeatures = None,
+    **options: Unpack[EditOptions],
 ) -> Edit:
     """Write the cloud with some instances in another colour.
 
@@ -135,7 +138,7 @@ def recolour(
     rgb = np.asarray(color, np.float64)
     if rgb.shape != (3,) or not ((rgb >= 0) & (rgb <= 255)).all():
         raise OgPointcloudError(f"color is {color}; expected three numbers from 0 to 255: red, green, blue")
-    subject = _subject(scene, what, output, cloud, halo, text_features)
+    subject = _subject(scene, what, output, **options)
     rows, notes = _recoloured(subject.rows, subject.chosen, rgb / 255, keep_shading)
     return replace(subject, notes=(*subject.notes, *notes)).write(output, rows, "recoloured")
 
@@ -157,18 +160,16 @@ def insert(
     rotation, scale, translation = _similarity(pose)
     _check_output(output, [cloud, other])
     base, added = _read(Path(cloud)), _read(Path(other))
-    notes = [*base.notes, *added.notes]
-    rows = added.rows
-    if base.are_gaussians != added.are_gaussians:
-        kind = "Gaussians" if base.are_gaussians else "plain points"
+    rows, notes = added.rows, [*base.notes, *added.notes]
+    if holds_gaussians(base.elements) != holds_gaussians(added.elements):
+        points, is_splat = read_points(other), holds_gaussians(base.elements)
+        rows = _as_gaussians(points) if is_splat else _plain_rows(points.xyz_world, points.rgb)
+        kind = "Gaussians" if is_splat else "plain points"
         notes.append(f"{other}: its points became {kind}, like those of {cloud}")
-        points = read_points(other)
-        rows = _as_gaussians(points) if base.are_gaussians else _plain_rows(points.xyz_world, points.rgb)
     placed, lost = _placed(rows, rotation, scale, translation)
     merged, differing = _appended(base.rows, placed)
-    elements = {**base.elements, "vertex": merged}
-    write_ply(output, elements, [f"edited by og-pointcloud: {len(rows)} points inserted"])
-    return Edit(Path(output), len(merged), len(rows), (), (*notes, *lost, *differing))
+    inserted = np.arange(len(merged)) >= len(base.rows)
+    return _Cloud(base.elements, (*notes, *lost, *differing), inserted).write(output, merged, "inserted")
 
 
 # What is edited ---------------------------------------------------------------------------------------------------
@@ -176,34 +177,22 @@ def insert(
 
 @dataclass(frozen=True)
 class _Cloud:
-    """A file as its elements, rows of ``vertex`` in the layout that is written. notes: what reading it lost."""
+    """A file as its elements, rows of ``vertex`` in the layout that is written, and what an edit concerns.
+
+    notes: what could not be kept. chosen: (n,) bool, the rows concerned. instances: to whom they belong.
+    """
 
     elements: Mapping[str, Rows]
     notes: tuple[str, ...] = ()
-
-    @property
-    def rows(self) -> Rows:
-        return self.elements["vertex"]
-
-    @property
-    def are_gaussians(self) -> bool:
-        return holds_gaussians(self.elements)
-
-
-@dataclass(frozen=True)
-class _Subject:
-    """rows: of the cloud. chosen: (n,) bool, which of them an edit concerns. instances: to whom they belong."""
-
-    elements: Mapping[str, Rows]
-    chosen: NDArray[np.bool_]
-    instances: tuple[int, ...]
-    notes: tuple[str, ...]
+    chosen: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, bool))
+    instances: tuple[int, ...] = ()
 
     @property
     def rows(self) -> Rows:
         return self.elements["vertex"]
 
     def write(self, output: str | os.PathLike[str], rows: Rows, verb: str) -> Edit:
+        """Write other rows in place of the cloud's."""
         changed = int(self.chosen.sum())
         write_ply(output, {**self.elements, "vertex": rows}, [f"edited by og-pointcloud: {changed} points {verb}"])
         return Edit(Path(output), len(rows), changed, self.instances, self.notes)
@@ -213,10 +202,10 @@ def _subject(
     scene: SceneLike,
     what: What,
     output: str | os.PathLike[str],
-    cloud: str | os.PathLike[str] | None,
-    halo: float,
-    text_features: TextFeatures,
-) -> _Subject:
+    cloud: str | os.PathLike[str] | None = None,
+    halo: float = 0.0,
+    text_features: TextFeatures = None,
+) -> _Cloud:
     """Reads the cloud and finds the points that are meant."""
     if not (np.isfinite(halo) and halo >= 0):
         raise OgPointcloudError(f"halo is {halo}; expected a number of spacings, at least 0")
@@ -234,7 +223,7 @@ def _subject(
         )
     if halo > 0:
         chosen |= _halo(scene, xyz, ids, chosen, halo)
-    return _Subject(source.elements, chosen, instances, (*source.notes, *notes))
+    return _Cloud(source.elements, (*source.notes, *notes), chosen, instances)
 
 
 def _instances_meant(scene: LabelledScene, what: What, text_features: TextFeatures) -> tuple[int, ...]:
@@ -445,16 +434,15 @@ def _placed(
             turned = stack_columns(rows, normal, np.float64) @ rotation.T
             columns |= {name: turned[:, index].astype(rows.dtype[name]) for index, name in enumerate(normal)}
     placed = join_columns(columns)
-    everything = np.ones(len(rows), bool)
     if set(LOG_SCALE) <= set(names):
-        _set_columns(placed, everything, LOG_SCALE, stack_columns(rows, LOG_SCALE, np.float64) + np.log(scale))
+        _set_columns(placed, slice(None), LOG_SCALE, stack_columns(rows, LOG_SCALE, np.float64) + np.log(scale))
     if set(ROTATION) <= set(names):
-        _set_columns(placed, everything, ROTATION, _turned(quaternion_of(rotation), rows))
+        _set_columns(placed, slice(None), ROTATION, _turned(quaternion_of(rotation), rows))
     rest = _rest(rows)
     if rest.shape[2] > _coefficients(MAX_DEGREE):
         return placed, (f"harmonics above degree {MAX_DEGREE} are not turned",)
     if rest.shape[2]:
-        _set_rest(placed, everything, rotated_harmonics(rest, rotation))
+        _set_rest(placed, slice(None), rotated_harmonics(rest, rotation))
     return placed, ()
 
 
@@ -499,7 +487,9 @@ def _listed(names: Sequence[str]) -> str:
 # Columns ----------------------------------------------------------------------------------------------------------
 
 
-def _set_columns(rows: Rows, chosen: NDArray[np.bool_], names: Sequence[str], values: NDArray[np.floating]) -> None:
+def _set_columns(
+    rows: Rows, chosen: NDArray[np.bool_] | slice, names: Sequence[str], values: NDArray[np.floating]
+) -> None:
     for index, name in enumerate(names):
         rows[name][chosen] = values[:, index]
 
@@ -526,7 +516,7 @@ def _rest(rows: Rows) -> NDArray[np.float64]:
     return stack_columns(rows, names, np.float64).reshape(len(rows), 3, len(names) // 3)
 
 
-def _set_rest(rows: Rows, chosen: NDArray[np.bool_], rest: NDArray[np.float64]) -> None:
+def _set_rest(rows: Rows, chosen: NDArray[np.bool_] | slice, rest: NDArray[np.float64]) -> None:
     _set_columns(rows, chosen, _rest_names(rows), rest.reshape(len(rest), -1))
 
 

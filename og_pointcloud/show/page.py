@@ -9,6 +9,7 @@ import base64
 import json
 import os
 import zlib
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,7 @@ from og_pointcloud.formats.atomic import replacing
 from og_pointcloud.formats.colors import label_colors
 from og_pointcloud.show.viewpoint import Viewpoint
 
-__all__ = ["MOST_POINTS", "write_page"]
+__all__ = ["MOST_POINTS", "Look", "write_page"]
 
 TEMPLATE = Path(__file__).with_name("page.html")
 MOST_POINTS = 2_000_000
@@ -36,22 +37,31 @@ LEVELS = 65535
 """Steps of 16-bit coordinates and scores: a place is right to 1/131,000 of the cloud's extent."""
 
 
+@dataclass(frozen=True)
+class Look:
+    """How a page begins; a click changes all but the title.
+
+    mode: what colours show, "labels", "instances" or "photo". boxes: whether they are shown. cut: share of the height
+    hidden from the top, 0 to 1.
+    """
+
+    title: str
+    mode: str = "labels"
+    boxes: bool = False
+    cut: float = 0.0
+
+
 def write_page(
     path: str | os.PathLike[str],
     scene: LabelledScene,
     result: Segmentation,
     view: Viewpoint,
-    *,
-    title: str,
+    look: Look,
     rgb: NDArray[np.uint8] | None = None,
-    mode: str = "labels",
-    boxes: bool = False,
-    cut: float = 0.0,
 ) -> str:
     """Write the page, whole or not at all; returns what it leaves out, in words, empty if nothing.
 
-    result: of ``scene``, at least one finite point. rgb: (N, 3) of its points. mode: what colours show first, "labels",
-    "instances" or "photo". boxes: whether they are shown first. cut: share of the height hidden from the top, 0 to 1.
+    result: of ``scene``, at least one finite point. rgb: (N, 3) colours of its points.
     """
     finite = np.flatnonzero(np.isfinite(result.xyz).all(axis=1))
     if len(finite) == 0:
@@ -67,9 +77,8 @@ def write_page(
     low, high = xyz.min(axis=0), xyz.max(axis=0)
     middle = low + (high - low) / 2
     data = {
-        "title": title,
         "subtitle": f"{len(shown):,} points · {len(scene.instances)} instances",
-        "mode": mode, "boxes": boxes, "cut": cut, "calibrated": result.calibrated,
+        **asdict(look), "calibrated": result.calibrated,
         "spacing": scene.cloud.spacing * (len(finite) / len(shown)) ** 0.5,
         "low": (low - middle).tolist(), "size": (high - low).tolist(),
         "corners": _corners(low - middle, high - middle).tolist(), "extent": float(np.linalg.norm(high - low)) or 1.0,

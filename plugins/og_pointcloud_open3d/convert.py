@@ -3,23 +3,25 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 import og_pointcloud as og
 from og_pointcloud.ask.hosts import world_points
-from og_pointcloud.ask.labelled_scene import SceneLike
+from og_pointcloud.ask.labelled_scene import SceneLike, SegmentOptions
 from og_pointcloud.ask.segmentation import Segmentation
 from og_pointcloud.errors import OgPointcloudError, SceneError
 from og_pointcloud.formats.pcd import read_pcd
 from og_pointcloud.formats.ply import read_ply
 from og_pointcloud.formats.tables import naming, positions
-from og_pointcloud.text.words import Labels, TextFeatures
+from og_pointcloud.text.words import Labels
 from og_pointcloud_open3d.host import open3d
+
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
 
 __all__ = ["Segmented", "read", "segment", "to_open3d"]
 
@@ -68,11 +70,8 @@ def segment(
     labels: Labels = None,
     scene: SceneLike | None = None,
     *,
-    text_features: TextFeatures = None,
-    templates: Sequence[str] | None = None,
-    negatives: Labels = None,
     pose: ArrayLike | None = None,
-    max_distance: float | None = None,
+    **options: Unpack[SegmentOptions],
 ) -> Segmented:
     """Label a cloud, or a mesh by its vertices, and paint a copy of it.
 
@@ -87,10 +86,7 @@ def segment(
             "the cloud has 0 points; Open3D returns such a cloud for a file that it cannot read: read it with "
             "og_pointcloud_open3d.read, which says so"
         )
-    result = og.segment(
-        pcd, labels, scene, text_features=text_features, templates=templates, negatives=negatives, pose=pose,
-        max_distance=max_distance,
-    )  # fmt: skip
+    result = og.segment(pcd, labels, scene, pose=pose, **options)
     return Segmented(_painted(pcd, result), result)
 
 

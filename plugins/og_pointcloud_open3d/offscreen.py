@@ -20,7 +20,7 @@ from og_pointcloud.ask.labelled_scene import SceneLike
 from og_pointcloud.ask.segmentation import Segmentation
 from og_pointcloud.errors import OgPointcloudError, SceneError
 from og_pointcloud.formats.atomic import replacing
-from og_pointcloud.formats.colors import label_colors
+from og_pointcloud.formats.colors import LUMINANCE, label_colors
 from og_pointcloud.formats.gaussian_ply import BASE_COLOR, LOG_SCALE, ROTATION, gaussian_rows
 from og_pointcloud.formats.tables import stack_columns
 from og_pointcloud.scene import Camera, Points
@@ -30,8 +30,6 @@ from og_pointcloud_open3d.host import WITH_SPLATS, open3d, require_version
 
 __all__ = ["draw_png", "highlight_png", "look_at", "viewpoint"]
 
-LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
-"""Of RGB, ITU-R BT.709."""
 FADED = 0.35
 """Contrast that is left to what is not highlighted."""
 PAPER = 0.92

@@ -11,25 +11,27 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyvista as pv
 from numpy.typing import ArrayLike, NDArray
 
 import og_pointcloud as og
-from og_pointcloud.ask import labelled_scene as runtime
 from og_pointcloud.ask.hosts import NAMES_FIELD, SCENE_FIELD
 from og_pointcloud.ask.instances import Instance
-from og_pointcloud.ask.labelled_scene import LabelledScene, SceneLike
+from og_pointcloud.ask.labelled_scene import SceneLike, SegmentOptions, find_scene
 from og_pointcloud.ask.segmentation import Segmentation
 from og_pointcloud.errors import MissingExtraError, OgPointcloudError
 from og_pointcloud.formats.colors import label_colors
 from og_pointcloud.text.words import Labels, TextFeatures
 
+if TYPE_CHECKING:
+    from typing_extensions import Unpack
+
 __all__ = [
     "COLOR", "INSTANCE", "LABEL", "SCORE", "OgDataSet", "best_words", "box_lines", "label_names",
-    "scene_of", "set_strings", "to_pyvista",
+    "set_strings", "to_pyvista",
 ]  # fmt: skip
 
 LABEL, INSTANCE, SCORE, COLOR = "og_label", "og_instance", "og_score", "og_color"
@@ -64,27 +66,21 @@ class OgDataSet:
         labels: Labels = None,
         scene: SceneLike | None = None,
         *,
-        text_features: TextFeatures = None,
-        templates: Sequence[str] | None = None,
-        negatives: Labels = None,
         pose: ArrayLike | None = None,
-        max_distance: float | None = None,
         inplace: bool = False,
         progress_bar: bool = False,
+        **options: Unpack[SegmentOptions],
     ) -> Any:
         """Label every point; returns a dataset of the same type with the arrays that this module names.
 
-        labels, scene, text_features, templates, negatives, pose, max_distance: as for ``og_pointcloud.segment``.
+        labels, scene, pose, options: as for ``og_pointcloud.segment``.
         inplace: add the arrays to this dataset, and return it. progress_bar: needs tqdm.
         Warns where no point gets a label, and names the labels asked for that no point got.
         """
         with _progress("Segmenting", 2, progress_bar) as advance:
-            found = scene_of(self._mesh, scene)
+            found = find_scene(self._mesh, scene)
             advance()
-            result = og.segment(
-                self._mesh, labels, found, text_features=text_features, templates=templates, negatives=negatives,
-                pose=pose, max_distance=max_distance,
-            )  # fmt: skip
+            result = og.segment(self._mesh, labels, found, pose=pose, **options)
             advance()
         absent = [name for name, count in result.counts().items() if not count]
         if labels is not None and absent and len(absent) < len(result.names):
@@ -107,7 +103,7 @@ class OgDataSet:
         text, against, text_features: as for ``og_pointcloud.select``. Warns where nothing is selected, and names what
         is closest.
         """
-        found = scene_of(self._mesh, scene)
+        found = find_scene(self._mesh, scene)
         selection = og.select(found, text, against=against, text_features=text_features)
         mesh = self._with_instances(found)
         points = _extracted(mesh, selection.instances)
@@ -141,7 +137,7 @@ class OgDataSet:
         Of a segmented dataset, only labelled instances, in their label's colour. Cell arrays: og_instance, og_color.
         up: (3,) direction that boxes stand upright on, where it is known.
         """
-        found = scene_of(self._mesh, scene)
+        found = find_scene(self._mesh, scene)
         mesh = self._with_instances(found)
         segmented = LABEL in mesh.point_data
         wanted = mesh.point_data[LABEL] >= 0 if segmented else np.ones(mesh.n_points, bool)
@@ -174,13 +170,8 @@ class OgDataSet:
         mesh = self._mesh.copy(deep=False)
         if mesh.n_points:
             points = np.asarray(self._mesh.points)
-            mesh.point_data[INSTANCE] = scene_of(self._mesh, scene).instances_at(points)
+            mesh.point_data[INSTANCE] = find_scene(self._mesh, scene).instances_at(points)
         return mesh
-
-
-def scene_of(mesh: Any, scene: SceneLike | None = None) -> LabelledScene:
-    """The scene to ask about a dataset; OgPointcloudError says which ways there are to name one."""
-    return runtime.find_scene(mesh, scene)
 
 
 def label_names(mesh: pv.DataSet) -> tuple[str, ...]:
@@ -201,7 +192,7 @@ def best_words(mesh: pv.DataSet, scene: SceneLike | None = None) -> dict[int, st
         return {instance: names[labels[row]] for instance, row in zip(ids, where, strict=True)}
     if not ids:
         return {}
-    table = scene_of(mesh, scene).instances
+    table = find_scene(mesh, scene).instances
     return {instance: table[instance].words[0][0] if table[instance].words else "" for instance in ids}
 
 

@@ -14,13 +14,13 @@ import pyvista as pv
 from numpy.typing import ArrayLike, NDArray
 
 import og_pointcloud as og
-from og_pointcloud.ask.labelled_scene import LabelledScene, SceneLike
+from og_pointcloud.ask.labelled_scene import LabelledScene, SceneLike, find_scene
 from og_pointcloud.ask.picking import Pick
 from og_pointcloud.errors import OgPointcloudError
-from og_pointcloud.formats.colors import label_colors
+from og_pointcloud.formats.colors import LUMINANCE, label_colors
 from og_pointcloud.show.viewpoint import FOCAL, Viewpoint, choose_viewpoint
 from og_pointcloud.text.words import Labels, TextFeatures
-from og_pointcloud_pyvista.datasets import COLOR, INSTANCE, LABEL, best_words, box_lines, label_names, scene_of
+from og_pointcloud_pyvista.datasets import COLOR, INSTANCE, LABEL, best_words, box_lines, label_names
 from og_pointcloud_pyvista.files import RGB
 
 __all__ = ["OgPlotter", "can_render"]
@@ -94,7 +94,7 @@ class OgPlotter:
         if names and INSTANCE in mesh.point_data:
             self._add_names(mesh, labels, name)
         try:
-            self._scene = scene_of(mesh)
+            self._scene = find_scene(mesh)
         except OgPointcloudError:  # drawing needs none
             self._scene = None
         return actor
@@ -167,7 +167,7 @@ class OgPlotter:
         labels, text_features: the words to rank; left out, the scene's own. words: how many are shown.
         callback: called with each ``Pick``, also one that hit no instance. options: of ``enable_point_picking``.
         """
-        self._scene = scene_of(None, scene if scene is not None else self._scene)
+        self._scene = find_scene(None, scene if scene is not None else self._scene)
         self._words = {"labels": labels, "text_features": text_features, "count": words}
         self._on_click = callback
         self._plotter.enable_point_picking(
@@ -267,7 +267,7 @@ def _shaded(colors: NDArray[np.uint8], mesh: pv.DataSet) -> NDArray[np.uint8]:
     rgb = mesh.point_data.get(RGB)
     if rgb is None:
         return colors
-    luminance = np.asarray(rgb)[:, :3] @ np.array([0.3, 0.59, 0.11])
+    luminance = np.asarray(rgb)[:, :3] @ LUMINANCE
     bright = max(float(np.percentile(luminance, 95)), 1.0)
     light = 1 - SHADE + SHADE * np.clip(luminance / bright, 0, 1)
     return (colors * light[:, None]).astype(np.uint8)
