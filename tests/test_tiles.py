@@ -8,8 +8,8 @@ from functools import lru_cache
 import numpy as np
 import pytest
 from conftest import TinyCapture
-from make_street import MadeStreet, make_street
 from scipy.optimize import linear_sum_assignment
+from street import MadeStreet, make_street
 
 import og_pointcloud as og
 from og_pointcloud.cli import main

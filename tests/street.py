@@ -1,7 +1,4 @@
-"""A street as a mapping car sees it, with its truth: as many LiDAR points and images as asked for.
-
-    python examples/make_street.py out/street --points 2000000 --views 60       # a capture folder
-    og-pointcloud fit out/street -o street.ogpc
+"""A street as a mapping car sees it: as many LiDAR points and images as asked for, for tests of large scenes.
 
 Two rows of houses, cars along two kerbs that run the whole length, lamps and trees. Every surface is a box or an
 ellipsoid, so images and masks are cast exactly, and points are spread evenly over what a LiDAR on the road can reach.
@@ -10,13 +7,9 @@ Some masks are missing, as from a real proposer. The road and the pavement have 
 
 from __future__ import annotations
 
-import argparse
-import json
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numba import njit, prange
@@ -124,11 +117,8 @@ class Street:
         """(H, W) int16, the object, GROUND or SKY that each pixel shows, and (H, W) float32, its depth in metres."""
         intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
         pose = camera.world_to_camera
-        windows = np.array([_window(camera, *corners) for corners in zip(self.low, self.high, strict=True)])
-        return _cast(
-            self.low, self.high, self.round, self.owner, windows, pose, camera.center, intrinsics,
-            camera.width, camera.height,
-        )  # fmt: skip
+        solids = self.low, self.high, self.round, self.owner
+        return _cast(*solids, pose, camera.center, intrinsics, camera.width, camera.height)
 
     def image(self, camera: Camera) -> NDArray[np.uint8]:
         """(H, W, 3) uint8: what the camera sees."""
@@ -137,26 +127,6 @@ class Street:
         rays = np.stack([(column - camera.cx) / camera.fx, (row - camera.cy) / camera.fy, np.ones_like(row)], axis=-1)
         place = (rays * depth[..., None]) @ camera.world_to_camera[:3, :3] + camera.center
         return colours(place.reshape(-1, 3), owner.ravel()).reshape(*owner.shape, 3)
-
-    def seen(self, views: list[Camera], xyz: NDArray[np.float32], owner: NDArray[np.int16]) -> NDArray[np.bool_]:
-        """(n,) bool: points that some camera shows: the pixel is of the same object, at about the same depth."""
-        seen = np.zeros(len(xyz), bool)
-        for camera in views:
-            shown, depth = self.look(camera)
-            pose = camera.world_to_camera.astype(np.float32)
-            for part in _chunks(len(xyz)):
-                at = xyz[part] @ pose[:3, :3].T + pose[:3, 3]
-                front = at[:, 2] > 0.2
-                z = np.where(front, at[:, 2], 1)
-                column, row = (
-                    np.floor(at[:, 0] / z * camera.fx + camera.cx),
-                    np.floor(at[:, 1] / z * camera.fy + camera.cy),
-                )
-                front &= (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
-                pixel = row[front].astype(int), column[front].astype(int)
-                near = np.abs(depth[pixel] - z[front]) < 0.05 + 0.02 * z[front]
-                seen[part][np.flatnonzero(front)] |= near & (shown[pixel] == owner[part][front])
-        return seen
 
 
 def _along(
@@ -173,22 +143,8 @@ def _chunks(count: int, size: int = 1 << 20) -> Iterator[slice]:
     return (slice(begin, begin + size) for begin in range(0, count, size))
 
 
-def _window(camera: Camera, low: Floats, high: Floats) -> tuple[int, int, int, int]:
-    """Columns and rows, ends exclusive, that a box can cover: all of them where it reaches behind the camera."""
-    corner = np.stack(np.meshgrid(*zip(low, high, strict=True)), axis=-1).reshape(8, 3)
-    x, y, z = camera.world_to_camera[:3, :3] @ corner.T + camera.world_to_camera[:3, 3:]
-    if z.max() < 0.1:
-        return 0, 0, 0, 0
-    if z.min() < 0.1:
-        return 0, camera.width, 0, camera.height
-    u, v = x / z * camera.fx + camera.cx, y / z * camera.fy + camera.cy
-    left, right = np.clip([u.min(), u.max() + 1], 0, camera.width)
-    top, bottom = np.clip([v.min(), v.max() + 1], 0, camera.height)
-    return int(left), int(right), int(top), int(bottom)
-
-
 @njit(cache=True, parallel=True, error_model="numpy")
-def _cast(low, high, round_, owner, windows, pose, eye, intrinsics, width, height):  # noqa: ANN001, ANN202
+def _cast(low, high, round_, owner, pose, eye, intrinsics, width, height):
     """Nearest solid along the ray of every pixel, the plane z = 0 behind all of them, and its depth."""
     shown = np.full((height, width), SKY, np.int16)
     nearest = np.full((height, width), FARTHEST_M, np.float32)
@@ -200,9 +156,7 @@ def _cast(low, high, round_, owner, windows, pose, eye, intrinsics, width, heigh
             if down < 0 and -eye[2] / down < FARTHEST_M:
                 shown[row, column], nearest[row, column] = GROUND, -eye[2] / down
         for s in range(len(low)):
-            if row < windows[s, 2] or row >= windows[s, 3]:
-                continue
-            for column in range(windows[s, 0], windows[s, 1]):
+            for column in range(width):
                 u, v = (column + 0.5 - cx) / fx, (row + 0.5 - cy) / fy
                 enter, leave = 0.05, np.float64(nearest[row, column])
                 a, b, c = 0.0, 0.0, -1.0
@@ -254,17 +208,10 @@ def drive(length_m: float, views: int, image: tuple[int, int]) -> list[Camera]:
 
 @dataclass(frozen=True)
 class MadeStreet:
-    """A scene and its truth. owner: (n,) int16, the object of each point, GROUND on road and pavement. texts:
-    (classes, D) float32, text vectors of CLASSES."""
+    """A scene and its truth. owner: (n,) int16, the object of each point, GROUND on road and pavement."""
 
-    street: Street
     scene: Scene
     owner: NDArray[np.int16]
-    texts: NDArray[np.float32]
-
-    def seen(self) -> NDArray[np.bool_]:
-        """(n,) bool: points that some view shows."""
-        return self.street.seen([view.camera for view in self.scene.views], self.scene.points.xyz, self.owner)
 
 
 def make_street(
@@ -289,68 +236,4 @@ def make_street(
         taken.append(View(f"view{index:04d}", camera, number[shown], features, pictured))
     tint = np.concatenate([colours(xyz[part], owner[part]) for part in _chunks(len(xyz))])
     cloud = Points(xyz, np.zeros(3), tint)
-    return MadeStreet(street, Scene(cloud, tuple(taken), FEATURE_SPACE, "street"), owner, model.texts)
-
-
-def write_street(made: MadeStreet, folder: Path) -> None:
-    """The street as a capture folder, with gt.npz for scoring."""
-    import cv2
-
-    for name in ("images", "masks"):
-        (folder / name).mkdir(parents=True, exist_ok=True)
-    frames = []
-    opengl = np.diag([1.0, -1.0, -1.0, 1.0])
-    for view in made.scene.views:
-        cv2.imwrite(str(folder / "images" / f"{view.name}.jpg"), made.street.image(view.camera)[..., ::-1])
-        cv2.imwrite(str(folder / "masks" / f"{view.name}.png"), (view.mask_map() + 1).astype(np.uint16))
-        pose = np.linalg.inv(view.camera.world_to_camera) @ opengl
-        frames.append({"file_path": f"images/{view.name}.jpg", "transform_matrix": pose.tolist()})
-    camera = made.scene.views[0].camera
-    intrinsics = {"w": camera.width, "h": camera.height, "fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx}
-    transforms = {**intrinsics, "cy": camera.cy, "ply_file_path": "points.ply", "frames": frames}
-    (folder / "transforms.json").write_text(json.dumps(transforms, indent=1))
-    cloud = made.scene.points
-    _write_ply(folder / "points.ply", cloud.xyz, colours(cloud.xyz, made.owner))
-    space: Any = np.array(FEATURE_SPACE)
-    features: dict[str, Any] = {view.name: view.mask_features.astype(np.float16) for view in made.scene.views}
-    np.savez(folder / "mask_features.npz", feature_space=space, **features)
-    np.savez(folder / "text_features.npz", names=np.array(CLASSES), vectors=made.texts, feature_space=space)
-    cls = np.where(made.owner >= 0, made.street.cls[made.owner], -1).astype(np.int32)
-    background = made.owner == GROUND
-    np.savez(folder / "gt.npz", names=np.array(CLASSES), cls=cls, instance=made.owner, background=background)
-
-
-def _write_ply(path: Path, xyz: NDArray[np.float32], rgb: NDArray[np.uint8]) -> None:
-    fields = [(name, "<f4") for name in "xyz"] + [(name, "u1") for name in ("red", "green", "blue")]
-    rows = np.empty(len(xyz), fields)
-    for column, name in enumerate("xyz"):
-        rows[name] = xyz[:, column]
-    for column, name in enumerate(("red", "green", "blue")):
-        rows[name] = rgb[:, column]
-    kinds = [f"property {'float' if kind == '<f4' else 'uchar'} {name}\n" for name, kind in fields]
-    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(rows)}\n{''.join(kinds)}end_header\n"
-    with path.open("wb") as file:
-        file.write(header.encode())
-        rows.tofile(file)
-
-
-def main() -> None:
-    """Make a street and write it."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folder", type=Path, help="where the capture goes")
-    parser.add_argument("--points", type=int, default=2_000_000)
-    parser.add_argument("--views", type=int, default=60)
-    parser.add_argument("--image", type=int, nargs=2, default=(960, 540), metavar=("WIDTH", "HEIGHT"))
-    parser.add_argument("--length", type=float, default=200.0, help="metres")
-    parser.add_argument("--seed", type=int, default=0)
-    arguments = parser.parse_args()
-    image = arguments.image[0], arguments.image[1]
-    made = make_street(arguments.points, arguments.views, image, arguments.length, arguments.seed)
-    write_street(made, arguments.folder)
-    print(
-        f"{arguments.points:,} points, {arguments.views} views of {len(made.street.cls)} objects in {arguments.folder}"
-    )
-
-
-if __name__ == "__main__":
-    main()
+    return MadeStreet(Scene(cloud, tuple(taken), FEATURE_SPACE, "street"), owner)
