@@ -7,8 +7,8 @@ import struct
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import cv2
 import numpy as np
+from scenes import write_image
 
 from og_pointcloud.scene import Camera
 
@@ -66,21 +66,6 @@ def make_world(offset=(0.0, 0.0, 0.0), count=3, seed=0):
     return World([f"frame_{i:02d}" for i in range(count)], quaternions, translations, xyz, rgb)
 
 
-def write_ply(file: Path, xyz, rgb):
-    """Binary little endian, doubles, so that large coordinates survive."""
-    header = "ply\nformat binary_little_endian 1.0\n" + f"element vertex {len(xyz)}\n"
-    header += "".join(f"property double {axis}\n" for axis in "xyz")
-    header += "".join(f"property uchar {name}\n" for name in ("red", "green", "blue")) + "end_header\n"
-    rows = np.zeros(len(xyz), [("xyz", "<f8", 3), ("rgb", "u1", 3)])
-    rows["xyz"], rows["rgb"] = xyz, rgb
-    file.write_bytes(header.encode() + rows.tobytes())
-
-
-def write_png(file: Path, pixels):
-    file.parent.mkdir(parents=True, exist_ok=True)
-    file.write_bytes(cv2.imencode(".png", pixels)[1].tobytes())
-
-
 def write_masks(folder: Path, names, size=(WIDTH, HEIGHT), dtype: type = np.uint16, replaced=None):
     """Two masks an image: id 1 the left third, id 2 the right third. Features of width 8, but for ``replaced``."""
     width, height = size
@@ -89,7 +74,7 @@ def write_masks(folder: Path, names, size=(WIDTH, HEIGHT), dtype: type = np.uint
     rng = np.random.default_rng(1)
     features = {name: rng.normal(size=(2, 8)).astype(np.float16) for name in names}
     for name in names:
-        write_png(folder / "masks" / f"{name}.png", ids)
+        write_image(folder / "masks" / f"{name}.png", ids)
     write_features(folder, {"feature_space": np.array("tiny"), **features, **(replaced or {})})
     return ids, features
 
@@ -105,7 +90,7 @@ def write_images(folder: Path, names, size=(WIDTH, HEIGHT)):
     bgr[..., 2] = np.linspace(0, 250, width).round()
     bgr[..., 1] = np.linspace(0, 250, height).round()[:, None]
     for name in names:
-        write_png(folder / "images" / f"{name}.png", bgr)
+        write_image(folder / "images" / f"{name}.png", bgr)
     return bgr[..., ::-1]
 
 

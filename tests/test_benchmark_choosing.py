@@ -9,8 +9,8 @@ from pathlib import Path
 import benchmark_choosing as bench
 import numpy as np
 import pytest
-from conftest import FEATURE_SPACE, NAMES, TinyCapture
 from labelled_clouds import unit_rows
+from scenes import FEATURE_SPACE, NAMES, TinyCapture
 
 from og_pointcloud.ask.choosing import Choice, Chooser
 from og_pointcloud.cloud import WordBank

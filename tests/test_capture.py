@@ -22,10 +22,9 @@ from capture_files import (
     write_features,
     write_images,
     write_masks,
-    write_ply,
-    write_png,
     write_transforms,
 )
+from scenes import write_image, write_ply
 
 from og_pointcloud.errors import MissingExtraError, SceneError
 from og_pointcloud.formats.capture import read_capture
@@ -125,7 +124,7 @@ def test_masks_and_images_are_read_when_asked_for(capture):
     scene = read_capture(folder)
     shutil.rmtree(folder / "images")
     new = np.full((HEIGHT, WIDTH), 2, np.uint8)
-    write_png(folder / "masks" / f"{world.names[0]}.png", new)
+    write_image(folder / "masks" / f"{world.names[0]}.png", new)
     assert (scene.views[0].mask_map() == 1).all()
     with pytest.raises(FileNotFoundError):
         scene.views[0].image_rgb()
@@ -144,7 +143,7 @@ def test_a_view_without_masks_is_legal(capture, empty):
     folder, world = capture
     nothing = world.names[1]
     write_masks(folder, world.names, replaced={nothing: empty})
-    write_png(folder / "masks" / f"{nothing}.png", np.zeros((HEIGHT, WIDTH), np.uint16))
+    write_image(folder / "masks" / f"{nothing}.png", np.zeros((HEIGHT, WIDTH), np.uint16))
     view = read_capture(folder).views[1]
     assert view.mask_count == 0
     assert (view.mask_map() == -1).all()
@@ -204,7 +203,7 @@ def test_a_shrunken_image_is_averaged(capture):
     write_masks(folder, world.names, size=(WIDTH // 2, HEIGHT // 2))
     stripes = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
     stripes[:, ::2] = 200
-    write_png(folder / "images/frame_00.png", stripes)
+    write_image(folder / "images/frame_00.png", stripes)
     image = read_capture(folder).views[0].image_rgb()
     assert image is not None
     assert (image == 100).all()
@@ -295,7 +294,7 @@ def test_images_are_optional_but_missed(capture):
 def test_paths_out_of_the_folder_are_looked_for_inside(capture, path):
     folder, _ = capture
     outside = folder.parent / "other"
-    write_png(outside / "frame_00.png", np.zeros((HEIGHT, WIDTH, 3), np.uint8))
+    write_image(outside / "frame_00.png", np.zeros((HEIGHT, WIDTH, 3), np.uint8))
     edit(folder, lambda content: content["frames"][0].update(file_path=path))
     image = read_capture(folder).views[0].image_rgb()
     assert image is not None
@@ -482,7 +481,7 @@ def test_features_of_another_kind(capture, values):
 )
 def test_colour_masks_are_refused(capture, pixels, kind):
     folder, _ = capture
-    write_png(folder / "masks/frame_01.png", pixels)
+    write_image(folder / "masks/frame_01.png", pixels)
     with pytest.raises(SceneError, match=rf"frame_01.png is a {kind}; expected grey of 8 or 16 bit"):
         read_capture(folder)
 

@@ -6,7 +6,7 @@ import shlex
 import cv2
 import numpy as np
 import pytest
-from conftest import (
+from scenes import (
     COLOURS,
     FEATURE_SPACE,
     FEATURE_WIDTH,

@@ -4,13 +4,7 @@ import struct
 
 import numpy as np
 import pytest
-from capture_files import (
-    make_world,
-    quaternion_matrix,
-    same_camera,
-    write_colmap_binary,
-    write_colmap_text,
-)
+from capture_files import make_world, quaternion_matrix, same_camera, write_colmap_binary, write_colmap_text
 
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.colmap import find_model, read_images, read_points3d

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from capture_files import write_masks
-from depth_rooms import HEIGHT, WIDTH, distance_to_surface, look, poses, write_depth, write_rgb
+from scenes import ROOM_SIZE, distance_to_surface, look, room_poses, write_depth, write_rgb
 
 from og_pointcloud.cli import main
 from og_pointcloud.errors import SceneError
@@ -20,7 +20,7 @@ COUNT = 6
 LENS = (130.0, 131.0, 79.0, 60.5)
 """fx fy cx cy with pixel centres at whole numbers, as these data sets state them; the scene adds 0.5 to cx, cy."""
 OURS = (LENS[0], LENS[1], LENS[2] + 0.5, LENS[3] + 0.5)
-SIZE = (WIDTH, HEIGHT)
+SIZE = WIDTH, HEIGHT = ROOM_SIZE
 
 
 def matrix(lens, size=4):
@@ -34,7 +34,7 @@ def write_scannet(folder: Path):
     color_lens, color_size = (260.0, 262.0, 158.0, 121.0), (2 * WIDTH, 2 * HEIGHT)
     for name in ("pose", "intrinsic"):
         (folder / name).mkdir(parents=True)
-    for index, pose in enumerate(poses(COUNT)):
+    for index, pose in enumerate(room_poses(COUNT)):
         centred = (color_lens[0], color_lens[1], color_lens[2] + 0.5, color_lens[3] + 0.5)
         write_rgb(folder / f"color/{index * 5}.jpg", look(pose, size=color_size, intrinsics=centred)[1])
         write_depth(folder / f"depth/{index * 5}.png", look(pose, intrinsics=OURS)[0])
@@ -46,7 +46,7 @@ def write_scannet(folder: Path):
 
 
 def write_seven_scenes(folder: Path, intrinsics: bool = True):
-    for index, pose in enumerate(poses(COUNT)):
+    for index, pose in enumerate(room_poses(COUNT)):
         depth, rgb = look(pose, intrinsics=OURS)
         depth[:3] = 65.535
         write_depth(folder / f"frame-{index:06d}.depth.png", depth)
@@ -58,11 +58,11 @@ def write_seven_scenes(folder: Path, intrinsics: bool = True):
 
 
 def write_replica(folder: Path):
-    for index, pose in enumerate(poses(COUNT)):
+    for index, pose in enumerate(room_poses(COUNT)):
         depth, rgb = look(pose, intrinsics=OURS)
         write_depth(folder / f"results/depth{index:06d}.png", depth, 1 / 6553.5)
         write_rgb(folder / f"results/frame{index:06d}.jpg", rgb)
-    np.savetxt(folder / "traj.txt", [pose.ravel() for pose in poses(COUNT)])
+    np.savetxt(folder / "traj.txt", [pose.ravel() for pose in room_poses(COUNT)])
     lens = dict(zip(("fx", "fy", "cx", "cy"), LENS, strict=True))
     parameters = {"camera": {"w": WIDTH, "h": HEIGHT, **lens, "scale": 6553.5}}
     (folder.parent / "cam_params.json").write_text(json.dumps(parameters))
@@ -72,7 +72,7 @@ def write_replica(folder: Path):
 def write_record3d(folder: Path):
     """Quaternions xyzw and OpenGL axes; depth at half size, as .npy in the place of .exr."""
     rows = []
-    for index, pose in enumerate(poses(COUNT)):
+    for index, pose in enumerate(room_poses(COUNT)):
         write_rgb(folder / f"rgb/{index}.jpg", look(pose, intrinsics=LENS)[1])
         (folder / "depth").mkdir(exist_ok=True)
         half = tuple(value / 2 for value in LENS)
@@ -121,7 +121,7 @@ def test_every_layout_becomes_a_scene_with_a_fused_cloud(dataset):
     fused = fuse_capture(folder)
     assert distance_to_surface(scene.points.xyz_world).max() < fused.survey.voxel / 2
     assert len(scene.points) == len(fused.points) > 3000
-    for view, pose in zip(scene.views, poses(COUNT), strict=True):
+    for view, pose in zip(scene.views, room_poses(COUNT), strict=True):
         np.testing.assert_allclose(view.camera.center + scene.points.origin, pose[:3, 3], atol=1e-5)
         np.testing.assert_allclose(view.camera.world_to_camera[:3, :3].T, pose[:3, :3], atol=1e-5)
         assert (view.camera.width, view.camera.height) == size
@@ -139,7 +139,7 @@ def test_depth_of_a_view_is_given_at_the_pixels_of_its_image(dataset):
     depth = resampled(image.depth, image.camera, posed.images[2].camera)
     assert depth.shape == (size[1], size[0])
     intrinsics = (260.0, 262.0, 158.5, 121.5) if scale == 2 else lens
-    truth, _ = look(poses(COUNT)[2], size=size, intrinsics=intrinsics)
+    truth, _ = look(room_poses(COUNT)[2], size=size, intrinsics=intrinsics)
     measured = depth > 0
     assert measured.mean() > 0.9
     # Nearest pixels: exact to a pixel's slope, but at the edges of things.
@@ -200,7 +200,7 @@ def test_scannets_mesh_is_the_cloud_where_it_is_there(tmp_path):
 def nerfstudio(folder: Path, **keys):
     """transforms.json with depth_file_path."""
     frames = []
-    for index, pose in enumerate(poses(COUNT)):
+    for index, pose in enumerate(room_poses(COUNT)):
         depth, rgb = look(pose, intrinsics=LENS)
         write_rgb(folder / f"images/{index}.png", rgb)
         write_depth(folder / f"depths/d{index}.png", depth, keys.get("integer_depth_scale", 1e-3))
@@ -233,7 +233,7 @@ def test_a_depth_folder_beside_the_images_is_found(tmp_path):
     content = json.loads((tmp_path / "transforms.json").read_text())
     for index, frame in enumerate(content["frames"]):
         del frame["depth_file_path"]
-        np.save(tmp_path / f"{index}.npy", look(poses(COUNT)[index], intrinsics=LENS)[0])
+        np.save(tmp_path / f"{index}.npy", look(room_poses(COUNT)[index], intrinsics=LENS)[0])
     (tmp_path / "transforms.json").write_text(json.dumps(content))
     add_masks(tmp_path, names, SIZE)
     with pytest.raises(SceneError, match=r"no geometry; .*depth images in depth/"):

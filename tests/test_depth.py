@@ -3,15 +3,14 @@
 import cv2
 import numpy as np
 import pytest
-from depth_rooms import (
+from scenes import (
     CRATE,
-    HEIGHT,
+    ROOM_SIZE,
     THING,
-    WIDTH,
     camera,
     distance_to_surface,
     look,
-    poses,
+    room_poses,
     write_depth,
     write_frames,
 )
@@ -21,7 +20,8 @@ from og_pointcloud.formats.depth import DepthFile, DepthFrame, DepthImage, resam
 from og_pointcloud.formats.distortion import lens_distortion
 from og_pointcloud.formats.fusion import _slot, doubts, evenly, fuse, on_surface, survey, to_world
 
-POSE = poses()[0]
+WIDTH, HEIGHT = ROOM_SIZE
+POSE = room_poses()[0]
 
 
 def read(path, **keys):
@@ -221,7 +221,7 @@ def test_empty_images_are_named_and_all_empty_ones_refused(tmp_path):
 
 def test_a_view_far_away_is_named(tmp_path):
     frames = write_frames(tmp_path, 3)
-    pose = poses(3)[1].copy()
+    pose = room_poses(3)[1].copy()
     pose[0, 3] = 1e7
     frames[1] = DepthFrame("lost", DepthFile(frames[1].depth.path, camera(pose), 1e-3), frames[1].colors)
     with pytest.raises(SceneError, match="view 'lost' has points 1e\\+07 from the middle"):
@@ -280,7 +280,7 @@ def test_a_wrong_unit_is_named(tmp_path):
 def test_colours_seen_through_another_lens_are_noticed(tmp_path, shift, magnification):
     frames = []
     for index, frame in enumerate(write_frames(tmp_path)):
-        pose = poses()[index]
+        pose = room_poses()[index]
         focal = magnification * camera(pose).fx
         rgb = look(pose, intrinsics=(focal, focal, WIDTH / 2 + shift[0], HEIGHT / 2 + shift[1]))[1]
         frames.append(DepthFrame(frame.name, frame.depth, lambda _, rgb=rgb: rgb))

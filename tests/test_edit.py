@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import write_ply as write_other_ply
 from labelled_clouds import WORDS, make_cloud, room
+from scenes import write_ply as write_other_ply
 from scipy.spatial.transform import Rotation
 from scipy.special import lpmv
 

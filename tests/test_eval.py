@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import NAMES, write_tiny_capture
 from labelled_clouds import SPACE, WIDTH, instance_table, make_cloud
+from scenes import NAMES, write_tiny_capture
 
 import og_pointcloud as og
 from og_pointcloud.cli import main

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 import numba
 import numpy as np
 import pytest
-from conftest import TinyCapture
 from numpy.typing import NDArray
+from scenes import TinyCapture
 from scipy.sparse import csr_array, random_array, vstack
 
 from og_pointcloud.errors import OgPointcloudError, SceneError

@@ -13,7 +13,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from capture_files import HEIGHT, WIDTH, make_world, write_colmap_text, write_ply, write_png, write_transforms
+from capture_files import HEIGHT, WIDTH, make_world, write_colmap_text, write_transforms
+from scenes import write_image, write_ply
 
 from og_pointcloud.cli import main
 from og_pointcloud.errors import OgPointcloudError, SceneError
@@ -395,7 +396,7 @@ def test_other_masks_in_the_folder_of_the_proposer_are_taken_up(tmp_path):
         ids = np.zeros((HEIGHT, WIDTH), np.uint8)
         ids[10:30, 10 : 30 + fill // 20] = fill
         for name in world.names:
-            write_png(tmp_path / "given" / f"{name}.png", ids)
+            write_image(tmp_path / "given" / f"{name}.png", ids)
         make_masks(tmp_path / "c", MaskSettings(str(tmp_path / "given"), encoder=None), say=silent)
         assert ((ids_of(tmp_path / "c", world.names[0]) > 0) == (ids > 0)).all()
 

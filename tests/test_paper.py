@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from conftest import TinyCapture
 from numpy.typing import NDArray
+from scenes import TinyCapture
 
 from og_pointcloud.errors import OgPointcloudError, SceneError
 from og_pointcloud.fitting.fit import prepare

@@ -12,7 +12,7 @@ from types import SimpleNamespace
 import cv2
 import numpy as np
 import pytest
-from conftest import COLOURS, NAMES, write_ply, write_tiny_capture
+from scenes import COLOURS, NAMES, write_ply, write_tiny_capture
 from scipy.sparse import csr_array
 
 from og_pointcloud.ask.labelled_scene import LabelledScene

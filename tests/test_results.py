@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import NAMES, write_tiny_capture
+from scenes import NAMES, write_tiny_capture
 
 import og_pointcloud as og
 from og_pointcloud.evaluate.baselines import BASELINES, only_where_masked

@@ -7,7 +7,7 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
-from conftest import TinyCapture
+from scenes import TinyCapture
 from scipy.optimize import linear_sum_assignment
 from street import MadeStreet, make_street
 

@@ -11,9 +11,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import write_ply
 from labelled_clouds import make_cloud, room
 from og_pointcloud_export import write_bundle
+from scenes import write_ply
 
 import og_pointcloud as og
 from og_pointcloud.cli import main

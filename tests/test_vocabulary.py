@@ -9,9 +9,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import write_tiny_capture
 from labelled_clouds import SPACE, WIDTH, WORDS, instance_table, reference_scores, room, unit_rows
 from og_pointcloud_export import write_bundle
+from scenes import write_tiny_capture
 
 import og_pointcloud as og
 from og_pointcloud.bundle.read import read_bundle, read_carried_encoder
