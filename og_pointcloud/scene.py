@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -244,6 +245,13 @@ class Points:
 
     def __len__(self) -> int:
         return len(self.xyz)
+
+    def take(self, rows: NDArray[np.integer]) -> Points:
+        """The points of these rows, in their order, with all that is known of them."""
+        names = ("rgb", "normals", "scale", "rotation", "opacity")
+        columns: dict[str, Any] = {name: getattr(self, name) for name in names}
+        chosen = {name: None if column is None else column[rows] for name, column in columns.items()}
+        return Points(self.xyz[rows], self.origin, **chosen)
 
     @property
     def are_gaussians(self) -> bool:

@@ -332,6 +332,8 @@ class FitSettings:
     seed: int = 0
     memory: int | None = None
     """Bytes that the process may hold; None: half of what is free, beside what it holds already."""
+    tile_points: int | None = None
+    """Fit in tiles of at most so many points; None: only where the whole cloud would not fit into memory."""
     geometry: GeometrySettings = field(default_factory=GeometrySettings)
     visibility: VisibilitySettings = field(default_factory=VisibilitySettings)
     grouping: GroupingSettings = field(default_factory=GroupingSettings)
@@ -345,6 +347,8 @@ class FitSettings:
     def __post_init__(self) -> None:
         if self.memory is not None and not self.memory > 0:
             raise OgPointcloudError(f"memory is {self.memory} bytes; expected more than 0, or None")
+        if self.tile_points is not None and self.tile_points < 1:
+            raise OgPointcloudError(f"tile_points is {self.tile_points}; expected at least 1, or None")
 
 
 @dataclass(frozen=True)

@@ -11,13 +11,13 @@ from test_grouping import ONE, hand_table
 from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.fitting.learned.codebook import (
     Codebook,
-    cluster_weights,
     kmeans,
     seed_centres,
     thing_count,
     things_together,
     two_level_codebook,
 )
+from og_pointcloud.fitting.mask_table import weights_by_instance
 from og_pointcloud.settings import CodebookSettings
 
 DEFAULTS = CodebookSettings()
@@ -299,11 +299,11 @@ def test_hardly_any_points_for_two_levels(count: int, settings: CodebookSettings
     assert codebook.levels == 1
 
 
-def test_cluster_weights_are_a_product_with_indicators() -> None:
+def test_weights_by_instance_are_a_product_with_indicators() -> None:
     _, _, _, table = room()
     cluster = np.random.default_rng(0).integers(-1, 5, table.weights.shape[1]).astype(np.int32)
     onehot = (cluster[:, None] == np.arange(5)).astype(float)
-    np.testing.assert_allclose(cluster_weights(table.weights, cluster, 5), table.weights.toarray() @ onehot)
+    np.testing.assert_allclose(weights_by_instance(table.weights, cluster, 5), table.weights.toarray() @ onehot)
 
 
 def test_bad_settings_are_refused() -> None:

@@ -1,8 +1,18 @@
-"""Instances + masks -> feature rows: what the encoder saw of each instance, over all views (paper, Sec. 3.3).
+"""Instances + masks -> feature rows, and which instance is a part of which.
 
-The paper matches each instance with one mask per view by IoU and feature distance (Eq. 5) and averages. Here the masks
-of an instance are known from grouping, and how much each shows of it is a product with the mask table, with true
-visibility: a mask counts by the pixels it shows of the instance, and masks that disagree with the rest are left out.
+Feature rows: what the encoder saw of each instance, over all views (paper, Sec. 3.3). The paper matches each instance
+with one mask per view by IoU and feature distance (Eq. 5) and averages. Here the masks of an instance are known from
+grouping, and how much each shows of it is a product with the mask table, with true visibility: a mask counts by the
+pixels it shows of the instance, and masks that disagree with the rest are left out.
+
+Parts: a handle has masks of its own in some views, while most views show it within the mask of the mug. So, for
+instances a and b, over the views that see both and have a mask of b:
+
+    held     views in which most of what shows of a lies in a mask of b
+    a is a part of b where held / all of them is a majority, and some view shows a in a mask of its own
+
+No mask is needed that no view has: a parent is always an instance too. Where masks never show the parent, or never the
+part, nothing is found. Works alike for groups of masks and for the leaves of a codebook.
 """
 
 from __future__ import annotations
@@ -12,10 +22,18 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from og_pointcloud.cloud import InstanceTable
-from og_pointcloud.fitting.mask_table import MaskTable
+from og_pointcloud.fitting.mask_table import MaskTable, weights_by_instance
 from og_pointcloud.settings import AssociationSettings
 
-__all__ = ["describe_instances", "directions", "robust_mean"]
+__all__ = ["describe_instances", "directions", "part_of", "robust_mean"]
+
+MOSTLY = 0.5
+"""A part lies mostly in one mask of its parent: more than this share of what a view shows of it, in more than this
+share of the views."""
+SEEN_SHARE = 0.1
+"""A view that shows less of an instance than this share of its typical view is no evidence about it."""
+FEWEST_VIEWS = 2
+"""Views that show a part in its parent at least: one alone could be a mask that spilled over."""
 
 
 def describe_instances(
@@ -98,3 +116,49 @@ def robust_mean(
         spread = 1.4826 * np.median(np.abs(cosines - middle))
         kept = cosines >= middle - deviations * max(spread, 1e-6)
     return mean, kept, cosines
+
+
+def part_of(
+    table: MaskTable, mask_instance: NDArray[np.int32], instance_ids: NDArray[np.int32], count: int
+) -> NDArray[np.int32]:
+    """(count,) int32: the instance that each is a part of, -1 none. No cycles: a parent has more points than its parts.
+
+    mask_instance: (masks,) int32, the instance whose mask it is (`MaskGroups.group` or `Matching.mask_instance`), -1
+    none. instance_ids: (n,) int32, below 0 none. Of several parents the one that holds the part in most of the views is
+    taken, of equal ones the smallest: a handle is a part of the mug before it is one of the table.
+    """
+    shown = weights_by_instance(table.weights, instance_ids, count)
+    seen = weights_by_instance(table.outside, instance_ids, count)
+    np.add.at(seen, table.mask_view, shown)  # (views, count): all that each view shows of each instance
+    sees = seen > SEEN_SHARE * _typical(seen)
+    has_mask = np.zeros((count, len(seen)), bool)  # instance, view
+    has_mask[mask_instance[mask_instance >= 0], table.mask_view[mask_instance >= 0]] = True
+
+    within = (shown > MOSTLY * seen[table.mask_view]) & sees[table.mask_view]
+    masks, parts = np.nonzero(within)
+    owners = mask_instance[masks]
+    has_own_mask = np.zeros(count, bool)
+    has_own_mask[parts[owners == parts]] = True
+    other = (owners >= 0) & (owners != parts)
+    other &= sees[table.mask_view[masks], owners]
+    held = np.zeros((count, count))  # part, parent
+    np.add.at(held, (parts[other], owners[other]), 1)
+    possible = sees.T.astype(np.float64) @ (has_mask.T & sees)
+
+    size = np.bincount(instance_ids[instance_ids >= 0], minlength=count)
+    share = held / np.maximum(possible, 1)
+    candidate = (share > MOSTLY) & (held >= FEWEST_VIEWS) & has_own_mask[:, None] & (size[None] > size[:, None])
+    parent = np.full(count, -1, np.int32)
+    for part in np.flatnonzero(candidate.any(axis=1)):
+        parents = np.flatnonzero(candidate[part])
+        parent[part] = parents[np.lexsort((parents, size[parents], -share[part, parents]))[0]]
+    return parent
+
+
+def _typical(seen: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Per instance, the median over the views that show it at all."""
+    shows = np.where(seen > 0, seen, np.nan)
+    typical = np.zeros(seen.shape[1])
+    known = (seen > 0).any(axis=0)
+    typical[known] = np.nanmedian(shows[:, known], axis=0)
+    return typical

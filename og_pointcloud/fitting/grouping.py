@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from og_pointcloud.fitting.mask_table import MaskTable
-from og_pointcloud.fitting.view_votes import Testimony
+from og_pointcloud.fitting.view_votes import ViewVotes
 from og_pointcloud.settings import GroupingSettings
 
 __all__ = ["MaskGroups", "group_masks", "indicator"]
@@ -41,13 +41,13 @@ class MaskGroups:
 
 
 def group_masks(
-    table: MaskTable, testimony: Testimony, settings: GroupingSettings, sample: NDArray[np.int64] | None = None
+    table: MaskTable, votes: ViewVotes, settings: GroupingSettings, sample: NDArray[np.int64] | None = None
 ) -> MaskGroups:
     """Group the masks of a table. Ids are ordered by shown mass, largest first, and do not depend on chance.
 
     sample: columns that overlaps are measured on: means over thousands of points need no more. None: all.
     """
-    share = mask_shares(testimony, table.mask_view, settings, sample)
+    share = mask_shares(votes, table.mask_view, settings, sample)
     spanning = _spanning_masks(share, table.mask_view, settings)
     container = _containers(share, table.mask_view, spanning, settings)
     witnesses = _witnesses(share, container, table.mask_view, settings)
@@ -58,13 +58,13 @@ def group_masks(
 
 
 def mask_shares(
-    testimony: Testimony,
+    votes: ViewVotes,
     mask_view: NDArray[np.int32],
     settings: GroupingSettings,
     sample: NDArray[np.int64] | None = None,
 ) -> csr_array:
     """(masks, masks) sparse: entry (i, j) is the share of what mask i shows, and j's view sees, that lies in j."""
-    weights, seen = testimony.inside, testimony.word
+    weights, seen = votes.in_mask, votes.vote
     if sample is not None and len(sample) < weights.shape[1]:
         weights, seen = csr_array(weights[:, sample]), csr_array(seen[:, sample])
     together = (weights @ weights.T).tocoo()
@@ -101,11 +101,10 @@ def _spanning_masks(share: csr_array, mask_view: NDArray[np.int32], settings: Gr
     parts = np.bincount(cell[part], (entries.data[part] > settings.part_share).astype(float), size)
     covered = np.bincount(cell[part], entries.data[part], size)
     split = (largest < settings.container_share) & (parts >= 2) & (covered > settings.container_share)
-    whole = largest >= settings.container_share
-    own = np.arange(len(mask_view)) * views + mask_view
-    whole[own] = False  # a mask is no witness of itself
+    held = largest >= settings.container_share
+    held[np.arange(len(mask_view)) * views + mask_view] = False  # a mask is no witness of itself
     shape = len(mask_view), views
-    return split.reshape(shape).sum(axis=1) > whole.reshape(shape).sum(axis=1)
+    return split.reshape(shape).sum(axis=1) > held.reshape(shape).sum(axis=1)
 
 
 def _lookup(matrix: csr_array, rows: NDArray[np.int32], cols: NDArray[np.int32]) -> NDArray[np.float64]:

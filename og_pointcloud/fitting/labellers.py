@@ -1,69 +1,56 @@
-"""Masks -> instances, by three roads, and the choice between them.
+"""Mask table -> instances, in one of four modes.
 
 grouping  masks that cover the same Gaussians are one instance (grouping.py). No training.
-fast      instance features from the mask table, a two-level codebook, masks matched by Eq. 5 (features.py,
-          codebook.py, matching.py): the paper's objectives without rendering. Deterministic, seconds.
-paper     the same objectives as published: trained by rendering, a view a step (paper.py), each instance matched as
-          rendered alone. The reference of the other two.
-auto      grouping, and fast as well where the scene's masks say that grouping has not understood them.
+fast      instance features from the mask table, a two-level codebook, masks matched by Eq. 5 (learned/): the paper's
+          objectives without rendering. Deterministic, seconds.
+paper     the same objectives as published: trained by rendering, a view a step (learned/paper.py), each instance
+          matched as rendered alone. The reference of the other two.
+auto      grouping, and fast as well where the scene's masks contradict what grouping found.
 
-All give a `Labelling`. Grouping and fast then let all views settle every point (membership.py); the paper's points
-keep their leaf.
+All give a `Labelling`. Grouping and fast then decide every point from all views (membership.py); the points of mode
+paper keep their leaf.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.cloud import UNOBSERVED, InstanceTable
-from og_pointcloud.fitting.association import describe_instances
+from og_pointcloud.fitting.association import describe_instances, part_of
 from og_pointcloud.fitting.grouping import MaskGroups, group_masks
-from og_pointcloud.fitting.learned.codebook import cluster_weights, two_level_codebook
+from og_pointcloud.fitting.learned.codebook import two_level_codebook
 from og_pointcloud.fitting.learned.instance_features import learn_features
 from og_pointcloud.fitting.learned.matching import Matching, alone_evidence, match_masks, visible_evidence
-from og_pointcloud.fitting.mask_table import Gaussians, MaskTable
+from og_pointcloud.fitting.mask_table import MaskTable, weights_by_instance
 from og_pointcloud.fitting.membership import assign_points
-from og_pointcloud.fitting.parts import part_of
-from og_pointcloud.fitting.view_votes import Testimony, hear_views
-from og_pointcloud.journal import Journal
-from og_pointcloud.rendering.geometry import Neighbourhood, sample_of_points, thinned
-from og_pointcloud.scene import Scene
-from og_pointcloud.settings import FitSettings
+from og_pointcloud.fitting.view_votes import ViewVotes, view_votes
+from og_pointcloud.journal import Journal, LeftOut
+from og_pointcloud.rendering.geometry import sample_of_points
+from og_pointcloud.rendering.surface import Surface
+from og_pointcloud.settings import AssociationSettings, FitSettings
 
 __all__ = [
+    "LABELLERS",
     "Labelling",
-    "Prepared",
-    "as_published",
-    "by_choice",
-    "by_features",
-    "by_grouping",
+    "auto",
+    "fast",
+    "grouping",
+    "instances_of_groups",
     "mask_agreement",
     "mask_means",
+    "paper",
+    "renumbered",
 ]
-
-
-@dataclass(frozen=True)
-class Prepared:
-    """Frozen geometry and what every mask shows of it: all that the stages after rendering need.
-
-    near: depth of the near plane, scene units. stride: every stride-th row and column of the images was used.
-    table: what shows behind an object through its mask is in ``outside`` (membership.without_see_through).
-    """
-
-    neighbourhood: Neighbourhood
-    gaussians: Gaussians
-    near: float
-    stride: int
-    table: MaskTable
 
 
 @dataclass(frozen=True)
 class Labelling:
     """instance_ids: (n,) int32, a row of ``instances``, BACKGROUND or UNOBSERVED. mask_instance: (masks,) int32, the
-    instance that each mask shows, -1 none. certainty: (n,) float32 as of `Membership`; None where views did not settle
+    instance that each mask shows, -1 none. certainty: (n,) float32 as of `Membership`; None where views did not decide
     every point."""
 
     instance_ids: NDArray[np.int32]
@@ -71,63 +58,66 @@ class Labelling:
     mask_instance: NDArray[np.int32]
     certainty: NDArray[np.float32] | None = None
 
+    def of_points(self, rows: NDArray[np.integer] | None) -> Labelling:
+        """The labelling of points that each get what one of ``rows`` has; None: of the same points."""
+        if rows is None:
+            return self
+        certainty = None if self.certainty is None else self.certainty[rows]
+        return replace(self, instance_ids=self.instance_ids[rows], certainty=certainty)
 
-def by_choice(scene: Scene, prepared: Prepared, settings: FitSettings, journal: Journal) -> Labelling:
-    """Mode "auto": grouping, unless learned features explain the masks clearly better.
+
+Labeller = Callable[[MaskTable, Surface, FitSettings, Journal], Labelling]
+
+
+def auto(table: MaskTable, surface: Surface, settings: FitSettings, journal: Journal) -> Labelling:
+    """Grouping, unless learned features explain the masks clearly better.
 
     The judge is `mask_agreement`, which needs no truth. Learning is tried only where grouping leaves room for it.
     """
     before = list(journal.left_out)
-    grouped = by_grouping(scene, prepared, settings, journal)
-    agreement = mask_agreement(prepared.table, grouped)
+    grouped = grouping(table, surface, settings, journal)
+    agreement = mask_agreement(table, grouped)
     journal.notes["mask_agreement"] = {"grouping": round(agreement, 4)}
     if len(grouped.instances) == 0:
-        journal.leave_out("learned features and codebook", "no mask shows an instance: there is nothing to learn from")
+        journal.leave_out(LeftOut.LEARNING_WITHOUT_INSTANCES)
         return grouped
     if agreement >= settings.agreement_enough:
-        journal.leave_out(
-            "learned features and codebook",
-            f"instances from grouping agree with {agreement:.0%} of the masks' area; learning is tried below "
-            f"{settings.agreement_enough:.0%}",
-        )
+        journal.leave_out(LeftOut.LEARNING_NOT_NEEDED, grouped=agreement, enough=settings.agreement_enough)
         return grouped
     trial = Journal(journal.progress)
-    learned = by_features(scene, prepared, settings, trial)
+    learned = fast(table, surface, settings, trial)
     journal.stages += trial.stages
-    other = mask_agreement(prepared.table, learned)
+    other = mask_agreement(table, learned)
     journal.notes["mask_agreement"]["fast"] = round(other, 4)
-    shares = f"they agree with {other:.0%} of the masks' area, those from grouping with {agreement:.0%}"
     if other > agreement + settings.agreement_lead:
         journal.notes.update(trial.notes)
         journal.left_out = before + trial.left_out
-        journal.leave_out("instances from grouping", f"learned ones explain the masks better: {shares}")
+        journal.leave_out(LeftOut.GROUPED_INSTANCES, learned=other, grouped=agreement)
         return learned
-    journal.leave_out("instances from learned features", f"they explain the masks no better: {shares}")
+    journal.leave_out(LeftOut.LEARNED_INSTANCES, learned=other, grouped=agreement)
     return grouped
 
 
-def by_grouping(scene: Scene, prepared: Prepared, settings: FitSettings, journal: Journal) -> Labelling:
+def grouping(table: MaskTable, surface: Surface, settings: FitSettings, journal: Journal) -> Labelling:
     """Masks joined by the Gaussians they share; no training."""
     with journal.stage("grouping"):
-        testimony = hear_views(prepared.table)
-        sample = sample_of_points(prepared.gaussians.xyz, settings.grouping.graph_points)
-        groups = group_masks(prepared.table, testimony, settings.grouping, sample)
+        votes = view_votes(table)
+        sample = sample_of_points(surface.gaussians.xyz, settings.grouping.graph_points)
+        groups = group_masks(table, votes, settings.grouping, sample)
     if groups.spanning.any():
-        journal.leave_out(f"{groups.spanning.sum()} masks", "most views show each of them as several things")
-    return _settled(prepared, testimony, groups, settings, journal)
+        journal.leave_out(LeftOut.SPANNING_MASKS, count=int(groups.spanning.sum()))
+    return _decided_by_views(table, votes, groups, surface, settings, journal)
 
 
-def by_features(scene: Scene, prepared: Prepared, settings: FitSettings, journal: Journal) -> Labelling:
+def fast(table: MaskTable, surface: Surface, settings: FitSettings, journal: Journal) -> Labelling:
     """Features by Eq. 1 and 2, codebook by Eq. 3, masks by Eq. 5, all from the mask table."""
-    table = prepared.table
     with journal.stage("features"):
         learned = learn_features(table, settings.features, settings.seed)
     with journal.stage("codebook"):
-        book = two_level_codebook(
-            learned.features, scene.points.xyz, learned.seen, table, settings.codebook, settings.seed
-        )
+        xyz = surface.scene.points.xyz
+        book = two_level_codebook(learned.features, xyz, learned.seen, table, settings.codebook, settings.seed)
         if book.levels == 1:
-            journal.leave_out("the codebook's second level", "no view shows two masks in one coarse cluster")
+            journal.leave_out(LeftOut.SECOND_LEVEL)
     journal.notes["feature_steps"], journal.notes["features_converged"] = learned.steps, learned.converged
     journal.notes["clusters"] = [len(book.coarse_centres), len(book.leaf_centres)]
     with journal.stage("matching"):
@@ -135,24 +125,23 @@ def by_features(scene: Scene, prepared: Prepared, settings: FitSettings, journal
         evidence = visible_evidence(table, book.leaf, book.leaf_centres, shown)
         matching = match_masks(table, book.leaf, evidence, settings.matching, settings.association)
     if not settings.matching.settle:
-        return _literal(table, book.leaf, book.leaf_coarse, matching)
+        return _leaves_as_instances(table, book.leaf, book.leaf_coarse, matching)
     groups = MaskGroups(matching.mask_instance, len(book.leaf_centres), np.zeros(len(table.mask_view), bool))
     with journal.stage("grouping"):
-        testimony = hear_views(table)
-    return _settled(prepared, testimony, groups, settings, journal, book.leaf_coarse)
+        votes = view_votes(table)
+    return _decided_by_views(table, votes, groups, surface, settings, journal, book.leaf_coarse)
 
 
-def as_published(scene: Scene, prepared: Prepared, settings: FitSettings, journal: Journal) -> Labelling:
+def paper(table: MaskTable, surface: Surface, settings: FitSettings, journal: Journal) -> Labelling:
     """The paper's method: features and codebook trained by rendering, instances matched as rendered alone (Eq. 5)."""
     from og_pointcloud.fitting.learned.paper import train_codebook, train_features
 
-    paper, gaussians, near = settings.paper, prepared.gaussians, prepared.near
-    views = [thinned(view, prepared.stride) for view in scene.views]
+    options, gaussians, near = settings.paper, surface.gaussians, surface.near
+    views = surface.thinned_views()
     with journal.stage("features"), journal.bars() as report:
-        trained = train_features(gaussians, views, near, paper, settings.seed, report)
+        trained = train_features(gaussians, views, near, options, settings.seed, report)
     with journal.stage("codebook"), journal.bars() as report:
-        book = train_codebook(gaussians, views, near, trained.features, paper, settings.seed, report)
-    histories = (trained.history, *book.histories)
+        book = train_codebook(gaussians, views, near, trained.features, options, settings.seed, report)
     journal.notes["training"] = [
         {
             "stage": history.name,
@@ -161,28 +150,32 @@ def as_published(scene: Scene, prepared: Prepared, settings: FitSettings, journa
             "seconds_per_step": round(history.seconds_per_step, 5),
             "published_seconds": round(history.published_seconds, 1),
         }
-        for history in histories
+        for history in (trained.history, *book.histories)
     ]
     used, leaf = np.unique(book.leaf[book.leaf >= 0], return_inverse=True)
     ids = np.full(len(gaussians), -1, np.int32)
     ids[book.leaf >= 0] = leaf
     centres = book.centres[used]
     with journal.stage("matching"):
-        shown = mask_means(prepared.table, trained.features)
-        if paper.association == "alone":
-            evidence = alone_evidence(gaussians, views, near, ids, centres, shown, paper.covered_share)
+        shown = mask_means(table, trained.features)
+        if options.association == "alone":
+            evidence = alone_evidence(gaussians, views, near, ids, centres, shown, options.covered_share)
         else:
-            evidence = visible_evidence(prepared.table, ids, centres, shown)
-        matching = match_masks(prepared.table, ids, evidence, paper.matching, settings.association)
-    return _literal(prepared.table, ids, (used // paper.k2).astype(np.int32), matching)
+            evidence = visible_evidence(table, ids, centres, shown)
+        matching = match_masks(table, ids, evidence, options.matching, settings.association)
+    return _leaves_as_instances(table, ids, (used // options.k2).astype(np.int32), matching)
+
+
+LABELLERS: dict[str, Labeller] = {"auto": auto, "grouping": grouping, "fast": fast, "paper": paper}
+"""By `FitSettings.mode`."""
 
 
 def mask_agreement(table: MaskTable, labelling: Labelling) -> float:
     """How well the instances reproduce the masks they came from: mean over masks, by area, of the best IoU with what an
     instance shows in that view. In [0, 1]; torn, merged and missed masks lower it whatever the instances."""
     count = len(labelling.instances)
-    shared = cluster_weights(table.weights, labelling.instance_ids, count)
-    in_view = cluster_weights(table.outside, labelling.instance_ids, count)
+    shared = weights_by_instance(table.weights, labelling.instance_ids, count)
+    in_view = weights_by_instance(table.outside, labelling.instance_ids, count)
     np.add.at(in_view, table.mask_view, shared)
     area = np.asarray(table.weights.sum(axis=1), np.float64).ravel()
     if count == 0 or area.sum() == 0:
@@ -192,53 +185,67 @@ def mask_agreement(table: MaskTable, labelling: Labelling) -> float:
     return float(np.average(best, weights=area))
 
 
-def _settled(
-    prepared: Prepared,
-    testimony: Testimony,
-    groups: MaskGroups,
-    settings: FitSettings,
-    journal: Journal,
-    coarse: NDArray[np.int32] | None = None,
-) -> Labelling:
-    """Every point's state from all views together, and what the encoder saw of each instance."""
-    table = prepared.table
-    with journal.stage("membership"):
-        membership = assign_points(table, testimony, groups, prepared.neighbourhood, settings.membership)
-    if membership.dismissed.any():
-        journal.leave_out(
-            f"{membership.dismissed.sum()} of {groups.count} groups of masks",
-            "views that see their points mostly show no such mask, far more often than the proposer's misses explain",
-        )
-    with journal.stage("association"):
-        ids, group, used = _without_empty(membership.instance_ids, groups.group)
-        instances = describe_instances(table, group, ids, len(used), settings.association)
-        instances = replace(instances, part_of=part_of(table, group, ids, len(used)))
-        if coarse is not None:
-            instances = replace(instances, coarse=coarse[used])
-    return Labelling(ids, instances, group, membership.certainty)
-
-
-def _literal(
-    table: MaskTable, leaf: NDArray[np.int32], leaf_coarse: NDArray[np.int32], matching: Matching
-) -> Labelling:
-    """Points keep the leaf they are in; those that no mask shows are unobserved."""
-    whole = part_of(table, matching.mask_instance, leaf, len(leaf_coarse))
-    ids = np.where(leaf >= 0, leaf, UNOBSERVED).astype(np.int32)
-    return Labelling(ids, replace(matching.instances, part_of=whole, coarse=leaf_coarse), matching.mask_instance)
-
-
-def _without_empty(
-    ids: NDArray[np.int32], group: NDArray[np.int32]
-) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]:
-    """Number the groups that have points 0, 1, ... in their order; masks of the others belong to none. Also returns
-    the groups that are left."""
-    used = np.unique(ids[ids >= 0])
-    number = np.full(int(max(group.max(initial=-1), ids.max(initial=-1))) + 2, -1, np.int32)
-    number[used] = np.arange(len(used), dtype=np.int32)
-    return np.where(ids >= 0, number[ids], ids).astype(np.int32), number[group], used
-
-
 def mask_means(table: MaskTable, features: NDArray[np.float32]) -> NDArray[np.float64]:
     """(masks, width): the mean instance feature that each mask shows; zero where it shows nothing."""
     shown = np.asarray(table.weights.sum(axis=1), np.float64).reshape(-1, 1)
     return (table.weights @ features) / np.where(shown > 0, shown, 1)
+
+
+def _decided_by_views(
+    table: MaskTable,
+    votes: ViewVotes,
+    groups: MaskGroups,
+    surface: Surface,
+    settings: FitSettings,
+    journal: Journal,
+    coarse: NDArray[np.int32] | None = None,
+) -> Labelling:
+    """Every point's state from all views together, and what the encoder saw of each instance.
+
+    coarse: (groups,) the coarse cluster of each group, if the groups are leaves of a codebook.
+    """
+    with journal.stage("membership"):
+        membership = assign_points(table, votes, groups, surface.neighbourhood, settings.membership)
+    if membership.dismissed.any():
+        journal.leave_out(LeftOut.CONTRADICTED_GROUPS, count=int(membership.dismissed.sum()), total=groups.count)
+    with journal.stage("association"):
+        used, ids, mask_instance = renumbered(membership.instance_ids, groups.group)
+        instances = instances_of_groups(table, mask_instance, ids, len(used), settings.association)
+        if coarse is not None:
+            instances = replace(instances, coarse=coarse[used])
+    return Labelling(ids, instances, mask_instance, membership.certainty)
+
+
+def renumbered(
+    ids: NDArray[np.int32], group: NDArray[np.int32]
+) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]:
+    """Groups that have points become instances 0, 1, ... in their order: (the groups that do, the instance of each
+    point, the instance of each mask, -1 where its group has no point).
+
+    ids: (n,) the group of each point, or a state below 0, which stays. group: (masks,) the group of each mask, -1 none.
+    """
+    used = np.unique(ids[ids >= 0])
+    number = np.full(int(max(group.max(initial=-1), ids.max(initial=-1))) + 2, -1, np.int32)
+    number[used] = np.arange(len(used), dtype=np.int32)
+    return used, np.where(ids >= 0, number[ids], ids).astype(np.int32), number[group]
+
+
+def instances_of_groups(
+    table: MaskTable,
+    mask_instance: NDArray[np.int32],
+    ids: NDArray[np.int32],
+    count: int,
+    settings: AssociationSettings,
+) -> InstanceTable:
+    """What the encoder saw of each of ``count`` instances, and which are parts of others."""
+    instances = describe_instances(table, mask_instance, ids, count, settings)
+    return replace(instances, part_of=part_of(table, mask_instance, ids, count))
+
+
+def _leaves_as_instances(
+    table: MaskTable, leaf: NDArray[np.int32], leaf_coarse: NDArray[np.int32], matching: Matching
+) -> Labelling:
+    """Points keep the leaf they are in; those that no mask shows are unobserved."""
+    parent = part_of(table, matching.mask_instance, leaf, len(leaf_coarse))
+    ids = np.where(leaf >= 0, leaf, UNOBSERVED).astype(np.int32)
+    return Labelling(ids, replace(matching.instances, part_of=parent, coarse=leaf_coarse), matching.mask_instance)

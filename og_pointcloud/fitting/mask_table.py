@@ -1,7 +1,8 @@
 """Frozen geometry + views -> the mask table: how much each Gaussian shows in each mask of each view.
 
-One pass over each view (`splatting.view_weights`), several side by side; the rows go to a `TableStore`, which knows
-where there is room for them. Views that an interrupted fit left in a work folder are not rendered again.
+One pass over each view (`splatting.view_weights`), several side by side. What a view shows goes to a `WorkFolder`,
+which writes it where memory is short or the work long; in the end the views are put together to one table. Views that
+an interrupted fit left in the folder are not rendered again.
 """
 
 from __future__ import annotations
@@ -10,16 +11,18 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from hashlib import blake2b
-from itertools import chain, islice
-from typing import TypeVar
+from itertools import islice
+from typing import Any, TypeVar
 
 import numba
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csr_array
 
-from og_pointcloud.fitting.table_store import TableStore
+from og_pointcloud.errors import OgPointcloudError, SceneError
+from og_pointcloud.fitting.memory import scratch_array
+from og_pointcloud.fitting.work_folder import WorkFolder, fingerprint
+from og_pointcloud.kernels import njit
 from og_pointcloud.rendering.splatting import (
     CUTOFFS,
     FRUSTUM_MARGIN,
@@ -32,7 +35,7 @@ from og_pointcloud.rendering.splatting import (
     view_weights,
     working_memory,
 )
-from og_pointcloud.scene import View
+from og_pointcloud.scene import Scene, View
 
 __all__ = [
     "FRUSTUM_MARGIN",
@@ -40,21 +43,23 @@ __all__ = [
     "Cutoffs",
     "Gaussians",
     "MaskTable",
+    "SparseRows",
     "ViewWeights",
     "mask_table",
     "pixel_weights",
     "render",
-    "table_key",
+    "require_sight",
+    "view_fingerprint",
     "view_weights",
+    "weights_by_instance",
     "working_memory",
 ]
 
-Shown = TypeVar("Shown")
+Result = TypeVar("Result")
 
 SEEN_THROUGH = 0.1
-"""What a weight through a surface counts as exposure. Not 0: a point that no view sees otherwise keeps its say."""
-VERSION = b"1"
-"""Of the weights: rows that a killed fit of another version left are not taken up."""
+"""Share of a weight through a surface that counts as exposure. Not 0: points that are only ever seen through a surface
+are still decided by the views that see them."""
 
 
 @dataclass(frozen=True)
@@ -94,75 +99,175 @@ def mask_table(
     views: Iterable[View],
     near: float,
     thickness: NDArray[np.float32] | None = None,
-    store: TableStore | None = None,
-    at_once: int | None = None,
+    *,
+    work: WorkFolder | None = None,
+    side_by_side: int | None = None,
+    most_in_memory: float = np.inf,
     cutoffs: Cutoffs = CUTOFFS,
 ) -> MaskTable:
     """The mask table of all views, one pass over each.
 
     near: depth of the near plane, scene units. thickness: (n,) how far behind the surface in front of it a Gaussian may
-    lie and still belong to it, scene units; what lies farther is seen through it and counts
-    SEEN_THROUGH. None: all counts alike.
-    store: where the rows go; None: into memory. Its views that are the first of these are not rendered again.
-    at_once: views worked on side by side at most, None: as many as there are threads.
+    lie and still belong to it, scene units; what lies farther is seen through it and counts SEEN_THROUGH. None: all
+    counts alike.
+    work: where the views are kept meanwhile; views that are there already are not rendered. None: in memory.
+    side_by_side: views worked on at once at most, None: as many as there are threads.
+    most_in_memory: bytes of entries; a larger table is in files, mapped.
     """
-    store = store or TableStore(len(gaussians))
-    of_views: list[tuple[NDArray[np.int32], NDArray[np.float32]]] = []
+    if work is None:
+        work = WorkFolder(None)
+        work.hold(np.inf, np.inf)
+    geometry = (gaussians.xyz, gaussians.scale, gaussians.rotation, gaussians.opacity, thickness, near, *cutoffs)
+    of_all = fingerprint(*geometry)
 
-    def note(view: View, ids: NDArray[np.int32]) -> None:
+    def shown(view: View) -> _ShownView:
+        ids = view.mask_map()
+        key = fingerprint(of_all, view_fingerprint(view, ids))
+
+        def make() -> tuple[NDArray[Any], ...]:
+            return _view_arrays(gaussians, view, ids, near, thickness, cutoffs)
+
+        lengths, *_, exposed = work.arrays("view", key, make)
+        sizes = np.array([lengths[:-1].sum(dtype=np.int64), lengths[-1], len(exposed)])
         pixels = np.bincount(ids.ravel() + 1, minlength=view.mask_count + 1)[1:].astype(np.int32)
-        of_views.append((pixels, view.mask_features))
+        return _ShownView(key, make, sizes, pixels, view.mask_features)
 
-    def show(view: View) -> tuple[View, NDArray[np.int32], str, ViewWeights, csr_array]:
-        ids = view.mask_map()
-        shown = view_weights(gaussians, view.camera, ids, view.mask_count, near, thickness, cutoffs)
-        return view, ids, _mark(view, ids) if store.folder else "", shown, _exposure(shown)
-
-    coming = iter(views)
-    for view in coming if store.marks else ():
-        ids = view.mask_map()
-        if len(of_views) == len(store.marks) or _mark(view, ids) != store.marks[len(of_views)]:
-            coming = chain([view], coming)
-            break
-        note(view, ids)
-    store.keep(len(of_views))
-    try:
-        for view, ids, mark, shown, exposed in _side_by_side(show, coming, at_once):
-            store.add(mark, shown.rows, exposed)
-            note(view, ids)
-    finally:
-        store.checkpoint()
-    width = max((rows.shape[1] for _, rows in of_views), default=0)
+    views_shown = list(_side_by_side(shown, views, side_by_side))
+    matrices = _put_together(views_shown, len(gaussians), work, most_in_memory)
     return MaskTable(
-        store.matrix("weights"),
-        store.matrix("outside"),
-        store.matrix("exposure"),
-        np.repeat(np.arange(len(of_views), dtype=np.int32), [len(pixels) for pixels, _ in of_views]),
-        np.concatenate([pixels for pixels, _ in of_views]),
-        np.concatenate([rows if len(rows) else np.zeros((0, width), np.float32) for _, rows in of_views]),
+        *matrices,
+        np.repeat(np.arange(len(views_shown), dtype=np.int32), [len(view.pixels) for view in views_shown]),
+        np.concatenate([view.pixels for view in views_shown]),
+        _stacked([view.mask_features for view in views_shown]),
     )
 
 
-def table_key(gaussians: Gaussians, near: float, thickness: NDArray[np.float32], cutoffs: Cutoffs = CUTOFFS) -> str:
-    """A fingerprint of all that the rows of a view depend on, but for the view."""
-    digest = blake2b(VERSION, digest_size=16)
-    numbers = np.array([near, *cutoffs])
-    for array in (gaussians.xyz, gaussians.scale, gaussians.rotation, gaussians.opacity, thickness, numbers):
-        digest.update(np.ascontiguousarray(array).data)
-    return digest.hexdigest()
+@dataclass(frozen=True)
+class _ShownView:
+    """A view whose arrays (`_view_arrays`) a work folder keeps under ``key``. sizes: (3,) entries in masks, outside of
+    them, and of the exposure. pixels: (masks,) int32. mask_features: (masks, D) float32."""
+
+    key: str
+    make: Callable[[], tuple[NDArray[Any], ...]]
+    sizes: NDArray[np.int64]
+    pixels: NDArray[np.int32]
+    mask_features: NDArray[np.float32]
 
 
-def _mark(view: View, ids: NDArray[np.int32]) -> str:
-    """A fingerprint of what the rows depend on in one view."""
+def view_fingerprint(view: View, ids: NDArray[np.int32]) -> str:
+    """Of all that the rows of a view depend on but for the geometry; ids: its mask map."""
     camera = view.camera
     numbers = camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, view.mask_count
-    digest = blake2b(repr(numbers).encode(), digest_size=16)
-    digest.update(np.ascontiguousarray(camera.world_to_camera).data)
-    digest.update(np.ascontiguousarray(ids).data)
-    return digest.hexdigest()
+    return fingerprint(numbers, camera.world_to_camera, ids)
 
 
-def _side_by_side(work: Callable[[View], Shown], views: Iterable[View], at_once: int | None = None) -> Iterator[Shown]:
+def _view_arrays(
+    gaussians: Gaussians,
+    view: View,
+    ids: NDArray[np.int32],
+    near: float,
+    thickness: NDArray[np.float32] | None,
+    cutoffs: Cutoffs,
+) -> tuple[NDArray[Any], ...]:
+    """What a view shows: entries of each row (masks + 1,), the last one of pixels without a mask, the entries' columns
+    and values, and columns and values of the view's exposure."""
+    shown = view_weights(gaussians, view.camera, ids, view.mask_count, near, thickness, cutoffs)
+    rows, exposure = shown.rows, _exposure(shown)
+    return np.diff(rows.indptr), rows.indices, rows.data, exposure.indices, exposure.data
+
+
+def _put_together(
+    views: list[_ShownView], n: int, work: WorkFolder, most_in_memory: float
+) -> tuple[csr_array, csr_array, csr_array]:
+    """(weights, outside, exposure) of all views. Each view is let go once it is copied: none is in memory twice."""
+    sizes = sum((view.sizes for view in views), np.zeros(3, np.int64)).tolist()
+    matrices = [SparseRows(entries, n, 8 * sum(sizes) > most_in_memory) for entries in sizes]
+    for view in views:
+        lengths, columns, values, exposed_columns, exposed_values = work.arrays("view", view.key, view.make)
+        work.forget("view", view.key)
+        border = len(columns) - lengths[-1]
+        matrices[0].append(lengths[:-1], columns[:border], values[:border])
+        matrices[1].append(lengths[-1:], columns[border:], values[border:])
+        matrices[2].append(len(exposed_columns), exposed_columns, exposed_values)
+    weights, unmasked, exposure = (rows.matrix() for rows in matrices)
+    return weights, unmasked, exposure
+
+
+def _stacked(features: list[NDArray[np.float32]]) -> NDArray[np.float32]:
+    """Mask features of all views; a view without masks may give rows of any width."""
+    width = max((rows.shape[1] for rows in features), default=0)
+    return np.concatenate([rows if len(rows) else np.zeros((0, width), np.float32) for rows in features])
+
+
+def require_sight(exposed: int, masked: int, scene: Scene) -> None:
+    """SceneError where no view shows a point, or no mask does; given the numbers of such entries."""
+    if exposed == 0:
+        raise SceneError(
+            f"no camera sees the cloud: {len(scene.points)} points, {len(scene.views)} views, none in any image; check "
+            "that poses and cloud share one frame and that poses are camera-to-world (transforms.json) as documented"
+        )
+    if masked == 0:
+        raise SceneError(
+            f"none of the {sum(view.mask_count for view in scene.views)} masks shows a Gaussian; expected at least one: "
+            "make masks, and check that poses and cloud share one frame"
+        )
+
+
+def weights_by_instance(matrix: csr_array, instance_ids: NDArray[np.int32], count: int) -> NDArray[np.float64]:
+    """(rows, count) float64: what each row of a table's matrix shows of the points of every instance, in pixels.
+
+    instance_ids: (n,) int32, the instance of each column below ``count``, below 0 none.
+    """
+    return _weights_by_instance(matrix.indptr, matrix.indices, matrix.data, instance_ids, count)
+
+
+@njit(cache=True)
+def _weights_by_instance(indptr, indices, data, instance_ids, count):  # noqa: ANN001, ANN202
+    rows = len(indptr) - 1
+    sums = np.zeros((rows, count))
+    for row in range(rows):
+        for e in range(indptr[row], indptr[row + 1]):
+            instance = instance_ids[indices[e]]
+            if instance >= 0:
+                sums[row, instance] += data[e]
+    return sums
+
+
+class SparseRows:
+    """A CSR matrix (rows, width) of int32 columns and float32 values that is filled row by row.
+
+    entries: how many it will have at most. on_disk: whether they go to files, mapped, or into memory.
+    """
+
+    def __init__(self, entries: int, width: int, on_disk: bool) -> None:
+        if entries > np.iinfo(np.int32).max:
+            raise OgPointcloudError(
+                f"the mask table has {entries:,} entries; expected fewer than 2^31: use fewer views, larger pixels, or "
+                "parts of the cloud"
+            )
+        self.width, self.filled = width, 0
+        make = scratch_array if on_disk else np.empty
+        self._indices, self._data = make(entries, np.int32), make(entries, np.float32)
+        self._lengths: list[NDArray[np.integer]] = []
+
+    def append(self, lengths: ArrayLike, indices: NDArray[np.int32], data: NDArray[np.float32]) -> None:
+        """Add rows of these lengths, their entries one row after the other."""
+        end = self.filled + len(indices)
+        self._indices[self.filled : end], self._data[self.filled : end] = indices, data
+        self.filled = end
+        self._lengths.append(np.atleast_1d(np.asarray(lengths)))
+
+    def matrix(self) -> csr_array:
+        """The rows so far."""
+        lengths = np.concatenate([np.zeros(1, np.int64), *self._lengths])
+        start = np.cumsum(lengths).astype(np.int32)
+        entries = self._data[: self.filled], self._indices[: self.filled]
+        return csr_array((*entries, start), shape=(len(start) - 1, self.width))
+
+
+def _side_by_side(
+    work: Callable[[View], Result], views: Iterable[View], at_once: int | None = None
+) -> Iterator[Result]:
     """Work on several views at once, each on one thread: sorting and merging then keep no core waiting.
 
     Results come in the order of the views; only a few views are held at a time.
@@ -176,12 +281,12 @@ def _side_by_side(work: Callable[[View], Shown], views: Iterable[View], at_once:
         yield from map(work, coming)
         return
 
-    def alone(view: View) -> Shown:
+    def alone(view: View) -> Result:
         numba.set_num_threads(1)  # of this Python thread
         return work(view)
 
     with ThreadPoolExecutor(max_workers=threads) as pool:
-        waiting: deque[Future[Shown]] = deque()
+        waiting: deque[Future[Result]] = deque()
         try:
             for view in coming:
                 waiting.append(pool.submit(alone, view))

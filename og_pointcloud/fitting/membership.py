@@ -2,11 +2,11 @@
 
 A mask covers a point or it does not; what matters is what the *other* views say. Let, for point g and instance k,
 
-    own_k(g)   what views say for "in a mask of k" (see `testimony`)
-    asked_k(g) all that is said of g by the views that have a mask of k: those that could have said so
+    own_k(g)   votes for "in a mask of k" (see `view_votes`)
+    asked_k(g) all votes on g of the views that have a mask of k: those that could have voted so
     share      own_k / asked_k
 
-A view in which the proposer missed k says nothing about k; a view that has a mask of k and shows g outside it says
+A view in which the proposer missed k has no vote about k; a view that has a mask of k and shows g outside it votes
 "not k". So a share near 1 means "k", near 0 "seen, and not k", however often the proposer misses. Rays that slip past
 an edge or through a thin surface leave low shares on what lies behind, in many views; torn mask edges leave middling
 shares on the rim of the object itself. The two are told apart by place: a middling share counts only where the
@@ -27,10 +27,9 @@ from scipy.sparse.csgraph import connected_components
 
 from og_pointcloud.cloud import BACKGROUND, UNOBSERVED
 from og_pointcloud.fitting.grouping import MaskGroups
-from og_pointcloud.fitting.mask_table import Gaussians, MaskTable
+from og_pointcloud.fitting.mask_table import Gaussians, MaskTable, SparseRows
 from og_pointcloud.fitting.memory import in_file
-from og_pointcloud.fitting.table_store import Rows
-from og_pointcloud.fitting.view_votes import Testimony
+from og_pointcloud.fitting.view_votes import ViewVotes
 from og_pointcloud.kernels import njit, prange
 from og_pointcloud.rendering.geometry import Neighbourhood
 from og_pointcloud.settings import MembershipSettings
@@ -38,7 +37,7 @@ from og_pointcloud.settings import MembershipSettings
 __all__ = ["Membership", "assign_points", "without_see_through"]
 
 ENTRIES_AT_ONCE = 1 << 26
-"""Entries of the testimony that are sorted by point at once: half a gigabyte."""
+"""Entries of the votes that are sorted by point at once: half a gigabyte."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +57,7 @@ class Membership:
 
 def assign_points(
     table: MaskTable,
-    testimony: Testimony,
+    votes: ViewVotes,
     groups: MaskGroups,
     neighbourhood: Neighbourhood,
     settings: MembershipSettings,
@@ -68,19 +67,19 @@ def assign_points(
     grouped = groups.group >= 0
     has_mask[groups.group[grouped], table.mask_view[grouped]] = True
     every = np.ones(groups.count, np.bool_)
-    best, own, asked, total = _best_groups(testimony, groups.group, has_mask, every)
+    best, own, asked, total = _best_groups(votes, groups.group, has_mask, every)
     share = own / np.maximum(asked, 1e-12)
 
     rate, dismissed = _contradicted(best, share, own, asked, total, groups.count, settings)
     if dismissed.any():
-        best, own, asked, total = _best_groups(testimony, groups.group, has_mask, ~dismissed)
+        best, own, asked, total = _best_groups(votes, groups.group, has_mask, ~dismissed)
         share = own / np.maximum(asked, 1e-12)
 
     ids = np.where((best >= 0) & (share > settings.sure_share), best, BACKGROUND).astype(np.int32)
     possible = (best >= 0) & (share > settings.possible_share)
     ids = _grow(ids, best, possible, neighbourhood.index, neighbourhood.adjoining, settings.growth_votes)
     # Seen, but mostly inside masks: no background, however many instances claim it. Borders are settled below.
-    covered = _column_sums(testimony.inside.indices, testimony.inside.data, len(ids))
+    covered = _column_sums(votes.in_mask.indices, votes.in_mask.data, len(ids))
     ids = np.where((ids == BACKGROUND) & possible & (covered > settings.covered_share * total), best, ids)
     ids = _without_islands(ids, own_area(table, groups.group, ids), neighbourhood, settings.island_share)
     ids = _fill_unobserved(np.where((ids == BACKGROUND) & (total == 0), UNOBSERVED, ids), neighbourhood)
@@ -141,23 +140,23 @@ def _without_entries(matrix: csr_array, dropped: Iterable[NDArray[np.intp]]) -> 
     kept = np.ones(matrix.nnz, np.bool_)
     for entries in dropped:
         kept[entries] = False
-    rows = Rows(on_disk=in_file(matrix.data))
+    rows = SparseRows(int(np.count_nonzero(kept)), matrix.shape[1], in_file(matrix.data))
     for begin, end in pairwise(matrix.indptr.tolist()):
         chosen = kept[begin:end]
-        rows.append([np.count_nonzero(chosen)], matrix.indices[begin:end][chosen], matrix.data[begin:end][chosen])
-    return rows.matrix(matrix.shape[1])
+        rows.append(np.count_nonzero(chosen), matrix.indices[begin:end][chosen], matrix.data[begin:end][chosen])
+    return rows.matrix()
 
 
 def _with_entries(matrix: csr_array, source: csr_array, added: Mapping[int, NDArray[np.intp]]) -> csr_array:
     """The matrix with entries of another added to its rows: row -> their places in the other."""
-    rows = Rows(on_disk=in_file(matrix.data))
+    rows = SparseRows(matrix.nnz + sum(map(len, added.values())), matrix.shape[1], in_file(matrix.data))
     for row in range(matrix.shape[0]):
         own = matrix[[row]]
         if row in added:
             data, indices = source.data[added[row]], source.indices[added[row]]
             own = csr_array(own + csr_array((data, indices, [0, len(data)]), shape=own.shape))
-        rows.append([own.nnz], own.indices, own.data)
-    return rows.matrix(matrix.shape[1])
+        rows.append(own.nnz, own.indices, own.data)
+    return rows.matrix()
 
 
 def _behind_front(
@@ -180,16 +179,17 @@ def _behind_front(
 
 
 def _best_groups(
-    testimony: Testimony, group: NDArray[np.int32], has_mask: NDArray[np.bool_], allowed: NDArray[np.bool_]
+    votes: ViewVotes, group: NDArray[np.int32], has_mask: NDArray[np.bool_], allowed: NDArray[np.bool_]
 ) -> tuple[NDArray[Any], ...]:
-    """`_best_group` of all points, so many at a time that what is said of them, sorted by point, fits into memory."""
-    inside, word = testimony.inside, testimony.word
-    n = inside.shape[1]
-    runs = 1 + (inside.nnz + word.nnz) // ENTRIES_AT_ONCE
+    """`_best_group` of all points, so many at a time that their votes, sorted by point, fit into memory."""
+    in_mask, vote = votes.in_mask, votes.vote
+    n = in_mask.shape[1]
+    runs = 1 + (in_mask.nnz + vote.nnz) // ENTRIES_AT_ONCE
     found = []
     for run in range(runs):
         low, high = n * run // runs, n * (run + 1) // runs
-        found.append(_best_group(_by_point(inside, low, high), _by_point(word, low, high), group, has_mask, allowed))
+        of_points = _by_point(in_mask, low, high), _by_point(vote, low, high)
+        found.append(_best_group(*of_points, group, has_mask, allowed))
     return tuple(np.concatenate(parts) for parts in zip(*found, strict=True))
 
 

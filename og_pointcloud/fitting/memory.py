@@ -11,14 +11,23 @@ import os
 import re
 import tempfile
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from og_pointcloud.errors import OgPointcloudError
 
-__all__ = ["Column", "free_memory", "in_file", "memory_in_use", "parse_memory", "scratch_file", "scratch_like"]
+__all__ = [
+    "free_memory",
+    "in_file",
+    "memory_in_use",
+    "memory_left",
+    "parse_memory",
+    "scratch_array",
+    "scratch_like",
+    "scratch_root",
+]
 
 UNITS = {"": 1, "K": 10**3, "M": 10**6, "G": 10**9, "T": 10**12}
 LEAST = 64 * 10**6
@@ -72,11 +81,40 @@ def memory_in_use() -> int:
         return 0
 
 
-def scratch_file() -> BinaryIO:
-    """A file that vanishes when it is closed. In TMPDIR if that is set, else /var/tmp, which is not kept in memory."""
+def memory_left(limit: int | None) -> int:
+    """Bytes that this process may still take: up to the limit, or without one half of what is free."""
+    return max(0, limit - memory_in_use()) if limit is not None else free_memory() // 2
+
+
+def scratch_root() -> str | None:
+    """Where large temporary files go: TMPDIR if that is set, else /var/tmp, which is not kept in memory as /tmp may be.
+    None: the system's own choice."""
     large = "/var/tmp"
-    folder = None if os.environ.get("TMPDIR") or not os.access(large, os.W_OK) else large
-    return tempfile.TemporaryFile(dir=folder)  # type: ignore[return-value]
+    return None if os.environ.get("TMPDIR") or not os.access(large, os.W_OK) else large
+
+
+def scratch_array(size: int, dtype: DTypeLike) -> NDArray[Any]:
+    """An array with undefined values in a file that vanishes with it. OgPointcloudError where there is no room."""
+    dtype = np.dtype(dtype)
+    if size == 0:
+        return np.empty(0, dtype)
+    with tempfile.TemporaryFile(dir=scratch_root()) as file:
+        try:
+            _reserve(file.fileno(), size * dtype.itemsize)
+        except OSError as error:
+            raise OgPointcloudError(
+                f"no room for {size * dtype.itemsize / 1e9:.1f} GB in '{tempfile.gettempdir()}' or '{scratch_root()}' "
+                f"({error.strerror}): set TMPDIR to a folder on a larger disk, or give the fit more memory"
+            ) from error
+        return np.asarray(np.memmap(file, dtype, "r+", shape=(size,)))  # the map outlives the file object
+
+
+def _reserve(file: int, size: int) -> None:
+    """Take the room on the disk now: a mapped file that turns out to have none ends the process (SIGBUS)."""
+    if hasattr(os, "posix_fallocate"):
+        os.posix_fallocate(file, 0, size)
+    else:
+        os.ftruncate(file, size)
 
 
 def in_file(array: NDArray[Any]) -> bool:
@@ -91,70 +129,4 @@ def in_file(array: NDArray[Any]) -> bool:
 
 def scratch_like(array: NDArray[Any], dtype: DTypeLike) -> NDArray[Any]:
     """An array of the same length with undefined values, in a file if that one is."""
-    if not in_file(array):
-        return np.empty(len(array), dtype)
-    file = scratch_file()
-    file.truncate(len(array) * np.dtype(dtype).itemsize)
-    return _mapped(file, np.dtype(dtype), len(array))
-
-
-def _mapped(file: BinaryIO, dtype: np.dtype[Any], size: int) -> NDArray[Any]:
-    """A file's first values; the mapping outlives the file object."""
-    file.flush()
-    return np.asarray(np.memmap(file, dtype, "r+", shape=(size,))) if size else np.empty(0, dtype)
-
-
-class Column:
-    """A one-dimensional array that grows at its end: in memory, until it is given a file to live in."""
-
-    def __init__(self, dtype: DTypeLike) -> None:
-        self.dtype, self.size = np.dtype(dtype), 0
-        self._values = np.empty(0, dtype)
-        self._file: BinaryIO | None = None
-
-    @property
-    def nbytes(self) -> int:
-        """Bytes of its values."""
-        return self.size * self.dtype.itemsize
-
-    def append(self, values: NDArray[Any]) -> None:
-        """Add values at the end."""
-        end = self.size + len(values)
-        if self._file is not None:
-            self._file.write(np.ascontiguousarray(values, self.dtype).data)
-        else:
-            if end > len(self._values):
-                # In place: the system moves the pages of a large array, where concatenating would hold it twice.
-                self._values.resize(max(end, len(self._values) * 9 // 8), refcheck=False)
-            self._values[self.size : end] = values
-        self.size = end
-
-    def move_to(self, file: BinaryIO) -> None:
-        """Write what there is to an empty file, and go on there."""
-        file.write(self._values[: self.size].data)
-        self._values, self._file = np.empty(0, self.dtype), file
-
-    def continue_in(self, file: BinaryIO, size: int) -> None:
-        """Take the first ``size`` values of a file for its own; the rest is cut off."""
-        file.truncate(size * self.dtype.itemsize)
-        file.seek(0, os.SEEK_END)
-        self._values, self._file, self.size = np.empty(0, self.dtype), file, size
-
-    def cut(self, size: int) -> None:
-        """Drop all values but the first ``size``."""
-        if self._file is not None:
-            self.continue_in(self._file, size)
-        self.size = size
-
-    def sync(self) -> None:
-        """Have what was written on the disk itself, where there is a file."""
-        if self._file is not None:
-            self._file.flush()
-            os.fsync(self._file.fileno())
-
-    def array(self) -> NDArray[Any]:
-        """All values; nothing may be appended while this array is in use."""
-        if self._file is not None:
-            return _mapped(self._file, self.dtype, self.size)
-        self._values.resize(self.size, refcheck=False)
-        return self._values
+    return scratch_array(len(array), dtype) if in_file(array) else np.empty(len(array), dtype)

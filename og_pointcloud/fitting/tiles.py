@@ -18,42 +18,24 @@ neither the order nor the place of the tiles shows in the result, but for what h
 
 from __future__ import annotations
 
-import os
-import tempfile
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from hashlib import blake2b
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array, vstack
 from scipy.spatial import cKDTree
 
-from og_pointcloud.cloud import LabelledCloud
-from og_pointcloud.errors import OgPointcloudError, SceneError
-from og_pointcloud.fitting.association import describe_instances
-from og_pointcloud.fitting.fit import (
-    check_scene,
-    cutoffs,
-    labelled_cloud,
-    note_choice,
-    pixel_stride,
-    with_distinct_points,
-    with_needed_views,
-)
+from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.fitting.grouping import MaskGroups, group_masks, indicator
-from og_pointcloud.fitting.labellers import Labelling
-from og_pointcloud.fitting.mask_table import FRUSTUM_MARGIN, Gaussians, MaskTable, mask_table
+from og_pointcloud.fitting.labellers import Labelling, instances_of_groups, renumbered
+from og_pointcloud.fitting.mask_table import Cutoffs, Gaussians, MaskTable, mask_table, require_sight, view_fingerprint
 from og_pointcloud.fitting.membership import assign_points, without_see_through
-from og_pointcloud.fitting.memory import free_memory, memory_in_use
-from og_pointcloud.fitting.parts import part_of
-from og_pointcloud.fitting.view_votes import hear_views
-from og_pointcloud.formats.atomic import replacing
-from og_pointcloud.journal import Journal
+from og_pointcloud.fitting.memory import memory_left
+from og_pointcloud.fitting.view_votes import view_votes
+from og_pointcloud.fitting.work_folder import WorkFolder, fingerprint
+from og_pointcloud.journal import Journal, LeftOut
 from og_pointcloud.kernels import njit, prange
 from og_pointcloud.rendering.geometry import (
     Neighbourhood,
@@ -65,10 +47,18 @@ from og_pointcloud.rendering.geometry import (
     sample_of_points,
     thinned,
 )
+from og_pointcloud.rendering.splatting import linearised_at, seen_from
+from og_pointcloud.rendering.surface import (
+    note_choice,
+    pixel_stride,
+    surface_thickness,
+    with_distinct_points,
+    with_needed_views,
+)
 from og_pointcloud.scene import Points, Scene, View
 from og_pointcloud.settings import FitSettings
 
-__all__ = ["Tiles", "fit_tiles", "kept_views", "needs_tiles", "split"]
+__all__ = ["Tiles", "fit_tiles", "needs_tiles", "split"]
 
 MODES = ("auto", "grouping")
 """Modes that need no more than masks; the others learn from all points at once."""
@@ -93,8 +83,6 @@ FIT_BYTES = 1_000
 """Bytes that one fit of a whole cloud takes, per point."""
 CLOUD_BYTES = 120
 """Bytes that every point takes, whatever the tiles: positions, colours, spacings, ids, order."""
-SUFFIX = ".tile.npy"
-"""Ends the names of files in a work folder."""
 PROBES = 2_000
 """Points of a tile that are asked for their spacing before its margin is known."""
 
@@ -106,83 +94,57 @@ M + 2 + mask: weight in that mask, but behind its object, which is believed wher
 
 
 def needs_tiles(scene: Scene, settings: FitSettings) -> bool:
-    """Whether one fit of all points would take more memory than it may, and tiles would help it."""
-    return settings.mode in MODES and len(scene.points) * FIT_BYTES > _room(settings)
+    """Whether a fit is asked to be in tiles, or all points at once would take more memory than it may and tiles would
+    help it."""
+    if settings.tile_points is not None:
+        return True
+    points = len(scene.points)
+    return settings.mode in MODES and points > LEAST_TILE and points * FIT_BYTES > memory_left(settings.memory)
 
 
-def kept_views(work: Path) -> int:
-    """How many views an interrupted fit in tiles has left in its work folder."""
-    return len(list(work.glob(f"view-*{SUFFIX}")))
+def fit_tiles(scene: Scene, settings: FitSettings, work: WorkFolder, journal: Journal) -> tuple[Labelling, float]:
+    """Label a scene as `fit` does by grouping masks, in memory that the tiles bound, not the cloud. Returns the
+    labelling of all its points, and their typical spacing.
 
-
-def fit_tiles(
-    scene: Scene,
-    settings: FitSettings | None = None,
-    *,
-    points_per_tile: int | None = None,
-    work: str | os.PathLike[str] | None = None,
-    progress: bool = True,
-) -> LabelledCloud:
-    """Label a scene as `fit` does by grouping masks, in memory that the tiles bound, not the cloud.
-
-    points_per_tile: at most; None: what the memory of the settings allows. work: a folder for the neighbours of the
-    points and for what the views show (80 bytes a point, and about 25 for each view that sees it). It is kept where
-    the fit is interrupted, taken up by the next fit of the same scene and settings, and emptied by one that ends well.
-    None: a temporary folder.
-
-    Deterministic. Raises SceneError where `fit` does, and OgPointcloudError for a mode that learns from all points at
-    once.
+    work: keeps the neighbours of the points and what the views show (80 bytes a point, and about 25 for each view that
+    sees it). Raises SceneError where `fit` does, and OgPointcloudError for a mode that learns from all points at once.
     """
-    settings = settings or FitSettings()
-    journal = Journal(progress)
-    _check(scene, settings, journal)
-    whole = scene
-    views = with_needed_views(scene, settings, journal).views
-    scene, place = with_distinct_points(scene, journal)
-    most = points_per_tile or _points_per_tile(len(scene.points), settings)
-    with _Kept.open(Path(work) if work else None, _key(scene.points, settings, most)) as kept:
-        with journal.stage("spacing"):
-            cloud = _tiled(scene.points, most, settings, kept, journal)
-        with journal.stage("geometry"):
-            drawing = _drawing(views, cloud, settings, journal)
-        with journal.stage("visibility"):
-            shown = _look(views, cloud, drawing, settings, kept, journal)
-        with journal.stage("grouping"):
-            groups = _instances(cloud, shown, settings, journal)
-        with journal.stage("membership"):
-            tiles = journal.steps(range(len(cloud.tiles)), "membership")
-            settled = [_settle(tile, cloud, shown, groups, settings, kept) for tile in tiles]
-        with journal.stage("association"):
-            labelling = _evidence(cloud, shown, groups, settled, settings)
-    if settings.mode == "auto":
-        journal.leave_out(
-            "learned features and codebook", "they learn from all points at once, which tiles do not hold"
-        )
-    return labelled_cloud(whole, labelling, place, cloud.spacing, settings, journal)
-
-
-def _check(scene: Scene, settings: FitSettings, journal: Journal) -> None:
     if settings.mode not in MODES:
         raise OgPointcloudError(
             f'mode is "{settings.mode}", which learns from all points at once; expected "auto" or "grouping" for a fit '
             "in tiles: take one of these, or thin the cloud until it fits whole"
         )
-    check_scene(scene, journal)
-
-
-def _room(settings: FitSettings) -> int:
-    """Bytes that a fit may take beside what the process holds."""
-    return settings.memory - memory_in_use() if settings.memory else free_memory() // 2
+    if settings.tile_points is None:
+        journal.leave_out(LeftOut.WHOLE_FIT, count=len(scene.points))
+    scene = with_needed_views(scene, settings, journal)
+    scene, row_of_point = with_distinct_points(scene, journal)
+    most = settings.tile_points or _points_per_tile(len(scene.points), settings)
+    with journal.stage("spacing"):
+        cloud = _tiled(scene.points, most, settings, work, journal)
+    with journal.stage("geometry"):
+        drawing = _drawing(scene.views, cloud, settings, journal)
+    with journal.stage("visibility"):
+        shown = _look(scene, cloud, drawing, settings, work, journal)
+    with journal.stage("grouping"):
+        groups = _groups(cloud, shown, settings, journal)
+    with journal.stage("membership"):
+        tiles = journal.steps(range(len(cloud.tiles)), "membership")
+        decided = [_decide(tile, cloud, shown, groups, settings, work) for tile in tiles]
+    with journal.stage("association"):
+        labelling = _instances(cloud, shown, groups, decided, settings)
+    if settings.mode == "auto":
+        journal.leave_out(LeftOut.LEARNING_IN_TILES)
+    return labelling.of_points(row_of_point), float(np.median(cloud.spacing))
 
 
 def _points_per_tile(points: int, settings: FitSettings) -> int:
-    room = _room(settings)
-    fitting = (room - points * CLOUD_BYTES) // TILE_BYTES
+    left = memory_left(settings.memory)
+    fitting = (left - points * CLOUD_BYTES) // TILE_BYTES
     if fitting < LEAST_TILE:
         raise OgPointcloudError(
             f"{points:,} points take {points * CLOUD_BYTES / 1e9:.1f} GB beside the scene, and tiles of {LEAST_TILE:,} "
-            f"{LEAST_TILE * TILE_BYTES / 1e9:.1f} GB; the fit has {max(room, 0) / 1e9:.1f} GB: give it more memory, or "
-            "thin the cloud"
+            f"{LEAST_TILE * TILE_BYTES / 1e9:.1f} GB; the fit has {left / 1e9:.1f} GB: give it more memory, or thin the "
+            "cloud"
         )
     return min(LEAST_TILE << (fitting // LEAST_TILE).bit_length() - 1, LARGEST_TILE)
 
@@ -232,44 +194,35 @@ def split(xyz: NDArray[np.float32], most: int) -> Tiles:
 @dataclass(frozen=True)
 class _TiledCloud:
     """points, spacing (n,): in the order of the tiles. members: per tile, its points and those within its margin,
-    ascending; they are int32 as there are many."""
+    ascending; they are int32 as there are many. key: fingerprint of points, tiles and settings."""
 
     tiles: Tiles
     points: Points
     spacing: NDArray[np.float32]
     members: tuple[NDArray[np.int32], ...]
+    key: str = ""
 
-    def own(self, tile: int) -> slice:
-        """A tile's own points among its members."""
+    def inner(self, tile: int) -> slice:
+        """A tile's points without those of its margin, among its members."""
         part = self.tiles.part(tile)
         first, last = np.searchsorted(self.members[tile], [part.start, part.stop])
         return slice(int(first), int(last))
 
 
-def _tiled(points: Points, most: int, settings: FitSettings, kept: _Kept, journal: Journal) -> _TiledCloud:
+def _tiled(points: Points, most: int, settings: FitSettings, work: WorkFolder, journal: Journal) -> _TiledCloud:
+    key = fingerprint(points.xyz, points.scale, points.rotation, points.opacity, settings, most, MARGIN)
     tiles = split(points.xyz, most)
-    points = _rows_of(points, tiles.order)
+    points = replace(points, normals=None).take(tiles.order)  # no stage needs normals
     parts = [tiles.part(tile) for tile in range(len(tiles))]
     boxes = np.array([[points.xyz[part].min(axis=0), points.xyz[part].max(axis=0)] for part in parts])
     margins = [MARGIN * _sparse_spacing(points.xyz[part]) for part in parts]
     members = tuple(_within(points.xyz, parts, boxes, tile, margin) for tile, margin in enumerate(margins))
-    cloud = _TiledCloud(tiles, points, np.empty(len(points), np.float32), members)
+    cloud = _TiledCloud(tiles, points, np.empty(len(points), np.float32), members, key)
     for tile in journal.steps(range(len(tiles)), "spacing"):
-        cloud.spacing[parts[tile]] = _neighbours(tile, cloud, settings, kept).spacing[cloud.own(tile)]
+        cloud.spacing[parts[tile]] = _neighbours(tile, cloud, settings, work).spacing[cloud.inner(tile)]
     journal.notes["tiles"] = [part.stop - part.start for part in parts]
     journal.notes["tile_margins"] = [float(f"{margin:.4g}") for margin in margins]
     return cloud
-
-
-def _rows_of(points: Points, rows: Rows) -> Points:
-    """Some of the points, in that order; without normals, which no stage needs."""
-    names = ("rgb", "scale", "rotation", "opacity")
-    columns: dict[str, Any] = {name: getattr(points, name) for name in names}
-    return Points(
-        points.xyz[rows],
-        points.origin,
-        **{name: None if all_ is None else all_[rows] for name, all_ in columns.items()},
-    )
 
 
 def _sparse_spacing(xyz: NDArray[np.float32]) -> float:
@@ -296,19 +249,14 @@ def _within(
     return np.concatenate(rows)
 
 
-def _neighbours(tile: int, cloud: _TiledCloud, settings: FitSettings, kept: _Kept) -> Neighbourhood:
+def _neighbours(tile: int, cloud: _TiledCloud, settings: FitSettings, work: WorkFolder) -> Neighbourhood:
     """The neighbourhood of a tile's members, numbered as these."""
 
-    def find() -> NDArray[Any]:
+    def find() -> tuple[NDArray[np.generic], ...]:
         around = neighbourhood(cloud.points.xyz[cloud.members[tile]], settings.geometry)
-        width = around.index.shape[1]
-        kind = [("spacing", "<f4"), ("index", "<i4", (width,)), ("adjoining", "?", (width,))]
-        records = np.empty(len(around.index), kind)
-        records["spacing"], records["index"], records["adjoining"] = around.spacing, around.index, around.adjoining
-        return records
+        return around.spacing, around.index, around.adjoining
 
-    records = kept.array(f"neighbours-{tile:04d}", find)
-    return Neighbourhood(*(np.ascontiguousarray(records[name]) for name in ("spacing", "index", "adjoining")))
+    return Neighbourhood(*work.arrays(f"neighbours-{tile:04d}", cloud.key, find))
 
 
 # Views ----------------------------------------------------------------------------------------------------------
@@ -327,7 +275,7 @@ class _Drawing:
 
     def splats(self, cloud: _TiledCloud, rows: Rows, larger: NDArray[np.float32]) -> Gaussians:
         """Splats of some points, each so many times larger than it would be."""
-        chosen = _rows_of(cloud.points, rows)
+        chosen = cloud.points.take(rows)
         if self.scale is None or self.opacity is None:
             splats = Gaussians.from_points(chosen)
             return replace(splats, scale=splats.scale * larger[:, None])
@@ -339,13 +287,12 @@ def _drawing(views: Sequence[View], cloud: _TiledCloud, settings: FitSettings, j
     points, geometry = cloud.points, settings.geometry
     near, typical = near_plane(points.xyz, views), float(np.median(cloud.spacing))
     if points.are_gaussians:
-        journal.leave_out("choice of scale and opacity", "the file holds Gaussians")
+        journal.leave_out(LeftOut.CHOICE_OF_SPLATS)
         return _Drawing(None, None, near, typical, 1)
     few, spacing = points, cloud.spacing
     if len(points) > CHOICE_POINTS:
-        left_out = f"{1 - CHOICE_POINTS / len(points):.0%} of the points in the choice of scale and opacity"
-        journal.leave_out(left_out, "the rest say enough")
-        few = _rows_of(points, sample_of_points(points.xyz, CHOICE_POINTS))
+        journal.leave_out(LeftOut.CHOICE_POINTS, share=1 - CHOICE_POINTS / len(points))
+        few = points.take(sample_of_points(points.xyz, CHOICE_POINTS))
         spacing = neighbourhood(few.xyz, geometry).spacing
     choice = choose_gaussians(few, spacing, views, near, geometry, partial(journal.steps, name="geometry"))
     note_choice(choice, journal)
@@ -398,53 +345,54 @@ def _stacked(entries: Entries, masks: int, seldom: NDArray[np.bool_]) -> tuple[c
 
 
 def _look(
-    views: Sequence[View], cloud: _TiledCloud, drawing: _Drawing, settings: FitSettings, kept: _Kept, journal: Journal
+    scene: Scene, cloud: _TiledCloud, drawing: _Drawing, settings: FitSettings, work: WorkFolder, journal: Journal
 ) -> _Shown:
-    """Render every view once. What is left of an interrupted fit is not rendered again."""
+    """Render every view once, but for those that an interrupted fit has left in the work folder."""
     readers, first = [], []
     thinning: list[tuple[int, int]] = []
-    for view in journal.steps(views, "visibility"):
+    for view in journal.steps(scene.views, "visibility"):
         view = thinned(view, drawing.stride)
         view = replace(view, masks=view.mask_map())
-        show = partial(_entries, view, cloud, drawing, settings, thinning)
-        read = partial(kept.array, f"view-{_mark(view, drawing)}", show)
-        readers.append(read)
-        first.append(np.searchsorted(np.ascontiguousarray(read()["point"]), cloud.tiles.start))
-    if not any(row[-1] for row in first):
-        raise SceneError(
-            f"no camera sees the cloud: {len(cloud.points)} points, {len(views)} views, none in any image; check that "
-            "poses and cloud share one frame and that poses are camera-to-world (transforms.json) as documented"
+        key = fingerprint(
+            cloud.key, drawing, FINEST_PX, MOST_SPLATS, view.name, view_fingerprint(view, view.mask_map())
         )
+        show = partial(_entries, view, cloud, drawing, settings, thinning)
+        readers.append(partial(work.array, "view", key, show))
+        first.append(np.searchsorted(np.ascontiguousarray(readers[-1]()["point"]), cloud.tiles.start))
+    if work.found:
+        journal.leave_out(LeftOut.RENDERING, count=work.found, folder=str(work.folder))
+    masks = [view.mask_features for view in scene.views if view.mask_count]
+    require_sight(sum(row[-1] for row in first), len(masks), scene)
     drawn, inside = np.sum(thinning, axis=0) if thinning else (0, 0)
     if drawn < inside:
-        why = f"closer together than {FINEST_PX:g} px, or more than {MOST_SPLATS:,} in one: larger ones stand in"
-        journal.leave_out(f"{1 - drawn / inside:.0%} of the points in the images", why)
-    mask_view = np.repeat(np.arange(len(views), dtype=np.int32), [view.mask_count for view in views])
-    features = np.concatenate([view.mask_features for view in views if view.mask_count])
-    return _Shown(tuple(readers), np.array(first), mask_view, features)
+        share = float(1 - drawn / inside)
+        journal.leave_out(LeftOut.FINE_POINTS, share=share, finest_px=FINEST_PX, most=MOST_SPLATS)
+    mask_view = np.repeat(np.arange(len(readers), dtype=np.int32), [view.mask_count for view in scene.views])
+    return _Shown(tuple(readers), np.array(first), mask_view, np.concatenate(masks))
 
 
 def _entries(
     view: View, cloud: _TiledCloud, drawing: _Drawing, settings: FitSettings, thinning: list[tuple[int, int]]
 ) -> Entries:
     """What one view shows. thinning: gets how many points were drawn, and how many there are in the image."""
-    rows, larger, inside = _worth_drawing(view, cloud, drawing, settings.visibility.alpha_min)
+    visibility = settings.visibility
+    rows, larger, inside = _worth_drawing(view, cloud, drawing, visibility.alpha_min)
     thinning.append((len(rows), inside))
     if len(rows) == 0:
         return np.zeros(0, ENTRY)
     splats = drawing.splats(cloud, rows, larger)
-    apart = np.maximum(cloud.spacing[rows] * larger, drawing.typical)
-    thickness = (settings.geometry.thickness * apart + 3 * splats.scale.max(axis=1)).astype(np.float32)
-    whole = mask_table(splats, [view], drawing.near, thickness, cutoffs=cutoffs(settings))
+    thickness = surface_thickness(splats, cloud.spacing[rows] * larger, drawing.typical, settings.geometry)
+    cutoffs = Cutoffs(visibility.alpha_min, visibility.transmittance_min)
+    table = mask_table(splats, [view], drawing.near, thickness, cutoffs=cutoffs)
     camera = view.camera
     # In a table of one view each point has too few of them to contradict a mask: all that is behind is found.
     front, _ = without_see_through(
-        whole, splats, camera.world_to_camera[2:3], np.sqrt([camera.fx * camera.fy]), settings.membership
+        table, splats, camera.world_to_camera[2:3], np.sqrt([camera.fx * camera.fy]), settings.membership
     )
-    behind = csr_array(whole.weights - front.weights)
+    behind = csr_array(table.weights - front.weights)
     behind.eliminate_zeros()
     masks = view.mask_count
-    blocks = [(front.weights, 0), (whole.outside, masks), (whole.exposure, masks + 1), (behind, masks + 2)]
+    blocks = [(front.weights, 0), (table.outside, masks), (table.exposure, masks + 1), (behind, masks + 2)]
     entries = np.empty(sum(block.nnz for block, _ in blocks), ENTRY)
     end = 0
     for block, first_row in blocks:
@@ -468,74 +416,63 @@ def _worth_drawing(
     intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
     size, reach = (camera.width, camera.height), np.sqrt(-2 * np.log(alpha_min))
     pose = camera.world_to_camera
-    apart = _apart_px(points.xyz, cloud.spacing, widest, reach, pose, intrinsics, size, drawing.near)
-    rows = np.flatnonzero(apart)
-    apart, finest = apart[rows], FINEST_PX
-    while (part := np.minimum(1, (apart / finest) ** 2, dtype=np.float32)).sum(dtype=np.float64) > MOST_SPLATS:
+    spacing_px = _spacing_px(points.xyz, cloud.spacing, widest, reach, pose, intrinsics, size, drawing.near)
+    rows = np.flatnonzero(spacing_px)
+    spacing_px, finest = spacing_px[rows], FINEST_PX
+    while (part := np.minimum(1, (spacing_px / finest) ** 2, dtype=np.float32)).sum(dtype=np.float64) > MOST_SPLATS:
         finest *= 1.2
     drawn = chance_of_place(points.xyz[rows], view.name) < part
     return rows[drawn], (1 / np.sqrt(part[drawn])).astype(np.float32), len(rows)
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
-def _apart_px(xyz, spacing, widest, reach, pose, intrinsics, size, near):  # noqa: ANN001, ANN202
-    """(n,) float32: how many pixels apart points lie where they are; 0 where they are surely in no pixel.
+def _spacing_px(xyz, spacing, widest, reach, pose, intrinsics, size, near):  # noqa: ANN001, ANN202
+    """(n,) float32: the spacing of points in pixels where they are; 0 where they are surely in no pixel.
 
     A splat reaches ``reach`` standard deviations, its own and those of the pixels' low-pass (splatting.py).
     """
-    apart = np.zeros(len(xyz), np.float32)
+    in_pixels = np.zeros(len(xyz), np.float32)
     fx, fy, cx, cy = intrinsics
     width, height = size
-    low_x, high_x = -cx / fx - FRUSTUM_MARGIN * 0.5 * width / fx, (width - cx) / fx + FRUSTUM_MARGIN * 0.5 * width / fx
-    low_y, high_y = (
-        -cy / fy - FRUSTUM_MARGIN * 0.5 * height / fy,
-        (height - cy) / fy + FRUSTUM_MARGIN * 0.5 * height / fy,
-    )
     for g in prange(len(xyz)):
-        x, y, z = np.float64(xyz[g, 0]), np.float64(xyz[g, 1]), np.float64(xyz[g, 2])
-        depth = pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] * z + pose[2, 3]
+        depth, tx, ty = seen_from(np.float64(xyz[g, 0]), np.float64(xyz[g, 1]), np.float64(xyz[g, 2]), pose)
         if not depth > near:
             continue
-        tx = (pose[0, 0] * x + pose[0, 1] * y + pose[0, 2] * z + pose[0, 3]) / depth
-        ty = (pose[1, 0] * x + pose[1, 1] * y + pose[1, 2] * z + pose[1, 3]) / depth
         # The projection is linearised within a margin of the image: there a round splat is widened by its direction.
-        jx, jy = min(max(tx, low_x), high_x), min(max(ty, low_y), high_y)
+        jx, jy = linearised_at(tx, ty, intrinsics, size)
         reach_x = reach * (fx * widest[g] / depth * np.sqrt(1 + jx * jx) + 0.6) + 1
         reach_y = reach * (fy * widest[g] / depth * np.sqrt(1 + jy * jy) + 0.6) + 1
         u, v = fx * tx + cx, fy * ty + cy
         if -reach_x < u < width + reach_x and -reach_y < v < height + reach_y:
-            apart[g] = np.sqrt(fx * fy) * spacing[g] / depth
-    return apart
+            in_pixels[g] = np.sqrt(fx * fy) * spacing[g] / depth
+    return in_pixels
 
 
 # Instances and points -------------------------------------------------------------------------------------------
 
 
-def _instances(cloud: _TiledCloud, shown: _Shown, settings: FitSettings, journal: Journal) -> MaskGroups:
+def _groups(cloud: _TiledCloud, shown: _Shown, settings: FitSettings, journal: Journal) -> MaskGroups:
     """Masks grouped by a sample of all points; without those groups that the scene's views contradict."""
     count = max(settings.grouping.graph_points, len(cloud.points) // SAMPLE_STEP)
     sample = sample_of_points(cloud.points.xyz, count)
     table = shown.table(cloud, sample, settings.membership.few_views)
-    testimony = hear_views(table)
-    groups = group_masks(table, testimony, settings.grouping)
+    votes = view_votes(table)
+    groups = group_masks(table, votes, settings.grouping)
     if groups.spanning.any():
-        journal.leave_out(f"{groups.spanning.sum()} masks", "most views show each of them as several things")
+        journal.leave_out(LeftOut.SPANNING_MASKS, count=int(groups.spanning.sum()))
     around = neighbourhood(cloud.points.xyz[sample], settings.geometry)
-    judged = assign_points(table, testimony, groups, around, settings.membership)
+    judged = assign_points(table, votes, groups, around, settings.membership)
     # Groups of which the sample shows no sure point have rate 0: of these the tiles know more.
     dismissed = judged.dismissed & (judged.detection_rate > 0)
     if dismissed.any():
-        journal.leave_out(
-            f"{dismissed.sum()} of {groups.count} groups of masks",
-            "views that see their points mostly show no such mask, far more often than the proposer's misses explain",
-        )
+        journal.leave_out(LeftOut.CONTRADICTED_GROUPS, count=int(dismissed.sum()), total=groups.count)
     return replace(groups, group=np.where((groups.group >= 0) & dismissed[groups.group], -1, groups.group))
 
 
 @dataclass(frozen=True)
-class _Settled:
-    """Of a tile's own points: ids, the group of each, BACKGROUND or UNOBSERVED, and certainty; in_masks (masks, groups)
-    and outside (views, groups), sparse, what shows of each group's points there."""
+class _Decided:
+    """What is known of a tile's inner points. ids, certainty: as of `Membership`. in_masks (masks, groups) and outside
+    (views, groups), sparse: what shows of each group's points there."""
 
     ids: NDArray[np.int32]
     certainty: NDArray[np.float32]
@@ -543,42 +480,38 @@ class _Settled:
     outside: csr_array
 
 
-def _settle(
-    tile: int, cloud: _TiledCloud, shown: _Shown, groups: MaskGroups, settings: FitSettings, kept: _Kept
-) -> _Settled:
+def _decide(
+    tile: int, cloud: _TiledCloud, shown: _Shown, groups: MaskGroups, settings: FitSettings, work: WorkFolder
+) -> _Decided:
     """Decide the state of a tile's points."""
     table = shown.table(cloud, cloud.members[tile], settings.membership.few_views)
-    around = _neighbours(tile, cloud, settings, kept)
+    around = _neighbours(tile, cloud, settings, work)
     # Which groups are noise was decided for all tiles.
     membership = replace(settings.membership, rate_share=0.0)
-    decided = assign_points(table, hear_views(table), groups, around, membership)
-    ids, mine = decided.instance_ids, cloud.own(tile)
-    own = np.full(len(ids), -1, np.int32)
-    own[mine] = ids[mine]
-    of_groups = indicator(own, groups.count).T
+    state = assign_points(table, view_votes(table), groups, around, membership)
+    inner = cloud.inner(tile)
+    inner_ids = np.full(len(state.instance_ids), -1, np.int32)
+    inner_ids[inner] = state.instance_ids[inner]
+    of_groups = indicator(inner_ids, groups.count).T
     in_masks, outside = csr_array(table.weights @ of_groups), csr_array(table.outside @ of_groups)
-    return _Settled(ids[mine], decided.certainty[mine], in_masks, outside)
+    return _Decided(state.instance_ids[inner], state.certainty[inner], in_masks, outside)
 
 
-def _evidence(
-    cloud: _TiledCloud, shown: _Shown, groups: MaskGroups, settled: Sequence[_Settled], settings: FitSettings
+def _instances(
+    cloud: _TiledCloud, shown: _Shown, groups: MaskGroups, decided: Sequence[_Decided], settings: FitSettings
 ) -> Labelling:
     """Groups that have points become instances, largest first; what is known of them comes from sums over the tiles."""
-    in_order = np.concatenate([tile.ids for tile in settled])
-    used = np.unique(in_order[in_order >= 0])
-    number = np.full(groups.count + 2, -1, np.int32)
-    number[used] = np.arange(len(used), dtype=np.int32)
-    ids = np.empty(len(in_order), np.int32)
-    ids[cloud.tiles.order] = np.where(in_order >= 0, number[in_order], in_order)
-    certainty = np.empty(len(ids), np.float32)
-    certainty[cloud.tiles.order] = np.concatenate([tile.certainty for tile in settled])
-    group = number[groups.group]
-    table = _table_of_sums(ids, used, shown, settled)
-    instances = describe_instances(table, group, ids, len(used), settings.association)
-    return Labelling(ids, replace(instances, part_of=part_of(table, group, ids, len(used))), group, certainty)
+    group_of_point = np.empty(len(cloud.points), np.int32)
+    group_of_point[cloud.tiles.order] = np.concatenate([tile.ids for tile in decided])
+    certainty = np.empty(len(cloud.points), np.float32)
+    certainty[cloud.tiles.order] = np.concatenate([tile.certainty for tile in decided])
+    used, ids, mask_instance = renumbered(group_of_point, groups.group)
+    table = _table_of_sums(ids, used, shown, decided)
+    instances = instances_of_groups(table, mask_instance, ids, len(used), settings.association)
+    return Labelling(ids, instances, mask_instance, certainty)
 
 
-def _table_of_sums(ids: NDArray[np.int32], used: Rows, shown: _Shown, settled: Sequence[_Settled]) -> MaskTable:
+def _table_of_sums(ids: NDArray[np.int32], used: Rows, shown: _Shown, decided: Sequence[_Decided]) -> MaskTable:
     """A mask table in which the first point of every instance stands for all its points.
 
     What is asked of a table once the points have their ids are sums over the points of an instance: here they are.
@@ -592,66 +525,7 @@ def _table_of_sums(ids: NDArray[np.int32], used: Rows, shown: _Shown, settled: S
         place = (entries.row, first[entries.col])
         return csr_array((entries.data.astype(np.float32), place), shape=(sums.shape[0], len(ids)))
 
-    weights = at_first(sum((tile.in_masks for tile in settled[1:]), settled[0].in_masks))
-    outside = at_first(sum((tile.outside for tile in settled[1:]), settled[0].outside))
+    weights = at_first(sum((tile.in_masks for tile in decided[1:]), decided[0].in_masks))
+    outside = at_first(sum((tile.outside for tile in decided[1:]), decided[0].outside))
     no_pixels = np.zeros(len(shown.mask_view), np.int32)
     return MaskTable(weights, outside, csr_array(outside.shape), shown.mask_view, no_pixels, shown.mask_features)
-
-
-# The work folder ------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class _Kept:
-    """Arrays on disk by name, and a key to what they are of: a file of another key is not taken up."""
-
-    folder: Path
-    key: str
-
-    @classmethod
-    @contextmanager
-    def open(cls, folder: Path | None, key: str) -> Iterator[_Kept]:
-        """In a folder, whose files go when the block ends well; or in a temporary one, which goes in any case."""
-        if folder is None:
-            large = "/var/tmp"  # more than memory, where /tmp may be memory
-            place = None if os.environ.get("TMPDIR") or not os.access(large, os.W_OK) else large
-            with tempfile.TemporaryDirectory(prefix="og-pointcloud-", dir=place) as temporary:
-                yield cls(Path(temporary), key)
-            return
-        folder.mkdir(parents=True, exist_ok=True)
-        yield cls(folder, key)
-        for path in [*folder.glob(f"*{SUFFIX}"), *folder.glob(f".*{SUFFIX}.*.tmp")]:  # the latter of a killed fit
-            path.unlink()
-        with suppress(OSError):
-            folder.rmdir()  # there is more in it
-
-    def array(self, name: str, make: Callable[[], NDArray[Any]]) -> NDArray[Any]:
-        """The array of that name, mapped; made and kept, whole or not at all, where it is not there yet."""
-        path = self.folder / f"{name}-{self.key}{SUFFIX}"
-        if not path.exists():
-            try:
-                with replacing(path) as file:
-                    np.lib.format.write_array(file, make(), allow_pickle=False)
-            except OSError as error:
-                raise OgPointcloudError(
-                    f"no room for '{path}' ({error.strerror}); give a work folder on a larger disk"
-                ) from error
-        return np.load(path, mmap_mode="r", allow_pickle=False)
-
-
-def _key(points: Points, settings: FitSettings, most: int) -> str:
-    """A fingerprint of all that the kept arrays depend on, but for the views."""
-    digest = blake2b(f"1 {settings} {most} {MARGIN} {FINEST_PX} {MOST_SPLATS}".encode(), digest_size=12)
-    for array in (points.xyz, points.scale, points.rotation, points.opacity):
-        digest.update(b"" if array is None else np.ascontiguousarray(array).data)
-    return digest.hexdigest()
-
-
-def _mark(view: View, drawing: _Drawing) -> str:
-    """A fingerprint of what a view shows, points and settings being the same."""
-    camera, ids = view.camera, view.mask_map()
-    numbers = camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, view.mask_count
-    digest = blake2b(f"{view.name} {numbers} {drawing}".encode(), digest_size=12)
-    digest.update(np.ascontiguousarray(camera.world_to_camera).data)
-    digest.update(ids.data)
-    return digest.hexdigest()

@@ -33,8 +33,10 @@ __all__ = [
     "Cutoffs",
     "Gaussians",
     "ViewWeights",
+    "linearised_at",
     "pixel_weights",
     "render",
+    "seen_from",
     "view_weights",
     "working_memory",
 ]
@@ -239,7 +241,7 @@ large numbers: float32 holds it for any needle."""
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _seen_from(x, y, z, pose):  # noqa: ANN001, ANN202
+def seen_from(x, y, z, pose):  # noqa: ANN001, ANN202
     """Depth, and the two slopes of the ray to a point."""
     depth = pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] * z + pose[2, 3]
     across = (pose[0, 0] * x + pose[0, 1] * y + pose[0, 2] * z + pose[0, 3]) / depth
@@ -247,7 +249,7 @@ def _seen_from(x, y, z, pose):  # noqa: ANN001, ANN202
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _linearised_at(tx, ty, intrinsics, size):  # noqa: ANN001, ANN202
+def linearised_at(tx, ty, intrinsics, size):  # noqa: ANN001, ANN202
     """The slopes at which the projection is linearised: those of the ray, at most FRUSTUM_MARGIN outside the image."""
     fx, fy, cx, cy = intrinsics
     margin_x, margin_y = FRUSTUM_MARGIN * 0.5 * size[0] / fx, FRUSTUM_MARGIN * 0.5 * size[1] / fy
@@ -266,10 +268,10 @@ def _near_image(xyz, scale, opacity, pose, intrinsics, size, near, cutoffs):  # 
     fx, fy, cx, cy = intrinsics
     reach = -2.0 * np.log(cutoffs.alpha_min)  # squared Mahalanobis distance at which an opacity of 1 falls so low
     for g in prange(n):
-        depth, tx, ty = _seen_from(np.float64(xyz[g, 0]), np.float64(xyz[g, 1]), np.float64(xyz[g, 2]), pose)
+        depth, tx, ty = seen_from(np.float64(xyz[g, 0]), np.float64(xyz[g, 1]), np.float64(xyz[g, 2]), pose)
         if not depth > near or not opacity[g] > cutoffs.alpha_min:
             continue
-        jx, jy = _linearised_at(tx, ty, intrinsics, size)
+        jx, jy = linearised_at(tx, ty, intrinsics, size)
         largest = np.float64(max(scale[g, 0], scale[g, 1], scale[g, 2])) / depth
         xx = fx * fx * largest * largest * (1 + jx * jx) + LOW_PASS
         yy = fy * fy * largest * largest * (1 + jy * jy) + LOW_PASS
@@ -297,8 +299,8 @@ def _project(chosen, xyz, scale, rotation, opacity, thickness, pose, intrinsics,
     fx, fy, cx, cy = intrinsics
     for i in prange(m):
         g = chosen[i]
-        depth, tx, ty = _seen_from(np.float64(xyz[g, 0]), np.float64(xyz[g, 1]), np.float64(xyz[g, 2]), pose)
-        jx, jy = _linearised_at(tx, ty, intrinsics, size)
+        depth, tx, ty = seen_from(np.float64(xyz[g, 0]), np.float64(xyz[g, 1]), np.float64(xyz[g, 2]), pose)
+        jx, jy = linearised_at(tx, ty, intrinsics, size)
         sxx, sxy, syy, det = _covariance(scale[g], rotation[g], pose, fx / depth, fy / depth, jx, jy)
         u, v, sigma = fx * tx + cx, fy * ty + cy, np.float64(opacity[g])
         # The ellipse on which alpha falls to its least; its box holds every pixel that can contribute.

@@ -15,13 +15,12 @@ from scipy.sparse import csr_array
 
 from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.fitting.grouping import indicator
-from og_pointcloud.fitting.mask_table import MaskTable
+from og_pointcloud.fitting.mask_table import MaskTable, weights_by_instance
 from og_pointcloud.kernels import njit, prange
 from og_pointcloud.settings import CodebookSettings
 
 __all__ = [
     "Codebook",
-    "cluster_weights",
     "kmeans",
     "seed_centres",
     "thing_count",
@@ -129,7 +128,7 @@ def things_together(
     Masks of one view are different things (Eq. 2 rests on this too). A mask falls into a cluster when a fair share of
     the mask lies in it, or it makes up a fair share of what the view shows of the cluster.
     """
-    inside = cluster_weights(table.weights, cluster, count)
+    inside = weights_by_instance(table.weights, cluster, count)
     of_view = np.zeros((int(table.mask_view.max(initial=-1)) + 1, count))
     np.add.at(of_view, table.mask_view, inside)
     whole = np.asarray(table.weights.sum(axis=1), np.float64).reshape(-1, 1)
@@ -142,14 +141,6 @@ def things_together(
     known = (masks > 0).any(axis=0)
     together[known] = np.nanquantile(seen[:, known], settings.view_quantile, axis=0, method="higher")
     return together
-
-
-def cluster_weights(matrix: csr_array, cluster: NDArray[np.int32], count: int) -> NDArray[np.float64]:
-    """(rows, count) float64: each row's sum over the columns of every cluster, those of negative ones left out.
-
-    Of the mask table: what every mask shows of every cluster, ``A @ onehot(cluster)``.
-    """
-    return _cluster_weights(matrix.indptr, matrix.indices, matrix.data, cluster, count)
 
 
 def kmeans(
@@ -359,15 +350,3 @@ def _cluster_sums(points, weight, own, k):  # noqa: ANN001, ANN202
             for i in range(d):
                 sums[chunk, own[p], i] += weight[p] * points[p, i]
     return sums.sum(axis=0), mass.sum(axis=0)
-
-
-@njit(cache=True)
-def _cluster_weights(indptr, indices, data, cluster, count):  # noqa: ANN001, ANN202
-    rows = len(indptr) - 1
-    sums = np.zeros((rows, count))
-    for row in range(rows):
-        for e in range(indptr[row], indptr[row + 1]):
-            own = cluster[indices[e]]
-            if own >= 0:
-                sums[row, own] += data[e]
-    return sums

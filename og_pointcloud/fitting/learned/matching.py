@@ -18,8 +18,13 @@ from numpy.typing import NDArray
 
 from og_pointcloud.cloud import InstanceTable
 from og_pointcloud.fitting.association import directions, robust_mean
-from og_pointcloud.fitting.learned.codebook import cluster_weights
-from og_pointcloud.fitting.mask_table import FRUSTUM_MARGIN, Gaussians, MaskTable, view_weights
+from og_pointcloud.fitting.mask_table import (
+    FRUSTUM_MARGIN,
+    Gaussians,
+    MaskTable,
+    view_weights,
+    weights_by_instance,
+)
 from og_pointcloud.scene import Camera, View
 from og_pointcloud.settings import AssociationSettings, MatchingSettings
 
@@ -68,8 +73,8 @@ def visible_evidence(
     A mask's area is what it shows of the cloud: pixels in which it has no point do not count.
     """
     count = len(instance_features)
-    shared = cluster_weights(table.weights, instance_ids, count)
-    instance_area = cluster_weights(table.outside, instance_ids, count)
+    shared = weights_by_instance(table.weights, instance_ids, count)
+    instance_area = weights_by_instance(table.outside, instance_ids, count)
     np.add.at(instance_area, table.mask_view, shared)
     distance = np.zeros_like(shared)
     for of_masks, of_instances in zip(mask_features.T, instance_features.T, strict=True):

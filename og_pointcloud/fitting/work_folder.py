@@ -1,0 +1,244 @@
+"""A folder in which long work keeps its arrays, so that a run that was killed goes on where it was.
+
+One file for each unit of work (a view, a tile, a stage of training), named by what it is and by a fingerprint of all
+that it depends on: a file that is there is the answer, whichever run wrote it. Files are written whole or not at all
+and end in a checksum; one that is damaged is made anew. Nothing else is stored, and nothing needs to be in order.
+"""
+
+from __future__ import annotations
+
+import math
+import mmap
+import os
+import shutil
+import tempfile
+import threading
+import time
+import zlib
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from hashlib import blake2b
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from og_pointcloud.errors import OgPointcloudError
+from og_pointcloud.fitting.memory import scratch_root
+from og_pointcloud.formats.atomic import replacing
+
+try:
+    import fcntl
+except ImportError:  # not on Windows: there nobody keeps a second process out
+    fcntl = None
+
+__all__ = ["WorkFolder", "fingerprint", "kept_files"]
+
+SUFFIX = ".kept.npy"
+"""Ends the names of all files of a work folder, so that files of others are left alone."""
+LOCK = ".lock"
+ALIGNED = 64
+"""Arrays begin at multiples of so many bytes of a file."""
+
+Arrays = tuple[NDArray[Any], ...]
+
+
+def fingerprint(*parts: Any) -> str:
+    """24 hexadecimal digits that tell values apart: arrays by their bytes, all else (None too) by how it is written."""
+    digest = blake2b(digest_size=12)
+    for part in parts:
+        if isinstance(part, np.ndarray):
+            digest.update(f"{part.dtype.str} {part.shape}".encode())
+            digest.update(np.ascontiguousarray(part).data)
+        else:
+            digest.update(repr(part).encode())
+    return digest.hexdigest()
+
+
+def kept_files(folder: Path, name: str = "") -> int:
+    """How many files a run that did not end has left in its work folder, of those whose names begin with ``name``."""
+    return len(list(folder.glob(f"{name}*{SUFFIX}")))
+
+
+class WorkFolder:
+    """Tuples of arrays by name and fingerprint, in files of a folder. Made by `WorkFolder.open`.
+
+    found: how many of the arrays asked for were there already. May be used by several threads at once.
+    """
+
+    def __init__(self, folder: Path | None) -> None:
+        self.folder, self.found = folder, 0
+        self._temporary: Path | None = None
+        self._pending: dict[str, Arrays] | None = None
+        self._bytes_pending, self._most_pending, self._pending_until = 0, 0.0, 0.0
+        self._sound: set[str] = set()
+        self._guard = threading.Lock()
+
+    @classmethod
+    @contextmanager
+    def open(cls, folder: str | os.PathLike[str] | None) -> Iterator[WorkFolder]:
+        """For one run, which owns the folder meanwhile: another process that opens it gets an error.
+
+        A run that ends well removes its files, and the folder if nothing else is in it; one that is interrupted leaves
+        them. folder None: a temporary one, made when it is needed, which goes in any case.
+        """
+        work = cls(None if folder is None else Path(folder))
+        lock = None if work.folder is None else _lock(work.folder)
+        try:
+            yield work
+            if work.folder is not None:
+                for path in [*work.folder.glob(f"*{SUFFIX}"), *work.folder.glob(f".*{SUFFIX}.*.tmp")]:
+                    path.unlink()  # the latter of a run that was killed while it wrote
+        finally:
+            if work._temporary is not None:
+                shutil.rmtree(work._temporary, ignore_errors=True)
+            if work.folder is not None:
+                with suppress(OSError):
+                    (work.folder / LOCK).unlink()
+                with suppress(OSError):
+                    work.folder.rmdir()  # fails where there is more in it
+            if lock is not None:
+                lock.close()
+
+    def hold(self, nbytes: float, seconds: float) -> None:
+        """Write no file until arrays of more than so many bytes are held, or until so many seconds have passed: what
+        is done by then is soon made again. The time counts only where the folder outlives the run."""
+        self._pending, self._bytes_pending, self._most_pending = {}, 0, nbytes
+        self._pending_until = time.monotonic() + seconds if self.folder is not None else np.inf
+
+    def arrays(self, name: str, key: str, make: Callable[[], Sequence[NDArray[Any]]]) -> Arrays:
+        """What ``make`` returns; not made again where the folder has it. Mapped from the file, read-only, or in memory.
+
+        name: of the kind and number of the work, for people who look into the folder. key: a `fingerprint` of all that
+        the arrays depend on.
+        """
+        label = f"{name}-{key}{SUFFIX}"
+        with self._guard:
+            if self._pending and label in self._pending:
+                return self._pending[label]
+        found = self._read(label)
+        if found is not None:
+            return found
+        made = tuple(make())
+        with self._guard:
+            if self._pending is not None:
+                self._pending[label] = made
+                self._bytes_pending += sum(array.nbytes for array in made)
+                if time.monotonic() > self._pending_until or self._bytes_pending > self._most_pending:
+                    for waiting, arrays in self._pending.items():
+                        self._write(waiting, arrays)
+                    self._pending = None
+                return made
+        self._write(label, made)
+        return made
+
+    def array(self, name: str, key: str, make: Callable[[], NDArray[Any]]) -> NDArray[Any]:
+        """As `arrays`, for a single one."""
+        return self.arrays(name, key, lambda: [make()])[0]
+
+    def forget(self, name: str, key: str) -> None:
+        """Let go of arrays that are held in memory; those in a file stay."""
+        with self._guard:
+            if self._pending:
+                self._pending.pop(f"{name}-{key}{SUFFIX}", None)
+
+    def _place(self) -> Path:
+        if self.folder is not None:
+            return self.folder
+        if self._temporary is None:
+            self._temporary = Path(tempfile.mkdtemp(prefix="og-pointcloud-", dir=scratch_root()))
+        return self._temporary
+
+    def _write(self, label: str, arrays: Arrays) -> None:
+        path = self._place() / label
+        try:
+            with replacing(path) as file:
+                _write_arrays(file, arrays)
+        except OSError as error:
+            size = sum(array.nbytes for array in arrays) / 1e6
+            raise OgPointcloudError(
+                f"'{path}' cannot be written ({error.strerror}); expected room for {size:.1f} MB: give a work folder "
+                "on a larger disk, or, for a run without one, set TMPDIR to such a disk"
+            ) from error
+        self._sound.add(label)
+
+    def _read(self, label: str) -> Arrays | None:
+        """The arrays of a file, mapped; None where there is none, or it is damaged."""
+        folder = self.folder or self._temporary
+        if folder is None:
+            return None
+        try:
+            arrays = _read_arrays(folder / label, label in self._sound)
+        except (OSError, ValueError):  # no such file, or an empty one
+            return None
+        if arrays is not None and label not in self._sound:  # of an earlier run
+            self._sound.add(label)
+            self.found += 1
+        return arrays
+
+
+def _lock(folder: Path) -> IO[str] | None:
+    """Make the folder and keep other processes out of it until the file returned is closed, or the process ends."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        file = (folder / LOCK).open("a+")
+    except OSError as error:
+        raise OgPointcloudError(
+            f"the work folder '{folder}' cannot be used ({error.strerror}); expected one that can be written to: name "
+            "another"
+        ) from error
+    if fcntl is None:
+        return file
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        file.seek(0)
+        holder = file.read().strip() or "another process"
+        file.close()
+        raise OgPointcloudError(
+            f"the work folder '{folder}' is in use by {holder}; expected one run at a time: wait for it, or name "
+            "another folder"
+        ) from None
+    file.truncate(0)
+    file.write(f"process {os.getpid()}, since {time.strftime('%Y-%m-%d %H:%M:%S')}")
+    file.flush()
+    return file
+
+
+class _Summed:
+    """A file to write to that adds up a checksum of all that is written."""
+
+    def __init__(self, file: IO[bytes]) -> None:
+        self.file, self.size, self.checksum = file, 0, 0
+
+    def write(self, data: bytes) -> None:
+        self.file.write(data)
+        self.size, self.checksum = self.size + len(data), zlib.crc32(data, self.checksum)
+
+
+def _write_arrays(file: IO[bytes], arrays: Arrays) -> None:
+    """One .npy after another, each from a multiple of ALIGNED bytes on, then the checksum of all before it."""
+    summed = _Summed(file)
+    for array in arrays:
+        np.lib.format.write_array(summed, np.ascontiguousarray(array), version=(1, 0), allow_pickle=False)
+        summed.write(bytes(-summed.size % ALIGNED))
+    file.write(summed.checksum.to_bytes(4, "little"))
+
+
+def _read_arrays(path: Path, is_sound: bool) -> Arrays | None:
+    """What `_write_arrays` wrote, mapped. They share one map, of which a process has only so many. None where the
+    checksum is another, unless the file is known to be sound."""
+    with path.open("rb") as file:
+        content = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+        end = len(content) - 4
+        if not is_sound and zlib.crc32(memoryview(content)[: max(end, 0)]).to_bytes(4, "little") != content[end:]:
+            return None
+        arrays = []
+        while file.tell() < end:
+            np.lib.format.read_magic(file)
+            shape, _, dtype = np.lib.format.read_array_header_1_0(file)
+            arrays.append(np.frombuffer(content, dtype, math.prod(shape), offset=file.tell()).reshape(shape))
+            place = file.tell() + arrays[-1].nbytes
+            file.seek(place + -place % ALIGNED)
+    return tuple(arrays)

@@ -1,0 +1,153 @@
+"""Scene -> surface: which views and points a fit needs, and how each point is drawn."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from og_pointcloud.journal import Journal, LeftOut
+from og_pointcloud.rendering.coverage import needed_views
+from og_pointcloud.rendering.geometry import (
+    GeometryChoice,
+    Neighbourhood,
+    choose_gaussians,
+    distinct_places,
+    isotropic,
+    near_plane,
+    neighbourhood,
+    pixels_per_spacing,
+    thinned,
+)
+from og_pointcloud.rendering.splatting import Gaussians
+from og_pointcloud.scene import Points, Scene, View
+from og_pointcloud.settings import FitSettings, GeometrySettings
+
+__all__ = [
+    "Surface",
+    "note_choice",
+    "pixel_stride",
+    "reconstruct_surface",
+    "surface_thickness",
+    "with_distinct_points",
+    "with_needed_views",
+]
+
+
+@dataclass(frozen=True)
+class Surface:
+    """A scene's points as they are drawn, and the views that they are drawn in.
+
+    scene: only with the views that are needed, and one point per position. n below is the number of its points.
+    row_of_point: (all points,) int64, the row here that stands for each point of the whole scene; None: all are here.
+    neighbourhood: spacing and neighbours of the n points. gaussians: how the n points are drawn.
+    near: depth of the near plane, scene units.
+    thickness: (n,) float32, how far behind the front of its surface a Gaussian may lie, scene units.
+    stride: every stride-th row and column of the images is used.
+    """
+
+    scene: Scene
+    row_of_point: NDArray[np.int64] | None
+    neighbourhood: Neighbourhood
+    gaussians: Gaussians
+    near: float
+    thickness: NDArray[np.float32]
+    stride: int
+
+    def thinned_views(self) -> list[View]:
+        """The views at the resolution that is used, without their images."""
+        return [thinned(view, self.stride) for view in self.scene.views]
+
+
+def reconstruct_surface(scene: Scene, settings: FitSettings, journal: Journal) -> Surface:
+    """Find the views and points that are needed, the points' spacing, and the Gaussians that they are drawn as."""
+    scene = with_needed_views(scene, settings, journal)
+    scene, row_of_point = with_distinct_points(scene, journal)
+    with journal.stage("spacing"):
+        near = near_plane(scene.points.xyz, scene.views)
+        around = neighbourhood(scene.points.xyz, settings.geometry)
+    with journal.stage("geometry"):
+        gaussians = _gaussians(scene, around, near, settings, journal)
+        thickness = surface_thickness(gaussians, around.spacing, float(np.median(around.spacing)), settings.geometry)
+        stride = pixel_stride(scene.points, around.spacing, scene.views, settings.geometry, journal)
+    return Surface(scene, row_of_point, around, gaussians, near, thickness, stride)
+
+
+def with_needed_views(scene: Scene, settings: FitSettings, journal: Journal) -> Scene:
+    """The scene with the views that see something new, where the settings ask for that, else with all."""
+    enough = settings.visibility.enough_views
+    needed = range(len(scene.views)) if enough is None else needed_views(scene.points.xyz, scene.views, enough)
+    if len(needed) in (0, len(scene.views)):
+        return scene
+    journal.leave_out(LeftOut.VIEWS, count=len(scene.views) - len(needed), total=len(scene.views), enough=enough)
+    return replace(scene, views=tuple(scene.views[index] for index in needed))
+
+
+def with_distinct_points(scene: Scene, journal: Journal) -> tuple[Scene, NDArray[np.int64] | None]:
+    """The scene with one point per position, and for each of its points the row that stands for it; None if all differ.
+
+    Of two points at the same position one would hide the other, which would then seem unseen. Gaussians all stay: how
+    they overlap is part of how the scene looks.
+    """
+    points = scene.points
+    if points.are_gaussians:
+        return scene, None
+    first, row_of_point = distinct_places(points.xyz)
+    if len(first) == len(points):
+        return scene, None
+    journal.leave_out(LeftOut.COINCIDENT_POINTS, count=len(points) - len(first))
+    return replace(scene, points=points.take(first)), row_of_point
+
+
+def _gaussians(scene: Scene, around: Neighbourhood, near: float, settings: FitSettings, journal: Journal) -> Gaussians:
+    if scene.points.are_gaussians:
+        journal.leave_out(LeftOut.CHOICE_OF_SPLATS)
+        return Gaussians.from_points(scene.points)
+    if settings.mode == "paper":
+        journal.leave_out(LeftOut.CHOICE_IN_PAPER_MODE)
+        return isotropic(scene.points, around.spacing, settings.paper.scale, settings.paper.opacity)
+    choice = choose_gaussians(
+        scene.points,
+        around.spacing,
+        scene.views,
+        near,
+        settings.geometry,
+        lambda values: journal.steps(values, "geometry"),
+    )
+    note_choice(choice, journal)
+    return choice.gaussians
+
+
+def note_choice(choice: GeometryChoice, journal: Journal) -> None:
+    """Note how a plain cloud's points are drawn, and why; warn where there was nothing to compare with."""
+    journal.notes["gaussian_scale"], journal.notes["gaussian_opacity"] = choice.scale, choice.opacity
+    journal.notes["photometric_trials"] = [list(trial) for trial in choice.trials]
+    if not choice.trials:
+        journal.warnings.append(
+            f"no colours or images to compare with: points are drawn {choice.scale} spacings large, {choice.opacity} "
+            "opaque; add images for a choice by photometric agreement"
+        )
+
+
+def surface_thickness(
+    gaussians: Gaussians, spacing: NDArray[np.float32], typical_spacing: float, settings: GeometrySettings
+) -> NDArray[np.float32]:
+    """(n,) how far behind the front of its surface a Gaussian may lie: noise and overlap are a few spacings thick."""
+    thickness = settings.thickness * np.maximum(spacing, typical_spacing) + 3 * gaussians.scale.max(axis=1)
+    return thickness.astype(np.float32)
+
+
+def pixel_stride(
+    points: Points, spacing: NDArray[np.float32], views: Sequence[View], settings: GeometrySettings, journal: Journal
+) -> int:
+    """Use every stride-th pixel of the masks: pixels much finer than the points see nothing new."""
+    if points.are_gaussians:
+        return 1
+    spacing_px = pixels_per_spacing(points, spacing, views)
+    smallest = min(min(view.camera.width, view.camera.height) for view in views)
+    stride = int(np.clip(spacing_px / settings.pixels_per_spacing, 1, min(settings.max_stride, smallest)))
+    if stride > 1:
+        journal.leave_out(LeftOut.PIXELS, share=1 - 1 / stride**2, spacing_px=round(spacing_px, 3), stride=stride)
+    return stride
