@@ -83,7 +83,7 @@ def rendered(weights: list[csr_array], ids: list[NDArray[np.int32]], mask_counts
 @pytest.fixture
 def tiny(tiny_capture: TinyCapture) -> Rendered:
     scene = read_capture(tiny_capture.folder)
-    gaussians = prepare(scene).gaussians
+    gaussians = prepare(scene).surface.gaussians
     table, gram = mask_table(gaussians, scene.views, 0.05), masked_gram(gaussians, scene.views, 0.05)
     weights = [pixel_weights(gaussians, view.camera, 0.05) for view in scene.views]
     ids = [view.mask_map().ravel() for view in scene.views]

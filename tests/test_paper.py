@@ -37,7 +37,7 @@ class Balls:
 @pytest.fixture
 def balls(tiny_capture: TinyCapture) -> Balls:
     scene = read_capture(tiny_capture.folder)
-    return Balls(prepare(scene).gaussians, scene.views, tiny_capture.object_ids)
+    return Balls(prepare(scene).surface.gaussians, scene.views, tiny_capture.object_ids)
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])

@@ -5,7 +5,6 @@ Twice: with the masks and features of a simulated proposer and encoder, and from
 
 from __future__ import annotations
 
-import sys
 import time
 import warnings
 from collections.abc import Iterator
@@ -19,7 +18,7 @@ from og_pointcloud_export import write_bundle
 import og_pointcloud as og
 from og_pointcloud.cloud import Vocabulary, WordBank
 from og_pointcloud.evaluate.metrics import Score, adjusted_rand_index, score_labels
-from og_pointcloud.fitting.fit import fit, prepare
+from og_pointcloud.fitting.fit import fit_prepared, prepare
 from og_pointcloud.fitting.mask_table import MaskTable
 from og_pointcloud.formats.capture import read_capture
 from og_pointcloud.settings import FitSettings
@@ -88,7 +87,7 @@ def run_demo(
     with _stage("render the masks", seconds):
         prepared = prepare(scene, settings)
     with _stage("fit", seconds):
-        cloud = fit(scene, settings, progress=sys.stderr.isatty(), prepared=prepared)
+        cloud = fit_prepared(prepared, settings)
     bundle = output / "room.ogpc"
     with _stage("write one file", seconds):
         words, bank = Vocabulary(CLASS_NAMES, capture.text_vectors), WordBank(capture.bank_vectors)

@@ -205,25 +205,24 @@ def view_capture(arguments: argparse.Namespace) -> None:
     from og_pointcloud.fitting.fit import prepare
     from og_pointcloud.formats.capture import read_capture
     from og_pointcloud.journal import Journal
-    from og_pointcloud.rendering.geometry import near_plane
     from og_pointcloud.show import fit_pictures as pictures
 
     stages: list[dict[str, Any]] = []
     with timed(stages, "read capture"):
         scene = read_capture(arguments.source)
-        near = near_plane(scene.points.xyz, scene.views)
     output.parent.mkdir(parents=True, exist_ok=True)
     with timed(stages, "prepare"):
-        prepared = prepare(scene, journal=Journal(progress=sys.stderr.isatty()))
+        prepared = prepare(scene, journal=Journal(progress=True))
+        surface = prepared.surface
     if arguments.features:
         with timed(stages, "learn"):
-            features = pictures.learned_stages(prepared.table, scene.points.xyz, seed=seed)
+            features = pictures.learned_stages(prepared.table, surface.scene.points.xyz, seed=seed)
         with timed(stages, "draw"):
-            pictures.feature_picture(prepared.gaussians, scene.views, near, features, output, columns)
+            pictures.feature_picture(surface.gaussians, scene.views, surface.near, features, output, columns)
     else:
-        ids = instances_of(arguments.instances, scene)
+        ids, gaussians = instances_of(arguments.instances, scene), surface.gaussians.take(surface.row_of_point)
         with timed(stages, "draw"):
-            pictures.instance_picture(prepared.gaussians, scene.views, near, ids, output, columns)
+            pictures.instance_picture(gaussians, scene.views, surface.near, ids, output, columns)
     print_table(("stage", "seconds"), [(stage["name"], f"{stage['seconds']:.2f}") for stage in stages])
     print(f"wrote {output}")
 

@@ -94,7 +94,8 @@ def fit_prepared(
     surface = prepared.surface
     labelling = LABELLERS[settings.mode](prepared.table, surface, settings, journal)
     spacing = float(np.median(surface.neighbourhood.spacing))
-    return _labelled_cloud(prepared.scene, labelling.of_points(surface.row_of_point), spacing, settings, journal)
+    labelling = labelling.of_points(surface.row_of_point)
+    return _labelled_cloud(prepared.scene, labelling, spacing, settings, journal)
 
 
 def _check(scene: Scene, journal: Journal) -> None:

@@ -208,8 +208,8 @@ def require_sight(exposed: int, masked: int, scene: Scene) -> None:
         )
     if masked == 0:
         raise SceneError(
-            f"none of the {sum(view.mask_count for view in scene.views)} masks shows a Gaussian; expected at least one: "
-            "make masks, and check that poses and cloud share one frame"
+            f"none of the {sum(view.mask_count for view in scene.views)} masks shows a Gaussian; expected at least "
+            "one: make masks, and check that poses and cloud share one frame"
         )
 
 

@@ -143,8 +143,8 @@ def _points_per_tile(points: int, settings: FitSettings) -> int:
     if fitting < LEAST_TILE:
         raise OgPointcloudError(
             f"{points:,} points take {points * CLOUD_BYTES / 1e9:.1f} GB beside the scene, and tiles of {LEAST_TILE:,} "
-            f"{LEAST_TILE * TILE_BYTES / 1e9:.1f} GB; the fit has {left / 1e9:.1f} GB: give it more memory, or thin the "
-            "cloud"
+            f"{LEAST_TILE * TILE_BYTES / 1e9:.1f} GB; the fit has {left / 1e9:.1f} GB: give it more memory, or thin "
+            "the cloud"
         )
     return min(LEAST_TILE << (fitting // LEAST_TILE).bit_length() - 1, LARGEST_TILE)
 
@@ -256,7 +256,7 @@ def _neighbours(tile: int, cloud: _TiledCloud, settings: FitSettings, work: Work
         around = neighbourhood(cloud.points.xyz[cloud.members[tile]], settings.geometry)
         return around.spacing, around.index, around.adjoining
 
-    return Neighbourhood(*work.arrays(f"neighbours-{tile:04d}", cloud.key, find))
+    return Neighbourhood(*map(np.array, work.arrays(f"neighbours-{tile:04d}", cloud.key, find)))
 
 
 # Views ----------------------------------------------------------------------------------------------------------

@@ -92,6 +92,12 @@ class Gaussians:
     def __len__(self) -> int:
         return len(self.xyz)
 
+    def take(self, rows: NDArray[np.integer] | None) -> Gaussians:
+        """The Gaussians of these rows, in their order; None: all."""
+        if rows is None:
+            return self
+        return Gaussians(self.xyz[rows], self.scale[rows], self.rotation[rows], self.opacity[rows])
+
 
 def pixel_weights(gaussians: Gaussians, camera: Camera, near: float) -> csr_array:
     """The blending weights ``W`` of one view themselves: (H W, n) sparse float32, pixels row by row."""
@@ -241,7 +247,7 @@ large numbers: float32 holds it for any needle."""
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def seen_from(x, y, z, pose):  # noqa: ANN001, ANN202
+def seen_from(x, y, z, pose):  # noqa: ANN001, ANN201
     """Depth, and the two slopes of the ray to a point."""
     depth = pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] * z + pose[2, 3]
     across = (pose[0, 0] * x + pose[0, 1] * y + pose[0, 2] * z + pose[0, 3]) / depth
@@ -249,7 +255,7 @@ def seen_from(x, y, z, pose):  # noqa: ANN001, ANN202
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def linearised_at(tx, ty, intrinsics, size):  # noqa: ANN001, ANN202
+def linearised_at(tx, ty, intrinsics, size):  # noqa: ANN001, ANN201
     """The slopes at which the projection is linearised: those of the ray, at most FRUSTUM_MARGIN outside the image."""
     fx, fy, cx, cy = intrinsics
     margin_x, margin_y = FRUSTUM_MARGIN * 0.5 * size[0] / fx, FRUSTUM_MARGIN * 0.5 * size[1] / fy

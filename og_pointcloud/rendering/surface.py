@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,6 +56,10 @@ class Surface:
     near: float
     thickness: NDArray[np.float32]
     stride: int
+
+    def of_points(self, values: NDArray[Any]) -> NDArray[Any]:
+        """What each point of the whole scene has, of values (n, ...) that the points here have."""
+        return values if self.row_of_point is None else values[self.row_of_point]
 
     def thinned_views(self) -> list[View]:
         """The views at the resolution that is used, without their images."""

@@ -16,7 +16,7 @@ from og_pointcloud.fitting.grouping import MaskGroups
 from og_pointcloud.fitting.learned.matching import eq5_scores, match_masks, visible_evidence
 from og_pointcloud.fitting.mask_table import MaskTable
 from og_pointcloud.fitting.membership import Membership, assign_points
-from og_pointcloud.fitting.view_votes import hear_views
+from og_pointcloud.fitting.view_votes import view_votes
 from og_pointcloud.rendering.geometry import Neighbourhood
 from og_pointcloud.settings import MatchingSettings, MembershipSettings
 
@@ -163,9 +163,9 @@ def _table(seed: int, views: int = 4) -> MaskTable:
 
 
 def _votes(table: MaskTable) -> Answer:
-    ours, exact = hear_views(table), _literal(table)
+    ours, exact = view_votes(table), _literal(table)
     return Answer(
-        np.concatenate([ours.inside.toarray(), ours.word.toarray()]), np.concatenate([exact.inside, exact.weight])
+        np.concatenate([ours.in_mask.toarray(), ours.vote.toarray()]), np.concatenate([exact.inside, exact.weight])
     )
 
 
@@ -188,7 +188,7 @@ def _assigned(
         index[point, : len(near)], adjoining[point, : len(near)] = near, True
     around = Neighbourhood(np.ones(len(neighbours), np.float32), index, adjoining)
     groups = MaskGroups(int32(group), max(group) + 1, np.zeros(len(group), bool))
-    return assign_points(table, hear_views(table), groups, around, settings or MembershipSettings())
+    return assign_points(table, view_votes(table), groups, around, settings or MembershipSettings())
 
 
 def _both(seed: int, settings: MembershipSettings) -> tuple[Membership, tuple[NDArray, NDArray, NDArray]]:
