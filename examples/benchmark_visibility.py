@@ -86,11 +86,11 @@ def capture_case(folder: Path) -> Case:
 
     scene = read_capture(folder)
     middle = scene.views[len(scene.views) // 2]
-    prepared = prepare(replace(scene, views=scene.views[:: max(1, len(scene.views) // 10)]))
-    view = thinned(middle, prepared.stride)
-    thickness = (6 * prepared.neighbourhood.spacing).astype(np.float32)
+    surface = prepare(replace(scene, views=scene.views[:: max(1, len(scene.views) // 10)])).surface
+    view = thinned(middle, surface.stride)
+    thickness = (6 * surface.neighbourhood.spacing).astype(np.float32)
     name = f"{folder.name}, {len(scene.points):,}"
-    return Case(name, prepared.gaussians, view.camera, view.mask_map(), view.mask_count, prepared.near, thickness)
+    return Case(name, surface.gaussians, view.camera, view.mask_map(), view.mask_count, surface.near, thickness)
 
 
 def window_of(case: Case) -> Case:

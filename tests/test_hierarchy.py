@@ -16,7 +16,7 @@ from test_grouping import ONE, OTHER, HandView, hand_table
 from og_pointcloud.bundle.read import read_bundle
 from og_pointcloud.cloud import InstanceTable
 from og_pointcloud.errors import BundleError, OgPointcloudError
-from og_pointcloud.fitting.parts import part_of
+from og_pointcloud.fitting.association import part_of
 
 MUG, HANDLE, TABLE = range(60), range(60, 80), range(80, 200)
 IDS = np.repeat([0, 1, 2], [60, 20, 120]).astype(np.int32)

@@ -23,7 +23,7 @@ from og_pointcloud.fitting.membership import (
     own_area,
     without_see_through,
 )
-from og_pointcloud.fitting.view_votes import OPENNESS_POWER, hear_views
+from og_pointcloud.fitting.view_votes import OPENNESS_POWER, view_votes
 from og_pointcloud.rendering.geometry import neighbourhood
 from og_pointcloud.settings import GeometrySettings, MembershipSettings
 
@@ -45,7 +45,7 @@ def groups(numbers: Sequence[int]) -> MaskGroups:
 def decide(table: MaskTable, numbers: Sequence[int], xyz: NDArray[np.float32] | None = None) -> Membership:
     xyz = on_a_line(table.weights.shape[1]) if xyz is None else xyz
     around = neighbourhood(xyz, GeometrySettings())
-    result = assign_points(table, hear_views(table), groups(numbers), around, SETTINGS)
+    result = assign_points(table, view_votes(table), groups(numbers), around, SETTINGS)
     assert result.instance_ids.dtype == np.int32
     assert result.share.dtype == result.detection_rate.dtype == np.float32
     assert result.instance_ids.shape == result.share.shape == result.certainty.shape == (len(xyz),)
@@ -193,19 +193,19 @@ def test_certainty_is_what_views_say_times_how_far_neighbours_agree(seed: int) -
     random = np.random.default_rng(seed)
     table, numbers = random_case(random)
     xyz = random.uniform(0, 8, (200, 3)).astype(np.float32)
-    around, testimony = neighbourhood(xyz, GeometrySettings()), hear_views(table)
-    result = assign_points(table, testimony, groups(numbers), around, replace(SETTINGS, rate_share=0.0))
-    inside, word = testimony.inside.toarray().astype(float), testimony.word.toarray().astype(float)
+    around, votes = neighbourhood(xyz, GeometrySettings()), view_votes(table)
+    result = assign_points(table, votes, groups(numbers), around, replace(SETTINGS, rate_share=0.0))
+    in_mask, vote = votes.in_mask.toarray().astype(float), votes.vote.toarray().astype(float)
     group, said = np.array(numbers), []
     for point, state in enumerate(result.instance_ids):
-        of_groups = [inside[group == k, point].sum() for k in range(max(numbers) + 1)]
+        of_groups = [in_mask[group == k, point].sum() for k in range(max(numbers) + 1)]
         best = int(np.argmax(of_groups)) if max(of_groups) > 0 else -1
-        asked = sum(word[view, point] for view in range(6) if best in group[table.mask_view == view])
+        asked = sum(vote[view, point] for view in range(6) if best in group[table.mask_view == view])
         share = of_groups[best] / asked if best >= 0 else 0.0
         of_views = share if best >= 0 and state == best else 1 - share
         near = around.index[point][around.adjoining[point]]
         agree = np.mean([result.instance_ids[other] == state for other in near]) if len(near) else 1.0
-        said.append(of_views * agree if word[:, point].any() else 0.0)
+        said.append(of_views * agree if vote[:, point].any() else 0.0)
     assert len(set(result.instance_ids)) > 4
     np.testing.assert_allclose(result.certainty, said, rtol=1e-5, atol=1e-6)
 
@@ -244,28 +244,28 @@ def random_case(random: Generator, n: int = 200, views: int = 6, masks: int = 4)
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_testimony_is_its_formula(seed: int) -> None:
+def test_votes_are_their_formula(seed: int) -> None:
     table, _ = random_case(np.random.default_rng(seed))
-    testimony = hear_views(table)
+    votes = view_votes(table)
     weights, outside, exposure = (m.toarray().astype(float) for m in (table.weights, table.outside, table.exposure))
     best = exposure.max(axis=0)
-    word = (exposure / np.where(best > 0, best, 1)) ** OPENNESS_POWER
-    np.testing.assert_allclose(testimony.word.toarray(), word, rtol=1e-5)
+    vote = (exposure / np.where(best > 0, best, 1)) ** OPENNESS_POWER
+    np.testing.assert_allclose(votes.vote.toarray(), vote, rtol=1e-5)
     expected = np.zeros_like(weights)
     for mask, view in enumerate(table.mask_view):
         seen = weights[table.mask_view == view].sum(axis=0) + outside[view]
-        expected[mask] = weights[mask] / np.where(seen > 0, seen, 1) * word[view]
-    np.testing.assert_allclose(testimony.inside.toarray(), expected, rtol=1e-5, atol=1e-9)
-    by_view = np.add.reduceat(testimony.inside.toarray(), np.arange(0, 24, 4), axis=0)
-    assert (by_view <= testimony.word.toarray() + 1e-6).all()
+        expected[mask] = weights[mask] / np.where(seen > 0, seen, 1) * vote[view]
+    np.testing.assert_allclose(votes.in_mask.toarray(), expected, rtol=1e-5, atol=1e-9)
+    by_view = np.add.reduceat(votes.in_mask.toarray(), np.arange(0, 24, 4), axis=0)
+    assert (by_view <= votes.vote.toarray() + 1e-6).all()
 
 
 def test_a_view_that_looks_openly_outweighs_views_through_a_gap() -> None:
     """Three views glimpse point 0 in a mask, at a tenth of what the fourth sees of it, outside."""
     table = hand_table(1, [[([0], ONE)]] * 3 + [[([], ONE)]])
     exposure = csr_array(np.array([[0.1], [0.1], [0.1], [1.0]], np.float32))
-    word = hear_views(replace(table, exposure=exposure)).word.toarray().ravel()
-    np.testing.assert_allclose(word, [0.01, 0.01, 0.01, 1], rtol=1e-5)
+    vote = view_votes(replace(table, exposure=exposure)).vote.toarray().ravel()
+    np.testing.assert_allclose(vote, [0.01, 0.01, 0.01, 1], rtol=1e-5)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -273,15 +273,15 @@ def test_best_group_is_that_of_the_literal_reference(seed: int) -> None:
     random = np.random.default_rng(seed)
     table, numbers = random_case(random)
     group = np.array(numbers, np.int32)
-    testimony = hear_views(table)
+    votes = view_votes(table)
     has_mask = random.uniform(size=(5, 6)) < 0.7
     allowed = np.array([True, True, False, True, True])
-    actual = _best_group(_by_point(testimony.inside), _by_point(testimony.word), group, has_mask, allowed)
-    inside, word = testimony.inside.toarray().astype(float), testimony.word.toarray().astype(float)
-    per_group = np.array([inside[group == k].sum(axis=0) if allowed[k] else 0 * inside[0] for k in range(5)])
+    actual = _best_group(_by_point(votes.in_mask), _by_point(votes.vote), group, has_mask, allowed)
+    in_mask, vote = votes.in_mask.toarray().astype(float), votes.vote.toarray().astype(float)
+    per_group = np.array([in_mask[group == k].sum(axis=0) if allowed[k] else 0 * in_mask[0] for k in range(5)])
     best = np.where(per_group.max(axis=0) > 0, per_group.argmax(axis=0), -1)
-    asked = np.where(best >= 0, np.einsum("kv,vn->kn", has_mask, word)[best, np.arange(200)], 0)
-    for value, expected in zip(actual, (best, per_group.max(axis=0), asked, word.sum(axis=0)), strict=True):
+    asked = np.where(best >= 0, np.einsum("kv,vn->kn", has_mask, vote)[best, np.arange(200)], 0)
+    for value, expected in zip(actual, (best, per_group.max(axis=0), asked, vote.sum(axis=0)), strict=True):
         np.testing.assert_allclose(value, expected, rtol=1e-5, atol=1e-9)
     assert (best == -1).any()
 

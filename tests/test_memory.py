@@ -1,39 +1,47 @@
-"""Tables that outgrow their memory, and fits that are interrupted: the same bits as when all goes well."""
+"""Tables that outgrow their memory, and work that is interrupted: the same bits as when all goes well."""
 
 from __future__ import annotations
 
-import json
 import mmap
+import os
+import signal
+import subprocess
+import sys
+import time
 from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import TinyCapture
 from scipy.sparse import csr_array, random_array
 from test_fit import boxes_on_a_table
 from test_grouping import hand_table
 from test_membership import groups, on_a_line
 from test_visibility import NEAR, camera, cloud, view_of
 
+import og_pointcloud as og
 from og_pointcloud.cli import main
 from og_pointcloud.errors import OgPointcloudError
+from og_pointcloud.fitting import mask_table as mask_table_module
 from og_pointcloud.fitting import membership
 from og_pointcloud.fitting import memory as memory_module
 from og_pointcloud.fitting.fit import fit, prepare
-from og_pointcloud.fitting.mask_table import Gaussians, MaskTable, mask_table, table_key
+from og_pointcloud.fitting.mask_table import Gaussians, MaskTable, mask_table
 from og_pointcloud.fitting.membership import assign_points
 from og_pointcloud.fitting.memory import (
-    Column,
     free_memory,
     in_file,
     memory_in_use,
+    memory_left,
     parse_memory,
-    scratch_file,
+    scratch_array,
     scratch_like,
 )
-from og_pointcloud.fitting.table_store import PROGRESS, TableStore, kept_views, remove_work
-from og_pointcloud.fitting.view_votes import hear_views
+from og_pointcloud.fitting.view_votes import view_votes
+from og_pointcloud.fitting.work_folder import WorkFolder, fingerprint, kept_files
 from og_pointcloud.rendering.geometry import neighbourhood
 from og_pointcloud.scene import View
 from og_pointcloud.settings import FitSettings, GeometrySettings, MembershipSettings, VisibilitySettings
@@ -75,32 +83,157 @@ def test_memory_in_use_grows_with_an_array() -> None:
     assert memory_in_use() - before > 0.9 * held.nbytes
 
 
-@pytest.mark.parametrize("moved_after", [0, 3, 10])
-def test_a_column_is_its_pieces_wherever_it_lives(moved_after: int) -> None:
-    pieces = [np.arange(count, dtype=np.int32) for count in (0, 3, 1000, 0, 7, 1, 100_000, 2)]
-    column = Column(np.int32)
-    for index, piece in enumerate(pieces):
-        if index == moved_after:
-            column.move_to(scratch_file())
-        column.append(piece)
-    assert column.nbytes == 4 * sum(map(len, pieces))
-    values = column.array()
-    np.testing.assert_array_equal(values, np.concatenate(pieces))
-    assert in_file(values) == (moved_after < len(pieces))
-    assert in_file(scratch_like(values, np.float64)) == in_file(values)
-    assert scratch_like(values, np.float64).shape == values.shape
+def test_memory_left_is_what_the_limit_leaves_or_half_of_what_is_free() -> None:
+    assert memory_left(1) == 0
+    assert 0.9 * (4 << 40) < memory_left(4 << 40) < 4 << 40
+    assert 0 < memory_left(None) <= free_memory()
 
 
-def test_mapped_arrays_are_plain_writable_arrays_that_csr_takes_as_they_are() -> None:
-    column = Column(np.float32)
-    column.move_to(scratch_file())
-    column.append(np.array([1, 2, 3], np.float32))
-    values = column.array()
+def test_scratch_arrays_are_plain_writable_arrays_in_files_that_csr_takes_as_they_are() -> None:
+    values = scratch_array(3, np.float32)
+    values[:] = [5, 2, 3]
     assert type(values) is np.ndarray
-    values[0] = 5
     matrix = csr_array((values, np.array([0, 1, 1], np.int32), np.array([0, 2, 3], np.int32)), shape=(2, 2))
     assert in_file(matrix.data)
     np.testing.assert_array_equal(matrix.toarray(), [[5, 2], [0, 3]])
+    assert in_file(scratch_like(values, np.float64))
+    assert not in_file(scratch_like(np.zeros(3), np.float64))
+    assert scratch_array(0, np.int32).shape == (0,)
+
+
+def test_a_full_disk_is_one_clear_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object, **__: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch, WorkFolder.open(tmp_path / "work") as work:
+        patch.setattr("numpy.lib.format.write_array", full)
+        with pytest.raises(OgPointcloudError, match=r"work/a-1.*cannot be written \(No space left.*larger disk"):
+            work.array("a", "1", lambda: np.zeros(3))
+    monkeypatch.setattr(memory_module, "_reserve", full)
+    with pytest.raises(OgPointcloudError, match=r"no room for 0.0 GB in.*No space left.*TMPDIR"):
+        scratch_array(3, np.int32)
+
+
+# A work folder ---------------------------------------------------------------------------------------------------
+
+
+class Killed(BaseException):
+    """What Ctrl-C raises is no Exception either."""
+
+
+@contextmanager
+def killed_run(folder: Path | None) -> Iterator[WorkFolder]:
+    """A run that is killed at the end of the block."""
+    with suppress(Killed), WorkFolder.open(folder) as work:
+        yield work
+        raise Killed
+
+
+ARRAYS = [
+    np.arange(7, dtype=np.float32),
+    np.zeros((0, 3), np.int32),
+    np.array([[True, False, True]]),
+    np.array([(1, 2.5)], [("point", "<i4"), ("value", "<f4")]),
+]
+
+
+def keep(folder: Path, key: str = "1") -> None:
+    """A run that makes ARRAYS and is killed."""
+    with killed_run(folder) as work:
+        work.arrays("view", key, lambda: ARRAYS)
+
+
+def taken_up(folder: Path, key: str = "1") -> bool:
+    """Whether the next run finds the arrays; it gets them whether or not."""
+    with WorkFolder.open(folder) as work:
+        for read, array in zip(work.arrays("view", key, lambda: ARRAYS), ARRAYS, strict=True):
+            assert read.dtype == array.dtype
+            np.testing.assert_array_equal(read, array)
+        return work.found == 1
+
+
+def test_what_a_killed_run_made_is_not_made_again(tmp_path: Path) -> None:
+    keep(tmp_path / "work")
+    assert kept_files(tmp_path / "work", "view") == 1
+    assert taken_up(tmp_path / "work")
+    assert not (tmp_path / "work").exists()
+    keep(tmp_path / "work")
+    assert not taken_up(tmp_path / "work", "2")
+
+
+@pytest.mark.parametrize("damage", ["empty", "cut", "longer", "header", "value", "checksum", "foreign"])
+def test_a_damaged_file_is_made_anew(tmp_path: Path, damage: str) -> None:
+    keep(tmp_path)
+    (file,) = tmp_path.glob("view*")
+    content = bytearray(file.read_bytes())
+    place = {"header": 20, "value": 140, "checksum": -1}.get(damage)
+    if place is not None:
+        content[place] ^= 1
+    changed = {"empty": b"", "cut": content[:-5], "longer": content + b"0", "foreign": b"no arrays at all"}
+    file.write_bytes(changed.get(damage, content))
+    assert not taken_up(tmp_path)
+
+
+def test_a_run_leaves_what_others_put_into_its_folder(tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").write_text("mine")
+    np.save(tmp_path / "mine.npy", np.zeros(3))
+    keep(tmp_path)
+    assert taken_up(tmp_path)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["mine.npy", "notes.txt"]
+
+
+def test_only_one_run_at_a_time(tmp_path: Path) -> None:
+    code = (
+        "import sys; from og_pointcloud.fitting.work_folder import WorkFolder\nwith WorkFolder.open(sys.argv[1]): pass"
+    )
+    other = [sys.executable, "-c", code, str(tmp_path / "work")]
+    with WorkFolder.open(tmp_path / "work"):
+        refused = subprocess.run(other, capture_output=True, text=True, check=False)
+        assert refused.returncode != 0
+        assert f"in use by process {os.getpid()}, since" in refused.stderr
+        assert "wait for it, or name another folder" in refused.stderr
+        with pytest.raises(OgPointcloudError, match="in use by process"), WorkFolder.open(tmp_path / "work"):
+            pass
+    assert subprocess.run(other, check=False).returncode == 0
+
+
+def test_a_folder_that_cannot_be_made_is_an_error(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OgPointcloudError, match="cannot be used"), WorkFolder.open(tmp_path / "file" / "work"):
+        pass
+
+
+def test_held_arrays_are_written_when_they_are_many_or_old(tmp_path: Path) -> None:
+    folder = tmp_path / "work"
+    with killed_run(folder) as work:
+        work.hold(2 * ARRAYS[0].nbytes, 1000)
+        for number in range(2):
+            work.array("view", str(number), lambda: ARRAYS[0])
+        assert kept_files(folder) == 0
+        work.array("view", "2", lambda: ARRAYS[0])
+        assert kept_files(folder) == 3
+        work.array("view", "3", lambda: ARRAYS[0])
+        assert kept_files(folder) == 4
+        work.hold(np.inf, -1)
+        work.array("view", "4", lambda: ARRAYS[0])
+        assert kept_files(folder) == 5
+
+
+def test_a_temporary_folder_goes_in_any_case(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    monkeypatch.setattr("tempfile.tempdir", None)
+    with killed_run(None) as work:
+        assert not list(tmp_path.iterdir())
+        work.array("view", "1", lambda: ARRAYS[0])
+        assert len(list(tmp_path.glob("*/view*"))) == 1
+    assert not list(tmp_path.iterdir())
+
+
+def test_fingerprints_tell_arrays_and_numbers_apart() -> None:
+    one = np.ones(4, np.float32)
+    different = [one, 2 * one, one[:2], one.reshape(2, 2), one.astype(np.int32), 1.0, 1, None, "1", FitSettings()]
+    assert len({fingerprint(value) for value in different}) == len(different)
+    assert fingerprint(one, 2) == fingerprint(one.copy(), 2) != fingerprint(2, one)
 
 
 # A table of views ------------------------------------------------------------------------------------------------
@@ -131,21 +264,22 @@ def assert_same(table: MaskTable, expected: MaskTable) -> None:
         np.testing.assert_array_equal(getattr(table, name), getattr(expected, name))
 
 
-@pytest.mark.parametrize("share", [0.0, 0.3, 0.9])
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.9, 1.1])
 def test_a_table_on_disk_is_the_table_in_memory(gaussians: Gaussians, expected: MaskTable, share: float) -> None:
     nbytes = sum(getattr(expected, name).nnz for name in MATRICES) * 8
-    store = TableStore(len(gaussians), memory=share * nbytes)
-    table = mask_table(gaussians, views(), NEAR, store=store)
-    assert store.on_disk
-    assert all(in_file(getattr(table, name).data) and in_file(getattr(table, name).indices) for name in MATRICES)
+    with WorkFolder.open(None) as work:
+        work.hold(share * nbytes, np.inf)
+        table = mask_table(gaussians, views(), NEAR, work=work, most_in_memory=share * nbytes)
+    for name in MATRICES:
+        matrix = getattr(table, name)
+        assert in_file(matrix.data) == in_file(matrix.indices) == (share < 1)
     assert_same(table, expected)
 
 
-def test_a_table_within_its_memory_touches_no_disk(gaussians: Gaussians, tmp_path: Path) -> None:
-    store = TableStore(len(gaussians), folder=tmp_path / "work")
-    table = mask_table(gaussians, views(), NEAR, store=store)
-    assert not store.on_disk
-    assert not any(in_file(getattr(table, name).data) for name in MATRICES)
+def test_a_short_fit_writes_no_file(tmp_path: Path) -> None:
+    with WorkFolder.open(tmp_path / "work") as work:
+        prepare(boxes_on_a_table().scene, work=work)
+        assert kept_files(tmp_path / "work") == 0
     assert not (tmp_path / "work").exists()
 
 
@@ -154,68 +288,53 @@ def test_indices_are_of_four_bytes(expected: MaskTable) -> None:
     assert {getattr(expected, name).indices.dtype for name in MATRICES} == {np.dtype(np.int32)}
 
 
-class Killed(BaseException):
-    """What Ctrl-C raises is no Exception either."""
-
-
 def killed_after(count: int, of: list[View]) -> Iterator[View]:
     yield from of[:count]
     raise Killed
 
 
-def store_in(folder: Path, gaussians: Gaussians, key: str = "key") -> TableStore:
-    return TableStore(len(gaussians), folder=folder, key=key, keep_after_s=-1)
-
-
 def interrupted(folder: Path, gaussians: Gaussians, after: int = 4) -> int:
     """A table that is killed; how many views it keeps."""
-    with pytest.raises(Killed):
-        mask_table(gaussians, killed_after(after, views()), NEAR, store=store_in(folder, gaussians), at_once=1)
-    return kept_views(folder)
+    with pytest.raises(Killed), WorkFolder.open(folder) as work:
+        mask_table(gaussians, killed_after(after, views()), NEAR, work=work, side_by_side=1)
+    return kept_files(folder)
+
+
+def resumed(folder: Path, gaussians: Gaussians, of: list[View]) -> MaskTable:
+    with WorkFolder.open(folder) as work:
+        return mask_table(gaussians, of, NEAR, work=work, side_by_side=1)
 
 
 def rendered(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """Ids of the masks of every view that is rendered from now on."""
-    import og_pointcloud.fitting.mask_table as module
-
+    """Numbers of masks of every view that is rendered from now on."""
     counts: list[int] = []
-    plain = module.view_weights
+    plain = mask_table_module.view_weights
 
     def counting(*arguments: object, **options: object) -> object:
         counts.append(arguments[3])  # type: ignore[arg-type]
         return plain(*arguments, **options)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(module, "view_weights", counting)
+    monkeypatch.setattr(mask_table_module, "view_weights", counting)
     return counts
 
 
 def test_a_killed_table_goes_on_where_it_was(
     gaussians: Gaussians, expected: MaskTable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert interrupted(tmp_path, gaussians) == 4
+    assert interrupted(tmp_path / "work", gaussians, 2) == 2
+    assert interrupted(tmp_path / "work", gaussians, 4) == 4
     counts = rendered(monkeypatch)
-    store = store_in(tmp_path, gaussians)
-    table = mask_table(gaussians, views(), NEAR, store=store, at_once=1)
-    assert_same(table, expected)
+    assert_same(resumed(tmp_path / "work", gaussians, views()), expected)
     assert counts == [2, 6, 1]
-    assert store.resumed == 4
-    remove_work(tmp_path)
-    assert not tmp_path.exists()
-    assert_same(table, expected)  # mapped files outlive their names
+    assert not (tmp_path / "work").exists()
 
 
-def test_a_killed_table_that_was_killed_again(gaussians: Gaussians, expected: MaskTable, tmp_path: Path) -> None:
-    assert interrupted(tmp_path, gaussians, 2) == 2
-    assert interrupted(tmp_path, gaussians, 5) == 5
-    assert_same(mask_table(gaussians, views(), NEAR, store=store_in(tmp_path, gaussians)), expected)
-
-
-@pytest.mark.parametrize("change", ["pose", "masks", "count", "order"])
-def test_views_that_changed_are_rendered_again(
-    gaussians: Gaussians, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, change: str
+@pytest.mark.parametrize(("change", "again"), [("pose", 1), ("masks", 1), ("count", 1), ("order", 0), ("fewer", 0)])
+def test_only_views_that_changed_are_rendered_again(
+    gaussians: Gaussians, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, change: str, again: int
 ) -> None:
-    interrupted(tmp_path, gaussians)
-    changed = views()
+    interrupted(tmp_path, gaussians, 5)
+    changed = views(5)
     if change == "pose":
         pose = np.eye(4)
         pose[2, 3] = 0.1
@@ -227,82 +346,32 @@ def test_views_that_changed_are_rendered_again(
     elif change == "count":  # one mask more, without a pixel
         changed[1] = replace(changed[1], mask_features=np.ones((4, 8), np.float32))
     else:
-        changed = [changed[0], *changed[:0:-1]]
+        changed = changed[::-1] if change == "order" else changed[:3]
     counts = rendered(monkeypatch)
-    table = mask_table(gaussians, changed, NEAR, store=store_in(tmp_path, gaussians), at_once=1)
-    assert counts == [view.mask_count for view in changed[1:]]
-    monkeypatch.undo()
+    table = resumed(tmp_path, gaussians, changed)
+    assert len(counts) == again
     assert_same(table, mask_table(gaussians, changed, NEAR))
 
 
-def test_fewer_views_than_were_kept(gaussians: Gaussians, tmp_path: Path) -> None:
-    interrupted(tmp_path, gaussians, 5)
-    table = mask_table(gaussians, views(3), NEAR, store=store_in(tmp_path, gaussians))
-    assert_same(table, mask_table(gaussians, views(3), NEAR))
-
-
-def test_rows_of_another_geometry_are_not_taken(gaussians: Gaussians, tmp_path: Path) -> None:
-    thickness = np.full(len(gaussians), 0.1, np.float32)
-    key = table_key(gaussians, NEAR, thickness)
-    assert key == table_key(gaussians, NEAR, thickness.copy())
-    moved = replace(gaussians, xyz=gaussians.xyz + np.float32(0.01))
-    keys = [
-        table_key(moved, NEAR, thickness),
-        table_key(gaussians, 2 * NEAR, thickness),
-        table_key(gaussians, NEAR, 2 * thickness),
-        table_key(replace(gaussians, opacity=gaussians.opacity / 2), NEAR, thickness),
-    ]
-    assert len({key, *keys}) == 5
-    interrupted(tmp_path, gaussians)
-    store = store_in(tmp_path, moved, key)
-    assert store.marks == []
-    assert_same(mask_table(moved, views(), NEAR, store=store), mask_table(moved, views(), NEAR))
-
-
-@pytest.mark.parametrize(
-    "damage", ["short", "column out of range", "negative column", "infinite", "lengths", "no json", "no file", "counts"]
-)
-def test_a_damaged_work_folder_is_started_over(
-    gaussians: Gaussians, expected: MaskTable, tmp_path: Path, damage: str
+@pytest.mark.parametrize("change", ["xyz", "opacity", "near", "thickness", "cutoffs"])
+def test_views_of_another_geometry_are_not_taken(
+    gaussians: Gaussians, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, change: str
 ) -> None:
     interrupted(tmp_path, gaussians)
-    indices, data, lengths = (tmp_path / f"weights.{part}" for part in ("indices", "data", "lengths"))
-    if damage == "short":
-        data.write_bytes(data.read_bytes()[:-4])
-    elif damage in ("column out of range", "negative column"):
-        values = np.fromfile(indices, np.int32)
-        values[10] = len(gaussians) if damage == "column out of range" else -1
-        values.tofile(indices)
-    elif damage == "infinite":
-        values = np.fromfile(data, np.float32)
-        values[10] = np.inf
-        values.tofile(data)
-    elif damage == "lengths":
-        values = np.fromfile(lengths, np.int32)
-        values[2] = -values[2]
-        values.tofile(lengths)
-    elif damage == "no json":
-        (tmp_path / PROGRESS).write_text("{")
-    elif damage == "no file":
-        indices.unlink()
-    else:
-        progress = json.loads((tmp_path / PROGRESS).read_text())
-        (tmp_path / PROGRESS).write_text(json.dumps({**progress, "masks": ["5"] * 4}))
-    store = store_in(tmp_path, gaussians)
-    assert store.marks == []
-    assert_same(mask_table(gaussians, views(), NEAR, store=store), expected)
+    counts = rendered(monkeypatch)
+    options = {
+        "thickness": {"thickness": np.full(len(gaussians), 0.1, np.float32)},
+        "cutoffs": {"cutoffs": mask_table_module.Cutoffs(0.1, 0.1)},
+    }
+    if change in ("xyz", "opacity"):
+        gaussians = replace(gaussians, **{change: getattr(gaussians, change) * np.float32(0.9)})
+    with WorkFolder.open(tmp_path) as work:
+        near = 2 * NEAR if change == "near" else NEAR
+        mask_table(gaussians, views(), near, work=work, side_by_side=1, **options.get(change, {}))  # type: ignore[arg-type]
+    assert len(counts) == 7
 
 
-def test_a_full_disk_is_one_clear_error(gaussians: Gaussians, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full() -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("og_pointcloud.fitting.table_store.scratch_file", full)
-    with pytest.raises(OgPointcloudError, match=r"no room for the mask table.*No space left.*larger disk"):
-        mask_table(gaussians, views(), NEAR, store=TableStore(len(gaussians), memory=0))
-
-
-# Stages after the table --------------------------------------------------------------------------------------------
+# Fits ------------------------------------------------------------------------------------------------------------
 
 
 def test_a_fit_in_little_memory_gives_the_same_bits() -> None:
@@ -316,9 +385,8 @@ def test_a_fit_in_little_memory_gives_the_same_bits() -> None:
 
 
 def test_what_follows_from_a_table_on_disk_is_on_disk() -> None:
-    prepared = prepare(boxes_on_a_table().scene, TIGHT)
-    testimony = hear_views(prepared.table)
-    matrices = (prepared.table.weights, prepared.table.outside, prepared.table.exposure, *vars(testimony).values())
+    table = prepare(boxes_on_a_table().scene, TIGHT).table
+    matrices = (table.weights, table.outside, table.exposure, *vars(view_votes(table)).values())
     assert all(in_file(matrix.data) and in_file(matrix.indices) for matrix in matrices)
 
 
@@ -330,7 +398,7 @@ def test_points_decided_a_few_at_a_time_are_decided_alike(monkeypatch: pytest.Mo
     exposure = random_array((4, 100), density=0.9, rng=np.random.default_rng(0), format="csr", dtype=np.float32)
     exposure.data += np.float32(0.01)
     table = replace(table, exposure=csr_array(table.exposure.maximum(exposure)))
-    arguments = (table, hear_views(table), groups([0, 1, 0, 1]), around, MembershipSettings())
+    arguments = (table, view_votes(table), groups([0, 1, 0, 1]), around, MembershipSettings())
     at_once = assign_points(*arguments)
     monkeypatch.setattr(membership, "ENTRIES_AT_ONCE", 40)
     few = assign_points(*arguments)
@@ -338,23 +406,57 @@ def test_points_decided_a_few_at_a_time_are_decided_alike(monkeypatch: pytest.Mo
         np.testing.assert_array_equal(getattr(few, name), value)
 
 
-def test_a_fit_goes_on_from_its_work_folder_and_removes_it(tmp_path: Path) -> None:
+def test_a_fit_goes_on_from_its_work_folder_and_removes_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     scene = boxes_on_a_table().scene
     settings = FitSettings(visibility=VisibilitySettings(keep_after_s=-1))
-    prepare(scene, settings, work=tmp_path / "work")
-    assert kept_views(tmp_path / "work") == len(scene.views)
+    with killed_run(tmp_path / "work") as work:
+        prepare(scene, settings, work=work)
+    assert kept_files(tmp_path / "work", "view") == len(scene.views)
+    counts = rendered(monkeypatch)
     cloud = fit(scene, settings, progress=False, work=tmp_path / "work")
-    assert any("rendering of 8 views" in entry["what"] for entry in cloud.provenance["left_out"])
+    assert counts == []
+    assert {
+        name: value
+        for name, value in next(e for e in cloud.provenance["left_out"] if e["key"] == "rendering").items()
+        if name in ("key", "count")
+    } == {"key": "rendering", "count": 8}
     np.testing.assert_array_equal(cloud.instance_ids, fit(scene, progress=False).instance_ids)
     assert not (tmp_path / "work").exists()
 
 
-def test_removing_a_work_folder_leaves_what_others_put_there(tmp_path: Path, gaussians: Gaussians) -> None:
-    interrupted(tmp_path, gaussians)
-    (tmp_path / "notes.txt").write_text("mine")
-    remove_work(tmp_path)
-    assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
-    remove_work(tmp_path / "missing")
+SLOW_FIT = """
+import sys, time
+import og_pointcloud as og
+from og_pointcloud.fitting import mask_table
+from og_pointcloud.settings import VisibilitySettings
+plain = mask_table._view_arrays
+def slow(*arguments):
+    time.sleep(0.5)
+    return plain(*arguments)
+mask_table._view_arrays = slow
+settings = og.FitSettings(visibility=VisibilitySettings(keep_after_s=0, views_share=0))
+og.fit(og.read_capture(sys.argv[1]), settings, work=sys.argv[2], progress=False)
+"""
+
+
+@pytest.mark.slow
+def test_a_fit_killed_in_the_middle_goes_on_and_gives_the_same_bits(tiny_capture: TinyCapture, tmp_path: Path) -> None:
+    work = tmp_path / "work"
+    process = subprocess.Popen([sys.executable, "-c", SLOW_FIT, str(tiny_capture.folder), str(work)])
+    while kept_files(work, "view") < 2 and process.poll() is None:
+        time.sleep(0.05)
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    kept = kept_files(work, "view")
+    assert 2 <= kept < 6
+    scene = og.read_capture(tiny_capture.folder)
+    cloud = og.fit(scene, work=work, progress=False)
+    assert [entry["count"] for entry in cloud.provenance["left_out"] if entry["key"] == "rendering"] == [kept]
+    whole = og.fit(scene, progress=False)
+    np.testing.assert_array_equal(cloud.instance_ids, whole.instance_ids)
+    np.testing.assert_array_equal(cloud.instances.descriptors, whole.instances.descriptors)
+    np.testing.assert_array_equal(cloud.certainty, whole.certainty)
+    assert not work.exists()
 
 
 def test_memory_of_a_fit_is_refused_before_any_work(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

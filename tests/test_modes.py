@@ -1,8 +1,9 @@
-"""The roads from masks to instances, on boxes whose truth is known, and the choice between them."""
+"""The modes from masks to instances, on boxes whose truth is known, and the choice between them."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from string import Formatter
 from typing import get_args, get_type_hints
 
 import numpy as np
@@ -12,9 +13,9 @@ from test_fit import BOXES, boxes_on_a_table
 
 from og_pointcloud.cloud import BACKGROUND, UNOBSERVED, InstanceTable, LabelledCloud
 from og_pointcloud.fitting.fit import fit, prepare
-from og_pointcloud.fitting.labellers import Labelling, by_choice, by_features, by_grouping, mask_agreement
+from og_pointcloud.fitting.labellers import LABELLERS, Labelling, auto, fast, grouping, mask_agreement
 from og_pointcloud.fitting.mask_table import MaskTable
-from og_pointcloud.journal import Journal
+from og_pointcloud.journal import SENTENCES, Journal, LeftOut, left_out_entry
 from og_pointcloud.settings import CodebookSettings, FitSettings, MatchingSettings, PaperSettings
 
 MODES = get_args(get_type_hints(FitSettings)["mode"])
@@ -61,7 +62,7 @@ def test_ids_are_the_same_on_every_run(mode: str) -> None:
 def test_paper_mode_draws_points_as_full_as_trained_gaussians() -> None:
     """Each rendered alone must cover its pixels; Gaussians of a file stay as they are."""
     scene = boxes_on_a_table().scene
-    full = prepare(scene, FitSettings(mode="paper"))
+    full = prepare(scene, FitSettings(mode="paper")).surface
     np.testing.assert_allclose(full.gaussians.scale, np.repeat(0.7 * full.neighbourhood.spacing[:, None], 3, axis=1))
     np.testing.assert_allclose(full.gaussians.opacity, 0.95)
     own = {
@@ -69,7 +70,7 @@ def test_paper_mode_draws_points_as_full_as_trained_gaussians() -> None:
         "rotation": full.gaussians.rotation,
         "opacity": full.gaussians.opacity / 2,
     }
-    trained = prepare(replace(scene, points=replace(scene.points, **own)), FitSettings(mode="paper"))
+    trained = prepare(replace(scene, points=replace(scene.points, **own)), FitSettings(mode="paper")).surface
     np.testing.assert_array_equal(trained.gaussians.scale, own["scale"])
     np.testing.assert_array_equal(trained.gaussians.opacity, own["opacity"])
 
@@ -79,11 +80,11 @@ def test_literal_leaves_know_no_background() -> None:
     known = boxes_on_a_table()
     prepared = prepare(known.scene)
     settings = FitSettings(matching=MatchingSettings(settle=False))
-    literal = by_features(known.scene, prepared, settings, Journal(False))
+    literal = fast(prepared.table, prepared.surface, settings, Journal(False))
     shown = np.asarray(prepared.table.weights.sum(axis=0)).ravel() > 0
     np.testing.assert_array_equal(literal.instance_ids >= 0, shown)
     assert (literal.instance_ids[~shown] == UNOBSERVED).all()
-    settled = by_features(known.scene, prepared, FitSettings(), Journal(False))
+    settled = fast(prepared.table, prepared.surface, FitSettings(), Journal(False))
     assert (settled.instance_ids[known.truth == BOXES] == BACKGROUND).mean() > 0.5
 
 
@@ -126,11 +127,11 @@ def test_mask_agreement_by_hand() -> None:
 def test_auto_learns_nothing_where_grouping_explains_the_masks() -> None:
     known = boxes_on_a_table()
     prepared, journal = prepare(known.scene), Journal(False)
-    chosen = by_choice(known.scene, prepared, FitSettings(), journal)
-    grouped = by_grouping(known.scene, prepared, FitSettings(), Journal(False))
+    chosen = auto(prepared.table, prepared.surface, FitSettings(), journal)
+    grouped = grouping(prepared.table, prepared.surface, FitSettings(), Journal(False))
     np.testing.assert_array_equal(chosen.instance_ids, grouped.instance_ids)
     assert list(journal.notes["mask_agreement"]) == ["grouping"]
-    assert journal.left_out[-1]["what"] == "learned features and codebook"
+    assert journal.left_out[-1][0] is LeftOut.LEARNING_NOT_NEEDED
 
 
 @pytest.mark.parametrize("lead", [-1.0, 1.0])
@@ -139,12 +140,29 @@ def test_auto_takes_what_agrees_with_the_masks(lead: float) -> None:
     known = boxes_on_a_table()
     prepared, journal = prepare(known.scene), Journal(False)
     settings = FitSettings(agreement_enough=2.0, agreement_lead=lead)
-    chosen = by_choice(known.scene, prepared, settings, journal)
-    road = by_features if lead < 0 else by_grouping
-    expected = road(known.scene, prepared, settings, Journal(False))
+    chosen = auto(prepared.table, prepared.surface, settings, journal)
+    labeller = fast if lead < 0 else grouping
+    expected = labeller(prepared.table, prepared.surface, settings, Journal(False))
     np.testing.assert_array_equal(chosen.instance_ids, expected.instance_ids)
     assert set(journal.notes["mask_agreement"]) == {"grouping", "fast"}
-    assert ("grouping" in journal.left_out[-1]["what"]) == (lead < 0)
+    key, numbers = journal.left_out[-1]
+    assert key is (LeftOut.GROUPED_INSTANCES if lead < 0 else LeftOut.LEARNED_INSTANCES)
+    assert journal.notes["mask_agreement"]["fast"] == pytest.approx(numbers["learned"], abs=1e-4)
+
+
+def test_every_mode_has_its_labeller() -> None:
+    assert tuple(LABELLERS) == MODES
+
+
+@pytest.mark.parametrize("key", LeftOut)
+def test_whatever_is_left_out_has_its_sentences(key: LeftOut) -> None:
+    """Told whole numbers, as a journal may be."""
+    names = [name for text in SENTENCES[key] for _, name, _, _ in Formatter().parse(text) if name]
+    entry = left_out_entry(key, **dict.fromkeys(names, 7))
+    assert entry["key"] == key.value
+    assert entry["what"]
+    assert entry["why"]
+    assert [entry[name] for name in names] == [7] * len(names)
 
 
 def test_paper_mode_says_how_long_the_published_schedule_would_take() -> None:

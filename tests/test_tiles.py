@@ -18,7 +18,9 @@ from og_pointcloud.errors import OgPointcloudError, SceneError
 from og_pointcloud.fitting import tiles
 from og_pointcloud.fitting.fit import fit
 from og_pointcloud.fitting.mask_table import mask_table
-from og_pointcloud.fitting.tiles import fit_tiles, split
+from og_pointcloud.fitting.memory import memory_in_use
+from og_pointcloud.fitting.tiles import split
+from og_pointcloud.fitting.work_folder import kept_files
 from og_pointcloud.scene import Camera, Points, Scene, View
 from og_pointcloud.settings import FitSettings, GeometrySettings, VisibilitySettings
 
@@ -47,7 +49,7 @@ def whole() -> LabelledCloud:
 
 @lru_cache
 def tiled(most: int) -> LabelledCloud:
-    return fit_tiles(street().scene, SETTINGS, points_per_tile=most, progress=False)
+    return fit(street().scene, replace(SETTINGS, tile_points=most), progress=False)
 
 
 @pytest.mark.parametrize("most", [1, 7, 100, 999, 5000])
@@ -84,7 +86,7 @@ def test_coincident_points_stay_together():
 
 def test_one_tile_is_the_fit_itself(monkeypatch):
     monkeypatch.setattr(tiles, "FINEST_PX", 1e-6)
-    cloud = fit_tiles(street().scene, SETTINGS, points_per_tile=POINTS, progress=False)
+    cloud = fit(street().scene, replace(SETTINGS, tile_points=POINTS), progress=False)
     assert len(whole().instances) > 20
     np.testing.assert_array_equal(cloud.instance_ids, whole().instance_ids)
     for name in ("points", "views", "masks", "whole", "descriptor_instance"):
@@ -150,7 +152,7 @@ def test_the_order_of_points_does_not_matter():
     order = np.random.default_rng(2).permutation(POINTS)
     points = made.scene.points
     shuffled = replace(made.scene, points=Points(points.xyz[order], points.origin, points.rgb[order]))
-    cloud = fit_tiles(shuffled, SETTINGS, points_per_tile=POINTS // 4, progress=False)
+    cloud = fit(shuffled, replace(SETTINGS, tile_points=POINTS // 4), progress=False)
     assert agreement(tiled(POINTS // 4).instance_ids[order], cloud.instance_ids) > 0.999
 
 
@@ -174,7 +176,7 @@ def test_what_stands_in_another_tile_hides_what_is_behind_it():
     cut = split(scene.points.xyz, 1600)
     assert [set(scene.points.xyz[cut.order[cut.part(tile)], 2].tolist()) for tile in range(2)] == [{2.0}, {6.0}]
     full = FitSettings(geometry=GeometrySettings(scales=(1.0,), start_scale=1.0, start_opacity=0.95, mask_share=1.0))
-    cloud = fit_tiles(scene, full, points_per_tile=1600, progress=False)
+    cloud = fit(scene, replace(full, tile_points=1600), progress=False)
     assert (cloud.instance_ids[:1600] == 0).mean() > 0.7  # the rest is outside the images
     assert (cloud.instance_ids[1600:] < 0).all()
 
@@ -234,10 +236,10 @@ def test_an_interrupted_fit_goes_on_behind_its_last_view(tmp_path, monkeypatch):
     work = tmp_path / "work"
     monkeypatch.setattr(tiles, "_entries", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        fit_tiles(street().scene, SETTINGS, points_per_tile=POINTS // 4, work=work, progress=False)
-    assert tiles.kept_views(work) == 5
+        fit(street().scene, replace(SETTINGS, tile_points=POINTS // 4), work=work, progress=False)
+    assert kept_files(work, "view") == 5
     monkeypatch.setattr(tiles, "_entries", lambda view, *rest: rendered.append(view.name) or real(view, *rest))
-    cloud = fit_tiles(street().scene, SETTINGS, points_per_tile=POINTS // 4, work=work, progress=False)
+    cloud = fit(street().scene, replace(SETTINGS, tile_points=POINTS // 4), work=work, progress=False)
     assert rendered == [view.name for view in street().scene.views]
     np.testing.assert_array_equal(cloud.instance_ids, tiled(POINTS // 4).instance_ids)
     assert not work.exists()
@@ -246,16 +248,16 @@ def test_an_interrupted_fit_goes_on_behind_its_last_view(tmp_path, monkeypatch):
 def test_another_scene_takes_up_nothing(tmp_path, monkeypatch):
     work = tmp_path / "work"
     scene = two_walls()
-    monkeypatch.setattr(tiles, "_settle", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+    monkeypatch.setattr(tiles, "_decide", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
     with pytest.raises(KeyboardInterrupt):
-        fit_tiles(scene, SETTINGS, points_per_tile=1600, work=work, progress=False)
+        fit(scene, replace(SETTINGS, tile_points=1600), work=work, progress=False)
     before = set(work.iterdir())
     masks = [np.where(np.arange(60) < 30, -1, view.mask_map()).astype(np.int32) for view in scene.views]
     other = replace(scene, views=tuple(replace(v, masks=m) for v, m in zip(scene.views, masks, strict=True)))
     moved = replace(scene, points=Points(scene.points.xyz + np.float32(0.01), np.zeros(3)))
     for changed, new in ((other, 3), (moved, 2 + 3)):
         with pytest.raises(KeyboardInterrupt):
-            fit_tiles(changed, SETTINGS, points_per_tile=1600, work=work, progress=False)
+            fit(changed, replace(SETTINGS, tile_points=1600), work=work, progress=False)
         assert len(set(work.iterdir()) - before) == new
         before = set(work.iterdir())
 
@@ -263,24 +265,32 @@ def test_another_scene_takes_up_nothing(tmp_path, monkeypatch):
 def test_bad_use_is_told_at_the_door():
     scene = two_walls()
     with pytest.raises(OgPointcloudError, match=r'mode is "fast".*expected "auto" or "grouping"'):
-        fit_tiles(scene, FitSettings(mode="fast"), points_per_tile=1600)
+        fit(scene, FitSettings(mode="fast", tile_points=1600))
     bare = tuple(
         replace(view, mask_features=np.zeros((0, 4), np.float32), masks=view.mask_map() - 1) for view in scene.views
     )
     with pytest.raises(SceneError, match="has a mask"):
-        fit_tiles(replace(scene, views=bare), points_per_tile=1600)
+        fit(replace(scene, views=bare), FitSettings(tile_points=1600), progress=False)
     behind = replace(scene, points=Points(-scene.points.xyz, np.zeros(3)))
     with pytest.raises(SceneError, match="no camera sees the cloud"):
-        fit_tiles(behind, points_per_tile=1600, progress=False)
-    with pytest.raises(OgPointcloudError, match="give it more memory"):
-        fit_tiles(scene, FitSettings(memory=64_000_000), progress=False)
+        fit(behind, FitSettings(tile_points=1600), progress=False)
+    with pytest.raises(OgPointcloudError, match="tile_points is 0; expected at least 1"):
+        FitSettings(tile_points=0)
 
 
-def test_tiles_are_needed_where_memory_is_short():
-    scene = two_walls()
+def test_a_fit_is_in_tiles_where_memory_is_short_and_they_help(monkeypatch):
+    scene, tight = two_walls(), FitSettings(memory=64_000_000)
+    assert not tiles.needs_tiles(scene, tight)  # no larger than the smallest tile
+    monkeypatch.setattr(tiles, "LEAST_TILE", 1000)
     assert not tiles.needs_tiles(scene, FitSettings())
-    assert tiles.needs_tiles(scene, FitSettings(memory=64_000_000))
-    assert not tiles.needs_tiles(scene, FitSettings(memory=64_000_000, mode="paper"))
+    assert not tiles.needs_tiles(scene, replace(tight, mode="paper"))
+    assert tiles.needs_tiles(scene, tight)
+    with pytest.raises(OgPointcloudError, match="give it more memory"):
+        fit(scene, tight, progress=False)
+    monkeypatch.setattr(tiles, "memory_left", lambda limit: 3_000_000)
+    cloud = fit(scene, tight, progress=False)
+    assert cloud.provenance["left_out"][0]["key"] == "whole fit"
+    assert cloud.provenance["notes"]["tiles"] == [800] * 4
 
 
 def test_settings_of_rendering_count_in_tiles_too(monkeypatch):
@@ -289,14 +299,14 @@ def test_settings_of_rendering_count_in_tiles_too(monkeypatch):
     settings = replace(SETTINGS, visibility=rendering)
     again = tuple(replace(view, name=f"{view.name} again") for view in street().scene.views)
     scene = replace(street().scene, views=street().scene.views + again)
-    cloud = fit_tiles(scene, settings, points_per_tile=POINTS, progress=False)
+    cloud = fit(scene, replace(settings, tile_points=POINTS), progress=False)
     np.testing.assert_array_equal(cloud.instance_ids, fit(scene, settings, progress=False).instance_ids)
     assert cloud.provenance["left_out"][0]["what"] == "12 of 24 views"
 
 
 def test_memory_decides_the_tiles_in_few_steps():
     def most(points: int, memory: float) -> int:
-        used = tiles.memory_in_use()
+        used = memory_in_use()
         return tiles._points_per_tile(points, FitSettings(memory=int(memory) + used))
 
     assert most(20_000_000, 12e9) == 2_000_000

@@ -15,7 +15,7 @@ from scipy.sparse import csr_array
 
 from og_pointcloud.errors import SceneError
 from og_pointcloud.fitting.mask_table import Cutoffs, Gaussians, mask_table, pixel_weights, render, view_weights
-from og_pointcloud.fitting.view_votes import hear_views
+from og_pointcloud.fitting.view_votes import view_votes
 from og_pointcloud.scene import Camera, Points, View
 
 NEAR = 0.25
@@ -453,7 +453,7 @@ def test_huge_splats_have_a_word(random: Generator) -> None:
     table = mask_table(huge, [view_of(camera())], NEAR)
     assert table.exposure.nnz > 0
     assert (table.exposure.data > 0).all()
-    assert np.isfinite(hear_views(table).inside.data).all()
+    assert np.isfinite(view_votes(table).in_mask.data).all()
 
 
 def test_table_is_the_views_stacked(random: Generator) -> None:

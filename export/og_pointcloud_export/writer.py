@@ -15,13 +15,13 @@ from numpy.typing import NDArray
 
 from og_pointcloud.bundle.format import FORMAT, SCHEMA_VERSION, describe_member
 from og_pointcloud.bundle.nearest import NONE_WITHIN_REACH, NearestPoint
+from og_pointcloud.bundle.scene_words import bank_of_encoder
 from og_pointcloud.bundle.vocabulary import bank_members, encoder_members, vocabulary_members
 from og_pointcloud.cloud import TOO_FAR, InstanceTable, LabelledCloud
 from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.formats.atomic import replacing
 from og_pointcloud.formats.npy import npy_bytes
 from og_pointcloud.models import open_session
-from og_pointcloud.text.encoder import find_encoder, read_text_encoder
 from og_pointcloud_export.lookup_grid import LookupGrid, build_lookup_grid
 from og_pointcloud_export.query_graph import OPSET, build_query_graph
 
@@ -52,9 +52,8 @@ def write_bundle(
     another feature space: then nothing is written.
     """
     path = Path(path)
-    encoder = find_encoder(cloud.feature_space) if text_encoder is None else read_text_encoder(text_encoder)
-    if cloud.word_bank is None and encoder is not None and encoder.feature_space == cloud.feature_space:
-        cloud = replace(cloud, word_bank=encoder.word_bank)
+    if cloud.word_bank is None:
+        cloud = replace(cloud, word_bank=bank_of_encoder(cloud.space, text_encoder))
     model = query_model(cloud)
     members = {"query.onnx": model.onnx} | {
         f"arrays/{name}.npy": npy_bytes(array) for name, array in _arrays(cloud).items()

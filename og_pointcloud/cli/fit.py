@@ -9,12 +9,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args, get_type_hints
 
 from og_pointcloud.cli.common import add_command, check_outputs, describe_fit, print_fit, timed, write_json
-from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError
+from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.settings import FitSettings, PaperSettings
 
 if TYPE_CHECKING:
-    from og_pointcloud.cloud import LabelledCloud, Vocabulary, WordBank
-    from og_pointcloud.scene import Scene
+    from og_pointcloud.cloud import LabelledCloud
 
 MODES = get_args(get_type_hints(FitSettings)["mode"])
 MASK_LEVELS = ("default", "small", "medium", "large")
@@ -28,7 +27,7 @@ def add(commands: Any) -> None:
     parser.add_argument("capture", type=Path, metavar="CAPTURE", help="folder with poses, masks and mask features")
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="S.ogpc", help="the file to write")
     parser.add_argument("--gaussians", type=Path, metavar="F.ply", help="geometry, in place of the capture's own")
-    parser.add_argument("--mode", choices=MODES, default="auto", help="which road to take (default: %(default)s)")
+    parser.add_argument("--mode", choices=MODES, default="auto", help="how to find instances (default: %(default)s)")
     parser.add_argument(
         "--schedule-share", type=float, metavar="X", help="shorten the published schedule (mode paper; default: 1)"
     )
@@ -73,24 +72,27 @@ def run(arguments: argparse.Namespace) -> None:
     settings = fit_settings(arguments)
     from og_pointcloud_export import write_bundle
 
-    from og_pointcloud.fitting import table_store, tiles
+    from og_pointcloud.bundle.scene_words import scene_words
+    from og_pointcloud.cloud import FeatureSpace
+    from og_pointcloud.fitting.fit import fit
+    from og_pointcloud.fitting.work_folder import kept_files
     from og_pointcloud.formats.capture import read_capture
 
     stages: list[dict[str, Any]] = []
     with timed(stages, "read capture"):
         scene = read_capture(arguments.capture, gaussians=arguments.gaussians, mask_level=arguments.mask_level)
-        vocabulary, left_out = vocabulary_for(scene, arguments)
-        bank = word_bank_for(scene, arguments.word_bank)
+        space = FeatureSpace(scene.feature_space, scene.feature_width)
+        asked = {"text_features": arguments.vocabulary, "word_bank": arguments.word_bank}
+        words = scene_words(space, **asked, capture=arguments.capture)
     work = arguments.work or arguments.output.with_name(f"{arguments.output.name}.work")
     try:
-        cloud = labelled(scene, settings, arguments.tile_points, work)
+        cloud = words.added_to(fit(scene, settings, work=work))
     except KeyboardInterrupt:
-        if views := table_store.kept_views(work) or tiles.kept_views(work):
+        if views := kept_files(work, "view"):
             print(f"{views} views are kept in '{work}': the same command goes on behind them", file=sys.stderr)
         raise
     stages += cloud.provenance["stages"]
-    provenance = {**cloud.provenance, "stages": stages, "left_out": [*cloud.provenance["left_out"], *left_out]}
-    cloud = replace(cloud, vocabulary=vocabulary, word_bank=bank, provenance=provenance)
+    cloud = replace(cloud, provenance={**cloud.provenance, "stages": stages})
     with timed(stages, "write file"):
         arguments.output.parent.mkdir(parents=True, exist_ok=True)
         write_bundle(cloud, arguments.output)
@@ -103,25 +105,10 @@ def run(arguments: argparse.Namespace) -> None:
     print_fit(report, cloud)
 
 
-def labelled(scene: Scene, settings: FitSettings, tile_points: int | None, work: Path) -> LabelledCloud:
-    """The scene fitted whole, or in tiles where that is asked for or needed."""
-    from og_pointcloud.fitting.fit import fit
-    from og_pointcloud.fitting.tiles import fit_tiles, needs_tiles
-
-    progress = sys.stderr.isatty()
-    if tile_points is None and not needs_tiles(scene, settings):
-        return fit(scene, settings, progress=progress, work=work)
-    if tile_points is None:
-        print(
-            f"{len(scene.points):,} points are more than one fit holds in memory: fitted in tiles; --memory or "
-            "--tile-points would say how large",
-            file=sys.stderr,
-        )
-    return fit_tiles(scene, settings, points_per_tile=tile_points, work=work, progress=progress)
-
-
 def fit_settings(arguments: argparse.Namespace) -> FitSettings:
-    settings = FitSettings(mode=arguments.mode, seed=arguments.seed, memory=arguments.memory)
+    settings = FitSettings(
+        mode=arguments.mode, seed=arguments.seed, memory=arguments.memory, tile_points=arguments.tile_points
+    )
     if arguments.schedule_share is None:
         return settings
     if arguments.mode != "paper":
@@ -145,47 +132,6 @@ def memory(text: str) -> int:
         return parse_memory(text)
     except OgPointcloudError as error:
         raise argparse.ArgumentTypeError(str(error)) from None
-
-
-def vocabulary_for(scene: Scene, arguments: argparse.Namespace) -> tuple[Vocabulary | None, list[dict[str, str]]]:
-    """Words for the bundle, and what was left out: those asked for, else the capture's own if their space fits."""
-    from og_pointcloud.text.text_features import read_text_features
-
-    path = arguments.vocabulary or arguments.capture / "text_features.npz"
-    if not arguments.vocabulary and not path.is_file():
-        return None, []
-    vocabulary, feature_space = read_text_features(path)
-    width = vocabulary.vectors.shape[1]
-    if feature_space == scene.feature_space and width == (scene.feature_width or width):
-        return vocabulary, []
-    why = (
-        f"{path} is of feature space '{feature_space}' (width {width}), the masks are of '{scene.feature_space}' "
-        f"(width {scene.feature_width}): encode the names with the masks' model"
-    )
-    if arguments.vocabulary:
-        raise FeatureSpaceError(why)
-    return None, [{"what": "vocabulary", "why": why}]
-
-
-def word_bank_for(scene: Scene, path: Path | None) -> WordBank | None:
-    """The bank asked for, else that of the encoder that is found for the scene, if any; checked before the fit."""
-    from og_pointcloud.bundle.vocabulary import read_bank
-    from og_pointcloud.text.encoder import find_encoder
-    from og_pointcloud.text.text_features import UNKNOWN_SPACE
-
-    if path is not None:
-        bank, feature_space = read_bank(path)
-    elif (encoder := find_encoder(scene.feature_space)) and encoder.word_bank:
-        path, bank, feature_space = Path(encoder.where), encoder.word_bank, encoder.feature_space
-    else:
-        return None
-    width, spaces = bank.vectors.shape[1], {feature_space, scene.feature_space}
-    if (len(spaces) > 1 and UNKNOWN_SPACE not in spaces) or width != (scene.feature_width or width):
-        raise FeatureSpaceError(
-            f"{path} is of feature space '{feature_space}' (width {width}), the masks are of '{scene.feature_space}' "
-            f"(width {scene.feature_width}): encode the words with the masks' model"
-        )
-    return bank
 
 
 def write_cloud(cloud: LabelledCloud, bundle: Path, path: Path) -> None:

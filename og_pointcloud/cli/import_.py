@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from og_pointcloud.cli.common import add_command, check_outputs, describe_fit, print_fit, timed
 
 if TYPE_CHECKING:
-    from og_pointcloud.cloud import LabelledCloud, Vocabulary
+    from og_pointcloud.cloud import LabelledCloud
 
 
 def add(commands: Any) -> None:
@@ -35,29 +35,18 @@ def run(arguments: argparse.Namespace) -> None:
     )
     from og_pointcloud_export import write_bundle
 
+    from og_pointcloud.bundle.scene_words import scene_words
     from og_pointcloud.fitting.opengaussian import read_opengaussian
 
     stages: list[dict[str, Any]] = []
     with timed(stages, "read result"):
         cloud = read_opengaussian(arguments.result, arguments.cluster_lang, feature_space=arguments.feature_space)
-        vocabulary = vocabulary_of(cloud, arguments.text_features)
-    cloud = replace(cloud, vocabulary=vocabulary, provenance={**cloud.provenance, "stages": stages})
+        cloud = scene_words(cloud.space, text_features=arguments.text_features).added_to(cloud)
+    cloud = replace(cloud, provenance={**cloud.provenance, "stages": stages})
     with timed(stages, "write file"):
         arguments.output.parent.mkdir(parents=True, exist_ok=True)
         write_bundle(cloud, arguments.output)
     print_import(describe_fit(cloud, arguments.result, arguments.output), cloud)
-
-
-def vocabulary_of(cloud: LabelledCloud, path: Path | None) -> Vocabulary | None:
-    """The words of a text-features file, None without one; FeatureSpaceError unless the cloud can be asked them."""
-    if path is None:
-        return None
-    from og_pointcloud.cloud import FeatureSpace
-    from og_pointcloud.text.text_features import read_text_features
-
-    vocabulary, feature_space = read_text_features(path)
-    cloud.space.require(FeatureSpace(feature_space, vocabulary.vectors.shape[1]), f"names of {path}")
-    return vocabulary
 
 
 def print_import(report: Mapping[str, Any], cloud: LabelledCloud) -> None:

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from og_pointcloud.fitting.labellers import Prepared
+from og_pointcloud.fitting.fit import Prepared
 from og_pointcloud.scene import Scene
 
 __all__ = ["BASELINES", "centre_sampling", "direct_uplift", "only_where_masked", "uplift"]
@@ -37,11 +37,11 @@ def direct_uplift(scene: Scene, prepared: Prepared, words: Words) -> Labels:
 
 def centre_sampling(scene: Scene, prepared: Prepared, words: Words) -> Labels:
     """Each point takes the word nearest to the mean of the mask features at its centre's pixel, by exposure."""
-    table, xyz = prepared.table, prepared.gaussians.xyz
-    first = np.searchsorted(table.mask_view, np.arange(len(scene.views)))
+    table, xyz = prepared.table, prepared.surface.gaussians.xyz
+    first = np.searchsorted(table.mask_view, np.arange(len(prepared.surface.scene.views)))
     similarity = table.unit_features @ _unit(words).T
     scores, reached = np.zeros((len(xyz), len(words))), np.zeros(len(xyz), bool)
-    for index, view in enumerate(scene.views):
+    for index, view in enumerate(prepared.surface.scene.views):
         exposure = csr_array(table.exposure[[index]])
         points, visible = exposure.indices, exposure.data
         uv_px, _ = view.camera.project(xyz[points])

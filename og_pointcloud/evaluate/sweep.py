@@ -37,15 +37,14 @@ from og_pointcloud.evaluate.truth import GT_NAME, Truth, read_truth
 from og_pointcloud.formats.atomic import replacing
 from og_pointcloud.formats.capture import read_capture
 from og_pointcloud.journal import Journal
-from og_pointcloud.scene import Points, Scene
+from og_pointcloud.scene import Scene
 from og_pointcloud.settings import FitSettings
 from og_pointcloud.text.text_features import read_text_features
 
 try:
     from og_pointcloud.evaluate.baselines import BASELINES, only_where_masked
-    from og_pointcloud.fitting.fit import fit, prepare
+    from og_pointcloud.fitting.fit import fit, fit_prepared, prepare
     from og_pointcloud.fitting.labellers import Labelling, mask_agreement
-    from og_pointcloud.rendering.geometry import distinct_places
 except ImportError as error:
     raise MissingExtraError("scipy and numba", "fit") from error
 
@@ -193,8 +192,6 @@ class _Trial:
         self.prepared = prepare(scene, journal=journal)
         self.shared_seconds = time.perf_counter() - start
         self.shared_left_out = tuple(journal.left_out)
-        # A whole fit labels coincident points once; from the table of all of them its result would differ.
-        self.can_share = scene.points.are_gaussians or len(distinct_places(scene.points.xyz)[0]) == len(scene.points)
 
     def row(self, setting: Setting) -> Row:
         """The row of one setting; settings that several tables name are run once."""
@@ -213,7 +210,7 @@ class _Trial:
             labels = method(self.subject.scene, self.prepared, self.subject.vocabulary.vectors)
             seconds = self.shared_seconds + time.perf_counter() - start
             for value, found in ((name, labels), (f"{name}, where masked", only_where_masked(labels, self.prepared))):
-                scores = self._scores(found)
+                scores = self._scores(self.prepared.surface.of_points(found))
                 yield Row(self.subject.name, BASELINE, value, seconds, seconds, 1, 1 - scores["miou"], **scores)
 
     def _measured(self, setting: Setting) -> Row:
@@ -225,7 +222,6 @@ class _Trial:
         scores = [self._scores(found) | self._of_instances(c) for found, c in zip(labels, clouds, strict=True)]
         mean: dict[str, Any] = {name: _mean([score[name] for score in scores]) for name in scores[0]}
         errors = [1 - score.get("miou", score["agreement"]) for score in scores]
-        shared = self.shared_left_out if self._shares(setting) else ()
         return Row(
             capture=self.subject.name,
             knob=setting.knob,
@@ -235,7 +231,7 @@ class _Trial:
             runs=self.seeds,
             error=float(np.mean(errors)),
             error_spread=float(np.std(errors, ddof=1)) if len(errors) > 1 else None,
-            left_out=(*shared, *clouds[0].provenance["left_out"]),
+            left_out=tuple(clouds[0].provenance["left_out"]),
             **mean,
         )
 
@@ -244,15 +240,18 @@ class _Trial:
         settings, scene = replace(setting.settings, seed=seed), self.subject.scene
         scene = replace(scene, views=scene.views[:: setting.every])
         self._warm_up(settings)
-        prepared = self.prepared if self._shares(setting) else None
         start = time.perf_counter()
-        cloud = fit(scene, settings, prepared=prepared, progress=False)
-        return time.perf_counter() - start + (self.shared_seconds if prepared else 0.0), cloud
+        if not self._shares(setting):
+            cloud = fit(scene, settings, progress=False)
+            return time.perf_counter() - start, cloud
+        journal = Journal(progress=False, left_out=list(self.shared_left_out))
+        cloud = fit_prepared(self.prepared, settings, journal)
+        return time.perf_counter() - start + self.shared_seconds, cloud
 
     def _shares(self, setting: Setting) -> bool:
         """Whether a setting changes nothing up to the mask table, and can take that over."""
         same_table = _before_table(setting.settings) == _before_table(DEFAULT.settings)
-        return self.can_share and same_table and setting.every == 1 and setting.settings.mode != "paper"
+        return same_table and setting.every == 1 and setting.settings.mode != "paper"
 
     def _warm_up(self, settings: FitSettings) -> None:
         """Fit two views of a few points in this mode: what they are labelled does not matter."""
@@ -260,11 +259,9 @@ class _Trial:
             return
         self.warm.add(settings.mode)
         scene = self.subject.scene
-        points, rows = scene.points, slice(None, None, 1 + len(scene.points) // WARM_UP_POINTS)
-        columns = {name: getattr(points, name) for name in ("rgb", "normals", "scale", "rotation", "opacity")}
-        kept = {name: None if column is None else column[rows] for name, column in columns.items()}
+        points = scene.points.take(np.arange(0, len(scene.points), 1 + len(scene.points) // WARM_UP_POINTS))
         views = tuple(view for view in scene.views if view.mask_count)[:2]
-        thin = replace(scene, points=Points(points.xyz[rows], points.origin, **kept), views=views)
+        thin = replace(scene, points=points, views=views)
         with suppress(OgPointcloudError):  # two views may show nothing; the fit itself will tell
             fit(thin, replace(settings, paper=replace(settings.paper, schedule_share=1e-4)), progress=False)
 
@@ -276,7 +273,10 @@ class _Trial:
         return LabelledScene.from_cloud(cloud).chooser.choose(vocabulary.vectors).at(cloud.instance_ids)[0]
 
     def _of_instances(self, cloud: LabelledCloud) -> dict[str, Any]:
-        labelling = Labelling(cloud.instance_ids, cloud.instances, np.zeros(0, np.int32))
+        ids, row_of_point = cloud.instance_ids, self.prepared.surface.row_of_point
+        if row_of_point is not None:  # points at one position have one label
+            ids = ids[np.unique(row_of_point, return_index=True)[1]]
+        labelling = Labelling(ids, cloud.instances, np.zeros(0, np.int32))
         return {
             "agreement": mask_agreement(self.prepared.table, labelling),
             "instances": float(len(cloud.instances)),
@@ -298,7 +298,7 @@ class _Trial:
         }
         if self.default_labels is not None and score.classes:
             default = truth.class_of(self.default_labels, vocabulary.names)
-            spacing = float(np.median(self.prepared.neighbourhood.spacing))
+            spacing = float(np.median(self.prepared.surface.neighbourhood.spacing))
             gain = miou_difference(called, default, truth, self.subject.scene.points.xyz, spacing, score.classes)
             found |= {"gain": gain.mean, "gain_low": gain.low, "gain_high": gain.high}
         return found

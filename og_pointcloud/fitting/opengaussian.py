@@ -30,6 +30,7 @@ from og_pointcloud.formats.gaussian_ply import latest_iteration, read_gaussian_p
 from og_pointcloud.formats.langsplat import LANGSPLAT_SPACE, LANGSPLAT_WIDTH
 from og_pointcloud.formats.npy import array_from_zip
 from og_pointcloud.formats.tables import naming
+from og_pointcloud.journal import LeftOut, left_out_entry
 from og_pointcloud.settings import GeometrySettings
 from og_pointcloud.text.text_features import UNKNOWN_SPACE
 
@@ -224,9 +225,9 @@ def _provenance(
     undescribed = int((~leaves.unit_features[used].any(axis=1)).sum())
     left_out = []
     if total > count:
-        left_out.append({"what": f"{total - count} of {total} leaves", "why": "no visible Gaussian is in them"})
+        left_out.append(left_out_entry(LeftOut.EMPTY_LEAVES, count=total - count, total=total))
     if faint:
-        left_out.append({"what": f"{faint} Gaussians", "why": f"less opaque than {min_opacity}: they cannot be seen"})
+        left_out.append(left_out_entry(LeftOut.FAINT_GAUSSIANS, count=faint, opacity=min_opacity))
     warnings = [f"{undescribed} of {count} instances have no feature and answer unknown"] if undescribed else []
     return {
         "source": "OpenGaussian result",
