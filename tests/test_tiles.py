@@ -89,7 +89,7 @@ def test_one_tile_is_the_fit_itself(monkeypatch):
     cloud = fit(street().scene, replace(SETTINGS, tile_points=POINTS), progress=False)
     assert len(whole().instances) > 20
     np.testing.assert_array_equal(cloud.instance_ids, whole().instance_ids)
-    for name in ("points", "views", "masks", "whole", "descriptor_instance"):
+    for name in ("points", "views", "masks", "part_of", "descriptor_instance"):
         np.testing.assert_array_equal(getattr(cloud.instances, name), getattr(whole().instances, name))
     for name in ("descriptors", "agreement", "visible_area"):
         np.testing.assert_allclose(
