@@ -96,14 +96,14 @@ def test_every_row_of_the_paper_is_there(share):
 
 
 def test_rows_have_error_and_seconds_and_a_setting_that_fails_costs_no_other(subject, monkeypatch):
-    real = sweeping.fit
+    real = sweeping.fit_prepared
 
-    def fails(scene, settings, **more):
+    def fails(prepared, settings, journal):
         if settings.membership.sure_share == 0.4:
             raise ZeroDivisionError("division by zero")
-        return real(scene, settings, **more)
+        return real(prepared, settings, journal)
 
-    monkeypatch.setattr(sweeping, "fit", fails)
+    monkeypatch.setattr(sweeping, "fit_prepared", fails)
     tried = [DEFAULT, value_of("sure share", "0.4"), value_of("views", "one of 2"), FAST]
     found = sweep([subject], tried, seeds=2, progress=False)
     assert found.failed == {"capture, sure share: 0.4": "ZeroDivisionError: division by zero"}
