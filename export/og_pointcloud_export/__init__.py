@@ -1,4 +1,9 @@
-"""LabelledCloud -> .ogpc: the query head graph, its check against float64, and the file."""
+"""All that writes what travels, and needs onnx or numba to do it; what reads it again is in ``og_pointcloud``.
+
+``writer``: a LabelledCloud -> one .ogpc file, checked against float64. ``query_graph``: the graph in it that answers
+text for points; ``lookup_grid`` and ``lookup_boxes``: the table by which that graph finds the nearest point's instance.
+Further, text and image models -> the ONNX folders that encode words and masks.
+"""
 
 from __future__ import annotations
 

@@ -84,7 +84,7 @@ def _answer_box(corner, level, limits, points, answers, child, lengths, lists): 
         # Queries come where points are: there the smaller children of a split answer most of them without a list.
         if not last and (holds[number] or count > longest):
             child[number] = SPLIT
-        elif count <= LONGEST_LIST:
+        elif count <= LONGEST_LIST:  # else left open
             chosen = _list_to_share(rows[:count], lists_of, lengths[:made])
             for row in rows[:count]:
                 bit = np.uint64(1) << np.uint64(chosen)
@@ -139,6 +139,7 @@ def _points_about(corner, size, rounding, reach, points):  # noqa: ANN001, ANN20
 def _answer_child(center, half, last, limits, near, squared, rows):  # noqa: ANN001, ANN202
     """(code of the answer at the centre, whether it is all the child's, count of candidates, the first of ``rows``)."""
     reach = limits[0]
+    # The point nearest to the centre. None within reach of the cube's circumscribed sphere: too far.
     best, best_squared = -1, np.inf
     for row in range(len(squared)):
         seen = _seen_from(center, near, row)
@@ -148,7 +149,7 @@ def _answer_child(center, half, last, limits, near, squared, rows):  # noqa: ANN
     diagonal = np.sqrt(3.0) * half
     if best < 0 or best_squared > (reach + diagonal) ** 2:
         return TOO_FAR_CODE, True, 0
-    # Candidates: what the point nearest to the centre does not beat.
+    # Candidates: what does not lose to that point, and is within reach of the cube.
     nearest = _seen_from(center, near, best)
     limit = (np.sqrt(best_squared) + 2 * diagonal) ** 2  # farther points always lose: the test itself costs more
     count = 0
@@ -161,12 +162,14 @@ def _answer_child(center, half, last, limits, near, squared, rows):  # noqa: ANN
                 count += 1
     if count == 0:
         return TOO_FAR_CODE, True, 0
+    # One answer for all of it, as far as any is within reach? That needs the reach of one point to hold the cube.
     code = _code(near[3][best], best_squared, limits)
     within = _all_within_reach(nearest, half, reach)
     if within and _alike(near[3], rows[:count]):
         return code, True, count
     if count > MANY_RIVALS and not last:
         return code, False, count
+    # Fewer candidates, each compared with each; they may then agree.
     count = _winners(center, half, near, squared, rows, count)
     return code, within and _alike(near[3], rows[:count]), count
 

@@ -35,8 +35,8 @@ except ImportError as error:
 
 __all__ = ["OPSET", "build_query_graph"]
 
-MIDDLE_LIST = 20
-"""So many candidates are compared where the list is longer than SHORT_LIST, LONGEST_LIST where it is longer still."""
+LIST_LENGTHS = {"short": SHORT_LIST, "middle": 20, "long": LONGEST_LIST}
+"""So many candidates are compared: of most lists the first number, of longer ones the next."""
 OPSET, IR_VERSION = 18, 8
 """The oldest that has everything needed (ScatterElements with max), so that onnxruntime 1.17 and later run it."""
 
@@ -226,24 +226,21 @@ def _child_nodes(reference: str, value: str, output: str) -> list[onnx.NodeProto
 def _list_nodes() -> list[onnx.NodeProto]:
     """part_value, child -> pending_value: of points with a list, the code of the nearest candidate.
 
-    Lists are read to the same length by all: first SHORT_LIST entries, then, where there are more, again to the next.
+    As many entries are read of every list: LIST_LENGTHS' first, then, of longer lists, all again up to the next.
     """
-    return [
+    nodes = [
         _node("GatherElements", "child_start child", "list_start"),
         _node("GatherElements", "child_length child", "list_length_stored"),
         _node("Cast", "list_length_stored", "list_length", to=TensorProto.INT32),
         _node("Less", "part_value first_child_value", "part_answered"),
         _node("Where", "part_answered zero_int32 list_length", "length"),
-        *_where_true("Greater", "length zero_int32", "short_rows"),
-        *_search_nodes("short"),
-        _node("ScatterElements", "part_value short_rows short_code", "value_after_short", axis=0),
-        *_where_true("Greater", "length short_length", "middle_rows"),
-        *_search_nodes("middle"),
-        _node("ScatterElements", "value_after_short middle_rows middle_code", "value_after_middle", axis=0),
-        *_where_true("Greater", "length middle_length", "long_rows"),
-        *_search_nodes("long"),
-        _node("ScatterElements", "value_after_middle long_rows long_code", "pending_value", axis=0),
     ]
+    value, longer_than = "part_value", "zero_int32"
+    for name in LIST_LENGTHS:
+        nodes += [*_where_true("Greater", f"length {longer_than}", f"{name}_rows"), *_search_nodes(name)]
+        nodes += [_node("ScatterElements", f"{value} {name}_rows {name}_code", f"value_after_{name}", axis=0)]
+        value, longer_than = f"value_after_{name}", f"{name}_length"
+    return [*nodes, _node("Identity", value, "pending_value")]
 
 
 def _search_nodes(name: str) -> list[onnx.NodeProto]:
@@ -376,11 +373,8 @@ def _lookup_constants(cloud: LabelledCloud, grid: LookupGrid) -> dict[str, Any]:
         **_in_three_bytes("candidates", np.append(candidate, np.zeros(LONGEST_LIST, np.int64))),
         **{f"candidate_{axis}": np.ascontiguousarray(xyz[:, row]) for row, axis in enumerate("xyz")},
         "candidate_answer": answer.astype(np.min_scalar_type(int(answer.max()))),
-        "short_steps": np.arange(SHORT_LIST, dtype=np.int32)[None],
-        "short_length": np.int32(SHORT_LIST),
-        "middle_steps": np.arange(MIDDLE_LIST, dtype=np.int32)[None],
-        "middle_length": np.int32(MIDDLE_LIST),
-        "long_steps": np.arange(LONGEST_LIST, dtype=np.int32)[None],
+        **{f"{name}_steps": np.arange(length, dtype=np.int32)[None] for name, length in LIST_LENGTHS.items()},
+        **{f"{name}_length": np.int32(length) for name, length in LIST_LENGTHS.items()},
         "reach_squared": np.float64(cloud.reach) ** 2,
         "surface_squared": np.float64(surface_distance(cloud.spacing, cloud.reach)) ** 2,
         # answers
