@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from og_pointcloud.errors import FeatureSpaceError
-from og_pointcloud.masking.encoders import DEMO_FOLDER, DEMO_SPACE, open_encoder
+from og_pointcloud.masking.encode import DEMO_FOLDER, DEMO_SPACE, open_encoder
 from og_pointcloud.text.encoder import encoder_for, find_encoder
 
 pytest.importorskip("open3d")
@@ -95,10 +95,11 @@ def test_its_vectors_are_of_this_machine_as_of_any(seen):
     assert np.allclose(np.linalg.norm(seen[0], axis=1), 1, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_its_script_makes_the_same_weights_from_the_same_seed(tmp_path, monkeypatch):
     torch = pytest.importorskip("torch")
-    pytest.importorskip("safetensors")
-    monkeypatch.syspath_prepend(str(EXAMPLES))
+    pytest.importorskip("onnxscript")
+    monkeypatch.syspath_prepend(str(EXAMPLES.parent / "scripts"))
     import train_demo_encoder as script
 
     torch.set_num_threads(1)
@@ -115,6 +116,7 @@ def test_its_script_makes_the_same_weights_from_the_same_seed(tmp_path, monkeypa
     sys.modules.pop("train_demo_encoder")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("proposer", ["truth", "opencv"])
 def test_a_coarse_room_from_photographs_alone(proposer, tmp_path):
     from og_pointcloud_room.capture import write_capture

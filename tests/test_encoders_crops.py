@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from og_pointcloud.errors import SceneError
-from og_pointcloud.masking.crops import LANGSPLAT, Crop, mask_box, mask_crops, resized
+from og_pointcloud.masking.crops import LANGSPLAT, Crop, mask_box, mask_crops
 
 RNG = np.random.default_rng(0)
 IMAGE = RNG.integers(1, 256, (50, 70, 3), np.uint8)
@@ -50,7 +50,8 @@ def test_a_shrunk_window_beyond_the_edge_is_the_filled_image_shrunk(place, name)
     canvas[100:150, 100:170] = IMAGE
     corner = [100 + at - (90 - 15) // 2 for at in place]
     window = canvas[corner[0] : corner[0] + 90, corner[1] : corner[1] + 90]
-    apart = np.abs(mask_crops(IMAGE, mask[None], crop, 12, fill, name)[0].astype(int) - resized(window, 12, 12, name))
+    expected = pillow_resized(window, 12, {"bilinear": 2, "bicubic": 3}[name])
+    apart = np.abs(mask_crops(IMAGE, mask[None], crop, 12, fill, name)[0] - expected)
     assert apart.max() <= 1
     assert (apart > 0).mean() < 0.1, "a last bit here and there: the other direction is rounded first"
 
@@ -96,19 +97,24 @@ def test_what_does_not_fit_is_refused():
             Crop(**wrong)
 
 
-@pytest.mark.parametrize("size", [(37, 91), (224, 224), (12, 10), (50, 70), (1, 1)])
+@pytest.mark.parametrize("side", [37, 91, 224, 12, 50])
 @pytest.mark.parametrize(("name", "number"), [("bilinear", 2), ("bicubic", 3)])
-def test_resizing_is_pillows(size, name, number):
-    pillow = pytest.importorskip("PIL.Image")
-    expected = np.asarray(pillow.fromarray(IMAGE).resize(size[::-1], number)).astype(int)
-    apart = np.abs(resized(IMAGE, *size, name) - expected)
+def test_resizing_is_pillows(side, name, number):
+    expected = pillow_resized(IMAGE[:, :50], side, number)
+    apart = np.abs(mask_crops(IMAGE[:, :50], np.ones((1, 50, 50), bool), Crop(), side, resample=name)[0] - expected)
     assert apart.max() <= 1
     assert (apart > 0).mean() < 0.05
 
 
+def pillow_resized(image, side, number):
+    """By columns of the transposed image first: Pillow rounds after each direction, and begins with the other one."""
+    pillow = pytest.importorskip("PIL.Image")
+    turned = pillow.fromarray(np.ascontiguousarray(image.transpose(1, 0, 2)))
+    return np.asarray(turned.resize((side, side), number)).astype(int).transpose(1, 0, 2)
+
+
 def test_shrinking_counts_every_pixel():
-    image = np.zeros((64, 64, 1), np.uint8)
+    image = np.zeros((64, 64, 3), np.uint8)
     image[::2, ::2] = 255
-    assert np.abs(resized(image, 8, 8).astype(int) - 64)[1:-1, 1:-1].max() <= 3, (
-        "without smoothing it would be 0 or 255"
-    )
+    shrunk = mask_crops(image, np.ones((1, 64, 64), bool), Crop(), 8)[0].astype(int)
+    assert np.abs(shrunk - 64)[1:-1, 1:-1].max() <= 3, "without smoothing it would be 0 or 255"

@@ -24,7 +24,7 @@ from og_pointcloud_room.room import furnish  # noqa: E402
 from scipy import sparse  # noqa: E402
 
 from og_pointcloud.bundle.read import read_bundle  # noqa: E402
-from og_pointcloud.bundle.vocabulary import everyday_words  # noqa: E402
+from og_pointcloud.text.everyday import everyday_words  # noqa: E402
 
 SMALL = CaptureSettings(views=8, width=160, height=120, samples_per_view=4000)
 

@@ -1,26 +1,22 @@
-"""Token ids: a small vocabulary by hand, slow plain merging, and the libraries that wrote the formats."""
+"""Token ids: a small vocabulary by hand, slow plain merging, and the library that wrote the format."""
 
 from __future__ import annotations
 
-import base64
 import gzip
 import json
 import random
-import re
-import string
-import struct
+import sys
 import unicodedata
 from itertools import pairwise
 from pathlib import Path
 
 import pytest
-from og_pointcloud_export.text_tokenizer import clip_description, siglip_description
+from text_models import END, MERGES, START, clip_tokenizer
 
-from og_pointcloud.text.tokenizer import BYTE_CHARACTERS, WHITESPACE, BytePairs, CharacterMap, Tokenizer, Unigrams
+from og_pointcloud.errors import MissingExtraError
+from og_pointcloud.text.tokenizer import BYTE_CHARACTERS, BytePairs, ClipTokenizer, OtherTokenizer, open_tokenizer
 
 CLIP_MERGES = Path(__file__).resolve().parents[2] / "shared" / "data" / "clip" / "bpe_simple_vocab_16e6.txt.gz"
-SMALL_MERGES = [("a", "t</w>"), ("c", "at</w>"), ("l", "o"), ("lo", "w</w>"), ("lo", "w"), ("e", "r</w>")]
-START, END = 512 + len(SMALL_MERGES), 513 + len(SMALL_MERGES)
 NASTY = [
     "", " ", "a", "a photo of a café", "cafe\u0301", "I'M don't WE'LL o'clock '' 's 'S !'s 'x", "日本語の看板 中文",
     "한국어", "\U0001f469\u200d\U0001f469\u200d\U0001f467 \U0001f44d\U0001f3fd \U0001f1e9\U0001f1ea",
@@ -32,13 +28,13 @@ NASTY = [
 ]  # fmt: skip
 
 
-def tokenizer_of(description) -> Tokenizer:
-    return Tokenizer(json.dumps(description).encode())
+def tokenizer_of(description, context_length=10**6):
+    return open_tokenizer(json.dumps(description).encode(), context_length)
 
 
 @pytest.fixture(scope="module")
-def small() -> Tokenizer:
-    return tokenizer_of(clip_description(SMALL_MERGES))
+def small():
+    return tokenizer_of(clip_tokenizer(MERGES))
 
 
 def byte(character: str, *, last: bool) -> int:
@@ -67,22 +63,28 @@ def byte(character: str, *, last: bool) -> int:
     ],
 )
 def test_a_small_vocabulary_by_hand(small, text, ids):
-    assert small(text, 77) == [START, *ids, END]
+    assert small(text) == [START, *ids, END]
 
 
-def test_a_long_text_loses_its_end_but_not_its_closing_token(small):
-    assert small("cat " * 100, 7) == [START, 513, 513, 513, 513, 513, END]
-    assert small("cat " * 5, 7) == [START, 513, 513, 513, 513, 513, END]
-    assert small("cat", 7) == [START, 513, END]
+def test_a_long_text_loses_its_end_but_not_its_closing_token():
+    small = tokenizer_of(clip_tokenizer(MERGES), 7)
+    assert small("cat " * 100) == [START, 513, 513, 513, 513, 513, END]
+    assert small("cat " * 5) == [START, 513, 513, 513, 513, 513, END]
+    assert small("cat") == [START, 513, END]
 
 
 def test_special_words_are_tokens_of_their_own(small):
-    assert small("cat<|endoftext|>cat", 77) == [START, 513, END, 513, END]
+    assert small("cat<|endoftext|>cat") == [START, 513, END, 513, END]
+    assert len(small("cat<|ENDOFTEXT|>cat")) > 10
+    description = clip_tokenizer(MERGES)
+    for token in description["added_tokens"]:
+        token["normalized"] = True
+    assert tokenizer_of(description)("cat<|ENDOFTEXT|>cat") == [START, 513, END, 513, END]
 
 
 def test_a_lone_surrogate_counts_as_the_replacement_character(small):
-    assert small("a\ud800b", 77) == small("a\ufffdb", 77)
-    assert small("\ud83d\udc4d", 77) == small("\U0001f44d", 77)  # a pair is the character that it spells
+    assert small("a\ud800b") == small("a\ufffdb")
+    assert small("\ud83d\udc4d") == small("\U0001f44d")  # a pair is the character that it spells
 
 
 def test_every_byte_has_a_character_of_its_own():
@@ -105,156 +107,120 @@ def merge_plainly(symbols: list[str], ranks: dict[tuple[str, str], int]) -> list
 def test_merging_by_heap_is_merging_step_by_step():
     source = random.Random(0)
     for _ in range(200):
-        tokens = list("abc")
+        tokens = [*"abc", *(f"{letter}</w>" for letter in "abc")]
         merges = []
         for _ in range(8):
-            pair = (source.choice(tokens), source.choice(tokens))
-            if pair not in merges and "".join(pair) not in tokens:
-                merges.append(pair)
-                tokens.append("".join(pair))
+            left, right = (
+                source.choice([token for token in tokens if not token.endswith("</w>")]),
+                source.choice(tokens),
+            )
+            if (left, right) not in merges and left + right not in tokens:
+                merges.append((left, right))
+                tokens.append(left + right)
+        others = [byte for byte in BYTE_CHARACTERS if byte not in "abc"]
+        tokens += [*others, *(f"{byte}</w>" for byte in others)]
         ids = {token: id for id, token in enumerate(tokens)}
-        pieces = BytePairs({"vocab": ids, "merges": [" ".join(pair) for pair in merges]})
-        text = "".join(source.choices("abc", k=source.randrange(25)))
+        pieces = BytePairs(ids, [" ".join(pair) for pair in merges])
+        text = "".join(source.choices("abc", k=source.randrange(1, 25)))
         ranks = {pair: rank for rank, pair in enumerate(merges)}
-        assert pieces(text) == [ids[token] for token in merge_plainly(list(text), ranks)]
+        expected = merge_plainly([*text[:-1], f"{text[-1]}</w>"], ranks)
+        assert pieces(text) == [ids[token] for token in expected]
 
 
 def test_a_very_long_word_is_no_burden(small):
-    assert len(small("low" * 30_000, 10**6)) == 30_002
+    assert len(small("low" * 30_000)) == 30_002
 
 
-@pytest.mark.parametrize(
-    ("spec", "text", "ids"),
-    [
-        ({"unk_token": "?"}, "axya", [1, 0, 0, 1]),
-        ({"unk_token": "?", "fuse_unk": True}, "axya", [1, 0, 1]),
-        ({}, "axya", [1, 1]),
-        ({"byte_fallback": True, "unk_token": "?"}, "aéa", [1, 2, 3, 1]),
-        ({"byte_fallback": True, "unk_token": "?"}, "axa", [1, 0, 1]),
-    ],
-)
-def test_what_the_vocabulary_lacks(spec, text, ids):
-    vocabulary = {"?": 0, "a": 1, "<0xC3>": 2, "<0xA9>": 3}
-    assert BytePairs({"vocab": vocabulary, "merges": [], **spec})(text) == ids
+# What is refused, and what goes to another library
 
 
-@pytest.mark.parametrize(
-    ("pattern", "cleaned"),
-    [
-        (r"\s+", "a-b._c-"),
-        ("[,-.]", "a  b_c\t\u00a0"),  # a range
-        (r"[\-\.]", "a  b_c\t\u00a0"),
-        (" {2,}", "a-b._c-\t\u00a0"),
-    ],
-)
-def test_what_a_replacement_finds(pattern, cleaned):
-    replace = {"type": "Replace", "pattern": {"Regex": pattern}, "content": ""}
-    tokenizer = tokenizer_of({**clip_description(SMALL_MERGES), "normalizer": replace})
-    assert tokenizer._normalize("a-  b._c-\t\u00a0") == cleaned
+def unigrams(**changes):
+    """SigLIP's kind of tokenizer: lower case, no punctuation, single spaces, unigrams, an end."""
+    patterns = ((r"[!-/:-@\[-`{-~]", ""), (r"\s+", " "))
+    replaced = [{"type": "Replace", "pattern": {"Regex": found}, "content": content} for found, content in patterns]
+    pieces = [("<unk>", 0.0), ("</s>", 0.0), ("▁", -3.0), ("▁cat", -1.0), ("▁c", -2.0), ("at", -2.5), ("s", -2.0)]
+    return {
+        "version": "1.0", "truncation": None, "padding": None, "added_tokens": [], "decoder": None,
+        "normalizer": {"type": "Sequence", "normalizers": [{"type": "Lowercase"}, *replaced]},
+        "pre_tokenizer": {"type": "Metaspace", "replacement": "▁", "prepend_scheme": "always", "split": True},
+        "model": {"type": "Unigram", "unk_id": 0, "vocab": pieces, "byte_fallback": False},
+        "post_processor": {
+            "type": "TemplateProcessing", "pair": [],
+            "single": [{"Sequence": {"id": "A", "type_id": 0}}, {"SpecialToken": {"id": "</s>", "type_id": 0}}],
+            "special_tokens": {"</s>": {"id": "</s>", "ids": [1], "tokens": ["</s>"]}},
+        },
+        **changes,
+    }  # fmt: skip
 
 
-def test_unigrams_are_cut_where_the_scores_sum_highest():
-    vocabulary = [["<unk>", 0.0], ["a", -1.0], ["b", -1.0], ["ab", -2.5], ["aba", -2.6]]
-    model = Unigrams({"vocab": vocabulary, "unk_id": 0})
-    assert model("ab") == [1, 2]  # -2 against -2.5
-    assert model("aba") == [4]  # -2.6 against -3
-    assert model("abab") == [4, 2]
-    assert model("xaxx") == [0, 1, 0]
-    assert model("") == []
+def test_unigrams_go_through_tokenizers():
+    pytest.importorskip("tokenizers")
+    tokenizer = tokenizer_of(unigrams(), 4)
+    assert isinstance(tokenizer, OtherTokenizer)
+    assert tokenizer("Cats!") == [3, 6, 1]
+    assert tokenizer("") == [1]
+    assert tokenizer("cat " * 10_000) == [3, 3, 3, 1]
+    assert tokenizer("cat\ud800") == [3, 0, 1]
+    assert tokenizer.highest_id == 6
 
 
-def character_map(entries: dict[str, str]) -> bytes:
-    """A double-array trie, built the slow way: the first place where a node's children are all free."""
-    replacements, offsets = b"", {}
-    for key, value in entries.items():
-        offsets[key.encode()] = len(replacements)
-        replacements += value.encode() + b"\0"
-    cells = [0] * 4096
-    taken = {0}
-
-    def place(node: int, prefix: bytes) -> None:
-        labels = sorted(
-            {key[len(prefix)] if len(key) > len(prefix) else 0 for key in offsets if key.startswith(prefix)}
-        )
-        offset = next(
-            base
-            for base in range(1, 1024)
-            if all((node ^ base ^ label) not in taken and node ^ base ^ label for label in labels)
-        )
-        cells[node] |= offset << 10
-        taken.update(node ^ offset ^ label for label in labels)
-        for label in labels:
-            child = node ^ offset ^ label
-            if label == 0:
-                cells[node] |= 1 << 8
-                cells[child] = 1 << 31 | offsets[prefix]
-            else:
-                cells[child] = label
-                place(child, prefix + bytes([label]))
-
-    place(0, b"")
-    return struct.pack("<I", 4 * len(cells)) + struct.pack(f"<{len(cells)}I", *cells) + replacements
-
-
-def test_a_character_map_takes_the_longest_entry():
-    table = CharacterMap(character_map({"ﬁ": "fi", "e\u0301": "é", "e": "E", "\t": " ", "\x01": ""}))
-    assert table("ﬁx\te\u0301e\x01日") == "fix éE日"
-    assert table("") == ""
-
-
-@pytest.mark.parametrize("data", [b"", b"\x00", struct.pack("<I", 400) + bytes(8), struct.pack("<I", 2) + bytes(8)])
-def test_a_character_map_that_claims_more_than_it_has(data):
-    with pytest.raises(ValueError, match=r"claims a trie|not in the form"):
-        tokenizer_of(
-            {
-                "model": {"type": "BPE", "vocab": {}, "merges": []},
-                "normalizer": {"type": "Precompiled", "precompiled_charsmap": base64.b64encode(data).decode()},
-            }
-        )
-
-
-def test_a_character_map_of_noise_ends():
-    source = random.Random(0)
-    for _ in range(200):
-        noise = source.randbytes(4 * source.randrange(1, 200))
-        CharacterMap(struct.pack("<I", len(noise)) + noise + source.randbytes(9))("any text, ünd more\x00")
+def test_without_tokenizers_the_extra_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "tokenizers", None)
+    assert isinstance(tokenizer_of(clip_tokenizer(MERGES)), ClipTokenizer)
+    with pytest.raises(MissingExtraError, match=r"og-pointcloud\[words\]"):
+        tokenizer_of(unigrams())
 
 
 @pytest.mark.parametrize(
     ("change", "says"),
     [
         ({"model": {"type": "WordPiece", "vocab": {}}}, "model is a 'WordPiece'"),
-        ({"normalizer": {"type": "BertNormalizer"}}, "normalizer is a 'BertNormalizer'"),
         (
             {"normalizer": {"type": "Replace", "pattern": {"Regex": "(a+)+$"}, "content": ""}},
-            r"replaces the pattern '\(a",
+            r"looks for the pattern '\(a",
         ),
-        ({"normalizer": {"type": "Replace", "pattern": {"Regex": "[!&&~]"}, "content": ""}}, "replaces the pattern"),
-        ({"normalizer": {"type": "Replace", "pattern": {"Regex": "[~-!]"}, "content": ""}}, "replaces the pattern"),
-        ({"pre_tokenizer": {"type": "BertPreTokenizer"}}, "pre_tokenizer is a 'BertPreTokenizer'"),
-        ({"pre_tokenizer": {"type": "ByteLevel", "add_prefix_space": True}}, "a space before"),
-        ({"pre_tokenizer": {"type": "Split", "pattern": {"Regex": "x"}, "behavior": "Removed"}}, "splits at"),
-        ({"pre_tokenizer": {"type": "Metaspace", "replacement": "_", "prepend_scheme": "first"}}, "prepends 'first'"),
-        ({"post_processor": {"type": "BertProcessing"}}, "post_processor is a 'BertProcessing'"),
-        ({"added_tokens": [{"content": "x", "id": 1, "single_word": True}]}, "single word"),
+        (
+            {"pre_tokenizer": {"type": "Split", "pattern": {"Regex": "(x|x)*y"}, "behavior": "Removed"}},
+            "for the pattern",
+        ),
         ({"added_tokens": [{"content": "x", "id": -1}]}, "-1 stands where a token id"),
         ({"added_tokens": [{"id": 1}]}, "not in the form"),
-        ({"model": {"type": "BPE", "vocab": {"a": 0}, "merges": ["a b"]}}, "not in the form"),
-        ({"model": {"type": "BPE", "vocab": {"a": "0"}, "merges": []}}, "'0' stands where a token id"),
-        ({"model": {"type": "BPE", "vocab": {}, "merges": [], "dropout": 0.1}}, "dropout 0.1"),
-        ({"model": {"type": "Unigram", "vocab": [["a"]]}}, "values to unpack"),
+        ({"model": {**clip_tokenizer([])["model"], "merges": ["a bc"]}}, "not in the form"),
+        ({"model": {**clip_tokenizer([])["model"], "vocab": {"a": 0}}}, "lacks 256 of the 256 bytes"),
+        ({"model": {**clip_tokenizer([])["model"], "vocab": {"a": "0"}}}, "'0' stands where a token id"),
+        ({"model": {**clip_tokenizer([])["model"], "dropout": 0.1}}, "dropout 0.1"),
         ({"model": None}, "not in the form"),
+        ({"post_processor": {"type": "RobertaProcessing"}}, "not in the form"),
     ],
 )
-def test_what_is_not_understood_is_named(change, says):
+def test_what_is_refused_is_named(change, says):
     with pytest.raises(ValueError, match=says):
-        tokenizer_of({**clip_description(SMALL_MERGES), **change})
+        tokenizer_of({**clip_tokenizer(MERGES), **change})
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"model": {"type": "Unigram", "vocab": [["a"]]}},
+        {"model": {"type": "Unigram", "vocab": [["a", 0.0]], "unk_id": 7}},
+        {"normalizer": {"type": "Precompiled", "precompiled_charsmap": "////fwAAAAA="}},
+        {"normalizer": {"type": "Unheard"}},
+        {"post_processor": {"type": "TemplateProcessing", "single": [], "pair": [], "special_tokens": 3}},
+    ],
+)
+def test_what_tokenizers_does_not_read_is_a_plain_error(change):
+    pytest.importorskip("tokenizers")
+    with pytest.raises(ValueError, match="tokenizers does not read it"):
+        tokenizer_of(unigrams(**change))
 
 
 @pytest.mark.parametrize("data", [b"", b"[]", b"[" * 100_000, b'{"model": 3}', b"\xff\xfe"])
 def test_bytes_that_are_no_description(data):
     with pytest.raises(ValueError, match=r".+"):
-        Tokenizer(data)
+        open_tokenizer(data, 77)
+
+
+# Against the libraries
 
 
 def some_text(source: random.Random) -> str:
@@ -283,83 +249,33 @@ def clip_merges():
     return [tuple(line.split()) for line in lines]
 
 
-def test_clip_ids_are_those_of_transformers(clip_merges):
+@pytest.mark.slow
+@pytest.mark.parametrize("full", [False, True])
+def test_clip_ids_are_those_of_transformers(full, request):
+    """With a few merges, and with CLIP's own where its list is at hand."""
     transformers = pytest.importorskip("transformers")
-    description = clip_description(clip_merges)
-    theirs = transformers.CLIPTokenizer(vocab=description["model"]["vocab"], merges=clip_merges)
-    of_theirs = Tokenizer(theirs.backend_tokenizer.to_str().encode())
-    ours = tokenizer_of(description)
+    merges = request.getfixturevalue("clip_merges") if full else MERGES
+    description = clip_tokenizer(merges)
+    theirs = transformers.CLIPTokenizer(vocab=description["model"]["vocab"], merges=merges)
+    as_transformers_writes_it = json.loads(theirs.backend_tokenizer.to_str())
+    ours, cut = tokenizer_of(as_transformers_writes_it), tokenizer_of(as_transformers_writes_it, 77)
+    of_old_folders = tokenizer_of(description)
+    assert isinstance(ours, ClipTokenizer)
+    assert isinstance(of_old_folders, ClipTokenizer)
     source = random.Random(1)
     compared = 0
     for text in NASTY + [some_text(source) for _ in range(800)]:
         expected = theirs(text)["input_ids"]
-        assert of_theirs(text, 10**6) == expected, repr(text)
-        assert of_theirs(text, 77) == theirs(text, truncation=True, max_length=77)["input_ids"], repr(text)
-        if "|" not in text:  # our own description has no second name for special words
-            assert ours(text, 10**6) == expected, repr(text)
+        assert ours(text) == expected, repr(text)
+        assert cut(text) == theirs(text, truncation=True, max_length=77)["input_ids"], repr(text)
+        if "|" not in text:  # an older description has no second name for special words
+            assert of_old_folders(text) == expected, repr(text)
         compared += len(expected)
     assert compared > 20_000
 
 
+@pytest.mark.slow
 def test_clip_ids_known_from_its_publication(clip_merges):
-    ours = tokenizer_of(clip_description(clip_merges))
-    assert ours("a photo of a cat", 77) == [49406, 320, 1125, 539, 320, 2368, 49407]
-    assert ours("a diagram", 77) == [49406, 320, 22697, 49407]
-
-
-def test_siglip_ids_are_those_of_sentencepiece(tmp_path):
-    sentencepiece = pytest.importorskip("sentencepiece")
-    (tmp_path / "corpus.txt").write_text(
-        "a photo of a red mug on the table\nthe quick brown fox jumps over the lazy dog\ncafé déjà vu naïve façade\n"
-        "open vocabulary labels for point clouds\n日本語 の テキスト\nkitchen chair desk lamp window door sofa\n" * 40
-    )
-    sentencepiece.SentencePieceTrainer.train(
-        input=str(tmp_path / "corpus.txt"), model_prefix=str(tmp_path / "spiece"), vocab_size=180, pad_id=0, eos_id=1,
-        unk_id=2, bos_id=-1, normalization_rule_name="nmt_nfkc", hard_vocab_limit=False, minloglevel=2,
-    )  # fmt: skip
-    theirs = sentencepiece.SentencePieceProcessor(model_file=str(tmp_path / "spiece.model"))
-    ours = tokenizer_of(siglip_description((tmp_path / "spiece.model").read_bytes()))
-    source = random.Random(2)
-    for text in NASTY + [some_text(source) for _ in range(1000)]:
-        if "|" in text or "▁" in text:
-            continue
-        # SigLIP's own cleaning, which comes before its pieces.
-        cleaned = "".join(map(str.lower, text)).translate(dict.fromkeys(map(ord, string.punctuation)))
-        cleaned = re.sub(f"[{WHITESPACE}]+", " ", cleaned)
-        assert ours(text, 10**6) == [*theirs.encode(cleaned), 1], repr(text)
-    assert ours("red mug " * 100, 64)[-1] == 1
-    assert len(ours("red mug " * 100, 64)) == 64
-
-
-def test_gemma_ids_are_those_of_tokenizers():
-    tokenizers = pytest.importorskip("tokenizers")
-    bytes_ = [f"<0x{byte:02X}>" for byte in range(256)]
-    tokens = [
-        "<pad>",
-        "<eos>",
-        "<unk>",
-        *bytes_,
-        *"abcdefghijklmnopqrstuvwxyz▁",
-        "re",
-        "red",
-        "▁r",
-        "▁red",
-        "mu",
-        "mug",
-    ]
-    merges = [("r", "e"), ("re", "d"), ("▁", "red"), ("m", "u"), ("mu", "g")]
-    theirs = tokenizers.Tokenizer(
-        tokenizers.models.BPE(
-            vocab={token: id for id, token in enumerate(tokens)}, merges=merges, fuse_unk=True, byte_fallback=True,
-            unk_token="<unk>",
-        )
-    )  # fmt: skip
-    theirs.normalizer = tokenizers.normalizers.Sequence(
-        [tokenizers.normalizers.Lowercase(), tokenizers.normalizers.Replace(" ", "▁")]
-    )
-    theirs.pre_tokenizer = tokenizers.pre_tokenizers.Split(" ", "merged_with_previous")
-    theirs.post_processor = tokenizers.processors.TemplateProcessing("$A <eos>", special_tokens=[("<eos>", 1)])
-    ours = Tokenizer(theirs.to_str().encode())
-    source = random.Random(3)
-    for text in [*NASTY, "Red mug", " red  red", *(some_text(source) for _ in range(500))]:
-        assert ours(text, 10**6) == theirs.encode(text).ids, repr(text)
+    ours = tokenizer_of(clip_tokenizer(clip_merges), 77)
+    assert ours("a photo of a cat") == [49406, 320, 1125, 539, 320, 2368, 49407]
+    assert ours("a diagram") == [49406, 320, 22697, 49407]

@@ -1,102 +1,141 @@
-"""Small random text towers in the formats that people have, and CLIP's forward pass written plainly in numpy."""
+"""Small models: CLIP and SigLIP of transformers with random weights, and a text encoder made without torch."""
 
 from __future__ import annotations
 
 import json
-from math import erf
-from typing import TYPE_CHECKING
+import zlib
 
 import numpy as np
-from og_pointcloud_export.text_tokenizer import clip_description
+from labelled_clouds import unit_rows
+from onnx import TensorProto, helper, numpy_helper
 
-if TYPE_CHECKING:
-    import torch
+from og_pointcloud.formats.npy import npy_bytes
+from og_pointcloud.text.everyday import everyday_words
+from og_pointcloud.text.tokenizer import BYTE_CHARACTERS, CLIP_NORMALIZER, CLIP_WORDS
 
-WIDTH, LAYERS, CONTEXT, OUT = 128, 2, 16, 24
 MERGES = [("a", "t</w>"), ("c", "at</w>"), ("l", "o"), ("lo", "w</w>"), ("lo", "w"), ("e", "r</w>")]
-VOCABULARY = 512 + len(MERGES) + 2
+VOCABULARY, CONTEXT, OUT = 512 + len(MERGES) + 2, 16, 24
+START, END = VOCABULARY - 2, VOCABULARY - 1
+SIZE, PATCH = 32, 8
 TEXTS = ["", "cat", "low lower cat", "it's 12 cats!", "café \U0001f44d", "cat " * 50, "cat<|endoftext|>low"]
 SPACE = "tests/tiny-clip"
+KINDS = ("clip", "clip of early days", "siglip", "siglip2")
 
 
-def openai_state(seed: int = 0, width: int = WIDTH) -> dict[str, torch.Tensor]:
-    """Random weights under OpenAI's names, large enough that every part of the tower matters."""
-    import torch
+def clip_tokenizer(merges):
+    """A tokenizer.json as CLIP's repositories have it, with other merges."""
+    letters = sorted(BYTE_CHARACTERS, key=lambda character: (ord(character) >= 256, ord(character)))
+    joined = ["".join(merge) for merge in merges]
+    tokens = [*letters, *(f"{letter}</w>" for letter in letters), *joined, "<|startoftext|>", "<|endoftext|>"]
+    ids = {token: id for id, token in enumerate(tokens)}
+    start, end = ([token, ids[token]] for token in tokens[-2:])
+    split = {"type": "Split", "pattern": {"Regex": CLIP_WORDS}, "behavior": "Removed", "invert": True}
+    bytes_ = {"type": "ByteLevel", "add_prefix_space": False, "trim_offsets": True, "use_regex": True}
+    flags = {"single_word": False, "lstrip": False, "rstrip": False, "normalized": False, "special": True}
+    return {
+        "version": "1.0", "truncation": None, "padding": None, "decoder": None,
+        "added_tokens": [{"id": id, "content": token, **flags} for token, id in (start, end)],
+        "normalizer": CLIP_NORMALIZER,
+        "pre_tokenizer": {"type": "Sequence", "pretokenizers": [split, bytes_]},
+        "model": {"type": "BPE", "unk_token": end[0], "end_of_word_suffix": "</w>", "vocab": ids,
+                  "merges": [" ".join(merge) for merge in merges]},
+        "post_processor": {"type": "RobertaProcessing", "sep": end, "cls": start, "trim_offsets": False,
+                           "add_prefix_space": False},
+    }  # fmt: skip
 
-    random = torch.Generator().manual_seed(seed)
 
-    def normal(*shape: int, scale: float = 0.1, shift: float = 0.0) -> torch.Tensor:
-        return torch.randn(*shape, generator=random) * scale + shift
-
-    state = {
-        "token_embedding.weight": normal(VOCABULARY, width, scale=0.5),
-        "positional_embedding": normal(CONTEXT, width, scale=0.5),
-        "ln_final.weight": normal(width, shift=1.0),
-        "ln_final.bias": normal(width),
-        "text_projection": normal(width, OUT),
-        "logit_scale": torch.tensor(4.6),
-        "visual.proj": normal(3, 5),
+def encoder_files(feature_space=SPACE, width=OUT, tokenizer=None):
+    """The files of a text encoder that gives each text the vector of its second token: of a word, its first."""
+    nodes = [
+        helper.make_node("Gather", ["rows", "tokens"], ["all"], axis=0),
+        helper.make_node("Gather", ["all", "second"], ["text"], axis=1),
+    ]
+    tokens = helper.make_tensor_value_info("tokens", TensorProto.INT64, ["batch", "length"])
+    text = helper.make_tensor_value_info("text", TensorProto.FLOAT, ["batch", width])
+    rows = unit_rows(VOCABULARY, width, seed=5)
+    constants = [numpy_helper.from_array(rows, "rows"), numpy_helper.from_array(np.array(1, np.int64), "second")]
+    graph = helper.make_graph(nodes, "encoder", [tokens], [text], constants)
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=9)
+    held = {
+        "text_encoder.onnx": model.SerializeToString(),
+        "tokenizer.json": json.dumps(tokenizer or clip_tokenizer(MERGES)).encode(),
+        "word_bank.npy": npy_bytes(unit_rows(len(everyday_words()), width, seed=6).astype(np.float16)),
     }
-    for layer in range(LAYERS):
-        name = f"transformer.resblocks.{layer}"
-        state |= {
-            f"{name}.attn.in_proj_weight": normal(3 * width, width, scale=0.15),
-            f"{name}.attn.in_proj_bias": normal(3 * width),
-            f"{name}.attn.out_proj.weight": normal(width, width),
-            f"{name}.attn.out_proj.bias": normal(width),
-            f"{name}.ln_1.weight": normal(width, shift=1.0),
-            f"{name}.ln_1.bias": normal(width),
-            f"{name}.ln_2.weight": normal(width, shift=1.0),
-            f"{name}.ln_2.bias": normal(width),
-            f"{name}.mlp.c_fc.weight": normal(4 * width, width),
-            f"{name}.mlp.c_fc.bias": normal(4 * width),
-            f"{name}.mlp.c_proj.weight": normal(width, 4 * width),
-            f"{name}.mlp.c_proj.bias": normal(width),
-        }
-    return state
+    manifest = {
+        "format": "og-text-encoder", "schema_version": 1, "feature_space": feature_space, "width": width,
+        "context_length": CONTEXT, "vocabulary": VOCABULARY, "pad_id": None, "templates": ["{}"], "precision": "fp32",
+        "files": {name: {"bytes": len(data), "crc32": zlib.crc32(data)} for name, data in held.items()},
+    }  # fmt: skip
+    return {"manifest.json": json.dumps(manifest).encode(), **held}
 
 
-def write_tokenizer(folder, **changes):
-    (folder / "tokenizer.json").write_text(json.dumps({**clip_description(MERGES), **changes}))
+def write_files(folder, files):
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, data in files.items():
+        (folder / name).write_bytes(data)
     return folder
 
 
-GELU = {
-    "quick_gelu": lambda x: x / (1 + np.exp(-1.702 * x)),
-    "gelu": lambda x: x * (1 + np.vectorize(erf)(x / np.sqrt(2))) / 2,
-    "gelu_pytorch_tanh": lambda x: x * (1 + np.tanh(np.sqrt(2 / np.pi) * (x + 0.044715 * x**3))) / 2,
-}
+def transformers_model(kind):
+    """One of KINDS, in which every part of both halves matters."""
+    import torch
+    import transformers
+
+    text = {"vocab_size": VOCABULARY, "hidden_size": 32, "intermediate_size": 48, "num_hidden_layers": 2,
+            "num_attention_heads": 4, "max_position_embeddings": CONTEXT, "bos_token_id": START,
+            "pad_token_id": END}  # fmt: skip
+    vision = {"hidden_size": 32, "intermediate_size": 48, "num_hidden_layers": 2, "num_attention_heads": 4,
+              "image_size": SIZE, "patch_size": PATCH}  # fmt: skip
+    if kind.startswith("clip"):
+        # The first configurations had eos_token_id 2 for what is the highest id.
+        early = {"eos_token_id": 2, "hidden_act": "quick_gelu"}
+        text |= early if "early" in kind else {"eos_token_id": END, "hidden_act": "gelu"}
+        config = transformers.CLIPConfig(text_config=text, vision_config=vision, projection_dim=OUT)
+        model = transformers.CLIPModel(config)
+    elif kind == "siglip":
+        text |= {"projection_size": 32, "eos_token_id": END}
+        model = transformers.SiglipModel(transformers.SiglipConfig(text_config=text, vision_config=vision))
+    else:
+        text |= {"projection_size": 32, "eos_token_id": END}
+        vision = {name: value for name, value in vision.items() if name != "image_size"}
+        vision["num_patches"] = (SIZE // PATCH) ** 2
+        model = transformers.Siglip2Model(transformers.Siglip2Config(text_config=text, vision_config=vision))
+    torch.manual_seed(0)
+    with torch.no_grad():
+        for weight in model.parameters():  # as they begin, biases are zero and vectors nearly one
+            weight.copy_(torch.randn_like(weight) * 0.15)
+    return model.eval()
 
 
-def forward_plainly(state, tokens, heads=WIDTH // 64, activation="quick_gelu", causal=True, place=None, epsilon=1e-5):
-    """(D,) float64, unit length: one text through the tower, one head at a time. place: None for the highest id's."""
-    get = {name: value.double().numpy() for name, value in state.items()}
+def write_model(folder, kind="clip"):
+    """A model's folder with its tokenizer."""
+    transformers_model(kind).save_pretrained(folder)
+    (folder / "tokenizer.json").write_text(json.dumps(clip_tokenizer(MERGES)))
+    (folder / "tokenizer_config.json").write_text('{"pad_token": "<|endoftext|>"}')
+    return folder
 
-    def norm(x, name):
-        centred = x - x.mean(axis=1, keepdims=True)
-        scale = np.sqrt((centred**2).mean(axis=1, keepdims=True) + epsilon)
-        return centred / scale * get[f"{name}.weight"] + get[f"{name}.bias"]
 
-    def linear(x, weight, bias):
-        return x @ get[weight].T + get[bias]
+def text_vectors(model, tokens):
+    """(1, D) unit rows as transformers has them."""
+    import torch
 
-    x = get["token_embedding.weight"][tokens] + get["positional_embedding"][: len(tokens)]
-    for layer in range(LAYERS):
-        name = f"transformer.resblocks.{layer}"
-        qkv = linear(norm(x, f"{name}.ln_1"), f"{name}.attn.in_proj_weight", f"{name}.attn.in_proj_bias")
-        q, k, v = np.split(qkv, 3, axis=1)
-        width = x.shape[1] // heads
-        mixed = []
-        for head in range(heads):
-            own = slice(head * width, (head + 1) * width)
-            logits = q[:, own] @ k[:, own].T / np.sqrt(width)
-            if causal:
-                logits[np.triu_indices(len(tokens), 1)] = -np.inf
-            weights = np.exp(logits - logits.max(axis=1, keepdims=True))
-            mixed.append(weights / weights.sum(axis=1, keepdims=True) @ v[:, own])
-        x = x + linear(np.hstack(mixed), f"{name}.attn.out_proj.weight", f"{name}.attn.out_proj.bias")
-        hidden = GELU[activation](linear(norm(x, f"{name}.ln_2"), f"{name}.mlp.c_fc.weight", f"{name}.mlp.c_fc.bias"))
-        x = x + linear(hidden, f"{name}.mlp.c_proj.weight", f"{name}.mlp.c_proj.bias")
-    x = norm(x, "ln_final")[int(np.argmax(tokens)) if place is None else place]
-    vector = x @ get["text_projection"]
-    return vector / np.linalg.norm(vector)
+    with torch.no_grad():
+        vectors = model.get_text_features(input_ids=torch.tensor([tokens])).pooler_output
+    return torch.nn.functional.normalize(vectors, dim=-1).numpy()
+
+
+def image_vectors(model, pixels):
+    """(B, D) unit rows as transformers has them."""
+    import torch
+
+    images = torch.from_numpy(pixels)
+    given = {"pixel_values": images}
+    if type(model).__name__ == "Siglip2Model":
+        side = SIZE // PATCH
+        cut = images.unfold(2, PATCH, PATCH).unfold(3, PATCH, PATCH).permute(0, 2, 3, 4, 5, 1)
+        given["pixel_values"] = cut.reshape(len(pixels), side * side, PATCH * PATCH * 3)
+        given["pixel_attention_mask"] = torch.ones(len(pixels), side * side, dtype=torch.long)
+        given["spatial_shapes"] = torch.tensor([[side, side]] * len(pixels))
+    with torch.no_grad():
+        vectors = model.get_image_features(**given).pooler_output
+    return torch.nn.functional.normalize(vectors, dim=-1).numpy()

@@ -26,6 +26,7 @@ from og_pointcloud.ask.segmentation import Segmentation
 from og_pointcloud.bundle.format import BEYOND, NEAR, ON_SURFACE
 from og_pointcloud.bundle.nearest import NONE_WITHIN_REACH, NearestPoint, surface_distance
 from og_pointcloud.bundle.read import Bundle, read_bundle
+from og_pointcloud.bundle.vocabulary import carried_encoder
 from og_pointcloud.cloud import TOO_FAR, UNKNOWN_SPACE, FeatureSpace, LabelledCloud, Vocabulary
 from og_pointcloud.errors import OgPointcloudError, SceneError
 from og_pointcloud.text.words import Labels, TextFeatures, resolve_labels
@@ -286,7 +287,7 @@ class Segmenter:
     ) -> None:
         self.scene = scene = as_scene(scene)
         scene.check_distance(max_distance)
-        known = (text_features, scene.vocabulary, scene.feature_space, scene.path)
+        known = (text_features, scene.vocabulary, scene.feature_space, carried_encoder(scene.path))
         words, against = resolve_labels(labels, *known, templates), None
         if negatives is not None:
             has_vectors = isinstance(negatives, (Mapping, Vocabulary))
@@ -341,7 +342,7 @@ def instance_table(
     scene = as_scene(scene)
     own, asked = scene.vocabulary, None
     if labels is not None or text_features is not None or (own and own.names):
-        asked = resolve_labels(labels, text_features, own, scene.feature_space, scene.path)
+        asked = resolve_labels(labels, text_features, own, scene.feature_space, carried_encoder(scene.path))
     return list_instances(scene.cloud, scene.chooser, asked, up=up, words=words)
 
 

@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from og_pointcloud.ask.boxes import points_around
 from og_pointcloud.ask.labelled_scene import LabelledScene, SceneLike, as_scene
+from og_pointcloud.bundle.vocabulary import carried_encoder
 from og_pointcloud.cloud import BACKGROUND, TOO_FAR, UNOBSERVED, LabelledCloud
 from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.scene import Camera
@@ -102,7 +103,9 @@ class Pick:
         """
         self._require_instance()
         scene = self.scene
-        words = resolve_labels(labels, text_features, scene.vocabulary, scene.feature_space, scene.path)
+        words = resolve_labels(
+            labels, text_features, scene.vocabulary, scene.feature_space, carried_encoder(scene.path)
+        )
         return scene.chooser.choose(words.vectors).words(self.instance, words.names)
 
     def __str__(self) -> str:

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from og_pointcloud.ask.choosing import Choice, Reason
 from og_pointcloud.ask.instances import SHOWN
 from og_pointcloud.ask.labelled_scene import LabelledScene, SceneLike, as_scene
+from og_pointcloud.bundle.vocabulary import carried_encoder
 from og_pointcloud.cloud import NO_EVIDENCE, FeatureSpace, Vocabulary
 from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.text.words import Labels, TextFeatures, resolve_labels
@@ -143,7 +144,7 @@ def select(
     if not isinstance(text, str) and (not isinstance(text, Mapping) or len(text) != 1):
         shown = list(text) if isinstance(text, Mapping) else text
         raise OgPointcloudError(f"the text is {shown!r:.80}; expected one word or phrase, or one name -> vector")
-    query = resolve_labels(text, text_features, scene.vocabulary, scene.feature_space, scene.path)
+    query = resolve_labels(text, text_features, scene.vocabulary, scene.feature_space, carried_encoder(scene.path))
     rivals = _rivals(scene, query.names[0], against, text_features)
     choice = scene.chooser.choose(_together(query, rivals, scene.feature_space))
     points = np.bincount(scene.instance_ids[scene.instance_ids >= 0], minlength=len(choice.labels))
@@ -185,6 +186,6 @@ def _rivals(scene: LabelledScene, query: str, against: Labels, text_features: Te
         return None
     if isinstance(against, Sequence) and not len(against):
         return None
-    words = resolve_labels(against, text_features, own, scene.feature_space, scene.path)
+    words = resolve_labels(against, text_features, own, scene.feature_space, carried_encoder(scene.path))
     others = [index for index, name in enumerate(words.names) if name != query]
     return Vocabulary(tuple(words.names[index] for index in others), words.vectors[others]) if others else None

@@ -11,6 +11,7 @@ import os
 import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -18,22 +19,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.bundle.format import BANK, CARRIED_ENCODER, describe_member
-from og_pointcloud.bundle.read import read_bundle
+from og_pointcloud.bundle.read import read_bundle, read_carried_encoder
 from og_pointcloud.cloud import FeatureSpace, InstanceTable, Vocabulary, WordBank, unit_rows
-from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError
+from og_pointcloud.errors import FeatureSpaceError
 from og_pointcloud.formats.atomic import replacing
 from og_pointcloud.formats.npy import npy_bytes
-from og_pointcloud.text.encoder import TextEncoder, encoder_files
+from og_pointcloud.text.encoder import CarriedEncoder, TextEncoder, encoder_files
 from og_pointcloud.text.text_features import read_text_features
 
 __all__ = [
-    "AddedWords", "add_words", "bank_members", "carry_encoder", "compact_vectors", "encoder_members",
-    "everyday_words", "read_bank", "read_words", "store_bank", "vocabulary_members",
+    "AddedWords", "add_words", "bank_members", "carried_encoder", "carry_encoder", "compact_vectors", "encoder_members",
+    "read_bank", "store_bank", "vocabulary_members",
 ]  # fmt: skip
 
 HALF_PRECISION_TOLERANCE = 1e-3
 """Words are stored as float16 where no cosine with a descriptor moves by more, and no instance's best word changes."""
-MAX_WORDS_BYTES = 1 << 24
 
 
 @dataclass(frozen=True)
@@ -43,26 +43,6 @@ class AddedWords:
     added: int
     replaced: int
     total: int
-
-
-def read_words(path: str | os.PathLike[str]) -> tuple[str, ...]:
-    """The words of a text file, one a line, UTF-8; empty lines and words that come again are left out."""
-    path = Path(path)
-    try:
-        if path.stat().st_size > MAX_WORDS_BYTES:
-            raise ValueError(f"it has {path.stat().st_size} bytes, more than {MAX_WORDS_BYTES}")
-        lines = path.read_bytes().decode("utf-8-sig").splitlines()
-    except (OSError, ValueError) as error:
-        raise OgPointcloudError(f"{path} cannot be read as words, one a line, in UTF-8 ({error})") from None
-    words = tuple(dict.fromkeys(filter(None, (line.strip() for line in lines))))
-    if not words:
-        raise OgPointcloudError(f"{path} has no words; expected one a line")
-    return words
-
-
-def everyday_words() -> tuple[str, ...]:
-    """The library's own words of everyday things, which an encoder makes a word bank of."""
-    return read_words(Path(__file__).parents[1] / "text" / "everyday_words.txt")
 
 
 def add_words(
@@ -124,7 +104,8 @@ def carry_encoder(
 ) -> TextEncoder:
     """Store a text encoder in a .ogpc file, which then answers any word wherever it goes. Returns the encoder.
 
-    folder: what export-text-encoder wrote; a file without a word bank gets the encoder's. output: as for ``add_words``.
+    folder: what ``og-pointcloud export text`` wrote; a file without a word bank gets the encoder's. output: as for
+    ``add_words``.
     """
     bundle = read_bundle(path)
     members, encoder = encoder_members(folder, bundle.cloud.space)
@@ -132,6 +113,27 @@ def carry_encoder(
         members |= bank_members(encoder.word_bank)
     _rewrite(Path(path), Path(output or path), bundle.manifest, members, lambda manifest: None)
     return encoder
+
+
+def carried_encoder(path: str | os.PathLike[str] | None) -> CarriedEncoder:
+    """A function that opens the text encoder in a .ogpc file: most who ask a scene never need it.
+
+    It gives None where the file carries none, or there is no file (any more); of an unchanged file always the same
+    encoder. OgPointcloudError where it cannot be used.
+    """
+    return partial(_carried, path)
+
+
+def _carried(path: str | os.PathLike[str] | None) -> TextEncoder | None:
+    if path is None or not Path(path).is_file():
+        return None
+    return _carried_once(Path(path).resolve(), Path(path).stat().st_mtime_ns)
+
+
+@lru_cache(maxsize=2)
+def _carried_once(path: Path, _modified: int) -> TextEncoder | None:
+    files = read_carried_encoder(path)
+    return TextEncoder(files, f"{path}: text_encoder") if files else None
 
 
 def encoder_members(folder: str | os.PathLike[str], space: FeatureSpace) -> tuple[dict[str, bytes], TextEncoder]:

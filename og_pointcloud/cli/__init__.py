@@ -17,8 +17,7 @@ from og_pointcloud.cli import (
     demo,
     edit,
     evaluate,
-    export_image_encoder,
-    export_text_encoder,
+    export,
     fit,
     fuse,
     import_,
@@ -41,7 +40,7 @@ __all__ = ["main"]
 
 COMMANDS = (
     masks, models, fit, fuse, import_, segment, select, pick, instances, edit, view, ros_bag, info, vocabulary,
-    export_text_encoder, export_image_encoder, evaluate, report, demo,
+    export, evaluate, report, demo,
 )  # fmt: skip
 
 

@@ -41,41 +41,6 @@ def add_command(commands: Any, name: str, run: Any, summary: str, example: str) 
     return parser
 
 
-def add_model_options(parser: Parser) -> None:
-    """What exporting either half of a model is told: whose weights, where to, in which feature space."""
-    parser.add_argument(
-        "source", type=Path, metavar="SOURCE",
-        help="OWNER/MODEL that was fetched, a transformers or OpenCLIP folder, or a file of weights (.safetensors, "
-        "weights-only .pt)",
-    )  # fmt: skip
-    parser.add_argument(
-        "-o", "--output", type=Path, metavar="DIR",
-        help="the folder to write (default: in the user's cache, where it is found by its feature space)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--feature-space", metavar="OWNER/MODEL",
-        help="as scenes name it (og-pointcloud info S.ogpc); default: OWNER/MODEL, or what its configuration says",
-    )  # fmt: skip
-    parser.add_argument(
-        "--activation", choices=("quick_gelu", "gelu", "gelu_pytorch_tanh"), help="of weights that do not say"
-    )
-
-
-def given_model(source: Path, feature_space: str | None) -> tuple[Path, str | None]:
-    """The folder or file of the SOURCE that was given, and its feature space, as far as both are known by now."""
-    from og_pointcloud.models import fetched_model
-
-    if source.exists():
-        return source, feature_space
-    name = source.as_posix()
-    if folder := fetched_model(name):
-        return folder, feature_space or name
-    raise OgPointcloudError(
-        f"'{name}' is no folder, no file and no model that was fetched; expected one of them: check the path, or fetch "
-        "the model (hf download OWNER/MODEL)"
-    )
-
-
 def did_you_mean(word: str, known: Iterable[str]) -> str:
     close = difflib.get_close_matches(word, list(known), n=3)
     return f"; did you mean {' or '.join(repr(match) for match in close)}?" if close else ""
@@ -179,12 +144,13 @@ def print_fit(report: Mapping[str, Any], cloud: LabelledCloud) -> None:
 
 def next_segment_command(bundle: str, cloud: LabelledCloud) -> str:
     """A segment command that works as it stands, or names what it still needs."""
+    from og_pointcloud.bundle.vocabulary import carried_encoder
     from og_pointcloud.text.encoder import find_encoder
 
     command = ["og-pointcloud", "segment", bundle]
     if cloud.vocabulary and cloud.vocabulary.names:
         labels = ["--labels", ",".join(cloud.vocabulary.names[:2])]
-    elif find_encoder(cloud.feature_space, bundle):
+    elif find_encoder(cloud.feature_space, carried_encoder(bundle)):
         labels = ["--labels", "chair,table"]
     else:
         labels = ["--text-features", f"{cloud.feature_space.replace('/', '_')}_names.npz"]

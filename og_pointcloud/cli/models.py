@@ -15,6 +15,8 @@ PARTS = (
     ("fit, opencv masks", ("cv2", "numba", "scipy"), "fit"),
     ("SAM, CLIP, SigLIP masks", ("torch", "transformers", "safetensors"), "masks"),
     ("learned modes", ("torch",), "learn"),
+    ("export of encoders", ("torch", "transformers", "onnx", "onnxscript"), "export"),
+    ("SigLIP's typed words", ("tokenizers",), "words"),
 )
 """What for, modules, extra."""
 KINDS = {"sam": "proposer", "sam_hq": "proposer", "sam2": "proposer", "sam2_video": "proposer", "sam3": "proposer",

@@ -50,7 +50,7 @@ def add(commands: Any) -> None:
         "og-pointcloud vocabulary carry kitchen.ogpc clip-vit-b32 -o kitchen_any_word.ogpc",
     )  # fmt: skip
     add_bundle(carrying, writes=True)
-    carrying.add_argument("encoder", type=Path, metavar="DIR", help="what export-text-encoder wrote")
+    carrying.add_argument("encoder", type=Path, metavar="DIR", help="what `og-pointcloud export text` wrote")
 
 
 def add_bundle(parser: argparse.ArgumentParser, writes: bool) -> None:
@@ -61,7 +61,8 @@ def add_bundle(parser: argparse.ArgumentParser, writes: bool) -> None:
 
 def run_add(arguments: argparse.Namespace) -> None:
     from og_pointcloud.bundle.read import read_bundle
-    from og_pointcloud.bundle.vocabulary import add_words, read_words
+    from og_pointcloud.bundle.vocabulary import add_words
+    from og_pointcloud.text.everyday import read_words
 
     if arguments.words is None and arguments.text_features is None:
         arguments.parser.error("no words: name a file with one a line, or --text-features F.npz")
@@ -95,10 +96,11 @@ def from_features(path: Path, words: tuple[str, ...] | None) -> Any:
 
 def encoded(words: tuple[str, ...] | None, folder: Path | None, own_space: str, bundle: Path) -> Any:
     """The words as the scene's encoder, or the one in a folder, has them; and its feature space."""
+    from og_pointcloud.bundle.vocabulary import carried_encoder
     from og_pointcloud.cloud import FeatureSpace, Vocabulary
     from og_pointcloud.text.encoder import encoder_for, read_text_encoder
 
-    encoder = read_text_encoder(folder) if folder else encoder_for(own_space, bundle)
+    encoder = read_text_encoder(folder) if folder else encoder_for(own_space, carried_encoder(bundle))
     FeatureSpace(own_space, 0).require(
         FeatureSpace(encoder.feature_space, encoder.width), f"texts that {encoder.where} encodes"
     )
@@ -115,7 +117,7 @@ def run_list(arguments: argparse.Namespace) -> None:
 
 def run_bank(arguments: argparse.Namespace) -> None:
     from og_pointcloud.bundle.read import read_bundle
-    from og_pointcloud.bundle.vocabulary import read_bank, store_bank
+    from og_pointcloud.bundle.vocabulary import carried_encoder, read_bank, store_bank
     from og_pointcloud.text.encoder import encoder_for, read_text_encoder
 
     check_outputs({"-o": (arguments.output, [".ogpc"])}, inputs=[arguments.features])
@@ -124,9 +126,9 @@ def run_bank(arguments: argparse.Namespace) -> None:
     else:
         own_space = read_bundle(arguments.bundle).cloud.feature_space
         folder = arguments.text_encoder
-        encoder = read_text_encoder(folder) if folder else encoder_for(own_space, arguments.bundle)
+        encoder = read_text_encoder(folder) if folder else encoder_for(own_space, carried_encoder(arguments.bundle))
         if encoder.word_bank is None:
-            raise OgPointcloudError(f"{encoder.where} has no word bank: make it again with export-text-encoder")
+            raise OgPointcloudError(f"{encoder.where} has no word bank: make it again with og-pointcloud export text")
         bank, space = encoder.word_bank, encoder.feature_space
     store_bank(arguments.bundle, bank, space, arguments.output)
     path = arguments.output or arguments.bundle

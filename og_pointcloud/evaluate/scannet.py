@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from og_pointcloud.ask.choosing import Chooser
 from og_pointcloud.ask.labelled_scene import as_scene, segment
+from og_pointcloud.bundle.vocabulary import carried_encoder
 from og_pointcloud.errors import SceneError
 from og_pointcloud.evaluate.captures import sure
 from og_pointcloud.evaluate.intervals import RiskCoverage, risk_coverage
@@ -153,7 +154,7 @@ def _asked_labels(
 ) -> tuple[NDArray[np.integer], NDArray[np.floating], NDArray[np.integer]]:
     """(n,) labels, how sure they are, and the labels of a scene that may not say that none fits: the largest cosine."""
     scene = as_scene(file)
-    words = resolve_labels(names, text_features, scene.vocabulary, scene.feature_space, scene.path)
+    words = resolve_labels(names, text_features, scene.vocabulary, scene.feature_space, carried_encoder(scene.path))
     result = segment(xyz, words, scene=scene)
     forced = Chooser(scene.cloud.instances).choose(words.vectors).at(result.instances)[0]
     return result.labels, sure(result.scores, result.calibrated, result.certainty), forced

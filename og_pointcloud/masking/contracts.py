@@ -92,7 +92,7 @@ class DepthMaskProposer(Protocol):
 class MaskSettings:
     """How masks are made; what changes one of these starts anew.
 
-    proposer: see `open_proposer`, or a folder of masks. encoder: see `encoders.open_encoder`; None: masks alone, with
+    proposer: see `open_proposer`, or a folder of masks. encoder: see `encode.open_encoder`; None: masks alone, with
     zero features. level: small, medium or large, for ``masks/`` (LangSplat's files have all); or agreed: all images
     are proposed for first, and proposals count by how far other views confirm them (`agreement`).
     longest_side: larger images are shrunk to this; masks have the shrunk size.

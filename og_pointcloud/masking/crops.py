@@ -1,4 +1,4 @@
-"""Square cut-outs of an image, one a mask, as image encoders want them.
+"""Square cut-outs of an image, one a mask, and the numbers that an image encoder takes for their pixels.
 
 LangSplat's: the mask's tight box with black outside the mask, padded to a square. Better ones show where the thing
 stands: a larger window, and outside the mask a blend of the image with an even colour, so that the encoder sees a
@@ -7,19 +7,22 @@ table's chairs, and still which of them is meant. Several are weighted into one 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
 from functools import lru_cache
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud.errors import SceneError
+from og_pointcloud.errors import OgPointcloudError, SceneError
 
-__all__ = ["CROP_STYLES", "LANGSPLAT", "WITH_CONTEXT", "Crop", "Resample", "mask_box", "mask_crops", "resized"]
+__all__ = ["CROP_STYLES", "LANGSPLAT", "WITH_CONTEXT", "Crop", "Preprocessing", "Resample", "mask_box", "mask_crops"]
 
 Resample = Literal["bilinear", "bicubic"]
+Colour = tuple[float, float, float]
+
+MAX_SIZE = 4096
 CUBIC = -0.5
 """Keys' parameter, as Pillow has it; OpenCV's is -0.75, and OpenCV's does not smooth what it shrinks."""
 
@@ -44,6 +47,52 @@ class Crop:
 LANGSPLAT = (Crop(),)
 WITH_CONTEXT = (Crop(1.0, 0.0, 1.0), Crop(1.2, 0.35, 1.0), Crop(2.0, 0.6, 0.5))
 CROP_STYLES = {"langsplat": LANGSPLAT, "context": WITH_CONTEXT}
+
+
+@dataclass(frozen=True)
+class Preprocessing:
+    """From squares of an image to what an image model takes.
+
+    size: of the square, pixels. mean, std: RGB, of values in [0, 1]. keeps_shape: whether the model's own processor
+    cuts an image to a square rather than squeezing it; crops of masks are squares already.
+    """
+
+    size: int
+    mean: Colour
+    std: Colour
+    resample: Resample = "bicubic"
+    keeps_shape: bool = True
+
+    def __post_init__(self) -> None:
+        numbers = np.array([*self.mean, *self.std], float)
+        if not 1 <= self.size <= MAX_SIZE or len(self.mean) != 3 or len(self.std) != 3 or self.resample not in (
+            "bilinear", "bicubic"
+        ) or not np.isfinite(numbers).all() or min(self.std) <= 0:  # fmt: skip
+            raise OgPointcloudError(
+                f"preprocessing is {self}; expected a size up to {MAX_SIZE}, three finite means, three deviations "
+                "above 0, and bilinear or bicubic"
+            )
+
+    @classmethod
+    def from_manifest(cls, entry: Mapping[str, Any]) -> Preprocessing:
+        """Read back what ``as_manifest`` gave; TypeError for other fields."""
+        return cls(**{**entry, "mean": tuple(entry["mean"]), "std": tuple(entry["std"])})
+
+    def as_manifest(self) -> dict[str, Any]:
+        """The fields, as JSON has them."""
+        return asdict(self)
+
+    @property
+    def fill(self) -> tuple[int, int, int]:
+        """The colour that becomes zero, or nearly: what says nothing to the model."""
+        red, green, blue = (round(255 * value) for value in self.mean)
+        return red, green, blue
+
+    def pixels(self, squares: NDArray[np.uint8]) -> NDArray[np.float32]:
+        """(B, 3, size, size) float32 of squares (B, size, size, 3) uint8 RGB."""
+        scale, offset = 1 / (255 * np.array(self.std)), np.array(self.mean) / np.array(self.std)
+        values = squares * scale.astype(np.float32) - offset.astype(np.float32)
+        return np.ascontiguousarray(values.transpose(0, 3, 1, 2), np.float32)
 
 
 def mask_crops(
@@ -97,27 +146,6 @@ def _square(
     shown[inside] = image[rows, columns][inside]
     down = _resampled(shown, size, resample, side, rows.start - top, fill)  # first: rows lie together in memory
     return _resampled(down.transpose(1, 0, 2), size, resample, side, columns.start - left, fill).transpose(1, 0, 2)
-
-
-def resized(image: NDArray[np.uint8], height: int, width: int, resample: Resample = "bicubic") -> NDArray[np.uint8]:
-    """The image (H, W, C) uint8 at another size, smoothed where it shrinks, as Pillow does.
-
-    One direction after the other, rounded to whole numbers after each, the one first that leaves less for the second:
-    what the processors of published models do, but for a last bit here and there.
-    """
-    if len(image) * width <= height * image.shape[1]:
-        return np.ascontiguousarray(_rows_resized(_columns_resized(image, width, resample), height, resample))
-    return np.ascontiguousarray(_columns_resized(_rows_resized(image, height, resample), width, resample))
-
-
-def _columns_resized(image: NDArray[np.uint8], width: int, resample: Resample) -> NDArray[np.uint8]:
-    return _rows_resized(image.transpose(1, 0, 2), width, resample).transpose(1, 0, 2)
-
-
-def _rows_resized(image: NDArray[np.uint8], height: int, resample: Resample) -> NDArray[np.uint8]:
-    if len(image) == height:
-        return image
-    return _resampled(image, height, resample, len(image), 0, np.zeros(image.shape[2], np.float32))
 
 
 def _resampled(

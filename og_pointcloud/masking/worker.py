@@ -200,7 +200,7 @@ def _open_proposer(settings: MaskSettings) -> MaskProposer | ExistingMasks:
 def _open_encoder(name: str | None) -> MaskEncoder | None:
     if name is None:
         return None
-    from og_pointcloud.masking.encoders import open_encoder
+    from og_pointcloud.masking.encode import open_encoder
 
     return open_encoder(name)
 

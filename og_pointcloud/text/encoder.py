@@ -1,4 +1,4 @@
-"""Words -> text vectors of a feature space: an encoder that ``og-pointcloud export-text-encoder`` wrote, run anywhere.
+"""Words -> text vectors of a feature space: an encoder that ``og-pointcloud export text`` wrote, run anywhere.
 
 A folder, or the members ``text_encoder/`` of a .ogpc file, nothing in it pickled:
 
@@ -8,7 +8,8 @@ A folder, or the members ``text_encoder/`` of a .ogpc file, nothing in it pickle
   tokenizer.json      vocabulary and merges (see ``tokenizer``)
   word_bank.npy       (B, D) float16, everyday words in the manifest's templates (see ``choosing``)
 
-numpy and onnxruntime, nothing else. What is read is checked before it is run: it may come from a stranger.
+numpy and onnxruntime run it, and the tokenizers package where the tokenizer is not CLIP's. What is read is checked
+before it is run: it may come from a stranger.
 """
 
 from __future__ import annotations
@@ -19,10 +20,10 @@ import sys
 import threading
 import zlib
 from collections import OrderedDict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,15 +32,15 @@ from og_pointcloud.cloud import WordBank
 from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError
 from og_pointcloud.formats.npy import array_from_npy
 from og_pointcloud.models import MODEL_NAME, check_graph
-from og_pointcloud.text.tokenizer import Tokenizer
+from og_pointcloud.text.tokenizer import open_tokenizer
 
 if TYPE_CHECKING:
     from onnxruntime import InferenceSession
 
 __all__ = [
-    "ENCODER_FILES", "FORMAT", "MODELS_VARIABLE", "OPERATORS", "SCHEMA_VERSION", "TextEncoder", "cache_folder",
-    "check_templates", "encoder_files", "encoder_for", "export_command", "find_encoder", "model_folders",
-    "read_text_encoder",
+    "ENCODER_FILES", "FORMAT", "MODELS_VARIABLE", "OPERATORS", "SCHEMA_VERSION", "CarriedEncoder", "TextEncoder",
+    "cache_folder", "check_templates", "encoder_files", "encoder_for", "export_command", "find_encoder",
+    "model_folders", "read_text_encoder",
 ]  # fmt: skip
 
 FORMAT, SCHEMA_VERSION = "og-text-encoder", 1
@@ -50,16 +51,18 @@ ENCODER_FILES = {MANIFEST: 1 << 20, GRAPH: (1 << 31) - 1, TOKENIZER: 1 << 26, WO
 """The files of an encoder, and the bytes that each may have; a serialised graph cannot have more. One without a word
 bank is an encoder too."""
 OPERATORS = frozenset({
-    "Add", "ArgMax", "Cast", "Div", "DynamicQuantizeLinear", "Equal", "Erf", "Gather", "GatherND", "LayerNormalization",
-    "MatMul", "MatMulInteger", "Max", "Mul", "ReduceL2", "Reshape", "Shape", "Sigmoid", "Slice", "Softmax", "Split",
-    "Tanh", "Transpose", "Unsqueeze",
+    "Add", "ArgMax", "Cast", "Clip", "Concat", "DequantizeLinear", "Div", "DynamicQuantizeLinear", "Equal", "Erf",
+    "Expand", "Gather", "GatherND", "Gemm", "LayerNormalization", "LessOrEqual", "MatMul", "MatMulInteger", "Max",
+    "Mul", "Pow", "Range", "ReduceL2", "Reshape", "Shape", "Sigmoid", "Slice", "Softmax", "Split", "Squeeze", "Tanh",
+    "Transpose", "Unsqueeze", "Where",
 })  # fmt: skip
-"""All that an encoder's graph is made of: none repeats, calls other graphs, or makes an array larger by its values."""
+"""All that an encoder's graph is made of: arithmetic without loops, random numbers, or graphs inside nodes."""
 DEMO_ENCODER = Path(__file__).parents[1] / "masking" / "demo_encoder"
 """The encoder that comes with the library: it knows the demo's room and nothing else of the world."""
+CarriedEncoder: TypeAlias = "Callable[[], TextEncoder | None]"
 TEXTS_PER_RUN = 64
 VECTORS_REMEMBERED = 1 << 14
-REMAKE = "make the encoder again with og-pointcloud export-text-encoder"
+REMAKE = "make the encoder again with og-pointcloud export text"
 
 
 class TextEncoder:
@@ -84,7 +87,7 @@ class TextEncoder:
         self._graph = files[GRAPH]
         self._session: InferenceSession | None = None
         try:
-            self._tokenizer = Tokenizer(files[TOKENIZER])
+            self._tokenizer = open_tokenizer(files[TOKENIZER], self.context_length)
         except ValueError as error:
             raise OgPointcloudError(f"{where}: {TOKENIZER} cannot be used ({error}): {REMAKE}") from None
         if self._tokenizer.highest_id >= self.manifest["vocabulary"]:
@@ -124,7 +127,7 @@ class TextEncoder:
 
     def tokens(self, text: str) -> list[int]:
         """Token ids of a text as the encoder is given them: cut to the context, padded only where it must be."""
-        ids = self._tokenizer(text, self.context_length)
+        ids = self._tokenizer(text)
         pad = self.manifest["pad_id"]
         return ids if pad is None else ids + [pad] * (self.context_length - len(ids))
 
@@ -165,13 +168,13 @@ class TextEncoder:
 
 
 def read_text_encoder(folder: str | os.PathLike[str]) -> TextEncoder:
-    """Open a folder that export-text-encoder wrote, checked whole; OgPointcloudError for any other.
+    """Open a folder that ``og-pointcloud export text`` wrote, checked whole; OgPointcloudError for any other.
 
     Asking for the same unchanged folder again gives the same encoder.
     """
     path = Path(folder).resolve()
     if not (path / MANIFEST).is_file():
-        raise OgPointcloudError(f"{folder} has no {MANIFEST}; expected a folder of og-pointcloud export-text-encoder")
+        raise OgPointcloudError(f"{folder} has no {MANIFEST}; expected a folder that og-pointcloud export text wrote")
     states = [(path / name).stat() for name in ENCODER_FILES if (path / name).is_file()]
     return _read_once(path, tuple((state.st_mtime_ns, state.st_size) for state in states))
 
@@ -187,9 +190,9 @@ def encoder_files(folder: Path) -> dict[str, bytes]:
     return {name: _read_bounded(folder / name, ENCODER_FILES[name]) for name in present}
 
 
-def encoder_for(feature_space: str, bundle: str | os.PathLike[str] | None = None) -> TextEncoder:
+def encoder_for(feature_space: str, carried: CarriedEncoder | None = None) -> TextEncoder:
     """As ``find_encoder``, but OgPointcloudError, with the command that makes one, where there is none."""
-    if encoder := find_encoder(feature_space, bundle):
+    if encoder := find_encoder(feature_space, carried):
         return encoder
     named = os.environ.get(MODELS_VARIABLE)
     raise OgPointcloudError(
@@ -198,17 +201,15 @@ def encoder_for(feature_space: str, bundle: str | os.PathLike[str] | None = None
     )
 
 
-def find_encoder(feature_space: str, bundle: str | os.PathLike[str] | None = None) -> TextEncoder | None:
-    """The encoder of a feature space: the one that a .ogpc carries, else the first that is found among the models.
+def find_encoder(feature_space: str, carried: CarriedEncoder | None = None) -> TextEncoder | None:
+    """The encoder of a feature space: the one that the scene carries, else the first that is found among the models.
 
-    bundle: the scene's file, if it has one. Looked through are the folders of OG_POINTCLOUD_MODELS, then the user's
-    cache folder, then the library's own; each may be an encoder, or hold encoders. None where there is none;
-    OgPointcloudError where there is one that cannot be used.
+    carried: gives the encoder in the scene's file, if it has one (`bundle.vocabulary.carried_encoder`). Looked through
+    are the folders of OG_POINTCLOUD_MODELS, then the user's cache folder, then the library's own; each may be an
+    encoder, or hold encoders. None where there is none; OgPointcloudError where there is one that cannot be used.
     """
-    if bundle is not None and Path(bundle).is_file():  # a scene outlives its file
-        carried = _carried(Path(bundle).resolve(), Path(bundle).stat().st_mtime_ns)
-        if carried is not None:
-            return carried
+    if carried is not None and (encoder := carried()):
+        return encoder
     for folder in model_folders():
         candidates = [folder, *sorted(path for path in folder.iterdir() if path.is_dir())] if folder.is_dir() else []
         for candidate in candidates:
@@ -220,8 +221,8 @@ def find_encoder(feature_space: str, bundle: str | os.PathLike[str] | None = Non
 def export_command(feature_space: str) -> str:
     """The command that makes the encoder of a feature space, where it will be found."""
     if MODEL_NAME.fullmatch(feature_space):  # OWNER/MODEL, found where it was fetched to
-        return f"og-pointcloud export-text-encoder {feature_space}"
-    return f"og-pointcloud export-text-encoder MODEL_FOLDER --feature-space '{feature_space}'"
+        return f"og-pointcloud export text {feature_space}"
+    return f"og-pointcloud export text MODEL_FOLDER --feature-space '{feature_space}'"
 
 
 def cache_folder() -> Path:
@@ -261,14 +262,6 @@ def _feature_space_of(folder: Path) -> str | None:
     return manifest.get("feature_space") if isinstance(manifest, dict) and manifest.get("format") == FORMAT else None
 
 
-@lru_cache(maxsize=2)
-def _carried(bundle: Path, _modified: int) -> TextEncoder | None:
-    from og_pointcloud.bundle.read import read_carried_encoder
-
-    files = read_carried_encoder(bundle)
-    return TextEncoder(files, f"{bundle}: text_encoder") if files else None
-
-
 def _read_bounded(path: Path, most: int) -> bytes:
     try:
         with path.open("rb") as file:
@@ -277,7 +270,9 @@ def _read_bounded(path: Path, most: int) -> bytes:
                 return file.read(size)  # not the bound, which it would allocate
     except FileNotFoundError:
         raise OgPointcloudError(f"{path} is missing: {REMAKE}") from None
-    raise OgPointcloudError(f"{path} has {size}, more than {most} bytes: it is not what export-text-encoder writes")
+    raise OgPointcloudError(
+        f"{path} has {size}, more than {most} bytes: it is not what og-pointcloud export text writes"
+    )
 
 
 def _checked_manifest(files: Mapping[str, bytes], where: str) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from og_pointcloud.cloud import FeatureSpace, Vocabulary
 from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError
-from og_pointcloud.text.encoder import encoder_for, export_command, find_encoder
+from og_pointcloud.text.encoder import CarriedEncoder, encoder_for, export_command, find_encoder
 from og_pointcloud.text.text_features import read_text_features
 
 __all__ = ["Labels", "TextFeatures", "resolve_labels"]
@@ -26,7 +26,7 @@ def resolve_labels(
     text_features: TextFeatures,
     own_words: Vocabulary | None,
     feature_space: str,
-    bundle: Path | None = None,
+    carried: CarriedEncoder | None = None,
     templates: Sequence[str] | None = None,
 ) -> Vocabulary:
     """Names, all different, with a finite vector each that is not zero.
@@ -34,8 +34,8 @@ def resolve_labels(
     labels: words, looked up in text_features and then in own_words (None: every word of the first that there is), and
     encoded where both lack them, if there is an encoder; or name -> vector (D,); or a Vocabulary, taken as it is.
     text_features: a text-features file, or what ``read_text_features`` returned. own_words, feature_space: the scene's.
-    bundle: the scene's file, which may carry the encoder. templates: texts with ``{}``, which every word is put into
-    and encoded, whatever vectors are stored for it; needs the encoder.
+    carried: gives the encoder in the scene's file, if it has one. templates: texts with ``{}``, which every word is
+    put into and encoded, whatever vectors are stored for it; needs the encoder.
     Raises OgPointcloudError for a word without vector or given twice, FeatureSpaceError for text_features of another
     space and for vectors that cannot be compared.
     """
@@ -59,8 +59,8 @@ def resolve_labels(
         if not isinstance(word, str):
             raise OgPointcloudError(f"label {word!r:.60} is a {type(word).__name__}; expected words, or name -> vector")
     if templates is not None:
-        return _checked(Vocabulary(words, encoder_for(feature_space, bundle)(words, templates)))
-    return _checked(_looked_up(words, sources, feature_space, bundle))
+        return _checked(Vocabulary(words, encoder_for(feature_space, carried)(words, templates)))
+    return _checked(_looked_up(words, sources, feature_space, carried))
 
 
 def _ways(feature_space: str) -> str:
@@ -104,13 +104,13 @@ def _refuse_not_finite(names: tuple[str, ...], vectors: np.ndarray) -> Vocabular
 
 
 def _looked_up(
-    words: tuple[str, ...], sources: list[Vocabulary], feature_space: str, bundle: Path | None
+    words: tuple[str, ...], sources: list[Vocabulary], feature_space: str, carried: CarriedEncoder | None
 ) -> Vocabulary:
     vectors: dict[str, np.ndarray] = {}
     for source in reversed(sources):
         vectors |= dict(zip(source.names, source.vectors, strict=True))
     missing = [word for word in words if word not in vectors]
-    if missing and (encoder := find_encoder(feature_space, bundle)):
+    if missing and (encoder := find_encoder(feature_space, carried)):
         vectors |= dict(zip(missing, encoder(missing), strict=True))
     elif missing:
         others = f", nor are {len(missing) - 1} more of the labels" if len(missing) > 1 else ""

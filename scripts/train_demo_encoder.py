@@ -1,7 +1,7 @@
 """Trains the demo encoder: a tiny image encoder and a tiny text encoder that know the procedural room's things.
 
-    python examples/train_demo_encoder.py              # writes og_pointcloud/masking/demo_encoder, then measures it
-    python examples/train_demo_encoder.py --measure    # measures the one that is there
+    python scripts/train_demo_encoder.py              # writes og_pointcloud/masking/demo_encoder, then measures it
+    python scripts/train_demo_encoder.py --measure    # measures the one that is there
 
 Crops of some thousand masks of rendered rooms and the words for what they show are brought together by the usual
 contrastive loss; words for nothing in the room, many of them made up, compete. Half of the masks are those of a
@@ -17,7 +17,6 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import tempfile
 import time
 from collections import Counter, OrderedDict
 from collections.abc import Iterable, Sequence
@@ -27,34 +26,30 @@ from functools import cached_property
 from itertools import pairwise
 from multiprocessing import get_context
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import cv2
 import numpy as np
 import torch
 import torch.nn.functional as F
 from numpy.typing import NDArray
-from og_pointcloud_export.image_encoder import write_image_encoder
-from og_pointcloud_export.image_graph import add_unit_rows, serialized
-from og_pointcloud_export.text_encoder import export_text_encoder
-from og_pointcloud_export.text_graph import Graph
-from og_pointcloud_export.text_tokenizer import clip_description
+from og_pointcloud_export.encoders import write_image_encoder, write_text_encoder
 from og_pointcloud_room.capture import CaptureSettings, RoomCapture, make_capture
 from og_pointcloud_room.furniture import CLASS_NAMES
 from og_pointcloud_room.raycast import Frame
 from og_pointcloud_room.words import RELATED, SYNONYMS
-from safetensors.torch import save_file
+from onnx import TensorProto, helper, numpy_helper
 from torch import nn
+from transformers import CLIPTokenizer
 
-from og_pointcloud.bundle.vocabulary import everyday_words
-from og_pointcloud.masking.crops import Crop, mask_crops
-from og_pointcloud.masking.encoders import DEMO_FOLDER, DEMO_SPACE, open_encoder
-from og_pointcloud.masking.encoders.preprocessing import Preprocessing
+from og_pointcloud.masking.crops import Crop, Preprocessing, mask_crops
+from og_pointcloud.masking.encode import DEMO_FOLDER, DEMO_SPACE, open_encoder
 from og_pointcloud.masking.levels import settle
 from og_pointcloud.masking.opencv import OpenCVProposer
 from og_pointcloud.text.encoder import TextEncoder as TrainedTextEncoder
 from og_pointcloud.text.encoder import read_text_encoder
-from og_pointcloud.text.tokenizer import Tokenizer
+from og_pointcloud.text.everyday import everyday_words
+from og_pointcloud.text.tokenizer import BYTE_CHARACTERS, Tokenizer, open_tokenizer
 
 Random = np.random.Generator
 
@@ -263,6 +258,15 @@ def learnt_merges(texts: Iterable[str], count: int) -> list[tuple[str, str]]:
     return merges
 
 
+def tokenizer_json(merges: Iterable[tuple[str, str]]) -> dict[str, Any]:
+    """CLIP's tokenizer of these merges: ids are the 256 bytes, the bytes at a word's end, the merges, start, end."""
+    letters = sorted(BYTE_CHARACTERS, key=lambda character: (ord(character) >= 256, ord(character)))
+    joined = ["".join(merge) for merge in merges]
+    tokens = [*letters, *(f"{letter}</w>" for letter in letters), *joined, "<|startoftext|>", "<|endoftext|>"]
+    made: Any = CLIPTokenizer(vocab={token: id for id, token in enumerate(tokens)}, merges=list(merges))
+    return json.loads(made.backend_tokenizer.to_str())
+
+
 def _merged(parts: list[str], pair: tuple[str, str]) -> list[str]:
     merged: list[str] = []
     for part in parts:
@@ -305,17 +309,26 @@ class TextEncoder(nn.Module):
         self.transformer = nn.ModuleDict({"resblocks": nn.ModuleList([Block()])})
         self.ln_final = nn.LayerNorm(TEXT_WIDTH)
         self.text_projection = nn.Parameter(torch.randn(TEXT_WIDTH, WIDTH) * TEXT_WIDTH**-0.5)
+        self.later = torch.full((CONTEXT, CONTEXT), -torch.inf).triu(1)
 
     def forward(self, texts: Sequence[str]) -> torch.Tensor:
         """(B, WIDTH) unit rows."""
-        rows = [self.tokenizer(text, CONTEXT) for text in texts]
+        rows = [self.tokenizer(text) for text in texts]
         length = max(map(len, rows))
         # The end's id is the highest; behind the end nothing counts, since no token looks ahead.
-        ids = torch.tensor([row + row[-1:] * (length - len(row)) for row in rows])
-        later = torch.full((length, length), -torch.inf).triu(1)
+        return self.vectors(torch.tensor([row + row[-1:] * (length - len(row)) for row in rows]))
+
+    def vectors(self, ids: torch.Tensor) -> torch.Tensor:
+        """(B, WIDTH) unit rows of tokens (B, T)."""
+        length = ids.shape[1]
+        later = self.later[:length, :length]
         x = self.token_embedding(ids) + self.positional_embedding[:length]
         for block in self.transformer["resblocks"]:  # type: ignore[union-attr]
             x = block(x, later)
+        return self.pooled(x, ids)
+
+    def pooled(self, x: torch.Tensor, ids: torch.Tensor) -> torch.Tensor:
+        """(B, WIDTH) unit rows of what the last block gives (B, T, TEXT_WIDTH)."""
         last = self.ln_final(x)[torch.arange(len(ids)), ids.argmax(dim=1)]
         return F.normalize(last @ self.text_projection, dim=1)
 
@@ -344,7 +357,7 @@ def train(crops: Crops, words: Words, steps: int, seed: int) -> tuple[TextEncode
     """Both encoders. A mask's vector is in training what it is in use, the mean of its crops' vectors."""
     torch.manual_seed(seed)
     rng = np.random.default_rng([seed, 1])
-    text = TextEncoder(Tokenizer(json.dumps(clip_description(list(words.merges))).encode()))
+    text = TextEncoder(open_tokenizer(json.dumps(tokenizer_json(words.merges)).encode(), CONTEXT))
     image = ImageEncoder().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     optimizer = torch.optim.AdamW([*text.parameters(), *image.parameters()], weight_decay=0.02)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, LEARNING_RATE, total_steps=steps, pct_start=0.1)
@@ -405,25 +418,46 @@ def _hue_turns(angles: NDArray[np.float64]) -> NDArray[np.float64]:
 # Export ---------------------------------------------------------------------------------------------------------
 
 
+class TextTower(nn.Module):
+    """The text encoder as it is exported: from tokens on, its attention as plain products, since torch's own module
+    fixes the number of texts when it is exported."""
+
+    def __init__(self, text: TextEncoder) -> None:
+        super().__init__()
+        self.text = text
+
+    def forward(self, tokens: torch.Tensor) -> torch.Tensor:
+        """(B, WIDTH) unit rows of tokens (B, T)."""
+        length = tokens.shape[1]
+        x = self.text.token_embedding(tokens) + self.text.positional_embedding[:length]
+        for block in self.text.transformer["resblocks"]:  # type: ignore[union-attr]
+            inputs = F.linear(block.ln_1(x), block.attn.in_proj_weight, block.attn.in_proj_bias)
+            query, key, value = inputs.unflatten(2, (3, HEADS, -1)).permute(2, 0, 3, 1, 4)
+            cosines = query @ key.transpose(2, 3) * (TEXT_WIDTH / HEADS) ** -0.5 + self.text.later[:length, :length]
+            x = x + block.attn.out_proj((cosines.softmax(3) @ value).transpose(1, 2).flatten(2))
+            x = x + block.mlp(block.ln_2(x))
+        return self.text.pooled(x, tokens)
+
+
 def export(text: TextEncoder, image: ImageEncoder, words: Words, folder: Path) -> None:
-    """Write both halves. The text side takes the road of any OpenCLIP model, through a folder in its format."""
-    with tempfile.TemporaryDirectory() as temporary:
-        source = Path(temporary)
-        save_file({name: value.contiguous() for name, value in text.state_dict().items()},
-                  source / "open_clip_model.safetensors")  # fmt: skip
-        config = {"model_cfg": {"embed_dim": WIDTH, "text_cfg": {"heads": HEADS}}}
-        (source / "open_clip_config.json").write_text(json.dumps(config))
-        (source / "tokenizer.json").write_text(json.dumps(clip_description(list(words.merges))))
-        export_text_encoder(source, folder / "text", feature_space=DEMO_SPACE)
+    """Write both halves."""
+    about = {
+        "feature_space": DEMO_SPACE, "context_length": CONTEXT, "vocabulary": text.tokenizer.highest_id + 1,
+        "pad_id": None, "templates": ["{}"], "tower": {"layers": 1, "heads": HEADS, "activation": "gelu"},
+    }  # fmt: skip
+    tower, some = TextTower(text).eval(), torch.tensor([text.tokenizer("an old chair")])
+    with torch.no_grad():
+        torch.testing.assert_close(tower(some), text.vectors(some))
+    write_text_encoder(folder / "text", tower, tokenizer_json(words.merges), about)
     rounded = RoundedImageModel(image)
-    about = {"knows": list(KINDS), "trained_by": "examples/train_demo_encoder.py"}
-    write_image_encoder(folder / "image", rounded.graph(), rounded, CROPS, about)
+    about = {"knows": list(KINDS), "trained_by": "scripts/train_demo_encoder.py"}
+    write_image_encoder(folder / "image", rounded, rounded.graph(), about)
 
 
 class RoundedImageModel:
     """The image encoder as it is stored: norms folded into the convolutions, these in 8 bits, a scale a channel."""
 
-    feature_space, width, preprocessing = DEMO_SPACE, WIDTH, PREPROCESSING
+    feature_space, width, preprocessing, crops = DEMO_SPACE, WIDTH, PREPROCESSING, CROPS
 
     def __init__(self, image: ImageEncoder) -> None:
         self.layers: list[tuple[NDArray[np.int8], NDArray[np.float32], NDArray[np.float32]]] = []
@@ -448,24 +482,36 @@ class RoundedImageModel:
 
     def graph(self) -> bytes:
         """The same as image_encoder.onnx."""
-        graph, x = Graph(int8=False), "pixels"
-        for number, ((weight, scale, offset), (_, _, kernel, stride)) in enumerate(
-            zip(self.layers, CHANNELS, strict=True)
+        constants: dict[str, NDArray[Any]] = {"flat": np.array([0, -1])}
+        constants |= {"head": self.head[0], "head.bias": self.head[1], "tiny": np.array(np.finfo(np.float32).tiny)}
+        nodes, x = [], "pixels"
+        for number, (layer, (_, _, kernel, stride)) in enumerate(zip(self.layers, CHANNELS, strict=True)):
+            weight, scale, offset = (f"layer{number}.{part}" for part in ("weight", "scale", "offset"))
+            constants |= zip((weight, scale, offset), layer, strict=True)
+            values, total = f"layer{number}.values", f"layer{number}.sum"
+            shape = {"strides": [stride, stride], "pads": [kernel // 2] * 4}
+            nodes += [
+                helper.make_node("DequantizeLinear", [weight, scale], [values], axis=0),
+                helper.make_node("Conv", [x, values, offset], [total], **shape),
+                helper.make_node("Relu", [total], [x := f"layer{number}.x"]),
+            ]
+        for operator, inputs, output in (
+            ("GlobalAveragePool", [x], "mean_square"),
+            ("Reshape", ["mean_square", "flat"], "mean"),
+            ("MatMul", ["mean", "head"], "product"),
+            ("Add", ["product", "head.bias"], "vector"),
+            ("ReduceL2", ["vector", "last"], "length_raw"),
+            ("Max", ["length_raw", "tiny"], "length"),
+            ("Div", ["vector", "length"], "image"),
         ):
-            name = f"layer{number}"
-            stored = f"{graph.constant(f'{name}.weight', weight)} {graph.constant(f'{name}.scale', scale)}"
-            values = graph.add("DequantizeLinear", stored, f"{name}.values", axis=0)
-            inputs = f"{x} {values} {graph.constant(f'{name}.offset', offset)}"
-            graph.add("Conv", inputs, f"{name}.sum", strides=[stride, stride], pads=[kernel // 2] * 4)
-            x = graph.add("Relu", f"{name}.sum", f"{name}.x")
-        graph.add("GlobalAveragePool", x, "mean_square")
-        graph.add("Reshape", f"mean_square {graph.constant('flat', np.array([0, -1]))}", "mean")
-        graph.add("MatMul", f"mean {graph.constant('head', self.head[0])}", "product")
-        graph.add("Add", f"product {graph.constant('head.bias', self.head[1])}", "vector")
-        add_unit_rows(graph, "vector")
-        return serialized(
-            graph, PREPROCESSING.size, WIDTH, "The demo encoder's image half: knows the demo's room alone."
-        )
+            nodes.append(helper.make_node(operator, inputs, [output]))
+        constants["last"] = np.array([-1])
+        kept = [numpy_helper.from_array(np.ascontiguousarray(value), name) for name, value in constants.items()]
+        side = PREPROCESSING.size
+        pixels = helper.make_tensor_value_info("pixels", TensorProto.FLOAT, ["batch", 3, side, side])
+        rows = helper.make_tensor_value_info("image", TensorProto.FLOAT, ["batch", WIDTH])
+        graph = helper.make_graph(nodes, "image_encoder", [pixels], [rows], kept)
+        return helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=8).SerializeToString()
 
 
 # Measuring ------------------------------------------------------------------------------------------------------

@@ -1,0 +1,437 @@
+"""CLIP and SigLIP models of transformers -> the encoder folders that the base install runs, through torch.onnx.export.
+
+Before a folder is written, its graph is opened by the same code that will open it later, and its vectors are held
+against torch's. What is exported is `masking.clip.load_model`'s: three model types, .safetensors, nothing fetched.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import os
+import re
+import shutil
+import tempfile
+import warnings
+import zlib
+from collections.abc import Collection, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict
+from importlib.metadata import PackageNotFoundError, version
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from og_pointcloud.bundle.read import read_bundle
+from og_pointcloud.cloud import FeatureSpace
+from og_pointcloud.errors import MissingExtraError, OgPointcloudError
+from og_pointcloud.formats.npy import npy_bytes
+from og_pointcloud.masking import encode
+from og_pointcloud.masking.crops import WITH_CONTEXT, Crop
+from og_pointcloud.masking.existing import read_json
+from og_pointcloud.models import check_graph, open_session
+from og_pointcloud.text import encoder as text_encoder
+from og_pointcloud.text.encoder import TextEncoder, cache_folder, check_templates
+from og_pointcloud.text.everyday import everyday_words
+
+try:
+    import onnx
+    import torch
+    from onnx import numpy_helper
+
+    from og_pointcloud.masking.clip import TransformersModel, load_model, published_name
+except ImportError as error:
+    raise MissingExtraError("torch, transformers and onnx", "export") from error
+if find_spec("onnxscript") is None:  # torch.onnx.export imports it late, and says less
+    raise MissingExtraError("onnxscript", "export")
+
+if TYPE_CHECKING:
+    from og_pointcloud.cloud import LabelledCloud
+
+__all__ = ["PARITY_TEXTS", "export_image_encoder", "export_text_encoder", "write_image_encoder", "write_text_encoder"]
+
+OPSET = 18
+TOLERANCE = 1e-5
+"""Largest difference of a unit vector's entry from torch that is let through; float32 reaches about 1e-6."""
+INT8_COSINE = 0.99
+"""Smallest cosine of an int8 vector with its float32 one that is let through."""
+EQUAL = 1e-6
+"""Cosines that float32 vectors cannot tell apart."""
+PARITY_TEXTS = (
+    "", " ", "a", "chair", "a photo of a chair.", "red mug", "object", "things", "stuff", "texture",
+    "fire extinguisher", "kitchen counter", "a wooden table with four legs, seen from above", "traffic light",
+    "person riding a bicycle", "café", "cafe\u0301", "naïve façade", "it's the dog's", "Ünïcödé", "日本語の看板",
+    "стул", "كرسي", "\U0001f469\u200d\U0001f467 \U0001f44d\U0001f3fd", "1234567890", "3.14 %", "!?.,;:-_()[]{}",
+    "A   lot\tof \n space", "&amp; &lt;b&gt;", "\x00\x1f control", "x" * 300,
+    "a very long sentence that goes on " * 20, "<|endoftext|> early", "TV", "tv", "sofa", "window", "door", "lamp",
+)  # fmt: skip
+"""Labels and awkward texts, on which graph and torch are compared."""
+PARITY_IMAGES = 4
+
+
+def export_text_encoder(
+    source: str | os.PathLike[str],
+    output: str | os.PathLike[str] | None = None,
+    *,
+    feature_space: str | None = None,
+    templates: Sequence[str] = ("{}",),
+    int8: bool = False,
+    scene: str | os.PathLike[str] | None = None,
+) -> tuple[Path, dict[str, Any]]:
+    """Write a model's text half as a folder, complete or not at all. Returns the folder, and its manifest.
+
+    The folder also holds the vectors of our everyday words, which scenes judge labels by (`ask.choosing`).
+
+    source: a transformers folder of CLIP or SigLIP with its tokenizer. output: None for the user's cache, where it is
+        found by its feature space.
+    feature_space: OWNER/MODEL, as scenes name it; None: what the model's configuration calls itself.
+    templates: texts with {} where a name goes; their vectors' mean stands for the name.
+    int8: a quarter of the size. Refused where a cosine with float32 falls below 0.99 or, with a scene (.ogpc), where an
+        instance's best word, or a word's best instance, becomes another.
+    Raises OgPointcloudError, and FeatureSpaceError for a scene of another space; then nothing is written.
+    """
+    source = Path(source)
+    templates = check_templates(templates)
+    space = feature_space or published_name(source)
+    model = load_model(source, "eager")
+    config, is_causal = model.config.text_config, model.config.model_type == "clip"
+    tokenizer = _tokenizer_of(source, is_causal)
+    about = {
+        "feature_space": space,
+        "context_length": config.max_position_embeddings,
+        "vocabulary": config.vocab_size,
+        "pad_id": None if is_causal else _pad_id(source, tokenizer),
+        "templates": list(templates),
+        "tower": {
+            "model_type": model.config.model_type, "layers": config.num_hidden_layers,
+            "heads": config.num_attention_heads, "activation": config.hidden_act,
+        },
+    }  # fmt: skip
+    folder = Path(output) if output is not None else cache_folder() / _folder_name(space)
+    cloud = read_bundle(scene).cloud if scene is not None else None
+    tower = _TextTower(model).eval()
+    return folder, write_text_encoder(folder, tower, tokenizer, about, int8=int8, cloud=cloud)
+
+
+def write_text_encoder(
+    folder: Path, tower: Any, tokenizer: dict[str, Any], about: dict[str, Any],
+    *, int8: bool = False, cloud: LabelledCloud | None = None,
+) -> dict[str, Any]:  # fmt: skip
+    """Write a torch module as a text encoder if its graph gives the module's vectors. Returns the manifest.
+
+    tower: tokens (B, T) int64 -> (B, D) unit rows; T is any length up to the context, or the context alone where
+        about["pad_id"] is set. tokenizer: as in a tokenizer.json. about: the manifest's entries on the model.
+    int8, cloud, errors: as in ``export_text_encoder``.
+    """
+    context, pad_id = about["context_length"], about["pad_id"]
+    example = torch.zeros((2, min(context, 7) if pad_id is None else context), dtype=torch.int64)
+    batch, length = torch.export.Dim("batch"), torch.export.Dim("length", min=1, max=context)
+    graph = _onnx_graph(tower, example, "tokens", "text", {0: batch, 1: length} if pad_id is None else {0: batch})
+    with torch.no_grad():
+        width = tower(example).shape[1]
+    about = {**_heading(text_encoder.FORMAT, text_encoder.SCHEMA_VERSION), **about, "width": width, "precision": "fp32"}
+    held = {text_encoder.GRAPH: graph, text_encoder.TOKENIZER: json.dumps(tokenizer, ensure_ascii=False).encode()}
+    encoder = TextEncoder(_with_manifest(about, held), str(folder))
+    parity = _text_parity(tower, encoder)
+    if int8:
+        held[text_encoder.GRAPH], about["precision"] = _quantized(graph), "int8"
+        small = TextEncoder(_with_manifest(about, held), str(folder))
+        parity["int8"] = _accept_int8(small, encoder, cloud)
+        encoder = small
+    held[text_encoder.WORD_BANK] = npy_bytes(encoder(everyday_words()).astype(np.float16))
+    files = _with_manifest({**about, "parity": parity}, held)
+    _write_folder(folder, files, known=text_encoder.ENCODER_FILES)
+    return json.loads(files[text_encoder.MANIFEST])
+
+
+def export_image_encoder(
+    source: str | os.PathLike[str],
+    output: str | os.PathLike[str] | None = None,
+    *,
+    feature_space: str | None = None,
+    crops: Sequence[Crop] = WITH_CONTEXT,
+) -> tuple[Path, dict[str, Any]]:
+    """Write a model's image half as a folder, complete or not at all. Returns the folder, and its manifest.
+
+    source, output: as for ``export_text_encoder``. feature_space: OWNER/MODEL, the text encoder's; None: what the
+    model's configuration calls itself. crops: how masks are cut out unless the caller says otherwise.
+    Raises OgPointcloudError, and MissingExtraError where a package of the 'export' extra is absent.
+    """
+    model = TransformersModel(source, feature_space, crops=tuple(crops), attention="eager")
+    config = model.tower.model.config
+    vision = config.vision_config
+    about = {
+        "tower": {
+            "model_type": config.model_type, "layers": vision.num_hidden_layers, "heads": vision.num_attention_heads,
+            "activation": vision.hidden_act, "patch_size": vision.patch_size,
+        },
+    }  # fmt: skip
+    folder = Path(output) if output is not None else cache_folder() / f"{_folder_name(model.feature_space)}--image"
+    return folder, write_image_encoder(folder, model, model.tower.cpu(), about)
+
+
+def write_image_encoder(folder: Path, model: encode.ImageModel, tower: Any, about: dict[str, Any]) -> dict[str, Any]:
+    """Write a torch module as an image encoder if its graph gives the model's vectors. Returns the manifest.
+
+    model: what the graph must agree with. tower: the same as a torch module, pixels (B, 3, S, S) -> (B, D) unit rows;
+    or the bytes of its graph. about: more entries of the manifest.
+    """
+    preprocessing = model.preprocessing
+    if isinstance(tower, bytes):
+        graph = tower
+    else:
+        example = torch.zeros((2, 3, preprocessing.size, preprocessing.size))
+        graph = _onnx_graph(tower, example, "pixels", "image", {0: torch.export.Dim("batch")})
+    try:
+        check_graph(graph, encode.OPERATORS)
+    except ValueError as error:
+        raise OgPointcloudError(
+            f"the graph that torch {torch.__version__} wrote cannot be used ({error}): please report this model"
+        ) from None
+    manifest = {
+        **_heading(encode.FORMAT, encode.SCHEMA_VERSION),
+        "feature_space": model.feature_space,
+        "width": model.width,
+        "preprocessing": preprocessing.as_manifest(),
+        "crops": [asdict(crop) for crop in model.crops],
+        **about,
+        "parity": _image_parity(graph, model),
+    }
+    _write_folder(folder, _with_manifest(manifest, {encode.GRAPH: graph}), known=encode.ENCODER_FILES)
+    return encode.OnnxModel(folder).manifest
+
+
+class _TextTower(torch.nn.Module):
+    """Tokens (B, T) int64 -> (B, D) unit rows."""
+
+    def __init__(self, model: Any) -> None:
+        super().__init__()
+        self.model = model
+
+    def forward(self, tokens: torch.Tensor) -> torch.Tensor:
+        vectors = self.model.get_text_features(input_ids=tokens).pooler_output
+        return vectors / vectors.norm(dim=-1, keepdim=True)
+
+
+def _onnx_graph(tower: Any, example: torch.Tensor, given: str, answer: str, dimensions: dict[int, Any]) -> bytes:
+    """The module as one file. OgPointcloudError where it would be larger than a graph in one file may be."""
+    held = sum(tensor.numel() * tensor.element_size() for tensor in {id(p): p for p in tower.parameters()}.values())
+    with _quietly(), torch.no_grad():
+        program = torch.onnx.export(
+            tower, (example,), dynamo=True, opset_version=OPSET, verbose=False,
+            input_names=[given], output_names=[answer], dynamic_shapes=(dimensions,),
+        )  # fmt: skip
+    assert program is not None
+    try:
+        return program.model_proto.SerializeToString()
+    except Exception:  # protobuf's own kind
+        raise OgPointcloudError(
+            f"the model has {held / 1e9:.2f} GB of weights; expected less than 2 GB, all that one file may hold"
+        ) from None
+
+
+@contextmanager
+def _quietly() -> Any:
+    """torch.onnx.export and the quantiser tell of their own insides, as warnings and log lines."""
+    names = ("torch.onnx", "onnxscript", "onnx_ir", "root")
+    loggers = {logging.getLogger(name): logging.getLogger(name).level for name in names}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        for logger in loggers:
+            logger.setLevel(logging.ERROR)
+        try:
+            yield
+        finally:
+            for logger, level in loggers.items():
+                logger.setLevel(level)
+
+
+def _quantized(graph: bytes) -> bytes:
+    """Matrices in 8 bits, a scale a column; activations as they come, a scale a run; embeddings in 8 bits.
+
+    Weights are unsigned: with signed ones, processors without VNNI saturate, and answers would differ.
+    """
+    from onnxruntime.quantization import QuantType, quantize_dynamic
+
+    model = onnx.load_from_string(graph)
+    del model.graph.value_info[:]  # shapes in between, which the quantiser changes without telling
+    with tempfile.TemporaryDirectory() as temporary, _quietly():
+        path = Path(temporary) / "int8.onnx"
+        quantize_dynamic(model, path, ["MatMul", "Gather"], per_channel=True, weight_type=QuantType.QUInt8)
+        model = onnx.load(path)
+    for constant in model.graph.initializer:  # as plain bytes, which is all that check_graph lets pass
+        constant.CopyFrom(numpy_helper.from_array(numpy_helper.to_array(constant), constant.name))
+    return model.SerializeToString()
+
+
+# Tokenizers
+
+
+def _tokenizer_of(source: Path, is_causal: bool) -> dict[str, Any]:
+    """tokenizer.json beside the weights or, for CLIP, what transformers makes of vocab.json and merges.txt."""
+    if (source / text_encoder.TOKENIZER).is_file():
+        description = read_json(source / text_encoder.TOKENIZER)
+        return description if is_causal else _lower_casing(description)
+    if is_causal and (source / "vocab.json").is_file() and (source / "merges.txt").is_file():
+        from transformers import CLIPTokenizer
+
+        tokenizer: Any = CLIPTokenizer.from_pretrained(source, local_files_only=True)
+        return json.loads(tokenizer.backend_tokenizer.to_str())
+    raise OgPointcloudError(
+        f"{source} holds no tokenizer; expected tokenizer.json{', or vocab.json and merges.txt,' if is_causal else ''} "
+        "beside the weights"
+    )
+
+
+def _lower_casing(description: dict[str, Any]) -> dict[str, Any]:
+    """SigLIP 2 was trained on lower case, which the Gemma tokenizer.json that its models carry does not say."""
+    model = description.get("model")
+    if not isinstance(model, dict) or model.get("type") == "Unigram" or '"Lowercase"' in json.dumps(
+        description.get("normalizer")
+    ):  # fmt: skip
+        return description
+    steps = [{"type": "Lowercase"}, *filter(None, [description.get("normalizer")])]
+    return {**description, "normalizer": {"type": "Sequence", "normalizers": steps}}
+
+
+def _pad_id(source: Path, description: dict[str, Any]) -> int:
+    """What fills a text up to the context, where every token sees it and it must be the one of training."""
+    file = source / "tokenizer_config.json"
+    config = read_json(file) if file.is_file() else {}
+    named = config.get("pad_token")
+    token = named.get("content") if isinstance(named, dict) else named
+    added = {entry["content"]: entry["id"] for entry in description.get("added_tokens") or []}
+    vocabulary = description["model"]["vocab"]
+    ids = vocabulary if isinstance(vocabulary, dict) else {entry[0]: id for id, entry in enumerate(vocabulary)}
+    id = {**ids, **added}.get(token)
+    if id is None or config.get("padding_side", "right") != "right":
+        raise OgPointcloudError(
+            f"{file} has pad_token {token!r:.40}, padding_side {config.get('padding_side')!r:.20}; expected a token of "
+            "the vocabulary, on the right, since this model reads texts filled up to its context: write both there"
+        )
+    return id
+
+
+# Checks
+
+
+def _text_parity(tower: Any, encoder: TextEncoder) -> dict[str, Any]:
+    """How far the graph is from torch; texts in torch stand alone, so that what a batch does to them shows."""
+    tokens = [torch.tensor([encoder.tokens(text)]) for text in PARITY_TEXTS]
+    with torch.no_grad():
+        expected = torch.cat([tower(row) for row in tokens]).numpy()
+    return {
+        "texts": len(PARITY_TEXTS), "tokens": sum(row.numel() for row in tokens),
+        **_difference(encoder.encode(PARITY_TEXTS), expected),
+    }  # fmt: skip
+
+
+def _image_parity(graph: bytes, model: encode.ImageModel) -> dict[str, Any]:
+    """How far the graph is from the model, on images of noise and of even colours."""
+    size = model.preprocessing.size
+    squares = np.random.default_rng(0).integers(0, 256, (PARITY_IMAGES, size, size, 3), np.uint8)
+    squares[PARITY_IMAGES // 2 :] = squares[PARITY_IMAGES // 2 :, :1, :1]
+    pixels = model.preprocessing.pixels(squares)
+    got = np.asarray(open_session(graph).run(["image"], {"pixels": pixels})[0])
+    return {"images": PARITY_IMAGES, **_difference(got, model(pixels))}
+
+
+def _difference(got: NDArray[np.float32], expected: NDArray[np.float32]) -> dict[str, Any]:
+    """The manifest's figures; OgPointcloudError where a graph's unit rows are too far from torch's."""
+    error = float(np.abs(got - expected).max())
+    if not error <= TOLERANCE:
+        raise OgPointcloudError(
+            f"the graph differs from torch by {error:.3g}; expected at most {TOLERANCE}: the weights may hold values "
+            "that leave float32; if not, please report this model"
+        )
+    cosine = float((got.astype(np.float64) * expected).sum(axis=1).min())
+    return {"max_abs_error": error, "min_cosine": cosine, "torch": torch.__version__}
+
+
+def _accept_int8(small: TextEncoder, exact: TextEncoder, cloud: LabelledCloud | None) -> dict[str, Any]:
+    """What int8 costs; OgPointcloudError where that is too much."""
+    own = cloud.vocabulary.names if cloud is not None and cloud.vocabulary is not None else ()
+    names = list(dict.fromkeys([*own, *filter(str.strip, PARITY_TEXTS)]))
+    vectors, expected = small(names), exact(names)
+    cosines = (vectors.astype(np.float64) * expected).sum(axis=1)
+    worst = int(cosines.argmin())
+    if not cosines[worst] >= INT8_COSINE:
+        raise OgPointcloudError(
+            f"int8 turns the vector of '{names[worst]:.40}' to cosine {cosines[worst]:.4f}; expected at least "
+            f"{INT8_COSINE}: leave --int8 out"
+        )
+    report: dict[str, Any] = {
+        "texts": len(names),
+        "min_cosine": float(cosines[worst]),
+        "mean_cosine": float(cosines.mean()),
+    }
+    if cloud is None:
+        return report
+    FeatureSpace(exact.feature_space, exact.width).require(cloud.space, "scene's descriptors")
+    words = [names.index(name) for name in own] or list(range(len(names)))
+    before, after = (cloud.instances.cosines(rows[words].astype(np.float64)) for rows in (expected, vectors))
+    changed = _choices_changed(before, after) + _choices_changed(before.T, after.T)
+    if changed:
+        raise OgPointcloudError(
+            f"int8 changes {changed} of the scene's choices (best word of {len(before)} instances, best instance of "
+            f"{len(words)} words); expected 0: leave --int8 out"
+        )
+    return {**report, "instances": len(before), "words": len(words), "choices_changed": changed}
+
+
+def _choices_changed(before: NDArray[np.floating], after: NDArray[np.floating]) -> int:
+    """Rows whose best column became one that was worse; among equals there was no choice."""
+    if before.size == 0:
+        return 0
+    chosen = np.take_along_axis(before, after.argmax(axis=1)[:, None], axis=1)[:, 0]
+    return int((chosen < before.max(axis=1) - EQUAL).sum())
+
+
+# Files
+
+
+def _heading(format: str, schema_version: int) -> dict[str, Any]:
+    try:
+        library = version("og-pointcloud")
+    except PackageNotFoundError:
+        library = "unknown"
+    return {"format": format, "schema_version": schema_version, "written_by": f"og-pointcloud {library}"}
+
+
+def _with_manifest(manifest: dict[str, Any], held: dict[str, bytes]) -> dict[str, bytes]:
+    """The files of an encoder, the manifest among them, which says their sizes and checksums."""
+    described = {
+        name: {"bytes": len(data), "crc32": zlib.crc32(data), "sha256": hashlib.sha256(data).hexdigest()}
+        for name, data in held.items()
+    }
+    text = json.dumps({**manifest, "files": described}, indent=1, ensure_ascii=False)
+    return {text_encoder.MANIFEST: text.encode(), **held}
+
+
+def _folder_name(feature_space: str) -> str:
+    return re.sub(r"[^\w.-]+", "--", feature_space)
+
+
+def _write_folder(folder: Path, files: Mapping[str, bytes], known: Collection[str]) -> None:
+    """Put a complete folder in place; one that is there already must hold known names only, which it replaces."""
+    if folder.exists() and (not folder.is_dir() or {path.name for path in folder.iterdir()} - set(known)):
+        raise OgPointcloudError(f"{folder} holds other things than an encoder; expected a new or an encoder's folder")
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    new, old = (folder.with_name(f".{folder.name}.{os.getpid()}.{kind}") for kind in ("new", "old"))
+    try:
+        new.mkdir()
+        for name, data in files.items():
+            (new / name).write_bytes(data)
+        if folder.exists():
+            folder.rename(old)
+        new.rename(folder)
+    except BaseException:
+        shutil.rmtree(new, ignore_errors=True)
+        if old.exists() and not folder.exists():
+            old.rename(folder)
+        raise
+    shutil.rmtree(old, ignore_errors=True)

@@ -1,0 +1,119 @@
+"""``og-pointcloud export text|image``: half of a CLIP or SigLIP model as a folder that the base install runs."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from og_pointcloud.cli.common import add_command
+from og_pointcloud.errors import OgPointcloudError
+
+
+def add(commands: Any) -> None:
+    parser = add_command(
+        commands, "export", run_text, "Make a model's text or image encoder usable without torch.",
+        "og-pointcloud export text openai/clip-vit-base-patch32",
+    )  # fmt: skip
+    halves = parser.add_subparsers(dest="half", required=True, metavar="HALF")
+    text = add_command(
+        halves, "text", run_text, "Words -> vectors: any word can then be asked.",
+        "og-pointcloud export text openai/clip-vit-base-patch32",
+    )  # fmt: skip
+    image = add_command(
+        halves, "image", run_image, "Crops of masks -> vectors, for og-pointcloud masks.",
+        "og-pointcloud export image openai/clip-vit-base-patch32",
+    )  # fmt: skip
+    for half in (text, image):
+        half.add_argument(
+            "model", type=Path, metavar="MODEL",
+            help="OWNER/MODEL that was fetched, or a transformers folder of CLIP or SigLIP",
+        )  # fmt: skip
+        half.add_argument(
+            "-o", "--output", type=Path, metavar="DIR",
+            help="the folder to write (default: in the user's cache, where it is found by its feature space)",
+        )  # fmt: skip
+        half.add_argument(
+            "--feature-space", metavar="OWNER/MODEL",
+            help="as scenes name it (og-pointcloud info S.ogpc); default: OWNER/MODEL, or what its configuration says",
+        )  # fmt: skip
+    text.add_argument(
+        "--template", action="append", metavar="TEXT",
+        help="what a name is put into, such as 'a photo of a {}.'; several are averaged (default: {})",
+    )  # fmt: skip
+    text.add_argument(
+        "--int8", action="store_true", help="a quarter of the size; refused where it would change what is found"
+    )
+    text.add_argument("--scene", type=Path, metavar="S.ogpc", help="with --int8: a scene whose answers must stay")
+    image.add_argument(
+        "--crops", choices=("context", "langsplat"), default="context",
+        help="how masks are cut out unless a caller says otherwise (default: %(default)s)",
+    )  # fmt: skip
+
+
+def run_text(arguments: argparse.Namespace) -> None:
+    if arguments.scene and not arguments.int8:
+        arguments.parser.error("--scene is asked only what --int8 would change: give both, or neither")
+    source, feature_space = found_model(arguments.model, arguments.feature_space)
+    from og_pointcloud_export.encoders import export_text_encoder
+
+    folder, manifest = export_text_encoder(
+        source,
+        arguments.output,
+        feature_space=feature_space,
+        templates=arguments.template or ("{}",),
+        int8=arguments.int8,
+        scene=arguments.scene,
+    )
+    print_export(folder, manifest, f"context {manifest['context_length']}", "texts")
+    if "int8" in manifest["parity"]:
+        int8 = manifest["parity"]["int8"]
+        print(f"int8 and float32: cosine {int8['min_cosine']:.4f} at least, {describe_choices(int8)}")
+    if arguments.output is not None:
+        print(f"next: export OG_POINTCLOUD_MODELS='{folder.resolve()}'  # scenes of this feature space then find it")
+
+
+def run_image(arguments: argparse.Namespace) -> None:
+    source, feature_space = found_model(arguments.model, arguments.feature_space)
+    from og_pointcloud_export.encoders import export_image_encoder
+
+    from og_pointcloud.masking.crops import CROP_STYLES
+
+    folder, manifest = export_image_encoder(
+        source, arguments.output, feature_space=feature_space, crops=CROP_STYLES[arguments.crops]
+    )
+    print_export(folder, manifest, f"{manifest['preprocessing']['size']} pixels", "images")
+
+
+def found_model(model: Path, feature_space: str | None) -> tuple[Path, str | None]:
+    """The folder of the MODEL that was given, and its feature space, as far as both are known by now."""
+    from og_pointcloud.models import fetched_model
+
+    if model.is_dir():
+        return model, feature_space
+    name = model.as_posix()
+    if folder := fetched_model(name):
+        return folder, feature_space or name
+    raise OgPointcloudError(
+        f"'{name}' is no folder and no model that was fetched; expected one of them: check the path, or fetch "
+        "the model (hf download OWNER/MODEL)"
+    )
+
+
+def print_export(folder: Path, manifest: Mapping[str, Any], reads: str, compared: str) -> None:
+    """What was made, and how far it is from torch. compared: the name of the manifest's count, 'texts' or 'images'."""
+    parity, tower = manifest["parity"], manifest["tower"]
+    print(
+        f"feature space '{manifest['feature_space']}': width {manifest['width']}, {tower['layers']} layers, "
+        f"{tower['heads']} heads, {tower['activation']}, {reads}"
+    )
+    print(f"onnxruntime and torch differ by {parity['max_abs_error']:.1e} at most, over {parity[compared]} {compared}")
+    size = sum(file["bytes"] for file in manifest["files"].values())
+    print(f"wrote {folder} ({size / 1e6:.1f} MB)")
+
+
+def describe_choices(int8: Mapping[str, Any]) -> str:
+    if "instances" not in int8:
+        return "no scene asked (--scene)"
+    return f"no choice changed among {int8['instances']} instances and {int8['words']} words"

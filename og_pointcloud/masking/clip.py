@@ -1,0 +1,166 @@
+"""CLIP and SigLIP through transformers, without its image processors and without torchvision.
+
+A folder is trusted with nothing but numbers: its config.json must name one of three model types, whose classes are
+transformers' own; weights are read from .safetensors only; nothing is fetched, and no code of the folder is run.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from pathlib import Path
+from typing import Any, Literal, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from og_pointcloud.errors import MissingExtraError, OgPointcloudError
+from og_pointcloud.masking.crops import WITH_CONTEXT, Crop, Preprocessing, Resample
+from og_pointcloud.masking.existing import read_json
+from og_pointcloud.models import MODEL_NAME
+
+try:
+    import torch
+    import transformers
+except ImportError as error:
+    raise MissingExtraError("torch and transformers", "masks") from error
+
+__all__ = ["ImageTower", "TransformersModel", "load_model", "preprocessing_of", "published_name"]
+
+CLASSES = {"clip": "CLIPModel", "siglip": "SiglipModel", "siglip2": "Siglip2Model"}
+"""config.json's model_type -> transformers' class of it."""
+CLIP_COLOURS = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)
+SIGLIP_COLOURS = (0.5, 0.5, 0.5), (0.5, 0.5, 0.5)
+"""Means and standard deviations that the published models were trained with."""
+PILLOW_RESAMPLE: dict[Any, Resample] = {2: "bilinear", 3: "bicubic"}
+
+
+def load_model(folder: str | os.PathLike[str], attention: Literal["eager", "sdpa"] = "sdpa") -> Any:
+    """A transformers folder of CLIP, SigLIP or SigLIP 2 -> the model in float32, for evaluation.
+
+    attention: how transformers computes it; "eager" is plain matrix products, which exports well.
+    OgPointcloudError where the folder is none of these, or its weights do not fit its configuration.
+    """
+    folder = Path(folder)
+    if not (folder / "config.json").is_file():
+        raise OgPointcloudError(
+            f"{folder} is no transformers folder: it has no config.json; expected CLIP's or SigLIP's (of an OpenCLIP "
+            "model, fetch the repository that holds it for transformers)"
+        )
+    config = read_json(folder / "config.json")
+    kind = config.get("model_type") if isinstance(config, dict) else None
+    if kind not in CLASSES or "quantization_config" in config:
+        raise OgPointcloudError(
+            f"{folder}: model_type is {kind!r:.40}{', quantised' if kind in CLASSES else ''}; expected "
+            f"{', '.join(CLASSES)}, in float32 or float16"
+        )
+    try:
+        model, report = getattr(transformers, CLASSES[kind]).from_pretrained(
+            folder,
+            local_files_only=True,
+            use_safetensors=True,
+            attn_implementation=attention,
+            dtype=torch.float32,
+            output_loading_info=True,
+        )
+    except Exception as error:  # of many types, some of safetensors' own
+        reason = (str(error).strip().splitlines() or [""])[0]
+        raise OgPointcloudError(
+            f"{folder} cannot be read ({type(error).__name__}: {reason:.200}); expected a whole {CLASSES[kind]} with "
+            "weights in .safetensors: fetch it again, or save it again with save_pretrained"
+        ) from None
+    if missing := sorted(report["missing_keys"]):
+        raise OgPointcloudError(
+            f"{folder} lacks {len(missing)} of the weights of a {CLASSES[kind]}, '{missing[0]}' first: name a folder "
+            "with the whole model"
+        )
+    return model.eval()
+
+
+class ImageTower(torch.nn.Module):
+    """Pixels (B, 3, S, S) float32 -> (B, D) unit rows."""
+
+    def __init__(self, model: Any) -> None:
+        """model: from ``load_model``. A SigLIP 2 of flexible shapes is given square images only from now on."""
+        super().__init__()
+        self.model = model
+        if model.config.model_type == "siglip2":
+            model.vision_model.embeddings = _SquareEmbeddings(model.vision_model.embeddings)
+
+    def forward(self, pixels: torch.Tensor) -> torch.Tensor:
+        """See the class."""
+        if self.model.config.model_type == "siglip2":
+            found = self.model.vision_model(pixel_values=pixels, pixel_attention_mask=None, spatial_shapes=None)
+        else:
+            found = self.model.get_image_features(pixel_values=pixels)
+        return found.pooler_output / found.pooler_output.norm(dim=-1, keepdim=True)
+
+
+class _SquareEmbeddings(torch.nn.Module):
+    """SigLIP 2 takes patches and resizes the embeddings of their places; for its own square these are as trained."""
+
+    def __init__(self, embeddings: Any) -> None:
+        super().__init__()
+        self.inner = embeddings
+
+    def forward(self, pixels: torch.Tensor, _shapes: None) -> torch.Tensor:
+        side = self.inner.patch_size
+        patches = pixels.unfold(2, side, side).unfold(3, side, side)  # (B, 3, rows, columns, P, P)
+        flat = patches.permute(0, 2, 3, 4, 5, 1).flatten(3).flatten(1, 2)
+        return self.inner.patch_embedding(flat) + self.inner.position_embedding.weight
+
+
+class TransformersModel:
+    """A CLIP or SigLIP as an `encode.ImageModel`; on a GPU where torch has one."""
+
+    def __init__(
+        self,
+        folder: str | os.PathLike[str],
+        feature_space: str | None = None,
+        *,
+        crops: tuple[Crop, ...] = WITH_CONTEXT,
+        attention: Literal["eager", "sdpa"] = "sdpa",
+    ) -> None:
+        """feature_space: None for what the folder's configuration says. Errors: as ``load_model``."""
+        self.feature_space = feature_space or published_name(folder)
+        model = load_model(folder, attention)
+        self.preprocessing, self.crops = preprocessing_of(folder, model.config), crops
+        self.device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+        self.tower = ImageTower(model).eval().to(self.device)
+        size = self.preprocessing.size
+        self.width: int = self(np.zeros((1, 3, size, size), np.float32)).shape[1]
+
+    @torch.inference_mode()
+    def __call__(self, pixels: NDArray[np.float32]) -> NDArray[np.float32]:
+        """(B, width) float32 unit rows of pixels (B, 3, S, S)."""
+        return self.tower(torch.from_numpy(pixels).to(self.device)).cpu().numpy()
+
+
+def preprocessing_of(folder: str | os.PathLike[str], config: Any) -> Preprocessing:
+    """What preprocessor_config.json says, or what the family's published models do. config: the model's."""
+    vision, is_clip = config.vision_config, config.model_type == "clip"
+    size = vision.patch_size * math.isqrt(vision.num_patches) if config.model_type == "siglip2" else vision.image_size
+    file = Path(folder) / "preprocessor_config.json"
+    stated = read_json(file) if file.is_file() else {}
+    mean, std = CLIP_COLOURS if is_clip else SIGLIP_COLOURS
+    resample = PILLOW_RESAMPLE.get(stated.get("resample", 3))
+    if resample is None or stated.get("rescale_factor", 1 / 255) != 1 / 255:
+        raise OgPointcloudError(
+            f"{file}: resample {stated.get('resample')!r:.20} or rescale_factor {stated.get('rescale_factor')!r:.20}; "
+            "expected 2 (bilinear) or 3 (bicubic), and 1/255"
+        )
+    mean, std = tuple(stated.get("image_mean", mean)), tuple(stated.get("image_std", std))
+    return Preprocessing(size, cast("Any", mean), cast("Any", std), resample, keeps_shape=is_clip)
+
+
+def published_name(folder: str | os.PathLike[str]) -> str:
+    """OWNER/MODEL as a model's configuration has it; OgPointcloudError where it says none."""
+    file = Path(folder) / "config.json"
+    config = read_json(file) if file.is_file() else {}
+    name = config.get("_name_or_path") if isinstance(config, dict) else None
+    if not isinstance(name, str) or not MODEL_NAME.fullmatch(name):
+        raise OgPointcloudError(
+            f"{folder} does not say which model it is; pass --feature-space as your scenes name it (og-pointcloud info "
+            "S.ogpc), such as openai/clip-vit-base-patch32 or laion/CLIP-ViT-B-16-laion2B-s34B-b88K"
+        )
+    return name

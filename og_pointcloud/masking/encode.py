@@ -1,0 +1,236 @@
+"""Mask encoders: what a mask shows, as a vector of the space that a text encoder of the same name puts words into.
+
+``open_encoder`` opens three kinds:
+
+- CLIP and SigLIP folders of transformers (`masking.clip`), which need torch;
+- folders that ``og-pointcloud export image`` wrote, run by onnxruntime:
+    manifest.json       format, schema_version, feature_space, width, preprocessing, crops, bytes and checksums of the
+                        graph, parity figures against torch
+    image_encoder.onnx  pixels (B, 3, S, S) float32 -> image (B, D) float32, unit rows
+- "demo", such a folder that comes with the library; it knows the things of the procedural room and nothing else.
+
+A folder is checked before it is run, since it may come from a stranger: nothing is unpickled, no code of it is run.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import zlib
+from collections.abc import Iterator, Mapping, Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError, SceneError
+from og_pointcloud.masking.contracts import MaskEncoder
+from og_pointcloud.masking.crops import CROP_STYLES, WITH_CONTEXT, Crop, Preprocessing, mask_crops
+from og_pointcloud.models import check_graph, fetched_model, open_session
+from og_pointcloud.text.encoder import MODELS_VARIABLE, model_folders
+
+if TYPE_CHECKING:
+    from onnxruntime import InferenceSession
+
+__all__ = [
+    "DEMO_FOLDER", "DEMO_SPACE", "ENCODER_FILES", "FORMAT", "GRAPH", "OPERATORS", "SCHEMA_VERSION", "CropEncoder",
+    "ImageModel", "OnnxModel", "open_encoder",
+]  # fmt: skip
+
+DEMO_SPACE = "og_pointcloud/demo-room-encoder"
+"""Feature space of the demo encoder, which knows the procedural room's things and nothing else of the world."""
+DEMO_FOLDER = Path(__file__).parent / "demo_encoder"
+"""Its two halves: ``image`` and ``text``."""
+FORMAT, SCHEMA_VERSION = "og-image-encoder", 1
+MANIFEST, GRAPH = "manifest.json", "image_encoder.onnx"
+ENCODER_FILES = {MANIFEST: 1 << 20, GRAPH: (1 << 31) - 1}
+"""The files of an encoder, and the bytes that each may have; a serialised graph cannot have more."""
+OPERATORS = frozenset({
+    "Add", "Clip", "Concat", "Conv", "DequantizeLinear", "Div", "Erf", "Expand", "Gather", "Gemm", "GlobalAveragePool",
+    "LayerNormalization", "MatMul", "Max", "Mul", "Pow", "ReduceL2", "Relu", "Reshape", "Shape", "Sigmoid", "Softmax",
+    "Split", "Squeeze", "Tanh", "Tile", "Transpose", "Unsqueeze", "Where",
+})  # fmt: skip
+"""All that an encoder's graph is made of: arithmetic without loops, random numbers, or graphs inside nodes."""
+REMAKE = "make the encoder again with og-pointcloud export image"
+CROPS_PER_RUN = 16
+"""Bounds memory: a run of a large model holds some 100 MB a crop."""
+
+
+class ImageModel(Protocol):
+    """Squares of pixels -> vectors.
+
+    feature_space: the text encoder's. width: of a vector. crops: how masks are best cut out for it.
+    """
+
+    feature_space: str
+    width: int
+    preprocessing: Preprocessing
+    crops: tuple[Crop, ...]
+
+    def __call__(self, pixels: NDArray[np.float32]) -> NDArray[np.float32]:
+        """(B, width) float32 unit rows of pixels (B, 3, S, S) float32."""
+        ...
+
+
+def open_encoder(
+    name: str | os.PathLike[str], feature_space: str | None = None, *, crops: str | Sequence[Crop] | None = None
+) -> CropEncoder:
+    """Open an encoder; nothing is downloaded.
+
+    name: "demo"; a folder that ``og-pointcloud export image`` wrote; a transformers folder of CLIP or SigLIP, which
+        needs torch; or OWNER/MODEL, looked for in the folders of OG_POINTCLOUD_MODELS, in the user's cache, and among
+        what Hugging Face's own tools have fetched.
+    feature_space: the one that is expected, as the text encoder and the capture name it; of a folder that does not say
+        its name, the one that it has.
+    crops: "langsplat", "context", or ways to cut masks out; None: what the encoder was made with, else "context".
+    Raises OgPointcloudError where there is no such encoder, FeatureSpaceError for one of another space.
+    """
+    model = _open_model(name, feature_space)
+    if feature_space is not None and model.feature_space != feature_space:
+        raise FeatureSpaceError(
+            f"{name} encodes to feature space '{model.feature_space}'; expected '{feature_space}': words and masks are "
+            "compared only within one model's space"
+        )
+    if isinstance(crops, str) and crops not in CROP_STYLES:
+        raise OgPointcloudError(f"crops '{crops}' are unknown; expected {' or '.join(CROP_STYLES)}")
+    return CropEncoder(model, CROP_STYLES[crops] if isinstance(crops, str) else crops or model.crops)
+
+
+def _open_model(name: str | os.PathLike[str], feature_space: str | None) -> ImageModel:
+    if name == "demo":
+        return OnnxModel(DEMO_FOLDER / "image")
+    path = Path(name).expanduser()
+    if path.exists():
+        return OnnxModel(path) if _space_of(path) is not None else _transformers_model(path, feature_space)
+    for folder in _image_encoders():
+        if _space_of(folder) == str(name):
+            return OnnxModel(folder)
+    if fetched := fetched_model(str(name)):
+        return _transformers_model(fetched, feature_space or str(name))
+    named = os.environ.get(MODELS_VARIABLE)
+    raise OgPointcloudError(
+        f"no encoder '{name}': it is no folder, none of that feature space is in {MODELS_VARIABLE} "
+        f"({named or 'not set'}) or the cache, and it has not been fetched; expected 'demo', a model's folder or "
+        f"OWNER/MODEL: fetch it first (hf download {name}), or name its folder"
+    )
+
+
+def _transformers_model(folder: Path, feature_space: str | None) -> ImageModel:
+    from og_pointcloud.masking.clip import TransformersModel  # torch
+
+    return TransformersModel(folder, feature_space)
+
+
+def _image_encoders() -> Iterator[Path]:
+    for folder in model_folders():
+        if folder.is_dir():
+            yield folder
+            yield from sorted(path for path in folder.iterdir() if path.is_dir())
+
+
+def _space_of(folder: Path) -> str | None:
+    """The feature space of a folder with an image encoder; None for any other folder."""
+    try:
+        manifest = json.loads(_read_bounded(folder / MANIFEST, ENCODER_FILES[MANIFEST]))
+    except (OgPointcloudError, OSError, ValueError, RecursionError):
+        return None
+    return manifest.get("feature_space") if isinstance(manifest, dict) and manifest.get("format") == FORMAT else None
+
+
+class CropEncoder(MaskEncoder):
+    """A mask's vector is the weighted mean of its crops' vectors (a `contracts.MaskEncoder`)."""
+
+    def __init__(self, model: ImageModel, crops: Sequence[Crop] = WITH_CONTEXT) -> None:
+        """crops: ways to cut a mask out, at least one."""
+        if not crops:
+            raise SceneError("0 ways to crop are given; expected at least one")
+        self.model, self.crops = model, tuple(crops)
+        self.feature_space, self.width = model.feature_space, model.width
+
+    def embed(self, image: NDArray[np.uint8], masks: NDArray[np.bool_]) -> NDArray[np.float32]:
+        """image (H, W, 3) uint8 RGB, masks (M, H, W) bool -> (M, width) float32, L2-normalised rows.
+
+        SceneError for arrays that do not fit together, and for a mask without a pixel.
+        """
+        total = np.zeros((len(masks), self.width), np.float32)
+        for crop in self.crops:
+            for start in range(0, len(masks), CROPS_PER_RUN):
+                rows = slice(start, start + CROPS_PER_RUN)
+                total[rows] += np.float32(crop.weight) * self._vectors(image, masks[rows], crop)
+        return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), np.finfo(np.float32).tiny)
+
+    def _vectors(self, image: NDArray[np.uint8], masks: NDArray[np.bool_], crop: Crop) -> NDArray[np.float32]:
+        before = self.model.preprocessing
+        # Black outside, as LangSplat has it, is a colour to the model; what a blend goes to should be none.
+        fill = before.fill if crop.outside else (0, 0, 0)
+        return self.model(before.pixels(mask_crops(image, masks, crop, before.size, fill, before.resample)))
+
+
+class OnnxModel:
+    """An exported image encoder (an `ImageModel`), run by onnxruntime."""
+
+    def __init__(self, folder: str | os.PathLike[str]) -> None:
+        """folder: what ``og-pointcloud export image`` wrote; OgPointcloudError where it is damaged or another's."""
+        self.where = str(folder)
+        files = {name: _read_bounded(Path(folder) / name, most) for name, most in ENCODER_FILES.items()}
+        try:
+            manifest = _checked_manifest(files)
+            self.feature_space: str = manifest["feature_space"]
+            self.width: int = manifest["width"]
+            self.preprocessing = Preprocessing.from_manifest(manifest["preprocessing"])
+            self.crops = tuple(Crop(**entry) for entry in manifest["crops"])
+        except KeyError as error:
+            raise OgPointcloudError(f"{folder}: {error} is missing in {MANIFEST}: {REMAKE}") from None
+        except (ValueError, TypeError, AttributeError, RecursionError) as error:
+            raise OgPointcloudError(f"{folder}: not an image encoder that can be used ({error}): {REMAKE}") from None
+        self.manifest = manifest
+        self._graph = files[GRAPH]
+
+    def __call__(self, pixels: NDArray[np.float32]) -> NDArray[np.float32]:
+        """(B, width) float32 unit rows of pixels (B, 3, S, S)."""
+        try:
+            vectors = np.asarray(self._session.run(["image"], {"pixels": pixels})[0])
+        except Exception as error:  # onnxruntime raises types of its own
+            reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
+            raise OgPointcloudError(f"{self.where}: {GRAPH} does not run ({reason:.200}): {REMAKE}") from None
+        if vectors.dtype != np.float32 or vectors.shape != (len(pixels), self.width) or not np.isfinite(vectors).all():
+            raise OgPointcloudError(
+                f"{self.where}: {GRAPH} gives {vectors.dtype} {vectors.shape} or NaN; expected finite float32 "
+                f"({len(pixels)}, {self.width}): {REMAKE}"
+            )
+        return vectors
+
+    @cached_property
+    def _session(self) -> InferenceSession:
+        return open_session(self._graph)
+
+
+def _read_bounded(path: Path, most: int) -> bytes:
+    try:
+        with path.open("rb") as file:
+            data = file.read(most + 1)
+    except FileNotFoundError:
+        raise OgPointcloudError(f"{path} is missing: {REMAKE}") from None
+    if len(data) > most:
+        raise OgPointcloudError(f"{path} has more than {most} bytes: {REMAKE}")
+    return data
+
+
+def _checked_manifest(files: Mapping[str, bytes]) -> dict[str, Any]:
+    manifest = json.loads(files[MANIFEST])
+    if manifest["format"] != FORMAT or manifest["schema_version"] != SCHEMA_VERSION:
+        raise ValueError(
+            f"its manifest says {manifest['format']!r:.40} {manifest['schema_version']!r:.20}; expected {FORMAT!r} "
+            f"{SCHEMA_VERSION}"
+        )
+    width, space = manifest["width"], manifest["feature_space"]
+    if not isinstance(width, int) or isinstance(width, bool) or not 1 <= width < 1 << 24 or not isinstance(space, str):
+        raise ValueError(f"width {width!r:.40} or feature_space {space!r:.60}; expected a whole number and a name")
+    if not isinstance(manifest["crops"], list) or not manifest["crops"]:
+        raise ValueError(f"crops are {manifest['crops']!r:.60}; expected a list of at least one")
+    if manifest["files"][GRAPH]["crc32"] != zlib.crc32(files[GRAPH]):
+        raise ValueError(f"{GRAPH} has not the manifest's checksum: it is damaged or was changed")
+    check_graph(files[GRAPH], OPERATORS)
+    return manifest

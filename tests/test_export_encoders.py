@@ -1,0 +1,308 @@
+"""Exported encoders: the vectors of transformers' own models, and what cannot be exported."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import onnx
+import pytest
+from labelled_clouds import room
+from og_pointcloud_export import write_bundle
+from text_models import (
+    CONTEXT,
+    END,
+    KINDS,
+    MERGES,
+    OUT,
+    SIZE,
+    SPACE,
+    TEXTS,
+    clip_tokenizer,
+    image_vectors,
+    text_vectors,
+    transformers_model,
+    write_model,
+)
+
+from og_pointcloud.cli import main
+from og_pointcloud.cloud import Vocabulary
+from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError
+from og_pointcloud.masking.crops import LANGSPLAT, WITH_CONTEXT
+from og_pointcloud.masking.encode import OnnxModel, open_encoder
+from og_pointcloud.text.encoder import encoder_for, read_text_encoder
+from og_pointcloud.text.everyday import everyday_words
+
+torch = pytest.importorskip("torch")
+pytest.importorskip("transformers")
+pytest.importorskip("onnxscript")
+exporter = pytest.importorskip("og_pointcloud_export.encoders")
+clip = pytest.importorskip("og_pointcloud.masking.clip")
+torch.set_num_threads(1)
+pytestmark = pytest.mark.slow
+
+PIXELS = np.random.default_rng(0).normal(size=(3, 3, SIZE, SIZE)).astype(np.float32)
+
+
+@pytest.fixture(autouse=True)
+def no_models_of_this_machine(monkeypatch, tmp_path):
+    monkeypatch.delenv("OG_POINTCLOUD_MODELS", raising=False)
+    monkeypatch.setattr("og_pointcloud.text.encoder.cache_folder", lambda: tmp_path / "cache")
+    monkeypatch.setattr(exporter, "cache_folder", lambda: tmp_path / "cache")
+    logging.getLogger("transformers").setLevel(logging.ERROR)
+
+
+@pytest.fixture(scope="module")
+def model_folder(tmp_path_factory):
+    return write_model(tmp_path_factory.mktemp("models") / "clip")
+
+
+@pytest.fixture(scope="module")
+def encoder_folder(model_folder):
+    return exporter.export_text_encoder(model_folder, model_folder.parent / "text", feature_space=SPACE)[0]
+
+
+@pytest.fixture(scope="module")
+def small_folder(model_folder):
+    folder = model_folder.parent / "int8"
+    return exporter.export_text_encoder(model_folder, folder, feature_space=SPACE, int8=True)[0]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_texts_have_the_vectors_of_transformers(kind, tmp_path):
+    folder, manifest = exporter.export_text_encoder(
+        write_model(tmp_path / "model", kind), tmp_path / "out", feature_space=SPACE
+    )
+    encoder, model = read_text_encoder(folder), transformers_model(kind)
+    together = encoder.encode(TEXTS)
+    expected = np.concatenate([text_vectors(model, encoder.tokens(text)) for text in TEXTS])
+    assert np.abs(together - expected).max() < 1e-5
+    assert (np.abs(expected[1] - expected[2]) > 1e-3).any(), "the model reads its tokens"
+    is_clip = kind.startswith("clip")
+    assert manifest["pad_id"] == (None if is_clip else END)
+    assert ({len(encoder.tokens(text)) for text in TEXTS} == {CONTEXT}) == (not is_clip)
+    assert manifest["parity"]["texts"] == len(exporter.PARITY_TEXTS)
+    assert manifest["parity"]["max_abs_error"] < 1e-5
+    assert manifest["parity"]["min_cosine"] > 1 - 1e-6
+    for name, entry in manifest["files"].items():
+        assert hashlib.sha256((folder / name).read_bytes()).hexdigest() == entry["sha256"]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_images_have_the_vectors_of_transformers(kind, tmp_path):
+    expected = image_vectors(transformers_model(kind), PIXELS)
+    folder = write_model(tmp_path / "model", kind)
+    assert np.abs(clip.TransformersModel(folder, SPACE)(PIXELS) - expected).max() < 1e-5
+    out, manifest = exporter.export_image_encoder(folder, tmp_path / "out", feature_space=SPACE)
+    assert np.abs(OnnxModel(out)(PIXELS) - expected).max() < 1e-5
+    assert np.abs(OnnxModel(out)(PIXELS[:1]) - expected[:1]).max() < 1e-5
+    assert (np.abs(expected[0] - expected[1]) > 1e-3).any(), "the model looks at its pixels"
+    assert manifest["parity"]["max_abs_error"] < 1e-5
+    assert manifest["width"] == expected.shape[1]
+    assert manifest["preprocessing"]["size"] == SIZE
+
+
+def test_merges_alone_make_the_same_tokenizer(model_folder, encoder_folder, tmp_path):
+    shutil.copytree(model_folder, tmp_path / "model")
+    description = clip_tokenizer(MERGES)
+    (tmp_path / "model" / "tokenizer.json").unlink()
+    (tmp_path / "model" / "vocab.json").write_text(json.dumps(description["model"]["vocab"]))
+    merges = "".join(f"{left} {right}\n" for left, right in MERGES)
+    (tmp_path / "model" / "merges.txt").write_text(f"#version: 0.2\n{merges}")
+    folder, _ = exporter.export_text_encoder(tmp_path / "model", tmp_path / "out", feature_space=SPACE)
+    before, after = read_text_encoder(encoder_folder), read_text_encoder(folder)
+    assert [after.tokens(text) for text in TEXTS[:-1]] == [before.tokens(text) for text in TEXTS[:-1]]
+
+
+# What cannot be exported
+
+
+class Harmful:
+    def __reduce__(self):
+        import os
+
+        return os.mkdir, ("was_run",)
+
+
+def test_folders_that_are_refused(model_folder, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+    def changed(**fields):
+        shutil.rmtree(tmp_path / "model", ignore_errors=True)
+        shutil.copytree(model_folder, tmp_path / "model")
+        config = json.loads((model_folder / "config.json").read_text())
+        (tmp_path / "model" / "config.json").write_text(json.dumps({**config, **fields}))
+        return tmp_path / "model"
+
+    def refused(folder, says, **options):
+        for export in (exporter.export_text_encoder, exporter.export_image_encoder):
+            with pytest.raises(OgPointcloudError, match=says):
+                export(folder, tmp_path / "out", **{"feature_space": SPACE, **options})
+
+    refused(tmp_path, "has no config.json")
+    refused(changed(model_type="blip"), "model_type is 'blip'; expected clip, siglip, siglip2")
+    refused(changed(quantization_config={"quant_method": "gptq"}), "quantised")
+    refused(changed(text_config=3), "cannot be read")
+    refused(changed(), "pass --feature-space as your scenes name it", feature_space=None)
+    folder = changed(auto_map={"AutoModel": "evil.Model"})
+    (folder / "evil.py").write_text("open('was_run', 'w')")
+    clip.load_model(folder)
+    (folder / "model.safetensors").write_bytes(b"\xff" * 100)
+    refused(folder, "cannot be read")
+    (folder / "model.safetensors").unlink()
+    torch.save({"logit_scale": Harmful()}, folder / "pytorch_model.bin")
+    refused(folder, "weights in .safetensors")
+    assert not (tmp_path / "was_run").exists()
+    assert not (tmp_path / "out").exists()
+
+
+def test_weights_that_do_not_fit(model_folder, tmp_path):
+    from safetensors.torch import load_file, save_file
+
+    shutil.copytree(model_folder, tmp_path / "model")
+    weights = load_file(model_folder / "model.safetensors")
+    for change, says in (
+        (lambda state: state.pop("text_projection.weight"), "lacks 1 of the weights of a CLIPModel, 'text_projection"),
+        (lambda state: state["text_projection.weight"].fill_(torch.nan), "NaN|differs from torch by nan"),
+        (lambda state: state.update({"text_projection.weight": torch.zeros(3, 3)}), "cannot be read"),
+    ):
+        state = {name: tensor.clone() for name, tensor in weights.items()}
+        change(state)
+        save_file(state, tmp_path / "model" / "model.safetensors", {"format": "pt"})
+        with pytest.raises(OgPointcloudError, match=says):
+            exporter.export_text_encoder(tmp_path / "model", tmp_path / "out", feature_space=SPACE)
+    assert not (tmp_path / "out").exists()
+
+
+def test_what_a_text_encoder_needs(model_folder, tmp_path):
+    shutil.copytree(model_folder, tmp_path / "model")
+    with pytest.raises(OgPointcloudError, match=r"no place for the name; expected \{\}"):
+        exporter.export_text_encoder(model_folder, tmp_path / "out", feature_space=SPACE, templates=["a photo"])
+    (tmp_path / "model" / "tokenizer.json").unlink()
+    with pytest.raises(OgPointcloudError, match=r"holds no tokenizer; expected tokenizer\.json, or vocab\.json"):
+        exporter.export_text_encoder(tmp_path / "model", tmp_path / "out", feature_space=SPACE)
+    folder = write_model(tmp_path / "siglip", "siglip")
+    (folder / "tokenizer_config.json").unlink()
+    with pytest.raises(OgPointcloudError, match="has pad_token None"):
+        exporter.export_text_encoder(folder, tmp_path / "out", feature_space=SPACE)
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_export_that_fails_writes_nothing(model_folder, tmp_path, monkeypatch):
+    (tmp_path / "thesis").mkdir()
+    (tmp_path / "thesis" / "thesis.tex").write_text("years of work")
+    with pytest.raises(OgPointcloudError, match="holds other things than an encoder"):
+        exporter.export_image_encoder(model_folder, tmp_path / "thesis", feature_space=SPACE)
+    assert [path.name for path in (tmp_path / "thesis").iterdir()] == ["thesis.tex"]
+    monkeypatch.setattr(exporter, "TOLERANCE", 0.0)
+    for export in (exporter.export_text_encoder, exporter.export_image_encoder):
+        with pytest.raises(OgPointcloudError, match="differs from torch"):
+            export(model_folder, tmp_path / "out", feature_space=SPACE)
+    monkeypatch.undo()
+    monkeypatch.setattr("og_pointcloud.masking.encode.OPERATORS", frozenset({"Add"}))
+    with pytest.raises(OgPointcloudError, match="uses the operator"):
+        exporter.export_image_encoder(model_folder, tmp_path / "out", feature_space=SPACE)
+    assert not (tmp_path / "out").exists()
+
+
+# int8
+
+
+def test_int8_is_small_close_and_never_depends_on_what_it_runs_with(encoder_folder, small_folder):
+    exact, small = read_text_encoder(encoder_folder), read_text_encoder(small_folder)
+    cosines = (small.encode(TEXTS) * exact.encode(TEXTS)).sum(axis=1)
+    assert 0.99 < cosines.min() < 0.999999
+    assert small.manifest["parity"]["int8"]["min_cosine"] >= 0.99
+    weights = onnx.load(small_folder / "text_encoder.onnx").graph.initializer
+    large = [constant for constant in weights if len(constant.dims) == 2 and min(constant.dims) > 16]
+    assert large
+    assert {constant.data_type for constant in large} == {onnx.TensorProto.UINT8}
+    alike = ["cat low", "low cat", "12", "lowlow", "cat cat"]
+    assert len({len(small.tokens(text)) for text in alike}) == 1
+    together = small.encode(alike)
+    alone = type(small)({path.name: path.read_bytes() for path in small_folder.iterdir()}, "alone")
+    assert all((alone.encode([text])[0] == vector).all() for text, vector in zip(alike, together, strict=True))
+
+
+def test_int8_that_turns_vectors_too_far(model_folder, tmp_path, monkeypatch):
+    monkeypatch.setattr(exporter, "INT8_COSINE", 0.9999999)
+    with pytest.raises(OgPointcloudError, match=r"int8 turns the vector of .* leave --int8 out"):
+        exporter.export_text_encoder(model_folder, tmp_path / "out", feature_space=SPACE, int8=True)
+    assert not (tmp_path / "out").exists()
+
+
+def test_int8_must_not_change_what_a_scene_answers(encoder_folder, small_folder):
+    exact, small = read_text_encoder(encoder_folder), read_text_encoder(small_folder)
+    names = ("cat", "low", "lower cats")
+    vectors = exact(names)
+
+    def scene(descriptors):
+        cloud = room(300)
+        table = replace(cloud.instances, descriptors=np.asarray(descriptors, np.float32))
+        return replace(cloud, instances=table, feature_space=SPACE, vocabulary=Vocabulary(names, vectors))
+
+    # An instance nearly as like one word as another: by half of what int8 moves the two apart, the other way.
+    tie = (vectors[0] + vectors[1]).astype(np.float64)
+    tie /= np.linalg.norm(tie)
+    moved, apart = small(names) - vectors, (vectors[0] - vectors[1]).astype(np.float64)
+    tie -= (moved[0] - moved[1]) @ tie / 2 * apart / (apart @ apart)
+    with pytest.raises(OgPointcloudError, match=r"int8 changes \d+ of the scene's choices"):
+        exporter._accept_int8(small, exact, scene([tie / np.linalg.norm(tie)] * 9))
+    with pytest.raises(FeatureSpaceError, match="the scene's descriptors are of feature space"):
+        exporter._accept_int8(small, exact, room(100))
+    report = exporter._accept_int8(small, exact, scene(vectors[np.arange(9) % 3]))
+    assert (report["instances"], report["words"], report["choices_changed"]) == (9, 3, 0)
+
+
+# The command
+
+
+def test_the_text_command(model_folder, tmp_path, capsys):
+    arguments = ["export", "text", str(model_folder), "--feature-space", SPACE]
+    scene = write_bundle(room(100), tmp_path / "other.ogpc")
+    assert main([*arguments, "--int8", "--scene", str(scene)]) == 2
+    assert "the scene's descriptors are of feature space" in capsys.readouterr().err
+    assert main([*arguments, "-o", str(tmp_path / "out"), "--template", "a {}", "--int8"]) == 0
+    printed = capsys.readouterr().out
+    assert "onnxruntime and torch differ by" in printed
+    assert "int8 and float32: cosine 0.99" in printed
+    assert f"export OG_POINTCLOUD_MODELS='{tmp_path / 'out'}'" in printed
+    made = read_text_encoder(tmp_path / "out")
+    assert made.templates == ("a {}",)
+    words = everyday_words()[:30]
+    assert np.abs(made.word_bank.vectors[:30] - made.encode([f"a {word}" for word in words])).max() < 1e-3
+    with pytest.raises(SystemExit):
+        main([*arguments, "--scene", "s.ogpc"])
+
+
+def test_the_image_command(model_folder, tmp_path, capsys):
+    arguments = ["export", "image", str(model_folder), "-o", str(tmp_path / "out"), "--feature-space", SPACE]
+    assert main([*arguments, "--crops", "langsplat"]) == 0
+    assert "differ by" in capsys.readouterr().out
+    assert open_encoder(tmp_path / "out", SPACE).crops == LANGSPLAT
+    assert main(arguments) == 0
+    assert open_encoder(tmp_path / "out", SPACE).crops == WITH_CONTEXT
+    assert main(["export", "image", str(tmp_path / "none")]) == 2
+
+
+def test_a_fetched_model_is_found_by_its_name(model_folder, tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("HF_HUB_CACHE", str(tmp_path / "hub"))
+    model = tmp_path / "hub" / f"models--{SPACE.replace('/', '--')}"
+    (model / "snapshots" / ("a" * 40)).mkdir(parents=True)
+    (model / "refs").mkdir()
+    for main_is in ("", "../../..", "c" * 40):
+        (model / "refs" / "main").write_text(main_is)
+        assert main(["export", "text", SPACE]) == 2
+        assert f"'{SPACE}' is no folder and no model that was fetched" in capsys.readouterr().err
+    (model / "refs" / "main").write_text("b" * 40 + "\n")
+    shutil.copytree(model_folder, model / "snapshots" / ("b" * 40))
+    assert main(["export", "text", SPACE]) == 0
+    assert encoder_for(SPACE).where == str(tmp_path / "cache" / "tests--tiny-clip")
+    assert open_encoder(SPACE).width == OUT, "masks are encoded by the fetched model itself"
+    assert main(["models"]) == 0
+    printed = capsys.readouterr().out
+    assert SPACE in printed
