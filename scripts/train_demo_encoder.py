@@ -329,7 +329,7 @@ class TextEncoder(nn.Module):
 
     def pooled(self, x: torch.Tensor, ids: torch.Tensor) -> torch.Tensor:
         """(B, WIDTH) unit rows of what the last block gives (B, T, TEXT_WIDTH)."""
-        last = self.ln_final(x)[torch.arange(len(ids)), ids.argmax(dim=1)]
+        last = self.ln_final(x)[torch.arange(ids.shape[0]), ids.argmax(dim=1)]
         return F.normalize(last @ self.text_projection, dim=1)
 
 
