@@ -284,15 +284,15 @@ def _colors_at(file: Path, image: PosedImage, camera: Camera) -> NDArray[np.uint
     """(H, W, 3): the photograph's colours at the pixels of the depth camera, averaged down to its resolution first."""
     scale = min(1.0, camera.fx / image.camera.fx)
     size = max(1, round(image.camera.width * scale)), max(1, round(image.camera.height * scale))
-    own = image.camera.resized(*size)
-    return resampled(_image(file, own, image.distortion), own, camera)
+    photographed = image.camera.resized(*size)
+    return resampled(_image(file, photographed, image.distortion), photographed, camera)
 
 
 def _in_world_of(poses: CapturePoses, model: Path, xyz: NDArray[np.float64]) -> NDArray[np.float64]:
     """COLMAP's points in the world of the poses.
 
     Poses of a transforms.json were often rotated, shifted or scaled after COLMAP, and only nerfstudio writes down how.
-    So the two files' poses of the same images are compared: a cloud in a world of its own would be labelled at random.
+    So the two files' poses of the same images are compared: a cloud in another world would be labelled at random.
     """
     if poses.source == model:
         return xyz
@@ -303,9 +303,9 @@ def _in_world_of(poses: CapturePoses, model: Path, xyz: NDArray[np.float64]) -> 
     pairs = [(image.camera, theirs[_stem(image.path)]) for image in poses.images if _stem(image.path) in theirs]
     if pairs and len(moved):
         distance = float(np.median(np.linalg.norm(moved - pairs[0][0].center, axis=1)))
-        apart = max(np.linalg.norm(a.center - (rotation @ b.center + translation)) / distance for a, b in pairs)
+        moved_by = max(np.linalg.norm(a.center - (rotation @ b.center + translation)) / distance for a, b in pairs)
         turned = max(np.abs(a.world_to_camera[:3, :3] @ rotation - b.world_to_camera[:3, :3]).max() for a, b in pairs)
-        if max(apart, turned) < SAME_POSE:
+        if max(moved_by, turned) < SAME_POSE:
             return moved
     raise SceneError(
         f"{model} and {poses.source.name} do not place the same images alike, so points3D is in another world than the "

@@ -120,7 +120,11 @@ def _stored(file: Path) -> NDArray:
     if not file.is_file():
         raise SceneError(f"{file} is listed as a depth image but is no file: add it or fix the pose file")
     if suffix == ".npy":
-        values = _mapped(file)
+        values = mapped_array(file)
+        if values.size > MAX_PIXELS:
+            raise SceneError(
+                f"{file} holds {values.size} numbers; expected a depth image of at most {MAX_PIXELS} pixels"
+            )
     elif suffix == ".exr":
         values = _exr(file)
     else:
@@ -139,19 +143,6 @@ def _stored(file: Path) -> NDArray:
             f"{file} is {values.dtype} {values.shape}; expected (height, width) of floats or of whole numbers of 16 "
             "bit and more"
         )
-    return values
-
-
-def _mapped(file: Path) -> NDArray:
-    """A .npy file's array, of the size that a depth image may have."""
-    try:
-        values = mapped_array(file)
-    except (ValueError, OSError) as error:
-        raise SceneError(
-            f"{file} cannot be read as a .npy array ({error!s:.120}): it is damaged or truncated, write it again"
-        ) from None
-    if values.size > MAX_PIXELS:
-        raise SceneError(f"{file} holds {values.size} numbers; expected a depth image of at most {MAX_PIXELS} pixels")
     return values
 
 

@@ -66,7 +66,7 @@ def read_gaussian_ply(path: str | os.PathLike[str]) -> Points:
 def write_gaussian_ply(path: str | os.PathLike[str], points: Points) -> None:
     """Write Gaussians in the trained layout of degree 0 (no ``f_rest``), in world coordinates; atomic.
 
-    The rows are those of `gaussian_rows`, where what is not written exactly is told.
+    The rows are those of `gaussian_rows`, which lists what is not written exactly.
     """
     write_ply(path, {"vertex": gaussian_rows(points)})
 

@@ -15,7 +15,6 @@ import warnings
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,7 +63,7 @@ def read_language_features(capture: Path, names: Sequence[str], level: str) -> t
 
 def _layer(id_file: Path, feature_file: Path, level: str) -> MaskLayer:
     ids = _level_ids(id_file, level)
-    features = _mapped(feature_file)
+    features = mapped_array(feature_file)
     if features.ndim != 2 or not np.issubdtype(features.dtype, np.floating):
         raise SceneError(
             f"{feature_file} is {features.dtype} {features.shape}; expected floats of shape (masks, width)"
@@ -89,7 +88,7 @@ def _rows(id_file: Path, level: str, row_of_id: NDArray[np.int32]) -> NDArray[np
 
 def _level_ids(file: Path, level: str) -> NDArray[np.int32]:
     """(H, W) int32, cumulative ids of one level, -1 for none; the other levels' bytes are not read."""
-    levels = _mapped(file)
+    levels = mapped_array(file)
     if levels.ndim != 3 or len(levels) != len(LEVELS) or levels.dtype.kind not in "iuf":
         raise SceneError(
             f"{file} is {levels.dtype} {levels.shape}; expected numbers (4, height, width), one map a level: "
@@ -107,16 +106,6 @@ def _level_ids(file: Path, level: str) -> NDArray[np.int32]:
             "LangSplat writes them, so that an id is a row of the features"
         )
     return np.maximum(ids, -1)
-
-
-def _mapped(file: Path) -> NDArray[Any]:
-    """A .npy file's array, mapped: only what is used is read."""
-    try:
-        return mapped_array(file)
-    except (ValueError, OSError) as error:
-        raise SceneError(
-            f"{file} cannot be read as a .npy array ({error!s:.120}): it is damaged or truncated, write it again"
-        ) from None
 
 
 def _feature_space(folder: Path, layers: Sequence[MaskLayer]) -> str:

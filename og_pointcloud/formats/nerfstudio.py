@@ -15,7 +15,6 @@ come from COLMAP itself.
 
 from __future__ import annotations
 
-import json
 import posixpath
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -29,7 +28,7 @@ from numpy.typing import NDArray
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.depth import DepthFile
 from og_pointcloud.formats.distortion import Distortion, lens_distortion
-from og_pointcloud.formats.poses import PosedImage, rigid
+from og_pointcloud.formats.poses import PosedImage, read_json, rigid
 from og_pointcloud.formats.tables import naming
 from og_pointcloud.scene import Camera
 
@@ -62,10 +61,7 @@ def read_transforms(file: Path, image_size: Callable[[str], tuple[int, int]]) ->
 
     Raises SceneError for anything that is not such a file, naming the frame and the key.
     """
-    try:
-        content = json.loads(file.read_text(encoding="utf-8"))
-    except (ValueError, RecursionError) as error:
-        raise SceneError(f"{file} is not valid JSON ({error}): export it again") from None
+    content = read_json(file)
     frames = content.get("frames") if isinstance(content, dict) else None
     if not isinstance(frames, list) or not frames:
         raise SceneError(

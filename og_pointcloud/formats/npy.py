@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from og_pointcloud.errors import SceneError
+
 __all__ = ["array_from_npy", "array_from_zip", "mapped_array", "npy_bytes"]
 
 LONGEST_HEADER = 1 << 17
@@ -44,12 +46,17 @@ def array_from_npy(data: bytes | mmap.mmap) -> NDArray[Any]:
 
 
 def mapped_array(file: Path) -> NDArray[Any]:
-    """The array of a .npy file, of which only what is used is read. ValueError as above, OSError where it cannot be.
+    """The array of a .npy file, of which only what is used is read. SceneError where it cannot be.
 
     Not by numpy.load, which divides by zero, and with it ends the process, where a type has no bytes.
     """
-    with file.open("rb") as stream:
-        return array_from_npy(mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ))
+    try:
+        with file.open("rb") as stream:
+            return array_from_npy(mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ))
+    except (ValueError, OSError) as error:
+        raise SceneError(
+            f"{file} cannot be read as a .npy array ({error!s:.120}): it is damaged or truncated, write it again"
+        ) from None
 
 
 def array_from_zip(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> NDArray[Any]:

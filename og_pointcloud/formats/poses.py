@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,12 +22,13 @@ __all__ = [
     "PosedImage",
     "in_local_frame",
     "numbered",
+    "read_json",
     "read_numbers",
     "rigid",
     "rotation_of_quaternion",
 ]
 
-MAX_TEXT_BYTES = 1 << 26
+MAX_TEXT_BYTES, MAX_JSON_BYTES = 1 << 26, 1 << 30
 
 
 @dataclass(frozen=True)
@@ -83,6 +86,16 @@ def in_local_frame(camera: Camera, origin: NDArray[np.float64]) -> Camera:
 def numbered(files: Iterable[Path]) -> list[Path]:
     """Files in the order of the numbers in their names: 2.jpg before 10.jpg."""
     return sorted(files, key=lambda file: ([int(digits) for digits in re.findall(r"\d+", file.name)], file.name))
+
+
+def read_json(file: Path) -> Any:
+    """What a JSON file of bounded size holds. SceneError where it is none."""
+    if (size := file.stat().st_size) > MAX_JSON_BYTES:
+        raise SceneError(f"{file} has {size} bytes; expected at most {MAX_JSON_BYTES}")
+    try:
+        return json.loads(file.read_text(encoding="utf-8"))
+    except (ValueError, RecursionError) as error:
+        raise SceneError(f"{file} is not valid JSON ({error}): export it again") from None
 
 
 def read_numbers(file: Path, columns: int) -> NDArray[np.float64]:

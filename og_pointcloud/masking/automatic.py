@@ -77,8 +77,8 @@ class AutomaticMasks:
                     continue
                 found, found_scores, count = self._in_crop(image[top:bottom, left:right], per_side, deadline)
                 asked += count
-                whole = _uncut(found, (left, top, right, bottom), image.shape[1], image.shape[0])
-                for mask, score in zip(found[whole], found_scores[whole], strict=True):
+                uncut = _uncut(found, (left, top, right, bottom), image.shape[1], image.shape[0])
+                for mask, score in zip(found[uncut], found_scores[uncut], strict=True):
                     placed = np.zeros(image.shape[:2], np.bool_)
                     placed[top:bottom, left:right] = mask
                     masks.append(placed)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import json
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -18,11 +17,11 @@ from numpy.typing import NDArray
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.images import MAX_PIXELS, png_header, require_cv2, without_suffix
 from og_pointcloud.formats.mask_files import read_ids
+from og_pointcloud.formats.poses import read_json
 from og_pointcloud.masking.contracts import MaskProposer, Proposals
 
-__all__ = ["CallableProposer", "ExistingMasks", "as_proposals", "decode_rle", "from_ids", "own_proposer", "read_json"]
+__all__ = ["CallableProposer", "ExistingMasks", "as_proposals", "decode_rle", "from_ids", "own_proposer"]
 
-MAX_JSON_BYTES = 1 << 30
 MAX_MASKS_PX = 1 << 33
 """Masks of one image together: more is refused before anything is allocated."""
 
@@ -35,7 +34,7 @@ def from_ids(ids: NDArray[np.integer], none: int = 0) -> Proposals:
     return Proposals(ids == names[:, None, None], np.ones(len(names), np.float32))
 
 
-def as_proposals(said: Any, shape: tuple[int, int]) -> Proposals:
+def as_proposals(given: Any, shape: tuple[int, int]) -> Proposals:
     """What a function or library gave, as proposals for an image of ``shape`` (H, W).
 
     Taken: Proposals; bool (M, H, W); an id map of integers (H, W), negative outside every mask, and 0 as well where
@@ -43,24 +42,24 @@ def as_proposals(said: Any, shape: tuple[int, int]) -> Proposals:
     (M,), as supervision's detections.
     """
     scores: Any = None
-    if isinstance(said, Proposals):
-        proposals = said
+    if isinstance(given, Proposals):
+        proposals = given
     else:
-        if hasattr(said, "mask"):
-            said, scores = said.mask, getattr(said, "confidence", None)
-            said = np.zeros((0, *shape), np.bool_) if said is None else said
-        elif isinstance(said, tuple) and len(said) == 2:
-            said, scores = said
-        masks = np.asarray(said)
+        if hasattr(given, "mask"):
+            given, scores = given.mask, getattr(given, "confidence", None)
+            given = np.zeros((0, *shape), np.bool_) if given is None else given
+        elif isinstance(given, tuple) and len(given) == 2:
+            given, scores = given
+        masks = np.asarray(given)
         if masks.ndim == 2 and masks.dtype.kind in "iu":
             proposals = from_ids(np.maximum(masks, -1), none=-1 if masks.min(initial=0) < 0 else 0)
         elif masks.ndim == 3 and masks.dtype == np.bool_:
-            given = np.ones(len(masks)) if scores is None else np.asarray(scores)
-            proposals = Proposals(masks, np.clip(given.astype(np.float32), 0, 1))
+            trust = np.ones(len(masks)) if scores is None else np.asarray(scores)
+            proposals = Proposals(masks, np.clip(trust.astype(np.float32), 0, 1))
         else:
             raise SceneError(
-                f"a mask proposer gave {type(said).__name__} {masks.dtype} {masks.shape}; expected bool (masks, H, W), "
-                "or an id map of whole numbers (H, W)"
+                f"a mask proposer gave {type(given).__name__} {masks.dtype} {masks.shape}; expected bool (masks, H, "
+                "W), or an id map of whole numbers (H, W)"
             )
     if proposals.masks.shape[1:] != shape:
         raise SceneError(f"masks are {proposals.masks.shape[1:]}, their image {shape}; expected the same (H, W)")
@@ -256,16 +255,6 @@ def _polygons(polygons: list[Any], size: Any, source: str) -> NDArray[np.bool_]:
             raise SceneError(f"{source}: a polygon is {ring!r:.60}; expected x, y, x, y ... of three corners or more")
         require_cv2().fillPoly(drawn, [np.rint(corners).astype(np.int32)], 1)
     return drawn.astype(np.bool_)
-
-
-def read_json(file: Path) -> Any:
-    """A JSON file of bounded size. SceneError where it is none."""
-    if file.stat().st_size > MAX_JSON_BYTES:
-        raise SceneError(f"{file} has {file.stat().st_size} bytes; expected at most {MAX_JSON_BYTES}")
-    try:
-        return json.loads(file.read_text(encoding="utf-8"))
-    except (ValueError, RecursionError) as error:
-        raise SceneError(f"{file} is not valid JSON ({error}): export it again") from None
 
 
 def _read_ids(file: Path) -> NDArray[np.int32]:

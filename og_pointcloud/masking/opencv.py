@@ -3,7 +3,7 @@
 1. Superpixels: graph segmentation (Felzenszwalb and Huttenlocher, 2004) cut by compact SLIC cells, so that none runs
    from one surface into another of its colour.
 2. Merging: in every round, pairs of neighbours that are each other's nearest become one region. How far apart two
-   are is told by their mean colours, by the contrast along their common border and, with depth, by steps of depth
+   are follows from their mean colours, by the contrast along their common border and, with depth, by steps of depth
    there. Small regions are near to all their neighbours, and texture brings regions nearer.
 3. Proposals: the regions that lasted: the distance at which a region was merged away against that at which it
    was made is its score. They overlap only by containing one another; `levels` settles which to use.

@@ -157,7 +157,7 @@ def _kept_proposals(task: ImageTask) -> tuple[Proposals, int]:
 
 
 def read_work(file: Path, *names: str) -> dict[str, NDArray[Any]]:
-    """All arrays, or those named, of our own file, whole since it was renamed into place; disk errors are named."""
+    """The arrays of a work file, all or those named. SceneError where the disk fails: such files are complete."""
     try:
         with np.load(file, allow_pickle=False) as arrays:
             return {name: arrays[name] for name in names or arrays.files}
