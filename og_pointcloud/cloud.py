@@ -69,6 +69,12 @@ class InstanceTable:
     visible_area: (K,) float32, pixels of blending weight that its masks put on it, over all views.
     coarse: (K,) int32, the coarse cluster that an instance of a codebook lies in, -1 none. part_of: (K,) int32, the
         instance that this one is a part of, -1 none; without cycles. Left empty, both become -1 throughout.
+
+    >>> cloud.instances.points, cloud.instances.part_of  # of `LabelledCloud`'s example
+    (array([2, 1], dtype=int32), array([-1, -1], dtype=int32))
+    >>> cloud.instances.cosines(np.array([[3, 4]], np.float32))
+    array([[0.6],
+           [0.8]], dtype=float32)
     """
 
     descriptors: NDArray[np.float32]
@@ -133,7 +139,13 @@ def _check_hierarchy(coarse: NDArray[np.int32], part_of: NDArray[np.int32]) -> N
 
 @dataclass(frozen=True)
 class Vocabulary:
-    """Words with their text vectors. names: unique strings; vectors: (len(names), D) float32, any length."""
+    """Words with their text vectors. names: unique strings; vectors: (len(names), D) float32, any length.
+
+    >>> import numpy as np
+    >>> import og_pointcloud as og
+    >>> og.Vocabulary(("chair", "desk"), np.eye(2, dtype=np.float32)).names
+    ('chair', 'desk')
+    """
 
     names: tuple[str, ...]
     vectors: NDArray[np.float32]
@@ -153,6 +165,11 @@ class WordBank:
     """Everyday words of the scene's encoder: how a text that does not fit scores, and what else a thing may be.
 
     vectors: (B, D) float32 unit rows, B at least 50; they may be stored as float16.
+
+    >>> import numpy as np
+    >>> import og_pointcloud as og
+    >>> float(og.WordBank(2 * np.eye(64, dtype=np.float32)).mean[0])
+    0.015625
     """
 
     vectors: NDArray[np.float32]
@@ -186,6 +203,24 @@ class LabelledCloud:
     vocabulary: words that may be asked as strings. word_bank: everyday words of the same encoder, which labels are
     judged by; without one, answers are not calibrated.
     provenance: JSON-able record of settings, seed, seconds per stage, and what was left out and why.
+
+    A chair of two points and a desk of one, as if an encoder had two words only:
+
+    >>> import numpy as np
+    >>> import og_pointcloud as og
+    >>> vectors = np.eye(2, dtype=np.float32)
+    >>> counts = np.array([[2, 1], [4, 4], [9, 6]], np.int32)  # points, views, masks
+    >>> evidence = np.array([[0.9, 0.8], [500, 300]], np.float32)  # agreement, visible area
+    >>> cloud = og.LabelledCloud(
+    ...     xyz=np.array([[0, 0, 1], [0.1, 0, 1], [1, 0, 1]], np.float32),
+    ...     origin=np.zeros(3),
+    ...     instance_ids=np.array([0, 0, 1], np.int32),
+    ...     instances=og.InstanceTable(vectors, np.array([0, 1], np.int32), *counts, *evidence),
+    ...     feature_space="two-words", spacing=0.1, reach=0.3,
+    ...     vocabulary=og.Vocabulary(("chair", "desk"), vectors),
+    ... )
+    >>> og.segment(cloud).counts()
+    {'chair': 2, 'desk': 1}
     """
 
     xyz: NDArray[np.float32]

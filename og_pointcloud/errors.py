@@ -9,6 +9,10 @@ class OgPointcloudError(ValueError):
     """Base of all errors raised by og_pointcloud for bad input; the command line prints it as one line.
 
     The message is printable whatever a file put into it: control characters and half characters become escapes.
+
+    >>> import og_pointcloud as og
+    >>> issubclass(og.SceneError, og.OgPointcloudError), issubclass(og.OgPointcloudError, ValueError)
+    (True, True)
     """
 
     def __init__(self, message: str) -> None:
@@ -16,19 +20,44 @@ class OgPointcloudError(ValueError):
 
 
 class SceneError(OgPointcloudError):
-    """A capture folder, cloud, pose, mask or feature file cannot be used as it is."""
+    """A capture folder, cloud, pose, mask or feature file cannot be used as it is.
+
+    >>> import og_pointcloud as og
+    >>> og.axis_aligned_box([])
+    Traceback (most recent call last):
+        ...
+    og_pointcloud.errors.SceneError: points are of shape (0,); expected (n, 3) with at least one point for a box
+    """
 
 
 class BundleError(OgPointcloudError):
-    """A ``.ogpc`` file is damaged, foreign, newer than this library, or hostile."""
+    """A ``.ogpc`` file is damaged, foreign, newer than this library, or hostile.
+
+    >>> import og_pointcloud as og
+    >>> og.load("no.ogpc")
+    Traceback (most recent call last):
+        ...
+    og_pointcloud.errors.BundleError: no.ogpc is not a file; expected a .ogpc file: ...
+    """
 
 
 class FeatureSpaceError(OgPointcloudError):
-    """Vectors of two feature spaces, or of two widths, were about to be compared."""
+    """Vectors of two feature spaces, or of two widths, were about to be compared.
+
+    >>> og.segment(cloud, {"mug": np.ones(3)})  # of `LabelledCloud`'s example
+    Traceback (most recent call last):
+        ...
+    og_pointcloud.errors.FeatureSpaceError: the label vectors are of feature space 'unknown' (width 3); expected ...
+    """
 
 
 class MissingExtraError(ImportError):
-    """An optional dependency is absent; the message names the extra that brings it."""
+    """An optional dependency is absent; the message names the extra that brings it.
+
+    >>> import og_pointcloud as og
+    >>> str(og.MissingExtraError("laspy", "las"))
+    "this needs laspy, which is not installed: pip install 'og-pointcloud[las]'"
+    """
 
     def __init__(self, module: str, extra: str) -> None:
         super().__init__(f"this needs {module}, which is not installed: pip install 'og-pointcloud[{extra}]'")

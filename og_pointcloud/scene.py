@@ -37,6 +37,13 @@ class Camera:
 
     width, height: pixels. fx, fy, cx, cy: pixels (pixel centres at +0.5).
     world_to_camera: (4, 4) float64 rigid transform from the scene's local frame, OpenCV axes.
+
+    >>> import numpy as np
+    >>> import og_pointcloud as og
+    >>> camera = og.Camera(640, 480, 500.0, 500.0, 320.0, 240.0, np.eye(4))
+    >>> camera.project(np.array([[0, 0, 2.0], [0.4, 0, 2]]))
+    (array([[320., 240.],
+           [420., 240.]]), array([2., 2.]))
     """
 
     width: int

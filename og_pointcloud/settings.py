@@ -321,7 +321,13 @@ class VisibilitySettings:
 
 @dataclass(frozen=True)
 class FitSettings:
-    """Settings of `fit`. The defaults are meant for every scene; none needs tuning."""
+    """Settings of `fit`. The defaults are meant for every scene; none needs tuning.
+
+    >>> import og_pointcloud as og
+    >>> settings = og.FitSettings(mode="grouping", seed=1)
+    >>> settings.mode, settings.memory
+    ('grouping', None)
+    """
 
     mode: Literal["auto", "grouping", "fast", "paper"] = "auto"
     """The road from masks to instances (modes.py)."""

@@ -50,6 +50,11 @@ def write_bundle(
     or of the one that is found for its feature space (`og_pointcloud.text.encoder.find_encoder`), if there is any.
     Raises OgPointcloudError where the provenance is no JSON, where the graph disagrees with numpy, or the encoder is of
     another feature space: then nothing is written.
+
+    >>> import pathlib, tempfile
+    >>> path = og.write_bundle(cloud, pathlib.Path(tempfile.mkdtemp()) / "two.ogpc")  # of `LabelledCloud`'s example
+    >>> og.segment(path, ["chair"]).counts()
+    {'chair': 3}
     """
     path = Path(path)
     if cloud.word_bank is None:

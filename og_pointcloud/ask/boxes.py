@@ -47,7 +47,13 @@ WIDEST = 1 << 19
 @dataclass(frozen=True)
 class Box:
     """center: (3,) float64. size: (3,) float64, full lengths along the rows of axes. axes: (3, 3) float64, unit rows,
-    right-handed. In the frame and unit of the points it was made from."""
+    right-handed. In the frame and unit of the points it was made from.
+
+    >>> import og_pointcloud as og
+    >>> box = og.axis_aligned_box([[0, 0, 0], [2, 1, 4]])
+    >>> box.volume, box.contains([[1, 1, 1], [3, 0, 0]])
+    (8.0, array([ True, False]))
+    """
 
     center: DoubleArray
     size: DoubleArray
@@ -91,7 +97,12 @@ class Box:
 
 
 def axis_aligned_box(points: ArrayLike) -> Box:
-    """The smallest box along the coordinate axes that holds all points (n, 3), n >= 1. SceneError as `oriented_box`."""
+    """The smallest box along the coordinate axes that holds all points (n, 3), n >= 1. SceneError as `oriented_box`.
+
+    >>> import og_pointcloud as og
+    >>> og.axis_aligned_box([[0, 0, 0], [2, 1, 4]]).center
+    array([1. , 0.5, 2. ])
+    """
     xyz = _checked(points)
     low, high = xyz.min(axis=0), xyz.max(axis=0)
     return Box(low + (high - low) / 2, high - low, np.eye(3))
@@ -103,6 +114,12 @@ def oriented_box(points: ArrayLike, up: ArrayLike | None = None) -> Box:
     Of flat points, nearly the least area; of points on a line, the line. up: (3,) direction that one axis has to have,
     where it is known: the box then stands upright, is the least one that does, and this axis is its third.
     SceneError for no points, for NaN or infinity, and for an up of length 0.
+
+    A square that stands on its corner, by its four corners:
+
+    >>> import og_pointcloud as og
+    >>> og.oriented_box([[1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0]], up=(0, 0, 1)).size.round(3)
+    array([1.414, 1.414, 0.   ])
     """
     xyz, _ = _distinct(_checked(points))
     middle = xyz.min(axis=0) + np.ptp(xyz, axis=0) / 2

@@ -50,7 +50,12 @@ ROWS_AT_ONCE = 2048
 
 
 class Reason(IntEnum):
-    """Why a point or instance has no label."""
+    """Why a point or instance has no label.
+
+    >>> import og_pointcloud as og
+    >>> int(og.Reason.TOO_FAR), str(og.Reason.TOO_FAR)
+    (5, 'too far from the scene')
+    """
 
     LABELLED = 0
     NONE_FITS = 1

@@ -49,6 +49,12 @@ class Instance:
     that it is a part of, -1 none. coarse: the codebook's coarse cluster that it lies in, -1 none.
     state: "labelled", "no feature" or "empty". words: (word, score), best first; a score is the probability that the
     instance is what the word says, where the scene has a word bank, else a cosine.
+
+    >>> chair = og.instance_table(cloud)[0]  # of `LabelledCloud`'s example
+    >>> chair.point_indices, chair.state, chair.words[0]
+    (array([0, 1]), 'labelled', ('chair', 1.0))
+    >>> chair.axis_aligned_box.size.round(2)
+    array([0.1, 0. , 0. ])
     """
 
     id: int
@@ -129,6 +135,12 @@ class Instances(Sequence[Instance]):
     """Row k is instance id k. ``scene.instances`` is one; `instance_table` makes others, of other words.
 
     Unlike a list's, its indices do not count from the end: -1 is the id of background, not the last instance.
+
+    >>> table = og.instance_table(cloud)  # of `LabelledCloud`'s example
+    >>> [row.id for row in table.largest(1)], len(table.to_records())
+    ([0], 2)
+    >>> table.to_csv().splitlines()[1][:15]
+    '0,labelled,2,0,'
     """
 
     def __init__(self, rows: Sequence[Instance]) -> None:

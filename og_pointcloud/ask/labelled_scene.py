@@ -56,7 +56,14 @@ POINTS_PER_RUN = 1 << 20
 
 
 class LabelledScene:
-    """A labelled cloud that can be asked. Make one with ``load``; it is cheap to keep and safe to share by threads."""
+    """A labelled cloud that can be asked. Make one with ``load``; it is cheap to keep and safe to share by threads.
+
+    >>> scene = og.LabelledScene.from_cloud(cloud)  # of `LabelledCloud`'s example; og.load reads a file
+    >>> scene.instances_at(np.array([[0.02, 0, 1], [1, 0.1, 1], [9, 9, 9]]))
+    array([ 0,  1, -3], dtype=int32)
+    >>> len(scene.instances), scene.vocabulary.names
+    (2, ('chair', 'desk'))
+    """
 
     def __init__(self, bundle: Bundle) -> None:
         self._bundle = bundle
@@ -213,12 +220,24 @@ class LabelledScene:
 
 
 def load(path: str | os.PathLike[str]) -> LabelledScene:
-    """Open a .ogpc file; BundleError says what is wrong with any other."""
+    """Open a .ogpc file; BundleError says what is wrong with any other.
+
+    >>> import pathlib, tempfile
+    >>> path = og.write_bundle(cloud, pathlib.Path(tempfile.mkdtemp()) / "two.ogpc")  # of `LabelledCloud`'s example
+    >>> og.load(path).instance_ids
+    array([0, 0, 1], dtype=int32)
+    """
     return LabelledScene(read_bundle(path))
 
 
 def use(scene: SceneLike | None) -> LabelledScene | None:
-    """Make a scene, or a .ogpc file, the one that ``segment`` asks when it is given none. None forgets it."""
+    """Make a scene, or a .ogpc file, the one that ``segment`` asks when it is given none. None forgets it.
+
+    >>> scene = og.use(cloud)  # of `LabelledCloud`'s example
+    >>> og.segment([[0, 0, 1]]).counts()
+    {'chair': 1, 'desk': 0}
+    >>> og.use(None)
+    """
     global _scene_in_use
     _scene_in_use = None if scene is None else as_scene(scene)
     return _scene_in_use
@@ -256,6 +275,12 @@ def segment(
 
     Warns where no point gets a label, and says why. Raises OgPointcloudError and its kinds: SceneError (no cloud),
     BundleError (no scene), FeatureSpaceError (vectors of another space or width).
+
+    >>> result = og.segment([[0.02, 0, 1], [9, 9, 9]], ["desk", "chair"], cloud)  # of `LabelledCloud`'s example
+    >>> result.labels, result.scores
+    (array([ 1, -1], dtype=int32), array([1., 0.], dtype=float32))
+    >>> og.segment(cloud, {"seat": np.array([5, 1]), "top": np.array([1, 5])}).labels
+    array([0, 0, 1], dtype=int32)
     """
     return Segmenter(find_scene(pcd, scene), labels, **options)._answer(pcd, pose)
 
@@ -273,6 +298,12 @@ class Segmenter:
         mean counts. Left out: stored vectors, and the encoder's own templates for other words.
     negatives: labels too, but points that they fit better are unknown.
     max_distance: points farther than this from the scene's cloud answer unknown; at most, and left out, its reach.
+
+    >>> ask = og.Segmenter(cloud, ["desk", "chair"])  # of `LabelledCloud`'s example
+    >>> for frame in (np.array([[0, 0, 1.0]]), np.array([[1, 0, 1.1], [0, 0, 0.9]])):
+    ...     ask(frame).labels.tolist()
+    [1]
+    [0, 1]
     """
 
     def __init__(
@@ -338,6 +369,9 @@ def instance_table(
     scene: a loaded scene, a LabelledCloud or the path of a .ogpc file.
     labels, text_features: the words to choose among, as for ``segment``; left out, the scene's own, or none.
     up: (3,) direction that the oriented boxes stand upright on, where it is known. words: how many a row names.
+
+    >>> [(row.id, row.points, row.words) for row in og.instance_table(cloud, words=1)]  # of `LabelledCloud`'s example
+    [(0, 2, (('chair', 1.0),)), (1, 1, (('desk', 1.0),))]
     """
     scene = as_scene(scene)
     own, asked = scene.vocabulary, None

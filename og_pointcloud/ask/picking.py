@@ -57,6 +57,12 @@ class Pick:
 
     instance: id in the scene's table; or BACKGROUND (-1), UNOBSERVED (-2) or TOO_FAR (-3), a miss.
     point: index of the scene's point that was hit, None for a miss. xyz_world: (3,) float64, its place, or None.
+
+    >>> hit = og.pick(cloud, (0.09, 0, 1))  # of `LabelledCloud`'s example
+    >>> hit.instance, hit.point, hit.words()[0]
+    (0, 1, ('chair', 1.0))
+    >>> str(og.pick(cloud, (9, 9, 9)))
+    'no point of the scene'
     """
 
     scene: LabelledScene = field(repr=False)
@@ -133,6 +139,11 @@ def pick(scene: SceneLike, where: Camera | ArrayLike, uv_px: ArrayLike | None = 
 
     A miss is a Pick too: its ``instance`` says which kind, ``str(pick)`` in words. Raises OgPointcloudError for a pixel
     outside the image and for numbers that are not finite.
+
+    >>> camera = og.Camera(64, 48, 40.0, 40.0, 32.0, 24.0, np.eye(4))  # at the world's origin, along z
+    >>> hit = og.pick(cloud, camera, (32, 24))  # of `LabelledCloud`'s example
+    >>> hit.instance, bool(hit.mask(camera)[24, 32])
+    (0, True)
     """
     scene = as_scene(scene)
     if isinstance(where, Camera):
@@ -147,7 +158,14 @@ def pick(scene: SceneLike, where: Camera | ArrayLike, uv_px: ArrayLike | None = 
 
 
 def in_world(camera: Camera, origin: NDArray[np.float64]) -> Camera:
-    """A camera of a scene's local frame as one of world coordinates. origin: (3,), world = local + origin."""
+    """A camera of a scene's local frame as one of world coordinates. origin: (3,), world = local + origin.
+
+    >>> import numpy as np
+    >>> import og_pointcloud as og
+    >>> local = og.Camera(64, 48, 40.0, 40.0, 32.0, 24.0, np.eye(4))
+    >>> og.in_world(local, np.array([500.0, 0, 20])).center
+    array([500.,   0.,  20.])
+    """
     pose = camera.world_to_camera.copy()
     pose[:3, 3] -= pose[:3, :3] @ np.asarray(origin, np.float64)
     return replace(camera, world_to_camera=pose)

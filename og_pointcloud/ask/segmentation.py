@@ -40,6 +40,12 @@ class Segmentation:
     calibrated: whether the scene has a word bank to judge labels by. Without one the best label is answered, however
         badly it fits: then nothing is unknown for Reason.NONE_FITS, unless negatives were asked against.
     certainty: (N,) float32, see there; looked up by ``certainty_at``, the scene's, when it is first read.
+
+    >>> result = og.segment([[0, 0, 1], [9, 9, 9]], ["chair"], cloud)  # of `LabelledCloud`'s example
+    >>> result.mask("chair"), result.instances
+    (array([ True, False]), array([ 0, -3], dtype=int32))
+    >>> {str(reason): count for reason, count in result.unknown_because().items()}
+    {'too far from the scene': 1}
     """
 
     xyz: NDArray[np.float64]

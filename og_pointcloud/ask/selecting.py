@@ -33,6 +33,10 @@ class Match:
     fits: whether neither another word nor "none of these" is more probable. Where not calibrated: whether no other word
     has a higher cosine; where no other word was given, whether it is the best of all.
     rival: the other word that fits it best, with its score; None and -2 where no other word was given.
+
+    >>> best = og.select(cloud, "desk").best  # of `LabelledCloud`'s example
+    >>> best.instance, best.score, best.fits, best.rival
+    (1, 1.0, True, 'chair')
     """
 
     instance: int
@@ -57,6 +61,10 @@ class Selection(Sequence[Match]):
 
     query: the text. rivals: how many other words competed. unknown: instances with points that have no feature, which
     no text can find. calibrated: whether the scene has a word bank, and scores are probabilities.
+
+    >>> selection = og.select(cloud, "chair")  # of `LabelledCloud`'s example
+    >>> selection.instances, selection.point_indices
+    ((0,), array([0, 1]))
     """
 
     query: str
@@ -139,6 +147,9 @@ def select(
         between them.
 
     Raises OgPointcloudError where text is not one word, else as ``segment``.
+
+    >>> [(match.instance, match.score) for match in og.select(cloud, "desk")]  # of `LabelledCloud`'s example
+    [(1, 1.0), (0, 0.0)]
     """
     scene = as_scene(scene)
     if not isinstance(text, str) and (not isinstance(text, Mapping) or len(text) != 1):

@@ -58,6 +58,12 @@ def read_bundle(path: str | os.PathLike[str], *, verify_sha256: bool = False) ->
 
     Each member's CRC-32 is always checked. verify_sha256 checks the manifest's digests too, which takes about as long
     as the rest of reading; as anyone can write them, they show which file this is, not that it is to be trusted.
+
+    >>> import pathlib, tempfile
+    >>> path = og.write_bundle(cloud, pathlib.Path(tempfile.mkdtemp()) / "two.ogpc")  # of `LabelledCloud`'s example
+    >>> bundle = og.read_bundle(path, verify_sha256=True)
+    >>> bundle.cloud.feature_space, bundle.manifest["counts"]["points"]
+    ('two-words', 3)
     """
     path = Path(path)
     if not path.is_file():

@@ -43,6 +43,20 @@ def fit(
     Deterministic: the same scene and settings give the same ids on every run. Raises SceneError where the scene
     cannot give an instance at all (no masks, or no camera that sees the cloud), and OgPointcloudError where memory or
     disk are too small, or another process uses the work folder.
+
+    A wall that three views show from the same place, its left half in one mask and its right half in another:
+
+    >>> import numpy as np
+    >>> import og_pointcloud as og
+    >>> from og_pointcloud.scene import Points, Scene, View
+    >>> x, y = np.meshgrid(np.linspace(-1, 1, 40), np.linspace(-1, 1, 40))
+    >>> points = Points(np.stack([x, y, np.full_like(x, 2)], axis=-1).reshape(-1, 3).astype(np.float32), np.zeros(3))
+    >>> camera = og.Camera(64, 64, 64.0, 64.0, 32.0, 32.0, np.eye(4))
+    >>> masks = np.repeat(np.arange(64)[None] >= 32, 64, axis=0).astype(np.int32)
+    >>> views = tuple(View(name, camera, masks, np.eye(2, dtype=np.float32)) for name in "abc")
+    >>> cloud = og.fit(Scene(points, views, "two-words"), progress=False)
+    >>> cloud.instances.points
+    array([800, 800], dtype=int32)
     """
     settings = settings or FitSettings()
     journal = Journal(progress)

@@ -76,6 +76,12 @@ def read_opengaussian(
     Evidence: ``views`` and ``masks`` are occu_count, ``agreement`` is leaf_score; ``visible_area``, of which the files
     say nothing, is 0. Raises SceneError, beginning with the path, for files that are missing, damaged or not of one
     run. Nothing is unpickled.
+
+    >>> import og_pointcloud as og
+    >>> og.read_opengaussian("no_such_run")
+    Traceback (most recent call last):
+        ...
+    og_pointcloud.errors.SceneError: no_such_run...
     """
     ply, clusters = find_result(Path(result), None if cluster_lang is None else Path(cluster_lang))
     points = read_gaussian_ply(ply)

@@ -79,6 +79,12 @@ def read_capture(folder: str | Path, gaussians: str | Path | None = None, mask_l
     The scene's masks and images are functions that read on demand; poses, features and points are read, and everything
     that can be told from headers is checked, here. Raises SceneError with the cause and the cure; warns of images
     that are listed but absent and of frames without a pose, which are left out.
+
+    >>> import og_pointcloud as og
+    >>> og.read_capture("no_such_folder")
+    Traceback (most recent call last):
+        ...
+    og_pointcloud.errors.SceneError: no_such_folder is not a folder; expected a capture folder with poses, ...
     """
     capture = Path(folder)
     if not capture.is_dir():

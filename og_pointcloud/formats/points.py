@@ -29,6 +29,11 @@ def read_points(path: str | os.PathLike[str]) -> Points:
     vectors, a zero row where the file has none for that point; either is None where the file has none at all.
     SceneError, beginning with the path, for what cannot be read, has no points, or holds NaN. LAS and LAZ need the
     extra 'las'.
+
+    >>> import pathlib, tempfile
+    >>> path = og.segment(cloud).save(pathlib.Path(tempfile.mkdtemp()) / "two.ply")  # of `LabelledCloud`'s example
+    >>> og.read_points(path).xyz_world[2].round(3)
+    array([1., 0., 1.])
     """
     path = Path(path)
     with naming(path):

@@ -91,7 +91,13 @@ class FeatureColors:
 
 
 def feature_colors(features: NDArray[np.floating], weight: NDArray[np.floating]) -> Colors:
-    """(n, 3) uint8 RGB of features (n, w), grey for points without weight (n,), which no view sees, and for NaN."""
+    """(n, 3) uint8 RGB of features (n, w), grey for points without weight (n,), which no view sees, and for NaN.
+
+    >>> import numpy as np
+    >>> import og_pointcloud as og
+    >>> og.feature_colors(np.array([[0.0], [1.0], [np.nan]]), np.ones(3))[:, 0]  # red; without a feature, grey
+    array([  0, 255, 128], dtype=uint8)
+    """
     colors = FeatureColors.fit(features, weight)(features)
     colors[weight <= 0] = GREY
     return colors
@@ -110,6 +116,19 @@ def feature_picture(
     near: depth of the near plane (`geometry.near_plane`). stages: title -> (n, w) features, NaN rows for points without
     one; colours are fitted to the first stage, as the views shown see it. columns: views shown, evenly spread.
     SceneError where the stages do not fit the Gaussians.
+
+    >>> import pathlib, tempfile
+    >>> import numpy as np
+    >>> import og_pointcloud as og
+    >>> from og_pointcloud.rendering.splatting import Gaussians
+    >>> from og_pointcloud.scene import View
+    >>> xyz, scale = np.array([[0, 0, 2], [0.2, 0, 2]], np.float32), np.full((2, 3), 0.1, np.float32)
+    >>> gaussians = Gaussians(xyz, scale, np.eye(4, dtype=np.float32)[[0, 0]], np.ones(2, np.float32))
+    >>> camera = og.Camera(64, 48, 60.0, 60.0, 32.0, 24.0, np.eye(4))
+    >>> view = View("front", camera, np.full((48, 64), -1, np.int32), np.zeros((0, 1), np.float32))
+    >>> stages = {"features": np.array([[0.0], [1.0]], np.float32)}
+    >>> og.feature_picture(gaussians, [view], 0.1, stages, pathlib.Path(tempfile.mkdtemp()) / "two.png").name
+    'two.png'
     """
     _check(stages, (len(gaussians), None))
     shown, weights = _weights(gaussians, views, near, columns)
@@ -156,6 +175,19 @@ def instance_picture(
 
     stages: title -> (n,) ids, >= 0 an instance, whose colour depends on its number alone; -1 background (grey) and -2
     unobserved (dark). The rest as `feature_picture`.
+
+    >>> import pathlib, tempfile
+    >>> import numpy as np
+    >>> import og_pointcloud as og
+    >>> from og_pointcloud.rendering.splatting import Gaussians
+    >>> from og_pointcloud.scene import View
+    >>> xyz, scale = np.array([[0, 0, 2], [0.2, 0, 2]], np.float32), np.full((2, 3), 0.1, np.float32)
+    >>> gaussians = Gaussians(xyz, scale, np.eye(4, dtype=np.float32)[[0, 0]], np.ones(2, np.float32))
+    >>> camera = og.Camera(64, 48, 60.0, 60.0, 32.0, 24.0, np.eye(4))
+    >>> view = View("front", camera, np.full((48, 64), -1, np.int32), np.zeros((0, 1), np.float32))
+    >>> stages = {"instances": np.array([0, 1])}
+    >>> og.instance_picture(gaussians, [view], 0.1, stages, pathlib.Path(tempfile.mkdtemp()) / "two.png").name
+    'two.png'
     """
     _check(stages, (len(gaussians),))
     shown, weights = _weights(gaussians, views, near, columns)

@@ -28,6 +28,15 @@ def read_text_features(path: str | os.PathLike[str]) -> tuple[Vocabulary, str]:
 
     Raises FeatureSpaceError, beginning with the path, where the file cannot be read, an entry is missing, or a name
     comes twice, is empty, or has a vector that is zero, NaN or infinite. Nothing is unpickled.
+
+    >>> import pathlib, tempfile
+    >>> import numpy as np
+    >>> import og_pointcloud as og
+    >>> path = pathlib.Path(tempfile.mkdtemp()) / "words.npz"
+    >>> np.savez(path, names=["chair", "desk"], vectors=np.eye(2), feature_space="two-words")
+    >>> vocabulary, space = og.read_text_features(path)
+    >>> vocabulary.names, space
+    (('chair', 'desk'), 'two-words')
     """
     path = Path(path)
     if not path.is_file():
