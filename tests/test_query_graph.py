@@ -188,17 +188,17 @@ def points_of_list(grid, child):
 
 
 def box_plainly(cloud, center, half):
-    """(answer of the instance, or -3; points nearest somewhere): the box against every point and every pair of them."""
+    """(answer of the instance, or -3; points nearest somewhere): the box against all points in reach, and their pairs."""
     seen = cloud.xyz.astype(np.float64) - center
+    in_reach = np.flatnonzero((np.maximum(np.abs(seen) - half, 0) ** 2).sum(axis=1) <= float(cloud.reach) ** 2)
+    if len(in_reach) == 0:
+        return TOO_FAR, set()
+    seen = seen[in_reach]  # what loses to a point out of reach is out of reach itself
     squared = (seen**2).sum(axis=1)
-    reach = float(cloud.reach)
-    in_reach = (np.maximum(np.abs(seen) - half, 0) ** 2).sum(axis=1) <= reach**2
     spread = np.abs(seen[:, None] - seen).sum(axis=2)
     loses = (squared[:, None] - squared - 2 * half * spread > 1e-9 * half**2).any(axis=1)
-    winners = np.flatnonzero(in_reach & ~loses)
-    if len(winners) == 0:
-        return TOO_FAR, set()
-    everywhere = ((np.abs(seen[squared.argmin()]) + half) ** 2).sum() <= reach**2
+    winners = in_reach[~loses]
+    everywhere = ((np.abs(seen[squared.argmin()]) + half) ** 2).sum() <= float(cloud.reach) ** 2
     same = len(set(cloud.instance_ids[winners].tolist())) == 1
     return (int(cloud.instance_ids[winners[0]]) if everywhere and same else None), set(winners.tolist())
 
