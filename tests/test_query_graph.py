@@ -188,7 +188,7 @@ def points_of_list(grid, child):
 
 
 def box_plainly(cloud, center, half):
-    """(answer of the instance, or -3; points nearest somewhere): the box against all points in reach, and their pairs."""
+    """(answer of the instance, or -3; points nearest somewhere): the box against all points in reach, pair by pair."""
     seen = cloud.xyz.astype(np.float64) - center
     in_reach = np.flatnonzero((np.maximum(np.abs(seen) - half, 0) ** 2).sum(axis=1) <= float(cloud.reach) ** 2)
     if len(in_reach) == 0:
