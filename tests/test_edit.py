@@ -16,7 +16,7 @@ from og_pointcloud.ask.labelled_scene import LabelledScene
 from og_pointcloud.cli import main
 from og_pointcloud.errors import OgPointcloudError, SceneError
 from og_pointcloud.formats.ply import join_columns, read_ply, write_ply
-from og_pointcloud.show.harmonics import rotated_harmonics
+from og_pointcloud.show.splat_columns import rotated_harmonics
 
 SH_CONSTANT = 0.28209479177387814
 BASE = ("f_dc_0", "f_dc_1", "f_dc_2")

@@ -55,6 +55,13 @@ def test_asking_works_where_no_heavy_module_can_be_imported(bundle_file, tmp_pat
     run(blocked + ASK, bundle_file, tmp_path)
 
 
+def test_a_cloud_in_memory_is_asked_without_its_exporter(bundle_file, tmp_path):
+    """Nothing heavy, and nothing of what writes files: its arrays answer."""
+    blocked = f"import sys; sys.modules.update(dict.fromkeys({(*HEAVY, 'og_pointcloud_export')}))\n"
+    in_memory = ASK.replace("og.load(sys.argv[1])", "og.LabelledScene.from_cloud(og.load(sys.argv[1]).cloud)")
+    run(blocked + in_memory, bundle_file, tmp_path)
+
+
 def test_a_missing_extra_is_named(bundle_file, tmp_path):
     blocked = """import sys
 sys.modules.update(dict.fromkeys(["numba", "open3d", "pyvista", "laspy"]))

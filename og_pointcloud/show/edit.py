@@ -24,28 +24,23 @@ from typing import TYPE_CHECKING, TypeAlias, TypedDict
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from og_pointcloud.ask.boxes import quaternion_of, typical_spacing
+from og_pointcloud.ask.boxes import typical_spacing
 from og_pointcloud.ask.labelled_scene import LabelledScene, SceneLike, as_scene
 from og_pointcloud.ask.picking import Pick
 from og_pointcloud.ask.selecting import Match, Selection, select
 from og_pointcloud.bundle.nearest import NearestPoint
 from og_pointcloud.cloud import TOO_FAR
 from og_pointcloud.errors import OgPointcloudError, SceneError
-from og_pointcloud.formats.colors import LUMINANCE
 from og_pointcloud.formats.gaussian_ply import (
-    BASE_COLOR,
-    LOG_SCALE,
-    ROTATION,
-    SH_CONSTANT,
     gaussian_rows,
     gaussians_from_ply,
     holds_gaussians,
 )
 from og_pointcloud.formats.ply import HEADER_LIMIT, join_columns, read_ply, write_ply
 from og_pointcloud.formats.points import read_points
-from og_pointcloud.formats.tables import NORMAL_COLUMNS, colors, naming, positions, stack_columns, storable_positions
+from og_pointcloud.formats.tables import NORMAL_COLUMNS, naming, positions, storable_positions
 from og_pointcloud.scene import Points
-from og_pointcloud.show.harmonics import MAX_DEGREE, rotated_harmonics
+from og_pointcloud.show.splat_columns import appended, placed, recoloured
 from og_pointcloud.text.words import TextFeatures
 
 if TYPE_CHECKING:
@@ -60,8 +55,6 @@ Rows = NDArray[np.void]
 
 SAME_PLACE = 1e-3
 """Distance in spacings up to which a point of the cloud is the scene's: .ogpc files hold float32."""
-DARK = 0.05
-"""Mean luminance below which an object's shading is too faint to be kept in a new colour."""
 SPLAT_SCALE, SPLAT_OPACITY = 0.5, 0.95
 """What a plain point becomes among Gaussians: its standard deviation in spacings, just closing surfaces."""
 RIGID = 1e-4
@@ -139,7 +132,7 @@ def recolour(
     if rgb.shape != (3,) or not ((rgb >= 0) & (rgb <= 255)).all():
         raise OgPointcloudError(f"color is {color}; expected three numbers from 0 to 255: red, green, blue")
     subject = _subject(scene, what, output, **options)
-    rows, notes = _recoloured(subject.rows, subject.chosen, rgb / 255, keep_shading)
+    rows, notes = recoloured(subject.rows, subject.chosen, rgb / 255, keep_shading)
     return replace(subject, notes=(*subject.notes, *notes)).write(output, rows, "recoloured")
 
 
@@ -166,8 +159,8 @@ def insert(
         rows = _as_gaussians(points) if is_splat else _plain_rows(points.xyz_world, points.rgb)
         kind = "Gaussians" if is_splat else "plain points"
         notes.append(f"{other}: its points became {kind}, like those of {cloud}")
-    placed, lost = _placed(rows, rotation, scale, translation)
-    merged, differing = _appended(base.rows, placed)
+    moved, lost = placed(rows, rotation, scale, translation)
+    merged, differing = appended(base.rows, moved)
     inserted = np.arange(len(merged)) >= len(base.rows)
     return _Cloud(base.elements, (*notes, *lost, *differing), inserted).write(output, merged, "inserted")
 
@@ -349,62 +342,6 @@ def _as_gaussians(points: Points) -> Rows:
     )
 
 
-# Colours ----------------------------------------------------------------------------------------------------------
-
-
-def _recoloured(
-    rows: Rows, chosen: NDArray[np.bool_], color: NDArray[np.float64], keep_shading: bool
-) -> tuple[Rows, tuple[str, ...]]:
-    """The rows with those chosen in another colour (3,), 0 to 1: as harmonics, as red green blue, or both."""
-    rows, notes = rows.copy(), ()
-    names = rows.dtype.names or ()
-    gaussians = set(BASE_COLOR) <= set(names)
-    if gaussians:
-        _recolour_harmonics(rows, chosen, color, keep_shading)
-    known = colors(rows)
-    if known is None and not gaussians:
-        known, notes = np.full((len(rows), 3), 128, np.uint8), ("the cloud has no colours: the rest became grey",)
-    if known is not None:
-        base = known[chosen] / 255
-        turned = base @ _color_map(base, color, keep_shading).T + (0 if keep_shading else color)
-        known[chosen] = np.rint(255 * np.clip(turned, 0, 1)).astype(np.uint8)
-        rows = _with_rgb(rows, known)
-    return rows, notes
-
-
-def _color_map(base: NDArray[np.float64], color: NDArray[np.float64], keep_shading: bool) -> NDArray[np.float64]:
-    """(3, 3): luminance times the new colour, so that the mean of the object becomes that colour; 0 where flat."""
-    if not keep_shading:
-        return np.zeros((3, 3))
-    mean = float((base @ LUMINANCE).mean())
-    return np.outer(color, LUMINANCE) / max(mean, DARK)
-
-
-def _recolour_harmonics(rows: Rows, chosen: NDArray[np.bool_], color: NDArray[np.float64], keep_shading: bool) -> None:
-    """In place. Colour is linear in the coefficients, so what a linear map does to colours it does to them."""
-    base = 0.5 + SH_CONSTANT * stack_columns(rows, BASE_COLOR, np.float64)[chosen]
-    mapping = _color_map(np.clip(base, 0, 1), color, keep_shading)
-    turned = base @ mapping.T + (0 if keep_shading else color)
-    _set_columns(rows, chosen, BASE_COLOR, (turned - 0.5) / SH_CONSTANT)
-    rest = _rest(rows[chosen])
-    if rest.shape[2]:
-        _set_rest(rows, chosen, np.einsum("dc,nck->ndk", mapping, rest))
-
-
-def _with_rgb(rows: Rows, rgb: NDArray[np.uint8]) -> Rows:
-    """The rows with these colours as red, green, blue; colour columns of another type give way to uchar ones."""
-    names = ("red", "green", "blue")
-    columns = {name: rows[name] for name in rows.dtype.names or ()}
-    if not all(name in columns and columns[name].dtype == np.uint8 for name in names):
-        for name in (*names, "r", "g", "b", "diffuse_red", "diffuse_green", "diffuse_blue", "rgb", "rgba"):
-            columns.pop(name, None)
-    columns |= {name: rgb[:, index] for index, name in enumerate(names)}
-    return join_columns(columns)
-
-
-# Placing ----------------------------------------------------------------------------------------------------------
-
-
 def _similarity(pose: ArrayLike | None) -> tuple[NDArray[np.float64], float, NDArray[np.float64]]:
     """Rotation (3, 3), scale and translation (3,) of a pose."""
     matrix = np.eye(4) if pose is None else np.asarray(pose, np.float64)
@@ -419,119 +356,3 @@ def _similarity(pose: ArrayLike | None) -> tuple[NDArray[np.float64], float, NDA
             "positive scale: Gaussians cannot follow any other"
         )
     return rotation, float(scale), matrix[:3, 3]
-
-
-def _placed(
-    rows: Rows, rotation: NDArray[np.float64], scale: float, translation: NDArray[np.float64]
-) -> tuple[Rows, tuple[str, ...]]:
-    """The rows in the frame of the cloud that they are put into. Positions become float64."""
-    names = rows.dtype.names or ()
-    columns = {name: rows[name].copy() for name in names}
-    xyz = positions(rows) @ (scale * rotation).T + translation
-    columns |= dict(zip("xyz", xyz.T, strict=True))
-    for normal in NORMAL_COLUMNS:
-        if set(normal) <= set(names):
-            turned = stack_columns(rows, normal, np.float64) @ rotation.T
-            columns |= {name: turned[:, index].astype(rows.dtype[name]) for index, name in enumerate(normal)}
-    placed = join_columns(columns)
-    if set(LOG_SCALE) <= set(names):
-        _set_columns(placed, slice(None), LOG_SCALE, stack_columns(rows, LOG_SCALE, np.float64) + np.log(scale))
-    if set(ROTATION) <= set(names):
-        _set_columns(placed, slice(None), ROTATION, _turned(quaternion_of(rotation), rows))
-    rest = _rest(rows)
-    if rest.shape[2] > _coefficients(MAX_DEGREE):
-        return placed, (f"harmonics above degree {MAX_DEGREE} are not turned",)
-    if rest.shape[2]:
-        _set_rest(placed, slice(None), rotated_harmonics(rest, rotation))
-    return placed, ()
-
-
-def _turned(turn: NDArray[np.float64], rows: Rows) -> NDArray[np.float64]:
-    """(n, 4) the rows' quaternions wxyz after another turn; their lengths, which mean nothing, stay."""
-    quaternions = stack_columns(rows, ROTATION, np.float64)
-    quaternions[~quaternions.any(axis=1), 0] = 1.0  # a zero quaternion is no rotation
-    (a, b, c, d), (w, x, y, z) = turn, quaternions.T
-    product = [
-        a * w - b * x - c * y - d * z,
-        a * x + b * w + c * z - d * y,
-        a * y - b * z + c * w + d * x,
-        a * z + b * y - c * x + d * w,
-    ]
-    return np.stack(product, axis=1)
-
-
-def _appended(base: Rows, added: Rows) -> tuple[Rows, tuple[str, ...]]:
-    """The rows of both, in the layout of the first, with as many harmonics as either has."""
-    if set(BASE_COLOR) <= set(base.dtype.names or ()):
-        harmonics = max(len(_rest_names(rows)) // 3 for rows in (base, added))
-        base, added = _with_harmonics(base, harmonics), _with_harmonics(added, harmonics)
-    names = base.dtype.names or ()
-    merged = np.zeros(len(base) + len(added), base.dtype)
-    merged[: len(base)] = base
-    theirs = set(added.dtype.names or ())
-    for name in names:
-        if name in theirs:
-            merged[name][len(base) :] = added[name]
-    notes = []
-    if lacking := [name for name in names if name not in theirs]:
-        notes.append(f"{_listed(lacking)} are 0 for the inserted points, which had none")
-    if dropped := [name for name in added.dtype.names or () if name not in names]:
-        notes.append(f"{_listed(dropped)} of the inserted points are left out, which the cloud does not have")
-    return merged, tuple(notes)
-
-
-def _listed(names: Sequence[str]) -> str:
-    return ", ".join(names[:6]) + (f" and {len(names) - 6} more" if len(names) > 6 else "")
-
-
-# Columns ----------------------------------------------------------------------------------------------------------
-
-
-def _set_columns(
-    rows: Rows, chosen: NDArray[np.bool_] | slice, names: Sequence[str], values: NDArray[np.floating]
-) -> None:
-    for index, name in enumerate(names):
-        rows[name][chosen] = values[:, index]
-
-
-def _coefficients(degree: int) -> int:
-    """Harmonics of a channel above the constant one."""
-    return (degree + 1) ** 2 - 1
-
-
-def _rest_names(rows: Rows) -> list[str]:
-    """f_rest_0, f_rest_1, ..: all harmonics of red, then of green, then of blue."""
-    present = set(rows.dtype.names or ())
-    names = []
-    while f"f_rest_{len(names)}" in present:
-        names.append(f"f_rest_{len(names)}")
-    if len(names) % 3:
-        raise SceneError(f"{len(names)} properties f_rest; expected three times as many as a channel has")
-    return names
-
-
-def _rest(rows: Rows) -> NDArray[np.float64]:
-    """(n, 3, k) harmonics above the constant one; k is 0 where there are none."""
-    names = _rest_names(rows)
-    return stack_columns(rows, names, np.float64).reshape(len(rows), 3, len(names) // 3)
-
-
-def _set_rest(rows: Rows, chosen: NDArray[np.bool_] | slice, rest: NDArray[np.float64]) -> None:
-    _set_columns(rows, chosen, _rest_names(rows), rest.reshape(len(rest), -1))
-
-
-def _with_harmonics(rows: Rows, count: int) -> Rows:
-    """The rows with ``count`` harmonics a channel, new ones 0, after the constant ones, where files have them."""
-    rest = _rest(rows)
-    if rest.shape[2] == count:
-        return rows
-    padded = np.zeros((len(rows), 3, count), np.float32)
-    padded[:, :, : rest.shape[2]] = rest
-    new = {f"f_rest_{index}": column for index, column in enumerate(padded.reshape(len(rows), -1).T)}
-    columns: dict[str, NDArray] = {}
-    for name in rows.dtype.names or ():
-        if not name.startswith("f_rest_"):
-            columns[name] = rows[name]
-        if name == BASE_COLOR[-1]:
-            columns |= new
-    return join_columns(columns)

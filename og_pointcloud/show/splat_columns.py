@@ -1,0 +1,235 @@
+"""Columns of a cloud or 3DGS file that an edit changes: recoloured, moved into another frame, put behind others.
+
+A splat's colour seen along a direction d is 0.5 + sum_k c_k Y_k(d), Y_k real spherical harmonics with the
+Condon-Shortley sign, in the order l = 0, 1, .., m = -l .. l. Turning a splat mixes the coefficients of each degree
+among themselves: the colour that was seen along d is then seen along R d.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from og_pointcloud.ask.boxes import quaternion_of
+from og_pointcloud.errors import SceneError
+from og_pointcloud.formats.colors import LUMINANCE
+from og_pointcloud.formats.gaussian_ply import BASE_COLOR, LOG_SCALE, ROTATION, SH_CONSTANT
+from og_pointcloud.formats.ply import join_columns
+from og_pointcloud.formats.tables import NORMAL_COLUMNS, colors, positions
+
+__all__ = ["MAX_DEGREE", "appended", "placed", "recoloured", "rotated_harmonics"]
+
+Rows: TypeAlias = NDArray[np.void]
+Columns: TypeAlias = dict[str, NDArray[Any]]
+
+RGB = ("red", "green", "blue")
+OTHER_COLORS = ("r", "g", "b", "diffuse_red", "diffuse_green", "diffuse_blue", "rgb", "rgba")
+"""Further names of colour columns, which give way to RGB of type uchar."""
+DARK = 0.05
+"""Mean luminance below which an object's shading is too faint to be kept in a new colour."""
+MAX_DEGREE = 3
+"""Highest degree of the harmonics that files have."""
+DIRECTIONS = 32
+
+
+def recoloured(
+    rows: Rows, chosen: NDArray[np.bool_], color: NDArray[np.float64], keep_shading: bool
+) -> tuple[Rows, tuple[str, ...]]:
+    """The rows with those chosen in another colour, as harmonics, as red green blue, or both; and what is to be told.
+
+    color: (3,), 0 to 1. keep_shading: the mean of the object becomes that colour, its light and dark stay.
+    """
+    columns, rgb, notes = _columns(rows), colors(rows), ()
+    is_splat = set(BASE_COLOR) <= set(columns)
+    if is_splat:
+        # Colour is linear in the coefficients, so what a linear map does to colours it does to them.
+        base = 0.5 + SH_CONSTANT * _stack(columns, BASE_COLOR)[chosen]
+        mapping, constant = _color_map(np.clip(base, 0, 1), color, keep_shading)
+        _set(columns, BASE_COLOR, (base @ mapping.T + constant - 0.5) / SH_CONSTANT, chosen)
+        _set_rest(columns, np.einsum("dc,nck->ndk", mapping, _rest(columns)[chosen]), chosen)
+    elif rgb is None:
+        rgb, notes = np.full((len(rows), 3), 128, np.uint8), ("the cloud has no colours: the rest became grey",)
+    if rgb is not None:
+        base = rgb[chosen] / 255
+        mapping, constant = _color_map(base, color, keep_shading)
+        rgb[chosen] = np.rint(255 * np.clip(base @ mapping.T + constant, 0, 1)).astype(np.uint8)
+        if not all(name in columns and columns[name].dtype == np.uint8 for name in RGB):
+            columns = {name: column for name, column in columns.items() if name not in RGB + OTHER_COLORS}
+        columns |= dict(zip(RGB, rgb.T, strict=True))
+    return join_columns(columns), notes
+
+
+def placed(
+    rows: Rows, rotation: NDArray[np.float64], scale: float, translation: NDArray[np.float64]
+) -> tuple[Rows, tuple[str, ...]]:
+    """The rows in another frame, x -> scale * rotation @ x + translation; and what could not follow.
+
+    Positions become float64. Normals, rotations and scales of Gaussians and their harmonics follow.
+    """
+    columns = _columns(rows)
+    columns |= dict(zip("xyz", (positions(rows) @ (scale * rotation).T + translation).T, strict=True))
+    for normal in NORMAL_COLUMNS:
+        if set(normal) <= set(columns):
+            _set(columns, normal, _stack(columns, normal) @ rotation.T)
+    if set(LOG_SCALE) <= set(columns):
+        _set(columns, LOG_SCALE, _stack(columns, LOG_SCALE) + np.log(scale))
+    if set(ROTATION) <= set(columns):
+        _set(columns, ROTATION, _turned(quaternion_of(rotation), _stack(columns, ROTATION)))
+    rest = _rest(columns)
+    if rest.shape[2] >= (MAX_DEGREE + 1) ** 2:
+        return join_columns(columns), (f"harmonics above degree {MAX_DEGREE} are not turned",)
+    _set_rest(columns, rotated_harmonics(rest, rotation))
+    return join_columns(columns), ()
+
+
+def appended(base: Rows, added: Rows) -> tuple[Rows, tuple[str, ...]]:
+    """The rows of both, with the columns of the first and as many harmonics as either has; and what is to be told."""
+    first, second = _columns(base), _columns(added)
+    if set(BASE_COLOR) <= set(first):
+        harmonics = max(_rest(first).shape[2], _rest(second).shape[2])
+        first, second = _with_harmonics(first, harmonics), _with_harmonics(second, harmonics)
+    zeros, notes = np.zeros(len(added)), []
+    merged = {
+        name: np.concatenate([column, second.get(name, zeros).astype(column.dtype)]) for name, column in first.items()
+    }
+    if lacking := [name for name in first if name not in second]:
+        notes.append(f"{_listed(lacking)} are 0 for the inserted points, which had none")
+    if dropped := [name for name in second if name not in first]:
+        notes.append(f"{_listed(dropped)} of the inserted points are left out, which the cloud does not have")
+    return join_columns(merged), tuple(notes)
+
+
+def _color_map(
+    base: NDArray[np.float64], color: NDArray[np.float64], keep_shading: bool
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """(3, 3) and (3,): what colours (n, 3) are multiplied by, and what is added: luminance times the new colour, so
+    that the mean of the object becomes that colour; or the new colour alone."""
+    if not keep_shading:
+        return np.zeros((3, 3)), color
+    return np.outer(color, LUMINANCE) / max(float((base @ LUMINANCE).mean()), DARK), np.zeros(3)
+
+
+def _turned(turn: NDArray[np.float64], quaternions: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(n, 4) quaternions wxyz after another turn; their lengths, which mean nothing, stay."""
+    quaternions[~quaternions.any(axis=1), 0] = 1.0  # a zero quaternion is no rotation
+    (a, b, c, d), (w, x, y, z) = turn, quaternions.T
+    product = [
+        a * w - b * x - c * y - d * z,
+        a * x + b * w + c * z - d * y,
+        a * y - b * z + c * w + d * x,
+        a * z + b * y - c * x + d * w,
+    ]
+    return np.stack(product, axis=1)
+
+
+def _listed(names: Sequence[str]) -> str:
+    return ", ".join(names[:6]) + (f" and {len(names) - 6} more" if len(names) > 6 else "")
+
+
+# Columns ----------------------------------------------------------------------------------------------------------
+
+
+def _columns(rows: Rows) -> Columns:
+    return {name: rows[name] for name in rows.dtype.names or ()}
+
+
+def _stack(columns: Columns, names: Sequence[str]) -> NDArray[np.float64]:
+    """(n, names) float64."""
+    values = [columns[name].astype(np.float64) for name in names]
+    return np.stack(values, axis=1) if values else np.zeros((len(columns["x"]), 0))
+
+
+def _set(
+    columns: Columns,
+    names: Sequence[str],
+    values: NDArray[np.floating],
+    chosen: NDArray[np.bool_] | slice = slice(None),
+) -> None:
+    """Give some rows of the columns other values (rows, names), in the columns' types; the arrays given stay."""
+    for index, name in enumerate(names):
+        columns[name] = columns[name].copy()
+        columns[name][chosen] = values[:, index]
+
+
+def _rest_names(columns: Columns) -> list[str]:
+    """f_rest_0, f_rest_1, ..: all harmonics of red, then of green, then of blue."""
+    names = []
+    while f"f_rest_{len(names)}" in columns:
+        names.append(f"f_rest_{len(names)}")
+    if len(names) % 3:
+        raise SceneError(f"{len(names)} properties f_rest; expected three times as many as a channel has")
+    return names
+
+
+def _rest(columns: Columns) -> NDArray[np.float64]:
+    """(n, 3, k) harmonics above the constant one; k is 0 where there are none."""
+    names = _rest_names(columns)
+    return _stack(columns, names).reshape(-1, 3, len(names) // 3) if names else np.zeros((len(columns["x"]), 3, 0))
+
+
+def _set_rest(
+    columns: Columns,
+    rest: NDArray[np.float64],
+    chosen: NDArray[np.bool_] | slice = slice(None),
+) -> None:
+    _set(columns, _rest_names(columns), rest.reshape(len(rest), 3 * rest.shape[2]), chosen)
+
+
+def _with_harmonics(columns: Columns, count: int) -> Columns:
+    """The columns with ``count`` harmonics a channel, new ones 0, behind the constant ones, where files have them."""
+    rest = _rest(columns)
+    if rest.shape[2] == count:
+        return columns
+    padded = np.zeros((len(rest), 3, count), np.float32)
+    padded[:, :, : rest.shape[2]] = rest
+    new = {f"f_rest_{index}": column for index, column in enumerate(padded.reshape(len(rest), -1).T)}
+    others = [(name, column) for name, column in columns.items() if not name.startswith("f_rest_")]
+    behind = [name for name, _ in others].index(BASE_COLOR[-1]) + 1
+    return dict([*others[:behind], *new.items(), *others[behind:]])
+
+
+# Harmonics --------------------------------------------------------------------------------------------------------
+
+
+def rotated_harmonics(rest: NDArray[np.floating], rotation: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Coefficients of splats that are turned. rotation: (3, 3), of column vectors.
+
+    rest: (n, channels, k), k = 0, 3, 8 or 15: degrees 1 up to 3, without the constant. The same shape comes back.
+    """
+    turned = np.array(rest, np.float64)
+    directions = np.random.default_rng(0).normal(size=(DIRECTIONS, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    start = 0
+    for degree in range(1, MAX_DEGREE + 1):
+        end = start + 2 * degree + 1
+        if end > rest.shape[2]:
+            break
+        # Turned harmonics of one degree are mixtures of that degree, Y(R' d) = Y(d) M: any few directions give M.
+        seen_before, seen_after = _harmonics(directions @ rotation, degree), _harmonics(directions, degree)
+        mixing = np.linalg.lstsq(seen_after, seen_before, rcond=None)[0]
+        turned[..., start:end] = rest[..., start:end] @ mixing.T
+        start = end
+    return turned
+
+
+def _harmonics(directions: NDArray[np.float64], degree: int) -> NDArray[np.float64]:
+    """(n, 2 degree + 1) real spherical harmonics of unit vectors (n, 3), m = -degree .. degree."""
+    x, y, z = directions.T
+    pi = np.pi
+    if degree == 1:
+        a = np.sqrt(3 / (4 * pi))
+        columns = [-a * y, a * z, -a * x]
+    elif degree == 2:
+        a, b = np.sqrt(15 / (4 * pi)), np.sqrt(5 / (16 * pi))
+        columns = [a * x * y, -a * y * z, b * (3 * z**2 - 1), -a * x * z, a / 2 * (x**2 - y**2)]
+    else:
+        a, b = np.sqrt(35 / (32 * pi)), np.sqrt(105 / (4 * pi))
+        c, d = np.sqrt(21 / (32 * pi)), np.sqrt(7 / (16 * pi))
+        columns = [
+            -a * y * (3 * x**2 - y**2), b * x * y * z, -c * y * (5 * z**2 - 1), d * z * (5 * z**2 - 3),
+            -c * x * (5 * z**2 - 1), b / 2 * z * (x**2 - y**2), -a * x * (x**2 - 3 * y**2),
+        ]  # fmt: skip
+    return np.stack(columns, axis=1)
