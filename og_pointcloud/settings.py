@@ -130,8 +130,6 @@ class FeatureSettings:
     """Use the intra-mask smoothing loss (Eq. 1)."""
     inter: bool = True
     """Use the inter-mask contrastive loss (Eq. 2)."""
-    cohesion: Literal["points", "rendered"] = "points"
-    """Eq. 1 asked of every Gaussian that shows in a mask (its Jensen bound), or of the rendered pixels, literally."""
     cohesion_weight: float | None = None
     """Weight of Eq. 1, as a mean over pixels, beside Eq. 2. None: 0.1 with the authors' formula, as in their code; 10
     with the paper's, which gives none: squared distances are that much smaller."""
@@ -146,11 +144,6 @@ class FeatureSettings:
         _check_losses(self.width, self.intra, self.inter, self.cohesion_weight)
         if self.start not in ("masks", "random"):
             raise OgPointcloudError(f'start is "{self.start}"; expected "masks" or "random"')
-        if self.formula == "authors" and self.cohesion == "rendered":
-            raise OgPointcloudError(
-                'formula "authors" with cohesion "rendered": an unsquared distance per pixel is no quadratic form of '
-                'features; take cohesion "points", or train by rendering (paper.py)'
-            )
 
 
 @dataclass(frozen=True)

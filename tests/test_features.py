@@ -16,9 +16,7 @@ from og_pointcloud.fitting.fit import prepare
 from og_pointcloud.fitting.learned import instance_features as features
 from og_pointcloud.fitting.learned.instance_features import (
     FeatureObjective,
-    MaskGram,
     learn_features,
-    masked_gram,
     raw_gradient,
     read_features,
 )
@@ -31,11 +29,10 @@ torch = pytest.importorskip("torch")
 WIDTH = 6
 CLOSEST = 0.1
 VARIANTS = {
-    "paper rendered": FeatureSettings(cohesion="rendered"),
-    "paper points": FeatureSettings(),
-    "authors points": FeatureSettings(formula="authors"),
+    "paper": FeatureSettings(),
+    "authors": FeatureSettings(formula="authors"),
     "separation alone": FeatureSettings(intra=False),
-    "cohesion alone": FeatureSettings(inter=False, cohesion="rendered"),
+    "cohesion alone": FeatureSettings(inter=False),
 }
 
 
@@ -47,7 +44,6 @@ class Rendered:
     ids: list[NDArray[np.int32]]
     mask_counts: list[int]
     table: MaskTable
-    gram: MaskGram
 
 
 def random_views(seed: int = 0, n: int = 40, pixels: int = 90, mask_counts: tuple[int, ...] = (5, 3, 1, 2)) -> Rendered:
@@ -64,30 +60,29 @@ def random_views(seed: int = 0, n: int = 40, pixels: int = 90, mask_counts: tupl
 
 
 def rendered(weights: list[csr_array], ids: list[NDArray[np.int32]], mask_counts: list[int]) -> Rendered:
-    rows, pixels, gram = [], [], csr_array((weights[0].shape[1],) * 2, dtype=np.float32)
+    rows, pixels = [], []
     for view_weights, view_ids, count in zip(weights, ids, mask_counts, strict=True):
         inside = np.flatnonzero(view_ids >= 0)
         member = csr_array((np.ones(len(inside), np.float32), (view_ids[inside], inside)), (count, len(view_ids)))
         rows.append(member @ view_weights)
         pixels.append(np.bincount(view_ids[inside], minlength=count))
-        gram = gram + view_weights[inside].T @ view_weights[inside]
     nothing = csr_array((len(weights), weights[0].shape[1]), dtype=np.float32)
     view = np.repeat(np.arange(len(weights), dtype=np.int32), mask_counts)
     area = np.concatenate(pixels).astype(np.int32)
     table = MaskTable(
         csr_array(vstack(rows, format="csr")), nothing, nothing, view, area, np.zeros((len(view), 2), np.float32)
     )
-    return Rendered(weights, ids, mask_counts, table, MaskGram(csr_array(gram), np.concatenate(pixels)))
+    return Rendered(weights, ids, mask_counts, table)
 
 
 @pytest.fixture
 def tiny(tiny_capture: TinyCapture) -> Rendered:
     scene = read_capture(tiny_capture.folder)
     gaussians = prepare(scene).surface.gaussians
-    table, gram = mask_table(gaussians, scene.views, 0.05), masked_gram(gaussians, scene.views, 0.05)
+    table = mask_table(gaussians, scene.views, 0.05)
     weights = [pixel_weights(gaussians, view.camera, 0.05) for view in scene.views]
     ids = [view.mask_map().ravel() for view in scene.views]
-    return Rendered(weights, ids, [view.mask_count for view in scene.views], table, gram)
+    return Rendered(weights, ids, [view.mask_count for view in scene.views], table)
 
 
 def literal(scene: Rendered, settings: FeatureSettings, values: NDArray[np.floating]) -> tuple[float, NDArray]:
@@ -98,21 +93,15 @@ def literal(scene: Rendered, settings: FeatureSettings, values: NDArray[np.float
     for sparse, ids, count in zip(scene.weights, scene.ids, scene.mask_counts, strict=True):
         inside = np.flatnonzero(ids >= 0)
         weights, ids = torch.tensor(sparse[inside].toarray(), dtype=dtype), ids[inside]
-        image = weights @ f
         members = [torch.tensor(np.flatnonzero(ids == i)) for i in range(count)]
         members = [pixels for pixels in members if len(pixels) and float(weights[pixels].sum()) > 0]
         views += bool(members)
         blended = [weights[pixels].sum(dim=0) for pixels in members]
-        if settings.cohesion == "rendered":
-            means = [image[pixels].mean(dim=0) for pixels in members]
-        else:
-            means = [weight @ f / weight.sum() for weight in blended]
-        for mean, weight, pixels in zip(means, blended, members, strict=True):
+        means = [weight @ f / weight.sum() for weight in blended]
+        for mean, weight in zip(means, blended, strict=True):
             if settings.formula == "authors":
                 apart = ((f - mean).square().sum(dim=1) + features.ROUNDING**2).sqrt()
                 cohesion = cohesion + (weight * apart).sum() / weight.sum() / len(members)
-            elif settings.cohesion == "rendered":
-                cohesion, size = cohesion + (image[pixels] - mean).square().sum(), size + len(pixels)
             else:
                 cohesion = cohesion + (weight * (f - mean).square().sum(dim=1)).sum()
                 size += float(weight.sum())
@@ -142,7 +131,7 @@ def literal_separation(means: list[torch.Tensor], formula: str) -> torch.Tensor 
 def worst_errors(scene: Rendered, settings: FeatureSettings, dtype: type) -> tuple[float, float]:
     """Relative error of the objective and of its gradient (to the largest entry), fast in dtype, literal in float64."""
     values = np.random.default_rng(1).uniform(size=(scene.table.weights.shape[1], WIDTH)).astype(dtype)
-    problem = FeatureObjective(scene.table, settings, scene.gram)
+    problem = FeatureObjective(scene.table, settings)
     terms = problem.terms(values[problem.shown], CLOSEST)
     objective, gradient = literal(scene, settings, values.astype(np.float64))
     full = np.zeros_like(gradient)
@@ -152,7 +141,7 @@ def worst_errors(scene: Rendered, settings: FeatureSettings, dtype: type) -> tup
 
 @pytest.mark.parametrize("name", VARIANTS)
 def test_value_and_gradient_equal_those_of_rendered_pixels_with_random_weights(name: str) -> None:
-    # Weights are float32 in both: what is left in float64 is the order of sums in float32 A and S.
+    # Weights are float32 in both: what is left in float64 is the order of sums in float32 A.
     assert max(worst_errors(random_views(), VARIANTS[name], np.float64)) < 2e-6
     assert max(worst_errors(random_views(), VARIANTS[name], np.float32)) < 2e-6
 
@@ -167,8 +156,7 @@ def test_in_exact_weights_the_quadratic_form_is_exact() -> None:
     scene = random_views()
     weights = [rows.astype(np.float64) for rows in scene.weights]
     exact = rendered(weights, scene.ids, scene.mask_counts)
-    assert max(worst_errors(exact, VARIANTS["paper rendered"], np.float64)) < 1e-12
-    assert max(worst_errors(exact, VARIANTS["paper points"], np.float64)) < 1e-12
+    assert max(worst_errors(exact, VARIANTS["paper"], np.float64)) < 1e-12
 
 
 def test_points_bound_what_covered_pixels_show() -> None:
@@ -208,19 +196,11 @@ def test_product_equals_scipy() -> None:
     np.testing.assert_allclose(ours, matrix.astype(np.float64) @ dense.astype(np.float64), rtol=1e-12, atol=1e-14)
 
 
-def test_gram_is_the_sum_over_masked_pixels(tiny: Rendered) -> None:
-    expected = rendered(tiny.weights, tiny.ids, tiny.mask_counts).gram
-    np.testing.assert_array_equal(tiny.gram.pixels, expected.pixels)
-    np.testing.assert_allclose(tiny.gram.matrix.toarray(), expected.matrix.toarray(), rtol=1e-5, atol=1e-6)
-    assert tiny.gram.matrix.nnz > len(tiny.gram.pixels)
-
-
 @pytest.mark.parametrize(
     "settings",
     [
         FeatureSettings(),
         FeatureSettings(formula="authors"),
-        FeatureSettings(cohesion="rendered"),
         FeatureSettings(normalise=False),
         FeatureSettings(width=2),
     ],
@@ -228,7 +208,7 @@ def test_gram_is_the_sum_over_masked_pixels(tiny: Rendered) -> None:
 def test_objects_come_apart_and_keep_together(
     tiny: Rendered, tiny_capture: TinyCapture, settings: FeatureSettings
 ) -> None:
-    learned = learn_features(tiny.table, settings, gram=tiny.gram)
+    learned = learn_features(tiny.table, settings)
     assert learned.converged
     assert learned.features.dtype == np.float32
     assert np.isfinite(learned.features).all()
@@ -327,21 +307,12 @@ def test_masks_that_show_nothing_are_refused() -> None:
         learn_features(empty)
 
 
-def test_rendered_cohesion_needs_its_own_gram() -> None:
-    scene, settings = random_views(), FeatureSettings(cohesion="rendered")
-    with pytest.raises(SceneError, match="got none"):
-        learn_features(scene.table, settings)
-    with pytest.raises(SceneError, match="one of 3 masks"):
-        learn_features(scene.table, settings, gram=replace(scene.gram, pixels=scene.gram.pixels[:3]))
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
         ({"width": 0}, "width of features is 0"),
         ({"intra": False, "inter": False}, "both losses are off"),
         ({"cohesion_weight": -1.0}, "cohesion_weight is -1"),
-        ({"formula": "authors", "cohesion": "rendered"}, "no quadratic form"),
     ],
 )
 def test_settings_that_mean_nothing_are_refused(options: dict, message: str) -> None:

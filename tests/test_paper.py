@@ -1,7 +1,8 @@
-"""The published training: its losses against the full-batch ones and literal loops, and what its stages must do."""
+"""The published training: its losses against literal loops, and what its stages must do."""
 
 from __future__ import annotations
 
+import itertools
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -14,11 +15,10 @@ from scenes import TinyCapture
 
 from og_pointcloud.errors import OgPointcloudError, SceneError
 from og_pointcloud.fitting.fit import prepare
-from og_pointcloud.fitting.learned.instance_features import FeatureObjective, masked_gram
-from og_pointcloud.fitting.mask_table import Gaussians, mask_table
+from og_pointcloud.fitting.mask_table import Gaussians, pixel_weights
 from og_pointcloud.formats.capture import read_capture
 from og_pointcloud.scene import View
-from og_pointcloud.settings import FeatureSettings, PaperSettings
+from og_pointcloud.settings import PaperSettings
 
 torch = pytest.importorskip("torch")
 paper = pytest.importorskip("og_pointcloud.fitting.learned.paper")
@@ -41,14 +41,10 @@ def balls(tiny_capture: TinyCapture) -> Balls:
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
-def test_the_mean_of_the_rendered_losses_is_the_objective_of_the_mask_table(balls: Balls, dtype: torch.dtype) -> None:
-    """Value and gradient, every pixel of a mask counted: what a random view expects is what the full batch computes."""
+def test_the_printed_losses_are_those_of_dense_pixels(balls: Balls, dtype: torch.dtype) -> None:
+    """Value and gradient of Eq. 1 and 2 over all views, every pixel of a mask counted, pair by pair."""
     settings = PaperSettings(formula="paper", covered_share=0)
-    table, gram = (make(balls.gaussians, balls.views, NEAR) for make in (mask_table, masked_gram))
-    problem = FeatureObjective(table, FeatureSettings(cohesion="rendered"), gram)
     values = np.random.default_rng(0).random((len(balls.gaussians), 6), np.float32)
-    terms = problem.terms(values[problem.shown].astype(np.float64), paper.SMALLEST_DISTANCE)
-
     source = paper._Views(balls.gaussians, balls.views, NEAR, settings, whole=False)
     features = torch.tensor(values, dtype=dtype, requires_grad=True)
     loss = torch.zeros((), dtype=dtype)
@@ -57,11 +53,28 @@ def test_the_mean_of_the_rendered_losses_is_the_objective_of_the_mask_table(ball
         separation, cohesion = paper.view_losses(image, view.mask, settings)
         loss = loss + (separation + 10 * cohesion / source.masked_pixels) / len(source)
     loss.backward()
+
+    literal = torch.tensor(values, dtype=torch.float64, requires_grad=True)
+    expected, masked = torch.zeros((), dtype=torch.float64), 0
+    for view in balls.views:
+        weights = pixel_weights(balls.gaussians, view.camera, NEAR).toarray().astype(np.float64)
+        image, ids = torch.tensor(weights) @ literal, view.mask_map().ravel()
+        members = [np.flatnonzero(ids == mask) for mask in range(view.mask_count)]
+        means = [image[pixels].mean(dim=0) for pixels in members if len(pixels)]
+        for mean, pixels in zip(means, filter(len, members), strict=True):
+            expected = expected + 10 * (image[pixels] - mean).square().sum() / source.masked_pixels
+        for i, j in itertools.permutations(range(len(means)), 2):
+            square = (means[i] - means[j]).square().sum() + paper.SMALLEST_DISTANCE**2
+            expected = expected + 1 / square / (len(means) * (len(means) - 1))
+        masked += int((ids >= 0).sum())
+    (expected / len(balls.views)).backward()
+    assert source.masked_pixels == pytest.approx(masked / len(balls.views))
     assert features.grad is not None
-    tolerance = 1e-6 if dtype == torch.float64 else 1e-4  # A and S are float32 in both
-    assert loss.item() == pytest.approx(terms.objective, rel=tolerance)
-    ours, largest = features.grad.numpy()[problem.shown], np.abs(terms.gradient).max()
-    np.testing.assert_allclose(ours, terms.gradient, rtol=0, atol=tolerance * largest)
+    assert literal.grad is not None
+    tolerance = 1e-6 if dtype == torch.float64 else 1e-4
+    assert loss.item() == pytest.approx(expected.item() / len(balls.views), rel=tolerance)
+    largest = float(literal.grad.abs().max())
+    np.testing.assert_allclose(features.grad.numpy(), literal.grad.numpy(), rtol=0, atol=tolerance * largest)
 
 
 def test_blend_has_the_gradient_of_a_dense_product(balls: Balls) -> None:

@@ -1,7 +1,7 @@
 """Instance features of all Gaussians (paper, Sec. 3.1, Eq. 1 and 2), from the mask table instead of by rendering.
 
 Blending is linear: with the weights ``W`` of a view and features ``F`` a pixel shows ``M = W F``, and a mask's mean is
-a row of ``diag(1 / N) A F``, where ``A`` (visibility.py) sums W over the mask's pixels. So both losses of all views
+a row of ``diag(1 / N) A F``, where ``A`` (mask_table.py) sums W over the mask's pixels. So both losses of all views
 follow from two sparse products, ``A F`` for the value and ``A' G`` for the gradient; nothing is rendered meanwhile.
 
     objective = mean over views of L_c  +  cohesion_weight * L_s
@@ -11,19 +11,15 @@ follow from two sparse products, ``A F`` for the value and ``A' G`` for the grad
              meet; here e is `FeatureSettings.closest` of the typical distance, reached from 1 in steps of 4.
     authors  the same with e = 1; pair ij also counts 0.1 + 0.9 r / (m - 1), r the rank of j by nearness to i. (Their
              change of these weights late in training has no counterpart without a step count.)
-``L_s``, intra-mask smoothness (Eq. 1), in one of two senses; N_i is a mask's size, P the sum of all N_i.
-    rendered the printed loss: squares ``|M_p - Mbar_i|^2`` summed over the pixels p of all masks, over P. N_i is
-             ``|B_i|``, a mask's *pixels*. As ``sum_p M_p = |B_i| Mbar_i`` whatever the rows of W sum to, it is
-             exactly ``tr(F' S F) - sum_i |B_i| |Mbar_i|^2`` with ``S = sum_p W_p' W_p``. A pixel that Gaussians cover
-             in part counts as a pixel of smaller feature, in the mean and in the sum, as it does when rendered.
-    points   squares ``|f_g - Mbar_i|^2`` weighted by A_ig, over P. N_i is the mask's *blended weight*, the sum of row i
-             of A, so that coverage does not look like feature: it is ``sum_g c_g |f_g|^2 - sum_i N_i |Mbar_i|^2`` with
+``L_s``, intra-mask smoothness (Eq. 1), asked of every Gaussian that shows in a mask instead of the rendered pixels. N_i
+is a mask's *blended weight*, the sum of row i of A, so that coverage does not look like feature; P the sum of all N_i.
+    paper    squares ``|f_g - Mbar_i|^2`` weighted by A_ig, over P: ``sum_g c_g |f_g|^2 - sum_i N_i |Mbar_i|^2`` with
              ``c = A' 1``. By Jensen's inequality it bounds the sum over pixels of ``|M_p - a_p Mbar_i|^2``, a_p the
              pixel's coverage, which is the printed loss where a_p = 1; it asks for more: each Gaussian agrees, not only
              each blend.
-    authors  (with "points") distances not squared: mean over a mask's weight, then over a view's masks, then views.
-             Below ROUNDING the distance is rounded off, as it has no gradient at zero. (Their code takes the distances
-             of pixels that are covered by 0.7 or more: not a function of A.)
+    authors  distances not squared: mean over a mask's weight, then over a view's masks, then views. Below ROUNDING the
+             distance is rounded off, as it has no gradient at zero. (Their code takes the distances of pixels that are
+             covered by 0.7 or more: not a function of A.)
 
 Dividing Eq. 1 by P makes its weight mean the same at any image size; it is else the paper's sum over a random view.
 With raw features the weight sets the features' scale only: Eq. 1 grows as its square, Eq. 2 falls as its square.
@@ -31,28 +27,24 @@ With raw features the weight sets the features' scale only: Eq. 1 grows as its s
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from og_pointcloud.errors import SceneError
-from og_pointcloud.fitting.mask_table import Gaussians, MaskTable, pixel_weights
+from og_pointcloud.fitting.mask_table import MaskTable
 from og_pointcloud.kernels import njit, prange
-from og_pointcloud.scene import View
 from og_pointcloud.settings import FeatureSettings, PaperSettings
 
 __all__ = [
     "FeatureObjective",
     "LearnedFeatures",
-    "MaskGram",
     "Terms",
     "cohesion_factor",
     "learn_features",
-    "masked_gram",
     "raw_gradient",
     "read_features",
 ]
@@ -83,15 +75,6 @@ KICK = 0.1
 """Where two means have met, mask-wise random directions of this length are added."""
 MET = 1e-3
 """Means nearer than this have met. (Features lie on, or in, the unit ball.)"""
-
-
-@dataclass(frozen=True)
-class MaskGram:
-    """matrix: (n, n) sparse float32, symmetric, ``sum W_p' W_p`` over the pixels p in a mask, all views.
-    pixels: (masks,) int64, pixels of each mask at the resolution of those views, stacked view by view."""
-
-    matrix: csr_array
-    pixels: NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -135,23 +118,21 @@ def learn_features(
     settings: FeatureSettings | None = None,
     seed: int = 0,
     *,
-    gram: MaskGram | None = None,
     start: NDArray[np.floating] | None = None,
     progress: Callable[[int, float], None] | None = None,
 ) -> LearnedFeatures:
     """Features that agree within masks and differ between the masks of a view, by L-BFGS on all views at once.
 
-    gram: of the table's own Gaussians and views; needed for cohesion "rendered" only.
     start: (n, width), not yet read; else `FeatureSettings.start` says where each Gaussian starts, seeded. Where two
         means of a view have met, the gradient vanishes by symmetry: random directions of the masks then part them.
     progress: called after each step with its number and the objective.
 
     Steps are preconditioned by each Gaussian's visible weight, shortened until the objective falls enough, and no
     feature moves farther than REACH in one. The same input and seed give the same features. Raises SceneError if no
-    mask shows a Gaussian, or if the gram is missing or of other masks.
+    mask shows a Gaussian.
     """
     settings = settings or FeatureSettings()
-    problem = FeatureObjective(table, settings, gram)
+    problem = FeatureObjective(table, settings)
     rng = np.random.default_rng(seed)
     random = rng.normal(size=(problem.mask_count, settings.width))
     directions = problem.uplift((random / np.linalg.norm(random, axis=1, keepdims=True)).astype(np.float32))
@@ -171,26 +152,6 @@ def learn_features(
     features[problem.shown] = read_features(descent.raw, settings.normalise)
     objective, separation, cohesion, closest = np.array(descent.history).T
     return LearnedFeatures(features, problem.seen, objective, separation, cohesion, closest, descent.converged)
-
-
-def masked_gram(gaussians: Gaussians, views: Iterable[View], near: float) -> MaskGram:
-    """S of Eq. 1 as a quadratic form: which Gaussians share the pixels of masks, and how much, over all views.
-
-    Gaussians, views and near plane are those of the mask table, thinned alike. One view's pixels are held at a time,
-    and sums of two to the power of k views, so that each product is added log(views) times.
-    """
-    sums: list[Any] = []  # scipy's sums lose the number of dimensions
-    pixels = [np.zeros(0, np.int64)]
-    for count, view in enumerate(views, start=1):
-        ids = view.mask_map().ravel()
-        weights = pixel_weights(gaussians, view.camera, near)[np.flatnonzero(ids >= 0)]
-        sums.append(weights.T @ weights)
-        pixels.append(np.bincount(ids[ids >= 0], minlength=view.mask_count))
-        while count % 2 == 0:
-            sums[-2:] = [sums[-2] + sums[-1]]
-            count //= 2
-    matrix: Any = sum(sums, csr_array((len(gaussians), len(gaussians)), dtype=np.float32))
-    return MaskGram(csr_array(matrix), np.concatenate(pixels))
 
 
 def read_features(raw: NDArray[np.floating], normalise: bool) -> NDArray[np.floating]:
@@ -229,7 +190,7 @@ class FeatureObjective:
     Masks that show none are left out.
     """
 
-    def __init__(self, table: MaskTable, settings: FeatureSettings, gram: MaskGram | None = None) -> None:
+    def __init__(self, table: MaskTable, settings: FeatureSettings) -> None:
         self.settings = settings
         # In float64: where features agree, Eq. 1 is a small difference of large sums. (scipy's own sums stay float32.)
         weight = table.weights @ np.ones(table.weights.shape[1])
@@ -246,18 +207,7 @@ class FeatureObjective:
         self._weights.sort_indices()  # neighbouring rows of the features are then read one after another
         self._transposed = _int32(csr_array(self._weights.T))
         self._first = np.flatnonzero(np.diff(table.mask_view[kept], prepend=-1, append=-2))
-        self._gram, self._size = None, weight[kept]
-        if settings.cohesion == "rendered":
-            if gram is None or gram.pixels.shape != weight.shape or gram.matrix.shape[0] != len(self.seen):
-                found = "none" if gram is None else f"one of {len(gram.pixels)} masks, {gram.matrix.shape[0]} Gaussians"
-                raise SceneError(
-                    f'cohesion "rendered" needs the gram of {len(weight)} masks and {len(self.seen)} Gaussians; got '
-                    f"{found}: make it with masked_gram from the table's Gaussians and views"
-                )
-            self._gram, self._size = (
-                _int32(gram.matrix[self.shown][:, self.shown]),
-                gram.pixels[kept].astype(np.float64),
-            )
+        self._size = weight[kept]
 
     @property
     def mask_count(self) -> int:
@@ -308,10 +258,7 @@ class FeatureObjective:
             by_feature = _distance_gradient(*_arrays(self._transposed), features, means, share, _columns(features))
             return float(value), by_feature, by_mean
         total = self._size.sum()
-        if self._gram is None:
-            blended = self.seen[self.shown, None] * features
-        else:
-            blended = _product(*_arrays(self._gram), features, _columns(features))
+        blended = self.seen[self.shown, None] * features
         spread = float((features * blended).sum() - (self._size[:, None] * means**2).sum())
         return float(spread / total), 2 / total * blended, -2 / total * self._size[:, None] * means
 
