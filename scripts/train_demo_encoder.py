@@ -261,9 +261,11 @@ def learnt_merges(texts: Iterable[str], count: int) -> list[tuple[str, str]]:
 def tokenizer_json(merges: Iterable[tuple[str, str]]) -> dict[str, Any]:
     """CLIP's tokenizer of these merges: ids are the 256 bytes, the bytes at a word's end, the merges, start, end."""
     letters = sorted(BYTE_CHARACTERS, key=lambda character: (ord(character) >= 256, ord(character)))
+    merges = list(merges)
     joined = ["".join(merge) for merge in merges]
     tokens = [*letters, *(f"{letter}</w>" for letter in letters), *joined, "<|startoftext|>", "<|endoftext|>"]
-    made: Any = CLIPTokenizer(vocab={token: id for id, token in enumerate(tokens)}, merges=list(merges))
+    pairs: Any = merges
+    made: Any = CLIPTokenizer(vocab={token: id for id, token in enumerate(tokens)}, merges=pairs)
     return json.loads(made.backend_tokenizer.to_str())
 
 
@@ -489,7 +491,7 @@ class RoundedImageModel:
             weight, scale, offset = (f"layer{number}.{part}" for part in ("weight", "scale", "offset"))
             constants |= zip((weight, scale, offset), layer, strict=True)
             values, total = f"layer{number}.values", f"layer{number}.sum"
-            shape = {"strides": [stride, stride], "pads": [kernel // 2] * 4}
+            shape: dict[str, Any] = {"strides": [stride, stride], "pads": [kernel // 2] * 4}
             nodes += [
                 helper.make_node("DequantizeLinear", [weight, scale], [values], axis=0),
                 helper.make_node("Conv", [x, values, offset], [total], **shape),

@@ -266,7 +266,7 @@ def test_fit_stores_the_bank_asked_for_else_the_encoders(encoder_folder, tmp_pat
     def fit(*arguments):
         return main(["fit", str(folder), "-o", str(path), *map(str, arguments)])
 
-    for bank, says in (("few", "a word bank of 49"), ("wide", "(width 20), the masks are"), ("other", "space 'other'")):
+    for bank, says in (("few", "a word bank of 49"), ("wide", "(width 20); expected"), ("other", "space 'other'")):
         assert fit("--word-bank", tmp_path / f"{bank}.npz") == 2
         assert says in capsys.readouterr().err
         assert not path.exists()
