@@ -307,6 +307,11 @@ def test_array_headers(header):
     assert len(str(caught.value)) < 200
 
 
+def test_bytes_behind_an_array():
+    with pytest.raises(ValueError, match="claims float64"):
+        array_from_npy(npy_bytes(_xyz()) + b"\0")
+
+
 def test_text_of_characters_that_there_are_not():
     """A str made of them breaks the interpreter."""
     data = npy_bytes(np.array(["chair"]))

@@ -30,7 +30,8 @@ from og_pointcloud.fitting.fit import fit
 from og_pointcloud.fitting.mask_table import NEAR_SHARE, view_weights
 from og_pointcloud.formats.capture import read_capture
 from og_pointcloud.formats.poses import in_local_frame, rigid
-from og_pointcloud.scene import Camera, Points
+from og_pointcloud.rendering.geometry import near_plane
+from og_pointcloud.scene import Camera, Points, View
 
 TURNED = np.diag([1.0, -1.0, -1.0, 1.0])
 """A camera that looks the other way."""
@@ -105,6 +106,16 @@ def lookup_of_anything() -> Answer:
     rows = [[np.nan, 0, 0], [np.inf, 0, 0], [0.5, -np.inf, 0], [1e300, 0, 0], [-1e38, 1e38, 0]]
     asked = np.concatenate([rows, cloud.xyz_world[:2]])
     return Answer(LabelledScene.from_cloud(cloud).instances_at(asked), int32([-3] * 5 + [3, 3]))
+
+
+@agrees(1e-6, "depth, of the scene's median", (0.5, 0.1, 0.05, 0.03))
+def close_object(share: float) -> Answer:
+    """A splat much closer to the camera than the rest of the scene is drawn as if there were no near plane."""
+    gaussians = scatter()
+    depth = share * np.median(gaussians.xyz[1:, 2])
+    gaussians.xyz[0], gaussians.scale[0] = [0.1 * depth, 0, depth], 0.05 * depth
+    near = near_plane(gaussians.xyz, [View("one", camera(), np.zeros((18, 24), np.int32), np.zeros((1, 4), "f4"))])
+    return Answer(dense_weights(gaussians, camera(), near), reference_pixel_weights(gaussians, camera(), 1e-9))
 
 
 @agrees(0)

@@ -82,8 +82,8 @@ def certainty_of_any_votes(seed: float) -> Answer:
 @agrees(0, "rounds", (0, 1, 2, 10))
 def border_rounds(rounds: float) -> Answer:
     """Points whose share says little are settled by their neighbours' squared shares, round by round."""
-    settings = MembershipSettings(border_rounds=int(rounds), own_vote=0.4, border_shares=(0.1, 0.97))
-    ours, (ids, *_) = _both(11, settings)
+    settings = MembershipSettings(border_rounds=int(rounds), own_vote=0.4, border_shares=(0.1, 0.96))
+    ours, (ids, *_) = _both(1, settings)
     return Answer(ours.instance_ids, ids)
 
 
@@ -145,20 +145,22 @@ def _made(weights: NDArray, outside: NDArray, exposure: NDArray, mask_view: list
 
 
 def _table(seed: int, views: int = 4) -> MaskTable:
-    """Points on a line in three stretches; each view masks them, torn, sometimes wrong, sometimes missing."""
+    """Points on a line in three stretches; each view masks them, with edges of its own, torn, sometimes wrong."""
     random = np.random.default_rng(seed)
-    stretch = np.arange(POINTS) * 3 // POINTS
-    weights, mask_view, shown = [], [], random.uniform(0.1, 9, (views, POINTS))
-    for view, instance in np.ndindex(views, 3):
-        torn = np.where(random.random(POINTS) < 0.35, random.random(POINTS), 1)
-        noise = 0.3 * random.random(POINTS) * (random.random(POINTS) < 0.3)
-        weights.append(np.where(stretch == instance, torn, noise) * shown[view] / 1.7)
-        mask_view.append(view)
-    masked = np.array(weights)
-    of_view = np.array([masked[np.array(mask_view) == view].sum(axis=0) for view in range(views)])
+    shown, shares, mask_view = random.uniform(0.1, 9, (views, POINTS)), [], []
+    for view in range(views):
+        place = np.arange(POINTS) + random.normal(0, 3, POINTS) + random.normal(0, 3)
+        stretch = np.clip(3 * place // POINTS, 0, 2)
+        torn = np.where(random.random(POINTS) < 0.3, random.random(POINTS), 0.97)
+        for instance in range(3):
+            spilt = 0.3 * random.random(POINTS) * (1 - torn)
+            shares.append(np.where(stretch == instance, torn, spilt))
+            mask_view.append(view)
+    of_view = np.array(shares).reshape(views, 3, POINTS).sum(axis=1)
+    masked = np.array(shares) * shown[mask_view]
     seen = random.random((views, POINTS)) < 0.85
-    visible = seen[np.array(mask_view)]
-    outside = np.maximum(shown - of_view, 0.05) * seen
+    visible = seen[mask_view]
+    outside = np.maximum(1 - of_view, 0.01) * shown * seen
     return _made(masked * visible, outside, random.uniform(0.02, 1, (views, POINTS)) * seen, mask_view)
 
 

@@ -1,0 +1,168 @@
+"""Small faults of the core, and the tests that must turn red with each: held to account by test_mutations.py."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+__all__ = ["MUTATIONS", "Mutation"]
+
+
+class Mutation(NamedTuple):
+    """name: what the fault is. file: below og_pointcloud/. old: a text that stands in it exactly once, new: what takes
+    its place. tests: node ids below tests/ of which one must fail."""
+
+    name: str
+    file: str
+    old: str
+    new: str
+    tests: tuple[str, ...]
+
+
+def hard(*cases: str) -> tuple[str, ...]:
+    """Node ids of hard cases, by "family-name"."""
+    return tuple(f"test_hard_cases.py::test_case_holds[{case}]" for case in cases)
+
+
+def slow(*cases: str) -> tuple[str, ...]:
+    """The same of those that are no part of the fast tests."""
+    return tuple(f"test_hard_cases.py::test_case_holds_everywhere[{case}]" for case in cases)
+
+
+MEMBERSHIP = hard("votes-border_rounds", "votes-membership_of_any_votes", "votes-certainty_of_any_votes")
+CHOOSING = hard("choosing-nearly_equal_labels", "choosing-label_among_the_bank", "choosing-equal_labels")
+
+MUTATIONS = (
+    # Splatting and geometry. Changes of a file with kernels compile it anew: these are few.
+    Mutation(
+        "near plane at ten times its depth", "rendering/splatting.py",
+        "NEAR_SHARE = 0.02", "NEAR_SHARE = 0.2", hard("frames-close_object"),
+    ),
+    Mutation(
+        "low-pass filter twice as wide", "rendering/splatting.py",
+        "LOW_PASS = 0.3", "LOW_PASS = 0.6", hard("geometry-scale_zero"),
+    ),
+    Mutation(
+        "near plane from the farthest point", "rendering/geometry.py",
+        "np.median(front)) if len(front)", "np.max(front)) if len(front)", ("test_geometry.py",),
+    ),
+    # Scene, frames.
+    Mutation(
+        "projection with y upwards", "scene.py",
+        "self.fy * y / in_front + self.cy", "self.cy - self.fy * y / in_front", ("test_scene.py",),
+    ),
+    Mutation(
+        "cloud's origin at zero", "scene.py",
+        "origin = np.median(world, axis=0)", "origin = np.zeros(3)", hard("frames-offset"),
+    ),
+    Mutation(
+        "pose not moved with the cloud's origin", "formats/poses.py",
+        "rigid(rotation, rotation @ origin + translation)", "rigid(rotation, translation)", hard("frames-offset"),
+    ),
+    Mutation(
+        "quaternions of another convention", "formats/poses.py",
+        "1 - 2 * (y * y + z * z), 2 * (x * y - w * z)", "1 - 2 * (y * y + z * z), 2 * (x * y + w * z)",
+        ("test_colmap.py",),
+    ),
+    # View votes and membership.
+    Mutation(
+        "votes by exposure, not its square", "fitting/view_votes.py",
+        "OPENNESS_POWER = 2", "OPENNESS_POWER = 1", hard("votes-exposure"),
+    ),
+    Mutation(
+        "border votes unsquared", "fitting/membership.py",
+        "vote = share[other] ** 2 if", "vote = share[other] if", MEMBERSHIP,
+    ),
+    Mutation(
+        "covered points may be background", "fitting/membership.py",
+        "covered > settings.covered_share * total", "covered > np.inf", MEMBERSHIP,
+    ),
+    Mutation(
+        "seen-through islands stay", "fitting/membership.py",
+        "kept[island] = UNOBSERVED", "kept[island] = ids[island]", ("test_membership.py",),
+    ),
+    Mutation(
+        "one border round fewer", "fitting/membership.py",
+        "for _ in range(settings.border_rounds)", "for _ in range(settings.border_rounds - 1)", MEMBERSHIP,
+    ),
+    Mutation(
+        "noise of one view is an instance", "fitting/membership.py",
+        "(rate < settings.rate_share * typical)", "(rate < 0 * typical)", (*MEMBERSHIP, "test_membership.py"),
+    ),
+    Mutation(
+        "certainty without the neighbours", "fitting/membership.py",
+        "agreeing[g] = same / count", "agreeing[g] = 1", MEMBERSHIP,
+    ),
+    # Grouping, association.
+    Mutation(
+        "groups join without a majority", "fitting/grouping.py",
+        "if -order[0] > settings.join_majority:", "if -order[0] > 0:", ("test_grouping.py",),
+    ),
+    Mutation(
+        "masks that span objects take part", "fitting/grouping.py",
+        "usable = ~spanning & (shown > 0)", "usable = shown > 0", ("test_grouping.py",),
+    ),
+    Mutation(
+        "groups numbered by the smallest first", "fitting/grouping.py",
+        "np.lexsort((roots, -mass))", "np.lexsort((roots, mass))", ("test_grouping.py",),
+    ),
+    Mutation(
+        "features of any length in a descriptor", "fitting/association.py",
+        "return np.divide(wide, length, out=np.zeros_like(wide), where=length > 0)", "return wide",
+        hard("features-feature_length", "features-nearly_opposite_rows"),
+    ),
+    Mutation(
+        "outliers stay in a descriptor", "fitting/association.py",
+        "kept = cosines >= middle - deviations * max(spread, 1e-6)", "kept = cosines >= -2", ("test_association.py",),
+    ),
+    # Learned modes.
+    Mutation(
+        "Eq. 5 of masks that share nothing with the union", "fitting/learned/matching.py",
+        "+ evidence.mask_area[:, None] - evidence.shared", "+ evidence.mask_area[:, None]", hard("votes-eq5"),
+    ),
+    Mutation(
+        "Eq. 5 of distances past one", "fitting/learned/matching.py",
+        "np.maximum(1 - evidence.distance, 0)", "np.abs(1 - evidence.distance)", hard("votes-eq5"),
+    ),
+    Mutation(
+        "Eq. 2 over all pairs, themselves too", "fitting/learned/paper.py",
+        "return near.sum() / (m * (m - 1))", "return near.sum() / (m * m)", slow("learning-paper_losses"),
+    ),
+    # Choosing.
+    Mutation(
+        "words not centred", "ask/choosing.py",
+        "directions = unit_rows(unit_rows(texts) - self.bank.mean)\n        scores",
+        "directions = unit_rows(texts)\n        scores", CHOOSING,
+    ),
+    Mutation(
+        "synonyms speak against a label", "ask/choosing.py",
+        ".max(axis=1) < self.settings.synonym", ".max(axis=1) < 2", CHOOSING,
+    ),
+    Mutation(
+        "equal labels compete", "ask/choosing.py",
+        "rounded = np.round(unit_rows(texts), 5) + 0.0", "rounded = np.arange(len(texts), dtype=np.float32)[:, None]",
+        CHOOSING,
+    ),
+    Mutation(
+        "a look counts for each of its descriptors", "ask/choosing.py",
+        "weight = 1 / np.maximum(alike, 1)", "weight = np.ones(len(alike))", ("test_choosing.py",),
+    ),
+    # Lookup, scores, files.
+    Mutation(
+        "nearest point of too few columns", "bundle/nearest.py",
+        "for x in (-1, 0, 1) for y in (-1, 0, 1)", "for x in (0, 1) for y in (-1, 0, 1)", ("test_nearest.py",),
+    ),
+    Mutation(
+        "IoU without false positives on background", "evaluate/metrics.py",
+        "counted = evaluated if background is None else evaluated | background", "counted = evaluated",
+        ("test_metrics.py",),
+    ),
+    Mutation(
+        "arrays longer than their header claims", "formats/npy.py",
+        "or claimed != held or", "or claimed > held or", ("test_fuzz.py::test_bytes_behind_an_array",),
+    ),
+    Mutation(
+        "a failed write leaves what it wrote", "formats/atomic.py",
+        "temporary.unlink(missing_ok=True)\n        raise", "os.replace(temporary, path)\n        raise",
+        ("test_bundle.py",),
+    ),
+)  # fmt: skip
