@@ -23,7 +23,7 @@ from pathlib import Path
 import numpy as np
 
 import og_pointcloud as og
-from og_pointcloud.evaluate.baselines import BASELINES, only_where_masked
+from og_pointcloud.evaluate.baselines import baseline_labels
 from og_pointcloud.evaluate.captures import ask
 from og_pointcloud.evaluate.intervals import Interval, bootstrap, miou_interval
 from og_pointcloud.evaluate.truth import read_truth
@@ -87,11 +87,10 @@ def measure(folder: Path, runs: int = 1) -> Result:
         seconds = min(timed(["fit", str(folder), "-o", str(bundle), *bank]) for _ in range(runs))
         answer = ask(og.load(bundle), truth, words)
     vocabulary, prepared = read_text_features(words)[0], prepare(scene)
-    baselines: dict[str, float] = {}
-    for name, method in BASELINES.items():
-        labels = method(scene, prepared, vocabulary.vectors)
-        for value, found in ((name, labels), (f"{name}, where masked", only_where_masked(labels, prepared))):
-            baselines[value] = truth.score(found, vocabulary.names).miou
+    baselines = {
+        name: truth.score(labels, vocabulary.names).miou
+        for name, labels, _ in baseline_labels(prepared, vocabulary.vectors)
+    }
     score = truth.score(answer.called, [*truth.names, "a word that the truth lacks"])
     return Result(
         scene=f"{folder.absolute().name}, {len(scene.views)} views, {len(scene.points):,} points",

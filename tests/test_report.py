@@ -137,7 +137,10 @@ def test_without_truth_the_error_is_the_disagreement_with_the_masks(folder, tmp_
     assert (default.miou, default.gain) == (None, None)
     assert default.error == 1 - default.agreement < 0.5
     assert fewer.agreement != default.agreement
-    assert "no truth" in write_page(found, tmp_path / "r.html").read_text()
+    html = write_page(found, tmp_path / "r.html").read_text()
+    assert "no truth" in html
+    assert "<th>agreement</th>" in html
+    assert "<th>mIoU</th>" not in html
 
 
 @pytest.mark.parametrize(
@@ -231,12 +234,12 @@ def test_direct_uplift_is_the_weighted_mean_word_by_word(subject, prepared):
         if weights[:, point].sum() > 0:
             mean = sum(weight * feature for weight, feature in zip(weights[:, point], features, strict=True))
             literal[point] = np.argmax([mean @ (word / np.linalg.norm(word)) for word in words])
-    np.testing.assert_array_equal(BASELINES["direct uplift"](subject.scene, prepared, words), literal)
+    np.testing.assert_array_equal(BASELINES["direct uplift"](prepared, words), literal)
 
 
 def test_centre_sampling_reads_the_pixel_of_each_centre(subject, prepared):
     scene, table, words = subject.scene, prepared.table, subject.vocabulary.vectors
-    labels = BASELINES["centre sampling"](scene, prepared, words)
+    labels = BASELINES["centre sampling"](prepared, words)
     exposure, similarity = table.exposure.toarray(), table.unit_features @ words.T
     first = np.searchsorted(table.mask_view, np.arange(len(scene.views)))
     maps = [view.mask_map() for view in scene.views]

@@ -10,7 +10,7 @@ import pytest
 from scenes import NAMES, write_tiny_capture
 
 import og_pointcloud as og
-from og_pointcloud.evaluate.baselines import BASELINES, only_where_masked
+from og_pointcloud.evaluate.baselines import baseline_labels
 from og_pointcloud.evaluate.intervals import Interval
 from og_pointcloud.fitting.fit import prepare
 
@@ -53,10 +53,7 @@ def test_a_row_is_what_the_scorers_say(script, capture, tmp_path, capsys):
     words, prepared = np.load(capture.text_features), prepare(scene)
     names = np.array([*words["names"], ""])
     plain = [
-        literal_miou(names[labels], capture.object_ids)
-        for method in BASELINES.values()
-        for found in [method(scene, prepared, words["vectors"])]
-        for labels in (found, only_where_masked(found, prepared))
+        literal_miou(names[labels], capture.object_ids) for _, labels, _ in baseline_labels(prepared, words["vectors"])
     ]
     assert row[1].startswith(f"**{ours:.3f}** (")
     assert row[2].startswith(f"{max(plain):.3f} (")

@@ -51,13 +51,13 @@ def run(arguments: argparse.Namespace) -> None:
     rooms, output, captures = room_seeds(arguments.room), arguments.output, arguments.captures
     check_options(arguments, rooms)
     stem = output / ("ablation" if arguments.ablation else "report")
-    page, table, picture = (stem.with_suffix(ending) for ending in (".html", ".csv", ".png"))
-    outputs = {"page": (page, [".html"]), "table": (table, [".csv"]), "chart": (picture, [".png"])}
+    page, rows, picture = (stem.with_suffix(ending) for ending in (".html", ".csv", ".png"))
+    outputs = {"page": (page, [".html"]), "table": (rows, [".csv"]), "chart": (picture, [".png"])}
     check_outputs(outputs, inputs=captures)
     from og_pointcloud.evaluate.knobs import QUICK, ablations, settings_of
     from og_pointcloud.evaluate.plots import require_matplotlib
     from og_pointcloud.evaluate.sweep import read_subject, sweep, write_rows
-    from og_pointcloud.evaluate.sweep_page import COLUMNS, cells, chart, write_page
+    from og_pointcloud.evaluate.sweep_page import chart, table, write_page
     from og_pointcloud.formats.atomic import replacing
 
     require_matplotlib()
@@ -69,15 +69,16 @@ def run(arguments: argparse.Namespace) -> None:
     folders = [*captures, *(made_room(seed, output) for seed in rooms)]
     found = sweep([read_subject(folder) for folder in folders], settings, seeds=arguments.seeds)
     output.mkdir(parents=True, exist_ok=True)
-    write_rows(found.rows, table)
+    write_rows(found.rows, rows)
     with replacing(picture) as file:
         file.write(chart(found))
     write_page(found, page, "Ablations" if arguments.ablation else "Error against run time")
     for capture in found.captures:
-        print_table((capture, *COLUMNS[1:]), [cells(row) for row in found.rows if row.capture == capture])
+        (_, *header), *lines = table([row for row in found.rows if row.capture == capture])
+        print_table((capture, *header), lines)
     for what, why in found.failed.items():
         print(f"warning: could not be run: {what}: {why}", file=sys.stderr)
-    print(f"wrote {page}, {table} and {picture}")
+    print(f"wrote {page}, {rows} and {picture}")
     print(f"next: open {shlex.quote(str(page))} in a browser")
 
 

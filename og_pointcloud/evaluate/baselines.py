@@ -1,7 +1,7 @@
 """Other ways from masks to labelled points, on the same mask table: what the whole method is worth beside them.
 
-Each takes what the stages that all share have prepared, and vectors of words; it returns a word a point, (n,) int, -1
-where it says nothing. None knows background: a point that a mask's rays reach gets a word. `only_where_masked` is the
+Each takes what the stages that all share have prepared, and vectors of words (L, D); it returns a word for each point
+of the surface, (n,) int, -1 where it has none. None knows background: a point that a mask's rays reach gets a word. `only_where_masked` is the
 plain remedy, and is reported beside each: points that views show mostly outside of masks get none.
 
     direct uplift      every point the mean feature of the masks that show it, by blending weight
@@ -11,37 +11,38 @@ plain remedy, and is reported beside each: points that views show mostly outside
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from og_pointcloud.fitting.fit import Prepared
-from og_pointcloud.scene import Scene
 
-__all__ = ["BASELINES", "centre_sampling", "direct_uplift", "only_where_masked", "uplift"]
+__all__ = ["BASELINES", "baseline_labels", "centre_sampling", "direct_uplift", "only_where_masked", "uplift"]
 
 MOSTLY = 0.5
 """Share of a point's weight in masks from which it belongs to them."""
 
 Words = NDArray[np.floating]
 Labels = NDArray[np.integer]
-Baseline = Callable[[Scene, Prepared, Words], Labels]
+Baseline = Callable[[Prepared, Words], Labels]
 
 
-def direct_uplift(scene: Scene, prepared: Prepared, words: Words) -> Labels:
+def direct_uplift(prepared: Prepared, words: Words) -> Labels:
     """Each point takes the word nearest to the mean feature of the masks that show it."""
     return uplift(prepared.table.weights, prepared.table.unit_features, words)
 
 
-def centre_sampling(scene: Scene, prepared: Prepared, words: Words) -> Labels:
+def centre_sampling(prepared: Prepared, words: Words) -> Labels:
     """Each point takes the word nearest to the mean of the mask features at its centre's pixel, by exposure."""
-    table, xyz = prepared.table, prepared.surface.gaussians.xyz
-    first = np.searchsorted(table.mask_view, np.arange(len(prepared.surface.scene.views)))
+    table, views = prepared.table, prepared.surface.scene.views
+    xyz = prepared.surface.gaussians.xyz
+    first = np.searchsorted(table.mask_view, np.arange(len(views)))
     similarity = table.unit_features @ _unit(words).T
     scores, reached = np.zeros((len(xyz), len(words))), np.zeros(len(xyz), bool)
-    for index, view in enumerate(prepared.surface.scene.views):
+    for index, view in enumerate(views):
         exposure = csr_array(table.exposure[[index]])
         points, visible = exposure.indices, exposure.data
         uv_px, _ = view.camera.project(xyz[points])
@@ -56,6 +57,16 @@ def centre_sampling(scene: Scene, prepared: Prepared, words: Words) -> Labels:
 
 
 BASELINES: dict[str, Baseline] = {"direct uplift": direct_uplift, "centre sampling": centre_sampling}
+
+
+def baseline_labels(prepared: Prepared, words: Words) -> Iterator[tuple[str, Labels, float]]:
+    """Every method, as it is and where masked: its name, the words of all points of the scene, and its seconds."""
+    for name, method in BASELINES.items():
+        start = time.perf_counter()
+        labels = method(prepared, words)
+        seconds = time.perf_counter() - start
+        for value, found in ((name, labels), (f"{name}, where masked", only_where_masked(labels, prepared))):
+            yield value, prepared.surface.of_points(found), seconds
 
 
 def only_where_masked(labels: Labels, prepared: Prepared) -> Labels:

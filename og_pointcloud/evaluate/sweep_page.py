@@ -13,11 +13,11 @@ from og_pointcloud.evaluate.plots import require_matplotlib
 from og_pointcloud.evaluate.sweep import BASELINE, Row, Sweep, front, machine
 from og_pointcloud.formats.atomic import replacing
 
-__all__ = ["COLUMNS", "cells", "chart", "write_page"]
+__all__ = ["chart", "table", "write_page"]
 
 COLUMNS = (
-    "setting", "seconds", "error", "mIoU less the default's (95 %)", "mIoU", "mAcc", "unknown", "background called",
-    "agreement", "instances",
+    "setting", "seconds", "error", "mIoU less the default's (95 %)", "mIoU", "without background", "paper", "mAcc",
+    "unknown", "background called", "agreement", "instances",
 )  # fmt: skip
 COLOURS = ("tab:blue", "tab:orange", "tab:green", "tab:red", "tab:purple", "tab:brown", "tab:pink", "tab:olive",
            "tab:cyan", "navy", "gold", "teal", "orchid", "slategrey", "lime")  # fmt: skip
@@ -65,8 +65,8 @@ def _panel(axes: Any, rows: Sequence[Row]) -> None:
     axes.step([row.seconds for row in best], [row.error for row in best], where="post", color="0.7", label="front")
     for number, row in enumerate(best, 1):
         axes.annotate(
-            str(number), (row.seconds, row.error), (0, -17), textcoords="offset points", fontsize=9, ha="center",
-            fontweight="bold", zorder=5,
+            str(number), (row.seconds, row.error), (0, -17 if number % 2 else 11), textcoords="offset points",
+            fontsize=9, ha="center", fontweight="bold", zorder=5,
         )  # fmt: skip
         axes.plot([], [], " ", label=f"{number}  {row.name}")
     others = [row for row in rows if row.knob == BASELINE]
@@ -122,22 +122,30 @@ def _left_out(default: Row) -> str:
 
 def _table(rows: Sequence[Row]) -> str:
     best = {id(row) for row in front(rows)}
-    header = "".join(f"<th>{name}</th>" for name in COLUMNS)
-    lines = []
-    for row in rows:
+    header, *lines = table(rows)
+    parts = [f"<tr>{''.join(f'<th>{escape(name)}</th>' for name in header)}</tr>"]
+    for row, line in zip(rows, lines, strict=True):
         marks = ("default " if row.is_default else "") + ("front" if id(row) in best else "")
-        columns = "".join(f"<td>{escape(cell)}</td>" for cell in cells(row))
-        lines.append(f'<tr class="{marks.strip()}">{columns}</tr>')
-    return f"<table><tr>{header}</tr>{''.join(lines)}</table>"
+        columns = "".join(f"<td>{escape(cell)}</td>" for cell in line)
+        parts.append(f'<tr class="{marks.strip()}">{columns}</tr>')
+    return f"<table>{''.join(parts)}</table>"
 
 
-def cells(row: Row) -> tuple[str, ...]:
-    """A row's cells under COLUMNS."""
+def table(rows: Sequence[Row]) -> list[tuple[str, ...]]:
+    """A header, then the cells of each row; without the columns that no row has a figure for."""
+    lines = [_cells(row) for row in rows]
+    filled = [column for column in range(len(COLUMNS)) if any(line[column] != "-" for line in lines)]
+    return [tuple(line[column] for column in filled) for line in (COLUMNS, *lines)]
+
+
+def _cells(row: Row) -> tuple[str, ...]:
     seconds = f"{row.seconds:.2f}" + (f" to {row.seconds_most:.2f}" if row.seconds_most > 1.01 * row.seconds else "")
     error = f"{row.error:.4f}" + ("" if row.error_spread is None else f" ± {row.error_spread:.4f}")
     gain = "-" if row.gain is None or row.is_default else f"{row.gain:+.4f}"
     if gain != "-" and row.gain_low is not None and row.gain_high is not None:
         gain += f" ({row.gain_low:+.4f} to {row.gain_high:+.4f})"
-    shares = (row.miou, row.macc, row.unknown, row.background, row.agreement)
+    shares = (
+        row.miou, row.labelled_miou, row.published, row.macc, row.unknown, row.background, row.agreement,
+    )  # fmt: skip
     instances = "-" if row.instances is None else f"{row.instances:.4g}"
     return (row.name, seconds, error, gain, *("-" if one is None else f"{one:.4f}" for one in shares), instances)
