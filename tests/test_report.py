@@ -26,6 +26,7 @@ from og_pointcloud.evaluate.sweep import BASELINE, Row, Sweep, front, read_subje
 from og_pointcloud.evaluate.sweep_page import chart, write_page
 from og_pointcloud.fitting.fit import fit, prepare
 from og_pointcloud.formats.capture import read_capture
+from og_pointcloud.journal import LeftOut, left_out_entry
 from og_pointcloud.settings import FitSettings
 
 PNG = b"\x89PNG"
@@ -187,6 +188,17 @@ def test_points_at_one_place_are_fitted_as_a_fit_does(folder, subject, tmp_path)
     assert default.instances == len(cloud.instances)
 
 
+def test_a_capture_that_cannot_be_fitted_is_named_and_costs_no_other(subject, monkeypatch):
+    monkeypatch.setattr(sweeping, "needs_tiles", lambda scene, _: scene.views[0].name == "large")
+    views = (replace(subject.scene.views[0], name="large"), *subject.scene.views[1:])
+    large = replace(subject, name="large", scene=replace(subject.scene, views=views))
+    found = sweep([large, subject], [DEFAULT], progress=False)
+    assert found.captures == ["capture"]
+    assert "large: 1,576 points take more memory" in found.failed["large"]
+    with pytest.raises(OgPointcloudError, match="no capture could be fitted: large: .* report on a part"):
+        sweep([large], [DEFAULT], progress=False)
+
+
 def test_means_are_over_captures_and_of_settings_that_ran_on_all():
     rows = [row(1.0, 0.2, capture="a"), row(4.0, 0.4, capture="b"), row(1.0, 0.1, "only here", capture="a")]
     (mean,) = sweeping._means(rows)
@@ -268,11 +280,17 @@ def test_points_shown_mostly_outside_of_masks_lose_their_label():
 
 
 def test_the_page_needs_nothing_else_and_names_what_is_left_out_and_what_failed(tmp_path):
-    default = replace(row(2.0, 0.1, "default", ""), left_out=({"what": "75% of the pixels", "why": "they are fine"},))
-    rows = (default, row(1.0, 0.2, "views", "one of <2>"), row(3.0, 0.4, BASELINE, "direct uplift"))
-    html = write_page(Sweep(rows, {"c, mode: fast": "no mask"}), tmp_path / "r.html").read_text()
+    entry = left_out_entry(LeftOut.PIXELS, share=0.75, spacing_px=4.0, stride=2)
+    default = replace(row(2.0, 0.1, "default", ""), left_out=(entry,))
+    others = (row(1.0, 0.2, "views", "one of <2>"), row(3.0, 0.4, BASELINE, "direct uplift"))
+    forced = row(2.5, 0.08, knobs.FORCED, entry["key"])
+    html = write_page(Sweep((default, *others, forced), {"c, mode: fast": "no mask"}), tmp_path / "r.html").read_text()
     assert re.findall(r'(?:src|href)="(?!data:)', html) == []
-    for words in ("75% of the pixels: they are fine", "c, mode: fast: no mask", "one of &lt;2&gt;"):
+    for words in (
+        f"<li>{entry['what']}: {entry['why']}. Forced back in: +0.50 s, error -0.0200</li>",
+        "c, mode: fast: no mask",
+        "one of &lt;2&gt;",
+    ):
         assert words in html
     assert html.count('class="default front"') == 1
     assert chart(Sweep((row(2.0, 0.0, "default", ""),), {})).startswith(PNG)  # one row, no error

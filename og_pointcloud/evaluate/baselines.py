@@ -1,8 +1,9 @@
 """Other ways from masks to labelled points, on the same mask table: what the whole method is worth beside them.
 
 Each takes what the stages that all share have prepared, and vectors of words (L, D); it returns a word for each point
-of the surface, (n,) int, -1 where it has none. None knows background: a point that a mask's rays reach gets a word. `only_where_masked` is the
-plain remedy, and is reported beside each: points that views show mostly outside of masks get none.
+of the surface, (n,) int, -1 where it has none. None knows background: a point that a mask's rays reach gets a word.
+`only_where_masked` is the plain remedy, and is reported beside each: points that views show mostly outside of masks get
+none.
 
     direct uplift      every point the mean feature of the masks that show it, by blending weight
     centre sampling    the feature of the mask at the pixel of its centre, mean over views by how visible it is there

@@ -10,9 +10,10 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from og_pointcloud.errors import OgPointcloudError
+from og_pointcloud.journal import LeftOut
 from og_pointcloud.settings import CodebookSettings, FeatureSettings, FitSettings, MatchingSettings, PaperSettings
 
-__all__ = ["ABLATIONS", "DEFAULT", "KNOBS", "PUBLISHED_MIOU", "QUICK", "Setting", "ablations", "settings_of"]
+__all__ = ["ABLATIONS", "DEFAULT", "FORCED", "KNOBS", "PUBLISHED_MIOU", "QUICK", "Setting", "ablations", "settings_of"]
 
 
 @dataclass(frozen=True)
@@ -59,6 +60,8 @@ def _several(name: str, values: Mapping[str, Mapping[str, Any]], base: FitSettin
     return [Setting(name, label, _changed(base, changes)) for label, changes in values.items()]
 
 
+FORCED = "forced back in"
+"""The knob that puts in again what a fit leaves out: values that a fit names are by their key in its provenance."""
 ALL = 1_000_000_000
 """More points than any cloud has."""
 _TRIED = (
@@ -89,11 +92,11 @@ _TRIED = (
         FAST.settings,
     ),
     _several(
-        "forced back in",
+        FORCED,
         {
-            "all pixels": {"geometry.max_stride": 1},
-            "spanning masks": {"grouping.part_share": 2.0},
-            "dismissed groups": {"membership.rate_share": 0.0},
+            LeftOut.PIXELS.value: {"geometry.max_stride": 1},
+            LeftOut.SPANNING_MASKS.value: {"grouping.part_share": 2.0},
+            LeftOut.CONTRADICTED_GROUPS.value: {"membership.rate_share": 0.0},
             "islands": {"membership.island_share": 0.0},
             "outlying masks": {"association.outlier_deviations": 1e9},
             "all that is approximated": {

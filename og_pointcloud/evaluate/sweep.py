@@ -45,6 +45,7 @@ try:
     from og_pointcloud.evaluate.baselines import baseline_labels
     from og_pointcloud.fitting.fit import fit, fit_prepared, prepare
     from og_pointcloud.fitting.labellers import Labelling, mask_agreement
+    from og_pointcloud.fitting.tiles import needs_tiles
 except ImportError as error:
     raise MissingExtraError("scipy and numba", "fit") from error
 
@@ -184,6 +185,11 @@ class _Trial:
 
     def __init__(self, subject: Subject, seeds: int) -> None:
         self.subject, self.seeds, scene = subject, seeds, subject.scene
+        if needs_tiles(scene, DEFAULT.settings):
+            raise OgPointcloudError(
+                f"{subject.name}: {len(scene.points):,} points take more memory than there is for all settings; "
+                "expected fewer: report on a part of the cloud"
+            )
         self.warm: set[str] = set()
         self.rows: dict[tuple[FitSettings, int], Row] = {}
         self.default_labels: Labels | None = None
@@ -307,7 +313,7 @@ def _before_table(settings: FitSettings) -> tuple[Any, ...]:
     """All that the mask table depends on (fit.prepare)."""
     membership = settings.membership
     see_through = membership.few_views, membership.gap_sizes, membership.front_share
-    return settings.geometry, settings.visibility, settings.memory, see_through
+    return settings.geometry, settings.visibility, settings.memory, settings.tile_points, see_through
 
 
 def _means(rows: Sequence[Row]) -> list[Row]:

@@ -9,6 +9,7 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
+from og_pointcloud.evaluate.knobs import FORCED
 from og_pointcloud.evaluate.plots import require_matplotlib
 from og_pointcloud.evaluate.sweep import BASELINE, Row, Sweep, front, machine
 from og_pointcloud.formats.atomic import replacing
@@ -107,17 +108,25 @@ def write_page(sweep: Sweep, path: Path, title: str = "Error against run time") 
     for capture in sweep.captures:
         rows = [row for row in sweep.rows if row.capture == capture]
         parts.append(f"<h2>{escape(capture)}</h2><p>Error is {error_name(rows)}; a dot marks the front.</p>")
-        parts += [_left_out(row) for row in rows if row.is_default and row.left_out]
+        parts += [_left_out(row, rows) for row in rows if row.is_default and row.left_out]
         parts.append(_table(rows))
     with replacing(path) as file:
         file.write("\n".join(parts).encode())
     return path
 
 
-def _left_out(default: Row) -> str:
-    """What the default's fit left out; the knob "forced back in" has what that saves and costs."""
-    entries = "".join(f"<li>{escape(entry['what'])}: {escape(entry['why'])}</li>" for entry in default.left_out)
-    return f"<h3>Left out by the default</h3><ul>{entries}</ul>"
+def _left_out(default: Row, rows: Sequence[Row]) -> str:
+    """What the default's fit left out, and what that saved and cost, where it was forced back in."""
+    forced = {row.value: row for row in rows if row.knob == FORCED}
+    items = []
+    for entry in default.left_out:
+        text, back = f"{entry['what']}: {entry['why']}", forced.get(entry.get("key", ""))
+        if back is not None:
+            text += (
+                f". Forced back in: {back.seconds - default.seconds:+.2f} s, error {back.error - default.error:+.4f}"
+            )
+        items.append(f"<li>{escape(text)}</li>")
+    return f"<h3>Left out by the default</h3><ul>{''.join(items)}</ul>"
 
 
 def _table(rows: Sequence[Row]) -> str:
