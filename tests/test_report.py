@@ -195,7 +195,7 @@ def test_a_capture_that_cannot_be_fitted_is_named_and_costs_no_other(subject, mo
     found = sweep([large, subject], [DEFAULT], progress=False)
     assert found.captures == ["capture"]
     assert "large: 1,576 points take more memory" in found.failed["large"]
-    with pytest.raises(OgPointcloudError, match="no capture could be fitted: large: .* report on a part"):
+    with pytest.raises(OgPointcloudError, match=r"no capture could be fitted: large: .* report on a part"):
         sweep([large], [DEFAULT], progress=False)
 
 
