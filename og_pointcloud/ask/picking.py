@@ -182,7 +182,8 @@ def front_points(cloud: LabelledCloud, camera: Camera) -> NDArray[np.int64]:
     """
     discs, drawn = _discs(cloud, camera)
     front = np.full((drawn.height, drawn.width), NO_POINT)
-    bands = int(np.ceil(4 * (discs.radius**2).sum() / PAIRS_AT_ONCE)) + 1
+    pairs = np.minimum(4 * discs.radius**2, front.size).sum()  # at most: some discs reach out of the image
+    bands = int(pairs // PAIRS_AT_ONCE) + 1
     for rows in np.array_split(np.arange(drawn.height), min(bands, drawn.height)):
         disc, pixel, squared = _covered(discs, drawn.width, int(rows[0]), len(rows))
         front[rows] = _in_front(discs, disc, pixel, squared, cloud.reach, len(rows) * drawn.width).reshape(
