@@ -406,7 +406,7 @@ def test_results_of_opengaussian_can_be_asked(tmp_path, capsys):
     assert run(capsys, *shlex.split(command)[2:])[0] == 0, "the next command must work as printed"
     assert run(capsys, "info", bundle)[0] == 0
     error = error_of(capsys, *arguments[:5], "another space", *arguments[6:])
-    assert "encode the names with the leaves' model" in error
+    assert "encode them with that encoder" in error
     np.savez(words, names=np.array(["cup"]), vectors=np.ones((1, 3)))
     assert "(width 3), the leaves are of 'their space' (width 8)" in error_of(capsys, *arguments)
 
