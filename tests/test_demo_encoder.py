@@ -128,4 +128,4 @@ def test_a_coarse_room_from_photographs_alone(proposer, tmp_path):
     result = label_from_photographs(capture, tmp_path / "out", masks)
     assert result.masks > 0
     assert result.score.miou > (0.3 if proposer == "truth" else 0.05)
-    assert (result.labels >= 0).any()
+    assert (result.result.labels >= 0).any()

@@ -23,7 +23,7 @@ from og_pointcloud.text.everyday import everyday_words
 from og_pointcloud_room.features import FEATURE_SPACE, FeatureModel
 from og_pointcloud_room.furniture import CLASS_NAMES
 from og_pointcloud_room.masks import MaskNoise, propose_masks
-from og_pointcloud_room.raycast import BACKGROUND, Frame, Intrinsics, RayCaster, Surfaces
+from og_pointcloud_room.raycast import BACKGROUND, Frame, Intrinsics, RayCaster, Surfaces, o3d, tensor
 from og_pointcloud_room.room import Room, furnish
 from og_pointcloud_room.shapes import rotated
 
@@ -306,13 +306,8 @@ def _transforms(capture: RoomCapture, stems: list[str]) -> dict[str, object]:
 
 
 def _write_ply(path: Path, xyz: NDArray[np.float32], rgb: NDArray[np.uint8]) -> None:
-    """A binary point cloud. Written here so that the generator shares no code with the reader that it tests."""
-    columns = [(name, "<f4") for name in "xyz"] + [(name, "u1") for name in ("red", "green", "blue")]
-    rows = np.empty(len(xyz), columns)
-    for axis, name in enumerate("xyz"):
-        rows[name] = xyz[:, axis]
-    for channel, name in enumerate(("red", "green", "blue")):
-        rows[name] = rgb[:, channel]
-    properties = [f"property {'float' if kind == '<f4' else 'uchar'} {name}" for name, kind in columns]
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(xyz)}", *properties, "end_header", ""]
-    path.write_bytes("\n".join(header).encode() + rows.tobytes())
+    """By Open3D, so that the generator shares no code with the reader that it tests."""
+    cloud: Any = o3d.t.geometry.PointCloud(tensor(xyz))
+    cloud.point.colors = tensor(rgb, np.uint8)
+    if not o3d.t.io.write_point_cloud(path, cloud):
+        raise OSError(f"Open3D could not write {path}")

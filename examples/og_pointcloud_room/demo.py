@@ -1,4 +1,4 @@
-"""The whole road on the procedural room: capture, fit, one file, words, a score beside its bounds, and pictures.
+"""The demo: the procedural room captured, fitted, written to one file, asked by words, scored and drawn.
 
 Twice: with the masks and features of a simulated proposer and encoder, and from the photographs alone.
 """
@@ -7,28 +7,28 @@ from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 from og_pointcloud_export import write_bundle
 
 import og_pointcloud as og
 from og_pointcloud.cloud import Vocabulary, WordBank
+from og_pointcloud.evaluate.baselines import uplift
 from og_pointcloud.evaluate.metrics import Score, adjusted_rand_index, score_labels
 from og_pointcloud.fitting.fit import fit_prepared, prepare
 from og_pointcloud.fitting.mask_table import MaskTable
 from og_pointcloud.formats.capture import read_capture
 from og_pointcloud.settings import FitSettings
-from og_pointcloud_room.baselines import ceiling, direct_uplift
 from og_pointcloud_room.capture import ABSENT_WORDS, CaptureSettings, RoomCapture, make_capture, write_capture
 from og_pointcloud_room.furniture import CLASS_NAMES
 from og_pointcloud_room.photographs import ABSENT, FromPhotographs, label_from_photographs
-from og_pointcloud_room.pictures import can_render, draw_instances, draw_labels, draw_views
+from og_pointcloud_room.pictures import draw_clouds, draw_views
+from og_pointcloud_room.stages import stage
 
-__all__ = ["DemoResult", "MethodScore", "run_demo"]
+__all__ = ["DemoResult", "MethodScore", "ceiling", "run_demo"]
 
 SHOWN_VIEWS = (0.0, 0.2, 0.62, 0.82)
 """Where along the path the views of the contact sheet lie."""
@@ -78,49 +78,65 @@ def run_demo(
     Prints one line per stage and a table.
     """
     seconds: dict[str, float] = {}
-    with _stage("make the room", seconds):
+    with stage("make the room", seconds):
         capture = make_capture(seed, CaptureSettings(mask_noise=mask_noise))
         folder = write_capture(capture, output / "capture")
     settings = FitSettings(seed=seed)
-    with _stage("read the capture", seconds):
+    with stage("read the capture", seconds):
         scene = read_capture(folder)
-    with _stage("render the masks", seconds):
+    with stage("render the masks", seconds):
         prepared = prepare(scene, settings)
-    with _stage("fit", seconds):
+    with stage("fit", seconds):
         cloud = fit_prepared(prepared, settings)
     bundle = output / "room.ogpc"
-    with _stage("write one file", seconds):
+    with stage("write one file", seconds):
         words, bank = Vocabulary(CLASS_NAMES, capture.text_vectors), WordBank(capture.bank_vectors)
         write_bundle(replace(cloud, vocabulary=words, word_bank=bank), bundle)
-    with _stage("segment by words", seconds):
+    with stage("segment by words", seconds):
         loaded = og.load(bundle)
         result = og.segment(capture.xyz, CLASS_NAMES, scene=loaded)
-    with _stage("ask absent words", seconds):
+    with stage("ask absent words", seconds):
         called = _absent_called(loaded, capture)
-    with _stage("baselines", seconds):
-        baselines = _baselines(prepared.table, seconds["render the masks"], capture)
+    with stage("baselines", seconds):
+        plain, best = _baselines(prepared.table, seconds["render the masks"], capture)
     ours_seconds = sum(seconds[name] for name in ("render the masks", "fit", "write one file", "segment by words"))
-    ours_row = MethodScore("og_pointcloud", _score(result.labels, capture), called, ours_seconds)
-    methods = (baselines[0], ours_row, baselines[1])
-    uplift, ours, best = (method.score.miou for method in methods)
-    seen = None
+    ours = MethodScore("og_pointcloud", _score(result.labels, capture), called, ours_seconds)
+    methods, seen = (plain, ours, best), None
     if photographs:
         print("\nfrom photographs alone: masks by OpenCV, features and typed words by the demo encoder", flush=True)
         seen = label_from_photographs(folder, output / "photographs", seed=seed)
         seconds |= {f"photographs: {name}": value for name, value in seen.seconds.items()}
-        own_seconds = sum(seen.seconds.values())
-        methods += (MethodScore("from photographs alone", seen.score, seen.absent_called, own_seconds),)
+        total = sum(seen.seconds.values())
+        methods += (MethodScore("from photographs alone", seen.score, seen.absent_called, total),)
     written: tuple[Path, ...] = ()
     if pictures:
-        with _stage("draw pictures", seconds):
-            written = _draw(output, capture, result.labels, result.instances)
-            written += _draw_photographs(output, capture, seen) if seen else ()
-    share = (ours - uplift) / (best - uplift) if best > uplift else float("nan")
+        with stage("draw pictures", seconds):
+            written = _draw(output, capture, loaded, result, seen)
+    gain, possible = ours.score.miou - plain.score.miou, best.score.miou - plain.score.miou
     labelled = capture.instance >= 0
     agreement = adjusted_rand_index(result.instances[labelled], capture.instance[labelled])
+    share = gain / possible if possible > 0 else float("nan")
     demo = DemoResult(output, bundle, written, methods, share, agreement, seconds)
     _report(demo)
     return demo
+
+
+def ceiling(
+    features: NDArray[np.floating], mask_instance: NDArray[np.integer], texts: NDArray[np.floating],
+    instances: NDArray[np.integer],
+) -> NDArray[np.int32]:  # fmt: skip
+    """The best that masks allow: true instances, each with the mean feature of the masks that show mostly it.
+
+    features: (M, D) unit rows; mask_instance: (M,) the true instance that each mask mostly shows, -1 for background;
+    texts: (C, D) unit rows; instances: (n,) true instance of each point, -1 none. Returns (n,) int32 class ids, -1 off
+    the instances and for an instance without a mask.
+    """
+    count = int(max(instances.max(initial=-1), mask_instance.max(initial=-1))) + 1
+    label_of = np.full(count + 1, -1, np.int32)
+    similarity = features @ texts.T
+    for instance in np.unique(mask_instance[mask_instance >= 0]):
+        label_of[instance] = similarity[mask_instance == instance].mean(axis=0).argmax()
+    return label_of[np.where(instances >= 0, instances, count)]
 
 
 def _absent_called(scene: og.LabelledScene, capture: RoomCapture) -> float:
@@ -134,76 +150,61 @@ def _baselines(table: MaskTable, render_s: float, capture: RoomCapture) -> tuple
     """Direct uplift on the mask table that the fit works on, and the ceiling on the truth."""
     features = np.concatenate(capture.mask_features)
 
-    def uplift(texts: np.ndarray) -> np.ndarray:
-        return direct_uplift(table.weights, table.mask_features, texts)
+    def plain(texts: NDArray[np.floating]) -> NDArray[np.integer]:
+        return uplift(table.weights, table.unit_features, texts)
 
-    def best(texts: np.ndarray) -> np.ndarray:
+    def best(texts: NDArray[np.floating]) -> NDArray[np.integer]:
         return ceiling(features, capture.mask_instance, texts, capture.instance)
 
     start = time.perf_counter()
-    labels = uplift(capture.text_vectors)
+    labels = plain(capture.text_vectors)
     seconds = render_s + time.perf_counter() - start
-    uplift_called, best_called = (float((ask(capture.absent_vectors) >= 0).mean()) for ask in (uplift, best))
+    plain_called, best_called = (float((ask(capture.absent_vectors) >= 0).mean()) for ask in (plain, best))
     return (
-        MethodScore("direct uplift", _score(labels, capture), uplift_called, seconds),
+        MethodScore("direct uplift", _score(labels, capture), plain_called, seconds),
         MethodScore("ceiling: true instances", _score(best(capture.text_vectors), capture), best_called, None),
     )
 
 
-def _score(labels: np.ndarray, capture: RoomCapture) -> Score:
+def _score(labels: NDArray[np.integer], capture: RoomCapture) -> Score:
     return score_labels(labels, capture.cls, background=capture.background)
 
 
-def _draw(output: Path, capture: RoomCapture, labels: np.ndarray, instances: np.ndarray) -> tuple[Path, ...]:
-    """The three pictures, or the first alone where nothing can be rendered."""
-    views, by_instance, by_label = (output / f"{name}.png" for name in ("views", "instances", "labels"))
+def _draw(
+    output: Path, capture: RoomCapture, scene: og.LabelledScene, result: og.Segmentation, seen: FromPhotographs | None
+) -> tuple[Path, ...]:
+    """The pictures, or those of images alone where nothing can be rendered."""
+    from og_pointcloud_pyvista import can_render
+
+    views = output / "views.png"
     chosen = [int(place * len(capture.frames)) for place in SHOWN_VIEWS]
     draw_views(views, [capture.frames[index].image for index in chosen], [capture.masks[index] for index in chosen])
+    written = (views, seen.preview) if seen else (views,)
     if not can_render():
         print("no pictures of the cloud: off-screen rendering needs EGL or OSMesa (Debian: apt install libegl1 libgl1)")
-        return (views,)
-    draw_instances(by_instance, capture.xyz, capture.rgb, instances)
+        return written
     # Flying pixels and outliers have no truth to be held against; they are shown among the instances.
-    known = (capture.cls >= 0) | capture.background
-    draw_labels(
-        by_label, capture.xyz[known], capture.rgb[known], labels[known], capture.cls[known], CLASS_NAMES,
-        instance_ids=instances[known],
-    )  # fmt: skip
-    return (views, by_instance, by_label)
-
-
-def _draw_photographs(output: Path, capture: RoomCapture, seen: FromPhotographs) -> tuple[Path, ...]:
-    if not can_render():
-        return (seen.preview,)
-    path, known = output / "from_photographs.png", (capture.cls >= 0) | capture.background
-    draw_labels(
-        path, capture.xyz[known], capture.rgb[known], seen.labels[known], capture.cls[known], CLASS_NAMES,
-        instance_ids=seen.instance_ids[known],
-    )  # fmt: skip
-    return seen.preview, path
-
-
-@contextmanager
-def _stage(name: str, seconds: dict[str, float]) -> Iterator[None]:
-    start = time.perf_counter()
-    yield
-    seconds[name] = time.perf_counter() - start
-    print(f"{name:<18} {seconds[name]:6.1f} s", flush=True)
+    known, rgb = (capture.cls >= 0) | capture.background, capture.rgb
+    truth = {"ground truth": replace(result, labels=capture.cls, instances=capture.instance)}
+    by_instance = draw_clouds(output / "instances.png", scene, {"instances": result}, rgb, by="instance")
+    by_label = draw_clouds(output / "labels.png", scene, {"segmented by words": result, **truth}, rgb, known)
+    written += (by_instance, by_label)
+    if seen:
+        panels = {"from photographs alone": seen.result, **truth}
+        written += (draw_clouds(output / "from_photographs.png", scene, panels, rgb, known),)
+    return written
 
 
 def _report(demo: DemoResult) -> None:
-    print(
-        f"\n{'method':<24} {'mIoU':>7} {'mAcc':>7} {'unknown':>8} {'background called':>18} {'absent called':>14} "
-        f"{'seconds':>8}"
-    )
+    columns = ("mIoU", "mAcc", "unknown", "background called", "absent called", "seconds")
+    print("\n" + f"{'method':<24}" + "".join(f"{name:>{len(name) + 3}}" for name in columns))
     for method in demo.methods:
         score = method.score
-        called = "-" if score.background_called is None else f"{score.background_called:.4f}"
-        seconds = "-" if method.seconds is None else f"{method.seconds:.1f}"
-        print(
-            f"{method.name:<24} {score.miou:7.4f} {score.macc:7.4f} {score.unknown_share:8.4f} {called:>18} "
-            f"{method.absent_called:14.4f} {seconds:>8}"
-        )
+        shares = (score.miou, score.macc, score.unknown_share, score.background_called, method.absent_called)
+        cells = ["-" if share is None else f"{share:.4f}" for share in shares]
+        cells.append("-" if method.seconds is None else f"{method.seconds:.1f}")
+        row = "".join(f"{cell:>{len(name) + 3}}" for cell, name in zip(cells, columns, strict=True))
+        print(f"{method.name:<24}{row}")
     print(
         f"absent called: of all points, the share that gets one of {ABSENT_WORDS} words that nothing in the room is "
         f"(from photographs: one of {len(ABSENT)} typed ones); og_pointcloud judges them by its word bank"

@@ -7,14 +7,10 @@ nothing is simulated but the room, and nothing is fetched. The truth is used for
 from __future__ import annotations
 
 import sys
-import time
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
 from og_pointcloud_export import write_bundle
 
 import og_pointcloud as og
@@ -26,6 +22,7 @@ from og_pointcloud.masking.make_masks import PREVIEW_NAME, MaskSettings, make_ma
 from og_pointcloud.settings import FitSettings
 from og_pointcloud.text.encoder import DEMO_ENCODER
 from og_pointcloud_room.furniture import CLASS_NAMES
+from og_pointcloud_room.stages import stage
 
 __all__ = ["ABSENT", "FromPhotographs", "label_from_photographs"]
 
@@ -39,14 +36,13 @@ ABSENT = (
 
 @dataclass(frozen=True)
 class FromPhotographs:
-    """What came of it. masks: of all images. absent_called: of all points, the share that gets one of ABSENT when these
-    are asked. preview: some images with their masks drawn in. seconds: wall clock per stage."""
+    """What came of it. masks: of all images. result: the room's points asked for CLASS_NAMES. absent_called: of all
+    points, the share that gets one of ABSENT when these are asked. preview: some images with their masks drawn in.
+    seconds: wall clock per stage."""
 
     bundle: Path
     masks: int
-    instances: int
-    labels: np.ndarray
-    instance_ids: np.ndarray
+    result: og.Segmentation
     score: Score
     absent_called: float
     preview: Path
@@ -54,13 +50,9 @@ class FromPhotographs:
 
 
 def label_from_photographs(
-    capture: Path,
-    output: Path,
-    proposer: str = "opencv",
-    seed: int = 0,
-    processes: int | None = None,
+    capture: Path, output: Path, proposer: str = "opencv", seed: int = 0, processes: int | None = None,
     level: str | None = None,
-) -> FromPhotographs:
+) -> FromPhotographs:  # fmt: skip
     """Label a room's capture, as ``write_capture`` wrote it, by the names of its classes as someone types them.
 
     Of the capture only images, poses, points and the truth are used; ``output`` becomes a capture of its own, with the
@@ -72,39 +64,21 @@ def label_from_photographs(
     output.mkdir(parents=True, exist_ok=True)
     settings = MaskSettings(proposer=proposer, encoder="demo")
     settings = settings if level is None else replace(settings, level=level)
-    with _stage("masks and features", seconds):
+    with stage("masks and features", seconds):
         made = make_masks(capture, settings, output, processes=processes, overwrite=True)
-    with _stage("read the capture", seconds):
+    with stage("read the capture", seconds):
         scene = read_capture(output)
-    with _stage("fit", seconds):
+    with stage("fit", seconds):
         cloud = fit(scene, FitSettings(seed=seed), progress=sys.stderr.isatty())
     bundle = output / "room.ogpc"
-    with _stage("write one file", seconds):
+    with stage("write one file", seconds):
         write_bundle(cloud, bundle, text_encoder=DEMO_ENCODER / "text")
     truth = read_truth(capture)
-    with _stage("typed words to labels", seconds):
+    with stage("typed words to labels", seconds):
         loaded = og.load(bundle)
-        labels = og.segment(loaded.xyz, CLASS_NAMES, scene=loaded).labels
+        result = og.segment(loaded.xyz, CLASS_NAMES, scene=loaded)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # that no point has a label is what is hoped for
         called = float((og.segment(loaded, ABSENT).labels >= 0).mean())
-    score = score_labels(labels, truth.cls, background=truth.background)
-    return FromPhotographs(
-        bundle,
-        made.masks,
-        len(cloud.instances),
-        labels,
-        cloud.instance_ids,
-        score,
-        called,
-        output / PREVIEW_NAME,
-        seconds,
-    )
-
-
-@contextmanager
-def _stage(name: str, seconds: dict[str, float]) -> Iterator[None]:
-    start = time.perf_counter()
-    yield
-    seconds[name] = time.perf_counter() - start
-    print(f"{name:<22} {seconds[name]:6.1f} s", flush=True)
+    score = score_labels(result.labels, truth.cls, background=truth.background)
+    return FromPhotographs(bundle, made.masks, result, score, called, output / PREVIEW_NAME, seconds)

@@ -1,60 +1,31 @@
-"""Pictures of the demo: input views with their masks, the cloud by instance, the cloud by class beside the truth."""
+"""Pictures of the demo: input views with their masks, and the cloud by instance or label as `og-pointcloud view` draws.
+
+A picture of the cloud looks into the room: the ceiling and the walls on the eye's side are cut away.
+"""
 
 from __future__ import annotations
 
-import importlib.util
-import os
-import subprocess
-import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud.errors import MissingExtraError
+from og_pointcloud.ask.labelled_scene import LabelledScene
+from og_pointcloud.ask.segmentation import Segmentation
+from og_pointcloud.formats.colors import label_colors
+from og_pointcloud.show.viewpoint import Viewpoint, choose_viewpoint
 
-if TYPE_CHECKING:
-    import pyvista
+__all__ = ["draw_clouds", "draw_views"]
 
-__all__ = ["can_render", "draw_instances", "draw_labels", "draw_views"]
-
-PALETTE = np.array(
-    [
-        (31, 119, 180), (255, 152, 62), (44, 150, 60), (214, 39, 40), (148, 103, 189), (240, 128, 190), (188, 166, 34),
-        (23, 180, 200), (128, 84, 62), (122, 200, 90), (250, 205, 60), (70, 70, 150), (160, 30, 100), (110, 180, 250),
-        (0, 110, 105), (200, 120, 105), (205, 160, 230), (90, 110, 40), (255, 90, 90), (60, 60, 70),
-    ],
-    np.uint8,
-)  # fmt: skip
-"""Colours that stay apart beside each other; classes beyond their number start again."""
-UNKNOWN = np.array((216, 216, 216), np.uint8)
-CUT_HEIGHT = 2.3
+CUT_M = 2.3
 """Points above are cut away, so that one sees into the room; metres above the floor."""
-SPLAT_M = 0.055
-"""Side of the square that a point is drawn as, metres: neighbours of a cloud thinned to 4 cm just close up."""
-VIEW_ANGLE = 30.0
-OVERSAMPLING = 2
-"""Pictures are rendered this much larger and averaged down: splats have no anti-aliasing of their own."""
-PROBE = "import pyvista as pv; p = pv.Plotter(off_screen=True, window_size=(32, 32)); p.screenshot(return_img=True)"
+WALL_M = 0.15
+"""What lies nearer than this to the end of the room is a wall, or hangs on one."""
+PICTURE_WIDTH = 1000
 
 Colours = NDArray[np.uint8]
-
-
-def can_render() -> bool:
-    """Whether PyVista can draw off-screen here. Tried in a process of its own: without EGL or OSMesa VTK crashes.
-
-    Raises MissingExtraError where PyVista is not installed.
-    """
-    if importlib.util.find_spec("pyvista") is None:
-        raise MissingExtraError("pyvista", "demo")
-    if not os.environ.get("DISPLAY"):
-        # Else VTK looks for an X server first and complains.
-        os.environ.setdefault("VTK_DEFAULT_OPENGL_WINDOW", "vtkEGLRenderWindow")
-    tried = subprocess.run([sys.executable, "-c", PROBE], capture_output=True, timeout=120, check=False)
-    return tried.returncode == 0
 
 
 def draw_views(path: Path, images: Sequence[Colours], masks: Sequence[NDArray[np.integer]], *, seed: int = 0) -> None:
@@ -65,7 +36,7 @@ def draw_views(path: Path, images: Sequence[Colours], masks: Sequence[NDArray[np
     rng = np.random.default_rng(seed)
     columns = []
     for image, ids in zip(images, masks, strict=True):
-        colours = np.concatenate([[(255, 255, 255)], PALETTE[rng.permutation(max(int(ids.max()), 1)) % len(PALETTE)]])
+        colours = np.concatenate([[(255, 255, 255)], label_colors(rng.permutation(max(int(ids.max()), 1)))])
         inside = (ids > 0)[:, :, None]
         over = np.where(inside, 0.4 * image + 0.6 * colours[np.maximum(ids, 0)], 0.35 * image + 0.65 * 255)
         smoothed = ids.astype(np.float32)
@@ -77,137 +48,39 @@ def draw_views(path: Path, images: Sequence[Colours], masks: Sequence[NDArray[np
     cv2.imwrite(str(path), sheet[:, :, ::-1])
 
 
-def draw_instances(path: Path, xyz: NDArray[np.floating], rgb: Colours, instance_ids: NDArray[np.integer]) -> None:
-    """The cloud in its own colours beside the cloud by instance, unlabelled points light grey.
+def draw_clouds(
+    path: Path, scene: LabelledScene, results: dict[str, Segmentation], rgb: Colours,
+    known: NDArray[np.bool_] | None = None, *, by: str = "label",
+) -> Path:  # fmt: skip
+    """Answers about one cloud beside each other, each under its title. Needs PyVista that can render off-screen.
 
-    xyz: (n, 3) metres, z up, floor at 0. rgb: (n, 3) uint8. instance_ids: (n,), negative for none.
+    rgb: (N, 3) colours of the points, which shade those of the labels. known: (N,) points to draw; all if left out.
+    by: "label" or "instance".
     """
-    rank = np.unique(np.maximum(instance_ids, -1), return_inverse=True)[1]
-    # Neighbouring ids get far colours; three shades tell instances apart that share a colour.
-    shade = np.array([1.0, 0.72, 1.25])[(rank // len(PALETTE)) % 3]
-    bright = np.clip(PALETTE[rank * 7 % len(PALETTE)] * shade[:, None], 0, 255).astype(np.uint8)
-    colours = np.where((instance_ids >= 0)[:, None], bright, UNKNOWN)
-    count = len(np.unique(instance_ids[instance_ids >= 0]))
-    plotter = _plotter((1600, 760), shape=(1, 2))
-    _panel(plotter, 0, f"input: {len(xyz):,} points", xyz, rgb)
-    _panel(plotter, 1, f"{count} instances", xyz, _lit(colours, rgb))
-    _save(plotter, path)
+    from og_pointcloud_pyvista.screening import draw
+
+    first = next(iter(results.values()))
+    shown, view = _look_into_room(first)
+    panels = []
+    for title, result in results.items():
+        plotter = draw(scene, result, rgb, shown if known is None else shown & known, view, by=by)
+        plotter.add_text(title, position="upper_left", font_size=14, color="black", font="arial")
+        picture = np.asarray(plotter.screenshot(return_img=True))
+        plotter.close()
+        size = (PICTURE_WIDTH, round(picture.shape[0] * PICTURE_WIDTH / picture.shape[1]))
+        panels.append(cv2.resize(picture[:, :, 2::-1], size, interpolation=cv2.INTER_AREA))
+    cv2.imwrite(str(path), np.hstack(panels))
+    return path
 
 
-def draw_labels(
-    path: Path, xyz: NDArray[np.floating], rgb: Colours, labels: NDArray[np.integer], truth: NDArray[np.integer],
-    names: Sequence[str], *, instance_ids: NDArray[np.integer] | None = None, title: str = "segmented by words",
-) -> None:  # fmt: skip
-    """The cloud by class beside the truth, with a legend; unknown points light grey.
-
-    xyz: (n, 3) metres, z up, floor at 0. rgb: (n, 3) uint8. labels, truth: (n,) rows of ``names``, -1 unknown.
-    instance_ids: (n,) or None; with it the largest instance of each class carries its name.
-    """
-    plotter = _plotter((1760, 760), shape=(1, 3), col_weights=[0.45, 0.45, 0.1])
-    for column, (caption, ids) in enumerate([(title, labels), ("ground truth", truth)]):
-        colours = np.where((ids >= 0)[:, None], PALETTE[np.maximum(ids, 0) % len(PALETTE)], UNKNOWN)
-        shown = _panel(plotter, column, caption, xyz, _lit(colours, rgb))
-        if column == 0 and instance_ids is not None:
-            _name_instances(plotter, xyz[shown], labels[shown], instance_ids[shown], names)
-    present = np.union1d(labels[labels >= 0], truth[truth >= 0])
-    plotter.subplot(0, 2)
-    words = [names[int(index)] for index in present]
-    _legend(plotter, [*words, "unknown"], [*PALETTE[present % len(PALETTE)], UNKNOWN])
-    _save(plotter, path)
-
-
-def _legend(plotter: pyvista.Plotter, words: Sequence[str], colours: Sequence[Colours]) -> None:
-    """Swatches with black words beside them; VTK's own legend writes yellow words on white."""
-    places = np.stack([np.zeros(len(words)), -np.arange(len(words)), np.zeros(len(words))], axis=1)
-    plotter.add_points(places, scalars=np.stack(colours), rgb=True, point_size=16 * OVERSAMPLING, lighting=False)
-    beside = places + np.array([0.45, 0, 0])
-    plotter.add_point_labels(
-        beside, list(words), font_size=17 * OVERSAMPLING, text_color="black", shape=None, show_points=False,
-        always_visible=True, font_family="arial", bold=False, justification_vertical="center",
-    )  # fmt: skip
-    plotter.camera.parallel_projection = True
-    plotter.camera.focal_point = (1.6, -(len(words) - 1) / 2, 0)
-    plotter.camera.position = (1.6, -(len(words) - 1) / 2, 10)
-    plotter.camera.up = (0, 1, 0)
-    plotter.camera.parallel_scale = 0.6 * max(len(words), 16)
-
-
-def _name_instances(
-    plotter: pyvista.Plotter, xyz: NDArray[np.floating], labels: NDArray[np.integer],
-    instance_ids: NDArray[np.integer], names: Sequence[str],
-) -> None:  # fmt: skip
-    """The name of each class at the top of its largest instance."""
-    places, words = [], []
-    for class_id in np.unique(labels[labels >= 0]):
-        ids, counts = np.unique(instance_ids[(labels == class_id) & (instance_ids >= 0)], return_counts=True)
-        if len(ids):
-            points = xyz[instance_ids == ids[counts.argmax()]]
-            places.append([*np.median(points[:, :2], axis=0), np.percentile(points[:, 2], 95) + 0.05])
-            words.append(names[class_id])
-    if words:
-        plotter.add_point_labels(
-            np.array(places), words, font_size=14 * OVERSAMPLING, text_color="black", shape_color="white",
-            shape_opacity=0.75, margin=2 * OVERSAMPLING, show_points=False, always_visible=True, font_family="arial",
-            bold=False,
-        )  # fmt: skip
-
-
-def _plotter(window_size: tuple[int, int], **layout: Any) -> pyvista.Plotter:
-    import pyvista
-
-    large = [OVERSAMPLING * side for side in window_size]
-    theme = pyvista.themes.DocumentTheme()
-    return pyvista.Plotter(off_screen=True, window_size=large, border=False, theme=theme, **layout)
-
-
-def _panel(
-    plotter: pyvista.Plotter, column: int, caption: str, xyz: NDArray[np.floating], colours: Colours
-) -> NDArray[np.bool_]:
-    """One view into the room from above a corner, ceiling and near walls cut away; returns which points it shows."""
+def _look_into_room(result: Segmentation) -> tuple[NDArray[np.bool_], Viewpoint]:
+    """(N,) which points to show, and where from: the things in the room decide, then walls before the eye go."""
+    xyz = result.xyz
     lower, upper = np.percentile(xyz, (0.5, 99.5), axis=0)
-    middle, size = (lower + upper) / 2, upper - lower
-    inside = ((xyz > lower - 0.1) & (xyz < upper + 0.1)).all(axis=1)
-    corner = _open_corner(xyz[inside], middle, size)
-    near_wall = ((xyz[:, :2] - middle[:2]) * corner > size[:2] / 2 - 0.15).any(axis=1)
-    shown = inside & ~near_wall & (xyz[:, 2] < lower[2] + CUT_HEIGHT)
-    plotter.subplot(0, column)
-    reach = 1.28 * float(np.linalg.norm(size[:2]))
-    focus = np.array([middle[0], middle[1], lower[2] + 0.3 * size[2]])
-    toward_eye = np.array([0.6 * corner[0], 0.74 * corner[1], 1.0])
-    focal_px = plotter.window_size[1] / 2 / np.tan(np.deg2rad(VIEW_ANGLE / 2))
-    splat_px = SPLAT_M * focal_px / (reach * float(np.linalg.norm(toward_eye)))
-    cloud = xyz[shown].astype(np.float32)
-    plotter.add_points(cloud, scalars=colours[shown], rgb=True, point_size=splat_px, lighting=False)
-    plotter.add_text(caption, position="upper_edge", font_size=13 * OVERSAMPLING, color="black", font="arial")
-    plotter.camera.position = tuple(focus + toward_eye * reach)
-    plotter.camera.focal_point = tuple(focus)
-    plotter.camera.up = (0, 0, 1)
-    plotter.camera.view_angle = VIEW_ANGLE
-    plotter.reset_camera_clipping_range()
-    return shown
-
-
-def _open_corner(
-    xyz: NDArray[np.floating], middle: NDArray[np.floating], size: NDArray[np.floating]
-) -> NDArray[np.float64]:
-    """Signs (2,) of the corner to look from: the one whose two walls have the least tall furniture before them."""
-    from_middle = (xyz - middle)[:, :2]
-    tall = (xyz[:, 2] > middle[2] - 0.1 * size[2]) & (np.abs(from_middle) < size[:2] / 2 - 0.12).all(axis=1)
-    corners = np.array([(1.0, -1.0), (-1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)])
-    hidden = [(tall & (from_middle * corner > size[:2] / 2 - 0.7).any(axis=1)).sum() for corner in corners]
-    return corners[int(np.argmin(hidden))]
-
-
-def _lit(colours: Colours, rgb: Colours) -> Colours:
-    """Label colours darkened where the cloud itself is dark, so that shape and shadows stay visible."""
-    luminance = rgb @ np.array([0.3, 0.59, 0.11])
-    light = 0.62 + 0.38 * np.clip(luminance / max(float(np.percentile(luminance, 90)), 1.0), 0, 1)
-    return (colours * light[:, None]).astype(np.uint8)
-
-
-def _save(plotter: pyvista.Plotter, path: Path) -> None:
-    large = plotter.screenshot(return_img=True)
-    plotter.close()
-    assert large is not None
-    size = (large.shape[1] // OVERSAMPLING, large.shape[0] // OVERSAMPLING)
-    cv2.imwrite(str(path), cv2.resize(np.asarray(large)[:, :, 2::-1], size, interpolation=cv2.INTER_AREA))
+    middle, half = (lower + upper) / 2, (upper - lower) / 2
+    below = (xyz > lower - 0.1).all(axis=1) & (xyz < upper + 0.1).all(axis=1) & (xyz[:, 2] < lower[2] + CUT_M)
+    beyond = (xyz - middle)[:, :2]
+    inside = below & (np.abs(beyond) < half[:2] - WALL_M).all(axis=1)
+    view = choose_viewpoint(xyz[inside], result.labels[inside] >= 0, np.array([0.0, 0.0, 1.0]))
+    before_eye = beyond * np.sign(view.eye - middle)[:2] > half[:2] - WALL_M
+    return below & ~before_eye.any(axis=1), view

@@ -25,7 +25,7 @@ try:
 except ImportError as error:
     raise MissingExtraError("open3d", "demo") from error
 
-__all__ = ["Frame", "Hits", "Intrinsics", "RayCaster", "Surfaces"]
+__all__ = ["Frame", "Hits", "Intrinsics", "RayCaster", "Surfaces", "o3d", "tensor"]
 
 Points = NDArray[np.float64]
 BACKGROUND = -1
@@ -52,7 +52,7 @@ class Surfaces:
         owners, corners = [], []
         for index, item in enumerate(items):
             for part in item.parts:
-                self._scene.add_triangles(_tensor(part.vertices), _tensor(part.triangles, np.uint32))
+                self._scene.add_triangles(tensor(part.vertices), tensor(part.triangles, np.uint32))
                 owners.append(index)
                 corners.append(part.vertices[part.triangles])
         self.part_item = np.array(owners)
@@ -65,7 +65,7 @@ class Surfaces:
     def cast(self, origin: ArrayLike, directions: Points) -> Hits:
         """The nearest surface along rays from ``origin`` (3,) in ``directions`` (n, 3)."""
         rays = np.concatenate([np.broadcast_to(origin, directions.shape), directions], axis=1)
-        found = self._scene.cast_rays(_tensor(rays))
+        found = self._scene.cast_rays(tensor(rays))
         part = found["geometry_ids"].numpy().astype(np.int64)
         missed = part >= len(self.part_item)
         part[missed] = -1
@@ -80,12 +80,12 @@ class Surfaces:
 
     def is_blocked(self, starts: Points, steps: Points) -> NDArray[np.bool_]:
         """(n,) whether a surface lies between ``starts`` and ``starts + steps``, both (n, 3)."""
-        rays = _tensor(np.concatenate([starts, steps], axis=1))
+        rays = tensor(np.concatenate([starts, steps], axis=1))
         return self._scene.test_occlusions(rays, tnear=0.0, tfar=1.0).numpy()
 
     def distance_m(self, xyz: Points | NDArray[np.float32]) -> NDArray[np.float32]:
         """(n,) metres from points (n, 3) to the nearest surface."""
-        return self._scene.compute_distance(_tensor(xyz)).numpy()
+        return self._scene.compute_distance(tensor(xyz)).numpy()
 
 
 @dataclass(frozen=True)
@@ -100,7 +100,8 @@ class Intrinsics:
         """(H * W, 3) ray directions in the camera's frame (OpenCV), z = 1, through pixel centres, row by row."""
         x = (np.arange(self.width) + 0.5 - self.width / 2) / self.focal_px
         y = (np.arange(self.height) + 0.5 - self.height / 2) / self.focal_px
-        return np.stack([*np.meshgrid(x, y), np.ones((self.height, self.width))], axis=2).reshape(-1, 3)
+        grid = np.stack([*np.meshgrid(x, y), np.ones((self.height, self.width))], axis=2)
+        return grid.reshape(-1, 3).astype(np.float64)
 
 
 @dataclass(frozen=True)
@@ -151,7 +152,8 @@ class RayCaster:
     def _albedo(self, xyz: Points, part: NDArray[np.int64]) -> Points:
         """Two colours of each part's material, mixed by two octaves of value noise of its grain. (n, 3)."""
         cell = np.floor(xyz * (NOISE_STEPS / self._grain[part])).astype(np.int64) % NOISE_SIDE
-        share = np.clip(0.5 + self._noise_table[cell[:, 0], cell[:, 1], cell[:, 2]], 0, 1)[:, None]
+        noise = self._noise_table[cell[:, 0], cell[:, 1], cell[:, 2]].astype(np.float64)
+        share = np.clip(0.5 + noise, 0, 1)[:, None]
         return self._first[part] + (self._second - self._first)[part] * share
 
     def _light_at(self, xyz: Points, normals: Points) -> Points:
@@ -180,7 +182,7 @@ def _dot(first: Points, second: Points) -> Points:
     return first[..., 0] * second[..., 0] + first[..., 1] * second[..., 1] + first[..., 2] * second[..., 2]
 
 
-def _tensor(values: NDArray[Any], dtype: Any = np.float32) -> Any:
+def tensor(values: NDArray[Any], dtype: Any = np.float32) -> Any:
     """An Open3D tensor; typed loosely, as Open3D's own stubs know no arrays."""
     make_tensor: Any = o3d.core.Tensor
     return make_tensor(np.ascontiguousarray(values, dtype))

@@ -7,20 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud.errors import MissingExtraError
 from og_pointcloud_room.furniture import CLASS_NAMES, Item
+from og_pointcloud_room.raycast import Surfaces
 from og_pointcloud_room.room import Room, furnish
-from og_pointcloud_room.shapes import Material, box, lathe, rotation_about
-
-try:
-    import open3d as o3d
-except ImportError as error:
-    raise MissingExtraError("open3d", "demo") from error
+from og_pointcloud_room.shapes import Material, box, lathe, rotated, rotation_about
 
 __all__ = ["BACKGROUND", "MOVED", "NEW", "NO_RETURN", "ChangedRoom", "Drive", "Lidar", "LidarFrame"]
 
@@ -91,9 +85,7 @@ class Drive:
         lap_s = np.linalg.norm(np.diff(self.path, axis=0, append=self.path[:1]), axis=1).sum() / SPEED_M_S
         self.frame_count = frames or int(lap_s * self.lidar.hertz)
         self.now = _changed(self.room, self.path)
-        self._scene = _surfaces(self.now.items)
-        counts = [len(item.parts) for item in self.now.items]
-        self._truth_of_part = np.append(np.repeat(self.now.truth, counts), np.int32(NO_RETURN))
+        self._surfaces = Surfaces(self.now.items)
 
     def __len__(self) -> int:
         return self.frame_count
@@ -122,13 +114,10 @@ class Drive:
         return pose
 
     def _cast(self, pose: Points, rays: Points) -> tuple[Points, NDArray[np.int32]]:
-        """Range of each ray in metres, infinite without a hit, and what it hits."""
-        world = np.empty((len(rays), 6), np.float32)
-        world[:, :3], world[:, 3:] = pose[:3, 3], rays @ pose[:3, :3].T
-        hit = self._scene.cast_rays(_tensor(world))
-        part = np.minimum(hit["geometry_ids"].numpy(), len(self._truth_of_part) - 1)
-        ranges = hit["t_hit"].numpy().astype(np.float64)
-        return np.where(np.isfinite(ranges), ranges, np.nan), self._truth_of_part[part]
+        """Range of each ray in metres, NaN without a hit, and what it hits."""
+        hits = self._surfaces.cast(pose[:3, 3], rotated(rays, pose[:3, :3]))
+        truth = self.now.truth[self._surfaces.part_item[hits.part]]
+        return hits.distance, np.where(hits.part < 0, NO_RETURN, truth)
 
 
 def _changed(room: Room, path: Points) -> ChangedRoom:
@@ -145,7 +134,7 @@ def _changed(room: Room, path: Points) -> ChangedRoom:
     ]
     items, taken = [*others, *room.shell], np.full((1, 2), np.inf)
     truth = [CLASS_NAMES.index(item.name) for item in others] + [BACKGROUND] * len(room.shell)
-    surfaces = _surfaces([*room.objects, *room.shell])
+    surfaces = Surfaces([*room.objects, *room.shell])
     for item, what in arrivals:
         place = _free_floor(room, surfaces, path, taken)
         taken = np.concatenate([taken, place[None]])
@@ -161,7 +150,7 @@ def _centred(item: Item) -> Item:
     return item.moved((-middle[0], -middle[1], 0.0))
 
 
-def _free_floor(room: Room, surfaces: Any, path: Points, taken: Points) -> Points:
+def _free_floor(room: Room, surfaces: Surfaces, path: Points, taken: Points) -> Points:
     """(2,) the place on the floor nearest to the path that is clear of it, of all furniture and of places taken."""
     x, y = (np.arange(-side / 2, side / 2, FLOOR_STEP_M) for side in room.size[:2])
     floor = np.stack(np.meshgrid(x, y), axis=2).reshape(-1, 2)
@@ -173,7 +162,7 @@ def _free_floor(room: Room, surfaces: Any, path: Points, taken: Points) -> Point
 
 def _ring(room: Room, steps: int = 90) -> Points:
     """(steps, 2) a closed path around the middle, each step where the furniture leaves most room; smoothed."""
-    surfaces, angle = _surfaces([*room.objects, *room.shell]), 2 * np.pi * np.arange(steps) / steps
+    surfaces, angle = Surfaces([*room.objects, *room.shell]), 2 * np.pi * np.arange(steps) / steps
     around = np.stack([np.cos(angle), np.sin(angle)], axis=1) * np.array(room.size[:2]) / 2
     shares = np.linspace(0.3, 0.85, 23)
     places = around[:, None] * shares[None, :, None]
@@ -189,22 +178,7 @@ def _on_ring(path: Points, place: float) -> Points:
     return (1 - share) * path[first % len(path)] + share * path[(first + 1) % len(path)]
 
 
-def _clearance(surfaces: Any, places: Points) -> Points:
+def _clearance(surfaces: Surfaces, places: Points) -> Points:
     """(n,) metres from each place (n, 2) to the nearest surface between knee and sensor; the floor is one too."""
-    heights = (0.4, 0.65, SENSOR_HEIGHT_M)
-    distances: list[NDArray[np.float32]] = [
-        surfaces.compute_distance(_tensor(np.column_stack([places, np.full(len(places), z)]))).numpy() for z in heights
-    ]
-    return np.min(np.array(distances, np.float64), axis=0)
-
-
-def _surfaces(items: Any) -> Any:
-    scene = o3d.t.geometry.RaycastingScene()
-    for part in (part for item in items for part in item.parts):
-        scene.add_triangles(_tensor(part.vertices), _tensor(part.triangles, np.uint32))
-    return scene
-
-
-def _tensor(values: NDArray[Any], dtype: Any = np.float32) -> Any:
-    make_tensor: Any = o3d.core.Tensor
-    return make_tensor(np.ascontiguousarray(values, dtype))
+    at_heights = (np.column_stack([places, np.full(len(places), z)]) for z in (0.4, 0.65, SENSOR_HEIGHT_M))
+    return np.min([surfaces.distance_m(xyz) for xyz in at_heights], axis=0).astype(np.float64)

@@ -1,0 +1,18 @@
+"""What a demo prints while it runs: its stages with the seconds that each took."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+__all__ = ["stage"]
+
+
+@contextmanager
+def stage(name: str, seconds: dict[str, float]) -> Iterator[None]:
+    """Time what runs inside into ``seconds`` and print it when it is done."""
+    start = time.perf_counter()
+    yield
+    seconds[name] = time.perf_counter() - start
+    print(f"{name:<22} {seconds[name]:6.1f} s", flush=True)
