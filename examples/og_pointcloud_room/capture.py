@@ -216,7 +216,7 @@ def _sense(
     flying = (far > 1.05 * near) & (rng.uniform(size=len(pixel)) < settings.flying)
     depth_m = np.where(flying, near + rng.uniform(size=len(pixel)) * (far - near), depth_m)
     depth_m += settings.depth_noise * (0.0012 + 0.0019 * (depth_m - 0.4) ** 2) * rng.normal(size=len(pixel))
-    in_camera = intrinsics.directions()[pixel] * depth_m[:, None]
+    in_camera = intrinsics.directions().reshape(-1, 3)[pixel] * depth_m[:, None]
     xyz = rotated(in_camera, frame.camera_to_world[:3, :3]) + frame.camera_to_world[:3, 3]
     source = np.where(flying, FLYING, frame.owner.ravel()[pixel]).astype(np.int32)
     return xyz, frame.image.reshape(-1, 3)[pixel], source, depth_m < settings.range_m

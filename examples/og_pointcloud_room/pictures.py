@@ -6,6 +6,7 @@ A picture of the cloud looks into the room: the ceiling and the walls on the eye
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -23,6 +24,8 @@ CUT_M = 2.3
 """Points above are cut away, so that one sees into the room; metres above the floor."""
 WALL_M = 0.15
 """What lies nearer than this to the end of the room is a wall, or hangs on one."""
+STEP_BACK = 1.4
+"""Of the eye, so that walls and what hangs on them are in the picture too."""
 PICTURE_WIDTH = 1000
 
 Colours = NDArray[np.uint8]
@@ -82,5 +85,6 @@ def _look_into_room(result: Segmentation) -> tuple[NDArray[np.bool_], Viewpoint]
     beyond = (xyz - middle)[:, :2]
     inside = below & (np.abs(beyond) < half[:2] - WALL_M).all(axis=1)
     view = choose_viewpoint(xyz[inside], result.labels[inside] >= 0, np.array([0.0, 0.0, 1.0]))
+    view = replace(view, eye=view.target + STEP_BACK * (view.eye - view.target))
     before_eye = beyond * np.sign(view.eye - middle)[:2] > half[:2] - WALL_M
     return below & ~before_eye.any(axis=1), view

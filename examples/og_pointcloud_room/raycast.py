@@ -97,11 +97,10 @@ class Intrinsics:
     focal_px: float
 
     def directions(self) -> Points:
-        """(H * W, 3) ray directions in the camera's frame (OpenCV), z = 1, through pixel centres, row by row."""
+        """(H, W, 3) ray directions in the camera's frame (OpenCV), z = 1, through pixel centres."""
         x = (np.arange(self.width) + 0.5 - self.width / 2) / self.focal_px
         y = (np.arange(self.height) + 0.5 - self.height / 2) / self.focal_px
-        grid = np.stack([*np.meshgrid(x, y), np.ones((self.height, self.width))], axis=2)
-        return grid.reshape(-1, 3).astype(np.float64)
+        return np.stack([*np.meshgrid(x, y), np.ones((self.height, self.width))], axis=2).astype(np.float64)
 
 
 @dataclass(frozen=True)
@@ -139,7 +138,7 @@ class RayCaster:
         ValueError where a ray leaves the room.
         """
         shape, eye = (intrinsics.height, intrinsics.width), camera_to_world[:3, 3]
-        directions = rotated(intrinsics.directions(), camera_to_world[:3, :3])
+        directions = rotated(intrinsics.directions().reshape(-1, 3), camera_to_world[:3, :3])
         hits = self.surfaces.cast(eye, directions)
         if (hits.part < 0).any():
             raise ValueError(f"{int((hits.part < 0).sum())} rays leave the room; expected a camera inside it")
