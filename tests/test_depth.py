@@ -18,7 +18,7 @@ from scenes import (
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.depth import DepthFile, DepthFrame, DepthImage, resampled
 from og_pointcloud.formats.distortion import lens_distortion
-from og_pointcloud.formats.fusion import _slot, doubts, evenly, fuse, on_surface, survey, to_world
+from og_pointcloud.formats.fusion import _Voxels, doubts, evenly, fuse, on_surface, survey, to_world
 
 WIDTH, HEIGHT = ROOM_SIZE
 POSE = room_poses()[0]
@@ -249,15 +249,19 @@ def test_evenly_takes_first_and_last():
     assert evenly([], 3) == []
 
 
-def test_keys_that_meet_in_the_table_find_slots_of_their_own():
-    table = np.full(8, -1, np.int64)
-    slots = []
-    for key in range(7):
-        slot = int(_slot(key, table))
-        table[slot] = key
-        slots.append(slot)
-    assert len(set(slots)) == 7
-    assert [int(_slot(key, table)) for key in range(7)] == slots
+def test_voxels_are_the_means_of_their_points_however_often_they_are_added_to():
+    rng = np.random.default_rng(0)
+    xyz, rgb = rng.normal(size=(4000, 3)), rng.integers(0, 256, (4000, 3))
+    voxels = _Voxels(0.25)
+    for rows in np.array_split(rng.permutation(4000), 9):
+        voxels.add(xyz[rows], rgb[rows], "points")
+    cells, cell = np.unique(np.floor(xyz / 0.25), axis=0, return_inverse=True)
+    means, colors = voxels.means()
+    assert len(means) == len(cells)
+    for k in range(len(cells)):
+        np.testing.assert_allclose(means[k], xyz[cell.ravel() == k].mean(axis=0), atol=1e-12)
+        np.testing.assert_allclose(colors[k], rgb[cell.ravel() == k].mean(axis=0), atol=1e-12)
+    assert len(_Voxels(1.0).means()[0]) == 0
 
 
 # Doubts ---------------------------------------------------------------------------------------------------------

@@ -54,8 +54,6 @@ VOXEL_TOLERANCE, NOISE_TOLERANCE = 1.5, 3.0
 ROUNDS = 2
 VOXELS_ACROSS = 1 << 21
 """Along each axis, so that a voxel's three indices fit one 64-bit key."""
-FREE = -1
-FIBONACCI = np.uint64(0x9E3779B97F4A7C15)
 
 COMPARED = 12
 """Views, spread evenly, that the two checks read."""
@@ -297,13 +295,12 @@ def _add_votes(xyz, rotation, center, lens, depth, surface, nearest, tolerance, 
 
 
 class _Voxels:
-    """Mean position and colour by voxel: a hash table of keys with open addressing, grown as it fills."""
+    """Mean position and colour by voxel: sums by key, ascending, and the points that wait to be added to them."""
 
     def __init__(self, edge: float) -> None:
         self._edge = edge
-        self._keys = np.full(1 << 16, FREE, np.int64)
-        self._sums = np.zeros((1 << 16, 7))
-        self._filled = 0
+        self._merged = np.zeros(0, np.int64), np.zeros((0, 7))
+        self._waiting: list[tuple[NDArray[np.int64], Doubles]] = []
 
     def add(self, xyz: Doubles, rgb: NDArray[Any], source: str) -> None:
         """xyz: (n, 3), within VOXELS_ACROSS / 2 voxels of 0. rgb: (n, 3). source: of the points, for the error."""
@@ -313,60 +310,29 @@ class _Voxels:
                 f"{source} has points {farthest:.3g} from the middle of the cameras, in voxels of {self._edge:.3g}; "
                 f"expected fewer than {VOXELS_ACROSS // 2} voxels: check its pose and the depth unit"
             )
-        while 2 * (self._filled + len(xyz)) > len(self._keys):
-            self._grow()
-        self._filled += _insert_points(xyz, rgb, self._edge, self._keys, self._sums)
+        x, y, z = (np.floor(xyz / self._edge).astype(np.int64) + VOXELS_ACROSS // 2).T
+        keys = (x * VOXELS_ACROSS + y) * VOXELS_ACROSS + z
+        self._waiting.append((keys, np.column_stack([xyz, rgb, np.ones(len(xyz))])))
+        # Merged when as much waits as is there: every voxel is then sorted a few times, not once a frame.
+        if sum(len(keys) for keys, _ in self._waiting) > len(self._merged[0]):
+            self._merge()
 
     def means(self) -> tuple[Doubles, Doubles]:
         """(n, 3) positions and (n, 3) colours, in the order of the voxels."""
-        used = np.flatnonzero(self._keys != FREE)
-        sums = self._sums[used[np.argsort(self._keys[used])]]
+        self._merge()
+        sums = self._merged[1]
         means = sums[:, :6] / sums[:, 6:]
         return means[:, :3], means[:, 3:]
 
-    def _grow(self) -> None:
-        used = self._keys != FREE
-        keys, sums = self._keys[used], self._sums[used]
-        size = 2 * len(self._keys)
-        self._keys, self._sums = np.full(size, FREE, np.int64), np.zeros((size, 7))
-        _insert_sums(keys, sums, self._keys, self._sums)
+    def _merge(self) -> None:
+        keys, sums = zip(self._merged, *self._waiting, strict=True)
+        self._merged, self._waiting = _summed(np.concatenate(keys), np.concatenate(sums)), []
 
 
-@njit(cache=True)
-def _slot(key, table):  # noqa: ANN001, ANN202
-    """Where the key is, or belongs. The table must have a free slot."""
-    mask = np.uint64(len(table) - 1)
-    slot = ((np.uint64(key) * FIBONACCI) >> np.uint64(20)) & mask
-    while table[slot] != FREE and table[slot] != key:
-        slot = (slot + np.uint64(1)) & mask
-    return slot
-
-
-@njit(cache=True)
-def _insert_points(xyz, rgb, edge, table, sums):  # noqa: ANN001, ANN202
-    """Add points to the sums of their voxels; the number of voxels that are new."""
-    new = 0
-    for i in range(len(xyz)):
-        key = 0
-        for axis in range(3):
-            key = key * VOXELS_ACROSS + int(np.floor(xyz[i, axis] / edge)) + VOXELS_ACROSS // 2
-        slot = _slot(key, table)
-        if table[slot] == FREE:
-            table[slot] = key
-            new += 1
-        for axis in range(3):
-            sums[slot, axis] += xyz[i, axis]
-            sums[slot, 3 + axis] += rgb[i, axis]
-        sums[slot, 6] += 1
-    return new
-
-
-@njit(cache=True)
-def _insert_sums(keys, rows, table, sums):  # noqa: ANN001, ANN202
-    for i in range(len(keys)):
-        slot = _slot(keys[i], table)
-        table[slot] = keys[i]
-        sums[slot] = rows[i]
+def _summed(keys: NDArray[np.int64], rows: Doubles) -> tuple[NDArray[np.int64], Doubles]:
+    """The keys that occur, ascending, and the sum of each one's rows, added up in their order."""
+    unique, index = np.unique(keys, return_inverse=True)
+    return unique, np.column_stack([np.bincount(index, column, len(unique)) for column in rows.T])
 
 
 @dataclass(frozen=True)
