@@ -119,18 +119,8 @@ def bottle(rng: Random) -> Item:
 def vase(rng: Random) -> Item:
     """Bulged, open vase, 20-30 cm tall."""
     radius, height = rng.uniform(0.07, 0.095), rng.uniform(0.2, 0.3)
-    profile = [
-        (0, 0),
-        (0.6, 0),
-        (0.9, 0.2),
-        (1, 0.4),
-        (0.8, 0.65),
-        (0.45, 0.82),
-        (0.6, 1),
-        (0.48, 0.98),
-        (0.3, 0.8),
-        (0, 0.7),
-    ]
+    below = [(0, 0), (0.6, 0), (0.9, 0.2), (1, 0.4), (0.8, 0.65), (0.45, 0.82), (0.6, 1)]
+    profile = [*below, (0.48, 0.98), (0.3, 0.8), (0, 0.7)]
     return Item("vase", (lathe([(r * radius, z * height) for r, z in profile], (0, 0, 0), paint(rng, 0.45)),))
 
 
