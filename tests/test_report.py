@@ -310,6 +310,12 @@ def test_the_command_writes_table_chart_and_page(folder, tmp_path, capsys):
     assert "border rounds: 0" in (out / "report.html").read_text()
 
 
+def test_ablations_need_truth(tiny_capture, tmp_path, capsys):
+    assert main(["report", str(tiny_capture.folder), "--ablation", "-o", str(tmp_path / "r")]) == 2
+    assert "capture lacks gt.npz or text_features.npz" in capsys.readouterr().err
+    assert not (tmp_path / "r").exists()
+
+
 @pytest.mark.slow
 def test_the_ablations_are_written_by_the_same_command(folder, tmp_path, capsys):
     assert main(["report", str(folder), "--ablation", "--seeds", "2", "-o", str(tmp_path)]) == 0

@@ -67,7 +67,14 @@ def run(arguments: argparse.Namespace) -> None:
         settings = settings_of(tuple(arguments.knob) if arguments.knob else QUICK if arguments.quick else None)
     # All are read before the first is worked on: what is missing in the last is told at once.
     folders = [*captures, *(made_room(seed, output) for seed in rooms)]
-    found = sweep([read_subject(folder) for folder in folders], settings, seeds=arguments.seeds)
+    subjects = [read_subject(folder) for folder in folders]
+    unknown = [subject.name for subject in subjects if subject.truth is None]
+    if arguments.ablation and unknown:
+        raise OgPointcloudError(
+            f"{unknown[0]} lacks gt.npz or text_features.npz; ablations compare words with the truth: take a capture "
+            "that has both, or a made room (--room 1)"
+        )
+    found = sweep(subjects, settings, seeds=arguments.seeds)
     output.mkdir(parents=True, exist_ok=True)
     write_rows(found.rows, rows)
     with replacing(picture) as file:
