@@ -156,7 +156,7 @@ def kinds_seen(capture: RoomCapture, frame: Frame) -> NDArray[np.int64]:
     """(H, W) index into KINDS of what each pixel shows; the ceiling counts as wall."""
     of_object = np.array([KINDS.index(item.name) for item in capture.room.objects] + [WALL])
     directions = capture.intrinsics.directions() @ frame.camera_to_world[2, :3]
-    height_m = directions * frame.depth_m + frame.camera_to_world[2, 3]
+    height_m = directions.reshape(frame.depth_m.shape) * frame.depth_m + frame.camera_to_world[2, 3]
     return np.where((frame.owner < 0) & (height_m < 0.02), FLOOR, of_object[frame.owner])
 
 

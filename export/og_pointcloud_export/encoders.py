@@ -30,9 +30,9 @@ from og_pointcloud.bundle.read import read_bundle
 from og_pointcloud.cloud import FeatureSpace
 from og_pointcloud.errors import MissingExtraError, OgPointcloudError
 from og_pointcloud.formats.npy import npy_bytes
+from og_pointcloud.formats.poses import read_json
 from og_pointcloud.masking import encode
 from og_pointcloud.masking.crops import WITH_CONTEXT, Crop
-from og_pointcloud.masking.existing import read_json
 from og_pointcloud.models import check_graph, open_session
 from og_pointcloud.text import encoder as text_encoder
 from og_pointcloud.text.encoder import TextEncoder, cache_folder, check_templates

@@ -87,7 +87,7 @@ def exported_kind(folder: Path) -> str:
 def model_kind(folder: Path) -> str | None:
     """What a transformers folder with weights is for, None for one of another kind."""
     from og_pointcloud.errors import SceneError
-    from og_pointcloud.masking.existing import read_json
+    from og_pointcloud.formats.poses import read_json
 
     config = folder / "config.json"
     if not config.is_file() or (not any(folder.glob("*.safetensors*")) and not any(folder.glob("*.bin"))):

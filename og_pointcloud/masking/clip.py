@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.errors import MissingExtraError, OgPointcloudError
+from og_pointcloud.formats.poses import read_json
 from og_pointcloud.masking.crops import WITH_CONTEXT, Crop, Preprocessing, Resample
-from og_pointcloud.masking.existing import read_json
 from og_pointcloud.models import MODEL_NAME
 
 try:
