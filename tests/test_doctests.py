@@ -1,32 +1,42 @@
-"""Every public name has an example in its docstring, and every example holds."""
+"""Every public name has an example in its docstring, and every example of a docstring holds."""
 
 import doctest
+import importlib
+from pathlib import Path
 
 import pytest
 
 import og_pointcloud as og
 
+ROOT = Path(__file__).parents[1]
+SOURCES = [path for folder in ("og_pointcloud", "export", "plugins") for path in (ROOT / folder).rglob("*.py")]
+WITH_EXAMPLES = [path for path in SOURCES if ">>> " in path.read_text()]
 CONSTANTS = {"BACKGROUND", "TOO_FAR", "UNKNOWN", "UNOBSERVED"}
-NAMES = sorted(set(og.__all__) - CONSTANTS)
-FINDER = doctest.DocTestFinder(recurse=False)
+OPTIONS = doctest.NORMALIZE_WHITESPACE | doctest.ELLIPSIS
 
 
-def run(name, known):
-    """Runs the examples of one docstring on a copy of what is known; how many there are, and what they make known."""
-    (example,) = FINDER.find(getattr(og, name), name, module=False, globs=known)
-    count = len(example.examples)
-    said: list[str] = []
-    done = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS).run(example, out=said.append, clear_globs=False)
-    assert done.failed == 0, "".join(said)
-    return count, example.globs
+def example_of(name):
+    """The examples of a public name's own docstring, those of its methods left out."""
+    return doctest.DocTestFinder(recurse=False).find(getattr(og, name), name, module=False, globs={})[0]
 
 
 @pytest.fixture(scope="module")
 def known():
     """What other examples start from: the cloud that LabelledCloud's own makes."""
-    return run("LabelledCloud", {})[1]
+    example = example_of("LabelledCloud")
+    assert doctest.DocTestRunner(optionflags=OPTIONS).run(example, clear_globs=False).failed == 0
+    return {name: example.globs[name] for name in ("cloud", "np", "og")}
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_the_example_of_each_public_name_holds(name, known):
-    assert run(name, {} if name == "LabelledCloud" else dict(known))[0] >= 1
+@pytest.mark.parametrize("name", sorted(set(og.__all__) - CONSTANTS))
+def test_each_public_name_has_an_example(name):
+    assert len(example_of(name).examples) > 0
+
+
+@pytest.mark.parametrize("path", WITH_EXAMPLES, ids=lambda path: path.stem)
+def test_the_examples_of_each_module_hold(path, known):
+    top = next(parent for parent in (ROOT / "export", ROOT / "plugins", ROOT) if parent in path.parents)
+    module = importlib.import_module(".".join(path.relative_to(top).with_suffix("").parts))
+    result = doctest.testmod(module, optionflags=OPTIONS, extraglobs=known)
+    assert result.attempted > 0
+    assert result.failed == 0
