@@ -61,9 +61,9 @@ def _floor(module: str) -> float:
     place = rest.split(".")[0]
     if package == "og_pointcloud":
         if not rest:
-            return len(FOLDERS)  # the face, which fetches names when they are used
+            return FOLDERS.index("evaluate") + 0.5  # the face, which hosts use and which fetches names when used
         return -1 if place in RECORDS else FOLDERS.index(place) if place in FOLDERS else len(FOLDERS)
-    # The exporter writes what the core has made; hosts stand above all but the command line.
+    # The exporter writes what the core has made; hosts use the core and the exporter; the command line uses all.
     return FOLDERS.index("evaluate") + (0.3 if package == "og_pointcloud_export" else 0.6)
 
 
