@@ -332,7 +332,8 @@ class _Voxels:
 def _summed(keys: NDArray[np.int64], rows: Doubles) -> tuple[NDArray[np.int64], Doubles]:
     """The keys that occur, ascending, and the sum of each one's rows, added up in their order."""
     unique, index = np.unique(keys, return_inverse=True)
-    return unique, np.column_stack([np.bincount(index, column, len(unique)) for column in rows.T])
+    sums = [np.bincount(index, column, len(unique)) for column in rows.T]
+    return unique, np.column_stack(sums).astype(np.float64, copy=False)
 
 
 @dataclass(frozen=True)
