@@ -84,7 +84,7 @@ class MembershipSettings:
     possible_share: float = 0.2
     """A point may be of an instance from this share on, if it adjoins sure ones."""
     covered_share: float = 0.7
-    """A point is no background when views say "in some mask" with more than this share of their words."""
+    """A point is no background when more than this share of the votes is for "in some mask"."""
     growth_votes: float = 0.25
     """This share of the adjoining points must be of the instance already."""
     rate_share: float = 0.25
@@ -114,18 +114,15 @@ class AssociationSettings:
 
 
 @dataclass(frozen=True)
-class FeatureSettings:
-    """Instance features from the mask table (features.py; paper, Sec. 3.1, Eq. 1 and 2)."""
+class _LossSettings:
+    """Features and the losses that they are learned by (paper, Sec. 3.1, Eq. 1 and 2)."""
 
     width: int = 6
     """Columns of a feature (paper, Sec. 3.1)."""
     formula: Literal["paper", "authors"] = "paper"
-    """Eq. 1 and 2 as printed, or as the authors' code computes them; features.py says what differs."""
+    """Eq. 1, 2 and 4 as printed, or as the authors' code computes them; the docs of the modules say what differs."""
     normalise: bool = True
-    """Read a feature as its direction, mapped to [0, 1] (the authors' code), or as it is, within the unit ball."""
-    start: Literal["masks", "random"] = "masks"
-    """Each Gaussian starts at the mean of random directions of its masks, which groups it already; or at a random
-    direction of its own (nearly as the authors' code, from U(0, 1))."""
+    """Read a feature as its direction, mapped to [0, 1] (the authors' code), or as it is (the paper)."""
     intra: bool = True
     """Use the intra-mask smoothing loss (Eq. 1)."""
     inter: bool = True
@@ -133,6 +130,23 @@ class FeatureSettings:
     cohesion_weight: float | None = None
     """Weight of Eq. 1, as a mean over pixels, beside Eq. 2. None: 0.1 with the authors' formula, as in their code; 10
     with the paper's, which gives none: squared distances are that much smaller."""
+
+    def __post_init__(self) -> None:
+        if self.width < 1:
+            raise OgPointcloudError(f"the width of features is {self.width}; expected at least 1, 6 as published")
+        if not (self.intra or self.inter):
+            raise OgPointcloudError("both losses are off; features need intra (Eq. 1), inter (Eq. 2), or both")
+        if self.cohesion_weight is not None and not self.cohesion_weight >= 0:
+            raise OgPointcloudError(f"cohesion_weight is {self.cohesion_weight}; expected 0 or more")
+
+
+@dataclass(frozen=True)
+class FeatureSettings(_LossSettings):
+    """Instance features from the mask table (learned/instance_features.py). As they are: within the unit ball."""
+
+    start: Literal["masks", "random"] = "masks"
+    """Each Gaussian starts at the mean of random directions of its masks, which groups it already; or at a random
+    direction of its own (nearly as the authors' code, from U(0, 1))."""
     closest: float = 0.05
     """Eq. 2 stops growing where two mask means are nearer than this share of their typical distance."""
     tolerance: float = 1e-3
@@ -141,14 +155,14 @@ class FeatureSettings:
     """Steps after which it ends without having converged."""
 
     def __post_init__(self) -> None:
-        _check_losses(self.width, self.intra, self.inter, self.cohesion_weight)
+        super().__post_init__()
         if self.start not in ("masks", "random"):
             raise OgPointcloudError(f'start is "{self.start}"; expected "masks" or "random"')
 
 
 @dataclass(frozen=True)
 class CodebookSettings:
-    """Two-level codebook without rendering (codebook.py; paper, Sec. 3.2, Eq. 3)."""
+    """Two-level codebook without rendering (learned/codebook.py; paper, Sec. 3.2, Eq. 3)."""
 
     levels: Literal[1, 2] = 2
     """Coarse clusters alone, or fine ones within them where their masks say that they hold several things."""
@@ -179,7 +193,7 @@ class CodebookSettings:
 
 @dataclass(frozen=True)
 class MatchingSettings:
-    """Masks of instances that a codebook made (matching.py; paper, Sec. 3.3, Eq. 5)."""
+    """Masks of instances that a codebook made (learned/matching.py; paper, Sec. 3.3, Eq. 5)."""
 
     score: Literal["both", "iou", "feature"] = "both"
     """Eq. 5, or one of its factors alone (the paper's ablation)."""
@@ -207,26 +221,15 @@ class MatchingSettings:
 
 
 @dataclass(frozen=True)
-class PaperSettings:
-    """The method as published, by rendering (paper.py). Steps are those of the authors' code at schedule_share 1."""
+class PaperSettings(_LossSettings):
+    """The method as published, by rendering (learned/paper.py). At schedule_share 1 its steps are the authors'."""
 
     schedule: Literal["scannet", "lerf"] = "scannet"
     """Steps of the three stages: 20k, 20k, 20k (ScanNet) or 10k, 10k, 20k (LeRF)."""
     schedule_share: float = 1.0
     """Shortens all stages alike."""
-    width: int = 6
-    """Columns of a feature (paper, Sec. 3.1)."""
     formula: Literal["paper", "authors"] = "authors"
-    """Eq. 1, 2 and 4 as printed, or as the authors' code computes them; paper.py says what differs."""
-    normalise: bool = True
-    """Read a feature as its direction, mapped to [0, 1] (the authors' code), or as it is (the paper)."""
-    intra: bool = True
-    """Use the intra-mask smoothing loss (Eq. 1)."""
-    inter: bool = True
-    """Use the inter-mask contrastive loss (Eq. 2)."""
-    cohesion_weight: float | None = None
-    """Weight of Eq. 1, as a mean over pixels, beside Eq. 2. None: 0.1 with the authors' formula, as in their code; 10
-    with the paper's, which gives none: squared distances are that much smaller."""
+    """Eq. 1, 2 and 4 as printed, or as the authors' code computes them; learned/paper.py says what differs."""
     scale: float = 0.7
     """Standard deviation of a plain cloud's Gaussians, in point spacings: full ones, as trained Gaussians are. Drawn as
     thin as the mask table wants them, an instance rendered alone would cover no pixel by covered_share."""
@@ -267,7 +270,7 @@ class PaperSettings:
     """Blending weights kept between steps; views beyond are rendered anew."""
 
     def __post_init__(self) -> None:
-        _check_losses(self.width, self.intra, self.inter, self.cohesion_weight)
+        super().__post_init__()
         for name in ("k1", "k2", "coarse_interval", "fine_interval", "lloyd_rounds"):
             if getattr(self, name) < 1:
                 raise OgPointcloudError(f"{name} is {getattr(self, name)}; expected at least 1")
@@ -277,19 +280,10 @@ class PaperSettings:
             )
 
 
-def _check_losses(width: int, intra: bool, inter: bool, cohesion_weight: float | None) -> None:
-    if width < 1:
-        raise OgPointcloudError(f"the width of features is {width}; expected at least 1, 6 as published")
-    if not (intra or inter):
-        raise OgPointcloudError("both losses are off; features need intra (Eq. 1), inter (Eq. 2), or both")
-    if cohesion_weight is not None and not cohesion_weight >= 0:
-        raise OgPointcloudError(f"cohesion_weight is {cohesion_weight}; expected 0 or more")
-
-
 @dataclass(frozen=True)
 class VisibilitySettings:
     """What is rendered of the views (splatting.py, coverage.py), and where the mask table is kept while it grows
-    (visibility.py, table_store.py). `examples/benchmark_visibility.py` gives error and time of each choice."""
+    (mask_table.py, work_folder.py). `examples/benchmark_visibility.py` gives error and time of each choice."""
 
     alpha_min: float = 1 / 255
     """Alpha below this is dropped (3DGS)."""
@@ -323,12 +317,13 @@ class FitSettings:
     """
 
     mode: Literal["auto", "grouping", "fast", "paper"] = "auto"
-    """The road from masks to instances (modes.py)."""
+    """How masks become instances (labellers.py)."""
     agreement_enough: float = 0.5
     """Mode auto learns features only where instances from grouping agree with less of the masks than this."""
     agreement_lead: float = 0.02
     """Mode auto takes learned instances only if they agree with this much more of the masks."""
     seed: int = 0
+    """Seed of all that is random."""
     memory: int | None = None
     """Bytes that the process may hold; None: half of what is free, beside what it holds already."""
     tile_points: int | None = None

@@ -20,7 +20,7 @@ from og_pointcloud.fitting.membership import (
     _best_group,
     _by_point,
     assign_points,
-    own_area,
+    instance_area,
     without_see_through,
 )
 from og_pointcloud.fitting.view_votes import OPENNESS_POWER, view_votes
@@ -291,9 +291,9 @@ def test_of_groups_that_cover_a_point_alike_the_lower_is_taken() -> None:
     assert ids == [0] * 50 + [BACKGROUND] * 50
 
 
-def test_own_area_is_what_the_masks_of_its_instance_show_of_a_point() -> None:
+def test_instance_area_is_what_the_masks_of_its_instance_show_of_a_point() -> None:
     table = hand_table(3, [[([0, 1], ONE), ([2], ONE)], [([0, 1, 2], ONE)]])
-    area = own_area(table, np.array([0, 1, 0], np.int32), np.array([0, BACKGROUND, 1], np.int32))
+    area = instance_area(table, np.array([0, 1, 0], np.int32), np.array([0, BACKGROUND, 1], np.int32))
     np.testing.assert_array_equal(area, [2, 0, 1])
 
 

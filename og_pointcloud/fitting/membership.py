@@ -2,9 +2,9 @@
 
 A mask covers a point or it does not; what matters is what the *other* views say. Let, for point g and instance k,
 
-    own_k(g)   votes for "in a mask of k" (see `view_votes`)
-    asked_k(g) all votes on g of the views that have a mask of k: those that could have voted so
-    share      own_k / asked_k
+    for_k(g)       votes for "in a mask of k" (see `view_votes`)
+    possible_k(g)  all votes on g of the views that have a mask of k: those that could have voted so
+    share          for_k / possible_k
 
 A view in which the proposer missed k has no vote about k; a view that has a mask of k and shows g outside it votes
 "not k". So a share near 1 means "k", near 0 "seen, and not k", however often the proposer misses. Rays that slip past
@@ -18,7 +18,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,31 +65,26 @@ def assign_points(
     has_mask = np.zeros((groups.count, table.outside.shape[0]), np.bool_)
     grouped = groups.group >= 0
     has_mask[groups.group[grouped], table.mask_view[grouped]] = True
-    every = np.ones(groups.count, np.bool_)
-    best, own, asked, total = _best_groups(votes, groups.group, has_mask, every)
-    share = own / np.maximum(asked, 1e-12)
-
-    rate, dismissed = _contradicted(best, share, own, asked, total, groups.count, settings)
+    support = _support(votes, groups.group, has_mask, np.ones(groups.count, np.bool_))
+    rate, dismissed = _contradicted(support, groups.count, settings)
     if dismissed.any():
-        best, own, asked, total = _best_groups(votes, groups.group, has_mask, ~dismissed)
-        share = own / np.maximum(asked, 1e-12)
+        support = _support(votes, groups.group, has_mask, ~dismissed)
+    group, share, total, around = support.group, support.share, support.total, neighbourhood
 
-    ids = np.where((best >= 0) & (share > settings.sure_share), best, BACKGROUND).astype(np.int32)
-    possible = (best >= 0) & (share > settings.possible_share)
-    ids = _grow(ids, best, possible, neighbourhood.index, neighbourhood.adjoining, settings.growth_votes)
+    # Sure points, and possible ones that adjoin them.
+    ids = np.where((group >= 0) & (share > settings.sure_share), group, BACKGROUND).astype(np.int32)
+    possible = (group >= 0) & (share > settings.possible_share)
+    ids = _grow(ids, group, possible, around.index, around.adjoining, settings.growth_votes)
     # Seen, but mostly inside masks: no background, however many instances claim it. Borders are settled below.
     covered = _column_sums(votes.in_mask.indices, votes.in_mask.data, len(ids))
-    ids = np.where((ids == BACKGROUND) & possible & (covered > settings.covered_share * total), best, ids)
-    ids = _without_islands(ids, own_area(table, groups.group, ids), neighbourhood, settings.island_share)
-    ids = _fill_unobserved(np.where((ids == BACKGROUND) & (total == 0), UNOBSERVED, ids), neighbourhood)
+    ids = np.where((ids == BACKGROUND) & possible & (covered > settings.covered_share * total), group, ids)
+    # What is seen through an instance is no part of it; what no view saw is as its neighbours are.
+    ids = _without_islands(ids, instance_area(table, groups.group, ids), around, settings.island_share)
+    ids = _fill_unobserved(np.where((ids == BACKGROUND) & (total == 0), UNOBSERVED, ids), around)
     for _ in range(settings.border_rounds):
-        ids = _settle_borders(
-            ids, share, neighbourhood.index, neighbourhood.adjoining, *settings.border_shares, settings.own_vote
-        )
-    for_its_state = np.where((best >= 0) & (ids == best), share, 1 - share)
-    certainty = np.where(total > 0, np.clip(for_its_state, 0, 1), 0) * _agreeing(
-        ids, neighbourhood.index, neighbourhood.adjoining
-    )
+        ids = _settle_borders(ids, share, around.index, around.adjoining, *settings.border_shares, settings.own_vote)
+    share_of_state = np.where((group >= 0) & (ids == group), share, 1 - share)
+    certainty = np.where(total > 0, np.clip(share_of_state, 0, 1), 0) * _agreeing(ids, around.index, around.adjoining)
     return Membership(
         ids.astype(np.int32), share.astype(np.float32), certainty.astype(np.float32), rate.astype(np.float32), dismissed
     )
@@ -151,11 +145,11 @@ def _with_entries(matrix: csr_array, source: csr_array, added: Mapping[int, NDAr
     """The matrix with entries of another added to its rows: row -> their places in the other."""
     rows = SparseRows(matrix.nnz + sum(map(len, added.values())), matrix.shape[1], in_file(matrix.data))
     for row in range(matrix.shape[0]):
-        own = matrix[[row]]
+        entries = matrix[[row]]
         if row in added:
             data, indices = source.data[added[row]], source.indices[added[row]]
-            own = csr_array(own + csr_array((data, indices, [0, len(data)]), shape=own.shape))
-        rows.append(own.nnz, own.indices, own.data)
+            entries = csr_array(entries + csr_array((data, indices, [0, len(data)]), shape=entries.shape))
+        rows.append(entries.nnz, entries.indices, entries.data)
     return rows.matrix()
 
 
@@ -178,10 +172,30 @@ def _behind_front(
     return behind
 
 
-def _best_groups(
+@dataclass(frozen=True)
+class _Support:
+    """What speaks for the group that most votes on a point are for. group: (n,) int32, -1 where there is none.
+    votes: (n,) float64, votes for it. possible: (n,) all votes of views that have a mask of it. total: (n,) all votes.
+    """
+
+    group: NDArray[np.int32]
+    votes: NDArray[np.float64]
+    possible: NDArray[np.float64]
+    total: NDArray[np.float64]
+
+    @property
+    def share(self) -> NDArray[np.float64]:
+        """(n,) the part of the possible votes that the group has."""
+        return self.votes / np.maximum(self.possible, 1e-12)
+
+
+def _support(
     votes: ViewVotes, group: NDArray[np.int32], has_mask: NDArray[np.bool_], allowed: NDArray[np.bool_]
-) -> tuple[NDArray[Any], ...]:
-    """`_best_group` of all points, so many at a time that their votes, sorted by point, fit into memory."""
+) -> _Support:
+    """The support of all points, so many at a time that their votes, sorted by point, fit into memory.
+
+    group: (masks,) the group of each mask. has_mask: (groups, views). allowed: (groups,) those that may be chosen.
+    """
     in_mask, vote = votes.in_mask, votes.vote
     n = in_mask.shape[1]
     runs = 1 + (in_mask.nnz + vote.nnz) // ENTRIES_AT_ONCE
@@ -190,7 +204,7 @@ def _best_groups(
         low, high = n * run // runs, n * (run + 1) // runs
         of_points = _by_point(in_mask, low, high), _by_point(vote, low, high)
         found.append(_best_group(*of_points, group, has_mask, allowed))
-    return tuple(np.concatenate(parts) for parts in zip(*found, strict=True))
+    return _Support(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
 
 
 def _by_point(
@@ -221,52 +235,48 @@ def _columns(indptr, indices, data, low, high):  # noqa: ANN001, ANN202
 
 @njit(cache=True, parallel=True)
 def _best_group(masks, views, group, has_mask, allowed):  # noqa: ANN001, ANN202
-    """Per point: the allowed group with the largest own weight (ties: the lower), own, asked, total weight."""
-    mask_start, mask_index, mask_weight = masks
-    view_start, view_index, view_weight = views
+    """Per point: the allowed group with the most votes (ties: the lower); `_Support`'s votes, possible and total."""
+    mask_start, mask_index, mask_vote = masks
+    view_start, view_index, view_vote = views
     n = len(mask_start) - 1
     best = np.full(n, -1, np.int32)
-    own = np.zeros(n)
-    asked = np.zeros(n)
+    votes = np.zeros(n)
+    possible = np.zeros(n)
     total = np.zeros(n)
     for g in prange(n):
         begin, end = mask_start[g], mask_start[g + 1]
+        # A point lies in few masks: for each, the votes of all masks of its group are added up anew.
         for e in range(begin, end):
             k = group[mask_index[e]]
             if k < 0 or not allowed[k]:
                 continue
-            weight = 0.0
+            of_group = 0.0
             for other in range(begin, end):
                 if group[mask_index[other]] == k:
-                    weight += mask_weight[other]
-            if weight > own[g] or (weight == own[g] and k < best[g]):
-                best[g], own[g] = k, weight
+                    of_group += mask_vote[other]
+            if of_group > votes[g] or (of_group == votes[g] and k < best[g]):
+                best[g], votes[g] = k, of_group
+        # Of the views, those that have a mask of the group could have voted for it.
         for e in range(view_start[g], view_start[g + 1]):
-            total[g] += view_weight[e]
+            total[g] += view_vote[e]
             if best[g] >= 0 and has_mask[best[g], view_index[e]]:
-                asked[g] += view_weight[e]
-    return best, own, asked, total
+                possible[g] += view_vote[e]
+    return best, votes, possible, total
 
 
 def _contradicted(
-    best: NDArray[np.int32],
-    share: NDArray[np.float64],
-    own: NDArray[np.float64],
-    asked: NDArray[np.float64],
-    total: NDArray[np.float64],
-    count: int,
-    settings: MembershipSettings,
+    support: _Support, count: int, settings: MembershipSettings
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Detection rate per group, and the groups whose rate is far below what the proposer reaches in this scene.
 
     How often the proposer misses is a property of the scene's masks: a detector may find a chair in a third of the
     views, a mask that one view of seventy shows is noise. The rate of the scene is the median over covered weight.
     """
-    sure = (best >= 0) & (share > 0.5)
-    group = best[sure]
-    visible = np.bincount(group, total[sure], count)
-    rate = np.bincount(group, asked[sure], count) / np.maximum(visible, 1e-12)
-    mass = np.bincount(group, own[sure], count)
+    sure = (support.group >= 0) & (support.share > 0.5)
+    group = support.group[sure]
+    visible = np.bincount(group, support.total[sure], count)
+    rate = np.bincount(group, support.possible[sure], count) / np.maximum(visible, 1e-12)
+    mass = np.bincount(group, support.votes[sure], count)
     if mass.sum() == 0:
         return rate, np.ones(count, bool)
     order = np.argsort(rate, kind="stable")
@@ -314,6 +324,7 @@ def _settle_borders(ids, share, neighbours, adjoining, low, high, own_vote):  # 
     for g in range(len(ids)):
         if not low < share[g] < high or ids[g] < BACKGROUND:
             continue
+        # The distinct states about the point, its own first, and the votes of each.
         states[0], votes[0], count = ids[g], own_vote, 1
         for k in range(width):
             other = neighbours[g, k]
@@ -347,16 +358,16 @@ def _agreeing(ids, neighbours, adjoining):  # noqa: ANN001, ANN202
     return agreeing
 
 
-def own_area(table: MaskTable, group: NDArray[np.int32], ids: NDArray[np.int32]) -> NDArray[np.float64]:
+def instance_area(table: MaskTable, group: NDArray[np.int32], ids: NDArray[np.int32]) -> NDArray[np.float64]:
     """(n,) float64: pixels of blending weight that the masks of each point's own instance put on it."""
     weights = table.weights
     area = np.zeros(len(ids))
-    _add_own(weights.indptr, weights.indices, weights.data, group, ids, area)
+    _add_area(weights.indptr, weights.indices, weights.data, group, ids, area)
     return area
 
 
 @njit(cache=True)
-def _add_own(indptr, indices, data, group, ids, area):  # noqa: ANN001, ANN202
+def _add_area(indptr, indices, data, group, ids, area):  # noqa: ANN001, ANN202
     for row in range(len(indptr) - 1):
         for e in range(indptr[row] if group[row] >= 0 else indptr[row + 1], indptr[row + 1]):
             if ids[indices[e]] == group[row]:
@@ -376,7 +387,7 @@ def _without_islands(
 ) -> NDArray[np.int32]:
     """Take from each instance the connected pieces whose points show less than ``share`` of what its main piece's do.
 
-    A floor that no view sees but through the table top above it has only the table's word; but of the pixels of the
+    A floor that no view sees but through the table top above it has only votes for the table; but of the pixels of the
     table's masks nearly all the weight stays on the top. A part of the object cut off by an occluder is seen as openly
     as the rest of it.
     """

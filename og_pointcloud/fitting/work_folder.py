@@ -84,6 +84,7 @@ class WorkFolder:
         them. folder None: a temporary one, made when it is needed, which goes in any case.
         """
         work = cls(None if folder is None else Path(folder))
+        new = [] if work.folder is None else [path for path in work.folder.parents if not path.exists()]
         lock = None if work.folder is None else _lock(work.folder)
         try:
             yield work
@@ -97,7 +98,8 @@ class WorkFolder:
                 with suppress(OSError):
                     (work.folder / LOCK).unlink()
                 with suppress(OSError):
-                    work.folder.rmdir()  # fails where there is more in it
+                    for path in (work.folder, *new):
+                        path.rmdir()  # fails where there is more in it
             if lock is not None:
                 lock.close()
 
