@@ -180,7 +180,7 @@ class CodebookSettings:
     """A mask counts in a cluster with this share of the mask, or of what its view shows of the cluster (the authors'
     code: overlap 0.2)."""
     view_quantile: float = 0.8
-    """Of the views' counts of masks in a cluster, this one is believed: a few views tear a thing into several masks."""
+    """Quantile of the views' counts of masks in a cluster that is believed: a few views tear one into many masks."""
     rounds: int = 30
     """Rounds of k-means at most."""
 

@@ -155,7 +155,7 @@ class _ShownView:
 
 
 def view_fingerprint(view: View, ids: NDArray[np.int32]) -> str:
-    """Of all that the rows of a view depend on but for the geometry; ids: its mask map."""
+    """Tells all that the rows of a view depend on but for the geometry. ids: its mask map."""
     camera = view.camera
     numbers = camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy, view.mask_count
     return fingerprint(numbers, camera.world_to_camera, ids)

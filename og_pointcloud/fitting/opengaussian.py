@@ -45,7 +45,7 @@ CLUSTERS_NAME = "cluster_lang.npz"
 MIN_OPACITY = 0.1
 """Gaussians less opaque cannot be seen; the authors' ScanNet evaluation leaves out the same ones."""
 MAX_UNPACKED_BYTES = 1 << 31
-"""Of the four arrays together; ten million Gaussians and a thousand leaves need 82 MB."""
+"""Bytes of the four arrays together; ten million Gaussians and a thousand leaves need 82 MB."""
 
 
 @dataclass(frozen=True)

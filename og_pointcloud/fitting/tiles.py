@@ -64,7 +64,7 @@ MODES = ("auto", "grouping")
 """Modes that need no more than masks; the others learn from all points at once."""
 
 MARGIN = 32.0
-"""How far a tile looks over its borders, in spacings of its sparser points: what settles a point is seldom farther."""
+"""How far a tile looks over its borders, in spacings of its sparser points: what decides a point lies nearer."""
 SAMPLE_STEP = 50
 """Masks are grouped by at least one in so many points, also where that is more than a whole fit would take."""
 FINEST_PX = 0.35

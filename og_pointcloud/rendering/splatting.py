@@ -153,7 +153,7 @@ def view_weights(
 ) -> ViewWeights:
     """Blending weight of every Gaussian summed over the pixels of every id of one view.
 
-    ids: (H, W) int32 in -1..id_count-1, H and W the camera's. thickness: see `visibility.mask_table`.
+    ids: (H, W) int32 in -1..id_count-1, H and W the camera's. thickness: see `mask_table.mask_table`.
     Splats are blended by (float32 depth, index), so that equal depths have one order.
     """
     (rows, cols, weights, first, counts), area = _entries(gaussians, camera, ids, id_count, near, thickness, cutoffs)
@@ -370,6 +370,7 @@ def _bin(splats, order, columns, tiles, cutoffs, bands):  # noqa: ANN001, ANN202
         s = splats[order[i]]
         ranges[i, 0], ranges[i, 1] = s.x0 // TILE, s.x1 // TILE + 1
         ranges[i, 2], ranges[i, 3] = s.y0 // TILE, s.y1 // TILE + 1
+    # First pass: how many splats each tile has. A band of rows of tiles is one thread's, so none writes to another's.
     counts = np.zeros(tiles + 1, np.int64)
     for band in prange(bands):
         low, high = band * tile_rows // bands, (band + 1) * tile_rows // bands
@@ -378,6 +379,7 @@ def _bin(splats, order, columns, tiles, cutoffs, bands):  # noqa: ANN001, ANN202
                 begin, end = _tiles_of_row(splats, order[i], row, ranges[i, 0], ranges[i, 1], log2_least)
                 for column in range(begin, end):
                     counts[row * columns + column + 1] += 1
+    # Second pass: the splats themselves, in order of depth as they come.
     starts = np.cumsum(counts)
     members = np.empty(starts[-1], np.int32)
     fill = starts[:-1].copy()
@@ -538,17 +540,21 @@ def _blend(s, left, top, log2_least, least_light, light, surface, shown):  # noq
     across, depth, near_side, least = spread(s.across), spread(s.depth), spread(s.surface), spread(log2_least)
     weight, through = none, none
     for y in range(max(s.y0 - top, 0), min(s.y1 + 1 - top, TILE)):
+        # log2 of alpha along the row: a parabola about the row's middle, which lies a shear off the centre.
         dy = top + y + 0.5 - s.v
         distance = (ramp() - spread(np.float32(s.u - s.shear * dy - left - 0.5))) * across
         log_alpha = spread(np.float32(s.peak - s.down * dy * dy)) - distance * distance
+        # Alpha, cut at both ends as in 3DGS; 0 where the splat does not reach.
         covers = log_alpha >= least
         alpha = lesser(exp2(either(covers, log_alpha, least)), spread(np.float32(ALPHA_MAX)))
         alpha = either(covers, alpha, none)
+        # Weight = transmittance before the splat times alpha, but for pixels that this splat would finish.
         before = load(light, y * TILE)
         after = before * (full - alpha)
         goes_on = after >= spread(least_light)  # also where it is not covered and not finished
         here = either(goes_on, before * alpha, none)
         store(light, y * TILE, either(goes_on, after, none))
+        # The splat at which the transmittance falls below a half is the pixel's surface.
         passed = either((before >= half) & (after < half), depth, never)
         front = lesser(load(surface, y * TILE), passed)
         store(surface, y * TILE, front)
@@ -596,6 +602,7 @@ def _is_open(light):  # noqa: ANN001, ANN202
 @njit(cache=True, nogil=True)
 def _merge(rows, cols, weights, first, counts, row_count, n):  # noqa: ANN001, ANN202
     """Tiles' entries as CSR (data, indices, indptr), one entry per (mask, Gaussian)."""
+    # Count the entries of each row, then put them there (a counting sort: tiles stay in order within a row).
     start = np.zeros(row_count + 1, np.int64)
     for tile in range(len(first)):
         for e in range(first[tile], first[tile] + counts[tile]):
@@ -610,6 +617,7 @@ def _merge(rows, cols, weights, first, counts, row_count, n):  # noqa: ANN001, A
             sorted_cols[p], sorted_weights[p] = cols[e], weights[e]
             place[rows[e]] = p + 1
     # A Gaussian over a tile border has an entry from each tile: fold them together, row by row.
+    # ``where`` holds a Gaussian's place in the output; one from before this row's begin is of an earlier row.
     where = np.full(n, -1, np.int64)
     indptr = np.zeros(row_count + 1, np.int32)
     out = 0
