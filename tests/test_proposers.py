@@ -20,9 +20,10 @@ from og_pointcloud.masking.automatic import (
     stability,
     without_specks,
 )
-from og_pointcloud.masking.contracts import DepthMaskProposer, Proposals, open_proposer
+from og_pointcloud.masking.contracts import DepthMaskProposer, Proposals
 from og_pointcloud.masking.existing import CallableProposer, ExistingMasks, as_proposals, decode_rle, from_ids
 from og_pointcloud.masking.opencv import OpenCVProposer, region_tree
+from og_pointcloud.masking.worker import open_proposer
 from og_pointcloud.scene import Camera
 
 

@@ -7,7 +7,7 @@ import pytest
 from onnx import TensorProto, helper, numpy_helper
 
 from og_pointcloud.errors import SceneError
-from og_pointcloud.masking.contracts import open_proposer
+from og_pointcloud.masking.worker import open_proposer
 
 FLOAT = TensorProto.FLOAT
 

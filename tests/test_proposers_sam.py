@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from og_pointcloud.errors import SceneError
-from og_pointcloud.masking.contracts import open_proposer
+from og_pointcloud.masking.worker import open_proposer
 
 torch = pytest.importorskip("torch")
 transformers = pytest.importorskip("transformers")

@@ -1,4 +1,4 @@
-"""What the front end agrees on: proposers and encoders as protocols, the settings, and how a proposer is named."""
+"""What the front end agrees on: proposers and encoders as protocols, and the settings."""
 
 from __future__ import annotations
 
@@ -12,10 +12,7 @@ from numpy.typing import NDArray
 
 from og_pointcloud.errors import OgPointcloudError, SceneError
 
-__all__ = [
-    "AGREED", "LEVELS", "DepthMaskProposer", "MaskEncoder", "MaskProposer", "MaskSettings", "Proposals",
-    "open_proposer",
-]  # fmt: skip
+__all__ = ["AGREED", "LEVELS", "DepthMaskProposer", "MaskEncoder", "MaskProposer", "MaskSettings", "Proposals"]
 
 LEVELS = ("small", "medium", "large")
 """How much is one mask, as SAM and LangSplat call it."""
@@ -92,7 +89,7 @@ class DepthMaskProposer(Protocol):
 class MaskSettings:
     """How masks are made; what changes one of these starts anew.
 
-    proposer: see `open_proposer`, or a folder of masks. encoder: see `encode.open_encoder`; None: masks alone, with
+    proposer: see `worker.open_proposer`. encoder: see `encode.open_encoder`; None: masks alone, with
     zero features. level: small, medium or large, for ``masks/`` (LangSplat's files have all); or agreed: all images
     are proposed for first, and proposals count by how far other views confirm them (`agreement`).
     longest_side: larger images are shrunk to this; masks have the shrunk size.
@@ -135,34 +132,3 @@ class MaskSettings:
         cores by themselves."""
         light = (self.proposer == "opencv" or Path(self.proposer).is_dir()) and self.encoder in (None, "demo")
         return min(os.cpu_count() or 1, max(1, images // IMAGES_A_PROCESS)) if light else 1
-
-
-def open_proposer(text: str, *, seconds_per_image: float | None = None, download: bool = False) -> MaskProposer:
-    """``opencv``; ``sam:FOLDER`` or ``sam:OWNER/MODEL``; ``onnx:ENCODER,DECODER``, SAM as two ONNX files;
-    ``python:MODULE:NAME``, a function or proposer of the user's own (`existing.own_proposer`).
-
-    seconds_per_image: where SAM stops adding prompts; None: never. download: let transformers fetch the model.
-    Nothing is downloaded otherwise. SceneError names what is known. A folder of masks is no proposer of this kind: it
-    goes by the image's name (`existing.ExistingMasks`).
-    """
-    kind, _, name = text.partition(":")
-    if text == "opencv":
-        from og_pointcloud.masking.opencv import OpenCVProposer
-
-        return OpenCVProposer()
-    if kind == "sam" and name:
-        from og_pointcloud.masking.sam import open_sam
-
-        return open_sam(name, seconds_per_image=seconds_per_image, download=download)
-    if kind == "onnx" and name:
-        from og_pointcloud.masking.onnx import open_onnx
-
-        return open_onnx([Path(part) for part in name.split(",")], seconds_per_image=seconds_per_image)
-    if kind == "python" and name:
-        from og_pointcloud.masking.existing import own_proposer
-
-        return own_proposer(name)
-    raise SceneError(
-        f"proposer is '{text}'; expected opencv, sam:FOLDER, sam:OWNER/MODEL, "
-        "onnx:ENCODER.onnx,DECODER.onnx, python:MODULE:NAME, or a folder of id PNGs or COCO JSON files"
-    )

@@ -41,14 +41,13 @@ from og_pointcloud.masking.contracts import (
     MaskProposer,
     MaskSettings,
     Proposals,
-    open_proposer,
 )
-from og_pointcloud.masking.existing import ExistingMasks
+from og_pointcloud.masking.existing import ExistingMasks, own_proposer
 from og_pointcloud.masking.levels import AGREED_PREFERENCE, PREFERENCE, settle
 from og_pointcloud.masking.photographs import Photograph, read_cloud
 from og_pointcloud.scene import Camera
 
-__all__ = ["AGREEMENT_POINTS", "ImageTask", "read_work", "results"]
+__all__ = ["AGREEMENT_POINTS", "ImageTask", "open_proposer", "read_work", "results"]
 
 THREAD_VARIABLES = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 
@@ -195,6 +194,35 @@ def _open_proposer(settings: MaskSettings) -> MaskProposer | ExistingMasks:
     if folder.is_dir():
         return ExistingMasks(folder)
     return open_proposer(settings.proposer, seconds_per_image=settings.seconds_per_image, download=settings.download)
+
+
+def open_proposer(text: str, *, seconds_per_image: float | None = None, download: bool = False) -> MaskProposer:
+    """``opencv``; ``sam:FOLDER`` or ``sam:OWNER/MODEL``; ``onnx:ENCODER,DECODER``, SAM as two ONNX files;
+    ``python:MODULE:NAME``, a function or proposer of the user's own (`existing.own_proposer`).
+
+    seconds_per_image: where SAM stops adding prompts; None: never. download: let transformers fetch the model.
+    Nothing is downloaded otherwise. SceneError names what is known. A folder of masks is no proposer of this kind: it
+    goes by the image's name (`existing.ExistingMasks`).
+    """
+    kind, _, name = text.partition(":")
+    if text == "opencv":
+        from og_pointcloud.masking.opencv import OpenCVProposer
+
+        return OpenCVProposer()
+    if kind == "sam" and name:
+        from og_pointcloud.masking.sam import open_sam
+
+        return open_sam(name, seconds_per_image=seconds_per_image, download=download)
+    if kind == "onnx" and name:
+        from og_pointcloud.masking.onnx import open_onnx
+
+        return open_onnx([Path(part) for part in name.split(",")], seconds_per_image=seconds_per_image)
+    if kind == "python" and name:
+        return own_proposer(name)
+    raise SceneError(
+        f"proposer is '{text}'; expected opencv, sam:FOLDER, sam:OWNER/MODEL, "
+        "onnx:ENCODER.onnx,DECODER.onnx, python:MODULE:NAME, or a folder of id PNGs or COCO JSON files"
+    )
 
 
 def _open_encoder(name: str | None) -> MaskEncoder | None:
