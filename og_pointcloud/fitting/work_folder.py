@@ -40,6 +40,8 @@ SUFFIX = ".kept.npy"
 LOCK = ".lock"
 ALIGNED = 64
 """Arrays begin at multiples of so many bytes of a file."""
+OWN_PAGES = 1 << 17
+"""Bytes from which an array that is held gets memory of its own from the system."""
 
 Arrays = tuple[NDArray[Any], ...]
 
@@ -125,7 +127,7 @@ class WorkFolder:
         made = tuple(make())
         with self._guard:
             if self._pending is not None:
-                self._pending[label] = made
+                self._pending[label] = made = tuple(map(_on_own_pages, made))
                 self._bytes_pending += sum(array.nbytes for array in made)
                 if time.monotonic() > self._pending_until or self._bytes_pending > self._most_pending:
                     for waiting, arrays in self._pending.items():
@@ -178,6 +180,17 @@ class WorkFolder:
             self._sound.add(label)
             self.found += 1
         return arrays
+
+
+def _on_own_pages(array: NDArray[Any]) -> NDArray[Any]:
+    """A copy of a large array whose memory goes back to the system when it is let go: pieces of the heap would not, and
+    a table put together from such pieces would be in memory twice."""
+    if array.nbytes < OWN_PAGES:
+        return array
+    private = {"flags": mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS} if hasattr(mmap, "MAP_PRIVATE") else {}
+    copy = np.frombuffer(mmap.mmap(-1, array.nbytes, **private), array.dtype).reshape(array.shape)
+    copy[...] = array
+    return copy
 
 
 def _lock(folder: Path) -> IO[str] | None:
