@@ -30,7 +30,7 @@ def random_proposals(seed, count=25, size=(24, 32)):
     return Proposals(np.array(masks), rng.uniform(0.1, 1, count).astype(np.float32))
 
 
-def literal(said: Proposals, preference: float, smallest_px: int = 1):
+def literal(said: Proposals, preference: float):
     """The rules as written, pixel by pixel and mask by mask: the map of proposal numbers, -1 for none."""
     order = sorted(range(len(said)), key=lambda k: (-float(said.scores[k]), said.masks[k].sum(), k))
     kept: list[int] = []
@@ -68,7 +68,7 @@ def literal(said: Proposals, preference: float, smallest_px: int = 1):
     for k in reversed(used):
         result[said.masks[k]] = k
     for k in used:
-        if (result == k).sum() < max(VISIBLE * said.masks[k].sum(), smallest_px):
+        if (result == k).sum() < VISIBLE * said.masks[k].sum():
             result = np.where(result == k, -1 - len(said), result)
     return np.where(result < 0, -1, result)
 
@@ -80,9 +80,9 @@ def shown(level):
 @pytest.mark.parametrize("seed", range(12))
 def test_the_literal_reference(seed):
     said = random_proposals(seed)
-    levels = settle(said, smallest_px=6)
+    levels = settle(said)
     for name in PREFERENCE:
-        assert np.array_equal(shown(levels[name]), literal(said, PREFERENCE[name], 6)), name
+        assert np.array_equal(shown(levels[name]), literal(said, PREFERENCE[name])), name
         assert np.array_equal(levels[name].scores, said.scores[levels[name].proposals])
 
 
@@ -140,11 +140,6 @@ def test_nothing_and_empty_masks():
         assert level.ids.shape == (5, 7)
         assert (level.ids == -1).all()
         assert len(level.proposals) == len(level.masks()) == 0
-
-
-def test_tiny_masks_are_left_out():
-    levels = settle(proposals((rectangle(0, 0, 2, 2), 1.0), (rectangle(5, 5, 15, 15), 0.5)), smallest_px=5)
-    assert levels["small"].proposals.tolist() == [1]
 
 
 def test_proposals_are_checked():

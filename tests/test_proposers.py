@@ -10,17 +10,15 @@ import numpy as np
 import pytest
 
 from og_pointcloud.errors import SceneError
-from og_pointcloud.masking.agreement import depth_edges, rendered_depth, smallest_mask_px, split_at_depth_edges
+from og_pointcloud.masking.agreement import rendered_depth
 from og_pointcloud.masking.automatic import (
     AutomaticMasks,
     best_boxes,
-    crops,
     grid,
     mask_boxes,
     stability,
     without_specks,
 )
-from og_pointcloud.masking.contracts import DepthMaskProposer, Proposals
 from og_pointcloud.masking.existing import CallableProposer, ExistingMasks, as_proposals, decode_rle, from_ids
 from og_pointcloud.masking.opencv import OpenCVProposer, region_tree
 from og_pointcloud.masking.worker import open_proposer
@@ -63,28 +61,8 @@ def test_opencv_is_deterministic():
     assert np.array_equal(first.scores, second.scores)
 
 
-def test_depth_parts_what_colour_does_not():
-    image = np.full((120, 160, 3), 120, np.uint8)
-    image += np.random.default_rng(0).integers(0, 8, image.shape, np.uint8)
-    thing = np.zeros((120, 160), bool)
-    thing[36:84, 48:112] = True
-    depth = np.where(thing, 1.0, 1.5).astype(np.float32)
-    proposer = OpenCVProposer()
-    assert isinstance(proposer, DepthMaskProposer)
-    with_depth = proposer.propose_with_depth(image, depth)
-    without = proposer.propose(image)
-    assert max(iou(mask, thing) for mask in with_depth.masks) > 0.8
-    assert max([iou(mask, thing) for mask in without.masks], default=0) < 0.6
-
-
-def test_a_slope_of_depth_is_no_step():
-    image = np.full((60, 80, 3), 120, np.uint8)
-    slope = np.tile(np.linspace(1, 3, 80, dtype=np.float32), (60, 1))
-    assert region_tree(image, slope).made.max() == pytest.approx(region_tree(image, None).made.max(), abs=0.5)
-
-
 def test_the_tree_is_a_tree_and_runs_are_its_regions():
-    tree = region_tree(painted()[0], None)
+    tree = region_tree(painted()[0])
     n, m = int(tree.superpixels.max()) + 1, len(tree.parent)
     assert m == 2 * n - 1
     assert (tree.parent < 0).sum() == 1
@@ -106,14 +84,6 @@ def test_the_tree_is_a_tree_and_runs_are_its_regions():
 def test_opencv_on_almost_nothing(shape):
     proposals = OpenCVProposer().propose(np.zeros((*shape, 3), np.uint8))
     assert proposals.masks.shape[1:] == shape
-
-
-def test_opencv_refuses_depth_of_another_size():
-    with pytest.raises(SceneError, match="one depth a pixel"):
-        OpenCVProposer().propose_with_depth(painted()[0], np.zeros((5, 5), np.float32))
-
-
-# A grid of prompts ----------------------------------------------------------------------------------------------
 
 
 class Oracle:
@@ -160,18 +130,6 @@ def test_the_time_budget_stops_adding_prompts_and_says_so():
         proposals = AutomaticMasks(oracle, "oracle", points_per_side=8, batch=8, seconds_per_image=0.01).propose(image)
     assert oracle.prompts == 8
     assert len(proposals) > 0
-
-
-def test_crops_find_the_same_things_and_drop_what_they_cut():
-    _, ids = painted()
-    image = np.repeat((ids * 60).astype(np.uint8)[:, :, None], 3, axis=2)
-    proposals = AutomaticMasks(Oracle(), "oracle", points_per_side=8, crop_layers=1).propose(image)
-    assert len(proposals) == 4
-    covered = np.zeros(ids.shape, int)
-    for left, top, right, bottom in crops(160, 120, 1):
-        covered[top:bottom, left:right] += 1
-    assert covered.min() == 1
-    assert list(crops(160, 120, 0)) == [(0, 0, 160, 120)]
 
 
 def test_the_grid_lies_in_the_middles_of_cells():
@@ -372,29 +330,3 @@ def test_depth_of_points():
     xyz, spacing, camera = two_planes()
     behind = xyz * [1, 1, -1]
     assert (rendered_depth(behind.astype(np.float32), spacing, camera) == 0).all()
-
-
-def test_masks_are_split_at_depth_edges():
-    depth = rendered_depth(*two_planes())
-    across = np.zeros((60, 80), bool)
-    across[20:40, 30:75] = True
-    flat = np.zeros((60, 80), bool)
-    flat[2:9, 2:70] = True
-    split = split_at_depth_edges(Proposals(np.stack([across, flat]), np.array([0.5, 0.7], np.float32)), depth)
-    assert split.scores.tolist() == pytest.approx([0.5, 0.5, 0.7])
-    assert iou(split.masks[0] | split.masks[1], across) > 0.9
-    near = max(split.masks[:2], key=lambda mask: mask[30, 35])
-    assert (depth[near] == 1).mean() > 0.9
-    assert np.array_equal(split.masks[2], flat)
-
-
-def test_a_slope_is_no_edge():
-    slope = np.tile(np.linspace(1, 4, 80, dtype=np.float32), (60, 1))
-    assert not depth_edges(slope).any()
-    assert not depth_edges(np.zeros((3, 3), np.float32)).any()
-
-
-def test_smallest_mask_follows_the_points():
-    xyz, spacing, camera = two_planes()
-    assert smallest_mask_px(xyz, spacing * 10, camera) == 4 * 4**2
-    assert smallest_mask_px(xyz * [1, 1, -1], spacing, camera) == 1

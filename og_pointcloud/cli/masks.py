@@ -34,16 +34,12 @@ def add(commands: Any) -> None:
         "--level", default="medium", choices=("small", "medium", "large", "agreed"),
         help="how much is one mask; agreed: fine masks on the scale that other views confirm, by the cloud",
     )  # fmt: skip
-    parser.add_argument("--langsplat", action="store_true", help="write LangSplat's language_features/, all levels")
     parser.add_argument("--every", type=int, default=1, metavar="N", help="use every N-th image; needs -o")
     parser.add_argument(
         "--views", choices=("all", "auto"), default="all", help="auto: leave out images that add nothing; needs -o"
     )
     parser.add_argument("--seconds-per-image", type=float, metavar="S", help="SAM stops adding prompts after so long")
     parser.add_argument("--longest-side", type=int, default=1024, metavar="PX", help="larger images are shrunk to this")
-    parser.add_argument("--depth", action="store_true", help="let the proposer use the points' depth as well")
-    parser.add_argument("--split", action="store_true", help="split masks where the points' depth breaks off")
-    parser.add_argument("--drop-tiny", action="store_true", help="drop masks that the points do not resolve")
     parser.add_argument(
         "--processes", type=int, metavar="N",
         help="images worked on side by side (default: a core each, one alone with models of their own)",
@@ -64,12 +60,8 @@ def run(arguments: argparse.Namespace) -> None:
         proposer=arguments.proposer,
         encoder=None if arguments.encoder == "none" else arguments.encoder,
         level=arguments.level,
-        langsplat=arguments.langsplat,
         longest_side=arguments.longest_side,
         seconds_per_image=arguments.seconds_per_image,
-        use_depth=arguments.depth,
-        split=arguments.split,
-        drop_tiny=arguments.drop_tiny,
         every=arguments.every,
         enough_views=ENOUGH_VIEWS if arguments.views == "auto" else None,
         download=arguments.download,
@@ -87,6 +79,5 @@ def run(arguments: argparse.Namespace) -> None:
         f"{made.masks} masks in {made.images} images ({made.seconds:.1f} s, {made.done_before} images done before), "
         f"feature space {made.feature_space}"
     )
-    level = ["--mask-level", "large"] if arguments.langsplat else []
-    fit = ["og-pointcloud", "fit", str(made.output), *level, "-o", f"{made.output.resolve().name}.ogpc"]
+    fit = ["og-pointcloud", "fit", str(made.output), "-o", f"{made.output.resolve().name}.ogpc"]
     print(f"next: {shlex.join(fit)}")

@@ -1,15 +1,14 @@
 """Everything in an image by a model that answers points: a grid of prompts, and of its answers the good ones once.
 
 After segment-anything's automatic generator: masks with a low predicted IoU or an unstable border are dropped, of
-masks with nearly the same box the best stays, small holes are filled and small islands removed; crops repeat it for
-small things. Where there is a time budget, prompts come in an order that covers the image evenly at any moment.
+masks with nearly the same box the best stays, small holes are filled and small islands removed. Where there is a time
+budget, prompts come in an order that covers the image evenly at any moment.
 """
 
 from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -23,11 +22,6 @@ __all__ = ["AutomaticMasks", "PointPredictor", "best_boxes", "mask_boxes", "stab
 
 Masks = NDArray[np.bool_]
 Floats = NDArray[np.float32]
-
-CROP_OVERLAP = 512 / 1500
-"""Overlap of crops as a share of the shorter side, as segment-anything has it."""
-EDGE_PX = 2
-"""A mask that ends so near a crop's edge, inside the image, is cut off there and is left to another crop."""
 
 
 class PointPredictor(Protocol):
@@ -49,7 +43,7 @@ class AutomaticMasks:
 
     points_per_side: of the grid. batch: prompts at once. least_iou, least_stability: below, a mask is dropped.
     stability_offset: logits by which the border is moved. same_box: box IoU from which two masks are one.
-    speck_share: holes and islands of less of the image go. crop_layers: n adds 4^1 to 4^n crops with coarser grids.
+    speck_share: holes and islands of less of the image go.
     seconds_per_image: no prompt is begun after so long; None: no limit. Encoding counts, and is never cut short.
     """
 
@@ -62,62 +56,39 @@ class AutomaticMasks:
     stability_offset: float = 1.0
     same_box: float = 0.7
     speck_share: float = 1e-4
-    crop_layers: int = 0
     seconds_per_image: float | None = None
 
     def propose(self, image: NDArray[np.uint8]) -> Proposals:
         """image: (H, W, 3) uint8 RGB. Warns where the time did not suffice for all prompts."""
         deadline = np.inf if self.seconds_per_image is None else time.perf_counter() + self.seconds_per_image
-        masks, scores, asked, planned = [], [], 0, 0
-        for layer in range(self.crop_layers + 1):
-            per_side = max(1, self.points_per_side >> layer)
-            for left, top, right, bottom in crops(image.shape[1], image.shape[0], layer):
-                planned += per_side**2
-                if layer and time.perf_counter() > deadline:
-                    continue
-                found, found_scores, count = self._in_crop(image[top:bottom, left:right], per_side, deadline)
-                asked += count
-                uncut = _uncut(found, (left, top, right, bottom), image.shape[1], image.shape[0])
-                for mask, score in zip(found[uncut], found_scores[uncut], strict=True):
-                    placed = np.zeros(image.shape[:2], np.bool_)
-                    placed[top:bottom, left:right] = mask
-                    masks.append(placed)
-                    scores.append(score)
-        if asked < planned:
-            warnings.warn(
-                f"{self.name}: {asked} of {planned} prompts in {self.seconds_per_image:g} s; small things may be "
-                "missing: allow more seconds per image",
-                stacklevel=2,
-            )
-        stacked = np.array(masks, np.bool_).reshape(-1, *image.shape[:2])
-        kept = best_boxes(mask_boxes(stacked), np.array(scores, np.float32), self.same_box)
-        return Proposals(stacked[kept], np.array(scores, np.float32)[kept])
-
-    def _in_crop(self, image: NDArray[np.uint8], per_side: int, deadline: float) -> tuple[Masks, Floats, int]:
-        """Masks of one crop, their scores, and how many prompts were asked."""
         height, width = image.shape[:2]
-        points = grid(per_side, width, height)
+        points = grid(self.points_per_side, width, height)
         self.predictor.set_image(image)
-        kept_logits, kept_scores, asked = [np.zeros((0, 1, 1), np.float32)], [np.zeros(0, np.float32)], 0
+        kept: list[tuple[Floats, Floats]] = []
         for first in range(0, len(points), self.batch):
             if first and time.perf_counter() > deadline:
+                warnings.warn(
+                    f"{self.name}: {first} of {len(points)} prompts in {self.seconds_per_image:g} s; small things may "
+                    "be missing: allow more seconds per image",
+                    stacklevel=2,
+                )
                 break
-            logits, iou = self.predictor.at_points(points[first : first + self.batch])
-            asked += len(logits)
-            logits, iou = logits.reshape(-1, *logits.shape[2:]), iou.reshape(-1)
-            good = (iou > self.least_iou) & (logits > 0).any(axis=(1, 2))
-            good[good] = stability(logits[good], self.stability_offset) >= self.least_stability
-            kept_logits.append(logits[good])
-            kept_scores.append(np.clip(iou[good], 0, 1))
-        logits = np.concatenate(kept_logits[1:] if asked else kept_logits)
-        scores = np.concatenate(kept_scores)
+            kept.append(self._good(*self.predictor.at_points(points[first : first + self.batch])))
+        logits, scores = (np.concatenate(parts) for parts in zip(*kept, strict=True))
         best = best_boxes(mask_boxes(logits > 0), scores, self.same_box)
-        speck_px = round(self.speck_share * width * height)
         masks = np.zeros((len(best), height, width), np.bool_)
         for mask, chosen in zip(masks, best, strict=True):
             full = require_cv2().resize(logits[chosen], (width, height), interpolation=require_cv2().INTER_LINEAR)
-            mask[:] = without_specks(full > 0, speck_px)
-        return masks, scores[best], asked
+            mask[:] = without_specks(full > 0, round(self.speck_share * width * height))
+        kept_whole = best_boxes(mask_boxes(masks), scores[best], self.same_box)  # again: specks made boxes larger
+        return Proposals(masks[kept_whole], scores[best][kept_whole])
+
+    def _good(self, logits: Floats, iou: Floats) -> tuple[Floats, Floats]:
+        """Of the answers (k, m, h, w) and (k, m) to a batch of prompts the stable ones: (n, h, w), and scores (n,)."""
+        logits, iou = logits.reshape(-1, *logits.shape[2:]), iou.reshape(-1)
+        good = (iou > self.least_iou) & (logits > 0).any(axis=(1, 2))
+        good[good] = stability(logits[good], self.stability_offset) >= self.least_stability
+        return logits[good], np.clip(iou[good], 0, 1)
 
 
 def grid(per_side: int, width: int, height: int) -> Floats:
@@ -125,17 +96,6 @@ def grid(per_side: int, width: int, height: int) -> Floats:
     at = (np.arange(per_side) + 0.5) / per_side
     points = np.stack(np.meshgrid(at * width, at * height), axis=-1).reshape(-1, 2).astype(np.float32)
     return points[np.random.default_rng(0).permutation(len(points))]
-
-
-def crops(width: int, height: int, layer: int) -> Iterator[tuple[int, int, int, int]]:
-    """left, top, right, bottom of the 2^layer x 2^layer overlapping crops of a layer; layer 0 is the image."""
-    count = 1 << layer
-    overlap = 0 if layer == 0 else int(CROP_OVERLAP * min(width, height) * 2 / count)
-    step_x, step_y = -(-(overlap * (count - 1) + width) // count), -(-(overlap * (count - 1) + height) // count)
-    for row in range(count):
-        for column in range(count):
-            left, top = column * (step_x - overlap), row * (step_y - overlap)
-            yield left, top, min(left + step_x, width), min(top + step_y, height)
 
 
 def stability(logits: Floats, offset: float) -> Floats:
@@ -185,18 +145,3 @@ def _specks(mask: Masks, smallest_px: int, spare_largest: bool) -> Masks:
     if spare_largest and len(area) > 1:
         small[1 + int(np.argmax(area[1:]))] = False
     return small[labels]
-
-
-def _uncut(masks: Masks, crop: tuple[int, int, int, int], width: int, height: int) -> Masks:
-    """(n,): whether a mask stays off those edges of its crop that lie inside the image."""
-    left, top, right, bottom = crop
-    near = np.zeros(masks.shape[1:], np.bool_)
-    if left > 0:
-        near[:, :EDGE_PX] = True
-    if top > 0:
-        near[:EDGE_PX] = True
-    if right < width:
-        near[:, -EDGE_PX:] = True
-    if bottom < height:
-        near[-EDGE_PX:] = True
-    return ~np.asarray((masks & near).any(axis=(1, 2)))

@@ -5,14 +5,14 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.errors import OgPointcloudError, SceneError
 
-__all__ = ["AGREED", "LEVELS", "DepthMaskProposer", "MaskEncoder", "MaskProposer", "MaskSettings", "Proposals"]
+__all__ = ["AGREED", "LEVELS", "MaskEncoder", "MaskProposer", "MaskSettings", "Proposals"]
 
 LEVELS = ("small", "medium", "large")
 """How much is one mask, as SAM and LangSplat call it."""
@@ -71,43 +71,23 @@ class MaskEncoder(Protocol):
         ...
 
 
-@runtime_checkable
-class DepthMaskProposer(Protocol):
-    """A `MaskProposer` that can also use depth."""
-
-    @property
-    def name(self) -> str:
-        """Which proposer it is."""
-        ...
-
-    def propose_with_depth(self, image: NDArray[np.uint8], depth: NDArray[np.float32] | None) -> Proposals:
-        """depth: (H, W) float32 along the optical axis, any unit, 0 where it is not known; None: there is none."""
-        ...
-
-
 @dataclass(frozen=True)
 class MaskSettings:
     """How masks are made; what changes one of these starts anew.
 
-    proposer: see `worker.open_proposer`. encoder: see `encode.open_encoder`; None: masks alone, with
-    zero features. level: small, medium or large, for ``masks/`` (LangSplat's files have all); or agreed: all images
-    are proposed for first, and proposals count by how far other views confirm them (`agreement`).
+    proposer: see `worker.open_proposer`. encoder: see `encode.open_encoder`; None: masks alone, with zero features.
+    level: small, medium or large; or agreed: all images are proposed for first, and proposals count by how far other
+    views confirm them (`agreement`), which needs the cloud.
     longest_side: larger images are shrunk to this; masks have the shrunk size.
-    seconds_per_image: where SAM stops adding prompts. use_depth: colour and the points' depth, where the proposer
-    takes it. split: masks are cut at depth edges. drop_tiny: masks that the points do not resolve are dropped
-    (a proposer that makes none, such as opencv, then need not read the cloud).
+    seconds_per_image: where SAM stops adding prompts.
     every: of so many images one is used. enough_views: images are left out whose content so many others show.
     """
 
     proposer: str = "opencv"
     encoder: str | None = "demo"
     level: str = "medium"
-    langsplat: bool = False
     longest_side: int = 1024
     seconds_per_image: float | None = None
-    use_depth: bool = False
-    split: bool = False
-    drop_tiny: bool = False
     every: int = 1
     enough_views: int | None = None
     download: bool = False
@@ -115,17 +95,10 @@ class MaskSettings:
     def __post_init__(self) -> None:
         if self.level not in (*LEVELS, AGREED):
             raise OgPointcloudError(f"mask level is '{self.level}'; expected one of {', '.join(LEVELS)}, {AGREED}")
-        if self.langsplat and self.level == AGREED:
-            raise OgPointcloudError(f"mask level is '{self.level}'; LangSplat's files hold {', '.join(LEVELS)}")
         if self.every < 1 or self.longest_side < 16:
             raise OgPointcloudError(
                 f"every is {self.every} and longest_side {self.longest_side}; expected at least 1 and 16"
             )
-
-    @property
-    def needs_points(self) -> bool:
-        """Whether the cloud is read: a proposer of colour alone needs none."""
-        return self.use_depth or self.split or self.drop_tiny or self.level == AGREED
 
     def processes_for(self, images: int) -> int:
         """How many processes to use where nobody says: a core each, but one alone for models that fill memory and

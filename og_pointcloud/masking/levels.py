@@ -48,13 +48,8 @@ class Level:
         return self.ids == np.arange(len(self.proposals), dtype=np.int32)[:, None, None]
 
 
-def settle(
-    proposals: Proposals, smallest_px: int = 1, preferences: Mapping[str, float] = PREFERENCE
-) -> dict[str, Level]:
-    """A map for each level of `PREFERENCE`, or of other preferences; the same input gives the same maps.
-
-    smallest_px: masks that show fewer pixels are left out.
-    """
+def settle(proposals: Proposals, preferences: Mapping[str, float] = PREFERENCE) -> dict[str, Level]:
+    """A map for each level of `PREFERENCE`, or of other preferences; the same input gives the same maps."""
     atom_of_pixel, member, area_px = _atoms(proposals.masks)
     order = np.lexsort((member @ area_px, -proposals.scores.astype(np.float64)))  # the better, then the smaller
     member, scores = member[order], proposals.scores[order].astype(np.float64)
@@ -65,7 +60,7 @@ def settle(
     levels = {}
     for level, preference in preferences.items():
         used = _cut(np.diag(shared_px) * scores, parent, preference)
-        owner = _owners(member, area_px, used, smallest_px)
+        owner = _owners(member, area_px, used)
         shown, ids = np.unique(owner, return_inverse=True)
         ids = (ids - (shown[:1] < 0).sum()).astype(np.int32)
         chosen = order[shown[shown >= 0]]
@@ -133,13 +128,11 @@ def _cut(value: NDArray[np.float64], parent: NDArray[np.intp], preference: float
     return np.flatnonzero(used)
 
 
-def _owners(
-    member: NDArray[np.bool_], area_px: NDArray[np.float64], used: NDArray[np.intp], smallest_px: int
-) -> NDArray[np.intp]:
+def _owners(member: NDArray[np.bool_], area_px: NDArray[np.float64], used: NDArray[np.intp]) -> NDArray[np.intp]:
     """(atoms,) the best of the used masks over each atom, -1 for none. Masks are numbered best first."""
     owner = np.full(member.shape[1], -1)
     for mask in used[::-1]:
         owner[member[mask]] = mask
     shown_px = np.bincount(owner + 1, area_px, len(member) + 1)[1:]
-    hidden = (shown_px < VISIBLE * (member @ area_px)) | (shown_px < smallest_px)
+    hidden = shown_px < VISIBLE * (member @ area_px)
     return np.where(np.append(hidden, False)[owner], -1, owner)  # the last entry serves -1

@@ -1,9 +1,8 @@
 """Photographs -> masks and mask features in a capture folder: resumable, on several cores, nothing half-written.
 
 What each image gives is first an atomic file of its own in ``masks.work/``; when all are there they become ``masks/``
-with ``mask_features.npz``, or LangSplat's ``language_features/``, and the folder goes. Killed at any moment, the same
-command goes on behind the last image; where all is made already it does nothing. ``made.json`` beside the masks says
-that they were made here, and how.
+with ``mask_features.npz``, and the folder goes. Killed at any moment, the same command goes on behind the last image;
+where all is made already it does nothing. ``made.json`` beside the masks says that they were made here, and how.
 """
 
 from __future__ import annotations
@@ -15,6 +14,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
+from datetime import timedelta
 from hashlib import blake2b
 from pathlib import Path
 from typing import Any
@@ -34,7 +34,6 @@ from og_pointcloud.masking.contracts import AGREED, MaskSettings
 from og_pointcloud.masking.photographs import (
     Photograph,
     choose_by_coverage,
-    read_cloud,
     read_photographs,
     write_contact_sheet,
 )
@@ -42,14 +41,12 @@ from og_pointcloud.masking.worker import ImageTask, read_work, results
 
 __all__ = ["MaskSettings", "MasksMade", "make_masks"]
 
-VERSION = 1
+VERSION = 2
 """Counts changes of what an image's work file holds; files of another version are made again."""
 WORK_FOLDER = "masks.work"
 MADE_NAME = "made.json"
-LANGSPLAT_LEVELS = ("medium", "small", "medium", "large")
-"""The levels that stand for LangSplat's: default, small, medium, large."""
 PREVIEW_NAME = "masks_preview.png"
-PREVIEW_IMAGES = 6
+PREVIEW_IMAGES = 4
 REPORT_SECONDS = 10.0
 
 Say = Callable[[str], None]
@@ -92,14 +89,13 @@ def make_masks(
     target = capture if output is None else Path(output)
     separate = target.resolve() != capture.resolve()
     photographs = read_photographs(capture)
-    settings = _with_possible_level(settings, capture, len(photographs), say)
     chosen = _chosen(capture, photographs, settings)
     left_out = _left_out(photographs, chosen, settings, separate, say)
-    _refuse_foreign(target, settings, overwrite)
+    _refuse_foreign(target, overwrite)
     work = target / WORK_FOLDER / _fingerprint(settings)
     tasks = [ImageTask(photograph, work / _work_name(photograph)) for photograph in chosen]
     key = _digest([str(task.work_file.relative_to(target)) for task in tasks])
-    made, done_before = None if overwrite else _made_before(target, settings, tasks, key), len(tasks)
+    made, done_before = None if overwrite else _made_before(target, tasks, key), len(tasks)
     if made:
         say(f"all {len(tasks)} images have these masks already: nothing to do (--overwrite makes them again)")
     else:
@@ -120,21 +116,6 @@ def _chosen(capture: Path, photographs: Sequence[Photograph], settings: MaskSett
     if settings.enough_views is None:
         return chosen
     return [chosen[index] for index in choose_by_coverage(capture, chosen, settings.enough_views)]
-
-
-def _with_possible_level(settings: MaskSettings, capture: Path, images: int, say: Say) -> MaskSettings:
-    """Without other views or a cloud nothing can agree: the small level is then nearest to it."""
-    if settings.level != AGREED:
-        return settings
-    reason = "there is one image" if images == 1 else ""
-    try:
-        read_cloud(capture)
-    except SceneError as error:
-        reason = str(error)
-    if not reason:
-        return settings
-    say(f"level agreed: no other view can confirm masks ({reason}); the small level is used")
-    return replace(settings, level="small")
 
 
 def _reason(settings: MaskSettings) -> str:
@@ -207,20 +188,20 @@ def _work_through(
     if len(waiting) < len(tasks):
         say(f"{len(tasks) - len(waiting)} of {len(tasks)} images are done already")
     broken, start = [], time.perf_counter()
-    last_said, previewed = start, False
+    last_said, preview_at = start, min(PREVIEW_IMAGES, len(tasks))
     for count, (task, wrong) in enumerate(results(capture, settings, waiting, processes), 1):
         if wrong:
             broken.append(wrong)
             say(f"broken: {wrong}")
         done = [task for task in tasks if task.work_file.exists()]
-        if not previewed and len(done) >= min(PREVIEW_IMAGES, len(tasks)):
+        if len(done) >= preview_at > 0:
             _write_preview(target, settings, done[:PREVIEW_IMAGES])
             say(f"preview of the first images: {target / PREVIEW_NAME}")
-            previewed = True
+            preview_at = 0
         now = time.perf_counter()
         if now - last_said > REPORT_SECONDS or count == len(waiting):
             each = (now - start) / count
-            left = _duration(each * (len(waiting) - count))
+            left = timedelta(seconds=round(each * (len(waiting) - count)))
             say(f"{len(done)} of {len(tasks)} images, {each:.1f} s each, {left} left")
             last_said = now
     if broken:
@@ -256,20 +237,9 @@ def _confirmed(tasks: Sequence[ImageTask], say: Say) -> list[ImageTask]:
     ]
 
 
-def _duration(seconds: float) -> str:
-    return (
-        f"{seconds:.0f} s"
-        if seconds < 100
-        else f"{seconds / 60:.0f} min"
-        if seconds < 6000
-        else f"{seconds / 3600:.1f} h"
-    )
-
-
 def _write_preview(target: Path, settings: MaskSettings, tasks: Sequence[ImageTask]) -> None:
     pictures = [
-        (task.photograph.read(settings.longest_side), read_work(task.work_file)[f"{settings.level}_ids"])
-        for task in tasks
+        (task.photograph.read(settings.longest_side), read_work(task.work_file, "ids")["ids"]) for task in tasks
     ]
     write_contact_sheet(target / PREVIEW_NAME, pictures)
 
@@ -277,14 +247,9 @@ def _write_preview(target: Path, settings: MaskSettings, tasks: Sequence[ImageTa
 # The files that masks end in, and the record by which the next run knows them -------------------------------------
 
 
-def _folder(target: Path, settings: MaskSettings) -> Path:
-    return target / (LANGUAGE_FEATURES_FOLDER if settings.langsplat else MASKS_FOLDER)
-
-
-def _refuse_foreign(target: Path, settings: MaskSettings, overwrite: bool) -> None:
+def _refuse_foreign(target: Path, overwrite: bool) -> None:
     """OgPointcloudError where masks or features of somebody else would be replaced."""
-    folder = _folder(target, settings)
-    features = target / FEATURES_NAME
+    folder, features = target / MASKS_FOLDER, target / FEATURES_NAME
     if overwrite or (folder / MADE_NAME).is_file():
         return
     found = folder if folder.is_dir() and any(folder.iterdir()) else features
@@ -295,67 +260,46 @@ def _refuse_foreign(target: Path, settings: MaskSettings, overwrite: bool) -> No
         )
 
 
-def _made_before(target: Path, settings: MaskSettings, tasks: Sequence[ImageTask], key: str) -> dict[str, Any] | None:
+def _made_before(target: Path, tasks: Sequence[ImageTask], key: str) -> dict[str, Any] | None:
     """The record of a run that made the same masks of the same images, if all its files are still there."""
-    folder = _folder(target, settings)
+    folder = target / MASKS_FOLDER
     try:
         made = json.loads((folder / MADE_NAME).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return None
-    endings = ("_s.npy", "_f.npy") if settings.langsplat else (".png",)
-    files = [folder / f"{task.photograph.name}{ending}" for task in tasks for ending in endings]
-    files += [] if settings.langsplat else [target / FEATURES_NAME]
+    files = [target / FEATURES_NAME, *(folder / f"{task.photograph.name}.png" for task in tasks)]
     same = isinstance(made, dict) and made.get("key") == key and isinstance(made.get("masks"), int)
     return made if same and all(file.is_file() for file in files) else None
 
 
 def _assemble(target: Path, settings: MaskSettings, tasks: Sequence[ImageTask]) -> tuple[int, str]:
-    """Work files -> the capture's files. Number of masks on the level of `settings`, and the feature space."""
-    folder = _folder(target, settings)
+    """Work files -> the capture's files. Number of masks, and the feature space."""
+    folder = target / MASKS_FOLDER
     folder.mkdir(parents=True, exist_ok=True)
     _write_made(target, settings, tasks)  # first: killed here, the next run knows the folder as ours, but not as whole
-    write = _write_langsplat if settings.langsplat else _write_mask_image
     features: dict[str, Any] = {}
-    masks, space = 0, UNKNOWN_SPACE
+    space = UNKNOWN_SPACE
     for task in tasks:
         work = read_work(task.work_file)
-        space, rows = str(work["feature_space"]), work[f"{settings.level}_features"]
-        masks += len(rows)
-        features[task.photograph.name] = rows
-        write(folder / task.photograph.name, work, settings.level)
-    if settings.langsplat:
-        with replacing(folder / "feature_space.txt") as file:
-            file.write(f"{space}\n".encode())
-    else:
-        with replacing(target / FEATURES_NAME) as file:
-            np.savez(file, feature_space=np.array(space), **features)
-    return masks, space
+        space, features[task.photograph.name] = str(work["feature_space"]), work["features"]
+        _write_mask_image(folder / f"{task.photograph.name}.png", work["ids"])
+    with replacing(target / FEATURES_NAME) as file:
+        np.savez(file, feature_space=np.array(space), **features)
+    return sum(map(len, features.values())), space
 
 
 def _write_made(target: Path, settings: MaskSettings, tasks: Sequence[ImageTask], **record: Any) -> None:
     """record: what a run leaves that came to its end."""
     made = {"made_by": "og-pointcloud masks", **asdict(settings), "images": len(tasks), **record}
-    _write_json(_folder(target, settings) / MADE_NAME, made)
+    _write_json(target / MASKS_FOLDER / MADE_NAME, made)
 
 
-def _write_mask_image(stem: Path, work: dict[str, NDArray[Any]], level: str) -> None:
-    """``<stem>.png``: 0 outside every mask, else the row of the features + 1."""
-    stem.parent.mkdir(parents=True, exist_ok=True)
-    png = require_cv2().imencode(".png", (work[f"{level}_ids"] + 1).astype(np.uint16))[1]
-    with replacing(stem.with_name(f"{stem.name}.png")) as file:
+def _write_mask_image(path: Path, ids: NDArray[np.int32]) -> None:
+    """A PNG of 16 bit: 0 outside every mask, else the row of the features + 1."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    png = require_cv2().imencode(".png", (ids + 1).astype(np.uint16))[1]
+    with replacing(path) as file:
         file.write(png.tobytes())
-
-
-def _write_langsplat(stem: Path, work: dict[str, NDArray[Any]], _: str) -> None:
-    """``<stem>_s.npy`` (4, H, W) float32 of ids that count on from level to level, ``<stem>_f.npy`` (M, D) float16."""
-    stem.parent.mkdir(parents=True, exist_ok=True)
-    rows = [work[f"{level}_features"] for level in LANGSPLAT_LEVELS]
-    firsts = np.cumsum([0, *map(len, rows[:-1])])
-    maps = [work[f"{level}_ids"] for level in LANGSPLAT_LEVELS]
-    ids = np.stack([np.where(level >= 0, level + first, -1) for level, first in zip(maps, firsts, strict=True)])
-    for ending, array in (("_s", ids.astype(np.float32)), ("_f", np.concatenate(rows))):
-        with replacing(stem.with_name(f"{stem.name}{ending}.npy")) as file:
-            np.save(file, array, allow_pickle=False)
 
 
 def _make_capture_of(capture: Path, target: Path, chosen: Sequence[Photograph]) -> None:

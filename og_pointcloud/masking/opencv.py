@@ -1,10 +1,10 @@
-"""Masks without a model: superpixels merged by colour, contrast and, where it is known, depth, into a region tree.
+"""Masks without a model: superpixels merged by colour and contrast into a region tree.
 
 1. Superpixels: graph segmentation (Felzenszwalb and Huttenlocher, 2004) cut by compact SLIC cells, so that none runs
    from one surface into another of its colour.
 2. Merging: in every round, pairs of neighbours that are each other's nearest become one region. How far apart two
-   are follows from their mean colours, by the contrast along their common border and, with depth, by steps of depth
-   there. Small regions are near to all their neighbours, and texture brings regions nearer.
+   are follows from their mean colours and the contrast along their common border. Small regions are near to all their
+   neighbours, and texture brings regions nearer.
 3. Proposals: the regions that lasted: the distance at which a region was merged away against that at which it
    was made is its score. They overlap only by containing one another; `levels` settles which to use.
 
@@ -18,7 +18,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud.errors import MissingExtraError, SceneError
+from og_pointcloud.errors import MissingExtraError
 from og_pointcloud.formats.images import require_cv2
 from og_pointcloud.masking.contracts import Proposals
 
@@ -44,10 +44,6 @@ TEXTURE = 0.03
 """Per unit of the standard deviation inside both regions, distances count so much less."""
 REACH_PX = 2
 """Borders are compared so many pixels to either side: the border itself is blurred."""
-STEP = 0.04
-"""Relative step of depth, beyond what the slope explains, that is one for certain."""
-STEP_DISTANCE = 12.0
-"""What a certain step all along a border counts as, in units of colour."""
 SMALL_REGION = 4e-3
 """Share of the image: a region of this size is nearer to its neighbours by the root of 2 than a large one."""
 NOISE = 5.0
@@ -65,7 +61,7 @@ MOST = 250
 
 @dataclass(frozen=True)
 class OpenCVProposer:
-    """The embedded proposer: OpenCV's contrib modules, no weights. It also takes depth (`DepthMaskProposer`).
+    """The embedded proposer: OpenCV's contrib modules, no weights.
 
     working_side: the image is shrunk to this many pixels along its longer side first.
     """
@@ -75,20 +71,14 @@ class OpenCVProposer:
 
     def propose(self, image: NDArray[np.uint8]) -> Proposals:
         """image: (H, W, 3) uint8 RGB."""
-        return self.propose_with_depth(image, None)
-
-    def propose_with_depth(self, image: NDArray[np.uint8], depth: NDArray[np.float32] | None) -> Proposals:
-        """depth: (H, W) float32 along the optical axis in any unit, 0 where it is not known; None: colour alone."""
         cv2 = require_cv2()
         height, width = image.shape[:2]
-        if depth is not None and depth.shape != (height, width):
-            raise SceneError(f"depth is {depth.shape}, the image {image.shape}; expected one depth a pixel")
         scale = min(1.0, self.working_side / max(height, width))
         size = round(width * scale), round(height * scale)
         if min(size) < FEWEST_PIXELS:
             return Proposals(np.zeros((0, height, width), np.bool_), np.zeros(0, np.float32))
         small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-        tree = region_tree(small, None if depth is None else cv2.resize(depth, size, interpolation=cv2.INTER_NEAREST))
+        tree = region_tree(small)
         chosen, scores = tree.lasting()
         place, runs = tree.runs()
         rank = place[tree.superpixels]
@@ -147,13 +137,13 @@ class RegionTree:
         return chosen, score[chosen].astype(np.float32)
 
 
-def region_tree(image: NDArray[np.uint8], depth: NDArray[np.float32] | None) -> RegionTree:
-    """image: (H, W, 3) uint8 RGB. depth: (H, W) float32, 0 unknown, or None."""
+def region_tree(image: NDArray[np.uint8]) -> RegionTree:
+    """image: (H, W, 3) uint8 RGB."""
     cv2 = require_cv2()
     lab = cv2.cvtColor(cv2.bilateralFilter(image, 5, 20, 5), cv2.COLOR_RGB2LAB).astype(np.float32)
     lab[:, :, 0] *= LIGHTNESS
     superpixels = _superpixels(lab)
-    regions, borders = _Regions.of(superpixels, lab), _Borders.of(superpixels, lab, depth)
+    regions, borders = _Regions.of(superpixels, lab), _Borders.of(superpixels, lab)
     count = len(regions.area)
     number, made = np.arange(count), np.zeros(2 * count - 1)
     parent, area = np.full(2 * count - 1, -1, np.int32), np.zeros(2 * count - 1)
@@ -217,21 +207,19 @@ class _Regions:
 
 @dataclass(frozen=True)
 class _Borders:
-    """Neighbours a < b, (e,), and sums over the pixel pairs of their border: how many, contrast, steps of depth."""
+    """Neighbours a < b, (e,), and sums over the pixel pairs of their border: how many, contrast."""
 
     a: NDArray[np.integer]
     b: NDArray[np.integer]
     length: Floats
     contrast: Floats
-    step: Floats
 
     @classmethod
-    def of(cls, labels: Labels, lab: NDArray[np.float32], depth: NDArray[np.float32] | None) -> _Borders:
-        across = _pixel_pairs(labels, lab, depth)
-        down = _pixel_pairs(labels.T, lab.transpose(1, 0, 2), None if depth is None else depth.T)
+    def of(cls, labels: Labels, lab: NDArray[np.float32]) -> _Borders:
+        across, down = _pixel_pairs(labels, lab), _pixel_pairs(labels.T, lab.transpose(1, 0, 2))
         a, b = np.concatenate([across[0], down[0]]), np.concatenate([across[1], down[1]])
-        length, contrast, step = np.concatenate([across[2], down[2]], axis=1)
-        return cls(a, b, length, contrast, step).gathered(np.arange(int(labels.max()) + 1))
+        contrast = np.concatenate([across[2], down[2]])
+        return cls(a, b, np.ones(len(a)), contrast).gathered(np.arange(int(labels.max()) + 1))
 
     def gathered(self, into: NDArray[np.intp]) -> _Borders:
         """The borders between what the regions became; a border inside one is gone."""
@@ -240,8 +228,8 @@ class _Borders:
         between = a != b
         key = np.minimum(a, b)[between] * count + np.maximum(a, b)[between]
         pair, place = np.unique(key, return_inverse=True)
-        length, contrast, step = _sums(place, np.stack([self.length, self.contrast, self.step], axis=1)[between]).T
-        return _Borders(pair // count, pair % count, length, contrast, step)
+        length, contrast = _sums(place, np.stack([self.length, self.contrast], axis=1)[between]).T
+        return _Borders(pair // count, pair % count, length, contrast)
 
 
 def _sums(labels: NDArray[np.integer], values: Floats) -> Floats:
@@ -250,22 +238,12 @@ def _sums(labels: NDArray[np.integer], values: Floats) -> Floats:
     return np.stack([np.bincount(labels, column, count) for column in values.T], axis=1).astype(np.float64)
 
 
-def _pixel_pairs(labels: Labels, lab: NDArray[np.float32], depth: NDArray[np.float32] | None) -> Pairs:
-    """Pixels whose right neighbour is another region, p of them: both regions, (3, p): 1, contrast, step in 0 to 1."""
+def _pixel_pairs(labels: Labels, lab: NDArray[np.float32]) -> Pairs:
+    """Pixels whose right neighbour is another region, p of them: both regions, and the contrast there, each (p,)."""
     row, column = np.nonzero(labels[:, :-1] != labels[:, 1:])
-    last = labels.shape[1] - 1
-    left, right = np.maximum(column + 1 - REACH_PX, 0), np.minimum(column + REACH_PX, last)
+    left, right = np.maximum(column + 1 - REACH_PX, 0), np.minimum(column + REACH_PX, labels.shape[1] - 1)
     contrast = np.linalg.norm(lab[row, left] - lab[row, right], axis=1).astype(np.float64)
-    step = np.zeros(len(row))
-    if depth is not None:
-        z_left, z_right = depth[row, left], depth[row, right]
-        before, after = left - (right - left), right + (right - left)
-        slope_left = np.where(before >= 0, np.abs(depth[row, np.maximum(before, 0)] - z_left), np.inf)
-        slope_right = np.where(after <= last, np.abs(depth[row, np.minimum(after, last)] - z_right), np.inf)
-        beyond_slope = np.abs(z_left - z_right) - np.minimum(slope_left, slope_right)
-        nearer = np.minimum(z_left, z_right)
-        step = np.clip(beyond_slope / np.where(nearer > 0, STEP * nearer, np.inf), 0, 1)
-    return labels[row, column], labels[row, column + 1], np.stack([np.ones(len(row)), contrast, step])
+    return labels[row, column], labels[row, column + 1], contrast
 
 
 def _distances(regions: _Regions, borders: _Borders, pixels: int) -> Floats:
@@ -276,7 +254,7 @@ def _distances(regions: _Regions, borders: _Borders, pixels: int) -> Floats:
     color = np.linalg.norm(mean[a] - mean[b], axis=1)
     color = (color + borders.contrast / borders.length) / 2 / (1 + TEXTURE * np.minimum(texture[a], texture[b]))
     share = np.minimum(regions.area[a], regions.area[b]) / pixels
-    return (color + STEP_DISTANCE * borders.step / borders.length) * np.sqrt(share / (share + SMALL_REGION))
+    return color * np.sqrt(share / (share + SMALL_REGION))
 
 
 def _nearest_pairs(borders: _Borders, distance: Floats, count: int) -> NDArray[np.intp]:

@@ -21,7 +21,7 @@ from og_pointcloud.scene import Camera, Points, View
 
 __all__ = ["Photograph", "choose_by_coverage", "read_cloud", "read_photographs", "write_contact_sheet"]
 
-CELL_WIDTH, COLUMNS = 480, 3
+CELL_WIDTH = 480
 TINT = 0.55
 
 
@@ -94,22 +94,13 @@ def choose_by_coverage(capture: Path, photographs: Sequence[Photograph], enough:
 
 
 def write_contact_sheet(path: Path, pictures: Sequence[tuple[NDArray[np.uint8], NDArray[np.int32]]]) -> None:
-    """A PNG of images above the same with their masks. pictures: (H, W, 3) uint8 RGB and (H, W) ids of each."""
+    """A PNG of images in a row, with their masks below. pictures: (H, W, 3) uint8 RGB and (H, W) ids of each."""
     cv2 = require_cv2()
-    rows = []
-    for first in range(0, len(pictures), COLUMNS):
-        row = pictures[first : first + COLUMNS]
-        cells = [np.vstack([image, _drawn(image, ids)]) for image, ids in row]
-        height = max(1, max(round(cell.shape[0] * CELL_WIDTH / cell.shape[1]) for cell in cells))
-        sheet = np.zeros((height, CELL_WIDTH * min(COLUMNS, len(pictures)), 3), np.uint8)
-        for column, cell in enumerate(cells):
-            fitted = max(1, round(cell.shape[0] * CELL_WIDTH / cell.shape[1]))
-            left = column * CELL_WIDTH
-            sheet[:fitted, left : left + CELL_WIDTH] = cv2.resize(
-                cell, (CELL_WIDTH, fitted), interpolation=cv2.INTER_AREA
-            )
-        rows.append(sheet)
-    png = cv2.imencode(".png", cv2.cvtColor(np.vstack(rows), cv2.COLOR_RGB2BGR))[1]
+    height, width = pictures[0][1].shape
+    size = CELL_WIDTH, max(1, round(2 * CELL_WIDTH * height / width))  # of the first for all: one camera, as a rule
+    cells = [np.vstack([image, _drawn(image, ids)]) for image, ids in pictures]
+    sheet = np.hstack([cv2.resize(cell, size, interpolation=cv2.INTER_AREA) for cell in cells])
+    png = cv2.imencode(".png", cv2.cvtColor(sheet, cv2.COLOR_RGB2BGR))[1]
     with replacing(path) as file:
         file.write(png.tobytes())
 

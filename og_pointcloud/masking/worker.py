@@ -1,21 +1,22 @@
-"""What is done for one image: proposals, a map for each level, features, all in one atomic work file; and this for many
-images side by side.
+"""What is done for one image, proposals, an id map and features in one atomic work file; and this for many images.
 
-Each process opens its models once and serves one pipe: it takes a task, answers with what is wrong with the image, and
-takes the next. A pipe ends with the process at its other end, so a worker stops when its parent is gone, and the parent
-notices a worker that was killed. One broken image stops no other.
+Each process opens its models once. One broken image stops no other; a process that is killed stops the run, but not
+what is done.
 """
 
 from __future__ import annotations
 
 import os
+import signal
 import zipfile
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
-from multiprocessing import get_context
-from multiprocessing.connection import Connection, wait
-from multiprocessing.process import BaseProcess
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from functools import lru_cache
+from multiprocessing import get_context, parent_process
 from pathlib import Path
+from threading import Thread
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -26,24 +27,11 @@ from og_pointcloud.errors import OgPointcloudError, SceneError
 from og_pointcloud.formats.atomic import replacing
 from og_pointcloud.formats.images import require_cv2
 from og_pointcloud.formats.poses import in_local_frame
-from og_pointcloud.masking.agreement import (
-    ProposedPoints,
-    points_of_proposals,
-    rendered_depth,
-    smallest_mask_px,
-    split_at_depth_edges,
-)
-from og_pointcloud.masking.contracts import (
-    AGREED,
-    LEVELS,
-    DepthMaskProposer,
-    MaskEncoder,
-    MaskProposer,
-    MaskSettings,
-    Proposals,
-)
+from og_pointcloud.masking.agreement import ProposedPoints, points_of_proposals
+from og_pointcloud.masking.contracts import AGREED, MaskProposer, MaskSettings, Proposals
+from og_pointcloud.masking.encode import open_encoder
 from og_pointcloud.masking.existing import ExistingMasks, own_proposer
-from og_pointcloud.masking.levels import AGREED_PREFERENCE, PREFERENCE, settle
+from og_pointcloud.masking.levels import AGREED_PREFERENCE, PREFERENCE, Level, settle
 from og_pointcloud.masking.photographs import Photograph, read_cloud
 from og_pointcloud.scene import Camera
 
@@ -69,90 +57,70 @@ class ImageWorker:
 
     def __init__(self, capture: Path, settings: MaskSettings) -> None:
         self.settings = settings
-        self.levels = LEVELS if settings.langsplat else (settings.level,)
-        self.preferences = AGREED_PREFERENCE if settings.level == AGREED else PREFERENCE
-        self.proposer = _open_proposer(settings)
-        self.encoder = _open_encoder(settings.encoder)
-        self.cloud = _SpacedCloud(capture) if settings.needs_points else None
+        folder, seconds = Path(settings.proposer), settings.seconds_per_image
+        self.proposer = (
+            ExistingMasks(folder)
+            if folder.is_dir()
+            else open_proposer(settings.proposer, seconds_per_image=seconds, download=settings.download)
+        )
+        self.encoder = open_encoder(settings.encoder) if settings.encoder is not None else None
+        self.cloud = _SpacedCloud(capture) if settings.level == AGREED else None
 
     def __call__(self, task: ImageTask) -> str | None:
         """Make the image's work file; what is wrong with the image, or None."""
         try:
-            self._make(task)
+            image = task.photograph.read(self.settings.longest_side)
+            if task.scores is not None:
+                arrays = self._masks(image, _kept_proposals(task))
+            elif self.cloud is not None:
+                arrays = self._first_pass(self.cloud, self._proposals(image, task.photograph), task.photograph)
+            else:
+                arrays = self._masks(image, self._proposals(image, task.photograph))
+            with replacing(task.work_file) as file:
+                np.savez_compressed(file, **arrays)
         except SceneError as error:
             return str(error)
         return None
 
-    def _make(self, task: ImageTask) -> None:
-        """Masks on the levels asked for, and their features; in a first pass the proposals."""
-        image = task.photograph.read(self.settings.longest_side)
-        if task.scores is not None:
-            arrays = self._masks(image, *_kept_proposals(task))
-        elif self.settings.level == AGREED:
-            arrays = self._first_pass(image, task.photograph)
-        else:
-            arrays = self._masks(image, *self._proposals(image, task.photograph))
-        with replacing(task.work_file) as file:
-            np.savez_compressed(file, **arrays)
+    def _proposals(self, image: NDArray[np.uint8], photograph: Photograph) -> Proposals:
+        if isinstance(self.proposer, ExistingMasks):
+            return self.proposer.of(photograph.name, image.shape[:2])
+        return self.proposer.propose(image)
 
-    def _masks(self, image: NDArray[np.uint8], proposals: Proposals, smallest_px: int) -> dict[str, Any]:
-        settled = settle(proposals, smallest_px, self.preferences)
-        space = self.encoder.feature_space if self.encoder else UNKNOWN_SPACE
-        arrays: dict[str, Any] = {"feature_space": np.array(space)}
-        for level in self.levels:
-            arrays[f"{level}_ids"] = settled[level].ids
-            arrays[f"{level}_features"] = self._features(image, settled[level].masks())
-        return arrays
-
-    def _first_pass(self, image: NDArray[np.uint8], photograph: Photograph) -> dict[str, Any]:
-        """Proposals, the points that show in them, and for the preview a map by the proposer's scores alone."""
-        proposals, smallest_px = self._proposals(image, photograph)
-        points = ProposedPoints(np.zeros(0, np.int32), np.zeros((len(proposals), 0), np.bool_))
-        if self.cloud is not None and photograph.distortion is None:
-            points = self.cloud.in_proposals(proposals, photograph.camera.resized(image.shape[1], image.shape[0]))
+    def _settled(self, proposals: Proposals) -> Level:
         level = self.settings.level
+        return settle(proposals, AGREED_PREFERENCE if level == AGREED else PREFERENCE)[level]
+
+    def _masks(self, image: NDArray[np.uint8], proposals: Proposals) -> dict[str, Any]:
+        """The id map of the level that is asked for, and its masks' features."""
+        level = self._settled(proposals)
+        space = self.encoder.feature_space if self.encoder else UNKNOWN_SPACE
+        masks = level.masks()
+        features = self.encoder.embed(image, masks) if self.encoder else np.zeros((len(masks), 1))
+        return {"feature_space": np.array(space), "ids": level.ids, "features": features.astype(np.float16)}
+
+    def _first_pass(self, cloud: _SpacedCloud, proposals: Proposals, photograph: Photograph) -> dict[str, Any]:
+        """Proposals, the points that show in them, and for the preview a map by the proposer's scores alone."""
+        points = ProposedPoints(np.zeros(0, np.int32), np.zeros((len(proposals), 0), np.bool_))
+        if photograph.distortion is None:  # the points fit pinhole images alone
+            height, width = proposals.masks.shape[1:]
+            points = cloud.in_proposals(proposals, photograph.camera.resized(width, height))
         return {
             "masks": np.packbits(proposals.masks, axis=2),
             "scores": proposals.scores,
-            "smallest_px": np.array(smallest_px),
             "seen": points.seen,
             "inside": points.inside,
-            f"{level}_ids": settle(proposals, smallest_px, self.preferences)[level].ids,
+            "ids": self._settled(proposals).ids,
         }
 
-    def _proposals(self, image: NDArray[np.uint8], photograph: Photograph) -> tuple[Proposals, int]:
-        """What the proposer says, after geometry, and the fewest pixels of a mask."""
-        if isinstance(self.proposer, ExistingMasks):
-            return self.proposer.of(photograph.name, image.shape[:2]), 1
-        if self.cloud is None or photograph.distortion is not None:  # the points fit pinhole images alone
-            return self.proposer.propose(image), 1
-        camera = photograph.camera.resized(image.shape[1], image.shape[0])
-        use_depth, split = self.settings.use_depth, self.settings.split
-        depth = self.cloud.depth(camera) if use_depth or split else None
-        if use_depth and isinstance(self.proposer, DepthMaskProposer):
-            proposals = self.proposer.propose_with_depth(image, depth)
-        else:
-            proposals = self.proposer.propose(image)
-        if split and depth is not None:
-            proposals = split_at_depth_edges(proposals, depth)
-        return proposals, self.cloud.smallest_mask_px(camera) if self.settings.drop_tiny else 1
 
-    def _features(self, image: NDArray[np.uint8], masks: NDArray[np.bool_]) -> NDArray[np.float16]:
-        if self.encoder is None:
-            return np.zeros((len(masks), 1), np.float16)
-        if not len(masks):
-            return np.zeros((0, self.encoder.width), np.float16)
-        return self.encoder.embed(image, masks).astype(np.float16)
-
-
-def _kept_proposals(task: ImageTask) -> tuple[Proposals, int]:
+def _kept_proposals(task: ImageTask) -> Proposals:
     """What the first pass kept, with the scores of the second."""
     assert task.proposals is not None
     assert task.scores is not None
     work = read_work(task.proposals)
-    width = next(work[name] for name in work if name.endswith("_ids")).shape[1]
-    masks = np.unpackbits(work["masks"], axis=2, count=width).astype(np.bool_)
-    return Proposals(masks, task.scores), int(work["smallest_px"])
+    masks = np.unpackbits(work["masks"], axis=2, count=work["ids"].shape[1]).astype(np.bool_)
+    return Proposals(masks, task.scores)
 
 
 def read_work(file: Path, *names: str) -> dict[str, NDArray[Any]]:
@@ -175,25 +143,10 @@ class _SpacedCloud:
         self.spacing = neighbourhood(self.points.xyz, GeometrySettings()).spacing
         self.asked = sample_of_points(self.points.xyz, AGREEMENT_POINTS)
 
-    def depth(self, camera: Camera) -> NDArray[np.float32]:
-        """camera: from world coordinates."""
-        return rendered_depth(self.points.xyz, self.spacing, in_local_frame(camera, self.points.origin))
-
     def in_proposals(self, proposals: Proposals, camera: Camera) -> ProposedPoints:
         """camera: from world coordinates."""
         camera = in_local_frame(camera, self.points.origin)
         return points_of_proposals(proposals, self.points.xyz, self.spacing, self.asked, camera)
-
-    def smallest_mask_px(self, camera: Camera) -> int:
-        """camera: from world coordinates."""
-        return smallest_mask_px(self.points.xyz, self.spacing, in_local_frame(camera, self.points.origin))
-
-
-def _open_proposer(settings: MaskSettings) -> MaskProposer | ExistingMasks:
-    folder = Path(settings.proposer)
-    if folder.is_dir():
-        return ExistingMasks(folder)
-    return open_proposer(settings.proposer, seconds_per_image=settings.seconds_per_image, download=settings.download)
 
 
 def open_proposer(text: str, *, seconds_per_image: float | None = None, download: bool = False) -> MaskProposer:
@@ -225,14 +178,6 @@ def open_proposer(text: str, *, seconds_per_image: float | None = None, download
     )
 
 
-def _open_encoder(name: str | None) -> MaskEncoder | None:
-    if name is None:
-        return None
-    from og_pointcloud.masking.encode import open_encoder
-
-    return open_encoder(name)
-
-
 def results(
     capture: Path, settings: MaskSettings, tasks: Sequence[ImageTask], processes: int
 ) -> Iterator[tuple[ImageTask, str | None]]:
@@ -247,67 +192,47 @@ def results(
         for task in tasks:
             yield task, work(task)
         return
-    waiting = list(reversed(tasks))
-    workers = _started(min(processes, len(tasks)), capture, settings)
-    try:
-        at_work = {pipe: _sent(pipe, waiting.pop()) for _, pipe in workers}
-        while at_work:
-            for pipe in wait(list(at_work)):
-                assert isinstance(pipe, Connection)
-                task, wrong = at_work.pop(pipe), _answer(pipe)
-                if waiting:
-                    at_work[pipe] = _sent(pipe, waiting.pop())
-                yield task, wrong
-    finally:
-        for process, pipe in workers:
-            pipe.close()  # the worker ends after the image that it is at
-            process.join()
-
-
-def _started(count: int, capture: Path, settings: MaskSettings) -> list[tuple[BaseProcess, Connection]]:
-    """Processes that serve the other end of a pipe each."""
-    context, workers = get_context("spawn"), []
     with one_thread_each():
-        for _ in range(count):
-            ours, theirs = context.Pipe()
-            process = context.Process(target=_serve, args=(theirs, capture, settings), daemon=True)
-            process.start()
-            theirs.close()
-            workers.append((process, ours))
-    return workers
-
-
-def _serve(pipe: Connection, capture: Path, settings: MaskSettings) -> None:
-    """In a process of its own: answer tasks until the other end of the pipe is closed, or gone."""
-    require_cv2().setNumThreads(1)
-    with suppress(EOFError, ConnectionError, KeyboardInterrupt):
-        try:
-            work = ImageWorker(capture, settings)
-        except (OgPointcloudError, ImportError, OSError) as error:
-            pipe.recv()
-            pipe.send(OgPointcloudError(str(error)))
-            return
-        while True:
-            pipe.send(work(pipe.recv()))
-
-
-def _sent(pipe: Connection, task: ImageTask) -> ImageTask:
-    with suppress(OSError):  # a worker that has ended: waiting for its answer says so
-        pipe.send(task)
-    return task
-
-
-def _answer(pipe: Connection) -> str | None:
+        pool = ProcessPoolExecutor(min(processes, len(tasks)), get_context("spawn"), initializer=_begin_process)
+        waiting = {pool.submit(_in_process, capture, settings, task): task for task in tasks}
     try:
-        answer = pipe.recv()
-    except (EOFError, OSError):
+        for future in as_completed(waiting):
+            yield waiting[future], future.result()
+    except BrokenProcessPool:
         raise OgPointcloudError(
             "a process that makes masks ended early (out of memory?); the images that are done are kept: the same "
             "command with --processes 1 goes on behind them, and says what is wrong"
         ) from None
-    if isinstance(answer, OgPointcloudError):
-        raise answer
-    return answer
+    finally:
+        pool.shutdown(cancel_futures=True)  # after the images that are being made
+
+
+def _begin_process() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent stops for all
+    require_cv2().setNumThreads(1)
+    Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    """A parent that is killed does not end its processes."""
+    parent = parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)
+
+
+@lru_cache(maxsize=1)
+def _opened(capture: Path, settings: MaskSettings) -> ImageWorker:
+    """The one that this process has."""
+    return ImageWorker(capture, settings)
+
+
+def _in_process(capture: Path, settings: MaskSettings, task: ImageTask) -> str | None:
+    try:
+        work = _opened(capture, settings)
+    except ImportError as error:  # MissingExtraError cannot be sent to another process
+        raise OgPointcloudError(str(error)) from None
+    return work(task)
 
 
 @contextmanager
