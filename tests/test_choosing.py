@@ -62,7 +62,7 @@ def choose_plainly(descriptors, texts, bank, sharpness, kinds, synonym):
     others = [j for j, w in enumerate(word) if max(w @ t for t in label) < synonym]
     table = []
     for e, n in zip(evidence, null, strict=True):
-        none = max(exp(s * s / 2), sum(exp(s * n[j]) for j in others) / len(bank)) * max(len(label), kinds)
+        none = max(exp(s * s / 2), sum(exp(s * n[j]) for j in others) / len(others)) * max(len(label), kinds)
         weights = [exp(s * x) for x in e]
         table.append([w / (sum(weights) + none) for w in weights])
     return np.array(table)

@@ -255,7 +255,7 @@ class Chooser:
         if not other.any():
             return by_chance
         exponents = sharpness * self._bank_evidence[:, other].astype(np.float64)
-        return np.maximum(by_chance, np.logaddexp.reduce(exponents, axis=1) - np.log(len(other)))
+        return np.maximum(by_chance, np.logaddexp.reduce(exponents, axis=1) - np.log(np.count_nonzero(other)))
 
     def _uncalibrated(self, texts: NDArray[np.float32], negatives: NDArray[np.float32]) -> Choice:
         """Without a bank: the largest cosine, judged by LERF's relevancy where there are negatives."""

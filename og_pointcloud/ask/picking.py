@@ -1,9 +1,9 @@
 """A click selects an instance (Sec. 4.3): a pixel of a camera, or a place, -> instance, its points, its mask anywhere.
 
-numpy only. Points are discs that face the camera, as wide as points lie apart; at each pixel the front surface wins,
-and on it the point whose centre is nearest to the pixel. One rule answers a click and makes a mask, so a picked
-instance's mask contains the pixel that was clicked. Images much finer than the cloud are made coarser and enlarged:
-their pixels see nothing new of it.
+numpy only. Points are squares in the image, a spacing to each side; at each pixel the front surface wins, and on it the
+point that lies nearest to the pixel. One rule answers a click and makes a mask, so a picked instance's mask contains
+the pixel that was clicked. Images much finer than the cloud are made coarser and enlarged: their pixels see nothing new
+of it.
 
 Frames. Everything here is in world coordinates, like ``scene.xyz``; a camera's ``world_to_camera`` maps from them.
 Views of a capture map from its local frame: ``in_world(view.camera, capture.points.origin)`` is the camera to pass.
@@ -11,15 +11,15 @@ Views of a capture map from its local frame: ``in_world(view.camera, capture.poi
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
 from pathlib import Path
 from typing import overload
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from og_pointcloud.ask.boxes import points_around
 from og_pointcloud.ask.labelled_scene import LabelledScene, SceneLike, as_scene
 from og_pointcloud.bundle.vocabulary import carried_encoder
 from og_pointcloud.cloud import BACKGROUND, TOO_FAR, UNOBSERVED, LabelledCloud
@@ -29,20 +29,13 @@ from og_pointcloud.text.words import Labels, TextFeatures, resolve_labels
 
 __all__ = ["Pick", "front_points", "in_world", "pick"]
 
-FOOTPRINT = 1.0
-"""Radius of a point's disc in point spacings. An evenly sampled surface is closed from 0.71 on; of one sampled at
-random a sixth stays open at 1. Wider discs make masks fatter: 1.5 costs up to 0.06 of IoU on noisy RGB-D clouds."""
 NEAR = 1.0
 """Depth of the near plane in point spacings: nearer points would cover half the image each."""
-LONE = 3
-"""A point with fewer points in the 27 voxels around it, itself among them, 2 spacings an edge, floats alone."""
 PIXELS_PER_SPACING = 2.0
 """Pixels a point spacing that are looked at, at most; as many as the fit looks at."""
+WIDEST = 8
+"""Pixels that a point covers to each side at most: those much nearer than the others leave gaps."""
 NO_POINT = -1
-HALF_DIAGONAL = 0.7072
-"""Of a pixel: the least radius of a disc, so that it covers the pixel that holds its centre."""
-PAIRS_AT_ONCE = 1_000_000
-"""(disc, pixel) pairs at once: about 100 MB."""
 
 _NOTHING_PICKED = {
     BACKGROUND: "background: views saw this point, but outside every mask",
@@ -176,19 +169,12 @@ def front_points(cloud: LabelledCloud, camera: Camera) -> NDArray[np.int64]:
 
     camera: maps from world coordinates.
 
-    A disc of FOOTPRINT spacings covers the pixels whose centres it holds, and always the one that holds its own. At
-    each pixel the nearest disc begins the front surface, as thick as the scene's reach; within it the disc with the
-    nearest centre wins, of equals the lowest index. Points that float alone show only where nothing else does.
+    A point covers the pixels within a spacing of its own, at most WIDEST, along rows and columns. At each pixel the
+    nearest point begins the front surface, as thick as the scene's reach; within it the point whose pixel is nearest
+    wins, of equally near ones the rightmost, then the lowest; in one pixel the one nearest to the camera.
     """
-    discs, drawn = _discs(cloud, camera)
-    front = np.full((drawn.height, drawn.width), NO_POINT)
-    pairs = np.minimum(4 * discs.radius**2, front.size).sum()  # at most: some discs reach out of the image
-    bands = int(pairs // PAIRS_AT_ONCE) + 1
-    for rows in np.array_split(np.arange(drawn.height), min(bands, drawn.height)):
-        disc, pixel, squared = _covered(discs, drawn.width, int(rows[0]), len(rows))
-        front[rows] = _in_front(discs, disc, pixel, squared, cloud.reach, len(rows) * drawn.width).reshape(
-            len(rows), -1
-        )
+    squares, drawn = _squares(cloud, camera)
+    front = _in_front(squares, drawn.width, drawn.height, cloud.reach)
     rows = ((np.arange(camera.height) + 0.5) * drawn.height / camera.height).astype(np.intp)
     columns = ((np.arange(camera.width) + 0.5) * drawn.width / camera.width).astype(np.intp)
     return front[rows[:, None], columns]
@@ -203,11 +189,11 @@ def _point_at_pixel(cloud: LabelledCloud, camera: Camera, uv_px: ArrayLike | Non
             f"uv_px is {uv_px}; expected a pixel (column, row) of the camera's image, 0 to {camera.width} and 0 to "
             f"{camera.height}, both less than the end"
         )
-    discs, drawn = _discs(cloud, camera)
-    center = np.floor((np.floor(uv) + 0.5) * [drawn.width, drawn.height] / size) + 0.5
-    squared = np.square(discs.uv_px - center).sum(axis=1)
-    disc = np.flatnonzero(squared <= np.square(discs.radius))
-    return int(_in_front(discs, disc, np.zeros(len(disc), np.int64), squared[disc], cloud.reach, 1)[0])
+    squares, drawn = _squares(cloud, camera)
+    offset = squares.pixel - ((np.floor(uv) + 0.5) * [drawn.width, drawn.height] / size).astype(np.int64)
+    covering = (np.abs(offset) <= squares.half[:, None]).all(axis=1)
+    alone = _Squares(*(values[covering] for values in (squares.index, offset, squares.depth, squares.half)))
+    return int(_in_front(alone, 1, 1, cloud.reach)[0, 0])
 
 
 def _nearest_point(cloud: LabelledCloud, place: ArrayLike) -> int:
@@ -222,77 +208,56 @@ def _nearest_point(cloud: LabelledCloud, place: ArrayLike) -> int:
 
 
 @dataclass(frozen=True)
-class _Discs:
-    """Points as discs in an image, those that float alone first, then from far to near.
+class _Squares:
+    """Points as squares of pixels, from far to near, of equals the lowest index last.
 
-    index: (m,) in the cloud. uv_px: (m, 2). depth, radius (pixels): (m,). lone: (m,) bool.
+    index: (m,) in the cloud. pixel: (m, 2) column and row of the middle one. depth: (m,). half: (m,) pixels that are
+    covered to each side of the middle one.
     """
 
     index: NDArray[np.int64]
-    uv_px: NDArray[np.float64]
+    pixel: NDArray[np.int64]
     depth: NDArray[np.float64]
-    radius: NDArray[np.float64]
-    lone: NDArray[np.bool_]
+    half: NDArray[np.int64]
 
 
-def _discs(cloud: LabelledCloud, camera: Camera) -> tuple[_Discs, Camera]:
-    """The discs that may touch the image, and the camera that they are drawn by: coarser where the cloud is."""
+def _squares(cloud: LabelledCloud, camera: Camera) -> tuple[_Squares, Camera]:
+    """The squares that may touch the image, and the camera that they are drawn by: coarser where the cloud is."""
     uv_px, depth = in_world(camera, -cloud.origin).project(cloud.xyz.astype(np.float64))
-    focal_px = np.sqrt(camera.fx * camera.fy)
-    with np.errstate(divide="ignore"):
-        spacing_px = focal_px * cloud.spacing / depth
     before = depth > NEAR * cloud.spacing
+    spacing_px = np.sqrt(camera.fx * camera.fy) * cloud.spacing / np.where(before, depth, np.inf)
     inside = before & camera.shows(uv_px)
     shrink = max(1.0, float(np.median(spacing_px[inside])) / PIXELS_PER_SPACING) if inside.any() else 1.0
     drawn = camera.resized(max(1, round(camera.width / shrink)), max(1, round(camera.height / shrink)))
-    scale = np.array([drawn.width / camera.width, drawn.height / camera.height])
+    size = np.array([drawn.width, drawn.height])
+    scale = size / [camera.width, camera.height]
+    half = np.minimum(np.rint(spacing_px * np.sqrt(scale.prod())), WIDEST)
     uv_px = uv_px * scale
-    radius = np.maximum(FOOTPRINT * spacing_px * np.sqrt(scale.prod()), HALF_DIAGONAL)
-    outside = np.abs(uv_px - np.array([drawn.width, drawn.height]) / 2) - np.array([drawn.width, drawn.height]) / 2
-    index = np.flatnonzero(before & (outside < radius[:, None]).all(axis=1))
-    lone = _lone(cloud)
-    index = index[np.lexsort((-depth[index], ~lone[index]))]
-    return _Discs(index, uv_px[index], depth[index], radius[index], lone[index]), drawn
+    index = np.flatnonzero(before & ((uv_px >= -half[:, None] - 1) & (uv_px <= size + half[:, None] + 1)).all(axis=1))
+    index = index[np.lexsort((-index, -depth[index]))]
+    return _Squares(index, np.floor(uv_px[index]).astype(np.int64), depth[index], half[index].astype(np.int64)), drawn
 
 
-@lru_cache(maxsize=2)
-def _lone(cloud: LabelledCloud) -> NDArray[np.bool_]:
-    """(n,) which points float alone; kept, so that the next click is quick."""
-    return points_around(cloud.xyz, 2 * cloud.spacing) < LONE
+def _in_front(squares: _Squares, width: int, height: int, reach: float) -> NDArray[np.int64]:
+    """(height, width) the point that each pixel shows."""
+    nearest, shown = np.full(width * height, -1), np.full(width * height, NO_POINT)
+    for square, pixel in _covered(squares, width, height):
+        ranks = np.full(width * height, -1)
+        ranks[pixel] = square  # of several writes the last one stays: the nearest
+        np.maximum(nearest, ranks, out=nearest)
+    surface = np.append(squares.depth, np.inf)[nearest] + reach
+    for square, pixel in _covered(squares, width, height):
+        wins = (shown[pixel] == NO_POINT) & (squares.depth[square] <= surface[pixel])
+        shown[pixel[wins]] = squares.index[square[wins]]
+    return shown.reshape(height, width)
 
 
-def _covered(
-    discs: _Discs, width: int, top: int, height: int
-) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
-    """Every pixel of a band of rows with every disc that covers it: disc, pixel (row-major in the band), and squared
-    distance of their centres. In the order of the discs."""
-    low = np.clip(np.ceil(discs.uv_px - discs.radius[:, None] - 0.5), [0, top], [width, top + height]).astype(np.int64)
-    high = np.clip(np.floor(discs.uv_px + discs.radius[:, None] + 0.5), low, [width, top + height]).astype(np.int64)
-    columns, rows = (high - low).T
-    cells = columns * rows
-    disc = np.repeat(np.arange(len(cells)), cells)
-    cell = np.arange(len(disc)) - np.repeat(np.cumsum(cells) - cells, cells)  # 0, 1, .. within each disc's box
-    column, row = low[disc, 0] + cell % columns[disc], low[disc, 1] + cell // columns[disc]
-    squared = np.square(column + 0.5 - discs.uv_px[disc, 0]) + np.square(row + 0.5 - discs.uv_px[disc, 1])
-    held = squared <= np.square(discs.radius[disc])
-    return disc[held], ((row - top) * width + column)[held], squared[held]
-
-
-def _in_front(
-    discs: _Discs,
-    disc: NDArray[np.int64],
-    pixel: NDArray[np.int64],
-    squared: NDArray[np.float64],
-    reach: float,
-    pixels: int,
-) -> NDArray[np.int64]:
-    """(pixels,) the point that each pixel shows, from pairs of discs and pixels that they cover, in discs' order."""
-    first = np.zeros(pixels, np.int64)
-    first[pixel] = disc  # of several writes the last one stays: the nearest, one in company if there is any
-    front = first[pixel]
-    on_front = (discs.depth[disc] <= discs.depth[front] + reach) & (discs.lone[disc] == discs.lone[front])
-    disc, pixel, squared = disc[on_front], pixel[on_front], squared[on_front]
-    best_last = np.lexsort((-discs.index[disc], -squared))
-    shown = np.full(pixels, NO_POINT)
-    shown[pixel[best_last]] = discs.index[disc[best_last]]
-    return shown
+def _covered(squares: _Squares, width: int, height: int) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
+    """Squares with a pixel (row-major) that each covers, its middle one first, then farther and farther ones."""
+    widest = int(squares.half.max(initial=-1))
+    steps = np.arange(-widest, widest + 1)
+    for right, down in sorted(itertools.product(steps, steps), key=lambda step: step[0] ** 2 + step[1] ** 2):
+        column, row = (squares.pixel + np.array([right, down])).T
+        inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        square = np.flatnonzero(inside & (squares.half >= max(abs(right), abs(down))))
+        yield square, row[square] * width + column[square]

@@ -197,8 +197,8 @@ def choice(
     others = np.flatnonzero((words @ labels.T).max(axis=1) < settings.synonym)
     table, none = np.zeros((len(evidence), len(texts))), np.zeros(len(evidence))
     for k in range(len(evidence)):
-        # The mean over the bank, in which words that mean a label count as nothing; no less than chance.
-        mean = _log_sum(sharpness * against[k][others]) - np.log(len(bank)) if len(others) else -np.inf
+        # The mean over the words of the bank that do not mean a label; no less than chance.
+        mean = _log_sum(sharpness * against[k][others]) - np.log(len(others)) if len(others) else -np.inf
         no_label = max(mean, sharpness**2 / 2) + np.log(max(len(different), settings.kinds))
         total = _log_sum(np.append(sharpness * evidence[k][first], no_label))
         table[k], none[k] = np.exp(sharpness * evidence[k] - total), np.exp(no_label - total)
