@@ -25,10 +25,10 @@ if TYPE_CHECKING:
 SCANNET_LABELS = "_vh_clean_2.labels.ply"
 CAPTURE_HEADER = (
     "", "mIoU", "95 %", "mAcc", "unknown", "background called", "answered", "share answered", "risk area", "AP50",
-    "PQ", "ARI",
+    "ARI",
 )  # fmt: skip
 SCANNET_HEADER = (
-    "", "mIoU", "mAcc", "forced", "flat mIoU", "all points", "answered", "share answered", "risk area", "95 % of mIoU",
+    "", "mIoU", "mAcc", "forced", "flat mIoU", "answered", "share answered", "risk area", "95 % of mIoU",
 )  # fmt: skip
 
 
@@ -66,11 +66,12 @@ def add(commands: Any) -> None:
     }
     gaussians = {
         scannet: "folder with <scene>.ply, whose points of opacity below 0.1 are ignored",
-        lerf: "folder with <scene>.ply, or <scene>/point_cloud/iteration_*/, of scenes fitted from Gaussians",
+        lerf: "folder with <scene>.ply, or <scene>/point_cloud/iteration_*/: what the scenes were fitted from",
     }
     for data_set in (scannet, lerf):
         data_set.add_argument("--predictions", type=Path, required=True, metavar="P", help=predictions[data_set])
-        data_set.add_argument("--gaussians", type=Path, metavar="G", help=gaussians[data_set])
+        required = data_set is lerf
+        data_set.add_argument("--gaussians", type=Path, metavar="G", required=required, help=gaussians[data_set])
         data_set.add_argument("--scenes", metavar="A,B", help="these scenes (default: all with labels in DIR)")
     for protocol in (capture, scannet, lerf):
         protocol.add_argument(
@@ -127,7 +128,7 @@ def capture_cells(name: str, score: CaptureScore, change: BlockInterval | None) 
         name, percent(labels.miou), spread(score.interval), percent(labels.macc), percent(labels.unknown_share),
         percent(labels.background_called), percent(score.answered.miou if score.answered.classes else None),
         percent(score.answered_share), f"{score.curve.area:.4f}", percent(things and things.of_class.ap50),
-        percent(things and things.panoptic.quality), f"{things.rand:.3f}" if things else "-",
+        f"{things.rand:.3f}" if things else "-",
         *((signed(change),) if change else ()),
     )  # fmt: skip
 
@@ -168,21 +169,18 @@ def run_scannet(arguments: argparse.Namespace) -> None:
     folders = [folder for folder in (arguments.predictions, arguments.against) if folder]
     predictions = [{scene: prediction_file(folder, scene) for scene in files} for folder in folders]
     results = [score_scans(files, found, arguments) for found in predictions]
-    foreign = results[0][1]
     rows, report = [], {}
     for task in TASKS:
-        row, report[str(task)] = scannet_row(task, *(scores[task] for scores, _ in results))
+        row, report[str(task)] = scannet_row(task, *(scores[task] for scores in results))
         rows.append(row)
     print_table(SCANNET_HEADER + (("less the other",) if arguments.against else ()), rows)
     published = sum(scene in SCENES for scene in files)
     print(f"{len(files)} scenes, {published} of the {len(SCENES)} of the published table; intervals are over scenes")
-    if foreign:
-        print(f"said, but no class of the table, so wrong everywhere: {', '.join(foreign[:5])}")
     if arguments.gaussians is None:
-        print("no --gaussians: transparent points are not ignored, so mIoU is that of all points")
+        print("no --gaussians: transparent points are not ignored")
     found = {
         str(folder): risk_over_scenes(list(scores[max(TASKS)].values()))
-        for folder, (scores, _) in zip(folders, results, strict=True)
+        for folder, scores in zip(folders, results, strict=True)
     }
     curves = {name: (curve, answered) for name, (curve, answered) in found.items() if curve}
     if arguments.plot and not curves:
@@ -192,19 +190,18 @@ def run_scannet(arguments: argparse.Namespace) -> None:
 
 def score_scans(
     truths: Mapping[str, Path], predictions: Mapping[str, Path], arguments: argparse.Namespace
-) -> tuple[dict[int, dict[str, SceneScore]], list[str]]:
-    """Every task of every scene, and the names said that are no class of the table."""
+) -> dict[int, dict[str, SceneScore]]:
+    """Every task of every scene."""
     from og_pointcloud.evaluate.scannet import TASKS, read_prediction, read_truth, score_scene
 
-    scores, foreign = {task: {} for task in TASKS}, set()
+    scores = {task: {} for task in TASKS}
     for scene, file in truths.items():
         xyz, truth = read_truth(file)
         opacity = opacities(arguments.gaussians, scene, len(truth))
         for task, of_task in scores.items():
             found = read_prediction(predictions[scene], xyz, task, arguments.text_features)
             of_task[scene] = score_scene(found.ids, truth, task, opacity, found.confidence, found.forced)
-            foreign |= found.foreign
-    return scores, sorted(foreign)
+    return scores
 
 
 def scannet_row(
@@ -224,7 +221,7 @@ def scannet_row(
     if other and mean.scenes:
         change = paired_bootstrap(per_scene, np.array([score.protocol.miou for score in other.values()]))
     row = (
-        f"{task} classes", *map(percent, (mean.miou, mean.macc, mean.forced_miou, mean.flat_miou, mean.all_points)),
+        f"{task} classes", *map(percent, (mean.miou, mean.macc, mean.forced_miou, mean.flat_miou)),
         percent(mean.answered), percent(mean.answered_share), f"{curve.area:.4f}" if curve else "-", spread(interval),
         *([] if other is None else [signed(change) if change else "-"]),
     )  # fmt: skip
@@ -248,7 +245,6 @@ def scan_scores(score: SceneScore) -> dict[str, Any]:
         "macc": score.protocol.macc,
         "class_iou": dict(zip(map(str, score.protocol.classes), score.protocol.class_iou, strict=True)),
         "points": score.protocol.points,
-        "all_points_miou": score.all_points.miou,
         "answered_miou": score.answered.miou,
         "answered_share": score.answered_share,
     }
@@ -299,10 +295,6 @@ def run_lerf(arguments: argparse.Namespace) -> None:
     for way in ways[1:]:
         change = paired_bootstrap(pair_column(own, way), pair_column(own, ways[0]))
         print(f"{way} less {ways[0]}, mIoU of all pairs: {signed(change)}")
-    pairs = [pair for of_scene in own.values() for pair in of_scene]
-    for way in pairs[0].selected:
-        nothing = sum(pair.selected[way] == 0 for pair in pairs)
-        print(f"{way}: nothing selected for {nothing} of {len(pairs)} pairs")
     for other in others:
         for way in ways:
             change = paired_bootstrap(pair_column(own, way), pair_column(other, way))
@@ -312,7 +304,7 @@ def run_lerf(arguments: argparse.Namespace) -> None:
 
 
 def score_selections(
-    labels: Sequence[Any], files: list[Path], splats: list[Path | None], arguments: argparse.Namespace
+    labels: Sequence[Any], files: list[Path], splats: list[Path], arguments: argparse.Namespace
 ) -> LerfScores:
     from og_pointcloud.ask.labelled_scene import load
     from og_pointcloud.evaluate.lerf import gaussians_of, score_pairs
@@ -365,9 +357,7 @@ def print_set(scenes: Mapping[str, Sequence[Any]]) -> None:
         print(f"not the set of the published table, whose pairs are {published}: its means are of others")
 
 
-def gaussians_file(folder: Path | None, scene: str) -> Path | None:
-    if folder is None:
-        return None
+def gaussians_file(folder: Path, scene: str) -> Path:
     from og_pointcloud.formats.gaussian_ply import latest_iteration
 
     file = folder / f"{scene}.ply"

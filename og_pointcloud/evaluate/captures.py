@@ -16,19 +16,8 @@ from numpy.typing import NDArray
 
 from og_pointcloud.ask.labelled_scene import SceneLike, as_scene, segment
 from og_pointcloud.errors import SceneError
-from og_pointcloud.evaluate.instance_scores import (
-    AveragePrecision,
-    PanopticQuality,
-    average_precision,
-    panoptic_quality,
-)
-from og_pointcloud.evaluate.intervals import (
-    BlockInterval,
-    RiskCoverage,
-    miou_difference,
-    miou_interval,
-    risk_coverage,
-)
+from og_pointcloud.evaluate.instance_scores import AveragePrecision, average_precision
+from og_pointcloud.evaluate.intervals import BlockInterval, RiskCoverage, miou_interval, risk_coverage
 from og_pointcloud.evaluate.metrics import Score, adjusted_rand_index, score_labels
 from og_pointcloud.evaluate.truth import Truth
 
@@ -59,13 +48,11 @@ class Answer:
 
 @dataclass(frozen=True)
 class InstanceScore:
-    """Over points of things whose class is known. any_kind, any_panoptic: whatever they are called. of_class,
-    panoptic: of the right class. rand: adjusted Rand index; points without an instance are one part."""
+    """Over points of things whose class is known. any_kind: whatever they are called. of_class: of the right class.
+    rand: adjusted Rand index; points without an instance are one part."""
 
     any_kind: AveragePrecision
-    any_panoptic: PanopticQuality
     of_class: AveragePrecision
-    panoptic: PanopticQuality
     rand: float
 
 
@@ -127,7 +114,7 @@ def score_capture(answer: Answer, truth: Truth, seed: int = 0) -> CaptureScore:
 def difference(first: Answer, second: Answer, truth: Truth, seed: int = 0) -> BlockInterval:
     """Of the mIoU of one answer less that of another, of the same points: paired, over the same blocks of space."""
     classes = score_labels(first.called, truth.cls, scored=truth.scored).classes
-    return miou_difference(first.called, second.called, truth, first.xyz, first.spacing, classes, seed)
+    return miou_interval(first.called, truth, first.xyz, first.spacing, classes, seed, less=second.called)
 
 
 def score_instances(answer: Answer, truth: Truth) -> InstanceScore | None:
@@ -149,9 +136,7 @@ def score_instances(answer: Answer, truth: Truth) -> InstanceScore | None:
     named = np.where((predicted >= 0) & (np.append(called, -1)[predicted] >= 0), predicted, -1)
     return InstanceScore(
         any_kind=average_precision(predicted, things, confidence),
-        any_panoptic=panoptic_quality(predicted, things),
         of_class=average_precision(named, things, confidence, called, true_class),
-        panoptic=panoptic_quality(named, things, called, true_class),
         rand=adjusted_rand_index(predicted[counted], things[counted]),
     )
 

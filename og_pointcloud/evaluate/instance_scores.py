@@ -1,4 +1,4 @@
-"""Instance scores of a cloud whose points carry one instance id each: average precision and panoptic quality.
+"""Average precision of a cloud whose points carry one instance id each.
 
 Average precision follows ScanNet's benchmark, class by class. A true instance is found at a threshold if a prediction's
 IoU with it is *above* the threshold; of several, the surest is the hit and the others are false. True instances of
@@ -6,9 +6,6 @@ fewer than 100 points, and unlabelled points, are void: a prediction that finds 
 share ``threshold`` of its points is void. Predictions of fewer than 100 points are not looked at. Precision is
 integrated over recall with each step weighted by half the distance of its neighbours. AP is the mean over the
 thresholds 0.5, 0.55, ... 0.95 (0.25 is apart); a class without a true instance has none.
-
-Panoptic quality follows Kirillov et al. 2019: matches are pairs with IoU above 0.5, which are unique; void points are
-taken out of predictions, and one that is mostly void and finds nothing is not counted.
 """
 
 from __future__ import annotations
@@ -20,14 +17,13 @@ from numpy.typing import NDArray
 
 from og_pointcloud.errors import OgPointcloudError
 
-__all__ = ["AveragePrecision", "PanopticQuality", "average_precision", "panoptic_quality"]
+__all__ = ["AveragePrecision", "average_precision"]
 
 Integers = NDArray[np.integer]
 Doubles = NDArray[np.float64]
 
 THRESHOLDS = tuple(round(0.5 + 0.05 * step, 2) for step in range(10))
 SMALLEST_INSTANCE = 100
-MATCHED = 0.5
 
 
 @dataclass(frozen=True)
@@ -37,16 +33,6 @@ class AveragePrecision:
     ap: float
     ap50: float
     ap25: float
-
-
-@dataclass(frozen=True)
-class PanopticQuality:
-    """quality = segmentation (mean IoU of matches) x recognition (matches / (matches + half of what is unmatched)),
-    each a mean over the classes that have a true or a predicted instance."""
-
-    quality: float
-    segmentation: float
-    recognition: float
 
 
 def average_precision(
@@ -59,7 +45,9 @@ def average_precision(
     truth_class (T,): by id; None, both, asks for things of any kind.
     """
     shared = _shared_points(predicted, truth, len(confidence))
-    of_predicted, of_truth = _classes(shared, predicted_class, truth_class)
+    predictions, true_instances = shared.shape[0] - 1, shared.shape[1] - 1
+    of_predicted = np.zeros(predictions, int) if predicted_class is None else np.asarray(predicted_class)
+    of_truth = np.zeros(true_instances, int) if truth_class is None else np.asarray(truth_class)[:true_instances]
     table = []
     for class_id in np.unique(of_truth):
         true, large = of_truth == class_id, shared[:, :-1].sum(axis=0) >= min_points
@@ -78,30 +66,6 @@ def average_precision(
     return AveragePrecision(ap=float(means[1:].mean()), ap50=float(means[1]), ap25=float(means[0]))
 
 
-def panoptic_quality(
-    predicted: Integers, truth: Integers, predicted_class: Integers | None = None, truth_class: Integers | None = None
-) -> PanopticQuality:
-    """Panoptic quality of instance ids; arguments as for average_precision."""
-    count = int(np.max(predicted, initial=-1)) + 1 if predicted_class is None else len(predicted_class)
-    shared = _shared_points(predicted, truth, count)
-    of_predicted, of_truth = _classes(shared, predicted_class, truth_class)
-    present_rows, present_columns = shared[:-1].sum(axis=1) > 0, shared[:, :-1].sum(axis=0) > 0
-    mostly_void = shared[:-1, -1] > MATCHED * shared[:-1].sum(axis=1)
-    without_void = shared.copy()
-    without_void[:-1, -1] = 0
-    iou = _iou(without_void)
-    scores = []
-    for class_id in np.union1d(of_predicted[present_rows & ~mostly_void], of_truth[present_columns]):
-        rows, columns = present_rows & (of_predicted == class_id), present_columns & (of_truth == class_id)
-        matched = iou[np.ix_(rows, columns)] > MATCHED
-        matches = int(matched.sum())
-        unmatched = (~matched.any(axis=1) & ~mostly_void[rows]).sum() + (~matched.any(axis=0)).sum()
-        segmentation = float(iou[np.ix_(rows, columns)][matched].mean()) if matches else 0.0
-        recognition = matches / (matches + unmatched / 2) if matches + unmatched else 0.0
-        scores.append((segmentation * recognition, segmentation, recognition))
-    return PanopticQuality(*map(float, np.mean(scores, axis=0))) if scores else PanopticQuality(*[float("nan")] * 3)
-
-
 def _shared_points(predicted: Integers, truth: Integers, predictions: int) -> NDArray[np.int64]:
     """(P + 1, T + 1) points that each pair of ids shares; the last row and column are points without an id."""
     predicted, truth = np.asarray(predicted, np.int64), np.asarray(truth, np.int64)
@@ -113,19 +77,6 @@ def _shared_points(predicted: Integers, truth: Integers, predictions: int) -> ND
     rows, columns = np.where(predicted < 0, predictions, predicted), np.where(truth < 0, true, truth)
     size = (predictions + 1) * (true + 1)
     return np.bincount(rows * (true + 1) + columns, minlength=size).reshape(predictions + 1, true + 1)
-
-
-def _classes(
-    shared: NDArray[np.int64], predicted_class: Integers | None, truth_class: Integers | None
-) -> tuple[Integers, Integers]:
-    predictions, true = shared.shape[0] - 1, shared.shape[1] - 1
-    if (predicted_class is None) != (truth_class is None):
-        raise OgPointcloudError("classes of one side alone; expected those of predictions and of truth, or neither")
-    if predicted_class is None or truth_class is None:
-        return np.zeros(predictions, np.int64), np.zeros(true, np.int64)
-    if len(truth_class) < true:
-        raise OgPointcloudError(f"{len(truth_class)} classes for {true} true instances; expected one each")
-    return np.asarray(predicted_class)[:predictions], np.asarray(truth_class)[:true]
 
 
 def _iou(shared: NDArray[np.int64]) -> Doubles:

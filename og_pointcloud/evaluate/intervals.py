@@ -26,13 +26,13 @@ __all__ = [
     "Interval",
     "RiskCoverage",
     "bootstrap",
-    "miou_difference",
     "miou_interval",
     "paired_bootstrap",
     "risk_coverage",
 ]
 
 Doubles = NDArray[np.float64]
+Integers = NDArray[np.integer]
 
 DRAWS, BLOCK_DRAWS = 10_000, 2_000
 CHUNK = 1 << 21
@@ -114,60 +114,36 @@ def risk_coverage(correct: NDArray[np.bool_], confidence: NDArray[np.floating]) 
 
 
 def miou_interval(
-    called: NDArray[np.integer], truth: Truth, xyz: NDArray[np.floating], spacing: float, classes: tuple[int, ...],
-    seed: int = 0,
+    called: Integers, truth: Truth, xyz: NDArray[np.floating], spacing: float, classes: tuple[int, ...],
+    seed: int = 0, less: Integers | None = None,
 ) -> BlockInterval:  # fmt: skip
-    """Of the mean IoU that `score_labels` gives.
+    """Of the mean IoU that `score_labels` gives; or of its difference to another labelling's, ``called`` less ``less``:
+    both are scored on the same draws, since what is hard is hard for both.
 
-    called: (n,) classes of the truth, below 0 unknown (`Truth.class_of`). xyz: (n, 3). spacing: of its points, same
-    unit. classes: those that the score is a mean over. Raises OgPointcloudError where there are none, or no spacing.
+    called, less: (n,) classes of the truth, below 0 unknown (`Truth.class_of`). xyz: (n, 3). spacing: of its points,
+    same unit. classes: those that the score is a mean over. OgPointcloudError where there are none, or no spacing.
     """
-    return _widest([called], truth, xyz, spacing, classes, seed)
-
-
-def miou_difference(
-    first: NDArray[np.integer], second: NDArray[np.integer], truth: Truth, xyz: NDArray[np.floating], spacing: float,
-    classes: tuple[int, ...], seed: int = 0,
-) -> BlockInterval:  # fmt: skip
-    """Of the difference first - second of two labellings of one cloud: both are scored on the same draws, since what is
-    hard is hard for both. Arguments as for `miou_interval`."""
-    return _widest([first, second], truth, xyz, spacing, classes, seed)
-
-
-@dataclass(frozen=True)
-class _Counts:
-    """(blocks, classes) points of each block: hits, and union = true + called - hits."""
-
-    hits: Doubles
-    union: Doubles
-
-    def miou(self, weights: Doubles) -> Doubles:
-        """(draws,) for weights (draws, blocks), how often each block was drawn."""
-        union = weights @ self.union
-        iou = np.divide(weights @ self.hits, union, out=np.zeros_like(union), where=union > 0)
-        return iou.sum(axis=1) / np.maximum((union > 0).sum(axis=1), 1)
-
-
-def _widest(
-    labellings: list[NDArray[np.integer]], truth: Truth, xyz: NDArray[np.floating], spacing: float,
-    classes: tuple[int, ...], seed: int,
-) -> BlockInterval:  # fmt: skip
     if not classes:
         raise OgPointcloudError("no class has enough points to be scored; expected one or more")
     if not (np.isfinite(spacing) and spacing > 0):
         raise OgPointcloudError(f"the point spacing is {spacing:g}; expected a length above 0, in the points' unit")
     evaluated = truth.scored & np.isin(truth.cls, classes)
     counted = evaluated if truth.background is None else evaluated | truth.background
-    points, own = np.asarray(xyz, np.float64)[counted], evaluated[counted]
-    intervals = []
+    points, true = np.asarray(xyz, np.float64)[counted], np.where(evaluated, truth.cls, -1)[counted]
+    labellings = [labels[counted] for labels in (called, less) if labels is not None]
+    intervals: list[BlockInterval] = []
     edge = SMALLEST_EDGE * spacing
     while True:
         block = _cubes(points, edge)
-        spread = [len(np.unique(block[own & (truth.cls[counted] == class_id)])) for class_id in classes]
-        if intervals and np.median(spread) < FEWEST_BLOCKS:
+        present = _points_per_block(block, true, classes)
+        if intervals and np.median((present > 0).sum(axis=0)) < FEWEST_BLOCKS:
             return max(intervals, key=lambda interval: interval.high - interval.low)
-        counts = [_count(called, truth.cls, evaluated, counted, block, classes) for called in labellings]
-        intervals.append(_interval(counts, edge, seed))
+        hits = [_points_per_block(block, np.where(labels == true, true, -1), classes) for labels in labellings]
+        unions = [
+            present + _points_per_block(block, labels, classes) - hit
+            for labels, hit in zip(labellings, hits, strict=True)
+        ]
+        intervals.append(_interval(hits, unions, edge, seed))
         edge *= 2
 
 
@@ -177,29 +153,26 @@ def _cubes(xyz: Doubles, edge: float) -> NDArray[np.intp]:
     return np.unique((cube[:, 0] << 42) | (cube[:, 1] << 21) | cube[:, 2], return_inverse=True)[1]
 
 
-def _count(
-    called: NDArray[np.integer], cls: NDArray[np.integer], evaluated: NDArray[np.bool_], counted: NDArray[np.bool_],
-    block: NDArray[np.intp], classes: tuple[int, ...],
-) -> _Counts:  # fmt: skip
-    blocks, width = int(block.max()) + 1, len(classes)
-    order = np.asarray(classes)  # ascending, as score_labels has them
-
-    def tally(rows: NDArray[np.bool_], ids: NDArray[np.integer]) -> Doubles:
-        rows = rows[counted] & np.isin(ids[counted], order)
-        cell = block[rows] * width + np.searchsorted(order, ids[counted][rows])
-        return np.bincount(cell, minlength=blocks * width).reshape(blocks, width).astype(np.float64)
-
-    hits = tally(evaluated & (called == cls), cls)
-    return _Counts(hits, tally(evaluated, cls) + tally(counted, called) - hits)
+def _points_per_block(block: NDArray[np.intp], ids: Integers, classes: tuple[int, ...]) -> Doubles:
+    """(blocks, classes) how many points of each block have each class. block, ids: (n,)."""
+    counts = np.zeros((int(block.max()) + 1, len(classes)))
+    for column, class_id in enumerate(classes):
+        counts[:, column] = np.bincount(block[ids == class_id], minlength=len(counts))
+    return counts
 
 
-def _interval(counts: list[_Counts], edge: float, seed: int) -> BlockInterval:
-    """Of the one mean IoU, or of the first less the second."""
-    blocks = len(counts[0].hits)
+def _interval(hits: list[Doubles], unions: list[Doubles], edge: float, seed: int) -> BlockInterval:
+    """Of the one mean IoU, or of the first less the second. hits, unions: of each labelling, (blocks, classes)."""
+    blocks = len(hits[0])
 
     def score(weights: Doubles) -> Doubles:
-        scores = [one.miou(weights) for one in counts]
-        return scores[0] if len(scores) == 1 else scores[0] - scores[1]
+        """(draws,) for weights (draws, blocks), how often each block was drawn."""
+        mious = []
+        for hit, union in zip(hits, unions, strict=True):
+            drawn_union = weights @ union
+            iou = np.divide(weights @ hit, drawn_union, out=np.zeros_like(drawn_union), where=drawn_union > 0)
+            mious.append(iou.sum(axis=1) / np.maximum((drawn_union > 0).sum(axis=1), 1))
+        return mious[0] if len(mious) == 1 else mious[0] - mious[1]
 
     drawn = []
     for picked in _draws(blocks, BLOCK_DRAWS, seed):

@@ -38,12 +38,11 @@ from og_pointcloud.formats.colmap import find_model, read_images
 from og_pointcloud.formats.images import MAX_PIXELS, require_cv2, same_shape
 from og_pointcloud.formats.points import read_points
 from og_pointcloud.formats.poses import in_local_frame
-from og_pointcloud.scene import Camera, Points, View
-from og_pointcloud.settings import GeometrySettings
+from og_pointcloud.scene import Camera, View
 from og_pointcloud.text.words import TextFeatures
 
 try:
-    from og_pointcloud.rendering.geometry import isotropic, near_plane, neighbourhood
+    from og_pointcloud.rendering.geometry import near_plane
     from og_pointcloud.rendering.splatting import Gaussians, render
 except ImportError as error:
     raise MissingExtraError("scipy and numba", "fit") from error
@@ -103,12 +102,11 @@ class LerfScene:
 
 @dataclass(frozen=True)
 class PairScore:
-    """A (frame, object) pair. iou: by way. selected: how many instances each way selected."""
+    """A (frame, object) pair. iou: by way."""
 
     frame: str
     object: str
     iou: dict[str, float]
-    selected: dict[str, int]
 
 
 @dataclass(frozen=True)
@@ -194,19 +192,9 @@ def _filled(outline: Any, shape: tuple[int, int], source: str) -> NDArray[np.boo
     return mask.astype(bool)
 
 
-def gaussians_of(cloud: LabelledCloud, file: Path | None) -> Gaussians:
-    """The cloud's points as splats, in its local frame: those of the file that it was fitted from, or round ones as the
-    fit drew a plain cloud. SceneError where neither is known, or the file is another cloud's."""
-    if file is None:
-        scale, opacity = (cloud.provenance.get("notes", {}).get(f"gaussian_{name}") for name in ("scale", "opacity"))
-        known = isinstance(scale, int | float) and isinstance(opacity, int | float)
-        if not known or not (scale > 0 and 0 < opacity <= 1):
-            raise SceneError(
-                "the scene does not say how its points were drawn: it was fitted from Gaussians, which its file "
-                "does not hold; expected them: name their folder (--gaussians)"
-            )
-        spacing = neighbourhood(cloud.xyz, GeometrySettings()).spacing
-        return isotropic(Points(cloud.xyz, cloud.origin), spacing, scale, opacity)
+def gaussians_of(cloud: LabelledCloud, file: Path) -> Gaussians:
+    """The cloud's points as splats, in its local frame: those of the file that it was fitted from. SceneError where the
+    file is another cloud's."""
     points = read_points(file)
     found = Gaussians.from_points(points)
     if len(points) != len(cloud):
@@ -245,9 +233,7 @@ def score_pairs(
             for instance in np.unique(scene.instance_ids[scene.instance_ids >= 0]).tolist():
                 found = pair_ious(frame, dict.fromkeys(frame.objects, shown((instance,))))
                 ious[ORACLE] = {name: max(found[name], best) for name, best in ious[ORACLE].items()}
-        for name in frame.objects:
-            counts = {way: len(chosen[name][way]) for way in WAYS}
-            scores.append(PairScore(frame.name, name, {way: of[name] for way, of in ious.items()}, counts))
+        scores += [PairScore(frame.name, name, {way: of[name] for way, of in ious.items()}) for name in frame.objects]
     return scores
 
 

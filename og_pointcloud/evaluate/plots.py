@@ -14,7 +14,7 @@ from og_pointcloud.errors import MissingExtraError
 from og_pointcloud.evaluate.intervals import RiskCoverage
 from og_pointcloud.formats.atomic import replacing
 
-__all__ = ["plot_risk_coverage", "require_matplotlib", "risk_coverage_png"]
+__all__ = ["plot_risk_coverage", "png_bytes", "require_matplotlib"]
 
 
 def require_matplotlib() -> Any:
@@ -26,35 +26,32 @@ def require_matplotlib() -> Any:
     return Figure
 
 
+def png_bytes(figure: Any) -> bytes:
+    """A matplotlib figure as a PNG."""
+    data = io.BytesIO()
+    figure.savefig(data, format="png", dpi=110)
+    return data.getvalue()
+
+
 def plot_risk_coverage(
     curves: Mapping[str, RiskCoverage], answered: Mapping[str, float], path: str | os.PathLike[str], title: str = ""
 ) -> Path:
-    """Write `risk_coverage_png`, whole or not at all."""
-    png = risk_coverage_png(curves, answered, title)
-    with replacing(Path(path)) as file:
-        file.write(png)
-    return Path(path)
-
-
-def risk_coverage_png(curves: Mapping[str, RiskCoverage], answered: Mapping[str, float], title: str = "") -> bytes:
-    """A PNG. curves: by method. answered: share of the points that each method answers of itself; beyond it lie the
-    unknown ones, which count as wrong."""
+    """Write a PNG, whole or not at all. curves: by method. answered: share of the points that each method answers of
+    itself; beyond it lie the unknown ones, which count as wrong."""
     figure = require_matplotlib()(figsize=(7, 4.2), layout="constrained")
     axes = figure.subplots()
     for name, curve in curves.items():
         # From the first point on: with nothing answered there is no risk to speak of.
-        coverage, risk = np.append(curve.coverage[:1] * 0, curve.coverage), np.append(curve.risk[:1], curve.risk)
+        coverage, risk = np.append(0, curve.coverage), np.append(curve.risk[:1], curve.risk)
         (line,) = axes.plot(100 * coverage, 100 * risk, label=f"{name} (area {curve.area:.4f})")
-        share = answered[name]
-        at = float(np.interp(share, coverage, risk))
-        axes.plot([100 * share], [100 * at], "o", ms=9, mfc="none", mew=1.8, color=line.get_color())
+        stop = 100 * answered[name], 100 * float(np.interp(answered[name], coverage, risk))
+        axes.plot(*stop, "o", ms=9, mfc="none", mew=1.8, color=line.get_color())
     axes.plot([], [], "o", ms=9, mfc="none", mew=1.8, color="0.3", label="answers no more: unknown counts as wrong")
     axes.set(xlabel="% of the points answered, surest first", ylabel="% of these that are wrong", title=title)
-    axes.set_xlim(0, 101)
-    axes.set_ylim(bottom=0)
+    axes.set(xlim=(0, 101), ylim=(0, None))
     axes.grid(alpha=0.3)
-    axes.spines[["top", "right"]].set_visible(False)
     axes.legend(fontsize=8, frameon=False)
-    data = io.BytesIO()
-    figure.savefig(data, format="png", dpi=110)
-    return data.getvalue()
+    png = png_bytes(figure)
+    with replacing(Path(path)) as file:
+        file.write(png)
+    return Path(path)

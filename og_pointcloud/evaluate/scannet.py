@@ -4,9 +4,9 @@ Rules. A task is 19, 15 or 10 classes, asked by their bare names. Points of othe
 an opacity below 0.1, are ignored: neither they nor what is predicted on them counts anywhere. IoU and recall are taken
 per class over one scene and averaged over the classes *present in that scene*, then over scenes (macro mean).
 
-Beside the protocol stand: all points, with the transparent ones; the answered points alone, with the share that was
-answered (unknown as abstention; in the protocol it counts as wrong); and the flat mean, where each class's points of
-all scenes are one pool, so that a class seen once weighs as much as one seen in every scene.
+Beside the protocol stand the answered points alone, with the share that was answered (unknown as abstention; in the
+protocol it counts as wrong); and the flat mean, where each class's points of all scenes are one pool, so that a class
+seen once weighs as much as one seen in every scene.
 """
 
 from __future__ import annotations
@@ -66,29 +66,26 @@ NOT_OF_THE_TABLE = 40
 
 @dataclass(frozen=True)
 class Prediction:
-    """ids: (n,) NYU40, below 1 unknown. confidence: (n,) larger is surer; None where a file of labels has none. forced:
-    (n,) as ids, but every instance with a feature takes a class; None for stored labels. foreign: names said that are
-    no class of the table."""
+    """ids: (n,) NYU40, below 1 unknown. confidence: (n,) larger is surer. forced: (n,) as ids, but every instance with
+    a feature takes a class. Both None for stored labels."""
 
     ids: NDArray[np.int64]
     confidence: NDArray[np.floating] | None
     forced: NDArray[np.int64] | None
-    foreign: frozenset[str]
 
 
 @dataclass(frozen=True)
 class SceneScore:
     """One scene, one task; class ids in the scores are NYU40's.
 
-    protocol: as published, unknown counts as wrong. all_points: with the transparent ones. answered: points with a
-    label alone, over the classes present among them; answered_share: of the protocol's points.
+    protocol: as published, unknown counts as wrong. answered: points with a label alone, over the classes present among
+    them; answered_share: of the protocol's points.
     hits, union: by NYU40 id, (41,) int64, points of the protocol, for the flat mean.
     correct, confidence: (k,) of the protocol's points, whether each is right and how sure it is, -inf where unknown;
     confidence is None where the prediction has none. forced_miou: of `Prediction.forced`, None where that is.
     """
 
     protocol: Score
-    all_points: Score
     answered: Score
     answered_share: float
     hits: NDArray[np.int64]
@@ -101,14 +98,13 @@ class SceneScore:
 @dataclass(frozen=True)
 class TaskMean:
     """Means over scenes: macro means of the protocol's mIoU and mAcc (as published), and the flat mIoU over pooled
-    points; of the mIoU with forced answers (None where a scene has none), of all points, and of the answered ones, with
-    their share. Scenes with no point of the task have no mean and are left out; NaN where none is left."""
+    points; of the mIoU with forced answers (None where a scene has none) and of the answered points, with their share.
+    Scenes with no point of the task have no mean and are left out; NaN where none is left."""
 
     miou: float
     macc: float
     flat_miou: float
     forced_miou: float | None
-    all_points: float
     answered: float
     answered_share: float
     scenes: int
@@ -132,57 +128,35 @@ def read_truth(file: str | Path) -> tuple[NDArray[np.float64], NDArray[np.int32]
 def read_prediction(file: Path, xyz: NDArray[np.float64], task: int, text_features: Path | None = None) -> Prediction:
     """What a file says of a scene's vertices: a .ogpc is asked for the task's names, labels of a .npz are taken by
     their names. xyz: (n, 3) world coordinates. SceneError where the labels are not one each vertex, or damaged."""
-    forced = None
-    if file.suffix == ".ogpc":
-        asked = [NAMES[class_id] for class_id in TASKS[task]]
-        labels, confidence, forced = _asked_labels(file, xyz, asked, text_features)
-    else:
-        labels, confidence, asked = _stored_labels(file)
-    if len(labels) != len(xyz):
-        raise SceneError(f"{file} has {len(labels)} labels, the scene {len(xyz)} points; expected one each")
-    if len(labels) and labels.max() >= len(asked):
-        raise SceneError(f"{file}: label {labels.max()} has no name (there are {len(asked)})")
-    ids = {name: class_id for class_id, name in NAMES.items()}
-    id_of_label = np.array([*(ids.get(name, NOT_OF_THE_TABLE) for name in asked), 0])
-    foreign = frozenset(asked[label] for label in np.unique(labels[labels >= 0]) if asked[label] not in ids)
-    forced_ids = None if forced is None else id_of_label[np.maximum(forced, -1)]
-    return Prediction(id_of_label[np.maximum(labels, -1)], confidence, forced_ids, foreign)
-
-
-def _asked_labels(
-    file: Path, xyz: NDArray[np.float64], names: list[str], text_features: Path | None
-) -> tuple[NDArray[np.integer], NDArray[np.floating], NDArray[np.integer]]:
-    """(n,) labels, how sure they are, and the labels of a scene that may not say that none fits: the largest cosine."""
-    scene = as_scene(file)
+    if file.suffix != ".ogpc":
+        return Prediction(_stored_labels(file, len(xyz)), None, None)
+    scene, ids = as_scene(file), np.array([*TASKS[task], 0])  # the last is what label -1 takes: unknown
+    names = [NAMES[class_id] for class_id in TASKS[task]]
     words = resolve_labels(names, text_features, scene.vocabulary, scene.feature_space, carried_encoder(scene.path))
     result = segment(xyz, words, scene=scene)
+    # Of a scene that may not say that none fits: the largest cosine.
     forced = Chooser(scene.cloud.instances).choose(words.vectors).at(result.instances)[0]
-    return result.labels, sure(result.scores, result.calibrated, result.certainty), forced
+    confidence = sure(result.scores, result.calibrated, result.certainty)
+    return Prediction(ids[np.maximum(result.labels, -1)], confidence, ids[np.maximum(forced, -1)])
 
 
-def _stored_labels(file: Path) -> tuple[NDArray[np.integer], NDArray[np.floating] | None, list[str]]:
-    """(n,) indices of names, below 0 unknown; (n,) how sure they are, if that is known; the names. As ``segment -o``
-    writes: scores, and where it is known the certainty of each point."""
+def _stored_labels(file: Path, points: int) -> NDArray[np.int64]:
+    """(n,) NYU40 ids of an .npz as ``segment -o`` writes it: labels index names, below 0 is unknown."""
     arrays = read_arrays(file)
     missing = [name for name in ("labels", "names") if name not in arrays]
     if missing:
         raise SceneError(f"{file} lacks '{missing[0]}'; expected labels and names: segment the scene again")
-    labels, names, scores, certainty = (arrays.get(name) for name in ("labels", "names", "scores", "certainty"))
-    assert labels is not None
-    assert names is not None
-    if labels.ndim != 1 or labels.dtype.kind not in "iu" or names.ndim != 1 or names.dtype.kind != "U":
+    labels, names = arrays["labels"], arrays["names"]
+    if labels.shape != (points,) or labels.dtype.kind not in "iu" or names.ndim != 1 or names.dtype.kind != "U":
         raise SceneError(
             f"{file}: labels are {labels.dtype} {labels.shape}, names {names.dtype} {names.shape}; expected whole "
-            "numbers (points,) and strings (names,)"
+            f"numbers ({points},), one for each of the scene's points, and strings (names,)"
         )
-    for name, numbers in (("scores", scores), ("certainty", certainty)):
-        if numbers is None:
-            continue
-        if numbers.shape != labels.shape or numbers.dtype.kind != "f" or np.isnan(numbers).any():
-            raise SceneError(f"{file}: {name} are {numbers.dtype} {numbers.shape}; expected numbers {labels.shape}")
-    if scores is not None and certainty is not None:
-        scores = sure(scores, bool(arrays.get("calibrated", False)), certainty)
-    return labels.astype(np.int64), scores, names.tolist()
+    if labels.max(initial=-1) >= len(names):
+        raise SceneError(f"{file}: label {labels.max()} has no name (there are {len(names)})")
+    ids = {name: class_id for class_id, name in NAMES.items()}
+    id_of_label = np.array([*(ids.get(name, NOT_OF_THE_TABLE) for name in names.tolist()), 0])
+    return id_of_label[np.maximum(labels.astype(np.int64), -1)]
 
 
 def score_scene(
@@ -211,7 +185,6 @@ def score_scene(
     surely = None if confidence is None else np.where(called > 0, np.asarray(confidence, np.float64), -np.inf)[counted]
     return SceneScore(
         protocol=score_labels(called, of_task, scored=opaque, min_points=1),
-        all_points=score_labels(called, of_task, min_points=1),
         answered=score_labels(called, of_task, scored=answered, min_points=1),
         answered_share=float(answered.sum() / counted.sum()) if counted.any() else float("nan"),
         hits=hits,
@@ -236,7 +209,6 @@ def average(scores: Sequence[SceneScore]) -> TaskMean:
         macc=_mean([score.protocol.macc for score in scores]),
         flat_miou=flat,
         forced_miou=_mean(forced) if len(forced) == len(scores) else None,
-        all_points=_mean([score.all_points.miou for score in scores]),
         answered=_mean([score.answered.miou for score in scores]),
         answered_share=_mean([score.answered_share for score in scores]),
         scenes=len(present),

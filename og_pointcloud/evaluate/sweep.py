@@ -16,6 +16,7 @@ import csv
 import io
 import os
 import platform
+import re
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
@@ -30,8 +31,8 @@ from numpy.typing import NDArray
 from og_pointcloud.ask.labelled_scene import LabelledScene
 from og_pointcloud.cloud import FeatureSpace, LabelledCloud, Vocabulary
 from og_pointcloud.errors import MissingExtraError, OgPointcloudError, SceneError
-from og_pointcloud.evaluate.intervals import miou_difference
-from og_pointcloud.evaluate.knobs import DEFAULT, PUBLISHED_MIOU, Setting
+from og_pointcloud.evaluate.intervals import miou_interval
+from og_pointcloud.evaluate.knobs import DEFAULT, Setting
 from og_pointcloud.evaluate.metrics import score_labels
 from og_pointcloud.evaluate.truth import GT_NAME, Truth, read_truth
 from og_pointcloud.formats.atomic import replacing
@@ -70,10 +71,10 @@ class Subject:
 
 @dataclass(frozen=True)
 class Row:
-    """One setting on one capture, over ``runs`` seeds; or the mean of all captures.
+    """One setting on one capture, over ``runs`` seeds.
 
-    seconds, seconds_most: of a whole fit, least and most of the runs. error: 1 - mIoU, or where the truth is not known
-    1 - agreement; mean of the runs, and their standard deviation (None for a single run).
+    seconds: of a whole fit, the least of the runs. error: 1 - mIoU, or where the truth is not known 1 - agreement; mean
+    of the runs, and their standard deviation (None for a single run).
     miou, macc, unknown: over the points with a known class; background: the share of known background that was given a
     class. labelled_miou: mIoU with background left out, as published tables have it. None without truth.
     gain, gain_low, gain_high: mIoU less the default's, with its paired 95 % interval over blocks of space.
@@ -85,7 +86,6 @@ class Row:
     knob: str
     value: str
     seconds: float
-    seconds_most: float
     runs: int
     error: float
     error_spread: float | None = None
@@ -115,15 +115,14 @@ class Row:
 
 @dataclass(frozen=True)
 class Sweep:
-    """rows: of every capture in turn, the default first; where there are several captures their means come first.
-    failed: what could not be run -> why."""
+    """rows: of every capture in turn, the default first. failed: what could not be run -> why."""
 
     rows: tuple[Row, ...]
     failed: dict[str, str]
 
     @property
     def captures(self) -> list[str]:
-        """Names of the captures, the mean among them, in order."""
+        """Names of the captures, in order."""
         return list(dict.fromkeys(row.capture for row in self.rows))
 
 
@@ -177,7 +176,7 @@ def sweep(subjects: Sequence[Subject], settings: Sequence[Setting], *, seeds: in
             bar.update((number + 1) * len(settings) - bar.n)
     if not rows:
         raise OgPointcloudError(f"no capture could be fitted: {next(iter(failed.values()), 'none was given')}")
-    return Sweep((*_means(rows), *rows), failed)
+    return Sweep(tuple(rows), failed)
 
 
 class _Trial:
@@ -207,16 +206,15 @@ class _Trial:
         key = setting.settings, setting.every
         if key not in self.rows:
             self.rows[key] = self._measured(setting)
-        published = PUBLISHED_MIOU.get(setting.knob, {}).get(setting.value)
-        return replace(self.rows[key], knob=setting.knob, value=setting.value, published=published)
+        return replace(self.rows[key], knob=setting.knob, value=setting.value, published=setting.published)
 
     def baselines(self) -> Iterator[Row]:
         """Other methods, as they are, and with points that masks mostly pass by left out; none without truth."""
         if self.subject.truth is None or self.subject.vocabulary is None:
             return
         for name, labels, seconds in baseline_labels(self.prepared, self.subject.vocabulary.vectors):
-            scores, whole = self._scores(labels), self.shared_seconds + seconds
-            yield Row(self.subject.name, BASELINE, name, whole, whole, 1, 1 - scores["miou"], **scores)
+            scores = self._scores(labels)
+            yield Row(self.subject.name, BASELINE, name, self.shared_seconds + seconds, 1, 1 - scores["miou"], **scores)
 
     def _measured(self, setting: Setting) -> Row:
         runs = [self._run(setting, seed) for seed in range(self.seeds)]
@@ -232,7 +230,6 @@ class _Trial:
             knob=setting.knob,
             value=setting.value,
             seconds=min(seconds),
-            seconds_most=max(seconds),
             runs=self.seeds,
             error=float(np.mean(errors)),
             error_spread=float(np.std(errors, ddof=1)) if len(errors) > 1 else None,
@@ -304,7 +301,8 @@ class _Trial:
         if self.default_labels is not None and score.classes:
             default = truth.class_of(self.default_labels, vocabulary.names)
             spacing = float(np.median(self.prepared.surface.neighbourhood.spacing))
-            gain = miou_difference(called, default, truth, self.subject.scene.points.xyz, spacing, score.classes)
+            xyz = self.subject.scene.points.xyz
+            gain = miou_interval(called, truth, xyz, spacing, score.classes, less=default)
             found |= {"gain": gain.mean, "gain_low": gain.low, "gain_high": gain.high}
         return found
 
@@ -314,28 +312,6 @@ def _before_table(settings: FitSettings) -> tuple[Any, ...]:
     membership = settings.membership
     see_through = membership.few_views, membership.gap_sizes, membership.front_share
     return settings.geometry, settings.visibility, settings.memory, settings.tile_points, see_through
-
-
-def _means(rows: Sequence[Row]) -> list[Row]:
-    """One row a setting that ran on every capture: means, of seconds the geometric one. Nothing for one capture, or
-    where errors are of two kinds."""
-    captures = list(dict.fromkeys(row.capture for row in rows))
-    if len(captures) < 2 or len({row.miou is None for row in rows}) > 1:
-        return []
-    means = []
-    for setting in dict.fromkeys((row.knob, row.value) for row in rows):
-        own = [row for row in rows if (row.knob, row.value) == setting]
-        if len(own) < len(captures):
-            continue
-        numbers = {
-            one.name: _mean([getattr(row, one.name) for row in own])
-            for one in fields(Row) if one.name not in ("capture", "knob", "value", "runs", "left_out", "published")
-        }  # fmt: skip
-        for name in ("seconds", "seconds_most"):
-            numbers[name] = float(np.exp(np.mean(np.log([getattr(row, name) for row in own]))))
-        unknown = dict.fromkeys(("error_spread", "gain_low", "gain_high"), None)
-        means.append(replace(own[0], capture=f"mean of {len(captures)}", left_out=(), **(numbers | unknown)))
-    return means
 
 
 def _mean(values: Sequence[float | None]) -> float | None:
@@ -355,13 +331,11 @@ def front(rows: Sequence[Row]) -> list[Row]:
 
 def write_rows(rows: Iterable[Row], path: Path) -> Path:
     """A CSV with a line a row, the machine and the versions in each; written whole or not at all."""
-    text = io.StringIO()
-    where = {"machine": machine()}
+    text, where = io.StringIO(), {"machine": machine()}
     lines = csv.DictWriter(text, [*(one.name for one in fields(Row)), *where], lineterminator="\n")
     lines.writeheader()
     for row in rows:
-        values = asdict(row) | {"left_out": "; ".join(str(entry["what"]) for entry in row.left_out)} | where
-        lines.writerow({name: f"{value:.6g}" if isinstance(value, float) else value for name, value in values.items()})
+        lines.writerow(asdict(row) | {"left_out": "; ".join(str(entry["what"]) for entry in row.left_out)} | where)
     with replacing(path) as file:
         file.write(text.getvalue().encode())
     return path
@@ -369,15 +343,8 @@ def write_rows(rows: Iterable[Row], path: Path) -> Path:
 
 def machine() -> str:
     """What seconds are of: processor, cores, system, and the versions of what computes."""
-    names = ("numpy", "numba", "scipy", "onnxruntime")
-    versions = ", ".join([f"Python {platform.python_version()}", *(f"{name} {version(name)}" for name in names)])
-    return f"{_processor()}, {os.cpu_count()} cores, {platform.system()}, {versions}"
-
-
-def _processor() -> str:
     information = Path("/proc/cpuinfo")
-    if information.is_file():
-        for line in information.read_text().splitlines():
-            if line.startswith("model name"):
-                return line.partition(":")[2].strip()
-    return platform.processor() or platform.machine()
+    models = re.findall(r"^model name\s*: (.*)", information.read_text(), re.M) if information.is_file() else []
+    processor = models[0] if models else platform.processor() or platform.machine()
+    versions = ", ".join(f"{name} {version(name)}" for name in ("numpy", "numba", "scipy", "onnxruntime"))
+    return f"{processor}, {os.cpu_count()} cores, {platform.system()}, Python {platform.python_version()}, {versions}"
