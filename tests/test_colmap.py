@@ -1,10 +1,10 @@
-"""COLMAP models: binary, text, and rigs give the same cameras; damage gives one error."""
+"""COLMAP models: binary and text give the same cameras; damage gives one error."""
 
 import struct
 
 import numpy as np
 import pytest
-from capture_files import make_world, quaternion_matrix, same_camera, write_colmap_binary, write_colmap_text
+from capture_files import make_world, same_camera, write_colmap_binary, write_colmap_text
 
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.colmap import find_model, read_images, read_points3d
@@ -38,83 +38,6 @@ def test_scaled_quaternions_are_normalised(tmp_path):
     world = make_world()
     write_colmap_binary(tmp_path, world, poses=np.hstack([world.quaternions * 3.0, world.translations]))
     assert all(map(same_camera, [image.camera for image in read_images(tmp_path)], expected_cameras(world)))
-
-
-def split_into_rig(world, camera_from_rig):
-    """rig_from_world of one frame per image, such that camera_from_rig @ rig_from_world is the image's pose."""
-    return [np.linalg.inv(sensor) @ pose for sensor, pose in zip(camera_from_rig, world.poses, strict=True)]
-
-
-def pose_row(pose):
-    """qw qx qy qz tx ty tz of a 4x4 pose whose rotation angle is below 180 degrees."""
-    rotation = pose[:3, :3]
-    w = np.sqrt(1 + np.trace(rotation)) / 2
-    axis = np.array([rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]])
-    return [w, *(axis / (4 * w)), *pose[:3, 3]]
-
-
-@pytest.fixture
-def rig_world():
-    """Images 1 and 3 by camera 5, the rig's reference; image 2 by camera 9, beside it; and an IMU, no camera."""
-    world = make_world(seed=4)
-    turned = np.eye(4)
-    turned[:3, :3] = quaternion_matrix(np.array([np.cos(0.4), 0.0, np.sin(0.4), 0.0]))
-    turned[:3, 3] = [-0.2, 0.01, 0.03]
-    sensors = [np.eye(4), turned, np.eye(4)]
-    frames = split_into_rig(world, sensors)
-    if any(1 + np.trace(pose[:3, :3]) < 1e-3 for pose in frames):
-        pytest.fail("choose a seed without half turns")
-    cameras = {5: ("PINHOLE", world.intrinsics), 9: ("PINHOLE", world.intrinsics)}
-    return world, cameras, turned, [pose_row(pose) for pose in frames]
-
-
-def write_rigs(model, turned, frames, binary):
-    camera_ids = [5, 9, 5]
-    if binary:
-        rig = struct.pack("<QII", 1, 7, 3) + struct.pack("<iI", 0, 5)
-        rig += struct.pack("<iIB7d", 0, 9, 1, *pose_row(turned)) + struct.pack("<iIB", 1, 3, 0)
-        (model / "rigs.bin").write_bytes(rig)
-        data = struct.pack("<Q", 3)
-        for index, row in enumerate(frames):
-            data += struct.pack("<II7dI", index + 40, 7, *row, 2)
-            data += struct.pack("<iIQ", 0, camera_ids[index], index + 1) + struct.pack("<iIQ", 1, 3, 1)
-        (model / "frames.bin").write_bytes(data)
-        return
-    sensor = " ".join(repr(float(value)) for value in pose_row(turned))
-    (model / "rigs.txt").write_text(f"# Rig calib list\n7 3 CAMERA 5 CAMERA 9 1 {sensor} IMU 3 0\n")
-    lines = [
-        f"{index + 40} 7 {' '.join(repr(float(v)) for v in row)} 2 CAMERA {camera_ids[index]} {index + 1} IMU 3 1"
-        for index, row in enumerate(frames)
-    ]
-    (model / "frames.txt").write_text("# Frame list\n" + "\n".join(lines) + "\n")
-
-
-@pytest.mark.parametrize("binary", [True, False])
-def test_rigs_and_frames_place_the_images(tmp_path, rig_world, binary):
-    world, cameras, turned, frames = rig_world
-    nowhere = np.tile([1.0, 0, 0, 0, 0, 0, 0], (3, 1))  # the images' own poses are useless: only rigs know
-    (write_colmap_binary if binary else write_colmap_text)(tmp_path, world, cameras, nowhere)
-    write_rigs(tmp_path, turned, frames, binary)
-    cameras_read = [image.camera for image in read_images(tmp_path)]
-    assert all(map(same_camera, cameras_read, expected_cameras(world)))
-
-
-def test_an_image_outside_every_frame_keeps_its_own_pose(tmp_path, rig_world):
-    world, cameras, turned, frames = rig_world
-    write_colmap_text(tmp_path, world, cameras)
-    write_rigs(tmp_path, turned, frames, binary=False)
-    lines = (tmp_path / "frames.txt").read_text().splitlines()
-    (tmp_path / "frames.txt").write_text("\n".join(lines[:-1]) + "\n")
-    assert same_camera(read_images(tmp_path)[2].camera, expected_cameras(world)[2])
-
-
-def test_a_frame_of_an_unknown_rig_is_refused(tmp_path, rig_world):
-    world, cameras, turned, frames = rig_world
-    write_colmap_text(tmp_path, world, cameras)
-    write_rigs(tmp_path, turned, frames, binary=False)
-    (tmp_path / "rigs.txt").write_text("8 1 CAMERA 5\n")
-    with pytest.raises(SceneError, match=r"frame has rig 7, which the rigs file lacks"):
-        read_images(tmp_path)
 
 
 @pytest.mark.parametrize("write", WRITERS)
@@ -153,11 +76,9 @@ def read_all(model):
     return read_images(model), read_points3d(model)
 
 
-@pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "points3D.bin", "rigs.bin", "frames.bin"])
-def test_every_truncation_of_a_binary_file_is_one_error(tmp_path, rig_world, name):
-    world, cameras, turned, frames = rig_world
-    write_colmap_binary(tmp_path, world, cameras)
-    write_rigs(tmp_path, turned, frames, binary=True)
+@pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "points3D.bin"])
+def test_every_truncation_of_a_binary_file_is_one_error(tmp_path, name):
+    write_colmap_binary(tmp_path, make_world())
     read_all(tmp_path)
     whole = (tmp_path / name).read_bytes()
     for size in {*range(0, min(len(whole), 120)), *range(0, len(whole), 37), len(whole) - 1}:
@@ -183,7 +104,7 @@ def test_a_count_beyond_the_file_is_refused_before_anything_is_allocated(tmp_pat
         ("cameras.txt", " 25.5", "", "line 2: found .* expected 4 numbers"),
         ("images.txt", "1 ", "one ", "line 3: found 'one'; expected a whole number"),
         ("images.txt", "frame_00.png\n\n", "frame_00.png\n", "line 4: found '2 .*expected the line of 2-D points"),
-        ("points3D.txt", "\n0 ", "\n0 x", "points3D.txt, line 2: .*expected id x y z r g b"),
+        ("points3D.txt", "\n0 ", "\n0 x", r"points3D.txt: .*row 0, column 2.*expected lines of id x y z r g b"),
     ],
 )
 def test_damaged_text_names_the_line(tmp_path, name, find, put, message):

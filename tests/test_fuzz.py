@@ -68,8 +68,8 @@ def _ply(folder: Path) -> list[bytes]:
     names = ("x", "y", "z", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3", "opacity")
     rows = np.c_[gaussians.xyz, np.log(gaussians.scale), gaussians.rotation, gaussians.opacity]
     write_ply(folder / "splats.ply", {"vertex": join_columns(dict(zip(names, rows.T, strict=True)))})
-    header = "ply\nformat ascii 1.0\nelement face 1\nproperty list uchar int vertex_indices\nelement vertex 2\n"
-    header += "".join(f"property double {axis}\n" for axis in "xyz") + "end_header\n3 0 1 1\n0 1 2\n1e6 2 3\n"
+    header = "ply\nformat ascii 1.0\nelement vertex 2\n" + "".join(f"property double {axis}\n" for axis in "xyz")
+    header += "element face 1\nproperty list uchar int vertex_indices\nend_header\n0 1 2\n1e6 2 3\n3 0 1 1\n"
     return [(folder / "made.ply").read_bytes(), (folder / "splats.ply").read_bytes(), header.encode()]
 
 

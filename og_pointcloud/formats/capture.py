@@ -274,14 +274,12 @@ def _depth_frames(capture: Path, poses: CapturePoses) -> list[DepthFrame]:
 def _fused(capture: Path, frames: Sequence[DepthFrame]) -> FusedCloud:
     # The fusion brings numba, which whoever has a cloud need not load here.
     try:
-        from og_pointcloud.formats.fusion import doubts, fuse
+        from og_pointcloud.formats.fusion import doubtful_unit, fuse
     except ImportError as error:
         raise MissingExtraError("numba", "fit") from error
     fused = fuse(frames)
-    found = doubts(frames)
-    if fused.empty:
-        found.append(f"nothing is measured in {len(fused.empty)} of them, e.g. '{fused.empty[0]}'")
-    for text in found:
+    empty = f"nothing is measured in {len(fused.empty)} of them, e.g. '{fused.empty[0]}'" if fused.empty else None
+    for text in filter(None, (doubtful_unit(frames), empty)):
         warnings.warn(f"{capture}: depth images: {text}", stacklevel=4)
     return fused
 

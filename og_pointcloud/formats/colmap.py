@@ -4,8 +4,7 @@ Layout: https://colmap.github.io/format.html. Binary files are little endian: a 
 files have a record a line, ``#`` for comments. Both hold the same fields in the same order, so each record is parsed
 once, from either of two sources. Where both are present the binary files are read, as COLMAP does.
 
-Since 3.12 a model may have rigs and frames; an image's pose is then sensor_from_rig * rig_from_world. Images keep
-a pose of their own beside it, which serves images that no frame lists and sensors whose place in the rig is unknown.
+Since 3.12 a model may have files of rigs and frames. They need not be read: the images file still has all poses.
 """
 
 from __future__ import annotations
@@ -13,6 +12,7 @@ from __future__ import annotations
 import math
 import mmap
 import struct
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -54,8 +54,6 @@ PERSPECTIVE = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV",
 FISHEYE = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "SIMPLE_FISHEYE", "FISHEYE")
 """Models that OpenCV undistorts exactly; the others are refused."""
 
-CAMERA_SENSOR = 0
-
 Pose = NDArray[np.float64]
 
 
@@ -64,19 +62,6 @@ class _Lens(NamedTuple):
     height: int
     intrinsics: tuple[float, float, float, float]
     distortion: Distortion | None
-
-
-class _Image(NamedTuple):
-    image_id: int
-    world_to_camera: Pose
-    camera_id: int
-    name: str
-
-
-class _Frame(NamedTuple):
-    rig_id: int
-    rig_from_world: Pose
-    cameras_by_image: dict[int, int]
 
 
 def find_model(capture: Path) -> Path | None:
@@ -91,19 +76,20 @@ def find_model(capture: Path) -> Path | None:
 def read_images(model: Path) -> tuple[PosedImage, ...]:
     """The posed images of a sparse model in the file's order. Raises SceneError naming file, place and cure."""
     lenses = dict(map(_camera, _records(model, "cameras", minimum_bytes=24 + 3 * 8)))
-    poses = _poses_of_rigs(model)
     images = []
-    for image in map(_image, _records(model, "images", minimum_bytes=4 + 7 * 8 + 4 + 1 + 8)):
-        lens = lenses.get(image.camera_id)
+    for record in _records(model, "images", minimum_bytes=4 + 7 * 8 + 4 + 1 + 8):
+        record.integer("I")  # the image's own id
+        pose, camera_id, name = record.pose(), record.integer("I"), record.name()
+        record.skip_observations()
+        lens = lenses.get(camera_id)
         if lens is None:
             raise SceneError(
-                f"{model}: image '{image.name:.60}' has camera {image.camera_id}, but the cameras file has only "
+                f"{model}: image '{name:.60}' has camera {camera_id}, but the cameras file has only "
                 f"{sorted(lenses)[:10]}; expected files of one reconstruction: export the model again"
             )
-        pose = poses.get(image.image_id, image.world_to_camera)
-        with naming(f"{model}, image '{image.name:.60}'"):
+        with naming(f"{model}, image '{name:.60}'"):
             camera = Camera(lens.width, lens.height, *lens.intrinsics, pose)
-        images.append(PosedImage(image.name.replace("\\", "/"), camera, lens.distortion))
+        images.append(PosedImage(name.replace("\\", "/"), camera, lens.distortion))
     if not images:
         raise SceneError(f"{model}: the images file lists 0 images; expected at least one registered image")
     return tuple(images)
@@ -121,9 +107,6 @@ def _file(model: Path, stem: str) -> Path | None:
     return next((file for suffix in (".bin", ".txt") if (file := model / (stem + suffix)).is_file()), None)
 
 
-# Records: one parser each, whatever the source.
-
-
 def _camera(record: _Binary | _Text) -> tuple[int, _Lens]:
     camera_id, model = record.integer("I"), record.camera_model()
     width, height = record.integer("Q"), record.integer("Q")
@@ -137,55 +120,6 @@ def _camera(record: _Binary | _Text) -> tuple[int, _Lens]:
     fx, fy = (values.pop("f"),) * 2 if "f" in values else (values.pop("fx"), values.pop("fy"))
     intrinsics = (fx, fy, values.pop("cx"), values.pop("cy"))
     return camera_id, _Lens(width, height, intrinsics, lens_distortion(values, fisheye=model in FISHEYE))
-
-
-def _image(record: _Binary | _Text) -> _Image:
-    image = _Image(record.integer("I"), record.pose(), record.integer("I"), record.name())
-    record.skip_observations()
-    return image
-
-
-def _rig(record: _Binary | _Text) -> tuple[int, dict[int, Pose | None]]:
-    """A rig's id and, by camera id, camera_from_rig (None where it is not calibrated)."""
-    rig_id, sensor_count = record.integer("I"), record.integer("I")
-    cameras: dict[int, Pose | None] = {}
-    for index in range(sensor_count):
-        is_camera, sensor_id = record.sensor()
-        # The first sensor is the rig's reference and has no pose of its own.
-        pose = np.eye(4) if index == 0 else record.pose() if record.integer("B") else None
-        if is_camera:
-            cameras[sensor_id] = pose
-    return rig_id, cameras
-
-
-def _frame(record: _Binary | _Text) -> _Frame:
-    record.integer("I")  # the frame's own id, which nothing refers to
-    rig_id, rig_from_world = record.integer("I"), record.pose()
-    cameras_by_image = {}
-    for _ in range(record.integer("I")):
-        is_camera, sensor_id = record.sensor()
-        data_id = record.integer("Q")
-        if is_camera:
-            cameras_by_image[data_id] = sensor_id
-    return _Frame(rig_id, rig_from_world, cameras_by_image)
-
-
-def _poses_of_rigs(model: Path) -> dict[int, Pose]:
-    """world_to_camera by image id, for the images that rigs and frames place."""
-    if _file(model, "rigs") is None or _file(model, "frames") is None:
-        return {}
-    rigs = dict(map(_rig, _records(model, "rigs", minimum_bytes=8)))
-    poses = {}
-    for frame in map(_frame, _records(model, "frames", minimum_bytes=8 + 7 * 8 + 4)):
-        if frame.rig_id not in rigs:
-            raise SceneError(
-                f"{model}: a frame has rig {frame.rig_id}, which the rigs file lacks: export the model again"
-            )
-        for image_id, camera_id in frame.cameras_by_image.items():
-            camera_from_rig = rigs[frame.rig_id].get(camera_id)
-            if camera_from_rig is not None:
-                poses[image_id] = camera_from_rig @ frame.rig_from_world
-    return poses
 
 
 # Sources.
@@ -247,10 +181,6 @@ class _Binary:
 
     def pose(self) -> Pose:
         return _pose(self.reals(7), f"{self.path} before byte {self.offset}")
-
-    def sensor(self) -> tuple[bool, int]:
-        kind, sensor_id = self.unpack("<iI")
-        return kind == CAMERA_SENSOR, sensor_id
 
     def camera_model(self) -> str:
         model_id = self.integer("i")
@@ -316,9 +246,6 @@ class _Text:
     def pose(self) -> Pose:
         return _pose(self.reals(7), f"{self.path}, line {self.line_number}")
 
-    def sensor(self) -> tuple[bool, int]:
-        return self.word() == "CAMERA", self.integer("I")
-
     def camera_model(self) -> str:
         word = self.word()
         if word not in CAMERA_MODELS:
@@ -371,19 +298,13 @@ def _points_binary(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
 
 def _points_text(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
     """One line a point: id, x, y, z, r, g, b, error, track."""
-    xyz, rgb = [], []
-    with path.open(encoding="utf-8", errors="replace") as lines:
-        for number, line in enumerate(lines, 1):
-            words = line.split(None, 7)
-            if not words or words[0].startswith("#"):
-                continue
-            try:
-                x, y, z = map(float, words[1:4])
-                red, green, blue = map(int, words[4:7])
-            except ValueError:
-                raise SceneError(
-                    f"{path}, line {number}: '{line.strip():.60}'; expected id x y z r g b and more: export it again"
-                ) from None
-            xyz.append((x, y, z))
-            rgb.append((red, green, blue))
-    return np.array(xyz, np.float64).reshape(-1, 3), np.clip(np.array(rgb).reshape(-1, 3), 0, 255).astype(np.uint8)
+    try:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "loadtxt: input contained no data")
+            values = np.loadtxt(path, usecols=range(1, 7), ndmin=2, encoding="utf-8")
+    except ValueError as error:
+        raise SceneError(
+            f"{path}: {error!s:.120}; expected lines of id x y z r g b and more: export it again"
+        ) from None
+    with np.errstate(invalid="ignore"):  # a colour that is no number is black
+        return values[:, :3].copy(), np.clip(np.nan_to_num(values[:, 3:]), 0, 255).astype(np.uint8)

@@ -7,10 +7,9 @@ from __future__ import annotations
 
 import os
 import re
-import struct
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from itertools import islice
+from dataclasses import dataclass, field
+from itertools import takewhile
 from pathlib import Path
 from typing import BinaryIO
 
@@ -37,26 +36,16 @@ PLY_TYPES = {numpy_type: name for name, numpy_type in reversed(NUMPY_TYPES.items
 BYTE_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 
 
-@dataclass(frozen=True)
-class _Property:
-    name: str
-    numpy_type: str
-    length_type: str | None = None
-    """Type of the length that precedes the items of a list property; None for a scalar."""
-
-
-@dataclass(frozen=True)
+@dataclass
 class _Element:
     name: str
     count: int
-    properties: list[_Property]
-
-    @property
-    def has_lists(self) -> bool:
-        return any(prop.length_type for prop in self.properties)
+    columns: dict[str, str] = field(default_factory=dict)
+    """Property -> type code of numpy, without a byte order."""
+    has_lists: bool = False
 
     def dtype(self, byte_order: str) -> np.dtype:
-        return np.dtype([(prop.name, byte_order + prop.numpy_type) for prop in self.properties])
+        return np.dtype([(name, byte_order + numpy_type) for name, numpy_type in self.columns.items()])
 
 
 @dataclass(frozen=True)
@@ -66,25 +55,20 @@ class _Header:
     elements: list[_Element]
     data_offset: int
 
-    @property
-    def elements_to_read(self) -> list[_Element]:
-        """All up to the last one without lists: the faces of a mesh, written after its vertices, are not touched."""
-        last = max((i for i, element in enumerate(self.elements) if not element.has_lists), default=-1)
-        return self.elements[: last + 1]
-
 
 def read_ply(path: str | os.PathLike[str]) -> dict[str, NDArray[np.void]]:
     """Element name -> (count,) structured array, one field per property, native byte order.
 
-    Elements with list properties (the faces of a mesh) are left out. SceneError, beginning with the path, for a file
-    that is missing, foreign, truncated, or whose header does not fit its size; nothing is allocated before that check.
+    Elements are read up to the first with a list property (the faces of a mesh, which follow the vertices). SceneError,
+    beginning with the path, for a file that is missing, foreign, truncated, or whose header does not fit its size;
+    nothing is allocated before that check.
     """
     path = Path(path)
     with naming(path), path.open("rb") as file:
         header = _parse_header(file.read(HEADER_LIMIT))
         file.seek(header.data_offset)
-        read = _read_binary if header.byte_order else _read_text
-        return read(file, header)
+        plain = takewhile(lambda element: not element.has_lists, header.elements)
+        return {element.name: _rows(file, element, header.byte_order) for element in plain}
 
 
 def write_ply(
@@ -139,8 +123,8 @@ def _parse_header(head: bytes) -> _Header:
             case ["element", name, count] if re.fullmatch("[0-9]{1,15}", count) and len(name) <= LONGEST_NAME:
                 if any(name == element.name for element in elements):
                     raise SceneError(f"header line {number}: element '{name}' is declared twice")
-                elements.append(_Element(name, int(count), []))
-            case ["property", *words] if elements and all(len(word) <= LONGEST_NAME for word in words):
+                elements.append(_Element(name, int(count)))
+            case ["property", *words] if words and elements and all(len(word) <= LONGEST_NAME for word in words):
                 _add_property(elements[-1], words, number)
             case _:
                 raise SceneError(
@@ -150,105 +134,39 @@ def _parse_header(head: bytes) -> _Header:
     if byte_order is None:
         raise SceneError(f"the PLY header has no 'format' line; expected one of {', '.join(BYTE_ORDERS)}")
     for element in elements:
-        if not element.properties:
+        if not (element.columns or element.has_lists):
             raise SceneError(f"element '{element.name}' has no properties: the PLY header is damaged")
     return _Header(byte_order, elements, end.end())
 
 
 def _add_property(element: _Element, words: list[str], number: int) -> None:
     """Append the property that ``words``, the rest of a header line, declare."""
-    match words:
-        case ["list", length_type, item_type, name]:
-            types = [length_type, item_type]
-            prop = _Property(name, NUMPY_TYPES.get(item_type, ""), NUMPY_TYPES.get(length_type, ""))
-        case [item_type, name]:
-            types = [item_type]
-            prop = _Property(name, NUMPY_TYPES.get(item_type, ""))
-        case _:
-            raise SceneError(f"header line {number}: property {' '.join(words)[:80]!r}; expected a type and a name")
-    unknown = [kind for kind in types if kind not in NUMPY_TYPES]
-    if unknown:
-        expected = ", ".join(NUMPY_TYPES)
-        raise SceneError(f"header line {number}: unknown type {unknown[0]!r:.60}; expected one of {expected}")
-    if prop.length_type in ("f4", "f8"):
-        raise SceneError(f"header line {number}: the length of list '{prop.name}' is {types[0]}; expected an integer")
-    if any(prop.name == other.name for other in element.properties):
-        raise SceneError(f"header line {number}: element '{element.name}' has property '{prop.name}' twice")
-    element.properties.append(prop)
+    if words[0] == "list" and len(words) == 4:
+        element.has_lists = True
+        return
+    if len(words) != 2:
+        raise SceneError(f"header line {number}: property {' '.join(words)[:80]!r}; expected a type and a name")
+    kind, name = words
+    if kind not in NUMPY_TYPES:
+        raise SceneError(f"header line {number}: unknown type {kind!r:.60}; expected one of {', '.join(NUMPY_TYPES)}")
+    if name in element.columns:
+        raise SceneError(f"header line {number}: element '{element.name}' has property '{name}' twice")
+    element.columns[name] = NUMPY_TYPES[kind]
 
 
-def _read_binary(file: BinaryIO, header: _Header) -> dict[str, NDArray[np.void]]:
-    size = os.fstat(file.fileno()).st_size
-    arrays: dict[str, NDArray[np.void]] = {}
-    for element in header.elements_to_read:
-        if element.has_lists:
-            _skip_binary_lists(file, element, header.byte_order)
-            continue
-        dtype = element.dtype(header.byte_order)
-        left = size - file.tell()
-        if element.count * dtype.itemsize > left:
-            raise SceneError(
-                f"element '{element.name}': expected {element.count} rows of {dtype.itemsize} bytes "
-                f"({element.count * dtype.itemsize} bytes), the file has {left // dtype.itemsize} rows ({left} bytes): "
-                "it is truncated; copy or write it again"
-            )
-        rows = np.fromfile(file, dtype, element.count)
-        arrays[element.name] = rows.astype(dtype.newbyteorder("="), copy=False)
-    return arrays
-
-
-def _skip_binary_lists(file: BinaryIO, element: _Element, byte_order: str) -> None:
-    """Move past an element with lists. Row by row, since each length decides where the next row starts."""
-    start = file.tell()
-    data = file.read()
-    steps = [
-        (
-            struct.Struct(byte_order + np.dtype(prop.length_type).char) if prop.length_type else None,
-            np.dtype(prop.numpy_type).itemsize,
-        )
-        for prop in element.properties
-    ]
-    at = row = 0
-    while row < element.count and at <= len(data):
-        for length_format, item_size in steps:
-            length = 1
-            if length_format:
-                # Past the end of the data the length does not matter any more: `at` already tells.
-                readable = at + length_format.size <= len(data)
-                length = length_format.unpack_from(data, at)[0] if readable else 0
-                at += length_format.size
-            if length < 0:
-                raise SceneError(
-                    f"element '{element.name}': a list of row {row} has length {length}; the file is damaged"
-                )
-            at += length * item_size
-        row += 1
-    if at > len(data):
+def _rows(file: BinaryIO, element: _Element, byte_order: str) -> NDArray[np.void]:
+    """The rows of an element without lists, which begin where the file stands."""
+    if not byte_order:
+        return read_text_rows(file, element.dtype("="), element.count, f"element '{element.name}'")
+    dtype = element.dtype(byte_order)
+    left = os.fstat(file.fileno()).st_size - file.tell()
+    if element.count * dtype.itemsize > left:
         raise SceneError(
-            f"element '{element.name}': expected {element.count} rows, the file ends in row {row - 1}: "
+            f"element '{element.name}': expected {element.count} rows of {dtype.itemsize} bytes "
+            f"({element.count * dtype.itemsize} bytes), the file has {left // dtype.itemsize} rows ({left} bytes): "
             "it is truncated; copy or write it again"
         )
-    file.seek(start + at)
-
-
-def _read_text(file: BinaryIO, header: _Header) -> dict[str, NDArray[np.void]]:
-    arrays: dict[str, NDArray[np.void]] = {}
-    for element in header.elements_to_read:
-        if element.has_lists:
-            _skip_text_rows(file, element)
-        else:
-            what = f"element '{element.name}'"
-            arrays[element.name] = read_text_rows(file, element.dtype("="), element.count, what)
-    return arrays
-
-
-def _skip_text_rows(file: BinaryIO, element: _Element) -> None:
-    skipped = sum(1 for _ in islice((line for line in file if not line.isspace()), element.count))
-    if skipped < element.count:
-        raise SceneError(
-            f"element '{element.name}': expected {element.count} rows, the file has {skipped}: it is truncated; "
-            "copy or write it again"
-        )
+    return np.fromfile(file, dtype, element.count).astype(dtype.newbyteorder("="), copy=False)
 
 
 def _packed(element: str, rows: NDArray[np.void]) -> NDArray[np.void]:

@@ -45,7 +45,8 @@ def read_points(path: str | os.PathLike[str]) -> Points:
                 return gaussians_from_ply(elements)
             if "vertex" not in elements:
                 raise SceneError(
-                    f"no element 'vertex' of plain properties; the file has {', '.join(elements) or 'none':.200}"
+                    "no element 'vertex' before the first with lists (faces); the file has "
+                    f"{', '.join(elements) or 'none':.200}: write the vertices first"
                 )
             return _cloud(elements["vertex"])
         if looks_like_pcd(head):
