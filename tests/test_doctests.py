@@ -22,10 +22,13 @@ def example_of(name):
 
 @pytest.fixture(scope="module")
 def known():
-    """What other examples start from: the cloud that LabelledCloud's own makes."""
-    example = example_of("LabelledCloud")
-    assert doctest.DocTestRunner(optionflags=OPTIONS).run(example, clear_globs=False).failed == 0
-    return {name: example.globs[name] for name in ("cloud", "np", "og")}
+    """What other examples start from: the cloud that LabelledCloud's own makes, the scene of feature_picture's."""
+    start = {}
+    for source, names in (("LabelledCloud", ("cloud", "np", "og")), ("feature_picture", ("gaussians", "view", "pathlib", "tempfile"))):
+        example = example_of(source)
+        assert doctest.DocTestRunner(optionflags=OPTIONS).run(example, clear_globs=False).failed == 0
+        start |= {name: example.globs[name] for name in names}
+    return start
 
 
 @pytest.mark.parametrize("name", sorted(set(og.__all__) - CONSTANTS))

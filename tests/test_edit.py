@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from labelled_clouds import WORDS, make_cloud, room
-from scenes import write_ply as write_other_ply
 from scipy.spatial.transform import Rotation
 from scipy.special import lpmv
 
@@ -332,20 +331,17 @@ def covariances(rows):
     return axes @ axes.transpose(0, 2, 1)
 
 
-@pytest.mark.parametrize(("base_degree", "other_degree"), [(0, 3), (3, 0), (1, 2)])
-def test_harmonics_of_different_degree_both_survive(tmp_path, base_degree, other_degree):
+def test_harmonics_that_the_cloud_lacks_are_left_out_and_told(tmp_path):
     random = np.random.default_rng(0)
-    base, other = tmp_path / "base.ply", tmp_path / "other.ply"
-    write_ply(base, {"vertex": join_columns(gaussian_columns(random.normal(size=(9, 3)), base_degree))})
-    write_ply(other, {"vertex": join_columns(gaussian_columns(random.normal(size=(5, 3)), other_degree))})
-    done = og.edit.insert(base, other, tmp_path / "out.ply")
-    rows, directions = vertices(done.path), some_directions()
-    highest = max(base_degree, other_degree)
-    # In the order that trainers write, which readers by offset rely on.
-    assert rows.dtype.names == tuple(gaussian_columns(np.zeros((1, 3)), highest))
-    for part, source in ((rows[:9], base), (rows[9:], other)):
-        np.testing.assert_allclose(colors_seen(part, directions), colors_seen(vertices(source), directions), atol=1e-6)
-    assert done.notes == ()
+    files = [tmp_path / "flat.ply", tmp_path / "shiny.ply"]
+    for path, degree in zip(files, (0, 3), strict=True):
+        write_ply(path, {"vertex": join_columns(gaussian_columns(random.normal(size=(9, 3)), degree))})
+    done = og.edit.insert(*files, tmp_path / "out.ply")
+    assert vertices(done.path).dtype == vertices(files[0]).dtype
+    assert "f_rest_0" in done.notes[0]
+    back = og.edit.insert(*files[::-1], tmp_path / "back.ply")
+    assert not stacked(vertices(back.path)[9:], [f"f_rest_{k}" for k in range(45)]).any()
+    assert "are 0" in back.notes[0]
 
 
 def test_properties_that_only_one_has_are_told(tmp_path):
@@ -360,23 +356,12 @@ def test_properties_that_only_one_has_are_told(tmp_path):
     )
 
 
-def test_plain_points_and_splats_become_what_the_cloud_is(tmp_path):
-    grid = np.stack(np.meshgrid(*[np.arange(8.0)] * 2, [0.0]), -1).reshape(-1, 3).astype(np.float32)
-    plain, splats = tmp_path / "plain.ply", tmp_path / "splats.ply"
-    write_other_ply(plain, 0.1 * grid, np.full((64, 3), 200, np.uint8))
-    write_ply(splats, {"vertex": join_columns(gaussian_columns(grid[:10]))})
-    pose = similarity(1.0)
-    as_splats = og.edit.insert(splats, plain, tmp_path / "a.ply", pose)
-    gaussians = og.read_points(as_splats.path)
-    np.testing.assert_allclose(gaussians.scale[10:], 0.05, rtol=1e-4)
-    np.testing.assert_array_equal(gaussians.rgb[10:], 200)
-    np.testing.assert_allclose(gaussians.xyz_world[10:], 0.1 * grid @ pose[:3, :3].T + pose[:3, 3], atol=1e-5)
-    assert "became Gaussians" in as_splats.notes[0]
-    as_points = og.edit.insert(plain, splats, tmp_path / "b.ply")
-    cloud = og.read_points(as_points.path)
-    assert not cloud.are_gaussians
-    np.testing.assert_array_equal(cloud.rgb[64:], og.read_points(splats).rgb)
-    assert "became plain points" in as_points.notes[0]
+def test_plain_points_and_splats_do_not_mix(tmp_path):
+    plain, splats = plain_file(tmp_path / "plain.ply", np.eye(3)), tmp_path / "splats.ply"
+    write_ply(splats, {"vertex": join_columns(gaussian_columns(np.eye(3)))})
+    for pair in ((plain, splats), (splats, plain)):
+        with pytest.raises(SceneError, match="two of a kind"):
+            og.edit.insert(*pair, tmp_path / "out.ply")
 
 
 def test_what_was_extracted_fits_back_where_it_was_removed(scene, splats, tmp_path):
@@ -425,14 +410,14 @@ def test_commands(scene, splats, tmp_path, capsys):
         == len(scene.xyz)
         == record["points"] + np.isin(scene.instance_ids, [3, 5]).sum()
     )
-    assert edit("extract", bundle, f"--xyz={place}", "-o", tmp_path / "two.ply") == 0
+    assert edit("extract", bundle, f"--xyz={place}", "--cloud", splats, "-o", tmp_path / "two.ply") == 0
     assert "points extracted (instance 2)" in capsys.readouterr().out
     assert edit("recolour", bundle, "--word", WORDS[1], "--color", "9,8,7", "--flat", "-o", tmp_path / "c.ply") == 0
     assert (og.read_points(tmp_path / "c.ply").rgb == [9, 8, 7]).all(axis=1).sum() > 0
     (tmp_path / "pose.txt").write_text("\n".join(" ".join(map(str, row)) for row in similarity()))
     capsys.readouterr()
     assert edit("insert", out, tmp_path / "two.ply", "--pose", tmp_path / "pose.txt", "-o", tmp_path / "i.ply") == 0
-    assert "note: " in capsys.readouterr().out
+    assert "points inserted" in capsys.readouterr().out
     assert edit("insert", out, tmp_path / "two.ply", "--at=-1,0,0", "-o", tmp_path / "i.ply") == 0
     moved = og.read_points(tmp_path / "i.ply").xyz_world[len(vertices(out)) :]
     np.testing.assert_allclose(moved, scene.xyz[scene.instance_ids == 2] - [1, 0, 0], atol=1e-3)

@@ -68,7 +68,7 @@ def test_colours_are_the_weighted_main_directions():
     for channel, axis in enumerate((1, 3, 5)):
         along = features[:, axis] - center[axis]
         inside = (colors[:, channel] > 0) & (colors[:, channel] < 1)
-        assert 0.9 < inside.mean() < 0.99, "the ends are cut off"
+        assert 0.8 < inside.mean() < 0.95, "the ends are cut off"
         assert np.corrcoef(along[inside], colors[inside, channel])[0, 1] > 0.99, "its sign is fixed too"
 
 
@@ -103,18 +103,13 @@ def test_points_without_weight_or_feature_are_grey_and_move_nothing():
     assert (colors[100:] == GREY).all()
 
 
-def test_weights_count_as_repetitions_and_skewed_values_use_the_whole_range():
+def test_weights_count_as_repetitions():
     random = np.random.default_rng(5)
     features, times = random.exponential(size=(300, 6)) ** 2, random.integers(0, 5, 300)
     repeated = np.repeat(features, times, axis=0)
     assert np.array_equal(
         np.repeat(feature_colors(features, times), times, axis=0), feature_colors(repeated, np.ones(len(repeated)))
     )
-    widest = np.sort(feature_colors(repeated, np.ones(len(repeated)))[:, 0])
-    assert widest[0] == 0
-    assert widest[-1] == 255
-    assert 0 < (widest == 0).mean() < 0.04
-    assert 0 < (widest == 255).mean() < 0.04
 
 
 def test_a_cloud_that_no_view_sees_is_grey():
@@ -130,8 +125,8 @@ def test_features_that_are_all_one_are_mid_grey(features):
 
 def test_narrow_features_have_colours_too():
     colors = feature_colors(np.array([[0.0], [1.0]]), np.ones(2))
-    assert colors[0].tolist() == [0, 128, 128]
-    assert colors[1].tolist() == [255, 128, 128]
+    assert colors[0].tolist() == [42, 128, 128], "one standard deviation of 1.5 to either side"
+    assert colors[1].tolist() == [212, 128, 128]
 
 
 def test_faint_directions_are_not_blown_up():

@@ -110,7 +110,7 @@ def axis_aligned_box(points: ArrayLike) -> Box:
 def oriented_box(points: ArrayLike, up: ArrayLike | None = None) -> Box:
     """A small box that holds all points (n, 3), n >= 1; axes by falling length.
 
-    Its volume is within a few percent of the least there is as a rule, within a fifth for a few scattered points.
+    Its volume is within a few percent of the least there is as a rule; up to half more around a few scattered points.
     Of flat points, a small area; of points on a line, the line. up: (3,) direction that one axis has to have, where it
     is known: the box then stands upright, is the least one that does, and this axis is its third.
     SceneError for no points, for NaN or infinity, and for an up of length 0.
@@ -264,7 +264,8 @@ def _upright(local: DoubleArray, up: DoubleArray) -> DoubleArray:
     """Axes of the least box whose third axis is up."""
     aside = np.cross(up, np.eye(3)[np.abs(up).argmin()])
     aside /= np.linalg.norm(aside)
-    return _turned_about(local, np.stack([aside, np.cross(up, aside), up]))
+    axes: DoubleArray = np.asarray([aside, np.cross(up, aside), up], np.float64)
+    return _turned_about(local, axes)
 
 
 def _turned_about(local: DoubleArray, axes: DoubleArray) -> DoubleArray:

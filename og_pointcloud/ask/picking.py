@@ -192,7 +192,7 @@ def _point_at_pixel(cloud: LabelledCloud, camera: Camera, uv_px: ArrayLike | Non
     squares, drawn = _squares(cloud, camera)
     offset = squares.pixel - ((np.floor(uv) + 0.5) * [drawn.width, drawn.height] / size).astype(np.int64)
     covering = (np.abs(offset) <= squares.half[:, None]).all(axis=1)
-    alone = _Squares(*(values[covering] for values in (squares.index, offset, squares.depth, squares.half)))
+    alone = _Squares(squares.index[covering], offset[covering], squares.depth[covering], squares.half[covering])
     return int(_in_front(alone, 1, 1, cloud.reach)[0, 0])
 
 

@@ -24,22 +24,16 @@ from typing import TYPE_CHECKING, TypeAlias, TypedDict
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from og_pointcloud.ask.boxes import typical_spacing
 from og_pointcloud.ask.labelled_scene import LabelledScene, SceneLike, as_scene
 from og_pointcloud.ask.picking import Pick
 from og_pointcloud.ask.selecting import Match, Selection, select
 from og_pointcloud.bundle.nearest import NearestPoint
 from og_pointcloud.cloud import TOO_FAR
 from og_pointcloud.errors import OgPointcloudError, SceneError
-from og_pointcloud.formats.gaussian_ply import (
-    gaussian_rows,
-    gaussians_from_ply,
-    holds_gaussians,
-)
+from og_pointcloud.formats.gaussian_ply import gaussian_rows, gaussians_from_ply, holds_gaussians
 from og_pointcloud.formats.ply import HEADER_LIMIT, join_columns, read_ply, write_ply
 from og_pointcloud.formats.points import read_points
 from og_pointcloud.formats.tables import NORMAL_COLUMNS, naming, positions, storable_positions
-from og_pointcloud.scene import Points
 from og_pointcloud.show.splat_columns import appended, placed, recoloured
 from og_pointcloud.text.words import TextFeatures
 
@@ -55,8 +49,6 @@ Rows = NDArray[np.void]
 
 SAME_PLACE = 1e-3
 """Distance in spacings up to which a point of the cloud is the scene's: .ogpc files hold float32."""
-SPLAT_SCALE, SPLAT_OPACITY = 0.5, 0.95
-"""What a plain point becomes among Gaussians: its standard deviation in spacings, just closing surfaces."""
 RIGID = 1e-4
 """How far a pose may be off a rotation with one scale."""
 
@@ -142,27 +134,24 @@ def insert(
     output: str | os.PathLike[str],
     pose: ArrayLike | None = None,
 ) -> Edit:
-    """Write a cloud with another one put into it, each a plain cloud or a 3DGS file.
+    """Write a cloud with another one put into it, both plain clouds or both 3DGS files.
 
     pose: (4, 4), takes the other's coordinates to the cloud's: a rotation, one scale for all axes, and a translation.
     Left out: they share a frame. Positions, normals, rotations and scales of Gaussians follow it, and so do spherical
-    harmonics, exactly, up to degree 3. The result has the cloud's properties (and the other's harmonics where they go
-    higher); those that the other lacks are 0 for its points.
-    SceneError for a pose that shears or mirrors, and for clouds that cannot be read.
+    harmonics, exactly, up to degree 3. The result has the cloud's properties; those that the other lacks are 0 for its
+    points.
+    SceneError for a pose that shears or mirrors, and for clouds of different kinds or that cannot be read.
     """
     rotation, scale, translation = _similarity(pose)
     _check_output(output, [cloud, other])
     base, added = _read(Path(cloud)), _read(Path(other))
-    rows, notes = added.rows, [*base.notes, *added.notes]
     if holds_gaussians(base.elements) != holds_gaussians(added.elements):
-        points, is_splat = read_points(other), holds_gaussians(base.elements)
-        rows = _as_gaussians(points) if is_splat else _plain_rows(points.xyz_world, points.rgb)
-        kind = "Gaussians" if is_splat else "plain points"
-        notes.append(f"{other}: its points became {kind}, like those of {cloud}")
-    moved, lost = placed(rows, rotation, scale, translation)
+        raise SceneError(f"one of {cloud} and {other} holds Gaussians, the other plain points; expected two of a kind")
+    moved, lost = placed(added.rows, rotation, scale, translation)
     merged, differing = appended(base.rows, moved)
     inserted = np.arange(len(merged)) >= len(base.rows)
-    return _Cloud(base.elements, (*notes, *lost, *differing), inserted).write(output, merged, "inserted")
+    notes = (*base.notes, *added.notes, *lost, *differing)
+    return _Cloud(base.elements, notes, inserted).write(output, merged, "inserted")
 
 
 # What is edited ---------------------------------------------------------------------------------------------------
@@ -225,11 +214,8 @@ def _instances_meant(scene: LabelledScene, what: What, text_features: TextFeatur
         what = select(scene, what, text_features=text_features)
     if isinstance(what, Selection):
         if not what.fitting:
-            best = (
-                f"the nearest is {what.best.instance}, which is rather '{what.best.rival}'" if what.best else "none has"
-            )
             raise OgPointcloudError(
-                f"'{what.query}' fits none of {count} instances better than other words do ({best}): give its id"
+                f"'{what.query}' fits none of {count} instances better than other words do: give its id"
             )
         ids: Sequence[int] = what.instances
     elif isinstance(what, (Pick, Match)):
@@ -326,20 +312,6 @@ def _plain_rows(
     if rgb is not None:
         columns |= dict(zip(("red", "green", "blue"), rgb.T, strict=True))
     return join_columns(columns)
-
-
-def _as_gaussians(points: Points) -> Rows:
-    """A plain cloud as Gaussians that just close its surfaces."""
-    n = len(points)
-    spacing = typical_spacing(points.xyz) or np.finfo(np.float32).tiny
-    return gaussian_rows(
-        replace(
-            points,
-            scale=np.full((n, 3), SPLAT_SCALE * spacing, np.float32),
-            rotation=np.tile(np.array([1, 0, 0, 0], np.float32), (n, 1)),
-            opacity=np.full(n, SPLAT_OPACITY, np.float32),
-        )
-    )
 
 
 def _similarity(pose: ArrayLike | None) -> tuple[NDArray[np.float64], float, NDArray[np.float64]]:

@@ -39,17 +39,17 @@ GREY = (128, 128, 128)
 """A point without a feature, because no view sees it."""
 DARK = (64, 64, 64)
 """A point that is not observed, where instances are shown."""
-OUTLIERS = 0.02
-"""Share of the weight at each end of a colour channel that may be cut off."""
+SPREAD = 1.5
+"""Standard deviations to either side of the mean that a colour channel shows."""
 LEAST_RANGE = 0.25
-"""A channel is stretched no further than to show this part of the widest one's range at full contrast: the rest of the
-variance may be noise."""
+"""A channel is stretched no further than to show this part of the widest one's range: the rest may be noise."""
 OPAQUE = 0.5
 """Pixels with this much blending weight show their value alone, emptier ones fade to white."""
 CELL_WIDTH = 360
 """Pixels; views that are narrower keep their size."""
 GAP, STRIP, MARGIN = 6, 26, 10
-TEXT_SCALE = 0.5
+TEXT_SCALE, LETTER = 0.5, 11
+"""Size of letters, and pixels that the widest takes: of long names the end is shown, where they differ."""
 
 Colors = NDArray[np.uint8]
 
@@ -70,18 +70,18 @@ class FeatureColors:
         """
         used = _known(features) & (weight > 0)
         rows, mass = features[used].astype(np.float64), weight[used].astype(np.float64)
-        width = features.shape[1]
-        axes = np.zeros((width, 3))
+        axes = np.zeros((features.shape[1], 3))
         if not len(rows):
-            return cls(np.zeros(width), axes)
+            return cls(axes[:, 0], axes)
         mass /= mass.sum()
-        centered = rows - mass @ rows
-        directions = np.linalg.eigh((centered * mass[:, None]).T @ centered)[1][:, ::-1][:, :3]
+        center = rows[0] + mass @ (rows - rows[0])  # exact where all are equal
+        centered = rows - center
+        variances, directions = np.linalg.eigh((centered * mass[:, None]).T @ centered)
+        variances, directions = variances[::-1][:3], directions[:, ::-1][:, :3]
         directions *= np.sign(directions[np.abs(directions).argmax(axis=0), np.arange(directions.shape[1])])
-        low, high = _robust_range(centered @ directions, mass)
-        shown = np.maximum(high - low, LEAST_RANGE * (high - low).max(initial=0))
-        axes[:, : directions.shape[1]] = directions / np.where(shown > 0, shown, np.inf)
-        return cls(mass @ rows + directions @ ((low + high) / 2), axes)
+        deviations = np.sqrt(np.maximum(variances, LEAST_RANGE**2 * variances[0]))
+        axes[:, : directions.shape[1]] = directions / np.where(deviations > 0, 2 * SPREAD * deviations, np.inf)
+        return cls(center, axes)
 
     def __call__(self, features: NDArray[np.floating]) -> Colors:
         """(n, 3) uint8 RGB of features (n, w), grey where they are NaN."""
@@ -96,7 +96,7 @@ def feature_colors(features: NDArray[np.floating], weight: NDArray[np.floating])
     >>> import numpy as np
     >>> import og_pointcloud as og
     >>> og.feature_colors(np.array([[0.0], [1.0], [np.nan]]), np.ones(3))[:, 0]  # red; without a feature, grey
-    array([  0, 255, 128], dtype=uint8)
+    array([ 42, 212, 128], dtype=uint8)
     """
     colors = FeatureColors.fit(features, weight)(features)
     colors[weight <= 0] = GREY
@@ -176,16 +176,7 @@ def instance_picture(
     stages: title -> (n,) ids, >= 0 an instance, whose colour depends on its number alone; -1 background (grey) and -2
     unobserved (dark). The rest as `feature_picture`.
 
-    >>> import pathlib, tempfile
-    >>> import numpy as np
-    >>> import og_pointcloud as og
-    >>> from og_pointcloud.rendering.splatting import Gaussians
-    >>> from og_pointcloud.scene import View
-    >>> xyz, scale = np.array([[0, 0, 2], [0.2, 0, 2]], np.float32), np.full((2, 3), 0.1, np.float32)
-    >>> gaussians = Gaussians(xyz, scale, np.eye(4, dtype=np.float32)[[0, 0]], np.ones(2, np.float32))
-    >>> camera = og.Camera(64, 48, 60.0, 60.0, 32.0, 24.0, np.eye(4))
-    >>> view = View("front", camera, np.full((48, 64), -1, np.int32), np.zeros((0, 1), np.float32))
-    >>> stages = {"instances": np.array([0, 1])}
+    >>> stages = {"instances": np.array([0, 1])}  # of the scene in `feature_picture`'s example
     >>> og.instance_picture(gaussians, [view], 0.1, stages, pathlib.Path(tempfile.mkdtemp()) / "two.png").name
     'two.png'
     """
@@ -205,10 +196,7 @@ def _check(stages: Mapping[str, NDArray[Any]], shape: tuple[int | None, ...]) ->
         raise SceneError("a picture has 0 stages; expected at least one title with its values")
     for title, values in stages.items():
         if values.ndim != len(shape) or len(values) != shape[0]:
-            raise SceneError(
-                f"stage '{title}' has shape {values.shape}; expected {shape[0]} rows, one a Gaussian"
-                + (", of features" if len(shape) > 1 else "")
-            )
+            raise SceneError(f"stage '{title}' has shape {values.shape}; expected {shape[0]} rows, one a Gaussian")
     if len({values.shape for values in stages.values()}) > 1:
         shapes = ", ".join(f"{title} {values.shape}" for title, values in stages.items())
         raise SceneError(f"the stages differ in shape ({shapes}); expected one, since they share their colours")
@@ -216,17 +204,6 @@ def _check(stages: Mapping[str, NDArray[Any]], shape: tuple[int | None, ...]) ->
 
 def _known(features: NDArray[np.floating]) -> NDArray[np.bool_]:
     return np.logical_and.reduce(np.isfinite(features), axis=1)
-
-
-def _robust_range(
-    values: NDArray[np.float64], mass: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Of each column, the values below and above which a share OUTLIERS of the mass lies."""
-    order = values.argsort(axis=0, kind="stable")
-    reached = np.cumsum(mass[order], axis=0)
-    at = [(reached < share).sum(axis=0).clip(max=len(values) - 1) for share in (OUTLIERS, 1 - OUTLIERS)]
-    low, high = (np.take_along_axis(values, np.take_along_axis(order, row[None], axis=0), axis=0)[0] for row in at)
-    return low, high
 
 
 def _weights(
@@ -297,7 +274,7 @@ def _write_grid(path: Path, views: Sequence[View], rows: Mapping[str, Sequence[N
     height = max(view.camera.height for view in views)
     sheet = np.full((STRIP + len(cells) * (STRIP + height + GAP), int(lefts[-1]) + MARGIN - GAP, 3), 255, np.uint8)
     for left, view in zip(lefts, views, strict=False):
-        _write_text(sheet, _fitting(view.name, view.camera.width), int(left), STRIP)
+        _write_text(sheet, view.name[-view.camera.width // LETTER :], int(left), STRIP)
     for index, (title, row) in enumerate(cells.items()):
         top = STRIP + index * (STRIP + height + GAP)
         _write_text(sheet, title, MARGIN, top + STRIP)
@@ -311,17 +288,7 @@ def _write_grid(path: Path, views: Sequence[View], rows: Mapping[str, Sequence[N
     return path
 
 
-def _fitting(text: str, width: int) -> str:
-    """The end of a text that is too long for a width in pixels: names of images differ at their ends."""
-    cv2 = require_cv2()
-    while len(text) > 1 and cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, TEXT_SCALE, 1)[0][0] > width:
-        text = text[1:]
-    return text
-
-
 def _write_text(sheet: Colors, text: str, left: int, bottom: int) -> None:
     """Black text in a strip that ends at row ``bottom``; OpenCV's font is ASCII only."""
-    cv2 = require_cv2()
-    ascii_text = text.encode("ascii", "replace").decode()
-    place = (left, bottom - 8)
-    cv2.putText(sheet, ascii_text, place, cv2.FONT_HERSHEY_SIMPLEX, TEXT_SCALE, (0, 0, 0), 1, cv2.LINE_AA)
+    cv2, ascii_text = require_cv2(), text.encode("ascii", "replace").decode()
+    cv2.putText(sheet, ascii_text, (left, bottom - 8), cv2.FONT_HERSHEY_SIMPLEX, TEXT_SCALE, (0, 0, 0), 1, cv2.LINE_AA)

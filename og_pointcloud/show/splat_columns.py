@@ -7,6 +7,7 @@ among themselves: the colour that was seen along d is then seen along R d.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from typing import Any, TypeAlias
 
@@ -49,7 +50,7 @@ def recoloured(
         base = 0.5 + SH_CONSTANT * _stack(columns, BASE_COLOR)[chosen]
         mapping, constant = _color_map(np.clip(base, 0, 1), color, keep_shading)
         _set(columns, BASE_COLOR, (base @ mapping.T + constant - 0.5) / SH_CONSTANT, chosen)
-        _set_rest(columns, np.einsum("dc,nck->ndk", mapping, _rest(columns)[chosen]), chosen)
+        _set(columns, _rest_names(columns), np.einsum("dc,nck->ndk", mapping, _rest(columns)[chosen]), chosen)
     elif rgb is None:
         rgb, notes = np.full((len(rows), 3), 128, np.uint8), ("the cloud has no colours: the rest became grey",)
     if rgb is not None:
@@ -81,16 +82,13 @@ def placed(
     rest = _rest(columns)
     if rest.shape[2] >= (MAX_DEGREE + 1) ** 2:
         return join_columns(columns), (f"harmonics above degree {MAX_DEGREE} are not turned",)
-    _set_rest(columns, rotated_harmonics(rest, rotation))
+    _set(columns, _rest_names(columns), rotated_harmonics(rest, rotation))
     return join_columns(columns), ()
 
 
 def appended(base: Rows, added: Rows) -> tuple[Rows, tuple[str, ...]]:
-    """The rows of both, with the columns of the first and as many harmonics as either has; and what is to be told."""
+    """The rows of both, with the columns of the first; and what is to be told."""
     first, second = _columns(base), _columns(added)
-    if set(BASE_COLOR) <= set(first):
-        harmonics = max(_rest(first).shape[2], _rest(second).shape[2])
-        first, second = _with_harmonics(first, harmonics), _with_harmonics(second, harmonics)
     zeros, notes = np.zeros(len(added)), []
     merged = {
         name: np.concatenate([column, second.get(name, zeros).astype(column.dtype)]) for name, column in first.items()
@@ -148,17 +146,15 @@ def _set(
     values: NDArray[np.floating],
     chosen: NDArray[np.bool_] | slice = slice(None),
 ) -> None:
-    """Give some rows of the columns other values (rows, names), in the columns' types; the arrays given stay."""
-    for index, name in enumerate(names):
+    """Give some rows of the columns other values (rows, ..), a name each, in the columns' types; the arrays stay."""
+    for name, column in zip(names, values.reshape(len(values), len(names)).T, strict=True):
         columns[name] = columns[name].copy()
-        columns[name][chosen] = values[:, index]
+        columns[name][chosen] = column
 
 
 def _rest_names(columns: Columns) -> list[str]:
     """f_rest_0, f_rest_1, ..: all harmonics of red, then of green, then of blue."""
-    names = []
-    while f"f_rest_{len(names)}" in columns:
-        names.append(f"f_rest_{len(names)}")
+    names = list(itertools.takewhile(columns.__contains__, map("f_rest_{}".format, itertools.count())))
     if len(names) % 3:
         raise SceneError(f"{len(names)} properties f_rest; expected three times as many as a channel has")
     return names
@@ -166,29 +162,8 @@ def _rest_names(columns: Columns) -> list[str]:
 
 def _rest(columns: Columns) -> NDArray[np.float64]:
     """(n, 3, k) harmonics above the constant one; k is 0 where there are none."""
-    names = _rest_names(columns)
-    return _stack(columns, names).reshape(-1, 3, len(names) // 3) if names else np.zeros((len(columns["x"]), 3, 0))
-
-
-def _set_rest(
-    columns: Columns,
-    rest: NDArray[np.float64],
-    chosen: NDArray[np.bool_] | slice = slice(None),
-) -> None:
-    _set(columns, _rest_names(columns), rest.reshape(len(rest), 3 * rest.shape[2]), chosen)
-
-
-def _with_harmonics(columns: Columns, count: int) -> Columns:
-    """The columns with ``count`` harmonics a channel, new ones 0, behind the constant ones, where files have them."""
-    rest = _rest(columns)
-    if rest.shape[2] == count:
-        return columns
-    padded = np.zeros((len(rest), 3, count), np.float32)
-    padded[:, :, : rest.shape[2]] = rest
-    new = {f"f_rest_{index}": column for index, column in enumerate(padded.reshape(len(rest), -1).T)}
-    others = [(name, column) for name, column in columns.items() if not name.startswith("f_rest_")]
-    behind = [name for name, _ in others].index(BASE_COLOR[-1]) + 1
-    return dict([*others[:behind], *new.items(), *others[behind:]])
+    values = _stack(columns, _rest_names(columns))
+    return values.reshape(len(values), 3, values.shape[1] // 3)
 
 
 # Harmonics --------------------------------------------------------------------------------------------------------
