@@ -24,7 +24,8 @@ def example_of(name):
 def known():
     """What other examples start from: the cloud that LabelledCloud's own makes, the scene of feature_picture's."""
     start = {}
-    for source, names in (("LabelledCloud", ("cloud", "np", "og")), ("feature_picture", ("gaussians", "view", "pathlib", "tempfile"))):
+    shared = {"LabelledCloud": ("cloud", "np", "og"), "feature_picture": ("gaussians", "view", "pathlib", "tempfile")}
+    for source, names in shared.items():
         example = example_of(source)
         assert doctest.DocTestRunner(optionflags=OPTIONS).run(example, clear_globs=False).failed == 0
         start |= {name: example.globs[name] for name in names}

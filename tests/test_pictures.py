@@ -125,7 +125,7 @@ def test_features_that_are_all_one_are_mid_grey(features):
 
 def test_narrow_features_have_colours_too():
     colors = feature_colors(np.array([[0.0], [1.0]]), np.ones(2))
-    assert colors[0].tolist() == [42, 128, 128], "one standard deviation of 1.5 to either side"
+    assert colors[0].tolist() == [43, 128, 128], "one standard deviation of 1.5 to either side"
     assert colors[1].tolist() == [212, 128, 128]
 
 

@@ -96,7 +96,7 @@ def feature_colors(features: NDArray[np.floating], weight: NDArray[np.floating])
     >>> import numpy as np
     >>> import og_pointcloud as og
     >>> og.feature_colors(np.array([[0.0], [1.0], [np.nan]]), np.ones(3))[:, 0]  # red; without a feature, grey
-    array([ 42, 212, 128], dtype=uint8)
+    array([ 43, 212, 128], dtype=uint8)
     """
     colors = FeatureColors.fit(features, weight)(features)
     colors[weight <= 0] = GREY
