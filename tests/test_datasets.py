@@ -268,10 +268,10 @@ def test_poses_in_millimetres_with_depth_in_metres_are_doubted(tmp_path):
         (write_scannet, "intrinsic/intrinsic_color.txt", "a b", "cannot be read as rows of numbers"),
         (write_scannet, "intrinsic/intrinsic_depth.txt", "1 0 0 0", "expected a 4x4 matrix"),
         (write_seven_scenes, "camera-intrinsics.txt", "1 0 0", "expected a 3x3 matrix"),
-        (write_replica, "traj.txt", "1 " * 16, "6 images in results/ and 1 poses"),
+        (write_replica, "traj.txt", "1 " * 16, r"traj.txt has 1 poses for 6 images"),
         (write_replica, "../cam_params.json", '{"camera": {"w": 1}}', "is not"),
         (write_record3d, "metadata.json", '{"w": 1}', "is not Record3D's metadata"),
-        (write_record3d, "metadata.json", "[" * 100000, "is not Record3D's metadata"),
+        (write_record3d, "metadata.json", "[" * 100000, "is not valid JSON"),
     ],
 )
 def test_damaged_data_sets_name_the_file_and_the_cure(tmp_path, write, file, content, said):

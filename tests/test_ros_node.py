@@ -5,7 +5,6 @@ import json
 import sys
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -85,7 +84,7 @@ def test_topics_and_their_quality(node):
     latest = fake_ros.QoSProfile("keep last", 1, "best effort", "volatile")
     assert node.name == "og_pointcloud"
     assert node.subscriptions["~/input/points"].qos == latest
-    assert set(node.subscriptions) == {"~/input/points", "~/set_labels"}
+    assert set(node.subscriptions) == {"~/input/points"}
     assert {topic: publisher.qos.durability for topic, publisher in node.publishers.items()} == {
         "~/output/points": "volatile", "~/output/detections": "volatile", "~/label_info": "transient local",
     }  # fmt: skip
@@ -101,36 +100,28 @@ def test_names_are_told_at_once(node):
     assert sent(node, "~/label_info")[0].header.stamp.sec == 12
 
 
-@pytest.mark.parametrize("text", ['["pear", "plum"]', "pear, plum"])
-def test_labels_change_while_it_runs(node, scene, text):
-    send(node, "~/set_labels", SimpleNamespace(data=text))
+def set_labels(node, *labels):
+    (answer,) = node.set_parameters([fake_ros.Parameter("labels", list(labels))])
+    return answer
+
+
+def test_labels_change_while_it_runs(node, scene):
+    assert set_labels(node, "pear", "plum").successful
     assert names(node) == [WORDS, ["pear", "plum"]]
     assert node.get_parameter("labels").value == ["pear", "plum"]
     send(node, "~/input/points", cloud(scene))
     assert set(read_fields(sent(node)[0])["label"].ravel().tolist()) == {0, 1, 65535}
 
 
-@pytest.mark.parametrize(
-    ("text", "said"), [('["pear", "unicorn"]', "unicorn"), ("[1]", "expected words"), ("{}", "expected")]
-)
-def test_words_that_cannot_be_used_change_nothing(node, text, said):
-    send(node, "~/set_labels", SimpleNamespace(data=text))
-    assert names(node) == [WORDS]
-    assert node.get_parameter("labels").value == WORDS
-    level, line = node.logger.lines[-1]
-    assert level == "error"
-    assert said in line
-
-
 def test_setting_the_parameter_answers(node):
-    (good,) = node.set_parameters([fake_ros.Parameter("labels", ["plum"])])
-    (unknown,) = node.set_parameters([fake_ros.Parameter("labels", ["unicorn"])])
+    good, unknown = set_labels(node, "plum"), set_labels(node, "pear", "unicorn")
     (fixed,) = node.set_parameters([fake_ros.Parameter("scene", "other.ogpc")])
     (foreign,) = node.set_parameters([fake_ros.Parameter("use_sim_time", True)])
     assert (good.successful, unknown.successful, fixed.successful, foreign.successful) == (True, False, False, True)
     assert "unicorn" in unknown.reason
     assert "at the start only" in fixed.reason
     assert node.get_parameter("labels").value == ["plum"]
+    assert names(node) == [WORDS, ["plum"]]
 
 
 def test_nothing_is_done_for_nobody(node, scene, monkeypatch):
@@ -207,8 +198,8 @@ def test_words_that_cannot_be_scored_change_nothing(node, module, monkeypatch):
         raise RuntimeError("the graph ended")
 
     monkeypatch.setattr(module, "Segmenter", broken)
-    send(node, "~/set_labels", SimpleNamespace(data="chair"))
-    assert node.logger.lines[-1] == ("error", "the labels stay as they are: RuntimeError: the graph ended")
+    answer = set_labels(node, "chair")
+    assert (answer.successful, answer.reason) == (False, "RuntimeError: the graph ended")
 
 
 def test_max_distance_shortens_the_reach(module, scene):

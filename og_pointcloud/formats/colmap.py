@@ -30,29 +30,21 @@ __all__ = ["find_model", "read_images", "read_points3d"]
 
 MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse")
 
-# COLMAP's camera models in the order of their ids: name -> parameters.
-CAMERA_MODELS: dict[str, str] = {
-    "SIMPLE_PINHOLE": "f cx cy",
-    "PINHOLE": "fx fy cx cy",
-    "SIMPLE_RADIAL": "f cx cy k1",
-    "RADIAL": "f cx cy k1 k2",
-    "OPENCV": "fx fy cx cy k1 k2 p1 p2",
-    "OPENCV_FISHEYE": "fx fy cx cy k1 k2 k3 k4",
-    "FULL_OPENCV": "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6",
-    "FOV": "fx fy cx cy omega",
-    "SIMPLE_RADIAL_FISHEYE": "f cx cy k1",
-    "RADIAL_FISHEYE": "f cx cy k1 k2",
-    "THIN_PRISM_FISHEYE": "fx fy cx cy k1 k2 p1 p2 k3 k4 sx1 sy1",
-    "RAD_TAN_THIN_PRISM_FISHEYE": "fx fy cx cy k0 k1 k2 k3 k4 k5 p0 p1 s0 s1 s2 s3",
-    "SIMPLE_DIVISION": "f cx cy k",
-    "DIVISION": "fx fy cx cy k",
-    "SIMPLE_FISHEYE": "f cx cy",
-    "FISHEYE": "fx fy cx cy",
-    "EUCM": "fx fy cx cy alpha beta",
+CAMERA_MODELS: dict[str, tuple[int, str]] = {
+    "SIMPLE_PINHOLE": (0, "f cx cy"),
+    "PINHOLE": (1, "fx fy cx cy"),
+    "SIMPLE_RADIAL": (2, "f cx cy k1"),
+    "RADIAL": (3, "f cx cy k1 k2"),
+    "OPENCV": (4, "fx fy cx cy k1 k2 p1 p2"),
+    "OPENCV_FISHEYE": (5, "fx fy cx cy k1 k2 k3 k4"),
+    "FULL_OPENCV": (6, "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6"),
+    "SIMPLE_RADIAL_FISHEYE": (8, "f cx cy k1"),
+    "RADIAL_FISHEYE": (9, "f cx cy k1 k2"),
+    "SIMPLE_FISHEYE": (14, "f cx cy"),
+    "FISHEYE": (15, "fx fy cx cy"),
 }
-PERSPECTIVE = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
-FISHEYE = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "SIMPLE_FISHEYE", "FISHEYE")
-"""Models that OpenCV undistorts exactly; the others are refused."""
+"""Models that OpenCV undistorts exactly, with COLMAP's ids and parameters; the others are refused."""
+MODEL_NAMES = {model_id: name for name, (model_id, _) in CAMERA_MODELS.items()}
 
 Pose = NDArray[np.float64]
 
@@ -109,17 +101,17 @@ def _file(model: Path, stem: str) -> Path | None:
 
 def _camera(record: _Binary | _Text) -> tuple[int, _Lens]:
     camera_id, model = record.integer("I"), record.camera_model()
-    width, height = record.integer("Q"), record.integer("Q")
-    names = CAMERA_MODELS[model].split()
-    values = dict(zip(names, record.reals(len(names)), strict=True))
-    if model not in PERSPECTIVE + FISHEYE:
+    if model not in CAMERA_MODELS:
         raise SceneError(
-            f"{record.path}: camera {camera_id} has the model {model}; expected one of "
-            f"{', '.join(PERSPECTIVE + FISHEYE)}: run 'colmap image_undistorter' and make the masks on its images"
+            f"{record.path}: camera {camera_id} has the model {model:.60}; expected one of {', '.join(CAMERA_MODELS)}: "
+            "run 'colmap image_undistorter' and make the masks on its images"
         )
+    width, height = record.integer("Q"), record.integer("Q")
+    names = CAMERA_MODELS[model][1].split()
+    values = dict(zip(names, record.reals(len(names)), strict=True))
     fx, fy = (values.pop("f"),) * 2 if "f" in values else (values.pop("fx"), values.pop("fy"))
     intrinsics = (fx, fy, values.pop("cx"), values.pop("cy"))
-    return camera_id, _Lens(width, height, intrinsics, lens_distortion(values, fisheye=model in FISHEYE))
+    return camera_id, _Lens(width, height, intrinsics, lens_distortion(values, fisheye=model.endswith("FISHEYE")))
 
 
 # Sources.
@@ -184,12 +176,7 @@ class _Binary:
 
     def camera_model(self) -> str:
         model_id = self.integer("i")
-        if not 0 <= model_id < len(CAMERA_MODELS):
-            raise SceneError(
-                f"{self.path}: camera model id {model_id} at byte {self.offset - 4}; expected one of COLMAP's "
-                f"perspective or fisheye models, 0 to {len(CAMERA_MODELS) - 1}: run 'colmap image_undistorter' first"
-            )
-        return list(CAMERA_MODELS)[model_id]
+        return MODEL_NAMES.get(model_id, f"of id {model_id}")
 
     def name(self) -> str:
         end = self.data.find(b"\0", self.offset)
@@ -247,10 +234,7 @@ class _Text:
         return _pose(self.reals(7), f"{self.path}, line {self.line_number}")
 
     def camera_model(self) -> str:
-        word = self.word()
-        if word not in CAMERA_MODELS:
-            raise self.damaged(word, f"a camera model of {', '.join(CAMERA_MODELS)}")
-        return word
+        return self.word()
 
     def name(self) -> str:
         if not self.rest:

@@ -56,37 +56,34 @@ def write_gltf(
             raise SceneError("0 points; expected at least one: glTF has no empty clouds")
         require_finite(xyz_world, "glTF allows no others")
         origin = np.median(np.asarray(xyz_world, np.float64), axis=0)
+        instances = attributes["og_instance"]
+        features = {
+            "og_label": (attributes["og_label"], len(names)),
+            "og_instance": (instances, int(instances.max(initial=-1)) + 1),
+        }
         columns = {
             "POSITION": (xyz_world - origin).astype(np.float32),
             "COLOR_0": _linear_colors(rgb),
-            "_FEATURE_ID_0": _feature_ids(attributes["og_label"], len(names)),
-            "_FEATURE_ID_1": _feature_ids(attributes["og_instance"], _id_count(attributes["og_instance"])),
+            **{
+                f"_FEATURE_ID_{index}": np.where(ids >= 0, ids, none).astype(np.float32)
+                for index, (ids, none) in enumerate(features.values())
+            },
             "_OG_SCORE": attributes["og_score"].astype(np.float32),
             "_OG_REASON": attributes["og_reason"].astype(np.float32),
         }
-        extensions = {FEATURES: {"featureIds": _feature_sets(attributes, len(names))}}
-        document, binary = _document(columns, origin, extensions, names)
+        feature_sets = [
+            # featureCount: at least 1, as the schema has it
+            {
+                "featureCount": max(len(np.unique(ids[ids >= 0])), 1),
+                "nullFeatureId": none,
+                "attribute": index,
+                "label": label,
+            }
+            for index, (label, (ids, none)) in enumerate(features.items())
+        ]
+        document, binary = _document(columns, origin, {FEATURES: {"featureIds": feature_sets}}, names)
         with replacing(path) as file:
             file.write(_as_glb(document, binary) if path.suffix == ".glb" else _as_text(document, binary))
-
-
-def _feature_ids(ids: NDArray[np.integer], none: int) -> NDArray[np.float32]:
-    return np.where(ids >= 0, ids, none).astype(np.float32)
-
-
-def _id_count(ids: NDArray[np.integer]) -> int:
-    return int(ids.max(initial=-1)) + 1
-
-
-def _feature_sets(attributes: Mapping[str, NDArray], name_count: int) -> list[dict[str, Any]]:
-    sets = []
-    for index, (label, none) in enumerate(
-        (("og_label", name_count), ("og_instance", _id_count(attributes["og_instance"])))
-    ):
-        ids = attributes[label]
-        present = max(len(np.unique(ids[ids >= 0])), 1)  # the schema's minimum
-        sets.append({"featureCount": present, "nullFeatureId": none, "attribute": index, "label": label})
-    return sets
 
 
 def _linear_colors(rgb: NDArray[np.uint8]) -> NDArray[np.uint16]:

@@ -45,8 +45,7 @@ STEPS_PER_EXTENT = 1e8
 FULL_RANGE = 257
 """An 8-bit colour times this spans the format's 16 bits."""
 RECORD_OWNER, NAMES_RECORD = "og_pointcloud", 1
-SHORT_RECORD = 65_535
-"""Bytes that a record before the points holds; a longer one goes behind them."""
+LONGEST_RECORD = 65_535
 SMALLEST_HEADER, RECORD_HEADER = 227, 54
 LAYERED = 3
 """LASzip's compressor whose chunks hold each field as a layer of its own."""
@@ -96,11 +95,9 @@ def labelled_las(
     las.classification = _classes(attributes["og_label"])
     las.user_data = attributes["og_reason"]
     record = json.dumps(list(names)).encode()
-    names_record = laspy.VLR(RECORD_OWNER, NAMES_RECORD, "og_names", record)
-    if len(record) <= SHORT_RECORD:
-        las.header.vlrs.append(names_record)
-    else:
-        las.evlrs = laspy.vlrs.vlrlist.VLRList([names_record])
+    if len(record) > LONGEST_RECORD:
+        raise SceneError(f"{len(names)} names take {len(record)} bytes; LAS holds {LONGEST_RECORD}: ask for fewer")
+    las.header.vlrs.append(laspy.VLR(RECORD_OWNER, NAMES_RECORD, "og_names", record))
     return las
 
 
@@ -117,17 +114,13 @@ def write_las(
     attributes: og_label, og_instance (n,) int32, og_score (n,) float32, og_reason (n,) uint8: as they are in extra
         bytes; og_label + 64 also as the classification, 1 without a label or beyond 255; og_reason also as user data.
     names: what og_label counts; JSON, in a record.
-    SceneError where a coordinate is not finite; MissingExtraError without laspy.
+    SceneError where a coordinate is not finite or the names are too long; MissingExtraError without laspy.
     """
     path = Path(path)
     with naming(path):
         las = labelled_las(xyz_world, rgb, attributes, names)
         with replacing(path) as file:
-            writer = _laspy().LasWriter(file, las.header, do_compress=path.suffix == ".laz", closefd=False)
-            writer.write_points(las.points)
-            if las.evlrs:
-                writer.write_evlrs(las.evlrs)
-            writer.close()
+            las.write(file, do_compress=path.suffix == ".laz")
 
 
 def _laspy() -> Any:

@@ -22,9 +22,7 @@ __all__ = ["looks_like_pcd", "read_pcd"]
 
 HEADER_LIMIT = 1 << 16
 POINT_SIZE_LIMIT = 1 << 20
-"""Bytes of one point, descriptors and padding included; the largest of PCL's own types has about 8 kB."""
-LZF_LARGEST_RATIO = 88
-"""Three bytes of LZF data give at most 264."""
+"""Bytes, descriptors and padding included; the largest of PCL's own types has about 8 kB."""
 
 NUMPY_KINDS = {"F": "f", "I": "i", "U": "u"}
 SIZES = {"F": (4, 8), "I": (1, 2, 4, 8), "U": (1, 2, 4, 8)}
@@ -103,11 +101,8 @@ def _dtype(entries: dict[str, list[str]]) -> np.dtype:
                 f"PCD field '{name:.40}' has TYPE {kind:.20} SIZE {size} COUNT {count}; expected F with 4 or 8, I or U "
                 "with 1, 2, 4 or 8, and a count of 1 or more"
             )
-    point_size = sum(size * count for size, count in zip(sizes, counts, strict=True))
-    if point_size > POINT_SIZE_LIMIT:
-        raise SceneError(
-            f"a PCD point has {point_size} bytes; expected at most {POINT_SIZE_LIMIT}: the file is damaged"
-        )
+    if sum(size * count for size, count in zip(sizes, counts, strict=True)) > POINT_SIZE_LIMIT:
+        raise SceneError(f"a PCD point has more than {POINT_SIZE_LIMIT} bytes: the file is damaged")
     numpy_types = [f"<{NUMPY_KINDS[kind]}{size}" for kind, size in zip(types, sizes, strict=True)]
     return np.dtype(
         [
@@ -137,10 +132,10 @@ def _read_compressed(file: BinaryIO, header: _Header, left: int) -> NDArray[np.v
     compressed_size, size = struct.unpack("<II", file.read(8))
     _require_bytes("compressed data", compressed_size, left - 8)
     expected = header.points * header.dtype.itemsize
-    if size != expected or size > LZF_LARGEST_RATIO * compressed_size:
+    if size != expected:
         raise SceneError(
-            f"PCD data of {compressed_size} bytes claims to unpack to {size}; the header's {header.points} points need "
-            f"{expected}, and LZF packs at most {LZF_LARGEST_RATIO}:1: the file is damaged"
+            f"PCD data claims to unpack to {size} bytes; the header's {header.points} points need {expected}: the file "
+            "is damaged"
         )
     data = _lzf_decompress(file.read(compressed_size), size)
     rows = np.empty(header.points, header.dtype)

@@ -22,12 +22,9 @@ pixel centres at whole numbers; the scene has them at +0.5.
 
 from __future__ import annotations
 
-import json
-import warnings
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,6 +36,7 @@ from og_pointcloud.formats.poses import (
     PosedFrames,
     PosedImage,
     numbered,
+    read_json,
     read_numbers,
     rigid,
     rotation_of_quaternion,
@@ -60,13 +58,15 @@ RECORD3D_METADATA = "metadata.json"
 
 @dataclass(frozen=True)
 class _Lens:
-    """A camera without its pose: pixels, pixel centres at +0.5."""
+    """A camera without its pose: pixels, pixel centres at +0.5. unit, invalid: of depth, as `DepthFile` has them."""
 
     size: tuple[int, int]
     fx: float
     fy: float
     cx: float
     cy: float
+    unit: float | None = None
+    invalid: int | None = None
 
     @classmethod
     def from_matrix(cls, size: tuple[int, int], matrix: NDArray[np.float64]) -> _Lens:
@@ -83,34 +83,26 @@ class _Lens:
 
 
 @dataclass(frozen=True)
-class _Depth:
-    """A depth image without its pose. unit, invalid: as `DepthFile` has them."""
-
-    file: Path
-    lens: _Lens
-    unit: float | None = None
-    invalid: int | None = None
-
-
-@dataclass(frozen=True)
 class _Frame:
     """An image of a recording.
 
     path: in the capture folder. pose: camera to world, NaN or infinite where tracking was lost. source: where the pose
-    was read, for errors.
+    was read, for errors. depth_file: may be absent.
     """
 
     path: str
     pose: NDArray[np.float64]
     source: str
     lens: _Lens
-    depth: _Depth | None
+    depth_file: Path | None
+    depth_lens: _Lens
 
     def posed(self) -> PosedImage:
         with naming(self.source):
-            camera, depth = self.lens.at(self.pose), self.depth
-            file = DepthFile(depth.file, depth.lens.at(self.pose), depth.unit, depth.invalid) if depth else None
-        return PosedImage(self.path, camera, depth=file)
+            camera, file, lens = self.lens.at(self.pose), self.depth_file, self.depth_lens
+            if file is None or not file.is_file():
+                return PosedImage(self.path, camera)
+            return PosedImage(self.path, camera, depth=DepthFile(file, lens.at(self.pose), lens.unit, lens.invalid))
 
 
 def read_rgbd(folder: Path) -> PosedFrames | None:
@@ -161,14 +153,12 @@ def read_scannet(folder: Path) -> PosedFrames:
     if not images:
         raise SceneError(f"{folder / 'color'} has no image; expected 0.jpg, 1.jpg, ...: export the colour frames")
     color = _scannet_lens(folder, "color", images[0])
-    depth_files = {file.stem: file for file in (folder / "depth").glob("*.png")}
-    depth = _scannet_lens(folder, "depth", next(iter(depth_files.values()))) if depth_files else color
-    _warn_of_extrinsics(folder)
+    some_depth = next((folder / "depth").glob("*.png"), None)
+    depth = replace(_scannet_lens(folder, "depth", some_depth) if some_depth else color, unit=MILLIMETRE)
     frames = []
     for file in images:
-        pose_file, depth_file = folder / "pose" / f"{file.stem}.txt", depth_files.get(file.stem)
-        of_depth = _Depth(depth_file, depth, MILLIMETRE) if depth_file else None
-        frames.append(_Frame(f"color/{file.name}", _pose_in(pose_file), str(pose_file), color, of_depth))
+        pose_file, depth_file = folder / "pose" / f"{file.stem}.txt", folder / "depth" / f"{file.stem}.png"
+        frames.append(_Frame(f"color/{file.name}", _pose_in(pose_file), str(pose_file), color, depth_file, depth))
     return _posed_frames(frames)
 
 
@@ -177,8 +167,8 @@ def find_mesh(folder: Path) -> Path | None:
     return next(iter(sorted(folder.glob("*_vh_clean_2.ply"))), None)
 
 
-def _scannet_file(folder: Path, sensor: str, kind: str = "intrinsic") -> Path | None:
-    files = (folder / "intrinsic" / f"{kind}_{sensor}.txt", folder / f"{kind}s_{sensor}.txt")
+def _scannet_file(folder: Path, sensor: str) -> Path | None:
+    files = (folder / "intrinsic" / f"intrinsic_{sensor}.txt", folder / f"intrinsics_{sensor}.txt")
     return next((file for file in files if file.is_file()), None)
 
 
@@ -187,16 +177,6 @@ def _scannet_lens(folder: Path, sensor: str, image: Path) -> _Lens:
     if file is None:
         raise SceneError(f"{folder} has no intrinsic/intrinsic_{sensor}.txt: export the intrinsics again")
     return _Lens.from_matrix(image_size(image), _matrix_in(file, 4))
-
-
-def _warn_of_extrinsics(folder: Path) -> None:
-    for sensor in ("color", "depth"):
-        file = _scannet_file(folder, sensor, "extrinsic")
-        if file is not None and np.abs(read_numbers(file, 4) - np.eye(4)).max() > 1e-3:
-            warnings.warn(
-                f"{file} is not the identity and is not applied: depth and colours are taken to share a pose",
-                stacklevel=6,
-            )
 
 
 def read_seven_scenes(folder: Path) -> PosedFrames:
@@ -209,13 +189,13 @@ def read_seven_scenes(folder: Path) -> PosedFrames:
     if not images:
         raise SceneError(f"{folder} has poses but no frame-*.color.png or .color.jpg: add the colour images")
     color, depth = _seven_scenes_lenses(folder, image_size(images[0]))
+    depth = replace(depth, unit=MILLIMETRE, invalid=SEVEN_SCENES_INVALID)
     frames = []
     for file in images:
         frame = file.name.split(".")[0]
         pose_file, depth_file = file.with_name(f"{frame}.pose.txt"), file.with_name(f"{frame}.depth.png")
-        of_depth = _Depth(depth_file, depth, MILLIMETRE, SEVEN_SCENES_INVALID) if depth_file.is_file() else None
         path = file.relative_to(folder).as_posix()
-        frames.append(_Frame(path, _pose_in(pose_file), str(pose_file), color, of_depth))
+        frames.append(_Frame(path, _pose_in(pose_file), str(pose_file), color, depth_file, depth))
     return _posed_frames(frames)
 
 
@@ -240,19 +220,23 @@ def read_replica(folder: Path) -> PosedFrames:
     results = folder / "results"
     images = numbered([*results.glob("frame*.jpg"), *results.glob("frame*.png")])
     poses = read_numbers(folder / "traj.txt", 16).reshape(-1, 4, 4)
-    if not images or len(images) > len(poses):
-        raise SceneError(
-            f"{folder} has {len(images)} images in results/ and {len(poses)} poses in traj.txt; expected at least one "
-            "image and a pose for each: copy both from one run"
-        )
+    _require_poses(images, poses, f"{folder / 'traj.txt'}")
     width, height, fx, fy, cx, cy, scale = _replica_parameters(folder)
-    lens = _Lens((round(width), round(height)), fx, fy, cx + 0.5, cy + 0.5)
+    lens = _Lens((round(width), round(height)), fx, fy, cx + 0.5, cy + 0.5, unit=1 / scale)
     frames = []
     for line, (file, pose) in enumerate(zip(images, poses, strict=False), 1):
         depth_file = results / f"{file.stem.replace('frame', 'depth', 1)}.png"
-        depth = _Depth(depth_file, lens, 1 / scale) if depth_file.is_file() else None
-        frames.append(_Frame(f"results/{file.name}", pose, f"{folder / 'traj.txt'}, line {line}", lens, depth))
+        source = f"{folder / 'traj.txt'}, line {line}"
+        frames.append(_Frame(f"results/{file.name}", pose, source, lens, depth_file, lens))
     return _posed_frames(frames)
+
+
+def _require_poses(images: Sequence[Path], poses: NDArray[np.float64], source: str) -> None:
+    if not images or len(images) > len(poses):
+        raise SceneError(
+            f"{source} has {len(poses)} poses for {len(images)} images; expected at least one image and a pose for "
+            "each: export the recording again"
+        )
 
 
 def _replica_parameters(folder: Path) -> list[float]:
@@ -261,10 +245,10 @@ def _replica_parameters(folder: Path) -> list[float]:
         raise SceneError(
             f"{folder} has no {REPLICA_PARAMETERS}, nor has the folder above; expected it with w h fx fy cx cy scale"
         )
+    content = read_json(file)
     try:
-        content: Any = json.loads(file.read_text(encoding="utf-8"))
         values = [float(content["camera"][key]) for key in REPLICA_KEYS]
-    except (ValueError, TypeError, KeyError, RecursionError) as error:
+    except (ValueError, TypeError, KeyError) as error:
         raise SceneError(
             f'{file} is not {{"camera": {{{", ".join(REPLICA_KEYS)}}}}} ({error!s:.80}): copy it again'
         ) from None
@@ -278,31 +262,26 @@ def read_record3d(folder: Path) -> PosedFrames:
     file = folder / RECORD3D_METADATA
     images = numbered([*(folder / "rgb").glob("*.jpg"), *(folder / "rgb").glob("*.png")])
     size, intrinsics, poses = _record3d_metadata(file)
-    if not images or len(images) > len(poses):
-        raise SceneError(
-            f"{folder} has {len(images)} images in rgb/ and {len(poses)} poses in {RECORD3D_METADATA}; expected at "
-            "least one image and a pose for each: export the recording again"
-        )
+    _require_poses(images, poses, str(file))
     frames = []
     for index, image in enumerate(images):
         lens = _Lens(size, *intrinsics[min(index, len(intrinsics) - 1)].tolist())
-        depth_file = find_depth(folder, image.stem)
-        depth = _Depth(depth_file, lens) if depth_file else None
-        frames.append(_Frame(f"rgb/{image.name}", _arkit_pose(poses[index]), f"{file}, pose {index}", lens, depth))
+        pose, source = _arkit_pose(poses[index]), f"{file}, pose {index}"
+        frames.append(_Frame(f"rgb/{image.name}", pose, source, lens, find_depth(folder, image.stem), lens))
     return _posed_frames(frames)
 
 
 def _record3d_metadata(file: Path) -> tuple[tuple[int, int], NDArray[np.float64], NDArray[np.float64]]:
     """(width, height), intrinsics (1 or frames, 4), poses (frames, 7)."""
+    content = read_json(file)
     try:
-        content: Any = json.loads(file.read_text(encoding="utf-8"))
         size = int(content["w"]), int(content["h"])
         poses = np.array(content["poses"], np.float64)
         matrix = np.array(content["K"], np.float64).reshape(3, 3).T
         per_frame = content.get("perFrameIntrinsicCoeffs")
         shared = [[matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]]]
         intrinsics = np.array(per_frame or shared, np.float64)
-    except (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError) as error:
+    except (ValueError, TypeError, KeyError, AttributeError, OverflowError) as error:
         raise SceneError(
             f"{file} is not Record3D's metadata with w, h, K and poses ({error!s:.80}): export it again"
         ) from None

@@ -12,7 +12,6 @@ from types import SimpleNamespace
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from og_pointcloud.errors import SceneError
 
@@ -34,16 +33,18 @@ class MessageFactory(Protocol):
 
 
 def plain_messages(type_name: str, /, **fields: Any) -> Any:
-    """Objects with the message's fields and no type; they need neither ROS nor rosbags."""
-    return SimpleNamespace(**fields)
+    """Plain objects with the message's fields, of a class with its name; they need neither ROS nor rosbags."""
+    return type(type_name.rpartition("/")[2], (SimpleNamespace,), {})(**fields)
 
 
 def ros_messages(type_name: str, /, **fields: Any) -> Any:
     """The message types of a ROS 2 installation, which are imported here and only here."""
     package, _, name = type_name.partition("/msg/")
     kind = getattr(importlib.import_module(f"{package}.msg"), name)
-    # An array of bytes is taken over as it is; anything else is checked byte by byte.
-    return kind(**{key: _byte_array(value) if _is_bytes(value) else value for key, value in fields.items()})
+    # An array.array of bytes is taken over as it is; anything else is checked byte by byte.
+    return kind(
+        **{key: array.array("B", value.tobytes()) if _is_bytes(value) else value for key, value in fields.items()}
+    )
 
 
 def header(messages: MessageFactory, frame_id: str, stamp: Any) -> Any:
@@ -68,9 +69,3 @@ def nanoseconds(stamp: Any) -> int:
 
 def _is_bytes(value: Any) -> bool:
     return isinstance(value, np.ndarray) and value.dtype == np.uint8
-
-
-def _byte_array(value: NDArray[np.uint8]) -> array.array[int]:
-    data = array.array("B")
-    data.frombytes(np.ascontiguousarray(value).data)
-    return data

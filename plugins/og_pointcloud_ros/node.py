@@ -1,6 +1,6 @@
 """The ROS 2 node: clouds in, labelled clouds and detections out. The only module that needs ROS.
 
-Subscribes ~/input/points (sensor_msgs/PointCloud2, best effort, the newest alone) and ~/set_labels (std_msgs/String).
+Subscribes ~/input/points (sensor_msgs/PointCloud2, best effort, the newest alone).
 Publishes ~/output/points, ~/output/detections and, latched, ~/label_info. A cloud is placed in the scene by tf.
 
 Work is left out rather than queued: a cloud is dropped when nobody listens, when a newer one has come, or when its
@@ -9,7 +9,6 @@ transform does not come in time. No message ends the node: what it cannot use is
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Sequence
 from typing import Any
@@ -21,7 +20,6 @@ import rclpy.logging  # pyright: ignore[reportMissingImports]
 from numpy.typing import NDArray
 from rcl_interfaces.msg import SetParametersResult  # pyright: ignore[reportMissingImports]
 from rclpy.node import Node  # pyright: ignore[reportMissingImports]
-from rclpy.parameter import Parameter  # pyright: ignore[reportMissingImports]
 from rclpy.qos import (  # pyright: ignore[reportMissingImports]
     QoSDurabilityPolicy,
     QoSHistoryPolicy,
@@ -30,7 +28,6 @@ from rclpy.qos import (  # pyright: ignore[reportMissingImports]
 )
 from rclpy.time import Time  # pyright: ignore[reportMissingImports]
 from sensor_msgs.msg import PointCloud2  # pyright: ignore[reportMissingImports]
-from std_msgs.msg import String  # pyright: ignore[reportMissingImports]
 from tf2_ros import Buffer, TransformException, TransformListener  # pyright: ignore[reportMissingImports]
 from vision_msgs.msg import Detection3DArray, LabelInfo  # pyright: ignore[reportMissingImports]
 
@@ -85,7 +82,6 @@ class SegmentNode(Node):
         self._transforms = Buffer()
         self._listener = TransformListener(self._transforms, self)
         self.create_subscription(PointCloud2, "~/input/points", self._on_cloud, _latest(best_effort))
-        self.create_subscription(String, "~/set_labels", self._on_labels, 10)
         self.create_timer(RETRY_S, self._work)
 
     def _load(self) -> LabelledScene:
@@ -112,19 +108,6 @@ class SegmentNode(Node):
         stamp = self.get_clock().now().to_msg()
         self._info.publish(to_label_info(names, self._target_frame, stamp, messages=ros_messages))
         self.get_logger().info(f"{len(names)} labels: {', '.join(names)}")
-
-    def _on_labels(self, message: Any) -> None:
-        """A JSON list of words, or words with commas between them; the same as setting the parameter."""
-        try:
-            labels = json.loads(message.data)
-        except ValueError:
-            labels = message.data.split(",")
-        if not (isinstance(labels, list) and labels and all(isinstance(label, str) for label in labels)):
-            self.get_logger().error(f"set_labels got {message.data!r}; expected words like: chair, table")
-            return
-        result = self.set_parameters([Parameter("labels", value=[label.strip() for label in labels])])[0]
-        if not result.successful:
-            self.get_logger().error(f"the labels stay as they are: {result.reason}")
 
     def _on_parameters(self, parameters: Sequence[Any]) -> Any:
         """Refuses what cannot be used, with the reason, before it is set."""
