@@ -13,18 +13,29 @@ Field numbers are those of onnx.proto3; the file is walked over, not copied.
 
 from __future__ import annotations
 
+import json
 import math
 import os
 import re
-from collections.abc import Iterator
+import zlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from og_pointcloud.errors import OgPointcloudError
 
 if TYPE_CHECKING:
     from onnxruntime import InferenceSession
 
-__all__ = ["MODEL_NAME", "check_graph", "fetched_model", "hub_cache", "message_fields", "open_session"]
+__all__ = [
+    "MODEL_NAME", "EncoderFormat", "check_graph", "fetched_model", "hub_cache", "message_fields", "open_session",
+]  # fmt: skip
 
+MANIFEST = "manifest.json"
 MODEL_NAME = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*", re.ASCII)
 REVISION = re.compile(r"[0-9a-f]{40}")
 ERRORS_ONLY = 3
@@ -64,6 +75,101 @@ def open_session(model: bytes) -> InferenceSession:
     options.log_severity_level = ERRORS_ONLY
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     return onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
+
+
+@dataclass(frozen=True)
+class EncoderFormat:
+    """A kind of folder that ``og-pointcloud export`` writes; it may come from a stranger.
+
+    name, version: ``format`` and ``schema_version`` of its manifest.json. files: theirs, and the bytes that each may
+    have. graph: which of them is the ONNX graph, and operators, all that it is made of. optional: a file that may be
+    absent. command: what makes such a folder.
+    """
+
+    name: str
+    version: int
+    files: Mapping[str, int]
+    graph: str
+    operators: frozenset[str]
+    command: str
+    optional: str = ""
+
+    @property
+    def remake(self) -> str:
+        """The cure that errors end in."""
+        return f"make the encoder again with {self.command}"
+
+    def read(self, folder: Path) -> dict[str, bytes]:
+        """The bytes of a folder's files, unchecked but for their size; OgPointcloudError where one is missing."""
+        present = [name for name in self.files if name != self.optional or (folder / name).is_file()]
+        return {name: self._bounded(folder / name) for name in present}
+
+    def _bounded(self, path: Path) -> bytes:
+        most = self.files[path.name]
+        try:
+            with path.open("rb") as file:
+                size = os.fstat(file.fileno()).st_size
+                if size <= most:
+                    return file.read(size)  # not the bound, which it would allocate
+        except FileNotFoundError:
+            raise OgPointcloudError(f"{path} is missing: {self.remake}") from None
+        raise OgPointcloudError(f"{path} has {size}, more than {most} bytes: {self.remake}")
+
+    def checked(self, files: Mapping[str, bytes], where: str, take: Callable[[dict[str, Any]], None]) -> dict[str, Any]:
+        """The manifest, if all fits together. take: reads its other fields; its KeyError, TypeError and ValueError say
+        what is wrong. OgPointcloudError begins with ``where``."""
+        try:
+            for name, data in files.items():
+                if len(data) > self.files[name]:
+                    raise ValueError(f"{name} has {len(data)} bytes; expected at most {self.files[name]}")
+            manifest = json.loads(files[MANIFEST])
+            found = manifest["format"], manifest["schema_version"]
+            if found != (self.name, self.version):
+                raise ValueError(f"its format is {found!r:.60}; expected {self.name!r} {self.version}")
+            needed = {*self.files} - {self.optional}
+            for name in sorted((needed | {*files, *manifest["files"]}) - {MANIFEST}):
+                # Not the sha256 beside it: eight times as slow, and it proves no more to one who trusts neither.
+                if manifest["files"][name]["crc32"] != zlib.crc32(files[name]):
+                    raise ValueError(f"{name} has not the manifest's checksum: it is damaged or was changed")
+            check_graph(files[self.graph], self.operators)
+            take(manifest)
+        except KeyError as error:
+            raise OgPointcloudError(f"{where}: {error} is missing: {self.remake}") from None
+        except (ValueError, TypeError, AttributeError, RecursionError) as error:
+            raise OgPointcloudError(f"{where}: not an encoder that can be used ({error}): {self.remake}") from None
+        return manifest
+
+    def feature_space(self, folder: Path) -> str | None:
+        """What a folder's manifest says, None where there is none or it cannot be read: others may lie here too."""
+        try:
+            manifest = json.loads(self._bounded(folder / MANIFEST))
+        except (OgPointcloudError, OSError, ValueError, RecursionError):
+            return None
+        ours = isinstance(manifest, dict) and manifest.get("format") == self.name
+        return manifest.get("feature_space") if ours else None
+
+    def find(self, feature_space: str, folders: Sequence[Path]) -> Path | None:
+        """The first encoder of a feature space among folders that may be one, or hold some."""
+        for folder in folders:
+            inside = sorted(path for path in folder.iterdir() if path.is_dir()) if folder.is_dir() else []
+            for candidate in (folder, *inside):
+                if self.feature_space(candidate) == feature_space:
+                    return candidate
+        return None
+
+    def vectors(self, session: InferenceSession, given: NDArray[Any], width: int, where: str) -> NDArray[np.float32]:
+        """(B, width) float32: what the graph makes of its one input (B, ...). OgPointcloudError where it does not."""
+        try:
+            vectors = np.asarray(session.run(None, {session.get_inputs()[0].name: given})[0])
+        except Exception as error:  # onnxruntime raises types of its own
+            reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
+            raise OgPointcloudError(f"{where}: {self.graph} does not run ({reason:.200}): {self.remake}") from None
+        if vectors.dtype != np.float32 or vectors.shape != (len(given), width) or not np.isfinite(vectors).all():
+            raise OgPointcloudError(
+                f"{where}: {self.graph} gives {vectors.dtype} {vectors.shape} or NaN; expected finite float32 "
+                f"({len(given)}, {width}): {self.remake}"
+            )
+        return vectors
 
 
 def check_graph(model: bytes, operators: frozenset[str] | None = None) -> None:

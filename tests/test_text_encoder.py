@@ -68,7 +68,7 @@ def test_names_are_put_into_templates_and_averaged(encoder):
 def test_a_text_is_encoded_once(encoder, monkeypatch):
     first = encoder.encode(["cat", "low", "cat"])
     assert (first[0] == first[2]).all()
-    monkeypatch.setattr(encoder, "_run", None)
+    monkeypatch.setitem(encoder.__dict__, "_session", None)
     assert (encoder.encode(["low", "cat"]) == first[[1, 0]]).all()
     monkeypatch.setattr("og_pointcloud.text.encoder.VECTORS_REMEMBERED", 1)
     encoder.encode(["cat"])
@@ -107,8 +107,8 @@ def altered(folder, out, change=None, **files):
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        (lambda m: m.update(format="zip"), "format 'zip'; expected 'og-text-encoder'"),
-        (lambda m: m.update(schema_version=2), "schema_version is 2"),
+        (lambda m: m.update(format="zip"), "format is .'zip', 1.; expected 'og-text-encoder' 1"),
+        (lambda m: m.update(schema_version=2), "expected 'og-text-encoder' 1"),
         (lambda m: m.update(width=0), "width is 0"),
         (lambda m: m.update(width=True), "width is True"),
         (lambda m: m.update(width=OUT + 1), r"word_bank.npy cannot be used \(it is <f2 .*expected <f2 \(B, 25\)"),
@@ -123,7 +123,7 @@ def altered(folder, out, change=None, **files):
         (lambda m: m.update(feature_space=None), "feature_space None"),
         (lambda m: m.pop("files"), "'files' is missing"),
         (lambda m: m["files"]["tokenizer.json"].update(crc32=0), "checksum"),
-        (lambda m: m.update(files=[]), "not a text encoder"),
+        (lambda m: m.update(files=[]), "not an encoder"),
     ],
 )
 def test_manifests_that_do_not_fit(encoder_folder, tmp_path, change, says):

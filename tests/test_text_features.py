@@ -46,7 +46,7 @@ def test_a_file_that_names_no_space_is_unknown(tmp_path):
     [
         ({"names": None}, "lacks 'names'"),
         ({"vectors": None}, "lacks 'vectors'"),
-        ({"names": np.array(["a", "a"])}, "'a' comes twice"),
+        ({"names": np.array(["a", "a"])}, "'a' is given twice"),
         ({"names": np.array(["a", " "])}, "row 1 has an empty name"),
         ({"names": np.array([1, 2])}, "names are int64"),
         ({"names": np.array(["a"])}, r"vectors are float64 \(2, 3\); expected floats of shape \(1, D\)"),

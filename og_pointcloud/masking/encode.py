@@ -14,10 +14,8 @@ A folder is checked before it is run, since it may come from a stranger: nothing
 
 from __future__ import annotations
 
-import json
 import os
-import zlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
@@ -28,7 +26,7 @@ from numpy.typing import NDArray
 from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError, SceneError
 from og_pointcloud.masking.contracts import MaskEncoder
 from og_pointcloud.masking.crops import CROP_STYLES, WITH_CONTEXT, Crop, Preprocessing, mask_crops
-from og_pointcloud.models import check_graph, fetched_model, open_session
+from og_pointcloud.models import EncoderFormat, fetched_model, open_session
 from og_pointcloud.text.encoder import MODELS_VARIABLE, model_folders
 
 if TYPE_CHECKING:
@@ -53,7 +51,7 @@ OPERATORS = frozenset({
     "Split", "Squeeze", "Tanh", "Tile", "Transpose", "Unsqueeze", "Where",
 })  # fmt: skip
 """All that an encoder's graph is made of: arithmetic without loops, random numbers, or graphs inside nodes."""
-REMAKE = "make the encoder again with og-pointcloud export image"
+ENCODER = EncoderFormat(FORMAT, SCHEMA_VERSION, ENCODER_FILES, GRAPH, OPERATORS, "og-pointcloud export image")
 CROPS_PER_RUN = 16
 """Bounds memory: a run of a large model holds some 100 MB a crop."""
 
@@ -103,10 +101,9 @@ def _open_model(name: str | os.PathLike[str], feature_space: str | None) -> Imag
         return OnnxModel(DEMO_FOLDER / "image")
     path = Path(name).expanduser()
     if path.exists():
-        return OnnxModel(path) if _space_of(path) is not None else _transformers_model(path, feature_space)
-    for folder in _image_encoders():
-        if _space_of(folder) == str(name):
-            return OnnxModel(folder)
+        return OnnxModel(path) if ENCODER.feature_space(path) is not None else _transformers_model(path, feature_space)
+    if exported := ENCODER.find(str(name), model_folders()):
+        return OnnxModel(exported)
     if fetched := fetched_model(str(name)):
         return _transformers_model(fetched, feature_space or str(name))
     named = os.environ.get(MODELS_VARIABLE)
@@ -121,22 +118,6 @@ def _transformers_model(folder: Path, feature_space: str | None) -> ImageModel:
     from og_pointcloud.masking.clip import TransformersModel  # torch
 
     return TransformersModel(folder, feature_space)
-
-
-def _image_encoders() -> Iterator[Path]:
-    for folder in model_folders():
-        if folder.is_dir():
-            yield folder
-            yield from sorted(path for path in folder.iterdir() if path.is_dir())
-
-
-def _space_of(folder: Path) -> str | None:
-    """The feature space of a folder with an image encoder; None for any other folder."""
-    try:
-        manifest = json.loads(_read_bounded(folder / MANIFEST, ENCODER_FILES[MANIFEST]))
-    except (OgPointcloudError, OSError, ValueError, RecursionError):
-        return None
-    return manifest.get("feature_space") if isinstance(manifest, dict) and manifest.get("format") == FORMAT else None
 
 
 class CropEncoder(MaskEncoder):
@@ -174,63 +155,25 @@ class OnnxModel:
     def __init__(self, folder: str | os.PathLike[str]) -> None:
         """folder: what ``og-pointcloud export image`` wrote; OgPointcloudError where it is damaged or another's."""
         self.where = str(folder)
-        files = {name: _read_bounded(Path(folder) / name, most) for name, most in ENCODER_FILES.items()}
-        try:
-            manifest = _checked_manifest(files)
-            self.feature_space: str = manifest["feature_space"]
-            self.width: int = manifest["width"]
-            self.preprocessing = Preprocessing.from_manifest(manifest["preprocessing"])
-            self.crops = tuple(Crop(**entry) for entry in manifest["crops"])
-        except KeyError as error:
-            raise OgPointcloudError(f"{folder}: {error} is missing in {MANIFEST}: {REMAKE}") from None
-        except (ValueError, TypeError, AttributeError, RecursionError) as error:
-            raise OgPointcloudError(f"{folder}: not an image encoder that can be used ({error}): {REMAKE}") from None
-        self.manifest = manifest
+        files = ENCODER.read(Path(folder))
+        self.manifest = ENCODER.checked(files, self.where, self._take)
         self._graph = files[GRAPH]
+
+    def _take(self, manifest: dict[str, Any]) -> None:
+        width, space, crops = manifest["width"], manifest["feature_space"], manifest["crops"]
+        if type(width) is not int or not 1 <= width < 1 << 24 or not isinstance(space, str):
+            raise ValueError(f"width {width!r:.40} or feature_space {space!r:.60}; expected a whole number and a name")
+        if not isinstance(crops, list) or not crops:
+            raise ValueError(f"crops are {crops!r:.60}; expected a list of at least one")
+        self.feature_space: str = space
+        self.width: int = width
+        self.preprocessing = Preprocessing.from_manifest(manifest["preprocessing"])
+        self.crops = tuple(Crop(**entry) for entry in crops)
 
     def __call__(self, pixels: NDArray[np.float32]) -> NDArray[np.float32]:
         """(B, width) float32 unit rows of pixels (B, 3, S, S)."""
-        try:
-            vectors = np.asarray(self._session.run(["image"], {"pixels": pixels})[0])
-        except Exception as error:  # onnxruntime raises types of its own
-            reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
-            raise OgPointcloudError(f"{self.where}: {GRAPH} does not run ({reason:.200}): {REMAKE}") from None
-        if vectors.dtype != np.float32 or vectors.shape != (len(pixels), self.width) or not np.isfinite(vectors).all():
-            raise OgPointcloudError(
-                f"{self.where}: {GRAPH} gives {vectors.dtype} {vectors.shape} or NaN; expected finite float32 "
-                f"({len(pixels)}, {self.width}): {REMAKE}"
-            )
-        return vectors
+        return ENCODER.vectors(self._session, pixels, self.width, self.where)
 
     @cached_property
     def _session(self) -> InferenceSession:
         return open_session(self._graph)
-
-
-def _read_bounded(path: Path, most: int) -> bytes:
-    try:
-        with path.open("rb") as file:
-            data = file.read(most + 1)
-    except FileNotFoundError:
-        raise OgPointcloudError(f"{path} is missing: {REMAKE}") from None
-    if len(data) > most:
-        raise OgPointcloudError(f"{path} has more than {most} bytes: {REMAKE}")
-    return data
-
-
-def _checked_manifest(files: Mapping[str, bytes]) -> dict[str, Any]:
-    manifest = json.loads(files[MANIFEST])
-    if manifest["format"] != FORMAT or manifest["schema_version"] != SCHEMA_VERSION:
-        raise ValueError(
-            f"its manifest says {manifest['format']!r:.40} {manifest['schema_version']!r:.20}; expected {FORMAT!r} "
-            f"{SCHEMA_VERSION}"
-        )
-    width, space = manifest["width"], manifest["feature_space"]
-    if not isinstance(width, int) or isinstance(width, bool) or not 1 <= width < 1 << 24 or not isinstance(space, str):
-        raise ValueError(f"width {width!r:.40} or feature_space {space!r:.60}; expected a whole number and a name")
-    if not isinstance(manifest["crops"], list) or not manifest["crops"]:
-        raise ValueError(f"crops are {manifest['crops']!r:.60}; expected a list of at least one")
-    if manifest["files"][GRAPH]["crc32"] != zlib.crc32(files[GRAPH]):
-        raise ValueError(f"{GRAPH} has not the manifest's checksum: it is damaged or was changed")
-    check_graph(files[GRAPH], OPERATORS)
-    return manifest

@@ -14,14 +14,10 @@ before it is run: it may come from a stranger.
 
 from __future__ import annotations
 
-import json
 import os
 import sys
-import threading
-import zlib
-from collections import OrderedDict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -31,7 +27,7 @@ from numpy.typing import NDArray
 from og_pointcloud.cloud import WordBank
 from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError
 from og_pointcloud.formats.npy import array_from_npy
-from og_pointcloud.models import MODEL_NAME, check_graph
+from og_pointcloud.models import MODEL_NAME, EncoderFormat, open_session
 from og_pointcloud.text.tokenizer import open_tokenizer
 
 if TYPE_CHECKING:
@@ -62,13 +58,15 @@ DEMO_ENCODER = Path(__file__).parents[1] / "masking" / "demo_encoder"
 CarriedEncoder: TypeAlias = "Callable[[], TextEncoder | None]"
 TEXTS_PER_RUN = 64
 VECTORS_REMEMBERED = 1 << 14
-REMAKE = "make the encoder again with og-pointcloud export text"
+ENCODER = EncoderFormat(
+    FORMAT, SCHEMA_VERSION, ENCODER_FILES, GRAPH, OPERATORS, "og-pointcloud export text", optional=WORD_BANK
+)
 
 
 class TextEncoder:
     """Encodes words; make one with ``read_text_encoder`` or ``encoder_for``. Safe to share by threads.
 
-    The vectors of the last 16,384 texts are remembered: a label that is asked again costs a look-up.
+    The vectors of 16,384 texts are remembered: a label that is asked again costs a look-up.
     """
 
     def __init__(self, files: Mapping[str, bytes], where: str) -> None:
@@ -77,7 +75,7 @@ class TextEncoder:
         ``word_bank``: everyday words as this encoder has them, None for one that was made without.
         """
         self.where = where
-        self.manifest = _checked_manifest(files, where)
+        self.manifest = ENCODER.checked(files, where, _check_fields)
         self.feature_space: str = self.manifest["feature_space"]
         self.width: int = self.manifest["width"]
         self.context_length: int = self.manifest["context_length"]
@@ -85,18 +83,16 @@ class TextEncoder:
         self.precision: str = self.manifest["precision"]
         self.word_bank = _word_bank(files[WORD_BANK], self.width, where) if WORD_BANK in files else None
         self._graph = files[GRAPH]
-        self._session: InferenceSession | None = None
         try:
             self._tokenizer = open_tokenizer(files[TOKENIZER], self.context_length)
         except ValueError as error:
-            raise OgPointcloudError(f"{where}: {TOKENIZER} cannot be used ({error}): {REMAKE}") from None
+            raise OgPointcloudError(f"{where}: {TOKENIZER} cannot be used ({error}): {ENCODER.remake}") from None
         if self._tokenizer.highest_id >= self.manifest["vocabulary"]:
             raise OgPointcloudError(
                 f"{where}: {TOKENIZER} gives ids up to {self._tokenizer.highest_id}, the encoder has "
-                f"{self.manifest['vocabulary']} tokens: they do not belong together; {REMAKE}"
+                f"{self.manifest['vocabulary']} tokens: they do not belong together; {ENCODER.remake}"
             )
-        self._remembered: OrderedDict[str, NDArray[np.float32]] = OrderedDict()
-        self._lock = threading.Lock()
+        self._remembered: dict[str, NDArray[np.float32]] = {}
 
     def __call__(self, names: Sequence[str], templates: Sequence[str] | None = None) -> NDArray[np.float32]:
         """(len(names), D) float32, unit rows: each name put into every template, the mean of their vectors.
@@ -112,18 +108,13 @@ class TextEncoder:
 
     def encode(self, texts: Sequence[str]) -> NDArray[np.float32]:
         """(len(texts), D) float32, unit rows: the texts as they stand."""
-        with self._lock:
-            found = {text: self._remembered[text] for text in texts if text in self._remembered}
-        missing = list(dict.fromkeys(text for text in texts if text not in found))
+        remembered = self._remembered if len(self._remembered) < VECTORS_REMEMBERED else {}
+        missing = [text for text in dict.fromkeys(texts) if text not in remembered]
         for batch, tokens in self._batches(missing):
-            found |= dict(zip(batch, self._run(tokens), strict=True))
-        with self._lock:
-            for text in dict.fromkeys(texts):
-                self._remembered[text] = found[text]
-                self._remembered.move_to_end(text)
-            while len(self._remembered) > VECTORS_REMEMBERED:
-                self._remembered.popitem(last=False)
-        return np.array([found[text] for text in texts], np.float32).reshape(len(texts), self.width)
+            vectors = ENCODER.vectors(self._session, tokens, self.width, self.where)
+            remembered.update(zip(batch, vectors, strict=True))
+        self._remembered = remembered  # another thread's is never emptied, only replaced
+        return np.array([remembered[text] for text in texts], np.float32).reshape(len(texts), self.width)
 
     def tokens(self, text: str) -> list[int]:
         """Token ids of a text as the encoder is given them: cut to the context, padded only where it must be."""
@@ -146,25 +137,9 @@ class TextEncoder:
                 batch = group[start : start + size]
                 yield [text for text, _ in batch], np.array([tokens for _, tokens in batch], np.int64)
 
-    def _run(self, tokens: NDArray[np.int64]) -> NDArray[np.float32]:
-        try:
-            vectors = np.asarray(self._open_session().run(["text"], {"tokens": tokens})[0])
-        except Exception as error:  # onnxruntime raises types of its own
-            raise OgPointcloudError(f"{self.where}: {GRAPH} does not run ({_first_line(error)}): {REMAKE}") from None
-        if vectors.dtype != np.float32 or vectors.shape != (len(tokens), self.width) or not np.isfinite(vectors).all():
-            raise OgPointcloudError(
-                f"{self.where}: {GRAPH} gives {vectors.dtype} {vectors.shape} or NaN; expected finite float32 "
-                f"({len(tokens)}, {self.width}): {REMAKE}"
-            )
-        return vectors
-
-    def _open_session(self) -> InferenceSession:
-        with self._lock:
-            if self._session is None:
-                from og_pointcloud.models import open_session
-
-                self._session, self._graph = open_session(self._graph), b""  # the session has its own copy
-            return self._session
+    @cached_property
+    def _session(self) -> InferenceSession:
+        return open_session(self._graph)
 
 
 def read_text_encoder(folder: str | os.PathLike[str]) -> TextEncoder:
@@ -186,8 +161,7 @@ def _read_once(folder: Path, _state: tuple[tuple[int, int], ...]) -> TextEncoder
 
 def encoder_files(folder: Path) -> dict[str, bytes]:
     """The bytes of an encoder's files, unchecked but for their size; OgPointcloudError where one is missing."""
-    present = [name for name in ENCODER_FILES if name != WORD_BANK or (folder / name).is_file()]
-    return {name: _read_bounded(folder / name, ENCODER_FILES[name]) for name in present}
+    return ENCODER.read(folder)
 
 
 def encoder_for(feature_space: str, carried: CarriedEncoder | None = None) -> TextEncoder:
@@ -210,12 +184,8 @@ def find_encoder(feature_space: str, carried: CarriedEncoder | None = None) -> T
     """
     if carried is not None and (encoder := carried()):
         return encoder
-    for folder in model_folders():
-        candidates = [folder, *sorted(path for path in folder.iterdir() if path.is_dir())] if folder.is_dir() else []
-        for candidate in candidates:
-            if _feature_space_of(candidate) == feature_space:
-                return read_text_encoder(candidate)
-    return None
+    folder = ENCODER.find(feature_space, model_folders())
+    return read_text_encoder(folder) if folder else None
 
 
 def export_command(feature_space: str) -> str:
@@ -253,53 +223,7 @@ def model_folders() -> list[Path]:
     return [*(Path(folder).expanduser() for folder in named if folder), cache_folder(), DEMO_ENCODER]
 
 
-def _feature_space_of(folder: Path) -> str | None:
-    """What a folder's manifest says, None where there is none or it cannot be read: others may lie here too."""
-    try:
-        manifest = json.loads(_read_bounded(folder / MANIFEST, ENCODER_FILES[MANIFEST]))
-    except (OgPointcloudError, OSError, ValueError, RecursionError):
-        return None
-    return manifest.get("feature_space") if isinstance(manifest, dict) and manifest.get("format") == FORMAT else None
-
-
-def _read_bounded(path: Path, most: int) -> bytes:
-    try:
-        with path.open("rb") as file:
-            size = os.fstat(file.fileno()).st_size
-            if size <= most:
-                return file.read(size)  # not the bound, which it would allocate
-    except FileNotFoundError:
-        raise OgPointcloudError(f"{path} is missing: {REMAKE}") from None
-    raise OgPointcloudError(
-        f"{path} has {size}, more than {most} bytes: it is not what og-pointcloud export text writes"
-    )
-
-
-def _checked_manifest(files: Mapping[str, bytes], where: str) -> dict[str, Any]:
-    try:
-        for name, data in files.items():
-            if len(data) > ENCODER_FILES[name]:
-                raise ValueError(f"{name} has {len(data)} bytes; expected at most {ENCODER_FILES[name]}")
-        manifest = json.loads(files[MANIFEST])
-        _check_fields(manifest)
-        for name in sorted({GRAPH, TOKENIZER, *files, *manifest["files"]} - {MANIFEST}):
-            # Not the sha256 beside it: that takes eight times as long, and proves no more to one who trusts neither.
-            if manifest["files"][name]["crc32"] != zlib.crc32(files[name]):
-                raise ValueError(f"{name} has not the manifest's checksum: it is damaged or was changed")
-        check_graph(files[GRAPH], OPERATORS)
-    except KeyError as error:
-        raise OgPointcloudError(f"{where}: {error} is missing: {REMAKE}") from None
-    except (ValueError, TypeError, AttributeError, RecursionError) as error:
-        raise OgPointcloudError(f"{where}: not a text encoder that can be used ({error}): {REMAKE}") from None
-    return manifest
-
-
 def _check_fields(manifest: dict[str, Any]) -> None:
-    if manifest["format"] != FORMAT:
-        raise ValueError(f"its manifest says format {manifest['format']!r:.40}; expected {FORMAT!r}")
-    schema = manifest["schema_version"]
-    if schema != SCHEMA_VERSION:
-        raise ValueError(f"schema_version is {schema!r:.20}; this library reads {SCHEMA_VERSION}")
     for name, least in (("width", 1), ("context_length", 3), ("vocabulary", 1)):
         value = manifest[name]
         if not isinstance(value, int) or isinstance(value, bool) or not least <= value < 1 << 24:
@@ -321,8 +245,4 @@ def _word_bank(data: bytes, width: int, where: str) -> WordBank:
             raise ValueError(f"it is {vectors.dtype.str} {vectors.shape}; expected <f2 (B, {width})")
         return WordBank(vectors)
     except (ValueError, FeatureSpaceError) as error:
-        raise OgPointcloudError(f"{where}: {WORD_BANK} cannot be used ({error}): {REMAKE}") from None
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error).strip().splitlines() or [type(error).__name__])[0][:200]
+        raise OgPointcloudError(f"{where}: {WORD_BANK} cannot be used ({error}): {ENCODER.remake}") from None

@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 import zipfile
 import zlib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.cloud import UNKNOWN_SPACE, Vocabulary
-from og_pointcloud.errors import FeatureSpaceError
+from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError
 from og_pointcloud.formats.npy import array_from_zip
 
-__all__ = ["MAX_UNPACKED_BYTES", "read_text_features"]
+__all__ = ["MAX_UNPACKED_BYTES", "checked_vocabulary", "read_text_features"]
 
 MAX_UNPACKED_BYTES = 1 << 30
 
@@ -56,7 +57,10 @@ def read_text_features(path: str | os.PathLike[str]) -> tuple[Vocabulary, str]:
             f"{path}: vectors are {vectors.dtype} {vectors.shape}; expected floats of shape ({len(names)}, D), one row "
             "a name, and at least one"
         )
-    vocabulary = Vocabulary(tuple(names.tolist()), _checked(path, names.tolist(), vectors))
+    try:
+        vocabulary = checked_vocabulary(names.tolist(), vectors)
+    except OgPointcloudError as error:
+        raise FeatureSpaceError(f"{path}: {error}") from None
     return vocabulary, str(entries.get("feature_space", UNKNOWN_SPACE))
 
 
@@ -75,19 +79,20 @@ def _entries(path: Path) -> dict[str, NDArray[Any]]:
         ) from None
 
 
-def _checked(path: Path, names: list[str], vectors: NDArray[np.floating]) -> NDArray[np.float32]:
+def checked_vocabulary(names: Sequence[str], vectors: NDArray[Any]) -> Vocabulary:
+    """Words with vectors (L, D) of any numbers, as float32. OgPointcloudError for an empty name and one given twice,
+    FeatureSpaceError for a vector that is zero, NaN or infinite."""
     with np.errstate(over="ignore"):
-        vectors = vectors.astype(np.float32)
+        vectors = vectors.astype(np.float32, copy=False)
     seen: set[str] = set()
     for name, vector in zip(names, vectors, strict=True):
         if name in seen:
-            raise FeatureSpaceError(f"{path}: the name '{name}' comes twice; expected unique names: remove one")
+            raise OgPointcloudError(f"the name '{name}' is given twice; expected different names: remove one")
         if not name.strip():
-            raise FeatureSpaceError(f"{path}: row {len(seen)} has an empty name; expected a word: name or remove it")
-        if not np.isfinite(vector).all() or not vector.any():
-            kind = "zero" if np.isfinite(vector).all() else "NaN or infinite"
-            raise FeatureSpaceError(
-                f"{path}: the vector of '{name}' is {kind}; expected finite numbers, not all zero: encode it again"
-            )
+            raise OgPointcloudError(f"row {len(seen)} has an empty name; expected a word: name it or remove it")
+        if not np.isfinite(vector).all():
+            raise FeatureSpaceError(f"the vector of '{name}' is NaN or infinite; expected finite numbers")
+        if not vector.any():
+            raise FeatureSpaceError(f"the vector of '{name}' is zero, which is like nothing: encode it again")
         seen.add(name)
-    return vectors
+    return Vocabulary(tuple(names), vectors)

@@ -7,12 +7,12 @@ for very long, or give other ids on another run, is refused.
 
 from __future__ import annotations
 
-import heapq
 import json
 import re
 import unicodedata
 from collections.abc import Iterator, Mapping
 from functools import lru_cache
+from itertools import pairwise
 from typing import Any, Protocol
 
 from og_pointcloud.errors import MissingExtraError, OgPointcloudError
@@ -36,7 +36,7 @@ SIGN = "[!-/:-@\\[-`{-~ ]"
 LINEAR_PATTERN = re.compile(rf"(?:\\s| |\[(?:\\{SIGN}|(?![\[\\\]]){SIGN})+\])(?:\+|\{{2,\}})?")
 """Regular expressions that no text makes slow: one character class, once or repeated."""
 MOST_CHARACTERS = 4096
-"""A longer text is cut here before ``tokenizers`` sees it; contexts hold 77 tokens or fewer."""
+"""A longer text is cut here before anything else; contexts hold 77 tokens or fewer."""
 PIECES_REMEMBERED = 1 << 14
 
 
@@ -81,7 +81,6 @@ def _is_clip(description: dict[str, Any]) -> bool:
         and model.get("end_of_word_suffix") == "</w>"
         and not any(model.get(name) for name in ("dropout", "continuing_subword_prefix", "ignore_merges"))
         and (description.get("post_processor") or {}).get("type") == "RobertaProcessing"
-        and not any(token.get("single_word") for token in description.get("added_tokens") or ())
     )
 
 
@@ -104,40 +103,22 @@ class ClipTokenizer:
         model, frame = description["model"], description["post_processor"]
         self._context_length = context_length
         self._start, self._end = _id(frame["cls"][1]), _id(frame["sep"][1])
-        # Special tokens are looked for in the text as it stands or, if "normalized", in the cleaned text.
-        tokens = description.get("added_tokens") or []
-        self._raw_specials = {token["content"]: _id(token["id"]) for token in tokens if not token.get("normalized")}
-        self._specials = {token["content"]: _id(token["id"]) for token in tokens if token.get("normalized")}
-        self._has_specials = description["pre_tokenizer"]["pretokenizers"][0]["pattern"] != {"Regex": CLIP_WORDS}
         pairs = BytePairs(model["vocab"], model["merges"])
         self._piece_ids = lru_cache(PIECES_REMEMBERED)(pairs)
-        self.highest_id = max(
-            *pairs.vocabulary.values(), *self._raw_specials.values(), *self._specials.values(), self._start, self._end
-        )
+        self.highest_id = max(*pairs.vocabulary.values(), self._start, self._end)
 
     def __call__(self, text: str) -> list[int]:
-        """See `Tokenizer`. A lone surrogate, which is no character, counts as U+FFFD."""
-        text = text.encode("utf-16", "surrogatepass").decode("utf-16", "replace")
+        """See `Tokenizer`. A lone surrogate, which is no character, counts as U+FFFD. The names of special tokens are
+        read as the letters and signs that they are."""
         ids: list[int] = []
-        for raw, special in _parts(text, self._raw_specials):
-            if special is not None:
-                ids.append(special)
-                continue
-            for part, special in _parts(_cleaned(raw), self._specials):
-                if special is not None:
-                    ids.append(special)
-                    continue
-                for word in _words(part, self._has_specials):
-                    ids += self._piece_ids("".join(BYTE_CHARACTERS[byte] for byte in word.encode()))
+        for word in _words(_cleaned(_short(text))):
+            ids += self._piece_ids("".join(BYTE_CHARACTERS[byte] for byte in word.encode()))
         return [self._start, *ids[: max(0, self._context_length - 2)], self._end]
 
 
-def _parts(text: str, special: Mapping[str, int]) -> Iterator[tuple[str, int | None]]:
-    """The text in order: ("", id) for each special token, (text, None) for what lies between."""
-    longest_first = sorted(filter(None, special), key=len, reverse=True)
-    for part in re.split(f"({'|'.join(map(re.escape, longest_first))})", text) if longest_first else [text]:
-        if part:
-            yield ("", special[part]) if part in special else (part, None)
+def _short(text: str) -> str:
+    """At most MOST_CHARACTERS, all of them characters."""
+    return text[:MOST_CHARACTERS].encode("utf-16", "surrogatepass").decode("utf-16", "replace")
 
 
 def _cleaned(text: str) -> str:
@@ -145,23 +126,17 @@ def _cleaned(text: str) -> str:
     return "".join(map(str.lower, re.sub(f"[{WHITESPACE}]+", " ", unicodedata.normalize("NFC", text))))
 
 
-def _words(text: str, has_specials: bool) -> Iterator[str]:
+def _words(text: str) -> Iterator[str]:
     """CLIP_WORDS without a library that knows \\p{L}: the text is spelled by kind, and runs are looked for in that."""
     kinds = "".join(map(_kind, text))
-    endings = re.compile((CLIP_SPECIALS if has_specials else "") + "'s|'t|'re|'ve|'m|'ll|'d")
-    runs = re.compile("L+|N|O+")
+    endings, runs = re.compile("'s|'t|'re|'ve|'m|'ll|'d"), re.compile("L+|N|O+")
     position = 0
     while position < len(text):
-        match = endings.match(text, position) or runs.match(kinds, position)
-        if match is None:  # white space
+        if match := endings.match(text, position) or runs.match(kinds, position):
+            yield text[position : match.end()]
+            position = match.end()
+        else:  # white space
             position += 1
-            continue
-        word, position = text[position : match.end()], match.end()
-        if word[0] == "<" and word[-1] == ">":
-            # A special token that came to be by lower-casing is none: its letters and signs go apart.
-            yield from re.findall("[a-z]+|[^a-z]+", word)
-        else:
-            yield word
 
 
 @lru_cache(PIECES_REMEMBERED)
@@ -188,31 +163,18 @@ class BytePairs:
             self._merges[pair] = (rank, self.vocabulary[left + right])
 
     def __call__(self, word: str) -> list[int]:
-        """Ids of a word, spelled in BYTE_CHARACTERS. A heap of pairs, so that a long word costs n log n."""
+        """Ids of a word, spelled in BYTE_CHARACTERS."""
         ids = [self.vocabulary[character] for character in word[:-1]] + [self.vocabulary[f"{word[-1]}</w>"]]
-        before, after = list(range(-1, len(ids) - 1)), list(range(1, len(ids) + 1))
-        heap: list[tuple[int, int, int, int]] = []  # rank, left position, left id, right id
-
-        def offer(left: int) -> None:
-            if left >= 0 and after[left] < len(ids):
-                pair = (ids[left], ids[after[left]])
-                if pair in self._merges:
-                    heapq.heappush(heap, (self._merges[pair][0], left, *pair))
-
-        for position in range(len(ids) - 1):
-            offer(position)
-        while heap:
-            _, left, *pair = heapq.heappop(heap)
-            right = after[left]
-            if right >= len(ids) or [ids[left], ids[right]] != pair:
-                continue  # one of the two has been joined to another since
-            ids[left], ids[right] = self._merges[pair[0], pair[1]][1], -1
-            after[left] = after[right]
-            if after[right] < len(ids):
-                before[after[right]] = left
-            offer(before[left])
-            offer(left)
-        return [id for id in ids if id >= 0]
+        while known := [(*self._merges[pair], pair) for pair in pairwise(ids) if pair in self._merges]:
+            _, joined, first_learnt = min(known)
+            merged: list[int] = []
+            position = 0
+            while position < len(ids):
+                together = tuple(ids[position : position + 2]) == first_learnt
+                merged.append(joined if together else ids[position])
+                position += 2 if together else 1
+            ids = merged
+        return ids
 
 
 def _id(value: Any) -> int:
@@ -243,7 +205,7 @@ class OtherTokenizer:
 
     def __call__(self, text: str) -> list[int]:
         """See `Tokenizer`."""
-        text = text[:MOST_CHARACTERS].encode("utf-16", "surrogatepass").decode("utf-16", "replace")
+        text = _short(text)
         try:
             return self._tokenizer.encode(text).ids
         except BaseException as error:

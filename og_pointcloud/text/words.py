@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from og_pointcloud.cloud import FeatureSpace, Vocabulary
 from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError
 from og_pointcloud.text.encoder import CarriedEncoder, encoder_for, export_command, find_encoder
-from og_pointcloud.text.text_features import read_text_features
+from og_pointcloud.text.text_features import checked_vocabulary, read_text_features
 
 __all__ = ["Labels", "TextFeatures", "resolve_labels"]
 
@@ -49,18 +49,26 @@ def resolve_labels(
             raise OgPointcloudError(
                 f"no labels are given, and the scene has no words of its own: {_ways(feature_space)}"
             )
-        return _checked(sources[0])
+        labels = sources[0]
     if isinstance(labels, Vocabulary):
-        return _checked(labels)
+        return _checked(labels.names, labels.vectors)
     if isinstance(labels, Mapping):
-        return _checked(_from_mapping(labels))
+        return _checked([str(name) for name in labels], _stacked(labels))
     words = (labels,) if isinstance(labels, str) else tuple(labels)
     for word in words:
         if not isinstance(word, str):
             raise OgPointcloudError(f"label {word!r:.60} is a {type(word).__name__}; expected words, or name -> vector")
     if templates is not None:
-        return _checked(Vocabulary(words, encoder_for(feature_space, carried)(words, templates)))
-    return _checked(_looked_up(words, sources, feature_space, carried))
+        return _checked(words, encoder_for(feature_space, carried)(words, templates))
+    return _checked(words, _looked_up(words, sources, feature_space, carried))
+
+
+def _checked(names: Sequence[str], vectors: NDArray[Any]) -> Vocabulary:
+    if not names:
+        raise OgPointcloudError(
+            "0 labels are given; expected at least one word to look for: name what you want to find"
+        )
+    return checked_vocabulary(names, vectors)
 
 
 def _ways(feature_space: str) -> str:
@@ -82,7 +90,7 @@ def _of_space(text_features: TextFeatures, feature_space: str) -> Vocabulary | N
     return vocabulary
 
 
-def _from_mapping(labels: Mapping[str, Any]) -> Vocabulary:
+def _stacked(labels: Mapping[str, Any]) -> NDArray[Any]:
     rows = []
     for name, vector in labels.items():
         row = np.asarray(vector)
@@ -92,20 +100,12 @@ def _from_mapping(labels: Mapping[str, Any]) -> Vocabulary:
                 f"{rows[0].shape if rows else '(D,)'}, one width for all labels"
             )
         rows.append(row)
-    with np.errstate(over="ignore"):
-        vectors = np.array(rows).astype(np.float32) if rows else np.zeros((0, 0), np.float32)
-    names = tuple(str(name) for name in labels)
-    return Vocabulary(names, vectors) if np.isfinite(vectors).all() else _refuse_not_finite(names, vectors)
-
-
-def _refuse_not_finite(names: tuple[str, ...], vectors: np.ndarray) -> Vocabulary:
-    name = names[int(np.argmin(np.isfinite(vectors).all(axis=1)))]
-    raise FeatureSpaceError(f"the vector of '{name}' holds NaN or infinity; expected finite numbers: encode it again")
+    return np.array(rows).reshape(len(rows), -1) if rows else np.zeros((0, 0))
 
 
 def _looked_up(
     words: tuple[str, ...], sources: list[Vocabulary], feature_space: str, carried: CarriedEncoder | None
-) -> Vocabulary:
+) -> NDArray[np.float32]:
     vectors: dict[str, np.ndarray] = {}
     for source in reversed(sources):
         vectors |= dict(zip(source.names, source.vectors, strict=True))
@@ -119,7 +119,7 @@ def _looked_up(
             f"'{missing[0]}' is not among the {len(vectors)} known words{others}{hint}: {_ways(feature_space)}"
         )
     _check_one_width(words, vectors)
-    return Vocabulary(words, np.array([vectors[word] for word in words]) if words else np.zeros((0, 0), np.float32))
+    return np.array([vectors[word] for word in words], np.float32)
 
 
 def _check_one_width(words: tuple[str, ...], vectors: Mapping[str, np.ndarray]) -> None:
@@ -137,20 +137,3 @@ def _close_matches(word: str, known: list[str]) -> str:
     by_lower = {name.lower(): name for name in known}
     close = [by_lower[match] for match in difflib.get_close_matches(word.lower(), by_lower, n=3)]
     return f"; did you mean {' or '.join(repr(name) for name in close)}? If not" if close else ""
-
-
-def _checked(vocabulary: Vocabulary) -> Vocabulary:
-    if not vocabulary.names:
-        raise OgPointcloudError(
-            "0 labels are given; expected at least one word to look for: name what you want to find"
-        )
-    seen: set[str] = set()
-    for name, vector in zip(vocabulary.names, vocabulary.vectors, strict=True):
-        if not name.strip():
-            raise OgPointcloudError(f"label {len(seen)} is an empty name; expected a word: name it or remove it")
-        if name in seen:
-            raise OgPointcloudError(f"the label '{name}' is given twice; expected different names: remove one")
-        if not vector.any():
-            raise FeatureSpaceError(f"the vector of '{name}' is zero, which is like nothing: encode it again")
-        seen.add(name)
-    return vocabulary
