@@ -90,7 +90,7 @@ def test_an_instance_without_points_has_no_place():
     assert len(table[0].main_part) == 0
     np.testing.assert_allclose(table[2].size, [1, 0, 0], atol=1e-12)
     records = list(csv.DictReader(table.to_csv().splitlines()))
-    assert [record["low_x"] for record in records] == ["", "", "0.0", ""]
+    assert [record["axis_aligned_box_low_0"] for record in records] == ["", "", "0.0", ""]
     assert "empty" in repr(table)
 
 
@@ -122,10 +122,12 @@ def test_json_and_csv_hold_the_same_numbers(scene, tmp_path):
         rows = list(csv.DictReader(file))
     assert len(rows) == len(records) == 9
     for record, row in zip(records, rows, strict=True):
-        assert [float(row[f"box_size_{k}"]) for k in range(3)] == record["oriented_box"]["size"]
-        assert [float(row[f"box_rotation_{k}"]) for k in "wxyz"] == record["oriented_box"]["rotation_wxyz"]
-        assert [float(row[f"high_{k}"]) for k in "xyz"] == record["axis_aligned_box"]["high"]
-        assert [row[f"word_{k + 1}"] for k in range(len(record["words"]))] == [word["name"] for word in record["words"]]
+        oriented, words = record["oriented_box"], record["words"]
+        assert [float(row[f"oriented_box_size_{k}"]) for k in range(3)] == oriented["size"]
+        assert [float(row[f"oriented_box_rotation_wxyz_{k}"]) for k in range(4)] == oriented["rotation_wxyz"]
+        assert float(row["oriented_box_axes_2_1"]) == oriented["axes"][2][1]
+        assert [float(row[f"axis_aligned_box_high_{k}"]) for k in range(3)] == record["axis_aligned_box"]["high"]
+        assert [row[f"words_{k}_name"] for k in range(len(words))] == [word["name"] for word in words]
     assert not list(tmp_path.glob("*.tmp"))
 
 

@@ -215,7 +215,7 @@ def test_words_are_ranked_as_segment_scores_them():
     for instance in (0, 1, 4):
         place = scene.xyz[np.argmax(scene.instance_ids == instance)]
         words = pick(scene, place).words()
-        scores = scene.instance_scores(scene.vocabulary.vectors)[instance]
+        scores = scene.cloud.instances.cosines(scene.vocabulary.vectors)[instance]
         if instance == 4:
             assert words == [], "it has no descriptor"
             continue

@@ -61,7 +61,7 @@ def test_words_compete_for_instances():
     np.testing.assert_allclose([match.rival_score for match in mug], [0, 0, 0.8], atol=1e-6)
     assert mug.instances == (0, 1)
     assert mug.point_indices.tolist() == [0, 1, 2]
-    assert mug.points_of(mug[2]).tolist() == [3, 4, 5]
+    assert np.flatnonzero(mug.scene.instance_ids == mug[2].instance).tolist() == [3, 4, 5]
     assert og.select(scene, "cup").instances == (2,)
     assert mug.unknown == 1
 

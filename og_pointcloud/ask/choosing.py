@@ -222,10 +222,7 @@ class Chooser:
         return best_of_rows(scores, np.searchsorted(self._described, self._owner), len(self._described))
 
     def _posterior(
-        self,
-        evidence: NDArray[np.floating],
-        rival: NDArray[np.floating],
-        texts: NDArray[np.float32],
+        self, evidence: NDArray[np.floating], rival: NDArray[np.floating], texts: NDArray[np.float32]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Probability of each label and of none, (described, L) and (described,), float64.
 
@@ -327,8 +324,7 @@ def _relevancy(scores: NDArray[np.floating], rivals: NDArray[np.floating]) -> ND
 def _distinct(texts: NDArray[np.float32]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """(T,) number of each text among the different ones, and (different,) where each comes first."""
     rounded = np.round(unit_rows(texts), 5) + 0.0  # -0 becomes 0
-    rows = np.ascontiguousarray(rounded).view(np.dtype((np.void, rounded.dtype.itemsize * rounded.shape[1]))).ravel()
-    _, first, number = np.unique(rows, return_index=True, return_inverse=True)
+    _, first, number = np.unique(rounded, axis=0, return_index=True, return_inverse=True)
     return number.reshape(-1), first
 
 

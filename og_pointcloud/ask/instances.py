@@ -110,23 +110,13 @@ class Instance:
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-able: everything but the points themselves; of those, how many, and how many are strays."""
+        columns = ("id", "state", "points", "views", "masks", "agreement", "visible_area", "part_of", "coarse")
         aligned, oriented = self.axis_aligned_box, self.oriented_box
-        return {
-            "id": self.id,
-            "state": self.state,
-            "points": self.points,
+        return {name: getattr(self, name) for name in columns} | {
             "strays": int((~self.main_part).sum()),
-            "views": self.views,
-            "masks": self.masks,
-            "agreement": self.agreement,
-            "visible_area": self.visible_area,
-            "part_of": self.part_of,
-            "coarse": self.coarse,
             "centroid": None if self.centroid is None else self.centroid.tolist(),
-            "axis_aligned_box": None
-            if aligned is None
-            else {"low": aligned.low.tolist(), "high": aligned.high.tolist()},
-            "oriented_box": None if oriented is None else oriented.to_dict(),
+            "axis_aligned_box": aligned and {"low": aligned.low.tolist(), "high": aligned.high.tolist()},
+            "oriented_box": oriented and oriented.to_dict(),
             "words": [{"name": name, "score": score} for name, score in self.words],
         }
 
@@ -220,7 +210,7 @@ def list_instances(
     bounds = np.searchsorted(cloud.instance_ids[order], np.arange(len(table) + 1))
     described = np.zeros(len(table), bool)
     described[table.descriptor_instance] = True
-    best = _best_words(len(table), chooser, labels, words)
+    choice = None if labels is None else chooser.choose(labels.vectors)
     return Instances(
         [
             Instance(
@@ -233,23 +223,13 @@ def list_instances(
                 part_of=int(table.part_of[k]),
                 coarse=int(table.coarse[k]),
                 state=EMPTY if bounds[k] == bounds[k + 1] else LABELLED if described[k] else NO_FEATURE,
-                words=best[k] if described[k] else (),
+                words=tuple(choice.words(k, labels.names, words)) if choice and labels else (),
                 _cloud=cloud,
                 _up=up,
             )
             for k in range(len(table))
         ]
     )
-
-
-def _best_words(
-    instances: int, chooser: Chooser, labels: Vocabulary | None, count: int
-) -> list[tuple[tuple[str, float], ...]]:
-    """Per instance the words with the highest scores, of equal ones the first given."""
-    if labels is None:
-        return [()] * instances
-    choice = chooser.choose(labels.vectors)
-    return [tuple(choice.words(k, labels.names, count)) for k in range(len(choice.labels))]
 
 
 def _cells(row: Instance) -> tuple[str, ...]:
@@ -266,24 +246,11 @@ def _cells(row: Instance) -> tuple[str, ...]:
     )
 
 
-def _flat(record: dict[str, Any]) -> dict[str, Any]:
-    """A record without nesting. Columns of places and boxes are empty where there are no points."""
-    aligned, oriented = record.pop("axis_aligned_box"), record.pop("oriented_box")
-    vectors = {
-        "centroid": (record.pop("centroid"), "xyz"),
-        "low": (aligned and aligned["low"], "xyz"),
-        "high": (aligned and aligned["high"], "xyz"),
-        "box_center": (oriented and oriented["center"], "xyz"),
-        "box_size": (oriented and oriented["size"], "012"),
-        "box_rotation": (oriented and oriented["rotation_wxyz"], "wxyz"),
-    }
-    words = record.pop("words")
-    flat = dict(record)
-    for name, (values, parts) in vectors.items():
-        flat |= {f"{name}_{part}": values[index] if values else "" for index, part in enumerate(parts)}
-    for rank, word in enumerate(words, start=1):
-        flat |= {f"word_{rank}": word["name"], f"score_{rank}": word["score"]}
-    return flat
+def _flat(value: Any, name: str = "") -> dict[str, Any]:
+    """A record without nesting: a column a number, e.g. centroid_0. What is not known has none."""
+    parts = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    flat = {column: leaf for key, part in parts for column, leaf in _flat(part, f"{name}_{key}".strip("_")).items()}
+    return flat if isinstance(value, (dict, list)) or value is None else {name: value}
 
 
 def _write(path: str | os.PathLike[str] | None, text: str) -> None:

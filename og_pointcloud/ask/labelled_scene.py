@@ -27,7 +27,7 @@ from og_pointcloud.bundle.format import BEYOND, NEAR, ON_SURFACE
 from og_pointcloud.bundle.nearest import NONE_WITHIN_REACH, NearestPoint, surface_distance
 from og_pointcloud.bundle.read import Bundle, read_bundle
 from og_pointcloud.bundle.vocabulary import carried_encoder
-from og_pointcloud.cloud import TOO_FAR, UNKNOWN_SPACE, FeatureSpace, LabelledCloud, Vocabulary
+from og_pointcloud.cloud import TOO_FAR, LabelledCloud, Vocabulary
 from og_pointcloud.errors import OgPointcloudError, SceneError
 from og_pointcloud.text.words import Labels, TextFeatures, resolve_labels
 
@@ -35,18 +35,9 @@ if TYPE_CHECKING:
     from typing_extensions import Unpack
 
 __all__ = [
-    "SCENE_VARIABLE",
-    "LabelledScene",
-    "SceneLike",
-    "SegmentOptions",
-    "Segmenter",
-    "as_scene",
-    "find_scene",
-    "instance_table",
-    "load",
-    "segment",
-    "use",
-]
+    "SCENE_VARIABLE", "LabelledScene", "SceneLike", "SegmentOptions", "Segmenter", "as_scene", "find_scene",
+    "instance_table", "load", "pose_matrix", "segment", "use",
+]  # fmt: skip
 
 SceneLike: TypeAlias = "LabelledScene | LabelledCloud | str | os.PathLike[str]"
 
@@ -128,13 +119,18 @@ class LabelledScene:
         """What tells which label fits each instance, if any; calibrated if the scene has a word bank."""
         return Chooser(self.cloud.instances, self.cloud.word_bank, feature_space=self.feature_space)
 
-    def instance_scores(self, vectors: NDArray[np.floating]) -> NDArray[np.floating]:
-        """(K, L) best cosine of an instance's descriptors with each vector, -2 for one without a descriptor.
+    def words(
+        self, labels: Labels = None, text_features: TextFeatures = None, templates: Sequence[str] | None = None
+    ) -> Vocabulary:
+        """Labels with their vectors, as ``segment`` finds them: named, in a file, in the scene's own words, encoded."""
+        encoder = carried_encoder(self.path)
+        return resolve_labels(labels, text_features, self.vocabulary, self.feature_space, encoder, templates)
 
-        vectors: (L, D) of any length. FeatureSpaceError where D is not the scene's.
-        """
-        self.cloud.space.require(FeatureSpace(UNKNOWN_SPACE, vectors.shape[1]), "label vectors")
-        return self.cloud.instances.cosines(vectors)
+    def words_or_none(self, labels: Labels = None, text_features: TextFeatures = None) -> Vocabulary | None:
+        """The same, but None where none are given and the scene has none."""
+        own = self.vocabulary
+        given = labels is not None or text_features is not None
+        return self.words(labels, text_features) if given or (own and own.names) else None
 
     def instances_at(self, points: NDArray[np.floating], *, max_distance: float | None = None) -> NDArray[np.int32]:
         """(N,) int32: instance id of the scene's point nearest to each, -1, -2, or -3 where none is within reach.
@@ -318,11 +314,10 @@ class Segmenter:
     ) -> None:
         self.scene = scene = as_scene(scene)
         scene.check_distance(max_distance)
-        known = (text_features, scene.vocabulary, scene.feature_space, carried_encoder(scene.path))
-        words, against = resolve_labels(labels, *known, templates), None
+        words, against = scene.words(labels, text_features, templates), None
         if negatives is not None:
             has_vectors = isinstance(negatives, (Mapping, Vocabulary))
-            against = resolve_labels(negatives, *known, None if has_vectors else templates).vectors
+            against = scene.words(negatives, text_features, None if has_vectors else templates).vectors
         self.names = words.names
         """The labels, in the order of their numbers."""
         self._max_distance, self._warned = max_distance, False
@@ -374,10 +369,7 @@ def instance_table(
     [(0, 2, (('chair', 1.0),)), (1, 1, (('desk', 1.0),))]
     """
     scene = as_scene(scene)
-    own, asked = scene.vocabulary, None
-    if labels is not None or text_features is not None or (own and own.names):
-        asked = resolve_labels(labels, text_features, own, scene.feature_space, carried_encoder(scene.path))
-    return list_instances(scene.cloud, scene.chooser, asked, up=up, words=words)
+    return list_instances(scene.cloud, scene.chooser, scene.words_or_none(labels, text_features), up=up, words=words)
 
 
 _scene_in_use: LabelledScene | None = None
@@ -436,18 +428,23 @@ def _scene_once(cloud: LabelledCloud) -> LabelledScene:
     return LabelledScene.from_cloud(cloud)
 
 
-def _posed(points: NDArray[np.float64], pose: ArrayLike | None) -> NDArray[np.float64]:
-    if pose is None:
-        return points
+def pose_matrix(pose: ArrayLike) -> NDArray[np.float64]:
+    """A pose (4, 4) as float64. SceneError for numbers that are not finite and a last row other than 0 0 0 1."""
     matrix = np.asarray(pose)
     if matrix.shape != (4, 4) or matrix.dtype.kind not in "fiu" or not np.isfinite(matrix).all():
         raise SceneError(f"pose is {matrix.dtype} {matrix.shape}; expected a finite 4x4 matrix, cloud to world")
-    matrix = matrix.astype(np.float64)
     if np.abs(matrix[3] - [0, 0, 0, 1]).max() > 1e-6:
         raise SceneError(
             f"the last row of pose is {matrix[3].tolist()}; expected 0 0 0 1: give the matrix whose last column is the "
             "translation (transposed, perhaps?)"
         )
+    return matrix.astype(np.float64)
+
+
+def _posed(points: NDArray[np.float64], pose: ArrayLike | None) -> NDArray[np.float64]:
+    if pose is None:
+        return points
+    matrix = pose_matrix(pose)
     with np.errstate(invalid="ignore", over="ignore"):  # rows with NaN or infinity stay such
         return points @ matrix[:3, :3].T + matrix[:3, 3]
 

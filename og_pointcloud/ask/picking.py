@@ -21,11 +21,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from og_pointcloud.ask.labelled_scene import LabelledScene, SceneLike, as_scene
-from og_pointcloud.bundle.vocabulary import carried_encoder
 from og_pointcloud.cloud import BACKGROUND, TOO_FAR, UNOBSERVED, LabelledCloud
 from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.scene import Camera
-from og_pointcloud.text.words import Labels, TextFeatures, resolve_labels
+from og_pointcloud.text.words import Labels, TextFeatures
 
 __all__ = ["Pick", "front_points", "in_world", "pick"]
 
@@ -101,11 +100,8 @@ class Pick:
         instance was hit, or as ``segment``.
         """
         self._require_instance()
-        scene = self.scene
-        words = resolve_labels(
-            labels, text_features, scene.vocabulary, scene.feature_space, carried_encoder(scene.path)
-        )
-        return scene.chooser.choose(words.vectors).words(self.instance, words.names)
+        words = self.scene.words(labels, text_features)
+        return self.scene.chooser.choose(words.vectors).words(self.instance, words.names)
 
     def __str__(self) -> str:
         if not self.found:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any, overload
 
 import numpy as np
@@ -17,10 +17,9 @@ from numpy.typing import ArrayLike, NDArray
 from og_pointcloud.ask.choosing import Choice, Reason
 from og_pointcloud.ask.instances import SHOWN
 from og_pointcloud.ask.labelled_scene import LabelledScene, SceneLike, as_scene
-from og_pointcloud.bundle.vocabulary import carried_encoder
 from og_pointcloud.cloud import NO_EVIDENCE, FeatureSpace, Vocabulary
 from og_pointcloud.errors import OgPointcloudError
-from og_pointcloud.text.words import Labels, TextFeatures, resolve_labels
+from og_pointcloud.text.words import Labels, TextFeatures
 
 __all__ = ["Match", "Selection", "select"]
 
@@ -48,11 +47,7 @@ class Match:
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-able."""
-        rival_score = None if self.rival is None else self.rival_score
-        return {
-            "instance": self.instance, "score": self.score, "fits": self.fits, "rival": self.rival,
-            "rival_score": rival_score, "points": self.points,
-        }  # fmt: skip
+        return asdict(self) | {"rival_score": None if self.rival is None else self.rival_score}
 
 
 @dataclass(frozen=True)
@@ -108,10 +103,6 @@ class Selection(Sequence[Match]):
         """(m,) the scene's points that belong to fitting instances, ascending."""
         return np.flatnonzero(np.isin(self.scene.instance_ids, self.instances))
 
-    def points_of(self, match: Match) -> NDArray[np.int64]:
-        """(m,) the scene's points that belong to one match, ascending."""
-        return np.flatnonzero(self.scene.instance_ids == match.instance)
-
     def to_json(self) -> str:
         """The query, and every match in order."""
         names = ("query", "rivals", "unknown", "calibrated")
@@ -155,7 +146,7 @@ def select(
     if not isinstance(text, str) and (not isinstance(text, Mapping) or len(text) != 1):
         shown = list(text) if isinstance(text, Mapping) else text
         raise OgPointcloudError(f"the text is {shown!r:.80}; expected one word or phrase, or one name -> vector")
-    query = resolve_labels(text, text_features, scene.vocabulary, scene.feature_space, carried_encoder(scene.path))
+    query = scene.words(text, text_features)
     rivals = _rivals(scene, query.names[0], against, text_features)
     choice = scene.chooser.choose(_together(query, rivals, scene.feature_space))
     points = np.bincount(scene.instance_ids[scene.instance_ids >= 0], minlength=len(choice.labels))
@@ -192,11 +183,9 @@ def _together(query: Vocabulary, rivals: Vocabulary | None, space: str) -> NDArr
 
 def _rivals(scene: LabelledScene, query: str, against: Labels, text_features: TextFeatures) -> Vocabulary | None:
     """The words that compete with the query, without itself; None without any."""
-    own = scene.vocabulary
-    if against is None and text_features is None and not (own and own.names):
+    none_wanted = isinstance(against, Sequence) and not len(against)
+    words = None if none_wanted else scene.words_or_none(against, text_features)
+    if words is None:
         return None
-    if isinstance(against, Sequence) and not len(against):
-        return None
-    words = resolve_labels(against, text_features, own, scene.feature_space, carried_encoder(scene.path))
     others = [index for index, name in enumerate(words.names) if name != query]
     return Vocabulary(tuple(words.names[index] for index in others), words.vectors[others]) if others else None

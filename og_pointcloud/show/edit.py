@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, TypeAlias, TypedDict
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from og_pointcloud.ask.labelled_scene import LabelledScene, SceneLike, as_scene
+from og_pointcloud.ask.labelled_scene import LabelledScene, SceneLike, as_scene, pose_matrix
 from og_pointcloud.ask.picking import Pick
 from og_pointcloud.ask.selecting import Match, Selection, select
 from og_pointcloud.bundle.nearest import NearestPoint
@@ -316,9 +316,7 @@ def _plain_rows(
 
 def _similarity(pose: ArrayLike | None) -> tuple[NDArray[np.float64], float, NDArray[np.float64]]:
     """Rotation (3, 3), scale and translation (3,) of a pose."""
-    matrix = np.eye(4) if pose is None else np.asarray(pose, np.float64)
-    if matrix.shape != (4, 4) or not np.isfinite(matrix).all() or not np.allclose(matrix[3], [0, 0, 0, 1]):
-        raise SceneError(f"pose is {matrix.tolist()!r:.120}; expected a finite (4, 4) matrix that ends in 0 0 0 1")
+    matrix = pose_matrix(np.eye(4) if pose is None else pose)
     determinant = float(np.linalg.det(matrix[:3, :3]))
     scale = np.cbrt(determinant)
     rotation = matrix[:3, :3] / (scale if scale > 0 else 1)

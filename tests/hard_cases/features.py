@@ -102,7 +102,7 @@ def width(columns: float) -> Answer:
     """Cosines of words with descriptors, of vectors stored as float16; naive: computed in float16 too."""
     descriptors = unit_rows(5, int(columns))
     text = (40 * unit_rows(20, int(columns), seed=1)).astype(np.float16)
-    ours = LabelledScene.from_cloud(labelled_cloud(descriptors=descriptors)).instance_scores(text)
+    ours = LabelledScene.from_cloud(labelled_cloud(descriptors=descriptors)).cloud.instances.cosines(text)
     return Answer(ours, _cosines(descriptors, text), lambda: naive.cosines(descriptors, text, np.float16))
 
 

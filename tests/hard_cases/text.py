@@ -24,7 +24,9 @@ def vector_length(length: float) -> Answer:
     text = (unit_rows(50, 16, 1).astype(np.float64) * length).astype(np.float32)
     cloud = labelled_cloud()
     descriptors = cloud.instances.descriptors
-    return Answer(_scene(cloud).instance_scores(text), _exact(cloud, text), lambda: naive.cosines(descriptors, text))
+    return Answer(
+        _scene(cloud).cloud.instances.cosines(text), _exact(cloud, text), lambda: naive.cosines(descriptors, text)
+    )
 
 
 @agrees(0, "angle between two words, radians", powers(0, -5, -1))
@@ -39,7 +41,7 @@ def nearly_equal_words(angle: float) -> Answer:
     text = np.stack([word, np.cos(angle) * word + np.sin(angle) * other]).astype(np.float32)
     exact = _exact(cloud, text).argmax(axis=1)
     clear = np.abs(np.diff(_exact(cloud, text), axis=1))[:, 0] > 1e-6  # nearer ones are equal in float32
-    ours = _scene(cloud).instance_scores(text).argmax(axis=1)
+    ours = _scene(cloud).cloud.instances.cosines(text).argmax(axis=1)
     return Answer(ours[clear], exact[clear], lambda: naive.cosines(descriptors, text, np.float16).argmax(axis=1)[clear])
 
 
