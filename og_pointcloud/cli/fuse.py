@@ -23,8 +23,7 @@ def add(commands: Any) -> None:
     )  # fmt: skip
     parser.add_argument(
         "capture", type=Path, metavar="CAPTURE",
-        help="folder with poses and depth images: depth/, nerfstudio's depth_file_path, ScanNet, 7-Scenes, Replica, "
-        "Record3D",
+        help="folder with poses and depth images: depth/, nerfstudio's depth_file_path, ScanNet, 7-Scenes, Replica",
     )  # fmt: skip
     parser.add_argument(
         "-o", "--output", type=Path, metavar="F.ply", help="the cloud to write (default: CAPTURE/points.ply)"

@@ -2,7 +2,7 @@
 
 Each part comes from the first of these that the folder has.
   poses     ``transforms.json`` (nerfstudio, instant-ngp, Blender), ``transforms_train.json``; COLMAP ``sparse/0``; the
-            folders of ScanNet, 7-Scenes, Replica and Record3D
+            folders of ScanNet, 7-Scenes and Replica
   masks     ``mask_features.npz`` with ``masks/``; LangSplat's ``language_features/``
   geometry  the file given; ``ply_file_path`` of transforms.json; ``points.ply``, ``point_cloud.ply``, the folder's one
             ``.pcd``; the latest ``point_cloud/iteration_*/point_cloud.ply``; ScanNet's ``*_vh_clean_2.ply``; COLMAP's
@@ -122,7 +122,7 @@ def read_poses(capture: Path) -> CapturePoses:
     raise SceneError(
         f"{capture} has no pose file; expected transforms.json (nerfstudio, instant-ngp, Blender), a COLMAP model in "
         "sparse/0 (cameras and images, .bin or .txt), or the layout of ScanNet (color/, pose/, intrinsic/), 7-Scenes "
-        "(frame-*.pose.txt), Replica (results/, traj.txt) or Record3D (rgb/, metadata.json)"
+        "(frame-*.pose.txt) or Replica (results/, traj.txt)"
     )
 
 

@@ -1,6 +1,6 @@
 """Depth images: each pixel's distance along the optical axis (z, not the length of the ray), 0 where none was measured.
 
-16-bit grey PNG and TIFF, float TIFF, ``.npy``, and ``.exr`` where OpenCV was started with it. Stored whole numbers are
+16-bit grey PNG and TIFF, float TIFF, ``.npy``. Stored whole numbers are
 millimetres in a world of metres unless the data set says otherwise, stored floats are lengths of the world.
 """
 
@@ -22,7 +22,7 @@ from og_pointcloud.scene import Camera
 __all__ = ["MILLIMETRE", "DepthFile", "DepthFrame", "DepthImage", "find_depth", "resampled"]
 
 DEPTH_FOLDERS = ("depth", "depths", "depth_images")
-DEPTH_SUFFIXES = (".png", ".npy", ".tif", ".tiff", ".exr")
+DEPTH_SUFFIXES = (".png", ".npy", ".tif", ".tiff")
 MILLIMETRE = 1e-3
 
 
@@ -125,8 +125,6 @@ def _stored(file: Path) -> NDArray:
             raise SceneError(
                 f"{file} holds {values.size} numbers; expected a depth image of at most {MAX_PIXELS} pixels"
             )
-    elif suffix == ".exr":
-        values = _exr(file)
     else:
         header = png_header(file)
         if header is not None and (header.bit_depth != 16 or header.color_type != 0):
@@ -135,8 +133,8 @@ def _stored(file: Path) -> NDArray:
                 "bit: pictures of depth in colours or 8 bit have lost the lengths"
             )
         values = decoded(file, require_cv2().IMREAD_UNCHANGED)
-    if values.ndim == 3:
-        values = _first_channel(values)
+    if values.ndim == 3 and values.shape[-1] == 1:
+        values = values[..., 0]
     kind = values.dtype.kind
     if values.ndim != 2 or not (kind == "f" or (kind in "iu" and values.dtype.itemsize > 1)) or not values.size:
         raise SceneError(
@@ -144,21 +142,3 @@ def _stored(file: Path) -> NDArray:
             "bit and more"
         )
     return values
-
-
-def _exr(file: Path) -> NDArray:
-    try:
-        return decoded(file, require_cv2().IMREAD_UNCHANGED)
-    except SceneError:
-        raise SceneError(
-            f"{file} cannot be decoded: it is damaged, or OpenCV was started without OpenEXR; set "
-            "OPENCV_IO_ENABLE_OPENEXR=1 in the environment, or convert it to .npy"
-        ) from None
-
-
-def _first_channel(values: NDArray) -> NDArray:
-    """Depth written as (H, W, 1), or grey in three equal channels, as EXR writers do."""
-    channels = [values[..., index] for index in range(min(values.shape[-1], 4))]
-    first = channels[0]
-    same = values.shape[-1] <= 4 and all(np.array_equal(first, other) for other in channels[1:3])
-    return np.asarray(first) if same else values

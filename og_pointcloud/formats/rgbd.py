@@ -1,4 +1,4 @@
-"""Folders of RGB-D data sets: ScanNet, 7-Scenes, Replica and Record3D, each as its exporter writes it.
+"""Folders of RGB-D data sets: ScanNet, 7-Scenes and Replica, each as its exporter writes it.
 
 ScanNet   ``color/0.jpg``, ``depth/0.png``, ``pose/0.txt``, ``intrinsic/`` (or, in the 25k-frame subset,
           ``intrinsics_color.txt`` beside the folders). Depth is 16-bit millimetres with intrinsics of its own. A pose
@@ -11,18 +11,13 @@ ScanNet   ``color/0.jpg``, ``depth/0.png``, ``pose/0.txt``, ``intrinsic/`` (or, 
 Replica   as NICE-SLAM renders it: ``results/frame000000.jpg``, ``results/depth000000.png``; line i of ``traj.txt`` is
           the pose of frame i, 16 numbers. ``cam_params.json`` lies in the folder or beside it: ``{"camera": {"w", "h",
           "fx", "fy", "cx", "cy", "scale"}}``; a stored depth of ``scale`` is a metre.
-Record3D  exported as "EXR + JPG": ``rgb/0.jpg``, ``depth/0.exr``, ``metadata.json`` with ``K``, the 3x3 intrinsics
-          column by column for images of ``w`` x ``h``, or one a frame in ``perFrameIntrinsicCoeffs`` (fx, fy, cx, cy),
-          and ``poses``, qx qy qz qw tx ty tz a frame. Depth is float metres, smaller than the image; OpenCV reads EXR
-          only if it is started with ``OPENCV_IO_ENABLE_OPENEXR=1``.
 
-Poses are camera-to-world with OpenCV axes, Record3D's with ARKit's (x right, y up, z back). All but Record3D count
-pixel centres at whole numbers; the scene has them at +0.5.
+Poses are camera-to-world with OpenCV axes. Pixel centres are counted at whole numbers; the scene has them at +0.5.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -30,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.errors import SceneError
-from og_pointcloud.formats.depth import MILLIMETRE, DepthFile, find_depth
+from og_pointcloud.formats.depth import MILLIMETRE, DepthFile
 from og_pointcloud.formats.images import IMAGE_SUFFIXES, image_size
 from og_pointcloud.formats.poses import (
     PosedFrames,
@@ -39,12 +34,11 @@ from og_pointcloud.formats.poses import (
     read_json,
     read_numbers,
     rigid,
-    rotation_of_quaternion,
 )
 from og_pointcloud.formats.tables import naming
 from og_pointcloud.scene import Camera
 
-__all__ = ["find_mesh", "read_record3d", "read_replica", "read_rgbd", "read_scannet", "read_seven_scenes"]
+__all__ = ["find_mesh", "read_replica", "read_rgbd", "read_scannet", "read_seven_scenes"]
 
 DEPTH_FOCAL_PX, COLOR_FOCAL_PX, FOCAL_WIDTH = 585.0, 525.0, 640
 """Focal lengths of 7-Scenes in pixels of an image of that width."""
@@ -53,7 +47,6 @@ SEVEN_SCENES_IMAGES = ("frame-*.color.png", "frame-*.color.jpg")
 SEVEN_SCENES_INTRINSICS = "camera-intrinsics.txt"
 REPLICA_PARAMETERS = "cam_params.json"
 REPLICA_KEYS = ("w", "h", "fx", "fy", "cx", "cy", "scale")
-RECORD3D_METADATA = "metadata.json"
 
 
 @dataclass(frozen=True)
@@ -116,8 +109,6 @@ def read_rgbd(folder: Path) -> PosedFrames | None:
         return read_seven_scenes(folder)
     if (folder / "traj.txt").is_file() and (folder / "results").is_dir():
         return read_replica(folder)
-    if (folder / RECORD3D_METADATA).is_file() and (folder / "rgb").is_dir():
-        return read_record3d(folder)
     return None
 
 
@@ -220,7 +211,11 @@ def read_replica(folder: Path) -> PosedFrames:
     results = folder / "results"
     images = numbered([*results.glob("frame*.jpg"), *results.glob("frame*.png")])
     poses = read_numbers(folder / "traj.txt", 16).reshape(-1, 4, 4)
-    _require_poses(images, poses, f"{folder / 'traj.txt'}")
+    if not images or len(images) > len(poses):
+        raise SceneError(
+            f"{folder} has {len(images)} images in results/ and {len(poses)} poses in traj.txt; expected at least one "
+            "image and a pose for each: copy both from one run"
+        )
     width, height, fx, fy, cx, cy, scale = _replica_parameters(folder)
     lens = _Lens((round(width), round(height)), fx, fy, cx + 0.5, cy + 0.5, unit=1 / scale)
     frames = []
@@ -229,14 +224,6 @@ def read_replica(folder: Path) -> PosedFrames:
         source = f"{folder / 'traj.txt'}, line {line}"
         frames.append(_Frame(f"results/{file.name}", pose, source, lens, depth_file, lens))
     return _posed_frames(frames)
-
-
-def _require_poses(images: Sequence[Path], poses: NDArray[np.float64], source: str) -> None:
-    if not images or len(images) > len(poses):
-        raise SceneError(
-            f"{source} has {len(poses)} poses for {len(images)} images; expected at least one image and a pose for "
-            "each: export the recording again"
-        )
 
 
 def _replica_parameters(folder: Path) -> list[float]:
@@ -255,47 +242,3 @@ def _replica_parameters(folder: Path) -> list[float]:
     if not np.isfinite(values).all() or min(values[0], values[1], values[-1]) <= 0 or max(values[:2]) > 1 << 16:
         raise SceneError(f"{file}: {', '.join(REPLICA_KEYS)} are {values}; expected positive sizes and scale")
     return values
-
-
-def read_record3d(folder: Path) -> PosedFrames:
-    """As `read_rgbd`, of Record3D's layout."""
-    file = folder / RECORD3D_METADATA
-    images = numbered([*(folder / "rgb").glob("*.jpg"), *(folder / "rgb").glob("*.png")])
-    size, intrinsics, poses = _record3d_metadata(file)
-    _require_poses(images, poses, str(file))
-    frames = []
-    for index, image in enumerate(images):
-        lens = _Lens(size, *intrinsics[min(index, len(intrinsics) - 1)].tolist())
-        pose, source = _arkit_pose(poses[index]), f"{file}, pose {index}"
-        frames.append(_Frame(f"rgb/{image.name}", pose, source, lens, find_depth(folder, image.stem), lens))
-    return _posed_frames(frames)
-
-
-def _record3d_metadata(file: Path) -> tuple[tuple[int, int], NDArray[np.float64], NDArray[np.float64]]:
-    """(width, height), intrinsics (1 or frames, 4), poses (frames, 7)."""
-    content = read_json(file)
-    try:
-        size = int(content["w"]), int(content["h"])
-        poses = np.array(content["poses"], np.float64)
-        matrix = np.array(content["K"], np.float64).reshape(3, 3).T
-        per_frame = content.get("perFrameIntrinsicCoeffs")
-        shared = [[matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]]]
-        intrinsics = np.array(per_frame or shared, np.float64)
-    except (ValueError, TypeError, KeyError, AttributeError, OverflowError) as error:
-        raise SceneError(
-            f"{file} is not Record3D's metadata with w, h, K and poses ({error!s:.80}): export it again"
-        ) from None
-    if poses.ndim != 2 or poses.shape[1] != 7 or intrinsics.ndim != 2 or intrinsics.shape[1] < 4:
-        raise SceneError(
-            f"{file}: poses are {poses.shape}, intrinsics {intrinsics.shape}; expected (frames, 7) and (_, 4)"
-        )
-    return size, intrinsics[:, :4], poses
-
-
-def _arkit_pose(pose: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(4, 4) camera to world with OpenCV axes, NaN where qx qy qz qw tx ty tz is no pose."""
-    if not np.isfinite(pose).all() or not pose[:4].any():
-        return np.full((4, 4), np.nan)
-    with np.errstate(all="ignore"):  # what comes of absurd lengths is dropped or refused like other bad poses
-        wxyz = np.roll(pose[:4] / np.linalg.norm(pose[:4]), 1)
-        return rigid(rotation_of_quaternion(wxyz) * [1.0, -1.0, -1.0], pose[4:])  # OpenGL's y and z to OpenCV's
