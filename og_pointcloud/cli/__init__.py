@@ -1,8 +1,9 @@
 """The command line: ``og-pointcloud fit | import | segment | pick | view | info | vocabulary | ...``.
 
-A file a command: ``add`` declares its options, ``run`` does the work. A command imports what it needs when it runs, so
-that ``--help`` answers at once and ``segment`` and ``pick`` work on the base install. Progress, warnings and errors go
-to stderr, results to stdout. Exit codes: 0 done, 2 bad use or bad input, 130 interrupted.
+A file a command: its docstring is the help (what it does, and an example), ``add`` declares its options, ``run`` does
+the work. A command imports what it needs when it runs, so that ``--help`` answers at once and ``segment`` and ``pick``
+work on the base install. Progress, warnings and errors go to stderr, results to stdout. Exit codes: 0 done, 2 bad use
+or bad input, 130 interrupted.
 """
 
 from __future__ import annotations
@@ -11,37 +12,20 @@ import argparse
 import sys
 import warnings
 from collections.abc import Sequence
+from importlib import import_module
 from typing import NoReturn
 
-from og_pointcloud.cli import (
-    demo,
-    edit,
-    evaluate,
-    export,
-    fit,
-    fuse,
-    import_,
-    info,
-    instances,
-    masks,
-    models,
-    pick,
-    report,
-    ros_bag,
-    segment,
-    select,
-    view,
-    vocabulary,
-)
-from og_pointcloud.cli.common import Parser, did_you_mean
+from og_pointcloud.cli.common import Parser, add_command, check_outputs, did_you_mean
 from og_pointcloud.errors import MissingExtraError, OgPointcloudError
 
 __all__ = ["main"]
 
 COMMANDS = (
-    masks, models, fit, fuse, import_, segment, select, pick, instances, edit, view, ros_bag, info, vocabulary,
-    export, evaluate, report, demo,
+    "masks", "models", "fit", "fuse", "import", "segment", "select", "pick", "instances", "edit", "view", "ros-bag",
+    "info", "vocabulary", "export", "eval", "report", "demo",
 )  # fmt: skip
+MODULES = {"import": "import_", "eval": "evaluate", "ros-bag": "ros_bag"}
+"""Command -> its module, where they are not called the same."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -51,13 +35,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         if unknown:
             raise OgPointcloudError(describe_unknown_option(unknown[0], arguments))
+        check_outputs(arguments)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # what libraries tell programmers
             warnings.simplefilter("always", UserWarning)
             warnings.showwarning = print_warning
             arguments.run(arguments)
-    except (OgPointcloudError, MissingExtraError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
+    except (OgPointcloudError, MissingExtraError, OSError, UnicodeError, MemoryError) as error:
+        print(f"error: {str(error) or 'out of memory'}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         print("interrupted: the files of this command were not written", file=sys.stderr)
@@ -74,8 +59,9 @@ def build_parser() -> Parser:
     parser = Parser(prog="og-pointcloud", description="Ask a point cloud or Gaussian splat for things by name.")
     parser.add_argument("--version", action=VersionAction, help="print the version and leave")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    for command in COMMANDS:
-        command.add(commands)
+    for name in COMMANDS:
+        module = import_module(f"og_pointcloud.cli.{MODULES.get(name, name)}")
+        module.add(add_command(commands, name, getattr(module, "run", None), module.__doc__))
     return parser
 
 

@@ -9,8 +9,9 @@ import os
 import shlex
 import time
 import zipfile
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
@@ -35,10 +36,41 @@ class Parser(argparse.ArgumentParser):
         self.exit(2, f"error: {message} ('{self.prog} --help' explains)\n")
 
 
-def add_command(commands: Any, name: str, run: Any, summary: str, example: str) -> Parser:
-    parser = commands.add_parser(name, help=summary, description=summary, epilog=f"example:\n  {example}")
+SHARED: dict[str, dict[str, Any]] = {
+    "capture": {"type": Path, "metavar": "CAPTURE", "help": "folder with images and poses"},
+    "bundle": {"type": Path, "metavar": "S.ogpc", "help": "what `fit` wrote"},
+    "--labels": {"metavar": "A,B,C", "help": "names to choose among (default: all that are known)"},
+    "--text-features": {
+        "type": Path, "metavar": "F.npz",
+        "help": "names and vectors, from the scene's encoder (default: the scene's own words)",
+    },
+    "--json": {"action": "store_true", "help": "print the result as JSON"},
+}  # fmt: skip
+"""Options that mean the same in several commands."""
+
+
+def add_command(commands: Any, name: str, run: Any, text: str | None) -> Parser:
+    """text: what the command does in a line, and an example behind an empty line."""
+    summary, _, example = (text or "").strip().partition("\n\n")
+    parser = commands.add_parser(name, help=summary, description=summary, epilog=f"example:\n  {example.strip()}")
     parser.set_defaults(run=run, parser=parser)
     return parser
+
+
+def add_shared(parser: Any, *names: str) -> None:
+    for name in names:
+        parser.add_argument(name, **SHARED[name])
+
+
+def add_output(parser: Any, *flags: str, endings: Sequence[str], help: str, **settings: Any) -> None:
+    """An option with a file to write, which `check_outputs` looks at before the command runs."""
+    settings = {"metavar": f"OUT{endings[0]}", **settings}
+    parser.add_argument(*flags, type=Path, help=help, **settings).endings = endings
+
+
+def replaceable(text: str) -> Path:
+    """The type of a path that is read, and that an output may replace, or something in it."""
+    return Path(text)
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:
@@ -46,43 +78,67 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
     return f"; did you mean {' or '.join(repr(match) for match in close)}?" if close else ""
 
 
-def check_outputs(outputs: Mapping[str, tuple[Path | None, Sequence[str]]], inputs: Iterable[Path | None]) -> None:
+def check_outputs(arguments: argparse.Namespace) -> None:
     """Refuse, before any work, an output that cannot be written or that would replace an input.
 
-    outputs: option -> (path or None, the endings it may have).
+    Options of `add_output` are outputs, all other options of type Path inputs.
     """
-    sources = [path.resolve() for path in inputs if path]
+    actions = [(action, getattr(arguments, action.dest)) for action in arguments.parser._actions if action.type is Path]
+    values = [value if isinstance(value, list) else [value] for action, value in actions if not outputs_of(action)]
+    inputs = [path for several in values for path in several if isinstance(path, Path)]
     taken: dict[Path, str] = {}
-    for option, (path, endings) in outputs.items():
-        if path is None:
+    for action, path in actions:
+        if path is None or not (endings := outputs_of(action)):
             continue
-        resolved = path.resolve()
+        option = action.option_strings[0]
         if path.suffix not in endings:
             raise OgPointcloudError(f"{option} is '{path}'; expected a name that ends in {' or '.join(endings)}")
-        if path.is_dir():
-            raise OgPointcloudError(f"{option} is '{path}', which is a folder; expected a file name")
-        if replaces_input(resolved, sources):
-            raise OgPointcloudError(
-                f"{option} is '{path}', a file that is read; expected another name, so that it stays"
-            )
-        if resolved in taken:
-            raise OgPointcloudError(f"{taken[resolved]} and {option} are both '{path}'; expected two names")
-        taken[resolved] = option
-        existing = next(parent for parent in resolved.parents if parent.exists())
-        if not existing.is_dir() or not os.access(existing, os.W_OK):
-            raise OgPointcloudError(f"{option} is '{path}', but '{existing}' is not a folder that can be written to")
+        check_output(option, path, inputs)
+        if path.resolve() in taken:
+            raise OgPointcloudError(f"{taken[path.resolve()]} and {option} are both '{path}'; expected two names")
+        taken[path.resolve()] = option
 
 
-def replaces_input(path: Path, sources: Sequence[Path]) -> bool:
-    """Also true for what lies in a capture folder already, except a .ogpc, which is never an input of fit."""
-    in_capture = any(source in path.parents for source in sources) and path.exists() and path.suffix != ".ogpc"
-    return path in sources or in_capture
+def outputs_of(action: argparse.Action) -> Sequence[str]:
+    """The endings that an option's file may have, none if it is no output."""
+    return getattr(action, "endings", ())
+
+
+def check_output(option: str, path: Path, inputs: Sequence[Path]) -> None:
+    """Refuse a folder, an input, what lies in a folder that is read already (.ogpc are no part of captures), and what
+    cannot be written."""
+    resolved, sources = path.resolve(), [source.resolve() for source in inputs]
+    if path.is_dir():
+        raise OgPointcloudError(f"{option} is '{path}', which is a folder; expected a file name")
+    in_folder = any(source in resolved.parents for source in sources) and path.exists() and path.suffix != ".ogpc"
+    if resolved in sources or in_folder:
+        raise OgPointcloudError(f"{option} is '{path}', a file that is read; expected another name, so that it stays")
+    existing = next(parent for parent in resolved.parents if parent.exists())
+    if not existing.is_dir() or not os.access(existing, os.W_OK):
+        raise OgPointcloudError(f"{option} is '{path}', but '{existing}' is not a folder that can be written to")
+
+
+def print_result(arguments: argparse.Namespace, result: Mapping[str, Any], show: Callable[[Any], None]) -> None:
+    """As JSON where --json was given, else as ``show`` prints it."""
+    if arguments.json:
+        print(json.dumps(result, indent=2, ensure_ascii=False))
+    else:
+        show(result)
+
+
+def print_next(*words: object, hint: str = "") -> None:
+    """Close with a command to type next."""
+    print(f"next: {hint}{shlex.join(['og-pointcloud', *map(str, words)])}")
+
+
+def check_at_least(option: str, value: float | None, least: float) -> None:
+    if value is not None and not value >= least:
+        raise OgPointcloudError(f"{option} is {value}; expected at least {least}")
 
 
 def write_json(path: Path, value: Mapping[str, Any]) -> None:
     from og_pointcloud.formats.atomic import replacing
 
-    path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as file:
         file.write(json.dumps(value, indent=2, ensure_ascii=False).encode() + b"\n")
 
@@ -157,9 +213,33 @@ def next_segment_command(bundle: str, cloud: LabelledCloud) -> str:
     return shlex.join([*command, *labels, "-o", str(Path(bundle).with_suffix(".ply"))])
 
 
+def write_fit(cloud: LabelledCloud, stages: list[dict[str, Any]], output: Path) -> LabelledCloud:
+    """Write the .ogpc file; returns the cloud with the seconds of all stages, writing included, in its provenance."""
+    from og_pointcloud_export import write_bundle
+
+    cloud = replace(cloud, provenance={**cloud.provenance, "stages": stages})
+    with timed(stages, "write file"):
+        write_bundle(cloud, output)
+    return cloud
+
+
 def names_in(text: str | None) -> list[str] | None:
     """The names of an option like A,B,C; None where it is not given."""
     return None if text is None else [name.strip() for name in text.split(",") if name.strip()]
+
+
+def numbers(text: str, option: str, count: int) -> list[float]:
+    try:
+        values = [float(part) for part in text.split(",")]
+    except ValueError:
+        values = []
+    if len(values) != count:
+        raise OgPointcloudError(f"{option} is '{text}'; expected {count} numbers with commas between them")
+    return values
+
+
+def some_of(words: Sequence[str]) -> str:
+    return ", ".join(words[:SHOWN]) + (", ..." if len(words) > SHOWN else "")
 
 
 def calibration_hint(bundle: Path | str) -> str:
@@ -185,3 +265,13 @@ def print_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
     for row in [header, *rows]:
         first, *others = (cell.rjust(width) for cell, width in zip(row, widths, strict=True))
         print("  ".join([first.strip().ljust(widths[0]), *others]))
+
+
+def print_shares(counts: Mapping[str, int], unknown: int, unknown_because: Mapping[Any, int]) -> None:
+    """Points and share of each label that was found and of the unknown ones, and why these are unknown."""
+    total = max(sum(counts.values()) + unknown, 1)
+    found = [(name, count) for name, count in counts.items() if count]
+    rows = [(name, f"{count:,}", f"{count / total:.1%}") for name, count in [*found, ("unknown", unknown)]]
+    print_table(("label", "points", "share"), rows)
+    if unknown_because:
+        print(f"unknown: {', '.join(f'{count:,} {reason}' for reason, count in unknown_because.items())}")

@@ -1,19 +1,17 @@
-"""``og-pointcloud demo``: a furnished room made, fitted, asked, scored and shown."""
+"""Make a furnished room, fit it, ask it for things, score it and show it.
+
+og-pointcloud demo -o out/demo
+"""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
 
-from og_pointcloud.cli.common import add_command, require_room
+from og_pointcloud.cli.common import Parser, require_room
 
 
-def add(commands: Any) -> None:
-    parser = add_command(
-        commands, "demo", run, "Make a furnished room, fit it, ask it for things, score it and show it.",
-        "og-pointcloud demo -o out/demo",
-    )  # fmt: skip
+def add(parser: Parser) -> None:
     parser.add_argument("-o", "--output", type=Path, default=Path("out/demo"), metavar="DIR", help="folder to fill")
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="another room (default: %(default)s)")
     parser.add_argument(

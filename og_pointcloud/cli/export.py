@@ -1,4 +1,7 @@
-"""``og-pointcloud export text|image``: half of a CLIP or SigLIP model as a folder that the base install runs."""
+"""Make a model's text or image encoder usable without torch.
+
+og-pointcloud export text openai/clip-vit-base-patch32
+"""
 
 from __future__ import annotations
 
@@ -7,24 +10,14 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from og_pointcloud.cli.common import add_command
+from og_pointcloud.cli.common import Parser, add_command
 from og_pointcloud.errors import OgPointcloudError
 
 
-def add(commands: Any) -> None:
-    parser = add_command(
-        commands, "export", run_text, "Make a model's text or image encoder usable without torch.",
-        "og-pointcloud export text openai/clip-vit-base-patch32",
-    )  # fmt: skip
+def add(parser: Parser) -> None:
     halves = parser.add_subparsers(dest="half", required=True, metavar="HALF")
-    text = add_command(
-        halves, "text", run_text, "Words -> vectors: any word can then be asked.",
-        "og-pointcloud export text openai/clip-vit-base-patch32",
-    )  # fmt: skip
-    image = add_command(
-        halves, "image", run_image, "Crops of masks -> vectors, for og-pointcloud masks.",
-        "og-pointcloud export image openai/clip-vit-base-patch32",
-    )  # fmt: skip
+    text = add_command(halves, "text", run_text, run_text.__doc__)
+    image = add_command(halves, "image", run_image, run_image.__doc__)
     for half in (text, image):
         half.add_argument(
             "model", type=Path, metavar="MODEL",
@@ -53,37 +46,40 @@ def add(commands: Any) -> None:
 
 
 def run_text(arguments: argparse.Namespace) -> None:
+    """Words -> vectors: any word can then be asked.
+
+    og-pointcloud export text openai/clip-vit-base-patch32
+    """
     if arguments.scene and not arguments.int8:
         arguments.parser.error("--scene is asked only what --int8 would change: give both, or neither")
     source, feature_space = found_model(arguments.model, arguments.feature_space)
     from og_pointcloud_export.encoders import export_text_encoder
 
     folder, manifest = export_text_encoder(
-        source,
-        arguments.output,
-        feature_space=feature_space,
-        templates=arguments.template or ("{}",),
-        int8=arguments.int8,
-        scene=arguments.scene,
-    )
-    print_export(folder, manifest, f"context {manifest['context_length']}", "texts")
-    if "int8" in manifest["parity"]:
-        int8 = manifest["parity"]["int8"]
-        print(f"int8 and float32: cosine {int8['min_cosine']:.4f} at least, {describe_choices(int8)}")
+        source, arguments.output, feature_space=feature_space, templates=arguments.template or ("{}",),
+        int8=arguments.int8, scene=arguments.scene,
+    )  # fmt: skip
+    print_export(folder, manifest, "texts")
+    if int8 := manifest["parity"].get("int8"):
+        asked = f"no choice changed among {int8['instances']} instances" if "instances" in int8 else "no scene asked"
+        print(f"int8 and float32: cosine {int8['min_cosine']:.4f} at least, {asked} (--scene)")
     if arguments.output is not None:
         print(f"next: export OG_POINTCLOUD_MODELS='{folder.resolve()}'  # scenes of this feature space then find it")
 
 
 def run_image(arguments: argparse.Namespace) -> None:
+    """Crops of masks -> vectors, for og-pointcloud masks.
+
+    og-pointcloud export image openai/clip-vit-base-patch32
+    """
     source, feature_space = found_model(arguments.model, arguments.feature_space)
     from og_pointcloud_export.encoders import export_image_encoder
 
     from og_pointcloud.masking.crops import CROP_STYLES
 
-    folder, manifest = export_image_encoder(
-        source, arguments.output, feature_space=feature_space, crops=CROP_STYLES[arguments.crops]
-    )
-    print_export(folder, manifest, f"{manifest['preprocessing']['size']} pixels", "images")
+    crops = CROP_STYLES[arguments.crops]
+    folder, manifest = export_image_encoder(source, arguments.output, feature_space=feature_space, crops=crops)
+    print_export(folder, manifest, "images")
 
 
 def found_model(model: Path, feature_space: str | None) -> tuple[Path, str | None]:
@@ -101,19 +97,10 @@ def found_model(model: Path, feature_space: str | None) -> tuple[Path, str | Non
     )
 
 
-def print_export(folder: Path, manifest: Mapping[str, Any], reads: str, compared: str) -> None:
+def print_export(folder: Path, manifest: Mapping[str, Any], compared: str) -> None:
     """What was made, and how far it is from torch. compared: the name of the manifest's count, 'texts' or 'images'."""
-    parity, tower = manifest["parity"], manifest["tower"]
-    print(
-        f"feature space '{manifest['feature_space']}': width {manifest['width']}, {tower['layers']} layers, "
-        f"{tower['heads']} heads, {tower['activation']}, {reads}"
-    )
+    parity = manifest["parity"]
+    print(f"feature space '{manifest['feature_space']}': width {manifest['width']}")
     print(f"onnxruntime and torch differ by {parity['max_abs_error']:.1e} at most, over {parity[compared]} {compared}")
     size = sum(file["bytes"] for file in manifest["files"].values())
     print(f"wrote {folder} ({size / 1e6:.1f} MB)")
-
-
-def describe_choices(int8: Mapping[str, Any]) -> str:
-    if "instances" not in int8:
-        return "no scene asked (--scene)"
-    return f"no choice changed among {int8['instances']} instances and {int8['words']} words"

@@ -1,4 +1,7 @@
-"""``og-pointcloud fit``: a capture folder to one .ogpc file."""
+"""Turn a capture folder (posed images with masks, and a cloud) into one .ogpc file.
+
+og-pointcloud fit kitchen -o kitchen.ogpc
+"""
 
 from __future__ import annotations
 
@@ -8,7 +11,17 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args, get_type_hints
 
-from og_pointcloud.cli.common import add_command, check_outputs, describe_fit, print_fit, timed, write_json
+from og_pointcloud.cli.common import (
+    Parser,
+    add_output,
+    add_shared,
+    describe_fit,
+    print_fit,
+    replaceable,
+    timed,
+    write_fit,
+    write_json,
+)
 from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.settings import FitSettings, PaperSettings
 
@@ -19,13 +32,9 @@ MODES = get_args(get_type_hints(FitSettings)["mode"])
 MASK_LEVELS = ("default", "small", "medium", "large")
 
 
-def add(commands: Any) -> None:
-    parser = add_command(
-        commands, "fit", run, "Turn a capture folder (posed images with masks, and a cloud) into one .ogpc file.",
-        "og-pointcloud fit kitchen -o kitchen.ogpc",
-    )  # fmt: skip
-    parser.add_argument("capture", type=Path, metavar="CAPTURE", help="folder with poses, masks and mask features")
-    parser.add_argument("-o", "--output", type=Path, required=True, metavar="S.ogpc", help="the file to write")
+def add(parser: Parser) -> None:
+    add_shared(parser, "capture")
+    add_output(parser, "-o", "--output", endings=(".ogpc",), required=True, help="the file to write")
     parser.add_argument("--gaussians", type=Path, metavar="F.ply", help="geometry, in place of the capture's own")
     parser.add_argument("--mode", choices=MODES, default="auto", help="how to find instances (default: %(default)s)")
     parser.add_argument(
@@ -45,33 +54,23 @@ def add(commands: Any) -> None:
     )  # fmt: skip
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="of everything random (default: %(default)s)")
     parser.add_argument(
-        "--memory", type=memory, metavar="4GB",
+        "--memory", metavar="4GB",
         help="what the fit may hold in memory; a larger table goes to disk (default: half of what is free)",
     )  # fmt: skip
     parser.add_argument(
-        "--tile-points", type=positive, metavar="N",
+        "--tile-points", type=int, metavar="N",
         help="fit in tiles of at most so many points (default: only where one fit would not fit into memory)",
     )  # fmt: skip
     parser.add_argument(
-        "--work", type=Path, metavar="DIR",
+        "--work", type=replaceable, metavar="DIR",
         help="where the views of a long fit are kept until it ends, for a start after a kill (default: S.ogpc.work)",
     )  # fmt: skip
-    parser.add_argument("--ply", type=Path, metavar="F.ply", help="also write the labelled cloud for other tools")
-    parser.add_argument("--json", type=Path, metavar="F.json", help="also write timings and settings of this run")
+    add_output(parser, "--ply", endings=(".ply",), help="also write the labelled cloud for other tools")
+    add_output(parser, "--json", endings=(".json",), help="also write timings and settings of this run")
 
 
 def run(arguments: argparse.Namespace) -> None:
-    check_outputs(
-        {
-            "-o": (arguments.output, [".ogpc"]),
-            "--ply": (arguments.ply, [".ply"]),
-            "--json": (arguments.json, [".json"]),
-        },
-        inputs=[arguments.capture, arguments.gaussians, arguments.vocabulary, arguments.word_bank],
-    )
     settings = fit_settings(arguments)
-    from og_pointcloud_export import write_bundle
-
     from og_pointcloud.bundle.scene_words import scene_words
     from og_pointcloud.cloud import FeatureSpace
     from og_pointcloud.fitting.fit import fit
@@ -91,13 +90,9 @@ def run(arguments: argparse.Namespace) -> None:
         if views := kept_files(work, "view"):
             print(f"{views} views are kept in '{work}': the same command goes on behind them", file=sys.stderr)
         raise
-    stages += cloud.provenance["stages"]
-    cloud = replace(cloud, provenance={**cloud.provenance, "stages": stages})
-    with timed(stages, "write file"):
-        arguments.output.parent.mkdir(parents=True, exist_ok=True)
-        write_bundle(cloud, arguments.output)
+    cloud = write_fit(cloud, stages + cloud.provenance["stages"], arguments.output)
     if arguments.ply:
-        with timed(stages, "write cloud"):
+        with timed(cloud.provenance["stages"], "write cloud"):
             write_cloud(cloud, arguments.output, arguments.ply)
     report = describe_fit(cloud, arguments.capture, arguments.output)
     if arguments.json:
@@ -106,9 +101,10 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def fit_settings(arguments: argparse.Namespace) -> FitSettings:
-    settings = FitSettings(
-        mode=arguments.mode, seed=arguments.seed, memory=arguments.memory, tile_points=arguments.tile_points
-    )
+    from og_pointcloud.fitting.memory import parse_memory
+
+    memory = None if arguments.memory is None else parse_memory(arguments.memory)
+    settings = FitSettings(mode=arguments.mode, seed=arguments.seed, memory=memory, tile_points=arguments.tile_points)
     if arguments.schedule_share is None:
         return settings
     if arguments.mode != "paper":
@@ -117,21 +113,6 @@ def fit_settings(arguments: argparse.Namespace) -> FitSettings:
             "expected --mode paper: leave the option out, or take that mode"
         )
     return replace(settings, paper=PaperSettings(schedule_share=arguments.schedule_share))
-
-
-def positive(text: str) -> int:
-    if not text.isdecimal() or int(text) == 0:
-        raise argparse.ArgumentTypeError(f"'{text}' is no number of points; expected a whole number from 1")
-    return int(text)
-
-
-def memory(text: str) -> int:
-    from og_pointcloud.fitting.memory import parse_memory
-
-    try:
-        return parse_memory(text)
-    except OgPointcloudError as error:
-        raise argparse.ArgumentTypeError(str(error)) from None
 
 
 def write_cloud(cloud: LabelledCloud, bundle: Path, path: Path) -> None:
@@ -143,7 +124,6 @@ def write_cloud(cloud: LabelledCloud, bundle: Path, path: Path) -> None:
     from og_pointcloud.formats.colors import label_colors
     from og_pointcloud.formats.points import write_labelled_ply
 
-    path.parent.mkdir(parents=True, exist_ok=True)
     if cloud.vocabulary:
         segment(bundle).save(path)
         return

@@ -1,33 +1,28 @@
-"""``og-pointcloud fuse``: the depth images of a capture to one cloud."""
+"""Make a capture's cloud from its depth images, once, so that no later command has to.
+
+og-pointcloud fuse scene0000_00
+"""
 
 from __future__ import annotations
 
 import argparse
-import shlex
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from og_pointcloud.cli.common import add_command, check_outputs
+from og_pointcloud.cli.common import Parser, add_output, check_output, print_next
 from og_pointcloud.errors import OgPointcloudError
 
 if TYPE_CHECKING:
     from og_pointcloud.scene import Points
 
 
-def add(commands: Any) -> None:
-    parser = add_command(
-        commands, "fuse", run,
-        "Make a capture's cloud from its depth images, once, so that no later command has to.",
-        "og-pointcloud fuse scene0000_00",
-    )  # fmt: skip
+def add(parser: Parser) -> None:
     parser.add_argument(
         "capture", type=Path, metavar="CAPTURE",
         help="folder with poses and depth images: depth/, nerfstudio's depth_file_path, ScanNet, 7-Scenes, Replica",
     )  # fmt: skip
-    parser.add_argument(
-        "-o", "--output", type=Path, metavar="F.ply", help="the cloud to write (default: CAPTURE/points.ply)"
-    )
+    add_output(parser, "-o", "--output", endings=(".ply",), help="the cloud to write (default: CAPTURE/points.ply)")
     parser.add_argument(
         "--depth-unit", type=float, metavar="X",
         help="lengths of the poses' world in a stored step, e.g. 0.001 (default: what the data set or the type says)",
@@ -38,12 +33,11 @@ def run(arguments: argparse.Namespace) -> None:
     unit, output = arguments.depth_unit, arguments.output or arguments.capture / "points.ply"
     if unit is not None and not 0 < unit < float("inf"):
         raise OgPointcloudError(f"--depth-unit is {unit:g}; expected a number above 0, such as 0.001")
-    check_outputs({"-o": (output, [".ply"])}, inputs=[arguments.capture])
+    check_output("-o", output, [arguments.capture])
     from og_pointcloud.formats.capture import fuse_capture
 
     start = time.perf_counter()
     fused = fuse_capture(arguments.capture, unit)
-    output.parent.mkdir(parents=True, exist_ok=True)
     write_points(fused.points, output)
     print(
         f"{fused.frames} depth images in {time.perf_counter() - start:.1f} s: {len(fused.points):,} points, voxels of "
@@ -52,7 +46,7 @@ def run(arguments: argparse.Namespace) -> None:
     )
     print(f"wrote {output}")
     if arguments.output is None:
-        print(f"next: {shlex.join(['og-pointcloud', 'fit', str(arguments.capture), '-o', 'scene.ogpc'])}")
+        print_next("fit", arguments.capture, "-o", "scene.ogpc")
 
 
 def write_points(points: Points, path: Path) -> None:

@@ -1,37 +1,41 @@
-"""``og-pointcloud info``: what a .ogpc file holds and how it was made."""
+"""Say what a .ogpc file holds and how it was made.
+
+og-pointcloud info kitchen.ogpc
+"""
 
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from og_pointcloud.cli.common import SHOWN, add_command, calibration_hint, print_provenance, print_table
+from og_pointcloud.cli.common import (
+    SHOWN,
+    Parser,
+    add_shared,
+    calibration_hint,
+    print_provenance,
+    print_result,
+    print_table,
+    some_of,
+)  # fmt: skip
 from og_pointcloud.errors import BundleError
 
 if TYPE_CHECKING:
     from og_pointcloud.ask.labelled_scene import LabelledScene
 
 
-def add(commands: Any) -> None:
-    parser = add_command(
-        commands, "info", run, "Say what a .ogpc file holds and how it was made.",
-        "og-pointcloud info kitchen.ogpc",
-    )  # fmt: skip
-    parser.add_argument("bundle", type=Path, metavar="S.ogpc", help="what `fit` wrote")
-    parser.add_argument("--json", action="store_true", help="print everything as JSON")
+def add(parser: Parser) -> None:
+    add_shared(parser, "bundle", "--json")
 
 
 def run(arguments: argparse.Namespace) -> None:
     from og_pointcloud.ask.labelled_scene import load
 
     scene = load(arguments.bundle)
-    if arguments.json:
-        print(json.dumps(describe_bundle(scene, arguments.bundle), indent=2, ensure_ascii=False))
-        return
+    described = describe_bundle(scene, arguments.bundle)
     try:
-        print_info(scene, arguments.bundle)
+        print_result(arguments, described, lambda _: print_info(scene, arguments.bundle))
     except (KeyError, TypeError, ValueError):  # the one part of a file that reading it does not check
         raise BundleError(
             f"{arguments.bundle}: its provenance is not in the form that fit writes; see --json"
@@ -56,7 +60,7 @@ def print_info(scene: LabelledScene, path: Path) -> None:
     print(f"{len(cloud):,} points, {len(cloud.instances)} instances, feature space '{cloud.feature_space}'")
     origin = ", ".join(f"{value:g}" for value in cloud.origin)
     print(f"spacing {cloud.spacing:.4g}, reach {cloud.reach:.4g}, origin ({origin}), in the capture's unit")
-    print(f"{len(words)} words: {', '.join(words[:SHOWN])}{', ...' if len(words) > SHOWN else ''}")
+    print(f"{len(words)} words: {some_of(words)}")
     print(f"{describe_bank(scene, path)}\n")
     print_instances(scene)
     print()

@@ -1,26 +1,22 @@
-"""``og-pointcloud masks``: photographs -> masks and mask features, ready for ``fit``."""
+"""Make masks and mask features from a capture's images.
+
+og-pointcloud masks CAPTURE --proposer sam:facebook/sam-vit-base --encoder openai/clip-vit-base-patch16
+"""
 
 from __future__ import annotations
 
 import argparse
-import shlex
 import warnings
 from pathlib import Path
-from typing import Any
 
-from og_pointcloud.cli.common import add_command
-from og_pointcloud.errors import OgPointcloudError
+from og_pointcloud.cli.common import Parser, add_shared, check_at_least, print_next
 
 ENOUGH_VIEWS = 6
 """--views auto: an image is left out when nearly all that it sees is seen by so many others."""
 
 
-def add(commands: Any) -> None:
-    parser = add_command(
-        commands, "masks", run, "Make masks and mask features from a capture's images.",
-        "og-pointcloud masks CAPTURE --proposer sam:facebook/sam-vit-base --encoder openai/clip-vit-base-patch16",
-    )  # fmt: skip
-    parser.add_argument("capture", type=Path, metavar="CAPTURE", help="folder with images and poses")
+def add(parser: Parser) -> None:
+    add_shared(parser, "capture")
     parser.add_argument(
         "--proposer", default="opencv", metavar="P",
         help="opencv (default, no weights), sam:FOLDER, sam:OWNER/MODEL, onnx:ENCODER.onnx,DECODER.onnx,"
@@ -50,10 +46,8 @@ def add(commands: Any) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    if arguments.processes is not None and arguments.processes < 1:
-        raise OgPointcloudError(f"--processes is {arguments.processes}; expected at least 1")
-    if arguments.seconds_per_image is not None and not arguments.seconds_per_image > 0:
-        raise OgPointcloudError(f"--seconds-per-image is {arguments.seconds_per_image}; expected more than 0")
+    check_at_least("--processes", arguments.processes, 1)
+    check_at_least("--seconds-per-image", arguments.seconds_per_image, 0)
     from og_pointcloud.masking.make_masks import MaskSettings, make_masks
 
     settings = MaskSettings(
@@ -79,5 +73,4 @@ def run(arguments: argparse.Namespace) -> None:
         f"{made.masks} masks in {made.images} images ({made.seconds:.1f} s, {made.done_before} images done before), "
         f"feature space {made.feature_space}"
     )
-    fit = ["og-pointcloud", "fit", str(made.output), "-o", f"{made.output.resolve().name}.ogpc"]
-    print(f"next: {shlex.join(fit)}")
+    print_next("fit", made.output, "-o", f"{made.output.resolve().name}.ogpc")

@@ -1,15 +1,17 @@
-"""``og-pointcloud pick``: the instance at a pixel or a place, and its mask in a view."""
+"""Select the instance at a pixel of a view, or at a place; render its mask.
+
+og-pointcloud pick kitchen.ogpc --capture kitchen --view frame7 --pixel 320,240 -o mask.png
+"""
 
 from __future__ import annotations
 
 import argparse
-import json
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from og_pointcloud.cli.common import SHOWN, add_command, check_outputs, did_you_mean
+from og_pointcloud.cli.common import Parser, add_output, add_shared, did_you_mean, numbers, print_result, some_of
 from og_pointcloud.errors import OgPointcloudError
 
 if TYPE_CHECKING:
@@ -20,12 +22,8 @@ if TYPE_CHECKING:
     from og_pointcloud.scene import Camera
 
 
-def add(commands: Any) -> None:
-    parser = add_command(
-        commands, "pick", run, "Select the instance at a pixel of a view, or at a place; render its mask.",
-        "og-pointcloud pick kitchen.ogpc --capture kitchen --view frame7 --pixel 320,240 -o mask.png",
-    )  # fmt: skip
-    parser.add_argument("bundle", type=Path, metavar="S.ogpc", help="what `fit` wrote")
+def add(parser: Parser) -> None:
+    add_shared(parser, "bundle", "--text-features", "--json")
     click = parser.add_mutually_exclusive_group(required=True)
     click.add_argument("--xyz", metavar="X,Y,Z", help="a place in world coordinates")
     click.add_argument("--pixel", metavar="U,V", help="a pixel of the view, column and row")
@@ -33,16 +31,10 @@ def add(commands: Any) -> None:
     parser._negative_number_matcher = re.compile(r"-[\d.,-]+$")
     parser.add_argument("--capture", type=Path, metavar="CAPTURE", help="folder that the view is in")
     parser.add_argument("--view", metavar="NAME", help="file stem of the view's image")
-    parser.add_argument("-o", "--output", type=Path, metavar="M.png", help="the instance's mask in the view")
-    parser.add_argument("--text-features", type=Path, metavar="F.npz", help="names to rank (default: the file's own)")
-    parser.add_argument("--json", action="store_true", help="print the answer as JSON")
+    add_output(parser, "-o", "--output", endings=(".png",), help="the instance's mask in the view")
 
 
 def run(arguments: argparse.Namespace) -> None:
-    check_outputs(
-        {"-o": (arguments.output, [".png"])},
-        inputs=[arguments.bundle, arguments.capture, arguments.text_features],
-    )
     from og_pointcloud.ask.labelled_scene import load
     from og_pointcloud.ask.picking import pick
 
@@ -58,26 +50,12 @@ def run(arguments: argparse.Namespace) -> None:
     words = []
     if hit.found and (scene.vocabulary or arguments.text_features):
         words = hit.words(text_features=arguments.text_features)
-    mask_pixels = None
+    mask = None
     if arguments.output and camera is not None:
         mask = hit.mask(camera)
-        mask_pixels = int(mask.sum())
         write_mask(arguments.output, mask)
-    report = describe_pick(hit, words, arguments.output, mask_pixels)
-    if arguments.json:
-        print(json.dumps(report, indent=2, ensure_ascii=False))
-    else:
-        print_pick(report)
-
-
-def numbers(text: str, option: str, count: int) -> list[float]:
-    try:
-        values = [float(part) for part in text.split(",")]
-    except ValueError:
-        values = []
-    if len(values) != count:
-        raise OgPointcloudError(f"{option} is '{text}'; expected {count} numbers with commas between them")
-    return values
+    pixels = None if mask is None else int(mask.sum())
+    print_result(arguments, describe_pick(hit, words, arguments.output, pixels), print_pick)
 
 
 def world_camera(capture: Path, name: str) -> Camera:
@@ -99,7 +77,6 @@ def write_mask(path: Path, mask: NDArray[np.bool_]) -> None:
     from og_pointcloud.formats.images import require_cv2
 
     png = require_cv2().imencode(".png", mask.astype("uint8") * 255)[1]
-    path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as file:
         file.write(png.tobytes())
 
@@ -127,7 +104,7 @@ def print_pick(report: Mapping[str, Any]) -> None:
     if report["xyz_world"]:
         print(f"hit at {', '.join(f'{value:.6g}' for value in report['xyz_world'])} (point {report['point']})")
     if report["words"]:
-        best = [f"{word['name']} {word['score']:.2f}" for word in report["words"][:SHOWN]]
-        print(f"best words: {', '.join(best)}{', ...' if len(report['words']) > SHOWN else ''}")
+        best = [f"{word['name']} {word['score']:.2f}" for word in report["words"]]
+        print(f"best words: {some_of(best)}")
     if report["mask"]:
         print(f"wrote {report['mask']} ({report['mask_pixels']:,} pixels)")

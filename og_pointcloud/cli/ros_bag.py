@@ -1,4 +1,7 @@
-"""``og-pointcloud ros-bag``: a ROS 2 bag in, the same bag with labels and boxes out."""
+"""Label the clouds of a ROS 2 bag; needs no ROS.
+
+og-pointcloud ros-bag drive -o drive_labelled --scene room.ogpc --labels chair,table
+"""
 
 from __future__ import annotations
 
@@ -10,7 +13,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from og_pointcloud.cli.common import add_command, names_in, print_table
+from og_pointcloud.cli.common import Parser, add_shared, names_in, print_shares
 from og_pointcloud.errors import OgPointcloudError
 
 if TYPE_CHECKING:
@@ -19,16 +22,11 @@ if TYPE_CHECKING:
 SHOWN_REASONS = 3
 
 
-def add(commands: Any) -> None:
-    parser = add_command(
-        commands, "ros-bag", run, "Label the clouds of a ROS 2 bag; needs no ROS.",
-        "og-pointcloud ros-bag drive -o drive_labelled --scene room.ogpc --labels chair,table",
-    )  # fmt: skip
+def add(parser: Parser) -> None:
     parser.add_argument("bag", type=Path, metavar="IN", help="a bag's folder, or one .db3 or .mcap file")
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="OUT", help="the folder to make")
     parser.add_argument("--scene", type=Path, required=True, metavar="S.ogpc", help="what `fit` wrote")
-    parser.add_argument("--labels", metavar="A,B,C", help="names to choose among (default: all that are known)")
-    parser.add_argument("--text-features", type=Path, metavar="F.npz", help="names and vectors, from the same encoder")
+    add_shared(parser, "--labels", "--text-features")
     parser.add_argument(
         "--topic", action="append", metavar="T", help="clouds to label; may be repeated (default: every PointCloud2)"
     )
@@ -70,13 +68,7 @@ def progress_line(stream: Any) -> Callable[[int, int], None]:
 
 
 def print_report(report: BagReport, output: Path, seconds: float) -> None:
-    total = max(report.points, 1)
-    rows = [(name, f"{count:,}", f"{count / total:.1%}") for name, count in report.counts.items() if count]
-    unknown = report.points - report.counts.total()
-    print_table(("label", "points", "share"), [*rows, ("unknown", f"{unknown:,}", f"{unknown / total:.1%}")])
-    reasons = [f"{count:,} {reason}" for reason, count in report.unknown_because.items()]
-    if reasons:
-        print(f"unknown: {', '.join(reasons)}")
+    print_shares(report.counts, report.points - report.counts.total(), report.unknown_because)
     if report.skipped:
         print(f"skipped {report.skipped.total():,} clouds, which have no labels:")
         for reason, count in report.skipped.most_common(SHOWN_REASONS):
@@ -88,5 +80,6 @@ def print_report(report: BagReport, output: Path, seconds: float) -> None:
     )
     print(f"wrote {output}: {', '.join(report.topics.values())}")
     shown = next(iter(report.topics.values()))
-    play = shlex.join(["ros2", "bag", "play", str(output)])
-    print(f"next: {play}, and in RViz a PointCloud2 of {shown}, coloured by rgb")
+    print(
+        f"next: {shlex.join(['ros2', 'bag', 'play', str(output)])}, and in RViz a PointCloud2 of {shown}, coloured by rgb"
+    )

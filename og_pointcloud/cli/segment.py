@@ -1,47 +1,50 @@
-"""``og-pointcloud segment``: points labelled by words."""
+"""Label points by words: those of the fitted cloud, or of another one.
+
+og-pointcloud segment kitchen.ogpc --labels chair,table -o labels.npz
+"""
 
 from __future__ import annotations
 
 import argparse
-import json
-import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from og_pointcloud.cli.common import SHOWN, add_command, calibration_hint, check_outputs, names_in, print_table, timed
+from og_pointcloud.cli.common import (
+    Parser,
+    add_output,
+    add_shared,
+    calibration_hint,
+    names_in,
+    print_next,
+    print_result,
+    print_shares,
+    some_of,
+    timed,
+)  # fmt: skip
 
 if TYPE_CHECKING:
     from og_pointcloud.ask.segmentation import Segmentation
 
+SAVED_AS = (".npz", ".ply", ".las", ".laz", ".glb", ".gltf")
+"""As `og_pointcloud.ask.segmentation.SAVED_AS`; --help does not import numpy."""
 
-def add(commands: Any) -> None:
-    parser = add_command(
-        commands, "segment", run, "Label points by words: those of the fitted cloud, or of another one.",
-        "og-pointcloud segment kitchen.ogpc --labels chair,table -o labels.npz",
-    )  # fmt: skip
-    parser.add_argument("bundle", type=Path, metavar="S.ogpc", help="what `fit` wrote")
-    parser.add_argument("--labels", metavar="A,B,C", help="names to choose among (default: all that are known)")
-    parser.add_argument("--text-features", type=Path, metavar="F.npz", help="names and vectors, from the same encoder")
+
+def add(parser: Parser) -> None:
+    add_shared(parser, "bundle", "--labels", "--text-features", "--json")
     parser.add_argument(
         "--template", action="append", metavar="TEXT",
         help="what names are put into, such as 'a photo of a {}'; several are averaged; needs the text encoder",
     )  # fmt: skip
     parser.add_argument("--negatives", metavar="A,B,C", help="names too, but points that they fit better are unknown")
     parser.add_argument("--points", type=Path, metavar="CLOUD", help="points to label (default: those fitted)")
-    parser.add_argument(
-        "-o", "--output", type=Path, metavar="OUT", help="labels as .npz, or a coloured .ply, .las, .laz or .glb"
-    )
-    parser.add_argument("--json", action="store_true", help="print the counts as JSON")
+    add_output(
+        parser, "-o", "--output", endings=SAVED_AS, metavar="OUT",
+        help="labels as .npz, or a coloured .ply, .las, .laz or .glb",
+    )  # fmt: skip
 
 
 def run(arguments: argparse.Namespace) -> None:
-    from og_pointcloud.ask.segmentation import SAVED_AS
-
-    check_outputs(
-        {"-o": (arguments.output, SAVED_AS)},
-        inputs=[arguments.bundle, arguments.text_features, arguments.points],
-    )
     from og_pointcloud.ask.labelled_scene import load, segment
 
     stages: list[dict[str, Any]] = []
@@ -58,13 +61,9 @@ def run(arguments: argparse.Namespace) -> None:
         )
     if arguments.output:
         with timed(stages, "save"):
-            arguments.output.parent.mkdir(parents=True, exist_ok=True)
             result.save(arguments.output)
     report = describe_segmentation(result, stages, arguments.bundle, arguments.output)
-    if arguments.json:
-        print(json.dumps(report, indent=2, ensure_ascii=False))
-    else:
-        print_segmentation(report)
+    print_result(arguments, report, print_segmentation)
 
 
 def describe_segmentation(
@@ -85,17 +84,10 @@ def describe_segmentation(
 
 def print_segmentation(report: Mapping[str, Any]) -> None:
     """The names that were found, in the order asked, and the share that stays unknown."""
-    total = max(report["points"], 1)
-    found = {name: count for name, count in report["counts"].items() if count}
-    rows = [(name, f"{count:,}", f"{count / total:.1%}") for name, count in found.items()]
-    rows.append(("unknown", f"{report['unknown']:,}", f"{report['unknown'] / total:.1%}"))
-    print_table(("label", "points", "share"), rows)
-    absent = [name for name in report["counts"] if name not in found]
+    print_shares(report["counts"], report["unknown"], report["unknown_because"])
+    absent = [name for name, count in report["counts"].items() if not count]
     if absent:
-        print(f"no point: {', '.join(absent[:SHOWN])}{', ...' if len(absent) > SHOWN else ''}")
-    reasons = [f"{count:,} {reason}" for reason, count in report["unknown_because"].items()]
-    if reasons:
-        print(f"unknown: {', '.join(reasons)}")
+        print(f"no point: {some_of(absent)}")
     if not report["calibrated"]:
         print(
             "not calibrated: every instance gets its best label, however badly it fits. "
@@ -105,5 +97,5 @@ def print_segmentation(report: Mapping[str, Any]) -> None:
     if report["output"]:
         print(f"wrote {report['output']}")
     else:
-        command = ["og-pointcloud", "segment", report["bundle"], "-o", str(Path(report["bundle"]).with_suffix(".ply"))]
-        print(f"next: keep the labels with -o, e.g. {shlex.join(command)}")
+        ply = Path(report["bundle"]).with_suffix(".ply")
+        print_next("segment", report["bundle"], "-o", ply, hint="keep the labels with -o, e.g. ")

@@ -1,84 +1,64 @@
-"""``og-pointcloud vocabulary add | list | bank | carry``: a .ogpc file's words, its word bank, and its text encoder."""
+"""Store words in a .ogpc file, so that asking for them needs no encoder.
+
+og-pointcloud vocabulary add kitchen.ogpc words.txt
+"""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
-from og_pointcloud.cli.common import add_command, check_outputs
+from og_pointcloud.cli.common import Parser, add_command, add_output, replaceable
 from og_pointcloud.errors import OgPointcloudError
 
+if TYPE_CHECKING:
+    from og_pointcloud.cloud import Vocabulary
+    from og_pointcloud.text.encoder import TextEncoder
 
-def add(commands: Any) -> None:
-    parser = add_command(
-        commands, "vocabulary", run_list, "Store words in a .ogpc file, so that asking for them needs no encoder.",
-        "og-pointcloud vocabulary add kitchen.ogpc words.txt",
-    )  # fmt: skip
+
+def add(parser: Parser) -> None:
     actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
-    adding = add_command(
-        actions, "add", run_add, "Store the words of a file, one a line, with their text vectors.",
-        "og-pointcloud vocabulary add kitchen.ogpc words.txt --text-encoder clip-vit-b32",
-    )  # fmt: skip
-    add_bundle(adding, writes=True)
-    adding.add_argument(
-        "words", type=Path, nargs="?", metavar="words.txt", help="one word a line (default: all of --text-features)"
+    runs = (run_add, run_list, run_bank, run_carry)
+    add, listing, bank, carry = (
+        add_command(actions, run.__name__.removeprefix("run_"), run, run.__doc__) for run in runs
     )
-    vectors = adding.add_mutually_exclusive_group()
-    vectors.add_argument("--text-features", type=Path, metavar="F.npz", help="names with their vectors")
-    vectors.add_argument(
-        "--text-encoder", type=Path, metavar="DIR", help="what encodes them (default: the feature space's, if found)"
-    )
-    listing = add_command(
-        actions, "list", run_list, "Print the words, one a line.", "og-pointcloud vocabulary list kitchen.ogpc"
-    )
-    add_bundle(listing, writes=False)
-    banking = add_command(
-        actions, "bank", run_bank, "Store everyday words that labels are judged by: answers become probabilities.",
-        "og-pointcloud vocabulary bank kitchen.ogpc --text-encoder clip-vit-b32",
-    )  # fmt: skip
-    add_bundle(banking, writes=True)
-    source = banking.add_mutually_exclusive_group()
-    source.add_argument(
-        "features", type=Path, nargs="?", metavar="F.npz", help="text features of at least 50 everyday words"
-    )
-    source.add_argument(
-        "--text-encoder", type=Path, metavar="DIR", help="whose bank it is (default: the feature space's, if found)"
-    )
-    carrying = add_command(
-        actions, "carry", run_carry, "Store a text encoder in the file, which then answers any word anywhere.",
-        "og-pointcloud vocabulary carry kitchen.ogpc clip-vit-b32 -o kitchen_any_word.ogpc",
-    )  # fmt: skip
-    add_bundle(carrying, writes=True)
-    carrying.add_argument("encoder", type=Path, metavar="DIR", help="what `og-pointcloud export text` wrote")
-
-
-def add_bundle(parser: argparse.ArgumentParser, writes: bool) -> None:
-    parser.add_argument("bundle", type=Path, metavar="S.ogpc", help="what `fit` wrote")
-    if writes:
-        parser.add_argument("-o", "--output", type=Path, metavar="T.ogpc", help="another file (default: S.ogpc itself)")
+    for action in (add, listing, bank, carry):
+        action.add_argument("bundle", type=replaceable, metavar="S.ogpc", help="what `fit` wrote")
+    for action in (add, bank, carry):
+        add_output(action, "-o", "--output", endings=(".ogpc",), help="another file (default: S.ogpc itself)")
+    add.add_argument("words", type=Path, nargs="?", metavar="words.txt", help="one a line (default: all vectors')")
+    sources = add.add_mutually_exclusive_group(), bank.add_mutually_exclusive_group()
+    sources[0].add_argument("--text-features", type=Path, metavar="F.npz", help="names with their vectors")
+    sources[1].add_argument("features", type=Path, nargs="?", metavar="F.npz", help="of at least 50 everyday words")
+    for source in sources:
+        source.add_argument("--text-encoder", type=Path, metavar="DIR", help="default: the feature space's, if found")
+    carry.add_argument("encoder", type=Path, metavar="DIR", help="what `og-pointcloud export text` wrote")
 
 
 def run_add(arguments: argparse.Namespace) -> None:
-    from og_pointcloud.bundle.read import read_bundle
+    """Store the words of a file, one a line, with their text vectors.
+
+    og-pointcloud vocabulary add kitchen.ogpc words.txt --text-encoder clip-vit-b32
+    """
     from og_pointcloud.bundle.vocabulary import add_words
+    from og_pointcloud.cloud import Vocabulary
     from og_pointcloud.text.everyday import read_words
 
     if arguments.words is None and arguments.text_features is None:
         arguments.parser.error("no words: name a file with one a line, or --text-features F.npz")
-    check_outputs({"-o": (arguments.output, [".ogpc"])}, inputs=[arguments.words, arguments.text_features])
     words = read_words(arguments.words) if arguments.words else None
     if arguments.text_features:
         vocabulary, space = from_features(arguments.text_features, words)
     else:
-        own_space = read_bundle(arguments.bundle).cloud.feature_space
-        vocabulary, space = encoded(words, arguments.text_encoder, own_space, arguments.bundle)
+        encoder = scene_encoder(arguments)
+        vocabulary, space = Vocabulary(words or (), encoder(words or ())), encoder.feature_space
     done = add_words(arguments.bundle, vocabulary, space, arguments.output)
     replaced = f", {done.replaced} with a new vector" if done.replaced else ""
     print(f"wrote {arguments.output or arguments.bundle}: {done.total} words, {done.added} new{replaced}")
 
 
-def from_features(path: Path, words: tuple[str, ...] | None) -> Any:
+def from_features(path: Path, words: tuple[str, ...] | None) -> tuple[Vocabulary, str]:
     """The vocabulary (of some words only, if any are named) and the feature space of a text-features file."""
     from og_pointcloud.cloud import Vocabulary
     from og_pointcloud.text.text_features import read_text_features
@@ -94,20 +74,26 @@ def from_features(path: Path, words: tuple[str, ...] | None) -> Any:
     return Vocabulary(words, vocabulary.vectors[[rows[word] for word in words]]), space
 
 
-def encoded(words: tuple[str, ...] | None, folder: Path | None, own_space: str, bundle: Path) -> Any:
-    """The words as the scene's encoder, or the one in a folder, has them; and its feature space."""
+def scene_encoder(arguments: argparse.Namespace) -> TextEncoder:
+    """The text encoder in --text-encoder, else that of the scene's feature space; FeatureSpaceError for another's."""
+    from og_pointcloud.bundle.read import read_bundle
     from og_pointcloud.bundle.vocabulary import carried_encoder
-    from og_pointcloud.cloud import FeatureSpace, Vocabulary
+    from og_pointcloud.cloud import FeatureSpace
     from og_pointcloud.text.encoder import encoder_for, read_text_encoder
 
-    encoder = read_text_encoder(folder) if folder else encoder_for(own_space, carried_encoder(bundle))
-    FeatureSpace(own_space, 0).require(
-        FeatureSpace(encoder.feature_space, encoder.width), f"texts that {encoder.where} encodes"
-    )
-    return Vocabulary(words or (), encoder(words or ())), encoder.feature_space
+    own = read_bundle(arguments.bundle).cloud.feature_space
+    folder = arguments.text_encoder
+    encoder = read_text_encoder(folder) if folder else encoder_for(own, carried_encoder(arguments.bundle))
+    found = FeatureSpace(encoder.feature_space, encoder.width)
+    FeatureSpace(own, 0).require(found, f"texts that {encoder.where} encodes")
+    return encoder
 
 
 def run_list(arguments: argparse.Namespace) -> None:
+    """Print the words, one a line.
+
+    og-pointcloud vocabulary list kitchen.ogpc
+    """
     from og_pointcloud.bundle.read import read_bundle
 
     vocabulary = read_bundle(arguments.bundle).cloud.vocabulary
@@ -116,17 +102,16 @@ def run_list(arguments: argparse.Namespace) -> None:
 
 
 def run_bank(arguments: argparse.Namespace) -> None:
-    from og_pointcloud.bundle.read import read_bundle
-    from og_pointcloud.bundle.vocabulary import carried_encoder, read_bank, store_bank
-    from og_pointcloud.text.encoder import encoder_for, read_text_encoder
+    """Store everyday words that labels are judged by: answers become probabilities.
 
-    check_outputs({"-o": (arguments.output, [".ogpc"])}, inputs=[arguments.features])
+    og-pointcloud vocabulary bank kitchen.ogpc --text-encoder clip-vit-b32
+    """
+    from og_pointcloud.bundle.vocabulary import read_bank, store_bank
+
     if arguments.features:
         bank, space = read_bank(arguments.features)
     else:
-        own_space = read_bundle(arguments.bundle).cloud.feature_space
-        folder = arguments.text_encoder
-        encoder = read_text_encoder(folder) if folder else encoder_for(own_space, carried_encoder(arguments.bundle))
+        encoder = scene_encoder(arguments)
         if encoder.word_bank is None:
             raise OgPointcloudError(f"{encoder.where} has no word bank: make it again with og-pointcloud export text")
         bank, space = encoder.word_bank, encoder.feature_space
@@ -136,12 +121,13 @@ def run_bank(arguments: argparse.Namespace) -> None:
 
 
 def run_carry(arguments: argparse.Namespace) -> None:
+    """Store a text encoder in the file, which then answers any word anywhere.
+
+    og-pointcloud vocabulary carry kitchen.ogpc clip-vit-b32 -o kitchen_any_word.ogpc
+    """
     from og_pointcloud.bundle.vocabulary import carry_encoder
 
-    check_outputs({"-o": (arguments.output, [".ogpc"])}, inputs=[])
     encoder = carry_encoder(arguments.bundle, arguments.encoder, arguments.output)
     path = arguments.output or arguments.bundle
-    print(
-        f"wrote {path} ({path.stat().st_size / 1e6:.1f} MB): it carries its text encoder ({encoder.precision}, feature "
-        f"space '{encoder.feature_space}')"
-    )
+    size = f"{path.stat().st_size / 1e6:.1f} MB"
+    print(f"wrote {path} ({size}): it carries its text encoder (feature space '{encoder.feature_space}')")
