@@ -329,7 +329,6 @@ def test_bad_use_is_one_error(tmp_path, capsys):
         (["--room", "1;2"], "--room is '1;2'"),
         ([one, "--seeds", "0"], "--seeds is 0; expected at least 1"),
         ([one, "--paper"], "--paper is of --ablation"),
-        ([one, "--schedule-share", "0.1"], "--schedule-share is of --paper"),
         ([one, "--ablation", "--quick"], "--ablation has settings of its own"),
         ([one, "--knob", "colour"], "'colour' is no knob"),
     ):

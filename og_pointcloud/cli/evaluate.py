@@ -1,4 +1,7 @@
-"""``og-pointcloud eval``: scores by the protocols of published tables and of captures, from their own files."""
+"""Score labels against a data set's, or a capture's, own truth.
+
+og-pointcloud eval capture kitchen kitchen.ogpc
+"""
 
 from __future__ import annotations
 
@@ -8,14 +11,14 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from og_pointcloud.cli.common import Parser, add_command, check_outputs, names_in, print_table, write_json
+from og_pointcloud.cli.common import Parser, add_command, add_output, names_in, print_table, replaceable, write_json
 from og_pointcloud.errors import OgPointcloudError
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from og_pointcloud.evaluate.captures import Answer, CaptureScore
+    from og_pointcloud.evaluate.captures import CaptureScore
     from og_pointcloud.evaluate.intervals import BlockInterval, Interval
     from og_pointcloud.evaluate.lerf import PairScore
     from og_pointcloud.evaluate.scannet import SceneScore
@@ -32,63 +35,50 @@ SCANNET_HEADER = (
 )  # fmt: skip
 
 
-def add(commands: Any) -> None:
-    parser = add_command(
-        commands, "eval", None, "Score labels against a data set's, or a capture's, own truth.",
-        "og-pointcloud eval capture kitchen kitchen.ogpc",
-    )  # fmt: skip
+def add(parser: Parser) -> None:
     protocols = parser.add_subparsers(dest="protocol", required=True, metavar="PROTOCOL", parser_class=Parser)
-    capture = add_command(
-        protocols, "capture", run_capture,
-        "A fitted capture against its own gt.npz: labels with their interval, risk against coverage, instances.",
-        "og-pointcloud eval capture kitchen kitchen.ogpc --against kitchen_fast.ogpc --plot risk.png",
+    capture, scannet, lerf = (
+        add_command(protocols, run.__name__.removeprefix("run_"), run, run.__doc__)
+        for run in (run_capture, run_scannet, run_lerf)
+    )
+    add_path(capture, "captures", "CAPTURE", "folders with gt.npz", nargs="+")
+    add_path(capture, "predictions", "S", ".ogpc of the one CAPTURE, or folder with all")
+    add_path(scannet, "folder", "DIR", f"scene folders with <scene>{SCANNET_LABELS}")
+    add_path(scannet, "--predictions", "P", "folder with <scene>.ogpc, or <scene>.npz from `segment -o`", required=True)
+    add_path(scannet, "--gaussians", "G", "folder with <scene>.ply, whose points of opacity below 0.1 are ignored")
+    add_path(lerf, "folder", "DIR", "with <scene>/sparse/0 and label/<scene>/*.json")
+    add_path(lerf, "--predictions", "P", "folder with <scene>.ogpc", required=True)
+    add_path(
+        lerf, "--gaussians", "G", "folder with <scene>.ply, or <scene>/point_cloud/iteration_*/: what was fitted",
+        required=True,
     )  # fmt: skip
-    capture.add_argument("captures", type=Path, nargs="+", metavar="CAPTURE", help="folders with gt.npz")
-    capture.add_argument("predictions", type=Path, metavar="S", help=".ogpc of the one CAPTURE, or folder with all")
-    capture.add_argument("--plot", type=Path, metavar="F.png", help="risk against coverage, a line a scene")
-    scannet = add_command(
-        protocols, "scannet", run_scannet,
-        "ScanNet point segmentation with 19, 15 and 10 classes; unknown counts as wrong, and beside it as abstention.",
-        "og-pointcloud eval scannet scans --predictions fitted --json scores.json",
-    )  # fmt: skip
-    scannet.add_argument("folder", type=Path, metavar="DIR", help=f"scene folders with <scene>{SCANNET_LABELS}")
-    scannet.add_argument("--plot", type=Path, metavar="F.png", help="risk against coverage of the 19 classes")
-    lerf = add_command(
-        protocols, "lerf", run_lerf,
-        "LeRF-OVS: select by text, render the selection, hold it against the outlined objects (mIoU, IoU over 0.25).",
-        "og-pointcloud eval lerf lerf_ovs --predictions fitted --gaussians trained --text-features words.npz",
-    )  # fmt: skip
-    lerf.add_argument("folder", type=Path, metavar="DIR", help="with <scene>/sparse/0 and label/<scene>/*.json")
     lerf.add_argument("--oracle", action="store_true", help="also the best instance there is for each pair (slow)")
-    predictions = {
-        scannet: "folder with <scene>.ogpc, which is asked, or <scene>.npz, from `segment -o` for the labels' points",
-        lerf: "folder with <scene>.ogpc",
-    }
-    gaussians = {
-        scannet: "folder with <scene>.ply, whose points of opacity below 0.1 are ignored",
-        lerf: "folder with <scene>.ply, or <scene>/point_cloud/iteration_*/: what the scenes were fitted from",
-    }
     for data_set in (scannet, lerf):
-        data_set.add_argument("--predictions", type=Path, required=True, metavar="P", help=predictions[data_set])
-        required = data_set is lerf
-        data_set.add_argument("--gaussians", type=Path, metavar="G", required=required, help=gaussians[data_set])
         data_set.add_argument("--scenes", metavar="A,B", help="these scenes (default: all with labels in DIR)")
+    for protocol in (capture, scannet):
+        add_output(protocol, "--plot", endings=(".png",), help="risk against coverage")
     for protocol in (capture, scannet, lerf):
-        protocol.add_argument(
-            "--against", type=Path, metavar="OTHER", help="as the predictions: also the difference, less OTHER, paired"
-        )
-        protocol.add_argument(
-            "--text-features", type=Path, metavar="F.npz",
-            help="names asked and their vectors (default: the capture's text_features.npz, else the scene's own words)",
+        add_path(protocol, "--against", "OTHER", "as the predictions: also the difference, less OTHER, paired")
+        add_path(
+            protocol, "--text-features", "F.npz",
+            "names asked and their vectors (default: the capture's text_features.npz, else the scene's own words)",
         )  # fmt: skip
-        protocol.add_argument("--json", type=Path, metavar="F.json", help="also write every score")
+        add_output(protocol, "--json", endings=(".json",), help="also write every score")
+
+
+def add_path(parser: Parser, name: str, metavar: str, help: str, **settings: Any) -> None:
+    parser.add_argument(name, type=replaceable, metavar=metavar, help=help, **settings)
 
 
 # Captures -------------------------------------------------------------------------------------------------------
 
 
 def run_capture(arguments: argparse.Namespace) -> None:
-    check_files(arguments, inputs=[arguments.text_features, arguments.predictions, arguments.against])
+    """Score a fitted capture against its own gt.npz: labels with their interval, risk, coverage, instances.
+
+    og-pointcloud eval capture kitchen kitchen.ogpc --against kitchen_fast.ogpc --plot risk.png
+    """
+    require_plots(arguments)
     from og_pointcloud.evaluate.captures import ask, difference, score_capture
     from og_pointcloud.evaluate.truth import read_truth
 
@@ -113,7 +103,13 @@ def run_capture(arguments: argparse.Namespace) -> None:
             second = score_capture(other, truth)
             curves[f"{name}, {others[folder].name}"] = second.curve, second.answered_share
         rows.append(capture_cells(name, score, change))
-        report[name] = capture_scores(score, answer, change)
+        report[name] = {
+            **asdict(score),
+            "risk_area": score.curve.area,
+            "spacing": answer.spacing,
+            "less_the_other": asdict(change) if change else None,
+        }
+        del report[name]["curve"]
     print_table(CAPTURE_HEADER + (("less the other",) if against else ()), rows)
     print("unknown counts as wrong; 'answered' leaves it out. The 95 % are over cubes of each scene, not over points:")
     for name, entry in report.items():
@@ -133,20 +129,6 @@ def capture_cells(name: str, score: CaptureScore, change: BlockInterval | None) 
     )  # fmt: skip
 
 
-def capture_scores(score: CaptureScore, answer: Answer, change: BlockInterval | None) -> dict[str, Any]:
-    """All scores of a capture as JSON; shares, not percent."""
-    return {
-        "labels": asdict(score.labels),
-        "interval": asdict(score.interval),
-        "answered": asdict(score.answered),
-        "answered_share": score.answered_share,
-        "risk_area": score.curve.area,
-        "instances": asdict(score.instances) if score.instances else None,
-        "spacing": answer.spacing,
-        "less_the_other": asdict(change) if change else None,
-    }
-
-
 def scene_file(predictions: Path, capture: Path, captures: int) -> Path:
     """The labelled scene of a capture: the file, where there is one capture, or the file of its name in the folder."""
     if predictions.is_dir():
@@ -162,7 +144,11 @@ def scene_file(predictions: Path, capture: Path, captures: int) -> Path:
 
 
 def run_scannet(arguments: argparse.Namespace) -> None:
-    check_files(arguments, inputs=[arguments.text_features])
+    """ScanNet with 19, 15 and 10 classes; unknown counts as wrong, and beside it as abstention.
+
+    og-pointcloud eval scannet scans --predictions fitted --json scores.json
+    """
+    require_plots(arguments)
     from og_pointcloud.evaluate.scannet import SCENES, TASKS, risk_over_scenes
 
     files = scannet_truths(arguments.folder, names_in(arguments.scenes))
@@ -278,7 +264,10 @@ def opacities(folder: Path | None, scene: str, count: int) -> NDArray[np.floatin
 
 
 def run_lerf(arguments: argparse.Namespace) -> None:
-    check_files(arguments, inputs=[arguments.text_features])
+    """LeRF-OVS: select by text, render, compare with the outlined objects (mIoU, IoU over 0.25).
+
+    og-pointcloud eval lerf lerf_ovs --predictions fitted --gaussians trained --text-features words.npz
+    """
     from og_pointcloud.evaluate.intervals import paired_bootstrap
     from og_pointcloud.evaluate.lerf import ORACLE, WAYS, read_scene, scene_names
 
@@ -373,11 +362,8 @@ def gaussians_file(folder: Path, scene: str) -> Path:
 # What the protocols share ---------------------------------------------------------------------------------------
 
 
-def check_files(arguments: argparse.Namespace, inputs: Sequence[Path | None]) -> None:
-    """Refuse outputs that cannot be written before any work is done."""
-    plot = getattr(arguments, "plot", None)
-    check_outputs({"--json": (arguments.json, [".json"]), "--plot": (plot, [".png"])}, inputs)
-    if plot:
+def require_plots(arguments: argparse.Namespace) -> None:
+    if arguments.plot:
         from og_pointcloud.evaluate.plots import require_matplotlib
 
         require_matplotlib()

@@ -1,4 +1,7 @@
-"""``og-pointcloud models``: which mask and word models are here, what a capture needs, and the commands that get it."""
+"""List what is installed, and what a capture needs. Downloads nothing.
+
+og-pointcloud models CAPTURE
+"""
 
 from __future__ import annotations
 
@@ -6,9 +9,8 @@ import argparse
 from collections.abc import Iterator
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
 
-from og_pointcloud.cli.common import add_command, print_table
+from og_pointcloud.cli.common import Parser, print_table
 from og_pointcloud.models import fetched_model, hub_cache
 
 PARTS = (
@@ -32,19 +34,16 @@ USUAL = (
 """What most want first; sizes as published."""
 
 
-def add(commands: Any) -> None:
-    parser = add_command(
-        commands, "models", run, "List what is installed, and what a capture needs. Downloads nothing.",
-        "og-pointcloud models CAPTURE",
-    )  # fmt: skip
+def add(parser: Parser) -> None:
     parser.add_argument("capture", type=Path, nargs="?", metavar="CAPTURE", help="also say what this capture needs")
 
 
 def run(arguments: argparse.Namespace) -> None:
-    rows = []
-    for purpose, modules, extra in PARTS:
-        missing = [module for module in modules if find_spec(module) is None]
-        rows.append((purpose, f"pip install 'og-pointcloud[{extra}]'" if missing else "installed"))
+    missing = {purpose: not all(map(find_spec, modules)) for purpose, modules, _ in PARTS}
+    rows = [
+        (purpose, f"pip install 'og-pointcloud[{extra}]'" if missing[purpose] else "installed")
+        for purpose, _, extra in PARTS
+    ]
     print_table(("part", "state"), rows)
     found = sorted({(kind, name, where) for kind, name, where in found_models()})
     print()
@@ -69,9 +68,7 @@ def found_models() -> Iterator[tuple[str, str, Path]]:
 
     for parent in model_folders():
         for folder in sorted(parent.iterdir()) if parent.is_dir() else ():
-            if (folder / "manifest.json").is_file():
-                yield exported_kind(folder), folder.name, folder
-            elif kind := model_kind(folder):
+            if kind := model_kind(folder):
                 yield kind, folder.name, folder
     for snapshots in sorted(hub_cache().glob("models--*/snapshots")):
         name = snapshots.parent.name.removeprefix("models--").replace("--", "/", 1)
@@ -80,15 +77,13 @@ def found_models() -> Iterator[tuple[str, str, Path]]:
                 yield kind, name, folder
 
 
-def exported_kind(folder: Path) -> str:
-    return "encoder" if (folder / "image_encoder.onnx").is_file() else "words"
-
-
 def model_kind(folder: Path) -> str | None:
-    """What a transformers folder with weights is for, None for one of another kind."""
+    """What an exported encoder, or a transformers folder with weights, is for; None for one of another kind."""
     from og_pointcloud.errors import SceneError
     from og_pointcloud.formats.poses import read_json
 
+    if (folder / "manifest.json").is_file():
+        return "encoder" if (folder / "image_encoder.onnx").is_file() else "words"
     config = folder / "config.json"
     if not config.is_file() or (not any(folder.glob("*.safetensors*")) and not any(folder.glob("*.bin"))):
         return None

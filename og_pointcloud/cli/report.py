@@ -1,4 +1,7 @@
-"""``og-pointcloud report``: error against run time of every setting, on captures and made rooms."""
+"""Every setting that trades error for time, tried: one table, one chart, one page.
+
+og-pointcloud report kitchen shelf --quick -o report
+"""
 
 from __future__ import annotations
 
@@ -9,21 +12,15 @@ import sys
 from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
 
-from og_pointcloud.cli.common import add_command, check_outputs, print_table, require_room
+from og_pointcloud.cli.common import Parser, check_at_least, check_output, print_table, require_room
 from og_pointcloud.errors import MissingExtraError, OgPointcloudError
 
 SHARE = 0.05
-"""Of the published schedule, where --paper names none: the whole of it takes hours on a CPU."""
+"""Of the published schedule, where --paper names none: all of it takes hours on a CPU."""
 
 
-def add(commands: Any) -> None:
-    parser = add_command(
-        commands, "report", run,
-        "Every setting that trades error for time, tried: one table, one chart, one page.",
-        "og-pointcloud report kitchen shelf --quick -o report",
-    )  # fmt: skip
+def add(parser: Parser) -> None:
     parser.add_argument(
         "captures", type=Path, nargs="*", metavar="CAPTURE",
         help="folders; with gt.npz and text_features.npz the error is 1 - mIoU, else 1 - agreement with the masks",
@@ -39,7 +36,7 @@ def add(commands: Any) -> None:
     )
     parser.add_argument("--paper", action="store_true", help="of --ablation: trained by rendering, as published (slow)")
     parser.add_argument(
-        "--schedule-share", type=float, metavar="X", help=f"of --paper: part of its schedule (default: {SHARE})"
+        "--schedule-share", type=float, default=SHARE, metavar="X", help="of --paper: part of its schedule (%(default)s)"
     )
     parser.add_argument(
         "-o", "--output", type=Path, default=Path("out/report"), metavar="DIR",
@@ -52,8 +49,8 @@ def run(arguments: argparse.Namespace) -> None:
     check_options(arguments, rooms)
     stem = output / ("ablation" if arguments.ablation else "report")
     page, rows, picture = (stem.with_suffix(ending) for ending in (".html", ".csv", ".png"))
-    outputs = {"page": (page, [".html"]), "table": (rows, [".csv"]), "chart": (picture, [".png"])}
-    check_outputs(outputs, inputs=captures)
+    for path in (page, rows, picture):
+        check_output("-o", path, captures)
     from og_pointcloud.evaluate.knobs import QUICK, ablations, settings_of
     from og_pointcloud.evaluate.plots import require_matplotlib
     from og_pointcloud.evaluate.sweep import read_subject, sweep, write_rows
@@ -62,7 +59,7 @@ def run(arguments: argparse.Namespace) -> None:
 
     require_matplotlib()
     if arguments.ablation:
-        settings = ablations((arguments.schedule_share or SHARE) if arguments.paper else None)
+        settings = ablations(arguments.schedule_share if arguments.paper else None)
     else:
         settings = settings_of(tuple(arguments.knob) if arguments.knob else QUICK if arguments.quick else None)
     # All are read before the first is worked on: what is missing in the last is told at once.
@@ -75,7 +72,6 @@ def run(arguments: argparse.Namespace) -> None:
             "that has both, or a made room (--room 1)"
         )
     found = sweep(subjects, settings, seeds=arguments.seeds)
-    output.mkdir(parents=True, exist_ok=True)
     write_rows(found.rows, rows)
     with replacing(picture) as file:
         file.write(chart(found))
@@ -92,12 +88,9 @@ def run(arguments: argparse.Namespace) -> None:
 def check_options(arguments: argparse.Namespace, rooms: Sequence[int]) -> None:
     if not arguments.captures and not rooms:
         raise OgPointcloudError("no CAPTURE and no --room; expected at least one, e.g. --room 1")
-    if arguments.seeds < 1:
-        raise OgPointcloudError(f"--seeds is {arguments.seeds}; expected at least 1")
+    check_at_least("--seeds", arguments.seeds, 1)
     if arguments.paper and not arguments.ablation:
         raise OgPointcloudError("--paper is of --ablation; expected both, or neither")
-    if arguments.schedule_share is not None and not arguments.paper:
-        raise OgPointcloudError("--schedule-share is of --paper; expected both, or neither")
     if arguments.ablation and (arguments.knob or arguments.quick):
         raise OgPointcloudError("--ablation has settings of its own; expected no --knob and no --quick beside it")
     names = [folder.absolute().name for folder in arguments.captures]

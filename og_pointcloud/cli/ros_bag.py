@@ -80,6 +80,5 @@ def print_report(report: BagReport, output: Path, seconds: float) -> None:
     )
     print(f"wrote {output}: {', '.join(report.topics.values())}")
     shown = next(iter(report.topics.values()))
-    print(
-        f"next: {shlex.join(['ros2', 'bag', 'play', str(output)])}, and in RViz a PointCloud2 of {shown}, coloured by rgb"
-    )
+    play = shlex.join(["ros2", "bag", "play", str(output)])
+    print(f"next: {play}, and in RViz a PointCloud2 of {shown}, coloured by rgb")
