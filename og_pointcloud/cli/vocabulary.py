@@ -129,5 +129,5 @@ def run_carry(arguments: argparse.Namespace) -> None:
 
     encoder = carry_encoder(arguments.bundle, arguments.encoder, arguments.output)
     path = arguments.output or arguments.bundle
-    size = f"{path.stat().st_size / 1e6:.1f} MB"
-    print(f"wrote {path} ({size}): it carries its text encoder (feature space '{encoder.feature_space}')")
+    kind, size = f"{encoder.precision}, feature space '{encoder.feature_space}'", path.stat().st_size / 1e6
+    print(f"wrote {path} ({size:.1f} MB): it carries its text encoder ({kind})")
