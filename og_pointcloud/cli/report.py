@@ -36,7 +36,11 @@ def add(parser: Parser) -> None:
     )
     parser.add_argument("--paper", action="store_true", help="of --ablation: trained by rendering, as published (slow)")
     parser.add_argument(
-        "--schedule-share", type=float, default=SHARE, metavar="X", help="of --paper: part of its schedule (%(default)s)"
+        "--schedule-share",
+        type=float,
+        default=SHARE,
+        metavar="X",
+        help="of --paper: part of its schedule (%(default)s)",
     )
     parser.add_argument(
         "-o", "--output", type=Path, default=Path("out/report"), metavar="DIR",
