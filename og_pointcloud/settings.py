@@ -147,8 +147,8 @@ class FeatureSettings(_LossSettings):
     start: Literal["masks", "random"] = "masks"
     """Each Gaussian starts at the mean of random directions of its masks, which groups it already; or at a random
     direction of its own (nearly as the authors' code, from U(0, 1))."""
-    closest: float = 0.05
-    """Eq. 2 stops growing where two mask means are nearer than this share of their typical distance."""
+    closest: float = 0.035
+    """Eq. 2 stops growing where two mask means are nearer than this; directions at right angles read 0.71 apart."""
     tolerance: float = 1e-3
     """Converged when the objective fell by less than this share in the last ten steps."""
     max_steps: int = 1000

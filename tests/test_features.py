@@ -226,12 +226,10 @@ def test_gaussians_that_no_mask_shows_get_no_feature() -> None:
     assert (np.abs(learned.features[:36]).sum(axis=1) > 0).all()
 
 
-def test_the_objective_never_rises_in_a_round(tiny: Rendered) -> None:
+def test_the_objective_falls_in_every_step(tiny: Rendered) -> None:
     learned = learn_features(tiny.table)
-    same_round = learned.closest[1:] == learned.closest[:-1]
-    assert same_round.sum() > 20
-    assert (np.diff(learned.objective)[same_round] < 0).all()
-    assert learned.steps == len(learned.closest) - 1
+    assert learned.steps > 10
+    assert (np.diff(learned.objective) < 0).all()
 
 
 def test_same_answer_on_every_run_and_any_number_of_threads(tiny: Rendered) -> None:
@@ -273,7 +271,7 @@ def test_means_that_have_met_separate(apart: float, normalise: bool) -> None:
 def test_a_view_without_two_masks_has_no_separation() -> None:
     learned = learn_features(random_views(mask_counts=(1, 1)).table)
     assert learned.converged
-    assert (learned.separation == 0).all()
+    assert learned.objective[-1] == pytest.approx(0, abs=1e-6)
     assert np.isfinite(learned.features).all()
 
 
@@ -285,19 +283,10 @@ def test_one_mask_of_one_gaussian() -> None:
     assert learned.converged
 
 
-def test_progress_hears_every_step(tiny: Rendered) -> None:
-    heard: list[tuple[int, float]] = []
-    learned = learn_features(tiny.table, progress=lambda step, value: heard.append((step, value)))
-    assert [step for step, _ in heard] == list(range(1, learned.steps + 1))
-    assert [value for _, value in heard] == list(learned.objective[1:])
-
-
 def test_too_few_steps_are_admitted(tiny: Rendered) -> None:
-    first_round = int((np.diff(learn_features(tiny.table).closest) == 0).argmin())
-    for steps in (3, first_round + 1):  # within the first round, and after it had converged
-        learned = learn_features(tiny.table, FeatureSettings(max_steps=steps))
-        assert learned.steps == steps
-        assert not learned.converged
+    learned = learn_features(tiny.table, FeatureSettings(max_steps=3))
+    assert learned.steps == 3
+    assert not learned.converged
 
 
 def test_masks_that_show_nothing_are_refused() -> None:

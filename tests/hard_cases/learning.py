@@ -88,7 +88,7 @@ def equal_means() -> Answer:
 def one_mask_only() -> Answer:
     """A single mask: Eq. 2 has no pair, Eq. 1 is met exactly."""
     learned = learn_features(mask_table_of(np.ones((1, 50)), [0]))
-    return Answer(np.r_[np.ptp(learned.features, axis=0), learned.separation[-1]], np.zeros(7))
+    return Answer(np.r_[np.ptp(learned.features, axis=0), learned.objective[-1]], np.zeros(7))
 
 
 @refuses(

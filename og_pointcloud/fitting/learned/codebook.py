@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
+from scipy.sparse import csc_array, csr_array
 
 from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.fitting.grouping import indicator
@@ -28,12 +28,8 @@ __all__ = [
     "two_level_codebook",
 ]
 
-CHUNKS = 64
-"""Partial sums of `kmeans`: a fixed number, so that the result does not depend on the number of threads."""
 BLOCK = 256
 """Points whose distances are taken side by side."""
-SLACK = np.float32(1e-5)
-"""Distances of values in -1..1 are known to better than this in float32."""
 SEED_POINTS = 1 << 15
 """At most this many of the points are enough to find first centres."""
 STARTS = 4
@@ -161,6 +157,9 @@ def kmeans(
     The same input gives the same answer on any number of threads. Distances are taken about the middle of the values,
     in units of the largest: neither offset nor unit matters.
     """
+    # scikit-learn's KMeans gets to the same spread (within 4 % over seeds) in the same time: 1.2 s of processor time
+    # for 1.3 s in a room of 260,000 points, where mode fast then has mIoU 0.946 to 0.955, here 0.955 to 0.958. It would
+    # bring more packages, and its sums depend on the number of threads. scipy.cluster.vq takes no weights.
     _check(values, weight, centres)
     if len(centres) == 0:
         raise OgPointcloudError("k-means got 0 centres; expected at least one: do all points have weight 0?")
@@ -173,8 +172,7 @@ def kmeans(
     unit = max(float(points.max()), -float(points.min())) or 1.0
     points /= np.float32(unit)
     moving = (centres.astype(np.float64) - middle) / unit
-    own, upper, lower = np.zeros(n, np.int32), np.full(n, np.inf, np.float32), np.zeros(n, np.float32)
-    _reassign(points, moving.astype(np.float32), np.zeros(len(moving), np.float32), own, upper, lower)
+    own = _nearest(points, moving.astype(np.float32))
     for _ in range(rounds):
         sums, mass = _cluster_sums(points, weight, own, len(moving))
         filled = mass > 0
@@ -182,11 +180,10 @@ def kmeans(
         moved[filled] = sums[filled] / mass[filled, None]
         if reseed and not filled.all():
             moved = _reseeded(points, weight, own, moved, np.flatnonzero(~filled))
-        shift = np.linalg.norm(moved.astype(np.float32) - moving.astype(np.float32), axis=1)
-        moving = moved
-        if not shift.any():
+        if np.array_equal(moved.astype(np.float32), moving.astype(np.float32)):
             break
-        _reassign(points, moving.astype(np.float32), shift, own, upper, lower)
+        moving = moved
+        own = _nearest(points, moving.astype(np.float32))
     return own, (moving * unit + middle).astype(np.float32)
 
 
@@ -245,9 +242,16 @@ def _scaled_positions(xyz: NDArray[np.float32], settings: CodebookSettings) -> N
 def _means(
     values: NDArray[np.float32], weight: NDArray[np.float64], own: NDArray[np.int32], count: int
 ) -> NDArray[np.float32]:
-    columns = [np.bincount(own, weight * column, count) for column in values.T]
-    mass = np.bincount(own, weight, count)
-    return (np.stack(columns, axis=1) / mass[:, None]).astype(np.float32)
+    sums, mass = _cluster_sums(values, weight, own, count)
+    return (sums / mass[:, None]).astype(np.float32)
+
+
+def _cluster_sums(
+    values: NDArray[np.float32], weight: NDArray[np.float64], own: NDArray[np.int32], count: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Weighted sum of the values (count, d) and weight (count,) of every cluster, in float64."""
+    membership = csc_array((weight, own, np.arange(len(own) + 1)), shape=(count, len(own)))
+    return membership @ values, np.bincount(own, weight, count)
 
 
 def _check(values: NDArray[np.floating], weight: NDArray[np.floating], centres: NDArray[np.floating]) -> None:
@@ -283,70 +287,31 @@ def _reseeded(
     return centres
 
 
-@njit(cache=True, fastmath={"contract"})
-def _two_nearest(points, block, centres, own, upper, lower):  # noqa: ANN001, ANN202
-    """Set own centre, its distance and the second nearest's for the points listed in ``block``.
-
-    Points side by side, without branches: the compiler makes vector code of that.
-    """
-    size, d = len(block), points.shape[1]
-    columns = np.empty((d, size), np.float32)
-    for b in range(size):
-        for i in range(d):
-            columns[i, b] = points[block[b], i]
-    best = np.zeros(size, np.int32)
-    first, second = np.full(size, np.float32(np.inf)), np.full(size, np.float32(np.inf))
-    squared = np.empty(size, np.float32)
-    for j in range(len(centres)):
-        squared[:] = 0.0
-        for i in range(d):
-            value, column = centres[j, i], columns[i]
-            for b in range(size):
-                difference = column[b] - value
-                squared[b] += difference * difference
-        for b in range(size):
-            this, least, next_least = squared[b], first[b], second[b]
-            nearer = this < least
-            loser = least if nearer else this
-            second[b] = loser if loser < next_least else next_least
-            best[b] = np.int32(j) if nearer else best[b]
-            first[b] = this if nearer else least
-    for b in range(size):
-        own[block[b]], upper[block[b]], lower[block[b]] = best[b], np.sqrt(first[b]), np.sqrt(second[b])
-
-
-@njit(cache=True, parallel=True)
-def _reassign(points, centres, shift, own, upper, lower):  # noqa: ANN001, ANN202
-    """Nearest centres after these have moved by ``shift``, in place.
-
-    upper, lower: at least the distance to the own centre, at most that to any other. A point whose own centre is surely
-    still the nearest is not looked at (Hamerly 2010).
-    """
-    n = len(points)
-    farthest = shift.max()
-    for chunk in prange(CHUNKS):
-        block, size = np.empty(BLOCK, np.int32), 0
-        for p in range(chunk * n // CHUNKS, (chunk + 1) * n // CHUNKS):
-            upper[p] += shift[own[p]]
-            lower[p] -= farthest
-            if upper[p] >= lower[p] - SLACK:
-                block[size] = p
-                size += 1
-            if size == BLOCK:
-                _two_nearest(points, block, centres, own, upper, lower)
-                size = 0
-        _two_nearest(points, block[:size], centres, own, upper, lower)
-
-
-@njit(cache=True, parallel=True)
-def _cluster_sums(points, weight, own, k):  # noqa: ANN001, ANN202
-    """Weighted sum (k, d) and weight (k,) of every cluster in float64, in an order that threads do not change."""
+@njit(cache=True, parallel=True, fastmath={"contract"})
+def _nearest(points, centres):  # noqa: ANN001, ANN202
+    """(n,) int32: the centre nearest to each point (n, d), the lowest of equals."""
     n, d = points.shape
-    sums = np.zeros((CHUNKS, k, d))
-    mass = np.zeros((CHUNKS, k))
-    for chunk in prange(CHUNKS):
-        for p in range(chunk * n // CHUNKS, (chunk + 1) * n // CHUNKS):
-            mass[chunk, own[p]] += weight[p]
+    nearest = np.zeros(n, np.int32)
+    for block in prange((n + BLOCK - 1) // BLOCK):
+        begin, end = block * BLOCK, min((block + 1) * BLOCK, n)
+        size = end - begin
+        # Points side by side, without branches: the compiler makes vector code of the loops over b.
+        columns = np.empty((d, size), np.float32)
+        for b in range(size):
             for i in range(d):
-                sums[chunk, own[p], i] += weight[p] * points[p, i]
-    return sums.sum(axis=0), mass.sum(axis=0)
+                columns[i, b] = points[begin + b, i]
+        best, least = np.zeros(size, np.int32), np.full(size, np.float32(np.inf))
+        squared = np.empty(size, np.float32)
+        for j in range(len(centres)):
+            squared[:] = 0.0
+            for i in range(d):
+                value, column = centres[j, i], columns[i]
+                for b in range(size):
+                    difference = column[b] - value
+                    squared[b] += difference * difference
+            for b in range(size):
+                nearer = squared[b] < least[b]
+                best[b] = np.int32(j) if nearer else best[b]
+                least[b] = squared[b] if nearer else least[b]
+        nearest[begin:end] = best
+    return nearest

@@ -8,7 +8,7 @@ follow from two sparse products, ``A F`` for the value and ``A' G`` for the grad
 
 ``L_c``, inter-mask contrast (Eq. 2), over the pairs i != j of a view's m masks. A view without two masks has none.
     paper    1 / (m (m - 1)) sum of 1 / (d_ij^2 + e^2). The printed form has e = 0 and is infinite where two means
-             meet; here e is `FeatureSettings.closest` of the typical distance, reached from 1 in steps of 4.
+             meet; here e is `FeatureSettings.closest`.
     authors  the same with e = 1; pair ij also counts 0.1 + 0.9 r / (m - 1), r the rank of j by nearness to i. (Their
              change of these weights late in training has no counterpart without a step count.)
 ``L_s``, intra-mask smoothness (Eq. 1), asked of every Gaussian that shows in a mask instead of the rendered pixels. N_i
@@ -27,7 +27,6 @@ With raw features the weight sets the features' scale only: Eq. 1 grows as its s
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -53,10 +52,6 @@ COHESION_WEIGHT = {"paper": 10.0, "authors": 0.1}
 """Of Eq. 1 where none is set: the authors' own, and one that weighs squares, which are that much smaller, alike."""
 ROUNDING = 1e-3
 """Distances are rounded off below this where they are not squared: sqrt(d^2 + ROUNDING^2)."""
-HOMOTOPY = 4.0
-"""The closest distance that Eq. 2 tells apart shrinks by this factor between rounds."""
-COARSE_TOLERANCE = 10.0
-"""Rounds before the last need not converge as far, by this factor."""
 WINDOW = 10
 """Steps over which the fall of the objective is measured."""
 LEVEL = 0.01
@@ -65,8 +60,8 @@ MEMORY = 6
 """Steps remembered by L-BFGS (Nocedal & Wright 2006, Sec. 7.2; 3 to 20 are usual)."""
 DOT_PART = 8192
 """Length of the partial sums of dot products, each in float32."""
-REACH = 0.5
-"""No feature moves farther than this in a step; they lie on, or in, the unit ball."""
+FIRST_REACH = 0.5
+"""How far the first step, of which nothing is known, moves the feature that it moves most."""
 SUFFICIENT = 1e-4
 """Armijo's share of the fall that the slope promises (Nocedal & Wright, Eq. 3.4)."""
 HALVINGS = 20
@@ -75,6 +70,9 @@ KICK = 0.1
 """Where two means have met, mask-wise random directions of this length are added."""
 MET = 1e-3
 """Means nearer than this have met. (Features lie on, or in, the unit ball.)"""
+
+Pair = tuple[NDArray[np.float32], NDArray[np.float32], float]
+"""A step, the change of the gradient along it, and their product."""
 
 
 @dataclass(frozen=True)
@@ -94,17 +92,13 @@ class LearnedFeatures:
 
     features: (n, width) float32 as read (see `read_features`); rows of zeros where no mask sees the Gaussian.
     seen: (n,) float64, pixels of blending weight in masks; 0: the feature says nothing.
-    objective, separation, cohesion: (steps + 1,) float64, before the first and after every step.
-    closest: (steps + 1,) float64, the distance below which Eq. 2 was bounded. The objective falls while it is constant.
+    objective: (steps + 1,) float64, before the first and after every step; it falls in each.
     converged: False where `FeatureSettings.max_steps` came first.
     """
 
     features: NDArray[np.float32]
     seen: NDArray[np.float64]
     objective: NDArray[np.float64]
-    separation: NDArray[np.float64]
-    cohesion: NDArray[np.float64]
-    closest: NDArray[np.float64]
     converged: bool
 
     @property
@@ -119,17 +113,13 @@ def learn_features(
     seed: int = 0,
     *,
     start: NDArray[np.floating] | None = None,
-    progress: Callable[[int, float], None] | None = None,
 ) -> LearnedFeatures:
     """Features that agree within masks and differ between the masks of a view, by L-BFGS on all views at once.
 
     start: (n, width), not yet read; else `FeatureSettings.start` says where each Gaussian starts, seeded. Where two
-        means of a view have met, the gradient vanishes by symmetry: random directions of the masks then part them.
-    progress: called after each step with its number and the objective.
+    means of a view have met, the gradient vanishes by symmetry: random directions of the masks then part them.
 
-    Steps are preconditioned by each Gaussian's visible weight, shortened until the objective falls enough, and no
-    feature moves farther than REACH in one. The same input and seed give the same features. Raises SceneError if no
-    mask shows a Gaussian.
+    The same input and seed give the same features. Raises SceneError if no mask shows a Gaussian.
     """
     settings = settings or FeatureSettings()
     problem = FeatureObjective(table, settings)
@@ -139,19 +129,15 @@ def learn_features(
     if start is None and settings.start == "random":
         start = rng.normal(size=(table.weights.shape[1], settings.width))
     if start is None:
-        begin = directions / np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-6)
+        raw = directions / np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-6)
     else:
-        begin = np.array(start, np.float32)[problem.shown]
-        if settings.inter and problem.have_met(read_features(begin, settings.normalise)):
-            begin += KICK * directions
-    descent = _Descent(problem, begin, progress)
-    for share in _closest_shares(settings):
-        typical = problem.typical_distance(read_features(descent.raw, settings.normalise))
-        descent.run(share * typical, last=share == settings.closest)
+        raw = np.array(start, np.float32)[problem.shown]
+        if settings.inter and problem.have_met(read_features(raw, settings.normalise)):
+            raw += KICK * directions
+    raw, objective, converged = _minimise(problem, raw)
     features = np.zeros((table.weights.shape[1], settings.width), np.float32)
-    features[problem.shown] = read_features(descent.raw, settings.normalise)
-    objective, separation, cohesion, closest = np.array(descent.history).T
-    return LearnedFeatures(features, problem.seen, objective, separation, cohesion, closest, descent.converged)
+    features[problem.shown] = read_features(raw, settings.normalise)
+    return LearnedFeatures(features, problem.seen, np.array(objective), converged)
 
 
 def read_features(raw: NDArray[np.floating], normalise: bool) -> NDArray[np.floating]:
@@ -166,14 +152,6 @@ def read_features(raw: NDArray[np.floating], normalise: bool) -> NDArray[np.floa
 def raw_gradient(raw: NDArray[np.floating], gradient: NDArray[np.floating], normalise: bool) -> NDArray[np.floating]:
     """The gradient by raw features (n, width), of the one by what `read_features` makes of them."""
     return _raw_gradient(raw, gradient, normalise, _columns(raw))
-
-
-def _closest_shares(settings: FeatureSettings) -> list[float]:
-    """Shares of the typical distance below which Eq. 2 is bounded, from the easiest problem to the one asked for."""
-    shares = [settings.closest]
-    while settings.inter and settings.formula == "paper" and shares[0] < 1:
-        shares.insert(0, min(1.0, shares[0] * HOMOTOPY))
-    return shares
 
 
 def cohesion_factor(settings: FeatureSettings | PaperSettings) -> float:
@@ -222,14 +200,9 @@ class FeatureObjective:
         """(k, width): the mean of rows of masks, by how much each shows of a Gaussian."""
         return (_product(*_arrays(self._transposed), of_masks, _columns(of_masks)) / self.weight).astype(np.float32)
 
-    def typical_distance(self, features: NDArray[np.floating]) -> float:
-        """Root mean square distance between the mask means of a view, over all pairs; 1 where there is no pair."""
-        squares, pairs, _ = _pair_distances(self.mask_means(features), self._first)
-        return float(np.sqrt(squares / pairs)) if pairs and squares > 0 else 1.0
-
     def have_met(self, features: NDArray[np.floating]) -> bool:
         """Whether two mask means of a view are too near to be told apart by the gradient of Eq. 2."""
-        return _pair_distances(self.mask_means(features), self._first)[2] <= MET**2
+        return _nearest_pair(self.mask_means(features), self._first) <= MET**2
 
     def terms(self, features: NDArray[np.floating], closest: float) -> Terms:
         """Both losses at features (k, width) as read; formula "paper": Eq. 2 bounded below the distance ``closest``."""
@@ -263,110 +236,80 @@ class FeatureObjective:
         return float(spread / total), 2 / total * blended, -2 / total * self._size[:, None] * means
 
 
-class _Descent:
-    """Limited-memory BFGS with a diagonal preconditioner, a bound on each feature's step, and backtracking."""
+def _minimise(problem: FeatureObjective, raw: NDArray[np.float32]) -> tuple[NDArray[np.float32], list[float], bool]:
+    """Raw features where the objective hardly falls any more, its values on the way, and whether it was reached.
 
-    def __init__(
-        self, problem: FeatureObjective, raw: NDArray[np.float32], progress: Callable[[int, float], None] | None
-    ) -> None:
-        self.problem, self.raw, self.progress = problem, np.ascontiguousarray(raw), progress
-        self.history: list[tuple[float, float, float, float]] = []
-        self.converged = False
+    Limited-memory BFGS with backtracking, preconditioned by each Gaussian's visible weight.
+    """
+    # scipy's L-BFGS-B, in the same variables, gets to the same minimum (objective within 0.1 %, mIoU of mode fast
+    # 0.944 to 0.937..0.951 over seeds in a room of 260,000 points) in 3 to 13 times the time: 11.6 s for 2.5 s there,
+    # 2.9 s for 0.13 s with 103,000 points. It holds all in float64, and its sums depend on the number of threads.
+    settings, pairs = problem.settings, list[Pair]()
+    value, gradient = _value_and_gradient(problem, raw)
+    values = [value]
+    while len(values) <= settings.max_steps:
+        step = -gradient / problem.weight
+        if pairs:
+            step = _two_loops(gradient, pairs, np.float32(1) / problem.weight)
+        elif longest := float(np.linalg.norm(step, axis=1).max()):
+            step *= np.float32(FIRST_REACH / longest)
+        moved = _backtracked(problem, raw, step, values[-1], _dot(step, gradient))
+        if moved is None and pairs:
+            pairs.clear()  # the remembered curvature misled: try the plain gradient before giving up
+            continue
+        if moved is None:
+            return raw, values, True  # no step lowers the objective by more than rounding
+        new_raw, value, new_gradient = moved
+        _remember(pairs, new_raw - raw, new_gradient - gradient)
+        raw, gradient = new_raw, new_gradient
+        values.append(value)
+        least = settings.tolerance * max(value, LEVEL * values[0])
+        if len(values) > WINDOW and values[-1 - WINDOW] - value < least:
+            return raw, values, True
+    return raw, values, False
 
-    def run(self, closest: float, *, last: bool) -> None:
-        """Descend until the objective hardly falls. ``closest`` changes the objective, so curvature is forgotten."""
-        settings = self.problem.settings
-        tolerance = settings.tolerance * (1 if last else COARSE_TOLERANCE)
-        pairs: list[tuple[NDArray[np.float32], NDArray[np.float32], float]] = []
-        value, gradient = self._evaluate(self.raw, closest)
-        values = [value.objective]
-        if not self.history:
-            self.history.append((value.objective, value.separation, value.cohesion, closest))
-        while len(self.history) <= settings.max_steps:
-            step = self._step(gradient, pairs)
-            moved = self._backtrack(step, gradient, values[-1], closest)
-            if moved is None and pairs:
-                pairs.clear()  # the remembered curvature misled: try the plain gradient before giving up
-                continue
-            if moved is None:
-                self.converged = last  # no step lowers the objective by more than rounding
-                return
-            raw, value, new_gradient = moved
-            _remember(pairs, raw - self.raw, new_gradient - gradient)
-            self.raw, gradient = raw, new_gradient
-            values.append(value.objective)
-            self.history.append((value.objective, value.separation, value.cohesion, closest))
-            if self.progress:
-                self.progress(len(self.history) - 1, value.objective)
-            least = tolerance * max(values[-1], LEVEL * self.history[0][0])
-            if len(values) > WINDOW and values[-1 - WINDOW] - values[-1] < least:
-                self.converged = last
-                return
 
-    def _evaluate(self, raw: NDArray[np.float32], closest: float) -> tuple[Terms, NDArray[np.float32]]:
-        normalise = self.problem.settings.normalise
-        terms = self.problem.terms(read_features(raw, normalise), closest)
-        return terms, raw_gradient(raw, terms.gradient, normalise)
+def _value_and_gradient(problem: FeatureObjective, raw: NDArray[np.float32]) -> tuple[float, NDArray[np.float32]]:
+    settings = problem.settings
+    terms = problem.terms(read_features(raw, settings.normalise), settings.closest)
+    return terms.objective, raw_gradient(raw, terms.gradient, settings.normalise)
 
-    def _step(
-        self, gradient: NDArray[np.float32], pairs: list[tuple[NDArray[np.float32], NDArray[np.float32], float]]
-    ) -> NDArray[np.float32]:
-        """A direction of descent that moves no feature farther than REACH."""
-        steepest = -gradient / self.problem.weight
-        if not pairs:
-            longest = float(np.linalg.norm(steepest, axis=1).max())
-            return steepest * np.float32(REACH / longest if longest > 0 else 0)
-        step = _within_reach(_two_loops(gradient, pairs, np.float32(1) / self.problem.weight))
-        # Shortening single rows can turn a direction of descent; rows of the gradient itself cannot turn.
-        return step if _dot(step, gradient) < 0 else _within_reach(steepest)
 
-    def _backtrack(
-        self, step: NDArray[np.float32], gradient: NDArray[np.float32], value: float, closest: float
-    ) -> tuple[NDArray[np.float32], Terms, NDArray[np.float32]] | None:
-        slope = _dot(step, gradient)
-        length = 1.0
-        for _ in range(HALVINGS):
-            raw = self.raw + np.float32(length) * step
-            terms, raw_gradient = self._evaluate(raw, closest)
-            if terms.objective < value + SUFFICIENT * length * slope:
-                return raw, terms, raw_gradient
-            length /= 2
-        return None
+def _backtracked(
+    problem: FeatureObjective, raw: NDArray[np.float32], step: NDArray[np.float32], value: float, slope: float
+) -> tuple[NDArray[np.float32], float, NDArray[np.float32]] | None:
+    """Features, value and gradient after the step, halved until the value falls enough; None where it never does."""
+    for halving in range(HALVINGS):
+        length = 0.5**halving
+        moved = raw + np.float32(length) * step
+        new_value, gradient = _value_and_gradient(problem, moved)
+        if new_value < value + SUFFICIENT * length * slope:
+            return moved, new_value, gradient
+    return None
 
 
 def _two_loops(
-    gradient: NDArray[np.float32],
-    pairs: list[tuple[NDArray[np.float32], NDArray[np.float32], float]],
-    preconditioner: NDArray[np.float32],
+    gradient: NDArray[np.float32], pairs: list[Pair], preconditioner: NDArray[np.float32]
 ) -> NDArray[np.float32]:
     """Minus the remembered inverse Hessian times the gradient (Nocedal & Wright, Algorithm 7.4)."""
     direction = -gradient
     shares = []
     for moved, turned, curvature in reversed(pairs):
-        share = _dot(moved, direction) / curvature
-        shares.append(share)
-        _add(direction, np.float32(-share), turned)
+        shares.append(_dot(moved, direction) / curvature)
+        direction -= np.float32(shares[-1]) * turned
     _, turned, curvature = pairs[-1]
     direction *= preconditioner * np.float32(curvature / _dot(turned, turned * preconditioner))
     for (moved, turned, curvature), share in zip(pairs, reversed(shares), strict=True):
-        _add(direction, np.float32(share - _dot(turned, direction) / curvature), moved)
+        direction += np.float32(share - _dot(turned, direction) / curvature) * moved
     return direction
 
 
-def _remember(
-    pairs: list[tuple[NDArray[np.float32], NDArray[np.float32], float]],
-    moved: NDArray[np.float32],
-    turned: NDArray[np.float32],
-) -> None:
+def _remember(pairs: list[Pair], moved: NDArray[np.float32], turned: NDArray[np.float32]) -> None:
     """Keep a step and its change of gradient, unless the objective curved downward or hardly at all along it."""
     curvature = _dot(moved, turned)
     if curvature > 1e-6 * np.sqrt(_dot(moved, moved) * _dot(turned, turned)):
         pairs.append((moved, turned, curvature))
         del pairs[:-MEMORY]
-
-
-def _within_reach(step: NDArray[np.float32]) -> NDArray[np.float32]:
-    return step * np.minimum(1, REACH / np.maximum(np.linalg.norm(step, axis=1, keepdims=True), REACH))
 
 
 def _dot(a: NDArray[np.float32], b: NDArray[np.float32]) -> float:
@@ -435,28 +378,15 @@ def _raw_gradient(raw, gradient, normalise, columns):  # noqa: ANN001, ANN202
     return pulled
 
 
-@njit(cache=True, parallel=True)
-def _add(values, factor, others):  # noqa: ANN001, ANN202
-    """values += factor * others, in place; factor float32."""
-    values, others = values.ravel(), others.ravel()
-    for i in prange(len(values)):
-        values[i] += factor * others[i]
-
-
 @njit(cache=True)
-def _pair_distances(means, first):  # noqa: ANN001, ANN202
-    """Sum of squared distances over the pairs of each view, number of pairs, smallest squared distance."""
-    total, pairs, nearest = 0.0, 0, np.inf
+def _nearest_pair(means, first):  # noqa: ANN001, ANN202
+    """The smallest squared distance between two means of one view."""
+    nearest = np.inf
     for view in range(len(first) - 1):
         for i in range(first[view], first[view + 1]):
             for j in range(first[view], i):
-                square = 0.0
-                for c in range(means.shape[1]):
-                    square += (means[i, c] - means[j, c]) ** 2
-                total += square
-                pairs += 1
-                nearest = min(nearest, square)
-    return total, pairs, nearest
+                nearest = min(nearest, ((means[i] - means[j]) ** 2).sum())
+    return nearest
 
 
 @njit(cache=True)
