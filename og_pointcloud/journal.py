@@ -130,8 +130,8 @@ class Journal:
         return tqdm(items, desc=f"{name:<12}", leave=False, dynamic_ncols=True, disable=None)
 
     @contextmanager
-    def bars(self) -> Iterator[Callable[[str, int, int], None] | None]:
-        """A function to call with a stage's name, the step just done and the number of steps: one bar per stage."""
+    def bars(self) -> Iterator[Callable[[str, int, int, float], None] | None]:
+        """A function to call with a stage's name, the step just done, the number of steps and the loss: a bar each."""
         if not self.progress:
             yield None
             return
@@ -139,9 +139,10 @@ class Journal:
 
         bars: dict[str, Any] = {}
 
-        def report(name: str, step: int, steps: int) -> None:
+        def report(name: str, step: int, steps: int, loss: float) -> None:
             if name not in bars:
                 bars[name] = tqdm(total=steps, desc=f"{name:<16}", leave=False, dynamic_ncols=True, disable=None)
+            bars[name].set_postfix(loss=f"{loss:.3g}", refresh=False)
             bars[name].update(step - bars[name].n)
 
         try:

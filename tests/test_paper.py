@@ -7,6 +7,8 @@ import subprocess
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,6 +18,7 @@ from scenes import TinyCapture
 from og_pointcloud.errors import OgPointcloudError, SceneError
 from og_pointcloud.fitting.fit import prepare
 from og_pointcloud.fitting.mask_table import Gaussians, pixel_weights
+from og_pointcloud.fitting.work_folder import WorkFolder
 from og_pointcloud.formats.capture import read_capture
 from og_pointcloud.scene import View
 from og_pointcloud.settings import PaperSettings
@@ -153,13 +156,15 @@ def test_both_stages_part_the_balls(balls: Balls, settings: PaperSettings) -> No
 
 def test_training_is_repeatable_and_does_not_depend_on_what_is_kept(balls: Balls) -> None:
     settings = replace(SHORT, schedule_share=0.001)
-    first = paper.train_features(balls.gaussians, balls.views, NEAR, settings, seed=2)
-    uncached = paper.train_features(balls.gaussians, balls.views, NEAR, replace(settings, cache_bytes=0), seed=2)
+    first = paper.train_features(balls.gaussians, balls.views, NEAR, settings, paper.TrainingRun(seed=2))
+    uncached = paper.train_features(
+        balls.gaussians, balls.views, NEAR, replace(settings, cache_bytes=0), paper.TrainingRun(seed=2)
+    )
     np.testing.assert_array_equal(first.features, uncached.features)
-    other = paper.train_features(balls.gaussians, balls.views, NEAR, settings, seed=3)
+    other = paper.train_features(balls.gaussians, balls.views, NEAR, settings, paper.TrainingRun(seed=3))
     assert np.abs(other.features - first.features).max() > 0.1
     books = [
-        paper.train_codebook(balls.gaussians, balls.views, NEAR, first.features, each, seed=2)
+        paper.train_codebook(balls.gaussians, balls.views, NEAR, first.features, each, paper.TrainingRun(seed=2))
         for each in (settings, replace(settings, cache_bytes=0))
     ]
     np.testing.assert_array_equal(books[0].leaf, books[1].leaf)
@@ -199,9 +204,10 @@ def test_a_codebook_step_moves_features_by_the_gradient_of_their_centres(balls: 
         source, torch.from_numpy(features.copy()), known, settings, np.random.default_rng(0)
     )
     history = paper.StageHistory("coarse codebook", 20_000, 0)
+    parts = paper._Parts([np.arange(len(known))], [4], nothing)
     start = features[known[:4]]
     own, centres = paper.kmeans(features[known], np.ones(len(known)), start, settings.lloyd_rounds, reseed=True)
-    training.run(history, start, [np.arange(len(known))], nothing, 1, None)
+    training.train(history, start, parts, paper.TrainingRun(), "")
 
     weights, quantised = source[0].weights.astype(np.float64), features.astype(np.float64)
     quantised[known] = centres[own]
@@ -246,11 +252,67 @@ def test_more_clusters_than_gaussians(balls: Balls) -> None:
     assert book.centres.shape == (64 * 3, 6)
 
 
-def test_progress_names_stage_step_and_total(balls: Balls) -> None:
-    heard: list[tuple[str, int, int]] = []
+class Killed(Exception):
+    """In place of a kill."""
+
+
+@pytest.mark.parametrize("stop", [("features", 7), ("coarse codebook", 13), ("fine codebook", 20), ("end", 0)])
+def test_a_killed_training_continues_and_ends_with_the_same_bits(
+    balls: Balls, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stop: tuple[str, int]
+) -> None:
+    """With a checkpoint after every fifth step, and reassignments between them."""
+    settings = replace(SHORT, schedule_share=0.001, coarse_interval=6, fine_interval=6)
+    calls, keep = itertools.count(), WorkFolder.replace
+    monkeypatch.setattr(paper, "CHECKPOINT_SECONDS", 0)
+    monkeypatch.setattr(WorkFolder, "replace", lambda *given: next(calls) % 5 or keep(*given))
+
+    def train(work: WorkFolder | None, stop: tuple[str, int] | None = None) -> tuple[Any, Any]:
+        def progress(name: str, step: int, _count: int, _loss: float) -> None:
+            if (name, step) == stop:
+                raise Killed
+
+        run = paper.TrainingRun(3, progress, work)
+        trained = paper.train_features(balls.gaussians, balls.views, NEAR, settings, run)
+        book = paper.train_codebook(balls.gaussians, balls.views, NEAR, trained.features, settings, run)
+        if stop == ("end", 0):
+            raise Killed
+        return trained, book
+
+    expected, expected_book = train(None)
+    with pytest.raises(Killed), WorkFolder.open(tmp_path / "work") as work:
+        train(work, stop)
+    with WorkFolder.open(tmp_path / "work") as work:
+        resumed, book = train(work)
+    stages, expected_stages = (
+        {stage.name: stage for stage in (a.history, *b.histories)}
+        for a, b in ((resumed, book), (expected, expected_book))
+    )
+    assert 0 < stages.get(stop[0], stages["features"]).resumed_at < 20
+    assert all(stages[name].loss == stage.loss for name, stage in expected_stages.items())
+    np.testing.assert_array_equal(resumed.features, expected.features)
+    np.testing.assert_array_equal(book.leaf, expected_book.leaf)
+    np.testing.assert_array_equal(book.centres, expected_book.centres)
+    assert not (tmp_path / "work").exists()
+
+
+def test_checkpoints_of_other_settings_or_seeds_are_not_taken(balls: Balls, tmp_path: Path) -> None:
+    settings = replace(SHORT, schedule_share=0.0005)
+    with WorkFolder.open(tmp_path / "work") as work:
+        for each, seed in ((settings, 0), (settings, 1), (replace(settings, feature_rate=0.02), 0), (settings, 0)):
+            run = paper.TrainingRun(seed, work=work)
+            trained = paper.train_features(balls.gaussians, balls.views, NEAR, each, run)
+            alone = paper.train_features(balls.gaussians, balls.views, NEAR, each, paper.TrainingRun(seed))
+            np.testing.assert_array_equal(trained.features, alone.features)
+        assert trained.history.resumed_at == trained.history.steps == 10
+
+
+def test_progress_names_stage_step_total_and_loss(balls: Balls) -> None:
+    heard: list[tuple[str, int, int, float]] = []
     settings = replace(SHORT, schedule_share=0.0002, schedule="lerf")
-    trained = paper.train_features(balls.gaussians, balls.views, NEAR, settings, progress=lambda *a: heard.append(a))
-    assert heard == [("features", 1, 2), ("features", 2, 2)]
+    run = paper.TrainingRun(progress=lambda *a: heard.append(a))
+    trained = paper.train_features(balls.gaussians, balls.views, NEAR, settings, run)
+    assert [row[:3] for row in heard] == [("features", 1, 2), ("features", 2, 2)]
+    assert heard[1][3] == pytest.approx(np.mean(trained.history.loss))
     assert trained.history.published_steps == 10_000
     per_step, setup = trained.history.seconds_per_step, trained.history.setup_seconds
     assert per_step > 0

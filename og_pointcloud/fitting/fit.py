@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from og_pointcloud.cloud import BACKGROUND, UNOBSERVED, LabelledCloud
 from og_pointcloud.errors import SceneError
-from og_pointcloud.fitting.labellers import LABELLERS, Labelling
+from og_pointcloud.fitting.labellers import LABELLERS, Labelling, paper
 from og_pointcloud.fitting.mask_table import Cutoffs, MaskTable, mask_table, require_sight, working_memory
 from og_pointcloud.fitting.membership import without_see_through
 from og_pointcloud.fitting.memory import in_file, memory_left
@@ -37,8 +38,9 @@ def fit(
     A cloud that would not fit into memory as a whole is fitted in tiles (tiles.py); `FitSettings.memory` and
     `FitSettings.tile_points` decide.
 
-    work: a folder in which the views of a long fit are kept, so that the next call goes on where this one was
-    interrupted or killed; its files are removed at the end. None: nothing is kept. progress: show bars on a terminal.
+    work: a folder in which the views of a long fit, and the training of mode "paper", are kept, so that the next call
+    goes on where this one was interrupted or killed; its files are removed at the end. None: nothing is kept.
+    progress: show bars on a terminal.
 
     Deterministic: the same scene and settings give the same ids on every run. Raises SceneError where the scene
     cannot give an instance at all (no masks, or no camera that sees the cloud), and OgPointcloudError where memory or
@@ -66,7 +68,7 @@ def fit(
             labelling, spacing = fit_tiles(scene, settings, kept, journal)
             return _labelled_cloud(scene, labelling, spacing, settings, journal)
         prepared = prepare(scene, settings, journal, kept)
-        return fit_prepared(prepared, settings, journal)
+        return fit_prepared(prepared, settings, journal, None if work is None else kept)
 
 
 @dataclass(frozen=True)
@@ -100,13 +102,20 @@ def prepare(
 
 
 def fit_prepared(
-    prepared: Prepared, settings: FitSettings | None = None, journal: Journal | None = None
+    prepared: Prepared,
+    settings: FitSettings | None = None,
+    journal: Journal | None = None,
+    work: WorkFolder | None = None,
 ) -> LabelledCloud:
-    """The stages of `fit` from the mask table on. Settings of earlier stages are those that it was prepared with."""
+    """The stages of `fit` from the mask table on. Settings of earlier stages are those that it was prepared with.
+
+    work: keeps the training of mode "paper", which is the one labeller that takes hours; None: nothing is kept.
+    """
     settings = settings or FitSettings()
     journal = journal or Journal(progress=False)
     surface = prepared.surface
-    labelling = LABELLERS[settings.mode](prepared.table, surface, settings, journal)
+    labeller = partial(paper, work=work) if settings.mode == "paper" else LABELLERS[settings.mode]
+    labelling = labeller(prepared.table, surface, settings, journal)
     spacing = float(np.median(surface.neighbourhood.spacing))
     labelling = labelling.of_points(surface.row_of_point)
     return _labelled_cloud(prepared.scene, labelling, spacing, settings, journal)

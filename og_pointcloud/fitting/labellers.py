@@ -28,6 +28,7 @@ from og_pointcloud.fitting.learned.matching import Matching, alone_evidence, mat
 from og_pointcloud.fitting.mask_table import MaskTable, weights_by_instance
 from og_pointcloud.fitting.membership import assign_points
 from og_pointcloud.fitting.view_votes import ViewVotes, view_votes
+from og_pointcloud.fitting.work_folder import WorkFolder
 from og_pointcloud.journal import Journal, LeftOut
 from og_pointcloud.rendering.geometry import sample_of_points
 from og_pointcloud.rendering.surface import Surface
@@ -132,20 +133,28 @@ def fast(table: MaskTable, surface: Surface, settings: FitSettings, journal: Jou
     return _decided_by_views(table, votes, groups, surface, settings, journal, book.leaf_coarse)
 
 
-def paper(table: MaskTable, surface: Surface, settings: FitSettings, journal: Journal) -> Labelling:
-    """The paper's method: features and codebook trained by rendering, instances matched as rendered alone (Eq. 5)."""
-    from og_pointcloud.fitting.learned.paper import train_codebook, train_features
+def paper(
+    table: MaskTable, surface: Surface, settings: FitSettings, journal: Journal, work: WorkFolder | None = None
+) -> Labelling:
+    """The paper's method: features and codebook trained by rendering, instances matched as rendered alone (Eq. 5).
+
+    work: where the state of the training is kept, so that a run that was killed continues; None: nowhere.
+    """
+    from og_pointcloud.fitting.learned.paper import TrainingRun, train_codebook, train_features
 
     options, gaussians, near = settings.paper, surface.gaussians, surface.near
     views = surface.thinned_views()
-    with journal.stage("features"), journal.bars() as report:
-        trained = train_features(gaussians, views, near, options, settings.seed, report)
-    with journal.stage("codebook"), journal.bars() as report:
-        book = train_codebook(gaussians, views, near, trained.features, options, settings.seed, report)
+    with journal.bars() as report:
+        run = TrainingRun(settings.seed, report, work)
+        with journal.stage("features"):
+            trained = train_features(gaussians, views, near, options, run)
+        with journal.stage("codebook"):
+            book = train_codebook(gaussians, views, near, trained.features, options, run)
     journal.notes["training"] = [
         {
             "stage": history.name,
             "steps": history.steps,
+            "resumed_at": history.resumed_at,
             "published_steps": history.published_steps,
             "seconds_per_step": round(history.seconds_per_step, 5),
             "published_seconds": round(history.published_seconds, 1),

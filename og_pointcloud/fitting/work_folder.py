@@ -124,22 +124,33 @@ class WorkFolder:
         found = self._read(label)
         if found is not None:
             return found
-        made = tuple(make())
-        with self._guard:
-            if self._pending is not None:
-                self._pending[label] = made = tuple(map(_on_own_pages, made))
-                self._bytes_pending += sum(array.nbytes for array in made)
-                if time.monotonic() > self._pending_until or self._bytes_pending > self._most_pending:
-                    for waiting, arrays in self._pending.items():
-                        self._write(waiting, arrays)
-                    self._pending = None
-                return made
-        self._write(label, made)
-        return made
+        return self._keep(label, tuple(make()))
 
     def array(self, name: str, key: str, make: Callable[[], NDArray[Any]]) -> NDArray[Any]:
         """As `arrays`, for a single one."""
         return self.arrays(name, key, lambda: [make()])[0]
+
+    def replace(self, name: str, key: str, arrays: Sequence[NDArray[Any]]) -> None:
+        """From now on `arrays` gives these: a checkpoint of work that goes on. They must not change afterwards.
+
+        Let go of what `arrays` gave before: Windows does not replace a file that is mapped.
+        """
+        self._keep(f"{name}-{key}{SUFFIX}", tuple(arrays))
+
+    def _keep(self, label: str, arrays: Arrays) -> Arrays:
+        """Hold the arrays, or write them and those held before; returns them as they are held."""
+        with self._guard:
+            if self._pending is not None:
+                self._bytes_pending -= sum(array.nbytes for array in self._pending.get(label, ()))
+                self._pending[label] = arrays = tuple(map(_on_own_pages, arrays))
+                self._bytes_pending += sum(array.nbytes for array in arrays)
+                if time.monotonic() > self._pending_until or self._bytes_pending > self._most_pending:
+                    for waiting, held in self._pending.items():
+                        self._write(waiting, held)
+                    self._pending = None
+                return arrays
+        self._write(label, arrays)
+        return arrays
 
     def forget(self, name: str, key: str) -> None:
         """Let go of arrays that are held in memory; those in a file stay."""

@@ -21,6 +21,7 @@ raw vectors, whose length means nothing.
 
 from __future__ import annotations
 
+import json
 import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -34,7 +35,8 @@ from scipy.sparse import csr_array
 from og_pointcloud.errors import MissingExtraError, SceneError
 from og_pointcloud.fitting.learned.codebook import kmeans
 from og_pointcloud.fitting.learned.instance_features import ROUNDING, cohesion_factor, raw_gradient, read_features
-from og_pointcloud.fitting.mask_table import Gaussians, view_weights
+from og_pointcloud.fitting.mask_table import Gaussians, view_fingerprint, view_weights
+from og_pointcloud.fitting.work_folder import WorkFolder, fingerprint
 from og_pointcloud.scene import Camera, View
 from og_pointcloud.settings import PaperSettings
 
@@ -43,10 +45,15 @@ try:
 except ImportError as error:
     raise MissingExtraError("torch", "learn") from error
 
-Progress = Callable[[str, int, int], None]
-"""Called after every step with the stage's name, the step's number and the number of steps."""
-
-__all__ = ["StageHistory", "TrainedCodebook", "TrainedFeatures", "train_codebook", "train_features", "view_losses"]
+__all__ = [
+    "StageHistory",
+    "TrainedCodebook",
+    "TrainedFeatures",
+    "TrainingRun",
+    "train_codebook",
+    "train_features",
+    "view_losses",
+]
 
 STEPS = {"scannet": (20_000, 20_000, 20_000), "lerf": (10_000, 10_000, 20_000)}
 """Steps of the features, the coarse and the fine codebook (the authors' code; the sums are the paper's)."""
@@ -68,16 +75,38 @@ OWN_MASK_SHARE = 0.2
 """A coarse cluster holds a mask when it has this share of the mask's blended weight or more."""
 
 
+RECENT = 100
+"""The loss that is reported is the mean of so many steps: each sees another view."""
+CHECKPOINT_SECONDS = 60.0
+"""The state of the training is written to the work folder this often."""
+
+
+@dataclass(frozen=True)
+class TrainingRun:
+    """How the stages run. seed: of the start and of the views drawn.
+
+    progress: called after every step with the stage's name, the step's number, the number of steps, and the mean of the
+    last losses. work: a training that was killed and is started again with the same folder, scene, settings and seed
+    continues from its last checkpoint, and ends with the same bits as one that was not. None: nothing is kept.
+    """
+
+    seed: int = 0
+    progress: Callable[[str, int, int, float], None] | None = None
+    work: WorkFolder | None = None
+
+
 @dataclass
 class StageHistory:
     """A stage's cost and losses. setup_seconds: before the first step (rendering the weights that are kept).
-    seconds: of all steps. loss: one number per step done. published_steps: steps at schedule_share 1."""
+    seconds: of all steps. loss: one number per step done. published_steps: steps at schedule_share 1.
+    resumed_at: the step that an earlier run had got to, 0 where there was none."""
 
     name: str
     published_steps: int
     setup_seconds: float
     seconds: float = 0.0
     loss: list[float] = field(default_factory=list)
+    resumed_at: int = 0
 
     @property
     def steps(self) -> int:
@@ -121,31 +150,31 @@ def train_features(
     views: Sequence[View],
     near: float,
     settings: PaperSettings | None = None,
-    seed: int = 0,
-    progress: Progress | None = None,
+    run: TrainingRun | None = None,
 ) -> TrainedFeatures:
     """Stage 1: features of all Gaussians from random ones in [0, 1], by Eq. 1 and 2 of one random view a step.
 
     views: thinned to the resolution that is to be rendered. near: depth of the near plane, scene units.
     Raises SceneError where no view has a mask with a Gaussian in it.
     """
-    settings = settings or PaperSettings()
+    settings, run = settings or PaperSettings(), run or TrainingRun()
     start = time.perf_counter()
     source = _Views(gaussians, views, near, settings, whole=False)
-    rng = np.random.default_rng(seed)
-    raw = torch.tensor(rng.random((len(gaussians), settings.width), np.float32), requires_grad=True)
-    adam = torch.optim.Adam([raw], lr=settings.feature_rate, eps=ADAM_EPSILON)
+    rng = np.random.default_rng(run.seed)
+    raw = torch.from_numpy(rng.random((len(gaussians), settings.width), np.float32))
+    key = _training_key(gaussians, views, near, settings, run)
     history = StageHistory("features", STEPS[settings.schedule][0], time.perf_counter() - start)
+    stage = _Stage(history, raw, settings.feature_rate, rng)
     late = LATE_STEP * settings.schedule_share
-    for step in _steps(history, settings, progress):
+    for step in stage.steps(settings, run, key):
         view = source[int(rng.integers(len(source)))]
         image = view.render(_read(raw, settings.normalise))
         separation, cohesion = view_losses(image, view.mask, settings, late=step >= late)
         scale = 1 if settings.formula == "authors" else 1 / source.masked_pixels
         loss = settings.inter * separation + cohesion_factor(settings) * scale * cohesion
-        adam.zero_grad(set_to_none=True)
+        stage.adam.zero_grad(set_to_none=True)
         loss.backward()
-        adam.step()
+        stage.adam.step()
         history.loss.append(loss.item())
     features = _read(raw.detach(), settings.normalise).numpy()
     return TrainedFeatures(np.where(source.seen[:, None] > 0, features, 0).astype(np.float32), source.seen, history)
@@ -193,27 +222,28 @@ def train_codebook(
     near: float,
     features: NDArray[np.float32],
     settings: PaperSettings | None = None,
-    seed: int = 0,
-    progress: Progress | None = None,
+    run: TrainingRun | None = None,
 ) -> TrainedCodebook:
     """Stage 2: a coarse codebook of features and positions, then a fine one of features inside each coarse cluster.
 
     features: (n, width) as read, of stage 1. A step renders cluster centres in place of features, takes Eq. 4, and
     moves each feature by the gradient of its centre (straight through). Positions count in scene units, as published.
     """
-    settings = settings or PaperSettings()
+    settings, run = settings or PaperSettings(), run or TrainingRun()
     start = time.perf_counter()
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(run.seed)
     source = _Views(gaussians, views, near, settings, whole=settings.formula == "paper")
     known = np.flatnonzero(source.seen > 0)
     training = _CodebookTraining(source, torch.from_numpy(np.array(features, np.float32)), known, settings, rng)
-    places = settings.position_weight * gaussians.xyz[known]
+    key = _training_key(gaussians, views, near, settings, run, features)
     setup = time.perf_counter() - start
 
     coarse = StageHistory("coarse codebook", STEPS[settings.schedule][1], setup)
+    places = settings.position_weight * gaussians.xyz[known]
     first = rng.permutation(len(known))[: settings.k1]
     centres = np.concatenate([features[known[first]], places[first]], axis=1)
-    own, _ = training.run(coarse, centres, [np.arange(len(known))], places, settings.coarse_interval, progress)
+    together = _Parts([np.arange(len(known))], [len(centres)], places)
+    own, _ = training.train(coarse, centres, together, run, key)
 
     start = time.perf_counter()
     members = [np.flatnonzero(own == cluster) for cluster in range(len(centres))]
@@ -221,10 +251,8 @@ def train_codebook(
     seeds = [rng.permutation(rows)[:count] for rows, count in zip(members, allowed, strict=True)]
     fine = StageHistory("fine codebook", STEPS[settings.schedule][2], time.perf_counter() - start)
     fine_centres = training.features.numpy()[known[np.concatenate(seeds)]]
-    nothing = np.zeros((len(known), 0), np.float32)
-    own_fine, fine_centres = training.run(
-        fine, fine_centres, members, nothing, settings.fine_interval, progress, [len(rows) for rows in seeds]
-    )
+    apart = _Parts(members, [len(rows) for rows in seeds], np.zeros((len(known), 0), np.float32))
+    own_fine, fine_centres = training.train(fine, fine_centres, apart, run, key)
     # Leaf numbers leave room for k2 in every coarse cluster, as published.
     leaf_of_centre = np.concatenate([c * settings.k2 + np.arange(len(rows)) for c, rows in enumerate(seeds)])
     coarse_ids, leaf = np.full(len(gaussians), -1, np.int32), np.full(len(gaussians), -1, np.int32)
@@ -232,6 +260,30 @@ def train_codebook(
     table = np.zeros((settings.k1 * settings.k2, features.shape[1]), np.float32)
     table[leaf_of_centre] = fine_centres
     return TrainedCodebook(coarse_ids, leaf, table, (coarse, fine))
+
+
+@dataclass(frozen=True)
+class _Parts:
+    """Rows of the known Gaussians that are clustered apart from each other, each part into so many ``counts``.
+    places: (known, 3 or 0), clustered with the features but not rendered."""
+
+    rows: list[NDArray[np.int64]]
+    counts: list[int]
+    places: NDArray[np.float32]
+
+    def reassigned(
+        self, features: NDArray[np.float32], centres: NDArray[np.float32], rounds: int
+    ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+        """Every point's nearest centre of its part after a few rounds of Lloyd's algorithm, and the centres."""
+        values = np.concatenate([features, self.places], axis=1)
+        own, centres, first = np.zeros(len(values), np.int64), centres.copy(), 0
+        for rows, count in zip(self.rows, self.counts, strict=True):
+            if count:
+                mine = slice(first, first + count)
+                found, centres[mine] = kmeans(values[rows], np.ones(len(rows)), centres[mine], rounds, reseed=True)
+                own[rows] = first + found
+            first += count
+        return own, centres
 
 
 class _CodebookTraining:
@@ -250,64 +302,34 @@ class _CodebookTraining:
         self.features = features
         self.targets: dict[int, tuple[torch.Tensor, torch.Tensor]] = {}
 
-    def run(
-        self,
-        history: StageHistory,
-        centres: NDArray[np.float32],
-        parts: list[NDArray[np.int64]],
-        places: NDArray[np.float32],
-        interval: int,
-        progress: Progress | None,
-        counts: list[int] | None = None,
+    def train(
+        self, history: StageHistory, centres: NDArray[np.float32], parts: _Parts, run: TrainingRun, key: str
     ) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
-        """Train until the stage's steps are done; own centre of each known Gaussian and the centres (k, width).
-
-        parts: rows of the known Gaussians that are clustered apart from each other, counts their numbers of centres,
-        all of them by default. places: (known, 3 or 0), clustered with the features but not rendered.
-        """
-        counts = counts or [len(centres)]
-        features = self.features
-        adam = torch.optim.Adam([features.requires_grad_()], lr=self.settings.codebook_rate, eps=ADAM_EPSILON)
-        width = features.shape[1]
-        own = torch.zeros(len(self.known), dtype=torch.int64)
-        squared = history.name.startswith("fine") and self.settings.formula == "authors"
-        for step in _steps(history, self.settings, progress):
+        """Train until the stage's steps are done; own centre of each known Gaussian and the centres (k, width)."""
+        settings, features, known = self.settings, self.features, self.known
+        is_fine, width = history.name.startswith("fine"), features.shape[1]
+        interval = settings.fine_interval if is_fine else settings.coarse_interval
+        squared = is_fine and settings.formula == "authors"
+        stage = _Stage(history, features, settings.codebook_rate, self.rng, centres, len(known))
+        for step in stage.steps(settings, run, key):
             if step % interval == 0:
-                own, centres = self._reassigned(centres, parts, places, counts)
+                values = features.detach().numpy()[known]
+                stage.own, stage.centres = parts.reassigned(values, stage.centres, settings.lloyd_rounds)
             view, target, rows = self._draw()
             quantised = features.detach().clone()
-            quantised[self.known] = torch.from_numpy(centres[:, :width].copy())[own]
+            own = torch.from_numpy(stage.own)
+            quantised[known] = torch.from_numpy(stage.centres[:, :width].copy())[own]
             quantised.requires_grad_()
+            # Eq. 4, and its gradient by the centres given to the features: straight through.
             error = view.render(quantised)[rows] - target
             loss = error.square().mean() if squared else error.abs().mean()
             (features.grad,) = torch.autograd.grad(loss, quantised)
-            adam.step()
-            centres[:, :width] = _cluster_means(features.detach()[self.known], own, centres[:, :width])
+            stage.adam.step()
+            stage.centres[:, :width] = _cluster_means(features.detach()[known], own, stage.centres[:, :width])
             history.loss.append(loss.item())
         features.requires_grad_(False)
-        own, centres = self._reassigned(centres, parts, places, counts)
-        return own.numpy().astype(np.int32), centres[:, :width]
-
-    def _reassigned(
-        self,
-        centres: NDArray[np.float32],
-        parts: list[NDArray[np.int64]],
-        places: NDArray[np.float32],
-        counts: list[int],
-    ) -> tuple[torch.Tensor, NDArray[np.float32]]:
-        """Every point's nearest centre of its part after a few rounds of Lloyd's algorithm, and the centres."""
-        values = np.concatenate([self.features.detach().numpy()[self.known], places], axis=1)
-        own, centres, first = np.zeros(len(values), np.int64), centres.copy(), 0
-        for rows, count in zip(parts, counts, strict=True):
-            if count:
-                mine = slice(first, first + count)
-                weight = np.ones(len(rows))
-                found, centres[mine] = kmeans(
-                    values[rows], weight, centres[mine], self.settings.lloyd_rounds, reseed=True
-                )
-                own[rows] = first + found
-            first += count
-        return torch.from_numpy(own), centres
+        own, centres = parts.reassigned(features.numpy()[known], stage.centres, settings.lloyd_rounds)
+        return own.astype(np.int32), centres[:, :width]
 
     def _draw(self) -> tuple[_ViewWeights, torch.Tensor, torch.Tensor | slice]:
         """A random view, perhaps with smaller Gaussians; what its pixels should show, and which of them."""
@@ -512,12 +534,73 @@ def _read(raw: torch.Tensor, normalise: bool) -> torch.Tensor:
     return _Read.apply(raw) if normalise else raw
 
 
-def _steps(history: StageHistory, settings: PaperSettings, progress: Progress | None) -> Iterator[int]:
-    """The numbers of a stage's steps, timed and reported."""
-    count = max(1, round(history.published_steps * settings.schedule_share))
-    for step in range(count):
-        start = time.perf_counter()
-        yield step
-        history.seconds += time.perf_counter() - start
-        if progress:
-            progress(history.name, step + 1, count)
+def _training_key(
+    gaussians: Gaussians, views: Sequence[View], near: float, settings: PaperSettings, run: TrainingRun, *more: Any
+) -> str:
+    """Of all that the outcome of a stage depends on; empty where nothing is kept."""
+    if run.work is None:
+        return ""
+    drawn = gaussians.xyz, gaussians.scale, gaussians.rotation, gaussians.opacity, near
+    return fingerprint(*drawn, *(view_fingerprint(view, view.mask_map()) for view in views), settings, run.seed, *more)
+
+
+class _Stage:
+    """All that a stage of training changes: a checkpoint is all of it.
+
+    features: (n, width) float32, moved in place by ``adam``. rng: draws the views. centres, own: of a codebook stage,
+    (k, d) float32 and, for each of ``known`` Gaussians, its row of them.
+    """
+
+    def __init__(
+        self,
+        history: StageHistory,
+        features: torch.Tensor,
+        rate: float,
+        rng: np.random.Generator,
+        centres: NDArray[np.float32] | None = None,
+        known: int = 0,
+    ) -> None:
+        self.history, self.features, self.rng = history, features, rng
+        self.adam = torch.optim.Adam([features.requires_grad_()], lr=rate, eps=ADAM_EPSILON)
+        self.centres = np.zeros((0, 0), np.float32) if centres is None else centres
+        self.own = np.zeros(known, np.int64)
+
+    def steps(self, settings: PaperSettings, run: TrainingRun, key: str) -> Iterator[int]:
+        """The numbers of the steps that are left, timed, reported, and kept under the key now and then."""
+        history = self.history
+        count = max(1, round(history.published_steps * settings.schedule_share))
+        name, kept_at = history.name.replace(" ", "-"), time.monotonic()
+        if run.work is not None:
+            self._restore(run.work.arrays(name, key, self._arrays))
+        for step in range(history.steps, count):
+            start = time.perf_counter()
+            yield step
+            history.seconds += time.perf_counter() - start
+            is_due = step + 1 == count or time.monotonic() - kept_at >= CHECKPOINT_SECONDS
+            if run.work is not None and is_due:
+                run.work.replace(name, key, self._arrays())
+                kept_at = time.monotonic()
+            if run.progress:
+                run.progress(history.name, step + 1, count, float(np.mean(history.loss[-RECENT:])))
+
+    def _arrays(self) -> tuple[NDArray[Any], ...]:
+        state, features = self.adam.state.get(self.features), self.features.detach()
+        moments = (state["exp_avg"], state["exp_avg_sq"]) if state else (torch.zeros_like(features),) * 2
+        generator = np.frombuffer(json.dumps(self.rng.bit_generator.state).encode(), np.uint8)
+        tensors = [tensor.numpy().copy() for tensor in (features, *moments)]
+        loss = np.array(self.history.loss, np.float64)
+        return *tensors, self.centres.copy(), self.own.copy(), generator, loss, np.array([self.history.seconds])
+
+    def _restore(self, arrays: tuple[NDArray[Any], ...]) -> None:
+        """Nothing where the checkpoint is from before the first step."""
+        *tensors, centres, own, generator, loss, seconds = (np.array(array) for array in arrays)
+        if len(loss) == 0:
+            return
+        features, average, square = (torch.from_numpy(array) for array in tensors)
+        self.features.data.copy_(features)
+        done = torch.tensor(float(len(loss)))
+        self.adam.state[self.features] = {"step": done, "exp_avg": average, "exp_avg_sq": square}
+        self.centres, self.own = centres, own
+        self.rng.bit_generator.state = json.loads(generator.tobytes())
+        self.history.loss, self.history.seconds = loss.tolist(), float(seconds[0])
+        self.history.resumed_at = len(loss)
