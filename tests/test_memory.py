@@ -276,6 +276,21 @@ def test_a_table_on_disk_is_the_table_in_memory(gaussians: Gaussians, expected: 
     assert_same(table, expected)
 
 
+@pytest.mark.parametrize("held", [False, True])
+def test_a_replaced_checkpoint_is_the_one_that_the_next_run_finds(tmp_path: Path, held: bool) -> None:
+    with killed_run(tmp_path) as work:
+        if held:
+            work.hold(1e6, 1e3)
+        for step in range(4):
+            work.arrays("stage", "1", lambda: [np.zeros(3)])
+            work.replace("stage", "1", [np.full(3, step), np.ones(2)])
+        assert work.arrays("stage", "1", lambda: [])[0].tolist() == [3, 3, 3]
+    assert kept_files(tmp_path) == (0 if held else 1)
+    with WorkFolder.open(tmp_path) as work:
+        found = [array.tolist() for array in work.arrays("stage", "1", lambda: [np.zeros(3)])]
+    assert found == ([[0, 0, 0]] if held else [[3, 3, 3], [1, 1]])
+
+
 def test_a_short_fit_writes_no_file(tmp_path: Path) -> None:
     with WorkFolder.open(tmp_path / "work") as work:
         prepare(boxes_on_a_table().scene, work=work)

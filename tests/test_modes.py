@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from string import Formatter
 from typing import get_args, get_type_hints
 
@@ -16,7 +17,7 @@ from og_pointcloud.fitting.fit import fit, prepare
 from og_pointcloud.fitting.labellers import LABELLERS, Labelling, auto, fast, grouping, mask_agreement
 from og_pointcloud.fitting.mask_table import MaskTable
 from og_pointcloud.journal import SENTENCES, Journal, LeftOut, left_out_entry
-from og_pointcloud.settings import CodebookSettings, FitSettings, MatchingSettings, PaperSettings
+from og_pointcloud.settings import CodebookSettings, FitSettings, MatchingSettings, PaperSettings, VisibilitySettings
 
 MODES = get_args(get_type_hints(FitSettings)["mode"])
 PAPER = PaperSettings(schedule_share=0.004, k1=8, k2=2, feature_rate=0.02)
@@ -163,6 +164,27 @@ def test_whatever_is_left_out_has_its_sentences(key: LeftOut) -> None:
     assert entry["what"]
     assert entry["why"]
     assert [entry[name] for name in names] == [7] * len(names)
+
+
+def test_a_killed_fit_in_paper_mode_continues_its_training(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    paper = pytest.importorskip("og_pointcloud.fitting.learned.paper")
+    scene = boxes_on_a_table().scene
+    visibility = VisibilitySettings(keep_after_s=0)  # else a short fit keeps nothing
+    settings = FitSettings(mode="paper", paper=replace(PAPER, schedule_share=0.0005), visibility=visibility)
+    expected = fit(scene, settings, progress=False)
+    monkeypatch.setattr(paper, "CHECKPOINT_SECONDS", 0)
+    with monkeypatch.context() as patch:
+        patch.setattr(paper, "train_codebook", _interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            fit(scene, settings, work=tmp_path / "work", progress=False)
+    cloud = fit(scene, settings, work=tmp_path / "work", progress=False)
+    np.testing.assert_array_equal(cloud.instance_ids, expected.instance_ids)
+    assert [stage["resumed_at"] for stage in cloud.provenance["notes"]["training"]] == [10, 0, 0]
+    assert not (tmp_path / "work").exists()
+
+
+def _interrupt(*_: object) -> None:
+    raise KeyboardInterrupt
 
 
 def test_paper_mode_says_how_long_the_published_schedule_would_take() -> None:
