@@ -251,7 +251,7 @@ def _cluster_sums(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Weighted sum of the values (count, d) and weight (count,) of every cluster, in float64."""
     membership = csc_array((weight, own, np.arange(len(own) + 1)), shape=(count, len(own)))
-    return membership @ values, np.bincount(own, weight, count)
+    return membership @ values, np.asarray(membership.sum(axis=1), np.float64)
 
 
 def _check(values: NDArray[np.floating], weight: NDArray[np.floating], centres: NDArray[np.floating]) -> None:

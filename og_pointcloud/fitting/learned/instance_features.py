@@ -254,8 +254,8 @@ def _minimise(
     """
 
     # scipy's L-BFGS-B, in the same variables, gets to the same minimum (objective within 0.1 %, mIoU of mode fast
-    # within 0.005) in 4 to 11 times the processor time: 11.6 s for 3.0 s in a room of 260,000 points, 2.9 s for 0.26 s on a
-    # table of 103,000. It holds all in float64, and its sums depend on the number of threads.
+    # within 0.005) in 4 to 11 times the processor time: 11.6 s for 3.0 s in a room of 260,000 points, 2.9 s for 0.26 s
+    # on a table of 103,000. It holds all in float64, and its sums depend on the number of threads.
     def evaluate(raw: NDArray[np.float32]) -> tuple[float, NDArray[np.float32]]:
         normalise = problem.settings.normalise
         terms = problem.terms(read_features(raw, normalise), closest)
