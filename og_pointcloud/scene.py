@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from og_pointcloud.errors import SceneError
 
-__all__ = ["Camera", "Points", "Scene", "View"]
+__all__ = ["Camera", "Points", "Scene", "View", "require_finite"]
 
 FloatArray = NDArray[np.float32]
 DoubleArray = NDArray[np.float64]
@@ -216,12 +216,7 @@ class Points:
             raise SceneError(f"points are an array of shape {world.shape}; expected (points, 3)")
         if len(world) == 0:
             raise SceneError("the cloud has 0 points; expected at least one: check the geometry file")
-        finite = np.isfinite(world).all(axis=1)
-        if not finite.all():
-            raise SceneError(
-                f"{int((~finite).sum())} of {len(world)} points hold NaN or infinity (the first is row "
-                f"{int(np.argmin(finite))}); expected finite coordinates: remove them from the cloud first"
-            )
+        require_finite(world)
         origin = np.median(world, axis=0)
         extent = float(np.abs(world - origin).max())
         if extent > float(np.finfo(np.float32).max):
@@ -242,11 +237,7 @@ class Points:
         given = [name for name in ("scale", "rotation", "opacity") if getattr(self, name) is not None]
         if given and len(given) < 3:
             raise SceneError(f"Gaussians need scale, rotation and opacity together; got only {', '.join(given)}")
-        finite = np.isfinite(self.xyz).all(axis=1)
-        if not finite.all():
-            raise SceneError(
-                f"point {int(np.argmin(finite))} holds NaN or infinity; expected finite: remove such points"
-            )
+        require_finite(self.xyz)
         if self.scale is not None and self.rotation is not None and self.opacity is not None:
             _check_gaussians(self.scale, self.rotation, self.opacity)
 
@@ -271,30 +262,31 @@ class Points:
         return self.xyz.astype(np.float64) + self.origin
 
 
+def require_finite(xyz: NDArray[np.floating], cure: str = "remove them from the cloud first") -> None:
+    """SceneError for points (n, 3) with NaN or infinity."""
+    finite = np.logical_and.reduce(np.isfinite(xyz), axis=1)
+    if not finite.all():
+        raise SceneError(
+            f"{int((~finite).sum())} of {len(finite)} points hold NaN or infinity (the first is row "
+            f"{int(np.argmin(finite))}); expected finite coordinates: {cure}"
+        )
+
+
 def _check_gaussians(scale: FloatArray, rotation: FloatArray, opacity: FloatArray) -> None:
     """Files are activated and made unit by their readers; what is made by hand is drawn as it is."""
-    wrong = ~((scale >= 0) & (scale < np.inf)).all(axis=1)
-    if wrong.any():
-        row = int(np.argmax(wrong))
-        raise SceneError(
-            f"scale of Gaussian {row} is {scale[row].tolist()}; expected finite standard deviations, at least 0: take "
-            "the exponential of a 3DGS file's logarithms"
-        )
-    wrong = ~((opacity >= 0) & (opacity <= 1))
-    if wrong.any():
-        row = int(np.argmax(wrong))
-        raise SceneError(
-            f"opacity of Gaussian {row} is {opacity[row]}; expected 0 to 1: activate a 3DGS file's logits, 1 / (1 + "
-            "exp(-x))"
-        )
     length = np.linalg.norm(rotation.astype(np.float64), axis=1)
-    wrong = ~(np.abs(length - 1) < UNIT_TOLERANCE)
-    if wrong.any():
-        row = int(np.argmax(wrong))
-        raise SceneError(
-            f"rotation of Gaussian {row} has length {length[row]:.6g}; expected unit quaternions wxyz: divide each by "
-            "its length"
-        )
+    fits = ((scale >= 0) & (scale < np.inf)).all(axis=1)
+    _require(fits, scale, "scale", "finite standard deviations, at least 0: take the exponential of logarithms")
+    fits = (opacity >= 0) & (opacity <= 1)
+    _require(fits, opacity, "opacity", "0 to 1: activate a 3DGS file's logits, 1 / (1 + exp(-x))")
+    fits = np.abs(length - 1) < UNIT_TOLERANCE
+    _require(fits, rotation, "rotation", "unit quaternions wxyz: divide each by its length")
+
+
+def _require(fits: NDArray[np.bool_], values: FloatArray, name: str, expected: str) -> None:
+    if not fits.all():
+        row = int(np.argmin(fits))
+        raise SceneError(f"{name} of Gaussian {row} is {values[row].tolist()}; expected {expected}")
 
 
 @dataclass(frozen=True)

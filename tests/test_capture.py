@@ -482,7 +482,7 @@ def test_features_of_another_kind(capture, values):
 def test_colour_masks_are_refused(capture, pixels, kind):
     folder, _ = capture
     write_image(folder / "masks/frame_01.png", pixels)
-    with pytest.raises(SceneError, match=rf"frame_01.png is a {kind}; expected grey of 8 or 16 bit"):
+    with pytest.raises(SceneError, match=rf"frame_01.png is a {kind}; expected a grey PNG of 8 or 16 bit"):
         read_capture(folder)
 
 

@@ -172,25 +172,13 @@ def on_surface(image: DepthImage, noise: float) -> NDArray[np.bool_]:
 def to_world(image: DepthImage, chosen: NDArray[np.bool_], factor: float = 1.0) -> Doubles:
     """(n, 3) float64 world coordinates of the chosen pixels, row by row, their depths times ``factor``."""
     camera = image.camera
-    lens = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
-    return _unprojected(image.depth, chosen, lens, camera.world_to_camera[:3, :3], camera.center, factor)
-
-
-@njit(cache=True)
-def _unprojected(depth, chosen, lens, rotation, center, factor):  # noqa: ANN001, ANN202
-    fx, fy, cx, cy = lens
-    xyz = np.empty((np.count_nonzero(chosen), 3))
-    i = 0
-    for row in range(depth.shape[0]):
-        for column in range(depth.shape[1]):
-            if chosen[row, column]:
-                z = depth[row, column] * factor
-                x, y = (column + 0.5 - cx) / fx * z, (row + 0.5 - cy) / fy * z
-                for axis in range(3):
-                    along = rotation[0, axis] * x + rotation[1, axis] * y + rotation[2, axis] * z
-                    xyz[i, axis] = along + center[axis]
-                i += 1
-    return xyz
+    rows, columns = np.nonzero(chosen)
+    z = image.depth[chosen] * np.float64(factor)
+    x, y = (columns + 0.5 - camera.cx) / camera.fx * z, (rows + 0.5 - camera.cy) / camera.fy * z
+    rotation, center = camera.world_to_camera[:3, :3], camera.center
+    return np.column_stack(
+        [rotation[0, axis] * x + rotation[1, axis] * y + rotation[2, axis] * z + center[axis] for axis in range(3)]
+    )
 
 
 def _differences(images: Sequence[DepthImage], factor: float = 1.0) -> Doubles:

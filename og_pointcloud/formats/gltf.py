@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.atomic import replacing
-from og_pointcloud.formats.tables import naming, require_finite
+from og_pointcloud.formats.tables import LABEL_FINITE, naming
+from og_pointcloud.scene import require_finite
 
 __all__ = ["write_gltf"]
 
@@ -54,7 +55,7 @@ def write_gltf(
     with naming(path):
         if len(xyz_world) == 0:
             raise SceneError("0 points; expected at least one: glTF has no empty clouds")
-        require_finite(xyz_world, "glTF allows no others")
+        require_finite(xyz_world, LABEL_FINITE)
         origin = np.median(np.asarray(xyz_world, np.float64), axis=0)
         instances = attributes["og_instance"]
         features = {

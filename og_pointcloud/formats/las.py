@@ -25,8 +25,8 @@ from numpy.typing import NDArray
 
 from og_pointcloud.errors import MissingExtraError, SceneError
 from og_pointcloud.formats.atomic import replacing
-from og_pointcloud.formats.tables import naming, require_finite
-from og_pointcloud.scene import Points
+from og_pointcloud.formats.tables import LABEL_FINITE, naming
+from og_pointcloud.scene import Points, require_finite
 
 if TYPE_CHECKING:
     from laspy import LasData
@@ -82,7 +82,7 @@ def labelled_las(
 ) -> LasData:
     """A laspy LasData of a labelled cloud. Arguments and errors as for `write_las`."""
     laspy = _laspy()
-    require_finite(xyz_world, "LAS stores integers")
+    require_finite(xyz_world, LABEL_FINITE)
     header = laspy.LasHeader(point_format=7, version="1.4")
     header.offsets, header.scales = _grid(xyz_world)
     header.add_extra_dims([laspy.ExtraBytesParams(name, values.dtype) for name, values in attributes.items()])

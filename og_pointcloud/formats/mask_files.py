@@ -83,13 +83,11 @@ def require_all(files: Sequence[Path], cure: str) -> None:
 
 def _mask_size(file: Path) -> tuple[int, int]:
     header = png_header(file)
-    if header is None:
-        raise SceneError(f"{file} is not a PNG; expected a grey PNG of 8 or 16 bit: write the ids losslessly")
-    if header.color_type != GREY or header.bit_depth not in (8, 16):
-        kind = PNG_COLOR_TYPES.get(header.color_type, f"color type {header.color_type}")
+    if header is None or header.color_type != GREY or header.bit_depth not in (8, 16):
+        found = f"a {PNG_COLOR_TYPES.get(header.color_type)} PNG of {header.bit_depth} bit" if header else "not a PNG"
         raise SceneError(
-            f"{file} is a {kind} PNG of {header.bit_depth} bit; expected grey of 8 or 16 bit, whose values are mask "
-            "ids (0 none, 1..M): write ids instead of colours"
+            f"{file} is {found}; expected a grey PNG of 8 or 16 bit, whose values are mask ids (0 none, 1..M): write "
+            "ids instead of colours"
         )
     return header.width, header.height
 

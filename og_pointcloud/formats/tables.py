@@ -13,11 +13,13 @@ from numpy.typing import NDArray
 from og_pointcloud.errors import SceneError
 
 __all__ = [
-    "colors", "naming", "normals", "positions", "read_text_rows", "require_finite", "stack_columns",
+    "LABEL_FINITE",     "colors", "naming", "normals", "positions", "read_text_rows", "stack_columns",
     "storable_positions",
 ]  # fmt: skip
 
 COLOR_COLUMNS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
+LABEL_FINITE = "label the finite points alone, points[np.isfinite(points).all(axis=1)]"
+"""What helps where a cloud with NaN or infinity is to be saved in a format that cannot hold them."""
 PACKED_COLOR_COLUMNS = ("rgb", "rgba")
 NORMAL_COLUMNS = (("nx", "ny", "nz"), ("normal_x", "normal_y", "normal_z"))
 
@@ -145,14 +147,3 @@ def _first_present(rows: NDArray[np.void], choices: Sequence[tuple[str, ...]]) -
     """The first of ``choices`` whose columns are all there, else ()."""
     present = set(rows.dtype.names or ())
     return next((names for names in choices if present.issuperset(names)), ())
-
-
-def require_finite(xyz_world: NDArray[np.floating], why: str) -> None:
-    """SceneError for points (n, 3) with NaN or infinity, on their way into a format that cannot hold them."""
-    finite = np.logical_and.reduce(np.isfinite(xyz_world), axis=1)
-    if not finite.all():
-        raise SceneError(
-            f"{int((~finite).sum())} of {len(finite)} points hold NaN or infinity (the first is row "
-            f"{int(np.argmin(finite))}); expected finite coordinates, {why}: label the finite points alone, "
-            "points[np.isfinite(points).all(axis=1)]"
-        )

@@ -16,7 +16,6 @@ def generate_launch_description() -> LaunchDescription:
         [
             DeclareLaunchArgument("scene", description="the .ogpc file to ask"),
             DeclareLaunchArgument("points", default_value="/points", description="topic of the clouds to label"),
-            DeclareLaunchArgument("target_frame", default_value="map", description="the frame of the scene"),
             DeclareLaunchArgument(
                 "parameters", default_value=str(defaults), description="the other parameters (.yaml)"
             ),
@@ -25,13 +24,7 @@ def generate_launch_description() -> LaunchDescription:
                 executable="segment",
                 name="og_pointcloud",
                 output="screen",
-                parameters=[
-                    LaunchConfiguration("parameters"),
-                    {
-                        "scene": LaunchConfiguration("scene"),
-                        "target_frame": LaunchConfiguration("target_frame"),
-                    },
-                ],
+                parameters=[LaunchConfiguration("parameters"), {"scene": LaunchConfiguration("scene")}],
                 remappings=[("~/input/points", LaunchConfiguration("points"))],
             ),
         ]
