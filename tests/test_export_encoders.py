@@ -6,13 +6,10 @@ import hashlib
 import json
 import logging
 import shutil
-from dataclasses import replace
 
 import numpy as np
 import onnx
 import pytest
-from labelled_clouds import room
-from og_pointcloud_export import write_bundle
 from text_models import (
     CONTEXT,
     END,
@@ -30,8 +27,7 @@ from text_models import (
 )
 
 from og_pointcloud.cli import main
-from og_pointcloud.cloud import Vocabulary
-from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError
+from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.masking.crops import LANGSPLAT, WITH_CONTEXT
 from og_pointcloud.masking.encode import OnnxModel, open_encoder
 from og_pointcloud.text.encoder import encoder_for, read_text_encoder
@@ -235,37 +231,11 @@ def test_int8_that_turns_vectors_too_far(model_folder, tmp_path, monkeypatch):
     assert not (tmp_path / "out").exists()
 
 
-def test_int8_must_not_change_what_a_scene_answers(encoder_folder, small_folder):
-    exact, small = read_text_encoder(encoder_folder), read_text_encoder(small_folder)
-    names = ("cat", "low", "lower cats")
-    vectors = exact(names)
-
-    def scene(descriptors):
-        cloud = room(300)
-        table = replace(cloud.instances, descriptors=np.asarray(descriptors, np.float32))
-        return replace(cloud, instances=table, feature_space=SPACE, vocabulary=Vocabulary(names, vectors))
-
-    # An instance nearly as like one word as another: by half of what int8 moves the two apart, the other way.
-    tie = (vectors[0] + vectors[1]).astype(np.float64)
-    tie /= np.linalg.norm(tie)
-    moved, apart = small(names) - vectors, (vectors[0] - vectors[1]).astype(np.float64)
-    tie -= (moved[0] - moved[1]) @ tie / 2 * apart / (apart @ apart)
-    with pytest.raises(OgPointcloudError, match=r"int8 changes \d+ of the scene's choices"):
-        exporter._accept_int8(small, exact, scene([tie / np.linalg.norm(tie)] * 9))
-    with pytest.raises(FeatureSpaceError, match="the scene's descriptors are of feature space"):
-        exporter._accept_int8(small, exact, room(100))
-    report = exporter._accept_int8(small, exact, scene(vectors[np.arange(9) % 3]))
-    assert (report["instances"], report["words"], report["choices_changed"]) == (9, 3, 0)
-
-
 # The command
 
 
 def test_the_text_command(model_folder, tmp_path, capsys):
     arguments = ["export", "text", str(model_folder), "--feature-space", SPACE]
-    scene = write_bundle(room(100), tmp_path / "other.ogpc")
-    assert main([*arguments, "--int8", "--scene", str(scene)]) == 2
-    assert "the scene's descriptors are of feature space" in capsys.readouterr().err
     assert main([*arguments, "-o", str(tmp_path / "out"), "--template", "a {}", "--int8"]) == 0
     printed = capsys.readouterr().out
     assert "onnxruntime and torch differ by" in printed
@@ -275,8 +245,6 @@ def test_the_text_command(model_folder, tmp_path, capsys):
     assert made.templates == ("a {}",)
     words = everyday_words()[:30]
     assert np.abs(made.word_bank.vectors[:30] - made.encode([f"a {word}" for word in words])).max() < 1e-3
-    with pytest.raises(SystemExit):
-        main([*arguments, "--scene", "s.ogpc"])
 
 
 def test_the_image_command(model_folder, tmp_path, capsys):

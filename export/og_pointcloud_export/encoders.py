@@ -11,7 +11,6 @@ import json
 import logging
 import os
 import re
-import shutil
 import tempfile
 import warnings
 import zlib
@@ -21,13 +20,11 @@ from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud.bundle.read import read_bundle
-from og_pointcloud.cloud import FeatureSpace
 from og_pointcloud.errors import MissingExtraError, OgPointcloudError
 from og_pointcloud.formats.npy import npy_bytes
 from og_pointcloud.formats.poses import read_json
@@ -49,9 +46,6 @@ except ImportError as error:
 if find_spec("onnxscript") is None:  # torch.onnx.export imports it late, and says less
     raise MissingExtraError("onnxscript", "export")
 
-if TYPE_CHECKING:
-    from og_pointcloud.cloud import LabelledCloud
-
 __all__ = ["PARITY_TEXTS", "export_image_encoder", "export_text_encoder", "write_image_encoder", "write_text_encoder"]
 
 OPSET = 18
@@ -59,8 +53,6 @@ TOLERANCE = 1e-5
 """Largest difference of a unit vector's entry from torch that is let through; float32 reaches about 1e-6."""
 INT8_COSINE = 0.99
 """Smallest cosine of an int8 vector with its float32 one that is let through."""
-EQUAL = 1e-6
-"""Cosines that float32 vectors cannot tell apart."""
 PARITY_TEXTS = (
     "", " ", "a", "chair", "a photo of a chair.", "red mug", "object", "things", "stuff", "texture",
     "fire extinguisher", "kitchen counter", "a wooden table with four legs, seen from above", "traffic light",
@@ -80,7 +72,6 @@ def export_text_encoder(
     feature_space: str | None = None,
     templates: Sequence[str] = ("{}",),
     int8: bool = False,
-    scene: str | os.PathLike[str] | None = None,
 ) -> tuple[Path, dict[str, Any]]:
     """Write a model's text half as a folder, complete or not at all. Returns the folder, and its manifest.
 
@@ -90,9 +81,8 @@ def export_text_encoder(
         found by its feature space.
     feature_space: OWNER/MODEL, as scenes name it; None: what the model's configuration calls itself.
     templates: texts with {} where a name goes; their vectors' mean stands for the name.
-    int8: a quarter of the size. Refused where a cosine with float32 falls below 0.99 or, with a scene (.ogpc), where an
-        instance's best word, or a word's best instance, becomes another.
-    Raises OgPointcloudError, and FeatureSpaceError for a scene of another space; then nothing is written.
+    int8: a quarter of the size. Refused where a cosine with float32 falls below 0.99.
+    Raises OgPointcloudError; then nothing is written.
     """
     source = Path(source)
     templates = check_templates(templates)
@@ -106,26 +96,20 @@ def export_text_encoder(
         "vocabulary": config.vocab_size,
         "pad_id": None if is_causal else _pad_id(source, tokenizer),
         "templates": list(templates),
-        "tower": {
-            "model_type": model.config.model_type, "layers": config.num_hidden_layers,
-            "heads": config.num_attention_heads, "activation": config.hidden_act,
-        },
-    }  # fmt: skip
+        "model_type": model.config.model_type,
+    }
     folder = Path(output) if output is not None else cache_folder() / _folder_name(space)
-    cloud = read_bundle(scene).cloud if scene is not None else None
-    tower = _TextTower(model).eval()
-    return folder, write_text_encoder(folder, tower, tokenizer, about, int8=int8, cloud=cloud)
+    return folder, write_text_encoder(folder, _TextTower(model).eval(), tokenizer, about, int8=int8)
 
 
 def write_text_encoder(
-    folder: Path, tower: Any, tokenizer: dict[str, Any], about: dict[str, Any],
-    *, int8: bool = False, cloud: LabelledCloud | None = None,
-) -> dict[str, Any]:  # fmt: skip
+    folder: Path, tower: Any, tokenizer: dict[str, Any], about: dict[str, Any], *, int8: bool = False
+) -> dict[str, Any]:
     """Write a torch module as a text encoder if its graph gives the module's vectors. Returns the manifest.
 
     tower: tokens (B, T) int64 -> (B, D) unit rows; T is any length up to the context, or the context alone where
         about["pad_id"] is set. tokenizer: as in a tokenizer.json. about: the manifest's entries on the model.
-    int8, cloud, errors: as in ``export_text_encoder``.
+    int8, errors: as in ``export_text_encoder``.
     """
     context, pad_id = about["context_length"], about["pad_id"]
     example = torch.zeros((2, min(context, 7) if pad_id is None else context), dtype=torch.int64)
@@ -140,7 +124,7 @@ def write_text_encoder(
     if int8:
         held[text_encoder.GRAPH], about["precision"] = _quantized(graph), "int8"
         small = TextEncoder(_with_manifest(about, held), str(folder))
-        parity["int8"] = _accept_int8(small, encoder, cloud)
+        parity["int8"] = _accept_int8(small, encoder)
         encoder = small
     held[text_encoder.WORD_BANK] = npy_bytes(encoder(everyday_words()).astype(np.float16))
     files = _with_manifest({**about, "parity": parity}, held)
@@ -162,14 +146,7 @@ def export_image_encoder(
     Raises OgPointcloudError, and MissingExtraError where a package of the 'export' extra is absent.
     """
     model = TransformersModel(source, feature_space, crops=tuple(crops), attention="eager")
-    config = model.tower.model.config
-    vision = config.vision_config
-    about = {
-        "tower": {
-            "model_type": config.model_type, "layers": vision.num_hidden_layers, "heads": vision.num_attention_heads,
-            "activation": vision.hidden_act, "patch_size": vision.patch_size,
-        },
-    }  # fmt: skip
+    about = {"model_type": model.tower.model.config.model_type}
     folder = Path(output) if output is not None else cache_folder() / f"{_folder_name(model.feature_space)}--image"
     return folder, write_image_encoder(folder, model, model.tower.cpu(), about)
 
@@ -352,43 +329,17 @@ def _difference(got: NDArray[np.float32], expected: NDArray[np.float32]) -> dict
     return {"max_abs_error": error, "min_cosine": cosine, "torch": torch.__version__}
 
 
-def _accept_int8(small: TextEncoder, exact: TextEncoder, cloud: LabelledCloud | None) -> dict[str, Any]:
+def _accept_int8(small: TextEncoder, exact: TextEncoder) -> dict[str, Any]:
     """What int8 costs; OgPointcloudError where that is too much."""
-    own = cloud.vocabulary.names if cloud is not None and cloud.vocabulary is not None else ()
-    names = list(dict.fromkeys([*own, *filter(str.strip, PARITY_TEXTS)]))
-    vectors, expected = small(names), exact(names)
-    cosines = (vectors.astype(np.float64) * expected).sum(axis=1)
+    names = [*everyday_words(), *filter(str.strip, PARITY_TEXTS)]
+    cosines = (small(names).astype(np.float64) * exact(names)).sum(axis=1)
     worst = int(cosines.argmin())
     if not cosines[worst] >= INT8_COSINE:
         raise OgPointcloudError(
             f"int8 turns the vector of '{names[worst]:.40}' to cosine {cosines[worst]:.4f}; expected at least "
             f"{INT8_COSINE}: leave --int8 out"
         )
-    report: dict[str, Any] = {
-        "texts": len(names),
-        "min_cosine": float(cosines[worst]),
-        "mean_cosine": float(cosines.mean()),
-    }
-    if cloud is None:
-        return report
-    FeatureSpace(exact.feature_space, exact.width).require(cloud.space, "scene's descriptors")
-    words = [names.index(name) for name in own] or list(range(len(names)))
-    before, after = (cloud.instances.cosines(rows[words].astype(np.float64)) for rows in (expected, vectors))
-    changed = _choices_changed(before, after) + _choices_changed(before.T, after.T)
-    if changed:
-        raise OgPointcloudError(
-            f"int8 changes {changed} of the scene's choices (best word of {len(before)} instances, best instance of "
-            f"{len(words)} words); expected 0: leave --int8 out"
-        )
-    return {**report, "instances": len(before), "words": len(words), "choices_changed": changed}
-
-
-def _choices_changed(before: NDArray[np.floating], after: NDArray[np.floating]) -> int:
-    """Rows whose best column became one that was worse; among equals there was no choice."""
-    if before.size == 0:
-        return 0
-    chosen = np.take_along_axis(before, after.argmax(axis=1)[:, None], axis=1)[:, 0]
-    return int((chosen < before.max(axis=1) - EQUAL).sum())
+    return {"texts": len(names), "min_cosine": float(cosines[worst]), "mean_cosine": float(cosines.mean())}
 
 
 # Files
@@ -421,17 +372,11 @@ def _write_folder(folder: Path, files: Mapping[str, bytes], known: Collection[st
     if folder.exists() and (not folder.is_dir() or {path.name for path in folder.iterdir()} - set(known)):
         raise OgPointcloudError(f"{folder} holds other things than an encoder; expected a new or an encoder's folder")
     folder.parent.mkdir(parents=True, exist_ok=True)
-    new, old = (folder.with_name(f".{folder.name}.{os.getpid()}.{kind}") for kind in ("new", "old"))
-    try:
+    with tempfile.TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent) as temporary:
+        new = Path(temporary) / "new"
         new.mkdir()
         for name, data in files.items():
             (new / name).write_bytes(data)
         if folder.exists():
-            folder.rename(old)
+            folder.rename(Path(temporary) / "old")
         new.rename(folder)
-    except BaseException:
-        shutil.rmtree(new, ignore_errors=True)
-        if old.exists() and not folder.exists():
-            old.rename(folder)
-        raise
-    shutil.rmtree(old, ignore_errors=True)

@@ -35,7 +35,7 @@ except ImportError as error:
 
 __all__ = ["OPSET", "build_query_graph"]
 
-LIST_LENGTHS = {"short": SHORT_LIST, "middle": 20, "long": LONGEST_LIST}
+LIST_LENGTHS = (SHORT_LIST, 20, LONGEST_LIST)
 """So many candidates are compared: of most lists the first number, of longer ones the next."""
 OPSET, IR_VERSION = 18, 8
 """The oldest that has everything needed (ScatterElements with max), so that onnxruntime 1.17 and later run it."""
@@ -43,365 +43,277 @@ OPSET, IR_VERSION = 18, 8
 
 def build_query_graph(cloud: LabelledCloud, grid: LookupGrid) -> bytes:
     """The serialised graph of a cloud; inputs and outputs are described above."""
-    nodes = [*_unit_nodes("text"), *_score_nodes(), *_lookup_nodes()]
-    text_width = max(cloud.instances.descriptors.shape[1], 1)
-    constants = {**_score_constants(cloud.instances), **_lookup_constants(cloud, grid)}
-    inputs = [
-        helper.make_tensor_value_info("points", TensorProto.FLOAT, ["N", 3]),
-        helper.make_tensor_value_info("text", TensorProto.FLOAT, ["L", text_width]),
-    ]
+    graph = _Graph()
+    code_label, code_score = _score_labels(graph, cloud.instances)
+    _Lookup(graph, cloud, grid).answer(code_label, code_score)
+    inputs = [("points", TensorProto.FLOAT, ["N", 3]), ("text", TensorProto.FLOAT, ["L", _text_width(cloud.instances)])]
     outputs = [
-        helper.make_tensor_value_info("label", TensorProto.INT32, ["N"]),
-        helper.make_tensor_value_info("score", TensorProto.FLOAT, ["N"]),
-        helper.make_tensor_value_info("instance", TensorProto.INT32, ["N"]),
-        helper.make_tensor_value_info("distance", TensorProto.INT8, ["N"]),
-        helper.make_tensor_value_info("certain", TensorProto.BOOL, ["N"]),
-        helper.make_tensor_value_info("instance_scores", TensorProto.FLOAT, [len(cloud.instances), "L"]),
+        ("label", TensorProto.INT32, ["N"]),
+        ("score", TensorProto.FLOAT, ["N"]),
+        ("instance", TensorProto.INT32, ["N"]),
+        ("distance", TensorProto.INT8, ["N"]),
+        ("certain", TensorProto.BOOL, ["N"]),
+        ("instance_scores", TensorProto.FLOAT, [len(cloud.instances), "L"]),
     ]
-    initializers = [numpy_helper.from_array(np.asarray(value), name) for name, value in constants.items()]
-    graph = helper.make_graph(nodes, "query_head", inputs, outputs, initializers, doc_string=__doc__)
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], producer_name="og_pointcloud")
+    declared = ([helper.make_tensor_value_info(*value) for value in values] for values in (inputs, outputs))
+    made = helper.make_graph(graph.nodes, "query_head", *declared, graph.initializers, doc_string=__doc__)
+    model = helper.make_model(made, opset_imports=[helper.make_opsetid("", OPSET)], producer_name="og_pointcloud")
     model.ir_version = IR_VERSION
     onnx.checker.check_model(model)
     return model.SerializeToString()
 
 
-def _node(operator: str, inputs: str, output: str, **attributes: Any) -> onnx.NodeProto:
-    return helper.make_node(operator, inputs.split(), [output], name=output, **attributes)
+class _Graph:
+    """A graph in the making. A call adds a node and gives the name of its output, which other nodes take as an input;
+    they also take numpy arrays and scalars, which become constants."""
+
+    def __init__(self) -> None:
+        self.nodes: list[onnx.NodeProto] = []
+        self.initializers: list[onnx.TensorProto] = []
+        self._scalars: dict[tuple[str, bytes], str] = {}
+
+    def __call__(self, operator: str, *inputs: Any, name: str = "", **attributes: Any) -> str:
+        name = name or f"{operator}_{len(self.nodes)}"
+        names = [value if isinstance(value, str) else self._scalar(value) for value in inputs]
+        self.nodes.append(helper.make_node(operator, names, [name], name=name, **attributes))
+        return name
+
+    def constant(self, name: str, value: Any) -> str:
+        """Add a named constant."""
+        self.initializers.append(numpy_helper.from_array(np.asarray(value), name))
+        return name
+
+    def _scalar(self, value: Any) -> str:
+        """A small constant, once for all nodes that take it."""
+        array = np.asarray(value)
+        key = f"{array.dtype.str}{array.shape}", array.tobytes()
+        if key not in self._scalars:
+            self._scalars[key] = self.constant(f"constant_{len(self._scalars)}", array)
+        return self._scalars[key]
+
+    def int32(self, value: str) -> str:
+        return self("Cast", value, to=TensorProto.INT32)
+
+    def double(self, value: str) -> str:
+        return self("Cast", value, to=TensorProto.DOUBLE)
+
+    def flat(self, value: str) -> str:
+        return self("Reshape", value, FLAT)
+
+    def at(self, table: str, index: str, **attributes: Any) -> str:
+        """The table's entries at these indices, by GatherElements: in onnxruntime it takes a tenth of Gather's time."""
+        return self("GatherElements", table, index, **attributes)
+
+    def where_true(self, comparison: str, first: Any, second: Any) -> str:
+        """Indices (m,) int32 where the comparison holds."""
+        return self.int32(self.flat(self("NonZero", self(comparison, first, second))))
+
+    def rows_apart(self, table: str) -> list[str]:
+        """(3, m) -> three times (m,)."""
+        rows = [f"{table}_row_{axis}" for axis in "xyz"]
+        self.nodes.append(helper.make_node("Split", [table], rows, name=f"{table}_rows", axis=0, num_outputs=3))
+        return [self.flat(row) for row in rows]
+
+    def sum_of_rows(self, table: str) -> str:
+        """(3, m) -> (m,); twice as fast as ReduceSum."""
+        x, y, z = self.rows_apart(table)
+        return self("Add", self("Add", x, y), z)
+
+    def columns_at(self, table: str, columns: str) -> str:
+        """Those columns (m,) of a table of three rows, (3, m)."""
+        shape = self("Concat", np.array([3]), self("Shape", columns), axis=0)
+        return self.at(table, self("Expand", columns, shape), axis=1)
 
 
-def _unit_nodes(name: str) -> list[onnx.NodeProto]:
+FLAT, FIRST_AXIS, LAST_AXIS = np.array([-1]), np.array([0]), np.array([1])
+
+
+def _text_width(instances: InstanceTable) -> int:
+    return max(instances.descriptors.shape[1], 1)  # if nothing was ever described, any one column will do
+
+
+def _unit_rows(graph: _Graph, rows: str) -> str:
     """Rows of unit length, in two steps so that neither tiny nor huge vectors leave float32."""
-    return [
-        _node("Abs", name, f"{name}_magnitude"),
-        _node("ReduceMax", f"{name}_magnitude last_axis", f"{name}_largest"),
-        _node("Max", f"{name}_largest smallest_normal", f"{name}_scale"),
-        _node("Div", f"{name} {name}_scale", f"{name}_scaled"),
-        _node("ReduceL2", f"{name}_scaled last_axis", f"{name}_length"),
-        _node("Max", f"{name}_length smallest_normal", f"{name}_divisor"),
-        _node("Div", f"{name}_scaled {name}_divisor", f"{name}_unit"),
-    ]
+    smallest = np.finfo(np.float32).tiny
+    scaled = graph("Div", rows, graph("Max", graph("ReduceMax", graph("Abs", rows), LAST_AXIS), smallest))
+    return graph("Div", scaled, graph("Max", graph("ReduceL2", scaled, LAST_AXIS), smallest))
 
 
-def _score_nodes() -> list[onnx.NodeProto]:
-    """text_unit -> instance_scores; label and score of each answer code: too far, unobserved, background, 0.."""
-    return [
-        _node("Transpose", "text_unit", "text_columns", perm=[1, 0]),
-        _node("MatMul", "descriptors text_columns", "similarity"),
-        # The best descriptor of each instance; codes without one stay at NO_EVIDENCE.
-        _node("Shape", "text", "label_count", end=1),
-        _node("Concat", "code_count label_count", "table_shape", axis=0),
-        _node("Expand", "no_evidence table_shape", "empty_table"),
-        _node("Shape", "similarity", "similarity_shape"),
-        _node("Expand", "descriptor_code similarity_shape", "similarity_code"),
-        _node("ScatterElements", "empty_table similarity_code similarity", "code_scores", axis=0, reduction="max"),
-        _node("Slice", "code_scores first_instance past_the_end first_axis", "instance_scores"),
-        # Column 0 stands for "unknown": it wins where no label has evidence, or there is no label at all.
-        _node("Concat", "unknown_column code_scores", "choices", axis=1),
-        _node("ArgMax", "choices", "choice", axis=1, keepdims=0),
-        _node("Sub", "choice one_int64", "choice_label"),
-        _node("Cast", "choice_label", "code_label", to=TensorProto.INT32),
-        _node("ReduceMax", "choices last_axis", "best_score", keepdims=0),
-        _node("Less", "code_label zero_int32", "code_unknown"),
-        _node("Where", "code_unknown zero best_score", "code_score"),
-    ]
-
-
-def _score_constants(instances: InstanceTable) -> dict[str, Any]:
+def _score_labels(graph: _Graph, instances: InstanceTable) -> tuple[str, str]:
+    """text -> instance_scores; label and score of each answer code: too far, unobserved, background, 0.."""
     codes = len(instances) + CODE_OFFSET
-    described = instances.descriptors.shape[1] > 0  # if nothing was ever described, any one column will do
-    return {
-        "descriptors": np.ascontiguousarray(instances.descriptors if described else np.zeros((0, 1)), np.float32),
-        "descriptor_code": (instances.descriptor_instance.astype(np.int64) + CODE_OFFSET)[:, None],
-        "code_count": np.array([codes], np.int64),
-        "no_evidence": np.array(NO_EVIDENCE, np.float32),
-        "unknown_column": np.full((codes, 1), NO_EVIDENCE, np.float32),
-        "first_instance": np.array([CODE_OFFSET], np.int64),
-        "past_the_end": np.array([np.iinfo(np.int64).max], np.int64),
-        "first_axis": np.array([0], np.int64),
-        "last_axis": np.array([1], np.int64),
-        "smallest_normal": np.finfo(np.float32).tiny,
-        "zero": np.float32(0),
-        "zero_int32": np.int32(0),
-        "one_int64": np.int64(1),
-    }
+    rows = np.ascontiguousarray(instances.descriptors.reshape(-1, _text_width(instances)), np.float32)
+    descriptor_code = graph.constant(
+        "descriptor_code", instances.descriptor_instance.astype(np.int64)[:, None] + CODE_OFFSET
+    )
+    text_columns = graph("Transpose", _unit_rows(graph, "text"), perm=[1, 0])
+    similarity = graph("MatMul", graph.constant("descriptors", rows), text_columns)
+    # The best descriptor of each instance; codes without one stay at NO_EVIDENCE.
+    shape = graph("Concat", np.array([codes]), graph("Shape", "text", end=1), axis=0)
+    empty = graph("Expand", np.float32(NO_EVIDENCE), shape)
+    code_of_row = graph("Expand", descriptor_code, graph("Shape", similarity))
+    scores = graph("ScatterElements", empty, code_of_row, similarity, axis=0, reduction="max")
+    past_the_end = np.array([np.iinfo(np.int64).max])
+    graph("Slice", scores, np.array([CODE_OFFSET]), past_the_end, FIRST_AXIS, name="instance_scores")
+    # Column 0 stands for "unknown": it wins where no label has evidence, or there is no label at all.
+    unknown = graph.constant("unknown_column", np.full((codes, 1), NO_EVIDENCE, np.float32))
+    choices = graph("Concat", unknown, scores, axis=1)
+    label = graph.int32(graph("Sub", graph("ArgMax", choices, axis=1, keepdims=0), np.int64(1)))
+    best = graph("ReduceMax", choices, LAST_AXIS, keepdims=0)
+    return label, graph("Where", graph("Less", label, np.int32(0)), np.float32(0), best)
 
 
-def _lookup_nodes() -> list[onnx.NodeProto]:
+class _Lookup:
     """points -> answer code, by the tables of ``LookupGrid`` and, for the few points in boxes that have one, by their
     list -> the outputs.
 
     Coordinates are laid out as three rows of N: several times as fast as N rows of three, and, unlike a product with
-    the strides, exact in integers wherever it runs. Tables are read with GatherElements, which in onnxruntime takes a
-    tenth of Gather's time.
+    the strides, exact in integers wherever it runs.
     """
-    return [
-        _node("Transpose", "points", "rows", perm=[1, 0]),
-        _node("Sub", "rows grid_low", "offset"),
-        _node("Mul", "offset cells_per_unit", "position"),
+
+    def __init__(self, graph: _Graph, cloud: LabelledCloud, grid: LookupGrid) -> None:
+        self.graph, self.cloud, self.grid = graph, cloud, grid
+        self.first_child_value, self.last_row = np.int32(2 * grid.codes), np.int32(len(grid.nodes) - 1)
+        for name in ("first_child", "child_length", "child_start"):
+            graph.constant(name, getattr(grid, name))
+        graph.constant("node_values", grid.nodes.ravel())
+        graph.constant("grid_low", grid.low[:, None])
+        # Candidates, numbered anew: of the cloud's points only those that are in a list.
+        point, candidate = np.unique(grid.candidates, return_inverse=True)
+        xyz = cloud.xyz[point] if len(point) else np.zeros((1, 3), np.float32)
+        answer = cloud.instance_ids[point] + CODE_OFFSET if len(point) else np.zeros(1, np.int64)
+        for row, axis in enumerate("xyz"):
+            graph.constant(f"candidate_{axis}", np.ascontiguousarray(xyz[:, row]))
+        graph.constant("candidate_answer", answer.astype(np.min_scalar_type(int(answer.max()))))
+        # Indices below 2^24, as almost all are, in three bytes instead of four; the high part takes what it needs. A
+        # search may read LONGEST_LIST entries from the start of the last list.
+        candidate = np.append(candidate, np.zeros(LONGEST_LIST, np.int64))
+        high = candidate >> 16
+        graph.constant("candidates_low", (candidate & 0xFFFF).astype(np.uint16))
+        graph.constant("candidates_high", high.astype(np.min_scalar_type(int(high.max()))))
+
+    def answer(self, code_label: str, code_score: str) -> None:
+        """Add all outputs but instance_scores."""
+        graph, grid = self.graph, self.grid
+        rows = graph("Transpose", "points", perm=[1, 0])
         # The clamp is on integers: whatever NaN, infinity or 1e30 become there, they end in the outermost layer.
-        _node("Cast", "position", "cell_unbounded", to=TensorProto.INT32),
-        _node("Max", "cell_unbounded zero_int32", "cell_above"),
-        _node("Min", "cell_above last_cell", "cell"),
+        last_cell = graph.constant("last_cell", (np.array(grid.shape) * EDGE - 1).astype(np.int32)[:, None])
+        cell = graph("Min", graph("Max", graph.int32(self._position(rows)), np.int32(0)), last_cell)
         # Along each axis, cell -> what it adds to (block * 64 + brick in the block) * 64 + cell in the brick.
-        _node("GatherElements", "axis_places cell", "place_terms", axis=1),
-        *_sum_of_rows("place_terms", "place"),
-        _node("Div", "place cells_per_block", "block"),
-        _node("Div", "place children", "brick"),
+        place = graph.sum_of_rows(graph.at(graph.constant("axis_places", _axis_places(grid)), cell, axis=1))
+        block, brick = graph("Div", place, np.int32(CHILDREN**2)), graph("Div", place, np.int32(CHILDREN))
         # block -> its row of brick_values, less its number, times 64; brick -> its reference
-        _node("GatherElements", "block_shifts block", "brick_shift"),
-        _node("Add", "brick brick_shift", "brick_address"),
-        _node("GatherElements", "brick_values brick_address", "brick_stored"),
-        _node("Cast", "brick_stored", "brick_reference", to=TensorProto.INT32),
+        block_row = grid.blocks.ravel().astype(np.int64)
+        shifts = graph.constant("block_shifts", ((block_row - np.arange(len(block_row))) * CHILDREN).astype(np.int32))
+        brick_address = graph("Add", brick, graph.at(shifts, block))
+        brick_values = graph.constant("brick_values", grid.bricks.ravel())
+        brick_reference = graph.int32(graph.at(brick_values, brick_address))
         # cell -> its value; the last row stands for bricks that have a list
-        _node("Min", "brick_reference last_row", "brick_row"),
-        _node("Sub", "brick_row brick", "row_shift"),
-        _node("Mul", "row_shift children", "address_shift"),
-        _node("Add", "place address_shift", "cell_address"),
-        _node("GatherElements", "node_values cell_address", "cell_stored"),
-        _node("Cast", "cell_stored", "cell_value", to=TensorProto.INT32),
+        row_shift = graph("Sub", graph("Min", brick_reference, self.last_row), brick)
+        cell_address = graph("Add", place, graph("Mul", row_shift, np.int32(CHILDREN)))
+        cell_value = graph.int32(graph.at("node_values", cell_address))
         # The few points whose cell is split or has a list; for the others that value is the answer.
-        *_where_true("GreaterOrEqual", "cell_value first_child_value", "pending"),
-        *_part_nodes(),
-        *_list_nodes(),
-        _node("ScatterElements", "cell_value pending pending_value", "value", axis=0),
-        # certain, or open with the answer at the centre
-        _node("Less", "value codes", "certain"),
-        _node("GatherElements", "value_instance value", "instance"),
-        _node("GatherElements", "value_distance value", "distance"),
-        _node("GatherElements", "value_answer value", "answer"),
-        _node("GatherElements", "code_label answer", "label"),
-        _node("GatherElements", "code_score answer", "score"),
-    ]
+        pending = graph.where_true("GreaterOrEqual", cell_value, self.first_child_value)
+        points = graph.columns_at(rows, pending)
+        part_value, child = self._part(points, graph.at(brick_reference, pending), graph.at(cell_value, pending))
+        value = self._nearest_in_list(graph.rows_apart(points), part_value, child)
+        self._outputs(graph("ScatterElements", cell_value, pending, value, axis=0), code_label, code_score)
 
+    def _position(self, rows: str) -> str:
+        """(3, m) points -> in cells, from the grid's low corner."""
+        return self.graph("Mul", self.graph("Sub", rows, "grid_low"), np.float32(1) / self.grid.cell_size)
 
-def _part_nodes() -> list[onnx.NodeProto]:
-    """pending, indices of points -> part_value, of the part of the cell; child, number of what settles it, if any."""
-    return [
-        *_columns_at("rows", "pending", "pending_rows"),
-        *_rows_apart("pending_rows", "point"),
-        _node("GatherElements", "cell_value pending", "pending_cell_value"),
-        _node("GatherElements", "brick_reference pending", "pending_brick_reference"),
-        *_child_nodes("pending_brick_reference", "pending_cell_value", "cell_child"),
+    def _outputs(self, value: str, code_label: str, code_score: str) -> None:
+        """Value -> outputs: certain, or open with the answer at the centre."""
+        graph, codes, near_codes = self.graph, self.grid.codes, self.grid.codes // 2
+        code = np.arange(2 * codes) % codes
+        code_answer = np.where(code > near_codes, code - near_codes, code)
+        distance = np.where(code == TOO_FAR_CODE, BEYOND, np.where(code > near_codes, NEAR, ON_SURFACE))
+        answer = graph.at(graph.constant("value_answer", code_answer.astype(np.int32)), value)
+        instance = graph.constant("value_instance", (code_answer - CODE_OFFSET).astype(np.int32))
+        graph("Less", value, np.int32(codes), name="certain")
+        graph.at(instance, value, name="instance")
+        graph.at(graph.constant("value_distance", distance.astype(np.int8)), value, name="distance")
+        graph.at(code_label, answer, name="label")
+        graph.at(code_score, answer, name="score")
+
+    def _part(self, points: str, brick_reference: str, cell_value: str) -> tuple[str, str]:
+        """Value of the part of the cell that each of these points (3, m) lies in; and child, the number of what settles
+        that part, if anything does."""
+        graph, zero = self.graph, np.int32(0)
+        cell_child = self._child(brick_reference, cell_value)
         # A reference, as a brick's: the cell's row if it is split, else beyond the last row for its list.
-        _node("GatherElements", "child_length cell_child", "cell_child_length"),
-        _node("GatherElements", "child_start cell_child", "cell_child_start"),
-        _node("Cast", "cell_child_length", "cell_child_length_int32", to=TensorProto.INT32),
-        _node("Less", "cell_child_length_int32 one_int32", "cell_split"),
-        _node("Add", "cell_child row_count", "cell_list_reference"),
-        _node("Where", "cell_split cell_child_start cell_list_reference", "cell_reference"),
+        is_split = graph("Less", graph.int32(graph.at("child_length", cell_child)), np.int32(1))
+        list_reference = graph("Add", cell_child, self.last_row + np.int32(1))
+        reference = graph("Where", is_split, graph.at("child_start", cell_child), list_reference)
         # Where in the cell the point is, in parts.
-        _node("Sub", "pending_rows grid_low", "pending_offset"),
-        _node("Mul", "pending_offset cells_per_unit", "pending_position"),
-        _node("Mul", "pending_position edge", "part_position"),
-        _node("Cast", "part_position", "part", to=TensorProto.INT32),
-        _node("Cast", "pending_position", "pending_cell", to=TensorProto.INT32),
-        _node("Mul", "pending_cell edge_int32", "first_part"),
-        _node("Sub", "part first_part", "part_in_cell"),  # Mod takes ten times as long
-        _node("Mul", "part_in_cell part_strides", "part_terms"),
-        *_sum_of_rows("part_terms", "part_place"),
-        _node("Min", "cell_reference last_row", "cell_row"),
-        _node("Mul", "cell_row children", "cell_start"),
-        _node("Add", "cell_start part_place", "part_address"),
-        _node("GatherElements", "node_values part_address", "part_stored"),
-        _node("Cast", "part_stored", "part_value", to=TensorProto.INT32),
-        *_child_nodes("cell_reference", "part_value", "child_or_less"),
-        _node("Max", "child_or_less zero_int32", "child"),  # below 0, and unused, for parts that are answered
-    ]
+        position = self._position(points)
+        first_part = graph("Mul", graph.int32(position), np.int32(EDGE))
+        part = graph(
+            "Sub", graph.int32(graph("Mul", position, np.float32(EDGE))), first_part
+        )  # Mod takes 10 times as long
+        part_place = graph.sum_of_rows(graph("Mul", part, np.array([[EDGE**2], [EDGE], [1]], np.int32)))
+        row_start = graph("Mul", graph("Min", reference, self.last_row), np.int32(CHILDREN))
+        value = graph.int32(graph.at("node_values", graph("Add", row_start, part_place)))
+        # A child below 0, and unused, is that of a part that is answered.
+        return value, graph("Max", self._child(reference, value), zero)
 
+    def _child(self, reference: str, value: str) -> str:
+        """A box's reference, and the value in it -> number of the child: first of the row + value - 2 codes, or, of a
+        reference to a list, for which the last row says -1 and 2 codes, how far it lies beyond that row."""
+        graph = self.graph
+        row = graph("Min", reference, self.last_row)
+        of_row = graph("Add", graph.at("first_child", row), graph("Sub", value, self.first_child_value))
+        return graph("Add", of_row, graph("Sub", reference, row))
 
-def _child_nodes(reference: str, value: str, output: str) -> list[onnx.NodeProto]:
-    """A box's reference, and the value in it -> number of the child: first of the row + value - 2 codes, or, of a
-    reference to a list, for which the last row says -1 and 2 codes, how far it lies beyond that row."""
-    return [
-        _node("Min", f"{reference} last_row", f"{output}_row"),
-        _node("GatherElements", f"first_child {output}_row", f"{output}_first"),
-        _node("Sub", f"{value} first_child_value", f"{output}_in_box"),
-        _node("Add", f"{output}_first {output}_in_box", f"{output}_of_row"),
-        _node("Sub", f"{reference} {output}_row", f"{output}_beyond"),
-        _node("Add", f"{output}_of_row {output}_beyond", output),
-    ]
+    def _nearest_in_list(self, points: list[str], part_value: str, child: str) -> str:
+        """The code of the nearest candidate of points (x, y, z) with a list; of the others their part's value.
 
+        As many entries are read of every list: LIST_LENGTHS' first, then, of longer lists, all again up to the next.
+        """
+        graph = self.graph
+        start, length = graph.at("child_start", child), graph.int32(graph.at("child_length", child))
+        is_answered = graph("Less", part_value, self.first_child_value)
+        length = graph("Where", is_answered, np.int32(0), length)
+        value, longer_than = part_value, 0
+        for entries in LIST_LENGTHS:
+            rows = graph.where_true("Greater", length, np.int32(longer_than))
+            asked = [graph.at(coordinate, rows) for coordinate in points]
+            code = self._search(asked, graph.at(start, rows), entries)
+            value, longer_than = graph("ScatterElements", value, rows, code, axis=0), entries
+        return value
 
-def _list_nodes() -> list[onnx.NodeProto]:
-    """part_value, child -> pending_value: of points with a list, the code of the nearest candidate.
+    def _search(self, points: list[str], start: str, entries: int) -> str:
+        """The code of the nearest of some entries from the start of each point's list, decided in float64.
 
-    As many entries are read of every list: LIST_LENGTHS' first, then, of longer lists, all again up to the next.
-    """
-    nodes = [
-        _node("GatherElements", "child_start child", "list_start"),
-        _node("GatherElements", "child_length child", "list_length_stored"),
-        _node("Cast", "list_length_stored", "list_length", to=TensorProto.INT32),
-        _node("Less", "part_value first_child_value", "part_answered"),
-        _node("Where", "part_answered zero_int32 list_length", "length"),
-    ]
-    value, longer_than = "part_value", "zero_int32"
-    for name in LIST_LENGTHS:
-        nodes += [*_where_true("Greater", f"length {longer_than}", f"{name}_rows"), *_search_nodes(name)]
-        nodes += [_node("ScatterElements", f"{value} {name}_rows {name}_code", f"value_after_{name}", axis=0)]
-        value, longer_than = f"value_after_{name}", f"{name}_length"
-    return [*nodes, _node("Identity", value, "pending_value")]
-
-
-def _search_nodes(name: str) -> list[onnx.NodeProto]:
-    """{name}_rows of the pending points -> {name}_code, that of the nearest in each one's list, decided in float64.
-
-    {name}_steps 0..K-1 reads K entries of every list. Of a shorter one it runs on into the next: farther points, or the
-    same ones again.
-    """
-
-    def own(names: str) -> str:
-        return " ".join(given[1:] if given.startswith("/") else f"{name}_{given}" for given in names.split())
-
-    def node(operator: str, inputs: str, output: str, **attributes: Any) -> onnx.NodeProto:
-        return _node(operator, own(inputs), own(output), **attributes)
-
-    distance = []
-    for axis in "xyz":
-        distance += [
-            node("GatherElements", f"/candidate_{axis} candidate", f"{axis}"),
-            node("Cast", f"{axis}", f"{axis}_double", to=TensorProto.DOUBLE),
-            node("Reshape", f"{axis}_double candidate_shape", f"{axis}_table"),
-            node("GatherElements", f"/point_{axis} rows", f"{axis}_asked"),
-            node("Cast", f"{axis}_asked", f"{axis}_asked_double", to=TensorProto.DOUBLE),
-            node("Unsqueeze", f"{axis}_asked_double /last_axis", f"{axis}_column"),
-            node("Sub", f"{axis}_table {axis}_column", f"{axis}_difference"),
-            node("Mul", f"{axis}_difference {axis}_difference", f"{axis}_squared"),
-        ]
-    return [
-        node("GatherElements", "/list_start rows", "start"),
-        node("Unsqueeze", "start /last_axis", "start_column"),
-        node("Add", "start_column steps", "candidate_address"),
-        node("Shape", "candidate_address", "candidate_shape"),
-        node("Reshape", "candidate_address /flat", "candidate_address_flat"),
-        node("GatherElements", "/candidates_low candidate_address_flat", "candidate_low_stored"),
-        node("Cast", "candidate_low_stored", "candidate_low", to=TensorProto.INT32),
-        node("GatherElements", "/candidates_high candidate_address_flat", "candidate_high_stored"),
-        node("Cast", "candidate_high_stored", "candidate_high_steps", to=TensorProto.INT32),
-        node("Mul", "candidate_high_steps /high_step", "candidate_high"),
-        node("Add", "candidate_low candidate_high", "candidate"),
-        *distance,
-        node("Add", "x_squared y_squared", "xy_squared"),
-        node("Add", "xy_squared z_squared", "squared"),
+        Of a shorter list it runs on into the next: farther points, or the same ones again.
+        """
+        graph, cloud = self.graph, self.cloud
+        steps = np.arange(entries, dtype=np.int32)[None]
+        address = graph("Add", graph("Unsqueeze", start, LAST_AXIS), steps)
+        shape, address = graph("Shape", address), graph.flat(address)
+        low, high = (graph.int32(graph.at(f"candidates_{part}", address)) for part in ("low", "high"))
+        candidate = graph("Add", low, graph("Mul", high, np.int32(1 << 16)))
+        squares = []
+        for axis, asked in zip("xyz", points, strict=True):
+            found = graph("Reshape", graph.double(graph.at(f"candidate_{axis}", candidate)), shape)
+            difference = graph("Sub", found, graph("Unsqueeze", graph.double(asked), LAST_AXIS))
+            squares.append(graph("Mul", difference, difference))
+        squared = graph("Add", graph("Add", squares[0], squares[1]), squares[2])
         # Lists ascend by point number, so the first of equals is the lowest.
-        node("ArgMin", "squared", "nearest", axis=1),
-        node("GatherElements", "squared nearest", "nearest_squared", axis=1),
-        node("Reshape", "candidate candidate_shape", "candidate_table"),
-        node("GatherElements", "candidate_table nearest", "nearest_candidate", axis=1),
-        node("Reshape", "nearest_candidate /flat", "nearest_flat"),
-        node("Reshape", "nearest_squared /flat", "nearest_squared_flat"),
-        node("GatherElements", "/candidate_answer nearest_flat", "answer_stored"),
-        node("Cast", "answer_stored", "answer", to=TensorProto.INT32),
-        node("Add", "answer /near_codes", "answer_near"),
-        node("LessOrEqual", "nearest_squared_flat /surface_squared", "on_surface"),
-        node("Where", "on_surface answer answer_near", "answer_within"),
-        node("LessOrEqual", "nearest_squared_flat /reach_squared", "within_reach"),
-        node("Where", "within_reach answer_within /too_far", "code"),
-    ]
-
-
-def _rows_apart(table: str, name: str) -> list[onnx.NodeProto]:
-    """(3, m) -> name_x, name_y, name_z, (m,) each."""
-    rows = [f"{name}_row_{axis}" for axis in "xyz"]
-    return [
-        helper.make_node("Split", [table], rows, name=f"{name}_rows", axis=0, num_outputs=3),
-        *(_node("Reshape", f"{row} flat", f"{name}_{axis}") for row, axis in zip(rows, "xyz", strict=True)),
-    ]
-
-
-def _sum_of_rows(table: str, output: str) -> list[onnx.NodeProto]:
-    """(3, m) -> (m,); twice as fast as ReduceSum."""
-    return [
-        *_rows_apart(table, output),
-        _node("Add", f"{output}_x {output}_y", f"{output}_xy"),
-        _node("Add", f"{output}_xy {output}_z", output),
-    ]
-
-
-def _where_true(comparison: str, inputs: str, output: str) -> list[onnx.NodeProto]:
-    """Indices (m,) int32 where the comparison holds."""
-    return [
-        _node(comparison, inputs, f"{output}_mask"),
-        _node("NonZero", f"{output}_mask", f"{output}_indices"),
-        _node("Reshape", f"{output}_indices flat", f"{output}_flat"),
-        _node("Cast", f"{output}_flat", output, to=TensorProto.INT32),
-    ]
-
-
-def _columns_at(table: str, columns: str, output: str) -> list[onnx.NodeProto]:
-    """Those columns (m,) of a table of three rows, (3, m)."""
-    return [
-        _node("Shape", columns, f"{output}_count"),
-        _node("Concat", f"three {output}_count", f"{output}_shape", axis=0),
-        _node("Expand", f"{columns} {output}_shape", f"{output}_columns"),
-        _node("GatherElements", f"{table} {output}_columns", output, axis=1),
-    ]
-
-
-def _lookup_constants(cloud: LabelledCloud, grid: LookupGrid) -> dict[str, Any]:
-    codes, near_codes = grid.codes, grid.codes // 2
-    point, candidate = np.unique(grid.candidates, return_inverse=True)
-    xyz = cloud.xyz[point] if len(point) else np.zeros((1, 3), np.float32)
-    answer = cloud.instance_ids[point] + CODE_OFFSET if len(point) else np.zeros(1, np.int64)
-    code = np.arange(2 * codes) % codes
-    code_answer = np.where(code > near_codes, code - near_codes, code)
-    distance = np.where(code == TOO_FAR_CODE, BEYOND, np.where(code > near_codes, NEAR, ON_SURFACE))
-    block_row = grid.blocks.ravel().astype(np.int64)
-    return {
-        # where a point is
-        "grid_low": grid.low[:, None],
-        "cells_per_unit": np.float32(1) / grid.cell_size,
-        "last_cell": (np.array(grid.shape) * EDGE - 1).astype(np.int32)[:, None],
-        "axis_places": _axis_places(grid),
-        "cells_per_block": np.int32(CHILDREN**2),
-        "children": np.int32(CHILDREN),
-        "edge": np.float32(EDGE),
-        "edge_int32": np.int32(EDGE),
-        "part_strides": np.array([[EDGE**2], [EDGE], [1]], np.int32),
-        # boxes
-        "block_shifts": ((block_row - np.arange(len(block_row))) * CHILDREN).astype(np.int32),
-        "brick_values": grid.bricks.ravel(),
-        "node_values": grid.nodes.ravel(),
-        "last_row": np.int32(len(grid.nodes) - 1),
-        "row_count": np.int32(len(grid.nodes)),
-        "codes": np.int32(codes),
-        "first_child_value": np.int32(2 * codes),
-        "first_child": grid.first_child,
-        "child_length": grid.child_length,
-        "child_start": grid.child_start,
-        # candidates; a search may read LONGEST_LIST entries from the start of the last list
-        **_in_three_bytes("candidates", np.append(candidate, np.zeros(LONGEST_LIST, np.int64))),
-        **{f"candidate_{axis}": np.ascontiguousarray(xyz[:, row]) for row, axis in enumerate("xyz")},
-        "candidate_answer": answer.astype(np.min_scalar_type(int(answer.max()))),
-        **{f"{name}_steps": np.arange(length, dtype=np.int32)[None] for name, length in LIST_LENGTHS.items()},
-        **{f"{name}_length": np.int32(length) for name, length in LIST_LENGTHS.items()},
-        "reach_squared": np.float64(cloud.reach) ** 2,
-        "surface_squared": np.float64(surface_distance(cloud.spacing, cloud.reach)) ** 2,
-        # answers
-        "near_codes": np.int32(near_codes),
-        "too_far": np.int32(TOO_FAR_CODE),
-        "value_instance": (code_answer - CODE_OFFSET).astype(np.int32),
-        "value_distance": distance.astype(np.int8),
-        "value_answer": code_answer.astype(np.int32),
-        "one_int32": np.int32(1),
-        "three": np.array([3], np.int64),
-        "flat": np.array([-1], np.int64),
-    }
-
-
-def _in_three_bytes(name: str, values: NDArray[np.integer]) -> dict[str, Any]:
-    """Indices below 2^24, as almost all are, in three bytes instead of four; the high part takes what it needs."""
-    high = values >> 16
-    constants: dict[str, Any] = {
-        f"{name}_low": (values & 0xFFFF).astype(np.uint16),
-        f"{name}_high": high.astype(np.min_scalar_type(int(high.max()))),
-        "high_step": np.int32(1 << 16),
-    }
-    return constants
+        nearest = graph("ArgMin", squared, axis=1)
+        distance = graph.flat(graph.at(squared, nearest, axis=1))
+        nearest = graph.flat(graph.at(graph("Reshape", candidate, shape), nearest, axis=1))
+        answer = graph.int32(graph.at("candidate_answer", nearest))
+        near = graph("Add", answer, np.int32(self.grid.codes // 2))
+        surface = np.float64(surface_distance(cloud.spacing, cloud.reach))
+        within = graph("Where", graph("LessOrEqual", distance, surface**2), answer, near)
+        is_in_reach = graph("LessOrEqual", distance, np.float64(cloud.reach) ** 2)
+        return graph("Where", is_in_reach, within, np.int32(TOO_FAR_CODE))
 
 
 def _axis_places(grid: LookupGrid) -> NDArray[np.int32]:
-    """(3, cells along the longest axis) int32; see ``_lookup_nodes``."""
+    """(3, cells along the longest axis) int32; see ``_Lookup.answer``."""
     _, blocks_y, blocks_z = grid.blocks.shape
     cell = np.arange(max(grid.shape) * EDGE)
     block, brick, inside = cell // EDGE**2, cell // EDGE % EDGE, cell % EDGE

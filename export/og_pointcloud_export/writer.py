@@ -63,15 +63,13 @@ def write_bundle(
     members = {"query.onnx": model.onnx} | {
         f"arrays/{name}.npy": npy_bytes(array) for name, array in _arrays(cloud).items()
     }
-    vocabulary_error = None
     if cloud.vocabulary is not None:
-        words, vocabulary_error = vocabulary_members(cloud.vocabulary, cloud.instances)
-        members |= words
+        members |= vocabulary_members(cloud.vocabulary)
     if cloud.word_bank is not None:
         members |= bank_members(cloud.word_bank)
     if text_encoder is not None:
         members |= encoder_members(text_encoder, cloud.space)[0]
-    manifest = _manifest(cloud, model, members, {**model.parity, "vocabulary_cosine_error": vocabulary_error})
+    manifest = _manifest(cloud, model, members)
     with replacing(path) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
         for name, data in {"manifest.json": manifest, **members}.items():
             archive.writestr(zipfile.ZipInfo(name), data)  # a ZipInfo of its own: the date stays 1980, the bytes too
@@ -151,7 +149,7 @@ def _describe_grid(grid: LookupGrid) -> dict[str, Any]:
     }
 
 
-def _manifest(cloud: LabelledCloud, model: QueryModel, members: dict[str, bytes], parity: dict[str, Any]) -> bytes:
+def _manifest(cloud: LabelledCloud, model: QueryModel, members: dict[str, bytes]) -> bytes:
     descriptors = np.ascontiguousarray(cloud.instances.descriptors, "<f4")
     manifest = {
         "format": FORMAT,
@@ -172,7 +170,7 @@ def _manifest(cloud: LabelledCloud, model: QueryModel, members: dict[str, bytes]
             "shape": list(descriptors.shape),
         },
         "query_head": {"opset": OPSET, "grid": model.grid},
-        "parity": parity,
+        "parity": model.parity,
         "members": {name: describe_member(name, data) for name, data in members.items()},
         "provenance": cloud.provenance,
     }  # fmt: skip

@@ -16,11 +16,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from og_pointcloud.bundle.format import BANK, CARRIED_ENCODER, describe_member
 from og_pointcloud.bundle.read import read_bundle, read_carried_encoder
-from og_pointcloud.cloud import FeatureSpace, InstanceTable, Vocabulary, WordBank, unit_rows
+from og_pointcloud.cloud import FeatureSpace, Vocabulary, WordBank, unit_rows
 from og_pointcloud.errors import FeatureSpaceError
 from og_pointcloud.formats.atomic import replacing
 from og_pointcloud.formats.npy import npy_bytes
@@ -28,12 +27,9 @@ from og_pointcloud.text.encoder import CarriedEncoder, TextEncoder, encoder_file
 from og_pointcloud.text.text_features import read_text_features
 
 __all__ = [
-    "AddedWords", "add_words", "bank_members", "carried_encoder", "carry_encoder", "compact_vectors", "encoder_members",
+    "AddedWords", "add_words", "bank_members", "carried_encoder", "carry_encoder", "encoder_members",
     "read_bank", "store_bank", "vocabulary_members",
 ]  # fmt: skip
-
-HALF_PRECISION_TOLERANCE = 1e-3
-"""Words are stored as float16 where no cosine with a descriptor moves by more, and no instance's best word changes."""
 
 
 @dataclass(frozen=True)
@@ -65,13 +61,8 @@ def add_words(
     known = [name for name in new if name in vectors]
     vectors |= new
     together = Vocabulary(tuple(vectors), np.array(list(vectors.values()), np.float32))
-    members, error = vocabulary_members(together, cloud.instances)
-
-    def edit(manifest: dict[str, Any]) -> None:
-        manifest["counts"]["words"] = len(together.names)
-        manifest.setdefault("parity", {})["vocabulary_cosine_error"] = error
-
-    _rewrite(Path(path), Path(output or path), bundle.manifest, members, edit)
+    counts = {**bundle.manifest["counts"], "words": len(together.names)}
+    _rewrite(path, output, {**bundle.manifest, "counts": counts}, vocabulary_members(together))
     return AddedWords(len(new) - len(known), len(known), len(together.names))
 
 
@@ -96,7 +87,7 @@ def store_bank(
     """
     bundle = read_bundle(path)
     bundle.cloud.space.require(FeatureSpace(feature_space, bank.vectors.shape[1]), "words of the bank")
-    _rewrite(Path(path), Path(output or path), bundle.manifest, bank_members(bank), lambda manifest: None)
+    _rewrite(path, output, bundle.manifest, bank_members(bank))
 
 
 def carry_encoder(
@@ -111,7 +102,7 @@ def carry_encoder(
     members, encoder = encoder_members(folder, bundle.cloud.space)
     if bundle.cloud.word_bank is None and encoder.word_bank is not None:
         members |= bank_members(encoder.word_bank)
-    _rewrite(Path(path), Path(output or path), bundle.manifest, members, lambda manifest: None)
+    _rewrite(path, output, bundle.manifest, members)
     return encoder
 
 
@@ -144,11 +135,11 @@ def encoder_members(folder: str | os.PathLike[str], space: FeatureSpace) -> tupl
     return {CARRIED_ENCODER + name: data for name, data in files.items()}, encoder
 
 
-def vocabulary_members(vocabulary: Vocabulary, instances: InstanceTable) -> tuple[dict[str, bytes], float]:
-    """The members that hold words, and the largest change of a cosine that storing them makes."""
-    stored, error = compact_vectors(vocabulary, instances)
+def vocabulary_members(vocabulary: Vocabulary) -> dict[str, bytes]:
+    """The members that hold words: names, and unit vectors in float32."""
     names = json.dumps(list(vocabulary.names), ensure_ascii=False).encode()
-    return {"vocabulary/names.json": names, "vocabulary/vectors.npy": npy_bytes(stored)}, error
+    vectors = unit_rows(vocabulary.vectors.astype(np.float64)).astype(np.float32)
+    return {"vocabulary/names.json": names, "vocabulary/vectors.npy": npy_bytes(vectors)}
 
 
 def bank_members(bank: WordBank) -> dict[str, bytes]:
@@ -156,27 +147,16 @@ def bank_members(bank: WordBank) -> dict[str, bytes]:
     return {BANK: npy_bytes(bank.vectors.astype(np.float16))}
 
 
-def compact_vectors(vocabulary: Vocabulary, instances: InstanceTable) -> tuple[NDArray[np.floating], float]:
-    """Unit vectors, as float16 if that changes no answer, and the largest change of a cosine that this makes."""
-    unit = unit_rows(vocabulary.vectors.astype(np.float64))
-    half = unit.astype(np.float16)
-    if instances.descriptors.size == 0 or unit.size == 0:
-        return half, 0.0
-    exact, stored = instances.cosines(unit), instances.cosines(half.astype(np.float64))
-    error = float(np.abs(stored - exact).max())
-    if error <= HALF_PRECISION_TOLERANCE and (exact.argmax(axis=1) == stored.argmax(axis=1)).all():
-        return half, error
-    single = unit.astype(np.float32)
-    return single, float(np.abs(instances.cosines(single.astype(np.float64)) - exact).max())
-
-
-def _rewrite(path: Path, output: Path, manifest: dict[str, Any], changes: Mapping[str, bytes], edit: Any) -> None:
-    """A bundle with some members replaced or added, and its manifest to match; the others are copied as they are."""
-    manifest = json.loads(json.dumps(manifest))  # the reader's stays as it is
-    edit(manifest)
-    manifest["members"] |= {name: describe_member(name, data) for name, data in changes.items()}
-    text = json.dumps(manifest, indent=1, ensure_ascii=False).encode()
-    with zipfile.ZipFile(path) as source, replacing(output) as file, zipfile.ZipFile(file, "w") as target:
+def _rewrite(
+    path: str | os.PathLike[str],
+    output: str | os.PathLike[str] | None,
+    manifest: Mapping[str, Any],
+    changes: Mapping[str, bytes],
+) -> None:
+    """A bundle with some members replaced or added, and this manifest; the others are copied as they are."""
+    members = manifest["members"] | {name: describe_member(name, data) for name, data in changes.items()}
+    text = json.dumps({**manifest, "members": members}, indent=1, ensure_ascii=False).encode()
+    with zipfile.ZipFile(path) as source, replacing(output or path) as file, zipfile.ZipFile(file, "w") as target:
         target.writestr(zipfile.ZipInfo("manifest.json"), text)  # a ZipInfo of its own: the date stays 1980
-        for name in manifest["members"]:
+        for name in members:
             target.writestr(zipfile.ZipInfo(name), changes[name] if name in changes else source.read(name))

@@ -36,9 +36,8 @@ def add(parser: Parser) -> None:
         help="what a name is put into, such as 'a photo of a {}.'; several are averaged (default: {})",
     )  # fmt: skip
     text.add_argument(
-        "--int8", action="store_true", help="a quarter of the size; refused where it would change what is found"
+        "--int8", action="store_true", help="a quarter of the size; refused where it turns a word's vector too far"
     )
-    text.add_argument("--scene", type=Path, metavar="S.ogpc", help="with --int8: a scene whose answers must stay")
     image.add_argument(
         "--crops", choices=("context", "langsplat"), default="context",
         help="how masks are cut out unless a caller says otherwise (default: %(default)s)",
@@ -50,19 +49,16 @@ def run_text(arguments: argparse.Namespace) -> None:
 
     og-pointcloud export text openai/clip-vit-base-patch32
     """
-    if arguments.scene and not arguments.int8:
-        arguments.parser.error("--scene is asked only what --int8 would change: give both, or neither")
     source, feature_space = found_model(arguments.model, arguments.feature_space)
     from og_pointcloud_export.encoders import export_text_encoder
 
     folder, manifest = export_text_encoder(
         source, arguments.output, feature_space=feature_space, templates=arguments.template or ("{}",),
-        int8=arguments.int8, scene=arguments.scene,
+        int8=arguments.int8,
     )  # fmt: skip
     print_export(folder, manifest, "texts")
     if int8 := manifest["parity"].get("int8"):
-        asked = f"no choice changed among {int8['instances']} instances" if "instances" in int8 else "no scene asked"
-        print(f"int8 and float32: cosine {int8['min_cosine']:.4f} at least, {asked} (--scene)")
+        print(f"int8 and float32: cosine {int8['min_cosine']:.4f} at least, over {int8['texts']} texts")
     if arguments.output is not None:
         print(f"next: export OG_POINTCLOUD_MODELS='{folder.resolve()}'  # scenes of this feature space then find it")
 
