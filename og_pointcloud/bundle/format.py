@@ -7,7 +7,7 @@ One zip, every member stored uncompressed, nothing pickled:
   query.onnx               the graph that answers text; the instance table's descriptors (R, D) are its constants
   arrays/*.npy             xyz, instance_ids (smallest integer type), rgb and certainty if known, instances/*
   vocabulary/names.json    words that may be asked as strings, if any
-  vocabulary/vectors.npy   (L, D) float16 or float32 unit vectors
+  vocabulary/vectors.npy   (L, D) float32 unit vectors, in older files float16
   bank/vectors.npy         (B, D) float16, everyday words that labels are judged by (``ask.choosing``), if it has them
   text_encoder/*           the files of a text encoder (see ``text.encoder``), if it carries one; read when needed
 
