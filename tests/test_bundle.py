@@ -254,7 +254,7 @@ def test_a_changed_member_with_a_right_crc_is_found_by_its_digest(tmp_path, bund
     ("version", "says"),
     [
         (3, "schema_version is 3, newer than the 2.*pip install --upgrade"),
-        (1, r"schema_version is 1, written by an older version.*fit the capture again \(og-pointcloud fit CAPTURE"),
+        (1, r"schema_version is 1, older than the 2.*fit the capture again \(og-pointcloud fit CAPTURE"),
     ],
 )
 def test_another_schema_names_the_cure(tmp_path, bundle_file, version, says):

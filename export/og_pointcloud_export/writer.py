@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud.bundle.format import FORMAT, SCHEMA_VERSION, describe_member
+from og_pointcloud.bundle.format import FORMAT, INSTANCE_MEMBERS, SCHEMA_VERSION, describe_member
 from og_pointcloud.bundle.nearest import NONE_WITHIN_REACH, NearestPoint
 from og_pointcloud.bundle.scene_words import bank_of_encoder
 from og_pointcloud.bundle.vocabulary import bank_members, encoder_members, vocabulary_members
@@ -92,9 +92,8 @@ def query_model(cloud: LabelledCloud) -> QueryModel:
 
 def _arrays(cloud: LabelledCloud) -> dict[str, NDArray[Any]]:
     """What lies under arrays/; the descriptors lie in query.onnx alone, where the manifest says."""
-    table = {field.name: getattr(cloud.instances, field.name) for field in fields(InstanceTable)}
-    del table["descriptors"]
-    table["whole"] = table.pop("part_of")  # the member's name since schema 2
+    columns = [field.name for field in fields(InstanceTable) if field.name != "descriptors"]
+    table = {INSTANCE_MEMBERS.get(name, name): getattr(cloud.instances, name) for name in columns}
     arrays = {"xyz": cloud.xyz, "instance_ids": _smallest_signed(cloud.instance_ids)}
     if cloud.rgb is not None:
         arrays["rgb"] = cloud.rgb

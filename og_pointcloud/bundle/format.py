@@ -42,6 +42,8 @@ QUERY_OPERATORS = frozenset({
 """What a query.onnx is made of: arithmetic and look-ups, nothing that repeats or branches."""
 REBUILD = "write the file again with write_bundle"
 BANK = "bank/vectors.npy"
+INSTANCE_MEMBERS = {"part_of": "whole"}
+"""Columns of the instance table whose member has another name, as it was in the first files of schema 2."""
 RGB, CERTAINTY = "arrays/rgb.npy", "arrays/certainty.npy"
 CARRIED_ENCODER = "text_encoder/"
 """What the names of a carried text encoder's members begin with."""

@@ -6,7 +6,7 @@ import hashlib
 import json
 import os
 import zipfile
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -19,6 +19,7 @@ from og_pointcloud.bundle.format import (
     CERTAINTY,
     FLOATS,
     FORMAT,
+    INSTANCE_MEMBERS,
     INTEGERS,
     MAX_MANIFEST_BYTES,
     MAX_MEMBERS,
@@ -134,30 +135,28 @@ def _manifest(members: dict[str, bytes]) -> dict[str, Any]:
     if "manifest.json" not in members:
         found = ", ".join(list(members)[:3]) or "nothing"
         raise _Refused(f"a zip without manifest.json (it holds {found}): not a .ogpc file; give the one that fit wrote")
-    data = members["manifest.json"]
-    if len(data) > MAX_MANIFEST_BYTES:
-        raise _Refused(f"manifest.json has {len(data)} bytes; expected at most {MAX_MANIFEST_BYTES}: {REBUILD}")
-    try:
-        manifest = json.loads(data)
-    except (ValueError, RecursionError) as error:
-        raise _Refused(f"manifest.json is no JSON ({error}): {REBUILD}") from None
+    manifest = _json(members, "manifest.json")
     if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
         seen = manifest.get("format") if isinstance(manifest, dict) else type(manifest).__name__
         raise _Refused(f"its manifest says format {seen!r}; expected {FORMAT!r}: give the file that fit wrote")
     schema = manifest.get("schema_version")
     if not isinstance(schema, int) or schema < 1:
         raise _Refused(f"schema_version is {schema!r}; expected a whole number from 1: {REBUILD}")
-    if schema < SCHEMA_VERSION:
-        raise _Refused(
-            f"schema_version is {schema}, written by an older version of this library; this one reads "
-            f"{SCHEMA_VERSION}: fit the capture again (og-pointcloud fit CAPTURE -o S.ogpc)"
-        )
-    if schema > SCHEMA_VERSION:
-        raise _Refused(
-            f"schema_version is {schema}, newer than the {SCHEMA_VERSION} that this library reads: "
-            "pip install --upgrade og-pointcloud"
-        )
+    if schema != SCHEMA_VERSION:
+        older = "older", "fit the capture again (og-pointcloud fit CAPTURE -o S.ogpc)"
+        age, cure = older if schema < SCHEMA_VERSION else ("newer", "pip install --upgrade og-pointcloud")
+        raise _Refused(f"schema_version is {schema}, {age} than the {SCHEMA_VERSION} that this library reads: {cure}")
     return manifest
+
+
+def _json(members: dict[str, bytes], name: str) -> Any:
+    data = members[name]
+    if len(data) > MAX_MANIFEST_BYTES:
+        raise _Refused(f"{name} has {len(data)} bytes; expected at most {MAX_MANIFEST_BYTES}: {REBUILD}")
+    try:
+        return json.loads(data)
+    except (ValueError, RecursionError) as error:
+        raise _Refused(f"{name} is no JSON ({error}): {REBUILD}") from None
 
 
 def _check_members(
@@ -209,7 +208,7 @@ def _cloud(manifest: dict[str, Any], members: dict[str, bytes]) -> LabelledCloud
             rgb=rgb,
             certainty=certainty,
             vocabulary=_vocabulary(manifest, members),
-            word_bank=_word_bank(members),
+            word_bank=WordBank(_array(members, BANK, ("<f2",), (None, None))) if BANK in members else None,
             provenance=_field(manifest, "provenance", dict),
         )
     except (OgPointcloudError, ValueError, TypeError, OverflowError) as error:
@@ -218,21 +217,14 @@ def _cloud(manifest: dict[str, Any], members: dict[str, bytes]) -> LabelledCloud
 
 def _instances(manifest: dict[str, Any], members: dict[str, bytes], count: int) -> InstanceTable:
     descriptors = _descriptors(_field(manifest, "descriptors", dict), members)
-
-    def column(name: str, dtype: str, length: int = count) -> NDArray[Any]:
-        return _array(members, f"arrays/instances/{name}.npy", (dtype,), (length,))
-
-    return InstanceTable(
-        descriptors=descriptors,
-        descriptor_instance=column("descriptor_instance", "<i4", len(descriptors)),
-        points=column("points", "<i4"),
-        views=column("views", "<i4"),
-        masks=column("masks", "<i4"),
-        agreement=column("agreement", "<f4"),
-        visible_area=column("visible_area", "<f4"),
-        coarse=column("coarse", "<i4"),
-        part_of=column("whole", "<i4"),  # the member's name since schema 2
-    )
+    columns: dict[str, NDArray[Any]] = {}
+    for field in fields(InstanceTable):
+        if field.name != "descriptors":
+            name = INSTANCE_MEMBERS.get(field.name, field.name)
+            dtype = "<f4" if field.name in ("agreement", "visible_area") else "<i4"
+            length = len(descriptors) if field.name == "descriptor_instance" else count
+            columns[field.name] = _array(members, f"arrays/instances/{name}.npy", (dtype,), (length,))
+    return InstanceTable(descriptors, **columns)
 
 
 def _descriptors(place: dict[str, Any], members: dict[str, bytes]) -> NDArray[np.float32]:
@@ -248,20 +240,13 @@ def _descriptors(place: dict[str, Any], members: dict[str, bytes]) -> NDArray[np
 def _vocabulary(manifest: dict[str, Any], members: dict[str, bytes]) -> Vocabulary | None:
     if "vocabulary/names.json" not in members:
         return None
-    try:
-        names = json.loads(members["vocabulary/names.json"])
-    except (ValueError, RecursionError) as error:
-        raise _Refused(f"vocabulary/names.json is no JSON ({error}): {REBUILD}") from None
+    names = _json(members, "vocabulary/names.json")
     words = _field(_field(manifest, "counts", dict), "words", int, "counts/")
     unique = isinstance(names, list) and all(isinstance(name, str) for name in names) and len(set(names)) == len(names)
     if not unique or len(names) != words:
         raise _Refused(f"vocabulary/names.json is not a list of {words} different words: {REBUILD}")
     vectors = _array(members, "vocabulary/vectors.npy", FLOATS, (words, None))
     return Vocabulary(tuple(names), vectors.astype(np.float32))
-
-
-def _word_bank(members: dict[str, bytes]) -> WordBank | None:
-    return WordBank(_array(members, BANK, ("<f2",), (None, None))) if BANK in members else None
 
 
 def _array(
