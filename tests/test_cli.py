@@ -21,8 +21,10 @@ from scenes import (
 from test_opengaussian import WIDTH as LEAF_WIDTH
 from test_opengaussian import write_result
 
+from og_pointcloud.ask.segmentation import SAVED_AS
 from og_pointcloud.bundle.read import read_bundle
 from og_pointcloud.cli import main
+from og_pointcloud.cli import segment as cli_segment
 from og_pointcloud.formats.capture import read_capture
 from og_pointcloud.formats.ply import read_ply
 
@@ -309,6 +311,18 @@ def test_bad_bundles_are_refused(damage, fitted, tmp_path, capsys):
     path.write_bytes(data[: len(data) // 2] if damage == "truncated" else b"not a bundle at all")
     for command in ("segment", "info"):
         assert "bad.ogpc" in error_of(capsys, command, path)
+
+
+def test_segment_knows_the_endings_that_results_are_saved_with():
+    assert cli_segment.SAVED_AS == SAVED_AS
+
+
+def test_a_command_out_of_memory_is_one_line(fitted, capsys, monkeypatch):
+    def fail(*_, **__):
+        raise MemoryError
+
+    monkeypatch.setattr("og_pointcloud.ask.labelled_scene.segment", fail)
+    assert error_of(capsys, "segment", fitted[1]) == "error: out of memory"
 
 
 def test_unknown_and_repeated_labels(fitted, capsys):

@@ -212,28 +212,21 @@ def scannet_row(
         *([] if other is None else [signed(change) if change else "-"]),
     )  # fmt: skip
     entry = {
-        "miou": mean.miou,
-        "macc": mean.macc,
-        "forced_miou": mean.forced_miou,
-        "flat_miou": mean.flat_miou,
+        **{name: getattr(mean, name) for name in ("miou", "macc", "forced_miou", "flat_miou")},
         "risk_area": curve.area if curve else None,
         "interval": [interval.low, interval.high] if interval else None,
         "less_the_other": [change.mean, change.low, change.high] if change else None,
-        "scenes": {scene: scan_scores(score) for scene, score in scenes.items()},
+        "scenes": {
+            scene: {
+                **{name: getattr(score.protocol, name) for name in ("miou", "macc", "points")},
+                "class_iou": dict(zip(map(str, score.protocol.classes), score.protocol.class_iou, strict=True)),
+                "answered_miou": score.answered.miou,
+                "answered_share": score.answered_share,
+            }
+            for scene, score in scenes.items()
+        },
     }
     return row, entry
-
-
-def scan_scores(score: SceneScore) -> dict[str, Any]:
-    """One scene's scores as JSON: by class, and the means."""
-    return {
-        "miou": score.protocol.miou,
-        "macc": score.protocol.macc,
-        "class_iou": dict(zip(map(str, score.protocol.classes), score.protocol.class_iou, strict=True)),
-        "points": score.protocol.points,
-        "answered_miou": score.answered.miou,
-        "answered_share": score.answered_share,
-    }
 
 
 def scannet_truths(folder: Path, scenes: list[str] | None) -> dict[str, Path]:

@@ -1,6 +1,6 @@
-"""List what is installed, and what a capture needs. Downloads nothing.
+"""List the models and parts that are installed, and the commands that get others. Downloads nothing.
 
-og-pointcloud models CAPTURE
+og-pointcloud models
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from og_pointcloud.cli.common import Parser, print_table
-from og_pointcloud.models import fetched_model, hub_cache
+from og_pointcloud.models import hub_cache
 
 PARTS = (
     ("fit, opencv masks", ("cv2", "numba", "scipy"), "fit"),
@@ -34,11 +34,11 @@ USUAL = (
 """What most want first; sizes as published."""
 
 
-def add(parser: Parser) -> None:
-    parser.add_argument("capture", type=Path, nargs="?", metavar="CAPTURE", help="also say what this capture needs")
+def add(_: Parser) -> None:
+    """No options."""
 
 
-def run(arguments: argparse.Namespace) -> None:
+def run(_: argparse.Namespace) -> None:
     missing = {purpose: not all(map(find_spec, modules)) for purpose, modules, _ in PARTS}
     rows = [
         (purpose, f"pip install 'og-pointcloud[{extra}]'" if missing[purpose] else "installed")
@@ -56,10 +56,6 @@ def run(arguments: argparse.Namespace) -> None:
     for kind, name, size in USUAL:
         if name not in here:
             print(f"  hf download {name}    # {kind}, {size}")
-    if arguments.capture:
-        print()
-        for line in needs(arguments.capture, any(kind == "proposer" for kind, _, _ in found)):
-            print(line)
 
 
 def found_models() -> Iterator[tuple[str, str, Path]]:
@@ -92,33 +88,3 @@ def model_kind(folder: Path) -> str | None:
     except (SceneError, OSError):
         return None
     return KINDS.get(str(content.get("model_type"))) if isinstance(content, dict) else None
-
-
-def needs(capture: Path, has_proposer: bool) -> Iterator[str]:
-    """What stands between a capture folder and a fit, line by line."""
-    from og_pointcloud.errors import OgPointcloudError
-    from og_pointcloud.formats.capture import read_capture
-
-    if not (capture / "mask_features.npz").is_file() and not (capture / "language_features").is_dir():
-        proposer = "sam:OWNER/MODEL" if has_proposer else "opencv"
-        yield f"{capture} has no masks:"
-        yield f"  og-pointcloud masks {capture} --proposer {proposer} --encoder OWNER/MODEL"
-        return
-    try:
-        scene = read_capture(capture)
-    except OgPointcloudError as error:
-        yield f"{capture} cannot be read: {error}"
-        return
-    space = scene.feature_space
-    from og_pointcloud.text.encoder import export_command, find_encoder
-
-    yield f"{capture} has masks with features of '{space}' (width {scene.feature_width})"
-    if find_encoder(space):
-        yield "  its words can be typed: the text encoder is here"
-    elif "/" in space:
-        yield "  typed words need its text encoder, which the base install then runs:"
-        if fetched_model(space) is None:
-            yield f"  hf download {space}"
-        yield f"  {export_command(space)}"
-    else:
-        yield "  its space names no public model: words come from a features file (--text-features)"
