@@ -141,13 +141,6 @@ def test_the_scene_is_found_as_everywhere(scene, bundle, monkeypatch):
     assert np.array_equal(mesh.og.segment(["apple"])["og_instance"], scene.instance_ids[:20])
 
 
-def test_progress_bar_is_shown_when_asked_for(scene, capsys):
-    pv.PolyData(scene.xyz[:20]).og.segment(["apple"], scene, progress_bar=True)
-    assert "Segmenting: 100%" in capsys.readouterr().err
-    pv.PolyData(scene.xyz[:20]).og.segment(["apple"], scene)
-    assert capsys.readouterr().err == ""
-
-
 def test_select_extracts_the_fitting_instances_with_their_rank(scene):
     mesh = pv.PolyData(scene.xyz)
     selection = og.select(scene, "plum")

@@ -14,9 +14,6 @@ from og_pointcloud.ask.hosts import world_points
 from og_pointcloud.ask.labelled_scene import SceneLike, SegmentOptions
 from og_pointcloud.ask.segmentation import Segmentation
 from og_pointcloud.errors import OgPointcloudError, SceneError
-from og_pointcloud.formats.pcd import read_pcd
-from og_pointcloud.formats.ply import read_ply
-from og_pointcloud.formats.tables import naming, positions
 from og_pointcloud.text.words import Labels
 from og_pointcloud_open3d.host import open3d
 
@@ -42,7 +39,8 @@ def read(path: str | os.PathLike[str]) -> Any:
     host, path = open3d(), Path(path)
     if not path.is_file():
         raise SceneError(f"{path}: no such file; expected a point cloud")
-    _check_columns(path)
+    if path.suffix in (".ply", ".pcd"):
+        world_points(path)  # which raises for the damaged ones
     with host.utility.VerbosityContextManager(host.utility.VerbosityLevel.Error):  # the error below says it
         cloud = host.t.io.read_point_cloud(str(path))
     if cloud.is_empty():
@@ -51,18 +49,6 @@ def read(path: str | os.PathLike[str]) -> Any:
             "file is damaged, empty, or of another kind than its name says"
         )
     return cloud
-
-
-def _check_columns(path: Path) -> None:
-    """SceneError for a PLY or PCD that is truncated or lacks x, y or z."""
-    with naming(path):
-        if path.suffix == ".ply":
-            elements = read_ply(path)
-            if "vertex" not in elements:
-                raise SceneError(f"no element 'vertex'; the file has {', '.join(elements) or 'none'}")
-            positions(elements["vertex"])
-        elif path.suffix == ".pcd":
-            positions(read_pcd(path))
 
 
 def segment(

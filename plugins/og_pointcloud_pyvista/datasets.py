@@ -9,8 +9,7 @@ cell's points vote.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -22,7 +21,7 @@ from og_pointcloud.ask.hosts import NAMES_FIELD, SCENE_FIELD
 from og_pointcloud.ask.instances import Instance
 from og_pointcloud.ask.labelled_scene import SceneLike, SegmentOptions, find_scene
 from og_pointcloud.ask.segmentation import Segmentation
-from og_pointcloud.errors import MissingExtraError, OgPointcloudError
+from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.formats.colors import label_colors
 from og_pointcloud.text.words import Labels, TextFeatures
 
@@ -68,20 +67,15 @@ class OgDataSet:
         *,
         pose: ArrayLike | None = None,
         inplace: bool = False,
-        progress_bar: bool = False,
         **options: Unpack[SegmentOptions],
     ) -> Any:
         """Label every point; returns a dataset of the same type with the arrays that this module names.
 
         labels, scene, pose, options: as for ``og_pointcloud.segment``.
-        inplace: add the arrays to this dataset, and return it. progress_bar: needs tqdm.
+        inplace: add the arrays to this dataset, and return it.
         Warns where no point gets a label, and names the labels asked for that no point got.
         """
-        with _progress("Segmenting", 2, progress_bar) as advance:
-            found = find_scene(self._mesh, scene)
-            advance()
-            result = og.segment(self._mesh, labels, found, pose=pose, **options)
-            advance()
+        result = og.segment(self._mesh, labels, scene, pose=pose, **options)
         absent = [name for name, count in result.counts().items() if not count]
         if labels is not None and absent and len(absent) < len(result.names):
             _warn(f"no point is labelled {_listed(absent)}")
@@ -281,16 +275,3 @@ def _listed(names: Sequence[str]) -> str:
 
 def _warn(text: str) -> None:
     warnings.warn(text, stacklevel=3)
-
-
-@contextmanager
-def _progress(what: str, steps: int, shown: bool) -> Iterator[Any]:
-    if not shown:
-        yield lambda: None
-        return
-    try:
-        from tqdm import tqdm
-    except ImportError:
-        raise MissingExtraError("tqdm", extra="fit") from None
-    with tqdm(total=steps, desc=what) as bar:
-        yield bar.update
