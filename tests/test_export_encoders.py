@@ -140,7 +140,7 @@ def test_folders_that_are_refused(model_folder, tmp_path, monkeypatch):
                 export(folder, tmp_path / "out", **{"feature_space": SPACE, **options})
 
     refused(tmp_path, "has no config.json")
-    refused(changed(model_type="blip"), "model_type is 'blip'; expected clip, siglip, siglip2")
+    refused(changed(model_type="blip"), "model_type is 'blip'; expected clip, siglip")
     refused(changed(quantization_config={"quant_method": "gptq"}), "quantised")
     refused(changed(text_config=3), "cannot be read")
     refused(changed(), "pass --feature-space as your scenes name it", feature_space=None)

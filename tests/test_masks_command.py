@@ -513,7 +513,7 @@ def test_a_proposer_that_is_not_there_is_one_error(tmp_path, processes):
 OWN = """
 import numpy as np
 def bright(image):
-    return image.max(axis=2) > 150, 7
+    return image.max(axis=2) / 255
 def halves(image):
     left = np.arange(image.shape[1]) < image.shape[1] // 2
     return np.broadcast_to([[left], [~left]], (2, *image.shape[:2])).copy()

@@ -19,6 +19,7 @@ from og_pointcloud.masking.automatic import (
     stability,
     without_specks,
 )
+from og_pointcloud.masking.contracts import Proposals
 from og_pointcloud.masking.existing import CallableProposer, ExistingMasks, as_proposals, decode_rle, from_ids
 from og_pointcloud.masking.opencv import OpenCVProposer, region_tree
 from og_pointcloud.masking.worker import open_proposer
@@ -285,23 +286,17 @@ def test_a_colour_png_is_refused(tmp_path):
         ExistingMasks(tmp_path).of("a", (5, 5))
 
 
-class Detections:
-    def __init__(self, mask, confidence=None):
-        self.mask, self.confidence = mask, confidence
-
-
 def test_any_callable():
     image, ids = painted()
     masks = ids == np.arange(1, 4)[:, None, None]
-    said = [masks, ids, ids - 1, (masks, [0.2, 0.3, 0.4]), Detections(masks, np.array([0.2, 0.3, 0.4])), from_ids(ids)]
-    for answer in said:
+    for answer in (masks, ids, ids - 1, from_ids(ids)):
         proposals = CallableProposer(lambda _, answer=answer: answer).propose(image)
         assert np.array_equal(proposals.masks, masks)
-    assert as_proposals(said[3], (120, 160)).scores.tolist() == pytest.approx([0.2, 0.3, 0.4])
-    assert len(as_proposals(Detections(None), (120, 160))) == 0
+    scored = Proposals(masks, np.array([0.2, 0.3, 0.4], np.float32))
+    assert as_proposals(scored, (120, 160)) is scored
     with pytest.raises(SceneError, match="expected the same"):
         as_proposals(masks, (5, 5))
-    with pytest.raises(SceneError, match="expected bool"):
+    with pytest.raises(SceneError, match="expected Proposals, bool"):
         as_proposals(masks.astype(float), (120, 160))
 
 

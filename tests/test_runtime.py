@@ -422,7 +422,7 @@ def test_a_files_words_come_before_the_scenes(scene):
         ({"a": np.ones((1, WIDTH))}, FeatureSpaceError, r"'a' is float64 \(1, 16\)"),
         ({"a": "text"}, FeatureSpaceError, "the vector of 'a'"),
         ({"a": np.zeros(WIDTH)}, FeatureSpaceError, "'a' is zero"),
-        ({"a": np.ones(WIDTH), "b": np.full(WIDTH, np.nan)}, FeatureSpaceError, "'b' holds NaN"),
+        ({"a": np.ones(WIDTH), "b": np.full(WIDTH, np.nan)}, FeatureSpaceError, "'b' is NaN"),
     ],
 )
 def test_labels_that_cannot_be_asked(scene, labels, error, says):

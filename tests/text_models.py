@@ -19,7 +19,7 @@ START, END = VOCABULARY - 2, VOCABULARY - 1
 SIZE, PATCH = 32, 8
 TEXTS = ["", "cat", "low lower cat", "it's 12 cats!", "café \U0001f44d", "cat " * 50, "cat<|endoftext|>low"]
 SPACE = "tests/tiny-clip"
-KINDS = ("clip", "clip of early days", "siglip", "siglip2")
+KINDS = ("clip", "clip of early days", "siglip")
 
 
 def clip_tokenizer(merges):
@@ -92,14 +92,9 @@ def transformers_model(kind):
         text |= early if "early" in kind else {"eos_token_id": END, "hidden_act": "gelu"}
         config = transformers.CLIPConfig(text_config=text, vision_config=vision, projection_dim=OUT)
         model = transformers.CLIPModel(config)
-    elif kind == "siglip":
-        text |= {"projection_size": 32, "eos_token_id": END}
-        model = transformers.SiglipModel(transformers.SiglipConfig(text_config=text, vision_config=vision))
     else:
         text |= {"projection_size": 32, "eos_token_id": END}
-        vision = {name: value for name, value in vision.items() if name != "image_size"}
-        vision["num_patches"] = (SIZE // PATCH) ** 2
-        model = transformers.Siglip2Model(transformers.Siglip2Config(text_config=text, vision_config=vision))
+        model = transformers.SiglipModel(transformers.SiglipConfig(text_config=text, vision_config=vision))
     torch.manual_seed(0)
     with torch.no_grad():
         for weight in model.parameters():  # as they begin, biases are zero and vectors nearly one
@@ -128,14 +123,6 @@ def image_vectors(model, pixels):
     """(B, D) unit rows as transformers has them."""
     import torch
 
-    images = torch.from_numpy(pixels)
-    given = {"pixel_values": images}
-    if type(model).__name__ == "Siglip2Model":
-        side = SIZE // PATCH
-        cut = images.unfold(2, PATCH, PATCH).unfold(3, PATCH, PATCH).permute(0, 2, 3, 4, 5, 1)
-        given["pixel_values"] = cut.reshape(len(pixels), side * side, PATCH * PATCH * 3)
-        given["pixel_attention_mask"] = torch.ones(len(pixels), side * side, dtype=torch.long)
-        given["spatial_shapes"] = torch.tensor([[side, side]] * len(pixels))
     with torch.no_grad():
-        vectors = model.get_image_features(**given).pooler_output
+        vectors = model.get_image_features(pixel_values=torch.from_numpy(pixels)).pooler_output
     return torch.nn.functional.normalize(vectors, dim=-1).numpy()

@@ -22,8 +22,7 @@ PARTS = (
 )
 """What for, modules, extra."""
 KINDS = {"sam": "proposer", "sam_hq": "proposer", "sam2": "proposer", "sam2_video": "proposer", "sam3": "proposer",
-         "sam3_video": "proposer", "sam3_tracker": "proposer", "clip": "encoder", "siglip": "encoder",
-         "siglip2": "encoder"}  # fmt: skip
+         "sam3_video": "proposer", "sam3_tracker": "proposer", "clip": "encoder", "siglip": "encoder"}  # fmt: skip
 """config.json's model_type -> what it is for."""
 USUAL = (
     ("proposer", "facebook/sam-vit-base", "SAM, 94 M parameters"),

@@ -1,12 +1,11 @@
 """CLIP and SigLIP through transformers, without its image processors and without torchvision.
 
-A folder is trusted with nothing but numbers: its config.json must name one of three model types, whose classes are
+A folder is trusted with nothing but numbers: its config.json must name one of two model types, whose classes are
 transformers' own; weights are read from .safetensors only; nothing is fetched, and no code of the folder is run.
 """
 
 from __future__ import annotations
 
-import math
 import os
 from pathlib import Path
 from typing import Any, Literal, cast
@@ -27,7 +26,7 @@ except ImportError as error:
 
 __all__ = ["ImageTower", "TransformersModel", "load_model", "preprocessing_of", "published_name"]
 
-CLASSES = {"clip": "CLIPModel", "siglip": "SiglipModel", "siglip2": "Siglip2Model"}
+CLASSES = {"clip": "CLIPModel", "siglip": "SiglipModel"}
 """config.json's model_type -> transformers' class of it."""
 CLIP_COLOURS = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)
 SIGLIP_COLOURS = (0.5, 0.5, 0.5), (0.5, 0.5, 0.5)
@@ -36,7 +35,7 @@ PILLOW_RESAMPLE: dict[Any, Resample] = {2: "bilinear", 3: "bicubic"}
 
 
 def load_model(folder: str | os.PathLike[str], attention: Literal["eager", "sdpa"] = "sdpa") -> Any:
-    """A transformers folder of CLIP, SigLIP or SigLIP 2 -> the model in float32, for evaluation.
+    """A transformers folder of CLIP or SigLIP (SigLIP 2 of fixed size is one) -> the model in float32, for evaluation.
 
     attention: how transformers computes it; "eager" is plain matrix products, which exports well.
     OgPointcloudError where the folder is none of these, or its weights do not fit its configuration.
@@ -81,33 +80,14 @@ class ImageTower(torch.nn.Module):
     """Pixels (B, 3, S, S) float32 -> (B, D) unit rows."""
 
     def __init__(self, model: Any) -> None:
-        """model: from ``load_model``. A SigLIP 2 of flexible shapes is given square images only from now on."""
+        """model: from ``load_model``."""
         super().__init__()
         self.model = model
-        if model.config.model_type == "siglip2":
-            model.vision_model.embeddings = _SquareEmbeddings(model.vision_model.embeddings)
 
     def forward(self, pixels: torch.Tensor) -> torch.Tensor:
         """See the class."""
-        if self.model.config.model_type == "siglip2":
-            found = self.model.vision_model(pixel_values=pixels, pixel_attention_mask=None, spatial_shapes=None)
-        else:
-            found = self.model.get_image_features(pixel_values=pixels)
-        return found.pooler_output / found.pooler_output.norm(dim=-1, keepdim=True)
-
-
-class _SquareEmbeddings(torch.nn.Module):
-    """SigLIP 2 takes patches and resizes the embeddings of their places; for its own square these are as trained."""
-
-    def __init__(self, embeddings: Any) -> None:
-        super().__init__()
-        self.inner = embeddings
-
-    def forward(self, pixels: torch.Tensor, _shapes: None) -> torch.Tensor:
-        side = self.inner.patch_size
-        patches = pixels.unfold(2, side, side).unfold(3, side, side)  # (B, 3, rows, columns, P, P)
-        flat = patches.permute(0, 2, 3, 4, 5, 1).flatten(3).flatten(1, 2)
-        return self.inner.patch_embedding(flat) + self.inner.position_embedding.weight
+        found = self.model.get_image_features(pixel_values=pixels).pooler_output
+        return found / found.norm(dim=-1, keepdim=True)
 
 
 class TransformersModel:
@@ -139,7 +119,6 @@ class TransformersModel:
 def preprocessing_of(folder: str | os.PathLike[str], config: Any) -> Preprocessing:
     """What preprocessor_config.json says, or what the family's published models do. config: the model's."""
     vision, is_clip = config.vision_config, config.model_type == "clip"
-    size = vision.patch_size * math.isqrt(vision.num_patches) if config.model_type == "siglip2" else vision.image_size
     file = Path(folder) / "preprocessor_config.json"
     stated = read_json(file) if file.is_file() else {}
     mean, std = CLIP_COLOURS if is_clip else SIGLIP_COLOURS
@@ -150,7 +129,7 @@ def preprocessing_of(folder: str | os.PathLike[str], config: Any) -> Preprocessi
             "expected 2 (bilinear) or 3 (bicubic), and 1/255"
         )
     mean, std = tuple(stated.get("image_mean", mean)), tuple(stated.get("image_std", std))
-    return Preprocessing(size, cast("Any", mean), cast("Any", std), resample, keeps_shape=is_clip)
+    return Preprocessing(vision.image_size, cast("Any", mean), cast("Any", std), resample, keeps_shape=is_clip)
 
 
 def published_name(folder: str | os.PathLike[str]) -> str:

@@ -9,13 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from functools import lru_cache
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud.errors import OgPointcloudError, SceneError
+from og_pointcloud.errors import MissingExtraError, OgPointcloudError, SceneError
 
 __all__ = ["CROP_STYLES", "LANGSPLAT", "WITH_CONTEXT", "Crop", "Preprocessing", "Resample", "mask_box", "mask_crops"]
 
@@ -23,8 +22,6 @@ Resample = Literal["bilinear", "bicubic"]
 Colour = tuple[float, float, float]
 
 MAX_SIZE = 4096
-CUBIC = -0.5
-"""Keys' parameter, as Pillow has it; OpenCV's is -0.75, and OpenCV's does not smooth what it shrinks."""
 
 
 @dataclass(frozen=True)
@@ -40,8 +37,8 @@ class Crop:
     weight: float = 1.0
 
     def __post_init__(self) -> None:
-        if not (1 <= self.scale <= 16 and 0 <= self.outside <= 1 and 0 < self.weight < np.inf):
-            raise SceneError(f"{self} cannot be cut; expected scale 1 to 16, outside 0 to 1 and a weight above 0")
+        if not (1 <= self.scale <= 8 and 0 <= self.outside <= 1 and 0 < self.weight < np.inf):
+            raise SceneError(f"{self} cannot be cut; expected scale 1 to 8, outside 0 to 1 and a weight above 0")
 
 
 LANGSPLAT = (Crop(),)
@@ -115,11 +112,16 @@ def mask_crops(
             f"masks are {masks.dtype} {masks.shape}; expected bool (masks, {image.shape[0]}, {image.shape[1]}), as "
             "large as the image"
         )
-    colour = np.asarray(fill, np.float32)
-    faded = np.rint(crop.outside * image + (1 - crop.outside) * colour).astype(np.uint8)  # once, not for every mask
+    pillow = _require_pillow()
+    faded = np.rint(crop.outside * image + (1 - crop.outside) * np.asarray(fill, np.float32)).astype(
+        np.uint8
+    )  # once, not for every mask
     crops = np.empty((len(masks), size, size, 3), np.uint8)
     for row, mask in enumerate(masks):
-        crops[row] = _square(image, faded, mask, crop.scale, size, colour, resample)
+        square = _square(image, faded, mask, crop.scale, fill)
+        # Pillow's filters, as the models' own processors: they smooth what they shrink, OpenCV's do not.
+        resized = pillow.fromarray(square).resize((size, size), pillow.Resampling[resample.upper()])
+        crops[row] = np.asarray(resized)
     return crops
 
 
@@ -132,11 +134,9 @@ def mask_box(mask: NDArray[np.bool_]) -> tuple[int, int, int, int]:
 
 
 def _square(
-    image: NDArray[np.uint8], faded: NDArray[np.uint8], mask: NDArray[np.bool_], scale: float, size: int,
-    fill: NDArray[np.float32], resample: Resample,
-) -> NDArray[np.uint8]:  # fmt: skip
-    """(size, size, 3) the window about the mask's box, faded outside the mask, resized. What lies beyond the image's
-    edge is not made: its even colour is added where lines are mixed."""
+    image: NDArray[np.uint8], faded: NDArray[np.uint8], mask: NDArray[np.bool_], scale: float, fill: Sequence[int]
+) -> NDArray[np.uint8]:
+    """A square around the mask's box, faded outside the mask, of the fill beyond the image's edge."""
     top, left, height, width = mask_box(mask)
     side = max(round(scale * max(height, width)), 1)
     top, left = top - (side - height) // 2, left - (side - width) // 2
@@ -144,49 +144,14 @@ def _square(
     columns = slice(max(left, 0), min(left + side, image.shape[1]))
     shown, inside = faded[rows, columns].copy(), mask[rows, columns]
     shown[inside] = image[rows, columns][inside]
-    down = _resampled(shown, size, resample, side, rows.start - top, fill)  # first: rows lie together in memory
-    return _resampled(down.transpose(1, 0, 2), size, resample, side, columns.start - left, fill).transpose(1, 0, 2)
+    square = np.full((side, side, 3), fill, np.uint8)
+    square[rows.start - top : rows.stop - top, columns.start - left : columns.stop - left] = shown
+    return square
 
 
-def _resampled(
-    lines: NDArray[np.uint8], count: int, resample: Resample, before: int, start: int, fill: NDArray[np.float32]
-) -> NDArray[np.uint8]:
-    """(count, K, C) of ``before`` lines: those given (n, K, C) begin at ``start``, all others are of the fill (C,)."""
-    values = lines.astype(np.float32, order="C").reshape(len(lines), -1)
-    beyond = np.tile(fill, lines.shape[1])
-    mixed = np.empty((count, values.shape[1]), np.float32)
-    for row, (first, weights) in enumerate(_weights(before, count, resample)):
-        inside = weights[max(start - first, 0) : max(start + len(lines) - first, 0)]
-        place = max(first - start, 0)
-        mixed[row] = inside @ values[place : place + len(inside)]
-        if len(inside) < len(weights):
-            mixed[row] += (1 - inside.sum()) * beyond
-    return np.clip(np.floor(mixed + 0.5), 0, 255).astype(np.uint8).reshape(count, *lines.shape[1:])
-
-
-@lru_cache(maxsize=64)
-def _weights(before: int, after: int, resample: Resample) -> tuple[tuple[int, NDArray[np.float32]], ...]:
-    """For each new line the first old line that is in it, and how much of that and of those behind it; sums are 1.
-
-    The kernel is stretched by the shrinking, so that every old line counts, and cut off where it is zero.
-    """
-    step = before / after
-    stretch = max(step, 1.0)
-    centre = (np.arange(after) + 0.5) * step
-    reach = (2.0 if resample == "bicubic" else 1.0) * stretch
-    first = np.maximum(np.floor(centre - reach + 0.5), 0)[:, None]
-    last = np.minimum(np.floor(centre + reach + 0.5), before)[:, None]
-    line = np.arange(before)
-    distance = np.abs(line + 0.5 - centre[:, None]) / stretch
-    weight = _cubic(distance) if resample == "bicubic" else np.maximum(1 - distance, 0)
-    weight = np.where((line >= first) & (line < last), weight, 0)
-    weight = (weight / weight.sum(axis=1, keepdims=True)).astype(np.float32)
-    runs = zip(first[:, 0].astype(int).tolist(), last[:, 0].astype(int).tolist(), strict=True)
-    return tuple((start, row[start:end].copy()) for (start, end), row in zip(runs, weight, strict=True))
-
-
-def _cubic(x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Keys' cubic kernel at distances x >= 0."""
-    near = ((CUBIC + 2) * x - (CUBIC + 3)) * x * x + 1
-    far = (((x - 5) * x + 8) * x - 4) * CUBIC
-    return np.where(x < 1, near, np.where(x < 2, far, 0))
+def _require_pillow() -> Any:
+    try:
+        from PIL import Image
+    except ImportError as error:
+        raise MissingExtraError("Pillow", "fit") from error
+    return Image

@@ -1,4 +1,4 @@
-"""Masks that exist already: id images, COCO annotations, detections, and whatever a function of the user's returns."""
+"""Masks that exist already: id images, COCO annotations, and what a function of the user's returns."""
 
 from __future__ import annotations
 
@@ -35,35 +35,24 @@ def from_ids(ids: NDArray[np.integer], none: int = 0) -> Proposals:
 
 
 def as_proposals(given: Any, shape: tuple[int, int]) -> Proposals:
-    """What a function or library gave, as proposals for an image of ``shape`` (H, W).
+    """What a function of the user's gave, as proposals for an image of ``shape`` (H, W).
 
-    Taken: Proposals; bool (M, H, W); an id map of integers (H, W), negative outside every mask, and 0 as well where
-    nothing is negative; a pair (masks, scores); anything with ``.mask`` (M, H, W) or None, and perhaps ``.confidence``
-    (M,), as supervision's detections.
+    Taken: Proposals; bool (M, H, W), all of score 1; an id map of integers (H, W), negative outside every mask, and 0
+    as well where nothing is negative.
     """
-    scores: Any = None
+    masks = given.masks if isinstance(given, Proposals) else np.asarray(given)
+    if masks.shape[-2:] != shape:
+        raise SceneError(f"masks are {masks.shape}, their image {shape}; expected the same (H, W)")
     if isinstance(given, Proposals):
-        proposals = given
-    else:
-        if hasattr(given, "mask"):
-            given, scores = given.mask, getattr(given, "confidence", None)
-            given = np.zeros((0, *shape), np.bool_) if given is None else given
-        elif isinstance(given, tuple) and len(given) == 2:
-            given, scores = given
-        masks = np.asarray(given)
-        if masks.ndim == 2 and masks.dtype.kind in "iu":
-            proposals = from_ids(np.maximum(masks, -1), none=-1 if masks.min(initial=0) < 0 else 0)
-        elif masks.ndim == 3 and masks.dtype == np.bool_:
-            trust = np.ones(len(masks)) if scores is None else np.asarray(scores)
-            proposals = Proposals(masks, np.clip(trust.astype(np.float32), 0, 1))
-        else:
-            raise SceneError(
-                f"a mask proposer gave {type(given).__name__} {masks.dtype} {masks.shape}; expected bool (masks, H, "
-                "W), or an id map of whole numbers (H, W)"
-            )
-    if proposals.masks.shape[1:] != shape:
-        raise SceneError(f"masks are {proposals.masks.shape[1:]}, their image {shape}; expected the same (H, W)")
-    return proposals
+        return given
+    if masks.ndim == 2 and masks.dtype.kind in "iu":
+        return from_ids(np.maximum(masks, -1), none=-1 if masks.min(initial=0) < 0 else 0)
+    if masks.ndim == 3 and masks.dtype == np.bool_:
+        return Proposals(masks, np.ones(len(masks), np.float32))
+    raise SceneError(
+        f"a mask proposer gave {type(given).__name__} {masks.dtype} {masks.shape}; expected Proposals, bool (masks, H, "
+        "W), or an id map of whole numbers (H, W)"
+    )
 
 
 @dataclass(frozen=True)
