@@ -16,8 +16,7 @@ from og_pointcloud_room.furniture import CLASS_NAMES
 from og_pointcloud_room.robot import Drive
 from og_pointcloud_room.robot_log import DriveLog, draw_drive, write_drive
 from og_pointcloud_ros import read_fields, to_detections
-from og_pointcloud_ros.bags import label_bag, open_bag
-from og_pointcloud_ros.typestore import ros2_types
+from og_pointcloud_ros.bags import label_bag, open_bag, ros2_types
 
 import og_pointcloud as og
 

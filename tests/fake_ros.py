@@ -12,8 +12,8 @@ from dataclasses import dataclass, field, fields
 from types import ModuleType, SimpleNamespace
 
 import numpy as np
+from og_pointcloud_ros.bags import ros2_types
 from og_pointcloud_ros.messages import nanoseconds
-from og_pointcloud_ros.typestore import ros2_types
 
 NUMBERS = {"int": int, "float": float, "str": str, "bool": bool}
 """What rosbags calls the type of a single value -> that of Python."""

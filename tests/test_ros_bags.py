@@ -14,9 +14,8 @@ from og_pointcloud_export import write_bundle
 pytest.importorskip("rosbags")
 
 from og_pointcloud_ros import from_pointcloud2, read_fields, write_fields
-from og_pointcloud_ros.bags import label_bag, open_bag
+from og_pointcloud_ros.bags import label_bag, open_bag, ros2_types, rosbags_messages
 from og_pointcloud_ros.messages import header
-from og_pointcloud_ros.typestore import ros2_types, rosbags_messages
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
 import og_pointcloud as og

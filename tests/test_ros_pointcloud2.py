@@ -273,7 +273,7 @@ def test_a_result_of_another_scene_is_refused(scene, result):
 
 
 def test_label_info():
-    info = to_label_info(["apple", "Tür"], threshold=0.5)
+    info = to_label_info(["apple", "Tür"])
     assert [(entry.class_id, entry.class_name) for entry in info.class_map] == [(0, "apple"), (1, "Tür")]
     with pytest.raises(og.OgPointcloudError, match="at most 65535"):
         to_label_info(["a"] * 65536)
@@ -286,7 +286,7 @@ def test_label_info():
 def wire(request):
     """Message -> bytes -> message, as rosbags has it, and the factory of its types."""
     pytest.importorskip("rosbags")
-    from og_pointcloud_ros.typestore import VISION_MSGS, ros2_types, rosbags_messages
+    from og_pointcloud_ros.bags import VISION_MSGS, ros2_types, rosbags_messages
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     if request.param == "ROS 2":

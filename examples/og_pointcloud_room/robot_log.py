@@ -133,8 +133,8 @@ def _draw_map(axes: Axes, log: DriveLog, instances: Instances) -> None:
 def write_drive(folder: Path, drive: Drive) -> Path:
     """The drive as a ROS 2 bag: /points, /tf from map to base, /tf_static from base to lidar."""
     from og_pointcloud_ros import write_fields
+    from og_pointcloud_ros.bags import ros2_types, rosbags_messages
     from og_pointcloud_ros.messages import header
-    from og_pointcloud_ros.typestore import ros2_types, rosbags_messages
     from rosbags.rosbag2 import Writer
 
     store = ros2_types()

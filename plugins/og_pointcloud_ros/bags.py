@@ -10,7 +10,7 @@ import shutil
 import time
 import warnings
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -21,17 +21,21 @@ from og_pointcloud.ask.labelled_scene import Segmenter
 from og_pointcloud.errors import MissingExtraError, OgPointcloudError, SceneError
 from og_pointcloud_ros.detections import to_label_info
 from og_pointcloud_ros.labelling import MINIMUM_POINTS, CloudLabeller, LabelledMessages
-from og_pointcloud_ros.messages import nanoseconds
+from og_pointcloud_ros.messages import MessageFactory, nanoseconds
 from og_pointcloud_ros.transforms import TransformTree
-from og_pointcloud_ros.typestore import ros2_types, rosbags_messages
 
 try:
     from rosbags.interfaces import Connection, Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
     from rosbags.rosbag2 import Reader, StoragePlugin, Writer
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+    from rosbags.typesys.store import Typestore
 except ImportError as error:
     raise MissingExtraError("rosbags", "ros") from error
 
-__all__ = ["DETECTIONS", "LABELLED", "LABEL_INFO", "BagReport", "label_bag", "open_bag"]
+__all__ = [
+    "DETECTIONS", "LABELLED", "LABEL_INFO", "VISION_MSGS", "BagReport", "label_bag", "open_bag", "ros2_types",
+    "rosbags_messages",
+]  # fmt: skip
 
 CLOUD, TRANSFORMS = "sensor_msgs/msg/PointCloud2", "tf2_msgs/msg/TFMessage"
 DETECTION_ARRAY, INFO = "vision_msgs/msg/Detection3DArray", "vision_msgs/msg/LabelInfo"
@@ -47,6 +51,23 @@ LATCHED = Qos(
 )  # fmt: skip
 NO_HASH = "RIHS01_" + "0" * 64
 """Hash of a type that neither the bag nor we know: bags of Humble and older name types without defining them."""
+
+VISION_MSGS: Mapping[str, str] = {
+    "vision_msgs/msg/VisionClass": "uint16 class_id\nstring class_name",
+    "vision_msgs/msg/LabelInfo": "std_msgs/Header header\nvision_msgs/VisionClass[] class_map\nfloat32 threshold",
+    "vision_msgs/msg/ObjectHypothesis": "string class_id\nfloat64 score",
+    "vision_msgs/msg/ObjectHypothesisWithPose": (
+        "vision_msgs/ObjectHypothesis hypothesis\ngeometry_msgs/PoseWithCovariance pose"
+    ),
+    "vision_msgs/msg/BoundingBox3D": "geometry_msgs/Pose center\ngeometry_msgs/Vector3 size",
+    "vision_msgs/msg/Detection3D": (
+        "std_msgs/Header header\nvision_msgs/ObjectHypothesisWithPose[] results\n"
+        "vision_msgs/BoundingBox3D bbox\nstring id"
+    ),
+    "vision_msgs/msg/Detection3DArray": "std_msgs/Header header\nvision_msgs/Detection3D[] detections",
+}
+"""The fields of vision_msgs 4, that of ROS 2 Humble and later."""
+
 
 Progress = Callable[[int, int], None]
 
@@ -271,3 +292,23 @@ def _whole(target: Path) -> Iterator[Path]:
 
 def _first_line(error: Exception) -> str:
     return (str(error).strip() or type(error).__name__).splitlines()[0][:200]
+
+
+def ros2_types() -> Typestore:
+    """Types of ROS 2 Humble, whose clouds and transforms are those of every later release, and vision_msgs."""
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    for name, fields in VISION_MSGS.items():
+        store.register(get_types_from_msg(fields, name))
+    return store
+
+
+def rosbags_messages(store: Typestore) -> MessageFactory:
+    """Makes messages of rosbags' types, of ROS 2 or ROS 1, ready for ``store.serialize_cdr`` or ``serialize_ros1``."""
+
+    def make(type_name: str, /, **fields: Any) -> Any:
+        kind: Any = store.types[type_name]
+        if "seq" in getattr(kind, "__dataclass_fields__", ()):  # a header of ROS 1
+            fields["seq"] = 0
+        return kind(**fields)
+
+    return make

@@ -61,12 +61,11 @@ def to_label_info(
     frame_id: str = "",
     stamp: Any = None,
     *,
-    threshold: float = 0.0,
     messages: MessageFactory = plain_messages,
 ) -> Any:
     """What the numbers in the field ``label`` mean, as vision_msgs/LabelInfo, to be published once, latched.
 
-    names: those of the result, at most 65,535. threshold: score below which nothing is labelled.
+    names: those of the result, at most 65,535.
     """
     if len(names) > UNLABELLED:
         raise OgPointcloudError(f"{len(names)} names; expected at most {UNLABELLED}, for {UNLABELLED} means unlabelled")
@@ -74,7 +73,7 @@ def to_label_info(
         messages("vision_msgs/msg/VisionClass", class_id=number, class_name=name) for number, name in enumerate(names)
     ]
     head = header(messages, frame_id, stamp)
-    return messages("vision_msgs/msg/LabelInfo", header=head, class_map=class_map, threshold=float(threshold))
+    return messages("vision_msgs/msg/LabelInfo", header=head, class_map=class_map, threshold=0.0)
 
 
 def _detection(instance: Instance, name: str, score: float, head: Any, messages: MessageFactory) -> Any:

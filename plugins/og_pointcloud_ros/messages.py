@@ -1,15 +1,16 @@
 """ROS messages without ROS: ways to make one.
 
 Whatever makes messages here takes a ``MessageFactory``, so that the same lines fill plain objects, rosbags' types
-(``typestore.rosbags_messages``) and rclpy's. Reading needs none of this: messages are told by their attributes.
+(``bags.rosbags_messages``) and rclpy's. Reading needs none of this: messages are told by their attributes.
 """
 
 from __future__ import annotations
 
 import array
 import importlib
+from collections.abc import Callable
 from types import SimpleNamespace
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -20,16 +21,12 @@ __all__ = ["MessageFactory", "header", "nanoseconds", "plain_messages", "ros_mes
 NANOSECONDS = 1_000_000_000
 
 
-class MessageFactory(Protocol):
-    """Makes a message of a type such as "std_msgs/msg/Header" from all of its fields.
+MessageFactory = Callable[..., Any]
+"""Makes a message of a type such as "std_msgs/msg/Header", the only positional argument, from all of its fields.
 
-    Fields hold messages of the same factory, sequences of such, numbers, strings, and numpy arrays where the message
-    has a sequence or array of numbers.
-    """
-
-    def __call__(self, type_name: str, /, **fields: Any) -> Any:
-        """The message."""
-        ...
+Fields hold messages of the same factory, sequences of such, numbers, strings, and numpy arrays where the message has a
+sequence or array of numbers.
+"""
 
 
 def plain_messages(type_name: str, /, **fields: Any) -> Any:
