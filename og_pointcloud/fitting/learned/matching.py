@@ -104,7 +104,7 @@ def alone_evidence(
     distance = np.full((first[-1], count), np.inf)
     mask_area = np.zeros(first[-1])
     instance_area = np.zeros((len(views), count))
-    members = [_subset(gaussians, np.flatnonzero(instance_ids == instance)) for instance in range(count)]
+    members = [gaussians.take(np.flatnonzero(instance_ids == instance)) for instance in range(count)]
     for index, view in enumerate(views):
         rows = slice(first[index], first[index + 1])
         ids = view.mask_map().ravel()
@@ -126,7 +126,7 @@ def alone_evidence(
 
 
 def eq5_scores(evidence: Evidence, mask_view: NDArray[np.int32], settings: MatchingSettings) -> NDArray[np.float64]:
-    """(masks, K) float64 in [0, 1]: Eq. 5, or one of its factors alone."""
+    """(masks, K) float64 in [0, 1]: S_ij of Eq. 5, or one of its factors alone."""
     union = evidence.instance_area[mask_view] + evidence.mask_area[:, None] - evidence.shared
     iou = np.divide(evidence.shared, union, out=np.zeros_like(union), where=union > 0)
     likeness = np.maximum(1 - evidence.distance, 0)
@@ -243,10 +243,6 @@ def _split(
     if np.quantile(within, 0.1) <= np.quantile(cosines[~same], 0.9):
         return None
     return [np.flatnonzero(~second), np.flatnonzero(second)]
-
-
-def _subset(gaussians: Gaussians, index: NDArray[np.int64]) -> Gaussians:
-    return Gaussians(gaussians.xyz[index], gaussians.scale[index], gaussians.rotation[index], gaussians.opacity[index])
 
 
 def _in_image(gaussians: Gaussians, camera: Camera, near: float) -> bool:
