@@ -8,7 +8,7 @@ follow from two sparse products, ``A F`` for the value and ``A' G`` for the grad
 
 ``L_c``, inter-mask contrast (Eq. 2), over the pairs i != j of a view's m masks. A view without two masks has none.
     paper    1 / (m (m - 1)) sum of 1 / (d_ij^2 + e^2). The printed form has e = 0 and is infinite where two means
-             meet; here e is `FeatureSettings.closest`, after a first round with e = ORTHOGONAL: far fewer local minima.
+             meet; here e is `FeatureSettings.closest`, after rounds with e = COARSE_BOUNDS.
     authors  the same with e = 1; pair ij also counts 0.1 + 0.9 r / (m - 1), r the rank of j by nearness to i. (Their
              change of these weights late in training has no counterpart without a step count.)
 ``L_s``, intra-mask smoothness (Eq. 1), asked of every Gaussian that shows in a mask instead of the rendered pixels. N_i
@@ -53,10 +53,10 @@ COHESION_WEIGHT = {"paper": 10.0, "authors": 0.1}
 """Of Eq. 1 where none is set: the authors' own, and one that weighs squares, which are that much smaller, alike."""
 ROUNDING = 1e-3
 """Distances are rounded off below this where they are not squared: sqrt(d^2 + ROUNDING^2)."""
-ORTHOGONAL = 0.5**0.5
-"""Distance of two directions at right angles, read: about what means are apart in the end."""
+COARSE_BOUNDS = (0.71, 0.57, 0.14)
+"""Of Eq. 2 in the rounds before the last, which have fewer local minima; directions at right angles read 0.71 apart."""
 COARSE_TOLERANCE = 10.0
-"""The first round need not converge as far, by this factor."""
+"""Rounds before the last need not converge as far, by this factor."""
 WINDOW = 10
 """Steps over which the fall of the objective is measured."""
 LEVEL = 0.01
@@ -99,7 +99,7 @@ class LearnedFeatures:
 
     features: (n, width) float32 as read (see `read_features`); rows of zeros where no mask sees the Gaussian.
     seen: (n,) float64, pixels of blending weight in masks; 0: the feature says nothing.
-    objective: float64, before the last round and after each of its steps; it falls in each. steps: of both rounds.
+    objective: float64, before the last round and after each of its steps; it falls in each. steps: of all rounds.
     converged: False where `FeatureSettings.max_steps` came first.
     """
 
@@ -138,10 +138,8 @@ def learn_features(
         if settings.inter and problem.have_met(read_features(raw, settings.normalise)):
             raw += KICK * directions
     objective, steps, converged = [0.0], 0, False
-    for closest, tolerance in (
-        (ORTHOGONAL, COARSE_TOLERANCE * settings.tolerance),
-        (settings.closest, settings.tolerance),
-    ):
+    for closest in (*COARSE_BOUNDS, settings.closest):
+        tolerance = settings.tolerance * (1 if closest == settings.closest else COARSE_TOLERANCE)
         raw, objective, converged = _minimise(problem, raw, closest, tolerance, settings.max_steps - steps)
         steps += len(objective) - 1
     features = np.zeros((table.weights.shape[1], settings.width), np.float32)
