@@ -47,7 +47,7 @@ def add(parser: Parser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     check_at_least("--processes", arguments.processes, 1)
-    check_at_least("--seconds-per-image", arguments.seconds_per_image, 0)
+    check_at_least("--seconds-per-image", arguments.seconds_per_image, 0.001)
     from og_pointcloud.masking.make_masks import MaskSettings, make_masks
 
     settings = MaskSettings(
