@@ -55,8 +55,13 @@ def build_query_graph(cloud: LabelledCloud, grid: LookupGrid) -> bytes:
         ("certain", TensorProto.BOOL, ["N"]),
         ("instance_scores", TensorProto.FLOAT, [len(cloud.instances), "L"]),
     ]
-    declared = ([helper.make_tensor_value_info(*value) for value in values] for values in (inputs, outputs))
-    made = helper.make_graph(graph.nodes, "query_head", *declared, graph.initializers, doc_string=__doc__)
+    declared = [
+        [helper.make_tensor_value_info(name, kind, shape) for name, kind, shape in values]
+        for values in (inputs, outputs)
+    ]
+    made = helper.make_graph(
+        graph.nodes, "query_head", declared[0], declared[1], graph.initializers, doc_string=__doc__
+    )
     model = helper.make_model(made, opset_imports=[helper.make_opsetid("", OPSET)], producer_name="og_pointcloud")
     model.ir_version = IR_VERSION
     onnx.checker.check_model(model)

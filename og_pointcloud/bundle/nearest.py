@@ -7,7 +7,7 @@ import itertools
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["NONE_WITHIN_REACH", "NearestPoint", "VoxelBuckets", "surface_distance"]
+__all__ = ["NONE_WITHIN_REACH", "NearestPoint", "surface_distance"]
 
 NONE_WITHIN_REACH = -1
 """Index answered for a query that has no cloud point within reach."""
@@ -33,19 +33,19 @@ class VoxelBuckets:
 
     Voxels that share a bucket by accident do no harm: their points are farther away, and distances are true ones.
 
-    xyz: (n, 3) float32. edge: of a voxel. run: how many buckets in a row a search reads at once.
+    xyz: (n, 3) float32. edge: of a voxel.
     """
 
-    def __init__(self, xyz: NDArray[np.float32], edge: float, run: int = 3) -> None:
+    def __init__(self, xyz: NDArray[np.float32], edge: float) -> None:
         self.edge = edge
         self.mask = (1 << max(6, (2 * len(xyz)).bit_length())) - 1
         bucket = self.bucket(self.voxel(xyz.astype(np.float64)))
         order = np.argsort(bucket, kind="stable")  # stable: equal distances are settled for the lowest index
         starts = np.zeros(self.mask + 2, np.int64)
         np.cumsum(np.bincount(bucket, minlength=self.mask + 1), out=starts[1:])
-        # The first buckets once more at the end, so that a run may start at the last one.
-        self.starts = np.concatenate([starts, len(xyz) + starts[1:run]])
-        self.point = np.concatenate([order, order[: starts[run - 1]]])
+        # The first two buckets once more at the end, so that a run of three may start at the last one.
+        self.starts = np.concatenate([starts, len(xyz) + starts[1:3]])
+        self.point = np.concatenate([order, order[: starts[2]]])
         """Index of each sorted point in the cloud."""
         self.x, self.y, self.z = np.ascontiguousarray(xyz[self.point].T, np.float64)
 
