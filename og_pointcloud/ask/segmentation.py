@@ -21,7 +21,7 @@ from og_pointcloud.formats.colors import label_colors
 
 __all__ = ["SAVED_AS", "Reason", "Segmentation"]
 
-SAVED_AS = (".npz", ".ply", ".las", ".laz", ".glb", ".gltf")
+SAVED_AS = (".npz", ".ply", ".las", ".laz", ".glb")
 """Endings of the files that a result is written to."""
 
 
@@ -141,7 +141,7 @@ class Segmentation:
         .npz: labels, scores, instances, reasons, names and calibrated, and certainty if it is known.
         .ply: a coloured cloud with the `attributes`.
         .las, .laz: with colours, classification and the attributes as extra bytes (needs the extra 'las').
-        .glb, .gltf: coloured points with feature ids.
+        .glb: coloured points with feature ids.
         OgPointcloudError for another ending; SceneError where the format cannot hold the points: .las and .glb have no
         room for NaN, .glb none for an empty cloud.
         """

@@ -26,7 +26,7 @@ from og_pointcloud.cli.common import (
 if TYPE_CHECKING:
     from og_pointcloud.ask.segmentation import Segmentation
 
-SAVED_AS = (".npz", ".ply", ".las", ".laz", ".glb", ".gltf")
+SAVED_AS = (".npz", ".ply", ".las", ".laz", ".glb")
 """As `og_pointcloud.ask.segmentation.SAVED_AS`; --help does not import numpy."""
 
 

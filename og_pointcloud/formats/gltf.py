@@ -1,4 +1,4 @@
-"""Labelled clouds as glTF 2.0: .glb, or .gltf with everything inside. Out only.
+"""Labelled clouds as glTF 2.0, binary (.glb). Out only.
 
 Points with colours, label and instance as feature ids (EXT_mesh_features, attributes _FEATURE_ID_0 and _FEATURE_ID_1),
 score and reason as attributes of our own, names in the mesh's extras.
@@ -8,7 +8,6 @@ Format: Khronos, "glTF 2.0 Specification", and the extension's text.
 
 from __future__ import annotations
 
-import base64
 import json
 import os
 import struct
@@ -41,7 +40,7 @@ def write_gltf(
     attributes: Mapping[str, NDArray],
     names: Sequence[str],
 ) -> None:
-    """Write a labelled cloud as .glb or .gltf; whole or not at all.
+    """Write a labelled cloud as .glb; whole or not at all.
 
     xyz_world: (n, 3), n at least 1; stored as float32 around their median, which is the node's translation. Axes stay
         as they are: glTF takes y to be up, so turn a scene with z up in the viewer.
@@ -84,7 +83,7 @@ def write_gltf(
         ]
         document, binary = _document(columns, origin, {FEATURES: {"featureIds": feature_sets}}, names)
         with replacing(path) as file:
-            file.write(_as_glb(document, binary) if path.suffix == ".glb" else _as_text(document, binary))
+            file.write(_as_glb(document, binary))
 
 
 def _linear_colors(rgb: NDArray[np.uint8]) -> NDArray[np.uint16]:
@@ -148,9 +147,3 @@ def _as_glb(document: Mapping[str, Any], binary: bytes) -> bytes:
     ]
     length = 12 + sum(map(len, chunks))
     return b"".join([struct.pack("<4sII", GLB_MAGIC, GLB_VERSION, length), *chunks])
-
-
-def _as_text(document: Mapping[str, Any], binary: bytes) -> bytes:
-    uri = "data:application/octet-stream;base64," + base64.b64encode(binary).decode()
-    (buffer,) = document["buffers"]
-    return json.dumps({**document, "buffers": [{**buffer, "uri": uri}]}).encode()

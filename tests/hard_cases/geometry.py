@@ -129,7 +129,7 @@ def opacity_not_a_number() -> object:
     return Points(gaussians.xyz, np.zeros(3), scale=gaussians.scale, rotation=gaussians.rotation, opacity=opacity)
 
 
-@refuses(SceneError, "rotation of Gaussian 0 is [3.0, 0.0, 0.0, 0.0]", "expected", "divide")
+@refuses(SceneError, "rotation of Gaussian 0 is [", "expected", "divide")
 def rotation_not_unit() -> object:
     """Gaussians made by hand with quaternions of length 3, which would be drawn three times as large."""
     gaussians = scatter()
