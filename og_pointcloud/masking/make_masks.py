@@ -90,7 +90,7 @@ def make_masks(
     separate = target.resolve() != capture.resolve()
     photographs = read_photographs(capture)
     chosen = _chosen(capture, photographs, settings)
-    left_out = _left_out(photographs, chosen, settings, separate, say)
+    left_out = _left_out(photographs, chosen, separate, say)
     _refuse_foreign(target, overwrite)
     work = target / WORK_FOLDER / _fingerprint(settings)
     tasks = [ImageTask(photograph, work / _work_name(photograph)) for photograph in chosen]
@@ -118,14 +118,8 @@ def _chosen(capture: Path, photographs: Sequence[Photograph], settings: MaskSett
     return [chosen[index] for index in choose_by_coverage(capture, chosen, settings.enough_views)]
 
 
-def _reason(settings: MaskSettings) -> str:
-    every = f"every {settings.every} is used" if settings.every > 1 else ""
-    enough = f"what they see is seen by {settings.enough_views} others" if settings.enough_views else ""
-    return ", ".join(filter(None, (every, enough)))
-
-
 def _left_out(
-    photographs: Sequence[Photograph], chosen: Sequence[Photograph], settings: MaskSettings, separate: bool, say: Say
+    photographs: Sequence[Photograph], chosen: Sequence[Photograph], separate: bool, say: Say
 ) -> tuple[str, ...]:
     """Names of the images that are not used, which needs a folder of its own."""
     used = {photograph.name for photograph in chosen}
@@ -136,7 +130,7 @@ def _left_out(
             "expected a folder for a capture of the others (-o DIR)"
         )
     if names:
-        say(f"left out: {len(names)} of {len(photographs)} images ({_reason(settings)}): {', '.join(names)}")
+        say(f"left out: {len(names)} of {len(photographs)} images: {', '.join(names)}")
     return names
 
 
