@@ -138,6 +138,9 @@ MUTATIONS = (
         ".max(axis=1) < self.settings.synonym", ".max(axis=1) < 2", CHOOSING,
     ),
     Mutation(
+        "the other words' mean is taken over all", "ask/choosing.py", "np.count_nonzero(other)", "len(other)", CHOOSING,
+    ),
+    Mutation(
         "equal labels compete", "ask/choosing.py",
         "rounded = np.round(unit_rows(texts), 5) + 0.0", "rounded = np.arange(len(texts), dtype=np.float32)[:, None]",
         CHOOSING,

@@ -158,6 +158,14 @@ def test_a_synonym_in_the_bank_does_not_speak_against_a_label():
     assert deaf.choose(synonym[None]).table[0, 0] < Chooser(made.table, bank).choose(synonym[None]).table[0, 0]
 
 
+def test_other_words_that_fit_equally_well_mean_as_much_however_many_pass_for_synonyms():
+    made = Made()
+    for synonym in (0.01, 0.1, 1.01):
+        chooser = Chooser(made.table, made.bank, ChoosingSettings(synonym=synonym))
+        chooser._bank_evidence[:] = chooser.sharpness
+        np.testing.assert_allclose(chooser._log_none(made.texts[:2]), chooser.sharpness**2, rtol=1e-6)
+
+
 def test_the_best_of_several_descriptors_counts_for_labels_and_bank_alike():
     made = Made(instances=6, owners=[0, 0, 1, 2, 2, 3])
     choice = made.chooser.choose(made.texts[:6])

@@ -226,15 +226,10 @@ def _principal_axes(local: DoubleArray) -> DoubleArray:
 
 
 def _right_handed(axes: DoubleArray, keep_third: bool) -> DoubleArray:
-    """Each axis's largest part positive, but the one that is turned about to make the system right-handed."""
-    largest = np.abs(axes).argmax(axis=1)
-    signs = np.sign(axes[np.arange(3), largest])
-    if keep_third:
-        signs[2] = 1.0
-    axes = axes * signs[:, None]
-    flipped = 1 if keep_third else 2
-    axes[flipped] *= np.sign(np.linalg.det(axes))
-    return axes
+    """The first axis with its largest part positive, and the third one unless it is kept; the second follows."""
+    signs = np.sign(axes[np.arange(3), np.abs(axes).argmax(axis=1)])
+    first, third = signs[0] * axes[0], axes[2] * (1 if keep_third else signs[2])
+    return np.asarray([first, np.cross(third, first), third], np.float64)
 
 
 # The oriented box -------------------------------------------------------------------------------------------------

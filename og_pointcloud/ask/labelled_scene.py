@@ -153,8 +153,8 @@ class LabelledScene:
             instances[run], distance[run] = self._look_up(local[run])
         if max_distance is not None:
             within_reach = np.flatnonzero(instances != TOO_FAR)
-            nearest = self._nearest.query(local[within_reach])
-            cut = within_reach[self._nearest.distance(local[within_reach], nearest) > max_distance]
+            nearest = self.nearest.query(local[within_reach])
+            cut = within_reach[self.nearest.distance(local[within_reach], nearest) > max_distance]
             instances[cut], distance[cut] = TOO_FAR, BEYOND
         return instances, distance
 
@@ -175,7 +175,7 @@ class LabelledScene:
         certainty = np.zeros(len(points), np.float32)
         local = self._local(points)
         finite = np.isfinite(local).all(axis=1)
-        certainty[finite] = of_points[self._nearest.query(local[finite])]  # NONE_WITHIN_REACH is the last
+        certainty[finite] = of_points[self.nearest.query(local[finite])]  # NONE_WITHIN_REACH is the last
         return certainty
 
     def _local(self, points: NDArray[np.floating]) -> NDArray[np.float32]:
@@ -198,10 +198,10 @@ class LabelledScene:
                 return instances, distance
             still_open = np.flatnonzero(~certain)
         still_open = still_open[np.isfinite(local[still_open]).all(axis=1)]  # the others are too far already
-        nearest = self._nearest.query(local[still_open])
+        nearest = self.nearest.query(local[still_open])
         instances[still_open] = np.append(self.instance_ids, np.int32(TOO_FAR))[nearest]
         surface = surface_distance(self.cloud.spacing, self.cloud.reach)
-        on_surface = self._nearest.distance(local[still_open], nearest) <= surface
+        on_surface = self.nearest.distance(local[still_open], nearest) <= surface
         distance[still_open] = np.where(nearest == NONE_WITHIN_REACH, BEYOND, np.where(on_surface, ON_SURFACE, NEAR))
         return instances, distance
 
@@ -211,7 +211,8 @@ class LabelledScene:
         return None if graph is None else QueryGraph(graph, self.path, len(self.cloud.instances))
 
     @cached_property
-    def _nearest(self) -> NearestPoint:
+    def nearest(self) -> NearestPoint:
+        """Index of the scene's point nearest to points of the local frame, within the reach."""
         return NearestPoint(self.cloud.xyz, self.cloud.spacing, self.cloud.reach)
 
 

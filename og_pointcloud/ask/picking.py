@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from og_pointcloud.ask.labelled_scene import LabelledScene, SceneLike, as_scene
+from og_pointcloud.bundle.nearest import NONE_WITHIN_REACH
 from og_pointcloud.cloud import BACKGROUND, TOO_FAR, UNOBSERVED, LabelledCloud
 from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.scene import Camera
@@ -34,7 +35,7 @@ PIXELS_PER_SPACING = 2.0
 """Pixels a point spacing that are looked at, at most; as many as the fit looks at."""
 WIDEST = 8
 """Pixels that a point covers to each side at most: those much nearer than the others leave gaps."""
-NO_POINT = -1
+NO_POINT = NONE_WITHIN_REACH
 
 _NOTHING_PICKED = {
     BACKGROUND: "background: views saw this point, but outside every mask",
@@ -140,7 +141,7 @@ def pick(scene: SceneLike, where: Camera | ArrayLike, uv_px: ArrayLike | None = 
     elif uv_px is not None:
         raise OgPointcloudError(f"uv_px is given with a {type(where).__name__}; expected it with a Camera alone")
     else:
-        point = _nearest_point(scene.cloud, where)
+        point = _nearest_point(scene, where)
     if point == NO_POINT:
         return Pick(scene, TOO_FAR)
     return Pick(scene, int(scene.instance_ids[point]), point, scene.cloud.xyz[point] + scene.cloud.origin)
@@ -192,15 +193,12 @@ def _point_at_pixel(cloud: LabelledCloud, camera: Camera, uv_px: ArrayLike | Non
     return int(_in_front(alone, 1, 1, cloud.reach)[0, 0])
 
 
-def _nearest_point(cloud: LabelledCloud, place: ArrayLike) -> int:
+def _nearest_point(scene: LabelledScene, place: ArrayLike) -> int:
     """Index of the nearest point within the scene's reach, the same that a query point would find, else NO_POINT."""
     world = np.asarray(place, np.float64)
     if world.shape != (3,) or not np.isfinite(world).all():
         raise OgPointcloudError(f"the place is {place}; expected three finite world coordinates x, y, z")
-    local = (world - cloud.origin).astype(np.float32).astype(np.float64)
-    squared = np.square(cloud.xyz.astype(np.float64) - local).sum(axis=1)
-    nearest = int(squared.argmin()) if len(squared) else NO_POINT
-    return nearest if len(squared) and squared[nearest] <= cloud.reach**2 else NO_POINT
+    return int(scene.nearest.query((world - scene.cloud.origin).astype(np.float32)[None])[0])
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud.cloud import InstanceTable, LabelledCloud
+from og_pointcloud.cloud import UNKNOWN_SPACE, InstanceTable, LabelledCloud
 from og_pointcloud.errors import MissingExtraError, SceneError
 from og_pointcloud.formats.gaussian_ply import latest_iteration, read_gaussian_ply
 from og_pointcloud.formats.langsplat import LANGSPLAT_SPACE, LANGSPLAT_WIDTH
@@ -32,7 +32,6 @@ from og_pointcloud.formats.npy import array_from_zip
 from og_pointcloud.formats.tables import naming
 from og_pointcloud.journal import LeftOut, left_out_entry
 from og_pointcloud.settings import GeometrySettings
-from og_pointcloud.text.text_features import UNKNOWN_SPACE
 
 try:
     from og_pointcloud.rendering.geometry import neighbourhood

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from og_pointcloud.ask.boxes import axis_aligned_box
 from og_pointcloud.ask.choosing import Reason
 from og_pointcloud.ask.labelled_scene import LabelledScene, instance_table
 from og_pointcloud.ask.segmentation import Segmentation
@@ -81,7 +82,8 @@ def write_page(
         **asdict(look), "calibrated": result.calibrated,
         "spacing": scene.cloud.spacing * (len(finite) / len(shown)) ** 0.5,
         "low": (low - middle).tolist(), "size": (high - low).tolist(),
-        "corners": _corners(low - middle, high - middle).tolist(), "extent": float(np.linalg.norm(high - low)) or 1.0,
+        "corners": axis_aligned_box([low - middle, high - middle]).corners.tolist(),
+        "extent": float(np.linalg.norm(high - low)) or 1.0,
         "eye": (view.eye - middle).tolist(), "target": (view.target - middle).tolist(), "up": view.up.tolist(),
         "names": list(result.names), "colors": label_colors(np.arange(len(result.names))).tolist(),
         "counts": list(result.counts().values()), "unknown": int((result.labels < 0).sum()),
@@ -135,10 +137,6 @@ def _instances(
             }  # fmt: skip
         rows.append(record)
     return rows
-
-
-def _corners(low: NDArray[np.float64], high: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.stack(np.meshgrid(*np.stack([low, high], axis=1), indexing="ij"), axis=-1).reshape(-1, 3)
 
 
 def _levels(values: NDArray[np.float64], low: Any, high: Any) -> NDArray[np.uint16]:
