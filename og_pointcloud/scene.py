@@ -274,8 +274,8 @@ def require_finite(xyz: NDArray[np.floating], cure: str = "remove them from the 
 
 def _check_gaussians(scale: FloatArray, rotation: FloatArray, opacity: FloatArray) -> None:
     """Files are activated and made unit by their readers; what is made by hand is drawn as it is."""
-    fits = ((scale >= 0) & (scale < np.inf)).all(axis=1)
-    _require(np.asarray(fits), scale, "scale", "finite standard deviations, at least 0: take the exponential of logarithms")
+    fits = np.logical_and.reduce((scale >= 0) & (scale < np.inf), axis=1)
+    _require(fits, scale, "scale", "finite standard deviations, at least 0: take the exponential of logarithms")
     fits = np.logical_and(opacity >= 0, opacity <= 1)
     _require(fits, opacity, "opacity", "0 to 1: activate a 3DGS file's logits, 1 / (1 + exp(-x))")
     length = np.linalg.norm(rotation.astype(np.float64), axis=1)
