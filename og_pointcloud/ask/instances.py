@@ -129,8 +129,8 @@ class Instances(Sequence[Instance]):
     >>> table = og.instance_table(cloud)  # of `LabelledCloud`'s example
     >>> [row.id for row in table.largest(1)], len(table.to_records())
     ([0], 2)
-    >>> table.to_csv().splitlines()[1][:15]
-    '0,labelled,2,0,'
+    >>> table.to_csv().splitlines()[1][:13]
+    '0,labelled,2,'
     """
 
     def __init__(self, rows: Sequence[Instance]) -> None:
