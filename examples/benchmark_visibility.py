@@ -18,7 +18,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-os.environ["NUMBA_NUM_THREADS"] = "1"  # a fit works on as many views at once as there are cores
+if __name__ == "__main__":  # else a test that imports it would be of one core too
+    os.environ["NUMBA_NUM_THREADS"] = "1"  # a fit works on as many views at once as there are cores
 
 import numpy as np
 from numpy.typing import NDArray

@@ -22,6 +22,7 @@ class LeftOut(str, Enum):
     VIEWS = "views"
     COINCIDENT_POINTS = "coincident points"
     CHOICE_OF_SPLATS = "choice of splats"
+    CHOICE_OF_SCALE = "choice of scale"
     CHOICE_IN_PAPER_MODE = "choice of splats, mode paper"
     CHOICE_POINTS = "points of the choice of splats"
     PIXELS = "pixels"
@@ -46,6 +47,9 @@ SENTENCES = {
     LeftOut.VIEWS: ("{count} of {total} views", "nearly all that they see is seen by {enough} others"),
     LeftOut.COINCIDENT_POINTS: ("{count} points", "they lie exactly where another lies, and get its label"),
     LeftOut.CHOICE_OF_SPLATS: ("choice of scale and opacity", "the file holds Gaussians"),
+    LeftOut.CHOICE_OF_SCALE: (
+        "choice of the points' size", "no views can judge others here: points are drawn {scale:g} spacings large",
+    ),
     LeftOut.CHOICE_IN_PAPER_MODE: (
         "choice of scale and opacity", "mode paper draws points as full as trained Gaussians are",
     ),

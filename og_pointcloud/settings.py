@@ -29,24 +29,18 @@ __all__ = [
 class GeometrySettings:
     """Gaussians of a plain cloud (geometry.py)."""
 
-    scales: tuple[float, ...] = (0.2, 0.25, 0.35, 0.5, 0.7, 1.0)
-    """Standard deviations tried, in point spacings."""
-    opacities: tuple[float, ...] = (0.3, 0.5, 0.7, 0.9)
-    """Opacities tried."""
-    start_scale: float = 0.35
-    """Scale without images to compare with."""
-    start_opacity: float = 0.5
-    """Opacity without images."""
-    error_tolerance: float = 0.02
-    """Photometric errors within this share of the best look as good."""
-    mask_share: float = 0.08
-    """A splat's standard deviation is at most this part of a typical mask's side."""
-    photographs: tuple[int, int] = (4, 10)
-    """Images compared with, evenly spread over the views: at first, and to decide between scales that come close."""
-    close_call: float = 0.06
-    """Photometric errors within this share of the best are compared on more images."""
-    photograph_resolution: float = 1.2
-    """Pixels per point spacing of the images compared with."""
+    scales: tuple[float, ...] = (0.25, 0.35, 0.5, 0.7)
+    """Standard deviations tried, in point spacings; those of the best labels of held-out views (held_out.py)."""
+    start_scale: float = 0.5
+    """Scale where views cannot be held out: fewer than four, or such that share nothing."""
+    opacity: float = 0.9
+    """Opacity of every point: two layers of points hide what is behind them."""
+    held_out_views: int = 24
+    """Views, evenly spread, by which scales are compared: labels of half of them are judged on the other half."""
+    held_out_points: int = 30_000
+    """Points by which scales are compared."""
+    sight_thickness: float = 3.0
+    """Points closer than this many spacings along a ray are of one surface and do not hide each other."""
     pixels_per_spacing: float = 2.0
     """Image pixels used per point spacing: more pixels than that see nothing new of the cloud."""
     max_stride: int = 3
@@ -87,7 +81,7 @@ class MembershipSettings:
     """A point is no background when more than this share of the votes is for "in some mask"."""
     growth_votes: float = 0.25
     """This share of the adjoining points must be of the instance already."""
-    rate_share: float = 0.25
+    rate_share: float = 0.15
     """An instance detected less often than this share of the scene's typical rate is noise of the proposer."""
     island_share: float = 0.15
     """A separate piece whose points show less than this share of what the main piece's do was seen through it."""

@@ -24,7 +24,7 @@ ROOT = Path(__file__).resolve().parents[1]
 PRODUCT = ("og_pointcloud", "export", "plugins")
 sys.path.insert(0, str(ROOT / "tests"))
 
-from import_order import circles, imports_of, upward  # noqa: E402 - a folder of modules, not a package
+from import_order import circles, imports_of, upward  # noqa: E402 # pyright: ignore[reportMissingImports]
 
 MANY_PARAMETERS = 7
 

@@ -22,7 +22,7 @@ def reference_pixel_weights(gaussians: Gaussians, camera: Camera, near: float) -
     transmittance = np.ones((camera.height, camera.width))
     stopped = np.zeros((camera.height, camera.width), bool)
     for g in front_to_back(gaussians, camera, near):
-        alpha = _alpha(gaussians, g, camera)
+        alpha = reference_alpha(gaussians, g, camera)
         drawn = ~stopped & (alpha >= 1 / 255)
         rest = transmittance * (1 - alpha)
         stopped |= drawn & (rest < 1e-4)
@@ -43,7 +43,7 @@ def reference_view_weights(
 
 def front_to_back(gaussians: Gaussians, camera: Camera, near: float) -> list[int]:
     """Gaussians beyond the near plane by (float32 depth, index)."""
-    depths = [float(_in_camera(gaussians, g, camera)[2]) for g in range(len(gaussians))]
+    depths = [float(in_camera(gaussians, g, camera)[2]) for g in range(len(gaussians))]
     return sorted((g for g in range(len(gaussians)) if depths[g] > near), key=lambda g: (np.float32(depths[g]), g))
 
 
@@ -59,13 +59,13 @@ def rotation_matrix(quaternion: NDArray[np.floating]) -> NDArray[np.longdouble]:
     )
 
 
-def _in_camera(gaussians: Gaussians, g: int, camera: Camera) -> NDArray[np.float64]:
+def in_camera(gaussians: Gaussians, g: int, camera: Camera) -> NDArray[np.float64]:
     return camera.world_to_camera[:3, :3] @ gaussians.xyz[g].astype(np.float64) + camera.world_to_camera[:3, 3]
 
 
-def _alpha(gaussians: Gaussians, g: int, camera: Camera) -> NDArray[np.float64]:
+def reference_alpha(gaussians: Gaussians, g: int, camera: Camera) -> NDArray[np.float64]:
     """(H, W) float64: opacity times the projected Gaussian, cut at 0.99."""
-    x, y, z = _in_camera(gaussians, g, camera).astype(Wide)
+    x, y, z = in_camera(gaussians, g, camera).astype(Wide)
     u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
     covariance = projected_covariance(gaussians, g, camera)
     (xx, xy), (_, yy) = covariance
@@ -81,7 +81,7 @@ def projected_covariance(gaussians: Gaussians, g: int, camera: Camera) -> NDArra
 
     J is taken at most 0.3 half fields of view outside the image, as in 3DGS (1.3 tan(fov/2)).
     """
-    x, y, z = _in_camera(gaussians, g, camera).astype(Wide)
+    x, y, z = in_camera(gaussians, g, camera).astype(Wide)
     margin_x, margin_y = 0.3 * 0.5 * camera.width / camera.fx, 0.3 * 0.5 * camera.height / camera.fy
     x = z * np.clip(x / z, -camera.cx / camera.fx - margin_x, (camera.width - camera.cx) / camera.fx + margin_x)
     y = z * np.clip(y / z, -camera.cy / camera.fy - margin_y, (camera.height - camera.cy) / camera.fy + margin_y)

@@ -22,7 +22,7 @@ from og_pointcloud.bundle.format import SCHEMA_VERSION
 from og_pointcloud.cli import build_parser, main
 from og_pointcloud.cloud import Vocabulary
 from og_pointcloud.errors import SceneError
-from og_pointcloud.formats import capture as capture_format
+from og_pointcloud.formats import rgbd
 from og_pointcloud.text.encoder import DEMO_ENCODER, read_text_encoder
 
 ROOT = Path(__file__).parents[1]
@@ -129,7 +129,7 @@ def test_a_format_of_ones_own(tiny_capture, monkeypatch):
     """The tiny capture's poses as rows of numbers are read as its transforms.json is."""
     names = {}
     exec(extending("A format"), names)
-    monkeypatch.setattr(capture_format, "LAYOUTS", ((names["holds_rows"], names["read_rows"]),))
+    monkeypatch.setattr(rgbd, "LAYOUTS", ((names["holds_rows"], names["read_rows"]),))
     folder, known = tiny_capture.folder, og.read_capture(tiny_capture.folder)
     (folder / "transforms.json").unlink()
     rows = []
@@ -138,8 +138,7 @@ def test_a_format_of_ones_own(tiny_capture, monkeypatch):
         rows.append(np.column_stack([rotation.T, -rotation.T @ translation + known.points.origin]).ravel())
     np.savetxt(folder / "poses.txt", rows, fmt="%.17g")
     camera = known.views[0].camera
-    # Data sets count pixel centres at whole numbers.
-    numbers = (camera.width, camera.height, camera.fx, camera.fy, camera.cx - 0.5, camera.cy - 0.5)
+    numbers = (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
     np.savetxt(folder / "intrinsics.txt", [numbers], fmt="%.17g")
     for view, same in zip(og.read_capture(folder).views, known.views, strict=True):
         np.testing.assert_allclose(view.camera.world_to_camera, same.camera.world_to_camera, atol=1e-12)

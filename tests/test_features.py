@@ -139,6 +139,7 @@ def worst_errors(scene: Rendered, settings: FeatureSettings, dtype: type) -> tup
     return abs(terms.objective / objective - 1), float(np.abs(full - gradient).max() / np.abs(gradient).max())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", VARIANTS)
 def test_value_and_gradient_equal_those_of_rendered_pixels_with_random_weights(name: str) -> None:
     # Weights are float32 in both: what is left in float64 is the order of sums in float32 A.

@@ -14,6 +14,7 @@ import og_pointcloud as og
 from og_pointcloud.cloud import BACKGROUND, UNOBSERVED, LabelledCloud
 from og_pointcloud.errors import SceneError
 from og_pointcloud.fitting.fit import fit, prepare
+from og_pointcloud.journal import Journal, LeftOut
 from og_pointcloud.scene import Camera, Points, Scene, View
 from og_pointcloud.settings import FitSettings, MembershipSettings
 
@@ -273,11 +274,11 @@ def test_gaussians_are_taken_as_they_are(known: Known) -> None:
     assert "gaussian_scale" not in cloud.provenance["notes"]
 
 
-def test_without_images_a_warning_names_the_cure(known: Known) -> None:
+def test_photographs_are_not_needed(known: Known) -> None:
     scene = replace(known.scene, views=tuple(replace(view, image=None) for view in known.scene.views))
     cloud = fit(scene, progress=False)
     assert share_right(cloud, known.truth) > 0.9
-    assert any("add images" in warning for warning in cloud.provenance["warnings"])
+    np.testing.assert_array_equal(cloud.instance_ids, fit(known.scene, progress=False).instance_ids)
 
 
 def test_one_view_works_and_warns(known: Known) -> None:
@@ -337,7 +338,8 @@ def test_instances_keep_their_masks_when_a_group_is_dismissed(known: Known) -> N
     ids[seen == TABLE] = BOXES
     features = np.append(first.mask_features, np.eye(8, dtype=np.float32)[[7]], axis=0)
     views = (replace(first, masks=ids, mask_features=features), *known.scene.views[1:])
-    cloud = fit(replace(known.scene, views=views), progress=False)
+    settings = FitSettings(membership=MembershipSettings(rate_share=0.5))
+    cloud = fit(replace(known.scene, views=views), settings, progress=False)
     assert any("groups of masks" in entry["what"] for entry in cloud.provenance["left_out"])
     assert share_right(cloud, known.truth) > 0.95
     assert len(cloud.instances) == BOXES
@@ -384,13 +386,12 @@ def test_tiny_images(width: int, height: int) -> None:
         assert fit(tiny_scene(3, width, height, focal=focal), progress=False).instance_ids.shape == (3,)
 
 
-def test_pixels_much_finer_than_the_points_are_left_out() -> None:
-    scene = tiny_scene(3, 60, 45, focal=200.0)
-    prepared = prepare(scene)
+def test_pixels_much_finer_than_gaussians_of_mode_paper_are_left_out() -> None:
+    scene, settings, journal = tiny_scene(3, 60, 45, focal=200.0), FitSettings(mode="paper"), Journal(progress=False)
+    prepared = prepare(scene, settings, journal)
     np.testing.assert_array_equal(prepared.table.mask_pixels, [60 * 45] * 2)  # areas are of the whole image
-    cloud = fit(scene, progress=False)
-    assert any("of the pixels" in entry["what"] for entry in cloud.provenance["left_out"])
-    assert cloud.instance_ids.tolist() == [0] * 3
+    assert any(key is LeftOut.PIXELS for key, _ in journal.left_out)
+    assert fit(scene, progress=False).instance_ids.tolist() == [0] * 3
 
 
 @pytest.mark.parametrize("mode", ["auto", "grouping", "fast"])

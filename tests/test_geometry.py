@@ -1,20 +1,15 @@
-"""Point spacing, strided cameras, and the size of splats chosen by photographs."""
+"""Point spacing, samples, near plane and strided cameras."""
 
 from __future__ import annotations
-
-from dataclasses import dataclass, replace
-from itertools import product
 
 import numpy as np
 import pytest
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from og_pointcloud.fitting.mask_table import NEAR_SHARE, pixel_weights
+from og_pointcloud.fitting.mask_table import NEAR_SHARE
 from og_pointcloud.rendering.geometry import (
     chance_of_place,
-    choose_gaussians,
-    isotropic,
     near_plane,
     neighbourhood,
     pixels_per_spacing,
@@ -148,108 +143,6 @@ def test_near_plane_is_a_share_of_the_depth_of_what_is_in_front() -> None:
     assert near_plane(xyz, [frontal(0.0)]) == pytest.approx(2 * NEAR_SHARE)
     assert near_plane(xyz * 1000, [frontal(0.0)]) == pytest.approx(2000 * NEAR_SHARE)
     assert near_plane(xyz, [frontal(-100.0)]) > 0
-
-
-@dataclass(frozen=True)
-class DrawnCloud:
-    """A checked wall before another one, and photographs in which its points are splats of a known size."""
-
-    points: Points
-    spacing: NDArray[np.float32]
-    views: list[View]
-
-    def error(self, scale: float, opacity: float) -> float:
-        """Mean absolute difference between the photographs and the cloud drawn so."""
-        errors = [
-            np.abs(draw(self.points, self.spacing, view.camera, scale, opacity).astype(float) - view.image_rgb()).mean()
-            for view in self.views
-        ]
-        return float(np.mean(errors))
-
-
-def drawn_cloud(scale: float, opacity: float) -> DrawnCloud:
-    random = np.random.default_rng(0)
-    plane = (grid(30, 2 / 29) - [1, 1, 0]) + random.normal(size=(900, 3)) * [0.01, 0.01, 0.02]
-    xyz = np.concatenate([plane + np.array([0, 0, 3]), plane * [1.8, 1.8, 1] + np.array([0, 0, 5])]).astype(np.float32)
-    check = np.floor(xyz[:, :2] * 4).sum(axis=1).astype(int) % 2
-    colours = np.array([[200, 60, 40], [230, 220, 60], [40, 60, 200], [60, 160, 60]], np.uint8)
-    points = Points(xyz, np.zeros(3), colours[check + 2 * (np.arange(1800) >= 900)])
-    spacing = neighbourhood(xyz, SETTINGS).spacing
-    views = []
-    for index in range(4):
-        pose = np.eye(4)
-        pose[:2, 3] = 0.4 * (index - 1.5), 0.2 * (index % 2)
-        camera = Camera(48, 36, 40, 40, 24, 18, pose)  # points are a pixel apart: no photograph is shrunk
-        views.append(replace(empty_view(camera, draw(points, spacing, camera, scale, opacity)), name=f"{index}"))
-    return DrawnCloud(points, spacing, views)
-
-
-def draw(
-    points: Points, spacing: NDArray[np.float32], camera: Camera, scale: float, opacity: float
-) -> NDArray[np.uint8]:
-    """(H, W, 3) uint8: the cloud over grey."""
-    weights = pixel_weights(isotropic(points, spacing, scale, opacity), camera, NEAR)
-    image = weights @ points.rgb.astype(float) + 128 * (1 - weights.sum(axis=1)[:, None])
-    return image.round().astype(np.uint8).reshape(camera.height, camera.width, 3)
-
-
-def choose(cloud: DrawnCloud) -> tuple[float, float]:
-    choice = choose_gaussians(cloud.points, cloud.spacing, cloud.views, NEAR, SETTINGS)
-    np.testing.assert_allclose(choice.gaussians.scale, np.repeat(choice.scale * cloud.spacing[:, None], 3, axis=1))
-    np.testing.assert_array_equal(choice.gaussians.opacity, np.float32(choice.opacity))
-    errors = {(scale, opacity): error for scale, opacity, error in choice.trials}
-    assert errors[choice.scale, choice.opacity] <= 1.05 * min(errors.values())
-    return choice.scale, choice.opacity
-
-
-@pytest.mark.parametrize("scale", [0.25, 0.35, 0.5, 0.7])
-def test_the_size_that_the_photographs_show_is_chosen(scale: float) -> None:
-    chosen, opacity = choose(drawn_cloud(scale, 0.9))
-    place = SETTINGS.scales.index
-    assert abs(place(chosen) - place(scale)) <= 1
-    assert opacity == 0.9
-
-
-def test_the_choice_is_about_as_good_as_the_best_of_all() -> None:
-    cloud = drawn_cloud(0.35, 0.9)
-    best = min(cloud.error(*pair) for pair in product(SETTINGS.scales, SETTINGS.opacities))
-    assert cloud.error(*choose(cloud)) <= 1.1 * best + 1
-
-
-def test_soft_points_are_not_taken_for_opaque_ones() -> None:
-    assert choose(drawn_cloud(0.35, 0.3))[1] < 0.9
-    assert choose(drawn_cloud(0.35, 0.9))[1] == 0.9
-
-
-def test_choice_does_not_depend_on_the_unit_of_length() -> None:
-    cloud = drawn_cloud(0.5, 0.9)
-    views = []
-    for view in cloud.views:
-        pose = view.camera.world_to_camera.copy()
-        pose[:3, 3] *= 1024
-        views.append(replace(view, camera=replace(view.camera, world_to_camera=pose)))
-    points = replace(cloud.points, xyz=cloud.points.xyz * np.float32(1024))
-    choice = choose_gaussians(points, cloud.spacing * 1024, views, NEAR * 1024, SETTINGS)
-    assert (choice.scale, choice.opacity) == choose(cloud)
-
-
-@pytest.mark.parametrize("missing", ["colours", "images"])
-def test_without_colours_or_images_nothing_is_tried(missing: str) -> None:
-    cloud = drawn_cloud(0.5, 0.9)
-    points = replace(cloud.points, rgb=None) if missing == "colours" else cloud.points
-    views = [replace(view, image=None) for view in cloud.views] if missing == "images" else cloud.views
-    choice = choose_gaussians(points, cloud.spacing, views, NEAR, SETTINGS)
-    assert choice.trials == ()
-    assert (choice.scale, choice.opacity) == (SETTINGS.start_scale, SETTINGS.start_opacity)
-
-
-def test_one_coloured_point_can_be_chosen_for() -> None:
-    points = Points(np.array([[0, 0, 2]], np.float32), np.zeros(3), np.array([[255, 0, 0]], np.uint8))
-    image = np.full((30, 40, 3), 90, np.uint8)
-    view = replace(frontal(0.0), image=image)
-    choice = choose_gaussians(points, neighbourhood(points.xyz, SETTINGS).spacing, [view], NEAR, SETTINGS)
-    assert choice.scale in SETTINGS.scales
-    assert len(choice.gaussians) == 1
 
 
 def test_a_sample_of_points_does_not_depend_on_their_order() -> None:

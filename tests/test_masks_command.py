@@ -268,6 +268,7 @@ def run_slowly(capture, log, seconds):
     )
 
 
+@pytest.mark.slow
 def test_killed_in_the_middle_nothing_is_lost_and_nothing_done_twice(tmp_path):
     world = make_capture(tmp_path / "c", 5)
     make_masks(tmp_path / "c", ALONE, tmp_path / "whole", say=silent)

@@ -415,6 +415,7 @@ def run_example(name, *arguments):
     return done.stdout
 
 
+@pytest.mark.slow
 @needs_driver
 def test_example_of_a_painted_cloud(scene, bundle, tmp_path):
     open3d.io.write_point_cloud(str(tmp_path / "cloud.ply"), legacy_cloud(scene))
@@ -427,6 +428,7 @@ def test_example_of_a_painted_cloud(scene, bundle, tmp_path):
     assert np.array_equal(labels, og.segment(og.read_points(tmp_path / "cloud.ply").xyz_world, WORDS[:2], scene).labels)
 
 
+@pytest.mark.slow
 @needs_driver
 @needs_splats
 def test_example_of_a_highlight(tmp_path):
@@ -438,6 +440,7 @@ def test_example_of_a_highlight(tmp_path):
     assert picture(tmp_path / "h.png").shape == (480, 640, 3)
 
 
+@pytest.mark.slow
 @needs_driver
 def test_example_of_las_and_gltf(scene, bundle, tmp_path):
     pytest.importorskip("trimesh")

@@ -46,7 +46,9 @@ def front_points_plainly(cloud, camera):
                 continue
             across = column - math.floor(camera.fx * x / depth + camera.cx)
             down = row - math.floor(camera.fy * y / depth + camera.cy)
-            half = min(round(np.sqrt(camera.fx * camera.fy) * cloud.spacing / depth), picking.WIDEST)
+            half = min(
+                round(picking.HALF_WIDTH * np.sqrt(camera.fx * camera.fy) * cloud.spacing / depth), picking.WIDEST
+            )
             if max(abs(across), abs(down)) <= half:
                 covering.append((across**2 + down**2, across, down, depth, point))
         if covering:

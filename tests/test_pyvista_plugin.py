@@ -373,6 +373,7 @@ def balls(folder):
     return write_bundle(replace(cloud, certainty=certainty), folder / "balls.ogpc")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("example", "files"),
     [

@@ -24,7 +24,7 @@ from og_pointcloud.fitting.work_folder import kept_files
 from og_pointcloud.scene import Camera, Points, Scene, View
 from og_pointcloud.settings import FitSettings, GeometrySettings, VisibilitySettings
 
-SETTINGS = FitSettings(mode="grouping", geometry=GeometrySettings(scales=(0.5,), opacities=(0.9,)))
+SETTINGS = FitSettings(mode="grouping", geometry=GeometrySettings(scales=(0.5,)))
 POINTS = 60_000
 
 
@@ -175,7 +175,7 @@ def test_what_stands_in_another_tile_hides_what_is_behind_it():
     scene = two_walls()
     cut = split(scene.points.xyz, 1600)
     assert [set(scene.points.xyz[cut.order[cut.part(tile)], 2].tolist()) for tile in range(2)] == [{2.0}, {6.0}]
-    full = FitSettings(geometry=GeometrySettings(scales=(1.0,), start_scale=1.0, start_opacity=0.95, mask_share=1.0))
+    full = FitSettings(geometry=GeometrySettings(scales=(1.0,), start_scale=1.0, opacity=0.95))
     cloud = fit(scene, replace(full, tile_points=1600), progress=False)
     assert (cloud.instance_ids[:1600] == 0).mean() > 0.7  # the rest is outside the images
     assert (cloud.instance_ids[1600:] < 0).all()
@@ -194,7 +194,7 @@ def test_every_point_that_shows_is_worth_drawing(monkeypatch):
     camera = Camera(40, 30, 25.0, 40.0, 3.0, 28.0, np.eye(4))
     view = View("view", camera, np.full((30, 40), -1, np.int32), np.zeros((0, 4), np.float32))
     cloud = tiled_cloud(points, 0.3)
-    drawing = tiles._Drawing(1.0, 0.01, 0.1, 0.3, 1)  # so faint that nothing hides anything
+    drawing = tiles._Drawing(1.0, 0.01, 0.1, 0.3)  # so faint that nothing hides anything
     everything = drawing.splats(cloud, np.arange(4000), np.ones(4000, np.float32))
     shows = np.unique(mask_table(everything, [view], drawing.near).exposure.indices)
     rows, larger, inside = tiles._worth_drawing(view, cloud, drawing, 1 / 255)
@@ -211,7 +211,7 @@ def test_points_finer_than_pixels_are_thinned_to_them(monkeypatch):
     camera = Camera(80, 80, 160.0, 160.0, 40.0, 40.0, np.eye(4))
     view = View("view", camera, np.full((80, 80), -1, np.int32), np.zeros((0, 4), np.float32))
     cloud = tiled_cloud(Points(xyz, np.zeros(3)), 0.00625)  # a quarter of a pixel, half of FINEST_PX
-    drawing = tiles._Drawing(0.5, 0.9, 0.1, 0.00625, 1)
+    drawing = tiles._Drawing(0.5, 0.9, 0.1, 0.00625)
     rows, larger, inside = tiles._worth_drawing(view, cloud, drawing, 1 / 255)
     assert inside == 40_000
     assert len(rows) == pytest.approx(10_000, rel=0.05)

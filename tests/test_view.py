@@ -175,6 +175,7 @@ def test_where_nothing_can_draw_the_cure_is_named(bundle, tmp_path, capsys, monk
     assert run(capsys, "view", bundle, "--html", tmp_path / "room.html")[0] == 0, "a page needs no PyVista"
 
 
+@pytest.mark.slow
 def test_a_picture_shows_the_labels(bundle, tmp_path, capsys):
     plugin = pytest.importorskip("og_pointcloud_pyvista")
     if not plugin.can_render():
@@ -194,6 +195,7 @@ def test_a_picture_shows_the_labels(bundle, tmp_path, capsys):
         assert (direction @ (color / np.linalg.norm(color)) > 0.999).mean() > 0.05
 
 
+@pytest.mark.slow
 def test_a_picture_shows_how_sure_points_are(bundle, tmp_path, capsys):
     plugin = pytest.importorskip("og_pointcloud_pyvista")
     if not plugin.can_render():

@@ -533,5 +533,5 @@ def test_unit_features_have_length_one_or_stay_zero(random: Generator) -> None:
 
 
 def test_a_plain_cloud_is_refused() -> None:
-    with pytest.raises(SceneError, match="choose_gaussians"):
+    with pytest.raises(SceneError, match="no scale, rotation and opacity"):
         Gaussians.from_points(Points.from_world(np.zeros((2, 3))))

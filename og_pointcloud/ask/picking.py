@@ -31,6 +31,8 @@ __all__ = ["Pick", "front_points", "in_world", "pick"]
 
 NEAR = 1.0
 """Depth of the near plane in point spacings: nearer points would cover half the image each."""
+HALF_WIDTH = 0.7
+"""Pixels so many spacings around a point are its own: few gaps, and edges hardly fatter than what they show."""
 PIXELS_PER_SPACING = 2.0
 """Pixels a point spacing that are looked at, at most; as many as the fit looks at."""
 WIDEST = 8
@@ -166,9 +168,9 @@ def front_points(cloud: LabelledCloud, camera: Camera) -> NDArray[np.int64]:
 
     camera: maps from world coordinates.
 
-    A point covers the pixels within a spacing of its own, at most WIDEST, along rows and columns. At each pixel the
-    nearest point begins the front surface, as thick as the scene's reach; within it the point whose pixel is nearest
-    wins, of equally near ones the rightmost, then the lowest; in one pixel the one nearest to the camera.
+    A point covers the pixels within HALF_WIDTH spacings of its own, at most WIDEST, along rows and columns. At each
+    pixel the nearest point begins the front surface, as thick as the scene's reach; within it the point whose pixel is
+    nearest wins, of equally near ones the rightmost, then the lowest; in one pixel the one nearest to the camera.
     """
     squares, drawn = _squares(cloud, camera)
     front = _in_front(squares, drawn.width, drawn.height, cloud.reach)
@@ -225,7 +227,7 @@ def _squares(cloud: LabelledCloud, camera: Camera) -> tuple[_Squares, Camera]:
     drawn = camera.resized(max(1, round(camera.width / shrink)), max(1, round(camera.height / shrink)))
     size = np.array([drawn.width, drawn.height])
     scale = size / [camera.width, camera.height]
-    half = np.minimum(np.rint(spacing_px * np.sqrt(scale.prod())), WIDEST)
+    half = np.minimum(np.rint(HALF_WIDTH * spacing_px * np.sqrt(scale.prod())), WIDEST)
     uv_px = uv_px * scale
     index = np.flatnonzero(before & ((uv_px >= -half[:, None] - 1) & (uv_px <= size + half[:, None] + 1)).all(axis=1))
     index = index[np.lexsort((-index, -depth[index]))]

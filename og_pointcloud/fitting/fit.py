@@ -10,6 +10,7 @@ import numpy as np
 
 from og_pointcloud.cloud import BACKGROUND, UNOBSERVED, LabelledCloud
 from og_pointcloud.errors import SceneError
+from og_pointcloud.fitting.held_out import choose_scale, note_scale
 from og_pointcloud.fitting.labellers import LABELLERS, Labelling, paper
 from og_pointcloud.fitting.mask_table import Cutoffs, MaskTable, mask_table, require_sight, working_memory
 from og_pointcloud.fitting.membership import without_see_through
@@ -18,7 +19,7 @@ from og_pointcloud.fitting.tiles import fit_tiles, needs_tiles
 from og_pointcloud.fitting.work_folder import WorkFolder
 from og_pointcloud.journal import Journal, LeftOut
 from og_pointcloud.kernels import get_num_threads
-from og_pointcloud.rendering.geometry import thinned
+from og_pointcloud.rendering.geometry import isotropic, thinned
 from og_pointcloud.rendering.surface import Surface, reconstruct_surface
 from og_pointcloud.scene import Scene
 from og_pointcloud.settings import FitSettings
@@ -94,7 +95,7 @@ def prepare(
     settings = settings or FitSettings()
     journal = journal or Journal(progress=False)
     _check(scene, journal)
-    surface = reconstruct_surface(scene, settings, journal)
+    surface = _with_best_scale(reconstruct_surface(scene, settings, journal), settings, journal)
     if work is None:
         with WorkFolder.open(None) as temporary:
             return Prepared(scene, surface, _mask_table(surface, settings, journal, temporary))
@@ -131,6 +132,17 @@ def _check(scene: Scene, journal: Journal) -> None:
     journal.notes.update(points=len(scene.points), views=len(scene.views), masks=masks)
 
 
+def _with_best_scale(surface: Surface, settings: FitSettings, journal: Journal) -> Surface:
+    """The surface with a plain cloud's points drawn as large as held-out views find best."""
+    if not surface.by_sight:
+        return surface
+    points, spacing = surface.scene.points, surface.neighbourhood.spacing
+    with journal.stage("geometry"):
+        choice = choose_scale(points, spacing, surface.scene.views, surface.near, settings, journal)
+        note_scale(choice, journal)
+    return replace(surface, gaussians=isotropic(points, spacing, choice.scale, settings.geometry.opacity))
+
+
 def _mask_table(surface: Surface, settings: FitSettings, journal: Journal, work: WorkFolder) -> MaskTable:
     """The mask table of a surface, without what its masks show behind their objects; neither the table nor the views
     that are worked on side by side outgrow their share of the memory."""
@@ -151,6 +163,7 @@ def _mask_table(surface: Surface, settings: FitSettings, journal: Journal, work:
             side_by_side=at_once,
             most_in_memory=most,
             cutoffs=Cutoffs(visibility.alpha_min, visibility.transmittance_min),
+            by_sight=surface.by_sight,
         )
         journal.notes["table"] = {
             "views": len(views),

@@ -22,10 +22,11 @@ from numpy.typing import NDArray
 from og_pointcloud.cloud import UNOBSERVED, InstanceTable
 from og_pointcloud.fitting.association import describe_instances, part_of
 from og_pointcloud.fitting.grouping import MaskGroups, group_masks
+from og_pointcloud.fitting.held_out import agreement
 from og_pointcloud.fitting.learned.codebook import two_level_codebook
 from og_pointcloud.fitting.learned.instance_features import learn_features
 from og_pointcloud.fitting.learned.matching import Matching, alone_evidence, match_masks, visible_evidence
-from og_pointcloud.fitting.mask_table import MaskTable, weights_by_instance
+from og_pointcloud.fitting.mask_table import MaskTable
 from og_pointcloud.fitting.membership import assign_points
 from og_pointcloud.fitting.view_votes import ViewVotes, view_votes
 from og_pointcloud.fitting.work_folder import WorkFolder
@@ -77,25 +78,25 @@ def auto(table: MaskTable, surface: Surface, settings: FitSettings, journal: Jou
     """
     before = list(journal.left_out)
     grouped = grouping(table, surface, settings, journal)
-    agreement = mask_agreement(table, grouped)
-    journal.notes["mask_agreement"] = {"grouping": round(agreement, 4)}
+    own = mask_agreement(table, grouped)
+    journal.notes["mask_agreement"] = {"grouping": round(own, 4)}
     if len(grouped.instances) == 0:
         journal.leave_out(LeftOut.LEARNING_WITHOUT_INSTANCES)
         return grouped
-    if agreement >= settings.agreement_enough:
-        journal.leave_out(LeftOut.LEARNING_NOT_NEEDED, grouped=agreement, enough=settings.agreement_enough)
+    if own >= settings.agreement_enough:
+        journal.leave_out(LeftOut.LEARNING_NOT_NEEDED, grouped=own, enough=settings.agreement_enough)
         return grouped
     trial = Journal(journal.progress)
     learned = fast(table, surface, settings, trial)
     journal.stages += trial.stages
     other = mask_agreement(table, learned)
     journal.notes["mask_agreement"]["fast"] = round(other, 4)
-    if other > agreement + settings.agreement_lead:
+    if other > own + settings.agreement_lead:
         journal.notes.update(trial.notes)
         journal.left_out = before + trial.left_out
-        journal.leave_out(LeftOut.GROUPED_INSTANCES, learned=other, grouped=agreement)
+        journal.leave_out(LeftOut.GROUPED_INSTANCES, learned=other, grouped=own)
         return learned
-    journal.leave_out(LeftOut.LEARNED_INSTANCES, learned=other, grouped=agreement)
+    journal.leave_out(LeftOut.LEARNED_INSTANCES, learned=other, grouped=own)
     return grouped
 
 
@@ -180,18 +181,8 @@ LABELLERS: dict[str, Labeller] = {"auto": auto, "grouping": grouping, "fast": fa
 
 
 def mask_agreement(table: MaskTable, labelling: Labelling) -> float:
-    """How well the instances reproduce the masks they came from: mean over masks, by area, of the best IoU with what an
-    instance shows in that view. In [0, 1]; torn, merged and missed masks lower it whatever the instances."""
-    count = len(labelling.instances)
-    shared = weights_by_instance(table.weights, labelling.instance_ids, count)
-    in_view = weights_by_instance(table.outside, labelling.instance_ids, count)
-    np.add.at(in_view, table.mask_view, shared)
-    area = np.asarray(table.weights.sum(axis=1), np.float64).ravel()
-    if count == 0 or area.sum() == 0:
-        return 0.0
-    union = area[:, None] + in_view[table.mask_view] - shared
-    best = np.divide(shared, union, out=np.zeros_like(shared), where=union > 0).max(axis=1)
-    return float(np.average(best, weights=area))
+    """How well the instances reproduce the masks they came from, in [0, 1] (`held_out.agreement`)."""
+    return agreement(table, labelling.instance_ids, len(labelling.instances))
 
 
 def mask_means(table: MaskTable, features: NDArray[np.float32]) -> NDArray[np.float64]:
@@ -234,7 +225,8 @@ def renumbered(
     ids: (n,) the group of each point, or a state below 0, which stays. group: (masks,) the group of each mask, -1 none.
     """
     used = np.unique(ids[ids >= 0])
-    number = np.full(int(max(group.max(initial=-1), ids.max(initial=-1))) + 2, -1, np.int32)
+    # At least as long as the lowest state is negative: without any group all of them still index it.
+    number = np.full(int(max(group.max(initial=-1), ids.max(initial=-1))) + 3, -1, np.int32)
     number[used] = np.arange(len(used), dtype=np.int32)
     return used, np.where(ids >= 0, number[ids], ids).astype(np.int32), number[group]
 

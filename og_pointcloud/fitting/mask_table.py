@@ -23,6 +23,7 @@ from og_pointcloud.errors import OgPointcloudError, SceneError
 from og_pointcloud.fitting.memory import scratch_array
 from og_pointcloud.fitting.work_folder import WorkFolder, fingerprint
 from og_pointcloud.kernels import njit
+from og_pointcloud.rendering.sightings import sightings
 from og_pointcloud.rendering.splatting import (
     CUTOFFS,
     FRUSTUM_MARGIN,
@@ -104,6 +105,8 @@ def mask_table(
     side_by_side: int | None = None,
     most_in_memory: float = np.inf,
     cutoffs: Cutoffs = CUTOFFS,
+    by_sight: bool = False,
+    asked: NDArray[np.bool_] | None = None,
 ) -> MaskTable:
     """The mask table of all views, one pass over each.
 
@@ -113,19 +116,24 @@ def mask_table(
     work: where the views are kept meanwhile; views that are there already are not rendered. None: in memory.
     side_by_side: views worked on at once at most, None: as many as there are threads.
     most_in_memory: bytes of entries; a larger table is in files, mapped.
+    by_sight: take what views see along each point's own ray (`sightings.sightings`), not what each Gaussian paints;
+    thickness is then what it says there. asked: (n,) bool, the points that are looked at so; None: all.
     """
     if work is None:
         work = WorkFolder(None)
         work.hold(np.inf, np.inf)
     geometry = (gaussians.xyz, gaussians.scale, gaussians.rotation, gaussians.opacity, thickness, near, *cutoffs)
-    of_all = fingerprint(*geometry)
+    of_all = fingerprint(*geometry, by_sight, asked)
 
     def shown(view: View) -> _ShownView:
         ids = view.mask_map()
         key = fingerprint(of_all, view_fingerprint(view, ids))
 
         def make() -> tuple[NDArray[Any], ...]:
-            return _view_arrays(gaussians, view, ids, near, thickness, cutoffs)
+            if not by_sight or thickness is None:
+                return _view_arrays(gaussians, view, ids, near, thickness, cutoffs)
+            seen = sightings(gaussians, view.camera, ids, view.mask_count, near, thickness, asked, cutoffs)
+            return _as_arrays(seen.rows, seen.openness)
 
         lengths, *_, exposed = work.arrays("view", key, make)
         sizes = np.array([lengths[:-1].sum(dtype=np.int64), lengths[-1], len(exposed)])
@@ -172,7 +180,10 @@ def _view_arrays(
     """What a view shows: entries of each row (masks + 1,), the last one of pixels without a mask, the entries' columns
     and values, and columns and values of the view's exposure."""
     shown = view_weights(gaussians, view.camera, ids, view.mask_count, near, thickness, cutoffs)
-    rows, exposure = shown.rows, _exposure(shown)
+    return _as_arrays(shown.rows, _exposure(shown))
+
+
+def _as_arrays(rows: csr_array, exposure: csr_array) -> tuple[NDArray[Any], ...]:
     return np.diff(rows.indptr), rows.indices, rows.data, exposure.indices, exposure.data
 
 

@@ -29,6 +29,7 @@ from scipy.spatial import cKDTree
 
 from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.fitting.grouping import MaskGroups, group_masks, indicator
+from og_pointcloud.fitting.held_out import choose_scale, note_scale
 from og_pointcloud.fitting.labellers import Labelling, instances_of_groups, renumbered
 from og_pointcloud.fitting.mask_table import Cutoffs, Gaussians, MaskTable, mask_table, require_sight, view_fingerprint
 from og_pointcloud.fitting.membership import assign_points, without_see_through
@@ -40,17 +41,14 @@ from og_pointcloud.kernels import njit, prange
 from og_pointcloud.rendering.geometry import (
     Neighbourhood,
     chance_of_place,
-    choose_gaussians,
     isotropic,
     near_plane,
     neighbourhood,
     sample_of_points,
-    thinned,
 )
 from og_pointcloud.rendering.splatting import linearised_at, seen_from
 from og_pointcloud.rendering.surface import (
-    note_choice,
-    pixel_stride,
+    sight_thickness,
     surface_thickness,
     with_distinct_points,
     with_needed_views,
@@ -265,13 +263,12 @@ def _neighbours(tile: int, cloud: _TiledCloud, settings: FitSettings, work: Work
 @dataclass(frozen=True)
 class _Drawing:
     """How points are drawn, the same in every tile. scale, opacity: of a plain cloud's splats, in spacings; None for
-    Gaussians. near, typical: lengths. stride: every stride-th row and column of the images."""
+    Gaussians. near, typical: lengths."""
 
     scale: float | None
     opacity: float | None
     near: float
     typical: float
-    stride: int
 
     def splats(self, cloud: _TiledCloud, rows: Rows, larger: NDArray[np.float32]) -> Gaussians:
         """Splats of some points, each so many times larger than it would be."""
@@ -283,21 +280,20 @@ class _Drawing:
 
 
 def _drawing(views: Sequence[View], cloud: _TiledCloud, settings: FitSettings, journal: Journal) -> _Drawing:
-    """Size and opacity of the splats, and the share of the pixels that are worth a look, once for all tiles."""
+    """Size and opacity of the splats, once for all tiles."""
     points, geometry = cloud.points, settings.geometry
     near, typical = near_plane(points.xyz, views), float(np.median(cloud.spacing))
     if points.are_gaussians:
         journal.leave_out(LeftOut.CHOICE_OF_SPLATS)
-        return _Drawing(None, None, near, typical, 1)
+        return _Drawing(None, None, near, typical)
     few, spacing = points, cloud.spacing
     if len(points) > CHOICE_POINTS:
         journal.leave_out(LeftOut.CHOICE_POINTS, share=1 - CHOICE_POINTS / len(points))
         few = points.take(sample_of_points(points.xyz, CHOICE_POINTS))
         spacing = neighbourhood(few.xyz, geometry).spacing
-    choice = choose_gaussians(few, spacing, views, near, geometry, partial(journal.steps, name="geometry"))
-    note_choice(choice, journal)
-    stride = pixel_stride(points, cloud.spacing, views, geometry, journal)
-    return _Drawing(choice.scale, choice.opacity, near, typical, stride)
+    choice = choose_scale(few, spacing, views, near, settings, journal)
+    note_scale(choice, journal)
+    return _Drawing(choice.scale, geometry.opacity, near, typical)
 
 
 @dataclass(frozen=True)
@@ -351,7 +347,6 @@ def _look(
     readers, first = [], []
     thinning: list[tuple[int, int]] = []
     for view in journal.steps(scene.views, "visibility"):
-        view = thinned(view, drawing.stride)
         view = replace(view, masks=view.mask_map())
         key = fingerprint(
             cloud.key, drawing, FINEST_PX, MOST_SPLATS, view.name, view_fingerprint(view, view.mask_map())
@@ -381,9 +376,13 @@ def _entries(
     if len(rows) == 0:
         return np.zeros(0, ENTRY)
     splats = drawing.splats(cloud, rows, larger)
-    thickness = surface_thickness(splats, cloud.spacing[rows] * larger, drawing.typical, settings.geometry)
+    apart, by_sight = cloud.spacing[rows] * larger, drawing.scale is not None
+    if by_sight:
+        thickness = sight_thickness(apart, drawing.typical, settings.geometry)
+    else:
+        thickness = surface_thickness(splats, apart, drawing.typical, settings.geometry)
     cutoffs = Cutoffs(visibility.alpha_min, visibility.transmittance_min)
-    table = mask_table(splats, [view], drawing.near, thickness, cutoffs=cutoffs)
+    table = mask_table(splats, [view], drawing.near, thickness, cutoffs=cutoffs, by_sight=by_sight)
     camera = view.camera
     # In a table of one view each point has too few of them to contradict a mask: all that is behind is found.
     front, _ = without_see_through(

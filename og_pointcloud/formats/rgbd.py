@@ -17,7 +17,7 @@ Poses are camera-to-world with OpenCV axes. Pixel centres are counted at whole n
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -103,13 +103,19 @@ def read_rgbd(folder: Path) -> PosedFrames | None:
 
     SceneError names the file that is wrong, and the cure.
     """
-    if (folder / "color").is_dir() and (folder / "pose").is_dir() and _scannet_file(folder, "color") is not None:
-        return read_scannet(folder)
-    if any(next(sequence.glob("frame-*.pose.txt"), None) is not None for sequence in _sequences(folder)):
-        return read_seven_scenes(folder)
-    if (folder / "traj.txt").is_file() and (folder / "results").is_dir():
-        return read_replica(folder)
-    return None
+    return next((read(folder) for holds, read in LAYOUTS if holds(folder)), None)
+
+
+def _is_scannet(folder: Path) -> bool:
+    return (folder / "color").is_dir() and (folder / "pose").is_dir() and _scannet_file(folder, "color") is not None
+
+
+def _is_seven_scenes(folder: Path) -> bool:
+    return any(next(sequence.glob("frame-*.pose.txt"), None) is not None for sequence in _sequences(folder))
+
+
+def _is_replica(folder: Path) -> bool:
+    return (folder / "traj.txt").is_file() and (folder / "results").is_dir()
 
 
 def _posed_frames(frames: Iterable[_Frame]) -> PosedFrames:
@@ -242,3 +248,11 @@ def _replica_parameters(folder: Path) -> list[float]:
     if not np.isfinite(values).all() or min(values[0], values[1], values[-1]) <= 0 or max(values[:2]) > 1 << 16:
         raise SceneError(f"{file}: {', '.join(REPLICA_KEYS)} are {values}; expected positive sizes and scale")
     return values
+
+
+LAYOUTS: tuple[tuple[Callable[[Path], bool], Callable[[Path], PosedFrames]], ...] = (
+    (_is_scannet, read_scannet),
+    (_is_seven_scenes, read_seven_scenes),
+    (_is_replica, read_replica),
+)
+"""How a folder is told, and what reads it; the first that fits is taken. One of your own is a pair more."""

@@ -1,30 +1,25 @@
-"""Plain cloud -> Gaussians: how large and how opaque a point is, chosen so that the cloud looks like the photographs.
+"""What a fit asks of points before anything is drawn: spacing, neighbours, samples, the pixels worth looking at.
 
-Too large and the cloud becomes fog that hides itself and bleeds over edges; too small and rays pass through. Every
-point becomes an isotropic Gaussian of ``scale`` times its own spacing, with one ``opacity``; the two numbers are those
-with which the points, drawn in their own colours, differ least from the images. It is the paper's stage 0 (scale and
-opacity fitted with frozen positions) reduced to what a plain cloud needs.
+A plain cloud's points are drawn as isotropic Gaussians of a share of their own spacing; `fitting.held_out` chooses it.
 """
 
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from og_pointcloud.rendering.splatting import NEAR_SHARE, Gaussians, render
+from og_pointcloud.rendering.splatting import NEAR_SHARE, Gaussians
 from og_pointcloud.scene import Camera, Points, View
 from og_pointcloud.settings import GeometrySettings
 
 __all__ = [
-    "GeometryChoice",
     "Neighbourhood",
     "chance_of_place",
-    "choose_gaussians",
     "distinct_places",
     "near_plane",
     "neighbourhood",
@@ -44,17 +39,6 @@ class Neighbourhood:
     spacing: NDArray[np.float32]
     index: NDArray[np.int32]
     adjoining: NDArray[np.bool_]
-
-
-@dataclass(frozen=True)
-class GeometryChoice:
-    """scale (in spacings) and opacity of every point, and the trials (scale, opacity, photometric error) behind them;
-    no trials where there was nothing to compare with."""
-
-    gaussians: Gaussians
-    scale: float
-    opacity: float
-    trials: tuple[tuple[float, float, float], ...]
 
 
 def neighbourhood(xyz: NDArray[np.float32], settings: GeometrySettings) -> Neighbourhood:
@@ -159,49 +143,6 @@ def thinned(view: View, stride: int) -> View:
     return replace(view, camera=strided(view.camera, stride), masks=masks, image=None)
 
 
-def choose_gaussians(
-    points: Points,
-    spacing: NDArray[np.float32],
-    views: Sequence[View],
-    near: float,
-    settings: GeometrySettings,
-    progress: Callable[[Sequence[float]], Iterable[float]] = lambda values: values,
-) -> GeometryChoice:
-    """Gaussians of a plain cloud by photometric agreement with some of its images.
-
-    Scale is swept first, then opacity, with a few images; more of them decide between the scales that come close, for
-    which view is compared would decide else. Of scales that then look about as good the middle one is taken (of
-    two the smaller, which bleeds less over edges): the ends of the range are where gaps or fog begin. Splats that are
-    coarse beside the masks are not tried: they cannot tell inside from outside, however well they fill the image (a
-    LiDAR cloud with a person of five points).
-    Without colours or images the settings' start values are used.
-    """
-    views = sorted(views, key=lambda view: view.name)  # the same images whatever order the views came in
-    photographs = _Photographs(points, spacing, views, near, settings)
-    largest = settings.mask_share / max(_spacing_per_mask(points, spacing, views), 1e-12)
-    scales = tuple(scale for scale in settings.scales if scale <= largest) or settings.scales[:1]
-    scale, opacity = min(settings.start_scale, scales[-1]), settings.start_opacity
-    if len(photographs):
-        few, many = settings.photographs
-        opacity = settings.opacities[-1]
-        at_first: dict[float, float] = {}
-        for s in progress(scales):
-            at_first[s] = photographs.error(s, opacity, few)
-            if s > settings.start_scale and at_first[s] > (1 + settings.close_call) * min(at_first.values()):
-                break  # fog from here on
-        scale = min(at_first, key=lambda s: at_first[s])
-        for softer in progress(settings.opacities[-2::-1]):
-            if photographs.error(scale, softer, few) >= photographs.error(scale, opacity, few):
-                break
-            opacity = softer
-        best = min(photographs.error(s, opacity, few) for s in at_first)
-        close = [s for s in at_first if photographs.error(s, opacity, few) <= best * (1 + settings.close_call)]
-        errors = [photographs.error(s, opacity, many) for s in progress(close)] if len(close) > 1 else [best]
-        alike = [s for s, e in zip(close, errors, strict=True) if e <= min(errors) * (1 + settings.error_tolerance)]
-        scale = alike[(len(alike) - 1) // 2]
-    return GeometryChoice(isotropic(points, spacing, scale, opacity), scale, opacity, photographs.trials)
-
-
 def isotropic(points: Points, spacing: NDArray[np.float32], scale: float, opacity: float) -> Gaussians:
     """Round Gaussians of ``scale`` spacings."""
     n = len(points)
@@ -209,76 +150,6 @@ def isotropic(points: Points, spacing: NDArray[np.float32], scale: float, opacit
     rotation[:, 0] = 1
     size = np.repeat((scale * spacing).astype(np.float32)[:, None], 3, axis=1)
     return Gaussians(points.xyz, size, rotation, np.full(n, opacity, np.float32))
-
-
-class _Photographs:
-    """Images at about the cloud's own resolution (finer pixels would show only its gaps), and how little the cloud
-    drawn with some scale and opacity looks like them. Empty without images or colours."""
-
-    def __init__(
-        self,
-        points: Points,
-        spacing: NDArray[np.float32],
-        views: Sequence[View],
-        near: float,
-        settings: GeometrySettings,
-    ) -> None:
-        self.points, self.spacing, self.near = points, spacing, near
-        self.images: list[tuple[Camera, NDArray[np.float32]]] = []
-        self._errors: dict[tuple[float, float], list[float]] = {}
-        with_image = [view for view in views if view.image is not None]
-        if points.rgb is None or not with_image:
-            return
-        import cv2
-
-        # Evenly spread whether only the first few are looked at, or all.
-        few, many = (np.linspace(0, len(with_image) - 1, n).round().astype(int) for n in settings.photographs)
-        shrink = max(1.0, pixels_per_spacing(points, spacing, views) / settings.photograph_resolution)
-        for index in dict.fromkeys([*few.tolist(), *many.tolist()]):
-            image, camera = with_image[index].image_rgb(), with_image[index].camera
-            size = max(1, round(camera.width / shrink)), max(1, round(camera.height / shrink))
-            small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-            self.images.append((camera.resized(*size), small.astype(np.float32) / 255))
-        self.colors = (points.rgb / 255).astype(np.float32)
-        self.guess = np.median(np.concatenate([image.reshape(-1, 3) for _, image in self.images]), axis=0)
-
-    def __len__(self) -> int:
-        return len(self.images)
-
-    @property
-    def trials(self) -> tuple[tuple[float, float, float], ...]:
-        """(scale, opacity, mean error) of all that was tried."""
-        return tuple((*pair, float(np.mean(errors))) for pair, errors in self._errors.items())
-
-    def error(self, scale: float, opacity: float, count: int) -> float:
-        """Mean absolute difference of the drawn cloud and the first ``count`` images; what the cloud leaves open shows
-        the median colour.
-
-        So an uncovered pixel costs what a guess costs: a cloud that cannot cover the image is not blown up to do so.
-        """
-        errors = self._errors.setdefault((scale, opacity), [])
-        gaussians = isotropic(self.points, self.spacing, scale, opacity)
-        for camera, image in self.images[len(errors) : count]:
-            drawn, covered = render(gaussians, self.colors, camera, self.near)
-            errors.append(float(np.abs(drawn + (1 - covered[..., None]) * self.guess - image).mean()))
-        return float(np.mean(errors[:count]))
-
-
-def _spacing_per_mask(points: Points, spacing: NDArray[np.float32], views: Sequence[View]) -> float:
-    """Point spacing in an image as a part of a mask's side, median over the masks of a few views; 0 without masks."""
-    step = 1 + len(points) // 50_000
-    xyz, spacing = points.xyz[::step], spacing[::step]
-    parts = []
-    for view in (views[index] for index in np.unique(np.linspace(0, len(views) - 1, 12).round().astype(int))):
-        ids, camera = view.mask_map(), view.camera
-        uv_px, depth = camera.project(xyz)
-        inside = camera.shows(uv_px)
-        column, row = uv_px[inside].astype(int).T
-        mask = ids[row, column]
-        apart = np.sqrt(camera.fx * camera.fy) * spacing[inside] / depth[inside]
-        side = np.sqrt(np.bincount(ids.ravel() + 1, minlength=view.mask_count + 1)[1:])
-        parts += [np.median(apart[mask == index]) / side[index] for index in np.unique(mask[mask >= 0])]
-    return float(np.median(parts)) if parts else 0.0
 
 
 def _depths(xyz: NDArray[np.float32], camera: Camera) -> NDArray[np.float64]:

@@ -33,10 +33,13 @@ __all__ = [
     "Cutoffs",
     "Gaussians",
     "ViewWeights",
+    "binned_splats",
+    "dim",
     "linearised_at",
     "pixel_weights",
     "render",
     "seen_from",
+    "tile_buffer",
     "view_weights",
     "working_memory",
 ]
@@ -86,7 +89,7 @@ class Gaussians:
     def from_points(cls, points: Points) -> Gaussians:
         """The Gaussians of a 3DGS file; SceneError for a plain cloud, whose splats `geometry` has to choose."""
         if points.scale is None or points.rotation is None or points.opacity is None:
-            raise SceneError("the cloud has no scale, rotation and opacity; choose them with geometry.choose_gaussians")
+            raise SceneError("the cloud has no scale, rotation and opacity; og.fit chooses them for a plain cloud")
         return cls(points.xyz, points.scale, points.rotation, points.opacity)
 
     def __len__(self) -> int:
@@ -182,6 +185,21 @@ def _entries(
 ) -> tuple[tuple[NDArray[Any], ...], NDArray[np.float64]]:
     """What `view_weights` adds up, tile by tile: (rows, cols, weights, first, counts), tile t's entries being
     first[t] : first[t] + counts[t]; and the area of each splat."""
+    splats, starts, members, columns, area = binned_splats(gaussians, camera, near, thickness, cutoffs)
+    masks = np.where(ids < 0, id_count, ids).astype(np.int32)
+    bounds = _entry_bounds(splats, starts, members, masks, id_count, columns)
+    first = np.concatenate([[0], np.cumsum(bounds)])
+    rows, cols, weights, counts = _composite(
+        splats, starts, members, masks, id_count, columns, first, cutoffs, get_num_threads()
+    )
+    return (rows, cols, weights, first[:-1], counts), area
+
+
+def binned_splats(
+    gaussians: Gaussians, camera: Camera, near: float, thickness: NDArray[np.float32] | None, cutoffs: Cutoffs
+) -> tuple[NDArray[Any], NDArray[np.int64], NDArray[np.int32], int, NDArray[np.float64]]:
+    """The splats of an image by tile: (splats, starts, members, columns of tiles, area of each Gaussian); the members
+    of tile t, members[starts[t] : starts[t + 1]], are rows of splats, nearest first."""
     pose, near = camera.world_to_camera, float(near)
     intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
     size = (camera.width, camera.height)
@@ -207,13 +225,7 @@ def _entries(
     columns = -(-camera.width // TILE)
     tiles = columns * -(-camera.height // TILE)
     starts, members = _bin(splats, order, columns, tiles, cutoffs, get_num_threads())
-    masks = np.where(ids < 0, id_count, ids).astype(np.int32)
-    bounds = _entry_bounds(splats, starts, members, masks, id_count, columns)
-    first = np.concatenate([[0], np.cumsum(bounds)])
-    rows, cols, weights, counts = _composite(
-        splats, starts, members, masks, id_count, columns, first, cutoffs, get_num_threads()
-    )
-    return (rows, cols, weights, first[:-1], counts), area
+    return splats, starts, members, columns, area
 
 
 def _records(count: int) -> NDArray[Any]:
@@ -465,7 +477,7 @@ def _composite(splats, starts, members, masks, id_count, columns, first, cutoffs
     # scratch rows of its own.
     for worker in prange(workers):
         sum_of, touched = sums[worker], np.empty(TILE * TILE, np.int32)
-        light, surface, shown = _scratch(), _scratch(), _scratch()
+        light, surface, shown = tile_buffer(), tile_buffer(), tile_buffer()
         runs = np.empty((TILE, TILE), np.uint8)
         batch = np.empty(BATCH, SPLAT)
         log2_least = np.float32(np.log2(cutoffs.alpha_min))
@@ -504,7 +516,7 @@ def _composite(splats, starts, members, masks, id_count, columns, first, cutoffs
 
 
 @njit(cache=True, nogil=True)
-def _scratch():  # noqa: ANN202
+def tile_buffer():  # noqa: ANN201
     """A number for each pixel of a tile; rows begin where vectors are read fastest."""
     room = np.empty(TILE * TILE + 16, np.float32)
     ahead = (64 - room.ctypes.data % 64) % 64 // 4
@@ -562,6 +574,20 @@ def _blend(s, left, top, log2_least, least_light, light, surface, shown):  # noq
         weight = weight + here
         through = through + either(near_side > front, here, none)
     return total(weight), total(through)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def dim(s, left, top, log2_least, light):  # noqa: ANN001, ANN201
+    """Take from each pixel's light what a splat absorbs: `_blend` without asking whose it is."""
+    full, across, least = spread(ONE), spread(s.across), spread(log2_least)
+    for y in range(max(s.y0 - top, 0), min(s.y1 + 1 - top, TILE)):
+        dy = top + y + 0.5 - s.v
+        distance = (ramp() - spread(np.float32(s.u - s.shear * dy - left - 0.5))) * across
+        log_alpha = spread(np.float32(s.peak - s.down * dy * dy)) - distance * distance
+        covers = log_alpha >= least
+        alpha = lesser(exp2(either(covers, log_alpha, least)), spread(np.float32(ALPHA_MAX)))
+        before = load(light, y * TILE)
+        store(light, y * TILE, either(covers, before * (full - alpha), before))
 
 
 @njit(cache=True, nogil=True)

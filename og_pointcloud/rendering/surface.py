@@ -12,9 +12,7 @@ from numpy.typing import NDArray
 from og_pointcloud.journal import Journal, LeftOut
 from og_pointcloud.rendering.coverage import needed_views
 from og_pointcloud.rendering.geometry import (
-    GeometryChoice,
     Neighbourhood,
-    choose_gaussians,
     distinct_places,
     isotropic,
     near_plane,
@@ -28,9 +26,9 @@ from og_pointcloud.settings import FitSettings, GeometrySettings
 
 __all__ = [
     "Surface",
-    "note_choice",
     "pixel_stride",
     "reconstruct_surface",
+    "sight_thickness",
     "surface_thickness",
     "with_distinct_points",
     "with_needed_views",
@@ -47,6 +45,8 @@ class Surface:
     near: depth of the near plane, scene units.
     thickness: (n,) float32, how far behind the front of its surface a Gaussian may lie, scene units.
     stride: every stride-th row and column of the images is used.
+    by_sight: views are asked which masks a point lies in along its own ray (sightings.py), as for plain clouds, whose
+    Gaussians are of our making; else how much of each mask it paints (splatting.py), as the paper does.
     """
 
     scene: Scene
@@ -56,6 +56,7 @@ class Surface:
     near: float
     thickness: NDArray[np.float32]
     stride: int
+    by_sight: bool = False
 
     def of_points(self, values: NDArray[Any]) -> NDArray[Any]:
         """What each point of the whole scene has, of values (n, ...) that the points here have."""
@@ -75,9 +76,14 @@ def reconstruct_surface(scene: Scene, settings: FitSettings, journal: Journal) -
         around = neighbourhood(scene.points.xyz, settings.geometry)
     with journal.stage("geometry"):
         gaussians = _gaussians(scene, around, near, settings, journal)
-        thickness = surface_thickness(gaussians, around.spacing, float(np.median(around.spacing)), settings.geometry)
-        stride = pixel_stride(scene.points, around.spacing, scene.views, settings.geometry, journal)
-    return Surface(scene, row_of_point, around, gaussians, near, thickness, stride)
+        by_sight = not scene.points.are_gaussians and settings.mode != "paper"
+        typical = float(np.median(around.spacing))
+        if by_sight:
+            thickness = sight_thickness(around.spacing, typical, settings.geometry)
+        else:
+            thickness = surface_thickness(gaussians, around.spacing, typical, settings.geometry)
+        stride = 1 if by_sight else pixel_stride(scene.points, around.spacing, scene.views, settings.geometry, journal)
+    return Surface(scene, row_of_point, around, gaussians, near, thickness, stride, by_sight)
 
 
 def with_needed_views(scene: Scene, settings: FitSettings, journal: Journal) -> Scene:
@@ -113,27 +119,14 @@ def _gaussians(scene: Scene, around: Neighbourhood, near: float, settings: FitSe
     if settings.mode == "paper":
         journal.leave_out(LeftOut.CHOICE_IN_PAPER_MODE)
         return isotropic(scene.points, around.spacing, settings.paper.scale, settings.paper.opacity)
-    choice = choose_gaussians(
-        scene.points,
-        around.spacing,
-        scene.views,
-        near,
-        settings.geometry,
-        lambda values: journal.steps(values, "geometry"),
-    )
-    note_choice(choice, journal)
-    return choice.gaussians
+    return isotropic(scene.points, around.spacing, settings.geometry.start_scale, settings.geometry.opacity)
 
 
-def note_choice(choice: GeometryChoice, journal: Journal) -> None:
-    """Note how a plain cloud's points are drawn, and why; warn where there was nothing to compare with."""
-    journal.notes["gaussian_scale"], journal.notes["gaussian_opacity"] = choice.scale, choice.opacity
-    journal.notes["photometric_trials"] = [list(trial) for trial in choice.trials]
-    if not choice.trials:
-        journal.warnings.append(
-            f"no colours or images to compare with: points are drawn {choice.scale} spacings large, {choice.opacity} "
-            "opaque; add images for a choice by photometric agreement"
-        )
+def sight_thickness(
+    spacing: NDArray[np.float32], typical_spacing: float, settings: GeometrySettings
+) -> NDArray[np.float32]:
+    """(n,) how far before a point others must lie to hide it: noise and overlap make a surface so thick."""
+    return (settings.sight_thickness * np.maximum(spacing, typical_spacing)).astype(np.float32)
 
 
 def surface_thickness(

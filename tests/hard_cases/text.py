@@ -97,7 +97,7 @@ def no_word() -> object:
     return segment(labelled_cloud(), [])
 
 
-@refuses(OgPointcloudError, "label 0 is an empty name", "expected a word", "name it or remove it")
+@refuses(OgPointcloudError, "row 0 has an empty name", "expected a word", "name it or remove it")
 def empty_word() -> object:
     """The empty string as a word, with a vector."""
     return segment(labelled_cloud(), {"": unit_rows(1, 16)[0]})
@@ -109,7 +109,7 @@ def empty_word_without_a_vector() -> object:
     return segment(labelled_cloud(), "")
 
 
-@refuses(FeatureSpaceError, "row 1 has an empty name", "expected a word", "name or remove it")
+@refuses(FeatureSpaceError, "row 1 has an empty name", "expected a word", "name it or remove it")
 def empty_word_in_a_file() -> object:
     """A file of words with an empty one."""
     with tempfile.TemporaryDirectory() as folder:
@@ -124,7 +124,7 @@ def vector_of_zero() -> object:
     return segment(labelled_cloud(), {"chair": np.zeros(16)})
 
 
-@refuses(FeatureSpaceError, "the vector of 'desk' holds NaN or infinity", "expected finite", "encode it again")
+@refuses(FeatureSpaceError, "the vector of 'desk' is NaN or infinite", "expected finite", "encode it again")
 def vector_not_a_number() -> object:
     """A word whose vector holds NaN."""
     return segment(labelled_cloud(), {"chair": np.ones(16), "desk": np.full(16, np.nan)})

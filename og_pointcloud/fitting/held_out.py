@@ -1,0 +1,120 @@
+"""How large a point is drawn, decided by views that were held out: no truth, no photograph, no threshold is needed.
+
+Too large and points hide what lies behind their edge; too small and light slips through a surface and labels what is
+behind it. Which is worse depends on noise, density and floaters: the scene must decide. So labels are made from every
+other view, with points of each size, and judged on the views between, by how well they reproduce the masks there. What
+those views show depends on the size too; each size therefore judges all of them, and the best on average is taken. (A
+size that judged itself would always find large opaque points to agree with themselves.)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+
+from og_pointcloud.fitting.grouping import group_masks
+from og_pointcloud.fitting.mask_table import MaskTable, mask_table, weights_by_instance
+from og_pointcloud.fitting.membership import assign_points
+from og_pointcloud.fitting.view_votes import view_votes
+from og_pointcloud.journal import Journal, LeftOut
+from og_pointcloud.rendering.geometry import Neighbourhood, isotropic, neighbourhood, sample_of_points
+from og_pointcloud.rendering.surface import sight_thickness
+from og_pointcloud.scene import Points, View
+from og_pointcloud.settings import FitSettings
+
+__all__ = ["ScaleChoice", "agreement", "choose_scale", "note_scale"]
+
+FEWEST_VIEWS = 4
+"""Fewer cannot be halved so that views of one half contradict each other."""
+
+
+@dataclass(frozen=True)
+class ScaleChoice:
+    """scale: standard deviation of the points' Gaussians, in spacings. agreements: of each scale tried, how well labels
+    made with it reproduce masks of held-out views, in [0, 1]; empty where views could not be held out."""
+
+    scale: float
+    agreements: dict[float, float]
+
+
+def choose_scale(
+    points: Points,
+    spacing: NDArray[np.float32],
+    views: Sequence[View],
+    near: float,
+    settings: FitSettings,
+    journal: Journal,
+) -> ScaleChoice:
+    """The scale whose labels of half of the views reproduce the masks of the other half best.
+
+    spacing: (n,) of the points. near: depth of the near plane. Only some views and points are asked (see settings), but
+    all points hide others. Does not depend on the order of views or points.
+    """
+    geometry = settings.geometry
+    masked = sorted((view for view in views if view.mask_count), key=lambda view: view.name)
+    spread = np.linspace(0, len(masked) - 1, min(geometry.held_out_views, len(masked))).round().astype(int)
+    chosen = [masked[index] for index in np.unique(spread)]
+    if len(chosen) < FEWEST_VIEWS or len(geometry.scales) < 2:
+        return ScaleChoice(geometry.start_scale, {})
+    sample = sample_of_points(points.xyz, geometry.held_out_points)
+    around = neighbourhood(points.xyz[sample], geometry)
+    asked = np.zeros(len(points), np.bool_)
+    asked[sample] = True
+    thickness = sight_thickness(spacing, float(np.median(spacing)), geometry)
+    tables = []
+    for scale in journal.steps(geometry.scales, "geometry"):
+        gaussians = isotropic(points, spacing, scale, geometry.opacity)
+        halves = (
+            mask_table(gaussians, chosen[half::2], near, thickness, by_sight=True, asked=asked) for half in (0, 1)
+        )
+        tables.append([_of_points(table, sample) for table in halves])
+    agreements = np.zeros(len(geometry.scales))
+    for half in (0, 1):
+        for index in range(len(geometry.scales)):
+            ids, count = _labels(tables[index][half], around, settings)
+            agreements[index] += np.mean([agreement(judge[1 - half], ids, count) for judge in tables]) / 2
+    best = geometry.scales[int(np.argmax(agreements))] if agreements.any() else geometry.start_scale
+    rounded = np.round(agreements, 4).tolist()
+    return ScaleChoice(best, dict(zip(geometry.scales, rounded, strict=True)))
+
+
+def note_scale(choice: ScaleChoice, journal: Journal) -> None:
+    """Note how large a plain cloud's points are drawn, and why."""
+    journal.notes["gaussian_scale"], journal.notes["held_out_agreement"] = choice.scale, choice.agreements
+    if not any(choice.agreements.values()):
+        journal.leave_out(LeftOut.CHOICE_OF_SCALE, scale=choice.scale)
+
+
+def agreement(table: MaskTable, ids: NDArray[np.int32], count: int) -> float:
+    """How well instances reproduce a table's masks: mean over masks, by area, of the best IoU with what an instance
+    shows in that view. In [0, 1]; torn, merged and missed masks lower it whatever the instances.
+
+    ids: (n,) int32, the instance of each point, below 0 none; count: how many instances there are.
+    """
+    shared = weights_by_instance(table.weights, ids, count)
+    in_view = weights_by_instance(table.outside, ids, count)
+    np.add.at(in_view, table.mask_view, shared)
+    area = np.asarray(table.weights.sum(axis=1), np.float64).ravel()
+    if count == 0 or area.sum() == 0:
+        return 0.0
+    union = area[:, None] + in_view[table.mask_view] - shared
+    best = np.divide(shared, union, out=np.zeros_like(shared), where=union > 0).max(axis=1)
+    return float(np.average(best, weights=area))
+
+
+def _labels(table: MaskTable, around: Neighbourhood, settings: FitSettings) -> tuple[NDArray[np.int32], int]:
+    """The group of masks that each point is in, as mode grouping finds it, and how many groups there are."""
+    votes = view_votes(table)
+    groups = group_masks(table, votes, settings.grouping)
+    return assign_points(table, votes, groups, around, settings.membership).instance_ids, groups.count
+
+
+def _of_points(table: MaskTable, rows: NDArray[np.int64]) -> MaskTable:
+    """The table of some of its points."""
+    matrices = (csr_array(matrix[:, rows]) for matrix in (table.weights, table.outside, table.exposure))
+    weights, outside, exposure = matrices
+    return replace(table, weights=weights, outside=outside, exposure=exposure)

@@ -1,0 +1,147 @@
+"""How openly a view sees each point, and which of its masks the point lies in: along the point's own ray.
+
+Blending (`splatting`) says how much of a pixel's light comes from each Gaussian. That is what an image is made of; for
+the question "what is this point?" it is the wrong way round: Gaussians large enough to close a surface bleed over its
+edges, smaller ones let the background through. Here the size of a point serves occlusion alone. Let, for point g,
+
+    openness_g = product of (1 - alpha_h) at the pixel of g, over all h that lie more than ``thickness`` before g
+
+with alpha_h as in 3DGS. The point's vote goes to the mask at its pixel, by its openness; half of it to those around the
+pixel, since the edges of masks are uncertain by a pixel or two. Points within ``thickness`` of
+each other along a ray never hide each other, so noisy surfaces of several layers are seen whole.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+
+from og_pointcloud.kernels import get_num_threads, njit, prange
+from og_pointcloud.rendering.splatting import CUTOFFS, TILE, Cutoffs, Gaussians, binned_splats, dim, tile_buffer
+from og_pointcloud.scene import Camera
+
+__all__ = ["Sightings", "openness", "sightings"]
+
+LEAST_OPEN = 0.02
+"""A point that less light reaches is hidden: what so few rays say is as often an edge's as its own."""
+EDGE_PX = 1.5
+"""Edges of masks are uncertain by so many pixels: RING_SHARE of a vote goes to a ring so far around the pixel."""
+RING_SHARE = 0.5
+RING = [(EDGE_PX * np.cos(angle), EDGE_PX * np.sin(angle)) for angle in np.arange(8) * np.pi / 4]
+SAMPLES = np.array([(0.0, 0.0, 1 - RING_SHARE), *((x, y, RING_SHARE / len(RING)) for x, y in RING)])
+"""Right and down of a point, in pixels, and the share of its vote there."""
+
+
+@dataclass(frozen=True)
+class Sightings:
+    """What one view shows of n points. rows: (masks + 1, n) sparse float32, openness by mask, last row outside of all
+    masks. openness: (1, n) sparse float32, their sums, in (0, 1]."""
+
+    rows: csr_array
+    openness: csr_array
+
+
+def sightings(
+    gaussians: Gaussians,
+    camera: Camera,
+    ids: NDArray[np.int32],
+    mask_count: int,
+    near: float,
+    thickness: NDArray[np.float32],
+    asked: NDArray[np.bool_] | None = None,
+    cutoffs: Cutoffs = CUTOFFS,
+) -> Sightings:
+    """The masks that each point lies in, by how openly the view sees it.
+
+    ids: (H, W) int32 in -1..mask_count-1, H and W the camera's. near, thickness (n,): scene units.
+    asked: (n,) bool, points that are looked at (all of them hide others); None: all.
+    """
+    open_, u, v = openness(gaussians, camera, near, thickness, asked, cutoffs)
+    seen = np.flatnonzero(open_).astype(np.int32)
+    rows, columns, votes = _votes(seen, open_, u, v, np.where(ids < 0, mask_count, ids), SAMPLES)
+    order = np.argsort(rows, kind="stable")
+    starts = np.searchsorted(rows[order], np.arange(mask_count + 2)).astype(np.int32)
+    return Sightings(
+        csr_array((votes[order], columns[order], starts), shape=(mask_count + 1, len(gaussians))),
+        csr_array((open_[seen], seen, [0, len(seen)]), shape=(1, len(gaussians))),
+    )
+
+
+def openness(
+    gaussians: Gaussians,
+    camera: Camera,
+    near: float,
+    thickness: NDArray[np.float32],
+    asked: NDArray[np.bool_] | None = None,
+    cutoffs: Cutoffs = CUTOFFS,
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+    """(n,) float32 each: openness, 0 where a point is hidden, outside the image or not asked; and where it is seen, in
+    pixels (u, v). Light is followed through the centres of pixels."""
+    splats, starts, members, columns, _ = binned_splats(gaussians, camera, near, thickness, cutoffs)
+    n = len(gaussians)
+    asked = np.ones(n, np.bool_) if asked is None else asked
+    open_, u, v = (np.zeros(n, np.float32) for _ in range(3))
+    size = np.array([camera.width, camera.height])
+    log2_least = np.float32(np.log2(cutoffs.alpha_min))
+    _see(splats, starts, members, columns, size, asked, log2_least, get_num_threads(), open_, u, v)
+    return open_, u, v
+
+
+@njit(cache=True, parallel=True, nogil=True, error_model="numpy")
+def _see(splats, starts, members, columns, size, asked, log2_least, workers, open_, u, v):  # noqa: ANN001, ANN202
+    """Writes the last three, tile by tile: a centre lies in one tile, whose members are all that can hide it.
+
+    Light falls through the splats of a tile from front to back. A point is asked when all that lies before its surface
+    has been drawn: so points are taken by the depth of their surface, splats by their own.
+    """
+    tiles, deepest = len(starts) - 1, 0
+    for tile in range(tiles):
+        deepest = max(deepest, starts[tile + 1] - starts[tile])
+    for worker in prange(workers):
+        light = tile_buffer()
+        surface, point = np.empty(deepest, np.float32), np.empty(deepest, np.int32)
+        for tile in range(worker, tiles, workers):
+            left, top = tile % columns * TILE, tile // columns * TILE
+            count = 0
+            for k in range(starts[tile], starts[tile + 1]):
+                s = splats[members[k]]
+                inside = left <= s.u < min(left + TILE, size[0]) and top <= s.v < min(top + TILE, size[1])
+                if inside and asked[s.gaussian]:
+                    surface[count], point[count] = s.surface, members[k]
+                    count += 1
+            light[:] = np.float32(1)
+            drawn = starts[tile]
+            for q in np.argsort(surface[:count]):
+                while drawn < starts[tile + 1] and splats[members[drawn]].depth < surface[q]:
+                    dim(splats[members[drawn]], left, top, log2_least, light)
+                    drawn += 1
+                s = splats[point[q]]
+                g = s.gaussian
+                reaches = light[(int(s.v) - top) * TILE + int(s.u) - left]
+                open_[g], u[g], v[g] = reaches if reaches >= LEAST_OPEN else np.float32(0), s.u, s.v
+
+
+@njit(cache=True, nogil=True)
+def _votes(seen, open_, u, v, masks, samples):  # noqa: ANN001, ANN202
+    """(rows, columns, votes): the openness of each seen point, shared among the masks at and around its pixel."""
+    height, width = masks.shape
+    rows = np.empty(len(seen) * len(samples), np.int32)
+    columns = np.empty(len(seen) * len(samples), np.int32)
+    votes = np.empty(len(seen) * len(samples), np.float32)
+    end = 0
+    for g in seen:
+        first = end
+        for k in range(len(samples)):
+            x = min(max(int(np.floor(u[g] + samples[k, 0])), 0), width - 1)
+            y = min(max(int(np.floor(v[g] + samples[k, 1])), 0), height - 1)
+            mask, entry = masks[y, x], first
+            while entry < end and rows[entry] != mask:
+                entry += 1
+            if entry == end:
+                rows[end], columns[end], votes[end] = mask, g, np.float32(0)
+                end += 1
+            votes[entry] += open_[g] * samples[k, 2]
+    return rows[:end], columns[:end], votes[:end]

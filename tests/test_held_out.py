@@ -1,0 +1,69 @@
+"""The size of points by held-out views: it finds the size that labels best, and depends on nothing else."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scenes import write_tiny_capture
+from scipy.sparse import csr_array
+
+import og_pointcloud as og
+from og_pointcloud.fitting.held_out import agreement, choose_scale
+from og_pointcloud.fitting.mask_table import MaskTable
+from og_pointcloud.journal import Journal
+from og_pointcloud.rendering.geometry import near_plane, neighbourhood
+from og_pointcloud.scene import Scene
+from og_pointcloud.settings import FitSettings, GeometrySettings
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
+    return og.read_capture(write_tiny_capture(tmp_path_factory.mktemp("tiny") / "capture", 8).folder)
+
+
+def chosen(scene: Scene, settings: FitSettings | None = None):
+    settings = settings or FitSettings()
+    spacing = neighbourhood(scene.points.xyz, settings.geometry).spacing
+    near = near_plane(scene.points.xyz, scene.views)
+    return choose_scale(scene.points, spacing, scene.views, near, settings, Journal(progress=False))
+
+
+def test_the_best_on_held_out_views_is_taken(scene: Scene) -> None:
+    choice = chosen(scene)
+    assert set(choice.agreements) == set(FitSettings().geometry.scales)
+    assert choice.agreements[choice.scale] == max(choice.agreements.values())
+    assert 0.5 < choice.agreements[choice.scale] <= 1
+
+
+def test_points_that_let_everything_through_are_not_taken(scene: Scene) -> None:
+    """With points as fine as dust the floor behind a ball takes the ball's masks: the other views say so."""
+    settings = FitSettings(geometry=GeometrySettings(scales=(0.01, 0.5)))
+    assert chosen(scene, settings).scale == 0.5
+    assert chosen(scene, FitSettings(geometry=GeometrySettings(scales=(0.5, 6.0)))).scale == 0.5
+
+
+def test_order_of_views_and_points_does_not_matter(scene: Scene) -> None:
+    order = np.random.default_rng(0).permutation(len(scene.points))
+    shuffled = replace(scene, points=scene.points.take(order), views=scene.views[::-1])
+    first, second = chosen(scene), chosen(shuffled)
+    assert first.scale == second.scale
+    for scale, value in first.agreements.items():
+        assert second.agreements[scale] == pytest.approx(value, abs=2e-3)
+
+
+def test_too_few_views_to_hold_some_out(scene: Scene) -> None:
+    choice = chosen(replace(scene, views=scene.views[:3]))
+    assert (choice.scale, choice.agreements) == (FitSettings().geometry.start_scale, {})
+    cloud = og.fit(replace(scene, views=scene.views[:3]), progress=False)
+    assert any(entry["key"] == "choice of scale" for entry in cloud.provenance["left_out"])
+
+
+def test_agreement_by_hand() -> None:
+    """Two masks of one view over four points: the first is instance 0 exactly, the second half of instance 1."""
+    weights = csr_array(np.array([[1, 1, 0, 0], [0, 0, 1, 0]], np.float32))
+    outside = csr_array(np.array([[0, 0, 0, 1]], np.float32))
+    table = MaskTable(weights, outside, csr_array((1, 4)), np.zeros(2, np.int32), np.ones(2, np.int32), np.ones((2, 1)))
+    assert agreement(table, np.array([0, 0, 1, 1], np.int32), 2) == pytest.approx((2 * 1 + 1 * 0.5) / 3)
+    assert agreement(table, np.array([-1, -1, -1, -1], np.int32), 0) == 0

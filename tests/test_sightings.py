@@ -1,0 +1,121 @@
+"""Sight lines against their definition: every point, every splat before it, in float64."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from reference_splatting import in_camera, reference_alpha
+
+from og_pointcloud.rendering.sightings import EDGE_PX, LEAST_OPEN, RING_SHARE, openness, sightings
+from og_pointcloud.rendering.splatting import Gaussians
+from og_pointcloud.scene import Camera
+
+CAMERA = Camera(48, 40, 60, 60, 24, 20, np.eye(4))
+NEAR = 0.1
+
+
+def gaussians(xyz: NDArray[np.floating], scale: float | NDArray[np.floating], opacity: float = 0.9) -> Gaussians:
+    n = len(xyz)
+    rotation = np.zeros((n, 4), np.float32)
+    rotation[:, 0] = 1
+    size = np.broadcast_to(np.reshape(scale, (-1, 1)), (n, 3)).astype(np.float32)
+    return Gaussians(np.asarray(xyz, np.float32), size, rotation, np.full(n, opacity, np.float32))
+
+
+def reference_openness(splats: Gaussians, camera: Camera, thickness: NDArray[np.floating]) -> NDArray[np.float64]:
+    """(n,): the product of (1 - alpha) at each centre's pixel over all that lies more than thickness before it."""
+    depth = np.array([in_camera(splats, g, camera)[2] for g in range(len(splats))])
+    found = np.zeros(len(splats))
+    for g in range(len(splats)):
+        if depth[g] <= NEAR:
+            continue
+        u, v = camera.project(splats.xyz[[g]])[0][0]
+        if not (0 <= u < camera.width and 0 <= v < camera.height):
+            continue
+        light = 1.0
+        for h in range(len(splats)):
+            if NEAR < depth[h] < np.float32(depth[g]) - np.float32(thickness[g]):
+                alpha = reference_alpha(splats, h, camera)[int(v), int(u)]
+                light *= 1 - alpha if alpha >= 1 / 255 else 1.0
+        found[g] = light if light >= LEAST_OPEN else 0.0
+    return found
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_openness_is_that_of_the_definition(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    xyz = random.uniform([-1.5, -1.2, 0.5], [1.5, 1.2, 5], (150, 3))
+    splats = gaussians(xyz, random.uniform(0.01, 0.15, 150), random.uniform(0.3, 0.95))
+    thickness = random.uniform(0, 0.3, 150).astype(np.float32)
+    found, u, v = openness(splats, CAMERA, NEAR, thickness)
+    expected = reference_openness(splats, CAMERA, thickness)
+    np.testing.assert_allclose(found, expected, atol=2e-5)
+    assert (expected > 0.5).any()
+    assert (expected[(found > 0) | (expected > 0)] < 0.5).any(), "the scene has points that are partly hidden"
+    uv = CAMERA.project(splats.xyz)[0]
+    np.testing.assert_allclose(np.stack([u, v], axis=1)[found > 0], uv[found > 0], atol=1e-4)
+
+
+def test_points_of_one_surface_do_not_hide_each_other() -> None:
+    line = np.linspace(-0.3, 0.3, 12)
+    x, y, z = np.meshgrid(line, line, [2.0, 2.05, 2.1])
+    layers = gaussians(np.stack([x, y, z], axis=-1).reshape(-1, 3), 0.05)
+    thick = openness(layers, CAMERA, NEAR, np.full(len(layers), 0.2, np.float32))[0]
+    thin = openness(layers, CAMERA, NEAR, np.full(len(layers), 0.01, np.float32))[0]
+    np.testing.assert_array_equal(thick, 1)
+    assert (thin == 0).sum() > len(layers) / 3
+
+
+def test_votes_go_to_the_masks_at_and_around_the_pixel() -> None:
+    splats = gaussians(np.array([[0.0, 0, 2], [0.52, 0, 2], [-2.5, 0, 2]]), 0.01)  # middle, on the edge, outside
+    ids = np.full((40, 48), -1, np.int32)
+    ids[:, 24:39] = 0
+    ids[:, 39:] = 1
+    seen = sightings(splats, CAMERA, ids, 2, NEAR, np.ones(3, np.float32))
+    votes = seen.rows.toarray()
+    np.testing.assert_allclose(votes.sum(axis=0), [1, 1, 0], atol=1e-6)
+    np.testing.assert_array_equal(seen.openness.toarray()[0], [1, 1, 0])
+    u = CAMERA.project(splats.xyz)[0][1, 0]
+    around = np.floor(u + EDGE_PX * np.cos(np.arange(8) * np.pi / 4)) >= 39
+    np.testing.assert_allclose(votes[1, 1], (1 - RING_SHARE) * (u >= 39) + RING_SHARE * around.mean(), atol=1e-6)
+    assert 0 < votes[1, 1] < 1
+    assert votes[2, 0] > 0, "left of the middle point lies no mask"
+
+
+def test_order_of_points_and_who_is_asked_change_nothing() -> None:
+    random = np.random.default_rng(1)
+    xyz = random.uniform([-1.5, -1.2, 0.5], [1.5, 1.2, 5], (400, 3)).astype(np.float32)
+    splats, thickness = gaussians(xyz, 0.06), np.full(400, 0.1, np.float32)
+    ids = random.integers(-1, 3, (40, 48)).astype(np.int32)
+    rows = sightings(splats, CAMERA, ids, 3, NEAR, thickness).rows.toarray()
+    order = random.permutation(400)
+    shuffled = sightings(gaussians(xyz[order], 0.06), CAMERA, ids, 3, NEAR, thickness).rows.toarray()
+    np.testing.assert_array_equal(shuffled, rows[:, order])
+    asked = random.random(400) < 0.3
+    some = sightings(splats, CAMERA, ids, 3, NEAR, thickness, asked).rows.toarray()
+    np.testing.assert_array_equal(some[:, asked], rows[:, asked])
+    assert not some[:, ~asked].any()
+
+
+def test_unit_of_length_changes_nothing() -> None:
+    random = np.random.default_rng(2)
+    xyz = random.uniform([-1.5, -1.2, 0.5], [1.5, 1.2, 5], (300, 3)).astype(np.float32)
+    thickness = np.full(300, 0.1, np.float32)
+    found = openness(gaussians(xyz, 0.06), CAMERA, NEAR, thickness)[0]
+    for unit in (2.0**10, 2.0**-10):
+        same = openness(gaussians(xyz * unit, 0.06 * unit), CAMERA, NEAR * unit, thickness * np.float32(unit))[0]
+        np.testing.assert_allclose(same, found, atol=1e-6)
+
+
+def test_nothing_in_the_image_is_no_error() -> None:
+    ids = np.zeros((40, 48), np.int32)
+    behind = gaussians(np.array([[0.0, 0, -2]]), 0.1)
+    for splats in (behind, gaussians(np.zeros((0, 3)), 0.1)):
+        seen = sightings(splats, CAMERA, ids, 1, NEAR, np.ones(len(splats), np.float32))
+        assert (seen.rows.shape, seen.rows.nnz, seen.openness.nnz) == ((2, len(splats)), 0, 0)
+    other = replace(CAMERA, width=17, height=1)  # a tile and a bit, one row
+    one = sightings(gaussians(np.array([[0.0, -0.65, 2]]), 0.1), other, ids[:1, :17], 1, NEAR, np.ones(1, np.float32))
+    assert one.rows.shape == (2, 1)
