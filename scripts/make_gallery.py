@@ -1,4 +1,4 @@
-"""docs/gallery.md and its pictures: the numbered examples, run on the demo room, each with its code.
+"""docs/gallery.md and its pictures: the numbered examples, run on the demo room.
 
     python scripts/make_gallery.py [--scene out/demo/room.ogpc]     # without a scene the demo is run first
 
@@ -102,7 +102,7 @@ def run(exhibit: Exhibit, scene: Path, work: Path) -> None:
 
 
 def page() -> str:
-    """The page's text: a picture, what is seen, and the code, an example."""
+    """The page's text: for each example its picture, what is seen in it, and a link to its code."""
     parts = ["# Gallery\n\nThe numbered examples on the demo room, made by `python scripts/make_gallery.py`.\n"]
     for exhibit in EXHIBITS:
         code = (ROOT / "examples" / f"{exhibit.example}.py").read_text()
@@ -111,9 +111,7 @@ def page() -> str:
         parts += [
             f"![{exhibit.seen}](gallery/{exhibit.example[:2]}_{Path(name).stem}.jpg)" for name in exhibit.pictures
         ]
-        body = code[code.index('"""', 3) + 3 :].strip()
-        parts.append(f"\n{exhibit.seen}\n\n<details><summary>{exhibit.example}.py</summary>\n")
-        parts.append(f"```python\n{body}\n```\n\n</details>\n")
+        parts.append(f"\n{exhibit.seen} [{exhibit.example}.py](../examples/{exhibit.example}.py)\n")
     return "\n".join(parts)
 
 

@@ -45,6 +45,14 @@ MUTATIONS = (
         "near plane from the farthest point", "rendering/geometry.py",
         "np.median(front)) if len(front)", "np.max(front)) if len(front)", ("test_geometry.py",),
     ),
+    Mutation(
+        "layers of one surface hide each other", "rendering/sightings.py",
+        "depth < surface[q]", "depth < splats[point[q]].depth", ("test_sightings.py",),
+    ),
+    Mutation(
+        "labels judged by the views that they were made from", "fitting/held_out.py",
+        "judge[1 - half]", "judge[half]", ("test_held_out.py",),
+    ),
     # Scene, frames.
     Mutation(
         "projection with y upwards", "scene.py",

@@ -67,3 +67,14 @@ def test_agreement_by_hand() -> None:
     table = MaskTable(weights, outside, csr_array((1, 4)), np.zeros(2, np.int32), np.ones(2, np.int32), np.ones((2, 1)))
     assert agreement(table, np.array([0, 0, 1, 1], np.int32), 2) == pytest.approx((2 * 1 + 1 * 0.5) / 3)
     assert agreement(table, np.array([-1, -1, -1, -1], np.int32), 0) == 0
+
+
+def test_labels_are_judged_by_views_that_they_were_not_made_from(scene: Scene) -> None:
+    """Every other view's masks lie somewhere else: each half agrees with itself, and not with the other."""
+    views = sorted(scene.views, key=lambda view: view.name)
+    moved = [
+        replace(view, masks=np.roll(view.mask_map(), view.camera.width // 2, axis=1)) if index % 2 else view
+        for index, view in enumerate(views)
+    ]
+    honest, contradicted = chosen(scene), chosen(replace(scene, views=tuple(moved)))
+    assert max(contradicted.agreements.values()) < 0.5 * max(honest.agreements.values())
