@@ -384,7 +384,7 @@ def test_recorded_captures_keep_their_labels_and_give_absent_words_hardly_a_poin
     related = unit(unit(words["lvis_text"]) - middle) @ unit(unit(asked.vectors[present]) - middle).T
     pool = words["lvis_text"][related.max(axis=1) < 0.5]
     called = []
-    for seed in range(10):
+    for seed in range(60):  # of so few instances one word that fits is a fifth of all points: few draws say little
         rows = np.random.default_rng(seed).choice(len(pool), 50, replace=False)
         absent = {str(row): pool[row] for row in rows}
         assert (og.segment(bare, absent).labels[of_instance] >= 0).all()
