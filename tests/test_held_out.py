@@ -60,6 +60,10 @@ def test_too_few_views_to_hold_some_out(scene: Scene) -> None:
     assert any(entry["key"] == "choice of scale" for entry in cloud.provenance["left_out"])
 
 
+def test_a_size_that_is_given_is_taken(scene: Scene) -> None:
+    assert chosen(scene, FitSettings(geometry=GeometrySettings(scales=(0.3,)))).scale == 0.3
+
+
 def test_agreement_by_hand() -> None:
     """Two masks of one view over four points: the first is instance 0 exactly, the second half of instance 1."""
     weights = csr_array(np.array([[1, 1, 0, 0], [0, 0, 1, 0]], np.float32))

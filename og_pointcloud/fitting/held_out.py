@@ -55,10 +55,12 @@ def choose_scale(
     all points hide others. Does not depend on the order of views or points.
     """
     geometry = settings.geometry
+    if len(geometry.scales) == 1:
+        return ScaleChoice(geometry.scales[0], {})
     masked = sorted((view for view in views if view.mask_count), key=lambda view: view.name)
     spread = np.linspace(0, len(masked) - 1, min(geometry.held_out_views, len(masked))).round().astype(int)
     chosen = [masked[index] for index in np.unique(spread)]
-    if len(chosen) < FEWEST_VIEWS or len(geometry.scales) < 2:
+    if len(chosen) < FEWEST_VIEWS:
         return ScaleChoice(geometry.start_scale, {})
     sample = sample_of_points(points.xyz, geometry.held_out_points)
     around = neighbourhood(points.xyz[sample], geometry)
