@@ -197,6 +197,7 @@ def test_product_equals_scipy() -> None:
     np.testing.assert_allclose(ours, matrix.astype(np.float64) @ dense.astype(np.float64), rtol=1e-12, atol=1e-14)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "settings",
     [

@@ -472,6 +472,7 @@ def test_images_of_every_kind(tmp_path, encode):
     assert (found & thing).sum() / (found | thing).sum() > 0.7
 
 
+@pytest.mark.slow
 def test_a_large_image_is_shrunk_and_its_camera_with_it(tmp_path):
     make_capture(tmp_path / "c", 1, lambda *_: plain(0, scenery(size=(HEIGHT * 120, WIDTH * 120))))
     make_masks(tmp_path / "c", ALONE, say=silent)

@@ -321,6 +321,7 @@ def test_look_at_puts_the_target_in_the_middle_and_up_up():
         og3.look_at((0, 0, 1), (0, 0, 0))
 
 
+@pytest.mark.slow
 @needs_driver
 def test_painted_points_are_drawn_in_their_exact_colours(tmp_path):
     origin = np.array([1e6, -4e6, 300.0])

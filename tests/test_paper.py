@@ -43,6 +43,7 @@ def balls(tiny_capture: TinyCapture) -> Balls:
     return Balls(prepare(scene).surface.gaussians, scene.views, tiny_capture.object_ids)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 def test_the_printed_losses_are_those_of_dense_pixels(balls: Balls, dtype: torch.dtype) -> None:
     """Value and gradient of Eq. 1 and 2 over all views, every pixel of a mask counted, pair by pair."""
