@@ -6,6 +6,7 @@ import hashlib
 import json
 import logging
 import shutil
+from pathlib import Path
 
 import numpy as np
 import onnx
@@ -274,3 +275,21 @@ def test_a_fetched_model_is_found_by_its_name(model_folder, tmp_path, capsys, mo
     assert main(["models"]) == 0
     printed = capsys.readouterr().out
     assert SPACE in printed
+
+
+def test_a_folder_that_cannot_be_replaced_stays(tmp_path, monkeypatch):
+    from og_pointcloud_export.encoders import _write_folder
+
+    folder, rename = tmp_path / "encoder", Path.rename
+    _write_folder(folder, {"model.onnx": b"old"}, {"model.onnx"})
+
+    def fail(path, target):
+        if path.name == "new":
+            raise OSError("the disk is gone")
+        return rename(path, target)
+
+    monkeypatch.setattr(Path, "rename", fail)
+    with pytest.raises(OSError, match="the disk is gone"):
+        _write_folder(folder, {"model.onnx": b"new"}, {"model.onnx"})
+    assert (folder / "model.onnx").read_bytes() == b"old"
+    assert list(tmp_path.iterdir()) == [folder]

@@ -377,6 +377,12 @@ def _write_folder(folder: Path, files: Mapping[str, bytes], known: Collection[st
         new.mkdir()
         for name, data in files.items():
             (new / name).write_bytes(data)
+        old = Path(temporary) / "old"
         if folder.exists():
-            folder.rename(Path(temporary) / "old")
-        new.rename(folder)
+            folder.rename(old)
+        try:
+            new.rename(folder)
+        except BaseException:
+            if old.exists():  # else it would go with the temporary folder
+                old.rename(folder)
+            raise
