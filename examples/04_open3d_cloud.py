@@ -1,6 +1,6 @@
-"""An Open3D cloud in, the same cloud painted by labels out, and a picture of it.
+"""An Open3D cloud in, the same cloud painted by labels out.
 
-python examples/04_open3d_cloud.py kitchen.ogpc points.ply --labels chair,table -o painted.png
+python examples/04_open3d_cloud.py kitchen.ogpc points.ply --labels chair,table -o painted.ply
 """
 
 import argparse
@@ -13,7 +13,7 @@ parser = argparse.ArgumentParser(description="An Open3D cloud in, the same cloud
 parser.add_argument("scene", metavar="S.ogpc", help="what `og-pointcloud fit` wrote")
 parser.add_argument("cloud", metavar="CLOUD", help="a cloud of the same place, in the scene's frame")
 parser.add_argument("--labels", required=True, metavar="A,B,C")
-parser.add_argument("-o", "--output", type=Path, default=Path("painted.png"), metavar="P.png")
+parser.add_argument("-o", "--output", type=Path, default=Path("painted.ply"), metavar="P.ply")
 arguments = parser.parse_args()
 
 cloud = og3.read(arguments.cloud)  # where Open3D would return an empty cloud, this says why
@@ -25,5 +25,5 @@ first = result.names[0]
 mine = thinned.select_by_mask(thinned.point["og_label"].flatten() == 0)
 print(f"{result.counts()}; {len(mine.point['positions'])} voxels of {first}")
 
-o3d.t.io.write_point_cloud(arguments.output.with_suffix(".ply"), painted)
-print(f"wrote {og3.draw_png(arguments.output, painted)}")
+o3d.t.io.write_point_cloud(arguments.output, painted)
+print(f"wrote {arguments.output}; o3d.visualization.draw(painted) shows it")

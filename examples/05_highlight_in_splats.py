@@ -1,32 +1,49 @@
-"""A word highlighted in a rendering of 3D Gaussians. Needs Open3D 0.20.
+"""A word highlighted in a rendering of 3D Gaussians.
 
-python examples/05_highlight_in_splats.py kitchen.ogpc kitchen_3dgs.ply mug -o mug.png --eye 2,-2,2 --target 0,0,0.5
+python examples/05_highlight_in_splats.py kitchen.ogpc kitchen_3dgs.ply mug -o mug.png --eye=2,-2,2 --target=0,0,0.5
 """
 
 import argparse
 from pathlib import Path
 
-import og_pointcloud_open3d as og3
+import cv2
+import numpy as np
 
 import og_pointcloud as og
+from og_pointcloud.fitting.mask_table import Gaussians, render
+from og_pointcloud.formats.colors import LUMINANCE
 
 
-def numbers(text: str) -> list[float]:
+def numbers(text: str) -> np.ndarray:
     """x,y,z as three numbers."""
-    return [float(part) for part in text.split(",")]
+    return np.array([float(part) for part in text.split(",")])
 
 
 parser = argparse.ArgumentParser(description="A word highlighted in a rendering of 3D Gaussians.")
 parser.add_argument("scene", metavar="S.ogpc", help="what `og-pointcloud fit` wrote")
 parser.add_argument("splats", metavar="SPLATS.ply", help="a 3DGS file of the same place")
 parser.add_argument("word", metavar="WORD")
-parser.add_argument("--eye", type=numbers, metavar="X,Y,Z", help="where to look from; left out: obliquely from above")
-parser.add_argument("--target", type=numbers, default=[0.0, 0.0, 0.0], metavar="X,Y,Z", help="where to look at")
+parser.add_argument("--eye", type=numbers, required=True, metavar="X,Y,Z", help="where to look from")
+parser.add_argument("--target", type=numbers, required=True, metavar="X,Y,Z", help="where to look at")
 parser.add_argument("-o", "--output", type=Path, default=Path("highlight.png"), metavar="P.png")
 arguments = parser.parse_args()
 
-scene = og.load(arguments.scene)
-print(og.select(scene, arguments.word))
-camera = og3.look_at(arguments.eye, arguments.target, size=(640, 480)) if arguments.eye else None
-picture = og3.highlight_png(arguments.output, arguments.splats, arguments.word, scene, camera=camera)
-print(f"wrote {picture}")
+scene, splats = og.load(arguments.scene), og.read_points(arguments.splats)
+selection = og.select(scene, arguments.word)
+print(selection)
+
+# What the word means turns red, all else fades to light grey.
+found = np.isin(scene.instances_at(splats.xyz_world), selection.instances)
+rgb = np.asarray(splats.rgb, np.float32)
+pale = 150 + 0.35 * (rgb @ LUMINANCE)[:, None].repeat(3, axis=1)
+colors = np.where(found[:, None], 0.4 * rgb + 0.6 * np.array([230, 40, 60]), pale).astype(np.float32)
+
+forward = (arguments.target - arguments.eye) / np.linalg.norm(arguments.target - arguments.eye)
+right = np.cross(forward, [0, 0, 1]) / np.linalg.norm(forward[:2])
+rotation = np.stack([right, np.cross(forward, right), forward])
+world_to_camera = np.vstack([np.column_stack([rotation, -rotation @ arguments.eye]), [0, 0, 0, 1]])
+camera = og.in_world(og.Camera(640, 480, 420, 420, 320, 240, world_to_camera), -splats.origin)
+image, covered = render(Gaussians.from_points(splats), colors, camera, near=0.1)
+picture = np.clip(image + 255 * (1 - covered[..., None]), 0, 255).astype(np.uint8)
+cv2.imwrite(str(arguments.output), picture[:, :, ::-1])
+print(f"wrote {arguments.output}")

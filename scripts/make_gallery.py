@@ -23,12 +23,11 @@ ROOT = Path(__file__).parents[1]
 GALLERY = ROOT / "docs" / "gallery"
 WIDTH = 1000
 QUALITY = 82
-LABELS = "sofa,table,chair,bed,shelf,lamp"
 
 
 @dataclass(frozen=True)
 class Exhibit:
-    """An example, its arguments ({scene}, {cloud} and {out} are filled in), and the pictures of it that are shown."""
+    """An example, its arguments ({scene}, {splats} and {out} are filled in), and the pictures of it that are shown."""
 
     example: str
     arguments: tuple[str, ...]
@@ -40,10 +39,6 @@ EXHIBITS = (
     Exhibit("01_label_a_cloud", ("{scene}", "-o", "{out}"), ("labels.png",), "The room by words."),
     Exhibit("02_instances_and_boxes", ("{scene}", "-o", "{out}"), ("instances.png",), "Objects, and boxes."),
     Exhibit("03_click_query", ("{scene}", "-o", "{out}"), ("before.png", "after.png"), "Before and after a click."),
-    Exhibit(
-        "04_open3d_cloud", ("{scene}", "{cloud}", "--labels", LABELS, "-o", "{out}/painted.png"), ("painted.png",),
-        "An Open3D cloud, painted.",
-    ),
     Exhibit(
         "05_highlight_in_splats",
         ("{scene}", "{splats}", "chair", "--eye=-1.7,-1.5,1.9", "--target=0.1,0.1,0.4", "-o", "{out}/chairs.png"),
@@ -89,7 +84,7 @@ def run(exhibit: Exhibit, scene: Path, work: Path) -> None:
     out = work / exhibit.example
     out.mkdir(exist_ok=True)
     splats = work / "08_edit_a_scene" / "before.ply"
-    places = {"scene": scene, "cloud": splats, "splats": splats, "out": out}
+    places = {"scene": scene, "splats": splats, "out": out}
     arguments = [argument.format(**places) for argument in exhibit.arguments]
     subprocess.run([sys.executable, str(ROOT / "examples" / f"{exhibit.example}.py"), *arguments], check=True)
     for name in exhibit.pictures:

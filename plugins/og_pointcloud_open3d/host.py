@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import importlib
-import importlib.util
 import re
 from typing import Any
 
 from og_pointcloud.errors import MissingExtraError, OgPointcloudError
 
-__all__ = ["OLDEST", "WITH_SPLATS", "open3d", "require_version"]
+__all__ = ["OLDEST", "open3d"]
 
 OLDEST = (0, 19)
-WITH_SPLATS = (0, 20)
-"""First version whose renderer knows Gaussians."""
 DEBIAN_LIBRARIES = "libusb-1.0-0 libgl1 libegl1 libx11-6 libgomp1"
 
 
@@ -28,15 +25,9 @@ def open3d() -> Any:
             f"Open3D is installed but does not load ({str(error).splitlines()[0]}): install the system libraries it "
             f"needs, on Debian and Ubuntu: apt-get install {DEBIAN_LIBRARIES}"
         ) from None
-    require_version(module, OLDEST, "this plugin")
-    return module
-
-
-def require_version(module: Any, oldest: tuple[int, int], what: str) -> None:
-    """OgPointcloudError where Open3D is older."""
-    numbers = re.findall(r"\d+", module.__version__)[:2]
-    if tuple(map(int, numbers)) < oldest:
+    if tuple(map(int, re.findall(r"\d+", module.__version__)[:2])) < OLDEST:
+        oldest = "{}.{}".format(*OLDEST)
         raise OgPointcloudError(
-            f"Open3D is {module.__version__}; {what} needs {oldest[0]}.{oldest[1]} or later: "
-            f"pip install 'open3d>={oldest[0]}.{oldest[1]}'"
+            f"Open3D is {module.__version__}; this plugin needs {oldest} or later: pip install 'open3d>={oldest}'"
         )
+    return module
