@@ -20,7 +20,7 @@ import og_pointcloud as og
 from og_pointcloud.ask.choosing import Chooser, Reason
 from og_pointcloud.cli import main
 from og_pointcloud.cloud import BACKGROUND, UNOBSERVED, Vocabulary
-from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError
+from og_pointcloud.errors import FeatureSpaceError
 from og_pointcloud.evaluate.truth import read_truth
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
@@ -130,39 +130,6 @@ def test_the_chooser_is_made_once_and_shared(scene, cloud):
     assert og.segment(cloud, SHOWN).calibrated is True
 
 
-def test_negatives_compete_and_mean_unknown(scene, made):
-    alone = og.segment(scene, SHOWN[:4])
-    against = og.segment(scene, SHOWN[:4], negatives=[SHOWN[3], "absent 1"])
-    third = alone.labels == 3
-    assert third.any()
-    assert set(against.reasons[third]) == {Reason.NONE_FITS}
-    assert (against.labels[~third] == alone.labels[~third]).all()
-    by_vector = og.segment(scene, SHOWN[:4], negatives={"x": 9 * made.texts[3], "y": made.texts[11]})
-    assert (by_vector.labels == against.labels).all()
-    ask = og.Segmenter(scene, SHOWN[:4], negatives=["absent 1", SHOWN[3]])
-    assert (
-        ask(scene.xyz).reasons == og.segment(scene.xyz, SHOWN[:4], scene, negatives=[SHOWN[3], "absent 1"]).reasons
-    ).all()
-    with pytest.raises(OgPointcloudError, match="0 labels are given"):
-        og.segment(scene, SHOWN[:4], negatives=[])
-
-
-def test_without_a_bank_a_negative_wins_where_its_cosine_is_higher(plain, made):
-    cosines = unit(made.table.descriptors) @ unit(made.texts[[0, 1, 2, 3, 6, 11]]).T
-    of_instance = np.full((9, 6), -np.inf)
-    np.maximum.at(of_instance, OWNERS, cosines)
-    loses = of_instance[:, 4:].max(axis=1) > of_instance[:, :4].max(axis=1)
-    assert 0 < loses.sum() < 6
-    alone = og.segment(plain, SHOWN[:4])
-    result = og.segment(plain, SHOWN[:4], negatives=[SHOWN[6], "absent 1"])
-    lost = loses[result.instances] & (result.instances >= 0)
-    assert not result.calibrated
-    assert set(result.reasons[lost]) == {Reason.NONE_FITS}
-    assert (result.scores[lost] == 0).all()
-    for key in ("labels", "scores", "reasons"):
-        np.testing.assert_array_equal(getattr(result, key)[~lost], getattr(alone, key)[~lost])
-
-
 def test_threads_share_a_scene_from_its_first_question(path):
     scene = og.load(path)  # nothing of it has been made yet
     frames = [queries(scene.cloud, 100, seed).astype(np.float64) for seed in range(4)]
@@ -212,8 +179,6 @@ def test_vectors_that_cannot_be_judged(scene):
         og.segment(scene, {"a": np.zeros(64)})
     with pytest.raises(FeatureSpaceError, match=rf"label vectors are of .*\(width 3\).*'{SPACE}' \(width 64\)"):
         og.segment(scene, {"a": np.ones(3)})
-    with pytest.raises(FeatureSpaceError, match=r"negative vectors are of .*\(width 3\); expected .*\(width 64\)"):
-        og.segment(scene, SHOWN, negatives={"a": np.ones(3)})
 
 
 @pytest.mark.parametrize(
@@ -330,8 +295,6 @@ def test_segment_counts_reasons_and_names_the_cure(path, plain, tmp_path, capsys
     assert saved["calibrated"]
     reasons = np.bincount(saved["reasons"], minlength=len(Reason))
     assert f"unknown: {reasons[Reason.NONE_FITS]:,} like none of these labels, {reasons[2]:,} of instances" in stdout
-    negatives = run(capsys, "segment", path, "--labels", SHOWN[0], "--negatives", SHOWN[0], "--json")[1]
-    assert json.loads(negatives)["counts"] == {SHOWN[0]: 0}
     bare = write_bundle(plain.cloud, tmp_path / "bare scene.ogpc")
     report = json.loads(run(capsys, "segment", bare, "--labels", SHOWN[0], "--json")[1])
     assert report["calibrated"] is False

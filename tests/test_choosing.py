@@ -177,15 +177,6 @@ def test_the_best_of_several_descriptors_counts_for_labels_and_bank_alike():
     assert abs(made.chooser._bank_evidence.mean(axis=1)).max() < 1e-3
 
 
-def test_negatives_take_what_is_theirs():
-    made = Made()
-    free = made.chooser.choose(made.texts[:2])
-    held = made.chooser.choose(made.texts[:2], negatives=made.texts[:1])
-    assert free.labels[0] == 0
-    assert held.table[0, 0] == pytest.approx(0.5, abs=0.01)
-    assert held.table[1, 1] == pytest.approx(free.table[1, 1], abs=1e-3)
-
-
 def test_points_say_why_they_have_no_label():
     made = Made()
     table = replace(
@@ -249,8 +240,6 @@ def test_widths_must_agree():
         made.chooser.choose(np.ones((2, 3)))
     with pytest.raises(FeatureSpaceError, match=r"bank.s vectors are of .*\(width 16\)"):
         Chooser(made.table, WordBank(unit_rows(60, 16)))
-    with pytest.raises(FeatureSpaceError, match=r"negative vectors are of .*\(width 3\)"):
-        made.chooser.choose(made.texts[:2], negatives=np.ones((2, 3)))
     with pytest.raises(FeatureSpaceError, match=r"shape \(64,\); expected \(count, width\)"):
         made.chooser.choose(made.texts[0])
     with pytest.raises(FeatureSpaceError, match=r"word bank of 49 words; expected at least 50"):
@@ -275,13 +264,6 @@ def test_without_a_bank_the_largest_cosine_is_called_and_no_probability_claimed(
     np.testing.assert_array_equal(choice.labels, cosines.argmax(axis=1))
     assert np.isnan(choice.probability).all()
     assert np.isnan(choice.unknown).all()
-    judged = Chooser(made.table).choose(made.texts[:6], negatives=made.texts[50:54])
-    rivals = made.table.descriptors @ made.texts[50:54].T
-    # LERF's relevancy, literally: the least over the negatives of a softmax of two, with temperature 10.
-    pairs = np.exp(10 * cosines[:, :, None]) / (np.exp(10 * cosines[:, :, None]) + np.exp(10 * rivals[:, None, :]))
-    expected = pairs.min(axis=2)
-    np.testing.assert_allclose(judged.table, expected, atol=1e-6)
-    np.testing.assert_array_equal(judged.labels, np.where(expected.max(1) >= 0.5, expected.argmax(1), -1))
 
 
 def test_templates_narrow_what_prompts_scatter():

@@ -351,7 +351,6 @@ def test_a_carried_encoder_answers_whoever_asks_the_scene(path, encoder_folder):
     asks = (
         lambda: og.segment(scene, ["apple", "cat"]),
         lambda: og.Segmenter(scene, ["apple", "cat"]),
-        lambda: og.segment(scene, ["apple"], negatives=["cat"]),
         lambda: og.select(scene, "cat"),
         lambda: og.pick(scene, place).words(["cat"]),
         lambda: og.pick(path, place).words(["cat"]),
@@ -366,8 +365,8 @@ def test_a_carried_encoder_answers_whoever_asks_the_scene(path, encoder_folder):
     results = [ask() for ask in asks]
     cat = encoder_for(SPACE, carried_encoder(path))(["cat"])[0]
     assert (results[0].labels == og.segment(scene, {"apple": 10 * unit_rows(5)[0], "cat": cat}).labels).all()
-    assert results[4] == results[5] == og.pick(scene, place).words({"cat": cat})
-    assert len(results[6]) == len(scene.instances)
+    assert results[3] == results[4] == og.pick(scene, place).words({"cat": cat})
+    assert len(results[5]) == len(scene.instances)
 
 
 @pytest.mark.filterwarnings("ignore:none of")
@@ -381,8 +380,7 @@ def test_templates_encode_every_word_anew(path, encoder_folder):
         assert (ours.labels == theirs.labels).all()
         assert (ours.scores == theirs.scores).all()
     assert (ours.scores != og.segment(scene, list(WORDS)).scores).any()
-    ask = og.Segmenter(scene, list(WORDS), templates=templates, negatives={"x": np.ones(WIDTH)})
-    given = og.Segmenter(scene, vectors, negatives={"x": np.ones(WIDTH)})
+    ask, given = og.Segmenter(scene, list(WORDS), templates=templates), og.Segmenter(scene, vectors)
     assert (ask(scene.xyz).scores == given(scene.xyz).scores).all()
     with pytest.raises(OgPointcloudError, match="templates are given with vectors"):
         og.segment(scene, vectors, templates=templates)

@@ -36,9 +36,7 @@ from og_pointcloud.text.encoder import TextEncoder, cache_folder, check_template
 from og_pointcloud.text.everyday import everyday_words
 
 try:
-    import onnx
     import torch
-    from onnx import numpy_helper
 
     from og_pointcloud.masking.clip import TransformersModel, load_model, published_name
 except ImportError as error:
@@ -51,8 +49,6 @@ __all__ = ["PARITY_TEXTS", "export_image_encoder", "export_text_encoder", "write
 OPSET = 18
 TOLERANCE = 1e-5
 """Largest difference of a unit vector's entry from torch that is let through; float32 reaches about 1e-6."""
-INT8_COSINE = 0.99
-"""Smallest cosine of an int8 vector with its float32 one that is let through."""
 PARITY_TEXTS = (
     "", " ", "a", "chair", "a photo of a chair.", "red mug", "object", "things", "stuff", "texture",
     "fire extinguisher", "kitchen counter", "a wooden table with four legs, seen from above", "traffic light",
@@ -71,7 +67,6 @@ def export_text_encoder(
     *,
     feature_space: str | None = None,
     templates: Sequence[str] = ("{}",),
-    int8: bool = False,
 ) -> tuple[Path, dict[str, Any]]:
     """Write a model's text half as a folder, complete or not at all. Returns the folder, and its manifest.
 
@@ -81,7 +76,6 @@ def export_text_encoder(
         found by its feature space.
     feature_space: OWNER/MODEL, as scenes name it; None: what the model's configuration calls itself.
     templates: texts with {} where a name goes; their vectors' mean stands for the name.
-    int8: a quarter of the size. Refused where a cosine with float32 falls below 0.99.
     Raises OgPointcloudError; then nothing is written.
     """
     source = Path(source)
@@ -99,17 +93,14 @@ def export_text_encoder(
         "model_type": model.config.model_type,
     }
     folder = Path(output) if output is not None else cache_folder() / _folder_name(space)
-    return folder, write_text_encoder(folder, _TextTower(model).eval(), tokenizer, about, int8=int8)
+    return folder, write_text_encoder(folder, _TextTower(model).eval(), tokenizer, about)
 
 
-def write_text_encoder(
-    folder: Path, tower: Any, tokenizer: dict[str, Any], about: dict[str, Any], *, int8: bool = False
-) -> dict[str, Any]:
+def write_text_encoder(folder: Path, tower: Any, tokenizer: dict[str, Any], about: dict[str, Any]) -> dict[str, Any]:
     """Write a torch module as a text encoder if its graph gives the module's vectors. Returns the manifest.
 
     tower: tokens (B, T) int64 -> (B, D) unit rows; T is any length up to the context, or the context alone where
         about["pad_id"] is set. tokenizer: as in a tokenizer.json. about: the manifest's entries on the model.
-    int8, errors: as in ``export_text_encoder``.
     """
     context, pad_id = about["context_length"], about["pad_id"]
     example = torch.zeros((2, min(context, 7) if pad_id is None else context), dtype=torch.int64)
@@ -121,11 +112,6 @@ def write_text_encoder(
     held = {text_encoder.GRAPH: graph, text_encoder.TOKENIZER: json.dumps(tokenizer, ensure_ascii=False).encode()}
     encoder = TextEncoder(_with_manifest(about, held), str(folder))
     parity = _text_parity(tower, encoder)
-    if int8:
-        held[text_encoder.GRAPH], about["precision"] = _quantized(graph), "int8"
-        small = TextEncoder(_with_manifest(about, held), str(folder))
-        parity["int8"] = _accept_int8(small, encoder)
-        encoder = small
     held[text_encoder.WORD_BANK] = npy_bytes(encoder(everyday_words()).astype(np.float16))
     files = _with_manifest({**about, "parity": parity}, held)
     _write_folder(folder, files, known=text_encoder.ENCODER_FILES)
@@ -213,7 +199,7 @@ def _onnx_graph(tower: Any, example: torch.Tensor, given: str, answer: str, dime
 
 @contextmanager
 def _quietly() -> Any:
-    """torch.onnx.export and the quantiser tell of their own insides, as warnings and log lines."""
+    """torch.onnx.export tells of its own insides, as warnings and log lines."""
     names = ("torch.onnx", "onnxscript", "onnx_ir", "root")
     loggers = {logging.getLogger(name): logging.getLogger(name).level for name in names}
     with warnings.catch_warnings():
@@ -225,24 +211,6 @@ def _quietly() -> Any:
         finally:
             for logger, level in loggers.items():
                 logger.setLevel(level)
-
-
-def _quantized(graph: bytes) -> bytes:
-    """Matrices in 8 bits, a scale a column; activations as they come, a scale a run; embeddings in 8 bits.
-
-    Weights are unsigned: with signed ones, processors without VNNI saturate, and answers would differ.
-    """
-    from onnxruntime.quantization import QuantType, quantize_dynamic
-
-    model = onnx.load_from_string(graph)
-    del model.graph.value_info[:]  # shapes in between, which the quantiser changes without telling
-    with tempfile.TemporaryDirectory() as temporary, _quietly():
-        path = Path(temporary) / "int8.onnx"
-        quantize_dynamic(model, path, ["MatMul", "Gather"], per_channel=True, weight_type=QuantType.QUInt8)
-        model = onnx.load(path)
-    for constant in model.graph.initializer:  # as plain bytes, which is all that check_graph lets pass
-        constant.CopyFrom(numpy_helper.from_array(numpy_helper.to_array(constant), constant.name))
-    return model.SerializeToString()
 
 
 # Tokenizers
@@ -327,19 +295,6 @@ def _difference(got: NDArray[np.float32], expected: NDArray[np.float32]) -> dict
         )
     cosine = float((got.astype(np.float64) * expected).sum(axis=1).min())
     return {"max_abs_error": error, "min_cosine": cosine, "torch": torch.__version__}
-
-
-def _accept_int8(small: TextEncoder, exact: TextEncoder) -> dict[str, Any]:
-    """What int8 costs; OgPointcloudError where that is too much."""
-    names = [*everyday_words(), *filter(str.strip, PARITY_TEXTS)]
-    cosines = (small(names).astype(np.float64) * exact(names)).sum(axis=1)
-    worst = int(cosines.argmin())
-    if not cosines[worst] >= INT8_COSINE:
-        raise OgPointcloudError(
-            f"int8 turns the vector of '{names[worst]:.40}' to cosine {cosines[worst]:.4f}; expected at least "
-            f"{INT8_COSINE}: leave --int8 out"
-        )
-    return {"texts": len(names), "min_cosine": float(cosines[worst]), "mean_cosine": float(cosines.mean())}
 
 
 # Files

@@ -12,8 +12,7 @@ words are close to every image. So a score is read against what it would be by c
 
 No threshold is in cosines, none is tuned to a scene: the null distribution is the instance's own.
 
-Without a word bank the largest cosine wins; against negatives it is judged by LERF's relevancy (Kerr et al., LERF:
-Language Embedded Radiance Fields, ICCV 2023, Sec. 3.4).
+Without a word bank the largest cosine wins.
 """
 
 from __future__ import annotations
@@ -43,8 +42,6 @@ from og_pointcloud.settings import ChoosingSettings
 
 __all__ = ["Choice", "Chooser", "Reason"]
 
-RELEVANCY_TEMPERATURE = 10.0
-"""Factor of the cosines in LERF's pairwise softmax: of its released code, the paper gives none."""
 ROWS_AT_ONCE = 2048
 """Descriptors compared with all others at once."""
 
@@ -97,7 +94,7 @@ class Choice:
     reasons: (K,) int8, a ``Reason``.
     membership: (K,) float32, probability that a point with the instance's id is of it: of v views that agreed on the
         instance all said so, which makes (v + 1/2) / (v + 1) (Jeffreys' prior).
-    calibrated: false where there was no bank: probability is then LERF's relevancy, or NaN without negatives.
+    calibrated: false where there was no bank: probability and unknown are then NaN, evidence is the cosine.
     """
 
     labels: NDArray[np.int32]
@@ -187,23 +184,22 @@ class Chooser:
         self._bank_evidence = (best - self._best_middle) / self._best_spread
         self.sharpness = float(max(self.settings.sharpness, np.quantile(self._bank_evidence.max(axis=1), 0.75)))
 
-    def choose(self, texts: ArrayLike, negatives: ArrayLike | None = None) -> Choice:
+    def choose(self, texts: ArrayLike) -> Choice:
         """The label of each instance.
 
         texts: (L, D) one text vector a label, of any length, float16 to float64; a zero row fits nothing.
-        negatives: (M, D) texts that compete with the labels and mean "unknown".
         FeatureSpaceError for NaN or infinity, or another width than the descriptors'.
         """
         texts = finite_rows(texts, "label vectors")
-        others = np.zeros((0, texts.shape[1]), np.float32) if negatives is None else finite_rows(negatives, "negatives")
         self._require_width(texts, "label vectors")
-        self._require_width(others, "negative vectors")
         if len(self._descriptors) == 0 or len(texts) == 0:
             return self._nothing(len(texts))
         if self.bank is None:
-            return self._uncalibrated(texts, others)
+            cosines = self._best_descriptor(self._descriptors @ unit_rows(texts).T)
+            nothing = np.full(cosines.shape, np.nan)
+            return self._answer(cosines, nothing, nothing[:, 0])
         evidence = self._evidence(texts)
-        return self._answer(evidence, *self._posterior(evidence, self._evidence(others), texts))
+        return self._answer(evidence, *self._posterior(evidence, texts))
 
     def _require_width(self, vectors: NDArray[np.floating], what: str) -> None:
         self._space.require(FeatureSpace(UNKNOWN_SPACE, vectors.shape[1]), what)
@@ -222,7 +218,7 @@ class Chooser:
         return best_of_rows(scores, np.searchsorted(self._described, self._owner), len(self._described))
 
     def _posterior(
-        self, evidence: NDArray[np.floating], rival: NDArray[np.floating], texts: NDArray[np.float32]
+        self, evidence: NDArray[np.floating], texts: NDArray[np.float32]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Probability of each label and of none, (described, L) and (described,), float64.
 
@@ -235,8 +231,6 @@ class Chooser:
         log_words = np.log(max(len(first), self.settings.kinds))
         log_label = sharpness * evidence[:, first].astype(np.float64)
         log_none = self._log_none(texts) + log_words
-        if rival.shape[1]:
-            log_none = np.logaddexp(log_none, np.logaddexp.reduce(sharpness * rival.astype(np.float64), axis=1))
         top = np.maximum(log_none, log_label.max(axis=1))
         weight, none = np.exp(log_label - top[:, None]), np.exp(log_none - top)
         total = weight.sum(axis=1) + none
@@ -254,22 +248,12 @@ class Chooser:
         exponents = sharpness * self._bank_evidence[:, other].astype(np.float64)
         return np.maximum(by_chance, np.logaddexp.reduce(exponents, axis=1) - np.log(np.count_nonzero(other)))
 
-    def _uncalibrated(self, texts: NDArray[np.float32], negatives: NDArray[np.float32]) -> Choice:
-        """Without a bank: the largest cosine, judged by LERF's relevancy where there are negatives."""
-        best = self._best_descriptor(self._descriptors @ unit_rows(texts).T)
-        if len(negatives) == 0:
-            nothing = np.full(best.shape, np.nan)
-            return self._answer(best, nothing, nothing[:, 0])
-        rivals = self._best_descriptor(self._descriptors @ unit_rows(negatives).T)
-        table = _relevancy(best, rivals)
-        return self._answer(best, table, 1 - table.max(axis=1))
-
     def _answer(
         self, evidence: NDArray[np.floating], table: NDArray[np.floating], unknown: NDArray[np.floating]
     ) -> Choice:
         """Spread what is known of described instances over all of them."""
         answer = self._nothing(evidence.shape[1])
-        best = (evidence if np.isnan(table).all() else table).argmax(axis=1)
+        best = (evidence if self.bank is None else table).argmax(axis=1)
         fits = ~(unknown > 0.5) & (evidence[np.arange(len(best)), best] > -np.inf)
         rows = self._described
         answer.labels[rows] = np.where(fits, best, UNKNOWN)
@@ -309,16 +293,6 @@ def common_part(descriptors: NDArray[np.float32], same_look: float) -> NDArray[n
     weight = 1 / np.maximum(alike, 1)
     looks = weight.sum()
     return ((1 - 1 / looks) * (weight / looks) @ descriptors).astype(np.float32)
-
-
-def _relevancy(scores: NDArray[np.floating], rivals: NDArray[np.floating]) -> NDArray[np.float32]:
-    """LERF's relevancy in (0, 1): min over negatives n of exp(10 s) / (exp(10 s) + exp(10 n)), s and n cosines.
-
-    0.5: as close as the closest negative. scores: (rows, L). rivals: (rows, M).
-    """
-    # The minimum over negatives is that of the closest one.
-    margin = scores - rivals.max(axis=1, keepdims=True)
-    return (1 / (1 + np.exp(-RELEVANCY_TEMPERATURE * margin))).astype(np.float32)
 
 
 def _distinct(texts: NDArray[np.float32]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

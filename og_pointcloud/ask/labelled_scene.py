@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias, TypedDict
@@ -245,7 +245,6 @@ class SegmentOptions(TypedDict, total=False):
 
     text_features: TextFeatures
     templates: Sequence[str] | None
-    negatives: Labels
     max_distance: float | None
 
 
@@ -293,7 +292,6 @@ class Segmenter:
     text_features: a text-features .npz, or what ``read_text_features`` returned for it.
     templates: texts with ``{}`` ("a photo of a {}"), into which words are put before they are encoded; their vectors'
         mean counts. Left out: stored vectors, and the encoder's own templates for other words.
-    negatives: labels too, but points that they fit better are unknown.
     max_distance: points farther than this from the scene's cloud answer unknown; at most, and left out, its reach.
 
     >>> ask = og.Segmenter(cloud, ["desk", "chair"])  # of `LabelledCloud`'s example
@@ -310,19 +308,15 @@ class Segmenter:
         *,
         text_features: TextFeatures = None,
         templates: Sequence[str] | None = None,
-        negatives: Labels = None,
         max_distance: float | None = None,
     ) -> None:
         self.scene = scene = as_scene(scene)
         scene.check_distance(max_distance)
-        words, against = scene.words(labels, text_features, templates), None
-        if negatives is not None:
-            has_vectors = isinstance(negatives, (Mapping, Vocabulary))
-            against = scene.words(negatives, text_features, None if has_vectors else templates).vectors
+        words = scene.words(labels, text_features, templates)
         self.names = words.names
         """The labels, in the order of their numbers."""
         self._max_distance, self._warned = max_distance, False
-        self._choice = scene.chooser.choose(words.vectors, against)
+        self._choice = scene.chooser.choose(words.vectors)
 
     def __call__(self, points: Any, pose: ArrayLike | None = None) -> Segmentation:
         """points: (N, 3) world coordinates, or any cloud that ``segment`` takes; N may be 0.

@@ -38,7 +38,7 @@ class Segmentation:
         spacing, as one table cell speaks for all points in it.
     reasons: (N,) int8, why a point is unknown: a ``Reason``, 0 where it has a label.
     calibrated: whether the scene has a word bank to judge labels by. Without one the best label is answered, however
-        badly it fits: then nothing is unknown for Reason.NONE_FITS, unless negatives were asked against.
+        badly it fits: then nothing is unknown for Reason.NONE_FITS.
     certainty: (N,) float32, see there; looked up by ``certainty_at``, the scene's, when it is first read.
 
     >>> result = og.segment([[0, 0, 1], [9, 9, 9]], ["chair"], cloud)  # of `LabelledCloud`'s example
@@ -128,12 +128,6 @@ class Segmentation:
     def to_pointcloud2(self, frame_id: str = "map", stamp: Any = None) -> Any:
         """A sensor_msgs/PointCloud2 message with the labels in its fields. Needs the extra 'ros'."""
         return import_plugin("og_pointcloud_ros", "ros").to_pointcloud2(self, frame_id=frame_id, stamp=stamp)
-
-    def to_las(self) -> Any:
-        """A laspy LasData, laid out as ``save`` writes .las. Needs the extra 'las'."""
-        from og_pointcloud.formats.las import labelled_las
-
-        return labelled_las(self.xyz, self.colors, self.attributes, self.names)
 
     def save(self, path: str | os.PathLike[str]) -> Path:
         """Write the result, whole or not at all, as what the path's ending says.

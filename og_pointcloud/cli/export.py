@@ -35,9 +35,6 @@ def add(parser: Parser) -> None:
         "--template", action="append", metavar="TEXT",
         help="what a name is put into, such as 'a photo of a {}.'; several are averaged (default: {})",
     )  # fmt: skip
-    text.add_argument(
-        "--int8", action="store_true", help="a quarter of the size; refused where it turns a word's vector too far"
-    )
     image.add_argument(
         "--crops", choices=("context", "langsplat"), default="context",
         help="how masks are cut out unless a caller says otherwise (default: %(default)s)",
@@ -53,12 +50,9 @@ def run_text(arguments: argparse.Namespace) -> None:
     from og_pointcloud_export.encoders import export_text_encoder
 
     folder, manifest = export_text_encoder(
-        source, arguments.output, feature_space=feature_space, templates=arguments.template or ("{}",),
-        int8=arguments.int8,
-    )  # fmt: skip
+        source, arguments.output, feature_space=feature_space, templates=arguments.template or ("{}",)
+    )
     print_export(folder, manifest, "texts")
-    if int8 := manifest["parity"].get("int8"):
-        print(f"int8 and float32: cosine {int8['min_cosine']:.4f} at least, over {int8['texts']} texts")
     if arguments.output is not None:
         print(f"next: export OG_POINTCLOUD_MODELS='{folder.resolve()}'  # scenes of this feature space then find it")
 

@@ -36,7 +36,6 @@ def add(parser: Parser) -> None:
         "--template", action="append", metavar="TEXT",
         help="what names are put into, such as 'a photo of a {}'; several are averaged; needs the text encoder",
     )  # fmt: skip
-    parser.add_argument("--negatives", metavar="A,B,C", help="names too, but points that they fit better are unknown")
     parser.add_argument("--points", type=Path, metavar="CLOUD", help="points to label (default: those fitted)")
     add_output(
         parser, "-o", "--output", endings=SAVED_AS, metavar="OUT",
@@ -57,7 +56,6 @@ def run(arguments: argparse.Namespace) -> None:
             scene=scene,
             text_features=arguments.text_features,
             templates=arguments.template,
-            negatives=names_in(arguments.negatives),
         )
     if arguments.output:
         with timed(stages, "save"):
