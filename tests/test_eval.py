@@ -1,4 +1,4 @@
-"""``og-pointcloud eval capture`` and ``eval scannet`` from files to table, JSON and plot."""
+"""``og-pointcloud eval capture`` and ``eval scannet`` from files to table and JSON."""
 
 from __future__ import annotations
 
@@ -14,14 +14,11 @@ from scenes import NAMES, write_tiny_capture
 import og_pointcloud as og
 from og_pointcloud.cli import main
 from og_pointcloud.cloud import BACKGROUND, WordBank
-from og_pointcloud.evaluate.intervals import risk_coverage
-from og_pointcloud.evaluate.plots import plot_risk_coverage
 from og_pointcloud.evaluate.scannet import NAMES as NYU40
 from og_pointcloud.evaluate.scannet import score_scene
 from og_pointcloud.formats.ply import write_ply
 
 WALL, FLOOR, CHAIR = 1, 2, 5
-PNG = b"\x89PNG\r\n"
 
 
 # Captures -------------------------------------------------------------------------------------------------------
@@ -42,9 +39,8 @@ def fitted(tmp_path_factory) -> Path:
 
 
 def test_a_capture_is_scored_against_its_own_truth(fitted, tmp_path, capsys):
-    pytest.importorskip("matplotlib")
     command = ["eval", "capture", str(fitted / "tiny"), str(fitted / "S.ogpc")]
-    outputs = ["--json", str(tmp_path / "s.json"), "--plot", str(tmp_path / "r.png")]
+    outputs = ["--json", str(tmp_path / "s.json")]
     assert main([*command, "--against", str(fitted / "worse.ogpc"), *outputs]) == 0
     out = capsys.readouterr().out
     entry = json.loads((tmp_path / "s.json").read_text())["tiny"]
@@ -57,12 +53,11 @@ def test_a_capture_is_scored_against_its_own_truth(fitted, tmp_path, capsys):
     assert entry["labels"]["miou"] == entry["interval"]["mean"] > 0.8
     assert f"{100 * np.mean(hits):.1f}" in out
     assert entry["interval"]["low"] <= entry["interval"]["mean"] <= entry["interval"]["high"]
-    assert entry["instances"]["rand"] > 0.9
+    assert entry["rand"] > 0.9
     # The other lacks one ball of two: about half of the score, in every draw.
     less = entry["less_the_other"]
     assert less["mean"] == pytest.approx(hits[1] / 2)
     assert 0.3 < less["low"] < less["mean"] < less["high"]
-    assert (tmp_path / "r.png").read_bytes().startswith(PNG)
     assert "cubes of" in out
 
 
@@ -108,14 +103,6 @@ def test_a_score_of_nothing_is_null_in_json(fitted, tmp_path):
     assert entry["answered"]["miou"] is None
 
 
-def test_the_plot_takes_several_methods(tmp_path):
-    pytest.importorskip("matplotlib")
-    rng = np.random.default_rng(0)
-    curves = {name: risk_coverage(rng.random(50) < 0.8, rng.random(50)) for name in ("one", "two")}
-    path = plot_risk_coverage(curves, {"one": 0.9, "two": 1.0}, tmp_path / "r.png", "title")
-    assert path.read_bytes().startswith(PNG)
-
-
 # ScanNet --------------------------------------------------------------------------------------------------------
 
 
@@ -159,22 +146,18 @@ def command(scannet, *more):
 
 
 def test_scenes_are_asked_for_the_names_of_the_table(scannet, capsys):
-    pytest.importorskip("matplotlib")
-    outputs = ["--json", str(scannet / "s.json"), "--plot", str(scannet / "r.png")]
-    assert main(command(scannet, *outputs)) == 0
+    assert main(command(scannet, "--json", str(scannet / "s.json"))) == 0
     out = capsys.readouterr().out
     report = json.loads((scannet / "s.json").read_text())["19"]
-    # Scene 0: wall 2 of 2, chair 1 of 2. Scene 62: wall 1 of 2, floor 2 of 2; unknown as abstention 1 and 1.
+    # Scene 0: wall 2 of 2, chair 1 of 2. Scene 62: wall 1 of 2, floor 2 of 2; of its 4 one is unknown.
     assert report["scenes"]["scene0000_00"]["class_iou"] == {"1": 1.0, "5": 0.5}
     assert report["scenes"]["scene0062_00"]["class_iou"] == {"1": 0.5, "2": 1.0}
-    assert report["scenes"]["scene0062_00"]["answered_miou"] == 1
+    assert report["scenes"]["scene0062_00"]["unknown"] == 1 / 4
+    assert report["unknown"] == 1 / 8
     assert report["miou"] == pytest.approx(0.75)
     # Without a bank no instance may abstain: as asked and as forced are one.
     assert report["forced_miou"] == report["miou"]
-    # All cosines are 1, so the 7 answered points come together, one wrong; then the unknown one: (1/7) 7/8 + (2/8) 1/8.
-    assert report["risk_area"] == pytest.approx(1 / 8 + 1 / 32, abs=1e-6)
-    assert "risk area" in out
-    assert (scannet / "r.png").read_bytes().startswith(PNG)
+    assert "2 scenes, 2 of the 10 of the published table" in out
 
 
 def test_a_scene_that_abstains_is_also_scored_as_if_it_might_not(scannet, capsys):
@@ -192,74 +175,43 @@ def test_a_scene_that_abstains_is_also_scored_as_if_it_might_not(scannet, capsys
     assert "forced" in capsys.readouterr().out
 
 
-def test_points_that_are_surely_of_their_instance_come_first(scannet):
-    """Scene 0 says floor of a chair, its last point. Where that point is the least certain, it is answered last of the
-    seven: (1/7) 1/8 of the area, and (2/8) 1/8 for the unknown one. A file of its labels has the same mIoU."""
-    for file in (scannet / "p").glob("*.ogpc"):
-        certainty = np.array([255, 255, 255, 100 if file.stem == "scene0000_00" else 200], np.uint8)
-        og.write_bundle(replace(og.load(file).cloud, certainty=certainty), file)
-    assert main(command(scannet, "--json", str(scannet / "s.json"))) == 0
-    asked = json.loads((scannet / "s.json").read_text())["19"]
-    assert asked["risk_area"] == pytest.approx(1 / 7 / 8 + 2 / 8 / 8, abs=1e-6)
-    for file in (scannet / "p").glob("*.ogpc"):
-        words = [NYU40[class_id] for class_id in NYU40]
-        og.segment(np.arange(4)[:, None] * np.array([1.0, 0, 0]), words, file, text_features=scannet / "w.npz").save(
-            file.with_suffix(".npz")
-        )
-        file.unlink()
-    assert main(command(scannet, "--json", str(scannet / "s.json"))) == 0
-    assert json.loads((scannet / "s.json").read_text())["19"]["miou"] == asked["miou"]
-
-
-def test_names_that_are_no_class_are_wrong_answers(scannet):
-    names = np.array(["Wall", "floor", "unicorn"])  # the last is never said
-    np.savez(scannet / "p/scene0062_00.npz", labels=np.array([0, -1, 1, 1]), names=names)
-    (scannet / "p/scene0062_00.ogpc").unlink()
-    assert main(command(scannet, "--json", str(scannet / "s.json"))) == 0
-    report = json.loads((scannet / "s.json").read_text())["19"]
-    assert report["scenes"]["scene0062_00"]["class_iou"] == {"1": 0.0, "2": 1.0}
-    assert report["forced_miou"] is None  # of stored labels it is not known what else they might have said
-
-
 def test_scenes_without_a_point_of_the_task_are_left_out(scannet, capsys):
     """Bathtubs are among the 19 classes, not among the 10; nothing is where all scenes are of other things."""
-    write_labels(scannet / "other", "scene0000_00", np.zeros((4, 3)), [36, 36, 40, 0])
-    write_labels(scannet / "other", "scene0062_00", np.zeros((4, 3)), [WALL, WALL, 40, 0])
-    for scene, said in (("scene0000_00", "bathtub"), ("scene0062_00", "wall")):
-        (scannet / f"p/{scene}.ogpc").unlink()
-        np.savez(scannet / f"p/{scene}.npz", labels=np.array([0, -1, 0, 0]), names=np.array([said]))
-    folders = ["eval", "scannet", str(scannet / "other"), "--predictions", str(scannet / "p")]
-    assert main([*folders, "--json", str(scannet / "s.json"), "--against", str(scannet / "p")]) == 0
+    xyz = np.arange(4)[:, None] * np.array([1.0, 0, 0])
+    write_labels(scannet / "other", "scene0000_00", xyz, [36, 36, 40, 0])
+    write_labels(scannet / "other", "scene0062_00", xyz, [WALL, WALL, 40, 0])
+    folders = ["--predictions", str(scannet / "p"), "--text-features", str(scannet / "w.npz")]
+    folders = ["eval", "scannet", str(scannet / "other"), *folders]
+    assert main([*folders, "--json", str(scannet / "s.json")]) == 0
     report = json.loads((scannet / "s.json").read_text())
-    assert (report["19"]["miou"], report["10"]["miou"]) == (0.5, 0.5)  # 1 of 2 each
+    assert (report["19"]["miou"], report["10"]["miou"]) == (0.25, 0.5)  # bathtub 0 of 2; wall 1 of 2
     assert report["10"]["scenes"]["scene0000_00"] == {
-        "miou": None, "macc": None, "class_iou": {}, "points": 0, "answered_miou": None,
-        "answered_share": None,
+        "miou": None, "macc": None, "unknown": None, "points": 0, "class_iou": {},
     }  # fmt: skip
     assert report["10"]["interval"] == [0.5, 0.5]
     capsys.readouterr()
     assert main([*folders, "--scenes", "scene0000_00", "--json", str(scannet / "s.json")]) == 0
     ten = json.loads((scannet / "s.json").read_text(), parse_constant=lambda name: pytest.fail(name))["10"]
-    assert (ten["miou"], ten["flat_miou"], ten["risk_area"], ten["interval"]) == (None,) * 4
+    assert (ten["miou"], ten["forced_miou"], ten["unknown"], ten["interval"]) == (None,) * 4
     row = next(line for line in capsys.readouterr().out.splitlines() if line.startswith("10 classes"))
     assert set(row.split()[2:]) == {"-"}
 
 
-@pytest.mark.parametrize("ending", ["npz", "ogpc"])
-def test_an_empty_prediction_file_is_one_error(ending, scannet, capsys):
+def test_a_missing_scene_is_one_error(scannet, capsys):
+    assert main(command(scannet, "--scenes", "scene9999_00")) == 2
+    assert "has no labels of 'scene9999_00'" in capsys.readouterr().err
     (scannet / "p/scene0062_00.ogpc").unlink()
-    (scannet / f"p/scene0062_00.{ending}").write_bytes(b"")
+    assert main(command(scannet)) == 2
+    assert "has no scene0062_00.ogpc" in capsys.readouterr().err
+    assert main(command(scannet, "--scenes", "scene0000_00")) == 0
+
+
+def test_an_empty_prediction_file_is_one_error(scannet, capsys):
+    (scannet / "p/scene0062_00.ogpc").write_bytes(b"")
     assert main(command(scannet)) == 2
     captured = capsys.readouterr()
-    assert f"scene0062_00.{ending}" in captured.err
+    assert "scene0062_00.ogpc" in captured.err
     assert (captured.out, captured.err.count("\n")) == ("", 1)
-
-
-def test_predictions_of_no_points_are_one_error(scannet, capsys):
-    (scannet / "p/scene0062_00.ogpc").unlink()
-    np.savez(scannet / "p/scene0062_00.npz", labels=np.zeros(0, int), names=np.array(["wall"]))
-    assert main(command(scannet)) == 2
-    assert "labels are int64 (0,)" in capsys.readouterr().err
 
 
 def test_points_that_lie_in_one_place_count_each(scannet):
@@ -279,50 +231,6 @@ def test_answers_are_those_of_the_points_that_count():
     """Point 1 is transparent, point 2 of no class of the ten (a picture), point 4 of none at all."""
     truth, predicted = np.array([WALL, WALL, 11, CHAIR, 40, CHAIR]), np.array([WALL, WALL, 11, FLOOR, WALL, 0])
     opacity = np.array([1, 0.05, 1, 1, 1, 1])
-    score = score_scene(predicted, truth, 10, opacity, np.linspace(0, 1, 6))
-    assert score.correct.tolist() == [True, False, False]
-    assert score.confidence.tolist() == [0, pytest.approx(0.6), -np.inf]
-
-
-def test_two_methods_are_compared_over_scenes(scannet, capsys):
-    (scannet / "q").mkdir()
-    names = np.array(["wall", "floor", "chair"])
-    np.savez(scannet / "q/scene0000_00.npz", labels=np.array([0, 0, 2, 1]), names=names)
-    np.savez(scannet / "q/scene0062_00.npz", labels=np.array([-1, -1, 1, 1]), names=names)
-    outputs = ["--json", str(scannet / "s.json")]
-    assert main(command(scannet, "--against", str(scannet / "q"), *outputs)) == 0
-    # The same in scene 0; in scene 62 a wall less, 1/4 of a point. Draws of two scenes hold it never, once or twice.
-    for task in ("19", "15", "10"):
-        less = json.loads((scannet / "s.json").read_text())[task]["less_the_other"]
-        assert less == pytest.approx([1 / 8, 0, 1 / 4])
-    assert "+12.5 (+0.0 to +25.0)" in capsys.readouterr().out
-
-
-def test_labels_without_scores_have_no_curve(scannet, capsys):
-    names = np.array(["wall", "floor", "chair"])
-    np.savez(scannet / "p/scene0062_00.npz", labels=np.array([0, 0, 1, 1]), names=names)
-    (scannet / "p/scene0062_00.ogpc").unlink()
-    assert main(command(scannet, "--json", str(scannet / "s.json"))) == 0
-    assert json.loads((scannet / "s.json").read_text())["19"]["risk_area"] is None
-    pytest.importorskip("matplotlib")
-    assert main(command(scannet, "--plot", str(scannet / "r.png"))) == 2
-    assert "no prediction has scores" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    ("entries", "text"),
-    [
-        ({"labels": np.zeros(4, int)}, "lacks 'names'; expected labels and names"),
-        ({"labels": np.zeros(4), "names": np.array(["wall"])}, "labels are float64 (4,)"),
-        ({"labels": np.zeros(4, int), "names": np.array([1])}, "names int64 (1,)"),
-        ({"labels": np.zeros(4, int), "names": np.array(["a", None], object)}, "cannot be read as an .npz"),
-        ({"labels": np.full(4, 2**32), "names": np.array(["wall"])}, "label 4294967296 has no name"),
-    ],
-)
-def test_labels_that_cannot_be_scored_are_one_error(entries, text, scannet, capsys):
-    (scannet / "p/scene0062_00.ogpc").unlink()
-    np.savez(scannet / "p/scene0062_00.npz", **entries)
-    assert main(command(scannet)) == 2
-    captured = capsys.readouterr()
-    assert text in captured.err
-    assert captured.err.count("\n") == 1
+    score = score_scene(predicted, truth, 10, opacity)
+    assert (score.points, score.classes) == (3, (WALL, CHAIR))
+    assert (score.class_iou, score.unknown_share) == ((1, 0), 1 / 3)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -23,7 +22,7 @@ from og_pointcloud.evaluate import sweep as sweeping
 from og_pointcloud.evaluate.baselines import BASELINES, only_where_masked
 from og_pointcloud.evaluate.knobs import DEFAULT, FAST, KNOBS, Setting, settings_of
 from og_pointcloud.evaluate.sweep import BASELINE, Row, Sweep, front, read_subject, sweep
-from og_pointcloud.evaluate.sweep_page import chart, write_page
+from og_pointcloud.evaluate.sweep_report import write_chart, write_report
 from og_pointcloud.fitting.fit import fit, prepare
 from og_pointcloud.formats.capture import read_capture
 from og_pointcloud.journal import LeftOut, left_out_entry
@@ -51,7 +50,7 @@ def prepared(folder):
 
 
 def row(seconds: float, error: float, knob: str = "k", value: str = "v", capture: str = "c") -> Row:
-    return Row(capture, knob, value, seconds, 1, error)
+    return Row(capture, knob, value, seconds, error)
 
 
 def value_of(knob: str, value: str) -> Setting:
@@ -65,7 +64,7 @@ def test_one_value_of_every_knob_is_its_default_and_no_setting_is_tried_twice():
     for name, values in KNOBS.items():
         base = FitSettings(mode="fast") if values[0].settings.mode == "fast" else FitSettings()
         stands = [value.settings == base and value.every == 1 for value in values]
-        assert stands.count(True) == (1 if name not in ("mode", "forced back in") else int(name == "mode")), name
+        assert stands.count(True) == 1, name
         assert len({value.value for value in values}) == len(values)
     tried = settings_of()
     assert tried[0] == DEFAULT
@@ -97,16 +96,14 @@ def test_every_row_of_the_paper_is_there(share):
 
 
 def test_rows_have_error_and_seconds_and_a_setting_that_fails_costs_no_other(subject, monkeypatch):
-    real = sweeping.fit_prepared
-
-    def fails(prepared, settings, journal):
+    def fails(scene, settings, progress):
         if settings.membership.sure_share == 0.4:
             raise ZeroDivisionError("division by zero")
-        return real(prepared, settings, journal)
+        return fit(scene, settings, progress=progress)
 
-    monkeypatch.setattr(sweeping, "fit_prepared", fails)
+    monkeypatch.setattr(sweeping, "fit", fails)
     tried = [DEFAULT, value_of("sure share", "0.4"), value_of("views", "one of 2"), FAST]
-    found = sweep([subject], tried, seeds=2, progress=False)
+    found = sweep([subject], tried, progress=False)
     assert found.failed == {"capture, sure share: 0.4": "ZeroDivisionError: division by zero"}
     rows = {(one.knob, one.value): one for one in found.rows}
     assert list(rows)[:3] == [("default", ""), ("views", "one of 2"), ("mode", "fast")]
@@ -114,7 +111,7 @@ def test_rows_have_error_and_seconds_and_a_setting_that_fails_costs_no_other(sub
     default = rows["default", ""]
     labels = LabelledScene.from_cloud(cloud).chooser.choose(subject.vocabulary.vectors).at(cloud.instance_ids)[0]
     assert default.miou == 1 - default.error == subject.truth.score(labels, subject.vocabulary.names).miou > 0.8
-    assert (default.runs, default.error_spread, default.gain) == (2, 0.0, 0.0)
+    assert default.gain == 0
     assert list(default.left_out) == cloud.provenance["left_out"]
     assert default.instances == len(cloud.instances)
     assert default.labelled_miou >= default.miou  # without what is called on background
@@ -138,38 +135,10 @@ def test_without_truth_the_error_is_the_disagreement_with_the_masks(folder, tmp_
     assert (default.miou, default.gain) == (None, None)
     assert default.error == 1 - default.agreement < 0.5
     assert fewer.agreement != default.agreement
-    html = write_page(found, tmp_path / "r.html").read_text()
-    assert "no truth" in html
-    assert "<th>agreement</th>" in html
-    assert "<th>mIoU</th>" not in html
-
-
-@pytest.mark.parametrize(
-    ("knob", "value"),
-    [("mode", "auto"), ("mode", "fast"), ("grouping sample", "5,000"), ("border rounds", "0"),
-     ("codebook", "k1 64, k2 5")],
-)  # fmt: skip
-def test_what_takes_over_the_mask_table_is_what_a_whole_fit_makes(subject, knob, value):
-    setting = value_of(knob, value)
-    trial = sweeping._Trial(subject, 1)
-    assert trial._shares(setting)
-    shared = trial._run(setting, 0)[1]
-    whole = fit(subject.scene, setting.settings, progress=False)
-    np.testing.assert_array_equal(shared.instance_ids, whole.instance_ids)
-    np.testing.assert_array_equal(shared.instances.descriptors, whole.instances.descriptors)
-    entry = trial.row(setting)
-    assert list(entry.left_out) == whole.provenance["left_out"]
-
-
-def test_what_changes_the_mask_table_does_not_take_it_over(subject):
-    trial = sweeping._Trial(subject, 1)
-    alone = {setting.knob for setting in settings_of() if not trial._shares(setting)}
-    assert alone == {
-        "views", "enough views", "pixels per spacing", "alpha cut-off", "transmittance cut-off",
-        "neighbours", "forced back in",
-    }  # fmt: skip
-    see_through = replace(FitSettings(), membership=replace(FitSettings().membership, gap_sizes=5.0))
-    assert not trial._shares(Setting("k", "v", see_through))
+    text = write_report(found, tmp_path / "r.md", tmp_path / "r.png").read_text()
+    assert "no truth" in text
+    assert "| agreement |" in text
+    assert "| mIoU |" not in text
 
 
 def test_points_at_one_place_are_fitted_as_a_fit_does(folder, subject, tmp_path):
@@ -271,35 +240,36 @@ def test_points_shown_mostly_outside_of_masks_lose_their_label():
 # Files and the command ------------------------------------------------------------------------------------------
 
 
-def test_the_page_needs_nothing_else_and_names_what_is_left_out_and_what_failed(tmp_path):
+def test_the_report_names_what_is_left_out_and_what_failed(tmp_path):
     entry = left_out_entry(LeftOut.PIXELS, share=0.75, spacing_px=4.0, stride=2)
     default = replace(row(2.0, 0.1, "default", ""), left_out=(entry,))
-    others = (row(1.0, 0.2, "views", "one of <2>"), row(3.0, 0.4, BASELINE, "direct uplift"))
-    forced = row(2.5, 0.08, knobs.FORCED, entry["key"])
-    html = write_page(Sweep((default, *others, forced), {"c, mode: fast": "no mask"}), tmp_path / "r.html").read_text()
-    assert re.findall(r'(?:src|href)="(?!data:)', html) == []
+    others = (row(1.0, 0.2, "views", "one of |2|"), row(3.0, 0.4, BASELINE, "direct uplift"))
+    found = Sweep((default, *others), {"c, mode: fast": "no mask"})
+    text = write_report(found, tmp_path / "r.md", tmp_path / "r.png").read_text()
     for words in (
-        f"<li>{entry['what']}: {entry['why']}. Forced back in: +0.50 s, error -0.0200</li>",
-        "c, mode: fast: no mask",
-        "one of &lt;2&gt;",
-    ):
-        assert words in html
-    assert html.count('class="default front"') == 1
-    assert chart(Sweep((row(2.0, 0.0, "default", ""),), {})).startswith(PNG)  # one row, no error
+        f"- {entry['what']}: {entry['why']}", "- c, mode: fast: no mask", "![error against seconds](r.png)",
+        "| default * | 2.00 | 0.1000 |", "| views: one of &#124;2&#124; * | 1.00 |",
+        "| baseline: direct uplift | 3.00 |",
+    ):  # fmt: skip
+        assert words in text
+    lines = [line for line in text.splitlines() if line.startswith("|")]
+    assert len({line.count("|") for line in lines}) == 1
+    alone = write_chart(Sweep((row(2.0, 0.0, "default", ""),), {}), tmp_path / "r.png")  # one row, no error
+    assert alone.read_bytes().startswith(PNG)
 
 
-def test_the_command_writes_table_chart_and_page(folder, tmp_path, capsys):
+def test_the_command_writes_table_chart_and_report(folder, tmp_path, capsys):
     out = tmp_path / "r"
     assert main(["report", str(folder), "--knob", "views", "--knob", "border rounds", "-o", str(out)]) == 0
     printed = capsys.readouterr().out
-    assert "next: open" in printed
+    assert f"wrote {out / 'report.md'}" in printed
     assert "views: one of 2" in printed
     rows = {(r["knob"], r["value"]): r for r in csv.DictReader((out / "report.csv").open())}
     assert float(rows["default", ""]["miou"]) > 0.8
     assert all(float(one["seconds"]) > 0 and 0 <= float(one["error"]) <= 1 for one in rows.values())
     assert "cores" in rows["default", ""]["machine"]
     assert cv2.imread(str(out / "report.png")).shape[2] == 3
-    assert "border rounds: 0" in (out / "report.html").read_text()
+    assert "border rounds: 0" in (out / "report.md").read_text()
 
 
 def test_ablations_need_truth(tiny_capture, tmp_path, capsys):
@@ -310,12 +280,11 @@ def test_ablations_need_truth(tiny_capture, tmp_path, capsys):
 
 @pytest.mark.slow
 def test_the_ablations_are_written_by_the_same_command(folder, tmp_path, capsys):
-    assert main(["report", str(folder), "--ablation", "--seeds", "2", "-o", str(tmp_path)]) == 0
+    assert main(["report", str(folder), "--ablation", "-o", str(tmp_path)]) == 0
     rows = {(r["knob"], r["value"]): r for r in csv.DictReader((tmp_path / "ablation.csv").open())}
     for table, named in knobs.ABLATIONS.items():
         for name, (published, *_) in named.items():
             assert float(rows[table, name]["published"]) == published
-            assert rows[table, name]["runs"] == "2"
             assert float(rows[table, name]["labelled_miou"]) > 0
     assert float(rows["mode", "grouping"]["miou"]) > 0.8
     assert rows["losses", "both"]["miou"] == rows["association", "both"]["miou"]
@@ -327,7 +296,6 @@ def test_bad_use_is_one_error(tmp_path, capsys):
     for options, text in (
         (["-o", one], "no CAPTURE and no --room"),
         (["--room", "1;2"], "--room is '1;2'"),
-        ([one, "--seeds", "0"], "--seeds is 0; expected at least 1"),
         ([one, "--paper"], "--paper is of --ablation"),
         ([one, "--ablation", "--quick"], "--ablation has settings of its own"),
         ([one, "--knob", "colour"], "'colour' is no knob"),

@@ -21,18 +21,14 @@ if TYPE_CHECKING:
     from og_pointcloud.evaluate.captures import CaptureScore
     from og_pointcloud.evaluate.intervals import BlockInterval, Interval
     from og_pointcloud.evaluate.lerf import PairScore
-    from og_pointcloud.evaluate.scannet import SceneScore
-
-    LerfScores = dict[str, list[PairScore]]
+    from og_pointcloud.evaluate.metrics import Score
 
 SCANNET_LABELS = "_vh_clean_2.labels.ply"
 CAPTURE_HEADER = (
-    "", "mIoU", "95 %", "mAcc", "unknown", "background called", "answered", "share answered", "risk area", "AP50",
-    "ARI",
+    "", "mIoU", "95 %", "mAcc", "unknown", "background called", "answered", "share answered", "ARI",
 )  # fmt: skip
-SCANNET_HEADER = (
-    "", "mIoU", "mAcc", "forced", "flat mIoU", "answered", "share answered", "risk area", "95 % of mIoU",
-)  # fmt: skip
+
+TASK_MEANS = ("miou", "macc", "forced_miou", "unknown")
 
 
 def add(parser: Parser) -> None:
@@ -43,22 +39,18 @@ def add(parser: Parser) -> None:
     )
     add_path(capture, "captures", "CAPTURE", "folders with gt.npz", nargs="+")
     add_path(capture, "predictions", "S", ".ogpc of the one CAPTURE, or folder with all")
+    add_path(capture, "--against", "OTHER", "as the predictions: also the difference, less OTHER, paired")
     add_path(scannet, "folder", "DIR", f"scene folders with <scene>{SCANNET_LABELS}")
-    add_path(scannet, "--predictions", "P", "folder with <scene>.ogpc, or <scene>.npz from `segment -o`", required=True)
     add_path(scannet, "--gaussians", "G", "folder with <scene>.ply, whose points of opacity below 0.1 are ignored")
     add_path(lerf, "folder", "DIR", "with <scene>/sparse/0 and label/<scene>/*.json")
-    add_path(lerf, "--predictions", "P", "folder with <scene>.ogpc", required=True)
     add_path(
         lerf, "--gaussians", "G", "folder with <scene>.ply, or <scene>/point_cloud/iteration_*/: what was fitted",
         required=True,
     )  # fmt: skip
-    lerf.add_argument("--oracle", action="store_true", help="also the best instance there is for each pair (slow)")
     for data_set in (scannet, lerf):
+        add_path(data_set, "--predictions", "P", "folder with <scene>.ogpc", required=True)
         data_set.add_argument("--scenes", metavar="A,B", help="these scenes (default: all with labels in DIR)")
-    for protocol in (capture, scannet):
-        add_output(protocol, "--plot", endings=(".png",), help="risk against coverage")
     for protocol in (capture, scannet, lerf):
-        add_path(protocol, "--against", "OTHER", "as the predictions: also the difference, less OTHER, paired")
         add_path(
             protocol, "--text-features", "F.npz",
             "names asked and their vectors (default: the capture's text_features.npz, else the scene's own words)",
@@ -74,11 +66,10 @@ def add_path(parser: Parser, name: str, metavar: str, help: str, **settings: Any
 
 
 def run_capture(arguments: argparse.Namespace) -> None:
-    """Score a fitted capture against its own gt.npz: labels with their interval, risk, coverage, instances.
+    """Score a fitted capture against its own gt.npz: labels with their interval, abstentions, instances.
 
-    og-pointcloud eval capture kitchen kitchen.ogpc --against kitchen_fast.ogpc --plot risk.png
+    og-pointcloud eval capture kitchen kitchen.ogpc --against kitchen_fast.ogpc
     """
-    require_plots(arguments)
     from og_pointcloud.evaluate.captures import ask, difference, score_capture
     from og_pointcloud.evaluate.truth import read_truth
 
@@ -89,42 +80,30 @@ def run_capture(arguments: argparse.Namespace) -> None:
     truths = {folder: read_truth(folder) for folder in captures}
     files = {folder: scene_file(arguments.predictions, folder, len(captures)) for folder in captures}
     others = {folder: scene_file(against, folder, len(captures)) for folder in captures} if against else {}
-    rows, report, curves = [], {}, {}
+    rows, report = [], {}
     for name, (folder, truth) in zip(names, truths.items(), strict=True):
         own_words = folder / "text_features.npz"
         words = arguments.text_features or (own_words if own_words.is_file() else None)
         answer = ask(files[folder], truth, words)
         score = score_capture(answer, truth)
-        curves[name] = score.curve, score.answered_share
-        change = None
-        if against:
-            other = ask(others[folder], truth, words)
-            change = difference(answer, other, truth)
-            second = score_capture(other, truth)
-            curves[f"{name}, {others[folder].name}"] = second.curve, second.answered_share
+        change = difference(answer, ask(others[folder], truth, words), truth) if against else None
         rows.append(capture_cells(name, score, change))
-        report[name] = {
-            **asdict(score),
-            "risk_area": score.curve.area,
-            "spacing": answer.spacing,
-            "less_the_other": asdict(change) if change else None,
-        }
-        del report[name]["curve"]
+        less = asdict(change) if change else None
+        report[name] = {**asdict(score), "spacing": answer.spacing, "less_the_other": less}
     print_table(CAPTURE_HEADER + (("less the other",) if against else ()), rows)
     print("unknown counts as wrong; 'answered' leaves it out. The 95 % are over cubes of each scene, not over points:")
     for name, entry in report.items():
         interval = entry["interval"]
         print(f"{name}: {interval['blocks']} cubes of {interval['edge'] / entry['spacing']:.0f} point spacings")
-    write_files(arguments, report, curves)
+    write_scores(arguments, report)
 
 
 def capture_cells(name: str, score: CaptureScore, change: BlockInterval | None) -> tuple[str, ...]:
-    labels, things = score.labels, score.instances
+    labels = score.labels
     return (
         name, percent(labels.miou), spread(score.interval), percent(labels.macc), percent(labels.unknown_share),
-        percent(labels.background_called), percent(score.answered.miou if score.answered.classes else None),
-        percent(score.answered_share), f"{score.curve.area:.4f}", percent(things and things.of_class.ap50),
-        f"{things.rand:.3f}" if things else "-",
+        percent(labels.background_called), percent(score.answered.miou), percent(score.answered_share),
+        "-" if score.rand is None else f"{score.rand:.3f}",
         *((signed(change),) if change else ()),
     )  # fmt: skip
 
@@ -132,7 +111,7 @@ def capture_cells(name: str, score: CaptureScore, change: BlockInterval | None) 
 def scene_file(predictions: Path, capture: Path, captures: int) -> Path:
     """The labelled scene of a capture: the file, where there is one capture, or the file of its name in the folder."""
     if predictions.is_dir():
-        return prediction_file(predictions, capture.resolve().name, (".ogpc",))
+        return prediction_file(predictions, capture.resolve().name)
     if captures > 1:
         raise OgPointcloudError(f"{predictions} is one file for {captures} captures; expected a folder with one each")
     if predictions.suffix != ".ogpc" or not predictions.is_file():
@@ -144,89 +123,59 @@ def scene_file(predictions: Path, capture: Path, captures: int) -> Path:
 
 
 def run_scannet(arguments: argparse.Namespace) -> None:
-    """ScanNet with 19, 15 and 10 classes; unknown counts as wrong, and beside it as abstention.
+    """ScanNet with 19, 15 and 10 classes; unknown counts as wrong, and beside it stands how often it is said.
 
     og-pointcloud eval scannet scans --predictions fitted --json scores.json
     """
-    require_plots(arguments)
-    from og_pointcloud.evaluate.scannet import SCENES, TASKS, risk_over_scenes
+    from og_pointcloud.evaluate.scannet import SCENES, TASKS, ask, read_truth, score_scene
 
-    files = scannet_truths(arguments.folder, names_in(arguments.scenes))
-    folders = [folder for folder in (arguments.predictions, arguments.against) if folder]
-    predictions = [{scene: prediction_file(folder, scene) for scene in files} for folder in folders]
-    results = [score_scans(files, found, arguments) for found in predictions]
-    rows, report = [], {}
-    for task in TASKS:
-        row, report[str(task)] = scannet_row(task, *(scores[task] for scores in results))
-        rows.append(row)
-    print_table(SCANNET_HEADER + (("less the other",) if arguments.against else ()), rows)
-    published = sum(scene in SCENES for scene in files)
-    print(f"{len(files)} scenes, {published} of the {len(SCENES)} of the published table; intervals are over scenes")
-    if arguments.gaussians is None:
-        print("no --gaussians: transparent points are not ignored")
-    found = {
-        str(folder): risk_over_scenes(list(scores[max(TASKS)].values()))
-        for folder, scores in zip(folders, results, strict=True)
-    }
-    curves = {name: (curve, answered) for name, (curve, answered) in found.items() if curve}
-    if arguments.plot and not curves:
-        raise OgPointcloudError("no prediction has scores, so there is no risk against coverage to plot (--plot)")
-    write_files(arguments, report, curves, f"ScanNet, {max(TASKS)} classes")
-
-
-def score_scans(
-    truths: Mapping[str, Path], predictions: Mapping[str, Path], arguments: argparse.Namespace
-) -> dict[int, dict[str, SceneScore]]:
-    """Every task of every scene."""
-    from og_pointcloud.evaluate.scannet import TASKS, read_prediction, read_truth, score_scene
-
-    scores = {task: {} for task in TASKS}
+    truths = scannet_truths(arguments.folder, names_in(arguments.scenes))
+    files = {scene: prediction_file(arguments.predictions, scene) for scene in truths}
+    scores: dict[int, dict[str, tuple[Score, Score]]] = {task: {} for task in TASKS}
     for scene, file in truths.items():
         xyz, truth = read_truth(file)
         opacity = opacities(arguments.gaussians, scene, len(truth))
         for task, of_task in scores.items():
-            found = read_prediction(predictions[scene], xyz, task, arguments.text_features)
-            of_task[scene] = score_scene(found.ids, truth, task, opacity, found.confidence, found.forced)
-    return scores
+            said, forced = (
+                score_scene(found, truth, task, opacity)
+                for found in ask(files[scene], xyz, task, arguments.text_features)
+            )
+            of_task[scene] = said, forced
+    means = {task: task_means(list(of_task.values())) for task, of_task in scores.items()}
+    rows = [
+        (f"{task} classes", *map(percent, mean.values()), spread(interval)) for task, (mean, interval) in means.items()
+    ]
+    print_table(("", "mIoU", "mAcc", "forced", "unknown", "95 % of mIoU"), rows)
+    published = sum(scene in SCENES for scene in truths)
+    print(f"{len(truths)} scenes, {published} of the {len(SCENES)} of the published table; intervals are over scenes")
+    if arguments.gaussians is None:
+        print("no --gaussians: transparent points are not ignored")
+    report = {}
+    for task, (mean, interval) in means.items():
+        scenes = {scene: scene_entry(said) for scene, (said, _) in scores[task].items()}
+        spans = [interval.low, interval.high] if interval else None
+        report[str(task)] = {**mean, "interval": spans, "scenes": scenes}
+    write_scores(arguments, report)
 
 
-def scannet_row(
-    task: int, scenes: Mapping[str, SceneScore], other: Mapping[str, SceneScore] | None = None
-) -> tuple[tuple[str, ...], dict[str, Any]]:
-    """A row of the table, and the same with every scene as JSON. other: of the predictions to compare with."""
+def task_means(scores: Sequence[tuple[Score, Score]]) -> tuple[dict[str, float | None], Interval | None]:
+    """Means over the scenes that have a point of the task, as said and as forced; the interval of the mIoU."""
     import numpy as np
 
-    from og_pointcloud.evaluate.intervals import bootstrap, paired_bootstrap
-    from og_pointcloud.evaluate.scannet import average, risk_over_scenes
+    from og_pointcloud.evaluate.intervals import bootstrap
 
-    values = list(scenes.values())
-    mean, (curve, _) = average(values), risk_over_scenes(values)
-    per_scene = np.array([score.protocol.miou for score in values])
-    interval = bootstrap(per_scene) if mean.scenes else None
-    change = None
-    if other and mean.scenes:
-        change = paired_bootstrap(per_scene, np.array([score.protocol.miou for score in other.values()]))
-    row = (
-        f"{task} classes", *map(percent, (mean.miou, mean.macc, mean.forced_miou, mean.flat_miou)),
-        percent(mean.answered), percent(mean.answered_share), f"{curve.area:.4f}" if curve else "-", spread(interval),
-        *([] if other is None else [signed(change) if change else "-"]),
-    )  # fmt: skip
-    entry = {
-        **{name: getattr(mean, name) for name in ("miou", "macc", "forced_miou", "flat_miou")},
-        "risk_area": curve.area if curve else None,
-        "interval": [interval.low, interval.high] if interval else None,
-        "less_the_other": [change.mean, change.low, change.high] if change else None,
-        "scenes": {
-            scene: {
-                **{name: getattr(score.protocol, name) for name in ("miou", "macc", "points")},
-                "class_iou": dict(zip(map(str, score.protocol.classes), score.protocol.class_iou, strict=True)),
-                "answered_miou": score.answered.miou,
-                "answered_share": score.answered_share,
-            }
-            for scene, score in scenes.items()
-        },
-    }
-    return row, entry
+    present = [(said, forced) for said, forced in scores if said.classes]
+    if not present:
+        return dict.fromkeys(TASK_MEANS), None
+    table = np.array([(said.miou, said.macc, forced.miou, said.unknown_share) for said, forced in present])
+    return dict(zip(TASK_MEANS, table.mean(axis=0).tolist(), strict=True)), bootstrap(table[:, 0])
+
+
+def scene_entry(score: Score) -> dict[str, Any]:
+    """One scene as JSON."""
+    class_iou = dict(zip(map(str, score.classes), score.class_iou, strict=True))
+    figures = {"miou": score.miou, "macc": score.macc, "unknown": score.unknown_share, "points": score.points}
+    return {**figures, "class_iou": class_iou}
 
 
 def scannet_truths(folder: Path, scenes: list[str] | None) -> dict[str, Path]:
@@ -261,82 +210,45 @@ def run_lerf(arguments: argparse.Namespace) -> None:
 
     og-pointcloud eval lerf lerf_ovs --predictions fitted --gaussians trained --text-features words.npz
     """
-    from og_pointcloud.evaluate.intervals import paired_bootstrap
-    from og_pointcloud.evaluate.lerf import ORACLE, WAYS, read_scene, scene_names
+    from og_pointcloud.ask.labelled_scene import load
+    from og_pointcloud.evaluate.lerf import gaussians_of, read_scene, scene_names, score_pairs
 
     # Everything is looked for before anything is rendered: what the last scene lacks is named at once.
     wanted = known_scenes(arguments.folder, scene_names(arguments.folder), names_in(arguments.scenes))
     labels = [read_scene(arguments.folder, name) for name in wanted]
-    folders = [folder for folder in (arguments.predictions, arguments.against) if folder]
-    files = [[prediction_file(folder, name, (".ogpc",)) for name in wanted] for folder in folders]
+    files = [prediction_file(arguments.predictions, name) for name in wanted]
     splats = [gaussians_file(arguments.gaussians, name) for name in wanted]
-    ways = (*WAYS, ORACLE) if arguments.oracle else WAYS
-    own, *others = (score_selections(labels, of_folder, splats, arguments) for of_folder in files)
-    means = print_selections(own, ways)
-    print_set(own)
-    for way in ways[1:]:
-        change = paired_bootstrap(pair_column(own, way), pair_column(own, ways[0]))
-        print(f"{way} less {ways[0]}, mIoU of all pairs: {signed(change)}")
-    for other in others:
-        for way in ways:
-            change = paired_bootstrap(pair_column(own, way), pair_column(other, way))
-            print(f"{way}: less {arguments.against}, all pairs: {signed(change)}")
-    scenes = {name: [asdict(pair) for pair in pairs] for name, pairs in own.items()}
-    write_files(arguments, {"means": means, "scenes": scenes})
-
-
-def score_selections(
-    labels: Sequence[Any], files: list[Path], splats: list[Path], arguments: argparse.Namespace
-) -> LerfScores:
-    from og_pointcloud.ask.labelled_scene import load
-    from og_pointcloud.evaluate.lerf import gaussians_of, score_pairs
-
-    scenes: LerfScores = {}
+    scenes = {}
     for of_scene, file, splat in zip(labels, files, splats, strict=True):
         scene = load(file)
         gaussians = gaussians_of(scene.cloud, splat)
-        scenes[of_scene.name] = score_pairs(scene, of_scene, gaussians, arguments.text_features, arguments.oracle)
-    return scenes
+        scenes[of_scene.name] = score_pairs(scene, of_scene, gaussians, arguments.text_features)
+    means = print_selections(scenes)
+    pairs = {name: [asdict(pair) for pair in of_scene] for name, of_scene in scenes.items()}
+    write_scores(arguments, {"means": means, "scenes": pairs})
 
 
-def pair_column(scenes: LerfScores, way: str) -> NDArray[np.float64]:
-    """(pairs,) IoU in one way, of all scenes."""
+def print_selections(scenes: Mapping[str, Sequence[PairScore]]) -> dict[str, dict[str, float]]:
+    """A table with a row a scene, the means of scenes, and the interval over all pairs; the means as JSON, by way."""
     import numpy as np
 
-    return np.array([pair.iou[way] for pairs in scenes.values() for pair in pairs])
-
-
-def print_selections(scenes: LerfScores, ways: Sequence[str]) -> dict[str, dict[str, float]]:
-    """A table with a row a scene and the means; these as JSON, by way."""
     from og_pointcloud.evaluate.intervals import bootstrap
-    from og_pointcloud.evaluate.lerf import IOU_FOUND, score_scenes
+    from og_pointcloud.evaluate.lerf import IOU_FOUND, PUBLISHED_PAIRS, WAYS, score_scenes
 
-    by_way = {way: {name: pair_column({name: pairs}, way) for name, pairs in scenes.items()} for way in ways}
+    ious = {way: {name: np.array([pair.iou[way] for pair in pairs]) for name, pairs in scenes.items()} for way in WAYS}
+    means = {way: score_scenes(of_way) for way, of_way in ious.items()}
     rows = []
     for name, pairs in scenes.items():
-        cells = [(of[name].mean(), (of[name] > IOU_FOUND).mean()) if len(pairs) else (None,) * 2
-                 for of in by_way.values()]  # fmt: skip
+        cells = [(of[name].mean(), (of[name] > IOU_FOUND).mean()) if pairs else (None, None) for of in ious.values()]
         rows.append((name, str(len(pairs)), *(percent(value) for cell in cells for value in cell)))
-    means = [score_scenes(of) for of in by_way.values()]
-    total = str(means[0].pairs)
-    rows.append(("mean of scenes", total, *(percent(v) for mean in means for v in (mean.miou, mean.accuracy))))
-    rows.append(("all pairs", total, *(percent(v) for mean in means for v in (mean.flat_miou, mean.flat_accuracy))))
-    pooled = [pair_column(scenes, way) for way in ways]
-    intervals = [bootstrap(column) for ious in pooled for column in (ious, (ious > IOU_FOUND).astype(float))]
-    rows.append(("95 % of all pairs", "", *map(spread, intervals)))
-    print_table(("", "pairs", *(f"{way} {what}" for way in ways for what in ("mIoU", "over 0.25"))), rows)
-    return {way: asdict(mean) for way, mean in zip(ways, means, strict=True)}
-
-
-def print_set(scenes: Mapping[str, Sequence[Any]]) -> None:
-    """Whether the pairs are those of the published table."""
-    from og_pointcloud.evaluate.lerf import PAIRS
-
-    if {name: len(pairs) for name, pairs in scenes.items()} == dict(PAIRS):
-        print("the scenes and pairs of the published table")
-    else:
-        published = ", ".join(f"{name} {count}" for name, count in PAIRS.items())
-        print(f"not the set of the published table, whose pairs are {published}: its means are of others")
+    total = sum(map(len, scenes.values()))
+    rows.append(("mean", str(total), *(percent(v) for mean in means.values() for v in (mean.miou, mean.accuracy))))
+    pooled = [np.concatenate(list(of_way.values())) for of_way in ious.values()]
+    intervals = [bootstrap(column) for every in pooled for column in (every, (every > IOU_FOUND).astype(float))]
+    rows.append(("95 % over pairs", "", *map(spread, intervals)))
+    print_table(("", "pairs", *(f"{way} {what}" for way in WAYS for what in ("mIoU", "over 0.25"))), rows)
+    print(f"{total} pairs of {len(scenes)} scenes; the published table has {PUBLISHED_PAIRS} of 4")
+    return {way: asdict(mean) for way, mean in means.items()}
 
 
 def gaussians_file(folder: Path, scene: str) -> Path:
@@ -355,23 +267,7 @@ def gaussians_file(folder: Path, scene: str) -> Path:
 # What the protocols share ---------------------------------------------------------------------------------------
 
 
-def require_plots(arguments: argparse.Namespace) -> None:
-    if arguments.plot:
-        from og_pointcloud.evaluate.plots import require_matplotlib
-
-        require_matplotlib()
-
-
-def write_files(
-    arguments: argparse.Namespace, report: Mapping[str, Any], curves: Mapping[str, Any] | None = None, title: str = ""
-) -> None:
-    """--plot and --json, where they were asked for. curves: name -> (risk against coverage, share answered)."""
-    if curves and arguments.plot:
-        from og_pointcloud.evaluate.plots import plot_risk_coverage
-
-        answered = {name: share for name, (_, share) in curves.items()}
-        plot_risk_coverage({name: curve for name, (curve, _) in curves.items()}, answered, arguments.plot, title)
-        print(f"wrote {arguments.plot}")
+def write_scores(arguments: argparse.Namespace, report: Mapping[str, Any]) -> None:
     if arguments.json:
         write_json(arguments.json, without_nan(report))
         print(f"wrote {arguments.json}")
@@ -391,15 +287,13 @@ def known_scenes(folder: Path, known: list[str], wanted: list[str] | None) -> li
     return wanted or known
 
 
-def prediction_file(folder: Path, scene: str, endings: Sequence[str] = (".ogpc", ".npz")) -> Path:
+def prediction_file(folder: Path, scene: str) -> Path:
     """The file of one scene in a folder of them; a missing one is an error."""
-    files = [folder / f"{scene}{ending}" for ending in endings]
-    file = next((file for file in files if file.is_file()), None)
-    if file is None:
-        names = " nor ".join(file.name for file in files)
+    file = folder / f"{scene}.ogpc"
+    if not file.is_file():
         raise OgPointcloudError(
-            f"{folder} has {'neither ' if len(files) > 1 else 'no '}{names}: a mean over other scenes is another "
-            "figure; fit that scene, or name the scenes to score"
+            f"{folder} has no {file.name}: a mean over other scenes is another figure; fit that scene, or name the "
+            "scenes to score"
         )
     return file
 

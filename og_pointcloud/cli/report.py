@@ -1,4 +1,4 @@
-"""Every setting that trades error for time, tried: one table, one chart, one page.
+"""Every setting that trades error for time, tried: one table, one chart.
 
 og-pointcloud report kitchen shelf --quick -o report
 """
@@ -7,13 +7,12 @@ from __future__ import annotations
 
 import argparse
 import re
-import shlex
 import sys
 from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
 
-from og_pointcloud.cli.common import Parser, check_at_least, check_output, print_table, require_room
+from og_pointcloud.cli.common import Parser, check_output, print_table, require_room
 from og_pointcloud.errors import MissingExtraError, OgPointcloudError
 
 SHARE = 0.05
@@ -30,21 +29,16 @@ def add(parser: Parser) -> None:
         "--knob", action="append", metavar="NAME", help="only this setting (may be given several times)"
     )
     parser.add_argument("--quick", action="store_true", help="only the settings that matter most")
-    parser.add_argument("--seeds", type=int, default=1, metavar="N", help="runs of every setting (default: 1)")
     parser.add_argument(
         "--ablation", action="store_true", help="instead, the paper's tables: losses, codebook, association"
     )
     parser.add_argument("--paper", action="store_true", help="of --ablation: trained by rendering, as published (slow)")
     parser.add_argument(
-        "--schedule-share",
-        type=float,
-        default=SHARE,
-        metavar="X",
-        help="of --paper: part of its schedule (%(default)s)",
+        "--schedule-share", type=float, default=SHARE, metavar="X", help="of --paper: part of it (default: %(default)s)"
     )
     parser.add_argument(
         "-o", "--output", type=Path, default=Path("out/report"), metavar="DIR",
-        help="folder for report.html, .csv and .png, or ablation.* (default: %(default)s)",
+        help="folder for report.md, .csv and .png, or ablation.* (default: %(default)s)",
     )  # fmt: skip
 
 
@@ -52,14 +46,12 @@ def run(arguments: argparse.Namespace) -> None:
     rooms, output, captures = room_seeds(arguments.room), arguments.output, arguments.captures
     check_options(arguments, rooms)
     stem = output / ("ablation" if arguments.ablation else "report")
-    page, rows, picture = (stem.with_suffix(ending) for ending in (".html", ".csv", ".png"))
-    for path in (page, rows, picture):
+    text, rows, picture = (stem.with_suffix(ending) for ending in (".md", ".csv", ".png"))
+    for path in (text, rows, picture):
         check_output("-o", path, captures)
     from og_pointcloud.evaluate.knobs import QUICK, ablations, settings_of
-    from og_pointcloud.evaluate.plots import require_matplotlib
     from og_pointcloud.evaluate.sweep import read_subject, sweep, write_rows
-    from og_pointcloud.evaluate.sweep_page import chart, table, write_page
-    from og_pointcloud.formats.atomic import replacing
+    from og_pointcloud.evaluate.sweep_report import require_matplotlib, table, write_chart, write_report
 
     require_matplotlib()
     if arguments.ablation:
@@ -75,24 +67,21 @@ def run(arguments: argparse.Namespace) -> None:
             f"{unknown[0]} lacks gt.npz or text_features.npz; ablations compare words with the truth: take a capture "
             "that has both, or a made room (--room 1)"
         )
-    found = sweep(subjects, settings, seeds=arguments.seeds)
+    found = sweep(subjects, settings)
     write_rows(found.rows, rows)
-    with replacing(picture) as file:
-        file.write(chart(found))
-    write_page(found, page, "Ablations" if arguments.ablation else "Error against run time")
+    write_chart(found, picture)
+    write_report(found, text, picture, "Ablations" if arguments.ablation else "Error against run time")
     for capture in found.captures:
         (_, *header), *lines = table([row for row in found.rows if row.capture == capture])
         print_table((capture, *header), lines)
     for what, why in found.failed.items():
         print(f"warning: could not be run: {what}: {why}", file=sys.stderr)
-    print(f"wrote {page}, {rows} and {picture}")
-    print(f"next: open {shlex.quote(str(page))} in a browser")
+    print(f"wrote {text}, {rows} and {picture}")
 
 
 def check_options(arguments: argparse.Namespace, rooms: Sequence[int]) -> None:
     if not arguments.captures and not rooms:
         raise OgPointcloudError("no CAPTURE and no --room; expected at least one, e.g. --room 1")
-    check_at_least("--seeds", arguments.seeds, 1)
     if arguments.paper and not arguments.ablation:
         raise OgPointcloudError("--paper is of --ablation; expected both, or neither")
     if arguments.ablation and (arguments.knob or arguments.quick):

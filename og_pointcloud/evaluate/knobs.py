@@ -10,10 +10,9 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from og_pointcloud.errors import OgPointcloudError
-from og_pointcloud.journal import LeftOut
 from og_pointcloud.settings import CodebookSettings, FeatureSettings, FitSettings, MatchingSettings, PaperSettings
 
-__all__ = ["ABLATIONS", "DEFAULT", "FORCED", "KNOBS", "QUICK", "Setting", "ablations", "settings_of"]
+__all__ = ["ABLATIONS", "DEFAULT", "KNOBS", "QUICK", "Setting", "ablations", "settings_of"]
 
 
 @dataclass(frozen=True)
@@ -37,8 +36,6 @@ DEFAULT = Setting("default", "")
 """A fit without settings."""
 FAST = Setting("mode", "fast", FitSettings(mode="fast"))
 """What the knobs of learned features and codebook start from: by default neither runs on most scenes."""
-FORCED = "forced back in"
-"""The knob that puts in again what a fit leaves out: values that a fit names are by their key in its provenance."""
 ALL = 1_000_000_000
 """More points than any cloud has."""
 
@@ -62,28 +59,12 @@ ONE_NUMBER: Mapping[str, tuple[str, tuple[Any, ...]]] = {
     "feature steps": ("features.max_steps", (10, 30, 1000)),
 }
 """Knob -> the number that it sets, and the values tried."""
-SEVERAL: Mapping[str, Mapping[str, Changes]] = {
-    "codebook": {
-        "two levels, k from masks": {},
-        "one level, k from masks": {"codebook.levels": 1},
-        "k1 32, k2 5": {"codebook.k1": 32, "codebook.k2": 5},
-        "k1 64, k2 5": {"codebook.k1": 64, "codebook.k2": 5},
-    },
-    FORCED: {
-        LeftOut.PIXELS.value: {"geometry.max_stride": 1},
-        LeftOut.SPANNING_MASKS.value: {"grouping.part_share": 2.0},
-        LeftOut.CONTRADICTED_GROUPS.value: {"membership.rate_share": 0.0},
-        "islands": {"membership.island_share": 0.0},
-        "outlying masks": {"association.outlier_deviations": 1e9},
-        "all that is approximated": {
-            "visibility.alpha_min": 1e-6,
-            "visibility.transmittance_min": 1e-9,
-            "geometry.max_stride": 1,
-            "grouping.graph_points": ALL,
-        },
-    },
+CODEBOOKS: Mapping[str, Changes] = {
+    "two levels, k from masks": {},
+    "one level, k from masks": {"codebook.levels": 1},
+    "k1 32, k2 5": {"codebook.k1": 32, "codebook.k2": 5},
+    "k1 64, k2 5": {"codebook.k1": 64, "codebook.k2": 5},
 }
-"""Knobs whose values change any numbers: knob -> value -> changes."""
 
 
 def _changed(record: Any, path: str, value: Any) -> Any:
@@ -106,20 +87,16 @@ def _label(value: Any) -> str:
 
 def _knobs() -> dict[str, tuple[Setting, ...]]:
     tables = {name: {_label(value): {path: value} for value in values} for name, (path, values) in ONE_NUMBER.items()}
-    knobs = {
-        "views": tuple(
-            Setting("views", f"one of {every}" if every > 1 else "all", every=every) for every in (1, 2, 4, 8)
-        )
-    }
-    for name, values in {**tables, **SEVERAL}.items():
+    every = {f"one of {count}" if count > 1 else "all": count for count in (1, 2, 4, 8)}
+    knobs = {"views": tuple(Setting("views", label, every=count) for label, count in every.items())}
+    for name, values in {**tables, "codebook": CODEBOOKS}.items():
         base = FAST.settings if name.startswith(("feature", "codebook")) else DEFAULT.settings
         knobs[name] = tuple(Setting(name, label, _with(base, changes)) for label, changes in values.items())
     return knobs
 
 
 KNOBS = _knobs()
-"""Name -> values. One value of each but the last is what stands by default (for those of features and codebook: in mode
-fast); the last forces back in what a fit leaves out."""
+"""Name -> values, of which one is what stands by default (for those of features and codebook: in mode fast)."""
 QUICK = ("mode", "views", "pixels per spacing", "grouping sample")
 """Knobs of a report in a hurry."""
 

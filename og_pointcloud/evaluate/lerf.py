@@ -6,16 +6,13 @@ poses.
 Rules. A text selects Gaussians, these alone are rendered, and where their alpha is above 0.7 is the predicted mask. A
 (frame, object) pair scores the IoU with the outlined mask, 0 where nothing is selected or rendered; several outlines of
 one category in a frame are one object. mIoU is the mean over a scene's pairs, accuracy the share of pairs with an IoU
-above 0.25; the table's figure is the mean of the four scenes (macro), beside which stands that of all pairs (flat).
+above 0.25; the table's figure is the mean of the four scenes (macro).
 
-What a text selects is asked in several ways, whose scores stand side by side, since choosing is where most is lost:
+What a text selects is asked in two ways, whose scores stand side by side, since choosing is where most is lost:
 
     best         the one instance that the text fits best, whatever its score: no threshold, and no "nothing"
     calibrated   the instances that the text fits better than the everyday words of the scene's word bank; may be none.
                  Without a bank, the best
-    among        the instances that the text fits better than the scene's other labelled objects do, and than the bank's
-                 words: whoever asks knows the list
-    oracle       the one instance that would have scored best in this frame: what choosing can reach at most
 """
 
 from __future__ import annotations
@@ -48,8 +45,7 @@ except ImportError as error:
     raise MissingExtraError("scipy and numba", "fit") from error
 
 __all__ = [
-    "ORACLE",
-    "PAIRS",
+    "PUBLISHED_PAIRS",
     "WAYS",
     "LabelledFrame",
     "LerfScene",
@@ -65,10 +61,9 @@ __all__ = [
 ]
 
 ALPHA_SHOWN, IOU_FOUND = 0.7, 0.25
-PAIRS: Mapping[str, int] = {"figurines": 56, "ramen": 71, "teatime": 59, "waldo_kitchen": 22}
-"""The (frame, object) pairs of the published table, by scene."""
-WAYS = ("best", "calibrated", "among")
-ORACLE = "oracle"
+PUBLISHED_PAIRS = 208
+"""(frame, object) pairs of the published table, in four scenes."""
+WAYS = ("best", "calibrated")
 LABEL_FOLDER = "label"
 SAME_PLACE = 0.01
 """Share of the point spacing by which a fitted cloud and its Gaussians may lie apart."""
@@ -111,12 +106,10 @@ class PairScore:
 
 @dataclass(frozen=True)
 class LerfScore:
-    """miou, accuracy: macro, over scenes. flat_miou, flat_accuracy: over all pairs. pairs: their number."""
+    """miou, accuracy: means over scenes. pairs: their number."""
 
     miou: float
     accuracy: float
-    flat_miou: float
-    flat_accuracy: float
     pairs: int
 
 
@@ -211,28 +204,20 @@ def gaussians_of(cloud: LabelledCloud, file: Path) -> Gaussians:
 
 
 def score_pairs(
-    scene: LabelledScene, labels: LerfScene, gaussians: Gaussians, text_features: TextFeatures = None,
-    oracle: bool = False,
-) -> list[PairScore]:  # fmt: skip
+    scene: LabelledScene, labels: LerfScene, gaussians: Gaussians, text_features: TextFeatures = None
+) -> list[PairScore]:
     """The IoU of every (frame, object) pair, in every way.
 
     gaussians: of the scene's points (`gaussians_of`). text_features: where the objects' names are found; left out, the
-    scene's own words and text encoder. oracle: also that way, which renders every instance into every frame.
+    scene's own words and text encoder.
     """
     cameras = [in_local_frame(camera, scene.cloud.origin) for camera in labels.cameras]
     near = near_plane(scene.cloud.xyz, [_view_without_masks(camera) for camera in cameras])
-    chosen = {name: _selected(scene, name, labels.objects, text_features) for name in labels.objects}
+    chosen = {name: _selected(scene, name, text_features) for name in labels.objects}
     scores = []
     for frame, camera in zip(labels.frames, cameras, strict=True):
         shown = partial(_alpha, gaussians, scene.instance_ids, camera, near)
-        ious: dict[str, dict[str, float]] = {}
-        for way in WAYS:
-            ious[way] = pair_ious(frame, {name: shown(chosen[name][way]) for name in frame.objects})
-        if oracle:
-            ious[ORACLE] = dict.fromkeys(frame.objects, 0.0)
-            for instance in np.unique(scene.instance_ids[scene.instance_ids >= 0]).tolist():
-                found = pair_ious(frame, dict.fromkeys(frame.objects, shown((instance,))))
-                ious[ORACLE] = {name: max(found[name], best) for name, best in ious[ORACLE].items()}
+        ious = {way: pair_ious(frame, {name: shown(chosen[name][way]) for name in frame.objects}) for way in WAYS}
         scores += [PairScore(frame.name, name, {way: of[name] for way, of in ious.items()}) for name in frame.objects]
     return scores
 
@@ -258,24 +243,18 @@ def score_scenes(ious: Mapping[str, NDArray[np.floating]]) -> LerfScore:
     scenes = [np.asarray(values, np.float64) for values in ious.values() if len(values)]
     if not scenes:
         raise SceneError("no labelled object in any frame; expected at least one")
-    every = np.concatenate(scenes)
     return LerfScore(
         miou=float(np.mean([scene.mean() for scene in scenes])),
         accuracy=float(np.mean([(scene > IOU_FOUND).mean() for scene in scenes])),
-        flat_miou=float(every.mean()),
-        flat_accuracy=float((every > IOU_FOUND).mean()),
-        pairs=len(every),
+        pairs=sum(map(len, scenes)),
     )
 
 
-def _selected(
-    scene: LabelledScene, text: str, objects: Sequence[str], text_features: TextFeatures
-) -> dict[str, tuple[int, ...]]:
+def _selected(scene: LabelledScene, text: str, text_features: TextFeatures) -> dict[str, tuple[int, ...]]:
     """Instances that a text selects, by way."""
-    alone = select(scene, text, against=[], text_features=text_features)
-    among = select(scene, text, against=[name for name in objects if name != text], text_features=text_features)
-    best = () if alone.best is None else (alone.best.instance,)
-    return dict(zip(WAYS, (best, alone.instances, among.instances), strict=True))
+    found = select(scene, text, against=[], text_features=text_features)
+    best = () if found.best is None else (found.best.instance,)
+    return {"best": best, "calibrated": found.instances}
 
 
 def _alpha(

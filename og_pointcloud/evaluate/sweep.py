@@ -1,8 +1,7 @@
-"""Error against run time: settings x captures x seeds -> one table, with error and seconds in the same row.
+"""Error against run time: settings x captures -> one table, with error and seconds in the same row.
 
-A fit of a few points comes first in each mode and is discarded, so that compiled code is loaded. Settings of the stages
-after rendering take over the mask table, which is made once a capture; its seconds are added to theirs. Seconds are the
-least of the runs. Beside the settings stand other methods on the same table (`baselines`).
+A fit of a few points comes first in each mode and is discarded, so that compiled code is loaded. Beside the settings
+stand other methods on the default's mask table (`baselines`).
 
     with gt.npz and text_features.npz      error = 1 - mIoU; a point without a label is a miss, a class called on known
                                            background a false alarm
@@ -44,7 +43,7 @@ from og_pointcloud.text.text_features import read_text_features
 
 try:
     from og_pointcloud.evaluate.baselines import baseline_labels
-    from og_pointcloud.fitting.fit import fit, fit_prepared, prepare
+    from og_pointcloud.fitting.fit import fit, prepare
     from og_pointcloud.fitting.labellers import Labelling, mask_agreement
     from og_pointcloud.fitting.tiles import needs_tiles
 except ImportError as error:
@@ -71,10 +70,9 @@ class Subject:
 
 @dataclass(frozen=True)
 class Row:
-    """One setting on one capture, over ``runs`` seeds.
+    """One setting on one capture.
 
-    seconds: of a whole fit, the least of the runs. error: 1 - mIoU, or where the truth is not known 1 - agreement; mean
-    of the runs, and their standard deviation (None for a single run).
+    seconds: of a whole fit. error: 1 - mIoU, or where the truth is not known 1 - agreement.
     miou, macc, unknown: over the points with a known class; background: the share of known background that was given a
     class. labelled_miou: mIoU with background left out, as published tables have it. None without truth.
     gain, gain_low, gain_high: mIoU less the default's, with its paired 95 % interval over blocks of space.
@@ -86,9 +84,7 @@ class Row:
     knob: str
     value: str
     seconds: float
-    runs: int
     error: float
-    error_spread: float | None = None
     miou: float | None = None
     labelled_miou: float | None = None
     macc: float | None = None
@@ -98,7 +94,7 @@ class Row:
     gain_low: float | None = None
     gain_high: float | None = None
     agreement: float | None = None
-    instances: float | None = None
+    instances: int | None = None
     published: float | None = None
     left_out: tuple[dict[str, Any], ...] = field(default=(), repr=False)
 
@@ -147,8 +143,8 @@ def read_subject(folder: Path) -> Subject:
     return Subject(folder.name, scene, vocabulary, truth)
 
 
-def sweep(subjects: Sequence[Subject], settings: Sequence[Setting], *, seeds: int = 1, progress: bool = True) -> Sweep:
-    """Try all settings on all captures. settings: the default (knobs.DEFAULT) first. seeds: runs of each setting.
+def sweep(subjects: Sequence[Subject], settings: Sequence[Setting], *, progress: bool = True) -> Sweep:
+    """Try all settings on all captures. settings: the default (knobs.DEFAULT) first.
 
     A setting that fails is named in the result and costs no other. Deterministic but for seconds. OgPointcloudError
     where not even the default could be run on any capture.
@@ -160,12 +156,12 @@ def sweep(subjects: Sequence[Subject], settings: Sequence[Setting], *, seeds: in
     with tqdm(total=total, desc="report", dynamic_ncols=True, disable=None if progress else True) as bar:
         for number, subject in enumerate(subjects):
             try:
-                trial = _Trial(subject, seeds)
+                trial = _Trial(subject)
                 for setting in settings:
                     bar.set_postfix_str(f"{subject.name}, {setting.name}")
                     try:
                         rows.append(trial.row(setting))
-                    except Exception as error:  # one setting must not cost the report; the page names it
+                    except Exception as error:  # one setting must not cost the report, which names it
                         if setting == DEFAULT:
                             raise
                         failed[f"{subject.name}, {setting.name}"] = f"{type(error).__name__}: {error}"
@@ -180,26 +176,22 @@ def sweep(subjects: Sequence[Subject], settings: Sequence[Setting], *, seeds: in
 
 
 class _Trial:
-    """One capture while settings are tried on it. What they share is made once."""
+    """One capture while settings are tried on it."""
 
-    def __init__(self, subject: Subject, seeds: int) -> None:
-        self.subject, self.seeds, scene = subject, seeds, subject.scene
-        if needs_tiles(scene, DEFAULT.settings):
+    def __init__(self, subject: Subject) -> None:
+        self.subject = subject
+        if needs_tiles(subject.scene, DEFAULT.settings):
             raise OgPointcloudError(
-                f"{subject.name}: {len(scene.points):,} points take more memory than there is for all settings; "
-                "expected fewer: report on a part of the cloud"
+                f"{subject.name}: {len(subject.scene.points):,} points take more memory than there is for all settings;"
+                " expected fewer: report on a part of the cloud"
             )
         self.warm: set[str] = set()
         self.rows: dict[tuple[FitSettings, int], Row] = {}
         self.default_labels: Labels | None = None
         self._warm_up(DEFAULT.settings)
-        taken = []
-        for _ in range(max(2, seeds)):  # the first reads images and loads code that later fits find in memory
-            journal, start = Journal(progress=False), time.perf_counter()
-            self.prepared = prepare(scene, journal=journal)
-            taken.append(time.perf_counter() - start)
-            self.shared_left_out = tuple(journal.left_out)
-        self.shared_seconds = min(taken)
+        start = time.perf_counter()
+        self.prepared = prepare(subject.scene, journal=Journal(progress=False))
+        self.prepared_seconds = time.perf_counter() - start
 
     def row(self, setting: Setting) -> Row:
         """The row of one setting; settings that several tables name are run once."""
@@ -214,46 +206,31 @@ class _Trial:
             return
         for name, labels, seconds in baseline_labels(self.prepared, self.subject.vocabulary.vectors):
             scores = self._scores(labels)
-            yield Row(self.subject.name, BASELINE, name, self.shared_seconds + seconds, 1, 1 - scores["miou"], **scores)
+            seconds += self.prepared_seconds
+            yield Row(self.subject.name, BASELINE, name, seconds, 1 - scores["miou"], **scores)
 
     def _measured(self, setting: Setting) -> Row:
-        runs = [self._run(setting, seed) for seed in range(self.seeds)]
-        seconds, clouds = [seconds for seconds, _ in runs], [cloud for _, cloud in runs]
-        labels = [self._labels(cloud) for cloud in clouds]
+        settings, scene = setting.settings, self.subject.scene
+        scene = replace(scene, views=scene.views[:: setting.every])
+        self._warm_up(settings)
+        start = time.perf_counter()
+        cloud = fit(scene, settings, progress=False)
+        seconds = time.perf_counter() - start
+        labels = self._labels(cloud)
         if setting == DEFAULT:
-            self.default_labels = labels[0]
-        scores = [self._scores(found) | self._of_instances(c) for found, c in zip(labels, clouds, strict=True)]
-        mean: dict[str, Any] = {name: _mean([score[name] for score in scores]) for name in scores[0]}
-        errors = [1 - score.get("miou", score["agreement"]) for score in scores]
+            self.default_labels = labels
+        scores, agreement = self._scores(labels), self._agreement(cloud)
         return Row(
             capture=self.subject.name,
             knob=setting.knob,
             value=setting.value,
-            seconds=min(seconds),
-            runs=self.seeds,
-            error=float(np.mean(errors)),
-            error_spread=float(np.std(errors, ddof=1)) if len(errors) > 1 else None,
-            left_out=tuple(clouds[0].provenance["left_out"]),
-            **mean,
+            seconds=seconds,
+            error=1 - scores.get("miou", agreement),
+            agreement=agreement,
+            instances=len(cloud.instances),
+            left_out=tuple(cloud.provenance["left_out"]),
+            **scores,
         )
-
-    def _run(self, setting: Setting, seed: int) -> tuple[float, LabelledCloud]:
-        """Seconds of a whole fit, and what it gives."""
-        settings, scene = replace(setting.settings, seed=seed), self.subject.scene
-        scene = replace(scene, views=scene.views[:: setting.every])
-        self._warm_up(settings)
-        start = time.perf_counter()
-        if not self._shares(setting):
-            cloud = fit(scene, settings, progress=False)
-            return time.perf_counter() - start, cloud
-        journal = Journal(progress=False, left_out=list(self.shared_left_out))
-        cloud = fit_prepared(self.prepared, settings, journal)
-        return time.perf_counter() - start + self.shared_seconds, cloud
-
-    def _shares(self, setting: Setting) -> bool:
-        """Whether a setting changes nothing up to the mask table, and can take that over."""
-        same_table = _before_table(setting.settings) == _before_table(DEFAULT.settings)
-        return same_table and setting.every == 1 and setting.settings.mode != "paper"
 
     def _warm_up(self, settings: FitSettings) -> None:
         """Fit two views of a few points in this mode: what they are labelled does not matter."""
@@ -274,15 +251,11 @@ class _Trial:
             return cloud.instance_ids
         return LabelledScene.from_cloud(cloud).chooser.choose(vocabulary.vectors).at(cloud.instance_ids)[0]
 
-    def _of_instances(self, cloud: LabelledCloud) -> dict[str, Any]:
+    def _agreement(self, cloud: LabelledCloud) -> float:
         ids, row_of_point = cloud.instance_ids, self.prepared.surface.row_of_point
         if row_of_point is not None:  # points at one position have one label
             ids = ids[np.unique(row_of_point, return_index=True)[1]]
-        labelling = Labelling(ids, cloud.instances, np.zeros(0, np.int32))
-        return {
-            "agreement": mask_agreement(self.prepared.table, labelling),
-            "instances": float(len(cloud.instances)),
-        }
+        return mask_agreement(self.prepared.table, Labelling(ids, cloud.instances, np.zeros(0, np.int32)))
 
     def _scores(self, labels: Labels) -> dict[str, Any]:
         """mIoU, recall and shares, as Row has them; nothing where the capture does not know its classes."""
@@ -305,19 +278,6 @@ class _Trial:
             gain = miou_interval(called, truth, xyz, spacing, score.classes, less=default)
             found |= {"gain": gain.mean, "gain_low": gain.low, "gain_high": gain.high}
         return found
-
-
-def _before_table(settings: FitSettings) -> tuple[Any, ...]:
-    """All that the mask table depends on (fit.prepare)."""
-    membership = settings.membership
-    see_through = membership.few_views, membership.gap_sizes, membership.front_share
-    return settings.geometry, settings.visibility, settings.memory, settings.tile_points, see_through
-
-
-def _mean(values: Sequence[float | None]) -> float | None:
-    """None where a value is."""
-    known = [value for value in values if value is not None]
-    return float(np.mean(known)) if len(known) == len(values) else None
 
 
 def front(rows: Sequence[Row]) -> list[Row]:

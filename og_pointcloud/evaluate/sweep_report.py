@@ -1,21 +1,18 @@
-"""A sweep to look at: a chart of error against seconds, and an HTML page with it, the table and what was left out."""
+"""A sweep to look at: a chart of error against seconds, and the tables as Markdown, with what was left out."""
 
 from __future__ import annotations
 
-import base64
+import io
 import itertools
 from collections.abc import Iterable, Sequence
-from html import escape
 from pathlib import Path
-from string import Template
 from typing import Any
 
-from og_pointcloud.evaluate.knobs import FORCED
-from og_pointcloud.evaluate.plots import png_bytes, require_matplotlib
+from og_pointcloud.errors import MissingExtraError
 from og_pointcloud.evaluate.sweep import BASELINE, Row, Sweep, front, machine
 from og_pointcloud.formats.atomic import replacing
 
-__all__ = ["chart", "table", "write_page"]
+__all__ = ["require_matplotlib", "table", "write_chart", "write_report"]
 
 SHARES = {
     "mIoU": "miou", "without background": "labelled_miou", "paper": "published", "mAcc": "macc", "unknown": "unknown",
@@ -28,30 +25,32 @@ WIDTH, PANEL_HEIGHT = 11.0, 5.2
 LINEAR_BELOW = 0.01
 """Errors are on a logarithmic axis down to this one, and linear from there to 0."""
 TICKS = (0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1)
-PAGE = Template("""<!doctype html><html lang=en><meta charset=utf-8><title>$title</title><style>
-body { font: 15px/1.5 system-ui, sans-serif; color: #222; max-width: 1120px; margin: 2em auto; padding: 0 1em }
-table { border-collapse: collapse; font-size: 13px; margin: .6em 0 1.4em } th { border-bottom: 1px solid #999 }
-td, th { padding: 2px 10px; text-align: right } td:first-child, th:first-child { text-align: left }
-tr.default td { font-weight: 600 } tr.front td:first-child::after { content: " \\25cf"; color: #2a7 }
-img { width: 100% }
-</style><h1>$title</h1>
-<p>Measured on $machine. Seconds are of a whole fit; compare them within one report; less than a tenth of them is noise.
-A gain whose interval holds 0 may be chance.</p>
-<p><img src="data:image/png;base64,$picture" alt="error against seconds"></p>
-$failed
-$captures
-""")
+FRONT = " *"
+"""Behind the settings of the front, in tables."""
 
 
-def chart(sweep: Sweep) -> bytes:
+def require_matplotlib() -> Any:
+    """The class matplotlib.figure.Figure; MissingExtraError where matplotlib is not installed."""
+    try:
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise MissingExtraError("matplotlib", "report") from error
+    return Figure
+
+
+def write_chart(sweep: Sweep, path: Path) -> Path:
     """A PNG, a panel a capture: error against seconds, both of every row; the default ringed, the front joined, its
-    settings numbered and named beside it."""
+    settings numbered and named beside it. Written whole or not at all."""
     captures = sweep.captures
     figure = require_matplotlib()(figsize=(WIDTH, PANEL_HEIGHT * len(captures)), layout="constrained")
     for axes, capture in zip(figure.subplots(len(captures), squeeze=False).ravel(), captures, strict=True):
         _panel(axes, [row for row in sweep.rows if row.capture == capture])
         axes.set_title(capture, fontsize=11, fontweight="bold", loc="left")
-    return png_bytes(figure)
+    data = io.BytesIO()
+    figure.savefig(data, format="png", dpi=110)
+    with replacing(path) as file:
+        file.write(data.getvalue())
+    return path
 
 
 def _panel(axes: Any, rows: Sequence[Row]) -> None:
@@ -83,70 +82,53 @@ def error_name(rows: Sequence[Row]) -> str:
     return "1 - mIoU" if all(row.miou is not None for row in rows) else "1 - mask agreement (no truth)"
 
 
-def write_page(sweep: Sweep, path: Path, title: str = "Error against run time") -> Path:
-    """The page, whole or not at all; it needs nothing beside itself."""
-    parts = []
+def write_report(sweep: Sweep, path: Path, chart: Path, title: str = "Error against run time") -> Path:
+    """The tables as Markdown, with the chart that lies beside it; written whole or not at all."""
+    parts = [
+        f"# {title}",
+        f"Measured on {machine()}. Seconds are of a whole fit; compare them within one report; less than a tenth of "
+        "them is noise. A gain whose interval holds 0 may be chance.",
+        f"![error against seconds]({chart.name})",
+        *_list("Could not be run", (f"{what}: {why}" for what, why in sweep.failed.items())),
+    ]
     for capture in sweep.captures:
         rows = [row for row in sweep.rows if row.capture == capture]
-        parts.append(f"<h2>{escape(capture)}</h2><p>Error is {error_name(rows)}; a dot marks the front.</p>")
-        parts += [_list("Left out by the default", _left_out(row, rows)) for row in rows if row.is_default]
-        parts.append(_html_table(rows))
-    page = PAGE.substitute(
-        title=escape(title),
-        machine=escape(machine()),
-        picture=base64.b64encode(chart(sweep)).decode(),
-        failed=_list("Could not be run", (f"{what}: {why}" for what, why in sweep.failed.items())),
-        captures="\n".join(parts),
-    )
+        parts += [f"## {capture}", f"Error is {error_name(rows)};{FRONT} marks the front."]
+        for row in rows:
+            if row.is_default:
+                parts += _list("Left out by the default", (f"{one['what']}: {one['why']}" for one in row.left_out))
+        header, *lines = table(rows)
+        parts.append("\n".join(map(_markdown, [header, ["---", *["---:"] * (len(header) - 1)], *lines])))
     with replacing(path) as file:
-        file.write(page.encode())
+        file.write("\n\n".join(parts).encode() + b"\n")
     return path
 
 
-def _list(heading: str, entries: Iterable[str]) -> str:
-    items = "".join(f"<li>{escape(entry)}</li>" for entry in entries)
-    return f"<h3>{heading}</h3><ul>{items}</ul>" if items else ""
+def _list(heading: str, entries: Iterable[str]) -> list[str]:
+    items = [f"- {entry}" for entry in entries]
+    return [f"### {heading}", "\n".join(items)] if items else []
 
 
-def _left_out(default: Row, rows: Sequence[Row]) -> list[str]:
-    """What the default's fit left out, and what that saved and cost, where it was forced back in."""
-    forced = {row.value: row for row in rows if row.knob == FORCED}
-    texts = []
-    for entry in default.left_out:
-        text, back = f"{entry['what']}: {entry['why']}", forced.get(entry.get("key", ""))
-        if back is not None:
-            seconds, error = back.seconds - default.seconds, back.error - default.error
-            text += f". Forced back in: {seconds:+.2f} s, error {error:+.4f}"
-        texts.append(text)
-    return texts
-
-
-def _html_table(rows: Sequence[Row]) -> str:
-    best = {id(row) for row in front(rows)}
-    header, *lines = table(rows)
-    parts = [f"<tr>{''.join(f'<th>{escape(name)}</th>' for name in header)}</tr>"]
-    for row, line in zip(rows, lines, strict=True):
-        marks = ["default"] * row.is_default + ["front"] * (id(row) in best)
-        parts.append(f'<tr class="{" ".join(marks)}">{"".join(f"<td>{escape(cell)}</td>" for cell in line)}</tr>')
-    return f"<table>{''.join(parts)}</table>"
+def _markdown(cells: Sequence[str]) -> str:
+    return f"| {' | '.join(cell.replace('|', '&#124;') for cell in cells)} |"
 
 
 def table(rows: Sequence[Row]) -> list[tuple[str, ...]]:
     """A header, then the cells of each row; without the columns that no row has a figure for."""
     header = ("setting", "seconds", "error", "mIoU less the default's (95 %)", *SHARES, "instances")
-    lines = [_cells(row) for row in rows]
+    best = {id(row) for row in front(rows)}
+    lines = [_cells(row, FRONT if id(row) in best else "") for row in rows]
     filled = [column for column in range(len(header)) if any(line[column] != "-" for line in lines)]
     return [tuple(line[column] for column in filled) for line in (header, *lines)]
 
 
-def _cells(row: Row) -> tuple[str, ...]:
-    error = f"{row.error:.4f}" + ("" if row.error_spread is None else f" ± {row.error_spread:.4f}")
+def _cells(row: Row, mark: str) -> tuple[str, ...]:
     gain = "-"
     if row.gain is not None and not row.is_default:
         gain = f"{row.gain:+.4f} ({row.gain_low:+.4f} to {row.gain_high:+.4f})"
     shares = (getattr(row, name) for name in SHARES.values())
-    instances = "-" if row.instances is None else f"{row.instances:.4g}"
+    instances = "-" if row.instances is None else str(row.instances)
     return (
-        row.name, f"{row.seconds:.2f}", error, gain, *("-" if one is None else f"{one:.4f}" for one in shares),
-        instances,
+        row.name + mark, f"{row.seconds:.2f}", f"{row.error:.4f}", gain,
+        *("-" if one is None else f"{one:.4f}" for one in shares), instances,
     )  # fmt: skip
