@@ -1,9 +1,9 @@
 """How good a proposer's masks are, what a fit makes of them, and what they cost: one row a capture and level.
 
-    python examples/benchmark_masks.py CAPTURE [CAPTURE ...] [--proposer opencv] [--levels medium agreed] [--every N]
+    python examples/benchmark_masks.py CAPTURE [CAPTURE ...] [--proposer opencv] [--levels LEVEL ...] [--every N]
 
 The captures have masks and features of their own. Coverage: for each of these masks the best IoU with a mask of the
-level (agreed: the scale that other views confirm); its mean, and the share over a half. Fit: the own features are
+level; its mean, and the share over a half. Fit: the own features are
 handed to the proposer's masks by overlap (means weighted by shared pixels; masks of which less than half lies in own
 masks get none and are left out), fitted, and scored against ``gt.npz``. Without ``gt.npz`` the last columns are empty.
 """
@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 import og_pointcloud as og
 from og_pointcloud.evaluate.truth import read_truth
-from og_pointcloud.masking.contracts import AGREED, LEVELS, MaskSettings
+from og_pointcloud.masking.contracts import LEVELS, MaskSettings
 from og_pointcloud.masking.make_masks import MasksMade, make_masks
 from og_pointcloud.scene import Scene, View
 from og_pointcloud.text.text_features import read_text_features
@@ -37,7 +37,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("captures", nargs="+", type=Path)
     parser.add_argument("--proposer", default="opencv")
-    parser.add_argument("--levels", nargs="+", default=["medium", AGREED], choices=(*LEVELS, AGREED))
+    parser.add_argument("--levels", nargs="+", default=LEVELS, choices=LEVELS)
     parser.add_argument("--every", type=int, default=1, help="use every N-th image")
     options = parser.parse_args(arguments)
     print(HEADER + FIT_HEADER)
@@ -46,7 +46,7 @@ def main(arguments: list[str] | None = None) -> None:
         for level in options.levels:
             settings = MaskSettings(options.proposer, encoder=None, level=level, every=options.every)
             with tempfile.TemporaryDirectory() as temporary:
-                made = make_masks(folder, settings, temporary, processes=1, say=lambda _: None)
+                made = make_masks(folder, settings, temporary, say=lambda _: None)
                 print(row(scene, folder, made, level), flush=True)
 
 

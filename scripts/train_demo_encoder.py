@@ -42,6 +42,7 @@ from onnx import TensorProto, helper, numpy_helper
 from torch import nn
 from transformers import CLIPTokenizer
 
+from og_pointcloud.masking.contracts import LEVELS
 from og_pointcloud.masking.crops import Crop, Preprocessing, mask_crops
 from og_pointcloud.masking.encode import DEMO_FOLDER, DEMO_SPACE, open_encoder
 from og_pointcloud.masking.levels import settle
@@ -139,7 +140,9 @@ def rendered(seeds: Sequence[int], views: int, processes: int) -> Crops:
 
 def opencv_masks(image: NDArray[np.uint8]) -> list[NDArray[np.bool_]]:
     """The masks of all levels of what OpenCV proposes."""
-    return [mask for level in settle(OpenCVProposer().propose(image)).values() for mask in level.masks()]
+    proposals = OpenCVProposer().propose(image)
+    maps = [settle(proposals, level) for level in LEVELS]
+    return [ids == number for ids in maps for number in range(ids.max() + 1)]
 
 
 def _careless(ids: NDArray[np.uint16], kind: NDArray[np.int64], rng: Random) -> list[NDArray[np.bool_]]:

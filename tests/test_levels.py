@@ -7,7 +7,7 @@ import pytest
 
 from og_pointcloud.errors import SceneError
 from og_pointcloud.masking.contracts import Proposals
-from og_pointcloud.masking.levels import AGREED_PREFERENCE, INSIDE, PREFERENCE, SAME, VISIBLE, settle
+from og_pointcloud.masking.levels import INSIDE, PREFERENCE, SAME, VISIBLE, settle
 
 
 def rectangle(top, left, bottom, right, size=(24, 32)):
@@ -31,7 +31,7 @@ def random_proposals(seed, count=25, size=(24, 32)):
 
 
 def literal(said: Proposals, preference: float):
-    """The rules as written, pixel by pixel and mask by mask: the map of proposal numbers, -1 for none."""
+    """The rules as written, pixel by pixel and mask by mask: -1 for none, and the masks by how good they are."""
     order = sorted(range(len(said)), key=lambda k: (-float(said.scores[k]), said.masks[k].sum(), k))
     kept: list[int] = []
     for k in order:
@@ -70,36 +70,34 @@ def literal(said: Proposals, preference: float):
     for k in used:
         if (result == k).sum() < VISIBLE * said.masks[k].sum():
             result = np.where(result == k, -1 - len(said), result)
-    return np.where(result < 0, -1, result)
-
-
-def shown(level):
-    return np.append(level.proposals, -1)[level.ids]
+    shown = [k for k in kept if (result == k).any()]
+    return sum(((result == k) * (rank + 1) for rank, k in enumerate(shown)), np.full(result.shape, -1))
 
 
 @pytest.mark.parametrize("seed", range(12))
 def test_the_literal_reference(seed):
     said = random_proposals(seed)
-    levels = settle(said)
     for name in PREFERENCE:
-        assert np.array_equal(shown(levels[name]), literal(said, PREFERENCE[name])), name
-        assert np.array_equal(levels[name].scores, said.scores[levels[name].proposals])
+        assert np.array_equal(settle(said, name), literal(said, PREFERENCE[name])), name
 
 
 def test_a_box_of_two_halves_on_three_levels():
     whole, left, right = rectangle(4, 4, 20, 28), rectangle(4, 4, 20, 16), rectangle(4, 16, 20, 28)
-    levels = settle(proposals((whole, 0.8), (left, 0.75), (right, 0.75)))
-    assert np.array_equal(shown(levels["large"]) == 0, whole)
-    assert np.array_equal(shown(levels["medium"]) == 0, whole)
-    assert np.array_equal(shown(levels["small"]) == 1, left)
-    assert np.array_equal(shown(levels["small"]) == 2, right)
+    said = proposals((whole, 0.8), (left, 0.76), (right, 0.75))
+    assert np.array_equal(settle(said, "large") == 0, whole)
+    assert np.array_equal(settle(said, "medium") == 0, whole)
+    assert np.array_equal(settle(said, "small") == 0, left)
+    assert np.array_equal(settle(said, "small") == 1, right)
 
 
 def test_scores_decide_where_masks_overlap():
     a, b = rectangle(0, 0, 10, 20), rectangle(0, 12, 10, 32)
     both = a & b
-    assert (shown(settle(proposals((a, 0.9), (b, 0.5)))["large"])[both] == 0).all()
-    assert (shown(settle(proposals((a, 0.5), (b, 0.9)))["large"])[both] == 1).all()
+    first, second = (settle(proposals((a, x), (b, y)), "large") for x, y in ((0.9, 0.5), (0.5, 0.9)))
+    assert np.array_equal(first == 0, a)
+    assert np.array_equal(first == 1, b & ~both)
+    assert np.array_equal(second == 0, b)
+    assert np.array_equal(second == 1, a & ~both)
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -112,10 +110,11 @@ def test_levels_are_contained_in_one_another_in_a_tree(seed):
         if bottom - top > 4 and right - left > 4:
             middle = int(rng.integers(left + 2, right - 1))
             todo += [(top, left, bottom, middle), (top, middle, bottom, right)]
-    levels = settle(Proposals(np.array(masks), rng.uniform(0.2, 1, len(masks)).astype(np.float32)))
+    said = Proposals(np.array(masks), rng.uniform(0.2, 1, len(masks)).astype(np.float32))
     for finer, coarser in (("small", "medium"), ("medium", "large")):
-        for mask in levels[finer].masks():
-            owners = np.unique(levels[coarser].ids[mask])
+        fine = settle(said, finer)
+        for number in range(fine.max() + 1):
+            owners = np.unique(settle(said, coarser)[fine == number])
             assert len(owners) == 1
             assert owners[0] >= 0
 
@@ -123,23 +122,22 @@ def test_levels_are_contained_in_one_another_in_a_tree(seed):
 def test_the_order_of_proposals_does_not_matter():
     said = random_proposals(3)
     order = np.random.default_rng(0).permutation(len(said))
-    shuffled = settle(Proposals(said.masks[order], said.scores[order]))
-    for name, level in settle(said).items():
-        assert np.array_equal(shown(level), np.append(order, -1)[shown(shuffled[name])])
+    shuffled = Proposals(said.masks[order], said.scores[order])
+    for name in PREFERENCE:
+        assert np.array_equal(settle(said, name), settle(shuffled, name))
 
 
 def test_a_near_copy_is_one_mask_the_better_scored():
     a, b = rectangle(2, 2, 20, 20), rectangle(2, 2, 20, 21)
-    assert settle(proposals((a, 0.5), (b, 0.6)))["large"].proposals.tolist() == [1]
+    assert np.array_equal(settle(proposals((a, 0.5), (b, 0.6)), "large") == 0, b)
 
 
 def test_nothing_and_empty_masks():
-    none = settle(Proposals(np.zeros((0, 5, 7), bool), np.zeros(0, np.float32)))
-    empty = settle(Proposals(np.zeros((2, 5, 7), bool), np.ones(2, np.float32)))
-    for level in [*none.values(), *empty.values()]:
-        assert level.ids.shape == (5, 7)
-        assert (level.ids == -1).all()
-        assert len(level.proposals) == len(level.masks()) == 0
+    none = Proposals(np.zeros((0, 5, 7), bool), np.zeros(0, np.float32))
+    empty = Proposals(np.zeros((2, 5, 7), bool), np.ones(2, np.float32))
+    for name in PREFERENCE:
+        for said in (none, empty):
+            assert np.array_equal(settle(said, name), np.full((5, 7), -1))
 
 
 def test_proposals_are_checked():
@@ -147,10 +145,3 @@ def test_proposals_are_checked():
         Proposals(np.zeros((2, 3, 4), np.uint8), np.ones(2, np.float32))
     with pytest.raises(SceneError, match="a finite one each"):
         Proposals(np.zeros((2, 3, 4), bool), np.full(2, np.nan, np.float32))
-
-
-def test_other_preferences_give_other_levels():
-    said = random_proposals(5)
-    levels = settle(said, preferences=AGREED_PREFERENCE)
-    assert list(levels) == ["agreed"]
-    assert np.array_equal(shown(levels["agreed"]), literal(said, AGREED_PREFERENCE["agreed"]))

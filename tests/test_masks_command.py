@@ -19,7 +19,6 @@ from scenes import write_image, write_ply
 from og_pointcloud.cli import main
 from og_pointcloud.errors import OgPointcloudError, SceneError
 from og_pointcloud.formats.capture import read_capture
-from og_pointcloud.masking import worker
 from og_pointcloud.masking.make_masks import PREVIEW_NAME, WORK_FOLDER, MaskSettings, make_masks
 
 ALONE = MaskSettings(encoder=None)
@@ -86,81 +85,16 @@ def test_the_demo_encoder_gives_the_features(tmp_path):
     assert np.allclose(np.linalg.norm(features, axis=1), 1, atol=1e-2)
 
 
-def test_two_processes_give_the_same_files(tmp_path):
+def test_images_side_by_side_give_the_same_files(tmp_path, monkeypatch):
     world = make_capture(tmp_path / "c")
-    make_masks(tmp_path / "c", ALONE, tmp_path / "one", say=silent)
-    make_masks(tmp_path / "c", ALONE, tmp_path / "two", say=silent, processes=2)
-    for name in world.names:
-        assert (tmp_path / "one" / "masks" / f"{name}.png").read_bytes() == (
-            tmp_path / "two" / "masks" / f"{name}.png"
-        ).read_bytes()
+    for cores, name in ((1, "one"), (3, "three")):
+        monkeypatch.setattr(os, "cpu_count", lambda cores=cores: cores)
+        make_masks(tmp_path / "c", MaskSettings(), tmp_path / name, say=silent)
+    for name in ("mask_features.npz", *(f"masks/{name}.png" for name in world.names)):
+        assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "three" / name).read_bytes()
 
 
-def make_turned_capture(folder: Path, count=4):
-    """A wall with two things, looked at from places side by side."""
-    world = make_world(count=count)
-    world.quaternions[:] = (1, 0, 0, 0)
-    world.translations[:] = [(0.3 * k, 0, 4) for k in range(count)]
-    x, y = np.meshgrid(np.linspace(-3, 3, 90), np.linspace(-2, 2, 60))
-    world.xyz = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
-    world.rgb = np.zeros(world.xyz.shape, np.uint8)
-    (folder / "images").mkdir(parents=True)
-    write_transforms(folder, world, ply_file_path="points.ply")
-    write_ply(folder / "points.ply", world.xyz, world.rgb)
-    for k, name in enumerate(world.names):
-        (folder / "images" / f"{name}.png").write_bytes(plain(k, scenery(5 * k)))
-    return world
-
-
-AGREED = MaskSettings(encoder=None, level="agreed")
-
-
-@pytest.mark.parametrize("processes", [1, 2])
-def test_masks_that_other_views_confirm(tmp_path, processes):
-    make_turned_capture(tmp_path / "c")
-    said: list[str] = []
-    make_masks(tmp_path / "c", AGREED, say=said.append, processes=processes)
-    confirmed = next(text for text in said if "which confirm them by" in text)
-    assert float(confirmed.split("confirm them by ")[1].split()[0]) > 0.4  # one thing moves with the wall, one does not
-    for k, view in enumerate(read_capture(tmp_path / "c").views):
-        ids, thing = view.mask_map(), (scenery(5 * k) == (40, 40, 210)).all(axis=2)
-        found = ids == np.bincount(ids[thing] + 1).argmax() - 1
-        assert (found & thing).sum() / (found | thing).sum() > 0.7
-    assert not (tmp_path / "c" / WORK_FOLDER).exists()
-    make_masks(tmp_path / "c", AGREED, say=said.append)
-    assert "nothing to do" in said[-1]
-
-
-def test_two_passes_killed_after_the_first_go_on(tmp_path, monkeypatch):
-    make_turned_capture(tmp_path / "c")
-    make_masks(tmp_path / "c", AGREED, tmp_path / "whole", say=silent)
-
-    def killed(*_):
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch:
-        patch.setattr(worker, "_kept_proposals", killed)
-        with pytest.raises(KeyboardInterrupt):
-            make_masks(tmp_path / "c", AGREED, say=silent)
-    made = make_masks(tmp_path / "c", AGREED, say=silent)
-    assert made.done_before == 4
-    for file in sorted((tmp_path / "whole" / "masks").glob("*.png")):
-        assert (tmp_path / "c" / "masks" / file.name).read_bytes() == file.read_bytes()
-
-
-def test_nothing_to_agree_with(tmp_path):
-    make_turned_capture(tmp_path / "one", 1)
-    said: list[str] = []
-    assert make_masks(tmp_path / "one", AGREED, say=said.append).masks >= 2
-    assert any("0 of " in text and "proposals were seen by other views" in text for text in said)
-    make_turned_capture(tmp_path / "c", 2)
-    (tmp_path / "c" / "points.ply").unlink()
-    with pytest.raises(SceneError, match="points"):
-        make_masks(tmp_path / "c", AGREED, say=silent)
-
-
-@pytest.mark.parametrize("processes", [1, 2])
-def test_images_that_are_all_done_are_only_assembled(tmp_path, monkeypatch, processes):
+def test_images_that_are_all_done_are_only_assembled(tmp_path, monkeypatch):
     """A run that ended between its last image and `assemble`."""
     world = make_capture(tmp_path / "c")
     make_masks(tmp_path / "c", ALONE, tmp_path / "whole", say=silent)
@@ -169,7 +103,7 @@ def test_images_that_are_all_done_are_only_assembled(tmp_path, monkeypatch, proc
         with pytest.raises(KeyboardInterrupt):
             make_masks(tmp_path / "c", ALONE, say=silent)
     assert not (tmp_path / "c" / "masks").exists()
-    made = make_masks(tmp_path / "c", ALONE, say=silent, processes=processes)
+    made = make_masks(tmp_path / "c", ALONE, say=silent)
     assert made.done_before == made.images == 4
     for name in world.names:
         assert np.array_equal(ids_of(tmp_path / "c", name), ids_of(tmp_path / "whole", name))
@@ -177,72 +111,6 @@ def test_images_that_are_all_done_are_only_assembled(tmp_path, monkeypatch, proc
 
 def killed(*_):
     raise KeyboardInterrupt
-
-
-@pytest.mark.slow
-def test_a_worker_that_is_killed_is_one_error_and_the_same_command_goes_on(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "own_masks.py").write_text(LAST_WORDS)
-    make_capture(tmp_path / "c", 5)
-    settings = MaskSettings(proposer="python:own_masks:once_killed", encoder=None)
-    with pytest.raises(OgPointcloudError, match=r"ended early .* --processes 1 goes on"):
-        make_masks("c", settings, say=silent, processes=2)
-    made = make_masks("c", settings, say=silent)
-    assert made.images == 5
-    assert made.masks == 5
-
-
-LAST_WORDS = """
-import os, signal
-from pathlib import Path
-import numpy as np
-def once_killed(image):
-    if not Path("killed").exists():
-        Path("killed").touch()
-        os.kill(os.getpid(), signal.SIGKILL)
-    return np.ones(image.shape[:2], int)
-"""
-
-
-@pytest.mark.slow
-def test_workers_end_with_their_parent(tmp_path):
-    (tmp_path / "own_masks.py").write_text(TELLS_ITS_PROCESS)
-    make_capture(tmp_path / "c", 6)
-    parent = subprocess.Popen([sys.executable, "-c", WITH_WORKERS], cwd=tmp_path)
-    deadline = time.monotonic() + 60
-    while len(list(tmp_path.glob("process-*"))) < 2 and time.monotonic() < deadline:
-        time.sleep(0.02)
-    workers = [int(file.name.split("-")[1]) for file in tmp_path.glob("process-*")]
-    os.kill(parent.pid, signal.SIGKILL)
-    parent.wait()
-    assert len(workers) == 2
-    while any(runs(worker) for worker in workers) and time.monotonic() < deadline:
-        time.sleep(0.05)
-    assert not any(runs(worker) for worker in workers)
-
-
-TELLS_ITS_PROCESS = """
-import os, time
-from pathlib import Path
-import numpy as np
-def told(image):
-    Path(f"process-{os.getpid()}").touch()
-    time.sleep(0.5)
-    return np.ones(image.shape[:2], int)
-"""
-WITH_WORKERS = """
-from og_pointcloud.masking.make_masks import MaskSettings, make_masks
-if __name__ == "__main__":
-    make_masks("c", MaskSettings(proposer="python:own_masks:told", encoder=None), processes=2)
-"""
-
-
-def runs(process: int) -> bool:
-    """Whether a process is there and no zombie that nobody has waited for."""
-    try:
-        return Path(f"/proc/{process}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
-    except OSError:
-        return False
 
 
 # Long work -------------------------------------------------------------------------------------------------------
@@ -401,21 +269,6 @@ def test_left_out_images_need_a_folder_and_are_named(tmp_path, capsys):
     assert not (tmp_path / "c" / "masks").exists()
 
 
-def test_views_that_add_nothing_are_left_out(tmp_path):
-    world = make_world(count=9)
-    world.quaternions[:], world.translations[:] = world.quaternions[0], world.translations[0]
-    world.xyz[:] = world.xyz @ np.diag([0.1, 0.1, 0.1]) - world.poses[0, :3, :3].T @ (world.translations[0] - [0, 0, 5])
-    folder = tmp_path / "c"
-    make_capture(folder, 9)
-    write_transforms(folder, world, ply_file_path="points.ply")
-    write_ply(folder / "points.ply", world.xyz, world.rgb)
-    said: list[str] = []
-    made = make_masks(folder, MaskSettings(encoder=None, enough_views=3), tmp_path / "few", say=said.append)
-    assert made.images == 3
-    assert len(made.left_out) == 6
-    assert said[0].startswith("left out: 6 of 9 images")
-
-
 def test_colmap_captures_in_place(tmp_path):
     world = make_world(count=2)
     write_colmap_text(tmp_path / "sparse" / "0", world)
@@ -504,12 +357,11 @@ def test_a_missing_image_and_a_missing_folder(tmp_path):
         make_masks(tmp_path / "none", ALONE, say=silent)
 
 
-@pytest.mark.parametrize("processes", [1, 2])
-def test_a_proposer_that_is_not_there_is_one_error(tmp_path, processes):
+def test_a_proposer_that_is_not_there_is_one_error(tmp_path):
     make_capture(tmp_path / "c", 2)
-    settings = MaskSettings(proposer=f"onnx:{tmp_path / 'none.onnx'},b.onnx", encoder=None)
-    with pytest.raises(OgPointcloudError, match=r"none\.onnx is no file"):
-        make_masks(tmp_path / "c", settings, say=silent, processes=processes)
+    settings = MaskSettings(proposer="onnx:none.onnx", encoder=None)
+    with pytest.raises(OgPointcloudError, match=r"proposer is 'onnx:none\.onnx'; expected opencv"):
+        make_masks(tmp_path / "c", settings, say=silent)
 
 
 OWN = """
@@ -528,15 +380,14 @@ number = 3
 """
 
 
-@pytest.mark.parametrize("processes", [1, 2])
-def test_a_proposer_of_ones_own(tmp_path, monkeypatch, processes):
+def test_a_proposer_of_ones_own(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "own_masks.py").write_text(OWN)
     make_capture(tmp_path / "c", 2)
     settings = MaskSettings(proposer="python:own_masks:halves", encoder=None)
-    assert make_masks("c", settings, "halves", say=silent, processes=processes).masks == 4
+    assert make_masks("c", settings, "halves", say=silent).masks == 4
     settings = MaskSettings(proposer="python:own_masks:Nothing", encoder=None)
-    assert make_masks("c", settings, "nothing", say=silent, processes=processes).masks == 0
+    assert make_masks("c", settings, "nothing", say=silent).masks == 0
     for place, says in {
         "own_masks:number": "'python:own_masks:number' is a int; expected a function",
         "own_masks:none": "no proposer 'python:own_masks:none'",
@@ -546,7 +397,7 @@ def test_a_proposer_of_ones_own(tmp_path, monkeypatch, processes):
     }.items():
         settings = MaskSettings(proposer=f"python:{place}", encoder=None)
         with pytest.raises(OgPointcloudError, match=says):
-            make_masks("c", settings, "out", say=silent, processes=processes)
+            make_masks("c", settings, "out", say=silent)
     assert str(tmp_path) not in sys.path
 
 
@@ -575,20 +426,9 @@ def test_models_lists_and_downloads_nothing(tmp_path, capsys, monkeypatch):
     assert before == sorted(tmp_path.rglob("*"))
 
 
-def test_light_work_takes_a_process_a_core_and_models_take_one(monkeypatch, tmp_path):
+def test_light_work_takes_a_thread_a_core_and_models_take_one(monkeypatch, tmp_path):
     monkeypatch.setattr(os, "cpu_count", lambda: 4)
-    assert [ALONE.processes_for(images) for images in (1, 8, 16, 31, 1000)] == [1, 1, 2, 3, 4]
-    assert MaskSettings(proposer=str(tmp_path)).processes_for(1000) == 4  # a folder of masks
-    assert MaskSettings(proposer="sam:facebook/sam-vit-base").processes_for(1000) == 1
-    assert MaskSettings(encoder="openai/clip-vit-base-patch16").processes_for(1000) == 1
-
-
-def test_processes_find_one_thread_each_and_the_environment_is_as_before(monkeypatch):
-    from og_pointcloud.masking.worker import one_thread_each
-
-    monkeypatch.setenv("OMP_NUM_THREADS", "7")
-    monkeypatch.delenv("OPENBLAS_NUM_THREADS", raising=False)
-    before = dict(os.environ)
-    with one_thread_each():
-        assert os.environ["OMP_NUM_THREADS"] == os.environ["OPENBLAS_NUM_THREADS"] == "1"
-    assert dict(os.environ) == before
+    assert ALONE.threads == 4
+    assert MaskSettings(proposer=str(tmp_path)).threads == 4  # a folder of masks
+    assert MaskSettings(proposer="sam:facebook/sam-vit-base").threads == 1
+    assert MaskSettings(encoder="openai/clip-vit-base-patch16").threads == 1

@@ -1,16 +1,14 @@
-"""OpenCV's region tree, the automatic grid of prompts, masks that exist already, and what points know of masks."""
+"""OpenCV's region tree, the automatic grid of prompts, and masks that exist already."""
 
 from __future__ import annotations
 
 import json
-import time
 
 import cv2
 import numpy as np
 import pytest
 
 from og_pointcloud.errors import SceneError
-from og_pointcloud.masking.agreement import rendered_depth
 from og_pointcloud.masking.automatic import (
     AutomaticMasks,
     best_boxes,
@@ -23,7 +21,6 @@ from og_pointcloud.masking.contracts import Proposals
 from og_pointcloud.masking.existing import CallableProposer, ExistingMasks, as_proposals, decode_rle, from_ids
 from og_pointcloud.masking.opencv import OpenCVProposer, region_tree
 from og_pointcloud.masking.worker import open_proposer
-from og_pointcloud.scene import Camera
 
 
 def painted(noise=4.0, size=(120, 160)):
@@ -91,13 +88,12 @@ class Oracle:
     """Answers a point with the things there at a quarter of the size: itself, a blur of it, and noise."""
 
     def __init__(self):
-        self.image, self.prompts, self.pause = np.zeros(0), 0, 0.0
+        self.image, self.prompts = np.zeros(0), 0
 
     def set_image(self, image):
         self.image = image[:, :, 0]
 
     def at_points(self, points):
-        time.sleep(self.pause)
         self.prompts += len(points)
         height, width = self.image.shape
         logits, iou = [], []
@@ -121,16 +117,6 @@ def test_the_grid_finds_each_thing_once():
     assert len(proposals) == 4
     for thing in range(4):
         assert max(iou(mask, ids == thing) for mask in proposals.masks) > 0.9
-
-
-def test_the_time_budget_stops_adding_prompts_and_says_so():
-    image = np.repeat((painted()[1] * 60).astype(np.uint8)[:, :, None], 3, axis=2)
-    oracle = Oracle()
-    oracle.pause = 0.05
-    with pytest.warns(UserWarning, match=r"8 of 64 prompts in 0.01 s"):
-        proposals = AutomaticMasks(oracle, "oracle", points_per_side=8, batch=8, seconds_per_image=0.01).propose(image)
-    assert oracle.prompts == 8
-    assert len(proposals) > 0
 
 
 def test_the_grid_lies_in_the_middles_of_cells():
@@ -303,25 +289,3 @@ def test_any_callable():
 def test_unknown_proposers_name_the_known():
     with pytest.raises(SceneError, match="expected opencv, sam:FOLDER"):
         open_proposer("magic")
-
-
-# What points know -----------------------------------------------------------------------------------------------
-
-
-def two_planes():
-    """A square at depth 1 in front of a plane at depth 2, seen straight on by an 80x60 camera."""
-    step = 0.01
-    far = np.stack(np.meshgrid(np.arange(-1, 1, step), np.arange(-0.8, 0.8, step)), -1).reshape(-1, 2)
-    near = far[(np.abs(far) < 0.2).all(axis=1)]
-    xyz = np.concatenate([np.c_[far, np.full(len(far), 2.0)], np.c_[near, np.ones(len(near))]]).astype(np.float32)
-    return xyz, np.full(len(xyz), step, np.float32), Camera(80, 60, 80, 80, 40, 30, np.eye(4))
-
-
-def test_depth_of_points():
-    depth = rendered_depth(*two_planes())
-    assert depth[30, 40] == 1
-    assert depth[30, 5] == 2
-    assert (depth[16:44, 26:54] == 1).all()
-    xyz, spacing, camera = two_planes()
-    behind = xyz * [1, 1, -1]
-    assert (rendered_depth(behind.astype(np.float32), spacing, camera) == 0).all()

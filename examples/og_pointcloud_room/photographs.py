@@ -50,7 +50,7 @@ class FromPhotographs:
 
 
 def label_from_photographs(
-    capture: Path, output: Path, proposer: str = "opencv", seed: int = 0, processes: int | None = None,
+    capture: Path, output: Path, proposer: str = "opencv", seed: int = 0,
     level: str | None = None,
 ) -> FromPhotographs:  # fmt: skip
     """Label a room's capture, as ``write_capture`` wrote it, by the names of its classes as someone types them.
@@ -65,7 +65,7 @@ def label_from_photographs(
     settings = MaskSettings(proposer=proposer, encoder="demo")
     settings = settings if level is None else replace(settings, level=level)
     with stage("masks and features", seconds):
-        made = make_masks(capture, settings, output, processes=processes, overwrite=True)
+        made = make_masks(capture, settings, output, overwrite=True)
     with stage("read the capture", seconds):
         scene = read_capture(output)
     with stage("fit", seconds):

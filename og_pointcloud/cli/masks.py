@@ -9,45 +9,28 @@ import argparse
 import warnings
 from pathlib import Path
 
-from og_pointcloud.cli.common import Parser, add_shared, check_at_least, print_next
-
-ENOUGH_VIEWS = 6
-"""--views auto: an image is left out when nearly all that it sees is seen by so many others."""
+from og_pointcloud.cli.common import Parser, add_shared, print_next
 
 
 def add(parser: Parser) -> None:
     add_shared(parser, "capture")
     parser.add_argument(
         "--proposer", default="opencv", metavar="P",
-        help="opencv (default, no weights), sam:FOLDER, sam:OWNER/MODEL, onnx:ENCODER.onnx,DECODER.onnx,"
+        help="opencv (default, no weights), sam:FOLDER, sam:OWNER/MODEL,"
         " python:MODULE:NAME (your own), or a folder of id PNGs or COCO .json files",
     )  # fmt: skip
     parser.add_argument(
         "--encoder", default="demo", metavar="E",
         help="demo (default; knows the demo room alone), a model's folder, OWNER/MODEL, or none: masks alone",
     )  # fmt: skip
-    parser.add_argument(
-        "--level", default="medium", choices=("small", "medium", "large", "agreed"),
-        help="how much is one mask; agreed: fine masks on the scale that other views confirm, by the cloud",
-    )  # fmt: skip
+    parser.add_argument("--level", default="medium", choices=("small", "medium", "large"), help="how much is one mask")
     parser.add_argument("--every", type=int, default=1, metavar="N", help="use every N-th image; needs -o")
-    parser.add_argument(
-        "--views", choices=("all", "auto"), default="all", help="auto: leave out images that add nothing; needs -o"
-    )
-    parser.add_argument("--seconds-per-image", type=float, metavar="S", help="SAM stops adding prompts after so long")
     parser.add_argument("--longest-side", type=int, default=1024, metavar="PX", help="larger images are shrunk to this")
-    parser.add_argument(
-        "--processes", type=int, metavar="N",
-        help="images worked on side by side (default: a core each, one alone with models of their own)",
-    )  # fmt: skip
     parser.add_argument("--overwrite", action="store_true", help="replace masks of others, or make all again")
-    parser.add_argument("--download", action="store_true", help="fetch a SAM model that is not there yet")
     parser.add_argument("-o", "--output", type=Path, metavar="DIR", help="a capture of its own (default: CAPTURE)")
 
 
 def run(arguments: argparse.Namespace) -> None:
-    check_at_least("--processes", arguments.processes, 1)
-    check_at_least("--seconds-per-image", arguments.seconds_per_image, 0.001)
     from og_pointcloud.masking.make_masks import MaskSettings, make_masks
 
     settings = MaskSettings(
@@ -55,10 +38,7 @@ def run(arguments: argparse.Namespace) -> None:
         encoder=None if arguments.encoder == "none" else arguments.encoder,
         level=arguments.level,
         longest_side=arguments.longest_side,
-        seconds_per_image=arguments.seconds_per_image,
         every=arguments.every,
-        enough_views=ENOUGH_VIEWS if arguments.views == "auto" else None,
-        download=arguments.download,
     )
     if arguments.encoder == "demo":
         warnings.warn(
@@ -66,9 +46,7 @@ def run(arguments: argparse.Namespace) -> None:
             "a model's folder, --encoder FOLDER ('og-pointcloud models' lists them), or none",
             stacklevel=1,
         )
-    made = make_masks(
-        arguments.capture, settings, arguments.output, processes=arguments.processes, overwrite=arguments.overwrite
-    )
+    made = make_masks(arguments.capture, settings, arguments.output, overwrite=arguments.overwrite)
     print(
         f"{made.masks} masks in {made.images} images ({made.seconds:.1f} s, {made.done_before} images done before), "
         f"feature space {made.feature_space}"

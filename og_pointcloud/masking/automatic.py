@@ -1,14 +1,11 @@
 """Everything in an image by a model that answers points: a grid of prompts, and of its answers the good ones once.
 
 After segment-anything's automatic generator: masks with a low predicted IoU or an unstable border are dropped, of
-masks with nearly the same box the best stays, small holes are filled and small islands removed. Where there is a time
-budget, prompts come in an order that covers the image evenly at any moment.
+masks with nearly the same box the best stays, small holes are filled and small islands removed.
 """
 
 from __future__ import annotations
 
-import time
-import warnings
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -44,7 +41,6 @@ class AutomaticMasks:
     points_per_side: of the grid. batch: prompts at once. least_iou, least_stability: below, a mask is dropped.
     stability_offset: logits by which the border is moved. same_box: box IoU from which two masks are one.
     speck_share: holes and islands of less of the image go.
-    seconds_per_image: no prompt is begun after so long; None: no limit. Encoding counts, and is never cut short.
     """
 
     predictor: PointPredictor
@@ -56,24 +52,14 @@ class AutomaticMasks:
     stability_offset: float = 1.0
     same_box: float = 0.7
     speck_share: float = 1e-4
-    seconds_per_image: float | None = None
 
     def propose(self, image: NDArray[np.uint8]) -> Proposals:
-        """image: (H, W, 3) uint8 RGB. Warns where the time did not suffice for all prompts."""
-        deadline = np.inf if self.seconds_per_image is None else time.perf_counter() + self.seconds_per_image
+        """image: (H, W, 3) uint8 RGB."""
         height, width = image.shape[:2]
         points = grid(self.points_per_side, width, height)
         self.predictor.set_image(image)
-        kept: list[tuple[Floats, Floats]] = []
-        for first in range(0, len(points), self.batch):
-            if first and time.perf_counter() > deadline:
-                warnings.warn(
-                    f"{self.name}: {first} of {len(points)} prompts in {self.seconds_per_image:g} s; small things may "
-                    "be missing: allow more seconds per image",
-                    stacklevel=2,
-                )
-                break
-            kept.append(self._good(*self.predictor.at_points(points[first : first + self.batch])))
+        batches = (points[first : first + self.batch] for first in range(0, len(points), self.batch))
+        kept = [self._good(*self.predictor.at_points(batch)) for batch in batches]
         logits, scores = (np.concatenate(parts) for parts in zip(*kept, strict=True))
         best = best_boxes(mask_boxes(logits > 0), scores, self.same_box)
         masks = np.zeros((len(best), height, width), np.bool_)
@@ -92,10 +78,9 @@ class AutomaticMasks:
 
 
 def grid(per_side: int, width: int, height: int) -> Floats:
-    """(per_side^2, 2) points x, y in the middles of equal cells, shuffled the same way every time."""
+    """(per_side^2, 2) points x, y in the middles of equal cells."""
     at = (np.arange(per_side) + 0.5) / per_side
-    points = np.stack(np.meshgrid(at * width, at * height), axis=-1).reshape(-1, 2).astype(np.float32)
-    return points[np.random.default_rng(0).permutation(len(points))]
+    return np.stack(np.meshgrid(at * width, at * height), axis=-1).reshape(-1, 2).astype(np.float32)
 
 
 def stability(logits: Floats, offset: float) -> Floats:

@@ -12,14 +12,10 @@ from numpy.typing import NDArray
 
 from og_pointcloud.errors import OgPointcloudError, SceneError
 
-__all__ = ["AGREED", "LEVELS", "MaskEncoder", "MaskProposer", "MaskSettings", "Proposals"]
+__all__ = ["LEVELS", "MaskEncoder", "MaskProposer", "MaskSettings", "Proposals"]
 
 LEVELS = ("small", "medium", "large")
 """How much is one mask, as SAM and LangSplat call it."""
-AGREED = "agreed"
-"""The level on which other views confirm proposals (`agreement`)."""
-IMAGES_A_PROCESS = 8
-"""A process takes a second or two to begin: with fewer images each it saves nothing."""
 
 
 @dataclass(frozen=True)
@@ -76,32 +72,27 @@ class MaskSettings:
     """How masks are made; what changes one of these starts anew.
 
     proposer: see `worker.open_proposer`. encoder: see `encode.open_encoder`; None: masks alone, with zero features.
-    level: small, medium or large; or agreed: all images are proposed for first, and proposals count by how far other
-    views confirm them (`agreement`), which needs the cloud.
+    level: small, medium or large (`levels.PREFERENCE`).
     longest_side: larger images are shrunk to this; masks have the shrunk size.
-    seconds_per_image: where SAM stops adding prompts.
-    every: of so many images one is used. enough_views: images are left out whose content so many others show.
+    every: of so many images one is used.
     """
 
     proposer: str = "opencv"
     encoder: str | None = "demo"
     level: str = "medium"
     longest_side: int = 1024
-    seconds_per_image: float | None = None
     every: int = 1
-    enough_views: int | None = None
-    download: bool = False
 
     def __post_init__(self) -> None:
-        if self.level not in (*LEVELS, AGREED):
-            raise OgPointcloudError(f"mask level is '{self.level}'; expected one of {', '.join(LEVELS)}, {AGREED}")
+        if self.level not in LEVELS:
+            raise OgPointcloudError(f"mask level is '{self.level}'; expected one of {', '.join(LEVELS)}")
         if self.every < 1 or self.longest_side < 16:
             raise OgPointcloudError(
                 f"every is {self.every} and longest_side {self.longest_side}; expected at least 1 and 16"
             )
 
-    def processes_for(self, images: int) -> int:
-        """How many processes to use where nobody says: a core each, but one alone for models that fill memory and
-        cores by themselves."""
+    @property
+    def threads(self) -> int:
+        """Images worked on side by side: one a core, but one alone with models that fill memory and cores."""
         light = (self.proposer == "opencv" or Path(self.proposer).is_dir()) and self.encoder in (None, "demo")
-        return min(os.cpu_count() or 1, max(1, images // IMAGES_A_PROCESS)) if light else 1
+        return (os.cpu_count() or 1) if light else 1

@@ -1,4 +1,4 @@
-"""Overlapping proposals -> one id map per level: small, medium and large; and agreed, where other views were asked.
+"""Overlapping proposals -> one id map, on a level: small, medium or large.
 
 Proposals that nearly coincide become one, the better scored. What lies inside another is its child: a forest. A level
 is a cut through the forest: a mask is used instead of its parts where its area times its score is more than what the
@@ -12,20 +12,15 @@ size after one pass.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud.masking.contracts import AGREED, Proposals
+from og_pointcloud.masking.contracts import Proposals
 
-__all__ = ["AGREED_PREFERENCE", "PREFERENCE", "Level", "settle"]
+__all__ = ["PREFERENCE", "settle"]
 
 PREFERENCE = {"small": 1.6, "medium": 1.0, "large": 0.6}
 """Level -> how often the parts of a mask count: more prefers parts, less prefers wholes."""
-AGREED_PREFERENCE = {AGREED: 2.0}
-"""The same for scores of `agreement`: wholes agree more than parts, whose borders are more of them."""
 SAME = 0.8
 """Two masks whose intersection over union is more are one."""
 INSIDE = 0.9
@@ -34,38 +29,18 @@ VISIBLE = 0.3
 """A mask of which better ones leave less than this part is left out."""
 
 
-@dataclass(frozen=True)
-class Level:
-    """One id map. ids: (H, W) int32, -1 outside every mask, else 0..K-1. proposals: (K,) int32, where each is in the
-    proposals. scores: (K,) float32."""
-
-    ids: NDArray[np.int32]
-    proposals: NDArray[np.int32]
-    scores: NDArray[np.float32]
-
-    def masks(self) -> NDArray[np.bool_]:
-        """(K, H, W): the masks that the map shows."""
-        return self.ids == np.arange(len(self.proposals), dtype=np.int32)[:, None, None]
-
-
-def settle(proposals: Proposals, preferences: Mapping[str, float] = PREFERENCE) -> dict[str, Level]:
-    """A map for each level of `PREFERENCE`, or of other preferences; the same input gives the same maps."""
+def settle(proposals: Proposals, level: str = "medium") -> NDArray[np.int32]:
+    """(H, W) int32: -1 outside every mask of this level of `PREFERENCE`, else 0..K-1, the best scored mask first."""
     atom_of_pixel, member, area_px = _atoms(proposals.masks)
     order = np.lexsort((member @ area_px, -proposals.scores.astype(np.float64)))  # the better, then the smaller
     member, scores = member[order], proposals.scores[order].astype(np.float64)
     shared_px = (member * area_px) @ member.T.astype(np.float64)
     kept = _distinct(shared_px)
-    member, scores, order, shared_px = member[kept], scores[kept], order[kept], shared_px[np.ix_(kept, kept)]
-    parent = _parents(shared_px)
-    levels = {}
-    for level, preference in preferences.items():
-        used = _cut(np.diag(shared_px) * scores, parent, preference)
-        owner = _owners(member, area_px, used)
-        shown, ids = np.unique(owner, return_inverse=True)
-        ids = (ids - (shown[:1] < 0).sum()).astype(np.int32)
-        chosen = order[shown[shown >= 0]]
-        levels[level] = Level(ids[atom_of_pixel], chosen.astype(np.int32), proposals.scores[chosen])
-    return levels
+    member, scores, shared_px = member[kept], scores[kept], shared_px[np.ix_(kept, kept)]
+    used = _cut(np.diag(shared_px) * scores, _parents(shared_px), PREFERENCE[level])
+    shown, ids = np.unique(_owners(member, area_px, used), return_inverse=True)
+    ids = ids - (shown[:1] < 0).sum()  # -1, where there is one, is the first of the owners
+    return ids.astype(np.int32)[atom_of_pixel]
 
 
 def _atoms(masks: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.bool_], NDArray[np.float64]]:

@@ -1,4 +1,4 @@
-"""Photographs -> masks and mask features in a capture folder: resumable, on several cores, nothing half-written.
+"""Photographs -> masks and mask features in a capture folder: resumable, nothing half-written.
 
 What each image gives is first an atomic file of its own in ``masks.work/``; when all are there they become ``masks/``
 with ``mask_features.npz``, and the folder goes. Killed at any moment, the same command goes on behind the last image;
@@ -29,19 +29,13 @@ from og_pointcloud.formats.images import require_cv2
 from og_pointcloud.formats.langsplat import LANGUAGE_FEATURES_FOLDER
 from og_pointcloud.formats.mask_files import FEATURES_NAME, MASKS_FOLDER
 from og_pointcloud.formats.nerfstudio import TRANSFORMS_NAMES
-from og_pointcloud.masking.agreement import ProposedPoints, agreement, rescored
-from og_pointcloud.masking.contracts import AGREED, MaskSettings
-from og_pointcloud.masking.photographs import (
-    Photograph,
-    choose_by_coverage,
-    read_photographs,
-    write_contact_sheet,
-)
+from og_pointcloud.masking.contracts import MaskSettings
+from og_pointcloud.masking.photographs import Photograph, read_photographs, write_contact_sheet
 from og_pointcloud.masking.worker import ImageTask, read_work, results
 
 __all__ = ["MaskSettings", "MasksMade", "make_masks"]
 
-VERSION = 2
+VERSION = 3
 """Counts changes of what an image's work file holds; files of another version are made again."""
 WORK_FOLDER = "masks.work"
 MADE_NAME = "made.json"
@@ -71,7 +65,6 @@ def make_masks(
     settings: MaskSettings | None = None,
     output: str | os.PathLike[str] | None = None,
     *,
-    processes: int | None = None,
     overwrite: bool = False,
     say: Say = lambda text: print(text, file=sys.stderr, flush=True),
 ) -> MasksMade:
@@ -79,7 +72,6 @@ def make_masks(
 
     output: where they go; None: into the capture. Another folder becomes a capture of its own: poses of the images that
     are used, and links to everything else. It is needed where images are left out.
-    processes: images worked on side by side; None: `MaskSettings.processes_for`.
     overwrite: replace masks that were not made here, and make again what is complete.
     Raises SceneError where images are broken (after the others are done and kept), and OgPointcloudError where masks
     that were not made here would be overwritten.
@@ -89,7 +81,7 @@ def make_masks(
     target = capture if output is None else Path(output)
     separate = target.resolve() != capture.resolve()
     photographs = read_photographs(capture)
-    chosen = _chosen(capture, photographs, settings)
+    chosen = photographs[:: settings.every]
     left_out = _left_out(photographs, chosen, separate, say)
     _refuse_foreign(target, overwrite)
     work = target / WORK_FOLDER / _fingerprint(settings)
@@ -101,7 +93,7 @@ def make_masks(
     else:
         work.mkdir(parents=True, exist_ok=True)
         done_before = sum(task.work_file.exists() for task in tasks)
-        made = _make(capture, target, settings, tasks, processes or settings.processes_for(len(tasks)), key, say)
+        made = _make(target, settings, tasks, key, say)
     if separate:
         _make_capture_of(capture, target, chosen)  # poses may be new
     space = str(made.get("feature_space", UNKNOWN_SPACE))
@@ -109,13 +101,6 @@ def make_masks(
 
 
 # Which images, and what of them is done -----------------------------------------------------------------------------
-
-
-def _chosen(capture: Path, photographs: Sequence[Photograph], settings: MaskSettings) -> list[Photograph]:
-    chosen = list(photographs[:: settings.every])
-    if settings.enough_views is None:
-        return chosen
-    return [chosen[index] for index in choose_by_coverage(capture, chosen, settings.enough_views)]
 
 
 def _left_out(
@@ -136,7 +121,7 @@ def _left_out(
 
 def _fingerprint(settings: MaskSettings) -> str:
     """Work files of other settings are not taken up. Which images are used does not matter to an image."""
-    of_image = replace(settings, every=1, enough_views=None, download=False)
+    of_image = replace(settings, every=1)
     given = Path(settings.proposer)
     masks = [_state(file) for file in sorted(given.rglob("*"))] if given.is_dir() else []
     return _digest([VERSION, asdict(of_image), masks])
@@ -159,14 +144,9 @@ def _digest(value: list[Any]) -> str:
 # The work -----------------------------------------------------------------------------------------------------------
 
 
-def _make(
-    capture: Path, target: Path, settings: MaskSettings, tasks: Sequence[ImageTask], processes: int, key: str, say: Say
-) -> dict[str, Any]:
-    """Masks of all images, in one pass or two, and what the record says of them."""
-    _work_through(capture, settings, tasks, processes, target, say)
-    if settings.level == AGREED:
-        tasks = _confirmed(tasks, say)
-        _work_through(capture, settings, tasks, processes, target, say)
+def _make(target: Path, settings: MaskSettings, tasks: Sequence[ImageTask], key: str, say: Say) -> dict[str, Any]:
+    """Masks of all images, and what the record says of them."""
+    _work_through(settings, tasks, target, say)
     masks, space = _assemble(target, settings, tasks)
     made = {"key": key, "masks": masks, "feature_space": space}
     _write_made(target, settings, tasks, **made)
@@ -174,16 +154,14 @@ def _make(
     return made
 
 
-def _work_through(
-    capture: Path, settings: MaskSettings, tasks: Sequence[ImageTask], processes: int, target: Path, say: Say
-) -> None:
+def _work_through(settings: MaskSettings, tasks: Sequence[ImageTask], target: Path, say: Say) -> None:
     """Do what is not done yet; a preview after the first images, and now and then a word on the time that remains."""
     waiting = [task for task in tasks if not task.work_file.exists()]
     if len(waiting) < len(tasks):
         say(f"{len(tasks) - len(waiting)} of {len(tasks)} images are done already")
     broken, start = [], time.perf_counter()
     last_said, preview_at = start, min(PREVIEW_IMAGES, len(tasks))
-    for count, (task, wrong) in enumerate(results(capture, settings, waiting, processes), 1):
+    for count, (task, wrong) in enumerate(results(settings, waiting), 1):
         if wrong:
             broken.append(wrong)
             say(f"broken: {wrong}")
@@ -206,35 +184,8 @@ def _work_through(
         )
 
 
-def _confirmed(tasks: Sequence[ImageTask], say: Say) -> list[ImageTask]:
-    """Tasks of the second pass over images whose proposals are all there, with scores from all views' agreement."""
-    start = time.perf_counter()
-    kept = [read_work(task.work_file, "scores", "seen", "inside") for task in tasks]
-    views = [ProposedPoints(work["seen"], work["inside"]) for work in kept]
-    agreed = agreement(views, 1 + max((int(view.seen.max(initial=-1)) for view in views), default=0))
-    known = np.concatenate(agreed)
-    known = known[~np.isnan(known)]
-    usual = float(np.median(known)) if len(known) else 1.0
-    say(
-        f"{len(known)} of {sum(map(len, agreed))} proposals were seen by other views, which confirm them by "
-        f"{usual:.2f} (median IoU; {(time.perf_counter() - start) / len(tasks):.2f} s an image)"
-    )
-    everyone = _digest(sorted(task.work_file.name for task in tasks))
-    return [
-        ImageTask(
-            task.photograph,
-            task.work_file.with_name(f"{task.work_file.stem}.{everyone}.npz"),
-            task.work_file,
-            rescored(work["scores"], found, usual),
-        )
-        for task, work, found in zip(tasks, kept, agreed, strict=True)
-    ]
-
-
 def _write_preview(target: Path, settings: MaskSettings, tasks: Sequence[ImageTask]) -> None:
-    pictures = [
-        (task.photograph.read(settings.longest_side), read_work(task.work_file, "ids")["ids"]) for task in tasks
-    ]
+    pictures = [(task.photograph.read(settings.longest_side), read_work(task.work_file)["ids"]) for task in tasks]
     write_contact_sheet(target / PREVIEW_NAME, pictures)
 
 

@@ -11,15 +11,12 @@ from numpy.typing import NDArray
 
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.atomic import replacing
-from og_pointcloud.formats.capture import find_images, read_geometry, read_poses
+from og_pointcloud.formats.capture import find_images, read_poses
 from og_pointcloud.formats.colors import label_colors
-from og_pointcloud.formats.distortion import Distortion
 from og_pointcloud.formats.images import image_size, read_rgb, require_cv2, same_shape
-from og_pointcloud.formats.poses import in_local_frame
-from og_pointcloud.rendering.coverage import needed_views
-from og_pointcloud.scene import Camera, Points, View
+from og_pointcloud.scene import Camera
 
-__all__ = ["Photograph", "choose_by_coverage", "read_cloud", "read_photographs", "write_contact_sheet"]
+__all__ = ["Photograph", "read_photographs", "write_contact_sheet"]
 
 CELL_WIDTH = 480
 TINT = 0.55
@@ -28,13 +25,12 @@ TINT = 0.55
 @dataclass(frozen=True)
 class Photograph:
     """A posed image. name: its view's. path: as the pose file says. file: where it is. camera: from world coordinates.
-    distortion: None for a pinhole lens; masks are made on the image as it is, and undistorted when they are read."""
+    Masks are made on the image as it is, and undistorted when they are read."""
 
     name: str
     path: str
     file: Path
     camera: Camera
-    distortion: Distortion | None
 
     def read(self, longest_side: int) -> NDArray[np.uint8]:
         """(h, w, 3) uint8 RGB, shrunk so that neither side is longer. Grey, 16-bit and alpha become RGB of 8 bit; EXIF
@@ -58,7 +54,7 @@ def read_photographs(capture: Path) -> tuple[Photograph, ...]:
             "masks are made from images, so copy them there or take them out of the pose file"
         )
     photographs = tuple(
-        Photograph(name, image.path, file, image.camera, image.distortion)
+        Photograph(name, image.path, file, image.camera)
         for name, image, file in zip(poses.names, poses.images, files, strict=True)
         if file is not None
     )
@@ -75,22 +71,6 @@ def _check_size(photograph: Photograph) -> None:
             "same size or a scaled one: fix the width and height of the pose file, or turn the image (EXIF "
             "orientation is ignored, poses are of the pixels as stored)"
         )
-
-
-def read_cloud(capture: Path) -> Points:
-    """The capture's points."""
-    return read_geometry(capture, read_poses(capture))
-
-
-def choose_by_coverage(capture: Path, photographs: Sequence[Photograph], enough: int) -> list[int]:
-    """Indices of the photographs that see what fewer than ``enough`` others see, ascending."""
-    points = read_cloud(capture)
-    nothing = np.zeros((0, 1), np.float32)
-    views = [
-        View(photograph.name, in_local_frame(photograph.camera, points.origin), np.zeros((0, 0), np.int32), nothing)
-        for photograph in photographs
-    ]
-    return needed_views(points.xyz, views, enough)
 
 
 def write_contact_sheet(path: Path, pictures: Sequence[tuple[NDArray[np.uint8], NDArray[np.int32]]]) -> None:

@@ -56,38 +56,32 @@ class Preparation:
     std: tuple[float, ...]
 
 
-def open_sam(
-    name: str | os.PathLike[str], *, seconds_per_image: float | None = None, download: bool = False
-) -> AutomaticMasks:
-    """A proposer from a model's folder or OWNER/MODEL. download: fetch it where it is not there yet; else it must be.
-
-    SceneError where there is none, or it is of another kind.
-    """
-    predictor = SamPredictor(name, download=download)
-    return AutomaticMasks(predictor, f"sam:{name}", seconds_per_image=seconds_per_image)
+def open_sam(name: str | os.PathLike[str]) -> AutomaticMasks:
+    """A proposer from a model's folder or a fetched OWNER/MODEL; SceneError where there is none of SAM's kinds."""
+    return AutomaticMasks(SamPredictor(name), f"sam:{name}")
 
 
 class SamPredictor:
     """A `PointPredictor` on any of the four. On a GPU where torch has one."""
 
-    def __init__(self, name: str | os.PathLike[str], *, download: bool = False) -> None:
+    def __init__(self, name: str | os.PathLike[str]) -> None:
         where = str(Path(name).expanduser()) if Path(name).expanduser().is_dir() else str(name)
         try:
-            self.kind = _known_type(name, _read_json(where, "config.json", download))
+            self.kind = _known_type(name, _read_json(where, "config.json"))
             # A known type is a class of transformers: no code of the folder's (auto_map) is looked at.
             self.model: Any = getattr(transformers, CLASSES[self.kind]).from_pretrained(
-                where, local_files_only=not download, trust_remote_code=False, attn_implementation="sdpa"
+                where, local_files_only=True, trust_remote_code=False, attn_implementation="sdpa"
             )
         except (OSError, ValueError) as error:
             if isinstance(error, SceneError):
                 raise
             raise SceneError(
                 f"no SAM model '{name}' ({str(error).splitlines()[0]:.120}); expected a transformers folder with "
-                "config.json and weights, or a fetched model: --download, or hf download OWNER/MODEL"
+                "config.json and weights, or a fetched model: hf download OWNER/MODEL"
             ) from None
         self.device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
         self.model = self.model.eval().to(self.device)
-        self.preparation = _preparation(where, self.kind, self.model.config, download)
+        self.preparation = _preparation(where, self.kind, self.model.config)
         self.size = (0, 0)
         self.encoded: dict[str, Any] = {}
 
@@ -149,12 +143,12 @@ def _known_type(name: str | os.PathLike[str], config: dict[str, Any] | None) -> 
     return kind
 
 
-def _preparation(where: str, kind: str, config: Any, download: bool) -> Preparation:
+def _preparation(where: str, kind: str, config: Any) -> Preparation:
     """Side from the vision configuration, colours from the preprocessor's file where the model has one."""
     side = config.vision_config.image_size if kind in PADDED else _square_side(config)
     mean, std = HALVES if kind.startswith("sam3") else IMAGENET
-    stated = _read_json(where, "preprocessor_config.json", download)
-    stated = stated or _read_json(where, "processor_config.json", download) or {}
+    stated = _read_json(where, "preprocessor_config.json")
+    stated = stated or _read_json(where, "processor_config.json") or {}
     stated = stated.get("image_processor", stated)
     mean, std = stated.get("image_mean", mean), stated.get("image_std", std)
     return Preparation(int(side), kind in PADDED, tuple(map(float, mean)), tuple(map(float, std)))
@@ -165,12 +159,12 @@ def _square_side(config: Any) -> int:
     return int(side[0] if isinstance(side, (list, tuple)) else side)
 
 
-def _read_json(where: str, name: str, download: bool) -> dict[str, Any] | None:
+def _read_json(where: str, name: str) -> dict[str, Any] | None:
     """A JSON file of the model, None where it has none. ValueError where it is not a JSON object."""
     from transformers.utils.hub import cached_file
 
     file = cached_file(
-        where, name, local_files_only=not download, _raise_exceptions_for_missing_entries=False,
+        where, name, local_files_only=True, _raise_exceptions_for_missing_entries=False,
         _raise_exceptions_for_connection_errors=False,
     )  # fmt: skip
     content = json.loads(Path(file).read_text(encoding="utf-8")) if file is not None else None
