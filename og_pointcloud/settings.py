@@ -113,24 +113,22 @@ class _LossSettings:
 
     width: int = 6
     """Columns of a feature (paper, Sec. 3.1)."""
-    formula: Literal["paper", "authors"] = "paper"
-    """Eq. 1, 2 and 4 as printed, or as the authors' code computes them; the docs of the modules say what differs."""
     normalise: bool = True
     """Read a feature as its direction, mapped to [0, 1] (the authors' code), or as it is (the paper)."""
     intra: bool = True
     """Use the intra-mask smoothing loss (Eq. 1)."""
     inter: bool = True
     """Use the inter-mask contrastive loss (Eq. 2)."""
-    cohesion_weight: float | None = None
-    """Weight of Eq. 1, as a mean over pixels, beside Eq. 2. None: 0.1 with the authors' formula, as in their code; 10
-    with the paper's, which gives none: squared distances are that much smaller."""
+    cohesion_weight: float = 10.0
+    """Weight of Eq. 1, as a mean over pixels, beside Eq. 2. The paper gives none; squared distances are that much
+    smaller than the authors', which they weigh 0.1."""
 
     def __post_init__(self) -> None:
         if self.width < 1:
             raise OgPointcloudError(f"the width of features is {self.width}; expected at least 1, 6 as published")
         if not (self.intra or self.inter):
             raise OgPointcloudError("both losses are off; features need intra (Eq. 1), inter (Eq. 2), or both")
-        if self.cohesion_weight is not None and not self.cohesion_weight >= 0:
+        if not self.cohesion_weight >= 0:
             raise OgPointcloudError(f"cohesion_weight is {self.cohesion_weight}; expected 0 or more")
 
 
@@ -167,9 +165,7 @@ class CodebookSettings:
     positions: bool = True
     """Coarse clusters are of features and positions (Eq. 3), or of features alone."""
     position_weight: float = 2.0
-    """The scene's extent counts as much as this distance of features; or, absolute, one scene unit does (the paper)."""
-    absolute_positions: bool = False
-    """position_weight is per scene unit, as published (1.0 ScanNet, 0.5 LeRF), not per extent."""
+    """The scene's extent counts as much as this distance of features. (Published: per scene unit.)"""
     fair_share: float = 0.2
     """A mask counts in a cluster with this share of the mask, or of what its view shows of the cluster (the authors'
     code: overlap 0.2)."""
@@ -195,23 +191,13 @@ class MatchingSettings:
     """A view's best mask is accepted above this score (the authors' code: 0.2)."""
     min_views: int = 1
     """An instance accepted by fewer views is unknown (the authors' code: 2 on ScanNet, 5 on LeRF)."""
-    integration: Literal["weighted", "equal"] = "weighted"
-    """Accepted masks count by score and by what they show, without outliers; or all alike (the authors' code)."""
     settle: bool = True
-    """All views settle which instance a point is of (membership.py); else it keeps its leaf, as published."""
-    split: bool = True
-    """Two descriptors where the views of an instance fall into two clearly separate groups."""
-    split_views: int = 4
-    """Each group has at least this many views: fewer are apart by chance too often, or are wrong masks."""
-    split_share: float = 0.3
-    """Each group has at least this share of the weight."""
+    """Mode fast: all views settle which instance a point is of (membership.py); else it keeps its leaf, as published.
+    """
 
     def __post_init__(self) -> None:
-        if self.score not in ("both", "iou", "feature") or self.integration not in ("weighted", "equal"):
-            raise OgPointcloudError(
-                f'score "{self.score}" with integration "{self.integration}"; expected "both", "iou" or "feature", and '
-                '"weighted" or "equal"'
-            )
+        if self.score not in ("both", "iou", "feature"):
+            raise OgPointcloudError(f'score is "{self.score}"; expected "both", "iou" or "feature"')
 
 
 @dataclass(frozen=True)
@@ -224,6 +210,8 @@ class PaperSettings(_LossSettings):
     """Shortens all stages alike."""
     formula: Literal["paper", "authors"] = "authors"
     """Eq. 1, 2 and 4 as printed, or as the authors' code computes them; learned/paper.py says what differs."""
+    cohesion_weight: float = 0.1
+    """Weight of Eq. 1 beside Eq. 2 (the authors' code; 0.01 for LeRF's ramen)."""
     scale: float = 0.7
     """Standard deviation of a plain cloud's Gaussians, in point spacings: full ones, as trained Gaussians are. Drawn as
     thin as the mask table wants them, an instance rendered alone would cover no pixel by covered_share."""
@@ -238,9 +226,8 @@ class PaperSettings(_LossSettings):
     k1: int = 64
     """Coarse clusters (paper, Eq. 3)."""
     k2: int = 5
-    """Fine clusters in each coarse one (paper, Eq. 3: 10 or 5)."""
-    adapt_k2: bool = True
-    """Fewer fine clusters where a view shows fewer masks in a coarse one (the authors' code)."""
+    """Fine clusters in each coarse one (paper, Eq. 3: 10 or 5). Formula "authors": fewer where its views show fewer
+    masks in it."""
     position_weight: float = 1.0
     """Scene units of position that count as much as one of feature: absolute, as published (1.0 ScanNet, 0.5 LeRF)."""
     coarse_interval: int = 200
@@ -252,13 +239,7 @@ class PaperSettings(_LossSettings):
     point_pressure: float = 0.5
     """Chance per codebook step that all Gaussians shrink by one random factor, so that hidden ones show (formula
     "authors" only)."""
-    association: Literal["alone", "visible"] = "alone"
-    """Instances are matched as each is rendered alone (paper, Sec. 3.3), or as the mask table shows them."""
-    matching: MatchingSettings = field(
-        default_factory=lambda: MatchingSettings(
-            threshold=0.2, min_views=2, integration="equal", split=False, settle=False
-        )
-    )
+    matching: MatchingSettings = field(default_factory=lambda: MatchingSettings(threshold=0.2, min_views=2))
     """Eq. 5 as the authors' code applies it on ScanNet."""
     cache_bytes: int = 4 << 30
     """Blending weights kept between steps; views beyond are rendered anew."""

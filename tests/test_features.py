@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, replace
 
 import numba
@@ -30,7 +31,6 @@ WIDTH = 6
 CLOSEST = 0.1
 VARIANTS = {
     "paper": FeatureSettings(),
-    "authors": FeatureSettings(formula="authors"),
     "separation alone": FeatureSettings(intra=False),
     "cohesion alone": FeatureSettings(inter=False),
 }
@@ -99,32 +99,20 @@ def literal(scene: Rendered, settings: FeatureSettings, values: NDArray[np.float
         blended = [weights[pixels].sum(dim=0) for pixels in members]
         means = [weight @ f / weight.sum() for weight in blended]
         for mean, weight in zip(means, blended, strict=True):
-            if settings.formula == "authors":
-                apart = ((f - mean).square().sum(dim=1) + features.ROUNDING**2).sqrt()
-                cohesion = cohesion + (weight * apart).sum() / weight.sum() / len(members)
-            else:
-                cohesion = cohesion + (weight * (f - mean).square().sum(dim=1)).sum()
-                size += float(weight.sum())
-        separation = separation + literal_separation(means, settings.formula)
-    objective = settings.inter * separation / views
-    objective = objective + features.cohesion_factor(settings) * cohesion / (
-        views if settings.formula == "authors" else size
-    )
+            cohesion = cohesion + (weight * (f - mean).square().sum(dim=1)).sum()
+            size += float(weight.sum())
+        separation = separation + literal_separation(means)
+    objective = settings.inter * separation / views + settings.intra * settings.cohesion_weight * cohesion / size
     objective.backward()
     assert f.grad is not None
     return objective.item(), f.grad.numpy()
 
 
-def literal_separation(means: list[torch.Tensor], formula: str) -> torch.Tensor | float:
+def literal_separation(means: list[torch.Tensor]) -> torch.Tensor | float:
     """Eq. 2 of one view, pair by pair."""
     m, total = len(means), 0.0
-    for i in range(m):
-        near = [
-            1 / ((means[i] - means[j]).square().sum() + (1 if formula == "authors" else CLOSEST**2)) for j in range(m)
-        ]
-        order = sorted((j for j in range(m) if j != i), key=lambda j: near[j].item())
-        for rank, j in enumerate(order, start=1):
-            total = total + near[j] * (0.1 + 0.9 * rank / (m - 1) if formula == "authors" else 1)
+    for i, j in itertools.permutations(range(m), 2):
+        total = total + 1 / ((means[i] - means[j]).square().sum() + CLOSEST**2)
     return total / (m * (m - 1)) if m > 1 else 0.0
 
 
@@ -202,7 +190,6 @@ def test_product_equals_scipy() -> None:
     "settings",
     [
         FeatureSettings(),
-        FeatureSettings(formula="authors"),
         FeatureSettings(normalise=False),
         FeatureSettings(width=2),
     ],

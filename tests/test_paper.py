@@ -191,7 +191,7 @@ def test_fine_clusters_are_at_most_the_masks_held_and_one(balls: Balls) -> None:
     features = np.random.default_rng(0).random((len(balls.gaussians), 6), np.float32)
     book = paper.train_codebook(balls.gaussians, balls.views, NEAR, features, settings)
     assert len(np.unique(book.leaf[book.leaf >= 0])) == 3
-    fixed = paper.train_codebook(balls.gaussians, balls.views, NEAR, features, replace(settings, adapt_k2=False))
+    fixed = paper.train_codebook(balls.gaussians, balls.views, NEAR, features, replace(settings, formula="paper"))
     assert len(np.unique(fixed.leaf[fixed.leaf >= 0])) == 5
 
 

@@ -125,7 +125,7 @@ def fast(table: MaskTable, surface: Surface, settings: FitSettings, journal: Jou
     with journal.stage("matching"):
         shown = mask_means(table, learned.features)
         evidence = visible_evidence(table, book.leaf, book.leaf_centres, shown)
-        matching = match_masks(table, book.leaf, evidence, settings.matching, settings.association)
+        matching = match_masks(table, book.leaf, evidence, settings.matching)
     if not settings.matching.settle:
         return _leaves_as_instances(table, book.leaf, book.leaf_coarse, matching)
     groups = MaskGroups(matching.mask_instance, len(book.leaf_centres), np.zeros(len(table.mask_view), bool))
@@ -168,11 +168,8 @@ def paper(
     centres = book.centres[used]
     with journal.stage("matching"):
         shown = mask_means(table, trained.features)
-        if options.association == "alone":
-            evidence = alone_evidence(gaussians, views, near, ids, centres, shown, options.covered_share)
-        else:
-            evidence = visible_evidence(table, ids, centres, shown)
-        matching = match_masks(table, ids, evidence, options.matching, settings.association)
+        evidence = alone_evidence(gaussians, views, near, ids, centres, shown, options.covered_share)
+        matching = match_masks(table, ids, evidence, options.matching)
     return _leaves_as_instances(table, ids, (used // options.k2).astype(np.int32), matching)
 
 

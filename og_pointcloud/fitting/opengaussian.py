@@ -34,15 +34,16 @@ from og_pointcloud.journal import LeftOut, left_out_entry
 from og_pointcloud.settings import GeometrySettings
 
 try:
+    from og_pointcloud.fitting.association import directions
     from og_pointcloud.rendering.geometry import neighbourhood
 except ImportError as error:
     raise MissingExtraError("scipy and numba", "fit") from error
 
-__all__ = ["CLUSTERS_NAME", "MIN_OPACITY", "find_result", "read_opengaussian"]
+__all__ = ["read_opengaussian"]
 
-CLUSTERS_NAME = "cluster_lang.npz"
 MIN_OPACITY = 0.1
 """Gaussians less opaque cannot be seen; the authors' ScanNet evaluation leaves out the same ones."""
+ARRAYS = ("leaf_feat", "leaf_score", "occu_count", "leaf_ind")
 MAX_UNPACKED_BYTES = 1 << 31
 """Bytes of the four arrays together; ten million Gaussians and a thousand leaves need 82 MB."""
 
@@ -82,7 +83,7 @@ def read_opengaussian(
         ...
     og_pointcloud.errors.SceneError: no_such_run...
     """
-    ply, clusters = find_result(Path(result), None if cluster_lang is None else Path(cluster_lang))
+    ply, clusters = _find_result(Path(result), None if cluster_lang is None else Path(cluster_lang))
     points = read_gaussian_ply(ply)
     with naming(clusters):
         leaves = _read_leaves(clusters, len(points))
@@ -95,14 +96,14 @@ def read_opengaussian(
         )
     xyz = points.xyz[kept]
     used, ids = np.unique(leaves.of_gaussian[kept], return_inverse=True)
-    settings = GeometrySettings()
+    settings, width = GeometrySettings(), leaves.unit_features.shape[1]
     spacing = float(np.median(neighbourhood(xyz, settings).spacing))
     return LabelledCloud(
         xyz=xyz,
         origin=points.origin,
-        instance_ids=ids.reshape(-1).astype(np.int32),
-        instances=_instances(leaves, used, ids.reshape(-1)),
-        feature_space=feature_space or _usual_space(leaves.unit_features.shape[1]),
+        instance_ids=ids.astype(np.int32),
+        instances=_instances(leaves, used, ids),
+        feature_space=feature_space or (LANGSPLAT_SPACE if width == LANGSPLAT_WIDTH else UNKNOWN_SPACE),
         spacing=spacing,
         reach=settings.reach * spacing,
         rgb=None if points.rgb is None else points.rgb[kept],
@@ -110,7 +111,7 @@ def read_opengaussian(
     )
 
 
-def find_result(result: Path, cluster_lang: Path | None = None) -> tuple[Path, Path]:
+def _find_result(result: Path, cluster_lang: Path | None) -> tuple[Path, Path]:
     """The .ply and the .npz of a run, given its folder or its .ply. SceneError where one is not there."""
     if result.is_dir():
         ply, folders = latest_iteration(result) or result / "point_cloud.ply", [result]
@@ -120,7 +121,7 @@ def find_result(result: Path, cluster_lang: Path | None = None) -> tuple[Path, P
         raise SceneError(f"{ply} is not a file; expected a result folder of OpenGaussian or its point_cloud.ply")
     # The .ply lies in point_cloud/iteration_N/ of the folder that holds the .npz.
     folders += [ply.parent, *ply.resolve().parents[2:3]]
-    choices = [folder / CLUSTERS_NAME for folder in folders] if cluster_lang is None else [cluster_lang]
+    choices = [folder / "cluster_lang.npz" for folder in folders] if cluster_lang is None else [cluster_lang]
     clusters = next((file for file in choices if file.is_file()), None)
     if clusters is None:
         raise SceneError(
@@ -131,77 +132,56 @@ def find_result(result: Path, cluster_lang: Path | None = None) -> tuple[Path, P
 
 
 def _read_leaves(file: Path, gaussians: int) -> _Leaves:
+    """The four arrays, each of plain numbers in its shape; SceneError for anything else."""
     arrays = _arrays(file)
-    features, of_gaussian = arrays["leaf_feat"], arrays["leaf_ind"]
+    features, score, views, of_gaussian = (arrays[name] for name in ARRAYS)
     if features.ndim != 2 or features.dtype.kind != "f":
         raise SceneError(f"leaf_feat is {features.dtype} {features.shape}; expected floats of shape (leaves, width)")
-    score, views = (_per_leaf(name, arrays[name], len(features)) for name in ("leaf_score", "occu_count"))
-    if ((views < 0) | (views >= 1 << 31)).any():
-        raise SceneError(f"occu_count spans {views.min():g}..{views.max():g}; expected counts of views: match again")
-    with np.errstate(over="ignore", invalid="ignore"):
-        length = np.linalg.norm(features.astype(np.float64), axis=1, keepdims=True)
-    if not np.isfinite(length).all():
-        row = int(np.argmin(np.isfinite(length)))
-        raise SceneError(f"leaf_feat row {row} holds NaN or infinity; expected finite numbers: associate again")
-    matched = (length > 0) & (views > 0)[:, None]
+    leaves = len(features)
+    for name, kinds, length in zip(ARRAYS[1:], ("fiu", "fiu", "iu"), (leaves, leaves, gaussians), strict=True):
+        if arrays[name].dtype.kind not in kinds or arrays[name].shape not in ((length,), (length, 1)):
+            raise SceneError(
+                f"{name} is {arrays[name].dtype} {arrays[name].shape}; expected "
+                f"{'numbers' if 'f' in kinds else 'integers'} of shape ({length},): give the two files of one run"
+            )
+    largest = np.finfo(np.float32).max
+    bounds = (-largest, largest), (-largest, largest), (0, (1 << 31) - 1), (0, leaves - 1)
+    for name, (least, most) in zip(ARRAYS, bounds, strict=True):
+        within = (arrays[name].astype(np.float64) >= least) & (arrays[name].astype(np.float64) <= most)
+        if not within.all():
+            row = int(np.argwhere(~within)[0][0])
+            raise SceneError(
+                f"{name} row {row} holds {arrays[name][row]!s:.60}; expected numbers from {least:g} to {most:g}: give "
+                "the two files of one run, or associate again"
+            )
+    unit = directions(features)
     return _Leaves(
-        np.where(matched, features / np.where(length > 0, length, 1), 0).astype(np.float32),
-        np.clip(score, -1, 1).astype(np.float32),
-        views.astype(np.int32),
-        _leaf_of_gaussian(of_gaussian, gaussians, len(features)),
+        np.where((views > 0).reshape(-1, 1), unit, 0).astype(np.float32),
+        np.clip(score, -1, 1).astype(np.float32).reshape(-1),
+        views.astype(np.int32).reshape(-1),
+        of_gaussian.astype(np.int64).reshape(-1),
     )
 
 
 def _arrays(file: Path) -> dict[str, NDArray[Any]]:
     """The four arrays by name. None is unpacked before its size is checked, none is unpickled."""
-    wanted = ("leaf_feat", "leaf_score", "occu_count", "leaf_ind")
     try:
         with zipfile.ZipFile(file) as archive:
             # Saved under names that end in .npy themselves, so that numpy's own ending may follow once more.
             entries = {info.filename.split(".npy")[0]: info for info in archive.infolist()}
-            missing = [name for name in wanted if name not in entries]
+            missing = [name for name in ARRAYS if name not in entries]
+            size = sum(entries[name].file_size for name in ARRAYS if name in entries)
             if missing:
-                raise SceneError(
-                    f"no '{missing[0]}' (it has {', '.join(entries) or 'nothing':.120}); expected {', '.join(wanted)}: "
-                    "name the file that OpenGaussian wrote last"
-                )
-            size = sum(entries[name].file_size for name in wanted)
+                raise SceneError(f"no '{missing[0]}'; expected {', '.join(ARRAYS)}: name the file written last")
             if size > MAX_UNPACKED_BYTES:
                 raise SceneError(f"its arrays unpack to {size} bytes; expected at most {MAX_UNPACKED_BYTES}")
-            return {name: array_from_zip(archive, entries[name]) for name in wanted}
+            return {name: array_from_zip(archive, entries[name]) for name in ARRAYS}
     except SceneError:
         raise
     except (zipfile.BadZipFile, zlib.error, ValueError, EOFError, RuntimeError) as error:
         raise SceneError(
             f"cannot be read as an .npz of plain arrays ({error!s:.120}): associate again or copy it anew"
         ) from None
-
-
-def _per_leaf(name: str, values: NDArray[Any], leaves: int) -> NDArray[np.float64]:
-    """(K,) float64; a trailing axis of length 1 is dropped."""
-    if values.dtype.kind not in "fiu" or values.shape not in ((leaves,), (leaves, 1)):
-        raise SceneError(
-            f"{name} is {values.dtype} {values.shape}; expected numbers of shape ({leaves},), one a row of leaf_feat"
-        )
-    if not np.isfinite(values).all():
-        raise SceneError(f"{name} holds NaN or infinity; expected finite numbers: associate again")
-    return values.reshape(leaves).astype(np.float64)
-
-
-def _leaf_of_gaussian(of_gaussian: NDArray[Any], gaussians: int, leaves: int) -> NDArray[np.int64]:
-    if of_gaussian.shape not in ((gaussians,), (gaussians, 1)) or of_gaussian.dtype.kind not in "iu":
-        raise SceneError(
-            f"leaf_ind is {of_gaussian.dtype} {of_gaussian.shape}; expected integers of shape ({gaussians},), one a "
-            "Gaussian of the .ply: give the two files of one run"
-        )
-    outside = (of_gaussian < 0) | (of_gaussian >= leaves)
-    if outside.any():
-        row = int(np.argmax(outside))
-        raise SceneError(
-            f"leaf_ind sends Gaussian {row} to leaf {of_gaussian.reshape(-1)[row]}; expected 0..{leaves - 1}, a row of "
-            "leaf_feat: give the two files of one run"
-        )
-    return of_gaussian.reshape(gaussians).astype(np.int64)
 
 
 def _instances(leaves: _Leaves, used: NDArray[np.int64], ids: NDArray[np.intp]) -> InstanceTable:
@@ -217,10 +197,6 @@ def _instances(leaves: _Leaves, used: NDArray[np.int64], ids: NDArray[np.intp]) 
         agreement=leaves.score[used],
         visible_area=np.zeros(len(used), np.float32),
     )
-
-
-def _usual_space(width: int) -> str:
-    return LANGSPLAT_SPACE if width == LANGSPLAT_WIDTH else UNKNOWN_SPACE
 
 
 def _provenance(

@@ -232,8 +232,6 @@ def _clusters(
 
 def _scaled_positions(xyz: NDArray[np.float32], settings: CodebookSettings) -> NDArray[np.float32]:
     """Positions in units that compare with features. Outliers neither set the extent nor get clusters of their own."""
-    if settings.absolute_positions:
-        return (settings.position_weight * xyz).astype(np.float32)
     low, middle, high = np.quantile(xyz, [0.05, 0.5, 0.95], axis=0)
     extent = float(np.linalg.norm(high - low)) or float(np.linalg.norm(np.ptp(xyz, axis=0))) or 1.0
     return (settings.position_weight * np.clip((xyz - middle) / extent, -1, 1)).astype(np.float32)

@@ -6,20 +6,16 @@ follow from two sparse products, ``A F`` for the value and ``A' G`` for the grad
 
     objective = mean over views of L_c  +  cohesion_weight * L_s
 
-``L_c``, inter-mask contrast (Eq. 2), over the pairs i != j of a view's m masks. A view without two masks has none.
-    paper    1 / (m (m - 1)) sum of 1 / (d_ij^2 + e^2). The printed form has e = 0 and is infinite where two means
-             meet; here e is `FeatureSettings.closest`, after rounds with e = COARSE_BOUNDS.
-    authors  the same with e = 1; pair ij also counts 0.1 + 0.9 r / (m - 1), r the rank of j by nearness to i. (Their
-             change of these weights late in training has no counterpart without a step count.)
-``L_s``, intra-mask smoothness (Eq. 1), asked of every Gaussian that shows in a mask instead of the rendered pixels. N_i
-is a mask's *blended weight*, the sum of row i of A, so that coverage does not look like feature; P the sum of all N_i.
-    paper    squares ``|f_g - Mbar_i|^2`` weighted by A_ig, over P: ``sum_g c_g |f_g|^2 - sum_i N_i |Mbar_i|^2`` with
-             ``c = A' 1``. By Jensen's inequality it bounds the sum over pixels of ``|M_p - a_p Mbar_i|^2``, a_p the
-             pixel's coverage, which is the printed loss where a_p = 1; it asks for more: each Gaussian agrees, not only
-             each blend.
-    authors  distances not squared: mean over a mask's weight, then over a view's masks, then views. Below ROUNDING the
-             distance is rounded off, as it has no gradient at zero. (Their code takes the distances of pixels that are
-             covered by 0.7 or more: not a function of A.)
+``L_c``, inter-mask contrast (Eq. 2), over the pairs i != j of a view's m masks:
+    1 / (m (m - 1)) sum of 1 / (d_ij^2 + e^2).
+    A view without two masks has none. The printed form has e = 0 and is infinite where two means meet; here e is
+    `FeatureSettings.closest`, after rounds with e = COARSE_BOUNDS.
+``L_s``, intra-mask smoothness (Eq. 1), asked of every Gaussian that shows in a mask instead of the rendered pixels:
+    squares ``|f_g - Mbar_i|^2`` weighted by A_ig, over P:
+    ``sum_g c_g |f_g|^2 - sum_i N_i |Mbar_i|^2`` with ``c = A' 1``.
+    N_i is a mask's *blended weight*, the sum of row i of A, so that coverage does not look like feature; P the sum of
+    all N_i. By Jensen's inequality it bounds the sum over pixels of ``|M_p - a_p Mbar_i|^2``, a_p the pixel's coverage,
+    which is the printed loss where a_p = 1; it asks for more: each Gaussian agrees, not only each blend.
 
 Dividing Eq. 1 by P makes its weight mean the same at any image size; it is else the paper's sum over a random view.
 With raw features the weight sets the features' scale only: Eq. 1 grows as its square, Eq. 2 falls as its square.
@@ -37,22 +33,17 @@ from scipy.sparse import csr_array
 from og_pointcloud.errors import SceneError
 from og_pointcloud.fitting.mask_table import MaskTable
 from og_pointcloud.kernels import njit, prange
-from og_pointcloud.settings import FeatureSettings, PaperSettings
+from og_pointcloud.settings import FeatureSettings
 
 __all__ = [
     "FeatureObjective",
     "LearnedFeatures",
     "Terms",
-    "cohesion_factor",
     "learn_features",
     "raw_gradient",
     "read_features",
 ]
 
-COHESION_WEIGHT = {"paper": 10.0, "authors": 0.1}
-"""Of Eq. 1 where none is set: the authors' own, and one that weighs squares, which are that much smaller, alike."""
-ROUNDING = 1e-3
-"""Distances are rounded off below this where they are not squared: sqrt(d^2 + ROUNDING^2)."""
 COARSE_BOUNDS = (0.71, 0.57, 0.14)
 """Of Eq. 2 in the rounds before the last, which have fewer local minima; directions at right angles read 0.71 apart."""
 COARSE_TOLERANCE = 10.0
@@ -161,12 +152,6 @@ def raw_gradient(raw: NDArray[np.floating], gradient: NDArray[np.floating], norm
     return _raw_gradient(raw, gradient, normalise, _columns(raw))
 
 
-def cohesion_factor(settings: FeatureSettings | PaperSettings) -> float:
-    """What Eq. 1 is multiplied with beside Eq. 2; 0 where it is off."""
-    weight = settings.cohesion_weight
-    return settings.intra * (COHESION_WEIGHT[settings.formula] if weight is None else weight)
-
-
 class FeatureObjective:
     """Value and gradient of the losses over all views, for features as read.
 
@@ -212,35 +197,20 @@ class FeatureObjective:
         return _nearest_pair(self.mask_means(features), self._first) <= MET**2
 
     def terms(self, features: NDArray[np.floating], closest: float) -> Terms:
-        """Both losses at features (k, width) as read; formula "paper": Eq. 2 bounded below the distance ``closest``."""
+        """Both losses at features (k, width) as read, Eq. 2 bounded below the distance ``closest``."""
         settings, views = self.settings, len(self._first) - 1
         features = np.ascontiguousarray(features)
         means = self.mask_means(features)
-        rank_weights = settings.formula == "authors"
-        bound = 1.0 if rank_weights else closest**2
-        separation, pull = _separation(means, self._first, bound, rank_weights)
+        separation, pull = _separation(means, self._first, closest**2)
         separation, pull = float(separation) / views, pull * (settings.inter / views)
-        factor = cohesion_factor(settings)
-        cohesion, own, mean_pull = self._cohesion(features, means)
-        pull = (pull + factor * mean_pull) / self._size[:, None]
-        gradient = _product(*_arrays(self._transposed), pull, _columns(pull)) + factor * own
-        objective = settings.inter * separation + factor * cohesion
-        return Terms(separation, cohesion, objective, gradient.astype(features.dtype))
-
-    def _cohesion(
-        self, features: NDArray[np.floating], means: NDArray[np.float64]
-    ) -> tuple[float, NDArray[np.float64], NDArray[np.float64]]:
-        """Eq. 1, its gradient by features with the means held, and its gradient by the means (masks, width)."""
-        if self.settings.formula == "authors":
-            masks_of_view = np.repeat(np.diff(self._first), np.diff(self._first))
-            share = 1 / (self._size * masks_of_view * (len(self._first) - 1))
-            value, by_mean = _distances(*_arrays(self._weights), features, means, share, _columns(features))
-            by_feature = _distance_gradient(*_arrays(self._transposed), features, means, share, _columns(features))
-            return float(value), by_feature, by_mean
-        total = self._size.sum()
+        factor, total = settings.intra * settings.cohesion_weight, self._size.sum()
         blended = self.seen[self.shown, None] * features
         spread = float((features * blended).sum() - (self._size[:, None] * means**2).sum())
-        return float(spread / total), 2 / total * blended, -2 / total * self._size[:, None] * means
+        cohesion = float(spread / total)
+        pull = (pull + factor * (-2 / total * self._size[:, None] * means)) / self._size[:, None]
+        gradient = _product(*_arrays(self._transposed), pull, _columns(pull)) + factor * (2 / total * blended)
+        objective = settings.inter * separation + factor * cohesion
+        return Terms(separation, cohesion, objective, gradient.astype(features.dtype))
 
 
 def _minimise(
@@ -399,7 +369,7 @@ def _nearest_pair(means, first):  # noqa: ANN001, ANN202
 
 
 @njit(cache=True)
-def _separation(means, first, bound, rank_weights):  # noqa: ANN001, ANN202
+def _separation(means, first, bound):  # noqa: ANN001, ANN202
     """Eq. 2 summed over views, 1 / (d^2 + bound), and its gradient by the means (masks, width)."""
     total = 0.0
     gradient = np.zeros_like(means)
@@ -414,11 +384,8 @@ def _separation(means, first, bound, rank_weights):  # noqa: ANN001, ANN202
                 for c in range(means.shape[1]):
                     square += (means[i, c] - means[j, c]) ** 2
                 near[j - begin] = 1.0 / (square + bound) if j != i else 0.0
-            weight = np.full(count, 1.0 / (count * (count - 1)))
-            if rank_weights:
-                weight[np.argsort(near, kind="mergesort")] *= 0.1 + 0.9 * np.arange(count) / (count - 1)
             for j in range(begin, begin + count):
-                part = near[j - begin] * weight[j - begin]
+                part = near[j - begin] * (1.0 / (count * (count - 1)))
                 total += part
                 slope = -2.0 * part * near[j - begin]
                 for c in range(means.shape[1]):
@@ -426,35 +393,3 @@ def _separation(means, first, bound, rank_weights):  # noqa: ANN001, ANN202
                     gradient[i, c] += turn
                     gradient[j, c] -= turn
     return total, gradient
-
-
-@njit(cache=True, parallel=True)
-def _distances(indptr, indices, data, features, means, share, columns):  # noqa: ANN001, ANN202
-    """Sum over masks of share times the weighted rounded distances to the mean; its gradient by the means."""
-    values = np.zeros(len(means))
-    gradient = np.zeros(means.shape)
-    for mask in prange(len(means)):
-        for e in range(indptr[mask], indptr[mask + 1]):
-            g, square = indices[e], ROUNDING**2
-            for c in range(len(columns)):
-                square += (features[g, c] - means[mask, c]) ** 2
-            distance, weight = np.sqrt(square), share[mask] * data[e]
-            values[mask] += weight * distance
-            for c in range(len(columns)):
-                gradient[mask, c] -= weight * (features[g, c] - means[mask, c]) / distance
-    return values.sum(), gradient
-
-
-@njit(cache=True, parallel=True)
-def _distance_gradient(indptr, indices, data, features, means, share, columns):  # noqa: ANN001, ANN202
-    """The gradient of `_distances` by the features, the means held. The matrix is transposed: a row per Gaussian."""
-    gradient = np.zeros((len(features), len(columns)))
-    for g in prange(len(features)):
-        for e in range(indptr[g], indptr[g + 1]):
-            mask, square = indices[e], ROUNDING**2
-            for c in range(len(columns)):
-                square += (features[g, c] - means[mask, c]) ** 2
-            factor = share[mask] * data[e] / np.sqrt(square)
-            for c in range(len(columns)):
-                gradient[g, c] += factor * (features[g, c] - means[mask, c])
-    return gradient

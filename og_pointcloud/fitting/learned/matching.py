@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.cloud import InstanceTable
-from og_pointcloud.fitting.association import directions, robust_mean
+from og_pointcloud.fitting.association import directions
 from og_pointcloud.fitting.mask_table import (
     FRUSTUM_MARGIN,
     Gaussians,
@@ -26,13 +26,9 @@ from og_pointcloud.fitting.mask_table import (
     weights_by_instance,
 )
 from og_pointcloud.scene import Camera, View
-from og_pointcloud.settings import AssociationSettings, MatchingSettings
+from og_pointcloud.settings import MatchingSettings
 
 __all__ = ["Evidence", "Matching", "alone_evidence", "eq5_scores", "match_masks", "visible_evidence"]
-
-
-SPLIT_ROUNDS = 10
-"""Rounds of 2-means over the views of one instance; two or three settle it."""
 
 
 @dataclass(frozen=True)
@@ -134,42 +130,32 @@ def eq5_scores(evidence: Evidence, mask_view: NDArray[np.int32], settings: Match
 
 
 def match_masks(
-    table: MaskTable,
-    instance_ids: NDArray[np.int32],
-    evidence: Evidence,
-    settings: MatchingSettings,
-    association: AssociationSettings | None = None,
+    table: MaskTable, instance_ids: NDArray[np.int32], evidence: Evidence, settings: MatchingSettings
 ) -> Matching:
     """Accept masks for instances and describe these by what the encoder saw in their masks.
 
     In every view an instance takes the mask with its best score, if that exceeds the threshold; with fewer than
-    ``min_views`` of them it has none. Masks without a feature (zero rows) are evidence, but in no descriptor.
+    ``min_views`` of them it has none. Its descriptor is the mean direction of their features, all alike. Masks without
+    a feature (zero rows) are evidence, but in no descriptor.
     """
     scores = eq5_scores(evidence, table.mask_view, settings)
     masks, owners = _accepted(scores, table.mask_view, settings)
     count = scores.shape[1]
-    weight = np.ones(len(masks))
-    if settings.integration == "weighted":
-        weight = evidence.shared[masks, owners] * scores[masks, owners]
-    deviations = (association or AssociationSettings()).outlier_deviations
-    features = directions(table.mask_features)
-    rows, row_owner = [], []
-    agreement = np.zeros(count, np.float32)
-    for instance in range(count):
-        mine = (owners == instance) & features[masks].any(axis=1)
-        descriptors, agreement[instance] = _describe(features[masks[mine]], weight[mine], deviations, settings)
-        rows += descriptors
-        row_owner += [instance] * len(descriptors)
-    area = np.bincount(owners, evidence.shared[masks, owners], count)
     accepted = np.bincount(owners, minlength=count).astype(np.int32)
+    features = directions(table.mask_features)
+    total = np.zeros((count, features.shape[1]))
+    np.add.at(total, owners, features[masks])
+    described = np.flatnonzero(np.linalg.norm(total, axis=1) > 1e-12)
+    with_feature = np.bincount(owners[features[masks].any(axis=1)], minlength=count)
+    cosines = np.bincount(owners, (features[masks] * directions(total)[owners]).sum(axis=1), count)
     instances = InstanceTable(
-        descriptors=np.array(rows, np.float32).reshape(-1, features.shape[1]),
-        descriptor_instance=np.array(row_owner, np.int32),
+        descriptors=directions(total[described]).astype(np.float32),
+        descriptor_instance=described.astype(np.int32),
         points=np.bincount(instance_ids[instance_ids >= 0], minlength=count).astype(np.int32),
         views=accepted,
         masks=accepted.copy(),
-        agreement=agreement,
-        visible_area=area.astype(np.float32),
+        agreement=(cosines / np.maximum(with_feature, 1)).astype(np.float32),
+        visible_area=np.bincount(owners, evidence.shared[masks, owners], count).astype(np.float32),
     )
     return Matching(instances, _best_owner(masks, owners, scores))
 
@@ -195,54 +181,6 @@ def _best_owner(masks: NDArray[np.int64], owners: NDArray[np.int64], scores: NDA
     by_score = np.argsort(scores[masks, owners], kind="stable")
     owner[masks[by_score]] = owners[by_score]
     return owner
-
-
-def _describe(
-    features: NDArray[np.float64], weight: NDArray[np.float64], deviations: float, settings: MatchingSettings
-) -> tuple[list[NDArray[np.float64]], float]:
-    """The descriptors of one instance, none, one or two, and the mean cosine of its masks with theirs."""
-    groups = [np.arange(len(features))]
-    if settings.split:
-        groups = _split(features, weight, settings) or groups
-    rows, cosines, weights = [], [], []
-    for group in groups:
-        allowed = np.inf if settings.integration == "equal" else deviations
-        row, kept, cosine = robust_mean(features[group], weight[group], allowed)
-        if row is not None:
-            rows.append(row)
-            cosines.append(cosine[kept])
-            weights.append(weight[group][kept])
-    return rows, float(np.average(np.concatenate(cosines), weights=np.concatenate(weights))) if rows else 0.0
-
-
-def _split(
-    features: NDArray[np.float64], weight: NDArray[np.float64], settings: MatchingSettings
-) -> list[NDArray[np.int64]] | None:
-    """Two groups of views that clearly see different things, or None, as for most instances.
-
-    2-means on the sphere from the least alike pair. The groups are separate when views of one group are more alike
-    (all but a tenth of their pairs) than views of different groups (all but a tenth): a comparison of ranks, so that
-    it holds for any encoder's cosines. Noise spreads views evenly and fails it; a few wrong masks do not reach
-    ``split_views`` and ``split_share`` and are outliers, not a second look.
-    """
-    if len(features) < 2 * settings.split_views:
-        return None
-    cosines = features @ features.T
-    centres = features[list(np.unravel_index(cosines.argmin(), cosines.shape))]
-    second = features @ centres[1] > features @ centres[0]
-    for _ in range(SPLIT_ROUNDS):
-        centres = np.stack([weight[~second] @ features[~second], weight[second] @ features[second]])
-        centres /= np.maximum(np.linalg.norm(centres, axis=1, keepdims=True), 1e-12)
-        second = features @ centres[1] > features @ centres[0]
-    views = min(second.sum(), (~second).sum())
-    share = min(weight[second].sum(), weight[~second].sum()) / max(weight.sum(), 1e-300)
-    if views < settings.split_views or share < settings.split_share:
-        return None
-    same = second[:, None] == second
-    within = cosines[same & ~np.eye(len(features), dtype=bool)]
-    if np.quantile(within, 0.1) <= np.quantile(cosines[~same], 0.9):
-        return None
-    return [np.flatnonzero(~second), np.flatnonzero(second)]
 
 
 def _in_image(gaussians: Gaussians, camera: Camera, near: float) -> bool:

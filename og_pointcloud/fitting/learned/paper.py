@@ -34,7 +34,7 @@ from scipy.sparse import csr_array
 
 from og_pointcloud.errors import MissingExtraError, SceneError
 from og_pointcloud.fitting.learned.codebook import kmeans
-from og_pointcloud.fitting.learned.instance_features import ROUNDING, cohesion_factor, raw_gradient, read_features
+from og_pointcloud.fitting.learned.instance_features import raw_gradient, read_features
 from og_pointcloud.fitting.mask_table import Gaussians, view_fingerprint, view_weights
 from og_pointcloud.fitting.work_folder import WorkFolder, fingerprint
 from og_pointcloud.scene import Camera, View
@@ -65,6 +65,8 @@ LATE_RANK = 0.9
 """Pairs that weigh less than this weigh LEAST_WEIGHT late in training."""
 SMALLEST_DISTANCE = 1e-4
 """Added in quadrature to the distances of the printed Eq. 2: two equal means would give infinity."""
+ROUNDING = 1e-3
+"""Distances are rounded off below this where they are not squared: sqrt(d^2 + ROUNDING^2)."""
 ADAM_EPSILON = 1e-15
 """As in 3DGS: gradients of one Gaussian, of a mean over pixels, are small beside the usual 1e-8."""
 MIXED_VARIANCE = 0.006
@@ -171,7 +173,7 @@ def train_features(
         image = view.render(_read(raw, settings.normalise))
         separation, cohesion = view_losses(image, view.mask, settings, late=step >= late)
         scale = 1 if settings.formula == "authors" else 1 / source.masked_pixels
-        loss = settings.inter * separation + cohesion_factor(settings) * scale * cohesion
+        loss = settings.inter * separation + settings.intra * settings.cohesion_weight * scale * cohesion
         stage.adam.zero_grad(set_to_none=True)
         loss.backward()
         stage.adam.step()
@@ -368,7 +370,7 @@ def _fine_counts(
     source: _Views, known: NDArray[np.int64], own: NDArray[np.int32], k1: int, settings: PaperSettings
 ) -> list[int]:
     """Fine clusters of each coarse one: k2, or one more than the masks of a view that it holds, if that is fewer."""
-    if not settings.adapt_k2:
+    if settings.formula == "paper":
         return [settings.k2] * k1
     cluster = np.full(len(source.seen), k1)
     cluster[known] = own
