@@ -201,9 +201,7 @@ def test_a_codebook_step_moves_features_by_the_gradient_of_their_centres(balls: 
     features = np.random.default_rng(0).random((len(balls.gaussians), 6), np.float32)
     source = paper._Views(balls.gaussians, balls.views[:1], NEAR, settings, whole=True)
     known, nothing = np.flatnonzero(source.seen > 0), np.zeros((int((source.seen > 0).sum()), 0), np.float32)
-    training = paper._CodebookTraining(
-        source, torch.from_numpy(features.copy()), known, settings, np.random.default_rng(0)
-    )
+    training = paper._CodebookTraining(source, torch.from_numpy(features.copy()), known, settings)
     history = paper.StageHistory("coarse codebook", 20_000, 0)
     parts = paper._Parts([np.arange(len(known))], [4], nothing)
     start = features[known[:4]]
@@ -237,8 +235,8 @@ def test_gaussians_shrunk_to_nothing_leave_the_view_as_it_is(balls: Balls) -> No
     assert len(source.shrunk(0, 0.0).mask) == 0 < len(source[0].mask)
     features = torch.rand((len(balls.gaussians), 6))
     known = np.flatnonzero(source.seen > 0)
-    training = paper._CodebookTraining(source, features, known, SHORT, Never())  # pyright: ignore
-    view, target, rows = training._draw()
+    training = paper._CodebookTraining(source, features, known, SHORT)
+    view, target, rows = training._draw(Never())  # pyright: ignore
     assert len(target) == int(rows.sum()) > 0
     assert len(view.mask) == len(source[0].mask)
 

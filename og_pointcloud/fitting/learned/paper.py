@@ -21,7 +21,6 @@ raw vectors, whose length means nothing.
 
 from __future__ import annotations
 
-import json
 import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -33,11 +32,12 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from og_pointcloud.errors import MissingExtraError, SceneError
+from og_pointcloud.fitting.grouping import indicator
 from og_pointcloud.fitting.learned.codebook import kmeans
 from og_pointcloud.fitting.learned.instance_features import raw_gradient, read_features
-from og_pointcloud.fitting.mask_table import Gaussians, view_fingerprint, view_weights
+from og_pointcloud.fitting.mask_table import Gaussians, view_fingerprint, view_weights, weights_by_instance
 from og_pointcloud.fitting.work_folder import WorkFolder, fingerprint
-from og_pointcloud.scene import Camera, View
+from og_pointcloud.scene import View
 from og_pointcloud.settings import PaperSettings
 
 try:
@@ -162,13 +162,12 @@ def train_features(
     settings, run = settings or PaperSettings(), run or TrainingRun()
     start = time.perf_counter()
     source = _Views(gaussians, views, near, settings, whole=False)
-    rng = np.random.default_rng(run.seed)
-    raw = torch.from_numpy(rng.random((len(gaussians), settings.width), np.float32))
+    raw = torch.from_numpy(np.random.default_rng(run.seed).random((len(gaussians), settings.width), np.float32))
     key = _training_key(gaussians, views, near, settings, run)
     history = StageHistory("features", STEPS[settings.schedule][0], time.perf_counter() - start)
-    stage = _Stage(history, raw, settings.feature_rate, rng)
+    stage = _Stage(history, raw, settings.feature_rate)
     late = LATE_STEP * settings.schedule_share
-    for step in stage.steps(settings, run, key):
+    for step, rng in stage.steps(settings, run, key):
         view = source[int(rng.integers(len(source)))]
         image = view.render(_read(raw, settings.normalise))
         separation, cohesion = view_losses(image, view.mask, settings, late=step >= late)
@@ -236,7 +235,7 @@ def train_codebook(
     rng = np.random.default_rng(run.seed)
     source = _Views(gaussians, views, near, settings, whole=settings.formula == "paper")
     known = np.flatnonzero(source.seen > 0)
-    training = _CodebookTraining(source, torch.from_numpy(np.array(features, np.float32)), known, settings, rng)
+    training = _CodebookTraining(source, torch.from_numpy(np.array(features, np.float32)), known, settings)
     key = _training_key(gaussians, views, near, settings, run, features)
     setup = time.perf_counter() - start
 
@@ -297,9 +296,8 @@ class _CodebookTraining:
         features: torch.Tensor,
         known: NDArray[np.int64],
         settings: PaperSettings,
-        rng: np.random.Generator,
     ) -> None:
-        self.source, self.known, self.settings, self.rng = source, torch.from_numpy(known), settings, rng
+        self.source, self.known, self.settings = source, torch.from_numpy(known), settings
         self.pseudo = features.clone()  # of stage 1: never changed
         self.features = features
         self.targets: dict[int, tuple[torch.Tensor, torch.Tensor]] = {}
@@ -312,12 +310,12 @@ class _CodebookTraining:
         is_fine, width = history.name.startswith("fine"), features.shape[1]
         interval = settings.fine_interval if is_fine else settings.coarse_interval
         squared = is_fine and settings.formula == "authors"
-        stage = _Stage(history, features, settings.codebook_rate, self.rng, centres, len(known))
-        for step in stage.steps(settings, run, key):
+        stage = _Stage(history, features, settings.codebook_rate, centres, len(known))
+        for step, rng in stage.steps(settings, run, key):
             if step % interval == 0:
                 values = features.detach().numpy()[known]
                 stage.own, stage.centres = parts.reassigned(values, stage.centres, settings.lloyd_rounds)
-            view, target, rows = self._draw()
+            view, target, rows = self._draw(rng)
             quantised = features.detach().clone()
             own = torch.from_numpy(stage.own)
             quantised[known] = torch.from_numpy(stage.centres[:, :width].copy())[own]
@@ -333,17 +331,17 @@ class _CodebookTraining:
         own, centres = parts.reassigned(features.numpy()[known], stage.centres, settings.lloyd_rounds)
         return own.astype(np.int32), centres[:, :width]
 
-    def _draw(self) -> tuple[_ViewWeights, torch.Tensor, torch.Tensor | slice]:
+    def _draw(self, rng: np.random.Generator) -> tuple[_ViewWeights, torch.Tensor, torch.Tensor | slice]:
         """A random view, perhaps with smaller Gaussians; what its pixels should show, and which of them."""
-        index = int(self.rng.integers(len(self.source)))
+        index = int(rng.integers(len(self.source)))
         view = self.source[index]
         if self.settings.formula == "paper":
             return view, view.render(self.pseudo), slice(None)
         if index not in self.targets:
             self.targets[index] = _mask_targets(view.render(self.pseudo), view.mask)
         means, kept = self.targets[index]
-        if self.rng.random() < self.settings.point_pressure:
-            smaller = self.source.shrunk(index, self.rng.random())
+        if rng.random() < self.settings.point_pressure:
+            smaller = self.source.shrunk(index, rng.random())
             place = torch.searchsorted(view.mask_names, smaller.mask_names)[smaller.mask]
             if kept[place].any():  # else too little is left to cover a pixel of a target
                 return smaller, means[place][kept[place]], kept[place]
@@ -372,16 +370,13 @@ def _fine_counts(
     """Fine clusters of each coarse one: k2, or one more than the masks of a view that it holds, if that is fewer."""
     if settings.formula == "paper":
         return [settings.k2] * k1
-    cluster = np.full(len(source.seen), k1)
+    cluster = np.full(len(source.seen), -1, np.int32)
     cluster[known] = own
     most = np.zeros(k1, np.int64)
     for view in source:
-        mask = np.repeat(view.mask.numpy(), np.diff(view.weights.indptr))
-        inside = mask >= 0
-        shares = np.zeros((len(view.mask_names), k1 + 1))
-        np.add.at(shares, (mask[inside], cluster[view.weights.indices[inside]]), view.weights.data[inside])
-        shares /= shares.sum(axis=1, keepdims=True)
-        most = np.maximum(most, (shares[:, :k1] > OWN_MASK_SHARE).sum(axis=0))
+        of_masks = csr_array(indicator(view.mask.numpy(), len(view.mask_names)) @ view.weights)
+        shares = weights_by_instance(of_masks, cluster, k1) / of_masks.sum(axis=1)[:, None]
+        most = np.maximum(most, (shares > OWN_MASK_SHARE).sum(axis=0))
     return [int(count) for count in np.minimum(most + 1, settings.k2)]
 
 
@@ -401,15 +396,11 @@ class _ViewWeights:
 
     @classmethod
     def make(cls, weights: csr_array, ids: NDArray[np.int32]) -> _ViewWeights:
-        names, mask = np.unique(ids, return_inverse=True)
-        outside = int(names[0] < 0) if len(names) else 0
-        return cls(
-            weights,
-            torch.from_numpy(mask.astype(np.int64) - outside),
-            torch.from_numpy(names[outside:].astype(np.int64)),
-            _torch_csr(weights),
-            _torch_csr(csr_array(weights.T)),
-        )
+        """ids: (pixels,) the view's own mask ids, -1 outside masks."""
+        names = np.unique(ids[ids >= 0]).astype(np.int64)
+        mask = np.where(ids >= 0, np.searchsorted(names, ids), -1)
+        matrices = _torch_csr(weights), _torch_csr(csr_array(weights.T))
+        return cls(weights, torch.from_numpy(mask), torch.from_numpy(names), *matrices)
 
     def render(self, values: torch.Tensor) -> torch.Tensor:
         """(pixels, width) blended values of all Gaussians (n, width)."""
@@ -441,10 +432,7 @@ class _Views:
             inside = weights.mask.numpy() >= 0
             if not inside.any():
                 continue
-            shown = np.repeat(inside, np.diff(weights.weights.indptr))
-            self.seen += np.bincount(
-                weights.weights.indices[shown], weights.weights.data[shown], minlength=len(gaussians)
-            )
+            self.seen += weights.weights[inside].sum(axis=0, dtype=np.float64)
             pixels += int(inside.sum())
             if weights.nbytes <= room:
                 self._kept[len(self.views)] = weights
@@ -463,9 +451,6 @@ class _Views:
     def __getitem__(self, index: int) -> _ViewWeights:
         return self._kept[index] if index in self._kept else self._render(self.gaussians, self.views[index])
 
-    def __iter__(self) -> Iterator[_ViewWeights]:
-        return (self[index] for index in range(len(self)))
-
     def shrunk(self, index: int, factor: float) -> _ViewWeights:
         """The view with all Gaussians' standard deviations times factor; its masks are among those at full size."""
         smaller = replace(self.gaussians, scale=(self.gaussians.scale * np.float32(factor)).astype(np.float32))
@@ -477,8 +462,11 @@ class _Views:
         if masks is not None:
             ids = np.where(np.isin(ids, masks), ids, -1)
         wanted = np.arange(len(ids)) if self.whole else np.flatnonzero(ids >= 0)
-        weights, ids = self._weights(gaussians, view.camera, wanted), ids[wanted]
-        coverage = np.asarray(weights.sum(axis=1)).ravel()
+        number = np.full(len(ids), -1, np.int32)
+        number[wanted] = np.arange(len(wanted))
+        image, ids = number.reshape(view.camera.height, view.camera.width), ids[wanted]
+        weights = view_weights(gaussians, view.camera, image, len(wanted), self.near).rows[:-1]
+        coverage = weights.sum(axis=1)
         shown = np.bincount(ids + 1, coverage, minlength=view.mask_count + 1) > 0  # place 0: pixels without a mask
         inside = (ids >= 0) & shown[ids + 1] & (coverage >= self.settings.covered_share)
         rows = np.flatnonzero(inside | (coverage > 0)) if self.whole else np.flatnonzero(inside)
@@ -486,15 +474,6 @@ class _Views:
         index = (chosen.indices.astype(np.int32), chosen.indptr.astype(np.int32))
         small = csr_array((chosen.data, *index), shape=chosen.shape)
         return _ViewWeights.make(small, np.where(inside, ids, -1)[rows])
-
-    def _weights(self, gaussians: Gaussians, camera: Camera, pixels: NDArray[np.int64]) -> csr_array:
-        """(pixels, n) blending weights of some pixels of the camera's image."""
-        number = np.full(camera.width * camera.height, -1, np.int32)
-        number[pixels] = np.arange(len(pixels))
-        image = number.reshape(camera.height, camera.width)
-        rows = view_weights(gaussians, camera, image, len(pixels), self.near).rows
-        end = rows.indptr[-2]  # the last row holds all other pixels; slicing it off would copy everything
-        return csr_array((rows.data[:end], rows.indices[:end], rows.indptr[:-1]), shape=(len(pixels), len(gaussians)))
 
 
 class _Blend(torch.autograd.Function):
@@ -549,8 +528,8 @@ def _training_key(
 class _Stage:
     """All that a stage of training changes: a checkpoint is all of it.
 
-    features: (n, width) float32, moved in place by ``adam``. rng: draws the views. centres, own: of a codebook stage,
-    (k, d) float32 and, for each of ``known`` Gaussians, its row of them.
+    features: (n, width) float32, moved in place by ``adam``. centres, own: of a codebook stage, (k, d) float32 and, for
+    each of ``known`` Gaussians, its row of them.
     """
 
     def __init__(
@@ -558,17 +537,17 @@ class _Stage:
         history: StageHistory,
         features: torch.Tensor,
         rate: float,
-        rng: np.random.Generator,
         centres: NDArray[np.float32] | None = None,
         known: int = 0,
     ) -> None:
-        self.history, self.features, self.rng = history, features, rng
+        self.history, self.features = history, features
         self.adam = torch.optim.Adam([features.requires_grad_()], lr=rate, eps=ADAM_EPSILON)
         self.centres = np.zeros((0, 0), np.float32) if centres is None else centres
         self.own = np.zeros(known, np.int64)
 
-    def steps(self, settings: PaperSettings, run: TrainingRun, key: str) -> Iterator[int]:
-        """The numbers of the steps that are left, timed, reported, and kept under the key now and then."""
+    def steps(self, settings: PaperSettings, run: TrainingRun, key: str) -> Iterator[tuple[int, np.random.Generator]]:
+        """The numbers of the steps that are left, each with its own random numbers, which are the same whether or not
+        the steps before it were done in this run. Timed, reported, and kept under the key now and then."""
         history = self.history
         count = max(1, round(history.published_steps * settings.schedule_share))
         name, kept_at = history.name.replace(" ", "-"), time.monotonic()
@@ -576,7 +555,7 @@ class _Stage:
             self._restore(run.work.arrays(name, key, self._arrays))
         for step in range(history.steps, count):
             start = time.perf_counter()
-            yield step
+            yield step, np.random.default_rng([run.seed, step, *name.encode()])
             history.seconds += time.perf_counter() - start
             is_due = step + 1 == count or time.monotonic() - kept_at >= CHECKPOINT_SECONDS
             if run.work is not None and is_due:
@@ -588,21 +567,14 @@ class _Stage:
     def _arrays(self) -> tuple[NDArray[Any], ...]:
         state, features = self.adam.state.get(self.features), self.features.detach()
         moments = (state["exp_avg"], state["exp_avg_sq"]) if state else (torch.zeros_like(features),) * 2
-        generator = np.frombuffer(json.dumps(self.rng.bit_generator.state).encode(), np.uint8)
         tensors = [tensor.numpy().copy() for tensor in (features, *moments)]
-        loss = np.array(self.history.loss, np.float64)
-        return *tensors, self.centres.copy(), self.own.copy(), generator, loss, np.array([self.history.seconds])
+        losses = np.array([self.history.seconds, *self.history.loss])
+        return *tensors, self.centres.copy(), self.own.copy(), losses
 
     def _restore(self, arrays: tuple[NDArray[Any], ...]) -> None:
-        """Nothing where the checkpoint is from before the first step."""
-        *tensors, centres, own, generator, loss, seconds = (np.array(array) for array in arrays)
-        if len(loss) == 0:
-            return
-        features, average, square = (torch.from_numpy(array) for array in tensors)
-        self.features.data.copy_(features)
-        done = torch.tensor(float(len(loss)))
-        self.adam.state[self.features] = {"step": done, "exp_avg": average, "exp_avg_sq": square}
-        self.centres, self.own = centres, own
-        self.rng.bit_generator.state = json.loads(generator.tobytes())
-        self.history.loss, self.history.seconds = loss.tolist(), float(seconds[0])
-        self.history.resumed_at = len(loss)
+        features, average, square, self.centres, self.own, losses = (np.array(array) for array in arrays)
+        self.features.data.copy_(torch.from_numpy(features))
+        self.history.seconds, *self.history.loss = losses.tolist()
+        self.history.resumed_at = len(self.history.loss)
+        moments = {"exp_avg": torch.from_numpy(average), "exp_avg_sq": torch.from_numpy(square)}
+        self.adam.state[self.features] = {"step": torch.tensor(float(len(self.history.loss))), **moments}
