@@ -116,7 +116,7 @@ def through_pointcloud2(points, _):
     ros = pytest.importorskip("og_pointcloud_ros", exc_type=ImportError)
     empty = og.Segmentation(
         points, *(np.full(len(points), -1, kind) for kind in (np.int32, np.float32, np.int32)), names=("nothing",),
-        distance=np.zeros(len(points), np.int8), reasons=np.zeros(len(points), np.int8),
+        reasons=np.zeros(len(points), np.int8),
     )  # fmt: skip
     return ros.to_pointcloud2(empty)
 
@@ -187,7 +187,7 @@ def segmentation(labels, names, xyz=None):
     xyz = np.arange(3.0 * count).reshape(count, 3) if xyz is None else xyz
     scores = np.linspace(0, 1, count, dtype=np.float32)
     zeros = np.zeros(count, np.int8)
-    return og.Segmentation(xyz, labels, scores, labels * 2 - 1, tuple(names), distance=zeros, reasons=zeros)
+    return og.Segmentation(xyz, labels, scores, labels * 2 - 1, tuple(names), reasons=zeros)
 
 
 def test_las_with_more_labels_than_classes(tmp_path):

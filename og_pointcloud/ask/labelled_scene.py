@@ -23,8 +23,7 @@ from og_pointcloud.ask.hosts import carried_scene, world_points
 from og_pointcloud.ask.instances import WORDS, Instances, list_instances
 from og_pointcloud.ask.query_graph import QueryGraph
 from og_pointcloud.ask.segmentation import Segmentation
-from og_pointcloud.bundle.format import BEYOND, NEAR, ON_SURFACE
-from og_pointcloud.bundle.nearest import NONE_WITHIN_REACH, NearestPoint, surface_distance
+from og_pointcloud.bundle.nearest import NearestPoint
 from og_pointcloud.bundle.read import Bundle, read_bundle
 from og_pointcloud.bundle.vocabulary import carried_encoder
 from og_pointcloud.cloud import TOO_FAR, LabelledCloud, Vocabulary
@@ -139,24 +138,18 @@ class LabelledScene:
         max_distance: a shorter reach, in the scene's unit; costs an exact search of every point.
         Exact: of points equally near the first one counts, and a point of the scene finds its own id.
         """
-        return self.look_up(points, max_distance=max_distance)[0]
-
-    def look_up(
-        self, points: NDArray[np.floating], *, max_distance: float | None = None
-    ) -> tuple[NDArray[np.int32], NDArray[np.int8]]:
-        """What ``instances_at`` answers, and (N,) int8: on the surface, near, or too far, as Segmentation says."""
         self.check_distance(max_distance)
         local = self._local(points)
-        instances, distance = np.empty(len(local), np.int32), np.empty(len(local), np.int8)
+        instances = np.empty(len(local), np.int32)
         for start in range(0, len(local), POINTS_PER_RUN):
             run = slice(start, start + POINTS_PER_RUN)
-            instances[run], distance[run] = self._look_up(local[run])
+            instances[run] = self._look_up(local[run])
         if max_distance is not None:
             within_reach = np.flatnonzero(instances != TOO_FAR)
             nearest = self.nearest.query(local[within_reach])
             cut = within_reach[self.nearest.distance(local[within_reach], nearest) > max_distance]
-            instances[cut], distance[cut] = TOO_FAR, BEYOND
-        return instances, distance
+            instances[cut] = TOO_FAR
+        return instances
 
     def check_distance(self, max_distance: float | None) -> None:
         """OgPointcloudError for a distance that is none, or beyond the reach, within which points are looked up."""
@@ -187,23 +180,19 @@ class LabelledScene:
                 np.subtract(points[:, axis], self.cloud.origin[axis], out=local[:, axis], casting="same_kind")
         return local
 
-    def _look_up(self, local: NDArray[np.float32]) -> tuple[NDArray[np.int32], NDArray[np.int8]]:
-        """Instance and distance class of each point: the graph's where it is certain, else by exact search."""
+    def _look_up(self, local: NDArray[np.float32]) -> NDArray[np.int32]:
+        """Instance of each point: the graph's where it is certain, else by exact search."""
         if self._graph is None:
-            instances, distance = np.full(len(local), TOO_FAR, np.int32), np.full(len(local), BEYOND, np.int8)
-            still_open = np.arange(len(local))
+            instances, still_open = np.full(len(local), TOO_FAR, np.int32), np.arange(len(local))
         else:
-            instances, distance, certain = self._graph.look_up(local)
+            instances, certain = self._graph.look_up(local)
             if certain.all():
-                return instances, distance
+                return instances
             still_open = np.flatnonzero(~certain)
         still_open = still_open[np.isfinite(local[still_open]).all(axis=1)]  # the others are too far already
         nearest = self.nearest.query(local[still_open])
         instances[still_open] = np.append(self.instance_ids, np.int32(TOO_FAR))[nearest]
-        surface = surface_distance(self.cloud.spacing, self.cloud.reach)
-        on_surface = self.nearest.distance(local[still_open], nearest) <= surface
-        distance[still_open] = np.where(nearest == NONE_WITHIN_REACH, BEYOND, np.where(on_surface, ON_SURFACE, NEAR))
-        return instances, distance
+        return instances
 
     @cached_property
     def _graph(self) -> QueryGraph | None:
@@ -331,13 +320,12 @@ class Segmenter:
         scene, own = self.scene, as_scene(pcd) if _is_scene(pcd) else None
         if own is not None and own.cloud is scene.cloud and pose is None:  # its own points need no look-up
             points, instances = scene.xyz, scene.instance_ids
-            distance = np.full(len(points), ON_SURFACE, np.int8)
         else:
             points = _posed(world_points(pcd) if own is None else own.xyz, pose)
-            instances, distance = scene.look_up(points, max_distance=self._max_distance)
+            instances = scene.instances_at(points, max_distance=self._max_distance)
         labels, scores, reasons = self._choice.at(instances)
         result = Segmentation(
-            points, labels, scores, instances, self.names, scene.path, distance, reasons, self._choice.calibrated,
+            points, labels, scores, instances, self.names, scene.path, reasons, self._choice.calibrated,
             scene.certainty_at,
         )  # fmt: skip
         if not self._warned and (reason := _why_nothing(result, scene)):

@@ -14,7 +14,7 @@ from og_pointcloud.models import open_session
 
 __all__ = ["QueryGraph"]
 
-OUTPUTS = {"instance": np.int32, "distance": np.int8, "certain": np.bool_}
+OUTPUTS = {"instance": np.int32, "certain": np.bool_}
 """What is asked of the graph: one value a point each."""
 
 
@@ -40,20 +40,20 @@ class QueryGraph:
             raise self._refused(f"takes text of shape {shape}, of no width")
         self._no_text = np.zeros((0, shape[1]), np.float32)
 
-    def look_up(self, local: NDArray[np.float32]) -> tuple[NDArray[np.int32], NDArray[np.int8], NDArray[np.bool_]]:
-        """Instance id, distance class, and whether both are certain, (N,) each. local: (N, 3), the cloud's frame."""
+    def look_up(self, local: NDArray[np.float32]) -> tuple[NDArray[np.int32], NDArray[np.bool_]]:
+        """Instance id, and whether it is certain, (N,) each. local: (N, 3), the cloud's frame."""
         try:
             found = self._session.run(list(OUTPUTS), {"points": local, "text": self._no_text})
         except Exception as error:  # onnxruntime raises types of its own
             raise self._refused(f"fails ({_first_line(error)})") from None
-        instances, distance, certain = (np.asarray(values) for values in found)
-        for values, dtype in zip((instances, distance, certain), OUTPUTS.values(), strict=True):
+        instances, certain = (np.asarray(values) for values in found)
+        for values, dtype in zip((instances, certain), OUTPUTS.values(), strict=True):
             if values.shape != (len(local),) or values.dtype != dtype:
                 raise self._refused(f"answers {values.dtype} {values.shape} for {len(local)} points")
         # Nothing is looked up by a number that is no instance's.
         if len(local) and not (instances.min() >= TOO_FAR and instances.max() < self._instances):
             raise self._refused("answers what is no instance of this file")
-        return instances, distance, certain
+        return instances, certain
 
     def _refused(self, what: Any) -> BundleError:
         return BundleError(f"{self._path}: query.onnx {what}: write the file again")

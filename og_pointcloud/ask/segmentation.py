@@ -34,8 +34,6 @@ class Segmentation:
         says; if not, the cosine of the label's text with the instance's descriptor, which has no such meaning.
     instances: (N,) int32, the scene's instance id, -1 background, -2 unobserved, -3 too far from the scene.
     names: the labels asked for. scene: the .ogpc file that answered, None for one in memory.
-    distance: (N,) int8, 0 on the scene's surface, 1 near it, 2 too far from it; between 0 and 1 to about a point
-        spacing, as one table cell speaks for all points in it.
     reasons: (N,) int8, why a point is unknown: a ``Reason``, 0 where it has a label.
     calibrated: whether the scene has a word bank to judge labels by. Without one the best label is answered, however
         badly it fits: then nothing is unknown for Reason.NONE_FITS.
@@ -54,7 +52,6 @@ class Segmentation:
     instances: NDArray[np.int32]
     names: tuple[str, ...]
     scene: Path | None = None
-    distance: NDArray[np.int8] = field(default_factory=lambda: np.zeros(0, np.int8))
     reasons: NDArray[np.int8] = field(default_factory=lambda: np.zeros(0, np.int8))
     calibrated: bool = False
     certainty_at: Callable[[NDArray[np.float64]], NDArray[np.float32] | None] = field(
@@ -62,12 +59,10 @@ class Segmentation:
     )
 
     def __post_init__(self) -> None:
-        for name in ("distance", "reasons"):
-            count = len(getattr(self, name))
-            if count != len(self.labels):
-                raise OgPointcloudError(
-                    f"{len(self.labels)} labels and {count} {name} differ in number; expected one of each a point"
-                )
+        if len(self.reasons) != len(self.labels):
+            raise OgPointcloudError(
+                f"{len(self.labels)} labels and {len(self.reasons)} reasons differ in number; expected one each a point"
+            )
 
     def __len__(self) -> int:
         return len(self.labels)

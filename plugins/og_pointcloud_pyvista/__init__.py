@@ -16,7 +16,7 @@ A file a subject: ``datasets`` (what ``mesh.og`` does), ``plotting`` (what ``plo
 """
 
 from og_pointcloud_pyvista.datasets import OgDataSet, to_pyvista
-from og_pointcloud_pyvista.files import read_ogpc, write_ogpc
+from og_pointcloud_pyvista.files import read_ogpc
 from og_pointcloud_pyvista.plotting import OgPlotter, can_render
 
-__all__ = ["OgDataSet", "OgPlotter", "can_render", "read_ogpc", "to_pyvista", "write_ogpc"]
+__all__ = ["OgDataSet", "OgPlotter", "can_render", "read_ogpc", "to_pyvista"]

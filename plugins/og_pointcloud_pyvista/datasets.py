@@ -35,8 +35,6 @@ __all__ = [
 
 LABEL, INSTANCE, SCORE, COLOR = "og_label", "og_instance", "og_score", "og_color"
 RANK = "og_rank"
-SHOWN = 8
-"""Names that a warning lists."""
 BOX_EDGES = [(a, a | 1 << axis) for a in range(8) for axis in range(3) if not a >> axis & 1]
 """Pairs of `Box.corners`: they differ in one bit."""
 
@@ -66,20 +64,14 @@ class OgDataSet:
         scene: SceneLike | None = None,
         *,
         pose: ArrayLike | None = None,
-        inplace: bool = False,
         **options: Unpack[SegmentOptions],
     ) -> Any:
-        """Label every point; returns a dataset of the same type with the arrays that this module names.
+        """Label every point; returns a copy of the dataset with the arrays that this module names.
 
-        labels, scene, pose, options: as for ``og_pointcloud.segment``.
-        inplace: add the arrays to this dataset, and return it.
-        Warns where no point gets a label, and names the labels asked for that no point got.
+        labels, scene, pose, options, warnings: as for ``og_pointcloud.segment``.
         """
         result = og.segment(self._mesh, labels, scene, pose=pose, **options)
-        absent = [name for name, count in result.counts().items() if not count]
-        if labels is not None and absent and len(absent) < len(result.names):
-            _warn(f"no point is labelled {_listed(absent)}")
-        mesh = self._mesh if inplace else self._mesh.copy()
+        mesh = self._mesh.copy()
         _attach(mesh, result)
         return mesh
 
@@ -94,15 +86,14 @@ class OgDataSet:
         """The points of the instances that a text fits, and the cells that lie wholly among them.
 
         Point arrays: og_rank (int32, 0 for the instance that it fits best), og_score (its score), og_instance.
-        text, against, text_features: as for ``og_pointcloud.select``. Warns where nothing is selected, and names what
-        is closest.
+        text, against, text_features: as for ``og_pointcloud.select``. Warns where nothing is selected.
         """
         found = find_scene(self._mesh, scene)
         selection = og.select(found, text, against=against, text_features=text_features)
         mesh = self._with_instances(found)
         points = _extracted(mesh, selection.instances)
         if points.n_points == 0:
-            _warn(_why_none(selection))
+            _warn(f"no point of this dataset is selected: {selection}")
             return points
         ids = np.asarray(points.point_data[INSTANCE])
         rank, score = (np.zeros(len(found.cloud.instances), kind) for kind in (np.int32, np.float32))
@@ -139,24 +130,6 @@ class OgDataSet:
         colors = _instance_colors(mesh, ids) if segmented and COLOR in mesh.point_data else None
         return box_lines([og.instance_table(found, up=up)[instance] for instance in ids], colors)
 
-    def color(
-        self, by: str = "label", colors: Any = None, *, output_scalars: str = COLOR, inplace: bool = False
-    ) -> Any:
-        """Colours by "label" or by "instance", through ``color_labels``; returns a dataset of the same type.
-
-        colors: what ``color_labels`` takes; left out, this library's colours, grey where there is neither.
-        """
-        scalars = {"label": LABEL, "instance": INSTANCE}.get(by, "")
-        if not scalars:
-            raise OgPointcloudError(f"by is {by!r:.40}; expected 'label' or 'instance'")
-        _require(self._mesh, scalars)
-        if colors is None:
-            ids = np.unique(self._mesh.point_data[scalars])
-            colors = dict(zip(ids.tolist(), label_colors(ids).tolist(), strict=True))
-        return self._mesh.color_labels(
-            colors, scalars=scalars, preference="point", output_scalars=output_scalars, inplace=inplace
-        )
-
     def _with_instances(self, scene: SceneLike | None) -> Any:
         """This dataset, or, where it has no instance ids, a shallow copy with the scene's."""
         if INSTANCE in self._mesh.point_data:
@@ -169,8 +142,12 @@ class OgDataSet:
 
 
 def label_names(mesh: pv.DataSet) -> tuple[str, ...]:
-    """Names of the labels in og_label."""
-    _require(mesh, LABEL)
+    """Names of the labels in og_label; OgPointcloudError where the dataset has none."""
+    if LABEL not in mesh.point_data:
+        raise OgPointcloudError(
+            f"the {type(mesh).__name__} of {mesh.n_points:,} points has no point array '{LABEL}'; expected a segmented "
+            "dataset: mesh = mesh.og.segment(['chair', 'table'])"
+        )
     return tuple(str(name) for name in np.asarray(mesh.field_data[NAMES_FIELD]).ravel())
 
 
@@ -234,18 +211,6 @@ def _extracted(mesh: Any, ids: Sequence[int]) -> pv.UnstructuredGrid:
     return mesh.extract_values(list(ids), scalars=INSTANCE, preference="point", adjacent_cells=False)
 
 
-def _why_none(selection: og.Selection) -> str:
-    if selection.fitting:
-        return (
-            f"'{selection.query}' fits {len(selection.fitting)} of {len(selection)} instances of the scene, but no "
-            "point of this dataset belongs to one of them"
-        )
-    best = selection.best
-    closest = f"; the closest is instance {best.instance} with {best.score:.2f}" if best else ""
-    rival = f", which is rather '{best.rival}' ({best.rival_score:.2f})" if best and best.rival else ""
-    return f"'{selection.query}' fits none of {len(selection)} instances{closest}{rival}"
-
-
 def _present(ids: ArrayLike) -> list[int]:
     return [instance for instance in np.unique(np.asarray(ids)).tolist() if instance >= 0]
 
@@ -259,18 +224,6 @@ def _first_rows(ids: ArrayLike, wanted: Sequence[int]) -> NDArray[np.intp]:
 def _instance_colors(mesh: pv.DataSet, ids: Sequence[int]) -> dict[int, Sequence[int]]:
     rows = _first_rows(mesh.point_data[INSTANCE], ids)
     return dict(zip(ids, np.asarray(mesh.point_data[COLOR])[rows].tolist(), strict=True))
-
-
-def _require(mesh: pv.DataSet, array: str) -> None:
-    if array not in mesh.point_data:
-        raise OgPointcloudError(
-            f"the {type(mesh).__name__} of {mesh.n_points:,} points has no point array '{array}'; expected a segmented "
-            "dataset: mesh = mesh.og.segment(['chair', 'table'])"
-        )
-
-
-def _listed(names: Sequence[str]) -> str:
-    return ", ".join(f"'{name}'" for name in names[:SHOWN]) + (", ..." if len(names) > SHOWN else "")
 
 
 def _warn(text: str) -> None:

@@ -77,12 +77,14 @@ class OgPlotter:
 
         Returns the actor. Warns where no point has a label; OgPointcloudError for a dataset without points or labels.
         """
+        if by not in ("label", "instance"):
+            raise OgPointcloudError(f"by is {by!r:.40}; expected 'label' or 'instance'")
         mesh = _drawable(mesh)
         words = label_names(mesh)
         labels = np.asarray(mesh.point_data[LABEL])
         if (labels < 0).all():
             warnings.warn(f"none of {mesh.n_points:,} points has a label: all are drawn grey", stacklevel=2)
-        colors = np.asarray(mesh.og.color(by, _palette(mesh, by)).point_data[COLOR])
+        colors = _colors(np.asarray(mesh.point_data[INSTANCE]) if by == "instance" else labels)
         kind = {"style": "points", "point_size": point_size} if _is_cloud(mesh) else {}
         self._point_size = point_size
         actor = self._plotter.add_mesh(
@@ -104,34 +106,21 @@ class OgPlotter:
         of: Any,
         *,
         up: ArrayLike | None = None,
-        names: bool = False,
-        line_width: float = 2.5,
-        name: str = "og_boxes",
         **options: Any,
     ) -> pv.Actor | None:
         """Draw oriented boxes around the labelled instances of a segmented dataset, or around all of a scene.
 
         of: a dataset with og_instance, or a scene, a LabelledCloud or the path of a .ogpc file. up: (3,) direction
-        that boxes stand upright on. names: the best word beside each. options: of ``add_mesh``.
+        that boxes stand upright on. options: of ``add_mesh``.
         Returns the actor; warns, and returns None, where there is no instance to put a box around.
         """
-        if isinstance(of, pv.DataSet):
-            lines, words = of.og.boxes(up=up), best_words(of) if names else {}
-        else:
-            table = og.instance_table(of, up=up)
-            lines = box_lines(table)
-            words = {row.id: row.words[0][0] if row.words else f"instance {row.id}" for row in table}
+        lines = of.og.boxes(up=up) if isinstance(of, pv.DataSet) else box_lines(og.instance_table(of, up=up))
         if lines.n_cells == 0:
             warnings.warn("there is no instance with points to draw a box around", stacklevel=2)
             return None
-        if names:
-            ids, first = np.unique(lines.cell_data[INSTANCE], return_index=True)
-            corners = np.asarray(lines.points).reshape(len(ids), 8, 3)
-            order = np.argsort(first)  # boxes lie in the order of their lines
-            self._add_texts(corners.mean(axis=1), [words[int(k)] for k in ids[order]], f"{name}_names")
         return self._plotter.add_mesh(
-            lines, scalars=COLOR, rgb=True, name=name, preference="cell", pickable=False,
-            **{"line_width": line_width, "lighting": False, **options},
+            lines, scalars=COLOR, rgb=True, preference="cell", pickable=False,
+            **{"name": "og_boxes", "line_width": 2.5, "lighting": False, **options},
         )  # fmt: skip
 
     def show_labelled(self, mesh: Any, *, up: ArrayLike = (0, 0, 1)) -> None:
@@ -244,17 +233,12 @@ class OgPlotter:
         present, first = np.unique(sorted_ids, return_index=True)
         parts = np.split(points, first[1:]) if len(present) else []
         largest = sorted(range(len(parts)), key=lambda part: -len(parts[part]))
-        self._add_texts(
-            np.array([_middle_point(parts[part]) for part in largest]).reshape(-1, 3),
-            [words[int(present[part])] for part in largest],
-            f"{name}_names",
-        )
-
-    def _add_texts(self, places: NDArray[np.floating], texts: Sequence[str], name: str) -> None:
-        if len(texts):
+        if len(largest):
             self._plotter.add_point_labels(
-                places, list(texts), font_size=13, bold=False, font_family="arial", text_color="black",
-                shape_color="white", shape_opacity=0.8, margin=3, show_points=False, always_visible=True, name=name,
+                np.array([_middle_point(parts[part]) for part in largest]),
+                [words[int(present[part])] for part in largest],
+                font_size=13, bold=False, font_family="arial", text_color="black", shape_color="white",
+                shape_opacity=0.8, margin=3, show_points=False, always_visible=True, name=f"{name}_names",
                 reset_camera=False,
             )  # fmt: skip
 
@@ -271,11 +255,6 @@ def _shaded(colors: NDArray[np.uint8], mesh: pv.DataSet) -> NDArray[np.uint8]:
     bright = max(float(np.percentile(luminance, 95)), 1.0)
     light = 1 - SHADE + SHADE * np.clip(luminance / bright, 0, 1)
     return (colors * light[:, None]).astype(np.uint8)
-
-
-def _palette(mesh: Any, by: str) -> dict[int, list[int]]:
-    ids = np.unique(np.asarray(mesh.point_data[LABEL if by == "label" else INSTANCE]))
-    return dict(zip(ids.tolist(), _colors(ids).tolist(), strict=True))
 
 
 def _drawable(mesh: Any) -> Any:

@@ -54,7 +54,7 @@ class CloudLabeller:
         for instance in self._instances:
             _ = instance.oriented_box
         scene = self.segmenter.scene
-        scene.look_up(scene.xyz[:WARM_UP_POINTS] + scene.cloud.reach / 2)  # beside the cloud: the exact search too
+        scene.instances_at(scene.xyz[:WARM_UP_POINTS] + scene.cloud.reach / 2)  # beside the cloud: the exact search too
 
     def __call__(self, message: Any, pose: NDArray[np.float64]) -> LabelledMessages:
         """message: a cloud in the sensor's frame. pose: (4, 4), takes it to the scene's frame.
