@@ -586,9 +586,7 @@ def test_certainty_is_that_of_the_nearest_point(scene):
     ):
         assert result.certainty.dtype == np.float32
         np.testing.assert_allclose(result.certainty, wanted, rtol=1e-6)
-    columns = {
-        name: getattr(result, name)[::3] for name in ("xyz", "labels", "scores", "instances", "distance", "reasons")
-    }
+    columns = {name: getattr(result, name)[::3] for name in ("xyz", "labels", "scores", "instances", "reasons")}
     np.testing.assert_array_equal(replace(result, **columns).certainty, result.certainty[::3])
 
 
