@@ -14,80 +14,71 @@ from og_pointcloud.settings import FitSettings
 __all__ = ["Journal", "LeftOut", "left_out_entry"]
 
 Item = TypeVar("Item")
-
-
-class LeftOut(str, Enum):
-    """What can be left out of a fit. SENTENCES says what each means; the value is its ``key`` in provenance."""
-
-    VIEWS = "views"
-    COINCIDENT_POINTS = "coincident points"
-    CHOICE_OF_SPLATS = "choice of splats"
-    CHOICE_OF_SCALE = "choice of scale"
-    CHOICE_IN_PAPER_MODE = "choice of splats, mode paper"
-    CHOICE_POINTS = "points of the choice of splats"
-    PIXELS = "pixels"
-    RENDERING = "rendering"
-    FINE_POINTS = "points finer than pixels"
-    SPANNING_MASKS = "spanning masks"
-    CONTRADICTED_GROUPS = "contradicted groups"
-    LEARNING_WITHOUT_INSTANCES = "learning, no instances"
-    LEARNING_NOT_NEEDED = "learning, not needed"
-    LEARNING_IN_TILES = "learning, in tiles"
-    SECOND_LEVEL = "second level"
-    GROUPED_INSTANCES = "grouped instances"
-    LEARNED_INSTANCES = "learned instances"
-    WHOLE_FIT = "whole fit"
-    VOCABULARY = "vocabulary"
-    EMPTY_LEAVES = "empty leaves"
-    FAINT_GAUSSIANS = "faint gaussians"
-
-
 _SHARES = "they agree with {learned:.0%} of the masks' area, those from grouping with {grouped:.0%}"
-SENTENCES = {
-    LeftOut.VIEWS: ("{count} of {total} views", "nearly all that they see is seen by {enough} others"),
-    LeftOut.COINCIDENT_POINTS: ("{count} points", "they lie exactly where another lies, and get its label"),
-    LeftOut.CHOICE_OF_SPLATS: ("choice of scale and opacity", "the file holds Gaussians"),
-    LeftOut.CHOICE_OF_SCALE: (
-        "choice of the points' size", "no views can judge others here: points are drawn {scale:g} spacings large",
-    ),
-    LeftOut.CHOICE_IN_PAPER_MODE: (
-        "choice of scale and opacity", "mode paper draws points as full as trained Gaussians are",
-    ),
-    LeftOut.CHOICE_POINTS: ("{share:.0%} of the points in the choice of scale and opacity", "the rest are enough"),
-    LeftOut.PIXELS: (
-        "{share:.0%} of the pixels", "points lie {spacing_px:.1f} px apart: one row and column in {stride} is enough",
-    ),
-    LeftOut.RENDERING: ("rendering of {count} views", "an interrupted fit kept them in '{folder}'"),
-    LeftOut.FINE_POINTS: (
-        "{share:.0%} of the points in the images",
+
+
+class LeftOut(Enum):
+    """What can be left out of a fit: its key in provenance, then what it is and why, with places for numbers."""
+
+    # fmt: off
+    VIEWS = "views", "{count} of {total} views", "nearly all that they see is seen by {enough} others"
+    COINCIDENT_POINTS = "coincident points", "{count} points", "they lie exactly where another lies, and get its label"
+    CHOICE_OF_SPLATS = "choice of splats", "choice of scale and opacity", "the file holds Gaussians"
+    CHOICE_OF_SCALE = (
+        "choice of scale", "choice of the points' size",
+        "no views can judge others here: points are drawn {scale:g} spacings large",
+    )
+    CHOICE_IN_PAPER_MODE = (
+        "choice of splats, mode paper", "choice of scale and opacity",
+        "mode paper draws points as full as trained Gaussians are",
+    )
+    CHOICE_POINTS = (
+        "points of the choice of splats", "{share:.0%} of the points in the choice of scale and opacity",
+        "the rest are enough",
+    )
+    PIXELS = (
+        "pixels", "{share:.0%} of the pixels",
+        "points lie {spacing_px:.1f} px apart: one row and column in {stride} is enough",
+    )
+    RENDERING = "rendering", "rendering of {count} views", "an interrupted fit kept them in '{folder}'"
+    FINE_POINTS = (
+        "points finer than pixels", "{share:.0%} of the points in the images",
         "closer together than {finest_px:g} px, or more than {most:,} in one: larger ones stand in",
-    ),
-    LeftOut.SPANNING_MASKS: ("{count} masks", "most views show each of them as several things"),
-    LeftOut.CONTRADICTED_GROUPS: (
-        "{count} of {total} groups of masks",
+    )
+    SPANNING_MASKS = "spanning masks", "{count} masks", "most views show each of them as several things"
+    CONTRADICTED_GROUPS = (
+        "contradicted groups", "{count} of {total} groups of masks",
         "views that see their points mostly show no such mask, far more often than the proposer's misses explain",
-    ),
-    LeftOut.LEARNING_WITHOUT_INSTANCES: (
-        "learned features and codebook", "no mask shows an instance: there is nothing to learn from",
-    ),
-    LeftOut.LEARNING_NOT_NEEDED: (
-        "learned features and codebook",
+    )
+    LEARNING_WITHOUT_INSTANCES = (
+        "learning, no instances", "learned features and codebook",
+        "no mask shows an instance: there is nothing to learn from",
+    )
+    LEARNING_NOT_NEEDED = (
+        "learning, not needed", "learned features and codebook",
         "instances from grouping agree with {grouped:.0%} of the masks' area; learning is tried below {enough:.0%}",
-    ),
-    LeftOut.LEARNING_IN_TILES: (
-        "learned features and codebook", "they learn from all points at once, which tiles do not hold",
-    ),
-    LeftOut.SECOND_LEVEL: ("the codebook's second level", "no view shows two masks in one coarse cluster"),
-    LeftOut.GROUPED_INSTANCES: ("instances from grouping", f"learned ones explain the masks better: {_SHARES}"),
-    LeftOut.LEARNED_INSTANCES: ("instances from learned features", f"they explain the masks no better: {_SHARES}"),
-    LeftOut.WHOLE_FIT: (
-        "a fit of all points at once", "{count:,} points take more memory than it has: fitted in tiles",
-    ),
-    LeftOut.VOCABULARY: ("vocabulary", "{reason}"),
-    LeftOut.EMPTY_LEAVES: ("{count} of {total} leaves", "no visible Gaussian is in them"),
-    LeftOut.FAINT_GAUSSIANS: ("{count} Gaussians", "less opaque than {opacity}: they cannot be seen"),
-}  # fmt: skip
-"""What was left out, and why, for the numbers that `Journal.leave_out` is given."""
+    )
+    LEARNING_IN_TILES = (
+        "learning, in tiles", "learned features and codebook",
+        "they learn from all points at once, which tiles do not hold",
+    )
+    SECOND_LEVEL = "second level", "the codebook's second level", "no view shows two masks in one coarse cluster"
+    GROUPED_INSTANCES = (
+        "grouped instances", "instances from grouping", f"learned ones explain the masks better: {_SHARES}",
+    )
+    LEARNED_INSTANCES = (
+        "learned instances", "instances from learned features", f"they explain the masks no better: {_SHARES}",
+    )
+    WHOLE_FIT = (
+        "whole fit", "a fit of all points at once", "{count:,} points take more memory than it has: fitted in tiles",
+    )
+    VOCABULARY = "vocabulary", "vocabulary", "{reason}"
+    EMPTY_LEAVES = "empty leaves", "{count} of {total} leaves", "no visible Gaussian is in them"
+    FAINT_GAUSSIANS = "faint gaussians", "{count} Gaussians", "less opaque than {opacity}: they cannot be seen"
+    # fmt: on
+
+    def __init__(self, key: str, what: str, why: str) -> None:
+        self.key, self.what, self.why = key, what, why
 
 
 def left_out_entry(key: LeftOut, **numbers: Any) -> dict[str, Any]:
@@ -96,8 +87,7 @@ def left_out_entry(key: LeftOut, **numbers: Any) -> dict[str, Any]:
     >>> left_out_entry(LeftOut.SPANNING_MASKS, count=3)["what"]
     '3 masks'
     """
-    what, why = (sentence.format(**numbers) for sentence in SENTENCES[key])
-    return {"key": key.value, "what": what, "why": why, **numbers}
+    return {"key": key.key, "what": key.what.format(**numbers), "why": key.why.format(**numbers), **numbers}
 
 
 @dataclass

@@ -16,7 +16,7 @@ from og_pointcloud.cloud import BACKGROUND, UNOBSERVED, InstanceTable, LabelledC
 from og_pointcloud.fitting.fit import fit, prepare
 from og_pointcloud.fitting.labellers import LABELLERS, Labelling, auto, fast, grouping, mask_agreement
 from og_pointcloud.fitting.mask_table import MaskTable
-from og_pointcloud.journal import SENTENCES, Journal, LeftOut, left_out_entry
+from og_pointcloud.journal import Journal, LeftOut, left_out_entry
 from og_pointcloud.settings import CodebookSettings, FitSettings, MatchingSettings, PaperSettings, VisibilitySettings
 
 MODES = get_args(get_type_hints(FitSettings)["mode"])
@@ -158,9 +158,9 @@ def test_every_mode_has_its_labeller() -> None:
 @pytest.mark.parametrize("key", LeftOut)
 def test_whatever_is_left_out_has_its_sentences(key: LeftOut) -> None:
     """Told whole numbers, as a journal may be."""
-    names = [name for text in SENTENCES[key] for _, name, _, _ in Formatter().parse(text) if name]
+    names = [name for text in (key.what, key.why) for _, name, _, _ in Formatter().parse(text) if name]
     entry = left_out_entry(key, **dict.fromkeys(names, 7))
-    assert entry["key"] == key.value
+    assert entry["key"] == key.key
     assert entry["what"]
     assert entry["why"]
     assert [entry[name] for name in names] == [7] * len(names)

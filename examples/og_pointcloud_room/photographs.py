@@ -57,8 +57,8 @@ def label_from_photographs(
 
     Of the capture only images, poses, points and the truth are used; ``output`` becomes a capture of its own, with the
     masks made here, and gets ``room.ogpc``, which carries the words' encoder. proposer: as of `og-pointcloud masks`; or
-    the capture's own ``masks`` folder for those of the demo's simulated proposer. processes: images worked on side by
-    side; None: `make_masks` chooses. level: of the masks; None: that command's own.
+    the capture's own ``masks`` folder for those of the demo's simulated proposer. level: of the
+    masks; None: that command's own.
     """
     seconds: dict[str, float] = {}
     output.mkdir(parents=True, exist_ok=True)

@@ -6,7 +6,7 @@ Each part comes from the first of these that the folder has.
   masks     ``mask_features.npz`` with ``masks/``; LangSplat's ``language_features/``
   geometry  the file given; ``ply_file_path`` of transforms.json; ``points.ply``, ``point_cloud.ply``, the folder's one
             ``.pcd``; the latest ``point_cloud/iteration_*/point_cloud.ply``; ScanNet's ``*_vh_clean_2.ply``; COLMAP's
-            ``points3D``; depth images, fused
+            ``points3D``, with COLMAP's poses; depth images, fused
   depth     optional; ``depth_file_path`` of a frame; where the data set has it; ``depth/`` beside ``images/``
   images    optional; where the pose file says, or of that name in ``images/``
 
@@ -53,20 +53,17 @@ __all__ = [
 CLOUD_NAMES = ("points.ply", "point_cloud.ply")
 FUSED_FRAMES = 300
 """Depth images that are fused at most, evenly spread over a recording, whose neighbours show almost the same."""
-SAME_POSE = 1e-3
-"""Largest difference of poses that mean one world: radians, and a share of the distance from camera to points."""
 
 
 @dataclass(frozen=True)
 class CapturePoses:
-    """names: the views', an image each. source: the pose file or folder. applied_transform: from COLMAP's world to the
-    poses' (see nerfstudio.py). is_recording: every frame of a video has a pose, and some of them masks."""
+    """names: the views', an image each. source: the pose file or folder. is_recording: every frame of a video has a
+    pose, and some of them masks."""
 
     names: tuple[str, ...]
     images: tuple[PosedImage, ...]
     source: Path
     ply_file_path: str | None = None
-    applied_transform: NDArray[np.float64] | None = None
     is_recording: bool = False
 
 
@@ -108,7 +105,7 @@ def read_poses(capture: Path) -> CapturePoses:
         transforms = read_transforms(file, partial(_size_of_image, capture))
         _warn_of_dropped(file, transforms.dropped)
         names = _view_names(transforms.images)
-        return CapturePoses(names, transforms.images, file, transforms.ply_file_path, transforms.applied_transform)
+        return CapturePoses(names, transforms.images, file, transforms.ply_file_path)
     model = colmap.find_model(capture)
     if model is not None:
         images = colmap.read_images(model)
@@ -203,8 +200,14 @@ def read_geometry(capture: Path, poses: CapturePoses, gaussians: str | Path | No
                 "in depth/: add one of them, or name a file (--gaussians)"
             )
         return _fused(capture, frames).points
+    if poses.source != model:  # which was often rotated, shifted or scaled since, and seldom says how
+        raise SceneError(
+            f"{poses.source} names no cloud, and the world of {model}/points3D may be another than that of its poses; "
+            f"expected a cloud in the world of {poses.source.name}: add {CLOUD_NAMES[0]}, or remove "
+            f"{poses.source.name}, so that COLMAP's poses are used"
+        )
     xyz, rgb = colmap.read_points3d(model)
-    return Points.from_world(_in_world_of(poses, model, xyz), rgb=rgb)
+    return Points.from_world(xyz, rgb=rgb)
 
 
 def _inside(capture: Path, path: str, source: Path) -> Path:
@@ -290,36 +293,6 @@ def _colors_at(file: Path, image: PosedImage, camera: Camera) -> NDArray[np.uint
     size = max(1, round(image.camera.width * scale)), max(1, round(image.camera.height * scale))
     photographed = image.camera.resized(*size)
     return resampled(_image(file, photographed, image.distortion), photographed, camera)
-
-
-def _in_world_of(poses: CapturePoses, model: Path, xyz: NDArray[np.float64]) -> NDArray[np.float64]:
-    """COLMAP's points in the world of the poses.
-
-    Poses of a transforms.json were often rotated, shifted or scaled after COLMAP, and only nerfstudio writes down how.
-    So the two files' poses of the same images are compared: a cloud in another world would be labelled at random.
-    """
-    if poses.source == model:
-        return xyz
-    transform = np.eye(4) if poses.applied_transform is None else poses.applied_transform
-    rotation, translation = transform[:3, :3], transform[:3, 3]
-    moved = xyz @ rotation.T + translation
-    theirs = {_stem(image.path): image.camera for image in colmap.read_images(model)}
-    pairs = [(image.camera, theirs[_stem(image.path)]) for image in poses.images if _stem(image.path) in theirs]
-    if pairs and len(moved):
-        distance = float(np.median(np.linalg.norm(moved - pairs[0][0].center, axis=1)))
-        moved_by = max(np.linalg.norm(a.center - (rotation @ b.center + translation)) / distance for a, b in pairs)
-        turned = max(np.abs(a.world_to_camera[:3, :3] @ rotation - b.world_to_camera[:3, :3]).max() for a, b in pairs)
-        if max(moved_by, turned) < SAME_POSE:
-            return moved
-    raise SceneError(
-        f"{model} and {poses.source.name} do not place the same images alike, so points3D is in another world than the "
-        "poses; expected a cloud in the world of transforms.json: add points.ply, or remove transforms.json so that "
-        "COLMAP's poses are used"
-    )
-
-
-def _stem(path: str) -> str:
-    return posixpath.basename(without_suffix(path))
 
 
 def find_images(capture: Path, images: Sequence[PosedImage]) -> list[Path | None]:

@@ -1,8 +1,7 @@
 """COLMAP sparse models, .bin and .txt: world-to-camera poses, OpenCV axes, pixel centres at +0.5 as in the scene.
 
 Layout: https://colmap.github.io/format.html. Binary files are little endian: a count (uint64), then the records. Text
-files have a record a line, ``#`` for comments. Both hold the same fields in the same order, so each record is parsed
-once, from either of two sources. Where both are present the binary files are read, as COLMAP does.
+files have a record a line, ``#`` for comments. Where both are present the binary files are read, as COLMAP does.
 
 Since 3.12 a model may have files of rigs and frames. They need not be read: the images file still has all poses.
 """
@@ -13,9 +12,9 @@ import math
 import mmap
 import struct
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,7 +45,12 @@ CAMERA_MODELS: dict[str, tuple[int, str]] = {
 """Models that OpenCV undistorts exactly, with COLMAP's ids and parameters; the others are refused."""
 MODEL_NAMES = {model_id: name for name, (model_id, _) in CAMERA_MODELS.items()}
 
-Pose = NDArray[np.float64]
+CameraRecord = tuple[int, str, tuple[int, int], dict[str, float]]
+"""Id, model, (width, height), parameters by name."""
+ImageRecord = tuple[tuple[float, ...], int, str]
+"""Pose qw qx qy qz tx ty tz, the camera's id, name."""
+Records = TypeVar("Records")
+Number = TypeVar("Number", int, float)
 
 
 class _Lens(NamedTuple):
@@ -67,12 +71,12 @@ def find_model(capture: Path) -> Path | None:
 
 def read_images(model: Path) -> tuple[PosedImage, ...]:
     """The posed images of a sparse model in the file's order. Raises SceneError naming file, place and cure."""
-    lenses = dict(map(_camera, _records(model, "cameras", minimum_bytes=24 + 3 * 8)))
+    lenses = {
+        camera_id: _lens(camera_model, size, values)
+        for camera_id, camera_model, size, values in _records(model, "cameras", _cameras_binary, _cameras_text)
+    }
     images = []
-    for record in _records(model, "images", minimum_bytes=4 + 7 * 8 + 4 + 1 + 8):
-        record.integer("I")  # the image's own id
-        pose, camera_id, name = record.pose(), record.integer("I"), record.name()
-        record.skip_observations()
+    for pose, camera_id, name in _records(model, "images", _images_binary, _images_text):
         lens = lenses.get(camera_id)
         if lens is None:
             raise SceneError(
@@ -80,7 +84,7 @@ def read_images(model: Path) -> tuple[PosedImage, ...]:
                 f"{sorted(lenses)[:10]}; expected files of one reconstruction: export the model again"
             )
         with naming(f"{model}, image '{name:.60}'"):
-            camera = Camera(lens.width, lens.height, *lens.intrinsics, pose)
+            camera = Camera(lens.width, lens.height, *lens.intrinsics, _pose(pose))
         images.append(PosedImage(name.replace("\\", "/"), camera, lens.distortion))
     if not images:
         raise SceneError(f"{model}: the images file lists 0 images; expected at least one registered image")
@@ -89,48 +93,113 @@ def read_images(model: Path) -> tuple[PosedImage, ...]:
 
 def read_points3d(model: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
     """World coordinates (n, 3) float64 and colours (n, 3) uint8 of the triangulated points."""
-    file = _file(model, "points3D")
-    if file is None:
-        raise SceneError(f"{model} has neither points3D.bin nor points3D.txt: export the model again or name a cloud")
-    return _points_binary(file) if file.suffix == ".bin" else _points_text(file)
+    return _records(model, "points3D", _points_binary, _points_text)
 
 
 def _file(model: Path, stem: str) -> Path | None:
     return next((file for suffix in (".bin", ".txt") if (file := model / (stem + suffix)).is_file()), None)
 
 
-def _camera(record: _Binary | _Text) -> tuple[int, _Lens]:
-    camera_id, model = record.integer("I"), record.camera_model()
-    if model not in CAMERA_MODELS:
-        raise SceneError(
-            f"{record.path}: camera {camera_id} has the model {model:.60}; expected one of {', '.join(CAMERA_MODELS)}: "
-            "run 'colmap image_undistorter' and make the masks on its images"
-        )
-    width, height = record.integer("Q"), record.integer("Q")
-    names = CAMERA_MODELS[model][1].split()
-    values = dict(zip(names, record.reals(len(names)), strict=True))
-    fx, fy = (values.pop("f"),) * 2 if "f" in values else (values.pop("fx"), values.pop("fy"))
-    intrinsics = (fx, fy, values.pop("cx"), values.pop("cy"))
-    return camera_id, _Lens(width, height, intrinsics, lens_distortion(values, fisheye=model.endswith("FISHEYE")))
-
-
-# Sources.
-
-
-def _records(model: Path, stem: str, minimum_bytes: int) -> Iterator[_Binary | _Text]:
-    """The records of a model's file, each to be parsed before the next is asked for."""
+def _records(model: Path, stem: str, binary: Callable[[Path], Records], text: Callable[[Path], Records]) -> Records:
+    """What one of the two reads from the model's file of that name."""
     file = _file(model, stem)
     if file is None:
-        raise SceneError(f"{model} has neither {stem}.bin nor {stem}.txt: export the model again")
-    return _Binary(file).records(minimum_bytes) if file.suffix == ".bin" else _Text(file).records()
+        raise SceneError(f"{model} has neither {stem}.bin nor {stem}.txt: export the model again or name a cloud")
+    return binary(file) if file.suffix == ".bin" else text(file)
 
 
-def _pose(values: tuple[float, ...], source: str) -> Pose:
+def _parameters(file: Path, camera_id: int, camera_model: str) -> list[str]:
+    """Names of a camera model's parameters."""
+    if camera_model not in CAMERA_MODELS:
+        raise SceneError(
+            f"{file}: camera {camera_id} has the model {camera_model:.60}; expected one of {', '.join(CAMERA_MODELS)}: "
+            "run 'colmap image_undistorter' and make the masks on its images"
+        )
+    return CAMERA_MODELS[camera_model][1].split()
+
+
+def _lens(camera_model: str, size: tuple[int, int], values: dict[str, float]) -> _Lens:
+    """values: by the names of the model's parameters."""
+    fx, fy = (values.pop("f"),) * 2 if "f" in values else (values.pop("fx"), values.pop("fy"))
+    intrinsics = (fx, fy, values.pop("cx"), values.pop("cy"))
+    return _Lens(*size, intrinsics, lens_distortion(values, fisheye=camera_model.endswith("FISHEYE")))
+
+
+def _pose(values: tuple[float, ...]) -> NDArray[np.float64]:
     """(4, 4) from qw qx qy qz tx ty tz (Hamilton)."""
     norm = math.hypot(*values[:4])
     if not np.isfinite(values).all() or not 1e-8 < norm < math.inf:
-        raise SceneError(f"{source}: pose {values} has no rotation; expected a finite quaternion of length 1")
+        raise SceneError(f"pose {values} has no rotation; expected a finite quaternion of length 1")
     return rigid(rotation_of_quaternion(np.array(values[:4]) / norm), np.array(values[4:]))
+
+
+# Text files.
+
+
+def _cameras_text(file: Path) -> Iterator[CameraRecord]:
+    for place, line, _ in _lines(file):
+        words = [*line.split(), *[""] * 4]
+        (camera_id,), camera_model, size = _numbers(int, words[:1], place), words[1], _numbers(int, words[2:4], place)
+        names = _parameters(file, camera_id, camera_model)
+        values = _numbers(float, words[4 : 4 + len(names)], place)
+        yield camera_id, camera_model, (size[0], size[1]), dict(zip(names, values, strict=True))
+
+
+def _images_text(file: Path) -> Iterator[ImageRecord]:
+    """Two lines each. The second, of 2-D points, is empty, but there, where an image has none."""
+    for place, line, lines in _lines(file):
+        words = [*line.split(None, 9), *[""] * 10]
+        if not words[9].strip():
+            raise SceneError(f"{place}: found '{line.strip():.60}'; expected ten fields, a name last: export it again")
+        _, camera_id = _numbers(int, [words[0], words[8]], place)
+        yield _numbers(float, words[1:8], place), camera_id, words[9].strip()
+        number, observations = next(lines, (0, ""))
+        if len(observations.split(None, 10)) == 10:  # ten words are an image, never threes
+            raise SceneError(
+                f"{file}, line {number}: found '{observations.strip():.60}'; expected the line of 2-D points that "
+                "follows each image, empty if it has none: export it again"
+            )
+
+
+def _lines(file: Path) -> Iterator[tuple[str, str, Iterator[tuple[int, str]]]]:
+    """Lines that are no comments: each one's place, for errors, the line, and the numbered lines behind it."""
+    with file.open(encoding="utf-8", errors="replace") as stream:
+        lines = enumerate(stream, 1)
+        for number, line in lines:
+            if line.strip() and not line.startswith("#"):
+                yield f"{file}, line {number}", line, lines
+
+
+def _numbers(kind: Callable[[str], Number], words: Sequence[str], place: str) -> tuple[Number, ...]:
+    try:
+        return tuple(map(kind, words))
+    except ValueError:
+        what = "whole numbers" if kind is int else "numbers"
+        raise SceneError(
+            f"{place}: found '{' '.join(words):.60}'; expected {len(words)} {what}: export it again"
+        ) from None
+
+
+# Binary files.
+
+
+def _cameras_binary(file: Path) -> Iterator[CameraRecord]:
+    source = _Binary(file)
+    for _ in range(source.count(24 + 3 * 8)):
+        camera_id, model_id, width, height = source.unpack("<IiQQ")
+        camera_model = MODEL_NAMES.get(model_id, f"of id {model_id}")
+        names = _parameters(file, camera_id, camera_model)
+        values = source.unpack(f"<{len(names)}d")
+        yield camera_id, camera_model, (width, height), dict(zip(names, values, strict=True))
+
+
+def _images_binary(file: Path) -> Iterator[ImageRecord]:
+    source = _Binary(file)
+    for _ in range(source.count(4 + 7 * 8 + 4 + 1 + 8)):
+        _, *pose, camera_id = source.unpack("<I7dI")
+        yield tuple(pose), camera_id, source.name()
+        points = source.count(24)  # in the image: thousands, and nothing here needs them
+        source.offset += 24 * points
 
 
 class _Binary:
@@ -141,13 +210,9 @@ class _Binary:
         self.data = _mapped(path)
         self.offset = 0
 
-    def records(self, minimum_bytes: int) -> Iterator[_Binary]:
-        for _ in range(self.count(minimum_bytes)):
-            yield self
-
     def count(self, minimum_bytes: int) -> int:
         """A number of records, checked against the bytes that are left before anything is made of it."""
-        count = self.integer("Q")
+        count = self.unpack("<Q")[0]
         self.require(count * minimum_bytes)
         return count
 
@@ -165,88 +230,12 @@ class _Binary:
         self.offset += size
         return values
 
-    def integer(self, code: str) -> int:
-        return self.unpack("<" + code)[0]
-
-    def reals(self, count: int) -> tuple[float, ...]:
-        return self.unpack(f"<{count}d")
-
-    def pose(self) -> Pose:
-        return _pose(self.reals(7), f"{self.path} before byte {self.offset}")
-
-    def camera_model(self) -> str:
-        model_id = self.integer("i")
-        return MODEL_NAMES.get(model_id, f"of id {model_id}")
-
     def name(self) -> str:
         end = self.data.find(b"\0", self.offset)
         self.require((end if end >= 0 else len(self.data)) + 1 - self.offset)
         name = self.data[self.offset : end].decode("utf-8", errors="replace")
         self.offset = end + 1
         return name
-
-    def skip_observations(self) -> None:
-        """2-D points: x, y, point id, 24 bytes each. There are thousands an image, and nothing here needs them."""
-        count = self.count(24)
-        self.offset += 24 * count
-
-
-class _Text:
-    """Fields of a .txt file, a record a line; the field codes of the binary form are ignored."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self.line_number = 0
-        self.lines: Iterator[str] = iter(())
-        self.rest = ""
-
-    def records(self) -> Iterator[_Text]:
-        with self.path.open(encoding="utf-8", errors="replace") as self.lines:
-            for line in self.lines:
-                self.line_number += 1
-                self.rest = line.strip()
-                if self.rest and not self.rest.startswith("#"):
-                    yield self
-
-    def damaged(self, field: str, expected: str) -> SceneError:
-        return SceneError(
-            f"{self.path}, line {self.line_number}: found '{field:.60}'; expected {expected}: export it again"
-        )
-
-    def word(self) -> str:
-        word, self.rest = (*self.rest.split(None, 1), "", "")[:2]
-        return word
-
-    def integer(self, code: str) -> int:
-        word = self.word()
-        if not word.isdecimal():
-            raise self.damaged(word, "a whole number")
-        return int(word)
-
-    def reals(self, count: int) -> tuple[float, ...]:
-        words = [self.word() for _ in range(count)]
-        try:
-            return tuple(map(float, words))
-        except ValueError:
-            raise self.damaged(" ".join(words), f"{count} numbers") from None
-
-    def pose(self) -> Pose:
-        return _pose(self.reals(7), f"{self.path}, line {self.line_number}")
-
-    def camera_model(self) -> str:
-        return self.word()
-
-    def name(self) -> str:
-        if not self.rest:
-            raise self.damaged("", "an image name")
-        return self.rest
-
-    def skip_observations(self) -> None:
-        """The next line: x, y, point id of each 2-D point; empty, but there, where an image has none."""
-        self.line_number += 1
-        line = next(self.lines, "")
-        if len(line.split(None, 10)) == 10:  # ten words are an image, never threes
-            raise self.damaged(line.strip(), "the line of 2-D points that follows each image, empty if it has none")
 
 
 def _mapped(path: Path) -> mmap.mmap | bytes:

@@ -9,8 +9,7 @@ A frame's ``depth_file_path`` names its depth image inside the capture folder; a
 unless ``integer_depth_scale`` (instant-ngp) or ``depth_unit_scale_factor`` says what it is.
 
 ``applied_transform`` (nerfstudio: from COLMAP's world to the world of this file) is *not* applied to
-``ply_file_path``: nerfstudio writes that cloud in the world of ``transform_matrix``. It is reported for clouds that
-come from COLMAP itself.
+``ply_file_path``: nerfstudio writes that cloud in the world of ``transform_matrix``.
 """
 
 from __future__ import annotations
@@ -44,15 +43,10 @@ LARGEST = float(np.finfo(np.float64).max)
 
 @dataclass(frozen=True)
 class Transforms:
-    """What a transforms file holds.
-
-    applied_transform: (4, 4) from COLMAP's world to this file's, or None where the file does not say.
-    dropped: paths of frames whose pose is not finite (trackers write those when they are lost).
-    """
+    """What a transforms file holds. dropped: paths of frames whose pose is not finite (trackers get lost)."""
 
     images: tuple[PosedImage, ...]
     ply_file_path: str | None
-    applied_transform: NDArray[np.float64] | None
     dropped: tuple[str, ...]
 
 
@@ -87,11 +81,9 @@ def read_transforms(file: Path, image_size: Callable[[str], tuple[int, int]]) ->
         raise SceneError(
             f"{file}: none of its {len(frames)} frames has a finite transform_matrix; expected one or more"
         )
-    with naming(str(file)):
-        applied = _matrix(shared, "applied_transform") if "applied_transform" in shared else None
     ply = shared.get("ply_file_path")
     ply_file_path = ply.replace("\\", "/") if isinstance(ply, str) and ply else None
-    return Transforms(tuple(images), ply_file_path, applied, tuple(dropped))
+    return Transforms(tuple(images), ply_file_path, tuple(dropped))
 
 
 def _matrix(keys: dict[str, Any], key: str) -> NDArray[np.float64]:
