@@ -52,7 +52,7 @@ if TYPE_CHECKING:
     from og_pointcloud.scene import Camera
     from og_pointcloud.settings import FitSettings
     from og_pointcloud.show import edit as edit
-    from og_pointcloud.show.fit_pictures import feature_colors, feature_picture, instance_picture
+    from og_pointcloud.show.fit_pictures import feature_colors, feature_picture
     from og_pointcloud.text.text_features import read_text_features
 
 __all__ = [
@@ -86,7 +86,6 @@ __all__ = [
     "feature_picture",
     "fit",
     "in_world",
-    "instance_picture",
     "instance_table",
     "load",
     "oriented_box",
@@ -123,7 +122,7 @@ _HOMES = {
     "og_pointcloud.formats.points": ("read_points",),
     "og_pointcloud.scene": ("Camera",),
     "og_pointcloud.settings": ("FitSettings",),
-    "og_pointcloud.show.fit_pictures": ("feature_colors", "feature_picture", "instance_picture"),
+    "og_pointcloud.show.fit_pictures": ("feature_colors", "feature_picture"),
     "og_pointcloud.text.text_features": ("read_text_features",),
     "og_pointcloud_export": ("write_bundle",),
 }  # fmt: skip

@@ -157,8 +157,7 @@ def test_interrupt_leaves_nothing(tiny_capture, tmp_path, capsys, monkeypatch):
         (("pick", "s.ogpc", "--pixel", "3,4"), "--capture CAPTURE --view NAME"),
         (("pick", "s.ogpc", "--xyz", "1,2,3", "-o", "mask.png"), "--capture CAPTURE --view NAME"),
         (("pick", "s.ogpc", "--xyz", "1,2,3", "-o", "mask.jpg"), "ends in .png"),
-        (("view", "capture"), "one of the arguments --features --instances is required"),
-        (("view", "capture", "--features", "--columns", "0"), "--columns is 0"),
+        (("view", "capture", "--columns", "0"), "--columns is 0"),
         (("fit", "capture", "-o", "s.ogpc", "--schedule-share", "0.1"), "--mode auto, which has no schedule"),
         (("fit", "capture", "-o", "s.ogpc", "--mode", "paper", "--schedule-share", "-1"), "schedule_share is -1"),
         (("import", "absent", "-o", "s.ogpc"), "is not a file; expected a result folder"),
@@ -387,21 +386,15 @@ def test_clicks_that_give_no_mask(fitted, tmp_path, capsys):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_pictures_of_features_and_of_instances(fitted, tmp_path, capsys):
-    capture, bundle = fitted
-    for what in (("--features",), ("--instances", bundle)):
-        output = tmp_path / f"new{what[0]}" / "p.png"
-        code, stdout, _ = run(capsys, "view", capture.folder, *what, "-o", output, "--columns", "3")
-        assert code == 0
-        assert f"wrote {output}" in stdout
-        sheet = cv2.imread(str(output))
-        rows = 4 if what == ("--features",) else 2
-        assert sheet.shape[0] > rows * HEIGHT
-        assert 3 * WIDTH < sheet.shape[1] < 4 * WIDTH
-    other = write_tiny_capture(tmp_path / "other")
-    write_ply(other.folder / "points.ply", *[part[:900] for part in (sample_surfaces()[0], COLOURS[other.object_ids])])
-    error = error_of(capsys, "view", other.folder, "--instances", bundle, "-o", tmp_path / "i.png")
-    assert "expected a fit of this capture" in error
+def test_pictures_of_features(fitted, tmp_path, capsys):
+    capture, _ = fitted
+    output = tmp_path / "new" / "p.png"
+    code, stdout, _ = run(capsys, "view", capture.folder, "-o", output, "--columns", "3")
+    assert code == 0
+    assert f"wrote {output}" in stdout
+    sheet = cv2.imread(str(output))
+    assert sheet.shape[0] > 4 * HEIGHT
+    assert 3 * WIDTH < sheet.shape[1] < 4 * WIDTH
 
 
 def test_results_of_opengaussian_can_be_asked(tmp_path, capsys):

@@ -6,10 +6,8 @@ import pytest
 
 from og_pointcloud.errors import SceneError
 from og_pointcloud.fitting.mask_table import Gaussians
-from og_pointcloud.formats.colors import UNKNOWN_COLOR, label_colors
 from og_pointcloud.scene import Camera, View
 from og_pointcloud.show.fit_pictures import (
-    DARK,
     GAP,
     GREY,
     MARGIN,
@@ -17,7 +15,6 @@ from og_pointcloud.show.fit_pictures import (
     FeatureColors,
     feature_colors,
     feature_picture,
-    instance_picture,
 )
 
 WIDTH, HEIGHT = 80, 60
@@ -165,37 +162,12 @@ def test_what_no_gaussian_covers_is_white(tmp_path):
     assert (np.abs(right_color - 128) <= 1).all()
 
 
-def test_instances_have_colours_of_their_own(tmp_path):
-    gaussians, right = wall()
-    stages = {
-        "instances": np.where(right, 7, 2),
-        "states": np.where(right, -2, -1),
-    }
-    instance_picture(gaussians, [view("a"), view("b")], 0.1, stages, tmp_path / "i.png")
-    sheet = read(tmp_path / "i.png")
-    left, right_color = halves(cell(sheet, 0, 1))
-    assert np.array_equal(left, label_colors(np.array([2]))[0])
-    assert np.array_equal(right_color, label_colors(np.array([7]))[0])
-    background, unobserved = halves(cell(sheet, 1, 0))
-    assert np.array_equal(background, UNKNOWN_COLOR)
-    assert np.array_equal(unobserved, DARK)
-
-
-def test_pixels_take_the_instance_that_shows_most(tmp_path):
-    gaussians, _ = wall()
-    ids = np.where(np.arange(len(gaussians)) % 3 == 0, 5, 1)
-    instance_picture(gaussians, [view("a")], 0.1, {"instances": ids}, tmp_path / "i.png")
-    pixels = cell(read(tmp_path / "i.png"), 0, 0)[2:-2, 2:-2].reshape(-1, 3)
-    colors = label_colors(np.array([1, 5]))
-    assert all(any(np.array_equal(pixel, color) for color in colors) for pixel in pixels), "never a mixture"
-    assert (pixels == colors[0]).all(axis=1).mean() > 0.6
-
-
 def test_large_views_are_shrunk_and_long_names_cut(tmp_path):
     gaussians, right = wall()
+    stages = {"features": right[:, None].astype(float)}
     name = "a/very/long/name/" * 10 + "7"
     camera = ahead(1600, 1200)
-    instance_picture(gaussians, [view(name, camera)], 0.1, {"instances": right.astype(int)}, tmp_path / "i.png")
+    feature_picture(gaussians, [view(name, camera)], 0.1, stages, tmp_path / "i.png")
     sheet = read(tmp_path / "i.png")
     assert sheet.shape == (STRIP + STRIP + 270 + GAP, 360 + 2 * MARGIN, 3)
     strip = sheet[:STRIP]

@@ -1,7 +1,7 @@
-"""Look at a scene labelled by words: in a window, as a stand-alone page or picture. Or at views of a capture.
+"""Look at a scene labelled by words: in a window, as a stand-alone page or picture. Or at a capture's features.
 
 og-pointcloud view kitchen.ogpc --labels chair,table --html kitchen.html
-  og-pointcloud view kitchen --features -o features.png
+  og-pointcloud view kitchen -o features.png
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from og_pointcloud.show.viewpoint import Viewpoint
 
 AXES = {"x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1), "-x": (-1, 0, 0), "-y": (0, -1, 0), "-z": (0, 0, -1)}
-OF_SCENE = ("labels", "text_features", "cloud", "html", "png", "boxes", "certainty", "up", "cut")
-OF_CAPTURE = ("features", "output", "columns")
+OF_SCENE = ("labels", "text_features", "cloud", "html", "png", "boxes", "certainty", "up", "cut", "instances")
+OF_CAPTURE = ("output", "columns")
 
 
 def add(parser: Parser) -> None:
@@ -38,15 +38,9 @@ def add(parser: Parser) -> None:
     scene.add_argument("--certainty", action="store_true", help="colours by how sure each point's instance is")
     scene.add_argument("--up", choices=AXES, metavar="AXIS", help="which of x, y, z, -x, -y, -z points up (default: z)")
     scene.add_argument("--cut", type=float, metavar="SHARE", help="hide this share of the height, from the top")
-    parser.add_argument(
-        "--instances", nargs="?", type=Path, const=True, metavar="S.ogpc",
-        help="of a scene: colours by instance; of a capture: show the instances of this fit",
-    )  # fmt: skip
-    capture = parser.add_argument_group("a capture, with --features or --instances S.ogpc")
-    capture.add_argument(
-        "--features", action="store_true", help="learn features; show them before and after clustering"
-    )
-    add_output(capture, "-o", "--output", endings=(".png",), help="default: features.png or instances.png")
+    scene.add_argument("--instances", action="store_true", help="colours by instance")
+    capture = parser.add_argument_group("a CAPTURE: features are learned and shown before and after clustering")
+    add_output(capture, "-o", "--output", endings=(".png",), help="default: features.png")
     capture.add_argument("--columns", type=int, metavar="N", help="views shown (default: 4)")
 
 
@@ -104,8 +98,6 @@ def view_scene(arguments: argparse.Namespace) -> None:
 
 
 def check_scene_options(arguments: argparse.Namespace) -> None:
-    if isinstance(arguments.instances, Path):
-        raise OgPointcloudError(f"--instances is '{arguments.instances}'; expected no value where a scene is shown")
     if arguments.certainty and (arguments.instances or arguments.html):
         raise OgPointcloudError(
             "--certainty is drawn alone, in a window or with --png; leave out --instances and --html"
@@ -146,36 +138,16 @@ def chosen_view(result: Segmentation, arguments: argparse.Namespace) -> tuple[ND
 
 
 def view_capture(arguments: argparse.Namespace) -> None:
-    if not arguments.features and arguments.instances is None:
-        arguments.parser.error("one of the arguments --features --instances is required")
-    if arguments.features and arguments.instances is not None:
-        arguments.parser.error("argument --instances: not allowed with argument --features")
-    if arguments.instances is True:  # nothing behind the option
-        raise OgPointcloudError(
-            f"--instances has no value; expected the fit of '{arguments.source}': --instances S.ogpc"
-        )
     check_at_least("--columns", arguments.columns, 1)
-    from og_pointcloud.bundle.read import read_bundle
     from og_pointcloud.fitting.fit import prepare
     from og_pointcloud.formats.capture import read_capture
     from og_pointcloud.journal import Journal
-    from og_pointcloud.show import fit_pictures as pictures
+    from og_pointcloud.show.fit_pictures import feature_picture, learned_stages
 
-    output = arguments.output or Path("features.png" if arguments.features else "instances.png")
-    scene, columns = read_capture(arguments.source), arguments.columns or 4
+    output = arguments.output or Path("features.png")
+    scene = read_capture(arguments.source)
     prepared = prepare(scene, journal=Journal(progress=True))
     surface = prepared.surface
-    if arguments.instances is None:
-        features = pictures.learned_stages(prepared.table, surface.scene.points.xyz)
-        pictures.feature_picture(surface.gaussians, scene.views, surface.near, features, output, columns)
-    else:
-        cloud = read_bundle(arguments.instances).cloud
-        if len(cloud) != len(scene.points):
-            raise OgPointcloudError(
-                f"{arguments.instances} has {len(cloud)} points, the capture {len(scene.points)}; expected a fit of "
-                "this capture"
-            )
-        gaussians = surface.gaussians.take(surface.row_of_point)
-        ids = {f"{len(cloud.instances)} instances": cloud.instance_ids}
-        pictures.instance_picture(gaussians, scene.views, surface.near, ids, output, columns)
+    features = learned_stages(prepared.table, surface.scene.points.xyz)
+    feature_picture(surface.gaussians, scene.views, surface.near, features, output, arguments.columns or 4)
     print(f"wrote {output}")

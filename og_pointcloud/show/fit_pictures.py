@@ -1,8 +1,7 @@
-"""Pictures of features and instances, as in the paper's figures: rendered over several views, stage below stage.
+"""Pictures of features, as in the paper's figures: rendered over several views, stage below stage.
 
 Features become colours by one linear map, fitted once and used for every stage, so that equal colours mean equal
-features before and after discretisation. Maps are rendered with the blending weights of `visibility` (``W F``), the
-same that the features are learned with.
+features before and after discretisation. The colours are rendered with the blending weights of the renderer.
 """
 
 from __future__ import annotations
@@ -16,35 +15,29 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud.cloud import UNKNOWN, UNOBSERVED
 from og_pointcloud.errors import MissingExtraError, SceneError
 from og_pointcloud.formats.atomic import replacing
-from og_pointcloud.formats.colors import label_colors
 from og_pointcloud.formats.images import require_cv2
 from og_pointcloud.scene import View
-from og_pointcloud.settings import CodebookSettings, FeatureSettings
+from og_pointcloud.settings import CodebookSettings
 
 try:
-    from scipy.sparse import csr_array
-
     from og_pointcloud.fitting.learned.codebook import two_level_codebook
     from og_pointcloud.fitting.learned.instance_features import learn_features
-    from og_pointcloud.fitting.mask_table import Gaussians, MaskTable, pixel_weights
+    from og_pointcloud.fitting.mask_table import Gaussians, MaskTable, render
 except ImportError as error:
     raise MissingExtraError("scipy and numba", "fit") from error
 
-__all__ = ["FeatureColors", "feature_colors", "feature_picture", "instance_picture", "learned_stages"]
+__all__ = ["FeatureColors", "feature_colors", "feature_picture", "learned_stages"]
 
 GREY = (128, 128, 128)
 """A point without a feature, because no view sees it."""
-DARK = (64, 64, 64)
-"""A point that is not observed, where instances are shown."""
 SPREAD = 1.5
 """Standard deviations to either side of the mean that a colour channel shows."""
 LEAST_RANGE = 0.25
 """A channel is stretched no further than to show this part of the widest one's range: the rest may be noise."""
 OPAQUE = 0.5
-"""Pixels with this much blending weight show their value alone, emptier ones fade to white."""
+"""Pixels that are covered this much show their value alone, emptier ones fade to white."""
 CELL_WIDTH = 360
 """Pixels; views that are narrower keep their size."""
 GAP, STRIP, MARGIN = 6, 26, 10
@@ -114,7 +107,7 @@ def feature_picture(
     """Write a PNG of features over several views: a row of photographs, where there are any, then a row a stage.
 
     near: depth of the near plane (`geometry.near_plane`). stages: title -> (n, w) features, NaN rows for points without
-    one; colours are fitted to the first stage, as the views shown see it. columns: views shown, evenly spread.
+    one; colours are fitted to the first stage. columns: views shown, evenly spread.
     SceneError where the stages do not fit the Gaussians.
 
     >>> import pathlib, tempfile
@@ -130,29 +123,21 @@ def feature_picture(
     >>> og.feature_picture(gaussians, [view], 0.1, stages, pathlib.Path(tempfile.mkdtemp()) / "two.png").name
     'two.png'
     """
-    _check(stages, (len(gaussians), None))
-    shown, weights = _weights(gaussians, views, near, columns)
-    visible = np.sum([np.asarray(rows.sum(axis=0)) for rows in weights], axis=0)
-    colors = FeatureColors.fit(next(iter(stages.values())), visible)
-    rows = {title: [_rendered_features(w, features, colors) for w in weights] for title, features in stages.items()}
+    _check(stages, len(gaussians))
+    shown = _shown(views, columns)
+    colors = FeatureColors.fit(next(iter(stages.values())), np.ones(len(gaussians)))
+    of_points = {title: colors(features).astype(np.float32) for title, features in stages.items()}
+    rows = {title: [_rendered(gaussians, rgb, view, near) for view in shown] for title, rgb in of_points.items()}
     return _write_grid(Path(path), shown, rows)
 
 
-def learned_stages(
-    table: MaskTable,
-    xyz: NDArray[np.float32],
-    feature_settings: FeatureSettings | None = None,
-    codebook_settings: CodebookSettings | None = None,
-    seed: int = 0,
-) -> dict[str, NDArray[np.float32]]:
+def learned_stages(table: MaskTable, xyz: NDArray[np.float32], seed: int = 0) -> dict[str, NDArray[np.float32]]:
     """Learn features, and discretise them on both levels: title -> (n, w), NaN rows where no mask shows the Gaussian.
 
     table: of the Gaussians at xyz (n, 3). What `feature_picture` shows as the paper's figures do.
     """
-    learned = learn_features(table, feature_settings, seed)
-    codebook = two_level_codebook(
-        learned.features, xyz, learned.seen, table, codebook_settings or CodebookSettings(), seed
-    )
+    learned = learn_features(table, None, seed)
+    codebook = two_level_codebook(learned.features, xyz, learned.seen, table, CodebookSettings(), seed)
     width = learned.features.shape[1]
     coarse, leaf = codebook.coarse_centres[:, :width], codebook.leaf_centres
     shown = (learned.seen > 0)[:, None]
@@ -163,40 +148,17 @@ def learned_stages(
     }
 
 
-def instance_picture(
-    gaussians: Gaussians,
-    views: Sequence[View],
-    near: float,
-    stages: Mapping[str, NDArray[np.integer]],
-    path: str | os.PathLike[str],
-    columns: int = 4,
-) -> Path:
-    """Write a PNG of instance ids over several views, each pixel in the colour of the id that shows most in it.
-
-    stages: title -> (n,) ids, >= 0 an instance, whose colour depends on its number alone; -1 background (grey) and -2
-    unobserved (dark). The rest as `feature_picture`.
-
-    >>> stages = {"instances": np.array([0, 1])}  # of the scene in `feature_picture`'s example
-    >>> og.instance_picture(gaussians, [view], 0.1, stages, pathlib.Path(tempfile.mkdtemp()) / "two.png").name
-    'two.png'
-    """
-    _check(stages, (len(gaussians),))
-    shown, weights = _weights(gaussians, views, near, columns)
-    rows = {title: [_rendered_ids(w, ids) for w in weights] for title, ids in stages.items()}
-    return _write_grid(Path(path), shown, rows)
-
-
 def _centre_of_each(centres: NDArray[np.float32], cluster: NDArray[np.int32]) -> NDArray[np.float32]:
     none = np.full((1, centres.shape[1]), np.nan, np.float32)
     return np.concatenate([centres, none])[cluster]  # -1, no cluster, is the last row
 
 
-def _check(stages: Mapping[str, NDArray[Any]], shape: tuple[int | None, ...]) -> None:
+def _check(stages: Mapping[str, NDArray[Any]], points: int) -> None:
     if not stages:
         raise SceneError("a picture has 0 stages; expected at least one title with its values")
     for title, values in stages.items():
-        if values.ndim != len(shape) or len(values) != shape[0]:
-            raise SceneError(f"stage '{title}' has shape {values.shape}; expected {shape[0]} rows, one a Gaussian")
+        if values.ndim != 2 or len(values) != points:
+            raise SceneError(f"stage '{title}' has shape {values.shape}; expected {points} rows, one a Gaussian")
     if len({values.shape for values in stages.values()}) > 1:
         shapes = ", ".join(f"{title} {values.shape}" for title, values in stages.items())
         raise SceneError(f"the stages differ in shape ({shapes}); expected one, since they share their colours")
@@ -206,15 +168,11 @@ def _known(features: NDArray[np.floating]) -> NDArray[np.bool_]:
     return np.logical_and.reduce(np.isfinite(features), axis=1)
 
 
-def _weights(
-    gaussians: Gaussians, views: Sequence[View], near: float, columns: int
-) -> tuple[list[View], list[csr_array]]:
-    """The views to show, at the size they are shown in, and the blending weights (pixels, n) of each."""
+def _shown(views: Sequence[View], columns: int) -> list[View]:
+    """The views to show, evenly spread, at the size they are shown in."""
     if not views or columns < 1:
         raise SceneError(f"{columns} columns of {len(views)} views; expected at least one of each")
-    chosen = np.unique(np.linspace(0, len(views) - 1, columns).round().astype(int))
-    shown = [_shrunk(views[index]) for index in chosen]
-    return shown, [pixel_weights(gaussians, view.camera, near) for view in shown]
+    return [_shrunk(views[index]) for index in np.unique(np.linspace(0, len(views) - 1, columns).round().astype(int))]
 
 
 def _shrunk(view: View) -> View:
@@ -228,34 +186,11 @@ def _shrunk(view: View) -> View:
     return View(view.name, camera.resized(*size), none, np.zeros((0, 1), np.float32), small)
 
 
-def _rendered_features(weights: csr_array, features: NDArray[np.floating], colors: FeatureColors) -> NDArray:
-    """(pixels, 3) colours of the rendered feature; what blends in without a feature does so as grey."""
-    known = _known(features)
-    mass = np.asarray(weights @ known.astype(np.float64))
-    blend = weights @ np.asarray(np.where(known[:, None], features, 0), np.float64)
-    total = np.asarray(weights.sum(axis=1), np.float64)
-    part = np.divide(mass, total, out=np.zeros_like(mass), where=total > 0)[:, None]
-    mean = blend / np.where(mass > 0, mass, 1)[:, None]
-    return _on_white(part * colors(mean) + (1 - part) * GREY, total)
-
-
-def _rendered_ids(weights: csr_array, ids: NDArray[np.integer]) -> NDArray:
-    """(pixels, 3) colours of the id that holds most of a pixel's weight."""
-    column = ids.astype(np.int64) - UNOBSERVED
-    count = int(column.max(initial=0)) + 1
-    of_point = csr_array((np.ones(len(ids)), column, np.arange(len(ids) + 1)), shape=(len(ids), count))
-    shares = csr_array(weights @ of_point)
-    pixel = np.repeat(np.arange(len(shares.indptr) - 1), np.diff(shares.indptr))
-    order = np.lexsort([-shares.indices, shares.data])
-    most = np.zeros(weights.shape[0], np.int64)
-    most[pixel[order]] = shares.indices[order]  # of several writes the last one, the heaviest, stays
-    palette = np.concatenate([[DARK], label_colors(np.arange(UNKNOWN, count + UNOBSERVED))])
-    return _on_white(palette[most], np.asarray(weights.sum(axis=1), np.float64))
-
-
-def _on_white(colors: NDArray, total: NDArray[np.float64]) -> NDArray:
-    opacity = np.clip(total / OPAQUE, 0, 1)[:, None]
-    return opacity * colors + (1 - opacity) * 255
+def _rendered(gaussians: Gaussians, rgb: NDArray[np.float32], view: View, near: float) -> NDArray:
+    """(H, W, 3) mean colours of the points that show, fading to white where little covers a pixel."""
+    image, covered = render(gaussians, rgb, view.camera, near)
+    opacity = np.minimum(covered / OPAQUE, 1)[:, :, None]
+    return opacity * image / np.maximum(covered, 1e-12)[:, :, None] + (1 - opacity) * 255
 
 
 def _write_grid(path: Path, views: Sequence[View], rows: Mapping[str, Sequence[NDArray]]) -> Path:
@@ -266,16 +201,12 @@ def _write_grid(path: Path, views: Sequence[View], rows: Mapping[str, Sequence[N
         white = [np.full((view.camera.height, view.camera.width, 3), 255, np.uint8) for view in views]
         photos = [blank if image is None else image for image, blank in zip(photographs, white, strict=True)]
         rows = {"photograph": photos, **rows}
-    cells = {
-        title: [image.reshape(view.camera.height, view.camera.width, 3) for image, view in zip(row, views, strict=True)]
-        for title, row in rows.items()
-    }
     lefts = np.cumsum([MARGIN, *(view.camera.width + GAP for view in views)])
     height = max(view.camera.height for view in views)
-    sheet = np.full((STRIP + len(cells) * (STRIP + height + GAP), int(lefts[-1]) + MARGIN - GAP, 3), 255, np.uint8)
+    sheet = np.full((STRIP + len(rows) * (STRIP + height + GAP), int(lefts[-1]) + MARGIN - GAP, 3), 255, np.uint8)
     for left, view in zip(lefts, views, strict=False):
         _write_text(sheet, view.name[-view.camera.width // LETTER :], int(left), STRIP)
-    for index, (title, row) in enumerate(cells.items()):
+    for index, (title, row) in enumerate(rows.items()):
         top = STRIP + index * (STRIP + height + GAP)
         _write_text(sheet, title, MARGIN, top + STRIP)
         for left, image in zip(lefts, row, strict=False):
