@@ -294,8 +294,6 @@ def test_the_ablations_are_written_by_the_same_command(folder, tmp_path, capsys)
 def test_bad_use_is_one_error(tmp_path, capsys):
     one = str(tmp_path)
     for options, text in (
-        (["-o", one], "no CAPTURE and no --room"),
-        (["--room", "1;2"], "--room is '1;2'"),
         ([one, "--paper"], "--paper is of --ablation"),
         ([one, "--ablation", "--quick"], "--ablation has settings of its own"),
         ([one, "--knob", "colour"], "'colour' is no knob"),

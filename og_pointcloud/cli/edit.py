@@ -39,9 +39,7 @@ def add(parser: Parser) -> None:
         operation.add_argument(
             "--halo", type=float, default=0.0, metavar="N", help="also unlabelled points so near, in spacings"
         )
-    recolour = operations.choices["recolour"]
-    recolour.add_argument("--color", required=True, metavar="R,G,B", help="0 to 255 each")
-    recolour.add_argument("--flat", action="store_true", help="without the object's own light and dark")
+    operations.choices["recolour"].add_argument("--color", required=True, metavar="R,G,B", help="0 to 255 each")
     insert = add_command(operations, "insert", run_insert, run_insert.__doc__)
     insert.add_argument("cloud", type=Path, metavar="CLOUD", help="plain cloud or 3DGS file")
     insert.add_argument("other", type=Path, metavar="OTHER", help="what is put into it, of either kind")
@@ -60,7 +58,7 @@ def run(arguments: argparse.Namespace) -> None:
     scene = load(arguments.bundle)
     options = {"cloud": arguments.cloud, "halo": arguments.halo, "text_features": arguments.text_features}
     if arguments.operation == "recolour":
-        options |= {"color": numbers(arguments.color, "--color", 3), "keep_shading": not arguments.flat}
+        options["color"] = numbers(arguments.color, "--color", 3)
     report(getattr(edit, arguments.operation)(scene, meant(arguments), arguments.output, **options), arguments)
 
 

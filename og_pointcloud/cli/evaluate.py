@@ -242,13 +242,13 @@ def print_selections(scenes: Mapping[str, Sequence[PairScore]]) -> dict[str, dic
         cells = [(of[name].mean(), (of[name] > IOU_FOUND).mean()) if pairs else (None, None) for of in ious.values()]
         rows.append((name, str(len(pairs)), *(percent(value) for cell in cells for value in cell)))
     total = sum(map(len, scenes.values()))
-    rows.append(("mean", str(total), *(percent(v) for mean in means.values() for v in (mean.miou, mean.accuracy))))
+    rows.append(("mean", str(total), *(percent(value) for mean in means.values() for value in mean)))
     pooled = [np.concatenate(list(of_way.values())) for of_way in ious.values()]
     intervals = [bootstrap(column) for every in pooled for column in (every, (every > IOU_FOUND).astype(float))]
     rows.append(("95 % over pairs", "", *map(spread, intervals)))
     print_table(("", "pairs", *(f"{way} {what}" for way in WAYS for what in ("mIoU", "over 0.25"))), rows)
     print(f"{total} pairs of {len(scenes)} scenes; the published table has {PUBLISHED_PAIRS} of 4")
-    return {way: asdict(mean) for way, mean in means.items()}
+    return {way: {"miou": miou, "accuracy": found} for way, (miou, found) in means.items()}
 
 
 def gaussians_file(folder: Path, scene: str) -> Path:

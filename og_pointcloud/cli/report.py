@@ -6,13 +6,11 @@ og-pointcloud report kitchen shelf --quick -o report
 from __future__ import annotations
 
 import argparse
-import re
 import sys
-from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
 
-from og_pointcloud.cli.common import Parser, check_output, print_table, require_room
+from og_pointcloud.cli.common import Parser, check_output, print_table
 from og_pointcloud.errors import MissingExtraError, OgPointcloudError
 
 SHARE = 0.05
@@ -21,10 +19,9 @@ SHARE = 0.05
 
 def add(parser: Parser) -> None:
     parser.add_argument(
-        "captures", type=Path, nargs="*", metavar="CAPTURE",
+        "captures", type=Path, nargs="+", metavar="CAPTURE",
         help="folders; with gt.npz and text_features.npz the error is 1 - mIoU, else 1 - agreement with the masks",
     )  # fmt: skip
-    parser.add_argument("--room", metavar="SEED[,SEED]", help="made rooms, in place of captures or beside them")
     parser.add_argument(
         "--knob", action="append", metavar="NAME", help="only this setting (may be given several times)"
     )
@@ -43,12 +40,11 @@ def add(parser: Parser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    rooms, output, captures = room_seeds(arguments.room), arguments.output, arguments.captures
-    check_options(arguments, rooms)
-    stem = output / ("ablation" if arguments.ablation else "report")
+    check_options(arguments)
+    stem = arguments.output / ("ablation" if arguments.ablation else "report")
     text, rows, picture = (stem.with_suffix(ending) for ending in (".md", ".csv", ".png"))
     for path in (text, rows, picture):
-        check_output("-o", path, captures)
+        check_output("-o", path, arguments.captures)
     from og_pointcloud.evaluate.knobs import QUICK, ablations, settings_of
     from og_pointcloud.evaluate.sweep import read_subject, sweep, write_rows
     from og_pointcloud.evaluate.sweep_report import require_matplotlib, table, write_chart, write_report
@@ -59,13 +55,12 @@ def run(arguments: argparse.Namespace) -> None:
     else:
         settings = settings_of(tuple(arguments.knob) if arguments.knob else QUICK if arguments.quick else None)
     # All are read before the first is worked on: what is missing in the last is told at once.
-    folders = [*captures, *(made_room(seed, output) for seed in rooms)]
-    subjects = [read_subject(folder) for folder in folders]
+    subjects = [read_subject(folder) for folder in arguments.captures]
     unknown = [subject.name for subject in subjects if subject.truth is None]
     if arguments.ablation and unknown:
         raise OgPointcloudError(
             f"{unknown[0]} lacks gt.npz or text_features.npz; ablations compare words with the truth: take a capture "
-            "that has both, or a made room (--room 1)"
+            "that has both: og-pointcloud demo makes one"
         )
     found = sweep(subjects, settings)
     write_rows(found.rows, rows)
@@ -79,9 +74,7 @@ def run(arguments: argparse.Namespace) -> None:
     print(f"wrote {text}, {rows} and {picture}")
 
 
-def check_options(arguments: argparse.Namespace, rooms: Sequence[int]) -> None:
-    if not arguments.captures and not rooms:
-        raise OgPointcloudError("no CAPTURE and no --room; expected at least one, e.g. --room 1")
+def check_options(arguments: argparse.Namespace) -> None:
     if arguments.paper and not arguments.ablation:
         raise OgPointcloudError("--paper is of --ablation; expected both, or neither")
     if arguments.ablation and (arguments.knob or arguments.quick):
@@ -92,20 +85,3 @@ def check_options(arguments: argparse.Namespace, rooms: Sequence[int]) -> None:
         raise OgPointcloudError(f"two captures are in folders named '{twice}'; expected different names")
     if arguments.paper and find_spec("torch") is None:
         raise MissingExtraError("torch", "learn")
-
-
-def room_seeds(text: str | None) -> list[int]:
-    if text is None:
-        return []
-    if not re.fullmatch(r"\d{1,9}(,\d{1,9})*", text):
-        raise OgPointcloudError(f"--room is '{text}'; expected whole numbers with commas between them, e.g. 1,2")
-    return list(dict.fromkeys(int(seed) for seed in text.split(",")))
-
-
-def made_room(seed: int, output: Path) -> Path:
-    """A furnished room as a capture folder, small enough for many fits."""
-    require_room()
-    from og_pointcloud_room.capture import CaptureSettings, make_capture, write_capture
-
-    settings = CaptureSettings(views=40, width=320, height=240, samples_per_view=20_000)
-    return write_capture(make_capture(seed, settings), output / f"room-{seed}")

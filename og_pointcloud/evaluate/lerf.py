@@ -49,7 +49,6 @@ __all__ = [
     "WAYS",
     "LabelledFrame",
     "LerfScene",
-    "LerfScore",
     "PairScore",
     "gaussians_of",
     "pair_ious",
@@ -102,15 +101,6 @@ class PairScore:
     frame: str
     object: str
     iou: dict[str, float]
-
-
-@dataclass(frozen=True)
-class LerfScore:
-    """miou, accuracy: means over scenes. pairs: their number."""
-
-    miou: float
-    accuracy: float
-    pairs: int
 
 
 # Reading --------------------------------------------------------------------------------------------------------
@@ -238,16 +228,15 @@ def pair_ious(frame: LabelledFrame, alphas: Mapping[str, Alpha]) -> dict[str, fl
     return found
 
 
-def score_scenes(ious: Mapping[str, NDArray[np.floating]]) -> LerfScore:
-    """ious: scene -> (pairs,) IoU of all its (frame, object) pairs. Scenes without a pair are left out."""
+def score_scenes(ious: Mapping[str, NDArray[np.floating]]) -> tuple[float, float]:
+    """Mean over scenes of their mIoU, and of their share of pairs above IOU_FOUND.
+
+    ious: scene -> (pairs,) IoU of all its (frame, object) pairs. Scenes without a pair are left out.
+    """
     scenes = [np.asarray(values, np.float64) for values in ious.values() if len(values)]
     if not scenes:
         raise SceneError("no labelled object in any frame; expected at least one")
-    return LerfScore(
-        miou=float(np.mean([scene.mean() for scene in scenes])),
-        accuracy=float(np.mean([(scene > IOU_FOUND).mean() for scene in scenes])),
-        pairs=sum(map(len, scenes)),
-    )
+    return float(np.mean([scene.mean() for scene in scenes])), float(np.mean([(s > IOU_FOUND).mean() for s in scenes]))
 
 
 def _selected(scene: LabelledScene, text: str, text_features: TextFeatures) -> dict[str, tuple[int, ...]]:

@@ -7,7 +7,7 @@ those weights up over the pixels of each mask, tile by tile while compositing; `
     A[i, g] = sum over pixels p of mask i of W[p, g]
 
 It knows nothing of colours or features: what a view shows of any value is a product with these sparse rows. A map
-that gives every pixel its own id makes ``A`` the weights ``W`` themselves (see `pixel_weights`).
+that gives every pixel its own id makes ``A`` the weights ``W`` themselves.
 
 Blending also shows what a mask does not mean: the floor between the splats of a table top. Given how thick surfaces
 are, exposure counts little what shows *through* one: a splat farther than that behind the one at which a pixel became
@@ -36,7 +36,6 @@ __all__ = [
     "binned_splats",
     "dim",
     "linearised_at",
-    "pixel_weights",
     "render",
     "seen_from",
     "tile_buffer",
@@ -100,13 +99,6 @@ class Gaussians:
         if rows is None:
             return self
         return Gaussians(self.xyz[rows], self.scale[rows], self.rotation[rows], self.opacity[rows])
-
-
-def pixel_weights(gaussians: Gaussians, camera: Camera, near: float) -> csr_array:
-    """The blending weights ``W`` of one view themselves: (H W, n) sparse float32, pixels row by row."""
-    pixels = camera.width * camera.height
-    ids = np.arange(pixels, dtype=np.int32).reshape(camera.height, camera.width)
-    return view_weights(gaussians, camera, ids, pixels, near).rows[:-1]
 
 
 def render(

@@ -15,9 +15,8 @@ their ids count; else each point of the cloud takes the id of the nearest one of
 from __future__ import annotations
 
 import os
-import re
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias, TypedDict
 
@@ -76,12 +75,7 @@ class Edit:
     notes: tuple[str, ...] = ()
 
 
-def remove(
-    scene: SceneLike,
-    what: What,
-    output: str | os.PathLike[str],
-    **options: Unpack[EditOptions],
-) -> Edit:
+def remove(scene: SceneLike, what: What, output: str | os.PathLike[str], **options: Unpack[EditOptions]) -> Edit:
     """Write the cloud without some instances.
 
     scene: a loaded scene, a LabelledCloud or the path of a .ogpc file. what: see `What`. output: a .ply, not an input.
@@ -95,45 +89,31 @@ def remove(
     return subject.write(output, subject.rows[~subject.chosen], "removed")
 
 
-def extract(
-    scene: SceneLike,
-    what: What,
-    output: str | os.PathLike[str],
-    **options: Unpack[EditOptions],
-) -> Edit:
+def extract(scene: SceneLike, what: What, output: str | os.PathLike[str], **options: Unpack[EditOptions]) -> Edit:
     """Write some instances alone. Arguments and errors as for `remove`."""
     subject = _subject(scene, what, output, **options)
     return subject.write(output, subject.rows[subject.chosen], "extracted")
 
 
 def recolour(
-    scene: SceneLike,
-    what: What,
-    output: str | os.PathLike[str],
-    color: ArrayLike,
-    *,
-    keep_shading: bool = True,
-    **options: Unpack[EditOptions],
+    scene: SceneLike, what: What, output: str | os.PathLike[str], color: ArrayLike, **options: Unpack[EditOptions]
 ) -> Edit:
     """Write the cloud with some instances in another colour.
 
-    color: (3,) RGB, 0 to 255. keep_shading: the object keeps its light and dark, whose mean becomes the colour, and
-    Gaussians also how theirs changes with direction; else it becomes flat. Other arguments and errors as for `remove`.
+    color: (3,) RGB, 0 to 255. The object keeps its light and dark, whose mean becomes the colour, and Gaussians also
+    how theirs changes with direction. Other arguments and errors as for `remove`.
     """
     rgb = np.asarray(color, np.float64)
     if rgb.shape != (3,) or not ((rgb >= 0) & (rgb <= 255)).all():
         raise OgPointcloudError(f"color is {color}; expected three numbers from 0 to 255: red, green, blue")
     subject = _subject(scene, what, output, **options)
-    rows, notes = recoloured(subject.rows, subject.chosen, rgb / 255, keep_shading)
-    return replace(subject, notes=(*subject.notes, *notes)).write(output, rows, "recoloured")
+    return subject.write(output, recoloured(subject.rows, subject.chosen, rgb / 255), "recoloured")
 
 
 def insert(
-    cloud: str | os.PathLike[str],
-    other: str | os.PathLike[str],
-    output: str | os.PathLike[str],
+    cloud: str | os.PathLike[str], other: str | os.PathLike[str], output: str | os.PathLike[str],
     pose: ArrayLike | None = None,
-) -> Edit:
+) -> Edit:  # fmt: skip
     """Write a cloud with another one put into it, both plain clouds or both 3DGS files.
 
     pose: (4, 4), takes the other's coordinates to the cloud's: a rotation, one scale for all axes, and a translation.
@@ -181,13 +161,9 @@ class _Cloud:
 
 
 def _subject(
-    scene: SceneLike,
-    what: What,
-    output: str | os.PathLike[str],
-    cloud: str | os.PathLike[str] | None = None,
-    halo: float = 0.0,
-    text_features: TextFeatures = None,
-) -> _Cloud:
+    scene: SceneLike, what: What, output: str | os.PathLike[str], cloud: str | os.PathLike[str] | None = None,
+    halo: float = 0.0, text_features: TextFeatures = None,
+) -> _Cloud:  # fmt: skip
     """Reads the cloud and finds the points that are meant."""
     if not (np.isfinite(halo) and halo >= 0):
         raise OgPointcloudError(f"halo is {halo}; expected a number of spacings, at least 0")
@@ -212,16 +188,13 @@ def _instances_meant(scene: LabelledScene, what: What, text_features: TextFeatur
     count = len(scene.cloud.instances)
     if isinstance(what, str):
         what = select(scene, what, text_features=text_features)
-    if isinstance(what, Selection):
-        if not what.fitting:
-            raise OgPointcloudError(
-                f"'{what.query}' fits none of {count} instances better than other words do: give its id"
-            )
-        ids: Sequence[int] = what.instances
-    elif isinstance(what, (Pick, Match)):
-        ids = (what.instance,)
-    else:
-        ids = (what,) if isinstance(what, (int, np.integer)) else tuple(what)
+    if isinstance(what, Selection) and not what.fitting:
+        raise OgPointcloudError(
+            f"'{what.query}' fits none of {count} instances better than other words do: give its id"
+        )
+    what = what.instances if isinstance(what, Selection) else what
+    what = what.instance if isinstance(what, (Pick, Match)) else what
+    ids = (what,) if isinstance(what, (int, np.integer)) else tuple(what)
     wrong = [k for k in ids if isinstance(k, bool) or not isinstance(k, (int, np.integer)) or not 0 <= k < count]
     if wrong or not ids:
         raise OgPointcloudError(
@@ -251,11 +224,7 @@ def _ids_of_points(
 
 
 def _halo(
-    scene: LabelledScene,
-    xyz: NDArray[np.float64],
-    ids: NDArray[np.int32],
-    chosen: NDArray[np.bool_],
-    halo: float,
+    scene: LabelledScene, xyz: NDArray[np.float64], ids: NDArray[np.int32], chosen: NDArray[np.bool_], halo: float
 ) -> NDArray[np.bool_]:
     """(n,) bool, points of no instance that lie within ``halo`` spacings of a chosen one."""
     local = (xyz - scene.cloud.origin).astype(np.float32)
@@ -284,23 +253,21 @@ def _check_output(output: str | os.PathLike[str], inputs: Iterable[str | os.Path
 def _read(path: Path) -> _Cloud:
     """A cloud's elements: those of a PLY as they are, anything else as a PLY would hold it."""
     with naming(path), path.open("rb") as file:
-        head = file.read(HEADER_LIMIT)
-    if not re.match(rb"ply[ \t\r\n]", head):
+        head = file.read(HEADER_LIMIT).partition(b"end_header")[0]
+    if not head.startswith(b"ply"):
         points = read_points(path)
         columns = f"{path}: only positions, colours and normals are kept, as a PLY"
         return _Cloud({"vertex": _plain_rows(points.xyz_world, points.rgb, points.normals)}, (columns,))
     with naming(path):
         elements = read_ply(path)
-        if "vertex" not in elements or len(elements["vertex"]) == 0:
+        if len(elements.get("vertex", ())) == 0:
             raise SceneError("no points; expected an element 'vertex' of plain properties")
-        if "chunk" in elements and "packed_position" in (elements["vertex"].dtype.names or ()):
+        if "packed_position" in (elements["vertex"].dtype.names or ()):
             rows = gaussian_rows(gaussians_from_ply(elements))
             return _Cloud({"vertex": rows}, (f"{path}: unpacked; harmonics above the constant one are left out",))
         if not np.isfinite(positions(elements["vertex"])).all():
             raise SceneError("positions hold NaN or infinity; expected finite ones: remove those points first")
-    lists = re.search(rb"^property\s+list\s", head.partition(b"end_header")[0], re.MULTILINE)
-    notes = (f"{path}: faces and other lists are left out",) if lists else ()
-    return _Cloud(elements, notes)
+    return _Cloud(elements, (f"{path}: faces and other lists are left out",) if b"\nproperty list" in head else ())
 
 
 def _plain_rows(

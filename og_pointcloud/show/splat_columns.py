@@ -36,31 +36,26 @@ MAX_DEGREE = 3
 DIRECTIONS = 32
 
 
-def recoloured(
-    rows: Rows, chosen: NDArray[np.bool_], color: NDArray[np.float64], keep_shading: bool
-) -> tuple[Rows, tuple[str, ...]]:
-    """The rows with those chosen in another colour, as harmonics, as red green blue, or both; and what is to be told.
-
-    color: (3,), 0 to 1. keep_shading: the mean of the object becomes that colour, its light and dark stay.
-    """
-    columns, rgb, notes = _columns(rows), colors(rows), ()
+def recoloured(rows: Rows, chosen: NDArray[np.bool_], color: NDArray[np.float64]) -> Rows:
+    """The rows with those chosen in another colour, as harmonics, as red green blue, or both; a plain cloud without
+    colours becomes grey. color: (3,), 0 to 1; the mean of the object becomes that colour, its light and dark stay."""
+    columns, rgb = _columns(rows), colors(rows)
     is_splat = set(BASE_COLOR) <= set(columns)
     if is_splat:
         # Colour is linear in the coefficients, so what a linear map does to colours it does to them.
         base = 0.5 + SH_CONSTANT * _stack(columns, BASE_COLOR)[chosen]
-        mapping, constant = _color_map(np.clip(base, 0, 1), color, keep_shading)
-        _set(columns, BASE_COLOR, (base @ mapping.T + constant - 0.5) / SH_CONSTANT, chosen)
+        mapping = _color_map(np.clip(base, 0, 1), color)
+        _set(columns, BASE_COLOR, (base @ mapping.T - 0.5) / SH_CONSTANT, chosen)
         _set(columns, _rest_names(columns), np.einsum("dc,nck->ndk", mapping, _rest(columns)[chosen]), chosen)
     elif rgb is None:
-        rgb, notes = np.full((len(rows), 3), 128, np.uint8), ("the cloud has no colours: the rest became grey",)
+        rgb = np.full((len(rows), 3), 128, np.uint8)
     if rgb is not None:
         base = rgb[chosen] / 255
-        mapping, constant = _color_map(base, color, keep_shading)
-        rgb[chosen] = np.rint(255 * np.clip(base @ mapping.T + constant, 0, 1)).astype(np.uint8)
+        rgb[chosen] = np.rint(255 * np.clip(base @ _color_map(base, color).T, 0, 1)).astype(np.uint8)
         if not all(name in columns and columns[name].dtype == np.uint8 for name in RGB):
             columns = {name: column for name, column in columns.items() if name not in RGB + OTHER_COLORS}
         columns |= dict(zip(RGB, rgb.T, strict=True))
-    return join_columns(columns), notes
+    return join_columns(columns)
 
 
 def placed(
@@ -100,14 +95,10 @@ def appended(base: Rows, added: Rows) -> tuple[Rows, tuple[str, ...]]:
     return join_columns(merged), tuple(notes)
 
 
-def _color_map(
-    base: NDArray[np.float64], color: NDArray[np.float64], keep_shading: bool
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """(3, 3) and (3,): what colours (n, 3) are multiplied by, and what is added: luminance times the new colour, so
-    that the mean of the object becomes that colour; or the new colour alone."""
-    if not keep_shading:
-        return np.zeros((3, 3)), color
-    return np.outer(color, LUMINANCE) / max(float((base @ LUMINANCE).mean()), DARK), np.zeros(3)
+def _color_map(base: NDArray[np.float64], color: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(3, 3) what colours (n, 3) are multiplied by: their luminance times the new colour, so that their mean becomes
+    that colour."""
+    return np.outer(color, LUMINANCE) / max(float((base @ LUMINANCE).mean()), DARK)
 
 
 def _turned(turn: NDArray[np.float64], quaternions: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -22,8 +22,6 @@ DISTANCE = 1.6
 """Of the eye while directions are compared, in half diagonals of the points."""
 FILLED = 0.9
 """Share of the picture that the points fill at last."""
-ROUNDS = 4
-"""Of framing: each moves and scales, and so changes the perspective a little."""
 
 
 @dataclass(frozen=True)
@@ -52,9 +50,7 @@ def choose_viewpoint(xyz: NDArray[np.float64], labelled: NDArray[np.bool_], up: 
     views = [Viewpoint(target + distance * direction, target, up) for direction in directions]
     best = max(views, key=lambda view: _in_sight(points, wanted, view))
     inside = ((points >= low) & (points <= high)).all(axis=1)
-    for _ in range(ROUNDS):
-        best = _framed(points[inside], best)
-    return best
+    return _framed(points[inside], best)
 
 
 def _axes(view: Viewpoint) -> NDArray[np.float64]:
@@ -66,15 +62,12 @@ def _axes(view: Viewpoint) -> NDArray[np.float64]:
 
 
 def _framed(points: NDArray[np.float64], view: Viewpoint) -> Viewpoint:
-    """The same direction, moved and scaled so that the points lie in the middle and fill the picture."""
+    """The same direction and target, from as near as all points are in the picture."""
     axes, distance = _axes(view), float(np.linalg.norm(view.eye - view.target))
-    x, y, depth = axes @ (points - view.eye).T
-    plane = np.stack([x, y])[:, depth > 0.1 * distance] / depth[depth > 0.1 * distance]
-    low, high = plane.min(axis=1), plane.max(axis=1)
-    target = view.target + distance * ((low + high) / 2) @ axes[:2]
-    half = (high - low) / 2 * FOCAL / np.array([CELLS[0] / CELLS[1], 1.0])
-    scale = max(float(half.max()) / FILLED, 0.1)
-    return Viewpoint(target - scale * distance * axes[2], target, view.up)
+    x, y, behind = axes @ (points - view.target).T
+    aside = np.maximum(np.abs(x) * CELLS[1] / CELLS[0], np.abs(y))
+    nearest = float((FOCAL / FILLED * aside - behind).max())  # FOCAL aside / (distance + behind) <= FILLED
+    return Viewpoint(view.target - max(nearest, 0.1 * distance) * axes[2], view.target, view.up)
 
 
 def _in_sight(points: NDArray[np.float64], wanted: NDArray[np.bool_], view: Viewpoint) -> int:
