@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError, SceneError
-from og_pointcloud.masking.crops import CROP_STYLES, LANGSPLAT, Crop, Preprocessing, mask_crops
-from og_pointcloud.masking.encode import DEMO_FOLDER, DEMO_SPACE, CropEncoder, OnnxModel, open_encoder
+from og_pointcloud.masking.crops import Crop, Preprocessing, mask_crops
+from og_pointcloud.masking.encode import DEMO_FOLDER, CropEncoder, OnnxModel, open_encoder
 
 RNG = np.random.default_rng(0)
 IMAGE = RNG.integers(0, 256, (40, 60, 3), np.uint8)
@@ -106,13 +106,8 @@ def test_an_encoder_is_found_by_its_folder_and_its_name(tmp_path, monkeypatch):
         open_encoder(folder, "openai/clip-vit-base-patch16")
 
 
-def test_crops_are_the_callers_then_the_exports(tmp_path):
+def test_crops_are_the_exports():
     assert open_encoder("demo").crops == OnnxModel(DEMO_FOLDER / "image").crops
-    assert open_encoder("demo", crops="langsplat").crops == LANGSPLAT
-    assert open_encoder("demo", DEMO_SPACE, crops=[Crop(3.0)]).crops == (Crop(3.0),)
-    assert set(CROP_STYLES) == {"langsplat", "context"}
-    with pytest.raises(OgPointcloudError, match="langsplat or context"):
-        open_encoder("demo", crops="square")
 
 
 def exported(folder, name="manifest.json", edit=None, **fields):

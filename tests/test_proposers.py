@@ -11,9 +11,8 @@ import pytest
 from og_pointcloud.errors import SceneError
 from og_pointcloud.masking.automatic import (
     AutomaticMasks,
-    best_boxes,
+    best_of_alike,
     grid,
-    mask_boxes,
     stability,
     without_specks,
 )
@@ -125,28 +124,20 @@ def test_the_grid_lies_in_the_middles_of_cells():
     assert len({tuple(p) for p in points.tolist()}) == 16
 
 
-def test_boxes_and_suppression_against_loops():
-    rng = np.random.default_rng(0)
-    low = rng.uniform(0, 50, (60, 2))
-    boxes = np.concatenate([low, low + rng.uniform(5, 40, (60, 2))], axis=1).astype(np.float32)
+@pytest.mark.parametrize("seed", range(5))
+def test_suppression_against_loops(seed):
+    rng = np.random.default_rng(seed)
+    masks = np.zeros((60, 50, 70), bool)
+    for mask in masks:
+        top, left = rng.integers(0, 40), rng.integers(0, 60)
+        mask[top : top + rng.integers(2, 30), left : left + rng.integers(2, 30)] = True
     scores = rng.uniform(0, 1, 60).astype(np.float32)
     kept: list[int] = []
-    for k in sorted(range(60), key=lambda k: -scores[k]):
-
-        def box_iou(o, k=k):
-            w = min(boxes[o, 2], boxes[k, 2]) - max(boxes[o, 0], boxes[k, 0])
-            h = min(boxes[o, 3], boxes[k, 3]) - max(boxes[o, 1], boxes[k, 1])
-            shared = max(w, 0) * max(h, 0)
-            area = [(boxes[j, 2] - boxes[j, 0]) * (boxes[j, 3] - boxes[j, 1]) for j in (o, k)]
-            return shared / (sum(area) - shared)
-
-        if all(box_iou(o) <= 0.3 for o in kept):
+    for k in sorted(range(60), key=lambda k: -scores[k]):  # rectangles: a mask is its box
+        if all(iou(masks[o], masks[k]) <= 0.3 for o in kept):
             kept.append(k)
-    assert best_boxes(boxes, scores, 0.3).tolist() == kept
-    masks = np.zeros((3, 10, 12), bool)
-    masks[0, 2:5, 3:9] = masks[1, 9, 11] = True
-    assert mask_boxes(masks).tolist() == [[3, 2, 9, 5], [11, 9, 12, 10], [0, 0, 0, 0]]
-    assert mask_boxes(np.zeros((0, 4, 4), bool)).shape == (0, 4)
+    assert best_of_alike(masks, scores, 0.3).tolist() == kept
+    assert len(best_of_alike(masks[:0], scores[:0], 0.3)) == 0
 
 
 def test_stability_by_hand():

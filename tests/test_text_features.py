@@ -94,7 +94,7 @@ def test_a_header_that_claims_more_than_the_file_holds(tmp_path):
 
 def test_a_file_that_unpacks_to_too_much(tmp_path, monkeypatch):
     monkeypatch.setattr("og_pointcloud.text.text_features.MAX_UNPACKED_BYTES", 100)
-    with pytest.raises(FeatureSpaceError, match="more than 100"):
+    with pytest.raises(FeatureSpaceError, match="at most 100"):
         read_text_features(save(tmp_path / "t.npz", **good()))
 
 

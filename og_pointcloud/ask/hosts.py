@@ -73,10 +73,9 @@ def _host(pcd: Any) -> str | None:
 
 
 def _of_file(path: Path) -> NDArray[np.float64]:
-    from og_pointcloud.formats.las import looks_like_las, read_las_positions
     from og_pointcloud.formats.points import read_points
 
-    return read_las_positions(path) if looks_like_las(path) else read_points(path).xyz_world
+    return read_points(path).xyz_world
 
 
 def _of_open3d(cloud: Any) -> Any:

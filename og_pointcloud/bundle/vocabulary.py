@@ -23,7 +23,7 @@ from og_pointcloud.cloud import FeatureSpace, Vocabulary, WordBank, unit_rows
 from og_pointcloud.errors import FeatureSpaceError
 from og_pointcloud.formats.atomic import replacing
 from og_pointcloud.formats.npy import npy_bytes
-from og_pointcloud.text.encoder import CarriedEncoder, TextEncoder, encoder_files
+from og_pointcloud.text.encoder import ENCODER, CarriedEncoder, TextEncoder
 from og_pointcloud.text.text_features import read_text_features
 
 __all__ = [
@@ -129,7 +129,7 @@ def _carried_once(path: Path, _modified: int) -> TextEncoder | None:
 
 def encoder_members(folder: str | os.PathLike[str], space: FeatureSpace) -> tuple[dict[str, bytes], TextEncoder]:
     """A folder's files as members of a .ogpc of this feature space; FeatureSpaceError if it is of another."""
-    files = encoder_files(Path(folder))
+    files = ENCODER.read(Path(folder))
     encoder = TextEncoder(files, str(folder))
     space.require(FeatureSpace(encoder.feature_space, encoder.width), f"texts that {folder} encodes")
     return {CARRIED_ENCODER + name: data for name, data in files.items()}, encoder

@@ -31,7 +31,7 @@ from og_pointcloud.scene import Points, require_finite
 if TYPE_CHECKING:
     from laspy import LasData
 
-__all__ = ["labelled_las", "looks_like_las", "read_las", "read_las_positions", "write_las"]
+__all__ = ["labelled_las", "read_las", "write_las"]
 
 SIGNATURE = b"LASF"
 POINTS_PER_CHUNK = 1_000_000
@@ -54,25 +54,11 @@ LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}
 EXTRA_BYTES = 14
 
 
-def looks_like_las(path: str | os.PathLike[str]) -> bool:
-    """Whether a file begins as LAS and LAZ do; False where it cannot be read."""
-    try:
-        with Path(path).open("rb") as file:
-            return file.read(len(SIGNATURE)) == SIGNATURE
-    except OSError:
-        return False
-
-
-def read_las_positions(path: str | os.PathLike[str]) -> NDArray[np.float64]:
-    """(n, 3) float64 world coordinates, as the file's counts, step and offset give them.
+def read_las(path: str | os.PathLike[str]) -> Points:
+    """Positions, and colours where the point format has some.
 
     SceneError, beginning with the path, for a file that is damaged or has no points; MissingExtraError without laspy.
     """
-    return _read(Path(path))[0]
-
-
-def read_las(path: str | os.PathLike[str]) -> Points:
-    """Positions, and colours where the point format has some, as `Points`. Errors as for `read_las_positions`."""
     xyz, rgb = _read(Path(path))
     return Points.from_world(xyz, rgb=rgb)
 

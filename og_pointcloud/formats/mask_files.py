@@ -7,8 +7,6 @@ the name of the encoder. A view without masks has an all-zero image and an empty
 
 from __future__ import annotations
 
-import zipfile
-import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -21,7 +19,7 @@ from numpy.typing import NDArray
 from og_pointcloud.cloud import UNKNOWN_SPACE
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.images import decoded, png_header, require_cv2
-from og_pointcloud.formats.npy import array_from_zip
+from og_pointcloud.formats.npy import arrays_from_npz
 
 __all__ = [
     "FEATURES_NAME",
@@ -101,32 +99,19 @@ def read_ids(file: Path) -> NDArray[np.int32]:
 
 
 def _read_features(file: Path, names: Sequence[str]) -> tuple[dict[str, NDArray[np.float32]], str]:
-    """Features by view name. Nothing is unpickled, and no entry is unpacked before its size is checked."""
+    """Features by view name, and the name of their space."""
     try:
-        with zipfile.ZipFile(file) as archive:
-            entries = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
-            if (total := sum(info.file_size for info in entries.values())) > MAX_FEATURE_BYTES:
-                raise SceneError(
-                    f"{file} unpacks to {total} bytes; expected at most {MAX_FEATURE_BYTES}: it is no features file"
-                )
-            missing = [name for name in names if name not in entries]
-            if missing:
-                raise SceneError(
-                    f"{file} has no features for {len(missing)} of {len(names)} views, e.g. '{missing[0]}' (it has "
-                    f"{', '.join(map(repr, list(entries)[:3])):.120}, ...); expected an array (masks, D) under "
-                    "each image's stem"
-                )
-            arrays = {name: array_from_zip(archive, entries[name]) for name in names}
-            features = {name: _as_features(array, f"{file}, '{name}'") for name, array in arrays.items()}
-            named = entries.get("feature_space")
-            space = str(array_from_zip(archive, named)) if named else UNKNOWN_SPACE
-    except SceneError:
-        raise
-    except (zipfile.BadZipFile, zlib.error, ValueError, OSError, EOFError, RuntimeError) as error:
+        arrays, held = arrays_from_npz(file, [*names, "feature_space"], MAX_FEATURE_BYTES)
+    except ValueError as error:
+        raise SceneError(str(error)) from None
+    missing = [name for name in names if name not in arrays]
+    if missing:
         raise SceneError(
-            f"{file} cannot be read as an .npz of plain arrays ({error!s:.120}): write it again with numpy.savez"
-        ) from None
-    return features, space
+            f"{file} has no features for {len(missing)} of {len(names)} views, e.g. '{missing[0]}' (it has "
+            f"{', '.join(map(repr, held[:3])):.120}, ...); expected an array (masks, D) under each image's stem"
+        )
+    features = {name: _as_features(arrays[name], f"{file}, '{name}'") for name in names}
+    return features, str(arrays.get("feature_space", UNKNOWN_SPACE))
 
 
 def _as_features(values: NDArray[Any], source: str) -> NDArray[np.float32]:

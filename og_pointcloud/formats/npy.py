@@ -6,6 +6,8 @@ import io
 import mmap
 import tokenize
 import zipfile
+import zlib
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +16,7 @@ from numpy.typing import NDArray
 
 from og_pointcloud.errors import SceneError
 
-__all__ = ["array_from_npy", "array_from_zip", "mapped_array", "npy_bytes"]
+__all__ = ["array_from_npy", "array_from_zip", "arrays_from_npz", "mapped_array", "npy_bytes"]
 
 LONGEST_HEADER = 1 << 17
 """Bytes in which a header ends; numpy reads none of more than 10,000 characters."""
@@ -56,6 +58,24 @@ def mapped_array(file: Path) -> NDArray[Any]:
     except (ValueError, OSError) as error:
         raise SceneError(
             f"{file} cannot be read as a .npy array ({error!s:.120}): it is damaged or truncated, write it again"
+        ) from None
+
+
+def arrays_from_npz(file: Path, names: Iterable[str], most_bytes: int) -> tuple[dict[str, NDArray[Any]], list[str]]:
+    """Those of these arrays that an .npz has, by name, and the names of all its arrays.
+
+    ValueError where it is none, unpacks to more than ``most_bytes``, is packed as numpy packs none, or claims to end
+    beyond the file. Nothing is unpickled, and nothing is unpacked before its size is checked.
+    """
+    try:
+        with zipfile.ZipFile(file) as archive:
+            infos = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
+            if (total := sum(info.file_size for info in infos.values())) > most_bytes:
+                raise ValueError(f"it unpacks to {total} bytes; expected at most {most_bytes}")
+            return {name: array_from_zip(archive, infos[name]) for name in names if name in infos}, list(infos)
+    except (zipfile.BadZipFile, zlib.error, ValueError, OSError, EOFError, RuntimeError) as error:
+        raise ValueError(
+            f"{file} cannot be read as an .npz of plain arrays ({error!s:.120}): write it again with numpy.savez"
         ) from None
 
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from og_pointcloud.formats.images import require_cv2
 from og_pointcloud.masking.contracts import Proposals
 
-__all__ = ["AutomaticMasks", "PointPredictor", "best_boxes", "mask_boxes", "stability", "without_specks"]
+__all__ = ["AutomaticMasks", "PointPredictor", "best_of_alike", "stability", "without_specks"]
 
 Masks = NDArray[np.bool_]
 Floats = NDArray[np.float32]
@@ -61,12 +61,12 @@ class AutomaticMasks:
         batches = (points[first : first + self.batch] for first in range(0, len(points), self.batch))
         kept = [self._good(*self.predictor.at_points(batch)) for batch in batches]
         logits, scores = (np.concatenate(parts) for parts in zip(*kept, strict=True))
-        best = best_boxes(mask_boxes(logits > 0), scores, self.same_box)
+        best = best_of_alike(logits > 0, scores, self.same_box)
         masks = np.zeros((len(best), height, width), np.bool_)
         for mask, chosen in zip(masks, best, strict=True):
             full = require_cv2().resize(logits[chosen], (width, height), interpolation=require_cv2().INTER_LINEAR)
             mask[:] = without_specks(full > 0, round(self.speck_share * width * height))
-        kept_whole = best_boxes(mask_boxes(masks), scores[best], self.same_box)  # again: specks made boxes larger
+        kept_whole = best_of_alike(masks, scores[best], self.same_box)  # again: specks made boxes larger
         return Proposals(masks[kept_whole], scores[best][kept_whole])
 
     def _good(self, logits: Floats, iou: Floats) -> tuple[Floats, Floats]:
@@ -90,30 +90,12 @@ def stability(logits: Floats, offset: float) -> Floats:
     return (strict / np.maximum(lax, 1)).astype(np.float32)
 
 
-def mask_boxes(masks: Masks) -> Floats:
-    """(n, 4) left, top, right, bottom (exclusive) of masks (n, h, w); zeros for an empty one."""
-    columns, rows = np.asarray(masks.any(axis=1)), np.asarray(masks.any(axis=2))
-    if not masks.size:
-        return np.zeros((len(masks), 4), np.float32)
-    left, top = columns.argmax(axis=1), rows.argmax(axis=1)
-    right = masks.shape[2] - columns[:, ::-1].argmax(axis=1)
-    bottom = masks.shape[1] - rows[:, ::-1].argmax(axis=1)
-    boxes = np.stack([left, top, right, bottom], axis=1)
-    boxes[~np.asarray(columns.any(axis=1))] = 0
-    return boxes.astype(np.float32)
-
-
-def best_boxes(boxes: Floats, scores: Floats, same: float) -> NDArray[np.intp]:
-    """Non-maximum suppression: indices, best score first, of boxes whose IoU with no better one is above ``same``."""
-    order = np.argsort(-scores, kind="stable")
-    area = (boxes[:, 2] - boxes[:, 0]) * (boxes[:, 3] - boxes[:, 1])
-    kept: list[int] = []
-    for box in order.tolist():
-        low, high = np.maximum(boxes[kept, :2], boxes[box, :2]), np.minimum(boxes[kept, 2:], boxes[box, 2:])
-        shared = np.prod(np.maximum(high - low, 0), axis=1)
-        if not (shared > same * (area[kept] + area[box] - shared)).any():
-            kept.append(box)
-    return np.array(kept, np.intp)
+def best_of_alike(masks: Masks, scores: Floats, same: float) -> NDArray[np.intp]:
+    """Non-maximum suppression: indices, best score first, of masks (n, h, w) with a score above 0 whose boxes' IoU with
+    no better one is above ``same``."""
+    cv2 = require_cv2()
+    boxes = [cv2.boundingRect(mask.astype(np.uint8)) for mask in masks]
+    return np.array(cv2.dnn.NMSBoxes(boxes, scores.tolist(), 0.0, same), np.intp).reshape(-1)
 
 
 def without_specks(mask: Masks, smallest_px: int) -> Masks:

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError, SceneError
 from og_pointcloud.masking.contracts import MaskEncoder
-from og_pointcloud.masking.crops import CROP_STYLES, WITH_CONTEXT, Crop, Preprocessing, mask_crops
+from og_pointcloud.masking.crops import WITH_CONTEXT, Crop, Preprocessing, mask_crops
 from og_pointcloud.models import EncoderFormat, fetched_model, open_session
 from og_pointcloud.text.encoder import MODELS_VARIABLE, model_folders
 
@@ -72,9 +72,7 @@ class ImageModel(Protocol):
         ...
 
 
-def open_encoder(
-    name: str | os.PathLike[str], feature_space: str | None = None, *, crops: str | Sequence[Crop] | None = None
-) -> CropEncoder:
+def open_encoder(name: str | os.PathLike[str], feature_space: str | None = None) -> CropEncoder:
     """Open an encoder; nothing is downloaded.
 
     name: "demo"; a folder that ``og-pointcloud export image`` wrote; a transformers folder of CLIP or SigLIP, which
@@ -82,7 +80,6 @@ def open_encoder(
         what Hugging Face's own tools have fetched.
     feature_space: the one that is expected, as the text encoder and the capture name it; of a folder that does not say
         its name, the one that it has.
-    crops: "langsplat", "context", or ways to cut masks out; None: what the encoder was made with, else "context".
     Raises OgPointcloudError where there is no such encoder, FeatureSpaceError for one of another space.
     """
     model = _open_model(name, feature_space)
@@ -91,9 +88,7 @@ def open_encoder(
             f"{name} encodes to feature space '{model.feature_space}'; expected '{feature_space}': words and masks are "
             "compared only within one model's space"
         )
-    if isinstance(crops, str) and crops not in CROP_STYLES:
-        raise OgPointcloudError(f"crops '{crops}' are unknown; expected {' or '.join(CROP_STYLES)}")
-    return CropEncoder(model, CROP_STYLES[crops] if isinstance(crops, str) else crops or model.crops)
+    return CropEncoder(model, model.crops)
 
 
 def _open_model(name: str | os.PathLike[str], feature_space: str | None) -> ImageModel:

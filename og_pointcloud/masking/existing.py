@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import importlib.util
-import sys
+import importlib
+import runpy
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -79,8 +78,10 @@ def own_proposer(place: str) -> MaskProposer:
     if not name or not all(part.isidentifier() for part in module.split(".")):
         raise SceneError(f"the proposer is 'python:{place}'; expected python:MODULE:NAME")
     try:
-        found = getattr(_module(module), name)
-    except (ImportError, AttributeError) as error:
+        file = Path(*module.split(".")).with_suffix(".py")
+        # By path where it lies here: a file called numpy.py takes nobody's place.
+        found = runpy.run_path(str(file))[name] if file.is_file() else getattr(importlib.import_module(module), name)
+    except (ImportError, AttributeError, KeyError) as error:
         raise SceneError(
             f"no proposer 'python:{place}' ({error}); expected a name in {module}.py here, or in an installed module"
         ) from error
@@ -92,19 +93,6 @@ def own_proposer(place: str) -> MaskProposer:
     raise SceneError(
         f"'python:{place}' is a {type(made).__name__}; expected a function, or an object with propose and name"
     )
-
-
-def _module(name: str) -> ModuleType:
-    file = Path.cwd().joinpath(*name.split(".")).with_suffix(".py")
-    if not file.is_file():
-        return importlib.import_module(name)
-    private = f"_og_pointcloud_proposer.{name}"  # a file called numpy.py takes nobody's place
-    spec = importlib.util.spec_from_file_location(private, file)
-    assert spec is not None
-    assert spec.loader is not None
-    module = sys.modules[private] = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 @dataclass(frozen=True)

@@ -37,7 +37,7 @@ def settle(proposals: Proposals, level: str = "medium") -> NDArray[np.int32]:
     shared_px = (member * area_px) @ member.T.astype(np.float64)
     kept = _distinct(shared_px)
     member, scores, shared_px = member[kept], scores[kept], shared_px[np.ix_(kept, kept)]
-    used = _cut(np.diag(shared_px) * scores, _parents(shared_px), PREFERENCE[level])
+    used = _cut(np.diag(shared_px), scores, _parents(shared_px), PREFERENCE[level])
     shown, ids = np.unique(_owners(member, area_px, used), return_inverse=True)
     ids = ids - (shown[:1] < 0).sum()  # -1, where there is one, is the first of the owners
     return ids.astype(np.int32)[atom_of_pixel]
@@ -76,30 +76,22 @@ def _parents(shared_px: NDArray[np.float64]) -> NDArray[np.intp]:
     return parent
 
 
-def _cut(value: NDArray[np.float64], parent: NDArray[np.intp], preference: float) -> NDArray[np.intp]:
-    """The masks of one level, best first: none lies inside another in the forest.
-
-    value: (M,) area times score. A whole that ties with its parts is used.
-    """
-    depth = np.zeros(len(parent), np.int64)
-    for mask in range(len(parent)):
-        above = parent[mask]
-        while above >= 0:
-            depth[mask] += 1
-            above = parent[above]
-    best, parts = value.copy(), np.zeros(len(value))
-    whole = np.ones(len(value), bool)
-    for mask in np.argsort(-depth, kind="stable"):
-        whole[mask] = value[mask] >= preference * parts[mask]
-        best[mask] = max(value[mask], preference * parts[mask])
+def _cut(
+    area_px: NDArray[np.float64], scores: NDArray[np.float64], parent: NDArray[np.intp], preference: float
+) -> NDArray[np.intp]:
+    """The masks of one level, best first: none lies inside another in the forest. A whole that ties with its parts is
+    used."""
+    value, parts = area_px * scores, np.zeros(len(parent))
+    used = np.zeros(len(parent), bool)
+    upwards = np.argsort(area_px, kind="stable")  # a parent is larger
+    for mask in upwards:
+        used[mask] = value[mask] >= preference * parts[mask]
         if parent[mask] >= 0:
-            parts[parent[mask]] += best[mask]
-    used = np.zeros(len(value), bool)
-    covered = np.zeros(len(value), bool)
-    for mask in np.argsort(depth, kind="stable"):
-        above = parent[mask]
-        covered[mask] = above >= 0 and (covered[above] or used[above])
-        used[mask] = whole[mask] and not covered[mask]
+            parts[parent[mask]] += max(value[mask], preference * parts[mask])
+    covered = np.zeros(len(parent) + 1, bool)  # the last entry serves roots, whose parent is -1
+    for mask in upwards[::-1]:
+        used[mask] &= not covered[parent[mask]]
+        covered[mask] = used[mask] or covered[parent[mask]]
     return np.flatnonzero(used)
 
 

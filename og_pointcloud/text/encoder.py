@@ -34,8 +34,8 @@ if TYPE_CHECKING:
     from onnxruntime import InferenceSession
 
 __all__ = [
-    "ENCODER_FILES", "FORMAT", "MODELS_VARIABLE", "OPERATORS", "SCHEMA_VERSION", "CarriedEncoder", "TextEncoder",
-    "cache_folder", "check_templates", "encoder_files", "encoder_for", "export_command", "find_encoder",
+    "ENCODER", "ENCODER_FILES", "FORMAT", "MODELS_VARIABLE", "OPERATORS", "SCHEMA_VERSION", "CarriedEncoder",
+    "TextEncoder", "cache_folder", "check_templates", "encoder_for", "export_command", "find_encoder",
     "model_folders", "read_text_encoder",
 ]  # fmt: skip
 
@@ -156,12 +156,7 @@ def read_text_encoder(folder: str | os.PathLike[str]) -> TextEncoder:
 
 @lru_cache(maxsize=2)
 def _read_once(folder: Path, _state: tuple[tuple[int, int], ...]) -> TextEncoder:
-    return TextEncoder(encoder_files(folder), str(folder))
-
-
-def encoder_files(folder: Path) -> dict[str, bytes]:
-    """The bytes of an encoder's files, unchecked but for their size; OgPointcloudError where one is missing."""
-    return ENCODER.read(folder)
+    return TextEncoder(ENCODER.read(folder), str(folder))
 
 
 def encoder_for(feature_space: str, carried: CarriedEncoder | None = None) -> TextEncoder:

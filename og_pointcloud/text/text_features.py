@@ -6,8 +6,6 @@ An .npz with ``names`` (L,) strings, ``vectors`` (L, D) floats, and ``feature_sp
 from __future__ import annotations
 
 import os
-import zipfile
-import zlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -17,7 +15,7 @@ from numpy.typing import NDArray
 
 from og_pointcloud.cloud import UNKNOWN_SPACE, Vocabulary
 from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError
-from og_pointcloud.formats.npy import array_from_zip
+from og_pointcloud.formats.npy import arrays_from_npz
 
 __all__ = ["MAX_UNPACKED_BYTES", "checked_vocabulary", "read_text_features"]
 
@@ -42,12 +40,15 @@ def read_text_features(path: str | os.PathLike[str]) -> tuple[Vocabulary, str]:
     path = Path(path)
     if not path.is_file():
         raise FeatureSpaceError(f"{path} is not a file; expected an .npz with 'names', 'vectors' and 'feature_space'")
-    entries = _entries(path)
+    try:
+        entries, held = arrays_from_npz(path, ("names", "vectors", "feature_space"), MAX_UNPACKED_BYTES)
+    except ValueError as error:
+        raise FeatureSpaceError(str(error)) from None
     missing = [name for name in ("names", "vectors") if name not in entries]
     if missing:
         raise FeatureSpaceError(
-            f"{path} lacks '{missing[0]}' (it has {', '.join(entries) or 'nothing'}); expected 'names' (L,), 'vectors' "
-            "(L, D) and 'feature_space': write it with numpy.savez"
+            f"{path} lacks '{missing[0]}' (it has {', '.join(held) or 'nothing':.120}); expected 'names' (L,), "
+            "'vectors' (L, D) and 'feature_space': write it with numpy.savez"
         )
     names, vectors = entries["names"], entries["vectors"]
     if names.dtype.kind != "U" or names.ndim != 1:
@@ -62,21 +63,6 @@ def read_text_features(path: str | os.PathLike[str]) -> tuple[Vocabulary, str]:
     except OgPointcloudError as error:
         raise FeatureSpaceError(f"{path}: {error}") from None
     return vocabulary, str(entries.get("feature_space", UNKNOWN_SPACE))
-
-
-def _entries(path: Path) -> dict[str, NDArray[Any]]:
-    try:
-        with zipfile.ZipFile(path) as archive:
-            total = sum(info.file_size for info in archive.infolist())
-            if total > MAX_UNPACKED_BYTES:
-                raise ValueError(f"it unpacks to {total} bytes, more than {MAX_UNPACKED_BYTES}")
-            infos = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
-            wanted = [name for name in infos if name in ("names", "vectors", "feature_space")]
-            return {name: array_from_zip(archive, infos[name]) for name in wanted}
-    except (zipfile.BadZipFile, zlib.error, ValueError, EOFError, RuntimeError, OSError) as error:
-        raise FeatureSpaceError(
-            f"{path} cannot be read as an .npz of plain arrays ({error!s:.120}): write it again with numpy.savez"
-        ) from None
 
 
 def checked_vocabulary(names: Sequence[str], vectors: NDArray[Any]) -> Vocabulary:
