@@ -37,9 +37,9 @@ def add(parser: Parser) -> None:
         add_command(protocols, run.__name__.removeprefix("run_"), run, run.__doc__)
         for run in (run_capture, run_scannet, run_lerf)
     )
-    add_path(capture, "captures", "CAPTURE", "folders with gt.npz", nargs="+")
-    add_path(capture, "predictions", "S", ".ogpc of the one CAPTURE, or folder with all")
-    add_path(capture, "--against", "OTHER", "as the predictions: also the difference, less OTHER, paired")
+    add_path(capture, "capture", "CAPTURE", "folder with gt.npz")
+    add_path(capture, "bundle", "S.ogpc", "what `fit` wrote of it")
+    add_path(capture, "--against", "OTHER.ogpc", "another: also the difference, less OTHER, paired")
     add_path(scannet, "folder", "DIR", f"scene folders with <scene>{SCANNET_LABELS}")
     add_path(scannet, "--gaussians", "G", "folder with <scene>.ply, whose points of opacity below 0.1 are ignored")
     add_path(lerf, "folder", "DIR", "with <scene>/sparse/0 and label/<scene>/*.json")
@@ -73,29 +73,19 @@ def run_capture(arguments: argparse.Namespace) -> None:
     from og_pointcloud.evaluate.captures import ask, difference, score_capture
     from og_pointcloud.evaluate.truth import read_truth
 
-    captures, against = arguments.captures, arguments.against
-    names = [folder.resolve().name for folder in captures]
-    if len(set(names)) < len(names):
-        raise OgPointcloudError(f"two captures are called '{max(names, key=names.count)}'; expected names of their own")
-    truths = {folder: read_truth(folder) for folder in captures}
-    files = {folder: scene_file(arguments.predictions, folder, len(captures)) for folder in captures}
-    others = {folder: scene_file(against, folder, len(captures)) for folder in captures} if against else {}
-    rows, report = [], {}
-    for name, (folder, truth) in zip(names, truths.items(), strict=True):
-        own_words = folder / "text_features.npz"
-        words = arguments.text_features or (own_words if own_words.is_file() else None)
-        answer = ask(files[folder], truth, words)
-        score = score_capture(answer, truth)
-        change = difference(answer, ask(others[folder], truth, words), truth) if against else None
-        rows.append(capture_cells(name, score, change))
-        less = asdict(change) if change else None
-        report[name] = {**asdict(score), "spacing": answer.spacing, "less_the_other": less}
-    print_table(CAPTURE_HEADER + (("less the other",) if against else ()), rows)
-    print("unknown counts as wrong; 'answered' leaves it out. The 95 % are over cubes of each scene, not over points:")
-    for name, entry in report.items():
-        interval = entry["interval"]
-        print(f"{name}: {interval['blocks']} cubes of {interval['edge'] / entry['spacing']:.0f} point spacings")
-    write_scores(arguments, report)
+    truth, own_words = read_truth(arguments.capture), arguments.capture / "text_features.npz"
+    words = arguments.text_features or (own_words if own_words.is_file() else None)
+    answer = ask(arguments.bundle, truth, words)
+    score = score_capture(answer, truth)
+    change = difference(answer, ask(arguments.against, truth, words), truth) if arguments.against else None
+    name, interval = arguments.capture.resolve().name, score.interval
+    print_table(CAPTURE_HEADER + (("less the other",) if change else ()), [capture_cells(name, score, change)])
+    print(
+        "unknown counts as wrong; 'answered' leaves it out. The 95 % are over cubes of the scene, not over points: "
+        f"{interval.blocks} cubes of {interval.edge / answer.spacing:.0f} point spacings"
+    )
+    less = asdict(change) if change else None
+    write_scores(arguments, {name: {**asdict(score), "spacing": answer.spacing, "less_the_other": less}})
 
 
 def capture_cells(name: str, score: CaptureScore, change: BlockInterval | None) -> tuple[str, ...]:
@@ -106,17 +96,6 @@ def capture_cells(name: str, score: CaptureScore, change: BlockInterval | None) 
         "-" if score.rand is None else f"{score.rand:.3f}",
         *((signed(change),) if change else ()),
     )  # fmt: skip
-
-
-def scene_file(predictions: Path, capture: Path, captures: int) -> Path:
-    """The labelled scene of a capture: the file, where there is one capture, or the file of its name in the folder."""
-    if predictions.is_dir():
-        return prediction_file(predictions, capture.resolve().name)
-    if captures > 1:
-        raise OgPointcloudError(f"{predictions} is one file for {captures} captures; expected a folder with one each")
-    if predictions.suffix != ".ogpc" or not predictions.is_file():
-        raise OgPointcloudError(f"{predictions} is no .ogpc file; expected one: og-pointcloud fit {capture} -o S.ogpc")
-    return predictions
 
 
 # ScanNet --------------------------------------------------------------------------------------------------------

@@ -10,13 +10,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from og_pointcloud.cli.common import (
-    SHOWN,
     Parser,
     add_shared,
     calibration_hint,
     print_provenance,
     print_result,
-    print_table,
     some_of,
 )  # fmt: skip
 from og_pointcloud.errors import BundleError
@@ -62,8 +60,7 @@ def print_info(scene: LabelledScene, path: Path) -> None:
     print(f"spacing {cloud.spacing:.4g}, reach {cloud.reach:.4g}, origin ({origin}), in the capture's unit")
     print(f"{len(words)} words: {some_of(words)}")
     print(f"{describe_bank(scene, path)}\n")
-    print_instances(scene)
-    print()
+    print(f"{scene.instances}\n")
     print_provenance(cloud.provenance)
 
 
@@ -71,15 +68,3 @@ def describe_bank(scene: LabelledScene, path: Path) -> str:
     if scene.cloud.word_bank is None:
         return f"no word bank: scores are cosines. {calibration_hint(path)}"
     return f"word bank of {len(scene.cloud.word_bank.vectors)}: scores are probabilities"
-
-
-def print_instances(scene: LabelledScene) -> None:
-    """The largest instances, with the evidence for each and the word that fits it best."""
-    rows = []
-    for row in scene.instances.largest(SHOWN):
-        word = "{} {:.2f}".format(*row.words[0]) if row.words else "-"
-        evidence = (f"{row.points:,}", str(row.views), str(row.masks), f"{row.agreement:.2f}")
-        rows.append((str(row.id), *evidence, word))
-    print_table(("instance", "points", "views", "masks", "agreement", "best word"), rows)
-    if len(scene.instances) > SHOWN:
-        print(f"and {len(scene.instances) - SHOWN} smaller ones; og-pointcloud instances lists them, with boxes")

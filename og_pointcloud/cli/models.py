@@ -21,9 +21,8 @@ PARTS = (
     ("SigLIP's typed words", ("tokenizers",), "words"),
 )
 """What for, modules, extra."""
-KINDS = {"sam": "proposer", "sam_hq": "proposer", "sam2": "proposer", "sam2_video": "proposer", "sam3": "proposer",
-         "sam3_video": "proposer", "sam3_tracker": "proposer", "clip": "encoder", "siglip": "encoder"}  # fmt: skip
-"""config.json's model_type -> what it is for."""
+KINDS = {"sam": "proposer", "clip": "encoder", "siglip": "encoder"}
+"""Beginning of a config.json's model_type -> what it is for."""
 USUAL = (
     ("proposer", "facebook/sam-vit-base", "SAM, 94 M parameters"),
     ("proposer", "facebook/sam2.1-hiera-small", "SAM 2.1, 46 M"),
@@ -79,11 +78,10 @@ def model_kind(folder: Path) -> str | None:
 
     if (folder / "manifest.json").is_file():
         return "encoder" if (folder / "image_encoder.onnx").is_file() else "words"
-    config = folder / "config.json"
-    if not config.is_file() or (not any(folder.glob("*.safetensors*")) and not any(folder.glob("*.bin"))):
+    if not any((*folder.glob("*.safetensors*"), *folder.glob("*.bin"))):
         return None
     try:
-        content = read_json(config)
-    except (SceneError, OSError):
+        model_type = str(read_json(folder / "config.json").get("model_type"))
+    except (SceneError, OSError, AttributeError):  # none, damaged, or no object
         return None
-    return KINDS.get(str(content.get("model_type"))) if isinstance(content, dict) else None
+    return next((kind for name, kind in KINDS.items() if model_type.startswith(name)), None)

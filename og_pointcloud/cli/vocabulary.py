@@ -13,7 +13,6 @@ from og_pointcloud.cli.common import Parser, add_command, add_output, replaceabl
 from og_pointcloud.errors import OgPointcloudError
 
 if TYPE_CHECKING:
-    from og_pointcloud.cloud import Vocabulary
     from og_pointcloud.text.encoder import TextEncoder
 
 
@@ -27,9 +26,9 @@ def add(parser: Parser) -> None:
         action.add_argument("bundle", type=replaceable, metavar="S.ogpc", help="what `fit` wrote")
     for action in (add, bank, carry):
         add_output(action, "-o", "--output", endings=(".ogpc",), help="another file (default: S.ogpc itself)")
-    add.add_argument("words", type=Path, nargs="?", metavar="words.txt", help="one a line (default: all vectors')")
     sources = add.add_mutually_exclusive_group(), bank.add_mutually_exclusive_group()
-    sources[0].add_argument("--text-features", type=Path, metavar="F.npz", help="names with their vectors")
+    add.add_argument("words", type=Path, nargs="?", metavar="words.txt", help="one a line")
+    sources[0].add_argument("--text-features", type=Path, metavar="F.npz", help="or names with their vectors")
     sources[1].add_argument("features", type=Path, nargs="?", metavar="F.npz", help="of at least 50 everyday words")
     for source in sources:
         source.add_argument("--text-encoder", type=Path, metavar="DIR", help="default: the feature space's, if found")
@@ -44,34 +43,18 @@ def run_add(arguments: argparse.Namespace) -> None:
     from og_pointcloud.bundle.vocabulary import add_words
     from og_pointcloud.cloud import Vocabulary
     from og_pointcloud.text.everyday import read_words
+    from og_pointcloud.text.text_features import read_text_features
 
-    if arguments.words is None and arguments.text_features is None:
-        arguments.parser.error("no words: name a file with one a line, or --text-features F.npz")
-    words = read_words(arguments.words) if arguments.words else None
+    if (arguments.words is None) == (arguments.text_features is None):
+        arguments.parser.error("words come from one place: a file with one a line, or --text-features F.npz")
     if arguments.text_features:
-        vocabulary, space = from_features(arguments.text_features, words)
+        vocabulary, space = read_text_features(arguments.text_features)
     else:
-        encoder = scene_encoder(arguments)
-        vocabulary, space = Vocabulary(words or (), encoder(words or ())), encoder.feature_space
+        words, encoder = read_words(arguments.words), scene_encoder(arguments)
+        vocabulary, space = Vocabulary(words, encoder(words)), encoder.feature_space
     done = add_words(arguments.bundle, vocabulary, space, arguments.output)
     replaced = f", {done.replaced} with a new vector" if done.replaced else ""
     print(f"wrote {arguments.output or arguments.bundle}: {done.total} words, {done.added} new{replaced}")
-
-
-def from_features(path: Path, words: tuple[str, ...] | None) -> tuple[Vocabulary, str]:
-    """The vocabulary (of some words only, if any are named) and the feature space of a text-features file."""
-    from og_pointcloud.cloud import Vocabulary
-    from og_pointcloud.text.text_features import read_text_features
-
-    vocabulary, space = read_text_features(path)
-    if words is None:
-        return vocabulary, space
-    rows = {name: row for row, name in enumerate(vocabulary.names)}
-    missing = [word for word in words if word not in rows]
-    if missing:
-        others = f" (nor are {len(missing) - 1} more)" if len(missing) > 1 else ""
-        raise OgPointcloudError(f"'{missing[0]}' is not among the {len(rows)} names of {path}{others}: encode it there")
-    return Vocabulary(words, vocabulary.vectors[[rows[word] for word in words]]), space
 
 
 def scene_encoder(arguments: argparse.Namespace) -> TextEncoder:

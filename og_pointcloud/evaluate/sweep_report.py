@@ -39,8 +39,8 @@ def require_matplotlib() -> Any:
 
 
 def write_chart(sweep: Sweep, path: Path) -> Path:
-    """A PNG, a panel a capture: error against seconds, both of every row; the default ringed, the front joined, its
-    settings numbered and named beside it. Written whole or not at all."""
+    """A PNG, a panel a capture: error against seconds, both of every row; the default ringed, the front joined.
+    Written whole or not at all."""
     captures = sweep.captures
     figure = require_matplotlib()(figsize=(WIDTH, PANEL_HEIGHT * len(captures)), layout="constrained")
     for axes, capture in zip(figure.subplots(len(captures), squeeze=False).ravel(), captures, strict=True):
@@ -65,10 +65,6 @@ def _panel(axes: Any, rows: Sequence[Row]) -> None:
             axes.plot(row.seconds, row.error, "o", ms=13, mfc="none", mew=2, color="black", label="the default")
     best = front(rows)
     axes.step([row.seconds for row in best], [row.error for row in best], where="post", color="0.7", label="front")
-    for number, row in enumerate(best, 1):
-        place = (0, -17 if number % 2 else 11)  # below and above in turn, so that neighbours do not cover each other
-        axes.annotate(str(number), (row.seconds, row.error), place, textcoords="offset points", ha="center")
-        axes.plot([], [], " ", label=f"{number}  {row.name}")
     axes.set_xscale("log")
     axes.set_yscale("symlog", linthresh=LINEAR_BELOW)
     axes.set_yticks(TICKS, [f"{tick:g}" for tick in TICKS])
