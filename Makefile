@@ -1,5 +1,5 @@
 # `make demo` and `make test` do their whole set-up in .venv; a second run starts at once.
-.PHONY: help setup demo test test-all lint check bench clean
+.PHONY: help setup demo test test-all lint check bench zoo clean
 .DEFAULT_GOAL := help
 
 help:
@@ -8,6 +8,7 @@ help:
 	@echo "make lint    ruff and pyright"
 	@echo "make check   stiff and extreme cases beside references: table, CSV and picture in out/check"
 	@echo "make bench   seconds and error of the main pieces of work, beside another revision (AGAINST=REV)"
+	@echo "make zoo     fit many small scenes of many kinds beside baselines: table, CSV and picture in out/zoo"
 	@echo "make setup   only make .venv, with the libraries that Open3D and PyVista need"
 	@echo "make clean   remove .venv, out and the caches"
 
@@ -33,6 +34,9 @@ check: setup
 
 bench: setup
 	@.venv/bin/python examples/bench.py $(if $(AGAINST),--against $(AGAINST))
+
+zoo: setup
+	@.venv/bin/python examples/zoo.py -o out/zoo
 
 clean:
 	rm -rf .venv out .pytest_cache .ruff_cache

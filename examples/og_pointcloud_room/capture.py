@@ -27,7 +27,10 @@ from og_pointcloud_room.raycast import BACKGROUND, Frame, Intrinsics, RayCaster,
 from og_pointcloud_room.room import Room, furnish
 from og_pointcloud_room.shapes import rotated
 
-__all__ = ["CaptureSettings", "RoomCapture", "make_capture", "write_capture"]
+__all__ = [
+    "CaptureSettings", "RoomCapture", "everyday_vectors", "ground_truth", "looking_at", "make_capture",
+    "mask_features", "walk", "write_capture",
+]  # fmt: skip
 
 Random = np.random.Generator
 FLYING = -2
@@ -73,6 +76,7 @@ class RoomCapture:
     walls, floor or ceiling. Where ``cls`` is -1 and ``background`` false the truth is ambiguous: a flying pixel, an
     outlier, or noise that carried the point over to another surface. bank_vectors: (B, 512) float32, our everyday
     words, those of the room's things among them; absent_vectors: (50, 512) float32, words that nothing in it is.
+    names: of the classes. views: (n,) int32, how many views see each point; None: not counted.
     """
 
     room: Room
@@ -88,6 +92,8 @@ class RoomCapture:
     background: NDArray[np.bool_]
     bank_vectors: NDArray[np.float32]
     absent_vectors: NDArray[np.float32]
+    names: tuple[str, ...] = CLASS_NAMES
+    views: NDArray[np.int32] | None = None
 
     @property
     def mask_instance(self) -> NDArray[np.int32]:
@@ -104,31 +110,35 @@ def make_capture(seed: int = 0, settings: CaptureSettings | None = None) -> Room
     room = furnish(seed)
     caster = RayCaster(room, _stream(seed, TEXTURE))
     intrinsics = Intrinsics(settings.width, settings.height, 0.82 * settings.width)
-    path = _walk(room, caster.surfaces, settings.views, _stream(seed, PATH))
+    path = walk(room, caster.surfaces, settings.views, _stream(seed, PATH))
     frames = tuple(caster.look(intrinsics, pose) for pose in path)
     xyz, rgb, source = _fused_cloud(room, frames, intrinsics, settings, seed)
-    instance, background = _ground_truth(room, caster.surfaces, xyz, source)
+    instance, background = ground_truth(room, caster.surfaces, xyz, source)
     class_of_object = np.array([CLASS_NAMES.index(item.name) for item in room.objects], np.int32)
     masks = tuple(propose_masks(frame.owner, noise, _stream(seed, MASKS, view)) for view, frame in enumerate(frames))
     feature_rng, word_rng = _stream(seed, FEATURES), _stream(seed, WORDS)
     model = FeatureModel(len(CLASS_NAMES), feature_rng)
     looks = np.stack([model.object_look(feature_rng) for _ in room.objects])
     features = tuple(
-        _mask_features(
-            ids, frame.owner, class_of_object, looks, model, noise.wrong_class, _stream(seed, FEATURES, view)
-        )
+        mask_features(ids, frame.owner, class_of_object, looks, model, noise.wrong_class, _stream(seed, FEATURES, view))
         for view, (ids, frame) in enumerate(zip(masks, frames, strict=True))
     )
     cls = np.where(instance >= 0, class_of_object[instance], -1).astype(np.int32)
-    everyday = everyday_words()
-    bank = model.words(len(everyday), word_rng)
-    for name, vector in zip(CLASS_NAMES, model.texts, strict=True):
-        if name in everyday:
-            bank[everyday.index(name)] = vector
+    bank = everyday_vectors(model, CLASS_NAMES, word_rng)
     return RoomCapture(
         room, intrinsics, frames, masks, features, model.texts, xyz, rgb, cls, instance, background,
         bank, model.words(ABSENT_WORDS, word_rng),
     )  # fmt: skip
+
+
+def everyday_vectors(model: FeatureModel, names: tuple[str, ...], rng: Random) -> NDArray[np.float32]:
+    """(B, 512) float32: what the encoder makes of our everyday words; of those that name a class, that class's text."""
+    everyday = everyday_words()
+    bank = model.words(len(everyday), rng)
+    for name, vector in zip(names, model.texts, strict=True):
+        if name in everyday:
+            bank[everyday.index(name)] = vector
+    return bank
 
 
 def _stream(seed: int, purpose: int, *view: int) -> Random:
@@ -138,7 +148,7 @@ def _stream(seed: int, purpose: int, *view: int) -> Random:
 # The camera's path ----------------------------------------------------------------------------------------------
 
 
-def _walk(room: Room, surfaces: Surfaces, views: int, rng: Random) -> list[NDArray[np.float64]]:
+def walk(room: Room, surfaces: Surfaces, views: int, rng: Random) -> list[NDArray[np.float64]]:
     """Two rounds by hand: the first along the furniture looking across, the second in the middle looking outwards.
 
     The hand goes up and down on the way, to look under and onto things, as one does when scanning a room.
@@ -162,11 +172,11 @@ def _walk(room: Room, surfaces: Surfaces, views: int, rng: Random) -> list[NDArr
         while surfaces.distance_m(eye[None])[0] < 0.35:
             eye[:2] *= 0.9
             eye[2] = min(eye[2] + 0.03, 1.8)
-        poses.append(_looking_at(eye, target + rng.normal(size=3) * 0.12, roll=rng.normal() * 0.04))
+        poses.append(looking_at(eye, target + rng.normal(size=3) * 0.12, roll=rng.normal() * 0.04))
     return poses
 
 
-def _looking_at(eye: NDArray[np.float64], target: NDArray[np.float64], roll: float) -> NDArray[np.float64]:
+def looking_at(eye: NDArray[np.float64], target: NDArray[np.float64], roll: float) -> NDArray[np.float64]:
     """(4, 4) camera-to-world, OpenCV axes, z up in the world; rounded to what sines of all processors agree on."""
     forward = (target - eye) / np.linalg.norm(target - eye)
     right = np.cross(forward, (0, 0, 1.0))
@@ -222,7 +232,7 @@ def _sense(
     return xyz, frame.image.reshape(-1, 3)[pixel], source, depth_m < settings.range_m
 
 
-def _ground_truth(
+def ground_truth(
     room: Room, surfaces: Surfaces, xyz: NDArray[np.float32], source: NDArray[np.int32]
 ) -> tuple[NDArray[np.int32], NDArray[np.bool_]]:
     """instance (n,) int32 and background (n,) bool: known where no surface is nearer than that of the ray's target."""
@@ -237,7 +247,7 @@ def _ground_truth(
 # Mask features --------------------------------------------------------------------------------------------------
 
 
-def _mask_features(
+def mask_features(
     ids: NDArray[np.uint16], owner: NDArray[np.int32], class_of_object: NDArray[np.int32],
     looks: NDArray[np.float64], model: FeatureModel, wrong_class: float, rng: Random,
 ) -> NDArray[np.float32]:  # fmt: skip
@@ -282,12 +292,14 @@ def write_capture(capture: RoomCapture, folder: Path) -> Path:
         stem: rows.astype(np.float16) for stem, rows in zip(stems, capture.mask_features, strict=True)
     }
     space: dict[str, Any] = {"feature_space": np.array(FEATURE_SPACE)}
-    names = np.array(CLASS_NAMES)
+    names = np.array(capture.names)
     np.savez(folder / "mask_features.npz", **rows, **space)
     np.savez(folder / "text_features.npz", names=names, vectors=capture.text_vectors, **space)
     everyday = np.array(everyday_words())
     np.savez(folder / "word_bank.npz", names=everyday, vectors=capture.bank_vectors.astype(np.float16), **space)
     truth: dict[str, Any] = {"cls": capture.cls, "instance": capture.instance, "background": capture.background}
+    if capture.views is not None:
+        truth["views"] = capture.views
     np.savez(folder / "gt.npz", names=names, **truth)
     return folder
 

@@ -17,8 +17,9 @@ from numpy.typing import ArrayLike
 from og_pointcloud_room.shapes import Material, Part, box, cushion_shape, lathe, rotation_about
 
 __all__ = [
-    "CLASS_NAMES", "Group", "Item", "bed_group", "cabinet_group", "desk_group", "dining_group", "floor_lamp",
-    "floor_plant", "picture", "shelf_group", "sofa_group",
+    "CLASS_NAMES", "METAL", "Group", "Item", "Random", "arranged", "bed_group", "bottle", "cabinet_group", "desk_group",
+    "dining_group", "floor_lamp", "floor_plant", "lying_book", "mug", "paint", "picture", "shelf_group", "small_plant",
+    "sofa_group", "table_of", "vase", "wood",
 ]  # fmt: skip
 
 CLASS_NAMES = (
@@ -213,7 +214,8 @@ def _legs(width: float, depth: float, height: float, thickness: float, material:
     return [box((thickness, thickness, height), (sx * x, sy * y, 0), material) for sx in (-1, 1) for sy in (-1, 1)]
 
 
-def _table(name: str, width: float, depth: float, height: float, material: Material) -> Item:
+def table_of(name: str, width: float, depth: float, height: float, material: Material) -> Item:
+    """A top on four legs, as a thing of this class."""
     top = box((width, depth, 0.04), (0, 0, height - 0.04), material)
     return Item(name, (top, *_legs(width, depth, height - 0.04, 0.06, material)))
 
@@ -227,7 +229,7 @@ def chair(rng: Random, material: Material) -> Item:
     return Item("chair", (seat, back, *posts, *_legs(0.42, 0.42, seat_height - 0.04, 0.04, material)))
 
 
-def _arranged(
+def arranged(
     rng: Random, makers: Sequence[Callable[[Random], Item]], center: Sequence[float], size: Sequence[float],
     cells: tuple[int, int],
 ) -> list[Item]:  # fmt: skip
@@ -250,7 +252,7 @@ def dining_group(rng: Random) -> Group:
     """Rug, table, four chairs pushed in a little, and things on the table."""
     rug = Item("rug", (box((2.2, 1.75, 0.015), (0, 0, 0), _print(rng, 0.22)),))
     width, depth, floor = rng.uniform(1.25, 1.4), rng.uniform(0.75, 0.85), 0.015
-    table = _table("table", width, depth, 0.74, wood(rng)).moved((0, 0, floor))
+    table = table_of("table", width, depth, 0.74, wood(rng)).moved((0, 0, floor))
     material = wood(rng) if rng.uniform() < 0.5 else paint(rng)
     chairs = []
     for side in (-1, 1):
@@ -259,7 +261,7 @@ def dining_group(rng: Random) -> Group:
             yaw = (np.pi if side < 0 else 0.0) + rng.uniform(-0.15, 0.15)
             chairs.append(chair(rng, material).moved((x + rng.uniform(-0.03, 0.03), y, floor), yaw))
     makers = [mug, mug, bottle, vase, lying_book, *[lying_book, mug][: rng.integers(0, 3)]]
-    things = _arranged(rng, makers, (0, 0, floor + 0.74), (width, depth), (4, 2))
+    things = arranged(rng, makers, (0, 0, floor + 0.74), (width, depth), (4, 2))
     return Group((rug, table, *chairs, *things), 2.2, 1.75)
 
 
@@ -299,9 +301,9 @@ def bed_group(rng: Random) -> Group:
 def desk_group(rng: Random) -> Group:
     """Desk with monitor, lamp, mug and book, and a chair before it."""
     width, material = rng.uniform(1.3, 1.5), wood(rng)
-    desk = _table("desk", width, 0.65, 0.74, material).moved((0, 0.25, 0))
+    desk = table_of("desk", width, 0.65, 0.74, material).moved((0, 0.25, 0))
     back_row = [monitor(rng).moved((0, 0.38, 0.74)), table_lamp(rng).moved((-width / 2 + 0.16, 0.38, 0.74))]
-    front_row = _arranged(rng, [mug, lying_book], (0, 0.07, 0.74), (width, 0.29), (4, 1))
+    front_row = arranged(rng, [mug, lying_book], (0, 0.07, 0.74), (width, 0.29), (4, 1))
     seat = chair(rng, paint(rng)).moved((rng.uniform(-0.15, 0.15), -0.28, 0), np.pi + rng.uniform(-0.2, 0.2))
     return Group((desk, *back_row, *front_row, seat), width, 1.15)
 
@@ -318,7 +320,7 @@ def shelf_group(rng: Random) -> Group:
     things: list[Item] = []
     for level, share in zip(levels, np.array_split(np.arange(len(makers)), 4), strict=False):
         chosen = [makers[index] for index in share]
-        things += _arranged(rng, chosen, (0, -0.02, level + 0.03), (width - 0.08, depth - 0.05), (4, 1))
+        things += arranged(rng, chosen, (0, -0.02, level + 0.03), (width - 0.08, depth - 0.05), (4, 1))
     return Group((Item("shelf", tuple(parts)), *things), width, depth, carries_picture=False)
 
 
@@ -334,5 +336,5 @@ def cabinet_group(rng: Random) -> Group:
     body = box((width, depth - 0.02, height), (0, 0.01, 0), material)
     doors = [box(door, (x, -depth / 2 + 0.01, 0.06), front) for x in (-width / 4, width / 4)]
     makers = [small_plant, table_lamp, small_vase_or_bottle]
-    things = _arranged(rng, makers, (0, 0, height), (width, depth - 0.06), (3, 1))
+    things = arranged(rng, makers, (0, 0, height), (width, depth - 0.06), (3, 1))
     return Group((Item("cabinet", (body, *doors)), *things), width, depth)

@@ -25,7 +25,7 @@ from og_pointcloud_room.furniture import (
 )
 from og_pointcloud_room.shapes import Material, box
 
-__all__ = ["Room", "furnish"]
+__all__ = ["Room", "furnish", "shell"]
 
 WALL_GAP = 0.02
 CORNER = 0.5
@@ -53,7 +53,7 @@ def furnish(seed: int = 0) -> Room:
         signs = np.array([(1, 1), (-1, 1), (-1, -1), (1, -1)][corner])
         place = signs * (np.array(size[:2]) / 2 - CORNER / 2 - 0.05)
         objects.append(maker(rng).moved((*place, 0.0)))
-    return Room(size, tuple(objects), _shell(rng, size))
+    return Room(size, tuple(objects), shell(rng, size))
 
 
 def _against_wall(
@@ -83,7 +83,7 @@ def _in_the_middle(
     return group.moved((*(center + rng.uniform(-1, 1, 2) * np.minimum(slack, 0.2)), 0.0))
 
 
-def _shell(rng: Random, size: tuple[float, float, float]) -> tuple[Item, ...]:
+def shell(rng: Random, size: tuple[float, float, float]) -> tuple[Item, ...]:
     """Floor of planks, four walls and the ceiling, all outside of the room's box."""
     x, y, z = size
     tone = rng.uniform(0.7, 0.9)

@@ -12,7 +12,7 @@ from typing import Any
 from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.settings import CodebookSettings, FeatureSettings, FitSettings, MatchingSettings, PaperSettings
 
-__all__ = ["ABLATIONS", "DEFAULT", "KNOBS", "QUICK", "Setting", "ablations", "settings_of"]
+__all__ = ["ABLATIONS", "DEFAULT", "KNOBS", "QUICK", "Setting", "ablations", "changed", "settings_of"]
 
 
 @dataclass(frozen=True)
@@ -67,15 +67,15 @@ CODEBOOKS: Mapping[str, Changes] = {
 }
 
 
-def _changed(record: Any, path: str, value: Any) -> Any:
+def changed(record: Any, path: str, value: Any) -> Any:
     """A settings record in which one number, at any depth, is another."""
     name, _, rest = path.partition(".")
-    return replace(record, **{name: _changed(getattr(record, name), rest, value) if rest else value})
+    return replace(record, **{name: changed(getattr(record, name), rest, value) if rest else value})
 
 
 def _with(base: FitSettings, changes: Changes) -> FitSettings:
     for path, value in changes.items():
-        base = _changed(base, path, value)
+        base = changed(base, path, value)
     return base
 
 

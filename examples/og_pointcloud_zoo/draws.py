@@ -1,0 +1,142 @@
+"""What is drawn for each scene of the zoo: one record of numbers. The same name is the same scene on every machine.
+
+A kind fixes what it is about and leaves the rest to chance. Each has two scenes: number 0 is for choosing, number 1 for
+judging alone. Of scenes given by path the last digit of the name decides: even for choosing, odd or none for judging;
+captures on which today's numbers were settled are for choosing.
+"""
+
+from __future__ import annotations
+
+import re
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+__all__ = ["KINDS", "Draw", "draw", "half_of", "scene_names"]
+
+SETTLED = ("seven_redkitchen", "apc_shelf_B", "ycb_0050", "nuscenes_frame")
+"""Captures that constants were chosen on before there was a zoo."""
+
+
+@dataclass(frozen=True)
+class Draw:
+    """One scene. place: of `places.PLACES`, "street", or "demo", the demo's own capture with its fused cloud.
+
+    points: of the cloud. views, width, height: of the images, pixels. noise: of points across their surface, standard
+    deviation in spacings. uneven: density at the walls is exp(-uneven) of that in the middle. backdrop: density of
+    floor, walls and ceiling as a part of that of things. outliers: share of points anywhere; floaters: share of points
+    between a camera and what it sees. hidden: share of what no view sees that is in the cloud all the same.
+    all_masked: floor, walls and ceiling have masks and classes too; else they are known background.
+    split, merge, miss, spurious, wrong_class, edge_px: how the proposer errs (`MaskNoise`). spans: so many things share
+    their mask with a neighbour in all views. taken: so many things are gone in the second half of the views. levels:
+    each view comes three times, with masks of parts, of things, and of things with what stands on them.
+    """
+
+    name: str
+    place: str
+    seed: int
+    points: int
+    views: int
+    width: int
+    height: int
+    noise: float
+    uneven: float
+    backdrop: float
+    outliers: float
+    floaters: float
+    hidden: float
+    all_masked: bool
+    split: float
+    merge: float
+    miss: float
+    spurious: float
+    wrong_class: float
+    edge_px: float
+    spans: int = 0
+    taken: int = 0
+    levels: bool = False
+
+
+Fixed = Mapping[str, Any]
+SFM: Fixed = {"points": (8_000, 20_000), "noise": (0.1, 0.4), "backdrop": (0.002, 0.008), "floaters": (0.005, 0.02),
+              "hidden": (0, 0)}  # fmt: skip
+
+KINDS: Mapping[str, Fixed] = {
+    "room": {"place": "room", "all_masked": False},
+    "room-masked": {"place": "room", "all_masked": True},
+    "room-noisy": {"place": "room", "all_masked": False, "noise": (1.5, 3.0), "outliers": (0.001, 0.004)},
+    "room-sparse": {"place": "room", "points": (5_000, 8_000), "uneven": (0.5, 1.5)},
+    "room-oversegmented": {"place": "room", "split": (0.5, 0.8)},
+    "room-undersegmented": {"place": "room", "merge": (0.25, 0.45)},
+    "room-missed": {"place": "room", "all_masked": False, "miss": (0.4, 0.7), "wrong_class": (0.15, 0.3)},
+    "room-changing": {"place": "room", "taken": (4, 7)},
+    "million": {"place": "room", "points": (1_000_000, 1_000_000), "views": (16, 20), "width": (320, 320)},
+    "many-views": {"place": "desk", "views": (180, 200), "width": (160, 160)},
+    "large-images": {"place": "table", "views": (10, 12), "width": (1280, 1280)},
+    "flat": {"place": "flat", "views": (40, 60), "points": (60_000, 100_000)},
+    "shelf": {"place": "shelf"},
+    "bin": {"place": "bin", "views": (10, 15), "noise": (1.0, 2.5), "all_masked": False},
+    "desk": {"place": "desk"},
+    "table": {"place": "table"},
+    "board": {"place": "board", **SFM},
+    "board-dense": {"place": "board", "all_masked": False},
+    "still": {"place": "still", "views": (12, 20), "hidden": (0, 0)},
+    "boxes": {"place": "boxes"},
+    "plants": {"place": "plants"},
+    "wires": {"place": "wires"},
+    "glass": {"place": "glass"},
+    "mirror": {"place": "mirror"},
+    "levels": {"place": "desk", "levels": True, "views": (16, 24)},
+    "spanning": {"place": "shelf", "spans": (3, 4)},
+    "street": {"place": "street", "points": (40_000, 120_000), "views": (24, 40), "width": (480, 480)},
+    "demo": {"place": "demo", "views": (30, 40), "width": (320, 480)},
+}
+"""Name -> what is fixed of it: one value, or the range that it is drawn from."""
+ANY: Fixed = {
+    "points": (10_000, 80_000), "views": (16, 44), "width": (240, 640), "noise": (0.0, 1.0), "uneven": (0.0, 1.2),
+    "backdrop": (0.3, 1.0), "outliers": (0.0, 0.002), "floaters": (0.0, 0.002), "hidden": (0.0, 0.5),
+    "split": (0.05, 0.25), "merge": (0.0, 0.08), "miss": (0.05, 0.2), "spurious": (0.0, 0.1),
+    "wrong_class": (0.02, 0.1), "edge_px": (0.3, 1.2),
+}  # fmt: skip
+"""The ranges of what a kind leaves to chance. Whole numbers are drawn evenly over their logarithm."""
+
+
+def scene_names() -> list[str]:
+    """All that can be drawn, the two scenes of a kind side by side."""
+    return [f"{kind}-{number}" for kind in KINDS for number in (0, 1)]
+
+
+def draw(name: str) -> Draw:
+    """The scene of a name of `scene_names`; KeyError for another."""
+    kind, number = name[:-2], name[-2:]
+    if kind not in KINDS or number not in ("-0", "-1"):
+        raise KeyError(name)
+    seed = zlib.crc32(name.encode()) % 10_000
+    rng = np.random.default_rng([seed, 99])
+    fixed = KINDS[kind]
+    numbers: dict[str, Any] = {"all_masked": bool(rng.uniform() < 0.35)}
+    for key, usual in ANY.items():  # in one order, whatever the kind fixes
+        numbers[key] = _between(fixed.get(key, usual), rng.uniform())
+    for key in ("spans", "taken"):
+        if key in fixed:
+            numbers[key] = _between(fixed[key], rng.uniform())
+    numbers.update({key: fixed[key] for key in ("place", "all_masked", "levels") if key in fixed})
+    numbers["width"] = 16 * round(numbers["width"] / 16)
+    return Draw(name=name, seed=seed, height=3 * numbers["width"] // 4, **numbers)
+
+
+def _between(limits: tuple[float, float], share: float) -> float:
+    low, high = limits
+    if isinstance(low, int) and low > 0:
+        return round(low * (high / low) ** share)
+    return round(low + share * (high - low), 6)
+
+
+def half_of(name: str) -> str:
+    """ "choose" or "judge": which half a scene is of, by its name alone."""
+    digits = re.findall(r"\d", name)
+    even = bool(digits) and int(digits[-1]) % 2 == 0
+    return "choose" if even or name in SETTLED else "judge"

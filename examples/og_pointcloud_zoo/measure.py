@@ -1,0 +1,130 @@
+"""One scene of the zoo, fitted and scored as any capture is: our labels, what the fit says of itself, and baselines."""
+
+from __future__ import annotations
+
+import ast
+import time
+from collections.abc import Iterable
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+import og_pointcloud as og
+from og_pointcloud.errors import OgPointcloudError
+from og_pointcloud.evaluate.baselines import baseline_labels
+from og_pointcloud.evaluate.captures import Answer, ask
+from og_pointcloud.evaluate.intervals import miou_interval
+from og_pointcloud.evaluate.knobs import changed
+from og_pointcloud.evaluate.truth import Truth, read_truth
+from og_pointcloud.fitting.fit import Prepared, fit_prepared, prepare
+from og_pointcloud.formats.capture import read_capture
+from og_pointcloud.journal import Journal
+from og_pointcloud.scene import Scene
+from og_pointcloud.settings import FitSettings
+from og_pointcloud.text.text_features import read_text_features
+from og_pointcloud_zoo.draws import half_of
+
+__all__ = ["Row", "answered", "measure", "parsed_settings", "warm_up"]
+
+WORDS, BANK = "text_features.npz", "word_bank.npz"
+
+
+@dataclass(frozen=True)
+class Row:
+    """One scene. miou, background, unknown: as `Score` has them. seconds: of the fit, capture in memory.
+
+    agreement: what the fit says of itself, in [0, 1]. baseline: the best one, None where none was asked for; gain: our
+    mIoU less its, over the same blocks of space, and the middle 95 % of that.
+    """
+
+    scene: str
+    half: str
+    points: int
+    views: int
+    miou: float
+    background: float | None
+    unknown: float
+    seconds: float
+    agreement: float | None
+    baseline: str | None = None
+    baseline_miou: float | None = None
+    gain: float | None = None
+    gain_low: float | None = None
+    gain_high: float | None = None
+
+
+def measure(folder: Path, settings: FitSettings | None = None, baselines: bool = True) -> Row:
+    """Fit a capture with gt.npz and text_features.npz, score it; and the baselines on the same mask table."""
+    scene, truth = read_capture(folder), read_truth(folder)
+    start = time.perf_counter()
+    journal = Journal(progress=False)
+    prepared = prepare(scene, settings, journal)
+    cloud = fit_prepared(prepared, settings, journal)
+    seconds = time.perf_counter() - start
+    answer = answered(folder, cloud, truth)
+    score = truth.score(answer.called, [*truth.names, "a word that the truth lacks"])
+    row = Row(
+        scene=folder.name,
+        half=half_of(folder.name),
+        points=len(scene.points),
+        views=len(scene.views),
+        miou=score.miou,
+        background=score.background_called,
+        unknown=score.unknown_share,
+        seconds=seconds,
+        agreement=_agreement(cloud),
+    )
+    return _beside_baselines(row, folder, prepared, answer, truth, score.classes) if baselines else row
+
+
+def answered(folder: Path, cloud: og.LabelledCloud, truth: Truth) -> Answer:
+    """What a fitted cloud says of each of its points, with the capture's own word bank where it has one."""
+    if (folder / BANK).is_file():
+        with np.load(folder / BANK) as bank:
+            cloud = replace(cloud, word_bank=og.WordBank(bank["vectors"]))
+    return ask(cloud, truth, folder / WORDS)
+
+
+def _beside_baselines(
+    row: Row, folder: Path, prepared: Prepared, answer: Answer, truth: Truth, classes: tuple[int, ...]
+) -> Row:
+    vocabulary = read_text_features(folder / WORDS)[0]
+    best: tuple[float, str, NDArray[np.integer]] | None = None
+    for name, labels, _ in baseline_labels(prepared, vocabulary.vectors):
+        miou = truth.score(labels, vocabulary.names).miou
+        if best is None or miou > best[0]:
+            best = miou, name, truth.class_of(labels, vocabulary.names)
+    assert best is not None
+    gain = miou_interval(answer.called, truth, answer.xyz, answer.spacing, classes, less=best[2])
+    return replace(row, baseline=best[1], baseline_miou=best[0], gain=gain.mean, gain_low=gain.low, gain_high=gain.high)
+
+
+def _agreement(cloud: og.LabelledCloud) -> float | None:
+    notes = cloud.provenance["notes"]
+    return max(notes.get("mask_agreement", {}).values(), default=None)
+
+
+def warm_up(scene: Scene) -> None:
+    """Fit two views of a few points, so that no scene's seconds hold the loading of compiled code."""
+    few = scene.points.take(np.arange(0, len(scene.points), 1 + len(scene.points) // 2_000))
+    with suppress(OgPointcloudError):
+        og.fit(replace(scene, points=few, views=scene.views[:6]), progress=False)
+
+
+def parsed_settings(changes: Iterable[str], settings: FitSettings | None = None) -> FitSettings:
+    """Settings with numbers changed by ``path=value``, as "membership.sure_share=0.5" or "mode=grouping"."""
+    found = settings or FitSettings()
+    for change in changes:
+        path, _, text = change.partition("=")
+        value: Any = text
+        with suppress(ValueError, SyntaxError):
+            value = ast.literal_eval(text)
+        try:
+            found = changed(found, path, value)
+        except (AttributeError, TypeError):
+            raise OgPointcloudError(f"'{path}' is no setting; expected a path like membership.sure_share=0.5") from None
+    return found

@@ -1,0 +1,228 @@
+"""What the zoo's scenes show, and a camera's way through them. Frame and units are those of the demo's room."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from og_pointcloud_room.capture import looking_at, walk
+from og_pointcloud_room.furniture import (
+    CLASS_NAMES,
+    METAL,
+    Group,
+    Item,
+    Random,
+    arranged,
+    bottle,
+    desk_group,
+    dining_group,
+    floor_plant,
+    lying_book,
+    mug,
+    paint,
+    shelf_group,
+    small_plant,
+    sofa_group,
+    table_of,
+    vase,
+    wood,
+)
+from og_pointcloud_room.raycast import Surfaces
+from og_pointcloud_room.room import Room, furnish, shell
+from og_pointcloud_room.shapes import box
+
+__all__ = ["GLASS", "MIRROR", "NAMES", "PLACES", "Place"]
+
+GLASS, MIRROR = "window", "mirror"
+"""Names of what a depth sensor does not see: it looks through the one and into the other."""
+BOXES = ("box", "crate", "suitcase")
+NAMES = (*CLASS_NAMES, *BOXES, "rack", GLASS, MIRROR, "floor", "wall", "ceiling")
+Pose = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Place:
+    """room: what stands where. poses(views, surfaces, rng): a camera's way through it, (4, 4) camera-to-world each."""
+
+    room: Room
+    poses: Callable[[int, Surfaces, Random], list[Pose]]
+
+
+@dataclass(frozen=True)
+class _Arc:
+    """Around ``middle`` (3,), over ``angle`` radians about the side that faces -y; radius and height in metres."""
+
+    middle: tuple[float, float, float]
+    angle: float
+    radius: tuple[float, float]
+    height: tuple[float, float]
+
+    def __call__(self, views: int, surfaces: Surfaces, rng: Random) -> list[Pose]:
+        poses = []
+        for step in range(views):
+            turn = -np.pi / 2 + self.angle * (step / max(views - 1, 1) - 0.5) + 0.02 * rng.normal()
+            radius, height, target = rng.uniform(*self.radius), rng.uniform(*self.height), rng.normal(size=3)
+            x, y, _ = self.middle
+            eye = np.array([x + radius * np.cos(turn), y + radius * np.sin(turn), height])
+            for _ in range(20):  # off what stands in the way
+                if surfaces.distance_m(eye[None])[0] > 0.2:
+                    break
+                eye[2] += 0.1
+            poses.append(looking_at(eye, np.array(self.middle) + 0.06 * target, 0.04 * rng.normal()))
+        return poses
+
+
+def _in_shell(rng: Random, items: list[Item], size: tuple[float, float, float]) -> Room:
+    """Items in an otherwise empty room, whose four walls are four things."""
+    floor, walls, ceiling = shell(rng, size)
+    return Room(size, tuple(items), (floor, *(Item("wall", (part,)) for part in walls.parts), ceiling))
+
+
+def _grid(rng: Random, makers: list[Callable[[Random], Item]], pitch: float) -> list[Item]:
+    """Things on the floor, ``pitch`` metres apart and a little off their places."""
+    side = int(np.ceil(np.sqrt(len(makers))))
+    items = []
+    for index, maker in enumerate(makers):
+        place = (np.array(divmod(index, side)) - (side - 1) / 2) * pitch + rng.uniform(-0.08, 0.08, 2) * pitch
+        items.append(maker(rng).moved((*place, 0.0), rng.uniform(0, 2 * np.pi)))
+    return items
+
+
+def _box_item(rng: Random) -> Item:
+    """A box of 20 to 45 cm, half of them with another one on top, as one thing."""
+    width, depth, height = rng.uniform(0.2, 0.45, 3)
+    parts = [box((width, depth, height), (0, 0, 0), paint(rng, 0.4))]
+    if rng.uniform() < 0.5:
+        parts.append(box((0.7 * width, 0.7 * depth, 0.7 * height), (0, 0, height), paint(rng, 0.4)))
+    return Item(BOXES[rng.integers(len(BOXES))], tuple(parts))
+
+
+def _rack(rng: Random) -> Item:
+    """An upright grid of bars of 8 mm, as a fence or a drying rack is."""
+    width, height, bars = rng.uniform(0.7, 1.0), rng.uniform(0.8, 1.1), int(rng.integers(7, 11))
+    upright = [box((0.008, 0.008, height), (x, 0, 0), METAL) for x in np.linspace(-width / 2, width / 2, bars)]
+    across = [box((width, 0.008, 0.008), (0, 0, z), METAL) for z in np.linspace(0.05, height, 5)]
+    feet = [box((0.02, 0.4, 0.02), (x, 0, 0), METAL) for x in (-width / 2, width / 2)]
+    return Item("rack", (*upright, *across, *feet))
+
+
+def room(rng: Random, seed: int) -> Place:
+    """The demo's furnished room, walked through twice."""
+    made = furnish(seed)
+    floor, walls, ceiling = made.shell
+    made = replace(made, shell=(floor, *(Item("wall", (part,)) for part in walls.parts), ceiling))
+    return Place(made, lambda views, surfaces, rng: walk(made, surfaces, views, rng))
+
+
+def flat(rng: Random, seed: int) -> Place:
+    """Two furnished rooms with a doorway between them, walked through at head height, looking a little down."""
+    both = [furnish(seed), furnish(seed + 1000)]
+    width = max(made.size[0] for made in both) + 0.2
+    size = (2 * width, max(made.size[1] for made in both), 2.6)
+    items = [item.moved((side * width / 2, 0, 0)) for side, made in zip((-1, 1), both, strict=True) for item in
+             made.objects]  # fmt: skip
+    plain = _in_shell(rng, items, size)
+    walls = [
+        Item("wall", (box((0.1, size[1] / 2 - 0.5, 2.6), (0, side * (size[1] / 4 + 0.25), 0), paint(rng, 0.1)),))
+        for side in (-1, 1)
+    ]
+
+    def poses(views: int, surfaces: Surfaces, rng: Random) -> list[Pose]:
+        taken = []
+        for step in range(views):
+            turn = 4 * np.pi * step / views
+            eye = np.array([0.55 * width * np.sin(turn / 2), 0.3 * np.sin(turn), 1.65 + 0.03 * rng.normal()])
+            heading = turn + 1.5 * np.sin(2 * turn) + 0.2 * rng.normal()
+            while surfaces.distance_m(eye[None])[0] < 0.25:
+                eye *= (0.9, 0.9, 1.01)
+            ahead = np.array([np.cos(heading), np.sin(heading), -0.45 + 0.1 * rng.normal()])
+            taken.append(looking_at(eye, eye + ahead, 0.03 * rng.normal()))
+        return taken
+
+    return Place(replace(plain, shell=(*plain.shell, *walls)), poses)
+
+
+def _at_wall(rng: Random, group: Group, extra: list[Item], angle: float, distance: tuple[float, float]) -> Place:
+    """A group with its back to a wall, seen from its front."""
+    made = _in_shell(rng, [*group.items, *extra], (5.0, 4.0, 2.6))
+    back = 2.0 - group.depth / 2 - 0.02
+    objects = tuple(item.moved((0, back, 0)) for item in made.objects)
+    top = max(part.vertices[:, 2].max() for item in group.items for part in item.parts)
+    middle = (0.0, back, 0.5 * top)
+    return Place(replace(made, objects=objects), _Arc(middle, angle, distance, (0.4 * top, 0.9 * top + 0.5)))
+
+
+def shelf(rng: Random, seed: int) -> Place:
+    """An open shelf with small things, seen from in front."""
+    return _at_wall(rng, shelf_group(rng), [], 1.6, (1.3, 2.0))
+
+
+def shelf_bin(rng: Random, seed: int) -> Place:
+    """The same from close by and nearly from one place: one or two of its compartments."""
+    far = _at_wall(rng, shelf_group(rng), [], 0.9, (0.7, 0.9))
+    return replace(far, poses=_Arc((0.0, 1.8, 0.75), 0.9, (0.75, 0.95), (0.8, 1.2)))
+
+
+def desk(rng: Random, seed: int) -> Place:
+    """A desk with monitor, lamp and small things, and a chair."""
+    return _at_wall(rng, desk_group(rng), [], 1.8, (1.4, 2.0))
+
+
+def glass(rng: Random, seed: int) -> Place:
+    """A shelf behind a pane, through which the depth sensor looks."""
+    pane = Item(GLASS, (box((0.8, 0.01, 1.1), (0.05, -0.3, 0.3), METAL),))
+    return _at_wall(rng, shelf_group(rng), [pane], 1.8, (1.3, 2.0))
+
+
+def mirror(rng: Random, seed: int) -> Place:
+    """A sofa below a mirror, behind which the depth sensor finds a second room."""
+    group = sofa_group(rng)
+    frame = Item(MIRROR, (box((1.2, 0.03, 0.7), (0, group.depth / 2 - 0.015, 1.1), METAL),))
+    return _at_wall(rng, group, [frame], 1.4, (1.6, 2.4))
+
+
+def table(rng: Random, seed: int) -> Place:
+    """A laid table with its chairs, from all around."""
+    around = _Arc((0, 0, 0.6), 6, (1.7, 2.3), (1.2, 1.9))
+    return Place(_in_shell(rng, list(dining_group(rng).items), (6, 6, 2.8)), around)
+
+
+def board(rng: Random, seed: int) -> Place:
+    """Small things on a table top, filmed from near by; the room around is far."""
+    height = 0.74
+    makers = [mug, mug, bottle, vase, lying_book, lying_book, small_plant, mug, bottle]
+    top = table_of("table", 1.3, 0.9, height, wood(rng))
+    things = arranged(rng, makers, (0, 0, height), (1.25, 0.85), (4, 3))
+    return Place(_in_shell(rng, [top, *things], (7, 7, 3)), _Arc((0, 0, height), 6, (0.9, 1.2), (1.1, 1.5)))
+
+
+def still(rng: Random, seed: int) -> Place:
+    """The same table top with the camera almost still."""
+    return replace(board(rng, seed), poses=_Arc((0, 0, 0.78), 0.25, (0.9, 0.95), (1.2, 1.25)))
+
+
+def boxes(rng: Random, seed: int) -> Place:
+    """Boxes on a floor."""
+    items = _grid(rng, [_box_item] * 12, 0.75)
+    return Place(_in_shell(rng, items, (6, 6, 2.8)), _Arc((0, 0, 0.2), 6, (1.7, 2.4), (0.9, 1.8)))
+
+
+def plants(rng: Random, seed: int) -> Place:
+    """Potted plants and vases, whose leaves hide one another."""
+    items = _grid(rng, [floor_plant, small_plant, vase, floor_plant, small_plant, floor_plant, vase, small_plant], 0.55)
+    return Place(_in_shell(rng, items, (5, 5, 2.8)), _Arc((0, 0, 0.4), 6, (1.3, 1.9), (0.7, 1.6)))
+
+
+def wires(rng: Random, seed: int) -> Place:
+    """Racks of thin bars among boxes: most of what shows within a rack is behind it."""
+    items = _grid(rng, [_rack, _box_item, _rack, _box_item, _box_item, _rack], 0.8)
+    return Place(_in_shell(rng, items, (5, 5, 2.8)), _Arc((0, 0, 0.4), 6, (1.5, 2.1), (0.7, 1.6)))
+
+
+PLACES: dict[str, Callable[[Random, int], Place]] = {
+    "room": room, "flat": flat, "shelf": shelf, "bin": shelf_bin, "desk": desk, "glass": glass, "mirror": mirror,
+    "table": table, "board": board, "still": still, "boxes": boxes, "plants": plants, "wires": wires,
+}  # fmt: skip
+"""By name; each is made from a random generator and the seed that it was made of."""

@@ -1,0 +1,121 @@
+"""The zoo's rows as text, as a CSV and as a picture: choosing and judging side by side."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Sequence
+from dataclasses import asdict, fields
+from pathlib import Path
+
+import numpy as np
+
+from og_pointcloud.evaluate.plots import png_bytes, require_matplotlib
+from og_pointcloud.formats.atomic import replacing
+from og_pointcloud_zoo.measure import Row
+
+__all__ = ["HALVES", "line", "rank_correlation", "summary", "write_csv", "write_picture"]
+
+HALVES = {"choose": "for choosing", "judge": "for judging alone"}
+COLOURS = {"choose": "tab:blue", "judge": "tab:orange"}
+SHOWN = 5
+
+
+def line(row: Row) -> str:
+    """One scene on one line."""
+    background = "   -  " if row.background is None else f"{100 * row.background:5.2f}%"
+    text = f"{row.scene:22} {row.half:6} {row.points:9,} {row.views:4} {row.miou:6.3f} {background} {row.seconds:6.1f}"
+    text += "      -" if row.agreement is None else f" {row.agreement:6.3f}"
+    if row.baseline is None or row.gain is None:
+        return text
+    gain = f"{row.gain:+.3f} ({row.gain_low:+.3f} to {row.gain_high:+.3f})"
+    return f"{text}  {row.baseline_miou:.3f} {row.baseline:30} {gain}"
+
+
+HEADER = (
+    f"{'scene':22} {'half':6} {'points':>9} {'view':>4} {'mIoU':>6} {'called':>6} {'s':>6} {'agree':>6}  best baseline"
+)
+
+
+def summary(rows: Sequence[Row]) -> str:
+    """Means, worst and best of each half, and how well a fit's own figure ranks its scenes."""
+    parts: list[str] = []
+    for half, title in HALVES.items():
+        chosen = sorted((row for row in rows if row.half == half), key=lambda row: row.miou)
+        if not chosen:
+            continue
+        parts.append(f"\n{len(chosen)} scenes {title}: {_means(chosen)}")
+        if len(chosen) > 2 * SHOWN:
+            parts += ["worst", *(f"  {line(row)}" for row in chosen[:SHOWN])]
+            parts += ["best", *(f"  {line(row)}" for row in chosen[-SHOWN:])]
+    return "\n".join(parts)
+
+
+def _means(rows: Sequence[Row]) -> str:
+    called = [row.background for row in rows if row.background is not None]
+    text = f"mean mIoU {np.mean([row.miou for row in rows]):.4f}"
+    if called:
+        above = sum(share >= 0.01 for share in called)
+        text += f", background called {100 * np.mean(called):.2f} % ({above} of {len(called)} scenes 1 % or more)"
+    text += f", {sum(row.seconds for row in rows):.0f} s"
+    beside = [row for row in rows if row.baseline_miou is not None and row.gain_high is not None]
+    if beside:
+        text += f"; best baselines {np.mean([row.baseline_miou for row in beside if row.baseline_miou]):.4f}"
+        lost = [row.scene for row in beside if row.gain_high is not None and row.gain_high < 0]
+        text += f", better than ours beyond the interval on {len(lost)}" + (f": {', '.join(lost)}" if lost else "")
+    said = [(row.agreement, row.miou) for row in rows if row.agreement is not None]
+    if len(said) > 2:
+        text += f"; rank correlation of agreement and mIoU {rank_correlation(*zip(*said, strict=True)):.2f}"
+    return text
+
+
+def rank_correlation(first: Sequence[float], second: Sequence[float]) -> float:
+    """Spearman's: of ranks, equal values sharing their mean rank. NaN where one of the two is constant.
+
+    >>> round(rank_correlation([1, 2, 3, 4], [10, 30, 20, 40]), 2)
+    0.8
+    """
+    from scipy.stats import rankdata
+
+    a, b = (rankdata(values) - (len(values) + 1) / 2 for values in (first, second))
+    length = np.sqrt((a**2).sum() * (b**2).sum())
+    return float((a * b).sum() / length) if length else float("nan")
+
+
+def write_csv(rows: Sequence[Row], path: Path) -> Path:
+    """A line a scene; written whole or not at all."""
+    text = io.StringIO()
+    lines = csv.DictWriter(text, [one.name for one in fields(Row)], lineterminator="\n")
+    lines.writeheader()
+    lines.writerows(asdict(row) for row in rows)
+    with replacing(path) as file:
+        file.write(text.getvalue().encode())
+    return path
+
+
+def write_picture(rows: Sequence[Row], path: Path) -> Path:
+    """Ours against the best baseline, error against seconds, and mIoU against what the fit says of itself."""
+    figure = require_matplotlib()(figsize=(15, 5), layout="constrained")
+    ours, cost, own = figure.subplots(1, 3)
+    for half, title in HALVES.items():
+        chosen = [row for row in rows if row.half == half]
+        style = {"color": COLOURS[half], "label": title, "ls": "", "marker": "o", "ms": 5, "alpha": 0.8}
+        beside = [row for row in chosen if row.baseline_miou is not None]
+        ours.plot([row.baseline_miou for row in beside], [row.miou for row in beside], **style)
+        cost.plot([row.seconds for row in chosen], [1 - row.miou for row in chosen], **style)
+        said = [row for row in chosen if row.agreement is not None]
+        if len(said) > 2:
+            rank = rank_correlation([row.agreement or 0 for row in said], [row.miou for row in said])
+            style["label"] = f"{title}: rank correlation {rank:.2f}"
+        own.plot([row.agreement for row in said], [row.miou for row in said], **style)
+    ours.axline((0.5, 0.5), slope=1, color="0.6", lw=1)
+    ours.set(xlabel="mIoU, best baseline", ylabel="mIoU, ours", title="Each scene beside its best baseline")
+    cost.set(xlabel="seconds of the fit", ylabel="error, 1 - mIoU", xscale="log", title="Error against seconds")
+    own.set(xlabel="agreement, which needs no truth", ylabel="mIoU", title="What a fit says of itself")
+    for axes in (ours, cost, own):
+        axes.grid(alpha=0.3)
+        axes.legend(fontsize=8, frameon=False)
+    png = png_bytes(figure)
+    with replacing(path) as file:
+        file.write(png)
+    return path

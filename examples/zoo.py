@@ -1,0 +1,77 @@
+"""The zoo: many small scenes of many kinds, half for choosing numbers, half only for judging them.
+
+    python examples/zoo.py -o out/zoo                                    # all made scenes
+    python examples/zoo.py -o out/zoo --captures CAPTURE [CAPTURE ...]   # and captures with gt.npz, text_features.npz
+    python examples/zoo.py -o out/zoo --half choose --set membership.sure_share=0.5 --quick
+
+Scenes are made once, in OUT/scenes. Beside each fit stand the best of the baselines of
+`og_pointcloud.evaluate.baselines`, the difference with its 95 % interval over blocks of space, and how well the fit
+thinks that it did. Writes OUT/zoo.csv and OUT/zoo.png. Which half a scene is of, its name alone decides.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from og_pointcloud_zoo.draws import draw, half_of, scene_names
+from og_pointcloud_zoo.make import made_scene
+from og_pointcloud_zoo.measure import Row, measure, parsed_settings, warm_up
+from og_pointcloud_zoo.report import HALVES, HEADER, line, summary, write_csv, write_picture
+
+from og_pointcloud.errors import OgPointcloudError
+from og_pointcloud.formats.capture import read_capture
+
+__all__ = ["main"]
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Make what is not there yet, measure, print, write."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("-o", "--output", type=Path, default=Path("out/zoo"), help="folder of scenes and results")
+    parser.add_argument("--captures", nargs="+", type=Path, default=[], metavar="CAPTURE", help="more scenes, by path")
+    parser.add_argument("--only", nargs="+", default=[], metavar="NAME", help="scenes whose name begins so")
+    parser.add_argument("--half", choices=tuple(HALVES), help="only this half")
+    parser.add_argument("--set", nargs="+", default=[], metavar="PATH=VALUE", help="settings of the fit")
+    parser.add_argument("--quick", action="store_true", help="without baselines")
+    parser.add_argument("--list", action="store_true", help="print the scenes as drawn, and make none")
+    options = parser.parse_args(arguments)
+    chosen = [*options.captures, *(Path(name) for name in scene_names())]
+    chosen = [
+        path
+        for path in chosen
+        if options.half in (None, half_of(path.name))
+        and (not options.only or any(path.name.startswith(name) for name in options.only))
+    ]
+    if not chosen:
+        parser.error(f"no scene begins with {', '.join(options.only)}; expected one of {', '.join(scene_names())}")
+    if options.list:
+        print("\n".join(str(draw(path.name)) for path in chosen if path.name in scene_names()))
+        return
+    try:
+        _report(_rows(chosen, options), options.output)
+    except OgPointcloudError as error:
+        sys.exit(f"zoo: {error}")
+
+
+def _rows(chosen: Sequence[Path], options: argparse.Namespace) -> list[Row]:
+    settings, rows = parsed_settings(options.set), []
+    print(HEADER)
+    for path in chosen:
+        folder = path if path in options.captures else made_scene(draw(path.name), options.output / "scenes")
+        if not rows:
+            warm_up(read_capture(folder))
+        rows.append(measure(folder, settings, baselines=not options.quick))
+        print(line(rows[-1]), flush=True)
+    return rows
+
+
+def _report(rows: Sequence[Row], folder: Path) -> None:
+    print(summary(rows))
+    print(f"\n{write_csv(rows, folder / 'zoo.csv')}\n{write_picture(rows, folder / 'zoo.png')}")
+
+
+if __name__ == "__main__":
+    main()
