@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from og_pointcloud.evaluate.plots import png_bytes, require_matplotlib
+from og_pointcloud.evaluate.sweep_report import require_matplotlib
 from og_pointcloud.formats.atomic import replacing
 from og_pointcloud_zoo.measure import Row
 
@@ -115,7 +115,6 @@ def write_picture(rows: Sequence[Row], path: Path) -> Path:
     for axes in (ours, cost, own):
         axes.grid(alpha=0.3)
         axes.legend(fontsize=8, frameon=False)
-    png = png_bytes(figure)
     with replacing(path) as file:
-        file.write(png)
+        figure.savefig(file, format="png", dpi=110)
     return path
