@@ -187,14 +187,13 @@ class Points:
     """A plain cloud, or Gaussians when scale, rotation and opacity are known (all three or none).
 
     xyz: (n, 3) float32, local frame. origin: (3,) float64, world = xyz + origin. rgb: (n, 3) uint8 or None.
-    normals: (n, 3) float32 unit (zero rows: unknown) or None. scale: (n, 3) float32, linear standard deviations.
+    scale: (n, 3) float32, linear standard deviations.
     rotation: (n, 4) float32 quaternions wxyz, unit. opacity: (n,) float32 in [0, 1].
     """
 
     xyz: FloatArray
     origin: DoubleArray
     rgb: NDArray[np.uint8] | None = None
-    normals: FloatArray | None = None
     scale: FloatArray | None = None
     rotation: FloatArray | None = None
     opacity: FloatArray | None = None
@@ -205,7 +204,6 @@ class Points:
         xyz: NDArray[np.floating],
         *,
         rgb: NDArray[np.uint8] | None = None,
-        normals: FloatArray | None = None,
         scale: FloatArray | None = None,
         rotation: FloatArray | None = None,
         opacity: FloatArray | None = None,
@@ -224,11 +222,11 @@ class Points:
                 f"points lie up to {extent:.3g} from their median; expected less than float32's 3.4e38: "
                 "remove the outliers, or scale the cloud and its poses"
             )
-        return cls((world - origin).astype(np.float32), origin, rgb, normals, scale, rotation, opacity)
+        return cls((world - origin).astype(np.float32), origin, rgb, scale, rotation, opacity)
 
     def __post_init__(self) -> None:
         n = len(self.xyz)
-        widths = {"rgb": 3, "normals": 3, "scale": 3, "rotation": 4, "opacity": None}
+        widths = {"rgb": 3, "scale": 3, "rotation": 4, "opacity": None}
         for name, width in widths.items():
             value = getattr(self, name)
             expected = (n,) if width is None else (n, width)
@@ -246,7 +244,7 @@ class Points:
 
     def take(self, rows: NDArray[np.integer]) -> Points:
         """The points of these rows, in their order, with all that is known of them."""
-        names = ("rgb", "normals", "scale", "rotation", "opacity")
+        names = ("rgb", "scale", "rotation", "opacity")
         columns: dict[str, Any] = {name: getattr(self, name) for name in names}
         chosen = {name: None if column is None else column[rows] for name, column in columns.items()}
         return Points(self.xyz[rows], self.origin, **chosen)

@@ -43,7 +43,6 @@ def assert_same(a: Points, b: Points, atol: float = 0.0) -> None:
 def test_activations_are_those_of_3dgs(tmp_path):
     raw = trained_columns()
     points = read_gaussian_ply(write_columns(tmp_path / "a.ply", raw))
-    assert points.normals is None
     for row in range(len(points)):
         value = {name: float(column[row]) for name, column in raw.items()}
         quaternion = [value[f"rot_{i}"] for i in range(4)]
@@ -145,7 +144,7 @@ def test_no_gaussians(tmp_path):
 @pytest.mark.parametrize("offset", [0.0, 4e6])
 def test_what_is_written_reads_back(tmp_path, offset):
     points = read_gaussian_ply(write_columns(tmp_path / "a.ply", trained_columns()))
-    moved = Points(points.xyz, points.origin + offset, points.rgb, None, points.scale, points.rotation, points.opacity)
+    moved = Points(points.xyz, points.origin + offset, points.rgb, points.scale, points.rotation, points.opacity)
     write_gaussian_ply(tmp_path / "b.ply", moved)
     assert_same(read_points(tmp_path / "b.ply"), moved, atol=2e-6)
 

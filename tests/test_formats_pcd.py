@@ -116,14 +116,12 @@ def test_decompression_undoes_a_literal_compressor(tmp_path, pattern):
 
 
 @pytest.mark.parametrize("encoding", ["ascii", "binary", "binary_compressed"])
-def test_points_colours_and_normals(tmp_path, encoding):
+def test_points_and_colours(tmp_path, encoding):
     rows = sample(50)
     points = read_points(write(tmp_path / "a.pcd", encoding, body_of(rows, encoding), len(rows)))
     np.testing.assert_allclose(points.xyz_world, np.stack([rows[c] for c in "xyz"], 1), atol=1e-6)
     bits = rows["rgb"].view(np.uint32)
     np.testing.assert_array_equal(points.rgb, np.stack([bits >> 16 & 255, bits >> 8 & 255, bits & 255], 1))
-    lengths = np.linalg.norm(points.normals, axis=1)
-    np.testing.assert_allclose(lengths, np.where(np.arange(50) % 5 == 0, 0, 1), atol=1e-6)
 
 
 @pytest.mark.parametrize("kind", ["F", "U", "I"])
@@ -163,7 +161,6 @@ def test_files_written_by_open3d(tmp_path, ascii_file, pack):
     points = read_points(path)
     np.testing.assert_allclose(points.xyz_world, xyz, atol=1e-5)
     np.testing.assert_array_equal(points.rgb, rgb)
-    np.testing.assert_allclose(points.normals, np.asarray(cloud.normals), atol=1e-5)
 
 
 SMALL = "FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH 2\nHEIGHT 1\nPOINTS 2\nDATA binary\n"

@@ -28,7 +28,7 @@ def named(names: tuple[str, str, str], values: np.ndarray) -> dict[str, np.ndarr
 def test_a_cloud_without_colours_or_normals(tmp_path):
     points = read_points(write_cloud(tmp_path / "a.ply"))
     np.testing.assert_allclose(points.xyz_world, XYZ, atol=1e-6)
-    assert (points.rgb, points.normals, points.are_gaussians) == (None, None, False)
+    assert (points.rgb, points.are_gaussians) == (None, False)
 
 
 def test_map_coordinates_keep_their_millimetres(tmp_path):
@@ -56,21 +56,6 @@ def test_colours_out_of_range_are_refused(tmp_path, bad):
     values[3, 1] = bad
     with pytest.raises(SceneError, match=r"a\.ply: colours red, green, blue span .*; expected 0\.\.1 or 0\.\.255"):
         read_points(write_cloud(tmp_path / "a.ply", **named(("red", "green", "blue"), values)))
-
-
-@pytest.mark.parametrize("names", [("nx", "ny", "nz"), ("normal_x", "normal_y", "normal_z")])
-def test_normals_become_unit_and_unknown_ones_zero(tmp_path, names):
-    directions = XYZ / np.linalg.norm(XYZ, axis=1, keepdims=True)
-    normals = directions * np.geomspace(1e-300, 1e300, len(XYZ))[:, None]
-    normals[4], normals[5], normals[6] = 0, np.nan, [np.inf, 0, 0]
-    directions[4:7] = 0
-    read = read_points(write_cloud(tmp_path / "a.ply", **named(names, normals))).normals
-    assert read.dtype == np.float32
-    np.testing.assert_allclose(read, directions, atol=1e-6)
-
-
-def test_normals_that_are_all_zero_are_no_normals(tmp_path):
-    assert read_points(write_cloud(tmp_path / "a.ply", **named(("nx", "ny", "nz"), 0 * XYZ))).normals is None
 
 
 def test_the_content_decides_not_the_name(tmp_path):

@@ -210,7 +210,7 @@ class _TiledCloud:
 def _tiled(points: Points, most: int, settings: FitSettings, work: WorkFolder, journal: Journal) -> _TiledCloud:
     key = fingerprint(points.xyz, points.scale, points.rotation, points.opacity, settings, most, MARGIN)
     tiles = split(points.xyz, most)
-    points = replace(points, normals=None).take(tiles.order)  # no stage needs normals
+    points = points.take(tiles.order)
     parts = [tiles.part(tile) for tile in range(len(tiles))]
     boxes = np.array([[points.xyz[part].min(axis=0), points.xyz[part].max(axis=0)] for part in parts])
     margins = [MARGIN * _sparse_spacing(points.xyz[part]) for part in parts]

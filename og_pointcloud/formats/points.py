@@ -16,7 +16,7 @@ from og_pointcloud.formats.las import SIGNATURE as LAS_SIGNATURE
 from og_pointcloud.formats.las import read_las
 from og_pointcloud.formats.pcd import looks_like_pcd, read_pcd
 from og_pointcloud.formats.ply import HEADER_LIMIT, join_columns, read_ply, write_ply
-from og_pointcloud.formats.tables import colors, naming, normals, positions, storable_positions
+from og_pointcloud.formats.tables import colors, naming, positions, storable_positions
 from og_pointcloud.scene import Points
 
 __all__ = ["read_points", "write_labelled_ply"]
@@ -25,8 +25,8 @@ __all__ = ["read_points", "write_labelled_ply"]
 def read_points(path: str | os.PathLike[str]) -> Points:
     """A plain cloud (PLY, PCD, LAS, LAZ) or Gaussians (3DGS PLY, SuperSplat compressed PLY), whatever the file's name.
 
-    World coordinates are read as float64; their median becomes the origin. Colours come as uint8 RGB, normals as unit
-    vectors, a zero row where the file has none for that point; either is None where the file has none at all.
+    World coordinates are read as float64; their median becomes the origin. Colours come as uint8 RGB, None where the
+    file has none.
     SceneError, beginning with the path, for what cannot be read, has no points, or holds NaN. LAS and LAZ need the
     extra 'las'.
 
@@ -87,4 +87,4 @@ def write_labelled_ply(
 
 
 def _cloud(rows: NDArray[np.void]) -> Points:
-    return Points.from_world(positions(rows), rgb=colors(rows), normals=normals(rows))
+    return Points.from_world(positions(rows), rgb=colors(rows))

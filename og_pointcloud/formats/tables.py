@@ -1,4 +1,4 @@
-"""What the geometry formats share: rows of text, columns that become positions, colours and normals, errors' paths."""
+"""What the geometry formats share: rows of text, columns that become positions and colours, errors' paths."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from og_pointcloud.errors import SceneError
 
 __all__ = [
-    "LABEL_FINITE",     "colors", "naming", "normals", "positions", "read_text_rows", "stack_columns",
+    "LABEL_FINITE",     "colors", "naming", "positions", "read_text_rows", "stack_columns",
     "storable_positions",
 ]  # fmt: skip
 
@@ -21,7 +21,6 @@ COLOR_COLUMNS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "dif
 LABEL_FINITE = "label the finite points alone, points[np.isfinite(points).all(axis=1)]"
 """What helps where a cloud with NaN or infinity is to be saved in a format that cannot hold them."""
 PACKED_COLOR_COLUMNS = ("rgb", "rgba")
-NORMAL_COLUMNS = (("nx", "ny", "nz"), ("normal_x", "normal_y", "normal_z"))
 
 
 @contextmanager
@@ -108,26 +107,6 @@ def colors(rows: NDArray[np.void]) -> NDArray[np.uint8] | None:
     elif high <= 1 and rows.dtype[names[0]].kind == "f":
         values *= 255.0
     return np.rint(values).astype(np.uint8)
-
-
-def normals(rows: NDArray[np.void]) -> NDArray[np.float32] | None:
-    """(n, 3) float32 unit normals, or None without normal columns or where none of them is usable.
-
-    A zero or non-finite normal means that its writer had none for that point: its row is zero.
-    """
-    names = _first_present(rows, NORMAL_COLUMNS)
-    if not names:
-        return None
-    vectors = stack_columns(rows, names, np.float64)
-    vectors[~np.isfinite(vectors).all(axis=1)] = 0.0
-    # The largest component first: squares of tiny or huge but valid normals would leave the float range.
-    largest = np.abs(vectors).max(axis=1, keepdims=True, initial=0.0)
-    known = largest[:, 0] > 0
-    if not known.any():
-        return None
-    vectors[known] /= largest[known]
-    vectors[known] /= np.linalg.norm(vectors[known], axis=1, keepdims=True)
-    return vectors.astype(np.float32)
 
 
 def storable_positions(xyz_world: NDArray[np.floating]) -> NDArray:

@@ -32,7 +32,7 @@ from og_pointcloud.errors import OgPointcloudError, SceneError
 from og_pointcloud.formats.gaussian_ply import gaussian_rows, gaussians_from_ply, holds_gaussians
 from og_pointcloud.formats.ply import HEADER_LIMIT, join_columns, read_ply, write_ply
 from og_pointcloud.formats.points import read_points
-from og_pointcloud.formats.tables import NORMAL_COLUMNS, naming, positions, storable_positions
+from og_pointcloud.formats.tables import naming, positions, storable_positions
 from og_pointcloud.show.splat_columns import appended, placed, recoloured
 from og_pointcloud.text.words import TextFeatures
 
@@ -256,8 +256,8 @@ def _read(path: Path) -> _Cloud:
         head = file.read(HEADER_LIMIT).partition(b"end_header")[0]
     if not head.startswith(b"ply"):
         points = read_points(path)
-        columns = f"{path}: only positions, colours and normals are kept, as a PLY"
-        return _Cloud({"vertex": _plain_rows(points.xyz_world, points.rgb, points.normals)}, (columns,))
+        columns = f"{path}: only positions and colours are kept, as a PLY"
+        return _Cloud({"vertex": _plain_rows(points.xyz_world, points.rgb)}, (columns,))
     with naming(path):
         elements = read_ply(path)
         if len(elements.get("vertex", ())) == 0:
@@ -270,12 +270,8 @@ def _read(path: Path) -> _Cloud:
     return _Cloud(elements, (f"{path}: faces and other lists are left out",) if b"\nproperty list" in head else ())
 
 
-def _plain_rows(
-    xyz_world: NDArray[np.float64], rgb: NDArray[np.uint8] | None, normals: NDArray[np.float32] | None = None
-) -> Rows:
+def _plain_rows(xyz_world: NDArray[np.float64], rgb: NDArray[np.uint8] | None) -> Rows:
     columns = dict(zip("xyz", storable_positions(xyz_world).T, strict=True))
-    if normals is not None:
-        columns |= dict(zip(NORMAL_COLUMNS[0], normals.T, strict=True))
     if rgb is not None:
         columns |= dict(zip(("red", "green", "blue"), rgb.T, strict=True))
     return join_columns(columns)

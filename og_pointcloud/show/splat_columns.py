@@ -19,13 +19,14 @@ from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.colors import LUMINANCE
 from og_pointcloud.formats.gaussian_ply import BASE_COLOR, LOG_SCALE, ROTATION, SH_CONSTANT
 from og_pointcloud.formats.ply import join_columns
-from og_pointcloud.formats.tables import NORMAL_COLUMNS, colors, positions
+from og_pointcloud.formats.tables import colors, positions
 
 __all__ = ["MAX_DEGREE", "appended", "placed", "recoloured", "rotated_harmonics"]
 
 Rows: TypeAlias = NDArray[np.void]
 Columns: TypeAlias = dict[str, NDArray[Any]]
 
+NORMAL_COLUMNS = (("nx", "ny", "nz"), ("normal_x", "normal_y", "normal_z"))
 RGB = ("red", "green", "blue")
 OTHER_COLORS = ("r", "g", "b", "diffuse_red", "diffuse_green", "diffuse_blue", "rgb", "rgba")
 """Further names of colour columns, which give way to RGB of type uchar."""

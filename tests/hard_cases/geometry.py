@@ -134,7 +134,7 @@ def rotation_not_unit() -> object:
     """Gaussians made by hand with quaternions of length 3, which would be drawn three times as large."""
     gaussians = scatter()
     parts = gaussians.scale, 3 * gaussians.rotation, gaussians.opacity
-    return Points(gaussians.xyz, np.zeros(3), None, None, *parts)
+    return Points(gaussians.xyz, np.zeros(3), None, *parts)
 
 
 @agrees(WEIGHTS, "distance to the near plane, of its depth", powers(-1, -12, -1))
