@@ -8,13 +8,9 @@ from __future__ import annotations
 import argparse
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from og_pointcloud.cli.common import Parser, add_output, check_output, print_next
 from og_pointcloud.errors import OgPointcloudError
-
-if TYPE_CHECKING:
-    from og_pointcloud.scene import Points
 
 
 def add(parser: Parser) -> None:
@@ -35,10 +31,12 @@ def run(arguments: argparse.Namespace) -> None:
         raise OgPointcloudError(f"--depth-unit is {unit:g}; expected a number above 0, such as 0.001")
     check_output("-o", output, [arguments.capture])
     from og_pointcloud.formats.capture import fuse_capture
+    from og_pointcloud.formats.ply import write_ply
+    from og_pointcloud.show.splat_columns import plain_rows
 
     start = time.perf_counter()
     fused = fuse_capture(arguments.capture, unit)
-    write_points(fused.points, output)
+    write_ply(output, {"vertex": plain_rows(fused.points.xyz_world, fused.points.rgb)})
     print(
         f"{fused.frames} depth images in {time.perf_counter() - start:.1f} s: {len(fused.points):,} points, voxels of "
         f"{fused.survey.voxel:.3g}, noise {fused.survey.noise:.2g} at depth {fused.survey.depth:.3g}; "
@@ -47,14 +45,3 @@ def run(arguments: argparse.Namespace) -> None:
     print(f"wrote {output}")
     if arguments.output is None:
         print_next("fit", arguments.capture, "-o", "scene.ogpc")
-
-
-def write_points(points: Points, path: Path) -> None:
-    """x y z (double where float would lose digits), red green blue where the points have colours; atomic."""
-    from og_pointcloud.formats.ply import join_columns, write_ply
-    from og_pointcloud.formats.tables import storable_positions
-
-    columns = dict(zip("xyz", storable_positions(points.xyz_world).T, strict=True))
-    if points.rgb is not None:
-        columns |= dict(zip(("red", "green", "blue"), points.rgb.T, strict=True))
-    write_ply(path, {"vertex": join_columns(columns)})

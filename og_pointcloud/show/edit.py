@@ -30,10 +30,10 @@ from og_pointcloud.bundle.nearest import NearestPoint
 from og_pointcloud.cloud import TOO_FAR
 from og_pointcloud.errors import OgPointcloudError, SceneError
 from og_pointcloud.formats.gaussian_ply import gaussian_rows, gaussians_from_ply, holds_gaussians
-from og_pointcloud.formats.ply import HEADER_LIMIT, join_columns, read_ply, write_ply
+from og_pointcloud.formats.ply import HEADER_LIMIT, read_ply, write_ply
 from og_pointcloud.formats.points import read_points
-from og_pointcloud.formats.tables import naming, positions, storable_positions
-from og_pointcloud.show.splat_columns import appended, placed, recoloured
+from og_pointcloud.formats.tables import naming, positions
+from og_pointcloud.show.splat_columns import appended, placed, plain_rows, recoloured
 from og_pointcloud.text.words import TextFeatures
 
 if TYPE_CHECKING:
@@ -117,9 +117,9 @@ def insert(
     """Write a cloud with another one put into it, both plain clouds or both 3DGS files.
 
     pose: (4, 4), takes the other's coordinates to the cloud's: a rotation, one scale for all axes, and a translation.
-    Left out: they share a frame. Positions, normals, rotations and scales of Gaussians follow it, and so do spherical
-    harmonics, exactly, up to degree 3. The result has the cloud's properties; those that the other lacks are 0 for its
-    points.
+    Left out: they share a frame. Positions, normals, rotations and scales of Gaussians follow it; where it turns,
+    spherical harmonics above the constant one become 0. The result has the cloud's properties; those that the other
+    lacks are 0 for its points.
     SceneError for a pose that shears or mirrors, and for clouds of different kinds or that cannot be read.
     """
     rotation, scale, translation = _similarity(pose)
@@ -170,7 +170,7 @@ def _subject(
     scene = as_scene(scene)
     _check_output(output, [path for path in (cloud, scene.path) if path is not None])
     instances = _instances_meant(scene, what, text_features)
-    source = _Cloud({"vertex": _plain_rows(scene.xyz, scene.cloud.rgb)}) if cloud is None else _read(Path(cloud))
+    source = _Cloud({"vertex": plain_rows(scene.xyz, scene.cloud.rgb)}) if cloud is None else _read(Path(cloud))
     xyz = positions(source.rows)
     ids, notes = _ids_of_points(scene, xyz, cloud)
     chosen = np.isin(ids, instances)
@@ -257,7 +257,7 @@ def _read(path: Path) -> _Cloud:
     if not head.startswith(b"ply"):
         points = read_points(path)
         columns = f"{path}: only positions and colours are kept, as a PLY"
-        return _Cloud({"vertex": _plain_rows(points.xyz_world, points.rgb)}, (columns,))
+        return _Cloud({"vertex": plain_rows(points.xyz_world, points.rgb)}, (columns,))
     with naming(path):
         elements = read_ply(path)
         if len(elements.get("vertex", ())) == 0:
@@ -268,13 +268,6 @@ def _read(path: Path) -> _Cloud:
         if not np.isfinite(positions(elements["vertex"])).all():
             raise SceneError("positions hold NaN or infinity; expected finite ones: remove those points first")
     return _Cloud(elements, (f"{path}: faces and other lists are left out",) if b"\nproperty list" in head else ())
-
-
-def _plain_rows(xyz_world: NDArray[np.float64], rgb: NDArray[np.uint8] | None) -> Rows:
-    columns = dict(zip("xyz", storable_positions(xyz_world).T, strict=True))
-    if rgb is not None:
-        columns |= dict(zip(("red", "green", "blue"), rgb.T, strict=True))
-    return join_columns(columns)
 
 
 def _similarity(pose: ArrayLike | None) -> tuple[NDArray[np.float64], float, NDArray[np.float64]]:

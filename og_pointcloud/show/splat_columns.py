@@ -1,9 +1,4 @@
-"""Columns of a cloud or 3DGS file that an edit changes: recoloured, moved into another frame, put behind others.
-
-A splat's colour seen along a direction d is 0.5 + sum_k c_k Y_k(d), Y_k real spherical harmonics with the
-Condon-Shortley sign, in the order l = 0, 1, .., m = -l .. l. Turning a splat mixes the coefficients of each degree
-among themselves: the colour that was seen along d is then seen along R d.
-"""
+"""Columns of a cloud or 3DGS file that an edit changes: recoloured, moved into another frame, put behind others."""
 
 from __future__ import annotations
 
@@ -19,9 +14,9 @@ from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.colors import LUMINANCE
 from og_pointcloud.formats.gaussian_ply import BASE_COLOR, LOG_SCALE, ROTATION, SH_CONSTANT
 from og_pointcloud.formats.ply import join_columns
-from og_pointcloud.formats.tables import colors, positions
+from og_pointcloud.formats.tables import colors, positions, storable_positions
 
-__all__ = ["MAX_DEGREE", "appended", "placed", "recoloured", "rotated_harmonics"]
+__all__ = ["appended", "placed", "plain_rows", "recoloured"]
 
 Rows: TypeAlias = NDArray[np.void]
 Columns: TypeAlias = dict[str, NDArray[Any]]
@@ -32,9 +27,14 @@ OTHER_COLORS = ("r", "g", "b", "diffuse_red", "diffuse_green", "diffuse_blue", "
 """Further names of colour columns, which give way to RGB of type uchar."""
 DARK = 0.05
 """Mean luminance below which an object's shading is too faint to be kept in a new colour."""
-MAX_DEGREE = 3
-"""Highest degree of the harmonics that files have."""
-DIRECTIONS = 32
+
+
+def plain_rows(xyz_world: NDArray[np.float64], rgb: NDArray[np.uint8] | None) -> Rows:
+    """A plain cloud in the layout of a PLY: x y z, double where float would lose digits, then colours."""
+    columns = dict(zip("xyz", storable_positions(xyz_world).T, strict=True))
+    if rgb is not None:
+        columns |= dict(zip(RGB, rgb.T, strict=True))
+    return join_columns(columns)
 
 
 def recoloured(rows: Rows, chosen: NDArray[np.bool_], color: NDArray[np.float64]) -> Rows:
@@ -64,7 +64,8 @@ def placed(
 ) -> tuple[Rows, tuple[str, ...]]:
     """The rows in another frame, x -> scale * rotation @ x + translation; and what could not follow.
 
-    Positions become float64. Normals, rotations and scales of Gaussians and their harmonics follow.
+    Positions become float64. Normals, rotations and scales of Gaussians follow; harmonics above the constant one, which
+    would have to be mixed, become 0 where the frame is turned.
     """
     columns = _columns(rows)
     columns |= dict(zip("xyz", (positions(rows) @ (scale * rotation).T + translation).T, strict=True))
@@ -75,11 +76,11 @@ def placed(
         _set(columns, LOG_SCALE, _stack(columns, LOG_SCALE) + np.log(scale))
     if set(ROTATION) <= set(columns):
         _set(columns, ROTATION, _turned(quaternion_of(rotation), _stack(columns, ROTATION)))
-    rest = _rest(columns)
-    if rest.shape[2] >= (MAX_DEGREE + 1) ** 2:
-        return join_columns(columns), (f"harmonics above degree {MAX_DEGREE} are not turned",)
-    _set(columns, _rest_names(columns), rotated_harmonics(rest, rotation))
-    return join_columns(columns), ()
+    rest = _rest_names(columns)
+    if not rest or np.allclose(rotation, np.eye(3)):
+        return join_columns(columns), ()
+    columns |= {name: np.zeros_like(columns[name]) for name in rest}
+    return join_columns(columns), ("harmonics above the constant one became 0: they are not turned",)
 
 
 def appended(base: Rows, added: Rows) -> tuple[Rows, tuple[str, ...]]:
@@ -156,47 +157,3 @@ def _rest(columns: Columns) -> NDArray[np.float64]:
     """(n, 3, k) harmonics above the constant one; k is 0 where there are none."""
     values = _stack(columns, _rest_names(columns))
     return values.reshape(len(values), 3, values.shape[1] // 3)
-
-
-# Harmonics --------------------------------------------------------------------------------------------------------
-
-
-def rotated_harmonics(rest: NDArray[np.floating], rotation: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Coefficients of splats that are turned. rotation: (3, 3), of column vectors.
-
-    rest: (n, channels, k), k = 0, 3, 8 or 15: degrees 1 up to 3, without the constant. The same shape comes back.
-    """
-    turned = np.array(rest, np.float64)
-    directions = np.random.default_rng(0).normal(size=(DIRECTIONS, 3))
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    start = 0
-    for degree in range(1, MAX_DEGREE + 1):
-        end = start + 2 * degree + 1
-        if end > rest.shape[2]:
-            break
-        # Turned harmonics of one degree are mixtures of that degree, Y(R' d) = Y(d) M: any few directions give M.
-        seen_before, seen_after = _harmonics(directions @ rotation, degree), _harmonics(directions, degree)
-        mixing = np.linalg.lstsq(seen_after, seen_before, rcond=None)[0]
-        turned[..., start:end] = rest[..., start:end] @ mixing.T
-        start = end
-    return turned
-
-
-def _harmonics(directions: NDArray[np.float64], degree: int) -> NDArray[np.float64]:
-    """(n, 2 degree + 1) real spherical harmonics of unit vectors (n, 3), m = -degree .. degree."""
-    x, y, z = directions.T
-    pi = np.pi
-    if degree == 1:
-        a = np.sqrt(3 / (4 * pi))
-        columns = [-a * y, a * z, -a * x]
-    elif degree == 2:
-        a, b = np.sqrt(15 / (4 * pi)), np.sqrt(5 / (16 * pi))
-        columns = [a * x * y, -a * y * z, b * (3 * z**2 - 1), -a * x * z, a / 2 * (x**2 - y**2)]
-    else:
-        a, b = np.sqrt(35 / (32 * pi)), np.sqrt(105 / (4 * pi))
-        c, d = np.sqrt(21 / (32 * pi)), np.sqrt(7 / (16 * pi))
-        columns = [
-            -a * y * (3 * x**2 - y**2), b * x * y * z, -c * y * (5 * z**2 - 1), d * z * (5 * z**2 - 3),
-            -c * x * (5 * z**2 - 1), b / 2 * z * (x**2 - y**2), -a * x * (x**2 - 3 * y**2),
-        ]  # fmt: skip
-    return np.stack(columns, axis=1)
