@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from og_pointcloud.ask.boxes import Box, axis_aligned_box, oriented_box
     from og_pointcloud.ask.choosing import Reason
     from og_pointcloud.ask.instances import Instance, Instances
-    from og_pointcloud.ask.labelled_scene import LabelledScene, Segmenter, instance_table, load, segment, use
+    from og_pointcloud.ask.labelled_scene import LabelledScene, Segmenter, instance_table, load, segment
     from og_pointcloud.ask.picking import Pick, in_world, pick
     from og_pointcloud.ask.segmentation import Segmentation
     from og_pointcloud.ask.selecting import Match, Selection, select
@@ -97,7 +97,6 @@ __all__ = [
     "read_text_features",
     "segment",
     "select",
-    "use",
     "write_bundle",
 ]
 
@@ -105,7 +104,7 @@ _HOMES = {
     "og_pointcloud.ask.boxes": ("Box", "axis_aligned_box", "oriented_box"),
     "og_pointcloud.ask.choosing": ("Reason",),
     "og_pointcloud.ask.instances": ("Instance", "Instances"),
-    "og_pointcloud.ask.labelled_scene": ("LabelledScene", "Segmenter", "instance_table", "load", "segment", "use"),
+    "og_pointcloud.ask.labelled_scene": ("LabelledScene", "Segmenter", "instance_table", "load", "segment"),
     "og_pointcloud.ask.picking": ("Pick", "in_world", "pick"),
     "og_pointcloud.ask.segmentation": ("Segmentation",),
     "og_pointcloud.ask.selecting": ("Match", "Selection", "select"),

@@ -1,15 +1,25 @@
 """Boxes: held to a slow search, to known boxes, to every invariance, and to strays and degenerate points."""
 
 import itertools
+from functools import partial
 
 import numpy as np
 import pytest
-from scipy.spatial import ConvexHull
+from scipy.spatial import ConvexHull, cKDTree
 from scipy.spatial.transform import Rotation
 
 from og_pointcloud.ask import boxes
-from og_pointcloud.ask.boxes import Box, axis_aligned_box, main_part, oriented_box, quaternion_of, typical_spacing
+from og_pointcloud.ask.boxes import Box, axis_aligned_box, main_part, oriented_box, quaternion_of
 from og_pointcloud.errors import SceneError
+
+
+def without_strays(xyz):
+    """main_part, at the median distance to the third nearest other point."""
+    distinct = np.unique(xyz, axis=0)
+    third = min(4, len(distinct))
+    spacing = float(np.median(np.reshape(cKDTree(distinct).query(distinct, third)[0], (len(distinct), -1))[:, -1]))
+    return main_part(xyz, max(float(f"{spacing:.6g}"), 1e-12))
+
 
 RANDOM_SHAPES = [(count, seed) for count in (5, 8, 20, 60) for seed in range(2)]
 
@@ -179,12 +189,12 @@ def test_degenerate_points_have_a_box_with_lengths_of_zero(name, offset):
     np.testing.assert_allclose(box.axes @ box.axes.T, np.eye(3), atol=1e-12)
     assert box.contains(xyz, 1e-8).all()
     assert axis_aligned_box(xyz).contains(xyz, 1e-8).all()
-    assert main_part(xyz).all()
+    assert without_strays(xyz).all()
 
 
 @pytest.mark.parametrize("points", [np.zeros((0, 3)), np.zeros((4, 2)), [[0, np.nan, 0]], [[0, np.inf, 0]]])
 def test_points_without_a_box_are_refused(points):
-    for make in (axis_aligned_box, oriented_box, main_part, typical_spacing):
+    for make in (axis_aligned_box, oriented_box, partial(main_part, spacing=1.0)):
         with pytest.raises(SceneError, match="expected"):
             make(points)
 
@@ -217,7 +227,7 @@ def test_two_percent_of_strays_hardly_change_the_box(seed):
     random = np.random.default_rng(seed)
     strays = random.uniform(-5, 5, (60, 3))
     everything = np.concatenate([xyz, strays])
-    main = main_part(everything)
+    main = without_strays(everything)
     assert main[: len(xyz)].all()
     clean, trimmed, raw = (oriented_box(points).volume for points in (xyz, everything[main], everything))
     assert raw > 50 * clean
@@ -228,35 +238,35 @@ def test_a_speck_of_another_object_is_left_out_but_a_second_half_is_not():
     random = np.random.default_rng(0)
     one, speck, half = (random.random((n, 3)) + np.array([x, 0, 0]) for n, x in ((1000, 0), (30, 8), (400, 8)))
     with_speck, with_half = np.concatenate([one, speck * [1, 0.3, 0.3]]), np.concatenate([one, half])
-    np.testing.assert_array_equal(main_part(with_speck), np.arange(1030) < 1000)
-    assert main_part(with_half).all()
+    np.testing.assert_array_equal(without_strays(with_speck), np.arange(1030) < 1000)
+    assert without_strays(with_half).all()
 
 
 def test_sparse_points_are_linked_more_widely_and_few_are_all_kept():
     random = np.random.default_rng(0)
     xyz = random.random((300, 3))
     assert main_part(xyz, spacing=1e-3).mean() > 0.9
-    assert main_part(random.random((19, 3)) * [1000, 1, 1]).all()
+    assert without_strays(random.random((19, 3)) * [1000, 1, 1]).all()
 
 
 def test_strays_are_the_same_whatever_the_order_the_offset_or_the_turn():
     xyz, _ = turned_box(count=1500)
     random = np.random.default_rng(4)
     xyz = np.concatenate([xyz, random.uniform(-6, 6, (40, 3))])
-    main, order = main_part(xyz), random.permutation(len(xyz))
+    main, order = without_strays(xyz), random.permutation(len(xyz))
     assert 0 < (~main).sum() <= 40
-    np.testing.assert_array_equal(main_part(xyz[order]), main[order])
-    np.testing.assert_array_equal(main_part(np.concatenate([xyz, xyz[:500]]))[: len(xyz)], main)
+    np.testing.assert_array_equal(without_strays(xyz[order]), main[order])
+    np.testing.assert_array_equal(without_strays(np.concatenate([xyz, xyz[:500]]))[: len(xyz)], main)
     turned = xyz @ Rotation.random(random_state=5).as_matrix().T + 1e5
-    assert (main_part(turned) == main).mean() > 0.999
+    assert (without_strays(turned) == main).mean() > 0.999
 
 
 @pytest.mark.parametrize("seed", range(4))
 def test_a_turned_cloud_that_thins_out_loses_the_same_points(seed):
     xyz = np.random.default_rng(seed).standard_t(3, (800, 3)) * [3, 2, 1]
-    main = main_part(xyz)
+    main = without_strays(xyz)
     assert 0.9 < main.mean() < 1
-    np.testing.assert_array_equal(main_part(xyz @ Rotation.random(random_state=seed).as_matrix().T), main)
+    np.testing.assert_array_equal(without_strays(xyz @ Rotation.random(random_state=seed).as_matrix().T), main)
 
 
 def test_connected_parts_against_a_search_voxel_by_voxel():
@@ -272,9 +282,3 @@ def test_connected_parts_against_a_search_voxel_by_voxel():
             todo = np.flatnonzero(near & (expected < 0)).tolist()
     assert len(np.unique(part)) == len(np.unique(expected)) > 10
     assert len(np.unique(np.stack([part, expected]), axis=1).T) == len(np.unique(part))
-
-
-def test_typical_spacing_of_a_grid():
-    grid = np.stack(np.meshgrid(*[np.arange(12.0)] * 2, [0.0]), -1).reshape(-1, 3)
-    assert typical_spacing(0.25 * grid) == pytest.approx(0.25)
-    assert typical_spacing([[1, 1, 1]] * 4) == 0

@@ -124,13 +124,11 @@ def test_nothing_labelled_is_said(scene):
         far.og.segment(["pairs"], scene)
 
 
-def test_the_scene_is_found_as_everywhere(scene, bundle, monkeypatch):
+def test_the_scene_is_found_as_everywhere(scene, bundle):
     mesh = pv.PolyData(scene.xyz[:20])
-    monkeypatch.delenv("OG_POINTCLOUD_SCENE", raising=False)
     with pytest.raises(og.OgPointcloudError, match="no scene to ask"):
         mesh.og.segment(["apple"])
-    monkeypatch.setenv("OG_POINTCLOUD_SCENE", str(bundle))
-    assert np.array_equal(mesh.og.segment(["apple"])["og_instance"], scene.instance_ids[:20])
+    assert np.array_equal(mesh.og.segment(["apple"], bundle)["og_instance"], scene.instance_ids[:20])
 
 
 def test_select_extracts_the_fitting_instances_with_their_rank(scene):
@@ -289,8 +287,7 @@ def test_a_click_shows_the_instance_and_its_words(plotter, scene):
     assert magenta not in colors_seen(plotter)
 
 
-def test_a_click_asks_the_scene_drawn_last(plotter, bundle, monkeypatch):
-    monkeypatch.delenv("OG_POINTCLOUD_SCENE", raising=False)
+def test_a_click_asks_the_scene_drawn_last(plotter, bundle):
     with pytest.raises(og.OgPointcloudError, match="no scene to ask"):
         plotter.og.enable_click_query()
     with pytest.raises(og.OgPointcloudError, match=r"call plotter\.og\.enable_click_query"):

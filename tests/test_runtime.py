@@ -38,14 +38,6 @@ CLOUDS = tough_clouds()
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 
 
-@pytest.fixture(autouse=True)
-def nothing_in_use(monkeypatch):
-    monkeypatch.delenv("OG_POINTCLOUD_SCENE", raising=False)
-    og.use(None)
-    yield
-    og.use(None)
-
-
 @pytest.fixture(scope="module")
 def bundle_file(tmp_path_factory):
     return write_bundle(room(), tmp_path_factory.mktemp("bundle") / "room.ogpc")
@@ -148,24 +140,13 @@ def test_a_scene_offers_its_parts(scene, bundle_file):
 # Which scene is asked
 
 
-def test_the_scene_is_the_argument_then_the_clouds_then_that_in_use_then_the_environments(
-    scene, bundle_file, monkeypatch, tmp_path
-):
+def test_the_scene_may_be_named_in_any_way_but_must_be(scene, bundle_file):
     points = scene.xyz[:50]
     expected = og.segment(points, ["apple", "pear"], scene).labels
-    others = [write_bundle(replace(room(), origin=np.full(3, 1e3)), tmp_path / f"{name}.ogpc") for name in "ab"]
-    with pytest.raises(OgPointcloudError, match=r"scene=og.load.*og.use.*OG_POINTCLOUD_SCENE"):
-        og.segment(points, ["apple", "pear"])
-    monkeypatch.setenv("OG_POINTCLOUD_SCENE", str(bundle_file))
-    assert (og.segment(points, ["apple", "pear"]).labels == expected).all()
-    og.use(others[0])
-    assert (quietly(points, ["apple", "pear"]).instances == TOO_FAR).all()
-    og.use(scene)
-    monkeypatch.setenv("OG_POINTCLOUD_SCENE", str(others[1]))
-    assert (og.segment(points, ["apple", "pear"]).labels == expected).all()
-    og.use(others[0])
-    for given in (scene, bundle_file, str(bundle_file), room()):
+    for given in (bundle_file, str(bundle_file), room()):
         assert (og.segment(points, ["apple", "pear"], given).labels == expected).all()
+    with pytest.raises(OgPointcloudError, match=r"no scene to ask: pass scene=og.load"):
+        og.segment(points, ["apple", "pear"])
 
 
 @pytest.mark.parametrize("kind", ["scene", "cloud", "path", "text path"])

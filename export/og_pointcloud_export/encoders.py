@@ -17,7 +17,6 @@ import zlib
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
-from importlib.metadata import PackageNotFoundError, version
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -34,6 +33,7 @@ from og_pointcloud.models import check_graph, open_session
 from og_pointcloud.text import encoder as text_encoder
 from og_pointcloud.text.encoder import TextEncoder, cache_folder, check_templates
 from og_pointcloud.text.everyday import everyday_words
+from og_pointcloud_export.writer import written_by
 
 try:
     import torch
@@ -301,11 +301,7 @@ def _difference(got: NDArray[np.float32], expected: NDArray[np.float32]) -> dict
 
 
 def _heading(format: str, schema_version: int) -> dict[str, Any]:
-    try:
-        library = version("og-pointcloud")
-    except PackageNotFoundError:
-        library = "unknown"
-    return {"format": format, "schema_version": schema_version, "written_by": f"og-pointcloud {library}"}
+    return {"format": format, "schema_version": schema_version, "written_by": written_by()}
 
 
 def _with_manifest(manifest: dict[str, Any], held: dict[str, bytes]) -> dict[str, bytes]:

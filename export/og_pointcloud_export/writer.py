@@ -25,7 +25,7 @@ from og_pointcloud.models import open_session
 from og_pointcloud_export.lookup_grid import LookupGrid, build_lookup_grid
 from og_pointcloud_export.query_graph import OPSET, build_query_graph
 
-__all__ = ["query_model", "write_bundle"]
+__all__ = ["query_model", "write_bundle", "written_by"]
 
 SCORE_TOLERANCE = 1e-5
 """Largest cosine error of the graph against float64 that is let through; float32 sums of 512 terms reach 1e-6."""
@@ -151,7 +151,7 @@ def _manifest(cloud: LabelledCloud, model: QueryModel, members: dict[str, bytes]
     manifest = {
         "format": FORMAT,
         "schema_version": SCHEMA_VERSION,
-        "written_by": f"og-pointcloud {_own_version()}",
+        "written_by": written_by(),
         "feature_space": cloud.feature_space,
         "frame": {
             "origin": cloud.origin.tolist(), "unit": "of the capture", "spacing": float(cloud.spacing),
@@ -179,8 +179,9 @@ def _manifest(cloud: LabelledCloud, model: QueryModel, members: dict[str, bytes]
         ) from None
 
 
-def _own_version() -> str:
+def written_by() -> str:
+    """What a manifest names as its maker."""
     try:
-        return version("og-pointcloud")
+        return f"og-pointcloud {version('og-pointcloud')}"
     except PackageNotFoundError:
-        return "unknown"
+        return "og-pointcloud unknown"

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from og_pointcloud.errors import SceneError
 
-__all__ = ["Box", "axis_aligned_box", "main_part", "oriented_box", "quaternion_of", "typical_spacing"]
+__all__ = ["Box", "axis_aligned_box", "main_part", "oriented_box", "quaternion_of"]
 
 DoubleArray = NDArray[np.float64]
 
@@ -38,7 +38,6 @@ MAIN_PART = 0.05
 """Share of the points that a connected part needs to be no stray."""
 MOST = 0.9
 """Share of the points that main parts must hold, or the points are taken to be sparse and linked more widely."""
-SPACING_SAMPLE = 256
 WIDEST = 1 << 19
 """Voxels to either side of the origin."""
 
@@ -135,14 +134,14 @@ def oriented_box(points: ArrayLike, up: ArrayLike | None = None) -> Box:
     return Box(middle + center @ axes, high - low, axes)
 
 
-def main_part(points: ArrayLike, spacing: float | None = None) -> NDArray[np.bool_]:
+def main_part(points: ArrayLike, spacing: float) -> NDArray[np.bool_]:
     """(n,) bool, the points (n, 3) of an object that are not strays; at least nine tenths of them.
 
     Points are linked through neighbouring voxels, and a connected part counts where it holds a twentieth of the points.
     If such parts hold less than nine tenths, points lie wider apart than thought, and voxels twice as large are tried.
     What floats alone is thus left out, and so is a speck of another object; fewer than 20 points all count.
 
-    spacing: typical distance between neighbouring points, None to measure it.
+    spacing: typical distance between neighbouring points.
     """
     xyz = _checked(points)
     distinct, which = _distinct(xyz)
@@ -152,7 +151,7 @@ def main_part(points: ArrayLike, spacing: float | None = None) -> NDArray[np.boo
     # In the frame of the principal axes, so that a turned object loses the same points.
     local = local @ _principal_axes(local).T
     extent = float(np.ptp(local, axis=0).max())
-    edge = LINK * (typical_spacing(local) if spacing is None else spacing)
+    edge = LINK * spacing
     while edge < extent:
         part = _connected(np.floor(local / max(edge, extent / WIDEST)).astype(np.int64))
         held = np.bincount(part)
@@ -176,18 +175,6 @@ def quaternion_of(rotation: DoubleArray) -> DoubleArray:
     )
     quaternion = products[products.diagonal().argmax()]  # the row of the largest part divides safely
     return quaternion / np.linalg.norm(quaternion) * (1 if quaternion[0] >= 0 else -1)
-
-
-def typical_spacing(points: ArrayLike) -> float:
-    """Median distance from a point to the third nearest other one, over an even sample of the points (n, 3).
-
-    0 where all points lie in one place.
-    """
-    xyz, _ = _distinct(_checked(points))
-    sample = xyz[np.linspace(0, len(xyz) - 1, min(len(xyz), SPACING_SAMPLE)).round().astype(int)]
-    third = min(3, len(xyz) - 1)
-    squared = [np.partition(np.square(xyz - place).sum(axis=1), third)[third] for place in sample]
-    return float(np.sqrt(np.median(squared)))
 
 
 def _checked(points: ArrayLike) -> DoubleArray:

@@ -34,13 +34,12 @@ if TYPE_CHECKING:
     from typing_extensions import Unpack
 
 __all__ = [
-    "SCENE_VARIABLE", "LabelledScene", "SceneLike", "SegmentOptions", "Segmenter", "as_scene", "find_scene",
-    "instance_table", "load", "pose_matrix", "segment", "use",
+    "LabelledScene", "SceneLike", "SegmentOptions", "Segmenter", "as_scene", "find_scene",
+    "instance_table", "load", "pose_matrix", "segment",
 ]  # fmt: skip
 
 SceneLike: TypeAlias = "LabelledScene | LabelledCloud | str | os.PathLike[str]"
 
-SCENE_VARIABLE = "OG_POINTCLOUD_SCENE"
 POINTS_PER_RUN = 1 << 20
 """What bounds the memory of the graph: about 150 MB."""
 
@@ -216,19 +215,6 @@ def load(path: str | os.PathLike[str]) -> LabelledScene:
     return LabelledScene(read_bundle(path))
 
 
-def use(scene: SceneLike | None) -> LabelledScene | None:
-    """Make a scene, or a .ogpc file, the one that ``segment`` asks when it is given none. None forgets it.
-
-    >>> scene = og.use(cloud)  # of `LabelledCloud`'s example
-    >>> og.segment([[0, 0, 1]]).counts()
-    {'chair': 1, 'desk': 0}
-    >>> og.use(None)
-    """
-    global _scene_in_use
-    _scene_in_use = None if scene is None else as_scene(scene)
-    return _scene_in_use
-
-
 class SegmentOptions(TypedDict, total=False):
     """Options of ``segment`` and ``Segmenter``, which says what they mean."""
 
@@ -253,8 +239,7 @@ def segment(
 
     pcd: an array (N, 3) of world coordinates, a cloud or mesh of Open3D, PyVista or trimesh, a geometry file; or a
         scene, a LabelledCloud or a .ogpc file, whose own points are then labelled. Rows with NaN answer unknown.
-    scene: what to ask. Left out: the scene that the cloud is or carries, else that of ``use``, else the file that the
-        environment variable OG_POINTCLOUD_SCENE names.
+    scene: what to ask. Left out: the scene that the cloud is or carries.
     pose: (4, 4), takes the cloud's coordinates to the scene's world. Left out: they are world coordinates.
     labels, options: as for ``Segmenter``, which asks the same of many clouds.
 
@@ -355,30 +340,21 @@ def instance_table(
     return list_instances(scene.cloud, scene.chooser, scene.words_or_none(labels, text_features), up=up, words=words)
 
 
-_scene_in_use: LabelledScene | None = None
-
-
 def _is_scene(pcd: Any) -> bool:
     is_file = isinstance(pcd, (str, os.PathLike)) and Path(pcd).suffix == ".ogpc"
     return is_file or isinstance(pcd, (LabelledScene, LabelledCloud))
 
 
 def find_scene(pcd: Any, scene: SceneLike | None = None) -> LabelledScene:
-    """The scene that answers for a cloud: the one given, else that the cloud is or carries, else that of ``use``, else
-    that of the environment; OgPointcloudError names these ways."""
+    """The scene that answers for a cloud: the one given, else that the cloud is or carries; else OgPointcloudError."""
     if scene is not None:
         return as_scene(scene)
     if _is_scene(pcd):
         return as_scene(pcd)
     if (carried := carried_scene(pcd)) is not None:
         return as_scene(carried)
-    if _scene_in_use is not None:
-        return _scene_in_use
-    if path := os.environ.get(SCENE_VARIABLE):
-        return as_scene(path)
     raise OgPointcloudError(
-        "no scene to ask: pass scene=og.load('S.ogpc') (or its path), or call og.use('S.ogpc') once, or set "
-        f"{SCENE_VARIABLE}, or segment a labelled cloud itself"
+        "no scene to ask: pass scene=og.load('S.ogpc') (or its path), or segment a labelled cloud itself"
     )
 
 

@@ -14,7 +14,6 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import overload
 
 import numpy as np
@@ -66,16 +65,6 @@ class Pick:
     xyz_world: NDArray[np.float64] | None = None
 
     @property
-    def cloud(self) -> LabelledCloud:
-        """The scene's points and instances."""
-        return self.scene.cloud
-
-    @property
-    def path(self) -> Path | None:
-        """The scene's .ogpc file, None for one in memory."""
-        return self.scene.path
-
-    @property
     def found(self) -> bool:
         """Whether an instance was hit."""
         return self.instance >= 0
@@ -84,7 +73,7 @@ class Pick:
     def point_indices(self) -> NDArray[np.int64]:
         """Indices of the instance's points in the scene, ascending. OgPointcloudError where no instance was hit."""
         self._require_instance()
-        return np.flatnonzero(self.cloud.instance_ids == self.instance)
+        return np.flatnonzero(self.scene.instance_ids == self.instance)
 
     def mask(self, camera: Camera) -> NDArray[np.bool_]:
         """(H, W) bool: where the camera sees the instance, whatever hides it taken away.
@@ -92,8 +81,8 @@ class Pick:
         camera: maps from world coordinates (`in_world`). OgPointcloudError where no instance was hit.
         """
         self._require_instance()
-        front = front_points(self.cloud, camera)
-        return (front != NO_POINT) & (self.cloud.instance_ids[front] == self.instance)
+        front = front_points(self.scene.cloud, camera)
+        return (front != NO_POINT) & (self.scene.instance_ids[front] == self.instance)
 
     def words(self, labels: Labels = None, *, text_features: TextFeatures = None) -> list[tuple[str, float]]:
         """Words with their scores on the instance, best first; empty for an instance without a descriptor.
@@ -180,19 +169,14 @@ def front_points(cloud: LabelledCloud, camera: Camera) -> NDArray[np.int64]:
 
 
 def _point_at_pixel(cloud: LabelledCloud, camera: Camera, uv_px: ArrayLike | None) -> int:
-    """What `front_points` has at the pixel that holds uv_px, without the others."""
+    """What `front_points` has at the pixel that holds uv_px."""
     uv = np.asarray(uv_px, np.float64) if uv_px is not None else np.full(2, np.nan)
-    size = np.array([camera.width, camera.height])
-    if uv.shape != (2,) or not ((uv >= 0) & (uv < size)).all():
+    if uv.shape != (2,) or not ((uv >= 0) & (uv < [camera.width, camera.height])).all():
         raise OgPointcloudError(
             f"uv_px is {uv_px}; expected a pixel (column, row) of the camera's image, 0 to {camera.width} and 0 to "
             f"{camera.height}, both less than the end"
         )
-    squares, drawn = _squares(cloud, camera)
-    offset = squares.pixel - ((np.floor(uv) + 0.5) * [drawn.width, drawn.height] / size).astype(np.int64)
-    covering = (np.abs(offset) <= squares.half[:, None]).all(axis=1)
-    alone = _Squares(squares.index[covering], offset[covering], squares.depth[covering], squares.half[covering])
-    return int(_in_front(alone, 1, 1, cloud.reach)[0, 0])
+    return int(front_points(cloud, camera)[int(uv[1]), int(uv[0])])
 
 
 def _nearest_point(scene: LabelledScene, place: ArrayLike) -> int:

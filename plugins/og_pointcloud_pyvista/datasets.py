@@ -50,9 +50,8 @@ def to_pyvista(result: Segmentation) -> pv.PolyData:
 class OgDataSet:
     """``mesh.og``: ask what the points of any dataset are, by words.
 
-    The scene that answers is the one passed, else the file that the dataset says it came from, else that of
-    ``og_pointcloud.use``, else what the environment variable OG_POINTCLOUD_SCENE names. ``mesh.points`` are taken to be
-    in the scene's world coordinates.
+    The scene that answers is the one passed, else the file that the dataset says it came from. ``mesh.points`` are
+    taken to be in the scene's world coordinates.
     """
 
     def __init__(self, mesh: pv.DataSet) -> None:

@@ -182,7 +182,7 @@ class OgPlotter:
     def _answer(self, hit: Pick) -> str:
         if not hit.found:
             return str(hit)
-        cloud, options = hit.cloud, self._words or {"labels": None, "text_features": None, "count": 5}
+        cloud, options = hit.scene.cloud, self._words or {"labels": None, "text_features": None, "count": 5}
         has_words = options["labels"] is not None or options["text_features"] is not None or cloud.vocabulary
         if not has_words:
             return f"{hit}\n(the scene has no words of its own: pass labels)"
