@@ -88,7 +88,7 @@ def test_an_instance_without_points_has_no_place():
     assert [row.state for row in table] == ["empty", "empty", "labelled", "empty"]
     assert table[0].centroid is table[0].oriented_box is table[0].axis_aligned_box is table[0].size is None
     assert len(table[0].main_part) == 0
-    np.testing.assert_allclose(table[2].size, [1, 0, 0], atol=1e-12)
+    np.testing.assert_allclose(table[2].oriented_box.size, [1, 0, 0], atol=1e-12)
     records = list(csv.DictReader(table.to_csv().splitlines()))
     assert [record["axis_aligned_box_low_0"] for record in records] == ["", "", "0.0", ""]
     assert "empty" in repr(table)

@@ -20,7 +20,7 @@ from og_pointcloud.scene import Points
 open3d = pytest.importorskip("open3d")
 og3 = pytest.importorskip("og_pointcloud_open3d")
 
-from og_pointcloud_open3d import host  # noqa: E402
+from og_pointcloud_open3d import convert  # noqa: E402
 
 EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
 WORDS = ["apple", "pear", "plum"]
@@ -138,11 +138,11 @@ def test_missing_system_libraries_are_one_sentence(monkeypatch):
     def fail(name):
         raise OSError("libusb-1.0.so.0: cannot open shared object file: No such file or directory")
 
-    monkeypatch.setattr(host.importlib, "import_module", fail)
+    monkeypatch.setattr(convert.importlib, "import_module", fail)
     with pytest.raises(
         OgPointcloudError, match=r"does not load \(libusb.*apt-get install libusb-1.0-0 libgl1"
     ) as caught:
-        host.open3d()
+        convert.open3d()
     assert "\n" not in str(caught.value)
 
 
@@ -155,11 +155,11 @@ def test_open3d_that_is_not_installed_names_the_extra(scene, monkeypatch):
 def test_old_versions_are_refused_in_words(monkeypatch):
     monkeypatch.setattr(open3d, "__version__", "0.18.0")
     with pytest.raises(OgPointcloudError, match=r"Open3D is 0.18.0; this plugin needs 0.19 or later"):
-        host.open3d()
+        convert.open3d()
     monkeypatch.setattr(open3d, "__version__", "0.19.0")
-    assert host.open3d() is open3d
+    assert convert.open3d() is open3d
     monkeypatch.setattr(open3d, "__version__", "0.20.0+dev1")
-    assert host.open3d() is open3d
+    assert convert.open3d() is open3d
 
 
 # Examples

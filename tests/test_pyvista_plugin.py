@@ -131,16 +131,15 @@ def test_the_scene_is_found_as_everywhere(scene, bundle):
     assert np.array_equal(mesh.og.segment(["apple"], bundle)["og_instance"], scene.instance_ids[:20])
 
 
-def test_select_extracts_the_fitting_instances_with_their_rank(scene):
+def test_select_extracts_the_fitting_instances_with_their_scores(scene):
     mesh = pv.PolyData(scene.xyz)
     selection = og.select(scene, "plum")
     points = mesh.og.select("plum", scene)
     assert len(selection.instances) > 1
     expected = np.flatnonzero(np.isin(scene.instance_ids, selection.instances))
     assert np.allclose(points.points, scene.xyz[expected])
-    for rank, match in enumerate(selection.fitting):
+    for match in selection.fitting:
         rows = points["og_instance"] == match.instance
-        assert (points["og_rank"][rows] == rank).all()
         assert (points["og_score"][rows] == np.float32(match.score)).all()
     assert "og_instance" not in mesh.point_data
 

@@ -352,7 +352,6 @@ def test_a_carried_encoder_answers_whoever_asks_the_scene(path, encoder_folder):
         lambda: og.pick(scene, place).words(["cat"]),
         lambda: og.pick(path, place).words(["cat"]),
         lambda: og.instance_table(scene, ["cat"]),
-        lambda: og.segment(scene, ["apple"], templates=["a {}"]),
     )
     for ask in asks:
         with pytest.raises(OgPointcloudError, match=rf"export text MODEL_FOLDER --feature-space '{SPACE}'"):
@@ -364,26 +363,6 @@ def test_a_carried_encoder_answers_whoever_asks_the_scene(path, encoder_folder):
     assert (results[0].labels == og.segment(scene, {"apple": 10 * unit_rows(5)[0], "cat": cat}).labels).all()
     assert results[3] == results[4] == og.pick(scene, place).words({"cat": cat})
     assert len(results[5]) == len(scene.instances)
-
-
-@pytest.mark.filterwarnings("ignore:none of")
-def test_templates_encode_every_word_anew(path, encoder_folder):
-    carry_encoder(path, encoder_folder)
-    scene, templates = og.load(path), ["a {}", "low {} cat"]
-    vectors = dict(zip(WORDS, encoder_for(SPACE, carried_encoder(path))(WORDS, templates), strict=True))
-    for labels in (None, list(WORDS)):
-        ours, theirs = og.segment(scene, labels, templates=templates), og.segment(scene, vectors)
-        assert ours.names == WORDS
-        assert (ours.labels == theirs.labels).all()
-        assert (ours.scores == theirs.scores).all()
-    assert (ours.scores != og.segment(scene, list(WORDS)).scores).any()
-    ask, given = og.Segmenter(scene, list(WORDS), templates=templates), og.Segmenter(scene, vectors)
-    assert (ask(scene.xyz).scores == given(scene.xyz).scores).all()
-    with pytest.raises(OgPointcloudError, match="templates are given with vectors"):
-        og.segment(scene, vectors, templates=templates)
-    with pytest.raises(OgPointcloudError, match="no place for the name"):
-        og.segment(scene, ["apple"], templates=["a photo"])
-    assert main(["segment", str(path), "--labels", "apple,cat", "--template", "a {}"]) == 0
 
 
 def test_a_scene_outlives_its_file(path, encoder_folder):

@@ -91,12 +91,6 @@ class LookupGrid:
     candidates: NDArray[np.int32]
     codes: int
 
-    @property
-    def nbytes(self) -> int:
-        """Bytes of the table."""
-        boxes = (self.blocks, self.bricks, self.nodes, self.first_child)
-        return sum(table.nbytes for table in (*boxes, self.child_length, self.child_start, self.candidates))
-
 
 def build_lookup_grid(cloud: LabelledCloud) -> LookupGrid:
     """The grid of a cloud. Its size is bounded by the number of points, not by the extent of the scene."""

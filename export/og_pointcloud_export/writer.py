@@ -15,14 +15,13 @@ from numpy.typing import NDArray
 
 from og_pointcloud.bundle.format import FORMAT, INSTANCE_MEMBERS, SCHEMA_VERSION, describe_member
 from og_pointcloud.bundle.nearest import NONE_WITHIN_REACH, NearestPoint
-from og_pointcloud.bundle.scene_words import bank_of_encoder
-from og_pointcloud.bundle.vocabulary import bank_members, encoder_members, vocabulary_members
+from og_pointcloud.bundle.vocabulary import bank_members, bank_of_encoder, encoder_members, vocabulary_members
 from og_pointcloud.cloud import TOO_FAR, InstanceTable, LabelledCloud
 from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.formats.atomic import replacing
 from og_pointcloud.formats.npy import npy_bytes
 from og_pointcloud.models import open_session
-from og_pointcloud_export.lookup_grid import LookupGrid, build_lookup_grid
+from og_pointcloud_export.lookup_grid import build_lookup_grid
 from og_pointcloud_export.query_graph import OPSET, build_query_graph
 
 __all__ = ["query_model", "write_bundle", "written_by"]
@@ -34,11 +33,10 @@ PARITY_TEXTS, PARITY_POINTS = 64, 4096
 
 @dataclass(frozen=True)
 class QueryModel:
-    """query.onnx of a cloud. parity: its largest differences from float64; grid: size and share of certain cells."""
+    """query.onnx of a cloud. parity: its largest differences from float64."""
 
     onnx: bytes
     parity: dict[str, Any]
-    grid: dict[str, Any]
 
 
 def write_bundle(
@@ -78,8 +76,7 @@ def write_bundle(
 
 def query_model(cloud: LabelledCloud) -> QueryModel:
     """Build a cloud's query.onnx and hold it against numpy in float64; OgPointcloudError if they differ."""
-    grid = build_lookup_grid(cloud)
-    onnx = build_query_graph(cloud, grid)
+    onnx = build_query_graph(cloud, build_lookup_grid(cloud))
     parity = _parity(cloud, onnx)
     if parity["instance_score_error"] > SCORE_TOLERANCE or parity["certain_points_wrong"]:
         raise OgPointcloudError(
@@ -87,7 +84,7 @@ def query_model(cloud: LabelledCloud) -> QueryModel:
             f"{SCORE_TOLERANCE}), {parity['certain_points_wrong']} certain points wrong (expected 0): descriptors must "
             "be unit rows; if they are, please report this cloud"
         )
-    return QueryModel(onnx, parity, _describe_grid(grid))
+    return QueryModel(onnx, parity)
 
 
 def _arrays(cloud: LabelledCloud) -> dict[str, NDArray[Any]]:
@@ -134,18 +131,6 @@ def _parity(cloud: LabelledCloud, onnx: bytes) -> dict[str, Any]:
     }
 
 
-def _describe_grid(grid: LookupGrid) -> dict[str, Any]:
-    return {
-        "cell_size": float(grid.cell_size),
-        "bricks": list(grid.shape),
-        "blocks_stored": len(grid.bricks),
-        "boxes_split": len(grid.nodes),
-        "lists": int((grid.child_length > 0).sum()),
-        "candidates": len(grid.candidates),
-        "bytes": grid.nbytes,
-    }
-
-
 def _manifest(cloud: LabelledCloud, model: QueryModel, members: dict[str, bytes]) -> bytes:
     descriptors = np.ascontiguousarray(cloud.instances.descriptors, "<f4")
     manifest = {
@@ -166,7 +151,7 @@ def _manifest(cloud: LabelledCloud, model: QueryModel, members: dict[str, bytes]
             "member": "query.onnx", "offset": model.onnx.index(descriptors.tobytes()) if descriptors.size else 0,
             "shape": list(descriptors.shape),
         },
-        "query_head": {"opset": OPSET, "grid": model.grid},
+        "query_head": {"opset": OPSET},
         "parity": model.parity,
         "members": {name: describe_member(name, data) for name, data in members.items()},
         "provenance": cloud.provenance,

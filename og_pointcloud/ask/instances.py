@@ -103,11 +103,6 @@ class Instance:
         """A box of nearly the least volume around its main part (`boxes.oriented_box`); None without points."""
         return oriented_box(self.xyz[self.main_part], self._up) if self.points else None
 
-    @property
-    def size(self) -> NDArray[np.float64] | None:
-        """(3,) lengths of the oriented box; None without points."""
-        return None if self.oriented_box is None else self.oriented_box.size
-
     def to_dict(self) -> dict[str, Any]:
         """JSON-able: everything but the points themselves; of those, how many, and how many are strays."""
         columns = ("id", "state", "points", "views", "masks", "agreement", "visible_area", "part_of", "coarse")

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Sequence
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias, TypedDict
@@ -117,12 +116,10 @@ class LabelledScene:
         """What tells which label fits each instance, if any; calibrated if the scene has a word bank."""
         return Chooser(self.cloud.instances, self.cloud.word_bank, feature_space=self.feature_space)
 
-    def words(
-        self, labels: Labels = None, text_features: TextFeatures = None, templates: Sequence[str] | None = None
-    ) -> Vocabulary:
+    def words(self, labels: Labels = None, text_features: TextFeatures = None) -> Vocabulary:
         """Labels with their vectors, as ``segment`` finds them: named, in a file, in the scene's own words, encoded."""
         encoder = carried_encoder(self.path)
-        return resolve_labels(labels, text_features, self.vocabulary, self.feature_space, encoder, templates)
+        return resolve_labels(labels, text_features, self.vocabulary, self.feature_space, encoder)
 
     def words_or_none(self, labels: Labels = None, text_features: TextFeatures = None) -> Vocabulary | None:
         """The same, but None where none are given and the scene has none."""
@@ -219,7 +216,6 @@ class SegmentOptions(TypedDict, total=False):
     """Options of ``segment`` and ``Segmenter``, which says what they mean."""
 
     text_features: TextFeatures
-    templates: Sequence[str] | None
     max_distance: float | None
 
 
@@ -264,8 +260,6 @@ class Segmenter:
     labels: words, found in text_features or in the scene's vocabulary (None: all of them), or encoded, if the scene's
         text encoder is found; or name -> vector (D,).
     text_features: a text-features .npz, or what ``read_text_features`` returned for it.
-    templates: texts with ``{}`` ("a photo of a {}"), into which words are put before they are encoded; their vectors'
-        mean counts. Left out: stored vectors, and the encoder's own templates for other words.
     max_distance: points farther than this from the scene's cloud answer unknown; at most, and left out, its reach.
 
     >>> ask = og.Segmenter(cloud, ["desk", "chair"])  # of `LabelledCloud`'s example
@@ -281,12 +275,11 @@ class Segmenter:
         labels: Labels = None,
         *,
         text_features: TextFeatures = None,
-        templates: Sequence[str] | None = None,
         max_distance: float | None = None,
     ) -> None:
         self.scene = scene = as_scene(scene)
         scene.check_distance(max_distance)
-        words = scene.words(labels, text_features, templates)
+        words = scene.words(labels, text_features)
         self.names = words.names
         """The labels, in the order of their numbers."""
         self._max_distance, self._warned = max_distance, False

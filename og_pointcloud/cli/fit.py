@@ -71,7 +71,7 @@ def add(parser: Parser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     settings = fit_settings(arguments)
-    from og_pointcloud.bundle.scene_words import scene_words
+    from og_pointcloud.bundle.vocabulary import scene_words
     from og_pointcloud.cloud import FeatureSpace
     from og_pointcloud.fitting.fit import fit
     from og_pointcloud.fitting.work_folder import kept_files

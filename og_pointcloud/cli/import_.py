@@ -23,7 +23,7 @@ def add(parser: Parser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    from og_pointcloud.bundle.scene_words import scene_words
+    from og_pointcloud.bundle.vocabulary import scene_words
     from og_pointcloud.fitting.opengaussian import read_opengaussian
 
     stages: list[dict[str, Any]] = []

@@ -32,10 +32,6 @@ SAVED_AS = (".npz", ".ply", ".las", ".laz", ".glb")
 
 def add(parser: Parser) -> None:
     add_shared(parser, "bundle", "--labels", "--text-features", "--json")
-    parser.add_argument(
-        "--template", action="append", metavar="TEXT",
-        help="what names are put into, such as 'a photo of a {}'; several are averaged; needs the text encoder",
-    )  # fmt: skip
     parser.add_argument("--points", type=Path, metavar="CLOUD", help="points to label (default: those fitted)")
     add_output(
         parser, "-o", "--output", endings=SAVED_AS, metavar="OUT",
@@ -55,7 +51,6 @@ def run(arguments: argparse.Namespace) -> None:
             names_in(arguments.labels),
             scene=scene,
             text_features=arguments.text_features,
-            templates=arguments.template,
         )
     if arguments.output:
         with timed(stages, "save"):

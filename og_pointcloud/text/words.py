@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from og_pointcloud.cloud import FeatureSpace, Vocabulary
 from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError
-from og_pointcloud.text.encoder import CarriedEncoder, encoder_for, export_command, find_encoder
+from og_pointcloud.text.encoder import CarriedEncoder, export_command, find_encoder
 from og_pointcloud.text.text_features import checked_vocabulary, read_text_features
 
 __all__ = ["Labels", "TextFeatures", "resolve_labels"]
@@ -27,23 +27,17 @@ def resolve_labels(
     own_words: Vocabulary | None,
     feature_space: str,
     carried: CarriedEncoder | None = None,
-    templates: Sequence[str] | None = None,
 ) -> Vocabulary:
     """Names, all different, with a finite vector each that is not zero.
 
     labels: words, looked up in text_features and then in own_words (None: every word of the first that there is), and
     encoded where both lack them, if there is an encoder; or name -> vector (D,); or a Vocabulary, taken as it is.
     text_features: a text-features file, or what ``read_text_features`` returned. own_words, feature_space: the scene's.
-    carried: gives the encoder in the scene's file, if it has one. templates: texts with ``{}``, which every word is
-    put into and encoded, whatever vectors are stored for it; needs the encoder.
+    carried: gives the encoder in the scene's file, if it has one.
     Raises OgPointcloudError for a word without vector or given twice, FeatureSpaceError for text_features of another
     space and for vectors that cannot be compared.
     """
     sources = [source for source in (_of_space(text_features, feature_space), own_words) if source is not None]
-    if templates is not None and labels is None and sources:
-        labels = sources[0].names
-    if templates is not None and isinstance(labels, (Mapping, Vocabulary)):
-        raise OgPointcloudError("templates are given with vectors; expected words to put into them: leave one of both")
     if labels is None:
         if not sources:
             raise OgPointcloudError(
@@ -58,8 +52,6 @@ def resolve_labels(
     for word in words:
         if not isinstance(word, str):
             raise OgPointcloudError(f"label {word!r:.60} is a {type(word).__name__}; expected words, or name -> vector")
-    if templates is not None:
-        return _checked(words, encoder_for(feature_space, carried)(words, templates))
     return _checked(words, _looked_up(words, sources, feature_space, carried))
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import importlib
 import os
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -13,14 +15,16 @@ import og_pointcloud as og
 from og_pointcloud.ask.hosts import world_points
 from og_pointcloud.ask.labelled_scene import SceneLike, SegmentOptions
 from og_pointcloud.ask.segmentation import Segmentation
-from og_pointcloud.errors import OgPointcloudError, SceneError
+from og_pointcloud.errors import MissingExtraError, OgPointcloudError, SceneError
 from og_pointcloud.text.words import Labels
-from og_pointcloud_open3d.host import open3d
 
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
-__all__ = ["Segmented", "read", "segment", "to_open3d"]
+__all__ = ["Segmented", "open3d", "read", "segment", "to_open3d"]
+
+OLDEST = (0, 19)
+DEBIAN_LIBRARIES = "libusb-1.0-0 libgl1 libegl1 libx11-6 libgomp1"
 
 
 class Segmented(NamedTuple):
@@ -118,3 +122,22 @@ def _set_attributes(tensors: Any, result: Segmentation, device: Any) -> None:
     columns |= {name: values[:, None] for name, values in result.attributes.items()}
     for name, values in columns.items():
         tensors[name] = core.Tensor(np.ascontiguousarray(values)).to(device)
+
+
+def open3d() -> Any:
+    """Open3D. MissingExtraError where it is not installed, OgPointcloudError where it is too old or cannot load."""
+    try:
+        module = importlib.import_module("open3d")
+    except ModuleNotFoundError as error:
+        raise MissingExtraError(error.name or "open3d", "open3d") from None
+    except (ImportError, OSError) as error:
+        raise OgPointcloudError(
+            f"Open3D is installed but does not load ({str(error).splitlines()[0]}): install the system libraries it "
+            f"needs, on Debian and Ubuntu: apt-get install {DEBIAN_LIBRARIES}"
+        ) from None
+    if tuple(map(int, re.findall(r"\d+", module.__version__)[:2])) < OLDEST:
+        oldest = "{}.{}".format(*OLDEST)
+        raise OgPointcloudError(
+            f"Open3D is {module.__version__}; this plugin needs {oldest} or later: pip install 'open3d>={oldest}'"
+        )
+    return module

@@ -34,7 +34,6 @@ __all__ = [
 ]  # fmt: skip
 
 LABEL, INSTANCE, SCORE, COLOR = "og_label", "og_instance", "og_score", "og_color"
-RANK = "og_rank"
 BOX_EDGES = [(a, a | 1 << axis) for a in range(8) for axis in range(3) if not a >> axis & 1]
 """Pairs of `Box.corners`: they differ in one bit."""
 
@@ -84,7 +83,7 @@ class OgDataSet:
     ) -> pv.UnstructuredGrid:
         """The points of the instances that a text fits, and the cells that lie wholly among them.
 
-        Point arrays: og_rank (int32, 0 for the instance that it fits best), og_score (its score), og_instance.
+        Point arrays: og_instance, and og_score, that of the instance.
         text, against, text_features: as for ``og_pointcloud.select``. Warns where nothing is selected.
         """
         found = find_scene(self._mesh, scene)
@@ -95,11 +94,8 @@ class OgDataSet:
             _warn(f"no point of this dataset is selected: {selection}")
             return points
         ids = np.asarray(points.point_data[INSTANCE])
-        rank, score = (np.zeros(len(found.cloud.instances), kind) for kind in (np.int32, np.float32))
-        for place, match in enumerate(selection.fitting):
-            rank[match.instance], score[match.instance] = place, match.score
-        points.point_data[SCORE] = score[ids]
-        points.point_data[RANK] = rank[ids]
+        score = {match.instance: match.score for match in selection.fitting}
+        points.point_data[SCORE] = np.array([score[instance] for instance in ids.tolist()], np.float32)
         return points
 
     def instances(self, scene: SceneLike | None = None) -> pv.MultiBlock:

@@ -10,7 +10,6 @@ from og_pointcloud_ros.messages import MessageFactory, plain_messages, ros_messa
 from og_pointcloud_ros.pointcloud2 import (
     UNLABELLED,
     from_pointcloud2,
-    is_pointcloud2,
     read_fields,
     to_pointcloud2,
     write_fields,
@@ -23,7 +22,6 @@ __all__ = [
     "TransformError",
     "TransformTree",
     "from_pointcloud2",
-    "is_pointcloud2",
     "plain_messages",
     "read_fields",
     "ros_messages",

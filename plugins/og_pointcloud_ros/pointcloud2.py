@@ -18,7 +18,7 @@ from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.colors import label_colors
 from og_pointcloud_ros.messages import MessageFactory, header, plain_messages
 
-__all__ = ["UNLABELLED", "from_pointcloud2", "is_pointcloud2", "read_fields", "to_pointcloud2", "write_fields"]
+__all__ = ["UNLABELLED", "from_pointcloud2", "read_fields", "to_pointcloud2", "write_fields"]
 
 UNLABELLED = 65535
 """Label of a point without one, as vision_msgs/LabelInfo has it for 16-bit ids."""
@@ -26,11 +26,6 @@ ATTRIBUTES = ("height", "width", "fields", "is_bigendian", "point_step", "row_st
 TYPE_CODES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 """sensor_msgs/PointField's datatypes."""
 DATATYPES = {np.dtype(code): number for number, code in TYPE_CODES.items()}
-
-
-def is_pointcloud2(value: Any) -> bool:
-    """Whether a value has what makes a PointCloud2, whichever library it is of."""
-    return all(hasattr(value, name) for name in ATTRIBUTES)
 
 
 def from_pointcloud2(message: Any) -> NDArray[np.float64]:
@@ -59,9 +54,8 @@ def read_fields(message: Any) -> NDArray[Any]:
     Nothing is copied, unless data is a plain list; read-only where the message's bytes are. A field of count c has
     shape (height, width, c). Numbers are in the message's byte order. SceneError where sizes disagree.
     """
-    if not is_pointcloud2(message):
-        absent = next(name for name in ATTRIBUTES if not hasattr(message, name))
-        raise SceneError(f"a {type(message).__name__} has no '{absent}'; expected a sensor_msgs/PointCloud2")
+    if absent := [name for name in ATTRIBUTES if not hasattr(message, name)]:
+        raise SceneError(f"a {type(message).__name__} has no '{absent[0]}'; expected a sensor_msgs/PointCloud2")
     height, width, point_step, row_step = (
         _size(message, name) for name in ("height", "width", "point_step", "row_step")
     )
