@@ -187,7 +187,7 @@ def segmentation(labels, names, xyz=None):
     xyz = np.arange(3.0 * count).reshape(count, 3) if xyz is None else xyz
     scores = np.linspace(0, 1, count, dtype=np.float32)
     zeros = np.zeros(count, np.int8)
-    return og.Segmentation(xyz, labels, scores, labels * 2 - 1, tuple(names), reasons=zeros)
+    return og.Segmentation(xyz, labels, scores, labels * 2 - 1, zeros, tuple(names))
 
 
 def test_las_with_more_labels_than_classes(tmp_path):

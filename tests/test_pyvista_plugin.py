@@ -153,23 +153,6 @@ def test_selecting_nothing_says_what_is_closest(scene):
         assert pv.PolyData(scene.xyz + 50).og.select("plum", scene).n_points == 0
 
 
-def test_instances_are_blocks_named_by_id_and_word(scene):
-    mesh = pv.PolyData(scene.xyz).og.segment(["apple", "pear", "plum"], scene)
-    blocks = mesh.og.instances()
-    names = list(blocks.keys())  # a MultiBlock iterates over blocks
-    ids = [int(name.split()[0]) for name in names]
-    assert ids == [k for k in range(9) if (scene.instance_ids == k).any()]
-    for instance, name, block in zip(ids, names, blocks, strict=True):
-        rows = scene.instance_ids == instance
-        assert np.allclose(block.points, scene.xyz[rows])
-        label = int(mesh["og_label"][rows][0])
-        assert name == f"{instance} {'unknown' if label < 0 else mesh.field_data['og_names'][label]}"
-    own = pv.PolyData(scene.xyz).og.instances(scene)
-    assert own.keys()[0] == f"0 {scene.instances[0].words[0][0]}", "not segmented: the scene's own word"
-    with pytest.warns(UserWarning, match="there is no block"):
-        assert pv.PolyData(scene.xyz + 50).og.instances(scene).n_blocks == 0
-
-
 def test_boxes_are_the_instances_own(scene):
     mesh = pv.PolyData(scene.xyz).og.segment(["apple", "pear", "plum"], scene)
     lines = mesh.og.boxes(scene, up=(0, 0, 1))

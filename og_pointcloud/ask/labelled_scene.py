@@ -12,7 +12,7 @@ import os
 import warnings
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias, TypedDict
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -29,11 +29,8 @@ from og_pointcloud.cloud import TOO_FAR, LabelledCloud, Vocabulary
 from og_pointcloud.errors import OgPointcloudError, SceneError
 from og_pointcloud.text.words import Labels, TextFeatures, resolve_labels
 
-if TYPE_CHECKING:
-    from typing_extensions import Unpack
-
 __all__ = [
-    "LabelledScene", "SceneLike", "SegmentOptions", "Segmenter", "as_scene", "find_scene",
+    "LabelledScene", "SceneLike", "Segmenter", "as_scene", "find_scene",
     "instance_table", "load", "pose_matrix", "segment",
 ]  # fmt: skip
 
@@ -212,20 +209,14 @@ def load(path: str | os.PathLike[str]) -> LabelledScene:
     return LabelledScene(read_bundle(path))
 
 
-class SegmentOptions(TypedDict, total=False):
-    """Options of ``segment`` and ``Segmenter``, which says what they mean."""
-
-    text_features: TextFeatures
-    max_distance: float | None
-
-
 def segment(
     pcd: Any,
     labels: Labels = None,
     scene: SceneLike | None = None,
     *,
     pose: ArrayLike | None = None,
-    **options: Unpack[SegmentOptions],
+    text_features: TextFeatures = None,
+    max_distance: float | None = None,
 ) -> Segmentation:
     """Label the points of a cloud by words. The cloud may be of any density, a crop, noisy, or in a frame of its own.
 
@@ -237,7 +228,7 @@ def segment(
         scene, a LabelledCloud or a .ogpc file, whose own points are then labelled. Rows with NaN answer unknown.
     scene: what to ask. Left out: the scene that the cloud is or carries.
     pose: (4, 4), takes the cloud's coordinates to the scene's world. Left out: they are world coordinates.
-    labels, options: as for ``Segmenter``, which asks the same of many clouds.
+    labels, text_features, max_distance: as for ``Segmenter``, which asks the same of many clouds.
 
     Warns where no point gets a label, and says why. Raises OgPointcloudError and its kinds: SceneError (no cloud),
     BundleError (no scene), FeatureSpaceError (vectors of another space or width).
@@ -248,7 +239,8 @@ def segment(
     >>> og.segment(cloud, {"seat": np.array([5, 1]), "top": np.array([1, 5])}).labels
     array([0, 0, 1], dtype=int32)
     """
-    return Segmenter(find_scene(pcd, scene), labels, **options)._answer(pcd, pose)
+    ask = Segmenter(find_scene(pcd, scene), labels, text_features=text_features, max_distance=max_distance)
+    return ask._answer(pcd, pose)
 
 
 class Segmenter:
@@ -303,7 +295,7 @@ class Segmenter:
             instances = scene.instances_at(points, max_distance=self._max_distance)
         labels, scores, reasons = self._choice.at(instances)
         result = Segmentation(
-            points, labels, scores, instances, self.names, scene.path, reasons, self._choice.calibrated,
+            points, labels, scores, instances, reasons, self.names, scene.path, self._choice.calibrated,
             scene.certainty_at,
         )  # fmt: skip
         if not self._warned and (reason := _why_nothing(result, scene)):

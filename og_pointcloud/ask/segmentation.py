@@ -33,8 +33,8 @@ class Segmentation:
     scores: (N,) float32, 0 where unknown; else, if ``calibrated``, the probability that the point is what its label
         says; if not, the cosine of the label's text with the instance's descriptor, which has no such meaning.
     instances: (N,) int32, the scene's instance id, -1 background, -2 unobserved, -3 too far from the scene.
-    names: the labels asked for. scene: the .ogpc file that answered, None for one in memory.
     reasons: (N,) int8, why a point is unknown: a ``Reason``, 0 where it has a label.
+    names: the labels asked for. scene: the .ogpc file that answered, None for one in memory.
     calibrated: whether the scene has a word bank to judge labels by. Without one the best label is answered, however
         badly it fits: then nothing is unknown for Reason.NONE_FITS.
     certainty: (N,) float32, see there; looked up by ``certainty_at``, the scene's, when it is first read.
@@ -50,19 +50,13 @@ class Segmentation:
     labels: NDArray[np.int32]
     scores: NDArray[np.float32]
     instances: NDArray[np.int32]
+    reasons: NDArray[np.int8]
     names: tuple[str, ...]
     scene: Path | None = None
-    reasons: NDArray[np.int8] = field(default_factory=lambda: np.zeros(0, np.int8))
     calibrated: bool = False
     certainty_at: Callable[[NDArray[np.float64]], NDArray[np.float32] | None] = field(
         default=lambda points: None, repr=False, compare=False
     )
-
-    def __post_init__(self) -> None:
-        if len(self.reasons) != len(self.labels):
-            raise OgPointcloudError(
-                f"{len(self.labels)} labels and {len(self.reasons)} reasons differ in number; expected one each a point"
-            )
 
     def __len__(self) -> int:
         return len(self.labels)

@@ -6,20 +6,17 @@ import importlib
 import os
 import re
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 import og_pointcloud as og
 from og_pointcloud.ask.hosts import world_points
-from og_pointcloud.ask.labelled_scene import SceneLike, SegmentOptions
+from og_pointcloud.ask.labelled_scene import SceneLike
 from og_pointcloud.ask.segmentation import Segmentation
 from og_pointcloud.errors import MissingExtraError, OgPointcloudError, SceneError
 from og_pointcloud.text.words import Labels
-
-if TYPE_CHECKING:
-    from typing_extensions import Unpack
 
 __all__ = ["Segmented", "open3d", "read", "segment", "to_open3d"]
 
@@ -61,7 +58,7 @@ def segment(
     scene: SceneLike | None = None,
     *,
     pose: ArrayLike | None = None,
-    **options: Unpack[SegmentOptions],
+    **options: Any,
 ) -> Segmented:
     """Label a cloud, or a mesh by its vertices, and paint a copy of it.
 

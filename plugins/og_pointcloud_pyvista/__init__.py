@@ -4,7 +4,7 @@
 
     mesh = pv.read("kitchen.ogpc")                        # or any dataset of your own, with scene= below
     mesh = mesh.og.segment(["chair", "table"])            # a new dataset: og_label, og_instance, og_score, og_color
-    mesh.og.select("mug"), mesh.og.instances(), mesh.og.boxes()
+    mesh.og.select("mug"), mesh.og.boxes()
 
     plotter = pv.Plotter()
     plotter.og.add_segmentation(mesh)                     # colours, legend with counts, names on the instances

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import pyvista as pv
@@ -19,14 +19,11 @@ from numpy.typing import ArrayLike, NDArray
 import og_pointcloud as og
 from og_pointcloud.ask.hosts import NAMES_FIELD, SCENE_FIELD
 from og_pointcloud.ask.instances import Instance
-from og_pointcloud.ask.labelled_scene import SceneLike, SegmentOptions, find_scene
+from og_pointcloud.ask.labelled_scene import SceneLike, find_scene
 from og_pointcloud.ask.segmentation import Segmentation
 from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.formats.colors import label_colors
 from og_pointcloud.text.words import Labels, TextFeatures
-
-if TYPE_CHECKING:
-    from typing_extensions import Unpack
 
 __all__ = [
     "COLOR", "INSTANCE", "LABEL", "SCORE", "OgDataSet", "best_words", "box_lines", "label_names",
@@ -62,7 +59,7 @@ class OgDataSet:
         scene: SceneLike | None = None,
         *,
         pose: ArrayLike | None = None,
-        **options: Unpack[SegmentOptions],
+        **options: Any,
     ) -> Any:
         """Label every point; returns a copy of the dataset with the arrays that this module names.
 
@@ -97,19 +94,6 @@ class OgDataSet:
         score = {match.instance: match.score for match in selection.fitting}
         points.point_data[SCORE] = np.array([score[instance] for instance in ids.tolist()], np.float32)
         return points
-
-    def instances(self, scene: SceneLike | None = None) -> pv.MultiBlock:
-        """A block an instance that has points here, by id; named by its id and label, or the scene's best word for it.
-
-        Warns where there is none.
-        """
-        mesh = self._with_instances(scene)
-        words = best_words(mesh, scene)
-        if not words:
-            _warn(f"none of {mesh.n_points:,} points belongs to an instance: there is no block")
-            return pv.MultiBlock()
-        blocks = {f"{instance} {word}".strip(): instance for instance, word in words.items()}
-        return mesh.split_values(blocks, scalars=INSTANCE, adjacent_cells=False)
 
     def boxes(self, scene: SceneLike | None = None, *, up: ArrayLike | None = None) -> pv.PolyData:
         """Oriented boxes of the scene's instances that have points here, as lines: 12 cells each.

@@ -19,7 +19,7 @@ from og_pointcloud.ask.picking import Pick
 from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.formats.colors import LUMINANCE, label_colors
 from og_pointcloud.show.viewpoint import FOCAL, Viewpoint, choose_viewpoint
-from og_pointcloud.text.words import Labels, TextFeatures
+from og_pointcloud.text.words import Labels
 from og_pointcloud_pyvista.datasets import COLOR, INSTANCE, LABEL, best_words, box_lines, label_names
 from og_pointcloud_pyvista.files import RGB
 
@@ -52,7 +52,8 @@ class OgPlotter:
         self._plotter: Any = plotter
         self._scene: LabelledScene | None = None
         self._point_size = 5.0
-        self._words: dict[str, Any] = {}
+        self._labels: Labels = None
+        self._count = 5
         self._on_click: Callable[[Pick], None] | None = None
 
     def __plotter_close__(self) -> None:
@@ -144,24 +145,22 @@ class OgPlotter:
         scene: SceneLike | None = None,
         labels: Labels = None,
         *,
-        text_features: TextFeatures = None,
         words: int = 5,
         callback: Callable[[Pick], None] | None = None,
-        left_clicking: bool = True,
         **options: Any,
     ) -> None:
         """A click shows which instance it hit: its points and box highlighted, its best words and scores in a corner.
 
         scene: what to ask; left out, that of the dataset drawn last, else as for ``og_pointcloud.segment``.
-        labels, text_features: the words to rank; left out, the scene's own. words: how many are shown.
+        labels: the words to rank; left out, the scene's own. words: how many are shown.
         callback: called with each ``Pick``, also one that hit no instance. options: of ``enable_point_picking``.
         """
         self._scene = find_scene(None, scene if scene is not None else self._scene)
-        self._words = {"labels": labels, "text_features": text_features, "count": words}
+        self._labels, self._count = labels, words
         self._on_click = callback
         self._plotter.enable_point_picking(
             self.query,
-            **{"left_clicking": left_clicking, "show_point": False, "tolerance": 0.01, "font_size": TEXT_SIZE,
+            **{"left_clicking": True, "show_point": False, "tolerance": 0.01, "font_size": TEXT_SIZE,
                "show_message": "click a point, or P over it: what is it?", **options},
         )  # fmt: skip
 
@@ -182,11 +181,9 @@ class OgPlotter:
     def _answer(self, hit: Pick) -> str:
         if not hit.found:
             return str(hit)
-        cloud, options = hit.scene.cloud, self._words or {"labels": None, "text_features": None, "count": 5}
-        has_words = options["labels"] is not None or options["text_features"] is not None or cloud.vocabulary
-        if not has_words:
+        if self._labels is None and not hit.scene.vocabulary:
             return f"{hit}\n(the scene has no words of its own: pass labels)"
-        ranked = hit.words(options["labels"], text_features=options["text_features"])[: options["count"]]
+        ranked = hit.words(self._labels)[: self._count]
         lines = [f"{score:5.2f}  {word}" for word, score in ranked] or ["no mask gave it a feature: unknown"]
         return "\n".join([str(hit), *lines])
 
