@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import pyvista as pv
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 import og_pointcloud as og
 from og_pointcloud.ask.hosts import NAMES_FIELD, SCENE_FIELD
@@ -26,7 +26,7 @@ from og_pointcloud.formats.colors import label_colors
 from og_pointcloud.text.words import Labels, TextFeatures
 
 __all__ = [
-    "COLOR", "INSTANCE", "LABEL", "SCORE", "OgDataSet", "best_words", "box_lines", "label_names",
+    "COLOR", "INSTANCE", "LABEL", "SCORE", "OgDataSet", "box_lines", "label_names",
     "set_strings", "to_pyvista",
 ]  # fmt: skip
 
@@ -130,22 +130,6 @@ def label_names(mesh: pv.DataSet) -> tuple[str, ...]:
     return tuple(str(name) for name in np.asarray(mesh.field_data[NAMES_FIELD]).ravel())
 
 
-def best_words(mesh: pv.DataSet, scene: SceneLike | None = None) -> dict[int, str]:
-    """Instance id -> its label, or the scene's best own word for it where it has none, of instances with points here.
-
-    An empty string where nothing is known.
-    """
-    ids = _present(mesh.point_data[INSTANCE]) if INSTANCE in mesh.point_data else []
-    if LABEL in mesh.point_data:
-        names, labels = (*label_names(mesh), "unknown"), mesh.point_data[LABEL]
-        where = _first_rows(mesh.point_data[INSTANCE], ids)
-        return {instance: names[labels[row]] for instance, row in zip(ids, where, strict=True)}
-    if not ids:
-        return {}
-    table = find_scene(mesh, scene).instances
-    return {instance: table[instance].words[0][0] if table[instance].words else "" for instance in ids}
-
-
 def box_lines(rows: Iterable[Instance], colors: Mapping[int, Sequence[int]] | None = None) -> pv.PolyData:
     """Oriented boxes as lines, those of instances without points left out. colors: instance id -> RGB, else by id."""
     shown = [row for row in rows if row.oriented_box is not None]
@@ -194,14 +178,10 @@ def _present(ids: ArrayLike) -> list[int]:
     return [instance for instance in np.unique(np.asarray(ids)).tolist() if instance >= 0]
 
 
-def _first_rows(ids: ArrayLike, wanted: Sequence[int]) -> NDArray[np.intp]:
-    """Row of the first point of each id; all points of an instance have the same label."""
-    unique, first = np.unique(np.asarray(ids), return_index=True)
-    return first[np.searchsorted(unique, wanted)]
-
-
 def _instance_colors(mesh: pv.DataSet, ids: Sequence[int]) -> dict[int, Sequence[int]]:
-    rows = _first_rows(mesh.point_data[INSTANCE], ids)
+    """Of each instance the colour of its first point here; all have the same label."""
+    present, first = np.unique(np.asarray(mesh.point_data[INSTANCE]), return_index=True)
+    rows = first[np.searchsorted(present, ids)]
     return dict(zip(ids, np.asarray(mesh.point_data[COLOR])[rows].tolist(), strict=True))
 
 

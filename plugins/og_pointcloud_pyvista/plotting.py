@@ -20,7 +20,7 @@ from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.formats.colors import LUMINANCE, label_colors
 from og_pointcloud.show.viewpoint import FOCAL, Viewpoint, choose_viewpoint
 from og_pointcloud.text.words import Labels
-from og_pointcloud_pyvista.datasets import COLOR, INSTANCE, LABEL, best_words, box_lines, label_names
+from og_pointcloud_pyvista.datasets import COLOR, INSTANCE, LABEL, box_lines, label_names
 from og_pointcloud_pyvista.files import RGB
 
 __all__ = ["OgPlotter", "can_render"]
@@ -95,7 +95,7 @@ class OgPlotter:
         if legend:
             self._add_legend(labels, words, colored=by == "label")
         if names and INSTANCE in mesh.point_data:
-            self._add_names(mesh, labels, name)
+            self._add_names(mesh, labels, words, name)
         try:
             self._scene = find_scene(mesh)
         except OgPointcloudError:  # drawing needs none
@@ -222,8 +222,9 @@ class OgPlotter:
         for index, (_, color) in enumerate(entries if colored else []):
             legend.SetEntryIcon(index, _swatch(color))
 
-    def _add_names(self, mesh: Any, labels: NDArray[np.integer], name: str) -> None:
-        ids, words = np.asarray(mesh.point_data[INSTANCE]), best_words(mesh)
+    def _add_names(self, mesh: Any, labels: NDArray[np.integer], words: Sequence[str], name: str) -> None:
+        """Each labelled instance's word, the largest instances first."""
+        ids = np.asarray(mesh.point_data[INSTANCE])
         labelled = (labels >= 0) & (ids >= 0)
         order = np.argsort(ids[labelled], kind="stable")
         points, sorted_ids = np.asarray(mesh.points)[labelled][order], ids[labelled][order]
@@ -233,7 +234,7 @@ class OgPlotter:
         if len(largest):
             self._plotter.add_point_labels(
                 np.array([_middle_point(parts[part]) for part in largest]),
-                [words[int(present[part])] for part in largest],
+                [words[labels[labelled][order][first[part]]] for part in largest],
                 font_size=13, bold=False, font_family="arial", text_color="black", shape_color="white",
                 shape_opacity=0.8, margin=3, show_points=False, always_visible=True, name=f"{name}_names",
                 reset_camera=False,

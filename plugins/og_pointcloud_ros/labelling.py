@@ -20,8 +20,6 @@ UP = (0.0, 0.0, 1.0)
 MINIMUM_POINTS = 10
 """Points of an instance in a cloud from which it is a detection, and no speck."""
 
-WARM_UP_POINTS = 10_000
-
 
 class LabelledMessages(NamedTuple):
     """result: in the scene's world. points: sensor_msgs/PointCloud2. detections: vision_msgs/Detection3DArray."""
@@ -48,13 +46,6 @@ class CloudLabeller:
         self.segmenter = segmenter
         self._messages, self._frame, self._minimum_points = messages, frame, minimum_points
         self._instances = instance_table(segmenter.scene, up=UP)
-
-    def warm_up(self) -> None:
-        """Work out all boxes and open the graph now, not while the first clouds wait."""
-        for instance in self._instances:
-            _ = instance.oriented_box
-        scene = self.segmenter.scene
-        scene.instances_at(scene.xyz[:WARM_UP_POINTS] + scene.cloud.reach / 2)  # beside the cloud: the exact search too
 
     def __call__(self, message: Any, pose: NDArray[np.float64]) -> LabelledMessages:
         """message: a cloud in the sensor's frame. pose: (4, 4), takes it to the scene's frame.

@@ -39,9 +39,10 @@ def ros_messages(type_name: str, /, **fields: Any) -> Any:
     package, _, name = type_name.partition("/msg/")
     kind = getattr(importlib.import_module(f"{package}.msg"), name)
     # An array.array of bytes is taken over as it is; anything else is checked byte by byte.
-    return kind(
-        **{key: array.array("B", value.tobytes()) if _is_bytes(value) else value for key, value in fields.items()}
-    )
+    for key, value in fields.items():
+        if isinstance(value, np.ndarray) and value.dtype == np.uint8:
+            fields[key] = array.array("B", value.tobytes())
+    return kind(**fields)
 
 
 def header(messages: MessageFactory, frame_id: str, stamp: Any) -> Any:
@@ -62,7 +63,3 @@ def nanoseconds(stamp: Any) -> int:
     raise SceneError(
         f"stamp is a {type(stamp).__name__}; expected a Time message (sec, nanosec) or nanoseconds since the epoch"
     )
-
-
-def _is_bytes(value: Any) -> bool:
-    return isinstance(value, np.ndarray) and value.dtype == np.uint8

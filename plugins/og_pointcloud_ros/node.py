@@ -75,7 +75,6 @@ class SegmentNode(Node):
         self._labeller = CloudLabeller(
             self._segmenter(self._value("labels")), ros_messages, self._target_frame, self._value("minimum_points")
         )
-        self._labeller.warm_up()
         self._announce()
         self.add_on_set_parameters_callback(self._on_parameters)
         self._waiting: tuple[Any, float] | None = None
