@@ -234,7 +234,7 @@ class OgPlotter:
         if len(largest):
             self._plotter.add_point_labels(
                 np.array([_middle_point(parts[part]) for part in largest]),
-                [words[labels[labelled][order][first[part]]] for part in largest],
+                [words[int(labels[labelled][order][first[part]])] for part in largest],
                 font_size=13, bold=False, font_family="arial", text_color="black", shape_color="white",
                 shape_opacity=0.8, margin=3, show_points=False, always_visible=True, name=f"{name}_names",
                 reset_camera=False,
