@@ -196,4 +196,4 @@ def test_paper_mode_says_how_long_the_published_schedule_would_take() -> None:
     for stage in training:
         assert stage["steps"] == 10
         assert stage["published_steps"] == 20_000
-        assert stage["published_seconds"] >= stage["published_steps"] * stage["seconds_per_step"] * 0.99
+        assert stage["published_seconds"] == pytest.approx(2000 * stage["seconds"], abs=2)

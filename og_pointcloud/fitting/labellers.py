@@ -157,7 +157,7 @@ def paper(
             "steps": history.steps,
             "resumed_at": history.resumed_at,
             "published_steps": history.published_steps,
-            "seconds_per_step": round(history.seconds_per_step, 5),
+            "seconds": round(history.seconds, 3),
             "published_seconds": round(history.published_seconds, 1),
         }
         for history in (trained.history, *book.histories)

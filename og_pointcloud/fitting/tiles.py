@@ -37,7 +37,6 @@ from og_pointcloud.fitting.memory import memory_left
 from og_pointcloud.fitting.view_votes import view_votes
 from og_pointcloud.fitting.work_folder import WorkFolder, fingerprint
 from og_pointcloud.journal import Journal, LeftOut
-from og_pointcloud.kernels import njit, prange
 from og_pointcloud.rendering.geometry import (
     Neighbourhood,
     chance_of_place,
@@ -46,14 +45,14 @@ from og_pointcloud.rendering.geometry import (
     neighbourhood,
     sample_of_points,
 )
-from og_pointcloud.rendering.splatting import linearised_at, seen_from
+from og_pointcloud.rendering.splatting import FRUSTUM_MARGIN, LOW_PASS
 from og_pointcloud.rendering.surface import (
     sight_thickness,
     surface_thickness,
     with_distinct_points,
     with_needed_views,
 )
-from og_pointcloud.scene import Points, Scene, View
+from og_pointcloud.scene import Camera, Points, Scene, View
 from og_pointcloud.settings import FitSettings
 
 __all__ = ["Tiles", "fit_tiles", "needs_tiles", "split"]
@@ -212,9 +211,8 @@ def _tiled(points: Points, most: int, settings: FitSettings, work: WorkFolder, j
     tiles = split(points.xyz, most)
     points = points.take(tiles.order)
     parts = [tiles.part(tile) for tile in range(len(tiles))]
-    boxes = np.array([[points.xyz[part].min(axis=0), points.xyz[part].max(axis=0)] for part in parts])
     margins = [MARGIN * _sparse_spacing(points.xyz[part]) for part in parts]
-    members = tuple(_within(points.xyz, parts, boxes, tile, margin) for tile, margin in enumerate(margins))
+    members = tuple(_within(points.xyz, part, margin) for part, margin in zip(parts, margins, strict=True))
     cloud = _TiledCloud(tiles, points, np.empty(len(points), np.float32), members, key)
     for tile in journal.steps(range(len(tiles)), "spacing"):
         cloud.spacing[parts[tile]] = _neighbours(tile, cloud, settings, work).spacing[cloud.inner(tile)]
@@ -232,19 +230,10 @@ def _sparse_spacing(xyz: NDArray[np.float32]) -> float:
     return float(np.quantile(spacing, 0.95))
 
 
-def _within(
-    xyz: NDArray[np.float32], parts: Sequence[slice], boxes: NDArray[np.float32], tile: int, margin: float
-) -> NDArray[np.int32]:
-    """The points of a tile and, of the others, those that lie within the margin of its box."""
-    low, high = boxes[tile, 0] - margin, boxes[tile, 1] + margin
-    rows = []
-    for other, part in enumerate(parts):
-        index = np.arange(part.start, part.stop, dtype=np.int32)
-        if other != tile:
-            apart = (boxes[other, 0] > high).any() or (boxes[other, 1] < low).any()
-            index = index[:0] if apart else index[((xyz[part] >= low) & (xyz[part] <= high)).all(axis=1)]
-        rows.append(index)
-    return np.concatenate(rows)
+def _within(xyz: NDArray[np.float32], part: slice, margin: float) -> NDArray[np.int32]:
+    """The points of a tile and those of others that lie within the margin of its box."""
+    low, high = xyz[part].min(axis=0) - margin, xyz[part].max(axis=0) + margin
+    return np.flatnonzero(((xyz >= low) & (xyz <= high)).all(axis=1)).astype(np.int32)
 
 
 def _neighbours(tile: int, cloud: _TiledCloud, settings: FitSettings, work: WorkFolder) -> Neighbourhood:
@@ -410,41 +399,38 @@ def _worth_drawing(
     Those that lie FINEST_PX apart or more are all drawn; of others a part, by chance, such that they do. Larger in
     proportion, they cover what all of them did.
     """
-    camera, points = view.camera, cloud.points
-    widest = cloud.spacing * np.float32(drawing.scale) if points.scale is None else points.scale.max(axis=1)
-    intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
-    size, reach = (camera.width, camera.height), np.sqrt(-2 * np.log(alpha_min))
-    pose = camera.world_to_camera
-    spacing_px = _spacing_px(points.xyz, cloud.spacing, widest, reach, pose, intrinsics, size, drawing.near)
-    rows = np.flatnonzero(spacing_px)
-    spacing_px, finest = spacing_px[rows], FINEST_PX
+    parts = [
+        _in_image(view.camera, cloud, cloud.tiles.part(tile), drawing, alpha_min) for tile in range(len(cloud.tiles))
+    ]
+    rows, spacing_px = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+    finest = FINEST_PX
     while (part := np.minimum(1, (spacing_px / finest) ** 2, dtype=np.float32)).sum(dtype=np.float64) > MOST_SPLATS:
         finest *= 1.2
-    drawn = chance_of_place(points.xyz[rows], view.name) < part
+    drawn = chance_of_place(cloud.points.xyz[rows], view.name) < part
     return rows[drawn], (1 / np.sqrt(part[drawn])).astype(np.float32), len(rows)
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
-def _spacing_px(xyz, spacing, widest, reach, pose, intrinsics, size, near):  # noqa: ANN001, ANN202
-    """(n,) float32: the spacing of points in pixels where they are; 0 where they are surely in no pixel.
+def _in_image(
+    camera: Camera, cloud: _TiledCloud, part: slice, drawing: _Drawing, alpha_min: float
+) -> tuple[Rows, NDArray[np.float32]]:
+    """Rows of a tile's points that may show in a pixel, and their spacing in pixels where they are.
 
-    A splat reaches ``reach`` standard deviations, its own and those of the pixels' low-pass (splatting.py).
+    A splat reaches as many standard deviations, its own and the pixels' low-pass (splatting.py), as an opaque one needs
+    to fall to ``alpha_min``. The projection is linearised within a margin of the image: there a round one is widened.
     """
-    in_pixels = np.zeros(len(xyz), np.float32)
-    fx, fy, cx, cy = intrinsics
-    width, height = size
-    for g in prange(len(xyz)):
-        depth, tx, ty = seen_from(np.float64(xyz[g, 0]), np.float64(xyz[g, 1]), np.float64(xyz[g, 2]), pose)
-        if not depth > near:
-            continue
-        # The projection is linearised within a margin of the image: there a round splat is widened by its direction.
-        jx, jy = linearised_at(tx, ty, intrinsics, size)
-        reach_x = reach * (fx * widest[g] / depth * np.sqrt(1 + jx * jx) + 0.6) + 1
-        reach_y = reach * (fy * widest[g] / depth * np.sqrt(1 + jy * jy) + 0.6) + 1
-        u, v = fx * tx + cx, fy * ty + cy
-        if -reach_x < u < width + reach_x and -reach_y < v < height + reach_y:
-            in_pixels[g] = np.sqrt(fx * fy) * spacing[g] / depth
-    return in_pixels
+    points, spacing = cloud.points, cloud.spacing[part]
+    widest = spacing * (drawing.scale or 0) if points.scale is None else points.scale[part].max(axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        uv_px, depth = camera.project(points.xyz[part])
+        focal, center = np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy])
+        size = np.array([camera.width, camera.height])
+        slope = (np.maximum(center, size - center) + 0.5 * FRUSTUM_MARGIN * size) / focal
+        own_px = focal * np.sqrt(1 + slope**2) * (widest / depth)[:, None]
+        reach_px = np.sqrt(-2 * np.log(alpha_min)) * (own_px + np.sqrt(LOW_PASS)) + 1
+        shows = (depth > drawing.near) & ((uv_px > -reach_px) & (uv_px < size + reach_px)).all(axis=1)
+    inside = np.flatnonzero(shows)
+    spacing_px = np.sqrt(camera.fx * camera.fy) * spacing[inside] / depth[inside]
+    return part.start + inside, spacing_px.astype(np.float32)
 
 
 # Instances and points -------------------------------------------------------------------------------------------

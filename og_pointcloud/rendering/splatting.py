@@ -195,19 +195,17 @@ def binned_splats(
     pose, near = camera.world_to_camera, float(near)
     intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
     size = (camera.width, camera.height)
-    near_image = _near_image(gaussians.xyz, gaussians.scale, gaussians.opacity, pose, intrinsics, size, near, cutoffs)
-    chosen = np.flatnonzero(near_image).astype(np.int32)
-    splats, area = _records(len(chosen)), np.zeros(len(gaussians))
+    splats, area = _records(len(gaussians)), np.zeros(len(gaussians))
     keys = _project(
-        chosen,
         gaussians.xyz,
         gaussians.scale,
         gaussians.rotation,
         gaussians.opacity,
-        np.full(1, np.inf, np.float32) if thickness is None else thickness,
+        np.full(len(gaussians), np.inf, np.float32) if thickness is None else thickness,
         pose,
         intrinsics,
         size,
+        near,
         cutoffs,
         splats,
         area,
@@ -270,46 +268,19 @@ def linearised_at(tx, ty, intrinsics, size):  # noqa: ANN001, ANN201
 
 
 @njit(cache=True, parallel=True, nogil=True, error_model="numpy")
-def _near_image(xyz, scale, opacity, pose, intrinsics, size, near, cutoffs):  # noqa: ANN001, ANN202
-    """(n,) bool: Gaussians that may show. Most of a scene lies outside a view: turned away before an ellipse is known,
-    by the largest that it could be."""
-    n = len(xyz)
-    chosen = np.zeros(n, np.bool_)
+def _project(xyz, scale, rotation, opacity, thickness, pose, intrinsics, size, near, cutoffs, splats, area):  # noqa: ANN001, ANN202
+    """EWA projection in float64: writes splats (n,) and area (n,), the weight in pixels if nothing were in front;
+    returns depth keys (n,) uint64.
+
+    A key is the float32 depth's bits above the Gaussian: sorting keys sorts by depth, ties by Gaussian. Those without a
+    pixel have the key _CULLED.
+    """
+    keys = np.full(len(xyz), _CULLED)
     fx, fy, cx, cy = intrinsics
-    reach = -2.0 * np.log(cutoffs.alpha_min)  # squared Mahalanobis distance at which an opacity of 1 falls so low
-    for g in prange(n):
+    for g in prange(len(xyz)):
         depth, tx, ty = seen_from(np.float64(xyz[g, 0]), np.float64(xyz[g, 1]), np.float64(xyz[g, 2]), pose)
         if not depth > near or not opacity[g] > cutoffs.alpha_min:
             continue
-        jx, jy = linearised_at(tx, ty, intrinsics, size)
-        largest = np.float64(max(scale[g, 0], scale[g, 1], scale[g, 2])) / depth
-        xx = fx * fx * largest * largest * (1 + jx * jx) + LOW_PASS
-        yy = fy * fy * largest * largest * (1 + jy * jy) + LOW_PASS
-        chosen[g] = _reaches(fx * tx + cx, size[0], reach * xx) and _reaches(fy * ty + cy, size[1], reach * yy)
-    return chosen
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _reaches(at, size, reach_squared):  # noqa: ANN001, ANN202
-    """Whether what reaches so far (px^2) about ``at`` may show in pixels 0 to size."""
-    outside = max(-at, at - size) - 1.0
-    return not (outside > 0.0 and outside * outside > reach_squared)
-
-
-@njit(cache=True, parallel=True, nogil=True, error_model="numpy")
-def _project(chosen, xyz, scale, rotation, opacity, thickness, pose, intrinsics, size, cutoffs, splats, area):  # noqa: ANN001, ANN202
-    """EWA projection of the chosen Gaussians in float64: writes splats (m,) and area (n,), the weight in pixels if
-    nothing were in front; returns depth keys (m,) uint64.
-
-    A key is the float32 depth's bits above the place: sorting keys sorts by depth, ties by Gaussian. Splats without a
-    pixel have the key _CULLED.
-    """
-    m = len(chosen)
-    keys = np.empty(m, np.uint64)
-    fx, fy, cx, cy = intrinsics
-    for i in prange(m):
-        g = chosen[i]
-        depth, tx, ty = seen_from(np.float64(xyz[g, 0]), np.float64(xyz[g, 1]), np.float64(xyz[g, 2]), pose)
         jx, jy = linearised_at(tx, ty, intrinsics, size)
         sxx, sxy, syy, det = _covariance(scale[g], rotation[g], pose, fx / depth, fy / depth, jx, jy)
         u, v, sigma = fx * tx + cx, fy * ty + cy, np.float64(opacity[g])
@@ -319,16 +290,15 @@ def _project(chosen, xyz, scale, rotation, opacity, thickness, pose, intrinsics,
         rx, ry = np.sqrt(reach * sxx), np.sqrt(reach * syy)
         x0, x1 = max(np.ceil(u - rx - 0.5), 0.0), min(np.floor(u + rx - 0.5), size[0] - 1.0)
         y0, y1 = max(np.ceil(v - ry - 0.5), 0.0), min(np.floor(v + ry - 0.5), size[1] - 1.0)
-        keys[i] = _CULLED
         if not (x0 <= x1 and y0 <= y1 and det < np.inf):
             continue
-        s = splats[i]
+        s = splats[g]
         s.u, s.v, s.shear = u, v, -sxy / syy
         s.across, s.down = np.sqrt(0.5 * LOG2_E * syy / det), 0.5 * LOG2_E / syy
-        s.peak, s.depth, s.surface = peak, depth, depth - thickness[g if len(thickness) > 1 else 0]
+        s.peak, s.depth, s.surface = peak, depth, depth - thickness[g]
         s.x0, s.x1, s.y0, s.y1, s.gaussian = int(x0), int(x1), int(y0), int(y1), g
         area[g] = 2 * np.pi * np.sqrt(det) * (sigma - cutoffs.alpha_min)  # the integral of alpha over that ellipse
-        keys[i] = (np.uint64(np.float32(depth).view(np.uint32)) << np.uint64(32)) | np.uint64(i)
+        keys[g] = (np.uint64(np.float32(depth).view(np.uint32)) << np.uint64(32)) | np.uint64(g)
     return keys
 
 

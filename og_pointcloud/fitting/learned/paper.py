@@ -99,13 +99,11 @@ class TrainingRun:
 
 @dataclass
 class StageHistory:
-    """A stage's cost and losses. setup_seconds: before the first step (rendering the weights that are kept).
-    seconds: of all steps. loss: one number per step done. published_steps: steps at schedule_share 1.
-    resumed_at: the step that an earlier run had got to, 0 where there was none."""
+    """A stage's cost and losses. published_steps: steps at schedule_share 1. seconds: of all steps done. loss: one
+    number per step done. resumed_at: the step that an earlier run had got to, 0 where there was none."""
 
     name: str
     published_steps: int
-    setup_seconds: float
     seconds: float = 0.0
     loss: list[float] = field(default_factory=list)
     resumed_at: int = 0
@@ -116,14 +114,9 @@ class StageHistory:
         return len(self.loss)
 
     @property
-    def seconds_per_step(self) -> float:
-        """Mean over the steps done."""
-        return self.seconds / max(self.steps, 1)
-
-    @property
     def published_seconds(self) -> float:
         """What the stage would take at its published number of steps."""
-        return self.setup_seconds + self.published_steps * self.seconds_per_step
+        return self.published_steps * self.seconds / max(self.steps, 1)
 
 
 @dataclass(frozen=True)
@@ -160,11 +153,10 @@ def train_features(
     Raises SceneError where no view has a mask with a Gaussian in it.
     """
     settings, run = settings or PaperSettings(), run or TrainingRun()
-    start = time.perf_counter()
     source = _Views(gaussians, views, near, settings, whole=False)
     raw = torch.from_numpy(np.random.default_rng(run.seed).random((len(gaussians), settings.width), np.float32))
     key = _training_key(gaussians, views, near, settings, run)
-    history = StageHistory("features", STEPS[settings.schedule][0], time.perf_counter() - start)
+    history = StageHistory("features", STEPS[settings.schedule][0])
     stage = _Stage(history, raw, settings.feature_rate)
     late = LATE_STEP * settings.schedule_share
     for step, rng in stage.steps(settings, run, key):
@@ -231,26 +223,23 @@ def train_codebook(
     moves each feature by the gradient of its centre (straight through). Positions count in scene units, as published.
     """
     settings, run = settings or PaperSettings(), run or TrainingRun()
-    start = time.perf_counter()
     rng = np.random.default_rng(run.seed)
     source = _Views(gaussians, views, near, settings, whole=settings.formula == "paper")
     known = np.flatnonzero(source.seen > 0)
     training = _CodebookTraining(source, torch.from_numpy(np.array(features, np.float32)), known, settings)
     key = _training_key(gaussians, views, near, settings, run, features)
-    setup = time.perf_counter() - start
 
-    coarse = StageHistory("coarse codebook", STEPS[settings.schedule][1], setup)
+    coarse = StageHistory("coarse codebook", STEPS[settings.schedule][1])
     places = settings.position_weight * gaussians.xyz[known]
     first = rng.permutation(len(known))[: settings.k1]
     centres = np.concatenate([features[known[first]], places[first]], axis=1)
     together = _Parts([np.arange(len(known))], [len(centres)], places)
     own, _ = training.train(coarse, centres, together, run, key)
 
-    start = time.perf_counter()
     members = [np.flatnonzero(own == cluster) for cluster in range(len(centres))]
     allowed = _fine_counts(source, known, own, len(centres), settings)
     seeds = [rng.permutation(rows)[:count] for rows, count in zip(members, allowed, strict=True)]
-    fine = StageHistory("fine codebook", STEPS[settings.schedule][2], time.perf_counter() - start)
+    fine = StageHistory("fine codebook", STEPS[settings.schedule][2])
     fine_centres = training.features.numpy()[known[np.concatenate(seeds)]]
     apart = _Parts(members, [len(rows) for rows in seeds], np.zeros((len(known), 0), np.float32))
     own_fine, fine_centres = training.train(fine, fine_centres, apart, run, key)
