@@ -116,13 +116,21 @@ def room(rng: Random, seed: int) -> Place:
     return Place(made, lambda views, surfaces, rng: walk(made, surfaces, views, rng))
 
 
+def _in_the_way(item: Item) -> bool:
+    """Whether it stands in the middle of the flat, where the doorway is."""
+    xy = np.concatenate([part.vertices for part in item.parts])[:, :2]
+    return bool((xy.min(axis=0) < (0.7, 0.8)).all() and (xy.max(axis=0) > (-0.7, -0.8)).all())
+
+
 def flat(rng: Random, seed: int) -> Place:
     """Two furnished rooms with a doorway between them, walked through at head height, looking a little down."""
     both = [furnish(seed), furnish(seed + 1000)]
     width = max(made.size[0] for made in both) + 0.2
     size = (2 * width, max(made.size[1] for made in both), 2.6)
-    items = [item.moved((side * width / 2, 0, 0)) for side, made in zip((-1, 1), both, strict=True) for item in
-             made.objects]  # fmt: skip
+    items = [
+        item.moved((side * width / 2, 0, 0)) for side, made in zip((-1, 1), both, strict=True) for item in made.objects
+    ]
+    items = [item for item in items if not _in_the_way(item)]
     plain = _in_shell(rng, items, size)
     walls = [
         Item("wall", (box((0.1, size[1] / 2 - 0.5, 2.6), (0, side * (size[1] / 4 + 0.25), 0), paint(rng, 0.1)),))
@@ -136,7 +144,7 @@ def flat(rng: Random, seed: int) -> Place:
             eye = np.array([0.55 * width * np.sin(turn / 2), 0.3 * np.sin(turn), 1.65 + 0.03 * rng.normal()])
             heading = turn + 1.5 * np.sin(2 * turn) + 0.2 * rng.normal()
             while surfaces.distance_m(eye[None])[0] < 0.25:
-                eye *= (0.9, 0.9, 1.01)
+                eye[:2] *= 0.9  # at last it stands in the doorway
             ahead = np.array([np.cos(heading), np.sin(heading), -0.45 + 0.1 * rng.normal()])
             taken.append(looking_at(eye, eye + ahead, 0.03 * rng.normal()))
         return taken

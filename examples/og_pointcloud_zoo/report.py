@@ -58,11 +58,12 @@ def _means(rows: Sequence[Row]) -> str:
         above = sum(share >= 0.01 for share in called)
         text += f", background called {100 * np.mean(called):.2f} % ({above} of {len(called)} scenes 1 % or more)"
     text += f", {sum(row.seconds for row in rows):.0f} s"
-    beside = [row for row in rows if row.baseline_miou is not None and row.gain_high is not None]
-    if beside:
-        text += f"; best baselines {np.mean([row.baseline_miou for row in beside if row.baseline_miou]):.4f}"
-        lost = [row.scene for row in beside if row.gain_high is not None and row.gain_high < 0]
-        text += f", better than ours beyond the interval on {len(lost)}" + (f": {', '.join(lost)}" if lost else "")
+    text += f" ({sum(row.core_seconds for row in rows):.0f} s of cores)"
+    best = [row.baseline_miou for row in rows if row.baseline_miou is not None]
+    if best:
+        lost = [row.scene for row in rows if row.gain_high is not None and row.gain_high < 0]
+        text += f"; best baselines {np.mean(best):.4f}, better than ours beyond the interval on {len(lost)}"
+        text += f": {', '.join(lost)}" if lost else ""
     said = [(row.agreement, row.miou) for row in rows if row.agreement is not None]
     if len(said) > 2:
         text += f"; rank correlation of agreement and mIoU {rank_correlation(*zip(*said, strict=True)):.2f}"

@@ -1,0 +1,156 @@
+"""The zoo: scenes are as drawn, the same every time, and their rows are what the scorers say."""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+import zoo
+from og_pointcloud_zoo import make
+from og_pointcloud_zoo.draws import ANY, KINDS, draw, half_of, scene_names
+from og_pointcloud_zoo.measure import Row, measure, parsed_settings
+from og_pointcloud_zoo.report import rank_correlation, summary
+
+import og_pointcloud as og
+from og_pointcloud.errors import OgPointcloudError
+from og_pointcloud.evaluate.truth import read_truth
+from og_pointcloud.formats.capture import read_capture
+
+TINY = replace(draw("boxes-0"), points=1500, views=6, width=96, height=72, outliers=0.01, floaters=0.01, hidden=0.2,
+               all_masked=False)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def scenes(tmp_path_factory):
+    cache = tmp_path_factory.mktemp("zoo")
+    return [make.made_scene(replace(TINY, name=f"tiny-{half}", seed=half), cache) for half in (0, 1)]
+
+
+def test_every_kind_has_a_scene_in_each_half_and_its_numbers_are_as_fixed():
+    names = scene_names()
+    assert len(names) >= 40
+    assert len(set(names)) == len(names)
+    assert [half_of(name) for name in names[:2]] == ["choose", "judge"]
+    for kind, fixed in KINDS.items():
+        for number in (0, 1):
+            one = draw(f"{kind}-{number}")
+            for key, usual in ANY.items():
+                low, high = fixed.get(key, usual)
+                slack = 8 if key == "width" else 0  # widths are multiples of 16
+                assert low - slack <= getattr(one, key) <= high + slack, (one.name, key)
+
+
+def test_which_half_follows_from_the_name_alone():
+    assert half_of("ycb_0049") == half_of("hololens_office") == "judge"
+    assert half_of("room2") == half_of("seven_redkitchen") == "choose"
+
+
+def test_a_scene_is_as_drawn(scenes):
+    scene, truth = read_capture(scenes[0]), read_truth(scenes[0])
+    assert len(scene.points) == TINY.points
+    assert len(scene.views) == TINY.views
+    assert truth.background is not None
+    views = np.load(scenes[0] / "gt.npz")["views"]
+    astray = int(0.01 * TINY.points) * 2  # outliers and floaters: of no class, and no background
+    assert np.count_nonzero((views == 0) & (truth.cls < 0) & ~truth.background) >= astray
+    assert not truth.background[views == 0].any()
+    # Each point that has a class stands where cameras see it: in as many images as the truth says, or more.
+    xyz = scene.points.xyz + scene.points.origin
+    inside = np.zeros(len(xyz), int)
+    for view in scene.views:
+        uv, depth = view.camera.project(scene.points.xyz)
+        inside += view.camera.shows(uv) & (depth > 0)
+    assert (inside >= views).mean() > 0.99  # noise may carry a point over an image's edge
+    things = xyz[truth.scored & (truth.cls >= 0)]
+    assert things[:, 2].max() < 1.2  # boxes: 0.45 m and another of 0.7 times that
+    assert things[:, 2].min() > -0.1
+
+
+def test_the_same_draw_is_the_same_scene(scenes, tmp_path):
+    again = make.made_scene(replace(TINY, name="tiny-0", seed=0), tmp_path)
+    for path in sorted(scenes[0].rglob("*")):
+        if path.is_file() and path.suffix != ".npz":
+            assert (again / path.relative_to(scenes[0])).read_bytes() == path.read_bytes(), path.name
+    first, second = (np.load(folder / "gt.npz") for folder in (scenes[0], again))
+    assert all((first[name] == second[name]).all() for name in first.files)
+
+
+def test_a_scene_is_made_whole_or_not_at_all(tmp_path, monkeypatch):
+    def fails(capture, folder):
+        (folder / "points.ply").write_bytes(b"half")
+        raise OSError("disk full")
+
+    monkeypatch.setattr(make, "write_capture", fails)
+    with pytest.raises(OSError, match="disk full"):
+        make.made_scene(TINY, tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_things_that_share_a_mask_are_the_ones_that_are_drawn():
+    place = make.PLACES["shelf"](np.random.default_rng(0), 0)
+    owner = make._together(place.room, 3)
+    moved = np.flatnonzero(owner[:-1] != np.arange(len(owner) - 1))
+    names = [item.name for item in place.room.objects]
+    assert len(moved) == 3
+    assert all(names[k] in make.SMALL and names[owner[k]] == "shelf" for k in moved)
+    assert owner[-1] == -1
+
+
+@pytest.mark.slow
+def test_a_row_is_what_the_scorers_say(scenes, tmp_path, capsys):
+    zoo.main(["-o", str(tmp_path), "--captures", *map(str, scenes), "--only", "tiny", "--set", "mode=grouping"])
+    with open(tmp_path / "zoo.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["scene"] for row in rows] == ["tiny-0", "tiny-1"]
+    assert (tmp_path / "zoo.png").read_bytes()[:4] == b"\x89PNG"
+    printed = capsys.readouterr().out
+    assert "1 scenes for choosing" in printed
+    assert "1 scenes for judging alone" in printed
+    truth = read_truth(scenes[0])
+    cloud = og.fit(read_capture(scenes[0]), og.FitSettings(mode="grouping"), progress=False)
+    with np.load(scenes[0] / "word_bank.npz") as bank:
+        cloud = replace(cloud, word_bank=og.WordBank(bank["vectors"]))
+    result = og.segment(cloud, None, text_features=scenes[0] / "text_features.npz")
+    called, counted = np.array([*result.names, ""])[result.labels], (truth.cls >= 0) & truth.scored
+    ious = []
+    for k in np.unique(truth.cls[counted]):
+        true, said = (truth.cls == k) & counted, (called == truth.names[k]) & (counted | truth.background)
+        if true.sum() >= 30:
+            ious.append((true & said & counted).sum() / (true | said).sum())
+    assert float(rows[0]["miou"]) == pytest.approx(np.mean(ious), abs=0.02)  # classes below 30 points are left out
+    assert float(rows[0]["background"]) == pytest.approx(np.mean(called[truth.background] != ""))
+    gain = [float(rows[0][key]) for key in ("gain_low", "gain", "gain_high")]
+    assert gain == sorted(gain)
+    assert gain[1] == pytest.approx(float(rows[0]["miou"]) - float(rows[0]["baseline_miou"]), abs=1e-9)
+
+
+def test_settings_are_changed_by_path():
+    settings = parsed_settings(["membership.sure_share=0.5", "mode=grouping", "geometry.scales=(0.5,)"])
+    assert (settings.membership.sure_share, settings.mode, settings.geometry.scales) == (0.5, "grouping", (0.5,))
+    with pytest.raises(OgPointcloudError, match=r"'membership\.sure' is no setting"):
+        parsed_settings(["membership.sure=0.5"])
+
+
+def test_the_summary_names_scenes_where_a_baseline_is_better():
+    values = {one.name: 0 for one in fields(Row)}
+    lost = Row(**{**values, "scene": "a-0", "half": "choose", "baseline": "b", "background": 0.02, "gain_high": -0.1})
+    drawn = replace(lost, scene="b-0", gain_high=0.1, background=None)
+    text = summary([lost, drawn])
+    assert "better than ours beyond the interval on 1: a-0" in text
+    assert "1 of 1 scenes 1 % or more" in text
+
+
+def test_rank_correlation_by_hand():
+    assert rank_correlation([1, 2, 3], [2, 4, 8]) == pytest.approx(1)
+    assert rank_correlation([1, 2, 3], [8, 4, 2]) == pytest.approx(-1)
+    # Spearman's formula without ties: 1 - 6 sum d^2 / (n (n^2 - 1)), here 1 - 6 * 2 / 24.
+    assert rank_correlation([1, 2, 3], [10, 30, 20]) == pytest.approx(0.5)
+
+
+@pytest.mark.slow
+def test_measuring_without_baselines_leaves_them_out(scenes):
+    row = measure(scenes[0], og.FitSettings(mode="grouping"), baselines=False)
+    assert row.baseline is None
+    assert 0 < row.miou <= 1
