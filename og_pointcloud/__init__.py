@@ -44,6 +44,7 @@ if TYPE_CHECKING:
         Vocabulary,
         WordBank,
     )
+    from og_pointcloud.collection.collection import Collection, Finding, Findings
     from og_pointcloud.errors import BundleError, FeatureSpaceError, MissingExtraError, OgPointcloudError, SceneError
     from og_pointcloud.fitting.fit import fit
     from og_pointcloud.fitting.opengaussian import read_opengaussian
@@ -63,7 +64,10 @@ __all__ = [
     "Box",
     "BundleError",
     "Camera",
+    "Collection",
     "FeatureSpaceError",
+    "Finding",
+    "Findings",
     "FitSettings",
     "Instance",
     "InstanceTable",
@@ -112,6 +116,7 @@ _HOMES = {
     "og_pointcloud.cloud": (
         "BACKGROUND", "TOO_FAR", "UNKNOWN", "UNOBSERVED", "InstanceTable", "LabelledCloud", "Vocabulary", "WordBank",
     ),
+    "og_pointcloud.collection.collection": ("Collection", "Finding", "Findings"),
     "og_pointcloud.errors": (
         "BundleError", "FeatureSpaceError", "MissingExtraError", "OgPointcloudError", "SceneError",
     ),

@@ -13,7 +13,19 @@ PACKAGES = {
     "og_pointcloud_ros": "plugins",
 }
 RECORDS = ("errors", "scene", "cloud", "settings", "journal", "models", "kernels")
-FOLDERS = ("formats", "rendering", "text", "masking", "fitting", "bundle", "ask", "show", "evaluate", "cli")
+FOLDERS = (
+    "formats",
+    "rendering",
+    "text",
+    "masking",
+    "fitting",
+    "bundle",
+    "ask",
+    "collection",
+    "show",
+    "evaluate",
+    "cli",
+)
 
 Edges = dict[str, dict[str, int]]
 """Importing module -> imported module -> line."""

@@ -40,7 +40,7 @@ from og_pointcloud.cloud import (
 )  # fmt: skip
 from og_pointcloud.settings import ChoosingSettings
 
-__all__ = ["Choice", "Chooser", "Reason"]
+__all__ = ["Choice", "Chooser", "Reason", "Standard"]
 
 ROWS_AT_ONCE = 2048
 """Descriptors compared with all others at once."""
@@ -153,6 +153,21 @@ class Choice:
         return labels[instances], scores[instances], reasons[instances]  # negative ids index from the end
 
 
+@dataclass(frozen=True)
+class Standard:
+    """What turns the cosines of a scene's R descriptors into evidence, for those who ask many scenes at once.
+
+    An instance's evidence is the largest, over its descriptors, of ``scale * ((descriptor - common) @ direction) +
+    shift``, where ``direction`` is the text's unit vector without the bank's mean, of length one again.
+    common: (D,) float32. scale, shift: (R,) float32. sharpness: as `Chooser.sharpness`.
+    """
+
+    common: NDArray[np.float32]
+    scale: NDArray[np.float32]
+    shift: NDArray[np.float32]
+    sharpness: float
+
+
 class Chooser:
     """The instances of one scene, prepared for any number of labels. Cheap to keep, safe to share by threads."""
 
@@ -175,7 +190,8 @@ class Chooser:
         if bank is None or len(self._descriptors) == 0:
             return
         self._require_width(bank.vectors, "word bank's vectors")
-        self._centred = self._descriptors - common_part(self._descriptors, self.settings.same_look)
+        self._common = common_part(self._descriptors, self.settings.same_look)
+        self._centred = self._descriptors - self._common
         self._bank_directions = unit_rows(bank.vectors - bank.mean)
         scores = self._centred @ self._bank_directions.T
         self._middle, self._spread = _moments(scores)
@@ -183,6 +199,14 @@ class Chooser:
         self._best_middle, self._best_spread = _moments(best)
         self._bank_evidence = (best - self._best_middle) / self._best_spread
         self.sharpness = float(max(self.settings.sharpness, np.quantile(self._bank_evidence.max(axis=1), 0.75)))
+
+    def standard(self) -> Standard:
+        """Steps 1 and 2 as arrays; of a scene with a word bank and at least one descriptor."""
+        of_instance = np.searchsorted(self._described, self._owner)
+        middle, spread = self._best_middle[of_instance], self._best_spread[of_instance]
+        scale, shift = 1 / (self._spread * spread), -(self._middle / self._spread + middle) / spread
+        columns = scale[:, 0].astype(np.float32), shift[:, 0].astype(np.float32)
+        return Standard(self._common, *columns, self.sharpness)
 
     def choose(self, texts: ArrayLike) -> Choice:
         """The label of each instance.
