@@ -144,6 +144,11 @@ class Collection:
         """Names of all scenes: their files' paths below ``root``, without the ending."""
         return tuple(entry.name for entry in self.entries)
 
+    @property
+    def words(self) -> tuple[str, ...]:
+        """All words that some scene stores, sorted; an encoder may know more."""
+        return tuple(sorted({word for pool in self._pools.values() for word in pool}))
+
     def file(self, scene: str) -> Path:
         """The .ogpc file of a scene, where it was when it was indexed."""
         return self.root / f"{scene}.ogpc"

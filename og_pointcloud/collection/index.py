@@ -155,7 +155,7 @@ def _add(atlas: Atlas, name: str, found: ReadScene) -> None:
     words = atlas.add_words(vocabulary.names, unit_rows(vocabulary.vectors)) if vocabulary else None
     judge = atlas.add_words(("",) * len(bank.vectors), bank.vectors) if bank else None
     width = arrays.descriptors.shape[1] if len(arrays.descriptors) else 0
-    facts = (found.digest, found.bytes, found.modified, found.feature_space, width, found.points)
+    facts = (found.digest, found.bytes, found.modified, found.feature_space, width, found.points, len(arrays.instances))
     atlas.add(SceneEntry(0, name, *facts, words, judge, int(found.encoder)), arrays)
 
 

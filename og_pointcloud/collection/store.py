@@ -74,6 +74,7 @@ class SceneEntry:
     feature_space: str
     width: int
     points: int
+    instances: int
     vocabulary: str | None
     bank: str | None
     encoder: int = 0
@@ -202,11 +203,15 @@ class Atlas:
 
     def entries(self) -> list[SceneEntry]:
         """All scenes, by name."""
-        columns = "id, name, digest, bytes, modified, space, width, points, vocabulary, bank, encoder, kin, judge"
+        columns = "id, name, digest, bytes, modified, space, width, points, length(instances) / ?, vocabulary, bank, "
+        columns += "encoder, kin, judge"
         statement = f"SELECT {columns} FROM scenes LEFT JOIN judgements ON scene = id ORDER BY name"
-        texts, numbers = ("name", "digest", "feature_space"), ("id", "bytes", "modified", "width", "points")
+        texts, numbers = (
+            ("name", "digest", "feature_space"),
+            ("id", "bytes", "modified", "width", "points", "instances"),
+        )
         entries = []
-        for row in self._rows(statement):
+        for row in self._rows(statement, (INSTANCE.itemsize,)):
             entry = SceneEntry(*row)
             sound = all(isinstance(getattr(entry, name), str) for name in texts) and all(
                 isinstance(getattr(entry, name), int) and getattr(entry, name) >= 0 for name in numbers

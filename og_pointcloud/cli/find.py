@@ -1,0 +1,59 @@
+"""Find things by words in all scenes of an index, best first.
+
+og-pointcloud find atlas "fire extinguisher" --html found.html
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+from og_pointcloud.cli.common import Parser, add_output, add_shared, check_at_least, numbers
+
+
+def add(parser: Parser) -> None:
+    parser.add_argument("atlas", type=Path, metavar="ATLAS", help="what `index` wrote")
+    parser.add_argument("words", nargs="+", metavar="WORD", help="words or phrases")
+    parser.add_argument(
+        "--within",
+        metavar="X,Y,Z,X,Y,Z",
+        help="two corners of a box, the low one first: things with their middle in it",
+    )
+    parser.add_argument(
+        "--scene",
+        action="append",
+        metavar="NAME",
+        help="ask only this one, or those of a pattern: 'site3/*'; repeatable",
+    )
+    parser.add_argument("--top", type=int, default=20, metavar="N", help="how many (default: %(default)s)")
+    add_output(parser, "--html", endings=(".html", ".htm"), help="also write a page with a picture of each")
+    add_shared(parser, "--text-features", "--json")
+
+
+def run(arguments: argparse.Namespace) -> None:
+    from og_pointcloud.collection.collection import Collection
+    from og_pointcloud.collection.findings_page import write_findings
+
+    check_at_least("--top", arguments.top, 1)
+    corners = None if arguments.within is None else numbers(arguments.within, "--within", 6)
+    collection = Collection(arguments.atlas)
+    findings = collection.find(
+        arguments.words,
+        within=None if corners is None else (corners[:3], corners[3:]),
+        scenes=arguments.scene,
+        top=arguments.top,
+        text_features=arguments.text_features,
+    )
+    if arguments.html:
+        write_findings(arguments.html, collection, findings, ", ".join(arguments.words))
+    for note in findings.not_asked:
+        print(f"warning: {note}", file=sys.stderr)
+    if arguments.json:
+        print(findings.to_json())
+        return
+    print(findings if findings else "nothing was found there: no instance with a feature has its middle in the box")
+    if not all(finding.calibrated for finding in findings):
+        print("scores of scenes without a judge say how much better the word fits than other known words do")
+    if arguments.html:
+        print(f"wrote {arguments.html}")

@@ -1,0 +1,34 @@
+"""Bring an index of many scenes up to date: all .ogpc files in a folder, for `find`.
+
+og-pointcloud index scans -o atlas
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+from og_pointcloud.cli.common import Parser, print_next, replaceable
+
+
+def add(parser: Parser) -> None:
+    parser.add_argument("folder", type=Path, metavar="DIR", help="folder with .ogpc files, also in folders below it")
+    parser.add_argument(
+        "-o", "--output", type=replaceable, required=True, metavar="ATLAS",
+        help="the index, one file; where it is there, only what changed is read",
+    )  # fmt: skip
+
+
+def run(arguments: argparse.Namespace) -> None:
+    from og_pointcloud.collection.collection import Collection
+
+    collection = Collection.index(arguments.folder, arguments.output)
+    changes = collection.changes
+    assert changes is not None
+    for name, cause in changes.left_out:
+        print(f"warning: {name} is left out: {cause}", file=sys.stderr)
+    instances = sum(entry.instances for entry in collection.entries)
+    print(f"{changes}: {len(collection.scenes):,} scenes with {instances:,} instances in {arguments.output}")
+    if collection.words:
+        print_next("find", arguments.output, collection.words[0])

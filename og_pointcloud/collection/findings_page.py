@@ -1,0 +1,123 @@
+"""What was found, as a page with a picture of each: drawn from the points of its scene, where that is still there."""
+
+from __future__ import annotations
+
+import base64
+import html
+import os
+import struct
+import zlib
+
+import numpy as np
+from numpy.typing import NDArray
+
+from og_pointcloud.ask.labelled_scene import as_scene
+from og_pointcloud.cloud import LabelledCloud
+from og_pointcloud.collection.collection import Collection, Finding, Findings
+from og_pointcloud.errors import OgPointcloudError
+from og_pointcloud.formats.atomic import replacing
+
+__all__ = ["picture", "write_findings"]
+
+SIDE_PX = 200
+AROUND = 0.35
+"""How much of a thing's largest length is shown around it."""
+MOST_POINTS = 60_000
+"""Points that a picture is drawn from."""
+LARGEST_PX = 4
+"""Half the side of a drawn point, at most."""
+EYE = np.array([1.0, -1.4, 1.1])
+"""Where the eye is, as seen from the thing; z is up, as `og-pointcloud view` has it unless told."""
+PAPER = 250
+FADED = 0.6
+"""How far what is around a thing fades into the paper."""
+HIGHLIGHT = (214, 90, 40)
+"""Colour of things in clouds without colours."""
+
+PAGE = """<!doctype html><html><head><meta charset="utf-8"><title>{title}</title><style>
+body {{ font: 15px/1.4 system-ui, sans-serif; margin: 2em; color: #222; background: #fff }}
+main {{ display: grid; grid-template-columns: repeat(auto-fill, minmax(200px, 1fr)); gap: 1.2em }}
+figure {{ margin: 0 }} img, .none {{ width: 100%; aspect-ratio: 1; border-radius: 6px; background: #fafafa }}
+.none {{ display: grid; place-items: center; color: #999 }} figcaption {{ font-size: 13px }}
+b {{ font-size: 15px }} .score {{ float: right }}
+</style></head><body><h1>{title}</h1><p>{notes}</p><main>
+{cards}
+</main></body></html>
+"""
+
+
+def write_findings(path: str | os.PathLike[str], collection: Collection, findings: Findings, title: str) -> None:
+    """Write the page, whole or not at all. title: what was asked."""
+    text = PAGE.format(
+        title=html.escape(title),
+        notes="<br>".join(map(html.escape, findings.not_asked)),
+        cards="\n".join(_card(rank, finding, collection) for rank, finding in enumerate(findings, 1)),
+    )
+    with replacing(path) as file:
+        file.write(text.encode())
+
+
+def _card(rank: int, finding: Finding, collection: Collection) -> str:
+    try:
+        cloud = as_scene(collection.file(finding.scene)).cloud
+        png = base64.b64encode(picture(cloud, finding)).decode()
+        shown = f'<img alt="instance {finding.instance}" src="data:image/png;base64,{png}">'
+    except (OgPointcloudError, OSError):  # moved, or written anew: what was found then is still true of it then
+        shown = '<div class="none">file not found</div>'
+    center, size = (", ".join(f"{value:.3g}" for value in values) for values in (finding.center, finding.size))
+    return (
+        f'<figure>{shown}<figcaption><span class="score">{finding.score:.3f}</span><b>{rank}. '
+        f"{html.escape(finding.word)}</b><br>{html.escape(finding.scene)}, instance {finding.instance}<br>"
+        f"at {center}<br>size {size}</figcaption></figure>"
+    )
+
+
+def picture(cloud: LabelledCloud, finding: Finding) -> bytes:
+    """A square PNG of an instance and what is around it, without perspective."""
+    half = np.array(finding.size) / 2
+    reach = half + AROUND * max(2 * half.max(), 8 * cloud.spacing)
+    local = cloud.xyz - (np.array(finding.center) - cloud.origin).astype(np.float32)
+    near = np.flatnonzero((np.abs(local) <= reach).all(axis=1))
+    near = near[:: 1 + len(near) // MOST_POINTS]
+    is_it = cloud.instance_ids[near] == finding.instance
+    if cloud.rgb is None:
+        colors = np.where(is_it[:, None], HIGHLIGHT, 150).astype(float)
+    else:
+        colors = cloud.rgb[near].astype(float)
+    colors[~is_it] += FADED * (PAPER - colors[~is_it])
+    return png_bytes(_drawn(local[near].astype(float), colors, 2 * float(np.linalg.norm(reach)), cloud.spacing))
+
+
+def _drawn(
+    points: NDArray[np.float64], colors: NDArray[np.float64], extent: float, spacing: float
+) -> NDArray[np.uint8]:
+    """(SIDE_PX, SIDE_PX, 3): the nearest point of each pixel. points: about the middle. extent: what a side shows."""
+    back = EYE / np.linalg.norm(EYE)
+    right = np.cross((0, 0, 1), back)
+    right /= np.linalg.norm(right)
+    axes = np.stack([right, -np.cross(back, right), back])
+    across, down, depth = axes @ points.T
+    half = int(np.clip(round(0.6 * spacing * SIDE_PX / extent), 1, LARGEST_PX))
+    square = np.arange(-half, half + 1)
+    steps = np.stack(np.meshgrid(square, square), axis=-1).reshape(-1, 2)
+    place = np.rint(np.stack([across, down], axis=-1) * (SIDE_PX / extent) + SIDE_PX / 2).astype(int)
+    order = np.argsort(depth, kind="stable")  # from behind: of what is drawn twice the last stays
+    pixels = (place[order, None] + steps).reshape(-1, 2)
+    inside = ((pixels >= 0) & (pixels < SIDE_PX)).all(axis=1)
+    shown = np.full((SIDE_PX, SIDE_PX, 3), PAPER, np.uint8)
+    x, y = pixels[inside].T
+    shown[y, x] = np.repeat(colors[order], len(steps), axis=0)[inside]
+    return shown
+
+
+def png_bytes(image: NDArray[np.uint8]) -> bytes:
+    """An image (H, W, 3) as PNG: numpy and zlib are all that is needed."""
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    height, width = image.shape[:2]
+    rows = np.concatenate([np.zeros((height, 1), np.uint8), image.reshape(height, -1)], axis=1)  # 0: no filter
+    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+    body = chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(rows.tobytes(), 6)) + chunk(b"IEND", b"")
+    return b"\x89PNG\r\n\x1a\n" + body
