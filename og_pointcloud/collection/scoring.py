@@ -22,7 +22,7 @@ from og_pointcloud.settings import ChoosingSettings
 __all__ = ["Block", "Ranked", "load_block"]
 
 RELEVANCY_TEMPERATURE = 10.0
-"""Factor of the cosines in LERF's relevancy (Kerr et al., LERF: Language Embedded Radiance Fields, ICCV 2023, Sec. 3.4):
+"""Factor of the cosines in LERF's relevancy (Kerr et al., Language Embedded Radiance Fields, ICCV 2023, Sec. 3.4):
 of its released code, the paper gives none."""
 
 ROWS_AT_ONCE = 512
