@@ -45,6 +45,7 @@ if TYPE_CHECKING:
         WordBank,
     )
     from og_pointcloud.collection.collection import Collection, Finding, Findings
+    from og_pointcloud.collection.fit_many import CaptureFit, FitOptions, fit_many
     from og_pointcloud.errors import BundleError, FeatureSpaceError, MissingExtraError, OgPointcloudError, SceneError
     from og_pointcloud.fitting.fit import fit
     from og_pointcloud.fitting.opengaussian import read_opengaussian
@@ -64,10 +65,12 @@ __all__ = [
     "Box",
     "BundleError",
     "Camera",
+    "CaptureFit",
     "Collection",
     "FeatureSpaceError",
     "Finding",
     "Findings",
+    "FitOptions",
     "FitSettings",
     "Instance",
     "InstanceTable",
@@ -89,6 +92,7 @@ __all__ = [
     "feature_colors",
     "feature_picture",
     "fit",
+    "fit_many",
     "in_world",
     "instance_table",
     "load",
@@ -117,6 +121,7 @@ _HOMES = {
         "BACKGROUND", "TOO_FAR", "UNKNOWN", "UNOBSERVED", "InstanceTable", "LabelledCloud", "Vocabulary", "WordBank",
     ),
     "og_pointcloud.collection.collection": ("Collection", "Finding", "Findings"),
+    "og_pointcloud.collection.fit_many": ("CaptureFit", "FitOptions", "fit_many"),
     "og_pointcloud.errors": (
         "BundleError", "FeatureSpaceError", "MissingExtraError", "OgPointcloudError", "SceneError",
     ),

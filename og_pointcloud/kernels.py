@@ -7,10 +7,15 @@ import os
 import numba
 from numba import get_num_threads, njit, prange
 
-__all__ = ["get_num_threads", "njit", "prange"]
+__all__ = ["get_num_threads", "njit", "prange", "use_threads"]
 
 # OpenMP first: numba else tries TBB, and warns where it finds an old one. A user's own choice is kept.
 # Threads that wait sleep: spinning ones double the time of a fit wherever another program has a core.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 if "NUMBA_THREADING_LAYER_PRIORITY" not in os.environ:
     numba.config.THREADING_LAYER_PRIORITY = ["omp", "tbb", "workqueue"]  # pyright: ignore
+
+
+def use_threads(count: int) -> None:
+    """Run the kernels that this Python thread calls on so many threads, or as many as numba was started with."""
+    numba.set_num_threads(max(1, min(count, numba.config.NUMBA_NUM_THREADS)))  # pyright: ignore

@@ -1,22 +1,25 @@
-"""Turn a capture folder (posed images with masks, and a cloud) into one .ogpc file.
+"""Turn a capture folder (posed images with masks, and a cloud) into one .ogpc file; or many folders, on many workers.
 
 og-pointcloud fit kitchen -o kitchen.ogpc
+  og-pointcloud fit scans/* --out fitted --scheduler tcp://10.0.0.1:8786
 """
 
 from __future__ import annotations
 
 import argparse
 import sys
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, get_args, get_type_hints
+from typing import TYPE_CHECKING, get_args, get_type_hints
 
 from og_pointcloud.cli.common import (
     Parser,
     add_output,
-    add_shared,
     describe_fit,
     print_fit,
+    print_next,
+    print_table,
     replaceable,
     timed,
     write_fit,
@@ -26,15 +29,29 @@ from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.settings import FitSettings, PaperSettings
 
 if TYPE_CHECKING:
+    from concurrent.futures import Executor
+
     from og_pointcloud.cloud import LabelledCloud
+    from og_pointcloud.collection.fit_many import FitOptions
 
 MODES = get_args(get_type_hints(FitSettings)["mode"])
 MASK_LEVELS = ("default", "small", "medium", "large")
 
 
 def add(parser: Parser) -> None:
-    add_shared(parser, "capture")
-    add_output(parser, "-o", "--output", endings=(".ogpc",), required=True, help="the file to write")
+    parser.add_argument(
+        "capture", type=Path, nargs="+", metavar="CAPTURE", help="folder with images and poses; several with --out"
+    )
+    target = parser.add_mutually_exclusive_group(required=True)
+    add_output(target, "-o", "--output", endings=(".ogpc",), help="the file to write")
+    target.add_argument(
+        "--out", type=replaceable, metavar="DIR",
+        help="folder for a file of each capture, DIR/NAME.ogpc; those that are there are left as they are",
+    )  # fmt: skip
+    parser.add_argument(
+        "--scheduler", metavar="ADDRESS",
+        help="of a Dask cluster that takes the captures, or the tiles of one (default: processes of this machine)",
+    )  # fmt: skip
     parser.add_argument("--gaussians", type=Path, metavar="F.ply", help="geometry, in place of the capture's own")
     parser.add_argument("--mode", choices=MODES, default="auto", help="how to find instances (default: %(default)s)")
     parser.add_argument(
@@ -70,34 +87,60 @@ def add(parser: Parser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
+    alone = [name for name in ("work", "ply") if getattr(arguments, name) is not None]
+    if arguments.out is None and len(arguments.capture) > 1:
+        raise OgPointcloudError(f"{len(arguments.capture)} captures and one output; expected --out DIR for so many")
+    if arguments.out is not None and alone:
+        raise OgPointcloudError(f"--{alone[0]} is for a single file; expected -o S.ogpc with it, or leave it out")
     settings = fit_settings(arguments)
-    from og_pointcloud.bundle.vocabulary import scene_words
-    from og_pointcloud.cloud import FeatureSpace
-    from og_pointcloud.fitting.fit import fit
-    from og_pointcloud.fitting.work_folder import kept_files
-    from og_pointcloud.formats.capture import read_capture
+    from og_pointcloud.collection.fit_many import FitOptions
+    from og_pointcloud.collection.workers import dask_executor
 
-    stages: list[dict[str, Any]] = []
-    with timed(stages, "read capture"):
-        scene = read_capture(arguments.capture, gaussians=arguments.gaussians, mask_level=arguments.mask_level)
-        space = FeatureSpace(scene.feature_space, scene.feature_width)
-        asked = {"text_features": arguments.vocabulary, "word_bank": arguments.word_bank}
-        words = scene_words(space, **asked, capture=arguments.capture)
+    options = FitOptions(settings, arguments.gaussians, arguments.mask_level, arguments.vocabulary, arguments.word_bank)
+    with dask_executor(arguments.scheduler) if arguments.scheduler else nullcontext() as executor:
+        (fit_one if arguments.out is None else fit_several)(arguments, options, executor)
+
+
+def fit_one(arguments: argparse.Namespace, options: FitOptions, executor: Executor | None) -> None:
+    from og_pointcloud.collection.fit_many import fit_capture
+    from og_pointcloud.fitting.work_folder import kept_files
+
+    capture = arguments.capture[0]
     work = arguments.work or arguments.output.with_name(f"{arguments.output.name}.work")
     try:
-        cloud = words.added_to(fit(scene, settings, work=work))
+        cloud = fit_capture(capture, options, work=work, executor=executor, progress=True)
     except KeyboardInterrupt:
         if views := kept_files(work, "view"):
             print(f"{views} views are kept in '{work}': the same command goes on behind them", file=sys.stderr)
         raise
-    cloud = write_fit(cloud, stages + cloud.provenance["stages"], arguments.output)
+    cloud = write_fit(cloud, cloud.provenance["stages"], arguments.output)
     if arguments.ply:
         with timed(cloud.provenance["stages"], "write cloud"):
             write_cloud(cloud, arguments.output, arguments.ply)
-    report = describe_fit(cloud, arguments.capture, arguments.output)
+    report = describe_fit(cloud, capture, arguments.output)
     if arguments.json:
         write_json(arguments.json, report)
     print_fit(report, cloud)
+
+
+def fit_several(arguments: argparse.Namespace, options: FitOptions, executor: Executor | None) -> None:
+    from og_pointcloud.collection.fit_many import fit_many
+
+    fits = fit_many(arguments.capture, arguments.out, executor, options=options)
+    if arguments.json:
+        write_json(arguments.json, {"fits": [fit.to_dict() for fit in fits]})
+    if made := [fit for fit in fits if fit.state == "fitted"]:
+        rows = [(fit.name, f"{fit.points:,}", str(fit.instances), f"{fit.seconds:.1f}") for fit in made]
+        print_table(("capture", "points", "instances", "seconds"), rows)
+    failed = [fit for fit in fits if fit.state == "failed"]
+    there = len(fits) - len(made) - len(failed)
+    print(f"{len(made)} fitted, {there} were there already, {len(failed)} failed, in {arguments.out}")
+    for fit in failed:
+        print(f"failed: {fit.capture}: {fit.cause}", file=sys.stderr)
+    if len(failed) < len(fits):
+        print_next("index", arguments.out, "-o", arguments.out / "atlas")
+    if failed:
+        raise OgPointcloudError(f"{len(failed)} of {len(fits)} captures failed: mend them, then the same command again")
 
 
 def fit_settings(arguments: argparse.Namespace) -> FitSettings:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -32,6 +33,7 @@ def fit(
     settings: FitSettings | None = None,
     *,
     work: str | os.PathLike[str] | None = None,
+    executor: Executor | None = None,
     progress: bool = True,
 ) -> LabelledCloud:
     """Label a scene: which points form one instance, and what the encoder saw of each.
@@ -41,6 +43,8 @@ def fit(
 
     work: a folder in which the views of a long fit, and the training of mode "paper", are kept, so that the next call
     goes on where this one was interrupted or killed; its files are removed at the end. None: nothing is kept.
+    executor: of `concurrent.futures`, takes the tiles and views of a fit in tiles as tasks; its workers see the work
+    folder, or, without one, the folder for temporary files, by the same path. The result is the same, bit for bit.
     progress: show bars on a terminal.
 
     Deterministic: the same scene and settings give the same ids on every run. Raises SceneError where the scene
@@ -66,7 +70,7 @@ def fit(
     with WorkFolder.open(work) as kept:
         if needs_tiles(scene, settings):
             _check(scene, journal)
-            labelling, spacing = fit_tiles(scene, settings, kept, journal)
+            labelling, spacing = fit_tiles(scene, settings, kept, journal, executor)
             return _labelled_cloud(scene, labelling, spacing, settings, journal)
         prepared = prepare(scene, settings, journal, kept)
         return fit_prepared(prepared, settings, journal, None if work is None else kept)

@@ -19,6 +19,7 @@ neither the order nor the place of the tiles shows in the result, but for what h
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -99,7 +100,9 @@ def needs_tiles(scene: Scene, settings: FitSettings) -> bool:
     return settings.mode in MODES and points > LEAST_TILE and points * FIT_BYTES > memory_left(settings.memory)
 
 
-def fit_tiles(scene: Scene, settings: FitSettings, work: WorkFolder, journal: Journal) -> tuple[Labelling, float]:
+def fit_tiles(
+    scene: Scene, settings: FitSettings, work: WorkFolder, journal: Journal, executor: Executor | None = None
+) -> tuple[Labelling, float]:
     """Label a scene as `fit` does by grouping masks, in memory that the tiles bound, not the cloud. Returns the
     labelling of all its points, and their typical spacing.
 

@@ -1,0 +1,207 @@
+"""Many captures -> a .ogpc file each, on any executor. One that fails, or dies, leaves the others alone."""
+
+from __future__ import annotations
+
+import os
+import socket
+import time
+from collections.abc import Iterable, Sequence
+from concurrent.futures import Executor, Future, as_completed
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal
+
+from og_pointcloud.ask.hosts import import_plugin
+from og_pointcloud.bundle.read import read_bundle
+from og_pointcloud.bundle.scene_words import scene_words
+from og_pointcloud.cloud import FeatureSpace, LabelledCloud
+from og_pointcloud.collection.progress import counted
+from og_pointcloud.collection.workers import LocalWorkers, Share, share_here
+from og_pointcloud.errors import OgPointcloudError
+from og_pointcloud.fitting.fit import fit
+from og_pointcloud.formats.capture import read_capture
+from og_pointcloud.journal import LeftOut
+from og_pointcloud.kernels import use_threads
+from og_pointcloud.settings import FitSettings
+
+__all__ = ["CaptureFit", "FitOptions", "fit_capture", "fit_many"]
+
+
+@dataclass(frozen=True)
+class FitOptions:
+    """How captures are read and fitted. Arguments of `read_capture`, `fit` and `scene_words`."""
+
+    settings: FitSettings = field(default_factory=FitSettings)
+    gaussians: str | Path | None = None
+    mask_level: Literal["default", "small", "medium", "large"] = "large"
+    text_features: str | os.PathLike[str] | None = None
+    word_bank: str | os.PathLike[str] | None = None
+
+
+@dataclass(frozen=True)
+class CaptureFit:
+    """What became of a capture. state: "fitted", "was there" (its file is whole already) or "failed", then with the
+    cause. worker: where, as host:process. peak_bytes: the most memory that this process has held, 0 if unknown."""
+
+    capture: str
+    output: str
+    state: Literal["fitted", "was there", "failed"]
+    cause: str = ""
+    seconds: float = 0.0
+    points: int = 0
+    instances: int = 0
+    worker: str = ""
+    peak_bytes: int = 0
+
+    @property
+    def name(self) -> str:
+        """Of the capture: the last part of its path."""
+        return Path(self.capture).name
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-able."""
+        return asdict(self)
+
+
+def fit_many(
+    captures: Iterable[str | os.PathLike[str]],
+    out: str | os.PathLike[str],
+    executor: Executor | None = None,
+    *,
+    options: FitOptions | None = None,
+    progress: bool = True,
+) -> tuple[CaptureFit, ...]:
+    """Fit captures, one a task, to ``out``/NAME.ogpc, NAME being the last part of a capture's path.
+
+    executor: any of `concurrent.futures`; None: processes of this machine. Of a Dask cluster it is
+    ``dask.distributed.Client(address).get_executor(pure=False)``: captures and ``out`` lie where its workers see them.
+    A task takes its share of the worker's memory and cores; `FitSettings.memory` is the most for each.
+
+    Files that are there and whole are left as they are; fits that were killed go on behind the views that they kept.
+    Returns what became of each, in the order given; nothing is raised for a capture that fails. The files do not depend
+    on where and in what order they were made; so they hold no times, which are in what is returned.
+    OgPointcloudError, before any work, for two captures of one name.
+
+    >>> og.fit_many([], "out")
+    ()
+    """
+    options, out = options or FitOptions(), Path(out).resolve()
+    jobs = _outputs([Path(capture).resolve() for capture in captures], out)
+    done = {
+        capture: CaptureFit(str(capture), str(path), "was there") for capture, path in jobs.items() if _is_whole(path)
+    }
+    todo = {capture: path for capture, path in jobs.items() if capture not in done}
+    if todo:
+        out.mkdir(parents=True, exist_ok=True)
+        with _executor(executor, len(todo)) as (workers, share):
+            futures = {workers.submit(_try_fit, str(c), str(path), options, share): c for c, path in todo.items()}
+            for future in counted(as_completed(futures), "fit", len(futures), progress):
+                capture = futures[future]
+                done[capture] = _outcome(future, capture, todo[capture])
+    return tuple(done[capture] for capture in jobs)
+
+
+def _outputs(captures: Sequence[Path], out: Path) -> dict[Path, Path]:
+    """The file of each capture."""
+    names: dict[str, Path] = {}
+    for capture in captures:
+        if names.setdefault(capture.name, capture) != capture:
+            raise OgPointcloudError(
+                f"'{names[capture.name]}' and '{capture}' would both become {capture.name}.ogpc; expected folders of "
+                "different names: fit them to two folders"
+            )
+    return {capture: out / f"{name}.ogpc" for name, capture in names.items()}
+
+
+def _is_whole(path: Path) -> bool:
+    try:
+        read_bundle(path)
+    except OgPointcloudError:
+        return False
+    return True
+
+
+@contextmanager
+def _executor(given: Executor | None, tasks: int):  # noqa: ANN202
+    """The executor, and what each of its tasks may take."""
+    if given is not None:
+        at_once = getattr(given, "_max_workers", None)  # of pools of the standard library, and those made like them
+        yield given, Share() if at_once is None else Share.of_machine(at_once)
+        return
+    own = LocalWorkers(tasks)
+    try:
+        yield own, own.share
+    except BaseException:
+        own.shutdown(cancel_futures=True)
+        raise
+    own.shutdown()
+
+
+def _outcome(future: Future[CaptureFit], capture: Path, output: Path) -> CaptureFit:
+    try:
+        return future.result()
+    except Exception as error:  # of the executor: a task's own are in what it returns
+        cause = f"its worker died ({type(error).__name__}: {error!s:.160}); out of memory, or killed?"
+        return CaptureFit(str(capture), str(output), "failed", cause)
+
+
+def _try_fit(capture: str, output: str, options: FitOptions, share: Share) -> CaptureFit:
+    """The task: never raises, as not every error survives the way back from another process."""
+    start, worker = time.perf_counter(), f"{socket.gethostname()}:{os.getpid()}"
+    try:
+        cloud = _fit(Path(capture), Path(output), options, share_here(share))
+    except Exception as error:
+        cause = str(error) or type(error).__name__
+        if not isinstance(error, (OgPointcloudError, OSError, ImportError)):
+            cause = f"{type(error).__name__}: {cause}"
+        seconds = round(time.perf_counter() - start, 3)
+        return CaptureFit(capture, output, "failed", cause, seconds, worker=worker, peak_bytes=peak_memory())
+    seconds = round(time.perf_counter() - start, 3)
+    counts = len(cloud), len(cloud.instances)
+    return CaptureFit(capture, output, "fitted", "", seconds, *counts, worker, peak_memory())
+
+
+def _fit(capture: Path, output: Path, options: FitOptions, share: Share) -> LabelledCloud:
+    if share.threads is not None:
+        use_threads(share.threads)
+    limits = [limit for limit in (options.settings.memory, share.memory) if limit is not None]
+    settings = replace(options.settings, memory=min(limits, default=None))
+    work = output.with_name(f"{output.name}.work")
+    cloud = fit_capture(capture, replace(options, settings=settings), work=work)
+    cloud = replace(cloud, provenance=_without_circumstances(cloud.provenance, options.settings))
+    import_plugin("og_pointcloud_export", "fit").write_bundle(cloud, output)
+    return cloud
+
+
+def fit_capture(
+    capture: Path, options: FitOptions, *, work: Path | None, executor: Executor | None = None, progress: bool = False
+) -> LabelledCloud:
+    """A capture's cloud with its words, not yet written. work, executor, progress: as of `fit`."""
+    start = time.perf_counter()
+    scene = read_capture(capture, gaussians=options.gaussians, mask_level=options.mask_level)
+    space = FeatureSpace(scene.feature_space, scene.feature_width)
+    words = scene_words(space, text_features=options.text_features, word_bank=options.word_bank, capture=capture)
+    reading = {"name": "read capture", "seconds": round(time.perf_counter() - start, 4)}
+    cloud = words.added_to(fit(scene, options.settings, work=work, executor=executor, progress=progress))
+    return replace(cloud, provenance={**cloud.provenance, "stages": [reading, *cloud.provenance["stages"]]})
+
+
+def _without_circumstances(provenance: dict[str, Any], settings: FitSettings) -> dict[str, Any]:
+    """Provenance without what depends on where, when and beside what a fit ran."""
+    return {
+        **provenance,
+        "settings": {**provenance["settings"], "memory": settings.memory},
+        "stages": [],
+        "left_out": [entry for entry in provenance["left_out"] if entry["key"] != LeftOut.RENDERING.value],
+        "notes": {name: note for name, note in provenance["notes"].items() if name != "table"},
+    }
+
+
+def peak_memory() -> int:
+    """The most memory that this process has held, in bytes; 0 where the system does not tell."""
+    try:
+        lines = Path("/proc/self/status").read_text().splitlines()
+        return next(1024 * int(line.split()[1]) for line in lines if line.startswith("VmHWM:"))
+    except (OSError, StopIteration):
+        return 0
