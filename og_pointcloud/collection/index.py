@@ -236,7 +236,7 @@ def _lent_bank(atlas: Atlas, family: Sequence[SceneEntry], words: Mapping[str, V
 def _judged(atlas: Atlas, entry: SceneEntry, judge: str) -> Standard:
     arrays = atlas.arrays(entry)
     table = instance_table_of(arrays)
-    return Chooser(table, WordBank(atlas.words(judge).vectors), feature_space=entry.feature_space).standard()
+    return Chooser(table, atlas.bank(judge, entry.width), feature_space=entry.feature_space).standard()
 
 
 def instance_table_of(arrays: SceneArrays) -> InstanceTable:

@@ -195,7 +195,7 @@ def load_block(atlas: Atlas, entries: Sequence[SceneEntry]) -> Block:
             parts[name].append(arrays.instances[name][instance])
         start += len(arrays.owner)
     together = {name: np.concatenate(arrays) for name, arrays in parts.items()}
-    bank = WordBank(atlas.words(judge).vectors) if judge else None
+    bank = atlas.bank(judge, width) if judge else None
     common = np.array([standard.common for standard in standards], np.float32).reshape(len(standards), width)
     return Block(
         entries=tuple(entries),

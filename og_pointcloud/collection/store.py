@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from og_pointcloud.ask.choosing import Standard
-from og_pointcloud.cloud import Vocabulary
+from og_pointcloud.cloud import MIN_BANK, Vocabulary, WordBank
 from og_pointcloud.errors import OgPointcloudError
 
 __all__ = ["INSTANCE", "Atlas", "SceneArrays", "SceneEntry"]
@@ -245,6 +245,13 @@ class Atlas:
             raise self._refused(f"the sharpness of '{entry.name}' is {sharpness!r:.40}")
         common, scale, shift = np.split(numbers, [entry.width, entry.width + rows])
         return Standard(common, scale, shift, sharpness)
+
+    def bank(self, digest: str, width: int) -> WordBank:
+        """The words that judge descriptors of a width."""
+        vectors = self.words(digest).vectors
+        if vectors.shape[1] != width or len(vectors) < MIN_BANK:
+            raise self._refused(f"a bank has {vectors.shape}; expected at least {MIN_BANK} words of width {width}")
+        return WordBank(vectors)
 
     def words(self, digest: str) -> Vocabulary:
         """A vocabulary, or a bank, whose words have names of no meaning."""

@@ -1,0 +1,354 @@
+"""Many scenes asked at once give what asking each would, and no word crosses from one encoder's space to another's."""
+
+from __future__ import annotations
+
+import json
+import os
+import sqlite3
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from labelled_clouds import instance_table, unit_rows
+
+import og_pointcloud as og
+from og_pointcloud.cli import main
+from og_pointcloud.cloud import LabelledCloud, Vocabulary, WordBank
+from og_pointcloud.collection.findings_page import picture, png_bytes
+from og_pointcloud.collection.index import index
+from og_pointcloud.collection.store import Atlas
+from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError
+
+WIDTH = 32
+THINGS = ("chair", "desk", "lamp", "mug", "plant", "sofa", "bed", "rug")
+ENCODER = dict(zip(THINGS, unit_rows(len(THINGS), WIDTH, seed=9), strict=True))
+BANK = WordBank(unit_rows(80, WIDTH, seed=4))
+SPACE = "tests/encoder"
+
+
+def scene(things, seed=0, *, space=SPACE, encoder=ENCODER, words=THINGS, bank=None, noise=0.1, at=0.0, common=0.0):
+    """A cloud with an instance of 4 points for each thing, one unit apart along x; the second has two descriptors."""
+    random = np.random.default_rng(seed)
+    owners = sorted([*range(len(things)), *([1] if len(things) > 1 else [])])
+    rows = np.array([encoder[things[k]] for k in owners]) + noise * random.normal(size=(len(owners), WIDTH)) + common
+    rows = (rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(np.float32)
+    table = replace(instance_table(len(things), owners, WIDTH), descriptors=rows)
+    corners = np.array([[0, 0, 0], [0.4, 0, 0], [0, 0.2, 0], [0, 0, 0.3]])
+    xyz = (np.arange(len(things))[:, None, None] * [1, 0, 0] + corners).reshape(-1, 3).astype(np.float32)
+    vectors = np.array([encoder[name] for name in words], np.float32).reshape(-1, WIDTH)
+    return LabelledCloud(
+        xyz, np.array([at, 0, 0]), np.repeat(np.arange(len(things)), 4).astype(np.int32), table, space, 0.3, 0.9,
+        vocabulary=Vocabulary(tuple(words), vectors) if words else None, word_bank=bank,
+    )  # fmt: skip
+
+
+@pytest.fixture
+def folder(tmp_path):
+    return tmp_path / "scans"
+
+
+def indexed(folder: Path, clouds: dict[str, LabelledCloud]) -> og.Collection:
+    for name, cloud in clouds.items():
+        og.write_bundle(cloud, folder / f"{name}.ogpc")
+    return og.Collection.index(folder, folder.parent / "atlas", progress=False)
+
+
+def many(count: int, **options) -> dict[str, LabelledCloud]:
+    random = np.random.default_rng(1)
+    things = [list(random.choice(THINGS, random.integers(1, 7))) for _ in range(count)]
+    return {f"site{k % 3}/room{k:02d}": scene(things[k], k, **options) for k in range(count)}
+
+
+@pytest.mark.parametrize("word", THINGS)
+def test_scores_are_those_of_each_scene_alone(folder, word):
+    clouds = many(12, bank=BANK, noise=0.6, common=0.3)
+    found = indexed(folder, clouds).find(word, top=10_000)
+    assert len(found) == sum(len(cloud.instances) for cloud in clouds.values())
+    by_key = {(finding.scene, finding.instance): finding for finding in found}
+    for name, cloud in clouds.items():
+        for match in og.select(cloud, word, against=[]):
+            finding = by_key[name, match.instance]
+            assert finding.score == pytest.approx(match.score, abs=2e-4)
+            assert (finding.calibrated, finding.points) == (True, 4)
+    scores = [finding.score for finding in found]
+    assert scores == sorted(scores, reverse=True)
+
+
+@pytest.mark.parametrize("top", [1, 3, 40])
+def test_the_best_are_found_without_scoring_all(folder, top, monkeypatch):
+    monkeypatch.setattr("og_pointcloud.collection.scoring.FIRST", 1)
+    collection = indexed(folder, many(40, bank=BANK, noise=0.8, common=0.3))
+    for word in THINGS:
+        everything = collection.find(word, top=10_000)
+        some = collection.find(word, top=top)
+        assert [(f.scene, f.instance) for f in some] == [(f.scene, f.instance) for f in everything[:top]]
+        assert [f.score for f in some] == pytest.approx([f.score for f in everything[:top]])
+
+
+def test_the_room_with_the_thing_comes_first(folder):
+    things = {name: [name, *(other for other in THINGS[:3] if other != name)] for name in THINGS[3:]}
+    clouds = {f"{name} room": scene(kinds, k, noise=0.1) for k, (name, kinds) in enumerate(things.items())}
+    collection = indexed(folder, clouds)
+    for name in things:
+        best = collection.find(name)[0]
+        assert (best.scene, best.instance, best.fits) == (f"{name} room", 0, True)
+
+
+def test_cosines_of_two_scenes_are_not_compared_but_judged_by_the_words_that_they_share(folder):
+    """One scene's features all lie near the texts, as a detector's do; the other's far from them, as an image's."""
+    words = {f"word{k}": row for k, row in enumerate(unit_rows(60, WIDTH, seed=2))}
+    shared = unit_rows(1, WIDTH, seed=3)[0]
+    texts = {name: (row + 2 * shared) / np.linalg.norm(row + 2 * shared) for name, row in words.items()}
+    images = {name: row - 2 * shared for name, row in words.items()}
+    near = scene(["word1", "word2"], 0, encoder=texts, words=list(texts), noise=0.02)
+    far = replace(
+        scene(["word5", "word6"], 1, encoder=images, words=list(texts), noise=0.02), vocabulary=near.vocabulary
+    )
+    text = texts["word5"]
+    assert near.instances.cosines(text[None]).max() > far.instances.cosines(text[None]).max() + 0.3
+    collection = indexed(folder, {"near": near, "far": far})
+    best = collection.find("word5")[0]
+    assert (best.scene, best.instance, best.calibrated) == ("far", 0, True)
+    assert collection.find("word1")[0].scene == "near"
+
+
+def test_a_word_is_never_asked_in_the_space_of_another_encoder(folder):
+    other = dict(zip(THINGS, unit_rows(len(THINGS), WIDTH, seed=77), strict=True))
+    impostor = {"chair": ENCODER["chair"], "desk": ENCODER["desk"]}
+    clouds = {
+        "ours": scene(["chair", "desk"]),
+        "same name": scene(["mug", "chair"], encoder=other, words=["mug", "chair"]),
+        "other name": scene(["chair"], encoder=impostor, words=["desk"], space="another/encoder"),
+        "nobody's": scene(["chair"], encoder=impostor, words=["desk"], space="unknown"),
+        "nobody's too": scene(["chair"], encoder=impostor, words=[], space="unknown"),
+    }
+    collection = indexed(folder, clouds)
+    found = collection.find("lamp", top=100)
+    assert {finding.scene for finding in found} == {"ours"}
+    assert len(found.not_asked) == 3
+    found = collection.find("chair", top=100)
+    assert {finding.scene for finding in found} == {"ours", "same name"}
+    best = {finding.scene: finding.instance for finding in reversed(found.found)}
+    assert best == {"ours": 0, "same name": 1}
+
+
+def test_scenes_without_words_are_asked_in_those_of_their_kin(folder):
+    collection = indexed(folder, {"a": scene(["desk"]), "b": scene(["chair"], words=[])})
+    assert collection.find("chair")[0].scene == "b"
+    with pytest.raises(OgPointcloudError, match=r"'chairs' is not among the 8 words .* mean 'chair'"):
+        collection.find("chairs")
+
+
+def test_vectors_are_asked_where_only_one_encoder_can_be_meant(folder):
+    clouds = {"a": scene(["desk"]), "b": scene(["chair"], space="another/encoder")}
+    collection = indexed(folder, clouds)
+    with pytest.raises(FeatureSpaceError, match="2 kinds of scenes"):
+        collection.find({"seat": ENCODER["chair"]})
+    assert [f.scene for f in collection.find({"seat": ENCODER["chair"]}, scenes="b")] == ["b"]
+    features = (Vocabulary(("seat",), ENCODER["chair"][None]), "another/encoder")
+    assert {f.scene for f in collection.find("seat", text_features=features)} == {"b"}
+    with pytest.raises(FeatureSpaceError):
+        collection.find({"seat": np.ones(5)})
+
+
+def test_box_and_scenes_restrict(folder):
+    clouds = {f"room{k}": scene(THINGS[:5], k, at=10.0 * k) for k in range(6)}
+    collection = indexed(folder, clouds)
+    everything = collection.find("lamp", top=100)
+    low, high = np.array([9.5, -1, -1]), np.array([22.5, 1, 1])
+    inside = [f for f in everything if (np.array(f.center) >= low).all() and (np.array(f.center) <= high).all()]
+    assert len(inside) == 5 + 3  # of room 2 the first three
+    for fresh in (collection, og.Collection(folder.parent / "atlas")):  # with all in memory, and with nothing
+        found = fresh.find("lamp", within=(low, high), top=100)
+        assert {(f.scene, f.instance): pytest.approx(f.score) for f in found} == {
+            (f.scene, f.instance): f.score for f in inside
+        }
+        assert {f.scene for f in fresh.find("lamp", scenes=["room1", "room[34]"])} == {"room1", "room3", "room4"}
+    assert not collection.find("lamp", within=([500, 0, 0], [501, 1, 1]))
+    with pytest.raises(OgPointcloudError, match="no scene is called 'room9'"):
+        collection.find("lamp", scenes="room9")
+    with pytest.raises(OgPointcloudError, match="the low one first"):
+        collection.find("lamp", within=(high, low))
+
+
+def test_places_are_those_of_the_instances(folder):
+    cloud = scene(["chair", "desk"], at=1e6)
+    found = indexed(folder, {"far away": cloud}).find("desk")[0]
+    box = og.instance_table(cloud)[1].axis_aligned_box
+    assert box is not None
+    np.testing.assert_allclose(found.center, box.center, atol=1e-6)
+    np.testing.assert_allclose(found.size, box.size, atol=1e-6)
+
+
+def test_only_what_changed_is_read_again(folder, monkeypatch):
+    collection = indexed(folder, many(6))
+    names = collection.scenes
+    assert collection.changes is not None
+    assert collection.changes.added == names
+    (folder / f"{names[0]}.ogpc").unlink()
+    og.write_bundle(scene(["bed"], 99), folder / f"{names[1]}.ogpc")
+    os.utime(folder / f"{names[2]}.ogpc")  # another date, the same content
+    (folder / f"{names[3]}.ogpc").write_bytes(b"no zip")
+    og.write_bundle(scene(["rug"], 98), folder / "new.ogpc")
+    read = []
+    from og_pointcloud.collection import index as module
+
+    original = module.read_bundle
+    monkeypatch.setattr(module, "read_bundle", lambda path: read.append(path.stem) or original(path))
+    changes = index(folder, folder.parent / "atlas", progress=False)
+    assert sorted(read) == sorted([Path(names[1]).name, Path(names[3]).name, "new"])
+    assert (changes.added, changes.replaced, changes.removed) == (("new",), (names[1],), (names[0],))
+    assert [name for name, _ in changes.left_out] == [names[3]]
+    assert changes.unchanged == 3
+    fresh = og.Collection.index(folder, folder.parent / "other", progress=False)
+    again = og.Collection(folder.parent / "atlas")
+    assert set(again.scenes) == {names[1], names[2], names[4], names[5], "new"}
+    for word in THINGS:
+        assert again.find(word, top=100).to_json() == fresh.find(word, top=100).to_json()
+
+
+def test_a_change_that_fails_leaves_the_atlas_as_it_was(folder, monkeypatch):
+    collection = indexed(folder, many(4))
+    before = collection.find("chair", top=100).to_json()
+    content = (folder.parent / "atlas").read_bytes()
+    og.write_bundle(scene(["chair"], 50), folder / "late.ogpc")
+    monkeypatch.setattr("og_pointcloud.collection.index.settle", lambda atlas: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        index(folder, folder.parent / "atlas", progress=False)
+    with pytest.raises(ZeroDivisionError):
+        index(folder, folder.parent / "new atlas", progress=False)
+    assert not (folder.parent / "new atlas").exists()
+    assert (folder.parent / "atlas").read_bytes() == content
+    assert og.Collection(folder.parent / "atlas").find("chair", top=100).to_json() == before
+
+
+def test_files_are_read_side_by_side(folder):
+    from concurrent.futures import ThreadPoolExecutor
+
+    first = indexed(folder, many(5, bank=BANK))
+    with ThreadPoolExecutor(3) as executor:
+        second = og.Collection.index(folder, folder.parent / "other", executor=executor, progress=False)
+    assert first.find("mug", top=99).to_json() == second.find("mug", top=99).to_json()
+
+
+def test_tough_scenes(folder):
+    empty = replace(scene(["chair"]), xyz=np.zeros((0, 3), np.float32), instance_ids=np.zeros(0, np.int32))
+    nothing = replace(scene(["chair"]), instances=instance_table(0, width=0), instance_ids=np.full(4, -1, np.int32))
+    plain = replace(scene(["chair", "desk"]), instances=instance_table(2, [], WIDTH), vocabulary=None)
+    clouds = {"no points": empty, "no instance": nothing, "no descriptor": plain, "good": scene(["desk"])}
+    found = indexed(folder, clouds).find("desk", top=100)
+    assert [finding.scene for finding in found] == ["good"]
+    with pytest.raises(OgPointcloudError, match=r"holds no \.ogpc file"):
+        og.Collection.index(folder / "none", folder.parent / "atlas")
+
+
+@pytest.mark.parametrize(
+    ("change", "cause"),
+    [
+        ("CREATE VIEW trap AS SELECT 1", "schema"),
+        ("CREATE TRIGGER trap AFTER UPDATE ON scenes BEGIN DELETE FROM scenes; END", "schema"),
+        ("DROP TABLE judgements", "schema"),
+        ("PRAGMA user_version = 9", "version"),
+        ("PRAGMA application_id = 0", "version"),
+        ("UPDATE judgements SET judge = (SELECT vocabulary FROM scenes)", "at least 50"),
+        ("UPDATE scenes SET width = -1", "wrong kind"),
+        ("UPDATE scenes SET name = x'ff'", "wrong kind"),
+        ("UPDATE scenes SET descriptors = zeroblob(7)", "buffer|reshape"),
+        ("UPDATE scenes SET instances = zeroblob(0)", "belong to no instances"),
+        ("UPDATE scenes SET owner = randomblob(length(owner))", "belong to no instances"),
+        ("UPDATE words SET names = '[1, 2]'", "no names"),
+        ("UPDATE words SET vectors = 5", "buffer|bytes-like"),
+        ("UPDATE words SET width = 1e300", "."),
+        ("UPDATE judgements SET sharpness = 'x'", "sharpness"),
+        ("UPDATE judgements SET standard = CAST(x'0000c07f' || substr(standard, 5) AS BLOB)", "NaN"),
+    ],
+)
+def test_hostile_atlases_are_refused(folder, change, cause):
+    indexed(folder, {"a": scene(["chair", "desk"], bank=BANK)})
+    path = folder.parent / "atlas"
+    with sqlite3.connect(path) as connection:
+        connection.execute(change)
+    connection.close()
+    with pytest.raises(OgPointcloudError, match=cause) as caught:
+        og.Collection(path).find("chair")
+    assert str(caught.value).startswith(f"{path} is no atlas that can be used")
+
+
+def test_damaged_bytes_are_refused_or_answered(folder):
+    indexed(folder, many(5, bank=BANK))
+    path = folder.parent / "atlas"
+    content, random = path.read_bytes(), np.random.default_rng(0)
+    refused = 0
+    for _ in range(60):
+        damaged = np.frombuffer(content, np.uint8).copy()
+        damaged[random.integers(0, len(damaged), 40)] = random.integers(0, 256, 40)
+        path.write_bytes(damaged.tobytes()[: random.integers(1, len(damaged) + 1)])
+        try:
+            og.Collection(path).find("chair")
+        except OgPointcloudError:
+            refused += 1
+    assert refused > 20
+
+
+def test_other_files_are_no_atlas(tmp_path):
+    for content in (b"", b"text", b"SQLite format 3\0" + bytes(100)):
+        (tmp_path / "atlas").write_bytes(content)
+        with pytest.raises(OgPointcloudError, match="no atlas that can be used"):
+            og.Collection(tmp_path / "atlas")
+    with pytest.raises(OgPointcloudError, match="not a file"):
+        og.Collection(tmp_path / "nothing")
+
+
+def test_readers_see_the_atlas_before_a_change_or_after_it(folder):
+    collection = indexed(folder, many(3))
+    with Atlas.writing(folder.parent / "atlas") as atlas:
+        atlas.remove(collection.scenes[0])
+        assert og.Collection(folder.parent / "atlas").scenes == collection.scenes
+    assert og.Collection(folder.parent / "atlas").scenes == collection.scenes[1:]
+
+
+def test_commands(folder, capsys, tmp_path):
+    for k, things in enumerate((["chair", "mug"], ["desk"])):
+        og.write_bundle(scene(things, k), folder / f"room{k}.ogpc")
+    (folder / "broken.ogpc").write_bytes(b"x")
+    atlas, page = str(tmp_path / "atlas"), tmp_path / "found.html"
+    assert main(["index", str(folder), "-o", atlas]) == 0
+    out, err = capsys.readouterr()
+    assert "2 added" in out
+    assert "2 scenes with 3 instances" in out
+    assert "broken is left out" in err
+    assert main(["find", atlas, "mug", "--json", "--html", str(page)]) == 0
+    records = json.loads(capsys.readouterr().out)
+    assert list(records[0]) == ["scene", "instance", "word", "score", "center", "size"]
+    assert (records[0]["scene"], records[0]["instance"], records[0]["word"]) == ("room0", 1, "mug")
+    assert len(records) == 3
+    text = page.read_text()
+    assert text.count("data:image/png;base64,") == 3
+    assert main(["find", atlas, "mug", "--scene", "room1", "--top", "1"]) == 0
+    assert "room1" in capsys.readouterr().out
+    assert main(["find", atlas, "mug", "--within", "5,5,5,6,6,6"]) == 0
+    assert "nothing was found" in capsys.readouterr().out
+    (folder / "room0.ogpc").unlink()
+    assert main(["find", atlas, "<b>mug", "--html", str(page)]) == 2
+    assert main(["find", atlas, "mug", "--html", str(page)]) == 0
+    assert "file not found" in page.read_text()
+
+
+def test_pictures_show_the_thing(tmp_path):
+    import cv2
+
+    from og_pointcloud.collection.collection import Finding
+
+    random = np.random.default_rng(0)
+    xyz = np.concatenate([0.2 * random.random((4000, 3)), random.random((4000, 3)) * [1, 1, 0.01]]).astype(np.float32)
+    ids = np.repeat(np.array([0, -1], np.int32), 4000)
+    table = instance_table(1)
+    cloud = LabelledCloud(xyz, np.array([1e6, 0, 0]), ids, table, "s", 0.01, 0.1)
+    thing = Finding("s", 0, "x", 1.0, (1e6 + 0.1, 0.1, 0.1), (0.2, 0.2, 0.2), 4000, True, True)
+    shown = cv2.imdecode(np.frombuffer(picture(cloud, thing), np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
+    orange = (np.abs(shown.astype(int) - (214, 90, 40)) < 3).all(axis=2)
+    assert 0.05 < orange.mean() < 0.6
+    assert orange[80:120, 80:120].mean() > 0.9
+    image = random.integers(0, 256, (7, 5, 3)).astype(np.uint8)
+    np.testing.assert_array_equal(cv2.imdecode(np.frombuffer(png_bytes(image), np.uint8), 1)[..., ::-1], image)
