@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 from og_pointcloud.ask.hosts import import_plugin
 from og_pointcloud.bundle.read import read_bundle
-from og_pointcloud.bundle.scene_words import scene_words
+from og_pointcloud.bundle.vocabulary import scene_words
 from og_pointcloud.cloud import FeatureSpace, LabelledCloud
 from og_pointcloud.collection.progress import counted
 from og_pointcloud.collection.workers import LocalWorkers, Share, share_here

@@ -229,7 +229,9 @@ class Atlas:
             raise self._refused(f"the scene '{entry.name}' has no arrays, or was indexed again meanwhile")
         instances, owner = self._array(row[0], INSTANCE, (-1,)), self._array(row[1], np.dtype("<i4"), (-1,))
         descriptors = self._array(row[2], np.dtype("<f4"), (len(owner), entry.width))
-        ascending = len(owner) == 0 or (owner[0] >= 0 and owner[-1] < len(instances) and (np.diff(owner) >= 0).all())
+        ascending = len(owner) == 0 or (
+            owner[0] >= 0 and owner[-1] < len(instances) and (owner[1:] >= owner[:-1]).all()
+        )
         shown = instances[instances["points"] > 0]
         finite = all(np.isfinite(shown[name]).all() for name in ("low", "high", "centroid", "agreement"))
         if not finite or not ascending or len(instances) > MOST_INSTANCES:
