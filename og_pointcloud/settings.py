@@ -105,6 +105,10 @@ class AssociationSettings:
 
     outlier_deviations: float = 3.0
     """A mask's feature is left out when its cosine lies this many robust deviations below the median."""
+    look_masks: int = 4
+    """Masks that a second look of an instance takes at least (looks.py): fewer are apart by chance, or are wrong."""
+    look_share: float = 0.3
+    """Share that it takes at least of what the instance's masks show."""
 
 
 @dataclass(frozen=True)

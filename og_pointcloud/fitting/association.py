@@ -25,7 +25,7 @@ from og_pointcloud.cloud import InstanceTable
 from og_pointcloud.fitting.mask_table import MaskTable, weights_by_instance
 from og_pointcloud.settings import AssociationSettings
 
-__all__ = ["describe_instances", "directions", "part_of", "robust_mean"]
+__all__ = ["describe_instances", "directions", "part_of", "robust_mean", "shown_of_instance"]
 
 MOSTLY = 0.5
 """A part lies mostly in one mask of its parent: more than this share of what a view shows of it, in more than this
@@ -49,7 +49,7 @@ def describe_instances(
     Masks without a feature (zero rows) count as evidence of the instance but not in its row; an instance of which no
     mask has a feature gets no row.
     """
-    shown = _shown_of_instance(table, group, instance_ids)
+    shown = shown_of_instance(table, group, instance_ids)
     features = directions(table.mask_features)
     rows, owners = [], []
     agreement = np.zeros(count, np.float32)
@@ -74,7 +74,7 @@ def describe_instances(
     )
 
 
-def _shown_of_instance(
+def shown_of_instance(
     table: MaskTable, group: NDArray[np.int32], instance_ids: NDArray[np.int32]
 ) -> NDArray[np.float64]:
     """(masks,) float64: pixels of blending weight that each mask puts on the points of its own instance."""

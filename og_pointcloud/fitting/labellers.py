@@ -26,6 +26,7 @@ from og_pointcloud.fitting.held_out import agreement
 from og_pointcloud.fitting.learned.codebook import two_level_codebook
 from og_pointcloud.fitting.learned.instance_features import learn_features
 from og_pointcloud.fitting.learned.matching import Matching, alone_evidence, match_masks, visible_evidence
+from og_pointcloud.fitting.looks import by_look, looks_of_groups
 from og_pointcloud.fitting.mask_table import MaskTable
 from og_pointcloud.fitting.membership import assign_points
 from og_pointcloud.fitting.view_votes import ViewVotes, view_votes
@@ -206,10 +207,12 @@ def _decided_by_views(
     if membership.dismissed.any():
         journal.leave_out(LeftOut.CONTRADICTED_GROUPS, count=int(membership.dismissed.sum()), total=groups.count)
     with journal.stage("association"):
-        used, ids, mask_instance = renumbered(membership.instance_ids, groups.group)
+        ids = membership.instance_ids
+        looks = looks_of_groups(table, groups.group, ids, groups.count, settings.association)
+        used, ids, mask_instance = renumbered(by_look(votes, ids, looks), looks.look)
         instances = instances_of_groups(table, mask_instance, ids, len(used), settings.association)
         if coarse is not None:
-            instances = replace(instances, coarse=coarse[used])
+            instances = replace(instances, coarse=coarse[looks.group[used]])
     return Labelling(ids, instances, mask_instance, membership.certainty)
 
 

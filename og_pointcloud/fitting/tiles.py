@@ -32,6 +32,7 @@ from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.fitting.grouping import MaskGroups, group_masks, indicator
 from og_pointcloud.fitting.held_out import choose_scale, note_scale
 from og_pointcloud.fitting.labellers import Labelling, instances_of_groups, renumbered
+from og_pointcloud.fitting.looks import Looks, by_look, looks_of_groups
 from og_pointcloud.fitting.mask_table import Cutoffs, Gaussians, MaskTable, mask_table, require_sight, view_fingerprint
 from og_pointcloud.fitting.membership import assign_points, without_see_through
 from og_pointcloud.fitting.memory import memory_left
@@ -126,12 +127,12 @@ def fit_tiles(
     with journal.stage("visibility"):
         shown = _look(scene, cloud, drawing, settings, work, journal)
     with journal.stage("grouping"):
-        groups = _groups(cloud, shown, settings, journal)
+        groups, looks = _groups(cloud, shown, settings, journal)
     with journal.stage("membership"):
         tiles = journal.steps(range(len(cloud.tiles)), "membership")
-        decided = [_decide(tile, cloud, shown, groups, settings, work) for tile in tiles]
+        decided = [_decide(tile, cloud, shown, (groups, looks), settings, work) for tile in tiles]
     with journal.stage("association"):
-        labelling = _instances(cloud, shown, groups, decided, settings)
+        labelling = _instances(cloud, shown, looks, decided, settings)
     if settings.mode == "auto":
         journal.leave_out(LeftOut.LEARNING_IN_TILES)
     return labelling.of_points(row_of_point), float(np.median(cloud.spacing))
@@ -439,8 +440,8 @@ def _in_image(
 # Instances and points -------------------------------------------------------------------------------------------
 
 
-def _groups(cloud: _TiledCloud, shown: _Shown, settings: FitSettings, journal: Journal) -> MaskGroups:
-    """Masks grouped by a sample of all points; without those groups that the scene's views contradict."""
+def _groups(cloud: _TiledCloud, shown: _Shown, settings: FitSettings, journal: Journal) -> tuple[MaskGroups, Looks]:
+    """Masks grouped by a sample of all points, without those groups that the scene's views contradict; their looks."""
     count = max(settings.grouping.graph_points, len(cloud.points) // SAMPLE_STEP)
     sample = sample_of_points(cloud.points.xyz, count)
     table = shown.table(cloud, sample, settings.membership.few_views)
@@ -454,13 +455,14 @@ def _groups(cloud: _TiledCloud, shown: _Shown, settings: FitSettings, journal: J
     dismissed = judged.dismissed & (judged.detection_rate > 0)
     if dismissed.any():
         journal.leave_out(LeftOut.CONTRADICTED_GROUPS, count=int(dismissed.sum()), total=groups.count)
-    return replace(groups, group=np.where((groups.group >= 0) & dismissed[groups.group], -1, groups.group))
+    groups = replace(groups, group=np.where((groups.group >= 0) & dismissed[groups.group], -1, groups.group))
+    return groups, looks_of_groups(table, groups.group, judged.instance_ids, groups.count, settings.association)
 
 
 @dataclass(frozen=True)
 class _Decided:
-    """What is known of a tile's inner points. ids, certainty: as of `Membership`. in_masks (masks, groups) and outside
-    (views, groups), sparse: what shows of each group's points there."""
+    """What is known of a tile's inner points. ids, certainty: as of `Membership`, ids of looks. in_masks (masks, looks)
+    and outside (views, looks), sparse: what shows of each look's points there."""
 
     ids: NDArray[np.int32]
     certainty: NDArray[np.float32]
@@ -469,31 +471,39 @@ class _Decided:
 
 
 def _decide(
-    tile: int, cloud: _TiledCloud, shown: _Shown, groups: MaskGroups, settings: FitSettings, work: WorkFolder
+    tile: int,
+    cloud: _TiledCloud,
+    shown: _Shown,
+    grouped: tuple[MaskGroups, Looks],
+    settings: FitSettings,
+    work: WorkFolder,
 ) -> _Decided:
     """Decide the state of a tile's points."""
     table = shown.table(cloud, cloud.members[tile], settings.membership.few_views)
     around = _neighbours(tile, cloud, settings, work)
     # Which groups are noise was decided for all tiles.
     membership = replace(settings.membership, rate_share=0.0)
-    state = assign_points(table, view_votes(table), groups, around, membership)
+    groups, looks = grouped
+    votes = view_votes(table)
+    state = assign_points(table, votes, groups, around, membership)
+    ids = by_look(votes, state.instance_ids, looks)
     inner = cloud.inner(tile)
-    inner_ids = np.full(len(state.instance_ids), -1, np.int32)
-    inner_ids[inner] = state.instance_ids[inner]
-    of_groups = indicator(inner_ids, groups.count).T
-    in_masks, outside = csr_array(table.weights @ of_groups), csr_array(table.outside @ of_groups)
-    return _Decided(state.instance_ids[inner], state.certainty[inner], in_masks, outside)
+    inner_ids = np.full(len(ids), -1, np.int32)
+    inner_ids[inner] = ids[inner]
+    of_looks = indicator(inner_ids, len(looks.group)).T
+    in_masks, outside = csr_array(table.weights @ of_looks), csr_array(table.outside @ of_looks)
+    return _Decided(ids[inner], state.certainty[inner], in_masks, outside)
 
 
 def _instances(
-    cloud: _TiledCloud, shown: _Shown, groups: MaskGroups, decided: Sequence[_Decided], settings: FitSettings
+    cloud: _TiledCloud, shown: _Shown, looks: Looks, decided: Sequence[_Decided], settings: FitSettings
 ) -> Labelling:
-    """Groups that have points become instances, largest first; what is known of them comes from sums over the tiles."""
-    group_of_point = np.empty(len(cloud.points), np.int32)
-    group_of_point[cloud.tiles.order] = np.concatenate([tile.ids for tile in decided])
+    """Looks that have points become instances, largest first; what is known of them comes from sums over the tiles."""
+    look_of_point = np.empty(len(cloud.points), np.int32)
+    look_of_point[cloud.tiles.order] = np.concatenate([tile.ids for tile in decided])
     certainty = np.empty(len(cloud.points), np.float32)
     certainty[cloud.tiles.order] = np.concatenate([tile.certainty for tile in decided])
-    used, ids, mask_instance = renumbered(group_of_point, groups.group)
+    used, ids, mask_instance = renumbered(look_of_point, looks.look)
     table = _table_of_sums(ids, used, shown, decided)
     instances = instances_of_groups(table, mask_instance, ids, len(used), settings.association)
     return Labelling(ids, instances, mask_instance, certainty)

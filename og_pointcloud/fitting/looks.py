@@ -1,0 +1,109 @@
+"""Groups of masks that show two things -> looks: what each point was shown as decides between them.
+
+Masks of one extent are one group, whatever the encoder says of them (grouping.py): a couch that half of the views call
+a suitcase stays whole. Its mean feature is then of neither. Where the masks of a group fall into two clearly separate
+kinds, with enough views of each, every point of the group takes the kind that more of its own votes are for.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+
+from og_pointcloud.fitting.association import directions, shown_of_instance
+from og_pointcloud.fitting.mask_table import MaskTable
+from og_pointcloud.fitting.view_votes import ViewVotes
+from og_pointcloud.settings import AssociationSettings
+
+__all__ = ["Looks", "by_look", "looks_of_groups"]
+
+ROUNDS = 10
+"""Rounds of 2-means at most: groups of a few dozen masks have settled by then."""
+QUANTILE = 0.1
+"""Two kinds are separate though this share of the pairs of masks says otherwise: single masks are of other things."""
+
+
+@dataclass(frozen=True)
+class Looks:
+    """look: (masks,) int32, the look that each mask is of, -1 none. group: (looks,) int32, the group that each look is
+    of. A group's main look has the group's number; further looks are numbered after the last group."""
+
+    look: NDArray[np.int32]
+    group: NDArray[np.int32]
+
+
+def looks_of_groups(
+    table: MaskTable, group: NDArray[np.int32], ids: NDArray[np.int32], count: int, settings: AssociationSettings
+) -> Looks:
+    """The looks of ``count`` groups; of nearly all groups there is one.
+
+    group: (masks,) int32, the group of each mask, -1 none. ids: (n,) int32, the group of each point, below 0 none.
+    """
+    shown = shown_of_instance(table, group, ids)
+    features = directions(table.mask_features)
+    usable = (group >= 0) & (shown > 0) & features.any(axis=1)
+    look, owner = group.copy(), list(range(count))
+    for index in range(count):
+        waiting = [np.flatnonzero(usable & (group == index))]
+        kinds: list[NDArray[np.intp]] = []
+        while waiting:
+            masks = waiting.pop()
+            second = _second_look(features[masks], shown[masks], settings)
+            if second is None:
+                kinds.append(masks)
+            else:
+                waiting += [masks[second], masks[~second]]
+        kinds.sort(key=lambda masks: -shown[masks].sum())
+        for masks in kinds[1:]:
+            look[masks] = len(owner)
+            owner.append(index)
+    return Looks(look, np.array(owner, np.int32))
+
+
+def by_look(votes: ViewVotes, ids: NDArray[np.int32], looks: Looks) -> NDArray[np.int32]:
+    """(n,) int32: ids, those of groups with several looks replaced by the look that most votes on the point are for
+    (ties, and points without a vote: the main look)."""
+    found = ids.copy()
+    several = np.unique(looks.group[np.bincount(looks.group)[looks.group] > 1])
+    for group in several.tolist():
+        points = np.flatnonzero(ids == group)
+        own = np.flatnonzero(looks.group == group)
+        shares = [
+            np.asarray(csr_array(votes.in_mask[np.flatnonzero(looks.look == look)])[:, points].sum(axis=0)).ravel()
+            for look in own
+        ]
+        found[points] = own[np.argmax(shares, axis=0)]
+    return found
+
+
+def _second_look(
+    features: NDArray[np.float64], weight: NDArray[np.float64], settings: AssociationSettings
+) -> NDArray[np.bool_] | None:
+    """(masks,) bool, those of the second of two clearly separate kinds of masks; None, as for most, where there is one.
+
+    2-means on the sphere from the least alike pair. The kinds are separate when masks of one kind are more alike (all
+    but a tenth of their pairs) than masks of different kinds (all but a tenth): a comparison of ranks, so that it holds
+    for any encoder's cosines. Noise spreads features evenly and fails it; a few wrong masks do not reach
+    ``look_masks`` and ``look_share`` and are outliers, not a second look.
+    """
+    if len(features) < 2 * settings.look_masks:
+        return None
+    cosines = features @ features.T
+    centres = features[list(np.unravel_index(cosines.argmin(), cosines.shape))]
+    second = features @ centres[1] > features @ centres[0]
+    for _ in range(ROUNDS):
+        centres = directions(np.stack([weight[~second] @ features[~second], weight[second] @ features[second]]))
+        before, second = second, features @ centres[1] > features @ centres[0]
+        if (before == second).all():
+            break
+    masks = min(second.sum(), (~second).sum())
+    share = min(weight[second].sum(), weight[~second].sum()) / weight.sum()
+    if masks < settings.look_masks or share < settings.look_share:
+        return None
+    same = second[:, None] == second
+    within = cosines[same & ~np.eye(len(features), dtype=bool)]
+    separate = np.quantile(within, QUANTILE) > np.quantile(cosines[~same], 1 - QUANTILE)
+    return second if separate else None
