@@ -42,6 +42,10 @@ class Finding:
     score: where calibrated, the probability that it is what the word says; else between 0 and 1 how much better the
     word fits than the other words that the scene's kin knows (LERF's relevancy, 0.5: as well); the cosine where they
     know no other. fits: whether the score is above one half.
+
+    >>> chair = og.Finding("office", 3, "chair", 0.9, (1.0, 2.0, 0.5), (0.5, 0.5, 1.0), 800, True, True)
+    >>> list(chair.to_dict())
+    ['scene', 'instance', 'word', 'score', 'center', 'size']
     """
 
     scene: str
@@ -62,7 +66,11 @@ class Finding:
 
 @dataclass(frozen=True)
 class Findings(Sequence[Finding]):
-    """What was found, best first. not_asked: why which scenes could not be asked for which words, in words."""
+    """What was found, best first. not_asked: why which scenes could not be asked for which words, in words.
+
+    >>> og.Findings(()).to_json()
+    '[]'
+    """
 
     found: tuple[Finding, ...]
     not_asked: tuple[str, ...] = ()

@@ -30,7 +30,11 @@ __all__ = ["CaptureFit", "FitOptions", "fit_capture", "fit_many"]
 
 @dataclass(frozen=True)
 class FitOptions:
-    """How captures are read and fitted. Arguments of `read_capture`, `fit` and `scene_words`."""
+    """How captures are read and fitted: arguments of `read_capture`, `fit` and `scene_words`.
+
+    >>> og.FitOptions(og.FitSettings(mode="grouping")).mask_level
+    'large'
+    """
 
     settings: FitSettings = field(default_factory=FitSettings)
     gaussians: str | Path | None = None
@@ -42,7 +46,11 @@ class FitOptions:
 @dataclass(frozen=True)
 class CaptureFit:
     """What became of a capture. state: "fitted", "was there" (its file is whole already) or "failed", then with the
-    cause. worker: where, as host:process. peak_bytes: the most memory that this process has held, 0 if unknown."""
+    cause. worker: where, as host:process. peak_bytes: the most memory that this process has held, 0 if unknown.
+
+    >>> og.CaptureFit("scans/kitchen", "fitted/kitchen.ogpc", "was there").name
+    'kitchen'
+    """
 
     capture: str
     output: str

@@ -1,0 +1,221 @@
+"""Many captures on any executor: the same files wherever they are made, and one that fails or dies harms no other."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import signal
+import threading
+import time
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from functools import partial
+from pathlib import Path
+
+import pytest
+from scenes import write_tiny_capture
+
+import og_pointcloud as og
+from og_pointcloud.cli import main
+from og_pointcloud.collection import fit_many as module
+from og_pointcloud.collection.workers import LocalWorkers, Share, dask_executor, share_here
+from og_pointcloud.errors import MissingExtraError, OgPointcloudError
+
+
+class Inline(Executor):
+    """Runs each task when it is submitted."""
+
+    def submit(self, fn, /, *args, **kwargs):
+        future: Future = Future()
+        future.set_result(fn(*args, **kwargs))
+        return future
+
+
+@pytest.fixture(scope="module")
+def captures(tmp_path_factory) -> list[Path]:
+    """Of 2 to 5 views each, so that every file is another."""
+    folder = tmp_path_factory.mktemp("captures")
+    return [write_tiny_capture(folder / f"capture{views}", views).folder for views in (3, 4, 5, 6)]
+
+
+@pytest.fixture(scope="module")
+def one_by_one(captures, tmp_path_factory) -> dict[str, bytes]:
+    out = tmp_path_factory.mktemp("one_by_one")
+    fits = og.fit_many(captures, out, Inline(), progress=False)
+    assert [(fit.state, fit.points, fit.instances) for fit in fits] == [("fitted", 1576, 2)] * 4
+    assert [Path(fit.output).name for fit in fits] == [f"{path.name}.ogpc" for path in captures]
+    return contents(out)
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in sorted(folder.iterdir())}
+
+
+def test_a_file_is_what_fit_and_write_bundle_make(captures, one_by_one, tmp_path):
+    (tmp_path / "a.ogpc").write_bytes(one_by_one["capture6.ogpc"])
+    scene, cloud = og.load(tmp_path / "a.ogpc"), og.fit(og.read_capture(captures[3]), progress=False)
+    assert scene.instance_ids.tolist() == cloud.instance_ids.tolist()
+    assert scene.vocabulary is not None
+    assert "lamp" in scene.vocabulary.names
+    assert scene.cloud.provenance["settings"] == json.loads(json.dumps(cloud.provenance["settings"]))
+
+
+def test_threads_make_the_same_files(captures, one_by_one, tmp_path):
+    with ThreadPoolExecutor(2) as executor:
+        og.fit_many(captures, tmp_path, executor, progress=False)
+    assert contents(tmp_path) == one_by_one
+
+
+@pytest.mark.slow
+def test_processes_make_the_same_files(captures, one_by_one, tmp_path):
+    before = dict(os.environ)
+    fits = og.fit_many(captures, tmp_path, progress=False)
+    assert str(os.getpid()) not in {fit.worker.partition(":")[2] for fit in fits}
+    assert contents(tmp_path) == one_by_one
+    assert dict(os.environ) == before
+
+
+def test_what_is_there_stays_and_what_is_damaged_is_made_again(captures, one_by_one, tmp_path):
+    for name in ("capture3.ogpc", "capture4.ogpc"):
+        (tmp_path / name).write_bytes(one_by_one[name][: 5000 if name == "capture4.ogpc" else None])
+    kept = (tmp_path / "capture3.ogpc").stat().st_mtime_ns
+    fits = og.fit_many(captures, tmp_path, Inline(), progress=False)
+    assert [fit.state for fit in fits] == ["was there", "fitted", "fitted", "fitted"]
+    assert (tmp_path / "capture3.ogpc").stat().st_mtime_ns == kept
+    assert contents(tmp_path) == one_by_one
+
+
+def test_a_broken_capture_leaves_the_others(captures, one_by_one, tmp_path):
+    broken = write_tiny_capture(tmp_path / "broken").folder
+    (broken / "transforms.json").write_text("{")
+    out = tmp_path / "out"
+    fits = og.fit_many([captures[0], broken, tmp_path / "nowhere", captures[1]], out, Inline(), progress=False)
+    assert [fit.state for fit in fits] == ["fitted", "failed", "failed", "fitted"]
+    assert "transforms.json is not valid JSON" in fits[1].cause
+    assert "nowhere" in fits[2].cause
+    assert contents(out) == {name: one_by_one[name] for name in ("capture3.ogpc", "capture4.ogpc")}
+
+
+def test_a_full_disk_is_said_and_leaves_no_half_file(captures, tmp_path, monkeypatch):
+    original = module.import_plugin
+
+    def write(cloud, path):
+        if path.stem == "capture4":
+            raise OSError(errno.ENOSPC, "No space left on device", str(path))
+        return original("og_pointcloud_export", "fit").write_bundle(cloud, path)
+
+    monkeypatch.setattr(module, "import_plugin", lambda *_: type("exporter", (), {"write_bundle": staticmethod(write)}))
+    fits = og.fit_many(captures, tmp_path, Inline(), progress=False)
+    assert [fit.state for fit in fits] == ["fitted", "failed", "fitted", "fitted"]
+    assert "No space left" in fits[1].cause
+    assert sorted(contents(tmp_path)) == ["capture3.ogpc", "capture5.ogpc", "capture6.ogpc"]
+
+
+def test_two_captures_of_one_name_are_refused(captures, tmp_path):
+    with pytest.raises(OgPointcloudError, match=r"would both become capture3.ogpc"):
+        og.fit_many([captures[0], tmp_path / "capture3"], tmp_path / "out", Inline())
+    assert not (tmp_path / "out").exists()
+
+
+def die_once(marker: str) -> int:
+    """Kills its process the first time."""
+    if not Path(marker).exists():
+        Path(marker).touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return os.getpid()
+
+
+def die(_: object) -> None:
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+@pytest.mark.slow
+def test_a_process_that_dies_is_replaced_and_its_task_tried_once_more(tmp_path):
+    workers = LocalWorkers(4)
+    once = workers.submit(die_once, str(tmp_path / "marker"))
+    never = workers.submit(die, 0)
+    well = [workers.submit(abs, -k) for k in range(5)]
+    assert once.result() != os.getpid()
+    assert [future.result() for future in well] == list(range(5))
+    with pytest.raises(Exception, match="terminated abruptly"):
+        never.result()
+    workers.shutdown()
+    lost: Future = Future()
+    lost.set_exception(never.exception())
+    fit = module._outcome(lost, tmp_path / "a", tmp_path / "a.ogpc")
+    assert fit.state == "failed"
+    assert "worker died" in fit.cause
+
+
+def test_shares():
+    share = Share.of_machine(1)
+    assert share.threads is not None
+    assert share.memory is not None
+    assert share.threads >= Share.of_machine(10_000).threads == 1
+    assert Share.of_machine(2).memory <= share.memory
+    assert share_here(share) == share
+
+
+def test_command(captures, one_by_one, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(module, "LocalWorkers", lambda tasks: _Here())
+    out, report = tmp_path / "out", tmp_path / "report.json"
+    broken = tmp_path / "broken"
+    broken.mkdir()
+    assert main(["fit", str(captures[0]), str(broken), "--out", str(out), "--json", str(report)]) == 2
+    said = capsys.readouterr()
+    assert "1 fitted, 0 were there already, 1 failed" in said.out
+    assert f"failed: {broken}" in said.err
+    assert "1 of 2 captures failed" in said.err
+    assert [fit["state"] for fit in json.loads(report.read_text())["fits"]] == ["fitted", "failed"]
+    assert contents(out) == {"capture3.ogpc": one_by_one["capture3.ogpc"]}
+    assert main(["fit", str(captures[0]), "--out", str(out)]) == 0
+    assert "1 were there already" in capsys.readouterr().out
+    assert main(["fit", str(captures[0]), str(captures[1]), "-o", str(tmp_path / "x.ogpc")]) == 2
+    assert "expected --out DIR" in capsys.readouterr().err
+    assert main(["fit", str(captures[0]), "--out", str(out), "--ply", str(tmp_path / "x.ply")]) == 2
+
+
+class _Here(Inline):
+    share = Share()
+
+
+def test_a_cluster_that_is_not_there(monkeypatch):
+    if not _has_dask():
+        with pytest.raises(MissingExtraError, match="cluster"), dask_executor("tcp://127.0.0.1:1"):
+            pass
+        return
+    monkeypatch.setattr("og_pointcloud.collection.workers.PATIENCE_S", 0.5)
+    with pytest.raises(OgPointcloudError, match="no scheduler answers"), dask_executor("tcp://127.0.0.1:1"):
+        pass
+
+
+def _has_dask() -> bool:
+    from importlib.util import find_spec
+
+    return find_spec("distributed") is not None
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not _has_dask(), reason="needs the extra 'cluster': dask[distributed]")
+def test_a_dask_cluster_makes_the_same_files_though_a_worker_dies(captures, one_by_one, tmp_path):
+    from distributed import Client, LocalCluster
+
+    with (
+        LocalCluster(n_workers=2, threads_per_worker=1, memory_limit="2GB", dashboard_address=None) as cluster,
+        Client(cluster) as client,
+        dask_executor(client.scheduler.address) as executor,
+    ):
+        share = executor.submit(partial(share_here, Share())).result()
+        assert share == Share(1, int(0.6 * 2e9))
+        threading.Thread(target=_kill_one, args=(client, tmp_path), daemon=True).start()
+        fits = og.fit_many(captures, tmp_path, executor, progress=False)
+    assert [fit.state for fit in fits] == ["fitted"] * 4, [fit.cause for fit in fits]
+    assert contents(tmp_path) == one_by_one
+
+
+def _kill_one(client, out: Path) -> None:
+    """Kill a worker while it fits: as soon as a work folder is there."""
+    pids = client.run(os.getpid)
+    while not list(out.glob("*.work")):
+        time.sleep(0.01)
+    os.kill(next(iter(pids.values())), signal.SIGKILL)
