@@ -18,8 +18,9 @@ from scenes import write_tiny_capture
 import og_pointcloud as og
 from og_pointcloud.cli import main
 from og_pointcloud.collection import fit_many as module
-from og_pointcloud.collection.workers import LocalWorkers, Share, dask_executor, share_here
+from og_pointcloud.collection.workers import LocalWorkers, dask_executor
 from og_pointcloud.errors import MissingExtraError, OgPointcloudError
+from og_pointcloud.fitting.tasks import Share, share_here
 
 
 class Inline(Executor):

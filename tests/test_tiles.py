@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Iterator
+from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import fields, replace
 from functools import lru_cache
+from multiprocessing import get_context
 
 import numpy as np
 import pytest
@@ -18,7 +22,6 @@ from og_pointcloud.errors import OgPointcloudError, SceneError
 from og_pointcloud.fitting import tiles
 from og_pointcloud.fitting.fit import fit
 from og_pointcloud.fitting.mask_table import mask_table
-from og_pointcloud.fitting.memory import memory_in_use
 from og_pointcloud.fitting.tiles import split
 from og_pointcloud.fitting.work_folder import kept_files
 from og_pointcloud.scene import Camera, Points, Scene, View
@@ -306,8 +309,7 @@ def test_settings_of_rendering_count_in_tiles_too(monkeypatch):
 
 def test_memory_decides_the_tiles_in_few_steps():
     def most(points: int, memory: float) -> int:
-        used = memory_in_use()
-        return tiles._points_per_tile(points, FitSettings(memory=int(memory) + used))
+        return tiles._points_per_tile(points, int(memory))
 
     assert most(20_000_000, 12e9) == 2_000_000
     assert most(20_000_000, 2.9e9) == most(20_000_000, 3.1e9) == 250_000
@@ -322,3 +324,39 @@ def test_the_command_fits_in_tiles(tiny_capture: TinyCapture, tmp_path):
     result = og.segment(scene.xyz, ["red ball", "blue ball"], scene)
     assert tiny_capture.share_correct(result.labels, list(result.names)) > 0.95
     assert not list(tmp_path.glob("*.work"))
+
+
+@pytest.mark.parametrize(
+    "executor",
+    ["threads", pytest.param("processes", marks=pytest.mark.slow), pytest.param("dask", marks=pytest.mark.slow)],
+)
+def test_tiles_are_the_same_on_any_executor(executor, tmp_path, recwarn):
+    reference = tiled(POINTS // 4)
+    with executor_of(executor) as workers:
+        settings = replace(SETTINGS, tile_points=POINTS // 4)
+        cloud = fit(street().scene, settings, work=tmp_path / "work", executor=workers, progress=False)
+    for name in ("xyz", "instance_ids", "certainty"):
+        np.testing.assert_array_equal(getattr(cloud, name), getattr(reference, name))
+    for column in fields(reference.instances):
+        ours, theirs = (getattr(table, column.name) for table in (cloud.instances, reference.instances))
+        np.testing.assert_array_equal(ours, theirs, column.name)
+    assert (cloud.spacing, cloud.reach) == (reference.spacing, reference.reach)
+    assert cloud.provenance["left_out"] == reference.provenance["left_out"]
+    assert not (tmp_path / "work").exists()
+
+
+@contextmanager
+def executor_of(kind: str) -> Iterator[Executor]:
+    if kind == "dask":
+        distributed = pytest.importorskip("distributed", reason="needs the extra 'cluster': dask[distributed]")
+        cluster = distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None)
+        with cluster, distributed.Client(cluster) as client:
+            yield client.get_executor(pure=False)
+        return
+    with ThreadPoolExecutor(2) if kind == "threads" else ProcessPoolExecutor(2, get_context("spawn")) as executor:
+        yield executor
+
+
+def test_a_worker_that_cannot_see_the_folder_says_so(tmp_path):
+    with pytest.raises(OgPointcloudError, match="one folder that all workers share"):
+        tiles._cloud_in(tmp_path, "0", False)

@@ -17,9 +17,10 @@ from og_pointcloud.bundle.read import read_bundle
 from og_pointcloud.bundle.vocabulary import scene_words
 from og_pointcloud.cloud import FeatureSpace, LabelledCloud
 from og_pointcloud.collection.progress import counted
-from og_pointcloud.collection.workers import LocalWorkers, Share, share_here
+from og_pointcloud.collection.workers import LocalWorkers
 from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.fitting.fit import fit
+from og_pointcloud.fitting.tasks import Share, share_here
 from og_pointcloud.formats.capture import read_capture
 from og_pointcloud.journal import LeftOut
 from og_pointcloud.kernels import use_threads

@@ -3,62 +3,26 @@
 from __future__ import annotations
 
 import os
-import sys
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from dataclasses import dataclass
 from multiprocessing import get_context
 from typing import Any
 
 from og_pointcloud.errors import MissingExtraError, OgPointcloudError
 from og_pointcloud.fitting.memory import free_memory
+from og_pointcloud.fitting.tasks import Share, cores_here
 
-__all__ = ["LocalWorkers", "Share", "dask_executor", "share_here"]
+__all__ = ["LocalWorkers", "dask_executor"]
 
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
-SHARE_OF_LIMIT = 0.6
-"""Of the memory that a Dask worker may hold, what its tasks take: at 0.8 it would be paused, at 0.95 killed."""
 LEAST_BYTES = 10**9
 """Memory that a fit is given at least, if need be by fewer workers."""
 TRIES = 2
 """Processes that a task may kill before it is given up."""
 PATIENCE_S = 20
-
-
-@dataclass(frozen=True)
-class Share:
-    """What a task may take. threads: None for as many as there are; memory: bytes, None for what the fit decides."""
-
-    threads: int | None = None
-    memory: int | None = None
-
-    @classmethod
-    def of_machine(cls, workers: int) -> Share:
-        """What each of so many workers may take of this machine: its cores, and half of its free memory."""
-        return cls(max(1, cores_here() // workers), free_memory() // 2 // workers)
-
-
-def cores_here() -> int:
-    """Cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def share_here(otherwise: Share) -> Share:
-    """What a task may take where it runs: in a Dask worker one thread, and of the worker's memory what is left for each
-    of its threads; elsewhere what it was given."""
-    if "distributed" not in sys.modules:
-        return otherwise
-    from distributed import get_worker
-
-    try:
-        worker = get_worker()
-    except ValueError:  # this process is no worker
-        return otherwise
-    limit = worker.memory_manager.memory_limit
-    return Share(1, int(SHARE_OF_LIMIT * limit / worker.state.nthreads) if limit else None)
 
 
 class LocalWorkers(Executor):

@@ -20,8 +20,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import dataclass, field, replace
+from functools import lru_cache, partial
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, NoReturn, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +39,7 @@ from og_pointcloud.fitting.looks import Looks, by_look, looks_of_groups
 from og_pointcloud.fitting.mask_table import Cutoffs, Gaussians, MaskTable, mask_table, require_sight, view_fingerprint
 from og_pointcloud.fitting.membership import assign_points, without_see_through
 from og_pointcloud.fitting.memory import memory_left
+from og_pointcloud.fitting.tasks import Share, run_tasks, share_here
 from og_pointcloud.fitting.view_votes import view_votes
 from og_pointcloud.fitting.work_folder import WorkFolder, fingerprint
 from og_pointcloud.journal import Journal, LeftOut
@@ -85,6 +89,8 @@ CLOUD_BYTES = 120
 PROBES = 2_000
 """Points of a tile that are asked for their spacing before its margin is known."""
 
+Item = TypeVar("Item")
+Result = TypeVar("Result")
 Rows = NDArray[np.integer]
 Entries = NDArray[np.void]
 ENTRY = np.dtype([("point", "<i4"), ("row", "<i4"), ("value", "<f4")])
@@ -108,7 +114,9 @@ def fit_tiles(
     labelling of all its points, and their typical spacing.
 
     work: keeps the neighbours of the points and what the views show (80 bytes a point, and about 25 for each view that
-    sees it). Raises SceneError where `fit` does, and OgPointcloudError for a mode that learns from all points at once.
+    sees it); with an executor also the points. executor: takes tiles and views as tasks, and its workers read what they
+    need, and write what is large, in the work folder; None: one after another, here.
+    Raises SceneError where `fit` does, and OgPointcloudError for a mode that learns from all points at once.
     """
     if settings.mode not in MODES:
         raise OgPointcloudError(
@@ -119,18 +127,20 @@ def fit_tiles(
         journal.leave_out(LeftOut.WHOLE_FIT, count=len(scene.points))
     scene = with_needed_views(scene, settings, journal)
     scene, row_of_point = with_distinct_points(scene, journal)
-    most = settings.tile_points or _points_per_tile(len(scene.points), settings)
+    run = _Run(settings, work, journal, executor)
+    most = settings.tile_points or _points_per_tile(len(scene.points), run.memory(len(scene.points)))
     with journal.stage("spacing"):
-        cloud = _tiled(scene.points, most, settings, work, journal)
+        cloud = _tiled(scene.points, most, run)
     with journal.stage("geometry"):
         drawing = _drawing(scene.views, cloud, settings, journal)
     with journal.stage("visibility"):
-        shown = _look(scene, cloud, drawing, settings, work, journal)
+        shown = _look(scene, cloud, drawing, run)
     with journal.stage("grouping"):
         groups, looks = _groups(cloud, shown, settings, journal)
     with journal.stage("membership"):
-        tiles = journal.steps(range(len(cloud.tiles)), "membership")
-        decided = [_decide(tile, cloud, shown, (groups, looks), settings, work) for tile in tiles]
+        no_features = replace(shown, mask_features=np.zeros((len(shown.mask_view), 0), np.float32))
+        decide = partial(_decide, cloud, no_features, (groups, looks), settings, work)
+        decided = run.all(decide, range(len(cloud.tiles)), "membership")
     with journal.stage("association"):
         labelling = _instances(cloud, shown, looks, decided, settings)
     if settings.mode == "auto":
@@ -138,8 +148,28 @@ def fit_tiles(
     return labelling.of_points(row_of_point), float(np.median(cloud.spacing))
 
 
-def _points_per_tile(points: int, settings: FitSettings) -> int:
-    left = memory_left(settings.memory)
+@dataclass(frozen=True)
+class _Run:
+    """How the fit is done, and where."""
+
+    settings: FitSettings
+    work: WorkFolder
+    journal: Journal
+    executor: Executor | None
+
+    def all(self, function: Callable[[Item], Result], items: Sequence[Item], name: str) -> list[Result]:
+        """The function's value of each item, in their order."""
+        return run_tasks(self.executor, function, items, self.journal, name)
+
+    def memory(self, points: int) -> int:
+        """Bytes that the fit may still take, here and in a worker, where the points are mapped, not held."""
+        left = memory_left(self.settings.memory)
+        if self.executor is None or (share := self.executor.submit(share_here, Share()).result().memory) is None:
+            return left
+        return min(left, share + points * CLOUD_BYTES)
+
+
+def _points_per_tile(points: int, left: int) -> int:
     fitting = (left - points * CLOUD_BYTES) // TILE_BYTES
     if fitting < LEAST_TILE:
         raise OgPointcloudError(
@@ -194,14 +224,29 @@ def split(xyz: NDArray[np.float32], most: int) -> Tiles:
 
 @dataclass(frozen=True)
 class _TiledCloud:
-    """points, spacing (n,): in the order of the tiles. members: per tile, its points and those within its margin,
-    ascending; they are int32 as there are many. key: fingerprint of points, tiles and settings."""
+    """points, spacing (n,): in the order of the tiles; no spacing before it is known. members: per tile, its points and
+    those within its margin, ascending; they are int32 as there are many. key: fingerprint of points, tiles and
+    settings. work: where another process finds all of it, once it is kept there."""
 
     tiles: Tiles
     points: Points
     spacing: NDArray[np.float32]
     members: tuple[NDArray[np.int32], ...]
     key: str = ""
+    work: WorkFolder = field(default_factory=lambda: WorkFolder(None))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _cloud_in, (self.work._place(), self.key, len(self.spacing) > 0)
+
+    def keep(self) -> None:
+        """Write what other processes need of it; colours they don't."""
+        points = self.points
+        ends = np.cumsum([0, *map(len, self.members)])
+        arrays = [self.tiles.start, ends, np.concatenate(self.members), points.xyz, points.origin]
+        if points.scale is not None and points.rotation is not None and points.opacity is not None:
+            arrays += [points.scale, points.rotation, points.opacity]
+        name, kept = ("spacing", [self.spacing]) if len(self.spacing) else ("cloud", arrays)
+        self.work.arrays(name, self.key, lambda: kept)
 
     def inner(self, tile: int) -> slice:
         """A tile's points without those of its margin, among its members."""
@@ -210,19 +255,47 @@ class _TiledCloud:
         return slice(int(first), int(last))
 
 
-def _tiled(points: Points, most: int, settings: FitSettings, work: WorkFolder, journal: Journal) -> _TiledCloud:
+@lru_cache(maxsize=1)
+def _cloud_in(folder: Path, key: str, with_spacing: bool) -> _TiledCloud:
+    """A cloud that another process keeps in a work folder, mapped. Without the order of its points, and colours."""
+    work = WorkFolder(folder)
+    start, ends, members, xyz, origin, *gaussian = work.arrays("cloud", key, _vanished)
+    points = Points(xyz, origin, None, *gaussian)
+    spacing = work.array("spacing", key, _vanished) if with_spacing else np.zeros(0, np.float32)
+    parts = tuple(members[first:last] for first, last in pairwise(ends.tolist()))
+    return _TiledCloud(Tiles(np.zeros(0, np.int64), start), points, spacing, parts, key, work)
+
+
+def _vanished() -> NoReturn:
+    raise OgPointcloudError(
+        "a file of the work folder is gone or damaged, or a worker cannot see it; expected one folder that all workers "
+        "share: name such a work folder, or set TMPDIR to one"
+    )
+
+
+def _tiled(points: Points, most: int, run: _Run) -> _TiledCloud:
+    settings, work = run.settings, run.work
     key = fingerprint(points.xyz, points.scale, points.rotation, points.opacity, settings, most, MARGIN)
     tiles = split(points.xyz, most)
     points = points.take(tiles.order)
     parts = [tiles.part(tile) for tile in range(len(tiles))]
     margins = [MARGIN * _sparse_spacing(points.xyz[part]) for part in parts]
     members = tuple(_within(points.xyz, part, margin) for part, margin in zip(parts, margins, strict=True))
-    cloud = _TiledCloud(tiles, points, np.empty(len(points), np.float32), members, key)
-    for tile in journal.steps(range(len(tiles)), "spacing"):
-        cloud.spacing[parts[tile]] = _neighbours(tile, cloud, settings, work).spacing[cloud.inner(tile)]
-    journal.notes["tiles"] = [part.stop - part.start for part in parts]
-    journal.notes["tile_margins"] = [float(f"{margin:.4g}") for margin in margins]
+    run.journal.notes["tiles"] = [part.stop - part.start for part in parts]
+    run.journal.notes["tile_margins"] = [float(f"{margin:.4g}") for margin in margins]
+    cloud = _TiledCloud(tiles, points, np.zeros(0, np.float32), members, key, work)
+    if run.executor is not None:
+        cloud.keep()
+    spacings = run.all(partial(_spacing, cloud, settings, work), range(len(tiles)), "spacing")
+    cloud = replace(cloud, spacing=np.concatenate(spacings))
+    if run.executor is not None:
+        cloud.keep()
     return cloud
+
+
+def _spacing(cloud: _TiledCloud, settings: FitSettings, work: WorkFolder, tile: int) -> NDArray[np.float32]:
+    """Of a tile's points; finds their neighbours, which stay in the work folder."""
+    return _neighbours(tile, cloud, settings, work).spacing[cloud.inner(tile)]
 
 
 def _sparse_spacing(xyz: NDArray[np.float32]) -> float:
@@ -291,10 +364,11 @@ def _drawing(views: Sequence[View], cloud: _TiledCloud, settings: FitSettings, j
 
 @dataclass(frozen=True)
 class _Shown:
-    """What all views show. entries: per view, reads its array of ENTRY, sorted by point. first: (views, tiles + 1),
-    where each tile's points begin in it. mask_view, mask_features: as in `MaskTable`."""
+    """What all views show. work, keys: where the array of ENTRY of each view is, sorted by point. first:
+    (views, tiles + 1), where each tile's points begin in it. mask_view, mask_features: as in `MaskTable`."""
 
-    entries: tuple[Callable[[], Entries], ...]
+    work: WorkFolder
+    keys: tuple[str, ...]
     first: Rows
     mask_view: NDArray[np.int32]
     mask_features: NDArray[np.float32]
@@ -308,11 +382,11 @@ class _Shown:
         place = np.full(len(cloud.points), -1, np.int32)
         place[rows] = np.arange(len(rows), dtype=np.int32)
         tiles = np.flatnonzero(np.diff(np.searchsorted(rows, cloud.tiles.start)))
-        views, masks = len(self.entries), np.bincount(self.mask_view, minlength=len(self.entries))
+        views, masks = len(self.keys), np.bincount(self.mask_view, minlength=len(self.keys))
         witnesses = np.zeros(len(rows), np.int32)
         parts = []
         for view in range(views):
-            entries = self.entries[view]()
+            entries = self.work.array("view", self.keys[view], _vanished)
             pieces = [entries[self.first[view, tile] : self.first[view, tile + 1]] for tile in tiles]
             part = np.concatenate([piece[place[piece["point"]] >= 0] for piece in pieces])
             part["point"] = place[part["point"]]
@@ -333,30 +407,44 @@ def _stacked(entries: Entries, masks: int, seldom: NDArray[np.bool_]) -> tuple[c
     return matrix[:masks], matrix[masks : masks + 1], matrix[masks + 1 :]
 
 
-def _look(
-    scene: Scene, cloud: _TiledCloud, drawing: _Drawing, settings: FitSettings, work: WorkFolder, journal: Journal
-) -> _Shown:
+def _look(scene: Scene, cloud: _TiledCloud, drawing: _Drawing, run: _Run) -> _Shown:
     """Render every view once, but for those that an interrupted fit has left in the work folder."""
-    readers, first = [], []
-    thinning: list[tuple[int, int]] = []
-    for view in journal.steps(scene.views, "visibility"):
-        view = replace(view, masks=view.mask_map())
-        key = fingerprint(
-            cloud.key, drawing, FINEST_PX, MOST_SPLATS, view.name, view_fingerprint(view, view.mask_map())
-        )
-        show = partial(_entries, view, cloud, drawing, settings, thinning)
-        readers.append(partial(work.array, "view", key, show))
-        first.append(np.searchsorted(np.ascontiguousarray(readers[-1]()["point"]), cloud.tiles.start))
-    if work.found:
-        journal.leave_out(LeftOut.RENDERING, count=work.found, folder=str(work.folder))
+    work, journal = run.work, run.journal
+    views = [replace(view, image=None) for view in scene.views]
+    looked = run.all(partial(_look_at, cloud, drawing, run.settings, work), views, "visibility")
+    found = sum(view.drawn is None for view in looked)
+    for view in looked:
+        work.adopt("view", view.key)
+    if found:
+        journal.leave_out(LeftOut.RENDERING, count=found, folder=str(work.folder))
     masks = [view.mask_features for view in scene.views if view.mask_count]
-    require_sight(sum(row[-1] for row in first), len(masks), scene)
-    drawn, inside = np.sum(thinning, axis=0) if thinning else (0, 0)
+    require_sight(sum(int(view.first[-1]) for view in looked), len(masks), scene)
+    drawn, inside = (sum(counts) for counts in zip((0, 0), *(view.drawn for view in looked if view.drawn), strict=True))
     if drawn < inside:
         share = float(1 - drawn / inside)
         journal.leave_out(LeftOut.FINE_POINTS, share=share, finest_px=FINEST_PX, most=MOST_SPLATS)
-    mask_view = np.repeat(np.arange(len(readers), dtype=np.int32), [view.mask_count for view in scene.views])
-    return _Shown(tuple(readers), np.array(first), mask_view, np.concatenate(masks))
+    mask_view = np.repeat(np.arange(len(looked), dtype=np.int32), [view.mask_count for view in scene.views])
+    first = np.array([view.first for view in looked])
+    return _Shown(work, tuple(view.key for view in looked), first, mask_view, np.concatenate(masks))
+
+
+@dataclass(frozen=True)
+class _LookedAt:
+    """A view that was rendered into the work folder. first: (tiles + 1,), as in `_Shown`. drawn: how many points were
+    drawn, and how many there are in the image; None where the folder had it."""
+
+    key: str
+    first: Rows
+    drawn: tuple[int, int] | None
+
+
+def _look_at(cloud: _TiledCloud, drawing: _Drawing, settings: FitSettings, work: WorkFolder, view: View) -> _LookedAt:
+    view = replace(view, masks=view.mask_map())
+    key = fingerprint(cloud.key, drawing, FINEST_PX, MOST_SPLATS, view.name, view_fingerprint(view, view.mask_map()))
+    thinning: list[tuple[int, int]] = []
+    entries = work.array("view", key, partial(_entries, view, cloud, drawing, settings, thinning))
+    first = np.searchsorted(np.ascontiguousarray(entries["point"]), cloud.tiles.start)
+    return _LookedAt(key, first, thinning[0] if thinning else None)
 
 
 def _entries(
@@ -471,12 +559,12 @@ class _Decided:
 
 
 def _decide(
-    tile: int,
     cloud: _TiledCloud,
     shown: _Shown,
     grouped: tuple[MaskGroups, Looks],
     settings: FitSettings,
     work: WorkFolder,
+    tile: int,
 ) -> _Decided:
     """Decide the state of a tile's points."""
     table = shown.table(cloud, cloud.members[tile], settings.membership.few_views)

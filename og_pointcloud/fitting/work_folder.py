@@ -105,6 +105,14 @@ class WorkFolder:
             if lock is not None:
                 lock.close()
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """In another process: the same folder, which that of the run owns."""
+        return WorkFolder, (self._place(),)
+
+    def adopt(self, name: str, key: str) -> None:
+        """Take a file that another process of this run has written for sound, and not for one of an earlier run."""
+        self._sound.add(f"{name}-{key}{SUFFIX}")
+
     def hold(self, nbytes: float, seconds: float) -> None:
         """Write no file until arrays of more than so many bytes are held, or until so many seconds have passed: what
         is done by then is soon made again. The time counts only where the folder outlives the run."""
