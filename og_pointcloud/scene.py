@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from og_pointcloud.errors import SceneError
 
-__all__ = ["Camera", "Points", "Scene", "View", "require_finite"]
+__all__ = ["NOT_SEEN", "Camera", "Points", "Scene", "View", "require_finite"]
 
 FloatArray = NDArray[np.float32]
 DoubleArray = NDArray[np.float64]
@@ -27,6 +27,8 @@ IntArray = NDArray[np.int32]
 
 LONGEST_SIDE = 1 << 17
 """Pixels; no camera has more."""
+NOT_SEEN = -2
+"""In a mask map: a pixel that the lens did not see, which says nothing; -1 says that no mask is there."""
 UNIT_TOLERANCE = 1e-3
 """A quaternion's length may differ from 1 by this much: it changes the size of a Gaussian by twice as much."""
 
@@ -114,8 +116,9 @@ class View:
     """One posed image with its masks.
 
     name: the image's file stem, unique in the scene.
-    masks: (H, W) int32, -1 outside every mask, else a row of ``mask_features``; or a function that reads it, so that
-        a long capture is streamed. H, W are the camera's.
+    masks: (H, W) int32, -1 outside every mask, NOT_SEEN where the photograph shows nothing (beyond a lens's rim), else
+        a row of ``mask_features``; or a function that reads it, so that a long capture is streamed. H, W are the
+        camera's.
     mask_features: (M, D) float32, one row per mask, as the encoder gave it (not normalised).
     image: (H, W, 3) uint8 RGB, or a function that reads it, or None where the capture has no images.
     """
@@ -151,7 +154,7 @@ class View:
         return len(self.mask_features)
 
     def mask_map(self) -> IntArray:
-        """(H, W) int32: -1 or a row of ``mask_features``. Read and checked on every call; keep it if you need it."""
+        """(H, W) int32: NOT_SEEN, -1 or a row of ``mask_features``. Read and checked on every call; keep it at need."""
         ids = self.masks() if callable(self.masks) else self.masks
         expected = (self.camera.height, self.camera.width)
         if ids.shape != expected:
@@ -159,10 +162,10 @@ class View:
                 f"view '{self.name}': the mask image is {ids.shape[1]}x{ids.shape[0]} pixels, its camera "
                 f"{expected[1]}x{expected[0]}: make the masks at the image's size or fix w and h of the pose file"
             )
-        if ids.size and int(ids.min()) < -1:
+        if ids.size and int(ids.min()) < NOT_SEEN:
             raise SceneError(
-                f"view '{self.name}': the mask map holds {int(ids.min())}; expected rows of mask_features, or -1: "
-                "set pixels without a mask to -1"
+                f"view '{self.name}': the mask map holds {int(ids.min())}; expected rows of mask_features, -1 or "
+                f"{NOT_SEEN}: set pixels without a mask to -1"
             )
         if ids.size and int(ids.max()) >= self.mask_count:
             raise SceneError(

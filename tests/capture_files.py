@@ -21,6 +21,7 @@ CAMERA_MODEL_IDS = {
     "OPENCV_FISHEYE": 5,
     "FULL_OPENCV": 6,
     "FOV": 7,
+    "RAD_TAN_THIN_PRISM_FISHEYE": 11,
 }
 
 

@@ -236,13 +236,13 @@ def test_distorted_captures_are_undistorted(capture):
     folder, world = capture
     write_transforms(folder, world, ply_file_path="points.ply", k1=-3.0)
     straight, view = make_world(), read_capture(folder).views[0]
-    fx, _, cx, cy = straight.intrinsics
-    row = int(cy)
+    fx, _, cx, _ = straight.intrinsics
+    row = int(view.camera.cy)
     border = WIDTH - WIDTH // 3
     r = next(r for r in np.arange(0, 1 / 3, 1e-4) if r * (1 - 3 * r**2) >= (border - cx) / fx)
     first = int(np.argmax(view.mask_map()[row] == 1))
-    assert abs(first - (cx + fx * r)) <= 1
-    assert first > border
+    assert abs(first - (view.camera.cx + fx * r)) <= 1
+    assert r > (border - cx) / fx
     image = view.image_rgb()
     assert image is not None
     assert abs(float(image[row, first, 0]) - 250 * border / WIDTH) < 6

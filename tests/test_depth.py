@@ -17,8 +17,8 @@ from scenes import (
 
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.depth import DepthFile, DepthFrame, DepthImage, resampled
-from og_pointcloud.formats.distortion import lens_distortion
 from og_pointcloud.formats.fusion import _Voxels, doubtful_unit, evenly, fuse, on_surface, survey, to_world
+from og_pointcloud.formats.lenses import lens_of
 
 WIDTH, HEIGHT = ROOM_SIZE
 POSE = room_poses()[0]
@@ -67,13 +67,13 @@ def test_a_distorted_depth_image_becomes_a_pinholes(tmp_path):
     depth[:, WIDTH // 4 :] = 3.0
     write_depth(tmp_path / "a.png", depth)
     plain = read(tmp_path / "a.png")
-    bent = read(tmp_path / "a.png", distortion=lens_distortion({"k1": 0.3}, fisheye=False))
-    edge = [int(np.argmax(image.depth[HEIGHT // 2] > 2.5)) for image in (plain, bent)]
+    bent = read(tmp_path / "a.png", lens=lens_of("perspective", {"k1": 0.3}))
+    edge = [int(np.argmax(image.depth[len(image.depth) // 2] > 2.5)) for image in (plain, bent)]
     # r_d = r (1 + 0.3 r^2): the distorted edge at 40 px from the middle stands at a smaller radius in the pinhole.
     radius = np.roots([0.3, 0, 1, -(WIDTH / 4) / camera(POSE).fx])
     radius = float(radius[np.isreal(radius)].real[0])
     assert edge[0] == WIDTH // 4
-    assert abs(edge[1] - (WIDTH / 2 - radius * camera(POSE).fx)) <= 1
+    assert abs(edge[1] - (bent.camera.cx - radius * camera(POSE).fx)) <= 1
 
 
 @pytest.mark.parametrize(

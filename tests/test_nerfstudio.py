@@ -34,7 +34,7 @@ def test_opengl_camera_to_world_becomes_opencv_world_to_camera(tmp_path, per_fra
     assert [image.path for image in images] == [f"images/{name}.png" for name in world.names]
     for image, pose in zip(images, world.poses, strict=True):
         assert same_camera(image.camera, world.camera(pose))
-        assert image.distortion is None
+        assert image.lens is None
 
 
 def test_a_point_in_front_of_the_camera_has_positive_depth(tmp_path):
@@ -55,8 +55,8 @@ def test_frames_override_the_top(tmp_path):
     first, second, _ = read(tmp_path).images
     assert (first.camera.fx, second.camera.fx) == (70.0, 99.0)
     assert (second.camera.width, second.camera.height) == (128, 96)
-    assert first.distortion is None
-    assert second.distortion is not None
+    assert first.lens is None
+    assert second.lens is not None
 
 
 def test_blender_takes_its_size_from_the_image(tmp_path):
@@ -79,30 +79,31 @@ def test_instant_ngp(tmp_path):
     edit(tmp_path, lambda content: content["frames"][0].update(file_path=".\\images\\0001", sharpness=3.0))
     images = read(tmp_path).images
     assert images[0].path == "./images/0001"
-    assert images[0].distortion is None
+    assert images[0].lens is None
     edit(tmp_path, lambda content: content.update(is_fisheye=True))
-    distortion = read(tmp_path).images[0].distortion
-    assert distortion is not None
-    assert distortion.fisheye
+    lens = read(tmp_path).images[0].lens
+    assert lens is not None
+    assert lens.model == "fisheye"
 
 
 @pytest.mark.parametrize("model", ["OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "OPENCV_FISHEYE"])
 def test_distortion_is_never_ignored(tmp_path, model):
     write_transforms(tmp_path, make_world(), camera_model=model, k1=0.05, p1=0.0)
-    distortion = read(tmp_path).images[0].distortion
-    assert distortion is not None
-    assert distortion.coefficients[0] == 0.05
-    assert distortion.fisheye == (model == "OPENCV_FISHEYE")
+    lens = read(tmp_path).images[0].lens
+    assert lens is not None
+    assert lens.terms[0] == 0.05
+    assert (lens.model == "fisheye") == (model == "OPENCV_FISHEYE")
 
 
 @pytest.mark.parametrize(
     ("keys", "message"),
     [
-        ({"camera_model": "EQUIRECTANGULAR"}, "the camera model is EQUIRECTANGULAR; expected one of OPENCV"),
+        ({"camera_model": "EQUIRECTANGULAR"}, "an equirectangular image is 64x48; expected twice as wide as high"),
+        ({"camera_model": "VR180_L"}, "the camera model is VR180_L; expected one of OPENCV"),
         ({"camera_model": "FISHEYE624"}, "the camera model is FISHEYE624"),
         ({"ftheta_p0": 1.0}, "the camera model is ftheta_p0"),
         ({"k4": 0.01}, "k4, k5, k6 are 0.01, 0.0, 0.0; expected 0"),
-        ({"camera_model": "OPENCV_FISHEYE", "p1": 0.01}, "the term p1 = 0.01; expected only k1, k2, k3, k4"),
+        ({"camera_model": "OPENCV_FISHEYE", "p1": 0.01}, "p1, p2 are 0.01, 0.0; expected 0 for a fisheye"),
         ({"fl_x": None, "fl_y": None}, "neither fl_x .* nor camera_angle_x"),
         ({"fl_x": "wide"}, "fl_x is 'wide'; expected a finite number"),
         ({"fl_x": float("nan")}, "fl_x is nan; expected a finite number"),

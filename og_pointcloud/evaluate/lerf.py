@@ -132,7 +132,7 @@ def read_scene(folder: Path, name: str) -> LerfScene:
         image = images.get(frame.name)
         if image is None:
             raise SceneError(f"{file} is of frame '{frame.name}', of which {model} has no pose; it has {len(images)}")
-        if image.distortion is not None:
+        if image.lens is not None:
             raise SceneError(f"{model}: frame '{frame.name}' has a distorted lens; labels are of undistorted images")
         size, labelled = (image.camera.width, image.camera.height), (frame.width, frame.height)
         if not same_shape(size, labelled):

@@ -35,7 +35,7 @@ from og_pointcloud.rendering.splatting import (
     view_weights,
     working_memory,
 )
-from og_pointcloud.scene import Scene, View
+from og_pointcloud.scene import NOT_SEEN, Camera, Scene, View
 
 __all__ = [
     "FRUSTUM_MARGIN",
@@ -135,7 +135,7 @@ def mask_table(
 
         lengths, *_, exposed = work.arrays("view", key, make)
         sizes = np.array([lengths[:-1].sum(dtype=np.int64), lengths[-1], len(exposed)])
-        pixels = np.bincount(ids.ravel() + 1, minlength=view.mask_count + 1)[1:].astype(np.int32)
+        pixels = np.bincount(ids[ids >= 0], minlength=view.mask_count).astype(np.int32)
         return _ShownView(key, make, sizes, pixels, view.mask_features)
 
     views_shown = list(_side_by_side(shown, views, side_by_side))
@@ -178,7 +178,23 @@ def _view_arrays(
     """What a view shows: entries of each row (masks + 1,), the last one of pixels without a mask, the entries' columns
     and values, and columns and values of the view's exposure."""
     shown = view_weights(gaussians, view.camera, ids, view.mask_count, near, thickness, cutoffs)
-    return _as_arrays(shown.rows, _exposure(shown))
+    exposure = _exposure(shown)
+    if (ids == NOT_SEEN).any():
+        seen = _photographed(gaussians.xyz, view.camera, ids).astype(np.float32)
+        for matrix in (shown.rows, exposure):
+            matrix.data *= seen[matrix.indices]
+            matrix.eliminate_zeros()
+    return _as_arrays(shown.rows, exposure)
+
+
+def _photographed(xyz: NDArray[np.float32], camera: Camera, ids: NDArray[np.int32]) -> NDArray[np.bool_]:
+    """(n,) bool: False for centres in pixels that are NOT_SEEN."""
+    uv_px, _ = camera.project(xyz)
+    inside = np.flatnonzero(camera.shows(uv_px))
+    column, row = uv_px[inside].astype(np.intp).T
+    seen = np.ones(len(xyz), np.bool_)
+    seen[inside] = ids[row, column] != NOT_SEEN
+    return seen
 
 
 def _as_arrays(rows: csr_array, exposure: csr_array) -> tuple[NDArray[Any], ...]:

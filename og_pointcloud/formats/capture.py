@@ -13,6 +13,10 @@ Each part comes from the first of these that the folder has.
 A view is called by its image's file stem, and so are its masks and features; where two images share a stem (rigs demand
 it), by the path below the folder that all images share: ``left/000``, ``masks/left/000.png``.
 
+An image whose lens no pinhole can show (fisheye, equirectangular) becomes the faces of a cube, and a view each:
+``frame/front``, ``frame/left``. Masks are of the image as it is, ``masks/frame.png``, and are split with it, or of the
+faces, ``masks/frame/front.png``.
+
 Masks rule the resolution: a camera takes the size of its mask map (shapes must agree), and its image is resized to it.
 """
 
@@ -20,9 +24,9 @@ from __future__ import annotations
 
 import posixpath
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -32,33 +36,36 @@ from numpy.typing import NDArray
 from og_pointcloud.errors import MissingExtraError, SceneError
 from og_pointcloud.formats import colmap
 from og_pointcloud.formats.depth import DepthFile, DepthFrame, find_depth, resampled
-from og_pointcloud.formats.distortion import Distortion, undistorted
+from og_pointcloud.formats.faces import Face
 from og_pointcloud.formats.gaussian_ply import latest_iteration
 from og_pointcloud.formats.images import find_image, image_size, read_rgb, same_shape, without_suffix
 from og_pointcloud.formats.langsplat import LANGUAGE_FEATURES_FOLDER, read_language_features
 from og_pointcloud.formats.mask_files import FEATURES_NAME, MASKS_FOLDER, MaskLayer, read_masks
 from og_pointcloud.formats.nerfstudio import TRANSFORMS_NAMES, read_transforms
 from og_pointcloud.formats.points import read_points
-from og_pointcloud.formats.poses import PosedImage, in_local_frame
+from og_pointcloud.formats.poses import PosedImage, in_local_frame, in_pinholes
 from og_pointcloud.formats.rgbd import find_mesh, read_rgbd
-from og_pointcloud.scene import Camera, Points, Scene, View
+from og_pointcloud.scene import NOT_SEEN, Camera, Points, Scene, View
 
 if TYPE_CHECKING:
     from og_pointcloud.formats.fusion import FusedCloud
 
 __all__ = [
-    "CapturePoses", "depth_files", "find_images", "fuse_capture", "read_capture", "read_geometry", "read_poses",
+    "CapturePoses", "depth_files", "find_images", "fuse_capture", "read_capture", "read_geometry", "read_photograph",
+    "read_poses",
 ]  # fmt: skip
 
 CLOUD_NAMES = ("points.ply", "point_cloud.ply")
+DECODED = 4
+"""Mask maps of images with several faces that are kept: faces come one after the other, some side by side."""
 FUSED_FRAMES = 300
 """Depth images that are fused at most, evenly spread over a recording, whose neighbours show almost the same."""
 
 
 @dataclass(frozen=True)
 class CapturePoses:
-    """names: the views', an image each. source: the pose file or folder. is_recording: every frame of a video has a
-    pose, and some of them masks."""
+    """names: the views', a pinhole image each. source: the pose file or folder. is_recording: every frame of a video
+    has a pose, and some of them masks."""
 
     names: tuple[str, ...]
     images: tuple[PosedImage, ...]
@@ -88,7 +95,7 @@ def read_capture(folder: str | Path, gaussians: str | Path | None = None, mask_l
         raise SceneError(f"{capture} is not a folder; expected a capture folder with poses, masks and points")
     poses = read_poses(capture)
     shown = _with_masks(capture, poses) if poses.is_recording else poses
-    layers, feature_space = _read_masks(capture, shown.names, mask_level)
+    layers, feature_space = _layers(capture, shown, mask_level)
     points = read_geometry(capture, poses, gaussians)
     files = find_images(capture, shown.images)
     views = tuple(
@@ -99,7 +106,18 @@ def read_capture(folder: str | Path, gaussians: str | Path | None = None, mask_l
 
 
 def read_poses(capture: Path) -> CapturePoses:
-    """Every posed image of a capture folder; SceneError where there are no poses."""
+    """Every posed image of a capture folder as pinhole views; SceneError where there are no poses."""
+    poses = _stated_poses(capture)
+    names, images = [], []
+    for name, image in zip(poses.names, poses.images, strict=True):
+        for view in in_pinholes(image):
+            names.append(f"{name}/{view.face.name}" if view.face is not None and view.face.name else name)
+            images.append(view)
+    return replace(poses, names=tuple(names), images=tuple(images))
+
+
+def _stated_poses(capture: Path) -> CapturePoses:
+    """The images as pose files list them."""
     file = next((capture / name for name in TRANSFORMS_NAMES if (capture / name).is_file()), None)
     if file is not None:
         transforms = read_transforms(file, partial(_size_of_image, capture))
@@ -156,8 +174,7 @@ def _view_names(images: Sequence[PosedImage]) -> tuple[str, ...]:
 
 def _with_masks(capture: Path, poses: CapturePoses) -> CapturePoses:
     """The frames of a recording that have masks; all of them if none has, since reading the masks says that."""
-    files = ((f"{MASKS_FOLDER}/{name}.png", f"{LANGUAGE_FEATURES_FOLDER}/{name}_s.npy") for name in poses.names)
-    has_mask = [any((capture / file).is_file() for file in pair) for pair in files]
+    has_mask = [_has_mask(capture, name) or _has_mask(capture, posixpath.dirname(name)) for name in poses.names]
     if all(has_mask) or not any(has_mask):
         return poses
     warnings.warn(
@@ -167,6 +184,48 @@ def _with_masks(capture: Path, poses: CapturePoses) -> CapturePoses:
     kept = [pair for pair, has in zip(zip(poses.names, poses.images, strict=True), has_mask, strict=True) if has]
     names, images = zip(*kept, strict=True)
     return replace(poses, names=names, images=images)
+
+
+def _has_mask(capture: Path, name: str) -> bool:
+    files = f"{MASKS_FOLDER}/{name}.png", f"{LANGUAGE_FEATURES_FOLDER}/{name}_s.npy"
+    return any((capture / file).is_file() for file in files)
+
+
+def _layers(capture: Path, poses: CapturePoses, level: str) -> tuple[list[MaskLayer], str]:
+    """The masks of each view, and the name of their feature space. Those of an image as it is are split with it."""
+    of_whole = [
+        image.face is not None and not (image.face.name and _has_mask(capture, name))
+        for name, image in zip(poses.names, poses.images, strict=True)
+    ]
+    called = [
+        posixpath.dirname(name) if whole and image.face is not None and image.face.name else name
+        for name, image, whole in zip(poses.names, poses.images, of_whole, strict=True)
+    ]
+    distinct = list(dict.fromkeys(called))
+    read, feature_space = _read_masks(capture, distinct, level)
+    stored = dict(zip(distinct, read, strict=True))
+    latest = lru_cache(maxsize=DECODED)(lambda name: stored[name].read())
+    return [
+        _layer_of(image.face, replace(stored[name], read=partial(latest, name)), view)
+        if whole and image.face is not None
+        else stored[name]
+        for view, name, image, whole in zip(poses.names, called, poses.images, of_whole, strict=True)
+    ], feature_space
+
+
+def _layer_of(face: Face, layer: MaskLayer, view: str) -> MaskLayer:
+    """What a view shows of the masks of an image as it is; of a cube's face, only the masks that it shows."""
+    _require_shape(view, layer, face.whole)
+    scaled = face.of_whole_size(*layer.size)
+    size = scaled.camera.width, scaled.camera.height
+    if not face.name:
+        return MaskLayer(size, layer.features, lambda: scaled.mask_ids(layer.read()))
+    used = np.unique(scaled.mask_ids(layer.read()))
+    used = used[used >= 0]
+    row_of_id = np.full(len(layer.features) + 2, -1, np.int32)  # the last two serve NOT_SEEN and -1
+    row_of_id[NOT_SEEN] = NOT_SEEN
+    row_of_id[used] = np.arange(len(used), dtype=np.int32)
+    return MaskLayer(size, layer.features[used], lambda: row_of_id[scaled.mask_ids(layer.read())])
 
 
 def _read_masks(capture: Path, names: Sequence[str], level: str) -> tuple[list[MaskLayer], str]:
@@ -258,7 +317,8 @@ def depth_files(capture: Path, poses: CapturePoses) -> dict[str, DepthFile]:
         if image.depth is not None:
             files[name] = image.depth
         elif path := find_depth(capture, name):
-            files[name] = DepthFile(path, image.camera, distortion=image.distortion)
+            whole = image.face if image.face is not None and not image.face.name else None
+            files[name] = DepthFile(path, whole.whole, lens=whole.lens) if whole else DepthFile(path, image.camera)
     return files
 
 
@@ -292,7 +352,7 @@ def _colors_at(file: Path, image: PosedImage, camera: Camera) -> NDArray[np.uint
     scale = min(1.0, camera.fx / image.camera.fx)
     size = max(1, round(image.camera.width * scale)), max(1, round(image.camera.height * scale))
     photographed = image.camera.resized(*size)
-    return resampled(_image(file, photographed, image.distortion), photographed, camera)
+    return resampled(read_photograph(file, photographed, image.face), photographed, camera)
 
 
 def find_images(capture: Path, images: Sequence[PosedImage]) -> list[Path | None]:
@@ -308,24 +368,25 @@ def find_images(capture: Path, images: Sequence[PosedImage]) -> list[Path | None
     return files
 
 
-def _view(name: str, image: PosedImage, layer: MaskLayer, file: Path | None, origin: NDArray[np.float64]) -> View:
-    camera = image.camera
+def _require_shape(name: str, layer: MaskLayer, camera: Camera) -> None:
     if not same_shape(layer.size, (camera.width, camera.height)):
         raise SceneError(
             f"view '{name}': the masks are {layer.size[0]}x{layer.size[1]} pixels, the camera "
             f"{camera.width}x{camera.height}; expected the same size or a scaled one: make the masks on the posed "
             "images or fix w and h of the pose file"
         )
-    camera = in_local_frame(camera.resized(*layer.size), origin)
-    read_image = None if file is None else partial(_image, file, camera, image.distortion)
-    return View(name, camera, partial(_masks, layer.read, camera, image.distortion), layer.features, read_image)
 
 
-def _masks(read: Callable[[], NDArray[np.int32]], camera: Camera, distortion: Distortion | None) -> NDArray[np.int32]:
-    ids = read()
-    return ids if distortion is None else undistorted(camera, distortion).mask_ids(ids)
+def _view(name: str, image: PosedImage, layer: MaskLayer, file: Path | None, origin: NDArray[np.float64]) -> View:
+    _require_shape(name, layer, image.camera)
+    camera = in_local_frame(image.camera.resized(*layer.size), origin)
+    read_image = None if file is None else partial(read_photograph, file, camera, image.face)
+    return View(name, camera, layer.read, layer.features, read_image)
 
 
-def _image(file: Path, camera: Camera, distortion: Distortion | None) -> NDArray[np.uint8]:
-    rgb = read_rgb(file, (camera.width, camera.height))
-    return rgb if distortion is None else undistorted(camera, distortion).image(rgb)
+def read_photograph(file: Path, camera: Camera, face: Face | None) -> NDArray[np.uint8]:
+    """(H, W, 3) uint8 RGB of the camera's size: the image, or what of it the face shows."""
+    if face is None:
+        return read_rgb(file, (camera.width, camera.height))
+    scaled = face.of_size(camera.width, camera.height)
+    return scaled.image(read_rgb(file, (scaled.whole.width, scaled.whole.height)))

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.errors import SceneError
-from og_pointcloud.formats.distortion import Distortion, lens_distortion
+from og_pointcloud.formats.lenses import SPHERICAL, Lens, lens_of, spherical_camera
 from og_pointcloud.formats.poses import PosedImage, rigid, rotation_of_quaternion
 from og_pointcloud.formats.tables import naming
 from og_pointcloud.scene import Camera
@@ -37,12 +37,19 @@ CAMERA_MODELS: dict[str, tuple[int, str]] = {
     "OPENCV": (4, "fx fy cx cy k1 k2 p1 p2"),
     "OPENCV_FISHEYE": (5, "fx fy cx cy k1 k2 k3 k4"),
     "FULL_OPENCV": (6, "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6"),
+    "FOV": (7, "fx fy cx cy omega"),
     "SIMPLE_RADIAL_FISHEYE": (8, "f cx cy k1"),
     "RADIAL_FISHEYE": (9, "f cx cy k1 k2"),
+    "THIN_PRISM_FISHEYE": (10, "fx fy cx cy k1 k2 p1 p2 k3 k4 sx1 sy1"),
+    "SIMPLE_DIVISION": (12, "f cx cy k"),
+    "DIVISION": (13, "fx fy cx cy k"),
     "SIMPLE_FISHEYE": (14, "f cx cy"),
     "FISHEYE": (15, "fx fy cx cy"),
+    "EUCM": (16, "fx fy cx cy alpha beta"),
+    "EQUIRECTANGULAR": (17, "w h"),
 }
-"""Models that OpenCV undistorts exactly, with COLMAP's ids and parameters; the others are refused."""
+"""COLMAP's ids and parameters. RAD_TAN_THIN_PRISM_FISHEYE (11) alone is refused."""
+LENS_MODELS = {"FOV": "fov", "DIVISION": "division", "SIMPLE_DIVISION": "division", "EUCM": "extended"}
 MODEL_NAMES = {model_id: name for name, (model_id, _) in CAMERA_MODELS.items()}
 
 CameraRecord = tuple[int, str, tuple[int, int], dict[str, float]]
@@ -53,11 +60,16 @@ Records = TypeVar("Records")
 Number = TypeVar("Number", int, float)
 
 
-class _Lens(NamedTuple):
+class _Sensor(NamedTuple):
     width: int
     height: int
-    intrinsics: tuple[float, float, float, float]
-    distortion: Distortion | None
+    intrinsics: tuple[float, float, float, float] | None
+    lens: Lens | None
+
+    def at(self, pose: NDArray[np.float64]) -> Camera:
+        if self.intrinsics is None:
+            return spherical_camera(self.width, self.height, pose)
+        return Camera(self.width, self.height, *self.intrinsics, pose)
 
 
 def find_model(capture: Path) -> Path | None:
@@ -71,21 +83,21 @@ def find_model(capture: Path) -> Path | None:
 
 def read_images(model: Path) -> tuple[PosedImage, ...]:
     """The posed images of a sparse model in the file's order. Raises SceneError naming file, place and cure."""
-    lenses = {
-        camera_id: _lens(camera_model, size, values)
+    sensors = {
+        camera_id: _sensor(camera_model, size, values)
         for camera_id, camera_model, size, values in _records(model, "cameras", _cameras_binary, _cameras_text)
     }
     images = []
     for pose, camera_id, name in _records(model, "images", _images_binary, _images_text):
-        lens = lenses.get(camera_id)
-        if lens is None:
+        sensor = sensors.get(camera_id)
+        if sensor is None:
             raise SceneError(
                 f"{model}: image '{name:.60}' has camera {camera_id}, but the cameras file has only "
-                f"{sorted(lenses)[:10]}; expected files of one reconstruction: export the model again"
+                f"{sorted(sensors)[:10]}; expected files of one reconstruction: export the model again"
             )
         with naming(f"{model}, image '{name:.60}'"):
-            camera = Camera(lens.width, lens.height, *lens.intrinsics, _pose(pose))
-        images.append(PosedImage(name.replace("\\", "/"), camera, lens.distortion))
+            camera = sensor.at(_pose(pose))
+        images.append(PosedImage(name.replace("\\", "/"), camera, sensor.lens))
     if not images:
         raise SceneError(f"{model}: the images file lists 0 images; expected at least one registered image")
     return tuple(images)
@@ -118,11 +130,14 @@ def _parameters(file: Path, camera_id: int, camera_model: str) -> list[str]:
     return CAMERA_MODELS[camera_model][1].split()
 
 
-def _lens(camera_model: str, size: tuple[int, int], values: dict[str, float]) -> _Lens:
+def _sensor(camera_model: str, size: tuple[int, int], values: dict[str, float]) -> _Sensor:
     """values: by the names of the model's parameters."""
+    if camera_model == "EQUIRECTANGULAR":
+        return _Sensor(*size, None, SPHERICAL)
     fx, fy = (values.pop("f"),) * 2 if "f" in values else (values.pop("fx"), values.pop("fy"))
     intrinsics = (fx, fy, values.pop("cx"), values.pop("cy"))
-    return _Lens(*size, intrinsics, lens_distortion(values, fisheye=camera_model.endswith("FISHEYE")))
+    model = "fisheye" if camera_model.endswith("FISHEYE") else LENS_MODELS.get(camera_model, "perspective")
+    return _Sensor(*size, intrinsics, lens_of(model, values))
 
 
 def _pose(values: tuple[float, ...]) -> NDArray[np.float64]:

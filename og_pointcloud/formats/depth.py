@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.errors import SceneError
-from og_pointcloud.formats.distortion import Distortion, undistorted
+from og_pointcloud.formats.faces import faces
 from og_pointcloud.formats.images import MAX_PIXELS, decoded, png_header, require_cv2, same_shape
+from og_pointcloud.formats.lenses import Lens
 from og_pointcloud.formats.npy import mapped_array
 from og_pointcloud.scene import Camera
 
@@ -48,10 +49,13 @@ class DepthFile:
     camera: Camera
     unit: float | None = None
     invalid: int | None = None
-    distortion: Distortion | None = None
+    lens: Lens | None = None
 
     def read(self) -> DepthImage:
-        """Decode, scale and undistort. SceneError names the file, what it holds and what was expected."""
+        """Decode, scale and undistort; of a lens that no pinhole can show, what lies in front.
+
+        SceneError names the file, what it holds and what was expected.
+        """
         stored = _stored(self.path)
         height, width = stored.shape
         if not same_shape((width, height), (self.camera.width, self.camera.height)):
@@ -68,10 +72,10 @@ class DepthFile:
             measured &= stored != self.invalid
         depth = np.where(measured, depth, np.float32(0))
         camera = self.camera.resized(width, height)
-        if self.distortion is not None:
-            nearest = undistorted(camera, self.distortion).nearest
-            depth = np.where(nearest < 0, np.float32(0), depth.reshape(-1)[nearest])
-        return DepthImage(depth, camera)
+        if self.lens is None:
+            return DepthImage(depth, camera)
+        front = faces(camera, self.lens)[0]  # the only one with the axis that depths are along
+        return DepthImage(front.depths(depth), front.camera)
 
 
 @dataclass(frozen=True)

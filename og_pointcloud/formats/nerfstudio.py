@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.depth import DepthFile
-from og_pointcloud.formats.distortion import Distortion, lens_distortion
+from og_pointcloud.formats.lenses import SPHERICAL, Lens, lens_of, spherical_camera
 from og_pointcloud.formats.poses import PosedImage, read_json, rigid
 from og_pointcloud.formats.tables import naming
 from og_pointcloud.scene import Camera
@@ -35,7 +35,8 @@ __all__ = ["TRANSFORMS_NAMES", "Transforms", "read_transforms"]
 
 TRANSFORMS_NAMES = ("transforms.json", "transforms_train.json")
 PERSPECTIVE_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
-FISHEYE_MODELS = ("OPENCV_FISHEYE",)
+FISHEYE_MODELS = ("OPENCV_FISHEYE", "FISHEYE")
+SPHERICAL_MODELS = ("EQUIRECTANGULAR",)
 DEPTH_UNIT_KEYS = ("integer_depth_scale", "depth_unit_scale_factor")
 LENS_TERMS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 LARGEST = float(np.finfo(np.float64).max)
@@ -73,8 +74,8 @@ def read_transforms(file: Path, image_size: Callable[[str], tuple[int, int]]) ->
             if np.isfinite(camera_to_world).all():
                 keys = {**shared, **frame}
                 camera = _camera(keys, _world_to_camera(camera_to_world), partial(image_size, path))
-                distortion = _distortion(keys)
-                images.append(PosedImage(path, camera, distortion, _depth(file.parent, keys, camera, distortion)))
+                lens = _lens(keys)
+                images.append(PosedImage(path, camera, lens, _depth(file.parent, keys, camera, lens)))
             else:
                 dropped.append(path)
     if not images:
@@ -114,6 +115,8 @@ def _camera(
 ) -> Camera:
     w, h, cx, cy = (_number(keys, key) for key in ("w", "h", "cx", "cy"))
     width, height = image_size() if w is None or h is None else (round(w), round(h))
+    if _camera_model(keys) in SPHERICAL_MODELS:  # whatever fl_x says: writers disagree
+        return spherical_camera(width, height, world_to_camera)
     fx = _focal(keys, "x", width)
     fy = _focal(keys, "y", height)
     if fx is None:
@@ -148,34 +151,48 @@ def _number(keys: dict[str, Any], key: str) -> float | None:
     return float(value)
 
 
-def _depth(capture: Path, keys: dict[str, Any], camera: Camera, distortion: Distortion | None) -> DepthFile | None:
+def _depth(capture: Path, keys: dict[str, Any], camera: Camera, lens: Lens | None) -> DepthFile | None:
     path = keys.get("depth_file_path")
     if not path:
         return None
+    if lens is not None and lens.wraps:
+        raise SceneError("depth_file_path of an equirectangular image is not read; expected pinhole depths: remove it")
     inside = posixpath.normpath(str(path).replace("\\", "/"))
     if inside.startswith(("/", "..")) or "\0" in inside:
         raise SceneError(f"depth_file_path is {path!r:.80}, which leads out of the capture folder: copy it there")
     unit = next((unit for key in DEPTH_UNIT_KEYS if (unit := _number(keys, key)) is not None), None)
     if unit is not None and unit <= 0:
         raise SceneError(f"the depth unit is {unit}; expected lengths a stored step, above 0, such as 0.001")
-    return DepthFile(capture / inside, camera, unit, distortion=distortion)
+    return DepthFile(capture / inside, camera, unit, lens=lens)
 
 
-def _distortion(keys: dict[str, Any]) -> Distortion | None:
+def _camera_model(keys: dict[str, Any]) -> str:
+    return str(keys.get("camera_model") or "OPENCV").upper()
+
+
+def _lens(keys: dict[str, Any]) -> Lens | None:
     """The lens. As in nerfstudio, perspective models differ only in the terms they name, so all terms given count."""
-    model = str(keys.get("camera_model") or "OPENCV").upper()
+    model = _camera_model(keys)
     other = next((key for key in keys if key.startswith(("ftheta", "latlong"))), None)  # lenses of instant-ngp
-    if model not in PERSPECTIVE_MODELS + FISHEYE_MODELS or other:
+    known = PERSPECTIVE_MODELS + FISHEYE_MODELS + SPHERICAL_MODELS
+    if model not in known or other:
         raise SceneError(
-            f"the camera model is {other or model:.40}; expected one of "
-            f"{', '.join(PERSPECTIVE_MODELS + FISHEYE_MODELS)}: undistort images and masks to a pinhole camera first"
+            f"the camera model is {other or model:.40}; expected one of {', '.join(known)}: "
+            "undistort images and masks to a pinhole camera first"
         )
+    if model in SPHERICAL_MODELS:
+        return SPHERICAL
     fisheye = model in FISHEYE_MODELS or bool(keys.get("is_fisheye"))
     terms = {key: _number(keys, key) or 0.0 for key in LENS_TERMS}
+    if fisheye and (terms["p1"] or terms["p2"]):
+        raise SceneError(
+            f"p1, p2 are {terms['p1']}, {terms['p2']}; expected 0 for a fisheye, where nerfstudio leaves them out and "
+            "others do not: undistort images and masks to a pinhole camera first"
+        )
     if not fisheye and (terms["k4"] or terms["k5"] or terms["k6"]):
         # nerfstudio takes k4 as the r^8 term of the numerator, OpenCV as the r^2 term of the denominator.
         raise SceneError(
             f"k4, k5, k6 are {terms['k4']}, {terms['k5']}, {terms['k6']}; expected 0 for {model}, where programs "
             "disagree on their meaning: undistort images and masks to a pinhole camera first"
         )
-    return lens_distortion(terms, fisheye=fisheye)
+    return lens_of("fisheye" if fisheye else "perspective", terms)

@@ -14,13 +14,15 @@ from numpy.typing import ArrayLike, NDArray
 
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.depth import DepthFile
-from og_pointcloud.formats.distortion import Distortion
+from og_pointcloud.formats.faces import Face, faces
+from og_pointcloud.formats.lenses import Lens
 from og_pointcloud.scene import Camera
 
 __all__ = [
     "PosedFrames",
     "PosedImage",
     "in_local_frame",
+    "in_pinholes",
     "numbered",
     "read_json",
     "read_numbers",
@@ -33,17 +35,19 @@ MAX_TEXT_BYTES, MAX_JSON_BYTES = 1 << 26, 1 << 30
 
 @dataclass(frozen=True)
 class PosedImage:
-    """An image as a pose file lists it.
+    """An image as a pose file lists it, or a pinhole view of it.
 
     path: as written there, with forward slashes; relative to the capture folder or to its image folder.
     camera: its ``world_to_camera`` still starts from world coordinates (float64), not from the scene's local frame.
-    distortion: None for a pinhole lens. depth: the depth image that the pose file or data set has for it.
+    lens: None for a pinhole. depth: the depth image that the pose file or data set has for it.
+    face: of a view, where in the image it lies; None where the image is the view.
     """
 
     path: str
     camera: Camera
-    distortion: Distortion | None = None
+    lens: Lens | None = None
     depth: DepthFile | None = None
+    face: Face | None = None
 
 
 @dataclass(frozen=True)
@@ -52,6 +56,17 @@ class PosedFrames:
 
     images: tuple[PosedImage, ...]
     dropped: tuple[str, ...]
+
+
+def in_pinholes(image: PosedImage) -> tuple[PosedImage, ...]:
+    """The pinhole views of an image: itself, unless it has a lens."""
+    if image.lens is None:
+        return (image,)
+    views = faces(image.camera, image.lens)  # depths are along the axis of the first
+    return tuple(
+        replace(image, camera=face.camera, lens=None, depth=None if index else image.depth, face=face)
+        for index, face in enumerate(views)
+    )
 
 
 def rigid(rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -81,7 +81,8 @@ def make_masks(
     target = capture if output is None else Path(output)
     separate = target.resolve() != capture.resolve()
     photographs = read_photographs(capture)
-    chosen = photographs[:: settings.every]
+    used = set(list(dict.fromkeys(photograph.path for photograph in photographs))[:: settings.every])
+    chosen = tuple(photograph for photograph in photographs if photograph.path in used)
     left_out = _left_out(photographs, chosen, separate, say)
     _refuse_foreign(target, overwrite)
     work = target / WORK_FOLDER / _fingerprint(settings)

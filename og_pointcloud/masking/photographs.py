@@ -11,9 +11,11 @@ from numpy.typing import NDArray
 
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.atomic import replacing
-from og_pointcloud.formats.capture import find_images, read_poses
+from og_pointcloud.formats.capture import find_images, read_photograph, read_poses
 from og_pointcloud.formats.colors import label_colors
+from og_pointcloud.formats.faces import Face
 from og_pointcloud.formats.images import image_size, read_rgb, require_cv2, same_shape
+from og_pointcloud.formats.poses import PosedImage
 from og_pointcloud.scene import Camera
 
 __all__ = ["Photograph", "read_photographs", "write_contact_sheet"]
@@ -25,20 +27,30 @@ TINT = 0.55
 @dataclass(frozen=True)
 class Photograph:
     """A posed image. name: its view's. path: as the pose file says. file: where it is. camera: from world coordinates.
-    Masks are made on the image as it is, and undistorted when they are read."""
+
+    face: None where masks are made on the image as it is, and undistorted when they are read. Of an image that no
+    pinhole can show, the cube's face that this is: models know pinhole images, and no thing is cut at the border of a
+    panorama.
+    """
 
     name: str
     path: str
     file: Path
     camera: Camera
+    face: Face | None = None
 
     def read(self, longest_side: int) -> NDArray[np.uint8]:
         """(h, w, 3) uint8 RGB, shrunk so that neither side is longer. Grey, 16-bit and alpha become RGB of 8 bit; EXIF
         orientation is ignored, as poses ignore it."""
         width, height = image_size(self.file)
+        if self.face is not None:
+            camera = self.face.of_whole_size(width, height).camera
+            width, height = camera.width, camera.height
         scale = min(1.0, longest_side / max(width, height))
         size = (width, height) if scale == 1 else (max(1, round(width * scale)), max(1, round(height * scale)))
-        return read_rgb(self.file, size)
+        if self.face is None:
+            return read_rgb(self.file, size)
+        return read_photograph(self.file, self.camera.resized(*size), self.face)
 
 
 def read_photographs(capture: Path) -> tuple[Photograph, ...]:
@@ -54,7 +66,7 @@ def read_photographs(capture: Path) -> tuple[Photograph, ...]:
             "masks are made from images, so copy them there or take them out of the pose file"
         )
     photographs = tuple(
-        Photograph(name, image.path, file, image.camera)
+        _photograph(name, image, file)
         for name, image, file in zip(poses.names, poses.images, files, strict=True)
         if file is not None
     )
@@ -63,8 +75,16 @@ def read_photographs(capture: Path) -> tuple[Photograph, ...]:
     return photographs
 
 
+def _photograph(name: str, image: PosedImage, file: Path) -> Photograph:
+    face = image.face
+    if face is not None and not face.name:
+        return Photograph(name, image.path, file, face.whole)
+    return Photograph(name, image.path, file, image.camera, face)
+
+
 def _check_size(photograph: Photograph) -> None:
     size, camera = image_size(photograph.file), photograph.camera
+    camera = camera if photograph.face is None else photograph.face.whole
     if not same_shape(size, (camera.width, camera.height)):
         raise SceneError(
             f"{photograph.file} is {size[0]}x{size[1]} pixels, its camera {camera.width}x{camera.height}; expected the "

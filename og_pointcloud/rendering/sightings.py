@@ -21,7 +21,7 @@ from scipy.sparse import csr_array
 
 from og_pointcloud.kernels import get_num_threads, njit, prange
 from og_pointcloud.rendering.splatting import CUTOFFS, TILE, Cutoffs, Gaussians, binned_splats, dim, tile_buffer
-from og_pointcloud.scene import Camera
+from og_pointcloud.scene import NOT_SEEN, Camera
 
 __all__ = ["Sightings", "openness", "sightings"]
 
@@ -56,11 +56,13 @@ def sightings(
 ) -> Sightings:
     """The masks that each point lies in, by how openly the view sees it.
 
-    ids: (H, W) int32 in -1..mask_count-1, H and W the camera's. near, thickness (n,): scene units.
+    ids: (H, W) int32 in -1..mask_count-1, or NOT_SEEN, H and W the camera's; a view says nothing of points whose pixel
+        is NOT_SEEN. near, thickness (n,): scene units.
     asked: (n,) bool, points that are looked at (all of them hide others); None: all.
     """
     open_, u, v = openness(gaussians, camera, near, thickness, asked, cutoffs)
     seen = np.flatnonzero(open_).astype(np.int32)
+    seen = seen[ids[v[seen].astype(np.intp), u[seen].astype(np.intp)] != NOT_SEEN]
     rows, columns, votes = _votes(seen, open_, u, v, np.where(ids < 0, mask_count, ids), SAMPLES)
     order = np.argsort(rows, kind="stable")
     starts = np.searchsorted(rows[order], np.arange(mask_count + 2)).astype(np.int32)

@@ -447,7 +447,7 @@ class _Views:
 
     def _render(self, gaussians: Gaussians, view: View, masks: NDArray[np.int64] | None = None) -> _ViewWeights:
         """The view's weights; masks: only these count as such, all by default."""
-        ids = view.mask_map().ravel()
+        ids = np.maximum(view.mask_map().ravel(), -1)
         if masks is not None:
             ids = np.where(np.isin(ids, masks), ids, -1)
         wanted = np.arange(len(ids)) if self.whole else np.flatnonzero(ids >= 0)

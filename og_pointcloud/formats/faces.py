@@ -1,0 +1,194 @@
+"""An image of any lens becomes pinhole views: one, if a pinhole can show all that the lens saw, else faces of a cube.
+
+One view keeps the image's focal lengths and pose, and grows to the image's rim, which a view of the same size would
+crop. The faces of a cube are called front, left, right, up, down and back; those that the lens does not see are left
+out, the others cut to what it sees. Each has as many pixels across as the image has there.
+
+Masks are taken over by nearest pixel, since ids must not be blended. A pixel that the lens never saw is NOT_SEEN, which
+is no evidence of anything, while a pixel outside every mask says that no mask is there.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from og_pointcloud.errors import SceneError
+from og_pointcloud.formats.images import require_cv2
+from og_pointcloud.formats.lenses import Lens
+from og_pointcloud.scene import NOT_SEEN, Camera
+
+__all__ = ["Face", "faces"]
+
+Doubles = NDArray[np.float64]
+
+ONE_VIEW = float(np.tan(np.radians(55)))
+"""A pinhole that looks wider than this, from its axis to a border, stretches its rim to more than three times."""
+CIRCULAR = float(np.radians(85))
+"""A lens that sees as far as this from its axis towards the middle of a border draws a circle in the image."""
+LEAST_SHARE = 0.005
+"""Of a cube's face: less is not worth a view."""
+GRID = 257
+"""Rays a side by which it is looked up what a lens sees."""
+CACHED_MAPS = 12
+"""Faces whose maps are kept, 4 bytes a pixel each: those of two cameras that are read in turn."""
+CUBE = {
+    "front": np.eye(3),
+    "left": np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]]),
+    "right": np.array([[0.0, 0, -1], [0, 1, 0], [1, 0, 0]]),
+    "up": np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]),
+    "down": np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]),
+    "back": np.array([[-1.0, 0, 0], [0, 1, 0], [0, 0, -1]]),
+}
+"""Rotation from the image's camera to that of the face; x right, y down, z forward."""
+
+
+@dataclass(frozen=True)
+class Face:
+    """A pinhole view of what a lens saw.
+
+    name: of the cube's face, "" for the one view. camera: the pinhole, with its pose. whole: of the image as it is.
+    """
+
+    name: str
+    camera: Camera
+    whole: Camera
+    lens: Lens
+
+    def of_size(self, width: int, height: int) -> Face:
+        """This view in width x height pixels, of an image that is scaled alike."""
+        size = _scaled(self.whole, width / self.camera.width, height / self.camera.height)
+        return replace(self, camera=self.camera.resized(width, height), whole=self.whole.resized(*size))
+
+    def of_whole_size(self, width: int, height: int) -> Face:
+        """The same of an image of width x height pixels."""
+        size = _scaled(self.camera, width / self.whole.width, height / self.whole.height)
+        return replace(self, camera=self.camera.resized(*size), whole=self.whole.resized(width, height))
+
+    def mask_ids(self, ids: NDArray[np.int32]) -> NDArray[np.int32]:
+        """The ids (h, w) of the image as it is -> (H, W) of this view, by nearest pixel; NOT_SEEN where it has none."""
+        return self._picked(ids, NOT_SEEN)
+
+    def depths(self, depth: NDArray[np.float32]) -> NDArray[np.float32]:
+        """As `mask_ids`, of depths along this view's axis; 0 where the image has none."""
+        return self._picked(depth, 0)
+
+    def _picked(self, values: NDArray, otherwise: int) -> NDArray:
+        expected = (self.whole.height, self.whole.width)
+        if values.shape != expected:
+            raise SceneError(f"the map is {values.shape}; expected the camera's {expected} (rows, columns)")
+        nearest = _nearest(self._key)
+        return np.where(nearest < 0, values.dtype.type(otherwise), values.reshape(-1)[nearest])
+
+    def image(self, rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """(H, W, 3) uint8 of this view, linear, black where the lens saw nothing. rgb: (h, w, 3), the whole image."""
+        cv2 = require_cv2()
+        x, y = (np.nan_to_num(pixels - 0.5, nan=-2.0).astype(np.float32) for pixels in _pixels(self._key))
+        border = cv2.BORDER_CONSTANT
+        if self.lens.wraps:
+            y, border = np.clip(y, 0, self.whole.height - 1), cv2.BORDER_WRAP
+        return np.asarray(cv2.remap(rgb, x, y, cv2.INTER_LINEAR, borderMode=border), np.uint8)
+
+    @property
+    def _key(self) -> _Key:
+        """All that decides which pixel shows what; views that share it share their maps."""
+        return self.name, _numbers(self.camera), _numbers(self.whole), self.lens
+
+
+Numbers = tuple[int, int, float, float, float, float]
+"""Width, height, focal lengths, principal point: pixels."""
+Box = tuple[float, float, float, float]
+"""Left, top, right, bottom."""
+_Key = tuple[str, Numbers, Numbers, Lens]
+
+
+def faces(whole: Camera, lens: Lens) -> tuple[Face, ...]:
+    """The pinhole views of an image, at its resolution. whole: size, focal lengths, principal point and pose."""
+    boxes = _boxes(_numbers(whole), lens)
+    made = []
+    for name, (left, top, right, bottom) in boxes.items():
+        pose = whole.world_to_camera.copy()
+        pose[:3] = CUBE[name or "front"] @ pose[:3]
+        shrunk = np.pi / 4 if name else 1.0  # a cube's face is 2 wide for an arc of pi / 2
+        fx, fy = whole.fx * shrunk, whole.fy * shrunk
+        width, height = max(1, round((right - left) * fx)), max(1, round((bottom - top) * fy))
+        made.append(Face(name, Camera(width, height, fx, fy, -left * fx, -top * fy, pose), whole, lens))
+    return tuple(made)
+
+
+def _scaled(camera: Camera, x: float, y: float) -> tuple[int, int]:
+    return max(1, round(camera.width * x)), max(1, round(camera.height * y))
+
+
+def _numbers(camera: Camera) -> Numbers:
+    return camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy
+
+
+@lru_cache(maxsize=64)
+def _boxes(whole: Numbers, lens: Lens) -> dict[str, Box]:
+    """By face, what is seen of it at depth 1. The one view is called "", and cut at whole pixels of the image."""
+    one, _ = _seen_box("front", whole, lens, ONE_VIEW)
+    if one is None:
+        raise SceneError(f"a {lens.model} lens of {lens.terms} sees nothing before the camera: check the pose file")
+    if not lens.wraps and max(map(abs, one)) < ONE_VIEW:
+        _, _, fx, fy, cx, cy = whole
+        left, top, right, bottom = (round(at * f + c) for at, f, c in zip(one, (fx, fy) * 2, (cx, cy) * 2, strict=True))
+        right, bottom = max(right, left + 1), max(bottom, top + 1)
+        return {"": ((left - cx) / fx, (top - cy) / fy, (right - cx) / fx, (bottom - cy) / fy)}
+    seen = {name: _seen_box(name, whole, lens, 1.0) for name in CUBE}
+    return {name: box for name, (box, share) in seen.items() if box is not None and share > LEAST_SHARE}
+
+
+def _seen_box(name: str, whole: Numbers, lens: Lens, half: float) -> tuple[Box | None, float]:
+    """Of a face that reaches from -half to half at depth 1: the box around what the lens sees of it, and its share."""
+    at = np.linspace(-half, half, GRID)
+
+    def seen(x: Doubles, y: Doubles) -> NDArray[np.bool_]:
+        x, y = np.meshgrid(x, y)
+        return ~np.isnan(_image_pixels(np.stack([x, y, np.ones_like(x)], axis=-1) @ CUBE[name], whole, lens)[0])
+
+    coarse = seen(at, at)
+    if not coarse.any():
+        return None, 0.0
+    borders = []
+    for end, axis in ((0, 0), (0, 1), (-1, 0), (-1, 1)):  # left, top, right, bottom
+        border = np.flatnonzero(coarse.any(axis=axis))[end]
+        beside = min(max(border + (1 if end else -1), 0), GRID - 1)  # the border lies before this one: looked up finer
+        fine = np.linspace(min(at[border], at[beside]), max(at[border], at[beside]), GRID)
+        strip = seen(fine, at) if axis == 0 else seen(at, fine)
+        borders.append(float(fine[np.flatnonzero(strip.any(axis=axis))[end]]))
+    return (borders[0], borders[1], borders[2], borders[3]), float(coarse.mean())
+
+
+def _image_pixels(rays: Doubles, whole: Numbers, lens: Lens) -> tuple[Doubles, Doubles]:
+    """Where rays (..., 3) of the camera meet the image as it is, pixel centres at +0.5; NaN where they do not."""
+    width, height, fx, fy, cx, cy = whole
+    u, v = lens.project(rays)
+    reach = max(cx, width - cx) / fx, max(cy, height - cy) / fy
+    if max(reach) > lens.radius(CIRCULAR):  # of which the corners are black
+        beyond = np.hypot(u, v) > max(reach)
+        u, v = np.where(beyond, np.nan, u), np.where(beyond, np.nan, v)
+    u, v = u * fx + cx, v * fy + cy
+    if lens.wraps:
+        u, v = u % width, np.clip(v, 0, np.nextafter(height, 0))
+    inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
+    return np.where(inside, u, np.nan), np.where(inside, v, np.nan)
+
+
+def _pixels(key: _Key) -> tuple[Doubles, Doubles]:
+    """(H, W) each: column and row of the image as it is that every pixel of the face shows; NaN where it has none."""
+    name, (width, height, fx, fy, cx, cy), whole, lens = key
+    x, y = np.meshgrid((np.arange(width) + 0.5 - cx) / fx, (np.arange(height) + 0.5 - cy) / fy)
+    return _image_pixels(np.stack([x, y, np.ones_like(x)], axis=-1) @ CUBE[name or "front"], whole, lens)
+
+
+@lru_cache(maxsize=CACHED_MAPS)
+def _nearest(key: _Key) -> NDArray[np.int32]:
+    """(H, W) int32: the nearest pixel of the image as it is, counted row by row; -1 where it has none."""
+    column, row = _pixels(key)
+    with np.errstate(invalid="ignore"):
+        flat = np.floor(row) * key[2][0] + np.floor(column)
+    return np.where(np.isnan(flat), -1, flat).astype(np.int32)

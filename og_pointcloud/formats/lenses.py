@@ -1,0 +1,173 @@
+"""Where a ray meets the image, for every camera model that is read: rays of the camera -> normalised coordinates.
+
+Normalised coordinates times the focal lengths plus the principal point are pixels, so they do not change with the
+image's size. x right, y down, z forward; theta is a ray's angle from the axis.
+
+perspective  x/z, y/z, then OpenCV's k1..k6 and p1, p2. ``xi``: the ray's length times xi is added to z before (unified
+             model of Mei and Rives, ICRA 2007: KITTI-360's fisheyes).
+fisheye      radius theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8): Kannala and Brandt, OpenCV's fisheye;
+             p1, p2 and the thin prism's sx1, sy1 as in COLMAP's THIN_PRISM_FISHEYE.
+fov          radius atan(2 r tan(omega / 2)) / omega, r = tan(theta): Devernay and Faugeras 2001.
+division     radius d of which r = d / (1 + k d^2): Fitzgibbon 2001.
+extended     x / (alpha sqrt(beta (x^2 + y^2) + z^2) + (1 - alpha) z): Khomutenko et al. 2016.
+spherical    longitude and latitude in radians; the whole sphere, x wraps around.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from og_pointcloud.errors import SceneError
+from og_pointcloud.scene import Camera
+
+__all__ = ["SPHERICAL", "Lens", "lens_of", "spherical_camera"]
+
+Doubles = NDArray[np.float64]
+Terms = Mapping[str, float]
+
+ANGLES = np.linspace(0.0, np.pi, 4097)[:-1]
+"""At which it is looked up how far out a lens sees."""
+
+
+def _perspective(x: Doubles, y: Doubles, z: Doubles, t: Terms) -> tuple[Doubles, Doubles]:
+    z = z + t["xi"] * np.sqrt(x * x + y * y + z * z)
+    x, y = x / z, y / z
+    r2 = x * x + y * y
+    radial = 1 + r2 * (t["k1"] + r2 * (t["k2"] + r2 * t["k3"]))
+    return _tangential(x, y, r2, radial / (1 + r2 * (t["k4"] + r2 * (t["k5"] + r2 * t["k6"]))), t)
+
+
+def _fisheye(x: Doubles, y: Doubles, z: Doubles, t: Terms) -> tuple[Doubles, Doubles]:
+    radius = np.hypot(x, y)
+    scale = np.arctan2(radius, z) / np.maximum(radius, np.finfo(np.float64).tiny)
+    x, y = x * scale, y * scale
+    r2 = x * x + y * y
+    radial = 1 + r2 * (t["k1"] + r2 * (t["k2"] + r2 * (t["k3"] + r2 * t["k4"])))
+    x, y = _tangential(x, y, r2, radial, t)
+    return x + t["sx1"] * r2, y + t["sy1"] * r2
+
+
+def _tangential(x: Doubles, y: Doubles, r2: Doubles, radial: Doubles, t: Terms) -> tuple[Doubles, Doubles]:
+    p1, p2 = t["p1"], t["p2"]
+    return (
+        x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+        y * radial + 2 * p2 * x * y + p1 * (r2 + 2 * y * y),
+    )
+
+
+def _fov(x: Doubles, y: Doubles, z: Doubles, t: Terms) -> tuple[Doubles, Doubles]:
+    radius = np.hypot(x, y)
+    bent = np.arctan2(2 * np.tan(t["omega"] / 2) * radius, z) / t["omega"]
+    scale = bent / np.maximum(radius, np.finfo(np.float64).tiny)
+    return x * scale, y * scale
+
+
+def _division(x: Doubles, y: Doubles, z: Doubles, t: Terms) -> tuple[Doubles, Doubles]:
+    x, y = x / z, y / z
+    scale = 2 / (1 + np.sqrt(1 - 4 * t["k"] * (x * x + y * y)))
+    return x * scale, y * scale
+
+
+def _extended(x: Doubles, y: Doubles, z: Doubles, t: Terms) -> tuple[Doubles, Doubles]:
+    depth = t["alpha"] * np.sqrt(t["beta"] * (x * x + y * y) + z * z) + (1 - t["alpha"]) * z
+    return x / depth, y / depth
+
+
+def _spherical(x: Doubles, y: Doubles, z: Doubles, _: Terms) -> tuple[Doubles, Doubles]:
+    return np.arctan2(x, z), np.arctan2(y, np.hypot(x, z))
+
+
+Projection = Callable[[Doubles, Doubles, Doubles, Terms], tuple[Doubles, Doubles]]
+MODELS: dict[str, tuple[tuple[str, ...], Projection]] = {
+    "perspective": (("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "xi"), _perspective),
+    "fisheye": (("k1", "k2", "k3", "k4", "p1", "p2", "sx1", "sy1"), _fisheye),
+    "fov": (("omega",), _fov),
+    "division": (("k",), _division),
+    "extended": (("alpha", "beta"), _extended),
+    "spherical": ((), _spherical),
+}
+"""Names of the terms, and the projection."""
+
+
+@dataclass(frozen=True)
+class Lens:
+    """A camera model without focal lengths and principal point. terms: in the order of ``MODELS``."""
+
+    model: str
+    terms: tuple[float, ...]
+
+    @property
+    def wraps(self) -> bool:
+        """Whether the image's left border continues at the right."""
+        return self.model == "spherical"
+
+    def project(self, rays: Doubles) -> tuple[Doubles, Doubles]:
+        """Normalised coordinates (...) of rays (..., 3) of any length; NaN for rays that the lens does not see."""
+        x, y, z = np.moveaxis(np.asarray(rays, np.float64), -1, 0)
+        with np.errstate(all="ignore"):
+            u, v = self._normalized(x, y, z)
+            seen = np.arctan2(np.hypot(x, y), z) < widest(self)
+        return np.where(seen, u, np.nan), np.where(seen, v, np.nan)
+
+    def radius(self, angle: float) -> float:
+        """Of the circle that rays at this angle from the axis, radians, meet; infinite where the lens sees none of
+        them, or draws no circles."""
+        u, _ = self.project(np.array([np.sin(angle), 0.0, np.cos(angle)]))
+        return np.inf if self.wraps or np.isnan(u) else float(u)
+
+    def _normalized(self, x: Doubles, y: Doubles, z: Doubles) -> tuple[Doubles, Doubles]:
+        names, projection = MODELS[self.model]
+        return projection(x, y, z, dict(zip(names, self.terms, strict=True)))
+
+
+SPHERICAL = Lens("spherical", ())
+
+
+@lru_cache(maxsize=64)
+def widest(lens: Lens) -> float:
+    """The angle from the axis, radians, up to which radii grow: beyond, a polynomial turns back and would show the
+    image's inside once more, and rays to the side or behind pass a perspective lens by."""
+    if lens.wraps:
+        return np.inf
+    with np.errstate(all="ignore"):
+        radius, _ = lens._normalized(np.sin(ANGLES), np.zeros_like(ANGLES), np.cos(ANGLES))
+        falls = ~(np.diff(radius) > 0)
+    return float(ANGLES[int(np.argmax(falls))]) if falls.any() else np.inf
+
+
+def lens_of(model: str, values: Terms) -> Lens | None:
+    """The lens with these named terms (absent ones are zero); None if it is a pinhole. SceneError for other terms.
+
+    A fisheye lens with zero terms is equidistant, not a pinhole, so it always is a lens.
+    """
+    names, _ = MODELS[model]
+    unknown = [name for name, value in values.items() if value and name not in names]
+    if unknown:
+        raise SceneError(
+            f"a {model} lens has the term {unknown[0]} = {values[unknown[0]]}; expected only {', '.join(names)}: "
+            "undistort images and masks first and give pinhole cameras"
+        )
+    terms = tuple(float(values.get(name, 0.0)) for name in names)
+    if not np.isfinite(terms).all():
+        raise SceneError(f"lens distortion {', '.join(names)} is {terms}; expected finite numbers")
+    if model in ("perspective", "fov", "division") and not any(terms):
+        return None
+    lens = Lens(model, terms)
+    if not widest(lens) > 0:
+        raise SceneError(f"a {model} lens with {', '.join(names)} of {terms} sees nothing: check them in the pose file")
+    return lens
+
+
+def spherical_camera(width: int, height: int, world_to_camera: Doubles) -> Camera:
+    """The camera of an equirectangular image, all of the sphere: its focal lengths are pixels a radian."""
+    if not 1.9 < width / max(height, 1) < 2.1:
+        raise SceneError(
+            f"an equirectangular image is {width}x{height}; expected twice as wide as high, all of the sphere: pad it "
+            "with black to that shape"
+        )
+    return Camera(width, height, width / (2 * np.pi), height / np.pi, width / 2, height / 2, world_to_camera)

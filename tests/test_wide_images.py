@@ -1,0 +1,271 @@
+"""Captures of fisheyes and panoramas: images become pinhole views, and their masks go with them."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+from capture_files import make_world, write_colmap_text, write_features
+from scenes import write_image
+
+import og_pointcloud as og
+from og_pointcloud.errors import SceneError
+from og_pointcloud.fitting.mask_table import mask_table
+from og_pointcloud.formats.capture import read_capture, read_poses
+from og_pointcloud.formats.ply import join_columns, write_ply
+from og_pointcloud.masking.make_masks import MaskSettings, make_masks
+from og_pointcloud.rendering.geometry import isotropic
+from og_pointcloud.scene import NOT_SEEN
+
+FACES = ["front", "left", "right", "up", "down", "back"]
+SIZE = (256, 128)
+DIRECTIONS = np.array([[0.3, 0.1, 1], [1, 0.2, 0.9], [0.2, -0.1, -1], [-1, 0.1, 0.1], [0.1, 1, 0.2], [0.2, -1, 0.1]])
+
+
+def balls(count=400):
+    """(6, count, 3) points of balls of radius 0.25 at distance 3 in six directions."""
+    directions = DIRECTIONS / np.linalg.norm(DIRECTIONS, axis=1, keepdims=True)
+    around = np.random.default_rng(0).normal(size=(6, count, 3))
+    return 3 * directions[:, None] + 0.25 * around / np.linalg.norm(around, axis=2, keepdims=True)
+
+
+def positions():
+    return [np.array([0.2 * i, 0.1 * i, -0.15 * i]) for i in range(3)]
+
+
+def write_panoramas(folder, lens="EQUIRECTANGULAR", size=SIZE, circle=False):
+    """Three panoramas (or equidistant fisheyes) of the balls; ids 1..6 in each, rows of features to match."""
+    width, height = size
+    focal = width / np.pi  # of the fisheye: half a turn across
+    column, row = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    if lens == "EQUIRECTANGULAR":
+        longitude, latitude = (column / width - 0.5) * 2 * np.pi, (row / height - 0.5) * np.pi
+        rays = np.stack(
+            [np.cos(latitude) * np.sin(longitude), np.sin(latitude), np.cos(latitude) * np.cos(longitude)], axis=-1
+        )
+    else:
+        x, y = (column - width / 2) / focal, (row - height / 2) / focal
+        theta = np.hypot(x, y)
+        rays = np.stack([np.sinc(theta / np.pi) * x, np.sinc(theta / np.pi) * y, np.cos(theta)], axis=-1)
+    frames, features = [], {}
+    centers = balls().mean(axis=1)
+    for index, position in enumerate(positions()):
+        ids = np.zeros((height, width), np.uint16)
+        for ball, center in enumerate(centers):
+            to_ball = center - position
+            distance = np.linalg.norm(to_ball)
+            ids[rays @ (to_ball / distance) > np.cos(np.arcsin(0.25 / distance))] = ball + 1
+        if circle:
+            ids[theta > np.pi / 2] = 0
+        name = f"pano_{index}"
+        write_image(folder / "masks" / f"{name}.png", ids)
+        colours = np.stack([ids * 30, 255 - ids * 20, np.full_like(ids, 90)], axis=-1).astype(np.uint8)
+        write_image(folder / "images" / f"{name}.png", colours)
+        features[name] = np.eye(6, 8, dtype=np.float32)
+        pose = np.diag([1.0, -1.0, -1.0, 1.0])
+        pose[:3, 3] = position
+        frames.append({"file_path": f"images/{name}.png", "transform_matrix": pose.tolist()})
+    keys = {"camera_model": lens, "w": width, "h": height, "fl_x": focal, "fl_y": focal}
+    content = {**keys, "cx": width / 2, "cy": height / 2, "frames": frames}
+    (folder / "transforms.json").write_text(json.dumps(content))
+    write_features(folder, {"feature_space": np.array("tiny"), **features})
+    xyz = dict(zip("xyz", balls().reshape(-1, 3).T, strict=True))
+    write_ply(folder / "points.ply", {"vertex": join_columns(xyz)})
+    return folder
+
+
+@pytest.fixture
+def panoramas(tmp_path):
+    return write_panoramas(tmp_path)
+
+
+def test_a_panorama_becomes_six_views_with_its_masks(panoramas):
+    scene = read_capture(panoramas)
+    assert [view.name for view in scene.views] == [f"pano_{i}/{face}" for i in range(3) for face in FACES]
+    xyz, truth = scene.points.xyz, np.repeat(np.arange(6), 400)
+    for view in scene.views:
+        uv, _ = view.camera.project(xyz)
+        inside = view.camera.shows(uv)
+        column, row = np.floor(uv[inside]).astype(int).T
+        ids = view.mask_map()
+        assert (ids != NOT_SEEN).all()
+        held = ids[row, column]
+        owner = view.mask_features.argmax(axis=1)
+        on = held >= 0
+        assert (owner[held[on]] != truth[inside][on]).sum() <= 0.01 * on.sum()
+        assert on.sum() > 0.6 * inside.sum() or inside.sum() < 50  # balls are seven pixels wide, and rims lie beside
+        assert set(np.unique(ids)) == set(range(-1, view.mask_count)), "a face has the masks that it shows, no other"
+
+
+def test_a_mask_across_a_border_of_faces_is_one_mask_of_each(panoramas):
+    views = {view.name: view for view in read_capture(panoramas).views}
+    front, right = views["pano_0/front"], views["pano_0/right"]
+    both = {int(row) for row in front.mask_features.argmax(1)} & {int(row) for row in right.mask_features.argmax(1)}
+    assert both == {1}, "the ball at 48 degrees lies in both"
+
+
+def test_photographs_are_split_like_their_masks(panoramas):
+    for view in read_capture(panoramas).views[:6]:
+        image, ids = view.image_rgb(), view.mask_map()
+        assert image is not None
+        inside = np.abs(cv2.blur(ids.astype(np.float32), (5, 5)) - ids) < 1e-6
+        owner = np.append(view.mask_features.argmax(1), -1)
+        numbers = owner[ids] + 1
+        assert (np.abs(image[..., 2].astype(int) - numbers * 30)[inside] <= 1).all()
+
+
+@pytest.mark.parametrize("lens", ["EQUIRECTANGULAR", "OPENCV_FISHEYE", "FISHEYE"])
+def test_balls_all_around_are_labelled(tmp_path, lens):
+    size = (512, 256) if lens == "EQUIRECTANGULAR" else (400, 400)
+    folder = write_panoramas(tmp_path, lens, size, circle=lens != "EQUIRECTANGULAR")
+    scene = read_capture(folder)
+    cloud = og.fit(scene, progress=False)
+    result = og.segment(cloud, {f"ball {i}": row for i, row in enumerate(np.eye(6, 8, dtype=np.float32))})
+    truth = np.repeat(np.arange(6), 400)
+    ahead = np.repeat(DIRECTIONS[:, 2] > 0.05, 400) if lens != "EQUIRECTANGULAR" else np.ones(2400, bool)
+    assert ahead.sum() >= 1600
+    assert (result.labels == truth)[ahead].mean() > 0.9  # but for rims
+    assert ((result.labels == truth) | (result.labels == -1)).mean() > 0.998
+    behind = np.repeat(DIRECTIONS[:, 2] < -0.5, 400)
+    assert lens == "EQUIRECTANGULAR" or (result.labels[behind] == -1).all()
+
+
+def test_masks_may_be_of_the_faces(panoramas):
+    scene = read_capture(panoramas)
+    features = {"feature_space": np.array("tiny")}
+    for view in scene.views:
+        ids = view.mask_map()
+        write_image(panoramas / "masks" / f"{view.name}.png", (ids + 1).astype(np.uint16))
+        features[view.name] = view.mask_features
+    write_features(panoramas, features)
+    for index in range(3):
+        (panoramas / "masks" / f"pano_{index}.png").unlink()
+    again = read_capture(panoramas)
+    for view, same in zip(scene.views, again.views, strict=True):
+        np.testing.assert_array_equal(view.mask_map(), same.mask_map())
+        np.testing.assert_array_equal(view.mask_features, same.mask_features)
+
+
+def test_masks_of_half_the_size_halve_the_views(panoramas):
+    for file in (panoramas / "masks").glob("*.png"):
+        write_image(file, np.ascontiguousarray(cv2.imread(str(file), cv2.IMREAD_UNCHANGED)[::2, ::2]))
+    scene = read_capture(panoramas)
+    assert {view.camera.width for view in scene.views} == {32}
+    assert all(view.mask_map().shape == (32, 32) for view in scene.views)
+    image = scene.views[0].image_rgb()
+    assert image is not None
+    assert image.shape == (32, 32, 3)
+
+
+def test_masks_that_do_not_fit_the_panorama_are_refused(panoramas):
+    write_image(panoramas / "masks" / "pano_1.png", np.zeros((100, 100), np.uint16))
+    with pytest.raises(SceneError, match=r"view 'pano_1/front': the masks are 100x100 pixels, the camera 256x128"):
+        read_capture(panoramas)
+
+
+def test_masks_are_made_of_the_faces(panoramas, tmp_path):
+    output = tmp_path / "made"
+    made = make_masks(panoramas, MaskSettings(every=2), output, say=lambda _: None)
+    assert made.images == 12
+    scene = read_capture(output)
+    assert [view.name for view in scene.views] == [f"pano_{i}/{face}" for i in (0, 2) for face in FACES]
+    assert (output / "masks" / "pano_2" / "down.png").is_file()
+    assert sum(view.mask_count for view in scene.views) > 6
+
+
+def test_what_the_lens_did_not_see_says_nothing(tmp_path):
+    """A fisheye's side faces are cut to its rim; what lies beyond is neither in a mask nor outside of all."""
+    write_panoramas(tmp_path, "OPENCV_FISHEYE", (256, 200))
+    scene = read_capture(tmp_path)
+    maps = {view.name: view.mask_map() for view in scene.views}
+    assert any((ids == NOT_SEEN).any() for ids in maps.values())
+    points = scene.points
+    spacing = np.full(len(points), 0.02, np.float32)
+    cloud = isotropic(points, spacing, 0.5, 0.9)
+    for by_sight in (True, False):
+        table = mask_table(cloud, scene.views, 0.01, spacing, by_sight=by_sight)
+        for index, view in enumerate(scene.views):
+            said = np.unique(np.r_[table.outside[[index]].indices, table.weights[table.mask_view == index].indices])
+            uv, _ = view.camera.project(points.xyz[said])
+            inside = view.camera.shows(uv)
+            column, row = np.floor(uv[inside]).astype(int).T
+            assert len(said) == 0 or (maps[view.name][row, column] != NOT_SEEN).mean() > 0.995
+
+
+def test_colmaps_wide_cameras_are_views_too(tmp_path):
+    world = make_world()
+    write_colmap_text(
+        tmp_path / "sparse/0", world, {1: ("OPENCV_FISHEYE", (20.0, 20.0, 32.0, 24.0, 0.0, 0.0, 0.0, 0.0))}
+    )
+    poses = read_poses(tmp_path)
+    assert poses.names[:2] == ("frame_00/front", "frame_00/left")
+    assert len(poses.names) > 2 * len(world.names)
+    assert all(image.lens is None for image in poses.images)
+
+
+def test_depth_of_a_wide_lens_is_read_in_front(tmp_path):
+    folder = write_panoramas(tmp_path, "OPENCV_FISHEYE", (256, 256))
+    content = json.loads((folder / "transforms.json").read_text())
+    content["frames"][0]["depth_file_path"] = "depth/0.npy"
+    (folder / "transforms.json").write_text(json.dumps(content))
+    (folder / "depth").mkdir()
+    np.save(folder / "depth/0.npy", np.full((256, 256), 2.0, np.float32))
+    poses = read_poses(folder)
+    depths = [image.depth for image in poses.images if image.depth is not None]
+    assert len(depths) == 1
+    assert depths[0].read().camera.width == poses.images[0].camera.width
+    assert (depths[0].read().depth == 2).all()
+
+
+def test_depth_of_a_panorama_is_refused(panoramas):
+    content = json.loads((panoramas / "transforms.json").read_text())
+    content["frames"][0]["depth_file_path"] = "depth/0.npy"
+    (panoramas / "transforms.json").write_text(json.dumps(content))
+    with pytest.raises(SceneError, match="equirectangular image is not read"):
+        read_poses(panoramas)
+
+
+def unit(*xyzw):
+    return np.array(xyzw) / np.linalg.norm(xyzw)
+
+
+def test_rigs_as_colmap_writes_them(tmp_path):
+    """Since 3.12 poses are of frames, and of sensors in rigs; the images file has each image's own all the same."""
+    pycolmap = pytest.importorskip("pycolmap")
+    model = pycolmap.Reconstruction()
+    for camera_id in (1, 2):
+        params = [70.0, 72.0, 31.0, 25.0] if camera_id == 1 else [60.0, 60.0, 32.0, 24.0]
+        model.add_camera(pycolmap.Camera(camera_id=camera_id, model="PINHOLE", width=64, height=48, params=params))
+    rig = pycolmap.Rig(rig_id=1)
+    left, right = (pycolmap.sensor_t(type=pycolmap.SensorType.CAMERA, id=number) for number in (1, 2))
+    beside = pycolmap.Rigid3d(pycolmap.Rotation3d(unit(0.0, 0.0, 0.1, 1.0)), np.array([0.2, 0.0, 0.05]))
+    rig.add_ref_sensor(left)
+    rig.add_sensor(right, beside)
+    model.add_rig(rig)
+    expected = {}
+    for number in range(2):
+        frame = pycolmap.Frame(frame_id=number + 1, rig_id=1)
+        turn = pycolmap.Rotation3d(unit(0.1, 0.2 * number, 0.0, 1.0))
+        at = pycolmap.Rigid3d(turn, np.array([number, 0.5, 1.0]))
+        for camera_id, side in ((1, "left"), (2, "right")):
+            frame.add_data_id(pycolmap.data_t(left if camera_id == 1 else right, 2 * number + camera_id))
+            pose = at if camera_id == 1 else beside * at
+            expected[f"{side}/{number}.png"] = np.vstack([pose.matrix(), [0, 0, 0, 1]])
+        frame.rig_from_world = at
+        model.add_frame(frame)
+        for camera_id, side in ((1, "left"), (2, "right")):
+            image = pycolmap.Image(name=f"{side}/{number}.png", camera_id=camera_id, image_id=2 * number + camera_id)
+            image.frame_id = number + 1
+            model.add_image(image)
+        model.register_frame(number + 1)
+    for suffix, write in ((".bin", model.write_binary), (".txt", model.write_text)):
+        folder = tmp_path / suffix / "sparse" / "0"
+        folder.mkdir(parents=True)
+        write(folder)
+        assert (folder / f"rigs{suffix}").is_file()
+        assert (folder / f"frames{suffix}").is_file()
+        poses = read_poses(tmp_path / suffix)
+        assert set(poses.names) == {"left/0", "right/0", "left/1", "right/1"}
+        for image in poses.images:
+            np.testing.assert_allclose(image.camera.world_to_camera, expected[image.path], atol=1e-9)
+            assert image.camera.fx == (70.0 if image.path.startswith("left") else 60.0)
