@@ -51,6 +51,10 @@ if TYPE_CHECKING:
     from og_pointcloud.fitting.opengaussian import read_opengaussian
     from og_pointcloud.formats.capture import read_capture
     from og_pointcloud.formats.points import read_points
+    from og_pointcloud.mapping.changes import Changes, Moved, compare
+    from og_pointcloud.mapping.frame import Frame
+    from og_pointcloud.mapping.mapper import Mapper
+    from og_pointcloud.mapping.merging import update
     from og_pointcloud.scene import Camera
     from og_pointcloud.settings import FitSettings
     from og_pointcloud.show import edit as edit
@@ -66,19 +70,23 @@ __all__ = [
     "BundleError",
     "Camera",
     "CaptureFit",
+    "Changes",
     "Collection",
     "FeatureSpaceError",
     "Finding",
     "Findings",
     "FitOptions",
     "FitSettings",
+    "Frame",
     "Instance",
     "InstanceTable",
     "Instances",
     "LabelledCloud",
     "LabelledScene",
+    "Mapper",
     "Match",
     "MissingExtraError",
+    "Moved",
     "OgPointcloudError",
     "Pick",
     "Reason",
@@ -89,6 +97,7 @@ __all__ = [
     "Vocabulary",
     "WordBank",
     "axis_aligned_box",
+    "compare",
     "feature_colors",
     "feature_picture",
     "fit",
@@ -105,6 +114,7 @@ __all__ = [
     "read_text_features",
     "segment",
     "select",
+    "update",
     "write_bundle",
 ]
 
@@ -129,6 +139,10 @@ _HOMES = {
     "og_pointcloud.fitting.opengaussian": ("read_opengaussian",),
     "og_pointcloud.formats.capture": ("read_capture",),
     "og_pointcloud.formats.points": ("read_points",),
+    "og_pointcloud.mapping.changes": ("Changes", "Moved", "compare"),
+    "og_pointcloud.mapping.frame": ("Frame",),
+    "og_pointcloud.mapping.mapper": ("Mapper",),
+    "og_pointcloud.mapping.merging": ("update",),
     "og_pointcloud.scene": ("Camera",),
     "og_pointcloud.settings": ("FitSettings",),
     "og_pointcloud.show.fit_pictures": ("feature_colors", "feature_picture"),

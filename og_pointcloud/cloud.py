@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError
+from og_pointcloud.scene import Camera
 
 __all__ = [
     "BACKGROUND", "TOO_FAR", "UNKNOWN", "UNKNOWN_SPACE", "UNOBSERVED", "FeatureSpace", "InstanceTable", "LabelledCloud",
@@ -203,6 +204,8 @@ class LabelledCloud:
     vocabulary: words that may be asked as strings. word_bank: everyday words of the same encoder, which labels are
     judged by; without one, answers are not calibrated.
     provenance: JSON-able record of settings, seed, seconds per stage, and what was left out and why.
+    cameras: those of the views that it was made from, in the local frame: they tell which space was seen to be empty,
+    so that a later visit is not told that what nobody had looked at is new. Empty where they are not known.
 
     A chair of two points and a desk of one, as if an encoder had two words only:
 
@@ -235,6 +238,7 @@ class LabelledCloud:
     vocabulary: Vocabulary | None = None
     provenance: dict[str, Any] = field(default_factory=dict)
     word_bank: WordBank | None = None
+    cameras: tuple[Camera, ...] = ()
 
     def __post_init__(self) -> None:
         n = len(self.xyz)

@@ -21,6 +21,7 @@ FOLDERS = (
     "fitting",
     "bundle",
     "ask",
+    "mapping",
     "collection",
     "show",
     "evaluate",

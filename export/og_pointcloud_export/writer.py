@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud.bundle.format import FORMAT, INSTANCE_MEMBERS, SCHEMA_VERSION, describe_member
+from og_pointcloud.bundle.format import FORMAT, INSTANCE_MEMBERS, SCHEMA_VERSION, describe_member, rows_of_cameras
 from og_pointcloud.bundle.nearest import NONE_WITHIN_REACH, NearestPoint
 from og_pointcloud.bundle.vocabulary import bank_members, bank_of_encoder, encoder_members, vocabulary_members
 from og_pointcloud.cloud import TOO_FAR, InstanceTable, LabelledCloud
@@ -96,6 +96,8 @@ def _arrays(cloud: LabelledCloud) -> dict[str, NDArray[Any]]:
         arrays["rgb"] = cloud.rgb
     if cloud.certainty is not None:
         arrays["certainty"] = cloud.certainty
+    if cloud.cameras:
+        arrays["cameras"] = rows_of_cameras(cloud.cameras)
     return arrays | {f"instances/{name}": array for name, array in table.items()}
 
 

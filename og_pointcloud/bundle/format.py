@@ -5,7 +5,8 @@ One zip, every member stored uncompressed, nothing pickled:
   manifest.json            format, schema_version, feature_space, frame (origin, unit, spacing, reach), counts,
                            members (bytes, sha256, dtype, shape of each), parity figures of the graph, provenance
   query.onnx               the graph that answers text; the instance table's descriptors (R, D) are its constants
-  arrays/*.npy             xyz, instance_ids (smallest integer type), rgb and certainty if known, instances/*
+  arrays/*.npy             xyz, instance_ids (smallest integer type), rgb, certainty and cameras if known,
+                           instances/*
   vocabulary/names.json    words that may be asked as strings, if any
   vocabulary/vectors.npy   (L, D) float32 unit vectors, in older files float16
   bank/vectors.npy         (B, D) float16, everyday words that labels are judged by (``ask.choosing``), if it has them
@@ -19,9 +20,13 @@ from __future__ import annotations
 import hashlib
 import io
 import re
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+
+from og_pointcloud.scene import Camera
 
 FORMAT = "ogpc"
 SCHEMA_VERSION = 2
@@ -44,9 +49,24 @@ REBUILD = "write the file again with write_bundle"
 BANK = "bank/vectors.npy"
 INSTANCE_MEMBERS = {"part_of": "whole"}
 """Columns of the instance table whose member has another name, as it was in the first files of schema 2."""
-RGB, CERTAINTY = "arrays/rgb.npy", "arrays/certainty.npy"
+RGB, CERTAINTY, CAMERAS = "arrays/rgb.npy", "arrays/certainty.npy", "arrays/cameras.npy"
 CARRIED_ENCODER = "text_encoder/"
 """What the names of a carried text encoder's members begin with."""
+
+
+def rows_of_cameras(cameras: Sequence[Camera]) -> NDArray[np.float64]:
+    """(V, 18) float64 a camera: width, height, fx, fy, cx, cy, and the first three rows of world_to_camera."""
+    rows = [(c.width, c.height, c.fx, c.fy, c.cx, c.cy, *c.world_to_camera[:3].ravel()) for c in cameras]
+    return np.array(rows, np.float64).reshape(-1, 18)
+
+
+def cameras_of_rows(rows: NDArray[np.float64]) -> tuple[Camera, ...]:
+    """The cameras of `rows_of_cameras`; SceneError for a row that is none."""
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    poses[:, :3] = rows[:, 6:].reshape(-1, 3, 4)
+    sizes = np.nan_to_num(rows[:, :2]).clip(0, 1 << 30).astype(int).tolist()
+    lenses = rows[:, 2:6].tolist()
+    return tuple(Camera(*size, *lens, pose) for size, lens, pose in zip(sizes, lenses, poses, strict=True))
 
 
 def describe_member(name: str, data: bytes) -> dict[str, Any]:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from og_pointcloud.bundle.format import (
     BANK,
+    CAMERAS,
     CARRIED_ENCODER,
     CERTAINTY,
     FLOATS,
@@ -28,6 +29,7 @@ from og_pointcloud.bundle.format import (
     RGB,
     SAFE_NAME,
     SCHEMA_VERSION,
+    cameras_of_rows,
 )
 from og_pointcloud.cloud import InstanceTable, LabelledCloud, Vocabulary, WordBank
 from og_pointcloud.errors import BundleError, OgPointcloudError
@@ -193,6 +195,7 @@ def _cloud(manifest: dict[str, Any], members: dict[str, bytes]) -> LabelledCloud
     ids = _array(members, "arrays/instance_ids.npy", INTEGERS, (points,)).astype(np.int32)
     rgb = _array(members, RGB, ("|u1",), (points, 3)) if RGB in members else None
     certainty = _array(members, CERTAINTY, ("|u1",), (points,)) if CERTAINTY in members else None
+    cameras = _array(members, CAMERAS, ("<f8",), (None, 18)) if CAMERAS in members else np.zeros((0, 18))
     try:
         origin = np.array(_field(frame, "origin", list, "frame/"), np.float64)
         if origin.shape != (3,) or not np.isfinite(origin).all():
@@ -210,6 +213,7 @@ def _cloud(manifest: dict[str, Any], members: dict[str, bytes]) -> LabelledCloud
             vocabulary=_vocabulary(manifest, members),
             word_bank=WordBank(_array(members, BANK, ("<f2",), (None, None))) if BANK in members else None,
             provenance=_field(manifest, "provenance", dict),
+            cameras=cameras_of_rows(cameras),
         )
     except (OgPointcloudError, ValueError, TypeError, OverflowError) as error:
         raise _Refused(f"its parts do not fit together ({error}): {REBUILD}") from None

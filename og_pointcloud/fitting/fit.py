@@ -212,4 +212,5 @@ def _labelled_cloud(
         rgb=scene.points.rgb,
         certainty=None if certainty is None else np.rint(255 * certainty).astype(np.uint8),
         provenance=journal.provenance(settings),
+        cameras=tuple(view.camera for view in scene.views),
     )

@@ -23,7 +23,7 @@ from og_pointcloud.kernels import get_num_threads, njit, prange
 from og_pointcloud.rendering.splatting import CUTOFFS, TILE, Cutoffs, Gaussians, binned_splats, dim, tile_buffer
 from og_pointcloud.scene import NOT_SEEN, Camera
 
-__all__ = ["Sightings", "openness", "sightings"]
+__all__ = ["Sightings", "openness", "sightings", "sightings_of"]
 
 LEAST_OPEN = 0.02
 """A point that less light reaches is hidden: what so few rays say is as often an edge's as its own."""
@@ -60,15 +60,22 @@ def sightings(
         is NOT_SEEN. near, thickness (n,): scene units.
     asked: (n,) bool, points that are looked at (all of them hide others); None: all.
     """
-    open_, u, v = openness(gaussians, camera, near, thickness, asked, cutoffs)
+    return sightings_of(*openness(gaussians, camera, near, thickness, asked, cutoffs), ids, mask_count)
+
+
+def sightings_of(
+    open_: NDArray[np.float32], u: NDArray[np.float32], v: NDArray[np.float32], ids: NDArray[np.int32], mask_count: int
+) -> Sightings:
+    """The masks that each point lies in, by what `openness` answers, or by a depth image that says which points it
+    measured: 1 for these, 0 for the others."""
     seen = np.flatnonzero(open_).astype(np.int32)
     seen = seen[ids[v[seen].astype(np.intp), u[seen].astype(np.intp)] != NOT_SEEN]
     rows, columns, votes = _votes(seen, open_, u, v, np.where(ids < 0, mask_count, ids), SAMPLES)
     order = np.argsort(rows, kind="stable")
     starts = np.searchsorted(rows[order], np.arange(mask_count + 2)).astype(np.int32)
     return Sightings(
-        csr_array((votes[order], columns[order], starts), shape=(mask_count + 1, len(gaussians))),
-        csr_array((open_[seen], seen, [0, len(seen)]), shape=(1, len(gaussians))),
+        csr_array((votes[order], columns[order], starts), shape=(mask_count + 1, len(open_))),
+        csr_array((open_[seen], seen, [0, len(seen)]), shape=(1, len(open_))),
     )
 
 

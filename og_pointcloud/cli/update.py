@@ -1,0 +1,52 @@
+"""Fold a later capture of a place, or of a part of it, into its map.
+
+og-pointcloud update room.ogpc friday -o room_friday.ogpc --json changes.json
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from og_pointcloud.cli.common import Parser, add_output, add_shared, print_next, timed, write_fit, write_json
+
+
+def add(parser: Parser) -> None:
+    parser.add_argument("map", type=Path, metavar="MAP.ogpc", help="the map so far: of `fit`, `map` or `update`")
+    add_shared(parser, "capture")
+    add_output(parser, "-o", "--output", endings=(".ogpc",), required=True, help="the map after this visit")
+    add_output(parser, "--json", endings=(".json",), help="also write what is gone, new, moved and unseen")
+    parser.add_argument("--gaussians", type=Path, metavar="F.ply", help="geometry, in place of the capture's own")
+
+
+def run(arguments: argparse.Namespace) -> None:
+    from og_pointcloud.ask.labelled_scene import load
+    from og_pointcloud.formats.capture import read_capture
+    from og_pointcloud.mapping.captures import depth_views
+    from og_pointcloud.mapping.merging import update
+
+    before = load(arguments.map)
+    stages = []
+    with timed(stages, "read capture"):
+        capture = read_capture(arguments.capture, gaussians=arguments.gaussians)
+    with timed(stages, "update"):
+        updated = update(before, capture, depth=depth_views(arguments.capture, before.cloud.origin))
+    write_fit(updated.cloud, [*updated.cloud.provenance.get("stages", []), *stages], arguments.output)
+    if arguments.json:
+        write_json(arguments.json, updated.changes.to_dict())
+    print_changes(updated.changes)
+    print(f"wrote {arguments.output} ({len(updated.cloud):,} points, {len(updated.cloud.instances)} instances)")
+    print_next("compare", arguments.map, arguments.output, "--html", arguments.output.with_suffix(".html"))
+
+
+def print_changes(changes) -> None:  # noqa: ANN001
+    print(changes)
+    for name in ("gone", "new", "unseen"):
+        if ids := getattr(changes, name):
+            print(f"{name}: {', '.join(map(str, ids))}")
+    for moved in changes.moved:
+        print(f"moved: {moved.id} from {_place(moved.before)} to {_place(moved.after)}")
+
+
+def _place(xyz) -> str:  # noqa: ANN001
+    return "(" + ", ".join(f"{value:.2f}" for value in xyz) + ")"

@@ -1,0 +1,1 @@
+"""Maps that grow with every frame, and that know what came, went and moved."""

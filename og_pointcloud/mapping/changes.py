@@ -1,0 +1,335 @@
+"""Two visits of a place: what is gone, what is new, what moved, and what nobody looked at again.
+
+Both visits are clouds with the cameras that saw them. Each point of the earlier one is asked of the views of the later
+one, and each of the later one of the views of the earlier: is it still (was it already) there, or is its place seen
+through (was it)? By instance, over the points that show and that can tell:
+
+    gone     most of them are seen through later, from two places
+    new      most of them lie where the earlier visit had looked through, from two places
+    moved    a new instance that looks like a gone one
+    unseen   so few of them are looked at later that nothing is known
+
+Points close to the surface of something else cannot tell: when a book is gone, its lower edge still agrees with the
+table. What lies where the earlier visit never looked is neither new nor old: it is added to a map, and not reported.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
+from scipy.spatial import cKDTree
+
+from og_pointcloud.ask.labelled_scene import SceneLike, as_scene
+from og_pointcloud.cloud import LabelledCloud
+from og_pointcloud.errors import SceneError
+from og_pointcloud.formats.poses import in_local_frame
+from og_pointcloud.mapping.likeness import ALIKE, SAME_COLOR, Look, likeness, look_of, one_color, typical_cosine
+from og_pointcloud.mapping.presence import Presence
+from og_pointcloud.mapping.sight import DiscSurface, MeasuredView
+from og_pointcloud.rendering.geometry import Neighbourhood, neighbourhood
+from og_pointcloud.scene import Camera
+from og_pointcloud.settings import GeometrySettings
+
+__all__ = ["Changes", "Evidence", "Moved", "Visit", "compare", "compare_visits"]
+
+TOLERANCE = 0.5
+"""Spacings at right angles to a surface up to which a point is of it."""
+MOST = 0.5
+"""Share of an instance's telling points that decides."""
+FEWEST_POINTS, LEAST_SHARE = 5, 0.05
+"""Points of an instance, and share of those that show, that must be looked at before anything is said of it."""
+TELLING = 1.5
+"""Tolerances that a point lies off every other surface about it, to tell of its own thing."""
+FLAT_SHARE = 0.25
+"""Share of what is looked at that must be seen through where most of a thing lies flat on something else."""
+ADJOINING = 3.0
+"""Spacings up to which two instances adjoin, and may be pieces of one thing."""
+LEAST_STILL = 0.05
+"""Share of all points looked at, hidden ones among them, that are where they were."""
+SMALL_PIECE = 0.5
+"""A piece of less than this share of another's points is small."""
+OTHER_FRAME = 0.5
+"""Share of all points looked at that are seen through, above which the two do not lie in one frame."""
+
+
+@dataclass(frozen=True)
+class Moved:
+    """id: in the earlier cloud. before, after: (3,) float64, where its points were and are on average, world
+    coordinates. now: its id in the later cloud."""
+
+    id: int
+    before: NDArray[np.float64]
+    after: NDArray[np.float64]
+    now: int
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-able: id, from, to."""
+        return {"id": self.id, "from": self.before.round(6).tolist(), "to": self.after.round(6).tolist()}
+
+
+@dataclass(frozen=True)
+class Changes:
+    """gone, unseen: ids of the earlier cloud. new: ids of the later one. moved: what is in both."""
+
+    gone: tuple[int, ...]
+    new: tuple[int, ...]
+    moved: tuple[Moved, ...]
+    unseen: tuple[int, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON-able: gone, new, moved (id, from, to), unseen."""
+        moved = [one.to_dict() for one in self.moved]
+        return {"gone": list(self.gone), "new": list(self.new), "moved": moved, "unseen": list(self.unseen)}
+
+    def to_json(self) -> str:
+        """As the commands write it."""
+        return json.dumps(self.to_dict(), indent=2) + "\n"
+
+    def __str__(self) -> str:
+        counts = (self.gone, "gone"), (self.new, "new"), (self.moved, "moved"), (self.unseen, "not seen again")
+        return ", ".join(f"{len(items)} {name}" for items, name in counts)
+
+
+def compare(before: SceneLike, after: SceneLike) -> Changes:
+    """What changed between two visits of one place, of which each is a labelled cloud that `fit` or a mapper made.
+
+    Both lie in one world frame. SceneError where they do not seem to, where the later one does not know its cameras
+    (a file of an older version: fit it again), and FeatureSpaceError where their descriptors cannot be compared.
+    """
+    earlier, later = Visit(as_scene(before).cloud), Visit(as_scene(after).cloud)
+    return compare_visits(earlier, later.in_frame_of(earlier)).changes
+
+
+@dataclass(frozen=True)
+class Visit:
+    """A labelled cloud as it is compared. shift: (3,) float64, added to its local coordinates before they are used.
+    depth: what its views measured by depth images, in that frame; None: its own cloud, seen from its cameras."""
+
+    cloud: LabelledCloud
+    shift: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
+    depth: Iterable[MeasuredView] | None = None
+
+    def in_frame_of(self, other: Visit, depth: Iterable[MeasuredView] | None = None) -> Visit:
+        """The same visit in the local frame of another; depth: of the views, in that frame already."""
+        return Visit(self.cloud, self.cloud.origin - other.cloud.origin, depth)
+
+    @cached_property
+    def xyz(self) -> NDArray[np.float32]:
+        """(n, 3) float32."""
+        return (self.cloud.xyz + self.shift).astype(np.float32)
+
+    @cached_property
+    def surface(self) -> DiscSurface:
+        """Its cloud, as it is seen."""
+        return DiscSurface(self.xyz, self.around)
+
+    @cached_property
+    def around(self) -> Neighbourhood:
+        """Neighbours of its points."""
+        return neighbourhood(self.xyz, GeometrySettings())
+
+    @property
+    def cameras(self) -> list[Camera]:
+        """The cameras, from this frame."""
+        return [in_local_frame(camera, -self.shift) for camera in self.cloud.cameras]
+
+    def measured(self, cameras: Sequence[Camera] | None = None) -> Iterable[MeasuredView]:
+        """What its views measured, or, of its cloud, what views from other places would have."""
+        if self.depth is not None and cameras is None:
+            return self.depth
+        return (self.surface.seen_from(camera) for camera in (self.cameras if cameras is None else cameras))
+
+    def points_of(self, instance: int) -> NDArray[np.int64]:
+        """(m,) rows of an instance's points, ascending."""
+        return self._by_instance[instance]
+
+    @cached_property
+    def _by_instance(self) -> list[NDArray[np.int64]]:
+        ids = self.cloud.instance_ids
+        order = np.argsort(ids, kind="stable")
+        bounds = np.searchsorted(ids[order], np.arange(len(self.cloud.instances) + 1))
+        return [order[low:high] for low, high in pairwise(bounds)]
+
+    def look(self, instance: int, rows: NDArray[np.int64]) -> Look:
+        """The look of an instance, by some of its points."""
+        rgb = self.cloud.rgb
+        return look_of(self.cloud.instances, instance, self.xyz[rows], None if rgb is None else rgb[rows])
+
+    def count(self, chosen: NDArray[np.bool_]) -> NDArray[np.int64]:
+        """(instances,) how many of each instance's points are chosen, (n,) bool."""
+        ids = self.cloud.instance_ids
+        return np.bincount(ids[chosen & (ids >= 0)], minlength=len(self.cloud.instances))
+
+    def telling(self, tolerance: float) -> NDArray[np.bool_]:
+        """(n,) bool: points that lie off the surfaces of all other instances about them."""
+        ids, around, surface = self.cloud.instance_ids, self.around, self.surface
+        tells = np.ones(len(ids), bool)
+        for neighbour in around.index.T:
+            off = np.abs(np.einsum("na,na->n", self.xyz - surface.xyz[neighbour], surface.normal[neighbour]))
+            tells &= (ids[neighbour] == ids) | (off > TELLING * tolerance)
+        return tells
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Of one visit's points, by another's views, (n,) bool each. shown: seen by their own visit. still, through: the
+    other visit measures them where they are, or sees through their places. telling: off all surfaces of other things.
+    """
+
+    shown: NDArray[np.bool_]
+    still: NDArray[np.bool_]
+    through: NDArray[np.bool_]
+    telling: NDArray[np.bool_]
+
+    def decided(self, visit: Visit) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """(instances,) bool each: those that are seen through; those hardly looked at."""
+        shown, still, telling, through = (
+            visit.count(self.shown & which) for which in (True, self.still, self.still & self.telling, self.through)
+        )
+        least = np.maximum(FEWEST_POINTS, LEAST_SHARE * shown)
+        most = through > MOST * (through + still)
+        lies_flat = (through > MOST * (through + telling)) & (through > FLAT_SHARE * (through + still)) & ~most
+        for k in np.flatnonzero(lies_flat):
+            lies_flat[k] = self._of_one_color(visit, int(k))
+        return (through >= least) & (most | lies_flat), through + still < least
+
+    def _of_one_color(self, visit: Visit, instance: int) -> bool:
+        """Whether what is seen through is of the colour of the rest: else it is a part of something else."""
+        rows = visit.points_of(instance)
+        rgb = visit.cloud.rgb
+        if rgb is None:
+            return True
+        through, still = (rgb[rows[self.shown[rows] & which[rows]]] for which in (self.through, self.still))
+        return bool(np.abs(np.median(through, axis=0) - np.median(still, axis=0)).max() <= SAME_COLOR)
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """changes, and what they rest on. of_earlier, of_later: the evidence about each visit's points. pieces: later id ->
+    the later id whose thing it is a piece of. gone_pieces: earlier id -> the moved thing that it was a piece of."""
+
+    changes: Changes
+    of_earlier: Evidence
+    of_later: Evidence
+    pieces: dict[int, int]
+    gone_pieces: dict[int, int]
+
+
+def compare_visits(
+    earlier: Visit, later: Visit, again: tuple[NDArray[np.bool_], NDArray[np.bool_]] | None = None
+) -> Comparison:
+    """What changed, with the evidence. Both in the frame of the earlier one. Errors as `compare`.
+
+    again: (n,) bool each, which of the earlier points the later visit measured again, or saw through, where that is
+    known already; the later visit's points are then all taken to be seen.
+    """
+    a, b = earlier.cloud, later.cloud
+    a.space.require(b.space, "later descriptors")
+    if not b.cameras and later.depth is None:
+        raise SceneError("the later visit does not know its cameras, so not what it looked at: fit its capture again")
+    tolerance = TOLERANCE * max(a.spacing, b.spacing)
+    shown, known = Presence(len(a), tolerance), Presence(len(b), tolerance)
+    for view in earlier.measured():
+        shown.observe(earlier.xyz, view)
+        known.observe(later.xyz, view)
+    if not a.cameras:  # what the earlier visit saw is not known: it may have looked from the same places
+        for view in earlier.measured(later.cameras):
+            known.observe(later.xyz, view)
+    shows = np.ones(len(b), bool)
+    if again is None:
+        asked, own = Presence(len(a), tolerance), Presence(len(b), tolerance)
+        for view in later.measured():
+            asked.observe(earlier.xyz, view)
+            own.observe(later.xyz, view)
+        _require_one_frame(asked)
+        again, shows = (asked.present, asked.absent), own.present
+    seen = shown.present | (not a.cameras)
+    of_earlier = Evidence(seen, *again, earlier.telling(tolerance))
+    of_later = Evidence(shows, known.present, known.absent, later.telling(tolerance))
+    return _decide(earlier, later, of_earlier, of_later)
+
+
+def _require_one_frame(asked: Presence) -> None:
+    """SceneError where hardly a point that is looked at again is where it was."""
+    still, through = np.count_nonzero(asked.present), np.count_nonzero(asked.odds < 0)
+    met = np.count_nonzero(asked.hidden | (asked.odds != 0))
+    if through > OTHER_FRAME * (still + through) or still < LEAST_STILL * met:
+        raise SceneError(
+            f"of {met:,} points that the later visit looks at, {still:,} are where they were and {through:,} are seen "
+            "through; expected few changes: the two do not lie in one world frame, or are of two places: register "
+            "their poses first"
+        )
+
+
+@dataclass(frozen=True)
+class _Thing:
+    """Instances of one visit that are pieces of one thing that left or came, the largest first. look: by the points
+    that show so. place: (3,) their mean, world coordinates."""
+
+    pieces: tuple[int, ...]
+    look: Look
+    place: NDArray[np.float64]
+
+
+def _decide(earlier: Visit, later: Visit, of_earlier: Evidence, of_later: Evidence) -> Comparison:
+    left, hardly = of_earlier.decided(earlier)
+    came, _ = of_later.decided(later)
+    typical = typical_cosine(later.cloud.instances)
+    gone = _things(earlier, np.flatnonzero(left).tolist(), of_earlier.through, typical)
+    new = _things(later, np.flatnonzero(came).tolist(), of_later.through, typical)
+    pairs = _matched(gone, new, typical)
+    taken = set(pairs.values())
+    changes = Changes(
+        gone=tuple(sorted(k for g, thing in enumerate(gone) if g not in pairs for k in thing.pieces)),
+        new=tuple(thing.pieces[0] for n, thing in enumerate(new) if n not in taken),
+        moved=tuple(
+            Moved(gone[g].pieces[0], gone[g].place, new[n].place, new[n].pieces[0]) for g, n in sorted(pairs.items())
+        ),
+        unseen=tuple(np.flatnonzero(hardly & (earlier.count(earlier.cloud.instance_ids >= 0) > 0) & ~left).tolist()),
+    )
+    pieces = {piece: thing.pieces[0] for thing in new for piece in thing.pieces}
+    gone_pieces = {piece: gone[g].pieces[0] for g in pairs for piece in gone[g].pieces}
+    return Comparison(changes, of_earlier, of_later, pieces, gone_pieces)
+
+
+def _things(visit: Visit, candidates: list[int], through: NDArray[np.bool_], typical: float) -> list[_Thing]:
+    """Candidates, those that adjoin and look alike together: pieces of one thing. Of a small piece, which few masks
+    show, the colour is enough."""
+    rows = {k: visit.points_of(k)[through[visit.points_of(k)]] for k in candidates}
+    looks = {k: visit.look(k, of) for k, of in rows.items()}
+    trees = {k: cKDTree(visit.xyz[of]) for k, of in rows.items()}
+    group = {k: k for k in candidates}
+    reach = ADJOINING * visit.cloud.spacing
+    for index, one in enumerate(candidates):
+        for other in candidates[index + 1 :]:
+            small = SMALL_PIECE * max(len(rows[one]), len(rows[other])) > min(len(rows[one]), len(rows[other]))
+            alike = likeness(looks[one], looks[other], typical) > ALIKE
+            alike |= small and one_color(looks[one], looks[other])
+            if alike and trees[one].count_neighbors(trees[other], reach):
+                group = {k: group[one] if of == group[other] else of for k, of in group.items()}
+    things = []
+    for first in dict.fromkeys(group.values()):
+        pieces = sorted((k for k in candidates if group[k] == first), key=lambda k: (-len(rows[k]), k))
+        xyz = visit.cloud.xyz_world[np.concatenate([rows[k] for k in pieces])]
+        things.append(_Thing(tuple(pieces), looks[pieces[0]], xyz.mean(axis=0)))
+    return things
+
+
+def _matched(gone: list[_Thing], new: list[_Thing], typical: float) -> dict[int, int]:
+    """Row of gone -> row of new, where the two look like one thing, best pairs first over all."""
+    if not gone or not new:
+        return {}
+    alike = np.array([[likeness(one.look, other.look, typical) for other in new] for one in gone])
+    lengths = [np.array([thing.look.length for thing in things]) for things in (gone, new)]
+    as_long = np.minimum.outer(*lengths) / np.maximum(np.maximum.outer(*lengths), 1e-12)
+    # Of several that are alike, pieces of one thing perhaps, the one that is as long.
+    rows, columns = linear_sum_assignment(-np.where(alike > ALIKE, np.minimum(alike, 1) + as_long, 0))
+    return {int(g): int(n) for g, n in zip(rows, columns, strict=True) if alike[g, n] > ALIKE}

@@ -1,0 +1,91 @@
+"""Whether two instances, of two visits, are the same thing: by descriptor, colour and size.
+
+A descriptor is the mean of m mask features, each of which has the cosine a with it: that mean is off by a tangent of
+about sqrt(s), s = (1 - a^2) / (a^2 m). So two descriptors of one thing do not reach the cosine 1, but
+
+    c = 1 / sqrt((1 + s) (1 + s'))
+
+and a cosine divided by c is what endless views would give. What it means the scene itself tells: 1 for one thing, and
+for two the median over pairs of its instances, different things mostly. Colour and size only forbid: exposure, shade
+and what was hidden change both.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from og_pointcloud.cloud import InstanceTable
+
+__all__ = ["ALIKE", "Look", "likeness", "look_of", "one_color", "spread_of", "typical_cosine"]
+
+ALIKE = 0.5
+"""From here on two are one thing: nearer to what one thing has than to what different things have."""
+OTHER_COLOR = 48.0
+"""Levels of 255 in some channel by which the medians of one thing do not differ."""
+SAME_COLOR = 24.0
+"""Levels up to which two adjoining parts may be of one thing."""
+OTHER_SIZE = 5.0
+"""Times that one is longer than the other: a part that shows may be a third of the whole."""
+LEAST_AGREEMENT = 0.3
+"""Cosines of a mask's feature with its instance's descriptor below this tell no spread."""
+MOST_ROWS = 1000
+"""Descriptors that are compared with each other."""
+
+
+@dataclass(frozen=True)
+class Look:
+    """descriptors: (r, D) float32 unit rows, r = 0 where no mask gave a feature. spread: the squared tangent that they
+    are off by. color: (3,) median, or None. length: of its longest side, along the axes, without outliers."""
+
+    descriptors: NDArray[np.float32]
+    spread: float
+    color: NDArray[np.float64] | None
+    length: float
+
+
+def look_of(table: InstanceTable, instance: int, xyz: NDArray[np.float32], rgb: NDArray[np.uint8] | None) -> Look:
+    """The look of one instance of a table. xyz (n, 3), rgb (n, 3) or None: its points, at least one."""
+    sides = np.ptp(np.percentile(xyz, [3, 97], axis=0), axis=0)
+    return Look(
+        table.descriptors[table.descriptor_instance == instance],
+        float(spread_of(table.agreement[instance], table.masks[instance])),
+        None if rgb is None else np.median(rgb, axis=0).astype(np.float64),
+        float(sides.max()),
+    )
+
+
+def typical_cosine(table: InstanceTable) -> float:
+    """The median cosine of two instances of a table, as endless views would give it; 0 where there are no two."""
+    rows, owner = table.descriptors[:MOST_ROWS], table.descriptor_instance[:MOST_ROWS]
+    widened = np.sqrt(1 + spread_of(table.agreement, table.masks))[owner]
+    cosines = (rows @ rows.T) * np.outer(widened, widened)
+    different = np.triu(owner[:, None] != owner)
+    return float(np.median(cosines[different])) if different.any() else 0.0
+
+
+def one_color(one: Look, other: Look) -> bool:
+    """Whether the two may be parts of one thing by their colours; True where these are not known."""
+    return one.color is None or other.color is None or bool(np.abs(one.color - other.color).max() <= SAME_COLOR)
+
+
+def likeness(one: Look, other: Look, typical: float) -> float:
+    """How far the two are one thing: about 1 for one, 0 for two typical things of the scene, -inf if forbidden.
+
+    typical: `typical_cosine` of the scene.
+    """
+    if one.color is not None and other.color is not None and np.abs(one.color - other.color).max() > OTHER_COLOR:
+        return -np.inf
+    longer, shorter = max(one.length, other.length), min(one.length, other.length)
+    if longer > OTHER_SIZE * shorter or not (len(one.descriptors) and len(other.descriptors)):
+        return -np.inf
+    cosine = float((one.descriptors @ other.descriptors.T).max()) * np.sqrt((1 + one.spread) * (1 + other.spread))
+    return (cosine - typical) / max(1 - typical, 1e-6)
+
+
+def spread_of(agreement: ArrayLike, masks: ArrayLike) -> NDArray[np.float64]:
+    """The squared tangent that means of mask features are off by."""
+    square = np.clip(np.asarray(agreement, np.float64), LEAST_AGREEMENT, 1) ** 2
+    return (1 - square) / square / np.maximum(masks, 1)

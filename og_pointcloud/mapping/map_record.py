@@ -1,0 +1,92 @@
+"""What a map knows of its instances beyond one visit: when each was last seen, and what became of it.
+
+It is kept in the cloud's provenance under "map", as plain JSON, so that files of before are maps too: all is present.
+Ids are rows of the instance table and are never given twice: what left keeps its row, without points.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+from og_pointcloud.cloud import LabelledCloud
+from og_pointcloud.errors import OgPointcloudError
+
+__all__ = ["GONE", "PRESENT", "MapRecord", "Retired", "VisitEntry"]
+
+KEY = "map"
+PRESENT, GONE = "present", "gone"
+
+
+@dataclass(frozen=True)
+class VisitEntry:
+    """A visit. name: of its capture. stamp: when, seconds or a count, whatever its frames have. views: how many."""
+
+    name: str
+    stamp: float
+    views: int
+
+
+@dataclass(frozen=True)
+class Retired:
+    """How a thing that left looked, so that it is known when it comes back. place: (3,) where it was, world
+    coordinates. length: of its longest side. color: (3,) median, 0 to 255, or None."""
+
+    place: tuple[float, ...]
+    length: float
+    color: tuple[float, ...] | None
+
+
+@dataclass
+class MapRecord:
+    """visits: in their order. last_seen: by id, the stamp of the visit that last looked at the instance. moved_from: by
+    id, where it was before it moved last. gone: by id, what left and has not come back."""
+
+    visits: list[VisitEntry] = field(default_factory=list)
+    last_seen: dict[int, float] = field(default_factory=dict)
+    moved_from: dict[int, tuple[float, ...]] = field(default_factory=dict)
+    gone: dict[int, Retired] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, cloud: LabelledCloud) -> MapRecord:
+        """The record of a map; of a cloud that a fit made, one visit that saw every instance.
+
+        OgPointcloudError where a file holds something else under that name.
+        """
+        count = len(cloud.instances)
+        stored = cloud.provenance.get(KEY)
+        if stored is None:
+            return cls([VisitEntry("first visit", 0.0, len(cloud.cameras))], dict.fromkeys(range(count), 0.0))
+        try:
+            record = cls(
+                [VisitEntry(str(v["name"]), float(v["stamp"]), int(v["views"])) for v in stored["visits"]],
+                {int(k): float(stamp) for k, stamp in stored["last_seen"].items()},
+                {int(k): _three(place) for k, place in stored["moved_from"].items()},
+                {int(k): _retired(entry) for k, entry in stored["gone"].items()},
+            )
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            raise OgPointcloudError(
+                f"the map's record of its visits is damaged ({error!r:.80}): fit it again"
+            ) from None
+        ids = {*record.last_seen, *record.moved_from, *record.gone}
+        if ids and not 0 <= min(ids) <= max(ids) < count:
+            raise OgPointcloudError(f"the map's record names instance {max(ids)} of {count}: fit it again")
+        return record
+
+    def state(self, instance: int) -> str:
+        """PRESENT or GONE."""
+        return GONE if instance in self.gone else PRESENT
+
+    def added_to(self, provenance: dict[str, Any]) -> dict[str, Any]:
+        """The provenance with this record, JSON-able."""
+        return {**provenance, KEY: asdict(self)}
+
+
+def _three(values: Any) -> tuple[float, ...]:
+    x, y, z = (float(value) for value in values)
+    return x, y, z
+
+
+def _retired(entry: Any) -> Retired:
+    color = entry["color"]
+    return Retired(_three(entry["place"]), float(entry["length"]), None if color is None else _three(color))

@@ -1,0 +1,282 @@
+"""What a view says of points at some place: still there, hidden, or seen through.
+
+A view measures surfaces: by its depth image, or, where it has none, by the cloud of its visit, drawn as small discs in
+the surface's plane. A point is
+
+    AGREES    if a surface is measured where it lies
+    HIDDEN    if the surface lies in front of it
+    THROUGH   if all surfaces measured around its pixel lie behind it
+    NOTHING   if nothing is measured there, or so much at a slant that it says nothing
+
+Distances count at right angles to the surface: along a ray, a thing of 3 cm on a table lies 10 cm before it, and so
+does a table's edge before the table, at a slant. Absence is told by THROUGH alone; what no view looks at stays.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from og_pointcloud.kernels import njit, prange
+from og_pointcloud.rendering.geometry import Neighbourhood, neighbourhood
+from og_pointcloud.scene import Camera
+from og_pointcloud.settings import GeometrySettings
+
+__all__ = [
+    "AGREES",
+    "HIDDEN",
+    "NOTHING",
+    "THROUGH",
+    "DiscSurface",
+    "MeasuredView",
+    "lens_of",
+    "states_of_points",
+    "view_of_depth",
+]
+
+NOTHING, AGREES, HIDDEN, THROUGH = 0, 1, 2, 3
+
+PLANE_POINTS = 12
+"""Nearest points by which the plane of a surface is told."""
+DISC_SPACINGS = 2.0
+"""Radius of a disc: of randomly strewn points, one place in three hundred is then left open."""
+MOST_SHIFT = 2.5
+"""Deviations of the noise by which a point is moved at most."""
+SMOOTHED = 1.5
+"""The height of a plane through k points is this many times as exact as their noise over the root of k."""
+PIXELS_PER_DISC = 2.5
+"""Radius of a typical disc in the images that are drawn: finer ones say nothing more."""
+WIDEST_DISC = 24
+"""Pixels; a disc just before the camera is drawn no larger."""
+SLANT = 0.15
+"""Cosine between ray and normal below which a surface says nothing of points far from it."""
+AT_ONCE = 1 << 16
+"""Points whose planes are told at once: 30 MB."""
+NEAR_SHARE = 0.02
+"""What is nearer than this share of a view's median depth is not drawn."""
+
+
+@dataclass(frozen=True)
+class MeasuredView:
+    """Surfaces that one view measures. camera: of this image, from the frame of the points that it will be asked about.
+    depth: (h, w) float32, along the optical axis, 0 where nothing is measured. normal: (h, w, 3) float32, of length 1,
+    in the camera's frame, towards it. noise: standard deviation of the surface, at right angles to it."""
+
+    camera: Camera
+    depth: NDArray[np.float32]
+    normal: NDArray[np.float32]
+    noise: float
+
+
+class DiscSurface:
+    """A cloud as a surface: each point a disc in the plane of its neighbours.
+
+    xyz: (n, 3) float32, each moved onto the plane of its neighbours as far as noise goes. spacing: typical distance of
+    neighbours. noise: standard deviation of the planes.
+    """
+
+    def __init__(self, xyz: NDArray[np.float32], around: Neighbourhood | None = None) -> None:
+        around = neighbourhood(xyz, GeometrySettings()) if around is None else around
+        self.spacing = float(np.median(around.spacing))
+        self.normal, height, off = _planes(xyz, around.index[:, :PLANE_POINTS])
+        noise = float(np.median(off))
+        # Onto the planes, as far as noise goes: a mean of many readings is more exact than each of them.
+        shift = np.clip(height, -MOST_SHIFT * noise, MOST_SHIFT * noise)
+        self.xyz = (xyz - shift[:, None] * self.normal).astype(np.float32)
+        self.noise = noise * min(1.0, SMOOTHED / np.sqrt(1 + PLANE_POINTS))
+        self._radius = (DISC_SPACINGS * np.maximum(around.spacing, self.spacing)).astype(np.float32)
+
+    def seen_from(self, camera: Camera) -> MeasuredView:
+        """What a view of the surface would measure, at the points' own resolution. camera: from their frame."""
+        depth = self.xyz @ camera.world_to_camera[2, :3] + camera.world_to_camera[2, 3]
+        in_image = depth[camera.shows(camera.project(self.xyz)[0])]
+        typical = float(np.median(in_image)) if len(in_image) else 1.0
+        radius_px = DISC_SPACINGS * self.spacing * np.sqrt(camera.fx * camera.fy) / max(typical, 1e-12)
+        share = min(1.0, PIXELS_PER_DISC / max(radius_px, 1e-12))
+        size = max(8, round(camera.width * share)), max(8, round(camera.height * share))
+        camera = camera.resized(*size) if share < 1 else camera
+        drawn = _draw_discs(
+            self.xyz, self.normal, self._radius, camera.world_to_camera, lens_of(camera), camera.height, camera.width,
+            NEAR_SHARE * typical,
+        )  # fmt: skip
+        return MeasuredView(camera, *drawn, self.noise)
+
+
+def view_of_depth(depth: NDArray[np.float32], camera: Camera) -> MeasuredView:
+    """What a depth image measures. depth: (h, w) float32, 0 unmeasured. A sparse one is taken at the resolution at
+    which most pixels hold a reading: the nearest of those that fall into one."""
+    measured = depth > 0
+    # Of what is measured, how much has a measured neighbour: sky and black surfaces make no image sparse.
+    share = float(measured[:, 1:][measured[:, :-1]].mean()) if measured[:, :-1].any() else 1.0
+    step = int(np.ceil(np.sqrt(2 / max(share, 1e-3)))) if share < 0.5 else 1
+    if step > 1:
+        height, width = -(-depth.shape[0] // step), -(-depth.shape[1] // step)
+        padded = np.zeros((height * step, width * step), np.float32)
+        padded[: depth.shape[0], : depth.shape[1]] = depth
+        far = np.where(padded > 0, padded, np.inf).reshape(height, step, width, step).min(axis=(1, 3))
+        lens = camera.fx / step, camera.fy / step, camera.cx / step, camera.cy / step
+        camera = Camera(width, height, *lens, camera.world_to_camera)
+        depth = np.where(np.isfinite(far), far, 0).astype(np.float32)
+    return MeasuredView(camera, depth, *_normals(depth, lens_of(camera)))
+
+
+def states_of_points(xyz: NDArray[np.float32], tolerance: float, view: MeasuredView) -> NDArray[np.int8]:
+    """(n,) int8: NOTHING, AGREES, HIDDEN or THROUGH. tolerance: beside the view's noise, same unit as xyz (n, 3)."""
+    camera, tolerance = view.camera, float(np.hypot(tolerance, 3 * view.noise))
+    return _states(xyz, tolerance, camera.world_to_camera, lens_of(camera), view.depth, view.normal, SLANT)
+
+
+def lens_of(camera: Camera) -> NDArray[np.float64]:
+    """(4,) fx, fy, cx, cy."""
+    return np.array([camera.fx, camera.fy, camera.cx, camera.cy])
+
+
+def _planes(
+    xyz: NDArray[np.float32], neighbours: NDArray[np.int32]
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+    """Of each point with its neighbours (n, k): (n, 3) unit normals, (n,) the point's height over the plane, and (n,)
+    the standard deviation off it."""
+    normal, height, off = (np.empty(shape, np.float32) for shape in ((len(xyz), 3), len(xyz), len(xyz)))
+    for start in range(0, len(xyz), AT_ONCE):
+        part = slice(start, start + AT_ONCE)
+        about = np.concatenate([xyz[part, None], xyz[neighbours[part]]], axis=1).astype(np.float64)
+        about -= about.mean(axis=1, keepdims=True)
+        values, vectors = np.linalg.eigh(np.swapaxes(about, 1, 2) @ about / about.shape[1])
+        normal[part], off[part] = vectors[..., 0], np.sqrt(np.maximum(values[:, 0], 0))
+        height[part] = np.einsum("na,na->n", about[:, 0], vectors[..., 0])
+    return normal, height, off
+
+
+@njit(cache=True, nogil=True)
+def _turned(pose, p):  # noqa: ANN001, ANN202
+    """A direction in the camera's frame."""
+    return (
+        pose[0, 0] * p[0] + pose[0, 1] * p[1] + pose[0, 2] * p[2],
+        pose[1, 0] * p[0] + pose[1, 1] * p[1] + pose[1, 2] * p[2],
+        pose[2, 0] * p[0] + pose[2, 1] * p[1] + pose[2, 2] * p[2],
+    )
+
+
+@njit(cache=True, nogil=True)
+def _draw_discs(xyz, normal, radius, pose, lens, height, width, near):  # noqa: ANN001, ANN202
+    """(h, w) depth of the nearest disc in each pixel, 0 none, and (h, w, 3) its normal, towards the camera."""
+    fx, fy, cx, cy = lens
+    depth = np.zeros((height, width), np.float32)
+    facing = np.zeros((height, width, 3), np.float32)
+    for i in range(len(xyz)):
+        x, y, z = _turned(pose, xyz[i])
+        x, y, z = x + pose[0, 3], y + pose[1, 3], z + pose[2, 3]
+        if z <= near:
+            continue
+        u, v = fx * x / z + cx, fy * y / z + cy
+        reach = min(max(fx, fy) * radius[i] / z, WIDEST_DISC)
+        if u < -reach or v < -reach or u > width + reach or v > height + reach:
+            continue
+        nx, ny, nz = _turned(pose, normal[i])
+        along = nx * x + ny * y + nz * z
+        if along > 0:
+            nx, ny, nz, along = -nx, -ny, -nz, -along
+        # The pixels whose rays meet the disc's plane within its radius; at least the one that the point is in.
+        for row in range(max(int(v - reach), 0), min(int(v + reach) + 1, height)):
+            for column in range(max(int(u - reach), 0), min(int(u + reach) + 1, width)):
+                dx, dy = (column + 0.5 - cx) / fx, (row + 0.5 - cy) / fy
+                slope = nx * dx + ny * dy + nz
+                meets = along / slope if slope < -1e-6 else z
+                if (meets * dx - x) ** 2 + (meets * dy - y) ** 2 + (meets - z) ** 2 > radius[i] ** 2:
+                    if column != int(u) or row != int(v):
+                        continue
+                    meets = z
+                if depth[row, column] == 0 or meets < depth[row, column]:
+                    depth[row, column] = meets
+                    facing[row, column] = nx, ny, nz
+    return depth, facing
+
+
+@njit(cache=True, nogil=True)
+def _normals(depth, lens):  # noqa: ANN001, ANN202
+    """(h, w, 3) normals of a depth image, towards the camera, and its noise: what second differences leave."""
+    fx, fy, cx, cy = lens
+    height, width = depth.shape
+    normal = np.zeros((height, width, 3), np.float32)
+    second = np.zeros((height // 4 + 1) * (width // 4 + 1))
+    count = 0
+    for row in range(height):
+        for column in range(width):
+            z = depth[row, column]
+            if z <= 0:
+                continue
+            # The steps to the neighbours whose depths differ less: the others may lie beyond an edge.
+            before = depth[row, column - 1] if column > 0 else np.float32(0)
+            after = depth[row, column + 1] if column < width - 1 else np.float32(0)
+            above = depth[row - 1, column] if row > 0 else np.float32(0)
+            below = depth[row + 1, column] if row < height - 1 else np.float32(0)
+            right, down = _step(z, before, after), _step(z, above, below)
+            # Two tangents are d(z ray)/du and d(z ray)/dv; this is their cross product, up to its length.
+            a, b = right * fx / z, down * fy / z
+            c = -1 - a * (column + 0.5 - cx) / fx - b * (row + 0.5 - cy) / fy
+            length = np.sqrt(a * a + b * b + c * c)
+            normal[row, column] = a / length, b / length, c / length
+            if row % 4 == 0 and column % 4 == 0 and before > 0 and after > 0:
+                second[count] = abs(before + after - 2 * z)
+                count += 1
+    # A second difference of three readings of one noise has its deviation times the root of 6.
+    noise = 1.4826 * np.median(second[:count]) / np.sqrt(6.0) if count else 0.0
+    return normal, noise
+
+
+@njit(cache=True, nogil=True)
+def _step(here, before, after):  # noqa: ANN001, ANN202
+    """Change of depth per pixel: to the neighbour that is measured and differs less, 0 where neither is."""
+    if before <= 0 and after <= 0:
+        return 0.0
+    if before <= 0 or (after > 0 and abs(after - here) < abs(here - before)):
+        return after - here
+    return here - before
+
+
+@njit(cache=True, parallel=True, nogil=True)
+def _states(xyz, tolerance, pose, lens, depth, normal, slant):  # noqa: ANN001, ANN202
+    """The state of each point, by its distance from the surfaces in the 3 x 3 pixels around its own."""
+    fx, fy, cx, cy = lens
+    height, width = depth.shape
+    states = np.zeros(len(xyz), np.int8)
+    for i in prange(len(xyz)):
+        x, y, z = _turned(pose, xyz[i])
+        x, y, z = x + pose[0, 3], y + pose[1, 3], z + pose[2, 3]
+        if z <= 0:
+            continue
+        u, v = np.floor(fx * x / z + cx), np.floor(fy * y / z + cy)
+        if not (0 <= u < width and 0 <= v < height):
+            continue
+        column, row = int(u), int(v)
+        length = np.sqrt(x * x + y * y + z * z)
+        behind, before, unsure = 0, 0, 0
+        agrees = False
+        for r in range(max(row - 1, 0), min(row + 2, height)):
+            for c in range(max(column - 1, 0), min(column + 2, width)):
+                if depth[r, c] <= 0:
+                    continue
+                nx, ny, nz = normal[r, c]
+                dx, dy = (c + 0.5 - cx) / fx, (r + 0.5 - cy) / fy
+                # How far the point lies before the pixel's plane; and before its surface, along the ray.
+                across = nx * x + ny * y + nz * z - depth[r, c] * (nx * dx + ny * dy + nz)
+                on_ray = abs(depth[r, c] - z) * np.sqrt(dx * dx + dy * dy + 1)
+                slanted = abs(nx * x + ny * y + nz * z) < slant * length
+                if abs(across) <= tolerance and (on_ray <= tolerance or not slanted):
+                    agrees = True
+                elif slanted and on_ray > tolerance:
+                    unsure += depth[r, c] > z
+                    before += depth[r, c] < z
+                elif across < 0:
+                    before += 1
+                else:
+                    behind += 1
+        if agrees:
+            states[i] = AGREES
+        elif before > 0:
+            states[i] = HIDDEN
+        elif behind >= 3 and unsure == 0:
+            states[i] = THROUGH
+    return states

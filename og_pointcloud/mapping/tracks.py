@@ -1,0 +1,267 @@
+"""Things as they are found frame by frame: votes by point that later frames can overturn, and witnesses that join.
+
+A track is what masks of several frames show as one thing. A mask belongs to the track that it has most of, if it also
+is most of what the frame shows of that track; else it founds a track of its own. So a cup that the first frames took
+for a part of the table gets a track when frames show it alone, and its points go over to it as votes outweigh the
+table's.
+
+Each frame is a witness for every two tracks that it shows within masks: one thing, if most of both lies in one mask,
+else two. Tracks are joined while a majority of their witnesses says one (`fitting.grouping` does the same for masks,
+over all views at once; `Mapper.finish` runs that rule). Only tracks that a frame sees are touched.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from og_pointcloud.fitting.association import directions
+from og_pointcloud.kernels import njit
+
+__all__ = ["NO_TRACK", "PointVotes", "Track", "Tracks"]
+
+NO_TRACK = -1
+HEAVIEST = 4
+"""Tracks that a point remembers votes for."""
+MOST_VOTES = 24.0
+"""Votes for one track that a point counts at most, so that the present can overturn a long history."""
+CONFIRMED_VIEWS = 2
+"""Frames that show a track before it is an object with an id."""
+MOSTLY = 0.5
+JOIN_MAJORITY, FEWEST_WITNESSES = 0.5, 2
+LEAST_POINTS = 3.0
+"""Points of a track, or of a mask, that a frame must show to say anything of it."""
+
+
+class PointVotes:
+    """The heaviest votes of each point. track: (n, 4) int32, NO_TRACK where empty; weight: (n, 4) float32."""
+
+    def __init__(self) -> None:
+        self.track = np.full((0, HEAVIEST), NO_TRACK, np.int32)
+        self.weight = np.zeros((0, HEAVIEST), np.float32)
+
+    def grow(self, n: int) -> None:
+        """Room for the points of the map, in steps of half."""
+        if n > len(self.track):
+            more = max(n - len(self.track), len(self.track) // 2)
+            self.track = np.concatenate([self.track, np.full((more, HEAVIEST), NO_TRACK, np.int32)])
+            self.weight = np.concatenate([self.weight, np.zeros((more, HEAVIEST), np.float32)])
+
+    def best(self, points: NDArray[np.integer], root: NDArray[np.int32]) -> NDArray[np.int32]:
+        """(m,) the track, after joins, with the most votes of each point; NO_TRACK without any."""
+        return _best(points, self.track, self.weight, root)
+
+    def add(self, points: NDArray[np.integer], track: NDArray[np.int32], weight: NDArray[np.float32]) -> None:
+        """Votes of (m,) points for a track each; NO_TRACK takes from the heaviest: seen, and in no mask."""
+        _add(points, track, weight, self.track, self.weight)
+
+    def clear(self, points: NDArray[np.integer]) -> None:
+        """Forget the votes of points that are no longer there."""
+        self.track[points], self.weight[points] = NO_TRACK, 0
+
+
+@dataclass
+class Track:
+    """total: (D,) sum of unit features by pixels; pixels: their sum; agreement: sum of cosines by pixels. views, masks:
+    how many showed it. id: of the object, NO_TRACK while it is provisional."""
+
+    total: NDArray[np.float64] | None = None
+    pixels: float = 0.0
+    agreement: float = 0.0
+    views: int = 0
+    masks: int = 0
+    last_seen: float = 0.0
+    id: int = NO_TRACK
+
+    def take_in(self, other: Track) -> None:
+        """Become both."""
+        if other.total is not None:
+            self.total = other.total if self.total is None else self.total + other.total
+        for name in ("pixels", "agreement", "masks"):
+            setattr(self, name, getattr(self, name) + getattr(other, name))
+        self.views, self.last_seen = max(self.views, other.views), max(self.last_seen, other.last_seen)
+
+    @property
+    def descriptor(self) -> NDArray[np.float64] | None:
+        """(D,) of length 1, None without a feature."""
+        length = 0.0 if self.total is None else float(np.linalg.norm(self.total))
+        return None if self.total is None or length < 1e-12 else self.total / length
+
+
+@dataclass
+class Tracks:
+    """tracks: by number; root: (tracks,) int32, the track that each was joined into. pairs: for two roots, how many
+    frames showed them as one thing, and as two. next_id: of the next object; ids are never given twice."""
+
+    tracks: list[Track] = field(default_factory=list)
+    root: NDArray[np.int32] = field(default_factory=lambda: np.zeros(0, np.int32))
+    pairs: dict[tuple[int, int], list[int]] = field(default_factory=dict)
+    next_id: int = 0
+    free: list[int] = field(default_factory=list)
+
+    def named(self, k: int) -> int:
+        """Give a track the next id."""
+        self.tracks[k].id, self.next_id = self.next_id, self.next_id + 1
+        return self.tracks[k].id
+
+    def prune(self, votes: PointVotes, before: float) -> None:
+        """Let go of tracks that were joined into others, and of those that one frame showed before that stamp: their
+        numbers are given again. Memory follows the objects, and not the frames."""
+        stale = [k for k, t in enumerate(self.tracks) if t.id < 0 and t.last_seen < before and self.root[k] == k]
+        joined = [k for k in range(len(self.root)) if self.root[k] != k]
+        if not stale and not joined:
+            return
+        number = np.append(self.root, np.int32(NO_TRACK))
+        number[stale] = NO_TRACK
+        votes.track[:] = number[votes.track]
+        votes.weight[votes.track == NO_TRACK] = 0
+        out = {*stale, *joined}
+        self.pairs = {pair: counts for pair, counts in self.pairs.items() if not out & {*pair}}
+        for k in out:
+            self.tracks[k], self.root[k] = Track(last_seen=np.inf), k
+        self.free = sorted({*self.free, *out}, reverse=True)
+
+    def found(self) -> int:
+        """A new track's number."""
+        if self.free:
+            k = self.free.pop()
+            self.tracks[k] = Track()
+            return k
+        self.tracks.append(Track())
+        self.root = np.append(self.root, np.int32(len(self.root)))
+        return len(self.root) - 1
+
+    def by_id(self) -> dict[int, int]:
+        """Object id -> its track, of those that have not been joined into another."""
+        return {track.id: k for k, track in enumerate(self.tracks) if track.id >= 0 and self.root[k] == k}
+
+    def observe(
+        self, votes: PointVotes, points: NDArray[np.int32], mask: NDArray[np.int32], weight: NDArray[np.float32],
+        features: NDArray[np.float32], stamp: float,
+    ) -> tuple[list[int], list[int]]:  # fmt: skip
+        """Take in what a frame shows: points (m,), each in a mask or in -1, with a weight. features: (M, D).
+
+        Returns the tracks that are objects now and want an id, and those with one that were seen again.
+        """
+        own = votes.best(points, self.root)
+        seen, place = np.unique(own, return_inverse=True)
+        shown = np.zeros((len(features) + 1, len(seen)))  # the last row: in no mask
+        np.add.at(shown, (mask, place), weight)
+        if len(seen) and seen[0] == NO_TRACK:
+            of_tracks, seen = shown[:, 1:], seen[1:]
+        else:
+            of_tracks = shown
+        of_mask = self._belonging(of_tracks, shown.sum(axis=1), seen)
+        votes.add(points, np.append(of_mask, NO_TRACK).astype(np.int32)[mask], weight)
+        self._witness(of_tracks[:-1], of_tracks.sum(axis=0), seen)
+        return self._describe(of_mask, shown.sum(axis=1), features, stamp)
+
+    def _belonging(
+        self, of_tracks: NDArray[np.float64], of_masks: NDArray[np.float64], seen: NDArray[np.int32]
+    ) -> NDArray[np.int64]:
+        """(M,) the track of each mask, a fresh one where none fits; NO_TRACK for masks that show next to nothing."""
+        of_mask = np.full(len(of_tracks) - 1, NO_TRACK)
+        visible = of_tracks.sum(axis=0)
+        for m in np.flatnonzero(of_masks[:-1] >= LEAST_POINTS):
+            best = int(of_tracks[m].argmax()) if len(seen) else -1
+            fits = best >= 0 and of_tracks[m, best] > MOSTLY * max(of_tracks[m].sum(), 1e-9)
+            if fits and of_tracks[m, best] > MOSTLY * visible[best] and of_tracks[m].sum() > 0.25 * of_masks[m]:
+                of_mask[m] = seen[best]
+            else:
+                of_mask[m] = self.found()
+        return of_mask
+
+    def _witness(self, shown: NDArray[np.float64], visible: NDArray[np.float64], seen: NDArray[np.int32]) -> None:
+        """Count this frame's word on every two tracks that masks hold, and join those that most frames call one."""
+        holds = shown.max(axis=0, initial=0) > MOSTLY * np.maximum(visible, LEAST_POINTS)
+        container = shown.argmax(axis=0) if len(shown) else np.zeros(len(seen), int)
+        held = np.flatnonzero(holds)
+        for index, a in enumerate(held):
+            for b in held[index + 1 :]:
+                pair = int(seen[a]), int(seen[b])
+                same = container[a] == container[b]
+                if same or pair in self.pairs:
+                    counts = self.pairs.setdefault(pair, [0, 0])
+                    counts[0 if same else 1] += 1
+                    one, two = counts
+                    if same and one >= FEWEST_WITNESSES and one > JOIN_MAJORITY * (one + two):
+                        self._join(*pair)
+
+    def _join(self, a: int, b: int) -> None:
+        """Make one of two tracks: the one with the lower id, or else the lower number, stays."""
+        a, b = int(self.root[a]), int(self.root[b])
+        if a == b:
+            return
+        key = [(self.tracks[k].id < 0, self.tracks[k].id, k) for k in (a, b)]
+        a, b = (a, b) if key[0] < key[1] else (b, a)
+        self.tracks[a].take_in(self.tracks[b])
+        self.tracks[b].total = None
+        self.root[self.root == b] = a
+        self.pairs = {pair: counts for pair, counts in self.pairs.items() if b not in pair}
+
+    def _describe(
+        self, of_mask: NDArray[np.int64], of_masks: NDArray[np.float64], features: NDArray[np.float32], stamp: float
+    ) -> tuple[list[int], list[int]]:
+        unit = directions(features)
+        new, again = [], []
+        for m in np.flatnonzero(of_mask >= 0):
+            k = int(self.root[of_mask[m]])
+            track = self.tracks[k]
+            if unit[m].any():
+                before = track.descriptor
+                track.agreement += of_masks[m] * (1.0 if before is None else float(before @ unit[m]))
+                track.total = of_masks[m] * unit[m] + (0 if track.total is None else track.total)
+            track.pixels, track.masks = track.pixels + of_masks[m], track.masks + 1
+            if k in again or k in new:
+                continue
+            track.views, track.last_seen = track.views + 1, stamp
+            if track.id < 0 and track.views >= CONFIRMED_VIEWS:
+                new.append(k)
+            elif track.id >= 0:
+                again.append(k)
+        return new, again
+
+
+@njit(cache=True, nogil=True)
+def _best(points, track, weight, root):  # noqa: ANN001, ANN202
+    best = np.full(len(points), NO_TRACK, np.int32)
+    for i in range(len(points)):
+        p = points[i]
+        most = np.float32(0)
+        for a in range(HEAVIEST):
+            if track[p, a] < 0:
+                continue
+            # Tracks that were joined since then count together.
+            own, together = root[track[p, a]], np.float32(0)
+            for b in range(HEAVIEST):
+                if track[p, b] >= 0 and root[track[p, b]] == own:
+                    together += weight[p, b]
+            if together > most or (together == most and best[i] >= 0 and own < best[i]):
+                best[i], most = own, together
+    return best
+
+
+@njit(cache=True, nogil=True)
+def _add(points, new, amount, track, weight):  # noqa: ANN001, ANN202
+    for i in range(len(points)):
+        p, t = points[i], new[i]
+        heaviest, lightest = 0, 0
+        place = -1
+        for a in range(HEAVIEST):
+            if track[p, a] == t and t >= 0:
+                place = a
+            if weight[p, a] > weight[p, heaviest]:
+                heaviest = a
+            if weight[p, a] < weight[p, lightest]:
+                lightest = a
+        if t < 0:
+            # Seen in no mask: a proposer misses often, so it is a small word against.
+            weight[p, heaviest] = max(weight[p, heaviest] - np.float32(0.25) * amount[i], np.float32(0))
+        elif place >= 0:
+            weight[p, place] = min(weight[p, place] + amount[i], np.float32(MOST_VOTES))
+        elif weight[p, lightest] <= amount[i]:
+            track[p, lightest], weight[p, lightest] = t, amount[i]
+        else:
+            weight[p, lightest] -= amount[i]

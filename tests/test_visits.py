@@ -1,0 +1,252 @@
+"""Two visits of one place: what is gone, new, moved and unseen; maps that later visits are folded into."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from visits import BIN, CHEST, CRATE, PARCEL, SPACE, Thing, cameras, cast, instance_of, moved, scene, surface
+
+import og_pointcloud as og
+from og_pointcloud.cli import main
+from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError, SceneError
+from og_pointcloud.mapping.map_record import MapRecord
+from og_pointcloud.mapping.sight import (
+    AGREES,
+    HIDDEN,
+    NOTHING,
+    THROUGH,
+    DiscSurface,
+    states_of_points,
+    view_of_depth,
+)
+from og_pointcloud.scene import Camera
+
+AWAY = (-0.9, 0.5, 0.0)
+BEFORE = [CHEST, BIN, CRATE]
+AFTER = [CHEST, moved(CRATE, AWAY), PARCEL]
+"""The bin left, the crate moved, a parcel came."""
+
+
+@pytest.fixture(scope="module")
+def monday():
+    return og.fit(scene(BEFORE), progress=False)
+
+
+@pytest.fixture(scope="module")
+def friday():
+    return og.fit(scene(AFTER, seed=1), progress=False)
+
+
+@pytest.fixture(scope="module")
+def updated(monday):
+    return og.update(monday, scene(AFTER, seed=1), progress=False)
+
+
+def states_by_hand(xyz, camera, things, tolerance):
+    """The definition for one point at a time, in float64: the surface along its own ray, at right angles."""
+    states = []
+    for p in xyz.astype(np.float64):
+        toward = camera.world_to_camera[:3, :3] @ p + camera.world_to_camera[:3, 3]
+        narrow = replace(camera, width=1, height=1, cx=0.5 - camera.fx * toward[0] / toward[2],
+                         cy=0.5 - camera.fy * toward[1] / toward[2])  # fmt: skip
+        depth, _ = cast(things, narrow)
+        if not depth[0, 0]:
+            states.append(NOTHING)
+            continue
+        along = (float(depth[0, 0]) - toward[2]) * np.linalg.norm(toward / toward[2])
+        states.append(AGREES if abs(along) < tolerance else HIDDEN if along < 0 else THROUGH)
+    return np.array(states)
+
+
+def test_states_of_points_are_those_along_each_ray():
+    camera = cameras()[0]
+    view = view_of_depth(cast(AFTER, camera)[0], camera)
+    xyz, _ = surface(BEFORE, seed=3)
+    uv_px, _ = camera.project(xyz)
+    inside = (uv_px > 3).all(axis=1) & (uv_px < np.array([camera.width, camera.height]) - 3).all(axis=1)
+    xyz = xyz[inside].astype(np.float32)
+    literal = states_by_hand(xyz, camera, AFTER, 0.02)
+    fast = states_of_points(xyz, 0.02, view)
+    clear = (literal == HIDDEN) | (literal == THROUGH)
+    # At edges, within a pixel and a half, all surfaces around count: nothing is called absent there.
+    assert (literal[fast == THROUGH] == THROUGH).mean() > 0.99
+    assert (fast[clear] == literal[clear]).mean() > 0.8
+    assert (fast[literal == AGREES] == AGREES).mean() > 0.97
+
+
+def test_a_cloud_is_seen_like_its_depth_image():
+    camera = cameras()[2]
+    xyz, _ = surface(AFTER, seed=4)
+    drawn = DiscSurface(xyz.astype(np.float32)).seen_from(camera)
+    depth, _ = cast(AFTER, drawn.camera)
+    both = (drawn.depth > 0) & (depth > 0)
+    assert both.sum() > 0.95 * (depth > 0).sum()
+    assert np.median(np.abs(drawn.depth - depth)[both]) < 0.01
+
+
+def test_sparse_depth_says_the_same_of_fewer_points():
+    camera = cameras()[0]
+    depth, _ = cast(AFTER, camera)
+    sparse = np.where(np.random.default_rng(0).random(depth.shape) < 0.05, depth, 0).astype(np.float32)
+    xyz = surface(BEFORE, seed=3)[0].astype(np.float32)
+    full, few = (states_of_points(xyz, 0.02, view_of_depth(d, camera)) for d in (depth, sparse))
+    told = few == THROUGH
+    assert told.sum() > 50
+    assert (full[told] == THROUGH).mean() > 0.95
+
+
+def test_what_changed_is_told_by_id(monday, friday):
+    changes = og.compare(monday, friday)
+    assert changes.gone == (instance_of(monday, BIN),)
+    assert changes.new == (instance_of(friday, PARCEL),)
+    (followed,) = changes.moved
+    assert followed.id == instance_of(monday, CRATE)
+    assert followed.now == instance_of(friday, AFTER[1])
+    np.testing.assert_allclose(followed.after - followed.before, AWAY, atol=0.05)
+    assert json.loads(changes.to_json()) == changes.to_dict()
+    assert set(changes.to_dict()["moved"][0]) == {"id", "from", "to"}
+
+
+def test_the_same_place_again_has_not_changed(monday):
+    again = og.fit(scene(BEFORE, seed=2), progress=False)
+    changes = og.compare(monday, again)
+    assert (changes.gone, changes.new, changes.moved) == ((), (), ())
+
+
+def test_time_reversed_swaps_gone_and_new(monday, friday):
+    changes = og.compare(friday, monday)
+    assert changes.gone == (instance_of(friday, PARCEL),)
+    assert changes.new == (instance_of(monday, BIN),)
+    assert [moved.id for moved in changes.moved] == [instance_of(friday, AFTER[1])]
+
+
+@pytest.mark.parametrize("unit", [0.001, 1000.0])
+def test_the_unit_of_length_does_not_matter(monday, friday, unit):
+    def scaled(cloud):
+        poses = [camera.world_to_camera.copy() for camera in cloud.cameras]
+        for pose in poses:
+            pose[:3, 3] *= unit
+        views = (replace(camera, world_to_camera=pose) for camera, pose in zip(cloud.cameras, poses, strict=True))
+        lengths = {"spacing": unit * cloud.spacing, "reach": unit * cloud.reach}
+        return replace(cloud, xyz=(unit * cloud.xyz).astype(np.float32), cameras=tuple(views), **lengths)
+
+    one, other = og.compare(monday, friday), og.compare(scaled(monday), scaled(friday))
+    assert (one.gone, one.new) == (other.gone, other.new)
+    assert [(m.id, m.now) for m in one.moved] == [(m.id, m.now) for m in other.moved]
+
+
+def test_far_from_the_origin_nothing_changes(monday, friday):
+    far = np.array([5e5, 4e6, 300.0])
+    one = og.compare(monday, friday)
+    other = og.compare(replace(monday, origin=far), replace(friday, origin=far))
+    assert (one.gone, one.new, one.unseen) == (other.gone, other.new, other.unseen)
+
+
+def test_what_is_hidden_stays(monday):
+    """A screen before the bin hides it: nobody looked, so nothing is said of it."""
+    screen = Thing((0.1, -1.5, 0.0), (1.1, 0.05, 1.4), (240, 240, 240), 5)
+    views = [camera for camera in cameras(40) if camera.center[1] < -3.0 and abs(camera.center[0]) < 1]
+    hidden = og.fit(scene([CHEST, CRATE, screen], views, seed=5), progress=False)
+    changes = og.compare(monday, hidden)
+    assert instance_of(monday, BIN) not in changes.gone
+
+
+def test_one_place_alone_refutes_nothing(monday):
+    one = cameras(14)[:1]
+    seen = og.fit(scene([CHEST, CRATE], one, seed=6), progress=False)
+    assert og.compare(monday, seen).gone == ()
+
+
+def test_what_the_first_visit_never_looked_at_is_not_new(monday):
+    """Monday only looked from one side; behind the chest stands something that it could not see."""
+    side = [camera for camera in cameras(40) if camera.center[0] < -2.5]
+    behind = Thing((-0.35, -0.1, 0.0), (0.15, 0.2, 0.3), (30, 200, 200), 6)
+    before = og.fit(scene([CHEST, behind], side, seed=7), progress=False)
+    # The first visit's cloud holds what its cameras saw alone.
+    seen = surface([CHEST, behind], seed=7)[1] != 1
+    known = replace(before, xyz=before.xyz[seen], instance_ids=before.instance_ids[seen],
+                    rgb=before.rgb[seen], certainty=before.certainty[seen])  # fmt: skip
+    after = og.fit(scene([CHEST, behind], seed=8), progress=False)
+    assert instance_of(after, behind) not in og.compare(known, after).new
+
+
+def test_a_map_keeps_its_ids(monday, updated):
+    cloud = updated.cloud
+    assert updated.changes.gone == (instance_of(monday, BIN),)
+    assert instance_of(cloud, CHEST) == instance_of(monday, CHEST)
+    assert instance_of(cloud, AFTER[1]) == instance_of(monday, CRATE)
+    assert updated.changes.new == (instance_of(cloud, PARCEL),)
+    assert updated.changes.new[0] >= len(monday.instances)
+    bin_ = instance_of(monday, BIN)
+    assert cloud.instances.points[bin_] == 0
+    assert MapRecord.of(cloud).state(bin_) == "gone"
+    assert instance_of(cloud, BIN) == -1
+
+
+def test_what_comes_back_is_known_again(monday, updated):
+    bin_ = instance_of(monday, BIN)
+    back = [*AFTER, moved(BIN, (0.5, 1.1, 0.0))]
+    again = og.update(updated.cloud, scene(back, seed=9), progress=False)
+    assert [moved.id for moved in again.changes.moved] == [bin_]
+    assert again.changes.new == ()
+    assert instance_of(again.cloud, back[-1]) == bin_
+    assert MapRecord.of(again.cloud).state(bin_) == "present"
+
+
+def test_a_part_of_the_place_leaves_the_rest_as_it_was(monday):
+    """Half of the cameras, near things hide far ones: what is not looked at keeps id, points and time."""
+    low = [replace(camera, height=60, cy=-10.0) for camera in cameras(14)]  # the lower rows: the near floor
+    seen = og.update(monday, scene([CHEST, BIN, CRATE], low, seed=10), progress=False)
+    assert seen.changes.gone == ()
+    assert seen.changes.new == ()
+    for thing in BEFORE:
+        assert instance_of(seen.cloud, thing) == instance_of(monday, thing)
+
+
+def test_a_map_survives_its_file(updated, tmp_path):
+    path = og.write_bundle(updated.cloud, tmp_path / "map.ogpc")
+    read = og.load(path).cloud
+    assert MapRecord.of(read) == MapRecord.of(updated.cloud)
+    assert len(read.cameras) == len(updated.cloud.cameras) == 28
+    for one, other in zip(read.cameras, updated.cloud.cameras, strict=True):
+        np.testing.assert_array_equal(one.world_to_camera, other.world_to_camera)
+
+
+def test_a_file_of_before_has_no_cameras_and_says_so(monday):
+    bare = replace(monday, cameras=())
+    with pytest.raises(SceneError, match="does not know its cameras"):
+        og.compare(monday, bare)
+    assert len(og.compare(bare, monday).new) == 0
+
+
+def test_another_place_is_refused(monday, friday):
+    turned = replace(friday, origin=friday.origin + np.array([0.0, 0.0, 1.0]))
+    with pytest.raises(SceneError, match="one world frame"):
+        og.compare(monday, turned)
+
+
+def test_another_encoder_is_refused(monday):
+    other = replace(scene(AFTER), feature_space="another-space")
+    with pytest.raises(FeatureSpaceError, match=f"expected feature space '{SPACE}'"):
+        og.update(monday, other, progress=False)
+
+
+def test_a_damaged_record_is_refused(monday):
+    with pytest.raises(OgPointcloudError, match="record of its visits is damaged"):
+        MapRecord.of(replace(monday, provenance={"map": {"visits": 3}}))
+
+
+def test_the_commands_write_what_changed(monday, friday, tmp_path, capsys):
+    one, other = (og.write_bundle(cloud, tmp_path / f"{name}.ogpc") for name, cloud in (("m", monday), ("f", friday)))
+    assert main(["compare", str(one), str(other), "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report == og.compare(monday, friday).to_dict()
+
+
+def test_a_camera_without_a_view_of_anything_says_nothing(monday):
+    away = Camera(64, 48, 60.0, 60.0, 32.0, 24.0, np.diag([1.0, -1.0, -1.0, 1.0]))
+    view = view_of_depth(np.zeros((48, 64), np.float32), away)
+    assert (states_of_points(monday.xyz, 0.02, view) == NOTHING).all()
