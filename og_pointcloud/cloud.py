@@ -70,6 +70,8 @@ class InstanceTable:
     visible_area: (K,) float32, pixels of blending weight that its masks put on it, over all views.
     coarse: (K,) int32, the coarse cluster that an instance of a codebook lies in, -1 none. part_of: (K,) int32, the
         instance that this one is a part of, -1 none; without cycles. Left empty, both become -1 throughout.
+    reliability: (K,) float32 in [0, 1], how far labels from half of the views give its points again, and its masks
+        name it (fitting/reliability.py); NaN where that is not known. Left empty, it is NaN throughout.
 
     >>> cloud.instances.points, cloud.instances.part_of  # of `LabelledCloud`'s example
     (array([2, 1], dtype=int32), array([-1, -1], dtype=int32))
@@ -87,13 +89,14 @@ class InstanceTable:
     visible_area: NDArray[np.float32]
     coarse: NDArray[np.int32] = field(default_factory=lambda: np.zeros(0, np.int32))
     part_of: NDArray[np.int32] = field(default_factory=lambda: np.zeros(0, np.int32))
+    reliability: NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
 
     def __post_init__(self) -> None:
         count = len(self.points)
-        for name in ("coarse", "part_of"):
+        for name, unknown in (("coarse", np.int32(-1)), ("part_of", np.int32(-1)), ("reliability", np.float32("nan"))):
             if len(getattr(self, name)) == 0:
-                object.__setattr__(self, name, np.full(count, -1, np.int32))
-        for name in ("views", "masks", "agreement", "visible_area", "coarse", "part_of"):
+                object.__setattr__(self, name, np.full(count, unknown))
+        for name in ("views", "masks", "agreement", "visible_area", "coarse", "part_of", "reliability"):
             if getattr(self, name).shape != (count,):
                 raise OgPointcloudError(f"instance {name} has shape {getattr(self, name).shape}; expected ({count},)")
         if self.descriptors.ndim != 2 or len(self.descriptors) != len(self.descriptor_instance):
@@ -109,6 +112,15 @@ class InstanceTable:
 
     def __len__(self) -> int:
         return len(self.points)
+
+    @property
+    def overall_reliability(self) -> float | None:
+        """Mean reliability, by the root of the instances' points; None where no instance's is known. It ranks fits
+        nearly as mIoU does, which needs truth; 1 is not to be expected."""
+        known = np.isfinite(self.reliability) & (self.points > 0)
+        if not known.any():
+            return None
+        return float(np.average(self.reliability[known].astype(np.float64), weights=np.sqrt(self.points[known])))
 
     def cosines(self, vectors: NDArray[np.floating]) -> NDArray[np.floating]:
         """(K, L) best cosine of an instance's descriptors with each of vectors (L, D), -2 for one without a descriptor.
@@ -273,6 +285,11 @@ class LabelledCloud:
         """The feature space with its width: that of the descriptors, 0 where no instance has one."""
         descriptors = self.instances.descriptors
         return FeatureSpace(self.feature_space, descriptors.shape[1] if len(descriptors) else 0)
+
+    @property
+    def reliability(self) -> float | None:
+        """How good the fit thinks it is, in [0, 1]: `InstanceTable.overall_reliability`; None if unknown."""
+        return self.instances.overall_reliability
 
     @property
     def xyz_world(self) -> NDArray[np.float64]:

@@ -89,7 +89,7 @@ def test_tough_clouds_come_back_as_they_went(tmp_path, name):
         ours, theirs = getattr(back.instances, field.name), getattr(cloud.instances, field.name)
         assert ours.shape == theirs.shape
         assert ours.dtype == theirs.dtype
-        assert (ours == theirs).all()
+        np.testing.assert_array_equal(ours, theirs)
     for key in ("feature_space", "spacing", "reach", "provenance"):
         assert getattr(back, key) == getattr(cloud, key)
     assert (back.vocabulary is None) == (cloud.vocabulary is None)

@@ -38,8 +38,8 @@ class Row:
     """One scene. miou, background, unknown: as `Score` has them. seconds: of the fit, capture in memory;
     core_seconds: of all cores together, which other work on the machine changes less.
 
-    agreement: what the fit says of itself, in [0, 1]. baseline: the best one, None where none was asked for; gain: our
-    mIoU less its, over the same blocks of space, and the middle 95 % of that.
+    reliability: what the fit says of itself, in [0, 1]. baseline: the best one, None where none was asked for; gain:
+    our mIoU less its, over the same blocks of space, and the middle 95 % of that.
     """
 
     scene: str
@@ -51,7 +51,7 @@ class Row:
     unknown: float
     seconds: float
     core_seconds: float
-    agreement: float | None
+    reliability: float | None
     baseline: str | None = None
     baseline_miou: float | None = None
     gain: float | None = None
@@ -79,7 +79,7 @@ def measure(folder: Path, settings: FitSettings | None = None, baselines: bool =
         unknown=score.unknown_share,
         seconds=seconds,
         core_seconds=worked,
-        agreement=_agreement(cloud),
+        reliability=cloud.reliability,
     )
     return _beside_baselines(row, folder, prepared, answer, truth, score.classes) if baselines else row
 
@@ -104,11 +104,6 @@ def _beside_baselines(
     assert best is not None
     gain = miou_interval(answer.called, truth, answer.xyz, answer.spacing, classes, less=best[2])
     return replace(row, baseline=best[1], baseline_miou=best[0], gain=gain.mean, gain_low=gain.low, gain_high=gain.high)
-
-
-def _agreement(cloud: og.LabelledCloud) -> float | None:
-    notes = cloud.provenance["notes"]
-    return max(notes.get("mask_agreement", {}).values(), default=None)
 
 
 def warm_up(scene: Scene) -> None:

@@ -25,7 +25,7 @@ def line(row: Row) -> str:
     """One scene on one line."""
     background = "   -  " if row.background is None else f"{100 * row.background:5.2f}%"
     text = f"{row.scene:22} {row.half:6} {row.points:9,} {row.views:4} {row.miou:6.3f} {background} {row.seconds:6.1f}"
-    text += "      -" if row.agreement is None else f" {row.agreement:6.3f}"
+    text += "      -" if row.reliability is None else f" {row.reliability:6.3f}"
     if row.baseline is None or row.gain is None:
         return text
     gain = f"{row.gain:+.3f} ({row.gain_low:+.3f} to {row.gain_high:+.3f})"
@@ -33,7 +33,7 @@ def line(row: Row) -> str:
 
 
 HEADER = (
-    f"{'scene':22} {'half':6} {'points':>9} {'view':>4} {'mIoU':>6} {'called':>6} {'s':>6} {'agree':>6}  best baseline"
+    f"{'scene':22} {'half':6} {'points':>9} {'view':>4} {'mIoU':>6} {'called':>6} {'s':>6} {'relia.':>6}  best baseline"
 )
 
 
@@ -64,9 +64,9 @@ def _means(rows: Sequence[Row]) -> str:
         lost = [row.scene for row in rows if row.gain_high is not None and row.gain_high < 0]
         text += f"; best baselines {np.mean(best):.4f}, better than ours beyond the interval on {len(lost)}"
         text += f": {', '.join(lost)}" if lost else ""
-    said = [(row.agreement, row.miou) for row in rows if row.agreement is not None]
+    said = [(row.reliability, row.miou) for row in rows if row.reliability is not None]
     if len(said) > 2:
-        text += f"; rank correlation of agreement and mIoU {rank_correlation(*zip(*said, strict=True)):.2f}"
+        text += f"; rank correlation of reliability and mIoU {rank_correlation(*zip(*said, strict=True)):.2f}"
     return text
 
 
@@ -104,15 +104,15 @@ def write_picture(rows: Sequence[Row], path: Path) -> Path:
         beside = [row for row in chosen if row.baseline_miou is not None]
         ours.plot([row.baseline_miou for row in beside], [row.miou for row in beside], **style)
         cost.plot([row.seconds for row in chosen], [1 - row.miou for row in chosen], **style)
-        said = [row for row in chosen if row.agreement is not None]
+        said = [row for row in chosen if row.reliability is not None]
         if len(said) > 2:
-            rank = rank_correlation([row.agreement or 0 for row in said], [row.miou for row in said])
+            rank = rank_correlation([row.reliability or 0 for row in said], [row.miou for row in said])
             style["label"] = f"{title}: rank correlation {rank:.2f}"
-        own.plot([row.agreement for row in said], [row.miou for row in said], **style)
+        own.plot([row.reliability for row in said], [row.miou for row in said], **style)
     ours.axline((0.5, 0.5), slope=1, color="0.6", lw=1)
     ours.set(xlabel="mIoU, best baseline", ylabel="mIoU, ours", title="Each scene beside its best baseline")
     cost.set(xlabel="seconds of the fit", ylabel="error, 1 - mIoU", xscale="log", title="Error against seconds")
-    own.set(xlabel="agreement, which needs no truth", ylabel="mIoU", title="What a fit says of itself")
+    own.set(xlabel="reliability, which needs no truth", ylabel="mIoU", title="What a fit says of itself")
     for axes in (ours, cost, own):
         axes.grid(alpha=0.3)
         axes.legend(fontsize=8, frameon=False)

@@ -91,6 +91,8 @@ def _arrays(cloud: LabelledCloud) -> dict[str, NDArray[Any]]:
     """What lies under arrays/; the descriptors lie in query.onnx alone, where the manifest says."""
     columns = [field.name for field in fields(InstanceTable) if field.name != "descriptors"]
     table = {INSTANCE_MEMBERS.get(name, name): getattr(cloud.instances, name) for name in columns}
+    if not np.isfinite(table["reliability"]).any():
+        del table["reliability"]  # as in files of before there was one
     arrays = {"xyz": cloud.xyz, "instance_ids": _smallest_signed(cloud.instance_ids)}
     if cloud.rgb is not None:
         arrays["rgb"] = cloud.rgb

@@ -45,8 +45,9 @@ class Instance:
 
     id: in the scene's table. point_indices: (n,) int64, its points in the scene, ascending.
     views, masks: how many saw it and how many are joined in it. agreement: mean cosine of its masks' features with
-    their descriptor, -1 to 1. visible_area: pixels that its masks put on it, over all views. part_of: the instance
-    that it is a part of, -1 none. coarse: the codebook's coarse cluster that it lies in, -1 none.
+    their descriptor, -1 to 1. reliability: how far half of the views give its points again and its masks name it, 0 to
+    1, None where that is not known. visible_area: pixels that its masks put on it, over all views. part_of: the
+    instance that it is a part of, -1 none. coarse: the codebook's coarse cluster that it lies in, -1 none.
     state: "labelled", "no feature" or "empty". words: (word, score), best first; a score is the probability that the
     instance is what the word says, where the scene has a word bank, else a cosine.
 
@@ -62,6 +63,7 @@ class Instance:
     views: int
     masks: int
     agreement: float
+    reliability: float | None
     visible_area: float
     part_of: int
     coarse: int
@@ -105,7 +107,18 @@ class Instance:
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-able: everything but the points themselves; of those, how many, and how many are strays."""
-        columns = ("id", "state", "points", "views", "masks", "agreement", "visible_area", "part_of", "coarse")
+        columns = (
+            "id",
+            "state",
+            "points",
+            "views",
+            "masks",
+            "agreement",
+            "reliability",
+            "visible_area",
+            "part_of",
+            "coarse",
+        )
         aligned, oriented = self.axis_aligned_box, self.oriented_box
         return {name: getattr(self, name) for name in columns} | {
             "strays": int((~self.main_part).sum()),
@@ -178,7 +191,17 @@ class Instances(Sequence[Instance]):
         return text.getvalue()
 
     def __repr__(self) -> str:
-        header = ("id", "points", "views", "agreement", "state", "centroid", "size along x, y, z", "best words")
+        header = (
+            "id",
+            "points",
+            "views",
+            "agreement",
+            "reliability",
+            "state",
+            "centroid",
+            "size along x, y, z",
+            "best words",
+        )
         shown = self.largest(SHOWN)
         rows = [header, *(_cells(row) for row in shown)]
         widths = [max(len(row[column]) for row in rows) for column in range(len(header))]
@@ -214,6 +237,7 @@ def list_instances(
                 views=int(table.views[k]),
                 masks=int(table.masks[k]),
                 agreement=float(table.agreement[k]),
+                reliability=float(table.reliability[k]) if np.isfinite(table.reliability[k]) else None,
                 visible_area=float(table.visible_area[k]),
                 part_of=int(table.part_of[k]),
                 coarse=int(table.coarse[k]),
@@ -234,6 +258,7 @@ def _cells(row: Instance) -> tuple[str, ...]:
         f"{row.points:,}",
         str(row.views),
         f"{row.agreement:.2f}",
+        "-" if row.reliability is None else f"{row.reliability:.2f}",
         row.state,
         "-" if row.centroid is None else " ".join(f"{value:.4g}" for value in row.centroid),
         "-" if box is None else " x ".join(f"{value:.3g}" for value in box.size),

@@ -49,6 +49,8 @@ REBUILD = "write the file again with write_bundle"
 BANK = "bank/vectors.npy"
 INSTANCE_MEMBERS = {"part_of": "whole"}
 """Columns of the instance table whose member has another name, as it was in the first files of schema 2."""
+LATER_COLUMNS = ("reliability",)
+"""Columns of the instance table that the first files of schema 2 lack."""
 RGB, CERTAINTY, CAMERAS = "arrays/rgb.npy", "arrays/certainty.npy", "arrays/cameras.npy"
 CARRIED_ENCODER = "text_encoder/"
 """What the names of a carried text encoder's members begin with."""

@@ -22,6 +22,7 @@ from og_pointcloud.bundle.format import (
     FORMAT,
     INSTANCE_MEMBERS,
     INTEGERS,
+    LATER_COLUMNS,
     MAX_MANIFEST_BYTES,
     MAX_MEMBERS,
     QUERY_OPERATORS,
@@ -223,11 +224,12 @@ def _instances(manifest: dict[str, Any], members: dict[str, bytes], count: int) 
     descriptors = _descriptors(_field(manifest, "descriptors", dict), members)
     columns: dict[str, NDArray[Any]] = {}
     for field in fields(InstanceTable):
-        if field.name != "descriptors":
-            name = INSTANCE_MEMBERS.get(field.name, field.name)
-            dtype = "<f4" if field.name in ("agreement", "visible_area") else "<i4"
-            length = len(descriptors) if field.name == "descriptor_instance" else count
-            columns[field.name] = _array(members, f"arrays/instances/{name}.npy", (dtype,), (length,))
+        member = f"arrays/instances/{INSTANCE_MEMBERS.get(field.name, field.name)}.npy"
+        if field.name == "descriptors" or (field.name in LATER_COLUMNS and member not in members):
+            continue
+        dtype = "<f4" if field.name in ("agreement", "visible_area", "reliability") else "<i4"
+        length = len(descriptors) if field.name == "descriptor_instance" else count
+        columns[field.name] = _array(members, member, (dtype,), (length,))
     return InstanceTable(descriptors, **columns)
 
 

@@ -178,6 +178,7 @@ def describe_fit(cloud: LabelledCloud, capture: Path, bundle: Path) -> dict[str,
         "feature_space": cloud.feature_space,
         "vocabulary": len(cloud.vocabulary.names) if cloud.vocabulary else 0,
         "calibrated": calibrated,
+        "reliability": cloud.reliability,
         "seconds": round(sum(stage["seconds"] for stage in cloud.provenance["stages"]), 3),
         **cloud.provenance,
     }
@@ -192,6 +193,8 @@ def print_fit(report: Mapping[str, Any], cloud: LabelledCloud) -> None:
         f"{total:,} points: {shares[0]:.1%} in {report['instances']} instances, {shares[1]:.1%} background, "
         f"{shares[2]:.1%} unobserved"
     )
+    if report["reliability"] is not None:
+        print(f"reliability {report['reliability']:.2f}: how far half of the views bear the labels out, 0 to 1")
     print(f"wrote {report['output']} ({report['bytes'] / 1e6:.1f} MB)")
     if not report["calibrated"]:
         print(f"no word bank: scores will be cosines. {calibration_hint(report['output'])}")

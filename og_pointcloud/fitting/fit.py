@@ -16,6 +16,7 @@ from og_pointcloud.fitting.labellers import LABELLERS, Labelling, paper
 from og_pointcloud.fitting.mask_table import Cutoffs, MaskTable, mask_table, require_sight, working_memory
 from og_pointcloud.fitting.membership import without_see_through
 from og_pointcloud.fitting.memory import in_file, memory_left
+from og_pointcloud.fitting.reliability import likely_cause, split_half
 from og_pointcloud.fitting.tiles import fit_tiles, needs_tiles
 from og_pointcloud.fitting.work_folder import WorkFolder
 from og_pointcloud.journal import Journal, LeftOut
@@ -121,9 +122,26 @@ def fit_prepared(
     surface = prepared.surface
     labeller = partial(paper, work=work) if settings.mode == "paper" else LABELLERS[settings.mode]
     labelling = labeller(prepared.table, surface, settings, journal)
+    labelling = _with_reliability(labelling, prepared, settings, journal)
     spacing = float(np.median(surface.neighbourhood.spacing))
     labelling = labelling.of_points(surface.row_of_point)
     return _labelled_cloud(prepared.scene, labelling, spacing, settings, journal)
+
+
+def _with_reliability(labelling: Labelling, prepared: Prepared, settings: FitSettings, journal: Journal) -> Labelling:
+    """The labelling with what half of the views say of each instance."""
+    with journal.stage("reliability"):
+        found = split_half(prepared.table, prepared.surface, labelling, settings)
+    if found is None:
+        return labelling
+    instances = replace(labelling.instances, reliability=found.of_instance)
+    overall = instances.overall_reliability
+    if overall is not None:
+        journal.notes["reliability"] = round(overall, 4)
+        if overall < settings.reliable:
+            cause = likely_cause(found, prepared.table, prepared.surface, labelling.instance_ids)
+            journal.warnings.append(f"reliability {overall:.2f}, below {settings.reliable:g}: {cause}")
+    return replace(labelling, instances=instances)
 
 
 def _check(scene: Scene, journal: Journal) -> None:

@@ -1,0 +1,243 @@
+"""How good a fit is, without truth: its split-half reliability, for each instance and for the scene.
+
+Labels are made anew from either half of the views, every other one by name, from the rows of the mask table that there
+are already. An instance is as reliable as the product of two shares in [0, 1]:
+
+    again   of its points, those that a half gives the same look, mean of both halves. Few views, geometry that hides
+            the wrong things, wrong poses and masks that are cut otherwise in every view lower it
+    named   of its masks, those whose own feature, alone, is nearest to the instance's look. An encoder that errs, and
+            masks that span several things, lower it
+
+Instances are of one look where their descriptors are alike once what all masks have in common is taken away: two
+chairs are, and either may be found where the other was. What all views get wrong alike no half can tell. Over
+`examples/zoo.py` the scene's figure ranks fits nearly as mIoU does; docs/results.md has the figures.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+
+from og_pointcloud.cloud import InstanceTable, unit_rows
+from og_pointcloud.errors import SceneError
+from og_pointcloud.fitting.held_out import FEWEST_VIEWS
+from og_pointcloud.fitting.labellers import Labelling, grouping
+from og_pointcloud.fitting.mask_table import MaskTable
+from og_pointcloud.journal import Journal
+from og_pointcloud.rendering.geometry import neighbourhood, sample_of_points
+from og_pointcloud.rendering.surface import Surface
+from og_pointcloud.settings import FitSettings
+
+__all__ = ["Reliability", "likely_cause", "split_half"]
+
+SAME_LOOK = 0.5
+"""Cosine of descriptors, without what all masks share, from which two instances are of one look. Unrelated things have
+about 0; 0.3 and 0.7 rank scenes of the zoo as well."""
+ROWS_AT_ONCE = 1 << 24
+"""Cosines held at once."""
+JUDGED_VIEWS, JUDGED_POINTS = 12, 4_000
+"""Views whose poses are checked, and points of each: shares over thousands of points need no more."""
+STEP, STEPS = 0.01, 5
+"""Masks are moved by so much of their width, and so many times, to see whether they fit better elsewhere."""
+ABOVE_OTHERS = 1.2
+"""A view's own masks, moved as they fit best, fit it so many times as well as the best of other views'. On honest
+scenes of the zoo it is 1.4 and more, with poses given to other views 1.2 and less."""
+
+Bools = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Reliability:
+    """again, named: (K,) in [0, 1] as above; NaN where an instance has no feature or no point that was judged. alone:
+    share of the judged points in instances that one of the halves does not see."""
+
+    again: NDArray[np.float64]
+    named: NDArray[np.float64]
+    alone: float
+
+    @property
+    def of_instance(self) -> NDArray[np.float32]:
+        """(K,) their product."""
+        return (self.again * self.named).astype(np.float32)
+
+
+def split_half(table: MaskTable, surface: Surface, labelling: Labelling, settings: FitSettings) -> Reliability | None:
+    """The reliability of a labelling; None where views cannot be halved. Does not depend on the order of views.
+
+    table, surface: what it was made from. Clouds of more than ``geometry.held_out_points`` are judged by so many.
+    """
+    views = surface.scene.views
+    masked = sorted(np.unique(table.mask_view).tolist(), key=lambda index: views[index].name)
+    if len(masked) < FEWEST_VIEWS or not len(labelling.instances):
+        return None
+    sample = sample_of_points(surface.gaussians.xyz, settings.geometry.held_out_points)
+    judged = _of_points(surface, sample, settings)
+    ids = labelling.instance_ids[sample]
+    looks = _Looks(table, labelling.instances)
+    points = np.bincount(ids[ids >= 0], minlength=len(labelling.instances)).astype(np.float64)
+    again, unseen = np.zeros(len(points)), np.zeros(len(ids), bool)
+    for half in (masked[0::2], masked[1::2]):
+        part = _of_views(table, np.sort(half), sample)
+        unseen |= np.asarray(part.exposure.sum(axis=0)).ravel() == 0
+        again += np.bincount(ids[_same(part, judged, ids, looks, settings)], minlength=len(points)) / 2
+    known = looks.described & (points > 0)
+    share = np.divide(again, points, out=np.full(len(points), np.nan), where=known)
+    alone = float(unseen[ids >= 0].mean()) if (ids >= 0).any() else 0.0
+    return Reliability(share, np.where(known, _named(table, labelling, looks), np.nan), alone)
+
+
+class _Looks:
+    """What instances look like. described: (K,) bool, those with a feature."""
+
+    def __init__(self, table: MaskTable, instances: InstanceTable) -> None:
+        features = table.unit_features
+        given = features.any(axis=1)
+        self.common = features[given].mean(axis=0, dtype=np.float64) if given.any() else np.zeros(features.shape[1])
+        self.direction, self.described = self.of(instances)
+        self._rows = np.flatnonzero(self.described)
+
+    def of(self, instances: InstanceTable) -> tuple[NDArray[np.float64], Bools]:
+        """(K, D) directions of instances of the same scene, zero for those without a feature, and which have one."""
+        total = np.zeros((len(instances), len(self.common)))
+        if len(instances.descriptors):
+            np.add.at(total, instances.descriptor_instance, instances.descriptors)
+        described = np.asarray(total.any(axis=1))
+        total[described] = self.without_common(total[described])
+        return total, described
+
+    def without_common(self, features: NDArray[np.floating]) -> NDArray[np.floating]:
+        """Unit rows of what features have beyond that which all masks of the scene share."""
+        return unit_rows(unit_rows(features.astype(np.float64)) - self.common)
+
+    def nearest(self, directions: NDArray[np.floating]) -> NDArray[np.int64]:
+        """The instance whose look is nearest to each direction, -1 where none has one."""
+        if not len(self._rows):
+            return np.full(len(directions), -1)
+        step = max(1, ROWS_AT_ONCE // len(self._rows))
+        chunks = [directions[low : low + step] for low in range(0, len(directions), step)]
+        found = [(chunk @ self.direction[self._rows].T).argmax(axis=1) for chunk in chunks]
+        return self._rows[np.concatenate(found)] if found else np.zeros(0, np.int64)
+
+    def alike(self, first: NDArray[np.integer], second: NDArray[np.integer]) -> Bools:
+        """Whether pairs of instances are of one look; none is like -1."""
+        pairs, place = np.unique(np.stack([first, second]), axis=1, return_inverse=True)
+        cosine = (self.direction[pairs[0]] * self.direction[pairs[1]]).sum(axis=1)
+        same = ((pairs[0] == pairs[1]) | (cosine > SAME_LOOK)) & (pairs >= 0).all(axis=0)
+        return same[place.ravel()]
+
+
+def _same(table: MaskTable, surface: Surface, ids: NDArray[np.int32], looks: _Looks, settings: FitSettings) -> Bools:
+    """(n,) points of an instance that labels made from these views alone give the look of that instance."""
+    try:
+        found = grouping(table, surface, settings, Journal(progress=False))
+    except SceneError:
+        return np.zeros(len(ids), bool)
+    directions, described = looks.of(found.instances)
+    name = np.where(described, looks.nearest(directions), -1)
+    labelled = np.flatnonzero((ids >= 0) & (found.instance_ids >= 0))
+    same = np.zeros(len(ids), bool)
+    same[labelled] = looks.alike(ids[labelled], name[found.instance_ids[labelled]])
+    return same
+
+
+def _named(table: MaskTable, labelling: Labelling, looks: _Looks) -> NDArray[np.float64]:
+    """(K,) share of an instance's masks whose feature is nearest to its look; 1 where none has a feature."""
+    features, owner = table.unit_features, labelling.mask_instance
+    used = np.flatnonzero((owner >= 0) & features.any(axis=1))
+    right = looks.alike(owner[used], looks.nearest(looks.without_common(features[used])))
+    count = len(labelling.instances)
+    masks = np.bincount(owner[used], minlength=count)
+    return np.divide(np.bincount(owner[used], right, count), masks, out=np.ones(count), where=masks > 0)
+
+
+def _of_views(table: MaskTable, views: NDArray[np.int64], points: NDArray[np.int64]) -> MaskTable:
+    """The table of some of its views, ascending, and points."""
+    masks = np.flatnonzero(np.isin(table.mask_view, views))
+    rows = (table.weights[masks], table.outside[views], table.exposure[views])
+    weights, outside, exposure = (csr_array(csr_array(part)[:, points]) for part in rows)
+    return MaskTable(
+        weights, outside, exposure, np.searchsorted(views, table.mask_view[masks]).astype(np.int32),
+        table.mask_pixels[masks], table.mask_features[masks],
+    )  # fmt: skip
+
+
+def _of_points(surface: Surface, rows: NDArray[np.int64], settings: FitSettings) -> Surface:
+    """The surface of some of its points."""
+    if len(rows) == len(surface.gaussians):
+        return surface
+    return replace(
+        surface,
+        scene=replace(surface.scene, points=surface.scene.points.take(rows)),
+        neighbourhood=neighbourhood(surface.gaussians.xyz[rows], settings.geometry),
+        gaussians=surface.gaussians.take(rows),
+        thickness=surface.thickness[rows],
+    )
+
+
+# Why ------------------------------------------------------------------------------------------------------------
+
+
+def likely_cause(found: Reliability, table: MaskTable, surface: Surface, ids: NDArray[np.int32]) -> str:
+    """In words, why a reliability is low. ids: (n,) int32, the instance of each point of the surface."""
+    offset = misplaced(table, surface, ids)
+    if offset is not None:
+        return f"poses and cloud lie apart: {offset}"
+    if found.alone > 0.25:
+        return f"too few views: {found.alone:.0%} of the labelled points are seen by one half of the views alone"
+    again, named = float(np.nanmean(found.again)), float(np.nanmean(found.named))
+    if named < again:
+        return f"masks of one thing are named differently: {named:.0%} of them, read alone, name their instance"
+    return f"masks disagree about what is one thing: half of the views give {again:.0%} of the points the same label"
+
+
+def misplaced(table: MaskTable, surface: Surface, ids: NDArray[np.int32]) -> str | None:
+    """How far masks lie from the points that they show, where in most views they fit better elsewhere; None else."""
+    views = surface.scene.views
+    masked = np.unique(table.mask_view)
+    chosen = masked[np.unique(np.linspace(0, len(masked) - 1, JUDGED_VIEWS).round().astype(int))].tolist()
+    maps = {index: views[index].mask_map() for index in chosen}
+    moved, own, others = [], [], []
+    for index in chosen:
+        camera = views[index].camera
+        seen = csr_array(table.exposure[[index]]).indices
+        seen = seen[:: 1 + len(seen) // JUDGED_POINTS]
+        uv_px, _ = camera.project(surface.gaussians.xyz[seen])
+        share, fit = _best_shift(maps[index], uv_px, ids[seen])
+        moved.append(share * camera.width)
+        own.append(fit)
+        others.append(max(_fit(maps[other], uv_px, ids[seen]) for other in chosen if other != index))
+    if np.median(own) < ABOVE_OTHERS * np.median(others):
+        return "what a view shows fits the masks of others as well as its own; check that poses are camera-to-world"
+    if np.median(moved) > 0:
+        return f"masks fit best when moved by about {np.median(moved):.0f} pixels; check poses and intrinsics"
+    return None
+
+
+def _best_shift(masks: NDArray[np.int32], uv_px: NDArray[np.floating], ids: NDArray[np.int32]) -> tuple[float, float]:
+    """Moved by how much of their width masks fit the points best, and how well they fit there."""
+    step = STEP * masks.shape[1]
+    shifts = [(right, down) for right in range(-STEPS, STEPS + 1) for down in range(-STEPS, STEPS + 1)]
+    fits = {shift: _fit(masks, uv_px + np.multiply(shift, step), ids) for shift in shifts}
+    best = max(shifts, key=lambda shift: (fits[shift], -np.hypot(*shift)))
+    return STEP * float(np.hypot(*best)), fits[best]
+
+
+def _fit(masks: NDArray[np.int32], uv_px: NDArray[np.floating], ids: NDArray[np.int32]) -> float:
+    """How well a mask map tells instances apart: mutual information of both by the instances' entropy, in [0, 1]."""
+    height, width = masks.shape
+    column, row = np.floor(uv_px).astype(int).T
+    column, row = np.clip(column, 0, width - 1), np.clip(row, 0, height - 1)
+    if len(ids) == 0:
+        return 0.0
+    first, second = np.maximum(ids, -1) + 1, masks[row, column] + 1
+    shape = int(first.max()) + 1, int(second.max()) + 1
+    joint = np.bincount(first * shape[1] + second, minlength=shape[0] * shape[1]).reshape(shape) / len(ids)
+    joint = joint[joint.any(axis=1)][:, joint.any(axis=0)]
+    of_first, of_second = joint.sum(axis=1), joint.sum(axis=0)
+    entropy = -(of_first * np.log(of_first)).sum()
+    expected = of_first[:, None] * of_second[None]
+    told = (joint[joint > 0] * np.log(joint[joint > 0] / expected[joint > 0])).sum()
+    return float(told / entropy) if entropy > 0 else 0.0

@@ -1,0 +1,223 @@
+"""Split-half reliability: by hand, what lowers it and in what words, and its way into files and tables."""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from labelled_clouds import make_cloud
+from scenes import write_tiny_capture
+
+import og_pointcloud as og
+from og_pointcloud.fitting.fit import fit_prepared, prepare
+from og_pointcloud.fitting.labellers import grouping
+from og_pointcloud.fitting.mask_table import MaskTable
+from og_pointcloud.fitting.reliability import SAME_LOOK, likely_cause, split_half
+from og_pointcloud.journal import Journal
+from og_pointcloud.scene import Scene
+from og_pointcloud.settings import FitSettings
+
+SETTINGS = FitSettings(mode="grouping")
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
+    return og.read_capture(write_tiny_capture(tmp_path_factory.mktemp("tiny") / "capture", 8).folder)
+
+
+def judged(scene: Scene):
+    """The reliability of a fit of a scene, and its likely cause if it were low."""
+    prepared = prepare(scene, SETTINGS)
+    labelling = grouping(prepared.table, prepared.surface, SETTINGS, Journal(progress=False))
+    found = split_half(prepared.table, prepared.surface, labelling, SETTINGS)
+    assert found is not None
+    return found, likely_cause(found, prepared.table, prepared.surface, labelling.instance_ids)
+
+
+def with_views(scene: Scene, change) -> Scene:
+    return replace(scene, views=tuple(change(index, view) for index, view in enumerate(scene.views)))
+
+
+def literally(scene: Scene):
+    """The same in dense arrays and loops: (again, named) of each instance."""
+    prepared = prepare(scene, SETTINGS)
+    table, surface = prepared.table, prepared.surface
+    labelling = grouping(table, surface, SETTINGS, Journal(progress=False))
+    names = [view.name for view in surface.scene.views]
+    order = [index for index in np.argsort(names) if (table.mask_view == index).any()]
+    features = table.unit_features.astype(np.float64)
+    common = features[features.any(axis=1)].mean(axis=0)
+
+    def direction(feature):
+        moved = feature / np.linalg.norm(feature) - common
+        return moved / np.linalg.norm(moved)
+
+    def look(instances, k):
+        rows = instances.descriptors[instances.descriptor_instance == k]
+        return direction(rows.sum(axis=0)) if len(rows) else None
+
+    looks = [look(labelling.instances, k) for k in range(len(labelling.instances))]
+
+    def alike(a, b):
+        return a == b or looks[a] @ looks[b] > SAME_LOOK
+
+    def nearest(feature):
+        return int(np.argmax([feature @ other for other in looks]))
+
+    shares = np.zeros((2, len(looks)))
+    for number in (0, 1):
+        kept = sorted(order[number::2])
+        masks = [m for m in range(len(table.mask_view)) if table.mask_view[m] in kept]
+        half = MaskTable(
+            table.weights[masks],
+            table.outside[kept],
+            table.exposure[kept],
+            np.array([kept.index(view) for view in table.mask_view[masks]], np.int32),
+            table.mask_pixels[masks],
+            table.mask_features[masks],
+        )
+        found = grouping(half, surface, SETTINGS, Journal(progress=False))
+        for k in range(len(looks)):
+            own = np.flatnonzero(labelling.instance_ids == k)
+            same = 0
+            for point in own:
+                other = found.instance_ids[point]
+                same += other >= 0 and alike(k, nearest(look(found.instances, other)))
+            shares[number, k] = same / len(own)
+    named = [
+        np.mean([alike(k, nearest(direction(features[m]))) for m in np.flatnonzero(labelling.mask_instance == k)])
+        for k in range(len(looks))
+    ]
+    return shares.mean(axis=0), np.array(named)
+
+
+def noisy_features(scene: Scene, seed: int = 0) -> Scene:
+    """A third of the masks has the feature of the other ball, so that shares lie between 0 and 1."""
+    random = np.random.default_rng(seed)
+    swap = [random.random(view.mask_count) < 0.35 for view in scene.views]
+    rows = [np.where(swapped[:, None], view.mask_features[::-1], view.mask_features) for swapped, view in
+            zip(swap, scene.views, strict=True)]  # fmt: skip
+    return with_views(scene, lambda index, view: replace(view, mask_features=rows[index]))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_it_is_what_loops_say(scene: Scene, seed: int) -> None:
+    noisy = noisy_features(scene, seed)
+    found, _ = judged(noisy)
+    again, named = literally(noisy)
+    np.testing.assert_allclose(found.again, again, atol=1e-12)
+    np.testing.assert_allclose(found.named, named, atol=1e-12)
+    assert found.named.min() < 1
+
+
+def test_an_honest_capture_is_reliable_and_without_warning(scene: Scene) -> None:
+    cloud = og.fit(scene, SETTINGS, progress=False)
+    assert cloud.reliability is not None
+    assert 0.85 < cloud.reliability <= 1
+    assert cloud.provenance["notes"]["reliability"] == pytest.approx(cloud.reliability, abs=1e-4)
+    assert not any("reliability" in warning for warning in cloud.provenance["warnings"])
+
+
+def test_the_order_of_views_and_points_does_not_matter(scene: Scene) -> None:
+    order = np.random.default_rng(0).permutation(len(scene.points))
+    shuffled = replace(scene, points=scene.points.take(order), views=scene.views[::-1])
+    first, second = og.fit(scene, SETTINGS, progress=False), og.fit(shuffled, SETTINGS, progress=False)
+    assert first.reliability == pytest.approx(second.reliability, abs=5e-3)
+
+
+def test_features_that_err_lower_it_and_are_named(scene: Scene) -> None:
+    honest, _ = judged(scene)
+    found, cause = judged(noisy_features(scene))
+    assert np.nanmean(found.of_instance) < np.nanmean(honest.of_instance) - 0.1
+    assert "named differently" in cause
+
+
+def test_poses_of_other_views_are_named(scene: Scene) -> None:
+    cameras = [view.camera for view in scene.views]
+    wrong = with_views(scene, lambda index, view: replace(view, camera=cameras[(index + 2) % len(cameras)]))
+    found, cause = judged(wrong)
+    assert np.nanmean(found.of_instance) < 0.6
+    assert cause.startswith("poses and cloud lie apart")
+
+
+def test_images_that_lie_beside_their_poses_are_named_with_how_far(scene: Scene) -> None:
+    """Each view's masks moved by 5 of 120 pixels, to one side or the other."""
+    moved = [np.roll(view.mask_map(), 5 if index % 2 else -5, axis=1) for index, view in enumerate(scene.views)]
+    found, cause = judged(with_views(scene, lambda index, view: replace(view, masks=moved[index])))
+    honest, _ = judged(scene)
+    assert np.nanmean(found.again) < np.nanmean(honest.again)
+    assert cause.startswith("poses and cloud lie apart: masks fit best when moved by about ")
+
+
+def test_honest_poses_are_not_blamed(scene: Scene) -> None:
+    assert not judged(scene)[1].startswith("poses")
+    assert not judged(noisy_features(scene))[1].startswith("poses")
+
+
+def test_a_low_one_is_said_with_its_cause(scene: Scene) -> None:
+    cameras = [view.camera for view in scene.views]
+    wrong = with_views(scene, lambda index, view: replace(view, camera=cameras[(index + 2) % len(cameras)]))
+    settings = replace(SETTINGS, reliable=0.95)
+    (warning,) = [text for text in og.fit(wrong, settings, progress=False).provenance["warnings"] if "reliab" in text]
+    assert ", below 0.95: poses and cloud lie apart" in warning
+
+
+def test_three_views_judge_nothing(scene: Scene) -> None:
+    cloud = og.fit(replace(scene, views=scene.views[:3]), SETTINGS, progress=False)
+    assert cloud.reliability is None
+    assert np.isnan(cloud.instances.reliability).all()
+
+
+def test_masks_without_features_leave_it_unknown(scene: Scene) -> None:
+    blank = with_views(scene, lambda _, view: replace(view, mask_features=np.zeros_like(view.mask_features)))
+    assert og.fit(blank, SETTINGS, progress=False).reliability is None
+
+
+def test_it_is_not_judged_twice_for_points_at_one_place(scene: Scene) -> None:
+    twice = replace(scene, points=scene.points.take(np.repeat(np.arange(len(scene.points)), 2)))
+    prepared = prepare(twice, SETTINGS)
+    cloud = fit_prepared(prepared, SETTINGS)
+    assert len(cloud) == 2 * len(scene.points)
+    single = og.fit(scene, SETTINGS, progress=False)
+    assert cloud.reliability == pytest.approx(single.reliability, abs=1e-6)
+
+
+def test_the_scene_s_is_the_mean_by_the_root_of_points() -> None:
+    cloud = make_cloud(np.random.default_rng(0).normal(size=(13, 3)), np.array([0] * 9 + [1] * 4))
+    table = replace(cloud.instances, points=np.array([9, 4], np.int32), reliability=np.array([1, 0.5], np.float32))
+    assert table.overall_reliability == pytest.approx((3 * 1 + 2 * 0.5) / 5)
+    half = replace(table, reliability=np.array([np.nan, 0.5], np.float32))
+    assert half.overall_reliability == 0.5
+
+
+def test_it_travels_in_the_file_and_stands_in_the_table(scene: Scene, tmp_path) -> None:
+    cloud = og.fit(scene, SETTINGS, progress=False)
+    path = og.write_bundle(cloud, tmp_path / "s.ogpc")
+    opened = og.load(path)
+    np.testing.assert_array_equal(opened.cloud.instances.reliability, cloud.instances.reliability)
+    assert opened.cloud.reliability == cloud.reliability
+    row = opened.instances[0]
+    assert row.reliability == pytest.approx(float(cloud.instances.reliability[0]))
+    assert json.loads(opened.instances.to_json())[0]["reliability"] == row.reliability
+    assert "reliability" in repr(opened.instances).splitlines()[1]
+
+
+def test_a_file_of_before_opens_without_it(scene: Scene, tmp_path) -> None:
+    path = og.write_bundle(og.fit(scene, SETTINGS, progress=False), tmp_path / "s.ogpc")
+    old, member = tmp_path / "old.ogpc", "arrays/instances/reliability.npy"
+    with zipfile.ZipFile(path) as source, zipfile.ZipFile(old, "w") as target:
+        for info in source.infolist():
+            data = source.read(info)
+            if info.filename == "manifest.json":
+                manifest = json.loads(data)
+                del manifest["members"][member]
+                data = json.dumps(manifest).encode()
+            if info.filename != member:
+                target.writestr(info, data)
+    opened = og.load(old)
+    assert opened.cloud.reliability is None
+    assert opened.instances[0].reliability is None
+    assert json.loads(opened.instances.to_json())[0]["reliability"] is None
