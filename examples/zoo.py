@@ -3,6 +3,7 @@
     python examples/zoo.py -o out/zoo                                    # all made scenes
     python examples/zoo.py -o out/zoo --captures CAPTURE [CAPTURE ...]   # and captures with gt.npz, text_features.npz
     python examples/zoo.py -o out/zoo --half choose --set membership.sure_share=0.5 --quick
+    python examples/zoo.py -o out/zoo --constants docs/constants.md      # each number at half and at twice its value
 
 Scenes are made once, in OUT/scenes. Beside each fit stand the best of the baselines of
 `og_pointcloud.evaluate.baselines`, the difference with its 95 % interval over blocks of space, and how well the fit
@@ -16,12 +17,14 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from og_pointcloud_zoo.constants import constants, page, tried
 from og_pointcloud_zoo.draws import draw, half_of, scene_names
 from og_pointcloud_zoo.make import made_scene
 from og_pointcloud_zoo.measure import Row, measure, parsed_settings, warm_up
 from og_pointcloud_zoo.report import HALVES, HEADER, line, summary, write_csv, write_picture
 
 from og_pointcloud.errors import OgPointcloudError
+from og_pointcloud.formats.atomic import replacing
 from og_pointcloud.formats.capture import read_capture
 
 __all__ = ["main"]
@@ -36,8 +39,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--half", choices=tuple(HALVES), help="only this half")
     parser.add_argument("--set", nargs="+", default=[], metavar="PATH=VALUE", help="settings of the fit")
     parser.add_argument("--quick", action="store_true", help="without baselines")
+    parser.add_argument("--constants", type=Path, metavar="PAGE", help="write the page of constants (--only: of some)")
     parser.add_argument("--list", action="store_true", help="print the scenes as drawn, and make none")
     options = parser.parse_args(arguments)
+    if options.constants:
+        _write_constants(options)
+        return
     chosen = [*options.captures, *(Path(name) for name in scene_names())]
     chosen = [
         path
@@ -54,6 +61,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
         _report(_rows(chosen, options), options.output)
     except OgPointcloudError as error:
         sys.exit(f"zoo: {error}")
+
+
+def _write_constants(options: argparse.Namespace) -> None:
+    from tqdm import tqdm
+
+    chosen = [one for one in constants() if not options.only or one.path.startswith(tuple(options.only))]
+    results = list(tqdm(tried(chosen, options.output), "constants", len(chosen), disable=None))
+    with replacing(options.constants) as file:
+        file.write(page(results).encode())
+    print(options.constants)
 
 
 def _rows(chosen: Sequence[Path], options: argparse.Namespace) -> list[Row]:

@@ -8,6 +8,7 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 import zoo
+from og_pointcloud_zoo import constants as numbers
 from og_pointcloud_zoo import make
 from og_pointcloud_zoo.draws import ANY, KINDS, draw, half_of, scene_names
 from og_pointcloud_zoo.measure import Row, measure, parsed_settings
@@ -16,7 +17,9 @@ from og_pointcloud_zoo.report import rank_correlation, summary
 import og_pointcloud as og
 from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.evaluate.truth import read_truth
+from og_pointcloud.fitting import view_votes
 from og_pointcloud.formats.capture import read_capture
+from og_pointcloud.rendering import sightings
 
 TINY = replace(draw("boxes-0"), points=1500, views=6, width=96, height=72, outliers=0.01, floaters=0.01, hidden=0.2,
                all_masked=False)  # fmt: skip
@@ -154,3 +157,73 @@ def test_measuring_without_baselines_leaves_them_out(scenes):
     row = measure(scenes[0], og.FitSettings(mode="grouping"), baselines=False)
     assert row.baseline is None
     assert 0 < row.miou <= 1
+
+
+# The page of constants ------------------------------------------------------------------------------------------
+
+
+def test_every_number_of_the_default_way_has_a_source_and_no_source_is_of_none():
+    known = {one.path for one in numbers.constants()}
+    said = [path for paths in numbers.SOURCES.values() for path in paths]
+    assert {one.path for one in numbers.constants() if one.source == "not said"} == set()
+    assert sorted(said) == sorted(known)
+    assert all(one.meaning for one in numbers.constants())
+    assert {half_of(name) for name in numbers.SCENES} == {"choose"}
+
+
+def test_half_and_twice_stay_possible_values():
+    values = {one.path: one.values for one in numbers.constants()}
+    assert values["membership.sure_share"] == (0.3, 0.8)  # 0.6: half of the way from there to 1
+    assert values["membership.border_rounds"] == (1, 4)
+    assert values["geometry.reach"] == (1.5, 6.0)
+    assert values["membership.border_shares"] == ((0.1, 0.45), (0.4, 0.95))
+
+
+def test_a_number_of_a_module_is_changed_for_a_while_in_compiled_code_too():
+    exposure, index = np.array([1.0, 0.5], np.float32), np.zeros(2, np.int32)
+
+    def votes():
+        found = np.zeros(2, np.float32)
+        view_votes._relative_exposure(index, exposure, 1, found)
+        return found.tolist()
+
+    assert votes() == [1, 0.25]
+    with numbers._in_module("fitting.view_votes.OPENNESS_POWER", 1):
+        assert votes() == [1, 0.5]
+    assert votes() == [1, 0.25]
+
+
+def test_the_ring_of_votes_follows_its_numbers():
+    before = sightings.SAMPLES.copy()
+    with numbers._in_module("rendering.sightings.RING_SHARE", 0.25):
+        assert sightings.SAMPLES[:, 2].sum() == pytest.approx(1)
+        assert sightings.SAMPLES[0, 2] == 0.75
+    np.testing.assert_array_equal(sightings.SAMPLES, before)
+    with numbers._in_module("rendering.sightings.EDGE_PX", sightings.EDGE_PX):  # as it stands: the same ring
+        np.testing.assert_allclose(sightings.SAMPLES, before)
+
+
+def test_verdicts_of_numbers(tmp_path):
+    one = numbers.Constant("membership.sure_share", 0.6, "what it is", "guessed")
+    sharp = numbers.Tried(one, (0.1, 0.3), (0.2, 0.3), (0.09, 0.29))
+    assert sharp.verdict == "sharp, better at twice"
+    flat = numbers.Tried(one, (0.1, 0.3), (0.1, 0.3), (0.101, 0.299))
+    assert flat.verdict == "does not matter here"
+    text = numbers.page([sharp, flat])
+    assert (
+        "| `membership.sure_share` | 0.6 | guessed | +0.0500 | -0.0100 | sharp, better at twice | what it is |" in text
+    )
+
+
+def test_results_of_constants_are_kept(scenes, tmp_path, monkeypatch):
+    monkeypatch.setattr(numbers, "SCENES", ("tiny-0",))
+    monkeypatch.setattr(numbers, "made_scene", lambda drawn, cache: scenes[0])
+    monkeypatch.setattr(numbers, "draw", lambda name: name)
+    zoo.main(["-o", str(tmp_path), "--constants", str(tmp_path / "page.md"), "--only", "membership.sure_share"])
+    first = (tmp_path / "page.md").read_text()
+    assert "1 numbers steer labels" in first
+    monkeypatch.setattr(numbers, "fit_prepared", None)  # nothing is measured a second time
+    zoo.main(["-o", str(tmp_path), "--constants", str(tmp_path / "again.md"), "--only", "membership.sure_share"])
+    assert (tmp_path / "again.md").read_text() == first
+    error = 1 - measure(scenes[0], og.FitSettings(mode="grouping"), baselines=False).miou
+    assert f"is {error:.4f} as they stand" in first

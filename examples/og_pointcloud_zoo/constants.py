@@ -1,0 +1,304 @@
+"""Every number of the default way on one page: where it is from, and what the zoo says of half and of twice its value.
+
+A number between 0 and 1 is not doubled beyond 1 but moved half of the way there. Each value is tried on a few scenes
+of the half for choosing, in mode grouping but for the numbers of mode auto; the mask table is made anew only where the
+number changes it. Results are kept beside the scenes by a checksum of the code, so that an interrupted run goes on.
+"""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import inspect
+import json
+import zlib
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import og_pointcloud
+from og_pointcloud import settings as records
+from og_pointcloud.evaluate.knobs import changed
+from og_pointcloud.evaluate.truth import read_truth
+from og_pointcloud.fitting.fit import fit_prepared, prepare
+from og_pointcloud.formats.atomic import replacing
+from og_pointcloud.formats.capture import read_capture
+from og_pointcloud.settings import FitSettings
+from og_pointcloud_zoo.draws import draw
+from og_pointcloud_zoo.make import made_scene
+from og_pointcloud_zoo.measure import answered
+
+__all__ = ["SCENES", "SOURCES", "Constant", "Tried", "constants", "page", "tried"]
+
+SCENES = (
+    "room-0", "room-noisy-0", "room-sparse-0", "detector-0", "shelf-0", "bin-0", "board-0", "plants-0", "glass-0",
+)  # fmt: skip
+"""Of the half for choosing: clean and noisy, dense and sparse, all masked and things only, few views and many."""
+SWEPT = ("geometry", "grouping", "membership", "association")
+"""Records of settings whose numbers all steer labels."""
+SINGLE = ("agreement_enough", "agreement_lead", "visibility.alpha_min", "visibility.transmittance_min")
+MODULES: dict[str, tuple[str, tuple[str, ...]]] = {
+    "fitting.view_votes.OPENNESS_POWER": ("", ("_relative_exposure",)),
+    "fitting.looks.QUANTILE": ("", ()),
+    "fitting.looks.ROUNDS": ("", ()),
+    "rendering.sightings.LEAST_OPEN": ("table", ("_see",)),
+    "rendering.sightings.EDGE_PX": ("table", ()),
+    "rendering.sightings.RING_SHARE": ("table", ()),
+}
+"""Numbers that stand in modules: whether they change the mask table, and the compiled functions that know them."""
+TABLE = ("geometry", "visibility", "membership.few_views", "membership.gap_sizes", "membership.front_share")
+"""What the mask table depends on."""
+SOURCES: dict[str, tuple[str, ...]] = {
+    "the scene chooses": ("geometry.scales",),
+    "derived": (
+        "grouping.container_share", "grouping.join_majority", "geometry.start_scale", "membership.few_views",
+        "fitting.looks.ROUNDS",
+    ),
+    "published": ("visibility.alpha_min", "visibility.transmittance_min", "association.outlier_deviations"),
+    "enough": (
+        "geometry.held_out_views", "geometry.held_out_points", "grouping.graph_points", "geometry.max_stride",
+        "geometry.pixels_per_spacing",
+    ),
+    "guessed": (
+        "geometry.opacity", "geometry.sight_thickness", "geometry.neighbours", "geometry.thickness", "geometry.reach",
+        "grouping.witness_share", "grouping.part_share", "membership.sure_share", "membership.possible_share",
+        "membership.covered_share", "membership.growth_votes", "membership.rate_share", "membership.island_share",
+        "membership.border_shares", "membership.border_rounds", "membership.own_vote", "membership.gap_sizes",
+        "membership.front_share", "association.look_masks", "association.look_share", "agreement_enough",
+        "agreement_lead", "fitting.view_votes.OPENNESS_POWER", "fitting.looks.QUANTILE",
+        "rendering.sightings.LEAST_OPEN", "rendering.sightings.EDGE_PX", "rendering.sightings.RING_SHARE",
+    ),
+}  # fmt: skip
+"""Where numbers are from. Enough: more gives the same and takes longer. Guessed: found by trying a few captures."""
+SHARP, FLAT = 0.02, 0.002
+"""Of the mean error: a number that moves it by the first is sharp; one that moves it by less than the second does not
+matter to these scenes."""
+
+
+@dataclass(frozen=True)
+class Constant:
+    """path: of the setting, or of the module's name within og_pointcloud. value: as it stands. meaning: what its
+    documentation says. source: of SOURCES."""
+
+    path: str
+    value: Any
+    meaning: str
+    source: str
+
+    @property
+    def of_module(self) -> bool:
+        """Whether it stands in a module rather than in the settings."""
+        return self.path.split(".")[-1].isupper()
+
+    @property
+    def in_table(self) -> bool:
+        """Whether the mask table depends on it."""
+        return bool(MODULES[self.path][0]) if self.of_module else self.path.startswith(TABLE)
+
+    @property
+    def values(self) -> tuple[Any, Any]:
+        """Half of it and twice it."""
+        return _half(self.value), _twice(self.value)
+
+
+@dataclass(frozen=True)
+class Tried:
+    """Error, 1 - mIoU, of each of SCENES: as it stands, at half and at twice the value."""
+
+    constant: Constant
+    default: tuple[float, ...]
+    half: tuple[float, ...]
+    twice: tuple[float, ...]
+
+    def change(self, errors: tuple[float, ...]) -> float:
+        """Of the mean error."""
+        return float(np.mean(errors) - np.mean(self.default))
+
+    @property
+    def verdict(self) -> str:
+        """Whether it is sharp, does not matter, or would be better otherwise."""
+        changes = self.change(self.half), self.change(self.twice)
+        if max(map(abs, changes)) < FLAT:
+            return "does not matter here"
+        better = [name for name, change in zip(("half", "twice"), changes, strict=True) if change < -FLAT]
+        parts = ["sharp"] * (max(changes) >= SHARP) + [f"better at {name}" for name in better]
+        return ", ".join(parts)
+
+
+def constants() -> list[Constant]:
+    """All of the default way, with what the code says of them; a source of "not said" where SOURCES lacks one."""
+    default, meanings = FitSettings(), _meanings(inspect.getsource(records))
+    paths = [f"{record}.{field.name}" for record in SWEPT for field in fields(getattr(default, record))]
+    found = []
+    for path in [*paths, *SINGLE]:
+        owner, _, name = path.rpartition(".")
+        record = getattr(default, owner) if owner else default
+        found.append(_constant(path, getattr(record, name), meanings[type(record).__name__, name]))
+    for path in MODULES:
+        module, name = _module(path)
+        found.append(_constant(path, getattr(module, name), _meanings(inspect.getsource(module))["", name]))
+    return found
+
+
+def _constant(path: str, value: Any, meaning: str) -> Constant:
+    source = next((source for source, paths in SOURCES.items() if path in paths), "not said")
+    return Constant(path, value, " ".join(meaning.split()), source)
+
+
+def _meanings(source: str) -> dict[tuple[str, str], str]:
+    """(class or "", name) -> the string below it; of a name without one, a string that speaks of it."""
+    found: dict[tuple[str, str], str] = {}
+    tree = ast.parse(source)
+    classes = [(node.name, node.body) for node in tree.body if isinstance(node, ast.ClassDef)]
+    for owner, body in [("", tree.body), *classes]:
+        texts = [_text(node) for node in body]
+        for node, below in zip(body, [*texts[1:], None], strict=True):
+            targets = [node.target] if isinstance(node, ast.AnnAssign) else getattr(node, "targets", [])
+            for name in (target.id for target in targets if isinstance(target, ast.Name)):
+                found[owner, name] = below or next((text for text in texts if text and name in text), "")
+    return found
+
+
+def _text(node: ast.stmt) -> str | None:
+    """The string that a statement is; None where it is another."""
+    value = node.value if isinstance(node, ast.Expr) else None
+    return str(value.value) if isinstance(value, ast.Constant) else None
+
+
+def _half(value: Any) -> Any:
+    if isinstance(value, tuple):
+        return tuple(_half(part) for part in value)
+    return max(1, value // 2) if isinstance(value, int) else value / 2
+
+
+def _twice(value: Any) -> Any:
+    if isinstance(value, tuple):
+        return tuple(_twice(part) for part in value)
+    return (1 + value) / 2 if isinstance(value, float) and 0.5 <= value < 1 else 2 * value
+
+
+def tried(chosen: Sequence[Constant], output: Path) -> Iterator[Tried]:
+    """The errors of each constant, scenes and results under ``output``; what is known is not measured again."""
+    folders = [made_scene(draw(name), output / "scenes") for name in SCENES]
+    kept = output / f"constants-{_checksum():08x}"
+    bench = _Bench(folders)
+    for constant in chosen:
+        errors = {}
+        for name, value in (("default", constant.value), *zip(("half", "twice"), constant.values, strict=True)):
+            auto = "auto" if constant.path.startswith("agreement") else "grouping"
+            key = f"{auto}.json" if name == "default" else f"{constant.path}-{name}.json"
+            file = kept / key
+            if not file.is_file():
+                file.parent.mkdir(parents=True, exist_ok=True)
+                measured = bench.errors(constant, value, auto)
+                with replacing(file) as target:
+                    target.write(json.dumps(measured).encode())
+            errors[name] = tuple(json.loads(file.read_text()))
+        yield Tried(constant, **errors)
+
+
+def _checksum() -> int:
+    """Of all code that labels."""
+    root, total = Path(og_pointcloud.__file__).parent, 0
+    for path in sorted(path for folder in ("fitting", "rendering", "ask") for path in (root / folder).glob("*.py")):
+        total = zlib.crc32(path.read_bytes(), total)
+    return zlib.crc32((root / "settings.py").read_bytes(), total)
+
+
+class _Bench:
+    """Scenes with their mask tables as they stand."""
+
+    def __init__(self, folders: Sequence[Path]) -> None:
+        self.folders, self._prepared = folders, {}
+
+    def errors(self, constant: Constant, value: Any, mode: str) -> list[float]:
+        """1 - mIoU of each scene with one number changed."""
+        settings = changed(FitSettings(), "mode", mode)
+        if not constant.of_module:
+            settings = changed(settings, constant.path, value)
+        anew = constant.in_table and value != constant.value
+        with _in_module(constant.path, value) if constant.of_module else nullcontext():
+            return [self._error(folder, settings, anew) for folder in self.folders]
+
+    def _error(self, folder: Path, settings: FitSettings, anew: bool) -> float:
+        if folder not in self._prepared:
+            self._prepared[folder] = prepare(read_capture(folder))
+        prepared = prepare(self._prepared[folder].scene, settings) if anew else self._prepared[folder]
+        truth = read_truth(folder)
+        answer = answered(folder, fit_prepared(prepared, settings), truth)
+        return 1 - truth.score(answer.called, [*truth.names, "a word that the truth lacks"]).miou
+
+
+def _module(path: str) -> tuple[Any, str]:
+    module, _, name = path.rpartition(".")
+    return importlib.import_module(f"og_pointcloud.{module}"), name
+
+
+@contextmanager
+def _in_module(path: str, value: Any) -> Iterator[None]:
+    """A module's number changed for a while; compiled functions that know it are compiled anew, on no disk."""
+    module, name = _module(path)
+    before, samples = getattr(module, name), getattr(module, "SAMPLES", None)
+    try:
+        _put(module, name, value, path)
+        yield
+    finally:
+        _put(module, name, before, path)
+        if samples is not None:
+            module.SAMPLES = samples
+
+
+def _put(module: Any, name: str, value: Any, path: str) -> None:
+    from numba.core.caching import NullCache
+
+    changes = getattr(module, name) != value
+    setattr(module, name, value)
+    if path.startswith("rendering.sightings."):  # where votes are taken follows from two of its numbers
+        share, edge = module.RING_SHARE, module.EDGE_PX
+        ring = [(edge * np.cos(angle), edge * np.sin(angle)) for angle in np.arange(8) * np.pi / 4]
+        module.SAMPLES = np.array([(0.0, 0.0, 1 - share), *((x, y, share / len(ring)) for x, y in ring)])
+    for function in MODULES[path][1] if changes else ():
+        compiled = getattr(module, function)
+        compiled._cache = NullCache()
+        compiled.recompile()
+
+
+def page(results: Sequence[Tried]) -> str:
+    """Markdown: the table, and what it says."""
+    default = np.mean(results[0].default) if results else float("nan")
+    sharp = [result.constant.path for result in results if result.verdict.startswith("sharp")]
+    flat = [result.constant.path for result in results if result.verdict == "does not matter here"]
+    lines = [
+        "# Numbers of the default way",
+        "",
+        f"Printed by `python examples/zoo.py --constants docs/constants.md`: {len(results)} numbers steer labels. Each "
+        f"was halved and doubled (shares above a half: moved half of the way to 1) on {len(SCENES)} scenes of the "
+        f"zoo's half for choosing, {', '.join(SCENES)}, whose mean error, 1 - mIoU, is {default:.4f} as they stand. The "
+        "columns give what is added to it.",
+        "",
+        f"Sharp (a change costs {SHARP:g} or more): {_listed(sharp)}.",
+        "",
+        f"Of no matter to these scenes (less than {FLAT:g} either way): {_listed(flat)}.",
+        "",
+        "| number | value | from | half | twice | | what it is |",
+        "| --- | ---: | --- | ---: | ---: | --- | --- |",
+    ]
+    for result in results:
+        one = result.constant
+        half, twice = (f"{result.change(errors):+.4f}" for errors in (result.half, result.twice))
+        cells = (f"`{one.path}`", _short(one.value), one.source, half, twice, result.verdict, one.meaning)
+        lines.append(f"| {' | '.join(cell.replace('|', '/') for cell in cells)} |")
+    return "\n".join(lines) + "\n"
+
+
+def _listed(paths: Sequence[str]) -> str:
+    return ", ".join(f"`{path}`" for path in paths) or "none"
+
+
+def _short(value: Any) -> str:
+    parts = value if isinstance(value, tuple) else (value,)
+    return ", ".join(f"{part:,}" if isinstance(part, int) else f"{part:.3g}" for part in parts)
