@@ -277,8 +277,8 @@ def page(results: Sequence[Tried]) -> str:
         "",
         f"Printed by `python examples/zoo.py --constants docs/constants.md`: {len(results)} numbers steer labels. Each "
         f"was halved and doubled (shares above a half: moved half of the way to 1) on {len(SCENES)} scenes of the "
-        f"zoo's half for choosing, {', '.join(SCENES)}, whose mean error, 1 - mIoU, is {default:.4f} as they stand. The "
-        "columns give what is added to it.",
+        f"zoo's half for choosing, {', '.join(SCENES)}, whose mean error, 1 - mIoU, is {default:.4f} as they stand. "
+        "The columns give what is added to it.",
         "",
         f"Sharp (a change costs {SHARP:g} or more): {_listed(sharp)}.",
         "",
