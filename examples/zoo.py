@@ -82,6 +82,7 @@ def _rows(chosen: Sequence[Path], options: argparse.Namespace) -> list[Row]:
             warm_up(read_capture(folder))
         rows.append(measure(folder, settings, baselines=not options.quick))
         print(line(rows[-1]), flush=True)
+        write_csv(rows, options.output / "zoo.csv")  # what is measured stays, should it be interrupted
     return rows
 
 
