@@ -58,7 +58,7 @@ def test_the_page_holds_what_segment_answers(bundle, tmp_path, capsys):
     result = og.segment(scene, ["plum", "apple"])
     assert data["names"] == ["plum", "apple"]
     assert dict(zip(data["names"], data["counts"], strict=True)) == result.counts()
-    assert (data["boxes"], data["cut"], data["mode"], data["calibrated"]) == (True, 0.25, "labels", False)
+    assert (data["boxes"], data["cut"], data["mode"], data["meaning"][:6]) == (True, 0.25, "labels", "cosine")
     place = data["place"].reshape(-1, 3) / 65535 * data["size"] + data["low"]
     middle = (scene.xyz.min(axis=0) + scene.xyz.max(axis=0)) / 2
     assert np.abs(place + middle - scene.xyz).max() <= np.ptp(scene.xyz, axis=0).max() / 131000

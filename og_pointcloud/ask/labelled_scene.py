@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from og_pointcloud.ask.choosing import Chooser, Reason
-from og_pointcloud.ask.hosts import carried_scene, world_points
+from og_pointcloud.ask.hosts import carried_scene, import_plugin, world_points
 from og_pointcloud.ask.instances import WORDS, Instances, list_instances
 from og_pointcloud.ask.query_graph import QueryGraph
 from og_pointcloud.ask.segmentation import Segmentation
@@ -107,6 +107,14 @@ class LabelledScene:
     def feature_space(self) -> str:
         """Name of the encoder that label vectors must come from."""
         return self.cloud.feature_space
+
+    def show(self, labels: Labels = None, *, text_features: TextFeatures = None) -> Any:
+        """A live page of the scene, which a notebook shows in its cell; `og-pointcloud serve` for the command line.
+
+        labels, text_features: as for ``segment``. Returns at once: the page, which has a ``url``, ``wait`` and
+        ``stop``. Served to this machine alone. Needs the extra 'serve'.
+        """
+        return import_plugin("og_pointcloud.show.serve", "serve").show(self, labels, text_features=text_features)
 
     @cached_property
     def chooser(self) -> Chooser:

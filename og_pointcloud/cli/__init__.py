@@ -22,7 +22,7 @@ __all__ = ["main"]
 
 COMMANDS = (
     "masks", "models", "fit", "update", "compare", "fuse", "import", "segment", "select", "pick", "instances", "index",
-    "find", "edit", "view", "ros-bag", "info", "vocabulary", "export", "eval", "report", "demo",
+    "find", "edit", "view", "serve", "ros-bag", "info", "vocabulary", "export", "eval", "report", "demo",
 )  # fmt: skip
 MODULES = {"import": "import_", "eval": "evaluate", "ros-bag": "ros_bag"}
 """Command -> its module, where they are not called the same."""

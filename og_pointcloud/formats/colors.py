@@ -7,12 +7,19 @@ from numpy.typing import NDArray
 
 from og_pointcloud.cloud import UNKNOWN
 
-__all__ = ["LUMINANCE", "UNKNOWN_COLOR", "label_colors"]
+__all__ = ["LUMINANCE", "NO_LABEL", "UNKNOWN_COLOR", "certainty_colors", "label_colors"]
 
 UNKNOWN_COLOR = (128, 128, 128)
+NO_LABEL = (222, 224, 228)
+"""Of points without a label on pages: lighter than in files, as most of a scene may have none."""
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 """Weights of red, green and blue in how light a colour is, ITU-R BT.709."""
 GOLDEN_RATIO = 0.618033988749895
+VIRIDIS = np.array([
+    (68, 1, 84), (71, 44, 122), (59, 82, 139), (44, 113, 142), (33, 145, 140), (39, 173, 129), (94, 201, 98),
+    (170, 220, 50), (253, 231, 37),
+])  # fmt: skip
+"""Evenly spaced colours of the map of that name (Smith and van der Walt, 2015, CC0), from dark to bright."""
 
 
 def label_colors(labels: NDArray[np.integer]) -> NDArray[np.uint8]:
@@ -20,6 +27,13 @@ def label_colors(labels: NDArray[np.integer]) -> NDArray[np.uint8]:
     count = int(labels.max(initial=UNKNOWN)) + 1
     palette = np.array([UNKNOWN_COLOR, *(_color(label) for label in range(count))], np.uint8)
     return palette[np.maximum(labels, UNKNOWN) + 1]
+
+
+def certainty_colors(certainty: NDArray[np.floating]) -> NDArray[np.uint8]:
+    """(N, 3) uint8 RGB of certainties (N,) in [0, 1]: dark where nothing is sure, bright where all is."""
+    stops = np.linspace(0, 1, len(VIRIDIS))
+    channels = [np.interp(certainty, stops, channel) for channel in VIRIDIS.T]
+    return np.rint(np.stack(channels, axis=1)).astype(np.uint8)
 
 
 def _color(label: int) -> tuple[int, int, int]:

@@ -22,7 +22,8 @@ from og_pointcloud.ask.labelled_scene import LabelledScene, instance_table
 from og_pointcloud.ask.segmentation import Segmentation
 from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.formats.atomic import replacing
-from og_pointcloud.formats.colors import label_colors
+from og_pointcloud.formats.colors import NO_LABEL, label_colors
+from og_pointcloud.show.live import WORDS, meaning
 from og_pointcloud.show.viewpoint import Viewpoint
 
 __all__ = ["MOST_POINTS", "Look", "write_page"]
@@ -32,8 +33,6 @@ MOST_POINTS = 2_000_000
 """Points that a page holds; of larger clouds an even choice, about 16 MB."""
 MOST_SCORES = 4_000_000
 """Scores of words on instances that a page holds; beyond, it has no words to search for."""
-WORDS = 6
-"""Words that a click shows."""
 LEVELS = 65535
 """Steps of 16-bit coordinates and scores: a place is right to 1/131,000 of the cloud's extent."""
 
@@ -79,7 +78,8 @@ def write_page(
     middle = low + (high - low) / 2
     data = {
         "subtitle": f"{len(shown):,} points · {len(scene.instances)} instances",
-        **asdict(look), "calibrated": result.calibrated,
+        **asdict(look), "meaning": meaning(result.calibrated),
+        "grey": NO_LABEL, "hues": label_colors(np.arange(len(scene.instances))).tolist(),
         "spacing": scene.cloud.spacing * (len(finite) / len(shown)) ** 0.5,
         "low": (low - middle).tolist(), "size": (high - low).tolist(),
         "corners": axis_aligned_box([low - middle, high - middle]).corners.tolist(),

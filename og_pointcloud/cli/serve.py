@@ -1,0 +1,58 @@
+"""Serve a live page of scenes: type any word, click for what a thing is. On this machine alone unless --host says more.
+
+og-pointcloud serve kitchen.ogpc office.ogpc
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from og_pointcloud.cli.common import Parser, add_shared, names_in
+from og_pointcloud.cli.view import AXES
+from og_pointcloud.errors import OgPointcloudError
+
+
+def add(parser: Parser) -> None:
+    parser.add_argument("bundles", type=Path, nargs="+", metavar="S.ogpc", help="what `fit` wrote; several to choose")
+    add_shared(parser, "--labels", "--text-features")
+    parser.add_argument(
+        "--cloud", type=Path, metavar="CLOUD", help="points or splats to show of one scene (default: those fitted)"
+    )
+    parser.add_argument("--up", choices=AXES, default="z", metavar="AXIS", help="as for `view` (default: z)")
+    parser.add_argument(
+        "--host", default="127.0.0.1", help="address to listen on; 0.0.0.0 lets others in (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--port", type=int, default=8080, metavar="N", help="or the next one that is free (default: %(default)s)"
+    )
+
+
+def run(arguments: argparse.Namespace) -> None:
+    if arguments.cloud and len(arguments.bundles) > 1:
+        raise OgPointcloudError(f"--cloud is for one scene, but {len(arguments.bundles)} are given; serve it alone")
+    from og_pointcloud.ask.hosts import import_plugin
+    from og_pointcloud.ask.labelled_scene import load
+    from og_pointcloud.formats.points import read_points
+    from og_pointcloud.show.live import LiveScene
+
+    served = import_plugin("og_pointcloud.show.serve", "serve")
+    shown = read_points(arguments.cloud) if arguments.cloud else None
+    labels = names_in(arguments.labels)
+    scenes = {
+        title: LiveScene(load(path), shown, labels, arguments.text_features)
+        for title, path in titles(arguments.bundles).items()
+    }
+    page = served.serve(scenes, served.ServeSettings(arguments.host, arguments.port, AXES[arguments.up]))
+    print(f"{page.url}  (Ctrl-C ends it)", flush=True)
+    if page.is_open:
+        print(f"anyone who reaches {arguments.host} can see and ask these scenes: there is no password", flush=True)
+    else:
+        print("for this machine alone; --host 0.0.0.0 lets others in, without a password", flush=True)
+    page.wait()
+
+
+def titles(paths: list[Path]) -> dict[str, Path]:
+    """The paths by their names, or whole where two have the same name."""
+    stems = [path.stem for path in paths]
+    return {path.stem if stems.count(path.stem) == 1 else str(path): path for path in paths}

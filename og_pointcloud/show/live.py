@@ -1,0 +1,218 @@
+"""What a live page shows of a scene and what it answers, without the page: colors of points, words, clicks, instances.
+
+``serve`` puts this into a browser. State is small: how points are colored, and which instances are lit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from og_pointcloud.ask.instances import NO_FEATURE, Instances
+from og_pointcloud.ask.labelled_scene import LabelledScene, instance_table
+from og_pointcloud.ask.picking import pick
+from og_pointcloud.ask.selecting import Match, select
+from og_pointcloud.errors import OgPointcloudError
+from og_pointcloud.formats.colors import LUMINANCE, NO_LABEL, certainty_colors, label_colors
+from og_pointcloud.scene import Camera, Points
+from og_pointcloud.text.words import Labels, TextFeatures
+
+__all__ = ["FADED", "MODES", "WORDS", "Answer", "LiveScene", "look_along", "meaning"]
+
+MODES = ("labels", "instances", "certainty", "photo")
+WORDS = 6
+"""Words that are shown of an instance."""
+MATCHES = 12
+"""Instances that are listed for a word."""
+HINTED = 8
+"""Stored words that are named as examples."""
+DARKEST, LIGHTEST = 0.55, 1.10
+"""What a label's color is multiplied by where the point itself is black, and white: keeps shape and shadow."""
+FADED = (0.72, 237)
+"""What is not lit: so much of this light grey in its own grey."""
+CLICK_PX = 33
+"""Side of the square around a click in which points are looked for."""
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What is told: a title, lines of text, words or instances with their scores, and what the scores mean."""
+
+    title: str
+    lines: tuple[str, ...] = ()
+    bars: tuple[tuple[str, float], ...] = ()
+    note: str = ""
+
+
+class LiveScene:
+    """A scene on show, its points or those of another cloud of the place.
+
+    scene: what is asked. shown: the points to show, Gaussians perhaps; None for the scene's own. labels, text_features:
+    the words of mode "labels", as for ``segment``; left out, the scene's own, or none.
+
+    >>> live = LiveScene(og.LabelledScene.from_cloud(cloud))  # of `LabelledCloud`'s example
+    >>> live.ask("desk").lines, live.lit
+    (('fits 1 of 2 instances',), {1})
+    """
+
+    def __init__(
+        self,
+        scene: LabelledScene,
+        shown: Points | None = None,
+        labels: Labels = None,
+        text_features: TextFeatures = None,
+    ) -> None:
+        self.scene, self.shown, self._text_features = scene, shown, text_features
+        self.xyz = scene.xyz if shown is None else shown.xyz_world
+        self.rgb = scene.cloud.rgb if shown is None else shown.rgb
+        self.ids = scene.instance_ids if shown is None else scene.instances_at(self.xyz)
+        """(N,) instance of each point shown; ids below 0 index tables by id from their end."""
+        words = scene.words_or_none(labels, text_features)
+        self.names: tuple[str, ...] = words.names if words else ()
+        vectors = words.vectors if words else np.zeros((0, scene.cloud.space.width), np.float32)
+        self.label_of, self.score_of, self.reason_of = scene.chooser.choose(vectors).by_id
+        has = {"labels": self.names, "certainty": scene.certainty is not None, "photo": self.rgb is not None}
+        self.modes = tuple(mode for mode in MODES if has.get(mode, True))
+        self.mode = self.modes[0]
+        self.lit: set[int] | None = None
+        """Ids of the instances that stand out, None where all do."""
+
+    # What is shown --------------------------------------------------------------------------------------------------
+
+    def colors(self) -> NDArray[np.uint8]:
+        """(N, 3) uint8 RGB of the points shown: as the mode has it, in grey what is not lit."""
+        base = self._photo if self.mode == "photo" else self._sure if self.mode == "certainty" else self._painted()
+        if self.lit is None:
+            return base
+        share, grey = FADED
+        total = base[:, 0] + base[:, 1].astype(np.uint16) + base[:, 2]
+        faded = (np.float32(share * grey) + np.float32((1 - share) / 3) * total).astype(np.uint8)
+        return np.where(self._is_lit[self.ids][:, None], base, faded[:, None])
+
+    @cached_property
+    def instances(self) -> Instances:
+        """The instances as a table, each with its best words."""
+        return instance_table(self.scene, text_features=self._text_features, words=WORDS)
+
+    def legend(self) -> list[tuple[str, Sequence[int], int]]:
+        """Names with their colors and numbers of points, the most frequent first; last what has no label."""
+        counts = np.bincount(self.label_of[self.ids] + 1, minlength=len(self.names) + 1).tolist()
+        colors = label_colors(np.arange(len(self.names))).tolist()
+        rows = [row for row in zip(self.names, colors, counts[1:], strict=True) if row[2]]
+        return [*sorted(rows, key=lambda row: -row[2]), *([("unknown", NO_LABEL, counts[0])] if counts[0] else [])]
+
+    def name_of(self, instance: int) -> str:
+        """What an instance is called: its label, else its best word, else its number."""
+        if self.label_of[instance] >= 0:
+            return self.names[self.label_of[instance]]
+        words = self.instances[instance].words
+        return f"{words[0][0]}?" if words else f"instance {instance}"
+
+    def _painted(self) -> NDArray[np.uint8]:
+        """Colours of labels or instances, lighter and darker as the points' own are."""
+        count = len(self.scene.cloud.instances)
+        table = np.full((len(self.label_of), 3), NO_LABEL, np.uint8)
+        own = label_colors(np.arange(count))
+        labelled = self.label_of[:count] >= 0
+        if self.mode == "labels":
+            # What was asked for should stand out, also where none of the labels fits it.
+            show_own = ~labelled & self._is_lit[:count] if self.lit is not None else np.zeros(count, bool)
+            table[:count] = np.where(labelled[:, None], label_colors(self.label_of[:count]), table[:count])
+            table[:count][show_own] = own[show_own]
+        else:
+            table[:count] = own
+        return np.minimum(table[self.ids] * self._shade, 255).astype(np.uint8)
+
+    @property
+    def _is_lit(self) -> NDArray[np.bool_]:
+        lit = np.zeros(len(self.label_of), bool)
+        lit[sorted(self.lit or ())] = True
+        return lit
+
+    @cached_property
+    def _photo(self) -> NDArray[np.uint8]:
+        return np.full(self.xyz.shape, 200, np.uint8) if self.rgb is None else self.rgb
+
+    @cached_property
+    def _sure(self) -> NDArray[np.uint8]:
+        certainty = self.scene.certainty_at(self.xyz)
+        return certainty_colors(np.zeros(len(self.xyz)) if certainty is None else certainty)
+
+    @cached_property
+    def _shade(self) -> NDArray[np.float32]:
+        light = (self._photo / 255) @ LUMINANCE
+        return (DARKEST + (LIGHTEST - DARKEST) * light).astype(np.float32)[:, None]
+
+    # What is answered -----------------------------------------------------------------------------------------------
+
+    def ask(self, text: str) -> Answer:
+        """Light the instances that a word fits; all for none, and for a word that is not known."""
+        word, self.lit = text.strip(), None
+        if not word:
+            own = self.scene.vocabulary.names if self.scene.vocabulary else ()
+            stored = [f"stored words: {', '.join(own[:HINTED])}{', ...' if len(own) > HINTED else ''}"] if own else []
+            return Answer("", (*stored, "click a thing to learn what it is"))
+        try:
+            found = select(self.scene, word, text_features=self._text_features)
+        except OgPointcloudError as error:
+            return Answer(f"“{word}”", (str(error),))
+        self.lit = set(found.instances)
+        fits = f"fits {len(self.lit)} of {len(found)} instances" if self.lit else "fits no instance; closest:"
+        shown = found[: min(max(len(self.lit), 5), MATCHES)]
+        bars = tuple((self._beside(match), match.score) for match in shown)
+        return Answer(word, (fits,), bars, meaning(found.calibrated))
+
+    def choose(self, instance: int) -> Answer:
+        """Light one instance and tell what it is."""
+        row = self.instances[instance]
+        self.lit = {instance}
+        lines = [f"instance {instance} · {row.points:,} points · {row.views} views"]
+        if row.oriented_box is not None and row.centroid is not None:
+            size = " x ".join(f"{length:.3g}" for length in row.oriented_box.size)
+            lines.append(f"size {size} · at {', '.join(f'{value:.4g}' for value in row.centroid)}")
+        if row.state == NO_FEATURE:
+            note = "no mask gave it a feature: it answers every word with unknown"
+        else:
+            note = meaning(self.scene.chooser.bank is not None) if row.words else "the scene stores no words to name it"
+        title = self.names[self.label_of[instance]] if self.label_of[instance] >= 0 else "unknown"
+        return Answer(title, tuple(lines), row.words, note)
+
+    def click(self, eye: NDArray[np.float64], direction: NDArray[np.float64], focal_px: float) -> Answer:
+        """Light the instance that is seen from ``eye`` along a direction; tell what it is and how sure its point is.
+
+        eye, direction: (3,), world. focal_px: of the window that was clicked in.
+        """
+        hit = pick(self.scene, look_along(eye, direction, focal_px), (CLICK_PX / 2, CLICK_PX / 2))
+        if not hit.found:
+            self.lit = None
+            return Answer(str(hit), ("no instance",))
+        answer = self.choose(hit.instance)
+        sure = self.scene.certainty
+        if sure is None or hit.point is None:
+            return answer
+        line = f"that its point is part of it: {sure[hit.point]:.0%} sure"
+        return Answer(answer.title, (*answer.lines, line), answer.bars, answer.note)
+
+    def _beside(self, match: Match) -> str:
+        rather = f" (rather {match.rival})" if not match.fits and match.rival else ""
+        return f"instance {match.instance}{rather}"
+
+
+def meaning(calibrated: bool) -> str:
+    """What scores are."""
+    return "probability" if calibrated else "cosine: how similar, not how probable"
+
+
+def look_along(eye: NDArray[np.float64], direction: NDArray[np.float64], focal_px: float) -> Camera:
+    """A camera of a few pixels, whose middle one looks along the direction: all that a click needs."""
+    forward = direction / np.linalg.norm(direction)
+    right = np.cross(forward, np.eye(3)[np.abs(forward).argmin()])
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3, :3] = [right, np.cross(forward, right), forward]
+    pose[:3, 3] = -pose[:3, :3] @ eye
+    return Camera(CLICK_PX, CLICK_PX, focal_px, focal_px, CLICK_PX / 2, CLICK_PX / 2, pose)

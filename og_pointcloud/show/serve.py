@@ -1,0 +1,267 @@
+"""A live page of scenes: type any word, click for what a thing is, choose the colors. Needs the extra 'serve'.
+
+viser shows the points and carries the words; what they mean is in ``live``. Everybody who opens the page sees the same.
+It is served on this machine alone unless told otherwise: there is no password.
+"""
+
+from __future__ import annotations
+
+import html
+import socket
+import threading
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import viser
+from numpy.typing import ArrayLike, NDArray
+from viser.transforms import SO3
+
+from og_pointcloud.errors import OgPointcloudError
+from og_pointcloud.show.live import Answer, LiveScene
+from og_pointcloud.show.viewpoint import FOCAL, choose_viewpoint
+
+__all__ = ["LOOPBACK", "PORT", "LivePage", "ServeSettings", "serve", "show"]
+
+LOOPBACK, PORT, PORTS = "127.0.0.1", 8080, 1 << 16
+POINT_SIZE = 0.95
+"""Radius of a point in spacings: surfaces close."""
+HEIGHT_PX = 640
+"""Of the page in a notebook."""
+LISTED = 300
+"""Instances in the list, the largest ones."""
+EVERYTHING = "all"
+TITLE = "og_pointcloud"
+ROW = '<div style="display:flex;gap:8px;align-items:center;padding:1px 0">{}</div>'
+SWATCH = '<i style="flex:none;width:12px;height:12px;border-radius:50%;background:rgb{}"></i>'
+SIDE = '<span style="margin-left:auto;opacity:.6">{}</span>'
+BAR = (
+    ROW.format("<span>{}</span>" + SIDE.format("{:.2f}"))
+    + '<progress style="width:100%;height:5px" value="{}"></progress>'
+)
+GREY = '<div style="opacity:.6">{}</div>'
+CARD = '<div style="padding:0 12px 8px;font-size:13px;overflow-wrap:anywhere">{}</div>'
+
+
+@dataclass(frozen=True)
+class ServeSettings:
+    """host: the address to listen on; "0.0.0.0" lets others in. port: the first to try. up: (3,) which way is up."""
+
+    host: str = LOOPBACK
+    port: int = PORT
+    up: tuple[float, float, float] = (0.0, 0.0, 1.0)
+
+
+def serve(scenes: Mapping[str, LiveScene], settings: ServeSettings | None = None) -> LivePage:
+    """Start a page of scenes by their titles, at least one, and return at once.
+
+    OgPointcloudError where one has no point to show, or nothing may listen at the address.
+    """
+    empty = [title for title, live in scenes.items() if len(live.xyz) == 0]
+    if empty or not scenes:
+        raise OgPointcloudError(f"{', '.join(empty) or 'no scene'} has no point to show; expected at least one")
+    settings = settings or ServeSettings()
+    _check_address(settings.host, settings.port)
+    return LivePage(scenes, settings)
+
+
+def _check_address(host: str, port: int) -> None:
+    """viser would try port after port at an address that is none, and never say so."""
+    try:
+        socket.create_server((host, 0), family=socket.AF_INET6 if ":" in host else socket.AF_INET).close()
+    except OSError as error:
+        cure = "expected an address of this machine, such as 127.0.0.1, or 0.0.0.0 for all of them"
+        raise OgPointcloudError(f"nothing can listen at '{host}' ({error}); {cure}") from None
+    if not 0 <= port < PORTS:
+        raise OgPointcloudError(f"the port is {port}; expected a number from 0, for any that is free, to {PORTS - 1}")
+
+
+def show(scene: Any, labels: Any = None, *, text_features: Any = None, up: ArrayLike = (0, 0, 1)) -> LivePage:
+    """A page of one scene, on this machine; a notebook shows it in its cell. Arguments as for ``segment``."""
+    title = scene.path.stem if scene.path else "scene"
+    live = LiveScene(scene, labels=labels, text_features=text_features)
+    x, y, z = np.asarray(up, np.float64).tolist()
+    return serve({title: live}, ServeSettings(up=(x, y, z)))
+
+
+class LivePage:
+    """A page that is being served. url: where. ``stop`` ends it."""
+
+    def __init__(self, scenes: Mapping[str, LiveScene], settings: ServeSettings) -> None:
+        self._scenes, self._settings = dict(scenes), settings
+        self._lock = threading.RLock()  # viser calls from several threads
+        self._server = viser.ViserServer(settings.host, settings.port, TITLE, verbose=False)
+        self._live = next(iter(self._scenes.values()))
+        self._server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="large")
+        self._server.gui.main_panel.dock_right()
+        self._server.scene.set_up_direction(settings.up)
+        self._server.scene.on_click()(self._clicked)
+        self._add_controls()
+        self._show_scene()
+
+    @property
+    def url(self) -> str:
+        """Where a browser of this machine finds it."""
+        host = LOOPBACK if self._settings.host in ("0.0.0.0", "::") else self._settings.host
+        return f"http://{f'[{host}]' if ':' in host else host}:{self._server.get_port()}"
+
+    @property
+    def is_open(self) -> bool:
+        """Whether others than this machine can reach it."""
+        return self._settings.host not in ("127.0.0.1", "localhost", "::1")
+
+    def wait(self) -> None:
+        """Serve until interrupted (Ctrl-C), then stop."""
+        try:
+            threading.Event().wait()
+        except KeyboardInterrupt:
+            pass
+        finally:
+            self.stop()
+
+    def stop(self) -> None:
+        """End the page; browsers say that it is gone."""
+        self._server.stop()
+
+    def _repr_html_(self) -> str:
+        return f'<iframe src="{self.url}" width="100%" height="{HEIGHT_PX}" style="border:0"></iframe>'
+
+    # Controls -------------------------------------------------------------------------------------------------------
+
+    def _add_controls(self) -> None:
+        gui = self._server.gui
+        if len(self._scenes) > 1:
+            self._choice = gui.add_dropdown("scene", tuple(self._scenes))
+            self._choice.on_update(self._guarded(self._change_scene))
+        with gui.add_form(None) as form:
+            self._word = gui.add_text("find", "", hint="stored words at once, any other with Enter")
+        form.on_submit(self._guarded(self._ask))
+        self._word.on_update(self._guarded(self._typed))
+        self._answer = gui.add_html("")
+        self._mode = gui.add_dropdown("colors", self._live.modes)
+        self._mode.on_update(self._guarded(self._change_mode))
+        self._list: Any = gui.add_dropdown("instance", (EVERYTHING,))
+        self._list.on_update(self._guarded(self._chosen))
+        self._size = gui.add_slider("point size", 0.3, 4.0, 0.05, 1.0)
+        self._size.on_update(self._guarded(self._resize))
+        gui.add_button("picture").on_click(self._photograph)
+        self._legend = gui.add_html("")
+
+    def _guarded(self, act: Callable[[], None]) -> Callable[[Any], None]:
+        """What viser calls: one at a time, and only for what a person did, not for what the page set itself."""
+
+        def called(event: Any) -> None:
+            if event.client is not None:
+                with self._lock:
+                    act()
+
+        return called
+
+    def _typed(self) -> None:
+        """Stored words, and none, are answered while typing; others may need an encoder, and wait for Enter."""
+        own = self._live.scene.vocabulary
+        if not self._word.value.strip() or (own and self._word.value.strip() in own.names):
+            self._ask()
+
+    def _ask(self) -> None:
+        self._tell(self._live.ask(self._word.value))
+        self._list.value = EVERYTHING
+
+    def _chosen(self) -> None:
+        self._word.value = ""
+        row = self._list.value
+        self._tell(self._live.ask("") if row == EVERYTHING else self._live.choose(int(row.split(" ")[0])))
+
+    def _clicked(self, event: viser.SceneClickEvent) -> None:
+        camera = event.client.camera
+        focal_px = camera.image_height / 2 / np.tan(camera.fov / 2)
+        with self._lock:
+            eye = np.array(event.ray_origin) + self._middle
+            self._tell(self._live.click(eye, np.array(event.ray_direction), focal_px))
+            self._word.value, self._list.value = "", EVERYTHING
+
+    def _change_mode(self) -> None:
+        self._live.mode = self._mode.value
+        self._paint()
+
+    def _change_scene(self) -> None:
+        self._live = self._scenes[self._choice.value]
+        self._show_scene()
+
+    def _photograph(self, event: viser.GuiEvent) -> None:
+        """What the browser that asked sees, as a PNG that it saves."""
+        import imageio.v3
+
+        client = event.client
+        if client is None:
+            return
+        picture = client.get_render(client.camera.image_height, client.camera.image_width)
+        file = imageio.v3.imwrite("<bytes>", picture, extension=".png")
+        client.send_file_download(f"{TITLE}.png", file, save_immediately=True)
+
+    # What is shown --------------------------------------------------------------------------------------------------
+
+    def _show_scene(self) -> None:
+        """Put the scene's points, camera and lists into the page."""
+        live = self._live
+        low, high = live.xyz.min(axis=0), live.xyz.max(axis=0)
+        self._middle = low + (high - low) / 2
+        up = np.array(self._settings.up, np.float64)
+        view = choose_viewpoint(live.xyz, live.label_of[live.ids] >= 0, up / np.linalg.norm(up))
+        camera = self._server.initial_camera
+        camera.fov, camera.up = 2 * float(np.arctan(1 / FOCAL)), view.up
+        camera.position, camera.look_at = view.eye - self._middle, view.target - self._middle
+        extent = float(np.linalg.norm(high - low)) or 1.0
+        camera.near, camera.far = extent / 1e4, 10 * extent
+        for client in self._server.get_clients().values():
+            client.camera.position, client.camera.look_at = camera.position, camera.look_at
+        self._points = self._add_points((live.xyz - self._middle).astype(np.float32))
+        self._mode.options, self._mode.value = live.modes, live.mode
+        rows = [row for row in live.instances.largest(LISTED) if row.points]
+        self._list.options = (EVERYTHING, *(f"{row.id} · {live.name_of(row.id)} · {row.points:,}" for row in rows))
+        self._word.value, self._list.value = "", EVERYTHING
+        self._legend.content = legend_html(live)
+        self._tell(live.ask(""))
+
+    def _add_points(self, xyz: NDArray[np.float32]) -> Any:
+        """The points as splats where they are Gaussians, else as discs."""
+        live, scene = self._live, self._server.scene
+        shown = live.shown
+        if shown is None or shown.scale is None or shown.rotation is None or shown.opacity is None:
+            radius = POINT_SIZE * self._size.value * live.scene.cloud.spacing
+            return scene.add_point_cloud(
+                "/scene", xyz, live.colors(), point_size=radius, point_shape="circle", precision="float32",
+                point_shading="flat",
+            )  # fmt: skip
+        axes = SO3(shown.rotation).as_matrix() * shown.scale[:, None, :]
+        covariances = axes @ axes.transpose(0, 2, 1)
+        return scene.add_gaussian_splats("/scene", xyz, covariances, live.colors() / 255, shown.opacity[:, None])
+
+    def _resize(self) -> None:
+        if hasattr(self._points, "point_size"):
+            self._points.point_size = POINT_SIZE * self._size.value * self._live.scene.cloud.spacing
+
+    def _paint(self) -> None:
+        attribute = "colors" if hasattr(self._points, "colors") else "rgbs"
+        setattr(self._points, attribute, self._live.colors())
+
+    def _tell(self, answer: Answer) -> None:
+        self._paint()
+        self._answer.content = answer_html(answer)
+
+
+def answer_html(answer: Answer) -> str:
+    """As HTML; names come from files, so no text of theirs is taken for HTML."""
+    title, *lines, note = map(html.escape, (answer.title, *answer.lines, answer.note))
+    bars = [BAR.format(html.escape(name), score, score) for name, score in answer.bars]
+    return CARD.format("".join([f"<b>{title}</b>", *map(GREY.format, lines), *bars, GREY.format(note)]))
+
+
+def legend_html(live: LiveScene) -> str:
+    """Labels with their colors and numbers of points."""
+    rows = [
+        ROW.format(SWATCH.format(color) + f"<span>{html.escape(name)}</span>" + SIDE.format(f"{count:,}"))
+        for name, color, count in live.legend()
+    ]
+    return CARD.format("".join(rows))

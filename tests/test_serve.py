@@ -1,0 +1,197 @@
+"""The live page: who can reach it, what is refused, and a browser that types and clicks."""
+
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from labelled_clouds import make_cloud, room
+from og_pointcloud_export import write_bundle
+
+import og_pointcloud as og
+from og_pointcloud.cli import main
+from og_pointcloud.cloud import Vocabulary
+from og_pointcloud.show.live import Answer, LiveScene
+
+BROWSER = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-background-networking"]
+
+
+@pytest.fixture
+def viser():
+    return pytest.importorskip("viser")
+
+
+@pytest.fixture
+def bundle(tmp_path):
+    return write_bundle(room(500), tmp_path / "room.ogpc")
+
+
+def listens_at(port):
+    """Addresses with a socket that listens at the port, as Linux has them."""
+    rows = [
+        line.split() for table in ("tcp", "tcp6") for line in Path(f"/proc/net/{table}").read_text().splitlines()[1:]
+    ]
+    return {row[1].split(":")[0] for row in rows if row[3] == "0A" and int(row[1].split(":")[1], 16) == port}
+
+
+@pytest.mark.skipif(not Path("/proc/net/tcp").exists(), reason="only Linux tells who listens")
+def test_it_listens_on_this_machine_alone_unless_told_otherwise(viser):
+    from og_pointcloud.show.serve import ServeSettings, serve
+
+    scene = LiveScene(og.LabelledScene.from_cloud(room(300)))
+    for host, address, is_open in (("127.0.0.1", "0100007F", False), ("0.0.0.0", "00000000", True)):
+        page = serve({"room": scene}, ServeSettings(host, 0))
+        try:
+            assert page.is_open == is_open
+            assert page.url.startswith("http://127.0.0.1:")
+            assert listens_at(int(page.url.rsplit(":", 1)[1])) == {address}
+        finally:
+            page.stop()
+
+
+def test_a_notebook_shows_the_page_in_its_cell(viser):
+    page = og.LabelledScene.from_cloud(room(300)).show(["plum"])
+    try:
+        assert f'<iframe src="{page.url}"' in page._repr_html_()
+        assert not page.is_open
+    finally:
+        page.stop()
+
+
+def test_text_of_a_file_is_never_html(viser):
+    from og_pointcloud.show.serve import answer_html, legend_html
+
+    name = "<img src=x onerror=alert(1)>"
+    cloud = room(300)
+    cloud = replace(cloud, vocabulary=Vocabulary((name, *cloud.vocabulary.names[1:]), cloud.vocabulary.vectors))
+    live = LiveScene(og.LabelledScene.from_cloud(cloud))
+    for text in (
+        answer_html(live.ask("")),
+        legend_html(live),
+        answer_html(Answer(name, (name,), ((name, 2.0),), name)),
+    ):
+        assert "&lt;img src=x onerror" in text
+        assert name not in text
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--host", "203.0.113.5"], "nothing can listen at '203.0.113.5'"),
+        (["--host", "no such host"], "nothing can listen at 'no such host'"),
+        (["--port", "99999"], "the port is 99999; expected a number from 0"),
+        (["--labels", "appel"], "did you mean 'apple'"),
+        (["room.ogpc", "--cloud", "x.ply"], "--cloud is for one scene, but 2 are given"),
+    ],
+)
+def test_bad_use_is_refused_in_one_line(viser, bundle, capsys, monkeypatch, options, said):
+    monkeypatch.chdir(bundle.parent)
+    assert main(["serve", str(bundle), *options]) == 2
+    stderr = capsys.readouterr().err
+    assert said in stderr
+    assert len(stderr.splitlines()) == 1
+
+
+def test_an_empty_scene_is_refused(viser, tmp_path, capsys):
+    empty = write_bundle(make_cloud(np.zeros((0, 3)), []), tmp_path / "empty.ogpc")
+    assert main(["serve", str(empty)]) == 2
+    assert "empty has no point to show" in capsys.readouterr().err
+
+
+def test_without_viser_the_extra_is_named(bundle, capsys, monkeypatch):
+    monkeypatch.delitem(sys.modules, "og_pointcloud.show.serve", raising=False)
+    monkeypatch.setitem(sys.modules, "viser", None)
+    assert main(["serve", str(bundle)]) == 2
+    assert "og-pointcloud[serve]" in capsys.readouterr().err
+    with pytest.raises(og.MissingExtraError, match="serve"):
+        og.load(bundle).show()
+
+
+@pytest.mark.slow
+def test_the_command_says_who_can_reach_it_and_ends_when_interrupted(viser, bundle):
+    command = [sys.executable, "-u", "-c", "import sys; from og_pointcloud.cli import main; sys.exit(main())", "serve"]
+    process = subprocess.Popen(
+        [*command, bundle, "--port", "0"], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    )
+    try:
+        lines = iter(process.stdout.readline, "")
+        assert any(line.startswith("http://127.0.0.1:") for line in lines)
+        assert next(lines) == "for this machine alone; --host 0.0.0.0 lets others in, without a password\n"
+        process.send_signal(signal.SIGINT)
+        assert process.wait(30) == 0
+        assert "Traceback" not in process.stdout.read()
+    finally:
+        process.kill()
+
+
+def picture_of(data):
+    """(H, W, 3) int RGB of the bytes of a PNG."""
+    import cv2
+
+    return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)[..., ::-1].astype(int)
+
+
+def until(true, seconds=60):
+    end = time.monotonic() + seconds
+    while not true():
+        assert time.monotonic() < end, "the page did not get there"
+        time.sleep(0.2)
+
+
+@pytest.mark.slow
+def test_a_browser_types_a_word_sees_the_points_lit_and_clicks_them(viser):
+    browser = shutil.which("chromium") or shutil.which("google-chrome")
+    if browser is None:
+        pytest.skip("no Chromium here")
+    playwright = pytest.importorskip("playwright.sync_api")
+    from og_pointcloud.show.serve import ServeSettings, serve
+
+    # Two plates, one above the other in the picture, each an instance of its own and of one color.
+    plate = np.stack(np.meshgrid(np.arange(0, 2, 0.02), np.arange(0, 0.9, 0.02)), axis=-1).reshape(-1, 2)
+    xyz = np.concatenate([np.c_[plate, np.zeros(len(plate))], np.c_[plate + np.array([0, 1.1]), np.zeros(len(plate))]])
+    cloud = make_cloud(xyz, np.repeat([0, 1], len(plate)), spacing=0.02, reach=0.06, words=("left", "right"))
+    live = LiveScene(og.LabelledScene.from_cloud(replace(cloud, rgb=np.full((len(xyz), 3), 200, np.uint8))))
+    color = {name: live.colors()[live.ids == k][0].astype(int) for k, name in enumerate(("left", "right"))}
+    assert len({tuple(value) for value in color.values()}) == 2
+    served = serve({"plates": live}, ServeSettings(port=0))
+    try:
+        with playwright.sync_playwright() as play:
+            window = play.chromium.launch(executable_path=browser, args=BROWSER).new_page(
+                viewport={"width": 900, "height": 600}
+            )
+            window.goto(served.url)
+            shown = {
+                name: lambda name=name: np.abs(picture_of(window.screenshot()) - color[name]).max(axis=2) <= 3
+                for name in color
+            }
+            until(lambda: shown["left"]().sum() > 2000 and shown["right"]().sum() > 2000, 90)
+            places = {name: np.argwhere(shown[name]()[:, :450]).mean(axis=0) for name in color}
+
+            window.locator("form input").fill("right")
+            until(lambda: shown["left"]().sum() < 50)
+            assert shown["right"]().sum() > 2000
+            assert live.lit == {1}
+            assert "fits 1 of 2 instances" in window.inner_text("body")
+
+            row, column = places["left"]
+            window.mouse.click(column, row)
+            until(lambda: live.lit == {0})
+            until(lambda: "instance 0 ·" in window.inner_text("body"))
+            until(lambda: shown["right"]().sum() < 50)
+            assert shown["left"]().sum() > 2000
+
+            window.locator("form input").fill("lef")
+            window.keyboard.press("Enter")
+            until(lambda: "did you mean" in window.inner_text("body"))
+            until(lambda: shown["right"]().sum() > 2000)
+            with window.expect_download() as download:
+                window.get_by_role("button", name="picture").click()
+            saved = picture_of(download.value.path().read_bytes())
+            assert (np.abs(saved - color["left"]).max(axis=2) <= 20).sum() > 2000
+    finally:
+        served.stop()
