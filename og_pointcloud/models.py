@@ -32,7 +32,8 @@ if TYPE_CHECKING:
     from onnxruntime import InferenceSession
 
 __all__ = [
-    "MODEL_NAME", "EncoderFormat", "check_graph", "fetched_model", "hub_cache", "message_fields", "open_session",
+    "MODEL_NAME", "EncoderFormat", "check_graph", "fetched_model", "hub_cache", "integers_of",
+    "message_fields", "open_session", "text_of",
 ]  # fmt: skip
 
 MANIFEST = "manifest.json"
@@ -74,6 +75,7 @@ def open_session(model: bytes) -> InferenceSession:
     options = onnxruntime.SessionOptions()
     options.log_severity_level = ERRORS_ONLY
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    options.enable_mem_pattern = False  # else it keeps one for every number of points that it was ever asked
     return onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
 
 
@@ -180,7 +182,7 @@ def check_graph(model: bytes, operators: frozenset[str] | None = None) -> None:
     for number, value in message_fields(memoryview(model)):
         if number == 25:
             raise ValueError("it defines functions of its own")
-        if number == 8 and (domain := _string(_last(value, 1))) not in STANDARD_DOMAINS:
+        if number == 8 and (domain := text_of(value, 1)) not in STANDARD_DOMAINS:
             raise ValueError(f"it uses operators of {domain!r:.40}, not of the standard")
         if number == 7:
             _check_contents(_message(value), operators)
@@ -197,7 +199,7 @@ def _check_contents(graph: memoryview, operators: frozenset[str] | None) -> None
 
 
 def _check_node(node: memoryview, operators: frozenset[str] | None) -> None:
-    operator, domain = _string(_last(node, 4)), _string(_last(node, 7))
+    operator, domain = text_of(node, 4), text_of(node, 7)
     if domain not in STANDARD_DOMAINS:
         raise ValueError(f"it uses the operator {operator!r:.40} of {domain!r:.40}, not of the standard")
     if operators is not None and operator not in operators:
@@ -221,7 +223,7 @@ def _check_tensor(tensor: memoryview) -> None:
         if number == 13 or (number == 14 and value):
             raise ValueError("it asks for other files of this machine")
         if number == 1:
-            shape += _integers(value)
+            shape += integers_of(value)
         elif number == 2:
             kind = value
         elif number == 9:
@@ -282,11 +284,12 @@ def _last(message: memoryview | int, number: int) -> memoryview | int:
     return ([value for found, value in message_fields(message) if found == number] or [memoryview(b"")])[-1]
 
 
-def _string(value: memoryview | int) -> str:
-    return bytes(_message(value)).decode("utf-8", "replace")
+def text_of(message: memoryview | int, number: int) -> str:
+    """The last of a message's fields of this number as text, "" without one."""
+    return bytes(_message(_last(message, number))).decode("utf-8", "replace")
 
 
-def _integers(value: memoryview | int) -> list[int]:
+def integers_of(value: memoryview | int) -> list[int]:
     """A repeated int64, which may come one by one or packed."""
     if isinstance(value, int):
         return [_signed(value)]

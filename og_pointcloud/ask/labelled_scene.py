@@ -198,7 +198,7 @@ class LabelledScene:
     @cached_property
     def _graph(self) -> QueryGraph | None:
         graph = self._bundle.query_onnx
-        return None if graph is None else QueryGraph(graph, self.path, len(self.cloud.instances))
+        return None if graph is None else QueryGraph(graph, self.path, self.cloud)
 
     @cached_property
     def nearest(self) -> NearestPoint:

@@ -1,4 +1,8 @@
-"""query.onnx of a .ogpc file, asked for instances of points. Files come from anywhere, so its answers are checked."""
+"""query.onnx of a .ogpc file, asked for instances of points.
+
+Files come from anywhere. ``bundle.known_graph`` has settled what the graph may do; here is found out whether it tells
+the truth: on opening it is asked for a sample of the file's own points and of places about them, drawn anew each time.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud.cloud import TOO_FAR
+from og_pointcloud.cloud import TOO_FAR, LabelledCloud
 from og_pointcloud.errors import BundleError
 from og_pointcloud.models import open_session
 
@@ -16,17 +20,21 @@ __all__ = ["QueryGraph"]
 
 OUTPUTS = {"instance": np.int32, "certain": np.bool_}
 """What is asked of the graph: one value a point each."""
+OWN_POINTS, PLACES = 4096, 8
+"""How many are asked on opening: of 4,096 at random one is among any thousandth of the points, but once in 60 openings.
+Places are looked up plainly, in time that grows with the cloud."""
 
 
 class QueryGraph:
     """The look-up of a .ogpc file. Several threads may ask it at once.
 
-    onnx: the serialised graph. path: its file, for errors. instances: how many the file has.
-    BundleError, also of later calls, for a graph that does not run or answers what no graph of ours would.
+    onnx: the serialised graph. path: its file, for errors. cloud: what the file's arrays say.
+    BundleError for a graph that does not run or answers otherwise than the arrays; also of later calls, where it
+    answers what no graph of ours would.
     """
 
-    def __init__(self, onnx: bytes, path: Path | None, instances: int) -> None:
-        self._path, self._instances = path, instances
+    def __init__(self, onnx: bytes, path: Path | None, cloud: LabelledCloud) -> None:
+        self._path, self._instances = path, len(cloud.instances)
         try:
             self._session = open_session(onnx)
         except Exception as error:  # onnxruntime raises types of its own for a graph that it cannot run
@@ -39,6 +47,8 @@ class QueryGraph:
         if len(shape) != 2 or not isinstance(shape[1], int):
             raise self._refused(f"takes text of shape {shape}, of no width")
         self._no_text = np.zeros((0, shape[1]), np.float32)
+        if len(cloud):
+            self._compare(cloud, np.random.default_rng())
 
     def look_up(self, local: NDArray[np.float32]) -> tuple[NDArray[np.int32], NDArray[np.bool_]]:
         """Instance id, and whether it is certain, (N,) each. local: (N, 3), the cloud's frame."""
@@ -55,8 +65,32 @@ class QueryGraph:
             raise self._refused("answers what is no instance of this file")
         return instances, certain
 
+    def _compare(self, cloud: LabelledCloud, random: np.random.Generator) -> None:
+        """BundleError where the graph contradicts the arrays. It may be right whatever is drawn, or be found out."""
+        rows = random.integers(0, len(cloud), OWN_POINTS)
+        instances, certain = self.look_up(cloud.xyz[rows])
+        differ = np.flatnonzero(certain & (instances != cloud.instance_ids[rows]))
+        # Of points in one place the first one counts, so such points may differ, and are looked up as any place is.
+        places = cloud.xyz[rows[:PLACES]] + random.normal(size=(PLACES, 3)) * (0.5 * cloud.spacing)
+        places = np.concatenate([cloud.xyz[rows[differ[:PLACES]]], places.astype(np.float32)])
+        instances, certain = self.look_up(places)
+        expected = np.array([_instance_plainly(cloud, place) for place in places])
+        if wrong := int((certain & (instances != expected)).sum()):
+            raise self._refused(f"contradicts the file's own points and ids in {wrong} of {len(places)} places")
+
     def _refused(self, what: Any) -> BundleError:
         return BundleError(f"{self._path}: query.onnx {what}: write the file again")
+
+
+def _instance_plainly(cloud: LabelledCloud, place: NDArray[np.float32]) -> int:
+    """Instance of the nearest point within reach, of equally near ones the first's: by every distance, in float64."""
+    at = place.astype(np.float64)
+    close = np.flatnonzero(np.abs(cloud.xyz[:, 0] - place[0]) <= 2 * cloud.reach)  # a coarse sieve, not the answer
+    x, y, z = (cloud.xyz[close].astype(np.float64) - at).T
+    squared = (x * x + y * y) + z * z
+    if len(close) == 0 or squared.min() > float(cloud.reach) ** 2:
+        return TOO_FAR
+    return int(cloud.instance_ids[close[squared.argmin()]])
 
 
 def _first_line(error: Exception) -> str:

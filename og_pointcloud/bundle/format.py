@@ -35,16 +35,10 @@ ON_SURFACE, NEAR, BEYOND = 0, 1, 2
 """How far a query point is from the cloud: within about 1.5 spacings, within reach, or too far."""
 
 MAX_MEMBERS = 256
-MAX_MANIFEST_BYTES = 1 << 26
+MAX_MANIFEST_BYTES, MAX_NAMES_BYTES = 1 << 21, 1 << 23
+"""What JSON takes in memory is up to twenty times its bytes."""
 SAFE_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]*(/[A-Za-z0-9_][A-Za-z0-9_.-]*)*")
 INTEGERS, FLOATS = ("|i1", "<i2", "<i4"), ("<f2", "<f4")
-QUERY_OPERATORS = frozenset({
-    "Abs", "Add", "ArgMax", "ArgMin", "Cast", "Concat", "Div", "Expand", "Gather", "GatherElements", "Greater",
-    "GreaterOrEqual", "Identity", "IsNaN", "Less", "LessOrEqual", "MatMul", "Max", "Min", "Mod", "Mul", "NonZero",
-    "ReduceL2", "ReduceMax", "ReduceSum", "Reshape", "ScatterElements", "Shape", "Slice", "Split", "Sub",
-    "Transpose", "Unsqueeze", "Where",
-})  # fmt: skip
-"""What a query.onnx is made of: arithmetic and look-ups, nothing that repeats or branches."""
 REBUILD = "write the file again with write_bundle"
 BANK = "bank/vectors.npy"
 INSTANCE_MEMBERS = {"part_of": "whole"}

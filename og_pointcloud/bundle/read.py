@@ -25,17 +25,17 @@ from og_pointcloud.bundle.format import (
     LATER_COLUMNS,
     MAX_MANIFEST_BYTES,
     MAX_MEMBERS,
-    QUERY_OPERATORS,
+    MAX_NAMES_BYTES,
     REBUILD,
     RGB,
     SAFE_NAME,
     SCHEMA_VERSION,
     cameras_of_rows,
 )
-from og_pointcloud.cloud import InstanceTable, LabelledCloud, Vocabulary, WordBank
+from og_pointcloud.bundle.known_graph import query_tables
+from og_pointcloud.cloud import TOO_FAR, InstanceTable, LabelledCloud, Vocabulary, WordBank
 from og_pointcloud.errors import BundleError, OgPointcloudError
 from og_pointcloud.formats.npy import array_from_npy
-from og_pointcloud.models import check_graph
 
 __all__ = ["Bundle", "read_bundle", "read_carried_encoder"]
 
@@ -138,7 +138,7 @@ def _manifest(members: dict[str, bytes]) -> dict[str, Any]:
     if "manifest.json" not in members:
         found = ", ".join(list(members)[:3]) or "nothing"
         raise _Refused(f"a zip without manifest.json (it holds {found}): not a .ogpc file; give the one that fit wrote")
-    manifest = _json(members, "manifest.json")
+    manifest = _json(members, "manifest.json", MAX_MANIFEST_BYTES)
     if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
         seen = manifest.get("format") if isinstance(manifest, dict) else type(manifest).__name__
         raise _Refused(f"its manifest says format {seen!r}; expected {FORMAT!r}: give the file that fit wrote")
@@ -152,10 +152,10 @@ def _manifest(members: dict[str, bytes]) -> dict[str, Any]:
     return manifest
 
 
-def _json(members: dict[str, bytes], name: str) -> Any:
+def _json(members: dict[str, bytes], name: str, most: int) -> Any:
     data = members[name]
-    if len(data) > MAX_MANIFEST_BYTES:
-        raise _Refused(f"{name} has {len(data)} bytes; expected at most {MAX_MANIFEST_BYTES}: {REBUILD}")
+    if len(data) > most:
+        raise _Refused(f"{name} has {len(data)} bytes; expected at most {most}: {REBUILD}")
     try:
         return json.loads(data)
     except (ValueError, RecursionError) as error:
@@ -181,10 +181,6 @@ def _check_members(
                 raise _Refused(f"member '{name}' has sha256 {digest}, not the manifest's: it was changed; {REBUILD}")
     if "query.onnx" not in members:
         raise _Refused(f"member 'query.onnx' is missing: {REBUILD}")
-    try:
-        check_graph(members["query.onnx"], QUERY_OPERATORS)
-    except ValueError as error:
-        raise _Refused(f"query.onnx: {error}: the file is not to be trusted") from None
 
 
 def _cloud(manifest: dict[str, Any], members: dict[str, bytes]) -> LabelledCloud:
@@ -230,7 +226,29 @@ def _instances(manifest: dict[str, Any], members: dict[str, bytes], count: int) 
         dtype = "<f4" if field.name in ("agreement", "visible_area", "reliability") else "<i4"
         length = len(descriptors) if field.name == "descriptor_instance" else count
         columns[field.name] = _array(members, member, (dtype,), (length,))
+    _check_graph(members["query.onnx"], descriptors, columns["descriptor_instance"], count)
     return InstanceTable(descriptors, **columns)
+
+
+def _check_graph(
+    onnx: bytes, descriptors: NDArray[np.float32], descriptor_instance: NDArray[np.int32], instances: int
+) -> None:
+    """Refuse any graph but ours, and one whose scores would be of other descriptors than the manifest's."""
+    try:
+        tables = query_tables(onnx)
+    except ValueError as error:
+        raise _Refused(f"query.onnx: {error}: the file is not to be trusted") from None
+    # An answer code is an id, counted from TOO_FAR on.
+    codes, rows = instances - TOO_FAR, (len(descriptors), max(descriptors.shape[1], 1))
+    same = (
+        tables["codes"].tolist() == [codes]
+        and tables["unknown_column"].shape == (codes, 1)
+        and tables["descriptors"].shape == rows
+        and tables["descriptors"].tobytes() == descriptors.tobytes()
+        and tables["descriptor_code"].tolist() == (descriptor_instance[:, None] - TOO_FAR).tolist()
+    )
+    if not same:
+        raise _Refused("query.onnx has other instances or descriptors than the file says: it is not to be trusted")
 
 
 def _descriptors(place: dict[str, Any], members: dict[str, bytes]) -> NDArray[np.float32]:
@@ -246,7 +264,7 @@ def _descriptors(place: dict[str, Any], members: dict[str, bytes]) -> NDArray[np
 def _vocabulary(manifest: dict[str, Any], members: dict[str, bytes]) -> Vocabulary | None:
     if "vocabulary/names.json" not in members:
         return None
-    names = _json(members, "vocabulary/names.json")
+    names = _json(members, "vocabulary/names.json", MAX_NAMES_BYTES)
     words = _field(_field(manifest, "counts", dict), "words", int, "counts/")
     unique = isinstance(names, list) and all(isinstance(name, str) for name in names) and len(set(names)) == len(names)
     if not unique or len(names) != words:

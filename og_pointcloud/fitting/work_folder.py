@@ -16,7 +16,7 @@ import threading
 import time
 import zlib
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from hashlib import blake2b
 from pathlib import Path
 from typing import IO, Any
@@ -26,18 +26,12 @@ from numpy.typing import NDArray
 
 from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.fitting.memory import scratch_root
-from og_pointcloud.formats.atomic import replacing
-
-try:
-    import fcntl
-except ImportError:  # not on Windows: there nobody keeps a second process out
-    fcntl = None
+from og_pointcloud.formats.atomic import locked, replacing
 
 __all__ = ["WorkFolder", "fingerprint", "kept_files"]
 
 SUFFIX = ".kept.npy"
 """Ends the names of all files of a work folder, so that files of others are left alone."""
-LOCK = ".lock"
 ALIGNED = 64
 """Arrays begin at multiples of so many bytes of a file."""
 OWN_PAGES = 1 << 17
@@ -87,23 +81,19 @@ class WorkFolder:
         """
         work = cls(None if folder is None else Path(folder))
         new = [] if work.folder is None else [path for path in work.folder.parents if not path.exists()]
-        lock = None if work.folder is None else _lock(work.folder)
         try:
-            yield work
-            if work.folder is not None:
-                for path in [*work.folder.glob(f"*{SUFFIX}"), *work.folder.glob(f".*{SUFFIX}.*.tmp")]:
-                    path.unlink()  # the latter of a run that was killed while it wrote
+            with nullcontext() if work.folder is None else locked(work.folder):
+                yield work
+                if work.folder is not None:
+                    for path in [*work.folder.glob(f"*{SUFFIX}"), *work.folder.glob(f".*{SUFFIX}.*.tmp")]:
+                        path.unlink()  # the latter of a run that was killed while it wrote
         finally:
             if work._temporary is not None:
                 shutil.rmtree(work._temporary, ignore_errors=True)
             if work.folder is not None:
                 with suppress(OSError):
-                    (work.folder / LOCK).unlink()
-                with suppress(OSError):
                     for path in (work.folder, *new):
                         path.rmdir()  # fails where there is more in it
-            if lock is not None:
-                lock.close()
 
     def __reduce__(self) -> tuple[Any, ...]:
         """In another process: the same folder, which that of the run owns."""
@@ -176,7 +166,7 @@ class WorkFolder:
     def _write(self, label: str, arrays: Arrays) -> None:
         path = self._place() / label
         try:
-            with replacing(path) as file:
+            with replacing(path, durable=False) as file:  # a checksum ends it
                 _write_arrays(file, arrays)
         except OSError as error:
             size = sum(array.nbytes for array in arrays) / 1e6
@@ -210,34 +200,6 @@ def _on_own_pages(array: NDArray[Any]) -> NDArray[Any]:
     copy = np.frombuffer(mmap.mmap(-1, array.nbytes, **private), array.dtype).reshape(array.shape)
     copy[...] = array
     return copy
-
-
-def _lock(folder: Path) -> IO[str] | None:
-    """Make the folder and keep other processes out of it until the file returned is closed, or the process ends."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        file = (folder / LOCK).open("a+")
-    except OSError as error:
-        raise OgPointcloudError(
-            f"the work folder '{folder}' cannot be used ({error.strerror}); expected one that can be written to: name "
-            "another"
-        ) from error
-    if fcntl is None:
-        return file
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        file.seek(0)
-        holder = file.read().strip() or "another process"
-        file.close()
-        raise OgPointcloudError(
-            f"the work folder '{folder}' is in use by {holder}; expected one run at a time: wait for it, or name "
-            "another folder"
-        ) from None
-    file.truncate(0)
-    file.write(f"process {os.getpid()}, since {time.strftime('%Y-%m-%d %H:%M:%S')}")
-    file.flush()
-    return file
 
 
 class _Summed:

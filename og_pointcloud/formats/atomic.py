@@ -1,29 +1,164 @@
-"""Files that are written whole or not at all."""
+"""Files and folders that are written whole or not at all, and folders that one process at a time works in."""
 
 from __future__ import annotations
 
 import os
+import secrets
+import shutil
+import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import BinaryIO
+from typing import IO, BinaryIO
 
-__all__ = ["replacing"]
+from og_pointcloud.errors import OgPointcloudError
+
+try:
+    import fcntl
+except ImportError:  # not on Windows: there nobody keeps a second process out
+    fcntl = None
+
+__all__ = ["LOCK", "locked", "replacing", "replacing_folder"]
+
+LOCK = ".lock"
+"""The file in a folder by which processes know that another works there."""
+STALE_S = 60.0
+"""A temporary file is left alone for so long: whoever has just made it may not have locked it yet."""
 
 
 @contextmanager
-def replacing(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
+def replacing(path: str | os.PathLike[str], *, durable: bool = True) -> Iterator[BinaryIO]:
     """A file to write that takes the place of ``path`` when, and only when, the block ends without an error.
 
-    Folders above it that are missing are made.
+    Several may write one path at a time: each file is whole, and the last one stays. Folders above it that are missing
+    are made; what killed runs have left of the same path is removed.
+    durable: the file is on the disk before it takes its place, so that not even a power cut leaves half of one. Without
+    it, for files whose readers check them.
+    OSError names the path also where writing fails (a full disk).
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    _remove_stale(path)
+    temporary = _temporary(path)
     try:
-        with temporary.open("wb") as file:
+        with temporary.open("xb") as file:  # a new file, never one that was laid there, nor a link to another
+            _hold(file)
             yield file
+            if not file.closed:
+                file.flush()
+                if durable:
+                    os.fsync(file.fileno())
         os.replace(temporary, path)
+        if durable:
+            _sync_folder(path.parent)
+    except OSError as error:
+        temporary.unlink(missing_ok=True)
+        if error.filename is None and error.errno is not None:
+            raise OSError(error.errno, f"{error.strerror}, it was not written", str(path)) from error
+        raise
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
+
+
+@contextmanager
+def replacing_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """A folder of the same name, to make and to fill, that becomes ``path``, which must not exist, when, and only when,
+    the block ends without an error."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    for old in path.parent.glob(f".{_glob_name(path)}.*.tmp"):
+        if old.is_dir() and not old.is_symlink():
+            with suppress(OgPointcloudError), locked(old):
+                shutil.rmtree(old, ignore_errors=True)
+    temporary = _temporary(path)
+    temporary.mkdir()
+    try:
+        with locked(temporary):
+            yield temporary / path.name
+            os.replace(temporary / path.name, path)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+@contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Make the folder and keep other processes out of it; OgPointcloudError where another is in it already.
+
+    However a process ends, its lock ends with it. A folder that is empty afterwards stays.
+    """
+    file = _lock_file(folder)
+    try:
+        yield
+    finally:
+        with suppress(OSError):
+            (folder / LOCK).unlink()
+        file.close()
+
+
+def _lock_file(folder: Path) -> IO[str]:
+    while True:
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            file = (folder / LOCK).open("a+")
+        except OSError as error:
+            raise OgPointcloudError(
+                f"the work folder '{folder}' cannot be used ({error.strerror}); expected one that can be written to: "
+                "name another"
+            ) from error
+        if not _hold(file):
+            file.seek(0)
+            holder = file.read(80).strip() or "another process"
+            file.close()
+            raise OgPointcloudError(
+                f"the work folder '{folder}' is in use by {holder}; expected one run at a time: wait for it, or name "
+                "another folder"
+            )
+        with suppress(OSError):
+            if os.path.samestat(os.fstat(file.fileno()), (folder / LOCK).stat()):
+                file.truncate(0)
+                file.write(f"process {os.getpid()}, since {time.strftime('%Y-%m-%d %H:%M:%S')}")
+                file.flush()
+                return file
+        file.close()  # of a run that has just ended, and has removed it: nobody else would meet it
+
+
+def _hold(file: IO[str] | IO[bytes]) -> bool:
+    """Lock a file that is open until it is closed; False where another has locked it."""
+    if fcntl is not None:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return False
+        except OSError:  # a disk of a network that knows no locks
+            return True
+    return True
+
+
+def _temporary(path: Path) -> Path:
+    return path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
+
+
+def _glob_name(path: Path) -> str:
+    """The name as a pattern that means itself."""
+    return "".join(f"[{sign}]" if sign in "*?[" else sign for sign in path.name)
+
+
+def _remove_stale(path: Path) -> None:
+    """Temporary files of this path that nobody writes any more."""
+    for old in path.parent.glob(f".{_glob_name(path)}.*.tmp"):
+        with suppress(OSError):
+            if not old.is_symlink() and old.is_file() and time.time() - old.stat().st_mtime > STALE_S:
+                with old.open("rb") as file:
+                    if _hold(file):
+                        old.unlink()
+
+
+def _sync_folder(folder: Path) -> None:
+    """Put a new name on the disk, where the system lets one."""
+    with suppress(OSError):
+        number = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(number)
+        finally:
+            os.close(number)

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from og_pointcloud.cloud import UNKNOWN_SPACE
 from og_pointcloud.errors import OgPointcloudError, SceneError
-from og_pointcloud.formats.atomic import replacing
+from og_pointcloud.formats.atomic import locked, replacing
 from og_pointcloud.formats.images import require_cv2
 from og_pointcloud.formats.langsplat import LANGUAGE_FEATURES_FOLDER
 from og_pointcloud.formats.mask_files import FEATURES_NAME, MASKS_FOLDER
@@ -92,9 +92,10 @@ def make_masks(
     if made:
         say(f"all {len(tasks)} images have these masks already: nothing to do (--overwrite makes them again)")
     else:
-        work.mkdir(parents=True, exist_ok=True)
-        done_before = sum(task.work_file.exists() for task in tasks)
-        made = _make(target, settings, tasks, key, say)
+        with locked(target / WORK_FOLDER):
+            work.mkdir(parents=True, exist_ok=True)
+            done_before = sum(task.work_file.exists() for task in tasks)
+            made = _make(target, settings, tasks, key, say)
     if separate:
         _make_capture_of(capture, target, chosen)  # poses may be new
     space = str(made.get("feature_space", UNKNOWN_SPACE))
@@ -194,8 +195,14 @@ def _write_preview(target: Path, settings: MaskSettings, tasks: Sequence[ImageTa
 
 
 def _refuse_foreign(target: Path, overwrite: bool) -> None:
-    """OgPointcloudError where masks or features of somebody else would be replaced."""
+    """OgPointcloudError where masks or features of somebody else would be replaced, or lie elsewhere."""
     folder, features = target / MASKS_FOLDER, target / FEATURES_NAME
+    for link in (folder, target / WORK_FOLDER):
+        if link.is_symlink():  # as a stranger's capture may have it
+            raise OgPointcloudError(
+                f"{link} is a link to '{link.readlink()}'; expected a folder of the capture's own, as nothing is "
+                "written through links: remove it, or give another folder (-o DIR)"
+            )
     if overwrite or (folder / MADE_NAME).is_file():
         return
     found = folder if folder.is_dir() and any(folder.iterdir()) else features

@@ -6,7 +6,6 @@ The new bag holds all that the old one held, byte for byte, and beside each clou
 from __future__ import annotations
 
 import os
-import shutil
 import time
 import warnings
 from collections import Counter
@@ -19,6 +18,7 @@ from typing import Any
 from og_pointcloud.ask.choosing import Reason
 from og_pointcloud.ask.labelled_scene import Segmenter
 from og_pointcloud.errors import MissingExtraError, OgPointcloudError, SceneError
+from og_pointcloud.formats.atomic import replacing_folder
 from og_pointcloud_ros.detections import to_label_info
 from og_pointcloud_ros.labelling import MINIMUM_POINTS, CloudLabeller, LabelledMessages
 from og_pointcloud_ros.messages import MessageFactory, nanoseconds
@@ -117,6 +117,8 @@ def label_bag(
     SceneError for what is no such bag or has no such topic, or where no cloud can be labelled.
     """
     source, target = Path(source), Path(target)
+    if target.exists():
+        raise SceneError(f"'{target}' exists; expected a new name, as bags are never replaced")
     with open_bag(source) as reader:
         clouds, store = _cloud_topics(reader, topics), ros2_types()
         report = BagReport({topic: topic + LABELLED for topic in clouds})
@@ -124,7 +126,7 @@ def label_bag(
         labeller = CloudLabeller(segmenter, rosbags_messages(store), frame, minimum_points)
         total = sum(old.msgcount for old in reader.connections if old.topic in clouds)
         with (
-            _whole(target) as folder,
+            replacing_folder(target) as folder,  # a bag names its files after its folder
             Writer(folder, version=BAG_VERSION, storage_plugin=_storage(source)) as bag,
         ):
             outputs = _Outputs(bag, reader.connections, clouds, store)
@@ -273,21 +275,6 @@ def _storage(source: Path) -> StoragePlugin:
     """That of the source, which is a file of one storage or a folder of them."""
     files = [source] if source.is_file() else list(source.iterdir())
     return StoragePlugin.MCAP if any(".mcap" in file.suffixes for file in files) else StoragePlugin.SQLITE3
-
-
-@contextmanager
-def _whole(target: Path) -> Iterator[Path]:
-    """A folder to make that becomes ``target`` when, and only when, the block ends without an error."""
-    if target.exists():
-        raise SceneError(f"'{target}' exists; expected a new name, as bags are never replaced")
-    temporary = target.with_name(f".{target.name}.{os.getpid()}.tmp")
-    try:
-        # A bag names its files after its folder: inside, that has its final name already.
-        temporary.mkdir(parents=True)
-        yield temporary / target.name
-        os.replace(temporary / target.name, target)
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
 
 
 def _first_line(error: Exception) -> str:

@@ -1,0 +1,126 @@
+"""The query.onnx that files of this schema version have, node for node: nothing else is ever run.
+
+What the nodes do is settled by a digest; what differs from file to file are tables, whose names, types and ranks are
+settled too, and numbers that nodes add, compare or multiply with. None of these can make an array larger: what a graph
+takes is bounded by its own bytes and by the question. Whether it tells the truth ``ask.query_graph`` finds out.
+"""
+
+from __future__ import annotations
+
+from hashlib import blake2b
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from og_pointcloud.models import check_graph, integers_of, message_fields, text_of
+
+__all__ = ["KNOWN_GRAPHS", "query_graph_digest", "query_tables"]
+
+KNOWN_GRAPHS = frozenset({
+    "0931f16d57ab1db72ec826a2b787e5f5", "278a9debe4359bb24c880b918dd953e8", "cd2b6be498a00464ad55884c286e2033",
+    "5125ba60d69c8c34932f1c6f484a6e08", "d6b9de5009bf92436051be07f7985c7a", "b9731a6b2aa1345740ee322b1720fe8f",
+})  # fmt: skip
+"""`query_graph_digest` of the graph that `og_pointcloud_export.query_graph` builds, first, and of those that it has
+built since schema version 2. A change of that graph adds its digest here, and takes none away."""
+MODEL_FIELDS, GRAPH_FIELDS = {1, 2, 7, 8}, {1, 2, 5, 10, 11, 12}
+"""Fields of onnx.proto3 that our graphs have: of a model its versions, its maker, the graph; of a graph nodes, name,
+constants, text, inputs and outputs."""
+COUNT = "(answer codes)"
+TABLES = frozenset({
+    "axis_places", "block_shifts", "brick_values", "candidate_answer", "candidate_x", "candidate_y", "candidate_z",
+    "candidates", "candidates_high", "candidates_low", "cell_values", "child_length", "child_start", "descriptor_code",
+    "descriptors", "first_child", "first_list", "grid_low", "last_cell", "list_parts", "list_start", "node_values",
+    "part_values", "place_to_address", "unknown_column", "value_answer", "value_distance", "value_instance",
+})  # fmt: skip
+"""Constants that differ from file to file; all others are numbers."""
+DTYPES = {1: "<f4", 2: "|u1", 3: "|i1", 4: "<u2", 6: "<i4", 7: "<i8", 11: "<f8", 12: "<u4"}
+UNSIGNED = (2, 4, 12)
+FREE_OPERATORS = {6: ("Add", "Sub", "Less", "GreaterOrEqual", "Min", "Max"), 1: ("Mul",), 11: ("LessOrEqual",)}
+"""By type of a single number: where it may be any, as no other number comes of it than of another table."""
+
+
+def query_tables(onnx: bytes) -> dict[str, NDArray[np.generic]]:
+    """The tables of a query graph by name, read-only views, and ``codes``, the number of answer codes that it counts
+    with. ValueError, which says why, for any other graph."""
+    check_graph(onnx)
+    digest, constants, codes = _parsed(onnx)
+    if digest not in KNOWN_GRAPHS:
+        raise ValueError("it is not the graph that such files have")
+    tables = {name: constant for name, constant in constants.items() if name in TABLES} | {"codes": codes}
+    return {name: np.frombuffer(table.data, DTYPES[table.kind]).reshape(table.shape) for name, table in tables.items()}
+
+
+def query_graph_digest(onnx: bytes) -> str:
+    """32 hexadecimal digits of all that may not differ between the graphs of two files."""
+    return _parsed(onnx)[0]
+
+
+class _Constant(NamedTuple):
+    kind: int
+    shape: tuple[int, ...]
+    data: memoryview
+
+
+def _parsed(onnx: bytes) -> tuple[str, dict[str, _Constant], _Constant]:
+    """The digest, all constants by name, and the number of answer codes."""
+    model = list(message_fields(memoryview(onnx)))
+    graph = [field for number, value in model if number == 7 for field in message_fields(value)]
+    if {number for number, _ in model} - MODEL_FIELDS or {number for number, _ in graph} - GRAPH_FIELDS:
+        raise ValueError("it holds what no graph of ours does")
+    named = [(text_of(value, 8), _constant(value)) for number, value in graph if number == 5]
+    constants = dict(named)
+    nodes = [_Node(value) for number, value in graph if number == 1]
+    # The first Concat makes the shape (answer codes, texts) of the table of scores.
+    counting = next((node for node in nodes if node.operator == "Concat" and node.inputs), None)
+    if len(constants) != len(named) or COUNT in constants or counting is None or counting.inputs[0] not in constants:
+        raise ValueError("it does not count as graphs of ours do")
+    lines = [f"{number} {_hex(value)}" for number, value in model if number in (1, 8)]  # of the format, of operators
+    lines += sorted(f"{name} {_kind(constant)}" for name, constant in constants.items() if name in TABLES)
+    lines += [f"{number} {text_of(value, 1)!r}" for number, value in graph if number in (11, 12)]
+    codes, counting.inputs[0] = constants[counting.inputs[0]], COUNT
+    lines += [node.line(constants) for node in nodes]
+    return blake2b("\n".join(lines).encode(), digest_size=16).hexdigest(), constants, codes
+
+
+class _Node:
+    def __init__(self, message: memoryview | int) -> None:
+        fields = list(message_fields(message))
+        self.operator = text_of(message, 4)
+        self.inputs = [_text(value) for number, value in fields if number == 1]
+        self.outputs = [_text(value) for number, value in fields if number == 2]
+        self.attributes = [_hex(value) for number, value in fields if number == 5]
+
+    def line(self, constants: dict[str, _Constant]) -> str:
+        """All that the node does: its inputs are values, tables by name, and numbers by value where they may not
+        differ."""
+        inputs = [self._input(name, constants[name]) if name in constants else repr(name) for name in self.inputs]
+        return f"{self.operator} {inputs} {self.outputs} {self.attributes}"
+
+    def _input(self, name: str, constant: _Constant) -> str:
+        if name in TABLES:
+            return repr(name)
+        is_free = not constant.shape and self.operator in FREE_OPERATORS.get(constant.kind, ())
+        return f"{constant.kind} {constant.shape} {'any' if is_free else constant.data.hex()}"
+
+
+def _kind(table: _Constant) -> str:
+    """Type and rank. Whole numbers from 0 take the smallest type that holds them."""
+    return f"{'unsigned' if table.kind in UNSIGNED else table.kind} {len(table.shape)}"
+
+
+def _constant(message: memoryview | int) -> _Constant:
+    """What `check_graph` has found to be stored as plain bytes."""
+    fields = list(message_fields(message))
+    shape = [length for number, value in fields if number == 1 for length in integers_of(value)]
+    kinds = [value for number, value in fields if number == 2 and isinstance(value, int)]
+    data = [value for number, value in fields if number == 9 and isinstance(value, memoryview)]
+    return _Constant(kinds[-1] if kinds else 0, tuple(shape), data[-1] if data else memoryview(b""))
+
+
+def _text(value: memoryview | int) -> str:
+    return str(value) if isinstance(value, int) else bytes(value).decode("utf-8", "replace")
+
+
+def _hex(value: memoryview | int) -> str:
+    return str(value) if isinstance(value, int) else value.hex()
