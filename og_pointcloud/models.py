@@ -19,7 +19,9 @@ import os
 import re
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -32,7 +34,7 @@ if TYPE_CHECKING:
     from onnxruntime import InferenceSession
 
 __all__ = [
-    "MODEL_NAME", "EncoderFormat", "check_graph", "fetched_model", "hub_cache", "integers_of",
+    "MODEL_NAME", "EncoderFormat", "check_graph", "fetched_model", "home_folder", "hub_cache", "integers_of",
     "message_fields", "open_session", "text_of",
 ]  # fmt: skip
 
@@ -41,6 +43,8 @@ MODEL_NAME = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*", re.ASCII)
 REVISION = re.compile(r"[0-9a-f]{40}")
 ERRORS_ONLY = 3
 """Severity of onnxruntime's log."""
+MOST_GRAPH_BYTES, LONGEST_RUN_S = 3 << 30, 120.0
+"""Of weights and all that is computed from them; the largest text encoders take half of it, and a second."""
 STANDARD_DOMAINS = ("", "ai.onnx")
 TYPE_BYTES = {1: 4, 2: 1, 3: 1, 4: 2, 5: 2, 6: 4, 7: 8, 9: 1, 10: 2, 11: 8, 12: 4, 13: 8, 16: 2}
 """Bytes an element, by TensorProto.DataType."""
@@ -52,7 +56,15 @@ def hub_cache() -> Path:
     if hub := os.environ.get("HF_HUB_CACHE"):
         return Path(hub)
     home = os.environ.get("HF_HOME")
-    return Path(home) / "hub" if home else Path.home() / ".cache" / "huggingface" / "hub"
+    return Path(home) / "hub" if home else home_folder() / ".cache" / "huggingface" / "hub"
+
+
+def home_folder() -> Path:
+    """The user's; one that does not exist for a user without any, as in containers that are run by a bare number."""
+    try:
+        return Path.home()
+    except RuntimeError:
+        return Path("/nonexistent")
 
 
 def fetched_model(name: str) -> Path | None:
@@ -66,8 +78,12 @@ def fetched_model(name: str) -> Path | None:
     return folder if REVISION.fullmatch(revision) and folder.is_dir() else None
 
 
-def open_session(model: bytes) -> InferenceSession:
-    """A CPU session that leaves the cores idle between runs. model: a serialised ONNX graph."""
+def open_session(model: bytes, *, bounded: bool = False) -> InferenceSession:
+    """A CPU session that leaves the cores idle between runs. model: a serialised ONNX graph.
+
+    bounded: for a stranger's graph. Nothing is computed on opening, and all that such graphs compute shares
+    MOST_GRAPH_BYTES: what asks for more fails.
+    """
     # Read on import, when it would otherwise write a device id and a usage database into the user's cache folder.
     os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
     import onnxruntime
@@ -76,7 +92,36 @@ def open_session(model: bytes) -> InferenceSession:
     options.log_severity_level = ERRORS_ONLY
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     options.enable_mem_pattern = False  # else it keeps one for every number of points that it was ever asked
-    return onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
+    if bounded:
+        _bound_memory()
+        options.add_session_config_entry("session.use_env_allocators", "1")
+    without = ["ConstantFolding"] if bounded else []
+    return onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"], disabled_optimizers=without)
+
+
+@cache
+def _bound_memory() -> None:
+    """Make the allocator that sessions share which ask for one: there can be one in a process."""
+    import onnxruntime as ort
+
+    kind, usual = (ort.OrtAllocatorType.ORT_ARENA_ALLOCATOR, ort.OrtMemType.DEFAULT)  # pyright: ignore
+    place = ort.OrtMemoryInfo("Cpu", kind, 0, usual)  # pyright: ignore
+    ort.create_and_register_allocator(place, ort.OrtArenaCfg(MOST_GRAPH_BYTES, -1, -1, -1))  # pyright: ignore
+
+
+def run_bounded(session: InferenceSession, given: Mapping[str, NDArray[Any]]) -> list[Any]:
+    """All outputs, within LONGEST_RUN_S, else TimeoutError; Ctrl-C is heard meanwhile. Both stop between two nodes."""
+    import onnxruntime
+
+    options: Any = onnxruntime.RunOptions()
+    options.log_severity_level = ERRORS_ONLY + 1
+    with ThreadPoolExecutor(1) as pool:
+        answer = pool.submit(session.run, None, dict(given), options)
+        try:
+            return list(answer.result(LONGEST_RUN_S))
+        except BaseException:
+            options.terminate = True
+            raise
 
 
 @dataclass(frozen=True)
@@ -162,7 +207,7 @@ class EncoderFormat:
     def vectors(self, session: InferenceSession, given: NDArray[Any], width: int, where: str) -> NDArray[np.float32]:
         """(B, width) float32: what the graph makes of its one input (B, ...). OgPointcloudError where it does not."""
         try:
-            vectors = np.asarray(session.run(None, {session.get_inputs()[0].name: given})[0])
+            vectors = np.asarray(run_bounded(session, {session.get_inputs()[0].name: given})[0])
         except Exception as error:  # onnxruntime raises types of its own
             reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
             raise OgPointcloudError(f"{where}: {self.graph} does not run ({reason:.200}): {self.remake}") from None

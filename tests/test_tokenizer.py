@@ -201,7 +201,7 @@ def test_what_is_refused_is_named(change, says):
         {"model": {"type": "Unigram", "vocab": [["a"]]}},
         {"model": {"type": "Unigram", "vocab": [["a", 0.0]], "unk_id": 7}},
         {"normalizer": {"type": "Precompiled", "precompiled_charsmap": "////fwAAAAA="}},
-        {"normalizer": {"type": "Unheard"}},
+        {"pre_tokenizer": {"type": "Unheard"}},
         {"post_processor": {"type": "TemplateProcessing", "single": [], "pair": [], "special_tokens": 3}},
     ],
 )

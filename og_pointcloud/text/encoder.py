@@ -15,6 +15,7 @@ before it is run: it may come from a stranger.
 from __future__ import annotations
 
 import os
+import shlex
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import cached_property, lru_cache
@@ -27,8 +28,8 @@ from numpy.typing import NDArray
 from og_pointcloud.cloud import WordBank
 from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError
 from og_pointcloud.formats.npy import array_from_npy
-from og_pointcloud.models import MODEL_NAME, EncoderFormat, open_session
-from og_pointcloud.text.tokenizer import open_tokenizer
+from og_pointcloud.models import MODEL_NAME, EncoderFormat, home_folder, open_session
+from og_pointcloud.text.tokenizer import MOST_CHARACTERS, open_tokenizer
 
 if TYPE_CHECKING:
     from onnxruntime import InferenceSession
@@ -57,6 +58,8 @@ DEMO_ENCODER = Path(__file__).parents[1] / "masking" / "demo_encoder"
 """The encoder that comes with the library: it knows the demo's room and nothing else of the world."""
 CarriedEncoder: TypeAlias = "Callable[[], TextEncoder | None]"
 TEXTS_PER_RUN = 64
+MOST_TEMPLATES, LONGEST_TEMPLATE = 128, 400
+"""CLIP was published with 80."""
 VECTORS_REMEMBERED = 1 << 14
 ENCODER = EncoderFormat(
     FORMAT, SCHEMA_VERSION, ENCODER_FILES, GRAPH, OPERATORS, "og-pointcloud export text", optional=WORD_BANK
@@ -101,7 +104,7 @@ class TextEncoder:
         with others.
         """
         templates = self.templates if templates is None else check_templates(templates)
-        texts = [template.replace("{}", name) for name in names for template in templates]
+        texts = [template.replace("{}", name[:MOST_CHARACTERS]) for name in names for template in templates]
         vectors = self.encode(texts).reshape(len(names), len(templates), self.width).mean(axis=1)
         length = np.linalg.norm(vectors, axis=1, keepdims=True)
         return vectors / np.maximum(length, np.finfo(np.float32).tiny)
@@ -139,7 +142,7 @@ class TextEncoder:
 
     @cached_property
     def _session(self) -> InferenceSession:
-        return open_session(self._graph)
+        return open_session(self._graph, bounded=True)
 
 
 def read_text_encoder(folder: str | os.PathLike[str]) -> TextEncoder:
@@ -178,6 +181,11 @@ def find_encoder(feature_space: str, carried: CarriedEncoder | None = None) -> T
     encoder, or hold encoders. None where there is none; OgPointcloudError where there is one that cannot be used.
     """
     if carried is not None and (encoder := carried()):
+        if encoder.feature_space != feature_space:
+            raise FeatureSpaceError(
+                f"{encoder.where} is of feature space '{encoder.feature_space}', the scene of '{feature_space}', and "
+                "vectors of two spaces cannot be compared: store the scene's own (og-pointcloud export --help)"
+            )
         return encoder
     folder = ENCODER.find(feature_space, model_folders())
     return read_text_encoder(folder) if folder else None
@@ -187,22 +195,27 @@ def export_command(feature_space: str) -> str:
     """The command that makes the encoder of a feature space, where it will be found."""
     if MODEL_NAME.fullmatch(feature_space):  # OWNER/MODEL, found where it was fetched to
         return f"og-pointcloud export text {feature_space}"
-    return f"og-pointcloud export text MODEL_FOLDER --feature-space '{feature_space}'"
+    return shlex.join(["og-pointcloud", "export", "text", "MODEL_FOLDER", "--feature-space", feature_space])
 
 
 def cache_folder() -> Path:
     """The user's folder for encoders; it need not exist."""
     if sys.platform == "darwin":
-        return Path.home() / "Library" / "Caches" / "og_pointcloud"
+        return home_folder() / "Library" / "Caches" / "og_pointcloud"
     if sys.platform == "win32":
-        return Path(os.environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local") / "og_pointcloud" / "Cache"
+        return Path(os.environ.get("LOCALAPPDATA") or home_folder() / "AppData" / "Local") / "og_pointcloud" / "Cache"
     named = Path(os.environ.get("XDG_CACHE_HOME", ""))
-    return (named if named.is_absolute() else Path.home() / ".cache") / "og_pointcloud"
+    return (named if named.is_absolute() else home_folder() / ".cache") / "og_pointcloud"
 
 
 def check_templates(templates: Iterable[str]) -> tuple[str, ...]:
-    """At least one text with ``{}`` in it, else OgPointcloudError."""
+    """At least one text with ``{}`` in it, of bounded number and length, else OgPointcloudError."""
     templates = (templates,) if isinstance(templates, str) else tuple(templates)
+    if len(templates) > MOST_TEMPLATES or any(len(str(template)) > LONGEST_TEMPLATE for template in templates):
+        raise OgPointcloudError(
+            f"{len(templates)} templates of up to {max(len(str(template)) for template in templates)} characters; "
+            f"expected at most {MOST_TEMPLATES} of {LONGEST_TEMPLATE}: each is encoded for every word"
+        )
     wrong = [template for template in templates if not isinstance(template, str) or "{}" not in template]
     if wrong or not templates:
         raise OgPointcloudError(

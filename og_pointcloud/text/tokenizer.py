@@ -7,7 +7,9 @@ for very long, or give other ids on another run, is refused.
 
 from __future__ import annotations
 
+import base64
 import json
+import math
 import re
 import unicodedata
 from collections.abc import Iterator, Mapping
@@ -17,7 +19,10 @@ from typing import Any, Protocol
 
 from og_pointcloud.errors import MissingExtraError, OgPointcloudError
 
-__all__ = ["BYTE_CHARACTERS", "CLIP_NORMALIZER", "CLIP_WORDS", "ClipTokenizer", "Tokenizer", "open_tokenizer"]
+__all__ = [
+    "BYTE_CHARACTERS", "CLIP_NORMALIZER", "CLIP_WORDS", "MOST_CHARACTERS", "ClipTokenizer", "Tokenizer",
+    "open_tokenizer",
+]  # fmt: skip
 
 WHITESPACE = "\t\n\v\f\r \x85\xa0\u1680\u2000-\u200a\u2028\u2029\u202f\u205f\u3000"
 """Unicode's White_Space, as the inside of a character class; Python's ``\\s`` has four control characters more."""
@@ -37,6 +42,15 @@ LINEAR_PATTERN = re.compile(rf"(?:\\s| |\[(?:\\{SIGN}|(?![\[\\\]]){SIGN})+\])(?:
 """Regular expressions that no text makes slow: one character class, once or repeated."""
 MOST_CHARACTERS = 4096
 """A longer text is cut here before anything else; contexts hold 77 tokens or fewer."""
+LONGEST_PIECE, MOST_ADDED = 256, 1 << 12
+"""Characters of a piece, and pieces beside the vocabulary. Unigrams take time by the square of a piece's length."""
+MOST_GROWTH = 256
+"""How many times longer a text may become before it is cut into pieces."""
+GROWTH = {
+    "NFC": 3, "NFD": 4, "NFKC": 18, "NFKD": 18, "Lowercase": 3, "Strip": 1, "StripAccents": 1, "Nmt": 1,
+    "BertNormalizer": 4, "ByteLevel": 4, "Prepend": 2,
+}  # fmt: skip
+"""The same of each step of a normalizer, at worst, by Unicode's own tables."""
 PIECES_REMEMBERED = 1 << 14
 
 
@@ -221,6 +235,34 @@ def _check_other(description: dict[str, Any]) -> None:
     for pattern in _patterns([description.get("normalizer"), description.get("pre_tokenizer")]):
         if pattern not in (CLIP_WORDS, CLIP_SPECIALS + CLIP_WORDS) and not LINEAR_PATTERN.fullmatch(pattern):
             raise ValueError(f"it looks for the pattern {pattern!r:.80}, which some texts may make slow")
+
+    growth = _growth(description.get("normalizer") or {"type": "Strip"})
+    if growth > MOST_GROWTH:
+        raise ValueError(f"its normalizer makes texts {growth:.3g} times as long; expected at most {MOST_GROWTH}")
+    vocabulary, added = model["vocab"], description.get("added_tokens") or []
+    pieces = vocabulary if isinstance(vocabulary, dict) else (entry[0] for entry in vocabulary)
+    longest = max((len(piece) for piece in (*pieces, *(token["content"] for token in added))), default=0)
+    if longest > LONGEST_PIECE or len(added) > MOST_ADDED:
+        raise ValueError(
+            f"it has a piece of {longest} characters and {len(added)} added ones; expected at most {LONGEST_PIECE} and "
+            f"{MOST_ADDED}"
+        )
+
+
+def _growth(step: dict[str, Any]) -> float:
+    """How many times longer a normalizer makes a text, at worst."""
+    kind = step["type"]
+    if kind == "Sequence":
+        return math.prod(max(1.0, _growth(inner)) for inner in step["normalizers"])
+    if kind == "Replace":
+        return len(step["content"]) / max(1, len(step["pattern"].get("String", "")))
+    if kind == "Precompiled":
+        table = base64.b64decode(step["precompiled_charsmap"] or "")
+        trie = 4 + int.from_bytes(table[:4], "little")
+        return max(map(len, table[trie:].split(b"\0")))
+    if kind not in GROWTH or len(step.get("prepend", "")) > LONGEST_PIECE:
+        raise ValueError(f"its normalizer is a {kind!r:.40}; expected {', '.join(GROWTH)}")
+    return GROWTH[kind]
 
 
 def _patterns(value: Any) -> Iterator[str]:
