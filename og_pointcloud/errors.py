@@ -2,7 +2,19 @@
 
 from __future__ import annotations
 
-__all__ = ["BundleError", "FeatureSpaceError", "MissingExtraError", "OgPointcloudError", "SceneError"]
+__all__ = ["BundleError", "FeatureSpaceError", "MissingExtraError", "OgPointcloudError", "SceneError", "printable"]
+
+
+def printable(text: str, most: int | None = None) -> str:
+    """Foreign text as it may be shown: what would move the cursor, turn the text about or is half a character becomes
+    an escape; of more than ``most`` characters the end is left out.
+
+    >>> printable("mug\x1b[2J"), printable("chair" * 9, 12)
+    ('mug\\x1b[2J', 'chairchai...')
+    """
+    text = text if most is None else text[: most + 1]
+    shown = text if text.isprintable() else "".join(s if s.isprintable() else repr(s)[1:-1] for s in text)
+    return shown if most is None or len(shown) <= most else f"{shown[: most - 3]}..."
 
 
 class OgPointcloudError(ValueError):
@@ -16,7 +28,7 @@ class OgPointcloudError(ValueError):
     """
 
     def __init__(self, message: str) -> None:
-        super().__init__("".join(sign if sign.isprintable() else repr(sign)[1:-1] for sign in message))
+        super().__init__(printable(message))
 
 
 class SceneError(OgPointcloudError):

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
+from typing import Any
 
 import numba
-from numba import get_num_threads, njit, prange
+from numba import get_num_threads, prange
 
 __all__ = ["get_num_threads", "njit", "prange", "use_threads"]
 
@@ -19,3 +21,15 @@ if "NUMBA_THREADING_LAYER_PRIORITY" not in os.environ:
 def use_threads(count: int) -> None:
     """Run the kernels that this Python thread calls on so many threads, or as many as numba was started with."""
     numba.set_num_threads(max(1, min(count, numba.config.NUMBA_NUM_THREADS)))  # pyright: ignore
+
+
+def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
+    """`numba.njit`; where there is no folder that compiled code can be kept in, it is compiled anew in each process."""
+
+    def compiled(function: Callable[..., Any]) -> Any:
+        try:
+            return numba.njit(**options)(function)
+        except RuntimeError:  # "cannot cache function: no locator available"
+            return numba.njit(**{**options, "cache": False})(function)
+
+    return compiled

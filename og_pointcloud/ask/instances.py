@@ -22,7 +22,9 @@ from numpy.typing import ArrayLike, NDArray
 from og_pointcloud.ask.boxes import Box, axis_aligned_box, main_part, oriented_box
 from og_pointcloud.ask.choosing import Chooser
 from og_pointcloud.cloud import LabelledCloud, Vocabulary
+from og_pointcloud.errors import printable
 from og_pointcloud.formats.atomic import replacing
+from og_pointcloud.formats.tables import as_cell
 
 __all__ = ["EMPTY", "LABELLED", "NO_FEATURE", "Instance", "Instances", "list_instances"]
 
@@ -186,7 +188,7 @@ class Instances(Sequence[Instance]):
         # The longest row names all columns: one without points or words has fewer.
         writer = csv.DictWriter(text, dict.fromkeys(name for record in records for name in record), lineterminator="\n")
         writer.writeheader()
-        writer.writerows(records)
+        writer.writerows({name: as_cell(value) for name, value in record.items()} for record in records)
         _write(path, text.getvalue())
         return text.getvalue()
 
@@ -262,7 +264,7 @@ def _cells(row: Instance) -> tuple[str, ...]:
         row.state,
         "-" if row.centroid is None else " ".join(f"{value:.4g}" for value in row.centroid),
         "-" if box is None else " x ".join(f"{value:.3g}" for value in box.size),
-        ", ".join(f"{name} {score:.2f}" for name, score in row.words) or "-",
+        ", ".join(f"{printable(name, 40)} {score:.2f}" for name, score in row.words) or "-",
     )
 
 

@@ -36,6 +36,7 @@ from og_pointcloud.bundle.known_graph import query_tables
 from og_pointcloud.cloud import TOO_FAR, InstanceTable, LabelledCloud, Vocabulary, WordBank
 from og_pointcloud.errors import BundleError, OgPointcloudError
 from og_pointcloud.formats.npy import array_from_npy
+from og_pointcloud.text.text_features import check_names
 
 __all__ = ["Bundle", "read_bundle", "read_carried_encoder"]
 
@@ -269,6 +270,10 @@ def _vocabulary(manifest: dict[str, Any], members: dict[str, bytes]) -> Vocabula
     unique = isinstance(names, list) and all(isinstance(name, str) for name in names) and len(set(names)) == len(names)
     if not unique or len(names) != words:
         raise _Refused(f"vocabulary/names.json is not a list of {words} different words: {REBUILD}")
+    try:
+        check_names(names)
+    except OgPointcloudError as error:
+        raise _Refused(f"vocabulary/names.json: {error}") from None
     vectors = _array(members, "vocabulary/vectors.npy", FLOATS, (words, None))
     return Vocabulary(tuple(names), vectors.astype(np.float32))
 

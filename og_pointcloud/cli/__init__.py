@@ -3,20 +3,25 @@
 A file a command: its docstring is the help (what it does, and an example), ``add`` declares its options, ``run`` does
 the work. A command imports what it needs when it runs, so that ``--help`` answers at once and ``segment`` and ``pick``
 work on the base install. Progress, warnings and errors go to stderr, results to stdout. Exit codes: 0 done, 2 bad use
-or bad input, 130 interrupted.
+or bad input, 130 interrupted, 141 nobody reads on.
+
+Names and notes in files may be a stranger's: all that is printed goes through `printable`.
 """
 
 from __future__ import annotations
 
 import argparse
+import io
+import os
 import sys
 import warnings
 from collections.abc import Sequence
+from contextlib import redirect_stdout
 from importlib import import_module
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from og_pointcloud.cli.common import Parser, add_command, check_outputs, did_you_mean
-from og_pointcloud.errors import MissingExtraError, OgPointcloudError
+from og_pointcloud.errors import MissingExtraError, OgPointcloudError, printable
 
 __all__ = ["main"]
 
@@ -26,38 +31,75 @@ COMMANDS = (
 )  # fmt: skip
 MODULES = {"import": "import_", "eval": "evaluate", "ros-bag": "ros_bag"}
 """Command -> its module, where they are not called the same."""
+LONGEST_UNFORESEEN = 300
+"""Characters that are shown of an error that is none of ours."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; argv without the program's name, None for the process's own. Returns the exit code."""
     parser = build_parser()
     arguments, unknown = parser.parse_known_args(argv)
+    for stream in (sys.stdout, sys.stderr):  # which may know few characters, and file names hold any bytes
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
     try:
         if unknown:
             raise OgPointcloudError(describe_unknown_option(unknown[0], arguments))
         check_outputs(arguments)
-        with warnings.catch_warnings():
+        with warnings.catch_warnings(), redirect_stdout(Plain(sys.stdout)):  # pyright: ignore
             warnings.simplefilter("ignore")  # what libraries tell programmers
             warnings.simplefilter("always", UserWarning)
             warnings.showwarning = print_warning
             arguments.run(arguments)
-    except (OgPointcloudError, MissingExtraError, OSError, UnicodeError, MemoryError) as error:
-        print(f"error: {str(error) or 'out of memory'}", file=sys.stderr)
-        return 2
+            sys.stdout.flush()
     except KeyboardInterrupt:
         print("interrupted: the files of this command were not written", file=sys.stderr)
         return 130
+    except BrokenPipeError:  # as `| head` does; nothing is left to be said, not even on leaving
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 141
+    except Exception as error:
+        if arguments.debug:
+            raise
+        print(f"error: {describe_error(error)}", file=sys.stderr)
+        return 2
     return 0
+
+
+class Plain:
+    """A stream that passes on what is printed to it, `printable`."""
+
+    def __init__(self, stream: Any) -> None:
+        self._stream = stream
+
+    def write(self, text: str) -> int:
+        return self._stream.write("\n".join(map(printable, text.split("\n"))))
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+
+def describe_error(error: Exception) -> str:
+    """One line: what our own errors say, a path and what the system says of it, else the kind of error too."""
+    if isinstance(error, MemoryError):
+        return "out of memory: give it less at once, or a machine with more"
+    if isinstance(error, OSError) and error.strerror:
+        return printable(f"'{error.filename}': {error.strerror}" if error.filename else error.strerror)
+    text = printable(str(error), None if isinstance(error, OgPointcloudError) else LONGEST_UNFORESEEN)
+    if isinstance(error, (OgPointcloudError, MissingExtraError, OSError)):
+        return text
+    return f"{type(error).__name__}: {text}; 'og-pointcloud --debug COMMAND ...' shows where: please report it"
 
 
 def print_warning(message: Warning | str, *_: object) -> None:
     """In place of Python's two lines with a file name, which say nothing to someone who typed a command."""
-    print(f"warning: {message}", file=sys.stderr)
+    print(f"warning: {printable(str(message))}", file=sys.stderr)
 
 
 def build_parser() -> Parser:
     parser = Parser(prog="og-pointcloud", description="Ask a point cloud or Gaussian splat for things by name.")
     parser.add_argument("--version", action=VersionAction, help="print the version and leave")
+    parser.add_argument("--debug", action="store_true", help="show where in the program an error came from")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for name in COMMANDS:
         module = import_module(f"og_pointcloud.cli.{MODULES.get(name, name)}")

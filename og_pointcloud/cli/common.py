@@ -7,6 +7,7 @@ import difflib
 import json
 import os
 import shlex
+import tempfile
 import time
 import zipfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -16,13 +17,15 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
-from og_pointcloud.errors import MissingExtraError, OgPointcloudError
+from og_pointcloud.errors import MissingExtraError, OgPointcloudError, printable
 
 if TYPE_CHECKING:
     from og_pointcloud.cloud import LabelledCloud
 
 SHOWN = 12
 """Words, and instances, that a list shows before it ends in dots."""
+LONGEST_CELL, LONGEST_NOTE = 60, 1000
+"""Characters that are shown of a name in a table or list, and of a note."""
 
 
 class Parser(argparse.ArgumentParser):
@@ -121,7 +124,8 @@ def check_output(option: str, path: Path, inputs: Sequence[Path]) -> None:
 def print_result(arguments: argparse.Namespace, result: Mapping[str, Any], show: Callable[[Any], None]) -> None:
     """As JSON where --json was given, else as ``show`` prints it."""
     if arguments.json:
-        print(json.dumps(result, indent=2, ensure_ascii=False))
+        text = json.dumps(result, indent=2, ensure_ascii=False)
+        print("".join(sign if sign.isprintable() or sign == "\n" else json.dumps(sign)[1:-1] for sign in text))
     else:
         show(result)
 
@@ -217,12 +221,29 @@ def next_segment_command(bundle: str, cloud: LabelledCloud) -> str:
 
 
 def write_fit(cloud: LabelledCloud, stages: list[dict[str, Any]], output: Path) -> LabelledCloud:
-    """Write the .ogpc file; returns the cloud with the seconds of all stages, writing included, in its provenance."""
+    """Write the .ogpc file; returns the cloud with the seconds of all stages, writing included, in its provenance.
+
+    OgPointcloudError, which says where the cloud is kept, where that file cannot be written.
+    """
     from og_pointcloud_export import write_bundle
+
+    from og_pointcloud.fitting.memory import scratch_root
 
     cloud = replace(cloud, provenance={**cloud.provenance, "stages": stages})
     with timed(stages, "write file"):
-        write_bundle(cloud, output)
+        try:
+            write_bundle(cloud, output)
+        except OSError as error:
+            kept = Path(tempfile.mkdtemp(prefix="og-pointcloud-", dir=scratch_root())) / output.name
+            try:
+                write_bundle(cloud, kept)
+            except OSError:
+                kept.parent.rmdir()
+                raise error from None
+            raise OgPointcloudError(
+                f"'{output}' cannot be written ({error.strerror}): the fit is kept in '{kept}': move it where there is "
+                "room"
+            ) from error
     return cloud
 
 
@@ -242,7 +263,7 @@ def numbers(text: str, option: str, count: int) -> list[float]:
 
 
 def some_of(words: Sequence[str]) -> str:
-    return ", ".join(words[:SHOWN]) + (", ..." if len(words) > SHOWN else "")
+    return ", ".join(printable(word, LONGEST_CELL) for word in words[:SHOWN]) + (", ..." if len(words) > SHOWN else "")
 
 
 def calibration_hint(bundle: Path | str) -> str:
@@ -257,13 +278,14 @@ def print_provenance(provenance: Mapping[str, Any]) -> None:
         rows = [(stage["name"], f"{stage['seconds']:.2f}") for stage in stages]
         print_table(("stage", "seconds"), [*rows, ("total", f"{sum(stage['seconds'] for stage in stages):.2f}")])
     for entry in provenance.get("left_out", []):
-        print(f"left out: {entry['what']}: {entry['why']}")
+        print(printable(f"left out: {entry['what']}: {entry['why']}", LONGEST_NOTE))
     for text in provenance.get("warnings", []):
-        print(f"warning: {text}")
+        print(printable(f"warning: {text}", LONGEST_NOTE))
 
 
 def print_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
     """The first column to the left, numbers to the right."""
+    rows = [[printable(cell, LONGEST_CELL) for cell in row] for row in rows]
     widths = [max(len(row[column]) for row in [header, *rows]) for column in range(len(header))]
     for row in [header, *rows]:
         first, *others = (cell.rjust(width) for cell, width in zip(row, widths, strict=True))

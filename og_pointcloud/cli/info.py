@@ -17,7 +17,7 @@ from og_pointcloud.cli.common import (
     print_result,
     some_of,
 )  # fmt: skip
-from og_pointcloud.errors import BundleError
+from og_pointcloud.errors import BundleError, printable
 
 if TYPE_CHECKING:
     from og_pointcloud.ask.labelled_scene import LabelledScene
@@ -54,7 +54,8 @@ def print_info(scene: LabelledScene, path: Path) -> None:
     """The file's size, frame and words, its largest instances, and how it was made."""
     cloud, manifest = scene.cloud, scene.manifest
     words = cloud.vocabulary.names if cloud.vocabulary else ()
-    print(f"{path}: {path.stat().st_size / 1e6:.1f} MB, {manifest.get('written_by', 'unknown writer')}")
+    writer = printable(str(manifest.get("written_by", "unknown writer")), 60)
+    print(f"{path}: {path.stat().st_size / 1e6:.1f} MB, {writer}")
     print(f"{len(cloud):,} points, {len(cloud.instances)} instances, feature space '{cloud.feature_space}'")
     origin = ", ".join(f"{value:g}" for value in cloud.origin)
     print(f"spacing {cloud.spacing:.4g}, reach {cloud.reach:.4g}, origin ({origin}), in the capture's unit")

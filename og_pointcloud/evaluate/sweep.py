@@ -36,6 +36,7 @@ from og_pointcloud.evaluate.metrics import score_labels
 from og_pointcloud.evaluate.truth import GT_NAME, Truth, read_truth
 from og_pointcloud.formats.atomic import replacing
 from og_pointcloud.formats.capture import read_capture
+from og_pointcloud.formats.tables import as_cell
 from og_pointcloud.journal import Journal
 from og_pointcloud.scene import Scene
 from og_pointcloud.settings import FitSettings
@@ -295,7 +296,9 @@ def write_rows(rows: Iterable[Row], path: Path) -> Path:
     lines = csv.DictWriter(text, [*(one.name for one in fields(Row)), *where], lineterminator="\n")
     lines.writeheader()
     for row in rows:
-        lines.writerow(asdict(row) | {"left_out": "; ".join(str(entry["what"]) for entry in row.left_out)} | where)
+        left_out = "; ".join(str(entry["what"]) for entry in row.left_out)
+        record = asdict(row) | {"left_out": left_out} | where
+        lines.writerow({name: as_cell(value) for name, value in record.items()})
     with replacing(path) as file:
         file.write(text.getvalue().encode())
     return path

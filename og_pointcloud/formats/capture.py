@@ -33,7 +33,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud.errors import MissingExtraError, SceneError
+from og_pointcloud.errors import MissingExtraError, SceneError, printable
 from og_pointcloud.formats import colmap
 from og_pointcloud.formats.depth import DepthFile, DepthFrame, find_depth, resampled
 from og_pointcloud.formats.faces import Face
@@ -144,7 +144,8 @@ def _stated_poses(capture: Path) -> CapturePoses:
 def _warn_of_dropped(source: Path, paths: Sequence[str]) -> None:
     if paths:
         warnings.warn(
-            f"{source}: {len(paths)} frames have no finite pose and are left out, e.g. '{paths[0]}'", stacklevel=4
+            f"{source}: {len(paths)} frames have no finite pose and are left out, e.g. '{printable(paths[0], 80)}'",
+            stacklevel=4,
         )
 
 
@@ -361,7 +362,8 @@ def find_images(capture: Path, images: Sequence[PosedImage]) -> list[Path | None
     missing = [image.path for image, file in zip(images, files, strict=True) if file is None]
     if missing:
         warnings.warn(
-            f"{capture}: {len(missing)} of {len(images)} images are listed but not found, e.g. '{missing[0]}'; "
+            f"{capture}: {len(missing)} of {len(images)} images are listed but not found, e.g. "
+            f"'{printable(missing[0], 80)}'; "
             "their views have masks but no colours",
             stacklevel=3,
         )

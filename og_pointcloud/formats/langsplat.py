@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.cloud import UNKNOWN_SPACE
-from og_pointcloud.errors import SceneError
+from og_pointcloud.errors import SceneError, printable
 from og_pointcloud.formats.mask_files import MaskLayer, as_float32, require_all
 from og_pointcloud.formats.npy import mapped_array
 
@@ -56,7 +56,8 @@ def read_language_features(capture: Path, names: Sequence[str], level: str) -> t
         )
     if empty:
         warnings.warn(
-            f"{len(empty)} of {len(names)} views have no mask at level '{level}', e.g. '{empty[0]}'", stacklevel=2
+            f"{len(empty)} of {len(names)} views have no mask at level '{level}', e.g. '{printable(empty[0], 80)}'",
+            stacklevel=2,
         )
     return layers, _feature_space(folder, layers)
 

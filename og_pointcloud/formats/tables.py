@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from og_pointcloud.errors import SceneError
 
 __all__ = [
-    "LABEL_FINITE",     "colors", "naming", "positions", "read_text_rows", "stack_columns",
+    "LABEL_FINITE", "as_cell", "colors", "naming", "positions", "read_text_rows", "stack_columns",
     "storable_positions",
 ]  # fmt: skip
 
@@ -21,6 +21,11 @@ COLOR_COLUMNS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "dif
 LABEL_FINITE = "label the finite points alone, points[np.isfinite(points).all(axis=1)]"
 """What helps where a cloud with NaN or infinity is to be saved in a format that cannot hold them."""
 PACKED_COLOR_COLUMNS = ("rgb", "rgba")
+
+
+def as_cell(value: object) -> object:
+    """A value for a CSV: text that a spreadsheet would take for a formula gets a quote mark before it."""
+    return f"'{value}" if isinstance(value, str) and value[:1] in ("=", "+", "-", "@", "\t", "\r") else value
 
 
 @contextmanager

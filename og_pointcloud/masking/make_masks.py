@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.cloud import UNKNOWN_SPACE
-from og_pointcloud.errors import OgPointcloudError, SceneError
+from og_pointcloud.errors import OgPointcloudError, SceneError, printable
 from og_pointcloud.formats.atomic import locked, replacing
 from og_pointcloud.formats.images import require_cv2
 from og_pointcloud.formats.langsplat import LANGUAGE_FEATURES_FOLDER
@@ -66,7 +66,7 @@ def make_masks(
     output: str | os.PathLike[str] | None = None,
     *,
     overwrite: bool = False,
-    say: Say = lambda text: print(text, file=sys.stderr, flush=True),
+    say: Say = lambda text: print(printable(text), file=sys.stderr, flush=True),
 ) -> MasksMade:
     """Make the masks of a capture folder, readable by `read_capture`.
 

@@ -17,9 +17,10 @@ from og_pointcloud.cloud import UNKNOWN_SPACE, Vocabulary
 from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError
 from og_pointcloud.formats.npy import arrays_from_npz
 
-__all__ = ["MAX_UNPACKED_BYTES", "checked_vocabulary", "read_text_features"]
+__all__ = ["MAX_UNPACKED_BYTES", "check_names", "checked_vocabulary", "read_text_features"]
 
 MAX_UNPACKED_BYTES = 1 << 30
+LONGEST_NAME = 1000
 
 
 def read_text_features(path: str | os.PathLike[str]) -> tuple[Vocabulary, str]:
@@ -59,10 +60,20 @@ def read_text_features(path: str | os.PathLike[str]) -> tuple[Vocabulary, str]:
             "a name, and at least one"
         )
     try:
+        check_names(names.tolist())
         vocabulary = checked_vocabulary(names.tolist(), vectors)
     except OgPointcloudError as error:
         raise FeatureSpaceError(f"{path}: {error}") from None
     return vocabulary, str(entries.get("feature_space", UNKNOWN_SPACE))
+
+
+def check_names(names: Sequence[str]) -> None:
+    """OgPointcloudError for a name in a file that is longer than any word, or holds half a character."""
+    for name in names:
+        if len(name) > LONGEST_NAME or any("\ud800" <= sign <= "\udfff" for sign in name):
+            raise OgPointcloudError(
+                f"the name {name!r:.60} has {len(name)} characters; expected whole ones, at most {LONGEST_NAME}"
+            )
 
 
 def checked_vocabulary(names: Sequence[str], vectors: NDArray[Any]) -> Vocabulary:

@@ -17,7 +17,7 @@ from typing import Any
 
 from og_pointcloud.ask.choosing import Reason
 from og_pointcloud.ask.labelled_scene import Segmenter
-from og_pointcloud.errors import MissingExtraError, OgPointcloudError, SceneError
+from og_pointcloud.errors import MissingExtraError, OgPointcloudError, SceneError, printable
 from og_pointcloud.formats.atomic import replacing_folder
 from og_pointcloud_ros.detections import to_label_info
 from og_pointcloud_ros.labelling import MINIMUM_POINTS, CloudLabeller, LabelledMessages
@@ -253,7 +253,8 @@ def _transforms(reader: Reader, store: Any) -> TransformTree:
         except Exception as error:  # decoded, but a nonsense still
             damaged[_first_line(error)] += 1
     if damaged:
-        warnings.warn(f"{damaged.total()} messages of transforms left out: {next(iter(damaged))}", stacklevel=3)
+        example = printable(next(iter(damaged)))
+        warnings.warn(f"{damaged.total()} messages of transforms left out: {example}", stacklevel=3)
     return tree
 
 
