@@ -8,15 +8,17 @@ from __future__ import annotations
 
 import importlib
 import os
+import re
+from hashlib import blake2b
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud.errors import MissingExtraError, SceneError
+from og_pointcloud.errors import MissingExtraError, OgPointcloudError, SceneError
 
-__all__ = ["NAMES_FIELD", "SCENE_FIELD", "carried_scene", "import_plugin", "world_points"]
+__all__ = ["NAMES_FIELD", "SCENE_FIELD", "carried_scene", "import_plugin", "scene_name", "world_points"]
 
 SCENE_FIELD = "og_pointcloud_scene"
 """Field of a PyVista dataset that names the .ogpc file its labels came from."""
@@ -46,11 +48,37 @@ def world_points(pcd: Any) -> NDArray[np.float64]:
     return _checked(values, kind)
 
 
+_NAMED: dict[str, Path] = {}
+"""Files that datasets of this process came from, by what the datasets call them."""
+
+
+def scene_name(path: str | os.PathLike[str]) -> str:
+    """What a dataset says of the .ogpc file that it came from: its name, and digits that tell it from others of that
+    name. Not its path: datasets are saved, and passed on."""
+    path = Path(path).resolve()
+    name = f"{path.name}#{blake2b(os.fsencode(path), digest_size=4).hexdigest()}"
+    _NAMED[name] = path
+    return name
+
+
 def carried_scene(pcd: Any) -> Path | None:
-    """The .ogpc file that a cloud says its labels came from, if it says so."""
-    if _host(pcd) == "pyvista" and SCENE_FIELD in pcd.field_data:
-        return Path(str(np.asarray(pcd.field_data[SCENE_FIELD]).ravel()[0]))
-    return None
+    """The .ogpc file that a cloud says its labels came from, if it says so: one that this process has opened for it,
+    else a file of that name in the working folder. A dataset may be a stranger's, so it names no other place.
+
+    OgPointcloudError where there is no such file.
+    """
+    if _host(pcd) != "pyvista" or SCENE_FIELD not in pcd.field_data:
+        return None
+    named = str(np.asarray(pcd.field_data[SCENE_FIELD]).ravel()[0])
+    if path := _NAMED.get(named):
+        return path
+    beside = Path(re.split(r"[/\\]", named.partition("#")[0])[-1])
+    if beside.suffix == ".ogpc" and beside.is_file():
+        return beside
+    raise OgPointcloudError(
+        f"the dataset says that its labels came from '{named:.200}', which was not opened here and is not in this "
+        "folder; expected scene=og.load('S.ogpc'), or its path"
+    )
 
 
 def import_plugin(module: str, extra: str) -> Any:

@@ -73,7 +73,7 @@ def scene_words(
         vocabulary, name = read_text_features(own)
         of_words = FeatureSpace(name, vocabulary.vectors.shape[1])
         if name != space.name or not space.accepts(of_words):
-            reason = f"{own} is of {of_words}, the masks are of {space}: encode the names with the masks' model"
+            reason = f"{own.name} is of {of_words}, the masks are of {space}: encode the names with the masks' model"
             vocabulary, left_out = None, (left_out_entry(LeftOut.VOCABULARY, reason=reason),)
     if word_bank is not None:
         bank, name = read_bank(word_bank)

@@ -194,7 +194,9 @@ def _mask_table(surface: Surface, settings: FitSettings, journal: Journal, work:
             "views_side_by_side": at_once,
         }
         if work.found:
-            journal.leave_out(LeftOut.RENDERING, count=work.found, folder=str(work.folder))
+            journal.leave_out(
+                LeftOut.RENDERING, count=work.found, folder="" if work.folder is None else work.folder.name
+            )
         require_sight(table.exposure.nnz, table.weights.nnz, surface.scene)
         table = replace(table, mask_pixels=table.mask_pixels * surface.stride**2)
         return _front_surfaces(surface, table, settings, journal)

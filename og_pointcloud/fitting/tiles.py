@@ -416,7 +416,7 @@ def _look(scene: Scene, cloud: _TiledCloud, drawing: _Drawing, run: _Run) -> _Sh
     for view in looked:
         work.adopt("view", view.key)
     if found:
-        journal.leave_out(LeftOut.RENDERING, count=found, folder=str(work.folder))
+        journal.leave_out(LeftOut.RENDERING, count=found, folder="" if work.folder is None else work.folder.name)
     masks = [view.mask_features for view in scene.views if view.mask_count]
     require_sight(sum(int(view.first[-1]) for view in looked), len(masks), scene)
     drawn, inside = (sum(counts) for counts in zip((0, 0), *(view.drawn for view in looked if view.drawn), strict=True))

@@ -106,7 +106,12 @@ def write_las(
     with naming(path):
         las = labelled_las(xyz_world, rgb, attributes, names)
         with replacing(path) as file:
-            las.write(file, do_compress=path.suffix == ".laz")
+            try:
+                las.write(file, do_compress=path.suffix == ".laz")
+            except OSError:
+                raise
+            except Exception as error:  # a full disk, as lazrs has it
+                raise SceneError(f"it cannot be written ({error!s:.120}): is there room?") from error
 
 
 def _laspy() -> Any:

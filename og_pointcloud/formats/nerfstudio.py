@@ -92,7 +92,7 @@ def _matrix(keys: dict[str, Any], key: str) -> NDArray[np.float64]:
     value = keys.get(key)
     try:
         matrix = np.array(value, np.float64)
-    except (ValueError, TypeError):
+    except (ValueError, TypeError, OverflowError):
         matrix = np.empty(0)
     if matrix.shape == (3, 4):
         matrix = np.vstack([matrix, [0.0, 0.0, 0.0, 1.0]])

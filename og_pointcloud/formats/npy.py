@@ -21,6 +21,8 @@ __all__ = ["array_from_npy", "array_from_zip", "arrays_from_npz", "mapped_array"
 LONGEST_HEADER = 1 << 17
 """Bytes in which a header ends; numpy reads none of more than 10,000 characters."""
 LAST_CHARACTER = 0x10FFFF
+MOST_RATIO, PLENTY = 200, 1 << 26
+"""How many times its bytes a file may unpack to, and the bytes that any may. Vectors hardly shrink, masks by 100."""
 
 
 def array_from_npy(data: bytes | mmap.mmap) -> NDArray[Any]:
@@ -72,6 +74,9 @@ def arrays_from_npz(file: Path, names: Iterable[str], most_bytes: int) -> tuple[
             infos = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
             if (total := sum(info.file_size for info in infos.values())) > most_bytes:
                 raise ValueError(f"it unpacks to {total} bytes; expected at most {most_bytes}")
+            most_packed = max(PLENTY, MOST_RATIO * file.stat().st_size)
+            if total > most_packed:
+                raise ValueError(f"it unpacks to {total} bytes, {MOST_RATIO} times its own: it is made to fill memory")
             return {name: array_from_zip(archive, infos[name]) for name in names if name in infos}, list(infos)
     except (zipfile.BadZipFile, zlib.error, ValueError, OSError, EOFError, RuntimeError) as error:
         raise ValueError(

@@ -25,6 +25,7 @@ __all__ = ["join_columns", "read_ply", "write_ply"]
 HEADER_LIMIT = 1 << 18
 """Bytes in which a header must end; the longest known (a 3DGS file with its training record) has 4 kB."""
 
+MOST_PROPERTIES = 1024
 LONGEST_NAME = 80
 
 NUMPY_TYPES = {
@@ -149,6 +150,8 @@ def _add_property(element: _Element, words: list[str], number: int) -> None:
     kind, name = words
     if kind not in NUMPY_TYPES:
         raise SceneError(f"header line {number}: unknown type {kind!r:.60}; expected one of {', '.join(NUMPY_TYPES)}")
+    if len(element.columns) >= MOST_PROPERTIES:
+        raise SceneError(f"header line {number}: element '{element.name}' has more than {MOST_PROPERTIES} properties")
     if name in element.columns:
         raise SceneError(f"header line {number}: element '{element.name}' has property '{name}' twice")
     element.columns[name] = NUMPY_TYPES[kind]

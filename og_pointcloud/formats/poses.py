@@ -19,6 +19,7 @@ from og_pointcloud.formats.lenses import Lens
 from og_pointcloud.scene import Camera
 
 __all__ = [
+    "MAX_JSON_BYTES",
     "PosedFrames",
     "PosedImage",
     "in_local_frame",
@@ -103,12 +104,12 @@ def numbered(files: Iterable[Path]) -> list[Path]:
     return sorted(files, key=lambda file: ([int(digits) for digits in re.findall(r"\d+", file.name)], file.name))
 
 
-def read_json(file: Path) -> Any:
-    """What a JSON file of bounded size holds. SceneError where it is none."""
-    if (size := file.stat().st_size) > MAX_JSON_BYTES:
-        raise SceneError(f"{file} has {size} bytes; expected at most {MAX_JSON_BYTES}")
+def read_json(file: Path, most: int = MAX_TEXT_BYTES) -> Any:
+    """What a JSON file of bounded size holds, which takes up to twenty times its bytes. SceneError where it is none."""
+    if (size := file.stat().st_size) > most:
+        raise SceneError(f"{file} has {size} bytes; expected at most {most}")
     try:
-        return json.loads(file.read_text(encoding="utf-8"))
+        return json.loads(file.read_text(encoding="utf-8-sig"))  # editors of Windows put a mark before it
     except (ValueError, RecursionError) as error:
         raise SceneError(f"{file} is not valid JSON ({error}): export it again") from None
 

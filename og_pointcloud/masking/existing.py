@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.images import MAX_PIXELS, png_header, require_cv2, without_suffix
 from og_pointcloud.formats.mask_files import read_ids
-from og_pointcloud.formats.poses import read_json
+from og_pointcloud.formats.poses import MAX_JSON_BYTES, read_json
 from og_pointcloud.masking.contracts import MaskProposer, Proposals
 
 __all__ = ["CallableProposer", "ExistingMasks", "as_proposals", "decode_rle", "from_ids", "own_proposer"]
@@ -109,7 +109,7 @@ class ExistingMasks:
         if png.is_file():
             return _resized(from_ids(_read_ids(png), none=-1), shape)
         if single.is_file():
-            return _resized(_from_annotations(_annotations(read_json(single)), str(single)), shape)
+            return _resized(_from_annotations(_annotations(read_json(single, MAX_JSON_BYTES)), str(single)), shape)
         stem = image_name.rsplit("/", 1)[-1]
         for key in (image_name, stem):
             if key in self._coco:
@@ -124,7 +124,7 @@ class ExistingMasks:
         """Annotations by image stem, each with the image's size, from all COCO files of the folder."""
         found: dict[str, list[dict[str, Any]]] = {}
         for file in sorted(self.folder.glob("*.json")):
-            content = read_json(file)
+            content = read_json(file, MAX_JSON_BYTES)
             if not (isinstance(content, dict) and isinstance(content.get("images"), list)):
                 continue
             stems: dict[Any, tuple[str, list[Any]]] = {}

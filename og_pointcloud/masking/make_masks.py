@@ -243,8 +243,15 @@ def _assemble(target: Path, settings: MaskSettings, tasks: Sequence[ImageTask]) 
 
 def _write_made(target: Path, settings: MaskSettings, tasks: Sequence[ImageTask], **record: Any) -> None:
     """record: what a run leaves that came to its end."""
-    made = {"made_by": "og-pointcloud masks", **asdict(settings), "images": len(tasks), **record}
+    named = {key: _last_part(value) for key, value in asdict(settings).items()}
+    made = {"made_by": "og-pointcloud masks", **named, "images": len(tasks), **record}
     _write_json(target / MASKS_FOLDER / MADE_NAME, made)
+
+
+def _last_part(value: Any) -> Any:
+    """Of a folder its name alone: captures are passed on, where models lie on this machine is nobody's business."""
+    kind, colon, name = value.rpartition(":") if isinstance(value, str) else ("", "", "")
+    return f"{kind}{colon}{Path(name).name}" if Path(name).is_absolute() else value
 
 
 def _write_mask_image(path: Path, ids: NDArray[np.int32]) -> None:

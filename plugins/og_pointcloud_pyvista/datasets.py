@@ -17,7 +17,7 @@ import pyvista as pv
 from numpy.typing import ArrayLike
 
 import og_pointcloud as og
-from og_pointcloud.ask.hosts import NAMES_FIELD, SCENE_FIELD
+from og_pointcloud.ask.hosts import NAMES_FIELD, SCENE_FIELD, scene_name
 from og_pointcloud.ask.instances import Instance
 from og_pointcloud.ask.labelled_scene import SceneLike, find_scene
 from og_pointcloud.ask.segmentation import Segmentation
@@ -163,7 +163,7 @@ def _attach(mesh: Any, result: Segmentation) -> None:
         mesh.set_active_scalars(LABEL, preference="point")
     set_strings(mesh, NAMES_FIELD, result.names)
     if result.scene is not None:
-        set_strings(mesh, SCENE_FIELD, [str(result.scene.resolve())])
+        set_strings(mesh, SCENE_FIELD, [scene_name(result.scene)])
     elif SCENE_FIELD in mesh.field_data:  # of an earlier answer
         mesh.field_data.remove(SCENE_FIELD)
 

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pyvista as pv
 
-from og_pointcloud.ask.hosts import SCENE_FIELD
+from og_pointcloud.ask.hosts import SCENE_FIELD, scene_name
 from og_pointcloud.ask.labelled_scene import as_scene
 from og_pointcloud_pyvista.datasets import INSTANCE, set_strings
 
@@ -29,5 +27,5 @@ def read_ogpc(path: str) -> pv.PolyData:
             mesh.point_data[RGB] = scene.cloud.rgb
         mesh.point_data[INSTANCE] = scene.instance_ids
         mesh.set_active_scalars(INSTANCE, preference="point")
-    set_strings(mesh, SCENE_FIELD, [str(Path(path).resolve())])
+    set_strings(mesh, SCENE_FIELD, [scene_name(path)])
     return mesh

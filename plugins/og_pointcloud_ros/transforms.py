@@ -19,6 +19,7 @@ from og_pointcloud_ros.messages import NANOSECONDS, nanoseconds
 
 __all__ = ["TransformError", "TransformTree", "rotation_matrix", "slerp"]
 
+LEAST_LENGTH, MOST_FRAMES = 1e-6, 1000
 NEARLY_EQUAL = 1 - 1e-8
 """Cosine of half the angle between two rotations above which the arc is a straight line, to rounding."""
 
@@ -58,7 +59,7 @@ class TransformTree:
         """
         place, turn = np.asarray(translation, np.float64), np.asarray(rotation_xyzw, np.float64)
         length = float(np.linalg.norm(turn))
-        if not (np.isfinite(place).all() and np.isfinite(length) and length > 1e-6):
+        if not (np.isfinite(place).all() and np.isfinite(length) and length > LEAST_LENGTH):
             raise TransformError(
                 f"the transform from '{child}' to '{parent}' is {place.tolist()}, {turn.tolist()}; expected finite "
                 "numbers and a rotation of length 1"
@@ -102,6 +103,8 @@ class TransformTree:
         path = [frame]
         while path[-1] in self._edges:
             parent = self._edges[path[-1]].parent
+            if len(path) == MOST_FRAMES:
+                raise TransformError(f"'{frame}' hangs on more than {MOST_FRAMES} frames; expected a robot's tree")
             if parent in path:
                 raise TransformError(f"frames hang on each other: {' in '.join([*path, parent])}; expected a tree")
             path.append(parent)
@@ -145,8 +148,12 @@ def slerp(first: NDArray[np.float64], second: NDArray[np.float64], share: float)
 
 
 def rotation_matrix(xyzw: ArrayLike) -> NDArray[np.float64]:
-    """(3, 3) of a unit quaternion x y z w, ROS's order."""
-    return rotation_of_quaternion(np.roll(np.asarray(xyzw, np.float64), 1))
+    """(3, 3) of a quaternion x y z w, ROS's order; of any length but 0, else TransformError."""
+    turn = np.asarray(xyzw, np.float64)
+    length = float(np.linalg.norm(turn))
+    if not (np.isfinite(length) and length > LEAST_LENGTH):
+        raise TransformError(f"a rotation is {turn.tolist()}; expected a quaternion of length 1")
+    return rotation_of_quaternion(np.roll(turn / length, 1))
 
 
 def _matrix(translation: NDArray[np.float64], xyzw: NDArray[np.float64]) -> NDArray[np.float64]:
