@@ -82,7 +82,7 @@ class Plain:
 def describe_error(error: Exception) -> str:
     """One line: what our own errors say, a path and what the system says of it, else the kind of error too."""
     if isinstance(error, MemoryError):
-        return "out of memory: give it less at once, or a machine with more"
+        return "out of memory"
     if isinstance(error, OSError) and error.strerror:
         return printable(f"'{error.filename}': {error.strerror}" if error.filename else error.strerror)
     text = printable(str(error), None if isinstance(error, OgPointcloudError) else LONGEST_UNFORESEEN)

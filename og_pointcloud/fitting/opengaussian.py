@@ -212,7 +212,7 @@ def _provenance(
     warnings = [f"{undescribed} of {count} instances have no feature and answer unknown"] if undescribed else []
     return {
         "source": "OpenGaussian result",
-        "files": {"gaussians": ply.name, "clusters": clusters.name},
+        "files": {"gaussians": f"{ply.parent.name}/{ply.name}", "clusters": clusters.name},
         "settings": {"min_opacity": min_opacity},
         "stages": [],
         "left_out": left_out,

@@ -19,7 +19,10 @@ from og_pointcloud_ros.messages import NANOSECONDS, nanoseconds
 
 __all__ = ["TransformError", "TransformTree", "rotation_matrix", "slerp"]
 
-LEAST_LENGTH, MOST_FRAMES = 1e-6, 1000
+LEAST_LENGTH = 1e-6
+"""Of a quaternion that still says how something is turned."""
+MOST_FRAMES = 1000
+"""Frames that may hang on each other; robots have tens."""
 NEARLY_EQUAL = 1 - 1e-8
 """Cosine of half the angle between two rotations above which the arc is a straight line, to rounding."""
 
