@@ -147,7 +147,7 @@ def test_what_the_command_cannot_add(path, tmp_path, capsys, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     (tmp_path / "w.txt").write_text("grape\nsofa\nlamp\n")
     for arguments, says in (
-        ((tmp_path / "w.txt",), f"export text MODEL_FOLDER --feature-space '{SPACE}'"),
+        ((tmp_path / "w.txt",), f"export text MODEL_FOLDER --feature-space {SPACE}"),
         ((tmp_path / "w.txt", "--text-encoder", tmp_path), "has no manifest.json"),
         ((tmp_path / "w.txt", "-o", tmp_path / "t.zip"), "expected a name that ends in .ogpc"),
     ):
@@ -207,7 +207,7 @@ def test_the_command_stores_a_bank_of_text_features(path, tmp_path, capsys):
     for arguments, says in (
         ((tmp_path / "few.npz",), "few.npz: a word bank of 49 words; expected at least 50"),
         ((tmp_path / "other.npz",), "words of the bank are of feature space 'other'"),
-        ((), f"export text MODEL_FOLDER --feature-space '{SPACE}'"),
+        ((), f"export text MODEL_FOLDER --feature-space {SPACE}"),
     ):
         assert run("bank", path, *arguments) == 2
         assert says in capsys.readouterr().err
@@ -354,7 +354,7 @@ def test_a_carried_encoder_answers_whoever_asks_the_scene(path, encoder_folder):
         lambda: og.instance_table(scene, ["cat"]),
     )
     for ask in asks:
-        with pytest.raises(OgPointcloudError, match=rf"export text MODEL_FOLDER --feature-space '{SPACE}'"):
+        with pytest.raises(OgPointcloudError, match=rf"export text MODEL_FOLDER --feature-space {SPACE}"):
             ask()
     carry_encoder(path, encoder_folder)
     scene = og.load(path)
