@@ -30,6 +30,6 @@ def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
         try:
             return numba.njit(**options)(function)
         except RuntimeError:  # "cannot cache function: no locator available"
-            return numba.njit(**{**options, "cache": False})(function)
+            return numba.njit(**{**options, "cache": False})(function)  # pyright: ignore
 
     return compiled
