@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import json
 import struct
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -245,6 +247,22 @@ def test_damaged_las_files_give_one_error(tmp_path, ending):
 # glTF out
 
 
+def property_tables(document, binary):
+    """Strings of each property table (EXT_structural_metadata), the slow plain way."""
+    views = [binary[view["byteOffset"] :][: view["byteLength"]] for view in document["bufferViews"]]
+    tables = {}
+    metadata = document.get("extensions", {}).get("EXT_structural_metadata", {"propertyTables": []})
+    for table in metadata["propertyTables"]:
+        assert metadata["schema"]["classes"][table["class"]]["properties"] == {"name": {"type": "STRING"}}
+        place = table["properties"]["name"]
+        assert all(document["bufferViews"][view]["byteOffset"] % 8 == 0 for view in place.values())
+        ends = struct.unpack(f"<{table['count'] + 1}I", views[place["stringOffsets"]])
+        text = views[place["values"]]
+        tables[table["name"]] = [text[a:b].decode() for a, b in itertools.pairwise(ends)]
+        assert ends[-1] == len(text)
+    return tables
+
+
 def parsed(path):
     """A .glb the slow plain way: its document, and its attributes as arrays."""
     data = path.read_bytes()
@@ -267,7 +285,13 @@ def parsed(path):
         if "min" in accessor:
             assert arrays[name].min(axis=0).tolist() == accessor["min"]
             assert arrays[name].max(axis=0).tolist() == accessor["max"]
-    assert sum(view["byteLength"] for view in document["bufferViews"]) == binary_size
+    ends = [view["byteOffset"] + view["byteLength"] for view in document["bufferViews"]]
+    starts = [view["byteOffset"] for view in document["bufferViews"]]
+    assert all(0 <= start - end < 8 for start, end in zip(starts, [0, *ends], strict=False)), (
+        "no gaps but for alignment"
+    )
+    assert 0 <= binary_size - ends[-1] < 4
+    document["names"] = property_tables(document, binary)
     return document, arrays
 
 
@@ -278,8 +302,8 @@ def test_glb_holds_points_colours_and_feature_ids(tmp_path):
     origin = np.array(document["nodes"][0]["translation"])
     assert np.abs(arrays["POSITION"] + origin - xyz).max() < 1e-6
     first, second = document["meshes"][0]["primitives"][0]["extensions"]["EXT_mesh_features"]["featureIds"]
-    assert first == {"attribute": 0, "featureCount": 3, "nullFeatureId": 3, "label": "og_label"}
-    assert second == {"attribute": 1, "featureCount": 2, "nullFeatureId": 4, "label": "og_instance"}
+    assert first == {"attribute": 0, "featureCount": 3, "nullFeatureId": 3, "label": "og_label", "propertyTable": 0}
+    assert second == {"attribute": 1, "featureCount": 2, "nullFeatureId": 4, "label": "og_instance", "propertyTable": 1}
     labels = arrays["_FEATURE_ID_0"][:, 0]
     assert np.array_equal(np.where(labels == 3, -1, labels), result.labels)
     instances = arrays["_FEATURE_ID_1"][:, 0]
@@ -289,7 +313,20 @@ def test_glb_holds_points_colours_and_feature_ids(tmp_path):
     srgb = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
     assert np.array_equal(np.rint(255 * srgb), result.colors)
     assert document["meshes"][0]["extras"]["og_names"] == ["a", "b", "c"]
-    assert document["extensionsUsed"] == ["EXT_mesh_features"]
+    assert document["extensionsUsed"] == ["EXT_mesh_features", "EXT_structural_metadata"]
+
+
+def test_glb_names_labels_and_instances(tmp_path):
+    names = ["a chair", "", "Küche", "unused"]
+    result = replace(segmentation(np.arange(40) % 4 - 1, names), instances=np.arange(40, dtype=np.int32) % 8 - 1)
+    document, arrays = parsed(result.save(tmp_path / "out.glb"))
+    assert document["names"]["og_label"] == names
+    for row, label in zip(arrays["_FEATURE_ID_1"][:, 0], result.labels, strict=True):
+        if row < 7:
+            assert document["names"]["og_instance"][int(row)] == (names[label] if label >= 0 else "")
+    nothing, _ = parsed(segmentation([-1, -1], []).save(tmp_path / "none.glb"))
+    assert nothing["names"] == {}
+    assert nothing["extensionsUsed"] == ["EXT_mesh_features"]
 
 
 def test_trimesh_opens_it(tmp_path):

@@ -1,9 +1,10 @@
 """Labelled clouds as glTF 2.0, binary (.glb). Out only.
 
-Points with colours, label and instance as feature ids (EXT_mesh_features, attributes _FEATURE_ID_0 and _FEATURE_ID_1),
-score and reason as attributes of our own, names in the mesh's extras.
+Points with colors, label and instance as feature ids (EXT_mesh_features, attributes _FEATURE_ID_0 and _FEATURE_ID_1),
+their names in property tables (EXT_structural_metadata), which Cesium shows for a picked feature and styles by; score
+and reason as attributes of our own, names in the mesh's extras too.
 
-Format: Khronos, "glTF 2.0 Specification", and the extension's text.
+Format: Khronos, "glTF 2.0 Specification", and the extensions' texts.
 """
 
 from __future__ import annotations
@@ -30,7 +31,11 @@ COMPONENT_TYPES = {"f": 5126, "H": 5123}
 """FLOAT and UNSIGNED_SHORT. Ids are floats, exact up to 2^24: glTF has no 32-bit integers for vertices."""
 VECTOR_TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 GLB_MAGIC, GLB_VERSION, JSON_CHUNK, BINARY_CHUNK = b"glTF", 2, b"JSON", b"BIN\0"
-FEATURES = "EXT_mesh_features"
+FEATURES, METADATA = "EXT_mesh_features", "EXT_structural_metadata"
+ALIGNMENT = 8
+"""Of the buffers of property tables; columns need 4."""
+NAME = "name"
+"""The property of both tables: a label's name, and the name of an instance's label."""
 
 
 def write_gltf(
@@ -82,6 +87,8 @@ def write_gltf(
             for index, (label, (ids, none)) in enumerate(features.items())
         ]
         document, binary = _document(columns, origin, {FEATURES: {"featureIds": feature_sets}}, names)
+        tables = {"og_label": list(names), "og_instance": _instance_names(attributes, names)}
+        binary += _add_names(document, len(binary), tables, feature_sets)
         with replacing(path) as file:
             file.write(_as_glb(document, binary))
 
@@ -122,6 +129,49 @@ def _document(
     }
     little_endian = (column.astype(column.dtype.newbyteorder("<"), copy=False) for column in columns.values())
     return document, b"".join(column.tobytes() for column in little_endian)
+
+
+def _instance_names(attributes: Mapping[str, NDArray], names: Sequence[str]) -> list[str]:
+    """The name of each instance's label, "" where it has none; instances come from one choice, so any point tells."""
+    ids, labels = attributes["og_instance"], attributes["og_label"]
+    named = [""] * (int(ids.max(initial=-1)) + 1)
+    present, first = np.unique(ids, return_index=True)
+    for instance, label in zip(present.tolist(), labels[first].tolist(), strict=True):
+        if instance >= 0 and label >= 0:
+            named[instance] = names[label]
+    return named
+
+
+def _add_names(
+    document: dict[str, Any], start: int, tables: Mapping[str, Sequence[str]], feature_sets: list[dict[str, Any]]
+) -> bytes:
+    """Put property tables into a document, one a feature set, and return the bytes that go behind its ``start`` bytes.
+
+    Strings are one UTF-8 text, with the offsets of their starts and the end. A table without any text is left out: a
+    buffer cannot be empty.
+    """
+    binary, classes, made = b"", {}, []
+    for feature_set, (name, texts) in zip(feature_sets, tables.items(), strict=True):
+        encoded = [text.encode() for text in texts]
+        if not any(encoded):
+            continue
+        offsets = np.cumsum([0, *map(len, encoded)]).astype("<u4").tobytes()
+        places = {}
+        for role, data in (("values", b"".join(encoded)), ("stringOffsets", offsets)):
+            binary += b"\0" * (-(start + len(binary)) % ALIGNMENT)
+            places[role] = len(document["bufferViews"])
+            document["bufferViews"].append({"buffer": 0, "byteOffset": start + len(binary), "byteLength": len(data)})
+            binary += data
+        classes[name] = {"properties": {NAME: {"type": "STRING"}}}
+        feature_set["propertyTable"] = len(made)
+        made.append({"name": name, "class": name, "count": len(texts), "properties": {NAME: places}})
+    if made:
+        document["extensionsUsed"].append(METADATA)
+        schema = {"id": "og_pointcloud", "classes": classes}
+        document["extensions"] = {METADATA: {"schema": schema, "propertyTables": made}}
+    binary += b"\0" * (-(start + len(binary)) % 4)
+    document["buffers"][0]["byteLength"] += len(binary)
+    return binary
 
 
 def _accessor(view: int, column: NDArray, *, with_bounds: bool) -> dict[str, Any]:
