@@ -16,6 +16,7 @@ RECORDS = ("errors", "scene", "cloud", "settings", "journal", "models", "kernels
 FOLDERS = (
     "formats",
     "rendering",
+    "checking",
     "text",
     "masking",
     "fitting",

@@ -17,7 +17,7 @@ from scenes import (
 
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.depth import DepthFile, DepthFrame, DepthImage, resampled
-from og_pointcloud.formats.fusion import _Voxels, doubtful_unit, evenly, fuse, on_surface, survey, to_world
+from og_pointcloud.formats.fusion import _Voxels, doubtful_depth, evenly, fuse, on_surface, survey, to_world
 from og_pointcloud.formats.lenses import lens_of
 
 WIDTH, HEIGHT = ROOM_SIZE
@@ -267,7 +267,7 @@ def test_voxels_are_the_means_of_their_points_however_often_they_are_added_to():
 
 
 def test_depth_that_fits_raises_no_doubt(tmp_path):
-    assert doubtful_unit(write_frames(tmp_path)) is None
+    assert doubtful_depth(write_frames(tmp_path)) is None
 
 
 def test_a_wrong_unit_is_named(tmp_path):
@@ -275,7 +275,7 @@ def test_a_wrong_unit_is_named(tmp_path):
         DepthFrame(frame.name, DepthFile(frame.depth.path, frame.depth.camera, 1.0), frame.colors)
         for frame in write_frames(tmp_path)
     ]
-    said = doubtful_unit(frames)
+    said = doubtful_depth(frames)
     assert said is not None
     assert "times 0.001" in said
 

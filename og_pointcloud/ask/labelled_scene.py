@@ -36,6 +36,10 @@ __all__ = [
 
 SceneLike: TypeAlias = "LabelledScene | LabelledCloud | str | os.PathLike[str]"
 
+ELSEWHERE_SHARE = 1 / 3
+"""Of the points asked: where more lie too far from the scene, the two may be in different frames."""
+RIGID = 1e-2
+"""A rotation's rows are of length one and upright to each other within this."""
 POINTS_PER_RUN = 1 << 20
 """What bounds the memory of the graph: about 150 MB."""
 
@@ -306,7 +310,7 @@ class Segmenter:
             points, labels, scores, instances, reasons, self.names, scene.path, self._choice.calibrated,
             scene.certainty_at,
         )  # fmt: skip
-        if not self._warned and (reason := _why_nothing(result, scene)):
+        if not self._warned and (reason := _why_few(result, scene)):
             self._warned = True
             warnings.warn(reason, stacklevel=3)  # where segment, or the segmenter, is called
         return result
@@ -397,25 +401,36 @@ def _posed(points: NDArray[np.float64], pose: ArrayLike | None) -> NDArray[np.fl
     if pose is None:
         return points
     matrix = pose_matrix(pose)
+    with np.errstate(invalid="ignore", over="ignore"):
+        error = float(np.abs(matrix[:3, :3] @ matrix[:3, :3].T - np.eye(3)).max())
+        determinant = float(np.linalg.det(matrix[:3, :3]))
+    if not error <= RIGID or determinant < 0:  # also where the error is NaN
+        raise SceneError(
+            f"the rotation of pose is off a rotation matrix by {error:.3g} (det {determinant:.3g}); expected a rigid "
+            "pose: bring the points into the scene's unit first, and remove mirroring"
+        )
     with np.errstate(invalid="ignore", over="ignore"):  # rows with NaN or infinity stay such
         return points @ matrix[:3, :3].T + matrix[:3, 3]
 
 
-def _why_nothing(result: Segmentation, scene: LabelledScene) -> str | None:
-    """Why no point has a label; None if one has."""
+def _why_few(result: Segmentation, scene: LabelledScene) -> str | None:
+    """Why no point has a label, or that many lie elsewhere than the scene; None where neither is so."""
     if len(result) == 0:
         return "no point has a label: the cloud has 0 points (a file that could not be read may give such a cloud)"
-    if not result.reasons.all():  # Reason.LABELLED is 0
-        return None
-    counts = result.unknown_because()
-    parts = [f"{count} are {reason}" for reason, count in counts.items()]
-    advice = ""
-    if set(counts) == {Reason.TOO_FAR} and len(scene.cloud) and (finite := np.isfinite(result.xyz).all(axis=1)).any():
-        advice = (
-            f"; the points span {_box(result.xyz[finite])}, the scene {_box(scene.xyz)}, its reach is "
+    finite = np.logical_and.reduce(np.isfinite(result.xyz), axis=1)
+    far = int((finite & (result.reasons == Reason.TOO_FAR)).sum())
+    place = ""
+    if far > ELSEWHERE_SHARE * finite.sum() and len(scene.cloud):
+        place = (
+            f"the points span {_box(result.xyz[finite])}, the scene {_box(scene.xyz)}, its reach is "
             f"{scene.cloud.reach:.4g}: bring them into the scene's frame and unit"
         )
-    return f"none of {len(result)} points has a label: {', '.join(parts)}{advice}"
+    if result.reasons.all():  # Reason.LABELLED is 0
+        parts = [f"{count} are {reason}" for reason, count in result.unknown_because().items()]
+        return f"none of {len(result)} points has a label: {', '.join(parts)}{f'; {place}' if place else ''}"
+    return (
+        place and f"{far} of {len(result)} points are {Reason.TOO_FAR}, so that other labels may be wrong too; {place}"
+    )
 
 
 def _box(points: NDArray[np.float64]) -> str:

@@ -26,8 +26,8 @@ from og_pointcloud.errors import MissingExtraError, OgPointcloudError, printable
 __all__ = ["main"]
 
 COMMANDS = (
-    "masks", "models", "fit", "update", "compare", "fuse", "import", "segment", "select", "pick", "instances", "index",
-    "find", "edit", "view", "serve", "ros-bag", "info", "vocabulary", "export", "eval", "report", "demo",
+    "masks", "models", "fit", "update", "compare", "fuse", "repair", "import", "segment", "select", "pick", "instances",
+    "index", "find", "edit", "view", "serve", "ros-bag", "info", "vocabulary", "export", "eval", "report", "demo",
 )  # fmt: skip
 MODULES = {"import": "import_", "eval": "evaluate", "ros-bag": "ros_bag"}
 """Command -> its module, where they are not called the same."""

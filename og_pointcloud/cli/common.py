@@ -9,6 +9,7 @@ import os
 import shlex
 import tempfile
 import time
+import warnings
 import zipfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -21,6 +22,7 @@ from og_pointcloud.errors import MissingExtraError, OgPointcloudError, printable
 
 if TYPE_CHECKING:
     from og_pointcloud.cloud import LabelledCloud
+    from og_pointcloud.scene import Points, Scene
 
 SHOWN = 12
 """Words, and instances, that a list shows before it ends in dots."""
@@ -191,6 +193,7 @@ def describe_fit(cloud: LabelledCloud, capture: Path, bundle: Path) -> dict[str,
 def print_fit(report: Mapping[str, Any], cloud: LabelledCloud) -> None:
     """What ``fit`` closes with; ends in the next command."""
     print_provenance(cloud.provenance)
+    print_checks(report.get("checks", []), report["capture"])
     total = report["points"]
     shares = [report[f"points_{state}"] / total for state in ("in_instances", "background", "unobserved")]
     print(
@@ -245,6 +248,38 @@ def write_fit(cloud: LabelledCloud, stages: list[dict[str, Any]], output: Path) 
                 "room"
             ) from error
     return cloud
+
+
+def print_checks(checks: Sequence[Mapping[str, str]], capture: Path | str) -> None:
+    """What fits together in a line, what could not be checked in another, and each doubt with the line to type."""
+    for verdict, word in (("ok", "checked"), ("unchecked", "unchecked")):
+        names = [check["name"] for check in checks if check["verdict"] == verdict]
+        if names:
+            print(f"{word}: {', '.join(names)}")
+    for check in checks:
+        if check["verdict"] == "doubt":
+            print(f"doubt: {check['name']}: {check['says']}")
+            if repair := check.get("repair"):
+                print(f"try: {shlex.join(['og-pointcloud', 'repair', str(capture), *repair.split()])}")
+
+
+def warn_of_capture(scene: Scene, capture: Path) -> None:
+    """Warn of what does not fit together in a capture that a command is about to use."""
+    from og_pointcloud.checking.check import check_capture, warn_of_doubts
+
+    warn_of_doubts(check_capture(scene), shlex.quote(str(capture)))
+
+
+def warn_of_poses(capture: Path, points: Points | None = None) -> None:
+    """The part of it that needs no masks. points: those that the poses must fit; None: the capture's, if it has any."""
+    from og_pointcloud.checking.check import check_poses, warn_of_doubts
+    from og_pointcloud.formats.capture import read_photographed
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # what is missing there is said by the command itself
+        scene = read_photographed(capture, points)
+    if scene is not None:
+        warn_of_doubts(check_poses(scene), shlex.quote(str(capture)))
 
 
 def names_in(text: str | None) -> list[str] | None:

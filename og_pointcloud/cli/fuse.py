@@ -9,7 +9,7 @@ import argparse
 import time
 from pathlib import Path
 
-from og_pointcloud.cli.common import Parser, add_output, check_output, print_next
+from og_pointcloud.cli.common import Parser, add_output, check_output, print_next, warn_of_poses
 from og_pointcloud.errors import OgPointcloudError
 
 
@@ -36,6 +36,7 @@ def run(arguments: argparse.Namespace) -> None:
 
     start = time.perf_counter()
     fused = fuse_capture(arguments.capture, unit)
+    warn_of_poses(arguments.capture, fused.points)
     write_ply(output, {"vertex": plain_rows(fused.points.xyz_world, fused.points.rgb)})
     print(
         f"{fused.frames} depth images in {time.perf_counter() - start:.1f} s: {len(fused.points):,} points, voxels of "

@@ -9,7 +9,7 @@ import argparse
 import warnings
 from pathlib import Path
 
-from og_pointcloud.cli.common import Parser, add_shared, print_next
+from og_pointcloud.cli.common import Parser, add_shared, print_next, warn_of_poses
 
 
 def add(parser: Parser) -> None:
@@ -46,6 +46,7 @@ def run(arguments: argparse.Namespace) -> None:
             "a model's folder, --encoder FOLDER ('og-pointcloud models' lists them), or none",
             stacklevel=1,
         )
+    warn_of_poses(arguments.capture)
     made = make_masks(arguments.capture, settings, arguments.output, overwrite=arguments.overwrite)
     print(
         f"{made.masks} masks in {made.images} images ({made.seconds:.1f} s, {made.done_before} images done before), "

@@ -11,7 +11,16 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from og_pointcloud.cli.common import Parser, add_output, add_shared, did_you_mean, numbers, print_result, some_of
+from og_pointcloud.cli.common import (
+    Parser,
+    add_output,
+    add_shared,
+    did_you_mean,
+    numbers,
+    print_result,
+    some_of,
+    warn_of_poses,
+)
 from og_pointcloud.errors import OgPointcloudError
 
 if TYPE_CHECKING:
@@ -37,12 +46,15 @@ def add(parser: Parser) -> None:
 def run(arguments: argparse.Namespace) -> None:
     from og_pointcloud.ask.labelled_scene import load
     from og_pointcloud.ask.picking import pick
+    from og_pointcloud.scene import Points
 
     uses_view = arguments.pixel is not None or arguments.output is not None
     if uses_view and not (arguments.capture and arguments.view):
         raise OgPointcloudError("--pixel and -o need a camera: name it with --capture CAPTURE --view NAME")
     scene = load(arguments.bundle)
     camera = world_camera(arguments.capture, arguments.view) if uses_view else None
+    if camera is not None:
+        warn_of_poses(arguments.capture, Points(scene.cloud.xyz, scene.cloud.origin, scene.cloud.rgb))
     if arguments.pixel is not None and camera is not None:
         hit = pick(scene, camera, numbers(arguments.pixel, "--pixel", 2))
     else:

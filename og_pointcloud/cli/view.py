@@ -12,7 +12,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from og_pointcloud.cli.common import Parser, add_output, add_shared, check_at_least, names_in, timed
+from og_pointcloud.cli.common import Parser, add_output, add_shared, check_at_least, names_in, timed, warn_of_capture
 from og_pointcloud.errors import OgPointcloudError
 
 if TYPE_CHECKING:
@@ -146,6 +146,7 @@ def view_capture(arguments: argparse.Namespace) -> None:
 
     output = arguments.output or Path("features.png")
     scene = read_capture(arguments.source)
+    warn_of_capture(scene, arguments.source)
     prepared = prepare(scene, journal=Journal(progress=True))
     surface = prepared.surface
     features = learned_stages(prepared.table, surface.scene.points.xyz)

@@ -9,6 +9,7 @@ from functools import partial
 
 import numpy as np
 
+from og_pointcloud.checking.check import check_capture, check_cloud, warn_of_doubts, with_checks
 from og_pointcloud.cloud import BACKGROUND, UNOBSERVED, LabelledCloud
 from og_pointcloud.errors import SceneError
 from og_pointcloud.fitting.held_out import choose_scale, note_scale
@@ -48,6 +49,9 @@ def fit(
     folder, or, without one, the folder for temporary files, by the same path. The result is the same, bit for bit.
     progress: show bars on a terminal.
 
+    The capture is checked first, and the answer last (og_pointcloud.checking): what does not fit together is warned of
+    by a `CaptureWarning`; provenance["checks"] has every check. They change no label.
+
     Deterministic: the same scene and settings give the same ids on every run. Raises SceneError where the scene
     cannot give an instance at all (no masks, or no camera that sees the cloud), and OgPointcloudError where memory or
     disk are too small, or another process uses the work folder.
@@ -68,13 +72,20 @@ def fit(
     """
     settings = settings or FitSettings()
     journal = Journal(progress)
+    with journal.stage("checks"):
+        checks = check_capture(scene)
+    warn_of_doubts(checks)
     with WorkFolder.open(work) as kept:
         if needs_tiles(scene, settings):
             _check(scene, journal)
             labelling, spacing = fit_tiles(scene, settings, kept, journal, executor)
-            return _labelled_cloud(scene, labelling, spacing, settings, journal)
-        prepared = prepare(scene, settings, journal, kept)
-        return fit_prepared(prepared, settings, journal, None if work is None else kept)
+            cloud = _labelled_cloud(scene, labelling, spacing, settings, journal)
+        else:
+            prepared = prepare(scene, settings, journal, kept)
+            cloud = fit_prepared(prepared, settings, journal, None if work is None else kept)
+    found = check_cloud(cloud, checks)
+    warn_of_doubts(found)
+    return with_checks(cloud, [*checks, *found])
 
 
 @dataclass(frozen=True)

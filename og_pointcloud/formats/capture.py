@@ -33,6 +33,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from og_pointcloud.cloud import UNKNOWN_SPACE
 from og_pointcloud.errors import MissingExtraError, SceneError, printable
 from og_pointcloud.formats import colmap
 from og_pointcloud.formats.depth import DepthFile, DepthFrame, find_depth, resampled
@@ -44,6 +45,7 @@ from og_pointcloud.formats.mask_files import FEATURES_NAME, MASKS_FOLDER, MaskLa
 from og_pointcloud.formats.nerfstudio import TRANSFORMS_NAMES, read_transforms
 from og_pointcloud.formats.points import read_points
 from og_pointcloud.formats.poses import PosedImage, in_local_frame, in_pinholes
+from og_pointcloud.formats.repairs import Repair, read_repairs, repaired_images, repaired_layers
 from og_pointcloud.formats.rgbd import find_mesh, read_rgbd
 from og_pointcloud.scene import NOT_SEEN, Camera, Points, Scene, View
 
@@ -52,6 +54,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "CapturePoses", "depth_files", "find_images", "fuse_capture", "read_capture", "read_geometry", "read_photograph",
+    "read_photographed",
     "read_poses",
 ]  # fmt: skip
 
@@ -74,11 +77,18 @@ class CapturePoses:
     is_recording: bool = False
 
 
-def read_capture(folder: str | Path, gaussians: str | Path | None = None, mask_level: str = "large") -> Scene:
+def read_capture(
+    folder: str | Path,
+    gaussians: str | Path | None = None,
+    mask_level: str = "large",
+    repairs: Sequence[str] | None = None,
+) -> Scene:
     """Read a capture folder.
 
     gaussians: a cloud or 3DGS file to use instead of the folder's own geometry.
     mask_level: of LangSplat's masks: default, small, medium or large (the paper's).
+    repairs: of mistakes in the files, such as "axes=flipped" (formats/repairs.py lists them); left out, those that the
+        folder's ``repairs.json`` names, which `og-pointcloud repair` writes.
 
     The scene's masks and images are functions that read on demand; poses, features and points are read, and everything
     that can be told from headers is checked, here. Raises SceneError with the cause and the cure; warns of images
@@ -93,9 +103,11 @@ def read_capture(folder: str | Path, gaussians: str | Path | None = None, mask_l
     capture = Path(folder)
     if not capture.is_dir():
         raise SceneError(f"{capture} is not a folder; expected a capture folder with poses, masks and points")
-    poses = read_poses(capture)
+    applied = read_repairs(capture) if repairs is None else tuple(map(Repair.parse, repairs))
+    poses = read_poses(capture, applied)
     shown = _with_masks(capture, poses) if poses.is_recording else poses
     layers, feature_space = _layers(capture, shown, mask_level)
+    layers = repaired_layers(layers, applied)
     points = read_geometry(capture, poses, gaussians)
     files = find_images(capture, shown.images)
     views = tuple(
@@ -105,11 +117,37 @@ def read_capture(folder: str | Path, gaussians: str | Path | None = None, mask_l
     return Scene(points, views, feature_space, name=capture.resolve().name)
 
 
-def read_poses(capture: Path) -> CapturePoses:
-    """Every posed image of a capture folder as pinhole views; SceneError where there are no poses."""
+def read_photographed(folder: str | Path, points: Points | None = None) -> Scene | None:
+    """The posed photographs of a capture folder without their masks, and its points; None where it has none, or only
+    depth images that would have to be fused."""
+    capture = Path(folder)
+    poses = read_poses(capture)
+    if points is None:
+        has_file = poses.ply_file_path or _find_cloud(capture) or colmap.find_model(capture)
+        if not has_file:
+            return None
+        points = read_geometry(capture, poses)
+    views = []
+    for name, image in zip(poses.names, poses.images, strict=True):
+        camera, file = in_local_frame(image.camera, points.origin), find_image(capture, image.path)
+        photograph = None if file is None else partial(read_photograph, file, camera, image.face)
+        views.append(View(name, camera, partial(_no_masks, camera), np.zeros((0, 0), np.float32), photograph))
+    return Scene(points, tuple(views), UNKNOWN_SPACE, name=capture.resolve().name)
+
+
+def _no_masks(camera: Camera) -> NDArray[np.int32]:
+    return np.full((camera.height, camera.width), -1, np.int32)
+
+
+def read_poses(capture: Path, repairs: Sequence[Repair] | None = None) -> CapturePoses:
+    """Every posed image of a capture folder as pinhole views; SceneError where there are no poses.
+
+    repairs: None for those of the folder's ``repairs.json``.
+    """
+    repairs = read_repairs(capture) if repairs is None else repairs
     poses = _stated_poses(capture)
     names, images = [], []
-    for name, image in zip(poses.names, poses.images, strict=True):
+    for name, image in zip(poses.names, repaired_images(poses.images, repairs), strict=True):
         for view in in_pinholes(image):
             names.append(f"{name}/{view.face.name}" if view.face is not None and view.face.name else name)
             images.append(view)
@@ -338,12 +376,12 @@ def _depth_frames(capture: Path, poses: CapturePoses) -> list[DepthFrame]:
 def _fused(capture: Path, frames: Sequence[DepthFrame]) -> FusedCloud:
     # The fusion brings numba, which whoever has a cloud need not load here.
     try:
-        from og_pointcloud.formats.fusion import doubtful_unit, fuse
+        from og_pointcloud.formats.fusion import doubtful_depth, fuse
     except ImportError as error:
         raise MissingExtraError("numba", "fit") from error
     fused = fuse(frames)
     empty = f"nothing is measured in {len(fused.empty)} of them, e.g. '{fused.empty[0]}'" if fused.empty else None
-    for text in filter(None, (doubtful_unit(frames), empty)):
+    for text in filter(None, (doubtful_depth(frames), empty)):
         warnings.warn(f"{capture}: depth images: {text}", stacklevel=4)
     return fused
 

@@ -10,7 +10,7 @@ the noise fills voxels; what then shares a voxel is averaged once more.
 The voxel follows from the images: two pixels wide at the median depth, and not finer than the noise with which views
 contradict each other.
 
-A check (`doubtful_unit`) tells at once what is otherwise seen hours later: where views overlap, a depth image of one
+A check (`doubtful_depth`) tells at once what is otherwise seen hours later: where views overlap, a depth image of one
 predicts what the other measures; in the wrong unit it predicts another depth, unless the camera only turned.
 """
 
@@ -29,7 +29,7 @@ from og_pointcloud.formats.images import require_cv2
 from og_pointcloud.kernels import njit, prange
 from og_pointcloud.scene import Camera, Points
 
-__all__ = ["FusedCloud", "Survey", "doubtful_unit", "evenly", "fuse", "on_surface", "survey", "to_world"]
+__all__ = ["FusedCloud", "Survey", "doubtful_depth", "evenly", "fuse", "on_surface", "survey", "to_world"]
 
 Doubles = NDArray[np.float64]
 
@@ -55,6 +55,9 @@ COMPARED = 12
 """Views, spread evenly, that the check of the unit reads."""
 UNITS = (1e-3, 1e-2, 0.1, 0.2, 0.25, 4.0, 5.0, 10.0, 100.0, 1e3)
 """Factors between units in use: metres, centimetres, millimetres, 1/4000 and 1/5000 m against 1/1000 m."""
+LEAST_AGREEING, LEAST_COMPARABLE = 0.2, 0.35
+"""Shares of depths that agree, and that differ little enough for one surface, below which images are no depths of one
+place: right ones agree in about half of the places, the rest is hidden in one view."""
 CONVINCING = 0.3
 """How much larger a share of agreeing depths must become for another unit to be named."""
 
@@ -300,13 +303,14 @@ def _summed(keys: NDArray[np.int64], rows: Doubles) -> tuple[NDArray[np.int64], 
     return unique, np.column_stack(sums).astype(np.float64, copy=False)
 
 
-def doubtful_unit(frames: Sequence[DepthFrame]) -> str | None:
-    """What is said, with the cure, where views agree clearly better if all depths are taken in another unit."""
+def doubtful_depth(frames: Sequence[DepthFrame]) -> str | None:
+    """What is said, with the cure, where views agree clearly better if all depths are taken in another unit, or in no
+    unit."""
     images = [image for frame in evenly(frames, COMPARED) if (image := frame.depth.read()).depth.any()]
     shares = {factor: np.nan_to_num(_agreement(images, factor)) for factor in (1.0, *UNITS)}
     best = max(UNITS, key=shares.__getitem__)
     if shares[best] <= shares[1.0] + CONVINCING:
-        return None
+        return _disagreement(images, max(shares.values()))
     return (
         f"the views' depths agree in {shares[1.0]:.0%} of places, and in {shares[best]:.0%} if all depths are taken "
         f"times {best:g}: give the depth unit (og-pointcloud fuse --depth-unit, or integer_depth_scale in "
@@ -314,7 +318,19 @@ def doubtful_unit(frames: Sequence[DepthFrame]) -> str | None:
     )
 
 
-def _agreement(images: Sequence[DepthImage], factor: float) -> float:
+def _disagreement(images: Sequence[DepthImage], share: float) -> str | None:
+    """What is said where views overlap and agree in no unit. share: of depths that agree, in the best unit."""
+    roughly = _agreement(images, 1.0, COMPARABLE)
+    if share >= LEAST_AGREEING or not roughly < LEAST_COMPARABLE:  # also where no views overlap
+        return None
+    return (
+        f"the views' depths agree in {share:.0%} of places, whatever the unit (right ones in half of them): poses "
+        "(axes, direction, order) or intrinsics are wrong, or the images hold something other than depths along the "
+        "optical axis (lengths of rays, disparities, another frame's depths)"
+    )
+
+
+def _agreement(images: Sequence[DepthImage], factor: float, within: float = AGREEING) -> float:
     """Share of depths that another view confirms if all are taken times ``factor``; NaN where no views overlap."""
     off = _differences(images, factor)
-    return float((np.abs(off) < AGREEING).mean()) if len(off) else float("nan")
+    return float((np.abs(off) < within).mean()) if len(off) else float("nan")

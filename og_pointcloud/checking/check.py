@@ -1,0 +1,325 @@
+"""check_capture(scene) -> what fits together, what does not, and the repair that would help: before a fit is believed.
+
+Nothing here changes a label. A check that cannot be made says so; one that fails names its suspects. The bounds lie
+where right captures of every sensor at hand are far on the one side and gross faults on the other
+(examples/benchmark_checks.py); between them the benefit of the doubt is the capture's.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from og_pointcloud.checking.conversions import VOUCHING, best_conversion, best_mask_conversion, fits
+from og_pointcloud.checking.masks import Consistency, MaskMaps, read_mask_maps
+from og_pointcloud.checking.photographs import Likeness, Photographs, read_photographs
+from og_pointcloud.checking.registration import FREE, MORE_POINTS, Registration
+from og_pointcloud.checking.sample import Sample, draw_sample, seen
+from og_pointcloud.cloud import BACKGROUND, UNKNOWN_SPACE, UNOBSERVED, LabelledCloud
+from og_pointcloud.formats.repairs import Repair
+from og_pointcloud.scene import Scene
+
+__all__ = [
+    "CaptureWarning", "Check", "check_capture", "check_cloud", "check_poses", "check_words", "warn_of_doubts",
+    "with_checks",
+]  # fmt: skip
+
+Verdict = Literal["ok", "doubt", "unchecked"]
+
+LEAST_SHARE, LEAST_GAP = 0.7, 0.25
+"""Drawings fit their own photographs in so many comparisons at least, and stand out so far."""
+LEAST_MASK_SHARE, LEAST_MASK_GAP = 0.75, 0.08
+"""Masks of views agree where they see the same, better than other masks would; doubted where both are missed."""
+LEAST_FEATURE_SHARE, FEWEST_FEATURES = 0.68, 60
+"""Features of masks that show the same are the more alike ones in so many of so many comparisons at least."""
+LESS_ERROR, LEAST_SHIFT = 0.8, 0.01
+"""A small change that leaves less than this share of the error, and moves points by more than this share of the image's
+width, is a fault of the capture; real calibrations leave more and move less."""
+FEWEST = 10
+"""Points, comparisons, rows or instances below this number say nothing."""
+MOST_BLIND = 0.7
+"""Views that see nothing, of those asked, from which no part of a larger map explains it."""
+MOST_UNSHOWN, MOST_ZERO, WHOLE_IMAGE = 0.3, 0.5, 0.95
+NEARLY_ALL, MOST_UNOBSERVED = 0.95, 0.5
+LEAST_COSINE = 3.5
+"""Standard deviations of random directions' cosines, that the best word of a mask reaches where both share a space."""
+SUSPECTS = "poses (axes, direction, order), units, intrinsics or the cloud's frame are wrong"
+SMALL_CHANGES = {
+    "focal": "another focal length",
+    "shifted": "another principal point",
+    "lens": "a lens that bends otherwise (distortion corrected twice, or not at all)",
+    "aligned": "the cameras moved as a whole",
+    "everything": "poses and calibration changed a little",
+}
+
+
+class CaptureWarning(UserWarning):
+    """A capture does not fit together: what was found, and the repair."""
+
+
+@dataclass(frozen=True)
+class Check:
+    """name: of what was looked at. verdict: "unchecked" where there is nothing to tell by. says: what was found, in
+    words. repair: `og-pointcloud repair CAPTURE` takes it, where one is known to help."""
+
+    name: str
+    verdict: Verdict
+    says: str
+    repair: str = ""
+
+    def as_dict(self) -> dict[str, str]:
+        """What reports and manifests hold."""
+        entry = {"name": self.name, "verdict": self.verdict, "says": self.says}
+        return {**entry, "repair": self.repair} if self.repair else entry
+
+
+def check_capture(scene: Scene) -> list[Check]:
+    """Whether poses, photographs, masks, features and cloud fit together; takes half a second, more where they do not.
+
+    Some views and points are asked. Raises SceneError where masks cannot be read.
+    """
+    sample = draw_sample(scene)
+    maps = read_mask_maps(sample) if any(view.mask_count for view in scene.views) else None
+    checks, photographs = _poses(sample, maps)
+    checks.append(_alignment(photographs, sample))
+    if maps is not None:
+        checks.append(_masks(maps, is_doubted=_doubted(checks, "poses")))
+        checks.append(_features(maps, is_doubted=_doubted(checks, "poses", "masks")))
+    return checks
+
+
+def check_poses(scene: Scene) -> list[Check]:
+    """The part of `check_capture` that needs no masks: for commands that only look at a capture."""
+    sample = draw_sample(scene)
+    checks, photographs = _poses(sample, None)
+    return [*checks, _alignment(photographs, sample)]
+
+
+def check_cloud(cloud: LabelledCloud, before: Sequence[Check] = ()) -> list[Check]:
+    """Whether a fit's answer is one to believe: points seen, instances. before: the checks of its capture."""
+    vouched = any(check.name == "poses" and check.verdict == "ok" for check in before)
+    return [_observed(cloud, vouched), _instances(cloud), _space(cloud)]
+
+
+def check_words(cloud: LabelledCloud) -> Check:
+    """Whether the vocabulary's vectors can be of the masks' encoder.
+
+    Vectors of two encoders stand to each other as random directions do: their cosines spread by 1 / sqrt(width).
+    """
+    descriptors, vocabulary = cloud.instances.descriptors, cloud.vocabulary
+    if vocabulary is None or len(descriptors) < FEWEST or len(vocabulary.names) < 2:
+        return Check("words", "unchecked", "no words to compare, or too few instances")
+    best = cloud.instances.cosines(vocabulary.vectors).max(axis=1)
+    typical = float(np.median(best[best >= -1])) * float(np.sqrt(descriptors.shape[1]))
+    says = f"an instance's best word stands {typical:.1f} standard deviations of random vectors from chance"
+    if typical < LEAST_COSINE:
+        return Check("words", "doubt", f"{says}: the words' vectors seem to be of another encoder than the masks'")
+    return Check("words", "ok", says)
+
+
+def warn_of_doubts(checks: Sequence[Check], capture: str = "CAPTURE", stacklevel: int = 2) -> None:
+    """A `CaptureWarning` for each doubt. capture: its folder, as the repair's line has it."""
+    for check in checks:
+        if check.verdict == "doubt":
+            cure = f"; try: og-pointcloud repair {capture} {check.repair}" if check.repair else ""
+            warnings.warn(f"{check.name}: {check.says}{cure}", CaptureWarning, stacklevel=stacklevel + 1)
+
+
+def with_checks(cloud: LabelledCloud, checks: Sequence[Check]) -> LabelledCloud:
+    """The cloud with these checks behind those that its provenance has."""
+    entries = [*cloud.provenance.get("checks", []), *(check.as_dict() for check in checks)]
+    return replace(cloud, provenance={**cloud.provenance, "checks": entries})
+
+
+def _doubted(checks: Sequence[Check], *names: str) -> bool:
+    return any(check.verdict == "doubt" for check in checks if check.name in names)
+
+
+def _poses(sample: Sample, maps: MaskMaps | None) -> tuple[list[Check], Photographs | None]:
+    """By photographs where there are any, else by masks; and the photographs, if they fit."""
+    photographs = read_photographs(sample)
+    if photographs is None:
+        return [_poses_by_masks(sample, maps)], None
+    stated = photographs.likeness(photographs.sample.cameras)
+    if stated.share >= LEAST_SHARE and stated.gap >= LEAST_GAP:
+        return [Check("poses", "ok", f"drawings fit their own photographs best: {_in_words(stated)}")], photographs
+    repairs = best_conversion(photographs, maps)
+    if repairs:
+        found = photographs.likeness(photographs.sample.repaired(repairs))
+        better = f"; with {_listed(repairs)} it does ({_in_words(found)})"
+        return [Check("poses", "doubt", _misfit(stated) + better, _listed(repairs))], None
+    agreement = Consistency.of([]) if maps is None else maps.agreement(maps.sample.cameras)
+    if fits(agreement, VOUCHING):
+        says = (
+            f"they fit the points' colours no better than other photographs ({_in_words(stated)}), though masks do: "
+            "they are turned, of another place, or in another order; labels do not depend on them"
+        )
+        return [_agreed(agreement), Check("photographs", "doubt", says)], None
+    if photographs.points_are_grey:
+        return [Check("poses", "unchecked", "the points' colours are shades of grey, the photographs' are not")], None
+    return [Check("poses", "doubt", _misfit(stated))], None
+
+
+def _misfit(stated: Likeness) -> str:
+    return (
+        "drawn where the poses say, the cloud fits its own photographs no better than others "
+        f"({_in_words(stated)}): {SUSPECTS}"
+    )
+
+
+def _poses_by_masks(sample: Sample, maps: MaskMaps | None) -> Check:
+    enough = min(FEWEST, len(sample.xyz) / 2)
+    blind = sum(len(seen(sample.xyz, camera).rows) < enough for camera in sample.cameras)
+    is_blind = blind > MOST_BLIND * len(sample.cameras)
+    agreement = Consistency.of([]) if maps is None else maps.agreement(maps.sample.cameras)
+    if not is_blind and agreement.compared < FEWEST:
+        return Check("poses", "unchecked", "no photographs with coloured points; masks are missing or share too little")
+    if not is_blind and _verdict(agreement) != "doubt":
+        return _agreed(agreement)
+    repairs = best_conversion(None, maps) or (best_mask_conversion(maps) if maps is not None else ())
+    says = f"masks of different views agree no better than others' masks ({_masks_in_words(agreement)})"
+    if is_blind:
+        says = f"the cameras of {blind} of {len(sample.cameras)} views see next to nothing of the cloud"
+    better = f"; with {_listed(repairs)} masks agree" if repairs else ""
+    return Check("poses", "doubt", f"{says}: {SUSPECTS}, or masks are of other images{better}", _listed(repairs))
+
+
+def _agreed(agreement: Consistency) -> Check:
+    says = f"masks of different views agree on them: {_masks_in_words(agreement)}"
+    return Check("poses", _verdict(agreement), says)
+
+
+def _verdict(found: Consistency) -> Verdict:
+    """By masks: "unchecked" between the two bounds."""
+    signs = found.share >= LEAST_MASK_SHARE, found.gap >= LEAST_MASK_GAP
+    return "ok" if all(signs) else "unchecked" if any(signs) else "doubt"
+
+
+def _alignment(photographs: Photographs | None, sample: Sample) -> Check:
+    """Small faults: a shift, a turn, a scale or calibration that is a little off."""
+    if photographs is None:
+        return Check("alignment", "unchecked", "it takes photographs that fit the points' colours")
+    stated = photographs.sample.cameras
+    quick = Registration(photographs, stated)
+    best = quick.found(FREE["everything"])
+    if best.error > LESS_ERROR * quick.start.error or best.shift < LEAST_SHIFT:
+        less = 1 - best.error / max(quick.start.error, 1e-9)
+        says = f"no small change of poses or calibration fits much better ({less:.0%}, {best.shift:.1%} of the width)"
+        return Check("alignment", "ok", says)
+    registration = Registration(photographs, stated, MORE_POINTS)
+    start = registration.start.error
+    found = {name: registration.found(free) for name, free in FREE.items()}
+    least = min(change.error for change in found.values())
+    name, change = next(item for item in found.items() if item[1].error <= least + 0.25 * (start - least))
+    repair = registration.repair(name, change, np.stack([camera.center for camera in sample.listed]))
+    less = 1 - change.error / start
+    says = (
+        f"photographs fit {less:.0%} better with {SMALL_CHANGES[name]}: points lie {change.shift:.1%} of the width off"
+    )
+    return Check("alignment", "doubt", says, str(repair or ""))
+
+
+def _masks(maps: MaskMaps, *, is_doubted: bool) -> Check:
+    whole = sum(np.bincount(ids.reshape(-1))[1:].max(initial=0) > WHOLE_IMAGE * ids.size for ids in maps.ids)
+    if whole > len(maps.ids) / 2:
+        says = f"one mask covers the whole image in {whole} of {len(maps.ids)} views: make masks of things"
+        return Check("masks", "doubt", says)
+    if is_doubted:
+        return Check("masks", "unchecked", "poses come first")
+    found = maps.agreement(maps.sample.cameras)
+    if found.compared < FEWEST:
+        return Check("masks", "unchecked", "too few points are seen by two views with masks")
+    if (verdict := _verdict(found)) != "doubt":
+        return Check("masks", verdict, f"views agree on them: {_masks_in_words(found)}")
+    repairs = best_mask_conversion(maps)
+    says = (
+        f"where views see the same points, masks agree no better than others' ({_masks_in_words(found)}): they are "
+        "mirrored, turned, or of other images"
+    )
+    return Check("masks", "doubt", f"{says}; with {_listed(repairs)} they agree" if repairs else says, _listed(repairs))
+
+
+def _features(maps: MaskMaps, *, is_doubted: bool) -> Check:
+    with_rows = [features for features in maps.features if features.size]
+    if not with_rows:
+        return Check("features", "unchecked", "masks have none")
+    rows = np.concatenate(with_rows)
+    zero = float((rows == 0).all(axis=1).mean())
+    if len(rows) >= FEWEST and zero > MOST_ZERO:
+        return Check("features", "doubt", f"{zero:.0%} of the rows are zero: encode the masks")
+    if len(rows) >= FEWEST and np.ptp(rows, axis=0).max() < 1e-6:
+        return Check("features", "doubt", f"all {len(rows)} rows are equal: words cannot tell masks apart")
+    if doubt := _unshown(maps):
+        return doubt
+    if is_doubted:
+        return Check("features", "unchecked", "poses and masks come first")
+    alike = maps.features_alike(maps.sample.cameras)
+    if alike.compared < FEWEST_FEATURES:
+        return Check("features", "unchecked", "too few masks of different views show the same")
+    counted = f"{alike.share:.0%} of {alike.compared} comparisons"
+    if alike.share >= LEAST_FEATURE_SHARE:
+        return Check("features", "ok", f"masks that show the same have the more similar ones in {counted}")
+    says = f"masks that show the same have the more similar ones in {counted}: rows belong to other masks"
+    shifted = maps.features_alike(maps.sample.cameras, shift=1)
+    if shifted.share > max(LEAST_FEATURE_SHARE, alike.share + 0.1):
+        return Check("features", "doubt", f"{says}; ids seem to count from 0", "masks=from-zero")
+    return Check("features", "doubt", says)
+
+
+def _unshown(maps: MaskMaps) -> Check | None:
+    """A doubt where many rows belong to no pixel, or the last one never does."""
+    shown = [rows for rows in maps.shown if len(rows)]
+    missing = float((~np.concatenate(shown)).mean())
+    if sum(map(len, shown)) >= FEWEST and missing > MOST_UNSHOWN:
+        says = (
+            f"{missing:.0%} of the rows belong to no pixel: there are more rows than masks, or they are of another run"
+        )
+        return Check("features", "doubt", says)
+    many = [rows for rows in shown if len(rows) > 1]
+    others = np.mean([rows[:-1].mean() for rows in many]) if many else 0.0
+    if len(many) >= 4 and not any(rows[-1] for rows in many) and others > 1 - MOST_UNSHOWN:
+        says = f"the last row belongs to no pixel in any of {len(many)} views: ids seem to count from 0"
+        return Check("features", "doubt", says, "masks=from-zero")
+    return None
+
+
+def _observed(cloud: LabelledCloud, vouched: bool) -> Check:
+    share = float((cloud.instance_ids == UNOBSERVED).mean()) if len(cloud) else 0.0
+    says = f"{share:.0%} of the points are seen by no view"
+    if share > MOST_UNOBSERVED and not vouched:
+        return Check("points seen", "doubt", f"{says}: {SUSPECTS}, or the views show a small part")
+    return Check("points seen", "ok", says)
+
+
+def _instances(cloud: LabelledCloud) -> Check:
+    ids, count = cloud.instance_ids, len(cloud.instances)
+    if count == 0:
+        return Check("instances", "doubt", "none: masks contradict each other, or show no point")
+    largest = float(np.bincount(ids[ids >= 0], minlength=1).max() / max(len(ids), 1))
+    says = f"the largest of {count} has {largest:.0%} of the points, {(ids == BACKGROUND).mean():.0%} are background"
+    if largest > NEARLY_ALL and count > 1:
+        return Check("instances", "doubt", f"{says}: masks join what lies apart")
+    return Check("instances", "ok", says)
+
+
+def _space(cloud: LabelledCloud) -> Check:
+    if cloud.feature_space == UNKNOWN_SPACE:
+        says = "nobody named the encoder of the masks: words of any encoder of that width are compared with them"
+        return Check("feature space", "unchecked", says)
+    return Check("feature space", "ok", f"'{cloud.feature_space:.80}'")
+
+
+def _in_words(found: Likeness) -> str:
+    return f"{found.share:.0%} of {found.compared} comparisons, correlation {found.own:.2f} against {found.other:.2f}"
+
+
+def _masks_in_words(found: Consistency) -> str:
+    return f"{found.share:.0%} of {found.compared} comparisons, information {found.own:.2f} against {found.other:.2f}"
+
+
+def _listed(repairs: Sequence[Repair]) -> str:
+    return " ".join(map(str, repairs))

@@ -1,0 +1,59 @@
+"""Put a capture's mistakes right on reading: axes, direction, scale, intrinsics, masks. Its files stay as they are.
+
+og-pointcloud repair kitchen axes=flipped
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from og_pointcloud.cli.common import Parser, add_shared, print_next, write_json
+from og_pointcloud.errors import OgPointcloudError
+
+
+def add(parser: Parser) -> None:
+    from og_pointcloud.formats import repairs
+
+    parser.epilog = (
+        f"{parser.epilog}\n\n{(repairs.__doc__ or '').partition('  axes=')[1]}"
+        + ((repairs.__doc__ or "").partition("  axes=")[2])
+    )
+    add_shared(parser, "capture")
+    parser.add_argument(
+        "repairs", nargs="*", metavar="NAME=VALUE",
+        help="applied in this order, behind those that the capture has; none: find them, by checking the capture",
+    )  # fmt: skip
+    parser.add_argument("--only", action="store_true", help="in place of those that the capture has")
+    parser.add_argument("--undo", action="store_true", help="remove all repairs of the capture")
+
+
+def run(arguments: argparse.Namespace) -> None:
+    from og_pointcloud.checking.check import check_capture
+    from og_pointcloud.cli.common import print_checks
+    from og_pointcloud.formats.capture import read_capture
+    from og_pointcloud.formats.repairs import REPAIRS_NAME, Repair, read_repairs
+
+    capture: Path = arguments.capture
+    file = capture / REPAIRS_NAME
+    if arguments.undo:
+        if arguments.repairs:
+            raise OgPointcloudError("--undo takes no repairs: leave them out, or --undo")
+        file.unlink(missing_ok=True)
+        print(f"{capture} is read as its files are")
+        return
+    had = () if arguments.only else read_repairs(capture)
+    stated = [str(repair) for repair in had]
+    new = [str(Repair.parse(text)) for text in arguments.repairs]
+    if not new:
+        checks = check_capture(read_capture(capture, repairs=stated))
+        new = next((check.repair.split() for check in checks if check.verdict == "doubt" and check.repair), [])
+        if not new:
+            print_checks([check.as_dict() for check in checks], capture)
+            print("no repair is known that would help")
+            return
+    checks = check_capture(read_capture(capture, repairs=[*stated, *new]))
+    write_json(file, {"repairs": [*stated, *new]})
+    print_checks([check.as_dict() for check in checks], capture)
+    print(f"wrote {file} ({' '.join([*stated, *new])}): every command reads {capture} so; --undo takes it back")
+    print_next("fit", capture, "-o", f"{capture.resolve().name}.ogpc")
