@@ -20,6 +20,7 @@ from og_pointcloud.checking.photographs import Likeness, Photographs, read_photo
 from og_pointcloud.checking.registration import FREE, MORE_POINTS, Registration
 from og_pointcloud.checking.sample import Sample, draw_sample, seen
 from og_pointcloud.cloud import BACKGROUND, UNKNOWN_SPACE, UNOBSERVED, LabelledCloud
+from og_pointcloud.errors import printable
 from og_pointcloud.formats.repairs import Repair
 from og_pointcloud.scene import Scene
 
@@ -39,6 +40,8 @@ LEAST_FEATURE_SHARE, FEWEST_FEATURES = 0.68, 60
 LESS_ERROR, LEAST_SHIFT = 0.8, 0.01
 """A small change that leaves less than this share of the error, and moves points by more than this share of the image's
 width, is a fault of the capture; real calibrations leave more and move less."""
+AS_GOOD = 0.1
+"""A change of fewer numbers is preferred that leaves this share of what more numbers gain."""
 FEWEST = 10
 """Points, comparisons, rows or instances below this number say nothing."""
 MOST_BLIND = 0.7
@@ -156,7 +159,8 @@ def _poses(sample: Sample, maps: MaskMaps | None) -> tuple[list[Check], Photogra
     if fits(agreement, VOUCHING):
         says = (
             f"they fit the points' colours no better than other photographs ({_in_words(stated)}), though masks do: "
-            "they are turned, of another place, or in another order; labels do not depend on them"
+            "they are turned, of another place or in another order (labels do not depend on them), or poses are off a "
+            "little"
         )
         return [_agreed(agreement), Check("photographs", "doubt", says)], None
     if photographs.points_are_grey:
@@ -214,13 +218,13 @@ def _alignment(photographs: Photographs | None, sample: Sample) -> Check:
     start = registration.start.error
     found = {name: registration.found(free) for name, free in FREE.items()}
     least = min(change.error for change in found.values())
-    name, change = next(item for item in found.items() if item[1].error <= least + 0.25 * (start - least))
-    repair = registration.repair(name, change, np.stack([camera.center for camera in sample.listed]))
+    name, change = next(item for item in found.items() if item[1].error <= least + AS_GOOD * (start - least))
+    repairs = registration.repairs(name, change, np.stack([camera.center for camera in sample.listed]))
     less = 1 - change.error / start
     says = (
         f"photographs fit {less:.0%} better with {SMALL_CHANGES[name]}: points lie {change.shift:.1%} of the width off"
     )
-    return Check("alignment", "doubt", says, str(repair or ""))
+    return Check("alignment", "doubt", says, _listed(repairs))
 
 
 def _masks(maps: MaskMaps, *, is_doubted: bool) -> Check:
@@ -310,7 +314,7 @@ def _space(cloud: LabelledCloud) -> Check:
     if cloud.feature_space == UNKNOWN_SPACE:
         says = "nobody named the encoder of the masks: words of any encoder of that width are compared with them"
         return Check("feature space", "unchecked", says)
-    return Check("feature space", "ok", f"'{cloud.feature_space:.80}'")
+    return Check("feature space", "ok", f"'{printable(cloud.feature_space, 80)}'")
 
 
 def _in_words(found: Likeness) -> str:

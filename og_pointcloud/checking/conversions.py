@@ -72,8 +72,7 @@ def _moved(photographs: Photographs) -> Repairs:
     """The cameras moved as a whole so that photographs fit best."""
     registration = Registration(photographs, photographs.sample.cameras, MORE_POINTS)
     centers = np.stack([camera.center for camera in photographs.sample.listed])
-    repair = registration.repair("aligned", registration.found(FREE["aligned"]), centers)
-    return () if repair is None else (repair,)
+    return registration.repairs("aligned", registration.found(FREE["aligned"]), centers)
 
 
 def best_mask_conversion(maps: MaskMaps) -> Repairs:

@@ -93,24 +93,24 @@ class Registration:
         finally:
             self.cameras = stated
 
-    def repair(self, name: str, small: Small, centers: Doubles) -> Repair | None:
-        """The change of `FREE`'s group as a repair, where there is one. centers: (views, 3) of all cameras of
-        the scene, local frame."""
-        if name == "focal":
-            return Repair.parse(f"focal={np.exp(small.numbers[FOCAL]):.4g}")
-        if name == "shifted":
-            return Repair.parse("shifted=" + ",".join(f"{share:.4g}" for share in small.numbers[CENTER]))
-        if name == "aligned":
-            return self._alignment(small.numbers, centers)
-        return Repair.parse("lens=none") if name == "lens" else None
+    def repairs(self, name: str, small: Small, centers: Doubles) -> tuple[Repair, ...]:
+        """The change of `FREE`'s group as repairs. centers: (views, 3) of all cameras of the scene, local frame."""
+        if name == "lens":
+            return (Repair.parse("lens=none"),)
+        texts = {
+            "focal": f"focal={np.exp(small.numbers[FOCAL]):.4g}",
+            "shifted": "shifted=" + ",".join(f"{share:.4g}" for share in small.numbers[CENTER]),
+            "aligned": self._alignment(small.numbers, centers),
+        }
+        return tuple(Repair.parse(text) for part, text in texts.items() if name in (part, "everything"))
 
-    def _alignment(self, numbers: Doubles, centers: Doubles) -> Repair:
+    def _alignment(self, numbers: Doubles, centers: Doubles) -> str:
         """The cloud is turned by R, sized and moved about its middle; so cameras go the other way about their mean."""
         turn, size = rotation_of_vector(numbers[TURN]), float(np.exp(numbers[SIZE]))
         mean = centers.mean(axis=0)
         there = (mean - self.middle - numbers[MOVE] * self.depth) @ turn / size + self.middle
         values = [*(there - mean), *np.rad2deg(-numbers[TURN]), 1 / size]
-        return Repair.parse("aligned=" + ",".join(f"{value:.5g}" for value in values))
+        return "aligned=" + ",".join(f"{value:.5g}" for value in values)
 
     def _judged(self, numbers: Doubles) -> Small:
         correlations, shifts = [], []

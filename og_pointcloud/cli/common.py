@@ -192,8 +192,7 @@ def describe_fit(cloud: LabelledCloud, capture: Path, bundle: Path) -> dict[str,
 
 def print_fit(report: Mapping[str, Any], cloud: LabelledCloud) -> None:
     """What ``fit`` closes with; ends in the next command."""
-    print_provenance(cloud.provenance)
-    print_checks(report.get("checks", []), report["capture"])
+    print_provenance(cloud.provenance, report["capture"])
     total = report["points"]
     shares = [report[f"points_{state}"] / total for state in ("in_instances", "background", "unobserved")]
     print(
@@ -255,12 +254,13 @@ def print_checks(checks: Sequence[Mapping[str, str]], capture: Path | str) -> No
     for verdict, word in (("ok", "checked"), ("unchecked", "unchecked")):
         names = [check["name"] for check in checks if check["verdict"] == verdict]
         if names:
-            print(f"{word}: {', '.join(names)}")
+            print(printable(f"{word}: {', '.join(names)}", LONGEST_NOTE))
     for check in checks:
         if check["verdict"] == "doubt":
-            print(f"doubt: {check['name']}: {check['says']}")
+            print(printable(f"doubt: {check['name']}: {check['says']}", LONGEST_NOTE))
             if repair := check.get("repair"):
-                print(f"try: {shlex.join(['og-pointcloud', 'repair', str(capture), *repair.split()])}")
+                line = shlex.join(["og-pointcloud", "repair", str(capture), *repair.split()])
+                print(printable(f"try: {line}", LONGEST_NOTE))
 
 
 def warn_of_capture(scene: Scene, capture: Path) -> None:
@@ -307,7 +307,7 @@ def calibration_hint(bundle: Path | str) -> str:
     return f"For probabilities, and 'unknown' where no label fits: {command} [WORDS.npz]"
 
 
-def print_provenance(provenance: Mapping[str, Any]) -> None:
+def print_provenance(provenance: Mapping[str, Any], capture: Path | str = "CAPTURE") -> None:
     stages = provenance.get("stages", [])
     if stages:
         rows = [(stage["name"], f"{stage['seconds']:.2f}") for stage in stages]
@@ -316,6 +316,7 @@ def print_provenance(provenance: Mapping[str, Any]) -> None:
         print(printable(f"left out: {entry['what']}: {entry['why']}", LONGEST_NOTE))
     for text in provenance.get("warnings", []):
         print(printable(f"warning: {text}", LONGEST_NOTE))
+    print_checks(provenance.get("checks", []), capture)
 
 
 def print_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:

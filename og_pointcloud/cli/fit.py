@@ -7,6 +7,7 @@ og-pointcloud fit kitchen -o kitchen.ogpc
 from __future__ import annotations
 
 import argparse
+import shlex
 import sys
 from contextlib import nullcontext
 from dataclasses import replace
@@ -135,6 +136,9 @@ def fit_several(arguments: argparse.Namespace, options: FitOptions, executor: Ex
     failed = [fit for fit in fits if fit.state == "failed"]
     there = len(fits) - len(made) - len(failed)
     print(f"{len(made)} fitted, {there} were there already, {len(failed)} failed, in {arguments.out}")
+    for fit in made:
+        if fit.doubts:
+            print(f"doubt: {fit.name}: {', '.join(fit.doubts)} (og-pointcloud info {shlex.quote(fit.output)} says why)")
     for fit in failed:
         print(f"failed: {fit.capture}: {fit.cause}", file=sys.stderr)
     if len(failed) < len(fits):

@@ -15,6 +15,7 @@ from typing import Any, Literal
 from og_pointcloud.ask.hosts import import_plugin
 from og_pointcloud.bundle.read import read_bundle
 from og_pointcloud.bundle.vocabulary import scene_words
+from og_pointcloud.checking.check import check_words, with_checks
 from og_pointcloud.cloud import FeatureSpace, LabelledCloud
 from og_pointcloud.collection.progress import counted
 from og_pointcloud.collection.workers import LocalWorkers
@@ -47,7 +48,8 @@ class FitOptions:
 @dataclass(frozen=True)
 class CaptureFit:
     """What became of a capture. state: "fitted", "was there" (its file is whole already) or "failed", then with the
-    cause. worker: where, as host:process. peak_bytes: the most memory that this process has held, 0 if unknown.
+    cause. worker: where, as host:process. peak_bytes: the most memory that this process has held, 0 if unknown. doubts:
+    names of the checks that failed (the file's provenance says why).
 
     >>> og.CaptureFit("scans/kitchen", "fitted/kitchen.ogpc", "was there").name
     'kitchen'
@@ -62,6 +64,7 @@ class CaptureFit:
     instances: int = 0
     worker: str = ""
     peak_bytes: int = 0
+    doubts: tuple[str, ...] = ()
 
     @property
     def name(self) -> str:
@@ -168,7 +171,8 @@ def _try_fit(capture: str, output: str, options: FitOptions, share: Share) -> Ca
         return CaptureFit(capture, output, "failed", cause, seconds, worker=worker, peak_bytes=peak_memory())
     seconds = round(time.perf_counter() - start, 3)
     counts = len(cloud), len(cloud.instances)
-    return CaptureFit(capture, output, "fitted", "", seconds, *counts, worker, peak_memory())
+    doubts = tuple(check["name"] for check in cloud.provenance["checks"] if check["verdict"] == "doubt")
+    return CaptureFit(capture, output, "fitted", "", seconds, *counts, worker, peak_memory(), doubts)
 
 
 def _fit(capture: Path, output: Path, options: FitOptions, share: Share) -> LabelledCloud:
@@ -193,6 +197,7 @@ def fit_capture(
     words = scene_words(space, text_features=options.text_features, word_bank=options.word_bank, capture=capture)
     reading = {"name": "read capture", "seconds": round(time.perf_counter() - start, 4)}
     cloud = words.added_to(fit(scene, options.settings, work=work, executor=executor, progress=progress))
+    cloud = with_checks(cloud, [check_words(cloud)])
     return replace(cloud, provenance={**cloud.provenance, "stages": [reading, *cloud.provenance["stages"]]})
 
 
