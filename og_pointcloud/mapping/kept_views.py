@@ -16,10 +16,14 @@ from og_pointcloud.fitting.mask_table import MaskTable
 from og_pointcloud.rendering.sightings import Sightings
 from og_pointcloud.scene import Camera
 
-__all__ = ["KeptView", "KeptViews"]
+__all__ = ["KeptView", "KeptViews", "Moment"]
 
 ENOUGH_VIEWS = 48
 """Kept views of a point beyond which another one says nothing new of it: 10 bytes each, a point."""
+FEW_VIEWS = 4
+"""The same for a frame from where another kept one stood."""
+SAME_PLACE, SAME_DIRECTION = 0.02, 0.9994
+"""Share of the distance to what is seen, and cosine (2 degrees), within which two frames stand alike."""
 NEW_SHARE = 0.05
 """A frame is kept if more than this share of what it shows has not been shown often enough."""
 
@@ -47,6 +51,16 @@ class KeptView:
         return sum(array.nbytes for array in arrays)
 
 
+@dataclass(frozen=True)
+class Moment:
+    """Where and when a frame was taken. sequence: its number. distance: to what it sees, median."""
+
+    camera: Camera
+    stamp: float
+    sequence: int
+    distance: float
+
+
 @dataclass
 class KeptViews:
     """views: in the order in which they came. shown: (n,) uint8, how many of them show each point."""
@@ -55,25 +69,37 @@ class KeptViews:
     shown: NDArray[np.uint8] = field(default_factory=lambda: np.zeros(0, np.uint8))
 
     def offer(
-        self, camera: Camera, stamp: float, sequence: int, found: Sightings, rows: NDArray[np.int32], n: int,
-        ids: NDArray[np.int32], features: NDArray[np.float32],
+        self, moment: Moment, found: Sightings, rows: NDArray[np.int32], n: int, ids: NDArray[np.int32],
+        features: NDArray[np.float32],
     ) -> bool:  # fmt: skip
         """Keep a frame if it shows something new. found: of the points ``rows``, of n. Returns whether it is kept."""
         if n > len(self.shown):
             self.shown = np.concatenate([self.shown, np.zeros(n - len(self.shown) + n // 2, np.uint8)])
         seen = rows[found.openness.indices]
-        if len(features) == 0 or len(seen) == 0 or (self.shown[seen] < ENOUGH_VIEWS).mean() <= NEW_SHARE:
+        if len(features) == 0 or len(seen) == 0:
+            return False
+        enough = FEW_VIEWS if self._stood_here(moment) else ENOUGH_VIEWS
+        if (self.shown[seen] < enough).mean() <= NEW_SHARE:
             return False
         self.shown[seen] = np.minimum(self.shown[seen], 254) + 1
         pixels = np.bincount(ids.ravel() + 1, minlength=len(features) + 1)[1:].astype(np.int32)
         of_masks = found.rows
         self.views.append(
             KeptView(
-                camera, stamp, sequence, of_masks.indptr.astype(np.int32), rows[of_masks.indices],
+                moment.camera, moment.stamp, moment.sequence, of_masks.indptr.astype(np.int32), rows[of_masks.indices],
                 of_masks.data.astype(np.float16), seen, found.openness.data.astype(np.float16), pixels, features,
             )
         )  # fmt: skip
         return True
+
+    def _stood_here(self, moment: Moment) -> bool:
+        """Whether a kept view looked from about the same place in about the same direction."""
+        place, forward = moment.camera.center, moment.camera.world_to_camera[2, :3]
+        return any(
+            forward @ view.camera.world_to_camera[2, :3] > SAME_DIRECTION
+            and np.linalg.norm(view.camera.center - place) < SAME_PLACE * moment.distance
+            for view in self.views
+        )
 
     @property
     def nbytes(self) -> int:

@@ -28,7 +28,7 @@ from og_pointcloud.mapping import map_state
 from og_pointcloud.mapping.batch import label
 from og_pointcloud.mapping.changes import FEWEST_POINTS, MOST, TOLERANCE, Changes, Moved, Visit, compare_visits
 from og_pointcloud.mapping.frame import CheckedFrame, Frame, checked, require_same_place
-from og_pointcloud.mapping.kept_views import KeptViews
+from og_pointcloud.mapping.kept_views import KeptViews, Moment
 from og_pointcloud.mapping.likeness import ALIKE, Look, likeness, spread_of
 from og_pointcloud.mapping.map_journal import MapJournal
 from og_pointcloud.mapping.map_record import MapRecord
@@ -58,10 +58,14 @@ VOTE_COLUMNS = "track", "weight"
 PRESENCE_COLUMNS = "odds", "refuted", "seen_at", "hidden", "_from"
 MARGIN = 0.1
 """Share of an image beyond its border from which points are drawn, as they may hide others within."""
+MOST_ODDS = 3.0
+"""Frames that history counts for at most."""
 RECENT_FRAMES = 4096
 """Stamps of frames that are remembered: those that a journal still holds are not integrated twice."""
 PRUNED_EVERY = 64
 """Frames after which tracks that came to nothing are let go."""
+USUAL_SHARE = 0.3
+"""Part of an object's points that a usual frame shows."""
 KNOWN_VOTES = 8.0
 """Votes that a point of an earlier map has for its instance."""
 
@@ -142,7 +146,7 @@ class Mapper:
         self._space = FeatureSpace(feature_space, 0)
         self._spacing = spacing
         self._points: VoxelPoints | None = None
-        self._presence = Presence(0, 0.0)
+        self._presence = Presence(0, 0.0, MOST_ODDS)
         self._lost: dict[int, list[int]] = {}
         self._tracks, self._votes, self._kept = Tracks(), PointVotes(), KeptViews()
         self._left: dict[int, _Left] = {}
@@ -187,7 +191,7 @@ class Mapper:
         self._stamp = record.visits[-1].stamp
         for k in range(len(table)):
             rows = table.descriptors[table.descriptor_instance == k].astype(np.float64)
-            pixels = float(max(table.visible_area[k], 1e-6))
+            pixels = float(max(USUAL_SHARE * table.points[k] * table.masks[k], 1e-6))
             total = rows.sum(axis=0) * pixels if len(rows) else None
             seen = record.last_seen.get(k, 0.0)
             counts = int(table.views[k]), int(table.masks[k])
@@ -458,8 +462,11 @@ class Mapper:
             rows, uv_px = rows[inside], uv_px[inside]
             u, v = np.ascontiguousarray(uv_px.T, np.float32)
             found = sightings_of(np.ones(len(rows), np.float32), u, v, frame.ids, len(frame.features))
-        self._kept.offer(frame.camera, frame.stamp, self._sequence, found, rows, points.n, frame.ids, frame.features)
         seen = found.openness.indices
+        away = np.linalg.norm(points.xyz[rows[seen]] - frame.camera.center, axis=1)
+        typical = float(np.median(away)) if len(away) else 0.0
+        moment = Moment(frame.camera, frame.stamp, self._sequence, typical)
+        self._kept.offer(moment, found, rows, points.n, frame.ids, frame.features)
         column, row = np.minimum(uv_px[seen].astype(np.intp), (frame.camera.width - 1, frame.camera.height - 1)).T
         mask = frame.ids[row, column]
         new, again = self._tracks.observe(
@@ -599,24 +606,25 @@ class Mapper:
         around = self._neighbourhood(rows, xyz)
         cameras = [view.camera for view in self._kept.views]
         table = self._kept.table(place, self._born, len(rows))
-        ids, instances, certainty = label(xyz, around, table, cameras, self.settings)
+        found = label(xyz, around, table, cameras, self.settings)
+        ids, certainty = found.instance_ids, found.certainty
         visit = LabelledCloud(
             xyz=xyz,
             origin=self._origin_or_zero,
             instance_ids=ids,
-            instances=instances,
+            instances=found.instances,
             feature_space=self._space.name,
             spacing=float(np.median(around.spacing)),
             reach=self.settings.geometry.reach * float(np.median(around.spacing)),
             rgb=points.rgb[rows].astype(np.uint8),
-            certainty=np.rint(255 * certainty).astype(np.uint8),
+            certainty=None if certainty is None else np.rint(255 * certainty).astype(np.uint8),
             cameras=tuple(cameras),
         )
         online = self._best_of_all()[rows]
         known = np.append(np.array([t.id for t in self._tracks.tracks], np.int32), np.int32(-1))[online]
         if self._base is not None:
             return self._folded(visit, rows, known)
-        wanted, count = matched_ids(ids, len(instances), known, self._tracks.next_id)
+        wanted, count = matched_ids(ids, len(found.instances), known, self._tracks.next_id)
         self._tracks.next_id = count
         return with_ids(visit, wanted, count)
 

@@ -1,8 +1,9 @@
 """Whether points of a map are still there, from all that later views measured: bounded odds by point.
 
-A view that measures a surface where a point lies speaks for it, one that looks through its place against it. The sum is
-bounded, so that a long history cannot outvote what is seen today. One place alone refutes nothing: a point is absent
-only where it was seen through from two directions. A view in which no mask shows a thing is no evidence at all.
+A view that measures a surface where a point lies speaks for it, one that looks through its place against it. Of a map
+that grows the sum is bounded, so that a long history cannot outvote what is seen today. One place alone refutes
+nothing: a point is absent only where it was seen through from two directions. A view in which no mask shows a thing is
+no evidence at all.
 """
 
 from __future__ import annotations
@@ -15,8 +16,6 @@ from og_pointcloud.mapping.sight import AGREES, HIDDEN, THROUGH, MeasuredView, s
 
 __all__ = ["Presence"]
 
-MOST_ODDS = 6.0
-"""Views that history counts for at most."""
 APART = 0.998
 """Cosine between two directions of sight, from the point, that are two places: 3.6 degrees."""
 
@@ -25,11 +24,12 @@ class Presence:
     """Evidence about n points. odds: (n,) float32, views that bear a point out less those that see through it, bounded.
     refuted: (n,) uint8, directions, up to two, from which it was seen through. seen_at: (n,) float64, the latest stamp
     of a view that measured it, or its place; -inf where none did. tolerance: distance from a surface, at right angles
-    to it, up to which a point is of it. hidden: (n,) bool, some view measured a surface before it.
+    to it, up to which a point is of it. most: what the odds are bounded by. hidden: (n,) bool, some view measured a
+    surface before it.
     """
 
-    def __init__(self, n: int, tolerance: float) -> None:
-        self.tolerance = tolerance
+    def __init__(self, n: int, tolerance: float, most: float = np.inf) -> None:
+        self.tolerance, self.most = tolerance, most
         self.odds = np.zeros(n, np.float32)
         self.refuted = np.zeros(n, np.uint8)
         self.seen_at = np.full(n, -np.inf)
@@ -39,7 +39,7 @@ class Presence:
     def grow(self, n: int) -> None:
         """Room for n points, in steps of half."""
         if n > len(self.odds):
-            more = Presence(max(n - len(self.odds), len(self.odds) // 2), self.tolerance)
+            more = Presence(max(n - len(self.odds), len(self.odds) // 2), self.tolerance, self.most)
             for name in ("odds", "refuted", "seen_at", "hidden", "_from"):
                 setattr(self, name, np.concatenate([getattr(self, name), getattr(more, name)]))
 
@@ -56,7 +56,7 @@ class Presence:
         """Take in the states (m,) of some points, seen from a centre. What is older than a point's latest word is not
         counted: a frame that comes late cannot bring back what has left since."""
         self.hidden[rows[states == HIDDEN]] = True
-        _count(rows, xyz, states, center, stamp, self.odds, self.refuted, self.seen_at, self._from)
+        _count(rows, xyz, states, center, stamp, self.most, self.odds, self.refuted, self.seen_at, self._from)
 
     def reset(self, rows: NDArray[np.integer]) -> None:
         """Forget what was known of points that left."""
@@ -74,16 +74,16 @@ class Presence:
 
 
 @njit(cache=True, nogil=True)
-def _count(rows, xyz, states, center, stamp, odds, refuted, seen_at, first):  # noqa: ANN001, ANN202
+def _count(rows, xyz, states, center, stamp, most, odds, refuted, seen_at, first):  # noqa: ANN001, ANN202
     for k in range(len(states)):
         i = rows[k]
         if (states[k] != AGREES and states[k] != THROUGH) or stamp < seen_at[i]:
             continue
         seen_at[i] = stamp
         if states[k] == AGREES:
-            odds[i] = min(odds[i] + 1, MOST_ODDS)
+            odds[i] = min(odds[i] + 1, most)
             continue
-        odds[i] = max(odds[i] - 1, -MOST_ODDS)
+        odds[i] = max(odds[i] - 1, -most)
         if refuted[i] < 2:
             x, y, z = center[0] - xyz[k, 0], center[1] - xyz[k, 1], center[2] - xyz[k, 2]
             length = max(np.sqrt(x * x + y * y + z * z), 1e-12)

@@ -30,6 +30,8 @@ MOST_VOTES = 24.0
 CONFIRMED_VIEWS = 2
 """Frames that show a track before it is an object with an id."""
 MOSTLY = 0.5
+WITNESS_SHARE = 0.3
+"""Share of what a usual frame shows of a track, below which a frame says nothing of it."""
 JOIN_MAJORITY, FEWEST_WITNESSES = 0.5, 2
 LEAST_POINTS = 3.0
 """Points of a track, or of a mask, that a frame must show to say anything of it."""
@@ -175,7 +177,10 @@ class Tracks:
 
     def _witness(self, shown: NDArray[np.float64], visible: NDArray[np.float64], seen: NDArray[np.int32]) -> None:
         """Count this frame's word on every two tracks that masks hold, and join those that most frames call one."""
-        holds = shown.max(axis=0, initial=0) > MOSTLY * np.maximum(visible, LEAST_POINTS)
+        # A frame that shows little of a track, its foot when the rest has gone, is no witness of it.
+        usual = np.array([self.tracks[k].pixels / max(self.tracks[k].masks, 1) for k in seen.tolist()])
+        enough = visible >= np.maximum(WITNESS_SHARE * usual, LEAST_POINTS)
+        holds = enough & (shown.max(axis=0, initial=0) > MOSTLY * visible)
         container = shown.argmax(axis=0) if len(shown) else np.zeros(len(seen), int)
         held = np.flatnonzero(holds)
         for index, a in enumerate(held):

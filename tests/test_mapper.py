@@ -1,0 +1,274 @@
+"""Maps that grow frame by frame: the same as a fit, kept safe, unharmed by bad frames, aware of what changes."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from visits import BIN, CHEST, CRATE, PARCEL, SPACE, cameras, frames, instance_of, moved, scene
+
+import og_pointcloud as og
+from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError, SceneError
+from og_pointcloud.mapping.frame_queue import FrameQueue
+from og_pointcloud.mapping.voxels import VoxelPoints
+
+THINGS = [CHEST, BIN, CRATE]
+ELSEWHERE = moved(CRATE, (-0.9, 0.5, 0.0))
+
+
+def mapped(given, start=None, **options):
+    """A mapper that has taken frames in, and their changes."""
+    mapper = og.Mapper(start, feature_space=SPACE, **options) if start is None else og.Mapper(start, **options)
+    return mapper, [mapper.integrate(frame) for frame in given]
+
+
+def without_depth(given):
+    return [replace(frame, depth=None) for frame in given]
+
+
+@pytest.fixture(scope="module")
+def grown():
+    return mapped(frames(THINGS))
+
+
+def test_a_known_cloud_ends_as_a_fit_does():
+    capture = scene(THINGS)
+    fitted = og.fit(capture, og.FitSettings(mode="grouping"), progress=False)
+    mapper, _ = mapped(without_depth(frames(THINGS)), cloud=capture.points)
+    cloud = mapper.finish().cloud
+    np.testing.assert_array_equal(cloud.xyz, fitted.xyz)
+    same = [(fitted.instance_ids == instance_of(fitted, t)) == (cloud.instance_ids == instance_of(cloud, t))
+            for t in THINGS]  # fmt: skip
+    assert np.mean(same) > 0.99
+
+
+def test_depth_alone_makes_the_points(grown):
+    mapper, _ = grown
+    cloud = mapper.snapshot().cloud
+    assert {instance_of(cloud, thing) for thing in THINGS}.isdisjoint({-1})
+    assert len({instance_of(cloud, thing) for thing in THINGS}) == 3
+    on_surface = np.abs(cloud.xyz_world[:, 2]) < 0.02
+    for thing in THINGS:
+        low, size = np.array(thing.low), np.array(thing.size)
+        outside = np.maximum(low - cloud.xyz_world, cloud.xyz_world - low - size).max(axis=1)
+        on_surface |= np.abs(outside) < 0.02
+    assert on_surface.mean() > 0.97
+    assert og.segment(mapper.snapshot(), {"chest": cloud.instances.descriptors[0]}).labels.max() == 0
+
+
+def test_objects_have_the_ids_of_the_snapshot(grown):
+    mapper, changes = grown
+    cloud, objects = mapper.snapshot().cloud, {entry.id: entry for entry in mapper.objects()}
+    for thing in THINGS:
+        entry = objects[instance_of(cloud, thing)]
+        assert np.abs(entry.place - (np.array(thing.low) + np.array(thing.size) / 2)).max() < 0.2
+        assert entry.state == "present"
+    assert {*objects} <= {k for change in changes for k in (*change.new, *change.updated)}
+
+
+def test_the_order_of_frames_hardly_matters():
+    given = frames(THINGS)
+    shuffled = [given[k] for k in np.random.default_rng(0).permutation(len(given))]
+    one, other = (mapped(g, spacing=0.04)[0].finish().cloud for g in (given, shuffled))
+    for thing in THINGS:
+        sizes = [cloud.instances.points[instance_of(cloud, thing)] for cloud in (one, other)]
+        assert min(sizes) > 0.7 * max(sizes)
+
+
+def test_what_is_carried_elsewhere_keeps_its_id():
+    first, second = frames(THINGS), frames([CHEST, BIN, ELSEWHERE], seed=1, first=100.0)
+    mapper, _ = mapped(first)
+    crate = instance_of(mapper.snapshot().cloud, CRATE)
+    changes = [mapper.integrate(frame) for frame in second]
+    assert [k for change in changes for k in change.gone] == [crate]
+    assert [entry.id for change in changes for entry in change.moved] == [crate]
+    cloud = mapper.finish().cloud
+    assert instance_of(cloud, ELSEWHERE) == crate
+    assert instance_of(cloud, CRATE) == -1
+
+
+def test_a_missed_detection_removes_nothing():
+    mapper, _ = mapped(frames(THINGS))
+    blind = [replace(frame, masks=None, features=None, stamp=50.0 + k) for k, frame in enumerate(frames(THINGS))]
+    assert all(mapper.integrate(frame).gone == () for frame in blind)
+    assert {instance_of(mapper.finish().cloud, thing) for thing in THINGS}.isdisjoint({-1})
+
+
+def test_a_map_is_gone_on_with():
+    before = og.fit(scene(THINGS), progress=False)
+    mapper, _ = mapped(frames([CHEST, ELSEWHERE, PARCEL], seed=1, first=10.0), before)
+    cloud = mapper.finish().cloud
+    changes = mapper.changes
+    assert changes.gone == (instance_of(before, BIN),)
+    assert [entry.id for entry in changes.moved] == [instance_of(before, CRATE)]
+    assert changes.new == (instance_of(cloud, PARCEL),)
+    assert instance_of(cloud, CHEST) == instance_of(before, CHEST)
+
+
+def test_a_second_loop_keeps_no_more(grown):
+    mapper, _ = mapped(frames(THINGS))
+    held, points = mapper.nbytes, mapper.points
+    for frame in frames(THINGS):
+        mapper.integrate(frame)
+    assert mapper.nbytes == held
+    assert mapper.points < 1.01 * points
+
+
+def test_a_loop_closure_moves_what_its_frames_brought():
+    given = frames(THINGS)
+    off = np.eye(4)
+    off[:3, 3] = 0.0, 0.0, 0.5
+    wrong = [replace(f, camera=replace(f.camera, world_to_camera=f.camera.world_to_camera @ off)) for f in given]
+    mapper, _ = mapped([replace(frame, stamp=float(k)) for k, frame in enumerate(wrong)])
+    mapper.correct({float(k): frame.camera.world_to_camera for k, frame in enumerate(given)})
+    right, _ = mapped(given)
+    np.testing.assert_allclose(
+        np.sort(mapper.snapshot().xyz[:, 2])[::50], np.sort(right.snapshot().xyz[:, 2])[::50], atol=0.01
+    )
+    with pytest.raises(SceneError, match="rotation"):
+        mapper.correct({0.0: 2 * np.eye(4)})
+
+
+def bad_frames():
+    frame = frames(THINGS)[5]
+    lifted = frame.camera.world_to_camera.copy()
+    lifted[:3, 3] += 1.0
+    return {
+        "has no camera": replace(frame, camera=None),
+        "pose is off": replace(frame, camera=replace(frame.camera, world_to_camera=lifted)),
+        "no feature row": replace(frame, features=frame.features[:1]),
+        "another encoder": replace(frame, feature_space="another encoder"),
+        "width 7": replace(frame, features=np.ones((len(frame.features), 7), np.float32)),
+        "holds NaN": replace(frame, features=frame.features * np.nan),
+        "times what the map expects": replace(frame, depth=1000 * frame.depth),
+        "mask image is": replace(frame, masks=frame.masks[:-1]),
+        "masks are float64": replace(frame, masks=frame.masks.astype(float)),
+        "depth is float32": replace(frame, depth=frame.depth[1:]),
+        "both depth and a cloud": replace(frame, cloud=np.zeros((3, 3))),
+        "cloud has shape": replace(frame, depth=None, cloud=np.zeros(3)),
+        "rgb is": replace(frame, rgb=frame.rgb[..., :2]),
+        "stamp is nan": replace(frame, stamp=np.nan),
+    }
+
+
+@pytest.mark.parametrize("said", bad_frames())
+def test_a_bad_frame_is_refused_in_words_and_the_map_unharmed(grown, said):
+    mapper, _ = grown
+    before, sequence = mapper.snapshot(), mapper.points
+    with pytest.raises((SceneError, FeatureSpaceError), match=said):
+        mapper.integrate(bad_frames()[said])
+    assert mapper.snapshot() is before
+    assert mapper.points == sequence
+
+
+def test_masks_without_any_geometry_are_refused():
+    with pytest.raises(SceneError, match="no points yet"):
+        og.Mapper().integrate(without_depth(frames(THINGS))[0])
+    with pytest.raises(SceneError, match="integrate some first"):
+        og.Mapper().snapshot()
+
+
+def test_sparse_depth_makes_a_map():
+    random = np.random.default_rng(0)
+    sparse = [
+        replace(f, depth=np.where(random.random(f.depth.shape) < 0.05, f.depth, 0)) for f in frames(THINGS, cameras(40))
+    ]
+    mapper, _ = mapped(sparse, spacing=0.05)
+    cloud = mapper.finish().cloud
+    assert len({instance_of(cloud, thing) for thing in THINGS} - {-1}) == 3
+
+
+def test_voxel_points_are_means_of_their_voxels():
+    random = np.random.default_rng(0)
+    xyz = random.uniform(-1, 1, (3000, 3)).astype(np.float32)
+    points = VoxelPoints(0.25, grows=True)
+    for part in np.array_split(xyz, 7):
+        points.add(part, np.zeros((len(part), 3), np.uint8), 0)
+    voxel = np.floor(xyz / np.float32(0.25)).astype(int)
+    keys, owner = np.unique(voxel, axis=0, return_inverse=True)
+    owner = owner.ravel()
+    means = np.array([xyz[owner == k].astype(np.float64).mean(axis=0) for k in range(len(keys))])
+    few = np.bincount(owner) <= 32  # beyond, the mean follows
+    found = points.xyz[np.lexsort(np.floor(points.xyz / 0.25).astype(int).T[::-1])]
+    assert len(points) == len(keys)
+    np.testing.assert_allclose(found[few], means[few], atol=1e-5)
+
+
+KILLED = """
+import sys, time
+sys.path.insert(0, {tests!r})
+from og_pointcloud.mapping import map_journal
+from visits import CHEST, BIN, CRATE, frames, SPACE
+import og_pointcloud as og
+map_journal.LOG_BYTES = 1_500_000
+mapper = og.Mapper(feature_space=SPACE, journal={folder!r})
+for frame in frames([CHEST, BIN, CRATE]):
+    mapper.integrate(frame)
+    print(frame.stamp, flush=True)
+"""
+
+
+def test_killed_at_any_moment_it_goes_on(tmp_path, monkeypatch):
+    from og_pointcloud.mapping import map_journal
+
+    monkeypatch.setattr(map_journal, "LOG_BYTES", 1_500_000)
+    folder = tmp_path / "journal"
+    code = textwrap.dedent(KILLED).format(tests=str(Path(__file__).parent), folder=str(folder))
+    given = frames(THINGS)
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as process:
+        done = -1.0
+        for line in process.stdout:
+            done = float(line)
+            if done >= 8:
+                os.kill(process.pid, signal.SIGKILL)
+                break
+    torn = folder / "frames.log"
+    torn.write_bytes(torn.read_bytes() + b"OGF1half a frame")
+    mapper = og.Mapper(feature_space=SPACE, journal=folder)
+    assert mapper.last_stamp >= done
+    for frame in given:
+        if frame.stamp > mapper.last_stamp:
+            mapper.integrate(frame)
+    whole, _ = mapped(given)
+    one, other = mapper.snapshot().cloud, whole.snapshot().cloud
+    np.testing.assert_array_equal(one.xyz, other.xyz)
+    np.testing.assert_array_equal(one.instance_ids, other.instance_ids)
+    np.testing.assert_array_equal(one.instances.descriptors, other.instances.descriptors)
+    assert torn.stat().st_size < 4_000_000
+    with pytest.raises(OgPointcloudError, match="began with"):
+        og.Mapper(cloud=np.eye(3), journal=folder)
+
+
+def test_a_queue_never_blocks_and_says_what_it_drops():
+    said, seen = [], []
+    mapper = og.Mapper(feature_space=SPACE)
+    queue = FrameQueue(mapper, max_age=60.0, on_change=seen.append, on_drop=said.append)
+    given = frames(THINGS)[:4]
+    for frame in [*given, replace(given[0], camera=None)]:
+        queue.put(frame)
+    queue.close()
+    assert len(seen) == 4
+    assert len(said) == 1
+    assert "has no camera" in said[0]
+    slow = FrameQueue(mapper, max_age=0.0, on_drop=said.append)
+    slow.put(given[0])
+    time.sleep(0.01)
+    slow.close()
+    assert slow.dropped == 1
+    assert "1 dropped so far" in said[-1]
+
+
+def test_a_saved_map_is_a_file_like_any_other(grown, tmp_path):
+    mapper, _ = grown
+    path = mapper.save(tmp_path / "room.ogpc")
+    read = og.load(path)
+    np.testing.assert_array_equal(read.instance_ids, mapper.snapshot().instance_ids)
+    assert len(read.cloud.cameras) == 14
