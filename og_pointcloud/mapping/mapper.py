@@ -148,6 +148,7 @@ class Mapper:
         self._points: VoxelPoints | None = None
         self._presence = Presence(0, 0.0, MOST_ODDS)
         self._lost: dict[int, list[int]] = {}
+        self._named_at: dict[int, float] = {}
         self._tracks, self._votes, self._kept = Tracks(), PointVotes(), KeptViews()
         self._left: dict[int, _Left] = {}
         self._anchors: list[tuple[float, NDArray[np.float64]]] = []  # stamp and pose of each frame that brought points
@@ -356,7 +357,14 @@ class Mapper:
             k: (left.look.spread, None if left.look.color is None else left.look.color.tolist(), left.look.length,
                 left.place.tolist(), left.size.tolist()) for k, left in self._left.items()
         }  # fmt: skip
-        values |= {"left": plain, "lost": self._lost, "n": points.n, "spacing": self._spacing, "grows": points.grows}
+        values |= {
+            "named_at": self._named_at,
+            "left": plain,
+            "lost": self._lost,
+            "n": points.n,
+            "spacing": self._spacing,
+            "grows": points.grows,
+        }
         values |= {"sequence": self._sequence, "stamp": self._stamp, "space": (self._space.name, self._space.width)}
         return arrays, values
 
@@ -376,6 +384,7 @@ class Mapper:
         self._recent.extend(arrays["recent"].tolist())
         self._anchors = [(float(row[0]), row[1:].reshape(4, 4).copy()) for row in arrays["anchors"]]
         self._lost = {int(k): rows for k, rows in values["lost"].items()}
+        self._named_at = {int(k): stamp for k, stamp in values["named_at"].items()}
         for k, (spread, color, length, place, size) in values["left"].items():
             look = Look(arrays[f"left.{k}"], spread, None if color is None else np.array(color), length)
             self._left[int(k)] = _Left(look, np.array(place), np.array(size))
@@ -559,28 +568,37 @@ class Mapper:
         )
 
     def _name(self, new: list[int], gone: list[int]) -> tuple[tuple[int, ...], tuple[Moved, ...]]:
-        """Ids for tracks that are objects now: of something that left, if it looks so, else the next one."""
-        if not new:
+        """Ids for tracks that are objects now: of something that left, if it looks so, else the next one. And what left
+        just now may be an object already that was named since it was last seen where it stood."""
+        if not new and not gone:
             return (), ()
         best = self._best_of_all() if self._left else None
         ids, moved = [], []
-        for k in new:
-            if self._tracks.tracks[k].id >= 0 or self._tracks.root[k] != k:
+        owners = self._tracks.by_id()
+        since = min((self._tracks.tracks[owners[k]].last_seen for k in gone if k in owners), default=np.inf)
+        named = [k for k in owners.values() if self._named_at.get(self._tracks.tracks[k].id, -np.inf) >= since]
+        for k in (*new, *named):
+            track = self._tracks.tracks[k]
+            if self._tracks.root[k] != k or track.id in self._left or (k in new and track.id >= 0):
                 continue
-            old, rows = None, np.zeros(0, np.int64)
-            if best is not None and len(rows := np.flatnonzero(best == k)) >= FEWEST_POINTS:
-                old = self._recognised(self._look(k, rows))
-            if old is None:
+            rows = np.zeros(0, np.int64) if best is None else np.flatnonzero(best == k)
+            old = self._recognised(self._look(k, rows)) if len(rows) >= FEWEST_POINTS else None
+            if old is not None:
+                moved.append(self._returned(old, k, rows))
+            elif k in new:
                 ids.append(self._tracks.named(k))
-                continue
-            left = self._left.pop(old)
-            if (before := self._tracks.by_id().get(old)) is not None:
-                self._tracks.tracks[before].id = NO_TRACK
-            self._tracks.tracks[k].id = old
-            assert self._points is not None
-            place = self._points.xyz[rows].astype(np.float64).mean(axis=0) + self._origin_or_zero
-            moved.append(Moved(old, left.place, place, old))
+                self._named_at[ids[-1]] = self._stamp
         return tuple(ids), tuple(moved)
+
+    def _returned(self, old: int, k: int, rows: NDArray[np.int64]) -> Moved:
+        """Give a track the id of what left."""
+        assert self._points is not None
+        left = self._left.pop(old)
+        if (before := self._tracks.by_id().get(old)) is not None:
+            self._tracks.tracks[before].id = NO_TRACK
+        self._tracks.tracks[k].id = old
+        place = self._points.xyz[rows].astype(np.float64).mean(axis=0) + self._origin_or_zero
+        return Moved(old, left.place, place, old)
 
     def _recognised(self, look: Look) -> int | None:
         """The id of what left and looks so, if anything does."""
