@@ -1,8 +1,9 @@
 """A capture folder becomes a Scene: poses, masks with features, geometry, and images where there are any.
 
 Each part comes from the first of these that the folder has.
-  poses     ``transforms.json`` (nerfstudio, instant-ngp, Blender), ``transforms_train.json``; COLMAP ``sparse/0``; the
-            folders of ScanNet, 7-Scenes and Replica
+  poses     ``transforms.json`` (nerfstudio, instant-ngp, Blender), ``transforms_train.json``; COLMAP ``sparse/0`` (of
+            ScanNet++ ``dslr/colmap``); Metashape's ``.xml`` and RealityScan's ``.csv`` of cameras; the folders of
+            ScanNet, 7-Scenes, Replica, Polycam, 3D Scanner App and ARKitScenes
   masks     ``mask_features.npz`` with ``masks/``; LangSplat's ``language_features/``
   geometry  the file given; ``ply_file_path`` of transforms.json; ``points.ply``, ``point_cloud.ply``, the folder's one
             ``.pcd``; the latest ``point_cloud/iteration_*/point_cloud.ply``; ScanNet's ``*_vh_clean_2.ply``; COLMAP's
@@ -43,6 +44,7 @@ from og_pointcloud.formats.images import find_image, image_size, read_rgb, same_
 from og_pointcloud.formats.langsplat import LANGUAGE_FEATURES_FOLDER, read_language_features
 from og_pointcloud.formats.mask_files import FEATURES_NAME, MASKS_FOLDER, MaskLayer, read_masks
 from og_pointcloud.formats.nerfstudio import TRANSFORMS_NAMES, read_transforms
+from og_pointcloud.formats.photogrammetry import find_photogrammetry, read_photogrammetry
 from og_pointcloud.formats.points import read_points
 from og_pointcloud.formats.poses import PosedImage, in_local_frame, in_pinholes
 from og_pointcloud.formats.repairs import Repair, read_repairs, repaired_images, repaired_layers
@@ -58,7 +60,7 @@ __all__ = [
     "read_poses",
 ]  # fmt: skip
 
-CLOUD_NAMES = ("points.ply", "point_cloud.ply")
+CLOUD_NAMES = ("points.ply", "point_cloud.ply", "scans/mesh_aligned_0.05.ply")
 DECODED = 4
 """Mask maps of images with several faces that are kept: faces come one after the other, some side by side."""
 FUSED_FRAMES = 300
@@ -166,6 +168,11 @@ def _stated_poses(capture: Path) -> CapturePoses:
     if model is not None:
         images = colmap.read_images(model)
         return CapturePoses(_view_names(images), images, model)
+    export = find_photogrammetry(capture)
+    if export is not None:
+        frames = read_photogrammetry(export, partial(_size_of_image, capture))
+        _warn_of_dropped(export, frames.dropped)
+        return CapturePoses(_view_names(frames.images), frames.images, export)
     frames = read_rgbd(capture)
     if frames is not None:
         if not frames.images:
@@ -174,8 +181,10 @@ def _stated_poses(capture: Path) -> CapturePoses:
         return CapturePoses(_view_names(frames.images), frames.images, capture, is_recording=True)
     raise SceneError(
         f"{capture} has no pose file; expected transforms.json (nerfstudio, instant-ngp, Blender), a COLMAP model in "
-        "sparse/0 (cameras and images, .bin or .txt), or the layout of ScanNet (color/, pose/, intrinsic/), 7-Scenes "
-        "(frame-*.pose.txt) or Replica (results/, traj.txt)"
+        "sparse/0 (cameras and images, .bin or .txt), Metashape's .xml or RealityScan's .csv of cameras, or the layout "
+        "of ScanNet (color/, pose/, intrinsic/), 7-Scenes (frame-*.pose.txt), Replica (results/, traj.txt), Polycam "
+        "(keyframes/), 3D Scanner App (frame_*.json) or ARKitScenes (lowres_wide.traj); of an E57 file, og-pointcloud "
+        "import makes such a folder"
     )
 
 
@@ -293,7 +302,7 @@ def read_geometry(capture: Path, poses: CapturePoses, gaussians: str | Path | No
         frames = _depth_frames(capture, poses)
         if not frames:
             raise SceneError(
-                f"{capture} has no geometry; expected {' or '.join(CLOUD_NAMES)}, one .pcd, ply_file_path in "
+                f"{capture} has no geometry; expected {' or '.join(CLOUD_NAMES[:2])}, one .pcd, ply_file_path in "
                 "transforms.json, point_cloud/iteration_*/point_cloud.ply, COLMAP's sparse/0/points3D or depth images "
                 "in depth/: add one of them, or name a file (--gaussians)"
             )

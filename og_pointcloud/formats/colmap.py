@@ -27,7 +27,7 @@ from og_pointcloud.scene import Camera
 
 __all__ = ["find_model", "read_images", "read_points3d"]
 
-MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse")
+MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", "dslr/colmap")
 
 CAMERA_MODELS: dict[str, tuple[int, str]] = {
     "SIMPLE_PINHOLE": (0, "f cx cy"),

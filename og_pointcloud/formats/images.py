@@ -29,7 +29,7 @@ __all__ = [
 ]
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".PNG", ".JPEG", ".webp", ".tif", ".tiff", ".bmp")
-IMAGE_FOLDERS = ("images", "images_2", "images_4", "images_8", "color", "rgb")
+IMAGE_FOLDERS = ("images", "images_2", "images_4", "images_8", "color", "rgb", "dslr/resized_images")
 MAX_PIXELS = 1 << 27
 """Larger images are refused before anything is allocated."""
 MOST_SEGMENTS = 1000

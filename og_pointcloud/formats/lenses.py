@@ -3,8 +3,9 @@
 Normalised coordinates times the focal lengths plus the principal point are pixels, so they do not change with the
 image's size. x right, y down, z forward; theta is a ray's angle from the axis.
 
-perspective  x/z, y/z, then OpenCV's k1..k6 and p1, p2. ``xi``: the ray's length times xi is added to z before (unified
-             model of Mei and Rives, ICRA 2007: KITTI-360's fisheyes).
+perspective  x/z, y/z, then OpenCV's k1..k6 and p1, p2. ``r8``: of r^8 beside k3's r^6, which photogrammetry calls k4.
+             ``xi``: the ray's length times xi is added to z before (unified model of Mei and Rives, ICRA 2007:
+             KITTI-360's fisheyes).
 fisheye      radius theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8): Kannala and Brandt, OpenCV's fisheye;
              p1, p2 and the thin prism's sx1, sy1 as in COLMAP's THIN_PRISM_FISHEYE.
 fov          radius atan(2 r tan(omega / 2)) / omega, r = tan(theta): Devernay and Faugeras 2001.
@@ -38,7 +39,7 @@ def _perspective(x: Doubles, y: Doubles, z: Doubles, t: Terms) -> tuple[Doubles,
     z = z + t["xi"] * np.sqrt(x * x + y * y + z * z)
     x, y = x / z, y / z
     r2 = x * x + y * y
-    radial = 1 + r2 * (t["k1"] + r2 * (t["k2"] + r2 * t["k3"]))
+    radial = 1 + r2 * (t["k1"] + r2 * (t["k2"] + r2 * (t["k3"] + r2 * t["r8"])))
     return _tangential(x, y, r2, radial / (1 + r2 * (t["k4"] + r2 * (t["k5"] + r2 * t["k6"]))), t)
 
 
@@ -84,7 +85,7 @@ def _spherical(x: Doubles, y: Doubles, z: Doubles, _: Terms) -> tuple[Doubles, D
 
 Projection = Callable[[Doubles, Doubles, Doubles, Terms], tuple[Doubles, Doubles]]
 MODELS: dict[str, tuple[tuple[str, ...], Projection]] = {
-    "perspective": (("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "xi"), _perspective),
+    "perspective": (("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "r8", "xi"), _perspective),
     "fisheye": (("k1", "k2", "k3", "k4", "p1", "p2", "sx1", "sy1"), _fisheye),
     "fov": (("omega",), _fov),
     "division": (("k",), _division),

@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.depth import MILLIMETRE, DepthFile
 from og_pointcloud.formats.images import IMAGE_SUFFIXES, image_size
+from og_pointcloud.formats.phones import PHONE_LAYOUTS
 from og_pointcloud.formats.poses import (
     PosedFrames,
     PosedImage,
@@ -103,7 +104,7 @@ def read_rgbd(folder: Path) -> PosedFrames | None:
 
     SceneError names the file that is wrong, and the cure.
     """
-    return next((read(folder) for holds, read in LAYOUTS if holds(folder)), None)
+    return next((read(folder) for holds, read in (*LAYOUTS, *PHONE_LAYOUTS) if holds(folder)), None)
 
 
 def _is_scannet(folder: Path) -> bool:

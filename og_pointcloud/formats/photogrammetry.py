@@ -1,0 +1,247 @@
+"""Cameras as photogrammetry exports them: Agisoft Metashape's XML, RealityScan's (RealityCapture's) CSV.
+
+Metashape    File > Export > Export Cameras, Agisoft XML. Poses are camera-to-chunk with OpenCV axes; the transform of
+             the chunk, or of the camera's component, takes them to the world (geocentric where the project has
+             coordinates). The principal point counts from the image's middle; its p1 and p2 are OpenCV's p2 and p1, its
+             k4 is of r^8.
+RealityScan  Registration, "Internal/External camera parameters": a line an image, ``#name,x,y,alt,heading,pitch,roll,
+             f,px,py,k1,k2,k3,k4,t1,t2``. At angles of 0 a camera looks down with north on top. Focal length and
+             principal point are millimetres of a frame whose longer side is 36.
+
+Images are called by name alone; they are looked for in the folder and its image folders.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import itertools
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+from numpy.typing import NDArray
+
+from og_pointcloud.errors import SceneError
+from og_pointcloud.formats.lenses import SPHERICAL, Lens, lens_of, spherical_camera
+from og_pointcloud.formats.poses import PosedFrames, PosedImage, rigid
+from og_pointcloud.formats.tables import naming
+from og_pointcloud.scene import Camera
+
+__all__ = ["find_photogrammetry", "read_photogrammetry"]
+
+Doubles = NDArray[np.float64]
+ImageSize = Callable[[str], tuple[int, int]]
+
+MAX_BYTES = 1 << 28
+HEAD_BYTES = 4096
+MOST_SKEW_PX = 1.0
+FULL_FRAME = 36.0
+COLUMNS = ["x", "y", "alt", "heading", "pitch", "roll", "f", "px", "py", "k1", "k2", "k3", "k4", "t1", "t2"]
+OPENGL = np.array([1.0, -1.0, -1.0])
+"""Factors of a camera's axes between OpenGL's (y up, z back) and OpenCV's."""
+
+
+def find_photogrammetry(capture: Path) -> Path | None:
+    """The export of one of these programs in the folder, told by its first bytes, or None."""
+    files = [*sorted(capture.glob("*.xml")), *sorted(capture.glob("*.csv"))]
+    return next((file for file in files if _reader(file) is not None), None)
+
+
+def read_photogrammetry(file: Path, image_size: ImageSize) -> PosedFrames:
+    """Poses of the export that `find_photogrammetry` found. ``image_size(name)`` gives (width, height) of an image.
+
+    Images without a pose are dropped. SceneError names the file, the camera and the cure.
+    """
+    reader = _reader(file)
+    if reader is None:
+        raise SceneError(f"{file} is neither Metashape's XML of cameras nor RealityScan's CSV: export it again")
+    if (size := file.stat().st_size) > MAX_BYTES:
+        raise SceneError(f"{file} has {size} bytes; expected at most {MAX_BYTES}")
+    with naming(file):
+        frames = reader(file.read_text(encoding="utf-8-sig", errors="replace"), image_size)
+        if not frames.images:
+            raise SceneError(f"none of its {len(frames.dropped)} cameras has a pose: align the photographs first")
+    return frames
+
+
+def _reader(file: Path) -> Callable[[str, ImageSize], PosedFrames] | None:
+    with file.open("rb") as stream:
+        head = stream.read(HEAD_BYTES).removeprefix(b"\xef\xbb\xbf").lstrip()
+    if file.suffix == ".csv":
+        return _realityscan if head.startswith(b"#name,") else None
+    return _metashape if b"<document" in head and b"<chunk" in head else None
+
+
+# Metashape --------------------------------------------------------------------------------------------------------
+
+
+def _metashape(text: str, _: ImageSize) -> PosedFrames:
+    if "<!DOCTYPE" in text or "<!ENTITY" in text:
+        raise SceneError("the XML defines entities; expected none, as Metashape writes it: export it again")
+    try:
+        root = ElementTree.fromstring(text)
+    except ElementTree.ParseError as error:
+        raise SceneError(f"not valid XML ({error}): export the cameras again") from None
+    chunks = [chunk for chunk in root.iter("chunk") if chunk.get("enabled") != "false" and _cameras(chunk)]
+    placed = [chunk for chunk in chunks if _world_of(chunk) is not None or chunk.find(".//component/transform")]
+    if len(chunks) > 1 and len(placed) < len(chunks):
+        labels = ", ".join(repr(chunk.get("label")) for chunk in chunks)
+        raise SceneError(f"the chunks {labels:.200} have no common world; expected one chunk: align or disable chunks")
+    images, dropped = [], []
+    for chunk in chunks:
+        posed, without = _chunk(chunk)
+        images += posed
+        dropped += without
+    return PosedFrames(tuple(images), tuple(dropped))
+
+
+def _cameras(chunk: ElementTree.Element) -> list[ElementTree.Element]:
+    """Also of groups; but for disabled ones."""
+    return [camera for camera in chunk.iterfind("cameras//camera") if camera.get("enabled") not in ("false", "0")]
+
+
+def _chunk(chunk: ElementTree.Element) -> tuple[list[PosedImage], list[str]]:
+    sensors = {sensor.get("id"): sensor for sensor in chunk.iterfind("sensors/sensor")}
+    worlds = {component.get("id"): _world_of(component) for component in chunk.iterfind("components/component")}
+    world_of_chunk, images, dropped = _world_of(chunk), [], []
+    for camera in _cameras(chunk):
+        label, transform = camera.get("label") or "", camera.find("transform")
+        sensor = sensors.get(camera.get("sensor_id"))
+        if transform is None or sensor is None:
+            dropped.append(label)
+            continue
+        with naming(f"camera '{label:.60}'"):
+            world = worlds.get(camera.get("component_id")) or world_of_chunk or (1.0, np.eye(3), np.zeros(3))
+            images.append(_metashape_image(label, sensor, _floats(transform, 16).reshape(4, 4), world))
+    return images, dropped
+
+
+World = tuple[float, Doubles, Doubles]
+"""Scale, rotation, translation: world = scale * rotation @ chunk + translation."""
+
+
+def _world_of(element: ElementTree.Element) -> World | None:
+    transform = element.find("transform")
+    if transform is None:
+        return None
+    rotation, translation, scale = (transform.find(name) for name in ("rotation", "translation", "scale"))
+    return (
+        1.0 if scale is None else float(_floats(scale, 1)[0]),
+        np.eye(3) if rotation is None else _floats(rotation, 9).reshape(3, 3),
+        np.zeros(3) if translation is None else _floats(translation, 3),
+    )
+
+
+def _metashape_image(label: str, sensor: ElementTree.Element, to_chunk: Doubles, world: World) -> PosedImage:
+    scale, rotation, translation = world
+    with np.errstate(all="ignore"):  # the camera refuses what comes of it
+        center = scale * rotation @ to_chunk[:3, 3] + translation
+        camera_to_world = rotation @ to_chunk[:3, :3]
+        pose = rigid(camera_to_world.T, -camera_to_world.T @ center)
+    calibrations = sensor.findall("calibration")
+    stated = next((made for made in calibrations if made.get("class") == "adjusted"), None)
+    calibration = stated if stated is not None else next(iter(calibrations), None)
+    resolution = sensor.find("resolution")
+    if resolution is None:
+        raise SceneError("its sensor has no resolution: export the cameras again")
+    width, height = (_whole(resolution.get(side)) for side in ("width", "height"))
+    kind = sensor.get("type") or "frame"
+    if kind == "spherical":
+        return PosedImage(label, spherical_camera(width, height, pose), SPHERICAL)
+    if calibration is None:
+        raise SceneError("its sensor has no calibration: export the cameras again")
+    terms = {child.tag: _floats(child, 1)[0].item() for child in calibration if child.tag != "resolution"}
+    focal = terms.pop("f", 0.0)
+    cx, cy, skew = width / 2 + terms.pop("cx", 0.0), height / 2 + terms.pop("cy", 0.0), terms.pop("b2", 0.0)
+    if abs(skew) * height > 2 * MOST_SKEW_PX * max(focal, 1.0):
+        raise SceneError(f"its calibration has the skew b2 = {skew}; expected 0: optimise the cameras without b2")
+    camera = Camera(width, height, focal + terms.pop("b1", 0.0), focal, cx, cy, pose)
+    return PosedImage(label, camera, _metashape_lens(kind, terms))
+
+
+def _metashape_lens(kind: str, terms: dict[str, float]) -> Lens | None:
+    if kind not in ("frame", "fisheye"):
+        raise SceneError(
+            f"its sensor is of type '{kind:.40}'; expected frame, fisheye or spherical: undistort the images"
+        )
+    terms["p1"], terms["p2"] = terms.get("p2", 0.0), terms.get("p1", 0.0)
+    if kind == "fisheye":
+        return lens_of("fisheye", terms)
+    terms["r8"] = terms.pop("k4", 0.0)
+    return lens_of("perspective", terms)
+
+
+def _floats(element: ElementTree.Element, count: int) -> Doubles:
+    words = (element.text or "").split()
+    try:
+        values = np.array([float(word) for word in words[: count + 1]])
+    except ValueError:
+        values = np.empty(0)
+    if len(values) != count or not np.isfinite(values).all():
+        raise SceneError(f"<{element.tag:.40}> holds '{' '.join(words[:4]):.60}'; expected {count} numbers")
+    return values
+
+
+def _whole(text: str | None) -> int:
+    if text is None or not text.isascii() or not text.isdigit() or len(text) > 9:
+        raise SceneError(f"its sensor's resolution is '{text or '':.20}'; expected whole numbers of pixels")
+    return int(text)
+
+
+# RealityScan ------------------------------------------------------------------------------------------------------
+
+
+def _realityscan(text: str, image_size: ImageSize) -> PosedFrames:
+    try:
+        lines = csv.DictReader(io.StringIO(text))
+        missing = [name for name in ("x", "y", "alt", "heading", "f") if name not in (lines.fieldnames or ())]
+        if missing:
+            raise SceneError(f"it has no column '{missing[0]}'; expected Internal/External camera parameters as CSV")
+        return PosedFrames(tuple(_realityscan_images(lines, image_size)), ())
+    except csv.Error as error:
+        raise SceneError(f"not a CSV of cameras ({error!s:.80}): export it again") from None
+
+
+def _realityscan_images(lines: csv.DictReader[str], image_size: ImageSize) -> Iterator[PosedImage]:
+    for number, line in zip(itertools.count(2), lines, strict=False):
+        name = (line["#name"] or "").strip().replace("\\", "/").rsplit("/", 1)[-1]
+        with naming(f"line {number}"):
+            if not name:
+                raise SceneError("it names no image; expected #name first: export it again")
+            values = _numbers(line)
+            width, height = image_size(name)
+            scale = max(width, height) / FULL_FRAME
+            center = np.array([values["x"], values["y"], values["alt"]])
+            rotation = _looking_down(values["heading"], values["pitch"], values["roll"]) * OPENGL
+            camera = Camera(
+                width, height, scale * values["f"], scale * values["f"], width / 2 + scale * values["px"],
+                height / 2 + scale * values["py"], rigid(rotation.T, -rotation.T @ center),
+            )  # fmt: skip
+            terms = {"k1": "k1", "k2": "k2", "k3": "k3", "r8": "k4", "p1": "t1", "p2": "t2"}
+            lens = lens_of("perspective", {term: values[column] for term, column in terms.items()})
+        yield PosedImage(name, camera, lens)
+
+
+def _numbers(line: Mapping[str, str | None]) -> dict[str, float]:
+    """By column; those that an export may leave out are 0."""
+    values = {}
+    for column in COLUMNS:
+        text = line.get(column)
+        try:
+            values[column] = float(text or 0)
+        except (TypeError, ValueError):
+            values[column] = np.nan
+        if not abs(values[column]) < 1e30:
+            raise SceneError(f"{column} is '{text!s:.40}'; expected a number")
+    return values
+
+
+def _looking_down(heading: float, pitch: float, roll: float) -> Doubles:
+    """(3, 3) camera to world, OpenGL axes. Degrees; heading is clockwise from north."""
+    (sy, sp, sr), (cy, cp, cr) = (wave(np.radians([-heading, pitch, roll])) for wave in (np.sin, np.cos))
+    about_up = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
+    about_right = np.array([[1, 0, 0], [0, cp, -sp], [0, sp, cp]])
+    about_forward = np.array([[cr, 0, sr], [0, 1, 0], [-sr, 0, cr]])
+    return about_up @ about_right @ about_forward

@@ -1,0 +1,152 @@
+"""Phones' exports, as the apps write them: ARKit's axes, small depth images, frames without an image or a pose."""
+
+import json
+
+import numpy as np
+import pytest
+from capture_files import make_world, write_colmap_text, write_images, write_masks
+from scenes import ROOM_SIZE, camera, look, room_poses, write_depth, write_image
+
+from og_pointcloud.errors import SceneError
+from og_pointcloud.formats.capture import depth_files, fuse_capture, read_capture, read_poses
+from og_pointcloud.formats.ply import join_columns, write_ply
+
+OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+WIDTH, HEIGHT = ROOM_SIZE
+SCALE = 4
+"""Images are so many times as large as depth images."""
+
+
+def photographs():
+    """(name, camera to world with OpenCV axes, depth) of a room."""
+    return [(index, pose, look(pose)[0]) for index, pose in enumerate(room_poses()[:4])]
+
+
+def lens_of_images():
+    at = camera(np.eye(4))
+    return at.fx * SCALE, at.fy * SCALE, at.cx * SCALE, at.cy * SCALE
+
+
+def picture(path):
+    write_image(path, np.full((HEIGHT * SCALE, WIDTH * SCALE, 3), 120, np.uint8))
+
+
+def write_polycam(folder, images="corrected_images", cameras="corrected_cameras"):
+    fx, fy, cx, cy = lens_of_images()
+    for index, pose, depth in photographs():
+        name = f"17000{index}"
+        picture(folder / "keyframes" / images / f"{name}.jpg")
+        keys = {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "width": WIDTH * SCALE, "height": HEIGHT * SCALE}
+        matrix = pose @ OPENGL
+        keys |= {f"t_{row}{column}": matrix[row, column] for row in range(3) for column in range(4)}
+        file = folder / "keyframes" / cameras / f"{name}.json"
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(json.dumps({**keys, "blur_score": 100, "neighbors": [1, 2]}))
+        write_depth(folder / "keyframes/depth" / f"{name}.png", depth)
+    return "keyframes/corrected_cameras/170001.json"
+
+
+def write_scanner_app(folder):
+    fx, fy, cx, cy = lens_of_images()
+    for index, pose, depth in photographs():
+        picture(folder / f"frame_{index:05d}.jpg")
+        content = {"cameraPoseARFrame": (pose @ OPENGL).ravel().tolist(), "time": 1.5, "frame_index": index}
+        content["intrinsics"] = [fx, 0, cx - 0.5, 0, fy, cy - 0.5, 0, 0, 1]
+        (folder / f"frame_{index:05d}.json").write_text(json.dumps(content))
+        write_depth(folder / f"depth_{index:05d}.png", depth)
+    (folder / "frame_00007.json").write_text("{}")  # frames whose image was not kept
+    return "frame_00001.json"
+
+
+def write_arkit_scenes(folder):
+    from scipy.spatial.transform import Rotation
+
+    at, lines = camera(np.eye(4)), []
+    for index, pose, depth in photographs():
+        name = f"4200_{10 + index / 10:.3f}"
+        image = np.full((HEIGHT, WIDTH, 3), 120, np.uint8)
+        write_image(folder / "lowres_wide" / f"{name}.png", image)
+        write_depth(folder / "lowres_depth" / f"{name}.png", depth)
+        inverse = np.linalg.inv(pose)
+        vector = Rotation.from_matrix(inverse[:3, :3]).as_rotvec()
+        lines.append(" ".join(map(repr, [10 + index / 10 + 0.004, *vector.tolist(), *inverse[:3, 3].tolist()])))
+        pincam = folder / "lowres_wide_intrinsics" / f"{name}.pincam"
+        pincam.parent.mkdir(exist_ok=True)
+        pincam.write_text(f"{WIDTH} {HEIGHT} {at.fx} {at.fy} {at.cx - 0.5} {at.cy - 0.5}\n")
+    (folder / "lowres_wide.traj").write_text("\n".join(lines[::-1]) + "\n")
+    write_image(folder / "lowres_wide" / "4200_99.000.png", image)  # after tracking ended
+    return "lowres_wide_intrinsics/4200_10.100.pincam"
+
+
+WRITERS = {"Polycam": write_polycam, "3D Scanner App": write_scanner_app, "ARKitScenes": write_arkit_scenes}
+
+
+@pytest.fixture(params=WRITERS)
+def app(request, tmp_path):
+    return request.param, tmp_path, WRITERS[request.param](tmp_path)
+
+
+@pytest.mark.filterwarnings("ignore:.*no finite pose")
+def test_cameras_and_depths_fit_the_room(app):
+    name, folder, _ = app
+    poses = read_poses(folder)
+    scale = 1 if name == "ARKitScenes" else SCALE
+    assert len(poses.images) == 4
+    assert poses.is_recording
+    for image, (_, pose, _) in zip(poses.images, photographs(), strict=True):
+        np.testing.assert_allclose(image.camera.world_to_camera, np.linalg.inv(pose), atol=1e-9)
+        ours, theirs = image.camera, camera(pose)
+        np.testing.assert_allclose([ours.fx, ours.cx, ours.cy], scale * np.array([theirs.fx, theirs.cx, theirs.cy]))
+        assert (ours.width, ours.height) == (WIDTH * scale, HEIGHT * scale)
+    files = depth_files(folder, poses)
+    depth = files[poses.names[2]].read()
+    np.testing.assert_allclose(depth.depth, photographs()[2][2], atol=6e-4)
+    assert depth.camera.fx == pytest.approx(camera(np.eye(4)).fx)
+    cloud = fuse_capture(folder).points
+    assert len(cloud) > 1000
+    assert cloud.rgb is not None
+
+
+def test_frames_without_a_partner_are_left_out(app):
+    name, folder, partner = app
+    if name == "ARKitScenes":
+        with pytest.warns(UserWarning, match="1 frames have no finite pose"):
+            assert len(read_poses(folder).images) == 4
+    (folder / partner).unlink()
+    with pytest.warns(UserWarning, match=r"[12] frames have no finite pose and are left out"):
+        assert len(read_poses(folder).images) == 3
+
+
+@pytest.mark.filterwarnings("ignore:.*no finite pose")
+@pytest.mark.parametrize(
+    "content", [b"", b"{", b"[]", b"1 2 3", b'{"fx": "x", "intrinsics": [1], "t_00": null}', b"\xff\xfe"]
+)
+def test_damaged_files_name_the_cure(app, content):
+    _, folder, partner = app
+    (folder / partner).write_bytes(content)
+    with pytest.raises(SceneError) as caught:
+        read_poses(folder)
+    assert partner.split("/")[-1] in str(caught.value)
+
+
+def test_polycams_first_poses_serve_where_it_did_not_correct_them(tmp_path):
+    write_polycam(tmp_path, "images", "cameras")
+    assert read_poses(tmp_path).images[0].path == "keyframes/images/170000.jpg"
+
+
+def test_scannet_plus_plus(tmp_path):
+    """Its DSLR half is a COLMAP model in the mesh's world, with a fisheye lens."""
+    world = make_world()
+    write_colmap_text(tmp_path / "dslr/colmap", world, {1: ("OPENCV_FISHEYE", (60.0, 60.0, 32.0, 24.0, 0.1, 0, 0, 0))})
+    write_images(tmp_path, world.names)
+    (tmp_path / "dslr/resized_images").parent.mkdir(exist_ok=True)
+    (tmp_path / "images").rename(tmp_path / "dslr/resized_images")
+    write_masks(tmp_path, world.names)
+    (tmp_path / "scans").mkdir()
+    write_ply(
+        tmp_path / "scans/mesh_aligned_0.05.ply", {"vertex": join_columns(dict(zip("xyz", world.xyz.T, strict=True)))}
+    )
+    scene = read_capture(tmp_path)
+    assert [view.name for view in scene.views] == world.names
+    assert scene.views[0].image_rgb() is not None
+    assert len(scene.points) == len(world.xyz)
