@@ -12,6 +12,7 @@ from labelled_clouds import make_cloud
 from scenes import write_tiny_capture
 
 import og_pointcloud as og
+from og_pointcloud.cli import main
 from og_pointcloud.fitting.fit import fit_prepared, prepare
 from og_pointcloud.fitting.labellers import grouping
 from og_pointcloud.fitting.mask_table import MaskTable
@@ -221,3 +222,11 @@ def test_a_file_of_before_opens_without_it(scene: Scene, tmp_path) -> None:
     assert opened.cloud.reliability is None
     assert opened.instances[0].reliability is None
     assert json.loads(opened.instances.to_json())[0]["reliability"] is None
+
+
+def test_the_command_prints_it(tmp_path, capsys) -> None:
+    capture = write_tiny_capture(tmp_path / "capture", 8).folder
+    main(["fit", str(capture), "-o", str(tmp_path / "s.ogpc"), "--json", str(tmp_path / "fit.json")])
+    written = json.loads((tmp_path / "fit.json").read_text())["reliability"]
+    assert written == og.load(tmp_path / "s.ogpc").cloud.reliability
+    assert f"reliability {written:.2f}: how far half of the views bear the labels out" in capsys.readouterr().out

@@ -77,7 +77,8 @@ class Row:
     miou, macc, unknown: over the points with a known class; background: the share of known background that was given a
     class. labelled_miou: mIoU with background left out, as published tables have it. None without truth.
     gain, gain_low, gain_high: mIoU less the default's, with its paired 95 % interval over blocks of space.
-    agreement: of the instances with the masks, None for other methods. published: the same row's mIoU in the paper.
+    agreement: of the instances with the masks, None for other methods. reliability: of the fit
+    (`LabelledCloud.reliability`). published: the same row's mIoU in the paper.
     left_out: what the fit left out and why, as its provenance has it.
     """
 
@@ -95,6 +96,7 @@ class Row:
     gain_low: float | None = None
     gain_high: float | None = None
     agreement: float | None = None
+    reliability: float | None = None
     instances: int | None = None
     published: float | None = None
     left_out: tuple[dict[str, Any], ...] = field(default=(), repr=False)
@@ -228,6 +230,7 @@ class _Trial:
             seconds=seconds,
             error=1 - scores.get("miou", agreement),
             agreement=agreement,
+            reliability=cloud.reliability,
             instances=len(cloud.instances),
             left_out=tuple(cloud.provenance["left_out"]),
             **scores,

@@ -16,7 +16,7 @@ __all__ = ["require_matplotlib", "table", "write_chart", "write_report"]
 
 SHARES = {
     "mIoU": "miou", "without background": "labelled_miou", "paper": "published", "mAcc": "macc", "unknown": "unknown",
-    "background called": "background", "agreement": "agreement",
+    "background called": "background", "agreement": "agreement", "reliability": "reliability",
 }  # fmt: skip
 """Column -> field of `Row`, after setting, seconds, error and gain."""
 COLOURS, MARKERS = [f"C{number}" for number in range(10)], "osD^vPX*<>hpd"

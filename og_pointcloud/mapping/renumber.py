@@ -60,5 +60,6 @@ def with_ids(cloud: LabelledCloud, wanted: NDArray[np.int64], count: int) -> Lab
         visible_area=moved("visible_area", 0),
         coarse=moved("coarse", -1),
         part_of=part_of,
+        reliability=moved("reliability", np.nan),
     )
     return replace(cloud, instance_ids=number[cloud.instance_ids].astype(np.int32), instances=renamed)
