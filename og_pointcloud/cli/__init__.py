@@ -26,10 +26,11 @@ from og_pointcloud.errors import MissingExtraError, OgPointcloudError, printable
 __all__ = ["main"]
 
 COMMANDS = (
-    "masks", "models", "fit", "update", "compare", "fuse", "repair", "import", "segment", "select", "pick", "instances",
-    "index", "find", "edit", "view", "serve", "ros-bag", "info", "vocabulary", "export", "eval", "report", "demo",
+    "masks", "models", "fit", "map", "update", "compare", "fuse", "repair", "import", "segment", "select", "pick",
+    "instances", "index", "find", "edit", "view", "serve", "ros-bag", "info", "vocabulary", "export", "eval", "report",
+    "demo",
 )  # fmt: skip
-MODULES = {"import": "import_", "eval": "evaluate", "ros-bag": "ros_bag"}
+MODULES = {"import": "import_", "eval": "evaluate", "map": "map_", "ros-bag": "ros_bag"}
 """Command -> its module, where they are not called the same."""
 LONGEST_UNFORESEEN = 300
 """Characters that are shown of an error that is none of ours."""

@@ -1,0 +1,58 @@
+"""Make a map of a ROS 2 bag, frame by frame; needs no ROS.
+
+og-pointcloud map drive -o room.ogpc
+"""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+import sys
+from pathlib import Path
+
+from og_pointcloud.cli.common import Parser, add_output, print_next, replaceable
+from og_pointcloud.errors import OgPointcloudError
+
+
+def add(parser: Parser) -> None:
+    parser.add_argument("bag", type=Path, metavar="BAG", help="depth, masks with features, camera_info, tf (docs/maps)")
+    add_output(parser, "-o", "--output", endings=(".ogpc",), required=True, help="the map to write")
+    parser.add_argument("--resume", action="store_true", help="go on where an interrupted run was")
+    parser.add_argument("--start", type=Path, metavar="MAP.ogpc", help="a map to go on with (default: an empty one)")
+    parser.add_argument("--frame", default="map", metavar="F", help="what tf calls the map (default: %(default)s)")
+    parser.add_argument(
+        "--feature-space", default="unknown", metavar="NAME", help="encoder of the features (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--work", type=replaceable, metavar="DIR", help="where the map is kept while it grows (default: S.ogpc.map)"
+    )
+
+
+def run(arguments: argparse.Namespace) -> None:
+    from og_pointcloud_ros.map_bags import BagFrames
+    from tqdm import tqdm
+
+    from og_pointcloud.mapping.mapper import Mapper
+
+    work = arguments.work or arguments.output.with_name(f"{arguments.output.name}.map")
+    if work.exists() and not arguments.resume:
+        raise OgPointcloudError(f"'{work}' holds a map that was interrupted: add --resume, or remove it")
+    frames = BagFrames(arguments.bag, arguments.frame)
+    mapper = Mapper(arguments.start, feature_space=arguments.feature_space, journal=work)
+    resumed, refused, taken = mapper.last_stamp, {}, 0
+    for frame in tqdm(frames, desc="frames", disable=None, leave=False):
+        if arguments.resume and frame.stamp is not None and frame.stamp <= resumed:
+            continue
+        try:
+            mapper.integrate(frame)
+            taken += 1
+        except OgPointcloudError as error:
+            refused[str(error)] = refused.get(str(error), 0) + 1
+    mapper.save(arguments.output)
+    shutil.rmtree(work)
+    for why, count in [*frames.dropped.items(), *refused.items()][:12]:
+        print(f"left out: {count} x {why}", file=sys.stderr)
+    objects = mapper.objects()
+    print(f"{taken:,} frames, {mapper.points:,} points, {len(objects)} objects")
+    print(f"wrote {arguments.output}")
+    print_next("info", arguments.output)
