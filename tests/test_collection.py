@@ -352,3 +352,23 @@ def test_pictures_show_the_thing(tmp_path):
     assert orange[80:120, 80:120].mean() > 0.9
     image = random.integers(0, 256, (7, 5, 3)).astype(np.uint8)
     np.testing.assert_array_equal(cv2.imdecode(np.frombuffer(png_bytes(image), np.uint8), 1)[..., ::-1], image)
+
+
+def test_lance_proposes_what_the_exact_search_finds(folder, tmp_path, capsys):
+    pytest.importorskip("lancedb", reason="needs the extra 'lance': lancedb")
+    clouds = many(30, bank=BANK, noise=0.5) | {"cosines": scene(["bed", "rug"], 8, space="another/encoder")}
+    exact = indexed(folder, clouds)
+    uri, atlas = str(tmp_path / "lance"), str(folder.parent / "atlas")
+    assert main(["index", str(folder), "-o", atlas, "--lance", uri]) == 0
+    proposed = og.Collection(atlas, lance=uri)
+    box = ([1.5, -1, -1], [9, 1, 1])
+    for options in ({}, {"within": box}, {"scenes": "site1/*"}, {"within": ([50, 50, 50], [51, 51, 51])}):
+        for word in THINGS:
+            expected, found = (c.find(word, top=5, **options) for c in (exact, proposed))
+            assert [(f.scene, f.instance) for f in found] == [(f.scene, f.instance) for f in expected]
+            assert [f.score for f in found] == pytest.approx([f.score for f in expected], abs=1e-6)
+    capsys.readouterr()
+    assert main(["find", atlas, "bed", "--lance", uri, "--json", "--top", "1"]) == 0
+    assert len(json.loads(capsys.readouterr().out)) == 1
+    with pytest.raises(OgPointcloudError, match="has no table for these scenes"):
+        og.Collection(atlas, lance=str(tmp_path / "other")).find("bed")

@@ -27,6 +27,7 @@ def add(parser: Parser) -> None:
         help="ask only this one, or those of a pattern: 'site3/*'; repeatable",
     )
     parser.add_argument("--top", type=int, default=20, metavar="N", help="how many (default: %(default)s)")
+    parser.add_argument("--lance", metavar="URI", help="search what `index --lance` wrote, not memory")
     add_output(parser, "--html", endings=(".html", ".htm"), help="also write a page with a picture of each")
     add_shared(parser, "--text-features", "--json")
 
@@ -37,7 +38,7 @@ def run(arguments: argparse.Namespace) -> None:
 
     check_at_least("--top", arguments.top, 1)
     corners = None if arguments.within is None else numbers(arguments.within, "--within", 6)
-    collection = Collection(arguments.atlas)
+    collection = Collection(arguments.atlas, lance=arguments.lance)
     findings = collection.find(
         arguments.words,
         within=None if corners is None else (corners[:3], corners[3:]),

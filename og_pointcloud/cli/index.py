@@ -18,6 +18,9 @@ def add(parser: Parser) -> None:
         "-o", "--output", type=replaceable, required=True, metavar="ATLAS",
         help="the index, one file; where it is there, only what changed is read",
     )  # fmt: skip
+    parser.add_argument(
+        "--lance", metavar="URI", help="also write it for LanceDB, to a folder or an object store (s3://...)"
+    )
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -30,5 +33,10 @@ def run(arguments: argparse.Namespace) -> None:
         print(f"warning: {name} is left out: {cause}", file=sys.stderr)
     instances = sum(entry.instances for entry in collection.entries)
     print(f"{changes}: {len(collection.scenes):,} scenes with {instances:,} instances in {arguments.output}")
+    if arguments.lance:
+        from og_pointcloud.collection.lance import write_lance
+
+        write_lance(arguments.output, arguments.lance)
+        print(f"wrote {arguments.lance}")
     if collection.words:
         print_next("find", arguments.output, collection.words[0])

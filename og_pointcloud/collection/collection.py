@@ -19,7 +19,8 @@ from numpy.typing import ArrayLike, NDArray
 from og_pointcloud.bundle.vocabulary import carried_encoder
 from og_pointcloud.cloud import UNKNOWN_SPACE, FeatureSpace, Vocabulary, unit_rows
 from og_pointcloud.collection.index import Changes, index, own_words, pooled_words
-from og_pointcloud.collection.scoring import Block, load_block
+from og_pointcloud.collection.lance import LanceTables
+from og_pointcloud.collection.scoring import Block, block_key, load_block
 from og_pointcloud.collection.store import Atlas, SceneEntry
 from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError
 from og_pointcloud.text.encoder import TextEncoder, export_command, find_encoder
@@ -116,9 +117,11 @@ class Collection:
     1
     """
 
-    def __init__(self, path: str | os.PathLike[str]) -> None:
-        """path: of an atlas; OgPointcloudError where it is none, or damaged."""
+    def __init__(self, path: str | os.PathLike[str], *, lance: str | None = None) -> None:
+        """path: of an atlas; OgPointcloudError where it is none, or damaged. lance: folder or URI of what
+        `lance.write_lance` made of it, which is then searched in place of memory (extra 'lance')."""
         self.path = Path(path)
+        self._lance = None if lance is None else LanceTables(lance)
         self.changes: Changes | None = None
         self._blocks: dict[tuple[Any, ...], Block] = {}
         with Atlas.reading(path) as atlas:
@@ -210,15 +213,12 @@ class Collection:
                 )
         return [entry for entry in self.entries if any(_fits(entry.name, pattern) for pattern in patterns)]
 
-    def _key(self, entry: SceneEntry) -> tuple[Any, ...]:
-        return entry.kin, entry.vocabulary if entry.vocabulary in self._words else None, entry.judge
-
     def _groups(self, wanted: Iterable[SceneEntry]) -> list[list[SceneEntry]]:
         """Scenes with descriptors, those that are asked alike together."""
         groups: dict[tuple[Any, ...], list[SceneEntry]] = {}
         for entry in wanted:
             if entry.width:
-                groups.setdefault(self._key(entry), []).append(entry)
+                groups.setdefault(block_key(entry, self._words), []).append(entry)
         return list(groups.values())
 
     def _vectors(self, group: Sequence[SceneEntry], query: _Query) -> dict[str, NDArray[np.float32]]:
@@ -250,22 +250,39 @@ class Collection:
         here = group if near is None else [entry for entry in group if entry.id in near]
         if not known or not here:
             return []
-        block = self._block(atlas, here)
-        chosen = np.isin([entry.id for entry in block.entries], [entry.id for entry in here])[block.scene]
-        if query.box is not None:
-            middle = (block.low + block.high) / 2
-            chosen &= ((middle >= query.box[0]) & (middle <= query.box[1])).all(axis=1)
         found = []
         for word, vector in known.items():
+            block, chosen = self._candidates(atlas, group, here, vector, query)
             ranked = block.rank(vector, self._rivals(group[0], vector), chosen, query.top)
             found += [(key, _finding(block, row, word, score)) for row, key, score in ranked.rows_with_scores()]
         return found
 
+    def _candidates(
+        self, atlas: Atlas, group: list[SceneEntry], here: list[SceneEntry], vector: Any, query: _Query
+    ) -> tuple[Block, NDArray[np.bool_]]:
+        """A block, and which of its instances are asked: all of those scenes in the box, or what LanceDB proposes."""
+        if self._lance is None:
+            block = self._block(atlas, here)
+            chosen = np.isin([entry.id for entry in block.entries], [entry.id for entry in here])[block.scene]
+        else:
+            key = block_key(group[0], self._words)
+            some = None if len(here) == sum(block_key(e, self._words) == key for e in self.entries) else here
+            direction = load_block(atlas, here[:1]).direction(vector)
+            proposed = self._lance.propose(key, direction, query.box, some, query.top)
+            block = load_block(atlas, [entry for entry in here if entry.id in {id for id, _ in proposed}] or here[:1])
+            ids = np.array([entry.id for entry in block.entries])[block.scene]
+            pairs = zip(ids.tolist(), block.instance.tolist(), strict=True)
+            chosen = np.array([pair in proposed for pair in pairs], bool)
+        if query.box is not None:
+            middle = (block.low + block.high) / 2
+            chosen &= ((middle >= query.box[0]) & (middle <= query.box[1])).all(axis=1)
+        return block, chosen
+
     def _block(self, atlas: Atlas, here: list[SceneEntry]) -> Block:
         """The arrays of some scenes that are asked alike, maybe with those of others."""
-        key = self._key(here[0])
+        key = block_key(here[0], self._words)
         if key not in self._blocks:
-            if len(here) < sum(self._key(entry) == key for entry in self.entries):
+            if len(here) < sum(block_key(entry, self._words) == key for entry in self.entries):
                 return load_block(atlas, here)
             self._blocks[key] = load_block(atlas, here)
         return self._blocks[key]

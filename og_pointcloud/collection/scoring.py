@@ -8,18 +8,19 @@ reach the places that are asked for.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud.cloud import WordBank, unit_rows
+from og_pointcloud.cloud import Vocabulary, WordBank, unit_rows
 from og_pointcloud.collection.store import Atlas, SceneEntry
 from og_pointcloud.settings import ChoosingSettings
 
-__all__ = ["Block", "Ranked", "load_block"]
+__all__ = ["Block", "Ranked", "block_key", "load_block"]
 
 RELEVANCY_TEMPERATURE = 10.0
 """Factor of the cosines in LERF's relevancy (Kerr et al., Language Embedded Radiance Fields, ICCV 2023, Sec. 3.4):
@@ -77,6 +78,20 @@ class Block:
     def _end(self) -> NDArray[np.intp]:
         return np.append(self.first, len(self.descriptors))
 
+    def direction(self, text: NDArray[np.float32]) -> NDArray[np.float32]:
+        """(D,) of a text (D,): the unit vector whose products with the descriptors say how it fits."""
+        unit = unit_rows(text) if self.bank is None else unit_rows(unit_rows(text) - self.bank.mean)
+        return unit.astype(np.float32)
+
+    def evidence_vectors(self) -> NDArray[np.float32]:
+        """(R, D + 1): their inner product with (direction, 1) is the evidence of each descriptor, without judge the
+        cosine."""
+        if self.bank is None:
+            return np.pad(self.descriptors, ((0, 0), (0, 1)))
+        of_row = np.repeat(self.scene, np.diff(self._end))
+        scaled = self.scale[:, None] * (self.descriptors - self.common[of_row])
+        return np.column_stack([scaled, self.shift]).astype(np.float32)
+
     def rank(
         self,
         text: NDArray[np.float32],
@@ -104,7 +119,7 @@ class Block:
     def _uncalibrated(
         self, rows: NDArray[np.intp], text: NDArray[np.float32], rivals: NDArray[np.float32]
     ) -> NDArray[np.float64]:
-        cosine = self._best(rows, self._cosines(rows, unit_rows(text[None])))[:, 0].astype(np.float64)
+        cosine = self._best(rows, self._cosines(rows, self.direction(text)[None]))[:, 0].astype(np.float64)
         if not len(rivals):
             return cosine
         rival = self._best(rows, self._cosines(rows, unit_rows(rivals))).max(axis=1)
@@ -116,7 +131,7 @@ class Block:
         """At least the best ``top`` of these instances, and the logit of their probability."""
         assert self.bank is not None
         settings = ChoosingSettings()
-        direction = unit_rows(unit_rows(text[None]) - self.bank.mean)
+        direction = self.direction(text)[None]
         bank = unit_rows(self.bank.vectors - self.bank.mean)
         others = bank[(bank @ direction[0]) < settings.synonym]
         sharpness = self.sharpness[self.scene[rows]].astype(np.float64)
@@ -176,6 +191,11 @@ class Block:
             return np.zeros((0, scores.shape[1]), np.float32)
         count = np.diff(self._end)[rows]
         return np.maximum.reduceat(scores, np.cumsum(count) - count, axis=0)
+
+
+def block_key(entry: SceneEntry, words: Mapping[str, Vocabulary]) -> tuple[Any, ...]:
+    """Scenes of one key are asked alike: kin, own words and judge. words: the vocabularies by digest."""
+    return entry.kin, entry.vocabulary if entry.vocabulary in words else None, entry.judge
 
 
 def load_block(atlas: Atlas, entries: Sequence[SceneEntry]) -> Block:

@@ -1,0 +1,194 @@
+"""An atlas of many made scenes: seconds to index and to ask, memory, and how exact the answers are.
+
+    python examples/benchmark_collection.py                     # 1,000 scenes as files, then 1,000,000 descriptors
+    python examples/benchmark_collection.py --descriptors 0     # only the files
+    python examples/benchmark_collection.py --files 0 --lance   # LanceDB beside the exact search, recall at 10
+
+Descriptors are drawn about the vectors of made-up words, as an encoder's would be: near a word, with what all images
+share and noise. Every figure that is printed is of this run.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+import og_pointcloud as og
+from og_pointcloud.cloud import unit_rows
+from og_pointcloud.collection.fit_many import peak_memory
+from og_pointcloud.collection.index import settle
+from og_pointcloud.collection.store import INSTANCE, Atlas, SceneArrays, SceneEntry
+from og_pointcloud.fitting.memory import memory_in_use
+
+WORDS, SPACE = 400, "made/encoder"
+RECALL_AT, ASKED = 10, 40
+
+
+class MadeEncoder:
+    """Vectors of words, and of what masks show of things."""
+
+    def __init__(self, width: int, rng: np.random.Generator) -> None:
+        self.rng, self.shared = rng, unit_rows(rng.normal(size=(1, width)))[0]
+        rows = unit_rows(rng.normal(size=(WORDS, width))) + 1.2 * unit_rows(rng.normal(size=(1, width)))
+        self.words = og.Vocabulary(tuple(f"thing {k}" for k in range(WORDS)), unit_rows(rows).astype(np.float32))
+
+    def descriptors(self, kinds: NDArray[np.integer]) -> NDArray[np.float32]:
+        """(n, D) float32 unit rows, of things of these kinds."""
+        width = self.words.vectors.shape[1]
+        noise = self.rng.standard_normal((len(kinds), width), dtype=np.float32) * np.float32(1.2 / width**0.5)
+        rows = 0.9 * self.words.vectors[kinds] + self.shared.astype(np.float32) + noise
+        return unit_rows(rows)
+
+
+def main() -> None:
+    """All tables that are asked for."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--files", type=int, default=1000, help="scenes that are written as .ogpc files and indexed")
+    parser.add_argument("--descriptors", type=int, default=1_000_000)
+    parser.add_argument("--width", type=int, default=512)
+    parser.add_argument("--a-scene", type=int, default=100, help="instances a scene")
+    parser.add_argument("--lance", action="store_true", help="also LanceDB (extra 'lance')")
+    arguments = parser.parse_args()
+    encoder = MadeEncoder(arguments.width, np.random.default_rng(0))
+    with tempfile.TemporaryDirectory(dir=os.environ.get("TMPDIR", "/var/tmp")) as folder:
+        if arguments.files:
+            files(Path(folder), arguments.files, arguments.a_scene, encoder)
+        if arguments.descriptors:
+            large(Path(folder), arguments.descriptors, arguments.a_scene, encoder, arguments.lance)
+
+
+def files(folder: Path, count: int, instances: int, encoder: MadeEncoder) -> None:
+    """Index files, ask them, change some."""
+    start = time.perf_counter()
+    for number in range(count):
+        og.write_bundle(cloud(number, instances, encoder), folder / "scans" / f"room{number:04d}.ogpc")
+    print(f"wrote {count:,} scenes of {instances} instances: {time.perf_counter() - start:.1f} s")
+    atlas = folder / "atlas"
+
+    def index() -> og.Collection:
+        return og.Collection.index(folder / "scans", atlas, progress=False)
+
+    seconds, collection = timed(index)
+    print(f"index: {seconds:.1f} s ({collection.changes}), {atlas.stat().st_size / 1e6:.0f} MB")
+    seconds, collection = timed(index)
+    print(f"index again: {seconds:.2f} s ({collection.changes})")
+    for number in range(10):
+        (folder / "scans" / f"room{number:04d}.ogpc").unlink()
+        changed = folder / "scans" / f"new{number:04d}.ogpc"
+        og.write_bundle(cloud(count + number, instances, encoder), changed)
+    seconds, collection = timed(index)
+    print(f"index after changes: {seconds:.2f} s ({collection.changes})")
+    seconds, found = timed(lambda: og.Collection(atlas).find("thing 7"))
+    print(f"open and ask once, as the command does: {seconds:.2f} s, best score {found[0].score:.3f}")
+
+
+def cloud(number: int, instances: int, encoder: MadeEncoder) -> og.LabelledCloud:
+    """A room of things that are 20 points each."""
+    rng = np.random.default_rng(number)
+    xyz = rng.random((instances, 1, 3)) * [20, 20, 3] + 0.3 * rng.random((instances, 20, 3))
+    ids = np.repeat(np.arange(instances, dtype=np.int32), 20)
+    ones, ratios = np.full(instances, 20, np.int32), np.full(instances, 0.9, np.float32)
+    rows = encoder.descriptors(rng.integers(0, WORDS, instances))
+    table = og.InstanceTable(rows, np.arange(instances, dtype=np.int32), ones, ones, ones, ratios, ratios)
+    points = xyz.reshape(-1, 3).astype(np.float32)
+    return og.LabelledCloud(points, np.zeros(3), ids, table, SPACE, 0.1, 0.3, vocabulary=encoder.words)
+
+
+def large(folder: Path, descriptors: int, instances: int, encoder: MadeEncoder, with_lance: bool) -> None:
+    """An atlas written from arrays; the exact search beside a plain one, and LanceDB."""
+    path = folder / "large"
+    seconds, _ = timed(lambda: write_atlas(path, descriptors, instances, encoder))
+    print(
+        f"\natlas of {descriptors:,} descriptors, written and judged: {seconds:.0f} s, "
+        f"{path.stat().st_size / 1e9:.2f} GB"
+    )
+    before = memory_in_use()
+    collection = og.Collection(path)
+    seconds, _ = timed(lambda: collection.find("thing 0"))
+    print(f"first answer, loading included: {seconds:.1f} s, {(memory_in_use() - before) / 1e9:.2f} GB")
+    words = [f"thing {k}" for k in range(ASKED)]
+    rows = [row("exact, all", collection, words)]
+    half = ([0.0, 0.0, 0.0], [500.0, 1000.0, 10.0])
+    rows.append(row("exact, a box around half", collection, words, within=half))
+    rows.append(row("exact, one scene", collection, words, scenes="s000001"))
+    reference = {word: [(f.scene, f.instance) for f in collection.find(word, top=RECALL_AT)] for word in words}
+    if with_lance:
+        del collection
+        rows += lance(path, folder / "lance", words, half, reference)
+    print(f"{'search':<28}{'least s':>10}{'median s':>10}{'longest s':>11}{f'recall@{RECALL_AT}':>11}")
+    for name, times, recall in rows:
+        print(f"{name:<28}{min(times):>10.3f}{np.median(times):>10.3f}{max(times):>11.3f}{recall:>11}")
+    print(f"peak memory {peak_memory() / 1e9:.2f} GB")
+
+
+def write_atlas(path: Path, descriptors: int, instances: int, encoder: MadeEncoder) -> None:
+    """Scenes on a square kilometre, each of ten metres."""
+    with Atlas.writing(path) as atlas:
+        atlas.set_root(path.parent)
+        words = atlas.add_words(encoder.words.names, encoder.words.vectors)
+        for number, arrays in enumerate(made_scenes(descriptors, instances, encoder)):
+            facts = (f"{number}", 0, 0, SPACE, arrays.descriptors.shape[1], 20 * instances, instances, words, None)
+            atlas.add(SceneEntry(0, f"s{number:06d}", *facts), arrays)
+        settle(atlas)
+
+
+def made_scenes(descriptors: int, instances: int, encoder: MadeEncoder) -> Iterator[SceneArrays]:
+    """Scenes of so many instances, one descriptor each."""
+    for _ in range(descriptors // instances):
+        rows = np.zeros(instances, INSTANCE)
+        corner = np.append(encoder.rng.random(2) * 990, 0)
+        rows["low"] = corner + encoder.rng.random((instances, 3)) * [10, 10, 3]
+        rows["high"] = rows["low"] + 0.3
+        rows["centroid"], rows["points"], rows["part_of"] = rows["low"] + 0.15, 20, -1
+        vectors = encoder.descriptors(encoder.rng.integers(0, WORDS, instances))
+        yield SceneArrays(rows, np.arange(instances, dtype=np.int32), vectors)
+
+
+def lance(path: Path, folder: Path, words: list[str], half: Any, reference: dict[str, Any]) -> list[Any]:
+    """LanceDB's rows of the table."""
+    from og_pointcloud.collection.lance import write_lance
+
+    seconds, _ = timed(lambda: write_lance(path, str(folder)))
+    size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
+    before = memory_in_use()
+    print(f"LanceDB: written and indexed in {seconds:.0f} s, {size / 1e9:.2f} GB")
+    collection = og.Collection(path, lance=str(folder))
+    collection.find(words[0])
+    rows = [
+        row("LanceDB, all", collection, words, reference),
+        row("LanceDB, a box around half", collection, words, within=half),
+    ]
+    print(f"memory that asking it takes: {(memory_in_use() - before) / 1e9:.2f} GB")
+    return rows
+
+
+def row(
+    name: str, collection: og.Collection, words: list[str], reference: dict[str, Any] | None = None, **options: Any
+) -> tuple[str, list[float], str]:
+    """Seconds of each word, and which share of the reference's best was found."""
+    times, hits = [], 0
+    for word in words:
+        seconds, found = timed(lambda word=word: collection.find(word, top=RECALL_AT, **options))
+        times.append(seconds)
+        if reference is not None:
+            hits += len({(f.scene, f.instance) for f in found} & set(reference[word]))
+    return name, times, "" if reference is None else f"{hits / (RECALL_AT * len(words)):.4f}"
+
+
+def timed(function: Callable[[], Any]) -> tuple[float, Any]:
+    """Seconds, and the value."""
+    start = time.perf_counter()
+    value = function()
+    return time.perf_counter() - start, value
+
+
+if __name__ == "__main__":
+    main()
