@@ -170,10 +170,14 @@ def settle(atlas: Atlas) -> None:
     for number in sorted(set(kin.values())):
         family = [entry for entry in entries if kin[entry.id] == number]
         lent = _lent_bank(atlas, family, words)
+        banks: dict[str, WordBank] = {}
         for entry in family:
             judge = (entry.bank or lent) if entry.width else None
-            if judge != entry.judge:
-                atlas.judge(entry, judge, None if judge is None else _judged(atlas, entry, judge))
+            if judge == entry.judge:
+                continue
+            if judge is not None and judge not in banks:
+                banks = {judge: atlas.bank(judge, entry.width)}  # one: of many families each scene may have its own
+            atlas.judge(entry, judge, None if judge is None else _judged(atlas, entry, banks[judge]))
     atlas.set_kin(kin)
 
 
@@ -233,10 +237,10 @@ def _lent_bank(atlas: Atlas, family: Sequence[SceneEntry], words: Mapping[str, V
     return atlas.add_words(("",) * len(pool), np.array([pool[name] for name in sorted(pool)], np.float32))
 
 
-def _judged(atlas: Atlas, entry: SceneEntry, judge: str) -> Standard:
+def _judged(atlas: Atlas, entry: SceneEntry, bank: WordBank) -> Standard:
     arrays = atlas.arrays(entry)
     table = instance_table_of(arrays)
-    return Chooser(table, atlas.bank(judge, entry.width), feature_space=entry.feature_space).standard()
+    return Chooser(table, bank, feature_space=entry.feature_space).standard()
 
 
 def instance_table_of(arrays: SceneArrays) -> InstanceTable:
