@@ -91,7 +91,8 @@ def files(folder: Path, count: int, instances: int, encoder: MadeEncoder) -> Non
     print(f"index after changes: {seconds:.2f} s, CPU {cpu_seconds:.2f} s ({collection.changes})")
     seconds, found = timed(lambda: og.Collection(atlas).find("thing 7"))
     print(
-        f"open and ask once, as the command does: {seconds:.2f} s, CPU {cpu_seconds:.2f} s, best score {found[0].score:.3f}"
+        f"open and ask once, as the command does: {seconds:.2f} s, CPU {cpu_seconds:.2f} s, "
+        f"best score {found[0].score:.3f}"
     )
 
 
@@ -119,7 +120,8 @@ def large(folder: Path, descriptors: int, instances: int, encoder: MadeEncoder, 
     collection = og.Collection(path)
     seconds, _ = timed(lambda: collection.find("thing 0"))
     print(
-        f"first answer, loading included: {seconds:.1f} s, CPU {cpu_seconds:.1f} s, {(memory_in_use() - before) / 1e9:.2f} GB"
+        f"first answer, loading included: {seconds:.1f} s, CPU {cpu_seconds:.1f} s, "
+        f"{(memory_in_use() - before) / 1e9:.2f} GB"
     )
     words = [f"thing {k}" for k in range(ASKED)]
     rows = [row("exact, all", collection, words)]

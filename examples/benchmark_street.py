@@ -43,10 +43,11 @@ def main() -> None:
     settings = FitSettings(mode="grouping", tile_points=arguments.tile_points)
     limits = {"n_workers": arguments.workers, "threads_per_worker": 1, "memory_limit": arguments.memory}
     with LocalCluster(**limits, dashboard_address=None) as cluster, Client(cluster) as client:
-        start = time.perf_counter()
+        start, own = time.perf_counter(), time.process_time()
         cloud = fit(made.scene, settings, executor=client.get_executor(pure=False), progress=False)
         report("cluster", cloud, time.perf_counter() - start)
-        peaks = client.run(peak_memory)
+        peaks, cpu = client.run(peak_memory), client.run(time.process_time)
+        print(f"CPU seconds: workers {sum(cpu.values()):.0f}, here {time.process_time() - own:.0f}")
         print("peak memory: workers", *(f"{peak / 1e9:.2f}" for peak in peaks.values()), end="")
         print(f", here {peak_memory() / 1e9:.2f} GB (with the scene)")
     print(f"instances whose points are mostly of one object: {purity(cloud, made.owner):.1%}")
