@@ -12,6 +12,7 @@ from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 
+import numpy as np
 import pytest
 from scenes import write_tiny_capture
 
@@ -220,3 +221,26 @@ def _kill_one(client, out: Path) -> None:
     while not list(out.glob("*.work")):
         time.sleep(0.01)
     os.kill(next(iter(pids.values())), signal.SIGKILL)
+
+
+CAPTURES = Path(__file__).resolve().parents[2] / "shared" / "data"
+ASKED = ("apc_shelf_B", "desk_colmap29", "nuscenes_frame", "ycb_0049", "ycb_0050")
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not CAPTURES.exists(), reason="needs the captures in ../shared/data")
+def test_every_word_of_real_captures_finds_its_scene_first(tmp_path):
+    """Their features are of two kinds, from photographs and from a detector's words, under one feature space."""
+    fits = og.fit_many([CAPTURES / name for name in ASKED], tmp_path / "fitted", Inline(), progress=False)
+    assert {fit.state for fit in fits} == {"fitted"}
+    collection = og.Collection.index(tmp_path / "fitted", tmp_path / "atlas", progress=False)
+    where: dict[str, set[str]] = {}
+    for name in ASKED:
+        truth = np.load(CAPTURES / name / "gt.npz")
+        counts = np.bincount(truth["cls"][truth["cls"] >= 0], minlength=len(truth["names"]))
+        for cls in np.flatnonzero(counts >= 30):
+            where.setdefault(str(truth["names"][cls]), set()).add(name)
+    found = {word: collection.find(word, top=1)[0] for word in where}
+    assert len(where) >= 18
+    assert {word: best.scene for word, best in found.items() if best.scene not in where[word]} == {}
+    assert all(best.calibrated for best in found.values())
