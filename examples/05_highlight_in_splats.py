@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 
 import og_pointcloud as og
-from og_pointcloud.fitting.mask_table import Gaussians, render
 from og_pointcloud.formats.colors import LUMINANCE
+from og_pointcloud.rendering.splatting import Gaussians, render
 
 
 def numbers(text: str) -> np.ndarray:

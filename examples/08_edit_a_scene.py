@@ -11,9 +11,9 @@ import cv2
 import numpy as np
 
 import og_pointcloud as og
-from og_pointcloud.fitting.mask_table import Gaussians, render
 from og_pointcloud.formats.gaussian_ply import write_gaussian_ply
 from og_pointcloud.rendering.geometry import isotropic
+from og_pointcloud.rendering.splatting import Gaussians, render
 from og_pointcloud.scene import Points
 
 parser = argparse.ArgumentParser(description="Scene editing by words.")

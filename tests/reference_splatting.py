@@ -8,11 +8,19 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
 
-from og_pointcloud.fitting.mask_table import Gaussians
+from og_pointcloud.rendering.splatting import Gaussians, view_weights
 from og_pointcloud.scene import Camera
 
 Wide = np.longdouble
+
+
+def pixel_weights(gaussians: Gaussians, camera: Camera, near: float) -> csr_array:
+    """The library's own weights W of one view, by a map that gives every pixel its own id: (H W, n) sparse float32."""
+    pixels = camera.width * camera.height
+    ids = np.arange(pixels, dtype=np.int32).reshape(camera.height, camera.width)
+    return view_weights(gaussians, camera, ids, pixels, near).rows[:-1]
 
 
 def reference_pixel_weights(gaussians: Gaussians, camera: Camera, near: float) -> NDArray[np.float64]:

@@ -9,6 +9,7 @@ import numba
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from reference_splatting import pixel_weights
 from scenes import TinyCapture
 from scipy.sparse import csr_array, random_array, vstack
 
@@ -21,7 +22,7 @@ from og_pointcloud.fitting.learned.instance_features import (
     raw_gradient,
     read_features,
 )
-from og_pointcloud.fitting.mask_table import MaskTable, mask_table, pixel_weights
+from og_pointcloud.fitting.mask_table import MaskTable, mask_table
 from og_pointcloud.formats.capture import read_capture
 from og_pointcloud.settings import FeatureSettings
 

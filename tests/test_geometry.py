@@ -7,7 +7,6 @@ import pytest
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from og_pointcloud.fitting.mask_table import NEAR_SHARE
 from og_pointcloud.rendering.geometry import (
     chance_of_place,
     near_plane,
@@ -16,6 +15,7 @@ from og_pointcloud.rendering.geometry import (
     sample_of_points,
     strided,
 )
+from og_pointcloud.rendering.splatting import NEAR_SHARE
 from og_pointcloud.scene import Camera, Points, View
 from og_pointcloud.settings import GeometrySettings
 

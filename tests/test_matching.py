@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from reference_splatting import pixel_weights
 from test_grouping import ONE, OTHER, HandView, hand_table
 from test_visibility import IDENTITY, NEAR, camera, cloud, patches
 
@@ -18,7 +19,8 @@ from og_pointcloud.fitting.learned.matching import (
     match_masks,
     visible_evidence,
 )
-from og_pointcloud.fitting.mask_table import Gaussians, mask_table, pixel_weights
+from og_pointcloud.fitting.mask_table import mask_table
+from og_pointcloud.rendering.splatting import Gaussians
 from og_pointcloud.scene import Camera, View
 from og_pointcloud.settings import MatchingSettings
 

@@ -14,7 +14,7 @@ from test_grouping import ONE, HandView, hand_table
 
 from og_pointcloud.cloud import BACKGROUND, UNOBSERVED
 from og_pointcloud.fitting.grouping import MaskGroups
-from og_pointcloud.fitting.mask_table import Gaussians, MaskTable
+from og_pointcloud.fitting.mask_table import MaskTable
 from og_pointcloud.fitting.membership import (
     Membership,
     _best_group,
@@ -25,6 +25,7 @@ from og_pointcloud.fitting.membership import (
 )
 from og_pointcloud.fitting.view_votes import OPENNESS_POWER, view_votes
 from og_pointcloud.rendering.geometry import neighbourhood
+from og_pointcloud.rendering.splatting import Gaussians
 from og_pointcloud.settings import GeometrySettings, MembershipSettings
 
 SETTINGS = MembershipSettings()

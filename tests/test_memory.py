@@ -29,7 +29,7 @@ from og_pointcloud.fitting import mask_table as mask_table_module
 from og_pointcloud.fitting import membership
 from og_pointcloud.fitting import memory as memory_module
 from og_pointcloud.fitting.fit import fit, prepare
-from og_pointcloud.fitting.mask_table import Gaussians, MaskTable, mask_table
+from og_pointcloud.fitting.mask_table import MaskTable, mask_table
 from og_pointcloud.fitting.membership import assign_points
 from og_pointcloud.fitting.memory import (
     free_memory,
@@ -43,6 +43,7 @@ from og_pointcloud.fitting.memory import (
 from og_pointcloud.fitting.view_votes import view_votes
 from og_pointcloud.fitting.work_folder import WorkFolder, fingerprint, kept_files
 from og_pointcloud.rendering.geometry import neighbourhood
+from og_pointcloud.rendering.splatting import Cutoffs, Gaussians
 from og_pointcloud.scene import View
 from og_pointcloud.settings import FitSettings, GeometrySettings, MembershipSettings, VisibilitySettings
 
@@ -376,7 +377,7 @@ def test_views_of_another_geometry_are_not_taken(
     counts = rendered(monkeypatch)
     options = {
         "thickness": {"thickness": np.full(len(gaussians), 0.1, np.float32)},
-        "cutoffs": {"cutoffs": mask_table_module.Cutoffs(0.1, 0.1)},
+        "cutoffs": {"cutoffs": Cutoffs(0.1, 0.1)},
     }
     if change in ("xyz", "opacity"):
         gaussians = replace(gaussians, **{change: getattr(gaussians, change) * np.float32(0.9)})

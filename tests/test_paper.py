@@ -13,13 +13,14 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from reference_splatting import pixel_weights
 from scenes import TinyCapture
 
 from og_pointcloud.errors import OgPointcloudError, SceneError
 from og_pointcloud.fitting.fit import prepare
-from og_pointcloud.fitting.mask_table import Gaussians, pixel_weights
 from og_pointcloud.fitting.work_folder import WorkFolder
 from og_pointcloud.formats.capture import read_capture
+from og_pointcloud.rendering.splatting import Gaussians
 from og_pointcloud.scene import View
 from og_pointcloud.settings import PaperSettings
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from og_pointcloud.errors import SceneError
-from og_pointcloud.fitting.mask_table import Gaussians
+from og_pointcloud.rendering.splatting import Gaussians
 from og_pointcloud.scene import Camera, View
 from og_pointcloud.show.fit_pictures import (
     GAP,

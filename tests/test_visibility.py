@@ -10,12 +10,19 @@ import numpy as np
 import pytest
 from numpy.random import Generator
 from numpy.typing import NDArray
-from reference_splatting import front_to_back, reference_pixel_weights, reference_view_weights, rotation_matrix
+from reference_splatting import (
+    front_to_back,
+    pixel_weights,
+    reference_pixel_weights,
+    reference_view_weights,
+    rotation_matrix,
+)
 from scipy.sparse import csr_array
 
 from og_pointcloud.errors import SceneError
-from og_pointcloud.fitting.mask_table import Cutoffs, Gaussians, mask_table, pixel_weights, render, view_weights
+from og_pointcloud.fitting.mask_table import mask_table
 from og_pointcloud.fitting.view_votes import view_votes
+from og_pointcloud.rendering.splatting import Cutoffs, Gaussians, render, view_weights
 from og_pointcloud.scene import Camera, Points, View
 
 NEAR = 0.25

@@ -14,7 +14,7 @@ from og_pointcloud.cloud import BACKGROUND, UNOBSERVED, LabelledCloud
 from og_pointcloud.errors import SceneError
 from og_pointcloud.fitting.held_out import choose_scale, note_scale
 from og_pointcloud.fitting.labellers import LABELLERS, Labelling, paper
-from og_pointcloud.fitting.mask_table import Cutoffs, MaskTable, mask_table, require_sight, working_memory
+from og_pointcloud.fitting.mask_table import MaskTable, mask_table, require_sight
 from og_pointcloud.fitting.membership import without_see_through
 from og_pointcloud.fitting.memory import in_file, memory_left
 from og_pointcloud.fitting.reliability import likely_cause, split_half
@@ -23,6 +23,7 @@ from og_pointcloud.fitting.work_folder import WorkFolder
 from og_pointcloud.journal import Journal, LeftOut
 from og_pointcloud.kernels import get_num_threads
 from og_pointcloud.rendering.geometry import isotropic, thinned
+from og_pointcloud.rendering.splatting import Cutoffs, working_memory
 from og_pointcloud.rendering.surface import Surface, reconstruct_surface
 from og_pointcloud.scene import Scene
 from og_pointcloud.settings import FitSettings

@@ -24,35 +24,10 @@ from og_pointcloud.fitting.memory import scratch_array
 from og_pointcloud.fitting.work_folder import WorkFolder, fingerprint
 from og_pointcloud.kernels import njit
 from og_pointcloud.rendering.sightings import sightings
-from og_pointcloud.rendering.splatting import (
-    CUTOFFS,
-    FRUSTUM_MARGIN,
-    NEAR_SHARE,
-    Cutoffs,
-    Gaussians,
-    ViewWeights,
-    render,
-    view_weights,
-    working_memory,
-)
+from og_pointcloud.rendering.splatting import CUTOFFS, Cutoffs, Gaussians, ViewWeights, view_weights
 from og_pointcloud.scene import NOT_SEEN, Camera, Scene, View
 
-__all__ = [
-    "FRUSTUM_MARGIN",
-    "NEAR_SHARE",
-    "Cutoffs",
-    "Gaussians",
-    "MaskTable",
-    "SparseRows",
-    "ViewWeights",
-    "mask_table",
-    "render",
-    "require_sight",
-    "view_fingerprint",
-    "view_weights",
-    "weights_by_instance",
-    "working_memory",
-]
+__all__ = ["MaskTable", "SparseRows", "mask_table", "require_sight", "view_fingerprint", "weights_by_instance"]
 
 Result = TypeVar("Result")
 

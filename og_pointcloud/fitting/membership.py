@@ -26,11 +26,12 @@ from scipy.sparse.csgraph import connected_components
 
 from og_pointcloud.cloud import BACKGROUND, UNOBSERVED
 from og_pointcloud.fitting.grouping import MaskGroups
-from og_pointcloud.fitting.mask_table import Gaussians, MaskTable, SparseRows
+from og_pointcloud.fitting.mask_table import MaskTable, SparseRows
 from og_pointcloud.fitting.memory import in_file
 from og_pointcloud.fitting.view_votes import ViewVotes
 from og_pointcloud.kernels import njit, prange
 from og_pointcloud.rendering.geometry import Neighbourhood
+from og_pointcloud.rendering.splatting import Gaussians
 from og_pointcloud.settings import MembershipSettings
 
 __all__ = ["Membership", "assign_points", "without_see_through"]

@@ -36,7 +36,7 @@ from og_pointcloud.fitting.grouping import MaskGroups, group_masks, indicator
 from og_pointcloud.fitting.held_out import choose_scale, note_scale
 from og_pointcloud.fitting.labellers import Labelling, instances_of_groups, renumbered
 from og_pointcloud.fitting.looks import Looks, by_look, looks_of_groups
-from og_pointcloud.fitting.mask_table import Cutoffs, Gaussians, MaskTable, mask_table, require_sight, view_fingerprint
+from og_pointcloud.fitting.mask_table import MaskTable, mask_table, require_sight, view_fingerprint
 from og_pointcloud.fitting.membership import assign_points, without_see_through
 from og_pointcloud.fitting.memory import memory_left
 from og_pointcloud.fitting.tasks import Share, run_tasks, share_here
@@ -51,7 +51,7 @@ from og_pointcloud.rendering.geometry import (
     neighbourhood,
     sample_of_points,
 )
-from og_pointcloud.rendering.splatting import FRUSTUM_MARGIN, LOW_PASS
+from og_pointcloud.rendering.splatting import FRUSTUM_MARGIN, LOW_PASS, Cutoffs, Gaussians
 from og_pointcloud.rendering.surface import (
     sight_thickness,
     surface_thickness,

@@ -24,7 +24,8 @@ from og_pointcloud.settings import CodebookSettings
 try:
     from og_pointcloud.fitting.learned.codebook import two_level_codebook
     from og_pointcloud.fitting.learned.instance_features import learn_features
-    from og_pointcloud.fitting.mask_table import Gaussians, MaskTable, render
+    from og_pointcloud.fitting.mask_table import MaskTable
+    from og_pointcloud.rendering.splatting import Gaussians, render
 except ImportError as error:
     raise MissingExtraError("scipy and numba", "fit") from error
 

@@ -27,10 +27,10 @@ from hard_cases.inputs import (
 from og_pointcloud.ask.labelled_scene import LabelledScene
 from og_pointcloud.errors import SceneError
 from og_pointcloud.fitting.fit import fit
-from og_pointcloud.fitting.mask_table import NEAR_SHARE, view_weights
 from og_pointcloud.formats.capture import read_capture
 from og_pointcloud.formats.poses import in_local_frame, rigid
 from og_pointcloud.rendering.geometry import near_plane
+from og_pointcloud.rendering.splatting import NEAR_SHARE, view_weights
 from og_pointcloud.scene import Camera, Points, View
 
 TURNED = np.diag([1.0, -1.0, -1.0, 1.0])

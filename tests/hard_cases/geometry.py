@@ -14,9 +14,9 @@ from hard_cases import naive
 from hard_cases.case import Answer, agrees, powers, refuses
 from hard_cases.inputs import NEAR, camera, dense_weights, scatter, single, splatted
 from og_pointcloud.errors import SceneError
-from og_pointcloud.fitting.mask_table import Gaussians
 from og_pointcloud.formats.ply import join_columns, write_ply
 from og_pointcloud.formats.points import read_points
+from og_pointcloud.rendering.splatting import Gaussians
 from og_pointcloud.scene import Points
 
 WEIGHTS = 1e-6

@@ -8,14 +8,15 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from reference_splatting import reference_pixel_weights
+from reference_splatting import pixel_weights, reference_pixel_weights
 from scipy.sparse import csr_array
 
 from hard_cases import naive
 from hard_cases.case import Answer
 from og_pointcloud.cloud import InstanceTable, LabelledCloud, Vocabulary
-from og_pointcloud.fitting.mask_table import Gaussians, MaskTable, pixel_weights
+from og_pointcloud.fitting.mask_table import MaskTable
 from og_pointcloud.formats.poses import in_local_frame, rigid
+from og_pointcloud.rendering.splatting import Gaussians
 from og_pointcloud.scene import Camera, Points, Scene, View
 
 __all__ = [

@@ -18,13 +18,8 @@ from numpy.typing import NDArray
 
 from og_pointcloud.cloud import InstanceTable
 from og_pointcloud.fitting.association import directions
-from og_pointcloud.fitting.mask_table import (
-    FRUSTUM_MARGIN,
-    Gaussians,
-    MaskTable,
-    view_weights,
-    weights_by_instance,
-)
+from og_pointcloud.fitting.mask_table import MaskTable, weights_by_instance
+from og_pointcloud.rendering.splatting import FRUSTUM_MARGIN, Gaussians, view_weights
 from og_pointcloud.scene import Camera, View
 from og_pointcloud.settings import MatchingSettings
 

@@ -35,8 +35,9 @@ from og_pointcloud.errors import MissingExtraError, SceneError
 from og_pointcloud.fitting.grouping import indicator
 from og_pointcloud.fitting.learned.codebook import kmeans
 from og_pointcloud.fitting.learned.instance_features import raw_gradient, read_features
-from og_pointcloud.fitting.mask_table import Gaussians, view_fingerprint, view_weights, weights_by_instance
+from og_pointcloud.fitting.mask_table import view_fingerprint, weights_by_instance
 from og_pointcloud.fitting.work_folder import WorkFolder, fingerprint
+from og_pointcloud.rendering.splatting import Gaussians, view_weights
 from og_pointcloud.scene import View
 from og_pointcloud.settings import PaperSettings
 
