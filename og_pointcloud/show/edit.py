@@ -117,9 +117,9 @@ def insert(
     """Write a cloud with another one put into it, both plain clouds or both 3DGS files.
 
     pose: (4, 4), takes the other's coordinates to the cloud's: a rotation, one scale for all axes, and a translation.
-    Left out: they share a frame. Positions, normals, rotations and scales of Gaussians follow it; where it turns,
-    spherical harmonics above the constant one become 0. The result has the cloud's properties; those that the other
-    lacks are 0 for its points.
+    Left out: they share a frame. Positions, normals, rotations and scales of Gaussians follow it, and so do spherical
+    harmonics, exactly, up to degree 3. The result has the cloud's properties; those that the other lacks are 0 for its
+    points.
     SceneError for a pose that shears or mirrors, and for clouds of different kinds or that cannot be read.
     """
     rotation, scale, translation = _similarity(pose)

@@ -1,4 +1,9 @@
-"""Columns of a cloud or 3DGS file that an edit changes: recoloured, moved into another frame, put behind others."""
+"""Columns of a cloud or 3DGS file that an edit changes: recoloured, moved into another frame, put behind others.
+
+A splat's colour seen along a direction d is 0.5 + sum_k c_k Y_k(d), Y_k real spherical harmonics with the
+Condon-Shortley sign, in the order l = 0, 1, .., m = -l .. l. Turning a splat mixes the coefficients of each degree
+among themselves: the colour that was seen along d is then seen along R d.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +21,7 @@ from og_pointcloud.formats.gaussian_ply import BASE_COLOR, LOG_SCALE, ROTATION, 
 from og_pointcloud.formats.ply import join_columns
 from og_pointcloud.formats.tables import colors, positions, storable_positions
 
-__all__ = ["appended", "placed", "plain_rows", "recoloured"]
+__all__ = ["appended", "placed", "plain_rows", "recoloured", "rotated_harmonics"]
 
 Rows: TypeAlias = NDArray[np.void]
 Columns: TypeAlias = dict[str, NDArray[Any]]
@@ -27,6 +32,8 @@ OTHER_COLORS = ("r", "g", "b", "diffuse_red", "diffuse_green", "diffuse_blue", "
 """Further names of colour columns, which give way to RGB of type uchar."""
 DARK = 0.05
 """Mean luminance below which an object's shading is too faint to be kept in a new colour."""
+MAX_DEGREE = 3
+"""Highest degree of the harmonics that files have."""
 
 
 def plain_rows(xyz_world: NDArray[np.float64], rgb: NDArray[np.uint8] | None) -> Rows:
@@ -64,8 +71,7 @@ def placed(
 ) -> tuple[Rows, tuple[str, ...]]:
     """The rows in another frame, x -> scale * rotation @ x + translation; and what could not follow.
 
-    Positions become float64. Normals, rotations and scales of Gaussians follow; harmonics above the constant one, which
-    would have to be mixed, become 0 where the frame is turned.
+    Positions become float64. Normals, rotations and scales of Gaussians and their harmonics follow.
     """
     columns = _columns(rows)
     columns |= dict(zip("xyz", (positions(rows) @ (scale * rotation).T + translation).T, strict=True))
@@ -76,11 +82,10 @@ def placed(
         _set(columns, LOG_SCALE, _stack(columns, LOG_SCALE) + np.log(scale))
     if set(ROTATION) <= set(columns):
         _set(columns, ROTATION, _turned(quaternion_of(rotation), _stack(columns, ROTATION)))
-    rest = _rest_names(columns)
-    if not rest or np.allclose(rotation, np.eye(3)):
-        return join_columns(columns), ()
-    columns |= {name: np.zeros_like(columns[name]) for name in rest}
-    return join_columns(columns), ("harmonics above the constant one became 0: they are not turned",)
+    rest = _rest(columns)
+    _set(columns, _rest_names(columns), rotated_harmonics(rest, rotation))
+    too_high = rest.shape[2] >= (MAX_DEGREE + 1) ** 2
+    return join_columns(columns), (f"harmonics above degree {MAX_DEGREE} are not turned",) if too_high else ()
 
 
 def appended(base: Rows, added: Rows) -> tuple[Rows, tuple[str, ...]]:
@@ -157,3 +162,39 @@ def _rest(columns: Columns) -> NDArray[np.float64]:
     """(n, 3, k) harmonics above the constant one; k is 0 where there are none."""
     values = _stack(columns, _rest_names(columns))
     return values.reshape(len(values), 3, values.shape[1] // 3)
+
+
+# Harmonics --------------------------------------------------------------------------------------------------------
+
+
+def rotated_harmonics(rest: NDArray[np.float64], rotation: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Coefficients of splats that are turned by a rotation (3, 3) of column vectors.
+
+    rest: (n, channels, k), k = 0, 3, 8 or 15: degrees 1 up to 3, without the constant. The same shape comes back.
+    """
+    turned, directions = rest.copy(), np.random.default_rng(0).normal(size=(32, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    for degree in range(1, MAX_DEGREE + 1):
+        block = slice(degree**2 - 1, (degree + 1) ** 2 - 1)
+        if block.stop > rest.shape[2]:
+            break
+        # Turned harmonics of one degree are mixtures of that degree, Y(R' d) = Y(d) M: any few directions give M.
+        before, after = _harmonics(directions @ rotation, degree), _harmonics(directions, degree)
+        turned[..., block] = rest[..., block] @ np.linalg.lstsq(after, before, rcond=None)[0].T
+    return turned
+
+
+def _harmonics(directions: NDArray[np.float64], degree: int) -> NDArray[np.float64]:
+    """(n, 2 degree + 1) real spherical harmonics of unit vectors (n, 3), m = -degree .. degree, but for one factor."""
+    x, y, z = directions.T
+    if degree == 1:
+        columns = [-y, z, -x]
+    elif degree == 2:
+        columns = [x * y, -y * z, (3 * z**2 - 1) / np.sqrt(12), -x * z, (x**2 - y**2) / 2]
+    else:
+        columns = [
+            -y * (3 * x**2 - y**2) / np.sqrt(24), x * y * z, -y * (5 * z**2 - 1) / np.sqrt(40),
+            z * (5 * z**2 - 3) / np.sqrt(60),
+            -x * (5 * z**2 - 1) / np.sqrt(40), z * (x**2 - y**2) / 2, -x * (x**2 - 3 * y**2) / np.sqrt(24),
+        ]  # fmt: skip
+    return np.stack(columns, axis=1)
