@@ -11,7 +11,8 @@ import cv2
 import numpy as np
 
 import og_pointcloud as og
-from og_pointcloud.formats.gaussian_ply import write_gaussian_ply
+from og_pointcloud.formats.gaussian_ply import gaussian_rows
+from og_pointcloud.formats.ply import write_ply
 from og_pointcloud.rendering.geometry import isotropic
 from og_pointcloud.rendering.splatting import Gaussians, render
 from og_pointcloud.scene import Points
@@ -28,7 +29,8 @@ scene = og.load(arguments.scene)
 points = Points(scene.cloud.xyz, scene.cloud.origin, scene.cloud.rgb)
 splats = isotropic(points, np.full(len(points), scene.cloud.spacing, np.float32), 0.7, 0.95)
 files = before, removed, recoloured, inserted = [out / f"{n}.ply" for n in ("before", "removed", "red", "inserted")]
-write_gaussian_ply(before, replace(points, scale=splats.scale, rotation=splats.rotation, opacity=splats.opacity))
+gaussians = replace(points, scale=splats.scale, rotation=splats.rotation, opacity=splats.opacity)
+write_ply(before, {"vertex": gaussian_rows(gaussians)})
 
 sofas, cushions = og.select(scene, "sofa").instances, og.select(scene, "cushion").instances
 og.edit.remove(scene, [*sofas, *cushions], removed, cloud=before, halo=3)

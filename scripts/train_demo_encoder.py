@@ -49,7 +49,7 @@ from og_pointcloud.masking.levels import settle
 from og_pointcloud.masking.opencv import OpenCVProposer
 from og_pointcloud.text.encoder import TextEncoder as TrainedTextEncoder
 from og_pointcloud.text.encoder import read_text_encoder
-from og_pointcloud.text.everyday import everyday_words
+from og_pointcloud.text.text_features import everyday_words
 from og_pointcloud.text.tokenizer import BYTE_CHARACTERS, Tokenizer, open_tokenizer
 
 Random = np.random.Generator

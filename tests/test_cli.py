@@ -21,12 +21,12 @@ from scenes import (
 from test_opengaussian import WIDTH as LEAF_WIDTH
 from test_opengaussian import write_result
 
+from og_pointcloud.ask.labelled_scene import load
 from og_pointcloud.ask.segmentation import SAVED_AS
 from og_pointcloud.bundle.read import read_bundle
 from og_pointcloud.cli import main
 from og_pointcloud.cli import segment as cli_segment
 from og_pointcloud.formats.capture import read_capture
-from og_pointcloud.formats.ply import read_ply
 
 
 @pytest.fixture(scope="module")
@@ -103,10 +103,8 @@ def test_segment_json_counts_every_point(fitted, capsys):
 
 def test_fit_reports_its_stages_and_next_command(tiny_capture, tmp_path, capsys):
     bundle, record = tmp_path / "tiny.ogpc", tmp_path / "run.json"
-    cloud = tmp_path / "labelled.ply"
-    code, stdout, _ = run(capsys, "fit", tiny_capture.folder, "-o", bundle, "--json", record, "--ply", cloud)
+    code, stdout, _ = run(capsys, "fit", tiny_capture.folder, "-o", bundle, "--json", record)
     assert code == 0
-    assert tiny_capture.share_correct(read_ply(cloud)["vertex"]["og_label"], [*NAMES]) > 0.9
     report = json.loads(record.read_text())
     assert report["points"] == len(tiny_capture.object_ids)
     assert report["points"] == sum(report[f"points_{state}"] for state in ("in_instances", "background", "unobserved"))
@@ -171,8 +169,6 @@ def test_inputs_are_not_overwritten(tiny_capture, capsys):
     folder = tiny_capture.folder
     before = (folder / "transforms.json").read_bytes()
     error = error_of(capsys, "fit", folder, "-o", folder / "s.ogpc", "--json", folder / "transforms.json")
-    assert "expected another name" in error
-    error = error_of(capsys, "fit", folder, "-o", folder / "s.ogpc", "--ply", folder / "points.ply")
     assert "expected another name" in error
     assert (folder / "transforms.json").read_bytes() == before
     assert not (folder / "s.ogpc").exists()
@@ -277,12 +273,10 @@ def test_one_view_is_enough(tmp_path, capsys):
 def test_vocabulary_of_another_encoder(tiny_capture, tmp_path, capsys):
     """The capture's own is left out and said so; one that was asked for is an error."""
     rewrite_npz(tiny_capture.text_features, feature_space=np.array("another space"))
-    bundle, cloud = tmp_path / "s.ogpc", tmp_path / "labelled.ply"
-    code, stdout, _ = run(capsys, "fit", tiny_capture.folder, "-o", bundle, "--ply", cloud)
+    bundle = tmp_path / "s.ogpc"
+    code, stdout, _ = run(capsys, "fit", tiny_capture.folder, "-o", bundle)
     assert code == 0
-    points = read_ply(cloud)["vertex"]
-    assert set(points["og_label"]) == {-1}, "without words there are instances, but no labels"
-    assert {0, 1} <= set(points["og_instance"])
+    assert {0, 1} <= set(load(bundle).instance_ids), "without words there are instances"
     assert "left out: vocabulary" in stdout
     assert "another space" in stdout
     assert json.loads(run(capsys, "info", bundle, "--json")[1])["words"] == []

@@ -20,7 +20,8 @@ from og_pointcloud.cli import main
 from og_pointcloud.cloud import BACKGROUND, InstanceTable, WordBank
 from og_pointcloud.errors import SceneError
 from og_pointcloud.evaluate.lerf import gaussians_of, read_scene, score_pairs
-from og_pointcloud.formats.gaussian_ply import write_gaussian_ply
+from og_pointcloud.formats.gaussian_ply import gaussian_rows
+from og_pointcloud.formats.ply import write_ply
 from og_pointcloud.scene import Points
 
 WIDTH, HEIGHT, DEPTH = 20, 10, 10.0
@@ -79,7 +80,7 @@ def write_gaussians(path: Path, cloud, opacity=0.99) -> None:
         rotation=rotation, opacity=np.full(n, opacity, np.float32),
     )  # fmt: skip
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_gaussian_ply(path, points)
+    write_ply(path, {"vertex": gaussian_rows(points)})
 
 
 @pytest.fixture

@@ -34,7 +34,7 @@ from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.masking.crops import LANGSPLAT, WITH_CONTEXT
 from og_pointcloud.masking.encode import OnnxModel, open_encoder
 from og_pointcloud.text.encoder import TextEncoder, encoder_for, read_text_encoder
-from og_pointcloud.text.everyday import everyday_words
+from og_pointcloud.text.text_features import everyday_words
 
 torch = pytest.importorskip("torch")
 pytest.importorskip("transformers")

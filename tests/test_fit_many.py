@@ -174,7 +174,7 @@ def test_command(captures, one_by_one, tmp_path, capsys, monkeypatch):
     assert "1 were there already" in capsys.readouterr().out
     assert main(["fit", str(captures[0]), str(captures[1]), "-o", str(tmp_path / "x.ogpc")]) == 2
     assert "expected --out DIR" in capsys.readouterr().err
-    assert main(["fit", str(captures[0]), "--out", str(out), "--ply", str(tmp_path / "x.ply")]) == 2
+    assert main(["fit", str(captures[0]), "--out", str(out), "--work", str(tmp_path / "x.work")]) == 2
 
 
 class _Here(Inline):

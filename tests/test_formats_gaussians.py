@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from og_pointcloud.errors import SceneError
-from og_pointcloud.formats.gaussian_ply import read_gaussian_ply, write_gaussian_ply
+from og_pointcloud.formats.gaussian_ply import gaussian_rows
 from og_pointcloud.formats.ply import join_columns, read_ply, write_ply
 from og_pointcloud.formats.points import read_points
 from og_pointcloud.scene import Points
@@ -42,7 +42,7 @@ def assert_same(a: Points, b: Points, atol: float = 0.0) -> None:
 
 def test_activations_are_those_of_3dgs(tmp_path):
     raw = trained_columns()
-    points = read_gaussian_ply(write_columns(tmp_path / "a.ply", raw))
+    points = read_points(write_columns(tmp_path / "a.ply", raw))
     for row in range(len(points)):
         value = {name: float(column[row]) for name, column in raw.items()}
         quaternion = [value[f"rot_{i}"] for i in range(4)]
@@ -79,16 +79,16 @@ def as_doubles(columns):
 )
 def test_variants_of_the_trained_layout_read_the_same(tmp_path, variant):
     raw = trained_columns()
-    expected = read_gaussian_ply(write_columns(tmp_path / "a.ply", raw))
+    expected = read_points(write_columns(tmp_path / "a.ply", raw))
     assert_same(read_points(write_columns(tmp_path / "b.ply", variant(raw))), expected)
 
 
 def test_colours_instead_of_harmonics_and_no_colour_at_all(tmp_path):
     raw = {name: column for name, column in trained_columns().items() if not name.startswith("f_")}
-    assert read_gaussian_ply(write_columns(tmp_path / "a.ply", raw)).rgb is None
+    assert read_points(write_columns(tmp_path / "a.ply", raw)).rgb is None
     rgb = np.random.default_rng(0).integers(0, 256, (40, 3)).astype("u1")
     raw |= {name: rgb[:, i] for i, name in enumerate(("red", "green", "blue"))}
-    np.testing.assert_array_equal(read_gaussian_ply(write_columns(tmp_path / "b.ply", raw)).rgb, rgb)
+    np.testing.assert_array_equal(read_points(write_columns(tmp_path / "b.ply", raw)).rgb, rgb)
 
 
 def test_extreme_but_finite_gaussians_stay_finite(tmp_path):
@@ -97,7 +97,7 @@ def test_extreme_but_finite_gaussians_stay_finite(tmp_path):
     raw["scale_0"][:] = [-np.inf, -1e30, -100, 88.7, 0, 1]
     for i in range(4):
         raw[f"rot_{i}"][:3] = [0, 1e-38, 2e38]
-    points = read_gaussian_ply(write_columns(tmp_path / "a.ply", raw))
+    points = read_points(write_columns(tmp_path / "a.ply", raw))
     np.testing.assert_allclose(points.opacity, [0, 1, 0, 1, 0.5, 1], atol=1e-7)
     assert points.scale[:3, 0].tolist() == pytest.approx([0, 0, 0], abs=1e-43)
     assert 3e38 < points.scale[3, 0] <= MAXIMUM_32
@@ -143,9 +143,9 @@ def test_no_gaussians(tmp_path):
 
 @pytest.mark.parametrize("offset", [0.0, 4e6])
 def test_what_is_written_reads_back(tmp_path, offset):
-    points = read_gaussian_ply(write_columns(tmp_path / "a.ply", trained_columns()))
+    points = read_points(write_columns(tmp_path / "a.ply", trained_columns()))
     moved = Points(points.xyz, points.origin + offset, points.rgb, points.scale, points.rotation, points.opacity)
-    write_gaussian_ply(tmp_path / "b.ply", moved)
+    write_ply(tmp_path / "b.ply", {"vertex": gaussian_rows(moved)})
     assert_same(read_points(tmp_path / "b.ply"), moved, atol=2e-6)
 
 
@@ -155,10 +155,10 @@ def test_limits_are_written_as_finite_numbers(tmp_path):
         np.eye(3), scale=np.float32([[0, 1, 1e-45], [1, 1, 1], [1e38, 1, 1]]), rotation=identity,
         opacity=np.float32([0, 1, 0.5]),
     )  # fmt: skip
-    write_gaussian_ply(tmp_path / "a.ply", points)
+    write_ply(tmp_path / "a.ply", {"vertex": gaussian_rows(points)})
     raw = read_ply(tmp_path / "a.ply")["vertex"]
     assert all(np.isfinite(raw[name]).all() for name in raw.dtype.names)
-    read = read_gaussian_ply(tmp_path / "a.ply")
+    read = read_points(tmp_path / "a.ply")
     np.testing.assert_allclose(read.opacity, points.opacity, atol=1e-7)
     np.testing.assert_allclose(read.scale, points.scale, rtol=1e-5, atol=1e-37)
     assert read.rgb.tolist() == [[128, 128, 128]] * 3
@@ -166,7 +166,7 @@ def test_limits_are_written_as_finite_numbers(tmp_path):
 
 def test_plain_points_are_not_written_as_gaussians(tmp_path):
     with pytest.raises(SceneError, match="expected Gaussians"):
-        write_gaussian_ply(tmp_path / "a.ply", Points.from_world(np.eye(3)))
+        write_ply(tmp_path / "a.ply", {"vertex": gaussian_rows(Points.from_world(np.eye(3)))})
 
 
 # ---- compressed
@@ -286,7 +286,7 @@ def test_an_inria_file_survives_the_way_through_our_writer(tmp_path):
     assert len(points) == 9080
     raw = read_ply(INRIA)["vertex"]
     np.testing.assert_allclose(np.log(points.scale[:, 2]), raw["scale_2"], rtol=1e-5, atol=1e-6)
-    write_gaussian_ply(tmp_path / "a.ply", points)
+    write_ply(tmp_path / "a.ply", {"vertex": gaussian_rows(points)})
     read = read_points(tmp_path / "a.ply")
     np.testing.assert_allclose(read.xyz_world, points.xyz_world, rtol=1e-6, atol=1e-4)
     np.testing.assert_allclose(read.scale, points.scale, rtol=1e-5)

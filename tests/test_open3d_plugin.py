@@ -14,7 +14,8 @@ from og_pointcloud_export import write_bundle
 
 import og_pointcloud as og
 from og_pointcloud.errors import OgPointcloudError, SceneError
-from og_pointcloud.formats.gaussian_ply import write_gaussian_ply
+from og_pointcloud.formats.gaussian_ply import gaussian_rows
+from og_pointcloud.formats.ply import write_ply
 from og_pointcloud.scene import Points
 
 open3d = pytest.importorskip("open3d")
@@ -193,7 +194,7 @@ def test_example_of_a_highlight(tmp_path):
         xyz, rgb=np.full((len(y), 3), [40, 90, 160], np.uint8), scale=np.full((len(y), 3), 0.06, np.float32),
         rotation=np.tile(np.float32([1, 0, 0, 0]), (len(y), 1)), opacity=np.full(len(y), 0.95, np.float32),
     )  # fmt: skip
-    write_gaussian_ply(tmp_path / "splats.ply", splats)
+    write_ply(tmp_path / "splats.ply", {"vertex": gaussian_rows(splats)})
     bundle = write_bundle(make_cloud(xyz, side, 0.08, 0.2), tmp_path / "wall.ogpc")
     word = next(word for word in WORDS if og.select(bundle, word).instances == (0,))
     arguments = ("--eye=-4,0,0.1", "--target=0,0,0", "-o", tmp_path / "h.png")

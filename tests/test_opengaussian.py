@@ -11,9 +11,10 @@ from og_pointcloud.cloud import UNKNOWN_SPACE
 from og_pointcloud.errors import SceneError
 from og_pointcloud.fitting import opengaussian
 from og_pointcloud.fitting.opengaussian import read_opengaussian
-from og_pointcloud.formats.gaussian_ply import BASE_COLOR, LOG_SCALE, ROTATION, read_gaussian_ply
+from og_pointcloud.formats.gaussian_ply import BASE_COLOR, LOG_SCALE, ROTATION
 from og_pointcloud.formats.langsplat import LANGSPLAT_SPACE
 from og_pointcloud.formats.ply import join_columns, write_ply
+from og_pointcloud.formats.points import read_points
 
 COUNT, LEAVES, WIDTH = 300, 12, 8
 INSTANCE_FEATURES = ("ins_feat_r", "ins_feat_g", "ins_feat_b", "ins_feat_r2", "ins_feat_g2", "ins_feat_b2")
@@ -79,7 +80,7 @@ def test_leaves_become_instances(tmp_path):
     assert np.allclose(table.agreement, np.clip(arrays["leaf_score"][used], -1, 1))
     assert cloud.feature_space == "a space"
     ply = tmp_path / "point_cloud" / "iteration_90000" / "point_cloud.ply"
-    assert np.array_equal(cloud.rgb, read_gaussian_ply(ply).rgb[kept])
+    assert np.array_equal(cloud.rgb, read_points(ply).rgb[kept])
     assert cloud.provenance["notes"] == {"leaves": LEAVES, "instances": 4, "instances_without_feature": 2}
 
 

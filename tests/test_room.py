@@ -27,7 +27,7 @@ from og_pointcloud.ask.labelled_scene import as_scene  # noqa: E402
 from og_pointcloud.bundle.read import read_bundle  # noqa: E402
 from og_pointcloud.cloud import InstanceTable, LabelledCloud, Vocabulary  # noqa: E402
 from og_pointcloud.formats.colors import label_colors  # noqa: E402
-from og_pointcloud.text.everyday import everyday_words  # noqa: E402
+from og_pointcloud.text.text_features import everyday_words  # noqa: E402
 
 SMALL = CaptureSettings(views=8, width=160, height=120, samples_per_view=4000)
 

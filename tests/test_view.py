@@ -132,8 +132,6 @@ def test_nothing_found_is_said(bundle, tmp_path, capsys):
         (["--html", "x.png"], "expected a name that ends in .html or .htm"),
         (["--html", "x.html", "--cut", "1"], "--cut is 1.0; expected a share"),
         (["--html", "x.html", "--labels", "appel"], "did you mean 'apple'"),
-        (["--html", "x.html", "--certainty"], "--certainty is drawn alone"),
-        (["--png", "x.png", "--certainty", "--instances"], "--certainty is drawn alone"),
         ([], "there is no display for a window"),
     ],
 )
@@ -191,29 +189,6 @@ def test_a_picture_shows_the_labels(bundle, tmp_path, capsys):
     direction = colored / np.linalg.norm(colored, axis=1, keepdims=True)
     for color in hue_of:  # shaded by the cloud's own colours: the same hue, darker
         assert (direction @ (color / np.linalg.norm(color)) > 0.999).mean() > 0.05
-
-
-@pytest.mark.slow
-def test_a_picture_shows_how_sure_points_are(bundle, tmp_path, capsys):
-    plugin = pytest.importorskip("og_pointcloud_pyvista")
-    if not plugin.can_render():
-        pytest.skip("VTK cannot draw off-screen here")
-    import cv2
-
-    cloud = og.load(bundle).cloud
-    yellow, violet = [253, 231, 37], [68, 1, 84]  # the ends of viridis
-    for certainty, there, not_there in ((255, yellow, violet), (0, violet, yellow)):
-        sure = replace(cloud, certainty=np.full(len(cloud), certainty, np.uint8))
-        file = write_bundle(sure, tmp_path / f"{certainty}.ogpc")
-        assert run(capsys, "view", file, "--certainty", "--png", tmp_path / "sure.png")[0] == 0
-        picture = cv2.imread(str(tmp_path / "sure.png"))[:, :1200, ::-1].astype(int)  # without the scale beside it
-        shown = [(np.abs(picture - color).max(axis=-1) < 12).mean() for color in (there, not_there)]
-        assert shown[0] > 0.02
-        assert shown[1] == 0
-    unknown = write_bundle(replace(cloud, certainty=None), tmp_path / "unknown.ogpc")
-    code, _, stderr = run(capsys, "view", unknown, "--certainty", "--png", tmp_path / "unknown.png")
-    assert code == 2
-    assert "does not know how sure its points are: fit the capture again" in stderr
 
 
 def test_the_view_is_from_where_labelled_points_are_in_sight():

@@ -27,7 +27,7 @@ from og_pointcloud.cloud import Vocabulary, WordBank
 from og_pointcloud.errors import BundleError, FeatureSpaceError, OgPointcloudError
 from og_pointcloud.formats.npy import npy_bytes
 from og_pointcloud.text.encoder import TextEncoder, encoder_for, read_text_encoder
-from og_pointcloud.text.everyday import everyday_words, read_words
+from og_pointcloud.text.text_features import everyday_words, read_words
 from og_pointcloud.text.words import resolve_labels
 
 NEW = Vocabulary(("grape", "Größe 40"), 3 * unit_rows(2, seed=9))

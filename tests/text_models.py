@@ -10,7 +10,7 @@ from labelled_clouds import unit_rows
 from onnx import TensorProto, helper, numpy_helper
 
 from og_pointcloud.formats.npy import npy_bytes
-from og_pointcloud.text.everyday import everyday_words
+from og_pointcloud.text.text_features import everyday_words
 from og_pointcloud.text.tokenizer import BYTE_CHARACTERS, CLIP_NORMALIZER, CLIP_WORDS
 
 MERGES = [("a", "t</w>"), ("c", "at</w>"), ("l", "o"), ("lo", "w</w>"), ("lo", "w"), ("e", "r</w>")]

@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud.text.everyday import everyday_words
+from og_pointcloud.text.text_features import everyday_words
 from og_pointcloud_room.features import FEATURE_SPACE, FeatureModel
 from og_pointcloud_room.furniture import CLASS_NAMES
 from og_pointcloud_room.masks import MaskNoise, propose_masks

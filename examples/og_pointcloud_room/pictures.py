@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from og_pointcloud.ask.labelled_scene import LabelledScene
 from og_pointcloud.ask.segmentation import Segmentation
 from og_pointcloud.formats.colors import label_colors
+from og_pointcloud.show.page import Look
 from og_pointcloud.show.viewpoint import Viewpoint, choose_viewpoint
 
 __all__ = ["draw_clouds", "draw_views"]
@@ -66,7 +67,7 @@ def draw_clouds(
     shown, view = _look_into_room(first)
     panels = []
     for title, result in results.items():
-        plotter = draw(scene, result, rgb, shown if known is None else shown & known, view, by=by)
+        plotter = draw(scene, result, rgb, shown if known is None else shown & known, view, Look(title, f"{by}s"))
         plotter.add_text(title, position="upper_left", font_size=14, color="black", font="arial")
         picture = np.asarray(plotter.screenshot(return_img=True))
         plotter.close()

@@ -32,7 +32,7 @@ from og_pointcloud.masking.crops import WITH_CONTEXT, Crop
 from og_pointcloud.models import check_graph, open_session
 from og_pointcloud.text import encoder as text_encoder
 from og_pointcloud.text.encoder import TextEncoder, cache_folder, check_templates
-from og_pointcloud.text.everyday import everyday_words
+from og_pointcloud.text.text_features import everyday_words
 from og_pointcloud_export.writer import written_by
 
 try:

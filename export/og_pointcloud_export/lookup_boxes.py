@@ -52,19 +52,20 @@ _helper = njit(no_cpython_wrapper=True, no_cfunc_wrapper=True)  # pyright: ignor
 
 
 @njit(cache=True, parallel=True)
-def answer_children(corners, level, limits, points, answers, child, lengths, lists):  # noqa: ANN001, ANN201
-    """Answer the children of each box; corners (m, 3): its low corner. Fills, in C order of the children:
+def answer_children(corners, level, limits, points, filled):  # noqa: ANN001, ANN201
+    """Answer the children of each box; corners (m, 3): its low corner. Fills these four, in C order of the children:
 
     answers (m, 64): code of the answer, if certain; else that at the child's centre, plus the number of codes.
     child (m, 64): number of the list that settles the child, or NOTHING, or SPLIT.
     lengths (m, 64), lists (m, 64, LONGEST_LIST): the box's lists, of points' numbers, ascending; length 0: no list.
     """
     for box in prange(len(corners)):
-        _answer_box(corners[box], level, limits, points, answers[box], child[box], lengths[box], lists[box])
+        _answer_box(box, corners[box], level, limits, points, filled)
 
 
 @_helper
-def _answer_box(corner, level, limits, points, answers, child, lengths, lists):  # noqa: ANN001, ANN202
+def _answer_box(box, corner, level, limits, points, filled):  # noqa: ANN001, ANN202
+    answers, child, lengths, lists = filled[0][box], filled[1][box], filled[2][box], filled[3][box]
     size, rounding, longest, last = level
     near, holds = _points_about(corner, size, rounding, limits[0], points)
     squared, rows = np.empty(len(near[0])), np.empty(len(near[0]), np.int32)  # scratch of each child

@@ -231,7 +231,7 @@ class _Table:
             answers, child, lengths = (np.empty((len(corners), CHILDREN), np.int32) for _ in range(3))
             lists = np.empty((*child.shape, LONGEST_LIST), np.int32)
             level = (size, self._rounding, longest, last)
-            answer_children(corners, level, self._limits, self._points, answers, child, lengths, lists)
+            answer_children(corners, level, self._limits, self._points, (answers, child, lengths, lists))
             if self._lists_made >= self._lists_allowed:
                 child[child != SPLIT], lengths[:] = NOTHING, 0
             split = child == SPLIT

@@ -22,7 +22,6 @@ from og_pointcloud.cli.common import (
     print_next,
     print_table,
     replaceable,
-    timed,
     write_fit,
     write_json,
 )
@@ -32,7 +31,6 @@ from og_pointcloud.settings import FitSettings, PaperSettings
 if TYPE_CHECKING:
     from concurrent.futures import Executor
 
-    from og_pointcloud.cloud import LabelledCloud
     from og_pointcloud.collection.fit_many import FitOptions
 
 MODES = get_args(get_type_hints(FitSettings)["mode"])
@@ -83,12 +81,11 @@ def add(parser: Parser) -> None:
         "--work", type=replaceable, metavar="DIR",
         help="where the views of a long fit are kept until it ends, for a start after a kill (default: S.ogpc.work)",
     )  # fmt: skip
-    add_output(parser, "--ply", endings=(".ply",), help="also write the labelled cloud for other tools")
     add_output(parser, "--json", endings=(".json",), help="also write timings and settings of this run")
 
 
 def run(arguments: argparse.Namespace) -> None:
-    alone = [name for name in ("work", "ply") if getattr(arguments, name) is not None]
+    alone = [name for name in ("work",) if getattr(arguments, name) is not None]
     if arguments.out is None and len(arguments.capture) > 1:
         raise OgPointcloudError(f"{len(arguments.capture)} captures and one output; expected --out DIR for so many")
     if arguments.out is not None and alone:
@@ -115,9 +112,6 @@ def fit_one(arguments: argparse.Namespace, options: FitOptions, executor: Execut
             print(f"{views} views are kept in '{work}': the same command goes on behind them", file=sys.stderr)
         raise
     cloud = write_fit(cloud, cloud.provenance["stages"], arguments.output)
-    if arguments.ply:
-        with timed(cloud.provenance["stages"], "write cloud"):
-            write_cloud(cloud, arguments.output, arguments.ply)
     report = describe_fit(cloud, capture, arguments.output)
     if arguments.json:
         write_json(arguments.json, report)
@@ -160,20 +154,3 @@ def fit_settings(arguments: argparse.Namespace) -> FitSettings:
             "expected --mode paper: leave the option out, or take that mode"
         )
     return replace(settings, paper=PaperSettings(schedule_share=arguments.schedule_share))
-
-
-def write_cloud(cloud: LabelledCloud, bundle: Path, path: Path) -> None:
-    """The fitted cloud as .ply, coloured by the best word of each instance, or by instance where there are no words."""
-    import numpy as np
-
-    from og_pointcloud.ask.labelled_scene import segment
-    from og_pointcloud.cloud import UNKNOWN
-    from og_pointcloud.formats.colors import label_colors
-    from og_pointcloud.formats.points import write_labelled_ply
-
-    if cloud.vocabulary:
-        segment(bundle).save(path)
-        return
-    ids, unknown = cloud.instance_ids, np.full(len(cloud), UNKNOWN, np.int32)
-    colors = label_colors(np.maximum(ids, UNKNOWN))
-    write_labelled_ply(path, cloud.xyz_world, colors, {"og_label": unknown, "og_instance": ids})

@@ -1,4 +1,4 @@
-"""List the models and parts that are installed, and the commands that get others. Downloads nothing.
+"""List the models that are here, and the commands that get others. Downloads nothing.
 
 og-pointcloud models
 """
@@ -7,20 +7,11 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator
-from importlib.util import find_spec
 from pathlib import Path
 
 from og_pointcloud.cli.common import Parser, print_table
 from og_pointcloud.models import hub_cache
 
-PARTS = (
-    ("fit, opencv masks", ("cv2", "numba", "scipy"), "fit"),
-    ("SAM, CLIP, SigLIP masks", ("torch", "transformers", "safetensors"), "masks"),
-    ("learned modes", ("torch",), "learn"),
-    ("export of encoders", ("torch", "transformers", "onnx", "onnxscript"), "export"),
-    ("SigLIP's typed words", ("tokenizers",), "words"),
-)
-"""What for, modules, extra."""
 KINDS = {"sam": "proposer", "clip": "encoder", "siglip": "encoder"}
 """Beginning of a config.json's model_type -> what it is for."""
 USUAL = (
@@ -37,14 +28,7 @@ def add(_: Parser) -> None:
 
 
 def run(_: argparse.Namespace) -> None:
-    missing = {purpose: not all(map(find_spec, modules)) for purpose, modules, _ in PARTS}
-    rows = [
-        (purpose, f"pip install 'og-pointcloud[{extra}]'" if missing[purpose] else "installed")
-        for purpose, _, extra in PARTS
-    ]
-    print_table(("part", "state"), rows)
     found = sorted({(kind, name, where) for kind, name, where in found_models()})
-    print()
     if found:
         print_table(("model", "for", "where"), [(name, kind, str(where)) for kind, name, where in found])
     else:

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from og_pointcloud.show.viewpoint import Viewpoint
 
 AXES = {"x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1), "-x": (-1, 0, 0), "-y": (0, -1, 0), "-z": (0, 0, -1)}
-OF_SCENE = ("labels", "text_features", "cloud", "html", "png", "boxes", "certainty", "up", "cut", "instances")
+OF_SCENE = ("labels", "text_features", "cloud", "html", "png", "boxes", "up", "cut", "instances")
 OF_CAPTURE = ("output", "columns")
 
 
@@ -35,7 +35,6 @@ def add(parser: Parser) -> None:
     add_output(scene, "--html", endings=(".html", ".htm"), help="a page that any browser opens, without a network")
     add_output(scene, "--png", endings=(".png",), help="a picture")
     scene.add_argument("--boxes", action="store_true", help="boxes around what has a label")
-    scene.add_argument("--certainty", action="store_true", help="colours by how sure each point's instance is")
     scene.add_argument("--up", choices=AXES, metavar="AXIS", help="which of x, y, z, -x, -y, -z points up (default: z)")
     scene.add_argument("--cut", type=float, metavar="SHARE", help="hide this share of the height, from the top")
     scene.add_argument("--instances", action="store_true", help="colours by instance")
@@ -73,20 +72,16 @@ def view_scene(arguments: argparse.Namespace) -> None:
         points = scene if other is None else other.xyz_world
         result = segment(points, names_in(arguments.labels), scene, text_features=arguments.text_features)
     rgb = scene.cloud.rgb if other is None else other.rgb
-    if arguments.certainty and result.certainty is None:
-        raise OgPointcloudError(f"{arguments.source} does not know how sure its points are: fit the capture again")
     shown, view = chosen_view(result, arguments)
     outputs = [path for path in (arguments.html, arguments.png) if path]
-    if arguments.html:
-        title, mode = (arguments.cloud or arguments.source).stem, "instances" if arguments.instances else "labels"
-        look = Look(title, mode, arguments.boxes, arguments.cut or 0.0)
-        if left_out := write_page(arguments.html, scene, result, view, look, rgb):
-            print(f"left out of the page: {left_out}")
+    mode = "instances" if arguments.instances else "labels"
+    look = Look((arguments.cloud or arguments.source).stem, mode, arguments.boxes, arguments.cut or 0.0)
+    if arguments.html and (left_out := write_page(arguments.html, scene, result, view, look, rgb)):
+        print(f"left out of the page: {left_out}")
     plotter = None
     if arguments.png or not outputs:
-        by = "certainty" if arguments.certainty else "instance" if arguments.instances else "label"
         draw = import_plugin("og_pointcloud_pyvista.screening", "pyvista").draw
-        plotter = draw(scene, result, rgb, shown, view, by=by, boxes=arguments.boxes, window=not outputs)
+        plotter = draw(scene, result, rgb, shown, view, look, window=not outputs)
         if arguments.png:
             arguments.png.parent.mkdir(parents=True, exist_ok=True)
             plotter.screenshot(arguments.png)
@@ -98,10 +93,6 @@ def view_scene(arguments: argparse.Namespace) -> None:
 
 
 def check_scene_options(arguments: argparse.Namespace) -> None:
-    if arguments.certainty and (arguments.instances or arguments.html):
-        raise OgPointcloudError(
-            "--certainty is drawn alone, in a window or with --png; leave out --instances and --html"
-        )
     if arguments.cut is not None and not 0 <= arguments.cut < 1:
         raise OgPointcloudError(f"--cut is {arguments.cut}; expected a share of the height, from 0 to below 1")
     if arguments.html is not None and arguments.png is None:

@@ -42,8 +42,7 @@ def run_add(arguments: argparse.Namespace) -> None:
     """
     from og_pointcloud.bundle.vocabulary import add_words
     from og_pointcloud.cloud import Vocabulary
-    from og_pointcloud.text.everyday import read_words
-    from og_pointcloud.text.text_features import read_text_features
+    from og_pointcloud.text.text_features import read_text_features, read_words
 
     if (arguments.words is None) == (arguments.text_features is None):
         arguments.parser.error("words come from one place: a file with one a line, or --text-features F.npz")

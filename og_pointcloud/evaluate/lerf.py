@@ -213,16 +213,10 @@ def score_pairs(
 
 
 def pair_ious(frame: LabelledFrame, alphas: Mapping[str, Alpha]) -> dict[str, float]:
-    """IoU of each object of a frame. alphas: category -> (H, W) alpha of its selection's render; absent: 0."""
+    """IoU of each object of a frame. alphas: category -> (H, W) alpha of its selection's render."""
     found = {}
     for category, truth in frame.objects.items():
-        alpha = alphas.get(category)
-        if alpha is not None and alpha.shape != truth.shape:
-            raise SceneError(
-                f"frame '{frame.name}', '{category}': the render is {alpha.shape}, the label {truth.shape}; expected "
-                "the label's size: render at the labelled image's resolution"
-            )
-        shown = np.zeros(truth.shape, bool) if alpha is None else alpha > ALPHA_SHOWN
+        shown = alphas[category] > ALPHA_SHOWN
         union = int((shown | truth).sum())
         found[category] = int((shown & truth).sum()) / union if union else 0.0
     return found
@@ -250,12 +244,8 @@ def _alpha(
     gaussians: Gaussians, ids: NDArray[np.int32], camera: Camera, near: float, instances: Sequence[int]
 ) -> NDArray[np.float32]:
     """(H, W) what the points of some instances cover of a view, nothing else being there."""
-    rows = np.flatnonzero(np.isin(ids, instances))
-    if not len(rows):
-        return np.zeros((camera.height, camera.width), np.float32)
-    columns = (gaussians.xyz, gaussians.scale, gaussians.rotation, gaussians.opacity)
-    alone = Gaussians(*(np.ascontiguousarray(column[rows]) for column in columns))
-    return render(alone, np.zeros((len(rows), 0), np.float32), camera, near)[1]
+    alone = gaussians.take(np.flatnonzero(np.isin(ids, instances)))
+    return render(alone, np.zeros((len(alone), 0), np.float32), camera, near)[1]
 
 
 def _view_without_masks(camera: Camera) -> View:

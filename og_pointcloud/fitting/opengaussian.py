@@ -26,9 +26,10 @@ from numpy.typing import NDArray
 
 from og_pointcloud.cloud import UNKNOWN_SPACE, InstanceTable, LabelledCloud
 from og_pointcloud.errors import MissingExtraError, SceneError
-from og_pointcloud.formats.gaussian_ply import latest_iteration, read_gaussian_ply
+from og_pointcloud.formats.gaussian_ply import latest_iteration
 from og_pointcloud.formats.langsplat import LANGSPLAT_SPACE, LANGSPLAT_WIDTH
 from og_pointcloud.formats.npy import array_from_zip
+from og_pointcloud.formats.points import read_points
 from og_pointcloud.formats.tables import naming
 from og_pointcloud.journal import LeftOut, left_out_entry
 from og_pointcloud.settings import GeometrySettings
@@ -84,7 +85,7 @@ def read_opengaussian(
     og_pointcloud.errors.SceneError: no_such_run...
     """
     ply, clusters = _find_result(Path(result), None if cluster_lang is None else Path(cluster_lang))
-    points = read_gaussian_ply(ply)
+    points = read_points(ply)
     with naming(clusters):
         leaves = _read_leaves(clusters, len(points))
     assert points.opacity is not None

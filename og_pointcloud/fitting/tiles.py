@@ -53,7 +53,6 @@ from og_pointcloud.rendering.geometry import (
 )
 from og_pointcloud.rendering.splatting import FRUSTUM_MARGIN, LOW_PASS, Cutoffs, Gaussians
 from og_pointcloud.rendering.surface import (
-    sight_thickness,
     surface_thickness,
     with_distinct_points,
     with_needed_views,
@@ -458,10 +457,7 @@ def _entries(
         return np.zeros(0, ENTRY)
     splats = drawing.splats(cloud, rows, larger)
     apart, by_sight = cloud.spacing[rows] * larger, drawing.scale is not None
-    if by_sight:
-        thickness = sight_thickness(apart, drawing.typical, settings.geometry)
-    else:
-        thickness = surface_thickness(splats, apart, drawing.typical, settings.geometry)
+    thickness = surface_thickness(splats, apart, drawing.typical, settings.geometry, by_sight=by_sight)
     cutoffs = Cutoffs(visibility.alpha_min, visibility.transmittance_min)
     table = mask_table(splats, [view], drawing.near, thickness, cutoffs=cutoffs, by_sight=by_sight)
     camera = view.camera

@@ -8,7 +8,6 @@ instance features and normals are not read: nothing here renders colour by direc
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -17,18 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.errors import SceneError
-from og_pointcloud.formats.ply import join_columns, read_ply, write_ply
-from og_pointcloud.formats.tables import colors, naming, positions, stack_columns, storable_positions
+from og_pointcloud.formats.ply import join_columns
+from og_pointcloud.formats.tables import colors, positions, stack_columns, storable_positions
 from og_pointcloud.scene import Points
 
-__all__ = [
-    "gaussian_rows",
-    "gaussians_from_ply",
-    "holds_gaussians",
-    "latest_iteration",
-    "read_gaussian_ply",
-    "write_gaussian_ply",
-]
+__all__ = ["gaussian_rows", "gaussians_from_ply", "holds_gaussians", "latest_iteration"]
 
 SH_CONSTANT = 0.28209479177387814
 """The spherical harmonic of degree 0, 1 / (2 sqrt(pi)): colour = 0.5 + SH_CONSTANT * f_dc."""
@@ -51,28 +43,8 @@ def latest_iteration(folder: Path) -> Path | None:
     return iterations[max(iterations)] if iterations else None
 
 
-def read_gaussian_ply(path: str | os.PathLike[str]) -> Points:
-    """Gaussians from a trained or compressed 3DGS file; world coordinates, the median as origin.
-
-    A zero quaternion is no rotation. Opacity logits of +-inf are 1 and 0, a log scale of -inf is 0: some converters
-    write them for splats that are fully opaque, invisible or flat. SceneError, beginning with the path, where a
-    property is missing or anything else is not finite, also a log scale above 88.7, whose exponential leaves float32.
-    """
-    path = Path(path)
-    with naming(path):
-        return gaussians_from_ply(read_ply(path))
-
-
-def write_gaussian_ply(path: str | os.PathLike[str], points: Points) -> None:
-    """Write Gaussians in the trained layout of degree 0 (no ``f_rest``), in world coordinates; atomic.
-
-    The rows are those of `gaussian_rows`, which lists what is not written exactly.
-    """
-    write_ply(path, {"vertex": gaussian_rows(points)})
-
-
 def gaussian_rows(points: Points) -> NDArray[np.void]:
-    """(n,) records in the trained layout of degree 0, world coordinates: what a 3DGS file holds of these Gaussians.
+    """(n,) records in the trained layout of degree 0, world coordinates, for the element "vertex" of a 3DGS file.
 
     Positions are float64 where float32 would lose more than 1e-6 of the extent. Scale 0 and opacities 0 and 1 become
     the nearest finite logarithm and logit, so that any reader survives them. Without rgb the splats are mid-grey.
@@ -100,7 +72,12 @@ def holds_gaussians(elements: Elements) -> bool:
 
 
 def gaussians_from_ply(elements: Elements) -> Points:
-    """``read_gaussian_ply`` on elements that are read already."""
+    """Gaussians from the elements of a trained or compressed 3DGS file; world coordinates, the median as origin.
+
+    A zero quaternion is no rotation. Opacity logits of +-inf are 1 and 0, a log scale of -inf is 0: some converters
+    write them for splats that are fully opaque, invisible or flat. SceneError where a property is missing or anything
+    else is not finite, also a log scale above 88.7, whose exponential leaves float32.
+    """
     if "vertex" not in elements:
         raise SceneError(f"no element 'vertex' of plain properties; the file has {', '.join(elements) or 'none':.200}")
     return _compressed(elements) if _are_compressed(elements) else _trained(elements["vertex"])

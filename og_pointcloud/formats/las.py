@@ -31,7 +31,7 @@ from og_pointcloud.scene import Points, require_finite
 if TYPE_CHECKING:
     from laspy import LasData
 
-__all__ = ["labelled_las", "read_las", "write_las"]
+__all__ = ["read_las", "write_las"]
 
 SIGNATURE = b"LASF"
 POINTS_PER_CHUNK = 1_000_000
@@ -59,14 +59,36 @@ def read_las(path: str | os.PathLike[str]) -> Points:
 
     SceneError, beginning with the path, for a file that is damaged or has no points; MissingExtraError without laspy.
     """
-    xyz, rgb = _read(Path(path))
-    return Points.from_world(xyz, rgb=rgb)
+    path, laspy = Path(path), _laspy()
+    xyz: list[NDArray[np.float64]] = []
+    rgb: list[NDArray[np.uint16]] = []
+    with naming(path):
+        try:
+            _check_counts(path)
+            # Of the two backends this one makes no room for points that a chunk only claims to have.
+            with laspy.open(path, laz_backend=laspy.LazBackend.Lazrs, read_evlrs=False) as reader:
+                promised = reader.header.point_count
+                has_colors = "red" in reader.header.point_format.dimension_names
+                for chunk in reader.chunk_iterator(POINTS_PER_CHUNK):
+                    xyz.append(np.column_stack([chunk.x, chunk.y, chunk.z]))
+                    if has_colors:
+                        rgb.append(np.column_stack([chunk.red, chunk.green, chunk.blue]))
+        except (SceneError, OSError, KeyboardInterrupt, SystemExit):
+            raise
+        except BaseException as error:  # laspy raises types of its own; a panic of lazrs is no Exception
+            raise SceneError(f"cannot be read as LAS ({error!s:.120}): copy or write it again") from error
+        count = sum(map(len, xyz))
+        if count != promised or not count:
+            raise SceneError(
+                f"expected {promised} points, the file has {count}: it is empty or truncated; copy or write it again"
+            )
+    return Points.from_world(np.concatenate(xyz), rgb=_eight_bits(np.concatenate(rgb)) if rgb else None)
 
 
-def labelled_las(
+def _labelled(
     xyz_world: NDArray[np.floating], rgb: NDArray[np.uint8], attributes: Mapping[str, NDArray], names: Sequence[str]
 ) -> LasData:
-    """A laspy LasData of a labelled cloud. Arguments and errors as for `write_las`."""
+    """A laspy LasData of a labelled cloud."""
     laspy = _laspy()
     require_finite(xyz_world, LABEL_FINITE)
     header = laspy.LasHeader(point_format=7, version="1.4")
@@ -104,7 +126,7 @@ def write_las(
     """
     path = Path(path)
     with naming(path):
-        las = labelled_las(xyz_world, rgb, attributes, names)
+        las = _labelled(xyz_world, rgb, attributes, names)
         with replacing(path) as file:
             try:
                 las.write(file, do_compress=path.suffix == ".laz")
@@ -120,33 +142,6 @@ def _laspy() -> Any:
     except ImportError:
         raise MissingExtraError("laspy", "las") from None
     return laspy
-
-
-def _read(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8] | None]:
-    laspy = _laspy()
-    xyz: list[NDArray[np.float64]] = []
-    rgb: list[NDArray[np.uint16]] = []
-    with naming(path):
-        try:
-            _check_counts(path)
-            # Of the two backends this one makes no room for points that a chunk only claims to have.
-            with laspy.open(path, laz_backend=laspy.LazBackend.Lazrs, read_evlrs=False) as reader:
-                promised = reader.header.point_count
-                has_colors = "red" in reader.header.point_format.dimension_names
-                for chunk in reader.chunk_iterator(POINTS_PER_CHUNK):
-                    xyz.append(np.column_stack([chunk.x, chunk.y, chunk.z]))
-                    if has_colors:
-                        rgb.append(np.column_stack([chunk.red, chunk.green, chunk.blue]))
-        except (SceneError, OSError, KeyboardInterrupt, SystemExit):
-            raise
-        except BaseException as error:  # laspy raises types of its own; a panic of lazrs is no Exception
-            raise SceneError(f"cannot be read as LAS ({error!s:.120}): copy or write it again") from error
-        count = sum(map(len, xyz))
-        if count != promised or not count:
-            raise SceneError(
-                f"expected {promised} points, the file has {count}: it is empty or truncated; copy or write it again"
-            )
-    return np.concatenate(xyz), _eight_bits(np.concatenate(rgb)) if rgb else None
 
 
 def _check_counts(path: Path) -> None:

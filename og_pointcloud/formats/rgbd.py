@@ -17,9 +17,10 @@ Poses are camera-to-world with OpenCV axes. Pixel centres are counted at whole n
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,14 +29,7 @@ from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.depth import MILLIMETRE, DepthFile
 from og_pointcloud.formats.images import IMAGE_SUFFIXES, image_size
 from og_pointcloud.formats.phones import PHONE_LAYOUTS
-from og_pointcloud.formats.poses import (
-    PosedFrames,
-    PosedImage,
-    numbered,
-    read_json,
-    read_numbers,
-    rigid,
-)
+from og_pointcloud.formats.poses import PosedFrames, PosedImage, numbered, read_json, read_numbers, rigid
 from og_pointcloud.formats.tables import naming
 from og_pointcloud.scene import Camera
 
@@ -76,27 +70,25 @@ class _Lens:
         return Camera(*self.size, self.fx, self.fy, self.cx, self.cy, pose)
 
 
-@dataclass(frozen=True)
-class _Frame:
-    """An image of a recording.
+class _Recording(NamedTuple):
+    """The frames with a finite pose, and the paths of the others, whose tracking was lost."""
 
-    path: in the capture folder. pose: camera to world, NaN or infinite where tracking was lost. source: where the pose
-    was read, for errors. depth_file: may be absent.
-    """
+    images: list[PosedImage]
+    dropped: list[str]
 
-    path: str
-    pose: NDArray[np.float64]
-    source: str
-    lens: _Lens
-    depth_file: Path | None
-    depth_lens: _Lens
+    def add(self, path: str, pose: NDArray[np.float64], source: str, lenses: tuple[_Lens, _Lens], depth: Path) -> None:
+        """path: of the image, in the capture folder. pose: camera to world. source: where the pose was read, for
+        errors. lenses: of colour and depth. depth: a file that may be absent."""
+        if not np.isfinite(pose).all():
+            self.dropped.append(path)
+            return
+        with naming(source):
+            camera, lens = lenses[0].at(pose), lenses[1]
+            depth_file = DepthFile(depth, lens.at(pose), lens.unit, lens.invalid) if depth.is_file() else None
+        self.images.append(PosedImage(path, camera, depth=depth_file))
 
-    def posed(self) -> PosedImage:
-        with naming(self.source):
-            camera, file, lens = self.lens.at(self.pose), self.depth_file, self.depth_lens
-            if file is None or not file.is_file():
-                return PosedImage(self.path, camera)
-            return PosedImage(self.path, camera, depth=DepthFile(file, lens.at(self.pose), lens.unit, lens.invalid))
+    def frames(self) -> PosedFrames:
+        return PosedFrames(tuple(self.images), tuple(self.dropped))
 
 
 def read_rgbd(folder: Path) -> PosedFrames | None:
@@ -117,17 +109,6 @@ def _is_seven_scenes(folder: Path) -> bool:
 
 def _is_replica(folder: Path) -> bool:
     return (folder / "traj.txt").is_file() and (folder / "results").is_dir()
-
-
-def _posed_frames(frames: Iterable[_Frame]) -> PosedFrames:
-    """Frames with a finite pose as posed images, the others' paths as dropped."""
-    posed, dropped = [], []
-    for frame in frames:
-        if np.isfinite(frame.pose).all():
-            posed.append(frame.posed())
-        else:
-            dropped.append(frame.path)
-    return PosedFrames(tuple(posed), tuple(dropped))
 
 
 def _pose_in(file: Path) -> NDArray[np.float64]:
@@ -153,11 +134,11 @@ def read_scannet(folder: Path) -> PosedFrames:
     color = _scannet_lens(folder, "color", images[0])
     some_depth = next((folder / "depth").glob("*.png"), None)
     depth = replace(_scannet_lens(folder, "depth", some_depth) if some_depth else color, unit=MILLIMETRE)
-    frames = []
+    recording = _Recording([], [])
     for file in images:
         pose_file, depth_file = folder / "pose" / f"{file.stem}.txt", folder / "depth" / f"{file.stem}.png"
-        frames.append(_Frame(f"color/{file.name}", _pose_in(pose_file), str(pose_file), color, depth_file, depth))
-    return _posed_frames(frames)
+        recording.add(f"color/{file.name}", _pose_in(pose_file), str(pose_file), (color, depth), depth_file)
+    return recording.frames()
 
 
 def find_mesh(folder: Path) -> Path | None:
@@ -188,13 +169,13 @@ def read_seven_scenes(folder: Path) -> PosedFrames:
         raise SceneError(f"{folder} has poses but no frame-*.color.png or .color.jpg: add the colour images")
     color, depth = _seven_scenes_lenses(folder, image_size(images[0]))
     depth = replace(depth, unit=MILLIMETRE, invalid=SEVEN_SCENES_INVALID)
-    frames = []
+    recording = _Recording([], [])
     for file in images:
         frame = file.name.split(".")[0]
         pose_file, depth_file = file.with_name(f"{frame}.pose.txt"), file.with_name(f"{frame}.depth.png")
         path = file.relative_to(folder).as_posix()
-        frames.append(_Frame(path, _pose_in(pose_file), str(pose_file), color, depth_file, depth))
-    return _posed_frames(frames)
+        recording.add(path, _pose_in(pose_file), str(pose_file), (color, depth), depth_file)
+    return recording.frames()
 
 
 def _sequences(folder: Path) -> list[Path]:
@@ -225,12 +206,12 @@ def read_replica(folder: Path) -> PosedFrames:
         )
     width, height, fx, fy, cx, cy, scale = _replica_parameters(folder)
     lens = _Lens((round(width), round(height)), fx, fy, cx + 0.5, cy + 0.5, unit=1 / scale)
-    frames = []
+    recording = _Recording([], [])
     for line, (file, pose) in enumerate(zip(images, poses, strict=False), 1):
         depth_file = results / f"{file.stem.replace('frame', 'depth', 1)}.png"
         source = f"{folder / 'traj.txt'}, line {line}"
-        frames.append(_Frame(f"results/{file.name}", pose, source, lens, depth_file, lens))
-    return _posed_frames(frames)
+        recording.add(f"results/{file.name}", pose, source, (lens, lens), depth_file)
+    return recording.frames()
 
 
 def _replica_parameters(folder: Path) -> list[float]:

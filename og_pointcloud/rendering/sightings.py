@@ -89,23 +89,24 @@ def openness(
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
     """(n,) float32 each: openness, 0 where a point is hidden, outside the image or not asked; and where it is seen, in
     pixels (u, v). Light is followed through the centres of pixels."""
-    splats, starts, members, columns, _ = binned_splats(gaussians, camera, near, thickness, cutoffs)
+    binned, _ = binned_splats(gaussians, camera, near, thickness, cutoffs)
     n = len(gaussians)
     asked = np.ones(n, np.bool_) if asked is None else asked
     open_, u, v = (np.zeros(n, np.float32) for _ in range(3))
     size = np.array([camera.width, camera.height])
     log2_least = np.float32(np.log2(cutoffs.alpha_min))
-    _see(splats, starts, members, columns, size, asked, log2_least, get_num_threads(), open_, u, v)
+    _see(binned, size, asked, log2_least, get_num_threads(), (open_, u, v))
     return open_, u, v
 
 
 @njit(cache=True, parallel=True, nogil=True, error_model="numpy")
-def _see(splats, starts, members, columns, size, asked, log2_least, workers, open_, u, v):  # noqa: ANN001, ANN202
-    """Writes the last three, tile by tile: a centre lies in one tile, whose members are all that can hide it.
+def _see(binned, size, asked, log2_least, workers, seen):  # noqa: ANN001, ANN202
+    """Writes what is seen, tile by tile: a centre lies in one tile, whose members are all that can hide it.
 
     Light falls through the splats of a tile from front to back. A point is asked when all that lies before its surface
     has been drawn: so points are taken by the depth of their surface, splats by their own.
     """
+    (splats, starts, members, columns), (open_, u, v) = binned, seen
     tiles, deepest = len(starts) - 1, 0
     for tile in range(tiles):
         deepest = max(deepest, starts[tile + 1] - starts[tile])

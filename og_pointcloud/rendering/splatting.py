@@ -73,6 +73,8 @@ class Cutoffs(NamedTuple):
 
 
 CUTOFFS = Cutoffs()
+Binned = tuple[NDArray[Any], NDArray[np.int64], NDArray[np.int32], int]
+"""(splats, starts, members, columns of tiles); members[starts[t] : starts[t + 1]] are rows of splats, nearest first."""
 
 
 @dataclass(frozen=True)
@@ -177,21 +179,18 @@ def _entries(
 ) -> tuple[tuple[NDArray[Any], ...], NDArray[np.float64]]:
     """What `view_weights` adds up, tile by tile: (rows, cols, weights, first, counts), tile t's entries being
     first[t] : first[t] + counts[t]; and the area of each splat."""
-    splats, starts, members, columns, area = binned_splats(gaussians, camera, near, thickness, cutoffs)
+    binned, area = binned_splats(gaussians, camera, near, thickness, cutoffs)
     masks = np.where(ids < 0, id_count, ids).astype(np.int32)
-    bounds = _entry_bounds(splats, starts, members, masks, id_count, columns)
+    bounds = _entry_bounds(binned, masks, id_count)
     first = np.concatenate([[0], np.cumsum(bounds)])
-    rows, cols, weights, counts = _composite(
-        splats, starts, members, masks, id_count, columns, first, cutoffs, get_num_threads()
-    )
+    rows, cols, weights, counts = _composite(binned, masks, id_count, first, cutoffs, get_num_threads())
     return (rows, cols, weights, first[:-1], counts), area
 
 
 def binned_splats(
     gaussians: Gaussians, camera: Camera, near: float, thickness: NDArray[np.float32] | None, cutoffs: Cutoffs
-) -> tuple[NDArray[Any], NDArray[np.int64], NDArray[np.int32], int, NDArray[np.float64]]:
-    """The splats of an image by tile: (splats, starts, members, columns of tiles, area of each Gaussian); the members
-    of tile t, members[starts[t] : starts[t + 1]], are rows of splats, nearest first."""
+) -> tuple[Binned, NDArray[np.float64]]:
+    """The splats of an image by tile, and the area of each Gaussian."""
     pose, near = camera.world_to_camera, float(near)
     intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
     size = (camera.width, camera.height)
@@ -215,7 +214,7 @@ def binned_splats(
     columns = -(-camera.width // TILE)
     tiles = columns * -(-camera.height // TILE)
     starts, members = _bin(splats, order, columns, tiles, cutoffs, get_num_threads())
-    return splats, starts, members, columns, area
+    return (splats, starts, members, columns), area
 
 
 def _records(count: int) -> NDArray[Any]:
@@ -399,8 +398,9 @@ def _clip_box(s, left, top):  # noqa: ANN001, ANN202
 
 
 @njit(cache=True, parallel=True, nogil=True)
-def _entry_bounds(splats, starts, members, masks, id_count, columns):  # noqa: ANN001, ANN202
+def _entry_bounds(binned, masks, id_count):  # noqa: ANN001, ANN202
     """An upper bound of the (mask, Gaussian) entries each tile will write."""
+    splats, starts, members, columns = binned
     tiles = len(starts) - 1
     height, width = masks.shape
     bounds = np.zeros(tiles, np.int64)
@@ -425,10 +425,11 @@ def _entry_bounds(splats, starts, members, masks, id_count, columns):  # noqa: A
 
 
 @njit(cache=True, parallel=True, nogil=True, error_model="numpy")
-def _composite(splats, starts, members, masks, id_count, columns, first, cutoffs, workers):  # noqa: ANN001, ANN202
+def _composite(binned, masks, id_count, first, cutoffs, workers):  # noqa: ANN001, ANN202
     """Blend every tile front to back and add each splat's weights up by mask; entries of tile t start at first[t].
 
     Row id_count holds pixels without a mask, row id_count + 1 what shows through surfaces (counted in its mask too)."""
+    splats, starts, members, columns = binned
     tiles = len(starts) - 1
     rows = np.empty(first[-1], np.int32)
     cols = np.empty(first[-1], np.int32)
@@ -442,9 +443,8 @@ def _composite(splats, starts, members, masks, id_count, columns, first, cutoffs
         light, surface, shown = tile_buffer(), tile_buffer(), tile_buffer()
         runs = np.empty((TILE, TILE), np.uint8)
         batch = np.empty(BATCH, SPLAT)
-        log2_least = np.float32(np.log2(cutoffs.alpha_min))
-        # By more than rounding below: four splats of opacity 0.9 leave just the limit of 3DGS.
-        least_light = np.float32(0.99999 * cutoffs.transmittance_min)
+        # Light by more than rounding below: four splats of opacity 0.9 leave just the limit of 3DGS.
+        least = np.float32(np.log2(cutoffs.alpha_min)), np.float32(0.99999 * cutoffs.transmittance_min)
         for tile in range(worker, tiles, workers):
             left, top = tile % columns * TILE, tile // columns * TILE
             ids = masks[top : top + TILE, left : left + TILE]
@@ -456,15 +456,15 @@ def _composite(splats, starts, members, masks, id_count, columns, first, cutoffs
                     batch[k] = splats[members[begin + k]]
                 for k in range(count):
                     s = batch[k]
-                    weight, through = _blend(s, left, top, log2_least, least_light, light, surface, shown)
+                    weight, through = _blend(s, left, top, least, light, surface, shown)
                     if weight == 0.0:
                         continue
-                    x0, x1, y0, y1 = _clip_box(s, left, top)
-                    if is_one_mask or _shows_one_mask(ids, runs, x0, x1, y0, y1):
-                        rows[entry], cols[entry], weights[entry] = ids[y0, x0], s.gaussian, weight
+                    box = _clip_box(s, left, top)
+                    if is_one_mask or _shows_one_mask(ids, runs, box):
+                        rows[entry], cols[entry], weights[entry] = ids[box[2], box[0]], s.gaussian, weight
                         entry += 1
                     else:
-                        for j in range(_add_by_mask(ids, shown, x0, x1, y0, y1, sum_of, touched)):
+                        for j in range(_add_by_mask(ids, shown, box, sum_of, touched)):
                             rows[entry], cols[entry], weights[entry] = touched[j], s.gaussian, sum_of[touched[j]]
                             sum_of[touched[j]] = 0.0
                             entry += 1
@@ -504,28 +504,35 @@ def _begin_tile(ids, light, surface, runs):  # noqa: ANN001, ANN202
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _blend(s, left, top, log2_least, least_light, light, surface, shown):  # noqa: ANN001, ANN202
+def _alpha_of_row(s, left, row, log2_least):  # noqa: ANN001, ANN202
+    """Alpha of a splat in the pixels of a tile's row, cut at both ends as in 3DGS; 0 where it does not reach."""
+    least = spread(log2_least)
+    # log2 of alpha along the row: a parabola about the row's middle, which lies a shear off the centre.
+    dy = row + 0.5 - s.v
+    distance = (ramp() - spread(np.float32(s.u - s.shear * dy - left - 0.5))) * spread(s.across)
+    log_alpha = spread(np.float32(s.peak - s.down * dy * dy)) - distance * distance
+    covers = log_alpha >= least
+    alpha = lesser(exp2(either(covers, log_alpha, least)), spread(np.float32(ALPHA_MAX)))
+    return either(covers, alpha, spread(ZERO))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _blend(s, left, top, least, light, surface, shown):  # noqa: ANN001, ANN202
     """Draw a splat into a tile, a row of pixels at a time. Returns its weight, and that which shows through a surface.
 
+    least: log2 of the alpha that counts, and light of a pixel that is not finished, at least.
     light: transmittance of each pixel, 0 where it is finished. surface: depth of the splat that brought a pixel's
     transmittance below a half. shown: set to the weights in the rows of its box.
     """
     none, full, half, never = spread(ZERO), spread(ONE), spread(HALF), spread(np.float32(np.inf))
-    across, depth, near_side, least = spread(s.across), spread(s.depth), spread(s.surface), spread(log2_least)
+    depth, near_side = spread(s.depth), spread(s.surface)
     weight, through = none, none
     for y in range(max(s.y0 - top, 0), min(s.y1 + 1 - top, TILE)):
-        # log2 of alpha along the row: a parabola about the row's middle, which lies a shear off the centre.
-        dy = top + y + 0.5 - s.v
-        distance = (ramp() - spread(np.float32(s.u - s.shear * dy - left - 0.5))) * across
-        log_alpha = spread(np.float32(s.peak - s.down * dy * dy)) - distance * distance
-        # Alpha, cut at both ends as in 3DGS; 0 where the splat does not reach.
-        covers = log_alpha >= least
-        alpha = lesser(exp2(either(covers, log_alpha, least)), spread(np.float32(ALPHA_MAX)))
-        alpha = either(covers, alpha, none)
+        alpha = _alpha_of_row(s, left, top + y, least[0])
         # Weight = transmittance before the splat times alpha, but for pixels that this splat would finish.
         before = load(light, y * TILE)
         after = before * (full - alpha)
-        goes_on = after >= spread(least_light)  # also where it is not covered and not finished
+        goes_on = after >= spread(least[1])  # also where it is not covered and not finished
         here = either(goes_on, before * alpha, none)
         store(light, y * TILE, either(goes_on, after, none))
         # The splat at which the transmittance falls below a half is the pixel's surface.
@@ -541,20 +548,15 @@ def _blend(s, left, top, log2_least, least_light, light, surface, shown):  # noq
 @njit(cache=True, nogil=True, error_model="numpy")
 def dim(s, left, top, log2_least, light):  # noqa: ANN001, ANN201
     """Take from each pixel's light what a splat absorbs: `_blend` without asking whose it is."""
-    full, across, least = spread(ONE), spread(s.across), spread(log2_least)
+    full = spread(ONE)
     for y in range(max(s.y0 - top, 0), min(s.y1 + 1 - top, TILE)):
-        dy = top + y + 0.5 - s.v
-        distance = (ramp() - spread(np.float32(s.u - s.shear * dy - left - 0.5))) * across
-        log_alpha = spread(np.float32(s.peak - s.down * dy * dy)) - distance * distance
-        covers = log_alpha >= least
-        alpha = lesser(exp2(either(covers, log_alpha, least)), spread(np.float32(ALPHA_MAX)))
-        before = load(light, y * TILE)
-        store(light, y * TILE, either(covers, before * (full - alpha), before))
+        store(light, y * TILE, load(light, y * TILE) * (full - _alpha_of_row(s, left, top + y, log2_least)))
 
 
 @njit(cache=True, nogil=True)
-def _shows_one_mask(ids, runs, x0, x1, y0, y1):  # noqa: ANN001, ANN202
+def _shows_one_mask(ids, runs, box):  # noqa: ANN001, ANN202
     """Whether all pixels of a box have one id."""
+    x0, x1, y0, y1 = box
     one = True
     for y in range(y0, y1):
         one &= runs[y, x0] >= x1 - x0 and ids[y, x0] == ids[y0, x0]
@@ -562,9 +564,10 @@ def _shows_one_mask(ids, runs, x0, x1, y0, y1):  # noqa: ANN001, ANN202
 
 
 @njit(cache=True, nogil=True)
-def _add_by_mask(ids, shown, x0, x1, y0, y1, sum_of, touched):  # noqa: ANN001, ANN202
+def _add_by_mask(ids, shown, box, sum_of, touched):  # noqa: ANN001, ANN202
     """Add the weights of a box up by id; returns how many ids were touched, which ones is in ``touched``."""
     touches = 0
+    x0, x1, y0, y1 = box
     for y in range(y0, y1):
         for x in range(x0, x1):
             weight = shown[y * TILE + x]

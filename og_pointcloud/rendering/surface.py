@@ -77,11 +77,8 @@ def reconstruct_surface(scene: Scene, settings: FitSettings, journal: Journal) -
     with journal.stage("geometry"):
         gaussians = _gaussians(scene, around, near, settings, journal)
         by_sight = not scene.points.are_gaussians and settings.mode != "paper"
-        typical = float(np.median(around.spacing))
-        if by_sight:
-            thickness = sight_thickness(around.spacing, typical, settings.geometry)
-        else:
-            thickness = surface_thickness(gaussians, around.spacing, typical, settings.geometry)
+        spacing, typical = around.spacing, float(np.median(around.spacing))
+        thickness = surface_thickness(gaussians, spacing, typical, settings.geometry, by_sight=by_sight)
         stride = 1 if by_sight else pixel_stride(scene.points, around.spacing, scene.views, settings.geometry, journal)
     return Surface(scene, row_of_point, around, gaussians, near, thickness, stride, by_sight)
 
@@ -130,9 +127,15 @@ def sight_thickness(
 
 
 def surface_thickness(
-    gaussians: Gaussians, spacing: NDArray[np.float32], typical_spacing: float, settings: GeometrySettings
-) -> NDArray[np.float32]:
-    """(n,) how far behind the front of its surface a Gaussian may lie: noise and overlap are a few spacings thick."""
+    gaussians: Gaussians, spacing: NDArray[np.float32], typical_spacing: float, settings: GeometrySettings, *,
+    by_sight: bool,
+) -> NDArray[np.float32]:  # fmt: skip
+    """(n,) how far behind the front of its surface a Gaussian may lie: noise and overlap are a few spacings thick.
+
+    by_sight: of points that are asked along their own rays (`sight_thickness`).
+    """
+    if by_sight:
+        return sight_thickness(spacing, typical_spacing, settings)
     thickness = settings.thickness * np.maximum(spacing, typical_spacing) + 3 * gaussians.scale.max(axis=1)
     return thickness.astype(np.float32)
 

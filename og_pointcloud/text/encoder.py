@@ -97,15 +97,10 @@ class TextEncoder:
             )
         self._remembered: dict[str, NDArray[np.float32]] = {}
 
-    def __call__(self, names: Sequence[str], templates: Sequence[str] | None = None) -> NDArray[np.float32]:
-        """(len(names), D) float32, unit rows: each name put into every template, the mean of their vectors.
-
-        templates: texts with ``{}`` where the name goes; None: those of the manifest, ("{}",) unless it was made
-        with others.
-        """
-        templates = self.templates if templates is None else check_templates(templates)
-        texts = [template.replace("{}", name[:MOST_CHARACTERS]) for name in names for template in templates]
-        vectors = self.encode(texts).reshape(len(names), len(templates), self.width).mean(axis=1)
+    def __call__(self, names: Sequence[str]) -> NDArray[np.float32]:
+        """(len(names), D) float32, unit rows: of each name the mean over the manifest's templates."""
+        texts = [template.replace("{}", name[:MOST_CHARACTERS]) for name in names for template in self.templates]
+        vectors = self.encode(texts).reshape(len(names), len(self.templates), self.width).mean(axis=1)
         length = np.linalg.norm(vectors, axis=1, keepdims=True)
         return vectors / np.maximum(length, np.finfo(np.float32).tiny)
 

@@ -1,6 +1,7 @@
-"""Text-feature files: names with their vectors, as an encoder gave them.
+"""Files of words: lists, one a line; and text features, names with their vectors, as an encoder gave them.
 
-An .npz with ``names`` (L,) strings, ``vectors`` (L, D) floats, and ``feature_space``, the name of the encoder.
+Text features are an .npz with ``names`` (L,) strings, ``vectors`` (L, D) floats, and ``feature_space``, the name of the
+encoder.
 """
 
 from __future__ import annotations
@@ -17,9 +18,12 @@ from og_pointcloud.cloud import UNKNOWN_SPACE, Vocabulary
 from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError
 from og_pointcloud.formats.npy import arrays_from_npz
 
-__all__ = ["MAX_UNPACKED_BYTES", "check_names", "checked_vocabulary", "read_text_features"]
+__all__ = [
+    "MAX_UNPACKED_BYTES", "check_names", "checked_vocabulary", "everyday_words", "read_text_features", "read_words",
+]  # fmt: skip
 
 MAX_UNPACKED_BYTES = 1 << 30
+MAX_WORDS_BYTES = 1 << 24
 LONGEST_NAME = 1000
 
 
@@ -95,3 +99,26 @@ def checked_vocabulary(names: Sequence[str], vectors: NDArray[Any]) -> Vocabular
             raise FeatureSpaceError(f"the vector of '{name}' is zero, which is like nothing: encode it again")
         seen.add(name)
     return Vocabulary(tuple(names), vectors)
+
+
+def read_words(path: str | os.PathLike[str]) -> tuple[str, ...]:
+    """The words of a text file, one a line, UTF-8; empty lines and repeated words are left out.
+
+    OgPointcloudError where it cannot be read, or has no words.
+    """
+    path = Path(path)
+    try:
+        if path.stat().st_size > MAX_WORDS_BYTES:
+            raise ValueError(f"it has {path.stat().st_size} bytes, more than {MAX_WORDS_BYTES}")
+        lines = path.read_bytes().decode("utf-8-sig").splitlines()
+    except (OSError, ValueError) as error:
+        raise OgPointcloudError(f"{path} cannot be read as words, one a line, in UTF-8 ({error})") from None
+    words = tuple(dict.fromkeys(filter(None, (line.strip() for line in lines))))
+    if not words:
+        raise OgPointcloudError(f"{path} has no words; expected one a line")
+    return words
+
+
+def everyday_words() -> tuple[str, ...]:
+    """The library's own words of everyday things, which an encoder makes a word bank of."""
+    return read_words(Path(__file__).with_name("everyday_words.txt"))

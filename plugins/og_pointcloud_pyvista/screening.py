@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import fields, replace
-from typing import Any
 
 import numpy as np
 import pyvista as pv
@@ -11,6 +10,7 @@ from numpy.typing import NDArray
 
 from og_pointcloud.ask.labelled_scene import LabelledScene
 from og_pointcloud.ask.segmentation import Segmentation
+from og_pointcloud.show.page import Look
 from og_pointcloud.show.viewpoint import FOCAL, Viewpoint
 from og_pointcloud_pyvista.datasets import to_pyvista
 from og_pointcloud_pyvista.files import RGB
@@ -30,16 +30,13 @@ def draw(
     rgb: NDArray[np.uint8] | None,
     shown: NDArray[np.bool_],
     view: Viewpoint,
-    *,
-    by: str = "label",
-    boxes: bool = False,
+    look: Look,
     window: bool = False,
 ) -> pv.Plotter:
     """A plotter, ready to be shown, or, off-screen, to be photographed.
 
-    rgb: (N, 3) colours of the points, which shade those of the labels. shown: (N,) which points to draw. by: "label",
-    "instance", or "certainty", of a result that knows it. window: with clicks that are answered; else off-screen, which
-    needs `can_render`.
+    rgb: (N, 3) colours of the points, which shade those of the labels. shown: (N,) which points to draw. look: its mode
+    is "labels" or "instances". window: with clicks that are answered; else off-screen, which needs `can_render`.
     """
     of_points = [field.name for field in fields(result) if isinstance(getattr(result, field.name), np.ndarray)]
     mesh = to_pyvista(replace(result, **{name: getattr(result, name)[shown] for name in of_points}))
@@ -48,11 +45,8 @@ def draw(
     plotter = pv.Plotter(off_screen=not window, window_size=list(PICTURE_SIZE), theme=pv.themes.DocumentTheme())
     distance = float(np.linalg.norm(view.eye - view.target))
     point_size = float(np.clip(CLOSED * scene.cloud.spacing * FOCAL * PICTURE_SIZE[1] / 2 / distance, 2, 12))
-    if by == "certainty" and result.certainty is not None:
-        add_certainty(plotter, mesh, result.certainty[shown], point_size)
-    else:
-        plotter.og.add_segmentation(mesh, by=by, point_size=point_size)
-    if boxes:
+    plotter.og.add_segmentation(mesh, by=look.mode.removesuffix("s"), point_size=point_size)
+    if look.boxes:
         plotter.og.add_boxes(mesh, up=view.up)
     plotter.og.look(view)
     plotter.camera.SetWindowCenter(ASIDE, 0)
@@ -60,12 +54,3 @@ def draw(
     if window:
         plotter.og.enable_click_query(scene)
     return plotter
-
-
-def add_certainty(plotter: pv.Plotter, mesh: Any, certainty: NDArray[np.float32], point_size: float) -> None:
-    """The points from dark, where nothing is sure, to bright, with the scale beside them."""
-    bar: Any = {"title": "certainty", "vertical": True, "position_x": 0.86, "position_y": 0.25, "height": 0.5}
-    plotter.add_mesh(
-        mesh.copy(deep=False), scalars=certainty, cmap="viridis", clim=(0, 1), style="points", point_size=point_size,
-        lighting=False, scalar_bar_args=bar, name="og_certainty",
-    )  # fmt: skip

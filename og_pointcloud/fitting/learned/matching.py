@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from og_pointcloud.cloud import InstanceTable
 from og_pointcloud.fitting.association import directions
 from og_pointcloud.fitting.mask_table import MaskTable, weights_by_instance
-from og_pointcloud.rendering.splatting import FRUSTUM_MARGIN, Gaussians, view_weights
+from og_pointcloud.rendering.splatting import FRUSTUM_MARGIN, Gaussians, render
 from og_pointcloud.scene import Camera, View
 from og_pointcloud.settings import MatchingSettings
 
@@ -188,6 +188,4 @@ def _in_image(gaussians: Gaussians, camera: Camera, near: float) -> bool:
 
 def _alpha(gaussians: Gaussians, camera: Camera, near: float) -> NDArray[np.float64]:
     """(H W,) float64: how much the Gaussians cover each pixel."""
-    pixels = camera.width * camera.height
-    ids = np.arange(pixels, dtype=np.int32).reshape(camera.height, camera.width)
-    return np.asarray(view_weights(gaussians, camera, ids, pixels, near).rows[:-1].sum(axis=1), np.float64)
+    return render(gaussians, np.zeros((len(gaussians), 0), np.float32), camera, near)[1].ravel().astype(np.float64)
