@@ -559,8 +559,9 @@ def _report(
     vectors: NDArray[np.float32], kinds: NDArray[np.int64], hidden: NDArray[np.bool_],
     encode: TrainedTextEncoder, title: str, absent: tuple[Sequence[str], Sequence[str]],
 ) -> None:  # fmt: skip
-    def right(names: Sequence[str], templates: Sequence[str] = ("{}",)) -> NDArray[np.bool_]:
-        return (vectors @ encode(names, templates).T).argmax(axis=1) == kinds
+    def right(names: Sequence[str], template: str = "{}") -> NDArray[np.bool_]:
+        texts = [template.replace("{}", name) for name in names]
+        return (vectors @ encode(texts).T).argmax(axis=1) == kinds
 
     own = right(CLASS_NAMES)
     longest = max(map(len, SYNONYMS.values()))
@@ -570,7 +571,7 @@ def _report(
     print(f"  class words {own.mean():.3f}; in full view {own[~hidden].mean():.3f}, hidden {own[hidden].mean():.3f}")
     print(f"  synonyms {np.mean(others):.3f} ({np.min(np.mean(others, axis=1)):.3f} at worst)")
     for template in NEW_TEMPLATES:
-        print(f"  '{template}' {right(CLASS_NAMES, (template,)).mean():.3f}")
+        print(f"  '{template}' {right(CLASS_NAMES, template).mean():.3f}")
     for kind, names in zip(("trained as absent", "never seen"), absent, strict=True):
         beats = vectors @ encode(names).T > best
         print(f"  absent words, {kind}: one beats the best class word on {beats.mean():.4f} of masks, any of "
