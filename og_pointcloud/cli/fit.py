@@ -85,11 +85,10 @@ def add(parser: Parser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    alone = [name for name in ("work",) if getattr(arguments, name) is not None]
     if arguments.out is None and len(arguments.capture) > 1:
         raise OgPointcloudError(f"{len(arguments.capture)} captures and one output; expected --out DIR for so many")
-    if arguments.out is not None and alone:
-        raise OgPointcloudError(f"--{alone[0]} is for a single file; expected -o S.ogpc with it, or leave it out")
+    if arguments.out is not None and arguments.work is not None:
+        raise OgPointcloudError("--work is for a single file; expected -o S.ogpc with it, or leave it out")
     settings = fit_settings(arguments)
     from og_pointcloud.collection.fit_many import FitOptions
     from og_pointcloud.collection.workers import dask_executor
