@@ -112,10 +112,15 @@ def test_another_exposure_and_noise_raise_no_doubt():
     assert doubts(with_views(tiled_room(3), image=changed)) == {}
 
 
-def test_grey_points_before_coloured_photographs_are_no_doubt():
-    scene = faulty("frames=3")
-    grey = np.random.default_rng(0).integers(0, 255, (len(scene.points), 1), np.uint8).repeat(3, axis=1)
-    assert verdicts(check_capture(replace(scene, points=replace(scene.points, rgb=grey))))["poses"] != "doubt"
+@pytest.mark.parametrize("is_grey", [True, False])
+def test_intensities_and_colors_of_classes_are_not_held_against_photographs(is_grey):
+    scene, random = tiled_room(1), np.random.default_rng(0)
+    grey = random.integers(0, 255, (len(scene.points), 1), np.uint8).repeat(3, axis=1)
+    palette = random.integers(0, 255, (12, 3), np.uint8)
+    rgb = grey if is_grey else palette[random.integers(0, 12, len(scene.points))]
+    painted = replace(scene, points=replace(scene.points, rgb=rgb))
+    assert verdicts(check_capture(painted))["poses"] == "ok"  # by masks
+    assert verdicts(check_poses(painted))["poses"] == "unchecked"
 
 
 # Faults of poses, units and intrinsics: told by name, and mended by that name.

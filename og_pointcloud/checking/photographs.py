@@ -29,6 +29,8 @@ ALIKE = 0.95
 FEWEST_COMPARED = 3
 GREY = 3.0
 """Mean difference between the channels, of 255, up to which colours are no colours: a LiDAR's intensity, say."""
+FEW_COLORS = 64
+"""A cloud coloured by classes has no more."""
 
 
 @dataclass(frozen=True)
@@ -81,10 +83,13 @@ class Photographs:
         )  # fmt: skip
 
     @property
-    def points_are_grey(self) -> bool:
-        """Whether the points' colours are shades of grey, and the photographs are not."""
+    def points_are_painted(self) -> bool:
+        """Whether the points' colours may say something else than photographs do: shades of grey where those are not
+        grey, or a few colours, as of classes."""
         rgb = self.sample.rgb
-        return rgb is not None and _tint(rgb) < GREY <= float(np.median([_tint(grid) for grid in self.grids]))
+        if rgb is None or len(np.unique(rgb, axis=0)) <= FEW_COLORS:
+            return True
+        return _tint(rgb) < GREY <= float(np.median([_tint(grid) for grid in self.grids]))
 
     def _drawing(self, camera: Camera) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
         assert self.sample.rgb is not None
