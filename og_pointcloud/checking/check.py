@@ -33,15 +33,16 @@ Verdict = Literal["ok", "doubt", "unchecked"]
 
 LEAST_SHARE, LEAST_GAP = 0.7, 0.25
 """Drawings fit their own photographs in so many comparisons at least, and stand out so far."""
-LEAST_MASK_SHARE, LEAST_MASK_GAP = 0.75, 0.08
+LEAST_MASK_SHARE, LEAST_MASK_GAP = 0.75, 0.12
 """Masks of views agree where they see the same, better than other masks would; doubted where both are missed."""
 LEAST_FEATURE_SHARE, FEWEST_FEATURES = 0.68, 60
 """Features of masks that show the same are the more alike ones in so many of so many comparisons at least."""
 LESS_ERROR, LEAST_SHIFT = 0.8, 0.01
 """A small change that leaves less than this share of the error, and moves points by more than this share of the image's
 width, is a fault of the capture; real calibrations leave more and move less."""
-AS_GOOD = 0.1
-"""A change of fewer numbers is preferred that leaves this share of what more numbers gain."""
+AS_GOOD, HALF = 0.1, 0.5
+"""A change of fewer numbers is preferred that leaves this share of what more numbers gain; one of everything, for which
+there is no repair, only where no other gains half as much."""
 FEWEST = 10
 """Points, comparisons, rows or instances below this number say nothing."""
 MOST_BLIND = 0.7
@@ -218,8 +219,11 @@ def _alignment(photographs: Photographs | None, sample: Sample) -> Check:
     registration = Registration(photographs, stated, MORE_POINTS)
     start = registration.start.error
     found = {name: registration.found(free) for name, free in FREE.items()}
+    everything = found.pop("everything")
     least = min(change.error for change in found.values())
     name, change = next(item for item in found.items() if item[1].error <= least + AS_GOOD * (start - least))
+    if start - least < HALF * (start - everything.error):
+        name, change = "everything", everything
     repairs = registration.repairs(name, change, np.stack([camera.center for camera in sample.listed]))
     less = 1 - change.error / start
     says = (
@@ -238,9 +242,10 @@ def _masks(maps: MaskMaps, *, is_doubted: bool) -> Check:
     found = maps.agreement(maps.sample.cameras)
     if found.compared < FEWEST:
         return Check("masks", "unchecked", "too few points are seen by two views with masks")
-    if (verdict := _verdict(found)) != "doubt":
+    verdict = _verdict(found)
+    repairs = () if verdict == "ok" else best_mask_conversion(maps)
+    if verdict != "doubt" and not repairs:
         return Check("masks", verdict, f"views agree on them: {_masks_in_words(found)}")
-    repairs = best_mask_conversion(maps)
     says = (
         f"where views see the same points, masks agree no better than others' ({_masks_in_words(found)}): they are "
         "mirrored, turned, or of other images"

@@ -102,7 +102,7 @@ class Registration:
             "shifted": "shifted=" + ",".join(f"{share:.4g}" for share in small.numbers[CENTER]),
             "aligned": self._alignment(small.numbers, centers),
         }
-        return tuple(Repair.parse(text) for part, text in texts.items() if name in (part, "everything"))
+        return tuple(Repair.parse(text) for part, text in texts.items() if name == part)
 
     def _alignment(self, numbers: Doubles, centers: Doubles) -> str:
         """The cloud is turned by R, sized and moved about its middle; so cameras go the other way about their mean."""
