@@ -1,0 +1,167 @@
+"""Maps that grow and places that change: error beside time, in the same row.
+
+    python examples/benchmark_maps.py frames CAPTURE          # each tenth: ms a frame, mIoU beside a fit of the same
+    python examples/benchmark_maps.py frames CAPTURE --shuffle --pose-noise 0.01 0.2 --depth-share 0.05
+    python examples/benchmark_maps.py loops CAPTURE               # memory over two loops of the same path
+    python examples/benchmark_maps.py pairs FOLDER...             # a/ and b/ with changes.json, two visits each
+
+A capture has gt.npz for its scores; its depth images, if it has any, make the map, else its own cloud is given. Times
+are of `integrate` alone, without the models'; CPU milliseconds stand beside them, as other programs slow the wall clock
+down. A pair is scored by SuperMap's definitions: IoU above 0.1, centroid within 0.3 m.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from map_scores import PairScore, score_pair
+from scipy.spatial import cKDTree
+
+import og_pointcloud as og
+from og_pointcloud.evaluate.truth import read_truth
+from og_pointcloud.formats.capture import depth_files, read_capture, read_poses
+from og_pointcloud.formats.poses import in_local_frame
+from og_pointcloud.mapping.captures import depth_views
+from og_pointcloud.scene import Camera, Scene
+
+TENTHS = 10
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run one of the three."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=("frames", "loops", "pairs"))
+    parser.add_argument("folders", type=Path, nargs="+", metavar="FOLDER")
+    parser.add_argument("--shuffle", action="store_true", help="frames in random order")
+    parser.add_argument("--pose-noise", type=float, nargs=2, default=(0, 0), metavar=("M", "DEG"))
+    parser.add_argument("--depth-share", type=float, default=1.0, metavar="X", help="of the readings that are kept")
+    parser.add_argument("--no-fit", action="store_true", help="without the fits of the same frames")
+    options = parser.parse_args(arguments)
+    if options.what == "pairs":
+        pairs(options.folders)
+        return
+    for folder in options.folders:
+        if options.what == "frames":
+            growing(folder, options)
+        else:
+            loops(folder)
+
+
+def frames_of(folder: Path, options: argparse.Namespace | None = None) -> tuple[Scene, list[og.Frame]]:
+    """A capture and its views as frames, disturbed as asked."""
+    capture, random = read_capture(folder), np.random.default_rng(0)
+    depths = depth_files(folder, read_poses(folder))
+    frames = []
+    for number, view in enumerate(capture.views):
+        camera = in_local_frame(view.camera, -capture.points.origin)
+        depth = depths[view.name].read().depth if view.name in depths else None
+        if options is not None:
+            camera = _moved(camera, random, *options.pose_noise)
+            if depth is not None and options.depth_share < 1:
+                depth = np.where(random.random(depth.shape) < options.depth_share, depth, 0)
+        masks, rgb = view.mask_map(), view.image_rgb()
+        frames.append(og.Frame(camera, masks, view.mask_features, depth, rgb=rgb, stamp=float(number)))
+    if options is not None and options.shuffle:
+        frames = [frames[k] for k in random.permutation(len(frames))]
+    return capture, frames
+
+
+def _moved(camera: Camera, random: np.random.Generator, metres: float, degrees: float) -> Camera:
+    axis = random.normal(size=3) * np.deg2rad(degrees) / np.sqrt(3)
+    x, y, z = axis
+    turn = np.eye(3) + np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    left, _, right = np.linalg.svd(turn)
+    pose = camera.world_to_camera.copy()
+    pose[:3] = (left @ right) @ pose[:3]
+    pose[:3, 3] += random.normal(size=3) * metres / np.sqrt(3)
+    return replace(camera, world_to_camera=pose)
+
+
+def mapper_of(capture: Scene, frames: list[og.Frame]) -> og.Mapper:
+    """A mapper of the capture's own cloud, or an empty one where frames have depth."""
+    if all(frame.depth is not None for frame in frames):
+        return og.Mapper(feature_space=capture.feature_space)
+    return og.Mapper(cloud=capture.points, feature_space=capture.feature_space)
+
+
+def miou(cloud: og.LabelledCloud, folder: Path, xyz: np.ndarray) -> float:
+    """Of the capture's own points, each labelled as the cloud's nearest one."""
+    result = og.segment(cloud, text_features=folder / "text_features.npz")
+    labels = result.labels
+    if len(cloud) != len(xyz):
+        labels = labels[cKDTree(cloud.xyz_world).query(xyz, workers=-1)[1]]
+    return read_truth(folder).score(labels, result.names).miou
+
+
+def growing(folder: Path, options: argparse.Namespace) -> None:
+    """A table of each tenth of the frames."""
+    capture, frames = frames_of(folder, options)
+    mapper, xyz = mapper_of(capture, frames), capture.points.xyz_world
+    print(f"\n{folder.name}: {len(frames)} frames, {len(capture.points):,} points in the capture")
+    print("frames    points  objects  median ms  p95 ms  CPU ms  kept MB  mIoU map  mIoU fit   map s   fit s")
+    done = 0
+    for tenth in range(1, TENTHS + 1):
+        until, wall, start = round(len(frames) * tenth / TENTHS), [], time.process_time()
+        wall = [mapper.integrate(frame).seconds for frame in frames[done:until]]
+        spent, done = (time.process_time() - start) / max(len(wall), 1), until
+        if not wall:
+            continue
+        begun = time.perf_counter()
+        own = miou(mapper.snapshot().cloud, folder, xyz)
+        labelled = time.perf_counter() - begun
+        batch, seconds = float("nan"), float("nan")
+        if not options.no_fit:
+            begun = time.perf_counter()
+            names = {f"{frame.stamp:g}" for frame in frames[:until]}
+            views = tuple(view for number, view in enumerate(capture.views) if f"{float(number):g}" in names)
+            fitted = og.fit(replace(capture, views=views), progress=False)
+            batch, seconds = miou(fitted, folder, xyz), time.perf_counter() - begun
+        print(
+            f"{done:6}  {mapper.points:8,}  {len(mapper.objects()):7}  {1e3 * np.median(wall):9.1f}  "
+            f"{1e3 * np.percentile(wall, 95):6.1f}  {1e3 * spent:6.1f}  {mapper.nbytes / 1e6:7.1f}  {own:8.4f}  "
+            f"{batch:8.4f}  {labelled:6.1f}  {seconds:6.1f}",
+            flush=True,
+        )
+
+
+def loops(folder: Path) -> None:
+    """Memory after each of two loops of the same path."""
+    capture, frames = frames_of(folder)
+    mapper = mapper_of(capture, frames)
+    for loop in range(2):
+        for frame in frames:
+            mapper.integrate(replace(frame, stamp=frame.stamp + loop * len(frames)))  # pyright: ignore
+        print(f"{folder.name} loop {loop + 1}: {mapper.points:,} points, {mapper.nbytes / 1e6:.1f} MB kept of frames")
+
+
+def pairs(folders: list[Path]) -> None:
+    """Each pair's changes and errors, and the figures over all."""
+    total = PairScore()
+    print("pair      changes found  moved followed  reported right      s")
+    for folder in folders:
+        first = read_capture(folder / "a")
+        before = og.fit(first, progress=False)
+        second = read_capture(folder / "b")
+        start = time.perf_counter()
+        updated = og.update(before, second, depth=depth_views(folder / "b", before.origin), progress=False)
+        seconds = time.perf_counter() - start
+        visit = og.fit(second, progress=False)
+        score = score_pair(folder, updated.changes.to_dict(), before, visit, updated.cloud)
+        total += score
+        print(
+            f"{folder.name:10} {score.changes:6} {score.found:5} {score.moved:6} {score.followed:8} "
+            f"{score.reported:9} {score.right:5} {seconds:6.1f}",
+            flush=True,
+        )
+        for error in score.errors:
+            print(f"    {error}")
+    print("  ".join(f"{name} {value:.3f}" for name, value in total.figures.items()), f"({total.changes} changes)")
+
+
+if __name__ == "__main__":
+    main()
