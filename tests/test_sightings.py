@@ -119,3 +119,13 @@ def test_nothing_in_the_image_is_no_error() -> None:
     other = replace(CAMERA, width=17, height=1)  # a tile and a bit, one row
     one = sightings(gaussians(np.array([[0.0, -0.65, 2]]), 0.1), other, ids[:1, :17], 1, NEAR, np.ones(1, np.float32))
     assert one.rows.shape == (2, 1)
+
+
+def test_a_point_on_the_border_of_the_image_is_in_its_last_pixel():
+    """A place of 7.9999999 pixels is 8 in float32."""
+    from og_pointcloud.rendering.sightings import sightings_of
+
+    border = np.array([8.0], np.float32)
+    found = sightings_of(np.ones(1, np.float32), border, border, np.zeros((8, 8), np.int32), 1)
+    assert found.openness.nnz == 1
+    assert found.rows[[0]].sum() == pytest.approx(1)

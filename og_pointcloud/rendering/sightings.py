@@ -69,7 +69,10 @@ def sightings_of(
     """The masks that each point lies in, by what `openness` answers, or by a depth image that says which points it
     measured: 1 for these, 0 for the others."""
     seen = np.flatnonzero(open_).astype(np.int32)
-    seen = seen[ids[v[seen].astype(np.intp), u[seen].astype(np.intp)] != NOT_SEEN]
+    height, width = ids.shape
+    # Rounded to float32, a place just inside the image may lie on its border.
+    row, column = np.minimum(v[seen].astype(np.intp), height - 1), np.minimum(u[seen].astype(np.intp), width - 1)
+    seen = seen[ids[row, column] != NOT_SEEN]
     rows, columns, votes = _votes(seen, open_, u, v, np.where(ids < 0, mask_count, ids), SAMPLES)
     order = np.argsort(rows, kind="stable")
     starts = np.searchsorted(rows[order], np.arange(mask_count + 2)).astype(np.int32)
