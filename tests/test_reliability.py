@@ -10,13 +10,14 @@ import numpy as np
 import pytest
 from labelled_clouds import make_cloud
 from scenes import write_tiny_capture
+from scipy.sparse import csr_array
 
 import og_pointcloud as og
 from og_pointcloud.cli import main
 from og_pointcloud.fitting.fit import fit_prepared, prepare
 from og_pointcloud.fitting.labellers import grouping
 from og_pointcloud.fitting.mask_table import MaskTable
-from og_pointcloud.fitting.reliability import SAME_LOOK, likely_cause, split_half
+from og_pointcloud.fitting.reliability import SAME_LOOK, _cut, likely_cause, split_half
 from og_pointcloud.journal import Journal
 from og_pointcloud.scene import Scene
 from og_pointcloud.settings import FitSettings
@@ -174,7 +175,8 @@ def test_three_views_judge_nothing(scene: Scene) -> None:
 
 def test_masks_without_features_leave_it_unknown(scene: Scene) -> None:
     blank = with_views(scene, lambda _, view: replace(view, mask_features=np.zeros_like(view.mask_features)))
-    assert og.fit(blank, SETTINGS, progress=False).reliability is None
+    with pytest.warns(UserWarning, match="are zero"):
+        assert og.fit(blank, SETTINGS, progress=False).reliability is None
 
 
 def test_it_is_not_judged_twice_for_points_at_one_place(scene: Scene) -> None:
@@ -230,3 +232,12 @@ def test_the_command_prints_it(tmp_path, capsys) -> None:
     written = json.loads((tmp_path / "fit.json").read_text())["reliability"]
     assert written == og.load(tmp_path / "s.ogpc").cloud.reliability
     assert f"reliability {written:.2f}: how far half of the views bear the labels out" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("columns", [np.arange(50), np.array([3, 4, 40])])
+@pytest.mark.parametrize("rows", [np.arange(0, 40, 3), np.array([7]), np.zeros(0, np.int64)])
+def test_parts_of_a_table_are_its_parts(rows, columns) -> None:
+    dense = np.random.default_rng(0).integers(0, 3, (40, 50)).astype(np.float32)
+    part = _cut(csr_array(dense), rows, columns)
+    np.testing.assert_array_equal(part.toarray(), dense[np.ix_(rows, columns)])
+    assert (part.dtype, part.indices.dtype) == (np.float32, np.int32)

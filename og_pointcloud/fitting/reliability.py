@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
+from scipy.sparse import csr_array, vstack
 
 from og_pointcloud.cloud import InstanceTable, unit_rows
 from og_pointcloud.errors import SceneError
@@ -38,6 +38,8 @@ SAME_LOOK = 0.5
 about 0; 0.3 and 0.7 rank scenes of the zoo as well."""
 ROWS_AT_ONCE = 1 << 24
 """Cosines held at once."""
+ROWS = 16
+"""Rows of a mask table looked at at once."""
 JUDGED_VIEWS, JUDGED_POINTS = 12, 4_000
 """Views whose poses are checked, and points of each: shares over thousands of points need no more."""
 STEP, STEPS = 0.01, 5
@@ -156,12 +158,21 @@ def _named(table: MaskTable, labelling: Labelling, looks: _Looks) -> NDArray[np.
 def _of_views(table: MaskTable, views: NDArray[np.int64], points: NDArray[np.int64]) -> MaskTable:
     """The table of some of its views, ascending, and points."""
     masks = np.flatnonzero(np.isin(table.mask_view, views))
-    rows = (table.weights[masks], table.outside[views], table.exposure[views])
-    weights, outside, exposure = (csr_array(csr_array(part)[:, points]) for part in rows)
+    parts = ((table.weights, masks), (table.outside, views), (table.exposure, views))
+    weights, outside, exposure = (_cut(matrix, rows, points) for matrix, rows in parts)
     return MaskTable(
         weights, outside, exposure, np.searchsorted(views, table.mask_view[masks]).astype(np.int32),
         table.mask_pixels[masks], table.mask_features[masks],
     )  # fmt: skip
+
+
+def _cut(matrix: csr_array, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> csr_array:
+    """Some rows and columns of a matrix, a few rows at a time: the whole may be larger than memory."""
+    if not len(rows):
+        return csr_array((0, len(columns)), dtype=matrix.dtype)
+    chosen = slice(None) if len(columns) == matrix.shape[1] else columns
+    cuts = [csr_array(matrix[rows[low : low + ROWS]])[:, chosen] for low in range(0, len(rows), ROWS)]
+    return csr_array(vstack(cuts, format="csr"))
 
 
 def _of_points(surface: Surface, rows: NDArray[np.int64], settings: FitSettings) -> Surface:
