@@ -19,6 +19,7 @@ from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from hard_cases.inputs import labelled_cloud, scatter, write_two_balls
@@ -32,8 +33,10 @@ from og_pointcloud.formats import colmap
 from og_pointcloud.formats.las import write_las
 from og_pointcloud.formats.nerfstudio import read_transforms
 from og_pointcloud.formats.npy import array_from_npy, npy_bytes
+from og_pointcloud.formats.photogrammetry import read_photogrammetry
 from og_pointcloud.formats.ply import join_columns, write_ply
 from og_pointcloud.formats.points import read_points
+from og_pointcloud.formats.rgbd import read_rgbd
 from og_pointcloud.scene import Camera
 from og_pointcloud.text.text_features import read_text_features
 
@@ -112,6 +115,69 @@ def _transforms(folder: Path) -> list[bytes]:
     return [json.dumps(made).encode() for made in (content, {**content, **lens})]
 
 
+def _metashape(folder: Path) -> list[bytes]:
+    calibration = '<calibration class="adjusted"><f>70</f><cx>1</cx><k1>0.1</k1><p1>0.01</p1></calibration>'
+    pose = " ".join(map(str, np.eye(4).ravel().tolist()))
+    placed = "<rotation>1 0 0 0 1 0 0 0 1</rotation><translation>1 2 3</translation><scale>2.5</scale>"
+    parts = [
+        '<document version="2.0.0"><chunk label="Chunk 1" enabled="true"><sensors><sensor id="0" type="frame">',
+        f'<resolution width="64" height="48"/>{calibration}</sensor></sensors><cameras>',
+        f'<camera id="0" sensor_id="0" label="a"><transform>{pose}</transform></camera></cameras>',
+        f"<transform>{placed}</transform></chunk></document>",
+    ]
+    return ["".join(parts).encode(), "".join(parts).replace('"frame"', '"fisheye"').encode()]
+
+
+def _realityscan(folder: Path) -> list[bytes]:
+    header = b"#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2\n"
+    return [header + b"a.jpg,1,2,3,10,20,30,35,0.1,0.2,0.1,0,0,0,0.01,0\n"]
+
+
+def _polycam(folder: Path) -> list[bytes]:
+    keys = {"fx": 70.0, "fy": 70.0, "cx": 32.0, "cy": 24.0, "width": 64, "height": 48}
+    keys |= {f"t_{row}{column}": float(row == column) for row in range(3) for column in range(4)}
+    return [json.dumps(keys).encode()]
+
+
+def _scanner_app(folder: Path) -> list[bytes]:
+    content = {"cameraPoseARFrame": np.eye(4).ravel().tolist(), "intrinsics": [70, 0, 32, 0, 70, 24, 0, 0, 1]}
+    return [json.dumps(content).encode()]
+
+
+def _traj(folder: Path) -> list[bytes]:
+    return [b"10.001 0.1 0.2 0.3 1 2 3\n10.1 0 0 0 0 0 0\n"]
+
+
+def _e57(folder: Path) -> list[bytes]:
+    pye57 = pytest.importorskip("pye57")
+    with pye57.E57(str(folder / "made.e57"), mode="w") as file:
+        data = dict(zip(("cartesianX", "cartesianY", "cartesianZ"), _xyz().T.copy(), strict=True))
+        file.write_scan_raw(data, rotation=np.array([1.0, 0, 0, 0]), translation=np.array([1.0, 2, 3]))
+    return [(folder / "made.e57").read_bytes()]
+
+
+def _read_photogrammetry(path: Path) -> list[np.ndarray]:
+    return [image.camera.world_to_camera for image in read_photogrammetry(path, lambda _: (64, 48)).images]
+
+
+def _read_in_layout(place: str, images: dict[str, bytes]) -> Callable[[Path], list[np.ndarray]]:
+    """Reads a phone's folder of these images and one file of any content."""
+
+    def read(path: Path) -> list[np.ndarray]:
+        folder = path.parent / "phone"
+        for name, content in {**images, place: path.read_bytes()}.items():
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            (folder / name).write_bytes(content)
+        frames = read_rgbd(folder)
+        assert frames is not None
+        return [image.camera.world_to_camera for image in frames.images]
+
+    return read
+
+
+PICTURE = cv2.imencode(".png", np.zeros((48, 64), np.uint8))[1].tobytes()
+
+
 def _read_npy(path: Path) -> list[np.ndarray]:
     try:
         array_from_npy(path.read_bytes())  # may hold anything
@@ -144,6 +210,18 @@ READERS: dict[str, tuple[Callable, Callable]] = {
     "images.bin": (_images_bin, _read_images_bin),
     "points3D.bin": (_points_bin, lambda path: [colmap.read_points3d(path.parent)[0]]),
     "transforms.json": (_transforms, _read_transforms),
+    "metashape.xml": (_metashape, _read_photogrammetry),
+    "realityscan.csv": (_realityscan, _read_photogrammetry),
+    "polycam.json": (_polycam, _read_in_layout("keyframes/cameras/1.json", {"keyframes/images/1.png": PICTURE})),
+    "scanner_app.json": (_scanner_app, _read_in_layout("frame_00001.json", {"frame_00001.jpg": PICTURE})),
+    "lowres_wide.traj": (
+        _traj,
+        _read_in_layout(
+            "lowres_wide.traj",
+            {"lowres_wide/1_10.001.png": PICTURE, "lowres_wide_intrinsics/1_10.001.pincam": b"64 48 70 70 32 24"},
+        ),
+    ),
+    "scan.e57": (_e57, lambda path: [read_points(path).xyz]),
 }
 """By the file's name: what makes valid ones, and what reads one and returns arrays that must be finite."""
 

@@ -1,6 +1,7 @@
-"""Turn what an OpenGaussian run wrote into one .ogpc file.
+"""Turn what an OpenGaussian run wrote into one .ogpc file, or a scanner's E57 file into a capture folder.
 
 og-pointcloud import output/ramen -o ramen.ogpc
+og-pointcloud import house.e57 -o house
 """
 
 from __future__ import annotations
@@ -9,12 +10,25 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from og_pointcloud.cli.common import Parser, add_output, add_shared, describe_fit, print_fit, timed, write_fit
+from og_pointcloud.cli.common import (
+    Parser,
+    add_output,
+    add_shared,
+    describe_fit,
+    print_fit,
+    print_next,
+    timed,
+    write_fit,
+)
+from og_pointcloud.errors import OgPointcloudError
+from og_pointcloud.formats.atomic import replacing_folder
 
 
 def add(parser: Parser) -> None:
-    parser.add_argument("result", type=Path, metavar="RESULT", help="folder of the run, or its point_cloud.ply")
-    add_output(parser, "-o", "--output", endings=(".ogpc",), required=True, help="the file to write")
+    parser.add_argument("result", type=Path, metavar="RESULT", help="folder of the run, its point_cloud.ply; or .e57")
+    add_output(
+        parser, "-o", "--output", endings=(".ogpc", ""), required=True, help="the file to write; of an .e57 the folder"
+    )
     parser.add_argument(
         "--cluster-lang", type=Path, metavar="F.npz", help="features of the leaves (default: RESULT/cluster_lang.npz)"
     )
@@ -23,6 +37,11 @@ def add(parser: Parser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
+    if arguments.result.suffix.lower() == ".e57":
+        unpack(arguments.result, arguments.output)
+        return
+    if arguments.output.suffix != ".ogpc":
+        raise OgPointcloudError(f"-o is {arguments.output}; expected a file that ends in .ogpc")
     from og_pointcloud.bundle.vocabulary import scene_words
     from og_pointcloud.fitting.opengaussian import read_opengaussian
 
@@ -35,3 +54,18 @@ def run(arguments: argparse.Namespace) -> None:
     for file in report["files"].values():
         print(f"read {file}")
     print_fit(report, cloud)
+
+
+def unpack(file: Path, folder: Path) -> None:
+    """An E57 file as a capture folder."""
+    from og_pointcloud.formats.e57 import unpack_e57
+
+    if folder.exists():
+        raise OgPointcloudError(f"{folder} is there already; expected a new folder: name another (-o)")
+    with replacing_folder(folder) as made:
+        made.mkdir()
+        images, unused = unpack_e57(file, made)
+    for line in unused:
+        print(f"left out: {line}")
+    print(f"wrote {folder}: {images} images with poses, and the cloud of all scans")
+    print_next("masks", folder)

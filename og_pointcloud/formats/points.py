@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.errors import SceneError
+from og_pointcloud.formats.e57 import E57_SIGNATURE, read_e57
 from og_pointcloud.formats.gaussian_ply import gaussians_from_ply, holds_gaussians
 from og_pointcloud.formats.las import SIGNATURE as LAS_SIGNATURE
 from og_pointcloud.formats.las import read_las
@@ -23,12 +24,12 @@ __all__ = ["read_points", "write_labelled_ply"]
 
 
 def read_points(path: str | os.PathLike[str]) -> Points:
-    """A plain cloud (PLY, PCD, LAS, LAZ) or Gaussians (3DGS PLY, SuperSplat compressed PLY), whatever the file's name.
+    """A plain cloud (PLY, PCD, LAS, LAZ, COPC, E57) or Gaussians (3DGS PLY, SuperSplat's), whatever the file's name.
 
     World coordinates are read as float64; their median becomes the origin. Colours come as uint8 RGB, None where the
     file has none.
     SceneError, beginning with the path, for what cannot be read, has no points, or holds NaN. LAS and LAZ need the
-    extra 'las'.
+    extra 'las', E57 'e57'.
 
     >>> import pathlib, tempfile
     >>> path = og.segment(cloud).save(pathlib.Path(tempfile.mkdtemp()) / "two.ply")  # of `LabelledCloud`'s example
@@ -53,10 +54,12 @@ def read_points(path: str | os.PathLike[str]) -> Points:
             return _cloud(read_pcd(path))
         if head.startswith(LAS_SIGNATURE):
             return read_las(path)
+        if head.startswith(E57_SIGNATURE):
+            return read_e57(path)
         start = f"it starts with {head[:16]!r}" if head else "it is empty"
         raise SceneError(
             f"not a geometry file that can be read ({start}); expected a PLY (plain cloud, 3D Gaussians, or SuperSplat "
-            "compressed), a PCD (ascii, binary, binary_compressed), a LAS or a LAZ: convert it first"
+            "compressed), a PCD (ascii, binary, binary_compressed), a LAS, LAZ or COPC, or an E57: convert it first"
         )
 
 

@@ -1,0 +1,262 @@
+"""E57 files (ASTM E2807) of laser scanners: their scans as one cloud, their images as a capture folder.
+
+Poses take scans and images to the file's world. A pinhole image looks along -z, y up; a spherical one along +x, z up,
+and may end before the poles: it is filled up with black. Images without a pose, cylindrical ones, and those that only
+show the place (visual references) cannot be used. Read by pye57's libE57 (MIT, BSL), the extra 'e57'; it checks sums.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from og_pointcloud.errors import MissingExtraError, OgPointcloudError, SceneError
+from og_pointcloud.formats.atomic import replacing
+from og_pointcloud.formats.images import MAX_PIXELS, require_cv2
+from og_pointcloud.formats.ply import join_columns, write_ply
+from og_pointcloud.formats.poses import rigid, rotation_of_quaternion
+from og_pointcloud.formats.tables import naming, storable_positions
+from og_pointcloud.scene import Points
+
+__all__ = ["E57_SIGNATURE", "read_e57", "unpack_e57"]
+
+Doubles = NDArray[np.float64]
+
+E57_SIGNATURE = b"ASTM-E57"
+CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
+SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
+COLORS = ("colorRed", "colorGreen", "colorBlue")
+INVALID = ("cartesianInvalidState", "sphericalInvalidState")
+CHUNK = 1 << 18
+"""Points read at once."""
+MOST_POINTS_PER_BYTE = 8
+"""No file of any scanner packs more; one that claims to is hostile."""
+WHOLE_TURN = 0.02
+"""A spherical image spans 360 degrees to within this share."""
+FROM_ALONG_X = np.array([[0.0, 0, -1], [-1, 0, 0], [0, 1, 0]])
+"""OpenGL's axes (right, up, back) in the frame of a spherical image, as columns."""
+
+
+def read_e57(path: str | os.PathLike[str]) -> Points:
+    """All scans of an E57 file in its world; points that the scanner marks as invalid are left out.
+
+    SceneError, beginning with the path, for a file that is damaged or has no points; MissingExtraError without pye57.
+    """
+    parts: list[tuple[Doubles, NDArray[np.uint8] | None]] = []
+    path = Path(path)
+    with _opened(path) as (libe57, file):
+        most = MOST_POINTS_PER_BYTE * path.stat().st_size
+        for scan in _children(file.root(), "data3D"):
+            parts += _scan(libe57, file, scan, most)
+            most -= sum(len(xyz) for xyz, _ in parts[-1:])
+        if not parts:
+            raise SceneError("it has no scan with points; expected one or more: export the scans with the images")
+        xyz = np.concatenate([xyz for xyz, _ in parts])
+        colors = [rgb for _, rgb in parts if rgb is not None]
+        rgb = np.concatenate(colors) if len(colors) == len(parts) else None
+        return Points.from_world(xyz, rgb=rgb)
+
+
+def unpack_e57(path: str | os.PathLike[str], folder: str | os.PathLike[str]) -> tuple[int, list[str]]:
+    """Write an E57 file as a capture folder: ``images/``, ``transforms.json``, ``points.ply``.
+
+    Returns the number of images, and of each one that cannot be used its name and why. SceneError where there is none.
+    """
+    path, folder = Path(path), Path(folder)
+    points = read_e57(path)
+    frames, unused = [], []
+    with _opened(path) as (_, file):
+        for number, image in enumerate(_children(file.root(), "images2D")):
+            name = _text(image, "name") or f"image {number}"
+            try:
+                frames.append(_unpack_image(image, folder, f"{number:04d}_{_slug(name)}", path.stat().st_size))
+            except SceneError as error:
+                unused.append(f"{name:.60}: {error}")
+        if not frames:
+            why = unused[0] if unused else "the file has no images"
+            raise SceneError(f"no image of it can be used ({why}); expected pinhole or spherical ones with poses")
+    columns = dict(zip("xyz", storable_positions(points.xyz_world).T, strict=True))
+    if points.rgb is not None:
+        columns |= dict(zip(("red", "green", "blue"), points.rgb.T, strict=True))
+    write_ply(folder / "points.ply", {"vertex": join_columns(columns)})
+    with replacing(folder / "transforms.json") as stream:
+        stream.write(json.dumps({"ply_file_path": "points.ply", "frames": frames}, indent=1).encode())
+    return len(frames), unused
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
+    """libE57 and the open file; what libE57 raises inside is a SceneError."""
+    try:
+        from pye57 import libe57
+    except ImportError as error:
+        raise MissingExtraError("pye57", "e57") from error
+    with naming(path):
+        path.stat()
+        file = None
+        try:
+            file = libe57.ImageFile(str(path), "r")
+            yield libe57, file
+        except (OgPointcloudError, OSError, MemoryError):
+            raise
+        except Exception as error:  # libE57's own, and those of its bindings
+            raise SceneError(f"not a whole E57 file ({error!s:.200}): copy or export it again") from None
+        finally:
+            if file is not None:
+                file.close()
+
+
+def _children(node: Any, name: str) -> Iterator[Any]:
+    if node.isDefined(name):
+        vector = node[name]
+        for index in range(vector.childCount()):
+            yield vector[index]
+
+
+def _text(node: Any, name: str) -> str:
+    return str(node[name].value()) if node.isDefined(name) else ""
+
+
+def _number(node: Any, name: str) -> float:
+    if not node.isDefined(name):
+        raise SceneError(f"it has no {name}")
+    field = node[name]
+    value = float(field.scaledValue() if hasattr(field, "scaledValue") else field.value())
+    if not abs(value) < 1e30:
+        raise SceneError(f"its {name} is {value}; expected a finite number")
+    return value
+
+
+def _pose(node: Any) -> Doubles | None:
+    """(4, 4) to the file's world, or None where the file has none."""
+    if not node.isDefined("pose"):
+        return None
+    pose = node["pose"]
+    quaternion = np.array([_number(pose["rotation"], axis) for axis in "wxyz"])
+    length = float(np.linalg.norm(quaternion))
+    if not length > 1e-8:
+        raise SceneError(f"its rotation is {quaternion.tolist()}; expected a unit quaternion")
+    translation = np.array([_number(pose["translation"], axis) for axis in "xyz"])
+    return rigid(rotation_of_quaternion(quaternion / length), translation)
+
+
+# Points -----------------------------------------------------------------------------------------------------------
+
+
+def _scan(libe57: Any, file: Any, scan: Any, most: int) -> list[tuple[Doubles, NDArray[np.uint8] | None]]:
+    """Chunks of points in the file's world, and their colours."""
+    vector = scan["points"]
+    prototype = libe57.StructureNode(vector.prototype())
+    fields = {prototype.get(index).elementName() for index in range(prototype.childCount())}
+    places = next((names for names in (CARTESIAN, SPHERICAL) if fields.issuperset(names)), None)
+    if places is None:
+        raise SceneError(f"a scan has the fields {', '.join(sorted(fields)):.120}; expected {', '.join(CARTESIAN)}")
+    if vector.childCount() > most:
+        raise SceneError(f"a scan claims {vector.childCount()} points, more than fit into the file: copy it again")
+    colors = COLORS if fields.issuperset(COLORS) else ()
+    wanted = [*places, *colors, *(name for name in INVALID if name in fields)]
+    arrays = {name: np.zeros(min(CHUNK, max(vector.childCount(), 1))) for name in wanted}
+    buffers = libe57.VectorSourceDestBuffer()
+    for name, array in arrays.items():
+        buffers.append(libe57.SourceDestBuffer(file, name, array, len(array), True, True))
+    pose, limits, parts = _pose(scan), [_color_limit(scan, name) for name in colors], []
+    reader = vector.reader(buffers)
+    while count := reader.read():
+        valid = np.ones(count, np.bool_)
+        for name in INVALID:
+            valid &= arrays[name][:count] == 0 if name in arrays else True
+        xyz = np.column_stack([arrays[name][:count][valid] for name in places])
+        xyz = xyz if places is CARTESIAN else _from_angles(*xyz.T)
+        if pose is not None:
+            xyz = xyz @ pose[:3, :3].T + pose[:3, 3]
+        scaled = [255 * arrays[name][:count][valid] / limit for name, limit in zip(colors, limits, strict=True)]
+        rgb = np.clip(np.rint(np.column_stack(scaled)), 0, 255).astype(np.uint8) if colors else None
+        parts += [(xyz, rgb)] if len(xyz) else []
+    reader.close()
+    return parts
+
+
+def _from_angles(distance: Doubles, azimuth: Doubles, elevation: Doubles) -> Doubles:
+    flat = distance * np.cos(elevation)
+    return np.column_stack([flat * np.cos(azimuth), flat * np.sin(azimuth), distance * np.sin(elevation)])
+
+
+def _color_limit(scan: Any, name: str) -> float:
+    limit = _number(scan["colorLimits"], f"{name}Maximum") if scan.isDefined("colorLimits") else 255.0
+    return limit if limit > 0 else 255.0
+
+
+# Images -----------------------------------------------------------------------------------------------------------
+
+
+def _unpack_image(image: Any, folder: Path, name: str, most: int) -> dict[str, Any]:
+    """Write an image; returns its frame of transforms.json. SceneError says why it cannot be used."""
+    pose = _pose(image)
+    if pose is None:
+        raise SceneError("it has no pose")
+    kind = next((k for k in ("pinhole", "spherical") if image.isDefined(f"{k}Representation")), None)
+    if kind is None:
+        raise SceneError("it is neither pinhole nor spherical")
+    shown = image[f"{kind}Representation"]
+    width, height = (round(_number(shown, f"image{side}")) for side in ("Width", "Height"))
+    across, along = _number(shown, "pixelWidth"), _number(shown, "pixelHeight")
+    if not (0 < width * height <= MAX_PIXELS and across > 0 and along > 0):
+        raise SceneError(f"it is {width}x{height} pixels of {across} x {along}; expected sizes above 0")
+    suffix, data = _blob(shown, most)
+    keys: dict[str, Any] = {"w": width, "h": height}
+    if kind == "pinhole":
+        focal = _number(shown, "focalLength")
+        keys |= {"camera_model": "PINHOLE", "fl_x": focal / across, "fl_y": focal / along}
+        keys |= {"cx": _number(shown, "principalPointX"), "cy": _number(shown, "principalPointY")}
+    else:
+        data = _whole_sphere(data, suffix, (width, height), (across, along))
+        pose[:3, :3] = pose[:3, :3] @ FROM_ALONG_X
+        keys |= {"camera_model": "EQUIRECTANGULAR", "h": width // 2, "w": width // 2 * 2}
+    with replacing(folder / "images" / f"{name}{suffix}") as stream:
+        stream.write(data)
+    return {"file_path": f"images/{name}{suffix}", "transform_matrix": pose.tolist(), **keys}
+
+
+def _blob(shown: Any, most: int) -> tuple[str, bytes]:
+    kind = next((kind for kind in ("jpeg", "png") if shown.isDefined(f"{kind}Image")), None)
+    if kind is None:
+        raise SceneError("it holds no JPEG or PNG")
+    blob = shown[f"{kind}Image"]
+    size = blob.byteCount()
+    if not 0 < size <= most:
+        raise SceneError(f"its {kind} claims {size} bytes, more than the file has")
+    data = np.zeros(size, np.uint8)
+    blob.read(data, 0, size)
+    return ".jpg" if kind == "jpeg" else ".png", data.tobytes()
+
+
+def _whole_sphere(data: bytes, suffix: str, size: tuple[int, int], pixel: tuple[float, float]) -> bytes:
+    """The image with black above and below, twice as wide as high. pixel: radians, across and along."""
+    (width, height), (across, along) = size, pixel
+    if abs(width * across / (2 * np.pi) - 1) > WHOLE_TURN or height * along > np.pi * (1 + WHOLE_TURN):
+        turn, rise = np.degrees([width * across, height * along])
+        raise SceneError(f"it spans {turn:.0f} x {rise:.0f} degrees; expected 360 across, and 180 at most")
+    cv2 = require_cv2()
+    pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    if pixels is None or pixels.shape[:2] != (height, width):
+        raise SceneError("its JPEG or PNG is damaged, or of another size than the file says")
+    whole = width // 2 * 2, width // 2
+    shown = min(whole[1], max(1, round(whole[1] * height * along / np.pi)))
+    above = (whole[1] - shown) // 2
+    if pixels.shape[:2] == whole[::-1] and shown == whole[1]:
+        return data
+    pixels = cv2.resize(pixels, (whole[0], shown), interpolation=cv2.INTER_AREA)
+    padded = cv2.copyMakeBorder(pixels, above, whole[1] - shown - above, 0, 0, cv2.BORDER_CONSTANT)
+    return cv2.imencode(suffix, padded, [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes()
+
+
+def _slug(name: str) -> str:
+    return re.sub(r"[^A-Za-z0-9_-]+", "_", name)[:60].strip("_") or "image"
