@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from copc_files import write_copc
 
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.las import write_las
@@ -81,3 +82,21 @@ def test_las_of_any_kind_counts_right(tmp_path, version, point_format, suffix):
         las.xyz = np.random.default_rng(0).random((points, 3))
         las.write(tmp_path / f"cloud{suffix}")
         assert len(read_points(tmp_path / f"cloud{suffix}")) == points
+
+
+def test_copc_is_read_like_any_laz(tmp_path):
+    """Its chunks are of any size, and its octree lies in records that others skip."""
+    laspy = pytest.importorskip("laspy")
+    rng = np.random.default_rng(0)
+    xyz = rng.normal((4e5, 5e6, 100), 1.0, (900, 3))
+    rgb = rng.integers(0, 256, (900, 3)).astype(np.uint8)
+    write_copc(tmp_path / "a.copc.laz", xyz, rgb)
+    with laspy.CopcReader.open(str(tmp_path / "a.copc.laz")) as reader:
+        assert len(reader.query()) == 900
+    points = read_points(tmp_path / "a.copc.laz")
+    np.testing.assert_allclose(points.xyz_world, xyz, atol=1e-4)
+    np.testing.assert_array_equal(points.rgb, rgb)
+    whole = (tmp_path / "a.copc.laz").read_bytes()
+    (tmp_path / "cut.copc.laz").write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(SceneError, match=r"cut\.copc\.laz: .* damaged or truncated"):
+        read_points(tmp_path / "cut.copc.laz")

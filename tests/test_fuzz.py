@@ -22,6 +22,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from copc_files import write_copc
 from hard_cases.inputs import labelled_cloud, scatter, write_two_balls
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as some
@@ -96,6 +97,12 @@ def _las(folder: Path) -> list[bytes]:
     attributes["og_reason"] = np.zeros(12, np.uint8)
     write_las(folder / "made.las", _xyz(), np.full((12, 3), 99, np.uint8), attributes, ("chair",))
     return [(folder / "made.las").read_bytes()]
+
+
+def _copc(folder: Path) -> list[bytes]:
+    pytest.importorskip("laspy")
+    write_copc(folder / "made.copc.laz", _xyz(), np.full((12, 3), 99, np.uint8))
+    return [(folder / "made.copc.laz").read_bytes()]
 
 
 def _images_bin(folder: Path) -> list[bytes]:
@@ -207,6 +214,7 @@ READERS: dict[str, tuple[Callable, Callable]] = {
     "cloud.ply": (_ply, lambda path: [read_points(path).xyz]),
     "cloud.pcd": (_pcd, lambda path: [read_points(path).xyz]),
     "cloud.las": (_las, lambda path: [read_points(path).xyz]),
+    "cloud.copc.laz": (_copc, lambda path: [read_points(path).xyz]),
     "images.bin": (_images_bin, _read_images_bin),
     "points3D.bin": (_points_bin, lambda path: [colmap.read_points3d(path.parent)[0]]),
     "transforms.json": (_transforms, _read_transforms),
