@@ -12,7 +12,7 @@ import sys
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, get_args, get_type_hints
+from typing import TYPE_CHECKING, Any, get_args, get_type_hints
 
 from og_pointcloud.cli.common import (
     Parser,
@@ -22,6 +22,7 @@ from og_pointcloud.cli.common import (
     print_next,
     print_table,
     replaceable,
+    timed,
     write_fit,
     write_json,
 )
@@ -31,6 +32,7 @@ from og_pointcloud.settings import FitSettings, PaperSettings
 if TYPE_CHECKING:
     from concurrent.futures import Executor
 
+    from og_pointcloud.cloud import LabelledCloud
     from og_pointcloud.collection.fit_many import FitOptions
 
 MODES = get_args(get_type_hints(FitSettings)["mode"])
@@ -81,15 +83,21 @@ def add(parser: Parser) -> None:
         "--work", type=replaceable, metavar="DIR",
         help="where the views of a long fit are kept until it ends, for a start after a kill (default: S.ogpc.work)",
     )  # fmt: skip
+    add_output(
+        parser, "--rerun", endings=(".rrd",), help="also write the views and what they show for the Rerun viewer"
+    )
     add_output(parser, "--json", endings=(".json",), help="also write timings and settings of this run")
 
 
 def run(arguments: argparse.Namespace) -> None:
+    alone = [name for name in ("work", "rerun") if getattr(arguments, name) is not None]
     if arguments.out is None and len(arguments.capture) > 1:
         raise OgPointcloudError(f"{len(arguments.capture)} captures and one output; expected --out DIR for so many")
-    if arguments.out is not None and arguments.work is not None:
-        raise OgPointcloudError("--work is for a single file; expected -o S.ogpc with it, or leave it out")
+    if arguments.out is not None and alone:
+        raise OgPointcloudError(f"--{alone[0]} is for a single file; expected -o S.ogpc with it, or leave it out")
     settings = fit_settings(arguments)
+    if arguments.rerun:
+        rerun_file()  # before the work, if it is missing
     from og_pointcloud.collection.fit_many import FitOptions
     from og_pointcloud.collection.workers import dask_executor
 
@@ -111,6 +119,9 @@ def fit_one(arguments: argparse.Namespace, options: FitOptions, executor: Execut
             print(f"{views} views are kept in '{work}': the same command goes on behind them", file=sys.stderr)
         raise
     cloud = write_fit(cloud, cloud.provenance["stages"], arguments.output)
+    if arguments.rerun:
+        with timed(cloud.provenance["stages"], "write rerun"):
+            write_views(cloud, capture, options, arguments.rerun)
     report = describe_fit(cloud, capture, arguments.output)
     if arguments.json:
         write_json(arguments.json, report)
@@ -153,3 +164,18 @@ def fit_settings(arguments: argparse.Namespace) -> FitSettings:
             "expected --mode paper: leave the option out, or take that mode"
         )
     return replace(settings, paper=PaperSettings(schedule_share=arguments.schedule_share))
+
+
+def write_views(cloud: LabelledCloud, capture: Path, options: FitOptions, path: Path) -> None:
+    """The capture's views with the instances that they show, for Rerun."""
+    from og_pointcloud.formats.capture import read_capture
+
+    scene = read_capture(capture, gaussians=options.gaussians, mask_level=options.mask_level)
+    rerun_file().write_rerun(path, scene, cloud, progress=True)
+
+
+def rerun_file() -> Any:
+    """The module that writes for Rerun; MissingExtraError without it."""
+    from og_pointcloud.ask.hosts import import_plugin
+
+    return import_plugin("og_pointcloud.show.rerun_file", "rerun")

@@ -1,0 +1,115 @@
+"""Frames, masks and the instances that appear in them, as a .rrd file for the Rerun viewer. Needs the extra 'rerun'.
+
+A sink for streams (`RerunSink`), and what a fit saw and made, a view a step (`write_rerun`). Nothing is served and no
+viewer is started: a file can be looked at anywhere, later, and again. Places are in the scene's local frame.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib import import_module
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from og_pointcloud.ask.labelled_scene import LabelledScene
+from og_pointcloud.ask.picking import NO_POINT, front_points, in_world
+from og_pointcloud.cloud import LabelledCloud
+from og_pointcloud.formats.atomic import replacing
+from og_pointcloud.formats.colors import NO_LABEL, label_colors
+from og_pointcloud.journal import Journal
+from og_pointcloud.scene import Camera, Scene
+
+__all__ = ["RerunSink", "rerun_sink", "write_rerun"]
+
+rerun: Any = import_module("rerun")  # it comes without what tells its names to a type checker
+APPLICATION, TIMELINE = "og_pointcloud", "view"
+JPEG_QUALITY = 80
+
+
+class RerunSink:
+    """What is logged to a file; get one from `rerun_sink`. Steps are numbers that rise."""
+
+    def __init__(self, recording: Any) -> None:
+        self._recording = recording
+
+    def frame(
+        self, step: int, camera: Camera, image: NDArray[np.uint8] | None, masks: NDArray[np.integer] | None
+    ) -> None:
+        """A view: its camera, of the local frame; its image (H, W, 3) uint8 and masks (H, W), -1 outside, if any."""
+        self._recording.set_time(TIMELINE, sequence=step)
+        from_camera = rerun.Transform3D(translation=camera.center, mat3x3=camera.world_to_camera[:3, :3].T)
+        matrix = [[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]]
+        lens = rerun.Pinhole(
+            image_from_camera=matrix,
+            resolution=[camera.width, camera.height],
+            camera_xyz=rerun.ViewCoordinates.RDF,
+        )
+        self._recording.log("world/camera", from_camera, lens)
+        if image is not None:
+            self._recording.log("world/camera/image", rerun.Image(image).compress(jpeg_quality=JPEG_QUALITY))
+        if masks is not None:
+            ids = np.asarray(masks + 1, np.uint16)  # 0, which the viewer leaves clear, is outside
+            self._recording.log("world/camera/masks", rerun.SegmentationImage(ids, opacity=0.5))
+
+    def instances(self, step: int, scene: LabelledScene, appeared: NDArray[np.bool_]) -> None:
+        """The scene's points, those of instances that have appeared so far, (K,) bool, in the instances' colors; and
+        these instances' boxes with their best words."""
+        cloud = scene.cloud
+        table = np.full((len(appeared) + 3, 3), NO_LABEL, np.uint8)  # ids below 0 index it from its end
+        table[: len(appeared)][appeared] = label_colors(np.flatnonzero(appeared))
+        rows = [row for row in scene.instances if appeared[row.id]]
+        boxes = [(row, row.axis_aligned_box) for row in rows]
+        known = [(row, box) for row, box in boxes if box is not None]
+        self._recording.set_time(TIMELINE, sequence=step)
+        points = rerun.Points3D(cloud.xyz, colors=table[cloud.instance_ids], radii=0.7 * cloud.spacing)
+        self._recording.log("world/points", points)
+        lines = rerun.Boxes3D(
+            mins=[box.low - cloud.origin for _, box in known],
+            sizes=[box.size for _, box in known],
+            colors=label_colors(np.array([row.id for row, _ in known], np.int64)),
+            labels=[row.words[0][0] if row.words else f"instance {row.id}" for row, _ in known],
+        )
+        self._recording.log("world/boxes", lines)
+
+    def text(self, text: str) -> None:
+        """A line beside the first view."""
+        self._recording.set_time(TIMELINE, sequence=0)
+        self._recording.log("fit", rerun.TextLog(text))
+
+
+@contextmanager
+def rerun_sink(path: str | os.PathLike[str]) -> Iterator[RerunSink]:
+    """A sink whose file takes its place when the block ends without an error."""
+    recording = rerun.RecordingStream(APPLICATION)
+    with replacing(path) as file:
+        recording.save(file.name)  # written as it is logged: memory does not grow with the stream
+        try:
+            yield RerunSink(recording)
+        finally:
+            recording.disconnect()
+
+
+def write_rerun(path: str | os.PathLike[str], capture: Scene, cloud: LabelledCloud, *, progress: bool = False) -> None:
+    """What a fit saw and made: each view with its masks, the instances it is the first to show, the stages' seconds.
+
+    capture: what was fitted. cloud: what came of it.
+    """
+    scene, appeared = LabelledScene.from_cloud(cloud), np.zeros(len(cloud.instances), bool)
+    with rerun_sink(path) as sink:
+        for stage in cloud.provenance.get("stages", []):
+            sink.text(f"{stage['name']}: {stage['seconds']:.2f} s")
+        for entry in cloud.provenance.get("left_out", []):
+            sink.text(f"left out: {entry['what']}: {entry['why']}")
+        sink.instances(0, scene, appeared)
+        for step, view in enumerate(Journal(progress).steps(capture.views, "rerun")):
+            sink.frame(step, view.camera, view.image_rgb(), view.mask_map())
+            front = front_points(cloud, in_world(view.camera, capture.points.origin))
+            seen = np.unique(cloud.instance_ids[front[front != NO_POINT]])
+            new = seen[seen >= 0]
+            if not appeared[new].all():
+                appeared[new] = True
+                sink.instances(step, scene, appeared)
