@@ -2,6 +2,7 @@
 
     python examples/benchmark_collection.py                     # 1,000 scenes as files, then 1,000,000 descriptors
     python examples/benchmark_collection.py --descriptors 0     # only the files
+    python examples/benchmark_collection.py --files 0 --in-memory   # the search alone, of arrays that were never a file
     python examples/benchmark_collection.py --files 0 --lance   # LanceDB beside the exact search, recall at 10
 
 Descriptors are drawn about the vectors of made-up words, as an encoder's would be: near a word, with what all images
@@ -25,6 +26,7 @@ import og_pointcloud as og
 from og_pointcloud.cloud import unit_rows
 from og_pointcloud.collection.fit_many import peak_memory
 from og_pointcloud.collection.index import settle
+from og_pointcloud.collection.scoring import Block
 from og_pointcloud.collection.store import INSTANCE, Atlas, SceneArrays, SceneEntry
 from og_pointcloud.fitting.memory import memory_in_use
 
@@ -56,13 +58,16 @@ def main() -> None:
     parser.add_argument("--descriptors", type=int, default=1_000_000)
     parser.add_argument("--width", type=int, default=512)
     parser.add_argument("--a-scene", type=int, default=100, help="instances a scene")
+    parser.add_argument("--in-memory", action="store_true", help="time the search alone, without an atlas")
     parser.add_argument("--lance", action="store_true", help="also LanceDB (extra 'lance')")
     arguments = parser.parse_args()
     encoder = MadeEncoder(arguments.width, np.random.default_rng(0))
     with tempfile.TemporaryDirectory(dir=os.environ.get("TMPDIR", "/var/tmp")) as folder:
         if arguments.files:
             files(Path(folder), arguments.files, arguments.a_scene, encoder)
-        if arguments.descriptors:
+        if arguments.descriptors and arguments.in_memory:
+            search(arguments.descriptors, arguments.a_scene, encoder)
+        elif arguments.descriptors:
             large(Path(folder), arguments.descriptors, arguments.a_scene, encoder, arguments.lance)
 
 
@@ -138,6 +143,41 @@ def large(folder: Path, descriptors: int, instances: int, encoder: MadeEncoder, 
     for name, times, cpu, recall in rows:
         print(
             f"{name:<28}{min(times):>10.3f}{np.median(times):>10.3f}{max(times):>11.3f}{np.median(cpu):>14.3f}{recall:>11}"
+        )
+    print(f"peak memory {peak_memory() / 1e9:.2f} GB")
+
+
+def search(descriptors: int, instances: int, encoder: MadeEncoder) -> None:
+    """The exact search of arrays in memory, and of half of their scenes, as a box chooses; beside plain products."""
+    scenes = descriptors // instances
+    scene = np.repeat(np.arange(scenes, dtype=np.int32), instances)
+    rows = np.concatenate(
+        [encoder.descriptors(encoder.rng.integers(0, WORDS, 10_000)) for _ in range(descriptors // 10_000)]
+    )
+    bank = og.WordBank(encoder.words.vectors)
+    some = rows[:: max(1, len(rows) // 2000)] @ unit_rows(bank.vectors - bank.mean).T
+    low = np.zeros((len(rows), 3))
+    block = Block(
+        entries=(), descriptors=rows, first=np.arange(len(rows)), scene=scene, points=np.ones(len(rows), np.int32),
+        instance=np.tile(np.arange(instances, dtype=np.int32), scenes), low=low, high=low, bank=bank,
+        common=np.zeros((scenes, rows.shape[1]), np.float32), sharpness=np.full(scenes, 3.25, np.float32),
+        scale=np.full(len(rows), 1 / some.std(), np.float32),
+        shift=np.full(len(rows), -some.mean() / some.std(), np.float32),
+    )  # fmt: skip
+    nothing = np.zeros((0, rows.shape[1]), np.float32)
+    for name, chosen in (("exact, all", None), ("exact, half of the scenes", scene % 2 == 0)):
+        times = []
+        for word in range(ASKED):
+            text = encoder.words.vectors[word]
+            seconds, found = timed(lambda text=text, chosen=chosen: block.rank(text, nothing, chosen, RECALL_AT))
+            times.append((seconds, cpu_seconds))
+            if word < 3 and chosen is None:
+                evidence = rows @ block.direction(text)  # all judged alike here: the most evidence is the best
+                assert set(found.rows[:1]) <= set(np.argsort(-evidence)[:RECALL_AT])
+        least, middle = np.min(times, axis=0), np.median(times, axis=0)
+        print(
+            f"{name}, {len(rows):,} x {rows.shape[1]}: least {least[0]:.3f} s, median {middle[0]:.3f} s, "
+            f"CPU median {middle[1]:.3f} s, least {least[1]:.3f} s"
         )
     print(f"peak memory {peak_memory() / 1e9:.2f} GB")
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -28,6 +29,8 @@ of its released code, the paper gives none."""
 
 ROWS_AT_ONCE = 512
 """Descriptors that are put together before a product: so many stay in a core's cache."""
+LEAST_RUN = 16
+"""Mean length of runs of descriptors from which each run has a product of its own."""
 FIRST = 256
 """Instances scored to the end at first; then twice as many, as long as it takes."""
 CERTAIN = 1e-12
@@ -172,9 +175,14 @@ class Block:
         if isinstance(where, slice):
             return self.descriptors @ directions.T
         scores = np.empty((len(where), len(directions)), np.float32)
-        for start in range(0, len(where), ROWS_AT_ONCE):
-            part = slice(start, start + ROWS_AT_ONCE)
-            scores[part] = self.descriptors[where[part]] @ directions.T
+        ends = np.append(np.flatnonzero(np.diff(where) != 1) + 1, len(where))
+        if len(ends) * LEAST_RUN > len(where):
+            for start in range(0, len(where), ROWS_AT_ONCE):
+                part = slice(start, start + ROWS_AT_ONCE)
+                scores[part] = self.descriptors[where[part]] @ directions.T
+            return scores
+        for begin, end in pairwise([0, *ends.tolist()]):  # whole scenes: multiplied where they lie, not copied
+            np.matmul(self.descriptors[where[begin] : where[end - 1] + 1], directions.T, out=scores[begin:end])
         return scores
 
     def _descriptors_of(self, rows: NDArray[np.intp]) -> NDArray[np.intp] | slice:
