@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
 from typing import Any
@@ -286,10 +286,11 @@ def _decide(earlier: Visit, later: Visit, of_earlier: Evidence, of_later: Eviden
     gone = _things(earlier, np.flatnonzero(left).tolist(), of_earlier.through, typical)
     new = _things(later, np.flatnonzero(came).tolist(), of_later.through, typical)
     pairs = _matched(gone, new, typical)
+    new = _with_scattered(gone, new, pairs, typical)
     taken = set(pairs.values())
     changes = Changes(
         gone=tuple(sorted(k for g, thing in enumerate(gone) if g not in pairs for k in thing.pieces)),
-        new=tuple(thing.pieces[0] for n, thing in enumerate(new) if n not in taken),
+        new=tuple(thing.pieces[0] for n, thing in enumerate(new) if n not in taken and thing.pieces),
         moved=tuple(
             Moved(gone[g].pieces[0], gone[g].place, new[n].place, new[n].pieces[0]) for g, n in sorted(pairs.items())
         ),
@@ -331,5 +332,20 @@ def _matched(gone: list[_Thing], new: list[_Thing], typical: float) -> dict[int,
     lengths = [np.array([thing.look.length for thing in things]) for things in (gone, new)]
     as_long = np.minimum.outer(*lengths) / np.maximum(np.maximum.outer(*lengths), 1e-12)
     # Of several that are alike, pieces of one thing perhaps, the one that is as long.
-    rows, columns = linear_sum_assignment(-np.where(alike > ALIKE, np.minimum(alike, 1) + as_long, 0))
+    rows, columns = linear_sum_assignment(-np.where(alike > ALIKE, 2 * np.minimum(alike, 1) + as_long, 0))
     return {int(g): int(n) for g, n in zip(rows, columns, strict=True) if alike[g, n] > ALIKE}
+
+
+def _with_scattered(gone: list[_Thing], new: list[_Thing], pairs: dict[int, int], typical: float) -> list[_Thing]:
+    """The new things, those that are more pieces of one that moved within it: they look like it, have its colour, and
+    lie no farther off than it is long. What holds their pieces then has none of its own."""
+    things = list(new)
+    for g, n in pairs.items():
+        for other, thing in enumerate(new):
+            if other in pairs.values() or not things[other].pieces:
+                continue
+            near = np.linalg.norm(thing.place - new[n].place) < gone[g].look.length
+            if near and one_color(gone[g].look, thing.look) and likeness(gone[g].look, thing.look, typical) > ALIKE:
+                things[n] = replace(things[n], pieces=(*things[n].pieces, *thing.pieces))
+                things[other] = replace(thing, pieces=())
+    return things
