@@ -37,6 +37,7 @@ from og_pointcloud.formats.npy import array_from_npy, npy_bytes
 from og_pointcloud.formats.photogrammetry import read_photogrammetry
 from og_pointcloud.formats.ply import join_columns, write_ply
 from og_pointcloud.formats.points import read_points
+from og_pointcloud.formats.poses import in_pinholes
 from og_pointcloud.formats.rgbd import read_rgbd
 from og_pointcloud.scene import Camera
 from og_pointcloud.text.text_features import read_text_features
@@ -164,7 +165,8 @@ def _e57(folder: Path) -> list[bytes]:
 
 
 def _read_photogrammetry(path: Path) -> list[np.ndarray]:
-    return [image.camera.world_to_camera for image in read_photogrammetry(path, lambda _: (64, 48)).images]
+    images = read_photogrammetry(path, lambda _: (64, 48)).images
+    return [view.camera.world_to_camera for image in images for view in in_pinholes(image)]
 
 
 def _read_in_layout(place: str, images: dict[str, bytes]) -> Callable[[Path], list[np.ndarray]]:
@@ -205,7 +207,8 @@ def _read_ogpc(path: Path) -> list[np.ndarray]:
 
 
 def _read_transforms(path: Path) -> list[np.ndarray]:
-    return [image.camera.world_to_camera for image in read_transforms(path, lambda _: (48, 36)).images]
+    images = read_transforms(path, lambda _: (48, 36)).images
+    return [view.camera.world_to_camera for image in images for view in in_pinholes(image)]
 
 
 READERS: dict[str, tuple[Callable, Callable]] = {

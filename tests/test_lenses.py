@@ -187,6 +187,23 @@ def test_a_halved_image_is_split_alike():
     assert again == whole
 
 
+@pytest.mark.parametrize("cx", [320.0, -900.0])
+def test_a_long_lens_is_one_view_to_its_rim(cx):
+    """A hundredth of a degree a pixel; also of a cut-out beside the axis."""
+    camera = Camera(640, 480, 60000.0, 60000.0, cx, 240.0, np.eye(4))
+    made = lens_of("perspective", {"k1": 0.5})
+    assert made is not None
+    face = one_face(camera, made)
+    assert (face.camera.width, face.camera.height) == pytest.approx((640, 480), abs=1)
+    blocks = np.arange(640 * 480, dtype=np.int32).reshape(480, 640) // 40
+    assert len(np.unique(face.mask_ids(blocks))) >= 640 * 480 // 40 - 12  # but for a row
+
+
+def test_a_lens_that_looks_elsewhere_is_refused():
+    with pytest.raises(SceneError, match="sees nothing before the camera"):
+        faces(Camera(64, 48, 60.0, 60.0, 4000.0, 24.0, np.eye(4)), lens("barrel"))
+
+
 def test_named_terms():
     assert lens_of("perspective", {"k1": 0.0, "p1": 0.0}) is None
     assert lens_of("fisheye", {}) is not None

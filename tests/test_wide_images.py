@@ -163,6 +163,15 @@ def test_masks_that_do_not_fit_the_panorama_are_refused(panoramas):
         read_capture(panoramas)
 
 
+def test_a_mask_without_features_is_refused(panoramas):
+    features = {"feature_space": np.array("tiny")} | {f"pano_{i}": np.eye(5, 8, dtype=np.float32) for i in range(3)}
+    write_features(panoramas, features)
+    with pytest.raises(
+        SceneError, match=r"view 'pano_0/\w+': mask id 6 has no feature row \(the features file has 5\)"
+    ):
+        read_capture(panoramas)
+
+
 def test_masks_are_made_of_the_faces(panoramas, tmp_path):
     output = tmp_path / "made"
     made = make_masks(panoramas, MaskSettings(every=2), output, say=lambda _: None)

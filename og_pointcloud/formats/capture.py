@@ -270,6 +270,11 @@ def _layer_of(face: Face, layer: MaskLayer, view: str) -> MaskLayer:
         return MaskLayer(size, layer.features, lambda: scaled.mask_ids(layer.read()))
     used = np.unique(scaled.mask_ids(layer.read()))
     used = used[used >= 0]
+    if len(used) and used[-1] >= len(layer.features):
+        raise SceneError(
+            f"view '{view}': mask id {used[-1] + 1} has no feature row (the features file has {len(layer.features)}): "
+            "write one feature row per mask id"
+        )
     row_of_id = np.full(len(layer.features) + 2, -1, np.int32)  # the last two serve NOT_SEEN and -1
     row_of_id[NOT_SEEN] = NOT_SEEN
     row_of_id[used] = np.arange(len(used), dtype=np.int32)

@@ -96,7 +96,7 @@ def unpack_e57(path: str | os.PathLike[str], folder: str | os.PathLike[str]) -> 
 def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
     """libE57 and the open file; what libE57 raises inside is a SceneError."""
     try:
-        from pye57 import libe57
+        from pye57 import libe57  # pyright: ignore[reportAttributeAccessIssue]
     except ImportError as error:
         raise MissingExtraError("pye57", "e57") from error
     with naming(path):

@@ -130,16 +130,22 @@ def _numbers(camera: Camera) -> Numbers:
 @lru_cache(maxsize=64)
 def _boxes(whole: Numbers, lens: Lens) -> dict[str, Box]:
     """By face, what is seen of it at depth 1. The one view is called "", and cut at whole pixels of the image."""
-    one, _ = _seen_box("front", whole, lens, ONE_VIEW)
-    if one is None:
-        raise SceneError(f"a {lens.model} lens of {lens.terms} sees nothing before the camera: check the pose file")
-    if not lens.wraps and max(map(abs, one)) < ONE_VIEW:
-        _, _, fx, fy, cx, cy = whole
+    width, height, fx, fy, cx, cy = whole
+    telephoto = 2 * max(abs(cx), abs(width - cx), 1.0) / fx, 2 * max(abs(cy), abs(height - cy), 1.0) / fy
+    half = next(half for half in (max(telephoto), ONE_VIEW) if half <= ONE_VIEW)
+    one, _ = _seen_box("front", whole, lens, half)
+    if one is None or max(map(abs, one)) >= half:
+        half = ONE_VIEW
+        one, _ = _seen_box("front", whole, lens, half)
+    if one is not None and not lens.wraps and max(map(abs, one)) < half:
         left, top, right, bottom = (round(at * f + c) for at, f, c in zip(one, (fx, fy) * 2, (cx, cy) * 2, strict=True))
         right, bottom = max(right, left + 1), max(bottom, top + 1)
         return {"": ((left - cx) / fx, (top - cy) / fy, (right - cx) / fx, (bottom - cy) / fy)}
     seen = {name: _seen_box(name, whole, lens, 1.0) for name in CUBE}
-    return {name: box for name, (box, share) in seen.items() if box is not None and share > LEAST_SHARE}
+    boxes = {name: box for name, (box, share) in seen.items() if box is not None and share > LEAST_SHARE}
+    if "front" not in boxes:
+        raise SceneError(f"a {lens.model} lens of {lens.terms} sees nothing before the camera: check the pose file")
+    return boxes
 
 
 def _seen_box(name: str, whole: Numbers, lens: Lens, half: float) -> tuple[Box | None, float]:
@@ -171,7 +177,8 @@ def _image_pixels(rays: Doubles, whole: Numbers, lens: Lens) -> tuple[Doubles, D
     if max(reach) > lens.radius(CIRCULAR):  # of which the corners are black
         beyond = np.hypot(u, v) > max(reach)
         u, v = np.where(beyond, np.nan, u), np.where(beyond, np.nan, v)
-    u, v = u * fx + cx, v * fy + cy
+    with np.errstate(over="ignore", invalid="ignore"):  # far beyond the image
+        u, v = u * fx + cx, v * fy + cy
     if lens.wraps:
         u, v = u % width, np.clip(v, 0, np.nextafter(height, 0))
     inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
