@@ -215,13 +215,15 @@ def test_verdicts_of_numbers(tmp_path):
     )
 
 
+@pytest.mark.slow
 def test_results_of_constants_are_kept(scenes, tmp_path, monkeypatch):
     monkeypatch.setattr(numbers, "SCENES", ("tiny-0",))
     monkeypatch.setattr(numbers, "made_scene", lambda drawn, cache: scenes[0])
     monkeypatch.setattr(numbers, "draw", lambda name: name)
     zoo.main(["-o", str(tmp_path), "--constants", str(tmp_path / "page.md"), "--only", "membership.sure_share"])
     first = (tmp_path / "page.md").read_text()
-    assert "1 numbers steer labels" in first
+    assert f"{len(numbers.constants())} numbers steer labels. 1 of them" in first
+    assert first.count("| not tried |") == len(numbers.constants()) - 1
     monkeypatch.setattr(numbers, "fit_prepared", None)  # nothing is measured a second time
     zoo.main(["-o", str(tmp_path), "--constants", str(tmp_path / "again.md"), "--only", "membership.sure_share"])
     assert (tmp_path / "again.md").read_text() == first

@@ -268,17 +268,19 @@ def _put(module: Any, name: str, value: Any, path: str) -> None:
 
 
 def page(results: Sequence[Tried]) -> str:
-    """Markdown: the table, and what it says."""
+    """Markdown: the table, and what it says; numbers that were not tried are at its end."""
     default = np.mean(results[0].default) if results else float("nan")
     sharp = [result.constant.path for result in results if result.verdict.startswith("sharp")]
     flat = [result.constant.path for result in results if result.verdict == "does not matter here"]
+    names = {result.constant.path for result in results}
+    rest = [one for one in constants() if one.path not in names]
     lines = [
         "# Numbers of the default way",
         "",
-        f"Printed by `python examples/zoo.py --constants docs/constants.md`: {len(results)} numbers steer labels. Each "
-        f"was halved and doubled (shares above a half: moved half of the way to 1) on {len(SCENES)} scenes of the "
-        f"zoo's half for choosing, {', '.join(SCENES)}, whose mean error, 1 - mIoU, is {default:.4f} as they stand. "
-        "The columns give what is added to it.",
+        f"Printed by `python examples/zoo.py --constants docs/constants.md`. {len(names) + len(rest)} numbers steer "
+        f"labels. {len(names)} of them were halved and doubled (shares above a half: moved half of the way to 1) on "
+        f"{len(SCENES)} scenes of the zoo's half for choosing, {', '.join(SCENES)}, whose mean error, 1 - mIoU, is "
+        f"{default:.4f} as they stand. The columns give what is added to it.",
         "",
         f"Sharp (a change costs {SHARP:g} or more): {_listed(sharp)}.",
         "",
@@ -288,11 +290,15 @@ def page(results: Sequence[Tried]) -> str:
         "| --- | ---: | --- | ---: | ---: | --- | --- |",
     ]
     for result in results:
-        one = result.constant
         half, twice = (f"{result.change(errors):+.4f}" for errors in (result.half, result.twice))
-        cells = (f"`{one.path}`", _short(one.value), one.source, half, twice, result.verdict, one.meaning)
-        lines.append(f"| {' | '.join(cell.replace('|', '/') for cell in cells)} |")
+        lines.append(_line(result.constant, half, twice, result.verdict))
+    lines += [_line(one, "-", "-", "not tried") for one in rest]
     return "\n".join(lines) + "\n"
+
+
+def _line(one: Constant, half: str, twice: str, verdict: str) -> str:
+    cells = (f"`{one.path}`", _short(one.value), one.source, half, twice, verdict, one.meaning)
+    return f"| {' | '.join(cell.replace('|', '/') for cell in cells)} |"
 
 
 def _listed(paths: Sequence[str]) -> str:
