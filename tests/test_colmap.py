@@ -8,7 +8,7 @@ from capture_files import make_world, same_camera, write_colmap_binary, write_co
 
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.colmap import find_model, read_images, read_points3d
-from og_pointcloud.formats.lenses import Lens
+from og_pointcloud.formats.lenses import lens_of
 
 WRITERS = [write_colmap_binary, write_colmap_text]
 
@@ -54,7 +54,7 @@ def test_camera_models(tmp_path, write):
     assert (pinhole.camera.fx, pinhole.camera.fy, pinhole.camera.cx, pinhole.camera.cy) == (70.0, 70.0, 31.0, 25.0)
     assert pinhole.lens is None
     assert opencv.camera.fy == 72.0
-    assert opencv.lens == Lens("perspective", (0.1, -0.05, 0.001, 0.002, 0, 0, 0, 0, 0))
+    assert opencv.lens == lens_of("perspective", {"k1": 0.1, "k2": -0.05, "p1": 0.001, "p2": 0.002})
     assert fisheye.lens is not None, "an equidistant fisheye is no pinhole, although its terms are zero"
     assert fisheye.lens.model == "fisheye"
 
