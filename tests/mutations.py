@@ -28,6 +28,11 @@ def slow(*cases: str) -> tuple[str, ...]:
     return tuple(f"test_hard_cases.py::test_case_holds_everywhere[{case}]" for case in cases)
 
 
+def trust(*names: str) -> tuple[str, ...]:
+    """Node ids of tests of trust."""
+    return tuple(f"test_trust.py::test_{name}" for name in names)
+
+
 MEMBERSHIP = hard("votes-border_rounds", "votes-membership_of_any_votes", "votes-certainty_of_any_votes")
 CHOOSING = hard("choosing-nearly_equal_labels", "choosing-label_among_the_bank", "choosing-equal_labels")
 
@@ -175,5 +180,98 @@ MUTATIONS = (
         "a failed write leaves what it wrote", "formats/atomic.py",
         "temporary.unlink(missing_ok=True)\n        raise", "os.replace(temporary, path)\n        raise",
         ("test_bundle.py",),
+    ),
+    # Strangers' files, and files that are written.
+    Mutation(
+        "any graph is run", "bundle/known_graph.py",
+        "if digest not in KNOWN_GRAPHS:", "if not digest:", trust("no_graph_but_ours_reaches_a_runtime"),
+    ),
+    Mutation(
+        "the number of answer codes is believed", "bundle/read.py",
+        'tables["codes"].tolist() == [codes]', "True", trust("no_graph_but_ours_reaches_a_runtime"),
+    ),
+    Mutation(
+        "descriptors of the graph are believed", "bundle/read.py",
+        'tables["descriptors"].tobytes() == descriptors.tobytes()', "True",
+        trust("a_graph_with_other_descriptors_than_the_file_says"),
+    ),
+    Mutation(
+        "a graph's answers are believed", "ask/query_graph.py",
+        "        if len(cloud):", "        if not len(cloud):",
+        trust("a_graph_that_contradicts_the_arrays_is_found_out_on_opening"),
+    ),
+    Mutation(
+        "coincident points count as lies", "ask/query_graph.py",
+        "if wrong := int((certain & (instances != expected)).sum()):", "if wrong := len(differ):",
+        trust("whatever_is_drawn_no_honest_file_is_refused"),
+    ),
+    Mutation(
+        "a manifest of any size", "bundle/format.py",
+        "1 << 21, 1 << 23", "1 << 26, 1 << 26", trust("a_manifest_is_bounded_before_it_is_read"),
+    ),
+    Mutation(
+        "an encoder of another space answers", "text/encoder.py",
+        "if encoder.feature_space != feature_space:", "if not encoder:",
+        trust("a_carried_encoder_of_another_space_answers_nothing"),
+    ),
+    Mutation(
+        "texts may grow", "text/tokenizer.py",
+        "if growth > MOST_GROWTH:", "if growth < 0:", trust("tokenizers_that_would_grow_without_end"),
+    ),
+    Mutation(
+        "pieces of any length", "text/tokenizer.py",
+        "if longest > LONGEST_PIECE or", "if", trust("tokenizers_that_would_grow_without_end"),
+    ),
+    Mutation(
+        "a plan of memory for every size of frame", "models.py",
+        "enable_mem_pattern = False", "enable_mem_pattern = True",
+        trust("memory_is_flat_over_frames_of_many_sizes"),
+    ),
+    Mutation(
+        "temporary names by process", "formats/atomic.py",
+        "secrets.token_hex(4)", "os.getpid()", trust("threads_that_write_one_path_leave_one_whole_file"),
+    ),
+    Mutation(
+        "temporary files written through links", "formats/atomic.py",
+        'temporary.open("xb")', 'temporary.open("wb")',
+        trust("temporary_names_cannot_be_guessed_and_links_are_not_followed"),
+    ),
+    Mutation(
+        "files that others write are removed", "formats/atomic.py",
+        "                    if _hold(file):", "                    if True:",
+        trust("what_killed_runs_left_is_removed_and_what_others_write_is_not"),
+    ),
+    Mutation(
+        "two runs in one folder", "formats/atomic.py",
+        "if not _hold(file):", "if not file:", trust("one_run_at_a_time_in_a_folder"),
+    ),
+    Mutation(
+        "foreign text as it is", "errors.py",
+        "s if s.isprintable() else repr(s)[1:-1]", "s", trust("printable"),
+    ),
+    Mutation(
+        "results as they are", "cli/__init__.py",
+        "map(printable, text.split", "map(str, text.split",
+        trust("nothing_in_a_file_reaches_the_terminal_as_it_is"),
+    ),
+    Mutation(
+        "formulas in tables", "formats/tables.py",
+        '("=", "+"', '("~", "+"', trust("cells_of_tables_are_no_formulas"),
+    ),
+    Mutation(
+        "images of any size", "formats/images.py",
+        "if width * height > MAX_PIXELS:", "if width < 0:", trust("sizes_come_from_headers_and_are_bounded"),
+    ),
+    Mutation(
+        "archives of any ratio", "formats/npy.py",
+        "if total > most_packed:", "if total < 0:", trust("a_small_file_does_not_unpack_to_a_large_one"),
+    ),
+    Mutation(
+        "masks through links", "masking/make_masks.py",
+        "if link.is_symlink():", "if not link:", trust("nothing_is_written_through_links_of_a_capture"),
+    ),
+    Mutation(
+        "paths in files that travel", "bundle/vocabulary.py",
+        'reason = f"{own.name} is', 'reason = f"{own} is', trust("files_that_travel_hold_no_path"),
     ),
 )  # fmt: skip

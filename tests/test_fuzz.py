@@ -24,6 +24,7 @@ import numpy as np
 import pytest
 from copc_files import write_copc
 from hard_cases.inputs import labelled_cloud, scatter, write_two_balls
+from hostile_files import SEEDS, UNKNOWN_GRAPHS, with_graph
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as some
 
@@ -31,6 +32,7 @@ from og_pointcloud.bundle.read import read_bundle
 from og_pointcloud.cli import main
 from og_pointcloud.errors import BundleError, FeatureSpaceError, OgPointcloudError, SceneError
 from og_pointcloud.formats import colmap
+from og_pointcloud.formats.images import image_size
 from og_pointcloud.formats.las import write_las
 from og_pointcloud.formats.nerfstudio import read_transforms
 from og_pointcloud.formats.npy import array_from_npy, npy_bytes
@@ -187,6 +189,17 @@ def _read_in_layout(place: str, images: dict[str, bytes]) -> Callable[[Path], li
 PICTURE = cv2.imencode(".png", np.zeros((48, 64), np.uint8))[1].tobytes()
 
 
+def _images(folder: Path) -> list[bytes]:
+    cv2 = pytest.importorskip("cv2")
+    noise = np.random.default_rng(0).integers(0, 256, (9, 13, 3), np.uint8)
+    return [cv2.imencode(ending, noise)[1].tobytes() for ending in (".jpg", ".bmp", ".webp", ".tif", ".png")]
+
+
+def _words(folder: Path) -> list[bytes]:
+    np.savez(folder / "made.npz", names=np.array(["chair", "desk"]), vectors=np.eye(2), feature_space=np.array("fuzz"))
+    return [(folder / "made.npz").read_bytes()]
+
+
 def _read_npy(path: Path) -> list[np.ndarray]:
     try:
         array_from_npy(path.read_bytes())  # may hold anything
@@ -233,6 +246,8 @@ READERS: dict[str, tuple[Callable, Callable]] = {
         ),
     ),
     "scan.e57": (_e57, lambda path: [read_points(path).xyz]),
+    "image.jpg": (_images, lambda path: [np.array(image_size(path))]),
+    "words.npz": (_words, lambda path: [read_text_features(path)[0].vectors]),
 }
 """By the file's name: what makes valid ones, and what reads one and returns arrays that must be finite."""
 
@@ -241,6 +256,22 @@ READERS: dict[str, tuple[Callable, Callable]] = {
 def valid_files(name: str, folder: Path) -> list[bytes]:
     (folder / name).mkdir()
     return READERS[name][0](folder / name)
+
+
+@lru_cache
+def first_files(name: str, folder: Path) -> list[bytes]:
+    """What damage starts from: valid files, and those that were made by hand to do harm."""
+    valid, made = valid_files(name, folder), SEEDS.get(name, [])
+    if name == "scene.ogpc":
+        source = folder / name / "made.ogpc"
+        made = [with_graph(source, folder / "hostile.ogpc", change).read_bytes() for change in UNKNOWN_GRAPHS]
+    return valid + made
+
+
+@pytest.mark.parametrize("name", [*SEEDS, "scene.ogpc"])
+def test_files_made_by_hand_are_read_or_refused(name: str, folder: Path, tmp_path: Path):
+    for data in first_files(name, folder):
+        read_or_refused(name, tmp_path / name, data)
 
 
 def read_or_refused(name: str, path: Path, data: bytes) -> str:
@@ -336,12 +367,12 @@ def test_any_bytes_are_read_or_refused(name: str, folder: Path, data: bytes, sta
 
 @pytest.mark.parametrize("name", READERS)
 @everything
-@given(which=some.integers(0, 9), member=some.floats(0, 1), changes=damages())
+@given(which=some.integers(0, 19), member=some.floats(0, 1), changes=damages())
 def test_damaged_files_are_read_or_refused(
     name: str, folder: Path, which: int, member: float, changes: list[tuple[str, float, bytes]]
 ):
-    valid = valid_files(name, folder)
-    data = valid[which % len(valid)]
+    made = first_files(name, folder)
+    data = made[which % len(made)]
     changed = damaged_member(data, member, changes) if name.endswith(".ogpc") and which else damaged(data, changes)
     read_or_refused(name, folder / name / name, changed)
 

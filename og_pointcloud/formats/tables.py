@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from itertools import chain, islice
@@ -53,7 +54,11 @@ def read_text_rows(lines: Iterable[bytes], dtype: np.dtype, count: int, what: st
     if first is None:
         raise SceneError(f"{what}: expected {count} rows, the file has 0: it is truncated; copy or write it again")
     try:
-        rows = np.loadtxt(chain([first], rows_text), dtype, comments=None, ndmin=1)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", DeprecationWarning)  # numpy before 2.3 would store 300 as a byte, as 44
+            rows = np.loadtxt(chain([first], rows_text), dtype, comments=None, ndmin=1)
+    except DeprecationWarning as error:
+        raise SceneError(f"{what}: a value is no whole number of the type that the header says") from error
     except ValueError as error:
         raise SceneError(
             f"{what}: {error} (expected {len(dtype.names or ())} values a row, as the header says)"

@@ -1,0 +1,606 @@
+"""What a stranger's file cannot do, what two processes or a full disk cannot break: docs/security.md, held."""
+
+from __future__ import annotations
+
+import errno
+import importlib
+import json
+import os
+import shutil
+import subprocess
+import sys
+import threading
+import time
+import tracemalloc
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hostile_files import (
+    UNBOUNDED_TOKENIZERS,
+    UNKNOWN_GRAPHS,
+    answers_other_ids,
+    encoder_graph,
+    encoder_with,
+    forged,
+    huge_image,
+    members_of,
+    transforms,
+    with_graph,
+    zeros_npz,
+)
+from labelled_clouds import SPACE, WORDS, make_cloud, room, tough_clouds
+from og_pointcloud_export import write_bundle
+from scenes import write_tiny_capture
+from test_bundle import SCHEMA_2
+from text_models import OUT
+
+import og_pointcloud as og
+from og_pointcloud.bundle.known_graph import KNOWN_GRAPHS, query_graph_digest
+from og_pointcloud.cli import main
+from og_pointcloud.errors import BundleError, FeatureSpaceError, OgPointcloudError, SceneError, printable
+from og_pointcloud.formats.atomic import LOCK, locked, replacing, replacing_folder
+from og_pointcloud.formats.images import image_size, read_rgb
+from og_pointcloud.formats.nerfstudio import read_transforms
+from og_pointcloud.formats.npy import arrays_from_npz, npy_bytes
+from og_pointcloud.formats.points import read_points
+from og_pointcloud.masking.make_masks import MaskSettings, make_masks
+from og_pointcloud.text.encoder import TextEncoder, check_templates
+
+ROOT = Path(__file__).resolve().parents[1]
+ESCAPE = "\x1b]0;owned\x07\x1b[2J"
+
+
+@pytest.fixture(scope="module")
+def bundle(tmp_path_factory):
+    return write_bundle(room(500), tmp_path_factory.mktemp("trust") / "room.ogpc")
+
+
+# A .ogpc is data ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("file", ["new", SCHEMA_2], ids=["new", "old"])
+@pytest.mark.parametrize("change", UNKNOWN_GRAPHS, ids=lambda change: change.__name__)
+def test_no_graph_but_ours_reaches_a_runtime(bundle, tmp_path, monkeypatch, change, file):
+    if file is SCHEMA_2 and change.__name__ in ("divides_by_zero", "names_another_output"):
+        pytest.skip("the older graph has other numbers there")
+    hostile = with_graph(bundle if file == "new" else file, tmp_path / "s.ogpc", change)
+    monkeypatch.setattr("og_pointcloud.ask.query_graph.open_session", None)
+    with pytest.raises(BundleError, match=r"query\.onnx.*not to be trusted"):
+        og.load(hostile)
+
+
+def test_graphs_of_all_libraries_that_wrote_this_schema_are_known():
+    digests = {query_graph_digest(members_of(path)["query.onnx"]) for path in (SCHEMA_2,)}
+    assert digests < KNOWN_GRAPHS
+    assert len(KNOWN_GRAPHS) >= 6, "older files must still open"
+
+
+@pytest.mark.parametrize("part", ["values", "code", "counts"])
+def test_a_graph_with_other_descriptors_than_the_file_says(bundle, tmp_path, part):
+    def edit(manifest):
+        if part == "values":
+            manifest["descriptors"]["offset"] -= 4
+
+    owners = room(500).instances.descriptor_instance
+    changes = {"arrays/instances/descriptor_instance.npy": npy_bytes(owners[::-1].copy())} if part == "code" else {}
+    if part == "counts":
+        one_less = {"arrays/xyz.npy": npy_bytes(room(500).xyz)}
+        forged(bundle, tmp_path / "s.ogpc", one_less, lambda manifest: manifest["counts"].update(instances=8))
+    else:
+        forged(bundle, tmp_path / "s.ogpc", changes, edit)
+    with pytest.raises(BundleError, match=r"other instances or descriptors|expected <[if]4 \(8,\)"):
+        og.load(tmp_path / "s.ogpc")
+
+
+@pytest.mark.parametrize("lie", ["ids", "points", "one instance"])
+def test_a_graph_that_contradicts_the_arrays_is_found_out_on_opening(bundle, tmp_path, lie):
+    cloud, path = room(500), tmp_path / "s.ogpc"
+    if lie == "ids":
+        with_graph(bundle, path, answers_other_ids)
+    elif lie == "points":
+        forged(bundle, path, {"arrays/xyz.npy": npy_bytes(cloud.xyz[::-1].copy())})
+    else:
+        ids = np.where(cloud.instance_ids == 4, -1, cloud.instance_ids).astype(np.int8)
+        forged(bundle, path, {"arrays/instance_ids.npy": npy_bytes(ids)})
+    scene = og.load(path)  # the arrays may be looked at, as by `info`
+    with pytest.raises(BundleError, match="contradicts the file's own points and ids"):
+        og.segment([[0.5, 0.5, 0]], scene=scene)
+
+
+@pytest.mark.filterwarnings("ignore:none of", "ignore:no point")
+def test_whatever_is_drawn_no_honest_file_is_refused(tmp_path):
+    clouds = tough_clouds()
+    for name in ("coincident points of different ids", "all points in one place", "far outliers", "a lattice"):
+        path = write_bundle(clouds[name], tmp_path / "s.ogpc")
+        for _ in range(3):
+            assert len(og.load(path).instances_at(np.zeros((1, 3)))) == 1, name
+
+
+def test_a_manifest_is_bounded_before_it_is_read(bundle, tmp_path):
+    lists = b'{"format":"ogpc","schema_version":2,"x":[' + b"[]," * 800_000 + b"[]]}"
+    path = forged(bundle, tmp_path / "s.ogpc", {})
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("manifest.json", lists)
+    tracemalloc.start()
+    with pytest.raises(BundleError, match=r"manifest\.json has .* bytes; expected at most"):
+        og.load(path)
+    assert tracemalloc.get_traced_memory()[1] < 4 * len(lists)
+    tracemalloc.stop()
+
+
+@pytest.mark.parametrize("name", ["\ud800x", "x" * 1001])
+def test_names_that_are_none(bundle, tmp_path, name):
+    names = json.dumps([name, *WORDS[1:]]).encode()
+    with pytest.raises(BundleError, match="expected whole ones, at most 1000"):
+        og.load(forged(bundle, tmp_path / "s.ogpc", {"vocabulary/names.json": names}))
+
+
+# Text encoders --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("case", UNBOUNDED_TOKENIZERS)
+def test_tokenizers_that_would_grow_without_end(case):
+    tokenizer, says = UNBOUNDED_TOKENIZERS[case]
+    with pytest.raises(OgPointcloudError) as caught:
+        TextEncoder(encoder_with(tokenizer), "evil")
+    assert says in str(caught.value)
+
+
+@pytest.mark.parametrize("templates", [[f"{{}}{k}" for k in range(60_000)], ["{}" * 300_000]])
+def test_templates_are_few_and_short(templates):
+    with pytest.raises(OgPointcloudError, match="expected at most 128 of 400"):
+        TextEncoder(encoder_with(templates=templates), "evil")
+    assert len(check_templates(["a photo of a {}."] * 80)) == 80  # as CLIP was published
+
+
+def test_a_long_word_is_cut_before_templates_repeat_it():
+    encoder = TextEncoder(encoder_with(templates=["{}" * 150]), "long")
+    tracemalloc.start()
+    encoder(["low" * 1_000_000])
+    assert tracemalloc.get_traced_memory()[1] < 3 << 23
+    tracemalloc.stop()
+
+
+def test_what_an_encoder_computes_is_bounded_in_memory():
+    encoder = TextEncoder(encoder_with(graph=encoder_graph(OUT, "outer")), "evil")
+    with pytest.raises(OgPointcloudError, match=r"evil: text_encoder\.onnx does not run"):
+        encoder(["cat"])  # 4 GiB
+
+
+def test_what_an_encoder_computes_is_bounded_in_time(monkeypatch):
+    monkeypatch.setattr("og_pointcloud.models.LONGEST_RUN_S", 0.2)
+    encoder = TextEncoder(encoder_with(graph=encoder_graph(OUT, "long")), "evil")
+    with pytest.raises(OgPointcloudError, match=r"does not run \(TimeoutError\)"):
+        encoder(["cat"])
+
+
+def test_a_carried_encoder_of_another_space_answers_nothing(tmp_path):
+    files = encoder_with(feature_space="other/space", width=OUT)
+    path = write_bundle(room(100), tmp_path / "s.ogpc")
+    path = forged(path, path, {f"text_encoder/{name}": data for name, data in files.items()})
+    with pytest.raises(FeatureSpaceError, match=f"of feature space 'other/space', the scene of '{SPACE}'"):
+        og.segment(path, ["low"])
+
+
+# Files of captures ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", ["jpg", "bmp", "webp", "tif", "png"])
+def test_sizes_come_from_headers_and_are_bounded(tmp_path, kind):
+    cv2 = pytest.importorskip("cv2")
+    small, large = tmp_path / f"small.{kind}", tmp_path / f"large.{kind}"
+    cv2.imwrite(str(small), np.zeros((31, 57, 3), np.uint8))
+    assert image_size(small) == (57, 31)
+    large.write_bytes(huge_image(kind))
+    for read in (image_size, lambda file: read_rgb(file, (60_000, 17_000))):
+        with pytest.raises(SceneError, match="60000x17000 pixels; expected at most"):
+            read(large)
+
+
+def test_a_small_file_does_not_unpack_to_a_large_one(tmp_path):
+    for rows, refused in ((30_000_000, True), (1_000_000, False)):
+        (tmp_path / "f.npz").write_bytes(zeros_npz(rows))
+        if refused:
+            with pytest.raises(ValueError, match="made to fill memory"):
+                arrays_from_npz(tmp_path / "f.npz", ["view0"], 1 << 32)
+        else:
+            assert len(arrays_from_npz(tmp_path / "f.npz", ["view0"], 1 << 32)[0]["view0"]) == rows
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        (transforms(transform_matrix=[[10**400] * 4] * 4), "expected 4 rows of 4 numbers"),
+        (b" " * (1 << 26) + transforms(), "expected at most 67108864"),
+    ],
+)
+def test_pose_files_that_are_none(tmp_path, content, says):
+    (tmp_path / "transforms.json").write_bytes(content)
+    with pytest.raises(SceneError, match=says):
+        read_transforms(tmp_path / "transforms.json", lambda _: (48, 36))
+
+
+def test_a_pose_file_with_a_mark_before_it(tmp_path):
+    (tmp_path / "transforms.json").write_bytes(b"\xef\xbb\xbf" + transforms())
+    assert len(read_transforms(tmp_path / "transforms.json", lambda _: (48, 36)).images) == 1
+
+
+def test_a_name_too_long_for_any_file_is_a_missing_image(tiny_capture):
+    file = tiny_capture.folder / "transforms.json"
+    content = json.loads(file.read_text())
+    content["frames"][0]["file_path"] = "i" * 300 + "/view0.png"
+    file.write_text(json.dumps(content))
+    with pytest.warns(UserWarning, match=r"1 of 6 images are listed but not found, e\.g\. 'i{77}\.\.\.'"):
+        assert len(og.read_capture(tiny_capture.folder).views) == 6
+
+
+def test_a_ply_of_thousands_of_properties(tmp_path):
+    properties = b"".join(b"property uchar p%d\n" % k for k in range(12_000))
+    header = b"ply\nformat binary_little_endian 1.0\nelement vertex 1\n" + properties + b"end_header\n"
+    (tmp_path / "a.ply").write_bytes(header + bytes(12_000))
+    with pytest.raises(SceneError, match="more than 1024 properties"):
+        read_points(tmp_path / "a.ply")
+
+
+# Foreign text ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def rude(bundle, tmp_path_factory):
+    """A file whose every text would write to the terminal's title and clear it."""
+
+    def edit(manifest):
+        manifest.update(written_by=ESCAPE * 1000, feature_space=f"{ESCAPE}'; touch OWNED; '")
+        note = {"what": ESCAPE, "why": ESCAPE * 1000}
+        stages = [{"name": ESCAPE, "seconds": 1.0}]
+        manifest["provenance"].update(warnings=[ESCAPE * 1000], stages=stages, left_out=[note])
+
+    names = ["=cmd|' /C calc'!A0", f"{ESCAPE}red", "chair\u202etxt", "A" * 1000, "+1"]
+    changes = {"vocabulary/names.json": json.dumps(names).encode()}
+    return forged(bundle, tmp_path_factory.mktemp("rude") / "s.ogpc", changes, edit)
+
+
+@pytest.mark.parametrize(
+    "command",
+    [["info"], ["info", "--json"], ["instances"], ["segment"], ["segment", "--labels", "foo"], ["vocabulary", "list"]],
+    ids=" ".join,
+)
+def test_nothing_in_a_file_reaches_the_terminal_as_it_is(rude, capsys, command):
+    main([*command, str(rude)] if "--labels" not in command else ["segment", str(rude), *command[1:]])
+    said = capsys.readouterr()
+    for text in (said.out, said.err):
+        assert all(line.isprintable() for line in text.split("\n"))
+    assert len(said.out) < 20_000 or command[-1] == "--json"
+    assert "\\x1b" in said.out + said.err or command == ["instances"] or "u001b" in said.out
+    if command[-1] == "--json":
+        assert json.loads(said.out)["words"][1] == f"{ESCAPE}red"
+    if "--labels" in command:
+        assert "touch OWNED; '\"'\"''" in said.err, "the command that is advised quotes what it names"
+
+
+def test_cells_of_tables_are_no_formulas(rude, tmp_path):
+    main(["instances", str(rude), "-o", str(tmp_path / "t.csv")])
+    text = (tmp_path / "t.csv").read_text()
+    assert "'=cmd" in text
+    assert ",=cmd" not in text
+    assert '"=cmd' not in text
+
+
+def test_printable():
+    assert printable("mug \U0001f44d") == "mug \U0001f44d"
+    assert printable("\x1b\ud800\u202e\n") == "\\x1b\\ud800\\u202e\\n"
+    assert printable("\x1b" * 10**7, 20) == "\\x1b\\x1b\\x1b\\x1b\\..."
+
+
+# Files that are written, folders that are worked in -------------------------------------------------------------------
+
+
+def test_threads_that_write_one_path_leave_one_whole_file(tmp_path):
+    path, failed = tmp_path / "f", []
+
+    def write(byte):
+        try:
+            for _ in range(30):
+                with replacing(path) as file:
+                    for _ in range(8):
+                        file.write(bytes([byte]) * 4096)
+                        file.flush()
+        except OSError as error:
+            failed.append(error)
+
+    threads = [threading.Thread(target=write, args=(byte,)) for byte in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert failed == []
+    assert len(set(path.read_bytes())) == 1
+    assert path.stat().st_size == 8 * 4096
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_temporary_names_cannot_be_guessed_and_links_are_not_followed(tmp_path, monkeypatch):
+    (tmp_path / "victim").write_text("kept")
+    monkeypatch.setattr("secrets.token_hex", lambda _: "00000000")
+    (tmp_path / ".f.00000000.tmp").symlink_to(tmp_path / "victim")
+    with pytest.raises(FileExistsError), replacing(tmp_path / "f") as file:
+        file.write(b"gone")
+    assert (tmp_path / "victim").read_text() == "kept"
+
+
+def test_what_killed_runs_left_is_removed_and_what_others_write_is_not(tmp_path):
+    old, young, foreign = tmp_path / ".f[1].1.tmp", tmp_path / ".f[1].2.tmp", tmp_path / ".g.1.tmp"
+    for file in (old, young, foreign):
+        file.write_bytes(b"half")
+    for file in (old, foreign):
+        os.utime(file, (0, 0))
+    with replacing(tmp_path / "f[1]") as file:
+        os.utime(next(path for path in tmp_path.glob(".f*") if path not in (old, young)), (0, 0))
+        with replacing(tmp_path / "f[1]") as other:
+            other.write(b"other")
+        file.write(b"whole")
+    assert sorted(path.name for path in tmp_path.iterdir()) == [".f[1].2.tmp", ".g.1.tmp", "f[1]"]
+    assert (tmp_path / "f[1]").read_bytes() == b"whole"
+
+
+def test_a_full_disk_is_told_with_the_path(tmp_path):
+    with pytest.raises(OSError, match=r"No space left.*s\.ply"), replacing(tmp_path / "s.ply"):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_is_whole_or_not_there(tmp_path):
+    (tmp_path / ".bag.1.tmp").mkdir()
+    (tmp_path / ".bag.1.tmp" / "half").write_text("x")
+    with pytest.raises(ZeroDivisionError), replacing_folder(tmp_path / "bag") as folder:
+        folder.mkdir(1 // 0)
+    assert list(tmp_path.iterdir()) == []
+    with replacing_folder(tmp_path / "bag") as folder:
+        folder.mkdir()
+        (folder / "bag.mcap").write_text("x")
+    assert [path.name for path in tmp_path.rglob("*")] == ["bag", "bag.mcap"]
+
+
+def test_one_run_at_a_time_in_a_folder(tmp_path):
+    with locked(tmp_path / "work"):
+        with (
+            pytest.raises(OgPointcloudError, match=f"in use by process {os.getpid()}, since"),
+            locked(tmp_path / "work"),
+        ):
+            pass
+        assert (tmp_path / "work" / LOCK).exists(), "the second has not removed the first one's lock"
+    with locked(tmp_path / "work"):
+        pass
+
+
+def test_masks_twice_at_once(tiny_capture):
+    (tiny_capture.folder / "mask_features.npz").unlink()
+    shutil.rmtree(tiny_capture.folder / "masks")
+    with locked(tiny_capture.folder / "masks.work"), pytest.raises(OgPointcloudError, match="one run at a time"):
+        make_masks(tiny_capture.folder, MaskSettings(encoder=None), say=lambda _: None)
+
+
+@pytest.mark.parametrize("name", ["masks", "masks.work"])
+def test_nothing_is_written_through_links_of_a_capture(tiny_capture, tmp_path, name):
+    (tiny_capture.folder / "mask_features.npz").unlink()
+    shutil.rmtree(tiny_capture.folder / "masks")
+    (tmp_path / "elsewhere").mkdir()
+    (tiny_capture.folder / name).symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(OgPointcloudError, match="nothing is written through links"):
+        make_masks(tiny_capture.folder, MaskSettings(encoder=None), say=lambda _: None, overwrite=True)
+    assert list((tmp_path / "elsewhere").iterdir()) == []
+
+
+def test_masks_that_were_killed_before_they_were_put_together(tiny_capture):
+    capture = tiny_capture.folder
+    (capture / "mask_features.npz").unlink()
+    shutil.rmtree(capture / "masks")
+    (capture / "masks").write_text("in the way")
+    with pytest.raises(OSError):
+        make_masks(capture, MaskSettings(encoder=None), say=lambda _: None)
+    (capture / "masks").unlink()
+    made = make_masks(capture, MaskSettings(encoder=None), say=lambda _: None)
+    assert made.done_before == made.images == 6
+    assert not (capture / "masks.work").exists()
+
+
+def test_a_fit_that_cannot_be_written_is_kept(tiny_capture, tmp_path, capsys, monkeypatch):
+    from og_pointcloud_export import writer
+
+    def full(path):
+        if Path(path).parent == tmp_path / "full":
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
+        return replacing(path)
+
+    monkeypatch.setattr(writer, "replacing", full)
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    monkeypatch.setattr("tempfile.tempdir", None)
+    (tmp_path / "full").mkdir()
+    assert main(["fit", str(tiny_capture.folder), "-o", str(tmp_path / "full" / "s.ogpc")]) == 2
+    said = capsys.readouterr().err
+    assert "cannot be written (No space left on device): the fit is kept in" in said
+    assert len(og.load(said.partition("kept in '")[2].partition("'")[0]).instances) > 0
+
+
+# No path of this machine in a file that travels -----------------------------------------------------------------------
+
+
+def test_files_that_travel_hold_no_path(tmp_path):
+    capture = write_tiny_capture(tmp_path / "SECRET" / "capture")
+    words = dict(np.load(capture.folder / "text_features.npz"))
+    np.savez(capture.folder / "text_features.npz", **{**words, "feature_space": np.array("another")})
+    path = tmp_path / "s.ogpc"
+    work = tmp_path / "SECRET" / "work"
+    assert main(["fit", str(capture.folder), "-o", str(path), "--work", str(work)]) == 0
+    members = members_of(path)
+    assert b"text_features.npz is of feature space 'another'" in members["manifest.json"]
+    assert not any(b"SECRET" in data for data in members.values())
+
+
+def test_records_of_masks_name_models_without_their_folders(tiny_capture, tmp_path):
+    source = tmp_path / "SECRET" / "given"
+    source.parent.mkdir()
+    (tiny_capture.folder / "masks").rename(source)
+    (tiny_capture.folder / "mask_features.npz").unlink()
+    make_masks(tiny_capture.folder, MaskSettings(proposer=str(source), encoder=None), say=lambda _: None)
+    record = (tiny_capture.folder / "masks" / "made.json").read_text()
+    assert json.loads(record)["proposer"] == "given"
+    assert "SECRET" not in record
+
+
+def test_a_dataset_names_its_scene_without_its_folder_and_opens_no_other(bundle, tmp_path, monkeypatch):
+    pv = pytest.importorskip("pyvista")
+    from og_pointcloud_pyvista.files import read_ogpc
+
+    from og_pointcloud.ask.hosts import SCENE_FIELD, carried_scene
+
+    mesh = read_ogpc(bundle)
+    field = str(mesh.field_data[SCENE_FIELD][0])
+    assert "/" not in field
+    assert carried_scene(mesh) == bundle.resolve()
+    stranger = pv.PolyData(np.zeros((1, 3)))
+    opened = []
+    monkeypatch.setattr("og_pointcloud.ask.labelled_scene.load", opened.append)
+    for name in (str(bundle), "\\\\server\\share\\s.ogpc", "s.ogpc", "../room.ogpc"):
+        stranger.field_data[SCENE_FIELD] = [name]
+        with pytest.raises(OgPointcloudError, match="was not opened here and is not in this folder"):
+            og.segment(stranger, ["apple"])
+    assert opened == []
+    monkeypatch.chdir(bundle.parent)
+    assert carried_scene(stranger) == Path(bundle.name)
+
+
+# Environments ---------------------------------------------------------------------------------------------------------
+
+
+def test_no_home(monkeypatch, bundle, capsys):
+    def fail():
+        raise RuntimeError("Could not determine home directory")
+
+    monkeypatch.setattr(Path, "home", fail)
+    for name in ("HF_HOME", "HF_HUB_CACHE", "XDG_CACHE_HOME"):
+        monkeypatch.delenv(name, raising=False)
+    assert main(["segment", str(bundle), "--labels", "foo"]) == 2
+    assert "not among the 5 known words" in capsys.readouterr().err
+    assert main(["models"]) == 0
+
+
+def test_no_folder_for_compiled_code(monkeypatch):
+    numba = pytest.importorskip("numba")
+    from og_pointcloud import kernels
+
+    real = numba.njit
+
+    def without_locator(**options):
+        def decorate(function):
+            if options.get("cache"):
+                raise RuntimeError("cannot cache function: no locator available")
+            return real(**options)(function)
+
+        return decorate
+
+    monkeypatch.setattr(kernels.numba, "njit", without_locator)
+    assert kernels.njit(cache=True)(lambda value: value + 1)(2) == 3
+
+
+def program(*arguments, **environment):
+    code = "import sys; from og_pointcloud.cli import main; sys.exit(main(sys.argv[1:]))"
+    return [sys.executable, "-c", code, *map(str, arguments)], {**os.environ, **environment}
+
+
+@pytest.mark.parametrize("encoding", ["latin-1", "ascii", "cp1252"])
+def test_output_of_few_characters(tmp_path, encoding):
+    cloud = make_cloud(np.zeros((1, 3)), [0], words=("café", "日本", "😀"))
+    path = write_bundle(cloud, tmp_path / "s.ogpc")
+    command, environment = program("vocabulary", "list", path, PYTHONIOENCODING=encoding)
+    done = subprocess.run(command, env=environment, capture_output=True)
+    assert done.returncode == 0, done.stderr
+    assert b"\\u65e5\\u672c" in done.stdout
+
+
+def test_a_reader_that_goes_away(bundle):
+    command, environment = program("info", bundle)
+    process = subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    process.stdout.close()
+    assert process.wait() == 141
+    assert process.stderr.read() == b""
+
+
+def test_an_error_nobody_foresaw_is_one_line(bundle, capsys, monkeypatch):
+    def fail(*_, **__):
+        raise ZeroDivisionError("\x1bdivision\n" + "x" * 10_000)
+
+    monkeypatch.setattr("og_pointcloud.ask.labelled_scene.segment", fail)
+    assert main(["segment", str(bundle)]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("error: ZeroDivisionError: \\x1bdivision")
+    assert said.count("\n") == 1
+    assert len(said) < 500
+    with pytest.raises(ZeroDivisionError):
+        main(["--debug", "segment", str(bundle)])
+
+
+# Streams --------------------------------------------------------------------------------------------------------------
+
+
+def resident() -> int:
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+
+def stream(bundle, sizes):
+    ask = og.Segmenter(bundle, ["apple", "pear"])
+    points = np.tile(room(500).xyz, (200, 1)).astype(np.float64)
+    for size in sizes:
+        ask(points[:size])
+
+
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="only Linux tells")
+@pytest.mark.filterwarnings("ignore:none of")
+def test_memory_is_flat_over_frames_of_many_sizes(bundle):
+    stream(bundle, [1500] * 200)
+    before = resident()
+    stream(bundle, range(1, 1501))
+    assert resident() - before < 5 << 20  # 7 kB a size is 10 MB
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="only Linux tells")
+@pytest.mark.filterwarnings("ignore:none of")
+def test_a_stream_of_minutes(bundle):
+    """Frames of any size for two minutes, some with NaN, infinity or none: memory ends where it began."""
+    random, ask = np.random.default_rng(0), og.Segmenter(bundle, ["apple", "pear"])
+    points = np.tile(room(500).xyz, (40, 1)).astype(np.float64)
+    end, warm, before, frames = time.monotonic() + 120, time.monotonic() + 20, 0, 0
+    while time.monotonic() < end:
+        frame = points[: random.integers(0, len(points))] + random.normal(size=3) * random.choice([0, 0.1, 100])
+        if len(frame) and frames % 7 == 0:
+            frame[random.integers(0, len(frame), 5)] = random.choice([np.nan, np.inf, -1e300])
+        assert len(ask(frame).labels) == len(frame)
+        frames += 1
+        if not before and time.monotonic() > warm:
+            before = resident()
+    assert frames > 1000
+    assert resident() - before < 12 << 20
+
+
+def test_turns_of_any_length():
+    pytest.importorskip("rosbags")
+    transforms_ = importlib.import_module("og_pointcloud_ros.transforms")
+    np.testing.assert_allclose(
+        transforms_.rotation_matrix((0, 0, 2, 2)), [[0, -1, 0], [1, 0, 0], [0, 0, 1]], atol=1e-12
+    )
+    for wrong in ((0, 0, 0, 0), (np.nan, 0, 0, 1)):
+        with pytest.raises(transforms_.TransformError, match="expected a quaternion of length 1"):
+            transforms_.rotation_matrix(wrong)
+
+
+def test_frames_that_hang_on_thousands_of_others():
+    pytest.importorskip("rosbags")
+    tree = importlib.import_module("og_pointcloud_ros.transforms").TransformTree()
+    for k in range(3000):
+        tree.add(f"f{k}", f"f{k + 1}", (0, 0, 1), (0, 0, 0, 1), static=True)
+    with pytest.raises(OgPointcloudError, match="hangs on more than 1000 frames"):
+        tree.lookup("f0", "f3000", 0)
+    assert tree.lookup("f0", "f500", 0)[2, 3] == 500
