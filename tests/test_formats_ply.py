@@ -214,7 +214,7 @@ def test_ascii_rows_that_do_not_fit_the_header(tmp_path, body, message):
 
 def test_ascii_values_outside_their_type_are_refused(tmp_path):
     header = "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty uchar red\n"
-    with pytest.raises(SceneError, match="'300' to uint8|no whole number of the type"):
+    with pytest.raises(SceneError, match=r"'300' to uint8|no whole number of the type"):
         read_ply(write(tmp_path / "a.ply", header, b"1 300\n"))
 
 
