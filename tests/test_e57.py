@@ -171,7 +171,7 @@ def test_truncated_empty_and_foreign_files_are_one_error_and_stay(tmp_path):
     whole = (tmp_path / "whole.e57").read_bytes()
     for data in (whole[:48], whole[: len(whole) // 2], whole[:-100], whole[:3000] + b"x" * 8 + whole[3008:]):
         (tmp_path / "a.e57").write_bytes(data)
-        with pytest.raises(SceneError, match=r"a\.e57: not a whole E57 file \(.*: copy or export it again"):
+        with pytest.raises(SceneError, match=r"a\.e57: not a whole E57 file \([^\\]{9,120}\): copy or export"):
             read_points(tmp_path / "a.e57")
         assert (tmp_path / "a.e57").read_bytes() == data
     for data in (b"", b"PK\x03\x04 not this"):

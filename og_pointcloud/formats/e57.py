@@ -108,7 +108,8 @@ def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
         except (OgPointcloudError, OSError, MemoryError):
             raise
         except Exception as error:  # libE57's own, and those of its bindings
-            raise SceneError(f"not a whole E57 file ({error!s:.200}): copy or export it again") from None
+            what = (str(error).splitlines() or [""])[0]
+            raise SceneError(f"not a whole E57 file ({what:.200}): copy or export it again") from None
         finally:
             if file is not None:
                 file.close()

@@ -229,6 +229,8 @@ def _numbers(line: Mapping[str, str | None]) -> dict[str, float]:
     values = {}
     for column in COLUMNS:
         text = line.get(column)
+        if text is None and column in line:
+            raise SceneError(f"it ends before {column}: the file is cut, copy or export it again")
         try:
             values[column] = float(text or 0)
         except (TypeError, ValueError):
