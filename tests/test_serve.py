@@ -79,6 +79,17 @@ def test_text_of_a_file_is_never_html(viser):
         assert name not in text
 
 
+def test_the_legend_has_the_colors_of_the_points(viser):
+    from og_pointcloud.show.serve import legend_html
+
+    live = LiveScene(og.LabelledScene.from_cloud(room(300)))
+    shown = legend_html(live)
+    for name, color, count in live.legend():
+        red, green, blue = color
+        assert f'background:rgb({red}, {green}, {blue})"></i><span>{name}</span>' in shown
+        assert f">{count:,}</span>" in shown
+
+
 @pytest.mark.parametrize(
     ("options", "said"),
     [

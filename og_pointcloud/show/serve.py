@@ -38,7 +38,7 @@ SWATCH = '<i style="flex:none;width:12px;height:12px;border-radius:50%;backgroun
 SIDE = '<span style="margin-left:auto;opacity:.6">{}</span>'
 BAR = (
     ROW.format("<span>{}</span>" + SIDE.format("{:.2f}"))
-    + '<progress style="width:100%;height:5px" value="{}"></progress>'
+    + '<progress style="display:block;width:100%;height:5px" value="{}"></progress>'
 )
 GREY = '<div style="opacity:.6">{}</div>'
 CARD = '<div style="padding:0 12px 8px;font-size:13px;overflow-wrap:anywhere">{}</div>'
@@ -261,7 +261,7 @@ def answer_html(answer: Answer) -> str:
 def legend_html(live: LiveScene) -> str:
     """Labels with their colors and numbers of points."""
     rows = [
-        ROW.format(SWATCH.format(color) + f"<span>{html.escape(name)}</span>" + SIDE.format(f"{count:,}"))
+        ROW.format(SWATCH.format(tuple(color)) + f"<span>{html.escape(name)}</span>" + SIDE.format(f"{count:,}"))
         for name, color, count in live.legend()
     ]
     return CARD.format("".join(rows))
