@@ -272,11 +272,12 @@ def _require_one_frame(asked: Presence) -> None:
 @dataclass(frozen=True)
 class _Thing:
     """Instances of one visit that are pieces of one thing that left or came, the largest first. look: by the points
-    that show so. place: (3,) their mean, world coordinates."""
+    that show so. place: (3,) their mean, world coordinates; points: how many."""
 
     pieces: tuple[int, ...]
     look: Look
     place: NDArray[np.float64]
+    points: int
 
 
 def _decide(earlier: Visit, later: Visit, of_earlier: Evidence, of_later: Evidence) -> Comparison:
@@ -320,7 +321,7 @@ def _things(visit: Visit, candidates: list[int], through: NDArray[np.bool_], typ
     for first in dict.fromkeys(group.values()):
         pieces = sorted((k for k in candidates if group[k] == first), key=lambda k: (-len(rows[k]), k))
         xyz = visit.cloud.xyz_world[np.concatenate([rows[k] for k in pieces])]
-        things.append(_Thing(tuple(pieces), looks[pieces[0]], xyz.mean(axis=0)))
+        things.append(_Thing(tuple(pieces), looks[pieces[0]], xyz.mean(axis=0), len(xyz)))
     return things
 
 
@@ -346,6 +347,8 @@ def _with_scattered(gone: list[_Thing], new: list[_Thing], pairs: dict[int, int]
                 continue
             near = np.linalg.norm(thing.place - new[n].place) < gone[g].look.length
             if near and one_color(gone[g].look, thing.look) and likeness(gone[g].look, thing.look, typical) > ALIKE:
-                things[n] = replace(things[n], pieces=(*things[n].pieces, *thing.pieces))
+                one, count = things[n], things[n].points + thing.points
+                place = (one.points * one.place + thing.points * thing.place) / count
+                things[n] = replace(one, pieces=(*one.pieces, *thing.pieces), place=place, points=count)
                 things[other] = replace(thing, pieces=())
     return things
