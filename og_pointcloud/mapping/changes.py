@@ -42,6 +42,8 @@ __all__ = ["Changes", "Evidence", "Moved", "Visit", "compare", "compare_visits"]
 
 TOLERANCE = 0.5
 """Spacings at right angles to a surface up to which a point is of it."""
+SCATTER = 2.0
+"""Standard deviations of the points off their surface, where that is more: of dense and noisy clouds."""
 MOST = 0.5
 """Share of an instance's telling points that decides."""
 FEWEST_POINTS, LEAST_SHARE = 5, 0.05
@@ -235,7 +237,8 @@ def compare_visits(
     a.space.require(b.space, "later descriptors")
     if not b.cameras and later.depth is None:
         raise SceneError("the later visit does not know its cameras, so not what it looked at: fit its capture again")
-    tolerance = TOLERANCE * max(a.spacing, b.spacing)
+    scatter = max(earlier.surface.scatter, later.surface.scatter)
+    tolerance = max(TOLERANCE * max(a.spacing, b.spacing), SCATTER * scatter)
     shown, known = Presence(len(a), tolerance), Presence(len(b), tolerance)
     for view in earlier.measured():
         shown.observe(earlier.xyz, view)

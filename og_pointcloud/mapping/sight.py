@@ -74,14 +74,15 @@ class DiscSurface:
     """A cloud as a surface: each point a disc in the plane of its neighbours.
 
     xyz: (n, 3) float32, each moved onto the plane of its neighbours as far as noise goes. spacing: typical distance of
-    neighbours. noise: standard deviation of the planes.
+    neighbours. scatter: standard deviation of the points off their planes, before that; noise: of the
+    planes.
     """
 
     def __init__(self, xyz: NDArray[np.float32], around: Neighbourhood | None = None) -> None:
         around = neighbourhood(xyz, GeometrySettings()) if around is None else around
         self.spacing = float(np.median(around.spacing))
         self.normal, height, off = _planes(xyz, around.index[:, :PLANE_POINTS])
-        noise = float(np.median(off))
+        noise = self.scatter = float(np.median(off))
         # Onto the planes, as far as noise goes: a mean of many readings is more exact than each of them.
         shift = np.clip(height, -MOST_SHIFT * noise, MOST_SHIFT * noise)
         self.xyz = (xyz - shift[:, None] * self.normal).astype(np.float32)
