@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from visits import BIN, CHEST, CRATE, PARCEL, SPACE, cameras, frames, instance_of, moved, scene
+from visits import BIN, CHEST, CRATE, PARCEL, SPACE, cameras, frames, instance_of, moved, scene, surface
 
 import og_pointcloud as og
 from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError, SceneError
@@ -272,3 +272,13 @@ def test_a_saved_map_is_a_file_like_any_other(grown, tmp_path):
     read = og.load(path)
     np.testing.assert_array_equal(read.instance_ids, mapper.snapshot().instance_ids)
     assert len(read.cloud.cameras) == 14
+
+
+def test_a_noisy_cloud_is_still_where_it_was():
+    """Noise of half a spacing: what a point is off its surface is no absence."""
+    xyz, _ = surface(THINGS, seed=12)
+    noisy = xyz + np.random.default_rng(0).normal(0, 0.015, xyz.shape)
+    mapper = og.Mapper(cloud=noisy, feature_space=SPACE)
+    changes = [mapper.integrate(frame) for frame in frames(THINGS)]
+    assert all(change.gone == () for change in changes)
+    assert mapper.points > 0.95 * len(noisy)

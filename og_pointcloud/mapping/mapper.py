@@ -26,7 +26,7 @@ from og_pointcloud.errors import SceneError
 from og_pointcloud.kernels import njit, prange
 from og_pointcloud.mapping import map_state
 from og_pointcloud.mapping.batch import label
-from og_pointcloud.mapping.changes import FEWEST_POINTS, MOST, TOLERANCE, Changes, Moved, Visit, compare_visits
+from og_pointcloud.mapping.changes import FEWEST_POINTS, MOST, SCATTER, TOLERANCE, Changes, Moved, Visit, compare_visits
 from og_pointcloud.mapping.frame import CheckedFrame, Frame, checked, require_same_place
 from og_pointcloud.mapping.kept_views import KeptViews, Moment
 from og_pointcloud.mapping.likeness import ALIKE, Look, likeness, spread_of
@@ -35,7 +35,7 @@ from og_pointcloud.mapping.map_record import MapRecord
 from og_pointcloud.mapping.merging import merge
 from og_pointcloud.mapping.presence import Presence
 from og_pointcloud.mapping.renumber import matched_ids, with_ids
-from og_pointcloud.mapping.sight import AGREES, MeasuredView, lens_of, states_of_points, view_of_depth
+from og_pointcloud.mapping.sight import AGREES, DiscSurface, MeasuredView, lens_of, states_of_points, view_of_depth
 from og_pointcloud.mapping.tracks import NO_TRACK, PointVotes, Track, Tracks
 from og_pointcloud.mapping.voxels import VoxelPoints
 from og_pointcloud.rendering.geometry import Neighbourhood, isotropic, neighbourhood
@@ -219,7 +219,8 @@ class Mapper:
         self._points = VoxelPoints(self._spacing, grows)
         self._points.add_known(xyz, rgb)
         self._around = len(xyz), around
-        self._presence.tolerance = TOLERANCE * self._spacing
+        scatter = DiscSurface(xyz, around).scatter if len(xyz) > 1 else 0.0
+        self._presence.tolerance = max(TOLERANCE * self._spacing, SCATTER * scatter)
         self._grow()
 
     @property
@@ -365,7 +366,12 @@ class Mapper:
             "spacing": self._spacing,
             "grows": points.grows,
         }
-        values |= {"sequence": self._sequence, "stamp": self._stamp, "space": (self._space.name, self._space.width)}
+        values |= {
+            "tolerance": self._tolerance,
+            "sequence": self._sequence,
+            "stamp": self._stamp,
+            "space": (self._space.name, self._space.width),
+        }
         return arrays, values
 
     def _restore(self, arrays: dict[str, NDArray[Any]], values: dict[str, Any]) -> None:
@@ -377,7 +383,7 @@ class Mapper:
         map_state.set_columns("points", self._points, POINT_COLUMNS, arrays)
         map_state.set_columns("votes", self._votes, VOTE_COLUMNS, arrays)
         map_state.set_columns("presence", self._presence, PRESENCE_COLUMNS, arrays)
-        self._presence.tolerance = TOLERANCE * values["spacing"]
+        self._presence.tolerance = values["tolerance"]
         self._tracks = map_state.tracks_from(arrays, values)
         self._kept = map_state.kept_from(arrays, self._space.width)
         self._born, self._origin = arrays["born"].copy(), arrays["origin"].copy()
