@@ -112,6 +112,18 @@ def test_another_exposure_and_noise_raise_no_doubt():
     assert doubts(with_views(tiled_room(3), image=changed)) == {}
 
 
+def with_black_rims(scene):
+    column, row = np.meshgrid(np.arange(96) - 47.5, np.arange(72) - 35.5)
+    inside = (np.hypot(column / 48, row / 36) < 0.9)[..., None]
+    return with_views(scene, image=lambda view, i, views: view.image_rgb() * inside.astype(np.uint8))
+
+
+def test_what_lies_beyond_the_rim_of_a_lens_is_not_held_against_the_poses():
+    right, turned = with_black_rims(tiled_room(2)), with_black_rims(faulty("aligned=0,0,0,0,0,5,1"))
+    assert verdicts(check_poses(right)) == {"poses": "ok", "alignment": "ok"}
+    assert verdicts(check_poses(turned)) == {"poses": "ok", "alignment": "doubt"}
+
+
 @pytest.mark.parametrize("is_grey", [True, False])
 def test_intensities_and_colors_of_classes_are_not_held_against_photographs(is_grey):
     scene, random = tiled_room(1), np.random.default_rng(0)

@@ -26,8 +26,9 @@ Score = Callable[[Sequence[Camera]], float]
 TRIED_VIEWS, TRIED_POINTS = 8, 4000
 PHOTOGRAPHS_FIT = (0.8, 0.4, 0.5)
 """Share of comparisons, gap and correlation from which a conversion fits."""
-MASKS_FIT, VOUCHING = (0.85, 0.12), (0.85, 0.15)
+MASKS_FIT, VOUCHING = (0.9, 0.18), (0.85, 0.15)
 """Share and gap from which it does by masks; and from which masks vouch for poses that photographs doubt."""
+FEWEST_COMPARED = 30
 BETTER = 0.1
 """It fits by so much more than what the files say, of a correlation or of mutual information."""
 STEPS_PER_DOUBLING = 6
@@ -43,7 +44,7 @@ SPANS = {"scale": 11, "intrinsics": 4, "focal": 5}
 
 def fits(found: Consistency, needed: tuple[float, float] = MASKS_FIT) -> bool:
     """Whether masks agree so far."""
-    return found.compared > 0 and found.share >= needed[0] and found.gap >= needed[1]
+    return found.compared >= FEWEST_COMPARED and found.share >= needed[0] and found.gap >= needed[1]
 
 
 def best_conversion(photographs: Photographs | None, maps: MaskMaps | None) -> Repairs:

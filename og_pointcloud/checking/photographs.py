@@ -18,10 +18,14 @@ from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.images import require_cv2
 from og_pointcloud.scene import Camera
 
-__all__ = ["Likeness", "Photographs", "read_photographs"]
+__all__ = ["BLACK", "Likeness", "Photographs", "read_photographs"]
 
 FEWEST_CELLS = 30
 """A drawing of fewer cells says nothing."""
+BLACK = 1.0
+"""Of 255: what no light fell on is darker."""
+SOME_BLACK = 0.02
+"""Share of a cell that is black, above which its mean says little of what is there."""
 FLAT = 3.0
 """Standard deviation of colours, of 255, below which there is nothing to compare."""
 ALIKE = 0.95
@@ -124,11 +128,14 @@ def drawing(points: Seen, rgb: NDArray[np.float32]) -> tuple[NDArray[np.float32]
 
 
 def shrunk(image: NDArray[np.uint8], side: int) -> NDArray[np.float32]:
-    """The image with its longer side that long at most, averaged."""
+    """The image with its longer side that long at most, averaged; black where a part of what is averaged is."""
     scale = min(1.0, side / max(image.shape[:2]))
     width, height = (max(1, round(scale * length)) for length in image.shape[1::-1])
     cv2 = require_cv2()
-    return np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA), np.float32)
+    small = np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA), np.float32)
+    black = cv2.inRange(image, (0, 0, 0), (0, 0, 0))  # 255 where it is
+    small[cv2.resize(black, (width, height), interpolation=cv2.INTER_AREA) > 255 * SOME_BLACK] = 0
+    return small
 
 
 def _image(view) -> NDArray[np.uint8] | None:  # noqa: ANN001
@@ -148,12 +155,14 @@ def _rivals(grid: NDArray[np.float32], grids: list[NDArray[np.float32]]) -> list
 
 
 def _correlation(drawing: NDArray[np.float32], photograph: NDArray[np.float32], cells: NDArray[np.intp]) -> float:
-    """Of the colours in the cells, all channels together, each less its mean; 0 where there is too little."""
-    if len(cells) < FEWEST_CELLS:
-        return 0.0
-    a = drawing - drawing.mean(axis=0)
+    """Of the colours in the cells, all channels together, each less its mean; 0 where there is too little. Black cells
+    are left out: beyond a lens's rim a photograph shows nothing."""
     b = photograph.reshape(-1, 3)[cells]
-    b = b - b.mean(axis=0)
+    shown = b.max(axis=1, initial=0) >= BLACK
+    if np.count_nonzero(shown) < FEWEST_CELLS:
+        return 0.0
+    a, b = drawing[shown], b[shown]
+    a, b = a - a.mean(axis=0), b - b.mean(axis=0)
     return float((a * b).sum() / np.sqrt((a * a).sum() * (b * b).sum() + 1e-6))
 
 

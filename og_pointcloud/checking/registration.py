@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud.checking.photographs import Photographs, shrunk
+from og_pointcloud.checking.photographs import BLACK, Photographs, shrunk
 from og_pointcloud.checking.sample import seen
 from og_pointcloud.formats.repairs import Repair, rotation_of_vector
 from og_pointcloud.scene import Camera
@@ -152,11 +152,12 @@ class Registration:
         """(points, 3) photograph less colours, each less its mean and of length one; the photograph's slopes there, of
         the same scale, (points, 2, 3)."""
         sampled = _sampled(self.pyramids[side][view], places)
-        photograph, slopes = sampled[:, :3], sampled[:, 3:].reshape(-1, 2, 3)
-        photograph = photograph - photograph.mean(axis=0)
-        colors = self.rgb[rows] - self.rgb[rows].mean(axis=0)
+        photograph, slopes = sampled[:, :3], sampled[:, 3:9].reshape(-1, 2, 3)
+        shown = sampled[:, 9:] > 0.999  # beyond a lens's rim there is nothing to compare
+        photograph = _centered(photograph, shown)
+        colors = _centered(self.rgb[rows], shown)
         scale = float(np.sqrt((photograph**2).sum() + 1e-6))
-        return photograph / scale - colors / np.sqrt((colors**2).sum() + 1e-6), slopes / scale
+        return photograph / scale - colors / np.sqrt((colors**2).sum() + 1e-6), slopes * shown[..., None] / scale
 
     def _step(self, numbers: Doubles, rows: Sequence[NDArray[np.intp]], side: int, free: list[int]) -> Doubles:
         """One damped Gauss-Newton step of the free numbers, over all views."""
@@ -206,10 +207,20 @@ class Registration:
         return motion
 
 
+def _centered(colors: Doubles, shown: NDArray[np.bool_]) -> Doubles:
+    """Colours (points, 3) less the mean of those that are shown (points, 1); 0 where they are not."""
+    mean = (colors * shown).sum(axis=0) / max(np.count_nonzero(shown), 1)
+    return (colors - mean) * shown
+
+
 def _with_slopes(image: NDArray[np.float32]) -> NDArray[np.float32]:
-    """(H, W, 9): the colours, and how they change to the right and down, per width and height of the image."""
+    """(H, W, 10): the colours, how they change to the right and down, per width and height of the image, and 1 where
+    neither the pixel nor one beside it is black."""
     height, width = image.shape[:2]
-    return np.concatenate([image, np.gradient(image, axis=1) * width, np.gradient(image, axis=0) * height], axis=2)
+    lit = np.pad((image.max(axis=2) >= BLACK).astype(np.float32), 1, mode="edge")
+    lit = np.min([lit[1:-1, 1:-1], lit[:-2, 1:-1], lit[2:, 1:-1], lit[1:-1, :-2], lit[1:-1, 2:]], axis=0)[..., None]
+    right, down = np.gradient(image, axis=1) * width, np.gradient(image, axis=0) * height
+    return np.concatenate([image, right * lit, down * lit, lit], axis=2)
 
 
 def _sampled(image: NDArray[np.float32], places: Doubles) -> Doubles:
