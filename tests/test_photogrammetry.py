@@ -217,6 +217,7 @@ def test_other_tables_are_left_alone(tmp_path):
     (tmp_path / "scores.csv").write_text("name,score\n")
     (tmp_path / "doc.xml").write_text("<html/>")
     (tmp_path / "empty.xml").write_bytes(b"")
+    (tmp_path / "folder.xml").mkdir()
     assert find_photogrammetry(tmp_path) is None
     with pytest.raises(SceneError, match="is neither Metashape's XML"):
         read_photogrammetry(tmp_path / "doc.xml", lambda _: (1, 1))

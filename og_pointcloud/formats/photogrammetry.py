@@ -46,7 +46,7 @@ OPENGL = np.array([1.0, -1.0, -1.0])
 def find_photogrammetry(capture: Path) -> Path | None:
     """The export of one of these programs in the folder, told by its first bytes, or None."""
     files = [*sorted(capture.glob("*.xml")), *sorted(capture.glob("*.csv"))]
-    return next((file for file in files if _reader(file) is not None), None)
+    return next((file for file in files if file.is_file() and _reader(file) is not None), None)
 
 
 def read_photogrammetry(file: Path, image_size: ImageSize) -> PosedFrames:
