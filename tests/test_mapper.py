@@ -176,6 +176,7 @@ def test_masks_without_any_geometry_are_refused():
         og.Mapper().snapshot()
 
 
+@pytest.mark.slow
 def test_sparse_depth_makes_a_map():
     random = np.random.default_rng(0)
     sparse = [
@@ -216,6 +217,7 @@ for frame in frames([CHEST, BIN, CRATE]):
 """
 
 
+@pytest.mark.slow
 def test_killed_at_any_moment_it_goes_on(tmp_path, monkeypatch):
     from og_pointcloud.mapping import map_journal
 
