@@ -54,11 +54,11 @@ def _values(content: Any, keys: Sequence[str], source: Path) -> list[float]:
         values = [float(content[key]) for key in keys]
     except (TypeError, ValueError, KeyError, OverflowError) as error:
         raise SceneError(
-            f"{source} has no number {error!s:.60}; expected {', '.join(keys):.120}: export it again"
+            f"{source} has no number {error!s:.60}; expected {', '.join(map(str, keys)):.120}: export it again"
         ) from None
     if not np.isfinite(values).all() or np.abs(values).max() > 1e30:
         raise SceneError(
-            f"{source} holds numbers that are not finite; expected {', '.join(keys):.120}: export it again"
+            f"{source} holds numbers that are not finite; expected {', '.join(map(str, keys)):.120}: export it again"
         )
     return values
 
