@@ -187,6 +187,33 @@ def test_no_code_of_a_models_folder_runs(folders, image, tmp_path, kind):
     assert not ran.exists()
 
 
+@pytest.mark.parametrize("place", ["attn_implementation", "_attn_implementation"])
+def test_a_folder_does_not_say_how_attention_is_computed(folders, tmp_path, place):
+    """transformers would fetch what such a name means."""
+    shutil.copytree(folders["sam"], tmp_path / "model")
+    file = tmp_path / "model" / "config.json"
+    config = json.loads(file.read_text())
+    vision = {**config["vision_config"], place: "stranger/kernels"}
+    file.write_text(json.dumps({**config, place: "stranger/kernels", "vision_config": vision}))
+    model = SamPredictor(tmp_path / "model").model
+    assert model.config._attn_implementation == model.vision_encoder.config._attn_implementation == "sdpa"
+
+
+@pytest.mark.parametrize(("change", "says"), [("pickle", "no SAM model"), ("quantised", "is quantised")])
+def test_weights_are_plain_numbers(folders, tmp_path, change, says):
+    folder = tmp_path / "model"
+    shutil.copytree(folders["sam"], folder)
+    if change == "pickle":
+        (folder / "model.safetensors").unlink()
+        torch.save({"weight": torch.zeros(1)}, folder / "pytorch_model.bin")
+    else:
+        config = json.loads((folder / "config.json").read_text())
+        config["quantization_config"] = {"quant_method": "bitsandbytes", "load_in_8bit": True}
+        (folder / "config.json").write_text(json.dumps(config))
+    with pytest.raises(SceneError, match=says):
+        SamPredictor(folder)
+
+
 @pytest.mark.parametrize("content", ["[]", "{", "", '{"model_type": ["sam"]}'])
 def test_a_folder_with_another_config_is_one_error(tmp_path, content):
     (tmp_path / "config.json").write_text(content)

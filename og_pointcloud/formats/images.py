@@ -165,7 +165,7 @@ def decoded(file: Path, flags: int) -> NDArray[np.generic]:
     """The pixels as OpenCV gives them. EXIF orientation is ignored, as poses and masks ignore it."""
     cv2 = require_cv2()
     data = np.fromfile(file, np.uint8)
-    if stated := _stated_size(io.BytesIO(data)):
+    if stated := _stated_size(io.BytesIO(data.tobytes())):
         _check_pixels(file, *stated)
     try:
         pixels = cv2.imdecode(data, flags | cv2.IMREAD_IGNORE_ORIENTATION) if data.size else None

@@ -69,14 +69,15 @@ class SamPredictor:
         try:
             self.kind = _known_type(name, _read_json(where, "config.json"))
             # A known type is a class of transformers: no code of the folder's (auto_map) is looked at.
+            # Weights are read from .safetensors alone: other files are pickles.
             self.model: Any = getattr(transformers, CLASSES[self.kind]).from_pretrained(
-                where, local_files_only=True, trust_remote_code=False, attn_implementation="sdpa"
+                where, local_files_only=True, trust_remote_code=False, attn_implementation="sdpa", use_safetensors=True
             )
-        except (OSError, ValueError) as error:
-            if isinstance(error, SceneError):
-                raise
+        except SceneError:
+            raise
+        except Exception as error:  # of many types, some of safetensors' own
             raise SceneError(
-                f"no SAM model '{name}' ({str(error).splitlines()[0]:.120}); expected a transformers folder with "
+                f"no SAM model '{name}' ({(str(error).splitlines() or [type(error).__name__])[0]:.120}); expected a transformers folder with "
                 "config.json and weights, or a fetched model: hf download OWNER/MODEL"
             ) from None
         self.device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
@@ -135,6 +136,8 @@ def _known_type(name: str | os.PathLike[str], config: dict[str, Any] | None) -> 
     if config is None:
         raise OSError("there is no config.json")
     kind = str(config.get("model_type"))
+    if "quantization_config" in config:
+        raise SceneError(f"{name} is quantised; expected a model in float32 or float16, whose weights alone are read")
     if kind not in CLASSES or not hasattr(transformers, CLASSES[kind]):
         raise SceneError(
             f"{name} is a model of type '{kind:.40}'; expected one of {', '.join(CLASSES)} that the installed "
