@@ -76,8 +76,9 @@ class SamPredictor:
         except SceneError:
             raise
         except Exception as error:  # of many types, some of safetensors' own
+            reason = (str(error).splitlines() or [type(error).__name__])[0]
             raise SceneError(
-                f"no SAM model '{name}' ({(str(error).splitlines() or [type(error).__name__])[0]:.120}); expected a transformers folder with "
+                f"no SAM model '{name}' ({reason:.120}); expected a transformers folder with "
                 "config.json and weights, or a fetched model: hf download OWNER/MODEL"
             ) from None
         self.device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
