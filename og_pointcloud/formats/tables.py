@@ -39,7 +39,7 @@ def naming(place: str | Path) -> Iterator[None]:
             raise
         raise SceneError(f"{place}: {error}") from error
     except OSError as error:
-        raise SceneError(f"{place}: {error.strerror or error}: check the path and its permissions") from error
+        raise SceneError(f"{place}: {error.strerror or error}: check the path, its permissions, and the room there") from error
 
 
 def read_text_rows(lines: Iterable[bytes], dtype: np.dtype, count: int, what: str) -> NDArray[np.void]:
