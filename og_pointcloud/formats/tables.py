@@ -39,7 +39,8 @@ def naming(place: str | Path) -> Iterator[None]:
             raise
         raise SceneError(f"{place}: {error}") from error
     except OSError as error:
-        raise SceneError(f"{place}: {error.strerror or error}: check the path, its permissions, and the room there") from error
+        cure = "check the path, its permissions, and the room there"
+        raise SceneError(f"{place}: {error.strerror or error}: {cure}") from error
 
 
 def read_text_rows(lines: Iterable[bytes], dtype: np.dtype, count: int, what: str) -> NDArray[np.void]:
