@@ -48,7 +48,7 @@ def main() -> None:
 
 def make(folder: Path, count: int) -> list[Path]:
     """Captures of 3 to 8 views, the third without cameras that can be read."""
-    from scenes import write_tiny_capture
+    from scenes import write_tiny_capture  # pyright: ignore[reportMissingImports]
 
     captures = [write_tiny_capture(folder / f"room{k:02d}", 3 + k % 6).folder for k in range(count)]
     (captures[2] / "transforms.json").write_text("{")
@@ -60,7 +60,7 @@ def on_cluster(captures: list[Path], out: Path) -> tuple[og.CaptureFit, ...]:
     from distributed import Client, LocalCluster
 
     with (
-        LocalCluster(n_workers=2, threads_per_worker=1, memory_limit="4GB", dashboard_address=None) as cluster,
+        LocalCluster(n_workers=2, threads_per_worker=1, memory_limit="4GB", dashboard_address=None) as cluster,  # pyright: ignore[reportArgumentType]
         Client(cluster) as client,
     ):
         threading.Thread(target=kill_one, args=(client, out), daemon=True).start()

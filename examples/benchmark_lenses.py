@@ -66,7 +66,7 @@ def pinhole(camera: Camera) -> Photographer:
     x = (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx
     y = (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy
     rays = np.stack([*np.meshgrid(x, y), np.ones((camera.height, camera.width))], axis=2)
-    return _photographer(camera, rays, "PINHOLE")
+    return _photographer(camera, rays.astype(np.float64), "PINHOLE")
 
 
 def fisheye(pose: NDArray[np.float64]) -> Photographer:

@@ -85,7 +85,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if browser is None or find_spec("playwright") is None:
         print("no Chromium or no playwright: the browser's part is not measured", file=sys.stderr)
         return
-    from playwright.sync_api import sync_playwright
+    from playwright.sync_api import sync_playwright  # pyright: ignore[reportMissingImports]
 
     with sync_playwright() as playwright, opened(playwright.chromium, browser, live) as page:
         both = [browser_seconds(page, word) for word in words]

@@ -37,16 +37,17 @@ def main() -> None:
     parser.add_argument("--check", action="store_true", help="also fit without a cluster")
     arguments = parser.parse_args()
     from distributed import Client, LocalCluster
-    from street import make_street
+    from street import make_street  # pyright: ignore[reportMissingImports]
 
     made = make_street(arguments.points, arguments.views, length_m=arguments.length)
     settings = FitSettings(mode="grouping", tile_points=arguments.tile_points)
     limits = {"n_workers": arguments.workers, "threads_per_worker": 1, "memory_limit": arguments.memory}
-    with LocalCluster(**limits, dashboard_address=None) as cluster, Client(cluster) as client:
+    with LocalCluster(**limits, dashboard_address=None) as cluster, Client(cluster) as client:  # pyright: ignore[reportArgumentType]
         start, own = time.perf_counter(), time.process_time()
         cloud = fit(made.scene, settings, executor=client.get_executor(pure=False), progress=False)
         report("cluster", cloud, time.perf_counter() - start)
-        peaks, cpu = client.run(peak_memory), client.run(time.process_time)
+        peaks: dict[str, float] = client.run(peak_memory)  # pyright: ignore[reportAssignmentType]
+        cpu: dict[str, float] = client.run(time.process_time)  # pyright: ignore[reportAssignmentType]
         print(f"CPU seconds: workers {sum(cpu.values()):.0f}, here {time.process_time() - own:.0f}")
         print("peak memory: workers", *(f"{peak / 1e9:.2f}" for peak in peaks.values()), end="")
         print(f", here {peak_memory() / 1e9:.2f} GB (with the scene)")

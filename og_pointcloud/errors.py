@@ -9,8 +9,9 @@ def printable(text: str, most: int | None = None) -> str:
     """Foreign text as it may be shown: what would move the cursor, turn the text about or is half a character becomes
     an escape; of more than ``most`` characters the end is left out.
 
-    >>> printable("mug\x1b[2J"), printable("chair" * 9, 12)
-    ('mug\\x1b[2J', 'chairchai...')
+    >>> from og_pointcloud.errors import printable
+    >>> printable("mug" + chr(27) + "[2J"), printable("chair" * 9, 12)
+    ('mug\\\\x1b[2J', 'chairchai...')
     """
     text = text if most is None else text[: most + 1]
     shown = text if text.isprintable() else "".join(s if s.isprintable() else repr(s)[1:-1] for s in text)

@@ -6,8 +6,13 @@ import os
 from collections.abc import Callable
 from typing import Any
 
-import numba
-from numba import get_num_threads, prange
+from og_pointcloud.errors import MissingExtraError
+
+try:
+    import numba
+    from numba import get_num_threads, prange
+except ImportError as error:
+    raise MissingExtraError("numba", "fit") from error
 
 __all__ = ["get_num_threads", "njit", "prange", "use_threads"]
 

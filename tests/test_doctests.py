@@ -22,9 +22,14 @@ def example_of(name):
 
 @pytest.fixture(scope="module")
 def known():
-    """What other examples start from: the cloud that LabelledCloud's own makes, the scene of feature_picture's."""
+    """What other examples start from: the cloud that LabelledCloud's own makes, the scenes of fit's and
+    feature_picture's."""
     start = {}
-    shared = {"LabelledCloud": ("cloud", "np", "og"), "feature_picture": ("gaussians", "view", "pathlib", "tempfile")}
+    shared = {
+        "LabelledCloud": ("cloud", "np", "og"),
+        "fit": ("scene", "wall"),
+        "feature_picture": ("gaussians", "view", "pathlib", "tempfile"),
+    }
     for source, names in shared.items():
         example = example_of(source)
         assert doctest.DocTestRunner(optionflags=OPTIONS).run(example, clear_globs=False).failed == 0

@@ -61,8 +61,10 @@ def cameras_of_rows(rows: NDArray[np.float64]) -> tuple[Camera, ...]:
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
     poses[:, :3] = rows[:, 6:].reshape(-1, 3, 4)
     sizes = np.nan_to_num(rows[:, :2]).clip(0, 1 << 30).astype(int).tolist()
-    lenses = rows[:, 2:6].tolist()
-    return tuple(Camera(*size, *lens, pose) for size, lens, pose in zip(sizes, lenses, poses, strict=True))
+    return tuple(
+        Camera(width, height, fx, fy, cx, cy, pose)
+        for (width, height), (fx, fy, cx, cy), pose in zip(sizes, rows[:, 2:6].tolist(), poses, strict=True)
+    )
 
 
 def describe_member(name: str, data: bytes) -> dict[str, Any]:

@@ -35,7 +35,7 @@ PROBES, REFINE = 64, 8
 
 def _database(uri: str) -> Any:
     try:
-        import lancedb
+        import lancedb  # pyright: ignore[reportMissingImports]
     except ImportError:
         raise MissingExtraError("lancedb", "lance") from None
     return lancedb.connect(uri)
@@ -48,7 +48,7 @@ def _table(key: tuple[Any, ...]) -> str:
 
 def write_lance(atlas: str | os.PathLike[str], uri: str) -> None:
     """Write all that an atlas has to the database at a folder or URI (s3://...), in place of what is there."""
-    import pyarrow as pa
+    import pyarrow as pa  # pyright: ignore[reportMissingImports]
 
     database = _database(uri)
     with Atlas.reading(atlas) as opened:
@@ -70,7 +70,7 @@ def write_lance(atlas: str | os.PathLike[str], uri: str) -> None:
 
 
 def _batches(atlas: Atlas, scenes: Sequence[SceneEntry], schema: Any) -> Iterator[Any]:
-    import pyarrow as pa
+    import pyarrow as pa  # pyright: ignore[reportMissingImports]
 
     for start in range(0, len(scenes), SCENES_AT_ONCE):
         some = scenes[start : start + SCENES_AT_ONCE]

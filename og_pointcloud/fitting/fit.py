@@ -67,8 +67,9 @@ def fit(
     >>> camera = og.Camera(64, 64, 64.0, 64.0, 32.0, 32.0, np.eye(4))
     >>> masks = np.repeat(np.arange(64)[None] >= 32, 64, axis=0).astype(np.int32)
     >>> views = tuple(View(name, camera, masks, np.eye(2, dtype=np.float32)) for name in "abc")
-    >>> cloud = og.fit(Scene(points, views, "two-words"), progress=False)
-    >>> cloud.instances.points
+    >>> scene = Scene(points, views, "two-words")
+    >>> wall = og.fit(scene, progress=False)
+    >>> wall.instances.points
     array([800, 800], dtype=int32)
     """
     settings = settings or FitSettings()

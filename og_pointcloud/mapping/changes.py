@@ -65,7 +65,11 @@ OTHER_FRAME = 0.5
 @dataclass(frozen=True)
 class Moved:
     """id: in the earlier cloud. before, after: (3,) float64, where its points were and are on average, world
-    coordinates. now: its id in the later cloud."""
+    coordinates. now: its id in the later cloud.
+
+    >>> og.Moved(3, np.zeros(3), np.array([1, 0, 2]), 5).to_dict()
+    {'id': 3, 'from': [0.0, 0.0, 0.0], 'to': [1, 0, 2]}
+    """
 
     id: int
     before: NDArray[np.float64]
@@ -79,7 +83,11 @@ class Moved:
 
 @dataclass(frozen=True)
 class Changes:
-    """gone, unseen: ids of the earlier cloud. new: ids of the later one. moved: what is in both."""
+    """gone, unseen: ids of the earlier cloud. new: ids of the later one. moved: what is in both.
+
+    >>> print(og.Changes(gone=(1, 4), new=(7,), moved=(), unseen=()))
+    2 gone, 1 new, 0 moved, 0 not seen again
+    """
 
     gone: tuple[int, ...]
     new: tuple[int, ...]
@@ -105,6 +113,9 @@ def compare(before: SceneLike, after: SceneLike) -> Changes:
 
     Both lie in one world frame. SceneError where they do not seem to, where the later one does not know its cameras
     (a file of an older version: fit it again), and FeatureSpaceError where their descriptors cannot be compared.
+
+    >>> print(og.compare(wall, wall))  # of `fit`'s example
+    0 gone, 0 new, 0 moved, 0 not seen again
     """
     earlier, later = Visit(as_scene(before).cloud), Visit(as_scene(after).cloud)
     return compare_visits(earlier, later.in_frame_of(earlier)).changes

@@ -36,6 +36,9 @@ class Frame:
     cloud: (n, 3) float, world coordinates, measured from this camera's place, in place of depth.
     rgb: (H, W, 3) uint8. stamp: seconds, or any count that grows with time; None: one more than the last frame's.
     feature_space: name of the features' encoder, which must be the map's; None: it is not said.
+
+    >>> camera = og.Camera(64, 48, 60.0, 60.0, 32.0, 24.0, np.eye(4))
+    >>> frame = og.Frame(camera, masks=np.full((48, 64), -1), stamp=12.5)
     """
 
     camera: Camera | None

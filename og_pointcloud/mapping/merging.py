@@ -55,6 +55,9 @@ def update(
     capture: in the map's world frame, with points of its own. depth: what its views measured, in the map's local frame
     (`sight.view_of_depth`); None: as its points show it. FeatureSpaceError for masks of another encoder, SceneError for
     a capture that does not lie where the map does; the map is never changed.
+
+    >>> print(og.update(wall, scene, progress=False).changes)  # of `fit`'s example
+    0 gone, 0 new, 0 moved, 0 not seen again
     """
     cloud = as_scene(before).cloud
     cloud.space.require(FeatureSpace(capture.feature_space, capture.feature_width), "masks of the capture")

@@ -102,7 +102,8 @@ class DiscSurface:
             self.xyz, self.normal, self._radius, camera.world_to_camera, lens_of(camera), camera.height, camera.width,
             NEAR_SHARE * typical,
         )  # fmt: skip
-        return MeasuredView(camera, *drawn, self.noise)
+        depth, normal = drawn
+        return MeasuredView(camera, depth, normal, self.noise)
 
 
 def view_of_depth(depth: NDArray[np.float32], camera: Camera) -> MeasuredView:

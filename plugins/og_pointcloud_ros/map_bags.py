@@ -110,7 +110,7 @@ class BagFrames:
         try:
             if lens is None:
                 raise SceneError("no camera_info came before it")
-            camera = _camera(lens, np.linalg.inv(tree.lookup(self.frame, parts.frame_id, stamp)))
+            camera = _camera(lens, np.linalg.inv(tree.lookup(self.frame, parts.frame_id, stamp)).astype(np.float64))
             depth = parts.depth
             if depth is not None and depth.dtype.kind == "u":
                 depth = depth.astype(np.float32) * np.float32(1e-3)
