@@ -186,6 +186,7 @@ def test_members_of_a_file_are_on_the_page_of_formats(tmp_path):
         instances=replace(instance_table(2), descriptors=texts, coarse=none, part_of=none),
         feature_space=encoder.feature_space,
         certainty=np.full(2, 9, np.uint8),
+        cameras=(og.Camera(4, 4, 4.0, 4.0, 2.0, 2.0, np.eye(4)),),
         vocabulary=Vocabulary(("chair", "table"), texts),
         word_bank=encoder.word_bank,
     )
