@@ -172,7 +172,7 @@ def _with_best_scale(surface: Surface, settings: FitSettings, journal: Journal) 
     if not surface.by_sight:
         return surface
     points, spacing = surface.scene.points, surface.neighbourhood.spacing
-    with journal.stage("geometry"):
+    with journal.stage("point size"):
         choice = choose_scale(points, spacing, surface.scene.views, surface.near, settings, journal)
         note_scale(choice, journal)
     return replace(surface, gaussians=isotropic(points, spacing, choice.scale, settings.geometry.opacity))

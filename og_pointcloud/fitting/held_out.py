@@ -68,7 +68,7 @@ def choose_scale(
     asked[sample] = True
     thickness = sight_thickness(spacing, float(np.median(spacing)), geometry)
     tables = []
-    for scale in journal.steps(geometry.scales, "geometry"):
+    for scale in journal.steps(geometry.scales, "point size"):
         gaussians = isotropic(points, spacing, scale, geometry.opacity)
         halves = (
             mask_table(gaussians, chosen[half::2], near, thickness, by_sight=True, asked=asked) for half in (0, 1)
