@@ -92,6 +92,8 @@ class MaskMaps:
         sights = [seen(self.sample.xyz, camera, CELLS) for camera in cameras]
         found = []
         for i, j, mine, theirs in _pairs(sights):
+            if not (len(self.features[i]) and len(self.features[j])):  # a view without masks may be of any width
+                continue
             counts = _shared(
                 _at(self.ids[i], sights[i].places[mine]), _at(self.ids[j], sights[j].places[theirs]),
                 (len(self.features[i]), len(self.features[j])), shift,

@@ -151,6 +151,8 @@ def _webp_size(head: bytes) -> tuple[int, int] | None:
 def _tiff_size(stream: BinaryIO, head: bytes) -> tuple[int, int] | None:
     """Tags 256 and 257 of the first directory (TIFF 6.0, section 2)."""
     order = "<" if head[:2] == b"II" else ">"
+    if len(head) < 8:
+        return None
     stream.seek(struct.unpack_from(order + "I", head, 4)[0])
     count = int.from_bytes(stream.read(2), "little" if order == "<" else "big")
     entries = stream.read(12 * count)
