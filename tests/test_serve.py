@@ -127,7 +127,12 @@ def test_without_viser_the_extra_is_named(bundle, capsys, monkeypatch):
 def test_the_command_says_who_can_reach_it_and_ends_when_interrupted(viser, bundle):
     command = [sys.executable, "-u", "-c", "import sys; from og_pointcloud.cli import main; sys.exit(main())", "serve"]
     process = subprocess.Popen(
-        [*command, bundle, "--port", "0"], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+        [*command, bundle, "--port", "0"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        # Of a shell's background jobs children inherit that interrupts are ignored.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
     try:
         lines = iter(process.stdout.readline, "")
