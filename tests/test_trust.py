@@ -10,7 +10,6 @@ import shutil
 import subprocess
 import sys
 import threading
-import time
 import tracemalloc
 import zipfile
 from pathlib import Path
@@ -568,20 +567,18 @@ def test_memory_is_flat_over_frames_of_many_sizes(bundle):
 @pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="only Linux tells")
 @pytest.mark.filterwarnings("ignore:none of")
-def test_a_stream_of_minutes(bundle):
-    """Frames of any size for two minutes, some with NaN, infinity or none: memory ends where it began."""
+def test_a_stream_of_thousands(bundle):
+    """Frames of any size, some with NaN, infinity or none: memory ends where it began."""
     random, ask = np.random.default_rng(0), og.Segmenter(bundle, ["apple", "pear"])
     points = np.tile(room(500).xyz, (40, 1)).astype(np.float64)
-    end, warm, before, frames = time.monotonic() + 120, time.monotonic() + 20, 0, 0
-    while time.monotonic() < end:
+    before = 0
+    for number in range(12_000):
         frame = points[: random.integers(0, len(points))] + random.normal(size=3) * random.choice([0, 0.1, 100])
-        if len(frame) and frames % 7 == 0:
+        if len(frame) and number % 7 == 0:
             frame[random.integers(0, len(frame), 5)] = random.choice([np.nan, np.inf, -1e300])
         assert len(ask(frame).labels) == len(frame)
-        frames += 1
-        if not before and time.monotonic() > warm:
+        if number == 3000:
             before = resident()
-    assert frames > 1000
     assert resident() - before < 12 << 20
 
 
