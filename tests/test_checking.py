@@ -77,6 +77,12 @@ def test_offsets_units_few_views_and_few_points_raise_no_doubt(options):
     assert doubts(tiled_room(2, **options)) == {}
 
 
+def test_a_pixel_of_a_small_image_is_no_fault(tiny_capture):
+    """Where every number may change points move by more than the bound, where one kind may by less: no fault."""
+    found = check_capture(og.read_capture(tiny_capture.folder))
+    assert [check.name for check in found if check.verdict == "doubt"] == []
+
+
 def test_the_order_of_views_and_points_does_not_matter_for_a_right_room():
     scene = tiled_room(0)
     order = np.random.default_rng(0).permutation(len(scene.points))

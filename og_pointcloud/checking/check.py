@@ -17,7 +17,7 @@ import numpy as np
 from og_pointcloud.checking.conversions import VOUCHING, best_conversion, best_mask_conversion, fits
 from og_pointcloud.checking.masks import Consistency, MaskMaps, read_mask_maps
 from og_pointcloud.checking.photographs import Likeness, Photographs, read_photographs
-from og_pointcloud.checking.registration import FREE, MORE_POINTS, Registration
+from og_pointcloud.checking.registration import FREE, MORE_POINTS, Registration, Small
 from og_pointcloud.checking.sample import Sample, draw_sample, seen
 from og_pointcloud.cloud import BACKGROUND, UNKNOWN_SPACE, UNOBSERVED, LabelledCloud
 from og_pointcloud.errors import printable
@@ -212,10 +212,8 @@ def _alignment(photographs: Photographs | None, sample: Sample) -> Check:
     stated = photographs.sample.cameras
     quick = Registration(photographs, stated)
     best = quick.found(FREE["everything"])
-    if best.error > LESS_ERROR * quick.start.error or best.shift < LEAST_SHIFT:
-        less = 1 - best.error / max(quick.start.error, 1e-9)
-        says = f"no small change of poses or calibration fits much better ({less:.0%}, {best.shift:.1%} of the width)"
-        return Check("alignment", "ok", says)
+    if not _is_fault(best, quick.start.error):
+        return _aligned(best, quick.start.error)
     registration = Registration(photographs, stated, MORE_POINTS)
     start = registration.start.error
     found = {name: registration.found(free) for name, free in FREE.items()}
@@ -224,12 +222,25 @@ def _alignment(photographs: Photographs | None, sample: Sample) -> Check:
     name, change = next(item for item in found.items() if item[1].error <= least + AS_GOOD * (start - least))
     if start - least < HALF * (start - everything.error):
         name, change = "everything", everything
+    if not _is_fault(change, start):
+        return _aligned(change, start)
     repairs = registration.repairs(name, change, np.stack([camera.center for camera in sample.listed]))
     less = 1 - change.error / start
     says = (
         f"photographs fit {less:.0%} better with {SMALL_CHANGES[name]}: points lie {change.shift:.1%} of the width off"
     )
     return Check("alignment", "doubt", says, _listed(repairs))
+
+
+def _is_fault(change: Small, start: float) -> bool:
+    """Whether a change is that of a fault. start: the error without it."""
+    return change.error <= LESS_ERROR * start and change.shift >= LEAST_SHIFT
+
+
+def _aligned(change: Small, start: float) -> Check:
+    less = 1 - change.error / max(start, 1e-9)
+    says = f"no small change of poses or calibration fits much better ({less:.0%}, {change.shift:.1%} of the width)"
+    return Check("alignment", "ok", says)
 
 
 def _masks(maps: MaskMaps, *, is_doubted: bool) -> Check:
