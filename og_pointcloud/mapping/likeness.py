@@ -45,16 +45,24 @@ class Look:
     color: NDArray[np.float64] | None
     length: float
 
+    @classmethod
+    def of_points(
+        cls,
+        descriptors: NDArray[np.float32],
+        spread: float,
+        xyz: NDArray[np.float32],
+        rgb: NDArray[np.uint8 | np.float32] | None,
+    ) -> Look:
+        """Of points xyz (n, 3), at least one, with rgb (n, 3) or None."""
+        sides = np.ptp(np.percentile(xyz, [3, 97], axis=0), axis=0)
+        color = None if rgb is None else np.median(rgb, axis=0).astype(np.float64)
+        return cls(descriptors, spread, color, float(sides.max()))
+
 
 def look_of(table: InstanceTable, instance: int, xyz: NDArray[np.float32], rgb: NDArray[np.uint8] | None) -> Look:
     """The look of one instance of a table. xyz (n, 3), rgb (n, 3) or None: its points, at least one."""
-    sides = np.ptp(np.percentile(xyz, [3, 97], axis=0), axis=0)
-    return Look(
-        table.descriptors[table.descriptor_instance == instance],
-        float(spread_of(table.agreement[instance], table.masks[instance])),
-        None if rgb is None else np.median(rgb, axis=0).astype(np.float64),
-        float(sides.max()),
-    )
+    descriptors = table.descriptors[table.descriptor_instance == instance]
+    return Look.of_points(descriptors, float(spread_of(table.agreement[instance], table.masks[instance])), xyz, rgb)
 
 
 def typical_cosine(table: InstanceTable) -> float:

@@ -565,12 +565,11 @@ class Mapper:
         assert self._points is not None
         track = self._tracks.tracks[k]
         descriptor = track.descriptor
-        sides = np.ptp(np.percentile(self._points.xyz[rows], [3, 97], axis=0), axis=0)
-        return Look(
+        return Look.of_points(
             np.zeros((0, 1), np.float32) if descriptor is None else descriptor[None].astype(np.float32),
             float(spread_of(track.agreement / max(track.pixels, 1e-12), track.masks)),
-            np.median(self._points.rgb[rows], axis=0).astype(np.float64),
-            float(sides.max()),
+            self._points.xyz[rows],
+            self._points.rgb[rows],
         )
 
     def _name(self, new: list[int], gone: list[int]) -> tuple[tuple[int, ...], tuple[Moved, ...]]:
