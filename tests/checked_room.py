@@ -68,8 +68,7 @@ def write_room(folder: Path, scene: Scene) -> Path:
     (folder / "transforms.json").write_text(json.dumps({**intrinsics, "frames": frames}))
     features = {view.name: view.mask_features for view in scene.views}
     np.savez(folder / "mask_features.npz", feature_space=np.array(scene.feature_space), **features)
-    from og_pointcloud.formats.ply import write_ply
-    from og_pointcloud.show.splat_columns import plain_rows
+    from og_pointcloud.formats.ply import plain_rows, write_ply
 
     write_ply(folder / "points.ply", {"vertex": plain_rows(scene.points.xyz_world, scene.points.rgb)})
     return folder

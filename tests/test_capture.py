@@ -220,7 +220,7 @@ def test_a_small_image_beside_full_masks_is_enlarged(capture):
 def test_masks_of_another_shape_are_refused(capture):
     folder, world = capture
     write_masks(folder, world.names, size=(HEIGHT, WIDTH))
-    with pytest.raises(SceneError, match=r"view 'frame_00': the masks are 48x64 pixels, the camera 64x48; expected"):
+    with pytest.raises(SceneError, match=r"view 'frame_00': the masks are 48x64 pixels, its camera 64x48; expected"):
         read_capture(folder)
 
 

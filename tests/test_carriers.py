@@ -35,7 +35,7 @@ def scene_of(name, folder):
     return og.load(write_bundle(make_cloud(xyz, ids, 0.02, 0.06), folder / "kitchen.ogpc"))
 
 
-@pytest.fixture(scope="module", params=["made", "seven_redkitchen"])
+@pytest.fixture(scope="module", params=["made", pytest.param("seven_redkitchen", marks=pytest.mark.slow)])
 def asked(request, tmp_path_factory):
     """A scene, points that carriers of float32 and of whole tenths of millimetres hold exactly, and their labels."""
     scene = scene_of(request.param, tmp_path_factory.mktemp("scene"))

@@ -245,7 +245,7 @@ def test_poses_in_millimetres_with_depth_in_metres_are_doubted(tmp_path):
         (write_scannet, "intrinsic/intrinsic_depth.txt", "1 0 0 0", "expected a 4x4 matrix"),
         (write_seven_scenes, "camera-intrinsics.txt", "1 0 0", "expected a 3x3 matrix"),
         (write_replica, "traj.txt", "1 " * 16, "6 images in results/ and 1 poses"),
-        (write_replica, "../cam_params.json", '{"camera": {"w": 1}}', "is not"),
+        (write_replica, "../cam_params.json", '{"camera": {"w": 1}}', "lacks finite numbers w, h, fx"),
         (write_replica, "../cam_params.json", "[" * 100000, "is not valid JSON"),
     ],
 )

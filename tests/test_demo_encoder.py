@@ -36,8 +36,8 @@ ABSENT = (
 
 @pytest.fixture(scope="module")
 def seen():
-    """Vectors of the masks of six views of a room that training has not seen, and their classes."""
-    capture = make_capture(UNSEEN_ROOM, CaptureSettings(views=6, samples_per_view=50, mask_noise=0))
+    """Vectors of the masks of three views of a room that training has not seen, and their classes."""
+    capture = make_capture(UNSEEN_ROOM, CaptureSettings(views=3, samples_per_view=20, mask_noise=0))
     encoder, vectors, classes = open_encoder("demo"), [], []
     for frame, ids in zip(capture.frames, capture.masks, strict=True):
         masks = np.arange(1, ids.max() + 1)[:, None, None] == ids

@@ -41,7 +41,7 @@ from og_pointcloud.formats.ply import join_columns, write_ply
 from og_pointcloud.formats.points import read_points
 from og_pointcloud.formats.poses import in_pinholes
 from og_pointcloud.formats.rgbd import read_rgbd
-from og_pointcloud.scene import Camera
+from og_pointcloud.scene import Camera, Points
 from og_pointcloud.text.text_features import read_text_features
 
 MOST_BYTES = 1 << 26
@@ -232,7 +232,7 @@ READERS: dict[str, tuple[Callable, Callable]] = {
     "cloud.las": (_las, lambda path: [read_points(path).xyz]),
     "cloud.copc.laz": (_copc, lambda path: [read_points(path).xyz]),
     "images.bin": (_images_bin, _read_images_bin),
-    "points3D.bin": (_points_bin, lambda path: [colmap.read_points3d(path.parent)[0]]),
+    "points3D.bin": (_points_bin, lambda path: [Points.from_world(colmap.read_points3d(path.parent)[0]).xyz]),
     "transforms.json": (_transforms, _read_transforms),
     "metashape.xml": (_metashape, _read_photogrammetry),
     "realityscan.csv": (_realityscan, _read_photogrammetry),
@@ -341,9 +341,15 @@ def damaged_member(data: bytes, member: float, changes: list[tuple[str, float, b
     return stream.getvalue()
 
 
-everything = settings(
-    max_examples=100, derandomize=True, deadline=None, database=None, suppress_health_check=list(HealthCheck)
-)
+def fuzzed(examples: int, **arguments: some.SearchStrategy) -> Callable[[Callable[..., None]], None]:
+    """Run a function of these arguments with so many examples, the same every time."""
+    rules = settings(
+        max_examples=examples, derandomize=True, deadline=None, database=None, suppress_health_check=list(HealthCheck)
+    )
+    return lambda check: rules(given(**arguments)(check))()
+
+
+EXAMPLES = [12, pytest.param(300, marks=pytest.mark.slow)]
 
 
 @pytest.fixture(scope="module")
@@ -357,24 +363,26 @@ def test_valid_files_are_read(name: str, folder: Path, tmp_path: Path):
         assert read_or_refused(name, tmp_path / name, data) == ""
 
 
+@pytest.mark.parametrize("examples", EXAMPLES)
 @pytest.mark.parametrize("name", READERS)
-@everything
-@given(data=some.binary(max_size=300), start=some.integers(0, 60))
-def test_any_bytes_are_read_or_refused(name: str, folder: Path, data: bytes, start: int):
+def test_any_bytes_are_read_or_refused(name: str, examples: int, folder: Path):
     valid = valid_files(name, folder)[0]
-    read_or_refused(name, folder / name / name, valid[:start] + data)
+
+    @fuzzed(examples, data=some.binary(max_size=300), start=some.integers(0, 60))
+    def check(data: bytes, start: int) -> None:
+        read_or_refused(name, folder / name / name, valid[:start] + data)
 
 
+@pytest.mark.parametrize("examples", EXAMPLES)
 @pytest.mark.parametrize("name", READERS)
-@everything
-@given(which=some.integers(0, 19), member=some.floats(0, 1), changes=damages())
-def test_damaged_files_are_read_or_refused(
-    name: str, folder: Path, which: int, member: float, changes: list[tuple[str, float, bytes]]
-):
+def test_damaged_files_are_read_or_refused(name: str, examples: int, folder: Path):
     made = first_files(name, folder)
-    data = made[which % len(made)]
-    changed = damaged_member(data, member, changes) if name.endswith(".ogpc") and which else damaged(data, changes)
-    read_or_refused(name, folder / name / name, changed)
+
+    @fuzzed(examples, which=some.integers(0, 19), member=some.floats(0, 1), changes=damages())
+    def check(which: int, member: float, changes: list[tuple[str, float, bytes]]) -> None:
+        data = made[which % len(made)]
+        changed = damaged_member(data, member, changes) if name.endswith(".ogpc") and which else damaged(data, changes)
+        read_or_refused(name, folder / name / name, changed)
 
 
 def test_what_must_not_happen_fails_the_tests(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -13,7 +13,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from capture_files import HEIGHT, WIDTH, make_world, write_colmap_text, write_transforms
+from capture_files import BY_COLOR, HEIGHT, WIDTH, make_world, write_colmap_text, write_transforms
 from scenes import write_image, write_ply
 
 from og_pointcloud.cli import main
@@ -22,6 +22,14 @@ from og_pointcloud.formats.capture import read_capture
 from og_pointcloud.masking.make_masks import PREVIEW_NAME, WORK_FOLDER, MaskSettings, make_masks
 
 ALONE = MaskSettings(encoder=None)
+QUICK = MaskSettings(BY_COLOR, encoder=None)
+QUICKLY = ["--proposer", BY_COLOR, "--encoder", "none"]
+
+
+@pytest.fixture(autouse=True)
+def _poses_that_are_not_checked(monkeypatch):
+    """test_checking does that; the poses here are of nowhere, which takes it longest."""
+    monkeypatch.setattr("og_pointcloud.cli.masks.warn_of_poses", lambda _: None)
 
 
 def silent(_: str) -> None:
@@ -97,13 +105,13 @@ def test_images_side_by_side_give_the_same_files(tmp_path, monkeypatch):
 def test_images_that_are_all_done_are_only_assembled(tmp_path, monkeypatch):
     """A run that ended between its last image and `assemble`."""
     world = make_capture(tmp_path / "c")
-    make_masks(tmp_path / "c", ALONE, tmp_path / "whole", say=silent)
+    make_masks(tmp_path / "c", QUICK, tmp_path / "whole", say=silent)
     with monkeypatch.context() as patch:
         patch.setattr("og_pointcloud.masking.make_masks._assemble", killed)
         with pytest.raises(KeyboardInterrupt):
-            make_masks(tmp_path / "c", ALONE, say=silent)
+            make_masks(tmp_path / "c", QUICK, say=silent)
     assert not (tmp_path / "c" / "masks").exists()
-    made = make_masks(tmp_path / "c", ALONE, say=silent)
+    made = make_masks(tmp_path / "c", QUICK, say=silent)
     assert made.done_before == made.images == 4
     for name in world.names:
         assert np.array_equal(ids_of(tmp_path / "c", name), ids_of(tmp_path / "whole", name))
@@ -182,11 +190,11 @@ def test_masks_of_others_are_not_overwritten(tmp_path, capsys):
     (tmp_path / "c" / "masks").mkdir()
     theirs = tmp_path / "c" / "masks" / f"{world.names[0]}.png"
     theirs.write_bytes(b"mine")
-    assert main(["masks", str(tmp_path / "c"), "--encoder", "none"]) == 2
+    assert main(["masks", str(tmp_path / "c"), *QUICKLY]) == 2
     assert "was not made by this command" in capsys.readouterr().err
     assert theirs.read_bytes() == b"mine"
-    assert main(["masks", str(tmp_path / "c"), "--encoder", "none", "--overwrite"]) == 0
-    assert main(["masks", str(tmp_path / "c"), "--encoder", "none", "--level", "small"]) == 0
+    assert main(["masks", str(tmp_path / "c"), *QUICKLY, "--overwrite"]) == 0
+    assert main(["masks", str(tmp_path / "c"), *QUICKLY, "--level", "small"]) == 0
     out = capsys.readouterr().out
     assert "next: og-pointcloud fit" in out
 
@@ -195,13 +203,13 @@ def test_the_demo_encoder_is_not_taken_without_a_word(tmp_path, capsys):
     make_capture(tmp_path / "c", 1)
     assert main(["masks", str(tmp_path / "c")]) == 0
     assert "knows the demo room's furniture alone" in capsys.readouterr().err
-    assert main(["masks", str(tmp_path / "c"), "--encoder", "none"]) == 0
+    assert main(["masks", str(tmp_path / "c"), *QUICKLY]) == 0
     assert "demo room" not in capsys.readouterr().err
 
 
 def test_a_run_that_finds_all_done_does_nothing(tmp_path, capsys):
     make_capture(tmp_path / "c", 3)
-    command = ["masks", str(tmp_path / "c"), "--encoder", "none"]
+    command = ["masks", str(tmp_path / "c"), *QUICKLY]
     assert main(command) == 0
     first = capsys.readouterr()
     state = {file: file.stat().st_mtime_ns for file in sorted((tmp_path / "c").rglob("*")) if file.is_file()}
@@ -216,7 +224,7 @@ def test_a_run_that_finds_all_done_does_nothing(tmp_path, capsys):
 def test_what_changed_is_made_again(tmp_path, capsys, change):
     world = make_capture(tmp_path / "c", 3)
     masks = tmp_path / "c" / "masks"
-    command = ["masks", str(tmp_path / "c"), "--encoder", "none"]
+    command = ["masks", str(tmp_path / "c"), *QUICKLY]
     assert main(command) == 0
     before = {name: ids_of(tmp_path / "c", name) for name in world.names}
     if change.startswith("--"):
@@ -256,10 +264,10 @@ def test_other_masks_in_the_folder_of_the_proposer_are_taken_up(tmp_path):
 
 def test_left_out_images_need_a_folder_and_are_named(tmp_path, capsys):
     world = make_capture(tmp_path / "c", 5)
-    assert main(["masks", str(tmp_path / "c"), "--encoder", "none", "--every", "2"]) == 2
+    assert main(["masks", str(tmp_path / "c"), *QUICKLY, "--every", "2"]) == 2
     assert "(-o DIR)" in capsys.readouterr().err
     output = tmp_path / "half"
-    assert main(["masks", str(tmp_path / "c"), "--encoder", "none", "--every", "2", "-o", str(output)]) == 0
+    assert main(["masks", str(tmp_path / "c"), *QUICKLY, "--every", "2", "-o", str(output)]) == 0
     said = capsys.readouterr().err
     assert f"left out: 2 of 5 images: {world.names[1]}, {world.names[3]}" in said
     scene = read_capture(output)
@@ -275,7 +283,7 @@ def test_colmap_captures_in_place(tmp_path):
     (tmp_path / "images").mkdir()
     for name in world.names:
         (tmp_path / "images" / f"{name}.png").write_bytes(plain(0, scenery()))
-    make_masks(tmp_path, ALONE, say=silent)
+    make_masks(tmp_path, QUICK, say=silent)
     assert all(view.mask_count for view in read_capture(tmp_path).views)
 
 
@@ -341,7 +349,7 @@ def test_a_large_image_is_shrunk_and_its_camera_with_it(tmp_path):
 def test_an_image_that_cannot_be_used_is_named(tmp_path, data):
     world = make_capture(tmp_path / "c", 3, lambda k, picture: data if k == 1 else plain(k, picture))
     with pytest.raises(SceneError, match=world.names[1]):
-        make_masks(tmp_path / "c", ALONE, say=silent)
+        make_masks(tmp_path / "c", QUICK, say=silent)
     assert not (tmp_path / "c" / "masks").exists()
 
 

@@ -209,6 +209,7 @@ def test_the_view_is_from_where_labelled_points_are_in_sight():
     assert np.isfinite(one.eye).all()
 
 
+@pytest.mark.slow
 def test_a_browser_opens_the_page_and_answers(bundle, tmp_path, capsys):
     browser = shutil.which("chromium") or shutil.which("google-chrome")
     if browser is None:

@@ -159,7 +159,7 @@ def test_masks_of_half_the_size_halve_the_views(panoramas):
 
 def test_masks_that_do_not_fit_the_panorama_are_refused(panoramas):
     write_image(panoramas / "masks" / "pano_1.png", np.zeros((100, 100), np.uint16))
-    with pytest.raises(SceneError, match=r"view 'pano_1/front': the masks are 100x100 pixels, the camera 256x128"):
+    with pytest.raises(SceneError, match=r"view 'pano_1/front': the masks are 100x100 pixels, its camera 256x128"):
         read_capture(panoramas)
 
 

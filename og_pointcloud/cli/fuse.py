@@ -31,8 +31,7 @@ def run(arguments: argparse.Namespace) -> None:
         raise OgPointcloudError(f"--depth-unit is {unit:g}; expected a number above 0, such as 0.001")
     check_output("-o", output, [arguments.capture])
     from og_pointcloud.formats.capture import fuse_capture
-    from og_pointcloud.formats.ply import write_ply
-    from og_pointcloud.show.splat_columns import plain_rows
+    from og_pointcloud.formats.ply import plain_rows, write_ply
 
     start = time.perf_counter()
     fused = fuse_capture(arguments.capture, unit)

@@ -40,13 +40,13 @@ from og_pointcloud.formats import colmap
 from og_pointcloud.formats.depth import DepthFile, DepthFrame, find_depth, resampled
 from og_pointcloud.formats.faces import Face
 from og_pointcloud.formats.gaussian_ply import latest_iteration
-from og_pointcloud.formats.images import find_image, image_size, read_rgb, same_shape, without_suffix
+from og_pointcloud.formats.images import find_image, image_size, read_rgb, require_scaled, without_suffix
 from og_pointcloud.formats.langsplat import LANGUAGE_FEATURES_FOLDER, read_language_features
 from og_pointcloud.formats.mask_files import FEATURES_NAME, MASKS_FOLDER, MaskLayer, read_masks
 from og_pointcloud.formats.nerfstudio import TRANSFORMS_NAMES, read_transforms
 from og_pointcloud.formats.photogrammetry import find_photogrammetry, read_photogrammetry
 from og_pointcloud.formats.points import read_points
-from og_pointcloud.formats.poses import PosedImage, in_local_frame, in_pinholes
+from og_pointcloud.formats.poses import PosedFrames, PosedImage, in_local_frame, in_pinholes
 from og_pointcloud.formats.repairs import Repair, read_repairs, repaired_images, repaired_layers
 from og_pointcloud.formats.rgbd import find_mesh, read_rgbd
 from og_pointcloud.scene import NOT_SEEN, Camera, Points, Scene, View
@@ -158,27 +158,31 @@ def read_poses(capture: Path, repairs: Sequence[Repair] | None = None) -> Captur
 
 def _stated_poses(capture: Path) -> CapturePoses:
     """The images as pose files list them."""
-    file = next((capture / name for name in TRANSFORMS_NAMES if (capture / name).is_file()), None)
-    if file is not None:
-        transforms = read_transforms(file, partial(_size_of_image, capture))
-        _warn_of_dropped(file, transforms.dropped)
-        names = _view_names(transforms.images)
-        return CapturePoses(names, transforms.images, file, transforms.ply_file_path)
-    model = colmap.find_model(capture)
-    if model is not None:
-        images = colmap.read_images(model)
-        return CapturePoses(_view_names(images), images, model)
-    export = find_photogrammetry(capture)
-    if export is not None:
-        frames = read_photogrammetry(export, partial(_size_of_image, capture))
-        _warn_of_dropped(export, frames.dropped)
-        return CapturePoses(_view_names(frames.images), frames.images, export)
+    size_of, is_recording = partial(_size_of_image, capture), False
+    if (file := next((capture / name for name in TRANSFORMS_NAMES if (capture / name).is_file()), None)) is not None:
+        source, frames = file, read_transforms(file, size_of)
+    elif (model := colmap.find_model(capture)) is not None:
+        source, frames = model, PosedFrames(colmap.read_images(model))
+    elif (export := find_photogrammetry(capture)) is not None:
+        source, frames = export, read_photogrammetry(export, size_of)
+    else:
+        source, frames, is_recording = capture, _recording(capture), True
+    if frames.dropped:
+        warnings.warn(
+            f"{source}: {len(frames.dropped)} frames have no finite pose and are left out, e.g. "
+            f"'{printable(frames.dropped[0], 80)}'",
+            stacklevel=4,
+        )
+    return CapturePoses(_view_names(frames.images), frames.images, source, frames.ply_file_path, is_recording)
+
+
+def _recording(capture: Path) -> PosedFrames:
+    """What a data set's folder holds; SceneError where it is none of those that are known."""
     frames = read_rgbd(capture)
+    if frames is not None and frames.images:
+        return frames
     if frames is not None:
-        if not frames.images:
-            raise SceneError(f"{capture}: none of its {len(frames.dropped)} frames has a finite pose")
-        _warn_of_dropped(capture, frames.dropped)
-        return CapturePoses(_view_names(frames.images), frames.images, capture, is_recording=True)
+        raise SceneError(f"{capture}: none of its {len(frames.dropped)} frames has a finite pose")
     raise SceneError(
         f"{capture} has no pose file; expected transforms.json (nerfstudio, instant-ngp, Blender), a COLMAP model in "
         "sparse/0 (cameras and images, .bin or .txt), Metashape's .xml or RealityScan's .csv of cameras, or the layout "
@@ -186,14 +190,6 @@ def _stated_poses(capture: Path) -> CapturePoses:
         "(keyframes/), 3D Scanner App (frame_*.json) or ARKitScenes (lowres_wide.traj); of an E57 file, og-pointcloud "
         "import makes such a folder"
     )
-
-
-def _warn_of_dropped(source: Path, paths: Sequence[str]) -> None:
-    if paths:
-        warnings.warn(
-            f"{source}: {len(paths)} frames have no finite pose and are left out, e.g. '{printable(paths[0], 80)}'",
-            stacklevel=4,
-        )
 
 
 def _size_of_image(capture: Path, path: str) -> tuple[int, int]:
@@ -423,12 +419,8 @@ def find_images(capture: Path, images: Sequence[PosedImage]) -> list[Path | None
 
 
 def _require_shape(name: str, layer: MaskLayer, camera: Camera) -> None:
-    if not same_shape(layer.size, (camera.width, camera.height)):
-        raise SceneError(
-            f"view '{name}': the masks are {layer.size[0]}x{layer.size[1]} pixels, the camera "
-            f"{camera.width}x{camera.height}; expected the same size or a scaled one: make the masks on the posed "
-            "images or fix w and h of the pose file"
-        )
+    cure = "make the masks on the posed images or fix w and h of the pose file"
+    require_scaled(f"view '{name}': the masks are", layer.size, (camera.width, camera.height), cure)
 
 
 def _view(name: str, image: PosedImage, layer: MaskLayer, file: Path | None, origin: NDArray[np.float64]) -> View:

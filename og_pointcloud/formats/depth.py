@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.faces import faces
-from og_pointcloud.formats.images import MAX_PIXELS, decoded, png_header, require_cv2, same_shape
+from og_pointcloud.formats.images import MAX_PIXELS, decoded, png_header, require_cv2, require_scaled
 from og_pointcloud.formats.lenses import Lens
 from og_pointcloud.formats.npy import mapped_array
 from og_pointcloud.scene import Camera
@@ -58,11 +58,7 @@ class DepthFile:
         """
         stored = _stored(self.path)
         height, width = stored.shape
-        if not same_shape((width, height), (self.camera.width, self.camera.height)):
-            raise SceneError(
-                f"{self.path} is {width}x{height} pixels, its camera {self.camera.width}x{self.camera.height}; "
-                "expected the same size or a scaled one: fix the width and height of the pose file"
-            )
+        require_scaled(f"{self.path} is", (width, height), (self.camera.width, self.camera.height))
         whole = np.issubdtype(stored.dtype, np.integer)
         unit = (MILLIMETRE if whole else 1.0) if self.unit is None else self.unit
         with np.errstate(invalid="ignore", over="ignore"):

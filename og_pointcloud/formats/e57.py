@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 from og_pointcloud.errors import MissingExtraError, OgPointcloudError, SceneError
 from og_pointcloud.formats.atomic import replacing
 from og_pointcloud.formats.images import MAX_PIXELS, require_cv2
-from og_pointcloud.formats.ply import join_columns, write_ply
+from og_pointcloud.formats.ply import plain_rows, write_ply
 from og_pointcloud.formats.poses import rigid, rotation_of_quaternion
-from og_pointcloud.formats.tables import naming, storable_positions
+from og_pointcloud.formats.tables import naming
 from og_pointcloud.scene import Points
 
 __all__ = ["E57_SIGNATURE", "read_e57", "unpack_e57"]
@@ -83,10 +83,7 @@ def unpack_e57(path: str | os.PathLike[str], folder: str | os.PathLike[str]) -> 
         if not frames:
             why = unused[0] if unused else "the file has no images"
             raise SceneError(f"no image of it can be used ({why}); expected pinhole or spherical ones with poses")
-    columns = dict(zip("xyz", storable_positions(points.xyz_world).T, strict=True))
-    if points.rgb is not None:
-        columns |= dict(zip(("red", "green", "blue"), points.rgb.T, strict=True))
-    write_ply(folder / "points.ply", {"vertex": join_columns(columns)})
+    write_ply(folder / "points.ply", {"vertex": plain_rows(points.xyz_world, points.rgb)})
     with replacing(folder / "transforms.json") as stream:
         stream.write(json.dumps({"ply_file_path": "points.ply", "frames": frames}, indent=1).encode())
     return len(frames), unused

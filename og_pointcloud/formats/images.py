@@ -24,6 +24,7 @@ __all__ = [
     "png_header",
     "read_rgb",
     "require_cv2",
+    "require_scaled",
     "same_shape",
     "without_suffix",
 ]
@@ -185,14 +186,21 @@ def read_rgb(file: Path, size: tuple[int, int]) -> NDArray[np.uint8]:
     cv2 = require_cv2()
     image = decoded(file, cv2.IMREAD_COLOR)
     height, width = image.shape[:2]
-    if not same_shape((width, height), size):
-        raise SceneError(
-            f"{file} is {width}x{height} pixels, its camera {size[0]}x{size[1]}; expected the same size or a scaled "
-            "one: fix the width and height of the pose file"
-        )
+    require_scaled(f"{file} is", (width, height), size)
     if (width, height) != size:
         image = cv2.resize(image, size, interpolation=cv2.INTER_AREA if width > size[0] else cv2.INTER_LINEAR)
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)
+
+
+def require_scaled(
+    what: str, size: tuple[int, int], camera: tuple[int, int], cure: str = "fix the width and height of the pose file"
+) -> None:
+    """SceneError, which begins with ``what``, where a size (width, height) is not its camera's, or that scaled."""
+    if not same_shape(size, camera):
+        raise SceneError(
+            f"{what} {size[0]}x{size[1]} pixels, its camera {camera[0]}x{camera[1]}; expected the same size or a "
+            f"scaled one: {cure}"
+        )
 
 
 def same_shape(size: tuple[int, int], other: tuple[int, int]) -> bool:

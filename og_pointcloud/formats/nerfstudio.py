@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import posixpath
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -27,11 +26,11 @@ from numpy.typing import NDArray
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.depth import DepthFile
 from og_pointcloud.formats.lenses import SPHERICAL, Lens, lens_of, spherical_camera
-from og_pointcloud.formats.poses import PosedImage, read_json, rigid
+from og_pointcloud.formats.poses import OPENGL, PosedFrames, PosedImage, inverse, read_json
 from og_pointcloud.formats.tables import naming
 from og_pointcloud.scene import Camera
 
-__all__ = ["TRANSFORMS_NAMES", "Transforms", "read_transforms"]
+__all__ = ["TRANSFORMS_NAMES", "read_transforms"]
 
 TRANSFORMS_NAMES = ("transforms.json", "transforms_train.json")
 PERSPECTIVE_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
@@ -42,16 +41,7 @@ LENS_TERMS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 LARGEST = float(np.finfo(np.float64).max)
 
 
-@dataclass(frozen=True)
-class Transforms:
-    """What a transforms file holds. dropped: paths of frames whose pose is not finite (trackers get lost)."""
-
-    images: tuple[PosedImage, ...]
-    ply_file_path: str | None
-    dropped: tuple[str, ...]
-
-
-def read_transforms(file: Path, image_size: Callable[[str], tuple[int, int]]) -> Transforms:
+def read_transforms(file: Path, image_size: Callable[[str], tuple[int, int]]) -> PosedFrames:
     """Read a transforms file; ``image_size(path)`` gives (width, height) where it states none (Blender).
 
     Raises SceneError for anything that is not such a file, naming the frame and the key.
@@ -73,7 +63,7 @@ def read_transforms(file: Path, image_size: Callable[[str], tuple[int, int]]) ->
             camera_to_world = _matrix(frame, "transform_matrix")
             if np.isfinite(camera_to_world).all():
                 keys = {**shared, **frame}
-                camera = _camera(keys, _world_to_camera(camera_to_world), partial(image_size, path))
+                camera = _camera(keys, inverse(camera_to_world * OPENGL), partial(image_size, path))
                 lens = _lens(keys)
                 images.append(PosedImage(path, camera, lens, _depth(file.parent, keys, camera, lens)))
             else:
@@ -84,7 +74,7 @@ def read_transforms(file: Path, image_size: Callable[[str], tuple[int, int]]) ->
         )
     ply = shared.get("ply_file_path")
     ply_file_path = ply.replace("\\", "/") if isinstance(ply, str) and ply else None
-    return Transforms(tuple(images), ply_file_path, tuple(dropped))
+    return PosedFrames(tuple(images), tuple(dropped), ply_file_path)
 
 
 def _matrix(keys: dict[str, Any], key: str) -> NDArray[np.float64]:
@@ -101,13 +91,6 @@ def _matrix(keys: dict[str, Any], key: str) -> NDArray[np.float64]:
     if np.isfinite(matrix).all() and np.abs(matrix[3] - [0, 0, 0, 1]).max() > 1e-6:
         raise SceneError(f"the last row of {key} is {matrix[3].tolist()}; expected [0, 0, 0, 1]")
     return matrix
-
-
-def _world_to_camera(camera_to_world: NDArray[np.float64]) -> NDArray[np.float64]:
-    """OpenCV world-to-camera from OpenGL camera-to-world: y and z of the camera change sign, then invert."""
-    rotation = (camera_to_world[:3, :3] * [1.0, -1.0, -1.0]).T
-    with np.errstate(over="ignore", invalid="ignore"):  # the camera refuses what comes of it
-        return rigid(rotation, -rotation @ camera_to_world[:3, 3])
 
 
 def _camera(

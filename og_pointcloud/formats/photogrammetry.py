@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.lenses import SPHERICAL, Lens, lens_of, spherical_camera
-from og_pointcloud.formats.poses import PosedFrames, PosedImage, rigid
+from og_pointcloud.formats.poses import OPENGL, PosedFrames, PosedImage, inverse, rigid
 from og_pointcloud.formats.tables import naming
 from og_pointcloud.scene import Camera
 
@@ -39,8 +39,6 @@ HEAD_BYTES = 4096
 MOST_SKEW_PX = 1.0
 FULL_FRAME = 36.0
 COLUMNS = ["x", "y", "alt", "heading", "pitch", "roll", "f", "px", "py", "k1", "k2", "k3", "k4", "t1", "t2"]
-OPENGL = np.array([1.0, -1.0, -1.0])
-"""Factors of a camera's axes between OpenGL's (y up, z back) and OpenCV's."""
 
 
 def find_photogrammetry(capture: Path) -> Path | None:
@@ -137,9 +135,7 @@ def _world_of(element: ElementTree.Element) -> World | None:
 def _metashape_image(label: str, sensor: ElementTree.Element, to_chunk: Doubles, world: World) -> PosedImage:
     scale, rotation, translation = world
     with np.errstate(all="ignore"):  # the camera refuses what comes of it
-        center = scale * rotation @ to_chunk[:3, 3] + translation
-        camera_to_world = rotation @ to_chunk[:3, :3]
-        pose = rigid(camera_to_world.T, -camera_to_world.T @ center)
+        pose = inverse(rigid(rotation @ to_chunk[:3, :3], scale * rotation @ to_chunk[:3, 3] + translation))
     calibrations = sensor.findall("calibration")
     stated = next((made for made in calibrations if made.get("class") == "adjusted"), None)
     calibration = stated if stated is not None else next(iter(calibrations), None)
@@ -214,10 +210,10 @@ def _realityscan_images(lines: csv.DictReader[str], image_size: ImageSize) -> It
             width, height = image_size(name)
             scale = max(width, height) / FULL_FRAME
             center = np.array([values["x"], values["y"], values["alt"]])
-            rotation = _looking_down(values["heading"], values["pitch"], values["roll"]) * OPENGL
+            pose = rigid(_looking_down(values["heading"], values["pitch"], values["roll"]), center) * OPENGL
             camera = Camera(
                 width, height, scale * values["f"], scale * values["f"], width / 2 + scale * values["px"],
-                height / 2 + scale * values["py"], rigid(rotation.T, -rotation.T @ center),
+                height / 2 + scale * values["py"], inverse(pose),
             )  # fmt: skip
             terms = {"k1": "k1", "k2": "k2", "k3": "k3", "r8": "k4", "p1": "t1", "p2": "t2"}
             lens = lens_of("perspective", {term: values[column] for term, column in terms.items()})

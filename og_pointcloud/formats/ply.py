@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.atomic import replacing
-from og_pointcloud.formats.tables import naming, read_text_rows
+from og_pointcloud.formats.tables import naming, read_text_rows, storable_positions
 
-__all__ = ["join_columns", "read_ply", "write_ply"]
+__all__ = ["join_columns", "plain_rows", "read_ply", "write_ply"]
 
 HEADER_LIMIT = 1 << 18
 """Bytes in which a header must end; the longest known (a 3DGS file with its training record) has 4 kB."""
@@ -104,6 +104,17 @@ def join_columns(columns: Mapping[str, NDArray]) -> NDArray[np.void]:
     for name, column in columns.items():
         rows[name] = column
     return rows
+
+
+def plain_rows(
+    xyz_world: NDArray[np.floating], rgb: NDArray[np.uint8] | None, attributes: Mapping[str, NDArray] | None = None
+) -> NDArray[np.void]:
+    """A cloud as vertices: x y z, double where float would move a point by more than 1e-6 of the cloud's extent, red
+    green blue, and other columns."""
+    columns = dict(zip("xyz", storable_positions(xyz_world).T, strict=True))
+    if rgb is not None:
+        columns |= dict(zip(("red", "green", "blue"), rgb.T, strict=True))
+    return join_columns(columns | dict(attributes or {}))
 
 
 def _parse_header(head: bytes) -> _Header:

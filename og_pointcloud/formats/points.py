@@ -16,8 +16,8 @@ from og_pointcloud.formats.gaussian_ply import gaussians_from_ply, holds_gaussia
 from og_pointcloud.formats.las import SIGNATURE as LAS_SIGNATURE
 from og_pointcloud.formats.las import read_las
 from og_pointcloud.formats.pcd import looks_like_pcd, read_pcd
-from og_pointcloud.formats.ply import HEADER_LIMIT, join_columns, read_ply, write_ply
-from og_pointcloud.formats.tables import colors, naming, positions, storable_positions
+from og_pointcloud.formats.ply import HEADER_LIMIT, plain_rows, read_ply, write_ply
+from og_pointcloud.formats.tables import colors, naming, positions
 from og_pointcloud.scene import Points
 
 __all__ = ["read_points", "write_labelled_ply"]
@@ -82,11 +82,9 @@ def write_labelled_ply(
     for name, (values, expected) in shapes.items():
         if values.shape != expected:
             raise SceneError(f"{path}: {name} has shape {values.shape}; expected {expected}")
-    columns = dict(zip("xyz", storable_positions(xyz_world).T, strict=True))
-    columns |= dict(zip(("red", "green", "blue"), np.asarray(rgb, np.uint8).T, strict=True))
     comment = f"og_names {json.dumps(list(names))}"
     fits = names and len(comment) < HEADER_LIMIT // 2
-    write_ply(path, {"vertex": join_columns(columns | dict(attributes))}, [comment] if fits else [])
+    write_ply(path, {"vertex": plain_rows(xyz_world, np.asarray(rgb, np.uint8), attributes)}, [comment] if fits else [])
 
 
 def _cloud(rows: NDArray[np.void]) -> Points:

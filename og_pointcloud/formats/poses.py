@@ -1,10 +1,11 @@
-"""What every pose file gives, whatever its format: one record per image, in world coordinates."""
+"""What every pose file gives, whatever its format: one record per image, in world coordinates; and what their readers
+share: lenses without a pose, recordings whose tracking gets lost, numbers in text and JSON."""
 
 from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -15,23 +16,22 @@ from numpy.typing import ArrayLike, NDArray
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.depth import DepthFile
 from og_pointcloud.formats.faces import Face, faces
+from og_pointcloud.formats.images import IMAGE_SUFFIXES
 from og_pointcloud.formats.lenses import Lens
+from og_pointcloud.formats.tables import naming
 from og_pointcloud.scene import Camera
 
 __all__ = [
-    "MAX_JSON_BYTES",
-    "PosedFrames",
-    "PosedImage",
-    "in_local_frame",
-    "in_pinholes",
-    "numbered",
-    "read_json",
-    "read_numbers",
-    "rigid",
+    "MAX_JSON_BYTES", "OPENGL", "PosedFrames", "PosedImage", "Recording", "Sensor", "in_local_frame", "in_pinholes",
+    "inverse", "named_numbers", "numbered", "numbered_images", "read_json", "read_numbers", "rigid",
     "rotation_of_quaternion",
-]
+]  # fmt: skip
 
 MAX_TEXT_BYTES, MAX_JSON_BYTES = 1 << 26, 1 << 30
+LARGEST = 1e30
+"""Of a number in a pose file: anything beyond is damage, and its square still is a number."""
+OPENGL = np.array([1.0, -1.0, -1.0, 1.0])
+"""Factors of the columns of a pose, camera to world, between OpenGL's axes (y up, z back) and OpenCV's."""
 
 
 @dataclass(frozen=True)
@@ -53,10 +53,64 @@ class PosedImage:
 
 @dataclass(frozen=True)
 class PosedFrames:
-    """What a data set's folder holds. dropped: paths of images without a finite pose (trackers get lost)."""
+    """What a pose file or a data set's folder holds. dropped: paths of images without a finite pose (trackers get
+    lost). ply_file_path: of the cloud that the file names, as written there."""
 
     images: tuple[PosedImage, ...]
-    dropped: tuple[str, ...]
+    dropped: tuple[str, ...] = ()
+    ply_file_path: str | None = None
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """A pinhole camera without its pose: pixels, pixel centres at +0.5. unit, invalid: of depth, as `DepthFile`."""
+
+    size: tuple[int, int]
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    unit: float | None = None
+    invalid: int | None = None
+
+    @classmethod
+    def from_matrix(cls, size: tuple[int, int], matrix: NDArray[np.float64]) -> Sensor:
+        """From intrinsics (3 or 4, 3 or 4) that count pixel centres at whole numbers, as most RGB-D sets do."""
+        return cls(size, matrix[0, 0].item(), matrix[1, 1].item(), matrix[0, 2].item() + 0.5, matrix[1, 2].item() + 0.5)
+
+    def at(self, camera_to_world: NDArray[np.float64]) -> Camera:
+        """The camera there; camera_to_world: (3 or 4, 4), finite, OpenCV axes."""
+        if camera_to_world.shape not in ((3, 4), (4, 4)):
+            raise SceneError(f"the pose has shape {camera_to_world.shape}; expected a 4x4 matrix, camera to world")
+        return Camera(*self.size, self.fx, self.fy, self.cx, self.cy, inverse(camera_to_world))
+
+
+class Recording:
+    """Frames as a data set's reader finds them, one after the other."""
+
+    def __init__(self) -> None:
+        self._images: list[PosedImage] = []
+        self.dropped: list[str] = []
+        """Paths of images without a pose."""
+
+    def add(
+        self, path: str, pose: NDArray[np.float64], source: Path | str, color: Sensor,
+        depth: tuple[Sensor, Path] | None = None,
+    ) -> None:  # fmt: skip
+        """path: of the image, in the capture folder. pose: camera to world; not finite where tracking was lost.
+        source: where the pose was read, for errors. depth: its sensor, and a file that may be absent."""
+        if not np.isfinite(pose).all():
+            self.dropped.append(path)
+            return
+        with naming(source):
+            camera, file = color.at(pose), None
+            if depth is not None and depth[1].is_file():
+                file = DepthFile(depth[1], depth[0].at(pose), depth[0].unit, depth[0].invalid)
+        self._images.append(PosedImage(path, camera, depth=file))
+
+    def frames(self) -> PosedFrames:
+        """All of them."""
+        return PosedFrames(tuple(self._images), tuple(self.dropped))
 
 
 def in_pinholes(image: PosedImage) -> tuple[PosedImage, ...]:
@@ -76,6 +130,13 @@ def rigid(rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> ND
     transform[:3, :3] = rotation
     transform[:3, 3] = translation
     return transform
+
+
+def inverse(transform: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(4, 4) inverse of a rigid transform (3 or 4, 4); of absurd numbers something that the camera refuses."""
+    rotation = transform[:3, :3].T
+    with np.errstate(over="ignore", invalid="ignore"):
+        return rigid(rotation, -rotation @ transform[:3, 3])
 
 
 def rotation_of_quaternion(wxyz: ArrayLike) -> NDArray[np.float64]:
@@ -104,6 +165,11 @@ def numbered(files: Iterable[Path]) -> list[Path]:
     return sorted(files, key=lambda file: ([int(digits) for digits in re.findall(r"\d+", file.name)], file.name))
 
 
+def numbered_images(folder: Path) -> list[Path]:
+    """The images in a folder, as `numbered`; none where it is no folder."""
+    return numbered(file for file in folder.iterdir() if file.suffix in IMAGE_SUFFIXES) if folder.is_dir() else []
+
+
 def read_json(file: Path, most: int = MAX_TEXT_BYTES) -> Any:
     """What a JSON file of bounded size holds, which takes up to twenty times its bytes. SceneError where it is none."""
     if (size := file.stat().st_size) > most:
@@ -128,3 +194,14 @@ def read_numbers(file: Path, columns: int) -> NDArray[np.float64]:
     if numbers.ndim != 2 or numbers.shape[1] != columns:
         raise SceneError(f"{file} has numbers of shape {numbers.shape}; expected rows of {columns}")
     return numbers
+
+
+def named_numbers(content: Any, keys: Sequence[Any], source: Path | str) -> list[float]:
+    """The values of a JSON object, or list, at these keys; SceneError where one is no finite number."""
+    try:
+        values = [float(content[key]) for key in keys]
+    except (TypeError, ValueError, KeyError, IndexError, OverflowError):
+        values = []
+    if not values or not np.abs(values).max() <= LARGEST:
+        raise SceneError(f"{source} lacks finite numbers {', '.join(map(str, keys)):.120}: export or copy it again")
+    return values

@@ -18,20 +18,26 @@ Poses are camera-to-world with OpenCV axes. Pixel centres are counted at whole n
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.errors import SceneError
-from og_pointcloud.formats.depth import MILLIMETRE, DepthFile
-from og_pointcloud.formats.images import IMAGE_SUFFIXES, image_size
+from og_pointcloud.formats.depth import MILLIMETRE
+from og_pointcloud.formats.images import image_size
 from og_pointcloud.formats.phones import PHONE_LAYOUTS
-from og_pointcloud.formats.poses import PosedFrames, PosedImage, numbered, read_json, read_numbers, rigid
-from og_pointcloud.formats.tables import naming
-from og_pointcloud.scene import Camera
+from og_pointcloud.formats.poses import (
+    PosedFrames,
+    Recording,
+    Sensor,
+    named_numbers,
+    numbered,
+    numbered_images,
+    read_json,
+    read_numbers,
+)
 
 __all__ = ["find_mesh", "read_replica", "read_rgbd", "read_scannet", "read_seven_scenes"]
 
@@ -42,53 +48,6 @@ SEVEN_SCENES_IMAGES = ("frame-*.color.png", "frame-*.color.jpg")
 SEVEN_SCENES_INTRINSICS = "camera-intrinsics.txt"
 REPLICA_PARAMETERS = "cam_params.json"
 REPLICA_KEYS = ("w", "h", "fx", "fy", "cx", "cy", "scale")
-
-
-@dataclass(frozen=True)
-class _Lens:
-    """A camera without its pose: pixels, pixel centres at +0.5. unit, invalid: of depth, as `DepthFile` has them."""
-
-    size: tuple[int, int]
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-    unit: float | None = None
-    invalid: int | None = None
-
-    @classmethod
-    def from_matrix(cls, size: tuple[int, int], matrix: NDArray[np.float64]) -> _Lens:
-        """From intrinsics (3 or 4, 3 or 4) that count pixel centres at whole numbers, as most RGB-D sets do."""
-        return cls(size, matrix[0, 0].item(), matrix[1, 1].item(), matrix[0, 2].item() + 0.5, matrix[1, 2].item() + 0.5)
-
-    def at(self, camera_to_world: NDArray[np.float64]) -> Camera:
-        """The camera with this lens; camera_to_world: (4, 4), finite, OpenCV axes."""
-        if camera_to_world.shape != (4, 4):
-            raise SceneError(f"the pose has shape {camera_to_world.shape}; expected a 4x4 matrix, camera to world")
-        rotation = camera_to_world[:3, :3].T
-        pose = rigid(rotation, -rotation @ camera_to_world[:3, 3])
-        return Camera(*self.size, self.fx, self.fy, self.cx, self.cy, pose)
-
-
-class _Recording(NamedTuple):
-    """The frames with a finite pose, and the paths of the others, whose tracking was lost."""
-
-    images: list[PosedImage]
-    dropped: list[str]
-
-    def add(self, path: str, pose: NDArray[np.float64], source: str, lenses: tuple[_Lens, _Lens], depth: Path) -> None:
-        """path: of the image, in the capture folder. pose: camera to world. source: where the pose was read, for
-        errors. lenses: of colour and depth. depth: a file that may be absent."""
-        if not np.isfinite(pose).all():
-            self.dropped.append(path)
-            return
-        with naming(source):
-            camera, lens = lenses[0].at(pose), lenses[1]
-            depth_file = DepthFile(depth, lens.at(pose), lens.unit, lens.invalid) if depth.is_file() else None
-        self.images.append(PosedImage(path, camera, depth=depth_file))
-
-    def frames(self) -> PosedFrames:
-        return PosedFrames(tuple(self.images), tuple(self.dropped))
 
 
 def read_rgbd(folder: Path) -> PosedFrames | None:
@@ -128,16 +87,16 @@ def _in_or_above(folder: Path, name: str) -> Path | None:
 
 def read_scannet(folder: Path) -> PosedFrames:
     """As `read_rgbd`, of ScanNet's layout."""
-    images = numbered(file for file in (folder / "color").iterdir() if file.suffix in IMAGE_SUFFIXES)
+    images = numbered_images(folder / "color")
     if not images:
         raise SceneError(f"{folder / 'color'} has no image; expected 0.jpg, 1.jpg, ...: export the colour frames")
     color = _scannet_lens(folder, "color", images[0])
     some_depth = next((folder / "depth").glob("*.png"), None)
     depth = replace(_scannet_lens(folder, "depth", some_depth) if some_depth else color, unit=MILLIMETRE)
-    recording = _Recording([], [])
+    recording = Recording()
     for file in images:
         pose_file, depth_file = folder / "pose" / f"{file.stem}.txt", folder / "depth" / f"{file.stem}.png"
-        recording.add(f"color/{file.name}", _pose_in(pose_file), str(pose_file), (color, depth), depth_file)
+        recording.add(f"color/{file.name}", _pose_in(pose_file), pose_file, color, (depth, depth_file))
     return recording.frames()
 
 
@@ -151,11 +110,11 @@ def _scannet_file(folder: Path, sensor: str) -> Path | None:
     return next((file for file in files if file.is_file()), None)
 
 
-def _scannet_lens(folder: Path, sensor: str, image: Path) -> _Lens:
+def _scannet_lens(folder: Path, sensor: str, image: Path) -> Sensor:
     file = _scannet_file(folder, sensor)
     if file is None:
         raise SceneError(f"{folder} has no intrinsic/intrinsic_{sensor}.txt: export the intrinsics again")
-    return _Lens.from_matrix(image_size(image), _matrix_in(file, 4))
+    return Sensor.from_matrix(image_size(image), _matrix_in(file, 4))
 
 
 def read_seven_scenes(folder: Path) -> PosedFrames:
@@ -169,12 +128,12 @@ def read_seven_scenes(folder: Path) -> PosedFrames:
         raise SceneError(f"{folder} has poses but no frame-*.color.png or .color.jpg: add the colour images")
     color, depth = _seven_scenes_lenses(folder, image_size(images[0]))
     depth = replace(depth, unit=MILLIMETRE, invalid=SEVEN_SCENES_INVALID)
-    recording = _Recording([], [])
+    recording = Recording()
     for file in images:
         frame = file.name.split(".")[0]
         pose_file, depth_file = file.with_name(f"{frame}.pose.txt"), file.with_name(f"{frame}.depth.png")
         path = file.relative_to(folder).as_posix()
-        recording.add(path, _pose_in(pose_file), str(pose_file), (color, depth), depth_file)
+        recording.add(path, _pose_in(pose_file), pose_file, color, (depth, depth_file))
     return recording.frames()
 
 
@@ -182,16 +141,16 @@ def _sequences(folder: Path) -> list[Path]:
     return [folder, *sorted(path for path in folder.glob("seq-*") if path.is_dir())]
 
 
-def _seven_scenes_lenses(folder: Path, size: tuple[int, int]) -> tuple[_Lens, _Lens]:
+def _seven_scenes_lenses(folder: Path, size: tuple[int, int]) -> tuple[Sensor, Sensor]:
     """The lenses of colour and of depth."""
     file = _in_or_above(folder, SEVEN_SCENES_INTRINSICS)
     if file is not None:
-        both = _Lens.from_matrix(size, _matrix_in(file, 3))
+        both = Sensor.from_matrix(size, _matrix_in(file, 3))
         return both, both
     width, height = size
     color, depth = (focal * width / FOCAL_WIDTH for focal in (COLOR_FOCAL_PX, DEPTH_FOCAL_PX))
     middle = width / 2 + 0.5, height / 2 + 0.5
-    return _Lens(size, color, color, *middle), _Lens(size, depth, depth, *middle)
+    return Sensor(size, color, color, *middle), Sensor(size, depth, depth, *middle)
 
 
 def read_replica(folder: Path) -> PosedFrames:
@@ -205,12 +164,12 @@ def read_replica(folder: Path) -> PosedFrames:
             "image and a pose for each: copy both from one run"
         )
     width, height, fx, fy, cx, cy, scale = _replica_parameters(folder)
-    lens = _Lens((round(width), round(height)), fx, fy, cx + 0.5, cy + 0.5, unit=1 / scale)
-    recording = _Recording([], [])
+    lens = Sensor((round(width), round(height)), fx, fy, cx + 0.5, cy + 0.5, unit=1 / scale)
+    recording = Recording()
     for line, (file, pose) in enumerate(zip(images, poses, strict=False), 1):
         depth_file = results / f"{file.stem.replace('frame', 'depth', 1)}.png"
         source = f"{folder / 'traj.txt'}, line {line}"
-        recording.add(f"results/{file.name}", pose, source, (lens, lens), depth_file)
+        recording.add(f"results/{file.name}", pose, source, lens, (lens, depth_file))
     return recording.frames()
 
 
@@ -221,13 +180,8 @@ def _replica_parameters(folder: Path) -> list[float]:
             f"{folder} has no {REPLICA_PARAMETERS}, nor has the folder above; expected it with w h fx fy cx cy scale"
         )
     content = read_json(file)
-    try:
-        values = [float(content["camera"][key]) for key in REPLICA_KEYS]
-    except (ValueError, TypeError, KeyError) as error:
-        raise SceneError(
-            f'{file} is not {{"camera": {{{", ".join(REPLICA_KEYS)}}}}} ({error!s:.80}): copy it again'
-        ) from None
-    if not np.isfinite(values).all() or min(values[0], values[1], values[-1]) <= 0 or max(values[:2]) > 1 << 16:
+    values = named_numbers(content.get("camera") if isinstance(content, dict) else None, REPLICA_KEYS, file)
+    if min(values[0], values[1], values[-1]) <= 0 or max(values[:2]) > 1 << 16:
         raise SceneError(f"{file}: {', '.join(REPLICA_KEYS)} are {values}; expected positive sizes and scale")
     return values
 

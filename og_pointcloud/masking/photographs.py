@@ -14,7 +14,7 @@ from og_pointcloud.formats.atomic import replacing
 from og_pointcloud.formats.capture import find_images, read_photograph, read_poses
 from og_pointcloud.formats.colors import label_colors
 from og_pointcloud.formats.faces import Face
-from og_pointcloud.formats.images import image_size, read_rgb, require_cv2, same_shape
+from og_pointcloud.formats.images import image_size, read_rgb, require_cv2, require_scaled
 from og_pointcloud.formats.poses import PosedImage
 from og_pointcloud.scene import Camera
 
@@ -83,14 +83,12 @@ def _photograph(name: str, image: PosedImage, file: Path) -> Photograph:
 
 
 def _check_size(photograph: Photograph) -> None:
-    size, camera = image_size(photograph.file), photograph.camera
-    camera = camera if photograph.face is None else photograph.face.whole
-    if not same_shape(size, (camera.width, camera.height)):
-        raise SceneError(
-            f"{photograph.file} is {size[0]}x{size[1]} pixels, its camera {camera.width}x{camera.height}; expected the "
-            "same size or a scaled one: fix the width and height of the pose file, or turn the image (EXIF "
-            "orientation is ignored, poses are of the pixels as stored)"
-        )
+    camera = photograph.camera if photograph.face is None else photograph.face.whole
+    cure = (
+        "fix the width and height of the pose file, or turn the image (EXIF orientation is ignored, poses are of the "
+        "pixels as stored)"
+    )
+    require_scaled(f"{photograph.file} is", image_size(photograph.file), (camera.width, camera.height), cure)
 
 
 def write_contact_sheet(path: Path, pictures: Sequence[tuple[NDArray[np.uint8], NDArray[np.int32]]]) -> None:

@@ -30,10 +30,10 @@ from og_pointcloud.bundle.nearest import NearestPoint
 from og_pointcloud.cloud import TOO_FAR
 from og_pointcloud.errors import OgPointcloudError, SceneError
 from og_pointcloud.formats.gaussian_ply import gaussian_rows, gaussians_from_ply, holds_gaussians
-from og_pointcloud.formats.ply import HEADER_LIMIT, read_ply, write_ply
+from og_pointcloud.formats.ply import HEADER_LIMIT, plain_rows, read_ply, write_ply
 from og_pointcloud.formats.points import read_points
 from og_pointcloud.formats.tables import naming, positions
-from og_pointcloud.show.splat_columns import appended, placed, plain_rows, recoloured
+from og_pointcloud.show.splat_columns import appended, placed, recoloured
 from og_pointcloud.text.words import TextFeatures
 
 if TYPE_CHECKING:

@@ -19,9 +19,9 @@ from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.colors import LUMINANCE
 from og_pointcloud.formats.gaussian_ply import BASE_COLOR, LOG_SCALE, ROTATION, SH_CONSTANT
 from og_pointcloud.formats.ply import join_columns
-from og_pointcloud.formats.tables import colors, positions, storable_positions
+from og_pointcloud.formats.tables import colors, positions
 
-__all__ = ["appended", "placed", "plain_rows", "recoloured", "rotated_harmonics"]
+__all__ = ["appended", "placed", "recoloured", "rotated_harmonics"]
 
 Rows: TypeAlias = NDArray[np.void]
 Columns: TypeAlias = dict[str, NDArray[Any]]
@@ -34,14 +34,6 @@ DARK = 0.05
 """Mean luminance below which an object's shading is too faint to be kept in a new colour."""
 MAX_DEGREE = 3
 """Highest degree of the harmonics that files have."""
-
-
-def plain_rows(xyz_world: NDArray[np.float64], rgb: NDArray[np.uint8] | None) -> Rows:
-    """A plain cloud in the layout of a PLY: x y z, double where float would lose digits, then colours."""
-    columns = dict(zip("xyz", storable_positions(xyz_world).T, strict=True))
-    if rgb is not None:
-        columns |= dict(zip(RGB, rgb.T, strict=True))
-    return join_columns(columns)
 
 
 def recoloured(rows: Rows, chosen: NDArray[np.bool_], color: NDArray[np.float64]) -> Rows:
