@@ -1,6 +1,8 @@
 # `make demo` and `make test` do their whole set-up in .venv; a second run starts at once.
 .PHONY: help setup demo test test-all lint check bench zoo clean
 .DEFAULT_GOAL := help
+# A process a core; tests of one file stay together, since they share what is slow to make.
+PARALLEL := -n auto --dist loadfile
 
 help:
 	@echo "make demo    build a furnished room, label it and show it: pictures and scores in out/demo"
@@ -19,10 +21,10 @@ demo: setup
 	@.venv/bin/og-pointcloud demo -o out/demo
 
 test: setup
-	@.venv/bin/python -m pytest -m "not slow"
+	@.venv/bin/python -m pytest $(PARALLEL) -m "not slow"
 
 test-all: setup
-	@.venv/bin/python -m pytest
+	@.venv/bin/python -m pytest $(PARALLEL)
 
 lint: setup
 	@.venv/bin/ruff check

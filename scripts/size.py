@@ -2,6 +2,7 @@
 
     python scripts/size.py                 # this tree
     python scripts/size.py --against REV   # a revision beside it
+    python scripts/size.py --folders       # product lines of each folder too
 
 Product is og_pointcloud, export and plugins; a line is a line, comments and docstrings too. Circles and upward imports
 are those of ``tests/test_import_order.py``, which says where each is.
@@ -33,7 +34,9 @@ def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description="The size and shape of the code.")
     parser.add_argument("--against", metavar="REV", help="a revision to show beside this tree")
-    against = parser.parse_args().against
+    parser.add_argument("--folders", action="store_true", help="product lines of each folder too")
+    arguments = parser.parse_args()
+    against = arguments.against
     columns = {"this tree": measure(ROOT)}
     if against:
         with tempfile.TemporaryDirectory() as folder:
@@ -44,6 +47,9 @@ def main() -> None:
     print(f"{'':40}" + "".join(f"{name[:12]:>14}" for name in columns))
     for row in columns["this tree"]:
         print(f"{row:40}" + "".join(f"{column[row]:>14}" for column in columns.values()))
+    if arguments.folders:
+        for folder, lines in sorted(lines_by_folder(ROOT).items(), key=lambda pair: -pair[1]):
+            print(f"{folder:40}{lines:>14}")
 
 
 def measure(root: Path) -> dict[str, int | str]:
@@ -70,6 +76,15 @@ def measure(root: Path) -> dict[str, int | str]:
         "test lines": _count((root / "tests").rglob("*.py")),
         "example and script lines": _count([*(root / "examples").rglob("*.py"), *(root / "scripts").rglob("*.py")]),
     }
+
+
+def lines_by_folder(root: Path) -> dict[str, int]:
+    """Product lines of each folder, those below it included; "og_pointcloud" is the modules at its root."""
+    lines: dict[str, int] = {}
+    for path in (path for folder in PRODUCT for path in (root / folder).rglob("*.py")):
+        folder = "/".join(path.relative_to(root).parts[:2]) if path.parent.parent != root else path.parent.name
+        lines[folder] = lines.get(folder, 0) + _count([path])
+    return lines
 
 
 def _ends(root: Path) -> tuple[str, str]:

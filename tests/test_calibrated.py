@@ -323,6 +323,7 @@ def test_a_bank_that_is_added_calibrates(plain, made, tmp_path, capsys):
 RECORDED = {"nuscenes_frame": 0.55, "apc_shelf_B": 0.93}
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not DATA.is_dir(), reason="the recorded captures are absent")
 @pytest.mark.parametrize("name", RECORDED)
 def test_recorded_captures_keep_their_labels_and_give_absent_words_hardly_a_point(name, tmp_path, capsys):

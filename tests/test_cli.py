@@ -369,6 +369,7 @@ def test_a_place_selects_the_ball_it_is_on(fitted, capsys):
     assert run(capsys, "pick", bundle, "--xyz", "9,9,9")[1] == "no point of the scene\n"
 
 
+@pytest.mark.slow
 def test_clicks_that_give_no_mask(fitted, tmp_path, capsys):
     capture, bundle = fitted
     click = ("--capture", capture.folder, "--view", "view0", "-o", tmp_path / "mask.png")
@@ -380,6 +381,7 @@ def test_clicks_that_give_no_mask(fitted, tmp_path, capsys):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_pictures_of_features(fitted, tmp_path, capsys):
     capture, _ = fitted
     output = tmp_path / "new" / "p.png"
@@ -420,6 +422,7 @@ def test_import_leaves_nothing_of_a_damaged_result(tmp_path, capsys):
     assert not (tmp_path / "new").exists()
 
 
+@pytest.mark.slow
 def test_the_published_schedule_can_be_shortened(tiny_capture, tmp_path, capsys):
     pytest.importorskip("torch")
     record = tmp_path / "run.json"

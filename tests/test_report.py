@@ -95,6 +95,7 @@ def test_every_row_of_the_paper_is_there(share):
 # Rows -----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_rows_have_error_and_seconds_and_a_setting_that_fails_costs_no_other(subject, monkeypatch):
     def fails(scene, settings, progress):
         if settings.membership.sure_share == 0.4:
@@ -126,6 +127,7 @@ def test_rows_have_error_and_seconds_and_a_setting_that_fails_costs_no_other(sub
     }
 
 
+@pytest.mark.slow
 def test_without_truth_the_error_is_the_disagreement_with_the_masks(folder, tmp_path):
     bare = tmp_path / "bare"
     shutil.copytree(folder, bare)
@@ -258,6 +260,7 @@ def test_the_report_names_what_is_left_out_and_what_failed(tmp_path):
     assert alone.read_bytes().startswith(PNG)
 
 
+@pytest.mark.slow
 def test_the_command_writes_table_chart_and_report(folder, tmp_path, capsys):
     out = tmp_path / "r"
     assert main(["report", str(folder), "--knob", "views", "--knob", "border rounds", "-o", str(out)]) == 0

@@ -167,6 +167,7 @@ def test_truth_is_complete_and_consistent(capture):
     assert 0.0 < (~on_object & ~capture.background).mean() < 0.1, "some points are ambiguous, few are"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(5))
 def test_noise_that_carries_points_to_another_surface_makes_them_ambiguous(seed):
     """Over 24 seeds: no point without noise, 0.03 % to 0.4 % with the sensor's, 0.9 % to 5 % with five times that."""
@@ -257,6 +258,7 @@ def test_perfect_masks_are_the_objects_in_random_order():
     assert (first != second).any()
 
 
+@pytest.mark.slow
 def test_mask_errors_come_as_often_as_they_should():
     owner, rng, views, objects = _two_rows_of_squares(), np.random.default_rng(0), 200, 16
     counts = dict.fromkeys(("whole", "split", "missed", "merged", "spurious"), 0)

@@ -253,6 +253,7 @@ def test_an_encoder_brings_its_bank(path, encoder_folder, tmp_path, monkeypatch,
     )
 
 
+@pytest.mark.slow
 def test_fit_stores_the_bank_asked_for_else_the_encoders(encoder_folder, tmp_path, monkeypatch, capsys):
     folder, path = write_tiny_capture(tmp_path / "capture").folder, tmp_path / "s.ogpc"
     names = np.array([f"word {number}" for number in range(60)])
