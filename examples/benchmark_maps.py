@@ -26,7 +26,7 @@ import og_pointcloud as og
 from og_pointcloud.evaluate.truth import read_truth
 from og_pointcloud.formats.capture import depth_files, read_capture, read_poses
 from og_pointcloud.formats.poses import in_local_frame
-from og_pointcloud.mapping.captures import depth_views
+from og_pointcloud.mapping.sight import depth_views
 from og_pointcloud.scene import Camera, Scene
 
 TENTHS = 10

@@ -22,7 +22,7 @@ def add(parser: Parser) -> None:
 def run(arguments: argparse.Namespace) -> None:
     from og_pointcloud.ask.labelled_scene import load
     from og_pointcloud.formats.capture import read_capture
-    from og_pointcloud.mapping.captures import depth_views
+    from og_pointcloud.mapping.sight import depth_views
     from og_pointcloud.mapping.merging import update
 
     before = load(arguments.map)

@@ -28,7 +28,7 @@ from og_pointcloud.rendering.surface import Surface, reconstruct_surface
 from og_pointcloud.scene import Scene
 from og_pointcloud.settings import FitSettings
 
-__all__ = ["Prepared", "fit", "fit_prepared", "prepare"]
+__all__ = ["Prepared", "fit", "fit_prepared", "front_surfaces", "prepare"]
 
 
 def fit(
@@ -212,10 +212,11 @@ def _mask_table(surface: Surface, settings: FitSettings, journal: Journal, work:
             )
         require_sight(table.exposure.nnz, table.weights.nnz, surface.scene)
         table = replace(table, mask_pixels=table.mask_pixels * surface.stride**2)
-        return _front_surfaces(surface, table, settings, journal)
+        return front_surfaces(surface, table, settings, journal)
 
 
-def _front_surfaces(surface: Surface, table: MaskTable, settings: FitSettings, journal: Journal) -> MaskTable:
+def front_surfaces(surface: Surface, table: MaskTable, settings: FitSettings, journal: Journal) -> MaskTable:
+    """The table without what its masks show behind their objects (`membership.without_see_through`)."""
     cameras = [view.camera for view in surface.scene.views]
     depth_rows = np.stack([camera.world_to_camera[2] for camera in cameras])
     focal = np.sqrt([camera.fx * camera.fy for camera in cameras])

@@ -17,9 +17,8 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -31,7 +30,7 @@ from og_pointcloud.ask.labelled_scene import SceneLike, as_scene
 from og_pointcloud.cloud import LabelledCloud
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.poses import in_local_frame
-from og_pointcloud.mapping.likeness import ALIKE, SAME_COLOR, Look, likeness, look_of, one_color, typical_cosine
+from og_pointcloud.mapping.likeness import ALIKE, Look, descriptors_of, likeness, typical_cosine
 from og_pointcloud.mapping.presence import Presence
 from og_pointcloud.mapping.sight import DiscSurface, MeasuredView
 from og_pointcloud.rendering.geometry import Neighbourhood, neighbourhood
@@ -117,48 +116,44 @@ def compare(before: SceneLike, after: SceneLike) -> Changes:
     >>> print(og.compare(wall, wall))  # of `fit`'s example
     0 gone, 0 new, 0 moved, 0 not seen again
     """
-    earlier, later = Visit(as_scene(before).cloud), Visit(as_scene(after).cloud)
-    return compare_visits(earlier, later.in_frame_of(earlier)).changes
+    earlier = as_scene(before).cloud
+    return compare_visits(Visit(earlier), Visit.in_frame_of(earlier, as_scene(after).cloud)).changes
 
 
 @dataclass(frozen=True)
 class Visit:
-    """A labelled cloud as it is compared. shift: (3,) float64, added to its local coordinates before they are used.
-    depth: what its views measured by depth images, in that frame; None: its own cloud, seen from its cameras."""
+    """A labelled cloud as it is compared. depth: what its views measured by depth images, in its local frame; None: its
+    own cloud, seen from its cameras."""
 
     cloud: LabelledCloud
-    shift: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
     depth: Iterable[MeasuredView] | None = None
 
-    def in_frame_of(self, other: Visit, depth: Iterable[MeasuredView] | None = None) -> Visit:
-        """The same visit in the local frame of another; depth: of the views, in that frame already."""
-        return Visit(self.cloud, self.cloud.origin - other.cloud.origin, depth)
-
-    @cached_property
-    def xyz(self) -> NDArray[np.float32]:
-        """(n, 3) float32."""
-        return (self.cloud.xyz + self.shift).astype(np.float32)
+    @classmethod
+    def in_frame_of(
+        cls, other: LabelledCloud, cloud: LabelledCloud, depth: Iterable[MeasuredView] | None = None
+    ) -> Visit:
+        """A visit in the local frame of another; depth: of its views, in that frame already."""
+        shift = cloud.origin - other.origin
+        cameras = tuple(in_local_frame(camera, -shift) for camera in cloud.cameras)
+        return cls(
+            replace(cloud, xyz=(cloud.xyz + shift).astype(np.float32), origin=other.origin, cameras=cameras), depth
+        )
 
     @cached_property
     def surface(self) -> DiscSurface:
         """Its cloud, as it is seen."""
-        return DiscSurface(self.xyz, self.around)
+        return DiscSurface(self.cloud.xyz, self.around)
 
     @cached_property
     def around(self) -> Neighbourhood:
         """Neighbours of its points."""
-        return neighbourhood(self.xyz, GeometrySettings())
-
-    @property
-    def cameras(self) -> list[Camera]:
-        """The cameras, from this frame."""
-        return [in_local_frame(camera, -self.shift) for camera in self.cloud.cameras]
+        return neighbourhood(self.cloud.xyz, GeometrySettings())
 
     def measured(self, cameras: Sequence[Camera] | None = None) -> Iterable[MeasuredView]:
         """What its views measured, or, of its cloud, what views from other places would have."""
         if self.depth is not None and cameras is None:
             return self.depth
-        return (self.surface.seen_from(camera) for camera in (self.cameras if cameras is None else cameras))
+        return (self.surface.seen_from(camera) for camera in (self.cloud.cameras if cameras is None else cameras))
 
     def points_of(self, instance: int) -> NDArray[np.int64]:
         """(m,) rows of an instance's points, ascending."""
@@ -168,13 +163,13 @@ class Visit:
     def _by_instance(self) -> list[NDArray[np.int64]]:
         ids = self.cloud.instance_ids
         order = np.argsort(ids, kind="stable")
-        bounds = np.searchsorted(ids[order], np.arange(len(self.cloud.instances) + 1))
-        return [order[low:high] for low, high in pairwise(bounds)]
+        return np.split(order, np.searchsorted(ids[order], np.arange(len(self.cloud.instances) + 1)))[1:-1]
 
     def look(self, instance: int, rows: NDArray[np.int64]) -> Look:
         """The look of an instance, by some of its points."""
-        rgb = self.cloud.rgb
-        return look_of(self.cloud.instances, instance, self.xyz[rows], None if rgb is None else rgb[rows])
+        cloud = self.cloud
+        rgb = None if cloud.rgb is None else cloud.rgb[rows]
+        return Look.of_points(*descriptors_of(cloud.instances, instance), cloud.xyz[rows], rgb)
 
     def count(self, chosen: NDArray[np.bool_]) -> NDArray[np.int64]:
         """(instances,) how many of each instance's points are chosen, (n,) bool."""
@@ -183,10 +178,10 @@ class Visit:
 
     def telling(self, tolerance: float) -> NDArray[np.bool_]:
         """(n,) bool: points that lie off the surfaces of all other instances about them."""
-        ids, around, surface = self.cloud.instance_ids, self.around, self.surface
+        ids, surface = self.cloud.instance_ids, self.surface
         tells = np.ones(len(ids), bool)
-        for neighbour in around.index.T:
-            off = np.abs(np.einsum("na,na->n", self.xyz - surface.xyz[neighbour], surface.normal[neighbour]))
+        for neighbour in self.around.index.T:
+            off = np.abs(np.einsum("na,na->n", self.cloud.xyz - surface.xyz[neighbour], surface.normal[neighbour]))
             tells &= (ids[neighbour] == ids) | (off > TELLING * tolerance)
         return tells
 
@@ -217,11 +212,8 @@ class Evidence:
     def _of_one_color(self, visit: Visit, instance: int) -> bool:
         """Whether what is seen through is of the colour of the rest: else it is a part of something else."""
         rows = visit.points_of(instance)
-        rgb = visit.cloud.rgb
-        if rgb is None:
-            return True
-        through, still = (rgb[rows[self.shown[rows] & which[rows]]] for which in (self.through, self.still))
-        return bool(np.abs(np.median(through, axis=0) - np.median(still, axis=0)).max() <= SAME_COLOR)
+        rows = rows[self.shown[rows]]
+        return visit.look(instance, rows[self.through[rows]]).has_color_of(visit.look(instance, rows[self.still[rows]]))
 
 
 @dataclass(frozen=True)
@@ -250,23 +242,15 @@ def compare_visits(
         raise SceneError("the later visit does not know its cameras, so not what it looked at: fit its capture again")
     scatter = max(earlier.surface.scatter, later.surface.scatter)
     tolerance = max(TOLERANCE * max(a.spacing, b.spacing), SCATTER * scatter)
-    shown, known = Presence(len(a), tolerance), Presence(len(b), tolerance)
-    for view in earlier.measured():
-        shown.observe(earlier.xyz, view)
-        known.observe(later.xyz, view)
+    shown, known = Presence.by(earlier.measured(), tolerance, a.xyz, b.xyz)
     if not a.cameras:  # what the earlier visit saw is not known: it may have looked from the same places
-        for view in earlier.measured(later.cameras):
-            known.observe(later.xyz, view)
+        (known,) = Presence.by(earlier.measured(b.cameras), tolerance, b.xyz)
     shows = np.ones(len(b), bool)
     if again is None:
-        asked, own = Presence(len(a), tolerance), Presence(len(b), tolerance)
-        for view in later.measured():
-            asked.observe(earlier.xyz, view)
-            own.observe(later.xyz, view)
+        asked, own = Presence.by(later.measured(), tolerance, a.xyz, b.xyz)
         _require_one_frame(asked)
         again, shows = (asked.present, asked.absent), own.present
-    seen = shown.present | (not a.cameras)
-    of_earlier = Evidence(seen, *again, earlier.telling(tolerance))
+    of_earlier = Evidence(shown.present | (not a.cameras), *again, earlier.telling(tolerance))
     of_later = Evidence(shows, known.present, known.absent, later.telling(tolerance))
     return _decide(earlier, later, of_earlier, of_later)
 
@@ -321,14 +305,14 @@ def _things(visit: Visit, candidates: list[int], through: NDArray[np.bool_], typ
     show, the colour is enough."""
     rows = {k: visit.points_of(k)[through[visit.points_of(k)]] for k in candidates}
     looks = {k: visit.look(k, of) for k, of in rows.items()}
-    trees = {k: cKDTree(visit.xyz[of]) for k, of in rows.items()}
+    trees = {k: cKDTree(visit.cloud.xyz[of]) for k, of in rows.items()}
     group = {k: k for k in candidates}
     reach = ADJOINING * visit.cloud.spacing
     for index, one in enumerate(candidates):
         for other in candidates[index + 1 :]:
             small = SMALL_PIECE * max(len(rows[one]), len(rows[other])) > min(len(rows[one]), len(rows[other]))
             alike = likeness(looks[one], looks[other], typical) > ALIKE
-            alike |= small and one_color(looks[one], looks[other])
+            alike |= small and looks[one].has_color_of(looks[other])
             if alike and trees[one].count_neighbors(trees[other], reach):
                 group = {k: group[one] if of == group[other] else of for k, of in group.items()}
     things = []
@@ -360,7 +344,7 @@ def _with_scattered(gone: list[_Thing], new: list[_Thing], pairs: dict[int, int]
             if other in pairs.values() or not things[other].pieces:
                 continue
             near = np.linalg.norm(thing.place - new[n].place) < gone[g].look.length
-            if near and one_color(gone[g].look, thing.look) and likeness(gone[g].look, thing.look, typical) > ALIKE:
+            if near and gone[g].look.has_color_of(thing.look) and likeness(gone[g].look, thing.look, typical) > ALIKE:
                 one, count = things[n], things[n].points + thing.points
                 place = (one.points * one.place + thing.points * thing.place) / count
                 things[n] = replace(one, pieces=(*one.pieces, *thing.pieces), place=place, points=count)

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.cloud import FeatureSpace
 from og_pointcloud.errors import FeatureSpaceError, SceneError
-from og_pointcloud.mapping.sight import AGREES, MeasuredView, states_of_points
+from og_pointcloud.formats.poses import in_local_frame
+from og_pointcloud.mapping.sight import AGREES, MeasuredView, view_of_depth
 from og_pointcloud.scene import Camera, View
 
 __all__ = ["Frame", "checked", "require_same_place"]
@@ -20,8 +21,8 @@ FEWEST_COMPARED = 200
 """Fewer say nothing: the frame looks at a part of the place that the map does not know."""
 LEAST_AGREEING = 0.25
 """Share of the map's points in front of a camera whose depth it must confirm: what moved is a small part of a place."""
-UNIT_SPREAD = 0.15
-"""Depths in another unit are all off by one factor, up to so much in three quarters of the places."""
+UNIT_SPREAD = 1.2
+"""Depths in another unit are all off by one factor: three quarters of the places span less than this share of it."""
 
 
 @dataclass(frozen=True)
@@ -54,12 +55,12 @@ class Frame:
 @dataclass(frozen=True)
 class CheckedFrame:
     """A frame without surprises. camera: from the map's local frame. ids: (H, W) int32, -1 none. features: (M, D)
-    float32. depth: (H, W) float32, 0 unmeasured, or None. rgb: (H, W, 3) uint8 or None."""
+    float32. view: what its depth measures, None without any. rgb: (H, W, 3) uint8 or None."""
 
     camera: Camera
     ids: NDArray[np.int32]
     features: NDArray[np.float32]
-    depth: NDArray[np.float32] | None
+    view: MeasuredView | None
     rgb: NDArray[np.uint8] | None
     stamp: float
 
@@ -75,23 +76,18 @@ def checked(frame: Frame, origin: NDArray[np.float64], space: FeatureSpace, stam
     name = f"frame {stamp:g}"
     if frame.camera is None:
         raise SceneError(f"{name} has no camera; expected an og.Camera with its pose: drop frames that lost track")
-    rotation = frame.camera.world_to_camera[:3, :3]
-    pose = frame.camera.world_to_camera.copy()
-    pose[:3, 3] += rotation @ origin
-    camera = replace(frame.camera, world_to_camera=pose)
+    camera = in_local_frame(frame.camera, origin)
     if frame.depth is not None and frame.cloud is not None:
         raise SceneError(f"{name} has both depth and a cloud; expected one of them: leave out the sparser one")
     ids, features = _masks(frame, camera, name)
     if len(features):
         encoder = space.name if frame.feature_space is None else frame.feature_space
         space.require(FeatureSpace(encoder, features.shape[1]), f"mask features of {name}")
-    depth = None if frame.depth is None else _depth(frame.depth, camera, name)
-    if frame.cloud is not None:
-        depth = _depth_of_cloud(frame.cloud, origin, camera, name)
+    depth = _depth(frame, origin, camera, name)
     rgb = frame.rgb
     if rgb is not None and (rgb.shape != (camera.height, camera.width, 3) or rgb.dtype != np.uint8):
         raise SceneError(f"{name}: rgb is {rgb.dtype} {rgb.shape}; expected uint8 ({camera.height}, {camera.width}, 3)")
-    return CheckedFrame(camera, ids, features, depth, rgb, float(stamp))
+    return CheckedFrame(camera, ids, features, view_of_depth(depth, camera) if depth.any() else None, rgb, float(stamp))
 
 
 def _masks(frame: Frame, camera: Camera, name: str) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
@@ -113,62 +109,50 @@ def _masks(frame: Frame, camera: Camera, name: str) -> tuple[NDArray[np.int32], 
     return view.mask_map(), features
 
 
-def _depth(depth: NDArray[np.floating], camera: Camera, name: str) -> NDArray[np.float32]:
+def _depth(frame: Frame, origin: NDArray[np.float64], camera: Camera, name: str) -> NDArray[np.float32]:
+    """(H, W), 0 where nothing was measured; of a cloud the nearest point in each pixel."""
+    depth = np.zeros((camera.height, camera.width), np.float32) if frame.depth is None else np.asarray(frame.depth)
     if depth.shape != (camera.height, camera.width) or depth.dtype.kind not in "fiu":
         raise SceneError(
             f"{name}: depth is {depth.dtype} {depth.shape}; expected numbers ({camera.height}, {camera.width})"
         )
-    with np.errstate(invalid="ignore", over="ignore"):
-        values = np.asarray(depth, np.float32)
-        return np.where(np.isfinite(values) & (values > 0), values, np.float32(0))
+    with np.errstate(over="ignore"):
+        depth = depth.astype(np.float32)
+    if frame.cloud is not None:
+        cloud = np.asarray(frame.cloud, np.float64)
+        if cloud.ndim != 2 or cloud.shape[1] != 3:
+            raise SceneError(f"{name}: its cloud has shape {cloud.shape}; expected (points, 3), world coordinates")
+        uv_px, z = camera.project(cloud[np.isfinite(cloud).all(axis=1)] - origin)
+        inside = camera.shows(uv_px)
+        column, row = uv_px[inside].astype(np.intp).T
+        depth = np.full_like(depth, np.inf)
+        np.minimum.at(depth, (row, column), z[inside].astype(np.float32))
+    return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
 
 
-def _depth_of_cloud(
-    cloud: NDArray[np.floating], origin: NDArray[np.float64], camera: Camera, name: str
-) -> NDArray[np.float32]:
-    """A depth image of the points in view, the nearest in each pixel."""
-    cloud = np.asarray(cloud, np.float64)
-    if cloud.ndim != 2 or cloud.shape[1] != 3:
-        raise SceneError(f"{name}: its cloud has shape {cloud.shape}; expected (points, 3), world coordinates")
-    uv_px, z = camera.project(cloud[np.isfinite(cloud).all(axis=1)] - origin)
-    inside = camera.shows(uv_px)
-    column, row = uv_px[inside].astype(np.intp).T
-    depth = np.full((camera.height, camera.width), np.inf, np.float32)
-    np.minimum.at(depth, (row, column), z[inside].astype(np.float32))
-    return np.where(np.isfinite(depth), depth, np.float32(0))
-
-
-def require_same_place(frame: CheckedFrame, xyz: NDArray[np.float32], tolerance: float, view: MeasuredView) -> None:
+def require_same_place(stamp: float, view: MeasuredView, xyz: NDArray[np.float32], states: NDArray[np.int8]) -> None:
     """SceneError where a frame's depth contradicts nearly all of the map's points before it: pose or unit are wrong.
 
-    xyz: (n, 3) points of the map's surface that the frame might see, some of them hidden by others. What moves is a
-    small part of a place; a pose that is off moves all of it. A frame that hardly meets the map is let through.
+    xyz: (n, 3) points of the map that the frame might see, some of them hidden by others; states: what it says of them.
+    What moves is a small part of a place; a pose that is off moves all of it. A frame that hardly meets the map is let
+    through.
     """
-    uv_px, z = frame.camera.project(xyz)
-    inside = np.flatnonzero(frame.camera.shows(uv_px))
-    inside = inside[:: 1 + len(inside) // COMPARED]
+    step = 1 + len(xyz) // COMPARED
+    uv_px, z = view.camera.project(xyz[::step])
+    inside = view.camera.shows(uv_px)
     column, row = uv_px[inside].astype(np.intp).T
-    scale = view.camera.width / frame.camera.width, view.camera.height / frame.camera.height
-    measured = view.depth[
-        (row * scale[1]).astype(np.intp).clip(0, view.camera.height - 1),
-        (column * scale[0]).astype(np.intp).clip(0, view.camera.width - 1),
-    ]
+    measured, z = view.depth[row, column], z[inside]
     met = measured > 0
     if np.count_nonzero(met) < FEWEST_COMPARED:
         return
-    states = states_of_points(xyz[inside[met]], tolerance, view)
-    agreeing = float((states == AGREES).mean())
+    agreeing = float((states[::step][inside][met] == AGREES).mean())
     if agreeing >= LEAST_AGREEING:
         return
-    ratio = measured[met] / z[inside[met]]
-    low, middle, high = np.percentile(ratio, [12.5, 50, 87.5])
-    same_factor = (high - low) < 2 * UNIT_SPREAD * middle * 4 and not 0.5 < middle < 2
-    what = (
-        f"its depths are about {middle:.3g} times what the map expects: give them in the map's unit"
-        if same_factor
-        else "its pose is off, or it is of another place: check the pose, or correct the map after a loop closure"
-    )
+    low, middle, high = np.percentile(measured[met] / z[met], [12.5, 50, 87.5])
+    what = "its pose is off, or it is of another place: check the pose, or correct the map after a loop closure"
+    if high - low < UNIT_SPREAD * middle and not 0.5 < middle < 2:
+        what = f"its depths are about {middle:.3g} times what the map expects: give them in the map's unit"
     raise SceneError(
-        f"frame {frame.stamp:g} confirms {agreeing:.0%} of the {np.count_nonzero(met)} points of the map before it; "
-        f"expected at least {LEAST_AGREEING:.0%}: {what}"
+        f"frame {stamp:g} confirms {agreeing:.0%} of the {np.count_nonzero(met)} points of the map before it; expected "
+        f"at least {LEAST_AGREEING:.0%}: {what}"
     )

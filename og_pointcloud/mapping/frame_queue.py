@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import queue
 import threading
 import time
 import warnings
-from collections import deque
 from collections.abc import Callable
 
 from og_pointcloud.errors import OgPointcloudError
@@ -31,45 +31,28 @@ class FrameQueue:
         on_drop: Callable[[str], None] | None = None,
     ) -> None:
         self.mapper, self.max_age, self.dropped = mapper, max_age, 0
-        self._on_change, self._on_drop = on_change, on_drop or warnings.warn
-        self._waiting: deque[tuple[float, Frame]] = deque()
-        self._wake, self._open = threading.Condition(), True
+        self._on_change, self._on_drop = on_change or (lambda change: None), on_drop or warnings.warn
+        self._waiting: queue.SimpleQueue[tuple[float, Frame] | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._work, daemon=True)
         self._thread.start()
 
     def put(self, frame: Frame) -> None:
         """Hand a frame over; returns at once."""
-        with self._wake:
-            self._waiting.append((time.monotonic(), frame))
-            self._wake.notify()
+        self._waiting.put((time.monotonic(), frame))
 
     def close(self) -> None:
         """Work off what waits and is young enough, and end the thread."""
-        with self._wake:
-            self._open = False
-            self._wake.notify()
+        self._waiting.put(None)
         self._thread.join()
 
-    def _next(self) -> Frame | None:
-        """The oldest frame that is young enough; None when closed and empty."""
-        with self._wake:
-            while True:
-                while self._waiting:
-                    arrived, frame = self._waiting.popleft()
-                    if time.monotonic() - arrived <= self.max_age:
-                        return frame
-                    self.dropped += 1
-                    self._on_drop(f"a frame waited longer than {self.max_age} s: {self.dropped} dropped so far")
-                if not self._open:
-                    return None
-                self._wake.wait()
-
     def _work(self) -> None:
-        while (frame := self._next()) is not None:
+        while (waiting := self._waiting.get()) is not None:
+            arrived, frame = waiting
+            if time.monotonic() - arrived > self.max_age:
+                self.dropped += 1
+                self._on_drop(f"a frame waited longer than {self.max_age} s: {self.dropped} dropped so far")
+                continue
             try:
-                change = self.mapper.integrate(frame)
+                self._on_change(self.mapper.integrate(frame))
             except OgPointcloudError as error:
                 self._on_drop(f"a frame was refused: {error}")
-            else:
-                if self._on_change:
-                    self._on_change(change)

@@ -12,6 +12,7 @@ and what was hidden change both.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from og_pointcloud.cloud import InstanceTable
 
-__all__ = ["ALIKE", "Look", "likeness", "look_of", "one_color", "spread_of", "typical_cosine"]
+__all__ = ["ALIKE", "SAME_COLOR", "Look", "descriptors_of", "likeness", "recognized", "spread_of", "typical_cosine"]
 
 ALIKE = 0.5
 """From here on two are one thing: nearer to what one thing has than to what different things have."""
@@ -58,11 +59,15 @@ class Look:
         color = None if rgb is None else np.median(rgb, axis=0).astype(np.float64)
         return cls(descriptors, spread, color, float(sides.max()))
 
+    def has_color_of(self, other: Look, most: float = SAME_COLOR) -> bool:
+        """Whether the two may be parts of one thing by their colours; True where these are not known."""
+        return self.color is None or other.color is None or bool(np.abs(self.color - other.color).max() <= most)
 
-def look_of(table: InstanceTable, instance: int, xyz: NDArray[np.float32], rgb: NDArray[np.uint8] | None) -> Look:
-    """The look of one instance of a table. xyz (n, 3), rgb (n, 3) or None: its points, at least one."""
-    descriptors = table.descriptors[table.descriptor_instance == instance]
-    return Look.of_points(descriptors, float(spread_of(table.agreement[instance], table.masks[instance])), xyz, rgb)
+
+def descriptors_of(table: InstanceTable, instance: int) -> tuple[NDArray[np.float32], float]:
+    """(descriptors, spread) of one instance of a table."""
+    spread = spread_of(table.agreement[instance], table.masks[instance])
+    return table.descriptors[table.descriptor_instance == instance], float(spread)
 
 
 def typical_cosine(table: InstanceTable) -> float:
@@ -74,23 +79,25 @@ def typical_cosine(table: InstanceTable) -> float:
     return float(np.median(cosines[different])) if different.any() else 0.0
 
 
-def one_color(one: Look, other: Look) -> bool:
-    """Whether the two may be parts of one thing by their colours; True where these are not known."""
-    return one.color is None or other.color is None or bool(np.abs(one.color - other.color).max() <= SAME_COLOR)
-
-
 def likeness(one: Look, other: Look, typical: float) -> float:
     """How far the two are one thing: about 1 for one, 0 for two typical things of the scene, -inf if forbidden.
 
     typical: `typical_cosine` of the scene.
     """
-    if one.color is not None and other.color is not None and np.abs(one.color - other.color).max() > OTHER_COLOR:
-        return -np.inf
     longer, shorter = max(one.length, other.length), min(one.length, other.length)
-    if longer > OTHER_SIZE * shorter or not (len(one.descriptors) and len(other.descriptors)):
+    if longer > OTHER_SIZE * shorter or not one.has_color_of(other, OTHER_COLOR):
+        return -np.inf
+    if not (len(one.descriptors) and len(other.descriptors)):
         return -np.inf
     cosine = float((one.descriptors @ other.descriptors.T).max()) * np.sqrt((1 + one.spread) * (1 + other.spread))
     return (cosine - typical) / max(1 - typical, 1e-6)
+
+
+def recognized(look: Look, known: Mapping[int, Look], typical: float) -> int | None:
+    """The id of what looks most like it, of equals the lowest; None if nothing is ALIKE."""
+    alike = {old: likeness(of, look, typical) for old, of in known.items()}
+    best = max(alike, key=lambda old: (alike[old], -old), default=None)
+    return best if best is not None and alike[best] > ALIKE else None
 
 
 def spread_of(agreement: ArrayLike, masks: ArrayLike) -> NDArray[np.float64]:

@@ -1,9 +1,10 @@
 """A map on disk while it grows: kill -9 at any moment loses at most the frame in work.
 
-A folder with two files. ``frames.log`` is append-only: each integrated frame as length, checksum, arrays; a torn last
-one is cut off. ``map.state`` is the whole map at some frame, replaced in one step; the log then begins anew. A start
-with the folder reads the state and integrates the frames of the log again: the map is the one that was left, and disk
-follows the map and not the time. Nothing is pickled.
+A folder with two files of records, each with its length and checksum. ``frames.log`` is append-only: each integrated
+frame; a torn last one is cut off. ``map.state`` is the whole map at some frame, replaced in one step; the log then
+begins anew. A start with the folder reads the state and integrates the frames of the log again: the map is the one that
+was left, and disk follows the map and not the time. Nothing is pickled: a record is a tree of plain values and of
+records named in KINDS, as JSON, and the arrays in it, as .npy.
 """
 
 from __future__ import annotations
@@ -14,27 +15,40 @@ import os
 import struct
 import zlib
 from collections.abc import Iterator
+from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud.bundle.format import cameras_of_rows, rows_of_cameras
+from og_pointcloud.cloud import FeatureSpace
 from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.formats.atomic import replacing
 from og_pointcloud.formats.npy import array_from_npy, npy_bytes
 from og_pointcloud.mapping.frame import Frame
+from og_pointcloud.mapping.growing_map import GrowingMap
+from og_pointcloud.mapping.kept_views import KeptView, KeptViews
+from og_pointcloud.mapping.likeness import Look
+from og_pointcloud.mapping.presence import Presence
+from og_pointcloud.mapping.tracks import Left, PointVotes, Track, Tracks
+from og_pointcloud.mapping.voxels import VoxelHash, VoxelPoints
+from og_pointcloud.scene import Camera
 
-__all__ = ["MapJournal"]
+__all__ = ["MapJournal", "packed", "unpacked"]
 
+KINDS = {
+    kind.__name__: kind
+    for kind in (
+        Camera, FeatureSpace, Frame, GrowingMap, KeptView, KeptViews, Left, Look, PointVotes, Presence, Track, Tracks,
+        VoxelHash, VoxelPoints,
+    )
+}  # fmt: skip
+"""Records that a file may hold, by name."""
 HEAD = struct.Struct("<4sQI")
-MAGIC = b"OGF1"
+MAGIC = b"OGF2"
 LOG_BYTES = 1 << 27
 """Bytes of frames after which the whole map is written and the log begins anew."""
-MOST_BYTES = 1 << 31
-
-Arrays = dict[str, NDArray[Any]]
 
 
 class MapJournal:
@@ -49,18 +63,21 @@ class MapJournal:
         self._log, self._state, self._origin = self.folder / "frames.log", self.folder / "map.state", origin
         self._file: io.BufferedWriter | None = None
 
-    def state(self) -> tuple[Arrays, dict[str, Any]] | None:
-        """The arrays and the values of the last whole map; None where there is none yet."""
+    def state(self) -> GrowingMap | None:
+        """The last whole map; None where there is none yet."""
         if not self._state.is_file():
             return None
-        arrays = _unpacked(self._state.read_bytes(), str(self._state))
-        values = json.loads(arrays.pop("values").tobytes())
-        if values["began_with"] != self._origin:
+        with self._state.open("rb") as file:
+            record = _next_record(file)
+        began_with, known = (None, None) if record is None else unpacked(record, str(self._state))
+        if not isinstance(known, GrowingMap):
+            raise OgPointcloudError(f"{self._state} is damaged: remove the folder and map again")
+        if began_with != self._origin:
             raise OgPointcloudError(
-                f"{self.folder} holds a map that began with {values['began_with']}, not with {self._origin}: give "
-                "that, or another folder"
+                f"{self.folder} holds a map that began with {began_with}, not with {self._origin}: give that, or "
+                "another folder"
             )
-        return arrays, values
+        return known
 
     def frames(self) -> Iterator[Frame]:
         """The frames since then, in their order. A torn one at the end is cut off, and work goes on behind it."""
@@ -70,28 +87,28 @@ class MapJournal:
         with self._log.open("rb") as file:
             while record := _next_record(file):
                 whole = file.tell()
-                yield _frame(_unpacked(record, str(self._log)))
+                yield unpacked(record, str(self._log))
         if whole < self._log.stat().st_size:
             os.truncate(self._log, whole)
 
-    def append(self, frame: Frame) -> bool:
-        """Write a frame behind the others. Returns whether the log is so long that the map should be written."""
-        if self._file is None:
-            self._file = self._log.open("ab")
-        record = _packed(_arrays(frame))
-        self._file.write(HEAD.pack(MAGIC, len(record), zlib.crc32(record)) + record)
+    def append(self, frame: Frame, known: GrowingMap) -> None:
+        """Write a frame behind the others; once the log is long, the map that it led to, and the log begins anew. A
+        kill in between leaves frames that the map has already: their stamps are among its recent ones."""
+        if frame.masks is not None and frame.masks.max(initial=0) < 1 << 15:
+            frame = replace(frame, masks=frame.masks.astype(np.int16))
+        self._file = self._file or self._log.open("ab")
+        self._file.write(_record(frame))
         self._file.flush()
-        return self._file.tell() > LOG_BYTES
-
-    def write(self, arrays: Arrays, values: dict[str, Any]) -> None:
-        """The whole map; the log begins anew. A kill in between leaves frames that the state has: their sequence
-        numbers say so."""
-        text = json.dumps({**values, "began_with": self._origin}).encode()
-        with replacing(self._state) as file:
-            file.write(_packed({**arrays, "values": np.frombuffer(text, np.uint8)}))
-        if self._file is not None:
+        if self._file.tell() > LOG_BYTES:
+            with replacing(self._state) as file:
+                file.write(_record((self._origin, known)))
             self._file.close()
-        self._file = self._log.open("wb")
+            self._file = self._log.open("wb")
+
+
+def _record(value: Any) -> bytes:
+    data = packed(value)
+    return HEAD.pack(MAGIC, len(data), zlib.crc32(data)) + data
 
 
 def _next_record(file: io.BufferedReader) -> bytes | None:
@@ -100,49 +117,53 @@ def _next_record(file: io.BufferedReader) -> bytes | None:
     if len(head) < HEAD.size:
         return None
     magic, length, checksum = HEAD.unpack(head)
-    if magic != MAGIC or length > MOST_BYTES:
+    if magic != MAGIC or length > os.fstat(file.fileno()).st_size:
         return None
     record = file.read(length)
     return record if len(record) == length and zlib.crc32(record) == checksum else None
 
 
-def _packed(arrays: Arrays) -> bytes:
-    """Arrays, each as its name and .npy, one behind the other."""
-    parts = []
-    for name, array in arrays.items():
-        data = npy_bytes(array)
-        parts += [struct.pack("<HQ", len(name), len(data)), name.encode(), data]
-    return b"".join(parts)
+def packed(value: Any) -> bytes:
+    """A tree of plain values, lists, tuples, dictionaries, arrays and records of KINDS as bytes."""
+    arrays: list[NDArray[Any]] = []
+
+    def tree(value: Any) -> Any:
+        if isinstance(value, np.ndarray):
+            arrays.append(value)
+            return {"array": len(arrays) - 1}
+        if is_dataclass(value):
+            return {type(value).__name__: [tree(getattr(value, entry.name)) for entry in fields(value)]}
+        if isinstance(value, dict):
+            return {"dict": [[tree(key), tree(of)] for key, of in value.items()]}
+        if isinstance(value, tuple):
+            return {"tuple": [tree(entry) for entry in value]}
+        return [tree(entry) for entry in value] if isinstance(value, list) else value
+
+    text = json.dumps(tree(value), default=lambda number: number.item()).encode()
+    parts = [text, *map(npy_bytes, arrays)]
+    return b"".join(piece for part in parts for piece in (struct.pack("<Q", len(part)), part))
 
 
-def _unpacked(data: bytes, source: str) -> Arrays:
-    arrays, at = {}, 0
+def unpacked(data: bytes, source: str) -> Any:
+    """What was `packed`. OgPointcloudError, which names the source, for anything else."""
+    parts, at = [], 0
+
+    def value(tree: Any) -> Any:
+        if isinstance(tree, list):
+            return [value(entry) for entry in tree]
+        if not isinstance(tree, dict):
+            return tree
+        ((kind, of),) = tree.items()
+        if kind == "array":
+            return array_from_npy(parts[1 + of]).copy()
+        entries = [value(entry) for entry in of]
+        return dict(entries) if kind == "dict" else tuple(entries) if kind == "tuple" else KINDS[kind](*entries)
+
     try:
         while at < len(data):
-            name_length, length = struct.unpack_from("<HQ", data, at)
-            at += 10
-            name = data[at : at + name_length].decode()
-            at += name_length
-            arrays[name] = array_from_npy(data[at : at + length])
-            at += length
-    except (ValueError, struct.error, UnicodeError) as error:
-        raise OgPointcloudError(f"{source} is damaged ({error!s:.80}): remove the folder and map again") from None
-    return arrays
-
-
-FRAME_ARRAYS = ("masks", "features", "depth", "cloud", "rgb")
-
-
-def _arrays(frame: Frame) -> Arrays:
-    arrays = {name: np.asarray(value) for name in FRAME_ARRAYS if (value := getattr(frame, name)) is not None}
-    if "masks" in arrays:
-        arrays["masks"] = arrays["masks"].astype(np.int16 if arrays["masks"].max(initial=0) < 1 << 15 else np.int32)
-    assert frame.camera is not None
-    assert frame.stamp is not None
-    return {**arrays, "camera": rows_of_cameras([frame.camera]), "stamp": np.array([frame.stamp])}
-
-
-def _frame(arrays: Arrays) -> Frame:
-    camera = cameras_of_rows(arrays["camera"])[0]
-    given: dict[str, Any] = {name: arrays.get(name) for name in FRAME_ARRAYS}
-    return Frame(camera, stamp=float(arrays["stamp"][0]), **given)
+            (length,) = struct.unpack_from("<Q", data, at)
+            parts.append(data[at + 8 : at + 8 + length])
+            at += 8 + length
+        return value(json.loads(parts[0]))
+    except (ValueError, struct.error, TypeError, KeyError, IndexError, AttributeError, RecursionError) as error:
+        raise OgPointcloudError(f"{source} is damaged ({error!r:.80}): remove the folder and map again") from None

@@ -9,13 +9,15 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-from og_pointcloud.cloud import LabelledCloud
-from og_pointcloud.errors import OgPointcloudError
+import numpy as np
 
-__all__ = ["GONE", "PRESENT", "MapRecord", "Retired", "VisitEntry"]
+from og_pointcloud.cloud import InstanceTable, LabelledCloud
+from og_pointcloud.errors import OgPointcloudError
+from og_pointcloud.mapping.likeness import Look, descriptors_of
+
+__all__ = ["MapRecord", "Retired", "VisitEntry"]
 
 KEY = "map"
-PRESENT, GONE = "present", "gone"
 
 
 @dataclass(frozen=True)
@@ -35,6 +37,11 @@ class Retired:
     place: tuple[float, ...]
     length: float
     color: tuple[float, ...] | None
+
+    def look(self, table: InstanceTable, instance: int) -> Look:
+        """With the descriptors that its row of the table still has."""
+        color = None if self.color is None else np.array(self.color)
+        return Look(*descriptors_of(table, instance), color, self.length)
 
 
 @dataclass
@@ -62,8 +69,9 @@ class MapRecord:
                 [VisitEntry(str(v["name"]), float(v["stamp"]), int(v["views"])) for v in stored["visits"]],
                 {int(k): float(stamp) for k, stamp in stored["last_seen"].items()},
                 {int(k): _three(place) for k, place in stored["moved_from"].items()},
-                {int(k): _retired(entry) for k, entry in stored["gone"].items()},
-            )
+                {int(k): Retired(_three(v["place"]), float(v["length"]), v["color"] and _three(v["color"]))
+                 for k, v in stored["gone"].items()},
+            )  # fmt: skip
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise OgPointcloudError(
                 f"the map's record of its visits is damaged ({error!r:.80}): fit it again"
@@ -74,8 +82,8 @@ class MapRecord:
         return record
 
     def state(self, instance: int) -> str:
-        """PRESENT or GONE."""
-        return GONE if instance in self.gone else PRESENT
+        """ "present" or "gone"."""
+        return "gone" if instance in self.gone else "present"
 
     def added_to(self, provenance: dict[str, Any]) -> dict[str, Any]:
         """The provenance with this record, JSON-able."""
@@ -85,8 +93,3 @@ class MapRecord:
 def _three(values: Any) -> tuple[float, ...]:
     x, y, z = (float(value) for value in values)
     return x, y, z
-
-
-def _retired(entry: Any) -> Retired:
-    color = entry["color"]
-    return Retired(_three(entry["place"]), float(entry["length"]), None if color is None else _three(color))

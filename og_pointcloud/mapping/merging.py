@@ -16,9 +16,9 @@ from scipy.spatial import cKDTree
 from og_pointcloud.ask.labelled_scene import SceneLike, as_scene
 from og_pointcloud.cloud import BACKGROUND, UNOBSERVED, FeatureSpace, InstanceTable, LabelledCloud
 from og_pointcloud.fitting.fit import fit
-from og_pointcloud.mapping.changes import FEWEST_POINTS, MOST, Changes, Comparison, Visit, compare_visits
-from og_pointcloud.mapping.map_record import MapRecord, VisitEntry
-from og_pointcloud.mapping.returning import known_again, retire
+from og_pointcloud.mapping.changes import FEWEST_POINTS, MOST, Changes, Comparison, Moved, Visit, compare_visits
+from og_pointcloud.mapping.likeness import recognized, typical_cosine
+from og_pointcloud.mapping.map_record import MapRecord, Retired, VisitEntry
 from og_pointcloud.mapping.sight import MeasuredView
 from og_pointcloud.scene import Scene
 from og_pointcloud.settings import FitSettings
@@ -62,8 +62,7 @@ def update(
     cloud = as_scene(before).cloud
     cloud.space.require(FeatureSpace(capture.feature_space, capture.feature_width), "masks of the capture")
     visit = fit(capture, settings, progress=progress)
-    earlier = Visit(cloud)
-    later = Visit(visit).in_frame_of(earlier, depth)
+    earlier, later = Visit(cloud), Visit.in_frame_of(cloud, visit, depth)
     return merge(earlier, later, compare_visits(earlier, later), capture.name)
 
 
@@ -72,27 +71,29 @@ def merge(earlier: Visit, later: Visit, found: Comparison, name: str, stamp: flo
     a, b = earlier.cloud, later.cloud
     record = MapRecord.of(a)
     stamp = record.visits[-1].stamp + 1 if stamp is None else stamp
-    changes = known_again(found.changes, earlier, later, found, record)
+    changes = _known_again(found.changes, earlier, later, found, record)
     stays, shared = _staying(earlier, later, changes, found)
     ids_of_later, fresh = _ids(earlier, later, stays, changes, found.pieces)
     numbered = replace(changes, new=tuple(sorted({int(ids_of_later[k]) for k in changes.new})))
 
     adds: NDArray[np.bool_] = np.ones(len(b), bool)
     if stays.any():
-        adds = np.asarray(cKDTree(earlier.xyz[stays]).query(later.xyz, workers=-1)[0]) > SAME_PLACE * a.spacing
+        adds = (
+            np.asarray(cKDTree(earlier.cloud.xyz[stays]).query(later.cloud.xyz, workers=-1)[0]) > SAME_PLACE * a.spacing
+        )
     states = np.append(ids_of_later, [UNOBSERVED, BACKGROUND])  # -2 and -1 index the last two
     ids = np.concatenate([_relabelled(earlier, later, shared, states)[stays], states[b.instance_ids[adds]]])
     table = _table(a.instances, b.instances, ids_of_later, ids, len(a.instances) + fresh)
     _note(record, earlier, later, numbered, found, ids_of_later, VisitEntry(name, stamp, len(b.cameras)))
     merged = replace(
         a,
-        xyz=np.concatenate([a.xyz[stays], later.xyz[adds]]),
+        xyz=np.concatenate([a.xyz[stays], later.cloud.xyz[adds]]),
         instance_ids=ids.astype(np.int32),
         instances=table,
         rgb=_both(a.rgb, b.rgb, stays, adds),
         certainty=_both(a.certainty, b.certainty, stays, adds),
         provenance=record.added_to(a.provenance),
-        cameras=(*a.cameras, *later.cameras)[-MOST_CAMERAS:],
+        cameras=(*a.cameras, *later.cloud.cameras)[-MOST_CAMERAS:],
     )
     return Updated(merged, numbered)
 
@@ -119,7 +120,7 @@ def _ids(
     a, b = earlier.cloud, later.cloud
     known = np.full(len(b.instances), -1, np.int64)
     came = {**{moved.now: moved.id for moved in changes.moved}}
-    distance, nearest = cKDTree(earlier.xyz).query(later.xyz, workers=-1)
+    distance, nearest = cKDTree(earlier.cloud.xyz).query(later.cloud.xyz, workers=-1)
     on_map = (distance <= SAME_SURFACE * a.spacing) & stays[nearest] & (a.instance_ids[nearest] != UNOBSERVED)
     owners = a.instance_ids[nearest]
     fresh = len(a.instances)
@@ -147,7 +148,7 @@ def _relabelled(
     """(n,) ids of the map's points: what lost its instance, or had never been seen, is what the visit says of it."""
     ids = earlier.cloud.instance_ids.astype(np.int64)
     asked = np.flatnonzero(shared | (ids == UNOBSERVED))
-    distance, nearest = cKDTree(later.xyz).query(earlier.xyz[asked], workers=-1)
+    distance, nearest = cKDTree(later.cloud.xyz).query(earlier.cloud.xyz[asked], workers=-1)
     near = distance <= SAME_SURFACE * earlier.cloud.spacing
     ids[asked] = np.where(
         near, states[later.cloud.instance_ids[nearest]], np.where(shared[asked], BACKGROUND, ids[asked])
@@ -213,6 +214,29 @@ def _descriptors(
     return np.concatenate([np.zeros((0, width)), *own]).astype(np.float32), owners
 
 
+def _known_again(changes: Changes, earlier: Visit, later: Visit, found: Comparison, record: MapRecord) -> Changes:
+    """The changes, with new things that look like a retired one as moved, from where that was last."""
+    back: dict[int, Moved] = {}
+    typical = typical_cosine(later.cloud.instances)
+    retired = {k: entry.look(earlier.cloud.instances, k) for k, entry in record.gone.items()}
+    for moved in changes.moved:
+        retired.pop(moved.id, None)
+    for k in changes.new:
+        rows = later.points_of(k)
+        rows = rows[found.of_later.through[rows]]
+        if (old := recognized(later.look(k, rows), retired, typical)) is not None:
+            del retired[old]
+            back[k] = Moved(old, np.array(record.gone[old].place), later.cloud.xyz_world[rows].mean(axis=0), k)
+    return replace(changes, new=tuple(k for k in changes.new if k not in back), moved=(*changes.moved, *back.values()))
+
+
+def _retired(visit: Visit, instance: int) -> Retired:
+    """How an instance looks that leaves the map."""
+    rows = visit.points_of(instance)
+    look, place = visit.look(instance, rows), visit.cloud.xyz_world[rows].mean(axis=0)
+    return Retired(tuple(place.tolist()), look.length, None if look.color is None else tuple(look.color.tolist()))
+
+
 def _note(
     record: MapRecord, earlier: Visit, later: Visit, changes: Changes, found: Comparison,
     ids_of_later: NDArray[np.int64], entry: VisitEntry,
@@ -228,4 +252,4 @@ def _note(
         record.gone.pop(moved.id, None)
     pieces = (k for k, thing in found.gone_pieces.items() if k != thing)
     for k in {*changes.gone, *pieces}:
-        record.gone[k] = retire(earlier, k)
+        record.gone[k] = _retired(earlier, k)

@@ -8,11 +8,16 @@ no evidence at all.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from typing import ClassVar
+
 import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.kernels import njit
 from og_pointcloud.mapping.sight import AGREES, HIDDEN, THROUGH, MeasuredView, states_of_points
+from og_pointcloud.mapping.voxels import Columns
 
 __all__ = ["Presence"]
 
@@ -20,47 +25,43 @@ APART = 0.998
 """Cosine between two directions of sight, from the point, that are two places: 3.6 degrees."""
 
 
-class Presence:
-    """Evidence about n points. odds: (n,) float32, views that bear a point out less those that see through it, bounded.
-    refuted: (n,) uint8, directions, up to two, from which it was seen through. seen_at: (n,) float64, the latest stamp
-    of a view that measured it, or its place; -inf where none did. tolerance: distance from a surface, at right angles
-    to it, up to which a point is of it. most: what the odds are bounded by. hidden: (n,) bool, some view measured a
-    surface before it.
-    """
+@dataclass
+class Presence(Columns):
+    """Evidence about n points. tolerance: distance from a surface, at right angles to it, up to which a point is of it.
+    most: what the odds are bounded by. odds: (n,) float32, views that bear a point out less those that see through it,
+    bounded. refuted: (n,) uint8, directions, up to two, from which it was seen through; first: (n, 3), the first of
+    them. seen_at: (n,) float64, the latest stamp of a view that measured it, or its place; -inf where none did.
+    hidden: (n,) bool, some view measured a surface before it."""
 
-    def __init__(self, n: int, tolerance: float, most: float = np.inf) -> None:
-        self.tolerance, self.most = tolerance, most
-        self.odds = np.zeros(n, np.float32)
-        self.refuted = np.zeros(n, np.uint8)
-        self.seen_at = np.full(n, -np.inf)
-        self.hidden = np.zeros(n, bool)
-        self._from = np.zeros((n, 3), np.float32)
+    tolerance: float
+    most: float = np.inf
+    odds: NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
+    refuted: NDArray[np.uint8] = field(default_factory=lambda: np.zeros(0, np.uint8))
+    seen_at: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
+    hidden: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, bool))
+    first: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 3), np.float32))
+    SPARE: ClassVar[dict[str, float]] = {"seen_at": -np.inf}
 
-    def grow(self, n: int) -> None:
-        """Room for n points, in steps of half."""
-        if n > len(self.odds):
-            more = Presence(max(n - len(self.odds), len(self.odds) // 2), self.tolerance, self.most)
-            for name in ("odds", "refuted", "seen_at", "hidden", "_from"):
-                setattr(self, name, np.concatenate([getattr(self, name), getattr(more, name)]))
-
-    def observe(self, xyz: NDArray[np.float32], view: MeasuredView) -> NDArray[np.int8]:
-        """Take in a view of all points (n, 3); returns their states (`sight.states_of_points`)."""
-        states = states_of_points(xyz, self.tolerance, view)
-        self.take(np.arange(len(xyz), dtype=np.int32), xyz, states, view.camera.center, 0.0)
-        return states
+    @classmethod
+    def by(cls, views: Iterable[MeasuredView], tolerance: float, *clouds: NDArray[np.float32]) -> list[Presence]:
+        """What views say of all points of clouds, each (n, 3)."""
+        found = [cls(tolerance) for _ in clouds]
+        for presence, xyz in zip(found, clouds, strict=True):
+            presence.grow(len(xyz))
+        for view in views:
+            for presence, xyz in zip(found, clouds, strict=True):
+                states = states_of_points(xyz, tolerance, view)
+                presence.take(np.arange(len(xyz)), xyz, states, view.camera.center, 0.0)
+        return found
 
     def take(
-        self, rows: NDArray[np.int32], xyz: NDArray[np.float32], states: NDArray[np.int8], center: NDArray[np.float64],
-        stamp: float,
+        self, rows: NDArray[np.integer], xyz: NDArray[np.float32], states: NDArray[np.int8],
+        center: NDArray[np.float64], stamp: float,
     ) -> None:  # fmt: skip
         """Take in the states (m,) of some points, seen from a centre. What is older than a point's latest word is not
         counted: a frame that comes late cannot bring back what has left since."""
         self.hidden[rows[states == HIDDEN]] = True
-        _count(rows, xyz, states, center, stamp, self.most, self.odds, self.refuted, self.seen_at, self._from)
-
-    def reset(self, rows: NDArray[np.integer]) -> None:
-        """Forget what was known of points that left."""
-        self.odds[rows], self.refuted[rows] = 0, 0
+        _count(rows, xyz, states, center, stamp, self.most, self.odds, self.refuted, self.seen_at, self.first)
 
     @property
     def present(self) -> NDArray[np.bool_]:

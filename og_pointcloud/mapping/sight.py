@@ -14,11 +14,16 @@ does a table's edge before the table, at a slant. Absence is told by THROUGH alo
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from og_pointcloud.formats.capture import depth_files, read_poses
+from og_pointcloud.formats.depth import DepthFile
+from og_pointcloud.formats.poses import in_local_frame
 from og_pointcloud.kernels import njit, prange
 from og_pointcloud.rendering.geometry import Neighbourhood, neighbourhood
 from og_pointcloud.scene import Camera
@@ -31,12 +36,14 @@ __all__ = [
     "THROUGH",
     "DiscSurface",
     "MeasuredView",
+    "depth_views",
     "lens_of",
     "states_of_points",
     "view_of_depth",
 ]
 
 NOTHING, AGREES, HIDDEN, THROUGH = 0, 1, 2, 3
+"""States of a point."""
 
 PLANE_POINTS = 12
 """Nearest points by which the plane of a surface is told."""
@@ -98,11 +105,10 @@ class DiscSurface:
         share = min(1.0, PIXELS_PER_DISC / max(radius_px, 1e-12))
         size = max(8, round(camera.width * share)), max(8, round(camera.height * share))
         camera = camera.resized(*size) if share < 1 else camera
-        drawn = _draw_discs(
+        depth, normal = _draw_discs(
             self.xyz, self.normal, self._radius, camera.world_to_camera, lens_of(camera), camera.height, camera.width,
             NEAR_SHARE * typical,
         )  # fmt: skip
-        depth, normal = drawn
         return MeasuredView(camera, depth, normal, self.noise)
 
 
@@ -122,6 +128,26 @@ def view_of_depth(depth: NDArray[np.float32], camera: Camera) -> MeasuredView:
         camera = Camera(width, height, *lens, camera.world_to_camera)
         depth = np.where(np.isfinite(far), far, 0).astype(np.float32)
     return MeasuredView(camera, depth, *_normals(depth, lens_of(camera)))
+
+
+@dataclass(frozen=True)
+class _DepthViews:
+    """Views that are read one by one, as often as they are asked for."""
+
+    files: tuple[DepthFile, ...]
+    origin: NDArray[np.float64]
+
+    def __iter__(self) -> Iterator[MeasuredView]:
+        for file in self.files:
+            image = file.read()
+            yield view_of_depth(image.depth, in_local_frame(image.camera, self.origin))
+
+
+def depth_views(capture: str | Path, origin: NDArray[np.float64]) -> _DepthViews | None:
+    """What the depth images of a capture measured, from cameras in the local frame of that origin (world = local +
+    origin); None where it has none."""
+    files = depth_files(Path(capture), read_poses(Path(capture)))
+    return _DepthViews(tuple(files.values()), origin) if files else None
 
 
 def states_of_points(xyz: NDArray[np.float32], tolerance: float, view: MeasuredView) -> NDArray[np.int8]:

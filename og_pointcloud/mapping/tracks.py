@@ -13,14 +13,17 @@ over all views at once; `Mapper.finish` runs that rule). Only tracks that a fram
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.fitting.association import directions
 from og_pointcloud.kernels import njit
+from og_pointcloud.mapping.likeness import Look
+from og_pointcloud.mapping.voxels import Columns
 
-__all__ = ["NO_TRACK", "PointVotes", "Track", "Tracks"]
+__all__ = ["NO_TRACK", "Left", "PointVotes", "Track", "Tracks"]
 
 NO_TRACK = -1
 HEAVIEST = 4
@@ -37,19 +40,13 @@ LEAST_POINTS = 3.0
 """Points of a track, or of a mask, that a frame must show to say anything of it."""
 
 
-class PointVotes:
+@dataclass
+class PointVotes(Columns):
     """The heaviest votes of each point. track: (n, 4) int32, NO_TRACK where empty; weight: (n, 4) float32."""
 
-    def __init__(self) -> None:
-        self.track = np.full((0, HEAVIEST), NO_TRACK, np.int32)
-        self.weight = np.zeros((0, HEAVIEST), np.float32)
-
-    def grow(self, n: int) -> None:
-        """Room for the points of the map, in steps of half."""
-        if n > len(self.track):
-            more = max(n - len(self.track), len(self.track) // 2)
-            self.track = np.concatenate([self.track, np.full((more, HEAVIEST), NO_TRACK, np.int32)])
-            self.weight = np.concatenate([self.weight, np.zeros((more, HEAVIEST), np.float32)])
+    track: NDArray[np.int32] = field(default_factory=lambda: np.zeros((0, HEAVIEST), np.int32))
+    weight: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, HEAVIEST), np.float32))
+    SPARE: ClassVar[dict[str, float]] = {"track": NO_TRACK}
 
     def best(self, points: NDArray[np.integer], root: NDArray[np.int32]) -> NDArray[np.int32]:
         """(m,) the track, after joins, with the most votes of each point; NO_TRACK without any."""
@@ -59,15 +56,21 @@ class PointVotes:
         """Votes of (m,) points for a track each; NO_TRACK takes from the heaviest: seen, and in no mask."""
         _add(points, track, weight, self.track, self.weight)
 
-    def clear(self, points: NDArray[np.integer]) -> None:
-        """Forget the votes of points that are no longer there."""
-        self.track[points], self.weight[points] = NO_TRACK, 0
+
+@dataclass(frozen=True)
+class Left:
+    """How an object looked that left, and where it was last, (3,) world coordinates, for when it is found again."""
+
+    look: Look
+    place: NDArray[np.float64]
+    size: NDArray[np.float64]
 
 
 @dataclass
 class Track:
     """total: (D,) sum of unit features by pixels; pixels: their sum; agreement: sum of cosines by pixels. views, masks:
-    how many showed it. id: of the object, NO_TRACK while it is provisional."""
+    how many showed it. id: of the object, NO_TRACK while it is provisional; named_at: the stamp at which it got it.
+    lost: rows of its points that were seen through; left: when most of them were."""
 
     total: NDArray[np.float64] | None = None
     pixels: float = 0.0
@@ -76,12 +79,15 @@ class Track:
     masks: int = 0
     last_seen: float = 0.0
     id: int = NO_TRACK
+    named_at: float = -np.inf
+    lost: list[int] = field(default_factory=list)
+    left: Left | None = None
 
     def take_in(self, other: Track) -> None:
         """Become both."""
         if other.total is not None:
             self.total = other.total if self.total is None else self.total + other.total
-        for name in ("pixels", "agreement", "masks"):
+        for name in ("pixels", "agreement", "masks", "lost"):
             setattr(self, name, getattr(self, name) + getattr(other, name))
         self.views, self.last_seen = max(self.views, other.views), max(self.last_seen, other.last_seen)
 
@@ -101,39 +107,25 @@ class Tracks:
     root: NDArray[np.int32] = field(default_factory=lambda: np.zeros(0, np.int32))
     pairs: dict[tuple[int, int], list[int]] = field(default_factory=dict)
     next_id: int = 0
-    free: list[int] = field(default_factory=list)
 
-    def named(self, k: int) -> int:
-        """Give a track the next id."""
-        self.tracks[k].id, self.next_id = self.next_id, self.next_id + 1
-        return self.tracks[k].id
-
-    def prune(self, votes: PointVotes, before: float) -> None:
-        """Let go of tracks that were joined into others, and of those that one frame showed before that stamp: their
-        numbers are given again. Memory follows the objects, and not the frames."""
-        stale = [k for k, t in enumerate(self.tracks) if t.id < 0 and t.last_seen < before and self.root[k] == k]
-        joined = [k for k in range(len(self.root)) if self.root[k] != k]
-        if not stale and not joined:
-            return
-        number = np.append(self.root, np.int32(NO_TRACK))
-        number[stale] = NO_TRACK
-        votes.track[:] = number[votes.track]
-        votes.weight[votes.track == NO_TRACK] = 0
-        out = {*stale, *joined}
-        self.pairs = {pair: counts for pair, counts in self.pairs.items() if not out & {*pair}}
-        for k in out:
-            self.tracks[k], self.root[k] = Track(last_seen=np.inf), k
-        self.free = sorted({*self.free, *out}, reverse=True)
-
-    def found(self) -> int:
+    def add(self, track: Track) -> int:
         """A new track's number."""
-        if self.free:
-            k = self.free.pop()
-            self.tracks[k] = Track()
-            return k
-        self.tracks.append(Track())
+        self.tracks.append(track)
         self.root = np.append(self.root, np.int32(len(self.root)))
         return len(self.root) - 1
+
+    def prune(self, votes: PointVotes, before: float) -> None:
+        """Let go of tracks that were joined into others, and of those that one frame showed before that stamp, and
+        number the others anew: memory follows the objects, and not the frames."""
+        kept = [k for k, t in enumerate(self.tracks) if self.root[k] == k and (t.id >= 0 or t.last_seen >= before)]
+        number = np.full(len(self.tracks) + 1, NO_TRACK, np.int32)  # the last: of NO_TRACK
+        number[kept] = np.arange(len(kept))
+        number[:-1] = number[self.root]
+        votes.track[:] = number[votes.track]
+        votes.weight[votes.track == NO_TRACK] = 0
+        among = {*kept}
+        self.pairs = {(int(number[a]), int(number[b])): c for (a, b), c in self.pairs.items() if {a, b} <= among}
+        self.tracks, self.root = [self.tracks[k] for k in kept], np.arange(len(kept), dtype=np.int32)
 
     def by_id(self) -> dict[int, int]:
         """Object id -> its track, of those that have not been joined into another."""
@@ -151,10 +143,7 @@ class Tracks:
         seen, place = np.unique(own, return_inverse=True)
         shown = np.zeros((len(features) + 1, len(seen)))  # the last row: in no mask
         np.add.at(shown, (mask, place), weight)
-        if len(seen) and seen[0] == NO_TRACK:
-            of_tracks, seen = shown[:, 1:], seen[1:]
-        else:
-            of_tracks = shown
+        of_tracks, seen = shown[:, seen >= 0], seen[seen >= 0]
         of_mask = self._belonging(of_tracks, shown.sum(axis=1), seen)
         votes.add(points, np.append(of_mask, NO_TRACK).astype(np.int32)[mask], weight)
         self._witness(of_tracks[:-1], of_tracks.sum(axis=0), seen)
@@ -172,7 +161,7 @@ class Tracks:
             if fits and of_tracks[m, best] > MOSTLY * visible[best] and of_tracks[m].sum() > 0.25 * of_masks[m]:
                 of_mask[m] = seen[best]
             else:
-                of_mask[m] = self.found()
+                of_mask[m] = self.add(Track())
         return of_mask
 
     def _witness(self, shown: NDArray[np.float64], visible: NDArray[np.float64], seen: NDArray[np.int32]) -> None:

@@ -5,12 +5,15 @@ What is measured again moves its point towards the mean. A point keeps its row f
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
+from typing import ClassVar
+
 import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.kernels import njit
 
-__all__ = ["VoxelPoints"]
+__all__ = ["Columns", "VoxelHash", "VoxelPoints"]
 
 ACROSS = 1 << 20
 """Voxels to either side of the origin: three indices fit one 64-bit key."""
@@ -19,15 +22,43 @@ MOST_WEIGHT = 32.0
 EMPTY = np.int64(-1)
 
 
-class VoxelPoints:
-    """n points. edge: of a voxel. grows: whether measured points are added. xyz: (n, 3) float32; rgb: (n, 3) float32;
-    weight: (n,) float32 readings; anchor: (n,) int32, the frame that a point was first seen by."""
+@dataclass
+class Columns:
+    """Arrays with a row a point, that grow together in steps of half. SPARE: what rows of a name hold at first, if not
+    0."""
 
-    def __init__(self, edge: float, grows: bool) -> None:
-        self.edge, self.grows, self.n = edge, grows, 0
-        self._xyz, self._rgb = np.zeros((1024, 3), np.float32), np.zeros((1024, 3), np.float32)
-        self._weight, self._anchor = np.zeros(1024, np.float32), np.zeros(1024, np.int32)
-        self._keys, self._rows = np.full(4096, EMPTY), np.zeros(4096, np.int32)
+    SPARE: ClassVar[dict[str, float]] = {}
+
+    def grow(self, n: int) -> None:
+        """Room for n points."""
+        for name, rows in list(vars(self).items()):
+            if isinstance(rows, np.ndarray) and n > len(rows):
+                more = max(n - len(rows), len(rows) // 2)
+                spare = np.full((more, *rows.shape[1:]), self.SPARE.get(name, 0), rows.dtype)
+                setattr(self, name, np.concatenate([rows, spare]))
+
+
+@dataclass
+class VoxelHash:
+    """Open addressing. keys: (slots,) int64 of voxels, EMPTY where there is none; rows: (slots,) of their points."""
+
+    keys: NDArray[np.int64] = field(default_factory=lambda: np.full(4096, EMPTY))
+    rows: NDArray[np.int32] = field(default_factory=lambda: np.zeros(4096, np.int32))
+
+
+@dataclass
+class VoxelPoints(Columns):
+    """n points. edge: of a voxel. grows: whether measured points are added. weight: (n,) float32 readings, 0 for a
+    point that left: it keeps its row, for what may come to its voxel."""
+
+    edge: float
+    grows: bool
+    n: int = 0
+    hash: VoxelHash = field(default_factory=VoxelHash)
+    _xyz: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 3), np.float32))
+    _rgb: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 3), np.float32))
+    weight: NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
+    _anchor: NDArray[np.int32] = field(default_factory=lambda: np.zeros(0, np.int32))
 
     def __len__(self) -> int:
         return self.n
@@ -44,23 +75,19 @@ class VoxelPoints:
 
     @property
     def alive(self) -> NDArray[np.bool_]:
-        """(n,) bool: points that are there. One that left keeps its row, for what may come to its voxel."""
-        return self._weight[: self.n] > 0
-
-    def remove(self, rows: NDArray[np.integer]) -> None:
-        """Points that were seen through."""
-        self._weight[rows] = 0
+        """(n,) bool: points that are there."""
+        return self.weight[: self.n] > 0
 
     @property
     def anchor(self) -> NDArray[np.int32]:
-        """(n,) int32, -1 for points that no frame brought."""
+        """(n,) int32, the frame that a point was first seen by, -1 for points that no frame brought."""
         return self._anchor[: self.n]
 
     def add_known(self, xyz: NDArray[np.float32], rgb: NDArray[np.uint8] | None) -> None:
         """Points that are kept as they are, several in a voxel if they are so dense."""
         self._reserve(len(xyz))
         rows = slice(self.n, self.n + len(xyz))
-        self._xyz[rows], self._weight[rows], self._anchor[rows] = xyz, MOST_WEIGHT, -1
+        self._xyz[rows], self.weight[rows], self._anchor[rows] = xyz, MOST_WEIGHT, -1
         self._rgb[rows] = 128 if rgb is None else rgb
         self.n += len(xyz)
         self.rehash()
@@ -69,28 +96,22 @@ class VoxelPoints:
         """Take measured points (m, 3) in: into the mean of their voxel's point, or as a new one."""
         if self.grows:
             self._reserve(len(xyz))
-            arrays = self._xyz, self._rgb, self._weight, self._anchor
-            self.n = _insert(xyz, rgb, anchor, self.edge, self._keys, self._rows, *arrays, self.n)
+            arrays = self._xyz, self._rgb, self.weight, self._anchor
+            self.n = _insert(xyz, rgb, anchor, self.edge, self.hash.keys, self.hash.rows, *arrays, self.n)
 
     def rehash(self) -> None:
         """After points were moved."""
-        self._keys[:] = EMPTY
-        _index(self.xyz, self.edge, self._keys, self._rows)
+        self.hash.keys[:] = EMPTY
+        _index(self.xyz, self.edge, self.hash.keys, self.hash.rows)
 
     def _reserve(self, more: int) -> None:
         """Room for so many more points; the hash stays less than half full."""
         need = self.n + more
-        if need > len(self._xyz):
-            size = max(need, 2 * len(self._xyz))
-            for name in ("_xyz", "_rgb", "_weight", "_anchor"):
-                old = getattr(self, name)
-                new = np.zeros((size, *old.shape[1:]), old.dtype)
-                new[: self.n] = old[: self.n]
-                setattr(self, name, new)
-        if 2 * need > len(self._keys):
+        self.grow(need)
+        if 2 * need > len(self.hash.keys):
             size = 1 << int(2 * need - 1).bit_length()
-            self._keys, self._rows = np.full(size, EMPTY), np.zeros(size, np.int32)
-            _index(self.xyz, self.edge, self._keys, self._rows)
+            self.hash = VoxelHash(np.full(size, EMPTY), np.zeros(size, np.int32))
+            self.rehash()
 
 
 @njit(cache=True, nogil=True)

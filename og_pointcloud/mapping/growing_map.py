@@ -1,0 +1,196 @@
+"""All that a growing map holds: its points, whether they are still there, what they voted for, what views showed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from og_pointcloud.cloud import FeatureSpace
+from og_pointcloud.formats.poses import in_local_frame
+from og_pointcloud.kernels import njit, prange
+from og_pointcloud.mapping.changes import SCATTER, TOLERANCE
+from og_pointcloud.mapping.frame import CheckedFrame
+from og_pointcloud.mapping.kept_views import KeptViews
+from og_pointcloud.mapping.presence import Presence
+from og_pointcloud.mapping.sight import AGREES, lens_of
+from og_pointcloud.mapping.tracks import NO_TRACK, PointVotes, Tracks
+from og_pointcloud.mapping.voxels import VoxelPoints
+from og_pointcloud.scene import Camera
+
+__all__ = ["GrowingMap"]
+
+PIXELS_PER_SPACING = 4.0
+"""Pixels of the first depth image, at its median depth, to a spacing of a map that starts empty."""
+READINGS_PER_SPACING = 1.5
+"""Readings a spacing that a frame gives to the map, along each axis: more would only be averaged."""
+SLANT = 0.15
+"""Cosine between ray and surface below which a reading is no point: edges of depth images fly."""
+MOST_ODDS = 3.0
+"""Frames that history counts for at most."""
+RECENT_FRAMES = 4096
+"""Stamps of frames that are remembered: those that a journal still holds are not integrated twice."""
+
+
+@dataclass
+class GrowingMap:
+    """origin: (3,), world = local + origin. spacing: of points. anchors: stamp and pose of each frame that brought
+    points. sequence: frames so far; stamp: the latest of all; recent: those of the last ones."""
+
+    origin: NDArray[np.float64]
+    space: FeatureSpace
+    points: VoxelPoints
+    presence: Presence
+    votes: PointVotes = field(default_factory=PointVotes)
+    tracks: Tracks = field(default_factory=Tracks)
+    kept: KeptViews = field(default_factory=KeptViews)
+    anchors: list[tuple[float, NDArray[np.float64]]] = field(default_factory=list)
+    sequence: int = 0
+    stamp: float = -1.0
+    recent: list[float] = field(default_factory=list)
+
+    @classmethod
+    def empty(
+        cls, origin: NDArray[np.float64], space: FeatureSpace, spacing: float, grows: bool, scatter: float = 0.0
+    ) -> GrowingMap:
+        """Without a point. grows: whether frames add some. scatter: standard deviation of points off their surface."""
+        tolerance = max(TOLERANCE * spacing, SCATTER * scatter)
+        return cls(origin, space, VoxelPoints(spacing, grows), Presence(tolerance, MOST_ODDS))
+
+    @classmethod
+    def begun_by(
+        cls, frame: CheckedFrame, origin: NDArray[np.float64], space: FeatureSpace, spacing: float | None
+    ) -> GrowingMap:
+        """Without a point, for the depth of a first frame; spacing None: as dense as its pixels."""
+        assert frame.view is not None
+        depth, camera = frame.view.depth, frame.view.camera
+        pixel = np.median(depth[depth > 0]) / np.sqrt(camera.fx * camera.fy)
+        return cls.empty(origin, space, float(PIXELS_PER_SPACING * pixel) if spacing is None else spacing, grows=True)
+
+    def know(self, xyz: NDArray[np.float32], rgb: NDArray[np.uint8] | None) -> None:
+        """Take points (n, 3) of which the geometry is known."""
+        self.points.add_known(xyz, rgb)
+        self.grow()
+
+    def grow(self) -> None:
+        """Room for what is known of each point."""
+        for columns in (self.presence, self.votes, self.kept):
+            columns.grow(self.points.n)
+
+    def in_view(self, camera: Camera, margin: float = 0.0) -> NDArray[np.int32]:
+        """Rows of the points that are there and fall into an image, or within a share ``margin`` of it."""
+        pose, points = camera.world_to_camera, self.points
+        inside = _inside(points.xyz, points.alive, pose, lens_of(camera), margin, camera.width, camera.height)
+        return np.flatnonzero(inside).astype(np.int32)
+
+    def judge(
+        self, rows: NDArray[np.int32], states: NDArray[np.int8], frame: CheckedFrame
+    ) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+        """Presence of points by a frame's states of them: rows of those that it measures, and that leave by it."""
+        presence = self.presence
+        presence.take(rows, self.points.xyz[rows], states, frame.camera.center, frame.stamp)
+        return rows[states == AGREES], rows[(presence.odds[rows] < -1) & (presence.refuted[rows] > 1)]
+
+    def add(self, frame: CheckedFrame) -> NDArray[np.int32]:
+        """The readings of a frame, as dense as the map, but for those at a slant; rows of the new points."""
+        points, view, before = self.points, frame.view, self.points.n
+        if view is None or not points.grows:
+            return np.zeros(0, np.int32)
+        camera = view.camera
+        typical = float(np.median(view.depth[view.depth > 0]))
+        step = max(1, int(points.edge * np.sqrt(camera.fx * camera.fy) / typical / READINGS_PER_SPACING))
+        xyz, pixel = _readings(view.depth, view.normal, camera.world_to_camera, lens_of(camera), step, step // 2, SLANT)
+        rgb = np.full((len(xyz), 3), 128, np.uint8)
+        if frame.rgb is not None:
+            scale = frame.rgb.shape[0] / camera.height, frame.rgb.shape[1] / camera.width
+            row, column = pixel // camera.width, pixel % camera.width
+            rgb = frame.rgb[(row * scale[0]).astype(np.intp), (column * scale[1]).astype(np.intp)]
+        points.add(xyz, rgb, len(self.anchors))
+        added = np.arange(before, points.n, dtype=np.int32)
+        if len(added):
+            self.anchors.append((frame.stamp, frame.camera.world_to_camera))
+            self.grow()
+            self.presence.odds[added], self.presence.seen_at[added] = 1, frame.stamp
+            self.kept.born[added] = self.sequence
+        return added
+
+    def owners(self) -> NDArray[np.int32]:
+        """(n,) the track of each point, NO_TRACK for those that left."""
+        everyone = np.arange(self.points.n, dtype=np.int32)
+        return np.where(self.points.alive, self.votes.best(everyone, self.tracks.root), NO_TRACK)
+
+    def forget(self, rows: NDArray[np.int32]) -> None:
+        """What was known of points that left, or whose thing did."""
+        self.votes.track[rows], self.votes.weight[rows] = NO_TRACK, 0
+        self.presence.odds[rows], self.presence.refuted[rows] = 0, 0
+        self.kept.born[rows] = self.sequence
+
+    def place_of(self, rows: NDArray[np.integer]) -> NDArray[np.float64]:
+        """(3,) mean of points, world coordinates."""
+        return self.points.xyz[rows].astype(np.float64).mean(axis=0) + self.origin
+
+    def correct(self, poses: dict[float, ArrayLike]) -> None:
+        """Move what the frames of these stamps brought: stamp -> world_to_camera, from world coordinates."""
+        corrected = {}
+        for stamp, pose in poses.items():
+            camera = Camera(1, 1, 1.0, 1.0, 0.5, 0.5, np.asarray(pose, np.float64))
+            corrected[float(stamp)] = in_local_frame(camera, self.origin).world_to_camera
+        for index, (stamp, old) in enumerate(self.anchors):
+            if stamp in corrected:
+                rows = np.flatnonzero(self.points.anchor == index)
+                motion = np.linalg.inv(corrected[stamp]) @ old
+                self.points.xyz[rows] = self.points.xyz[rows] @ motion[:3, :3].T + motion[:3, 3]
+                self.anchors[index] = stamp, corrected[stamp]
+        for index, view in enumerate(self.kept.views):
+            if view.stamp in corrected:
+                camera = replace(view.camera, world_to_camera=corrected[view.stamp])
+                self.kept.views[index] = replace(view, camera=camera)
+        self.points.rehash()
+        self.sequence += 1
+
+    def count(self, stamp: float) -> None:
+        """One more frame is in."""
+        self.sequence += 1
+        self.recent = [*self.recent[1 - RECENT_FRAMES :], stamp]
+
+
+@njit(cache=True, parallel=True, nogil=True)
+def _inside(xyz, alive, pose, lens, margin, width, height):  # noqa: ANN001, ANN202
+    fx, fy, cx, cy = lens
+    inside = np.zeros(len(xyz), np.bool_)
+    for i in prange(len(xyz)):
+        if alive[i]:
+            x, y, z = xyz[i, 0], xyz[i, 1], xyz[i, 2]
+            depth = pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] * z + pose[2, 3]
+            if depth > 0:
+                u = fx * (pose[0, 0] * x + pose[0, 1] * y + pose[0, 2] * z + pose[0, 3]) / depth + cx
+                v = fy * (pose[1, 0] * x + pose[1, 1] * y + pose[1, 2] * z + pose[1, 3]) / depth + cy
+                across, down = margin * width, margin * height
+                inside[i] = -across <= u < width + across and -down <= v < height + down
+    return inside
+
+
+@njit(cache=True, nogil=True)
+def _readings(depth, normal, pose, lens, step, first, slant):  # noqa: ANN001, ANN202
+    """(xyz (m, 3), flat pixel (m,)) of every step-th reading that is not at a slant."""
+    fx, fy, cx, cy = lens
+    height, width = depth.shape
+    xyz = np.empty((depth.size // (step * step) + height + width + 1, 3), np.float32)
+    pixel = np.empty(len(xyz), np.int64)
+    count = 0
+    for row in range(first, height, step):
+        for column in range(first, width, step):
+            z = depth[row, column]
+            if z <= 0:
+                continue
+            dx, dy = (column + 0.5 - cx) / fx, (row + 0.5 - cy) / fy
+            n = normal[row, column]
+            if -(n[0] * dx + n[1] * dy + n[2]) < slant * np.sqrt(dx * dx + dy * dy + 1):
+                continue
+            x, y, w = z * dx - pose[0, 3], z * dy - pose[1, 3], z - pose[2, 3]
+            for a in range(3):
+                xyz[count, a] = pose[0, a] * x + pose[1, a] * y + pose[2, a] * w
+            pixel[count] = row * width + column
+            count += 1
+    return xyz[:count], pixel[:count]

@@ -1,0 +1,73 @@
+"""What a map kept -> a labelled cloud, by the rule of `fit` in mode grouping: the same masks, witnesses and votes."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from og_pointcloud.cloud import InstanceTable, LabelledCloud
+from og_pointcloud.fitting.fit import Prepared, fit_prepared, front_surfaces
+from og_pointcloud.journal import Journal
+from og_pointcloud.mapping.growing_map import GrowingMap
+from og_pointcloud.rendering.geometry import Neighbourhood, isotropic, near_plane
+from og_pointcloud.rendering.surface import Surface, sight_thickness
+from og_pointcloud.scene import Points, Scene, View
+from og_pointcloud.settings import FitSettings
+
+__all__ = ["labelled", "matched_ids", "with_ids"]
+
+
+def labelled(known: GrowingMap, rows: NDArray[np.int64], around: Neighbourhood, settings: FitSettings) -> LabelledCloud:
+    """Some of a map's points, rows (n,), labelled as `fit` would from the views kept. around: their neighbourhood."""
+    place = np.full(known.points.n, -1, np.int32)
+    place[rows] = np.arange(len(rows), dtype=np.int32)
+    points = Points(known.points.xyz[rows], known.origin, known.points.rgb[rows].astype(np.uint8))
+    table = known.kept.table(place, len(rows))
+    no_mask, width = np.zeros((0, 0), np.int32), table.mask_features.shape[1]
+    no_feature = np.zeros((0, width), np.float32)
+    views = tuple(View(str(k), view.camera, no_mask, no_feature) for k, view in enumerate(known.kept.views))
+    scene, geometry = Scene(points, views, known.space.name, "map"), settings.geometry
+    drawn = isotropic(points, around.spacing, geometry.start_scale, geometry.opacity)
+    thickness = sight_thickness(around.spacing, float(np.median(around.spacing)), geometry)
+    surface = Surface(scene, None, around, drawn, near_plane(points.xyz, views), thickness, 1, by_sight=True)
+    settings, journal = replace(settings, mode="grouping"), Journal(progress=False)
+    table = front_surfaces(surface, table, settings, journal)
+    return fit_prepared(Prepared(scene, surface, table), settings, journal)
+
+
+def matched_ids(
+    ids: NDArray[np.int32], count: int, known: NDArray[np.int32], known_count: int
+) -> tuple[NDArray[np.int64], int]:
+    """(count,) the id that each instance gets, and how many ids there are then: that of the known object with which it
+    shares most points, each given once; then fresh ones from known_count on.
+
+    ids, known: (n,) instance and known object of each point, below 0 none.
+    """
+    wanted = np.full(count, -1, np.int64)
+    both = (ids >= 0) & (known >= 0)
+    pairs, shared = np.unique(ids[both].astype(np.int64) * known_count + known[both], return_counts=True)
+    for pair in pairs[np.lexsort((pairs, -shared))].tolist():
+        instance, owner = divmod(pair, known_count)
+        if wanted[instance] < 0 and owner not in wanted:
+            wanted[instance] = owner
+    fresh = np.flatnonzero(wanted < 0)
+    wanted[fresh] = known_count + np.arange(len(fresh))
+    return wanted, known_count + len(fresh)
+
+
+def with_ids(cloud: LabelledCloud, wanted: NDArray[np.int64], count: int) -> LabelledCloud:
+    """The cloud with instance k called wanted[k], in a table of ``count`` rows; rows without an instance are empty."""
+    table, empty = cloud.instances, {"coarse": -1, "part_of": -1, "reliability": np.nan}
+    columns = {}
+    for entry in fields(InstanceTable)[2:]:
+        rows = getattr(table, entry.name)
+        columns[entry.name] = np.full(count, empty.get(entry.name, 0), rows.dtype)
+        columns[entry.name][wanted] = rows
+    number = np.append(wanted, [-2, -1])  # states -2 and -1 index the last two
+    columns["part_of"][wanted] = np.where(table.part_of >= 0, number[table.part_of], -1)
+    owner = wanted[table.descriptor_instance]
+    order = np.argsort(owner, kind="stable")
+    renamed = InstanceTable(table.descriptors[order], owner[order].astype(np.int32), **columns)
+    return replace(cloud, instance_ids=number[cloud.instance_ids].astype(np.int32), instances=renamed)
