@@ -22,8 +22,8 @@ def add(parser: Parser) -> None:
 def run(arguments: argparse.Namespace) -> None:
     from og_pointcloud.ask.labelled_scene import load
     from og_pointcloud.formats.capture import read_capture
-    from og_pointcloud.mapping.sight import depth_views
     from og_pointcloud.mapping.merging import update
+    from og_pointcloud.mapping.sight import depth_views
 
     before = load(arguments.map)
     stages = []
