@@ -15,7 +15,6 @@ table. What lies where the earlier visit never looked is neither new nor old: it
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -31,6 +30,7 @@ from og_pointcloud.cloud import LabelledCloud
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.poses import in_local_frame
 from og_pointcloud.mapping.likeness import ALIKE, Look, descriptors_of, likeness, typical_cosine
+from og_pointcloud.mapping.map_record import MapRecord
 from og_pointcloud.mapping.presence import Presence
 from og_pointcloud.mapping.sight import DiscSurface, MeasuredView
 from og_pointcloud.rendering.geometry import Neighbourhood, neighbourhood
@@ -97,10 +97,6 @@ class Changes:
         """JSON-able: gone, new, moved (id, from, to), unseen."""
         moved = [one.to_dict() for one in self.moved]
         return {"gone": list(self.gone), "new": list(self.new), "moved": moved, "unseen": list(self.unseen)}
-
-    def to_json(self) -> str:
-        """As the commands write it."""
-        return json.dumps(self.to_dict(), indent=2) + "\n"
 
     def __str__(self) -> str:
         counts = (self.gone, "gone"), (self.new, "new"), (self.moved, "moved"), (self.unseen, "not seen again")
@@ -284,11 +280,16 @@ def _decide(earlier: Visit, later: Visit, of_earlier: Evidence, of_later: Eviden
     typical = typical_cosine(later.cloud.instances)
     gone = _things(earlier, np.flatnonzero(left).tolist(), of_earlier.through, typical)
     new = _things(later, np.flatnonzero(came).tolist(), of_later.through, typical)
+    retired = [  # what an earlier visit found gone, and may be back
+        _Thing((k,), entry.look(earlier.cloud.instances, k), np.array(entry.place), 0)
+        for k, entry in MapRecord.of(earlier.cloud).gone.items()
+    ]
+    unmatched, gone = set(range(len(gone))), [*gone, *retired]
     pairs = _matched(gone, new, typical)
     new = _with_scattered(gone, new, pairs, typical)
     taken = set(pairs.values())
     changes = Changes(
-        gone=tuple(sorted(k for g, thing in enumerate(gone) if g not in pairs for k in thing.pieces)),
+        gone=tuple(sorted(k for g in unmatched - {*pairs} for k in gone[g].pieces)),
         new=tuple(thing.pieces[0] for n, thing in enumerate(new) if n not in taken and thing.pieces),
         moved=tuple(
             Moved(gone[g].pieces[0], gone[g].place, new[n].place, new[n].pieces[0]) for g, n in sorted(pairs.items())

@@ -22,7 +22,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.formats.capture import depth_files, read_poses
-from og_pointcloud.formats.depth import DepthFile
 from og_pointcloud.formats.poses import in_local_frame
 from og_pointcloud.kernels import njit, prange
 from og_pointcloud.rendering.geometry import Neighbourhood, neighbourhood
@@ -130,24 +129,12 @@ def view_of_depth(depth: NDArray[np.float32], camera: Camera) -> MeasuredView:
     return MeasuredView(camera, depth, *_normals(depth, lens_of(camera)))
 
 
-@dataclass(frozen=True)
-class _DepthViews:
-    """Views that are read one by one, as often as they are asked for."""
-
-    files: tuple[DepthFile, ...]
-    origin: NDArray[np.float64]
-
-    def __iter__(self) -> Iterator[MeasuredView]:
-        for file in self.files:
-            image = file.read()
-            yield view_of_depth(image.depth, in_local_frame(image.camera, self.origin))
-
-
-def depth_views(capture: str | Path, origin: NDArray[np.float64]) -> _DepthViews | None:
-    """What the depth images of a capture measured, from cameras in the local frame of that origin (world = local +
-    origin); None where it has none."""
+def depth_views(capture: str | Path, origin: NDArray[np.float64]) -> Iterator[MeasuredView] | None:
+    """What the depth images of a capture measured, read one by one, from cameras in the local frame of that origin
+    (world = local + origin); None where it has none."""
     files = depth_files(Path(capture), read_poses(Path(capture)))
-    return _DepthViews(tuple(files.values()), origin) if files else None
+    images = (file.read() for file in files.values())
+    return (view_of_depth(image.depth, in_local_frame(image.camera, origin)) for image in images) if files else None
 
 
 def states_of_points(xyz: NDArray[np.float32], tolerance: float, view: MeasuredView) -> NDArray[np.int8]:

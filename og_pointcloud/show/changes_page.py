@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from og_pointcloud.ask.labelled_scene import LabelledScene
 from og_pointcloud.ask.segmentation import Segmentation
-from og_pointcloud.cloud import InstanceTable, LabelledCloud
+from og_pointcloud.cloud import LabelledCloud
 from og_pointcloud.mapping.changes import Changes
+from og_pointcloud.mapping.merging import joined
 from og_pointcloud.show.page import Look, write_page
 from og_pointcloud.show.viewpoint import choose_viewpoint
 
@@ -39,11 +40,12 @@ def write_changes_page(
     labels = np.concatenate([of_after, of_before]).astype(np.int32)
     shift = before.origin - after.origin
     colored = before.rgb is not None and after.rgb is not None
+    ids = np.concatenate([after.instance_ids, before.instance_ids[rows] + count]).astype(np.int32)
     both = replace(
         after,
         xyz=np.concatenate([after.xyz, (before.xyz[rows] + shift).astype(np.float32)]),
-        instance_ids=np.concatenate([after.instance_ids, before.instance_ids[rows] + count]).astype(np.int32),
-        instances=_both(after.instances, before.instances),
+        instance_ids=ids,
+        instances=joined(after.instances, before.instances, count + np.arange(len(before.instances)), ids),
         rgb=np.concatenate([after.rgb, before.rgb[rows]]) if colored else None,  # pyright: ignore
         certainty=None,
     )
@@ -54,19 +56,3 @@ def write_changes_page(
     )
     view = choose_viewpoint(scene.xyz, labels >= 0, up)
     write_page(path, scene, result, view, Look(f"What changed: {changes}", boxes=True, cut=0.2), both.rgb)
-
-
-def _both(first: InstanceTable, second: InstanceTable) -> InstanceTable:
-    """One table behind the other."""
-    names = ("points", "views", "masks", "agreement", "visible_area", "coarse")
-    columns = {name: np.concatenate([getattr(first, name), getattr(second, name)]) for name in names}
-    owners = np.concatenate([first.descriptor_instance, second.descriptor_instance + np.int32(len(first))])
-    width = max(first.descriptors.shape[1], second.descriptors.shape[1])
-    descriptors = [t.descriptors if len(t.descriptors) else np.zeros((0, width), np.float32) for t in (first, second)]
-    part_of = np.where(second.part_of >= 0, second.part_of + len(first), -1)
-    return InstanceTable(
-        np.concatenate(descriptors),
-        owners,
-        part_of=np.concatenate([first.part_of, part_of]).astype(np.int32),
-        **columns,
-    )
