@@ -24,11 +24,10 @@ from numpy.typing import NDArray
 
 import og_pointcloud as og
 from og_pointcloud.cloud import unit_rows
-from og_pointcloud.collection.fit_many import peak_memory
 from og_pointcloud.collection.index import settle
 from og_pointcloud.collection.scoring import Block
-from og_pointcloud.collection.store import INSTANCE, Atlas, SceneArrays, SceneEntry
-from og_pointcloud.fitting.memory import memory_in_use
+from og_pointcloud.collection.store import Atlas, SceneEntry
+from og_pointcloud.fitting.memory import memory_in_use, peak_memory
 
 WORDS, SPACE = 400, "made/encoder"
 RECALL_AT, ASKED = 10, 40
@@ -156,24 +155,24 @@ def search(descriptors: int, instances: int, encoder: MadeEncoder) -> None:
     )
     bank = og.WordBank(encoder.words.vectors)
     some = rows[:: max(1, len(rows) // 2000)] @ unit_rows(bank.vectors - bank.mean).T
-    low = np.zeros((len(rows), 3))
+    rows /= some.std()
     block = Block(
-        entries=(), descriptors=rows, first=np.arange(len(rows)), scene=scene, points=np.ones(len(rows), np.int32),
-        instance=np.tile(np.arange(instances, dtype=np.int32), scenes), low=low, high=low, bank=bank,
-        common=np.zeros((scenes, rows.shape[1]), np.float32), sharpness=np.full(scenes, 3.25, np.float32),
-        scale=np.full(len(rows), 1 / some.std(), np.float32),
-        shift=np.full(len(rows), -some.mean() / some.std(), np.float32),
+        entries=(), vectors=rows, shift=np.full(len(rows), -some.mean() / some.std(), np.float32),
+        first=np.arange(len(rows)), scene=scene, instance=np.tile(np.arange(instances, dtype=np.int32), scenes),
+        points=np.ones(len(rows), np.int32), boxes=np.zeros((len(rows), 2, 3)), bank=bank,
+        sharpness=np.full(scenes, 3.25),
     )  # fmt: skip
     nothing = np.zeros((0, rows.shape[1]), np.float32)
-    for name, chosen in (("exact, all", None), ("exact, half of the scenes", scene % 2 == 0)):
+    everything = np.arange(len(rows))
+    for name, chosen in (("exact, all", everything), ("exact, half of the scenes", np.flatnonzero(scene % 2 == 0))):
         times = []
         for word in range(ASKED):
             text = encoder.words.vectors[word]
             seconds, found = timed(lambda text=text, chosen=chosen: block.rank(text, nothing, chosen, RECALL_AT))
             times.append((seconds, cpu_seconds))
-            if word < 3 and chosen is None:
+            if word < 3 and chosen is everything:
                 evidence = rows @ block.direction(text)  # all judged alike here: the most evidence is the best
-                assert set(found.rows[:1]) <= set(np.argsort(-evidence)[:RECALL_AT])
+                assert set(found[0][:1]) <= set(np.argsort(-evidence)[:RECALL_AT])
         least, middle = np.min(times, axis=0), np.median(times, axis=0)
         print(
             f"{name}, {len(rows):,} x {rows.shape[1]}: least {least[0]:.3f} s, median {middle[0]:.3f} s, "
@@ -187,22 +186,23 @@ def write_atlas(path: Path, descriptors: int, instances: int, encoder: MadeEncod
     with Atlas.writing(path) as atlas:
         atlas.set_root(path.parent)
         words = atlas.add_words(encoder.words.names, encoder.words.vectors)
-        for number, arrays in enumerate(made_scenes(descriptors, instances, encoder)):
-            facts = (f"{number}", 0, 0, SPACE, arrays.descriptors.shape[1], 20 * instances, instances, words, None)
-            atlas.add(SceneEntry(0, f"s{number:06d}", *facts), arrays)
+        for number, (table, boxes) in enumerate(made_scenes(descriptors, instances, encoder)):
+            width = table.descriptors.shape[1]
+            atlas.add(SceneEntry(0, f"s{number:06d}", f"{number}", SPACE, width=width, vocabulary=words), table, boxes)
         settle(atlas)
 
 
-def made_scenes(descriptors: int, instances: int, encoder: MadeEncoder) -> Iterator[SceneArrays]:
-    """Scenes of so many instances, one descriptor each."""
+def made_scenes(
+    descriptors: int, instances: int, encoder: MadeEncoder
+) -> Iterator[tuple[og.InstanceTable, NDArray[np.float64]]]:
+    """Scenes of so many instances, one descriptor each, and the corners of their boxes."""
+    twenty, ratios = np.full(instances, 20, np.int32), np.full(instances, 0.9, np.float32)
     for _ in range(descriptors // instances):
-        rows = np.zeros(instances, INSTANCE)
-        corner = np.append(encoder.rng.random(2) * 990, 0)
-        rows["low"] = corner + encoder.rng.random((instances, 3)) * [10, 10, 3]
-        rows["high"] = rows["low"] + 0.3
-        rows["centroid"], rows["points"], rows["part_of"] = rows["low"] + 0.15, 20, -1
+        low = np.append(encoder.rng.random(2) * 990, 0) + encoder.rng.random((instances, 3)) * [10, 10, 3]
         vectors = encoder.descriptors(encoder.rng.integers(0, WORDS, instances))
-        yield SceneArrays(rows, np.arange(instances, dtype=np.int32), vectors)
+        owner = np.arange(instances, dtype=np.int32)
+        table = og.InstanceTable(vectors, owner, twenty, twenty, twenty, ratios, ratios)
+        yield table, np.stack([low, low + 0.3], axis=1)
 
 
 def lance(path: Path, folder: Path, words: list[str], half: Any, reference: dict[str, Any]) -> list[Any]:

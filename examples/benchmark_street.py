@@ -18,8 +18,8 @@ from pathlib import Path
 import numpy as np
 
 from og_pointcloud.cloud import LabelledCloud
-from og_pointcloud.collection.fit_many import peak_memory
 from og_pointcloud.fitting.fit import fit
+from og_pointcloud.fitting.memory import peak_memory
 from og_pointcloud.settings import FitSettings
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))

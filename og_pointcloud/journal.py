@@ -7,11 +7,12 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from enum import Enum
+from importlib.util import find_spec
 from typing import Any, TypeVar
 
 from og_pointcloud.settings import FitSettings
 
-__all__ = ["Journal", "LeftOut", "left_out_entry"]
+__all__ = ["Journal", "LeftOut", "left_out_entry", "with_bar"]
 
 Item = TypeVar("Item")
 _SHARES = "they agree with {learned:.0%} of the masks' area, those from grouping with {grouped:.0%}"
@@ -90,6 +91,16 @@ def left_out_entry(key: LeftOut, **numbers: Any) -> dict[str, Any]:
     return {"key": key.key, "what": key.what.format(**numbers), "why": key.why.format(**numbers), **numbers}
 
 
+def with_bar(items: Iterable[Item], name: str, total: int, shown: bool) -> Iterable[Item]:
+    """The items, with a bar of the remaining time where stderr is a terminal and tqdm is installed: not all that takes
+    long needs more than numpy."""
+    if not shown or find_spec("tqdm") is None:
+        return items
+    from tqdm import tqdm
+
+    return tqdm(items, desc=f"{name:<12}", total=total, leave=False, dynamic_ncols=True, disable=None)
+
+
 @dataclass
 class Journal:
     """What a fit did: seconds per stage, what it left out and why, warnings, notes. Becomes the cloud's provenance.
@@ -117,11 +128,7 @@ class Journal:
 
     def steps(self, items: Sequence[Item], name: str) -> Iterable[Item]:
         """The items, with a progress bar."""
-        if not self.progress:
-            return items
-        from tqdm import tqdm
-
-        return tqdm(items, desc=f"{name:<12}", leave=False, dynamic_ncols=True, disable=None)
+        return with_bar(items, name, len(items), self.progress)
 
     @contextmanager
     def bars(self) -> Iterator[Callable[[str, int, int, float], None] | None]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import sqlite3
 from dataclasses import replace
 from pathlib import Path
@@ -15,10 +16,10 @@ from labelled_clouds import instance_table, unit_rows
 import og_pointcloud as og
 from og_pointcloud.cli import main
 from og_pointcloud.cloud import LabelledCloud, Vocabulary, WordBank
-from og_pointcloud.collection.findings_page import picture, png_bytes
 from og_pointcloud.collection.index import index
 from og_pointcloud.collection.store import Atlas
-from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError
+from og_pointcloud.errors import OgPointcloudError
+from og_pointcloud.show.findings_page import picture, png_bytes
 
 WIDTH = 32
 THINGS = ("chair", "desk", "lamp", "mug", "plant", "sofa", "bed", "rug")
@@ -60,30 +61,36 @@ def many(count: int, **options) -> dict[str, LabelledCloud]:
     return {f"site{k % 3}/room{k:02d}": scene(things[k], k, **options) for k in range(count)}
 
 
-@pytest.mark.parametrize("word", THINGS)
-def test_scores_are_those_of_each_scene_alone(folder, word):
-    clouds = many(12, bank=BANK, noise=0.6, common=0.3)
-    found = indexed(folder, clouds).find(word, top=10_000)
-    assert len(found) == sum(len(cloud.instances) for cloud in clouds.values())
-    by_key = {(finding.scene, finding.instance): finding for finding in found}
-    for name, cloud in clouds.items():
-        for match in og.select(cloud, word, against=[]):
-            finding = by_key[name, match.instance]
-            assert finding.score == pytest.approx(match.score, abs=2e-4)
-            assert (finding.calibrated, finding.points) == (True, 4)
-    scores = [finding.score for finding in found]
-    assert scores == sorted(scores, reverse=True)
+@pytest.fixture(scope="module")
+def judged(tmp_path_factory) -> tuple[dict[str, LabelledCloud], og.Collection]:
+    """Scenes of one bank, and their collection. Nobody changes it."""
+    clouds = many(12, bank=BANK, noise=0.7, common=0.3)
+    return clouds, indexed(tmp_path_factory.mktemp("judged") / "scans", clouds)
+
+
+def test_scores_are_those_of_each_scene_alone(judged):
+    clouds, collection = judged
+    for word in THINGS:
+        found = collection.find(word, top=10_000)
+        assert len(found) == sum(len(cloud.instances) for cloud in clouds.values())
+        by_key = {(finding.scene, finding.instance): finding for finding in found}
+        for name, cloud in clouds.items():
+            for match in og.select(cloud, word, against=[]):
+                finding = by_key[name, match.instance]
+                assert finding.score == pytest.approx(match.score, abs=2e-4)
+                assert (finding.calibrated, finding.points) == (True, 4)
+        scores = [finding.score for finding in found]
+        assert scores == sorted(scores, reverse=True)
 
 
 @pytest.mark.parametrize("top", [1, 3, 40])
-def test_the_best_are_found_without_scoring_all(folder, top, monkeypatch):
+def test_the_best_are_found_without_scoring_all(judged, top, monkeypatch):
     monkeypatch.setattr("og_pointcloud.collection.scoring.FIRST", 1)
-    collection = indexed(folder, many(40, bank=BANK, noise=0.8, common=0.3))
+    _, collection = judged
     for word in THINGS:
-        everything = collection.find(word, top=10_000)
-        some = collection.find(word, top=top)
+        everything, some = (collection.find(word, top=count) for count in (10_000, top))
         assert [(f.scene, f.instance) for f in some] == [(f.scene, f.instance) for f in everything[:top]]
-        assert [f.score for f in some] == pytest.approx([f.score for f in everything[:top]])
+        assert [f.score for f in some] == pytest.approx([f.score for f in everything[:top]], rel=1e-4)
 
 
 def test_the_room_with_the_thing_comes_first(folder):
@@ -129,7 +136,7 @@ def test_a_word_is_never_asked_in_the_space_of_another_encoder(folder):
     assert len(found.not_asked) == 3
     found = collection.find("chair", top=100)
     assert {finding.scene for finding in found} == {"ours", "same name"}
-    best = {finding.scene: finding.instance for finding in reversed(found.found)}
+    best = {finding.scene: finding.instance for finding in reversed(found)}
     assert best == {"ours": 0, "same name": 1}
 
 
@@ -140,20 +147,17 @@ def test_scenes_without_words_are_asked_in_those_of_their_kin(folder):
         collection.find("chairs")
 
 
-def test_vectors_are_asked_where_only_one_encoder_can_be_meant(folder):
+def test_vectors_are_asked_of_the_scenes_of_their_encoder(folder):
     clouds = {"a": scene(["desk"]), "b": scene(["chair"], space="another/encoder")}
     collection = indexed(folder, clouds)
-    with pytest.raises(FeatureSpaceError, match="2 kinds of scenes"):
-        collection.find({"seat": ENCODER["chair"]})
-    assert [f.scene for f in collection.find({"seat": ENCODER["chair"]}, scenes="b")] == ["b"]
     features = (Vocabulary(("seat",), ENCODER["chair"][None]), "another/encoder")
     assert {f.scene for f in collection.find("seat", text_features=features)} == {"b"}
-    with pytest.raises(FeatureSpaceError):
-        collection.find({"seat": np.ones(5)})
+    with pytest.raises(OgPointcloudError, match="'seat' is not among the 8 words"):
+        collection.find("seat", text_features=(Vocabulary(("seat",), np.ones((1, 5), np.float32)), "another/encoder"))
 
 
 def test_box_and_scenes_restrict(folder):
-    clouds = {f"room{k}": scene(THINGS[:5], k, at=10.0 * k) for k in range(6)}
+    clouds = {f"room{k}": scene(THINGS[:5], k, at=10.0 * k) for k in range(5)}
     collection = indexed(folder, clouds)
     everything = collection.find("lamp", top=100)
     low, high = np.array([9.5, -1, -1]), np.array([22.5, 1, 1])
@@ -182,7 +186,7 @@ def test_places_are_those_of_the_instances(folder):
 
 
 def test_only_what_changed_is_read_again(folder, monkeypatch):
-    collection = indexed(folder, many(6))
+    collection = indexed(folder, many(4))
     names = collection.scenes
     assert collection.changes is not None
     assert collection.changes.added == names
@@ -200,10 +204,10 @@ def test_only_what_changed_is_read_again(folder, monkeypatch):
     assert sorted(read) == sorted([Path(names[1]).name, Path(names[3]).name, "new"])
     assert (changes.added, changes.replaced, changes.removed) == (("new",), (names[1],), (names[0],))
     assert [name for name, _ in changes.left_out] == [names[3]]
-    assert changes.unchanged == 3
+    assert changes.unchanged == 1
     fresh = og.Collection.index(folder, folder.parent / "other", progress=False)
     again = og.Collection(folder.parent / "atlas")
-    assert set(again.scenes) == {names[1], names[2], names[4], names[5], "new"}
+    assert set(again.scenes) == {names[1], names[2], "new"}
     for word in THINGS:
         assert again.find(word, top=100).to_json() == fresh.find(word, top=100).to_json()
 
@@ -221,15 +225,6 @@ def test_a_change_that_fails_leaves_the_atlas_as_it_was(folder, monkeypatch):
     assert not (folder.parent / "new atlas").exists()
     assert (folder.parent / "atlas").read_bytes() == content
     assert og.Collection(folder.parent / "atlas").find("chair", top=100).to_json() == before
-
-
-def test_files_are_read_side_by_side(folder):
-    from concurrent.futures import ThreadPoolExecutor
-
-    first = indexed(folder, many(5, bank=BANK))
-    with ThreadPoolExecutor(3) as executor:
-        second = og.Collection.index(folder, folder.parent / "other", executor=executor, progress=False)
-    assert first.find("mug", top=99).to_json() == second.find("mug", top=99).to_json()
 
 
 def test_tough_scenes(folder):
@@ -252,21 +247,20 @@ def test_tough_scenes(folder):
         ("PRAGMA user_version = 9", "version"),
         ("PRAGMA application_id = 0", "version"),
         ("UPDATE judgements SET judge = (SELECT vocabulary FROM scenes)", "at least 50"),
-        ("UPDATE scenes SET width = -1", "wrong kind"),
-        ("UPDATE scenes SET name = x'ff'", "wrong kind"),
+        ("UPDATE scenes SET name = x'ff' WHERE id = 1", "UTF-8"),
         ("UPDATE scenes SET descriptors = zeroblob(7)", "buffer|reshape"),
-        ("UPDATE scenes SET instances = zeroblob(0)", "belong to no instances"),
-        ("UPDATE scenes SET owner = randomblob(length(owner))", "belong to no instances"),
-        ("UPDATE words SET names = '[1, 2]'", "no names"),
+        ("UPDATE scenes SET instances = zeroblob(0)", "must ascend within"),
+        ("UPDATE scenes SET owner = randomblob(length(owner))", "must ascend within"),
+        ("UPDATE words SET names = '[1, 2]'", "reshape"),
         ("UPDATE words SET vectors = 5", "buffer|bytes-like"),
         ("UPDATE words SET width = 1e300", "."),
-        ("UPDATE judgements SET sharpness = 'x'", "sharpness"),
+        ("UPDATE judgements SET sharpness = 'x'", "judgement of 'a'"),
         ("UPDATE judgements SET standard = CAST(x'0000c07f' || substr(standard, 5) AS BLOB)", "NaN"),
     ],
 )
-def test_hostile_atlases_are_refused(folder, change, cause):
-    indexed(folder, {"a": scene(["chair", "desk"], bank=BANK)})
-    path = folder.parent / "atlas"
+def test_hostile_atlases_are_refused(judged, tmp_path, change, cause):
+    path = tmp_path / "atlas"
+    shutil.copy(judged[1].path, path)
     with sqlite3.connect(path) as connection:
         connection.execute(change)
     connection.close()
@@ -275,10 +269,8 @@ def test_hostile_atlases_are_refused(folder, change, cause):
     assert str(caught.value).startswith(f"{path} is no atlas that can be used")
 
 
-def test_damaged_bytes_are_refused_or_answered(folder):
-    indexed(folder, many(5, bank=BANK))
-    path = folder.parent / "atlas"
-    content, random = path.read_bytes(), np.random.default_rng(0)
+def test_damaged_bytes_are_refused_or_answered(judged, tmp_path):
+    path, content, random = tmp_path / "atlas", judged[1].path.read_bytes(), np.random.default_rng(0)
     refused = 0
     for _ in range(60):
         damaged = np.frombuffer(content, np.uint8).copy()
@@ -354,9 +346,10 @@ def test_pictures_show_the_thing(tmp_path):
     np.testing.assert_array_equal(cv2.imdecode(np.frombuffer(png_bytes(image), np.uint8), 1)[..., ::-1], image)
 
 
+@pytest.mark.slow
 def test_lance_proposes_what_the_exact_search_finds(folder, tmp_path, capsys):
     pytest.importorskip("lancedb", reason="needs the extra 'lance': lancedb")
-    clouds = many(30, bank=BANK, noise=0.5) | {"cosines": scene(["bed", "rug"], 8, space="another/encoder")}
+    clouds = many(9, bank=BANK, noise=0.5) | {"cosines": scene(["bed", "rug"], 8, space="another/encoder")}
     exact = indexed(folder, clouds)
     uri, atlas = str(tmp_path / "lance"), str(folder.parent / "atlas")
     assert main(["index", str(folder), "-o", atlas, "--lance", uri]) == 0

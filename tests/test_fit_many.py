@@ -9,6 +9,8 @@ import signal
 import threading
 import time
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
 
@@ -19,9 +21,8 @@ from scenes import write_tiny_capture
 import og_pointcloud as og
 from og_pointcloud.cli import main
 from og_pointcloud.collection import fit_many as module
-from og_pointcloud.collection.workers import LocalWorkers, dask_executor
 from og_pointcloud.errors import MissingExtraError, OgPointcloudError
-from og_pointcloud.fitting.tasks import Share, share_here
+from og_pointcloud.fitting.tasks import LocalWorkers, Share, dask_executor, share_here
 
 
 class Inline(Executor):
@@ -119,34 +120,42 @@ def test_two_captures_of_one_name_are_refused(captures, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-def die_once(marker: str) -> int:
-    """Kills its process the first time."""
-    if not Path(marker).exists():
-        Path(marker).touch()
-        os.kill(os.getpid(), signal.SIGKILL)
-    return os.getpid()
-
-
 def die(_: object) -> None:
     os.kill(os.getpid(), signal.SIGKILL)
 
 
 @pytest.mark.slow
-def test_a_process_that_dies_is_replaced_and_its_task_tried_once_more(tmp_path):
-    workers = LocalWorkers(4)
-    once = workers.submit(die_once, str(tmp_path / "marker"))
-    never = workers.submit(die, 0)
+def test_a_process_that_dies_fails_its_task_alone():
+    workers = LocalWorkers(2)
+    dead = workers.submit(die, 0)
     well = [workers.submit(abs, -k) for k in range(5)]
-    assert once.result() != os.getpid()
     assert [future.result() for future in well] == list(range(5))
-    with pytest.raises(Exception, match="terminated abruptly"):
-        never.result()
+    with pytest.raises(BrokenProcessPool, match="terminated abruptly"):
+        dead.result()
     workers.shutdown()
-    lost: Future = Future()
-    lost.set_exception(never.exception())
-    fit = module._outcome(lost, tmp_path / "a", tmp_path / "a.ogpc")
-    assert fit.state == "failed"
-    assert "worker died" in fit.cause
+
+
+class Deadly(Inline):
+    """The worker that gets a capture dies, so many times."""
+
+    def __init__(self, name: str, times: int) -> None:
+        self.name, self.left = name, times
+
+    def submit(self, fn, /, *args, **kwargs):
+        if self.left and self.name in str(args[0]):
+            self.left -= 1
+            lost: Future = Future()
+            lost.set_exception(BrokenProcessPool("A process was terminated abruptly"))
+            return lost
+        return super().submit(fn, *args, **kwargs)
+
+
+@pytest.mark.parametrize(("times", "state"), [(1, "fitted"), (2, "failed")])
+def test_a_fit_whose_worker_dies_is_tried_once_more(captures, tmp_path, times, state):
+    workers = Deadly("capture4", times)
+    fits = og.fit_many(captures[:2], tmp_path, workers, progress=False)
+    assert ([fit.state for fit in fits], workers.left) == (["fitted", state], 0)
+    assert ("its worker died (BrokenProcessPool" in fits[1].cause) == (state == "failed")
 
 
 def test_shares():
@@ -159,7 +168,7 @@ def test_shares():
 
 
 def test_command(captures, one_by_one, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(module, "LocalWorkers", lambda tasks: _Here())
+    monkeypatch.setattr(module, "LocalWorkers", lambda tasks: nullcontext(Inline()))
     out, report = tmp_path / "out", tmp_path / "report.json"
     broken = tmp_path / "broken"
     broken.mkdir()
@@ -177,16 +186,12 @@ def test_command(captures, one_by_one, tmp_path, capsys, monkeypatch):
     assert main(["fit", str(captures[0]), "--out", str(out), "--work", str(tmp_path / "x.work")]) == 2
 
 
-class _Here(Inline):
-    share = Share()
-
-
 def test_a_cluster_that_is_not_there(monkeypatch):
     if not _has_dask():
         with pytest.raises(MissingExtraError, match="cluster"), dask_executor("tcp://127.0.0.1:1"):
             pass
         return
-    monkeypatch.setattr("og_pointcloud.collection.workers.PATIENCE_S", 0.5)
+    monkeypatch.setattr("og_pointcloud.fitting.tasks.PATIENCE_S", 0.5)
     with pytest.raises(OgPointcloudError, match="no scheduler answers"), dask_executor("tcp://127.0.0.1:1"):
         pass
 

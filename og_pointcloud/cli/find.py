@@ -34,7 +34,7 @@ def add(parser: Parser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     from og_pointcloud.collection.collection import Collection
-    from og_pointcloud.collection.findings_page import write_findings
+    from og_pointcloud.show.findings_page import write_findings
 
     check_at_least("--top", arguments.top, 1)
     corners = None if arguments.within is None else numbers(arguments.within, "--within", 6)

@@ -10,7 +10,7 @@ import argparse
 import shlex
 import sys
 from contextlib import nullcontext
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args, get_type_hints
 
@@ -99,7 +99,7 @@ def run(arguments: argparse.Namespace) -> None:
     if arguments.rerun:
         rerun_file()  # before the work, if it is missing
     from og_pointcloud.collection.fit_many import FitOptions
-    from og_pointcloud.collection.workers import dask_executor
+    from og_pointcloud.fitting.tasks import dask_executor
 
     options = FitOptions(settings, arguments.gaussians, arguments.mask_level, arguments.vocabulary, arguments.word_bank)
     with dask_executor(arguments.scheduler) if arguments.scheduler else nullcontext() as executor:
@@ -133,7 +133,7 @@ def fit_several(arguments: argparse.Namespace, options: FitOptions, executor: Ex
 
     fits = fit_many(arguments.capture, arguments.out, executor, options=options)
     if arguments.json:
-        write_json(arguments.json, {"fits": [fit.to_dict() for fit in fits]})
+        write_json(arguments.json, {"fits": [asdict(fit) for fit in fits]})
     if made := [fit for fit in fits if fit.state == "fitted"]:
         rows = [(fit.name, f"{fit.points:,}", str(fit.instances), f"{fit.seconds:.1f}") for fit in made]
         print_table(("capture", "points", "instances", "seconds"), rows)

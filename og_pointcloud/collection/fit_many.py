@@ -5,10 +5,10 @@ from __future__ import annotations
 import os
 import socket
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import Executor, Future, as_completed
-from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, replace
+from contextlib import nullcontext
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,17 +17,19 @@ from og_pointcloud.bundle.read import read_bundle
 from og_pointcloud.bundle.vocabulary import scene_words
 from og_pointcloud.checking.check import check_words, with_checks
 from og_pointcloud.cloud import FeatureSpace, LabelledCloud
-from og_pointcloud.collection.progress import counted
-from og_pointcloud.collection.workers import LocalWorkers
 from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.fitting.fit import fit
-from og_pointcloud.fitting.tasks import Share, share_here
+from og_pointcloud.fitting.memory import peak_memory
+from og_pointcloud.fitting.tasks import LocalWorkers, Share, share_here
 from og_pointcloud.formats.capture import read_capture
-from og_pointcloud.journal import LeftOut
+from og_pointcloud.journal import LeftOut, with_bar
 from og_pointcloud.kernels import use_threads
 from og_pointcloud.settings import FitSettings
 
 __all__ = ["CaptureFit", "FitOptions", "fit_capture", "fit_many"]
+
+LOST = "lost"
+"""The worker of a fit that no worker brought to an end."""
 
 
 @dataclass(frozen=True)
@@ -48,8 +50,8 @@ class FitOptions:
 @dataclass(frozen=True)
 class CaptureFit:
     """What became of a capture. state: "fitted", "was there" (its file is whole already) or "failed", then with the
-    cause. worker: where, as host:process. peak_bytes: the most memory that this process has held, 0 if unknown. doubts:
-    names of the checks that failed (the file's provenance says why).
+    cause. worker: where, as host:process, or "lost". peak_bytes: the most memory that this process has held, 0 if
+    unknown. doubts: names of the checks that failed (the file's provenance says why).
 
     >>> og.CaptureFit("scans/kitchen", "fitted/kitchen.ogpc", "was there").name
     'kitchen'
@@ -70,10 +72,6 @@ class CaptureFit:
     def name(self) -> str:
         """Of the capture: the last part of its path."""
         return Path(self.capture).name
-
-    def to_dict(self) -> dict[str, Any]:
-        """JSON-able."""
-        return asdict(self)
 
 
 def fit_many(
@@ -100,18 +98,44 @@ def fit_many(
     """
     options, out = options or FitOptions(), Path(out).resolve()
     jobs = _outputs([Path(capture).resolve() for capture in captures], out)
-    done = {
+    fits = {
         capture: CaptureFit(str(capture), str(path), "was there") for capture, path in jobs.items() if _is_whole(path)
     }
-    todo = {capture: path for capture, path in jobs.items() if capture not in done}
+    todo = {capture: path for capture, path in jobs.items() if capture not in fits}
     if todo:
         out.mkdir(parents=True, exist_ok=True)
-        with _executor(executor, len(todo)) as (workers, share):
-            futures = {workers.submit(_try_fit, str(c), str(path), options, share): c for c, path in todo.items()}
-            for future in counted(as_completed(futures), "fit", len(futures), progress):
-                capture = futures[future]
-                done[capture] = _outcome(future, capture, todo[capture])
-    return tuple(done[capture] for capture in jobs)
+        with LocalWorkers(len(todo)) if executor is None else nullcontext(executor) as workers:
+            fits |= _fit_all(workers, todo, options, progress)
+    return tuple(fits[capture] for capture in jobs)
+
+
+def _fit_all(
+    workers: Executor, todo: Mapping[Path, Path], options: FitOptions, progress: bool
+) -> dict[Path, CaptureFit]:
+    """Fit captures to their files. Those whose workers die are tried once more at the end, when there is more room."""
+    at_once = getattr(workers, "_max_workers", None)  # of pools of the standard library, and those made like them
+    share = Share() if at_once is None else Share.of_machine(at_once)
+    fits: dict[Path, CaptureFit] = {}
+    for attempt in ("fit", "fit again"):
+        left = [capture for capture in todo if capture not in fits or fits[capture].worker == LOST]
+        futures = {
+            workers.submit(_try_fit, str(capture), str(todo[capture]), options, share): capture for capture in left
+        }
+        try:
+            for future in with_bar(as_completed(futures), attempt, len(futures), progress and len(futures) > 0):
+                fits[futures[future]] = _outcome(future, futures[future], todo[futures[future]])
+        finally:
+            for future in futures:  # on an interrupt, those that have not begun
+                future.cancel()
+    return fits
+
+
+def _outcome(future: Future[CaptureFit], capture: Path, output: Path) -> CaptureFit:
+    try:
+        return future.result()
+    except Exception as error:  # of the executor: a task's own are in what it returns
+        cause = f"its worker died ({type(error).__name__}: {error!s:.160}); out of memory, or killed?"
+        return CaptureFit(str(capture), str(output), "failed", cause, worker=LOST)
 
 
 def _outputs(captures: Sequence[Path], out: Path) -> dict[Path, Path]:
@@ -134,45 +158,20 @@ def _is_whole(path: Path) -> bool:
     return True
 
 
-@contextmanager
-def _executor(given: Executor | None, tasks: int):  # noqa: ANN202
-    """The executor, and what each of its tasks may take."""
-    if given is not None:
-        at_once = getattr(given, "_max_workers", None)  # of pools of the standard library, and those made like them
-        yield given, Share() if at_once is None else Share.of_machine(at_once)
-        return
-    own = LocalWorkers(tasks)
-    try:
-        yield own, own.share
-    except BaseException:
-        own.shutdown(cancel_futures=True)
-        raise
-    own.shutdown()
-
-
-def _outcome(future: Future[CaptureFit], capture: Path, output: Path) -> CaptureFit:
-    try:
-        return future.result()
-    except Exception as error:  # of the executor: a task's own are in what it returns
-        cause = f"its worker died ({type(error).__name__}: {error!s:.160}); out of memory, or killed?"
-        return CaptureFit(str(capture), str(output), "failed", cause)
-
-
 def _try_fit(capture: str, output: str, options: FitOptions, share: Share) -> CaptureFit:
     """The task: never raises, as not every error survives the way back from another process."""
     start, worker = time.perf_counter(), f"{socket.gethostname()}:{os.getpid()}"
     try:
         cloud = _fit(Path(capture), Path(output), options, share_here(share))
     except Exception as error:
-        cause = str(error) or type(error).__name__
-        if not isinstance(error, (OgPointcloudError, OSError, ImportError)):
-            cause = f"{type(error).__name__}: {cause}"
-        seconds = round(time.perf_counter() - start, 3)
-        return CaptureFit(capture, output, "failed", cause, seconds, worker=worker, peak_bytes=peak_memory())
-    seconds = round(time.perf_counter() - start, 3)
-    counts = len(cloud), len(cloud.instances)
-    doubts = tuple(check["name"] for check in cloud.provenance["checks"] if check["verdict"] == "doubt")
-    return CaptureFit(capture, output, "fitted", "", seconds, *counts, worker, peak_memory(), doubts)
+        expected = isinstance(error, (OgPointcloudError, OSError, ImportError))
+        cause = str(error) if expected and str(error) else f"{type(error).__name__}: {error}"
+        result = CaptureFit(capture, output, "failed", cause)
+    else:
+        doubts = tuple(check["name"] for check in cloud.provenance["checks"] if check["verdict"] == "doubt")
+        counts = {"points": len(cloud), "instances": len(cloud.instances)}
+        result = CaptureFit(capture, output, "fitted", doubts=doubts, **counts)
+    return replace(result, seconds=round(time.perf_counter() - start, 3), worker=worker, peak_bytes=peak_memory())
 
 
 def _fit(capture: Path, output: Path, options: FitOptions, share: Share) -> LabelledCloud:
@@ -207,15 +206,6 @@ def _without_circumstances(provenance: dict[str, Any], settings: FitSettings) ->
         **provenance,
         "settings": {**provenance["settings"], "memory": settings.memory},
         "stages": [],
-        "left_out": [entry for entry in provenance["left_out"] if entry["key"] != LeftOut.RENDERING.value],
+        "left_out": [entry for entry in provenance["left_out"] if entry["key"] != LeftOut.RENDERING.key],
         "notes": {name: note for name, note in provenance["notes"].items() if name != "table"},
     }
-
-
-def peak_memory() -> int:
-    """The most memory that this process has held, in bytes; 0 where the system does not tell."""
-    try:
-        lines = Path("/proc/self/status").read_text().splitlines()
-        return next(1024 * int(line.split()[1]) for line in lines if line.startswith("VmHWM:"))
-    except (OSError, StopIteration):
-        return 0

@@ -9,15 +9,15 @@ anything of one that the exact search would not say.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud.collection.index import own_words
-from og_pointcloud.collection.scoring import block_key, load_block
-from og_pointcloud.collection.store import Atlas, SceneEntry
+from og_pointcloud.collection.index import families
+from og_pointcloud.collection.scoring import Block, load_block
+from og_pointcloud.collection.store import Atlas
 from og_pointcloud.errors import MissingExtraError, OgPointcloudError
 
 __all__ = ["LanceTables", "write_lance"]
@@ -41,47 +41,38 @@ def _database(uri: str) -> Any:
     return lancedb.connect(uri)
 
 
-def _table(key: tuple[Any, ...]) -> str:
-    kin, _, judge = key
-    return f"kin{kin}-{judge or 'cosine'}"
-
-
 def write_lance(atlas: str | os.PathLike[str], uri: str) -> None:
     """Write all that an atlas has to the database at a folder or URI (s3://...), in place of what is there."""
     import pyarrow as pa  # pyright: ignore[reportMissingImports]
 
     database = _database(uri)
     with Atlas.reading(atlas) as opened:
-        entries = [entry for entry in opened.entries() if entry.width]
-        words = own_words(opened, entries)
-        tables: dict[str, list[SceneEntry]] = {}
-        for entry in entries:
-            tables.setdefault(_table(block_key(entry, words)), []).append(entry)
-        for name, scenes in tables.items():
-            vector = pa.list_(pa.float16(), scenes[0].width + 1)
-            fields = [("scene", pa.int32()), ("instance", pa.int32()), ("x", pa.float64()), ("y", pa.float64())]
-            schema = pa.schema([*fields, ("z", pa.float64()), ("vector", vector)])
-            table = database.create_table(name, schema=schema, mode="overwrite")
-            for batch in _batches(opened, scenes, schema):  # a generator it would read in another thread
-                table.add(pa.Table.from_batches([batch]))
+        for group in (group for family in families(opened, opened.entries()) for group in family.groups()):
+            numbers = {"scene": pa.int64(), "instance": pa.int32()} | dict.fromkeys("xyz", pa.float64())
+            vector = pa.list_(pa.float16(), group.family.width + 1)
+            schema = pa.schema([*numbers.items(), ("vector", vector)])
+            table = database.create_table(group.name, schema=schema, mode="overwrite")
+            for start in range(0, len(group.entries), SCENES_AT_ONCE):  # a generator it would read in another thread
+                block = load_block(opened, group.entries[start : start + SCENES_AT_ONCE])
+                table.add(pa.Table.from_arrays(_columns(block), schema=schema))
             if (count := table.count_rows()) >= INDEXED_FROM:
                 partitions = max(8, count // ROWS_A_PARTITION)
                 table.create_index(metric="dot", index_type="IVF_SQ", num_partitions=partitions)
 
 
-def _batches(atlas: Atlas, scenes: Sequence[SceneEntry], schema: Any) -> Iterator[Any]:
+def _columns(block: Block) -> list[Any]:
     import pyarrow as pa  # pyright: ignore[reportMissingImports]
 
-    for start in range(0, len(scenes), SCENES_AT_ONCE):
-        some = scenes[start : start + SCENES_AT_ONCE]
-        block = load_block(atlas, some)
-        instance = np.repeat(np.arange(len(block)), np.diff(np.append(block.first, len(block.descriptors))))
-        ids = np.array([entry.id for entry in some], np.int32)
-        x, y, z = ((block.low + block.high) / 2)[instance].T
-        vectors = block.evidence_vectors().astype(np.float16)
-        rows = pa.FixedSizeListArray.from_arrays(pa.array(vectors.ravel()), vectors.shape[1])
-        columns = [ids[block.scene[instance]], block.instance[instance], x, y, z]
-        yield pa.record_batch([*map(pa.array, columns), rows], schema=schema)
+    instance = np.repeat(np.arange(len(block)), np.diff(block.first, append=len(block.vectors)))
+    ids = np.array([entry.id for entry in block.entries], np.int64)
+    vectors = np.column_stack([block.vectors, block.shift]).astype(np.float16)
+    rows = pa.FixedSizeListArray.from_arrays(pa.array(vectors.ravel()), vectors.shape[1])
+    numbers = [
+        ids[block.scene[instance]],
+        block.instance[instance].astype(np.int32),
+        *block.boxes.mean(axis=1)[instance].T,
+    ]
+    return [*map(pa.array, numbers), rows]
 
 
 class LanceTables:
@@ -92,31 +83,30 @@ class LanceTables:
 
     def propose(
         self,
-        key: tuple[Any, ...],
+        name: str,
         direction: NDArray[np.float32],
         box: NDArray[np.float64] | None,
-        scenes: Sequence[SceneEntry] | None,
+        scenes: Sequence[int] | None,
         top: int,
-    ) -> set[tuple[int, int]]:
-        """(scene id, instance) of descriptors with the most evidence for a direction (D,). key: as of `block_key`. box:
-        corners that hold the instances' middles. scenes: those that are asked; None for all."""
+    ) -> dict[int, set[int]]:
+        """Scene id -> instances with the descriptors of most evidence for a direction (D,). name: of the group. box:
+        (2, 3) corners that hold the instances' middles. scenes: ids of those that are asked; None for all."""
         try:
-            table = self._database.open_table(_table(key))
+            table = self._database.open_table(name)
         except (ValueError, FileNotFoundError) as error:
             raise OgPointcloudError(
                 f"'{self._uri}' has no table for these scenes ({error!s:.80}): the atlas has changed since; write it "
                 "again with og-pointcloud index --lance"
             ) from None
         query = table.search(np.append(direction, np.float32(1)), vector_column_name="vector").distance_type("dot")
-        query = (
-            query.nprobes(PROBES).refine_factor(REFINE).select(["scene", "instance", "_distance"]).limit(PROPOSED * top)
-        )
-        conditions = []
+        query = query.nprobes(PROBES).refine_factor(REFINE).limit(PROPOSED * top)
+        conditions = [] if scenes is None else [f"scene IN ({', '.join(map(str, scenes))})"]
         if box is not None:
-            conditions += [f"{axis} >= {low!r} AND {axis} <= {high!r}" for axis, low, high in zip("xyz", *box.tolist())]  # noqa: B905
-        if scenes is not None:
-            conditions.append(f"scene IN ({', '.join(str(entry.id) for entry in scenes)})")
+            corners = zip("xyz", *box.tolist(), strict=True)
+            conditions += [f"{axis} BETWEEN {low!r} AND {high!r}" for axis, low, high in corners]
         if conditions:
             query = query.where(" AND ".join(conditions), prefilter=True)
-        rows = query.to_arrow()
-        return set(zip(rows["scene"].to_pylist(), rows["instance"].to_pylist(), strict=True))
+        rows, found = query.select(["scene", "instance", "_distance"]).to_arrow(), {}
+        for scene, instance in zip(rows["scene"].to_pylist(), rows["instance"].to_pylist(), strict=True):
+            found.setdefault(scene, set()).add(instance)
+        return found

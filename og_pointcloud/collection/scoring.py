@@ -8,246 +8,151 @@ reach the places that are asked for.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
-from itertools import pairwise
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud.cloud import Vocabulary, WordBank, unit_rows
+from og_pointcloud.ask.choosing import Standard
+from og_pointcloud.cloud import WordBank, unit_rows
 from og_pointcloud.collection.store import Atlas, SceneEntry
 from og_pointcloud.settings import ChoosingSettings
 
-__all__ = ["Block", "Ranked", "block_key", "load_block"]
+__all__ = ["Block", "load_block", "share"]
 
 RELEVANCY_TEMPERATURE = 10.0
 """Factor of the cosines in LERF's relevancy (Kerr et al., Language Embedded Radiance Fields, ICCV 2023, Sec. 3.4):
 of its released code, the paper gives none."""
-
 ROWS_AT_ONCE = 512
 """Descriptors that are put together before a product: so many stay in a core's cache."""
-LEAST_RUN = 16
-"""Mean length of runs of descriptors from which each run has a product of its own."""
 FIRST = 256
-"""Instances scored to the end at first; then twice as many, as long as it takes."""
-CERTAIN = 1e-12
-"""Distance from 0 and 1 at which a cosine's logit is cut off."""
-
-
-@dataclass(frozen=True)
-class Ranked:
-    """rows: (n,) instances of a block, best first. key: (n,) float64, what they are ranked by, the same for all
-    blocks: the logit of the score. score: (n,) float64."""
-
-    rows: NDArray[np.intp]
-    key: NDArray[np.float64]
-    score: NDArray[np.float64]
-
-    def rows_with_scores(self) -> list[tuple[int, float, float]]:
-        """(row, key, score), best first."""
-        return list(zip(self.rows.tolist(), self.key.tolist(), self.score.tolist(), strict=True))
+"""Instances scored to the end at first; then four times as many, as long as it takes."""
 
 
 @dataclass(frozen=True)
 class Block:
-    """Scenes that are asked alike: of one kin, with one vocabulary and one judge. Only instances with a descriptor.
+    """Scenes that are asked alike: of one kin, with one vocabulary and one judge. Of I instances, those with a point
+    and a descriptor; a scene's lie side by side.
 
-    entries: S scenes. descriptors: (R, D) float32. first: (I,) the first descriptor of each instance. scene, instance:
-    (I,) row of entries, and id in the scene. points: (I,). low, high: (I, 3) float64, corners of the box.
-    bank: the judge; None for none, then the following are empty. common: (S, D). scale, shift: (R,). sharpness: (S,).
+    vectors: (R, D) float32, shift: (R,) float32; their product with a `direction`, plus the shift, is the evidence of a
+    descriptor in standard deviations of the judge's words; without a judge the cosine. first: (I,) where each
+    instance's descriptors begin. scene, instance: (I,) row of ``entries``, and id in the scene. points: (I,). boxes:
+    (I, 2, 3) low and high corners. bank: the judge, None for none. sharpness: (S,) float64 of the scenes
+    (`choosing.Standard`), 0 without a judge.
     """
 
     entries: tuple[SceneEntry, ...]
-    descriptors: NDArray[np.float32]
+    vectors: NDArray[np.float32]
+    shift: NDArray[np.float32]
     first: NDArray[np.intp]
     scene: NDArray[np.int32]
     instance: NDArray[np.int32]
     points: NDArray[np.int32]
-    low: NDArray[np.float64]
-    high: NDArray[np.float64]
+    boxes: NDArray[np.float64]
     bank: WordBank | None
-    common: NDArray[np.float32]
-    scale: NDArray[np.float32]
-    shift: NDArray[np.float32]
-    sharpness: NDArray[np.float32]
+    sharpness: NDArray[np.float64]
 
     def __len__(self) -> int:
         return len(self.instance)
 
-    @cached_property
-    def _end(self) -> NDArray[np.intp]:
-        return np.append(self.first, len(self.descriptors))
-
     def direction(self, text: NDArray[np.float32]) -> NDArray[np.float32]:
-        """(D,) of a text (D,): the unit vector whose products with the descriptors say how it fits."""
-        unit = unit_rows(text) if self.bank is None else unit_rows(unit_rows(text) - self.bank.mean)
-        return unit.astype(np.float32)
+        """(D,) unit vector of a text (D,) whose products with the vectors say how it fits."""
+        return unit_rows(text if self.bank is None else unit_rows(text) - self.bank.mean).astype(np.float32)
 
-    def evidence_vectors(self) -> NDArray[np.float32]:
-        """(R, D + 1): their inner product with (direction, 1) is the evidence of each descriptor, without judge the
-        cosine."""
-        if self.bank is None:
-            return np.pad(self.descriptors, ((0, 0), (0, 1)))
-        of_row = np.repeat(self.scene, np.diff(self._end))
-        scaled = self.scale[:, None] * (self.descriptors - self.common[of_row])
-        return np.column_stack([scaled, self.shift]).astype(np.float32)
+    def evidence(self, rows: NDArray[np.intp], directions: NDArray[np.float32]) -> NDArray[np.float32]:
+        """(n, L) of these instances for directions (L, D): of several descriptors the best."""
+        count = np.diff(self.first, append=len(self.vectors))[rows]
+        begin = np.cumsum(count) - count
+        if len(rows) == len(self):
+            scores = self.vectors @ directions.T + self.shift[:, None]
+        else:
+            where = np.arange(count.sum()) + np.repeat(self.first[rows] - begin, count)
+            scores = np.empty((len(where), len(directions)), np.float32)
+            for start in range(0, len(where), ROWS_AT_ONCE):
+                some = where[start : start + ROWS_AT_ONCE]
+                scores[start : start + ROWS_AT_ONCE] = self.vectors[some] @ directions.T + self.shift[some, None]
+        return np.maximum.reduceat(scores, begin, axis=0) if len(rows) else scores
 
     def rank(
-        self,
-        text: NDArray[np.float32],
-        rivals: NDArray[np.float32],
-        chosen: NDArray[np.bool_] | None,
-        top: int,
-    ) -> Ranked:
-        """The best ``top`` of the chosen instances (None: of all) for a text (D,), of equals the first.
+        self, text: NDArray[np.float32], rivals: NDArray[np.float32], rows: NDArray[np.intp], top: int
+    ) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+        """The best ``top`` of these instances for a text (D,), of equals the first, and the logit of their scores.
 
         With a judge the score is the probability that the instance is what the text says, as `og.select` has it
-        against no other word. Without, against rivals (M, D), LERF's relevancy; without those the cosine.
+        against no other word. Without, it is LERF's relevancy against rivals (M, D), unit rows.
         """
-        has_points = self.points > 0
-        rows = np.flatnonzero(has_points if chosen is None else has_points & chosen)
-        if self.bank is not None:
-            rows, key = self._most_probable(rows, text, top)
-        else:
-            key = self._uncalibrated(rows, text, rivals)
-        order = np.argsort(-key, kind="stable")[:top]
-        rows, key = rows[order], key[order]
-        if self.bank is None and not len(rivals):
-            return Ranked(rows, _logit(key), key)
-        return Ranked(rows, key, _share(key))
-
-    def _uncalibrated(
-        self, rows: NDArray[np.intp], text: NDArray[np.float32], rivals: NDArray[np.float32]
-    ) -> NDArray[np.float64]:
-        cosine = self._best(rows, self._cosines(rows, self.direction(text)[None]))[:, 0].astype(np.float64)
-        if not len(rivals):
-            return cosine
-        rival = self._best(rows, self._cosines(rows, unit_rows(rivals))).max(axis=1)
-        return RELEVANCY_TEMPERATURE * (cosine - rival)
-
-    def _most_probable(
-        self, rows: NDArray[np.intp], text: NDArray[np.float32], top: int
-    ) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
-        """At least the best ``top`` of these instances, and the logit of their probability."""
-        assert self.bank is not None
-        settings = ChoosingSettings()
         direction = self.direction(text)[None]
-        bank = unit_rows(self.bank.vectors - self.bank.mean)
-        others = bank[(bank @ direction[0]) < settings.synonym]
-        sharpness = self.sharpness[self.scene[rows]].astype(np.float64)
-        label = sharpness * self._evidence(rows, direction)[:, 0]
-        by_chance = sharpness**2 / 2
-        bound = label - by_chance - np.log(settings.kinds)
-        known = np.zeros(0, np.intp)
-        key = np.full(len(rows), -np.inf)
-        count = FIRST + top
-        while True:
-            best = _largest(bound, count)
-            new = np.setdiff1d(best, known, assume_unique=True)
-            none = by_chance[new]
-            if len(others) and len(new):
-                said = sharpness[new, None] * self._evidence(rows[new], others)
-                none = np.maximum(none, np.logaddexp.reduce(said, axis=1) - np.log(len(others)))
-            key[new] = label[new] - none - np.log(settings.kinds)
-            known = best
-            if len(best) == len(rows) or np.partition(key[best], -top)[-top] >= bound[best].min():
-                best.sort()
-                return rows[best], key[best]
-            count *= 4
+        evidence = self.evidence(rows, direction)[:, 0].astype(np.float64)
+        if self.bank is None:
+            bound, key_of = RELEVANCY_TEMPERATURE * (evidence + 1), self._relevancy  # no cosine is below -1
+        else:
+            sharpness, key_of = self.sharpness[self.scene[rows]], self._log_odds
+            bound = sharpness * evidence - sharpness**2 / 2 - np.log(ChoosingSettings().kinds)
+            bank = unit_rows(self.bank.vectors - self.bank.mean)
+            rivals = bank[(bank @ direction[0]) < ChoosingSettings().synonym]
+        places, key = largest(bound, lambda places: key_of(rows[places], direction, rivals), top)
+        return rows[places], key
 
-    def _evidence(self, rows: NDArray[np.intp], directions: NDArray[np.float32]) -> NDArray[np.float32]:
-        """(n, L) of these instances for unit directions (L, D), in standard deviations of the judge's words."""
-        where = self._descriptors_of(rows)
-        of_row = np.repeat(self.scene[rows], np.diff(self._end)[rows])
-        common = self.common @ directions.T
-        scores = self._cosines(rows, directions)
-        scores -= common[of_row]
-        scores *= self.scale[where, None]
-        scores += self.shift[where, None]
-        return self._best(rows, scores)
+    def _relevancy(
+        self, rows: NDArray[np.intp], direction: NDArray[np.float32], rivals: NDArray[np.float32]
+    ) -> NDArray[np.float64]:
+        """Logit of how much better a direction (1, D) fits than the best rival; without rivals, than nothing at all."""
+        cosine = self.evidence(rows, np.concatenate([direction, rivals])).astype(np.float64)
+        return RELEVANCY_TEMPERATURE * (cosine[:, 0] - (cosine[:, 1:].max(axis=1) if len(rivals) else 0))
 
-    def _cosines(self, rows: NDArray[np.intp], directions: NDArray[np.float32]) -> NDArray[np.float32]:
-        """(descriptors of these instances, L)."""
-        where = self._descriptors_of(rows)
-        if isinstance(where, slice):
-            return self.descriptors @ directions.T
-        scores = np.empty((len(where), len(directions)), np.float32)
-        ends = np.append(np.flatnonzero(np.diff(where) != 1) + 1, len(where))
-        if len(ends) * LEAST_RUN > len(where):
-            for start in range(0, len(where), ROWS_AT_ONCE):
-                part = slice(start, start + ROWS_AT_ONCE)
-                scores[part] = self.descriptors[where[part]] @ directions.T
-            return scores
-        for begin, end in pairwise([0, *ends.tolist()]):  # whole scenes: multiplied where they lie, not copied
-            np.matmul(self.descriptors[where[begin] : where[end - 1] + 1], directions.T, out=scores[begin:end])
-        return scores
-
-    def _descriptors_of(self, rows: NDArray[np.intp]) -> NDArray[np.intp] | slice:
-        """Numbers of the descriptors of these instances, in their order; of all instances, all."""
-        if len(rows) == len(self):
-            return slice(None)
-        count = np.diff(self._end)[rows]
-        begin = np.cumsum(count) - count
-        return np.arange(count.sum()) + np.repeat(self.first[rows] - begin, count)
-
-    def _best(self, rows: NDArray[np.intp], scores: NDArray[np.float32]) -> NDArray[np.float32]:
-        """(n, L) of the descriptors' scores, the largest of each instance."""
-        if len(rows) == 0:
-            return np.zeros((0, scores.shape[1]), np.float32)
-        count = np.diff(self._end)[rows]
-        return np.maximum.reduceat(scores, np.cumsum(count) - count, axis=0)
+    def _log_odds(
+        self, rows: NDArray[np.intp], direction: NDArray[np.float32], others: NDArray[np.float32]
+    ) -> NDArray[np.float64]:
+        """Logit of the probability (`choosing.Chooser`) of a direction (1, D) against the bank's other words."""
+        sharpness = self.sharpness[self.scene[rows], None]
+        said = sharpness * self.evidence(rows, np.concatenate([direction, others]))
+        none = sharpness[:, 0] ** 2 / 2
+        if len(others):
+            none = np.maximum(none, np.logaddexp.reduce(said[:, 1:], axis=1) - np.log(len(others)))
+        return said[:, 0] - none - np.log(ChoosingSettings().kinds)
 
 
-def block_key(entry: SceneEntry, words: Mapping[str, Vocabulary]) -> tuple[Any, ...]:
-    """Scenes of one key are asked alike: kin, own words and judge. words: the vocabularies by digest."""
-    return entry.kin, entry.vocabulary if entry.vocabulary in words else None, entry.judge
+def largest(
+    bound: NDArray[np.float64], key_of: Callable[[NDArray[np.intp]], NDArray[np.float64]], top: int
+) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+    """The ``top`` places with the largest keys, of equals the first, and their keys; few keys are asked for.
+
+    bound: (n,) what the keys do not exceed. key_of: the keys of some places.
+    """
+    known, key, count = np.zeros(0, np.intp), np.zeros(0), FIRST + top
+    while True:
+        tried = np.argpartition(-bound, count)[:count] if count < len(bound) else np.arange(len(bound))
+        new = np.setdiff1d(tried, known, assume_unique=True)
+        known, key = np.append(known, new), np.append(key, key_of(new))
+        if len(tried) == len(bound) or np.partition(key, -top)[-top] >= bound[tried].min():
+            order = np.lexsort((known, -key))[:top]
+            return known[order], key[order]
+        count *= 4
 
 
-def load_block(atlas: Atlas, entries: Sequence[SceneEntry]) -> Block:
-    """Scenes of an atlas with one kin, vocabulary and judge, by name; their arrays lie behind each other."""
-    loaded = [atlas.arrays(entry) for entry in entries]
-    judge, width = entries[0].judge, entries[0].width
-    sizes = [len(arrays.owner) for arrays in loaded]
-    parts: dict[str, list[NDArray]] = {name: [] for name in ("first", "scene", "instance", "points", "low", "high")}
-    standards = [atlas.judgement(entry, size) for entry, size in zip(entries, sizes, strict=True)] if judge else []
-    start = 0
-    for number, arrays in enumerate(loaded):
-        instance, first = np.unique(arrays.owner, return_index=True)
-        parts["first"].append(first + start)
-        parts["scene"].append(np.full(len(instance), number, np.int32))
-        parts["instance"].append(instance)
-        for name in ("points", "low", "high"):
-            parts[name].append(arrays.instances[name][instance])
-        start += len(arrays.owner)
-    together = {name: np.concatenate(arrays) for name, arrays in parts.items()}
-    bank = atlas.bank(judge, width) if judge else None
-    common = np.array([standard.common for standard in standards], np.float32).reshape(len(standards), width)
-    return Block(
-        entries=tuple(entries),
-        descriptors=np.concatenate([arrays.descriptors for arrays in loaded]),
-        bank=bank,
-        common=common,
-        scale=np.concatenate([np.zeros(0, np.float32), *(standard.scale for standard in standards)]),
-        shift=np.concatenate([np.zeros(0, np.float32), *(standard.shift for standard in standards)]),
-        sharpness=np.array([standard.sharpness for standard in standards], np.float32),
-        **together,
-    )
-
-
-def _largest(values: NDArray[np.float64], count: int) -> NDArray[np.intp]:
-    if count >= len(values):
-        return np.arange(len(values))
-    return np.argpartition(values, len(values) - count)[len(values) - count :]
-
-
-def _share(logit: NDArray[np.float64]) -> NDArray[np.float64]:
+def share(logit: NDArray[np.float64]) -> NDArray[np.float64]:
     """The probability of a logit."""
     return 1 / (1 + np.exp(-np.clip(logit, -700, 700)))
 
 
-def _logit(share: NDArray[np.float64]) -> NDArray[np.float64]:
-    share = np.clip(share, CERTAIN, 1 - CERTAIN)
-    return np.log(share) - np.log1p(-share)
+def load_block(atlas: Atlas, entries: Sequence[SceneEntry]) -> Block:
+    """Scenes of an atlas with one kin and judge; their arrays lie behind each other."""
+    parts: list[tuple[NDArray, ...]] = []
+    begin, sharpness = 0, []
+    for number, entry in enumerate(entries):
+        table, boxes = atlas.instances(entry)
+        vectors, owner = table.descriptors, table.descriptor_instance
+        standard = Standard(np.zeros(0), np.ones(len(owner)), np.zeros(len(owner)), 0.0)
+        if entry.judge is not None:
+            standard = atlas.judgement(entry, len(owner))
+            vectors = standard.scale[:, None] * (vectors - standard.common)
+        shown = np.flatnonzero(table.points[owner] > 0)
+        instance, first = np.unique(owner[shown], return_index=True)
+        scene = np.full(len(instance), number)
+        columns = vectors[shown], standard.shift[shown], begin + first, scene, instance
+        parts.append((*columns, table.points[instance], boxes[instance]))
+        begin += len(shown)
+        sharpness.append(standard.sharpness)
+    bank = atlas.bank(judge, entries[0].width) if (judge := entries[0].judge) else None
+    return Block(tuple(entries), *map(np.concatenate, zip(*parts, strict=True)), bank, np.array(sharpness))

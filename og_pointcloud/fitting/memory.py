@@ -24,6 +24,7 @@ __all__ = [
     "memory_in_use",
     "memory_left",
     "parse_memory",
+    "peak_memory",
     "scratch_array",
     "scratch_like",
     "scratch_root",
@@ -78,6 +79,15 @@ def memory_in_use() -> int:
     try:
         return int(Path("/proc/self/statm").read_text().split()[1]) * mmap.PAGESIZE
     except (OSError, ValueError):
+        return 0
+
+
+def peak_memory() -> int:
+    """The most memory that this process has held, in bytes; 0 where the system does not tell."""
+    try:
+        lines = Path("/proc/self/status").read_text().splitlines()
+        return next(1024 * int(line.split()[1]) for line in lines if line.startswith("VmHWM:"))
+    except (OSError, StopIteration):
         return 0
 
 

@@ -1,25 +1,35 @@
-"""Steps of a stage as tasks of an executor, and what a task may take of the machine where it runs."""
+"""Where tasks run, processes of this machine or a Dask cluster, both executors of `concurrent.futures`; what a task may
+take of the machine where it runs; and the steps of a stage as tasks."""
 
 from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable, Sequence
-from concurrent.futures import Executor
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TypeVar
+from multiprocessing import get_context
+from typing import Any, TypeVar
 
+from og_pointcloud.errors import MissingExtraError, OgPointcloudError
 from og_pointcloud.fitting.memory import free_memory
 from og_pointcloud.journal import Journal
 from og_pointcloud.kernels import use_threads
 
-__all__ = ["Share", "cores_here", "run_tasks", "share_here"]
+__all__ = ["LocalWorkers", "Share", "cores_here", "dask_executor", "run_tasks", "share_here"]
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 SHARE_OF_LIMIT = 0.6
 """Of the memory that a Dask worker may hold, what its tasks take: at 0.8 it would be paused, at 0.95 killed."""
+
+THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+LEAST_BYTES = 10**9
+"""Memory that a worker of this machine has at least, if need be by fewer of them."""
+PATIENCE_S = 20
 
 
 @dataclass(frozen=True)
@@ -74,3 +84,61 @@ def _with_share(function: Callable[[Item], Result], item: Item) -> Result:
     if (threads := share_here(Share()).threads) is not None:
         use_threads(threads)
     return function(item)
+
+
+class LocalWorkers(ThreadPoolExecutor):
+    """Processes of this machine, each with its share of cores and memory, and a thread that waits for what it does.
+
+    Each has one task at a time: where one dies (killed, out of memory, a crash in a library), that task fails with
+    BrokenProcessPool, the others go on, and the next has a new process.
+    """
+
+    def __init__(self, tasks: int) -> None:
+        """tasks: how many there will be; there are as many processes at most, and as cores."""
+        workers = max(1, min(tasks, cores_here(), free_memory() // 2 // LEAST_BYTES))
+        super().__init__(workers)
+        self.share, self._process_of = Share.of_machine(workers), threading.local()
+        self._before = {name: os.environ.get(name) for name in THREAD_VARIABLES}
+        # Read when a library starts, which may be before a task could say so: hence inherited.
+        os.environ.update(dict.fromkeys(THREAD_VARIABLES, str(self.share.threads)))
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        """As `concurrent.futures.Executor` has it."""
+        return super().submit(self._in_process, fn, *args, **kwargs)
+
+    def _in_process(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Any:
+        process = getattr(self._process_of, "thread", None) or ProcessPoolExecutor(1, get_context("spawn"))
+        self._process_of.thread = None  # if this fails, the next task begins with a new one
+        result = process.submit(fn, *args, **kwargs).result()
+        self._process_of.thread = process
+        return result
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        """As `concurrent.futures.Executor` has it. The processes end with the threads."""
+        super().shutdown(wait, cancel_futures=cancel_futures)
+        for name, value in self._before.items():
+            os.environ.pop(name, None) if value is None else os.environ.__setitem__(name, value)
+
+
+@contextmanager
+def dask_executor(address: str) -> Iterator[Executor]:
+    """An executor of the Dask cluster whose scheduler has this address, as `dask scheduler` prints it.
+
+    Its workers see the same files by the same paths. MissingExtraError without the extra 'cluster'; OgPointcloudError
+    where no scheduler answers, or it has no workers.
+    """
+    try:
+        from distributed import Client
+    except ImportError:
+        raise MissingExtraError("distributed", "cluster") from None
+    try:
+        client = Client(address, timeout=PATIENCE_S)
+    except (OSError, ValueError) as error:
+        raise OgPointcloudError(
+            f"no scheduler answers at '{address}' ({error!s:.100}); expected the address that `dask scheduler` prints, "
+            "such as tcp://10.0.0.1:8786"
+        ) from None
+    with client:
+        if not client.scheduler_info()["workers"]:
+            raise OgPointcloudError(f"the scheduler at '{address}' has no workers: start some (dask worker {address})")
+        yield client.get_executor(pure=False)

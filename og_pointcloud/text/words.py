@@ -15,7 +15,7 @@ from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError
 from og_pointcloud.text.encoder import CarriedEncoder, export_command, find_encoder
 from og_pointcloud.text.text_features import checked_vocabulary, read_text_features
 
-__all__ = ["Labels", "TextFeatures", "resolve_labels"]
+__all__ = ["Labels", "TextFeatures", "close_matches", "resolve_labels"]
 
 Labels: TypeAlias = "str | Iterable[str] | Mapping[str, ArrayLike] | Vocabulary | None"
 TextFeatures: TypeAlias = "str | os.PathLike[str] | tuple[Vocabulary, str] | None"
@@ -106,7 +106,7 @@ def _looked_up(
         vectors |= dict(zip(missing, encoder(missing), strict=True))
     elif missing:
         others = f", nor are {len(missing) - 1} more of the labels" if len(missing) > 1 else ""
-        hint = _close_matches(missing[0], list(vectors))
+        hint = close_matches(missing[0], list(vectors))
         raise OgPointcloudError(
             f"'{missing[0]}' is not among the {len(vectors)} known words{others}{hint}: {_ways(feature_space)}"
         )
@@ -123,7 +123,8 @@ def _check_one_width(words: tuple[str, ...], vectors: Mapping[str, np.ndarray]) 
         )
 
 
-def _close_matches(word: str, known: list[str]) -> str:
+def close_matches(word: str, known: Iterable[str]) -> str:
+    """What may have been meant by a word, as the end of a message; "" where no known word is like it."""
     import difflib  # only when something went wrong
 
     by_lower = {name.lower(): name for name in known}
