@@ -8,8 +8,12 @@ from __future__ import annotations
 import argparse
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from og_pointcloud.cli.common import Parser, add_output, add_shared, check_at_least, numbers
+from og_pointcloud.cli.common import Parser, add_output, add_shared, check_at_least, numbers, print_table
+
+if TYPE_CHECKING:
+    from og_pointcloud.collection.collection import Finding
 
 
 def add(parser: Parser) -> None:
@@ -53,8 +57,17 @@ def run(arguments: argparse.Namespace) -> None:
     if arguments.json:
         print(findings.to_json())
         return
-    print(findings if findings else "nothing was found there: no instance with a feature has its middle in the box")
+    if findings:
+        print_table(("scene", "instance", "word", "score", "center", "size"), [cells(finding) for finding in findings])
+    else:
+        print("nothing was found there: no instance with a feature has its middle in the box")
     if not all(finding.calibrated for finding in findings):
         print("scores of scenes without a judge say how much better the word fits than other known words do")
     if arguments.html:
         print(f"wrote {arguments.html}")
+
+
+def cells(finding: Finding) -> tuple[str, ...]:
+    center = " ".join(f"{value:.4g}" for value in finding.center)
+    size = " x ".join(f"{value:.3g}" for value in finding.size)
+    return finding.scene, str(finding.instance), finding.word, f"{finding.score:.3f}", center, size
