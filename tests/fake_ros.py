@@ -106,6 +106,7 @@ class Node:
     def __init__(self, name, **options):
         assert not options
         self.name, self.parameters, self.publishers, self.subscriptions, self.timers = name, {}, {}, {}, []
+        self.services = {}
         self.logger, self.checks, self.destroyed = Logger(), [], False
 
     def declare_parameter(self, name, default):
@@ -137,6 +138,9 @@ class Node:
     def create_subscription(self, kind, topic, callback, qos):
         self.subscriptions[topic] = SimpleNamespace(kind=kind, callback=callback, qos=qos)
 
+    def create_service(self, kind, name, callback):
+        self.services[name] = lambda: callback(kind.Request(), kind.Response())
+
     def create_timer(self, seconds, callback):
         assert seconds > 0
         self.timers.append(callback)
@@ -149,6 +153,12 @@ class Node:
 
     def destroy_node(self):
         self.destroyed = True
+
+
+class TriggerResponse:
+    """Of std_srvs/Trigger."""
+
+    __slots__ = ("message", "success")
 
 
 class TransformException(Exception):
@@ -226,7 +236,9 @@ def install(monkeypatch):
         ),
         **message_package("std_msgs", "Header String"),
         **message_package("builtin_interfaces", "Time"),
-        **message_package("sensor_msgs", "PointCloud2 PointField"),
+        **message_package("sensor_msgs", "PointCloud2 PointField Image CameraInfo RegionOfInterest"),
+        "std_srvs": module("std_srvs"),
+        "std_srvs.srv": module("std_srvs.srv", Trigger=SimpleNamespace(Request=object, Response=TriggerResponse)),
         **message_package("geometry_msgs", "Point Vector3 Quaternion Pose PoseWithCovariance"),
         **message_package(
             "vision_msgs",
@@ -236,5 +248,6 @@ def install(monkeypatch):
     }
     for name, stand_in in modules.items():
         monkeypatch.setitem(sys.modules, name, stand_in)
-    monkeypatch.delitem(sys.modules, "og_pointcloud_ros.node", raising=False)
+    for name in ("node", "map_node"):
+        monkeypatch.delitem(sys.modules, f"og_pointcloud_ros.{name}", raising=False)
     return rclpy

@@ -39,6 +39,7 @@ def grown():
     return mapped(frames(THINGS))
 
 
+@pytest.mark.slow
 def test_a_known_cloud_ends_as_a_fit_does():
     capture = scene(THINGS)
     fitted = og.fit(capture, og.FitSettings(mode="grouping"), progress=False)
@@ -102,6 +103,7 @@ def test_a_missed_detection_removes_nothing():
     assert {instance_of(mapper.finish().cloud, thing) for thing in THINGS}.isdisjoint({-1})
 
 
+@pytest.mark.slow
 def test_a_map_is_gone_on_with():
     before = og.fit(scene(THINGS), progress=False)
     mapper, _ = mapped(frames([CHEST, ELSEWHERE, PARCEL], seed=1, first=10.0), before)

@@ -298,6 +298,7 @@ def test_progress_tells_the_time_that_remains():
     assert written[1].endswith("\n")
 
 
+@pytest.mark.slow
 def test_a_missing_rosbags_names_its_extra(scene, tmp_path):
     command = ["ros-bag", "in", "-o", str(tmp_path / "out"), "--scene", str(scene.path), "--labels", "apple"]
     code = f"import sys; sys.modules['rosbags'] = None\nfrom og_pointcloud.cli import main; sys.exit(main({command}))"

@@ -255,9 +255,9 @@ def test_what_colcon_needs_is_there():
     for path in PACKAGE.rglob("*"):
         if path.is_file() and path.parent.name in ("launch", "config"):
             assert f"{path.parent.name}/{path.name}" in setup
-    lines = (PACKAGE / "node.py").read_text().splitlines()
+    lines = [line for name in ("node.py", "map_node.py") for line in (PACKAGE / name).read_text().splitlines()]
     imported = {
         line.split()[1].split(".")[0] for line in lines if line.startswith(("import", "from")) and "reportM" in line
     }
     depends = {entry.text for entry in package.findall("exec_depend")}
-    assert {"rclpy", "tf2_ros", "vision_msgs"} <= imported <= depends
+    assert {"rclpy", "tf2_ros", "vision_msgs", "std_srvs"} <= imported <= depends

@@ -34,6 +34,7 @@ def in_map(frame):
     return frame.xyz @ frame.sensor_to_map[:3, :3].T + frame.sensor_to_map[:3, 3]
 
 
+@pytest.mark.slow
 def test_a_seed_gives_one_drive():
     first, again, other = (next(iter(Drive(seed, Lidar(beams=4, columns=60), frames=2))) for seed in (0, 0, 1))
     np.testing.assert_array_equal(first.xyz, again.xyz)
@@ -65,6 +66,7 @@ def test_the_robot_keeps_clear_of_everything(exact_frames):
     assert np.linalg.norm(places - np.roll(places, 1, axis=0), axis=1).min() > 0.3  # it moves
 
 
+@pytest.mark.slow
 def test_noise_is_of_the_size_that_it_is_said_to_be():
     lidar = replace(EXACT, noise_m=0.02, dropouts=0.1)
     exact, noisy = (next(iter(Drive(0, kind, frames=2))) for kind in (EXACT, lidar))
@@ -102,6 +104,7 @@ def true_scene(tmp_path_factory):
     return write_bundle(cloud, tmp_path_factory.mktemp("room") / "room.ogpc")
 
 
+@pytest.mark.slow
 @pytest.mark.slow
 def test_the_example_leaves_a_picture_and_two_bags(true_scene, tmp_path):
     assert len(EXAMPLE.read_text().splitlines()) <= 60

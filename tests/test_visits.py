@@ -110,6 +110,7 @@ def test_what_changed_is_told_by_id(monday, friday):
     assert set(changes.to_dict()["moved"][0]) == {"id", "from", "to"}
 
 
+@pytest.mark.slow
 def test_the_same_place_again_has_not_changed(monday):
     again = og.fit(scene(BEFORE, seed=2), progress=False)
     changes = og.compare(monday, again)
@@ -123,6 +124,7 @@ def test_time_reversed_swaps_gone_and_new(monday, friday):
     assert [moved.id for moved in changes.moved] == [instance_of(friday, AFTER[1])]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("unit", [0.001, 1000.0])
 def test_the_unit_of_length_does_not_matter(monday, friday, unit):
     def scaled(cloud):
@@ -138,6 +140,7 @@ def test_the_unit_of_length_does_not_matter(monday, friday, unit):
     assert [(m.id, m.now) for m in one.moved] == [(m.id, m.now) for m in other.moved]
 
 
+@pytest.mark.slow
 def test_far_from_the_origin_nothing_changes(monday, friday):
     far = np.array([5e5, 4e6, 300.0])
     one = og.compare(monday, friday)
@@ -160,6 +163,7 @@ def test_one_place_alone_refutes_nothing(monday):
     assert og.compare(monday, seen).gone == ()
 
 
+@pytest.mark.slow
 def test_what_the_first_visit_never_looked_at_is_not_new(monday):
     """Monday only looked from one side; behind the chest stands something that it could not see."""
     side = [camera for camera in cameras(40) if camera.center[0] < -2.5]
@@ -186,6 +190,7 @@ def test_a_map_keeps_its_ids(monday, updated):
     assert instance_of(cloud, BIN) == -1
 
 
+@pytest.mark.slow
 def test_what_comes_back_is_known_again(monday, updated):
     bin_ = instance_of(monday, BIN)
     back = [*AFTER, moved(BIN, (0.5, 1.1, 0.0))]
@@ -239,6 +244,7 @@ def test_a_damaged_record_is_refused(monday):
         MapRecord.of(replace(monday, provenance={"map": {"visits": 3}}))
 
 
+@pytest.mark.slow
 def test_the_commands_write_what_changed(monday, friday, tmp_path, capsys):
     one, other = (og.write_bundle(cloud, tmp_path / f"{name}.ogpc") for name, cloud in (("m", monday), ("f", friday)))
     assert main(["compare", str(one), str(other), "--json"]) == 0

@@ -167,10 +167,11 @@ class Visit:
         rgb = None if cloud.rgb is None else cloud.rgb[rows]
         return Look.of_points(*descriptors_of(cloud.instances, instance), cloud.xyz[rows], rgb)
 
-    def count(self, chosen: NDArray[np.bool_]) -> NDArray[np.int64]:
-        """(instances,) how many of each instance's points are chosen, (n,) bool."""
-        ids = self.cloud.instance_ids
-        return np.bincount(ids[chosen & (ids >= 0)], minlength=len(self.cloud.instances))
+    def count(self, chosen: NDArray[np.bool_], sure: NDArray[np.floating] | None = None) -> NDArray[np.floating]:
+        """(instances,) how many of each instance's points are chosen, (n,) bool; sure: (n,) what each counts."""
+        ids, weight = self.cloud.instance_ids, np.ones(len(chosen)) if sure is None else sure
+        rows = np.flatnonzero(chosen & (ids >= 0))
+        return np.bincount(ids[rows], weight[rows], len(self.cloud.instances))
 
     def telling(self, tolerance: float) -> NDArray[np.bool_]:
         """(n,) bool: points that lie off the surfaces of all other instances about them."""
@@ -194,16 +195,22 @@ class Evidence:
     telling: NDArray[np.bool_]
 
     def decided(self, visit: Visit) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """(instances,) bool each: those that are seen through; those hardly looked at."""
-        shown, still, telling, through = (
-            visit.count(self.shown & which) for which in (True, self.still, self.still & self.telling, self.through)
+        """(instances,) bool each: those that are seen through; those hardly looked at.
+
+        Each point counts by how sure it is of its instance: a part of the table that a mask took for the book's stays
+        when the book leaves.
+        """
+        least = np.maximum(FEWEST_POINTS, LEAST_SHARE * visit.count(self.shown))
+        seen_through, looked_at = (visit.count(self.shown & of) for of in (self.through, self.through | self.still))
+        sure = None if visit.cloud.certainty is None else visit.cloud.certainty / 255
+        still, telling, through = (
+            visit.count(self.shown & of, sure) for of in (self.still, self.still & self.telling, self.through)
         )
-        least = np.maximum(FEWEST_POINTS, LEAST_SHARE * shown)
         most = through > MOST * (through + still)
         lies_flat = (through > MOST * (through + telling)) & (through > FLAT_SHARE * (through + still)) & ~most
         for k in np.flatnonzero(lies_flat):
             lies_flat[k] = self._of_one_color(visit, int(k))
-        return (through >= least) & (most | lies_flat), through + still < least
+        return (seen_through >= least) & (most | lies_flat), looked_at < least
 
     def _of_one_color(self, visit: Visit, instance: int) -> bool:
         """Whether what is seen through is of the colour of the rest: else it is a part of something else."""

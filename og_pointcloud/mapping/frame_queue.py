@@ -19,7 +19,8 @@ class FrameQueue:
     """Feeds a mapper in a thread of its own, in the order in which frames come.
 
     max_age: seconds that a frame may wait. on_change: called, in that thread, with each frame's change. on_drop: called
-    with what is said of a frame that was dropped, for its age or because it was refused; None: a warning.
+    with what is said of a frame that was dropped, for its age or because it was refused; None: a warning. lock: held
+    while a frame goes in; hold it to use the mapper, or to put another in its place.
     """
 
     def __init__(
@@ -33,12 +34,19 @@ class FrameQueue:
         self.mapper, self.max_age, self.dropped = mapper, max_age, 0
         self._on_change, self._on_drop = on_change or (lambda change: None), on_drop or warnings.warn
         self._waiting: queue.SimpleQueue[tuple[float, Frame] | None] = queue.SimpleQueue()
+        self.lock, self._put, self._done = threading.Lock(), 0, 0
         self._thread = threading.Thread(target=self._work, daemon=True)
         self._thread.start()
 
     def put(self, frame: Frame) -> None:
         """Hand a frame over; returns at once."""
+        self._put += 1
         self._waiting.put((time.monotonic(), frame))
+
+    @property
+    def idle(self) -> bool:
+        """Whether all that was put has been worked off."""
+        return self._done == self._put
 
     def close(self) -> None:
         """Work off what waits and is young enough, and end the thread."""
@@ -47,12 +55,16 @@ class FrameQueue:
 
     def _work(self) -> None:
         while (waiting := self._waiting.get()) is not None:
-            arrived, frame = waiting
-            if time.monotonic() - arrived > self.max_age:
-                self.dropped += 1
-                self._on_drop(f"a frame waited longer than {self.max_age} s: {self.dropped} dropped so far")
-                continue
-            try:
+            self._take(*waiting)
+            self._done += 1
+
+    def _take(self, arrived: float, frame: Frame) -> None:
+        if time.monotonic() - arrived > self.max_age:
+            self.dropped += 1
+            self._on_drop(f"a frame waited longer than {self.max_age} s: {self.dropped} dropped so far")
+            return
+        try:
+            with self.lock:
                 self._on_change(self.mapper.integrate(frame))
-            except OgPointcloudError as error:
-                self._on_drop(f"a frame was refused: {error}")
+        except OgPointcloudError as error:
+            self._on_drop(f"a frame was refused: {error}")

@@ -18,7 +18,8 @@ __all__ = ["MapObject", "leave", "name", "objects_of"]
 @dataclass(frozen=True)
 class MapObject:
     """An object as it is known now. place: (3,) mean of its points, world coordinates; size: (3,) along the axes.
-    state: "present" or "gone" (then where it was last). last_seen: the stamp."""
+    state: "present"; "moved", present where it was not at first; "unseen", of an earlier map, where no frame has looked
+    since; or "gone", then where it was last. last_seen: the stamp."""
 
     id: int
     state: str
@@ -38,8 +39,9 @@ def objects_of(known: GrowingMap) -> list[MapObject]:
         if track.left:
             place, size, state = track.left.place, track.left.size, "gone"
         elif len(rows):
-            size, state = np.ptp(known.points.xyz[rows].astype(np.float64), axis=0), "present"
-            place = known.place_of(rows)
+            size, place = np.ptp(known.points.xyz[rows].astype(np.float64), axis=0), known.place_of(rows)
+            looked_at = known.presence.seen_at[rows].max() > -np.inf
+            state = "moved" if track.moved else "present" if looked_at else "unseen"
         else:
             continue
         found.append(MapObject(id_, state, place, size, len(rows), track.views, track.last_seen, track.descriptor))
@@ -122,5 +124,5 @@ def _returned(known: GrowingMap, old: int, track: Track, rows: NDArray[np.int64]
     gone = known.tracks.tracks[known.tracks.by_id()[old]]
     assert gone.left is not None
     before = gone.left.place
-    gone.id, gone.left, track.id = -1, None, old
+    gone.id, gone.left, track.id, track.moved = -1, None, old, True
     return Moved(old, before, known.place_of(rows), old)

@@ -70,7 +70,7 @@ class Left:
 class Track:
     """total: (D,) sum of unit features by pixels; pixels: their sum; agreement: sum of cosines by pixels. views, masks:
     how many showed it. id: of the object, NO_TRACK while it is provisional; named_at: the stamp at which it got it.
-    lost: rows of its points that were seen through; left: when most of them were."""
+    moved: it has been elsewhere. lost: rows of its points that were seen through; left: when most of them were."""
 
     total: NDArray[np.float64] | None = None
     pixels: float = 0.0
@@ -80,6 +80,7 @@ class Track:
     last_seen: float = 0.0
     id: int = NO_TRACK
     named_at: float = -np.inf
+    moved: bool = False
     lost: list[int] = field(default_factory=list)
     left: Left | None = None
 

@@ -9,14 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.ask.boxes import Box
-from og_pointcloud.ask.instances import Instance, Instances
+from og_pointcloud.ask.instances import Instances
 from og_pointcloud.ask.labelled_scene import LabelledScene
 from og_pointcloud.ask.segmentation import Segmentation
 from og_pointcloud.errors import OgPointcloudError
+from og_pointcloud.mapping.map_objects import MapObject
 from og_pointcloud_ros.messages import MessageFactory, header, plain_messages
 from og_pointcloud_ros.pointcloud2 import UNLABELLED
 
-__all__ = ["to_detections", "to_label_info"]
+__all__ = ["to_detections", "to_label_info", "to_objects"]
 
 
 def to_detections(
@@ -49,9 +50,9 @@ def to_detections(
     seen = np.flatnonzero(np.bincount(owners, minlength=len(table)) >= max(minimum_points, 1))
     head = header(messages, frame_id, stamp)
     detections = [
-        _detection(table[k], result.names[result.labels[row]], float(result.scores[row]), head, messages)
+        _detection(k, box, result.names[result.labels[row]], float(result.scores[row]), head, messages)
         for k, row in zip(seen.tolist(), example[seen], strict=True)
-        if table[k].points
+        if (box := table[k].oriented_box) is not None
     ]
     return messages("vision_msgs/msg/Detection3DArray", header=head, detections=detections)
 
@@ -76,15 +77,24 @@ def to_label_info(
     return messages("vision_msgs/msg/LabelInfo", header=head, class_map=class_map, threshold=0.0)
 
 
-def _detection(instance: Instance, name: str, score: float, head: Any, messages: MessageFactory) -> Any:
-    box = instance.oriented_box
-    assert box is not None  # it has points
+def to_objects(
+    objects: Sequence[MapObject], frame_id: str = "map", stamp: Any = None, *, messages: MessageFactory = plain_messages
+) -> Any:
+    """What a map knows (`Mapper.objects`), as vision_msgs/Detection3DArray: the object's id, its box along the axes of
+    the map's frame, and its state as class id: present, moved, unseen, or gone (then where it was last)."""
+    head = header(messages, frame_id, stamp)
+    boxes = ((entry, Box(entry.place, entry.size, np.eye(3))) for entry in objects)
+    detections = [_detection(entry.id, box, entry.state, 1.0, head, messages) for entry, box in boxes]
+    return messages("vision_msgs/msg/Detection3DArray", header=head, detections=detections)
+
+
+def _detection(number: int, box: Box, name: str, score: float, head: Any, messages: MessageFactory) -> Any:
     pose, size = _pose(box, messages), messages("geometry_msgs/msg/Vector3", **_named(box.size, "xyz"))
     hypothesis = messages("vision_msgs/msg/ObjectHypothesis", class_id=name, score=score)
     uncertain = messages("geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=np.zeros(36))
     result = messages("vision_msgs/msg/ObjectHypothesisWithPose", hypothesis=hypothesis, pose=uncertain)
     bbox = messages("vision_msgs/msg/BoundingBox3D", center=pose, size=size)
-    return messages("vision_msgs/msg/Detection3D", header=head, results=[result], bbox=bbox, id=str(instance.id))
+    return messages("vision_msgs/msg/Detection3D", header=head, results=[result], bbox=bbox, id=str(number))
 
 
 def _pose(box: Box, messages: MessageFactory) -> Any:

@@ -16,7 +16,7 @@ import numpy as np
 
 from og_pointcloud.errors import SceneError
 
-__all__ = ["MessageFactory", "header", "nanoseconds", "plain_messages", "ros_messages"]
+__all__ = ["MessageFactory", "header", "nanoseconds", "plain_messages", "ros_messages", "time_message"]
 
 NANOSECONDS = 1_000_000_000
 
@@ -47,9 +47,13 @@ def ros_messages(type_name: str, /, **fields: Any) -> Any:
 
 def header(messages: MessageFactory, frame_id: str, stamp: Any) -> Any:
     """A std_msgs/Header. stamp: a Time message, nanoseconds since the epoch, or None for 0."""
+    return messages("std_msgs/msg/Header", stamp=time_message(messages, stamp), frame_id=frame_id)
+
+
+def time_message(messages: MessageFactory, stamp: Any) -> Any:
+    """A builtin_interfaces/Time of what `header` takes."""
     sec, nanosec = divmod(nanoseconds(stamp), NANOSECONDS)
-    time = messages("builtin_interfaces/msg/Time", sec=sec, nanosec=nanosec)
-    return messages("std_msgs/msg/Header", stamp=time, frame_id=frame_id)
+    return messages("builtin_interfaces/msg/Time", sec=sec, nanosec=nanosec)
 
 
 def nanoseconds(stamp: Any) -> int:

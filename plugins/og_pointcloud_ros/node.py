@@ -1,4 +1,4 @@
-"""The ROS 2 node: clouds in, labelled clouds and detections out. The only module that needs ROS.
+"""The ROS 2 node: clouds in, labelled clouds and detections out. It and `map_node` alone need ROS.
 
 Subscribes ~/input/points (sensor_msgs/PointCloud2, best effort, the newest alone).
 Publishes ~/output/points, ~/output/detections and, latched, ~/label_info. A cloud is placed in the scene by tf.
@@ -10,7 +10,7 @@ transform does not come in time. No message ends the node: what it cannot use is
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -33,12 +33,13 @@ from vision_msgs.msg import Detection3DArray, LabelInfo  # pyright: ignore[repor
 
 from og_pointcloud.ask.labelled_scene import LabelledScene, Segmenter, load
 from og_pointcloud.errors import OgPointcloudError
+from og_pointcloud.formats.poses import rigid
 from og_pointcloud_ros.detections import to_label_info
 from og_pointcloud_ros.labelling import MINIMUM_POINTS, CloudLabeller
 from og_pointcloud_ros.messages import ros_messages
 from og_pointcloud_ros.transforms import rotation_matrix
 
-__all__ = ["SegmentNode", "main"]
+__all__ = ["SegmentNode", "latest_only", "main", "pose_at", "run", "told"]
 
 PARAMETERS = {
     "scene": "",
@@ -69,9 +70,9 @@ class SegmentNode(Node):
         self._target_frame, self._max_age = self._value("target_frame"), self._value("max_age")
         self._scene = self._load()
         reliable, best_effort = QoSReliabilityPolicy.RELIABLE, QoSReliabilityPolicy.BEST_EFFORT
-        self._points = self.create_publisher(PointCloud2, "~/output/points", _latest(reliable))
-        self._detections = self.create_publisher(Detection3DArray, "~/output/detections", _latest(reliable))
-        self._info = self.create_publisher(LabelInfo, "~/label_info", _latest(reliable, latched=True))
+        self._points = self.create_publisher(PointCloud2, "~/output/points", latest_only(reliable))
+        self._detections = self.create_publisher(Detection3DArray, "~/output/detections", latest_only(reliable))
+        self._info = self.create_publisher(LabelInfo, "~/label_info", latest_only(reliable, latched=True))
         self._labeller = CloudLabeller(
             self._segmenter(self._value("labels")), ros_messages, self._target_frame, self._value("minimum_points")
         )
@@ -80,7 +81,7 @@ class SegmentNode(Node):
         self._waiting: tuple[Any, float] | None = None
         self._transforms = Buffer()
         self._listener = TransformListener(self._transforms, self)
-        self.create_subscription(PointCloud2, "~/input/points", self._on_cloud, _latest(best_effort))
+        self.create_subscription(PointCloud2, "~/input/points", self._on_cloud, latest_only(best_effort))
         self.create_timer(RETRY_S, self._work)
 
     def _load(self) -> LabelledScene:
@@ -117,7 +118,7 @@ class SegmentNode(Node):
             try:
                 self._labeller.segmenter = self._segmenter(labels or [])
             except Exception as error:  # words come from outside, and a robot goes on with those that it had
-                return SetParametersResult(successful=False, reason=_told(error))
+                return SetParametersResult(successful=False, reason=told(error))
             self._announce()
         return SetParametersResult(successful=True)
 
@@ -135,47 +136,45 @@ class SegmentNode(Node):
         message, arrived = self._waiting
         self._waiting = None
         try:
-            labelled = self._labeller(message, self._pose(message.header))
+            labelled = self._labeller(message, pose_at(self._transforms, self._target_frame, message.header))
         except TransformException as error:
             if time.monotonic() - arrived <= self._max_age:
                 self._waiting = message, arrived
             else:
                 self._warn(f"a cloud was dropped, its transform did not come within {self._max_age} s: {error}")
         except Exception as error:  # whatever a message holds, the node goes on
-            self._warn(f"a cloud was dropped: {_told(error)}")
+            self._warn(f"a cloud was dropped: {told(error)}")
         else:
             self._points.publish(labelled.points)
             self._detections.publish(labelled.detections)
-
-    def _pose(self, head: Any) -> NDArray[np.float64]:
-        """(4, 4) from the cloud's frame to the scene's, at the cloud's time; tf2's TransformException without one."""
-        found = self._transforms.lookup_transform(self._target_frame, head.frame_id, Time.from_msg(head.stamp))
-        place, turn = found.transform.translation, found.transform.rotation
-        pose = np.eye(4)
-        pose[:3, :3] = rotation_matrix((turn.x, turn.y, turn.z, turn.w))
-        pose[:3, 3] = place.x, place.y, place.z
-        return pose
 
     def _warn(self, text: str) -> None:
         self.get_logger().warning(text, throttle_duration_sec=QUIET_S)
 
 
-def _told(error: Exception) -> str:
+def pose_at(transforms: Buffer, target: str, head: Any) -> NDArray[np.float64]:
+    """(4, 4) from a message's frame to the target, at the message's time; tf2's TransformException without one."""
+    found = transforms.lookup_transform(target, head.frame_id, Time.from_msg(head.stamp))
+    place, turn = found.transform.translation, found.transform.rotation
+    return rigid(rotation_matrix((turn.x, turn.y, turn.z, turn.w)), np.array([place.x, place.y, place.z]))
+
+
+def told(error: Exception) -> str:
     """An error of ours says what is wrong and what helps; of another the kind is worth knowing."""
     return str(error) if isinstance(error, (OgPointcloudError, OSError)) else f"{type(error).__name__}: {error}"
 
 
-def _latest(reliability: Any, latched: bool = False) -> Any:
+def latest_only(reliability: Any, latched: bool = False) -> Any:
     """The newest message alone. A reliable publisher serves subscribers of both kinds."""
     durability = QoSDurabilityPolicy.TRANSIENT_LOCAL if latched else QoSDurabilityPolicy.VOLATILE
     return QoSProfile(history=QoSHistoryPolicy.KEEP_LAST, depth=1, reliability=reliability, durability=durability)
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the node until it is stopped. Returns the exit code, 2 for a scene or words that cannot be used."""
+def run(make: Callable[[], Node], arguments: Sequence[str] | None) -> int:
+    """Make a node and run it until it is stopped. Returns the exit code, 2 for what it cannot use."""
     rclpy.init(args=arguments)
     try:
-        node = SegmentNode()
+        node = make()
     except (OgPointcloudError, OSError) as error:
         rclpy.logging.get_logger("og_pointcloud").fatal(str(error))
         rclpy.try_shutdown()
@@ -188,3 +187,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         node.destroy_node()
         rclpy.try_shutdown()
     return 0
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the node until it is stopped. Returns the exit code, 2 for a scene or words that cannot be used."""
+    return run(SegmentNode, arguments)

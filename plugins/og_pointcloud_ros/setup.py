@@ -12,13 +12,13 @@ setup(
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),
-        (f"share/{NAME}/launch", ["launch/segment.launch.py"]),
-        (f"share/{NAME}/config", ["config/parameters.yaml"]),
+        (f"share/{NAME}/launch", ["launch/segment.launch.py", "launch/map.launch.py"]),
+        (f"share/{NAME}/config", ["config/parameters.yaml", "config/map.yaml"]),
     ],
     install_requires=["setuptools"],
     zip_safe=True,
     author="The og_pointcloud contributors",
     description="Labels point clouds by words, with the map that og_pointcloud fitted.",
     license="Apache-2.0",
-    entry_points={"console_scripts": [f"segment = {NAME}.node:main"]},
+    entry_points={"console_scripts": [f"segment = {NAME}.node:main", f"map = {NAME}.map_node:main"]},
 )

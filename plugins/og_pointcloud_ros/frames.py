@@ -1,0 +1,117 @@
+"""Messages of one stamp -> a frame of a map: depth and colour images, masks with features, the camera.
+
+Depth is 16UC1 in millimetres or 32FC1 in metres. Masks are 16UC1 or 32SC1: 0 none, else a number from 1 that means
+something in this image alone. A PointCloud2 with a field ``feature`` has a row a mask: what the encoder saw of masks 1,
+2, ... CameraInfo is of rectified images.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from og_pointcloud.errors import SceneError
+from og_pointcloud.mapping.frame import Frame
+from og_pointcloud.scene import Camera
+from og_pointcloud_ros.messages import NANOSECONDS, nanoseconds
+from og_pointcloud_ros.pointcloud2 import read_fields
+
+__all__ = ["WHOLE", "FrameAssembler", "image_array"]
+
+WHOLE = ("depth", "masks", "features")
+"""What a frame waits for."""
+ENCODINGS = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4", "32SC1": "i4", "rgb8": "u1", "bgr8": "u1", "mono8": "u1"}
+
+
+def image_array(message: Any) -> NDArray[Any]:
+    """(H, W) or (H, W, 3) pixels of a sensor_msgs/Image, colours as RGB. SceneError for an encoding that is unknown."""
+    encoding = str(message.encoding)
+    if encoding not in ENCODINGS:
+        raise SceneError(f"image encoding is '{encoding}'; expected one of {', '.join(ENCODINGS)}")
+    kind = np.dtype(ENCODINGS[encoding]).newbyteorder(">" if message.is_bigendian else "<")
+    data = np.frombuffer(np.asarray(message.data, np.uint8).tobytes(), np.uint8)
+    channels = 3 if encoding in ("rgb8", "bgr8") else 1
+    line = message.width * channels * kind.itemsize
+    if message.step < line or len(data) < message.step * message.height:
+        raise SceneError(f"image has {len(data)} bytes, {message.step} a line; expected {message.height} of {line}")
+    lines = data[: message.step * message.height].reshape(message.height, message.step)[:, :line]
+    pixels = np.ascontiguousarray(lines).view(kind).reshape(message.height, message.width, channels)
+    pixels = pixels.astype(kind.newbyteorder("="))
+    return pixels[..., ::-1] if encoding == "bgr8" else pixels if channels == 3 else pixels[..., 0]
+
+
+@dataclass
+class _Parts:
+    """What has come of one stamp. frame_id: of the camera."""
+
+    frame_id: str = ""
+    depth: NDArray[Any] | None = None
+    masks: NDArray[Any] | None = None
+    color: NDArray[Any] | None = None
+    features: NDArray[Any] | None = None
+
+
+class FrameAssembler:
+    """Puts messages together by their stamps. whole: roles that a frame waits for. waiting: by stamp, in nanoseconds,
+    in the order in which they came."""
+
+    def __init__(self, whole: Iterable[str] = WHOLE) -> None:
+        self.whole, self.waiting = tuple(whole), dict[int, _Parts]()
+        self._info: Any = None
+
+    def add(self, role: str, message: Any) -> None:
+        """Take a message of a role: "info" or a field of `_Parts`. SceneError for what it is not."""
+        stamp = nanoseconds(message.header.stamp)
+        if role == "info":
+            self._info = message
+            return
+        parts = self.waiting.setdefault(stamp, _Parts())
+        if role == "features":
+            rows = read_fields(message)
+            if "feature" not in (rows.dtype.names or ()):
+                raise SceneError(
+                    f"features have fields {rows.dtype.names}; expected a field 'feature' with a row a mask"
+                )
+            parts.features = np.asarray(rows["feature"], np.float32).reshape(message.width * message.height, -1)
+        else:
+            parts.frame_id = message.header.frame_id
+            setattr(parts, role, image_array(message))
+
+    def is_whole(self, stamp: int) -> bool:
+        """Whether all that a frame waits for has come, the camera among it."""
+        parts = self.waiting[stamp]
+        return self._info is not None and all(getattr(parts, role) is not None for role in self.whole)
+
+    def frame(self, stamp: int, pose: Callable[[str, int], NDArray[np.float64]]) -> Frame | None:
+        """The frame of a stamp, from what has come of it; None where that shows nothing. Call `forget` when it is used.
+
+        pose: (frame id, stamp) -> (4, 4) from there to the map; what it raises is raised. SceneError without a camera.
+        """
+        parts = self.waiting[stamp]
+        has_masks = parts.masks is not None and parts.features is not None
+        if parts.depth is None and not has_masks:
+            return None
+        if self._info is None:
+            raise SceneError("no camera_info came with it")
+        camera = _camera(self._info, np.linalg.inv(pose(parts.frame_id, stamp)))
+        depth = parts.depth
+        if depth is not None and depth.dtype.kind == "u":
+            depth = depth.astype(np.float32) * np.float32(1e-3)
+        masks = parts.masks.astype(np.int64) - 1 if has_masks and parts.masks is not None else None
+        features = parts.features if has_masks else None
+        return Frame(camera, masks, features, depth, rgb=parts.color, stamp=stamp / NANOSECONDS)
+
+    def forget(self, stamp: int) -> None:
+        """Let go of a stamp."""
+        self.waiting.pop(stamp, None)
+
+
+def _camera(info: Any, world_to_camera: NDArray[np.float64]) -> Camera:
+    if np.any(np.abs(np.asarray(info.d, np.float64)) > 1e-9):
+        raise SceneError("camera_info has distortion; expected rectified images: record image_rect topics")
+    k = np.asarray(info.k, np.float64)
+    return Camera(int(info.width), int(info.height), k[0], k[4], k[2], k[5], world_to_camera)

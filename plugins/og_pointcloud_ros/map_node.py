@@ -1,0 +1,162 @@
+"""The ROS 2 node that maps: images with depth and masks in, objects with their state out. It needs ROS.
+
+Subscribes ~/input/depth, ~/input/masks, ~/input/color (sensor_msgs/Image), ~/input/features (PointCloud2) and
+~/input/info (CameraInfo), all as `frames` reads them; messages of one stamp are one frame, placed by tf at that stamp.
+Publishes ~/objects (vision_msgs/Detection3DArray, latched) after each frame: ids, boxes, and as class id the state:
+present, moved, unseen or gone. Serves ~/save, ~/load and ~/reset (std_srvs/Trigger): the map to and from the file that
+the parameter ``map`` names, and an empty one.
+
+Frames go through a queue into a thread of its own, so that no sensor waits; what gets too old there, or waits too long
+for its masks or transform, is dropped or used as it is, and said to be. No message ends the node.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from functools import partial
+from types import SimpleNamespace
+from typing import Any
+
+from rclpy.node import Node  # pyright: ignore[reportMissingImports]
+from rclpy.qos import (  # pyright: ignore[reportMissingImports]
+    QoSDurabilityPolicy,
+    QoSHistoryPolicy,
+    QoSProfile,
+    QoSReliabilityPolicy,
+)
+from sensor_msgs.msg import CameraInfo, Image, PointCloud2  # pyright: ignore[reportMissingImports]
+from std_srvs.srv import Trigger  # pyright: ignore[reportMissingImports]
+from tf2_ros import Buffer, TransformException, TransformListener  # pyright: ignore[reportMissingImports]
+from vision_msgs.msg import Detection3DArray  # pyright: ignore[reportMissingImports]
+
+from og_pointcloud.errors import OgPointcloudError
+from og_pointcloud.mapping.frame_queue import FrameQueue
+from og_pointcloud.mapping.mapper import FrameChange, Mapper
+from og_pointcloud_ros.detections import to_objects
+from og_pointcloud_ros.frames import FrameAssembler
+from og_pointcloud_ros.messages import ros_messages, time_message
+from og_pointcloud_ros.node import QUIET_S, RETRY_S, latest_only, pose_at, run, told
+
+__all__ = ["MapNode", "main"]
+
+PARAMETERS = {"map": "", "target_frame": "map", "feature_space": "unknown", "max_age": 2.0}
+"""With their defaults; config/map.yaml explains them."""
+INPUTS = {"depth": Image, "masks": Image, "color": Image, "features": PointCloud2, "info": CameraInfo}
+QUEUED = 10
+"""Messages of a topic that may wait while a service answers."""
+
+
+class MapNode(Node):
+    """See the module."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__("og_pointcloud_map", **options)
+        for name, default in PARAMETERS.items():
+            self.declare_parameter(name, default)
+        self._target_frame, self._max_age = self._value("target_frame"), self._value("max_age")
+        self._assembler, self._arrived = FrameAssembler(), dict[int, float]()
+        self._transforms = Buffer()
+        self._listener = TransformListener(self._transforms, self)
+        reliable = QoSReliabilityPolicy.RELIABLE
+        self._objects = self.create_publisher(Detection3DArray, "~/objects", latest_only(reliable, latched=True))
+        self._queue = FrameQueue(self._empty(), max_age=self._max_age, on_change=self._on_change, on_drop=self._warn)
+        quality = QoSProfile(
+            history=QoSHistoryPolicy.KEEP_LAST, depth=QUEUED, reliability=QoSReliabilityPolicy.BEST_EFFORT,
+            durability=QoSDurabilityPolicy.VOLATILE,
+        )  # fmt: skip
+        for role, kind in INPUTS.items():
+            self.create_subscription(kind, f"~/input/{role}", partial(self._on_message, role), quality)
+        for name, serve in {"save": self._save, "load": self._load, "reset": self._reset}.items():
+            self.create_service(Trigger, f"~/{name}", partial(self._serve, serve))
+        self.create_timer(RETRY_S, self._work)
+
+    def _value(self, name: str) -> Any:
+        return self.get_parameter(name).value
+
+    def _empty(self) -> Mapper:
+        return Mapper(feature_space=self._value("feature_space"))
+
+    def _on_message(self, role: str, message: Any) -> None:
+        try:
+            self._assembler.add(role, message)
+        except Exception as error:  # whatever a message holds, the node goes on
+            self._warn(f"{role} was dropped: {told(error)}")
+        self._work()
+
+    def _work(self) -> None:
+        """Hand on the frames that are whole, or have waited long enough for the rest."""
+        now = time.monotonic()
+        self._arrived = {stamp: self._arrived.get(stamp, now) for stamp in self._assembler.waiting}
+        for stamp, arrived in self._arrived.items():
+            is_old = now - arrived > self._max_age
+            if not is_old and not self._assembler.is_whole(stamp):
+                continue
+            try:
+                if (frame := self._assembler.frame(stamp, self._pose)) is not None:
+                    self._queue.put(frame)
+            except TransformException as error:
+                if not is_old:
+                    continue
+                self._warn(f"a frame was dropped, its transform did not come within {self._max_age} s: {error}")
+            except Exception as error:
+                self._warn(f"a frame was dropped: {told(error)}")
+            self._assembler.forget(stamp)
+
+    def _pose(self, frame_id: str, stamp: int) -> Any:
+        head = SimpleNamespace(frame_id=frame_id, stamp=time_message(ros_messages, stamp))
+        return pose_at(self._transforms, self._target_frame, head)
+
+    def _on_change(self, change: FrameChange) -> None:
+        for text, ids in (("gone", change.gone), ("moved", [moved.id for moved in change.moved])):
+            if ids:
+                self.get_logger().info(f"{text}: {', '.join(map(str, ids))}")
+        self._publish()
+
+    def _publish(self) -> None:
+        stamp = self.get_clock().now().to_msg()
+        self._objects.publish(
+            to_objects(self._queue.mapper.objects(), self._target_frame, stamp, messages=ros_messages)
+        )
+
+    def _serve(self, serve: Callable[[], str], _: Any, response: Any) -> Any:
+        """Answer a Trigger: while no frame goes in."""
+        try:
+            with self._queue.lock:
+                response.success, response.message = True, serve()
+        except Exception as error:  # a full disk or a foreign file must not end the map
+            response.success, response.message = False, told(error)
+        return response
+
+    def _save(self) -> str:
+        return f"wrote {self._queue.mapper.save(self._path())}"
+
+    def _load(self) -> str:
+        self._queue.mapper = Mapper(self._path())
+        self._publish()
+        return f"{self._queue.mapper.points:,} points, {len(self._queue.mapper.objects())} objects"
+
+    def _reset(self) -> str:
+        self._queue.mapper = self._empty()
+        self._publish()
+        return "the map is empty"
+
+    def _path(self) -> str:
+        if not self._value("map"):
+            raise OgPointcloudError(
+                "the parameter 'map' is empty; expected a .ogpc file: --ros-args -p map:=/maps/room.ogpc"
+            )
+        return self._value("map")
+
+    def _warn(self, text: str) -> None:
+        self.get_logger().warning(text, throttle_duration_sec=QUIET_S)
+
+    def destroy_node(self) -> None:
+        """Ends the queue first."""
+        self._queue.close()
+        super().destroy_node()
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the node until it is stopped. Returns the exit code."""
+    return run(MapNode, arguments)

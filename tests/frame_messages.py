@@ -1,0 +1,50 @@
+"""Frames of a map as ROS messages: what a bag holds and what a node hears."""
+
+from __future__ import annotations
+
+import numpy as np
+from og_pointcloud_ros import write_fields
+from og_pointcloud_ros.messages import header
+
+SECOND = 1_000_000_000
+
+
+def stamp_of(frame):
+    """Nanoseconds."""
+    return int((1 + frame.stamp) * SECOND)
+
+
+def place_of(frame):
+    """The camera in the map: translation (3,) and quaternion x y z w."""
+    pose = np.linalg.inv(frame.camera.world_to_camera)
+    rotation = pose[:3, :3]
+    w = np.sqrt(max(1 + np.trace(rotation), 1e-12)) / 2
+    x, y, z = (rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1])
+    return pose[:3, 3], np.append(np.array([x, y, z]) / (4 * w), w)
+
+
+def image_message(make, array, encoding, stamp):
+    """sensor_msgs/Image of an array (H, W) or (H, W, 3)."""
+    height, width = array.shape[:2]
+    data = np.frombuffer(np.ascontiguousarray(array).tobytes(), np.uint8)
+    return make("sensor_msgs/msg/Image", header=header(make, "camera", stamp), height=height, width=width,
+                encoding=encoding, is_bigendian=0, step=len(data) // height, data=data)  # fmt: skip
+
+
+def messages_of(make, frame):
+    """By role, what a camera and a mask proposer send of a frame."""
+    camera, stamp = frame.camera, stamp_of(frame)
+    k = np.array([camera.fx, 0, camera.cx, 0, camera.fy, camera.cy, 0, 0, 1], np.float64)
+    window = make("sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False)
+    rows = np.zeros(len(frame.features), [("feature", "<f4", (frame.features.shape[1],))])
+    rows["feature"] = frame.features
+    return {
+        "info": make(
+            "sensor_msgs/msg/CameraInfo", header=header(make, "camera", stamp), height=camera.height,
+            width=camera.width, distortion_model="plumb_bob", d=np.zeros(5), k=k, r=np.eye(3).ravel(), p=np.zeros(12),
+            binning_x=0, binning_y=0, roi=window),
+        "depth": image_message(make, (1000 * frame.depth).round().astype(np.uint16), "16UC1", stamp),
+        "color": image_message(make, frame.rgb[..., ::-1], "bgr8", stamp),
+        "masks": image_message(make, (frame.masks + 1).astype(np.uint16), "16UC1", stamp),
+        "features": write_fields(rows, "camera", stamp, messages=make),
+    }  # fmt: skip
