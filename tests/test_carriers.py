@@ -329,6 +329,41 @@ def test_glb_names_labels_and_instances(tmp_path):
     assert nothing["extensionsUsed"] == ["EXT_mesh_features"]
 
 
+def test_glb_of_splats_adds_their_shape(tmp_path):
+    from test_formats_spz import splats
+
+    points = splats(40, center=(3, -4, 5))
+    result = segmentation(np.arange(40) % 4 - 1, ["a", "b", "c"], points.xyz_world)
+    document, arrays = parsed(result.save(tmp_path / "out.glb", points))
+    assert document["extensionsUsed"] == ["EXT_mesh_features", "KHR_gaussian_splatting", "EXT_structural_metadata"]
+    primitive = document["meshes"][0]["primitives"][0]
+    stated = primitive["extensions"]["KHR_gaussian_splatting"]
+    assert (primitive["mode"], stated["kernel"], stated["colorSpace"]) == (0, "ellipse", "srgb_rec709_display")
+    xyzw = arrays["KHR_gaussian_splatting:ROTATION"]
+    assert np.array_equal(np.roll(xyzw, 1, axis=1), points.rotation)
+    assert np.array_equal(arrays["KHR_gaussian_splatting:SCALE"], points.scale)
+    assert np.array_equal(arrays["KHR_gaussian_splatting:OPACITY"][:, 0], points.opacity)
+    color = 0.5 + arrays["KHR_gaussian_splatting:SH_DEGREE_0_COEF_0"] / (2 * np.sqrt(np.pi))
+    assert np.array_equal(np.rint(255 * color), result.colors)
+    assert document["names"]["og_label"] == ["a", "b", "c"]
+    labels = arrays["_FEATURE_ID_0"][:, 0]
+    assert np.array_equal(np.where(labels == 3, -1, labels), result.labels)
+    with pytest.raises(SceneError, match="40 points for 39 labels"):
+        segmentation([0] * 39, ["a"], points.xyz_world[:39]).save(tmp_path / "out.glb", points)
+
+
+def test_spz_holds_splats_in_the_colors_of_their_labels(tmp_path):
+    from test_formats_spz import splats
+
+    points = splats(40)
+    result = segmentation(np.arange(40) % 3, ["a", "b", "c"], points.xyz_world)
+    found = og.read_points(result.save(tmp_path / "out.spz", points))
+    assert np.abs(found.rgb.astype(int) - result.colors).max() <= 2
+    for other in (None, splats(39)):
+        with pytest.raises(og.OgPointcloudError, match=r"out.spz holds splats alone; expected .*--points"):
+            result.save(tmp_path / "out.spz", other)
+
+
 def test_trimesh_opens_it(tmp_path):
     trimesh = pytest.importorskip("trimesh")
     xyz = np.random.default_rng(0).normal((1e6, -4e6, 300), 1, (40, 3))

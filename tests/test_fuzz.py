@@ -6,6 +6,7 @@ Below, by name, files that once got through.
 
 from __future__ import annotations
 
+import gzip
 import hashlib
 import io
 import json
@@ -27,6 +28,7 @@ from hard_cases.inputs import labelled_cloud, scatter, write_two_balls
 from hostile_files import SEEDS, UNKNOWN_GRAPHS, with_graph
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as some
+from test_formats_spz import splats
 
 from og_pointcloud.bundle.read import read_bundle
 from og_pointcloud.cli import main
@@ -41,6 +43,7 @@ from og_pointcloud.formats.ply import join_columns, write_ply
 from og_pointcloud.formats.points import read_points
 from og_pointcloud.formats.poses import in_pinholes
 from og_pointcloud.formats.rgbd import read_rgbd
+from og_pointcloud.formats.spz import write_spz
 from og_pointcloud.scene import Camera, Points
 from og_pointcloud.text.text_features import read_text_features
 
@@ -106,6 +109,12 @@ def _copc(folder: Path) -> list[bytes]:
     pytest.importorskip("laspy")
     write_copc(folder / "made.copc.laz", _xyz(), np.full((12, 3), 99, np.uint8))
     return [(folder / "made.copc.laz").read_bytes()]
+
+
+def _spz(folder: Path) -> list[bytes]:
+    write_spz(folder / "made.spz", splats(12))
+    raw = gzip.decompress((folder / "made.spz").read_bytes())
+    return [(folder / "made.spz").read_bytes(), gzip.compress(raw, compresslevel=0)]  # of the second, damage is read
 
 
 def _images_bin(folder: Path) -> list[bytes]:
@@ -229,6 +238,7 @@ READERS: dict[str, tuple[Callable, Callable]] = {
     "scene.ogpc": (_ogpc, _read_ogpc),
     "cloud.ply": (_ply, lambda path: [read_points(path).xyz]),
     "cloud.pcd": (_pcd, lambda path: [read_points(path).xyz]),
+    "splats.spz": (_spz, lambda path: [read_points(path).xyz]),
     "cloud.las": (_las, lambda path: [read_points(path).xyz]),
     "cloud.copc.laz": (_copc, lambda path: [read_points(path).xyz]),
     "images.bin": (_images_bin, _read_images_bin),

@@ -18,10 +18,11 @@ from og_pointcloud.cloud import TOO_FAR
 from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.formats.atomic import replacing
 from og_pointcloud.formats.colors import label_colors
+from og_pointcloud.scene import Points
 
 __all__ = ["SAVED_AS", "Reason", "Segmentation"]
 
-SAVED_AS = (".npz", ".ply", ".las", ".laz", ".glb")
+SAVED_AS = (".npz", ".ply", ".las", ".laz", ".glb", ".spz")
 """Endings of the files that a result is written to."""
 
 
@@ -118,13 +119,15 @@ class Segmentation:
         """A sensor_msgs/PointCloud2 message with the labels in its fields. Needs the extra 'ros'."""
         return import_plugin("og_pointcloud_ros", "ros").to_pointcloud2(self, frame_id=frame_id, stamp=stamp)
 
-    def save(self, path: str | os.PathLike[str]) -> Path:
+    def save(self, path: str | os.PathLike[str], splats: Points | None = None) -> Path:
         """Write the result, whole or not at all, as what the path's ending says.
 
         .npz: labels, scores, instances, reasons, names and calibrated, and certainty if it is known.
         .ply: a coloured cloud with the `attributes`.
         .las, .laz: with colours, classification and the attributes as extra bytes (needs the extra 'las').
-        .glb: coloured points with feature ids.
+        .glb: coloured points, or splats, with feature ids and names.
+        .spz: splats in the labels' colors; the format has no place for labels.
+        splats: Gaussians, if the points asked about are some, row by row: `read_points` of their file.
         OgPointcloudError for another ending; SceneError where the format cannot hold the points: .las and .glb have no
         room for NaN, .glb none for an empty cloud.
         """
@@ -135,9 +138,19 @@ class Segmentation:
             )
         if path.suffix == ".npz":
             self._save_arrays(path)
+        elif path.suffix == ".spz":
+            self._save_spz(path, splats)
         else:
-            _writer(path.suffix)(path, self.xyz, self.colors, self.attributes, self.names)
+            more = {"splats": splats} if path.suffix == ".glb" else {}
+            _writer(path.suffix)(path, self.xyz, self.colors, self.attributes, self.names, **more)
         return path
+
+    def _save_spz(self, path: Path, splats: Points | None) -> None:
+        from og_pointcloud.formats.spz import write_spz
+
+        if splats is None or len(splats.xyz) != len(self):
+            raise OgPointcloudError(f"{path} holds splats alone; expected those that were asked about (--points S.ply)")
+        write_spz(path, splats, self.colors)
 
     def _save_arrays(self, path: Path) -> None:
         arrays: dict[str, Any] = {

@@ -26,9 +26,9 @@ from og_pointcloud.errors import MissingExtraError, OgPointcloudError, printable
 __all__ = ["main"]
 
 COMMANDS = (
-    "masks", "models", "fit", "map", "update", "compare", "fuse", "repair", "import", "segment", "select", "pick",
-    "instances", "index", "find", "edit", "view", "serve", "ros-bag", "info", "vocabulary", "export", "eval", "report",
-    "demo",
+    "poses", "masks", "models", "fit", "map", "update", "compare", "fuse", "repair", "import", "segment", "select",
+    "pick", "instances", "index", "find", "edit", "view", "serve", "ros-bag", "info", "vocabulary", "export", "eval",
+    "report", "demo",
 )  # fmt: skip
 MODULES = {"import": "import_", "eval": "evaluate", "map": "map_", "ros-bag": "ros_bag"}
 """Command -> its module, where they are not called the same."""

@@ -47,7 +47,14 @@ def add(parser: Parser) -> None:
     place.add_argument("--pose", type=Path, metavar="T.txt", help="4x4 matrix that takes OTHER to CLOUD's frame")
     place.add_argument("--at", metavar="X,Y,Z", help="move it by this, without turning it")
     for operation in operations.choices.values():
-        add_output(operation, "-o", "--output", endings=(".ply",), required=True, help="the edited cloud")
+        add_output(
+            operation,
+            "-o",
+            "--output",
+            endings=(".ply", ".spz"),
+            required=True,
+            help="the edited cloud; .spz of splats",
+        )
         add_shared(operation, "--json")
 
 

@@ -26,7 +26,7 @@ from og_pointcloud.cli.common import (
 if TYPE_CHECKING:
     from og_pointcloud.ask.segmentation import Segmentation
 
-SAVED_AS = (".npz", ".ply", ".las", ".laz", ".glb")
+SAVED_AS = (".npz", ".ply", ".las", ".laz", ".glb", ".spz")
 """As `og_pointcloud.ask.segmentation.SAVED_AS`; --help does not import numpy."""
 
 
@@ -35,26 +35,28 @@ def add(parser: Parser) -> None:
     parser.add_argument("--points", type=Path, metavar="CLOUD", help="points to label (default: those fitted)")
     add_output(
         parser, "-o", "--output", endings=SAVED_AS, metavar="OUT",
-        help="labels as .npz, or a coloured .ply, .las, .laz or .glb",
+        help="labels as .npz, or a coloured .ply, .las, .laz or .glb; of splats .glb or .spz",
     )  # fmt: skip
 
 
 def run(arguments: argparse.Namespace) -> None:
     from og_pointcloud.ask.labelled_scene import load, segment
+    from og_pointcloud.formats.points import read_points
 
     stages: list[dict[str, Any]] = []
     with timed(stages, "load"):
         scene = load(arguments.bundle)
+        points = read_points(arguments.points) if arguments.points else None
     with timed(stages, "segment"):
         result = segment(
-            arguments.points or scene,
+            scene if points is None else points.xyz_world,
             names_in(arguments.labels),
             scene=scene,
             text_features=arguments.text_features,
         )
     if arguments.output:
         with timed(stages, "save"):
-            result.save(arguments.output)
+            result.save(arguments.output, points if points is not None and points.scale is not None else None)
     report = describe_segmentation(result, stages, arguments.bundle, arguments.output)
     print_result(arguments, report, print_segmentation)
 

@@ -20,7 +20,7 @@ from og_pointcloud.formats.ply import join_columns
 from og_pointcloud.formats.tables import colors, positions, stack_columns, storable_positions
 from og_pointcloud.scene import Points
 
-__all__ = ["gaussian_rows", "gaussians_from_ply", "holds_gaussians", "latest_iteration"]
+__all__ = ["activated", "gaussian_rows", "gaussians_from_ply", "holds_gaussians", "latest_iteration"]
 
 SH_CONSTANT = 0.28209479177387814
 """The spherical harmonic of degree 0, 1 / (2 sqrt(pi)): colour = 0.5 + SH_CONSTANT * f_dc."""
@@ -102,7 +102,7 @@ def _trained(vertex: NDArray[np.void]) -> Points:
     else:  # nerfstudio's exporter writes red, green, blue instead where it is asked for colours
         rgb = colors(vertex)
         color = None if rgb is None else rgb / 255
-    return _gaussians(positions(vertex), scale, stack_columns(vertex, ROTATION, np.float64), opacity, color)
+    return activated(positions(vertex), scale, stack_columns(vertex, ROTATION, np.float64), opacity, color)
 
 
 def _compressed(elements: Elements) -> Points:
@@ -132,7 +132,7 @@ def _compressed(elements: Elements) -> Points:
         color = _between(chunk, ("min_r", "min_g", "min_b"), ("max_r", "max_g", "max_b"), color)
     with np.errstate(over="ignore"):
         scale = np.exp(log_scale).astype(np.float32)
-    return _gaussians(xyz, scale, _unpack_rotation(words["packed_rotation"]), rgba[:, 3], color)
+    return activated(xyz, scale, _unpack_rotation(words["packed_rotation"]), rgba[:, 3], color)
 
 
 def _unpack(words: NDArray[np.uint32], bits: tuple[int, ...] = (11, 10, 11)) -> NDArray[np.float64]:
@@ -167,7 +167,7 @@ def _unpack_rotation(words: NDArray[np.uint32]) -> NDArray[np.float64]:
     return quaternions
 
 
-def _gaussians(
+def activated(
     xyz: NDArray[np.float64],
     scale: NDArray[np.float32],
     rotation: NDArray[np.float64],

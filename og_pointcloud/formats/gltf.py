@@ -1,8 +1,9 @@
-"""Labelled clouds as glTF 2.0, binary (.glb). Out only.
+"""Labelled clouds and splats as glTF 2.0, binary (.glb). Out only.
 
-Points with colors, label and instance as feature ids (EXT_mesh_features, attributes _FEATURE_ID_0 and _FEATURE_ID_1),
-their names in property tables (EXT_structural_metadata), which Cesium shows for a picked feature and styles by; score
-and reason as attributes of our own, names in the mesh's extras too.
+Points with colors, splats with what KHR_gaussian_splatting adds (viewers without it draw points), label and instance as
+feature ids (EXT_mesh_features, attributes _FEATURE_ID_0 and _FEATURE_ID_1), their names in property tables
+(EXT_structural_metadata), which Cesium shows for a picked feature and styles by; score and reason as attributes of our
+own, names in the mesh's extras too.
 
 Format: Khronos, "glTF 2.0 Specification", and the extensions' texts.
 """
@@ -21,8 +22,9 @@ from numpy.typing import NDArray
 
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.atomic import replacing
+from og_pointcloud.formats.gaussian_ply import SH_CONSTANT
 from og_pointcloud.formats.tables import LABEL_FINITE, naming
-from og_pointcloud.scene import require_finite
+from og_pointcloud.scene import Points, require_finite
 
 __all__ = ["write_gltf"]
 
@@ -32,6 +34,9 @@ COMPONENT_TYPES = {"f": 5126, "H": 5123}
 VECTOR_TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 GLB_MAGIC, GLB_VERSION, JSON_CHUNK, BINARY_CHUNK = b"glTF", 2, b"JSON", b"BIN\0"
 FEATURES, METADATA = "EXT_mesh_features", "EXT_structural_metadata"
+SPLATS = "KHR_gaussian_splatting"
+SPLATS_AS = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
+"""How splats are trained: sRGB colors as they are shown."""
 ALIGNMENT = 8
 """Of the buffers of property tables; columns need 4."""
 NAME = "name"
@@ -44,6 +49,7 @@ def write_gltf(
     rgb: NDArray[np.uint8],
     attributes: Mapping[str, NDArray],
     names: Sequence[str],
+    splats: Points | None = None,
 ) -> None:
     """Write a labelled cloud as .glb; whole or not at all.
 
@@ -53,6 +59,7 @@ def write_gltf(
     attributes: og_label, og_instance (n,) int32, og_score (n,) float32, og_reason (n,) uint8. Ids below 0 become the
         feature id that says "none"; og_reason tells which none.
     names: what og_label counts.
+    splats: Gaussians, row by row those of xyz_world; their shape and opacity are kept, their color is ``rgb``.
     SceneError where there are no points or a coordinate is not finite.
     """
     path = Path(path)
@@ -75,6 +82,7 @@ def write_gltf(
             },
             "_OG_SCORE": attributes["og_score"].astype(np.float32),
             "_OG_REASON": attributes["og_reason"].astype(np.float32),
+            **({} if splats is None else _splat_columns(splats, rgb)),
         }
         feature_sets = [
             # featureCount: at least 1, as the schema has it
@@ -86,11 +94,25 @@ def write_gltf(
             }
             for index, (label, (ids, none)) in enumerate(features.items())
         ]
-        document, binary = _document(columns, origin, {FEATURES: {"featureIds": feature_sets}}, names)
+        extensions = {FEATURES: {"featureIds": feature_sets}} | ({} if splats is None else {SPLATS: SPLATS_AS})
+        document, binary = _document(columns, origin, extensions, names)
         tables = {"og_label": list(names), "og_instance": _instance_names(attributes, names)}
         binary += _add_names(document, len(binary), tables, feature_sets)
         with replacing(path) as file:
             file.write(_as_glb(document, binary))
+
+
+def _splat_columns(splats: Points, rgb: NDArray[np.uint8]) -> dict[str, NDArray[np.float32]]:
+    """Attributes of KHR_gaussian_splatting: quaternions x y z w, linear scales, opacity, the constant harmonic."""
+    if splats.rotation is None or splats.scale is None or splats.opacity is None or len(splats.xyz) != len(rgb):
+        raise SceneError(f"{len(splats.xyz)} points for {len(rgb)} labels; expected as many Gaussians")
+    columns = {
+        "ROTATION": splats.rotation[:, [1, 2, 3, 0]],
+        "SCALE": splats.scale,
+        "OPACITY": splats.opacity,
+        "SH_DEGREE_0_COEF_0": ((rgb / 255 - 0.5) / SH_CONSTANT).astype(np.float32),
+    }
+    return {f"{SPLATS}:{name}": column for name, column in columns.items()}
 
 
 def _linear_colors(rgb: NDArray[np.uint8]) -> NDArray[np.uint16]:

@@ -17,6 +17,7 @@ from og_pointcloud.formats.las import SIGNATURE as LAS_SIGNATURE
 from og_pointcloud.formats.las import read_las
 from og_pointcloud.formats.pcd import looks_like_pcd, read_pcd
 from og_pointcloud.formats.ply import HEADER_LIMIT, plain_rows, read_ply, write_ply
+from og_pointcloud.formats.spz import looks_like_spz, read_spz
 from og_pointcloud.formats.tables import colors, naming, positions
 from og_pointcloud.scene import Points
 
@@ -24,12 +25,12 @@ __all__ = ["read_points", "write_labelled_ply"]
 
 
 def read_points(path: str | os.PathLike[str]) -> Points:
-    """A plain cloud (PLY, PCD, LAS, LAZ, COPC, E57) or Gaussians (3DGS PLY, SuperSplat's), whatever the file's name.
+    """A plain cloud (PLY, PCD, LAS, LAZ, COPC, E57) or Gaussians (PLY, SuperSplat's, SPZ), whatever the file's name.
 
     World coordinates are read as float64; their median becomes the origin. Colours come as uint8 RGB, None where the
     file has none.
     SceneError, beginning with the path, for what cannot be read, has no points, or holds NaN. LAS and LAZ need the
-    extra 'las', E57 'e57'.
+    extra 'las', E57 'e57', the newest SPZ 'spz'.
 
     >>> import pathlib, tempfile
     >>> path = og.segment(cloud).save(pathlib.Path(tempfile.mkdtemp()) / "two.ply")  # of `LabelledCloud`'s example
@@ -56,10 +57,13 @@ def read_points(path: str | os.PathLike[str]) -> Points:
             return read_las(path)
         if head.startswith(E57_SIGNATURE):
             return read_e57(path)
+        if looks_like_spz(head):
+            return read_spz(path)
         start = f"it starts with {head[:16]!r}" if head else "it is empty"
         raise SceneError(
             f"not a geometry file that can be read ({start}); expected a PLY (plain cloud, 3D Gaussians, or SuperSplat "
-            "compressed), a PCD (ascii, binary, binary_compressed), a LAS, LAZ or COPC, or an E57: convert it first"
+            "compressed), a PCD (ascii, binary, binary_compressed), a LAS, LAZ or COPC, an E57 or an SPZ: convert it"
+            " first"
         )
 
 

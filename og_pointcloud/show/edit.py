@@ -5,8 +5,9 @@
     og.edit.extract(scene, og.pick(scene, (1.2, 0.4, 0.8)), "mug.ply", cloud="kitchen.ply")
     og.edit.insert("kitchen.ply", "mug.ply", "two_mugs.ply", pose)
 
-Results are PLY files of the layout that the cloud had, which any viewer opens. Points that an edit does not concern
-keep every property and value they had: spherical harmonics, normals, whatever a trainer added. Originals stay.
+Results are PLY files of the layout that the cloud had, which any viewer opens, or of splats SPZ. In a PLY, points that
+an edit does not concern keep every property and value they had: spherical harmonics, normals, whatever a trainer added.
+Originals stay.
 
 Which points an object has is decided by the .ogpc file. Where the cloud is the one it was made from, point by point,
 their ids count; else each point of the cloud takes the id of the nearest one of the scene, within its reach.
@@ -32,6 +33,7 @@ from og_pointcloud.errors import OgPointcloudError, SceneError
 from og_pointcloud.formats.gaussian_ply import gaussian_rows, gaussians_from_ply, holds_gaussians
 from og_pointcloud.formats.ply import HEADER_LIMIT, plain_rows, read_ply, write_ply
 from og_pointcloud.formats.points import read_points
+from og_pointcloud.formats.spz import write_spz
 from og_pointcloud.formats.tables import naming, positions
 from og_pointcloud.show.splat_columns import appended, placed, recoloured
 from og_pointcloud.text.words import TextFeatures
@@ -78,7 +80,8 @@ class Edit:
 def remove(scene: SceneLike, what: What, output: str | os.PathLike[str], **options: Unpack[EditOptions]) -> Edit:
     """Write the cloud without some instances.
 
-    scene: a loaded scene, a LabelledCloud or the path of a .ogpc file. what: see `What`. output: a .ply, not an input.
+    scene: a loaded scene, a LabelledCloud or the path of a .ogpc file. what: see `What`. output: a .ply, of splats
+    or .spz, not an input.
     options: see `EditOptions`.
     Raises OgPointcloudError where no instance is meant or none of the cloud's points belongs to it, SceneError for
     a cloud that cannot be read.
@@ -155,9 +158,13 @@ class _Cloud:
 
     def write(self, output: str | os.PathLike[str], rows: Rows, verb: str) -> Edit:
         """Write other rows in place of the cloud's."""
-        changed = int(self.chosen.sum())
-        write_ply(output, {**self.elements, "vertex": rows}, [f"edited by og-pointcloud: {changed} points {verb}"])
-        return Edit(Path(output), len(rows), changed, self.instances, self.notes)
+        changed, elements, notes = int(self.chosen.sum()), {**self.elements, "vertex": rows}, self.notes
+        if Path(output).suffix == ".spz":
+            notes = (*notes, "SPZ: harmonics above the constant one and other properties are left out")
+            write_spz(output, gaussians_from_ply(elements))
+        else:
+            write_ply(output, elements, [f"edited by og-pointcloud: {changed} points {verb}"])
+        return Edit(Path(output), len(rows), changed, self.instances, notes)
 
 
 def _subject(
@@ -238,8 +245,8 @@ def _halo(
 
 def _check_output(output: str | os.PathLike[str], inputs: Iterable[str | os.PathLike[str]]) -> None:
     path = Path(output)
-    if path.suffix != ".ply":
-        raise OgPointcloudError(f"the output is '{path}'; expected a name that ends in .ply")
+    if path.suffix not in (".ply", ".spz"):
+        raise OgPointcloudError(f"the output is '{path}'; expected a name that ends in .ply, or .spz of splats")
     for source in inputs:
         if path.exists() and Path(source).exists() and path.samefile(source):
             raise OgPointcloudError(
@@ -256,6 +263,10 @@ def _read(path: Path) -> _Cloud:
         head = file.read(HEADER_LIMIT).partition(b"end_header")[0]
     if not head.startswith(b"ply"):
         points = read_points(path)
+        if points.scale is not None:
+            return _Cloud(
+                {"vertex": gaussian_rows(points)}, (f"{path}: harmonics above the constant one are left out",)
+            )
         columns = f"{path}: only positions and colours are kept, as a PLY"
         return _Cloud({"vertex": plain_rows(points.xyz_world, points.rgb)}, (columns,))
     with naming(path):

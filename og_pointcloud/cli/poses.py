@@ -1,0 +1,47 @@
+"""Find the poses of photographs, and points, by structure from motion: a capture for `masks`. A help, not a promise.
+
+og-pointcloud poses photographs -o desk
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+from og_pointcloud.cli.common import Parser, check_at_least, print_next, some_of
+
+
+def add(parser: Parser) -> None:
+    parser.add_argument("photographs", type=Path, metavar="FOLDER", help="with the photographs, or with an images/")
+    parser.add_argument(
+        "-o", "--output", type=Path, metavar="CAPTURE", help="the folder to make (default: in FOLDER itself)"
+    )
+    parser.add_argument(
+        "--longest-side", type=int, default=1600, metavar="PX", help="larger images are shrunk to this (default: 1600)"
+    )
+    parser.add_argument(
+        "--threads", type=int, default=1, metavar="N",
+        help="more are faster, and may give a slightly different model each time (default: 1)",
+    )  # fmt: skip
+
+
+def run(arguments: argparse.Namespace) -> None:
+    check_at_least("--longest-side", arguments.longest_side, 100)
+    check_at_least("--threads", arguments.threads, 1)
+    from og_pointcloud.formats.structure_from_motion import find_poses
+
+    found = find_poses(
+        arguments.photographs, arguments.output, longest_side=arguments.longest_side, threads=arguments.threads,
+        progress=True,
+    )  # fmt: skip
+    features, matches, mapping = found.seconds
+    if found.left_out:
+        count = len(found.left_out)
+        print(f"warning: {count} photographs found no place: {some_of(found.left_out)}", file=sys.stderr)
+    print(
+        f"{found.registered} of {found.of} photographs have poses, {found.points:,} points, mean error "
+        f"{found.error_px:.2f} px (features {features:.0f} s, matches {matches:.0f} s, mapping {mapping:.0f} s)"
+    )
+    print(f"wrote {found.capture / 'sparse'}; its scale is free")
+    print_next("masks", found.capture)

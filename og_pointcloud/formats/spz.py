@@ -1,0 +1,228 @@
+"""SPZ, Niantic's packed splats: in (versions 2 to 4) and out (version 3).
+
+A header, then a column behind the other: positions as 24-bit fixed point, opacity, color, log scale in a byte each,
+rotations as three bytes x y z (version 2) or the smallest three of four in 32 bits. Versions 2 and 3 are one gzip of
+both; version 4 packs each column by itself with zstd, which needs the extra 'spz'. SPZ's axes are OpenGL's (y up, z
+back), a PLY's and the scene's are as trained (y down, z forward): converters turn y and z around, and so is it here.
+
+Harmonics above the constant one are not read, as of PLY files, nor written.
+
+Format: nianticlabs/spz, README, "Internals"; held against SuperSplat's files in the tests.
+"""
+
+from __future__ import annotations
+
+import gzip
+import os
+import struct
+import zlib
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from og_pointcloud.errors import MissingExtraError, SceneError
+from og_pointcloud.formats.atomic import replacing
+from og_pointcloud.formats.gaussian_ply import SH_CONSTANT, activated
+from og_pointcloud.formats.tables import naming
+from og_pointcloud.scene import Points
+
+__all__ = ["looks_like_spz", "read_spz", "write_spz"]
+
+Bytes = NDArray[np.uint8]
+Doubles = NDArray[np.float64]
+
+MAGIC, GZIP = b"NGSP", b"\x1f\x8b"
+HEADER = struct.Struct("<4sIIBBBB")
+"""Magic, version, splats, degree of the harmonics, fraction bits, flags, and of version 4 the number of columns."""
+HARMONICS = (0, 3, 8, 15, 24)
+"""Coefficients a channel above the constant one, by degree."""
+COLOR_SCALE, LOG_SCALE_STEPS, LOG_SCALE_LEAST = 0.15, 16.0, -10.0
+FIXED_POINT = 1 << 23
+MOST_FRACTION_BITS = 23
+MAGNITUDE = 511
+"""The largest of the nine bits that a part of a rotation has beside its sign."""
+TURNED = np.array([1.0, -1.0, -1.0])
+"""Factors of x, y, z, of positions and of quaternions, from one convention of axes to the other."""
+MOST_RATIO, PLENTY = 60, 1 << 20
+"""How many times its bytes a file may unpack to, and the bytes that any may: quantised noise shrinks to a half."""
+COARSEST = 1e-4
+"""The step of positions, over the cloud's extent, up to which they may be rounded."""
+
+
+def looks_like_spz(head: bytes) -> bool:
+    """Whether a file that starts so is an SPZ, or a gzip, which no other format here is."""
+    return head.startswith((MAGIC, GZIP))
+
+
+def read_spz(path: str | os.PathLike[str]) -> Points:
+    """Gaussians of an SPZ file; world coordinates, the median as origin.
+
+    SceneError, beginning with the path, for a file that is damaged, foreign, or claims more than it holds;
+    MissingExtraError for version 4 without zstandard.
+    """
+    path = Path(path)
+    with naming(path):
+        data = path.read_bytes()
+        count, bits, columns = _columns(data) if data.startswith(MAGIC) else _unpacked(data)
+        positions, opacity, color, log_scale, rotation = columns
+        xyz = _fixed_point(positions.reshape(count, 3, 3)) / 2.0**bits
+        base = 0.5 + SH_CONSTANT * (color.reshape(count, 3) / 255 - 0.5) / COLOR_SCALE
+        scale = np.exp(log_scale.reshape(count, 3) / LOG_SCALE_STEPS + LOG_SCALE_LEAST).astype(np.float32)
+        xyzw = _three_bytes(rotation) if len(rotation) == 3 * count else _smallest_three(rotation.view("<u4"))
+        wxyz = np.column_stack([xyzw[:, 3], xyzw[:, :3] * TURNED])
+        return activated(xyz * TURNED, scale, wxyz, opacity / 255, base)
+
+
+def write_spz(path: str | os.PathLike[str], points: Points, rgb: Bytes | None = None) -> None:
+    """Write Gaussians as SPZ version 3, whole or not at all. rgb: (n, 3), instead of the points' own colors.
+
+    Scales leave with steps of 6 % between 4.5e-5 and 379, colors with steps of two of 255; positions as finely as
+    24 bits allow. SceneError where these are no Gaussians, or lie so far from 0 that this is too coarse.
+    """
+    path = Path(path)
+    with naming(path):
+        if points.scale is None or points.rotation is None or points.opacity is None:
+            raise SceneError("the points have no scale, rotation and opacity; expected Gaussians: SPZ holds no others")
+        positions, bits = _as_fixed_point(points.xyz_world * TURNED)
+        color = points.rgb if rgb is None else rgb
+        base = (np.full(points.xyz.shape, 127.5) if color is None else color) / 255 - 0.5
+        with np.errstate(divide="ignore"):  # a scale of 0 becomes the smallest
+            steps = (np.log(points.scale.astype(np.float64)) - LOG_SCALE_LEAST) * LOG_SCALE_STEPS
+        columns = (
+            positions,
+            _byte(255 * points.opacity),
+            _byte(255 * (base / SH_CONSTANT * COLOR_SCALE + 0.5)),
+            _byte(steps),
+            _packed_rotation(points.rotation.astype(np.float64)),
+        )
+        header = HEADER.pack(MAGIC, 3, len(points.xyz), 0, bits, 0, 0)
+        with replacing(path) as file:
+            file.write(gzip.compress(b"".join([header, *(column.tobytes() for column in columns)]), mtime=0))
+
+
+# Files -------------------------------------------------------------------------------------------------------------
+
+
+def _sizes(data: bytes, version: int, count: int, degree: int, bits: int, packed: int) -> list[int]:
+    """Bytes of the columns, harmonics last; SceneError where a header cannot be right. packed: bytes of the file."""
+    if data != MAGIC or version not in (2, 3, 4) or degree >= len(HARMONICS) or bits > MOST_FRACTION_BITS:
+        raise SceneError(
+            f"its header says {data!r}, version {version}, degree {degree}, {bits} fraction bits; expected 'NGSP', "
+            f"version 2 to 4, at most {len(HARMONICS) - 1} and {MOST_FRACTION_BITS}: export it again"
+        )
+    if count == 0:
+        raise SceneError("it has 0 splats; expected at least one")
+    sizes = [9 * count, count, 3 * count, 3 * count, (3 if version == 2 else 4) * count, 3 * HARMONICS[degree] * count]
+    if sum(sizes) > max(PLENTY, MOST_RATIO * packed):
+        raise SceneError(
+            f"it claims {count} splats, {sum(sizes)} bytes, in a file of {packed}: it is made to fill memory"
+        )
+    return sizes
+
+
+def _unpacked(data: bytes) -> tuple[int, int, list[Bytes]]:
+    """Number of splats, fraction bits and columns of versions 2 and 3."""
+    stream = zlib.decompressobj(wbits=31)  # with gzip's header
+    try:
+        head = stream.decompress(data, HEADER.size)
+        if len(head) < HEADER.size:
+            raise SceneError(f"its header ends after {len(head)} bytes: copy or export it again")
+        magic, version, count, degree, bits, _, _ = HEADER.unpack(head)
+        sizes = _sizes(magic, version, count, degree, bits, len(data))
+        body = stream.decompress(stream.unconsumed_tail, sum(sizes))
+    except zlib.error as error:
+        raise SceneError(f"not a whole gzip ({error!s:.80}): copy or export it again") from None
+    if len(body) < sum(sizes):
+        raise SceneError(f"{count} splats need {sum(sizes)} bytes, it unpacks to {len(body)}: it is truncated")
+    return count, bits, np.split(np.frombuffer(body, np.uint8), np.cumsum(sizes)[:5])[:5]
+
+
+def _columns(data: bytes) -> tuple[int, int, list[Bytes]]:
+    """The same of version 4: a table of bytes packed and bytes, 64 bits each, then the columns."""
+    try:
+        import zstandard
+    except ImportError as error:
+        raise MissingExtraError("zstandard", "spz") from error
+    if len(data) < HEADER.size + 4:
+        raise SceneError(f"its header ends after {len(data)} bytes: copy or export it again")
+    magic, version, count, degree, bits, _, streams = HEADER.unpack_from(data)
+    sizes = _sizes(magic, version, count, degree, bits, len(data))
+    table = int.from_bytes(data[HEADER.size : HEADER.size + 4], "little")
+    start, columns = table + 16 * streams, []
+    if streams < 5 or start > len(data):
+        raise SceneError(f"its table of {streams} columns at byte {table} does not fit: copy or export it again")
+    for number, size in enumerate(sizes[:5]):
+        packed, claimed = struct.unpack_from("<QQ", data, table + 16 * number)
+        frame = data[start : start + packed]
+        start += packed
+        try:
+            if claimed != size or len(frame) < packed or zstandard.frame_content_size(frame) not in (size, -1):
+                raise SceneError(f"column {number} claims {claimed} bytes in {packed}; expected {size}: copy it again")
+            column = zstandard.ZstdDecompressor(max_window_size=1 << 27).decompress(frame, max_output_size=size)
+        except zstandard.ZstdError as error:
+            raise SceneError(f"column {number} is damaged ({error!s:.80}): copy or export it again") from None
+        if len(column) != size:
+            raise SceneError(f"column {number} unpacks to {len(column)} bytes; expected {size}: copy it again")
+        columns.append(np.frombuffer(column, np.uint8))
+    return count, bits, columns
+
+
+# Numbers -----------------------------------------------------------------------------------------------------------
+
+
+def _byte(values: NDArray[np.floating]) -> Bytes:
+    return np.clip(np.rint(values), 0, 255).astype(np.uint8)
+
+
+def _fixed_point(parts: Bytes) -> NDArray[np.int32]:
+    """(...) whole numbers of three bytes (..., 3) each, the lowest first, with a sign."""
+    low, middle, high = np.moveaxis(parts.astype(np.int32), -1, 0)
+    return ((low | middle << 8 | high << 16) ^ FIXED_POINT) - FIXED_POINT
+
+
+def _as_fixed_point(xyz: Doubles) -> tuple[Bytes, int]:
+    """(n, 9) bytes, and how many of their bits are fractions: as many as the farthest coordinate leaves."""
+    farthest = float(np.abs(xyz).max(initial=0.0))
+    bits = MOST_FRACTION_BITS if farthest < 0.5 else int(np.floor(np.log2((FIXED_POINT - 1) / farthest)))
+    extent = float(np.ptp(xyz, axis=0).max(initial=0.0))
+    if bits < 0 or (extent > 0 and 2.0**-bits > COARSEST * extent):
+        raise SceneError(
+            f"positions reach {farthest:.4g} from 0 over an extent of {extent:.4g}, too far or too little for SPZ's 24 "
+            "bits: move the splats near 0, take a smaller unit, or write a .ply"
+        )
+    steps = np.rint(xyz * 2.0**bits).astype(np.int32)
+    return np.stack([steps & 255, steps >> 8 & 255, steps >> 16 & 255], axis=-1).astype(np.uint8).reshape(-1, 9), bits
+
+
+def _three_bytes(rotation: Bytes) -> Doubles:
+    """(n, 4) quaternions x y z w of version 2, whose w is what is missing to 1."""
+    xyz = rotation.reshape(-1, 3) / 127.5 - 1
+    return np.column_stack([xyz, np.sqrt(np.maximum(0.0, 1 - np.square(xyz).sum(axis=1)))])
+
+
+def _smallest_three(words: NDArray[np.uint32]) -> Doubles:
+    """(n, 4) quaternions x y z w: two bits name the largest, which is positive; the others have nine bits and a sign
+    each, of +-1/sqrt(2), the last one lowest."""
+    largest, rest, parts = words >> 30, words.copy(), np.zeros((len(words), 4))
+    for part in (3, 2, 1, 0):
+        here = largest != part
+        value = (rest & MAGNITUDE) / MAGNITUDE * np.sqrt(0.5)
+        parts[here, part] = np.where(rest >> 9 & 1, -value, value)[here]
+        rest = np.where(here, rest >> 10, rest)
+    missing = np.sqrt(np.maximum(0.0, 1 - np.square(parts).sum(axis=1)))
+    parts[np.arange(len(parts)), largest] = missing
+    return parts
+
+
+def _packed_rotation(wxyz: Doubles) -> NDArray[np.uint32]:
+    """(n,) words that `_smallest_three` reads, of unit quaternions with the scene's axes."""
+    xyzw = np.column_stack([wxyz[:, 1:] * TURNED, wxyz[:, 0]])
+    largest = np.abs(xyzw).argmax(axis=1)
+    xyzw *= np.where(np.take_along_axis(xyzw, largest[:, None], axis=1) < 0, -1.0, 1.0)  # -q turns as q does
+    words = largest.astype(np.uint32)
+    for part in range(4):
+        size = np.minimum(np.rint(np.abs(xyzw[:, part]) * np.sqrt(2) * MAGNITUDE), MAGNITUDE).astype(np.uint32)
+        field = size | (xyzw[:, part] < 0).astype(np.uint32) << 9
+        words = np.where(largest == part, words, words << 10 | field)
+    return words.astype("<u4")

@@ -1,0 +1,215 @@
+"""Photographs without poses -> a COLMAP model with poses and points, through pycolmap (extra 'poses').
+
+SIFT features, matches of pairs, incremental mapping, as COLMAP does them; here are the choices: photographs of one size
+share a lens, every photograph is compared with every other, or, of more than `ALL_PAIRS`, with its neighbours and some
+of all; the largest model is kept, turned so that z is up as the photographer stood. Its scale is free. Seeds are fixed.
+
+Structure from motion fails on bare walls, mirrors, or photographs taken from one spot: it says so, and makes no
+capture of a few that happened to fit.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from og_pointcloud.errors import MissingExtraError, SceneError, printable
+from og_pointcloud.formats.atomic import replacing_folder
+from og_pointcloud.formats.images import image_size
+from og_pointcloud.formats.poses import numbered_images
+from og_pointcloud.formats.tables import naming
+from og_pointcloud.journal import Journal
+
+__all__ = ["PosesFound", "find_poses"]
+
+MODEL_FOLDER = "sparse"
+FEWEST = 3
+"""Photographs that a model is made of at least."""
+LEAST_SHARE = 0.5
+"""Of the photographs must have found their place: fewer are a fragment of the scene, or none."""
+ALL_PAIRS = 120
+"""Photographs up to which all pairs are compared; of more, every k-th with every k-th, so that there are as many."""
+NEIGHBOURS = 10
+"""Photographs before and behind that each is compared with in any case."""
+CHUNK = 64
+"""Pairs between two looks at the keyboard."""
+SEED = 0
+CURE = (
+    "take more photographs from more places, each sharing two thirds with the next, of textured and still things in "
+    "even light, or let the tool that took them export its poses"
+)
+
+
+@dataclass(frozen=True)
+class PosesFound:
+    """capture: where it is. registered, of: photographs with a pose, and all. points: triangulated. error_px: mean of
+    their reprojection. left_out: file names without a pose. seconds: features, matches, mapping, wall clock."""
+
+    capture: Path
+    registered: int
+    of: int
+    points: int
+    error_px: float
+    left_out: tuple[str, ...]
+    seconds: tuple[float, float, float]
+
+
+def find_poses(
+    photographs: str | os.PathLike[str],
+    capture: str | os.PathLike[str] | None = None,
+    *,
+    longest_side: int = 1600,
+    threads: int = 1,
+    progress: bool = False,
+) -> PosesFound:
+    """Make a capture folder of photographs: ``sparse/0``, as COLMAP writes it.
+
+    photographs: the folder with them, or one whose ``images/`` has them. capture: the folder to make, with a link to
+        the photographs; None: beside them.
+    longest_side: features are found in images shrunk to this, pixels. threads: of all steps; one makes the same model
+        again, more of them may not.
+    SceneError where there are too few photographs, a model is there already, or fewer than half find their place.
+    MissingExtraError without pycolmap.
+    """
+    source = Path(photographs)
+    target = source if capture is None else Path(capture)
+    files = numbered_images(source) or numbered_images(source / "images")
+    if len(files) < FEWEST:
+        raise SceneError(f"{source} has {len(files)} photographs; expected {FEWEST} or more, there or in its images/")
+    if (target / MODEL_FOLDER).exists():
+        raise SceneError(f"{target / MODEL_FOLDER} is there already; expected none: remove it, or name another folder")
+    with naming(target), tempfile.TemporaryDirectory(prefix="og-pointcloud-") as work:
+        run = _Run(files, Path(work), longest_side, threads, Journal(progress))
+        times = [time.perf_counter()]
+        for step in (run.find_features, run.match):
+            step()
+            times.append(time.perf_counter())
+        model = run.map()
+        times.append(time.perf_counter())
+        _require_enough(model, files)
+        placed = _put_back_names(model, files)
+        _turn_upright(model)
+        with replacing_folder(target / MODEL_FOLDER) as folder:
+            (folder / "0").mkdir(parents=True)
+            model.write_binary(str(folder / "0"))
+        if capture is not None and not (target / "images").exists():
+            (target / "images").symlink_to(files[0].parent.resolve(), target_is_directory=True)
+    left_out = tuple(file.name for file in files if file.name not in placed)
+    features, matches, mapping = np.diff(times).tolist()
+    return PosesFound(
+        target, len(placed), len(files), model.num_points3D(), float(model.compute_mean_reprojection_error()), left_out,
+        (features, matches, mapping),
+    )  # fmt: skip
+
+
+def _pycolmap() -> Any:
+    try:
+        import pycolmap
+    except ImportError as error:
+        raise MissingExtraError("pycolmap", "poses") from error
+    pycolmap.logging.minloglevel = pycolmap.logging.FATAL  # what fails is said here
+    return pycolmap
+
+
+class _Run:
+    """The three steps on one database. Photographs go by their numbers: COLMAP's list of pairs takes no spaces."""
+
+    def __init__(self, files: Sequence[Path], work: Path, longest_side: int, threads: int, journal: Journal) -> None:
+        self._colmap, self._journal, self._threads = _pycolmap(), journal, threads
+        self._folder, self._database, self._pairs_file = work / "images", work / "database.db", work / "pairs.txt"
+        self._names = [f"{number:06d}{file.suffix}" for number, file in enumerate(files)]
+        self._sizes = [image_size(file) for file in files]
+        self._longest_side = longest_side
+        self._folder.mkdir()
+        for file, name in zip(files, self._names, strict=True):
+            (self._folder / name).symlink_to(file.resolve())
+
+    def find_features(self) -> None:
+        colmap, camera_of_size = self._colmap, dict[tuple[int, int], int]()
+        options = colmap.FeatureExtractionOptions(
+            use_gpu=False, num_threads=self._threads, max_image_size=self._longest_side
+        )
+        for number in self._journal.steps(range(len(self._names)), "features"):
+            reader, size = colmap.ImageReaderOptions(), self._sizes[number]
+            reader.existing_camera_id = camera_of_size.get(size, -1)
+            camera_of_size.setdefault(size, len(camera_of_size) + 1)  # as COLMAP counts them
+            colmap.extract_features(
+                self._database, self._folder, [self._names[number]], colmap.CameraMode.SINGLE, reader, options,
+                colmap.Device.cpu,
+            )  # fmt: skip
+
+    def match(self) -> None:
+        colmap, pairs = self._colmap, _pairs(len(self._names))
+        options = colmap.FeatureMatchingOptions(use_gpu=False, num_threads=self._threads)
+        pairing, verification = colmap.ImportedPairingOptions(), colmap.TwoViewGeometryOptions()
+        pairing.match_list_path, verification.ransac.random_seed = self._pairs_file, SEED
+        for start in self._journal.steps(range(0, len(pairs), CHUNK), "matches"):
+            lines = (f"{self._names[a]} {self._names[b]}\n" for a, b in pairs[start : start + CHUNK])
+            self._pairs_file.write_text("".join(lines))
+            colmap.match_image_pairs(self._database, options, pairing, verification, colmap.Device.cpu)
+
+    def map(self) -> Any:
+        """The largest model, None where there is none."""
+        colmap = self._colmap
+        colmap.set_random_seed(SEED)
+        options = colmap.IncrementalPipelineOptions(num_threads=self._threads, random_seed=SEED, min_model_size=FEWEST)
+        options.mapper.random_seed = options.triangulation.random_seed = SEED
+        steps = iter(self._journal.steps(range(len(self._names)), "mapping"))
+        models = colmap.incremental_mapping(
+            self._database, self._folder, self._folder.with_name("models"), options,
+            next_image_callback=lambda: next(steps, None),
+        )  # fmt: skip
+        return max(models.values(), key=lambda model: model.num_reg_images(), default=None)
+
+
+def _pairs(count: int) -> list[tuple[int, int]]:
+    """Which photographs are compared, in order."""
+    step = max(1, -(-count // ALL_PAIRS))
+    return [
+        (first, second)
+        for first in range(count)
+        for second in range(first + 1, count)
+        if second - first <= NEIGHBOURS or not (first % step or second % step)
+    ]
+
+
+def _require_enough(model: Any, files: Sequence[Path]) -> None:
+    registered = 0 if model is None else model.num_reg_images()
+    if registered < max(FEWEST, LEAST_SHARE * len(files)):
+        raise SceneError(
+            f"{registered} of {len(files)} photographs found their place; expected half of them at least: {CURE}"
+        )
+
+
+def _put_back_names(model: Any, files: Sequence[Path]) -> set[str]:
+    """Call the model's images as their files; the names of those with a pose."""
+    placed = set()
+    for number in model.reg_image_ids():
+        image = model.images[number]
+        image.name = files[int(image.name.partition(".")[0])].name
+        placed.add(printable(image.name))
+    return placed
+
+
+def _turn_upright(model: Any) -> None:
+    """Turn the world so that z is where the photographs' upper borders point to, on average."""
+    poses = [model.images[number].cam_from_world().matrix() for number in model.reg_image_ids()]
+    up = -np.mean([pose[1, :3] for pose in poses], axis=0)
+    if np.linalg.norm(up) > np.finfo(np.float64).eps:
+        colmap = _pycolmap()
+        model.transform(colmap.Sim3d(1.0, colmap.Rotation3d(_to_z(up / np.linalg.norm(up))), np.zeros(3)))
+
+
+def _to_z(up: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(3, 3) rotation that takes a unit vector to z."""
+    side = np.cross(np.eye(3)[np.abs(up).argmin()], up)
+    side /= np.linalg.norm(side)
+    return np.stack([side, np.cross(up, side), up])
