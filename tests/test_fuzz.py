@@ -167,6 +167,17 @@ def _traj(folder: Path) -> list[bytes]:
     return [b"10.001 0.1 0.2 0.3 1 2 3\n10.1 0 0 0 0 0 0\n"]
 
 
+DRIVE = "2013_05_28_drive_0000_sync"
+
+
+def _perspective(folder: Path) -> list[bytes]:
+    return [b"calib_time: x\nS_rect_00: 64 48\nP_rect_00: 70 0 32 0 0 70 24 0 0 0 1 0\n"]
+
+
+def _cam0_to_world(folder: Path) -> list[bytes]:
+    return [b"7 0 0 1 100 -1 0 0 200 0 -1 0 1.5 0 0 0 1\n"]
+
+
 def _e57(folder: Path) -> list[bytes]:
     pye57 = pytest.importorskip("pye57")
     with pye57.E57(str(folder / "made.e57"), mode="w") as file:
@@ -181,10 +192,10 @@ def _read_photogrammetry(path: Path) -> list[np.ndarray]:
 
 
 def _read_in_layout(place: str, images: dict[str, bytes]) -> Callable[[Path], list[np.ndarray]]:
-    """Reads a phone's folder of these images and one file of any content."""
+    """Reads a folder of these images and one file of any content."""
 
     def read(path: Path) -> list[np.ndarray]:
-        folder = path.parent / "phone"
+        folder = path.parent / "capture"
         for name, content in {**images, place: path.read_bytes()}.items():
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             (folder / name).write_bytes(content)
@@ -253,6 +264,26 @@ READERS: dict[str, tuple[Callable, Callable]] = {
         _read_in_layout(
             "lowres_wide.traj",
             {"lowres_wide/1_10.001.png": PICTURE, "lowres_wide_intrinsics/1_10.001.pincam": b"64 48 70 70 32 24"},
+        ),
+    ),
+    "perspective.txt": (
+        _perspective,
+        _read_in_layout(
+            "calibration/perspective.txt",
+            {
+                f"data_poses/{DRIVE}/cam0_to_world.txt": _cam0_to_world(Path())[0],
+                f"data_2d_raw/{DRIVE}/image_00/data_rect/0000000007.png": PICTURE,
+            },
+        ),
+    ),
+    "cam0_to_world.txt": (
+        _cam0_to_world,
+        _read_in_layout(
+            f"data_poses/{DRIVE}/cam0_to_world.txt",
+            {
+                "calibration/perspective.txt": _perspective(Path())[0],
+                f"data_2d_raw/{DRIVE}/image_00/data_rect/0000000007.png": PICTURE,
+            },
         ),
     ),
     "scan.e57": (_e57, lambda path: [read_points(path).xyz]),

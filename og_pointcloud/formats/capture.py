@@ -3,11 +3,11 @@
 Each part comes from the first of these that the folder has.
   poses     ``transforms.json`` (nerfstudio, instant-ngp, Blender), ``transforms_train.json``; COLMAP ``sparse/0`` (of
             ScanNet++ ``dslr/colmap``); Metashape's ``.xml`` and RealityScan's ``.csv`` of cameras; the folders of
-            ScanNet, 7-Scenes, Replica, Polycam, 3D Scanner App and ARKitScenes
+            ScanNet, 7-Scenes, Replica, Polycam, 3D Scanner App, ARKitScenes and KITTI-360
   masks     ``mask_features.npz`` with ``masks/``; LangSplat's ``language_features/``
   geometry  the file given; ``ply_file_path`` of transforms.json; ``points.ply``, ``point_cloud.ply``, the folder's one
-            ``.pcd``; the latest ``point_cloud/iteration_*/point_cloud.ply``; ScanNet's ``*_vh_clean_2.ply``; COLMAP's
-            ``points3D``, with COLMAP's poses; depth images, fused
+            ``.pcd``; the latest ``point_cloud/iteration_*/point_cloud.ply``; ScanNet's ``*_vh_clean_2.ply``; KITTI-360's
+            static cloud; COLMAP's ``points3D``, with COLMAP's poses; depth images, fused
   depth     optional; ``depth_file_path`` of a frame; where the data set has it; ``depth/`` beside ``images/``
   images    optional; where the pose file says, or of that name in ``images/``
 
@@ -41,6 +41,7 @@ from og_pointcloud.formats.depth import DepthFile, DepthFrame, find_depth, resam
 from og_pointcloud.formats.faces import Face
 from og_pointcloud.formats.gaussian_ply import latest_iteration
 from og_pointcloud.formats.images import find_image, image_size, read_rgb, require_scaled, without_suffix
+from og_pointcloud.formats.kitti360 import find_static_cloud
 from og_pointcloud.formats.langsplat import LANGUAGE_FEATURES_FOLDER, read_language_features
 from og_pointcloud.formats.mask_files import FEATURES_NAME, MASKS_FOLDER, MaskLayer, read_masks
 from og_pointcloud.formats.nerfstudio import TRANSFORMS_NAMES, read_transforms
@@ -187,8 +188,8 @@ def _recording(capture: Path) -> PosedFrames:
         f"{capture} has no pose file; expected transforms.json (nerfstudio, instant-ngp, Blender), a COLMAP model in "
         "sparse/0 (cameras and images, .bin or .txt), Metashape's .xml or RealityScan's .csv of cameras, or the layout "
         "of ScanNet (color/, pose/, intrinsic/), 7-Scenes (frame-*.pose.txt), Replica (results/, traj.txt), Polycam "
-        "(keyframes/), 3D Scanner App (frame_*.json) or ARKitScenes (lowres_wide.traj); of an E57 file, og-pointcloud "
-        "import makes such a folder"
+        "(keyframes/), 3D Scanner App (frame_*.json), ARKitScenes (lowres_wide.traj) or KITTI-360 (data_poses/); of an "
+        "E57 file, og-pointcloud import makes such a folder, of photographs without poses og-pointcloud poses"
     )
 
 
@@ -342,7 +343,7 @@ def _find_cloud(capture: Path) -> Path | None:
         )
     if pcds:
         return pcds[0]
-    return latest_iteration(capture) or find_mesh(capture)
+    return latest_iteration(capture) or find_mesh(capture) or find_static_cloud(capture)
 
 
 def fuse_capture(folder: str | Path, depth_unit: float | None = None) -> FusedCloud:

@@ -23,7 +23,7 @@ from og_pointcloud.scene import Camera
 
 __all__ = [
     "MAX_JSON_BYTES", "OPENGL", "PosedFrames", "PosedImage", "Recording", "Sensor", "in_local_frame", "in_pinholes",
-    "inverse", "named_numbers", "numbered", "numbered_images", "read_json", "read_numbers", "rigid",
+    "inverse", "named_numbers", "numbered", "numbered_images", "read_json", "read_numbers", "read_text", "rigid",
     "rotation_of_quaternion",
 ]  # fmt: skip
 
@@ -180,16 +180,22 @@ def read_json(file: Path, most: int = MAX_TEXT_BYTES) -> Any:
         raise SceneError(f"{file} is not valid JSON ({error}): export it again") from None
 
 
-def read_numbers(file: Path, columns: int) -> NDArray[np.float64]:
-    """(rows, columns) float64 of a text file of numbers, ``nan`` and ``inf`` among them."""
+def read_text(file: Path) -> str:
+    """A text file of bounded size; SceneError where it is longer, or no text."""
     try:
         if (size := file.stat().st_size) > MAX_TEXT_BYTES:
             raise SceneError(f"{file} has {size} bytes; expected a text file of numbers, at most {MAX_TEXT_BYTES}")
-        rows = [line.split() for line in file.read_text(encoding="utf-8").splitlines() if line.strip()]
+        return file.read_text(encoding="utf-8")
+    except (UnicodeDecodeError, OSError) as error:
+        raise SceneError(f"{file} cannot be read as text ({error!s:.80}): export it again") from None
+
+
+def read_numbers(file: Path, columns: int) -> NDArray[np.float64]:
+    """(rows, columns) float64 of a text file of numbers, ``nan`` and ``inf`` among them."""
+    rows = [line.split() for line in read_text(file).splitlines() if line.strip()]
+    try:
         numbers = np.array([[float(word) for word in row] for row in rows], np.float64)
-    except (ValueError, OSError) as error:
-        if isinstance(error, SceneError):
-            raise
+    except ValueError as error:
         raise SceneError(f"{file} cannot be read as rows of numbers ({error!s:.80}): export it again") from None
     if numbers.ndim != 2 or numbers.shape[1] != columns:
         raise SceneError(f"{file} has numbers of shape {numbers.shape}; expected rows of {columns}")

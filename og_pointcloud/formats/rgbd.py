@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.depth import MILLIMETRE
 from og_pointcloud.formats.images import image_size
+from og_pointcloud.formats.kitti360 import is_kitti360, read_kitti360
 from og_pointcloud.formats.phones import PHONE_LAYOUTS
 from og_pointcloud.formats.poses import (
     PosedFrames,
@@ -190,5 +191,6 @@ LAYOUTS: tuple[tuple[Callable[[Path], bool], Callable[[Path], PosedFrames]], ...
     (_is_scannet, read_scannet),
     (_is_seven_scenes, read_seven_scenes),
     (_is_replica, read_replica),
+    (is_kitti360, read_kitti360),
 )
 """How a folder is told, and what reads it; the first that fits is taken. One of your own is a pair more."""

@@ -115,7 +115,7 @@ def _pycolmap() -> Any:
         import pycolmap
     except ImportError as error:
         raise MissingExtraError("pycolmap", "poses") from error
-    pycolmap.logging.minloglevel = pycolmap.logging.FATAL  # what fails is said here
+    pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL)  # what fails is said here
     return pycolmap
 
 

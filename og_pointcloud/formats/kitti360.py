@@ -1,0 +1,100 @@
+"""KITTI-360: the rectified stereo images of a drive, as the data set's documentation lays them out.
+
+calibration/perspective.txt                      ``S_rect_00: 1408 376``, ``P_rect_00:`` 12 numbers, row by row
+data_poses/DRIVE/cam0_to_world.txt               a frame's number, then 16: the rectified left camera to the world,
+                                                 OpenCV axes, metres; keyframes alone
+data_2d_raw/DRIVE/image_00/data_rect/*.png       and image_01, the right camera: named by the frame, ten digits
+data_3d_semantics/*/DRIVE/static/FIRST_LAST.ply  a cloud of these frames: the capture's geometry, if there is one file
+
+The right camera stands beside the left one: P_rect_01 has the distance times the focal length in its last column. The
+fisheye images to the sides (image_02, image_03) are not read.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from og_pointcloud.errors import SceneError
+from og_pointcloud.formats.poses import (
+    PosedFrames,
+    Recording,
+    Sensor,
+    named_numbers,
+    numbered_images,
+    read_numbers,
+    read_text,
+    rigid,
+)
+
+__all__ = ["find_static_cloud", "is_kitti360", "read_kitti360"]
+
+CALIBRATION = Path("calibration/perspective.txt")
+CAMERAS = ("00", "01")
+
+
+def is_kitti360(folder: Path) -> bool:
+    """Whether a folder has the data set's layout."""
+    return (folder / CALIBRATION).is_file() and next(folder.glob("data_poses/*/cam0_to_world.txt"), None) is not None
+
+
+def read_kitti360(folder: Path) -> PosedFrames:
+    """Posed images of the one drive whose images are there, the left ones first. SceneError names file and cure."""
+    poses_file = _poses_of_drive(folder)
+    rows = read_numbers(poses_file, 17)
+    pose_of_frame = dict(zip(rows[:, 0].tolist(), rows[:, 1:].reshape(-1, 4, 4), strict=True))
+    recording = Recording()
+    for camera in CAMERAS:
+        images = numbered_images(_images_folder(folder, poses_file.parent.name, camera))
+        sensor, beside = _sensor(folder / CALIBRATION, camera) if images else (None, np.eye(4))
+        for file in images:
+            path = file.relative_to(folder).as_posix()
+            pose = pose_of_frame.get(float(file.stem)) if file.stem.isdecimal() else None
+            if sensor is None or pose is None:
+                recording.dropped.append(path)
+            else:
+                recording.add(path, pose @ beside, poses_file, sensor)
+    return recording.frames()
+
+
+def find_static_cloud(folder: Path) -> Path | None:
+    """The accumulated cloud, None where there is none; SceneError for several, of which each has some of the frames."""
+    clouds = sorted(folder.glob("data_3d_semantics/*/*/static/*.ply"))
+    if len(clouds) > 1:
+        raise SceneError(
+            f"{folder} has {len(clouds)} static clouds ({clouds[0].name}, {clouds[1].name}, ...), each of some frames; "
+            "expected one: name the one to use (--gaussians)"
+        )
+    return clouds[0] if clouds else None
+
+
+def _images_folder(folder: Path, drive: str, camera: str) -> Path:
+    return folder / "data_2d_raw" / drive / f"image_{camera}" / "data_rect"
+
+
+def _poses_of_drive(folder: Path) -> Path:
+    files = sorted(folder.glob("data_poses/*/cam0_to_world.txt"))
+    seen = [file for file in files if _images_folder(folder, file.parent.name, "00").is_dir()]
+    if len(seen) != 1:
+        drives = ", ".join(file.parent.name for file in seen[:3]) or "none"
+        raise SceneError(
+            f"{folder} has rectified images of {len(seen)} drives with poses ({drives:.120}); expected one: make a "
+            f"folder of calibration/ and one drive's data_poses/DRIVE and {_images_folder(Path(), 'DRIVE', '00')}"
+        )
+    return seen[0]
+
+
+def _sensor(file: Path, camera: str) -> tuple[Sensor, NDArray[np.float64]]:
+    """The lens of a rectified camera, and its place in the left one's frame, (4, 4)."""
+    lines = dict(line.partition(":")[::2] for line in read_text(file).splitlines())
+    width, height = _stated(lines, f"S_rect_{camera}", 2, file)
+    projection = np.reshape(_stated(lines, f"P_rect_{camera}", 12, file), (3, 4))
+    sensor = Sensor.from_matrix((round(width), round(height)), projection)
+    beside = -projection[0, 3] / (projection[0, 0] or 1.0)  # the camera refuses a focal length of 0
+    return sensor, rigid(np.eye(3), np.array([beside, 0.0, 0.0]))
+
+
+def _stated(lines: dict[str, str], key: str, count: int, file: Path) -> list[float]:
+    return named_numbers(lines.get(key, "").split(), range(count), f"{file}, {key},")
