@@ -9,8 +9,9 @@ from labelled_clouds import make_cloud, room
 import og_pointcloud as og
 from og_pointcloud.ask.picking import front_points
 from og_pointcloud.formats.colors import LUMINANCE, NO_LABEL, certainty_colors, label_colors
+from og_pointcloud.mapping.map_record import MapRecord, VisitEntry
 from og_pointcloud.scene import Points
-from og_pointcloud.show.live import LiveScene, look_along
+from og_pointcloud.show.live import CHANGES, LiveScene, look_along
 
 
 def rainbow(count=3000):
@@ -38,6 +39,29 @@ def slow_color(own, rgb, is_lit):
     light = sum(weight * value / 255 for weight, value in zip(LUMINANCE, rgb, strict=True))
     color = np.array([min(channel * (0.55 + 0.55 * light), 255) for channel in own]).astype(int)
     return color if is_lit else np.full(3, int(0.72 * 237 + 0.28 * color.sum() / 3))
+
+
+def test_a_map_of_two_visits_is_colored_by_change(scene):
+    assert "changes" not in LiveScene(scene).modes
+    cloud = scene.cloud
+    count = len(cloud.instances)
+    record = MapRecord([VisitEntry("monday", 0.0, 3), VisitEntry("friday", 5.0, 3)], dict.fromkeys(range(count), 5.0))
+    record.last_seen[2], record.moved_from[4] = 0.0, (1.0, 2.0, 3.0)
+    map_ = replace(cloud, provenance=record.added_to(cloud.provenance))
+    live = LiveScene(og.LabelledScene.from_cloud(map_), labels=["plum"])
+    live.mode = "changes"
+    shown, ids = live.colors(), cloud.instance_ids
+    for point in range(0, len(shown), 7):
+        name = {4: "moved", 2: "not seen at the last visit"}.get(ids[point], "as it was")
+        expected = slow_color(CHANGES[name], cloud.rgb[point], True)
+        assert np.abs(shown[point].astype(int) - expected).max() <= 1
+    counts = {name: points for name, _, points in live.legend()}
+    assert counts == {
+        "moved": (ids == 4).sum(), "not seen at the last visit": (ids == 2).sum(),
+        "as it was": (~np.isin(ids, [2, 4])).sum(),
+    }  # fmt: skip
+    live.mode = "labels"
+    assert "moved" not in {name for name, *_ in live.legend()}
 
 
 @pytest.mark.parametrize("mode", ["labels", "instances"])

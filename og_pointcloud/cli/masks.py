@@ -23,6 +23,10 @@ def add(parser: Parser) -> None:
         "--encoder", default="demo", metavar="E",
         help="demo (default; knows the demo room alone), a model's folder, OWNER/MODEL, or none: masks alone",
     )  # fmt: skip
+    parser.add_argument(
+        "--features", default="crops", choices=("crops", "dense"),
+        help="crops: several runs of the encoder a mask (default); dense: one run an image, faster and coarser",
+    )  # fmt: skip
     parser.add_argument("--level", default="medium", choices=("small", "medium", "large"), help="how much is one mask")
     parser.add_argument("--every", type=int, default=1, metavar="N", help="use every N-th image; needs -o")
     parser.add_argument("--longest-side", type=int, default=1024, metavar="PX", help="larger images are shrunk to this")
@@ -37,6 +41,7 @@ def run(arguments: argparse.Namespace) -> None:
         proposer=arguments.proposer,
         encoder=None if arguments.encoder == "none" else arguments.encoder,
         level=arguments.level,
+        features=arguments.features,
         longest_side=arguments.longest_side,
         every=arguments.every,
     )

@@ -6,8 +6,8 @@ Each part comes from the first of these that the folder has.
             ScanNet, 7-Scenes, Replica, Polycam, 3D Scanner App, ARKitScenes and KITTI-360
   masks     ``mask_features.npz`` with ``masks/``; LangSplat's ``language_features/``
   geometry  the file given; ``ply_file_path`` of transforms.json; ``points.ply``, ``point_cloud.ply``, the folder's one
-            ``.pcd``; the latest ``point_cloud/iteration_*/point_cloud.ply``; ScanNet's ``*_vh_clean_2.ply``; KITTI-360's
-            static cloud; COLMAP's ``points3D``, with COLMAP's poses; depth images, fused
+            ``.pcd``; the latest ``point_cloud/iteration_*/point_cloud.ply``; ScanNet's ``*_vh_clean_2.ply``;
+            KITTI-360's static cloud; COLMAP's ``points3D``, with COLMAP's poses; depth images, fused
   depth     optional; ``depth_file_path`` of a frame; where the data set has it; ``depth/`` beside ``images/``
   images    optional; where the pose file says, or of that name in ``images/``
 

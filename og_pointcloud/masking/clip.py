@@ -24,7 +24,7 @@ try:
 except ImportError as error:
     raise MissingExtraError("torch and transformers", "masks") from error
 
-__all__ = ["ImageTower", "TransformersModel", "load_model", "preprocessing_of", "published_name"]
+__all__ = ["ImageTower", "PatchTower", "TransformersModel", "load_model", "preprocessing_of", "published_name"]
 
 CLASSES = {"clip": "CLIPModel", "siglip": "SiglipModel"}
 """config.json's model_type -> transformers' class of it."""
@@ -90,8 +90,37 @@ class ImageTower(torch.nn.Module):
         return found / found.norm(dim=-1, keepdim=True)
 
 
+class PatchTower(torch.nn.Module):
+    """Pixels (1, 3, h * patch, w * patch) float32 -> (h, w, D) unit vectors, in the space of `ImageTower`.
+
+    A model makes one vector of an image where tokens attend to each other last: CLIP in its last layer, to the class
+    token; SigLIP in its head, to a probe. There each patch attends to itself alone, so that its own value comes out;
+    nothing is trained. MaskCLIP (Zhou, Loy and Dai, ECCV 2022), section 3.2.
+    """
+
+    def __init__(self, model: Any) -> None:
+        """model: from ``load_model``."""
+        super().__init__()
+        self.model, self.patch = model, int(model.config.vision_config.patch_size)
+
+    def forward(self, pixels: torch.Tensor) -> torch.Tensor:
+        """See the class."""
+        vision = self.model.vision_model
+        seen = vision(pixel_values=pixels, interpolate_pos_encoding=True, output_hidden_states=True)
+        if self.model.config.model_type == "clip":
+            last, tokens = vision.encoder.layers[-1], seen.hidden_states[-2][0, 1:]
+            attention = last.self_attn
+            tokens = tokens + attention.out_proj(attention.v_proj(last.layer_norm1(tokens)))
+            tokens = tokens + last.mlp(last.layer_norm2(tokens))
+            found = self.model.visual_projection(vision.post_layernorm(tokens))
+        else:
+            found = vision.head(seen.last_hidden_state[0][:, None])  # each patch an image of one
+        found = found / found.norm(dim=-1, keepdim=True)
+        return found.reshape(pixels.shape[2] // self.patch, pixels.shape[3] // self.patch, -1)
+
+
 class TransformersModel:
-    """A CLIP or SigLIP as an `encode.ImageModel`; on a GPU where torch has one."""
+    """A CLIP or SigLIP as an `encode.ImageModel` and a `dense.PatchModel`; on a GPU where torch has one."""
 
     def __init__(
         self,
@@ -107,6 +136,8 @@ class TransformersModel:
         self.preprocessing, self.crops = preprocessing_of(folder, model.config), crops
         self.device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
         self.tower = ImageTower(model).eval().to(self.device)
+        self.patch_tower = PatchTower(model).eval().to(self.device)
+        self.patch = self.patch_tower.patch
         size = self.preprocessing.size
         self.width: int = self(np.zeros((1, 3, size, size), np.float32)).shape[1]
 
@@ -114,6 +145,11 @@ class TransformersModel:
     def __call__(self, pixels: NDArray[np.float32]) -> NDArray[np.float32]:
         """(B, width) float32 unit rows of pixels (B, 3, S, S)."""
         return self.tower(torch.from_numpy(pixels).to(self.device)).cpu().numpy()
+
+    @torch.inference_mode()
+    def patches(self, pixels: NDArray[np.float32]) -> NDArray[np.float32]:
+        """(h, w, width) float32 unit vectors of pixels (1, 3, h * patch, w * patch)."""
+        return self.patch_tower(torch.from_numpy(pixels).to(self.device)).cpu().numpy()
 
 
 def preprocessing_of(folder: str | os.PathLike[str], config: Any) -> Preprocessing:

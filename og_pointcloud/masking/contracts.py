@@ -14,6 +14,8 @@ from og_pointcloud.errors import OgPointcloudError, SceneError
 
 __all__ = ["LEVELS", "MaskEncoder", "MaskProposer", "MaskSettings", "Proposals"]
 
+FEATURES = ("crops", "dense")
+"""How the encoder is shown a mask."""
 LEVELS = ("small", "medium", "large")
 """How much is one mask, as SAM and LangSplat call it."""
 
@@ -73,6 +75,7 @@ class MaskSettings:
 
     proposer: see `worker.open_proposer`. encoder: see `encode.open_encoder`; None: masks alone, with zero features.
     level: small, medium or large (`levels.PREFERENCE`).
+    features: crops, a few runs of the encoder a mask; or dense, one an image, coarser (`masking/dense.py`).
     longest_side: larger images are shrunk to this; masks have the shrunk size.
     every: of so many images one is used.
     """
@@ -80,10 +83,13 @@ class MaskSettings:
     proposer: str = "opencv"
     encoder: str | None = "demo"
     level: str = "medium"
+    features: str = "crops"
     longest_side: int = 1024
     every: int = 1
 
     def __post_init__(self) -> None:
+        if self.features not in FEATURES:
+            raise OgPointcloudError(f"features are '{self.features}'; expected one of {', '.join(FEATURES)}")
         if self.level not in LEVELS:
             raise OgPointcloudError(f"mask level is '{self.level}'; expected one of {', '.join(LEVELS)}")
         if self.every < 1 or self.longest_side < 16:

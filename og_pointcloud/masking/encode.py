@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "DEMO_FOLDER", "DEMO_SPACE", "ENCODER_FILES", "FORMAT", "GRAPH", "OPERATORS", "SCHEMA_VERSION", "CropEncoder",
-    "ImageModel", "OnnxModel", "open_encoder",
+    "ImageModel", "OnnxModel", "open_encoder", "open_mask_encoder",
 ]  # fmt: skip
 
 DEMO_SPACE = "og_pointcloud/demo-room-encoder"
@@ -70,6 +70,22 @@ class ImageModel(Protocol):
     def __call__(self, pixels: NDArray[np.float32]) -> NDArray[np.float32]:
         """(B, width) float32 unit rows of pixels (B, 3, S, S) float32."""
         ...
+
+
+def open_mask_encoder(name: str | os.PathLike[str], features: str = "crops") -> MaskEncoder:
+    """An encoder as `open_encoder`; features "dense": one run an image (`dense.DenseEncoder`), for models of
+    transformers. OgPointcloudError where a model has no patches."""
+    encoder = open_encoder(name)
+    if features == "crops":
+        return encoder
+    if not hasattr(encoder.model, "patches"):
+        raise OgPointcloudError(
+            f"the encoder '{name}' has vectors of whole squares alone; expected a transformers folder of CLIP or "
+            "SigLIP for --features dense: name one, or take crops"
+        )
+    from og_pointcloud.masking.dense import DenseEncoder
+
+    return DenseEncoder(encoder.model)  # pyright: ignore[reportArgumentType]
 
 
 def open_encoder(name: str | os.PathLike[str], feature_space: str | None = None) -> CropEncoder:

@@ -16,14 +16,18 @@ from og_pointcloud.ask.instances import NO_FEATURE, Instances
 from og_pointcloud.ask.labelled_scene import LabelledScene, instance_table
 from og_pointcloud.ask.picking import pick
 from og_pointcloud.ask.selecting import Match, select
+from og_pointcloud.cloud import LabelledCloud
 from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.formats.colors import LUMINANCE, NO_LABEL, certainty_colors, label_colors
+from og_pointcloud.mapping.map_record import MapRecord
 from og_pointcloud.scene import Camera, Points
 from og_pointcloud.text.words import Labels, TextFeatures
 
 __all__ = ["FADED", "MODES", "WORDS", "Answer", "LiveScene", "look_along", "meaning"]
 
-MODES = ("labels", "instances", "certainty", "photo")
+MODES = ("labels", "instances", "certainty", "changes", "photo")
+CHANGES = {"moved": (226, 88, 34), "not seen at the last visit": (86, 110, 190), "as it was": NO_LABEL}
+"""What a map of several visits knows of its instances, and their colors; what left has no points."""
 WORDS = 6
 """Words that are shown of an instance."""
 MATCHES = 12
@@ -75,7 +79,13 @@ class LiveScene:
         self.names: tuple[str, ...] = words.names if words else ()
         vectors = words.vectors if words else np.zeros((0, scene.cloud.space.width), np.float32)
         self.label_of, self.score_of, self.reason_of = scene.chooser.choose(vectors).by_id
-        has = {"labels": self.names, "certainty": scene.certainty is not None, "photo": self.rgb is not None}
+        self._change_of = _changes(scene.cloud, len(self.label_of))
+        has = {
+            "labels": self.names,
+            "changes": self._change_of is not None,
+            "certainty": scene.certainty is not None,
+            "photo": self.rgb is not None,
+        }
         self.modes = tuple(mode for mode in MODES if has.get(mode, True))
         self.mode = self.modes[0]
         self.lit: set[int] | None = None
@@ -100,6 +110,9 @@ class LiveScene:
 
     def legend(self) -> list[tuple[str, Sequence[int], int]]:
         """Names with their colors and numbers of points, the most frequent first; last what has no label."""
+        if self.mode == "changes" and self._change_of is not None:
+            points = np.bincount(self._change_of[self.ids], minlength=len(CHANGES)).tolist()
+            return [(name, color, count) for (name, color), count in zip(CHANGES.items(), points, strict=True) if count]
         counts = np.bincount(self.label_of[self.ids] + 1, minlength=len(self.names) + 1).tolist()
         colors = label_colors(np.arange(len(self.names))).tolist()
         rows = [row for row in zip(self.names, colors, counts[1:], strict=True) if row[2]]
@@ -123,6 +136,8 @@ class LiveScene:
             show_own = ~labelled & self._is_lit[:count] if self.lit is not None else np.zeros(count, bool)
             table[:count] = np.where(labelled[:, None], label_colors(self.label_of[:count]), table[:count])
             table[:count][show_own] = own[show_own]
+        elif self.mode == "changes" and self._change_of is not None:
+            table = np.array([*CHANGES.values()], np.uint8)[self._change_of]
         else:
             table[:count] = own
         return np.minimum(table[self.ids] * self._shade, 255).astype(np.uint8)
@@ -200,6 +215,17 @@ class LiveScene:
     def _beside(self, match: Match) -> str:
         rather = f" (rather {match.rival})" if not match.fits and match.rival else ""
         return f"instance {match.instance}{rather}"
+
+
+def _changes(cloud: LabelledCloud, rows: int) -> NDArray[np.intp] | None:
+    """(rows,) row of `CHANGES` of each instance, and of ids below 0; None where there was one visit alone."""
+    record = MapRecord.of(cloud)
+    if len(record.visits) < 2:
+        return None
+    change = np.full(rows, 2)
+    change[[k for k, stamp in record.last_seen.items() if stamp < record.visits[-1].stamp]] = 1
+    change[list(record.moved_from)] = 0
+    return change
 
 
 def meaning(calibrated: bool) -> str:

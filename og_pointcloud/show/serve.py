@@ -183,6 +183,7 @@ class LivePage:
 
     def _change_mode(self) -> None:
         self._live.mode = self._mode.value
+        self._legend.content = legend_html(self._live)
         self._paint()
 
     def _change_scene(self) -> None:

@@ -1,0 +1,83 @@
+"""A mask's vector from one run of the encoder on the whole image: the mean of its patches. Faster, coarser than crops.
+
+Crops show the encoder each mask by itself, several runs a mask. Here it sees the image once, and a mask's vector is the
+mean of the vectors of its patches, each weighted by how much of it the mask covers. What a patch is, rather than what
+the image is about, is read as MaskCLIP does it (Zhou, Loy and Dai, ECCV 2022): see `clip.PatchTower`.
+"""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from og_pointcloud.errors import MissingExtraError, SceneError
+from og_pointcloud.formats.images import require_cv2
+from og_pointcloud.masking.contracts import MaskEncoder
+from og_pointcloud.masking.crops import Preprocessing
+
+__all__ = ["DenseEncoder", "PatchModel"]
+
+SHORTER_SIDE = 2.0
+"""The image's shorter side in sides of the square that the model was trained on: patches of CLIP B/16 are then 28 to a
+side, and positions in between are interpolated."""
+
+
+class PatchModel(Protocol):
+    """An image model that has vectors of patches. patch: its side, pixels."""
+
+    feature_space: str
+    width: int
+    patch: int
+    preprocessing: Preprocessing
+
+    def patches(self, pixels: NDArray[np.float32]) -> NDArray[np.float32]:
+        """(h, w, width) unit vectors of pixels (1, 3, h * patch, w * patch)."""
+        ...
+
+
+class DenseEncoder(MaskEncoder):
+    """A `contracts.MaskEncoder` around a model with patches."""
+
+    def __init__(self, model: PatchModel) -> None:
+        self.model, self.feature_space, self.width = model, model.feature_space, model.width
+
+    def embed(self, image: NDArray[np.uint8], masks: NDArray[np.bool_]) -> NDArray[np.float32]:
+        """image (H, W, 3) uint8 RGB, masks (M, H, W) bool -> (M, width) float32, L2-normalised rows.
+
+        SceneError for arrays that do not fit together, and for a mask without a pixel.
+        """
+        if image.ndim != 3 or masks.shape[1:] != image.shape[:2] or masks.dtype != np.bool_:
+            raise SceneError(f"masks are {masks.dtype} {masks.shape}, their image {image.shape}; expected one (H, W)")
+        if len(masks) == 0:
+            return np.zeros((0, self.width), np.float32)
+        if not masks.any(axis=(1, 2)).all():
+            raise SceneError("a mask has no pixel; expected at least one: leave empty masks out")
+        found = self.model.patches(self._pixels(image))
+        height, width = found.shape[:2]
+        shares = [_shares(mask, width, height) for mask in masks]
+        total = np.stack(shares).reshape(len(masks), -1) @ found.reshape(-1, self.width)
+        return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), np.finfo(np.float32).tiny)
+
+    def _pixels(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
+        """(1, 3, h, w) of whole patches, the image's shape but for rounding."""
+        try:
+            from PIL import Image
+        except ImportError as error:
+            raise MissingExtraError("Pillow", "fit") from error
+        before = self.model.preprocessing
+        scale = SHORTER_SIDE * before.size / min(image.shape[:2])
+        height, width = (max(1, round(side * scale / self.model.patch)) * self.model.patch for side in image.shape[:2])
+        filter_ = Image.Resampling[before.resample.upper()]
+        return before.pixels(np.asarray(Image.fromarray(image).resize((width, height), filter_))[None])
+
+
+def _shares(mask: NDArray[np.bool_], width: int, height: int) -> NDArray[np.float32]:
+    """(height, width): how much of each patch the mask covers; of an image smaller than that, of its nearest pixel."""
+    cv2 = require_cv2()
+    shrinks = mask.shape[0] >= height and mask.shape[1] >= width
+    shrunk = cv2.resize(
+        mask.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
+    )
+    return np.asarray(shrunk, np.float32)
