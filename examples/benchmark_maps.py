@@ -2,6 +2,8 @@
 
     python examples/benchmark_maps.py frames CAPTURE          # each tenth: ms a frame, mIoU beside a fit of the same
     python examples/benchmark_maps.py frames CAPTURE --shuffle --pose-noise 0.01 0.2 --depth-share 0.05
+    python examples/benchmark_maps.py frames CAPTURE --every 4 --tenths 1     # a quarter of the frames, the end alone
+    python examples/benchmark_maps.py speed CAPTURE               # ms a frame at 100,000 and 1,000,000 points
     python examples/benchmark_maps.py loops CAPTURE               # memory over two loops of the same path
     python examples/benchmark_maps.py pairs FOLDER...             # a/ and b/ with changes.json, two visits each
 
@@ -29,44 +31,44 @@ from og_pointcloud.formats.poses import in_local_frame
 from og_pointcloud.mapping.sight import depth_views
 from og_pointcloud.scene import Camera, Scene
 
-TENTHS = 10
+TENTHS, WARM_UP = 10, 5
+SIZES = 100_000, 1_000_000
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run one of the three."""
+    """Run one of the four."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("frames", "loops", "pairs"))
+    parser.add_argument("what", choices=("frames", "speed", "loops", "pairs"))
     parser.add_argument("folders", type=Path, nargs="+", metavar="FOLDER")
     parser.add_argument("--shuffle", action="store_true", help="frames in random order")
     parser.add_argument("--pose-noise", type=float, nargs=2, default=(0, 0), metavar=("M", "DEG"))
     parser.add_argument("--depth-share", type=float, default=1.0, metavar="X", help="of the readings that are kept")
+    parser.add_argument("--every", type=int, default=1, metavar="N", help="take each N-th frame")
+    parser.add_argument("--tenths", type=int, default=TENTHS, metavar="N", help="rows of the table")
     parser.add_argument("--no-fit", action="store_true", help="without the fits of the same frames")
     options = parser.parse_args(arguments)
     if options.what == "pairs":
         pairs(options.folders)
         return
     for folder in options.folders:
-        if options.what == "frames":
-            growing(folder, options)
-        else:
-            loops(folder)
+        {"frames": growing, "speed": speed, "loops": loops}[options.what](folder, options)
 
 
-def frames_of(folder: Path, options: argparse.Namespace | None = None) -> tuple[Scene, list[og.Frame]]:
-    """A capture and its views as frames, disturbed as asked."""
+def frames_of(folder: Path, options: argparse.Namespace) -> tuple[Scene, list[og.Frame]]:
+    """A capture and its views as frames, thinned and disturbed as asked."""
     capture, random = read_capture(folder), np.random.default_rng(0)
+    capture = replace(capture, views=capture.views[:: options.every])
     depths = depth_files(folder, read_poses(folder))
     frames = []
     for number, view in enumerate(capture.views):
         camera = in_local_frame(view.camera, -capture.points.origin)
         depth = depths[view.name].read().depth if view.name in depths else None
-        if options is not None:
-            camera = _moved(camera, random, *options.pose_noise)
-            if depth is not None and options.depth_share < 1:
-                depth = np.where(random.random(depth.shape) < options.depth_share, depth, 0)
+        camera = _moved(camera, random, *options.pose_noise)
+        if depth is not None and options.depth_share < 1:
+            depth = np.where(random.random(depth.shape) < options.depth_share, depth, 0)
         masks, rgb = view.mask_map(), view.image_rgb()
         frames.append(og.Frame(camera, masks, view.mask_features, depth, rgb=rgb, stamp=float(number)))
-    if options is not None and options.shuffle:
+    if options.shuffle:
         frames = [frames[k] for k in random.permutation(len(frames))]
     return capture, frames
 
@@ -105,8 +107,8 @@ def growing(folder: Path, options: argparse.Namespace) -> None:
     print(f"\n{folder.name}: {len(frames)} frames, {len(capture.points):,} points in the capture")
     print("frames    points  objects  median ms  p95 ms  CPU ms  kept MB  mIoU map  mIoU fit   map s   fit s")
     done = 0
-    for tenth in range(1, TENTHS + 1):
-        until, wall, start = round(len(frames) * tenth / TENTHS), [], time.process_time()
+    for tenth in range(1, options.tenths + 1):
+        until, start = round(len(frames) * tenth / options.tenths), time.process_time()
         wall = [mapper.integrate(frame).seconds for frame in frames[done:until]]
         spent, done = (time.process_time() - start) / max(len(wall), 1), until
         if not wall:
@@ -129,9 +131,30 @@ def growing(folder: Path, options: argparse.Namespace) -> None:
         )
 
 
-def loops(folder: Path) -> None:
+def speed(folder: Path, options: argparse.Namespace) -> None:
+    """Milliseconds a frame in maps of SIZES points: the capture's, drawn anew with noise of half a spacing."""
+    capture, frames = frames_of(folder, options)
+    xyz, random = capture.points.xyz_world, np.random.default_rng(0)
+    noise = 0.5 * float(np.median(cKDTree(xyz).query(xyz[:10_000], k=2, workers=-1)[0][:, 1]))
+    print(f"\n{folder.name}: {len(frames)} frames\n   points  objects  median ms  p95 ms  CPU ms")
+    for size in SIZES:
+        cloud = xyz[random.integers(0, len(xyz), size)] + random.normal(0, noise, (size, 3))
+        mapper = og.Mapper(cloud=cloud, feature_space=capture.feature_space)
+        for frame in frames[:WARM_UP]:
+            mapper.integrate(frame)
+        start = time.process_time()
+        wall = [mapper.integrate(frame).seconds for frame in frames[WARM_UP:]]
+        spent = (time.process_time() - start) / len(wall)
+        print(
+            f"{size:9,}  {len(mapper.objects()):7}  {1e3 * np.median(wall):9.1f}  "
+            f"{1e3 * np.percentile(wall, 95):6.1f}  {1e3 * spent:6.1f}",
+            flush=True,
+        )
+
+
+def loops(folder: Path, options: argparse.Namespace) -> None:
     """Memory after each of two loops of the same path."""
-    capture, frames = frames_of(folder)
+    capture, frames = frames_of(folder, options)
     mapper = mapper_of(capture, frames)
     for loop in range(2):
         for frame in frames:

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from visits import BIN, CHEST, CRATE, PARCEL, SPACE, cameras, frames, instance_of, moved, scene, surface
+from visits import BIN, CHEST, CRATE, PARCEL, SPACE, Thing, cameras, cast, frames, instance_of, moved, scene, surface
 
 import og_pointcloud as og
 from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError, SceneError
@@ -286,3 +286,51 @@ def test_a_noisy_cloud_is_still_where_it_was():
     changes = [mapper.integrate(frame) for frame in frames(THINGS)]
     assert all(change.gone == () for change in changes)
     assert mapper.points > 0.95 * len(noisy)
+
+
+PANE = Thing((-0.2, -1.2, 0.0), (0.8, 0.04, 0.9), (180, 220, 230), 5)
+
+
+def through_the_pane(given, others):
+    """The same frames, whose depth looks through the pane at what stands behind it."""
+    return [replace(frame, depth=cast(others, frame.camera)[0]) for frame in given]
+
+
+def test_glass_that_gives_no_reading_stays():
+    mapper, _ = mapped(frames([*THINGS, PANE]))
+    pane = instance_of(mapper.snapshot().cloud, PANE)
+    later = frames([*THINGS, PANE], seed=1, first=50.0)
+    holes = [replace(f, depth=np.where(cast([*THINGS, PANE], f.camera)[1] == 3, 0, f.depth)) for f in later]
+    assert all(mapper.integrate(frame).gone == () for frame in holes)
+    assert instance_of(mapper.finish().cloud, PANE) == pane
+
+
+def test_glass_that_is_looked_through_now_and_then_stays():
+    given = frames([*THINGS, PANE], cameras(28))
+    for k, through in [*enumerate(through_the_pane(given, THINGS))][3::4]:
+        given[k] = through
+    mapper, changes = mapped(given)
+    assert all(change.gone == () for change in changes)
+    assert instance_of(mapper.finish().cloud, PANE) not in {
+        -1,
+        *(instance_of(mapper.finish().cloud, t) for t in THINGS),
+    }
+
+
+def test_what_a_screen_hides_is_not_gone():
+    mapper, _ = mapped(frames(THINGS))
+    bin_ = instance_of(mapper.snapshot().cloud, BIN)
+    screen = Thing((0.1, -1.5, 0.0), (1.1, 0.05, 1.4), (240, 240, 240), 5)
+    before_it = [camera for camera in cameras(40) if camera.center[1] < -3.0 and abs(camera.center[0]) < 1]
+    for frame in frames([CHEST, CRATE, screen], before_it, seed=5, first=50.0):  # and behind it the bin is taken away
+        assert bin_ not in mapper.integrate(frame).gone
+    states = {entry.id: entry.state for entry in mapper.objects()}
+    assert states[bin_] == "present"
+
+
+def test_at_the_edge_of_images_nothing_is_gone():
+    """Views that cut through things, and look past the edge of the map."""
+    mapper, _ = mapped(frames(THINGS, cameras(14, part=(0, 0.5))))
+    narrow = [replace(camera, width=60, cx=20.0) for camera in cameras(28)]
+    changes = [mapper.integrate(frame) for frame in frames(THINGS, narrow, seed=1, first=50.0)]
+    assert all(change.gone == () for change in changes)

@@ -16,7 +16,10 @@ from og_pointcloud_room.raycast import Surfaces
 from og_pointcloud_room.room import Room, furnish
 from og_pointcloud_room.shapes import Material, box, lathe, rotated, rotation_about
 
-__all__ = ["BACKGROUND", "MOVED", "NEW", "NO_RETURN", "ChangedRoom", "Drive", "Lidar", "LidarFrame"]
+__all__ = [
+    "BACKGROUND", "MOVED", "NEW", "NO_RETURN", "ChangedRoom", "Drive", "Lidar", "LidarFrame", "centred", "free_floor",
+    "ring",
+]  # fmt: skip
 
 Points = NDArray[np.float64]
 BACKGROUND, NEW, MOVED, NO_RETURN = -1, -2, -3, -4
@@ -81,7 +84,7 @@ class Drive:
 
     def __init__(self, seed: int = 0, lidar: Lidar | None = None, frames: int | None = None) -> None:
         self.lidar, self._seed, self.room = lidar or Lidar(), seed, furnish(seed)
-        self.path = _ring(self.room)
+        self.path = ring(self.room)
         lap_s = np.linalg.norm(np.diff(self.path, axis=0, append=self.path[:1]), axis=1).sum() / SPEED_M_S
         self.frame_count = frames or int(lap_s * self.lidar.hertz)
         self.now = _changed(self.room, self.path)
@@ -130,27 +133,27 @@ def _changed(room: Room, path: Points) -> ChangedRoom:
     arrivals = [
         (Item("suitcase", (box((0.4, 0.25, 0.6), (0, 0, 0), grey),)), NEW),
         (Item("ball", (ball,)), NEW),
-        (_centred(room.objects[chair]), MOVED),
+        (centred(room.objects[chair]), MOVED),
     ]
     items, taken = [*others, *room.shell], np.full((1, 2), np.inf)
     truth = [CLASS_NAMES.index(item.name) for item in others] + [BACKGROUND] * len(room.shell)
     surfaces = Surfaces([*room.objects, *room.shell])
     for item, what in arrivals:
-        place = _free_floor(room, surfaces, path, taken)
+        place = free_floor(room, surfaces, path, taken)
         taken = np.concatenate([taken, place[None]])
         items.append(item.moved((*place, 0.0)))
         truth.append(what)
     return ChangedRoom(tuple(items), np.array(truth, np.int32), path)
 
 
-def _centred(item: Item) -> Item:
+def centred(item: Item) -> Item:
     """Above the origin."""
     corners = np.concatenate([part.vertices for part in item.parts])
     middle = (corners.min(axis=0) + corners.max(axis=0)) / 2
     return item.moved((-middle[0], -middle[1], 0.0))
 
 
-def _free_floor(room: Room, surfaces: Surfaces, path: Points, taken: Points) -> Points:
+def free_floor(room: Room, surfaces: Surfaces, path: Points, taken: Points) -> Points:
     """(2,) the place on the floor nearest to the path that is clear of it, of all furniture and of places taken."""
     x, y = (np.arange(-side / 2, side / 2, FLOOR_STEP_M) for side in room.size[:2])
     floor = np.stack(np.meshgrid(x, y), axis=2).reshape(-1, 2)
@@ -160,7 +163,7 @@ def _free_floor(room: Room, surfaces: Surfaces, path: Points, taken: Points) -> 
     return floor[np.where(free >= min(1.0, free.max()), from_path, np.inf).argmin()]
 
 
-def _ring(room: Room, steps: int = 90) -> Points:
+def ring(room: Room, steps: int = 90) -> Points:
     """(steps, 2) a closed path around the middle, each step where the furniture leaves most room; smoothed."""
     surfaces, angle = Surfaces([*room.objects, *room.shell]), 2 * np.pi * np.arange(steps) / steps
     around = np.stack([np.cos(angle), np.sin(angle)], axis=1) * np.array(room.size[:2]) / 2

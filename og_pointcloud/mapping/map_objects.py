@@ -48,8 +48,8 @@ def objects_of(known: GrowingMap) -> list[MapObject]:
     return found
 
 
-def leave(known: GrowingMap, died: NDArray[np.int32]) -> list[int]:
-    """Remove points that were seen through; the ids of objects that left with most of theirs, ascending."""
+def leave(known: GrowingMap, died: NDArray[np.int32], stamp: float) -> list[int]:
+    """Remove points that a frame of that stamp saw through; the ids of objects that left with most of theirs."""
     if len(died) == 0:
         return []
     owners = known.votes.best(died, known.tracks.root)
@@ -57,6 +57,8 @@ def leave(known: GrowingMap, died: NDArray[np.int32]) -> list[int]:
     gone = []
     for k in np.unique(owners[owners >= 0]).tolist():
         track = known.tracks.tracks[k]
+        if not track.lost:
+            track.losing_since = stamp
         track.lost.extend(died[owners == k].tolist())
         if track.id >= 0 and len(track.lost) >= FEWEST_POINTS and _has_left(known, k):
             gone.append(track.id)
@@ -65,7 +67,7 @@ def leave(known: GrowingMap, died: NDArray[np.int32]) -> list[int]:
 
 
 def _has_left(known: GrowingMap, k: int) -> bool:
-    """Whether most of a track's visible points left; then the others, which nobody sees, leave too."""
+    """Whether most of a track's visible points left; then the others leave too, but for what was measured since."""
     track = known.tracks.tracks[k]
     rows = np.flatnonzero(known.owners() == k).astype(np.int32)
     still = rows[known.presence.odds[rows] > 0]
@@ -74,7 +76,7 @@ def _has_left(known: GrowingMap, k: int) -> bool:
     every = np.concatenate([np.array(track.lost, np.int32), rows])
     size = np.ptp(known.points.xyz[every].astype(np.float64), axis=0)
     track.left, track.lost = Left(_look(known, track, every), known.place_of(every), size), []
-    known.points.weight[np.setdiff1d(rows, still)] = 0
+    known.points.weight[np.setdiff1d(rows, still[known.presence.seen_at[still] >= track.losing_since])] = 0
     known.forget(rows)
     return True
 

@@ -191,7 +191,7 @@ class Mapper:
                 else measured_points(given, known, rows)
             )
             new, again = vote(given, known, seen)
-        gone = leave(known, died)
+        gone = leave(known, died, given.stamp)
         new_ids, moved = name(known, new, gone)
         updated = tuple(sorted(known.tracks.tracks[k].id for k in again))
         if known.sequence % PRUNED_EVERY == PRUNED_EVERY - 1:

@@ -70,7 +70,8 @@ class Left:
 class Track:
     """total: (D,) sum of unit features by pixels; pixels: their sum; agreement: sum of cosines by pixels. views, masks:
     how many showed it. id: of the object, NO_TRACK while it is provisional; named_at: the stamp at which it got it.
-    moved: it has been elsewhere. lost: rows of its points that were seen through; left: when most of them were."""
+    moved: it has been elsewhere. lost: rows of its points that were seen through,
+    losing_since: from that stamp on; left: when most of them were."""
 
     total: NDArray[np.float64] | None = None
     pixels: float = 0.0
@@ -82,6 +83,7 @@ class Track:
     named_at: float = -np.inf
     moved: bool = False
     lost: list[int] = field(default_factory=list)
+    losing_since: float = -np.inf
     left: Left | None = None
 
     def take_in(self, other: Track) -> None:
@@ -90,6 +92,7 @@ class Track:
             self.total = other.total if self.total is None else self.total + other.total
         for name in ("pixels", "agreement", "masks", "lost"):
             setattr(self, name, getattr(self, name) + getattr(other, name))
+        self.moved |= other.moved
         self.views, self.last_seen = max(self.views, other.views), max(self.last_seen, other.last_seen)
 
     @property
