@@ -21,6 +21,8 @@ FEWEST_COMPARED = 200
 """Fewer say nothing: the frame looks at a part of the place that the map does not know."""
 LEAST_AGREEING = 0.25
 """Share of the map's points in front of a camera whose depth it must confirm: what moved is a small part of a place."""
+OTHER_UNIT = 2.5
+"""Factor from which on it is another unit of length: feet are 3.3 to a metre."""
 UNIT_SPREAD = 1.2
 """Depths in another unit are all off by one factor: three quarters of the places span less than this share of it."""
 
@@ -149,8 +151,11 @@ def require_same_place(stamp: float, view: MeasuredView, xyz: NDArray[np.float32
     if agreeing >= LEAST_AGREEING:
         return
     low, middle, high = np.percentile(measured[met] / z[met], [12.5, 50, 87.5])
-    what = "its pose is off, or it is of another place: check the pose, or correct the map after a loop closure"
-    if high - low < UNIT_SPREAD * middle and not 0.5 < middle < 2:
+    what = (
+        "its pose is off, it is of another place, or something stands before the camera: check these, or correct the "
+    )
+    what += "map after a loop closure"
+    if high - low < UNIT_SPREAD * middle and max(middle, 1 / middle) > OTHER_UNIT:
         what = f"its depths are about {middle:.3g} times what the map expects: give them in the map's unit"
     raise SceneError(
         f"frame {stamp:g} confirms {agreeing:.0%} of the {np.count_nonzero(met)} points of the map before it; expected "
