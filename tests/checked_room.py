@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 
 import cv2
@@ -20,6 +21,7 @@ TILE, MASK = 0.25, 0.7
 FEATURES = 24
 
 
+@lru_cache
 def tiled_room(seed=0, views=10, points=9000, origin=(0.0, 0.0, 0.0), scale=1.0):
     """A right scene: photographs, masks, features and coloured points of the room's six sides."""
     random = np.random.default_rng(seed)

@@ -9,8 +9,9 @@ from scipy.spatial import ConvexHull, cKDTree
 from scipy.spatial.transform import Rotation
 
 from og_pointcloud.ask import boxes
-from og_pointcloud.ask.boxes import Box, axis_aligned_box, main_part, oriented_box, quaternion_of
+from og_pointcloud.ask.boxes import Box, axis_aligned_box, main_part, oriented_box
 from og_pointcloud.errors import SceneError
+from og_pointcloud.formats.poses import quaternion_of
 
 
 def without_strays(xyz):

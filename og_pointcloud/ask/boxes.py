@@ -17,8 +17,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from og_pointcloud.errors import SceneError
+from og_pointcloud.formats.poses import quaternion_of
 
-__all__ = ["Box", "axis_aligned_box", "main_part", "oriented_box", "quaternion_of"]
+__all__ = ["Box", "axis_aligned_box", "main_part", "oriented_box"]
 
 DoubleArray = NDArray[np.float64]
 
@@ -160,21 +161,6 @@ def main_part(points: ArrayLike, spacing: float) -> NDArray[np.bool_]:
             return main[which]
         edge *= 2
     return np.ones(len(xyz), bool)
-
-
-def quaternion_of(rotation: DoubleArray) -> DoubleArray:
-    """(4,) unit quaternion wxyz, w >= 0, of a rotation matrix (3, 3) that turns column vectors."""
-    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = rotation
-    products = np.array(  # 4 q q'
-        [
-            [1 + xx + yy + zz, zy - yz, xz - zx, yx - xy],
-            [zy - yz, 1 + xx - yy - zz, xy + yx, xz + zx],
-            [xz - zx, xy + yx, 1 - xx + yy - zz, yz + zy],
-            [yx - xy, xz + zx, yz + zy, 1 - xx - yy + zz],
-        ]
-    )
-    quaternion = products[products.diagonal().argmax()]  # the row of the largest part divides safely
-    return quaternion / np.linalg.norm(quaternion) * (1 if quaternion[0] >= 0 else -1)
 
 
 def _checked(points: ArrayLike) -> DoubleArray:

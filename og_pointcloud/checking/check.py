@@ -14,14 +14,13 @@ from typing import Literal
 
 import numpy as np
 
-from og_pointcloud.checking.conversions import VOUCHING, best_conversion, best_mask_conversion, fits
-from og_pointcloud.checking.masks import Consistency, MaskMaps, read_mask_maps
-from og_pointcloud.checking.photographs import Likeness, Photographs, read_photographs
-from og_pointcloud.checking.registration import FREE, MORE_POINTS, Registration, Small
-from og_pointcloud.checking.sample import Sample, draw_sample, seen
+from og_pointcloud.checking.conversions import Repairs, best_conversion, best_mask_conversion
+from og_pointcloud.checking.masks import MaskMaps, read_mask_maps
+from og_pointcloud.checking.photographs import Photographs, read_photographs
+from og_pointcloud.checking.registration import GROUPS, MORE_POINTS, Registration, Small
+from og_pointcloud.checking.sample import Comparison, Sample, draw_sample, seen
 from og_pointcloud.cloud import BACKGROUND, UNKNOWN_SPACE, UNOBSERVED, LabelledCloud
 from og_pointcloud.errors import printable
-from og_pointcloud.formats.repairs import Repair
 from og_pointcloud.scene import Scene
 
 __all__ = [
@@ -31,10 +30,11 @@ __all__ = [
 
 Verdict = Literal["ok", "doubt", "unchecked"]
 
-LEAST_SHARE, LEAST_GAP = 0.7, 0.25
-"""Drawings fit their own photographs in so many comparisons at least, and stand out so far."""
-LEAST_MASK_SHARE, LEAST_MASK_GAP = 0.75, 0.12
-"""Masks of views agree where they see the same, better than other masks would; doubted where both are missed."""
+PHOTOGRAPHS_FIT = (0.7, 0.25)
+"""Share and gap: drawings fit their own photographs in so many comparisons at least, and stand out so far."""
+MASKS_AGREE, MASKS_VOUCH = (0.75, 0.12), (0.85, 0.15)
+"""Masks of views agree where they see the same, better than other masks would; doubted where share and gap are missed;
+and where they vouch for poses that photographs doubt."""
 LEAST_FEATURE_SHARE, FEWEST_FEATURES = 0.68, 60
 """Features of masks that show the same are the more alike ones in so many of so many comparisons at least."""
 LESS_ERROR, LEAST_SHIFT = 0.8, 0.01
@@ -45,6 +45,8 @@ AS_GOOD, HALF = 0.1, 0.5
 there is no repair, only where no other gains half as much."""
 FEWEST = 10
 """Points, comparisons, rows or instances below this number say nothing."""
+FEWEST_VOUCHING = 30
+"""Comparisons of masks that can stand against photographs."""
 MOST_BLIND = 0.7
 """Views that see nothing, of those asked, from which no part of a larger map explains it."""
 MOST_UNSHOWN, MOST_ZERO, WHOLE_IMAGE = 0.3, 0.5, 0.95
@@ -53,13 +55,6 @@ LEAST_COSINE = 2.5
 """Standard deviations of random directions' cosines: the best word of an instance lies farther out where both share a
 space, and less far for another encoder's, if words are few (of a thousand random ones the best one is at 3.2)."""
 SUSPECTS = "poses (axes, direction, order), units, intrinsics or the cloud's frame are wrong"
-SMALL_CHANGES = {
-    "focal": "another focal length",
-    "shifted": "another principal point",
-    "lens": "a lens that bends otherwise (distortion corrected twice, or not at all)",
-    "aligned": "the cameras moved as a whole",
-    "everything": "poses and calibration changed a little",
-}
 
 
 class CaptureWarning(UserWarning):
@@ -90,7 +85,7 @@ def check_capture(scene: Scene) -> list[Check]:
     sample = draw_sample(scene)
     maps = read_mask_maps(sample) if any(view.mask_count for view in scene.views) else None
     checks, photographs = _poses(sample, maps)
-    checks.append(_alignment(photographs, sample))
+    checks.append(_alignment(photographs))
     if maps is not None:
         checks.append(_masks(maps, is_doubted=_doubted(checks, "poses")))
         checks.append(_features(maps, is_doubted=_doubted(checks, "poses", "masks")))
@@ -101,7 +96,7 @@ def check_poses(scene: Scene) -> list[Check]:
     """The part of `check_capture` that needs no masks: for commands that only look at a capture."""
     sample = draw_sample(scene)
     checks, photographs = _poses(sample, None)
-    return [*checks, _alignment(photographs, sample)]
+    return [*checks, _alignment(photographs)]
 
 
 def check_cloud(cloud: LabelledCloud, before: Sequence[Check] = ()) -> list[Check]:
@@ -144,103 +139,100 @@ def _doubted(checks: Sequence[Check], *names: str) -> bool:
     return any(check.verdict == "doubt" for check in checks if check.name in names)
 
 
+def _doubt(name: str, says: str, repairs: Repairs = (), then: str = "") -> Check:
+    """then: what is so with the repairs, if there are any."""
+    listed = " ".join(map(str, repairs))
+    return Check(name, "doubt", f"{says}; with {listed} {then}" if repairs else says, listed)
+
+
 def _poses(sample: Sample, maps: MaskMaps | None) -> tuple[list[Check], Photographs | None]:
     """By photographs where there are any, else by masks; and the photographs, if they fit."""
     photographs = read_photographs(sample)
     if photographs is None:
         return [_poses_by_masks(sample, maps)], None
-    stated = photographs.likeness(photographs.sample.cameras)
-    if stated.share >= LEAST_SHARE and stated.gap >= LEAST_GAP:
-        return [Check("poses", "ok", f"drawings fit their own photographs best: {_in_words(stated)}")], photographs
-    repairs = best_conversion(photographs, maps)
-    if repairs:
-        found = photographs.likeness(photographs.sample.repaired(repairs))
-        better = f"; with {_listed(repairs)} it does ({_in_words(found)})"
-        return [Check("poses", "doubt", _misfit(stated) + better, _listed(repairs))], None
+    stated = photographs.fit(photographs.sample.cameras)
+    if stated.reaches(PHOTOGRAPHS_FIT):
+        return [Check("poses", "ok", f"drawings fit their own photographs best: {stated}")], photographs
     if photographs.points_are_painted:
         return [_poses_by_masks(sample, maps)], None
-    agreement = Consistency.of([]) if maps is None else maps.agreement(maps.sample.cameras)
-    if fits(agreement, VOUCHING):
+    misfit = f"drawn where the poses say, the cloud fits its own photographs no better than others ({stated})"
+    if repairs := best_conversion(photographs):
+        found = photographs.fit(photographs.sample.repaired(repairs))
+        return [_doubt("poses", f"{misfit}: {SUSPECTS}", repairs, f"it does ({found})")], None
+    agreement = _agreement(maps)
+    if agreement.compared >= FEWEST_VOUCHING and agreement.reaches(MASKS_VOUCH):
         says = (
-            f"they fit the points' colours no better than other photographs ({_in_words(stated)}), though masks do: "
-            "they are turned, of another place or in another order (labels do not depend on them), or poses are off a "
-            "little"
+            f"they fit the points' colours no better than other photographs ({stated}), though masks do: they are "
+            "turned, of another place or in another order (labels do not depend on them), or poses are off a little"
         )
-        return [_agreed(agreement), Check("photographs", "doubt", says)], None
-    return [Check("poses", "doubt", _misfit(stated))], None
-
-
-def _misfit(stated: Likeness) -> str:
-    return (
-        "drawn where the poses say, the cloud fits its own photographs no better than others "
-        f"({_in_words(stated)}): {SUSPECTS}"
-    )
+        return [_agreed("poses", agreement), _doubt("photographs", says)], None
+    return [_doubt("poses", f"{misfit}: {SUSPECTS}")], None
 
 
 def _poses_by_masks(sample: Sample, maps: MaskMaps | None) -> Check:
     enough = min(FEWEST, len(sample.xyz) / 2)
     blind = sum(len(seen(sample.xyz, camera).rows) < enough for camera in sample.cameras)
-    is_blind = blind > MOST_BLIND * len(sample.cameras)
-    agreement = Consistency.of([]) if maps is None else maps.agreement(maps.sample.cameras)
-    if not is_blind and agreement.compared < FEWEST:
-        return Check("poses", "unchecked", "no photographs with coloured points; masks are missing or share too little")
-    if not is_blind and _verdict(agreement) != "doubt":
-        return _agreed(agreement)
-    repairs = best_conversion(None, maps) or (best_mask_conversion(maps) if maps is not None else ())
-    says = f"masks of different views agree no better than others' masks ({_masks_in_words(agreement)})"
-    if is_blind:
+    agreement = _agreement(maps)
+    if blind > MOST_BLIND * len(sample.cameras):
         says = f"the cameras of {blind} of {len(sample.cameras)} views see next to nothing of the cloud"
-    better = f"; with {_listed(repairs)} masks agree" if repairs else ""
-    return Check("poses", "doubt", f"{says}: {SUSPECTS}, or masks are of other images{better}", _listed(repairs))
+    elif agreement.compared < FEWEST:
+        return Check("poses", "unchecked", "no photographs with coloured points; masks are missing or share too little")
+    elif _verdict(agreement) != "doubt":
+        return _agreed("poses", agreement)
+    else:
+        says = f"masks of different views agree no better than others' masks ({agreement})"
+    repairs = (best_conversion(maps) or best_mask_conversion(maps)) if maps else ()
+    return _doubt("poses", f"{says}: {SUSPECTS}, or masks are of other images", repairs, "masks agree")
 
 
-def _agreed(agreement: Consistency) -> Check:
-    says = f"masks of different views agree on them: {_masks_in_words(agreement)}"
-    return Check("poses", _verdict(agreement), says)
+def _agreement(maps: MaskMaps | None) -> Comparison:
+    return Comparison.of([], "information") if maps is None else maps.fit(maps.sample.cameras)
 
 
-def _verdict(found: Consistency) -> Verdict:
+def _agreed(name: str, found: Comparison) -> Check:
+    return Check(name, _verdict(found), f"masks of different views agree: {found}")
+
+
+def _verdict(found: Comparison) -> Verdict:
     """By masks: "unchecked" between the two bounds."""
-    signs = found.share >= LEAST_MASK_SHARE, found.gap >= LEAST_MASK_GAP
-    return "ok" if all(signs) else "unchecked" if any(signs) else "doubt"
+    if found.reaches(MASKS_AGREE):
+        return "ok"
+    return "unchecked" if found.share >= MASKS_AGREE[0] or found.gap >= MASKS_AGREE[1] else "doubt"
 
 
-def _alignment(photographs: Photographs | None, sample: Sample) -> Check:
+def _alignment(photographs: Photographs | None) -> Check:
     """Small faults: a shift, a turn, a scale or calibration that is a little off."""
     if photographs is None:
         return Check("alignment", "unchecked", "it takes photographs that fit the points' colours")
-    stated = photographs.sample.cameras
-    quick = Registration(photographs, stated)
-    best = quick.found(FREE["everything"])
-    if not _is_fault(best, quick.start.error):
-        return _aligned(best, quick.start.error)
-    registration = Registration(photographs, stated, MORE_POINTS)
+    registration = Registration(photographs, photographs.sample.cameras)
+    change = registration.found("everything")
+    if _is_fault(change, registration.start.error):
+        registration = Registration(photographs, photographs.sample.cameras, MORE_POINTS)
+        name, change = _simplest(registration)
+        less = 1 - change.error / max(registration.start.error, 1e-9)
+        if _is_fault(change, registration.start.error):
+            off = f"points lie {change.shift:.1%} of the width off"
+            says = f"photographs fit {less:.0%} better with {GROUPS[name].says}: {off}"
+            return Check("alignment", "doubt", says, " ".join(map(str, registration.repair(name, change))))
+    less = 1 - change.error / max(registration.start.error, 1e-9)
+    says = f"no small change of poses or calibration fits much better ({less:.0%}, {change.shift:.1%} of the width)"
+    return Check("alignment", "ok", says)
+
+
+def _simplest(registration: Registration) -> tuple[str, Small]:
+    """The group of fewest numbers whose best change is as good as others', and that change."""
     start = registration.start.error
-    found = {name: registration.found(free) for name, free in FREE.items()}
+    found = {name: registration.found(name) for name in GROUPS}
     everything = found.pop("everything")
     least = min(change.error for change in found.values())
-    name, change = next(item for item in found.items() if item[1].error <= least + AS_GOOD * (start - least))
     if start - least < HALF * (start - everything.error):
-        name, change = "everything", everything
-    if not _is_fault(change, start):
-        return _aligned(change, start)
-    repairs = registration.repairs(name, change, np.stack([camera.center for camera in sample.listed]))
-    less = 1 - change.error / start
-    says = (
-        f"photographs fit {less:.0%} better with {SMALL_CHANGES[name]}: points lie {change.shift:.1%} of the width off"
-    )
-    return Check("alignment", "doubt", says, _listed(repairs))
+        return "everything", everything
+    return next(item for item in found.items() if item[1].error <= least + AS_GOOD * (start - least))
 
 
 def _is_fault(change: Small, start: float) -> bool:
     """Whether a change is that of a fault. start: the error without it."""
     return change.error <= LESS_ERROR * start and change.shift >= LEAST_SHIFT
-
-
-def _aligned(change: Small, start: float) -> Check:
-    less = 1 - change.error / max(start, 1e-9)
-    says = f"no small change of poses or calibration fits much better ({less:.0%}, {change.shift:.1%} of the width)"
-    return Check("alignment", "ok", says)
 
 
 def _masks(maps: MaskMaps, *, is_doubted: bool) -> Check:
@@ -250,61 +242,63 @@ def _masks(maps: MaskMaps, *, is_doubted: bool) -> Check:
         return Check("masks", "doubt", says)
     if is_doubted:
         return Check("masks", "unchecked", "poses come first")
-    found = maps.agreement(maps.sample.cameras)
+    found = _agreement(maps)
     if found.compared < FEWEST:
         return Check("masks", "unchecked", "too few points are seen by two views with masks")
-    verdict = _verdict(found)
-    repairs = () if verdict == "ok" else best_mask_conversion(maps)
-    if verdict != "doubt" and not repairs:
-        return Check("masks", verdict, f"views agree on them: {_masks_in_words(found)}")
+    repairs = () if _verdict(found) == "ok" else best_mask_conversion(maps)
+    if _verdict(found) != "doubt" and not repairs:
+        return _agreed("masks", found)
     says = (
-        f"where views see the same points, masks agree no better than others' ({_masks_in_words(found)}): they are "
-        "mirrored, turned, or of other images"
+        f"where views see the same points, masks agree no better than others' ({found}): they are mirrored, turned, or "
+        "of other images"
     )
-    return Check("masks", "doubt", f"{says}; with {_listed(repairs)} they agree" if repairs else says, _listed(repairs))
+    return _doubt("masks", says, repairs, "they agree")
 
 
 def _features(maps: MaskMaps, *, is_doubted: bool) -> Check:
-    with_rows = [features for features in maps.features if features.size]
-    if not with_rows:
-        return Check("features", "unchecked", "masks have none")
-    rows = np.concatenate(with_rows)
-    zero = float((rows == 0).all(axis=1).mean())
-    if len(rows) >= FEWEST and zero > MOST_ZERO:
-        return Check("features", "doubt", f"{zero:.0%} of the rows are zero: encode the masks")
-    if len(rows) >= FEWEST and np.ptp(rows, axis=0).max() < 1e-6:
-        return Check("features", "doubt", f"all {len(rows)} rows are equal: words cannot tell masks apart")
-    if doubt := _unshown(maps):
+    if doubt := _odd_rows(maps) or _unshown(maps):
         return doubt
+    if not any(map(len, maps.features)):
+        return Check("features", "unchecked", "masks have none")
     if is_doubted:
         return Check("features", "unchecked", "poses and masks come first")
     alike = maps.features_alike(maps.sample.cameras)
     if alike.compared < FEWEST_FEATURES:
         return Check("features", "unchecked", "too few masks of different views show the same")
-    counted = f"{alike.share:.0%} of {alike.compared} comparisons"
+    says = f"masks that show the same have the more similar ones in {alike}"
     if alike.share >= LEAST_FEATURE_SHARE:
-        return Check("features", "ok", f"masks that show the same have the more similar ones in {counted}")
-    says = f"masks that show the same have the more similar ones in {counted}: rows belong to other masks"
-    shifted = maps.features_alike(maps.sample.cameras, shift=1)
-    if shifted.share > max(LEAST_FEATURE_SHARE, alike.share + 0.1):
-        return Check("features", "doubt", f"{says}; ids seem to count from 0", "masks=from-zero")
-    return Check("features", "doubt", says)
+        return Check("features", "ok", says)
+    shifted = maps.features_alike(maps.sample.cameras, shift=1).share
+    if shifted > max(LEAST_FEATURE_SHARE, alike.share + 0.1):
+        return Check("features", "doubt", f"{says}: ids seem to count from 0", "masks=from-zero")
+    return Check("features", "doubt", f"{says}: rows belong to other masks")
+
+
+def _odd_rows(maps: MaskMaps) -> Check | None:
+    """A doubt where rows say nothing."""
+    with_rows = [features for features in maps.features if features.size]
+    rows = np.concatenate(with_rows) if with_rows else np.zeros((0, 1))
+    if len(rows) < FEWEST:
+        return None
+    if (zero := float((rows == 0).all(axis=1).mean())) > MOST_ZERO:
+        return Check("features", "doubt", f"{zero:.0%} of the rows are zero: encode the masks")
+    if np.ptp(rows, axis=0).max() < 1e-6:
+        return Check("features", "doubt", f"all {len(rows)} rows are equal: words cannot tell masks apart")
+    return None
 
 
 def _unshown(maps: MaskMaps) -> Check | None:
     """A doubt where many rows belong to no pixel, or the last one never does."""
     shown = [rows for rows in maps.shown if len(rows)]
-    missing = float((~np.concatenate(shown)).mean())
-    if sum(map(len, shown)) >= FEWEST and missing > MOST_UNSHOWN:
-        says = (
-            f"{missing:.0%} of the rows belong to no pixel: there are more rows than masks, or they are of another run"
-        )
-        return Check("features", "doubt", says)
     many = [rows for rows in shown if len(rows) > 1]
-    others = np.mean([rows[:-1].mean() for rows in many]) if many else 0.0
+    others = float(np.mean([rows[:-1].mean() for rows in many])) if many else 0.0
     if len(many) >= 4 and not any(rows[-1] for rows in many) and others > 1 - MOST_UNSHOWN:
         says = f"the last row belongs to no pixel in any of {len(many)} views: ids seem to count from 0"
         return Check("features", "doubt", says, "masks=from-zero")
+    missing = 1 - float(np.concatenate(shown).mean()) if shown else 0.0
+    if sum(map(len, shown)) >= FEWEST and missing > MOST_UNSHOWN:
+        says = f"{missing:.0%} of the rows belong to no pixel: more rows than masks, or rows of another run"
+        return Check("features", "doubt", says)
     return None
 
 
@@ -332,15 +326,3 @@ def _space(cloud: LabelledCloud) -> Check:
         says = "nobody named the encoder of the masks: words of any encoder of that width are compared with them"
         return Check("feature space", "unchecked", says)
     return Check("feature space", "ok", f"'{printable(cloud.feature_space, 80)}'")
-
-
-def _in_words(found: Likeness) -> str:
-    return f"{found.share:.0%} of {found.compared} comparisons, correlation {found.own:.2f} against {found.other:.2f}"
-
-
-def _masks_in_words(found: Consistency) -> str:
-    return f"{found.share:.0%} of {found.compared} comparisons, information {found.own:.2f} against {found.other:.2f}"
-
-
-def _listed(repairs: Sequence[Repair]) -> str:
-    return " ".join(map(str, repairs))

@@ -1,36 +1,35 @@
 """Which of the usual conversions makes a capture fit: axes, direction, units, scale, intrinsics, neighbouring frames.
 
-Each is tried on a few views and points; the best one is tried again on all that were read, and named only if it fits
-well and far better than what the files say. Numbers (a scale, a focal length) are searched on a grid, then more finely.
+All that `KINDS` of repairs lists are tried on few views and points, the best again on all that were read, and one is
+named only if it fits well and far better than what the files say. Numbers (a scale, a focal length) are searched on a
+grid, then more finely.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable
+from dataclasses import replace
 
 import numpy as np
 
-from og_pointcloud.checking.masks import Consistency, MaskMaps
+from og_pointcloud.checking.masks import MaskMaps
 from og_pointcloud.checking.photographs import Photographs
-from og_pointcloud.checking.registration import FREE, MORE_POINTS, Registration
-from og_pointcloud.checking.sample import Sample
+from og_pointcloud.checking.registration import MORE_POINTS, Registration
+from og_pointcloud.checking.sample import Comparison
 from og_pointcloud.errors import SceneError
-from og_pointcloud.formats.repairs import SHIFTS, WORLDS, Repair, repaired_ids
-from og_pointcloud.scene import Camera
+from og_pointcloud.formats.repairs import KINDS, MASK_FLIPS, MASK_SHIFTS, Repair
 
-__all__ = ["VOUCHING", "best_conversion", "best_mask_conversion", "fits"]
+__all__ = ["Repairs", "best_conversion", "best_mask_conversion"]
 
 Repairs = tuple[Repair, ...]
-Score = Callable[[Sequence[Camera]], float]
 
-TRIED_VIEWS, TRIED_POINTS = 8, 4000
-PHOTOGRAPHS_FIT = (0.8, 0.4, 0.5)
-"""Share of comparisons, gap and correlation from which a conversion fits."""
-MASKS_FIT, VOUCHING = (0.9, 0.18), (0.85, 0.15)
-"""Share and gap from which it does by masks; and from which masks vouch for poses that photographs doubt."""
+FINALISTS = 8
+"""So many of the best of few views and points are tried again on all."""
+PHOTOGRAPHS_FIT, MASKS_FIT = (0.8, 0.4), (0.9, 0.18)
+"""Share and gap from which a conversion fits."""
 FEWEST_COMPARED = 30
 BETTER = 0.1
-"""It fits by so much more than what the files say, of a correlation or of mutual information."""
+"""Its gap is so much larger than that of what the files say."""
 STEPS_PER_DOUBLING = 6
 """A grid this fine brings the drawing to within a cell or two."""
 ROUND_NUMBERS = (1000, 100, 10, 8, 4, 3, 2, 1.5, 1 / 0.3048, 2.54, 1)
@@ -38,127 +37,80 @@ ROUND = 0.015
 """A number within this share of a round one, or of its reciprocal, is the round one, if that fits as well."""
 CLOSE = 1.1
 """Errors up to so many times the least one are as good."""
-SPANS = {"scale": 11, "intrinsics": 4, "focal": 5}
-"""Doublings and halvings that are tried."""
 
 
-def fits(found: Consistency, needed: tuple[float, float] = MASKS_FIT) -> bool:
-    """Whether masks agree so far."""
-    return found.compared >= FEWEST_COMPARED and found.share >= needed[0] and found.gap >= needed[1]
-
-
-def best_conversion(photographs: Photographs | None, maps: MaskMaps | None) -> Repairs:
-    """The repairs of cameras that make the capture fit, by its photographs or else by its masks; () if none does."""
-    score: Score
-    if photographs is not None:
-        few = photographs.fewer(TRIED_VIEWS, TRIED_POINTS)
-        sample, score = few.sample, lambda cameras: few.likeness(cameras).own
-    elif maps is not None:
-        masks = maps.fewer(TRIED_VIEWS, TRIED_POINTS)
-        sample, score = masks.sample, lambda cameras: masks.agreement(cameras).gap
-    else:
-        return ()
-    for tried in (_alone(), _together()):
-        best = max(tried, key=lambda repairs: _score(sample, repairs, score))
-        if photographs is not None:
-            best = _polished(best, photographs)
-        if _convinces(best, photographs, maps):
-            return best
-    if photographs is not None and _convinces(moved := _moved(photographs), photographs, maps):
-        return moved
-    return ()
-
-
-def _moved(photographs: Photographs) -> Repairs:
-    """The cameras moved as a whole so that photographs fit best."""
-    registration = Registration(photographs, photographs.sample.cameras, MORE_POINTS)
-    centers = np.stack([camera.center for camera in photographs.sample.listed])
-    return registration.repairs("aligned", registration.found(FREE["aligned"]), centers)
+def best_conversion(evidence: Photographs | MaskMaps) -> Repairs:
+    """The repairs of cameras that make photographs or masks fit; () if none does."""
+    few = evidence.fewer()
+    finalists = sorted(_tried(), key=lambda repairs: -_fit(few, repairs).gap)[:FINALISTS]
+    best = max(finalists, key=lambda repairs: _fit(evidence, repairs).gap)
+    if isinstance(evidence, MaskMaps):
+        return best if _convinces(evidence, best) else ()
+    best = _polished(best, evidence)
+    if _convinces(evidence, best):
+        return best
+    registration = Registration(evidence, evidence.sample.cameras, MORE_POINTS)
+    moved = registration.repair("aligned", registration.found("aligned"))
+    return moved if _convinces(evidence, moved) else ()
 
 
 def best_mask_conversion(maps: MaskMaps) -> Repairs:
     """The repair of masks that makes them agree; () if none does."""
     cameras = maps.sample.cameras
-    found: dict[Repairs, Consistency] = {}
-    for value in ("mirrored", "upside-down", "turned", "next", "previous"):
-        repair = Repair.parse(f"masks={value}")
-        if value not in SHIFTS:
-            ids = [repaired_ids(map_, repair) for map_ in maps.ids]  # flips alone: rows do not change
-            found[repair,] = maps.with_ids(ids).agreement(cameras)
-        elif len(maps.ids) == len(maps.sample.listed):
-            ids = maps.ids[SHIFTS[value] :] + maps.ids[: SHIFTS[value]]
-            found[repair,] = maps.with_ids(ids).agreement(cameras)
-        else:  # the neighbour's masks were not read; its camera with this one's masks tells the same
-            moved = maps.sample.repaired([Repair.parse(f"frames={-SHIFTS[value]}")])
-            found[repair,] = maps.agreement(moved)
+    found: dict[Repairs, Comparison] = {}
+    for value, flip in MASK_FLIPS.items():
+        found[_parsed(f"masks={value}")] = replace(maps, ids=[flip(ids) for ids in maps.ids]).fit(cameras)
+    for value, by in MASK_SHIFTS.items():  # with the neighbour's camera, these masks tell the same
+        found[_parsed(f"masks={value}")] = _fit(maps, _parsed(f"frames={-by}"))
     best = max(found, key=lambda repairs: found[repairs].gap)
-    stated = maps.agreement(cameras)
-    return best if fits(found[best]) and found[best].gap > stated.gap + BETTER / 2 else ()
+    better = found[best].gap > maps.fit(cameras).gap + BETTER / 2
+    return best if better and found[best].compared >= FEWEST_COMPARED and found[best].reaches(MASKS_FIT) else ()
 
 
-def _alone() -> list[Repairs]:
-    words = [
-        "axes=flipped", "direction=inverse", "axes=flipped direction=inverse", "direction=inverse axes=flipped",
-        "axes=flipped direction=inverse axes=flipped", "quaternions=xyzw", "frames=1", "frames=-1", "center=swapped",
-        "center=middle",
-    ]  # fmt: skip
-    words += [f"world={world}" for world in WORLDS if world != "x,y,z"]
-    for name, span in SPANS.items():
-        steps = np.arange(-span * STEPS_PER_DOUBLING, span * STEPS_PER_DOUBLING + 1)
-        words += [f"{name}={value:.6g}" for value in 2.0 ** (steps[steps != 0] / STEPS_PER_DOUBLING)]
-    return _parsed(words)
+def _tried() -> Iterable[Repairs]:
+    """Every repair of cameras that is one word or one number, and both mistakes of axes at once."""
+    flipped, inverse = "axes=flipped", "direction=inverse"
+    for name, kind in KINDS.items():
+        if name not in ("masks", "lens"):
+            yield from (_parsed(f"{name}={word}") for word in kind.words)
+        steps = np.arange(1, kind.doublings * STEPS_PER_DOUBLING + 1) / STEPS_PER_DOUBLING
+        yield from (_parsed(f"{name}={value:.6g}") for value in 2.0 ** np.concatenate([-steps, steps]))
+    yield from map(_parsed, (f"{flipped} {inverse}", f"{inverse} {flipped}", f"{flipped} {inverse} {flipped}"))
 
 
-def _together() -> list[Repairs]:
-    """Two mistakes at once, the commonest ones."""
-    camera = ("axes=flipped", "direction=inverse", "axes=flipped direction=inverse", "direction=inverse axes=flipped")
-    units = ("scale=1000", "scale=0.001", "intrinsics=2", "intrinsics=4", "intrinsics=0.5")
-    words = [f"{first} {other}" for first in camera for other in (*(f"world={world}" for world in WORLDS), *units)]
-    return _parsed([*words, *(f"world={world} {unit}" for world in WORLDS for unit in units[:2])])
+def _parsed(words: str) -> Repairs:
+    return tuple(map(Repair.parse, words.split()))
 
 
-def _parsed(words: Iterable[str]) -> list[Repairs]:
-    return [tuple(map(Repair.parse, word.split())) for word in words]
-
-
-def _score(sample: Sample, repairs: Repairs, score: Score) -> float:
+def _fit(evidence: Photographs | MaskMaps, repairs: Repairs) -> Comparison:
+    """With the cameras as the repairs mean them; of nothing where that makes no sense."""
     try:
-        return score(sample.repaired(repairs))
-    except SceneError:  # a matrix that is no pose
-        return -1.0
+        return evidence.fit(evidence.sample.repaired(repairs))
+    except SceneError:
+        return Comparison.of([], "")
 
 
 def _polished(repairs: Repairs, photographs: Photographs) -> Repairs:
     """The number of a repair, searched more finely, and made a round one where that fits as well."""
     repair = repairs[0]
-    if repair.name not in SPANS:
+    if not KINDS[repair.name].doublings:
         return repairs
 
-    sample = photographs.sample
-
     def error(value: float) -> float:
-        return registration.error(sample.repaired([Repair.parse(f"{repair.name}={value:.6g}")]))
+        return 1 - _fit(photographs, _parsed(f"{repair.name}={value:.6g}")).own
 
-    registration = Registration(photographs, sample.repaired(repairs))
     value = repair.numbers[0]
     for width, count in ((0.06, 6), (0.01, 5), (0.002, 4)):
-        tried = value * (1 + width * np.linspace(-1, 1, 2 * count + 1))
-        value = float(min(tried, key=error))
+        value = float(min(value * (1 + width * np.linspace(-1, 1, 2 * count + 1)), key=error))
     for round_one in (number**sign for number in ROUND_NUMBERS for sign in (1, -1)):
         if abs(value / round_one - 1) < ROUND and error(round_one) <= CLOSE * error(value):
             value = round_one
             break
-    return (Repair.parse(f"{repair.name}={value:.5g}"),)
+    return _parsed(f"{repair.name}={value:.5g}")
 
 
-def _convinces(repairs: Repairs, photographs: Photographs | None, maps: MaskMaps | None) -> bool:
-    try:
-        if photographs is not None:
-            stated, found = (photographs.likeness(photographs.sample.repaired(each)) for each in ((), repairs))
-            enough = min(np.array([found.share, found.gap, found.own]) / PHOTOGRAPHS_FIT) >= 1
-            return enough and found.own > stated.own + BETTER
-        assert maps is not None
-        said, meant = (maps.agreement(maps.sample.repaired(each)) for each in ((), repairs))
-        return fits(meant) and meant.gap > said.gap + BETTER
-    except SceneError:
-        return False
+def _convinces(evidence: Photographs | MaskMaps, repairs: Repairs) -> bool:
+    stated, found = _fit(evidence, ()), _fit(evidence, repairs)
+    enough = PHOTOGRAPHS_FIT if isinstance(evidence, Photographs) else MASKS_FIT
+    few = isinstance(evidence, MaskMaps) and found.compared < FEWEST_COMPARED
+    return not few and found.reaches(enough) and found.gap > stated.gap + BETTER

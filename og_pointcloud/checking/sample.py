@@ -1,4 +1,4 @@
-"""What the checks look at: some views and points of a scene, and which points a camera sees."""
+"""What the checks look at: some views and points of a scene, which points a camera sees, and how comparisons count."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.formats.poses import in_local_frame
-from og_pointcloud.formats.repairs import Repair, repaired_cameras
+from og_pointcloud.formats.repairs import KINDS, Repair, repaired_cameras
 from og_pointcloud.scene import Camera, Scene, View
 
-__all__ = ["CELLS", "Sample", "Seen", "draw_sample", "seen"]
+__all__ = ["CELLS", "Comparison", "Sample", "Seen", "draw_sample", "seen"]
 
 VIEWS = 12
 POINTS = 20_000
@@ -20,6 +20,36 @@ CELLS = 48
 """Cells along an image's longer side: of each, what is nearest is seen. A few points must fall into one."""
 BEHIND = 1.1
 """Points up to so many times as deep as the nearest one of their cell are seen."""
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """What is right against rivals. share: of comparisons in which it wins; ties count half. own, other: means of
+    both. gap: how far it stands out. compared: number of comparisons. unit: what is compared, in a word."""
+
+    share: float
+    own: float
+    other: float
+    gap: float
+    compared: int
+    unit: str
+
+    @classmethod
+    def of(cls, pairs: Sequence[tuple[float, float]], unit: str, *, of_rest: bool = False) -> Comparison:
+        """Of pairs of what is right and a rival. of_rest: the gap is a share of what the rivals leave up to 1."""
+        if not pairs:
+            return cls(0.0, 0.0, 0.0, 0.0, 0, unit)
+        own, other = np.array(pairs).T
+        won = (own > other + 1e-6) + 0.5 * (np.abs(own - other) <= 1e-6)
+        gap = float(own.mean() - other.mean()) / (max(1 - float(other.mean()), 1e-6) if of_rest else 1)
+        return cls(float(won.mean()), float(own.mean()), float(other.mean()), gap, len(pairs), unit)
+
+    def reaches(self, bounds: tuple[float, float]) -> bool:
+        """Whether share and gap are so large."""
+        return self.share >= bounds[0] and self.gap >= bounds[1]
+
+    def __str__(self) -> str:
+        return f"{self.share:.0%} of {self.compared} comparisons, {self.unit} {self.own:.2f} against {self.other:.2f}"
 
 
 @dataclass(frozen=True)
@@ -41,23 +71,21 @@ class Sample:
 
     def repaired(self, repairs: Sequence[Repair]) -> list[Camera]:
         """The cameras of the views as the repairs mean them; a matrix or lengths without sense raise SceneError."""
-        # All poses are needed where each takes its neighbour's, or is moved about the mean of all.
-        everyone = any(repair.name in ("frames", "aligned") for repair in repairs)
-        asked = range(len(self.listed)) if everyone else self.places
+        of_all = any(KINDS[repair.name].of_all for repair in repairs)
+        asked = range(len(self.listed)) if of_all else self.places
         world = [in_local_frame(self.listed[place], -self.origin) for place in asked]
         repaired = [in_local_frame(camera, self.origin) for camera in repaired_cameras(world, repairs)]
-        return [repaired[place] for place in self.places] if everyone else repaired
+        return [repaired[place] for place in self.places] if of_all else repaired
 
-    def fewer(self, views: int, points: int) -> Sample:
-        """Some of it, for what is asked often."""
-        rows = _spread(len(self.views), views)
+    def thinned(self, points: int) -> Sample:
+        """With about so many points at most, for what is asked often."""
         step = 1 + (len(self.xyz) - 1) // points
+        return replace(self, xyz=self.xyz[::step], rgb=None if self.rgb is None else self.rgb[::step])
+
+    def of_views(self, rows: Sequence[int]) -> Sample:
+        """With these of its views."""
         return replace(
-            self,
-            xyz=self.xyz[::step],
-            rgb=None if self.rgb is None else self.rgb[::step],
-            views=tuple(self.views[row] for row in rows),
-            places=tuple(self.places[row] for row in rows),
+            self, views=tuple(self.views[row] for row in rows), places=tuple(self.places[row] for row in rows)
         )
 
 
@@ -75,36 +103,25 @@ class Seen:
 def draw_sample(scene: Scene) -> Sample:
     """Some views and points of a scene. Nothing is read."""
     order = sorted(range(len(scene.views)), key=lambda index: scene.views[index].name)
-    places = tuple(order[row] for row in _spread(len(order), VIEWS))
-    step = 1 + (len(scene.points) - 1) // POINTS
-    rgb = scene.points.rgb
-    return Sample(
-        scene.points.xyz[::step].astype(np.float64),
-        None if rgb is None else rgb[::step].astype(np.float32),
-        tuple(scene.views[place] for place in places),
-        places,
-        tuple(view.camera for view in scene.views),
-        scene.points.origin,
-    )
+    spread = np.unique(np.linspace(0, len(order) - 1, min(VIEWS, len(order))).round().astype(int))
+    places = tuple(order[row] for row in spread)
+    cameras = tuple(view.camera for view in scene.views)
+    views, points = tuple(scene.views[place] for place in places), scene.points
+    step = 1 + (len(points) - 1) // POINTS
+    rgb = None if points.rgb is None else points.rgb[::step].astype(np.float32)
+    return Sample(points.xyz[::step].astype(np.float64), rgb, views, places, cameras, points.origin)
 
 
 def seen(xyz: NDArray[np.float64], camera: Camera, cells: int = CELLS) -> Seen:
     """The points (n, 3) that are in the image and not far behind the nearest one of their cell."""
-    columns, rows = (max(1, round(cells * side / max(camera.width, camera.height))) for side in _size(camera))
+    size = np.array([camera.width, camera.height])
+    columns, rows = (max(1, round(cells * side / max(size))) for side in size.tolist())
     uv_px, depth = camera.project(xyz)
     inside = np.flatnonzero(camera.shows(uv_px))
-    places = uv_px[inside] / _size(camera)
+    places = uv_px[inside] / size
     column, row = (np.minimum(places, 1 - 1e-9) * (columns, rows)).astype(np.intp).T
     cell = row * columns + column
     nearest = np.full(columns * rows, np.inf)
     np.minimum.at(nearest, cell, depth[inside])
     front = depth[inside] <= BEHIND * nearest[cell]
     return Seen(inside[front], places[front], cell[front], (rows, columns))
-
-
-def _size(camera: Camera) -> tuple[int, int]:
-    return camera.width, camera.height
-
-
-def _spread(count: int, most: int) -> list[int]:
-    return np.unique(np.linspace(0, count - 1, min(most, count)).round().astype(int)).tolist()

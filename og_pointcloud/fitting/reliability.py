@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array, vstack
 
+from og_pointcloud.checking.masks import entropies
 from og_pointcloud.cloud import InstanceTable, unit_rows
 from og_pointcloud.errors import SceneError
 from og_pointcloud.fitting.held_out import FEWEST_VIEWS
@@ -241,14 +242,5 @@ def _fit(masks: NDArray[np.int32], uv_px: NDArray[np.floating], ids: NDArray[np.
     height, width = masks.shape
     column, row = np.floor(uv_px).astype(int).T
     column, row = np.clip(column, 0, width - 1), np.clip(row, 0, height - 1)
-    if len(ids) == 0:
-        return 0.0
-    first, second = np.maximum(ids, -1) + 1, masks[row, column] + 1
-    shape = int(first.max()) + 1, int(second.max()) + 1
-    joint = np.bincount(first * shape[1] + second, minlength=shape[0] * shape[1]).reshape(shape) / len(ids)
-    joint = joint[joint.any(axis=1)][:, joint.any(axis=0)]
-    of_first, of_second = joint.sum(axis=1), joint.sum(axis=0)
-    entropy = -(of_first * np.log(of_first)).sum()
-    expected = of_first[:, None] * of_second[None]
-    told = (joint[joint > 0] * np.log(joint[joint > 0] / expected[joint > 0])).sum()
-    return float(told / entropy) if entropy > 0 else 0.0
+    entropy, of_masks, of_both = entropies(np.maximum(ids, -1) + 1, np.maximum(masks[row, column], -1) + 1)
+    return (entropy + of_masks - of_both) / entropy if entropy > 0 else 0.0

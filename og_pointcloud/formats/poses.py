@@ -23,8 +23,8 @@ from og_pointcloud.scene import Camera
 
 __all__ = [
     "MAX_JSON_BYTES", "OPENGL", "PosedFrames", "PosedImage", "Recording", "Sensor", "in_local_frame", "in_pinholes",
-    "inverse", "named_numbers", "numbered", "numbered_images", "read_json", "read_numbers", "read_text", "rigid",
-    "rotation_of_quaternion",
+    "inverse", "named_numbers", "numbered", "numbered_images", "quaternion_of", "read_json", "read_numbers", "read_text",
+    "rigid", "rotation_of_quaternion",
 ]  # fmt: skip
 
 MAX_TEXT_BYTES, MAX_JSON_BYTES = 1 << 26, 1 << 30
@@ -149,6 +149,21 @@ def rotation_of_quaternion(wxyz: ArrayLike) -> NDArray[np.float64]:
             [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
         ]
     )
+
+
+def quaternion_of(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(4,) unit quaternion wxyz, w >= 0, of a rotation matrix (3, 3) that turns column vectors."""
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = rotation
+    products = np.array(  # 4 q q'
+        [
+            [1 + xx + yy + zz, zy - yz, xz - zx, yx - xy],
+            [zy - yz, 1 + xx - yy - zz, xy + yx, xz + zx],
+            [xz - zx, xy + yx, 1 - xx + yy - zz, yz + zy],
+            [yx - xy, xz + zx, yz + zy, 1 - xx - yy + zz],
+        ]
+    )
+    quaternion = products[products.diagonal().argmax()]  # the row of the largest part divides safely
+    return quaternion / np.linalg.norm(quaternion) * (1 if quaternion[0] >= 0 else -1)
 
 
 def in_local_frame(camera: Camera, origin: NDArray[np.float64]) -> Camera:

@@ -1,8 +1,9 @@
-"""Mistakes of a capture's files, put right on reading: the files stay as they are.
+"""Mistakes in a capture's files, put right on reading: the files stay as they are.
 
 A repair is one word, ``name=value``. They are applied in their order to what the pose and mask files say; points are
 never touched, so that answers stay in the cloud's frame. ``repairs.json`` in a capture folder lists those that every
-command applies; `og-pointcloud repair` writes it, and the checks of a capture (og_pointcloud.checking) propose them.
+command applies; `og-pointcloud repair` writes it, and the checks of a capture (og_pointcloud.checking) try the same
+table, `KINDS`, to find out what a capture means.
 
   axes=flipped          the cameras' y and z axes point the other way: OpenCV's where OpenGL's are read, or the reverse
   direction=inverse     poses are world-to-camera where camera-to-world is read, or the reverse
@@ -27,7 +28,6 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -36,49 +36,39 @@ from numpy.typing import NDArray
 
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.mask_files import MaskLayer
-from og_pointcloud.formats.poses import PosedImage, read_json, rigid, rotation_of_quaternion
+from og_pointcloud.formats.poses import PosedImage, quaternion_of, read_json, rigid, rotation_of_quaternion
 from og_pointcloud.scene import Camera
 
 __all__ = [
-    "REPAIRS_NAME", "WORLDS", "Repair", "read_repairs", "repaired_cameras", "repaired_ids", "repaired_images",
-    "repaired_layers", "rotation_of_vector",
+    "KINDS", "MASK_FLIPS", "MASK_SHIFTS", "REPAIRS_NAME", "Kind", "Repair", "read_repairs", "repaired_cameras",
+    "repaired_images", "repaired_layers", "rotation_of_vector",
 ]  # fmt: skip
 
+Doubles = NDArray[np.float64]
+
 REPAIRS_NAME = "repairs.json"
-FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 MOST_REPAIRS = 16
-FLIPS: dict[str, Callable[[NDArray[Any]], NDArray[Any]]] = {
+FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+MASK_FLIPS: dict[str, Callable[[NDArray[Any]], NDArray[Any]]] = {
     "mirrored": lambda ids: ids[:, ::-1],
     "upside-down": lambda ids: ids[::-1],
     "turned": lambda ids: ids[::-1, ::-1],
-    "from-zero": lambda ids: np.where(ids < 0, ids, ids + 1),
 }
-SHIFTS = {"next": 1, "previous": -1}
+MASK_SHIFTS = {"next": 1, "previous": -1}
 WORLDS = tuple(
     ",".join(sign + axis for sign, axis in zip(signs, axes, strict=True))
     for axes in itertools.permutations("xyz")
     for signs in itertools.product(("", "-"), repeat=3)
-)
-"""All ways to name axes; half of them mirror the world."""
-WORDS = {
-    "axes": ("flipped",),
-    "direction": ("inverse",),
-    "quaternions": ("xyzw",),
-    "world": WORLDS,
-    "center": ("swapped", "middle"),
-    "lens": ("none",),
-    "masks": (*FLIPS, *SHIFTS),
-}
-NUMBERS = {"scale": 1, "aligned": 7, "frames": 1, "intrinsics": 1, "focal": 1, "shifted": 2}
-POSITIVE = ("scale", "intrinsics", "focal")
+)[1:]
+"""All ways to name axes but the one that changes nothing; half of them mirror the world."""
 
 
 @dataclass(frozen=True)
 class Repair:
     """One repair, as the list above has it. numbers: those of its value, where they are numbers.
 
-    >>> str(Repair.parse("scale=2.5")), Repair.parse("frames=-1").numbers
-    ('scale=2.5', (-1.0,))
+    >>> str(Repair.parse("scale=2.5")), Repair.parse("scale=2.5").numbers
+    ('scale=2.5', (2.5,))
     """
 
     name: str
@@ -89,31 +79,37 @@ class Repair:
     def parse(cls, text: str) -> Repair:
         """SceneError where the text is none of the repairs."""
         name, _, value = text.partition("=")
-        if value in WORDS.get(name, ()):
+        kind = KINDS.get(name)
+        if kind is not None and value in kind.words:
             return cls(name, value)
         numbers = _numbers(value)
-        fits = name in NUMBERS and len(numbers) == NUMBERS[name] and bool(np.isfinite(numbers).all())
-        fits = fits and (name != "frames" or numbers[0] == int(numbers[0]))
-        fits = fits and (name not in POSITIVE or numbers[0] > 0) and (name != "aligned" or numbers[6] > 0)
-        if not fits:
-            expected = ", ".join(WORDS[name][:8]) if name in WORDS else f"{NUMBERS.get(name, 'no')} finite numbers"
-            known = f"; {name} takes {expected}" if name in WORDS or name in NUMBERS else ""
-            raise SceneError(
-                f"'{text:.80}' is no repair; expected name=value with a name of "
-                f"{', '.join(sorted({*WORDS, *NUMBERS}))}{known} ('og-pointcloud repair --help' explains)"
-            )
-        return cls(name, value, numbers)
+        if kind is not None and numbers and len(numbers) == kind.numbers and (kind.may_be_negative or numbers[-1] > 0):
+            return cls(name, value, numbers)
+        expected = kind and (", ".join(kind.words[:8]) or f"{kind.numbers} finite numbers")
+        raise SceneError(
+            f"'{text:.80}' is no repair; expected name=value with a name of {', '.join(sorted(KINDS))}"
+            f"{f'; {name} takes {expected}' if kind else ''} ('og-pointcloud repair --help' explains)"
+        )
 
     def __str__(self) -> str:
         return f"{self.name}={self.value}"
 
 
-def _numbers(text: str) -> tuple[float, ...]:
-    """Those between commas; none where they are not numbers."""
-    try:
-        return tuple(float(part) for part in text.split(","))
-    except ValueError:
-        return ()
+Change = Callable[[list[Camera], Repair], list[Camera]]
+
+
+@dataclass(frozen=True)
+class Kind:
+    """change: of all cameras, which start from world coordinates, in the order of the pose file. words: the values that
+    there are; else numbers: how many it takes, of which the last is positive or may be negative. doublings: so many,
+    and halvings, of a number are tried by the checks, as every word is. of_all: a camera's change hangs on others."""
+
+    change: Change
+    words: tuple[str, ...] = ()
+    numbers: int = 0
+    may_be_negative: bool = False
+    doublings: int = 0
+    of_all: bool = False
 
 
 def read_repairs(capture: Path) -> tuple[Repair, ...]:
@@ -131,127 +127,110 @@ def read_repairs(capture: Path) -> tuple[Repair, ...]:
     return tuple(map(Repair.parse, listed))
 
 
-def repaired_images(images: Sequence[PosedImage], repairs: Sequence[Repair]) -> tuple[PosedImage, ...]:
-    """What the pose file means. Depth images move and scale with their photographs."""
-    cameras = repaired_cameras([image.camera for image in images], repairs)
-    depths = repaired_cameras([image.depth.camera if image.depth else image.camera for image in images], repairs)
-    without_lens = any(repair.name == "lens" for repair in repairs)
-    repaired = []
-    for image, camera, depth_camera in zip(images, cameras, depths, strict=True):
-        depth = None if image.depth is None else replace(image.depth, camera=depth_camera)
-        if without_lens:
-            depth = None if depth is None else replace(depth, lens=None)
-            image = replace(image, lens=None)
-        repaired.append(replace(image, camera=camera, depth=depth))
-    return tuple(repaired)
-
-
 def repaired_cameras(cameras: Sequence[Camera], repairs: Sequence[Repair]) -> list[Camera]:
     """cameras: from world coordinates, in the order of the pose file."""
     repaired = list(cameras)
     for repair in repairs:
-        if repair.name in INTRINSICS:
-            repaired = [INTRINSICS[repair.name](camera, repair) for camera in repaired]
-        elif repair.name in POSES:
-            poses = np.stack([camera.world_to_camera for camera in repaired])
-            moved = POSES[repair.name](poses, repair)
-            repaired = [replace(camera, world_to_camera=pose) for camera, pose in zip(repaired, moved, strict=True)]
+        repaired = KINDS[repair.name].change(repaired, repair)
     return repaired
+
+
+def repaired_images(images: Sequence[PosedImage], repairs: Sequence[Repair]) -> tuple[PosedImage, ...]:
+    """What the pose file means. Depth images move and scale with their photographs."""
+    cameras = repaired_cameras([image.camera for image in images], repairs)
+    depths = repaired_cameras([image.depth.camera if image.depth else image.camera for image in images], repairs)
+    without_lens = {"lens": None} if any(repair.name == "lens" for repair in repairs) else {}
+    repaired = []
+    for image, camera, depth_camera in zip(images, cameras, depths, strict=True):
+        depth = image.depth and replace(image.depth, camera=depth_camera, **without_lens)
+        repaired.append(replace(image, camera=camera, depth=depth, **without_lens))
+    return tuple(repaired)
 
 
 def repaired_layers(layers: Sequence[MaskLayer], repairs: Sequence[Repair]) -> list[MaskLayer]:
     """What the mask files mean; layers: in the order of the pose file."""
     repaired = list(layers)
-    for repair in repairs:
-        if repair.name == "masks" and repair.value in SHIFTS:
-            by = SHIFTS[repair.value]
-            repaired = [repaired[(index + by) % len(repaired)] for index in range(len(repaired))]
-        elif repair.name == "masks":
-            repaired = [replace(layer, read=partial(_read_repaired, layer.read, repair)) for layer in repaired]
+    for value in (repair.value for repair in repairs if repair.name == "masks"):
+        if value in MASK_SHIFTS:
+            by = MASK_SHIFTS[value] % len(repaired)
+            repaired = repaired[by:] + repaired[:by]
+        else:
+            repaired = [replace(layer, read=_ReadRepaired(layer.read, value)) for layer in repaired]
     return repaired
 
 
-def repaired_ids(ids: NDArray[Any], repair: Repair) -> NDArray[Any]:
-    """One mask map (H, W), -1 outside of all masks, as a repair of masks that stay with their image means it."""
-    return np.ascontiguousarray(FLIPS[repair.value](ids))
+@dataclass(frozen=True)
+class _ReadRepaired:
+    read: Callable[[], NDArray[np.int32]]
+    value: str
+
+    def __call__(self) -> NDArray[np.int32]:
+        ids = self.read()
+        if self.value == "from-zero":
+            return np.where(ids < 0, ids, ids + 1)
+        return np.ascontiguousarray(MASK_FLIPS[self.value](ids))
 
 
-def _read_repaired(read: Callable[[], NDArray[np.int32]], repair: Repair) -> NDArray[np.int32]:
-    return repaired_ids(read(), repair)
+def rotation_of_vector(radians: NDArray[np.floating]) -> Doubles:
+    """(3, 3) rotation about a vector (3,) by its length."""
+    half = np.asarray(radians, np.float64) / 2
+    angle = float(np.linalg.norm(half))
+    return rotation_of_quaternion([np.cos(angle), *(np.sinc(angle / np.pi) * half)])
 
 
-def _flipped(poses: NDArray[np.float64], repair: Repair) -> NDArray[np.float64]:
-    return FLIP @ poses
+def _numbers(text: str) -> tuple[float, ...]:
+    """Those between commas; none where they are not finite numbers."""
+    try:
+        numbers = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        return ()
+    return numbers if np.isfinite(numbers).all() else ()
 
 
-def _inverse(poses: NDArray[np.float64], repair: Repair) -> NDArray[np.float64]:
-    return np.asarray(np.linalg.inv(poses), np.float64)
+# What each does to cameras --------------------------------------------------------------------------------------------
 
 
-def _reordered(poses: NDArray[np.float64], repair: Repair) -> NDArray[np.float64]:
-    """A rotation of w x y z that was read from x y z w: q and -q are one rotation, so signs do not matter."""
-    return np.stack(
-        [rigid(rotation_of_quaternion(np.roll(_quaternion(pose[:3, :3]), 1)), pose[:3, 3]) for pose in poses]
-    )
+def _each(change: Callable[[Camera, Repair], Camera]) -> Change:
+    return lambda cameras, repair: [change(camera, repair) for camera in cameras]
 
 
-def _quaternion(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(4,) unit w x y z of a rotation: the eigenvector of the largest eigenvalue of Bar-Itzhack's symmetric matrix."""
-    (a, b, c), (d, e, f), (g, h, i) = rotation
-    symmetric = np.array(
-        [
-            [a + e + i, h - f, c - g, d - b],
-            [h - f, a - e - i, b + d, c + g],
-            [c - g, b + d, e - a - i, f + h],
-            [d - b, c + g, f + h, i - a - e],
-        ]
-    )
-    return np.linalg.eigh(symmetric)[1][:, -1]
+def _each_pose(change: Callable[[Doubles, Repair], Doubles]) -> Change:
+    """Of world_to_camera, (4, 4)."""
+    return _each(lambda camera, repair: replace(camera, world_to_camera=change(camera.world_to_camera, repair)))
 
 
-def _with_axes(poses: NDArray[np.float64], repair: Repair) -> NDArray[np.float64]:
+def _with_xyzw(pose: Doubles, repair: Repair) -> Doubles:
+    """Of a rotation that was made from x y z w as if it were w x y z. q and -q are one rotation."""
+    return rigid(rotation_of_quaternion(np.roll(quaternion_of(pose[:3, :3]), 1)), pose[:3, 3])
+
+
+def _with_axes(pose: Doubles, repair: Repair) -> Doubles:
     """x of the poses' world is the named axis of the cloud's, and so on; a mirrored world mirrors its cameras too."""
     turn = np.eye(4)
-    turn[:3, :3] = [
-        np.where(np.array(["x", "y", "z"]) == part[-1], -1.0 if part[0] == "-" else 1.0, 0.0)
-        for part in repair.value.split(",")
-    ]
-    mirrored = np.linalg.det(turn) < 0
-    return (np.diag([-1.0, 1, 1, 1]) if mirrored else np.eye(4)) @ poses @ turn
+    for row, axis in enumerate(repair.value.split(",")):
+        turn[row, :3] = np.where(np.array(list("xyz")) == axis[-1], -1.0 if axis[0] == "-" else 1.0, 0.0)
+    return np.diag([np.linalg.det(turn), 1, 1, 1]).round() @ pose @ turn
 
 
-def _scaled(poses: NDArray[np.float64], repair: Repair) -> NDArray[np.float64]:
-    scaled = poses.copy()
-    scaled[:, :3, 3] *= repair.numbers[0]
-    return scaled
-
-
-def _aligned(poses: NDArray[np.float64], repair: Repair) -> NDArray[np.float64]:
+def _aligned(cameras: list[Camera], repair: Repair) -> list[Camera]:
     """Cameras' centres c about their mean m become m + s R (c - m) + t, their rotations W become W R'."""
     move, turn, size = repair.numbers[:3], rotation_of_vector(np.deg2rad(repair.numbers[3:6])), repair.numbers[6]
-    rotations = poses[:, :3, :3]
-    centers = -np.einsum("nji,nj->ni", rotations, poses[:, :3, 3])
-    mean = centers.mean(axis=0)
-    centers = mean + size * (centers - mean) @ turn.T + move
-    aligned = poses.copy()
-    aligned[:, :3, :3] = rotations @ turn.T
-    aligned[:, :3, 3] = -np.einsum("nij,nj->ni", aligned[:, :3, :3], centers)
+    mean = np.mean([camera.center for camera in cameras], axis=0)
+    aligned = []
+    for camera in cameras:
+        rotation = camera.world_to_camera[:3, :3] @ turn.T
+        center = mean + size * turn @ (camera.center - mean) + move
+        aligned.append(replace(camera, world_to_camera=rigid(rotation, -rotation @ center)))
     return aligned
 
 
-def rotation_of_vector(radians: NDArray[np.floating]) -> NDArray[np.float64]:
-    """(3, 3) rotation about a vector (3,) by its length (Rodrigues)."""
-    angle = float(np.linalg.norm(radians))
-    x, y, z = np.asarray(radians, np.float64) / (angle or 1.0)
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+def _neighbours(cameras: list[Camera], repair: Repair) -> list[Camera]:
+    by = int(repair.value) % len(cameras)
+    poses = [camera.world_to_camera for camera in cameras[by:] + cameras[:by]]
+    return [replace(camera, world_to_camera=pose) for camera, pose in zip(cameras, poses, strict=True)]
 
 
-def _neighbours(poses: NDArray[np.float64], repair: Repair) -> NDArray[np.float64]:
-    return np.roll(poses, -int(repair.numbers[0]), axis=0)
-
-
-def _larger(camera: Camera, repair: Repair) -> Camera:
+def _of_another_size(camera: Camera, repair: Repair) -> Camera:
     by = repair.numbers[0]
     return replace(camera, fx=camera.fx * by, fy=camera.fy * by, cx=camera.cx * by, cy=camera.cy * by)
 
@@ -267,12 +246,28 @@ def _centered(camera: Camera, repair: Repair) -> Camera:
 
 
 def _shifted(camera: Camera, repair: Repair) -> Camera:
-    du, dv = repair.numbers
-    return replace(camera, cx=camera.cx + du * camera.width, cy=camera.cy + dv * camera.height)
+    right, down = repair.numbers
+    return replace(camera, cx=camera.cx + right * camera.width, cy=camera.cy + down * camera.height)
 
 
-POSES = {
-    "axes": _flipped, "direction": _inverse, "quaternions": _reordered, "world": _with_axes, "scale": _scaled,
-    "aligned": _aligned, "frames": _neighbours,
-}  # fmt: skip
-INTRINSICS = {"intrinsics": _larger, "focal": _focal, "center": _centered, "shifted": _shifted}
+def _none(cameras: list[Camera], repair: Repair) -> list[Camera]:
+    return cameras
+
+
+KINDS = {
+    "axes": Kind(_each_pose(lambda pose, repair: FLIP @ pose), ("flipped",)),
+    "direction": Kind(_each_pose(lambda pose, repair: np.linalg.inv(pose)), ("inverse",)),
+    "quaternions": Kind(_each_pose(_with_xyzw), ("xyzw",)),
+    "world": Kind(_each_pose(_with_axes), WORLDS),
+    "frames": Kind(_neighbours, ("1", "-1"), of_all=True),
+    "center": Kind(_each(_centered), ("swapped", "middle")),
+    "scale": Kind(
+        _each_pose(lambda pose, repair: rigid(pose[:3, :3], pose[:3, 3] * repair.numbers[0])), numbers=1, doublings=11
+    ),
+    "intrinsics": Kind(_each(_of_another_size), numbers=1, doublings=4),
+    "focal": Kind(_each(_focal), numbers=1, doublings=5),
+    "aligned": Kind(_aligned, numbers=7, of_all=True),
+    "shifted": Kind(_each(_shifted), numbers=2, may_be_negative=True),
+    "lens": Kind(_none, ("none",)),
+    "masks": Kind(_none, (*MASK_FLIPS, *MASK_SHIFTS, "from-zero")),
+}

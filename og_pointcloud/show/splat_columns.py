@@ -14,11 +14,11 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud.ask.boxes import quaternion_of
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.colors import LUMINANCE
 from og_pointcloud.formats.gaussian_ply import BASE_COLOR, LOG_SCALE, ROTATION, SH_CONSTANT
 from og_pointcloud.formats.ply import join_columns
+from og_pointcloud.formats.poses import quaternion_of
 from og_pointcloud.formats.tables import colors, positions
 
 __all__ = ["appended", "placed", "recoloured", "rotated_harmonics"]
