@@ -4,6 +4,7 @@ import json
 import warnings
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from checked_room import tiled_room, with_cameras, with_views, write_room
@@ -138,6 +139,17 @@ def test_what_lies_beyond_the_rim_of_a_lens_is_not_held_against_the_poses():
     assert verdicts(check_poses(with_black_rims(tiled_room(2, **SMALL)))) == {"poses": "ok", "alignment": "ok"}
     turned = with_black_rims(faulty("shifted=0.05,0.03", **SMALL))
     assert verdicts(check_poses(turned)) == {"poses": "ok", "alignment": "doubt"}
+
+
+@pytest.mark.parametrize(("width", "height"), [(97, 71), (71, 97), (1000, 761), (33, 21)])
+def test_images_of_any_size_are_compared_on_the_grid_of_what_is_seen(width, height):
+    scene = with_views(
+        tiled_room(2, **SMALL),
+        camera=lambda view, i, views: view.camera.resized(width, height),
+        image=lambda view, i, views: cv2.resize(view.image_rgb(), (width, height)),
+        masks=lambda view, i, views: cv2.resize(view.mask_map(), (width, height), interpolation=cv2.INTER_NEAREST),
+    )
+    assert doubts(scene) == {}
 
 
 @pytest.mark.parametrize("is_grey", [True, False])

@@ -509,7 +509,7 @@ def program(*arguments, **environment):
     return [sys.executable, "-c", code, *map(str, arguments)], {**os.environ, **environment}
 
 
-@pytest.mark.parametrize("encoding", ["latin-1", "ascii", "cp1252"])
+@pytest.mark.parametrize("encoding", ["cp1252", pytest.param("ascii", marks=pytest.mark.slow)])
 def test_output_of_few_characters(tmp_path, encoding):
     cloud = make_cloud(np.zeros((1, 3)), [0], words=("café", "日本", "😀"))
     path = write_bundle(cloud, tmp_path / "s.ogpc")

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud.checking.sample import CELLS, Comparison, Sample, Seen, seen
+from og_pointcloud.checking.sample import Comparison, Sample, Seen, grid_shape, seen
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.images import require_cv2
 from og_pointcloud.scene import Camera, View
@@ -43,7 +43,7 @@ FEW_COLORS = 64
 @dataclass(frozen=True)
 class Photographs:
     """sample: of the scene, views with photographs. images: (H, W, 3) each, LONGEST_PX along the longer side, NaN where
-    nothing is shown. grids: of each view (1 + rivals, cells, 3), the photograph with CELLS along its longer side, and
+    nothing is shown. grids: of each view (1 + rivals, cells, 3), the photograph on the grid of `seen`, and
     those that its drawing is compared with too: others that do not show the same, and its own mirrored."""
 
     sample: Sample
@@ -82,17 +82,22 @@ def read_photographs(sample: Sample) -> Photographs | None:
         return None
     found = {row: image for row, view in enumerate(sample.views) if (image := _small_image(view)) is not None}
     images = list(found.values())
-    small = [shrunk(image, CELLS) for image in images]
+    sample = sample.of_views(list(found))
+    shapes = [grid_shape(camera) for camera in sample.cameras]
+    small = [_resized(image, columns, rows) for image, (rows, columns) in zip(images, shapes, strict=True)]
     grids = [_with_rivals(grid, small) for grid in small]
     if sum(len(grid) - 1 for grid in grids) < FEWEST_COMPARED:
         return None
-    return Photographs(sample.of_views(list(found)), images, grids)
+    return Photographs(sample, images, grids)
 
 
 def shrunk(image: NDArray[np.generic], side: int) -> Floats:
     """The image with its longer side that long at most, averaged."""
     scale = min(1.0, side / max(image.shape[:2]))
-    width, height = (max(1, round(scale * length)) for length in image.shape[1::-1])
+    return _resized(image, *(max(1, round(scale * length)) for length in image.shape[1::-1]))
+
+
+def _resized(image: NDArray[np.generic], width: int, height: int) -> Floats:
     cv2 = require_cv2()
     return np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA), np.float32)
 

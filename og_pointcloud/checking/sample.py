@@ -12,7 +12,7 @@ from og_pointcloud.formats.poses import in_local_frame
 from og_pointcloud.formats.repairs import KINDS, Repair, repaired_cameras
 from og_pointcloud.scene import Camera, Scene, View
 
-__all__ = ["CELLS", "Comparison", "Sample", "Seen", "draw_sample", "seen"]
+__all__ = ["CELLS", "Comparison", "Sample", "Seen", "draw_sample", "grid_shape", "seen"]
 
 VIEWS = 12
 POINTS = 20_000
@@ -112,13 +112,18 @@ def draw_sample(scene: Scene) -> Sample:
     return Sample(points.xyz[::step].astype(np.float64), rgb, views, places, cameras, points.origin)
 
 
+def grid_shape(camera: Camera, cells: int = CELLS) -> tuple[int, int]:
+    """Rows and columns of a grid over the image with so many cells along the longer side."""
+    longest = max(camera.width, camera.height)
+    return max(1, round(cells * camera.height / longest)), max(1, round(cells * camera.width / longest))
+
+
 def seen(xyz: NDArray[np.float64], camera: Camera, cells: int = CELLS) -> Seen:
     """The points (n, 3) that are in the image and not far behind the nearest one of their cell."""
-    size = np.array([camera.width, camera.height])
-    columns, rows = (max(1, round(cells * side / max(size))) for side in size.tolist())
+    rows, columns = grid_shape(camera, cells)
     uv_px, depth = camera.project(xyz)
     inside = np.flatnonzero(camera.shows(uv_px))
-    places = uv_px[inside] / size
+    places = uv_px[inside] / (camera.width, camera.height)
     column, row = (np.minimum(places, 1 - 1e-9) * (columns, rows)).astype(np.intp).T
     cell = row * columns + column
     nearest = np.full(columns * rows, np.inf)

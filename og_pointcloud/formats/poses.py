@@ -23,8 +23,8 @@ from og_pointcloud.scene import Camera
 
 __all__ = [
     "MAX_JSON_BYTES", "OPENGL", "PosedFrames", "PosedImage", "Recording", "Sensor", "in_local_frame", "in_pinholes",
-    "inverse", "named_numbers", "numbered", "numbered_images", "quaternion_of", "read_json", "read_numbers", "read_text",
-    "rigid", "rotation_of_quaternion",
+    "inverse", "named_numbers", "numbered", "numbered_images", "quaternion_of", "read_json", "read_numbers",
+    "read_text", "rigid", "rotation_of_quaternion",
 ]  # fmt: skip
 
 MAX_TEXT_BYTES, MAX_JSON_BYTES = 1 << 26, 1 << 30
