@@ -2,6 +2,7 @@
 
 import json
 import warnings
+from collections import Counter
 from dataclasses import replace
 
 import cv2
@@ -20,6 +21,7 @@ from og_pointcloud.checking.check import (
     check_words,
     warn_of_doubts,
 )
+from og_pointcloud.checking.masks import entropies
 from og_pointcloud.checking.sample import seen
 from og_pointcloud.cli import main
 from og_pointcloud.cloud import UNOBSERVED
@@ -408,6 +410,18 @@ def test_repairs_of_masks_are_their_formulas():
     layers = [MaskLayer((3, 2), np.zeros((k, 2), np.float32), lambda: ids) for k in range(3)]
     assert [len(layer.features) for layer in repaired_layers(layers, parsed("masks=next"))] == [1, 2, 0]
     assert [len(layer.features) for layer in repaired_layers(layers, parsed("masks=previous"))] == [2, 0, 1]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_entropies_are_their_formula(seed):
+    random = np.random.default_rng(seed)
+    a, b = random.integers(0, 4, 50), random.integers(0, 3, 50)
+
+    def entropy(*labels):
+        shares = np.array([count / 50 for count in Counter(zip(*labels, strict=True)).values()])
+        return -(shares * np.log(shares)).sum()
+
+    assert np.allclose(entropies(a, b), (entropy(a), entropy(b), entropy(a, b)))
 
 
 def test_points_behind_others_are_not_seen():

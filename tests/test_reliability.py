@@ -19,7 +19,7 @@ from og_pointcloud.fitting.labellers import grouping
 from og_pointcloud.fitting.mask_table import MaskTable
 from og_pointcloud.fitting.reliability import SAME_LOOK, _cut, likely_cause, split_half
 from og_pointcloud.journal import Journal
-from og_pointcloud.scene import Scene
+from og_pointcloud.scene import NOT_SEEN, Scene
 from og_pointcloud.settings import FitSettings
 
 SETTINGS = FitSettings(mode="grouping")
@@ -41,6 +41,15 @@ def judged(scene: Scene):
 
 def with_views(scene: Scene, change) -> Scene:
     return replace(scene, views=tuple(change(index, view) for index, view in enumerate(scene.views)))
+
+
+def test_a_cause_is_found_where_lenses_left_pixels_unseen(scene: Scene):
+    def with_rim(index, view):
+        masks = view.mask_map().copy()
+        masks[:4] = masks[:, :4] = NOT_SEEN
+        return replace(view, masks=masks)
+
+    assert judged(with_views(scene, with_rim))[1]
 
 
 def literally(scene: Scene):

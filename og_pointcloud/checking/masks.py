@@ -79,8 +79,9 @@ class MaskMaps:
 
     def fewer(self) -> MaskMaps:
         """Of fewer points and of a few views that lie together, for what is asked often."""
-        sample = self.sample.thinned(FEW_POINTS).of_views(range(min(FEW_VIEWS, len(self.ids))))
-        return MaskMaps(sample, *(part[:FEW_VIEWS] for part in (self.ids, self.features, self.shown)))
+        few = slice(FEW_VIEWS)
+        sample = self.sample.thinned(FEW_POINTS).of_views(range(len(self.ids))[few])
+        return MaskMaps(sample, self.ids[few], self.features[few], self.shown[few])
 
     def _pairs(self, cameras: Sequence[Camera]) -> Iterator[tuple[int, int, Places, Places]]:
         """Every ordered pair of views that share enough points, and where each sees these."""

@@ -138,7 +138,7 @@ def _with_rivals(grid: Floats, grids: list[Floats]) -> Floats:
 def _correlations(drawing: Floats, photographs: Floats) -> Floats:
     """(k,) of colours (c, 3) with photographs (k, c, 3), all channels together, each less its mean; 0 where too little
     is shown."""
-    shown = np.isfinite(photographs).all(axis=2, keepdims=True)
+    shown = np.asarray(np.isfinite(photographs).all(axis=2, keepdims=True))
     a, b = centered(drawing[None], shown), centered(np.where(shown, photographs, 0), shown)
     size = np.sqrt((a * a).sum(axis=(1, 2)) * (b * b).sum(axis=(1, 2)) + 1e-6)
     return np.where(shown.sum(axis=(1, 2)) < FEWEST_CELLS, 0, (a * b).sum(axis=(1, 2)) / size)

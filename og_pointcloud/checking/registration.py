@@ -155,7 +155,7 @@ class Registration:
         """(points, 3) photograph less colours, each less its mean and of length one; the photograph's slopes there, of
         the same scale, (points, 2, 3). Both are 0 where the photograph shows nothing."""
         sampled = _sampled(image, places)
-        shown = np.isfinite(sampled).all(axis=1, keepdims=True)
+        shown = np.asarray(np.isfinite(sampled).all(axis=1, keepdims=True))
         sampled = np.where(shown, sampled, 0)
         photograph, colors = centered(sampled[:, :3], shown), centered(self.rgb[rows], shown)
         scale = float(np.sqrt((photograph**2).sum() + 1e-6))

@@ -256,7 +256,7 @@ def _none(cameras: list[Camera], repair: Repair) -> list[Camera]:
 
 KINDS = {
     "axes": Kind(_each_pose(lambda pose, repair: FLIP @ pose), ("flipped",)),
-    "direction": Kind(_each_pose(lambda pose, repair: np.linalg.inv(pose)), ("inverse",)),
+    "direction": Kind(_each_pose(lambda pose, repair: np.asarray(np.linalg.inv(pose), np.float64)), ("inverse",)),
     "quaternions": Kind(_each_pose(_with_xyzw), ("xyzw",)),
     "world": Kind(_each_pose(_with_axes), WORLDS),
     "frames": Kind(_neighbours, ("1", "-1"), of_all=True),
