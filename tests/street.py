@@ -116,9 +116,20 @@ class Street:
     def look(self, camera: Camera) -> tuple[NDArray[np.int16], NDArray[np.float32]]:
         """(H, W) int16, the object, GROUND or SKY that each pixel shows, and (H, W) float32, its depth in metres."""
         intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
-        pose = camera.world_to_camera
-        solids = self.low, self.high, self.round, self.owner
+        pose, near = camera.world_to_camera, self.in_sight(camera)
+        solids = self.low[near], self.high[near], self.round[near], self.owner[near]
         return _cast(*solids, pose, camera.center, intrinsics, camera.width, camera.height)
+
+    def in_sight(self, camera: Camera) -> NDArray[np.bool_]:
+        """(s,) false for solids all of whose corners are behind the camera, or beyond one side of its image."""
+        corners = np.stack(np.meshgrid(*[[0, 1]] * 3), axis=-1).reshape(8, 1, 3)
+        places = (
+            np.where(corners, self.high, self.low) @ camera.world_to_camera[:3, :3].T + camera.world_to_camera[:3, 3]
+        )
+        x, y, depth = np.moveaxis(places, -1, 0)
+        u, v = camera.fx * x + camera.cx * depth, camera.fy * y + camera.cy * depth  # times the depth: signs stay
+        sides = (depth, u, v, camera.width * depth - u, camera.height * depth - v)
+        return np.logical_and.reduce([(side > 0).any(axis=0) for side in sides])
 
     def image(self, camera: Camera) -> NDArray[np.uint8]:
         """(H, W, 3) uint8: what the camera sees."""
