@@ -158,8 +158,8 @@ def search(descriptors: int, instances: int, encoder: MadeEncoder) -> None:
     rows /= some.std()
     block = Block(
         entries=(), vectors=rows, shift=np.full(len(rows), -some.mean() / some.std(), np.float32),
-        first=np.arange(len(rows)), scene=scene, instance=np.tile(np.arange(instances, dtype=np.int32), scenes),
-        points=np.ones(len(rows), np.int32), boxes=np.zeros((len(rows), 2, 3)), bank=bank,
+        bounds=np.arange(len(rows) + 1), scene=scene, instance=np.tile(np.arange(instances, dtype=np.int32), scenes),
+        points=np.ones(len(rows), np.int32), center=np.zeros((len(rows), 3)), size=np.zeros((len(rows), 3)), bank=bank,
         sharpness=np.full(scenes, 3.25),
     )  # fmt: skip
     nothing = np.zeros((0, rows.shape[1]), np.float32)

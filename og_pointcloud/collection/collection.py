@@ -221,7 +221,7 @@ class Collection:
             return []
         block, rows = self._candidates(atlas, group, here, wanted, vector)
         if wanted.box is not None:
-            center = block.boxes[rows].mean(axis=1)
+            center = block.center[rows]
             rows = rows[((center >= wanted.box[0]) & (center <= wanted.box[1])).all(axis=1)]
         others = [other for other in group.family.words.values() if other @ vector < SAME_WORD]
         rivals = np.array(others, np.float32).reshape(len(others), len(vector))
@@ -273,12 +273,10 @@ def _corners(within: Any) -> NDArray[np.float64]:
 
 
 def _finding(block: Block, row: int, word: str, score: float) -> Finding:
-    scene, (low, high) = block.entries[block.scene[row]].name, block.boxes[row]
-    (x, y, z), (dx, dy, dz) = ((low + high) / 2).tolist(), (high - low).tolist()
-    points, calibrated = int(block.points[row]), block.bank is not None
-    return Finding(
-        scene, int(block.instance[row]), word, score, (x, y, z), (dx, dy, dz), points, calibrated, score > 0.5
-    )
+    scene, instance, points = block.entries[block.scene[row]].name, int(block.instance[row]), int(block.points[row])
+    (x, y, z), (dx, dy, dz) = block.center[row].tolist(), block.size[row].tolist()
+    calibrated = block.bank is not None
+    return Finding(scene, instance, word, score, (x, y, z), (dx, dy, dz), points, calibrated, score > 0.5)
 
 
 def _unanswerable(word: str, asked: Sequence[Family]) -> OgPointcloudError:

@@ -63,14 +63,14 @@ def write_lance(atlas: str | os.PathLike[str], uri: str) -> None:
 def _columns(block: Block) -> list[Any]:
     import pyarrow as pa  # pyright: ignore[reportMissingImports]
 
-    instance = np.repeat(np.arange(len(block)), np.diff(block.first, append=len(block.vectors)))
+    instance = np.repeat(np.arange(len(block)), np.diff(block.bounds))
     ids = np.array([entry.id for entry in block.entries], np.int64)
     vectors = np.column_stack([block.vectors, block.shift]).astype(np.float16)
     rows = pa.FixedSizeListArray.from_arrays(pa.array(vectors.ravel()), vectors.shape[1])
     numbers = [
         ids[block.scene[instance]],
         block.instance[instance].astype(np.int32),
-        *block.boxes.mean(axis=1)[instance].T,
+        *block.center[instance].T,
     ]
     return [*map(pa.array, numbers), rows]
 

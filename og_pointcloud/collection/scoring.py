@@ -26,6 +26,8 @@ RELEVANCY_TEMPERATURE = 10.0
 of its released code, the paper gives none."""
 ROWS_AT_ONCE = 512
 """Descriptors that are put together before a product: so many stay in a core's cache."""
+LEAST_RUN = 16
+"""Mean length of runs of neighbours from which each run has a product of its own."""
 FIRST = 256
 """Instances scored to the end at first; then four times as many, as long as it takes."""
 
@@ -36,20 +38,21 @@ class Block:
     and a descriptor; a scene's lie side by side.
 
     vectors: (R, D) float32, shift: (R,) float32; their product with a `direction`, plus the shift, is the evidence of a
-    descriptor in standard deviations of the judge's words; without a judge the cosine. first: (I,) where each
-    instance's descriptors begin. scene, instance: (I,) row of ``entries``, and id in the scene. points: (I,). boxes:
-    (I, 2, 3) low and high corners. bank: the judge, None for none. sharpness: (S,) float64 of the scenes
-    (`choosing.Standard`), 0 without a judge.
+    descriptor in standard deviations of the judge's words; without a judge the cosine. bounds: (I + 1,) where each
+    instance's descriptors begin, and where the last one's end. scene, instance: (I,) row of ``entries``, and id in the
+    scene. points: (I,). center, size: (I, 3) of the boxes. bank: the judge, None for none. sharpness: (S,) float64 of
+    the scenes (`choosing.Standard`), 0 without a judge.
     """
 
     entries: tuple[SceneEntry, ...]
     vectors: NDArray[np.float32]
     shift: NDArray[np.float32]
-    first: NDArray[np.intp]
+    bounds: NDArray[np.intp]
     scene: NDArray[np.int32]
     instance: NDArray[np.int32]
     points: NDArray[np.int32]
-    boxes: NDArray[np.float64]
+    center: NDArray[np.float64]
+    size: NDArray[np.float64]
     bank: WordBank | None
     sharpness: NDArray[np.float64]
 
@@ -62,17 +65,25 @@ class Block:
 
     def evidence(self, rows: NDArray[np.intp], directions: NDArray[np.float32]) -> NDArray[np.float32]:
         """(n, L) of these instances for directions (L, D): of several descriptors the best."""
-        count = np.diff(self.first, append=len(self.vectors))[rows]
-        begin = np.cumsum(count) - count
-        if len(rows) == len(self):
-            scores = self.vectors @ directions.T + self.shift[:, None]
+        if len(rows) == 0:
+            return np.zeros((0, len(directions)), np.float32)
+        count = self.bounds[rows + 1] - self.bounds[rows]
+        ends = np.cumsum(count)
+        scores = np.empty((ends[-1], len(directions)), np.float32)
+        last = np.append(np.flatnonzero(np.diff(rows) != 1), len(rows) - 1)  # of each run of neighbours
+        if len(last) * LEAST_RUN <= len(rows):  # multiplied where they lie: nothing else is read, and nothing copied
+            begins = self.bounds[rows[np.append(0, last[:-1] + 1)]]
+            runs = zip(begins.tolist(), self.bounds[rows[last] + 1].tolist(), ends[last].tolist(), strict=True)
+            for begin, end, filled in runs:
+                part = scores[filled - (end - begin) : filled]
+                np.matmul(self.vectors[begin:end], directions.T, out=part)
+                part += self.shift[begin:end, None]
         else:
-            where = np.arange(count.sum()) + np.repeat(self.first[rows] - begin, count)
-            scores = np.empty((len(where), len(directions)), np.float32)
+            where = np.arange(ends[-1]) + np.repeat(self.bounds[rows] - (ends - count), count)
             for start in range(0, len(where), ROWS_AT_ONCE):
                 some = where[start : start + ROWS_AT_ONCE]
                 scores[start : start + ROWS_AT_ONCE] = self.vectors[some] @ directions.T + self.shift[some, None]
-        return np.maximum.reduceat(scores, begin, axis=0) if len(rows) else scores
+        return np.maximum.reduceat(scores, ends - count, axis=0)
 
     def rank(
         self, text: NDArray[np.float32], rivals: NDArray[np.float32], rows: NDArray[np.intp], top: int
@@ -151,8 +162,10 @@ def load_block(atlas: Atlas, entries: Sequence[SceneEntry]) -> Block:
         instance, first = np.unique(owner[shown], return_index=True)
         scene = np.full(len(instance), number)
         columns = vectors[shown], standard.shift[shown], begin + first, scene, instance
-        parts.append((*columns, table.points[instance], boxes[instance]))
+        low, high = boxes[instance, 0], boxes[instance, 1]
+        parts.append((*columns, table.points[instance], (low + high) / 2, high - low))
         begin += len(shown)
         sharpness.append(standard.sharpness)
     bank = atlas.bank(judge, entries[0].width) if (judge := entries[0].judge) else None
-    return Block(tuple(entries), *map(np.concatenate, zip(*parts, strict=True)), bank, np.array(sharpness))
+    vectors, shift, first, *others = map(np.concatenate, zip(*parts, strict=True))
+    return Block(tuple(entries), vectors, shift, np.append(first, begin), *others, bank, np.array(sharpness))
