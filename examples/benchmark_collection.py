@@ -16,6 +16,7 @@ import os
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -113,37 +114,69 @@ def cloud(number: int, instances: int, encoder: MadeEncoder) -> og.LabelledCloud
 
 
 def large(folder: Path, descriptors: int, instances: int, encoder: MadeEncoder, with_lance: bool) -> None:
-    """An atlas written from arrays; the exact search beside a plain one, and LanceDB."""
+    """An atlas written from arrays; the exact search, and LanceDB beside it, which is opened first: what the exact one
+    has held would stay with the process."""
     path = folder / "large"
     seconds, _ = timed(lambda: write_atlas(path, descriptors, instances, encoder))
     print(
         f"\natlas of {descriptors:,} descriptors, written and judged: {seconds:.0f} s, CPU {cpu_seconds:.0f} s, "
         f"{path.stat().st_size / 1e9:.2f} GB"
     )
-    before = memory_in_use()
-    collection = og.Collection(path)
-    seconds, _ = timed(lambda: collection.find("thing 0"))
+    lance = lance_rows(path, folder / "lance") if with_lance else []
+    exact = rows_of("exact", lambda: og.Collection(path))
     print(
-        f"first answer, loading included: {seconds:.1f} s, CPU {cpu_seconds:.1f} s, "
-        f"{(memory_in_use() - before) / 1e9:.2f} GB"
+        f"{'search':<32}{'least s':>9}{'median s':>10}{'median CPU s':>14}{'memory GB':>11}{f'recall@{RECALL_AT}':>11}"
     )
-    words = [f"thing {k}" for k in range(ASKED)]
-    rows = [row("exact, all", collection, words)]
-    half = ([0.0, 0.0, 0.0], [500.0, 1000.0, 10.0])
-    rows.append(row("exact, a box around half", collection, words, within=half))
-    rows.append(row("exact, one scene", collection, words, scenes="s000001"))
-    reference = {word: [(f.scene, f.instance) for f in collection.find(word, top=RECALL_AT)] for word in words}
-    if with_lance:
-        del collection
-        rows += lance(path, folder / "lance", words, half, reference)
-    print(
-        f"{'search':<28}{'least s':>10}{'median s':>10}{'longest s':>11}{'median CPU s':>14}{f'recall@{RECALL_AT}':>11}"
-    )
-    for name, times, cpu, recall in rows:
+    for row in [*exact, *lance]:
+        best = next(other.found for other in exact if other.asked == row.asked)
+        hits = sum(len(ours & theirs) for ours, theirs in zip(row.found, best, strict=True))
         print(
-            f"{name:<28}{min(times):>10.3f}{np.median(times):>10.3f}{max(times):>11.3f}{np.median(cpu):>14.3f}{recall:>11}"
+            f"{row.name + ', ' + row.asked:<32}{min(row.seconds):>9.3f}{np.median(row.seconds):>10.3f}"
+            f"{np.median(row.cpu):>14.3f}{row.memory / 1e9:>11.2f}{hits / sum(map(len, best)):>11.4f}"
         )
     print(f"peak memory {peak_memory() / 1e9:.2f} GB")
+
+
+@dataclass(frozen=True)
+class Row:
+    """A row of the table. seconds, cpu, found: of each word; memory: bytes that asking has taken so far."""
+
+    name: str
+    asked: str
+    seconds: list[float]
+    cpu: list[float]
+    memory: int
+    found: list[set[tuple[str, int]]]
+
+
+def rows_of(name: str, opened: Callable[[], og.Collection]) -> list[Row]:
+    """The rows of one way to search: of everything, of half of the place, and of one scene."""
+    before = memory_in_use()
+    collection = opened()
+    seconds, _ = timed(lambda: collection.find("thing 0"))
+    print(f"{name}: first answer in {seconds:.1f} s, CPU {cpu_seconds:.1f} s")
+    rows = []
+    half = ([0.0, 0.0, 0.0], [500.0, 1000.0, 10.0])
+    for asked, options in (("all", {}), ("a box around half", {"within": half}), ("one scene", {"scenes": "s000001"})):
+        times, cpu, found = [], [], []
+        for k in range(ASKED):
+            word = f"thing {k}"
+            seconds, best = timed(lambda word=word, options=options: collection.find(word, top=RECALL_AT, **options))
+            times.append(seconds)
+            cpu.append(cpu_seconds)
+            found.append({(finding.scene, finding.instance) for finding in best})
+        rows.append(Row(name, asked, times, cpu, memory_in_use() - before, found))
+    return rows
+
+
+def lance_rows(path: Path, folder: Path) -> list[Row]:
+    """LanceDB's rows."""
+    from og_pointcloud.collection.lance import write_lance
+
+    seconds, _ = timed(lambda: write_lance(path, str(folder)))
+    size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
+    print(f"LanceDB: written and indexed in {seconds:.0f} s, CPU {cpu_seconds:.0f} s, {size / 1e9:.2f} GB")
+    return rows_of("LanceDB", lambda: og.Collection(path, lance=str(folder)))
 
 
 def search(descriptors: int, instances: int, encoder: MadeEncoder) -> None:
@@ -203,38 +236,6 @@ def made_scenes(
         owner = np.arange(instances, dtype=np.int32)
         table = og.InstanceTable(vectors, owner, twenty, twenty, twenty, ratios, ratios)
         yield table, np.stack([low, low + 0.3], axis=1)
-
-
-def lance(path: Path, folder: Path, words: list[str], half: Any, reference: dict[str, Any]) -> list[Any]:
-    """LanceDB's rows of the table."""
-    from og_pointcloud.collection.lance import write_lance
-
-    seconds, _ = timed(lambda: write_lance(path, str(folder)))
-    size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
-    before = memory_in_use()
-    print(f"LanceDB: written and indexed in {seconds:.0f} s, CPU {cpu_seconds:.0f} s, {size / 1e9:.2f} GB")
-    collection = og.Collection(path, lance=str(folder))
-    collection.find(words[0])
-    rows = [
-        row("LanceDB, all", collection, words, reference),
-        row("LanceDB, a box around half", collection, words, within=half),
-    ]
-    print(f"memory that asking it takes: {(memory_in_use() - before) / 1e9:.2f} GB")
-    return rows
-
-
-def row(
-    name: str, collection: og.Collection, words: list[str], reference: dict[str, Any] | None = None, **options: Any
-) -> tuple[str, list[float], list[float], str]:
-    """Seconds of each word, and which share of the reference's best was found."""
-    times, cpu, hits = [], [], 0
-    for word in words:
-        seconds, found = timed(lambda word=word: collection.find(word, top=RECALL_AT, **options))
-        times.append(seconds)
-        cpu.append(cpu_seconds)
-        if reference is not None:
-            hits += len({(f.scene, f.instance) for f in found} & set(reference[word]))
-    return name, times, cpu, "" if reference is None else f"{hits / (RECALL_AT * len(words)):.4f}"
 
 
 def timed(function: Callable[[], Any]) -> tuple[float, Any]:
