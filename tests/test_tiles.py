@@ -22,8 +22,8 @@ from og_pointcloud.errors import OgPointcloudError, SceneError
 from og_pointcloud.fitting import tiles
 from og_pointcloud.fitting.fit import fit
 from og_pointcloud.fitting.mask_table import mask_table
-from og_pointcloud.fitting.tiles import split
-from og_pointcloud.fitting.work_folder import kept_files
+from og_pointcloud.fitting.tiled_cloud import TiledCloud, _opened, split
+from og_pointcloud.fitting.work_folder import WorkFolder, kept_files
 from og_pointcloud.scene import Camera, Points, Scene, View
 from og_pointcloud.settings import FitSettings, GeometrySettings, VisibilitySettings
 
@@ -187,19 +187,19 @@ def test_what_stands_in_another_tile_hides_what_is_behind_it():
     assert (cloud.instance_ids[1600:] < 0).all()
 
 
-def tiled_cloud(points: Points, spacing: float) -> tiles._TiledCloud:
-    order = np.arange(len(points))
-    cut = tiles.Tiles(order, np.array([0, len(points)]))
-    return tiles._TiledCloud(cut, points, np.full(len(points), spacing, np.float32), (order.astype(np.int32),))
+def tiled_cloud(points: Points, spacing: float, work: WorkFolder) -> TiledCloud:
+    cloud = TiledCloud.cut(points, len(points), SETTINGS, work)
+    work.array("spacing", cloud.key, lambda: np.full(len(points), spacing, np.float32))
+    return cloud
 
 
-def test_every_point_that_shows_is_worth_drawing(monkeypatch):
+def test_every_point_that_shows_is_worth_drawing(monkeypatch, tmp_path):
     monkeypatch.setattr(tiles, "FINEST_PX", 1e-6)
     random = np.random.default_rng(3)
     points = Points((4 * random.normal(size=(4000, 3))).astype(np.float32), np.zeros(3))
     camera = Camera(40, 30, 25.0, 40.0, 3.0, 28.0, np.eye(4))
     view = View("view", camera, np.full((30, 40), -1, np.int32), np.zeros((0, 4), np.float32))
-    cloud = tiled_cloud(points, 0.3)
+    cloud = tiled_cloud(points, 0.3, WorkFolder(tmp_path))
     drawing = tiles._Drawing(1.0, 0.01, 0.1, 0.3)  # so faint that nothing hides anything
     everything = drawing.splats(cloud, np.arange(4000), np.ones(4000, np.float32))
     shows = np.unique(mask_table(everything, [view], drawing.near).exposure.indices)
@@ -210,13 +210,15 @@ def test_every_point_that_shows_is_worth_drawing(monkeypatch):
     assert (larger == 1).all()
 
 
-def test_points_finer_than_pixels_are_thinned_to_them(monkeypatch):
+def test_points_finer_than_pixels_are_thinned_to_them(monkeypatch, tmp_path):
     monkeypatch.setattr(tiles, "FINEST_PX", 0.5)
     random = np.random.default_rng(4)
     xyz = np.concatenate([random.uniform(-1, 1, (40_000, 2)), np.full((40_000, 1), 4.0)], axis=1).astype(np.float32)
     camera = Camera(80, 80, 160.0, 160.0, 40.0, 40.0, np.eye(4))
     view = View("view", camera, np.full((80, 80), -1, np.int32), np.zeros((0, 4), np.float32))
-    cloud = tiled_cloud(Points(xyz, np.zeros(3)), 0.00625)  # a quarter of a pixel, half of FINEST_PX
+    cloud = tiled_cloud(
+        Points(xyz, np.zeros(3)), 0.00625, WorkFolder(tmp_path)
+    )  # a quarter of a pixel, half of FINEST_PX
     drawing = tiles._Drawing(0.5, 0.9, 0.1, 0.00625)
     rows, larger, inside = tiles._worth_drawing(view, cloud, drawing, 1 / 255)
     assert inside == 40_000
@@ -262,7 +264,7 @@ def test_another_scene_takes_up_nothing(tmp_path, monkeypatch):
     masks = [np.where(np.arange(60) < 30, -1, view.mask_map()).astype(np.int32) for view in scene.views]
     other = replace(scene, views=tuple(replace(v, masks=m) for v, m in zip(scene.views, masks, strict=True)))
     moved = replace(scene, points=Points(scene.points.xyz + np.float32(0.01), np.zeros(3)))
-    for changed, new in ((other, 3), (moved, 2 + 3)):
+    for changed, new in ((other, 3), (moved, 4 + 3)):
         with pytest.raises(KeyboardInterrupt):
             fit(changed, replace(SETTINGS, tile_points=1600), work=work, progress=False)
         assert len(set(work.iterdir()) - before) == new
@@ -379,4 +381,4 @@ def executor_of(kind: str) -> Iterator[Executor]:
 
 def test_a_worker_that_cannot_see_the_folder_says_so(tmp_path):
     with pytest.raises(OgPointcloudError, match="one folder that all workers share"):
-        tiles._cloud_in(tmp_path, "0", False)
+        _opened(tmp_path, "0")

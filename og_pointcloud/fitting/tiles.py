@@ -20,16 +20,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, field, replace
-from functools import lru_cache, partial
-from itertools import pairwise
-from pathlib import Path
-from typing import Any, NoReturn, TypeVar
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array, vstack
-from scipy.spatial import cKDTree
 
 from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.fitting.grouping import MaskGroups, group_masks, indicator
@@ -40,11 +37,11 @@ from og_pointcloud.fitting.mask_table import MaskTable, mask_table, require_sigh
 from og_pointcloud.fitting.membership import assign_points, without_see_through
 from og_pointcloud.fitting.memory import memory_left
 from og_pointcloud.fitting.tasks import Share, run_tasks, share_here
+from og_pointcloud.fitting.tiled_cloud import TiledCloud, vanished
 from og_pointcloud.fitting.view_votes import view_votes
 from og_pointcloud.fitting.work_folder import WorkFolder, fingerprint
 from og_pointcloud.journal import Journal, LeftOut
 from og_pointcloud.rendering.geometry import (
-    Neighbourhood,
     chance_of_place,
     isotropic,
     near_plane,
@@ -57,16 +54,14 @@ from og_pointcloud.rendering.surface import (
     with_distinct_points,
     with_needed_views,
 )
-from og_pointcloud.scene import Camera, Points, Scene, View
+from og_pointcloud.scene import Camera, Scene, View
 from og_pointcloud.settings import FitSettings
 
-__all__ = ["Tiles", "fit_tiles", "needs_tiles", "split"]
+__all__ = ["fit_tiles", "needs_tiles"]
 
 MODES = ("auto", "grouping")
 """Modes that need no more than masks; the others learn from all points at once."""
 
-MARGIN = 32.0
-"""How far a tile looks over its borders, in spacings of its sparser points: what decides a point lies nearer."""
 SAMPLE_STEP = 50
 """Masks are grouped by at least one in so many points, also where that is more than a whole fit would take."""
 FINEST_PX = 0.35
@@ -85,8 +80,6 @@ FIT_BYTES = 1_000
 """Bytes that one fit of a whole cloud takes, per point."""
 CLOUD_BYTES = 120
 """Bytes that every point takes, whatever the tiles: positions, colours, spacings, ids, order."""
-PROBES = 2_000
-"""Points of a tile that are asked for their spacing before its margin is known."""
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -112,9 +105,9 @@ def fit_tiles(
     """Label a scene as `fit` does by grouping masks, in memory that the tiles bound, not the cloud. Returns the
     labelling of all its points, and their typical spacing.
 
-    work: keeps the neighbours of the points and what the views show (80 bytes a point, and about 25 for each view that
-    sees it); with an executor also the points. executor: takes tiles and views as tasks, and its workers read what they
-    need, and write what is large, in the work folder; None: one after another, here.
+    work: keeps the points, their neighbours and what the views show (110 bytes a point, and about 25 for each view that
+    sees it). executor: takes tiles and views as tasks, and its workers read what they need, and write what is large, in
+    the work folder; None: one after another, here.
     Raises SceneError where `fit` does, and OgPointcloudError for a mode that learns from all points at once.
     """
     if settings.mode not in MODES:
@@ -129,7 +122,11 @@ def fit_tiles(
     run = _Run(settings, work, journal, executor)
     most = settings.tile_points or _points_per_tile(len(scene.points), run.memory(len(scene.points)))
     with journal.stage("spacing"):
-        cloud = _tiled(scene.points, most, run)
+        cloud = TiledCloud.cut(scene.points, most, settings, work)
+        journal.notes["tiles"] = np.diff(cloud.tiles.start).tolist()
+        journal.notes["tile_margins"] = [float(f"{margin:.4g}") for margin in cloud.margins]
+        spacing = partial(_spacing, cloud, settings)
+        work.array("spacing", cloud.key, lambda: np.concatenate(run.all(spacing, range(len(cloud.tiles)), "spacing")))
     with journal.stage("geometry"):
         drawing = _drawing(scene.views, cloud, settings, journal)
     with journal.stage("visibility"):
@@ -138,7 +135,7 @@ def fit_tiles(
         groups, looks = _groups(cloud, shown, settings, journal)
     with journal.stage("membership"):
         no_features = replace(shown, mask_features=np.zeros((len(shown.mask_view), 0), np.float32))
-        decide = partial(_decide, cloud, no_features, (groups, looks), settings, work)
+        decide = partial(_decide, cloud, no_features, (groups, looks), settings)
         decided = run.all(decide, range(len(cloud.tiles)), "membership")
     with journal.stage("association"):
         labelling = _instances(cloud, shown, looks, decided, settings)
@@ -179,147 +176,9 @@ def _points_per_tile(points: int, left: int) -> int:
     return min(LEAST_TILE << (fitting // LEAST_TILE).bit_length() - 1, LARGEST_TILE)
 
 
-# Tiles ----------------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Tiles:
-    """order: (n,) rows of the cloud, tile by tile, ascending within a tile. start: (tiles + 1,) where each begins."""
-
-    order: Rows
-    start: Rows
-
-    def __len__(self) -> int:
-        return len(self.start) - 1
-
-    def part(self, tile: int) -> slice:
-        """A tile's points in arrays that are in ``order``."""
-        return slice(int(self.start[tile]), int(self.start[tile + 1]))
-
-
-def split(xyz: NDArray[np.float32], most: int) -> Tiles:
-    """As few tiles of equally many points as hold at most ``most`` each, where points do not coincide.
-
-    What holds more is cut across its longer side (that of the middle 90 % of its points: strays are no extent), so
-    that tiles are compact, small where points are dense, and never empty.
-    """
-    leaves: list[Rows] = []
-
-    def cut(rows: Rows, count: int) -> None:
-        low, high = np.quantile(xyz[rows], [0.05, 0.95], axis=0) if count > 1 else (np.zeros(0), np.zeros(0))
-        for axis in np.argsort(low - high, kind="stable"):
-            along = xyz[rows, axis]
-            place = len(rows) * (count // 2) // count
-            before = along < np.partition(along, place)[place]
-            if before.any():
-                cut(rows[before], count // 2)
-                cut(rows[~before], count - count // 2)
-                return
-        leaves.append(rows)
-
-    cut(np.arange(len(xyz)), -(-len(xyz) // most))
-    return Tiles(np.concatenate(leaves), np.cumsum([0, *map(len, leaves)]))
-
-
-@dataclass(frozen=True)
-class _TiledCloud:
-    """points, spacing (n,): in the order of the tiles; no spacing before it is known. members: per tile, its points and
-    those within its margin, ascending; they are int32 as there are many. key: fingerprint of points, tiles and
-    settings. work: where another process finds all of it, once it is kept there."""
-
-    tiles: Tiles
-    points: Points
-    spacing: NDArray[np.float32]
-    members: tuple[NDArray[np.int32], ...]
-    key: str = ""
-    work: WorkFolder = field(default_factory=lambda: WorkFolder(None))
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return _cloud_in, (self.work._place(), self.key, len(self.spacing) > 0)
-
-    def keep(self) -> None:
-        """Write what other processes need of it; colours they don't."""
-        points = self.points
-        ends = np.cumsum([0, *map(len, self.members)])
-        arrays = [self.tiles.start, ends, np.concatenate(self.members), points.xyz, points.origin]
-        if points.scale is not None and points.rotation is not None and points.opacity is not None:
-            arrays += [points.scale, points.rotation, points.opacity]
-        name, kept = ("spacing", [self.spacing]) if len(self.spacing) else ("cloud", arrays)
-        self.work.arrays(name, self.key, lambda: kept)
-
-    def inner(self, tile: int) -> slice:
-        """A tile's points without those of its margin, among its members."""
-        part = self.tiles.part(tile)
-        first, last = np.searchsorted(self.members[tile], [part.start, part.stop])
-        return slice(int(first), int(last))
-
-
-@lru_cache(maxsize=1)
-def _cloud_in(folder: Path, key: str, with_spacing: bool) -> _TiledCloud:
-    """A cloud that another process keeps in a work folder, mapped. Without the order of its points, and colours."""
-    work = WorkFolder(folder)
-    start, ends, members, xyz, origin, *gaussian = work.arrays("cloud", key, _vanished)
-    points = Points(xyz, origin, None, *gaussian)
-    spacing = work.array("spacing", key, _vanished) if with_spacing else np.zeros(0, np.float32)
-    parts = tuple(members[first:last] for first, last in pairwise(ends.tolist()))
-    return _TiledCloud(Tiles(np.zeros(0, np.int64), start), points, spacing, parts, key, work)
-
-
-def _vanished() -> NoReturn:
-    raise OgPointcloudError(
-        "a file of the work folder is gone or damaged, or a worker cannot see it; expected one folder that all workers "
-        "share: name such a work folder, or set TMPDIR to one"
-    )
-
-
-def _tiled(points: Points, most: int, run: _Run) -> _TiledCloud:
-    settings, work = run.settings, run.work
-    key = fingerprint(points.xyz, points.scale, points.rotation, points.opacity, settings, most, MARGIN)
-    tiles = split(points.xyz, most)
-    points = points.take(tiles.order)
-    parts = [tiles.part(tile) for tile in range(len(tiles))]
-    margins = [MARGIN * _sparse_spacing(points.xyz[part]) for part in parts]
-    members = tuple(_within(points.xyz, part, margin) for part, margin in zip(parts, margins, strict=True))
-    run.journal.notes["tiles"] = [part.stop - part.start for part in parts]
-    run.journal.notes["tile_margins"] = [float(f"{margin:.4g}") for margin in margins]
-    cloud = _TiledCloud(tiles, points, np.zeros(0, np.float32), members, key, work)
-    if run.executor is not None:
-        cloud.keep()
-    spacings = run.all(partial(_spacing, cloud, settings, work), range(len(tiles)), "spacing")
-    cloud = replace(cloud, spacing=np.concatenate(spacings))
-    if run.executor is not None:
-        cloud.keep()
-    return cloud
-
-
-def _spacing(cloud: _TiledCloud, settings: FitSettings, work: WorkFolder, tile: int) -> NDArray[np.float32]:
-    """Of a tile's points; finds their neighbours, which stay in the work folder."""
-    return _neighbours(tile, cloud, settings, work).spacing[cloud.inner(tile)]
-
-
-def _sparse_spacing(xyz: NDArray[np.float32]) -> float:
-    """The spacing that 95 % of the points do not exceed, by some of them."""
-    tree = cKDTree(xyz, balanced_tree=False, compact_nodes=False)
-    distance, _ = tree.query(xyz[:: 1 + len(xyz) // PROBES], k=[2, 3, 4])
-    known = np.where(np.isfinite(distance), distance, np.nan)  # fewer than four points
-    spacing = np.nanmean(known, axis=1) if np.isfinite(known).any() else np.zeros(1)
-    return float(np.quantile(spacing, 0.95))
-
-
-def _within(xyz: NDArray[np.float32], part: slice, margin: float) -> NDArray[np.int32]:
-    """The points of a tile and those of others that lie within the margin of its box."""
-    low, high = xyz[part].min(axis=0) - margin, xyz[part].max(axis=0) + margin
-    return np.flatnonzero(((xyz >= low) & (xyz <= high)).all(axis=1)).astype(np.int32)
-
-
-def _neighbours(tile: int, cloud: _TiledCloud, settings: FitSettings, work: WorkFolder) -> Neighbourhood:
-    """The neighbourhood of a tile's members, numbered as these."""
-
-    def find() -> tuple[NDArray[np.generic], ...]:
-        around = neighbourhood(cloud.points.xyz[cloud.members[tile]], settings.geometry)
-        return around.spacing, around.index, around.adjoining
-
-    return Neighbourhood(*map(np.array, work.arrays(f"neighbours-{tile:04d}", cloud.key, find)))
+def _spacing(cloud: TiledCloud, settings: FitSettings, tile: int) -> NDArray[np.float32]:
+    """Of a tile's points."""
+    return cloud.neighbours(tile, settings.geometry).spacing[cloud.inner(tile)]
 
 
 # Views ----------------------------------------------------------------------------------------------------------
@@ -335,7 +194,7 @@ class _Drawing:
     near: float
     typical: float
 
-    def splats(self, cloud: _TiledCloud, rows: Rows, larger: NDArray[np.float32]) -> Gaussians:
+    def splats(self, cloud: TiledCloud, rows: Rows, larger: NDArray[np.float32]) -> Gaussians:
         """Splats of some points, each so many times larger than it would be."""
         chosen = cloud.points.take(rows)
         if self.scale is None or self.opacity is None:
@@ -344,7 +203,7 @@ class _Drawing:
         return isotropic(chosen, cloud.spacing[rows] * larger, self.scale, self.opacity)
 
 
-def _drawing(views: Sequence[View], cloud: _TiledCloud, settings: FitSettings, journal: Journal) -> _Drawing:
+def _drawing(views: Sequence[View], cloud: TiledCloud, settings: FitSettings, journal: Journal) -> _Drawing:
     """Size and opacity of the splats, once for all tiles."""
     points, geometry = cloud.points, settings.geometry
     near, typical = near_plane(points.xyz, views), float(np.median(cloud.spacing))
@@ -363,16 +222,15 @@ def _drawing(views: Sequence[View], cloud: _TiledCloud, settings: FitSettings, j
 
 @dataclass(frozen=True)
 class _Shown:
-    """What all views show. work, keys: where the array of ENTRY of each view is, sorted by point. first:
+    """What all views show. keys: of the array of ENTRY of each view in the cloud's work folder, sorted by point. first:
     (views, tiles + 1), where each tile's points begin in it. mask_view, mask_features: as in `MaskTable`."""
 
-    work: WorkFolder
     keys: tuple[str, ...]
     first: Rows
     mask_view: NDArray[np.int32]
     mask_features: NDArray[np.float32]
 
-    def table(self, cloud: _TiledCloud, rows: NDArray[np.integer], few_views: int) -> MaskTable:
+    def table(self, cloud: TiledCloud, rows: NDArray[np.integer], few_views: int) -> MaskTable:
         """The mask table of some points, given in ascending order.
 
         Weight behind a mask's object counts as outside the mask where fewer views see the point than could contradict
@@ -385,7 +243,7 @@ class _Shown:
         witnesses = np.zeros(len(rows), np.int32)
         parts = []
         for view in range(views):
-            entries = self.work.array("view", self.keys[view], _vanished)
+            entries = cloud.work.arrays("view", self.keys[view], vanished)[0]
             pieces = [entries[self.first[view, tile] : self.first[view, tile + 1]] for tile in tiles]
             part = np.concatenate([piece[place[piece["point"]] >= 0] for piece in pieces])
             part["point"] = place[part["point"]]
@@ -406,55 +264,56 @@ def _stacked(entries: Entries, masks: int, seldom: NDArray[np.bool_]) -> tuple[c
     return matrix[:masks], matrix[masks : masks + 1], matrix[masks + 1 :]
 
 
-def _look(scene: Scene, cloud: _TiledCloud, drawing: _Drawing, run: _Run) -> _Shown:
+def _look(scene: Scene, cloud: TiledCloud, drawing: _Drawing, run: _Run) -> _Shown:
     """Render every view once, but for those that an interrupted fit has left in the work folder."""
     work, journal = run.work, run.journal
     views = [replace(view, image=None) for view in scene.views]
-    looked = run.all(partial(_look_at, cloud, drawing, run.settings, work), views, "visibility")
-    found = sum(view.drawn is None for view in looked)
+    looked = run.all(partial(_look_at, cloud, drawing, run.settings), views, "visibility")
+    found = sum(view.was_there for view in looked)
     for view in looked:
         work.adopt("view", view.key)
     if found:
         journal.leave_out(LeftOut.RENDERING, count=found, folder="" if work.folder is None else work.folder.name)
     masks = [view.mask_features for view in scene.views if view.mask_count]
     require_sight(sum(int(view.first[-1]) for view in looked), len(masks), scene)
-    drawn, inside = (sum(counts) for counts in zip((0, 0), *(view.drawn for view in looked if view.drawn), strict=True))
+    drawn, inside = np.sum([view.drawn for view in looked], axis=0).tolist()
     if drawn < inside:
-        share = float(1 - drawn / inside)
+        share = 1 - drawn / inside
         journal.leave_out(LeftOut.FINE_POINTS, share=share, finest_px=FINEST_PX, most=MOST_SPLATS)
     mask_view = np.repeat(np.arange(len(looked), dtype=np.int32), [view.mask_count for view in scene.views])
     first = np.array([view.first for view in looked])
-    return _Shown(work, tuple(view.key for view in looked), first, mask_view, np.concatenate(masks))
+    return _Shown(tuple(view.key for view in looked), first, mask_view, np.concatenate(masks))
 
 
 @dataclass(frozen=True)
 class _LookedAt:
-    """A view that was rendered into the work folder. first: (tiles + 1,), as in `_Shown`. drawn: how many points were
-    drawn, and how many there are in the image; None where the folder had it."""
+    """A view in the work folder. first: (tiles + 1,), as in `_Shown`. drawn: how many points were drawn, and how many
+    there are in the image. was_there: since an earlier run."""
 
     key: str
     first: Rows
-    drawn: tuple[int, int] | None
+    drawn: NDArray[np.int64]
+    was_there: bool
 
 
-def _look_at(cloud: _TiledCloud, drawing: _Drawing, settings: FitSettings, work: WorkFolder, view: View) -> _LookedAt:
+def _look_at(cloud: TiledCloud, drawing: _Drawing, settings: FitSettings, view: View) -> _LookedAt:
     view = replace(view, masks=view.mask_map())
     key = fingerprint(cloud.key, drawing, FINEST_PX, MOST_SPLATS, view.name, view_fingerprint(view, view.mask_map()))
-    thinning: list[tuple[int, int]] = []
-    entries = work.array("view", key, partial(_entries, view, cloud, drawing, settings, thinning))
+    was_there = cloud.work.has("view", key)
+    entries, drawn = cloud.work.arrays("view", key, partial(_entries, view, cloud, drawing, settings))
     first = np.searchsorted(np.ascontiguousarray(entries["point"]), cloud.tiles.start)
-    return _LookedAt(key, first, thinning[0] if thinning else None)
+    return _LookedAt(key, first, drawn, was_there)
 
 
 def _entries(
-    view: View, cloud: _TiledCloud, drawing: _Drawing, settings: FitSettings, thinning: list[tuple[int, int]]
-) -> Entries:
-    """What one view shows. thinning: gets how many points were drawn, and how many there are in the image."""
+    view: View, cloud: TiledCloud, drawing: _Drawing, settings: FitSettings
+) -> tuple[Entries, NDArray[np.int64]]:
+    """What one view shows; and how many points were drawn, and how many there are in the image."""
     visibility = settings.visibility
     rows, larger, inside = _worth_drawing(view, cloud, drawing, visibility.alpha_min)
-    thinning.append((len(rows), inside))
+    counts = np.array([len(rows), inside])
     if len(rows) == 0:
-        return np.zeros(0, ENTRY)
+        return np.zeros(0, ENTRY), counts
     splats = drawing.splats(cloud, rows, larger)
     apart, by_sight = cloud.spacing[rows] * larger, drawing.scale is not None
     thickness = surface_thickness(splats, apart, drawing.typical, settings.geometry, by_sight=by_sight)
@@ -476,11 +335,11 @@ def _entries(
         entries["point"][begin:end] = rows[block.indices]
         entries["row"][begin:end] = first_row + np.repeat(np.arange(block.shape[0]), np.diff(block.indptr))
         entries["value"][begin:end] = block.data
-    return entries[np.argsort(entries["point"], kind="stable")]
+    return entries[np.argsort(entries["point"], kind="stable")], counts
 
 
 def _worth_drawing(
-    view: View, cloud: _TiledCloud, drawing: _Drawing, alpha_min: float
+    view: View, cloud: TiledCloud, drawing: _Drawing, alpha_min: float
 ) -> tuple[Rows, NDArray[np.float32], int]:
     """The points in an image that are drawn, how much larger than they are, and how many there are in it.
 
@@ -499,7 +358,7 @@ def _worth_drawing(
 
 
 def _in_image(
-    camera: Camera, cloud: _TiledCloud, part: slice, drawing: _Drawing, alpha_min: float
+    camera: Camera, cloud: TiledCloud, part: slice, drawing: _Drawing, alpha_min: float
 ) -> tuple[Rows, NDArray[np.float32]]:
     """Rows of a tile's points that may show in a pixel, and their spacing in pixels where they are.
 
@@ -524,7 +383,7 @@ def _in_image(
 # Instances and points -------------------------------------------------------------------------------------------
 
 
-def _groups(cloud: _TiledCloud, shown: _Shown, settings: FitSettings, journal: Journal) -> tuple[MaskGroups, Looks]:
+def _groups(cloud: TiledCloud, shown: _Shown, settings: FitSettings, journal: Journal) -> tuple[MaskGroups, Looks]:
     """Masks grouped by a sample of all points, without those groups that the scene's views contradict; their looks."""
     count = max(settings.grouping.graph_points, len(cloud.points) // SAMPLE_STEP)
     sample = sample_of_points(cloud.points.xyz, count)
@@ -555,16 +414,15 @@ class _Decided:
 
 
 def _decide(
-    cloud: _TiledCloud,
+    cloud: TiledCloud,
     shown: _Shown,
     grouped: tuple[MaskGroups, Looks],
     settings: FitSettings,
-    work: WorkFolder,
     tile: int,
 ) -> _Decided:
     """Decide the state of a tile's points."""
     table = shown.table(cloud, cloud.members[tile], settings.membership.few_views)
-    around = _neighbours(tile, cloud, settings, work)
+    around = cloud.neighbours(tile, settings.geometry)
     # Which groups are noise was decided for all tiles.
     membership = replace(settings.membership, rate_share=0.0)
     groups, looks = grouped
@@ -580,7 +438,7 @@ def _decide(
 
 
 def _instances(
-    cloud: _TiledCloud, shown: _Shown, looks: Looks, decided: Sequence[_Decided], settings: FitSettings
+    cloud: TiledCloud, shown: _Shown, looks: Looks, decided: Sequence[_Decided], settings: FitSettings
 ) -> Labelling:
     """Looks that have points become instances, largest first; what is known of them comes from sums over the tiles."""
     look_of_point = np.empty(len(cloud.points), np.int32)

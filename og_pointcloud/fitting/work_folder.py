@@ -95,13 +95,13 @@ class WorkFolder:
                     for path in (work.folder, *new):
                         path.rmdir()  # fails where there is more in it
 
-    def __reduce__(self) -> tuple[Any, ...]:
-        """In another process: the same folder, which that of the run owns."""
-        return WorkFolder, (self._place(),)
-
     def adopt(self, name: str, key: str) -> None:
         """Take a file that another process of this run has written for sound, and not for one of an earlier run."""
         self._sound.add(f"{name}-{key}{SUFFIX}")
+
+    def has(self, name: str, key: str) -> bool:
+        """Whether there is a file of these arrays."""
+        return (self.place() / f"{name}-{key}{SUFFIX}").exists()
 
     def hold(self, nbytes: float, seconds: float) -> None:
         """Write no file until arrays of more than so many bytes are held, or until so many seconds have passed: what
@@ -156,7 +156,8 @@ class WorkFolder:
             if self._pending:
                 self._pending.pop(f"{name}-{key}{SUFFIX}", None)
 
-    def _place(self) -> Path:
+    def place(self) -> Path:
+        """The folder itself, also where it is a temporary one."""
         if self.folder is not None:
             return self.folder
         if self._temporary is None:
@@ -164,7 +165,7 @@ class WorkFolder:
         return self._temporary
 
     def _write(self, label: str, arrays: Arrays) -> None:
-        path = self._place() / label
+        path = self.place() / label
         try:
             with replacing(path, durable=False) as file:  # a checksum ends it
                 _write_arrays(file, arrays)

@@ -1,0 +1,156 @@
+"""A cloud cut into tiles, in files of a work folder that all workers of a fit map."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, NoReturn
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from og_pointcloud.errors import OgPointcloudError
+from og_pointcloud.fitting.work_folder import WorkFolder, fingerprint
+from og_pointcloud.rendering.geometry import Neighbourhood, neighbourhood
+from og_pointcloud.scene import Points
+from og_pointcloud.settings import FitSettings, GeometrySettings
+
+__all__ = ["TiledCloud", "Tiles", "split", "vanished"]
+
+MARGIN = 32.0
+"""How far a tile looks over its borders, in spacings of its sparser points: what decides a point lies nearer."""
+PROBES = 2_000
+"""Points of a tile that are asked for their spacing before its margin is known."""
+
+Rows = NDArray[np.integer]
+
+
+@dataclass(frozen=True)
+class Tiles:
+    """order: (n,) rows of the cloud, tile by tile, ascending within a tile. start: (tiles + 1,) where each begins."""
+
+    order: Rows
+    start: Rows
+
+    def __len__(self) -> int:
+        return len(self.start) - 1
+
+    def part(self, tile: int) -> slice:
+        """A tile's points in arrays that are in ``order``."""
+        return slice(int(self.start[tile]), int(self.start[tile + 1]))
+
+
+def split(xyz: NDArray[np.float32], most: int) -> Tiles:
+    """As few tiles of equally many points as hold at most ``most`` each, where points do not coincide.
+
+    What holds more is cut across its longer side (that of the middle 90 % of its points: strays are no extent), so
+    that tiles are compact, small where points are dense, and never empty.
+    """
+    leaves: list[Rows] = []
+
+    def cut(rows: Rows, count: int) -> None:
+        low, high = np.quantile(xyz[rows], [0.05, 0.95], axis=0) if count > 1 else (np.zeros(0), np.zeros(0))
+        for axis in np.argsort(low - high, kind="stable"):
+            along = xyz[rows, axis]
+            place = len(rows) * (count // 2) // count
+            before = along < np.partition(along, place)[place]
+            if before.any():
+                cut(rows[before], count // 2)
+                cut(rows[~before], count - count // 2)
+                return
+        leaves.append(rows)
+
+    cut(np.arange(len(xyz)), -(-len(xyz) // most))
+    return Tiles(np.concatenate(leaves), np.cumsum([0, *map(len, leaves)]))
+
+
+class TiledCloud:
+    """A cloud in the order of its tiles, without colours, read-only. Made by `TiledCloud.cut`.
+
+    points, spacing (n,): the latter once ``spacing`` of the key is in the work folder. members: per tile, its points
+    and those within its margin, ascending; int32 as there are many. margins: (tiles,) lengths. key: fingerprint of
+    points, tiles and settings. work: where all of it is, for other processes too.
+    """
+
+    def __init__(self, work: WorkFolder, key: str) -> None:
+        self.work, self.key = work, key
+        order, start, self.margins, ends, members, xyz, origin, *gaussian = work.arrays("cloud", key, vanished)
+        self.tiles, self.points = Tiles(order, start), Points(xyz, origin, None, *gaussian)
+        self.members = tuple(members[first:last] for first, last in pairwise(ends.tolist()))
+
+    @classmethod
+    def cut(cls, points: Points, most: int, settings: FitSettings, work: WorkFolder) -> TiledCloud:
+        """Tiles of at most so many points, and what lies about them."""
+        key = fingerprint(points.xyz, points.scale, points.rotation, points.opacity, settings, most, MARGIN)
+
+        def arrays() -> list[NDArray[Any]]:
+            tiles = split(points.xyz, most)
+            ordered = points.take(tiles.order)
+            parts = [tiles.part(tile) for tile in range(len(tiles))]
+            margins = [MARGIN * _sparse_spacing(ordered.xyz[part]) for part in parts]
+            members = [_within(ordered.xyz, part, margin) for part, margin in zip(parts, margins, strict=True)]
+            ends, shape = np.cumsum([0, *map(len, members)]), (ordered.scale, ordered.rotation, ordered.opacity)
+            known = [array for array in shape if array is not None]
+            cloud = (ordered.xyz, ordered.origin, *known)
+            return [tiles.order, tiles.start, np.array(margins), ends, np.concatenate(members), *cloud]
+
+        work.arrays("cloud", key, arrays)
+        return cls(work, key)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _opened, (self.work.place(), self.key)
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    @cached_property
+    def spacing(self) -> NDArray[np.float32]:
+        """(n,) as of `Neighbourhood`."""
+        return self.work.array("spacing", self.key, vanished)
+
+    def inner(self, tile: int) -> slice:
+        """A tile's points without those of its margin, among its members."""
+        part = self.tiles.part(tile)
+        first, last = np.searchsorted(self.members[tile], [part.start, part.stop])
+        return slice(int(first), int(last))
+
+    def neighbours(self, tile: int, settings: GeometrySettings) -> Neighbourhood:
+        """The neighbourhood of a tile's members, numbered as these; it stays in the work folder."""
+
+        def find() -> tuple[NDArray[np.generic], ...]:
+            around = neighbourhood(self.points.xyz[self.members[tile]], settings)
+            return around.spacing, around.index, around.adjoining
+
+        return Neighbourhood(*map(np.array, self.work.arrays(f"neighbours-{tile:04d}", self.key, find)))
+
+
+@lru_cache(maxsize=1)
+def _opened(folder: Path, key: str) -> TiledCloud:
+    """In another process: one for all its tasks, so that each file is checked once."""
+    return TiledCloud(WorkFolder(folder), key)
+
+
+def vanished() -> NoReturn:
+    """In place of arrays that another process should have made."""
+    raise OgPointcloudError(
+        "a file of the work folder is gone or damaged, or a worker cannot see it; expected one folder that all workers "
+        "share: name such a work folder, or set TMPDIR to one"
+    )
+
+
+def _sparse_spacing(xyz: NDArray[np.float32]) -> float:
+    """The spacing that 95 % of the points do not exceed, by some of them."""
+    tree = cKDTree(xyz, balanced_tree=False, compact_nodes=False)
+    distance, _ = tree.query(xyz[:: 1 + len(xyz) // PROBES], k=[2, 3, 4])
+    known = np.where(np.isfinite(distance), distance, np.nan)  # fewer than four points
+    spacing = np.nanmean(known, axis=1) if np.isfinite(known).any() else np.zeros(1)
+    return float(np.quantile(spacing, 0.95))
+
+
+def _within(xyz: NDArray[np.float32], part: slice, margin: float) -> NDArray[np.int32]:
+    """The points of a tile and those of others that lie within the margin of its box."""
+    low, high = xyz[part].min(axis=0) - margin, xyz[part].max(axis=0) + margin
+    return np.flatnonzero(((xyz >= low) & (xyz <= high)).all(axis=1)).astype(np.int32)
