@@ -40,7 +40,7 @@ from og_pointcloud.cloud import (
 )  # fmt: skip
 from og_pointcloud.settings import ChoosingSettings
 
-__all__ = ["Choice", "Chooser", "Reason", "Standard"]
+__all__ = ["Choice", "Chooser", "Reason", "Standard", "log_mean_likelihood"]
 
 ROWS_AT_ONCE = 2048
 """Descriptors compared with all others at once."""
@@ -263,14 +263,10 @@ class Chooser:
     def _log_none(self, texts: NDArray[np.float32]) -> NDArray[np.float64]:
         """(described,) log of the mean likelihood that a word of the bank other than the labels gives."""
         assert self.bank is not None
-        sharpness = self.sharpness
         directions = unit_rows(unit_rows(texts) - self.bank.mean)
         other = (self._bank_directions @ directions.T).max(axis=1) < self.settings.synonym
-        by_chance = np.full(len(self._bank_evidence), sharpness**2 / 2)
-        if not other.any():
-            return by_chance
-        exponents = sharpness * self._bank_evidence[:, other].astype(np.float64)
-        return np.maximum(by_chance, np.logaddexp.reduce(exponents, axis=1) - np.log(np.count_nonzero(other)))
+        exponents = self.sharpness * self._bank_evidence[:, other].astype(np.float64)
+        return log_mean_likelihood(exponents, self.sharpness)
 
     def _answer(
         self, evidence: NDArray[np.floating], table: NDArray[np.floating], unknown: NDArray[np.floating]
@@ -301,6 +297,15 @@ class Chooser:
             membership=self._membership,
             calibrated=self.bank is not None,
         )
+
+
+def log_mean_likelihood(exponents: NDArray[np.float64], sharpness: ArrayLike) -> NDArray[np.float64]:
+    """(n,) log of the mean likelihood that words give, at least that of a word that fits by chance. exponents: (n, W)
+    sharpness times evidence. sharpness: (n,), or one for all."""
+    by_chance = np.broadcast_to(np.square(sharpness) / 2, len(exponents))
+    if exponents.shape[1] == 0:
+        return by_chance
+    return np.maximum(by_chance, np.logaddexp.reduce(exponents, axis=1) - np.log(exponents.shape[1]))
 
 
 def common_part(descriptors: NDArray[np.float32], same_look: float) -> NDArray[np.float32]:

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud.ask.choosing import Standard
+from og_pointcloud.ask.choosing import Standard, log_mean_likelihood
 from og_pointcloud.cloud import WordBank, unit_rows
 from og_pointcloud.collection.store import Atlas, SceneEntry
 from og_pointcloud.settings import ChoosingSettings
@@ -116,12 +116,9 @@ class Block:
         self, rows: NDArray[np.intp], direction: NDArray[np.float32], others: NDArray[np.float32]
     ) -> NDArray[np.float64]:
         """Logit of the probability (`choosing.Chooser`) of a direction (1, D) against the bank's other words."""
-        sharpness = self.sharpness[self.scene[rows], None]
-        said = sharpness * self.evidence(rows, np.concatenate([direction, others]))
-        none = sharpness[:, 0] ** 2 / 2
-        if len(others):
-            none = np.maximum(none, np.logaddexp.reduce(said[:, 1:], axis=1) - np.log(len(others)))
-        return said[:, 0] - none - np.log(ChoosingSettings().kinds)
+        sharpness = self.sharpness[self.scene[rows]]
+        said = sharpness[:, None] * self.evidence(rows, np.concatenate([direction, others]))
+        return said[:, 0] - log_mean_likelihood(said[:, 1:], sharpness) - np.log(ChoosingSettings().kinds)
 
 
 def largest(
