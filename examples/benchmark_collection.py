@@ -157,7 +157,10 @@ def rows_of(name: str, opened: Callable[[], og.Collection]) -> list[Row]:
     print(f"{name}: first answer in {seconds:.1f} s, CPU {cpu_seconds:.1f} s")
     rows = []
     half = ([0.0, 0.0, 0.0], [500.0, 1000.0, 10.0])
-    for asked, options in (("all", {}), ("a box around half", {"within": half}), ("one scene", {"scenes": "s000001"})):
+    ways: dict[str, dict[str, Any]] = {
+        "all": {}, "a box around half": {"within": half}, "one scene": {"scenes": "s000001"},
+    }  # fmt: skip
+    for asked, options in ways.items():
         times, cpu, found = [], [], []
         for k in range(ASKED):
             word = f"thing {k}"

@@ -212,6 +212,18 @@ def test_only_what_changed_is_read_again(folder, monkeypatch):
         assert again.find(word, top=100).to_json() == fresh.find(word, top=100).to_json()
 
 
+def test_scenes_are_judged_as_long_as_their_kin_knows_enough_words(folder):
+    words = {f"word{k}": row for k, row in enumerate(unit_rows(60, WIDTH, seed=2))}
+    clouds = {
+        "many": scene(["word1"], encoder=words, words=words),
+        "few": scene(["word2"], encoder=words, words=["word2"]),
+    }
+    assert indexed(folder, clouds).find("word2")[0].calibrated
+    (folder / "many.ogpc").unlink()
+    (best,) = indexed(folder, {}).find("word2")
+    assert (best.scene, best.calibrated) == ("few", False)
+
+
 def test_a_change_that_fails_leaves_the_atlas_as_it_was(folder, monkeypatch):
     collection = indexed(folder, many(4))
     before = collection.find("chair", top=100).to_json()

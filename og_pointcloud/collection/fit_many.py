@@ -169,8 +169,7 @@ def _try_fit(capture: str, output: str, options: FitOptions, share: Share) -> Ca
         result = CaptureFit(capture, output, "failed", cause)
     else:
         doubts = tuple(check["name"] for check in cloud.provenance["checks"] if check["verdict"] == "doubt")
-        counts = {"points": len(cloud), "instances": len(cloud.instances)}
-        result = CaptureFit(capture, output, "fitted", doubts=doubts, **counts)
+        result = CaptureFit(capture, output, "fitted", points=len(cloud), instances=len(cloud.instances), doubts=doubts)
     return replace(result, seconds=round(time.perf_counter() - start, 3), worker=worker, peak_bytes=peak_memory())
 
 

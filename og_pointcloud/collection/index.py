@@ -189,14 +189,17 @@ def settle(atlas: Atlas) -> None:
     """Settle whose words judge the instances of each scene, and judge those for whom that is new."""
     for family in families(atlas, atlas.entries()):
         lent = _lent_bank(atlas, family)
-        banks: dict[str | None, WordBank | None] = {None: None}
+        banks: dict[str, WordBank] = {}
         for entry in sorted(family.entries, key=lambda entry: entry.bank or ""):
             judge = (entry.bank or lent) if family.width else None
-            if judge not in banks:  # one at a time: each scene may have its own
-                banks = {None: None, judge: atlas.bank(judge, family.width)}
-            if judge != entry.judge:
-                bank = banks[judge]
-                atlas.judge(entry, judge, bank and Chooser(atlas.instances(entry)[0], bank).standard())
+            if judge == entry.judge:
+                continue
+            made = None
+            if judge is not None:
+                if judge not in banks:  # one at a time: each scene may have its own
+                    banks = {judge: atlas.bank(judge, family.width)}
+                made = Chooser(atlas.instances(entry)[0], banks[judge]).standard()
+            atlas.judge(entry, judge, made)
     atlas.forget_unused_words()
 
 

@@ -10,11 +10,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud.ask.choosing import Standard, log_mean_likelihood
+from og_pointcloud.ask.choosing import log_mean_likelihood
 from og_pointcloud.cloud import WordBank, unit_rows
 from og_pointcloud.collection.store import Atlas, SceneEntry
 from og_pointcloud.settings import ChoosingSettings
@@ -41,7 +42,7 @@ class Block:
     descriptor in standard deviations of the judge's words; without a judge the cosine. bounds: (I + 1,) where each
     instance's descriptors begin, and where the last one's end. scene, instance: (I,) row of ``entries``, and id in the
     scene. points: (I,). center, size: (I, 3) of the boxes. bank: the judge, None for none. sharpness: (S,) float64 of
-    the scenes (`choosing.Standard`), 0 without a judge.
+    the scenes (`choosing.Standard`), none without a judge.
     """
 
     entries: tuple[SceneEntry, ...]
@@ -146,23 +147,29 @@ def share(logit: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def load_block(atlas: Atlas, entries: Sequence[SceneEntry]) -> Block:
     """Scenes of an atlas with one kin and judge; their arrays lie behind each other."""
-    parts: list[tuple[NDArray, ...]] = []
-    begin, sharpness = 0, []
+    parts: list[dict[str, NDArray[Any]]] = []
+    end, sharpness = 0, []
     for number, entry in enumerate(entries):
         table, boxes = atlas.instances(entry)
-        vectors, owner = table.descriptors, table.descriptor_instance
-        standard = Standard(np.zeros(0), np.ones(len(owner)), np.zeros(len(owner)), 0.0)
+        vectors, owner, shift = (
+            table.descriptors,
+            table.descriptor_instance,
+            np.zeros(len(table.descriptors), np.float32),
+        )
         if entry.judge is not None:
             standard = atlas.judgement(entry, len(owner))
-            vectors = standard.scale[:, None] * (vectors - standard.common)
+            vectors, shift = standard.scale[:, None] * (vectors - standard.common), standard.shift
+            sharpness.append(standard.sharpness)
         shown = np.flatnonzero(table.points[owner] > 0)
         instance, first = np.unique(owner[shown], return_index=True)
-        scene = np.full(len(instance), number)
-        columns = vectors[shown], standard.shift[shown], begin + first, scene, instance
         low, high = boxes[instance, 0], boxes[instance, 1]
-        parts.append((*columns, table.points[instance], (low + high) / 2, high - low))
-        begin += len(shown)
-        sharpness.append(standard.sharpness)
+        parts.append({
+            "vectors": vectors[shown], "shift": shift[shown], "bounds": end + first, "instance": instance,
+            "scene": np.full(len(instance), number, np.int32), "points": table.points[instance],
+            "center": (low + high) / 2, "size": high - low,
+        })  # fmt: skip
+        end += len(shown)
+    columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    columns["bounds"] = np.append(columns["bounds"], end)
     bank = atlas.bank(judge, entries[0].width) if (judge := entries[0].judge) else None
-    vectors, shift, first, *others = map(np.concatenate, zip(*parts, strict=True))
-    return Block(tuple(entries), vectors, shift, np.append(first, begin), *others, bank, np.array(sharpness))
+    return Block(tuple(entries), bank=bank, sharpness=np.array(sharpness), **columns)

@@ -241,7 +241,7 @@ class Atlas:
         self._run("INSERT OR IGNORE INTO words VALUES (?, ?, ?, ?)", (digest, text, vectors.shape[1], blob))
         return digest
 
-    def judge(self, entry: SceneEntry, judge: str, made: Standard | None) -> None:
+    def judge(self, entry: SceneEntry, judge: str | None, made: Standard | None) -> None:
         """Give a scene another judge, and what that makes of its descriptors; None for none."""
         self._run("DELETE FROM judgements WHERE scene = ?", (entry.id,))
         if made is not None:
