@@ -48,12 +48,14 @@ def drawn(scene: og.LabelledScene, colors: np.ndarray, size: tuple[int, int] = S
 def by_object(scene: og.LabelledScene) -> np.ndarray:
     """A color for each object, the rest as it is."""
     palette = np.random.default_rng(3).uniform(60, 230, (1 + scene.instance_ids.max(initial=0), 3))
-    return np.where(scene.instance_ids[:, None] >= 0, palette[scene.instance_ids], 0.4 * scene.cloud.rgb + 140)
+    return np.where(
+        scene.instance_ids[:, None] >= 0, palette[scene.instance_ids], 0.4 * np.asarray(scene.cloud.rgb) + 140
+    )
 
 
 def tinted(scene: og.LabelledScene, ids: list[int], color: tuple[int, int, int]) -> np.ndarray:
     """Some objects in one color, the rest pale."""
-    return np.where(np.isin(scene.instance_ids, ids)[:, None], color, 0.55 * scene.cloud.rgb + 95)
+    return np.where(np.isin(scene.instance_ids, ids)[:, None], color, 0.55 * np.asarray(scene.cloud.rgb) + 95)
 
 
 def written(image: np.ndarray, text: str, entry: MapObject, color: tuple[int, int, int]) -> None:
@@ -65,7 +67,7 @@ def written(image: np.ndarray, text: str, entry: MapObject, color: tuple[int, in
 
 def name_of(entry: MapObject) -> str:
     """The word that fits it best."""
-    return NAMES[int((days.model.texts @ entry.descriptor).argmax())]
+    return NAMES[int((days.model.texts @ np.asarray(entry.descriptor)).argmax())]
 
 
 # Monday: frame by frame; four pictures on the way.

@@ -135,7 +135,7 @@ def speed(folder: Path, options: argparse.Namespace) -> None:
     """Milliseconds a frame in maps of SIZES points: the capture's, drawn anew with noise of half a spacing."""
     capture, frames = frames_of(folder, options)
     xyz, random = capture.points.xyz_world, np.random.default_rng(0)
-    noise = 0.5 * float(np.median(cKDTree(xyz).query(xyz[:10_000], k=2, workers=-1)[0][:, 1]))
+    noise = 0.5 * float(np.median(np.asarray(cKDTree(xyz).query(xyz[:10_000], k=2, workers=-1)[0])[:, 1]))
     print(f"\n{folder.name}: {len(frames)} frames\n   points  objects  median ms  p95 ms  CPU ms")
     for size in SIZES:
         cloud = xyz[random.integers(0, len(xyz), size)] + random.normal(0, noise, (size, 3))

@@ -29,7 +29,7 @@ from og_pointcloud.ask.labelled_scene import SceneLike, as_scene
 from og_pointcloud.cloud import LabelledCloud
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.poses import in_local_frame
-from og_pointcloud.mapping.likeness import ALIKE, Look, descriptors_of, likeness, typical_cosine
+from og_pointcloud.mapping.likeness import ALIKE, Look, descriptors_of, likeness, typical_of_table
 from og_pointcloud.mapping.map_record import MapRecord
 from og_pointcloud.mapping.presence import Presence
 from og_pointcloud.mapping.sight import DiscSurface, MeasuredView
@@ -167,11 +167,11 @@ class Visit:
         rgb = None if cloud.rgb is None else cloud.rgb[rows]
         return Look.of_points(*descriptors_of(cloud.instances, instance), cloud.xyz[rows], rgb)
 
-    def count(self, chosen: NDArray[np.bool_], sure: NDArray[np.floating] | None = None) -> NDArray[np.floating]:
+    def count(self, chosen: NDArray[np.bool_], sure: NDArray[np.floating] | None = None) -> NDArray[np.float64]:
         """(instances,) how many of each instance's points are chosen, (n,) bool; sure: (n,) what each counts."""
         ids, weight = self.cloud.instance_ids, np.ones(len(chosen)) if sure is None else sure
         rows = np.flatnonzero(chosen & (ids >= 0))
-        return np.bincount(ids[rows], weight[rows], len(self.cloud.instances))
+        return np.asarray(np.bincount(ids[rows], weight[rows], len(self.cloud.instances)), np.float64)
 
     def telling(self, tolerance: float) -> NDArray[np.bool_]:
         """(n,) bool: points that lie off the surfaces of all other instances about them."""
@@ -284,7 +284,7 @@ class _Thing:
 def _decide(earlier: Visit, later: Visit, of_earlier: Evidence, of_later: Evidence) -> Comparison:
     left, hardly = of_earlier.decided(earlier)
     came, _ = of_later.decided(later)
-    typical = typical_cosine(later.cloud.instances)
+    typical = typical_of_table(later.cloud.instances)
     gone = _things(earlier, np.flatnonzero(left).tolist(), of_earlier.through, typical)
     new = _things(later, np.flatnonzero(came).tolist(), of_later.through, typical)
     retired = [  # what an earlier visit found gone, and may be back

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -21,8 +22,6 @@ from og_pointcloud.scene import Camera
 
 __all__ = ["GrowingMap"]
 
-PIXELS_PER_SPACING = 4.0
-"""Pixels of the first depth image, at its median depth, to a spacing of a map that starts empty."""
 READINGS_PER_SPACING = 1.5
 """Readings a spacing that a frame gives to the map, along each axis: more would only be averaged."""
 SLANT = 0.15
@@ -52,26 +51,12 @@ class GrowingMap:
 
     @classmethod
     def empty(
-        cls, origin: NDArray[np.float64], space: FeatureSpace, spacing: float, grows: bool, scatter: float = 0.0
-    ) -> GrowingMap:
+        cls, origin: NDArray[np.float64], space: FeatureSpace, spacing: float, *, grows: bool = True,
+        scatter: float = 0.0,
+    ) -> GrowingMap:  # fmt: skip
         """Without a point. grows: whether frames add some. scatter: standard deviation of points off their surface."""
         tolerance = max(TOLERANCE * spacing, SCATTER * scatter)
         return cls(origin, space, VoxelPoints(spacing, grows), Presence(tolerance, MOST_ODDS))
-
-    @classmethod
-    def begun_by(
-        cls, frame: CheckedFrame, origin: NDArray[np.float64], space: FeatureSpace, spacing: float | None
-    ) -> GrowingMap:
-        """Without a point, for the depth of a first frame; spacing None: as dense as its pixels."""
-        assert frame.view is not None
-        depth, camera = frame.view.depth, frame.view.camera
-        pixel = np.median(depth[depth > 0]) / np.sqrt(camera.fx * camera.fy)
-        return cls.empty(origin, space, float(PIXELS_PER_SPACING * pixel) if spacing is None else spacing, grows=True)
-
-    def know(self, xyz: NDArray[np.float32], rgb: NDArray[np.uint8] | None) -> None:
-        """Take points (n, 3) of which the geometry is known."""
-        self.points.add_known(xyz, rgb)
-        self.grow()
 
     def grow(self) -> None:
         """Room for what is known of each point."""
@@ -98,8 +83,7 @@ class GrowingMap:
         if view is None or not points.grows:
             return np.zeros(0, np.int32)
         camera = view.camera
-        typical = float(np.median(view.depth[view.depth > 0]))
-        step = max(1, int(points.edge * np.sqrt(camera.fx * camera.fy) / typical / READINGS_PER_SPACING))
+        step = max(1, int(points.edge / view.pixel / READINGS_PER_SPACING))
         xyz, pixel = _readings(view.depth, view.normal, camera.world_to_camera, lens_of(camera), step, step // 2, SLANT)
         rgb = np.full((len(xyz), 3), 128, np.uint8)
         if frame.rgb is not None:
@@ -130,7 +114,7 @@ class GrowingMap:
         """(3,) mean of points, world coordinates."""
         return self.points.xyz[rows].astype(np.float64).mean(axis=0) + self.origin
 
-    def correct(self, poses: dict[float, ArrayLike]) -> None:
+    def correct(self, poses: Mapping[float, ArrayLike]) -> None:
         """Move what the frames of these stamps brought: stamp -> world_to_camera, from world coordinates."""
         corrected = {}
         for stamp, pose in poses.items():

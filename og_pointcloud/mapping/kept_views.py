@@ -63,9 +63,9 @@ class KeptView:
 
     def stands_like(self, other: KeptView, distance: float) -> bool:
         """Whether the two looked from about the same place in about the same direction. distance: to what they see."""
-        turned = self.camera.world_to_camera[2, :3] @ other.camera.world_to_camera[2, :3]
-        apart = np.linalg.norm(self.camera.center - other.camera.center)
-        return bool(turned > SAME_DIRECTION and apart < SAME_PLACE * distance)
+        if self.camera.world_to_camera[2, :3] @ other.camera.world_to_camera[2, :3] <= SAME_DIRECTION:
+            return False
+        return bool(np.linalg.norm(self.camera.center - other.camera.center) < SAME_PLACE * distance)
 
 
 @dataclass

@@ -20,7 +20,17 @@ from numpy.typing import ArrayLike, NDArray
 
 from og_pointcloud.cloud import InstanceTable
 
-__all__ = ["ALIKE", "SAME_COLOR", "Look", "descriptors_of", "likeness", "recognized", "spread_of", "typical_cosine"]
+__all__ = [
+    "ALIKE",
+    "SAME_COLOR",
+    "Look",
+    "descriptors_of",
+    "likeness",
+    "recognized",
+    "spread_of",
+    "typical_cosine",
+    "typical_of_table",
+]
 
 ALIKE = 0.5
 """From here on two are one thing: nearer to what one thing has than to what different things have."""
@@ -70,10 +80,18 @@ def descriptors_of(table: InstanceTable, instance: int) -> tuple[NDArray[np.floa
     return table.descriptors[table.descriptor_instance == instance], float(spread)
 
 
-def typical_cosine(table: InstanceTable) -> float:
-    """The median cosine of two instances of a table, as endless views would give it; 0 where there are no two."""
-    rows, owner = table.descriptors[:MOST_ROWS], table.descriptor_instance[:MOST_ROWS]
-    widened = np.sqrt(1 + spread_of(table.agreement, table.masks))[owner]
+def typical_of_table(table: InstanceTable) -> float:
+    """The `typical_cosine` of a table's instances."""
+    owner = table.descriptor_instance
+    return typical_cosine(table.descriptors, owner, spread_of(table.agreement, table.masks)[owner])
+
+
+def typical_cosine(rows: NDArray[np.floating], owner: NDArray[np.integer], spread: NDArray[np.float64]) -> float:
+    """The median cosine of two instances, as endless views would give it; 0 where there are no two.
+
+    rows: (r, D) descriptors, of the instance owner (r,), off by a squared tangent (r,).
+    """
+    rows, owner, widened = rows[:MOST_ROWS], owner[:MOST_ROWS], np.sqrt(1 + spread[:MOST_ROWS])
     cosines = (rows @ rows.T) * np.outer(widened, widened)
     different = np.triu(owner[:, None] != owner)
     return float(np.median(cosines[different])) if different.any() else 0.0

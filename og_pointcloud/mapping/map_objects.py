@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from og_pointcloud.mapping.changes import FEWEST_POINTS, MOST, Moved
 from og_pointcloud.mapping.growing_map import GrowingMap
-from og_pointcloud.mapping.likeness import Look, recognized, spread_of
+from og_pointcloud.mapping.likeness import Look, recognized, typical_cosine
 from og_pointcloud.mapping.tracks import Left, Track
 
 __all__ = ["MapObject", "leave", "name", "objects_of"]
@@ -75,7 +75,7 @@ def _has_left(known: GrowingMap, k: int) -> bool:
         return False
     every = np.concatenate([np.array(track.lost, np.int32), rows])
     size = np.ptp(known.points.xyz[every].astype(np.float64), axis=0)
-    track.left, track.lost = Left(_look(known, track, every), known.place_of(every), size), []
+    track.left, track.lost = Left(_look(known, track, every), known.place_of(every), size, track.sequence), []
     known.points.weight[np.setdiff1d(rows, still[known.presence.seen_at[still] >= track.losing_since])] = 0
     known.forget(rows)
     return True
@@ -95,7 +95,7 @@ def name(known: GrowingMap, new: list[int], gone: list[int]) -> tuple[tuple[int,
         if known.tracks.root[k] != k or track.left or (k in new and track.id >= 0):
             continue
         rows = np.zeros(0, np.int64) if owners is None else np.flatnonzero(owners == k)
-        old = _recognized(known, _look(known, track, rows)) if len(rows) >= FEWEST_POINTS else None
+        old = _recognized(known, track, rows) if len(rows) >= FEWEST_POINTS else None
         if old is not None:
             moved.append(_returned(known, old, track, rows))
         elif track.id < 0:
@@ -108,17 +108,19 @@ def name(known: GrowingMap, new: list[int], gone: list[int]) -> tuple[tuple[int,
 def _look(known: GrowingMap, track: Track, rows: NDArray[np.integer]) -> Look:
     """How a track looks, by some of its points."""
     descriptor = np.zeros((0, 1)) if track.descriptor is None else track.descriptor[None]
-    spread = float(spread_of(track.agreement / max(track.pixels, 1e-12), track.masks))
-    return Look.of_points(descriptor.astype(np.float32), spread, known.points.xyz[rows], known.points.rgb[rows])
+    xyz, rgb = known.points.xyz[rows], known.points.rgb[rows]
+    return Look.of_points(descriptor.astype(np.float32), track.spread, xyz, rgb)
 
 
-def _recognized(known: GrowingMap, look: Look) -> int | None:
-    """The id of what left and looks so, if anything does."""
-    tracks = known.tracks.tracks
-    rows = [t.descriptor for t in tracks if t.id >= 0 and t.descriptor is not None]
-    cosines = np.array(rows) @ np.array(rows).T if len(rows) > 1 else np.zeros((1, 1))
-    typical = float(np.median(cosines[np.triu_indices(len(cosines), 1)])) if len(rows) > 1 else 0.0
-    return recognized(look, {t.id: t.left.look for t in tracks if t.left}, typical)
+def _recognized(known: GrowingMap, track: Track, rows: NDArray[np.integer]) -> int | None:
+    """The id of what left and looks like a track of these points, if anything does. What stood here already when the
+    other was still seen there is not it."""
+    tracks = [t for t in known.tracks.tracks if t.id >= 0 and t.descriptor is not None]
+    descriptors, spread = np.array([t.descriptor for t in tracks]), np.array([t.spread for t in tracks])
+    typical = typical_cosine(descriptors, np.arange(len(tracks)), spread) if tracks else 0.0
+    came = float(np.median(known.kept.born[rows]))
+    left = {t.id: t.left.look for t in known.tracks.tracks if t.left and t.left.sequence < came}
+    return recognized(_look(known, track, rows), left, typical)
 
 
 def _returned(known: GrowingMap, old: int, track: Track, rows: NDArray[np.int64]) -> Moved:

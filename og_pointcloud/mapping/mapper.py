@@ -38,6 +38,8 @@ from og_pointcloud.settings import FitSettings
 
 __all__ = ["FrameChange", "Mapper"]
 
+PIXELS_PER_SPACING = 4.0
+"""Pixels of the first depth image, at its median depth, to a spacing of a map that starts empty."""
 PRUNED_EVERY = 64
 """Frames after which tracks that came to nothing are let go."""
 USUAL_SHARE = 0.3
@@ -112,8 +114,9 @@ class Mapper:
         self._around = neighbourhood(points.xyz, self.settings.geometry)
         spacing = float(np.median(self._around.spacing)) if spacing is None else spacing
         scatter = DiscSurface(points.xyz, self._around).scatter if len(points) > 1 else 0.0
-        self._map = GrowingMap.empty(points.origin, space, spacing, grows, scatter)
-        self._map.know(points.xyz, points.rgb)
+        self._map = GrowingMap.empty(points.origin, space, spacing, grows=grows, scatter=scatter)
+        self._map.points.add_known(points.xyz, points.rgb)
+        self._map.grow()
         return self._map
 
     def _go_on(self, base: LabelledCloud) -> None:
@@ -127,7 +130,7 @@ class Mapper:
             total = rows.sum(axis=0) * pixels if len(rows) else None
             seen = record.last_seen.get(k, 0.0)
             counts = int(table.views[k]), int(table.masks[k])
-            known.tracks.add(Track(total, pixels, float(table.agreement[k]) * pixels, *counts, seen, k))
+            known.tracks.add(Track(total, pixels, float(table.agreement[k]) * pixels, *counts, seen, id=k))
         known.tracks.next_id = len(table)
         for k, entry in record.gone.items():
             place, size = np.array(entry.place), np.full(3, entry.length)
@@ -185,12 +188,8 @@ class Mapper:
             measured, died = known.judge(rows, states, given)
             rows = np.concatenate([measured, known.add(given)])
         if len(given.features):
-            seen = (
-                drawn_points(given, known, self._around, self.settings.geometry)
-                if given.view is None
-                else measured_points(given, known, rows)
-            )
-            new, again = vote(given, known, seen)
+            drawn = None if given.view else drawn_points(given, known, self._around, self.settings.geometry)
+            new, again = vote(given, known, drawn or measured_points(given, known, rows))
         gone = leave(known, died, given.stamp)
         new_ids, moved = name(known, new, gone)
         updated = tuple(sorted(known.tracks.tracks[k].id for k in again))
@@ -253,7 +252,8 @@ class Mapper:
                     f"frame {given.stamp:g} has no depth, and the map has no points yet; expected depth or a cloud: "
                     "start with Mapper(cloud=points), or with a map, where frames have masks alone"
                 )
-            known = GrowingMap.begun_by(given, origin, self._space, self._spacing)
+            spacing = PIXELS_PER_SPACING * given.view.pixel if self._spacing is None else self._spacing
+            known = GrowingMap.empty(origin, self._space, spacing)
         return given, known
 
     def _label(self, known: GrowingMap) -> LabelledCloud:

@@ -140,7 +140,7 @@ def _relabelled(
     """(n,) ids of the map's points: what lost its instance, or had never been seen, is what the visit says of it."""
     ids = np.where(orphaned, BACKGROUND, a.instance_ids).astype(np.int64)
     asked = np.flatnonzero(orphaned | (ids == UNOBSERVED))
-    distance, nearest = cKDTree(b.xyz).query(a.xyz[asked], workers=-1)
+    distance, nearest = map(np.asarray, cKDTree(b.xyz).query(a.xyz[asked], workers=-1))
     near = distance <= SAME_SURFACE * a.spacing
     ids[asked[near]] = states[b.instance_ids[nearest[near]]]
     return ids
@@ -157,7 +157,7 @@ def joined(
     owner = np.concatenate([np.arange(len(a)), ids_of_b])
 
     def total(one: NDArray[Any], other: NDArray[Any]) -> NDArray[np.float64]:
-        return np.bincount(owner, np.concatenate([one, other]), count)
+        return np.asarray(np.bincount(owner, np.concatenate([one, other]), count), np.float64)
 
     masks, none = total(a.masks, b.masks), np.full(count - len(a), -1, np.int32)
     rows, owners = _descriptors(a, b, ids_of_b, count)

@@ -42,10 +42,10 @@ class Presence(Columns):
     first: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 3), np.float32))
     SPARE: ClassVar[dict[str, float]] = {"seen_at": -np.inf}
 
-    @classmethod
-    def by(cls, views: Iterable[MeasuredView], tolerance: float, *clouds: NDArray[np.float32]) -> list[Presence]:
+    @staticmethod
+    def by(views: Iterable[MeasuredView], tolerance: float, *clouds: NDArray[np.float32]) -> list[Presence]:
         """What views say of all points of clouds, each (n, 3)."""
-        found = [cls(tolerance) for _ in clouds]
+        found = [Presence(tolerance) for _ in clouds]
         for presence, xyz in zip(found, clouds, strict=True):
             presence.grow(len(xyz))
         for view in views:

@@ -84,4 +84,4 @@ def vote(frame: CheckedFrame, known: GrowingMap, seen: Seen) -> tuple[list[int],
     known.kept.offer(view, float(np.median(away)) if len(away) else 0.0)
     seen_at[points] = np.maximum(seen_at[points], frame.stamp)
     weight = seen.found.openness.data.astype(np.float32)
-    return known.tracks.observe(known.votes, points, seen.mask, weight, frame.features, frame.stamp)
+    return known.tracks.observe(known.votes, points, seen.mask, weight, frame.features, (frame.stamp, known.sequence))

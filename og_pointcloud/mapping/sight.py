@@ -75,6 +75,11 @@ class MeasuredView:
     normal: NDArray[np.float32]
     noise: float
 
+    @property
+    def pixel(self) -> float:
+        """Length that a pixel spans at the median depth; of a view that measures something."""
+        return float(np.median(self.depth[self.depth > 0]) / np.sqrt(self.camera.fx * self.camera.fy))
+
 
 class DiscSurface:
     """A cloud as a surface: each point a disc in the plane of its neighbours.

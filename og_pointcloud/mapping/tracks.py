@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from og_pointcloud.fitting.association import directions
 from og_pointcloud.kernels import njit
-from og_pointcloud.mapping.likeness import Look
+from og_pointcloud.mapping.likeness import Look, spread_of
 from og_pointcloud.mapping.voxels import Columns
 
 __all__ = ["NO_TRACK", "Left", "PointVotes", "Track", "Tracks"]
@@ -59,19 +59,22 @@ class PointVotes(Columns):
 
 @dataclass(frozen=True)
 class Left:
-    """How an object looked that left, and where it was last, (3,) world coordinates, for when it is found again."""
+    """How an object looked that left, and where it was last, (3,) world coordinates, for when it is found again.
+    sequence: of the frame that showed it last: what stood elsewhere by then is something else."""
 
     look: Look
     place: NDArray[np.float64]
     size: NDArray[np.float64]
+    sequence: int = 0
 
 
 @dataclass
 class Track:
     """total: (D,) sum of unit features by pixels; pixels: their sum; agreement: sum of cosines by pixels. views, masks:
-    how many showed it. id: of the object, NO_TRACK while it is provisional; named_at: the stamp at which it got it.
-    moved: it has been elsewhere. lost: rows of its points that were seen through,
-    losing_since: from that stamp on; left: when most of them were."""
+    how many showed it; last_seen, sequence: the stamp and the number of the last frame that did, 0 for an earlier map.
+    id: of the object, NO_TRACK while it is provisional; named_at: the stamp at which it got it. moved: it has been
+    elsewhere. lost: rows of its points that were seen through, losing_since: from that stamp on; left: when most were.
+    """
 
     total: NDArray[np.float64] | None = None
     pixels: float = 0.0
@@ -79,6 +82,7 @@ class Track:
     views: int = 0
     masks: int = 0
     last_seen: float = 0.0
+    sequence: int = 0
     id: int = NO_TRACK
     named_at: float = -np.inf
     moved: bool = False
@@ -93,13 +97,19 @@ class Track:
         for name in ("pixels", "agreement", "masks", "lost"):
             setattr(self, name, getattr(self, name) + getattr(other, name))
         self.moved |= other.moved
-        self.views, self.last_seen = max(self.views, other.views), max(self.last_seen, other.last_seen)
+        for name in ("views", "last_seen", "sequence"):
+            setattr(self, name, max(getattr(self, name), getattr(other, name)))
 
     @property
     def descriptor(self) -> NDArray[np.float64] | None:
         """(D,) of length 1, None without a feature."""
         length = 0.0 if self.total is None else float(np.linalg.norm(self.total))
         return None if self.total is None or length < 1e-12 else self.total / length
+
+    @property
+    def spread(self) -> float:
+        """The squared tangent that the descriptor is off by (`likeness`)."""
+        return float(spread_of(self.agreement / max(self.pixels, 1e-12), self.masks))
 
 
 @dataclass
@@ -137,9 +147,10 @@ class Tracks:
 
     def observe(
         self, votes: PointVotes, points: NDArray[np.int32], mask: NDArray[np.int32], weight: NDArray[np.float32],
-        features: NDArray[np.float32], stamp: float,
+        features: NDArray[np.float32], when: tuple[float, int],
     ) -> tuple[list[int], list[int]]:  # fmt: skip
         """Take in what a frame shows: points (m,), each in a mask or in -1, with a weight. features: (M, D).
+        when: its stamp and sequence.
 
         Returns the tracks that are objects now and want an id, and those with one that were seen again.
         """
@@ -151,7 +162,7 @@ class Tracks:
         of_mask = self._belonging(of_tracks, shown.sum(axis=1), seen)
         votes.add(points, np.append(of_mask, NO_TRACK).astype(np.int32)[mask], weight)
         self._witness(of_tracks[:-1], of_tracks.sum(axis=0), seen)
-        return self._describe(of_mask, shown.sum(axis=1), features, stamp)
+        return self._describe(of_mask, shown.sum(axis=1), features, when)
 
     def _belonging(
         self, of_tracks: NDArray[np.float64], of_masks: NDArray[np.float64], seen: NDArray[np.int32]
@@ -200,7 +211,11 @@ class Tracks:
         self.pairs = {pair: counts for pair, counts in self.pairs.items() if b not in pair}
 
     def _describe(
-        self, of_mask: NDArray[np.int64], of_masks: NDArray[np.float64], features: NDArray[np.float32], stamp: float
+        self,
+        of_mask: NDArray[np.int64],
+        of_masks: NDArray[np.float64],
+        features: NDArray[np.float32],
+        when: tuple[float, int],
     ) -> tuple[list[int], list[int]]:
         unit = directions(features)
         new, again = [], []
@@ -214,7 +229,7 @@ class Tracks:
             track.pixels, track.masks = track.pixels + of_masks[m], track.masks + 1
             if k in again or k in new:
                 continue
-            track.views, track.last_seen = track.views + 1, stamp
+            track.views, (track.last_seen, track.sequence) = track.views + 1, when
             if track.id < 0 and track.views >= CONFIRMED_VIEWS:
                 new.append(k)
             elif track.id >= 0:

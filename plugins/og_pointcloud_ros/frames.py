@@ -97,7 +97,7 @@ class FrameAssembler:
             return None
         if self._info is None:
             raise SceneError("no camera_info came with it")
-        camera = _camera(self._info, np.linalg.inv(pose(parts.frame_id, stamp)))
+        camera = _camera(self._info, np.linalg.inv(pose(parts.frame_id, stamp)).astype(np.float64))
         depth = parts.depth
         if depth is not None and depth.dtype.kind == "u":
             depth = depth.astype(np.float32) * np.float32(1e-3)
