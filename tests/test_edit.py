@@ -420,6 +420,27 @@ def test_commands(scene, splats, tmp_path, capsys):
     np.testing.assert_allclose(moved, scene.xyz[scene.instance_ids == 2] - [1, 0, 0], atol=1e-3)
 
 
+def test_objects_go_in_and_out_as_spz(scene, splats, tmp_path, capsys):
+    bundle = og.write_bundle(scene.cloud, tmp_path / "room.ogpc")
+    run = lambda *words: main([*map(str, words)])  # noqa: E731
+    thing, rest = tmp_path / "two.spz", tmp_path / "rest.spz"
+    assert run("edit", "extract", bundle, "--id", "2", "--cloud", splats, "-o", thing) == 0
+    assert "note: SPZ: harmonics above the constant one" in capsys.readouterr().out
+    own, packed = og.read_points(splats), og.read_points(thing)
+    chosen = scene.instance_ids == 2
+    np.testing.assert_allclose(
+        packed.xyz_world, own.xyz_world[chosen], atol=7e-5
+    )  # half a step of 2^-13, as far as 1000 from 0
+    np.testing.assert_allclose(packed.opacity, own.opacity[chosen], atol=0.5 / 255 + 1e-6)
+    assert run("segment", bundle, "--points", splats, "-o", tmp_path / "all.spz") == 0
+    labels = og.segment(bundle).colors
+    assert np.abs(og.read_points(tmp_path / "all.spz").rgb.astype(int) - labels).max() <= 2
+    assert run("edit", "remove", bundle, "--id", "2", "--cloud", tmp_path / "all.spz", "-o", rest) == 0
+    assert len(og.read_points(rest)) == (~chosen).sum()
+    assert run("segment", bundle, "-o", tmp_path / "plain.spz") == 2
+    assert "holds splats alone; expected those that were asked about (--points" in capsys.readouterr().err
+
+
 def test_wrong_commands_name_what_is_wrong(scene, splats, tmp_path, capsys):
     bundle = og.write_bundle(make_cloud([[0, 0, 0], [1, 0, 0]], [0, 1]), tmp_path / "two.ogpc")
     out = str(tmp_path / "out.ply")
