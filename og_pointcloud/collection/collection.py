@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -160,20 +160,28 @@ class Collection:
         features = read_text_features(text_features) if isinstance(text_features, (str, os.PathLike)) else text_features
         box = None if within is None else _corners(within)
         ids = self._ids(scenes)
-        asked = [(group, count) for group in self._groups if (count := sum(entry.id in ids for entry in group.entries))]
-        vectors = [self._vectors(group.family, names, features) for group, _ in asked]
+        asked = [group for group in self._groups if any(entry.id in ids for entry in group.entries)]
+        vectors = [self._vectors(group.family, names, features) for group in asked]
         if not any(vectors):
-            raise _unanswerable(names[0], [group.family for group, _ in asked])
+            raise _unanswerable(names[0], [group.family for group in asked])
         with Atlas.reading(self.path) as atlas:
             wanted = _Wanted(ids if box is None else ids & atlas.within(*box), box, top)
             found = [
                 pair
-                for (group, _), known in zip(asked, vectors, strict=True)
+                for group, known in zip(asked, vectors, strict=True)
                 for word, vector in known.items()
                 for pair in self._best(atlas, group, wanted, word, vector)
             ]
         found.sort(key=lambda pair: -pair[0])  # stable: of equals the first
-        return Findings((finding for _, finding in found[:top]), _not_asked(asked, vectors, names))
+        counts: Counter[tuple[str, str]] = Counter()
+        for group, known in zip(asked, vectors, strict=True):
+            for word in set(names) - known.keys():
+                counts[word, group.family.feature_space] += sum(entry.id in ids for entry in group.entries)
+        not_asked = tuple(
+            f"{count} scenes of feature space '{space}' could not be asked for '{word}': no vector of theirs is known"
+            for (word, space), count in sorted(counts.items())
+        )
+        return Findings((finding for _, finding in found[:top]), not_asked)
 
     def _ids(self, scenes: str | Iterable[str] | None) -> set[int]:
         """Ids of the scenes of these names or patterns; of all for None."""
@@ -221,8 +229,9 @@ class Collection:
             return []
         block, rows = self._candidates(atlas, group, here, wanted, vector)
         if wanted.box is not None:
-            center = block.center[rows]
-            rows = rows[((center >= wanted.box[0]) & (center <= wanted.box[1])).all(axis=1)]
+            for axis, (low, high) in enumerate(wanted.box.T):
+                middle = block.center[rows, axis]
+                rows = rows[(middle >= low) & (middle <= high)]
         others = [other for other in group.family.words.values() if other @ vector < SAME_WORD]
         rivals = np.array(others, np.float32).reshape(len(others), len(vector))
         ranked = zip(*block.rank(vector, rivals, rows, wanted.top), strict=True)
@@ -249,7 +258,7 @@ class Collection:
         """The arrays of some of a group's scenes, maybe with those of others."""
         if group.name in self._blocks:
             return self._blocks[group.name]
-        block = load_block(atlas, here)
+        block = load_block(atlas, atlas.side_by_side(here))
         if len(here) == len(group.entries):
             self._blocks[group.name] = block
         return block
@@ -287,17 +296,4 @@ def _unanswerable(word: str, asked: Sequence[Family]) -> OgPointcloudError:
         f"'{word}' is not among the {len(known)} words of these scenes{close_matches(word, known)}: give "
         "text_features with its vector (--text-features), or, for any word at all, make the encoder once: "
         f"{export_command(asked[0].feature_space)}"
-    )
-
-
-def _not_asked(
-    asked: Sequence[tuple[Group, int]], vectors: Sequence[Mapping[str, Any]], names: Iterable[str]
-) -> tuple[str, ...]:
-    """What is said of words that some scenes could not be asked for. asked: groups, and how many of their scenes."""
-    counts: Counter[tuple[str, str]] = Counter()
-    for (group, count), known in zip(asked, vectors, strict=True):
-        counts.update({(word, group.family.feature_space): count for word in names if word not in known})
-    return tuple(
-        f"{count} scenes of feature space '{space}' could not be asked for '{word}': no vector of theirs is known"
-        for (word, space), count in sorted(counts.items())
     )
