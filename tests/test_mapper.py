@@ -262,6 +262,12 @@ def test_a_queue_never_blocks_and_says_what_it_drops():
     assert len(seen) == 4
     assert len(said) == 1
     assert "has no camera" in said[0]
+    broken = FrameQueue(mapper, on_change=lambda change: 1 / 0, on_drop=said.append)
+    for frame in given[:2]:
+        broken.put(frame)
+    broken.close()
+    assert [text.split(":")[1] for text in said[-2:]] == [" ZeroDivisionError"] * 2
+    said.clear()
     slow = FrameQueue(mapper, max_age=0.0, on_drop=said.append)
     slow.put(given[0])
     time.sleep(0.01)

@@ -68,3 +68,5 @@ class FrameQueue:
                 self._on_change(self.mapper.integrate(frame))
         except OgPointcloudError as error:
             self._on_drop(f"a frame was refused: {error}")
+        except Exception as error:  # of a listener, say: the next frame goes in all the same
+            self._on_drop(f"a frame failed: {type(error).__name__}: {error}")
