@@ -58,11 +58,11 @@ def in_lidar(scene, k):
     return (points - pose_at(k)[:3, 3]) @ pose_at(k)[:3, :3]
 
 
-def write_drive(folder, scene, storage=StoragePlugin.SQLITE3, compressed=False, frame="lidar", damage=None):
+def write_drive(folder, scene, storage=StoragePlugin.SQLITE3, compressed=None, frame="lidar", damage=None):
     """A bag of clouds seen on a drive, with tf at twice their rate, and text that has nothing to do with it."""
     bag = Writer(folder, version=8, storage_plugin=storage)
     if compressed:
-        bag.set_compression(CompressionMode.MESSAGE, CompressionFormat.ZSTD)
+        bag.set_compression(compressed, CompressionFormat.ZSTD)
     with bag:
         kinds = {
             "/lidar/points": "sensor_msgs/msg/PointCloud2", "/tf": "tf2_msgs/msg/TFMessage",
@@ -105,9 +105,16 @@ def decoded(messages, topic):
     return [STORE.deserialize_cdr(data, kind) for _, data in messages[topic, kind]]
 
 
+def test_a_bag_that_is_packed_as_whole_files_is_refused_before_it_is_unpacked(scene, tmp_path):
+    source = write_drive(tmp_path / "drive", scene, compressed=CompressionMode.FILE)
+    for path in (source, next(source.glob("*.zst*"))):
+        with pytest.raises(og.SceneError, match=r"packed as whole files .*: 'ros2 bag convert'"):
+            label_bag(path, tmp_path / "out", og.Segmenter(scene, WORDS))
+
+
 @pytest.mark.parametrize(
     ("storage", "compressed"),
-    [(StoragePlugin.SQLITE3, False), (StoragePlugin.MCAP, False), (StoragePlugin.SQLITE3, True)],
+    [(StoragePlugin.SQLITE3, None), (StoragePlugin.MCAP, None), (StoragePlugin.SQLITE3, CompressionMode.MESSAGE)],
 )
 def test_a_bag_is_labelled_as_its_clouds_are(scene, tmp_path, storage, compressed):
     source = write_drive(tmp_path / "drive", scene, storage, compressed)

@@ -109,8 +109,8 @@ def label_bag(
 ) -> BagReport:
     """Copy a ROS 2 bag and label its clouds, each at its place in the scene as /tf and /tf_static tell it.
 
-    source: a bag's folder, .db3 or .mcap, with zstd or without. target: the folder to make, of the same storage; it
-    appears when it is whole. topics: PointCloud2 topics to label, None for all. frame: the scene's frame.
+    source: a bag's folder, .db3 or .mcap, its messages with zstd or without. target: the folder to make, of the same
+    storage; it appears when it is whole. topics: PointCloud2 topics to label, None for all. frame: the scene's frame.
     progress: called with clouds done and clouds in all.
     Of a cloud on ``T`` the labels are on ``T/labelled``, in the cloud's own frame, the boxes on ``T/detections`` in the
     scene's; the names are on /og_pointcloud/label_info, latched. A cloud without a transform, or damaged, is skipped.
@@ -175,6 +175,11 @@ def open_bag(source: str | os.PathLike[str]) -> Iterator[Reader]:
         )
     if not path.exists() or (path.is_dir() and not (path / "metadata.yaml").is_file()):
         raise SceneError(f"{path} is no bag; expected a folder with a metadata.yaml, or a .db3 or .mcap file")
+    if packed := next((file for file in (path, *path.glob("*")) if file.suffix in (".zstd", ".zst")), None):
+        raise SceneError(
+            f"{path} is packed as whole files ({packed.name}), whose size nobody knows before they are unpacked; "
+            "expected messages packed one by one, or not at all: 'ros2 bag convert' it"
+        )
     try:
         reader = Reader(path)
         reader.open()
