@@ -15,7 +15,6 @@ from og_pointcloud.settings import FitSettings
 __all__ = ["Journal", "LeftOut", "left_out_entry", "with_bar"]
 
 Item = TypeVar("Item")
-_SHARES = "they agree with {learned:.0%} of the masks' area, those from grouping with {grouped:.0%}"
 
 
 class LeftOut(Enum):
@@ -51,25 +50,7 @@ class LeftOut(Enum):
         "contradicted groups", "{count} of {total} groups of masks",
         "views that see their points mostly show no such mask, far more often than the proposer's misses explain",
     )
-    LEARNING_WITHOUT_INSTANCES = (
-        "learning, no instances", "learned features and codebook",
-        "no mask shows an instance: there is nothing to learn from",
-    )
-    LEARNING_NOT_NEEDED = (
-        "learning, not needed", "learned features and codebook",
-        "instances from grouping agree with {grouped:.0%} of the masks' area; learning is tried below {enough:.0%}",
-    )
-    LEARNING_IN_TILES = (
-        "learning, in tiles", "learned features and codebook",
-        "they learn from all points at once, which tiles do not hold",
-    )
     SECOND_LEVEL = "second level", "the codebook's second level", "no view shows two masks in one coarse cluster"
-    GROUPED_INSTANCES = (
-        "grouped instances", "instances from grouping", f"learned ones explain the masks better: {_SHARES}",
-    )
-    LEARNED_INSTANCES = (
-        "learned instances", "instances from learned features", f"they explain the masks no better: {_SHARES}",
-    )
     WHOLE_FIT = (
         "whole fit", "a fit of all points at once", "{count:,} points take more memory than it has: fitted in tiles",
     )

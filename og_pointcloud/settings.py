@@ -11,7 +11,6 @@ from typing import Literal
 from og_pointcloud.errors import OgPointcloudError
 
 __all__ = [
-    "AssociationSettings",
     "ChoosingSettings",
     "CodebookSettings",
     "FeatureSettings",
@@ -31,8 +30,6 @@ class GeometrySettings:
 
     scales: tuple[float, ...] = (0.25, 0.35, 0.5, 0.7)
     """Standard deviations tried, in point spacings; those of the best labels of held-out views (held_out.py)."""
-    start_scale: float = 0.5
-    """Scale where views cannot be held out: fewer than four, or such that share nothing."""
     opacity: float = 0.9
     """Opacity of every point: two layers of points hide what is behind them."""
     held_out_views: int = 24
@@ -41,16 +38,15 @@ class GeometrySettings:
     """Points by which scales are compared."""
     sight_thickness: float = 3.0
     """Points closer than this many spacings along a ray are of one surface and do not hide each other."""
-    pixels_per_spacing: float = 2.0
-    """Image pixels used per point spacing: more pixels than that see nothing new of the cloud."""
-    max_stride: int = 3
-    """Never leave out more pixels than this, whatever the spacing: mask edges are drawn in pixels."""
     neighbours: int = 16
     """Nearest points looked at."""
-    thickness: float = 6.0
-    """A surface is this many spacings thick; what shows farther behind it is seen through it. 3 cuts noisy depth."""
     reach: float = 3.0
     """Points within this many spacings adjoin; farther than this from the cloud is "too far"."""
+
+    @property
+    def middle_scale(self) -> float:
+        """The scale where views cannot be held out: fewer than four, or such that share nothing."""
+        return self.scales[len(self.scales) // 2]
 
 
 @dataclass(frozen=True)
@@ -63,8 +59,6 @@ class GroupingSettings:
     """A view that sees less than this share of a mask is no witness of it."""
     container_share: float = 0.5
     """A mask lies in another view's mask when more than this share of it does: at most one can hold it."""
-    part_share: float = 0.1
-    """A piece smaller than this share of a mask does not make it span several things."""
     join_majority: float = 0.5
     """Groups are joined while more than this share of their witnesses says "one thing"."""
 
@@ -77,8 +71,6 @@ class MembershipSettings:
     """A point is surely of an instance when this share of the weight asked lies in its masks."""
     possible_share: float = 0.2
     """A point may be of an instance from this share on, if it adjoins sure ones."""
-    covered_share: float = 0.7
-    """A point is no background when more than this share of the votes is for "in some mask"."""
     growth_votes: float = 0.25
     """This share of the adjoining points must be of the instance already."""
     rate_share: float = 0.15
@@ -87,8 +79,6 @@ class MembershipSettings:
     """A separate piece whose points show less than this share of what the main piece's do was seen through it."""
     border_shares: tuple[float, float] = (0.2, 0.9)
     """Points with a share between these lie between states: their neighbours settle them."""
-    border_rounds: int = 2
-    """How often: a border can be two points thick."""
     own_vote: float = 3.0
     """Votes of a point's own state, where a sure neighbour has one."""
     few_views: int = 3
@@ -97,18 +87,6 @@ class MembershipSettings:
     """A gap in depth wider than this many times the mask's own size parts object and background."""
     front_share: float = 0.2
     """The nearest run of depths with this share of a mask's weight is its object."""
-
-
-@dataclass(frozen=True)
-class AssociationSettings:
-    """Feature rows of instances (association.py)."""
-
-    outlier_deviations: float = 3.0
-    """A mask's feature is left out when its cosine lies this many robust deviations below the median."""
-    look_masks: int = 4
-    """Masks that a second look of an instance takes at least (looks.py): fewer are apart by chance, or are wrong."""
-    look_share: float = 0.3
-    """Share that it takes at least of what the instance's masks show."""
 
 
 @dataclass(frozen=True)
@@ -295,12 +273,8 @@ class FitSettings:
     ('grouping', None)
     """
 
-    mode: Literal["auto", "grouping", "fast", "paper"] = "auto"
+    mode: Literal["grouping", "fast", "paper"] = "grouping"
     """How masks become instances (labellers.py)."""
-    agreement_enough: float = 0.5
-    """Mode auto learns features only where instances from grouping agree with less of the masks than this."""
-    agreement_lead: float = 0.02
-    """Mode auto takes learned instances only if they agree with this much more of the masks."""
     reliable: float = 0.65
     """A fit less reliable than this (reliability.py) is warned of, with the likely cause. Of the scenes of
     `examples/zoo.py` for choosing, those below have a mean mIoU of 0.54, the others one of 0.86."""
@@ -314,7 +288,6 @@ class FitSettings:
     visibility: VisibilitySettings = field(default_factory=VisibilitySettings)
     grouping: GroupingSettings = field(default_factory=GroupingSettings)
     membership: MembershipSettings = field(default_factory=MembershipSettings)
-    association: AssociationSettings = field(default_factory=AssociationSettings)
     features: FeatureSettings = field(default_factory=FeatureSettings)
     codebook: CodebookSettings = field(default_factory=CodebookSettings)
     matching: MatchingSettings = field(default_factory=MatchingSettings)

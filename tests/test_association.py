@@ -9,15 +9,12 @@ from test_grouping import ONE, OTHER, HandView, hand_table
 
 from og_pointcloud.cloud import BACKGROUND, UNOBSERVED, InstanceTable
 from og_pointcloud.fitting.association import describe_instances
-from og_pointcloud.settings import AssociationSettings
-
-SETTINGS = AssociationSettings()
 
 
 def describe(views: list[HandView], group: list[int], ids: list[int]) -> InstanceTable:
     table = hand_table(len(ids), views)
     count = max([*ids, -1]) + 1
-    return describe_instances(table, np.array(group, np.int32), np.array(ids, np.int32), count, SETTINGS)
+    return describe_instances(table, np.array(group, np.int32), np.array(ids, np.int32), count)
 
 
 def unit(vector: NDArray[np.float64]) -> NDArray[np.float64]:

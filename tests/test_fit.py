@@ -394,14 +394,14 @@ def test_pixels_much_finer_than_gaussians_of_mode_paper_are_left_out() -> None:
     assert fit(scene, progress=False).instance_ids.tolist() == [0] * 3
 
 
-@pytest.mark.parametrize("mode", ["auto", "grouping", "fast"])
+@pytest.mark.parametrize("mode", ["grouping", "fast"])
 def test_masks_that_show_no_point_are_refused(mode: str) -> None:
     with pytest.raises(SceneError, match=r"none of the \d+ masks shows a Gaussian; expected at least one: make masks"):
         fit(tiny_scene(5, masked=False), FitSettings(mode=mode), progress=False)  # type: ignore[arg-type]
 
 
 def test_a_fit_without_an_instance_says_so() -> None:
-    never = MembershipSettings(sure_share=2, covered_share=2)  # no share of a point's weight reaches 2
+    never = MembershipSettings(sure_share=2)  # no share of a point's weight reaches 2
     cloud = fit(boxes_on_a_table().scene, FitSettings(membership=never), progress=False)
     assert len(cloud.instances) == 0
     assert any("no instance was found" in warning for warning in cloud.provenance["warnings"])

@@ -350,7 +350,7 @@ def reference_spanning(share: NDArray[np.float64], view: NDArray[np.int32], view
             if v == view[i] or len(others) == 0:
                 continue
             within = [j for j in others if share[j, i] > SETTINGS.container_share and share[i, j] > 0]
-            parts = sum(share[i, j] > SETTINGS.part_share for j in within)
+            parts = len(within)
             if share[i, others].max() >= SETTINGS.container_share:
                 whole += 1
             elif parts >= 2 and share[i, within].sum() > SETTINGS.container_share:

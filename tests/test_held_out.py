@@ -55,7 +55,7 @@ def test_order_of_views_and_points_does_not_matter(scene: Scene) -> None:
 
 def test_too_few_views_to_hold_some_out(scene: Scene) -> None:
     choice = chosen(replace(scene, views=scene.views[:3]))
-    assert (choice.scale, choice.agreements) == (FitSettings().geometry.start_scale, {})
+    assert (choice.scale, choice.agreements) == (FitSettings().geometry.middle_scale, {})
     cloud = og.fit(replace(scene, views=scene.views[:3]), progress=False)
     assert any(entry["key"] == "choice of scale" for entry in cloud.provenance["left_out"])
 

@@ -9,9 +9,6 @@ from test_grouping import ONE, OTHER, HandView, hand_table
 
 from og_pointcloud.fitting.looks import by_look, looks_of_groups
 from og_pointcloud.fitting.view_votes import view_votes
-from og_pointcloud.settings import AssociationSettings
-
-SETTINGS = AssociationSettings()
 
 
 def noisy(feature: NDArray[np.float32], random: np.random.Generator) -> NDArray[np.float32]:
@@ -33,7 +30,7 @@ def test_points_take_the_look_that_more_of_their_votes_are_for(seed: int) -> Non
     order = np.random.default_rng(seed).permutation(len(views))
     table = hand_table(7, [views[view] for view in order])
     ids = np.array([0, 0, 0, 0, 0, 0, -1], np.int32)
-    looks = looks_of_groups(table, np.zeros(len(views), np.int32), ids, 1, SETTINGS)
+    looks = looks_of_groups(table, np.zeros(len(views), np.int32), ids, 1)
     np.testing.assert_array_equal(looks.group, [0, 0])
     first = looks.look[np.argsort(order)][0]
     np.testing.assert_array_equal(looks.look[np.argsort(order)], np.where(np.arange(len(views)) < 6, first, 1 - first))
@@ -50,7 +47,7 @@ def test_noise_and_few_wrong_masks_are_no_second_look(seed: int) -> None:
     ids = np.zeros(2, np.int32)
     for views in (spread, wrong):
         table = hand_table(2, views)
-        looks = looks_of_groups(table, np.zeros(12, np.int32), ids, 1, SETTINGS)
+        looks = looks_of_groups(table, np.zeros(12, np.int32), ids, 1)
         np.testing.assert_array_equal(looks.group, [0])
         np.testing.assert_array_equal(by_look(view_votes(table), ids, looks), ids)
 
@@ -60,6 +57,6 @@ def test_masks_of_no_group_and_without_a_feature_keep_what_they_have() -> None:
     group = np.zeros(len(views), np.int32)
     group[-2] = -1
     table = hand_table(7, views)
-    looks = looks_of_groups(table, group, np.array([0, 0, 0, 0, 0, 0, -1], np.int32), 1, SETTINGS)
+    looks = looks_of_groups(table, group, np.array([0, 0, 0, 0, 0, 0, -1], np.int32), 1)
     assert looks.look[-2] == -1
     assert looks.look[-1] == 0

@@ -199,10 +199,14 @@ def test_certainty_is_what_views_say_times_how_far_neighbours_agree(seed: int) -
     in_mask, vote = votes.in_mask.toarray().astype(float), votes.vote.toarray().astype(float)
     group, said = np.array(numbers), []
     for point, state in enumerate(result.instance_ids):
-        of_groups = [in_mask[group == k, point].sum() for k in range(max(numbers) + 1)]
-        best = int(np.argmax(of_groups)) if max(of_groups) > 0 else -1
-        asked = sum(vote[view, point] for view in range(6) if best in group[table.mask_view == view])
-        share = of_groups[best] / asked if best >= 0 else 0.0
+        of_groups = np.array([in_mask[group == k, point].sum() for k in range(max(numbers) + 1)])
+        asked = [vote[[k in group[table.mask_view == view] for view in range(6)], point].sum() for k in range(5)]
+        shares = of_groups / np.maximum(asked, 1e-12)
+        best = int(np.argmax(of_groups)) if of_groups.any() else -1
+        sure = np.flatnonzero(shares > SETTINGS.sure_share)
+        if len(sure) and best not in sure:  # contradicted: a smaller group that is sure goes before it
+            best = max(best, int(sure[np.argmax(of_groups[sure])]))
+        share = shares[best] if best >= 0 else 0.0
         of_views = share if best >= 0 and state == best else 1 - share
         near = around.index[point][around.adjoining[point]]
         agree = np.mean([result.instance_ids[other] == state for other in near]) if len(near) else 1.0
@@ -277,14 +281,30 @@ def test_best_group_is_that_of_the_literal_reference(seed: int) -> None:
     votes = view_votes(table)
     has_mask = random.uniform(size=(5, 6)) < 0.7
     allowed = np.array([True, True, False, True, True])
-    actual = _best_group(_by_point(votes.in_mask), _by_point(votes.vote), group, has_mask, allowed)
+    actual = _best_group(_by_point(votes.in_mask), _by_point(votes.vote), group, has_mask, allowed, 0.45)
     in_mask, vote = votes.in_mask.toarray().astype(float), votes.vote.toarray().astype(float)
     per_group = np.array([in_mask[group == k].sum(axis=0) if allowed[k] else 0 * in_mask[0] for k in range(5)])
-    best = np.where(per_group.max(axis=0) > 0, per_group.argmax(axis=0), -1)
-    asked = np.where(best >= 0, np.einsum("kv,vn->kn", has_mask, vote)[best, np.arange(200)], 0)
-    for value, expected in zip(actual, (best, per_group.max(axis=0), asked, vote.sum(axis=0)), strict=True):
+    most = np.where(per_group.max(axis=0) > 0, per_group.argmax(axis=0), -1)
+    asked = np.einsum("kv,vn->kn", has_mask, vote)
+    sure = np.where(per_group > 0.45 * asked, per_group, 0)
+    surest = sure.argmax(axis=0)
+    points = np.arange(200)
+    smaller = (most >= 0) & (sure[most, points] == 0) & (sure.max(axis=0) > 0) & (surest > most)
+    best = np.where(smaller, surest, most)
+    of_best = np.where(best >= 0, per_group[best, points], 0), np.where(best >= 0, asked[best, points], 0)
+    for value, expected in zip(actual, (best, *of_best, vote.sum(axis=0)), strict=True):
         np.testing.assert_allclose(value, expected, rtol=1e-5, atol=1e-9)
     assert (best == -1).any()
+    assert smaller.any()
+
+
+def test_a_small_thing_that_half_of_the_views_let_a_large_one_swallow_keeps_its_points() -> None:
+    """A book on a shelf: four views have a mask of it, five show it within the shelf's; a tie would do as well."""
+    book, shelf = range(80, 100), range(100)
+    known: HandView = [(range(80), ONE), (book, ONE)]
+    table = hand_table(100, [known] * 4 + [[(shelf, ONE)]] * 5)
+    ids = decide(table, [0, 1] * 4 + [0] * 5).instance_ids
+    assert ids.tolist() == [0] * 80 + [1] * 20
 
 
 def test_of_groups_that_cover_a_point_alike_the_lower_is_taken() -> None:

@@ -14,7 +14,7 @@ from test_fit import BOXES, boxes_on_a_table
 
 from og_pointcloud.cloud import BACKGROUND, UNOBSERVED, InstanceTable, LabelledCloud
 from og_pointcloud.fitting.fit import fit, prepare
-from og_pointcloud.fitting.labellers import LABELLERS, Labelling, auto, fast, grouping, mask_agreement
+from og_pointcloud.fitting.labellers import LABELLERS, Labelling, fast, mask_agreement
 from og_pointcloud.fitting.mask_table import MaskTable
 from og_pointcloud.journal import Journal, LeftOut, left_out_entry
 from og_pointcloud.settings import CodebookSettings, FitSettings, MatchingSettings, PaperSettings, VisibilitySettings
@@ -123,32 +123,6 @@ def test_mask_agreement_by_hand() -> None:
     assert mask_agreement(table, labelling_of([0, 0, 1])) == pytest.approx((4 / 6 + 1) / 2)
     # All one instance: 4 / 10 each.
     assert mask_agreement(table, labelling_of([0, 0, 0])) == pytest.approx(0.4)
-
-
-def test_auto_learns_nothing_where_grouping_explains_the_masks() -> None:
-    known = boxes_on_a_table()
-    prepared, journal = prepare(known.scene), Journal(False)
-    chosen = auto(prepared.table, prepared.surface, FitSettings(), journal)
-    grouped = grouping(prepared.table, prepared.surface, FitSettings(), Journal(False))
-    np.testing.assert_array_equal(chosen.instance_ids, grouped.instance_ids)
-    assert list(journal.notes["mask_agreement"]) == ["grouping"]
-    assert journal.left_out[-1][0] is LeftOut.LEARNING_NOT_NEEDED
-
-
-@pytest.mark.parametrize("lead", [-1.0, 1.0])
-def test_auto_takes_what_agrees_with_the_masks(lead: float) -> None:
-    """Asked to look at both, it follows the agreement, and says so."""
-    known = boxes_on_a_table()
-    prepared, journal = prepare(known.scene), Journal(False)
-    settings = FitSettings(agreement_enough=2.0, agreement_lead=lead)
-    chosen = auto(prepared.table, prepared.surface, settings, journal)
-    labeller = fast if lead < 0 else grouping
-    expected = labeller(prepared.table, prepared.surface, settings, Journal(False))
-    np.testing.assert_array_equal(chosen.instance_ids, expected.instance_ids)
-    assert set(journal.notes["mask_agreement"]) == {"grouping", "fast"}
-    key, numbers = journal.left_out[-1]
-    assert key is (LeftOut.GROUPED_INSTANCES if lead < 0 else LeftOut.LEARNED_INSTANCES)
-    assert journal.notes["mask_agreement"]["fast"] == pytest.approx(numbers["learned"], abs=1e-4)
 
 
 def test_every_mode_has_its_labeller() -> None:

@@ -181,7 +181,7 @@ def test_what_stands_in_another_tile_hides_what_is_behind_it():
     scene = two_walls()
     cut = split(scene.points.xyz, 1600)
     assert [set(scene.points.xyz[cut.order[cut.part(tile)], 2].tolist()) for tile in range(2)] == [{2.0}, {6.0}]
-    full = FitSettings(geometry=GeometrySettings(scales=(1.0,), start_scale=1.0, opacity=0.95))
+    full = FitSettings(geometry=GeometrySettings(scales=(1.0,), opacity=0.95))
     cloud = fit(scene, replace(full, tile_points=1600), progress=False)
     assert (cloud.instance_ids[:1600] == 0).mean() > 0.7  # the rest is outside the images
     assert (cloud.instance_ids[1600:] < 0).all()
@@ -273,7 +273,7 @@ def test_another_scene_takes_up_nothing(tmp_path, monkeypatch):
 
 def test_bad_use_is_told_at_the_door():
     scene = two_walls()
-    with pytest.raises(OgPointcloudError, match=r'mode is "fast".*expected "auto" or "grouping"'):
+    with pytest.raises(OgPointcloudError, match=r'mode is "fast".*expected "grouping"'):
         fit(scene, FitSettings(mode="fast", tile_points=1600))
     bare = tuple(
         replace(view, mask_features=np.zeros((0, 4), np.float32), masks=view.mask_map() - 1) for view in scene.views

@@ -54,7 +54,7 @@ def add(parser: Parser) -> None:
         help="of a Dask cluster that takes the captures, or the tiles of one (default: processes of this machine)",
     )  # fmt: skip
     parser.add_argument("--gaussians", type=Path, metavar="F.ply", help="geometry, in place of the capture's own")
-    parser.add_argument("--mode", choices=MODES, default="auto", help="how to find instances (default: %(default)s)")
+    parser.add_argument("--mode", choices=MODES, default=MODES[0], help="how to find instances (default: %(default)s)")
     parser.add_argument(
         "--schedule-share", type=float, metavar="X", help="shorten the published schedule (mode paper; default: 1)"
     )

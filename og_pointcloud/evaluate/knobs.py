@@ -40,20 +40,17 @@ ALL = 1_000_000_000
 """More points than any cloud has."""
 
 Changes = Mapping[str, Any]
-"""Settings by path: ``{"geometry.max_stride": 1, "seed": 2}``."""
+"""Settings by path: ``{"geometry.neighbours": 8, "seed": 2}``."""
 
 ONE_NUMBER: Mapping[str, tuple[str, tuple[Any, ...]]] = {
-    "mode": ("mode", ("grouping", "fast", "auto")),
+    "mode": ("mode", ("grouping", "fast")),
     "enough views": ("visibility.enough_views", (None, 5, 20)),
-    "pixels per spacing": ("geometry.pixels_per_spacing", (0.5, 1.0, 2.0, 4.0)),
     "alpha cut-off": ("visibility.alpha_min", (1 / 1024, 1 / 255, 1 / 64, 1 / 16)),
     "transmittance cut-off": ("visibility.transmittance_min", (1e-5, 1e-4, 1e-2, 1e-1)),
     "neighbours": ("geometry.neighbours", (8, 16, 32)),
     "grouping sample": ("grouping.graph_points", (5_000, 20_000, 60_000, ALL)),
     "join majority": ("grouping.join_majority", (0.4, 0.5, 0.6)),
     "sure share": ("membership.sure_share", (0.4, 0.6, 0.8)),
-    "covered share": ("membership.covered_share", (0.5, 0.7, 0.9)),
-    "border rounds": ("membership.border_rounds", (0, 2, 4)),
     "feature width": ("features.width", (3, 6, 12)),
     "feature tolerance": ("features.tolerance", (1e-2, 1e-3, 1e-4)),
     "feature steps": ("features.max_steps", (10, 30, 1000)),
@@ -97,7 +94,7 @@ def _knobs() -> dict[str, tuple[Setting, ...]]:
 
 KNOBS = _knobs()
 """Name -> values, of which one is what stands by default (for those of features and codebook: in mode fast)."""
-QUICK = ("mode", "views", "pixels per spacing", "grouping sample")
+QUICK = ("mode", "views", "grouping sample")
 """Knobs of a report in a hurry."""
 
 
@@ -157,7 +154,7 @@ what the row changes of `LITERAL`; and of mode paper."""
 
 
 def ablations(schedule_share: float | None = None) -> list[Setting]:
-    """The default, grouping and mode fast, then the rows of the paper's three tables.
+    """The default and mode fast, then the rows of the paper's three tables.
 
     schedule_share: None takes the literal method from the mask table (mode fast); else as trained by rendering, with
     this share of the published schedule.
@@ -169,4 +166,4 @@ def ablations(schedule_share: float | None = None) -> list[Setting]:
         for table, values in ABLATIONS.items()
         for row, (published, literal, of_paper) in values.items()
     ]
-    return [DEFAULT, *KNOBS["mode"][:2], *rows]
+    return [DEFAULT, FAST, *rows]

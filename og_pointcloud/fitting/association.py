@@ -23,7 +23,6 @@ from scipy.sparse import csr_array
 
 from og_pointcloud.cloud import InstanceTable
 from og_pointcloud.fitting.mask_table import MaskTable, weights_by_instance
-from og_pointcloud.settings import AssociationSettings
 
 __all__ = ["describe_instances", "directions", "part_of", "robust_mean", "shown_of_instance"]
 
@@ -41,7 +40,6 @@ def describe_instances(
     group: NDArray[np.int32],
     instance_ids: NDArray[np.int32],
     count: int,
-    settings: AssociationSettings,
 ) -> InstanceTable:
     """One unit feature row per instance with its evidence.
 
@@ -55,7 +53,7 @@ def describe_instances(
     agreement = np.zeros(count, np.float32)
     for instance in range(count):
         members = np.flatnonzero((group == instance) & (shown > 0) & features.any(axis=1))
-        row, kept, cosines = robust_mean(features[members], shown[members], settings.outlier_deviations)
+        row, kept, cosines = robust_mean(features[members], shown[members])
         if row is None:
             continue
         rows.append(row)
@@ -96,11 +94,11 @@ def directions(rows: NDArray[np.floating]) -> NDArray[np.float64]:
 
 
 def robust_mean(
-    features: NDArray[np.float64], weight: NDArray[np.float64], deviations: float
+    features: NDArray[np.float64], weight: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64] | None, NDArray[np.bool_], NDArray[np.float64]]:
     """Weighted mean direction of unit rows without outliers: the mean (None if there is none), the rows kept, cosines.
 
-    An outlier's cosine with the mean lies more than ``deviations`` robust deviations (1.4826 MAD) below the median.
+    An outlier's cosine with the mean lies more than three robust deviations (1.4826 MAD) below the median.
     """
     kept = np.ones(len(features), bool)
     cosines = np.zeros(len(features))
@@ -114,7 +112,7 @@ def robust_mean(
         cosines = features @ mean
         middle = np.median(cosines)
         spread = 1.4826 * np.median(np.abs(cosines - middle))
-        kept = cosines >= middle - deviations * max(spread, 1e-6)
+        kept = cosines >= middle - 3 * max(spread, 1e-6)
     return mean, kept, cosines
 
 

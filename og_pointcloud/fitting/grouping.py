@@ -98,7 +98,7 @@ def _spanning_masks(share: csr_array, mask_view: NDArray[np.int32], settings: Gr
     size = len(mask_view) * views
     largest = np.zeros(size)
     np.maximum.at(largest, cell, entries.data)
-    parts = np.bincount(cell[part], (entries.data[part] > settings.part_share).astype(float), size)
+    parts = np.bincount(cell[part], minlength=size)
     covered = np.bincount(cell[part], entries.data[part], size)
     split = (largest < settings.container_share) & (parts >= 2) & (covered > settings.container_share)
     held = largest >= settings.container_share

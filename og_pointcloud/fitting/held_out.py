@@ -61,7 +61,7 @@ def choose_scale(
     spread = np.linspace(0, len(masked) - 1, min(geometry.held_out_views, len(masked))).round().astype(int)
     chosen = [masked[index] for index in np.unique(spread)]
     if len(chosen) < FEWEST_VIEWS:
-        return ScaleChoice(geometry.start_scale, {})
+        return ScaleChoice(geometry.middle_scale, {})
     sample = sample_of_points(points.xyz, geometry.held_out_points)
     around = neighbourhood(points.xyz[sample], geometry)
     asked = np.zeros(len(points), np.bool_)
@@ -79,7 +79,7 @@ def choose_scale(
         for index in range(len(geometry.scales)):
             ids, count = _labels(tables[index][half], around, settings)
             agreements[index] += np.mean([agreement(judge[1 - half], ids, count) for judge in tables]) / 2
-    best = geometry.scales[int(np.argmax(agreements))] if agreements.any() else geometry.start_scale
+    best = geometry.scales[int(np.argmax(agreements))] if agreements.any() else geometry.middle_scale
     rounded = np.round(agreements, 4).tolist()
     return ScaleChoice(best, dict(zip(geometry.scales, rounded, strict=True)))
 

@@ -16,12 +16,11 @@ from scipy.sparse import csr_array
 from og_pointcloud.fitting.association import directions, shown_of_instance
 from og_pointcloud.fitting.mask_table import MaskTable
 from og_pointcloud.fitting.view_votes import ViewVotes
-from og_pointcloud.settings import AssociationSettings
 
 __all__ = ["Looks", "by_look", "looks_of_groups"]
 
-ROUNDS = 10
-"""Rounds of 2-means at most: groups of a few dozen masks have settled by then."""
+LEAST_MASKS = 4
+"""Masks that a look has at least: fewer are apart by chance, or are wrong."""
 QUANTILE = 0.1
 """Two kinds are separate though this share of the pairs of masks says otherwise: single masks are of other things."""
 
@@ -35,9 +34,7 @@ class Looks:
     group: NDArray[np.int32]
 
 
-def looks_of_groups(
-    table: MaskTable, group: NDArray[np.int32], ids: NDArray[np.int32], count: int, settings: AssociationSettings
-) -> Looks:
+def looks_of_groups(table: MaskTable, group: NDArray[np.int32], ids: NDArray[np.int32], count: int) -> Looks:
     """The looks of ``count`` groups; of nearly all groups there is one.
 
     group: (masks,) int32, the group of each mask, -1 none. ids: (n,) int32, the group of each point, below 0 none.
@@ -51,7 +48,7 @@ def looks_of_groups(
         kinds: list[NDArray[np.intp]] = []
         while waiting:
             masks = waiting.pop()
-            second = _second_look(features[masks], shown[masks], settings)
+            second = _second_look(features[masks], shown[masks])
             if second is None:
                 kinds.append(masks)
             else:
@@ -79,29 +76,25 @@ def by_look(votes: ViewVotes, ids: NDArray[np.int32], looks: Looks) -> NDArray[n
     return found
 
 
-def _second_look(
-    features: NDArray[np.float64], weight: NDArray[np.float64], settings: AssociationSettings
-) -> NDArray[np.bool_] | None:
+def _second_look(features: NDArray[np.float64], weight: NDArray[np.float64]) -> NDArray[np.bool_] | None:
     """(masks,) bool, those of the second of two clearly separate kinds of masks; None, as for most, where there is one.
 
     2-means on the sphere from the least alike pair. The kinds are separate when masks of one kind are more alike (all
     but a tenth of their pairs) than masks of different kinds (all but a tenth): a comparison of ranks, so that it holds
-    for any encoder's cosines. Noise spreads features evenly and fails it; a few wrong masks do not reach
-    ``look_masks`` and ``look_share`` and are outliers, not a second look.
+    for any encoder's cosines. Noise spreads features evenly and fails it; fewer than LEAST_MASKS wrong masks are
+    outliers, not a second look.
     """
-    if len(features) < 2 * settings.look_masks:
+    if len(features) < 2 * LEAST_MASKS:
         return None
     cosines = features @ features.T
     centres = features[list(np.unravel_index(cosines.argmin(), cosines.shape))]
     second = features @ centres[1] > features @ centres[0]
-    for _ in range(ROUNDS):
+    for _ in range(len(features)):  # settles in a few rounds
         centres = directions(np.stack([weight[~second] @ features[~second], weight[second] @ features[second]]))
         before, second = second, features @ centres[1] > features @ centres[0]
         if (before == second).all():
             break
-    masks = min(second.sum(), (~second).sum())
-    share = min(weight[second].sum(), weight[~second].sum()) / weight.sum()
-    if masks < settings.look_masks or share < settings.look_share:
+    if min(second.sum(), (~second).sum()) < LEAST_MASKS:
         return None
     same = second[:, None] == second
     within = cosines[same & ~np.eye(len(features), dtype=bool)]

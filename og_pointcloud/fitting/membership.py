@@ -66,24 +66,20 @@ def assign_points(
     has_mask = np.zeros((groups.count, table.outside.shape[0]), np.bool_)
     grouped = groups.group >= 0
     has_mask[groups.group[grouped], table.mask_view[grouped]] = True
-    support = _support(votes, groups.group, has_mask, np.ones(groups.count, np.bool_))
+    support = _support(votes, groups.group, has_mask, np.ones(groups.count, np.bool_), settings.sure_share)
     rate, dismissed = _contradicted(support, groups.count, settings)
     if dismissed.any():
-        support = _support(votes, groups.group, has_mask, ~dismissed)
+        support = _support(votes, groups.group, has_mask, ~dismissed, settings.sure_share)
     group, share, total, around = support.group, support.share, support.total, neighbourhood
 
     # Sure points, and possible ones that adjoin them.
     ids = np.where((group >= 0) & (share > settings.sure_share), group, BACKGROUND).astype(np.int32)
     possible = (group >= 0) & (share > settings.possible_share)
     ids = _grow(ids, group, possible, around.index, around.adjoining, settings.growth_votes)
-    # Seen, but mostly inside masks: no background, however many instances claim it. Borders are settled below.
-    covered = _column_sums(votes.in_mask.indices, votes.in_mask.data, len(ids))
-    ids = np.where((ids == BACKGROUND) & possible & (covered > settings.covered_share * total), group, ids)
     # What is seen through an instance is no part of it; what no view saw is as its neighbours are.
-    ids = _without_islands(ids, instance_area(table, groups.group, ids), around, settings.island_share)
+    ids = _without_islands(ids, share, instance_area(table, groups.group, ids), around, settings.island_share)
     ids = _fill_unobserved(np.where((ids == BACKGROUND) & (total == 0), UNOBSERVED, ids), around)
-    for _ in range(settings.border_rounds):
-        ids = _settle_borders(ids, share, around.index, around.adjoining, *settings.border_shares, settings.own_vote)
+    ids = _settle_borders(ids, share, around.index, around.adjoining, *settings.border_shares, settings.own_vote)
     share_of_state = np.where((group >= 0) & (ids == group), share, 1 - share)
     certainty = np.where(total > 0, np.clip(share_of_state, 0, 1), 0) * _agreeing(ids, around.index, around.adjoining)
     return Membership(
@@ -175,7 +171,7 @@ def _behind_front(
 
 @dataclass(frozen=True)
 class _Support:
-    """What speaks for the group that most votes on a point are for. group: (n,) int32, -1 where there is none.
+    """What speaks for the group that a point is of, if it is of any. group: (n,) int32, -1 where there is none.
     votes: (n,) float64, votes for it. possible: (n,) all votes of views that have a mask of it. total: (n,) all votes.
     """
 
@@ -191,11 +187,16 @@ class _Support:
 
 
 def _support(
-    votes: ViewVotes, group: NDArray[np.int32], has_mask: NDArray[np.bool_], allowed: NDArray[np.bool_]
+    votes: ViewVotes,
+    group: NDArray[np.int32],
+    has_mask: NDArray[np.bool_],
+    allowed: NDArray[np.bool_],
+    sure_share: float,
 ) -> _Support:
     """The support of all points, so many at a time that their votes, sorted by point, fit into memory.
 
-    group: (masks,) the group of each mask. has_mask: (groups, views). allowed: (groups,) those that may be chosen.
+    group: (masks,) the group of each mask, groups by what they show, largest first. has_mask: (groups, views).
+    allowed: (groups,) those that may be chosen.
     """
     in_mask, vote = votes.in_mask, votes.vote
     n = in_mask.shape[1]
@@ -204,7 +205,7 @@ def _support(
     for run in range(runs):
         low, high = n * run // runs, n * (run + 1) // runs
         of_points = _by_point(in_mask, low, high), _by_point(vote, low, high)
-        found.append(_best_group(*of_points, group, has_mask, allowed))
+        found.append(_best_group(*of_points, group, has_mask, allowed, sure_share))
     return _Support(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
 
 
@@ -235,8 +236,12 @@ def _columns(indptr, indices, data, low, high):  # noqa: ANN001, ANN202
 
 
 @njit(cache=True, parallel=True)
-def _best_group(masks, views, group, has_mask, allowed):  # noqa: ANN001, ANN202
-    """Per point: the allowed group with the most votes (ties: the lower); `_Support`'s votes, possible and total."""
+def _best_group(masks, views, group, has_mask, allowed, sure_share):  # noqa: ANN001, ANN202
+    """Per point: the allowed group with the most votes (ties: the lower); `_Support`'s votes, possible and total.
+
+    Where views that have a mask of that group contradict it, and a smaller group is sure, that one is taken: proposers
+    let a shelf swallow the book on it in half of the views; no view that knows the book shows it as shelf.
+    """
     mask_start, mask_index, mask_vote = masks
     view_start, view_index, view_vote = views
     n = len(mask_start) - 1
@@ -246,22 +251,32 @@ def _best_group(masks, views, group, has_mask, allowed):  # noqa: ANN001, ANN202
     total = np.zeros(n)
     for g in prange(n):
         begin, end = mask_start[g], mask_start[g + 1]
-        # A point lies in few masks: for each, the votes of all masks of its group are added up anew.
+        for e in range(view_start[g], view_start[g + 1]):
+            total[g] += view_vote[e]
+        sure, of_sure, asked_sure = -1, 0.0, 0.0
         for e in range(begin, end):
             k = group[mask_index[e]]
             if k < 0 or not allowed[k]:
                 continue
-            of_group = 0.0
+            # A point lies in few masks: the votes of all masks of a group are added up at the first of them.
+            of_group, first = 0.0, e
             for other in range(begin, end):
                 if group[mask_index[other]] == k:
                     of_group += mask_vote[other]
+                    first = min(first, other)
+            if first < e:
+                continue
+            # Of the views, those that have a mask of the group could have voted for it.
+            asked = 0.0
+            for view in range(view_start[g], view_start[g + 1]):
+                if has_mask[k, view_index[view]]:
+                    asked += view_vote[view]
             if of_group > votes[g] or (of_group == votes[g] and k < best[g]):
-                best[g], votes[g] = k, of_group
-        # Of the views, those that have a mask of the group could have voted for it.
-        for e in range(view_start[g], view_start[g + 1]):
-            total[g] += view_vote[e]
-            if best[g] >= 0 and has_mask[best[g], view_index[e]]:
-                possible[g] += view_vote[e]
+                best[g], votes[g], possible[g] = k, of_group, asked
+            if of_group > sure_share * asked and (of_group > of_sure or (of_group == of_sure and k < sure)):
+                sure, of_sure, asked_sure = k, of_group, asked
+        if sure > best[g] and votes[g] <= sure_share * possible[g]:
+            best[g], votes[g], possible[g] = sure, of_sure, asked_sure
     return best, votes, possible, total
 
 
@@ -375,18 +390,15 @@ def _add_area(indptr, indices, data, group, ids, area):  # noqa: ANN001, ANN202
                 area[indices[e]] += data[e]
 
 
-@njit(cache=True)
-def _column_sums(indices, data, n):  # noqa: ANN001, ANN202
-    total = np.zeros(n)
-    for e in range(len(indices)):
-        total[indices[e]] += data[e]
-    return total
-
-
 def _without_islands(
-    ids: NDArray[np.int32], area: NDArray[np.float64], neighbourhood: Neighbourhood, share: float
+    ids: NDArray[np.int32],
+    share: NDArray[np.float64],
+    area: NDArray[np.float64],
+    neighbourhood: Neighbourhood,
+    least: float,
 ) -> NDArray[np.int32]:
-    """Take from each instance the connected pieces whose points show less than ``share`` of what its main piece's do.
+    """Take from each instance the connected pieces beside its main one that are not of it by a majority of votes, or
+    whose points show less than ``least`` of what the main piece's do.
 
     A floor that no view sees but through the table top above it has only votes for the table; but of the pixels of the
     table's masks nearly all the weight stays on the top. A part of the object cut off by an occluder is seen as openly
@@ -399,15 +411,16 @@ def _without_islands(
     links = csr_array((np.ones(linked.sum(), bool), (source[linked], target[linked])), shape=(n, n))
     pieces, piece = connected_components(links, directed=False)
     labelled = np.flatnonzero(ids >= 0)
-    piece_area = np.bincount(piece, area, pieces)
-    density = piece_area / np.bincount(piece, minlength=pieces)
+    piece_area, points = np.bincount(piece, area, pieces), np.bincount(piece, minlength=pieces)
+    density, majority = piece_area / points, np.bincount(piece, share, pieces) > 0.5 * points
     # The main piece of each instance is the one its masks show most of.
     order = labelled[np.argsort(piece_area[piece[labelled]], kind="stable")]
     main = np.zeros(int(ids.max(initial=-1)) + 1, np.int64)
     main[ids[order]] = piece[order]
-    island = labelled[density[piece[labelled]] < share * density[main[ids[labelled]]]]
+    own, main_piece = piece[labelled], main[ids[labelled]]
+    island = (own != main_piece) & (~majority[own] | (density[own] < least * density[main_piece]))
     kept = ids.copy()
-    kept[island] = UNOBSERVED
+    kept[labelled[island]] = UNOBSERVED
     return kept
 
 

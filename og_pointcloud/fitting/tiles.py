@@ -59,8 +59,6 @@ from og_pointcloud.settings import FitSettings
 
 __all__ = ["fit_tiles", "needs_tiles"]
 
-MODES = ("auto", "grouping")
-"""Modes that need no more than masks; the others learn from all points at once."""
 
 SAMPLE_STEP = 50
 """Masks are grouped by at least one in so many points, also where that is more than a whole fit would take."""
@@ -96,7 +94,7 @@ def needs_tiles(scene: Scene, settings: FitSettings) -> bool:
     if settings.tile_points is not None:
         return True
     points = len(scene.points)
-    return settings.mode in MODES and points > LEAST_TILE and points * FIT_BYTES > memory_left(settings.memory)
+    return settings.mode == "grouping" and points > LEAST_TILE and points * FIT_BYTES > memory_left(settings.memory)
 
 
 def fit_tiles(
@@ -110,10 +108,10 @@ def fit_tiles(
     the work folder; None: one after another, here.
     Raises SceneError where `fit` does, and OgPointcloudError for a mode that learns from all points at once.
     """
-    if settings.mode not in MODES:
+    if settings.mode != "grouping":
         raise OgPointcloudError(
-            f'mode is "{settings.mode}", which learns from all points at once; expected "auto" or "grouping" for a fit '
-            "in tiles: take one of these, or thin the cloud until it fits whole"
+            f'mode is "{settings.mode}", which learns from all points at once; expected "grouping" for a fit in tiles: '
+            "take that, or thin the cloud until it fits whole"
         )
     if settings.tile_points is None:
         journal.leave_out(LeftOut.WHOLE_FIT, count=len(scene.points))
@@ -139,8 +137,6 @@ def fit_tiles(
         decided = run.all(decide, range(len(cloud.tiles)), "membership")
     with journal.stage("association"):
         labelling = _instances(cloud, shown, looks, decided, settings)
-    if settings.mode == "auto":
-        journal.leave_out(LeftOut.LEARNING_IN_TILES)
     return labelling.of_points(row_of_point), float(np.median(cloud.spacing))
 
 
@@ -399,7 +395,7 @@ def _groups(cloud: TiledCloud, shown: _Shown, settings: FitSettings, journal: Jo
     if dismissed.any():
         journal.leave_out(LeftOut.CONTRADICTED_GROUPS, count=int(dismissed.sum()), total=groups.count)
     groups = replace(groups, group=np.where((groups.group >= 0) & dismissed[groups.group], -1, groups.group))
-    return groups, looks_of_groups(table, groups.group, judged.instance_ids, groups.count, settings.association)
+    return groups, looks_of_groups(table, groups.group, judged.instance_ids, groups.count)
 
 
 @dataclass(frozen=True)
@@ -447,7 +443,7 @@ def _instances(
     certainty[cloud.tiles.order] = np.concatenate([tile.certainty for tile in decided])
     used, ids, mask_instance = renumbered(look_of_point, looks.look)
     table = _table_of_sums(ids, used, shown, decided)
-    instances = instances_of_groups(table, mask_instance, ids, len(used), settings.association)
+    instances = instances_of_groups(table, mask_instance, ids, len(used))
     return Labelling(ids, instances, mask_instance, certainty)
 
 

@@ -29,7 +29,7 @@ def labelled(known: GrowingMap, rows: NDArray[np.int64], around: Neighbourhood, 
     no_feature = np.zeros((0, width), np.float32)
     views = tuple(View(str(k), view.camera, no_mask, no_feature) for k, view in enumerate(known.kept.views))
     scene, geometry = Scene(points, views, known.space.name, "map"), settings.geometry
-    drawn = isotropic(points, around.spacing, geometry.start_scale, geometry.opacity)
+    drawn = isotropic(points, around.spacing, geometry.middle_scale, geometry.opacity)
     thickness = sight_thickness(around.spacing, float(np.median(around.spacing)), geometry)
     surface = Surface(scene, None, around, drawn, near_plane(points.xyz, views), thickness, 1, by_sight=True)
     settings, journal = replace(settings, mode="grouping"), Journal(progress=False)

@@ -55,7 +55,7 @@ def drawn_points(
     spacing = np.full(len(rows), typical, np.float32)
     if around is not None and len(around.spacing) == known.points.n:
         spacing = around.spacing[rows]
-    drawn = isotropic(Points(xyz, np.zeros(3)), spacing, geometry.start_scale, geometry.opacity)
+    drawn = isotropic(Points(xyz, np.zeros(3)), spacing, geometry.middle_scale, geometry.opacity)
     depth = xyz @ camera.world_to_camera[2, :3] + camera.world_to_camera[2, 3]
     near = NEAR_SHARE * float(np.median(depth)) if len(depth) else 1e-6
     open_, u, v = openness(drawn, camera, near, sight_thickness(spacing, typical, geometry))

@@ -34,6 +34,10 @@ __all__ = [
     "with_needed_views",
 ]
 
+PIXELS_PER_SPACING, MOST_STRIDE = 2, 3
+"""Mode paper renders every row and column of these images again and again: two pixels between neighbouring points show
+all that there is of them, but the edges of masks, which are drawn in pixels, want one in three at least."""
+
 
 @dataclass(frozen=True)
 class Surface:
@@ -79,7 +83,7 @@ def reconstruct_surface(scene: Scene, settings: FitSettings, journal: Journal) -
         by_sight = not scene.points.are_gaussians and settings.mode != "paper"
         spacing, typical = around.spacing, float(np.median(around.spacing))
         thickness = surface_thickness(gaussians, spacing, typical, settings.geometry, by_sight=by_sight)
-        stride = 1 if by_sight else pixel_stride(scene.points, around.spacing, scene.views, settings.geometry, journal)
+        stride = 1 if by_sight else pixel_stride(scene.points, around.spacing, scene.views, journal)
     return Surface(scene, row_of_point, around, gaussians, near, thickness, stride, by_sight)
 
 
@@ -116,7 +120,7 @@ def _gaussians(scene: Scene, around: Neighbourhood, near: float, settings: FitSe
     if settings.mode == "paper":
         journal.leave_out(LeftOut.CHOICE_IN_PAPER_MODE)
         return isotropic(scene.points, around.spacing, settings.paper.scale, settings.paper.opacity)
-    return isotropic(scene.points, around.spacing, settings.geometry.start_scale, settings.geometry.opacity)
+    return isotropic(scene.points, around.spacing, settings.geometry.middle_scale, settings.geometry.opacity)
 
 
 def sight_thickness(
@@ -136,19 +140,18 @@ def surface_thickness(
     """
     if by_sight:
         return sight_thickness(spacing, typical_spacing, settings)
-    thickness = settings.thickness * np.maximum(spacing, typical_spacing) + 3 * gaussians.scale.max(axis=1)
+    # Blending knows the front of a surface by a half-covered pixel only, anywhere within the thickness of the surface.
+    thickness = 2 * sight_thickness(spacing, typical_spacing, settings) + 3 * gaussians.scale.max(axis=1)
     return thickness.astype(np.float32)
 
 
-def pixel_stride(
-    points: Points, spacing: NDArray[np.float32], views: Sequence[View], settings: GeometrySettings, journal: Journal
-) -> int:
+def pixel_stride(points: Points, spacing: NDArray[np.float32], views: Sequence[View], journal: Journal) -> int:
     """Use every stride-th pixel of the masks: pixels much finer than the points see nothing new."""
     if points.are_gaussians:
         return 1
     spacing_px = pixels_per_spacing(points, spacing, views)
     smallest = min(min(view.camera.width, view.camera.height) for view in views)
-    stride = int(np.clip(spacing_px / settings.pixels_per_spacing, 1, min(settings.max_stride, smallest)))
+    stride = int(np.clip(spacing_px / PIXELS_PER_SPACING, 1, min(MOST_STRIDE, smallest)))
     if stride > 1:
         journal.leave_out(LeftOut.PIXELS, share=1 - 1 / stride**2, spacing_px=round(spacing_px, 3), stride=stride)
     return stride

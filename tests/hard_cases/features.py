@@ -27,7 +27,6 @@ from og_pointcloud.errors import FeatureSpaceError, SceneError
 from og_pointcloud.fitting.association import describe_instances
 from og_pointcloud.fitting.fit import fit
 from og_pointcloud.scene import Scene, View
-from og_pointcloud.settings import AssociationSettings
 
 
 @agrees(1e-6, "length of the features", (1e-40, 1e-30, *powers(-20, 20, 10), 1e30, 3e37))
@@ -147,7 +146,7 @@ def _described(rows: NDArray[np.float32], owners: Sequence[int]) -> InstanceTabl
     """The instances that these masks' features describe; every mask shows a point of its own, equally much."""
     group = int32(owners)
     table = replace(mask_table_of(np.eye(len(rows)), [0] * len(rows)), mask_features=rows)
-    return describe_instances(table, group, group, int(group.max()) + 1, AssociationSettings())
+    return describe_instances(table, group, group, int(group.max()) + 1)
 
 
 def _cosines(a: NDArray[np.floating], b: NDArray[np.floating]) -> NDArray[np.float64]:

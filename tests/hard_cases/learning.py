@@ -18,7 +18,7 @@ from og_pointcloud.fitting.learned.codebook import kmeans, two_level_codebook
 from og_pointcloud.fitting.learned.instance_features import FeatureObjective, learn_features
 from og_pointcloud.fitting.mask_table import MaskTable
 from og_pointcloud.scene import Points, Scene
-from og_pointcloud.settings import AssociationSettings, CodebookSettings, FeatureSettings, PaperSettings
+from og_pointcloud.settings import CodebookSettings, FeatureSettings, PaperSettings
 
 MASKS, EACH = 3, 200
 SEPARATE = np.sqrt(3)
@@ -177,7 +177,7 @@ def instance_no_mask_shows() -> Answer:
     """Of three instances the last has no mask: it has no descriptor, so no word is ever its label."""
     table = mask_table_of(np.eye(2, 30), [0, 0])
     ids = np.repeat(int32([0, 1, 2]), 10)
-    instances = describe_instances(table, int32([0, 1]), ids, 3, AssociationSettings())
+    instances = describe_instances(table, int32([0, 1]), ids, 3)
     return Answer(instances.descriptor_instance, int32([0]))
 
 

@@ -64,9 +64,15 @@ def membership(
 
     def best_of(allowed: Sequence[int]) -> tuple[Ids, Array]:
         best, share = np.full(len(points), -1, np.int32), np.zeros(len(points))
-        for g, k in product(points, allowed):
-            if own[k, g] > (own[best[g], g] if best[g] >= 0 else 0):  # ties: the lower group
-                best[g], share[g] = k, own[k, g] / asked[k, g]
+        for g in points:
+            voted = sorted((k for k in allowed if own[k, g] > 0), key=lambda k: -own[k, g])  # ties: the lower group
+            if not voted:
+                continue
+            best[g] = voted[0]
+            sure = [k for k in voted if own[k, g] > settings.sure_share * asked[k, g]]
+            if sure and best[g] not in sure and sure[0] > best[g]:  # smaller, and uncontradicted
+                best[g] = sure[0]
+            share[g] = own[best[g], g] / asked[best[g], g]
         return best, share
 
     best, share = best_of(range(count))
@@ -89,15 +95,12 @@ def membership(
         if not joins:
             break
         ids[joins] = best[joins]
-    covered = votes.inside.sum(axis=0) > settings.covered_share * total
-    ids = np.where((ids == BACKGROUND) & possible & covered, best, ids)
-    ids = _without_islands(ids, weights, group, neighbours, settings.island_share)
+    ids = _without_islands(ids, share, weights, group, neighbours, settings.island_share)
     ids[(ids == BACKGROUND) & (total == 0)] = UNOBSERVED
     seen = ids.copy()
     for g in np.flatnonzero(ids == UNOBSERVED):
         ids[g] = next((seen[other] for other in neighbours[g] if seen[other] != UNOBSERVED), UNOBSERVED)
-    for _ in range(settings.border_rounds):
-        ids = _settled(ids, share, neighbours, settings)
+    ids = _settled(ids, share, neighbours, settings)
     certainty = np.zeros(len(points))
     for g in points:
         alike = np.mean([ids[other] == ids[g] for other in neighbours[g]]) if neighbours[g] else 1.0
@@ -106,9 +109,10 @@ def membership(
 
 
 def _without_islands(
-    ids: Ids, weights: Array, group: Sequence[int], neighbours: list[list[int]], least: float
+    ids: Ids, share: Array, weights: Array, group: Sequence[int], neighbours: list[list[int]], least: float
 ) -> NDArray[np.int32]:
-    """Pieces of an instance whose points show less than ``least`` of what those of its main piece do, unobserved."""
+    """Pieces of an instance whose mean share is no majority, or whose points show less than ``least`` of what those of
+    its main piece do, unobserved."""
     area = [sum(weights[mask, g] for mask in range(len(group)) if group[mask] == ids[g]) for g in range(len(ids))]
     kept = ids.copy()
     for k in set(ids[ids >= 0].tolist()):
@@ -121,7 +125,8 @@ def _without_islands(
             left -= piece
         main = max(pieces, key=lambda piece: sum(area[g] for g in piece))
         for piece in pieces:
-            if np.mean([area[g] for g in piece]) < least * np.mean([area[g] for g in main]):
+            faint = np.mean([area[g] for g in piece]) < least * np.mean([area[g] for g in main])
+            if piece is not main and (faint or np.mean([share[g] for g in piece]) <= 0.5):
                 kept[piece] = UNOBSERVED
     return kept
 
