@@ -279,7 +279,7 @@ def test_best_group_is_that_of_the_literal_reference(seed: int) -> None:
     table, numbers = random_case(random)
     group = np.array(numbers, np.int32)
     votes = view_votes(table)
-    has_mask = random.uniform(size=(5, 6)) < 0.7
+    has_mask = random.uniform(size=(5, 6)) < 0.5
     allowed = np.array([True, True, False, True, True])
     actual = _best_group(_by_point(votes.in_mask), _by_point(votes.vote), group, has_mask, allowed, 0.45)
     in_mask, vote = votes.in_mask.toarray().astype(float), votes.vote.toarray().astype(float)
