@@ -1,8 +1,8 @@
 """Every number of the default way on one page: where it is from, and what the zoo says of half and of twice its value.
 
 A number between 0 and 1 is not doubled beyond 1 but moved half of the way there. Each value is tried on a few scenes
-of the half for choosing, in mode grouping but for the numbers of mode auto; the mask table is made anew only where the
-number changes it. Results are kept beside the scenes by a checksum of the code, so that an interrupted run goes on.
+of the half for choosing; the mask table is made anew only where the number changes it. Results are kept beside the
+scenes by a checksum of the code, so that an interrupted run goes on.
 """
 
 from __future__ import annotations
@@ -38,13 +38,13 @@ SCENES = (
     "room-0", "room-noisy-0", "room-sparse-0", "detector-0", "shelf-0", "bin-0", "board-0", "plants-0", "glass-0",
 )  # fmt: skip
 """Of the half for choosing: clean and noisy, dense and sparse, all masked and things only, few views and many."""
-SWEPT = ("geometry", "grouping", "membership", "association")
+SWEPT = ("geometry", "grouping", "membership")
 """Records of settings whose numbers all steer labels."""
-SINGLE = ("agreement_enough", "agreement_lead", "visibility.alpha_min", "visibility.transmittance_min")
+SINGLE = ("visibility.alpha_min", "visibility.transmittance_min")
 MODULES: dict[str, tuple[str, tuple[str, ...]]] = {
     "fitting.view_votes.OPENNESS_POWER": ("", ("_relative_exposure",)),
     "fitting.looks.QUANTILE": ("", ()),
-    "fitting.looks.ROUNDS": ("", ()),
+    "fitting.looks.LEAST_MASKS": ("", ()),
     "rendering.sightings.LEAST_OPEN": ("table", ("_see",)),
     "rendering.sightings.EDGE_PX": ("table", ()),
     "rendering.sightings.RING_SHARE": ("table", ()),
@@ -55,22 +55,19 @@ TABLE = ("geometry", "visibility", "membership.few_views", "membership.gap_sizes
 SOURCES: dict[str, tuple[str, ...]] = {
     "the scene chooses": ("geometry.scales",),
     "derived": (
-        "grouping.container_share", "grouping.join_majority", "geometry.start_scale", "membership.few_views",
-        "fitting.looks.ROUNDS",
+        "grouping.container_share", "grouping.join_majority", "membership.few_views",
     ),
-    "published": ("visibility.alpha_min", "visibility.transmittance_min", "association.outlier_deviations"),
+    "published": ("visibility.alpha_min", "visibility.transmittance_min"),
     "enough": (
-        "geometry.held_out_views", "geometry.held_out_points", "grouping.graph_points", "geometry.max_stride",
-        "geometry.pixels_per_spacing",
+        "geometry.held_out_views", "geometry.held_out_points", "grouping.graph_points",
     ),
     "guessed": (
-        "geometry.opacity", "geometry.sight_thickness", "geometry.neighbours", "geometry.thickness", "geometry.reach",
-        "grouping.witness_share", "grouping.part_share", "membership.sure_share", "membership.possible_share",
-        "membership.covered_share", "membership.growth_votes", "membership.rate_share", "membership.island_share",
-        "membership.border_shares", "membership.border_rounds", "membership.own_vote", "membership.gap_sizes",
-        "membership.front_share", "association.look_masks", "association.look_share", "agreement_enough",
-        "agreement_lead", "fitting.view_votes.OPENNESS_POWER", "fitting.looks.QUANTILE",
-        "rendering.sightings.LEAST_OPEN", "rendering.sightings.EDGE_PX", "rendering.sightings.RING_SHARE",
+        "geometry.opacity", "geometry.sight_thickness", "geometry.neighbours", "geometry.reach",
+        "grouping.witness_share", "membership.sure_share", "membership.possible_share", "membership.growth_votes",
+        "membership.rate_share", "membership.island_share", "membership.border_shares", "membership.own_vote",
+        "membership.gap_sizes", "membership.front_share", "fitting.view_votes.OPENNESS_POWER",
+        "fitting.looks.QUANTILE", "fitting.looks.LEAST_MASKS", "rendering.sightings.LEAST_OPEN",
+        "rendering.sightings.EDGE_PX", "rendering.sightings.RING_SHARE",
     ),
 }  # fmt: skip
 """Where numbers are from. Enough: more gives the same and takes longer. Guessed: found by trying a few captures."""
@@ -189,12 +186,11 @@ def tried(chosen: Sequence[Constant], output: Path) -> Iterator[Tried]:
     for constant in chosen:
         errors = {}
         for name, value in (("default", constant.value), *zip(("half", "twice"), constant.values, strict=True)):
-            auto = "auto" if constant.path.startswith("agreement") else "grouping"
-            key = f"{auto}.json" if name == "default" else f"{constant.path}-{name}.json"
+            key = "default.json" if name == "default" else f"{constant.path}-{name}.json"
             file = kept / key
             if not file.is_file():
                 file.parent.mkdir(parents=True, exist_ok=True)
-                measured = bench.errors(constant, value, auto)
+                measured = bench.errors(constant, value)
                 with replacing(file) as target:
                     target.write(json.dumps(measured).encode())
             errors[name] = tuple(json.loads(file.read_text()))
@@ -215,11 +211,9 @@ class _Bench:
     def __init__(self, folders: Sequence[Path]) -> None:
         self.folders, self._prepared = folders, {}
 
-    def errors(self, constant: Constant, value: Any, mode: str) -> list[float]:
+    def errors(self, constant: Constant, value: Any) -> list[float]:
         """1 - mIoU of each scene with one number changed."""
-        settings = changed(FitSettings(), "mode", mode)
-        if not constant.of_module:
-            settings = changed(settings, constant.path, value)
+        settings = FitSettings() if constant.of_module else changed(FitSettings(), constant.path, value)
         anew = constant.in_table and value != constant.value
         with _in_module(constant.path, value) if constant.of_module else nullcontext():
             return [self._error(folder, settings, anew) for folder in self.folders]
