@@ -63,6 +63,7 @@ def test_the_order_spreads_and_leaves_none_out(count: int) -> None:
         assert order == [0, 4, 2, 6, 1, 5, 3, 7]
 
 
+@pytest.mark.slow
 def test_a_fit_leaves_out_views_given_twice_and_says_so() -> None:
     known = boxes_on_a_table()
     again = [replace(view, name=f"{view.name} again") for view in known.scene.views]

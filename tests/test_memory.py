@@ -390,6 +390,7 @@ def test_views_of_another_geometry_are_not_taken(
 # Fits ------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_fit_in_little_memory_gives_the_same_bits() -> None:
     scene = boxes_on_a_table().scene
     cloud, tight = fit(scene, progress=False), fit(scene, TIGHT, progress=False)
@@ -422,6 +423,7 @@ def test_points_decided_a_few_at_a_time_are_decided_alike(monkeypatch: pytest.Mo
         np.testing.assert_array_equal(getattr(few, name), value)
 
 
+@pytest.mark.slow
 def test_a_fit_goes_on_from_its_work_folder_and_removes_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     scene = boxes_on_a_table().scene
     settings = FitSettings(visibility=VisibilitySettings(keep_after_s=-1))

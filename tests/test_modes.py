@@ -35,7 +35,7 @@ def box_purity(cloud: LabelledCloud, truth: np.ndarray) -> tuple[float, int]:
     return float((lead[ids[known]] == truth[known]).mean()), len(np.unique(lead[votes.any(axis=1)]))
 
 
-@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("mode", ["grouping", "fast", pytest.param("paper", marks=pytest.mark.slow)])
 def test_every_mode_finds_the_boxes(mode: str) -> None:
     if mode == "paper":
         pytest.importorskip("torch")
@@ -140,6 +140,7 @@ def test_whatever_is_left_out_has_its_sentences(key: LeftOut) -> None:
     assert [entry[name] for name in names] == [7] * len(names)
 
 
+@pytest.mark.slow
 def test_a_killed_fit_in_paper_mode_continues_its_training(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     paper = pytest.importorskip("og_pointcloud.fitting.learned.paper")
     scene = boxes_on_a_table().scene

@@ -28,6 +28,7 @@ def gaussians(xyz: NDArray[np.floating], scale: float | NDArray[np.floating], op
 def reference_openness(splats: Gaussians, camera: Camera, thickness: NDArray[np.floating]) -> NDArray[np.float64]:
     """(n,): the product of (1 - alpha) at each centre's pixel over all that lies more than thickness before it."""
     depth = np.array([in_camera(splats, g, camera)[2] for g in range(len(splats))])
+    alphas = {h: reference_alpha(splats, h, camera) for h in range(len(splats)) if depth[h] > NEAR}
     found = np.zeros(len(splats))
     for g in range(len(splats)):
         if depth[g] <= NEAR:
@@ -38,7 +39,7 @@ def reference_openness(splats: Gaussians, camera: Camera, thickness: NDArray[np.
         light = 1.0
         for h in range(len(splats)):
             if NEAR < depth[h] < np.float32(depth[g]) - np.float32(thickness[g]):
-                alpha = reference_alpha(splats, h, camera)[int(v), int(u)]
+                alpha = alphas[h][int(v), int(u)]
                 light *= 1 - alpha if alpha >= 1 / 255 else 1.0
         found[g] = light if light >= LEAST_OPEN else 0.0
     return found
