@@ -9,13 +9,11 @@ from typing import get_args, get_type_hints
 
 import numpy as np
 import pytest
-from scipy.sparse import csr_array
 from test_fit import BOXES, boxes_on_a_table
 
-from og_pointcloud.cloud import BACKGROUND, UNOBSERVED, InstanceTable, LabelledCloud
+from og_pointcloud.cloud import BACKGROUND, UNOBSERVED, LabelledCloud
 from og_pointcloud.fitting.fit import fit, prepare
-from og_pointcloud.fitting.labellers import LABELLERS, Labelling, fast, mask_agreement
-from og_pointcloud.fitting.mask_table import MaskTable
+from og_pointcloud.fitting.labellers import LABELLERS, fast
 from og_pointcloud.journal import Journal, LeftOut, left_out_entry
 from og_pointcloud.settings import CodebookSettings, FitSettings, MatchingSettings, PaperSettings, VisibilitySettings
 
@@ -95,34 +93,6 @@ def test_fast_mode_names_the_coarse_cluster_of_every_instance() -> None:
     assert set(np.unique(cloud.instances.coarse)) <= {0, 1}
     grouped = fit(known.scene, FitSettings(mode="grouping"), progress=False)
     assert (grouped.instances.coarse == -1).all()
-
-
-def table_of(weights: list[list[float]], outside: list[list[float]], mask_view: list[int]) -> MaskTable:
-    masks = len(weights)
-    return MaskTable(
-        csr_array(np.array(weights, np.float32)), csr_array(np.array(outside, np.float32)),
-        csr_array(np.ones_like(np.array(outside, np.float32))), np.array(mask_view, np.int32),
-        np.ones(masks, np.int32), np.eye(masks, dtype=np.float32),
-    )  # fmt: skip
-
-
-def labelling_of(ids: list[int]) -> Labelling:
-    count = max(ids) + 1
-    zeros = np.zeros(count, np.int32)
-    empty = InstanceTable(
-        np.zeros((0, 2), np.float32), np.zeros(0, np.int32), zeros, zeros, zeros,
-        zeros.astype(np.float32), zeros.astype(np.float32),
-    )  # fmt: skip
-    return Labelling(np.array(ids, np.int32), empty, zeros)
-
-
-def test_mask_agreement_by_hand() -> None:
-    """One view: mask 0 shows points 0 and 1 (3 + 1 px), mask 1 point 2 (4 px); point 1 also shows 2 px outside."""
-    table = table_of([[3, 1, 0], [0, 0, 4]], [[0, 2, 0]], [0, 0])
-    # Instance 0 = points 0, 1: IoU with mask 0 is 4 / 6; instance 1 = point 2: 1. By area 4 and 4.
-    assert mask_agreement(table, labelling_of([0, 0, 1])) == pytest.approx((4 / 6 + 1) / 2)
-    # All one instance: 4 / 10 each.
-    assert mask_agreement(table, labelling_of([0, 0, 0])) == pytest.approx(0.4)
 
 
 def test_every_mode_has_its_labeller() -> None:

@@ -128,18 +128,18 @@ def test_rows_have_error_and_seconds_and_a_setting_that_fails_costs_no_other(sub
 
 
 @pytest.mark.slow
-def test_without_truth_the_error_is_the_disagreement_with_the_masks(folder, tmp_path):
+def test_without_truth_the_error_is_what_the_fit_says_of_itself(folder, tmp_path):
     bare = tmp_path / "bare"
     shutil.copytree(folder, bare)
     (bare / "gt.npz").unlink()
     found = sweep([read_subject(bare)], [DEFAULT, value_of("views", "one of 4")], progress=False)
     default, fewer = found.rows  # no other method can be judged
     assert (default.miou, default.gain) == (None, None)
-    assert default.error == 1 - default.agreement < 0.5
-    assert fewer.agreement != default.agreement
+    assert default.error == 1 - default.reliability < 0.5
+    assert fewer.reliability != default.reliability
     text = write_report(found, tmp_path / "r.md", tmp_path / "r.png").read_text()
     assert "no truth" in text
-    assert "| agreement |" in text
+    assert "| reliability |" in text
     assert "| mIoU |" not in text
 
 

@@ -20,7 +20,7 @@ SHARE = 0.05
 def add(parser: Parser) -> None:
     parser.add_argument(
         "captures", type=Path, nargs="+", metavar="CAPTURE",
-        help="folders; with gt.npz and text_features.npz the error is 1 - mIoU, else 1 - agreement with the masks",
+        help="folders; with gt.npz and text_features.npz the error is 1 - mIoU, else 1 - reliability",
     )  # fmt: skip
     parser.add_argument(
         "--knob", action="append", metavar="NAME", help="only this setting (may be given several times)"

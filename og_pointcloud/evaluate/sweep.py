@@ -5,8 +5,7 @@ stand other methods on the default's mask table (`baselines`).
 
     with gt.npz and text_features.npz      error = 1 - mIoU; a point without a label is a miss, a class called on known
                                            background a false alarm
-    without                                error = 1 - mask agreement: how badly the instances reproduce the masks they
-                                           were made from. It sees what is torn, merged or missed, not wrong words
+    without                                error = 1 - reliability (fitting/reliability.py), 1 where it is not known
 """
 
 from __future__ import annotations
@@ -45,7 +44,6 @@ from og_pointcloud.text.text_features import read_text_features
 try:
     from og_pointcloud.evaluate.baselines import baseline_labels
     from og_pointcloud.fitting.fit import fit, prepare
-    from og_pointcloud.fitting.labellers import Labelling, mask_agreement
     from og_pointcloud.fitting.tiles import needs_tiles
 except ImportError as error:
     raise MissingExtraError("scipy and numba", "fit") from error
@@ -73,12 +71,12 @@ class Subject:
 class Row:
     """One setting on one capture.
 
-    seconds: of a whole fit. error: 1 - mIoU, or where the truth is not known 1 - agreement.
+    seconds: of a whole fit. error: 1 - mIoU, or where the truth is not known 1 - reliability.
     miou, macc, unknown: over the points with a known class; background: the share of known background that was given a
     class. labelled_miou: mIoU with background left out, as published tables have it. None without truth.
     gain, gain_low, gain_high: mIoU less the default's, with its paired 95 % interval over blocks of space.
-    agreement: of the instances with the masks, None for other methods. reliability: of the fit
-    (`LabelledCloud.reliability`). published: the same row's mIoU in the paper.
+    reliability: of the fit (`LabelledCloud.reliability`), None for other methods. published: the same row's mIoU in
+    the paper.
     left_out: what the fit left out and why, as its provenance has it.
     """
 
@@ -95,7 +93,6 @@ class Row:
     gain: float | None = None
     gain_low: float | None = None
     gain_high: float | None = None
-    agreement: float | None = None
     reliability: float | None = None
     instances: int | None = None
     published: float | None = None
@@ -222,14 +219,13 @@ class _Trial:
         labels = self._labels(cloud)
         if setting == DEFAULT:
             self.default_labels = labels
-        scores, agreement = self._scores(labels), self._agreement(cloud)
+        scores = self._scores(labels)
         return Row(
             capture=self.subject.name,
             knob=setting.knob,
             value=setting.value,
             seconds=seconds,
-            error=1 - scores.get("miou", agreement),
-            agreement=agreement,
+            error=1 - scores.get("miou", cloud.reliability or 0.0),
             reliability=cloud.reliability,
             instances=len(cloud.instances),
             left_out=tuple(cloud.provenance["left_out"]),
@@ -254,12 +250,6 @@ class _Trial:
         if vocabulary is None:
             return cloud.instance_ids
         return LabelledScene.from_cloud(cloud).chooser.choose(vocabulary.vectors).at(cloud.instance_ids)[0]
-
-    def _agreement(self, cloud: LabelledCloud) -> float:
-        ids, row_of_point = cloud.instance_ids, self.prepared.surface.row_of_point
-        if row_of_point is not None:  # points at one position have one label
-            ids = ids[np.unique(row_of_point, return_index=True)[1]]
-        return mask_agreement(self.prepared.table, Labelling(ids, cloud.instances, np.zeros(0, np.int32)))
 
     def _scores(self, labels: Labels) -> dict[str, Any]:
         """mIoU, recall and shares, as Row has them; nothing where the capture does not know its classes."""

@@ -16,7 +16,7 @@ __all__ = ["require_matplotlib", "table", "write_chart", "write_report"]
 
 SHARES = {
     "mIoU": "miou", "without background": "labelled_miou", "paper": "published", "mAcc": "macc", "unknown": "unknown",
-    "background called": "background", "agreement": "agreement", "reliability": "reliability",
+    "background called": "background", "reliability": "reliability",
 }  # fmt: skip
 """Column -> field of `Row`, after setting, seconds, error and gain."""
 COLOURS, MARKERS = [f"C{number}" for number in range(10)], "osD^vPX*<>hpd"
@@ -75,7 +75,7 @@ def _panel(axes: Any, rows: Sequence[Row]) -> None:
 
 def error_name(rows: Sequence[Row]) -> str:
     """What the error of these rows is."""
-    return "1 - mIoU" if all(row.miou is not None for row in rows) else "1 - mask agreement (no truth)"
+    return "1 - mIoU" if all(row.miou is not None for row in rows) else "1 - reliability (no truth)"
 
 
 def write_report(sweep: Sweep, path: Path, chart: Path, title: str = "Error against run time") -> Path:

@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 from og_pointcloud.cloud import UNOBSERVED, InstanceTable
 from og_pointcloud.fitting.association import describe_instances, part_of
 from og_pointcloud.fitting.grouping import MaskGroups, group_masks
-from og_pointcloud.fitting.held_out import agreement
 from og_pointcloud.fitting.learned.codebook import two_level_codebook
 from og_pointcloud.fitting.learned.instance_features import learn_features
 from og_pointcloud.fitting.learned.matching import Matching, alone_evidence, match_masks, visible_evidence
@@ -41,7 +40,6 @@ __all__ = [
     "fast",
     "grouping",
     "instances_of_groups",
-    "mask_agreement",
     "mask_means",
     "paper",
     "renumbered",
@@ -146,11 +144,6 @@ def paper(
 LABELLERS: dict[str, Labeller] = {"grouping": grouping, "fast": fast, "paper": paper}
 """By `FitSettings.mode`. The first is the default everywhere: over the zoo's half for choosing fast was better by more
 than 0.01 on one of 32 scenes, and neither agreement with masks nor reliability told which."""
-
-
-def mask_agreement(table: MaskTable, labelling: Labelling) -> float:
-    """How well the instances reproduce the masks they came from, in [0, 1] (`held_out.agreement`)."""
-    return agreement(table, labelling.instance_ids, len(labelling.instances))
 
 
 def mask_means(table: MaskTable, features: NDArray[np.float32]) -> NDArray[np.float64]:
