@@ -242,10 +242,6 @@ class VisibilitySettings:
     """What is rendered of the views (splatting.py, coverage.py), and where the mask table is kept while it grows
     (mask_table.py, work_folder.py). `examples/benchmark_visibility.py` gives error and time of each choice."""
 
-    alpha_min: float = 1 / 255
-    """Alpha below this is dropped (3DGS)."""
-    transmittance_min: float = 1e-4
-    """A pixel stops before the splat that would bring its transmittance below this (3DGS)."""
     enough_views: int | None = None
     """A view is left out when nearly all that it sees has been seen by so many others; None: all views are used."""
     table_share: float = 0.4
@@ -256,9 +252,6 @@ class VisibilitySettings:
     """Views are kept for a later start only where all of them take longer than this, seconds."""
 
     def __post_init__(self) -> None:
-        for name in ("alpha_min", "transmittance_min"):
-            if not 0 < getattr(self, name) < 0.5:
-                raise OgPointcloudError(f"{name} is {getattr(self, name)}; expected between 0 and 0.5")
         if self.enough_views is not None and self.enough_views < 1:
             raise OgPointcloudError(f"enough_views is {self.enough_views}; expected at least 1, or None for all views")
 

@@ -43,7 +43,7 @@ from og_pointcloud.fitting.memory import (
 from og_pointcloud.fitting.view_votes import view_votes
 from og_pointcloud.fitting.work_folder import WorkFolder, fingerprint, kept_files
 from og_pointcloud.rendering.geometry import neighbourhood
-from og_pointcloud.rendering.splatting import Cutoffs, Gaussians
+from og_pointcloud.rendering.splatting import Gaussians
 from og_pointcloud.scene import View
 from og_pointcloud.settings import FitSettings, GeometrySettings, MembershipSettings, VisibilitySettings
 
@@ -369,7 +369,7 @@ def test_only_views_that_changed_are_rendered_again(
     assert_same(table, mask_table(gaussians, changed, NEAR))
 
 
-@pytest.mark.parametrize("change", ["xyz", "opacity", "near", "thickness", "cutoffs"])
+@pytest.mark.parametrize("change", ["xyz", "opacity", "near", "thickness"])
 def test_views_of_another_geometry_are_not_taken(
     gaussians: Gaussians, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, change: str
 ) -> None:
@@ -377,7 +377,6 @@ def test_views_of_another_geometry_are_not_taken(
     counts = rendered(monkeypatch)
     options = {
         "thickness": {"thickness": np.full(len(gaussians), 0.1, np.float32)},
-        "cutoffs": {"cutoffs": Cutoffs(0.1, 0.1)},
     }
     if change in ("xyz", "opacity"):
         gaussians = replace(gaussians, **{change: getattr(gaussians, change) * np.float32(0.9)})

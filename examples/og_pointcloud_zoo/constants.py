@@ -40,7 +40,6 @@ SCENES = (
 """Of the half for choosing: clean and noisy, dense and sparse, all masked and things only, few views and many."""
 SWEPT = ("geometry", "grouping", "membership")
 """Records of settings whose numbers all steer labels."""
-SINGLE = ("visibility.alpha_min", "visibility.transmittance_min")
 MODULES: dict[str, tuple[str, tuple[str, ...]]] = {
     "fitting.view_votes.OPENNESS_POWER": ("", ("_relative_exposure",)),
     "fitting.looks.QUANTILE": ("", ()),
@@ -50,14 +49,13 @@ MODULES: dict[str, tuple[str, tuple[str, ...]]] = {
     "rendering.sightings.RING_SHARE": ("table", ()),
 }
 """Numbers that stand in modules: whether they change the mask table, and the compiled functions that know them."""
-TABLE = ("geometry", "visibility", "membership.few_views", "membership.gap_sizes", "membership.front_share")
+TABLE = ("geometry", "membership.few_views", "membership.gap_sizes", "membership.front_share")
 """What the mask table depends on."""
 SOURCES: dict[str, tuple[str, ...]] = {
     "the scene chooses": ("geometry.scales",),
     "derived": (
         "grouping.container_share", "grouping.join_majority", "membership.few_views",
     ),
-    "published": ("visibility.alpha_min", "visibility.transmittance_min"),
     "enough": (
         "geometry.held_out_views", "geometry.held_out_points", "grouping.graph_points",
     ),
@@ -129,12 +127,11 @@ class Tried:
 def constants() -> list[Constant]:
     """All of the default way, with what the code says of them; a source of "not said" where SOURCES lacks one."""
     default, meanings = FitSettings(), _meanings(inspect.getsource(records))
-    paths = [f"{record}.{field.name}" for record in SWEPT for field in fields(getattr(default, record))]
     found = []
-    for path in [*paths, *SINGLE]:
-        owner, _, name = path.rpartition(".")
-        record = getattr(default, owner) if owner else default
-        found.append(_constant(path, getattr(record, name), meanings[type(record).__name__, name]))
+    for owner in SWEPT:
+        record = getattr(default, owner)
+        for name in (field.name for field in fields(record)):
+            found.append(_constant(f"{owner}.{name}", getattr(record, name), meanings[type(record).__name__, name]))
     for path in MODULES:
         module, name = _module(path)
         found.append(_constant(path, getattr(module, name), _meanings(inspect.getsource(module))["", name]))

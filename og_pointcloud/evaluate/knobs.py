@@ -45,8 +45,6 @@ Changes = Mapping[str, Any]
 ONE_NUMBER: Mapping[str, tuple[str, tuple[Any, ...]]] = {
     "mode": ("mode", ("grouping", "fast")),
     "enough views": ("visibility.enough_views", (None, 5, 20)),
-    "alpha cut-off": ("visibility.alpha_min", (1 / 1024, 1 / 255, 1 / 64, 1 / 16)),
-    "transmittance cut-off": ("visibility.transmittance_min", (1e-5, 1e-4, 1e-2, 1e-1)),
     "neighbours": ("geometry.neighbours", (8, 16, 32)),
     "grouping sample": ("grouping.graph_points", (5_000, 20_000, 60_000, ALL)),
     "join majority": ("grouping.join_majority", (0.4, 0.5, 0.6)),

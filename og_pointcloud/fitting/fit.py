@@ -23,7 +23,7 @@ from og_pointcloud.fitting.work_folder import WorkFolder
 from og_pointcloud.journal import Journal, LeftOut
 from og_pointcloud.kernels import get_num_threads
 from og_pointcloud.rendering.geometry import isotropic, thinned
-from og_pointcloud.rendering.splatting import Cutoffs, working_memory
+from og_pointcloud.rendering.splatting import working_memory
 from og_pointcloud.rendering.surface import Surface, reconstruct_surface
 from og_pointcloud.scene import Scene
 from og_pointcloud.settings import FitSettings
@@ -197,7 +197,6 @@ def _mask_table(surface: Surface, settings: FitSettings, journal: Journal, work:
             work=work,
             side_by_side=at_once,
             most_in_memory=most,
-            cutoffs=Cutoffs(visibility.alpha_min, visibility.transmittance_min),
             by_sight=surface.by_sight,
         )
         journal.notes["table"] = {

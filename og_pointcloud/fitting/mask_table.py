@@ -24,7 +24,7 @@ from og_pointcloud.fitting.memory import scratch_array
 from og_pointcloud.fitting.work_folder import WorkFolder, fingerprint
 from og_pointcloud.kernels import njit
 from og_pointcloud.rendering.sightings import sightings
-from og_pointcloud.rendering.splatting import CUTOFFS, Cutoffs, Gaussians, ViewWeights, view_weights
+from og_pointcloud.rendering.splatting import Gaussians, ViewWeights, view_weights
 from og_pointcloud.scene import NOT_SEEN, Camera, Scene, View
 
 __all__ = ["MaskTable", "SparseRows", "mask_table", "require_sight", "view_fingerprint", "weights_by_instance"]
@@ -77,7 +77,6 @@ def mask_table(
     work: WorkFolder | None = None,
     side_by_side: int | None = None,
     most_in_memory: float = np.inf,
-    cutoffs: Cutoffs = CUTOFFS,
     by_sight: bool = False,
     asked: NDArray[np.bool_] | None = None,
 ) -> MaskTable:
@@ -95,7 +94,7 @@ def mask_table(
     if work is None:
         work = WorkFolder(None)
         work.hold(np.inf, np.inf)
-    geometry = (gaussians.xyz, gaussians.scale, gaussians.rotation, gaussians.opacity, thickness, near, *cutoffs)
+    geometry = (gaussians.xyz, gaussians.scale, gaussians.rotation, gaussians.opacity, thickness, near)
     of_all = fingerprint(*geometry, by_sight, asked)
 
     def shown(view: View) -> _ShownView:
@@ -104,8 +103,8 @@ def mask_table(
 
         def make() -> tuple[NDArray[Any], ...]:
             if not by_sight or thickness is None:
-                return _view_arrays(gaussians, view, ids, near, thickness, cutoffs)
-            seen = sightings(gaussians, view.camera, ids, view.mask_count, near, thickness, asked, cutoffs)
+                return _view_arrays(gaussians, view, ids, near, thickness)
+            seen = sightings(gaussians, view.camera, ids, view.mask_count, near, thickness, asked)
             return _as_arrays(seen.rows, seen.openness)
 
         lengths, *_, exposed = work.arrays("view", key, make)
@@ -148,11 +147,10 @@ def _view_arrays(
     ids: NDArray[np.int32],
     near: float,
     thickness: NDArray[np.float32] | None,
-    cutoffs: Cutoffs,
 ) -> tuple[NDArray[Any], ...]:
     """What a view shows: entries of each row (masks + 1,), the last one of pixels without a mask, the entries' columns
     and values, and columns and values of the view's exposure."""
-    shown = view_weights(gaussians, view.camera, ids, view.mask_count, near, thickness, cutoffs)
+    shown = view_weights(gaussians, view.camera, ids, view.mask_count, near, thickness)
     exposure = _exposure(shown)
     if (ids == NOT_SEEN).any():
         seen = _photographed(gaussians.xyz, view.camera, ids).astype(np.float32)

@@ -48,7 +48,7 @@ from og_pointcloud.rendering.geometry import (
     neighbourhood,
     sample_of_points,
 )
-from og_pointcloud.rendering.splatting import FRUSTUM_MARGIN, LOW_PASS, Cutoffs, Gaussians
+from og_pointcloud.rendering.splatting import ALPHA_MIN, FRUSTUM_MARGIN, LOW_PASS, Gaussians
 from og_pointcloud.rendering.surface import (
     surface_thickness,
     with_distinct_points,
@@ -305,16 +305,14 @@ def _entries(
     view: View, cloud: TiledCloud, drawing: _Drawing, settings: FitSettings
 ) -> tuple[Entries, NDArray[np.int64]]:
     """What one view shows; and how many points were drawn, and how many there are in the image."""
-    visibility = settings.visibility
-    rows, larger, inside = _worth_drawing(view, cloud, drawing, visibility.alpha_min)
+    rows, larger, inside = _worth_drawing(view, cloud, drawing)
     counts = np.array([len(rows), inside])
     if len(rows) == 0:
         return np.zeros(0, ENTRY), counts
     splats = drawing.splats(cloud, rows, larger)
     apart, by_sight = cloud.spacing[rows] * larger, drawing.scale is not None
     thickness = surface_thickness(splats, apart, drawing.typical, settings.geometry, by_sight=by_sight)
-    cutoffs = Cutoffs(visibility.alpha_min, visibility.transmittance_min)
-    table = mask_table(splats, [view], drawing.near, thickness, cutoffs=cutoffs, by_sight=by_sight)
+    table = mask_table(splats, [view], drawing.near, thickness, by_sight=by_sight)
     camera = view.camera
     # In a table of one view each point has too few of them to contradict a mask: all that is behind is found.
     front, _ = without_see_through(
@@ -334,17 +332,13 @@ def _entries(
     return entries[np.argsort(entries["point"], kind="stable")], counts
 
 
-def _worth_drawing(
-    view: View, cloud: TiledCloud, drawing: _Drawing, alpha_min: float
-) -> tuple[Rows, NDArray[np.float32], int]:
+def _worth_drawing(view: View, cloud: TiledCloud, drawing: _Drawing) -> tuple[Rows, NDArray[np.float32], int]:
     """The points in an image that are drawn, how much larger than they are, and how many there are in it.
 
     Those that lie FINEST_PX apart or more are all drawn; of others a part, by chance, such that they do. Larger in
     proportion, they cover what all of them did.
     """
-    parts = [
-        _in_image(view.camera, cloud, cloud.tiles.part(tile), drawing, alpha_min) for tile in range(len(cloud.tiles))
-    ]
+    parts = [_in_image(view.camera, cloud, cloud.tiles.part(tile), drawing) for tile in range(len(cloud.tiles))]
     rows, spacing_px = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
     finest = FINEST_PX
     while (part := np.minimum(1, (spacing_px / finest) ** 2, dtype=np.float32)).sum(dtype=np.float64) > MOST_SPLATS:
@@ -353,13 +347,11 @@ def _worth_drawing(
     return rows[drawn], (1 / np.sqrt(part[drawn])).astype(np.float32), len(rows)
 
 
-def _in_image(
-    camera: Camera, cloud: TiledCloud, part: slice, drawing: _Drawing, alpha_min: float
-) -> tuple[Rows, NDArray[np.float32]]:
+def _in_image(camera: Camera, cloud: TiledCloud, part: slice, drawing: _Drawing) -> tuple[Rows, NDArray[np.float32]]:
     """Rows of a tile's points that may show in a pixel, and their spacing in pixels where they are.
 
     A splat reaches as many standard deviations, its own and the pixels' low-pass (splatting.py), as an opaque one needs
-    to fall to ``alpha_min``. The projection is linearised within a margin of the image: there a round one is widened.
+    to fall to ALPHA_MIN. The projection is linearised within a margin of the image: there a round one is widened.
     """
     points, spacing = cloud.points, cloud.spacing[part]
     widest = spacing * (drawing.scale or 0) if points.scale is None else points.scale[part].max(axis=1)
@@ -369,7 +361,7 @@ def _in_image(
         size = np.array([camera.width, camera.height])
         slope = (np.maximum(center, size - center) + 0.5 * FRUSTUM_MARGIN * size) / focal
         own_px = focal * np.sqrt(1 + slope**2) * (widest / depth)[:, None]
-        reach_px = np.sqrt(-2 * np.log(alpha_min)) * (own_px + np.sqrt(LOW_PASS)) + 1
+        reach_px = np.sqrt(-2 * np.log(ALPHA_MIN)) * (own_px + np.sqrt(LOW_PASS)) + 1
         shows = (depth > drawing.near) & ((uv_px > -reach_px) & (uv_px < size + reach_px)).all(axis=1)
     inside = np.flatnonzero(shows)
     spacing_px = np.sqrt(camera.fx * camera.fy) * spacing[inside] / depth[inside]

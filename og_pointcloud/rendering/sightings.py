@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from og_pointcloud.kernels import get_num_threads, njit, prange
-from og_pointcloud.rendering.splatting import CUTOFFS, TILE, Cutoffs, Gaussians, binned_splats, dim, tile_buffer
+from og_pointcloud.rendering.splatting import CUTOFFS, TILE, Gaussians, binned_splats, dim, tile_buffer
 from og_pointcloud.scene import NOT_SEEN, Camera
 
 __all__ = ["Sightings", "openness", "sightings", "sightings_of"]
@@ -52,7 +52,6 @@ def sightings(
     near: float,
     thickness: NDArray[np.float32],
     asked: NDArray[np.bool_] | None = None,
-    cutoffs: Cutoffs = CUTOFFS,
 ) -> Sightings:
     """The masks that each point lies in, by how openly the view sees it.
 
@@ -60,7 +59,7 @@ def sightings(
         is NOT_SEEN. near, thickness (n,): scene units.
     asked: (n,) bool, points that are looked at (all of them hide others); None: all.
     """
-    return sightings_of(*openness(gaussians, camera, near, thickness, asked, cutoffs), ids, mask_count)
+    return sightings_of(*openness(gaussians, camera, near, thickness, asked), ids, mask_count)
 
 
 def sightings_of(
@@ -88,16 +87,15 @@ def openness(
     near: float,
     thickness: NDArray[np.float32],
     asked: NDArray[np.bool_] | None = None,
-    cutoffs: Cutoffs = CUTOFFS,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
     """(n,) float32 each: openness, 0 where a point is hidden, outside the image or not asked; and where it is seen, in
     pixels (u, v). Light is followed through the centres of pixels."""
-    binned, _ = binned_splats(gaussians, camera, near, thickness, cutoffs)
+    binned, _ = binned_splats(gaussians, camera, near, thickness, CUTOFFS)
     n = len(gaussians)
     asked = np.ones(n, np.bool_) if asked is None else asked
     open_, u, v = (np.zeros(n, np.float32) for _ in range(3))
     size = np.array([camera.width, camera.height])
-    log2_least = np.float32(np.log2(cutoffs.alpha_min))
+    log2_least = np.float32(np.log2(CUTOFFS.alpha_min))
     _see(binned, size, asked, log2_least, get_num_threads(), (open_, u, v))
     return open_, u, v
 
