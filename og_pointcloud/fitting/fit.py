@@ -152,8 +152,7 @@ def _with_reliability(labelling: Labelling, prepared: Prepared, settings: FitSet
     if overall is not None:
         journal.notes["reliability"] = round(overall, 4)
         if overall < settings.reliable:
-            cause = likely_cause(found, prepared.table, prepared.surface, labelling.instance_ids)
-            journal.warnings.append(f"reliability {overall:.2f}, below {settings.reliable:g}: {cause}")
+            journal.warnings.append(f"reliability {overall:.2f}, below {settings.reliable:g}: {likely_cause(found)}")
     return replace(labelling, instances=instances)
 
 

@@ -21,7 +21,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array, vstack
 
-from og_pointcloud.checking.masks import entropies
 from og_pointcloud.cloud import InstanceTable, unit_rows
 from og_pointcloud.errors import SceneError
 from og_pointcloud.fitting.held_out import FEWEST_VIEWS
@@ -41,13 +40,6 @@ ROWS_AT_ONCE = 1 << 24
 """Cosines held at once."""
 ROWS = 16
 """Rows of a mask table looked at at once."""
-JUDGED_VIEWS, JUDGED_POINTS = 12, 4_000
-"""Views whose poses are checked, and points of each: shares over thousands of points need no more."""
-STEP, STEPS = 0.01, 5
-"""Masks are moved by so much of their width, and so many times, to see whether they fit better elsewhere."""
-ABOVE_OTHERS = 1.2
-"""A view's own masks, moved as they fit best, fit it so many times as well as the best of other views'. On honest
-scenes of the zoo it is 1.4 and more, with poses given to other views 1.2 and less."""
 
 Bools = NDArray[np.bool_]
 
@@ -189,58 +181,14 @@ def _of_points(surface: Surface, rows: NDArray[np.int64], settings: FitSettings)
     )
 
 
-# Why ------------------------------------------------------------------------------------------------------------
-
-
-def likely_cause(found: Reliability, table: MaskTable, surface: Surface, ids: NDArray[np.int32]) -> str:
-    """In words, why a reliability is low. ids: (n,) int32, the instance of each point of the surface."""
-    offset = misplaced(table, surface, ids)
-    if offset is not None:
-        return f"poses and cloud lie apart: {offset}"
+def likely_cause(found: Reliability) -> str:
+    """In words, why a reliability is low. Whether poses are wrong the checks of the capture say (checking/)."""
     if found.alone > 0.25:
         return f"too few views: {found.alone:.0%} of the labelled points are seen by one half of the views alone"
     again, named = float(np.nanmean(found.again)), float(np.nanmean(found.named))
     if named < again:
         return f"masks of one thing are named differently: {named:.0%} of them, read alone, name their instance"
-    return f"masks disagree about what is one thing: half of the views give {again:.0%} of the points the same label"
-
-
-def misplaced(table: MaskTable, surface: Surface, ids: NDArray[np.int32]) -> str | None:
-    """How far masks lie from the points that they show, where in most views they fit better elsewhere; None else."""
-    views = surface.scene.views
-    masked = np.unique(table.mask_view)
-    chosen = masked[np.unique(np.linspace(0, len(masked) - 1, JUDGED_VIEWS).round().astype(int))].tolist()
-    maps = {index: views[index].mask_map() for index in chosen}
-    moved, own, others = [], [], []
-    for index in chosen:
-        camera = views[index].camera
-        seen = csr_array(table.exposure[[index]]).indices
-        seen = seen[:: 1 + len(seen) // JUDGED_POINTS]
-        uv_px, _ = camera.project(surface.gaussians.xyz[seen])
-        share, fit = _best_shift(maps[index], uv_px, ids[seen])
-        moved.append(share * camera.width)
-        own.append(fit)
-        others.append(max(_fit(maps[other], uv_px, ids[seen]) for other in chosen if other != index))
-    if np.median(own) < ABOVE_OTHERS * np.median(others):
-        return "what a view shows fits the masks of others as well as its own; check that poses are camera-to-world"
-    if np.median(moved) > 0:
-        return f"masks fit best when moved by about {np.median(moved):.0f} pixels; check poses and intrinsics"
-    return None
-
-
-def _best_shift(masks: NDArray[np.int32], uv_px: NDArray[np.floating], ids: NDArray[np.int32]) -> tuple[float, float]:
-    """Moved by how much of their width masks fit the points best, and how well they fit there."""
-    step = STEP * masks.shape[1]
-    shifts = [(right, down) for right in range(-STEPS, STEPS + 1) for down in range(-STEPS, STEPS + 1)]
-    fits = {shift: _fit(masks, uv_px + np.multiply(shift, step), ids) for shift in shifts}
-    best = max(shifts, key=lambda shift: (fits[shift], -np.hypot(*shift)))
-    return STEP * float(np.hypot(*best)), fits[best]
-
-
-def _fit(masks: NDArray[np.int32], uv_px: NDArray[np.floating], ids: NDArray[np.int32]) -> float:
-    """How well a mask map tells instances apart: mutual information of both by the instances' entropy, in [0, 1]."""
-    height, width = masks.shape
-    column, row = np.floor(uv_px).astype(int).T
-    column, row = np.clip(column, 0, width - 1), np.clip(row, 0, height - 1)
-    entropy, of_masks, of_both = entropies(np.maximum(ids, -1) + 1, np.maximum(masks[row, column], -1) + 1)
-    return (entropy + of_masks - of_both) / entropy if entropy > 0 else 0.0
+    return (
+        f"half of the views give {again:.0%} of the points the same label: masks disagree about what is one thing, or "
+        "do not lie where the poses say"
+    )
