@@ -132,6 +132,7 @@ def _interrupt(*_: object) -> None:
     raise KeyboardInterrupt
 
 
+@pytest.mark.slow
 def test_paper_mode_says_how_long_the_published_schedule_would_take() -> None:
     pytest.importorskip("torch")
     known = boxes_on_a_table()
