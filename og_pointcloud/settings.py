@@ -266,8 +266,8 @@ class FitSettings:
     ('grouping', None)
     """
 
-    mode: Literal["grouping", "fast", "paper"] = "grouping"
-    """How masks become instances (labellers.py)."""
+    mode: Literal["grouping", "fast", "paper", "auto"] = "grouping"
+    """How masks become instances (labellers.py). "auto" is another name of the default."""
     reliable: float = 0.65
     """A fit less reliable than this (reliability.py) is warned of, with the likely cause. Of the scenes of
     `examples/zoo.py` for choosing, those below have a mean mIoU of 0.54, the others one of 0.86."""

@@ -99,6 +99,12 @@ def test_every_mode_has_its_labeller() -> None:
     assert tuple(LABELLERS) == MODES
 
 
+def test_auto_is_the_default_by_another_name() -> None:
+    scene = boxes_on_a_table().scene
+    ids = [fit(scene, FitSettings(mode=mode), progress=False).instance_ids for mode in ("auto", FitSettings().mode)]
+    np.testing.assert_array_equal(*ids)
+
+
 @pytest.mark.parametrize("key", LeftOut)
 def test_whatever_is_left_out_has_its_sentences(key: LeftOut) -> None:
     """Told whole numbers, as a journal may be."""

@@ -31,7 +31,7 @@ from scipy.sparse import csr_array, vstack
 from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.fitting.grouping import MaskGroups, group_masks, indicator
 from og_pointcloud.fitting.held_out import choose_scale, note_scale
-from og_pointcloud.fitting.labellers import Labelling, instances_of_groups, renumbered
+from og_pointcloud.fitting.labellers import LABELLERS, Labelling, grouping, instances_of_groups, renumbered
 from og_pointcloud.fitting.looks import Looks, by_look, looks_of_groups
 from og_pointcloud.fitting.mask_table import MaskTable, mask_table, require_sight, view_fingerprint
 from og_pointcloud.fitting.membership import assign_points, without_see_through
@@ -94,7 +94,11 @@ def needs_tiles(scene: Scene, settings: FitSettings) -> bool:
     if settings.tile_points is not None:
         return True
     points = len(scene.points)
-    return settings.mode == "grouping" and points > LEAST_TILE and points * FIT_BYTES > memory_left(settings.memory)
+    return (
+        LABELLERS[settings.mode] is grouping
+        and points > LEAST_TILE
+        and points * FIT_BYTES > memory_left(settings.memory)
+    )
 
 
 def fit_tiles(
@@ -108,7 +112,7 @@ def fit_tiles(
     the work folder; None: one after another, here.
     Raises SceneError where `fit` does, and OgPointcloudError for a mode that learns from all points at once.
     """
-    if settings.mode != "grouping":
+    if LABELLERS[settings.mode] is not grouping:
         raise OgPointcloudError(
             f'mode is "{settings.mode}", which learns from all points at once; expected "grouping" for a fit in tiles: '
             "take that, or thin the cloud until it fits whole"
