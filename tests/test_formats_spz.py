@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import math
 import struct
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -187,15 +188,19 @@ def test_files_that_lie_are_refused(tmp_path, data, said):
     assert str(caught.value).startswith(f"{tmp_path / 'a.spz'}: ")
 
 
-def test_a_column_that_unpacks_to_more_is_refused(tmp_path):
+@pytest.mark.parametrize("states_its_size", [True, False])
+@pytest.mark.parametrize("unpacked", [1 << 26, 80])
+def test_a_column_that_unpacks_to_another_size_is_refused_and_not_unpacked(tmp_path, states_its_size, unpacked):
     zstandard = pytest.importorskip("zstandard")
-    bomb = zstandard.ZstdCompressor().compress(bytes(1 << 26))
-    unsized = zstandard.ZstdCompressor(write_content_size=False).compress(bytes(1 << 26))
-    for frame in (bomb, unsized):
-        sizes = struct.pack("<QQ", len(frame), 81) * 5
-        (tmp_path / "a.spz").write_bytes(header(4, 9, last=5) + struct.pack("<I12x", 32) + sizes + frame * 5)
-        with pytest.raises(SceneError, match="column 0"):
-            read_points(tmp_path / "a.spz")
+    frame = zstandard.ZstdCompressor(write_content_size=states_its_size).compress(bytes(unpacked))
+    sizes = struct.pack("<QQ", len(frame), 81) * 5
+    (tmp_path / "a.spz").write_bytes(header(4, 9, last=5) + struct.pack("<I12x", 32) + sizes + frame * 5)
+    tracemalloc.start()
+    with pytest.raises(SceneError, match="column 0"):
+        read_points(tmp_path / "a.spz")
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 1 << 20
 
 
 @pytest.mark.parametrize("version", [2, 3, 4])
