@@ -129,6 +129,11 @@ def test_too_few_photographs_and_a_missing_library(tmp_path, monkeypatch):
         find_poses(tmp_path / "none")
     for index in range(3):
         write_image(tmp_path / "images" / f"{index}.png", np.zeros((8, 8, 3), np.uint8))
+    (tmp_path / "other" / "images").mkdir(parents=True)
+    with pytest.raises(SceneError, match=r"images holds other images than .*name another folder"):
+        find_poses(tmp_path, tmp_path / "other")
+    (tmp_path / "other" / "images").rmdir()
+    (tmp_path / "other").rmdir()
     monkeypatch.setitem(sys.modules, "pycolmap", None)
     with pytest.raises(MissingExtraError, match="poses"):
         find_poses(tmp_path)

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud.errors import MissingExtraError, SceneError, printable
+from og_pointcloud.errors import MissingExtraError, SceneError
 from og_pointcloud.formats.atomic import replacing_folder
 from og_pointcloud.formats.images import image_size
 from og_pointcloud.formats.poses import numbered_images
@@ -81,19 +81,9 @@ def find_poses(
     """
     source = Path(photographs)
     target = source if capture is None else Path(capture)
-    files = numbered_images(source) or numbered_images(source / "images")
-    if len(files) < FEWEST:
-        raise SceneError(f"{source} has {len(files)} photographs; expected {FEWEST} or more, there or in its images/")
-    if (target / MODEL_FOLDER).exists():
-        raise SceneError(f"{target / MODEL_FOLDER} is there already; expected none: remove it, or name another folder")
+    files = _photographs(source, target)
     with naming(target), tempfile.TemporaryDirectory(prefix="og-pointcloud-") as work:
-        run = _Run(files, Path(work), longest_side, threads, Journal(progress))
-        times = [time.perf_counter()]
-        for step in (run.find_features, run.match):
-            step()
-            times.append(time.perf_counter())
-        model = run.map()
-        times.append(time.perf_counter())
+        model, seconds = _Run(files, Path(work), longest_side, threads, Journal(progress)).model()
         _require_enough(model, files)
         placed = _put_back_names(model, files)
         _turn_upright(model)
@@ -103,11 +93,21 @@ def find_poses(
         if capture is not None and not (target / "images").exists():
             (target / "images").symlink_to(files[0].parent.resolve(), target_is_directory=True)
     left_out = tuple(file.name for file in files if file.name not in placed)
-    features, matches, mapping = np.diff(times).tolist()
-    return PosesFound(
-        target, len(placed), len(files), model.num_points3D(), float(model.compute_mean_reprojection_error()), left_out,
-        (features, matches, mapping),
-    )  # fmt: skip
+    error_px = float(model.compute_mean_reprojection_error())
+    return PosesFound(target, len(placed), len(files), model.num_points3D(), error_px, left_out, seconds)
+
+
+def _photographs(source: Path, target: Path) -> list[Path]:
+    """The files, in the order of their numbers; SceneError where they cannot become a capture in the target."""
+    files = numbered_images(source) or numbered_images(source / "images")
+    if len(files) < FEWEST:
+        raise SceneError(f"{source} has {len(files)} photographs; expected {FEWEST} or more, there or in its images/")
+    if (target / MODEL_FOLDER).exists():
+        raise SceneError(f"{target / MODEL_FOLDER} is there already; expected none: remove it, or name another folder")
+    images = target / "images"
+    if images.exists() and not images.samefile(files[0].parent):
+        raise SceneError(f"{images} holds other images than {files[0].parent}; expected none: name another folder (-o)")
+    return files
 
 
 def _pycolmap() -> Any:
@@ -132,7 +132,17 @@ class _Run:
         for file, name in zip(files, self._names, strict=True):
             (self._folder / name).symlink_to(file.resolve())
 
-    def find_features(self) -> None:
+    def model(self) -> tuple[Any, tuple[float, float, float]]:
+        """The largest model, None where there is none, and the seconds of the steps."""
+        start = time.perf_counter()
+        self._find_features()
+        found = time.perf_counter()
+        self._match()
+        matched = time.perf_counter()
+        model = self._map()
+        return model, (found - start, matched - found, time.perf_counter() - matched)
+
+    def _find_features(self) -> None:
         colmap, camera_of_size = self._colmap, dict[tuple[int, int], int]()
         options = colmap.FeatureExtractionOptions(
             use_gpu=False, num_threads=self._threads, max_image_size=self._longest_side
@@ -146,7 +156,7 @@ class _Run:
                 colmap.Device.cpu,
             )  # fmt: skip
 
-    def match(self) -> None:
+    def _match(self) -> None:
         colmap, pairs = self._colmap, _pairs(len(self._names))
         options = colmap.FeatureMatchingOptions(use_gpu=False, num_threads=self._threads)
         pairing, verification = colmap.ImportedPairingOptions(), colmap.TwoViewGeometryOptions()
@@ -156,8 +166,7 @@ class _Run:
             self._pairs_file.write_text("".join(lines))
             colmap.match_image_pairs(self._database, options, pairing, verification, colmap.Device.cpu)
 
-    def map(self) -> Any:
-        """The largest model, None where there is none."""
+    def _map(self) -> Any:
         colmap = self._colmap
         colmap.set_random_seed(SEED)
         options = colmap.IncrementalPipelineOptions(num_threads=self._threads, random_seed=SEED, min_model_size=FEWEST)
@@ -195,7 +204,7 @@ def _put_back_names(model: Any, files: Sequence[Path]) -> set[str]:
     for number in model.reg_image_ids():
         image = model.images[number]
         image.name = files[int(image.name.partition(".")[0])].name
-        placed.add(printable(image.name))
+        placed.add(image.name)
     return placed
 
 
