@@ -105,7 +105,7 @@ def _photographs(source: Path, target: Path) -> list[Path]:
     if (target / MODEL_FOLDER).exists():
         raise SceneError(f"{target / MODEL_FOLDER} is there already; expected none: remove it, or name another folder")
     images = target / "images"
-    if images.exists() and not images.samefile(files[0].parent):
+    if target != source and images.exists() and not images.samefile(files[0].parent):
         raise SceneError(f"{images} holds other images than {files[0].parent}; expected none: name another folder (-o)")
     return files
 
