@@ -88,7 +88,8 @@ def _poses_of_drive(folder: Path) -> Path:
 
 def _sensor(file: Path, camera: str) -> tuple[Sensor, NDArray[np.float64]]:
     """The lens of a rectified camera, and its place in the left one's frame, (4, 4)."""
-    lines = dict(line.partition(":")[::2] for line in read_text(file).splitlines())
+    parts = (line.partition(":") for line in read_text(file).splitlines())
+    lines = {key: numbers for key, _, numbers in parts}
     width, height = _stated(lines, f"S_rect_{camera}", 2, file)
     projection = np.reshape(_stated(lines, f"P_rect_{camera}", 12, file), (3, 4))
     sensor = Sensor.from_matrix((round(width), round(height)), projection)
