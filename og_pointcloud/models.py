@@ -307,6 +307,8 @@ def message_fields(message: memoryview | int) -> Iterator[tuple[int, memoryview 
 
 
 def _varint(data: memoryview, position: int) -> tuple[int, int]:
+    if position < len(data) and data[position] < 0x80:  # nearly all
+        return data[position], position + 1
     value = 0
     for shift in range(0, 70, 7):
         if position >= len(data):
