@@ -66,7 +66,7 @@ def share_here(otherwise: Share) -> Share:
 
 
 def run_tasks(
-    executor: Executor | None, function: Callable[[Item], Result], items: Sequence[Item], journal: Journal, name: str
+    executor: Executor | None, journal: Journal, function: Callable[[Item], Result], items: Sequence[Item], name: str
 ) -> list[Result]:
     """The function's value of each item, in their order: made here, one after another, or by an executor's workers."""
     if executor is None:

@@ -18,7 +18,7 @@ neither the order nor the place of the tiles shows in the result, but for what h
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import partial
@@ -121,48 +121,37 @@ def fit_tiles(
         journal.leave_out(LeftOut.WHOLE_FIT, count=len(scene.points))
     scene = with_needed_views(scene, settings, journal)
     scene, row_of_point = with_distinct_points(scene, journal)
-    run = _Run(settings, work, journal, executor)
-    most = settings.tile_points or _points_per_tile(len(scene.points), run.memory(len(scene.points)))
+    count, run = len(scene.points), partial(run_tasks, executor, journal)
+    most = settings.tile_points or _points_per_tile(count, _memory(count, settings, executor))
     with journal.stage("spacing"):
         cloud = TiledCloud.cut(scene.points, most, settings, work)
         journal.notes["tiles"] = np.diff(cloud.tiles.start).tolist()
         journal.notes["tile_margins"] = [float(f"{margin:.4g}") for margin in cloud.margins]
         spacing = partial(_spacing, cloud, settings)
-        work.array("spacing", cloud.key, lambda: np.concatenate(run.all(spacing, range(len(cloud.tiles)), "spacing")))
+        work.array("spacing", cloud.key, lambda: np.concatenate(run(spacing, range(len(cloud.tiles)), "spacing")))
     with journal.stage("geometry"):
         drawing = _drawing(scene.views, cloud, settings, journal)
     with journal.stage("visibility"):
-        shown = _look(scene, cloud, drawing, run)
+        look = partial(_look_at, cloud, drawing, settings)
+        looked = run(look, [replace(view, image=None) for view in scene.views], "visibility")
+        shown = _all_shown(scene, cloud, looked, journal)
     with journal.stage("grouping"):
         groups, looks = _groups(cloud, shown, settings, journal)
     with journal.stage("membership"):
         no_features = replace(shown, mask_features=np.zeros((len(shown.mask_view), 0), np.float32))
         decide = partial(_decide, cloud, no_features, (groups, looks), settings)
-        decided = run.all(decide, range(len(cloud.tiles)), "membership")
+        decided = run(decide, range(len(cloud.tiles)), "membership")
     with journal.stage("association"):
         labelling = _instances(cloud, shown, looks, decided, settings)
     return labelling.of_points(row_of_point), float(np.median(cloud.spacing))
 
 
-@dataclass(frozen=True)
-class _Run:
-    """How the fit is done, and where."""
-
-    settings: FitSettings
-    work: WorkFolder
-    journal: Journal
-    executor: Executor | None
-
-    def all(self, function: Callable[[Item], Result], items: Sequence[Item], name: str) -> list[Result]:
-        """The function's value of each item, in their order."""
-        return run_tasks(self.executor, function, items, self.journal, name)
-
-    def memory(self, points: int) -> int:
-        """Bytes that the fit may still take, here and in a worker, where the points are mapped, not held."""
-        left = memory_left(self.settings.memory)
-        if self.executor is None or (share := self.executor.submit(share_here, Share()).result().memory) is None:
-            return left
-        return min(left, share + points * CLOUD_BYTES)
+def _memory(points: int, settings: FitSettings, executor: Executor | None) -> int:
+    """Bytes that a fit may still take, here and in a worker, where the points are mapped, not held."""
+    left = memory_left(settings.memory)
+    if executor is None or (share := executor.submit(share_here, Share()).result().memory) is None:
+        return left
+    return min(left, share + points * CLOUD_BYTES)
 
 
 def _points_per_tile(points: int, left: int) -> int:
@@ -264,16 +253,13 @@ def _stacked(entries: Entries, masks: int, seldom: NDArray[np.bool_]) -> tuple[c
     return matrix[:masks], matrix[masks : masks + 1], matrix[masks + 1 :]
 
 
-def _look(scene: Scene, cloud: TiledCloud, drawing: _Drawing, run: _Run) -> _Shown:
-    """Render every view once, but for those that an interrupted fit has left in the work folder."""
-    work, journal = run.work, run.journal
-    views = [replace(view, image=None) for view in scene.views]
-    looked = run.all(partial(_look_at, cloud, drawing, run.settings), views, "visibility")
-    found = sum(view.was_there for view in looked)
+def _all_shown(scene: Scene, cloud: TiledCloud, looked: Sequence[_LookedAt], journal: Journal) -> _Shown:
+    """What the views show, all of which are in the work folder."""
+    if found := sum(view.was_there for view in looked):
+        folder = "" if cloud.work.folder is None else cloud.work.folder.name
+        journal.leave_out(LeftOut.RENDERING, count=found, folder=folder)
     for view in looked:
-        work.adopt("view", view.key)
-    if found:
-        journal.leave_out(LeftOut.RENDERING, count=found, folder="" if work.folder is None else work.folder.name)
+        cloud.work.adopt("view", view.key)
     masks = [view.mask_features for view in scene.views if view.mask_count]
     require_sight(sum(int(view.first[-1]) for view in looked), len(masks), scene)
     drawn, inside = np.sum([view.drawn for view in looked], axis=0).tolist()
