@@ -11,6 +11,9 @@ A view in which the proposer missed k has no vote about k; a view that has a mas
 an edge or through a thin surface leave low shares on what lies behind, in many views; torn mask edges leave middling
 shares on the rim of the object itself. The two are told apart by place: a middling share counts only where the
 point adjoins surely labelled points of the same instance (hysteresis, as in Canny's edges).
+
+Of several groups a point is of the one with the most votes; but proposers let large things swallow small ones: where
+that group's own views contradict it and a smaller one is sure, the smaller one has the point.
 """
 
 from __future__ import annotations
@@ -43,7 +46,7 @@ ENTRIES_AT_ONCE = 1 << 26
 @dataclass(frozen=True)
 class Membership:
     """instance_ids: (n,) int32, a group, BACKGROUND or UNOBSERVED. share: (n,) float32, the share above for the group
-    that covers the point most. certainty: (n,) float32 in [0, 1], how far views and neighbours bear out the state that
+    that the point is of, if it is of any. certainty: (n,) float32 in [0, 1], how far views and neighbours bear out the state that
     a point is given, the product of both; 0 where no view sees it. detection_rate: (groups,) float32, the part of a
     group's visible weight that lies in views that have a mask of it. dismissed: (groups,) bool, groups that the scene's
     views contradict as a whole."""
@@ -62,7 +65,8 @@ def assign_points(
     neighbourhood: Neighbourhood,
     settings: MembershipSettings,
 ) -> Membership:
-    """Decide the state of every point. Groups keep their numbers; a dismissed group ends with no point."""
+    """Decide the state of every point. Groups keep their numbers, of which a later one shows less, as `group_masks` has
+    them (leaves of a codebook are in no order); a dismissed group ends with no point."""
     has_mask = np.zeros((groups.count, table.outside.shape[0]), np.bool_)
     grouped = groups.group >= 0
     has_mask[groups.group[grouped], table.mask_view[grouped]] = True
