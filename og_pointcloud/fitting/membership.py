@@ -46,10 +46,10 @@ ENTRIES_AT_ONCE = 1 << 26
 @dataclass(frozen=True)
 class Membership:
     """instance_ids: (n,) int32, a group, BACKGROUND or UNOBSERVED. share: (n,) float32, the share above for the group
-    that the point is of, if it is of any. certainty: (n,) float32 in [0, 1], how far views and neighbours bear out the state that
-    a point is given, the product of both; 0 where no view sees it. detection_rate: (groups,) float32, the part of a
-    group's visible weight that lies in views that have a mask of it. dismissed: (groups,) bool, groups that the scene's
-    views contradict as a whole."""
+    that the point is of, if it is of any. certainty: (n,) float32 in [0, 1], how far views and neighbours bear out the
+    state that a point is given, the product of both; 0 where no view sees it. detection_rate: (groups,) float32, the
+    part of a group's visible weight that lies in views that have a mask of it. dismissed: (groups,) bool, groups that
+    the scene's views contradict as a whole."""
 
     instance_ids: NDArray[np.int32]
     share: NDArray[np.float32]
