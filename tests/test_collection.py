@@ -152,6 +152,8 @@ def test_vectors_are_asked_of_the_scenes_of_their_encoder(folder):
     collection = indexed(folder, clouds)
     features = (Vocabulary(("seat",), ENCODER["chair"][None]), "another/encoder")
     assert {f.scene for f in collection.find("seat", text_features=features)} == {"b"}
+    other_width = (Vocabulary(("chair",), np.ones((1, 5), np.float32)), SPACE)
+    assert [f.scene for f in collection.find("chair", scenes="a", text_features=other_width)] == ["a"]
     with pytest.raises(OgPointcloudError, match="'seat' is not among the 8 words"):
         collection.find("seat", text_features=(Vocabulary(("seat",), np.ones((1, 5), np.float32)), "another/encoder"))
 

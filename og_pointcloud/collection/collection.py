@@ -203,9 +203,8 @@ class Collection:
     ) -> dict[str, NDArray[np.float32]]:
         """Unit vectors of those words that these scenes can be asked for."""
         known = family.words
-        if features is not None and features[1] == family.feature_space:
+        if features is not None and (features[1], features[0].vectors.shape[1]) == (family.feature_space, family.width):
             known = known | dict(zip(features[0].names, unit_rows(features[0].vectors), strict=True))
-            known = {name: vector for name, vector in known.items() if len(vector) == family.width}
         vectors = {name: known[name] for name in names if name in known}
         missing = [name for name in names if name not in known]
         if missing and (encoder := self._encoder(family)) is not None and encoder.width == family.width:

@@ -2,7 +2,7 @@
 
     scenes      a row each: name, hash of its file, feature space; arrays of its instances and descriptors
     words       vocabularies and word banks, each once, however many scenes share them, by a hash of their content
-    judgements  by which words a scene's instances are judged, and what that makes of its descriptors (`judging`)
+    judgements  by which words a scene's instances are judged, and what that makes of its descriptors (`Standard`)
     boxes       an R*Tree of the boxes of scenes
 
 A change is one transaction: whoever reads sees the atlas before it or after it, and a process that is killed leaves
