@@ -252,7 +252,9 @@ class Mapper:
                     f"frame {given.stamp:g} has no depth, and the map has no points yet; expected depth or a cloud: "
                     "start with Mapper(cloud=points), or with a map, where frames have masks alone"
                 )
-            spacing = PIXELS_PER_SPACING * given.view.pixel if self._spacing is None else self._spacing
+            # A sparse depth image is looked at with larger pixels than it has; many frames fill the map between them.
+            pixel = given.view.pixel * given.view.camera.fx / given.camera.fx
+            spacing = self._spacing or max(PIXELS_PER_SPACING * pixel, given.view.pixel)
             known = GrowingMap.empty(origin, self._space, spacing)
         return given, known
 
