@@ -7,6 +7,7 @@ import importlib
 import json
 import os
 import shutil
+import struct
 import subprocess
 import sys
 import threading
@@ -38,9 +39,11 @@ from text_models import OUT
 import og_pointcloud as og
 from og_pointcloud.bundle.known_graph import KNOWN_GRAPHS, query_graph_digest
 from og_pointcloud.cli import main
+from og_pointcloud.cloud import TOO_FAR
 from og_pointcloud.errors import BundleError, FeatureSpaceError, OgPointcloudError, SceneError, printable
 from og_pointcloud.formats.atomic import LOCK, locked, replacing, replacing_folder
 from og_pointcloud.formats.images import image_size, read_rgb
+from og_pointcloud.formats.las import write_las
 from og_pointcloud.formats.nerfstudio import read_transforms
 from og_pointcloud.formats.npy import arrays_from_npz, npy_bytes
 from og_pointcloud.formats.points import read_points
@@ -241,6 +244,27 @@ def test_a_ply_of_thousands_of_properties(tmp_path):
     (tmp_path / "a.ply").write_bytes(header + bytes(12_000))
     with pytest.raises(SceneError, match="more than 1024 properties"):
         read_points(tmp_path / "a.ply")
+
+
+@pytest.mark.parametrize("scale", [0.0, -1e-4, float("nan")])
+def test_a_las_file_whose_scales_collapse_or_mirror_it(tmp_path, scale):
+    pytest.importorskip("laspy")
+    attributes = {name: np.zeros(9, kind) for name, kind in (("og_label", "i4"), ("og_instance", "i4"))}
+    attributes |= {"og_score": np.ones(9, np.float32), "og_reason": np.zeros(9, np.uint8)}
+    write_las(tmp_path / "a.las", np.eye(9)[:, :3], np.zeros((9, 3), np.uint8), attributes, ("chair",))
+    data = bytearray((tmp_path / "a.las").read_bytes())
+    data[131:155] = struct.pack("<3d", scale, 1e-3, 1e-3)
+    (tmp_path / "a.las").write_bytes(data)
+    with pytest.raises(SceneError, match=r"its scale factors are .*; expected 3 above 0"):
+        read_points(tmp_path / "a.las")
+
+
+@pytest.mark.filterwarnings("ignore:none of")
+def test_what_is_masked_in_an_array_of_points_has_no_label(bundle):
+    points = np.ma.array(room(500).xyz[:4].astype(np.float64), mask=[[k < 2] * 3 for k in range(4)])
+    masked, plain = (og.segment(given, ["apple"], bundle) for given in (points, points.data))
+    assert (masked.instances[:2] == TOO_FAR).all()
+    np.testing.assert_array_equal(masked.instances[2:], plain.instances[2:])
 
 
 # Foreign text ---------------------------------------------------------------------------------------------------------

@@ -67,7 +67,9 @@ def read_las(path: str | os.PathLike[str]) -> Points:
             _check_counts(path)
             # Of the two backends this one makes no room for points that a chunk only claims to have.
             with laspy.open(path, laz_backend=laspy.LazBackend.Lazrs, read_evlrs=False) as reader:
-                promised = reader.header.point_count
+                promised, scales = reader.header.point_count, np.asarray(reader.header.scales)
+                if not (scales > 0).all():  # 0 puts all points into one place, a negative one mirrors them
+                    raise SceneError(f"its scale factors are {scales.tolist()}; expected 3 above 0: export it again")
                 has_colors = "red" in reader.header.point_format.dimension_names
                 for chunk in reader.chunk_iterator(POINTS_PER_CHUNK):
                     xyz.append(np.column_stack([chunk.x, chunk.y, chunk.z]))
