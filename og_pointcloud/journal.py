@@ -40,6 +40,10 @@ class LeftOut(Enum):
         "pixels", "{share:.0%} of the pixels",
         "points lie {spacing_px:.1f} px apart: one row and column in {stride} is enough",
     )
+    PIXELS_IN_PAPER_MODE = (
+        "pixels, mode paper", "{share:.0%} of the pixels",
+        "images of at most {most:,} pixels are rendered: one row and column in {stride} is enough",
+    )
     RENDERING = "rendering", "rendering of {count} views", "an interrupted fit kept them in '{folder}'"
     FINE_POINTS = (
         "points finer than pixels", "{share:.0%} of the points in the images",

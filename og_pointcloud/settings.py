@@ -194,6 +194,9 @@ class PaperSettings(_LossSettings):
     """Eq. 1, 2 and 4 as printed, or as the authors' code computes them; learned/paper.py says what differs."""
     cohesion_weight: float = 0.1
     """Weight of Eq. 1 beside Eq. 2 (the authors' code; 0.01 for LeRF's ramen)."""
+    image_pixels: int = 320 * 240
+    """Pixels rendered of a view at most: every stride-th row and column of larger ones. A step costs by the pixel, and
+    masks of whole things lose nothing; the authors halve ScanNet's 1296 x 968."""
     scale: float = 0.7
     """Standard deviation of a plain cloud's Gaussians, in point spacings: full ones, as trained Gaussians are. Drawn as
     thin as the mask table wants them, an instance rendered alone would cover no pixel by covered_share."""
@@ -201,10 +204,14 @@ class PaperSettings(_LossSettings):
     """Their opacity."""
     covered_share: float = 0.7
     """Pixels whose Gaussians cover less than this are no part of their mask (the authors' code)."""
+    alone_share: float = 0.8
+    """An instance rendered alone has the pixels that it covers by more than this (the authors' code)."""
     feature_rate: float = 1e-3
     """Adam's step length for the features."""
-    codebook_rate: float = 1e-4
-    """Adam's step length for the features behind the codebook (the authors' code)."""
+    coarse_rate: float = 1e-4
+    """Adam's step length for the features behind the coarse codebook (the authors' code)."""
+    fine_rate: float = 1e-3
+    """The same behind the fine codebook (the authors' code)."""
     k1: int = 64
     """Coarse clusters (paper, Eq. 3)."""
     k2: int = 5
@@ -212,6 +219,11 @@ class PaperSettings(_LossSettings):
     masks in it."""
     position_weight: float = 1.0
     """Scene units of position that count as much as one of feature: absolute, as published (1.0 ScanNet, 0.5 LeRF)."""
+    cluster_raw: bool = True
+    """Cluster features as trained (the authors' code), not as read: longer than those, they count more beside positions.
+    """
+    fine_alone: bool = True
+    """The fine stage draws one coarse cluster a step, by itself (the authors' code; formula "authors" only)."""
     coarse_interval: int = 200
     """Steps between reassignments to coarse clusters (the authors' code)."""
     fine_interval: int = 50
@@ -228,7 +240,7 @@ class PaperSettings(_LossSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name in ("k1", "k2", "coarse_interval", "fine_interval", "lloyd_rounds"):
+        for name in ("k1", "k2", "coarse_interval", "fine_interval", "lloyd_rounds", "image_pixels"):
             if getattr(self, name) < 1:
                 raise OgPointcloudError(f"{name} is {getattr(self, name)}; expected at least 1")
         if not self.schedule_share > 0:

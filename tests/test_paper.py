@@ -26,9 +26,10 @@ from og_pointcloud.settings import PaperSettings
 
 torch = pytest.importorskip("torch")
 paper = pytest.importorskip("og_pointcloud.fitting.learned.paper")
+rendered_views = pytest.importorskip("og_pointcloud.fitting.learned.rendered_views")
 
 NEAR = 0.05
-SHORT = PaperSettings(schedule_share=0.01, covered_share=0.3, feature_rate=1e-2, codebook_rate=1e-3, k1=8, k2=3)
+SHORT = PaperSettings(schedule_share=0.01, covered_share=0.3, feature_rate=1e-2, coarse_rate=1e-3, k1=8, k2=3)
 
 
 @dataclass(frozen=True)
@@ -50,11 +51,11 @@ def test_the_printed_losses_are_those_of_dense_pixels(balls: Balls, dtype: torch
     """Value and gradient of Eq. 1 and 2 over all views, every pixel of a mask counted, pair by pair."""
     settings = PaperSettings(formula="paper", covered_share=0)
     values = np.random.default_rng(0).random((len(balls.gaussians), 6), np.float32)
-    source = paper._Views(balls.gaussians, balls.views, NEAR, settings, whole=False)
+    source = rendered_views.RenderedViews(balls.gaussians, balls.views, NEAR, settings, whole=False)
     features = torch.tensor(values, dtype=dtype, requires_grad=True)
     loss = torch.zeros((), dtype=dtype)
     for view in source:
-        image = paper._Blend.apply(features, view.forward.to(dtype), view.backward.to(dtype))
+        image = view.render(features[source.known])
         separation, cohesion = paper.view_losses(image, view.mask, settings)
         loss = loss + (separation + 10 * cohesion / source.masked_pixels) / len(source)
     loss.backward()
@@ -83,11 +84,11 @@ def test_the_printed_losses_are_those_of_dense_pixels(balls: Balls, dtype: torch
 
 
 def test_blend_has_the_gradient_of_a_dense_product(balls: Balls) -> None:
-    view = paper._Views(balls.gaussians, balls.views[:1], NEAR, SHORT, whole=False)[0]
-    values = torch.rand((len(balls.gaussians), 2), dtype=torch.float64, requires_grad=True)
+    view = rendered_views.RenderedViews(balls.gaussians, balls.views[:1], NEAR, SHORT, whole=False)[0]
+    values = torch.rand((view.weights.shape[1], 2), dtype=torch.float64, requires_grad=True)
     pull = torch.rand((len(view.mask), 2), dtype=torch.float64)
     dense = torch.tensor(view.weights.toarray(), dtype=torch.float64)
-    image = paper._Blend.apply(values, view.forward.double(), view.backward.double())
+    image = view.render(values)
     torch.testing.assert_close(image, dense @ values)
     (gradient,) = torch.autograd.grad(image, values, pull)
     torch.testing.assert_close(gradient, dense.T @ pull)
@@ -141,7 +142,7 @@ def test_both_stages_part_the_balls(balls: Balls, settings: PaperSettings) -> No
     between = np.linalg.norm(red.mean(axis=0) - blue.mean(axis=0))
     assert between > 3 * max(np.linalg.norm(ball - ball.mean(axis=0), axis=1).mean() for ball in (red, blue))
 
-    book = paper.train_codebook(balls.gaussians, balls.views, NEAR, trained.features, settings)
+    book = paper.train_codebook(balls.gaussians, balls.views, NEAR, trained.raw, settings)
     assert ((book.leaf // settings.k2 == book.coarse) | (book.leaf < 0)).all()
     np.testing.assert_array_equal(book.leaf >= 0, trained.seen > 0)
     assert book.centres.shape == (24, 6)
@@ -166,7 +167,7 @@ def test_training_is_repeatable_and_does_not_depend_on_what_is_kept(balls: Balls
     other = paper.train_features(balls.gaussians, balls.views, NEAR, settings, paper.TrainingRun(seed=3))
     assert np.abs(other.features - first.features).max() > 0.1
     books = [
-        paper.train_codebook(balls.gaussians, balls.views, NEAR, first.features, each, paper.TrainingRun(seed=2))
+        paper.train_codebook(balls.gaussians, balls.views, NEAR, first.raw, each, paper.TrainingRun(seed=2))
         for each in (settings, replace(settings, cache_bytes=0))
     ]
     np.testing.assert_array_equal(books[0].leaf, books[1].leaf)
@@ -178,7 +179,7 @@ def test_gaussians_that_no_mask_shows_get_neither_feature_nor_cluster(balls: Bal
     hidden.xyz[:10] = [0, 0, -50]
     settings = replace(SHORT, schedule_share=0.0005)
     trained = paper.train_features(hidden, balls.views, NEAR, settings)
-    book = paper.train_codebook(hidden, balls.views, NEAR, trained.features, settings)
+    book = paper.train_codebook(hidden, balls.views, NEAR, trained.raw, settings)
     assert (trained.seen[:10] == 0).all()
     assert (trained.features[:10] == 0).all()
     assert (book.coarse[:10] == -1).all()
@@ -198,29 +199,28 @@ def test_fine_clusters_are_at_most_the_masks_held_and_one(balls: Balls) -> None:
 
 def test_a_codebook_step_moves_features_by_the_gradient_of_their_centres(balls: Balls) -> None:
     """Straight through: Adam's first step is the rate against the sign of W' sign(W c - W f), c the centres' rows."""
-    settings = replace(SHORT, formula="paper", k1=4, schedule_share=1 / 20_000)
+    settings = replace(SHORT, formula="paper", normalise=False, k1=4, schedule_share=1 / 20_000)
     features = np.random.default_rng(0).random((len(balls.gaussians), 6), np.float32)
-    source = paper._Views(balls.gaussians, balls.views[:1], NEAR, settings, whole=True)
-    known, nothing = np.flatnonzero(source.seen > 0), np.zeros((int((source.seen > 0).sum()), 0), np.float32)
-    training = paper._CodebookTraining(source, torch.from_numpy(features.copy()), known, settings)
+    source = rendered_views.RenderedViews(balls.gaussians, balls.views[:1], NEAR, settings, whole=True)
+    features = features[source.known]
+    training = paper._CodebookTraining(source, torch.from_numpy(features.copy()), settings)
     history = paper.StageHistory("coarse codebook", 20_000)
-    parts = paper._Parts([np.arange(len(known))], [4], nothing)
-    start = features[known[:4]]
-    own, centres = paper.kmeans(features[known], np.ones(len(known)), start, settings.lloyd_rounds, reseed=True)
+    parts = paper._Parts([np.arange(len(features))], [4], np.zeros((len(features), 0), np.float32))
+    start = features[:4]
+    own, centres = paper.kmeans(features, np.ones(len(features)), start, settings.lloyd_rounds, reseed=True)
     training.train(history, start, parts, paper.TrainingRun(), "")
 
-    weights, quantised = source[0].weights.astype(np.float64), features.astype(np.float64)
-    quantised[known] = centres[own]
+    weights, quantised = source[0].weights.astype(np.float64), centres[own].astype(np.float64)
     image = weights @ quantised - weights @ features.astype(np.float64)
     gradient = weights.T @ np.sign(image)
     clear = np.abs(gradient) > 1e-3
     moved = training.features.numpy() - features
-    np.testing.assert_allclose(moved[clear], -settings.codebook_rate * np.sign(gradient)[clear], atol=1e-7)
+    np.testing.assert_allclose(moved[clear], -settings.coarse_rate * np.sign(gradient)[clear], atol=1e-7)
     assert history.loss[0] == pytest.approx(np.abs(image).mean(), rel=1e-5)
-    assert clear[known].mean() > 0.9
+    assert clear.mean() > 0.9
 
 
-def test_gaussians_shrunk_to_nothing_leave_the_view_as_it_is(balls: Balls) -> None:
+def test_gaussians_shrunk_to_nothing_leave_the_view_as_it_is(balls: Balls, monkeypatch: pytest.MonkeyPatch) -> None:
     class Never:
         """Draws view 0, then "shrink", then "to nothing"."""
 
@@ -232,12 +232,12 @@ def test_gaussians_shrunk_to_nothing_leave_the_view_as_it_is(balls: Balls) -> No
 
     # Half opaque, they cover a pixel by 0.95 only where several overlap.
     faint = replace(balls.gaussians, opacity=np.full(len(balls.gaussians), 0.5, np.float32))
-    source = paper._Views(faint, balls.views, NEAR, replace(SHORT, covered_share=0.95), whole=False)
-    assert len(source.shrunk(0, 0.0).mask) == 0 < len(source[0].mask)
-    features = torch.rand((len(balls.gaussians), 6))
-    known = np.flatnonzero(source.seen > 0)
-    training = paper._CodebookTraining(source, features, known, SHORT)
-    view, target, rows = training._draw(Never())  # pyright: ignore
+    source = rendered_views.RenderedViews(faint, balls.views, NEAR, replace(SHORT, covered_share=0.95), whole=False)
+    assert len(source.drawn(0, 1e-3).mask) == 0 < len(source[0].mask)
+    training = paper._CodebookTraining(source, torch.rand((len(source.known), 6)), SHORT)
+    monkeypatch.setattr(paper, "SIZES", 1000)
+    together = paper._Parts([np.arange(len(source.known))], [4], np.zeros((len(source.known), 0), np.float32))
+    view, target, rows = training._draw(Never(), together)  # pyright: ignore
     assert len(target) == int(rows.sum()) > 0
     assert len(view.mask) == len(source[0].mask)
 
@@ -247,7 +247,7 @@ def test_more_clusters_than_gaussians(balls: Balls) -> None:
     few = replace(few, scale=few.scale * 6)
     settings = replace(SHORT, schedule_share=0.0005, k1=64, covered_share=0)
     trained = paper.train_features(few, balls.views, NEAR, settings)
-    book = paper.train_codebook(few, balls.views, NEAR, trained.features, settings)
+    book = paper.train_codebook(few, balls.views, NEAR, trained.raw, settings)
     assert (book.leaf[trained.seen > 0] >= 0).all()
     assert book.centres.shape == (64 * 3, 6)
 
@@ -273,7 +273,7 @@ def test_a_killed_training_continues_and_ends_with_the_same_bits(
 
         run = paper.TrainingRun(3, progress, work)
         trained = paper.train_features(balls.gaussians, balls.views, NEAR, settings, run)
-        book = paper.train_codebook(balls.gaussians, balls.views, NEAR, trained.features, settings, run)
+        book = paper.train_codebook(balls.gaussians, balls.views, NEAR, trained.raw, settings, run)
         if stop == ("end", 0):
             raise Killed
         return trained, book

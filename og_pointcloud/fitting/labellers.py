@@ -23,7 +23,13 @@ from og_pointcloud.fitting.association import describe_instances, part_of
 from og_pointcloud.fitting.grouping import MaskGroups, group_masks
 from og_pointcloud.fitting.learned.codebook import two_level_codebook
 from og_pointcloud.fitting.learned.instance_features import learn_features
-from og_pointcloud.fitting.learned.matching import Matching, alone_evidence, match_masks, visible_evidence
+from og_pointcloud.fitting.learned.matching import (
+    Matching,
+    alone_evidence,
+    match_masks,
+    rendered_masks,
+    visible_evidence,
+)
 from og_pointcloud.fitting.looks import by_look, looks_of_groups
 from og_pointcloud.fitting.mask_table import MaskTable
 from og_pointcloud.fitting.membership import assign_points
@@ -118,7 +124,7 @@ def paper(
         with journal.stage("features"):
             trained = train_features(gaussians, views, near, options, run)
         with journal.stage("codebook"):
-            book = train_codebook(gaussians, views, near, trained.features, options, run)
+            book = train_codebook(gaussians, views, near, trained.raw, options, run)
     journal.notes["training"] = [
         {
             "stage": history.name,
@@ -135,8 +141,10 @@ def paper(
     ids[book.leaf >= 0] = leaf
     centres = book.centres[used]
     with journal.stage("matching"):
-        shown = mask_means(table, trained.features)
-        evidence = alone_evidence(gaussians, views, near, ids, centres, shown, options.covered_share)
+        shown, pure = rendered_masks(gaussians, views, near, trained.features, options.covered_share)
+        evidence = alone_evidence(gaussians, views, near, ids, centres, shown, options.alone_share)
+        if options.formula == "authors":
+            evidence = evidence.of_masks(pure)
         matching = match_masks(table, ids, evidence, options.matching)
     return _leaves_as_instances(table, ids, (used // options.k2).astype(np.int32), matching)
 

@@ -29,6 +29,7 @@ __all__ = [
     "pixel_stride",
     "reconstruct_surface",
     "sight_thickness",
+    "stride_for_pixels",
     "surface_thickness",
     "with_distinct_points",
     "with_needed_views",
@@ -83,7 +84,11 @@ def reconstruct_surface(scene: Scene, settings: FitSettings, journal: Journal) -
         by_sight = not scene.points.are_gaussians and settings.mode != "paper"
         spacing, typical = around.spacing, float(np.median(around.spacing))
         thickness = surface_thickness(gaussians, spacing, typical, settings.geometry, by_sight=by_sight)
-        stride = 1 if by_sight else pixel_stride(scene.points, around.spacing, scene.views, journal)
+        stride = 1
+        if settings.mode == "paper":
+            stride = stride_for_pixels(scene.views, settings.paper.image_pixels, journal)
+        elif not by_sight:
+            stride = pixel_stride(scene.points, around.spacing, scene.views, journal)
     return Surface(scene, row_of_point, around, gaussians, near, thickness, stride, by_sight)
 
 
@@ -154,4 +159,14 @@ def pixel_stride(points: Points, spacing: NDArray[np.float32], views: Sequence[V
     stride = int(np.clip(spacing_px / PIXELS_PER_SPACING, 1, min(MOST_STRIDE, smallest)))
     if stride > 1:
         journal.leave_out(LeftOut.PIXELS, share=1 - 1 / stride**2, spacing_px=round(spacing_px, 3), stride=stride)
+    return stride
+
+
+def stride_for_pixels(views: Sequence[View], most: int, journal: Journal) -> int:
+    """The least stride that leaves the largest image no more than ``most`` pixels."""
+    largest = max(view.camera.width * view.camera.height for view in views)
+    smallest = min(min(view.camera.width, view.camera.height) for view in views)
+    stride = min(max(1, int(np.ceil(np.sqrt(largest / most)))), smallest)
+    if stride > 1:
+        journal.leave_out(LeftOut.PIXELS_IN_PAPER_MODE, share=1 - 1 / stride**2, most=most, stride=stride)
     return stride

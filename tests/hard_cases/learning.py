@@ -201,7 +201,7 @@ def paper_codebook_with_empty_clusters() -> Answer:
 
     scene, balls = two_balls(points=40)
     features = (np.where(balls[:, None] == 0, 0.2, 0.7) * np.ones((1, 6))).astype(np.float32)
-    still = PaperSettings(k1=8, k2=8, codebook_rate=0.0, schedule_share=1e-3)
+    still = PaperSettings(normalise=False, k1=8, k2=8, coarse_rate=0.0, fine_rate=0.0, schedule_share=1e-3)
     book = train_codebook(solid(scene.points.xyz), scene.views, NEAR, features, still)
     known = np.flatnonzero(book.leaf >= 0)
     return Answer(np.r_[book.centres[book.leaf[known]].ravel(), len(known) > 40], np.r_[features[known].ravel(), 1])

@@ -11,10 +11,11 @@ the best score is accepted, if that is good enough; the encoder's features of ac
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
 
 from og_pointcloud.cloud import InstanceTable
 from og_pointcloud.fitting.association import directions
@@ -23,7 +24,21 @@ from og_pointcloud.rendering.splatting import FRUSTUM_MARGIN, Gaussians, render
 from og_pointcloud.scene import Camera, View
 from og_pointcloud.settings import MatchingSettings
 
-__all__ = ["Evidence", "Matching", "alone_evidence", "eq5_scores", "match_masks", "visible_evidence"]
+__all__ = [
+    "Evidence",
+    "Matching",
+    "alone_evidence",
+    "eq5_scores",
+    "filled_masks",
+    "match_masks",
+    "rendered_masks",
+    "visible_evidence",
+]
+
+MIXED_VARIANCE = 0.006
+"""A mask whose features vary more is no target of Eq. 4, and not accepted by Eq. 5 (the authors' code), unless large."""
+LARGE_SHARE = 0.8
+"""Masks of this share of the largest's pixels or more count all the same (the authors' code)."""
 
 
 @dataclass(frozen=True)
@@ -39,6 +54,11 @@ class Evidence:
     mask_area: NDArray[np.float64]
     instance_area: NDArray[np.float64]
     distance: NDArray[np.float64]
+
+    def of_masks(self, kept: NDArray[np.bool_]) -> Evidence:
+        """The same without the other masks: they have nothing in common with any instance."""
+        distance = np.where(kept[:, None], self.distance, np.inf)
+        return replace(self, shared=self.shared * kept[:, None], distance=distance)
 
 
 @dataclass(frozen=True)
@@ -74,6 +94,35 @@ def visible_evidence(
     return Evidence(shared, np.asarray(table.weights.sum(axis=1), np.float64), instance_area, distance)
 
 
+def filled_masks(
+    image: NDArray[np.floating], mask: NDArray[np.integer], count: int
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """The mean feature of each mask, P of Eq. 5, (count, width), and whether the mask is of one feature, or large.
+
+    image: (pixels, width) rendered features; mask: (pixels,) the mask of each, 0..count-1. One without a pixel is zero.
+    """
+    pixels = np.bincount(mask, minlength=count)
+    own = csr_array((np.ones(len(mask)), (mask, np.arange(len(mask)))), shape=(count, len(mask)))
+    means = (own @ image) / np.maximum(pixels, 1)[:, None]
+    variance = (own @ (image - means[mask]) ** 2).mean(axis=1) / np.maximum(pixels, 1)
+    pure = (variance <= MIXED_VARIANCE) | (pixels >= LARGE_SHARE * pixels.max(initial=0))
+    return means, pure & (pixels > 0)
+
+
+def rendered_masks(
+    gaussians: Gaussians, views: Sequence[View], near: float, features: NDArray[np.float32], covered_share: float
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """`filled_masks` of all views, (masks, width) and (masks,), from the pixels that are covered by ``covered_share``."""
+    found = []
+    for view in views:
+        image, alpha = render(gaussians, features, view.camera, near)
+        ids = view.mask_map()
+        inside = (ids >= 0) & (alpha >= covered_share)
+        found.append(filled_masks(image[inside], ids[inside], view.mask_count))
+    means, pure = zip(*found, strict=True)
+    return np.concatenate(means), np.concatenate(pure)
+
+
 def alone_evidence(
     gaussians: Gaussians,
     views: Sequence[View],
@@ -81,12 +130,12 @@ def alone_evidence(
     instance_ids: NDArray[np.int32],
     instance_features: NDArray[np.floating],
     mask_features: NDArray[np.floating],
-    covered_share: float = 0.7,
+    covered_share: float,
 ) -> Evidence:
     """The paper's evidence: each instance rendered by itself in every view, as if nothing stood before it.
 
-    Its pixels are those it covers by more than ``covered_share`` (pi; 0.7 in the authors' code); the distance is the
-    mean over those of them that lie in the mask. Instances without a Gaussian before the camera are not rendered.
+    Its pixels are those it covers by more than ``covered_share`` (pi); the distance is the mean over those of them that
+    lie in the mask. Instances without a Gaussian before the camera are not rendered.
     One rendering per instance and view: slow. near: depth of the near plane; the rest as in `visible_evidence`.
     """
     count = len(instance_features)

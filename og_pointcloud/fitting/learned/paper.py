@@ -10,34 +10,37 @@ lets Adam move all features. ``formula`` chooses between the printed equations a
              LATE_STEP only the nearest tenth keeps its weight, the others the least.
     Eq. 4    paper: L1 between the map of cluster centres and that of the features of stage 1, over the image.
              authors: the target is each mask's mean painted back, L1 in the coarse stage, squares in the fine one;
-             masks of mixed features are left out; in some steps all Gaussians are drawn smaller, so that hidden ones
-             show and features become right per point, not only per blend.
+             masks of mixed features are left out, here and in the association; in some steps all Gaussians are drawn
+             smaller, so that hidden ones show and features become right per point, not only per blend; the fine stage
+             draws one coarse cluster a step, by itself.
+    Eq. 3    paper: clusters of features as read. authors: of the raw vectors, whose length positions compare with.
 
-Where published behaviour is a defect this does it right: centres follow their clusters at every step, not only when
-points are reassigned; fine centres start inside their coarse cluster, and empty ones again elsewhere in it; pixels
-without a mask are no target; points that no mask shows get no cluster. Clusters are of features as read, not of their
-raw vectors, whose length means nothing.
+docs/paper.md has all numbers of both beside ours. Where published behaviour is a defect this does it right: centres
+follow their clusters at every step, not only when points are reassigned; fine centres start inside their coarse
+cluster, and empty ones again elsewhere in it; pixels without a mask are no target; points that no mask shows get no
+cluster.
 """
 
 from __future__ import annotations
 
 import time
-import warnings
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from og_pointcloud.errors import MissingExtraError, SceneError
+from og_pointcloud.errors import MissingExtraError
 from og_pointcloud.fitting.grouping import indicator
 from og_pointcloud.fitting.learned.codebook import kmeans
 from og_pointcloud.fitting.learned.instance_features import raw_gradient, read_features
+from og_pointcloud.fitting.learned.matching import filled_masks
+from og_pointcloud.fitting.learned.rendered_views import RenderedView, RenderedViews
 from og_pointcloud.fitting.mask_table import view_fingerprint, weights_by_instance
 from og_pointcloud.fitting.work_folder import WorkFolder, fingerprint
-from og_pointcloud.rendering.splatting import Gaussians, view_weights
+from og_pointcloud.rendering.splatting import Gaussians
 from og_pointcloud.scene import View
 from og_pointcloud.settings import PaperSettings
 
@@ -70,14 +73,10 @@ ROUNDING = 1e-3
 """Distances are rounded off below this where they are not squared: sqrt(d^2 + ROUNDING^2)."""
 ADAM_EPSILON = 1e-15
 """As in 3DGS: gradients of one Gaussian, of a mean over pixels, are small beside the usual 1e-8."""
-MIXED_VARIANCE = 0.006
-"""A mask whose features vary more is no target of Eq. 4 (the authors' code), unless it is large."""
-LARGE_SHARE = 0.8
-"""Masks of this share of the largest's pixels or more are targets all the same."""
 OWN_MASK_SHARE = 0.2
-"""A coarse cluster holds a mask when it has this share of the mask's blended weight or more."""
-
-
+"""A coarse cluster holds a mask when it has more than this share of the mask's blended weight."""
+SIZES = 8
+"""Smaller Gaussians are drawn in so many sizes, evenly spread over 0 to 1 (the authors: any), so that they can be kept."""
 RECENT = 100
 """The loss that is reported is the mean of so many steps: each sees another view."""
 CHECKPOINT_SECONDS = 60.0
@@ -122,9 +121,10 @@ class StageHistory:
 
 @dataclass(frozen=True)
 class TrainedFeatures:
-    """features: (n, width) float32 as read, zero where unseen. seen: (n,) float64, pixels of blending weight in masks;
-    0: the feature was never trained."""
+    """raw: (n, width) float32 as trained, and features: as read; both zero where unseen. seen: (n,) float64, pixels of
+    blending weight in masks; 0: the feature was never trained."""
 
+    raw: NDArray[np.float32]
     features: NDArray[np.float32]
     seen: NDArray[np.float64]
     history: StageHistory
@@ -154,15 +154,16 @@ def train_features(
     Raises SceneError where no view has a mask with a Gaussian in it.
     """
     settings, run = settings or PaperSettings(), run or TrainingRun()
-    source = _Views(gaussians, views, near, settings, whole=False)
-    raw = torch.from_numpy(np.random.default_rng(run.seed).random((len(gaussians), settings.width), np.float32))
+    source = RenderedViews(gaussians, views, near, settings, whole=False)
+    random = np.random.default_rng(run.seed).random((len(gaussians), settings.width), np.float32)
+    trained = torch.from_numpy(random[source.known])
     key = _training_key(gaussians, views, near, settings, run)
     history = StageHistory("features", STEPS[settings.schedule][0])
-    stage = _Stage(history, raw, settings.feature_rate)
+    stage = _Stage(history, trained, settings.feature_rate)
     late = LATE_STEP * settings.schedule_share
     for step, rng in stage.steps(settings, run, key):
         view = source[int(rng.integers(len(source)))]
-        image = view.render(_read(raw, settings.normalise))
+        image = view.render(_read(trained, settings.normalise))
         separation, cohesion = view_losses(image, view.mask, settings, late=step >= late)
         scale = 1 if settings.formula == "authors" else 1 / source.masked_pixels
         loss = settings.inter * separation + settings.intra * settings.cohesion_weight * scale * cohesion
@@ -170,8 +171,10 @@ def train_features(
         loss.backward()
         stage.adam.step()
         history.loss.append(loss.item())
-    features = _read(raw.detach(), settings.normalise).numpy()
-    return TrainedFeatures(np.where(source.seen[:, None] > 0, features, 0).astype(np.float32), source.seen, history)
+    raw, features = np.zeros_like(random), np.zeros_like(random)
+    raw[source.known] = trained.detach().numpy()
+    features[source.known] = _read(trained.detach(), settings.normalise).numpy()
+    return TrainedFeatures(raw, features, source.seen, history)
 
 
 def view_losses(
@@ -214,53 +217,58 @@ def train_codebook(
     gaussians: Gaussians,
     views: Sequence[View],
     near: float,
-    features: NDArray[np.float32],
+    raw: NDArray[np.float32],
     settings: PaperSettings | None = None,
     run: TrainingRun | None = None,
 ) -> TrainedCodebook:
     """Stage 2: a coarse codebook of features and positions, then a fine one of features inside each coarse cluster.
 
-    features: (n, width) as read, of stage 1. A step renders cluster centres in place of features, takes Eq. 4, and
+    raw: (n, width), of stage 1, not yet read. A step renders cluster centres in place of features, takes Eq. 4, and
     moves each feature by the gradient of its centre (straight through). Positions count in scene units, as published.
     """
     settings, run = settings or PaperSettings(), run or TrainingRun()
     rng = np.random.default_rng(run.seed)
-    source = _Views(gaussians, views, near, settings, whole=settings.formula == "paper")
-    known = np.flatnonzero(source.seen > 0)
-    training = _CodebookTraining(source, torch.from_numpy(np.array(features, np.float32)), known, settings)
-    key = _training_key(gaussians, views, near, settings, run, features)
+    source = RenderedViews(gaussians, views, near, settings, whole=settings.formula == "paper")
+    known = source.known
+    training = _CodebookTraining(source, torch.from_numpy(raw[known]), settings)
+    start = training.features.numpy()
+    key = _training_key(gaussians, views, near, settings, run, raw)
 
     coarse = StageHistory("coarse codebook", STEPS[settings.schedule][1])
     places = settings.position_weight * gaussians.xyz[known]
     first = rng.permutation(len(known))[: settings.k1]
-    centres = np.concatenate([features[known[first]], places[first]], axis=1)
+    centres = np.concatenate([start[first], places[first]], axis=1)
     together = _Parts([np.arange(len(known))], [len(centres)], places)
     own, _ = training.train(coarse, centres, together, run, key)
 
     members = [np.flatnonzero(own == cluster) for cluster in range(len(centres))]
-    allowed = _fine_counts(source, known, own, len(centres), settings)
-    seeds = [rng.permutation(rows)[:count] for rows, count in zip(members, allowed, strict=True)]
+    held = _masks_held(source, own, len(centres))
+    seeds = [rng.permutation(rows)[:count] for rows, count in zip(members, _fine_counts(held, settings), strict=True)]
     fine = StageHistory("fine codebook", STEPS[settings.schedule][2])
-    fine_centres = training.features.numpy()[known[np.concatenate(seeds)]]
-    apart = _Parts(members, [len(rows) for rows in seeds], np.zeros((len(known), 0), np.float32))
+    fine_centres = training.features.numpy()[np.concatenate(seeds)]
+    apart = _Parts(members, [len(rows) for rows in seeds], np.zeros((len(known), 0), np.float32), held)
     own_fine, fine_centres = training.train(fine, fine_centres, apart, run, key)
     # Leaf numbers leave room for k2 in every coarse cluster, as published.
     leaf_of_centre = np.concatenate([c * settings.k2 + np.arange(len(rows)) for c, rows in enumerate(seeds)])
     coarse_ids, leaf = np.full(len(gaussians), -1, np.int32), np.full(len(gaussians), -1, np.int32)
     coarse_ids[known], leaf[known] = own, leaf_of_centre[own_fine]
-    table = np.zeros((settings.k1 * settings.k2, features.shape[1]), np.float32)
-    table[leaf_of_centre] = fine_centres
+    table = np.zeros((settings.k1 * settings.k2, raw.shape[1]), np.float32)
+    table[leaf_of_centre] = training.read(torch.from_numpy(fine_centres)).numpy()
     return TrainedCodebook(coarse_ids, leaf, table, (coarse, fine))
 
 
 @dataclass(frozen=True)
 class _Parts:
     """Rows of the known Gaussians that are clustered apart from each other, each part into so many ``counts``.
-    places: (known, 3 or 0), clustered with the features but not rendered."""
+
+    places: (known, 3 or 0), clustered with the features but not rendered. held: of each view (masks, parts) bool, the
+    masks that a part holds; None: of parts that are not drawn by themselves.
+    """
 
     rows: list[NDArray[np.int64]]
     counts: list[int]
     places: NDArray[np.float32]
+    held: list[NDArray[np.bool_]] | None = None
 
     def reassigned(
         self, features: NDArray[np.float32], centres: NDArray[np.float32], rounds: int
@@ -280,71 +288,68 @@ class _Parts:
 class _CodebookTraining:
     """Features that move behind their cluster centres; both codebook stages are runs of it."""
 
-    def __init__(
-        self,
-        source: _Views,
-        features: torch.Tensor,
-        known: NDArray[np.int64],
-        settings: PaperSettings,
-    ) -> None:
-        self.source, self.known, self.settings = source, torch.from_numpy(known), settings
-        self.pseudo = features.clone()  # of stage 1: never changed
-        self.features = features
+    def __init__(self, source: RenderedViews, raw: torch.Tensor, settings: PaperSettings) -> None:
+        self.source, self.settings = source, settings
+        self.pseudo = _read(raw, settings.normalise)  # of stage 1: never changed
+        self.reads_centres = settings.normalise and settings.cluster_raw
+        self.features = raw if self.reads_centres else self.pseudo.clone()
         self.targets: dict[int, tuple[torch.Tensor, torch.Tensor]] = {}
+
+    def read(self, values: torch.Tensor) -> torch.Tensor:
+        """What is rendered of features or centres."""
+        return _read(values, self.reads_centres)
 
     def train(
         self, history: StageHistory, centres: NDArray[np.float32], parts: _Parts, run: TrainingRun, key: str
     ) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
         """Train until the stage's steps are done; own centre of each known Gaussian and the centres (k, width)."""
-        settings, features, known = self.settings, self.features, self.known
-        is_fine, width = history.name.startswith("fine"), features.shape[1]
+        settings, features, width = self.settings, self.features, self.features.shape[1]
+        is_fine = parts.held is not None
         interval = settings.fine_interval if is_fine else settings.coarse_interval
+        rate = settings.fine_rate if is_fine else settings.coarse_rate
         squared = is_fine and settings.formula == "authors"
-        stage = _Stage(history, features, settings.codebook_rate, centres, len(known))
+        stage = _Stage(history, features, rate, centres)
         for step, rng in stage.steps(settings, run, key):
             if step % interval == 0:
-                values = features.detach().numpy()[known]
+                values = features.detach().numpy()
                 stage.own, stage.centres = parts.reassigned(values, stage.centres, settings.lloyd_rounds)
-            view, target, rows = self._draw(rng)
-            quantised = features.detach().clone()
+            view, target, rows = self._draw(rng, parts)
             own = torch.from_numpy(stage.own)
-            quantised[known] = torch.from_numpy(stage.centres[:, :width].copy())[own]
-            quantised.requires_grad_()
+            quantised = torch.from_numpy(stage.centres[:, :width].copy())[own].requires_grad_()
             # Eq. 4, and its gradient by the centres given to the features: straight through.
-            error = view.render(quantised)[rows] - target
+            error = view.render(self.read(quantised))[rows] - target
             loss = error.square().mean() if squared else error.abs().mean()
             (features.grad,) = torch.autograd.grad(loss, quantised)
             stage.adam.step()
-            stage.centres[:, :width] = _cluster_means(features.detach()[known], own, stage.centres[:, :width])
+            stage.centres[:, :width] = _cluster_means(features.detach(), own, stage.centres[:, :width])
             history.loss.append(loss.item())
         features.requires_grad_(False)
-        own, centres = parts.reassigned(features.numpy()[known], stage.centres, settings.lloyd_rounds)
+        own, centres = parts.reassigned(features.numpy(), stage.centres, settings.lloyd_rounds)
         return own.astype(np.int32), centres[:, :width]
 
-    def _draw(self, rng: np.random.Generator) -> tuple[_ViewWeights, torch.Tensor, torch.Tensor | slice]:
-        """A random view, perhaps with smaller Gaussians; what its pixels should show, and which of them."""
+    def _draw(self, rng: np.random.Generator, parts: _Parts) -> tuple[RenderedView, torch.Tensor, torch.Tensor | slice]:
+        """A random view, perhaps with smaller Gaussians or one part alone; what its pixels should show, and which."""
         index = int(rng.integers(len(self.source)))
         view = self.source[index]
         if self.settings.formula == "paper":
             return view, view.render(self.pseudo), slice(None)
         if index not in self.targets:
-            self.targets[index] = _mask_targets(view.render(self.pseudo), view.mask)
+            image = view.render(self.pseudo)
+            means, kept = filled_masks(image.numpy(), view.mask.numpy(), len(view.mask_names))
+            self.targets[index] = torch.from_numpy(means.astype(np.float32)), torch.from_numpy(kept)
         means, kept = self.targets[index]
-        if rng.random() < self.settings.point_pressure:
-            smaller = self.source.shrunk(index, rng.random())
-            place = torch.searchsorted(view.mask_names, smaller.mask_names)[smaller.mask]
-            if kept[place].any():  # else too little is left to cover a pixel of a target
-                return smaller, means[place][kept[place]], kept[place]
-        rows = kept[view.mask]
-        return view, means[view.mask][rows], rows
-
-
-def _mask_targets(image: torch.Tensor, mask: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """The mean feature of each mask, and whether it is a target: of one feature, or large."""
-    pixels = torch.bincount(mask)
-    means = _mask_means(image, mask, pixels)
-    variance = _mask_means((image - means[mask]).square(), mask, pixels).mean(dim=1)
-    return means, (variance <= MIXED_VARIANCE) | (pixels >= LARGE_SHARE * pixels.max())
+        factor = (int(SIZES * rng.random()) + 0.5) / SIZES if rng.random() < self.settings.point_pressure else 1.0
+        part, members = -1, None
+        if self.settings.fine_alone and parts.held is not None and parts.held[index].any():
+            choices = np.flatnonzero(parts.held[index].any(axis=0))
+            part = int(choices[rng.integers(len(choices))])
+            members, kept = parts.rows[part], kept & torch.from_numpy(parts.held[index][:, part])
+        drawn = self.source.drawn(index, factor, part, members)
+        place = torch.searchsorted(view.mask_names, drawn.mask_names)[drawn.mask]
+        if not kept[place].any():  # too little is left to cover a pixel of a target
+            drawn, place, kept = view, view.mask, self.targets[index][1]
+        rows = kept[place]
+        return drawn, means[place][rows], rows
 
 
 def _cluster_means(features: torch.Tensor, own: torch.Tensor, centres: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -354,136 +359,19 @@ def _cluster_means(features: torch.Tensor, own: torch.Tensor, centres: NDArray[n
     return torch.where(points > 0, sums / points.clamp(min=1), torch.from_numpy(centres.copy())).numpy()
 
 
-def _fine_counts(
-    source: _Views, known: NDArray[np.int64], own: NDArray[np.int32], k1: int, settings: PaperSettings
-) -> list[int]:
-    """Fine clusters of each coarse one: k2, or one more than the masks of a view that it holds, if that is fewer."""
-    if settings.formula == "paper":
-        return [settings.k2] * k1
-    cluster = np.full(len(source.seen), -1, np.int32)
-    cluster[known] = own
-    most = np.zeros(k1, np.int64)
+def _masks_held(source: RenderedViews, own: NDArray[np.int32], k1: int) -> list[NDArray[np.bool_]]:
+    """Of each view (masks, k1): the masks that each coarse cluster holds."""
+    held = []
     for view in source:
         of_masks = csr_array(indicator(view.mask.numpy(), len(view.mask_names)) @ view.weights)
-        shares = weights_by_instance(of_masks, cluster, k1) / of_masks.sum(axis=1)[:, None]
-        most = np.maximum(most, (shares > OWN_MASK_SHARE).sum(axis=0))
-    return [int(count) for count in np.minimum(most + 1, settings.k2)]
+        held.append(weights_by_instance(of_masks, own, k1) > OWN_MASK_SHARE * of_masks.sum(axis=1)[:, None])
+    return held
 
 
-@dataclass(frozen=True)
-class _ViewWeights:
-    """One view's blending weights, ready for products.
-
-    weights: (pixels, n) CSR float32, index int32. mask: (pixels,) int64, a row of mask_names, -1 outside masks.
-    mask_names: (m,) int64 ascending, the view's own mask ids.
-    """
-
-    weights: csr_array
-    mask: torch.Tensor
-    mask_names: torch.Tensor
-    forward: torch.Tensor
-    backward: torch.Tensor
-
-    @classmethod
-    def make(cls, weights: csr_array, ids: NDArray[np.int32]) -> _ViewWeights:
-        """ids: (pixels,) the view's own mask ids, -1 outside masks."""
-        names = np.unique(ids[ids >= 0]).astype(np.int64)
-        mask = np.where(ids >= 0, np.searchsorted(names, ids), -1)
-        matrices = _torch_csr(weights), _torch_csr(csr_array(weights.T))
-        return cls(weights, torch.from_numpy(mask), torch.from_numpy(names), *matrices)
-
-    def render(self, values: torch.Tensor) -> torch.Tensor:
-        """(pixels, width) blended values of all Gaussians (n, width)."""
-        return _Blend.apply(values, self.forward, self.backward)
-
-    @property
-    def nbytes(self) -> int:
-        """Both matrices; the scipy one shares its arrays with ``forward``."""
-        return 2 * 8 * self.weights.nnz + 4 * sum(self.weights.shape)
-
-
-class _Views:
-    """Blending weights of all views that have a mask, kept as far as ``cache_bytes`` go, else rendered anew.
-
-    whole: with all pixels, else those in masks that are covered enough. seen: (n,) blending weight in masks.
-    masked_pixels: pixels in masks of a view, on average.
-    """
-
-    def __init__(
-        self, gaussians: Gaussians, views: Sequence[View], near: float, settings: PaperSettings, *, whole: bool
-    ) -> None:
-        self.gaussians, self.near, self.settings, self.whole = gaussians, near, settings, whole
-        self.seen = np.zeros(len(gaussians))
-        self.views: list[View] = []
-        self._kept: dict[int, _ViewWeights] = {}
-        pixels, room = 0, settings.cache_bytes
-        for view in views:
-            weights = self._render(gaussians, view)
-            inside = weights.mask.numpy() >= 0
-            if not inside.any():
-                continue
-            self.seen += weights.weights[inside].sum(axis=0, dtype=np.float64)
-            pixels += int(inside.sum())
-            if weights.nbytes <= room:
-                self._kept[len(self.views)] = weights
-                room -= weights.nbytes
-            self.views.append(view)
-        if not self.views:
-            raise SceneError(
-                f"none of the {len(views)} views has a mask that Gaussians cover by {settings.covered_share} or more; "
-                "expected at least one: make masks, check poses, or lower covered_share"
-            )
-        self.masked_pixels = pixels / len(self.views)
-
-    def __len__(self) -> int:
-        return len(self.views)
-
-    def __getitem__(self, index: int) -> _ViewWeights:
-        return self._kept[index] if index in self._kept else self._render(self.gaussians, self.views[index])
-
-    def shrunk(self, index: int, factor: float) -> _ViewWeights:
-        """The view with all Gaussians' standard deviations times factor; its masks are among those at full size."""
-        smaller = replace(self.gaussians, scale=(self.gaussians.scale * np.float32(factor)).astype(np.float32))
-        return self._render(smaller, self.views[index], self[index].mask_names.numpy())
-
-    def _render(self, gaussians: Gaussians, view: View, masks: NDArray[np.int64] | None = None) -> _ViewWeights:
-        """The view's weights; masks: only these count as such, all by default."""
-        ids = np.maximum(view.mask_map().ravel(), -1)
-        if masks is not None:
-            ids = np.where(np.isin(ids, masks), ids, -1)
-        wanted = np.arange(len(ids)) if self.whole else np.flatnonzero(ids >= 0)
-        number = np.full(len(ids), -1, np.int32)
-        number[wanted] = np.arange(len(wanted))
-        image, ids = number.reshape(view.camera.height, view.camera.width), ids[wanted]
-        weights = view_weights(gaussians, view.camera, image, len(wanted), self.near).rows[:-1]
-        coverage = weights.sum(axis=1)
-        shown = np.bincount(ids + 1, coverage, minlength=view.mask_count + 1) > 0  # place 0: pixels without a mask
-        inside = (ids >= 0) & shown[ids + 1] & (coverage >= self.settings.covered_share)
-        rows = np.flatnonzero(inside | (coverage > 0)) if self.whole else np.flatnonzero(inside)
-        chosen = weights[rows]
-        index = (chosen.indices.astype(np.int32), chosen.indptr.astype(np.int32))
-        small = csr_array((chosen.data, *index), shape=chosen.shape)
-        return _ViewWeights.make(small, np.where(inside, ids, -1)[rows])
-
-
-class _Blend(torch.autograd.Function):
-    """W F with the gradient W' G from a transpose kept beside it: torch's own for CSR is a hundred times slower."""
-
-    @staticmethod
-    def forward(ctx: Any, values: torch.Tensor, weights: torch.Tensor, transposed: torch.Tensor) -> torch.Tensor:
-        ctx.transposed = transposed
-        return weights @ values
-
-    @staticmethod
-    def backward(ctx: Any, gradient: torch.Tensor) -> tuple[torch.Tensor, None, None]:  # pyright: ignore
-        return ctx.transposed @ gradient.contiguous(), None, None
-
-
-def _torch_csr(matrix: csr_array) -> torch.Tensor:
-    parts = [torch.from_numpy(np.ascontiguousarray(array)) for array in (matrix.indptr, matrix.indices, matrix.data)]
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "Sparse CSR tensor support is in beta")
-        return torch.sparse_csr_tensor(*parts, size=matrix.shape, check_invariants=False)
+def _fine_counts(held: list[NDArray[np.bool_]], settings: PaperSettings) -> list[int]:
+    """Fine clusters of each coarse one: k2, or one more than the masks of a view that it holds, if that is fewer."""
+    most = np.max([of_view.sum(axis=0) for of_view in held], axis=0)
+    return [settings.k2 if settings.formula == "paper" else int(min(count + 1, settings.k2)) for count in most]
 
 
 class _Read(torch.autograd.Function):
@@ -528,12 +416,11 @@ class _Stage:
         features: torch.Tensor,
         rate: float,
         centres: NDArray[np.float32] | None = None,
-        known: int = 0,
     ) -> None:
         self.history, self.features = history, features
-        self.adam = torch.optim.Adam([features.requires_grad_()], lr=rate, eps=ADAM_EPSILON)
+        self.adam = torch.optim.Adam([features.requires_grad_()], lr=rate, eps=ADAM_EPSILON, fused=True)
         self.centres = np.zeros((0, 0), np.float32) if centres is None else centres
-        self.own = np.zeros(known, np.int64)
+        self.own = np.zeros(len(features), np.int64)
 
     def steps(self, settings: PaperSettings, run: TrainingRun, key: str) -> Iterator[tuple[int, np.random.Generator]]:
         """The numbers of the steps that are left, each with its own random numbers, which are the same whether or not

@@ -1,0 +1,168 @@
+"""Blending weights of the views that mode paper trains on: geometry is frozen, so each is composited once and kept.
+
+A pixel shows ``M = W F``, and a step of training is two products, ``W F`` and ``W' G`` of the gradient. What is
+composited anew where memory ends is the same to the bit. Gaussians that no mask shows have no column: they get neither
+feature nor cluster, and show nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+
+from og_pointcloud.errors import MissingExtraError, SceneError
+from og_pointcloud.fitting.learned.instance_features import scattered_product, sparse_product
+from og_pointcloud.rendering.splatting import Gaussians, view_weights
+from og_pointcloud.scene import View
+from og_pointcloud.settings import PaperSettings
+
+try:
+    import torch
+except ImportError as error:
+    raise MissingExtraError("torch", "learn") from error
+
+__all__ = ["RenderedView", "RenderedViews"]
+
+
+@dataclass(frozen=True)
+class RenderedView:
+    """One view's blending weights.
+
+    weights: (pixels, known) CSR float32, index int32. mask: (pixels,) int64, a row of mask_names, -1 outside masks.
+    mask_names: (m,) int64 ascending, the view's own mask ids.
+    """
+
+    weights: csr_array
+    mask: torch.Tensor
+    mask_names: torch.Tensor
+
+    def render(self, values: torch.Tensor) -> torch.Tensor:
+        """(pixels, width) blended values of the known Gaussians (known, width)."""
+        return _Blend.apply(values, self.weights)
+
+    @property
+    def nbytes(self) -> int:
+        """What it holds in memory."""
+        return 8 * self.weights.nnz + 12 * len(self.mask)
+
+
+class RenderedViews:
+    """Blending weights of all views that have a mask, kept as far as ``cache_bytes`` go, else composited anew.
+
+    whole: with all pixels, else those in masks that are covered enough. seen: (n,) blending weight in masks. known:
+    rows of the Gaussians that have any. masked_pixels: pixels in masks of a view, on average.
+    """
+
+    def __init__(
+        self, gaussians: Gaussians, views: Sequence[View], near: float, settings: PaperSettings, *, whole: bool
+    ) -> None:
+        self.gaussians, self.near, self.settings, self.whole = gaussians, near, settings, whole
+        self.seen = np.zeros(len(gaussians))
+        self.views: list[View] = []
+        self._kept: dict[tuple[int, float, int], RenderedView] = {}
+        self._room = settings.cache_bytes
+        self._column = np.arange(len(gaussians), dtype=np.int32)
+        pixels = 0
+        for view in views:
+            rendered = self._composited(gaussians, view, self._column)
+            inside = rendered.mask.numpy() >= 0
+            if not inside.any():
+                continue
+            self.seen += rendered.weights[inside].sum(axis=0, dtype=np.float64)
+            pixels += int(inside.sum())
+            self._keep((len(self.views), 1.0, -1), rendered)
+            self.views.append(view)
+        if not self.views:
+            raise SceneError(
+                f"none of the {len(views)} views has a mask that Gaussians cover by {settings.covered_share} or more; "
+                "expected at least one: make masks, check poses, or lower covered_share"
+            )
+        self.masked_pixels = pixels / len(self.views)
+        self.known = np.flatnonzero(self.seen > 0)
+        self._column = np.full(len(gaussians), -1, np.int32)
+        self._column[self.known] = np.arange(len(self.known))
+        for key, rendered in self._kept.items():
+            self._kept[key] = replace(rendered, weights=_with_columns(rendered.weights, self._column, len(self.known)))
+
+    def __len__(self) -> int:
+        return len(self.views)
+
+    def __getitem__(self, index: int) -> RenderedView:
+        return self.drawn(index)
+
+    def drawn(
+        self, index: int, factor: float = 1.0, cluster: int = -1, members: NDArray[np.integer] | None = None
+    ) -> RenderedView:
+        """A view with all Gaussians' standard deviations times ``factor``, and only these ``members`` (rows of the
+        known Gaussians; None: all); its masks are among those at full size.
+
+        cluster: a number of the members, at least 0: the same always stands for the same.
+        """
+        key = index, factor, cluster
+        if key in self._kept:
+            return self._kept[key]
+        rows = None if members is None else self.known[members]
+        gaussians = self.gaussians.take(rows)
+        if factor != 1.0:
+            gaussians = replace(gaussians, scale=(gaussians.scale * np.float32(factor)).astype(np.float32))
+        full = key == (index, 1.0, -1)
+        masks = None if full else self[index].mask_names.numpy()
+        column = self._column if rows is None else self._column[rows]
+        rendered = self._composited(gaussians, self.views[index], column, masks)
+        self._keep(key, rendered)
+        return rendered
+
+    def _keep(self, key: tuple[int, float, int], rendered: RenderedView) -> None:
+        if rendered.nbytes <= self._room:
+            self._kept[key] = rendered
+            self._room -= rendered.nbytes
+
+    def _composited(
+        self, gaussians: Gaussians, view: View, column: NDArray[np.int32], masks: NDArray[np.int64] | None = None
+    ) -> RenderedView:
+        """The view's weights. column: (Gaussians,) of the result, -1 none; masks: only these count, all by default."""
+        ids = np.maximum(view.mask_map().ravel(), -1)
+        if masks is not None:
+            ids = np.where(np.isin(ids, masks), ids, -1)
+        wanted = np.arange(len(ids)) if self.whole else np.flatnonzero(ids >= 0)
+        number = np.full(len(ids), -1, np.int32)
+        number[wanted] = np.arange(len(wanted))
+        image, ids = number.reshape(view.camera.height, view.camera.width), ids[wanted]
+        weights = view_weights(gaussians, view.camera, image, len(wanted), self.near).rows[:-1]
+        coverage = weights.sum(axis=1)
+        shown = np.bincount(ids + 1, coverage, minlength=view.mask_count + 1) > 0  # place 0: pixels without a mask
+        inside = (ids >= 0) & shown[ids + 1] & (coverage >= self.settings.covered_share)
+        rows = np.flatnonzero(inside | (coverage > 0)) if self.whole else np.flatnonzero(inside)
+        ids = np.where(inside, ids, -1)[rows]
+        names = np.unique(ids[ids >= 0]).astype(np.int64)
+        mask = np.where(ids >= 0, np.searchsorted(names, ids), -1)
+        small = _with_columns(weights[rows], column, int(self._column.max(initial=-1)) + 1)
+        return RenderedView(small, torch.from_numpy(mask), torch.from_numpy(names))
+
+
+def _with_columns(weights: csr_array, column: NDArray[np.int32], count: int) -> csr_array:
+    """The weights in other columns, of ``count``; entries whose new column is -1 are left out."""
+    indices, indptr, data = column[weights.indices], weights.indptr, weights.data
+    if (indices < 0).any():
+        kept = indices >= 0
+        indptr = np.concatenate([[0], np.cumsum(kept)])[indptr]
+        indices, data = indices[kept], data[kept]
+    return csr_array((data, indices, indptr.astype(np.int32)), shape=(weights.shape[0], count))
+
+
+class _Blend(torch.autograd.Function):
+    """W F with the gradient W' G: torch's own for CSR is a hundred times slower."""
+
+    @staticmethod
+    def forward(ctx: Any, values: torch.Tensor, weights: csr_array) -> torch.Tensor:
+        ctx.weights = weights
+        return torch.from_numpy(sparse_product(weights, values.numpy())).to(values.dtype)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: torch.Tensor) -> tuple[torch.Tensor, None]:  # pyright: ignore
+        return torch.from_numpy(scattered_product(ctx.weights, gradient.contiguous().numpy())), None
