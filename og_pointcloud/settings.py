@@ -5,8 +5,8 @@ None of them is a length: distances are in point spacings, weights in pixels, th
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Literal
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal, get_args, get_type_hints
 
 from og_pointcloud.errors import OgPointcloudError
 
@@ -167,19 +167,29 @@ class CodebookSettings:
 class MatchingSettings:
     """Masks of instances that a codebook made (learned/matching.py; paper, Sec. 3.3, Eq. 5)."""
 
-    score: Literal["both", "iou", "feature"] = "both"
-    """Eq. 5, or one of its factors alone (the paper's ablation)."""
+    score: Literal["both", "iou", "feature", "within"] = "both"
+    """Eq. 5, or one of its factors alone (the paper's ablation); "within": Eq. 5 with the share of the instance that
+    lies in the mask in place of IoU, which a piece of a large thing never reaches."""
     threshold: float = 0.1
     """A view's best mask is accepted above this score (the authors' code: 0.2)."""
+    relative: bool = False
+    """The threshold counts in best scores as this scene's instances have them, by the median."""
     min_views: int = 1
     """An instance accepted by fewer views is unknown (the authors' code: 2 on ScanNet, 5 on LeRF)."""
-    settle: bool = True
-    """Mode fast: all views settle which instance a point is of (membership.py); else it keeps its leaf, as published.
+    visible: bool = True
+    """An instance shows what the others leave visible of it; else all of it, rendered alone, as published (mode paper).
     """
+    settle: bool = True
+    """All views settle which instance a point is of (membership.py); else it keeps its leaf, as published."""
 
     def __post_init__(self) -> None:
-        if self.score not in ("both", "iou", "feature"):
-            raise OgPointcloudError(f'score is "{self.score}"; expected "both", "iou" or "feature"')
+        scores = get_args(get_type_hints(type(self))["score"])
+        if self.score not in scores:
+            raise OgPointcloudError(f'score is "{self.score}"; expected one of {", ".join(scores)}')
+
+
+LITERAL_MATCHING = MatchingSettings(threshold=0.2, min_views=2, visible=False, settle=False)
+"""Eq. 5 as the authors' code applies it on ScanNet."""
 
 
 @dataclass(frozen=True)
@@ -204,25 +214,24 @@ class PaperSettings(_LossSettings):
     """Their opacity."""
     covered_share: float = 0.7
     """Pixels whose Gaussians cover less than this are no part of their mask (the authors' code)."""
-    alone_share: float = 0.8
-    """An instance rendered alone has the pixels that it covers by more than this (the authors' code)."""
+    alone_share: float = 0.7
+    """An instance rendered alone has the pixels that it covers by more than this (the authors' code: 0.8)."""
     feature_rate: float = 1e-3
     """Adam's step length for the features."""
     coarse_rate: float = 1e-4
     """Adam's step length for the features behind the coarse codebook (the authors' code)."""
-    fine_rate: float = 1e-3
-    """The same behind the fine codebook (the authors' code)."""
-    k1: int = 64
-    """Coarse clusters (paper, Eq. 3)."""
+    fine_rate: float = 1e-4
+    """The same behind the fine codebook (the authors' code: 1e-3, which takes features from those that masks show)."""
+    k1: int | None = 64
+    """Coarse clusters (paper, Eq. 3); None: as many as there are things (learned/codebook.py)."""
     k2: int = 5
     """Fine clusters in each coarse one (paper, Eq. 3: 10 or 5). Formula "authors": fewer where its views show fewer
     masks in it."""
     position_weight: float = 1.0
     """Scene units of position that count as much as one of feature: absolute, as published (1.0 ScanNet, 0.5 LeRF)."""
-    cluster_raw: bool = True
-    """Cluster features as trained (the authors' code), not as read: longer than those, they count more beside positions.
-    """
-    fine_alone: bool = True
+    cluster_raw: bool = False
+    """Cluster features as trained (the authors' code), not as read: they are longer, so positions count less."""
+    fine_alone: bool = False
     """The fine stage draws one coarse cluster a step, by itself (the authors' code; formula "authors" only)."""
     coarse_interval: int = 200
     """Steps between reassignments to coarse clusters (the authors' code)."""
@@ -233,16 +242,26 @@ class PaperSettings(_LossSettings):
     point_pressure: float = 0.5
     """Chance per codebook step that all Gaussians shrink by one random factor, so that hidden ones show (formula
     "authors" only)."""
-    matching: MatchingSettings = field(default_factory=lambda: MatchingSettings(threshold=0.2, min_views=2))
+    matching: MatchingSettings = field(default_factory=lambda: LITERAL_MATCHING)
     """Eq. 5 as the authors' code applies it on ScanNet."""
     cache_bytes: int = 4 << 30
     """Blending weights kept between steps; views beyond are rendered anew."""
 
+    @classmethod
+    def of_authors(cls, dataset: Literal["scannet", "lerf"] = "scannet", **changes: Any) -> PaperSettings:
+        """All as the authors' code has it for a data set, but for the changes; docs/paper.md says where ours differ."""
+        own: dict[str, Any] = {"fine_rate": 1e-3, "alone_share": 0.8, "cluster_raw": True, "fine_alone": True}
+        if dataset == "lerf":
+            matching = replace(LITERAL_MATCHING, min_views=5)
+            own |= {"schedule": "lerf", "k2": 10, "position_weight": 0.5, "matching": matching}
+        return cls(**(own | changes))
+
     def __post_init__(self) -> None:
         super().__post_init__()
         for name in ("k1", "k2", "coarse_interval", "fine_interval", "lloyd_rounds", "image_pixels"):
-            if getattr(self, name) < 1:
-                raise OgPointcloudError(f"{name} is {getattr(self, name)}; expected at least 1")
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise OgPointcloudError(f"{name} is {value}; expected at least 1")
         if not self.schedule_share > 0:
             raise OgPointcloudError(
                 f"schedule_share is {self.schedule_share}; expected more than 0, 1 for the published"

@@ -112,7 +112,7 @@ def test_alone_is_visible_where_nothing_is_in_front() -> None:
     table = mask_table(gaussians, [view], NEAR)
     colours = np.stack([RED, GREEN])
     visible = visible_evidence(table, ids, colours, colours)
-    alone = alone_evidence(gaussians, [view], NEAR, ids, colours, colours)
+    alone = alone_evidence(gaussians, [view], NEAR, ids, colours, colours, 0.7)
     scores = eq5_scores(visible, table.mask_view, SETTINGS), eq5_scores(alone, table.mask_view, SETTINGS)
     assert scores[0].diagonal().min() > 0.7
     np.testing.assert_allclose(*scores, atol=0.1)
@@ -127,7 +127,7 @@ def test_alone_compares_the_map_with_the_filled_mask_pixel_by_pixel() -> None:
     view = View("v", camera(), masks, np.ones((1, 3), np.float32))
     ids = np.zeros(len(gaussians), np.int32)
     feature, of_mask = np.array([0.9, 0.3]), np.array([0.8, 0.4])
-    evidence = alone_evidence(gaussians, [view], NEAR, ids, feature[None], of_mask[None])
+    evidence = alone_evidence(gaussians, [view], NEAR, ids, feature[None], of_mask[None], 0.7)
     alpha = pixel_weights(gaussians, camera(), NEAR).toarray().astype(np.float64).sum(axis=1)
     common = alpha[(alpha > 0.7) & (masks.ravel() == 0)]
     distance = np.abs(common[:, None] * feature - of_mask).sum(axis=1).mean()
@@ -146,7 +146,7 @@ def test_alone_sees_through_what_is_in_front() -> None:
     view = View("v", camera(), masks, np.ones((1, 3), np.float32))
     table = mask_table(gaussians, [view], NEAR)
     colours = np.stack([RED, GREEN])
-    alone = alone_evidence(gaussians, [view], NEAR, ids, colours, RED[None])
+    alone = alone_evidence(gaussians, [view], NEAR, ids, colours, RED[None], 0.7)
     visible = visible_evidence(table, ids, colours, RED[None])
     by_iou = MatchingSettings(score="iou")
     assert eq5_scores(alone, table.mask_view, by_iou)[0, 1] > 0.4
@@ -161,7 +161,7 @@ def test_alone_skips_what_is_not_in_the_image() -> None:
     view = View("v", camera(), np.zeros((37, 50), np.int32), np.ones((1, 3), np.float32))
     for hidden in (away, aside):
         ids = np.zeros(len(hidden), np.int32)
-        evidence = alone_evidence(hidden, [view], NEAR, ids, RED[None], RED[None])
+        evidence = alone_evidence(hidden, [view], NEAR, ids, RED[None], RED[None], 0.7)
         assert evidence.instance_area[0, 0] == 0
         assert np.isinf(evidence.distance[0, 0])
 

@@ -45,6 +45,18 @@ def balls(tiny_capture: TinyCapture) -> Balls:
     return Balls(prepare(scene).surface.gaussians, scene.views, tiny_capture.object_ids)
 
 
+def train_features(gaussians: Gaussians, views: Sequence[View], settings: PaperSettings, run: Any = None) -> Any:
+    source = rendered_views.RenderedViews(gaussians, views, NEAR, settings, whole=False)
+    return paper.train_features(source, settings, run)
+
+
+def train_codebook(
+    gaussians: Gaussians, views: Sequence[View], raw: NDArray[np.float32], settings: PaperSettings, run: Any = None
+) -> Any:
+    source = rendered_views.RenderedViews(gaussians, views, NEAR, settings, whole=settings.formula == "paper")
+    return paper.train_codebook(source, raw, settings, run)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 def test_the_printed_losses_are_those_of_dense_pixels(balls: Balls, dtype: torch.dtype) -> None:
@@ -135,14 +147,14 @@ AS_PRINTED = replace(SHORT, formula="paper", normalise=False, cohesion_weight=3e
 
 @pytest.mark.parametrize("settings", [AS_PRINTED, SHORT], ids=["paper", "authors"])
 def test_both_stages_part_the_balls(balls: Balls, settings: PaperSettings) -> None:
-    trained = paper.train_features(balls.gaussians, balls.views, NEAR, settings)
+    trained = train_features(balls.gaussians, balls.views, settings)
     seen = trained.seen > 5
     assert np.isfinite(trained.features).all()
     red, blue = (trained.features[seen & (balls.object_ids == ball)] for ball in (0, 1))
     between = np.linalg.norm(red.mean(axis=0) - blue.mean(axis=0))
     assert between > 3 * max(np.linalg.norm(ball - ball.mean(axis=0), axis=1).mean() for ball in (red, blue))
 
-    book = paper.train_codebook(balls.gaussians, balls.views, NEAR, trained.raw, settings)
+    book = train_codebook(balls.gaussians, balls.views, trained.raw, settings)
     assert ((book.leaf // settings.k2 == book.coarse) | (book.leaf < 0)).all()
     np.testing.assert_array_equal(book.leaf >= 0, trained.seen > 0)
     assert book.centres.shape == (24, 6)
@@ -159,15 +171,13 @@ def test_both_stages_part_the_balls(balls: Balls, settings: PaperSettings) -> No
 
 def test_training_is_repeatable_and_does_not_depend_on_what_is_kept(balls: Balls) -> None:
     settings = replace(SHORT, schedule_share=0.001)
-    first = paper.train_features(balls.gaussians, balls.views, NEAR, settings, paper.TrainingRun(seed=2))
-    uncached = paper.train_features(
-        balls.gaussians, balls.views, NEAR, replace(settings, cache_bytes=0), paper.TrainingRun(seed=2)
-    )
+    first = train_features(balls.gaussians, balls.views, settings, paper.TrainingRun(seed=2))
+    uncached = train_features(balls.gaussians, balls.views, replace(settings, cache_bytes=0), paper.TrainingRun(seed=2))
     np.testing.assert_array_equal(first.features, uncached.features)
-    other = paper.train_features(balls.gaussians, balls.views, NEAR, settings, paper.TrainingRun(seed=3))
+    other = train_features(balls.gaussians, balls.views, settings, paper.TrainingRun(seed=3))
     assert np.abs(other.features - first.features).max() > 0.1
     books = [
-        paper.train_codebook(balls.gaussians, balls.views, NEAR, first.raw, each, paper.TrainingRun(seed=2))
+        train_codebook(balls.gaussians, balls.views, first.raw, each, paper.TrainingRun(seed=2))
         for each in (settings, replace(settings, cache_bytes=0))
     ]
     np.testing.assert_array_equal(books[0].leaf, books[1].leaf)
@@ -178,8 +188,8 @@ def test_gaussians_that_no_mask_shows_get_neither_feature_nor_cluster(balls: Bal
     hidden = replace(balls.gaussians, xyz=balls.gaussians.xyz.copy())
     hidden.xyz[:10] = [0, 0, -50]
     settings = replace(SHORT, schedule_share=0.0005)
-    trained = paper.train_features(hidden, balls.views, NEAR, settings)
-    book = paper.train_codebook(hidden, balls.views, NEAR, trained.raw, settings)
+    trained = train_features(hidden, balls.views, settings)
+    book = train_codebook(hidden, balls.views, trained.raw, settings)
     assert (trained.seen[:10] == 0).all()
     assert (trained.features[:10] == 0).all()
     assert (book.coarse[:10] == -1).all()
@@ -191,9 +201,9 @@ def test_fine_clusters_are_at_most_the_masks_held_and_one(balls: Balls) -> None:
     """Two balls, one coarse cluster: two masks a view, so three leaves of the five allowed."""
     settings = replace(SHORT, schedule_share=0.0005, k1=1, k2=5)
     features = np.random.default_rng(0).random((len(balls.gaussians), 6), np.float32)
-    book = paper.train_codebook(balls.gaussians, balls.views, NEAR, features, settings)
+    book = train_codebook(balls.gaussians, balls.views, features, settings)
     assert len(np.unique(book.leaf[book.leaf >= 0])) == 3
-    fixed = paper.train_codebook(balls.gaussians, balls.views, NEAR, features, replace(settings, formula="paper"))
+    fixed = train_codebook(balls.gaussians, balls.views, features, replace(settings, formula="paper"))
     assert len(np.unique(fixed.leaf[fixed.leaf >= 0])) == 5
 
 
@@ -246,8 +256,8 @@ def test_more_clusters_than_gaussians(balls: Balls) -> None:
     few = Gaussians(*(getattr(balls.gaussians, name)[::100] for name in ("xyz", "scale", "rotation", "opacity")))
     few = replace(few, scale=few.scale * 6)
     settings = replace(SHORT, schedule_share=0.0005, k1=64, covered_share=0)
-    trained = paper.train_features(few, balls.views, NEAR, settings)
-    book = paper.train_codebook(few, balls.views, NEAR, trained.raw, settings)
+    trained = train_features(few, balls.views, settings)
+    book = train_codebook(few, balls.views, trained.raw, settings)
     assert (book.leaf[trained.seen > 0] >= 0).all()
     assert book.centres.shape == (64 * 3, 6)
 
@@ -272,8 +282,8 @@ def test_a_killed_training_continues_and_ends_with_the_same_bits(
                 raise Killed
 
         run = paper.TrainingRun(3, progress, work)
-        trained = paper.train_features(balls.gaussians, balls.views, NEAR, settings, run)
-        book = paper.train_codebook(balls.gaussians, balls.views, NEAR, trained.raw, settings, run)
+        trained = train_features(balls.gaussians, balls.views, settings, run)
+        book = train_codebook(balls.gaussians, balls.views, trained.raw, settings, run)
         if stop == ("end", 0):
             raise Killed
         return trained, book
@@ -300,8 +310,8 @@ def test_checkpoints_of_other_settings_or_seeds_are_not_taken(balls: Balls, tmp_
     with WorkFolder.open(tmp_path / "work") as work:
         for each, seed in ((settings, 0), (settings, 1), (replace(settings, feature_rate=0.02), 0), (settings, 0)):
             run = paper.TrainingRun(seed, work=work)
-            trained = paper.train_features(balls.gaussians, balls.views, NEAR, each, run)
-            alone = paper.train_features(balls.gaussians, balls.views, NEAR, each, paper.TrainingRun(seed))
+            trained = train_features(balls.gaussians, balls.views, each, run)
+            alone = train_features(balls.gaussians, balls.views, each, paper.TrainingRun(seed))
             np.testing.assert_array_equal(trained.features, alone.features)
         assert trained.history.resumed_at == trained.history.steps == 10
 
@@ -310,7 +320,7 @@ def test_progress_names_stage_step_total_and_loss(balls: Balls) -> None:
     heard: list[tuple[str, int, int, float]] = []
     settings = replace(SHORT, schedule_share=0.0002, schedule="lerf")
     run = paper.TrainingRun(progress=lambda *a: heard.append(a))
-    trained = paper.train_features(balls.gaussians, balls.views, NEAR, settings, run)
+    trained = train_features(balls.gaussians, balls.views, settings, run)
     assert [row[:3] for row in heard] == [("features", 1, 2), ("features", 2, 2)]
     assert heard[1][3] == pytest.approx(np.mean(trained.history.loss))
     assert trained.history.published_steps == 10_000
@@ -320,7 +330,7 @@ def test_progress_names_stage_step_total_and_loss(balls: Balls) -> None:
 
 def test_views_without_covered_masks_are_refused(balls: Balls) -> None:
     with pytest.raises(SceneError, match="none of the 6 views has a mask that Gaussians cover"):
-        paper.train_features(balls.gaussians, balls.views, NEAR, replace(SHORT, covered_share=1.1))
+        train_features(balls.gaussians, balls.views, replace(SHORT, covered_share=1.1))
 
 
 def test_a_view_with_one_mask_has_no_separation() -> None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import argparse
 import shlex
 import sys
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args, get_type_hints
@@ -26,7 +26,7 @@ from og_pointcloud.cli.common import (
     write_fit,
     write_json,
 )
-from og_pointcloud.errors import OgPointcloudError
+from og_pointcloud.errors import MissingExtraError, OgPointcloudError
 from og_pointcloud.settings import FitSettings, PaperSettings
 
 if TYPE_CHECKING:
@@ -122,6 +122,11 @@ def fit_one(arguments: argparse.Namespace, options: FitOptions, executor: Execut
     if arguments.rerun:
         with timed(cloud.provenance["stages"], "write rerun"):
             write_views(cloud, capture, options, arguments.rerun)
+    if training := cloud.provenance["notes"].get("training"):
+        with suppress(MissingExtraError):  # no picture without OpenCV
+            from og_pointcloud.show.fit_pictures import training_picture
+
+            print(f"wrote {training_picture(training, arguments.output.with_suffix('.training.png'))}")
     report = describe_fit(cloud, capture, arguments.output)
     if arguments.json:
         write_json(arguments.json, report)

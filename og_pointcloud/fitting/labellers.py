@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +22,7 @@ from numpy.typing import NDArray
 from og_pointcloud.cloud import UNOBSERVED, InstanceTable
 from og_pointcloud.fitting.association import describe_instances, part_of
 from og_pointcloud.fitting.grouping import MaskGroups, group_masks
-from og_pointcloud.fitting.learned.codebook import two_level_codebook
+from og_pointcloud.fitting.learned.codebook import thing_count, two_level_codebook
 from og_pointcloud.fitting.learned.instance_features import learn_features
 from og_pointcloud.fitting.learned.matching import (
     Matching,
@@ -40,15 +41,21 @@ from og_pointcloud.rendering.geometry import sample_of_points
 from og_pointcloud.rendering.surface import Surface
 from og_pointcloud.settings import FitSettings
 
+if TYPE_CHECKING:
+    from og_pointcloud.fitting.learned.paper import TrainedCodebook
+    from og_pointcloud.fitting.learned.rendered_views import RenderedViews
+
 __all__ = [
     "LABELLERS",
     "Labelling",
     "fast",
     "grouping",
     "instances_of_groups",
+    "leaves_of_training",
     "mask_means",
     "paper",
     "renumbered",
+    "trained_by_rendering",
 ]
 
 
@@ -102,10 +109,7 @@ def fast(table: MaskTable, surface: Surface, settings: FitSettings, journal: Jou
         matching = match_masks(table, book.leaf, evidence, settings.matching)
     if not settings.matching.settle:
         return _leaves_as_instances(table, book.leaf, book.leaf_coarse, matching)
-    groups = MaskGroups(matching.mask_instance, len(book.leaf_centres), np.zeros(len(table.mask_view), bool))
-    with journal.stage("grouping"):
-        votes = view_votes(table)
-    return _decided_by_views(table, votes, groups, surface, settings, journal, book.leaf_coarse)
+    return _settled(table, surface, settings, journal, book.leaf_coarse, matching)
 
 
 def paper(
@@ -115,38 +119,65 @@ def paper(
 
     work: where the state of the training is kept, so that a run that was killed continues; None: nowhere.
     """
-    from og_pointcloud.fitting.learned.paper import TrainingRun, train_codebook, train_features
+    features, book = trained_by_rendering(table, surface, settings, journal, work)
+    return leaves_of_training(table, surface, features, book, settings, journal)
 
-    options, gaussians, near = settings.paper, surface.gaussians, surface.near
-    views = surface.thinned_views()
+
+def trained_by_rendering(
+    table: MaskTable, surface: Surface, settings: FitSettings, journal: Journal, work: WorkFolder | None = None,
+    source: RenderedViews | None = None,
+) -> tuple[NDArray[np.float32], TrainedCodebook]:  # fmt: skip
+    """What mode paper trains: features (n, width) of the first stage, as read, and the codebook.
+
+    source: the blending weights, where they are at hand already.
+    """
+    from og_pointcloud.fitting.learned.paper import TrainingRun, train_codebook, train_features
+    from og_pointcloud.fitting.learned.rendered_views import RenderedViews
+
+    options = settings.paper
+    if options.k1 is None:
+        options = replace(options, k1=thing_count(table))
+    drawn = surface.gaussians, surface.thinned_views(), surface.near, options
     with journal.bars() as report:
         run = TrainingRun(settings.seed, report, work)
         with journal.stage("features"):
-            trained = train_features(gaussians, views, near, options, run)
+            source = source or RenderedViews(*drawn, whole=False)
+            trained = train_features(source, options, run)
         with journal.stage("codebook"):
-            book = train_codebook(gaussians, views, near, trained.raw, options, run)
-    journal.notes["training"] = [
-        {
-            "stage": history.name,
-            "steps": history.steps,
-            "resumed_at": history.resumed_at,
-            "published_steps": history.published_steps,
-            "seconds": round(history.seconds, 3),
-            "published_seconds": round(history.published_seconds, 1),
-        }
-        for history in (trained.history, *book.histories)
-    ]
+            source = RenderedViews(*drawn, whole=True) if options.formula == "paper" else source
+            book = train_codebook(source, trained.raw, options, run)
+    journal.notes["training"] = [history.to_dict() for history in (trained.history, *book.histories)]
+    return trained.features, book
+
+
+def leaves_of_training(
+    table: MaskTable,
+    surface: Surface,
+    features: NDArray[np.float32],
+    book: TrainedCodebook,
+    settings: FitSettings,
+    journal: Journal,
+) -> Labelling:
+    """The leaves of a trained codebook as instances, each with the masks that Eq. 5 accepts for it."""
+    options, gaussians = settings.paper, surface.gaussians
+    near, views = surface.near, surface.thinned_views()
     used, leaf = np.unique(book.leaf[book.leaf >= 0], return_inverse=True)
     ids = np.full(len(gaussians), -1, np.int32)
     ids[book.leaf >= 0] = leaf
-    centres = book.centres[used]
     with journal.stage("matching"):
-        shown, pure = rendered_masks(gaussians, views, near, trained.features, options.covered_share)
-        evidence = alone_evidence(gaussians, views, near, ids, centres, shown, options.alone_share)
+        shown, pure = rendered_masks(gaussians, views, near, features, options.covered_share)
+        centres = book.centres[used]
+        if options.matching.visible:
+            evidence = visible_evidence(table, ids, centres, shown)
+        else:
+            evidence = alone_evidence(gaussians, views, near, ids, centres, shown, options.alone_share)
         if options.formula == "authors":
             evidence = evidence.of_masks(pure)
         matching = match_masks(table, ids, evidence, options.matching)
-    return _leaves_as_instances(table, ids, (used // options.k2).astype(np.int32), matching)
+    coarse = (used // options.k2).astype(np.int32)
+    if options.matching.settle:
+        return _settled(table, surface, settings, journal, coarse, matching)
+    return _leaves_as_instances(table, ids, coarse, matching)
 
 
 LABELLERS: dict[str, Labeller] = {"grouping": grouping, "fast": fast, "paper": paper, "auto": grouping}
@@ -159,6 +190,17 @@ def mask_means(table: MaskTable, features: NDArray[np.float32]) -> NDArray[np.fl
     """(masks, width): the mean instance feature that each mask shows; zero where it shows nothing."""
     shown = np.asarray(table.weights.sum(axis=1), np.float64).reshape(-1, 1)
     return (table.weights @ features) / np.where(shown > 0, shown, 1)
+
+
+def _settled(
+    table: MaskTable, surface: Surface, settings: FitSettings, journal: Journal, coarse: NDArray[np.int32],
+    matching: Matching,
+) -> Labelling:  # fmt: skip
+    """Leaves as groups of the masks that they accepted; all views then decide every point."""
+    groups = MaskGroups(matching.mask_instance, len(coarse), np.zeros(len(table.mask_view), bool))
+    with journal.stage("grouping"):
+        votes = view_votes(table)
+    return _decided_by_views(table, votes, groups, surface, settings, journal, coarse)
 
 
 def _decided_by_views(

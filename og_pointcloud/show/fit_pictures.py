@@ -29,7 +29,7 @@ try:
 except ImportError as error:
     raise MissingExtraError("scipy and numba", "fit") from error
 
-__all__ = ["FeatureColors", "feature_colors", "feature_picture", "learned_stages"]
+__all__ = ["FeatureColors", "feature_colors", "feature_picture", "learned_stages", "training_picture"]
 
 GREY = (128, 128, 128)
 """A point without a feature, because no view sees it."""
@@ -44,6 +44,8 @@ CELL_WIDTH = 360
 GAP, STRIP, MARGIN = 6, 26, 10
 TEXT_SCALE, LETTER = 0.5, 11
 """Size of letters, and pixels that the widest takes: of long names the end is shown, where they differ."""
+PLOT_HEIGHT, CURVE = 200, (31, 119, 180)
+"""Of a stage's curve of losses: pixels, and RGB."""
 
 Colors = NDArray[np.uint8]
 
@@ -149,6 +151,27 @@ def learned_stages(table: MaskTable, xyz: NDArray[np.float32], seed: int = 0) ->
     }
 
 
+def training_picture(stages: Sequence[Mapping[str, Any]], path: str | os.PathLike[str]) -> Path:
+    """Write a PNG of each stage's losses against its steps, side by side.
+
+    stages: of a fit in mode paper, ``cloud.provenance["notes"]["training"]``. Each has a scale of its own, from zero.
+    """
+    cv2 = require_cv2()
+    panels = []
+    for stage in stages:
+        loss = np.array(stage["loss"], np.float64)
+        panel = np.full((PLOT_HEIGHT + 2 * STRIP, CELL_WIDTH, 3), 255, np.uint8)
+        top = float(loss.max(initial=0)) or 1.0
+        across = np.linspace(MARGIN, CELL_WIDTH - MARGIN, len(loss))
+        points = np.stack([across, STRIP + PLOT_HEIGHT * (1 - loss / top)], axis=1).round().astype(np.int32)
+        cv2.polylines(panel, [points], False, CURVE, 2, cv2.LINE_AA)
+        cv2.line(panel, (MARGIN, STRIP + PLOT_HEIGHT), (CELL_WIDTH - MARGIN, STRIP + PLOT_HEIGHT), (0, 0, 0), 1)
+        _write_text(panel, f"{stage['stage']}: loss, 0 to {top:.3g}", MARGIN, STRIP)
+        _write_text(panel, f"{stage['steps']:,} of {stage['published_steps']:,} steps", MARGIN, PLOT_HEIGHT + 2 * STRIP)
+        panels.append(panel)
+    return _write_png(Path(path), np.concatenate(panels, axis=1))
+
+
 def _centre_of_each(centres: NDArray[np.float32], cluster: NDArray[np.int32]) -> NDArray[np.float32]:
     none = np.full((1, centres.shape[1]), np.nan, np.float32)
     return np.concatenate([centres, none])[cluster]  # -1, no cluster, is the last row
@@ -196,7 +219,6 @@ def _rendered(gaussians: Gaussians, rgb: NDArray[np.float32], view: View, near: 
 
 def _write_grid(path: Path, views: Sequence[View], rows: Mapping[str, Sequence[NDArray]]) -> Path:
     """One column a view under its name, one row a stage under its title, photographs first."""
-    cv2 = require_cv2()
     photographs = [view.image_rgb() for view in views]
     if any(image is not None for image in photographs):
         white = [np.full((view.camera.height, view.camera.width, 3), 255, np.uint8) for view in views]
@@ -212,7 +234,11 @@ def _write_grid(path: Path, views: Sequence[View], rows: Mapping[str, Sequence[N
         _write_text(sheet, title, MARGIN, top + STRIP)
         for left, image in zip(lefts, row, strict=False):
             sheet[top + STRIP : top + STRIP + image.shape[0], left : left + image.shape[1]] = np.rint(image)
-    written, png = cv2.imencode(".png", sheet[:, :, ::-1])
+    return _write_png(path, sheet)
+
+
+def _write_png(path: Path, sheet: Colors) -> Path:
+    written, png = require_cv2().imencode(".png", sheet[:, :, ::-1])
     if not written:
         raise SceneError(f"{path}: OpenCV cannot write a PNG of {sheet.shape[1]}x{sheet.shape[0]} pixels")
     with replacing(path) as file:

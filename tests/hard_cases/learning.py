@@ -198,11 +198,14 @@ def paper_losses_of_one_mask() -> Answer:
 def paper_codebook_with_empty_clusters() -> Answer:
     """Two features in all and eight clusters of eight: the centre of each point's leaf is its feature."""
     from og_pointcloud.fitting.learned.paper import train_codebook
+    from og_pointcloud.fitting.learned.rendered_views import RenderedViews
 
     scene, balls = two_balls(points=40)
     features = (np.where(balls[:, None] == 0, 0.2, 0.7) * np.ones((1, 6))).astype(np.float32)
     still = PaperSettings(normalise=False, k1=8, k2=8, coarse_rate=0.0, fine_rate=0.0, schedule_share=1e-3)
-    book = train_codebook(solid(scene.points.xyz), scene.views, NEAR, features, still)
+    book = train_codebook(
+        RenderedViews(solid(scene.points.xyz), scene.views, NEAR, still, whole=False), features, still
+    )
     known = np.flatnonzero(book.leaf >= 0)
     return Answer(np.r_[book.centres[book.leaf[known]].ravel(), len(known) > 40], np.r_[features[known].ravel(), 1])
 

@@ -35,16 +35,7 @@ from og_pointcloud.fitting.mask_table import MaskTable
 from og_pointcloud.kernels import njit, prange
 from og_pointcloud.settings import FeatureSettings
 
-__all__ = [
-    "FeatureObjective",
-    "LearnedFeatures",
-    "Terms",
-    "learn_features",
-    "raw_gradient",
-    "read_features",
-    "scattered_product",
-    "sparse_product",
-]
+__all__ = ["FeatureObjective", "LearnedFeatures", "Terms", "learn_features", "raw_gradient", "read_features"]
 
 COARSE_BOUNDS = (0.71, 0.57, 0.14)
 """Of Eq. 2 in the rounds before the last, which have fewer local minima; directions at right angles read 0.71 apart."""
@@ -154,17 +145,6 @@ def raw_gradient(raw: NDArray[np.floating], gradient: NDArray[np.floating], norm
     return _raw_gradient(raw, gradient, normalise, _columns(raw))
 
 
-def sparse_product(matrix: csr_array, dense: NDArray[np.floating]) -> NDArray[np.float64]:
-    """A CSR matrix times (n, width), summed in float64: (rows, width)."""
-    return _product(matrix.indptr, matrix.indices, matrix.data, dense, _columns(dense))
-
-
-def scattered_product(matrix: csr_array, dense: NDArray[np.floating]) -> NDArray[np.floating]:
-    """The transposed CSR matrix times (rows, width), without transposing it: (n, width) in the type of ``dense``. One
-    thread adds, so that the order is always the same."""
-    return _scattered(matrix.indptr, matrix.indices, matrix.data, dense, matrix.shape[1], _columns(dense))
-
-
 class FeatureObjective:
     """Value and gradient of the losses over all views, for features as read.
 
@@ -199,11 +179,11 @@ class FeatureObjective:
 
     def mask_means(self, features: NDArray[np.floating]) -> NDArray[np.float64]:
         """(masks, width) float64, ``diag(1 / N) A F``."""
-        return sparse_product(self._weights, features) / self._size[:, None]
+        return _product(*_arrays(self._weights), features, _columns(features)) / self._size[:, None]
 
     def uplift(self, of_masks: NDArray[np.float32]) -> NDArray[np.float32]:
         """(k, width): the mean of rows of masks, by how much each shows of a Gaussian."""
-        return (sparse_product(self._transposed, of_masks) / self.weight).astype(np.float32)
+        return (_product(*_arrays(self._transposed), of_masks, _columns(of_masks)) / self.weight).astype(np.float32)
 
     def have_met(self, features: NDArray[np.floating]) -> bool:
         """Whether two mask means of a view are too near to be told apart by the gradient of Eq. 2."""
@@ -221,7 +201,7 @@ class FeatureObjective:
         spread = float((features * blended).sum() - (self._size[:, None] * means**2).sum())
         cohesion = float(spread / total)
         pull = (pull + factor * (-2 / total * self._size[:, None] * means)) / self._size[:, None]
-        gradient = sparse_product(self._transposed, pull) + factor * (2 / total * blended)
+        gradient = _product(*_arrays(self._transposed), pull, _columns(pull)) + factor * (2 / total * blended)
         objective = settings.inter * separation + factor * cohesion
         return Terms(separation, cohesion, objective, gradient.astype(features.dtype))
 
@@ -315,6 +295,10 @@ def _int32(matrix: csr_array) -> csr_array:
     return csr_array((matrix.data, *index), shape=matrix.shape)
 
 
+def _arrays(matrix: csr_array) -> tuple[NDArray[np.integer], NDArray[np.integer], NDArray[np.floating]]:
+    return matrix.indptr, matrix.indices, matrix.data
+
+
 def _columns(values: NDArray[np.floating]) -> tuple[int, ...]:
     """A tuple as long as a row: its length is part of its type, so that the kernels' inner loops are unrolled."""
     return (0,) * values.shape[1]
@@ -329,18 +313,6 @@ def _product(indptr, indices, data, dense, columns):  # noqa: ANN001, ANN202
             other, weight = indices[e], np.float64(data[e])
             for c in range(len(columns)):
                 out[row, c] += weight * dense[other, c]
-    return out
-
-
-@njit(cache=True)
-def _scattered(indptr, indices, data, dense, n, columns):  # noqa: ANN001, ANN202
-    """Transposed CSR matrix times (rows, width): every entry adds its row of ``dense`` to the row of its column."""
-    out = np.zeros((n, len(columns)), dense.dtype)
-    for row in range(len(indptr) - 1):
-        for e in range(indptr[row], indptr[row + 1]):
-            other, weight = indices[e], data[e]
-            for c in range(len(columns)):
-                out[other, c] += weight * dense[row, c]
     return out
 
 

@@ -36,7 +36,7 @@ __all__ = [
 ]
 
 MIXED_VARIANCE = 0.006
-"""A mask whose features vary more is no target of Eq. 4, and not accepted by Eq. 5 (the authors' code), unless large."""
+"""A mask whose features vary more is no target of Eq. 4, nor accepted by Eq. 5 (the authors' code), unless large."""
 LARGE_SHARE = 0.8
 """Masks of this share of the largest's pixels or more count all the same (the authors' code)."""
 
@@ -112,7 +112,7 @@ def filled_masks(
 def rendered_masks(
     gaussians: Gaussians, views: Sequence[View], near: float, features: NDArray[np.float32], covered_share: float
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """`filled_masks` of all views, (masks, width) and (masks,), from the pixels that are covered by ``covered_share``."""
+    """`filled_masks` of all views, (masks, width) and (masks,), from pixels that are covered by ``covered_share``."""
     found = []
     for view in views:
         image, alpha = render(gaussians, features, view.camera, near)
@@ -167,10 +167,12 @@ def alone_evidence(
 
 def eq5_scores(evidence: Evidence, mask_view: NDArray[np.int32], settings: MatchingSettings) -> NDArray[np.float64]:
     """(masks, K) float64 in [0, 1]: S_ij of Eq. 5, or one of its factors alone."""
-    union = evidence.instance_area[mask_view] + evidence.mask_area[:, None] - evidence.shared
-    iou = np.divide(evidence.shared, union, out=np.zeros_like(union), where=union > 0)
-    likeness = np.maximum(1 - evidence.distance, 0)
-    return {"both": iou * likeness, "iou": iou, "feature": likeness}[settings.score]
+    area, likeness = evidence.instance_area[mask_view], np.maximum(1 - evidence.distance, 0)
+    if settings.score == "feature":
+        return likeness
+    whole = area if settings.score == "within" else area + evidence.mask_area[:, None] - evidence.shared
+    overlap = np.divide(evidence.shared, whole, out=np.zeros_like(whole), where=whole > 0)
+    return overlap if settings.score == "iou" else overlap * likeness
 
 
 def match_masks(
@@ -215,7 +217,10 @@ def _accepted(
     if not best or scores.shape[1] == 0:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
     masks = np.stack(best, axis=1)  # (K, views that have masks)
-    good = np.take_along_axis(scores.T, masks, axis=1) > settings.threshold
+    reached = np.take_along_axis(scores.T, masks, axis=1)
+    best_of_instance = reached.max(axis=1)
+    unit = np.median(best_of_instance[best_of_instance > 0]) if settings.relative and best_of_instance.any() else 1.0
+    good = reached > settings.threshold * unit
     good[good.sum(axis=1) < settings.min_views] = False
     return masks[good], np.nonzero(good)[0]
 

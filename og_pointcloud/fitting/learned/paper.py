@@ -24,7 +24,7 @@ cluster.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -40,8 +40,6 @@ from og_pointcloud.fitting.learned.matching import filled_masks
 from og_pointcloud.fitting.learned.rendered_views import RenderedView, RenderedViews
 from og_pointcloud.fitting.mask_table import view_fingerprint, weights_by_instance
 from og_pointcloud.fitting.work_folder import WorkFolder, fingerprint
-from og_pointcloud.rendering.splatting import Gaussians
-from og_pointcloud.scene import View
 from og_pointcloud.settings import PaperSettings
 
 try:
@@ -76,7 +74,9 @@ ADAM_EPSILON = 1e-15
 OWN_MASK_SHARE = 0.2
 """A coarse cluster holds a mask when it has more than this share of the mask's blended weight."""
 SIZES = 8
-"""Smaller Gaussians are drawn in so many sizes, evenly spread over 0 to 1 (the authors: any), so that they can be kept."""
+"""Smaller Gaussians are drawn in so many sizes, evenly spread over 0 to 1 (the authors: any), which can be kept."""
+CURVE_POINTS = 200
+"""Points of a stage's curve of losses in the provenance."""
 RECENT = 100
 """The loss that is reported is the mean of so many steps: each sees another view."""
 CHECKPOINT_SECONDS = 60.0
@@ -118,6 +118,19 @@ class StageHistory:
         """What the stage would take at its published number of steps."""
         return self.published_steps * self.seconds / max(self.steps, 1)
 
+    def to_dict(self) -> dict[str, Any]:
+        """For the cloud's provenance. loss: means of at most CURVE_POINTS equal stretches of the stage."""
+        stretches = np.array_split(np.array(self.loss), min(CURVE_POINTS, max(self.steps, 1)))
+        return {
+            "stage": self.name,
+            "steps": self.steps,
+            "resumed_at": self.resumed_at,
+            "published_steps": self.published_steps,
+            "seconds": round(self.seconds, 3),
+            "published_seconds": round(self.published_seconds, 1),
+            "loss": [float(f"{stretch.mean():.4g}") for stretch in stretches],
+        }
+
 
 @dataclass(frozen=True)
 class TrainedFeatures:
@@ -141,23 +154,15 @@ class TrainedCodebook:
     histories: tuple[StageHistory, StageHistory]
 
 
-def train_features(
-    gaussians: Gaussians,
-    views: Sequence[View],
-    near: float,
-    settings: PaperSettings | None = None,
-    run: TrainingRun | None = None,
-) -> TrainedFeatures:
+def train_features(source: RenderedViews, settings: PaperSettings, run: TrainingRun | None = None) -> TrainedFeatures:
     """Stage 1: features of all Gaussians from random ones in [0, 1], by Eq. 1 and 2 of one random view a step.
 
-    views: thinned to the resolution that is to be rendered. near: depth of the near plane, scene units.
-    Raises SceneError where no view has a mask with a Gaussian in it.
+    source: only the pixels in masks.
     """
-    settings, run = settings or PaperSettings(), run or TrainingRun()
-    source = RenderedViews(gaussians, views, near, settings, whole=False)
-    random = np.random.default_rng(run.seed).random((len(gaussians), settings.width), np.float32)
+    run = run or TrainingRun()
+    random = np.random.default_rng(run.seed).random((len(source.gaussians), settings.width), np.float32)
     trained = torch.from_numpy(random[source.known])
-    key = _training_key(gaussians, views, near, settings, run)
+    key = _training_key(source, settings, run)
     history = StageHistory("features", STEPS[settings.schedule][0])
     stage = _Stage(history, trained, settings.feature_rate)
     late = LATE_STEP * settings.schedule_share
@@ -214,29 +219,26 @@ def _separation(means: torch.Tensor, formula: str, late: bool) -> torch.Tensor:
 
 
 def train_codebook(
-    gaussians: Gaussians,
-    views: Sequence[View],
-    near: float,
-    raw: NDArray[np.float32],
-    settings: PaperSettings | None = None,
-    run: TrainingRun | None = None,
+    source: RenderedViews, raw: NDArray[np.float32], settings: PaperSettings, run: TrainingRun | None = None
 ) -> TrainedCodebook:
     """Stage 2: a coarse codebook of features and positions, then a fine one of features inside each coarse cluster.
 
-    raw: (n, width), of stage 1, not yet read. A step renders cluster centres in place of features, takes Eq. 4, and
-    moves each feature by the gradient of its centre (straight through). Positions count in scene units, as published.
+    source: only the pixels in masks, or all (formula "paper"). raw: (n, width), of stage 1, not yet read. A step renders
+    cluster centres in place of features, takes Eq. 4, and moves each feature by the gradient of its centre (straight
+    through). Positions count in scene units, as published.
     """
-    settings, run = settings or PaperSettings(), run or TrainingRun()
+    run = run or TrainingRun()
     rng = np.random.default_rng(run.seed)
-    source = RenderedViews(gaussians, views, near, settings, whole=settings.formula == "paper")
-    known = source.known
+    gaussians, known = source.gaussians, source.known
     training = _CodebookTraining(source, torch.from_numpy(raw[known]), settings)
     start = training.features.numpy()
-    key = _training_key(gaussians, views, near, settings, run, raw)
+    key = _training_key(source, settings, run, raw)
 
     coarse = StageHistory("coarse codebook", STEPS[settings.schedule][1])
     places = settings.position_weight * gaussians.xyz[known]
-    first = rng.permutation(len(known))[: settings.k1]
+    assert settings.k1 is not None, "the number of coarse clusters is the caller's to find"
+    k1 = settings.k1
+    first = rng.permutation(len(known))[:k1]
     centres = np.concatenate([start[first], places[first]], axis=1)
     together = _Parts([np.arange(len(known))], [len(centres)], places)
     own, _ = training.train(coarse, centres, together, run, key)
@@ -252,7 +254,7 @@ def train_codebook(
     leaf_of_centre = np.concatenate([c * settings.k2 + np.arange(len(rows)) for c, rows in enumerate(seeds)])
     coarse_ids, leaf = np.full(len(gaussians), -1, np.int32), np.full(len(gaussians), -1, np.int32)
     coarse_ids[known], leaf[known] = own, leaf_of_centre[own_fine]
-    table = np.zeros((settings.k1 * settings.k2, raw.shape[1]), np.float32)
+    table = np.zeros((k1 * settings.k2, raw.shape[1]), np.float32)
     table[leaf_of_centre] = training.read(torch.from_numpy(fine_centres)).numpy()
     return TrainedCodebook(coarse_ids, leaf, table, (coarse, fine))
 
@@ -393,14 +395,14 @@ def _read(raw: torch.Tensor, normalise: bool) -> torch.Tensor:
     return _Read.apply(raw) if normalise else raw
 
 
-def _training_key(
-    gaussians: Gaussians, views: Sequence[View], near: float, settings: PaperSettings, run: TrainingRun, *more: Any
-) -> str:
+def _training_key(source: RenderedViews, settings: PaperSettings, run: TrainingRun, *more: Any) -> str:
     """Of all that the outcome of a stage depends on; empty where nothing is kept."""
     if run.work is None:
         return ""
-    drawn = gaussians.xyz, gaussians.scale, gaussians.rotation, gaussians.opacity, near
-    return fingerprint(*drawn, *(view_fingerprint(view, view.mask_map()) for view in views), settings, run.seed, *more)
+    drawn = source.gaussians
+    shapes = drawn.xyz, drawn.scale, drawn.rotation, drawn.opacity, source.near
+    views = (view_fingerprint(view, view.mask_map()) for view in source.views)
+    return fingerprint(*shapes, *views, settings, run.seed, *more)
 
 
 class _Stage:
