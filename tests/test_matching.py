@@ -16,7 +16,9 @@ from og_pointcloud.fitting.learned.matching import (
     Matching,
     alone_evidence,
     eq5_scores,
+    filled_masks,
     match_masks,
+    rendered_masks,
     visible_evidence,
 )
 from og_pointcloud.fitting.mask_table import mask_table
@@ -249,3 +251,52 @@ def test_no_instance_at_all() -> None:
     result = match_masks(table, ids, evidence, SETTINGS)
     assert len(result.instances) == 0
     np.testing.assert_array_equal(result.mask_instance, [-1])
+
+
+def test_within_is_the_share_of_the_instance() -> None:
+    """A piece of a large mask: Eq. 5 by IoU is small, by its own share it is the likeness alone."""
+    evidence = Evidence(np.array([[4.0, 0.0]]), np.array([40.0]), np.array([[5.0, 2.0]]), np.array([[0.1, np.inf]]))
+    view = np.zeros(1, np.int32)
+    assert eq5_scores(evidence, view, MatchingSettings())[0, 0] == pytest.approx(4 / 41 * 0.9)
+    within = eq5_scores(evidence, view, MatchingSettings(score="within"))
+    np.testing.assert_allclose(within, [[4 / 5 * 0.9, 0]])
+
+
+def test_a_relative_threshold_counts_in_the_median_of_the_best_scores() -> None:
+    views: list[HandView] = [[([0, 1], ONE), ([4, 5], OTHER)]] * 2
+    found = [
+        match(views, [0, 0, 0, 0, 1, 1], MatchingSettings(threshold=share, relative=True)).instances.views.tolist()
+        for share in (0.6, 0.7, 1.4)
+    ]
+    assert found == [[2, 2], [0, 2], [0, 0]], "best scores are 0.5 and 1, their median is 0.75"
+
+
+def test_filled_masks_mask_by_mask() -> None:
+    random = np.random.default_rng(0)
+    mask = np.repeat([0, 1, 3], [50, 6, 6])
+    image = np.where(mask[:, None] == 3, random.random((62, 4)), 0.01 * random.random((62, 4)) + 0.3)
+    means, pure = filled_masks(image, mask, 4)
+    for index in (0, 1, 3):
+        np.testing.assert_allclose(means[index], image[mask == index].mean(axis=0))
+    assert pure.tolist() == [True, True, False, False], "mask 2 has no pixel, mask 3 is mixed and small"
+    assert filled_masks(random.random((62, 4)), mask, 4)[1].tolist() == [True, False, False, False], "0 is large"
+
+
+def test_masks_left_out_have_nothing_in_common_with_any_instance() -> None:
+    evidence = Evidence(np.ones((2, 1)), np.ones(2), np.ones((1, 1)), np.zeros((2, 1)))
+    kept = evidence.of_masks(np.array([True, False]))
+    assert eq5_scores(kept, np.zeros(2, np.int32), MatchingSettings()).ravel().tolist() == [1, 0]
+    assert kept.distance.ravel().tolist() == [0, np.inf]
+
+
+def test_rendered_masks_are_filled_from_covered_pixels() -> None:
+    gaussians = cloud(np.random.default_rng(0))
+    views = [View("v", turned(0.0), patches(turned(0.0)), np.ones((12, 3), np.float32))]
+    values = np.random.default_rng(1).random((len(gaussians), 2), np.float32)
+    means, pure = rendered_masks(gaussians, views, NEAR, values, 0.3)
+    weights, ids = pixel_weights(gaussians, views[0].camera, NEAR).toarray(), views[0].mask_map().ravel()
+    for mask in range(views[0].mask_count):
+        pixels = (ids == mask) & (weights.sum(axis=1) >= 0.3)
+        expected = (weights[pixels] @ values).mean(axis=0) if pixels.any() else np.zeros(2)
+        np.testing.assert_allclose(means[mask], expected, atol=1e-5)
+        assert pure[mask] <= pixels.any()

@@ -198,3 +198,20 @@ def test_a_header_that_claims_more_than_it_holds_is_refused(result):
             archive.writestr(f"{name}.npy", data.getvalue())
     with pytest.raises(SceneError, match="its header claims"):
         read_opengaussian(result)
+
+
+@pytest.mark.parametrize("iterations", [(30_000, 90_000), (30_000, 40_000, 50_000, 70_000)], ids=["scannet", "lerf"])
+@pytest.mark.parametrize("second_codebook", [True, False])
+def test_what_a_training_leaves_beside_its_result_is_passed_by(tmp_path, iterations, second_codebook):
+    """Both data sets' iterations, the codebooks of each, and one that stopped before the second."""
+    xyz, opacity = write_result(tmp_path, iterations=iterations)
+    for iteration in iterations[1:]:
+        for name in ("root_code_book", "leaf_code_book")[: 2 if second_codebook else 1]:
+            folder = tmp_path / "point_cloud" / f"iteration_{iteration}" / name
+            folder.mkdir()
+            (folder / "kmeans_centers.pth").write_bytes(b"not to be read")
+    (tmp_path / "cfg_args").write_text("Namespace(sh_degree=3)")
+    (tmp_path / "cameras.json").write_text("[]")
+    cloud = read_opengaussian(tmp_path)
+    assert np.abs(cloud.xyz_world - xyz[opacity >= 0.1]).max() < 1e-6, "of the last iteration"
+    assert len(cloud.instances) == 4

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import ast
+import dataclasses
 import itertools
+import operator
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -20,8 +23,10 @@ from og_pointcloud.errors import OgPointcloudError, SceneError
 from og_pointcloud.fitting.fit import prepare
 from og_pointcloud.fitting.work_folder import WorkFolder
 from og_pointcloud.formats.capture import read_capture
+from og_pointcloud.journal import Journal
 from og_pointcloud.rendering.splatting import Gaussians
-from og_pointcloud.scene import View
+from og_pointcloud.rendering.surface import stride_for_pixels
+from og_pointcloud.scene import Camera, View
 from og_pointcloud.settings import PaperSettings
 
 torch = pytest.importorskip("torch")
@@ -29,7 +34,8 @@ paper = pytest.importorskip("og_pointcloud.fitting.learned.paper")
 rendered_views = pytest.importorskip("og_pointcloud.fitting.learned.rendered_views")
 
 NEAR = 0.05
-SHORT = PaperSettings(schedule_share=0.01, covered_share=0.3, feature_rate=1e-2, coarse_rate=1e-3, k1=8, k2=3)
+SHORT = PaperSettings(schedule_share=0.005, covered_share=0.3, feature_rate=2e-2, coarse_rate=1e-3, k1=8, k2=3)
+PAGE = Path(__file__).parents[1] / "docs" / "paper.md"
 
 
 @dataclass(frozen=True)
@@ -142,10 +148,11 @@ def test_equal_means_give_finite_losses_and_gradients() -> None:
         assert torch.isfinite(gradient).all()
 
 
-AS_PRINTED = replace(SHORT, formula="paper", normalise=False, cohesion_weight=3e3, feature_rate=2e-2)
+AS_PRINTED = replace(SHORT, formula="paper", normalise=False, cohesion_weight=3e3, feature_rate=4e-2)
+OF_AUTHORS = replace(SHORT, cluster_raw=True, fine_alone=True)
 
 
-@pytest.mark.parametrize("settings", [AS_PRINTED, SHORT], ids=["paper", "authors"])
+@pytest.mark.parametrize("settings", [AS_PRINTED, SHORT, OF_AUTHORS], ids=["paper", "ours", "authors"])
 def test_both_stages_part_the_balls(balls: Balls, settings: PaperSettings) -> None:
     trained = train_features(balls.gaussians, balls.views, settings)
     seen = trained.seen > 5
@@ -164,7 +171,7 @@ def test_both_stages_part_the_balls(balls: Balls, settings: PaperSettings) -> No
     assert members.max(axis=1).sum() > 0.9 * sure.sum()
     for leaf in np.unique(book.leaf[book.leaf >= 0]):  # centres are where their features are
         assert np.abs(book.centres[leaf] - np.median(trained.features[book.leaf == leaf], axis=0)).max() < 0.5
-    assert [stage.steps for stage in (trained.history, *book.histories)] == [200, 200, 200]
+    assert [stage.steps for stage in (trained.history, *book.histories)] == [100, 100, 100]
     assert [stage.published_steps for stage in (trained.history, *book.histories)] == [20_000] * 3
     assert np.mean(trained.history.loss[-20:]) < np.mean(trained.history.loss[:20])
 
@@ -351,3 +358,61 @@ def test_missing_torch_names_the_extra() -> None:
     code = "import sys; sys.modules['torch'] = None; import og_pointcloud.fitting.learned.paper"
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert "pip install 'og-pointcloud[learn]'" in run.stderr.splitlines()[-1]
+
+
+def cells_of(name: str, cell: str) -> Any:
+    return cell if name in ("schedule", "formula", "matching.score") else ast.literal_eval(cell)
+
+
+def test_the_page_names_every_number_and_no_other() -> None:
+    """Ours are the defaults; the authors' columns are what `of_authors` sets."""
+    rows = [
+        [cell.strip() for cell in line.strip("|\n").split("|")]
+        for line in PAGE.read_text().splitlines()
+        if line.startswith("| `")
+    ]
+    records = {"scannet": PaperSettings.of_authors(), "lerf": PaperSettings.of_authors("lerf"), "ours": PaperSettings()}
+    names = [row[0].strip("`") for row in rows]
+    fields = [field.name for field in dataclasses.fields(PaperSettings) if field.name != "matching"]
+    of_matching = [f"matching.{field.name}" for field in dataclasses.fields(PaperSettings().matching)]
+    assert sorted(names) == sorted([*fields, *of_matching])
+    for name, (_, _, scannet, lerf, ours, why) in zip(names, rows, strict=True):
+        for dataset, cell in (("scannet", scannet), ("lerf", lerf), ("ours", ours)):
+            assert cells_of(name, cell) == operator.attrgetter(name)(records[dataset]), (name, dataset)
+        assert why
+
+
+def test_of_authors_takes_changes() -> None:
+    settings = PaperSettings.of_authors("lerf", k1=32, position_weight=0.1)  # teatime
+    assert (settings.k1, settings.k2, settings.position_weight, settings.matching.min_views) == (32, 10, 0.1, 5)
+
+
+@pytest.mark.parametrize(("most", "stride"), [(64 * 48, 1), (64 * 48 - 1, 2), (32 * 24, 2), (1, 48)])
+def test_images_are_thinned_to_so_many_pixels(most: int, stride: int) -> None:
+    camera = Camera(64, 48, 60.0, 60.0, 32.0, 24.0, np.eye(4))
+    view = View("v", camera, np.zeros((48, 64), np.int32), np.ones((1, 2), np.float32))
+    journal = Journal(False)
+    assert stride_for_pixels([view], most, journal) == stride
+    assert [numbers["stride"] for _, numbers in journal.left_out] == [stride] * (stride > 1)
+
+
+def test_some_gaussians_drawn_alone_are_those_of_a_scene_of_them(balls: Balls) -> None:
+    source = rendered_views.RenderedViews(balls.gaussians, balls.views, NEAR, SHORT, whole=False)
+    members = np.flatnonzero(balls.object_ids[source.known] == 0)
+    alone = source.drawn(2, 0.5, 0, members)
+    own = balls.gaussians.take(source.known[members])
+    own = replace(own, scale=own.scale * np.float32(0.5))
+    weights = pixel_weights(own, balls.views[2].camera, NEAR).toarray()
+    covered = (weights.sum(axis=1) >= SHORT.covered_share) & (balls.views[2].mask_map().ravel() >= 0)
+    assert 0 < len(alone.mask) == covered.sum()
+    np.testing.assert_allclose(alone.weights.toarray()[:, members], weights[covered], atol=1e-5)
+    assert alone.weights.shape[1] == len(source.known)
+    assert source.drawn(2, 0.5, 0, members) is alone
+
+
+def test_the_curve_of_a_stage_is_its_losses_in_stretches() -> None:
+    history = paper.StageHistory("features", 20_000, 2.0, [float(step) for step in range(1000)])
+    curve = history.to_dict()["loss"]
+    assert len(curve) == paper.CURVE_POINTS
+    np.testing.assert_allclose(curve, np.arange(1000).reshape(200, 5).mean(axis=1), rtol=1e-3)
+    assert paper.StageHistory("features", 20_000, 0.0, [3.0]).to_dict()["loss"] == [3.0]

@@ -15,6 +15,7 @@ from og_pointcloud.show.fit_pictures import (
     FeatureColors,
     feature_colors,
     feature_picture,
+    training_picture,
 )
 
 WIDTH, HEIGHT = 80, 60
@@ -191,3 +192,18 @@ def test_stages_that_do_not_fit_are_refused(stages, views, text, tmp_path):
     with pytest.raises(SceneError, match=text):
         feature_picture(gaussians, [view("a")] * views, 0.1, stages, tmp_path / "f.png")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_training_is_drawn_stage_by_stage(tmp_path):
+    stages = [
+        {"stage": name, "steps": 10, "published_steps": 20_000, "loss": loss}
+        for name, loss in (("features", [1.0, 0.5, 0.25]), ("coarse codebook", [2.0, 0.0]), ("fine codebook", [0.1]))
+    ]
+    picture = cv2.imread(str(training_picture(stages, tmp_path / "t.png")))[:, :, ::-1].astype(int)
+    assert picture.shape[1] == 3 * 360
+    blue = picture[:, :, 2] - picture[:, :, 0] > 80
+    first, second, third = (blue[:, 360 * panel : 360 * (panel + 1)] for panel in range(3))
+    heights = [np.argwhere(first[:, column])[:, 0].mean() for column in (12, 178, 346)]
+    assert np.diff(heights) == pytest.approx([100, 50], abs=4), "from one to a half to a quarter of 200 pixels"
+    assert second.any()
+    assert third.any()

@@ -159,9 +159,9 @@ def training_picture(stages: Sequence[Mapping[str, Any]], path: str | os.PathLik
     cv2 = require_cv2()
     panels = []
     for stage in stages:
-        loss = np.array(stage["loss"], np.float64)
+        loss = np.repeat(stage["loss"], 2 if len(stage["loss"]) == 1 else 1)  # one alone is a level line
         panel = np.full((PLOT_HEIGHT + 2 * STRIP, CELL_WIDTH, 3), 255, np.uint8)
-        top = float(loss.max(initial=0)) or 1.0
+        top = float(loss.max(initial=0.0)) or 1.0
         across = np.linspace(MARGIN, CELL_WIDTH - MARGIN, len(loss))
         points = np.stack([across, STRIP + PLOT_HEIGHT * (1 - loss / top)], axis=1).round().astype(np.int32)
         cv2.polylines(panel, [points], False, CURVE, 2, cv2.LINE_AA)

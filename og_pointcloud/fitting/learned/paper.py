@@ -223,7 +223,7 @@ def train_codebook(
 ) -> TrainedCodebook:
     """Stage 2: a coarse codebook of features and positions, then a fine one of features inside each coarse cluster.
 
-    source: only the pixels in masks, or all (formula "paper"). raw: (n, width), of stage 1, not yet read. A step renders
+    source: only pixels in masks, or all (formula "paper"). raw: (n, width), of stage 1, not yet read. A step renders
     cluster centres in place of features, takes Eq. 4, and moves each feature by the gradient of its centre (straight
     through). Positions count in scene units, as published.
     """
