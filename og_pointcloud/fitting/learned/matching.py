@@ -104,7 +104,7 @@ def filled_masks(
     pixels = np.bincount(mask, minlength=count)
     own = csr_array((np.ones(len(mask)), (mask, np.arange(len(mask)))), shape=(count, len(mask)))
     means = (own @ image) / np.maximum(pixels, 1)[:, None]
-    variance = (own @ (image - means[mask]) ** 2).mean(axis=1) / np.maximum(pixels, 1)
+    variance = np.mean(np.asarray(own @ (image - means[mask]) ** 2), axis=1) / np.maximum(pixels, 1)
     pure = (variance <= MIXED_VARIANCE) | (pixels >= LARGE_SHARE * pixels.max(initial=0))
     return means, pure & (pixels > 0)
 
