@@ -152,7 +152,14 @@ AS_PRINTED = replace(SHORT, formula="paper", normalise=False, cohesion_weight=3e
 OF_AUTHORS = replace(SHORT, cluster_raw=True, fine_alone=True)
 
 
-@pytest.mark.parametrize("settings", [AS_PRINTED, SHORT, OF_AUTHORS], ids=["paper", "ours", "authors"])
+@pytest.mark.parametrize(
+    "settings",
+    [
+        pytest.param(SHORT, id="ours"),
+        pytest.param(AS_PRINTED, id="paper", marks=pytest.mark.slow),
+        pytest.param(OF_AUTHORS, id="authors", marks=pytest.mark.slow),
+    ],
+)
 def test_both_stages_part_the_balls(balls: Balls, settings: PaperSettings) -> None:
     trained = train_features(balls.gaussians, balls.views, settings)
     seen = trained.seen > 5
@@ -273,7 +280,15 @@ class Killed(Exception):
     """In place of a kill."""
 
 
-@pytest.mark.parametrize("stop", [("features", 7), ("coarse codebook", 13), ("fine codebook", 20), ("end", 0)])
+@pytest.mark.parametrize(
+    "stop",
+    [
+        ("features", 7),
+        pytest.param(("coarse codebook", 13), marks=pytest.mark.slow),
+        ("fine codebook", 20),
+        pytest.param(("end", 0), marks=pytest.mark.slow),
+    ],
+)
 def test_a_killed_training_continues_and_ends_with_the_same_bits(
     balls: Balls, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stop: tuple[str, int]
 ) -> None:
