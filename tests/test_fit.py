@@ -401,7 +401,7 @@ def test_masks_that_show_no_point_are_refused(mode: str) -> None:
 
 
 def test_a_fit_without_an_instance_says_so() -> None:
-    never = MembershipSettings(sure_share=2)  # no share of a point's weight reaches 2
+    never = MembershipSettings(sure_share=2.0)  # no share of a point's weight reaches 2
     cloud = fit(boxes_on_a_table().scene, FitSettings(membership=never), progress=False)
     assert len(cloud.instances) == 0
     assert any("no instance was found" in warning for warning in cloud.provenance["warnings"])

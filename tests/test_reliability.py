@@ -146,6 +146,7 @@ def test_features_that_err_lower_it_and_are_named(scene: Scene) -> None:
     assert "named differently" in cause
 
 
+@pytest.mark.slow
 def test_a_low_one_is_said_with_its_cause(scene: Scene) -> None:
     """Each view has the pose of another."""
     cameras = [view.camera for view in scene.views]
