@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import argparse
 import csv
+import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -116,7 +117,10 @@ def measure(capture: Path, base: FitSettings, rows: Sequence[Mapping[str, Any]],
     left = [(seed, dict(row)) for seed in range(seeds) for row in rows if (name, key_of(row), seed) not in done]
     if not left:
         return
-    trial = Trial(read_subject(capture), base)
+    subject = read_subject(capture)
+    if subject.truth is None:
+        sys.exit(f"{name} lacks gt.npz or text_features.npz; expected both: rows are scored by the truth")
+    trial = Trial(subject, base)
     for seed, row in tqdm(left, name, disable=None):
         if (name, key_of(row), seed) in done:  # tables share rows
             continue

@@ -80,3 +80,25 @@ def test_bench_measures_every_piece_and_pairs_the_rounds(tmp_path: Path, capsys:
     bench.print_table([[before, after]] * 3)
     rows = capsys.readouterr().out.splitlines()[-len(bench.PIECES) :]
     assert all("2.00    2.00-2.00" in row for row in rows)
+
+
+def test_tables_of_the_paper_are_written_and_go_on_where_they_were(tiny_capture, tmp_path, monkeypatch, capsys):
+    """Every row of the association from one training; a second start measures nothing."""
+    pytest.importorskip("torch")
+    import benchmark_paper
+
+    with pytest.raises(SystemExit, match="lacks gt"):
+        benchmark_paper.main([str(tiny_capture.folder), "-o", str(tmp_path / "out")])
+    truth = {"cls": tiny_capture.object_ids, "background": tiny_capture.object_ids < 0}
+    np.savez(tiny_capture.folder / "gt.npz", names=np.array(["red ball", "blue ball"]), **truth)
+    command = [str(tiny_capture.folder), "--table", "association", "--share", "0.0005", "--seeds", "2", "-o"]
+    benchmark_paper.main([*command, str(tmp_path / "out")])
+    page = (tmp_path / "out" / "association.md").read_text().splitlines()
+    assert [line.split(" | ")[0] for line in page[2:]] == ["| IoU only", "| feature only", "| both"]
+    assert page[-1].endswith("| 0.383 |")
+    rows = list(benchmark_paper.read_rows(tmp_path / "out" / "rows.csv"))
+    assert [row.seed for row in rows] == [0, 0, 0, 1, 1, 1]
+    assert len({(row.seed, row.instances) for row in rows}) <= 2, "one training a seed"
+    monkeypatch.setattr(benchmark_paper, "append", None)
+    benchmark_paper.main([*command, str(tmp_path / "out")])
+    assert capsys.readouterr().out.count("| IoU only |") == 2
