@@ -18,9 +18,9 @@ import shutil
 import tempfile
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -40,6 +40,8 @@ from og_pointcloud.formats.repairs import rotation_of_vector
 OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 MIRROR = np.diag([-1.0, 1.0, 1.0, 1.0])
 ROUNDS = 2
+CURED = 3
+"""Percent of mIoU below that of the right capture up to which a repair has cured a fault."""
 Fault = Callable[[Path], None]
 Maps = list[NDArray[Any]]
 
@@ -57,21 +59,42 @@ def main(arguments: list[str] | None = None) -> None:
         false_alarms(options.captures, options.fit)
         return
     for capture in options.captures:
-        told = named = 0
-        print(f"{capture.name:<22} {'told by':<28} {'repair':<52} {'mIoU':>6} {'repaired':>9}")
-        for name in options.only:
-            with tempfile.TemporaryDirectory() as temporary:
-                folder = Path(temporary) / capture.name
-                row, was_told, was_named = row_of(capture, folder, name, options.fit)
-            print(row, flush=True)
-            if name not in HARMLESS:
-                told, named = told + was_told, named + was_named
-        faults = sum(name not in HARMLESS for name in options.only)
-        print(f"{capture.name}: {told} of {faults} faults told, {named} with a repair\n", flush=True)
+        table(capture, options.only, options.fit)
 
 
-def row_of(capture: Path, folder: Path, name: str, fitted: bool) -> tuple[str, bool, bool]:
-    """A line of the table; whether the fault was told, and a repair named."""
+def table(capture: Path, names: Sequence[str], fitted: bool) -> None:
+    """A line for each fault, and how many are told, named, and cured."""
+    right = judged(capture, [], True)[0] if fitted else None
+    beside = "" if right is None else f", {right:.1f} as it is"
+    print(f"{capture.name}{beside}\n{'fault':<22} {'told by':<28} {'repair':<52} {'mIoU':>6} {'repaired':>9}")
+    faults = [name for name in names if name not in HARMLESS]
+    told, named, cured = [], [], []
+    for name in names:
+        with tempfile.TemporaryDirectory() as temporary:
+            found = found_of(capture, Path(temporary) / capture.name, name, fitted)
+        scores = [f"{value:6.1f}" if value is not None else " " * 6 for value in (found.score, found.repaired)]
+        print(
+            f"{name:<22} {', '.join(found.doubts):<28} {' '.join(found.repairs):<52} {'    '.join(scores)}", flush=True
+        )
+        if name in faults:
+            told += [name] if found.doubts else []
+            named += [name] if found.repairs else []
+            cured += [name] if right and found.repaired and found.repaired > right - CURED else []
+    last = f", {len(cured)} cured by it (within {CURED} of the right capture)" if fitted else ""
+    print(f"{capture.name}: {len(told)} of {len(faults)} faults told, {len(named)} with a repair{last}\n", flush=True)
+
+
+class Found(NamedTuple):
+    """doubts: names of the checks in doubt. score, repaired: mIoU in percent with the fault, and with the repairs."""
+
+    doubts: list[str]
+    repairs: list[str]
+    score: float | None
+    repaired: float | None
+
+
+def found_of(capture: Path, folder: Path, name: str, fitted: bool) -> Found:
+    """What is found of one fault; folder: where the faulty capture is made."""
     link(capture, folder)
     repairs: list[str] = []
     FAULTS[name](folder)
@@ -89,12 +112,7 @@ def row_of(capture: Path, folder: Path, name: str, fitted: bool) -> tuple[str, b
             break
         repairs += found.split()
     after = judged(folder, repairs, fitted)[0] if repairs else None
-    cells = [f"{value:6.1f}" if value is not None else " " * 6 for value in (score, after)]
-    return (
-        f"{name:<22} {', '.join(doubts):<28} {' '.join(repairs):<52} {'    '.join(cells)}",
-        bool(doubts),
-        bool(repairs),
-    )
+    return Found(doubts, repairs, score, after)
 
 
 def judged(folder: Path, repairs: tuple[str, ...] | list[str], fitted: bool) -> tuple[float | None, list[str]]:
