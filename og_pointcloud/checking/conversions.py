@@ -30,7 +30,7 @@ PHOTOGRAPHS_FIT, MASKS_FIT = (0.8, 0.4), (0.9, 0.18)
 FEWEST_COMPARED = 30
 BETTER = 0.1
 """Its gap is so much larger than that of what the files say."""
-STEPS_PER_DOUBLING = 6
+STEPS_PER_DOUBLING = 8
 """A grid this fine brings the drawing to within a cell or two."""
 ROUND_NUMBERS = (1000, 100, 10, 8, 4, 3, 2, 1.5, 1 / 0.3048, 2.54, 1)
 ROUND = 0.015
