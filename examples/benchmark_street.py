@@ -81,7 +81,8 @@ def same(first: LabelledCloud, second: LabelledCloud) -> bool:
         (getattr(first.instances, column.name), getattr(second.instances, column.name))
         for column in fields(first.instances)
     ]
-    return all(np.array_equal(np.asarray(one), np.asarray(other)) for one, other in pairs)
+    # What is not known is NaN in both: tiles say nothing of reliability.
+    return all(np.array_equal(np.asarray(one, float), np.asarray(other, float), equal_nan=True) for one, other in pairs)
 
 
 if __name__ == "__main__":
