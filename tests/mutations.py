@@ -151,7 +151,8 @@ MUTATIONS = (
         ".max(axis=1) < self.settings.synonym", ".max(axis=1) < 2", CHOOSING,
     ),
     Mutation(
-        "the other words' mean is taken over all", "ask/choosing.py", "np.count_nonzero(other)", "len(other)", CHOOSING,
+        "the other words' mean is taken over all", "ask/choosing.py",
+        "self._bank_evidence[:, other].astype", "np.where(other, self._bank_evidence, -np.inf).astype", CHOOSING,
     ),
     Mutation(
         "equal labels compete", "ask/choosing.py",
