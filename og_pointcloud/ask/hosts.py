@@ -134,7 +134,7 @@ _READERS = {
 
 def _checked(values: Any, kind: str) -> NDArray[np.float64]:
     if isinstance(values, np.ma.MaskedArray) and values.dtype.kind in "fiu":
-        values = values.astype(np.float64).filled(np.nan)  # what is masked has no place
+        values = np.ma.filled(values.astype(np.float64), np.nan)  # what is masked has no place
     try:
         points = np.asarray(values)
     except ValueError as error:
