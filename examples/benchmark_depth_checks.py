@@ -79,7 +79,7 @@ def said_of(depth: Depth, cameras: list[Camera]) -> str:
 
 def camera_of(frame: Frame, lens: Intrinsics) -> Camera:
     """The camera of a frame of the room."""
-    pose = np.linalg.inv(frame.camera_to_world)
+    pose = np.linalg.inv(frame.camera_to_world).astype(np.float64)
     return Camera(lens.width, lens.height, lens.focal_px, lens.focal_px, lens.width / 2, lens.height / 2, pose)
 
 
