@@ -16,7 +16,7 @@ from og_pointcloud.errors import SceneError
 from og_pointcloud.fitting.fit import fit, prepare
 from og_pointcloud.journal import Journal, LeftOut
 from og_pointcloud.scene import Camera, Points, Scene, View
-from og_pointcloud.settings import FitSettings, MembershipSettings
+from og_pointcloud.settings import FitSettings, MembershipSettings, PaperSettings
 
 WIDTH, HEIGHT, FOCAL_PX = 96, 72, 90.0
 LOWER = np.array([[-1.0, -0.9, 0], [0.2, -1.0, 0], [-0.9, 0.3, 0], [0.4, 0.3, 0]])
@@ -386,11 +386,12 @@ def test_tiny_images(width: int, height: int) -> None:
         assert fit(tiny_scene(3, width, height, focal=focal), progress=False).instance_ids.shape == (3,)
 
 
-def test_pixels_much_finer_than_gaussians_of_mode_paper_are_left_out() -> None:
-    scene, settings, journal = tiny_scene(3, 60, 45, focal=200.0), FitSettings(mode="paper"), Journal(progress=False)
+def test_pixels_beyond_those_that_mode_paper_renders_are_left_out() -> None:
+    settings = FitSettings(mode="paper", paper=PaperSettings(image_pixels=30 * 22))
+    scene, journal = tiny_scene(3, 60, 44, focal=200.0), Journal(progress=False)
     prepared = prepare(scene, settings, journal)
-    np.testing.assert_array_equal(prepared.table.mask_pixels, [60 * 45] * 2)  # areas are of the whole image
-    assert any(key is LeftOut.PIXELS for key, _ in journal.left_out)
+    np.testing.assert_array_equal(prepared.table.mask_pixels, [60 * 44] * 2)  # areas are of the whole image
+    assert any(key is LeftOut.PIXELS_IN_PAPER_MODE for key, _ in journal.left_out)
     assert fit(scene, progress=False).instance_ids.tolist() == [0] * 3
 
 

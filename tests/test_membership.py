@@ -19,6 +19,7 @@ from og_pointcloud.fitting.membership import (
     Membership,
     _best_group,
     _by_point,
+    _without_islands,
     assign_points,
     instance_area,
     without_see_through,
@@ -366,3 +367,14 @@ def test_with_enough_views_depth_is_not_asked() -> None:
     assert share == 0
     weights, _, _ = front_of(depth, views=SETTINGS.few_views, seen_once=[0, 7])
     np.testing.assert_array_equal(weights, [1] * 7 + [0, 1])
+
+
+@pytest.mark.parametrize(("votes", "stays"), [(0.6, True), (0.4, False)])
+def test_a_piece_apart_stays_by_the_majority_of_its_votes(votes: float, stays: bool) -> None:
+    grid = np.stack([*np.meshgrid(np.arange(12.0), np.arange(12.0)), np.zeros((12, 12))], axis=-1).reshape(-1, 3)
+    xyz = np.concatenate([grid, grid[:40] + np.array([100.0, 0, 0])]).astype(np.float32)
+    apart = np.arange(len(xyz)) >= len(grid)
+    share, around = np.where(apart, votes, 0.9), neighbourhood(xyz, GeometrySettings())
+    kept = _without_islands(np.zeros(len(xyz), np.int32), share, np.ones(len(xyz)), around, least=0.1)
+    assert (kept[~apart] == 0).all()
+    assert (kept[apart] == (0 if stays else UNOBSERVED)).all()

@@ -263,7 +263,7 @@ def test_the_report_names_what_is_left_out_and_what_failed(tmp_path):
 @pytest.mark.slow
 def test_the_command_writes_table_chart_and_report(folder, tmp_path, capsys):
     out = tmp_path / "r"
-    assert main(["report", str(folder), "--knob", "views", "--knob", "border rounds", "-o", str(out)]) == 0
+    assert main(["report", str(folder), "--knob", "views", "--knob", "sure share", "-o", str(out)]) == 0
     printed = capsys.readouterr().out
     assert f"wrote {out / 'report.md'}" in printed
     assert "views: one of 2" in printed
@@ -272,7 +272,7 @@ def test_the_command_writes_table_chart_and_report(folder, tmp_path, capsys):
     assert all(float(one["seconds"]) > 0 and 0 <= float(one["error"]) <= 1 for one in rows.values())
     assert "cores" in rows["default", ""]["machine"]
     assert cv2.imread(str(out / "report.png")).shape[2] == 3
-    assert "border rounds: 0" in (out / "report.md").read_text()
+    assert "sure share: 0.4" in (out / "report.md").read_text()
 
 
 def test_ablations_need_truth(tiny_capture, tmp_path, capsys):
@@ -289,7 +289,7 @@ def test_the_ablations_are_written_by_the_same_command(folder, tmp_path, capsys)
         for name, (published, *_) in named.items():
             assert float(rows[table, name]["published"]) == published
             assert float(rows[table, name]["labelled_miou"]) > 0
-    assert float(rows["mode", "grouping"]["miou"]) > 0.8
+    assert float(rows["default", ""]["miou"]) > 0.8
     assert rows["losses", "both"]["miou"] == rows["association", "both"]["miou"]
     assert "losses: inter only" in capsys.readouterr().out
 

@@ -44,12 +44,15 @@ def run(arguments: argparse.Namespace) -> None:
         for title, path in titles(arguments.bundles).items()
     }
     page = served.serve(scenes, served.ServeSettings(arguments.host, arguments.port, AXES[arguments.up]))
-    print(f"{page.url}  (Ctrl-C ends it)", flush=True)
-    if page.is_open:
-        print(f"anyone who reaches {arguments.host} can see and ask these scenes: there is no password", flush=True)
-    else:
-        print("for this machine alone; --host 0.0.0.0 lets others in, without a password", flush=True)
-    page.wait()
+    try:
+        print(f"{page.url}  (Ctrl-C ends it)", flush=True)
+        if page.is_open:
+            print(f"anyone who reaches {arguments.host} can see and ask these scenes: there is no password", flush=True)
+        else:
+            print("for this machine alone; --host 0.0.0.0 lets others in, without a password", flush=True)
+        page.wait()
+    except KeyboardInterrupt:  # before it waited
+        page.stop()
 
 
 def titles(paths: list[Path]) -> dict[str, Path]:
