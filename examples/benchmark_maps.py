@@ -132,13 +132,14 @@ def growing(folder: Path, options: argparse.Namespace) -> None:
 
 
 def speed(folder: Path, options: argparse.Namespace) -> None:
-    """Milliseconds a frame in maps of SIZES points: the capture's, drawn anew with noise of half a spacing."""
+    """Milliseconds a frame in maps of SIZES points: on the way from the capture's to their neighbours."""
     capture, frames = frames_of(folder, options)
     xyz, random = capture.points.xyz_world, np.random.default_rng(0)
-    noise = 0.5 * float(np.median(np.asarray(cKDTree(xyz).query(xyz[:10_000], k=2, workers=-1)[0])[:, 1]))
+    near = np.asarray(cKDTree(xyz).query(xyz, k=5, workers=-1)[1])
     print(f"\n{folder.name}: {len(frames)} frames\n   points  objects  median ms  p95 ms  CPU ms")
     for size in SIZES:
-        cloud = xyz[random.integers(0, len(xyz), size)] + random.normal(0, noise, (size, 3))
+        first, other = near[random.integers(0, len(xyz), size)][:, [0, random.integers(1, 5)]].T
+        cloud = xyz[first] + random.random((size, 1)) * (xyz[other] - xyz[first])
         mapper = og.Mapper(cloud=cloud, feature_space=capture.feature_space)
         for frame in frames[:WARM_UP]:
             mapper.integrate(frame)

@@ -171,6 +171,17 @@ def test_a_bad_frame_is_refused_in_words_and_the_map_unharmed(grown, said):
     assert mapper.points == sequence
 
 
+def test_a_camera_close_to_a_wall_is_of_the_place():
+    """Most of the map before it lies behind the wall."""
+    x, y = (grid.ravel() for grid in np.meshgrid(np.linspace(-1, 1, 60), np.linspace(-1, 1, 60)))
+    walls = [np.stack([x * z, y * z, np.full(3600, float(z))], axis=-1) for z in range(1, 9)]
+    camera = og.Camera(64, 48, 40.0, 40.0, 32.0, 24.0, np.eye(4))
+    depth = np.ones((48, 64), np.float32)
+    og.Mapper(cloud=np.concatenate(walls)).integrate(og.Frame(camera, depth=depth))
+    with pytest.raises(SceneError, match="confirms 0% of"):
+        og.Mapper(cloud=np.concatenate(walls)).integrate(og.Frame(camera, depth=5 * depth))
+
+
 def test_masks_without_any_geometry_are_refused():
     with pytest.raises(SceneError, match="no points yet"):
         og.Mapper().integrate(without_depth(frames(THINGS))[0])

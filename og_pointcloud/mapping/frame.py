@@ -19,6 +19,8 @@ COMPARED = 4000
 """Points of the map, at most, by which a frame's depth is held against it."""
 FEWEST_COMPARED = 200
 """Fewer say nothing: the frame looks at a part of the place that the map does not know."""
+CELLS, FRONT = 16, 1.2
+"""Parts of an image along each side; points farther than so often the nearest of their part may be hidden by it."""
 LEAST_AGREEING = 0.25
 """Share of the map's points in front of a camera whose depth it must confirm: what moved is a small part of a place."""
 OTHER_UNIT = 2.5
@@ -144,7 +146,11 @@ def require_same_place(stamp: float, view: MeasuredView, xyz: NDArray[np.float32
     inside = view.camera.shows(uv_px)
     column, row = uv_px[inside].astype(np.intp).T
     measured, z = view.depth[row, column], z[inside]
-    met = measured > 0
+    # What the map itself hides says nothing: a camera close to a wall has most of the place behind it.
+    cell = row * CELLS // view.camera.height * CELLS + column * CELLS // view.camera.width
+    nearest = np.full(CELLS**2, np.inf)
+    np.minimum.at(nearest, cell, z)
+    met = (measured > 0) & (z < FRONT * nearest[cell])
     if np.count_nonzero(met) < FEWEST_COMPARED:
         return
     agreeing = float((states[::step][inside][met] == AGREES).mean())
