@@ -112,7 +112,7 @@ def _photographs(source: Path, target: Path) -> list[Path]:
 
 def _pycolmap() -> Any:
     try:
-        import pycolmap
+        import pycolmap  # pyright: ignore[reportMissingImports]
     except ImportError as error:
         raise MissingExtraError("pycolmap", "poses") from error
     pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL)  # what fails is said here
