@@ -25,6 +25,8 @@ FloatArray = NDArray[np.float32]
 DoubleArray = NDArray[np.float64]
 IntArray = NDArray[np.int32]
 
+SHORTEST_FOCAL = 1e-6
+"""Focal length over the image's side: shorter ones see half of the world in every pixel."""
 LONGEST_SIDE = 1 << 17
 """Pixels; no camera has more."""
 NOT_SEEN = -2
@@ -76,10 +78,10 @@ class Camera:
                 f"most {LONGEST_SIDE} a side: check w and h of the pose file"
             )
         intrinsics = (self.fx, self.fy, self.cx, self.cy)
-        if not np.isfinite(intrinsics).all() or self.fx <= 0 or self.fy <= 0:
+        if not np.isfinite(intrinsics).all() or min(self.fx / self.width, self.fy / self.height) < SHORTEST_FOCAL:
             raise SceneError(
-                f"camera intrinsics fx, fy, cx, cy are {intrinsics}; expected finite numbers, fx and fy > 0: "
-                "check the camera model in the pose file"
+                f"camera intrinsics fx, fy, cx, cy are {intrinsics}; expected finite numbers, fx and fy > 0 "
+                f"by {SHORTEST_FOCAL:g} of the image's sides or more: check the camera model in the pose file"
             )
 
     def resized(self, width: int, height: int) -> Camera:

@@ -260,6 +260,11 @@ def test_a_las_file_whose_scales_collapse_or_mirror_it(tmp_path, scale):
 
 
 @pytest.mark.filterwarnings("ignore:none of")
+def test_a_focal_length_of_next_to_nothing():
+    with pytest.raises(SceneError, match="fx and fy > 0 by 1e-06 of the image's sides"):
+        og.Camera(640, 480, 1e-300, 1e-300, 320.0, 240.0, np.eye(4))
+
+
 def test_what_is_masked_in_an_array_of_points_has_no_label(bundle):
     points = np.ma.array(room(500).xyz[:4].astype(np.float64), mask=[[k < 2] * 3 for k in range(4)])
     masked, plain = (og.segment(given, ["apple"], bundle) for given in (points, points.data))
