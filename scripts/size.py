@@ -2,6 +2,7 @@
 
     python scripts/size.py                 # this tree
     python scripts/size.py --against REV   # a revision beside it
+    python scripts/size.py --since REV     # product lines of files that stood at a revision, and of those added since
     python scripts/size.py --folders       # product lines of each folder too
 
 Product is og_pointcloud, export and plugins; a line is a line, comments and docstrings too. Circles and upward imports
@@ -34,6 +35,9 @@ def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description="The size and shape of the code.")
     parser.add_argument("--against", metavar="REV", help="a revision to show beside this tree")
+    parser.add_argument(
+        "--since", metavar="REV", help="what stood at a revision, and what was added since, in two rows"
+    )
     parser.add_argument("--folders", action="store_true", help="product lines of each folder too")
     arguments = parser.parse_args()
     against = arguments.against
@@ -47,6 +51,9 @@ def main() -> None:
     print(f"{'':40}" + "".join(f"{name[:12]:>14}" for name in columns))
     for row in columns["this tree"]:
         print(f"{row:40}" + "".join(f"{column[row]:>14}" for column in columns.values()))
+    if arguments.since:
+        for row, lines in lines_since(arguments.since).items():
+            print(f"{row:40}{lines:>14}")
     if arguments.folders:
         for folder, lines in sorted(lines_by_folder(ROOT).items(), key=lambda pair: -pair[1]):
             print(f"{folder:40}{lines:>14}")
@@ -85,6 +92,18 @@ def lines_by_folder(root: Path) -> dict[str, int]:
         folder = "/".join(path.relative_to(root).parts[:2]) if path.parent.parent != root else path.parent.name
         lines[folder] = lines.get(folder, 0) + _count([path])
     return lines
+
+
+def lines_since(revision: str) -> dict[str, int]:
+    """Product lines of files that stood at a revision (by whatever name: git finds renames), and of those added."""
+    command = ["git", "diff", "-M", "--diff-filter=A", "--name-only", revision, "--", *PRODUCT]
+    names = subprocess.run(command, cwd=ROOT, capture_output=True, check=True, text=True).stdout.split()
+    added = [ROOT / name for name in names if name.endswith(".py")]
+    product = [path for folder in PRODUCT for path in (ROOT / folder).rglob("*.py")]
+    return {
+        f"product lines, stood at {revision[:12]}": _count(product) - _count(added),
+        f"product lines, {len(added)} files added since": _count(added),
+    }
 
 
 def _ends(root: Path) -> tuple[str, str]:
