@@ -5,15 +5,17 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 from string import Formatter
-from typing import get_args, get_type_hints
+from typing import Any, get_args, get_type_hints
 
 import numpy as np
 import pytest
 from test_fit import BOXES, boxes_on_a_table
 
 from og_pointcloud.cloud import BACKGROUND, UNOBSERVED, LabelledCloud
+from og_pointcloud.fitting import labellers
 from og_pointcloud.fitting.fit import fit, prepare
 from og_pointcloud.fitting.labellers import LABELLERS, fast
+from og_pointcloud.fitting.learned.codebook import Codebook
 from og_pointcloud.journal import Journal, LeftOut, left_out_entry
 from og_pointcloud.settings import CodebookSettings, FitSettings, MatchingSettings, PaperSettings, VisibilitySettings
 
@@ -93,6 +95,35 @@ def test_fast_mode_names_the_coarse_cluster_of_every_instance() -> None:
     assert set(np.unique(cloud.instances.coarse)) <= {0, 1}
     grouped = fit(known.scene, FitSettings(mode="grouping"), progress=False)
     assert (grouped.instances.coarse == -1).all()
+
+
+def test_leaves_are_decided_on_largest_first_whatever_their_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where masks of two overlap, the smaller one may have a point: which is smaller goes by number."""
+    prepared = prepare(boxes_on_a_table().scene)
+    given, books = [], []
+    decide, build = labellers.assign_points, labellers.two_level_codebook
+
+    def renumbered(*arguments: Any) -> Codebook:
+        book = build(*arguments)
+        order = np.random.default_rng(len(books)).permutation(len(book.leaf_coarse))
+        number = np.append(np.argsort(order), -1).astype(np.int32)
+        books.append(replace(
+            book, leaf=number[book.leaf], leaf_centres=book.leaf_centres[order], leaf_coarse=book.leaf_coarse[order]
+        ))  # fmt: skip
+        return books[-1]
+
+    monkeypatch.setattr(labellers, "two_level_codebook", renumbered)
+    monkeypatch.setattr(labellers, "assign_points", lambda *a: given.append(a[2].group) or decide(*a))
+    settings = FitSettings(codebook=CodebookSettings(k1=3))
+    found = [fast(prepared.table, prepared.surface, settings, Journal(False)) for _ in range(3)]
+    for groups, book in zip(given, books, strict=True):
+        np.testing.assert_array_equal(groups, given[0])
+        points = np.sort(np.bincount(book.leaf[book.leaf >= 0]))[::-1]
+        covered = [(prepared.table.weights[groups == group].sum(axis=0) > 0).sum() for group in range(len(points))]
+        assert len(np.unique(points)) == len(points) > 2
+        assert (np.diff(covered) < 0).all()
+    for each in found:
+        np.testing.assert_array_equal(each.instance_ids, found[0].instance_ids)
 
 
 def test_every_mode_has_its_labeller() -> None:

@@ -196,11 +196,13 @@ def _settled(
     table: MaskTable, surface: Surface, settings: FitSettings, journal: Journal, coarse: NDArray[np.int32],
     matching: Matching,
 ) -> Labelling:  # fmt: skip
-    """Leaves as groups of the masks that they accepted; all views then decide every point."""
-    groups = MaskGroups(matching.mask_instance, len(coarse), np.zeros(len(table.mask_view), bool))
+    """Leaves as groups of the masks that they accepted, largest first; all views then decide every point."""
+    order = np.argsort(-matching.instances.points, kind="stable")
+    number = np.append(np.argsort(order), -1).astype(np.int32)
+    groups = MaskGroups(number[matching.mask_instance], len(order), np.zeros(len(table.mask_view), bool))
     with journal.stage("grouping"):
         votes = view_votes(table)
-    return _decided_by_views(table, votes, groups, surface, settings, journal, coarse)
+    return _decided_by_views(table, votes, groups, surface, settings, journal, coarse[order])
 
 
 def _decided_by_views(

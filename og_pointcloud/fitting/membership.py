@@ -65,8 +65,8 @@ def assign_points(
     neighbourhood: Neighbourhood,
     settings: MembershipSettings,
 ) -> Membership:
-    """Decide the state of every point. Groups keep their numbers, of which a later one shows less, as `group_masks` has
-    them (leaves of a codebook are in no order); a dismissed group ends with no point."""
+    """Decide the state of every point. Groups keep their numbers, of which a later one is smaller; a dismissed group
+    ends with no point."""
     has_mask = np.zeros((groups.count, table.outside.shape[0]), np.bool_)
     grouped = groups.group >= 0
     has_mask[groups.group[grouped], table.mask_view[grouped]] = True
