@@ -123,6 +123,8 @@ class View:
         camera's.
     mask_features: (M, D) float32, one row per mask, as the encoder gave it (not normalised).
     image: (H, W, 3) uint8 RGB, or a function that reads it, or None where the capture has no images.
+    mask_tracks: (M,) integers, which masks of other views a tracker took for the same thing: equal numbers, -1 unknown;
+        None where there was no tracker.
     """
 
     name: str
@@ -130,6 +132,7 @@ class View:
     masks: IntArray | Callable[[], IntArray]
     mask_features: FloatArray
     image: NDArray[np.uint8] | Callable[[], NDArray[np.uint8]] | None = None
+    mask_tracks: NDArray[np.integer] | None = None
 
     def __post_init__(self) -> None:
         features = self.mask_features
@@ -148,6 +151,12 @@ class View:
             raise SceneError(
                 f"view '{self.name}': the feature of mask {int(np.argmin(finite)) + 1} holds NaN or infinity; "
                 "expected finite numbers: encode this mask again or remove it"
+            )
+        tracks = self.mask_tracks
+        if tracks is not None and (tracks.shape != (len(features),) or tracks.dtype.kind not in "iu"):
+            raise SceneError(
+                f"view '{self.name}': mask tracks are {tracks.dtype} {tracks.shape}; expected a whole number for each "
+                f"of {len(features)} masks: write -1 for a mask without a track"
             )
 
     @property

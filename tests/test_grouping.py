@@ -393,3 +393,44 @@ def reference_joins(
             break
         groups[a] += groups.pop(b)
     return groups
+
+
+def with_tracks(table: MaskTable, tracks: Sequence[int]) -> MaskTable:
+    return replace(table, mask_track=np.array(tracks, np.int64))
+
+
+def front_and_back(features: Sequence[NDArray[np.float32]] = (ONE, ONE)) -> MaskTable:
+    """Two views of each side of a thing; nothing is seen from both sides."""
+    front, back = [(A, features[0])], [(B, features[1])]
+    return hand_table(100, [front, front, back, back], [B, B, A, A])
+
+
+@pytest.mark.parametrize("features", [(ONE, ONE), (ONE, OTHER)])
+def test_a_track_joins_what_no_view_sees_together(features: Sequence[NDArray[np.float32]]) -> None:
+    table = front_and_back(features)
+    np.testing.assert_array_equal(groups_of(table), [0, 0, 1, 1])
+    np.testing.assert_array_equal(groups_of(with_tracks(table, [7, 7, 7, 7])), [0, 0, 0, 0])
+    np.testing.assert_array_equal(groups_of(with_tracks(table, [7, 7, 9, 9])), [0, 0, 1, 1])
+
+
+def test_unknown_tracks_say_nothing() -> None:
+    table = front_and_back()
+    np.testing.assert_array_equal(groups_of(with_tracks(table, [-1, 7, -1, 7])), [0, 0, 0, 0])
+    np.testing.assert_array_equal(groups_of(with_tracks(table, [-1, 7, -1, -1])), groups_of(table))
+    for track in (-1, -5):
+        np.testing.assert_array_equal(groups_of(with_tracks(table, [track] * 4)), groups_of(table))
+
+
+@pytest.mark.parametrize("views", [2, 3, 5])
+def test_a_tracker_is_one_witness_among_the_views(views: int) -> None:
+    """That took two things for one, which all views show apart; and one thing for two, which they show as one."""
+    table = hand_table(100, [[(A, ONE), (B, OTHER)]] * views)
+    np.testing.assert_array_equal(groups_of(with_tracks(table, [3, 3] * views)), [0, 1] * views)
+    table = hand_table(50, [[(A, ONE)]] * views)
+    np.testing.assert_array_equal(groups_of(with_tracks(table, range(views))), [0] * views)
+
+
+def test_names_of_tracks_do_not_matter() -> None:
+    table = front_and_back()
+    for names in ([5, 5, 2, 5], [1 << 40, 1 << 40, 0, 1 << 40]):
+        np.testing.assert_array_equal(groups_of(with_tracks(table, names)), groups_of(with_tracks(table, [0, 0, 1, 0])))

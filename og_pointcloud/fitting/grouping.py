@@ -10,6 +10,8 @@ so that ``N_ij / N_ib`` is the share of mask i that lies in mask j of view b. Fr
 of masks it contains: "one thing" (same container) or "two" (different ones). A view that missed an object says
 nothing. Masks are joined bottom-up while a majority of the witnesses pooled over both groups says "one thing":
 a mask that spans two objects is outvoted, parts of one object come together when other views show it whole.
+Where masks have tracks, the tracker is one witness more: of two masks that it followed it says "one thing" where their
+track is the same, also of masks that share no Gaussian, the front and the back of a thing, of which no view can say it.
 The idea of view consensus is that of MaskClustering (Yan et al., CVPR 2024); the soft, visibility-weighted form is
 ours.
 """
@@ -50,7 +52,7 @@ def group_masks(
     share = mask_shares(votes, table.mask_view, settings, sample)
     spanning = _spanning_masks(share, table.mask_view, settings)
     container = _containers(share, table.mask_view, spanning, settings)
-    witnesses = _witnesses(share, container, table.mask_view, settings)
+    witnesses = _witnesses(share, container, table, settings)
     shown = np.asarray(table.weights.sum(axis=1), np.float64).ravel()
     usable = ~spanning & (shown > 0)
     group = _agglomerate(witnesses, table.unit_features, table.mask_view, usable, settings)
@@ -140,9 +142,10 @@ def _containers(
 
 @dataclass(frozen=True)
 class _Witnesses:
-    """Per pair of masks (rows, cols, both ways) that any view shows as one thing: how many views do, and how many of
-    these if the two masks have the same extent, else 0. speaks: (masks, views), where a mask has a container: views
-    that say anything of a pair are those where both have."""
+    """Per pair of masks (rows, cols, both ways) that any view, or the tracker, shows as one thing: how many do, and how
+    many of these whatever the features say: all if the two masks have the same extent, else the tracker alone. speaks:
+    (masks, views, and one column for the tracker), where a mask has a container, or a track: witnesses that say anything
+    of a pair are those where both have."""
 
     rows: NDArray[np.int32]
     cols: NDArray[np.int32]
@@ -151,15 +154,21 @@ class _Witnesses:
     speaks: NDArray[np.float64]
 
 
-def _witnesses(
-    share: csr_array, container: csr_array, mask_view: NDArray[np.int32], settings: GroupingSettings
-) -> _Witnesses:
-    pairs = csr_array(container @ container.T).tocoo()
+def _witnesses(share: csr_array, container: csr_array, table: MaskTable, settings: GroupingSettings) -> _Witnesses:
+    views = int(table.mask_view.max(initial=-1)) + 1
+    speaks = (container @ indicator(table.mask_view, views).T).toarray().astype(np.float64)
+    followed = csr_array(container.shape, dtype=np.float32)
+    if table.mask_track is not None:
+        track = np.unique(np.maximum(table.mask_track, -1), return_inverse=True)[1] - (table.mask_track < 0).any()
+        tracks = indicator(track.astype(np.int32), int(track.max(initial=-1)) + 1)
+        followed = csr_array(tracks.T @ tracks)
+        speaks = np.column_stack([speaks, track >= 0])
+    pairs = csr_array(container @ container.T + followed).tocoo()
     off_diagonal = pairs.row != pairs.col
     rows, cols, one = pairs.row[off_diagonal], pairs.col[off_diagonal], pairs.data[off_diagonal].astype(np.float64)
-    speaks = (container @ indicator(mask_view, int(mask_view.max(initial=-1)) + 1).T).toarray().astype(np.float64)
     smaller = np.minimum(_lookup(share, rows, cols), _lookup(share, cols, rows))
-    return _Witnesses(rows, cols, one, np.where(smaller > settings.container_share, one, 0.0), speaks)
+    sure = np.where(smaller > settings.container_share, one, _lookup(followed, rows, cols))
+    return _Witnesses(rows, cols, one, sure, speaks)
 
 
 def _agglomerate(

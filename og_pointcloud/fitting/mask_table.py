@@ -8,7 +8,7 @@ an interrupted fit left in the folder are not rendered again.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import islice
@@ -46,6 +46,7 @@ class MaskTable:
         front, small behind other splats, and smaller still where it only shows through a surface.
     mask_view: (masks,) int32, the view of each mask. mask_pixels: (masks,) int32, area in pixels.
     mask_features: (masks, D) float32, as the encoder gave them.
+    mask_track: (masks,) int64 as `View.mask_tracks`; None where no view has tracks.
     """
 
     weights: csr_array
@@ -54,6 +55,7 @@ class MaskTable:
     mask_view: NDArray[np.int32]
     mask_pixels: NDArray[np.int32]
     mask_features: NDArray[np.float32]
+    mask_track: NDArray[np.int64] | None = None
 
     @property
     def unit_features(self) -> NDArray[np.float32]:
@@ -110,7 +112,7 @@ def mask_table(
         lengths, *_, exposed = work.arrays("view", key, make)
         sizes = np.array([lengths[:-1].sum(dtype=np.int64), lengths[-1], len(exposed)])
         pixels = np.bincount(ids[ids >= 0], minlength=view.mask_count).astype(np.int32)
-        return _ShownView(key, make, sizes, pixels, view.mask_features)
+        return _ShownView(key, make, sizes, pixels, view.mask_features, view.mask_tracks)
 
     views_shown = list(_side_by_side(shown, views, side_by_side))
     matrices = _put_together(views_shown, len(gaussians), work, most_in_memory)
@@ -119,19 +121,21 @@ def mask_table(
         np.repeat(np.arange(len(views_shown), dtype=np.int32), [len(view.pixels) for view in views_shown]),
         np.concatenate([view.pixels for view in views_shown]),
         _stacked([view.mask_features for view in views_shown]),
+        stacked_tracks([(view.mask_tracks, len(view.pixels)) for view in views_shown]),
     )
 
 
 @dataclass(frozen=True)
 class _ShownView:
     """A view whose arrays (`_view_arrays`) a work folder keeps under ``key``. sizes: (3,) entries in masks, outside of
-    them, and of the exposure. pixels: (masks,) int32. mask_features: (masks, D) float32."""
+    them, and of the exposure. pixels: (masks,) int32. mask_features, mask_tracks: as of `View`."""
 
     key: str
     make: Callable[[], tuple[NDArray[Any], ...]]
     sizes: NDArray[np.int64]
     pixels: NDArray[np.int32]
     mask_features: NDArray[np.float32]
+    mask_tracks: NDArray[np.integer] | None
 
 
 def view_fingerprint(view: View, ids: NDArray[np.int32]) -> str:
@@ -195,6 +199,13 @@ def _stacked(features: list[NDArray[np.float32]]) -> NDArray[np.float32]:
     """Mask features of all views; a view without masks may give rows of any width."""
     width = max((rows.shape[1] for rows in features), default=0)
     return np.concatenate([rows if len(rows) else np.zeros((0, width), np.float32) for rows in features])
+
+
+def stacked_tracks(of_views: Sequence[tuple[NDArray[np.integer] | None, int]]) -> NDArray[np.int64] | None:
+    """`MaskTable.mask_track` of `View.mask_tracks` and numbers of masks."""
+    if all(tracks is None for tracks, _ in of_views):
+        return None
+    return np.concatenate([np.full(count, -1) if tracks is None else np.int64(tracks) for tracks, count in of_views])
 
 
 def require_sight(exposed: int, masked: int, scene: Scene) -> None:

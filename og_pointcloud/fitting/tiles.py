@@ -33,7 +33,7 @@ from og_pointcloud.fitting.grouping import MaskGroups, group_masks, indicator
 from og_pointcloud.fitting.held_out import choose_scale, note_scale
 from og_pointcloud.fitting.labellers import LABELLERS, Labelling, grouping, instances_of_groups, renumbered
 from og_pointcloud.fitting.looks import Looks, by_look, looks_of_groups
-from og_pointcloud.fitting.mask_table import MaskTable, mask_table, require_sight, view_fingerprint
+from og_pointcloud.fitting.mask_table import MaskTable, mask_table, require_sight, stacked_tracks, view_fingerprint
 from og_pointcloud.fitting.membership import assign_points, without_see_through
 from og_pointcloud.fitting.memory import memory_left
 from og_pointcloud.fitting.tasks import Share, run_tasks, share_here
@@ -212,12 +212,13 @@ def _drawing(views: Sequence[View], cloud: TiledCloud, settings: FitSettings, jo
 @dataclass(frozen=True)
 class _Shown:
     """What all views show. keys: of the array of ENTRY of each view in the cloud's work folder, sorted by point. first:
-    (views, tiles + 1), where each tile's points begin in it. mask_view, mask_features: as in `MaskTable`."""
+    (views, tiles + 1), where each tile's points begin in it. mask_view, mask_features, mask_track: as in `MaskTable`."""
 
     keys: tuple[str, ...]
     first: Rows
     mask_view: NDArray[np.int32]
     mask_features: NDArray[np.float32]
+    mask_track: NDArray[np.int64] | None
 
     def table(self, cloud: TiledCloud, rows: NDArray[np.integer], few_views: int) -> MaskTable:
         """The mask table of some points, given in ascending order.
@@ -242,7 +243,7 @@ class _Shown:
         stacks = [_stacked(part, count, seldom) for part, count in zip(parts, masks.tolist(), strict=True)]
         weights, outside, exposure = (csr_array(vstack(blocks, format="csr")) for blocks in zip(*stacks, strict=True))
         no_pixels = np.zeros(len(self.mask_view), np.int32)  # asked only where what is behind an object is found
-        return MaskTable(weights, outside, exposure, self.mask_view, no_pixels, self.mask_features)
+        return MaskTable(weights, outside, exposure, self.mask_view, no_pixels, self.mask_features, self.mask_track)
 
 
 def _stacked(entries: Entries, masks: int, seldom: NDArray[np.bool_]) -> tuple[csr_array, csr_array, csr_array]:
@@ -268,7 +269,14 @@ def _all_shown(scene: Scene, cloud: TiledCloud, looked: Sequence[_LookedAt], jou
         journal.leave_out(LeftOut.FINE_POINTS, share=share, finest_px=FINEST_PX, most=MOST_SPLATS)
     mask_view = np.repeat(np.arange(len(looked), dtype=np.int32), [view.mask_count for view in scene.views])
     first = np.array([view.first for view in looked])
-    return _Shown(tuple(view.key for view in looked), first, mask_view, np.concatenate(masks))
+    keys = tuple(view.key for view in looked)
+    return _Shown(
+        keys,
+        first,
+        mask_view,
+        np.concatenate(masks),
+        stacked_tracks([(view.mask_tracks, view.mask_count) for view in scene.views]),
+    )
 
 
 @dataclass(frozen=True)
