@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -297,6 +298,33 @@ def test_an_existing_folder_of_masks_as_proposer(tmp_path):
     assert made.masks == 4
     ids = ids_of(tmp_path / "c", world.names[0])
     assert sorted(np.bincount(ids.ravel())[1:].tolist()) == [80, 400]
+
+
+def test_ids_of_a_video_tracker_are_tracks_of_the_capture(tmp_path):
+    world = make_capture(tmp_path / "c", 3)
+    for k, name in enumerate(world.names):
+        ids = np.zeros((HEIGHT, WIDTH), np.uint16)
+        ids[10:30, 10 + k : 30 + k], ids[5:9, 40:60] = 700, 5
+        (tmp_path / f"{name}.png").write_bytes(cv2.imencode(".png", ids)[1].tobytes())
+    settings = MaskSettings(str(tmp_path), encoder=None, level="large", tracks=True)
+    make_masks(tmp_path / "c", settings, say=silent)
+    for k, view in enumerate(read_capture(tmp_path / "c").views):
+        of_thing = view.mask_map()[20, 20 + k], view.mask_map()[6, 50]
+        assert [view.mask_tracks[mask] - 1 for mask in of_thing] == [698, 3]
+    make_masks(tmp_path / "c", replace(settings, tracks=False), say=silent)
+    assert all(view.mask_tracks is None for view in read_capture(tmp_path / "c").views)
+
+
+def test_tracks_that_do_not_fit_the_masks_are_refused(tmp_path):
+    make_capture(tmp_path, 2)
+    make_masks(tmp_path, QUICK, say=silent)
+    with np.load(tmp_path / "mask_features.npz") as file:
+        arrays = dict(file)
+    name = next(name for name in arrays if name != "feature_space")
+    for tracks in (np.zeros(len(arrays[name]) + 1, np.int64), np.zeros(len(arrays[name]))):
+        np.savez(tmp_path / "mask_features.npz", **arrays, **{f"{name}.tracks": tracks})
+        with pytest.raises(SceneError, match=rf"view '{name}': mask tracks are .*; expected a whole number for each"):
+            read_capture(tmp_path)
 
 
 # Images as they come ----------------------------------------------------------------------------------------------

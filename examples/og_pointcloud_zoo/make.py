@@ -34,7 +34,7 @@ from scipy.spatial import cKDTree
 from og_pointcloud_zoo.draws import Draw
 from og_pointcloud_zoo.places import GLASS, MIRROR, NAMES, PLACES
 
-__all__ = ["made_scene"]
+__all__ = ["drawn_capture", "made_scene"]
 
 TESTS = str(Path(__file__).parents[2] / "tests")
 SHELL = ("floor", "wall", "ceiling")
@@ -54,7 +54,7 @@ def made_scene(draw: Draw, cache: Path) -> Path:
         cache.mkdir(parents=True, exist_ok=True)
         temporary = Path(tempfile.mkdtemp(prefix=f".{draw.name}.", dir=cache))
         try:
-            write_capture(_capture(draw), temporary)
+            write_capture(drawn_capture(draw), temporary)
             temporary.rename(folder)
         finally:
             shutil.rmtree(temporary, ignore_errors=True)
@@ -65,7 +65,8 @@ def _stream(draw: Draw, purpose: int, *view: int) -> np.random.Generator:
     return np.random.default_rng([draw.seed, purpose, *view])
 
 
-def _capture(draw: Draw) -> RoomCapture:
+def drawn_capture(draw: Draw) -> RoomCapture:
+    """A scene with its truth, in memory."""
     if draw.place == "street":
         return _street(draw)
     if draw.place == "demo":

@@ -27,6 +27,11 @@ def add(parser: Parser) -> None:
         "--features", default="crops", choices=("crops", "dense"),
         help="crops: several runs of the encoder a mask (default); dense: one run an image, faster and coarser",
     )  # fmt: skip
+    parser.add_argument("--words", nargs="+", default=(), metavar="WORD", help="mask these alone; needs SAM 3")
+    parser.add_argument(
+        "--tracks", action="store_true",
+        help="follow things from image to image: SAM 3's words; or a folder's ids mean the same in all its PNGs",
+    )  # fmt: skip
     parser.add_argument("--level", default="medium", choices=("small", "medium", "large"), help="how much is one mask")
     parser.add_argument("--every", type=int, default=1, metavar="N", help="use every N-th image; needs -o")
     parser.add_argument("--longest-side", type=int, default=1024, metavar="PX", help="larger images are shrunk to this")
@@ -44,6 +49,8 @@ def run(arguments: argparse.Namespace) -> None:
         features=arguments.features,
         longest_side=arguments.longest_side,
         every=arguments.every,
+        words=tuple(arguments.words),
+        tracks=arguments.tracks,
     )
     if arguments.encoder == "demo":
         warnings.warn(

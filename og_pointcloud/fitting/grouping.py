@@ -144,8 +144,8 @@ def _containers(
 class _Witnesses:
     """Per pair of masks (rows, cols, both ways) that any view, or the tracker, shows as one thing: how many do, and how
     many of these whatever the features say: all if the two masks have the same extent, else the tracker alone. speaks:
-    (masks, views, and one column for the tracker), where a mask has a container, or a track: witnesses that say anything
-    of a pair are those where both have."""
+    (masks, views + 1 for the tracker), where a mask has a container, or a track: witnesses that say anything of a pair
+    are those where both have."""
 
     rows: NDArray[np.int32]
     cols: NDArray[np.int32]

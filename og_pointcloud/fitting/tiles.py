@@ -212,7 +212,7 @@ def _drawing(views: Sequence[View], cloud: TiledCloud, settings: FitSettings, jo
 @dataclass(frozen=True)
 class _Shown:
     """What all views show. keys: of the array of ENTRY of each view in the cloud's work folder, sorted by point. first:
-    (views, tiles + 1), where each tile's points begin in it. mask_view, mask_features, mask_track: as in `MaskTable`."""
+    (views, tiles + 1), where each tile's points begin in it. mask_view, mask_features, mask_track: as `MaskTable`."""
 
     keys: tuple[str, ...]
     first: Rows

@@ -264,7 +264,7 @@ def _layer_of(face: Face, layer: MaskLayer, view: str) -> MaskLayer:
     scaled = face.of_whole_size(*layer.size)
     size = scaled.camera.width, scaled.camera.height
     if not face.name:
-        return MaskLayer(size, layer.features, lambda: scaled.mask_ids(layer.read()))
+        return MaskLayer(size, layer.features, lambda: scaled.mask_ids(layer.read()), layer.tracks)
     used = np.unique(scaled.mask_ids(layer.read()))
     used = used[used >= 0]
     if len(used) and used[-1] >= len(layer.features):
@@ -275,7 +275,8 @@ def _layer_of(face: Face, layer: MaskLayer, view: str) -> MaskLayer:
     row_of_id = np.full(len(layer.features) + 2, -1, np.int32)  # the last two serve NOT_SEEN and -1
     row_of_id[NOT_SEEN] = NOT_SEEN
     row_of_id[used] = np.arange(len(used), dtype=np.int32)
-    return MaskLayer(size, layer.features[used], lambda: row_of_id[scaled.mask_ids(layer.read())])
+    tracks = None if layer.tracks is None else layer.tracks[used]
+    return MaskLayer(size, layer.features[used], lambda: row_of_id[scaled.mask_ids(layer.read())], tracks)
 
 
 def _read_masks(capture: Path, names: Sequence[str], level: str) -> tuple[list[MaskLayer], str]:
@@ -428,7 +429,7 @@ def _view(name: str, image: PosedImage, layer: MaskLayer, file: Path | None, ori
     _require_shape(name, layer, image.camera)
     camera = in_local_frame(image.camera.resized(*layer.size), origin)
     read_image = None if file is None else partial(read_photograph, file, camera, image.face)
-    return View(name, camera, layer.read, layer.features, read_image)
+    return View(name, camera, layer.read, layer.features, read_image, layer.tracks)
 
 
 def read_photograph(file: Path, camera: Camera, face: Face | None) -> NDArray[np.uint8]:

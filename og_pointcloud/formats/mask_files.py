@@ -2,7 +2,9 @@
 
 A mask image is grey, 8 or 16 bit, 0 outside every mask, else an id 1..M that means something in this image only. The
 features file holds ``<view name>`` -> (M, D), any float type, where row i belongs to id i + 1, and ``feature_space``,
-the name of the encoder. A view without masks has an all-zero image and an empty (0, D) array.
+the name of the encoder. A view without masks has an all-zero image and an empty (0, D) array. Masks that a tracker
+followed have ``<view name>.tracks`` -> (M,) whole numbers there: the same in all views for what it took for one thing,
+-1 unknown.
 """
 
 from __future__ import annotations
@@ -21,10 +23,13 @@ from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.images import decoded, png_header, require_cv2
 from og_pointcloud.formats.npy import arrays_from_npz
 
-__all__ = ["FEATURES_NAME", "MASKS_FOLDER", "MaskLayer", "as_float32", "read_ids", "read_masks", "require_all"]
+__all__ = [
+    "FEATURES_NAME", "MASKS_FOLDER", "TRACKS", "MaskLayer", "as_float32", "read_ids", "read_masks", "require_all",
+]  # fmt: skip
 
 MASKS_FOLDER = "masks"
 FEATURES_NAME = "mask_features.npz"
+TRACKS = ".tracks"
 MAX_FEATURE_BYTES = 1 << 32
 GREY = 0
 PNG_COLOR_TYPES = {0: "grey", 2: "RGB (3 channels)", 3: "palette", 4: "grey with alpha", 6: "RGBA (4 channels)"}
@@ -34,13 +39,14 @@ PNG_COLOR_TYPES = {0: "grey", 2: "RGB (3 channels)", 3: "palette", 4: "grey with
 class MaskLayer:
     """One view's masks before they meet a camera.
 
-    size: (width, height) of the mask map. features: (M, D) float32.
+    size: (width, height) of the mask map. features: (M, D) float32. tracks: as `View.mask_tracks`.
     read: gives the map, (height, width) int32, -1 outside every mask, else a row of ``features``.
     """
 
     size: tuple[int, int]
     features: NDArray[np.float32]
     read: Callable[[], NDArray[np.int32]]
+    tracks: NDArray[np.integer] | None = None
 
 
 def read_masks(capture: Path, names: Sequence[str]) -> tuple[list[MaskLayer], str]:
@@ -51,9 +57,9 @@ def read_masks(capture: Path, names: Sequence[str]) -> tuple[list[MaskLayer], st
     """
     files = [capture / MASKS_FOLDER / f"{name}.png" for name in names]
     require_all(files, "write an all-zero mask and an empty (0, D) feature array for an image without masks")
-    features, feature_space = _read_features(capture / FEATURES_NAME, names)
+    features, tracks, feature_space = _read_features(capture / FEATURES_NAME, names)
     layers = [
-        MaskLayer(_mask_size(file), features[name], partial(read_ids, file))
+        MaskLayer(_mask_size(file), features[name], partial(read_ids, file), tracks.get(name))
         for name, file in zip(names, files, strict=True)
     ]
     return layers, feature_space
@@ -90,10 +96,13 @@ def read_ids(file: Path) -> NDArray[np.int32]:
     return ids.astype(np.int32) - 1
 
 
-def _read_features(file: Path, names: Sequence[str]) -> tuple[dict[str, NDArray[np.float32]], str]:
-    """Features by view name, and the name of their space."""
+def _read_features(
+    file: Path, names: Sequence[str]
+) -> tuple[dict[str, NDArray[np.float32]], dict[str, NDArray[Any]], str]:
+    """Features and tracks by view name, and the name of the features' space."""
+    of_tracks = {name + TRACKS: name for name in names}
     try:
-        arrays, held = arrays_from_npz(file, [*names, "feature_space"], MAX_FEATURE_BYTES)
+        arrays, held = arrays_from_npz(file, [*names, *of_tracks, "feature_space"], MAX_FEATURE_BYTES)
     except ValueError as error:
         raise SceneError(str(error)) from None
     missing = [name for name in names if name not in arrays]
@@ -103,7 +112,8 @@ def _read_features(file: Path, names: Sequence[str]) -> tuple[dict[str, NDArray[
             f"{', '.join(map(repr, held[:3])):.120}, ...); expected an array (masks, D) under each image's stem"
         )
     features = {name: _as_features(arrays[name], f"{file}, '{name}'") for name in names}
-    return features, str(arrays.get("feature_space", UNKNOWN_SPACE))
+    tracks = {name: arrays[key] for key, name in of_tracks.items() if key in arrays}
+    return features, tracks, str(arrays.get("feature_space", UNKNOWN_SPACE))
 
 
 def _as_features(values: NDArray[Any], source: str) -> NDArray[np.float32]:

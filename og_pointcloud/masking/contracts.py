@@ -25,10 +25,12 @@ class Proposals:
     """Masks of one image; they may overlap, and contain one another.
 
     masks: (M, H, W) bool. scores: (M,) float32 in [0, 1], how much the proposer trusts each; what no model scored is 1.
+    tracks: (M,) int64, of a tracker, equal numbers for what it takes for one thing through all images, -1 unknown.
     """
 
     masks: NDArray[np.bool_]
     scores: NDArray[np.float32]
+    tracks: NDArray[np.int64] | None = None
 
     def __post_init__(self) -> None:
         if self.masks.ndim != 3 or self.masks.dtype != np.bool_:
@@ -37,6 +39,8 @@ class Proposals:
             raise SceneError(
                 f"{len(self.masks)} proposals have scores of shape {self.scores.shape}; expected a finite one each"
             )
+        if self.tracks is not None and self.tracks.shape != self.scores.shape:
+            raise SceneError(f"{len(self.masks)} proposals have tracks of shape {self.tracks.shape}; expected one each")
 
     def __len__(self) -> int:
         return len(self.masks)
@@ -78,6 +82,9 @@ class MaskSettings:
     features: crops, a few runs of the encoder a mask; or dense, one an image, coarser (`masking/dense.py`).
     longest_side: larger images are shrunk to this; masks have the shrunk size.
     every: of so many images one is used.
+    words: what to look for, with a proposer that takes words (`sam3`).
+    tracks: things are followed from image to image, in the order of the pose file; of a folder of id PNGs: its ids are
+        the same thing's in all images, as video trackers write them.
     """
 
     proposer: str = "opencv"
@@ -86,6 +93,8 @@ class MaskSettings:
     features: str = "crops"
     longest_side: int = 1024
     every: int = 1
+    words: tuple[str, ...] = ()
+    tracks: bool = False
 
     def __post_init__(self) -> None:
         if self.features not in FEATURES:

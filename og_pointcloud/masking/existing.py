@@ -25,12 +25,14 @@ MAX_MASKS_PX = 1 << 33
 """Masks of one image together: more is refused before anything is allocated."""
 
 
-def from_ids(ids: NDArray[np.integer], none: int = 0) -> Proposals:
-    """An id map (H, W) as proposals of score 1, by ascending id. none: the id outside every mask."""
+def from_ids(ids: NDArray[np.integer], none: int = 0, tracks: bool = False) -> Proposals:
+    """An id map (H, W) as proposals of score 1, by ascending id. none: the id outside every mask. tracks: whether ids
+    are those of tracks."""
     names = np.unique(ids)
     names = names[names != none]
     _check_room(len(names), ids.shape, "the id map")
-    return Proposals(ids == names[:, None, None], np.ones(len(names), np.float32))
+    of_tracks = names.astype(np.int64) if tracks else None
+    return Proposals(ids == names[:, None, None], np.ones(len(names), np.float32), of_tracks)
 
 
 def as_proposals(given: Any, shape: tuple[int, int]) -> Proposals:
@@ -98,16 +100,20 @@ def own_proposer(place: str) -> MaskProposer:
 @dataclass(frozen=True)
 class ExistingMasks:
     """A folder of masks by image name: ``<name>.png`` of ids (8 or 16 bit grey, 0 none), ``<name>.json`` (a list of RLE
-    annotations, as segment-anything's script writes), or one COCO ``.json`` for all images."""
+    annotations, as segment-anything's script writes), or one COCO ``.json`` for all images.
+
+    tracks: whether an id of a PNG means the same thing in all of them.
+    """
 
     folder: Path
+    tracks: bool = False
     name: str = field(default="existing", init=False)
 
     def of(self, image_name: str, shape: tuple[int, int]) -> Proposals:
         """The masks of one image, resized to ``shape`` (H, W). SceneError where it has none."""
         png, single = self.folder / f"{image_name}.png", self.folder / f"{image_name}.json"
         if png.is_file():
-            return _resized(from_ids(_read_ids(png), none=-1), shape)
+            return _resized(from_ids(_read_ids(png), none=-1, tracks=self.tracks), shape)
         if single.is_file():
             return _resized(_from_annotations(_annotations(read_json(single, MAX_JSON_BYTES)), str(single)), shape)
         stem = image_name.rsplit("/", 1)[-1]
@@ -249,7 +255,7 @@ def _resized(proposals: Proposals | None, shape: tuple[int, int]) -> Proposals:
     rows = (np.arange(shape[0]) + 0.5) * height / shape[0]
     columns = (np.arange(shape[1]) + 0.5) * width / shape[1]
     masks = proposals.masks[:, rows.astype(np.int64)[:, None], columns.astype(np.int64)]
-    return Proposals(masks, proposals.scores)
+    return Proposals(masks, proposals.scores, proposals.tracks)
 
 
 def _check_room(masks: int, shape: tuple[int, ...], source: str) -> None:

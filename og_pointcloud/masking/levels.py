@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from og_pointcloud.masking.contracts import Proposals
 
-__all__ = ["PREFERENCE", "settle"]
+__all__ = ["PREFERENCE", "settle", "settled"]
 
 PREFERENCE = {"small": 1.6, "medium": 1.0, "large": 0.6}
 """Level -> how often the parts of a mask count: more prefers parts, less prefers wholes."""
@@ -31,6 +31,11 @@ VISIBLE = 0.3
 
 def settle(proposals: Proposals, level: str = "medium") -> NDArray[np.int32]:
     """(H, W) int32: -1 outside every mask of this level of `PREFERENCE`, else 0..K-1, the best scored mask first."""
+    return settled(proposals, level)[0]
+
+
+def settled(proposals: Proposals, level: str) -> tuple[NDArray[np.int32], NDArray[np.intp]]:
+    """What `settle` gives, and (K,) the proposal that each id is."""
     atom_of_pixel, member, area_px = _atoms(proposals.masks)
     order = np.lexsort((member @ area_px, -proposals.scores.astype(np.float64)))  # the better, then the smaller
     member, scores = member[order], proposals.scores[order].astype(np.float64)
@@ -40,7 +45,7 @@ def settle(proposals: Proposals, level: str = "medium") -> NDArray[np.int32]:
     used = _cut(np.diag(shared_px), scores, _parents(shared_px), PREFERENCE[level])
     shown, ids = np.unique(_owners(member, area_px, used), return_inverse=True)
     ids = ids - (shown[:1] < 0).sum()  # -1, where there is one, is the first of the owners
-    return ids.astype(np.int32)[atom_of_pixel]
+    return ids.astype(np.int32)[atom_of_pixel], order[kept][shown[shown >= 0]]
 
 
 def _atoms(masks: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.bool_], NDArray[np.float64]]:

@@ -27,7 +27,7 @@ from og_pointcloud.errors import OgPointcloudError, SceneError, printable
 from og_pointcloud.formats.atomic import locked, replacing
 from og_pointcloud.formats.images import require_cv2
 from og_pointcloud.formats.langsplat import LANGUAGE_FEATURES_FOLDER
-from og_pointcloud.formats.mask_files import FEATURES_NAME, MASKS_FOLDER
+from og_pointcloud.formats.mask_files import FEATURES_NAME, MASKS_FOLDER, TRACKS
 from og_pointcloud.formats.nerfstudio import TRANSFORMS_NAMES
 from og_pointcloud.masking.contracts import MaskSettings
 from og_pointcloud.masking.photographs import Photograph, read_photographs, write_contact_sheet
@@ -163,7 +163,7 @@ def _work_through(settings: MaskSettings, tasks: Sequence[ImageTask], target: Pa
         say(f"{len(tasks) - len(waiting)} of {len(tasks)} images are done already")
     broken, start = [], time.perf_counter()
     last_said, preview_at = start, min(PREVIEW_IMAGES, len(tasks))
-    for count, (task, wrong) in enumerate(results(settings, waiting), 1):
+    for count, (task, wrong) in enumerate(results(settings, waiting, len(tasks) - len(waiting)), 1):
         if wrong:
             broken.append(wrong)
             say(f"broken: {wrong}")
@@ -231,14 +231,17 @@ def _assemble(target: Path, settings: MaskSettings, tasks: Sequence[ImageTask]) 
     folder.mkdir(parents=True, exist_ok=True)
     _write_made(target, settings, tasks)  # first: killed here, the next run knows the folder as ours, but not as whole
     features: dict[str, Any] = {}
-    space = UNKNOWN_SPACE
+    space, masks = UNKNOWN_SPACE, 0
     for task in tasks:
         work = read_work(task.work_file)
-        space, features[task.photograph.name] = str(work["feature_space"]), work["features"]
-        _write_mask_image(folder / f"{task.photograph.name}.png", work["ids"])
+        name, space = task.photograph.name, str(work["feature_space"])
+        features[name], masks = work["features"], masks + len(work["features"])
+        if "tracks" in work:
+            features[name + TRACKS] = work["tracks"]
+        _write_mask_image(folder / f"{name}.png", work["ids"])
     with replacing(target / FEATURES_NAME) as file:
         np.savez(file, feature_space=np.array(space), **features)
-    return sum(map(len, features.values())), space
+    return masks, space
 
 
 def _write_made(target: Path, settings: MaskSettings, tasks: Sequence[ImageTask], **record: Any) -> None:

@@ -2,13 +2,14 @@
 
 What the processors would do is a few lines (`prepared`), with the numbers of the model's ``preprocessor_config.json``:
 SAM and SAM-HQ scale the longer side and pad, SAM 2 and 3 scale both sides to a square. SAM 3's points are answered by
-its tracker half; its text half is not used, since words are asked later, of the points.
+its tracker half; its words are in ``sam3``.
 """
 
 from __future__ import annotations
 
 import json
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,7 +26,7 @@ try:
 except ImportError as error:
     raise MissingExtraError("torch and transformers", "masks") from error
 
-__all__ = ["SamPredictor", "open_sam", "prepared"]
+__all__ = ["LoadedModel", "SamPredictor", "file_of", "load_sam", "open_sam", "prepared"]
 
 Tensor = torch.Tensor
 
@@ -61,29 +62,49 @@ def open_sam(name: str | os.PathLike[str]) -> AutomaticMasks:
     return AutomaticMasks(SamPredictor(name), f"sam:{name}")
 
 
+@dataclass(frozen=True)
+class LoadedModel:
+    """kind: its model_type. where: its folder, or OWNER/MODEL. device: a GPU where torch has one."""
+
+    model: Any
+    kind: str
+    where: str
+    device: torch.device
+    preparation: Preparation
+
+
+def load_sam(name: str | os.PathLike[str], classes: Mapping[str, str]) -> LoadedModel:
+    """A model's folder or a fetched OWNER/MODEL, for evaluation. classes: model_type -> transformers' class to take.
+
+    SceneError where there is none of these types, or it cannot be read.
+    """
+    where = str(Path(name).expanduser()) if Path(name).expanduser().is_dir() else str(name)
+    try:
+        kind = _known_type(name, _read_json(where, "config.json"), classes)
+        # A known type is a class of transformers: no code of the folder's (auto_map) is looked at.
+        # Weights are read from .safetensors alone: other files are pickles.
+        model: Any = getattr(transformers, classes[kind]).from_pretrained(
+            where, local_files_only=True, trust_remote_code=False, attn_implementation="sdpa", use_safetensors=True
+        )
+    except SceneError:
+        raise
+    except Exception as error:  # of many types, some of safetensors' own
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise SceneError(
+            f"no SAM model '{name}' ({reason:.120}); expected a transformers folder with "
+            "config.json and weights, or a fetched model: hf download OWNER/MODEL"
+        ) from None
+    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    return LoadedModel(model.eval().to(device), kind, where, device, _preparation(where, kind, model.config))
+
+
 class SamPredictor:
-    """A `PointPredictor` on any of the four. On a GPU where torch has one."""
+    """A `PointPredictor` on any of the four."""
 
     def __init__(self, name: str | os.PathLike[str]) -> None:
-        where = str(Path(name).expanduser()) if Path(name).expanduser().is_dir() else str(name)
-        try:
-            self.kind = _known_type(name, _read_json(where, "config.json"))
-            # A known type is a class of transformers: no code of the folder's (auto_map) is looked at.
-            # Weights are read from .safetensors alone: other files are pickles.
-            self.model: Any = getattr(transformers, CLASSES[self.kind]).from_pretrained(
-                where, local_files_only=True, trust_remote_code=False, attn_implementation="sdpa", use_safetensors=True
-            )
-        except SceneError:
-            raise
-        except Exception as error:  # of many types, some of safetensors' own
-            reason = (str(error).splitlines() or [type(error).__name__])[0]
-            raise SceneError(
-                f"no SAM model '{name}' ({reason:.120}); expected a transformers folder with "
-                "config.json and weights, or a fetched model: hf download OWNER/MODEL"
-            ) from None
-        self.device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-        self.model = self.model.eval().to(self.device)
-        self.preparation = _preparation(where, self.kind, self.model.config)
+        loaded = load_sam(name, CLASSES)
+        self.model, self.kind, self.device = loaded.model, loaded.kind, loaded.device
+        self.preparation = loaded.preparation
         self.size = (0, 0)
         self.encoded: dict[str, Any] = {}
 
@@ -132,16 +153,16 @@ def prepared(image: NDArray[np.uint8], preparation: Preparation) -> Tensor:
     return torch.nn.functional.pad(pixels, (0, preparation.side - size[1], 0, preparation.side - size[0]))
 
 
-def _known_type(name: str | os.PathLike[str], config: dict[str, Any] | None) -> str:
-    """The model_type of a config.json, if it is one of `CLASSES`."""
+def _known_type(name: str | os.PathLike[str], config: dict[str, Any] | None, classes: Mapping[str, str]) -> str:
+    """The model_type of a config.json, if it is one of ``classes``."""
     if config is None:
         raise OSError("there is no config.json")
     kind = str(config.get("model_type"))
     if "quantization_config" in config:
         raise SceneError(f"{name} is quantised; expected a model in float32 or float16, whose weights alone are read")
-    if kind not in CLASSES or not hasattr(transformers, CLASSES[kind]):
+    if kind not in classes or not hasattr(transformers, classes[kind]):
         raise SceneError(
-            f"{name} is a model of type '{kind:.40}'; expected one of {', '.join(CLASSES)} that the installed "
+            f"{name} is a model of type '{kind:.40}'; expected one of {', '.join(classes)} that the installed "
             f"transformers {transformers.__version__} has"
         )
     return kind
@@ -159,19 +180,25 @@ def _preparation(where: str, kind: str, config: Any) -> Preparation:
 
 
 def _square_side(config: Any) -> int:
-    side = config.prompt_encoder_config.image_size
+    side = getattr(config, "prompt_encoder_config", config).image_size
     return int(side[0] if isinstance(side, (list, tuple)) else side)
 
 
-def _read_json(where: str, name: str) -> dict[str, Any] | None:
-    """A JSON file of the model, None where it has none. ValueError where it is not a JSON object."""
+def file_of(where: str, name: str) -> Path | None:
+    """A file of a model's folder, or of a fetched model; None where it has none."""
     from transformers.utils.hub import cached_file
 
     file = cached_file(
         where, name, local_files_only=True, _raise_exceptions_for_missing_entries=False,
         _raise_exceptions_for_connection_errors=False,
     )  # fmt: skip
-    content = json.loads(Path(file).read_text(encoding="utf-8")) if file is not None else None
+    return None if file is None else Path(file)
+
+
+def _read_json(where: str, name: str) -> dict[str, Any] | None:
+    """A JSON file of the model, None where it has none. ValueError where it is not a JSON object."""
+    file = file_of(where, name)
+    content = json.loads(file.read_text(encoding="utf-8")) if file is not None else None
     if content is not None and not isinstance(content, dict):
         raise ValueError(f"{name} holds no JSON object")
     return content

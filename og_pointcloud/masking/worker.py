@@ -20,7 +20,7 @@ from og_pointcloud.formats.atomic import replacing
 from og_pointcloud.masking.contracts import MaskProposer, MaskSettings
 from og_pointcloud.masking.encode import open_mask_encoder
 from og_pointcloud.masking.existing import ExistingMasks, own_proposer
-from og_pointcloud.masking.levels import settle
+from og_pointcloud.masking.levels import settled
 from og_pointcloud.masking.photographs import Photograph
 
 __all__ = ["ImageTask", "open_proposer", "read_work", "results"]
@@ -36,10 +36,14 @@ class ImageTask(NamedTuple):
 class ImageWorker:
     """The models of a run."""
 
-    def __init__(self, settings: MaskSettings) -> None:
+    def __init__(self, settings: MaskSettings, done: int = 0) -> None:
+        """done: images that earlier runs have done; of what they followed this one knows nothing."""
         self.settings = settings
         folder = Path(settings.proposer)
-        self.proposer = ExistingMasks(folder) if folder.is_dir() else open_proposer(settings.proposer)
+        if folder.is_dir() and not settings.words:
+            self.proposer = ExistingMasks(folder, settings.tracks)
+        else:
+            self.proposer = open_proposer(settings.proposer, settings.words, done if settings.tracks else None)
         self.encoder = open_mask_encoder(settings.encoder, settings.features) if settings.encoder is not None else None
 
     def __call__(self, task: ImageTask) -> str | None:
@@ -57,11 +61,12 @@ class ImageWorker:
         proposer = self.proposer
         existing = isinstance(proposer, ExistingMasks)
         proposals = proposer.of(name, image.shape[:2]) if existing else proposer.propose(image)
-        ids = settle(proposals, self.settings.level)
+        ids, chosen = settled(proposals, self.settings.level)
         masks = ids == np.arange(ids.max(initial=-1) + 1)[:, None, None]
         space = self.encoder.feature_space if self.encoder else UNKNOWN_SPACE
         features = self.encoder.embed(image, masks) if self.encoder else np.zeros((len(masks), 1))
-        return {"feature_space": np.array(space), "ids": ids, "features": features.astype(np.float16)}
+        made = {"feature_space": np.array(space), "ids": ids, "features": features.astype(np.float16)}
+        return made if proposals.tracks is None else {**made, "tracks": proposals.tracks[chosen]}
 
 
 def read_work(file: Path) -> dict[str, NDArray[Any]]:
@@ -73,14 +78,26 @@ def read_work(file: Path) -> dict[str, NDArray[Any]]:
         raise SceneError(f"{file} cannot be read ({error}): remove it, and the same command makes it again") from None
 
 
-def open_proposer(text: str) -> MaskProposer:
+def open_proposer(text: str, words: Sequence[str] = (), followed: int | None = None) -> MaskProposer:
     """``opencv``; ``sam:FOLDER`` or ``sam:OWNER/MODEL``; ``python:MODULE:NAME``, a function or proposer of the user's
     own (`existing.own_proposer`).
 
+    words: what SAM 3 looks for; left out, everything. followed: with words, follow them from image to image, as the
+    run that begins after so many images (`sam3.FollowedWords`).
     Nothing is downloaded. SceneError names what is known. A folder of masks is no proposer of this kind: it goes by
     the image's name (`existing.ExistingMasks`).
     """
     kind, _, name = text.partition(":")
+    if words or followed is not None:
+        if kind != "sam" or not name or not words:
+            asked = "tracks" if followed is not None else "words"
+            raise SceneError(
+                f"{asked} are asked of proposer '{text}'{'' if words else ' without words'}; expected words with SAM 3 "
+                "(--proposer sam:facebook/sam3 --words chair lamp), and tracks with both, or with a folder of id PNGs"
+            )
+        from og_pointcloud.masking.sam3 import FollowedWords, NamedThings
+
+        return NamedThings(name, words) if followed is None else FollowedWords(name, words, followed)
     if text == "opencv":
         from og_pointcloud.masking.opencv import OpenCVProposer
 
@@ -97,11 +114,14 @@ def open_proposer(text: str) -> MaskProposer:
     )
 
 
-def results(settings: MaskSettings, tasks: Sequence[ImageTask]) -> Iterator[tuple[ImageTask, str | None]]:
-    """Each task when it is done, and what is wrong with its image (None: nothing). No task is no work, and no error."""
+def results(
+    settings: MaskSettings, tasks: Sequence[ImageTask], done: int = 0
+) -> Iterator[tuple[ImageTask, str | None]]:
+    """Each task when it is done, and what is wrong with its image (None: nothing). No task is no work, and no error.
+    done: images that earlier runs have done."""
     if not tasks:
         return
-    work = ImageWorker(settings)
+    work = ImageWorker(settings, done)
     pool = ThreadPoolExecutor(settings.threads)
     waiting = {pool.submit(work, task): task for task in tasks}
     try:

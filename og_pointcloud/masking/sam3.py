@@ -1,0 +1,130 @@
+"""SAM 3's words through transformers: a mask for each thing that a word names, in one image or followed through many.
+
+Words go through the model's own tokenizer.json, read as all of them are (`text.tokenizer`), and unpadded: padding is
+masked in the model. What transformers would fetch from elsewhere while it tracks is not fetched: without it tracks are
+not thinned out, which settling the masks of an image does.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from og_pointcloud.errors import MissingExtraError, SceneError
+from og_pointcloud.masking.contracts import Proposals
+from og_pointcloud.masking.sam import LoadedModel, file_of, load_sam, prepared
+from og_pointcloud.text.tokenizer import open_tokenizer
+
+try:
+    import torch
+    import transformers
+except ImportError as error:
+    raise MissingExtraError("torch and transformers", "masks") from error
+
+__all__ = ["FollowedWords", "NamedThings"]
+
+LEAST_SCORE = 0.5
+"""Below, a detection is none, as transformers' examples have it. Of a tracker its configuration says it."""
+TRACKS_OF_A_RUN = 1 << 32
+
+
+class NamedThings:
+    """A proposer of what words name in an image by itself."""
+
+    def __init__(self, name: str | os.PathLike[str], words: Sequence[str]) -> None:
+        """name: as for `sam.open_sam`, of a SAM 3. words: at least one. SceneError where they cannot be used."""
+        self._loaded = load_sam(name, {"sam3": "Sam3Model", "sam3_video": "Sam3Model"})
+        self._tokens = _tokens(self._loaded, words)
+        self.name = f"sam:{name}"
+
+    @torch.inference_mode()
+    def propose(self, image: NDArray[np.uint8]) -> Proposals:
+        """image: (H, W, 3) uint8 RGB."""
+        model, masks, scores = self._loaded.model, [], []
+        seen = model.get_vision_features(pixel_values=_pixels(self._loaded, image))
+        for tokens in self._tokens:
+            found = model(vision_embeds=seen, input_ids=tokens, attention_mask=torch.ones_like(tokens))
+            score = (found.pred_logits.sigmoid() * found.presence_logits.sigmoid())[0]
+            kept = score > LEAST_SCORE
+            masks.append(found.pred_masks[0, kept].sigmoid() - 0.5)
+            scores.append(score[kept])
+        return _proposals(torch.cat(masks), torch.cat(scores), image)
+
+
+class FollowedWords:
+    """A proposer of what words name in images that come one after the other, which keeps the tracks of things."""
+
+    def __init__(self, name: str | os.PathLike[str], words: Sequence[str], images_before: int = 0) -> None:
+        """As `NamedThings`, of a SAM 3 with its tracker. images_before: how many others have seen; tracks of a run that
+        begins elsewhere have other numbers."""
+        self._loaded = load_sam(name, {"sam3_video": "Sam3VideoModel"})
+        self.name, self._first = f"sam:{name}", images_before * TRACKS_OF_A_RUN
+        # As after a failed attempt: it would fetch code and run it.
+        sys.modules[type(self._loaded.model).__module__].cv_utils_kernel = False  # pyright: ignore
+        device, self._step = self._loaded.device, 0
+        self._session = transformers.Sam3VideoInferenceSession(
+            inference_device=device, inference_state_device=device, video_storage_device=device, dtype=torch.float32
+        )
+        for word, tokens in zip(words, _tokens(self._loaded, words), strict=True):
+            prompt = self._session.add_prompt(word)
+            self._session.prompt_input_ids[prompt] = tokens
+            self._session.prompt_attention_masks[prompt] = torch.ones_like(tokens)
+
+    @torch.inference_mode()
+    def propose(self, image: NDArray[np.uint8]) -> Proposals:
+        """image: (H, W, 3) uint8 RGB, the next one."""
+        pixels = _pixels(self._loaded, image)
+        seen = self._loaded.model(inference_session=self._session, frame=pixels, frame_idx=self._step)
+        self._forget()
+        self._step += 1
+        hidden = {*(seen.suppressed_obj_ids or ()), *(seen.removed_obj_ids or ())}
+        tracks = [track for track in sorted(seen.obj_id_to_mask) if track not in hidden]
+        masks = [torch.zeros((0, 1, 1)), *(seen.obj_id_to_mask[track].float().cpu() for track in tracks)]
+        scores = torch.tensor([float(seen.obj_id_to_score[track]) for track in tracks])
+        return _proposals(torch.cat(masks[1:] or masks), scores, image, self._first + np.array(tracks, np.int64))
+
+    def _forget(self) -> None:
+        """What lies farther back than the tracker looks: an image takes 12 MB, a thing in it one."""
+        tracker = self._loaded.model.config.tracker_config
+        oldest = self._step - max(tracker.max_object_pointers_in_encoder, tracker.num_maskmem)
+        self._session.processed_frames.pop(self._step)
+        for outputs in self._session.output_dict_per_obj.values():
+            outputs["non_cond_frame_outputs"].pop(oldest, None)
+
+
+def _tokens(loaded: LoadedModel, words: Sequence[str]) -> list[torch.Tensor]:
+    """(1, T) ids of each word."""
+    file = file_of(loaded.where, "tokenizer.json")
+    if file is None:
+        raise SceneError(f"{loaded.where} has no tokenizer.json, which words need: fetch the whole model again")
+    config = getattr(loaded.model.config, "detector_config", loaded.model.config).text_config
+    try:
+        tokenizer = open_tokenizer(file.read_bytes(), config.max_position_embeddings)
+    except ValueError as error:
+        raise SceneError(f"{file} cannot be used ({error}): fetch the model again") from None
+    if tokenizer.highest_id >= config.vocab_size:
+        raise SceneError(
+            f"{file} gives ids up to {tokenizer.highest_id}, the model has {config.vocab_size}: fetch both"
+        )
+    return [torch.tensor([tokenizer(word)], device=loaded.device) for word in words]
+
+
+def _pixels(loaded: LoadedModel, image: NDArray[np.uint8]) -> torch.Tensor:
+    return prepared(image, loaded.preparation).to(loaded.device)
+
+
+def _proposals(
+    values: torch.Tensor, scores: torch.Tensor, image: NDArray[np.uint8], tracks: NDArray[np.int64] | None = None
+) -> Proposals:
+    """Of masks (n, h, w), which are where values are above 0, those that have a pixel of the image."""
+    size = image.shape[:2]
+    if not len(values):
+        return Proposals(np.zeros((0, *size), np.bool_), np.zeros(0, np.float32), tracks)
+    masks = torch.nn.functional.interpolate(values[None], size, mode="bilinear", align_corners=False)[0] > 0
+    shown = masks.any(dim=(1, 2)).cpu().numpy()
+    found = masks.cpu().numpy()[shown], scores.float().cpu().numpy()[shown].clip(0, 1)
+    return Proposals(*found, None if tracks is None else tracks[shown])
