@@ -21,7 +21,6 @@ class LeftOut(Enum):
     """What can be left out of a fit: its key in provenance, then what it is and why, with places for numbers."""
 
     # fmt: off
-    VIEWS = "views", "{count} of {total} views", "nearly all that they see is seen by {enough} others"
     COINCIDENT_POINTS = "coincident points", "{count} points", "they lie exactly where another lies, and get its label"
     CHOICE_OF_SPLATS = "choice of splats", "choice of scale and opacity", "the file holds Gaussians"
     CHOICE_OF_SCALE = (

@@ -270,21 +270,14 @@ class PaperSettings(_LossSettings):
 
 @dataclass(frozen=True)
 class VisibilitySettings:
-    """What is rendered of the views (splatting.py, coverage.py), and where the mask table is kept while it grows
-    (mask_table.py, work_folder.py). `examples/benchmark_visibility.py` gives error and time of each choice."""
+    """Where the mask table is kept while it grows (mask_table.py, work_folder.py)."""
 
-    enough_views: int | None = None
-    """A view is left out when nearly all that it sees has been seen by so many others; None: all views are used."""
     table_share: float = 0.4
     """Part of the memory left that the table may fill; beyond, it is on disk. What is derived from it takes as much."""
     views_share: float = 0.3
     """Part of the memory left that views worked on side by side may fill; one is always."""
     keep_after_s: float = 20.0
     """Views are kept for a later start only where all of them take longer than this, seconds."""
-
-    def __post_init__(self) -> None:
-        if self.enough_views is not None and self.enough_views < 1:
-            raise OgPointcloudError(f"enough_views is {self.enough_views}; expected at least 1, or None for all views")
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ from og_pointcloud.fitting.mask_table import mask_table
 from og_pointcloud.fitting.tiled_cloud import TiledCloud, _opened, split
 from og_pointcloud.fitting.work_folder import WorkFolder, kept_files
 from og_pointcloud.scene import Camera, Points, Scene, View
-from og_pointcloud.settings import FitSettings, GeometrySettings, VisibilitySettings
+from og_pointcloud.settings import FitSettings, GeometrySettings
 
 SETTINGS = FitSettings(mode="grouping", geometry=GeometrySettings(scales=(0.5,)))
 POINTS = 24_000
@@ -300,17 +300,6 @@ def test_a_fit_is_in_tiles_where_memory_is_short_and_they_help(monkeypatch):
     cloud = fit(scene, tight, progress=False)
     assert cloud.provenance["left_out"][0]["key"] == "whole fit"
     assert cloud.provenance["notes"]["tiles"] == [800] * 4
-
-
-@pytest.mark.slow
-def test_views_are_left_out_in_tiles_too(monkeypatch):
-    monkeypatch.setattr(tiles, "FINEST_PX", 1e-6)
-    settings = replace(SETTINGS, visibility=VisibilitySettings(enough_views=1))
-    again = tuple(replace(view, name=f"{view.name} again") for view in street().scene.views)
-    scene = replace(street().scene, views=street().scene.views + again)
-    cloud = fit(scene, replace(settings, tile_points=POINTS), progress=False)
-    np.testing.assert_array_equal(cloud.instance_ids, fit(scene, settings, progress=False).instance_ids)
-    assert cloud.provenance["left_out"][0]["what"].endswith("of 24 views")
 
 
 def test_memory_decides_the_tiles_in_few_steps():

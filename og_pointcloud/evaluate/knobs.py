@@ -44,7 +44,6 @@ Changes = Mapping[str, Any]
 
 ONE_NUMBER: Mapping[str, tuple[str, tuple[Any, ...]]] = {
     "mode": ("mode", ("grouping", "fast")),
-    "enough views": ("visibility.enough_views", (None, 5, 20)),
     "neighbours": ("geometry.neighbours", (8, 16, 32)),
     "grouping sample": ("grouping.graph_points", (5_000, 20_000, 60_000, ALL)),
     "join majority": ("grouping.join_majority", (0.4, 0.5, 0.6)),
@@ -75,8 +74,8 @@ def _with(base: FitSettings, changes: Changes) -> FitSettings:
 
 
 def _label(value: Any) -> str:
-    if value in (None, ALL):
-        return "off" if value is None else "all"
+    if value == ALL:
+        return "all"
     return f"{value:.2g}" if isinstance(value, float) else f"{value:,}" if isinstance(value, int) else value
 
 

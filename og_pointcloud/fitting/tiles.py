@@ -52,7 +52,6 @@ from og_pointcloud.rendering.splatting import ALPHA_MIN, FRUSTUM_MARGIN, LOW_PAS
 from og_pointcloud.rendering.surface import (
     surface_thickness,
     with_distinct_points,
-    with_needed_views,
 )
 from og_pointcloud.scene import Camera, Scene, View
 from og_pointcloud.settings import FitSettings
@@ -119,7 +118,6 @@ def fit_tiles(
         )
     if settings.tile_points is None:
         journal.leave_out(LeftOut.WHOLE_FIT, count=len(scene.points))
-    scene = with_needed_views(scene, settings, journal)
     scene, row_of_point = with_distinct_points(scene, journal)
     count, run = len(scene.points), partial(run_tasks, executor, journal)
     most = settings.tile_points or _points_per_tile(count, _memory(count, settings, executor))

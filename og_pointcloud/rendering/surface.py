@@ -1,4 +1,4 @@
-"""Scene -> surface: which views and points a fit needs, and how each point is drawn."""
+"""Scene -> surface: which points a fit needs, and how each is drawn."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.journal import Journal, LeftOut
-from og_pointcloud.rendering.coverage import needed_views
 from og_pointcloud.rendering.geometry import (
     Neighbourhood,
     distinct_places,
@@ -32,7 +31,6 @@ __all__ = [
     "stride_for_pixels",
     "surface_thickness",
     "with_distinct_points",
-    "with_needed_views",
 ]
 
 PIXELS_PER_SPACING, MOST_STRIDE = 2, 3
@@ -44,7 +42,7 @@ all that there is of them, but the edges of masks, which are drawn in pixels, wa
 class Surface:
     """A scene's points as they are drawn, and the views that they are drawn in.
 
-    scene: only with the views that are needed, and one point per position. n below is the number of its points.
+    scene: with one point per position. n below is the number of its points.
     row_of_point: (all points,) int64, the row here that stands for each point of the whole scene; None: all are here.
     neighbourhood: spacing and neighbours of the n points. gaussians: how the n points are drawn.
     near: depth of the near plane, scene units.
@@ -73,8 +71,7 @@ class Surface:
 
 
 def reconstruct_surface(scene: Scene, settings: FitSettings, journal: Journal) -> Surface:
-    """Find the views and points that are needed, the points' spacing, and the Gaussians that they are drawn as."""
-    scene = with_needed_views(scene, settings, journal)
+    """Find the points that are needed, their spacing, and the Gaussians that they are drawn as."""
     scene, row_of_point = with_distinct_points(scene, journal)
     with journal.stage("spacing"):
         near = near_plane(scene.points.xyz, scene.views)
@@ -90,16 +87,6 @@ def reconstruct_surface(scene: Scene, settings: FitSettings, journal: Journal) -
         elif not by_sight:
             stride = pixel_stride(scene.points, around.spacing, scene.views, journal)
     return Surface(scene, row_of_point, around, gaussians, near, thickness, stride, by_sight)
-
-
-def with_needed_views(scene: Scene, settings: FitSettings, journal: Journal) -> Scene:
-    """The scene with the views that see something new, where the settings ask for that, else with all."""
-    enough = settings.visibility.enough_views
-    needed = range(len(scene.views)) if enough is None else needed_views(scene.points.xyz, scene.views, enough)
-    if len(needed) in (0, len(scene.views)):
-        return scene
-    journal.leave_out(LeftOut.VIEWS, count=len(scene.views) - len(needed), total=len(scene.views), enough=enough)
-    return replace(scene, views=tuple(scene.views[index] for index in needed))
 
 
 def with_distinct_points(scene: Scene, journal: Journal) -> tuple[Scene, NDArray[np.int64] | None]:
