@@ -11,11 +11,6 @@ from numpy.typing import ArrayLike, NDArray
 from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError
 from og_pointcloud.scene import Camera
 
-__all__ = [
-    "BACKGROUND", "TOO_FAR", "UNKNOWN", "UNKNOWN_SPACE", "UNOBSERVED", "FeatureSpace", "InstanceTable", "LabelledCloud",
-    "Vocabulary", "WordBank", "best_of_rows", "finite_rows", "unit_rows",
-]  # fmt: skip
-
 BACKGROUND = -1
 """Instance id of a point that views saw, but outside every mask more often than missed masks explain."""
 UNOBSERVED = -2

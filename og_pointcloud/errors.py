@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-__all__ = ["BundleError", "FeatureSpaceError", "MissingExtraError", "OgPointcloudError", "SceneError", "printable"]
-
 
 def printable(text: str, most: int | None = None) -> str:
     """Foreign text as it may be shown: what would move the cursor, turn the text about or is half a character becomes

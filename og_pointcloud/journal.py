@@ -12,8 +12,6 @@ from typing import Any, TypeVar
 
 from og_pointcloud.settings import FitSettings
 
-__all__ = ["Journal", "LeftOut", "left_out_entry", "with_bar"]
-
 Item = TypeVar("Item")
 
 

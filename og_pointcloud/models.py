@@ -33,11 +33,6 @@ from og_pointcloud.errors import OgPointcloudError
 if TYPE_CHECKING:
     from onnxruntime import InferenceSession
 
-__all__ = [
-    "MODEL_NAME", "EncoderFormat", "check_graph", "fetched_model", "home_folder", "hub_cache", "integers_of",
-    "message_fields", "open_session", "text_of",
-]  # fmt: skip
-
 MANIFEST = "manifest.json"
 MODEL_NAME = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*", re.ASCII)
 REVISION = re.compile(r"[0-9a-f]{40}")

@@ -19,8 +19,6 @@ from numpy.typing import NDArray
 
 from og_pointcloud.errors import SceneError
 
-__all__ = ["NOT_SEEN", "Camera", "Points", "Scene", "View", "require_finite"]
-
 FloatArray = NDArray[np.float32]
 DoubleArray = NDArray[np.float64]
 IntArray = NDArray[np.int32]

@@ -10,19 +10,6 @@ from typing import Any, Literal, get_args, get_type_hints
 
 from og_pointcloud.errors import OgPointcloudError
 
-__all__ = [
-    "ChoosingSettings",
-    "CodebookSettings",
-    "FeatureSettings",
-    "FitSettings",
-    "GeometrySettings",
-    "GroupingSettings",
-    "MatchingSettings",
-    "MembershipSettings",
-    "PaperSettings",
-    "VisibilitySettings",
-]
-
 
 @dataclass(frozen=True)
 class GeometrySettings:

@@ -19,8 +19,6 @@ from numpy.typing import ArrayLike, NDArray
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.poses import quaternion_of
 
-__all__ = ["Box", "axis_aligned_box", "main_part", "oriented_box"]
-
 DoubleArray = NDArray[np.float64]
 
 DIRECTIONS = 180

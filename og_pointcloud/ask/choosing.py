@@ -40,8 +40,6 @@ from og_pointcloud.cloud import (
 )  # fmt: skip
 from og_pointcloud.settings import ChoosingSettings
 
-__all__ = ["Choice", "Chooser", "Reason", "Standard", "log_mean_likelihood"]
-
 ROWS_AT_ONCE = 2048
 """Descriptors compared with all others at once."""
 

@@ -18,8 +18,6 @@ from numpy.typing import NDArray
 
 from og_pointcloud.errors import MissingExtraError, OgPointcloudError, SceneError
 
-__all__ = ["NAMES_FIELD", "SCENE_FIELD", "carried_scene", "import_plugin", "scene_name", "world_points"]
-
 SCENE_FIELD = "og_pointcloud_scene"
 """Field of a PyVista dataset that names the .ogpc file its labels came from."""
 NAMES_FIELD = "og_names"

@@ -26,8 +26,6 @@ from og_pointcloud.errors import printable
 from og_pointcloud.formats.atomic import replacing
 from og_pointcloud.formats.tables import as_cell
 
-__all__ = ["EMPTY", "LABELLED", "NO_FEATURE", "Instance", "Instances", "list_instances"]
-
 LABELLED = "labelled"
 """State of an instance that words can be compared with."""
 NO_FEATURE = "no feature"

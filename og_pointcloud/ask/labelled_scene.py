@@ -29,11 +29,6 @@ from og_pointcloud.cloud import TOO_FAR, LabelledCloud, Vocabulary
 from og_pointcloud.errors import OgPointcloudError, SceneError
 from og_pointcloud.text.words import Labels, TextFeatures, resolve_labels
 
-__all__ = [
-    "LabelledScene", "SceneLike", "Segmenter", "as_scene", "find_scene",
-    "instance_table", "load", "pose_matrix", "segment",
-]  # fmt: skip
-
 SceneLike: TypeAlias = "LabelledScene | LabelledCloud | str | os.PathLike[str]"
 
 ELSEWHERE_SHARE = 1 / 3

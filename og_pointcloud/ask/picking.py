@@ -26,8 +26,6 @@ from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.scene import Camera
 from og_pointcloud.text.words import Labels, TextFeatures
 
-__all__ = ["Pick", "front_points", "in_world", "pick"]
-
 NEAR = 1.0
 """Depth of the near plane in point spacings: nearer points would cover half the image each."""
 HALF_WIDTH = 0.7

@@ -16,8 +16,6 @@ from og_pointcloud.cloud import TOO_FAR, LabelledCloud
 from og_pointcloud.errors import BundleError
 from og_pointcloud.models import open_session
 
-__all__ = ["QueryGraph"]
-
 OUTPUTS = {"instance": np.int32, "certain": np.bool_}
 """What is asked of the graph: one value a point each."""
 OWN_POINTS, PLACES = 4096, 8

@@ -20,8 +20,6 @@ from og_pointcloud.formats.atomic import replacing
 from og_pointcloud.formats.colors import label_colors
 from og_pointcloud.scene import Points
 
-__all__ = ["SAVED_AS", "Reason", "Segmentation"]
-
 SAVED_AS = (".npz", ".ply", ".las", ".laz", ".glb", ".spz")
 """Endings of the files that a result is written to."""
 

@@ -21,8 +21,6 @@ from og_pointcloud.cloud import NO_EVIDENCE, FeatureSpace, Vocabulary
 from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.text.words import Labels, TextFeatures
 
-__all__ = ["Match", "Selection", "select"]
-
 
 @dataclass(frozen=True)
 class Match:

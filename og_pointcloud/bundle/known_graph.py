@@ -15,8 +15,6 @@ from numpy.typing import NDArray
 
 from og_pointcloud.models import check_graph, integers_of, message_fields, text_of
 
-__all__ = ["KNOWN_GRAPHS", "query_graph_digest", "query_tables"]
-
 KNOWN_GRAPHS = frozenset({
     "0931f16d57ab1db72ec826a2b787e5f5", "278a9debe4359bb24c880b918dd953e8", "cd2b6be498a00464ad55884c286e2033",
     "5125ba60d69c8c34932f1c6f484a6e08", "d6b9de5009bf92436051be07f7985c7a", "b9731a6b2aa1345740ee322b1720fe8f",

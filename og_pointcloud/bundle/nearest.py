@@ -7,8 +7,6 @@ import itertools
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["NONE_WITHIN_REACH", "NearestPoint", "surface_distance"]
-
 NONE_WITHIN_REACH = -1
 """Index answered for a query that has no cloud point within reach."""
 

@@ -38,8 +38,6 @@ from og_pointcloud.errors import BundleError, OgPointcloudError
 from og_pointcloud.formats.npy import array_from_npy
 from og_pointcloud.text.text_features import check_names
 
-__all__ = ["Bundle", "read_bundle", "read_carried_encoder"]
-
 ZIP_ERRORS = (zipfile.BadZipFile, EOFError, RuntimeError, NotImplementedError, OSError, ValueError)
 """All that zipfile raises for damaged archives, encrypted ones, and those of methods that it lacks."""
 

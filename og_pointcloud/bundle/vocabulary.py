@@ -27,11 +27,6 @@ from og_pointcloud.journal import LeftOut, left_out_entry
 from og_pointcloud.text.encoder import ENCODER, CarriedEncoder, TextEncoder, find_encoder, read_text_encoder
 from og_pointcloud.text.text_features import read_text_features
 
-__all__ = [
-    "AddedWords", "SceneWords", "add_words", "bank_members", "bank_of_encoder", "carried_encoder", "carry_encoder",
-    "encoder_members", "read_bank", "scene_words", "store_bank", "vocabulary_members",
-]  # fmt: skip
-
 CAPTURE_WORDS = "text_features.npz"
 """Name of the text features that a capture folder may hold."""
 

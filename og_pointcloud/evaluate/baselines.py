@@ -21,8 +21,6 @@ from scipy.sparse import csr_array
 
 from og_pointcloud.fitting.fit import Prepared
 
-__all__ = ["BASELINES", "baseline_labels", "centre_sampling", "direct_uplift", "only_where_masked", "uplift"]
-
 MOSTLY = 0.5
 """Share of a point's weight in masks from which it belongs to them."""
 

@@ -19,8 +19,6 @@ from og_pointcloud.evaluate.intervals import BlockInterval, miou_interval
 from og_pointcloud.evaluate.metrics import Score, adjusted_rand_index, score_labels
 from og_pointcloud.evaluate.truth import Truth
 
-__all__ = ["Answer", "CaptureScore", "ask", "difference", "score_capture"]
-
 
 @dataclass(frozen=True)
 class Answer:

@@ -21,8 +21,6 @@ from numpy.typing import NDArray
 from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.evaluate.truth import Truth
 
-__all__ = ["BlockInterval", "Interval", "bootstrap", "miou_interval"]
-
 Doubles = NDArray[np.float64]
 Integers = NDArray[np.integer]
 

@@ -12,8 +12,6 @@ from typing import Any
 from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.settings import CodebookSettings, FeatureSettings, FitSettings, MatchingSettings, PaperSettings
 
-__all__ = ["ABLATIONS", "DEFAULT", "KNOBS", "QUICK", "Setting", "ablations", "changed", "settings_of"]
-
 
 @dataclass(frozen=True)
 class Setting:

@@ -44,21 +44,6 @@ try:
 except ImportError as error:
     raise MissingExtraError("scipy and numba", "fit") from error
 
-__all__ = [
-    "PUBLISHED_PAIRS",
-    "WAYS",
-    "LabelledFrame",
-    "LerfScene",
-    "PairScore",
-    "gaussians_of",
-    "pair_ious",
-    "read_frame",
-    "read_scene",
-    "scene_names",
-    "score_pairs",
-    "score_scenes",
-]
-
 ALPHA_SHOWN, IOU_FOUND = 0.7, 0.25
 PUBLISHED_PAIRS = 208
 """(frame, object) pairs of the published table, in four scenes."""

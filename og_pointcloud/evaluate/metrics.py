@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 
 from og_pointcloud.errors import OgPointcloudError
 
-__all__ = ["Score", "adjusted_rand_index", "score_labels"]
-
 
 @dataclass(frozen=True)
 class Score:

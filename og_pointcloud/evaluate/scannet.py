@@ -22,8 +22,6 @@ from og_pointcloud.formats.ply import read_ply
 from og_pointcloud.formats.tables import positions
 from og_pointcloud.text.words import resolve_labels
 
-__all__ = ["NAMES", "SCENES", "TASKS", "ask", "read_truth", "score_scene"]
-
 NAMES: Mapping[int, str] = {
     1: "wall", 2: "floor", 3: "cabinet", 4: "bed", 5: "chair", 6: "sofa", 7: "table", 8: "door", 9: "window",
     10: "bookshelf", 11: "picture", 12: "counter", 14: "desk", 16: "curtain", 24: "refrigerator",

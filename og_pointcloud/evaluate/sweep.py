@@ -48,8 +48,6 @@ try:
 except ImportError as error:
     raise MissingExtraError("scipy and numba", "fit") from error
 
-__all__ = ["BASELINE", "Row", "Subject", "Sweep", "front", "machine", "read_subject", "sweep", "write_rows"]
-
 BASELINE = "baseline"
 """The knob of rows of other methods."""
 WARM_UP_POINTS = 2_000

@@ -12,8 +12,6 @@ from og_pointcloud.errors import MissingExtraError
 from og_pointcloud.evaluate.sweep import BASELINE, Row, Sweep, front, machine
 from og_pointcloud.formats.atomic import replacing
 
-__all__ = ["require_matplotlib", "table", "write_chart", "write_report"]
-
 SHARES = {
     "mIoU": "miou", "without background": "labelled_miou", "paper": "published", "mAcc": "macc", "unknown": "unknown",
     "background called": "background", "reliability": "reliability",

@@ -17,8 +17,6 @@ from og_pointcloud.errors import SceneError
 from og_pointcloud.evaluate.metrics import Score, score_labels
 from og_pointcloud.formats.npy import array_from_zip
 
-__all__ = ["GT_NAME", "Truth", "read_arrays", "read_truth"]
-
 GT_NAME = "gt.npz"
 MAX_UNPACKED_BYTES = 1 << 31
 AGREED, VOTES = 0.5, 2

@@ -15,8 +15,6 @@ from numpy.typing import NDArray
 from og_pointcloud.formats.images import require_cv2
 from og_pointcloud.masking.contracts import Proposals
 
-__all__ = ["AutomaticMasks", "PointPredictor", "best_of_alike", "stability", "without_specks"]
-
 Masks = NDArray[np.bool_]
 Floats = NDArray[np.float32]
 

@@ -24,8 +24,6 @@ try:
 except ImportError as error:
     raise MissingExtraError("torch and transformers", "masks") from error
 
-__all__ = ["ImageTower", "PatchTower", "TransformersModel", "load_model", "preprocessing_of", "published_name"]
-
 CLASSES = {"clip": "CLIPModel", "siglip": "SiglipModel"}
 """config.json's model_type -> transformers' class of it."""
 CLIP_COLOURS = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)

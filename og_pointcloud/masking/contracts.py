@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 
 from og_pointcloud.errors import OgPointcloudError, SceneError
 
-__all__ = ["LEVELS", "MaskEncoder", "MaskProposer", "MaskSettings", "Proposals"]
-
 FEATURES = ("crops", "dense")
 """How the encoder is shown a mask."""
 LEVELS = ("small", "medium", "large")

@@ -16,8 +16,6 @@ from numpy.typing import NDArray
 
 from og_pointcloud.errors import MissingExtraError, OgPointcloudError, SceneError
 
-__all__ = ["CROP_STYLES", "LANGSPLAT", "WITH_CONTEXT", "Crop", "Preprocessing", "Resample", "mask_box", "mask_crops"]
-
 Resample = Literal["bilinear", "bicubic"]
 Colour = tuple[float, float, float]
 

@@ -32,11 +32,6 @@ from og_pointcloud.text.encoder import MODELS_VARIABLE, model_folders
 if TYPE_CHECKING:
     from onnxruntime import InferenceSession
 
-__all__ = [
-    "DEMO_FOLDER", "DEMO_SPACE", "ENCODER_FILES", "FORMAT", "GRAPH", "OPERATORS", "SCHEMA_VERSION", "CropEncoder",
-    "ImageModel", "OnnxModel", "open_encoder", "open_mask_encoder",
-]  # fmt: skip
-
 DEMO_SPACE = "og_pointcloud/demo-room-encoder"
 """Feature space of the demo encoder, which knows the procedural room's things and nothing else of the world."""
 DEMO_FOLDER = Path(__file__).parent / "demo_encoder"

@@ -19,8 +19,6 @@ from og_pointcloud.formats.mask_files import read_ids
 from og_pointcloud.formats.poses import MAX_JSON_BYTES, read_json
 from og_pointcloud.masking.contracts import MaskProposer, Proposals
 
-__all__ = ["CallableProposer", "ExistingMasks", "as_proposals", "decode_rle", "from_ids", "own_proposer"]
-
 MAX_MASKS_PX = 1 << 33
 """Masks of one image together: more is refused before anything is allocated."""
 

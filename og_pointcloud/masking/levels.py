@@ -17,8 +17,6 @@ from numpy.typing import NDArray
 
 from og_pointcloud.masking.contracts import Proposals
 
-__all__ = ["PREFERENCE", "settle", "settled"]
-
 PREFERENCE = {"small": 1.6, "medium": 1.0, "large": 0.6}
 """Level -> how often the parts of a mask count: more prefers parts, less prefers wholes."""
 SAME = 0.8

@@ -33,8 +33,6 @@ from og_pointcloud.masking.contracts import MaskSettings
 from og_pointcloud.masking.photographs import Photograph, read_photographs, write_contact_sheet
 from og_pointcloud.masking.worker import ImageTask, read_work, results
 
-__all__ = ["MaskSettings", "MasksMade", "make_masks"]
-
 VERSION = 3
 """Counts changes of what an image's work file holds; files of another version are made again."""
 WORK_FOLDER = "masks.work"

@@ -22,8 +22,6 @@ from og_pointcloud.errors import MissingExtraError
 from og_pointcloud.formats.images import require_cv2
 from og_pointcloud.masking.contracts import Proposals
 
-__all__ = ["OpenCVProposer", "RegionTree", "region_tree"]
-
 Labels = NDArray[np.int32]
 Floats = NDArray[np.float64]
 Pairs = tuple[Labels, Labels, Floats]

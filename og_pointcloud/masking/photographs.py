@@ -18,8 +18,6 @@ from og_pointcloud.formats.images import image_size, read_rgb, require_cv2, requ
 from og_pointcloud.formats.poses import PosedImage
 from og_pointcloud.scene import Camera
 
-__all__ = ["Photograph", "read_photographs", "write_contact_sheet"]
-
 CELL_WIDTH = 480
 TINT = 0.55
 

@@ -26,8 +26,6 @@ try:
 except ImportError as error:
     raise MissingExtraError("torch and transformers", "masks") from error
 
-__all__ = ["LoadedModel", "SamPredictor", "file_of", "load_sam", "open_sam", "prepared"]
-
 Tensor = torch.Tensor
 
 CLASSES = {

@@ -23,8 +23,6 @@ from og_pointcloud.masking.existing import ExistingMasks, own_proposer
 from og_pointcloud.masking.levels import settled
 from og_pointcloud.masking.photographs import Photograph
 
-__all__ = ["ImageTask", "open_proposer", "read_work", "results"]
-
 
 class ImageTask(NamedTuple):
     """A photograph, and where what it gives is kept until all are done."""

@@ -17,18 +17,6 @@ from og_pointcloud.rendering.splatting import NEAR_SHARE, Gaussians
 from og_pointcloud.scene import Camera, Points, View
 from og_pointcloud.settings import GeometrySettings
 
-__all__ = [
-    "Neighbourhood",
-    "chance_of_place",
-    "distinct_places",
-    "near_plane",
-    "neighbourhood",
-    "pixels_per_spacing",
-    "sample_of_points",
-    "strided",
-    "thinned",
-]
-
 
 @dataclass(frozen=True)
 class Neighbourhood:

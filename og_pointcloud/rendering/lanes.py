@@ -17,8 +17,6 @@ from numba import extending
 from numba.core import types
 from numba.extending import models, overload, register_model
 
-__all__ = ["WIDTH", "any_of", "either", "exp2", "lesser", "load", "ramp", "spread", "store", "total"]
-
 intrinsic: Any = extending.intrinsic  # whose functions are called without the context that they are written with
 
 WIDTH = 16

@@ -23,8 +23,6 @@ from og_pointcloud.kernels import get_num_threads, njit, prange
 from og_pointcloud.rendering.splatting import CUTOFFS, TILE, Gaussians, binned_splats, dim, tile_buffer
 from og_pointcloud.scene import NOT_SEEN, Camera
 
-__all__ = ["Sightings", "openness", "sightings", "sightings_of"]
-
 LEAST_OPEN = 0.02
 """A point that less light reaches is hidden: what so few rays say is as often an edge's as its own."""
 EDGE_PX = 1.5

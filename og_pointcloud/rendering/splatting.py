@@ -28,21 +28,6 @@ from og_pointcloud.kernels import get_num_threads, njit, prange
 from og_pointcloud.rendering.lanes import WIDTH, any_of, either, exp2, lesser, load, ramp, spread, store, total
 from og_pointcloud.scene import Camera, Points
 
-__all__ = [
-    "CUTOFFS",
-    "Cutoffs",
-    "Gaussians",
-    "ViewWeights",
-    "binned_splats",
-    "dim",
-    "linearised_at",
-    "render",
-    "seen_from",
-    "tile_buffer",
-    "view_weights",
-    "working_memory",
-]
-
 TILE = WIDTH
 """Pixels along a tile's side: 16 as in 3DGS, so that a row of a tile is one vector."""
 BATCH = 128

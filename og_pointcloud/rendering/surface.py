@@ -23,16 +23,6 @@ from og_pointcloud.rendering.splatting import Gaussians
 from og_pointcloud.scene import Points, Scene, View
 from og_pointcloud.settings import FitSettings, GeometrySettings
 
-__all__ = [
-    "Surface",
-    "pixel_stride",
-    "reconstruct_surface",
-    "sight_thickness",
-    "stride_for_pixels",
-    "surface_thickness",
-    "with_distinct_points",
-]
-
 PIXELS_PER_SPACING, MOST_STRIDE = 2, 3
 """Mode paper renders every row and column of these images again and again: two pixels between neighbouring points show
 all that there is of them, but the edges of masks, which are drawn in pixels, want one in three at least."""

@@ -34,12 +34,6 @@ from og_pointcloud.text.tokenizer import MOST_CHARACTERS, open_tokenizer
 if TYPE_CHECKING:
     from onnxruntime import InferenceSession
 
-__all__ = [
-    "ENCODER", "ENCODER_FILES", "FORMAT", "MODELS_VARIABLE", "OPERATORS", "SCHEMA_VERSION", "CarriedEncoder",
-    "TextEncoder", "cache_folder", "check_templates", "encoder_for", "export_command", "find_encoder",
-    "model_folders", "read_text_encoder",
-]  # fmt: skip
-
 FORMAT, SCHEMA_VERSION = "og-text-encoder", 1
 MODELS_VARIABLE = "OG_POINTCLOUD_MODELS"
 """Environment variable: folders, parted as in PATH, that are encoders or hold some."""

@@ -18,10 +18,6 @@ from og_pointcloud.cloud import UNKNOWN_SPACE, Vocabulary
 from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError
 from og_pointcloud.formats.npy import arrays_from_npz
 
-__all__ = [
-    "MAX_UNPACKED_BYTES", "check_names", "checked_vocabulary", "everyday_words", "read_text_features", "read_words",
-]  # fmt: skip
-
 MAX_UNPACKED_BYTES = 1 << 30
 MAX_WORDS_BYTES = 1 << 24
 LONGEST_NAME = 1000

@@ -19,11 +19,6 @@ from typing import Any, Protocol
 
 from og_pointcloud.errors import MissingExtraError, OgPointcloudError
 
-__all__ = [
-    "BYTE_CHARACTERS", "CLIP_NORMALIZER", "CLIP_WORDS", "MOST_CHARACTERS", "ClipTokenizer", "Tokenizer",
-    "open_tokenizer",
-]  # fmt: skip
-
 WHITESPACE = "\t\n\v\f\r \x85\xa0\u1680\u2000-\u200a\u2028\u2029\u202f\u205f\u3000"
 """Unicode's White_Space, as the inside of a character class; Python's ``\\s`` has four control characters more."""
 CLIP_WORDS = r"'s|'t|'re|'ve|'m|'ll|'d|[\p{L}]+|[\p{N}]|[^\s\p{L}\p{N}]+"

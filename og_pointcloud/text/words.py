@@ -15,8 +15,6 @@ from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError
 from og_pointcloud.text.encoder import CarriedEncoder, export_command, find_encoder
 from og_pointcloud.text.text_features import checked_vocabulary, read_text_features
 
-__all__ = ["Labels", "TextFeatures", "close_matches", "resolve_labels"]
-
 Labels: TypeAlias = "str | Iterable[str] | Mapping[str, ArrayLike] | Vocabulary | None"
 TextFeatures: TypeAlias = "str | os.PathLike[str] | tuple[Vocabulary, str] | None"
 

@@ -32,11 +32,6 @@ try:
 except ImportError as error:
     raise MissingExtraError("rosbags", "ros") from error
 
-__all__ = [
-    "DETECTIONS", "LABELLED", "LABEL_INFO", "VISION_MSGS", "BagReport", "label_bag", "open_bag", "ros2_types",
-    "rosbags_messages",
-]  # fmt: skip
-
 CLOUD, TRANSFORMS = "sensor_msgs/msg/PointCloud2", "tf2_msgs/msg/TFMessage"
 DETECTION_ARRAY, INFO = "vision_msgs/msg/Detection3DArray", "vision_msgs/msg/LabelInfo"
 LABELLED, DETECTIONS = "/labelled", "/detections"

@@ -17,8 +17,6 @@ from og_pointcloud.mapping.map_objects import MapObject
 from og_pointcloud_ros.messages import MessageFactory, header, plain_messages
 from og_pointcloud_ros.pointcloud2 import UNLABELLED
 
-__all__ = ["to_detections", "to_label_info", "to_objects"]
-
 
 def to_detections(
     instances: LabelledScene | Instances,

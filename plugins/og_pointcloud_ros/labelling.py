@@ -13,8 +13,6 @@ from og_pointcloud_ros.detections import to_detections
 from og_pointcloud_ros.messages import MessageFactory
 from og_pointcloud_ros.pointcloud2 import from_pointcloud2, read_fields, to_pointcloud2
 
-__all__ = ["MINIMUM_POINTS", "UP", "CloudLabeller", "LabelledMessages"]
-
 UP = (0.0, 0.0, 1.0)
 """Axis that boxes stand upright on: that of REP 103, which ROS frames follow."""
 MINIMUM_POINTS = 10

@@ -16,8 +16,6 @@ import numpy as np
 
 from og_pointcloud.errors import SceneError
 
-__all__ = ["MessageFactory", "header", "nanoseconds", "plain_messages", "ros_messages", "time_message"]
-
 NANOSECONDS = 1_000_000_000
 
 

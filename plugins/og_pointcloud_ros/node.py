@@ -39,8 +39,6 @@ from og_pointcloud_ros.labelling import MINIMUM_POINTS, CloudLabeller
 from og_pointcloud_ros.messages import ros_messages
 from og_pointcloud_ros.transforms import rotation_matrix
 
-__all__ = ["SegmentNode", "latest_only", "main", "pose_at", "run", "told"]
-
 PARAMETERS = {
     "scene": "",
     "labels": [""],

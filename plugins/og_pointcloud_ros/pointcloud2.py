@@ -18,8 +18,6 @@ from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.colors import label_colors
 from og_pointcloud_ros.messages import MessageFactory, header, plain_messages
 
-__all__ = ["UNLABELLED", "from_pointcloud2", "read_fields", "to_pointcloud2", "write_fields"]
-
 UNLABELLED = 65535
 """Label of a point without one, as vision_msgs/LabelInfo has it for 16-bit ids."""
 ATTRIBUTES = ("height", "width", "fields", "is_bigendian", "point_step", "row_step", "data")

@@ -17,8 +17,6 @@ from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.formats.poses import rigid, rotation_of_quaternion
 from og_pointcloud_ros.messages import NANOSECONDS, nanoseconds
 
-__all__ = ["TransformError", "TransformTree", "rotation_matrix", "slerp"]
-
 LEAST_LENGTH = 1e-6
 """Of a quaternion that still says how something is turned."""
 MOST_FRAMES = 1000
