@@ -16,6 +16,11 @@ def printable(text: str, most: int | None = None) -> str:
     return shown if most is None or len(shown) <= most else f"{shown[: most - 3]}..."
 
 
+def first_line(error: BaseException) -> str:
+    """What another library's error says, in one line of at most 200 characters; its kind where it says nothing."""
+    return (str(error).strip() or type(error).__name__).splitlines()[0][:200]
+
+
 class OgPointcloudError(ValueError):
     """Base of all errors raised by og_pointcloud for bad input; the command line prints it as one line.
 

@@ -28,7 +28,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud.errors import OgPointcloudError
+from og_pointcloud.errors import OgPointcloudError, first_line
 
 if TYPE_CHECKING:
     from onnxruntime import InferenceSession
@@ -204,8 +204,9 @@ class EncoderFormat:
         try:
             vectors = np.asarray(run_bounded(session, {session.get_inputs()[0].name: given})[0])
         except Exception as error:  # onnxruntime raises types of its own
-            reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
-            raise OgPointcloudError(f"{where}: {self.graph} does not run ({reason:.200}): {self.remake}") from None
+            raise OgPointcloudError(
+                f"{where}: {self.graph} does not run ({first_line(error)}): {self.remake}"
+            ) from None
         if vectors.dtype != np.float32 or vectors.shape != (len(given), width) or not np.isfinite(vectors).all():
             raise OgPointcloudError(
                 f"{where}: {self.graph} gives {vectors.dtype} {vectors.shape} or NaN; expected finite float32 "

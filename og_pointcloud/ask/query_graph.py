@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.cloud import TOO_FAR, LabelledCloud
-from og_pointcloud.errors import BundleError
+from og_pointcloud.errors import BundleError, first_line
 from og_pointcloud.models import open_session
 
 OUTPUTS = {"instance": np.int32, "certain": np.bool_}
@@ -36,7 +36,7 @@ class QueryGraph:
         try:
             self._session = open_session(onnx)
         except Exception as error:  # onnxruntime raises types of its own for a graph that it cannot run
-            raise self._refused(f"does not run ({_first_line(error)})") from None
+            raise self._refused(f"does not run ({first_line(error)})") from None
         inputs = {given.name: given for given in self._session.get_inputs()}
         outputs = {given.name for given in self._session.get_outputs()}
         if set(inputs) != {"points", "text"} or not set(OUTPUTS) <= outputs:
@@ -53,7 +53,7 @@ class QueryGraph:
         try:
             found = self._session.run(list(OUTPUTS), {"points": local, "text": self._no_text})
         except Exception as error:  # onnxruntime raises types of its own
-            raise self._refused(f"fails ({_first_line(error)})") from None
+            raise self._refused(f"fails ({first_line(error)})") from None
         instances, certain = (np.asarray(values) for values in found)
         for values, dtype in zip((instances, certain), OUTPUTS.values(), strict=True):
             if values.shape != (len(local),) or values.dtype != dtype:
@@ -89,7 +89,3 @@ def _instance_plainly(cloud: LabelledCloud, place: NDArray[np.float32]) -> int:
     if len(close) == 0 or squared.min() > float(cloud.reach) ** 2:
         return TOO_FAR
     return int(cloud.instance_ids[close[squared.argmin()]])
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error).strip() or type(error).__name__).splitlines()[0][:200]

@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import og_pointcloud as og
 from og_pointcloud.cli.common import Parser, add_command, add_output, add_shared, numbers, print_result
 from og_pointcloud.errors import OgPointcloudError
 
@@ -47,26 +48,17 @@ def add(parser: Parser) -> None:
     place.add_argument("--pose", type=Path, metavar="T.txt", help="4x4 matrix that takes OTHER to CLOUD's frame")
     place.add_argument("--at", metavar="X,Y,Z", help="move it by this, without turning it")
     for operation in operations.choices.values():
-        add_output(
-            operation,
-            "-o",
-            "--output",
-            endings=(".ply", ".spz"),
-            required=True,
-            help="the edited cloud; .spz of splats",
-        )
+        endings, help = (".ply", ".spz"), "the edited cloud; .spz of splats"
+        add_output(operation, "-o", "--output", endings=endings, required=True, help=help)
         add_shared(operation, "--json")
 
 
 def run(arguments: argparse.Namespace) -> None:
-    from og_pointcloud.ask.labelled_scene import load
-    from og_pointcloud.show import edit
-
-    scene = load(arguments.bundle)
+    scene = og.load(arguments.bundle)
     options = {"cloud": arguments.cloud, "halo": arguments.halo, "text_features": arguments.text_features}
     if arguments.operation == "recolour":
         options["color"] = numbers(arguments.color, "--color", 3)
-    report(getattr(edit, arguments.operation)(scene, meant(arguments), arguments.output, **options), arguments)
+    report(getattr(og.edit, arguments.operation)(scene, meant(arguments), arguments.output, **options), arguments)
 
 
 def run_insert(arguments: argparse.Namespace) -> None:
@@ -76,24 +68,20 @@ def run_insert(arguments: argparse.Namespace) -> None:
     """
     import numpy as np
 
-    from og_pointcloud.show import edit
-
     pose = np.eye(4)
     if arguments.at is not None:
         pose[:3, 3] = numbers(arguments.at, "--at", 3)
     elif arguments.pose is not None:
         text = ",".join(arguments.pose.read_text().replace(",", " ").split())
         pose = np.reshape(numbers(text, str(arguments.pose), 16), (4, 4))
-    report(edit.insert(arguments.cloud, arguments.other, arguments.output, pose), arguments)
+    report(og.edit.insert(arguments.cloud, arguments.other, arguments.output, pose), arguments)
 
 
 def meant(arguments: argparse.Namespace) -> What:
-    from og_pointcloud.ask.picking import pick
-
     if arguments.word is not None:
         return arguments.word
     if arguments.xyz is not None:
-        return pick(arguments.bundle, numbers(arguments.xyz, "--xyz", 3))
+        return og.pick(arguments.bundle, numbers(arguments.xyz, "--xyz", 3))
     try:
         return [int(part) for part in arguments.id.split(",")]
     except ValueError:

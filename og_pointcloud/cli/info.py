@@ -7,40 +7,30 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from og_pointcloud.cli.common import (
-    Parser,
-    add_shared,
-    calibration_hint,
-    print_provenance,
-    print_result,
-    some_of,
-)  # fmt: skip
+import og_pointcloud as og
+from og_pointcloud.cli import common
+from og_pointcloud.cli.common import Parser
 from og_pointcloud.errors import BundleError, printable
-
-if TYPE_CHECKING:
-    from og_pointcloud.ask.labelled_scene import LabelledScene
 
 
 def add(parser: Parser) -> None:
-    add_shared(parser, "bundle", "--json")
+    common.add_shared(parser, "bundle", "--json")
 
 
 def run(arguments: argparse.Namespace) -> None:
-    from og_pointcloud.ask.labelled_scene import load
-
-    scene = load(arguments.bundle)
+    scene = og.load(arguments.bundle)
     described = describe_bundle(scene, arguments.bundle)
     try:
-        print_result(arguments, described, lambda _: print_info(scene, arguments.bundle))
+        common.print_result(arguments, described, lambda _: print_info(scene, arguments.bundle))
     except (KeyError, TypeError, ValueError):  # the one part of a file that reading it does not check
         raise BundleError(
             f"{arguments.bundle}: its provenance is not in the form that fit writes; see --json"
         ) from None
 
 
-def describe_bundle(scene: LabelledScene, path: Path) -> dict[str, Any]:
+def describe_bundle(scene: og.LabelledScene, path: Path) -> dict[str, Any]:
     """What ``info --json`` prints: the manifest, with the file's size and its words."""
     words = list(scene.vocabulary.names) if scene.vocabulary else []
     bank = scene.cloud.word_bank
@@ -50,7 +40,7 @@ def describe_bundle(scene: LabelledScene, path: Path) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def print_info(scene: LabelledScene, path: Path) -> None:
+def print_info(scene: og.LabelledScene, path: Path) -> None:
     """The file's size, frame and words, its largest instances, and how it was made."""
     cloud, manifest = scene.cloud, scene.manifest
     words = cloud.vocabulary.names if cloud.vocabulary else ()
@@ -59,13 +49,13 @@ def print_info(scene: LabelledScene, path: Path) -> None:
     print(f"{len(cloud):,} points, {len(cloud.instances)} instances, feature space '{cloud.feature_space}'")
     origin = ", ".join(f"{value:g}" for value in cloud.origin)
     print(f"spacing {cloud.spacing:.4g}, reach {cloud.reach:.4g}, origin ({origin}), in the capture's unit")
-    print(f"{len(words)} words: {some_of(words)}")
+    print(f"{len(words)} words: {common.some_of(words)}")
     print(f"{describe_bank(scene, path)}\n")
     print(f"{scene.instances}\n")
-    print_provenance(cloud.provenance)
+    common.print_provenance(cloud.provenance)
 
 
-def describe_bank(scene: LabelledScene, path: Path) -> str:
+def describe_bank(scene: og.LabelledScene, path: Path) -> str:
     if scene.cloud.word_bank is None:
-        return f"no word bank: scores are cosines. {calibration_hint(path)}"
+        return f"no word bank: scores are cosines. {common.calibration_hint(path)}"
     return f"word bank of {len(scene.cloud.word_bank.vectors)}: scores are probabilities"

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 
+import og_pointcloud as og
 from og_pointcloud.cli.common import Parser, add_output, add_shared, check_at_least, numbers, print_next
 
 
@@ -18,11 +19,9 @@ def add(parser: Parser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    from og_pointcloud.ask.labelled_scene import instance_table
-
     check_at_least("--words", arguments.words, 0)
     up = None if arguments.up is None else numbers(arguments.up, "--up", 3)
-    table = instance_table(arguments.bundle, text_features=arguments.text_features, up=up, words=arguments.words)
+    table = og.instance_table(arguments.bundle, text_features=arguments.text_features, up=up, words=arguments.words)
     if arguments.output:
         write = table.to_csv if arguments.output.suffix == ".csv" else table.to_json
         write(arguments.output)

@@ -9,30 +9,16 @@ import argparse
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from og_pointcloud.cli.common import (
-    Parser,
-    add_output,
-    add_shared,
-    did_you_mean,
-    numbers,
-    print_result,
-    some_of,
-    warn_of_poses,
-)
+import og_pointcloud as og
+from og_pointcloud.cli import common
+from og_pointcloud.cli.common import Parser
 from og_pointcloud.errors import OgPointcloudError
-
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from og_pointcloud.ask.picking import Pick
-    from og_pointcloud.scene import Camera
 
 
 def add(parser: Parser) -> None:
-    add_shared(parser, "bundle", "--text-features", "--json")
+    common.add_shared(parser, "bundle", "--text-features", "--json")
     click = parser.add_mutually_exclusive_group(required=True)
     click.add_argument("--xyz", metavar="X,Y,Z", help="a place in world coordinates")
     click.add_argument("--pixel", metavar="U,V", help="a pixel of the view, column and row")
@@ -40,61 +26,48 @@ def add(parser: Parser) -> None:
     parser._negative_number_matcher = re.compile(r"-[\d.,-]+$")
     parser.add_argument("--capture", type=Path, metavar="CAPTURE", help="folder that the view is in")
     parser.add_argument("--view", metavar="NAME", help="file stem of the view's image")
-    add_output(parser, "-o", "--output", endings=(".png",), help="the instance's mask in the view")
+    common.add_output(parser, "-o", "--output", endings=(".png",), help="the instance's mask in the view")
 
 
 def run(arguments: argparse.Namespace) -> None:
-    from og_pointcloud.ask.labelled_scene import load
-    from og_pointcloud.ask.picking import pick
+    from og_pointcloud.formats.images import write_png
     from og_pointcloud.scene import Points
 
     uses_view = arguments.pixel is not None or arguments.output is not None
     if uses_view and not (arguments.capture and arguments.view):
         raise OgPointcloudError("--pixel and -o need a camera: name it with --capture CAPTURE --view NAME")
-    scene = load(arguments.bundle)
+    scene = og.load(arguments.bundle)
     camera = world_camera(arguments.capture, arguments.view) if uses_view else None
     if camera is not None:
-        warn_of_poses(arguments.capture, Points(scene.cloud.xyz, scene.cloud.origin, scene.cloud.rgb))
+        common.warn_of_poses(arguments.capture, Points(scene.cloud.xyz, scene.cloud.origin, scene.cloud.rgb))
     if arguments.pixel is not None and camera is not None:
-        hit = pick(scene, camera, numbers(arguments.pixel, "--pixel", 2))
+        hit = og.pick(scene, camera, common.numbers(arguments.pixel, "--pixel", 2))
     else:
-        hit = pick(scene, numbers(arguments.xyz, "--xyz", 3))
+        hit = og.pick(scene, common.numbers(arguments.xyz, "--xyz", 3))
     words = []
     if hit.found and (scene.vocabulary or arguments.text_features):
         words = hit.words(text_features=arguments.text_features)
     mask = None
     if arguments.output and camera is not None:
         mask = hit.mask(camera)
-        write_mask(arguments.output, mask)
+        write_png(arguments.output, mask.astype("uint8") * 255)
     pixels = None if mask is None else int(mask.sum())
-    print_result(arguments, describe_pick(hit, words, arguments.output, pixels), print_pick)
+    common.print_result(arguments, describe_pick(hit, words, arguments.output, pixels), print_pick)
 
 
-def world_camera(capture: Path, name: str) -> Camera:
-    from og_pointcloud.ask.picking import in_world
-    from og_pointcloud.formats.capture import read_capture
-
-    scene = read_capture(capture)
+def world_camera(capture: Path, name: str) -> og.Camera:
+    scene = og.read_capture(capture)
     cameras = {view.name: view.camera for view in scene.views}
     if name not in cameras:
         raise OgPointcloudError(
-            f"--view is '{name}', which is not among the {len(cameras)} views of {capture}{did_you_mean(name, cameras)}"
+            f"--view is '{name}', which is not among the {len(cameras)} views of {capture}"
+            f"{common.did_you_mean(name, cameras)}"
         )
-    return in_world(cameras[name], scene.points.origin)
-
-
-def write_mask(path: Path, mask: NDArray[np.bool_]) -> None:
-    """A grey PNG, 255 inside."""
-    from og_pointcloud.formats.atomic import replacing
-    from og_pointcloud.formats.images import require_cv2
-
-    png = require_cv2().imencode(".png", mask.astype("uint8") * 255)[1]
-    with replacing(path) as file:
-        file.write(png.tobytes())
+    return og.in_world(cameras[name], scene.points.origin)
 
 
 def describe_pick(
-    hit: Pick, words: Sequence[tuple[str, float]], mask: Path | None, mask_pixels: int | None
+    hit: og.Pick, words: Sequence[tuple[str, float]], mask: Path | None, mask_pixels: int | None
 ) -> dict[str, Any]:
     """What ``pick --json`` prints: the instance, or why there is none, and where the click hit."""
     return {
@@ -117,6 +90,6 @@ def print_pick(report: Mapping[str, Any]) -> None:
         print(f"hit at {', '.join(f'{value:.6g}' for value in report['xyz_world'])} (point {report['point']})")
     if report["words"]:
         best = [f"{word['name']} {word['score']:.2f}" for word in report["words"]]
-        print(f"best words: {some_of(best)}")
+        print(f"best words: {common.some_of(best)}")
     if report["mask"]:
         print(f"wrote {report['mask']} ({report['mask_pixels']:,} pixels)")

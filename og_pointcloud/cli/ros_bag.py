@@ -7,14 +7,12 @@ from __future__ import annotations
 
 import argparse
 import shlex
-import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
+import og_pointcloud as og
 from og_pointcloud.cli.common import Parser, add_shared, names_in, print_shares
-from og_pointcloud.errors import OgPointcloudError
 
 if TYPE_CHECKING:
     from og_pointcloud_ros.bags import BagReport
@@ -34,37 +32,13 @@ def add(parser: Parser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    check_folder(arguments.output)
     from og_pointcloud_ros.bags import label_bag
 
-    from og_pointcloud.ask.labelled_scene import Segmenter
-
     start = time.perf_counter()
-    segmenter = Segmenter(arguments.scene, names_in(arguments.labels), text_features=arguments.text_features)
-    report = label_bag(
-        arguments.bag, arguments.output, segmenter, topics=arguments.topic, frame=arguments.frame,
-        progress=progress_line(sys.stderr) if sys.stderr.isatty() else None,
-    )  # fmt: skip
+    segmenter = og.Segmenter(arguments.scene, names_in(arguments.labels), text_features=arguments.text_features)
+    options = {"topics": arguments.topic, "frame": arguments.frame, "progress": True}
+    report = label_bag(arguments.bag, arguments.output, segmenter, **options)
     print_report(report, arguments.output, time.perf_counter() - start)
-
-
-def check_folder(output: Path) -> None:
-    """Refuse before any work what would be refused after it."""
-    if output.exists():
-        raise OgPointcloudError(f"-o is '{output}', which exists; expected a new name, as bags are never replaced")
-
-
-def progress_line(stream: Any) -> Callable[[int, int], None]:
-    """A line that is written over and over: clouds done, and the seconds that the others will take at this pace."""
-    start = time.perf_counter()
-
-    def show(done: int, total: int) -> None:
-        left = (time.perf_counter() - start) / done * (total - done)
-        end = "\n" if done == total else ""
-        stream.write(f"\rcloud {done:,} of {total:,}, {left:,.0f} s left \033[K{end}")
-        stream.flush()
-
-    return show
 
 
 def print_report(report: BagReport, output: Path, seconds: float) -> None:

@@ -8,61 +8,42 @@ from __future__ import annotations
 import argparse
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from og_pointcloud.cli.common import (
-    Parser,
-    add_output,
-    add_shared,
-    calibration_hint,
-    names_in,
-    print_next,
-    print_result,
-    print_shares,
-    some_of,
-    timed,
-)  # fmt: skip
-
-if TYPE_CHECKING:
-    from og_pointcloud.ask.segmentation import Segmentation
+import og_pointcloud as og
+from og_pointcloud.cli import common
+from og_pointcloud.cli.common import Parser, timed
 
 SAVED_AS = (".npz", ".ply", ".las", ".laz", ".glb", ".spz")
 """As `og_pointcloud.ask.segmentation.SAVED_AS`; --help does not import numpy."""
 
 
 def add(parser: Parser) -> None:
-    add_shared(parser, "bundle", "--labels", "--text-features", "--json")
+    common.add_shared(parser, "bundle", "--labels", "--text-features", "--json")
     parser.add_argument("--points", type=Path, metavar="CLOUD", help="points to label (default: those fitted)")
-    add_output(
+    common.add_output(
         parser, "-o", "--output", endings=SAVED_AS, metavar="OUT",
         help="labels as .npz, or a coloured .ply, .las, .laz or .glb; of splats .glb or .spz",
     )  # fmt: skip
 
 
 def run(arguments: argparse.Namespace) -> None:
-    from og_pointcloud.ask.labelled_scene import load, segment
-    from og_pointcloud.formats.points import read_points
-
     stages: list[dict[str, Any]] = []
     with timed(stages, "load"):
-        scene = load(arguments.bundle)
-        points = read_points(arguments.points) if arguments.points else None
+        scene = og.load(arguments.bundle)
+        points = og.read_points(arguments.points) if arguments.points else None
     with timed(stages, "segment"):
-        result = segment(
-            scene if points is None else points.xyz_world,
-            names_in(arguments.labels),
-            scene=scene,
-            text_features=arguments.text_features,
-        )
+        asked, labels = scene if points is None else points.xyz_world, common.names_in(arguments.labels)
+        result = og.segment(asked, labels, scene, text_features=arguments.text_features)
     if arguments.output:
         with timed(stages, "save"):
             result.save(arguments.output, points if points is not None and points.scale is not None else None)
     report = describe_segmentation(result, stages, arguments.bundle, arguments.output)
-    print_result(arguments, report, print_segmentation)
+    common.print_result(arguments, report, print_segmentation)
 
 
 def describe_segmentation(
-    result: Segmentation, stages: Sequence[Mapping[str, Any]], bundle: Path, output: Path | None
+    result: og.Segmentation, stages: Sequence[Mapping[str, Any]], bundle: Path, output: Path | None
 ) -> dict[str, Any]:
     """What ``segment --json`` prints: points of each name, and why the others are unknown."""
     return {
@@ -79,18 +60,18 @@ def describe_segmentation(
 
 def print_segmentation(report: Mapping[str, Any]) -> None:
     """The names that were found, in the order asked, and the share that stays unknown."""
-    print_shares(report["counts"], report["unknown"], report["unknown_because"])
+    common.print_shares(report["counts"], report["unknown"], report["unknown_because"])
     absent = [name for name, count in report["counts"].items() if not count]
     if absent:
-        print(f"no point: {some_of(absent)}")
+        print(f"no point: {common.some_of(absent)}")
     if not report["calibrated"]:
         print(
             "not calibrated: every instance gets its best label, however badly it fits. "
-            f"{calibration_hint(report['bundle'])}"
+            f"{common.calibration_hint(report['bundle'])}"
         )
     print(", ".join(f"{name} {seconds:.2f} s" for name, seconds in report["seconds"].items()))
     if report["output"]:
         print(f"wrote {report['output']}")
     else:
         ply = Path(report["bundle"]).with_suffix(".ply")
-        print_next("segment", report["bundle"], "-o", ply, hint="keep the labels with -o, e.g. ")
+        common.print_next("segment", report["bundle"], "-o", ply, hint="keep the labels with -o, e.g. ")

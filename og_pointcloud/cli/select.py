@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 
+import og_pointcloud as og
 from og_pointcloud.cli.common import Parser, add_shared, calibration_hint, names_in, print_next
 
 
@@ -19,10 +20,8 @@ def add(parser: Parser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    from og_pointcloud.ask.selecting import select
-
     against = names_in(arguments.against)
-    selection = select(arguments.bundle, arguments.text, against=against, text_features=arguments.text_features)
+    selection = og.select(arguments.bundle, arguments.text, against=against, text_features=arguments.text_features)
     if arguments.json:
         print(selection.to_json())
         return

@@ -12,6 +12,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import og_pointcloud as og
 from og_pointcloud.cli.common import Parser, add_output, add_shared, check_at_least, names_in, timed, warn_of_capture
 from og_pointcloud.errors import OgPointcloudError
 
@@ -19,7 +20,6 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from og_pointcloud.ask.segmentation import Segmentation
     from og_pointcloud.show.viewpoint import Viewpoint
 
 AXES = {"x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1), "-x": (-1, 0, 0), "-y": (0, -1, 0), "-z": (0, 0, -1)}
@@ -59,18 +59,16 @@ def run(arguments: argparse.Namespace) -> None:
 def view_scene(arguments: argparse.Namespace) -> None:
     check_scene_options(arguments)
     from og_pointcloud.ask.hosts import import_plugin
-    from og_pointcloud.ask.labelled_scene import load, segment
     from og_pointcloud.cli.segment import describe_segmentation, print_segmentation
-    from og_pointcloud.formats.points import read_points
     from og_pointcloud.show.page import Look, write_page
 
     stages: list[dict[str, Any]] = []
     with timed(stages, "load"):
-        scene = load(arguments.source)
-        other = read_points(arguments.cloud) if arguments.cloud else None
+        scene = og.load(arguments.source)
+        other = og.read_points(arguments.cloud) if arguments.cloud else None
     with timed(stages, "segment"):
         points = scene if other is None else other.xyz_world
-        result = segment(points, names_in(arguments.labels), scene, text_features=arguments.text_features)
+        result = og.segment(points, names_in(arguments.labels), scene, text_features=arguments.text_features)
     rgb = scene.cloud.rgb if other is None else other.rgb
     shown, view = chosen_view(result, arguments)
     outputs = [path for path in (arguments.html, arguments.png) if path]
@@ -112,7 +110,7 @@ def check_scene_options(arguments: argparse.Namespace) -> None:
         )
 
 
-def chosen_view(result: Segmentation, arguments: argparse.Namespace) -> tuple[NDArray[np.bool_], Viewpoint]:
+def chosen_view(result: og.Segmentation, arguments: argparse.Namespace) -> tuple[NDArray[np.bool_], Viewpoint]:
     """(N,) which points are shown, what --cut hides left out; and where from."""
     import numpy as np
 
@@ -131,15 +129,14 @@ def chosen_view(result: Segmentation, arguments: argparse.Namespace) -> tuple[ND
 def view_capture(arguments: argparse.Namespace) -> None:
     check_at_least("--columns", arguments.columns, 1)
     from og_pointcloud.fitting.fit import prepare
-    from og_pointcloud.formats.capture import read_capture
     from og_pointcloud.journal import Journal
-    from og_pointcloud.show.fit_pictures import feature_picture, learned_stages
+    from og_pointcloud.show.fit_pictures import learned_stages
 
     output = arguments.output or Path("features.png")
-    scene = read_capture(arguments.source)
+    scene = og.read_capture(arguments.source)
     warn_of_capture(scene, arguments.source)
     prepared = prepare(scene, journal=Journal(progress=True))
     surface = prepared.surface
     features = learned_stages(prepared.table, surface.scene.points.xyz)
-    feature_picture(surface.gaussians, scene.views, surface.near, features, output, arguments.columns or 4)
+    og.feature_picture(surface.gaussians, scene.views, surface.near, features, output, arguments.columns or 4)
     print(f"wrote {output}")

@@ -9,6 +9,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import og_pointcloud as og
 from og_pointcloud.cli.common import Parser, add_command, add_output, replaceable
 from og_pointcloud.errors import OgPointcloudError
 
@@ -41,16 +42,15 @@ def run_add(arguments: argparse.Namespace) -> None:
     og-pointcloud vocabulary add kitchen.ogpc words.txt --text-encoder clip-vit-b32
     """
     from og_pointcloud.bundle.vocabulary import add_words
-    from og_pointcloud.cloud import Vocabulary
-    from og_pointcloud.text.text_features import read_text_features, read_words
+    from og_pointcloud.text.text_features import read_words
 
     if (arguments.words is None) == (arguments.text_features is None):
         arguments.parser.error("words come from one place: a file with one a line, or --text-features F.npz")
     if arguments.text_features:
-        vocabulary, space = read_text_features(arguments.text_features)
+        vocabulary, space = og.read_text_features(arguments.text_features)
     else:
         words, encoder = read_words(arguments.words), scene_encoder(arguments)
-        vocabulary, space = Vocabulary(words, encoder(words)), encoder.feature_space
+        vocabulary, space = og.Vocabulary(words, encoder(words)), encoder.feature_space
     done = add_words(arguments.bundle, vocabulary, space, arguments.output)
     replaced = f", {done.replaced} with a new vector" if done.replaced else ""
     print(f"wrote {arguments.output or arguments.bundle}: {done.total} words, {done.added} new{replaced}")
@@ -58,12 +58,11 @@ def run_add(arguments: argparse.Namespace) -> None:
 
 def scene_encoder(arguments: argparse.Namespace) -> TextEncoder:
     """The text encoder in --text-encoder, else that of the scene's feature space; FeatureSpaceError for another's."""
-    from og_pointcloud.bundle.read import read_bundle
     from og_pointcloud.bundle.vocabulary import carried_encoder
     from og_pointcloud.cloud import FeatureSpace
     from og_pointcloud.text.encoder import encoder_for, read_text_encoder
 
-    own = read_bundle(arguments.bundle).cloud.feature_space
+    own = og.read_bundle(arguments.bundle).cloud.feature_space
     folder = arguments.text_encoder
     encoder = read_text_encoder(folder) if folder else encoder_for(own, carried_encoder(arguments.bundle))
     found = FeatureSpace(encoder.feature_space, encoder.width)
@@ -76,9 +75,7 @@ def run_list(arguments: argparse.Namespace) -> None:
 
     og-pointcloud vocabulary list kitchen.ogpc
     """
-    from og_pointcloud.bundle.read import read_bundle
-
-    vocabulary = read_bundle(arguments.bundle).cloud.vocabulary
+    vocabulary = og.read_bundle(arguments.bundle).cloud.vocabulary
     for name in vocabulary.names if vocabulary else ():
         print(name)
 

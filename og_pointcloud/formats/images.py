@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.errors import MissingExtraError, SceneError
+from og_pointcloud.formats.atomic import replacing
 
 __all__ = [
     "IMAGE_SUFFIXES",
@@ -27,6 +28,7 @@ __all__ = [
     "require_scaled",
     "same_shape",
     "without_suffix",
+    "write_png",
 ]
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".PNG", ".JPEG", ".webp", ".tif", ".tiff", ".bmp")
@@ -206,3 +208,13 @@ def require_scaled(
 def same_shape(size: tuple[int, int], other: tuple[int, int]) -> bool:
     """Whether one size (width, height) is the other scaled, but for rounding by at most a pixel of the smaller."""
     return abs(size[0] * other[1] - size[1] * other[0]) <= max(*size, *other)
+
+
+def write_png(path: Path, pixels: NDArray[np.generic]) -> Path:
+    """A PNG of (H, W) uint8 or uint16, or of (H, W, 3) uint8 RGB; written whole or not at all."""
+    written, png = require_cv2().imencode(".png", pixels[:, :, ::-1] if pixels.ndim == 3 else pixels)
+    if not written:
+        raise SceneError(f"{path}: OpenCV cannot write a PNG of {pixels.shape[1]}x{pixels.shape[0]} pixels")
+    with replacing(path) as file:
+        file.write(png.tobytes())
+    return path

@@ -13,7 +13,7 @@ from typing import Any, Literal, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud.errors import MissingExtraError, OgPointcloudError
+from og_pointcloud.errors import MissingExtraError, OgPointcloudError, first_line
 from og_pointcloud.formats.poses import read_json
 from og_pointcloud.masking.crops import WITH_CONTEXT, Crop, Preprocessing, Resample
 from og_pointcloud.models import MODEL_NAME
@@ -61,10 +61,9 @@ def load_model(folder: str | os.PathLike[str], attention: Literal["eager", "sdpa
             output_loading_info=True,
         )
     except Exception as error:  # of many types, some of safetensors' own
-        reason = (str(error).strip().splitlines() or [""])[0]
         raise OgPointcloudError(
-            f"{folder} cannot be read ({type(error).__name__}: {reason:.200}); expected a whole {CLASSES[kind]} with "
-            "weights in .safetensors: fetch it again, or save it again with save_pretrained"
+            f"{folder} cannot be read ({type(error).__name__}: {first_line(error)}); expected a whole "
+            f"{CLASSES[kind]} with weights in .safetensors: fetch it again, or save it again with save_pretrained"
         ) from None
     if missing := sorted(report["missing_keys"]):
         raise OgPointcloudError(

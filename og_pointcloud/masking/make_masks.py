@@ -20,12 +20,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from og_pointcloud.cloud import UNKNOWN_SPACE
 from og_pointcloud.errors import OgPointcloudError, SceneError, printable
 from og_pointcloud.formats.atomic import locked, replacing
-from og_pointcloud.formats.images import require_cv2
+from og_pointcloud.formats.images import write_png
 from og_pointcloud.formats.langsplat import LANGUAGE_FEATURES_FOLDER
 from og_pointcloud.formats.mask_files import FEATURES_NAME, MASKS_FOLDER, TRACKS
 from og_pointcloud.formats.nerfstudio import TRANSFORMS_NAMES
@@ -236,7 +235,8 @@ def _assemble(target: Path, settings: MaskSettings, tasks: Sequence[ImageTask]) 
         features[name], masks = work["features"], masks + len(work["features"])
         if "tracks" in work:
             features[name + TRACKS] = work["tracks"]
-        _write_mask_image(folder / f"{name}.png", work["ids"])
+        # 16 bit: 0 outside every mask, else the row of the features + 1
+        write_png(folder / f"{name}.png", (work["ids"] + 1).astype(np.uint16))
     with replacing(target / FEATURES_NAME) as file:
         np.savez(file, feature_space=np.array(space), **features)
     return masks, space
@@ -253,14 +253,6 @@ def _last_part(value: Any) -> Any:
     """Of a folder its name alone: captures are passed on, where models lie on this machine is nobody's business."""
     kind, colon, name = value.rpartition(":") if isinstance(value, str) else ("", "", "")
     return f"{kind}{colon}{Path(name).name}" if Path(name).is_absolute() else value
-
-
-def _write_mask_image(path: Path, ids: NDArray[np.int32]) -> None:
-    """A PNG of 16 bit: 0 outside every mask, else the row of the features + 1."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    png = require_cv2().imencode(".png", (ids + 1).astype(np.uint16))[1]
-    with replacing(path) as file:
-        file.write(png.tobytes())
 
 
 def _make_capture_of(capture: Path, target: Path, chosen: Sequence[Photograph]) -> None:

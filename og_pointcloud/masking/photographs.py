@@ -10,11 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.errors import SceneError
-from og_pointcloud.formats.atomic import replacing
 from og_pointcloud.formats.capture import find_images, read_photograph, read_poses
 from og_pointcloud.formats.colors import label_colors
 from og_pointcloud.formats.faces import Face
-from og_pointcloud.formats.images import image_size, read_rgb, require_cv2, require_scaled
+from og_pointcloud.formats.images import image_size, read_rgb, require_cv2, require_scaled, write_png
 from og_pointcloud.formats.poses import PosedImage
 from og_pointcloud.scene import Camera
 
@@ -96,9 +95,7 @@ def write_contact_sheet(path: Path, pictures: Sequence[tuple[NDArray[np.uint8], 
     size = CELL_WIDTH, max(1, round(2 * CELL_WIDTH * height / width))  # of the first for all: one camera, as a rule
     cells = [np.vstack([image, _drawn(image, ids)]) for image, ids in pictures]
     sheet = np.hstack([cv2.resize(cell, size, interpolation=cv2.INTER_AREA) for cell in cells])
-    png = cv2.imencode(".png", cv2.cvtColor(sheet, cv2.COLOR_RGB2BGR))[1]
-    with replacing(path) as file:
-        file.write(png.tobytes())
+    write_png(path, sheet)
 
 
 def _drawn(image: NDArray[np.uint8], ids: NDArray[np.int32]) -> NDArray[np.uint8]:

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud.errors import MissingExtraError, SceneError
+from og_pointcloud.errors import MissingExtraError, SceneError, first_line
 from og_pointcloud.masking.automatic import AutomaticMasks
 
 try:
@@ -87,9 +87,8 @@ def load_sam(name: str | os.PathLike[str], classes: Mapping[str, str]) -> Loaded
     except SceneError:
         raise
     except Exception as error:  # of many types, some of safetensors' own
-        reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise SceneError(
-            f"no SAM model '{name}' ({reason:.120}); expected a transformers folder with "
+            f"no SAM model '{name}' ({first_line(error):.120}); expected a transformers folder with "
             "config.json and weights, or a fetched model: hf download OWNER/MODEL"
         ) from None
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")

@@ -16,8 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.errors import MissingExtraError, SceneError
-from og_pointcloud.formats.atomic import replacing
-from og_pointcloud.formats.images import require_cv2
+from og_pointcloud.formats.images import require_cv2, write_png
 from og_pointcloud.scene import View
 from og_pointcloud.settings import CodebookSettings
 
@@ -169,7 +168,7 @@ def training_picture(stages: Sequence[Mapping[str, Any]], path: str | os.PathLik
         _write_text(panel, f"{stage['stage']}: loss, 0 to {top:.3g}", MARGIN, STRIP)
         _write_text(panel, f"{stage['steps']:,} of {stage['published_steps']:,} steps", MARGIN, PLOT_HEIGHT + 2 * STRIP)
         panels.append(panel)
-    return _write_png(Path(path), np.concatenate(panels, axis=1))
+    return write_png(Path(path), np.concatenate(panels, axis=1))
 
 
 def _centre_of_each(centres: NDArray[np.float32], cluster: NDArray[np.int32]) -> NDArray[np.float32]:
@@ -234,16 +233,7 @@ def _write_grid(path: Path, views: Sequence[View], rows: Mapping[str, Sequence[N
         _write_text(sheet, title, MARGIN, top + STRIP)
         for left, image in zip(lefts, row, strict=False):
             sheet[top + STRIP : top + STRIP + image.shape[0], left : left + image.shape[1]] = np.rint(image)
-    return _write_png(path, sheet)
-
-
-def _write_png(path: Path, sheet: Colors) -> Path:
-    written, png = require_cv2().imencode(".png", sheet[:, :, ::-1])
-    if not written:
-        raise SceneError(f"{path}: OpenCV cannot write a PNG of {sheet.shape[1]}x{sheet.shape[0]} pixels")
-    with replacing(path) as file:
-        file.write(png.tobytes())
-    return path
+    return write_png(path, sheet)
 
 
 def _write_text(sheet: Colors, text: str, left: int, bottom: int) -> None:

@@ -9,7 +9,7 @@ import os
 import time
 import warnings
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,8 +17,9 @@ from typing import Any
 
 from og_pointcloud.ask.choosing import Reason
 from og_pointcloud.ask.labelled_scene import Segmenter
-from og_pointcloud.errors import MissingExtraError, OgPointcloudError, SceneError, printable
+from og_pointcloud.errors import MissingExtraError, OgPointcloudError, SceneError, first_line, printable
 from og_pointcloud.formats.atomic import replacing_folder
+from og_pointcloud.journal import with_bar
 from og_pointcloud_ros.detections import to_label_info
 from og_pointcloud_ros.labelling import MINIMUM_POINTS, CloudLabeller, LabelledMessages
 from og_pointcloud_ros.messages import MessageFactory, nanoseconds
@@ -64,9 +65,6 @@ VISION_MSGS: Mapping[str, str] = {
 """The fields of vision_msgs 4, that of ROS 2 Humble and later."""
 
 
-Progress = Callable[[int, int], None]
-
-
 @dataclass
 class BagReport:
     """What ``label_bag`` did. topics: of each cloud's topic, that of its labels. seconds: wall clock spent on clouds.
@@ -100,13 +98,13 @@ def label_bag(
     topics: Sequence[str] | None = None,
     frame: str = "map",
     minimum_points: int = MINIMUM_POINTS,
-    progress: Progress | None = None,
+    progress: bool = False,
 ) -> BagReport:
     """Copy a ROS 2 bag and label its clouds, each at its place in the scene as /tf and /tf_static tell it.
 
     source: a bag's folder, .db3 or .mcap, its messages with zstd or without. target: the folder to make, of the same
     storage; it appears when it is whole. topics: PointCloud2 topics to label, None for all. frame: the scene's frame.
-    progress: called with clouds done and clouds in all.
+    progress: show a bar with the remaining time, where stderr is a terminal.
     Of a cloud on ``T`` the labels are on ``T/labelled``, in the cloud's own frame, the boxes on ``T/detections`` in the
     scene's; the names are on /og_pointcloud/label_info, latched. A cloud without a transform, or damaged, is skipped.
     SceneError for what is no such bag or has no such topic, or where no cloud can be labelled.
@@ -119,21 +117,16 @@ def label_bag(
         report = BagReport({topic: topic + LABELLED for topic in clouds})
         tree = _transforms(reader, store)
         labeller = CloudLabeller(segmenter, rosbags_messages(store), frame, minimum_points)
-        total = sum(old.msgcount for old in reader.connections if old.topic in clouds)
         with (
             replacing_folder(target) as folder,  # a bag names its files after its folder
             Writer(folder, version=BAG_VERSION, storage_plugin=_storage(source)) as bag,
         ):
             outputs = _Outputs(bag, reader.connections, clouds, store)
             outputs.write_info(segmenter.names, reader.start_time)
-            for old, stamp, data in _messages(reader):
+            for old, stamp, data in with_bar(_messages(reader), "messages", reader.message_count, progress):
                 outputs.copy(old, stamp, data)
-                if old.topic not in clouds:
-                    continue
-                if labelled := _label(store, data, tree, frame, labeller, report):
+                if old.topic in clouds and (labelled := _label(store, data, tree, frame, labeller, report)):
                     outputs.write(old.topic, stamp, labelled)
-                if progress:
-                    progress(report.clouds + report.skipped.total(), total)
             if not report.clouds:
                 reason = next(iter(report.skipped), "its topics have no message")
                 raise SceneError(f"{source}: no cloud can be labelled: {reason}")
@@ -151,7 +144,7 @@ def _label(
         labelled = labeller(message, pose)
     except Exception as error:  # one cloud, whatever is in it, does not cost the others
         kind = "" if isinstance(error, OgPointcloudError) else f"{type(error).__name__}: "
-        report.skipped[kind + _first_line(error)] += 1
+        report.skipped[kind + first_line(error)] += 1
         return None
     finally:
         report.seconds += time.perf_counter() - start
@@ -179,7 +172,7 @@ def open_bag(source: str | os.PathLike[str]) -> Iterator[Reader]:
         reader = Reader(path)
         reader.open()
     except Exception as error:  # of rosbags, of its databases, of YAML
-        raise SceneError(f"{path} cannot be read as a bag ({_first_line(error)}): record or copy it again") from None
+        raise SceneError(f"{path} cannot be read as a bag ({first_line(error)}): record or copy it again") from None
     try:
         yield reader
     finally:
@@ -251,7 +244,7 @@ def _transforms(reader: Reader, store: Any) -> TransformTree:
         try:
             tree.add_message(_decoded(store, data, TRANSFORMS), static=connection.topic.endswith("tf_static"))
         except Exception as error:  # decoded, but a nonsense still
-            damaged[_first_line(error)] += 1
+            damaged[first_line(error)] += 1
     if damaged:
         example = printable(next(iter(damaged)))
         warnings.warn(f"{damaged.total()} messages of transforms left out: {example}", stacklevel=3)
@@ -262,24 +255,20 @@ def _messages(reader: Reader, connections: Sequence[Connection] = ()) -> Iterato
     try:
         yield from reader.messages(connections)
     except Exception as error:  # of rosbags or of its databases
-        raise SceneError(f"{reader.path} breaks off ({_first_line(error)}): record or copy it again") from None
+        raise SceneError(f"{reader.path} breaks off ({first_line(error)}): record or copy it again") from None
 
 
 def _decoded(store: Any, data: bytes, kind: str) -> Any:
     try:
         return store.deserialize_cdr(data, kind)
     except Exception as error:  # a damaged message may end anywhere
-        raise SceneError(f"a {kind} cannot be decoded ({_first_line(error)})") from None
+        raise SceneError(f"a {kind} cannot be decoded ({first_line(error)})") from None
 
 
 def _storage(source: Path) -> StoragePlugin:
     """That of the source, which is a file of one storage or a folder of them."""
     files = [source] if source.is_file() else list(source.iterdir())
     return StoragePlugin.MCAP if any(".mcap" in file.suffixes for file in files) else StoragePlugin.SQLITE3
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error).strip() or type(error).__name__).splitlines()[0][:200]
 
 
 def ros2_types() -> Typestore:
