@@ -46,7 +46,7 @@ def main(arguments: list[str] | None = None) -> None:
         for level in options.levels:
             settings = MaskSettings(options.proposer, encoder=None, level=level, every=options.every)
             with tempfile.TemporaryDirectory() as temporary:
-                made = make_masks(folder, settings, temporary, say=lambda _: None)
+                made = make_masks(folder, settings, temporary, progress=False)
                 print(row(scene, folder, made, level), flush=True)
 
 

@@ -4,7 +4,6 @@ import os
 import subprocess
 import sys
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -20,7 +19,6 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, W
 
 import og_pointcloud as og
 from og_pointcloud.cli import main
-from og_pointcloud.cli.ros_bag import progress_line
 
 STORE = ros2_types()
 MAKE = rosbags_messages(STORE)
@@ -118,16 +116,12 @@ def test_a_bag_that_is_packed_as_whole_files_is_refused_before_it_is_unpacked(sc
 )
 def test_a_bag_is_labelled_as_its_clouds_are(scene, tmp_path, storage, compressed):
     source = write_drive(tmp_path / "drive", scene, storage, compressed)
-    done = []
-    report = label_bag(
-        source, tmp_path / "out", og.Segmenter(scene, WORDS), minimum_points=1, progress=lambda *now: done.append(now)
-    )
+    report = label_bag(source, tmp_path / "out", og.Segmenter(scene, WORDS), minimum_points=1, progress=True)
     before, after = read(source), read(tmp_path / "out")
     assert before == {key: after[key] for key in before}, "what was there is there"
     labelled = decoded(after, "/lidar/points/labelled")
     boxes = decoded(after, "/lidar/points/detections")
     assert len(labelled) == len(boxes) == report.clouds == CLOUDS
-    assert done == [(k + 1, CLOUDS) for k in range(CLOUDS)]
     share = []
     for k, (cloud, original) in enumerate(zip(labelled, decoded(before, "/lidar/points"), strict=True)):
         np.testing.assert_array_equal(from_pointcloud2(cloud), from_pointcloud2(original))
@@ -230,15 +224,18 @@ def test_an_existing_folder_stays(scene, tmp_path):
     assert list((tmp_path / "out").iterdir()) == []
 
 
-def test_an_interruption_leaves_nothing(scene, tmp_path):
-    def interrupt(done, total):
-        if done == 2:
-            raise KeyboardInterrupt
+def test_an_interruption_leaves_nothing(scene, tmp_path, monkeypatch):
+    usual, calls = og.Segmenter.__call__, []
 
+    def interrupted(segmenter, *arguments):
+        calls.append(arguments)
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+        return usual(segmenter, *arguments)
+
+    monkeypatch.setattr(og.Segmenter, "__call__", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        label_bag(
-            write_drive(tmp_path / "drive", scene), tmp_path / "out", og.Segmenter(scene, WORDS), progress=interrupt
-        )
+        label_bag(write_drive(tmp_path / "drive", scene), tmp_path / "out", og.Segmenter(scene, WORDS))
     assert [path.name for path in tmp_path.iterdir()] == ["drive"]
 
 
@@ -293,16 +290,6 @@ def test_the_command(scene, tmp_path, capsys):
         assert text in out
     assert main(command) == 2
     assert "which exists; expected a new name" in capsys.readouterr().err
-
-
-def test_progress_tells_the_time_that_remains():
-    written = []
-    show = progress_line(SimpleNamespace(write=written.append, flush=lambda: None))
-    show(1, 2)
-    show(2, 2)
-    assert "cloud 1 of 2" in written[0]
-    assert "s left" in written[0]
-    assert written[1].endswith("\n")
 
 
 @pytest.mark.slow

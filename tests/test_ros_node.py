@@ -34,7 +34,8 @@ def rclpy(monkeypatch, scene):
     stand_in = fake_ros.install(monkeypatch)
     fake_ros.Node.overrides.update(scene=str(scene.path), labels=WORDS, minimum_points=1)
     yield stand_in
-    sys.modules.pop("og_pointcloud_ros.node", None)  # it holds the stand-ins
+    for name in ("node", "map_node"):
+        sys.modules.pop(f"og_pointcloud_ros.{name}", None)  # it holds the stand-ins
 
 
 @pytest.fixture
@@ -243,6 +244,19 @@ def test_the_parameter_file_names_every_parameter_with_its_default(module):
     yaml = pytest.importorskip("ruamel.yaml").YAML(typ="safe")
     told = yaml.load((PACKAGE / "config" / "parameters.yaml").read_text())["/**"]["ros__parameters"]
     assert json.dumps(told, sort_keys=True) == json.dumps(module.PARAMETERS, sort_keys=True)
+
+
+@pytest.mark.parametrize("name", ["segment", "map"])
+def test_a_launch_file_names_what_its_node_takes(rclpy, name):
+    inputs = ["points"] if name == "segment" else importlib.import_module("og_pointcloud_ros.map_node").INPUTS
+    launch = ElementTree.parse(PACKAGE / "launch" / f"{name}.launch.xml").getroot()
+    arguments, node = {entry.get("name") for entry in launch.findall("arg")}, launch.find("node")
+    assert {entry.get("from"): entry.get("to") for entry in node.findall("remap")} == {
+        f"~/input/{role}": f"$(var {role})" for role in inputs
+    }
+    (stated,) = [entry.get("name") for entry in node.findall("param") if entry.get("name")]
+    assert arguments == {*inputs, stated, "parameters"}
+    assert f'"{node.get("exec")} = ' in (PACKAGE / "setup.py").read_text().replace('f"', '"')
 
 
 def test_what_colcon_needs_is_there():

@@ -174,7 +174,7 @@ def test_a_mask_without_features_is_refused(panoramas):
 
 def test_masks_are_made_of_the_faces(panoramas, tmp_path):
     output = tmp_path / "made"
-    made = make_masks(panoramas, MaskSettings(every=2), output, say=lambda _: None)
+    made = make_masks(panoramas, MaskSettings(every=2), output, progress=False)
     assert made.images == 12
     scene = read_capture(output)
     assert [view.name for view in scene.views] == [f"pano_{i}/{face}" for i in (0, 2) for face in FACES]

@@ -42,6 +42,11 @@ POINTS_PER_RUN = 1 << 20
 class LabelledScene:
     """A labelled cloud that can be asked. Make one with ``load``; it is cheap to keep and safe to share by threads.
 
+    cloud: points in the local frame, their instance ids, and what is known of the instances. path: the .ogpc file, and
+    manifest: the file's, with counts, parity figures, provenance; None and empty for a scene in memory.
+    instance_ids: (n,) int32, row of ``instances``, -1 background, -2 unobserved. vocabulary: the words that may be
+    asked as strings, None without any. feature_space: name of the encoder that label vectors must come from.
+
     >>> scene = og.LabelledScene.from_cloud(cloud)  # of `LabelledCloud`'s example; og.load reads a file
     >>> scene.instances_at(np.array([[0.02, 0, 1], [1, 0.1, 1], [9, 9, 9]]))
     array([ 0,  1, -3], dtype=int32)
@@ -50,7 +55,13 @@ class LabelledScene:
     """
 
     def __init__(self, bundle: Bundle) -> None:
-        self._bundle = bundle
+        self._bundle, cloud = bundle, bundle.cloud
+        self.cloud, self.path, self.manifest = cloud, bundle.path, bundle.manifest
+        self.instance_ids, self.vocabulary, self.feature_space = (
+            cloud.instance_ids,
+            cloud.vocabulary,
+            cloud.feature_space,
+        )
 
     @classmethod
     def from_cloud(cls, cloud: LabelledCloud) -> LabelledScene:
@@ -58,30 +69,10 @@ class LabelledScene:
         points at a time more slowly: every point is searched for."""
         return cls(Bundle(None, cloud, None, {}))
 
-    @property
-    def cloud(self) -> LabelledCloud:
-        """Points in the local frame, their instance ids, and what is known of the instances."""
-        return self._bundle.cloud
-
-    @property
-    def path(self) -> Path | None:
-        """The .ogpc file, None for a scene in memory."""
-        return self._bundle.path
-
-    @property
-    def manifest(self) -> dict[str, Any]:
-        """The file's manifest: counts, parity figures, provenance; empty for a scene in memory."""
-        return self._bundle.manifest
-
     @cached_property
     def xyz(self) -> NDArray[np.float64]:
         """(n, 3) float64, world coordinates."""
         return self.cloud.xyz_world
-
-    @property
-    def instance_ids(self) -> NDArray[np.int32]:
-        """(n,) int32: row of ``instances``, -1 background, -2 unobserved."""
-        return self.cloud.instance_ids
 
     @cached_property
     def certainty(self) -> NDArray[np.float32] | None:
@@ -96,16 +87,6 @@ class LabelledScene:
         Whole columns, and the descriptors, are in ``cloud.instances``.
         """
         return instance_table(self)
-
-    @property
-    def vocabulary(self) -> Vocabulary | None:
-        """The words that may be asked as strings, if it has any."""
-        return self.cloud.vocabulary
-
-    @property
-    def feature_space(self) -> str:
-        """Name of the encoder that label vectors must come from."""
-        return self.cloud.feature_space
 
     def show(self, labels: Labels = None, *, text_features: TextFeatures = None) -> Any:
         """A live page of the scene, which a notebook shows in its cell; `og-pointcloud serve` for the command line.

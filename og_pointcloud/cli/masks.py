@@ -9,7 +9,7 @@ import argparse
 import warnings
 from pathlib import Path
 
-from og_pointcloud.cli.common import Parser, add_shared, print_next, warn_of_poses
+from og_pointcloud.cli.common import Parser, add_shared, print_next, some_of, warn_of_poses
 
 
 def add(parser: Parser) -> None:
@@ -60,6 +60,10 @@ def run(arguments: argparse.Namespace) -> None:
         )
     warn_of_poses(arguments.capture)
     made = make_masks(arguments.capture, settings, arguments.output, overwrite=arguments.overwrite)
+    if made.left_out:
+        print(f"left out: {len(made.left_out)} of {made.images + len(made.left_out)} images: {some_of(made.left_out)}")
+    if made.done_before == made.images:
+        print(f"all {made.images} images have these masks already: nothing to do (--overwrite makes them again)")
     print(
         f"{made.masks} masks in {made.images} images ({made.seconds:.1f} s, {made.done_before} images done before), "
         f"feature space {made.feature_space}"

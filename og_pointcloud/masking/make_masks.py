@@ -10,11 +10,10 @@ from __future__ import annotations
 import json
 import os
 import shutil
-import sys
 import time
-from collections.abc import Callable, Sequence
+import warnings
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
-from datetime import timedelta
 from hashlib import blake2b
 from pathlib import Path
 from typing import Any
@@ -22,12 +21,13 @@ from typing import Any
 import numpy as np
 
 from og_pointcloud.cloud import UNKNOWN_SPACE
-from og_pointcloud.errors import OgPointcloudError, SceneError, printable
+from og_pointcloud.errors import OgPointcloudError, SceneError
 from og_pointcloud.formats.atomic import locked, replacing
 from og_pointcloud.formats.images import write_png
 from og_pointcloud.formats.langsplat import LANGUAGE_FEATURES_FOLDER
 from og_pointcloud.formats.mask_files import FEATURES_NAME, MASKS_FOLDER, TRACKS
 from og_pointcloud.formats.nerfstudio import TRANSFORMS_NAMES
+from og_pointcloud.journal import with_bar
 from og_pointcloud.masking.contracts import MaskSettings
 from og_pointcloud.masking.photographs import Photograph, read_photographs, write_contact_sheet
 from og_pointcloud.masking.worker import ImageTask, read_work, results
@@ -38,9 +38,6 @@ WORK_FOLDER = "masks.work"
 MADE_NAME = "made.json"
 PREVIEW_NAME = "masks_preview.png"
 PREVIEW_IMAGES = 4
-REPORT_SECONDS = 10.0
-
-Say = Callable[[str], None]
 
 
 @dataclass(frozen=True)
@@ -63,14 +60,15 @@ def make_masks(
     output: str | os.PathLike[str] | None = None,
     *,
     overwrite: bool = False,
-    say: Say = lambda text: print(printable(text), file=sys.stderr, flush=True),
+    progress: bool = True,
 ) -> MasksMade:
     """Make the masks of a capture folder, readable by `read_capture`.
 
     output: where they go; None: into the capture. Another folder becomes a capture of its own: poses of the images that
     are used, and links to everything else. It is needed where images are left out.
-    overwrite: replace masks that were not made here, and make again what is complete.
-    Raises SceneError where images are broken (after the others are done and kept), and OgPointcloudError where masks
+    overwrite: replace masks that were not made here, and make again what is complete. progress: show a bar with the
+    remaining time where stderr is a terminal; masks_preview.png shows the first images as soon as they are done.
+    Warns of each image that is broken. Raises SceneError where images are broken (after the others are done and kept), and OgPointcloudError where masks
     that were not made here would be overwritten.
     """
     settings, start = settings or MaskSettings(), time.perf_counter()
@@ -80,19 +78,17 @@ def make_masks(
     photographs = read_photographs(capture)
     used = set(list(dict.fromkeys(photograph.path for photograph in photographs))[:: settings.every])
     chosen = tuple(photograph for photograph in photographs if photograph.path in used)
-    left_out = _left_out(photographs, chosen, separate, say)
+    left_out = _left_out(photographs, chosen, separate)
     _refuse_foreign(target, overwrite)
     work = target / WORK_FOLDER / _fingerprint(settings)
     tasks = [ImageTask(photograph, work / _work_name(photograph)) for photograph in chosen]
     key = _digest([str(task.work_file.relative_to(target)) for task in tasks])
     made, done_before = None if overwrite else _made_before(target, tasks, key), len(tasks)
-    if made:
-        say(f"all {len(tasks)} images have these masks already: nothing to do (--overwrite makes them again)")
-    else:
+    if made is None:
         with locked(target / WORK_FOLDER):
             work.mkdir(parents=True, exist_ok=True)
             done_before = sum(task.work_file.exists() for task in tasks)
-            made = _make(target, settings, tasks, key, say)
+            made = _make(target, settings, tasks, key, progress)
     if separate:
         _make_capture_of(capture, target, chosen)  # poses may be new
     space = str(made.get("feature_space", UNKNOWN_SPACE))
@@ -102,9 +98,7 @@ def make_masks(
 # Which images, and what of them is done -----------------------------------------------------------------------------
 
 
-def _left_out(
-    photographs: Sequence[Photograph], chosen: Sequence[Photograph], separate: bool, say: Say
-) -> tuple[str, ...]:
+def _left_out(photographs: Sequence[Photograph], chosen: Sequence[Photograph], separate: bool) -> tuple[str, ...]:
     """Names of the images that are not used, which needs a folder of its own."""
     used = {photograph.name for photograph in chosen}
     names = tuple(photograph.name for photograph in photographs if photograph.name not in used)
@@ -113,8 +107,6 @@ def _left_out(
             f"{len(names)} of {len(photographs)} images would be left out, but the pose file names them all; "
             "expected a folder for a capture of the others (-o DIR)"
         )
-    if names:
-        say(f"left out: {len(names)} of {len(photographs)} images: {', '.join(names)}")
     return names
 
 
@@ -143,9 +135,9 @@ def _digest(value: list[Any]) -> str:
 # The work -----------------------------------------------------------------------------------------------------------
 
 
-def _make(target: Path, settings: MaskSettings, tasks: Sequence[ImageTask], key: str, say: Say) -> dict[str, Any]:
+def _make(target: Path, settings: MaskSettings, tasks: Sequence[ImageTask], key: str, progress: bool) -> dict[str, Any]:
     """Masks of all images, and what the record says of them."""
-    _work_through(settings, tasks, target, say)
+    _work_through(settings, tasks, target, progress)
     masks, space = _assemble(target, settings, tasks)
     made = {"key": key, "masks": masks, "feature_space": space}
     _write_made(target, settings, tasks, **made)
@@ -153,32 +145,21 @@ def _make(target: Path, settings: MaskSettings, tasks: Sequence[ImageTask], key:
     return made
 
 
-def _work_through(settings: MaskSettings, tasks: Sequence[ImageTask], target: Path, say: Say) -> None:
-    """Do what is not done yet; a preview after the first images, and now and then a word on the time that remains."""
+def _work_through(settings: MaskSettings, tasks: Sequence[ImageTask], target: Path, progress: bool) -> None:
+    """Do what is not done yet, with a preview after the first images."""
     waiting = [task for task in tasks if not task.work_file.exists()]
-    if len(waiting) < len(tasks):
-        say(f"{len(tasks) - len(waiting)} of {len(tasks)} images are done already")
-    broken, start = [], time.perf_counter()
-    last_said, preview_at = start, min(PREVIEW_IMAGES, len(tasks))
-    for count, (task, wrong) in enumerate(results(settings, waiting, len(tasks) - len(waiting)), 1):
+    broken, previewed = [], False
+    for _, wrong in with_bar(results(settings, waiting, len(tasks) - len(waiting)), "masks", len(waiting), progress):
         if wrong:
             broken.append(wrong)
-            say(f"broken: {wrong}")
-        done = [task for task in tasks if task.work_file.exists()]
-        if len(done) >= preview_at > 0:
+            warnings.warn(wrong, stacklevel=4)
+        done = [] if previewed else [task for task in tasks if task.work_file.exists()]
+        if len(done) >= min(PREVIEW_IMAGES, len(tasks)):
             _write_preview(target, settings, done[:PREVIEW_IMAGES])
-            say(f"preview of the first images: {target / PREVIEW_NAME}")
-            preview_at = 0
-        now = time.perf_counter()
-        if now - last_said > REPORT_SECONDS or count == len(waiting):
-            each = (now - start) / count
-            left = timedelta(seconds=round(each * (len(waiting) - count)))
-            say(f"{len(done)} of {len(tasks)} images, {each:.1f} s each, {left} left")
-            last_said = now
+            previewed = True
     if broken:
-        more = f" (and {len(broken) - 1} more)" if len(broken) > 1 else ""
         raise SceneError(
-            f"{len(broken)} of {len(tasks)} images cannot be used: {broken[0]}{more}; the others are kept in "
+            f"{len(broken)} of {len(tasks)} images cannot be used, the first: {broken[0]}; the others are kept in "
             f"'{target / WORK_FOLDER}': repair or remove these, and the same command goes on"
         )
 

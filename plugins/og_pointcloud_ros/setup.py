@@ -12,7 +12,7 @@ setup(
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),
-        (f"share/{NAME}/launch", ["launch/segment.launch.py", "launch/map.launch.py"]),
+        (f"share/{NAME}/launch", ["launch/segment.launch.xml", "launch/map.launch.xml"]),
         (f"share/{NAME}/config", ["config/parameters.yaml", "config/map.yaml"]),
     ],
     install_requires=["setuptools"],
