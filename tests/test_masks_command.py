@@ -33,10 +33,6 @@ def _poses_that_are_not_checked(monkeypatch):
     monkeypatch.setattr("og_pointcloud.cli.masks.warn_of_poses", lambda _: None)
 
 
-def silent(_: str) -> None:
-    pass
-
-
 def scenery(shift=0, size=(HEIGHT, WIDTH)):
     """A picture (BGR) with two things on a ground."""
     height, width = size

@@ -57,11 +57,8 @@ class LabelledScene:
     def __init__(self, bundle: Bundle) -> None:
         self._bundle, cloud = bundle, bundle.cloud
         self.cloud, self.path, self.manifest = cloud, bundle.path, bundle.manifest
-        self.instance_ids, self.vocabulary, self.feature_space = (
-            cloud.instance_ids,
-            cloud.vocabulary,
-            cloud.feature_space,
-        )
+        self.instance_ids = cloud.instance_ids
+        self.vocabulary, self.feature_space = cloud.vocabulary, cloud.feature_space
 
     @classmethod
     def from_cloud(cls, cloud: LabelledCloud) -> LabelledScene:

@@ -68,8 +68,8 @@ def make_masks(
     are used, and links to everything else. It is needed where images are left out.
     overwrite: replace masks that were not made here, and make again what is complete. progress: show a bar with the
     remaining time where stderr is a terminal; masks_preview.png shows the first images as soon as they are done.
-    Warns of each image that is broken. Raises SceneError where images are broken (after the others are done and kept), and OgPointcloudError where masks
-    that were not made here would be overwritten.
+    Warns of each image that is broken, and raises SceneError when the others are done and kept; OgPointcloudError where
+    masks that were not made here would be overwritten.
     """
     settings, start = settings or MaskSettings(), time.perf_counter()
     capture = Path(capture)
@@ -149,7 +149,7 @@ def _work_through(settings: MaskSettings, tasks: Sequence[ImageTask], target: Pa
     """Do what is not done yet, with a preview after the first images."""
     waiting = [task for task in tasks if not task.work_file.exists()]
     broken, previewed = [], False
-    for _, wrong in with_bar(results(settings, waiting, len(tasks) - len(waiting)), "masks", len(waiting), progress):
+    for wrong in with_bar(results(settings, waiting, len(tasks) - len(waiting)), "masks", len(waiting), progress):
         if wrong:
             broken.append(wrong)
             warnings.warn(wrong, stacklevel=4)

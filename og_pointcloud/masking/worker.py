@@ -112,18 +112,16 @@ def open_proposer(text: str, words: Sequence[str] = (), followed: int | None = N
     )
 
 
-def results(
-    settings: MaskSettings, tasks: Sequence[ImageTask], done: int = 0
-) -> Iterator[tuple[ImageTask, str | None]]:
-    """Each task when it is done, and what is wrong with its image (None: nothing). No task is no work, and no error.
+def results(settings: MaskSettings, tasks: Sequence[ImageTask], done: int = 0) -> Iterator[str | None]:
+    """What is wrong with each task's image (None: nothing), as they are done. No task is no work, and no error.
     done: images that earlier runs have done."""
     if not tasks:
         return
     work = ImageWorker(settings, done)
     pool = ThreadPoolExecutor(settings.threads)
-    waiting = {pool.submit(work, task): task for task in tasks}
+    waiting = [pool.submit(work, task) for task in tasks]
     try:
         for future in as_completed(waiting):
-            yield waiting[future], future.result()
+            yield future.result()
     finally:
         pool.shutdown(cancel_futures=True)  # after the images that are being made
