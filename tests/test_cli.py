@@ -314,7 +314,7 @@ def test_a_command_out_of_memory_is_one_line(fitted, capsys, monkeypatch):
     def fail(*_, **__):
         raise MemoryError
 
-    monkeypatch.setattr("og_pointcloud.ask.labelled_scene.segment", fail)
+    monkeypatch.setattr("og_pointcloud.segment", fail)
     assert error_of(capsys, "segment", fitted[1]) == "error: out of memory"
 
 

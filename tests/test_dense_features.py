@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from capture_files import BY_COLOR
-from test_masks_command import make_capture, silent
+from test_masks_command import make_capture
 from text_models import OUT, PATCH, SIZE, SPACE, write_model
 
 from og_pointcloud.cli import main
@@ -134,7 +134,7 @@ def test_masks_on_the_command_line(folder, tmp_path, monkeypatch, capsys):
 def test_a_model_without_patches_is_refused(tmp_path):
     make_capture(tmp_path / "c", 1)
     with pytest.raises(OgPointcloudError, match=r"encoder 'demo' has vectors of whole squares alone; .*dense"):
-        make_masks(tmp_path / "c", MaskSettings(features="dense"), say=silent)
+        make_masks(tmp_path / "c", MaskSettings(features="dense"), progress=False)
     with pytest.raises(OgPointcloudError, match="features are 'thick'; expected one of crops, dense"):
         MaskSettings(features="thick")
     assert open_mask_encoder("demo").width

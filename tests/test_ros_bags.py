@@ -289,7 +289,7 @@ def test_the_command(scene, tmp_path, capsys):
     for text in ("apple", "unknown", "3 clouds", "points a second", "skipped 1 clouds", "next: ros2 bag play"):
         assert text in out
     assert main(command) == 2
-    assert "which exists; expected a new name" in capsys.readouterr().err
+    assert "exists; expected a new name" in capsys.readouterr().err
 
 
 @pytest.mark.slow

@@ -407,7 +407,7 @@ def test_masks_twice_at_once(tiny_capture):
     (tiny_capture.folder / "mask_features.npz").unlink()
     shutil.rmtree(tiny_capture.folder / "masks")
     with locked(tiny_capture.folder / "masks.work"), pytest.raises(OgPointcloudError, match="one run at a time"):
-        make_masks(tiny_capture.folder, MaskSettings(encoder=None), say=lambda _: None)
+        make_masks(tiny_capture.folder, MaskSettings(encoder=None), progress=False)
 
 
 @pytest.mark.parametrize("name", ["masks", "masks.work"])
@@ -417,7 +417,7 @@ def test_nothing_is_written_through_links_of_a_capture(tiny_capture, tmp_path, n
     (tmp_path / "elsewhere").mkdir()
     (tiny_capture.folder / name).symlink_to(tmp_path / "elsewhere")
     with pytest.raises(OgPointcloudError, match="nothing is written through links"):
-        make_masks(tiny_capture.folder, MaskSettings(encoder=None), say=lambda _: None, overwrite=True)
+        make_masks(tiny_capture.folder, MaskSettings(encoder=None), progress=False, overwrite=True)
     assert list((tmp_path / "elsewhere").iterdir()) == []
 
 
@@ -427,9 +427,9 @@ def test_masks_that_were_killed_before_they_were_put_together(tiny_capture):
     shutil.rmtree(capture / "masks")
     (capture / "masks").write_text("in the way")
     with pytest.raises(OSError):
-        make_masks(capture, MaskSettings(encoder=None), say=lambda _: None)
+        make_masks(capture, MaskSettings(encoder=None), progress=False)
     (capture / "masks").unlink()
-    made = make_masks(capture, MaskSettings(encoder=None), say=lambda _: None)
+    made = make_masks(capture, MaskSettings(encoder=None), progress=False)
     assert made.done_before == made.images == 6
     assert not (capture / "masks.work").exists()
 
@@ -472,7 +472,7 @@ def test_records_of_masks_name_models_without_their_folders(tiny_capture, tmp_pa
     source.parent.mkdir()
     (tiny_capture.folder / "masks").rename(source)
     (tiny_capture.folder / "mask_features.npz").unlink()
-    make_masks(tiny_capture.folder, MaskSettings(proposer=str(source), encoder=None), say=lambda _: None)
+    make_masks(tiny_capture.folder, MaskSettings(proposer=str(source), encoder=None), progress=False)
     record = (tiny_capture.folder / "masks" / "made.json").read_text()
     assert json.loads(record)["proposer"] == "given"
     assert "SECRET" not in record
@@ -560,7 +560,7 @@ def test_an_error_nobody_foresaw_is_one_line(bundle, capsys, monkeypatch):
     def fail(*_, **__):
         raise ZeroDivisionError("\x1bdivision\n" + "x" * 10_000)
 
-    monkeypatch.setattr("og_pointcloud.ask.labelled_scene.segment", fail)
+    monkeypatch.setattr("og_pointcloud.segment", fail)
     assert main(["segment", str(bundle)]) == 2
     said = capsys.readouterr().err
     assert said.startswith("error: ZeroDivisionError: \\x1bdivision")
