@@ -303,17 +303,17 @@ def test_ids_of_a_video_tracker_are_tracks_of_the_capture(tmp_path):
         ids[10:30, 10 + k : 30 + k], ids[5:9, 40:60] = 700, 5
         (tmp_path / f"{name}.png").write_bytes(cv2.imencode(".png", ids)[1].tobytes())
     settings = MaskSettings(str(tmp_path), encoder=None, level="large", tracks=True)
-    make_masks(tmp_path / "c", settings, say=silent)
+    make_masks(tmp_path / "c", settings, progress=False)
     for k, view in enumerate(read_capture(tmp_path / "c").views):
         of_thing = view.mask_map()[20, 20 + k], view.mask_map()[6, 50]
         assert [view.mask_tracks[mask] - 1 for mask in of_thing] == [698, 3]
-    make_masks(tmp_path / "c", replace(settings, tracks=False), say=silent)
+    make_masks(tmp_path / "c", replace(settings, tracks=False), progress=False)
     assert all(view.mask_tracks is None for view in read_capture(tmp_path / "c").views)
 
 
 def test_tracks_that_do_not_fit_the_masks_are_refused(tmp_path):
     make_capture(tmp_path, 2)
-    make_masks(tmp_path, QUICK, say=silent)
+    make_masks(tmp_path, QUICK, progress=False)
     with np.load(tmp_path / "mask_features.npz") as file:
         arrays = dict(file)
     name = next(name for name in arrays if name != "feature_space")
