@@ -22,6 +22,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+from trained_shapes import train_with_shapes
 
 from og_pointcloud.ask.labelled_scene import LabelledScene
 from og_pointcloud.cloud import LabelledCloud
@@ -30,12 +32,16 @@ from og_pointcloud.evaluate.knobs import ABLATIONS, changed
 from og_pointcloud.evaluate.sweep import Subject, read_subject
 from og_pointcloud.fitting.fit import Prepared, prepare
 from og_pointcloud.fitting.labellers import Labelling, fast, leaves_of_training, trained_by_rendering
+from og_pointcloud.fitting.learned.paper import TrainingRun, train_codebook
 from og_pointcloud.fitting.learned.rendered_views import RenderedViews
 from og_pointcloud.formats.atomic import replacing
 from og_pointcloud.journal import Journal
+from og_pointcloud.rendering.surface import Surface
 from og_pointcloud.settings import FitSettings, MatchingSettings, PaperSettings
 
 BOTH = "as published"
+SHAPES = "trained_shapes"
+"""Not a setting: the first stage is that of trained_shapes.py."""
 PIECES = {"paper.matching.score": "within"}
 BY_SCENE = {"paper.matching.relative": True, "paper.matching.threshold": 0.5}
 REPAIRS: Mapping[str, Mapping[str, Any]] = {
@@ -46,6 +52,8 @@ REPAIRS: Mapping[str, Mapping[str, Any]] = {
     "hidden ones not drawn alone": {"paper.matching.visible": True},
     "k1 by the scene": {"paper.k1": None},
     "all points decided by all views": {"paper.matching.settle": True},
+    "opacity and size trained too": {SHAPES: True},
+    "opacity and size trained too, decided by all views": {SHAPES: True, "paper.matching.settle": True},
     "pieces, and decided by all views": {**PIECES, "paper.matching.settle": True},
     "all but the threshold": {
         **PIECES,
@@ -134,14 +142,14 @@ class Trial:
     def __init__(self, subject: Subject, base: FitSettings) -> None:
         self.subject, self.base = subject, base
         self.prepared: dict[str, tuple[Prepared, float]] = {}
-        self.trained: dict[FitSettings, tuple[Any, float]] = {}
+        self.trained: dict[tuple[FitSettings, bool], tuple[Surface, NDArray[np.float32], Any, float]] = {}
         self.source: RenderedViews | None = None
 
     def measured(self, changes: Mapping[str, Any], seed: int) -> Measured:
         """One fit with the changes, scored."""
         settings = replace(self.base, seed=seed)
         for path, value in changes.items():
-            settings = changed(settings, path, value)
+            settings = settings if path == SHAPES else changed(settings, path, value)
         if settings.mode not in self.prepared:
             start = time.process_time()
             prepared = prepare(self.subject.scene, settings)
@@ -149,9 +157,9 @@ class Trial:
         prepared, seconds = self.prepared[settings.mode]
         start = time.process_time()
         if settings.mode == "paper":
-            features, book, spent = self.training(prepared, settings)
+            surface, features, book, spent = self.training(prepared, settings, SHAPES in changes)
             seconds, start = seconds + spent, time.process_time()
-            found = leaves_of_training(prepared.table, prepared.surface, features, book, settings, Journal(False))
+            found = leaves_of_training(prepared.table, surface, features, book, settings, Journal(False))
         else:
             found = fast(prepared.table, prepared.surface, settings, Journal(False))
         seconds += time.process_time() - start
@@ -160,20 +168,25 @@ class Trial:
             self.subject.name, key_of(changes), seed, miou, unknown, len(found.instances), round(seconds, 2)
         )
 
-    def training(self, prepared: Prepared, settings: FitSettings) -> tuple[Any, Any, float]:
-        """Features, codebook, and the seconds that they took."""
-        key = changed(settings, "paper.matching", MatchingSettings())
+    def training(
+        self, prepared: Prepared, settings: FitSettings, shapes: bool
+    ) -> tuple[Surface, NDArray[np.float32], Any, float]:
+        """The surface, features, codebook, and the seconds that they took. shapes: of the Gaussians trained too."""
+        key = changed(settings, "paper.matching", MatchingSettings()), shapes
+        surface, table = prepared.surface, prepared.table
         if self.source is None:
-            surface = prepared.surface
             drawn = surface.gaussians, surface.thinned_views(), surface.near, settings.paper
             self.source = RenderedViews(*drawn, whole=False)
         if key not in self.trained:
             start = time.process_time()
-            given = prepared.table, prepared.surface, settings, Journal(False)
-            trained = trained_by_rendering(*given, source=self.source)
-            self.trained[key] = trained, time.process_time() - start
-        (features, book), seconds = self.trained[key]
-        return features, book, seconds
+            if shapes:
+                raw, features, source = train_with_shapes(self.source, settings.paper, settings.seed)
+                book = train_codebook(source, raw, settings.paper, TrainingRun(settings.seed))
+                surface = replace(surface, gaussians=source.gaussians)
+            else:
+                features, book = trained_by_rendering(table, surface, settings, Journal(False), source=self.source)
+            self.trained[key] = surface, features, book, time.process_time() - start
+        return self.trained[key]
 
     def score(self, labelling: Labelling, prepared: Prepared) -> tuple[float, float]:
         """mIoU and the share of unknown points."""

@@ -1,4 +1,4 @@
-"""docs/gallery.md and its pictures: the numbered examples, run on the demo room.
+"""docs/gallery.md and its pictures: the numbered examples, run on the demo room, one on a kitchen too.
 
     python scripts/make_gallery.py [--scene out/demo/room.ogpc]     # without a scene the demo is run first
 
@@ -23,16 +23,23 @@ ROOT = Path(__file__).parents[1]
 GALLERY = ROOT / "docs" / "gallery"
 WIDTH = 1000
 QUALITY = 82
+KITCHEN = ROOT.parent / "shared" / "data" / "seven_redkitchen"
 
 
 @dataclass(frozen=True)
 class Exhibit:
-    """An example, its arguments ({scene}, {splats} and {out} are filled in), and the pictures of it that are shown."""
+    """An example, its arguments ({scene}, {capture}, {splats} and {out} are filled in), and the pictures of it that are
+    shown. needs: without this folder it is not run, and its pictures stay as they are."""
 
     example: str
     arguments: tuple[str, ...]
     pictures: tuple[str, ...]
     seen: str
+    needs: Path | None = None
+
+    def kept_as(self, picture: str) -> str:
+        """The picture's file in the gallery."""
+        return f"{self.example[:2]}_{Path(picture.replace('/', '_')).stem}.jpg"
 
 
 EXHIBITS = (
@@ -54,6 +61,13 @@ EXHIBITS = (
     Exhibit("10_second_visit", ("-o", "{out}"), ("growing.png", "changes.png"),
             "The map after 6, 18, 36 and 60 frames; then the next day: the vase left, the ball came, the chair was "
             "moved and keeps its id. White, and the seat below the table, is what no frame looked at."),
+    Exhibit("11_paper_figures", ("{capture}", "chair", "-o", "{out}"), ("features.png", "objects.png"),
+            "Mode paper in the made room: its features, the leaves of its codebook, and the default way's instances, "
+            "in the same colors; gray is what no mask shows. Then a click on a chair: what it selects, what is left "
+            "without that, and that painted, of mode paper and of the default way."),
+    Exhibit("11_paper_figures", (str(KITCHEN), "microwave", "-o", "{out}/kitchen"),
+            ("kitchen/features.png", "kitchen/objects.png"),
+            "The same of a real kitchen (7-Scenes), with a click on the microwave.", needs=KITCHEN),
 )  # fmt: skip
 
 
@@ -69,8 +83,10 @@ def main() -> None:
         # The edited room comes first: its splat file is what another example lights a word in.
         order = sorted(EXHIBITS, key=lambda exhibit: exhibit.example != "08_edit_a_scene")
         for exhibit in order:
-            print(exhibit.example, flush=True)
-            run(exhibit, scene, work)
+            missing = exhibit.needs is not None and not exhibit.needs.exists()
+            print(exhibit.example + (f": left out, {exhibit.needs} is not there" if missing else ""), flush=True)
+            if not missing:
+                run(exhibit, scene, work)
     (ROOT / "docs" / "gallery.md").write_text(page())
     print(f"wrote {ROOT / 'docs' / 'gallery.md'}")
 
@@ -87,7 +103,7 @@ def run(exhibit: Exhibit, scene: Path, work: Path) -> None:
     out = work / exhibit.example
     out.mkdir(exist_ok=True)
     splats = work / "08_edit_a_scene" / "before.ply"
-    places = {"scene": scene, "splats": splats, "out": out}
+    places = {"scene": scene, "capture": scene.parent / "capture", "splats": splats, "out": out}
     arguments = [argument.format(**places) for argument in exhibit.arguments]
     subprocess.run([sys.executable, str(ROOT / "examples" / f"{exhibit.example}.py"), *arguments], check=True)
     for name in exhibit.pictures:
@@ -95,8 +111,7 @@ def run(exhibit: Exhibit, scene: Path, work: Path) -> None:
         assert image is not None, f"{exhibit.example} left no {name}"
         height = round(image.shape[0] * WIDTH / image.shape[1])
         small = cv2.resize(image, (WIDTH, height), interpolation=cv2.INTER_AREA)
-        kept = GALLERY / f"{exhibit.example[:2]}_{Path(name).stem}.jpg"
-        cv2.imwrite(str(kept), small, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
+        cv2.imwrite(str(GALLERY / exhibit.kept_as(name)), small, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
 
 
 def page() -> str:
@@ -106,9 +121,7 @@ def page() -> str:
         code = (ROOT / "examples" / f"{exhibit.example}.py").read_text()
         title = (ast.get_docstring(ast.parse(code)) or "").splitlines()[0]
         parts.append(f"## {exhibit.example[:2]} {title}\n")
-        parts += [
-            f"![{exhibit.seen}](gallery/{exhibit.example[:2]}_{Path(name).stem}.jpg)" for name in exhibit.pictures
-        ]
+        parts += [f"![{exhibit.seen}](gallery/{exhibit.kept_as(name)})" for name in exhibit.pictures]
         parts.append(f"\n{exhibit.seen} [{exhibit.example}.py](../examples/{exhibit.example}.py)\n")
     return "\n".join(parts)
 

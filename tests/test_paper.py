@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import ast
 import dataclasses
+import importlib
 import itertools
 import operator
+import runpy
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -13,10 +15,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from reference_splatting import pixel_weights
+from reference_splatting import pixel_weights, reference_pixel_weights
 from scenes import TinyCapture
 
 from og_pointcloud.errors import OgPointcloudError, SceneError
@@ -431,3 +434,74 @@ def test_the_curve_of_a_stage_is_its_losses_in_stretches() -> None:
     assert len(curve) == paper.CURVE_POINTS
     np.testing.assert_allclose(curve, np.arange(1000).reshape(200, 5).mean(axis=1), rtol=1e-3)
     assert paper.StageHistory("features", 20_000, 0.0, [3.0]).to_dict()["loss"] == [3.0]
+
+
+@pytest.fixture
+def shapes(monkeypatch: pytest.MonkeyPatch) -> Any:
+    monkeypatch.syspath_prepend(str(PAGE.parents[1] / "examples"))
+    return importlib.import_module("trained_shapes")
+
+
+def test_shapes_are_trained_and_places_stay(balls: Balls, shapes: Any) -> None:
+    settings = replace(SHORT, schedule_share=0.001)
+    source = rendered_views.RenderedViews(balls.gaussians, balls.views, NEAR, settings, whole=False)
+    raw, features, trained = shapes.train_with_shapes(source, settings, 0)
+    new, old = trained.gaussians, balls.gaussians
+    assert new.xyz is old.xyz
+    assert new.rotation is old.rotation
+    seen = trained.seen > 5
+    for moved in (np.log(new.scale[seen, 0] / old.scale[seen, 0]), (new.opacity - old.opacity)[seen]):
+        assert 1e-4 < np.abs(moved).mean() < 0.5
+    assert ((new.opacity > 0) & (new.opacity < 1)).all()
+    assert (features[trained.seen == 0] == 0).all()
+    again, *_ = shapes.train_with_shapes(source, settings, 0)
+    np.testing.assert_array_equal(raw, again)
+
+
+@pytest.mark.parametrize("round_", [True, False], ids=["round", "needles"])
+def test_shapes_have_the_gradient_of_finite_differences(round_: bool, shapes: Any) -> None:
+    """In float64 and without tiles (reference_splatting.py), a step at a time of each opacity and log size."""
+    rng, n = np.random.default_rng(0), 25
+    xyz = (rng.random((n, 3)) + np.array([-0.5, -0.5, 2])).astype(np.float32)
+    scale = np.full((n, 3), 0.12) if round_ else 0.01 + 0.2 * rng.random((n, 3))
+    turned = rng.normal(size=(n, 4))
+    rotation = (turned / np.linalg.norm(turned, axis=1, keepdims=True)).astype(np.float32)
+    gaussians = Gaussians(xyz, scale.astype(np.float32), rotation, (0.2 + 0.5 * rng.random(n)).astype(np.float32))
+    camera = Camera(20, 16, 24.0, 24.0, 10.0, 8.0, np.eye(4))
+    view = View(
+        "v", camera, (np.arange(320).reshape(16, 20) % 20 < 10).astype(np.int32) - 1, np.ones((1, 2), np.float32)
+    )
+    source = rendered_views.RenderedViews(gaussians, [view], NEAR, replace(SHORT, covered_share=0), whole=False)
+    pixels, known = source[0].pixels, source.known
+    np.testing.assert_array_equal(pixels, np.flatnonzero(view.mask_map().ravel() == 0))
+    values, pull = rng.random((len(known), 6)), rng.normal(size=(len(pixels), 6))
+
+    def loss(opacity: NDArray[np.float64], log_size: NDArray[np.float64]) -> float:
+        larger = gaussians.scale.astype(np.float64) * np.exp(log_size)[:, None]
+        weights = reference_pixel_weights(replace(gaussians, scale=larger, opacity=opacity), camera, NEAR)
+        return float((weights.reshape(320, n)[pixels][:, known] @ values * pull).sum())
+
+    found = shapes.shape_gradient(source, source[0], values, pull)
+    at, step = (gaussians.opacity.astype(np.float64), np.zeros(n)), 1e-6 * np.eye(n)
+    expected = [
+        [(loss(at[0] + s, at[1]) - loss(at[0] - s, at[1])) / 2e-6 for s in step],
+        [(loss(at[0], at[1] + s) - loss(at[0], at[1] - s)) / 2e-6 for s in step],
+    ]
+    for got, slow in zip(found, np.array(expected), strict=True):
+        np.testing.assert_allclose(got, slow, rtol=0, atol=1e-5 * np.abs(slow).max())
+
+
+def test_the_figures_of_two_balls(tiny_capture: TinyCapture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Example 11: of the default way the clicked ball is lit, gone, and painted, and the other stays."""
+    arguments = ["example", str(tiny_capture.folder), "red ball", "-o", str(tmp_path), "--share", "0.002"]
+    monkeypatch.setattr(sys, "argv", arguments)
+    runpy.run_path(str(PAGE.parents[1] / "examples" / "11_paper_figures.py"), run_name="__main__")
+    assert cv2.imread(str(tmp_path / "features.png")).std() > 10
+    sheet = cv2.imread(str(tmp_path / "objects.png")).astype(int)
+    height, width = sheet.shape[0] // 2, sheet.shape[1] // 3
+    lit, gone, painted = (sheet[height:, i * width : (i + 1) * width] for i in range(3))
+    red = [((panel[..., 2] - panel[..., :2].max(axis=2)) > 60).sum() for panel in (lit, gone, painted)]
+    blue = [((panel[..., 0] - panel[..., 1:].max(axis=2)) > 60).sum() for panel in (lit, gone, painted)]
+    assert red[0] > 50
+    assert max(red[1:]) < 0.1 * red[0]
+    assert blue[2] > blue[1] + 0.5 * red[0]

@@ -152,7 +152,7 @@ def alone_evidence(
         for instance, own in enumerate(members):
             if not _in_image(own, view.camera, near):
                 continue
-            alpha = _alpha(own, view.camera, near)
+            alpha = render(own, np.zeros((len(own), 0), np.float32), view.camera, near)[1].ravel().astype(np.float64)
             covered = alpha > covered_share
             instance_area[index, instance] = covered.sum()
             both = covered & (ids >= 0)
@@ -203,7 +203,10 @@ def match_masks(
         agreement=(cosines / np.maximum(with_feature, 1)).astype(np.float32),
         visible_area=np.bincount(owners, evidence.shared[masks, owners], count).astype(np.float32),
     )
-    return Matching(instances, _best_owner(masks, owners, scores))
+    owner = np.full(len(scores), -1, np.int32)
+    by_score = np.argsort(scores[masks, owners], kind="stable")
+    owner[masks[by_score]] = owners[by_score]
+    return Matching(instances, owner)
 
 
 def _accepted(
@@ -225,21 +228,9 @@ def _accepted(
     return masks[good], np.nonzero(good)[0]
 
 
-def _best_owner(masks: NDArray[np.int64], owners: NDArray[np.int64], scores: NDArray[np.float64]) -> NDArray[np.int32]:
-    owner = np.full(len(scores), -1, np.int32)
-    by_score = np.argsort(scores[masks, owners], kind="stable")
-    owner[masks[by_score]] = owners[by_score]
-    return owner
-
-
 def _in_image(gaussians: Gaussians, camera: Camera, near: float) -> bool:
     """Whether any centre lies before the camera and in the image, or within the margin that splats reach in from."""
     uv_px, depth = camera.project(gaussians.xyz)
     size = np.array([camera.width, camera.height])
     reach = (0.5 + 0.5 * FRUSTUM_MARGIN) * size
     return bool((np.abs(uv_px[depth > near] - 0.5 * size) < reach).all(axis=1).any())
-
-
-def _alpha(gaussians: Gaussians, camera: Camera, near: float) -> NDArray[np.float64]:
-    """(H W,) float64: how much the Gaussians cover each pixel."""
-    return render(gaussians, np.zeros((len(gaussians), 0), np.float32), camera, near)[1].ravel().astype(np.float64)

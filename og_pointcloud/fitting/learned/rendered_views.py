@@ -32,13 +32,15 @@ __all__ = ["RenderedView", "RenderedViews"]
 class RenderedView:
     """One view's blending weights.
 
-    weights: (pixels, known) CSR float32, index int32. mask: (pixels,) int64, a row of mask_names, -1 outside masks.
-    mask_names: (m,) int64 ascending, the view's own mask ids.
+    weights: (pixels, known) CSR float32, index int32, nearest first. mask: (pixels,) int64, a row of mask_names, -1
+    outside masks. mask_names: (m,) int64 ascending, the view's own mask ids. pixels: (pixels,) places in the image,
+    row by row.
     """
 
     weights: csr_array
     mask: torch.Tensor
     mask_names: torch.Tensor
+    pixels: NDArray[np.int64]
 
     def render(self, values: torch.Tensor) -> torch.Tensor:
         """(pixels, width) blended values of the known Gaussians (known, width)."""
@@ -47,7 +49,7 @@ class RenderedView:
     @property
     def nbytes(self) -> int:
         """What it holds in memory."""
-        return 8 * self.weights.nnz + 12 * len(self.mask)
+        return 8 * self.weights.nnz + 20 * len(self.mask)
 
 
 class RenderedViews:
@@ -144,7 +146,7 @@ class RenderedViews:
         names = np.unique(ids[ids >= 0]).astype(np.int64)
         mask = np.where(ids >= 0, np.searchsorted(names, ids), -1)
         small = _with_columns(weights[rows], column, int(self._column.max(initial=-1)) + 1)
-        return RenderedView(small, torch.from_numpy(mask), torch.from_numpy(names))
+        return RenderedView(small, torch.from_numpy(mask), torch.from_numpy(names), wanted[rows])
 
 
 def _with_columns(weights: csr_array, column: NDArray[np.int32], count: int) -> csr_array:
