@@ -45,19 +45,6 @@ if TYPE_CHECKING:
     from og_pointcloud.fitting.learned.paper import TrainedCodebook
     from og_pointcloud.fitting.learned.rendered_views import RenderedViews
 
-__all__ = [
-    "LABELLERS",
-    "Labelling",
-    "fast",
-    "grouping",
-    "instances_of_groups",
-    "leaves_of_training",
-    "mask_means",
-    "paper",
-    "renumbered",
-    "trained_by_rendering",
-]
-
 
 @dataclass(frozen=True)
 class Labelling:

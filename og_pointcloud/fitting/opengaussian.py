@@ -40,8 +40,6 @@ try:
 except ImportError as error:
     raise MissingExtraError("scipy and numba", "fit") from error
 
-__all__ = ["read_opengaussian"]
-
 MIN_OPACITY = 0.1
 """Gaussians less opaque cannot be seen; the authors' ScanNet evaluation leaves out the same ones."""
 ARRAYS = ("leaf_feat", "leaf_score", "occu_count", "leaf_ind")

@@ -19,8 +19,6 @@ from og_pointcloud.fitting.mask_table import MaskTable, weights_by_instance
 from og_pointcloud.kernels import njit, prange
 from og_pointcloud.settings import CodebookSettings
 
-__all__ = ["Codebook", "kmeans", "seed_centres", "thing_count", "things_together", "two_level_codebook"]
-
 BLOCK = 256
 """Points whose distances are taken side by side."""
 SEED_POINTS = 1 << 15

@@ -35,8 +35,6 @@ from og_pointcloud.fitting.mask_table import MaskTable
 from og_pointcloud.kernels import njit, prange
 from og_pointcloud.settings import FeatureSettings
 
-__all__ = ["FeatureObjective", "LearnedFeatures", "Terms", "learn_features", "raw_gradient", "read_features"]
-
 COARSE_BOUNDS = (0.71, 0.57, 0.14)
 """Of Eq. 2 in the rounds before the last, which have fewer local minima; directions at right angles read 0.71 apart."""
 COARSE_TOLERANCE = 10.0

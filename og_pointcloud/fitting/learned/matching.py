@@ -24,17 +24,6 @@ from og_pointcloud.rendering.splatting import FRUSTUM_MARGIN, Gaussians, render
 from og_pointcloud.scene import Camera, View
 from og_pointcloud.settings import MatchingSettings
 
-__all__ = [
-    "Evidence",
-    "Matching",
-    "alone_evidence",
-    "eq5_scores",
-    "filled_masks",
-    "match_masks",
-    "rendered_masks",
-    "visible_evidence",
-]
-
 MIXED_VARIANCE = 0.006
 """A mask whose features vary more is no target of Eq. 4, nor accepted by Eq. 5 (the authors' code), unless large."""
 LARGE_SHARE = 0.8

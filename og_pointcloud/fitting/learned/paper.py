@@ -47,16 +47,6 @@ try:
 except ImportError as error:
     raise MissingExtraError("torch", "learn") from error
 
-__all__ = [
-    "StageHistory",
-    "TrainedCodebook",
-    "TrainedFeatures",
-    "TrainingRun",
-    "train_codebook",
-    "train_features",
-    "view_losses",
-]
-
 STEPS = {"scannet": (20_000, 20_000, 20_000), "lerf": (10_000, 10_000, 20_000)}
 """Steps of the features, the coarse and the fine codebook (the authors' code; the sums are the paper's)."""
 LATE_STEP = 5_000

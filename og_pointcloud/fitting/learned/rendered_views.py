@@ -25,8 +25,6 @@ try:
 except ImportError as error:
     raise MissingExtraError("torch", "learn") from error
 
-__all__ = ["RenderedView", "RenderedViews"]
-
 
 @dataclass(frozen=True)
 class RenderedView:
