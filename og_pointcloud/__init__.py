@@ -61,6 +61,8 @@ if TYPE_CHECKING:
     from og_pointcloud.show.fit_pictures import feature_colors, feature_picture
     from og_pointcloud.text.text_features import read_text_features
 
+__version__ = "0.1.0"
+
 __all__ = [
     "BACKGROUND",
     "TOO_FAR",

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 
 def printable(text: str, most: int | None = None) -> str:
     """Foreign text as it may be shown: what would move the cursor, turn the text about or is half a character becomes
@@ -19,6 +21,15 @@ def printable(text: str, most: int | None = None) -> str:
 def first_line(error: BaseException) -> str:
     """What another library's error says, in one line of at most 200 characters; its kind where it says nothing."""
     return (str(error).strip() or type(error).__name__).splitlines()[0][:200]
+
+
+def did_you_mean(word: str, known: Iterable[str], then: str = "") -> str:
+    """What may have been meant by a word, as a part of a message; "" where no known word is like it."""
+    import difflib  # only when something went wrong
+
+    by_lower = {name.lower(): name for name in known}
+    close = [by_lower[match] for match in difflib.get_close_matches(word.lower(), by_lower, n=3)]
+    return f"; did you mean {' or '.join(repr(name) for name in close)}?{then}" if close else ""
 
 
 class OgPointcloudError(ValueError):

@@ -85,22 +85,14 @@ def bank_of_encoder(space: FeatureSpace, folder: str | os.PathLike[str] | None =
     return encoder.word_bank if encoder is not None and encoder.feature_space == space.name else None
 
 
-@dataclass(frozen=True)
-class AddedWords:
-    """How many words came new, how many got another vector, and how many the file has now."""
-
-    added: int
-    replaced: int
-    total: int
-
-
 def add_words(
     path: str | os.PathLike[str],
     words: Vocabulary,
     feature_space: str,
     output: str | os.PathLike[str] | None = None,
-) -> AddedWords:
+) -> Vocabulary:
     """Store words with their vectors in a .ogpc file, behind those that it has; a word that it has gets the new vector.
+    Returns all that it has now.
 
     feature_space: of the vectors. output: another file to write; None: the same one, replaced whole or not at all.
     FeatureSpaceError for vectors of another space or width than the file's.
@@ -110,13 +102,11 @@ def add_words(
     cloud.space.require(FeatureSpace(feature_space, words.vectors.shape[1]), "words")
     old = cloud.vocabulary or Vocabulary((), np.zeros((0, words.vectors.shape[1]), np.float32))
     vectors = dict(zip(old.names, unit_rows(old.vectors), strict=True))
-    new = dict(zip(words.names, unit_rows(words.vectors), strict=True))
-    known = [name for name in new if name in vectors]
-    vectors |= new
+    vectors |= dict(zip(words.names, unit_rows(words.vectors), strict=True))
     together = Vocabulary(tuple(vectors), np.array(list(vectors.values()), np.float32))
     counts = {**bundle.manifest["counts"], "words": len(together.names)}
     _rewrite(path, output, {**bundle.manifest, "counts": counts}, vocabulary_members(together))
-    return AddedWords(len(new) - len(known), len(known), len(together.names))
+    return together
 
 
 def read_bank(path: str | os.PathLike[str]) -> tuple[WordBank, str]:

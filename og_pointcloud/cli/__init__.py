@@ -18,10 +18,11 @@ import warnings
 from collections.abc import Sequence
 from contextlib import redirect_stdout
 from importlib import import_module
-from typing import Any, NoReturn
+from typing import Any
 
-from og_pointcloud.cli.common import Parser, add_command, check_outputs, did_you_mean
-from og_pointcloud.errors import MissingExtraError, OgPointcloudError, printable
+import og_pointcloud as og
+from og_pointcloud.cli.common import Parser, add_command, check_outputs
+from og_pointcloud.errors import MissingExtraError, OgPointcloudError, did_you_mean, printable
 
 __all__ = ["main"]
 
@@ -99,26 +100,13 @@ def print_warning(message: Warning | str, *_: object) -> None:
 
 def build_parser() -> Parser:
     parser = Parser(prog="og-pointcloud", description="Ask a point cloud or Gaussian splat for things by name.")
-    parser.add_argument("--version", action=VersionAction, help="print the version and leave")
+    parser.add_argument("--version", action="version", version=f"og-pointcloud {og.__version__}")
     parser.add_argument("--debug", action="store_true", help="show where in the program an error came from")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for name in COMMANDS:
         module = import_module(f"og_pointcloud.cli.{MODULES.get(name, name)}")
         module.add(add_command(commands, name, getattr(module, "run", None), module.__doc__))
     return parser
-
-
-class VersionAction(argparse.Action):
-    """Looks the version up only when it is asked for."""
-
-    def __init__(self, option_strings: Sequence[str], dest: str, help: str | None = None) -> None:
-        super().__init__(option_strings, dest, nargs=0, help=help)
-
-    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> NoReturn:
-        from importlib.metadata import version
-
-        print(f"og-pointcloud {version('og-pointcloud')}")
-        parser.exit()
 
 
 def describe_unknown_option(option: str, arguments: argparse.Namespace) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import difflib
 import json
 import os
 import shlex
@@ -11,7 +10,7 @@ import tempfile
 import time
 import warnings
 import zipfile
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from importlib.util import find_spec
@@ -67,6 +66,11 @@ def add_shared(parser: Any, *names: str) -> None:
         parser.add_argument(name, **SHARED[name])
 
 
+def add_option(parser: Any, name: str, metavar: str | None, help: str, **settings: Any) -> None:
+    """An option or a position of one value."""
+    parser.add_argument(name, metavar=metavar, help=help, **settings)
+
+
 def add_output(parser: Any, *flags: str, endings: Sequence[str], help: str, **settings: Any) -> None:
     """An option with a file to write, which `check_outputs` looks at before the command runs."""
     settings = {"metavar": f"OUT{endings[0]}", **settings}
@@ -76,11 +80,6 @@ def add_output(parser: Any, *flags: str, endings: Sequence[str], help: str, **se
 def replaceable(text: str) -> Path:
     """The type of a path that is read, and that an output may replace, or something in it."""
     return Path(text)
-
-
-def did_you_mean(word: str, known: Iterable[str]) -> str:
-    close = difflib.get_close_matches(word, list(known), n=3)
-    return f"; did you mean {' or '.join(repr(match) for match in close)}?" if close else ""
 
 
 def check_outputs(arguments: argparse.Namespace) -> None:
@@ -204,22 +203,9 @@ def print_fit(report: Mapping[str, Any], cloud: LabelledCloud) -> None:
     print(f"wrote {report['output']} ({report['bytes'] / 1e6:.1f} MB)")
     if not report["calibrated"]:
         print(f"no word bank: scores will be cosines. {calibration_hint(report['output'])}")
-    print(f"next: {next_segment_command(report['output'], cloud)}")
-
-
-def next_segment_command(bundle: str, cloud: LabelledCloud) -> str:
-    """A segment command that works as it stands, or names what it still needs."""
-    from og_pointcloud.bundle.vocabulary import carried_encoder
-    from og_pointcloud.text.encoder import find_encoder
-
-    command = ["og-pointcloud", "segment", bundle]
-    if cloud.vocabulary and cloud.vocabulary.names:
-        labels = ["--labels", ",".join(cloud.vocabulary.names[:2])]
-    elif find_encoder(cloud.feature_space, carried_encoder(bundle)):
-        labels = ["--labels", "chair,table"]
-    else:
-        labels = ["--text-features", f"{cloud.feature_space.replace('/', '_')}_names.npz"]
-    return shlex.join([*command, *labels, "-o", str(Path(bundle).with_suffix(".ply"))])
+    labels = cloud.vocabulary.names[:2] if cloud.vocabulary else ("chair", "table")
+    ply = Path(report["output"]).with_suffix(".ply")
+    print_next("segment", report["output"], "--labels", ",".join(labels), "-o", ply)
 
 
 def write_fit(cloud: LabelledCloud, stages: list[dict[str, Any]], output: Path) -> LabelledCloud:

@@ -8,19 +8,15 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from og_pointcloud.cli.common import Parser, require_room
+from og_pointcloud.cli.common import Parser, add_option, require_room
 
 
 def add(parser: Parser) -> None:
     parser.add_argument("-o", "--output", type=Path, default=Path("out/demo"), metavar="DIR", help="folder to fill")
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="another room (default: %(default)s)")
-    parser.add_argument(
-        "--mask-noise", type=float, default=1.0, metavar="X", help="0 clean masks, 1 realistic (default: %(default)s)"
-    )
-    parser.add_argument(
-        "--photographs", action=argparse.BooleanOptionalAction, default=True,
-        help="also label the room from its images alone, without ready masks and features",
-    )  # fmt: skip
+    add_option(parser, "--mask-noise", "X", "0 clean, 1 realistic (default: %(default)s)", type=float, default=1.0)
+    alone = "also label the room from its images alone, without ready masks and features"
+    parser.add_argument("--photographs", action=argparse.BooleanOptionalAction, default=True, help=alone)
 
 
 def run(arguments: argparse.Namespace) -> None:

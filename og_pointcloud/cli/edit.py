@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import og_pointcloud as og
-from og_pointcloud.cli.common import Parser, add_command, add_output, add_shared, numbers, print_result
+from og_pointcloud.cli.common import Parser, add_command, add_option, add_output, add_shared, numbers, print_result
 from og_pointcloud.errors import OgPointcloudError
 
 if TYPE_CHECKING:
@@ -37,9 +37,7 @@ def add(parser: Parser) -> None:
         what.add_argument("--id", metavar="K,L", help="instances by their ids (`og-pointcloud instances` lists them)")
         what.add_argument("--xyz", metavar="X,Y,Z", help="the instance at a place in world coordinates")
         operation.add_argument("--cloud", type=Path, metavar="CLOUD", help="what to edit (default: the scene's points)")
-        operation.add_argument(
-            "--halo", type=float, default=0.0, metavar="N", help="also unlabelled points so near, in spacings"
-        )
+        add_option(operation, "--halo", "N", "also unlabelled points so near, in spacings", type=float, default=0.0)
     operations.choices["recolour"].add_argument("--color", required=True, metavar="R,G,B", help="0 to 255 each")
     insert = add_command(operations, "insert", run_insert, run_insert.__doc__)
     insert.add_argument("cloud", type=Path, metavar="CLOUD", help="plain cloud or 3DGS file")

@@ -8,10 +8,20 @@ from __future__ import annotations
 import argparse
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from og_pointcloud.cli.common import Parser, add_command, add_output, names_in, print_table, replaceable, write_json
+from og_pointcloud.cli.common import (
+    Parser,
+    add_command,
+    add_option,
+    add_output,
+    names_in,
+    print_table,
+    replaceable,
+    write_json,
+)
 from og_pointcloud.errors import OgPointcloudError
 
 if TYPE_CHECKING:
@@ -32,6 +42,7 @@ TASK_MEANS = ("miou", "macc", "forced_miou", "unknown")
 
 
 def add(parser: Parser) -> None:
+    add_path = partial(add_option, type=replaceable)
     protocols = parser.add_subparsers(dest="protocol", required=True, metavar="PROTOCOL", parser_class=Parser)
     capture, scannet, lerf = (
         add_command(protocols, run.__name__.removeprefix("run_"), run, run.__doc__)
@@ -43,23 +54,14 @@ def add(parser: Parser) -> None:
     add_path(scannet, "folder", "DIR", f"scene folders with <scene>{SCANNET_LABELS}")
     add_path(scannet, "--gaussians", "G", "folder with <scene>.ply, whose points of opacity below 0.1 are ignored")
     add_path(lerf, "folder", "DIR", "with <scene>/sparse/0 and label/<scene>/*.json")
-    add_path(
-        lerf, "--gaussians", "G", "folder with <scene>.ply, or <scene>/point_cloud/iteration_*/: what was fitted",
-        required=True,
-    )  # fmt: skip
+    splats = "folder with <scene>.ply, or <scene>/point_cloud/iteration_*/: what was fitted"
+    add_path(lerf, "--gaussians", "G", splats, required=True)
     for data_set in (scannet, lerf):
         add_path(data_set, "--predictions", "P", "folder with <scene>.ogpc", required=True)
         data_set.add_argument("--scenes", metavar="A,B", help="these scenes (default: all with labels in DIR)")
     for protocol in (capture, scannet, lerf):
-        add_path(
-            protocol, "--text-features", "F.npz",
-            "names asked and their vectors (default: the capture's text_features.npz, else the scene's own words)",
-        )  # fmt: skip
+        add_path(protocol, "--text-features", "F.npz", "words with vectors (default: the capture's, the scene's)")
         add_output(protocol, "--json", endings=(".json",), help="also write every score")
-
-
-def add_path(parser: Parser, name: str, metavar: str, help: str, **settings: Any) -> None:
-    parser.add_argument(name, type=replaceable, metavar=metavar, help=help, **settings)
 
 
 # Captures -------------------------------------------------------------------------------------------------------

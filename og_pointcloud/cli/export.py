@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from og_pointcloud.cli.common import Parser, add_command
+from og_pointcloud.cli.common import Parser, add_command, add_option
 from og_pointcloud.errors import OgPointcloudError
 
 
@@ -19,26 +19,15 @@ def add(parser: Parser) -> None:
     text = add_command(halves, "text", run_text, run_text.__doc__)
     image = add_command(halves, "image", run_image, run_image.__doc__)
     for half in (text, image):
+        add_option(half, "model", "MODEL", "fetched OWNER/MODEL, or a folder of CLIP or SigLIP", type=Path)
         half.add_argument(
-            "model", type=Path, metavar="MODEL",
-            help="OWNER/MODEL that was fetched, or a transformers folder of CLIP or SigLIP",
-        )  # fmt: skip
-        half.add_argument(
-            "-o", "--output", type=Path, metavar="DIR",
-            help="the folder to write (default: in the user's cache, where it is found by its feature space)",
-        )  # fmt: skip
-        half.add_argument(
-            "--feature-space", metavar="OWNER/MODEL",
-            help="as scenes name it (og-pointcloud info S.ogpc); default: OWNER/MODEL, or what its configuration says",
-        )  # fmt: skip
-    text.add_argument(
-        "--template", action="append", metavar="TEXT",
-        help="what a name is put into, such as 'a photo of a {}.'; several are averaged (default: {})",
-    )  # fmt: skip
-    image.add_argument(
-        "--crops", choices=("context", "langsplat"), default="context",
-        help="how masks are cut out unless a caller says otherwise (default: %(default)s)",
-    )  # fmt: skip
+            "-o", "--output", type=Path, metavar="DIR", help="default: in the cache, where scenes find it"
+        )
+        add_option(half, "--feature-space", "OWNER/MODEL", "as scenes name it (default: what the model says)")
+    template = "what a name is put into, such as 'a photo of a {}.'; several are averaged (default: {})"
+    add_option(text, "--template", "TEXT", template, action="append")
+    crops = "how masks are cut out unless a caller says otherwise (default: %(default)s)"
+    add_option(image, "--crops", None, crops, choices=("context", "langsplat"), default="context")
 
 
 def run_text(arguments: argparse.Namespace) -> None:

@@ -11,21 +11,12 @@ import shlex
 import sys
 from contextlib import nullcontext, suppress
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args, get_type_hints
 
-from og_pointcloud.cli.common import (
-    Parser,
-    add_output,
-    describe_fit,
-    print_fit,
-    print_next,
-    print_table,
-    replaceable,
-    timed,
-    write_fit,
-    write_json,
-)
+from og_pointcloud.cli import common
+from og_pointcloud.cli.common import Parser, add_option, add_output, replaceable, timed, write_json
 from og_pointcloud.errors import MissingExtraError, OgPointcloudError
 from og_pointcloud.settings import FitSettings, PaperSettings
 
@@ -40,52 +31,23 @@ MASK_LEVELS = ("default", "small", "medium", "large")
 
 
 def add(parser: Parser) -> None:
-    parser.add_argument(
-        "capture", type=Path, nargs="+", metavar="CAPTURE", help="folder with images and poses; several with --out"
-    )
+    option = partial(add_option, parser)
+    option("capture", "CAPTURE", "folder with images and poses; several with --out", type=Path, nargs="+")
     target = parser.add_mutually_exclusive_group(required=True)
     add_output(target, "-o", "--output", endings=(".ogpc",), help="the file to write")
-    target.add_argument(
-        "--out", type=replaceable, metavar="DIR",
-        help="folder for a file of each capture, DIR/NAME.ogpc; those that are there are left as they are",
-    )  # fmt: skip
-    parser.add_argument(
-        "--scheduler", metavar="ADDRESS",
-        help="of a Dask cluster that takes the captures, or the tiles of one (default: processes of this machine)",
-    )  # fmt: skip
-    parser.add_argument("--gaussians", type=Path, metavar="F.ply", help="geometry, in place of the capture's own")
-    parser.add_argument("--mode", choices=MODES, default=MODES[0], help="how to find instances (default: %(default)s)")
-    parser.add_argument(
-        "--schedule-share", type=float, metavar="X", help="shorten the published schedule (mode paper; default: 1)"
-    )
-    parser.add_argument(
-        "--mask-level", choices=MASK_LEVELS, default="large", help="level of LangSplat masks (default: %(default)s)"
-    )
-    parser.add_argument(
-        "--vocabulary", type=Path, metavar="F.npz",
-        help="text features whose names can then be asked (default: the capture's text_features.npz)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--word-bank", type=Path, metavar="F.npz",
-        help="text features of at least 50 everyday words, which labels are judged by (default: those of the feature "
-        "space's text encoder, if it is found)",
-    )  # fmt: skip
-    parser.add_argument("--seed", type=int, default=0, metavar="N", help="of everything random (default: %(default)s)")
-    parser.add_argument(
-        "--memory", metavar="4GB",
-        help="what the fit may hold in memory; a larger table goes to disk (default: half of what is free)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--tile-points", type=int, metavar="N",
-        help="fit in tiles of at most so many points (default: only where one fit would not fit into memory)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--work", type=replaceable, metavar="DIR",
-        help="where the views of a long fit are kept until it ends, for a start after a kill (default: S.ogpc.work)",
-    )  # fmt: skip
-    add_output(
-        parser, "--rerun", endings=(".rrd",), help="also write the views and what they show for the Rerun viewer"
-    )
+    add_option(target, "--out", "DIR", "for DIR/NAME.ogpc of each capture, but those that are there", type=replaceable)
+    option("--scheduler", "ADDRESS", "of a Dask cluster for captures, or tiles of one (default: this machine)")
+    option("--gaussians", "F.ply", "geometry, in place of the capture's own", type=Path)
+    option("--mode", None, "how to find instances (default: %(default)s)", choices=MODES, default=MODES[0])
+    option("--schedule-share", "X", "shorten the published schedule (mode paper; default: 1)", type=float)
+    option("--mask-level", None, "of LangSplat masks (default: %(default)s)", choices=MASK_LEVELS, default="large")
+    option("--vocabulary", "F.npz", "words that can be asked (default: the capture's text_features.npz)", type=Path)
+    option("--word-bank", "F.npz", "50 everyday words or more to judge labels by (default: the encoder's)", type=Path)
+    option("--seed", "N", "of everything random (default: %(default)s)", type=int, default=0)
+    option("--memory", "4GB", "a larger table of masks goes to disk (default: half of what is free)")
+    option("--tile-points", "N", "fit in tiles of so many points (default: where one fit would not fit)", type=int)
+    option("--work", "DIR", "keeps views, for a start after a kill (default: S.ogpc.work)", type=replaceable)
+    add_output(parser, "--rerun", endings=(".rrd",), help="also write the views and what they show for Rerun's viewer")
     add_output(parser, "--json", endings=(".json",), help="also write timings and settings of this run")
 
 
@@ -118,7 +80,7 @@ def fit_one(arguments: argparse.Namespace, options: FitOptions, executor: Execut
         if views := kept_files(work, "view"):
             print(f"{views} views are kept in '{work}': the same command goes on behind them", file=sys.stderr)
         raise
-    cloud = write_fit(cloud, cloud.provenance["stages"], arguments.output)
+    cloud = common.write_fit(cloud, cloud.provenance["stages"], arguments.output)
     if arguments.rerun:
         with timed(cloud.provenance["stages"], "write rerun"):
             write_views(cloud, capture, options, arguments.rerun)
@@ -127,10 +89,10 @@ def fit_one(arguments: argparse.Namespace, options: FitOptions, executor: Execut
             from og_pointcloud.show.fit_pictures import training_picture
 
             print(f"wrote {training_picture(training, arguments.output.with_suffix('.training.png'))}")
-    report = describe_fit(cloud, capture, arguments.output)
+    report = common.describe_fit(cloud, capture, arguments.output)
     if arguments.json:
         write_json(arguments.json, report)
-    print_fit(report, cloud)
+    common.print_fit(report, cloud)
 
 
 def fit_several(arguments: argparse.Namespace, options: FitOptions, executor: Executor | None) -> None:
@@ -141,7 +103,7 @@ def fit_several(arguments: argparse.Namespace, options: FitOptions, executor: Ex
         write_json(arguments.json, {"fits": [asdict(fit) for fit in fits]})
     if made := [fit for fit in fits if fit.state == "fitted"]:
         rows = [(fit.name, f"{fit.points:,}", str(fit.instances), f"{fit.seconds:.1f}") for fit in made]
-        print_table(("capture", "points", "instances", "seconds"), rows)
+        common.print_table(("capture", "points", "instances", "seconds"), rows)
     failed = [fit for fit in fits if fit.state == "failed"]
     there = len(fits) - len(made) - len(failed)
     print(f"{len(made)} fitted, {there} were there already, {len(failed)} failed, in {arguments.out}")
@@ -151,7 +113,7 @@ def fit_several(arguments: argparse.Namespace, options: FitOptions, executor: Ex
     for fit in failed:
         print(f"failed: {fit.capture}: {fit.cause}", file=sys.stderr)
     if len(failed) < len(fits):
-        print_next("index", arguments.out, "-o", arguments.out / "atlas")
+        common.print_next("index", arguments.out, "-o", arguments.out / "atlas")
     if failed:
         raise OgPointcloudError(f"{len(failed)} of {len(fits)} captures failed: mend them, then the same command again")
 

@@ -9,20 +9,16 @@ import argparse
 import time
 from pathlib import Path
 
-from og_pointcloud.cli.common import Parser, add_output, check_output, print_next, warn_of_poses
+from og_pointcloud.cli.common import Parser, add_option, add_output, check_output, print_next, warn_of_poses
 from og_pointcloud.errors import OgPointcloudError
 
 
 def add(parser: Parser) -> None:
-    parser.add_argument(
-        "capture", type=Path, metavar="CAPTURE",
-        help="folder with poses and depth images: depth/, nerfstudio's depth_file_path, ScanNet, 7-Scenes, Replica",
-    )  # fmt: skip
+    formats = "depth/, nerfstudio's depth_file_path, ScanNet, 7-Scenes, Replica"
+    add_option(parser, "capture", "CAPTURE", f"folder with poses and depth images: {formats}", type=Path)
     add_output(parser, "-o", "--output", endings=(".ply",), help="the cloud to write (default: CAPTURE/points.ply)")
-    parser.add_argument(
-        "--depth-unit", type=float, metavar="X",
-        help="lengths of the poses' world in a stored step, e.g. 0.001 (default: what the data set or the type says)",
-    )  # fmt: skip
+    unit = "lengths of the poses' world in a stored step, e.g. 0.001 (default: what the data set or the type says)"
+    add_option(parser, "--depth-unit", "X", unit, type=float)
 
 
 def run(arguments: argparse.Namespace) -> None:

@@ -14,7 +14,7 @@ from typing import Any
 import og_pointcloud as og
 from og_pointcloud.cli import common
 from og_pointcloud.cli.common import Parser
-from og_pointcloud.errors import OgPointcloudError
+from og_pointcloud.errors import OgPointcloudError, did_you_mean
 
 
 def add(parser: Parser) -> None:
@@ -60,8 +60,7 @@ def world_camera(capture: Path, name: str) -> og.Camera:
     cameras = {view.name: view.camera for view in scene.views}
     if name not in cameras:
         raise OgPointcloudError(
-            f"--view is '{name}', which is not among the {len(cameras)} views of {capture}"
-            f"{common.did_you_mean(name, cameras)}"
+            f"--view is '{name}', which is not among the {len(cameras)} views of {capture}{did_you_mean(name, cameras)}"
         )
     return og.in_world(cameras[name], scene.points.origin)
 

@@ -7,10 +7,11 @@ from __future__ import annotations
 
 import argparse
 import sys
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 
-from og_pointcloud.cli.common import Parser, check_output, print_table
+from og_pointcloud.cli.common import Parser, add_option, check_output, print_table
 from og_pointcloud.errors import MissingExtraError, OgPointcloudError
 
 SHARE = 0.05
@@ -18,25 +19,15 @@ SHARE = 0.05
 
 
 def add(parser: Parser) -> None:
-    parser.add_argument(
-        "captures", type=Path, nargs="+", metavar="CAPTURE",
-        help="folders; with gt.npz and text_features.npz the error is 1 - mIoU, else 1 - reliability",
-    )  # fmt: skip
-    parser.add_argument(
-        "--knob", action="append", metavar="NAME", help="only this setting (may be given several times)"
-    )
+    option = partial(add_option, parser)
+    option("captures", "CAPTURE", "folders; without gt.npz the error is 1 - reliability", type=Path, nargs="+")
+    option("--knob", "NAME", "only this setting (may be given several times)", action="append")
     parser.add_argument("--quick", action="store_true", help="only the settings that matter most")
-    parser.add_argument(
-        "--ablation", action="store_true", help="instead, the paper's tables: losses, codebook, association"
-    )
+    parser.add_argument("--ablation", action="store_true", help="instead, the paper's: losses, codebook, association")
     parser.add_argument("--paper", action="store_true", help="of --ablation: trained by rendering, as published (slow)")
-    parser.add_argument(
-        "--schedule-share", type=float, default=SHARE, metavar="X", help="of --paper: part of it (default: %(default)s)"
-    )
-    parser.add_argument(
-        "-o", "--output", type=Path, default=Path("out/report"), metavar="DIR",
-        help="folder for report.md, .csv and .png, or ablation.* (default: %(default)s)",
-    )  # fmt: skip
+    option("--schedule-share", "X", "of --paper: part of it (default: %(default)s)", type=float, default=SHARE)
+    folder = "folder for report.md, .csv and .png, or ablation.* (default: %(default)s)"
+    parser.add_argument("-o", "--output", type=Path, default=Path("out/report"), metavar="DIR", help=folder)
 
 
 def run(arguments: argparse.Namespace) -> None:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import og_pointcloud as og
-from og_pointcloud.cli.common import Parser, add_shared, names_in, print_shares
+from og_pointcloud.cli.common import Parser, add_option, add_shared, names_in, print_shares
 
 if TYPE_CHECKING:
     from og_pointcloud_ros.bags import BagReport
@@ -25,9 +25,7 @@ def add(parser: Parser) -> None:
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="OUT", help="the folder to make")
     parser.add_argument("--scene", type=Path, required=True, metavar="S.ogpc", help="what `fit` wrote")
     add_shared(parser, "--labels", "--text-features")
-    parser.add_argument(
-        "--topic", action="append", metavar="T", help="clouds to label; may be repeated (default: every PointCloud2)"
-    )
+    add_option(parser, "--topic", "T", "clouds to label, repeatable (default: every PointCloud2)", action="append")
     parser.add_argument("--frame", default="map", metavar="F", help="the scene's frame (default: %(default)s)")
 
 

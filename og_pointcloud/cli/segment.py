@@ -21,10 +21,8 @@ SAVED_AS = (".npz", ".ply", ".las", ".laz", ".glb", ".spz")
 def add(parser: Parser) -> None:
     common.add_shared(parser, "bundle", "--labels", "--text-features", "--json")
     parser.add_argument("--points", type=Path, metavar="CLOUD", help="points to label (default: those fitted)")
-    common.add_output(
-        parser, "-o", "--output", endings=SAVED_AS, metavar="OUT",
-        help="labels as .npz, or a coloured .ply, .las, .laz or .glb; of splats .glb or .spz",
-    )  # fmt: skip
+    files = "labels as .npz, or a coloured .ply, .las, .laz or .glb; of splats .glb or .spz"
+    common.add_output(parser, "-o", "--output", endings=SAVED_AS, metavar="OUT", help=files)
 
 
 def run(arguments: argparse.Namespace) -> None:

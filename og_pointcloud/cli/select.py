@@ -14,9 +14,7 @@ from og_pointcloud.cli.common import Parser, add_shared, calibration_hint, names
 def add(parser: Parser) -> None:
     add_shared(parser, "bundle", "--text-features", "--json")
     parser.add_argument("text", metavar="WORD", help="a word or phrase")
-    parser.add_argument(
-        "--against", metavar="A,B,C", help="words that compete with it (default: all others that are known)"
-    )
+    parser.add_argument("--against", metavar="A,B,C", help="words that compete with it (default: all that are known)")
 
 
 def run(arguments: argparse.Namespace) -> None:

@@ -51,9 +51,8 @@ def run_add(arguments: argparse.Namespace) -> None:
     else:
         words, encoder = read_words(arguments.words), scene_encoder(arguments)
         vocabulary, space = og.Vocabulary(words, encoder(words)), encoder.feature_space
-    done = add_words(arguments.bundle, vocabulary, space, arguments.output)
-    replaced = f", {done.replaced} with a new vector" if done.replaced else ""
-    print(f"wrote {arguments.output or arguments.bundle}: {done.total} words, {done.added} new{replaced}")
+    together = add_words(arguments.bundle, vocabulary, space, arguments.output)
+    print(f"wrote {arguments.output or arguments.bundle}: {len(together.names)} words")
 
 
 def scene_encoder(arguments: argparse.Namespace) -> TextEncoder:

@@ -20,10 +20,10 @@ from og_pointcloud.collection.index import Changes, Family, Group, families, ind
 from og_pointcloud.collection.lance import LanceTables
 from og_pointcloud.collection.scoring import Block, load_block, share
 from og_pointcloud.collection.store import Atlas, SceneEntry
-from og_pointcloud.errors import OgPointcloudError
+from og_pointcloud.errors import OgPointcloudError, did_you_mean
 from og_pointcloud.text.encoder import TextEncoder, export_command, find_encoder
 from og_pointcloud.text.text_features import read_text_features
-from og_pointcloud.text.words import TextFeatures, close_matches
+from og_pointcloud.text.words import TextFeatures
 
 __all__ = ["Collection", "Finding", "Findings"]
 
@@ -192,7 +192,7 @@ class Collection:
             fitting = {entry.id for entry in self.entries if pattern == entry.name or fnmatchcase(entry.name, pattern)}
             if not fitting:  # a name may hold brackets, hence the comparison
                 raise OgPointcloudError(
-                    f"no scene is called '{pattern}'{close_matches(pattern, self.scenes)}; expected one of the "
+                    f"no scene is called '{pattern}'{did_you_mean(pattern, self.scenes)}; expected one of the "
                     f"{len(self.entries)} scenes of {self.path}"
                 )
             found |= fitting
@@ -292,7 +292,7 @@ def _unanswerable(word: str, asked: Sequence[Family]) -> OgPointcloudError:
         return OgPointcloudError("no scene has an instance with a feature: nothing can be asked; make masks first")
     known = {name for family in asked for name in family.words}
     return OgPointcloudError(
-        f"'{word}' is not among the {len(known)} words of these scenes{close_matches(word, known)}: give "
+        f"'{word}' is not among the {len(known)} words of these scenes{did_you_mean(word, known, ' If not')}: give "
         "text_features with its vector (--text-features), or, for any word at all, make the encoder once: "
         f"{export_command(asked[0].feature_space)}"
     )

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
+from og_pointcloud.cloud import unit_rows
 from og_pointcloud.fitting.fit import Prepared
 
 MOSTLY = 0.5
@@ -39,7 +40,7 @@ def centre_sampling(prepared: Prepared, words: Words) -> Labels:
     table, views = prepared.table, prepared.surface.scene.views
     xyz = prepared.surface.gaussians.xyz
     first = np.searchsorted(table.mask_view, np.arange(len(views)))
-    similarity = table.unit_features @ _unit(words).T
+    similarity = table.unit_features @ unit_rows(words.astype(np.float64)).T
     scores, reached = np.zeros((len(xyz), len(words))), np.zeros(len(xyz), bool)
     for index, view in enumerate(views):
         exposure = csr_array(table.exposure[[index]])
@@ -78,11 +79,6 @@ def only_where_masked(labels: Labels, prepared: Prepared) -> Labels:
 def uplift(weights: csr_array, features: NDArray[np.floating], words: Words) -> Labels:
     """(n,) the word nearest to the mean of the features (M, D) by the weights (M, n); -1 where no mask reaches."""
     # A mean's cosines are in the order of its products with the words: it need not be made, nor be of length 1.
-    scores = np.asarray(weights.T @ (features @ _unit(words).T))
+    scores = np.asarray(weights.T @ (features @ unit_rows(words.astype(np.float64)).T))
     reached = np.asarray(weights.sum(axis=0)).ravel() > 0
     return np.where(reached, scores.argmax(axis=1), -1)
-
-
-def _unit(rows: NDArray[np.floating]) -> NDArray[np.float64]:
-    wide = np.asarray(rows, np.float64)
-    return wide / np.maximum(np.linalg.norm(wide, axis=1, keepdims=True), 1e-300)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from og_pointcloud.cloud import FeatureSpace, Vocabulary
-from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError
+from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError, did_you_mean
 from og_pointcloud.text.encoder import CarriedEncoder, export_command, find_encoder
 from og_pointcloud.text.text_features import checked_vocabulary, read_text_features
 
@@ -104,7 +104,7 @@ def _looked_up(
         vectors |= dict(zip(missing, encoder(missing), strict=True))
     elif missing:
         others = f", nor are {len(missing) - 1} more of the labels" if len(missing) > 1 else ""
-        hint = close_matches(missing[0], list(vectors))
+        hint = did_you_mean(missing[0], vectors, " If not")
         raise OgPointcloudError(
             f"'{missing[0]}' is not among the {len(vectors)} known words{others}{hint}: {_ways(feature_space)}"
         )
@@ -119,12 +119,3 @@ def _check_one_width(words: tuple[str, ...], vectors: Mapping[str, np.ndarray]) 
         raise FeatureSpaceError(
             f"'{first}' has a vector of width {one}, '{second}' of {other}: they come from two encoders under one name"
         )
-
-
-def close_matches(word: str, known: Iterable[str]) -> str:
-    """What may have been meant by a word, as the end of a message; "" where no known word is like it."""
-    import difflib  # only when something went wrong
-
-    by_lower = {name.lower(): name for name in known}
-    close = [by_lower[match] for match in difflib.get_close_matches(word.lower(), by_lower, n=3)]
-    return f"; did you mean {' or '.join(repr(name) for name in close)}? If not" if close else ""
