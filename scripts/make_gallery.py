@@ -67,7 +67,8 @@ EXHIBITS = (
             "without that, and that painted, of mode paper and of the default way."),
     Exhibit("11_paper_figures", (str(KITCHEN), "microwave", "-o", "{out}/kitchen"),
             ("kitchen/features.png", "kitchen/objects.png"),
-            "The same of a real kitchen (7-Scenes), with a click on the microwave.", needs=KITCHEN),
+            "The same of a real kitchen (7-Scenes), with a click on what its detector takes for a microwave.",
+            needs=KITCHEN),
 )  # fmt: skip
 
 
