@@ -426,8 +426,19 @@ def test_a_tracker_is_one_witness_among_the_views(views: int) -> None:
     """That took two things for one, which all views show apart; and one thing for two, which they show as one."""
     table = hand_table(100, [[(A, ONE), (B, OTHER)]] * views)
     np.testing.assert_array_equal(groups_of(with_tracks(table, [3, 3] * views)), [0, 1] * views)
+    np.testing.assert_array_equal(groups_of(with_tracks(table, [3, 4] * views)), [0, 1] * views)
     table = hand_table(50, [[(A, ONE)]] * views)
     np.testing.assert_array_equal(groups_of(with_tracks(table, range(views))), [0] * views)
+
+
+@pytest.mark.parametrize(("beside", "joined"), [(9, True), (2, False)])
+def test_tracks_are_two_things_only_where_an_image_has_both(beside: int, joined: bool) -> None:
+    """A mask holds another of the other view, tracks 1 and 2; that view says one thing. Where track 2 is in the first
+    image too, the tracker says two."""
+    side = (range(100, 130), OTHER)
+    table = hand_table(130, [[(range(100), ONE), side], [(range(30), ONE), side]])
+    group = groups_of(with_tracks(table, [1, beside, 2, 7]))
+    assert (group[0] == group[2]) == joined
 
 
 def test_names_of_tracks_do_not_matter() -> None:

@@ -52,16 +52,16 @@ def test_a_map_of_two_visits_is_colored_by_change(scene):
     live.mode = "changes"
     shown, ids = live.colors(), cloud.instance_ids
     for point in range(0, len(shown), 7):
-        name = {4: "moved", 2: "not seen at the last visit"}.get(ids[point], "as it was")
+        name = {4: "moved to here", 2: "not seen at the last visit"}.get(ids[point], "as it was")
         expected = slow_color(CHANGES[name], cloud.rgb[point], True)
         assert np.abs(shown[point].astype(int) - expected).max() <= 1
     counts = {name: points for name, _, points in live.legend()}
     assert counts == {
-        "moved": (ids == 4).sum(), "not seen at the last visit": (ids == 2).sum(),
+        "moved to here": (ids == 4).sum(), "not seen at the last visit": (ids == 2).sum(),
         "as it was": (~np.isin(ids, [2, 4])).sum(),
     }  # fmt: skip
     live.mode = "labels"
-    assert "moved" not in {name for name, *_ in live.legend()}
+    assert "moved to here" not in {name for name, *_ in live.legend()}
 
 
 @pytest.mark.parametrize("mode", ["labels", "instances"])

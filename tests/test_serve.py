@@ -16,7 +16,8 @@ from og_pointcloud_export import write_bundle
 import og_pointcloud as og
 from og_pointcloud.cli import main
 from og_pointcloud.cloud import Vocabulary
-from og_pointcloud.show.live import Answer, LiveScene
+from og_pointcloud.show.changes_page import both_visits, write_changes_page
+from og_pointcloud.show.live import CHANGES, Answer, LiveScene
 
 BROWSER = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-background-networking"]
 
@@ -211,3 +212,87 @@ def test_a_browser_types_a_word_sees_the_points_lit_and_clicks_them(viser):
             assert (np.abs(saved - color["left"]).max(axis=2) <= 20).sum() > 2000
     finally:
         served.stop()
+
+
+@pytest.fixture(scope="module")
+def visits_of_a_place():
+    """The chest stays, the bin leaves, a parcel comes, the crate moves."""
+    import visits
+
+    things = [visits.CHEST, visits.BIN, visits.CRATE]
+    later = [visits.CHEST, visits.moved(visits.CRATE, (-0.9, 0.3, 0)), visits.PARCEL]
+    before, after = (og.fit(visits.scene(place, seed=k), progress=False) for k, place in enumerate((things, later)))
+    return before, after, og.compare(before, after)
+
+
+def test_two_visits_are_colored_by_what_became_of_things(visits_of_a_place):
+    import visits
+
+    before, after, changes = visits_of_a_place
+    both, change = both_visits(before, after, changes)
+    live = LiveScene(og.LabelledScene.from_cloud(both), changes=change)
+    assert (live.mode, "changes" in live.modes) == ("changes", True)
+    seen = {name: points for name, _, points in live.legend()}
+    assert set(seen) == {"gone", "new", "moved from here", "moved to here", "as it was"}
+    gone = visits.instance_of(before, visits.BIN)
+    assert seen["gone"] == (before.instance_ids == gone).sum()
+    assert seen["new"] == (after.instance_ids == visits.instance_of(after, visits.PARCEL)).sum()
+    colors, shown = live.colors(), live.ids == len(after.instances) + gone
+    hue = np.array(CHANGES["gone"]) / max(CHANGES["gone"])
+    assert np.abs(colors[shown] / colors[shown].max(axis=1, keepdims=True) - hue).max() < 0.02
+    same, nothing = both_visits(after, after, og.Changes((), (), (), ()))
+    assert len(same) == len(after)
+    assert set(nothing) == {[*CHANGES].index("as it was")}
+
+
+def test_two_visits_are_served_by_one_command(visits_of_a_place, tmp_path, viser, capsys, monkeypatch):
+    before, after, _ = visits_of_a_place
+    monday, friday = (str(write_bundle(cloud, tmp_path / f"{day}.ogpc")) for day, cloud in
+                      (("monday", before), ("friday", after)))  # fmt: skip
+    monkeypatch.setattr("og_pointcloud.show.serve.LivePage.wait", lambda page: page.stop())
+    main(["serve", friday, "--before", monday, "--port", "0"])
+    assert "since monday: 1 gone, 1 new, 1 moved, 0 not seen again" in capsys.readouterr().out
+    for more, says in (([friday], "--before is for one scene"), (["--cloud", "c.ply"], "expected one")):
+        assert main(["serve", friday, *more, "--before", monday]) != 0
+        assert says in capsys.readouterr().err
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["serve", "page"])
+def test_a_browser_shows_what_is_gone_and_new(visits_of_a_place, tmp_path, kind):
+    browser = shutil.which("chromium") or shutil.which("google-chrome")
+    if browser is None:
+        pytest.skip("no Chromium here")
+    playwright = pytest.importorskip("playwright.sync_api")
+    before, after, changes = visits_of_a_place
+    served = None
+    if kind == "serve":
+        serve = pytest.importorskip("og_pointcloud.show.serve")
+        both, change = both_visits(before, after, changes)
+        live = LiveScene(og.LabelledScene.from_cloud(both), changes=change)
+        served = serve.serve({"visits": live}, serve.ServeSettings(port=0))
+        url = served.url
+    else:
+        write_changes_page(tmp_path / "changes.html", before, after, changes, np.array([0.0, 0, 1]))
+        url = (tmp_path / "changes.html").as_uri()
+    try:
+        with playwright.sync_playwright() as play:
+            window = play.chromium.launch(executable_path=browser, args=BROWSER).new_page(
+                viewport={"width": 900, "height": 600}
+            )
+            window.goto(url)
+
+            def pixels(name):
+                """Of the hue of a state, however light or dark."""
+                picture = (
+                    picture_of(window.screenshot())[:, :500] if served else picture_of(window.screenshot())[:, 310:]
+                )
+                hue, value = np.array(CHANGES[name]) / max(CHANGES[name]), picture.max(axis=2, keepdims=True)
+                return ((np.abs(picture / np.maximum(value, 1) - hue).max(axis=2) < 0.04) & (value[..., 0] > 60)).sum()
+
+            states = ("gone", "new", "moved from here", "moved to here")
+            until(lambda: all(pixels(name) > 150 for name in states), 90)
+            assert all(name in window.inner_text("body") for name in states)
+    finally:
+        if served is not None:
+            served.stop()

@@ -7,10 +7,15 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from og_pointcloud.cli.common import Parser, add_shared, names_in
 from og_pointcloud.cli.view import AXES
 from og_pointcloud.errors import OgPointcloudError
+
+if TYPE_CHECKING:
+    from og_pointcloud.show.live import LiveScene
+    from og_pointcloud.text.words import Labels, TextFeatures
 
 
 def add(parser: Parser) -> None:
@@ -18,6 +23,9 @@ def add(parser: Parser) -> None:
     add_shared(parser, "--labels", "--text-features")
     parser.add_argument(
         "--cloud", type=Path, metavar="CLOUD", help="points or splats to show of one scene (default: those fitted)"
+    )
+    parser.add_argument(
+        "--before", type=Path, metavar="A.ogpc", help="an earlier visit: show what is gone, new and moved since"
     )
     parser.add_argument("--up", choices=AXES, default="z", metavar="AXIS", help="as for `view` (default: z)")
     parser.add_argument(
@@ -29,8 +37,11 @@ def add(parser: Parser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    if arguments.cloud and len(arguments.bundles) > 1:
-        raise OgPointcloudError(f"--cloud is for one scene, but {len(arguments.bundles)} are given; serve it alone")
+    alone = "--cloud" if arguments.cloud else "--before" if arguments.before else None
+    if alone and len(arguments.bundles) > 1:
+        raise OgPointcloudError(f"{alone} is for one scene, but {len(arguments.bundles)} are given; serve it alone")
+    if arguments.cloud and arguments.before:
+        raise OgPointcloudError("--cloud and --before are both given; expected one: two visits are shown as they are")
     from og_pointcloud.ask.hosts import import_plugin
     from og_pointcloud.ask.labelled_scene import load
     from og_pointcloud.formats.points import read_points
@@ -39,10 +50,12 @@ def run(arguments: argparse.Namespace) -> None:
     served = import_plugin("og_pointcloud.show.serve", "serve")
     shown = read_points(arguments.cloud) if arguments.cloud else None
     labels = names_in(arguments.labels)
-    scenes = {
-        title: LiveScene(load(path), shown, labels, arguments.text_features)
-        for title, path in titles(arguments.bundles).items()
-    }
+    words = labels, arguments.text_features
+    if arguments.before:
+        scenes = _two_visits(arguments.before, arguments.bundles[0], *words)
+    else:
+        bundles = titles(arguments.bundles).items()
+        scenes = {title: LiveScene(load(path), shown, *words) for title, path in bundles}
     page = served.serve(scenes, served.ServeSettings(arguments.host, arguments.port, AXES[arguments.up]))
     try:
         print(f"{page.url}  (Ctrl-C ends it)", flush=True)
@@ -53,6 +66,19 @@ def run(arguments: argparse.Namespace) -> None:
         page.wait()
     except KeyboardInterrupt:  # before it waited
         page.stop()
+
+
+def _two_visits(earlier: Path, later: Path, labels: Labels, text_features: TextFeatures) -> dict[str, LiveScene]:
+    from og_pointcloud.ask.labelled_scene import LabelledScene, load
+    from og_pointcloud.mapping.changes import compare
+    from og_pointcloud.show.changes_page import both_visits
+    from og_pointcloud.show.live import LiveScene
+
+    before, after = load(earlier), load(later)
+    changes = compare(before, after)
+    print(f"since {earlier.stem}: {changes}")
+    both, change = both_visits(before.cloud, after.cloud, changes)
+    return {later.stem: LiveScene(LabelledScene.from_cloud(both), None, labels, text_features, change)}
 
 
 def titles(paths: list[Path]) -> dict[str, Path]:

@@ -10,8 +10,9 @@ so that ``N_ij / N_ib`` is the share of mask i that lies in mask j of view b. Fr
 of masks it contains: "one thing" (same container) or "two" (different ones). A view that missed an object says
 nothing. Masks are joined bottom-up while a majority of the witnesses pooled over both groups says "one thing":
 a mask that spans two objects is outvoted, parts of one object come together when other views show it whole.
-Where masks have tracks, the tracker is one witness more: of two masks that it followed it says "one thing" where their
-track is the same, also of masks that share no Gaussian, the front and the back of a thing, of which no view can say it.
+Where masks have tracks, the tracker is one witness more: it says "one thing" of two masks with the same track, also of
+the front and the back of a thing, of which no view can say it, and "two" where their tracks were in one image. Of other
+tracks it says nothing: what was out of sight comes back with another number.
 The idea of view consensus is that of MaskClustering (Yan et al., CVPR 2024); the soft, visibility-weighted form is
 ours.
 """
@@ -143,32 +144,35 @@ def _containers(
 @dataclass(frozen=True)
 class _Witnesses:
     """Per pair of masks (rows, cols, both ways) that any view, or the tracker, shows as one thing: how many do, and how
-    many of these whatever the features say: all if the two masks have the same extent, else the tracker alone. speaks:
-    (masks, views + 1 for the tracker), where a mask has a container, or a track: witnesses that say anything of a pair
-    are those where both have."""
+    many of these whatever the features say: all if the two masks have the same extent, else the tracker alone. speaks,
+    hears: (masks, views + tracks), of which speaks[i] @ hears[j] is how many witnesses say anything of a pair: views in
+    which both have a container, and the tracker where both tracks are the same or were in one image."""
 
     rows: NDArray[np.int32]
     cols: NDArray[np.int32]
     one: NDArray[np.float64]
     same_extent: NDArray[np.float64]
     speaks: NDArray[np.float64]
+    hears: NDArray[np.float64]
 
 
 def _witnesses(share: csr_array, container: csr_array, table: MaskTable, settings: GroupingSettings) -> _Witnesses:
     views = int(table.mask_view.max(initial=-1)) + 1
     speaks = (container @ indicator(table.mask_view, views).T).toarray().astype(np.float64)
-    followed = csr_array(container.shape, dtype=np.float32)
+    hears, followed = speaks, csr_array(container.shape, dtype=np.float32)
     if table.mask_track is not None:
         track = np.unique(np.maximum(table.mask_track, -1), return_inverse=True)[1] - (table.mask_track < 0).any()
         tracks = indicator(track.astype(np.int32), int(track.max(initial=-1)) + 1)
         followed = csr_array(tracks.T @ tracks)
-        speaks = np.column_stack([speaks, track >= 0])
+        in_view = tracks @ indicator(table.mask_view, views).T
+        together = (in_view @ in_view.T).toarray() > 0
+        speaks, hears = (np.column_stack([speaks, of_track]) for of_track in (tracks.T.toarray(), tracks.T @ together))
     pairs = csr_array(container @ container.T + followed).tocoo()
     off_diagonal = pairs.row != pairs.col
     rows, cols, one = pairs.row[off_diagonal], pairs.col[off_diagonal], pairs.data[off_diagonal].astype(np.float64)
     smaller = np.minimum(_lookup(share, rows, cols), _lookup(share, cols, rows))
     sure = np.where(smaller > settings.container_share, one, _lookup(followed, rows, cols))
-    return _Witnesses(rows, cols, one, sure, speaks)
+    return _Witnesses(rows, cols, one, sure, speaks, hears)
 
 
 def _agglomerate(
@@ -188,7 +192,7 @@ def _agglomerate(
     """
     likeness = _Likeness(features, mask_view)
     links = _link_table(witnesses, usable)
-    speaks = witnesses.speaks.copy()
+    speaks, hears = witnesses.speaks.copy(), witnesses.hears.copy()
     group = np.where(usable, np.arange(len(usable)), -1)
     version = [0] * len(usable)
     heap: list[tuple[float, float, float, int, int, int, int]] = []
@@ -196,7 +200,7 @@ def _agglomerate(
     def offer(a: int, others: list[int]) -> None:
         """Put the pairs of a group and others on the heap, with their agreement."""
         cosine, alike = likeness(a, others)
-        asked = speaks[others] @ speaks[a]
+        asked = speaks[others] @ hears[a]
         one, same_extent = np.array([links[a][b] for b in others]).T
         agreement = (same_extent + (one - same_extent) * alike) / asked
         for b, *order in zip(others, (-agreement).tolist(), (-asked).tolist(), (-cosine).tolist(), strict=True):
@@ -216,6 +220,7 @@ def _agglomerate(
         version[a] += 1
         likeness.join(a, b)
         speaks[a] += speaks[b]
+        hears[a] += hears[b]
         del links[a][b], links[b][a]
         for c, more in links.pop(b).items():
             del links[c][b]

@@ -1,4 +1,4 @@
-"""Two visits as one HTML page: what is gone, new and moved, in colours that can be switched on and off one by one."""
+"""Two visits in one: what is gone, new and moved, for a page that switches each on and off, and for the live page."""
 
 from __future__ import annotations
 
@@ -13,31 +13,33 @@ from og_pointcloud.ask.segmentation import Segmentation
 from og_pointcloud.cloud import LabelledCloud
 from og_pointcloud.mapping.changes import Changes
 from og_pointcloud.mapping.merging import joined
+from og_pointcloud.show.live import CHANGES
 from og_pointcloud.show.page import Look, write_page
 from og_pointcloud.show.viewpoint import choose_viewpoint
 
-__all__ = ["STATES", "write_changes_page"]
+__all__ = ["STATES", "both_visits", "write_changes_page"]
 
-STATES = ("gone", "new", "moved from here", "moved to here")
-"""Labels of the page; what has none of them is as it was, or was not seen again."""
+STATES = tuple(CHANGES)[:4]
+"""Labels of the page: gone, new, and from where to where things moved; what has none of them is as it was, or was not
+seen again."""
 
 
-def write_changes_page(
-    path: str | os.PathLike[str], before: LabelledCloud, after: LabelledCloud, changes: Changes, up: NDArray[np.float64]
-) -> None:
-    """Write the page, whole or not at all: the later visit, and of the earlier one what left its place. up: (3,) unit.
+def both_visits(
+    before: LabelledCloud, after: LabelledCloud, changes: Changes
+) -> tuple[LabelledCloud, NDArray[np.intp]]:
+    """The later visit, and of the earlier one what left its place; and (K,) what became of each instance, a row of
+    `live.CHANGES`.
 
     Instances of the later visit keep their ids; those of the earlier one follow behind.
     """
-    left = [*changes.gone, *(moved.id for moved in changes.moved)]
-    rows = np.flatnonzero(np.isin(before.instance_ids, left))
-    count = len(after.instances)
-    moved_from, moved_to = [entry.id for entry in changes.moved], [entry.now for entry in changes.moved]
-    of_before = np.where(np.isin(before.instance_ids[rows], moved_from), 2, 0)
-    of_after = np.full(len(after), -1)
-    of_after[np.isin(after.instance_ids, changes.new)] = 1
-    of_after[np.isin(after.instance_ids, moved_to)] = 3
-    labels = np.concatenate([of_after, of_before]).astype(np.int32)
+    gone, moved = [*changes.gone], [entry.id for entry in changes.moved]
+    rows = np.flatnonzero(np.isin(before.instance_ids, gone + moved))
+    count, names = len(after.instances), list(CHANGES)
+    change = np.full(count + len(before.instances), names.index("as it was"))
+    change[[*changes.new]] = names.index("new")
+    change[[entry.now for entry in changes.moved]] = names.index("moved to here")
+    change[count + np.array(gone, np.intp)] = names.index("gone")
+    change[count + np.array(moved, np.intp)] = names.index("moved from here")
     shift = before.origin - after.origin
     colored = before.rgb is not None and after.rgb is not None
     ids = np.concatenate([after.instance_ids, before.instance_ids[rows] + count]).astype(np.int32)
@@ -49,10 +51,21 @@ def write_changes_page(
         rgb=np.concatenate([after.rgb, before.rgb[rows]]) if colored else None,  # pyright: ignore
         certainty=None,
     )
+    return both, change
+
+
+def write_changes_page(
+    path: str | os.PathLike[str], before: LabelledCloud, after: LabelledCloud, changes: Changes, up: NDArray[np.float64]
+) -> None:
+    """Write the page, whole or not at all. up: (3,) unit."""
+    both, change = both_visits(before, after, changes)
     scene = LabelledScene.from_cloud(both)
+    labels = np.where(both.instance_ids >= 0, change[both.instance_ids], len(STATES)).astype(np.int32)
+    labels[labels >= len(STATES)] = -1
     reasons = np.where(labels < 0, 4, 0).astype(np.int8)
     result = Segmentation(
         scene.xyz, labels, (labels >= 0).astype(np.float32), both.instance_ids, reasons, STATES, scene.path
     )
     view = choose_viewpoint(scene.xyz, labels >= 0, up)
-    write_page(path, scene, result, view, Look(f"What changed: {changes}", boxes=True, cut=0.2), both.rgb)
+    look = Look(f"What changed: {changes}", boxes=True, cut=0.2, colors=tuple(CHANGES[name] for name in STATES))
+    write_page(path, scene, result, view, look, both.rgb)

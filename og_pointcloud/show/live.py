@@ -26,8 +26,11 @@ from og_pointcloud.text.words import Labels, TextFeatures
 __all__ = ["FADED", "MODES", "WORDS", "Answer", "LiveScene", "look_along", "meaning"]
 
 MODES = ("labels", "instances", "certainty", "changes", "photo")
-CHANGES = {"moved": (226, 88, 34), "not seen at the last visit": (86, 110, 190), "as it was": NO_LABEL}
-"""What a map of several visits knows of its instances, and their colors; what left has no points."""
+CHANGES = {
+    "gone": (200, 30, 60), "new": (24, 150, 70), "moved from here": (244, 178, 60), "moved to here": (226, 88, 34),
+    "not seen at the last visit": (86, 110, 190), "as it was": NO_LABEL,
+}  # fmt: skip
+"""What became of an instance between two visits, and its color. A map of several has no points of what left."""
 WORDS = 6
 """Words that are shown of an instance."""
 MATCHES = 12
@@ -56,7 +59,8 @@ class LiveScene:
     """A scene on show, its points or those of another cloud of the place.
 
     scene: what is asked. shown: the points to show, Gaussians perhaps; None for the scene's own. labels, text_features:
-    the words of mode "labels", as for ``segment``; left out, the scene's own, or none.
+    the words of mode "labels", as for ``segment``; left out, the scene's own, or none. changes: (K,) what became of
+    each instance, a row of `CHANGES`, which is then shown first; None for what a map of several visits knows.
 
     >>> live = LiveScene(og.LabelledScene.from_cloud(cloud))  # of `LabelledCloud`'s example
     >>> live.ask("desk").lines, live.lit
@@ -69,6 +73,7 @@ class LiveScene:
         shown: Points | None = None,
         labels: Labels = None,
         text_features: TextFeatures = None,
+        changes: NDArray[np.intp] | None = None,
     ) -> None:
         self.scene, self.shown, self._text_features = scene, shown, text_features
         self.xyz = scene.xyz if shown is None else shown.xyz_world
@@ -79,7 +84,9 @@ class LiveScene:
         self.names: tuple[str, ...] = words.names if words else ()
         vectors = words.vectors if words else np.zeros((0, scene.cloud.space.width), np.float32)
         self.label_of, self.score_of, self.reason_of = scene.chooser.choose(vectors).by_id
-        self._change_of = _changes(scene.cloud, len(self.label_of))
+        known = _known_changes(scene.cloud) if changes is None else changes
+        others = np.full(len(self.label_of) - len(scene.cloud.instances), len(CHANGES) - 1)  # ids below 0
+        self._change_of = None if known is None else np.concatenate([known, others])
         has = {
             "labels": self.names,
             "changes": self._change_of is not None,
@@ -87,7 +94,7 @@ class LiveScene:
             "photo": self.rgb is not None,
         }
         self.modes = tuple(mode for mode in MODES if has.get(mode, True))
-        self.mode = self.modes[0]
+        self.mode = self.modes[0] if changes is None else "changes"
         self.lit: set[int] | None = None
         """Ids of the instances that stand out, None where all do."""
 
@@ -217,14 +224,14 @@ class LiveScene:
         return f"instance {match.instance}{rather}"
 
 
-def _changes(cloud: LabelledCloud, rows: int) -> NDArray[np.intp] | None:
-    """(rows,) row of `CHANGES` of each instance, and of ids below 0; None where there was one visit alone."""
+def _known_changes(cloud: LabelledCloud) -> NDArray[np.intp] | None:
+    """(K,) row of `CHANGES` of each instance of a map; None where there was one visit alone."""
     record = MapRecord.of(cloud)
     if len(record.visits) < 2:
         return None
-    change = np.full(rows, 2)
-    change[[k for k, stamp in record.last_seen.items() if stamp < record.visits[-1].stamp]] = 1
-    change[list(record.moved_from)] = 0
+    change = np.full(len(cloud.instances), len(CHANGES) - 1)
+    change[[k for k, stamp in record.last_seen.items() if stamp < record.visits[-1].stamp]] = len(CHANGES) - 2
+    change[list(record.moved_from)] = [*CHANGES].index("moved to here")
     return change
 
 

@@ -42,13 +42,14 @@ class Look:
     """How a page begins; a click changes all but the title.
 
     mode: what colours show, "labels", "instances" or "photo". boxes: whether they are shown. cut: share of the height
-    hidden from the top, 0 to 1.
+    hidden from the top, 0 to 1. colors: RGB of each label; left out, by its number.
     """
 
     title: str
     mode: str = "labels"
     boxes: bool = False
     cut: float = 0.0
+    colors: tuple[tuple[int, int, int], ...] = ()
 
 
 def write_page(
@@ -85,7 +86,7 @@ def write_page(
         "corners": axis_aligned_box([low - middle, high - middle]).corners.tolist(),
         "extent": float(np.linalg.norm(high - low)) or 1.0,
         "eye": (view.eye - middle).tolist(), "target": (view.target - middle).tolist(), "up": view.up.tolist(),
-        "names": list(result.names), "colors": label_colors(np.arange(len(result.names))).tolist(),
+        "names": list(result.names), "colors": look.colors or label_colors(np.arange(len(result.names))).tolist(),
         "counts": list(result.counts().values()), "unknown": int((result.labels < 0).sum()),
         "reasons": [str(Reason.TOO_FAR), str(Reason.UNOBSERVED), str(Reason.IN_NO_MASK)],  # of ids -3, -2, -1
         "instances": _instances(scene, result, view.up, middle, word_data.pop("choice")),
