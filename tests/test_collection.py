@@ -171,6 +171,13 @@ def test_box_and_scenes_restrict(folder):
             (f.scene, f.instance): f.score for f in inside
         }
         assert {f.scene for f in fresh.find("lamp", scenes=["room1", "room[34]"])} == {"room1", "room3", "room4"}
+    random = np.random.default_rng(0)
+    for _ in range(30):
+        low, high = np.sort(random.uniform([-5, -1, -1], [50, 1, 1], (2, 3)), axis=0)
+        inside = [f for f in everything if (np.array(f.center) >= low).all() and (np.array(f.center) <= high).all()]
+        assert [(f.scene, f.instance) for f in collection.find("lamp", within=(low, high), top=100)] == [
+            (f.scene, f.instance) for f in inside
+        ]
     assert not collection.find("lamp", within=([500, 0, 0], [501, 1, 1]))
     with pytest.raises(OgPointcloudError, match="no scene is called 'room9'"):
         collection.find("lamp", scenes="room9")

@@ -165,7 +165,7 @@ class Collection:
         if not any(vectors):
             raise _unanswerable(names[0], [group.family for group in asked])
         with Atlas.reading(self.path) as atlas:
-            wanted = _Wanted(ids if box is None else ids & atlas.within(*box), box, top)
+            wanted = _Wanted(ids, box, top)
             found = [
                 pair
                 for group, known in zip(asked, vectors, strict=True)
@@ -227,22 +227,20 @@ class Collection:
         if not here:
             return []
         block, rows = self._candidates(atlas, group, here, wanted, vector)
-        if wanted.box is not None:
-            for axis, (low, high) in enumerate(wanted.box.T):
-                middle = block.center[rows, axis]
-                rows = rows[(middle >= low) & (middle <= high)]
-        others = [other for other in group.family.words.values() if other @ vector < SAME_WORD]
-        rivals = np.array(others, np.float32).reshape(len(others), len(vector))
-        ranked = zip(*block.rank(vector, rivals, rows, wanted.top), strict=True)
+        words = np.array([*group.family.words.values()], np.float32).reshape(-1, len(vector))
+        rivals = words[words @ vector < SAME_WORD]
+        ranked = zip(*block.rank(vector, rivals, rows, wanted.top, wanted.box), strict=True)
         return [(key, _finding(block, row, word, float(share(key)))) for row, key in ranked]
 
     def _candidates(
         self, atlas: Atlas, group: Group, here: list[SceneEntry], wanted: _Wanted, vector: NDArray[np.float32]
     ) -> tuple[Block, NDArray[np.intp]]:
-        """A block, and which of its instances are asked: all of these scenes, or what LanceDB proposes."""
+        """A block, and which of its instances are asked: all of the scenes that meet the box, or what LanceDB
+        proposes."""
         if self._lance is None:
-            block = self._block(atlas, group, here)
-            return block, np.flatnonzero(np.array([entry.id in wanted.ids for entry in block.entries])[block.scene])
+            block = self._block(atlas, group, here, wanted.box)
+            asked = np.array([entry.id in wanted.ids for entry in block.entries], bool)
+            return block, np.flatnonzero((asked & block.meets(wanted.box))[block.scene])
         direction = load_block(atlas, here[:1]).direction(vector)
         some = None if len(here) == len(group.entries) else [entry.id for entry in here]
         proposed = self._lance.propose(group.name, direction, wanted.box, some, wanted.top)
@@ -253,10 +251,14 @@ class Collection:
         ]
         return block, np.flatnonzero(chosen)
 
-    def _block(self, atlas: Atlas, group: Group, here: list[SceneEntry]) -> Block:
-        """The arrays of some of a group's scenes, maybe with those of others."""
+    def _block(self, atlas: Atlas, group: Group, here: list[SceneEntry], box: NDArray[np.float64] | None) -> Block:
+        """The arrays of some of a group's scenes, maybe with those of others; for a box of those near it, if none are
+        kept."""
         if group.name in self._blocks:
             return self._blocks[group.name]
+        if box is not None:
+            near = atlas.within(*box)
+            here = [entry for entry in here if entry.id in near] or here[:1]
         block = load_block(atlas, atlas.side_by_side(here))
         if len(here) == len(group.entries):
             self._blocks[group.name] = block
