@@ -24,6 +24,10 @@ UNKNOWN_SPACE = "unknown"
 """Feature space of vectors whose encoder nobody named: they are compared by width alone."""
 NO_EVIDENCE = -2.0
 """Cosine of an instance without a descriptor: below every true one."""
+LENGTHS = (1e-30, 1e30)
+"""Shortest and longest length of a scene: those whose squares and ratios are numbers."""
+FARTHEST = 1e15
+"""Largest coordinate of a scene's origin, in its unit: beyond, float64 has no digits left for the points."""
 MIN_BANK = 50
 """Words that a null distribution takes at least: fewer give no standard deviation worth the name."""
 
@@ -267,8 +271,10 @@ class LabelledCloud:
             )
         for name in ("spacing", "reach"):
             value = getattr(self, name)
-            if not (np.isfinite(value) and value > 0):
-                raise OgPointcloudError(f"{name} is {value}; expected a positive length")
+            if not LENGTHS[0] <= value <= LENGTHS[1]:
+                raise OgPointcloudError(f"{name} is {value}; expected a positive length, {LENGTHS[0]} to {LENGTHS[1]}")
+        if not (np.abs(self.origin) <= FARTHEST).all():
+            raise OgPointcloudError(f"origin is {self.origin}; expected finite numbers of up to {FARTHEST:g}")
         if self.word_bank is not None:
             self.space.require(FeatureSpace(self.feature_space, self.word_bank.vectors.shape[1]), "word bank's vectors")
 

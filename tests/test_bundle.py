@@ -362,7 +362,7 @@ def say(*keys_and_value):
         (say("frame", "spacing", 0), "spacing is 0"),
         (say("frame", "reach", float("nan")), "reach is nan"),
         (say("frame", "reach", 10**400), "do not fit"),
-        (say("frame", "origin", [0, 1]), "three finite numbers"),
+        (say("frame", "origin", [0, 1]), "expected three numbers"),
         (say("frame", "origin", [0, 1, "x"]), "do not fit"),
         (say("feature_space", None), "'feature_space' is None"),
         (say("schema_version", "1"), "schema_version is '1'"),

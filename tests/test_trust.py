@@ -133,10 +133,18 @@ def test_a_manifest_is_bounded_before_it_is_read(bundle, tmp_path):
     tracemalloc.stop()
 
 
-@pytest.mark.parametrize("name", ["\ud800x", "x" * 1001])
+@pytest.mark.parametrize(
+    "frame", [{"spacing": 5e-324}, {"reach": 1e300}, {"origin": [1e30, 0, 0]}], ids=lambda frame: next(iter(frame))
+)
+def test_lengths_whose_squares_are_no_numbers(bundle, tmp_path, frame):
+    with pytest.raises(BundleError, match=r"expected (a positive length, 1e-30 to|finite numbers of up to 1e\+15)"):
+        og.load(forged(bundle, tmp_path / "s.ogpc", {}, lambda manifest: manifest["frame"].update(frame)))
+
+
+@pytest.mark.parametrize("name", ["\ud800x", "x" * 1001, "\u2028"])
 def test_names_that_are_none(bundle, tmp_path, name):
     names = json.dumps([name, *WORDS[1:]]).encode()
-    with pytest.raises(BundleError, match="expected whole ones, at most 1000"):
+    with pytest.raises(BundleError, match="expected whole ones, 1 to 1000"):
         og.load(forged(bundle, tmp_path / "s.ogpc", {"vocabulary/names.json": names}))
 
 

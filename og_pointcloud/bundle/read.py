@@ -194,8 +194,8 @@ def _cloud(manifest: dict[str, Any], members: dict[str, bytes]) -> LabelledCloud
     cameras = _array(members, CAMERAS, ("<f8",), (None, 18)) if CAMERAS in members else np.zeros((0, 18))
     try:
         origin = np.array(_field(frame, "origin", list, "frame/"), np.float64)
-        if origin.shape != (3,) or not np.isfinite(origin).all():
-            raise ValueError(f"origin is {frame['origin']}; expected three finite numbers")
+        if origin.shape != (3,):
+            raise ValueError(f"origin is {frame['origin']}; expected three numbers")
         return LabelledCloud(
             xyz=xyz,
             origin=origin,
