@@ -52,21 +52,23 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("captures", nargs="+", type=Path)
     parser.add_argument("--fit", action="store_true")
     parser.add_argument("--good", action="store_true")
-    parser.add_argument("--only", nargs="+", choices=tuple(FAULTS), default=tuple(FAULTS))
+    parser.add_argument("--pairs", action="store_true", help="two mistakes at once")
+    parser.add_argument("--only", nargs="+", choices=tuple(FAULTS))
     options = parser.parse_args(arguments)
+    names = options.only or [name for name in FAULTS if (" + " in name) == options.pairs]
     warnings.simplefilter("ignore")
     if options.good:
         false_alarms(options.captures, options.fit)
         return
     for capture in options.captures:
-        table(capture, options.only, options.fit)
+        table(capture, names, options.fit)
 
 
 def table(capture: Path, names: Sequence[str], fitted: bool) -> None:
     """A line for each fault, and how many are told, named, and cured."""
     right = judged(capture, [], True)[0] if fitted else None
     beside = "" if right is None else f", {right:.1f} as it is"
-    print(f"{capture.name}{beside}\n{'fault':<22} {'told by':<28} {'repair':<52} {'mIoU':>6} {'repaired':>9}")
+    print(f"{capture.name}{beside}\n{'fault':<33} {'told by':<28} {'repair':<52} {'mIoU':>6} {'repaired':>9}")
     faults = [name for name in names if name not in HARMLESS]
     told, named, cured = [], [], []
     for name in names:
@@ -74,7 +76,7 @@ def table(capture: Path, names: Sequence[str], fitted: bool) -> None:
             found = found_of(capture, Path(temporary) / capture.name, name, fitted)
         scores = [f"{value:6.1f}" if value is not None else " " * 6 for value in (found.score, found.repaired)]
         print(
-            f"{name:<22} {', '.join(found.doubts):<28} {' '.join(found.repairs):<52} {'    '.join(scores)}", flush=True
+            f"{name:<33} {', '.join(found.doubts):<28} {' '.join(found.repairs):<52} {'    '.join(scores)}", flush=True
         )
         if name in faults:
             told += [name] if found.doubts else []
@@ -413,6 +415,14 @@ FAULTS: dict[str, Fault] = {
     "COLMAP, free scale": colmap(scale=2.7),
     "COLMAP, large images": colmap(size=4),
 }
+PAIRS = (
+    ("OpenCV axes", "ids from 0"), ("OpenCV axes", "masks mirrored"), ("OpenCV axes", "K halved"),
+    ("OpenCV axes", "cloud in mm"), ("cloud y-up", "OpenCV axes"), ("cloud in mm", "K halved"),
+    ("poses of next frame", "K halved"), ("cloud in mm", "features shuffled"), ("masks of next image", "ids from 0"),
+    ("moved by 4 %", "ids from 0"), ("turned 5 degrees", "cx, cy swapped"), ("poses shuffled", "masks turned"),
+)  # fmt: skip
+"""Mistakes that come together."""
+FAULTS |= {f"{one} + {other}": together(FAULTS[one], FAULTS[other]) for one, other in PAIRS}
 HARMLESS = ("none", "a NaN pose", "two identity poses", "COLMAP")
 """Not faults, or such that a fit leaves out."""
 

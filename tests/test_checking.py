@@ -222,6 +222,13 @@ def test_a_small_fault_is_told_with_a_repair_that_takes_it_back(fault):
     assert doubts(mended(scene, check.repair)) == {}
 
 
+def test_a_large_shift_is_taken_back_whole():
+    found = next(check.repair for check in doubts(faulty("aligned=0.25,0,0,0,0,5,1")).values() if check.repair)
+    (repair,) = parsed(found)
+    np.testing.assert_allclose(repair.numbers[:3], [-0.25, 0, 0], atol=0.01)
+    np.testing.assert_allclose(repair.numbers[3:], [0, 0, -5, 1], atol=0.15)
+
+
 def test_swapped_principal_points_are_named():
     def swapped(cameras):
         return [replace(camera, cx=camera.cy, cy=camera.cx) for camera in cameras]

@@ -216,6 +216,7 @@ def _alignment(photographs: Photographs | None) -> Check:
     if _is_fault(change, registration.start.error):
         registration = Registration(photographs, photographs.sample.cameras, MORE_POINTS)
         name, change = _simplest(registration)
+        change = registration.refined(name, change)
         less = 1 - change.error / max(registration.start.error, 1e-9)
         if _is_fault(change, registration.start.error):
             off = f"points lie {change.shift:.1%} of the width off"

@@ -50,7 +50,7 @@ def best_conversion(evidence: Photographs | MaskMaps) -> Repairs:
     if _convinces(evidence, best):
         return best
     registration = Registration(evidence, evidence.sample.cameras, MORE_POINTS)
-    moved = registration.repair("aligned", registration.found("aligned"))
+    moved = registration.repair("aligned", registration.refined("aligned", registration.found("aligned")))
     return moved if _convinces(evidence, moved) else ()
 
 

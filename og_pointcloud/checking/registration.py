@@ -30,6 +30,8 @@ POINTS = 400
 MORE_POINTS = 700
 """Of each view, once a fault is known, for its size."""
 ROUNDS = 4
+GAIN = 0.98
+"""A search goes on from where it ended as long as that leaves less than this share of the error."""
 FEWEST_POINTS = 50
 LIMITS = np.array([0.1] * 3 + [0.1] * 3 + [0.1, 0.1, 0.05, 0.05, 0.2, 0.2])
 """Size of a small fault: radians, median depths, logarithms, shares of the image, lens terms. They are drawn to 0 on
@@ -84,9 +86,17 @@ class Registration:
         self.finest = [_with_slopes(image) for image in photographs.images]
         self.start = self._judged(np.zeros(COUNT))
 
-    def found(self, name: str) -> Small:
-        """The best change of a group's numbers; none where nothing is better."""
-        numbers, free = np.zeros(COUNT), list(GROUPS[name].free)
+    def refined(self, name: str, small: Small) -> Small:
+        """A change that was found, searched again from where it ended as long as that helps: of a large one, points
+        that the first search took for hidden say more."""
+        again = self.found(name, small)
+        return small if again.error > GAIN * small.error else self.refined(name, again)
+
+    def found(self, name: str, begin: Small | None = None) -> Small:
+        """The best change of a group's numbers about another one, else about none; that itself where nothing is
+        better."""
+        begin = begin or self.start
+        numbers, free = begin.numbers.copy(), list(GROUPS[name].free)
         for side in LEVELS:
             images = self.finest
             if side < LONGEST_PX:
@@ -98,7 +108,7 @@ class Registration:
                 if np.abs(step / LIMITS[free]).max() < 3e-3:
                     break
         judged = self._judged(numbers)
-        return judged if judged.error < self.start.error else self.start
+        return judged if judged.error < begin.error else begin
 
     def repair(self, name: str, small: Small) -> tuple[Repair, ...]:
         """The change of a group as a repair, if there is one."""
