@@ -266,6 +266,22 @@ def test_one_mask_over_every_image_is_told():
     assert "covers the whole image" in doubts(scene)["masks"].says
 
 
+@pytest.mark.parametrize("is_jpeg", [False, True])
+def test_pictures_of_ids_that_were_blended_are_told(is_jpeg):
+    def blended(view, index, views):
+        ids = (view.mask_map() + 1).astype(np.uint8)
+        if is_jpeg:  # told apart by tens, as whoever stores ids so may do
+            kept = cv2.imdecode(cv2.imencode(".jpg", np.repeat(np.repeat(10 * ids, 4, 0), 4, 1))[1], -1)[::4, ::4] // 10
+        else:
+            kept = cv2.resize(cv2.resize(ids, (144, 108)), ids.shape[::-1])
+        return np.minimum(kept, view.mask_count).astype(np.int32) - 1
+
+    scene = with_views(tiled_room(1), masks=blended)
+    check = doubts(scene)["masks"]
+    assert "an id between those of both sides" in check.says
+    assert check.repair == ""
+
+
 def test_ids_that_count_from_zero_are_named():
     scene = with_views(tiled_room(1), masks=lambda view, i, views: np.maximum(view.mask_map() - 1, -1))
     assert doubts(scene)["features"].repair == "masks=from-zero"

@@ -56,6 +56,9 @@ FEWEST_VOUCHING = 30
 MOST_BLIND = 0.7
 """Views that see nothing, of those asked, from which no part of a larger map explains it."""
 MOST_UNSHOWN, MOST_ZERO, WHOLE_IMAGE = 0.3, 0.5, 0.95
+MOST_BLENDED = 0.02
+"""Share of mask borders, in half of the views, with an id between those of both sides: 0.005 at most in right captures,
+0.03 to 0.07 in masks that were stored with losses, 0.2 and more in those that were interpolated."""
 NEARLY_ALL, MOST_UNOBSERVED = 0.95, 0.5
 LEAST_COSINE = 2.5
 """Standard deviations of random directions' cosines: the best word of an instance lies farther out where both share a
@@ -247,6 +250,12 @@ def _masks(maps: MaskMaps, *, is_doubted: bool) -> Check:
     whole = sum(np.bincount(ids.reshape(-1))[1:].max(initial=0) > WHOLE_IMAGE * ids.size for ids in maps.ids)
     if whole > len(maps.ids) / 2:
         says = f"one mask covers the whole image in {whole} of {len(maps.ids)} views: make masks of things"
+        return Check("masks", "doubt", says)
+    if (blended := float(np.median(maps.blended))) > MOST_BLENDED:
+        says = (
+            f"{blended:.0%} of the borders hold an id between those of both sides: masks were resized with "
+            "interpolation, or stored with losses; expected ids as they were given: nearest neighbour, PNG"
+        )
         return Check("masks", "doubt", says)
     if is_doubted:
         return Check("masks", "unchecked", "poses come first")

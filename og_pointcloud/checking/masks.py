@@ -46,12 +46,14 @@ FEWEST_POINTS = 15
 @dataclass(frozen=True)
 class MaskMaps:
     """sample: of the scene. ids: (H, W) integers a view, at most LONGEST_PX long, 0 outside of all masks, else row + 1.
-    features: (masks, D) unit rows a view. shown: (masks,) bool a view, whether any pixel shows the row."""
+    features: (masks, D) unit rows a view. shown: (masks,) bool a view, whether any pixel shows the row. blended: the
+    share of a view's borders in whose middle lies an id between those of both sides."""
 
     sample: Sample
     ids: list[Ids]
     features: list[NDArray[np.floating]]
     shown: list[NDArray[np.bool_]]
+    blended: list[float]
 
     def fit(self, cameras: Sequence[Camera]) -> Comparison:
         """How much more masks say of each other where these cameras see the same points than elsewhere."""
@@ -81,7 +83,7 @@ class MaskMaps:
         """Of fewer points and of a few views that lie together, for what is asked often."""
         few = slice(FEW_VIEWS)
         sample = self.sample.thinned(FEW_POINTS).of_views(range(len(self.ids))[few])
-        return MaskMaps(sample, self.ids[few], self.features[few], self.shown[few])
+        return MaskMaps(sample, self.ids[few], self.features[few], self.shown[few], self.blended[few])
 
     def _pairs(self, cameras: Sequence[Camera]) -> Iterator[tuple[int, int, Places, Places]]:
         """Every ordered pair of views that share enough points, and where each sees these."""
@@ -109,13 +111,25 @@ class MaskMaps:
 
 def read_mask_maps(sample: Sample) -> MaskMaps:
     """The masks of the sample's views. Raises SceneError where they cannot be read."""
-    ids, shown = [], []
+    ids, shown, blended = [], [], []
     for view in sample.views:
         map_ = np.maximum(view.mask_map(), -1) + 1  # what a lens did not see is in no mask
         shown.append(np.bincount(map_.reshape(-1), minlength=view.mask_count + 1)[1:] > 0)
+        blended.append(_blended(map_))
         step = max(1, max(map_.shape) // LONGEST_PX)
         ids.append(map_[step // 2 :: step, step // 2 :: step].astype(np.int64))
-    return MaskMaps(sample.thinned(POINTS), ids, [unit_rows(view.mask_features) for view in sample.views], shown)
+    features = [unit_rows(view.mask_features) for view in sample.views]
+    return MaskMaps(sample.thinned(POINTS), ids, features, shown, blended)
+
+
+def _blended(ids: Ids) -> float:
+    """Along some rows, of steps from one id to another those to one between it and the next pixel's: a picture of ids
+    that was resized, or stored with losses, has them at its borders; where masks leave a gap, or touch, there are none.
+    """
+    rows = ids[:: max(1, len(ids) // LONGEST_PX)]
+    left, middle, right = rows[:, :-2], rows[:, 1:-1], rows[:, 2:]
+    between = ((left < middle) & (middle < right)) | ((left > middle) & (middle > right))
+    return float(between.sum() / max((left != middle).sum(), 1))
 
 
 def entropies(a: Ids, b: Ids) -> tuple[float, float, float]:
