@@ -579,6 +579,30 @@ def test_an_error_nobody_foresaw_is_one_line(bundle, capsys, monkeypatch):
         main(["--debug", "segment", str(bundle)])
 
 
+WATCHED = """
+import sys
+def watch(event, arguments):
+    if event.split(".")[0] in ("socket", "subprocess") or event in ("os.system", "os.exec", "os.posix_spawn"):
+        if event not in ("socket.__new__", "socket.gethostname"):
+            raise SystemExit(f"{event} {arguments}")
+sys.addaudithook(watch)
+from og_pointcloud.cli import main
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+@pytest.mark.slow
+def test_commands_open_no_connection_and_run_no_program(tiny_capture, tmp_path):
+    scene = tmp_path / "s.ogpc"
+    for command in (
+        f"fit {tiny_capture.folder} -o {scene}", f"info {scene}", f"instances {scene}",
+        f"segment {scene} -o {tmp_path}/s.ply", f"view {scene} --html {tmp_path}/s.html",
+        f"index {tmp_path} -o {tmp_path}/atlas", "models",
+    ):  # fmt: skip
+        ran = subprocess.run([sys.executable, "-c", WATCHED, *command.split()], capture_output=True, text=True)
+        assert ran.returncode == 0, (command, ran.stderr)
+
+
 # Streams --------------------------------------------------------------------------------------------------------------
 
 
