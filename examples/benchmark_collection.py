@@ -4,6 +4,7 @@
     python examples/benchmark_collection.py --descriptors 0     # only the files
     python examples/benchmark_collection.py --files 0 --in-memory   # the search alone, of arrays that were never a file
     python examples/benchmark_collection.py --files 0 --lance   # LanceDB beside the exact search, recall at 10
+    python examples/benchmark_collection.py --captures CAPTURE...   # the right scene first?
 
 Descriptors are drawn about the vectors of made-up words, as an encoder's would be: near a word, with what all images
 share and noise. Every figure that is printed is of this run.
@@ -60,7 +61,14 @@ def main() -> None:
     parser.add_argument("--a-scene", type=int, default=100, help="instances a scene")
     parser.add_argument("--in-memory", action="store_true", help="time the search alone, without an atlas")
     parser.add_argument("--lance", action="store_true", help="also LanceDB (extra 'lance')")
+    parser.add_argument(
+        "--captures", nargs="+", type=Path, help="folders with gt.npz: fit them and ask for their words"
+    )
+    parser.add_argument("--fitted", type=Path, default=Path("fitted"), help="where these are, or will be, fitted to")
     arguments = parser.parse_args()
+    if arguments.captures:
+        right_scenes(arguments.captures, arguments.fitted)
+        return
     encoder = MadeEncoder(arguments.width, np.random.default_rng(0))
     with tempfile.TemporaryDirectory(dir=os.environ.get("TMPDIR", "/var/tmp")) as folder:
         if arguments.files:
@@ -215,6 +223,27 @@ def search(descriptors: int, instances: int, encoder: MadeEncoder) -> None:
             f"CPU median {middle[1]:.3f} s, least {least[1]:.3f} s"
         )
     print(f"peak memory {peak_memory() / 1e9:.2f} GB")
+
+
+def right_scenes(captures: list[Path], fitted: Path) -> None:
+    """Ask all captures for each word of which one has 30 points or more: does such a one come first?"""
+    fits = og.fit_many(captures, fitted)
+    assert all(fit.state != "failed" for fit in fits), [fit.cause for fit in fits]
+    collection = og.Collection.index(fitted, fitted.with_suffix(".atlas"), progress=False)
+    where: dict[str, set[str]] = {}
+    for capture in captures:
+        truth = np.load(capture / "gt.npz")
+        counts = np.bincount(truth["cls"][truth["cls"] >= 0], minlength=len(truth["names"]))
+        for cls in np.flatnonzero(counts >= 30):
+            where.setdefault(str(truth["names"][cls]), set()).add(capture.name)
+    asked = [word for word in where if word in collection.words]
+    wrong = {word: best for word in asked if (best := collection.find(word, top=1)[0]).scene not in where[word]}
+    print(
+        f"{len(captures)} captures, {len(where)} words, {len(asked)} with a vector: the right scene first for all but"
+    )
+    for word, best in wrong.items():
+        print(f"  '{word}' of {', '.join(sorted(where[word]))}: {best.scene} with {best.score:.2f}")
+    print(f"{len(wrong)}")
 
 
 def write_atlas(path: Path, descriptors: int, instances: int, encoder: MadeEncoder) -> None:

@@ -368,19 +368,25 @@ def test_pictures_show_the_thing(tmp_path):
 
 
 @pytest.mark.slow
-def test_lance_proposes_what_the_exact_search_finds(folder, tmp_path, capsys):
+def test_lance_proposes_what_the_exact_search_finds(folder, tmp_path, capsys, monkeypatch):
     pytest.importorskip("lancedb", reason="needs the extra 'lance': lancedb")
     clouds = many(9, bank=BANK, noise=0.5) | {"cosines": scene(["bed", "rug"], 8, space="another/encoder")}
     exact = indexed(folder, clouds)
     uri, atlas = str(tmp_path / "lance"), str(folder.parent / "atlas")
     assert main(["index", str(folder), "-o", atlas, "--lance", uri]) == 0
     proposed = og.Collection(atlas, lance=uri)
+    monkeypatch.setattr("og_pointcloud.collection.collection.FEW_SCENES", 0)
     box = ([1.5, -1, -1], [9, 1, 1])
     for options in ({}, {"within": box}, {"scenes": "site1/*"}, {"within": ([50, 50, 50], [51, 51, 51])}):
         for word in THINGS:
             expected, found = (c.find(word, top=5, **options) for c in (exact, proposed))
             assert [(f.scene, f.instance) for f in found] == [(f.scene, f.instance) for f in expected]
             assert [f.score for f in found] == pytest.approx([f.score for f in expected], abs=1e-6)
+    monkeypatch.undo()
+    monkeypatch.setattr("og_pointcloud.collection.lance.LanceTables.propose", None)  # a few scenes are asked exactly
+    some = [found.find("bed", top=5, scenes="site1/*") for found in (exact, proposed)]
+    assert [(f.scene, f.instance) for f in some[0]] == [(f.scene, f.instance) for f in some[1]]
+    monkeypatch.undo()
     capsys.readouterr()
     assert main(["find", atlas, "bed", "--lance", uri, "--json", "--top", "1"]) == 0
     assert len(json.loads(capsys.readouterr().out)) == 1

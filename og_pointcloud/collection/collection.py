@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from og_pointcloud.bundle.vocabulary import carried_encoder
 from og_pointcloud.cloud import Vocabulary, unit_rows
 from og_pointcloud.collection.index import Changes, Family, Group, families, index
-from og_pointcloud.collection.lance import LanceTables
+from og_pointcloud.collection.lance import FEW_SCENES, LanceTables
 from og_pointcloud.collection.scoring import Block, load_block, share
 from og_pointcloud.collection.store import Atlas, SceneEntry
 from og_pointcloud.errors import OgPointcloudError, did_you_mean
@@ -236,33 +236,35 @@ class Collection:
         self, atlas: Atlas, group: Group, here: list[SceneEntry], wanted: _Wanted, vector: NDArray[np.float32]
     ) -> tuple[Block, NDArray[np.intp]]:
         """A block, and which of its instances are asked: all of the scenes that meet the box, or what LanceDB
-        proposes."""
-        if self._lance is None:
-            block = self._block(atlas, group, here, wanted.box)
-            asked = np.array([entry.id in wanted.ids for entry in block.entries], bool)
-            return block, np.flatnonzero((asked & block.meets(wanted.box))[block.scene])
-        direction = load_block(atlas, here[:1]).direction(vector)
-        some = None if len(here) == len(group.entries) else [entry.id for entry in here]
-        proposed = self._lance.propose(group.name, direction, wanted.box, some, wanted.top)
-        block = load_block(atlas, [entry for entry in here if entry.id in proposed] or here[:1])
+        proposes. All scenes are read once and kept, some of them each time."""
+        block = self._blocks.get(group.name)
+        if block is None:
+            ids = {entry.id for entry in here} if wanted.box is None else atlas.within(*wanted.box)
+            near = [entry for entry in here if entry.id in ids]
+            is_all = len(near) == len(group.entries)
+            if self._lance is not None and (is_all or len(near) > FEW_SCENES):
+                return self._proposed(atlas, group, near, wanted, vector)
+            block = load_block(atlas, atlas.side_by_side(near or here[:1]))
+            if is_all:
+                self._blocks[group.name] = block
+        asked = np.array([entry.id in wanted.ids for entry in block.entries], bool)
+        return block, np.flatnonzero((asked & block.meets(wanted.box))[block.scene])
+
+    def _proposed(
+        self, atlas: Atlas, group: Group, near: list[SceneEntry], wanted: _Wanted, vector: NDArray[np.float32]
+    ) -> tuple[Block, NDArray[np.intp]]:
+        """What LanceDB proposes of these scenes, read from the atlas."""
+        assert self._lance is not None
+        direction = load_block(atlas, near[:1]).direction(vector)
+        every = all(entry.id in wanted.ids for entry in group.entries)  # then the box says it all
+        some, part = None if every else [entry.id for entry in near], len(near) / len(group.entries)
+        proposed = self._lance.propose(group.name, direction, wanted.box, some, wanted.top, part)
+        block = load_block(atlas, [entry for entry in near if entry.id in proposed] or near[:1])
         chosen = [
             instance in proposed.get(block.entries[scene].id, ())
             for scene, instance in zip(block.scene.tolist(), block.instance.tolist(), strict=True)
         ]
         return block, np.flatnonzero(chosen)
-
-    def _block(self, atlas: Atlas, group: Group, here: list[SceneEntry], box: NDArray[np.float64] | None) -> Block:
-        """The arrays of some of a group's scenes, maybe with those of others; for a box of those near it, if none are
-        kept."""
-        if group.name in self._blocks:
-            return self._blocks[group.name]
-        if box is not None:
-            near = atlas.within(*box)
-            here = [entry for entry in here if entry.id in near] or here[:1]
-        block = load_block(atlas, atlas.side_by_side(here))
-        if len(here) == len(group.entries):
-            self._blocks[group.name] = block
-        return block
 
 
 @dataclass(frozen=True)

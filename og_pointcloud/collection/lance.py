@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
+from math import ceil
 from typing import Any
 
 import numpy as np
@@ -20,12 +21,13 @@ from og_pointcloud.collection.scoring import Block, load_block
 from og_pointcloud.collection.store import Atlas
 from og_pointcloud.errors import MissingExtraError, OgPointcloudError
 
-__all__ = ["LanceTables", "write_lance"]
+__all__ = ["FEW_SCENES", "LanceTables", "write_lance"]
 
 INDEXED_FROM = 50_000
 """Rows from which a table has an index; fewer are all looked at."""
 ROWS_A_PARTITION = 4_000
-SCENES_AT_ONCE = 200
+SCENES_AT_ONCE = FEW_SCENES = 200
+"""So many are written at once; so few are asked of the atlas, exactly: their rows lie in all partitions."""
 PROPOSED = 50
 """Rows that are asked for, for each that is wanted: a row's rank by evidence is not yet its rank by probability."""
 PROBES, REFINE = 64, 8
@@ -88,9 +90,12 @@ class LanceTables:
         box: NDArray[np.float64] | None,
         scenes: Sequence[int] | None,
         top: int,
+        share: float = 1.0,
     ) -> dict[int, set[int]]:
         """Scene id -> instances with the descriptors of most evidence for a direction (D,). name: of the group. box:
-        (2, 3) corners that hold the instances' middles. scenes: ids of those that are asked; None for all."""
+        (2, 3) corners that hold the instances' middles. scenes: ids of those that are asked; None for all. share: of
+        the rows that box and scenes leave, about: the best of fewer rows lie in more partitions.
+        """
         try:
             table = self._database.open_table(name)
         except (ValueError, FileNotFoundError) as error:
@@ -99,7 +104,7 @@ class LanceTables:
                 "again with og-pointcloud index --lance"
             ) from None
         query = table.search(np.append(direction, np.float32(1)), vector_column_name="vector").distance_type("dot")
-        query = query.nprobes(PROBES).refine_factor(REFINE).limit(PROPOSED * top)
+        query = query.nprobes(ceil(PROBES / share)).refine_factor(REFINE).limit(PROPOSED * top)
         conditions = [] if scenes is None else [f"scene IN ({', '.join(map(str, scenes))})"]
         if box is not None:
             corners = zip("xyz", *box.tolist(), strict=True)

@@ -28,6 +28,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -155,20 +156,13 @@ def repaired_layers(layers: Sequence[MaskLayer], repairs: Sequence[Repair]) -> l
             by = MASK_SHIFTS[value] % len(repaired)
             repaired = repaired[by:] + repaired[:by]
         else:
-            repaired = [replace(layer, read=_ReadRepaired(layer.read, value)) for layer in repaired]
+            repaired = [replace(layer, read=partial(_read_repaired, layer.read, value)) for layer in repaired]
     return repaired
 
 
-@dataclass(frozen=True)
-class _ReadRepaired:
-    read: Callable[[], NDArray[np.int32]]
-    value: str
-
-    def __call__(self) -> NDArray[np.int32]:
-        ids = self.read()
-        if self.value == "from-zero":
-            return np.where(ids < 0, ids, ids + 1)
-        return np.ascontiguousarray(MASK_FLIPS[self.value](ids))
+def _read_repaired(read: Callable[[], NDArray[np.int32]], value: str) -> NDArray[np.int32]:
+    ids = read()
+    return np.where(ids < 0, ids, ids + 1) if value == "from-zero" else np.ascontiguousarray(MASK_FLIPS[value](ids))
 
 
 def rotation_of_vector(radians: NDArray[np.floating]) -> Doubles:
