@@ -182,23 +182,23 @@ def share(logit: NDArray[np.float64]) -> NDArray[np.float64]:
 def load_block(atlas: Atlas, entries: Sequence[SceneEntry]) -> Block:
     """Scenes of an atlas with one kin and judge; their arrays lie behind each other."""
     parts: list[dict[str, NDArray[Any]]] = []
+    width = entries[0].width
+    vectors = np.empty((sum(entry.numbers for entry in entries) // width, width), np.float32)
     end, sharpness = 0, []
     for number, entry in enumerate(entries):
         table, boxes = atlas.instances(entry)
-        vectors, owner, shift = (
-            table.descriptors,
-            table.descriptor_instance,
-            np.zeros(len(table.descriptors), np.float32),
-        )
+        owner = table.descriptor_instance
+        shown = np.flatnonzero(table.points[owner] > 0)
+        rows, shift = table.descriptors[shown], np.zeros(len(shown), np.float32)
         if entry.judge is not None:
             standard = atlas.judgement(entry, len(owner))
-            vectors, shift = standard.scale[:, None] * (vectors - standard.common), standard.shift
+            rows, shift = standard.scale[shown, None] * (rows - standard.common), standard.shift[shown]
             sharpness.append(standard.sharpness)
-        shown = np.flatnonzero(table.points[owner] > 0)
+        vectors[end : end + len(shown)] = rows
         instance, first = np.unique(owner[shown], return_index=True)
         low, high = boxes[instance, 0], boxes[instance, 1]
         parts.append({
-            "vectors": vectors[shown], "shift": shift[shown], "bounds": end + first, "instance": instance,
+            "shift": shift, "bounds": end + first, "instance": instance,
             "scene": np.full(len(instance), number, np.int32), "points": table.points[instance],
             "center": (low + high) / 2, "size": high - low,
         })  # fmt: skip
@@ -206,4 +206,4 @@ def load_block(atlas: Atlas, entries: Sequence[SceneEntry]) -> Block:
     columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     columns["bounds"] = np.append(columns["bounds"], end)
     bank = atlas.bank(judge, entries[0].width) if (judge := entries[0].judge) else None
-    return Block(tuple(entries), bank=bank, sharpness=np.array(sharpness), **columns)
+    return Block(tuple(entries), vectors[:end], bank=bank, sharpness=np.array(sharpness), **columns)

@@ -45,7 +45,7 @@ SCHEMA = (
 )
 ENTRY = (
     "id, CAST(name AS TEXT), CAST(digest AS TEXT), CAST(feature_space AS TEXT), bytes, modified, "
-    "max(0, CAST(width AS INTEGER)), encoder, vocabulary, bank, judge, length(instances)"
+    "max(0, CAST(width AS INTEGER)), encoder, vocabulary, bank, judge, length(instances), length(descriptors)"
 )
 """What makes a `SceneEntry`; cast, since SQLite holds no column to its type."""
 EVIDENCE = np.dtype([
@@ -64,7 +64,7 @@ class SceneEntry:
 
     digest, bytes, modified: of the file. feature_space, width: of its descriptors. encoder: 1 where the file carries a
     text encoder. vocabulary, bank: digests in `words`, None without. judge: digest of the bank by which its instances
-    are judged, None without.
+    are judged, None without. instances, numbers: how many, and how many numbers their descriptors are.
     """
 
     id: int
@@ -79,6 +79,7 @@ class SceneEntry:
     bank: str | None = None
     judge: str | None = None
     instances: int = 0
+    numbers: int = 0
 
 
 class Atlas:
@@ -155,7 +156,7 @@ class Atlas:
     def entries(self) -> list[SceneEntry]:
         """All scenes, by name."""
         rows = self._run(f"SELECT {ENTRY} FROM scenes LEFT JOIN judgements ON scene = id ORDER BY name")
-        return [SceneEntry(*row, instances=size // EVIDENCE.itemsize) for *row, size in rows]
+        return [SceneEntry(*row, size // EVIDENCE.itemsize, numbers // 4) for *row, size, numbers in rows]
 
     def instances(self, entry: SceneEntry) -> tuple[InstanceTable, NDArray[np.float64]]:
         """The instances of a scene, with unit descriptors, and (K, 2, 3) low and high corners of their boxes."""
@@ -228,7 +229,7 @@ class Atlas:
         for name in EVIDENCE.names or ():
             rows[name] = boxes if name == "box" else getattr(table, name)
         blobs = (rows.tobytes(), table.descriptor_instance.tobytes(), table.descriptors.tobytes())
-        values = (None, *astuple(entry)[1:-2], *blobs)
+        values = (None, *astuple(entry)[1:-3], *blobs)
         id = self._run(f"INSERT INTO scenes VALUES ({', '.join('?' * len(values))})", values).lastrowid
         if (shown := table.points > 0).any():
             corners = np.stack([boxes[shown, 0].min(axis=0), boxes[shown, 1].max(axis=0)], axis=1)
