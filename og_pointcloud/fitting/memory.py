@@ -113,7 +113,7 @@ def scratch_array(size: int, dtype: DTypeLike) -> NDArray[Any]:
             _reserve(file.fileno(), size * dtype.itemsize)
         except OSError as error:
             raise OgPointcloudError(
-                f"no room for {size * dtype.itemsize / 1e9:.1f} GB in '{tempfile.gettempdir()}' or '{scratch_root()}' "
+                f"no room for {size * dtype.itemsize / 1e9:.1f} GB in '{scratch_root() or tempfile.gettempdir()}' "
                 f"({error.strerror}): set TMPDIR to a folder on a larger disk, or give the fit more memory"
             ) from error
         return np.asarray(np.memmap(file, dtype, "r+", shape=(size,)))  # the map outlives the file object
