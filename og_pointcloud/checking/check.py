@@ -57,8 +57,8 @@ MOST_BLIND = 0.7
 """Views that see nothing, of those asked, from which no part of a larger map explains it."""
 MOST_UNSHOWN, MOST_ZERO, WHOLE_IMAGE = 0.3, 0.5, 0.95
 MOST_BLENDED = 0.02
-"""Share of mask borders, in half of the views, with an id between those of both sides: 0.005 at most in right captures,
-0.03 to 0.07 in masks that were stored with losses, 0.2 and more in those that were interpolated."""
+"""Share of mask borders, in half of the views, with an id between those of both sides: 0 in right captures, whose views
+have none beyond chance, 0.03 to 0.08 in masks that were stored with losses, 0.18 and more in interpolated ones."""
 NEARLY_ALL, MOST_UNOBSERVED = 0.95, 0.5
 LEAST_COSINE = 2.5
 """Standard deviations of random directions' cosines: the best word of an instance lies farther out where both share a

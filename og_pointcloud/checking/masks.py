@@ -41,6 +41,8 @@ LEAST_ENTROPY = 0.05
 SAME_IOU = 0.5
 """Masks of two views show the same where they share more than this of their points, and are each other's best."""
 FEWEST_POINTS = 15
+CHANCE = 0.5
+"""A third, and some room."""
 
 
 @dataclass(frozen=True)
@@ -125,11 +127,15 @@ def read_mask_maps(sample: Sample) -> MaskMaps:
 def _blended(ids: Ids) -> float:
     """Along some rows, of steps from one id to another those to one between it and the next pixel's: a picture of ids
     that was resized, or stored with losses, has them at its borders; where masks leave a gap, or touch, there are none.
+    0 for no more than chance gives: of masks some pixels wide one in so many is of one pixel, and a third of ids lies
+    between two others.
     """
     rows = ids[:: max(1, len(ids) // LONGEST_PX)]
     left, middle, right = rows[:, :-2], rows[:, 1:-1], rows[:, 2:]
     between = ((left < middle) & (middle < right)) | ((left > middle) & (middle > right))
-    return float(between.sum() / max((left != middle).sum(), 1))
+    steps = max(int((left != middle).sum()), 1)
+    share = float(between.sum() / steps)
+    return share if share > CHANCE * steps / max(middle.size, 1) else 0.0
 
 
 def entropies(a: Ids, b: Ids) -> tuple[float, float, float]:
