@@ -30,8 +30,8 @@ POINTS = 400
 MORE_POINTS = 700
 """Of each view, once a fault is known, for its size."""
 ROUNDS = 4
-GAIN = 0.98
-"""A search goes on from where it ended as long as that leaves less than this share of the error."""
+GAIN = 0.01
+"""A search goes on from where it ended as long as that takes more than this share of the error without a change."""
 FEWEST_POINTS = 50
 LIMITS = np.array([0.1] * 3 + [0.1] * 3 + [0.1, 0.1, 0.05, 0.05, 0.2, 0.2])
 """Size of a small fault: radians, median depths, logarithms, shares of the image, lens terms. They are drawn to 0 on
@@ -90,7 +90,7 @@ class Registration:
         """A change that was found, searched again from where it ended as long as that helps: of a large one, points
         that the first search took for hidden say more."""
         again = self.found(name, small)
-        return small if again.error > GAIN * small.error else self.refined(name, again)
+        return self.refined(name, again) if small.error - again.error > GAIN * self.start.error else again
 
     def found(self, name: str, begin: Small | None = None) -> Small:
         """The best change of a group's numbers about another one, else about none; that itself where nothing is
