@@ -144,7 +144,7 @@ def test_lengths_whose_squares_are_no_numbers(bundle, tmp_path, frame):
 @pytest.mark.parametrize("name", ["\ud800x", "x" * 1001, "\u2028"])
 def test_names_that_are_none(bundle, tmp_path, name):
     names = json.dumps([name, *WORDS[1:]]).encode()
-    with pytest.raises(BundleError, match="expected whole ones, 1 to 1000"):
+    with pytest.raises(BundleError, match=r"expected whole ones, at most 1000|is not a list of 5 different words"):
         og.load(forged(bundle, tmp_path / "s.ogpc", {"vocabulary/names.json": names}))
 
 

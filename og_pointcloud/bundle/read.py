@@ -265,8 +265,8 @@ def _vocabulary(manifest: dict[str, Any], members: dict[str, bytes]) -> Vocabula
         return None
     names = _json(members, "vocabulary/names.json", MAX_NAMES_BYTES)
     words = _field(_field(manifest, "counts", dict), "words", int, "counts/")
-    unique = isinstance(names, list) and all(isinstance(name, str) for name in names) and len(set(names)) == len(names)
-    if not unique or len(names) != words:
+    are_words = isinstance(names, list) and all(isinstance(name, str) and name.strip() for name in names)
+    if not are_words or len(set(names)) != len(names) or len(names) != words:
         raise _Refused(f"vocabulary/names.json is not a list of {words} different words: {REBUILD}")
     try:
         check_names(names)

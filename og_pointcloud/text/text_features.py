@@ -68,11 +68,11 @@ def read_text_features(path: str | os.PathLike[str]) -> tuple[Vocabulary, str]:
 
 
 def check_names(names: Sequence[str]) -> None:
-    """OgPointcloudError for a name in a file that is longer than any word, blank, or holds half a character."""
+    """OgPointcloudError for a name in a file that is longer than any word, or holds half a character."""
     for name in names:
-        if not name.strip() or len(name) > LONGEST_NAME or any("\ud800" <= sign <= "\udfff" for sign in name):
+        if len(name) > LONGEST_NAME or any("\ud800" <= sign <= "\udfff" for sign in name):
             raise OgPointcloudError(
-                f"the name {name!r:.60} has {len(name)} characters; expected whole ones, 1 to {LONGEST_NAME} that show"
+                f"the name {name!r:.60} has {len(name)} characters; expected whole ones, at most {LONGEST_NAME}"
             )
 
 
