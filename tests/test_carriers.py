@@ -352,6 +352,49 @@ def test_glb_of_splats_adds_their_shape(tmp_path):
         segmentation([0] * 39, ["a"], points.xyz_world[:39]).save(tmp_path / "out.glb", points)
 
 
+FLOAT, BYTE, UNSIGNED_BYTE, SHORT, UNSIGNED_SHORT = 5126, 5120, 5121, 5122, 5123
+SPLAT_ATTRIBUTES = {
+    "ROTATION": ("VEC4", {(FLOAT, False), (BYTE, True), (SHORT, True)}),
+    "SCALE": ("VEC3", {(FLOAT, False), *itertools.product((UNSIGNED_BYTE, UNSIGNED_SHORT), (False, True))}),
+    "OPACITY": ("SCALAR", {(FLOAT, False), (UNSIGNED_BYTE, True), (UNSIGNED_SHORT, True)}),
+    "SH_DEGREE_0_COEF_0": ("VEC3", {(FLOAT, False)}),
+}
+SPLAT_PROPERTIES = {
+    "kernel": {"ellipse"}, "colorSpace": {"srgb_rec709_display", "lin_rec709_display"}, "projection": {"perspective"},
+    "sortingMethod": {"cameraDistance"},
+}  # fmt: skip
+"""What KHR_gaussian_splatting demands of the ellipse kernel, as its text and schema have it; the first two of the
+properties are required."""
+
+
+@pytest.mark.parametrize("count", [1, 40])
+def test_glb_of_splats_is_what_the_extensions_text_demands(tmp_path, count):
+    from test_formats_spz import splats
+
+    points = splats(count, center=(3, -4, 5))
+    result = segmentation(np.arange(count) % 4 - 1, ["a", "b", "c"], points.xyz_world)
+    document, arrays = parsed(result.save(tmp_path / "out.glb", points))
+    primitive = document["meshes"][0]["primitives"][0]
+    stated = primitive["extensions"]["KHR_gaussian_splatting"]
+    assert {"kernel", "colorSpace"} <= set(stated) <= set(SPLAT_PROPERTIES)
+    assert all(value in SPLAT_PROPERTIES[name] for name, value in stated.items())
+    assert "KHR_gaussian_splatting" in document["extensionsUsed"]
+    assert primitive["mode"] == 0
+    assert "extensionsRequired" not in document, "COLOR_0 shows points where splats are not known"
+    prefix = "KHR_gaussian_splatting:"
+    given = {name.removeprefix(prefix) for name in primitive["attributes"] if name.startswith(prefix)}
+    assert given == set(SPLAT_ATTRIBUTES), "no degree of harmonics but the first, which would have to be whole"
+    for name, (kind, components) in SPLAT_ATTRIBUTES.items():
+        accessor = document["accessors"][primitive["attributes"][prefix + name]]
+        assert (accessor["type"], accessor["count"]) == (kind, count)
+        assert (accessor["componentType"], accessor.get("normalized", False)) in components
+    assert (arrays[prefix + "SCALE"] >= 0).all()
+    assert ((arrays[prefix + "OPACITY"] >= 0) & (arrays[prefix + "OPACITY"] <= 1)).all()
+    assert np.abs(np.linalg.norm(arrays[prefix + "ROTATION"], axis=1) - 1).max() < 1e-5
+    alpha = arrays["COLOR_0"][:, 3] / 65535
+    assert np.abs(alpha - arrays[prefix + "OPACITY"][:, 0]).max() < 1e-5, "what is behind shows through fallbacks too"
+
+
 def test_spz_holds_splats_in_the_colors_of_their_labels(tmp_path):
     from test_formats_spz import splats
 

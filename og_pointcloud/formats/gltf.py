@@ -67,6 +67,7 @@ def write_gltf(
         if len(xyz_world) == 0:
             raise SceneError("0 points; expected at least one: glTF has no empty clouds")
         require_finite(xyz_world, LABEL_FINITE)
+        of_splats = {} if splats is None else _splat_columns(splats, rgb)
         origin = np.median(np.asarray(xyz_world, np.float64), axis=0)
         instances = attributes["og_instance"]
         features = {
@@ -75,14 +76,14 @@ def write_gltf(
         }
         columns = {
             "POSITION": (xyz_world - origin).astype(np.float32),
-            "COLOR_0": _linear_colors(rgb),
+            "COLOR_0": _linear_colors(rgb, splats),
             **{
                 f"_FEATURE_ID_{index}": np.where(ids >= 0, ids, none).astype(np.float32)
                 for index, (ids, none) in enumerate(features.values())
             },
             "_OG_SCORE": attributes["og_score"].astype(np.float32),
             "_OG_REASON": attributes["og_reason"].astype(np.float32),
-            **({} if splats is None else _splat_columns(splats, rgb)),
+            **of_splats,
         }
         feature_sets = [
             # featureCount: at least 1, as the schema has it
@@ -115,12 +116,13 @@ def _splat_columns(splats: Points, rgb: NDArray[np.uint8]) -> dict[str, NDArray[
     return {f"{SPLATS}:{name}": column for name, column in columns.items()}
 
 
-def _linear_colors(rgb: NDArray[np.uint8]) -> NDArray[np.uint16]:
-    """(n, 4) sRGB -> linear, opaque. 16 bits, since 8 linear ones would lose the dark colours."""
+def _linear_colors(rgb: NDArray[np.uint8], splats: Points | None) -> NDArray[np.uint16]:
+    """(n, 4) sRGB -> linear, opaque, or as the splats are. 16 bits, since 8 linear ones would lose the dark colours."""
     share = np.arange(256) / 255
     linear = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
     table = np.rint(linear * 65535).astype(np.uint16)
-    return np.column_stack([table[rgb], np.full(len(rgb), 65535, np.uint16)])
+    opacity = np.ones(len(rgb)) if splats is None or splats.opacity is None else splats.opacity
+    return np.column_stack([table[rgb], np.rint(65535 * opacity).astype(np.uint16)])
 
 
 def _document(
