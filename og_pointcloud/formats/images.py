@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import os
 import posixpath
+import struct
 from pathlib import Path, PurePosixPath
 from types import ModuleType
 from typing import BinaryIO, NamedTuple
@@ -34,8 +35,8 @@ IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".PNG", ".JPEG", ".webp", ".t
 IMAGE_FOLDERS = ("images", "images_2", "images_4", "images_8", "color", "rgb", "dslr/resized_images")
 MAX_PIXELS = 1 << 27
 """Larger images are refused before anything is allocated."""
-HEADERS = ("PNG", "JPEG", "BMP", "WEBP", "TIFF")
-"""Formats whose headers are read for an image's size; others are decoded for it."""
+MOST_SEGMENTS = 1000
+"""Within which a JPEG says how large it is."""
 
 
 class PngHeader(NamedTuple):
@@ -93,10 +94,13 @@ def png_header(file: Path) -> PngHeader | None:
 
 def image_size(file: Path) -> tuple[int, int]:
     """(width, height) of an image file, as its header states it. SceneError beyond MAX_PIXELS."""
-    if size := _stated_size(file, file):
-        return size
-    height, width = decoded(file, require_cv2().IMREAD_GRAYSCALE).shape[:2]  # of a kind that is not known here
-    return width, height
+    with file.open("rb") as stream:
+        size = _stated_size(stream)
+    if size is None:  # of a kind that is not known here
+        height, width = decoded(file, require_cv2().IMREAD_GRAYSCALE).shape[:2]
+        return width, height
+    _check_pixels(file, *size)
+    return size
 
 
 def _check_pixels(file: Path, width: int, height: int) -> None:
@@ -104,28 +108,70 @@ def _check_pixels(file: Path, width: int, height: int) -> None:
         raise SceneError(f"{file} says it is {width}x{height} pixels; expected at most {MAX_PIXELS} pixels")
 
 
-def _stated_size(file: Path, data: Path | BinaryIO) -> tuple[int, int] | None:
-    """(width, height) as the header states it; None where it is no image that Pillow knows. data: of the file."""
-    try:
-        from PIL import Image
-    except ImportError as error:
-        raise MissingExtraError("Pillow", "fit") from error
-    try:
-        with Image.open(data, formats=HEADERS) as image:
-            size = image.size
-    except Image.DecompressionBombError as error:
-        raise SceneError(f"{file} cannot be used ({error}); expected at most {MAX_PIXELS} pixels") from None
-    except Exception:  # of as many kinds as there are formats
+def _stated_size(stream: BinaryIO) -> tuple[int, int] | None:
+    """(width, height) as a PNG, JPEG, BMP, WebP or TIFF states it; None where the file is no such image."""
+    head = stream.read(30)
+    if head[:8] == b"\x89PNG\r\n\x1a\n" and head[12:16] == b"IHDR":
+        return int.from_bytes(head[16:20], "big"), int.from_bytes(head[20:24], "big")
+    if head[:2] == b"\xff\xd8":
+        return _jpeg_size(stream)
+    if head[:2] == b"BM" and len(head) >= 26:
+        width, height = struct.unpack_from("<ii", head, 18)
+        return abs(width), abs(height)  # rows from the top have a negative height
+    if head[:4] == b"RIFF" and head[8:12] == b"WEBP" and len(head) == 30:
+        return _webp_size(head)
+    return _tiff_size(stream, head) if head[:4] in (b"II*\0", b"MM\0*") else None
+
+
+def _jpeg_size(stream: BinaryIO) -> tuple[int, int] | None:
+    """That of the first frame header. Segments before it are skipped by their lengths (ITU-T T.81, B.1)."""
+    stream.seek(2)
+    for _ in range(MOST_SEGMENTS):
+        marker = stream.read(4)
+        while marker[:2] == b"\xff\xff":  # any number may stand before a marker
+            marker = marker[1:] + stream.read(1)
+        if len(marker) < 4 or marker[0] != 0xFF:
+            return None
+        if marker[1] in range(0xC0, 0xD0) and marker[1] not in (0xC4, 0xC8, 0xCC):
+            frame = stream.read(5)
+            return int.from_bytes(frame[3:5], "big"), int.from_bytes(frame[1:3], "big")
+        stream.seek(int.from_bytes(marker[2:], "big") - 2, os.SEEK_CUR)
+    return None
+
+
+def _webp_size(head: bytes) -> tuple[int, int] | None:
+    """Of a lossy (VP8), lossless (VP8L) or extended (VP8X) file."""
+    if head[12:16] == b"VP8 ":
+        width, height = struct.unpack_from("<HH", head, 26)
+        return width & 0x3FFF, height & 0x3FFF
+    if head[12:16] == b"VP8L":
+        bits = int.from_bytes(head[21:25], "little")
+        return (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1
+    sizes = int.from_bytes(head[24:27], "little") + 1, int.from_bytes(head[27:30], "little") + 1
+    return sizes if head[12:16] == b"VP8X" else None
+
+
+def _tiff_size(stream: BinaryIO, head: bytes) -> tuple[int, int] | None:
+    """Tags 256 and 257 of the first directory (TIFF 6.0, section 2)."""
+    order = "<" if head[:2] == b"II" else ">"
+    if len(head) < 8:
         return None
-    _check_pixels(file, *size)
-    return size
+    stream.seek(struct.unpack_from(order + "I", head, 4)[0])
+    count = int.from_bytes(stream.read(2), "little" if order == "<" else "big")
+    entries = stream.read(12 * count)
+    size: dict[int, int] = {}
+    for at in range(0, len(entries) - 11, 12):
+        tag, kind = struct.unpack_from(order + "HH", entries, at)
+        size[tag] = struct.unpack_from(order + ("H" if kind == 3 else "I"), entries, at + 8)[0]
+    return (size[256], size[257]) if {256, 257} <= size.keys() else None
 
 
 def decoded(file: Path, flags: int) -> NDArray[np.generic]:
     """The pixels as OpenCV gives them. EXIF orientation is ignored, as poses and masks ignore it."""
     cv2 = require_cv2()
     data = np.fromfile(file, np.uint8)
-    _stated_size(file, io.BytesIO(data.tobytes()))  # before anything is allocated
+    if stated := _stated_size(io.BytesIO(data.tobytes())):
+        _check_pixels(file, *stated)
     try:
         pixels = cv2.imdecode(data, flags | cv2.IMREAD_IGNORE_ORIENTATION) if data.size else None
     except cv2.error:

@@ -12,6 +12,7 @@ fisheye images to the sides (image_02, image_03) are not read.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -19,8 +20,7 @@ from numpy.typing import NDArray
 
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.poses import (
-    PosedFrames,
-    Recording,
+    RecordedFrame,
     Sensor,
     named_numbers,
     numbered_images,
@@ -40,23 +40,18 @@ def is_kitti360(folder: Path) -> bool:
     return (folder / CALIBRATION).is_file() and next(folder.glob("data_poses/*/cam0_to_world.txt"), None) is not None
 
 
-def read_kitti360(folder: Path) -> PosedFrames:
-    """Posed images of the one drive whose images are there, the left ones first. SceneError names file and cure."""
+def read_kitti360(folder: Path) -> Iterator[RecordedFrame]:
+    """Frames of the one drive whose images are there, the left ones first. SceneError names file and cure."""
     poses_file = _poses_of_drive(folder)
     rows = read_numbers(poses_file, 17)
     pose_of_frame = dict(zip(rows[:, 0].tolist(), rows[:, 1:].reshape(-1, 4, 4), strict=True))
-    recording = Recording()
     for camera in CAMERAS:
         images = numbered_images(_images_folder(folder, poses_file.parent.name, camera))
         sensor, beside = _sensor(folder / CALIBRATION, camera) if images else (None, np.eye(4))
         for file in images:
             path = file.relative_to(folder).as_posix()
             pose = pose_of_frame.get(float(file.stem)) if file.stem.isdecimal() else None
-            if sensor is None or pose is None:
-                recording.dropped.append(path)
-            else:
-                recording.add(path, pose @ beside, poses_file, sensor)
-    return recording.frames()
+            yield RecordedFrame(path, poses_file, None if pose is None else pose @ beside, sensor)
 
 
 def find_static_cloud(folder: Path) -> Path | None:

@@ -16,6 +16,7 @@ export (y up) fit. Images are as the sensor gave them, in landscape, however the
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -25,8 +26,7 @@ from og_pointcloud.formats.depth import MILLIMETRE
 from og_pointcloud.formats.images import image_size
 from og_pointcloud.formats.poses import (
     OPENGL,
-    PosedFrames,
-    Recording,
+    RecordedFrame,
     Sensor,
     inverse,
     named_numbers,
@@ -54,62 +54,56 @@ def _is_polycam(folder: Path) -> bool:
     return any(next((folder / "keyframes" / cameras).glob("*.json"), None) for _, cameras in POLYCAM)
 
 
-def _polycam(folder: Path) -> PosedFrames:
+def _polycam(folder: Path) -> Iterator[RecordedFrame]:
     keyframes = folder / "keyframes"
     images, cameras = next(pair for pair in POLYCAM if next((keyframes / pair[1]).glob("*.json"), None))
-    recording = Recording()
     for file in numbered_images(keyframes / images):
         source, path = keyframes / cameras / f"{file.stem}.json", f"keyframes/{images}/{file.name}"
         if not source.is_file():
-            recording.dropped.append(path)
+            yield RecordedFrame(path, source)
             continue
         content = read_json(source)
         sensor = _sensor(*named_numbers(content, POLYCAM_KEYS, source))
         pose = np.reshape(named_numbers(content, POSE_KEYS, source), (3, 4)) * OPENGL
-        recording.add(path, pose, source, sensor, (sensor, keyframes / "depth" / f"{file.stem}.png"))
-    return recording.frames()
+        yield RecordedFrame(path, source, pose, sensor, (sensor, keyframes / "depth" / f"{file.stem}.png"))
 
 
 def _is_scanner_app(folder: Path) -> bool:
     return next(folder.glob("frame_*.json"), None) is not None and next(folder.glob("frame_*.jpg"), None) is not None
 
 
-def _scanner_app(folder: Path) -> PosedFrames:
-    recording = Recording()
+def _scanner_app(folder: Path) -> Iterator[RecordedFrame]:
     for file in numbered(folder.glob("frame_*.jpg")):
         source, depth = file.with_suffix(".json"), folder / f"{file.stem.replace('frame_', 'depth_', 1)}.png"
         if not source.is_file():
-            recording.dropped.append(file.name)
+            yield RecordedFrame(file.name, source)
             continue
         content = read_json(source)
         content = content if isinstance(content, dict) else {}
         pose = np.reshape(named_numbers(content.get("cameraPoseARFrame"), range(16), source), (4, 4)) * OPENGL
         fx, _, cx, _, fy, cy, *_ = named_numbers(content.get("intrinsics"), range(9), source)
         sensor = _sensor(*image_size(file), fx, fy, cx + 0.5, cy + 0.5)
-        recording.add(file.name, pose, source, sensor, (sensor, depth))
-    return recording.frames()
+        yield RecordedFrame(file.name, source, pose, sensor, (sensor, depth))
 
 
 def _is_arkit_scenes(folder: Path) -> bool:
     return (folder / "lowres_wide.traj").is_file() and (folder / "lowres_wide").is_dir()
 
 
-def _arkit_scenes(folder: Path) -> PosedFrames:
+def _arkit_scenes(folder: Path) -> Iterator[RecordedFrame]:
     rows = read_numbers(folder / "lowres_wide.traj", 7)
     rows = rows[np.argsort(rows[:, 0])]
-    recording = Recording()
     for file in numbered_images(folder / "lowres_wide"):
         path, lens = f"lowres_wide/{file.name}", folder / "lowres_wide_intrinsics" / f"{file.stem}.pincam"
         time = re.search(r"_(\d+\.\d+)$", file.stem)
         nearest = rows[np.abs(rows[:, 0] - float(time[1])).argmin()] if time else None
         if nearest is None or time is None or not lens.is_file() or abs(nearest[0] - float(time[1])) > SAME_TIME_S:
-            recording.dropped.append(path)
+            yield RecordedFrame(path, lens)
             continue
         width, height, fx, fy, cx, cy = named_numbers(read_numbers(lens, 6).ravel(), range(6), lens)
         sensor = _sensor(width, height, fx, fy, cx + 0.5, cy + 0.5)
         pose = inverse(rigid(_rotation(nearest[1:4]), nearest[4:7]))
-        recording.add(path, pose, lens, sensor, (sensor, folder / "lowres_depth" / file.name))
-    return recording.frames()
+        yield RecordedFrame(path, lens, pose, sensor, (sensor, folder / "lowres_depth" / file.name))
 
 
 def _rotation(vector: Doubles) -> Doubles:

@@ -22,9 +22,9 @@ from og_pointcloud.formats.tables import naming
 from og_pointcloud.scene import Camera
 
 __all__ = [
-    "MAX_JSON_BYTES", "OPENGL", "PosedFrames", "PosedImage", "Recording", "Sensor", "in_local_frame", "in_pinholes",
+    "MAX_JSON_BYTES", "OPENGL", "PosedFrames", "PosedImage", "RecordedFrame", "Sensor", "in_local_frame", "in_pinholes",
     "inverse", "named_numbers", "numbered", "numbered_images", "quaternion_of", "read_json", "read_numbers",
-    "read_text", "rigid", "rotation_of_quaternion",
+    "read_text", "recorded", "rigid", "rotation_of_quaternion",
 ]  # fmt: skip
 
 MAX_TEXT_BYTES, MAX_JSON_BYTES = 1 << 26, 1 << 30
@@ -85,32 +85,39 @@ class Sensor:
         return Camera(*self.size, self.fx, self.fy, self.cx, self.cy, inverse(camera_to_world))
 
 
-class Recording:
-    """Frames as a data set's reader finds them, one after the other."""
+@dataclass(frozen=True)
+class RecordedFrame:
+    """A frame as a data set's reader finds it.
 
-    def __init__(self) -> None:
-        self._images: list[PosedImage] = []
-        self.dropped: list[str] = []
-        """Paths of images without a pose."""
+    path: of the image, in the capture folder. source: where the pose was read, for errors. pose: camera to world,
+    OpenCV axes; None, or not finite, where tracking was lost. color: the image's sensor; None where nothing is known of
+    it. depth: the depth sensor, and a file that may be absent.
+    """
 
-    def add(
-        self, path: str, pose: NDArray[np.float64], source: Path | str, color: Sensor,
-        depth: tuple[Sensor, Path] | None = None,
-    ) -> None:  # fmt: skip
-        """path: of the image, in the capture folder. pose: camera to world; not finite where tracking was lost.
-        source: where the pose was read, for errors. depth: its sensor, and a file that may be absent."""
-        if not np.isfinite(pose).all():
-            self.dropped.append(path)
-            return
-        with naming(source):
-            camera, file = color.at(pose), None
-            if depth is not None and depth[1].is_file():
-                file = DepthFile(depth[1], depth[0].at(pose), depth[0].unit, depth[0].invalid)
-        self._images.append(PosedImage(path, camera, depth=file))
+    path: str
+    source: Path | str
+    pose: NDArray[np.float64] | None = None
+    color: Sensor | None = None
+    depth: tuple[Sensor, Path] | None = None
 
-    def frames(self) -> PosedFrames:
-        """All of them."""
-        return PosedFrames(tuple(self._images), tuple(self.dropped))
+    def image(self) -> PosedImage | None:
+        """The posed image, None without a pose."""
+        if self.pose is None or self.color is None or not np.isfinite(self.pose).all():
+            return None
+        with naming(self.source):
+            camera, file = self.color.at(self.pose), None
+            if self.depth is not None and self.depth[1].is_file():
+                sensor, path = self.depth
+                file = DepthFile(path, sensor.at(self.pose), sensor.unit, sensor.invalid)
+        return PosedImage(self.path, camera, depth=file)
+
+
+def recorded(frames: Iterable[RecordedFrame]) -> PosedFrames:
+    """What a data set's folder holds, of all its frames."""
+    read = [(frame.path, frame.image()) for frame in frames]
+    return PosedFrames(
+        tuple(image for _, image in read if image is not None), tuple(path for path, image in read if image is None)
+    )
 
 
 def in_pinholes(image: PosedImage) -> tuple[PosedImage, ...]:

@@ -17,7 +17,7 @@ Poses are camera-to-world with OpenCV axes. Pixel centres are counted at whole n
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -31,16 +31,17 @@ from og_pointcloud.formats.kitti360 import is_kitti360, read_kitti360
 from og_pointcloud.formats.phones import PHONE_LAYOUTS
 from og_pointcloud.formats.poses import (
     PosedFrames,
-    Recording,
+    RecordedFrame,
     Sensor,
     named_numbers,
     numbered,
     numbered_images,
     read_json,
     read_numbers,
+    recorded,
 )
 
-__all__ = ["find_mesh", "read_replica", "read_rgbd", "read_scannet", "read_seven_scenes"]
+__all__ = ["LAYOUTS", "find_mesh", "read_rgbd"]
 
 DEPTH_FOCAL_PX, COLOR_FOCAL_PX, FOCAL_WIDTH = 585.0, 525.0, 640
 """Focal lengths of 7-Scenes in pixels of an image of that width."""
@@ -56,7 +57,7 @@ def read_rgbd(folder: Path) -> PosedFrames | None:
 
     SceneError names the file that is wrong, and the cure.
     """
-    return next((read(folder) for holds, read in (*LAYOUTS, *PHONE_LAYOUTS) if holds(folder)), None)
+    return next((recorded(read(folder)) for holds, read in (*LAYOUTS, *PHONE_LAYOUTS) if holds(folder)), None)
 
 
 def _is_scannet(folder: Path) -> bool:
@@ -86,19 +87,16 @@ def _in_or_above(folder: Path, name: str) -> Path | None:
     return next((place / name for place in (folder, folder.parent) if (place / name).is_file()), None)
 
 
-def read_scannet(folder: Path) -> PosedFrames:
-    """As `read_rgbd`, of ScanNet's layout."""
+def _scannet(folder: Path) -> Iterator[RecordedFrame]:
     images = numbered_images(folder / "color")
     if not images:
         raise SceneError(f"{folder / 'color'} has no image; expected 0.jpg, 1.jpg, ...: export the colour frames")
     color = _scannet_lens(folder, "color", images[0])
     some_depth = next((folder / "depth").glob("*.png"), None)
     depth = replace(_scannet_lens(folder, "depth", some_depth) if some_depth else color, unit=MILLIMETRE)
-    recording = Recording()
     for file in images:
-        pose_file, depth_file = folder / "pose" / f"{file.stem}.txt", folder / "depth" / f"{file.stem}.png"
-        recording.add(f"color/{file.name}", _pose_in(pose_file), pose_file, color, (depth, depth_file))
-    return recording.frames()
+        source, depth_file = folder / "pose" / f"{file.stem}.txt", folder / "depth" / f"{file.stem}.png"
+        yield RecordedFrame(f"color/{file.name}", source, _pose_in(source), color, (depth, depth_file))
 
 
 def find_mesh(folder: Path) -> Path | None:
@@ -118,8 +116,8 @@ def _scannet_lens(folder: Path, sensor: str, image: Path) -> Sensor:
     return Sensor.from_matrix(image_size(image), _matrix_in(file, 4))
 
 
-def read_seven_scenes(folder: Path) -> PosedFrames:
-    """As `read_rgbd`, of 7-Scenes' layout, sequence by sequence."""
+def _seven_scenes(folder: Path) -> Iterator[RecordedFrame]:
+    """Sequence by sequence."""
     images = [
         file
         for sequence in _sequences(folder)
@@ -129,13 +127,11 @@ def read_seven_scenes(folder: Path) -> PosedFrames:
         raise SceneError(f"{folder} has poses but no frame-*.color.png or .color.jpg: add the colour images")
     color, depth = _seven_scenes_lenses(folder, image_size(images[0]))
     depth = replace(depth, unit=MILLIMETRE, invalid=SEVEN_SCENES_INVALID)
-    recording = Recording()
     for file in images:
         frame = file.name.split(".")[0]
-        pose_file, depth_file = file.with_name(f"{frame}.pose.txt"), file.with_name(f"{frame}.depth.png")
+        source, depth_file = file.with_name(f"{frame}.pose.txt"), file.with_name(f"{frame}.depth.png")
         path = file.relative_to(folder).as_posix()
-        recording.add(path, _pose_in(pose_file), pose_file, color, (depth, depth_file))
-    return recording.frames()
+        yield RecordedFrame(path, source, _pose_in(source), color, (depth, depth_file))
 
 
 def _sequences(folder: Path) -> list[Path]:
@@ -154,8 +150,7 @@ def _seven_scenes_lenses(folder: Path, size: tuple[int, int]) -> tuple[Sensor, S
     return Sensor(size, color, color, *middle), Sensor(size, depth, depth, *middle)
 
 
-def read_replica(folder: Path) -> PosedFrames:
-    """As `read_rgbd`, of Replica's layout."""
+def _replica(folder: Path) -> Iterator[RecordedFrame]:
     results = folder / "results"
     images = numbered([*results.glob("frame*.jpg"), *results.glob("frame*.png")])
     poses = read_numbers(folder / "traj.txt", 16).reshape(-1, 4, 4)
@@ -166,12 +161,10 @@ def read_replica(folder: Path) -> PosedFrames:
         )
     width, height, fx, fy, cx, cy, scale = _replica_parameters(folder)
     lens = Sensor((round(width), round(height)), fx, fy, cx + 0.5, cy + 0.5, unit=1 / scale)
-    recording = Recording()
     for line, (file, pose) in enumerate(zip(images, poses, strict=False), 1):
         depth_file = results / f"{file.stem.replace('frame', 'depth', 1)}.png"
         source = f"{folder / 'traj.txt'}, line {line}"
-        recording.add(f"results/{file.name}", pose, source, lens, (lens, depth_file))
-    return recording.frames()
+        yield RecordedFrame(f"results/{file.name}", source, pose, lens, (lens, depth_file))
 
 
 def _replica_parameters(folder: Path) -> list[float]:
@@ -187,10 +180,10 @@ def _replica_parameters(folder: Path) -> list[float]:
     return values
 
 
-LAYOUTS: tuple[tuple[Callable[[Path], bool], Callable[[Path], PosedFrames]], ...] = (
-    (_is_scannet, read_scannet),
-    (_is_seven_scenes, read_seven_scenes),
-    (_is_replica, read_replica),
+LAYOUTS: tuple[tuple[Callable[[Path], bool], Callable[[Path], Iterable[RecordedFrame]]], ...] = (
+    (_is_scannet, _scannet),
+    (_is_seven_scenes, _seven_scenes),
+    (_is_replica, _replica),
     (is_kitti360, read_kitti360),
 )
 """How a folder is told, and what reads it; the first that fits is taken. One of your own is a pair more."""
