@@ -220,7 +220,7 @@ def read_numbers(file: Path, columns: int) -> NDArray[np.float64]:
     except ValueError as error:
         raise SceneError(f"{file} cannot be read as rows of numbers ({error!s:.80}): export it again") from None
     if numbers.ndim != 2 or numbers.shape[1] != columns:
-        raise SceneError(f"{file} has numbers of shape {numbers.shape}; expected rows of {columns}")
+        raise SceneError(f"{file} has numbers of shape {numbers.shape}; expected rows of {columns}: export it again")
     return numbers
 
 
