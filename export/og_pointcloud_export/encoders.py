@@ -44,8 +44,6 @@ except ImportError as error:
 if find_spec("onnxscript") is None:  # torch.onnx.export imports it late, and says less
     raise MissingExtraError("onnxscript", "export")
 
-__all__ = ["PARITY_TEXTS", "export_image_encoder", "export_text_encoder", "write_image_encoder", "write_text_encoder"]
-
 OPSET = 18
 TOLERANCE = 1e-5
 """Largest difference of a unit vector's entry from torch that is let through; float32 reaches about 1e-6."""

@@ -24,8 +24,6 @@ try:
 except ImportError as error:
     raise MissingExtraError("numba", "fit") from error
 
-__all__ = ["CHILDREN", "EDGE", "LONGEST_LIST", "NOTHING", "SHORT_LIST", "SPLIT", "TOO_FAR_CODE", "answer_children"]
-
 EDGE = 4
 """Children along the edge of a box that is split."""
 CHILDREN = EDGE**3

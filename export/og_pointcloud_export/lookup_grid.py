@@ -40,8 +40,6 @@ from og_pointcloud_export.lookup_boxes import (
     answer_children,
 )
 
-__all__ = ["CODE_OFFSET", "LookupGrid", "build_lookup_grid"]
-
 CODE_OFFSET = 1 - UNOBSERVED
 """Answer code of instance id + CODE_OFFSET on the surface; (instances + CODE_OFFSET - 1) more near it."""
 CELL_PER_SPACING = 1.5

@@ -33,8 +33,6 @@ try:
 except ImportError as error:
     raise MissingExtraError("onnx", "fit") from error
 
-__all__ = ["OPSET", "build_query_graph"]
-
 LIST_LENGTHS = (SHORT_LIST, 20, LONGEST_LIST)
 """So many candidates are compared: of most lists the first number, of longer ones the next."""
 OPSET, IR_VERSION = 18, 8

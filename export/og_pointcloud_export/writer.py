@@ -24,8 +24,6 @@ from og_pointcloud.models import open_session
 from og_pointcloud_export.lookup_grid import build_lookup_grid
 from og_pointcloud_export.query_graph import OPSET, build_query_graph
 
-__all__ = ["query_model", "write_bundle", "written_by"]
-
 SCORE_TOLERANCE = 1e-5
 """Largest cosine error of the graph against float64 that is let through; float32 sums of 512 terms reach 1e-6."""
 PARITY_TEXTS, PARITY_POINTS = 64, 4096

@@ -18,8 +18,6 @@ try:
 except ImportError:  # not on Windows: there nobody keeps a second process out
     fcntl = None
 
-__all__ = ["LOCK", "locked", "replacing", "replacing_folder"]
-
 LOCK = ".lock"
 """The file in a folder by which processes know that another works there."""
 STALE_S = 60.0

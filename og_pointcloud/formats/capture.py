@@ -55,12 +55,6 @@ from og_pointcloud.scene import NOT_SEEN, Camera, Points, Scene, View
 if TYPE_CHECKING:
     from og_pointcloud.formats.fusion import FusedCloud
 
-__all__ = [
-    "CapturePoses", "depth_files", "find_images", "fuse_capture", "read_capture", "read_geometry", "read_photograph",
-    "read_photographed",
-    "read_poses",
-]  # fmt: skip
-
 CLOUD_NAMES = ("points.ply", "point_cloud.ply", "scans/mesh_aligned_0.05.ply")
 DECODED = 4
 """Mask maps of images with several faces that are kept: faces come one after the other, some side by side."""

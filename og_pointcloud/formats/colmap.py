@@ -25,8 +25,6 @@ from og_pointcloud.formats.poses import PosedImage, rigid, rotation_of_quaternio
 from og_pointcloud.formats.tables import naming
 from og_pointcloud.scene import Camera
 
-__all__ = ["find_model", "read_images", "read_points3d"]
-
 MODEL_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", "dslr/colmap")
 
 CAMERA_MODELS: dict[str, tuple[int, str]] = {

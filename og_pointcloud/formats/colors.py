@@ -7,8 +7,6 @@ from numpy.typing import NDArray
 
 from og_pointcloud.cloud import UNKNOWN
 
-__all__ = ["LUMINANCE", "NO_LABEL", "UNKNOWN_COLOR", "certainty_colors", "label_colors"]
-
 UNKNOWN_COLOR = (128, 128, 128)
 NO_LABEL = (222, 224, 228)
 """Of points without a label on pages: lighter than in files, as most of a scene may have none."""

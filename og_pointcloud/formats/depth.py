@@ -20,8 +20,6 @@ from og_pointcloud.formats.lenses import Lens
 from og_pointcloud.formats.npy import mapped_array
 from og_pointcloud.scene import Camera
 
-__all__ = ["MILLIMETRE", "DepthFile", "DepthFrame", "DepthImage", "find_depth", "resampled"]
-
 DEPTH_FOLDERS = ("depth", "depths", "depth_images")
 DEPTH_SUFFIXES = (".png", ".npy", ".tif", ".tiff")
 MILLIMETRE = 1e-3

@@ -26,8 +26,6 @@ from og_pointcloud.formats.poses import rigid, rotation_of_quaternion
 from og_pointcloud.formats.tables import naming
 from og_pointcloud.scene import Points
 
-__all__ = ["E57_SIGNATURE", "read_e57", "unpack_e57"]
-
 Doubles = NDArray[np.float64]
 
 E57_SIGNATURE = b"ASTM-E57"

@@ -21,8 +21,6 @@ from og_pointcloud.formats.images import require_cv2
 from og_pointcloud.formats.lenses import Lens
 from og_pointcloud.scene import NOT_SEEN, Camera
 
-__all__ = ["Face", "faces"]
-
 Doubles = NDArray[np.float64]
 
 ONE_VIEW = float(np.tan(np.radians(55)))

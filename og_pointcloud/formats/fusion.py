@@ -29,8 +29,6 @@ from og_pointcloud.formats.images import require_cv2
 from og_pointcloud.kernels import njit, prange
 from og_pointcloud.scene import Camera, Points
 
-__all__ = ["FusedCloud", "Survey", "doubtful_depth", "evenly", "fuse", "on_surface", "survey", "to_world"]
-
 Doubles = NDArray[np.float64]
 
 SURVEYED = 16

@@ -20,8 +20,6 @@ from og_pointcloud.formats.ply import join_columns
 from og_pointcloud.formats.tables import colors, positions, stack_columns, storable_positions
 from og_pointcloud.scene import Points
 
-__all__ = ["activated", "gaussian_rows", "gaussians_from_ply", "holds_gaussians", "latest_iteration"]
-
 SH_CONSTANT = 0.28209479177387814
 """The spherical harmonic of degree 0, 1 / (2 sqrt(pi)): colour = 0.5 + SH_CONSTANT * f_dc."""
 SPLATS_PER_CHUNK = 256

@@ -26,8 +26,6 @@ from og_pointcloud.formats.gaussian_ply import SH_CONSTANT
 from og_pointcloud.formats.tables import LABEL_FINITE, naming
 from og_pointcloud.scene import Points, require_finite
 
-__all__ = ["write_gltf"]
-
 POINTS_MODE, ARRAY_BUFFER = 0, 34962
 COMPONENT_TYPES = {"f": 5126, "H": 5123}
 """FLOAT and UNSIGNED_SHORT. Ids are floats, exact up to 2^24: glTF has no 32-bit integers for vertices."""

@@ -16,21 +16,6 @@ from numpy.typing import NDArray
 from og_pointcloud.errors import MissingExtraError, SceneError
 from og_pointcloud.formats.atomic import replacing
 
-__all__ = [
-    "IMAGE_SUFFIXES",
-    "PngHeader",
-    "decoded",
-    "find_image",
-    "image_size",
-    "png_header",
-    "read_rgb",
-    "require_cv2",
-    "require_scaled",
-    "same_shape",
-    "without_suffix",
-    "write_png",
-]
-
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".PNG", ".JPEG", ".webp", ".tif", ".tiff", ".bmp")
 IMAGE_FOLDERS = ("images", "images_2", "images_4", "images_8", "color", "rgb", "dslr/resized_images")
 MAX_PIXELS = 1 << 27

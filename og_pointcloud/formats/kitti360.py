@@ -29,8 +29,6 @@ from og_pointcloud.formats.poses import (
     rigid,
 )
 
-__all__ = ["find_static_cloud", "is_kitti360", "read_kitti360"]
-
 CALIBRATION = Path("calibration/perspective.txt")
 CAMERAS = ("00", "01")
 

@@ -24,8 +24,6 @@ from og_pointcloud.errors import SceneError, printable
 from og_pointcloud.formats.mask_files import MaskLayer, as_float32, require_all
 from og_pointcloud.formats.npy import mapped_array
 
-__all__ = ["LANGUAGE_FEATURES_FOLDER", "LEVELS", "read_language_features"]
-
 LANGUAGE_FEATURES_FOLDER = "language_features"
 LEVELS = ("default", "small", "medium", "large")
 SPACE_FILE = "feature_space.txt"

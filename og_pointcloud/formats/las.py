@@ -31,8 +31,6 @@ from og_pointcloud.scene import Points, require_finite
 if TYPE_CHECKING:
     from laspy import LasData
 
-__all__ = ["read_las", "write_las"]
-
 SIGNATURE = b"LASF"
 POINTS_PER_CHUNK = 1_000_000
 """Read at once: a header that promises more points than the file holds never makes room for them."""

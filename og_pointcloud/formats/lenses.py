@@ -26,8 +26,6 @@ from numpy.typing import NDArray
 from og_pointcloud.errors import SceneError
 from og_pointcloud.scene import Camera
 
-__all__ = ["SPHERICAL", "Lens", "lens_of", "spherical_camera"]
-
 Doubles = NDArray[np.float64]
 Terms = Mapping[str, float]
 

@@ -23,10 +23,6 @@ from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.images import decoded, png_header, require_cv2
 from og_pointcloud.formats.npy import arrays_from_npz
 
-__all__ = [
-    "FEATURES_NAME", "MASKS_FOLDER", "TRACKS", "MaskLayer", "as_float32", "read_ids", "read_masks", "require_all",
-]  # fmt: skip
-
 MASKS_FOLDER = "masks"
 FEATURES_NAME = "mask_features.npz"
 TRACKS = ".tracks"

@@ -30,8 +30,6 @@ from og_pointcloud.formats.poses import OPENGL, PosedFrames, PosedImage, inverse
 from og_pointcloud.formats.tables import naming
 from og_pointcloud.scene import Camera
 
-__all__ = ["TRANSFORMS_NAMES", "read_transforms"]
-
 TRANSFORMS_NAMES = ("transforms.json", "transforms_train.json")
 PERSPECTIVE_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
 FISHEYE_MODELS = ("OPENCV_FISHEYE", "FISHEYE")

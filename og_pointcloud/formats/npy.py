@@ -16,8 +16,6 @@ from numpy.typing import NDArray
 
 from og_pointcloud.errors import SceneError
 
-__all__ = ["array_from_npy", "array_from_zip", "arrays_from_npz", "mapped_array", "npy_bytes"]
-
 LONGEST_HEADER = 1 << 17
 """Bytes in which a header ends; numpy reads none of more than 10,000 characters."""
 LAST_CHARACTER = 0x10FFFF

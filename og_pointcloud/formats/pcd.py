@@ -18,8 +18,6 @@ from numpy.typing import NDArray
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.tables import naming, read_text_rows
 
-__all__ = ["looks_like_pcd", "read_pcd"]
-
 HEADER_LIMIT = 1 << 16
 POINT_SIZE_LIMIT = 1 << 20
 """Bytes, descriptors and padding included; the largest of PCL's own types has about 8 kB."""

@@ -37,8 +37,6 @@ from og_pointcloud.formats.poses import (
     rigid,
 )
 
-__all__ = ["PHONE_LAYOUTS"]
-
 Doubles = NDArray[np.float64]
 POLYCAM = (("corrected_images", "corrected_cameras"), ("images", "cameras"))
 POLYCAM_KEYS = ("width", "height", "fx", "fy", "cx", "cy")

@@ -29,8 +29,6 @@ from og_pointcloud.formats.poses import OPENGL, PosedFrames, PosedImage, inverse
 from og_pointcloud.formats.tables import naming
 from og_pointcloud.scene import Camera
 
-__all__ = ["find_photogrammetry", "read_photogrammetry"]
-
 Doubles = NDArray[np.float64]
 ImageSize = Callable[[str], tuple[int, int]]
 

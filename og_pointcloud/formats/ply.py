@@ -20,8 +20,6 @@ from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.atomic import replacing
 from og_pointcloud.formats.tables import naming, read_text_rows, storable_positions
 
-__all__ = ["join_columns", "plain_rows", "read_ply", "write_ply"]
-
 HEADER_LIMIT = 1 << 18
 """Bytes in which a header must end; the longest known (a 3DGS file with its training record) has 4 kB."""
 

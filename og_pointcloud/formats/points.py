@@ -21,8 +21,6 @@ from og_pointcloud.formats.spz import looks_like_spz, read_spz
 from og_pointcloud.formats.tables import colors, naming, positions
 from og_pointcloud.scene import Points
 
-__all__ = ["read_points", "write_labelled_ply"]
-
 
 def read_points(path: str | os.PathLike[str]) -> Points:
     """A plain cloud (PLY, PCD, LAS, LAZ, COPC, E57) or Gaussians (PLY, SuperSplat's, SPZ), whatever the file's name.

@@ -21,12 +21,6 @@ from og_pointcloud.formats.lenses import Lens
 from og_pointcloud.formats.tables import naming
 from og_pointcloud.scene import Camera
 
-__all__ = [
-    "MAX_JSON_BYTES", "OPENGL", "PosedFrames", "PosedImage", "RecordedFrame", "Sensor", "in_local_frame", "in_pinholes",
-    "inverse", "named_numbers", "numbered", "numbered_images", "quaternion_of", "read_json", "read_numbers",
-    "read_text", "recorded", "rigid", "rotation_of_quaternion",
-]  # fmt: skip
-
 MAX_TEXT_BYTES, MAX_JSON_BYTES = 1 << 26, 1 << 30
 LARGEST = 1e30
 """Of a number in a pose file: anything beyond is damage, and its square still is a number."""

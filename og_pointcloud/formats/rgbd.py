@@ -41,8 +41,6 @@ from og_pointcloud.formats.poses import (
     recorded,
 )
 
-__all__ = ["LAYOUTS", "find_mesh", "read_rgbd"]
-
 DEPTH_FOCAL_PX, COLOR_FOCAL_PX, FOCAL_WIDTH = 585.0, 525.0, 640
 """Focal lengths of 7-Scenes in pixels of an image of that width."""
 SEVEN_SCENES_INVALID = 65535

@@ -27,8 +27,6 @@ from og_pointcloud.formats.gaussian_ply import SH_CONSTANT, activated
 from og_pointcloud.formats.tables import naming
 from og_pointcloud.scene import Points
 
-__all__ = ["looks_like_spz", "read_spz", "write_spz"]
-
 Bytes = NDArray[np.uint8]
 Doubles = NDArray[np.float64]
 

@@ -28,8 +28,6 @@ from og_pointcloud.formats.poses import numbered_images
 from og_pointcloud.formats.tables import naming
 from og_pointcloud.journal import Journal
 
-__all__ = ["PosesFound", "find_poses"]
-
 MODEL_FOLDER = "sparse"
 FEWEST = 3
 """Photographs that a model is made of at least."""

@@ -13,11 +13,6 @@ from numpy.typing import NDArray
 
 from og_pointcloud.errors import SceneError
 
-__all__ = [
-    "LABEL_FINITE", "as_cell", "colors", "naming", "positions", "read_text_rows", "stack_columns",
-    "storable_positions",
-]  # fmt: skip
-
 COLOR_COLUMNS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
 LABEL_FINITE = "label the finite points alone, points[np.isfinite(points).all(axis=1)]"
 """What helps where a cloud with NaN or infinity is to be saved in a format that cannot hold them."""

@@ -17,8 +17,6 @@ from og_pointcloud.formats.images import require_cv2
 from og_pointcloud.masking.contracts import MaskEncoder
 from og_pointcloud.masking.crops import Preprocessing
 
-__all__ = ["DenseEncoder", "PatchModel"]
-
 SHORTER_SIDE = 2.0
 """The image's shorter side in sides of the square that the model was trained on: patches of CLIP B/16 are then 28 to a
 side, and positions in between are interpolated."""

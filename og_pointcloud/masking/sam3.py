@@ -25,8 +25,6 @@ try:
 except ImportError as error:
     raise MissingExtraError("torch and transformers", "masks") from error
 
-__all__ = ["FollowedWords", "NamedThings"]
-
 LEAST_SCORE = 0.5
 """Below, a detection is none, as transformers' examples have it. Of a tracker its configuration says it."""
 TRACKS_OF_A_RUN = 1 << 32

@@ -17,8 +17,6 @@ from og_pointcloud.show.live import CHANGES
 from og_pointcloud.show.page import Look, write_page
 from og_pointcloud.show.viewpoint import choose_viewpoint
 
-__all__ = ["STATES", "both_visits", "write_changes_page"]
-
 STATES = tuple(CHANGES)[:4]
 """Labels of the page: gone, new, and from where to where things moved; what has none of them is as it was, or was not
 seen again."""

@@ -41,8 +41,6 @@ from og_pointcloud.text.words import TextFeatures
 if TYPE_CHECKING:
     from typing_extensions import Unpack
 
-__all__ = ["Edit", "EditOptions", "What", "extract", "insert", "recolour", "remove"]
-
 What: TypeAlias = "str | int | Iterable[int] | Pick | Match | Selection"
 """What to edit: a text, for the instances that it fits (`select`); ids of instances; what a click or `select` gave."""
 

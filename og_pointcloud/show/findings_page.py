@@ -17,8 +17,6 @@ from og_pointcloud.collection.collection import Collection, Finding, Findings
 from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.formats.atomic import replacing
 
-__all__ = ["picture", "write_findings"]
-
 SIDE_PX = 200
 AROUND = 0.35
 """How much of a thing's largest length is shown around it."""

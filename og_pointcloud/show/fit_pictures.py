@@ -28,8 +28,6 @@ try:
 except ImportError as error:
     raise MissingExtraError("scipy and numba", "fit") from error
 
-__all__ = ["FeatureColors", "feature_colors", "feature_picture", "learned_stages", "training_picture"]
-
 GREY = (128, 128, 128)
 """A point without a feature, because no view sees it."""
 SPREAD = 1.5

@@ -23,8 +23,6 @@ from og_pointcloud.mapping.map_record import MapRecord
 from og_pointcloud.scene import Camera, Points
 from og_pointcloud.text.words import Labels, TextFeatures
 
-__all__ = ["FADED", "MODES", "WORDS", "Answer", "LiveScene", "look_along", "meaning"]
-
 MODES = ("labels", "instances", "certainty", "changes", "photo")
 CHANGES = {
     "gone": (200, 30, 60), "new": (24, 150, 70), "moved from here": (244, 178, 60), "moved to here": (226, 88, 34),

@@ -26,8 +26,6 @@ from og_pointcloud.formats.colors import NO_LABEL, label_colors
 from og_pointcloud.show.live import WORDS, meaning
 from og_pointcloud.show.viewpoint import Viewpoint
 
-__all__ = ["MOST_POINTS", "Look", "write_page"]
-
 TEMPLATE = Path(__file__).with_name("page.html")
 MOST_POINTS = 2_000_000
 """Points that a page holds; of larger clouds an even choice, about 16 MB."""

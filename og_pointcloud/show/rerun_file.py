@@ -23,8 +23,6 @@ from og_pointcloud.formats.colors import NO_LABEL, label_colors
 from og_pointcloud.journal import Journal
 from og_pointcloud.scene import Camera, Scene
 
-__all__ = ["RerunSink", "rerun_sink", "write_rerun"]
-
 rerun: Any = import_module("rerun")  # it comes without what tells its names to a type checker
 APPLICATION, TIMELINE = "og_pointcloud", "view"
 JPEG_QUALITY = 80

@@ -22,8 +22,6 @@ from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.show.live import Answer, LiveScene
 from og_pointcloud.show.viewpoint import FOCAL, choose_viewpoint
 
-__all__ = ["LOOPBACK", "PORT", "LivePage", "ServeSettings", "serve", "show"]
-
 LOOPBACK, PORT, PORTS = "127.0.0.1", 8080, 1 << 16
 POINT_SIZE = 0.95
 """Radius of a point in spacings: surfaces close."""

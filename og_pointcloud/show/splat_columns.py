@@ -21,8 +21,6 @@ from og_pointcloud.formats.ply import join_columns
 from og_pointcloud.formats.poses import quaternion_of
 from og_pointcloud.formats.tables import colors, positions
 
-__all__ = ["appended", "placed", "recoloured", "rotated_harmonics"]
-
 Rows: TypeAlias = NDArray[np.void]
 Columns: TypeAlias = dict[str, NDArray[Any]]
 

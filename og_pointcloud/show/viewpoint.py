@@ -7,8 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["FOCAL", "Viewpoint", "choose_viewpoint"]
-
 FOCAL = 1.7
 """Focal length in half heights of the picture: a view angle of 61 degrees."""
 ELEVATIONS_DEG = (30.0, 50.0)

@@ -18,8 +18,6 @@ from og_pointcloud.ask.segmentation import Segmentation
 from og_pointcloud.errors import MissingExtraError, OgPointcloudError, SceneError
 from og_pointcloud.text.words import Labels
 
-__all__ = ["Segmented", "open3d", "read", "segment", "to_open3d"]
-
 OLDEST = (0, 19)
 DEBIAN_LIBRARIES = "libusb-1.0-0 libgl1 libegl1 libx11-6 libgomp1"
 

@@ -25,8 +25,6 @@ from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.formats.colors import label_colors
 from og_pointcloud.text.words import Labels, TextFeatures
 
-__all__ = ["COLOR", "INSTANCE", "LABEL", "SCORE", "OgDataSet", "box_lines", "label_names", "set_strings", "to_pyvista"]
-
 LABEL, INSTANCE, SCORE, COLOR = "og_label", "og_instance", "og_score", "og_color"
 BOX_EDGES = [(a, a | 1 << axis) for a in range(8) for axis in range(3) if not a >> axis & 1]
 """Pairs of `Box.corners`: they differ in one bit."""

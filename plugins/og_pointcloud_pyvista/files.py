@@ -8,8 +8,6 @@ from og_pointcloud.ask.hosts import SCENE_FIELD, scene_name
 from og_pointcloud.ask.labelled_scene import as_scene
 from og_pointcloud_pyvista.datasets import INSTANCE, set_strings
 
-__all__ = ["RGB", "read_ogpc"]
-
 RGB = "RGB"
 """Point array of the scene's own colours, as PyVista's reader of .ply names it."""
 

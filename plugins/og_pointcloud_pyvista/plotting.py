@@ -23,8 +23,6 @@ from og_pointcloud.text.words import Labels
 from og_pointcloud_pyvista.datasets import COLOR, INSTANCE, LABEL, box_lines, label_names
 from og_pointcloud_pyvista.files import RGB
 
-__all__ = ["OgPlotter", "can_render"]
-
 UNKNOWN_COLOR = (205, 205, 205)
 """Lighter than in the data: most of a scene may be unknown, and what is known should stand out."""
 LEGEND_ENTRIES = 20

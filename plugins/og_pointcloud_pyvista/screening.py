@@ -15,8 +15,6 @@ from og_pointcloud.show.viewpoint import FOCAL, Viewpoint
 from og_pointcloud_pyvista.datasets import to_pyvista
 from og_pointcloud_pyvista.files import RGB
 
-__all__ = ["draw"]
-
 PICTURE_SIZE = (1600, 1000)
 CLOSED = 3.0
 """Width of a point in point spacings, so that surfaces close; smoothing halves it."""
