@@ -267,7 +267,7 @@ class LabelledCloud:
             raise OgPointcloudError(f"rgb has shape {self.rgb.shape}; expected ({n}, 3)")
         if self.certainty is not None and (self.certainty.shape != (n,) or self.certainty.dtype != np.uint8):
             raise OgPointcloudError(
-                f"certainty is {self.certainty.dtype} {self.certainty.shape}; expected uint8 ({n},)"
+                f"certainty is {self.certainty.dtype} {self.certainty.shape}; expected uint8 {(n,)}"
             )
         for name in ("spacing", "reach"):
             value = getattr(self, name)

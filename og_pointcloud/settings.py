@@ -250,9 +250,7 @@ class PaperSettings(_LossSettings):
             if value is not None and value < 1:
                 raise OgPointcloudError(f"{name} is {value}; expected at least 1")
         if not self.schedule_share > 0:
-            raise OgPointcloudError(
-                f"schedule_share is {self.schedule_share}; expected more than 0, 1 for the published"
-            )
+            raise OgPointcloudError(f"schedule_share is {self.schedule_share}; expected more than 0, 1 as published")
 
 
 @dataclass(frozen=True)

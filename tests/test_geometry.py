@@ -140,9 +140,9 @@ def test_pixels_per_spacing_of_a_lattice_seen_from_the_front() -> None:
 
 def test_near_plane_is_a_share_of_the_depth_of_what_is_in_front() -> None:
     xyz = np.array([[0, 0, 1], [0, 0, 2], [0, 0, 3], [0, 0, -50]], np.float32)
-    assert near_plane(xyz, [frontal(0.0)]) == pytest.approx(2 * NEAR_SHARE)
-    assert near_plane(xyz * 1000, [frontal(0.0)]) == pytest.approx(2000 * NEAR_SHARE)
-    assert near_plane(xyz, [frontal(-100.0)]) > 0
+    assert near_plane(xyz, [frontal(0.0).camera]) == pytest.approx(2 * NEAR_SHARE)
+    assert near_plane(xyz * 1000, [frontal(0.0).camera]) == pytest.approx(2000 * NEAR_SHARE)
+    assert near_plane(xyz, [frontal(-100.0).camera]) > 0
 
 
 def test_a_sample_of_points_does_not_depend_on_their_order() -> None:

@@ -26,7 +26,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
 def chosen(scene: Scene, settings: FitSettings | None = None):
     settings = settings or FitSettings()
     spacing = neighbourhood(scene.points.xyz, settings.geometry).spacing
-    near = near_plane(scene.points.xyz, scene.views)
+    near = near_plane(scene.points.xyz, (view.camera for view in scene.views))
     return choose_scale(scene.points, spacing, scene.views, near, settings, Journal(progress=False))
 
 

@@ -323,9 +323,7 @@ def find_scene(pcd: Any, scene: SceneLike | None = None) -> LabelledScene:
         return as_scene(pcd)
     if (carried := carried_scene(pcd)) is not None:
         return as_scene(carried)
-    raise OgPointcloudError(
-        "no scene to ask: pass scene=og.load('S.ogpc') (or its path), or segment a labelled cloud itself"
-    )
+    raise OgPointcloudError("no scene to ask: pass scene=og.load('S.ogpc'), or its path, or segment a labelled cloud")
 
 
 def as_scene(source: SceneLike) -> LabelledScene:
@@ -341,7 +339,7 @@ def as_scene(source: SceneLike) -> LabelledScene:
         state = path.stat()
         return _load_once(path, state.st_mtime_ns, state.st_size)
     raise OgPointcloudError(
-        f"scene is a {type(source).__name__}; expected a loaded scene, a LabelledCloud or the path of a .ogpc file"
+        f"scene is a {type(source).__name__}; expected a scene, a LabelledCloud or the path of a .ogpc"
     )
 
 

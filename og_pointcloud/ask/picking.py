@@ -100,9 +100,7 @@ class Pick:
 
     def _require_instance(self) -> None:
         if not self.found:
-            raise OgPointcloudError(
-                f"the click hit {self}; expected an instance (where `found` is true): click elsewhere"
-            )
+            raise OgPointcloudError(f"the click hit {self}; expected an instance (`found` is true): click elsewhere")
 
 
 @overload

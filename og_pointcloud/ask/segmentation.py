@@ -131,9 +131,7 @@ class Segmentation:
         """
         path = Path(path)
         if path.suffix not in SAVED_AS:
-            raise OgPointcloudError(
-                f"'{path}' ends in '{path.suffix}'; expected a name that ends in {', '.join(SAVED_AS)}"
-            )
+            raise OgPointcloudError(f"'{path}' ends in '{path.suffix}'; expected one of {', '.join(SAVED_AS)}")
         if path.suffix == ".npz":
             self._save_arrays(path)
         elif path.suffix == ".spz":

@@ -71,7 +71,7 @@ def read_bundle(path: str | os.PathLike[str], *, verify_sha256: bool = False) ->
     path = Path(path)
     if not path.is_file():
         raise BundleError(
-            f"{path} is not a file; expected a .ogpc file: check the name, or make it with og-pointcloud fit"
+            f"{path} is not a file; expected a .ogpc file: check the name, or make it (og-pointcloud fit)"
         )
     try:
         with path.open("rb") as file:
@@ -112,9 +112,7 @@ def _members(file: BinaryIO) -> tuple[dict[str, bytes], dict[str, int]]:
         infos = archive.infolist()
         for info in infos:
             if not SAFE_NAME.fullmatch(info.filename):
-                raise _Refused(
-                    f"member name {info.filename!r:.80} is not a plain relative path: the file is not to be trusted"
-                )
+                raise _Refused(f"member name {info.filename!r:.80} is no plain relative path: it is not to be trusted")
             if info.compress_type != zipfile.ZIP_STORED or info.compress_size != info.file_size:
                 raise _Refused(f"member '{info.filename:.80}' is compressed; expected stored members: {REBUILD}")
         names = {info.filename for info in infos}

@@ -25,9 +25,7 @@ def run(arguments: argparse.Namespace) -> None:
     try:
         common.print_result(arguments, described, lambda _: print_info(scene, arguments.bundle))
     except (KeyError, TypeError, ValueError):  # the one part of a file that reading it does not check
-        raise BundleError(
-            f"{arguments.bundle}: its provenance is not in the form that fit writes; see --json"
-        ) from None
+        raise BundleError(f"{arguments.bundle}: its provenance is not as fit writes it; see --json") from None
 
 
 def describe_bundle(scene: og.LabelledScene, path: Path) -> dict[str, Any]:

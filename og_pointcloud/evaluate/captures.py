@@ -51,9 +51,7 @@ def ask(scene: SceneLike, truth: Truth, text_features: Path | None = None) -> An
     scene = as_scene(scene)
     cloud = scene.cloud
     if len(cloud) != len(truth.cls):
-        raise SceneError(
-            f"{scene.path} has {len(cloud)} points, the truth {len(truth.cls)}; expected one each: fit that capture"
-        )
+        raise SceneError(f"{scene.path} has {len(cloud)} points, the truth {len(truth.cls)}; expected one each")
     result = segment(scene, None, text_features=text_features)
     return Answer(truth.class_of(result.labels, result.names), result.instances, cloud.xyz, cloud.spacing)
 

@@ -35,7 +35,7 @@ from og_pointcloud.formats.colmap import find_model, read_images
 from og_pointcloud.formats.images import MAX_PIXELS, require_cv2, same_shape
 from og_pointcloud.formats.points import read_points
 from og_pointcloud.formats.poses import in_local_frame
-from og_pointcloud.scene import Camera, View
+from og_pointcloud.scene import Camera
 from og_pointcloud.text.words import TextFeatures
 
 try:
@@ -136,7 +136,7 @@ def read_frame(file: str | Path) -> LabelledFrame:
         outlines = [(str(entry["category"]), entry["segmentation"]) for entry in objects]
     except (ValueError, TypeError, KeyError, RecursionError, OverflowError) as error:
         raise SceneError(
-            f"{file} is no label file of LeRF-OVS with info and objects ({error}): copy it again"
+            f"{file} is no label file of LeRF-OVS, with info and objects ({error}): copy it anew"
         ) from None
     if min(width, height) < 1 or width * height > MAX_PIXELS:
         raise SceneError(f"{file} is of an image of {width}x{height} pixels; expected 1 to {MAX_PIXELS}")
@@ -169,9 +169,7 @@ def gaussians_of(cloud: LabelledCloud, file: Path) -> Gaussians:
         raise SceneError(f"{file} has {len(points)} Gaussians, the scene {len(cloud)} points; expected one each")
     apart = float(np.abs(points.xyz_world - cloud.xyz_world).max(initial=0))
     if apart > SAME_PLACE * cloud.spacing:
-        raise SceneError(
-            f"{file}: Gaussians lie up to {apart:.3g} from the scene's points; expected those that it was fitted from"
-        )
+        raise SceneError(f"{file}: Gaussians lie up to {apart:.3g} from the scene's points; expected those it is of")
     return Gaussians(cloud.xyz, found.scale, found.rotation, found.opacity)
 
 
@@ -187,7 +185,7 @@ def score_pairs(
     scene's own words and text encoder.
     """
     cameras = [in_local_frame(camera, scene.cloud.origin) for camera in labels.cameras]
-    near = near_plane(scene.cloud.xyz, [_view_without_masks(camera) for camera in cameras])
+    near = near_plane(scene.cloud.xyz, cameras)
     chosen = {name: _selected(scene, name, text_features) for name in labels.objects}
     scores = []
     for frame, camera in zip(labels.frames, cameras, strict=True):
@@ -231,8 +229,3 @@ def _alpha(
     """(H, W) what the points of some instances cover of a view, nothing else being there."""
     alone = gaussians.take(np.flatnonzero(np.isin(ids, instances)))
     return render(alone, np.zeros((len(alone), 0), np.float32), camera, near)[1]
-
-
-def _view_without_masks(camera: Camera) -> View:
-    nothing = np.full((camera.height, camera.width), -1, np.int32)
-    return View("", camera, nothing, np.zeros((0, 0), np.float32))

@@ -3,22 +3,21 @@
 from __future__ import annotations
 
 import os
-import zipfile
-import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.errors import SceneError
 from og_pointcloud.evaluate.metrics import Score, score_labels
-from og_pointcloud.formats.npy import array_from_zip
+from og_pointcloud.formats.npy import arrays_from_npz
 
 GT_NAME = "gt.npz"
 MAX_UNPACKED_BYTES = 1 << 31
+OF_POINTS = ("background", "views", "ratio", "votes", "instance")
+"""What may stand beside the classes, one a point."""
 AGREED, VOTES = 0.5, 2
 """Of a class found by votes: the share that agreed on it, and how many there were, at least."""
 
@@ -67,11 +66,14 @@ def read_truth(folder: str | os.PathLike[str]) -> Truth:
             f"{path} is not a file; a score needs it: 'cls' (n,) a class per point, -1 none, and 'names'. Without one, "
             "take a made room: og-pointcloud demo"
         )
-    entries = read_arrays(path)
+    try:
+        entries, held = arrays_from_npz(path, ("cls", "names", *OF_POINTS), MAX_UNPACKED_BYTES)
+    except ValueError as error:
+        raise SceneError(str(error)) from None
     missing = [name for name in ("cls", "names") if name not in entries]
     if missing:
         raise SceneError(
-            f"{path} lacks '{missing[0]}' (it has {', '.join(entries) or 'nothing'}); expected 'cls', 'names'"
+            f"{path} lacks '{missing[0]}' (it has {', '.join(held) or 'nothing':.120}); expected 'cls', 'names'"
         )
     cls, names = entries["cls"], entries["names"]
     if cls.ndim != 1 or cls.dtype.kind not in "iu" or names.dtype.kind != "U" or cls.max(initial=-1) >= len(names):
@@ -79,7 +81,7 @@ def read_truth(folder: str | os.PathLike[str]) -> Truth:
             f"{path}: cls is {cls.dtype} {cls.shape} up to {cls.max(initial=-1)}, names {names.dtype} {names.shape}; "
             "expected whole numbers (n,) that index the names, and strings (L,)"
         )
-    for name in ("background", "views", "ratio", "votes", "instance"):
+    for name in OF_POINTS:
         if name in entries and entries[name].shape != cls.shape:
             raise SceneError(f"{path}: {name} has shape {entries[name].shape}, cls {cls.shape}; expected one a point")
     instance = entries.get("instance")
@@ -92,16 +94,3 @@ def read_truth(folder: str | os.PathLike[str]) -> Truth:
         scored &= (entries["ratio"] >= AGREED) & (entries["votes"] >= VOTES)
     background = entries["background"].astype(bool) if "background" in entries else None
     return Truth(cls, tuple(names.tolist()), scored, background, instance)
-
-
-def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
-    """All arrays of an .npz, read-only; SceneError where it is damaged, holds objects, or is larger than 2 GiB."""
-    try:
-        with zipfile.ZipFile(path) as archive:
-            infos = archive.infolist()
-            size = sum(info.file_size for info in infos)
-            if size > MAX_UNPACKED_BYTES:
-                raise ValueError(f"it unpacks to {size} bytes, more than {MAX_UNPACKED_BYTES}")
-            return {info.filename.removesuffix(".npy"): array_from_zip(archive, info) for info in infos}
-    except (OSError, ValueError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error) as error:
-        raise SceneError(f"{path} cannot be read as an .npz of plain arrays ({error!s:.120}): write it again") from None

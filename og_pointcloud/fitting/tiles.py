@@ -193,7 +193,7 @@ class _Drawing:
 def _drawing(views: Sequence[View], cloud: TiledCloud, settings: FitSettings, journal: Journal) -> _Drawing:
     """Size and opacity of the splats, once for all tiles."""
     points, geometry = cloud.points, settings.geometry
-    near, typical = near_plane(points.xyz, views), float(np.median(cloud.spacing))
+    near, typical = near_plane(points.xyz, (view.camera for view in views)), float(np.median(cloud.spacing))
     if points.are_gaussians:
         journal.leave_out(LeftOut.CHOICE_OF_SPLATS)
         return _Drawing(None, None, near, typical)

@@ -31,7 +31,9 @@ def labelled(known: GrowingMap, rows: NDArray[np.int64], around: Neighbourhood, 
     scene, geometry = Scene(points, views, known.space.name, "map"), settings.geometry
     drawn = isotropic(points, around.spacing, geometry.middle_scale, geometry.opacity)
     thickness = sight_thickness(around.spacing, float(np.median(around.spacing)), geometry)
-    surface = Surface(scene, None, around, drawn, near_plane(points.xyz, views), thickness, 1, by_sight=True)
+    surface = Surface(
+        scene, None, around, drawn, near_plane(points.xyz, (view.camera for view in views)), thickness, 1, by_sight=True
+    )
     settings, journal = replace(settings, mode="grouping"), Journal(progress=False)
     table = front_surfaces(surface, table, settings, journal)
     return fit_prepared(Prepared(scene, surface, table), settings, journal)

@@ -6,7 +6,7 @@ A plain cloud's points are drawn as isotropic Gaussians of a share of their own 
 from __future__ import annotations
 
 import zlib
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -52,9 +52,9 @@ def neighbourhood(xyz: NDArray[np.float32], settings: GeometrySettings) -> Neigh
     return Neighbourhood(spacing, index, adjoining)
 
 
-def near_plane(xyz: NDArray[np.float32], views: Sequence[View]) -> float:
+def near_plane(xyz: NDArray[np.float32], cameras: Iterable[Camera]) -> float:
     """Depth of the near plane: a share of the median depth at which cameras see the cloud. Never 0."""
-    depths = [_depths(xyz[:: 1 + len(xyz) // 20_000], view.camera) for view in views]
+    depths = [_depths(xyz[:: 1 + len(xyz) // 20_000], camera) for camera in cameras]
     front = np.concatenate([depth[depth > 0] for depth in depths])
     return NEAR_SHARE * float(np.median(front)) if len(front) else 1e-6
 

@@ -64,7 +64,7 @@ def reconstruct_surface(scene: Scene, settings: FitSettings, journal: Journal) -
     """Find the points that are needed, their spacing, and the Gaussians that they are drawn as."""
     scene, row_of_point = with_distinct_points(scene, journal)
     with journal.stage("spacing"):
-        near = near_plane(scene.points.xyz, scene.views)
+        near = near_plane(scene.points.xyz, (view.camera for view in scene.views))
         around = neighbourhood(scene.points.xyz, settings.geometry)
     with journal.stage("geometry"):
         gaussians = _gaussians(scene, around, near, settings, journal)

@@ -72,7 +72,7 @@ def check_names(names: Sequence[str]) -> None:
     for name in names:
         if len(name) > LONGEST_NAME or any("\ud800" <= sign <= "\udfff" for sign in name):
             raise OgPointcloudError(
-                f"the name {name!r:.60} has {len(name)} characters; expected whole ones, at most {LONGEST_NAME}"
+                f"the name {name!r:.60} has {len(name)} characters; expected whole ones, {LONGEST_NAME} at most"
             )
 
 
@@ -88,9 +88,7 @@ def checked_vocabulary(names: Sequence[str], vectors: NDArray[Any]) -> Vocabular
         if not name.strip():
             raise OgPointcloudError(f"row {len(seen)} has an empty name; expected a word: name it or remove it")
         if not np.isfinite(vector).all():
-            raise FeatureSpaceError(
-                f"the vector of '{name}' is NaN or infinite; expected finite numbers: encode it again"
-            )
+            raise FeatureSpaceError(f"the vector of '{name}' is NaN or infinite; expected numbers: encode it again")
         if not vector.any():
             raise FeatureSpaceError(f"the vector of '{name}' is zero, which is like nothing: encode it again")
         seen.add(name)

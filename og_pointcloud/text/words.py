@@ -38,9 +38,7 @@ def resolve_labels(
     sources = [source for source in (_of_space(text_features, feature_space), own_words) if source is not None]
     if labels is None:
         if not sources:
-            raise OgPointcloudError(
-                f"no labels are given, and the scene has no words of its own: {_ways(feature_space)}"
-            )
+            raise OgPointcloudError(f"no labels are given, and the scene has no words: {_ways(feature_space)}")
         labels = sources[0]
     if isinstance(labels, Vocabulary):
         return _checked(labels.names, labels.vectors)
@@ -55,9 +53,7 @@ def resolve_labels(
 
 def _checked(names: Sequence[str], vectors: NDArray[Any]) -> Vocabulary:
     if not names:
-        raise OgPointcloudError(
-            "0 labels are given; expected at least one word to look for: name what you want to find"
-        )
+        raise OgPointcloudError("0 labels are given; expected one word or more: name what you want to find")
     return checked_vocabulary(names, vectors)
 
 

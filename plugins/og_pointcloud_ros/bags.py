@@ -228,9 +228,7 @@ def _cloud_topics(reader: Reader, topics: Sequence[str] | None) -> list[str]:
             raise SceneError(f"topic '{topic}' {what}; expected one of {CLOUD}: {known}")
     taken = [name for topic in wanted for name in (topic + LABELLED, topic + DETECTIONS) if name in types]
     if taken or LABEL_INFO in types:
-        raise SceneError(
-            f"the bag has a topic '{[*taken, LABEL_INFO][0]}' already; expected one that was not labelled before"
-        )
+        raise SceneError(f"the bag has a topic '{[*taken, LABEL_INFO][0]}' already; expected one without labels")
     if not wanted:
         raise SceneError(f"no cloud to label: {known}; it has {', '.join(sorted(types)) or 'nothing at all'}")
     return wanted

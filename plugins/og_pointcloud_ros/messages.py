@@ -62,6 +62,4 @@ def nanoseconds(stamp: Any) -> int:
         return int(stamp.sec) * NANOSECONDS + int(stamp.nanosec)
     if isinstance(stamp, (int, np.integer)):
         return int(stamp)
-    raise SceneError(
-        f"stamp is a {type(stamp).__name__}; expected a Time message (sec, nanosec) or nanoseconds since the epoch"
-    )
+    raise SceneError(f"stamp is a {type(stamp).__name__}; expected a Time message or nanoseconds since the epoch")

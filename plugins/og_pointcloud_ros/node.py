@@ -85,9 +85,7 @@ class SegmentNode(Node):
     def _load(self) -> LabelledScene:
         path = self._value("scene")
         if not path:
-            raise OgPointcloudError(
-                "the parameter 'scene' is empty; expected a .ogpc file: --ros-args -p scene:=/maps/room.ogpc"
-            )
+            raise OgPointcloudError("the parameter 'scene' is empty; expected a .ogpc file: -p scene:=/maps/room.ogpc")
         return load(path)
 
     def _segmenter(self, labels: Sequence[str]) -> Segmenter:

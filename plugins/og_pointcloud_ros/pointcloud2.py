@@ -39,9 +39,7 @@ def from_pointcloud2(message: Any) -> NDArray[np.float64]:
         if values is None or values.shape != rows.shape:
             fields = ", ".join(rows.dtype.names or ()) or "none"
             what = "is absent" if values is None else f"holds {values.shape[-1]} values a point"
-            raise SceneError(
-                f"field '{name}' of a PointCloud2 {what} (its fields: {fields}); expected one each of x, y, z"
-            )
+            raise SceneError(f"field '{name}' of a PointCloud2 {what} (its fields: {fields}); expected x, y, z")
         xyz[..., axis] = values
     return xyz.reshape(-1, 3)
 
@@ -157,14 +155,10 @@ def _dtype(fields: Any, point_step: int, byte_order: str) -> np.dtype[Any]:
         name, offset, count = field.name, int(field.offset), max(int(field.count), 1)  # PCL writes a count of 0 as 1
         code = TYPE_CODES.get(int(field.datatype))
         if code is None:
-            raise SceneError(
-                f"field '{name}' of a PointCloud2 has datatype {field.datatype}; expected 1 (int8) to 8 (float64)"
-            )
+            raise SceneError(f"field '{name}' of a PointCloud2 has datatype {field.datatype}; expected 1 to 8")
         end = offset + count * np.dtype(code).itemsize
         if offset < 0 or end > point_step:
-            raise SceneError(
-                f"field '{name}' of a PointCloud2 spans bytes {offset} to {end} of a point of {point_step} bytes"
-            )
+            raise SceneError(f"field '{name}' of a PointCloud2 spans bytes {offset} to {end} of a point's {point_step}")
         if name in kinds:
             raise SceneError(f"field '{name}' of a PointCloud2 comes twice; expected every name once")
         if name:
@@ -180,7 +174,7 @@ def _bytes_of(data: Any) -> NDArray[np.uint8]:
         return np.frombuffer(data, np.uint8)
     except (TypeError, ValueError, BufferError) as error:
         raise SceneError(
-            f"data of a PointCloud2 is a {type(data).__name__} ({error}); expected contiguous bytes"
+            f"data of a PointCloud2 is a {type(data).__name__} ({error}); expected one run of bytes"
         ) from None
 
 

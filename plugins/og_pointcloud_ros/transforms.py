@@ -128,7 +128,7 @@ class TransformTree:
         if not 0 < after < len(edge.stamps):
             first, last, asked = (moment / NANOSECONDS for moment in (edge.stamps[0], edge.stamps[-1], stamp))
             raise TransformError(
-                f"'{frame}' in '{edge.parent}' is known from {first:.3f} to {last:.3f} s, not at {asked:.3f} s"
+                f"'{frame}' in '{edge.parent}' is known from {first:.3f} to {last:.3f}, not at {asked:.3f} s"
             )
         before = after - 1
         share = (stamp - edge.stamps[before]) / (edge.stamps[after] - edge.stamps[before])

@@ -31,7 +31,7 @@ from og_pointcloud.formats.capture import read_capture
 from og_pointcloud.formats.poses import in_local_frame, rigid
 from og_pointcloud.rendering.geometry import near_plane
 from og_pointcloud.rendering.splatting import NEAR_SHARE, view_weights
-from og_pointcloud.scene import Camera, Points, View
+from og_pointcloud.scene import Camera, Points
 
 TURNED = np.diag([1.0, -1.0, -1.0, 1.0])
 """A camera that looks the other way."""
@@ -114,7 +114,7 @@ def close_object(share: float) -> Answer:
     gaussians = scatter()
     depth = share * np.median(gaussians.xyz[1:, 2])
     gaussians.xyz[0], gaussians.scale[0] = [0.1 * depth, 0, depth], 0.05 * depth
-    near = near_plane(gaussians.xyz, [View("one", camera(), np.zeros((18, 24), np.int32), np.zeros((1, 4), "f4"))])
+    near = near_plane(gaussians.xyz, [camera()])
     return Answer(dense_weights(gaussians, camera(), near), reference_pixel_weights(gaussians, camera(), 1e-9))
 
 
