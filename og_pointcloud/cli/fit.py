@@ -15,6 +15,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args, get_type_hints
 
+import og_pointcloud as og
 from og_pointcloud.cli import common
 from og_pointcloud.cli.common import Parser, add_option, add_output, replaceable, timed, write_json
 from og_pointcloud.errors import MissingExtraError, OgPointcloudError
@@ -135,9 +136,7 @@ def fit_settings(arguments: argparse.Namespace) -> FitSettings:
 
 def write_views(cloud: LabelledCloud, capture: Path, options: FitOptions, path: Path) -> None:
     """The capture's views with the instances that they show, for Rerun."""
-    from og_pointcloud.formats.capture import read_capture
-
-    scene = read_capture(capture, gaussians=options.gaussians, mask_level=options.mask_level)
+    scene = og.read_capture(capture, gaussians=options.gaussians, mask_level=options.mask_level)
     rerun_file().write_rerun(path, scene, cloud, progress=True)
 
 

@@ -15,12 +15,10 @@ from numpy.typing import NDArray
 
 from og_pointcloud.ask.choosing import Chooser
 from og_pointcloud.ask.labelled_scene import as_scene, segment
-from og_pointcloud.bundle.vocabulary import carried_encoder
 from og_pointcloud.errors import SceneError
 from og_pointcloud.evaluate.metrics import Score, score_labels
 from og_pointcloud.formats.ply import read_ply
 from og_pointcloud.formats.tables import positions
-from og_pointcloud.text.words import resolve_labels
 
 NAMES: Mapping[int, str] = {
     1: "wall", 2: "floor", 3: "cabinet", 4: "bed", 5: "chair", 6: "sofa", 7: "table", 8: "door", 9: "window",
@@ -62,7 +60,7 @@ def ask(
     feature takes its best class, however badly it fits. xyz: (n, 3) world coordinates. task: 19, 15 or 10."""
     scene, ids = as_scene(file), np.array([*TASKS[task], 0])  # the last is what label -1 takes: unknown
     names = [NAMES[class_id] for class_id in TASKS[task]]
-    words = resolve_labels(names, text_features, scene.vocabulary, scene.feature_space, carried_encoder(scene.path))
+    words = scene.words(names, text_features)
     result = segment(xyz, words, scene=scene)
     forced = Chooser(scene.cloud.instances).choose(words.vectors).at(result.instances)[0]  # without bank: best cosine
     return ids[np.maximum(result.labels, -1)], ids[np.maximum(forced, -1)]
