@@ -267,7 +267,7 @@ def test_another_schema_names_the_cure(tmp_path, bundle_file, version, says):
 )
 def test_names_that_are_no_plain_paths(tmp_path, bundle_file, name):
     path = zip_of(tmp_path / "s.ogpc", {**members_of(bundle_file), name: b"x"})
-    refuse(path, "is not a plain relative path")
+    refuse(path, "is no plain relative path")
 
 
 def test_compressed_members_are_refused_unopened(tmp_path, bundle_file):

@@ -113,7 +113,7 @@ ERRORS = {
     ),
     "two unknown frames": ("world", "nose", 0, "'world' and 'nose' unknown"),
     "two trees": ("map", "lost", 0, "from 'lost' to 'map': they hang on no common frame"),
-    "before the first": ("map", "base", 0, r"'base' in 'map' is known from 1.000 to 2.000 s, not at 0.000 s"),
+    "before the first": ("map", "base", 0, r"'base' in 'map' is known from 1.000 to 2.000, not at 0.000 s"),
     "after the last": ("map", "base", 3 * SECOND, "not at 3.000 s"),
 }
 

@@ -427,7 +427,7 @@ def test_result_masks_counts_and_refusals(scene, tmp_path):
     assert (result.labels[result.instances == 4] == -1).all()  # it has no descriptor
     with pytest.raises(OgPointcloudError, match="'plum' was not asked for; the labels are apple, pear"):
         result.mask("plum")
-    with pytest.raises(OgPointcloudError, match=r"expected a name that ends in .npz, .ply, .las, .laz, .glb"):
+    with pytest.raises(OgPointcloudError, match=r"expected one of .npz, .ply, .las, .laz, .glb"):
         result.save(tmp_path / "out.txt")
 
 

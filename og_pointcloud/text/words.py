@@ -53,7 +53,7 @@ def resolve_labels(
 
 def _checked(names: Sequence[str], vectors: NDArray[Any]) -> Vocabulary:
     if not names:
-        raise OgPointcloudError("0 labels are given; expected one word or more: name what you want to find")
+        raise OgPointcloudError("0 labels are given; expected at least one word: name what you want to find")
     return checked_vocabulary(names, vectors)
 
 
