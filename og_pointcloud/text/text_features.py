@@ -88,7 +88,7 @@ def checked_vocabulary(names: Sequence[str], vectors: NDArray[Any]) -> Vocabular
         if not name.strip():
             raise OgPointcloudError(f"row {len(seen)} has an empty name; expected a word: name it or remove it")
         if not np.isfinite(vector).all():
-            raise FeatureSpaceError(f"the vector of '{name}' is NaN or infinite; expected numbers: encode it again")
+            raise FeatureSpaceError(f"the vector of '{name}' is NaN or infinite; expected finite ones: encode it again")
         if not vector.any():
             raise FeatureSpaceError(f"the vector of '{name}' is zero, which is like nothing: encode it again")
         seen.add(name)
