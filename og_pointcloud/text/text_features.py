@@ -72,7 +72,7 @@ def check_names(names: Sequence[str]) -> None:
     for name in names:
         if len(name) > LONGEST_NAME or any("\ud800" <= sign <= "\udfff" for sign in name):
             raise OgPointcloudError(
-                f"the name {name!r:.60} has {len(name)} characters; expected whole ones, {LONGEST_NAME} at most"
+                f"the name {name!r:.60} has {len(name)} characters; expected whole ones, at most {LONGEST_NAME}"
             )
 
 
