@@ -38,7 +38,7 @@ def main(arguments: list[str] | None = None) -> None:
     warnings.simplefilter("ignore")
     with tempfile.TemporaryDirectory() as folder:
         scene = og.load(og.write_bundle(made_room(), Path(folder) / "room.ogpc"))
-        start, settled, most, told = time.perf_counter(), 0.0, 0.0, 1000
+        start, settled, most, told, number = time.perf_counter(), 0.0, 0.0, 1000, 0
         for number, resident in enumerate(stream(scene, frames, options.points), 1):
             settled, most = (resident, resident) if number <= SETTLED else (settled, max(most, resident))
             seconds = time.perf_counter() - start
@@ -53,8 +53,9 @@ def main(arguments: list[str] | None = None) -> None:
 def stream(scene: og.LabelledScene, frames: int, points: int) -> Iterator[float]:
     """Ask so many frames of up to so many points; after each the resident megabytes of the process."""
     random, xyz = np.random.default_rng(0), np.resize(scene.xyz, (points, 3))
-    vectors = scene.vocabulary.vectors
-    ask = og.Segmenter(scene, list(scene.vocabulary.names))
+    words = scene.vocabulary
+    assert words is not None
+    vectors, ask = words.vectors, og.Segmenter(scene, list(words.names))
     for number in range(frames):
         if number % 100 == 99:
             ask = og.Segmenter(scene, {f"label {number}": vectors[number % len(vectors)]})

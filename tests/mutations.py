@@ -211,6 +211,29 @@ MUTATIONS = (
         "1 << 21, 1 << 23", "1 << 26, 1 << 26", trust("a_manifest_is_bounded_before_it_is_read"),
     ),
     Mutation(
+        "lengths of any size are believed", "cloud.py",
+        "if not LENGTHS[0] <= value <= LENGTHS[1]:", "if not value > 0:",
+        trust("lengths_whose_squares_are_no_numbers"),
+    ),
+    Mutation(
+        "blank names are words", "bundle/read.py",
+        "isinstance(name, str) and name.strip() for", "isinstance(name, str) for", trust("names_that_are_none"),
+    ),
+    Mutation(
+        "what a box cuts off is found in it", "collection/scoring.py",
+        "rows, evidence = rows[within], evidence[within]", "pass",
+        ("test_collection.py::test_box_and_scenes_restrict",),
+    ),
+    Mutation(
+        "ids between ids are believed", "checking/check.py",
+        "MOST_BLENDED = 0.02", "MOST_BLENDED = 2",
+        ("test_checking.py::test_pictures_of_ids_that_were_blended_are_told",),
+    ),
+    Mutation(
+        "a search ends where it is hidden from", "checking/registration.py",
+        "GAIN = 0.01", "GAIN = 1.01", ("test_checking.py::test_a_large_shift_is_taken_back_whole",),
+    ),
+    Mutation(
         "an encoder of another space answers", "text/encoder.py",
         "if encoder.feature_space != feature_space:", "if not encoder:",
         trust("a_carried_encoder_of_another_space_answers_nothing"),

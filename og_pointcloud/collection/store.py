@@ -156,7 +156,8 @@ class Atlas:
     def entries(self) -> list[SceneEntry]:
         """All scenes, by name."""
         rows = self._run(f"SELECT {ENTRY} FROM scenes LEFT JOIN judgements ON scene = id ORDER BY name")
-        return [SceneEntry(*row, size // EVIDENCE.itemsize, numbers // 4) for *row, size, numbers in rows]
+        counted = ((row[:-2], row[-2] // EVIDENCE.itemsize, row[-1] // 4) for row in rows)
+        return [SceneEntry(*row, instances=size, numbers=numbers) for row, size, numbers in counted]
 
     def instances(self, entry: SceneEntry) -> tuple[InstanceTable, NDArray[np.float64]]:
         """The instances of a scene, with unit descriptors, and (K, 2, 3) low and high corners of their boxes."""
