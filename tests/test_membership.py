@@ -173,6 +173,34 @@ def test_a_piece_that_is_shown_as_openly_as_the_rest_stays() -> None:
     assert two_pieces(0.5) == [0] * 50
 
 
+def dimly(shown: float, views: list[HandView]) -> list[int]:
+    """States of a line of points of which every view sees those from 40 on ``shown`` as openly as the others."""
+    table = hand_table(N, views)
+    exposure = table.exposure.toarray()
+    exposure[:, 40:60] *= np.float32(shown)
+    return decide(replace(table, exposure=csr_array(exposure)), [0] * len(views)).instance_ids.tolist()
+
+
+@pytest.mark.parametrize(("shown", "believed"), [(0.51, True), (0.49, False)])
+def test_what_no_view_sees_openly_is_as_its_neighbours_are(shown: float, believed: bool) -> None:
+    """Twenty points that every view's mask holds, beside background: the floor under a car, seen through its roof. Of
+    those not seen openly the outermost are as the background that they adjoin, and nobody knows the rest."""
+    ids = dimly(shown, [[(range(40, 60), ONE)]] * 4)
+    within = [0] * 20 if believed else [BACKGROUND] * 4 + [UNOBSERVED] * 12 + [BACKGROUND] * 4
+    assert ids == [BACKGROUND] * 40 + within + [BACKGROUND] * 40
+
+
+def test_what_no_view_sees_openly_joins_the_instance_that_it_adjoins() -> None:
+    assert dimly(0.1, [[(range(20, 80), ONE)]] * 4) == [BACKGROUND] * 20 + [0] * 60 + [BACKGROUND] * 20
+
+
+def test_a_scene_that_no_view_sees_openly_is_believed_as_a_whole() -> None:
+    """Surfaces of many noisy layers: little of every point reaches the camera."""
+    table = hand_table(N, [[(OBJECT, ONE)]] * 4)
+    dim = replace(table, exposure=csr_array(table.exposure.toarray() * np.float32(0.1)))
+    assert decide(dim, [0] * 4).instance_ids.tolist() == [0] * 50 + [BACKGROUND] * 50
+
+
 def test_order_of_points_does_not_matter() -> None:
     random = np.random.default_rng(0)
     table, numbers = random_case(random)

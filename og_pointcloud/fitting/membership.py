@@ -14,6 +14,10 @@ point adjoins surely labelled points of the same instance (hysteresis, as in Can
 
 Of several groups a point is of the one with the most votes; but proposers let large things swallow small ones: where
 that group's own views contradict it and a smaller one is sure, the smaller one has the point.
+
+Votes of views none of which sees a point openly are hearsay: rays that slip through a surface agree about what lies
+behind it, and are wrong. Such a point is as its neighbours are. How openly is measured by the scene's other points, for
+of surfaces of several noisy layers little is seen anywhere.
 """
 
 from __future__ import annotations
@@ -64,9 +68,13 @@ def assign_points(
     groups: MaskGroups,
     neighbourhood: Neighbourhood,
     settings: MembershipSettings,
+    typical_openness: float | None = None,
 ) -> Membership:
     """Decide the state of every point. Groups keep their numbers, of which a later one is smaller; a dismissed group
-    ends with no point."""
+    ends with no point.
+
+    typical_openness: as of `ViewVotes`, of a scene that these points are a part of; None: they are all of it.
+    """
     has_mask = np.zeros((groups.count, table.outside.shape[0]), np.bool_)
     grouped = groups.group >= 0
     has_mask[groups.group[grouped], table.mask_view[grouped]] = True
@@ -76,13 +84,17 @@ def assign_points(
         support = _support(votes, groups.group, has_mask, ~dismissed, settings.sure_share)
     group, share, total, around = support.group, support.share, support.total, neighbourhood
 
-    # Sure points, and possible ones that adjoin them.
-    ids = np.where((group >= 0) & (share > settings.sure_share), group, BACKGROUND).astype(np.int32)
+    # Sure points, and possible ones that adjoin them. What no view sees openly is not sure, however its views agree:
+    # all that look at a car see the same floor through its roof.
+    agreed = (group >= 0) & (share > settings.sure_share)
+    typical = votes.typical_openness if typical_openness is None else typical_openness
+    hearsay = agreed & (votes.openness < settings.open_share * typical)
+    ids = np.where(agreed & ~hearsay, group, BACKGROUND).astype(np.int32)
     possible = (group >= 0) & (share > settings.possible_share)
     ids = _grow(ids, group, possible, around.index, around.adjoining, settings.growth_votes)
-    # What is seen through an instance is no part of it; what no view saw is as its neighbours are.
+    # What is seen through an instance is no part of it; what no view saw, or none openly, is as its neighbours are.
     ids = _without_islands(ids, share, instance_area(table, groups.group, ids), around, settings.island_share)
-    ids = _fill_unobserved(np.where((ids == BACKGROUND) & (total == 0), UNOBSERVED, ids), around)
+    ids = _fill_unobserved(np.where((ids == BACKGROUND) & (hearsay | (total == 0)), UNOBSERVED, ids), around)
     ids = _settle_borders(ids, share, around.index, around.adjoining, *settings.border_shares, settings.own_vote)
     share_of_state = np.where((group >= 0) & (ids == group), share, 1 - share)
     certainty = np.where(total > 0, np.clip(share_of_state, 0, 1), 0) * _agreeing(ids, around.index, around.adjoining)

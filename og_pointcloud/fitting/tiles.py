@@ -134,13 +134,13 @@ def fit_tiles(
         looked = run(look, [replace(view, image=None) for view in scene.views], "visibility")
         shown = _all_shown(scene, cloud, looked, journal)
     with journal.stage("grouping"):
-        groups, looks = _groups(cloud, shown, settings, journal)
+        grouped = _groups(cloud, shown, settings, journal)
     with journal.stage("membership"):
         no_features = replace(shown, mask_features=np.zeros((len(shown.mask_view), 0), np.float32))
-        decide = partial(_decide, cloud, no_features, (groups, looks), settings)
+        decide = partial(_decide, cloud, no_features, grouped, settings)
         decided = run(decide, range(len(cloud.tiles)), "membership")
     with journal.stage("association"):
-        labelling = _instances(cloud, shown, looks, decided, settings)
+        labelling = _instances(cloud, shown, grouped.looks, decided, settings)
     return labelling.of_points(row_of_point), float(np.median(cloud.spacing))
 
 
@@ -367,8 +367,18 @@ def _in_image(camera: Camera, cloud: TiledCloud, part: slice, drawing: _Drawing)
 # Instances and points -------------------------------------------------------------------------------------------
 
 
-def _groups(cloud: TiledCloud, shown: _Shown, settings: FitSettings, journal: Journal) -> tuple[MaskGroups, Looks]:
-    """Masks grouped by a sample of all points, without those groups that the scene's views contradict; their looks."""
+@dataclass(frozen=True)
+class _Grouped:
+    """What is decided for all tiles. groups: of masks, without those that the scene's views contradict. looks: theirs.
+    typical_openness: how openly points of the scene are seen."""
+
+    groups: MaskGroups
+    looks: Looks
+    typical_openness: float
+
+
+def _groups(cloud: TiledCloud, shown: _Shown, settings: FitSettings, journal: Journal) -> _Grouped:
+    """Masks grouped by a sample of all points."""
     count = max(settings.grouping.graph_points, len(cloud.points) // SAMPLE_STEP)
     sample = sample_of_points(cloud.points.xyz, count)
     table = shown.table(cloud, sample, settings.membership.few_views)
@@ -383,7 +393,8 @@ def _groups(cloud: TiledCloud, shown: _Shown, settings: FitSettings, journal: Jo
     if dismissed.any():
         journal.leave_out(LeftOut.CONTRADICTED_GROUPS, count=int(dismissed.sum()), total=groups.count)
     groups = replace(groups, group=np.where((groups.group >= 0) & dismissed[groups.group], -1, groups.group))
-    return groups, looks_of_groups(table, groups.group, judged.instance_ids, groups.count)
+    looks = looks_of_groups(table, groups.group, judged.instance_ids, groups.count)
+    return _Grouped(groups, looks, votes.typical_openness)
 
 
 @dataclass(frozen=True)
@@ -400,7 +411,7 @@ class _Decided:
 def _decide(
     cloud: TiledCloud,
     shown: _Shown,
-    grouped: tuple[MaskGroups, Looks],
+    grouped: _Grouped,
     settings: FitSettings,
     tile: int,
 ) -> _Decided:
@@ -409,9 +420,8 @@ def _decide(
     around = cloud.neighbours(tile, settings.geometry)
     # Which groups are noise was decided for all tiles.
     membership = replace(settings.membership, rate_share=0.0)
-    groups, looks = grouped
-    votes = view_votes(table)
-    state = assign_points(table, votes, groups, around, membership)
+    votes, looks = view_votes(table), grouped.looks
+    state = assign_points(table, votes, grouped.groups, around, membership, grouped.typical_openness)
     ids = by_look(votes, state.instance_ids, looks)
     inner = cloud.inner(tile)
     inner_ids = np.full(len(ids), -1, np.int32)

@@ -15,6 +15,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from og_pointcloud.fitting.mask_table import MaskTable
@@ -31,17 +32,25 @@ OPENNESS_POWER = 2
 class ViewVotes:
     """vote: (views, n) sparse float32 in (0, 1], how much the vote of each view counts on each point that it sees.
     in_mask: (masks, n) sparse float32, the part of its view's vote that is for "in this mask". The masks' rows of a
-    view sum to at most its vote; the rest is for "in no mask"."""
+    view sum to at most its vote; the rest is for "in no mask". openness: (n,) float32, the exposure of each point in the
+    view that sees it best, 0 where none does."""
 
     in_mask: csr_array
     vote: csr_array
+    openness: NDArray[np.float32]
+
+    @property
+    def typical_openness(self) -> float:
+        """The median of ``openness`` over points that are seen at all; 0 without one."""
+        seen = self.openness[self.openness > 0]
+        return float(np.median(seen)) if len(seen) else 0.0
 
 
 def view_votes(table: MaskTable) -> ViewVotes:
     """The votes of all views of a table."""
     weights, outside, exposure = table.weights, table.outside, table.exposure
     vote, in_mask = scratch_like(exposure.data, np.float32), scratch_like(weights.data, np.float32)
-    _relative_exposure(exposure.indices, exposure.data, exposure.shape[1], vote)
+    openness = _relative_exposure(exposure.indices, exposure.data, exposure.shape[1], vote)
     first_mask = np.searchsorted(table.mask_view, np.arange(exposure.shape[0] + 1))
     _share_votes(
         first_mask,
@@ -54,17 +63,19 @@ def view_votes(table: MaskTable) -> ViewVotes:
     return ViewVotes(
         csr_array((in_mask, weights.indices, weights.indptr), shape=weights.shape),
         csr_array((vote, exposure.indices, exposure.indptr), shape=exposure.shape),
+        openness,
     )
 
 
 @njit(cache=True)
 def _relative_exposure(index, exposure, n, vote):  # noqa: ANN001, ANN202
-    """Write to ``vote`` each exposure as a part of the point's best one, to the power above."""
+    """Write to ``vote`` each exposure as a part of the point's best one, to the power above; the best ones."""
     best = np.zeros(n, np.float32)
     for e in range(len(index)):
         best[index[e]] = max(best[index[e]], exposure[e])
     for e in range(len(index)):
         vote[e] = (exposure[e] / best[index[e]]) ** OPENNESS_POWER
+    return best
 
 
 @njit(cache=True)

@@ -26,10 +26,12 @@ Ids = NDArray[np.int32]
 
 @dataclass(frozen=True)
 class Votes:
-    """inside: (masks, n), what a view says for "in this mask". weight: (views, n), all that it says of a point."""
+    """inside: (masks, n), what a view says for "in this mask". weight: (views, n), all that it says of a point.
+    openness: (n,), the exposure of each point in the view that sees it best."""
 
     inside: Array
     weight: Array
+    openness: Array
 
 
 def view_votes(weights: Array, outside: Array, exposure: Array, mask_view: Sequence[int]) -> Votes:
@@ -43,7 +45,7 @@ def view_votes(weights: Array, outside: Array, exposure: Array, mask_view: Seque
         shown = outside[view, point] + sum(weights[mask, point] for mask in masks)
         for mask in masks:
             inside[mask, point] = weights[mask, point] / shown * weight[view, point]
-    return Votes(inside, weight)
+    return Votes(inside, weight, exposure.max(axis=0))
 
 
 # Membership ------------------------------------------------------------------------------------------------------
@@ -84,7 +86,11 @@ def membership(
     kept = [k for k in range(count) if masses[k] > 0 and rates[k] >= settings.rate_share * rates[half[0]]]
     best, share = best_of(kept)
 
-    ids = np.where((best >= 0) & (share > settings.sure_share), best, BACKGROUND).astype(np.int32)
+    seen = sorted(votes.openness[votes.openness > 0])
+    typical = (seen[(len(seen) - 1) // 2] + seen[len(seen) // 2]) / 2
+    hidden = votes.openness < settings.open_share * typical
+    hearsay = hidden & (best >= 0) & (share > settings.sure_share)
+    ids = np.where((best >= 0) & (share > settings.sure_share) & ~hidden, best, BACKGROUND).astype(np.int32)
     possible = (best >= 0) & (share > settings.possible_share)
     while True:  # a middling share counts where it adjoins points that are in already
         beside = [sum(ids[other] == best[g] for other in neighbours[g]) for g in points]
@@ -96,10 +102,10 @@ def membership(
             break
         ids[joins] = best[joins]
     ids = _without_islands(ids, share, weights, group, neighbours, settings.island_share)
-    ids[(ids == BACKGROUND) & (total == 0)] = UNOBSERVED
-    seen = ids.copy()
+    ids[(ids == BACKGROUND) & (hearsay | (total == 0))] = UNOBSERVED
+    before = ids.copy()
     for g in np.flatnonzero(ids == UNOBSERVED):
-        ids[g] = next((seen[other] for other in neighbours[g] if seen[other] != UNOBSERVED), UNOBSERVED)
+        ids[g] = next((before[other] for other in neighbours[g] if before[other] != UNOBSERVED), UNOBSERVED)
     ids = _settled(ids, share, neighbours, settings)
     certainty = np.zeros(len(points))
     for g in points:
