@@ -32,7 +32,7 @@ OPENNESS_POWER = 2
 class ViewVotes:
     """vote: (views, n) sparse float32 in (0, 1], how much the vote of each view counts on each point that it sees.
     in_mask: (masks, n) sparse float32, the part of its view's vote that is for "in this mask". The masks' rows of a
-    view sum to at most its vote; the rest is for "in no mask". openness: (n,) float32, the exposure of each point in the
+    view sum to at most its vote; the rest is for "in no mask". openness: (n,) float32, exposure of each point in the
     view that sees it best, 0 where none does."""
 
     in_mask: csr_array
