@@ -231,7 +231,8 @@ MUTATIONS = (
     ),
     Mutation(
         "a search ends where it is hidden from", "checking/registration.py",
-        "again = self.found(name, small)", "again = small", ("test_checking.py::test_a_large_shift_is_taken_back_whole",),
+        "again = self.found(name, small)", "again = small",
+        ("test_checking.py::test_a_large_shift_is_taken_back_whole",),
     ),
     Mutation(
         "an encoder of another space answers", "text/encoder.py",
