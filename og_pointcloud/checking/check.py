@@ -23,11 +23,6 @@ from og_pointcloud.cloud import BACKGROUND, UNKNOWN_SPACE, UNOBSERVED, LabelledC
 from og_pointcloud.errors import printable
 from og_pointcloud.scene import Scene
 
-__all__ = [
-    "CaptureWarning", "Check", "check_capture", "check_cloud", "check_poses", "check_words", "warn_of_doubts",
-    "with_checks",
-]  # fmt: skip
-
 Verdict = Literal["ok", "doubt", "unchecked"]
 
 PHOTOGRAPHS_FIT = (0.7, 0.25)

@@ -19,8 +19,6 @@ from og_pointcloud.checking.sample import Comparison
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.repairs import KINDS, MASK_FLIPS, MASK_SHIFTS, Repair
 
-__all__ = ["Repairs", "best_conversion", "best_mask_conversion"]
-
 Repairs = tuple[Repair, ...]
 
 FINALISTS = 8

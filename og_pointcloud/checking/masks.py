@@ -18,8 +18,6 @@ from og_pointcloud.checking.sample import Comparison, Sample, seen
 from og_pointcloud.cloud import unit_rows
 from og_pointcloud.scene import Camera
 
-__all__ = ["MaskMaps", "entropies", "read_mask_maps"]
-
 Ids = NDArray[np.integer]
 Places = NDArray[np.float64]
 

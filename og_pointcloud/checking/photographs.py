@@ -19,8 +19,6 @@ from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.images import require_cv2
 from og_pointcloud.scene import Camera, View
 
-__all__ = ["LONGEST_PX", "Floats", "Photographs", "centered", "read_photographs", "shrunk"]
-
 Floats = NDArray[np.float32]
 
 LONGEST_PX = 192

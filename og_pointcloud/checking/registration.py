@@ -19,8 +19,6 @@ from og_pointcloud.checking.sample import seen
 from og_pointcloud.formats.repairs import Repair, rotation_of_vector
 from og_pointcloud.scene import Camera
 
-__all__ = ["GROUPS", "MORE_POINTS", "Registration", "Small"]
-
 Doubles = NDArray[np.float64]
 
 LEVELS = (24, 48, 96, LONGEST_PX)

@@ -12,8 +12,6 @@ from og_pointcloud.formats.poses import in_local_frame
 from og_pointcloud.formats.repairs import KINDS, Repair, repaired_cameras
 from og_pointcloud.scene import Camera, Scene, View
 
-__all__ = ["CELLS", "Comparison", "Sample", "Seen", "draw_sample", "grid_shape", "seen"]
-
 VIEWS = 12
 POINTS = 20_000
 CELLS = 48

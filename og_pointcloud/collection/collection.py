@@ -25,8 +25,6 @@ from og_pointcloud.text.encoder import TextEncoder, export_command, find_encoder
 from og_pointcloud.text.text_features import read_text_features
 from og_pointcloud.text.words import TextFeatures
 
-__all__ = ["Collection", "Finding", "Findings"]
-
 TOP = 20
 SAME_WORD = 0.95
 """Cosine from which two names are one word, which does not compete with itself: "mug" and "a mug"."""

@@ -26,8 +26,6 @@ from og_pointcloud.journal import LeftOut, with_bar
 from og_pointcloud.kernels import use_threads
 from og_pointcloud.settings import FitSettings
 
-__all__ = ["CaptureFit", "FitOptions", "fit_capture", "fit_many"]
-
 LOST = "lost"
 """The worker of a fit that no worker brought to an end."""
 

@@ -28,8 +28,6 @@ from og_pointcloud.collection.store import Atlas, SceneEntry
 from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.journal import with_bar
 
-__all__ = ["Changes", "Family", "Group", "families", "index"]
-
 SAME_ENCODER = 0.5
 """Mean cosine of the words that two scenes share, above which one encoder made both: the same word in other templates
 has about 0.9, in another encoder's space about 0."""

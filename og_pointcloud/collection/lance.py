@@ -21,8 +21,6 @@ from og_pointcloud.collection.scoring import Block, load_block
 from og_pointcloud.collection.store import Atlas
 from og_pointcloud.errors import MissingExtraError, OgPointcloudError
 
-__all__ = ["FEW_SCENES", "LanceTables", "write_lance"]
-
 INDEXED_FROM = 50_000
 """Rows from which a table has an index; fewer are all looked at."""
 ROWS_A_PARTITION = 4_000

@@ -21,8 +21,6 @@ from og_pointcloud.cloud import WordBank, unit_rows
 from og_pointcloud.collection.store import Atlas, SceneEntry
 from og_pointcloud.settings import ChoosingSettings
 
-__all__ = ["Block", "load_block", "share"]
-
 RELEVANCY_TEMPERATURE = 10.0
 """Factor of the cosines in LERF's relevancy (Kerr et al., Language Embedded Radiance Fields, ICCV 2023, Sec. 3.4):
 of its released code, the paper gives none."""

@@ -28,8 +28,6 @@ from og_pointcloud.ask.choosing import Standard
 from og_pointcloud.cloud import InstanceTable, Vocabulary, WordBank
 from og_pointcloud.errors import OgPointcloudError
 
-__all__ = ["Atlas", "SceneEntry"]
-
 APPLICATION, VERSION = 0x4F474154, 2
 """SQLite's application_id and user_version of an atlas; the second is raised when older ones cannot be read."""
 SCHEMA = (

@@ -24,8 +24,6 @@ from scipy.sparse import csr_array
 from og_pointcloud.cloud import InstanceTable
 from og_pointcloud.fitting.mask_table import MaskTable, weights_by_instance
 
-__all__ = ["describe_instances", "directions", "part_of", "robust_mean", "shown_of_instance"]
-
 MOSTLY = 0.5
 """A part lies mostly in one mask of its parent: more than this share of what a view shows of it, in more than this
 share of the views."""

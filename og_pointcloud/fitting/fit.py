@@ -28,8 +28,6 @@ from og_pointcloud.rendering.surface import Surface, reconstruct_surface
 from og_pointcloud.scene import Scene
 from og_pointcloud.settings import FitSettings
 
-__all__ = ["Prepared", "fit", "fit_prepared", "front_surfaces", "prepare"]
-
 
 def fit(
     scene: Scene,

@@ -30,8 +30,6 @@ from og_pointcloud.fitting.mask_table import MaskTable
 from og_pointcloud.fitting.view_votes import ViewVotes
 from og_pointcloud.settings import GroupingSettings
 
-__all__ = ["MaskGroups", "group_masks", "indicator"]
-
 
 @dataclass(frozen=True)
 class MaskGroups:

@@ -26,8 +26,6 @@ from og_pointcloud.rendering.surface import sight_thickness
 from og_pointcloud.scene import Points, View
 from og_pointcloud.settings import FitSettings
 
-__all__ = ["ScaleChoice", "agreement", "choose_scale", "note_scale"]
-
 FEWEST_VIEWS = 4
 """Fewer cannot be halved so that views of one half contradict each other."""
 

@@ -17,8 +17,6 @@ from og_pointcloud.fitting.association import directions, shown_of_instance
 from og_pointcloud.fitting.mask_table import MaskTable
 from og_pointcloud.fitting.view_votes import ViewVotes
 
-__all__ = ["Looks", "by_look", "looks_of_groups"]
-
 LEAST_MASKS = 4
 """Masks that a look has at least: fewer are apart by chance, or are wrong."""
 QUANTILE = 0.1

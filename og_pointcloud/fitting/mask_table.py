@@ -27,8 +27,6 @@ from og_pointcloud.rendering.sightings import sightings
 from og_pointcloud.rendering.splatting import Gaussians, ViewWeights, view_weights
 from og_pointcloud.scene import NOT_SEEN, Camera, Scene, View
 
-__all__ = ["MaskTable", "SparseRows", "mask_table", "require_sight", "view_fingerprint", "weights_by_instance"]
-
 Result = TypeVar("Result")
 
 SEEN_THROUGH = 0.1

@@ -41,8 +41,6 @@ from og_pointcloud.rendering.geometry import Neighbourhood
 from og_pointcloud.rendering.splatting import Gaussians
 from og_pointcloud.settings import MembershipSettings
 
-__all__ = ["Membership", "assign_points", "without_see_through"]
-
 ENTRIES_AT_ONCE = 1 << 26
 """Entries of the votes that are sorted by point at once: half a gigabyte."""
 

@@ -18,18 +18,6 @@ from numpy.typing import DTypeLike, NDArray
 
 from og_pointcloud.errors import OgPointcloudError
 
-__all__ = [
-    "free_memory",
-    "in_file",
-    "memory_in_use",
-    "memory_left",
-    "parse_memory",
-    "peak_memory",
-    "scratch_array",
-    "scratch_like",
-    "scratch_root",
-]
-
 UNITS = {"": 1, "K": 10**3, "M": 10**6, "G": 10**9, "T": 10**12}
 LEAST = 64 * 10**6
 """Less memory than this is a mistyped unit."""

@@ -31,8 +31,6 @@ from og_pointcloud.rendering.geometry import neighbourhood, sample_of_points
 from og_pointcloud.rendering.surface import Surface
 from og_pointcloud.settings import FitSettings
 
-__all__ = ["Reliability", "likely_cause", "split_half"]
-
 SAME_LOOK = 0.5
 """Cosine of descriptors, without what all masks share, from which two instances are of one look. Unrelated things have
 about 0; 0.3 and 0.7 rank scenes of the zoo as well."""

@@ -18,8 +18,6 @@ from og_pointcloud.fitting.memory import free_memory
 from og_pointcloud.journal import Journal
 from og_pointcloud.kernels import use_threads
 
-__all__ = ["LocalWorkers", "Share", "cores_here", "dask_executor", "run_tasks", "share_here"]
-
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 

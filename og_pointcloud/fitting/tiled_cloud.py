@@ -18,8 +18,6 @@ from og_pointcloud.rendering.geometry import Neighbourhood, neighbourhood
 from og_pointcloud.scene import Points
 from og_pointcloud.settings import FitSettings, GeometrySettings
 
-__all__ = ["TiledCloud", "Tiles", "split", "vanished"]
-
 MARGIN = 32.0
 """How far a tile looks over its borders, in spacings of its sparser points: what decides a point lies nearer."""
 PROBES = 2_000

@@ -56,9 +56,6 @@ from og_pointcloud.rendering.surface import (
 from og_pointcloud.scene import Camera, Scene, View
 from og_pointcloud.settings import FitSettings
 
-__all__ = ["fit_tiles", "needs_tiles"]
-
-
 SAMPLE_STEP = 50
 """Masks are grouped by at least one in so many points, also where that is more than a whole fit would take."""
 FINEST_PX = 0.35

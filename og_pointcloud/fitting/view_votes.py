@@ -22,8 +22,6 @@ from og_pointcloud.fitting.mask_table import MaskTable
 from og_pointcloud.fitting.memory import scratch_like
 from og_pointcloud.kernels import njit
 
-__all__ = ["ViewVotes", "view_votes"]
-
 OPENNESS_POWER = 2
 """Exponent of the relative exposure. 1 believes too much of what shines through, 4 too little of thick surfaces."""
 

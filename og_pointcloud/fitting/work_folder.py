@@ -28,8 +28,6 @@ from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.fitting.memory import scratch_root
 from og_pointcloud.formats.atomic import locked, replacing
 
-__all__ = ["WorkFolder", "fingerprint", "kept_files"]
-
 SUFFIX = ".kept.npy"
 """Ends the names of all files of a work folder, so that files of others are left alone."""
 ALIGNED = 64

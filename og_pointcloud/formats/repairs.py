@@ -40,11 +40,6 @@ from og_pointcloud.formats.mask_files import MaskLayer
 from og_pointcloud.formats.poses import PosedImage, quaternion_of, read_json, rigid, rotation_of_quaternion
 from og_pointcloud.scene import Camera
 
-__all__ = [
-    "KINDS", "MASK_FLIPS", "MASK_SHIFTS", "REPAIRS_NAME", "Kind", "Repair", "read_repairs", "repaired_cameras",
-    "repaired_images", "repaired_layers", "rotation_of_vector",
-]  # fmt: skip
-
 Doubles = NDArray[np.float64]
 
 REPAIRS_NAME = "repairs.json"

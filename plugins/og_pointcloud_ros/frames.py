@@ -20,8 +20,6 @@ from og_pointcloud.scene import Camera
 from og_pointcloud_ros.messages import NANOSECONDS, nanoseconds
 from og_pointcloud_ros.pointcloud2 import read_fields
 
-__all__ = ["WHOLE", "FrameAssembler", "image_array"]
-
 WHOLE = ("depth", "masks", "features")
 """What a frame waits for."""
 ENCODINGS = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4", "32SC1": "i4", "rgb8": "u1", "bgr8": "u1", "mono8": "u1"}

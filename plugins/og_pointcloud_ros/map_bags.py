@@ -16,8 +16,6 @@ from og_pointcloud_ros.bags import _decoded, _messages, _transforms, open_bag, r
 from og_pointcloud_ros.frames import WHOLE, FrameAssembler
 from og_pointcloud_ros.transforms import TransformTree
 
-__all__ = ["BagFrames"]
-
 IMAGE, INFO, CLOUD = "sensor_msgs/msg/Image", "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/PointCloud2"
 PENDING = 100
 """Stamps that wait for their other messages; masks come seconds after their image."""

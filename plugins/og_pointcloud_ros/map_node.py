@@ -38,8 +38,6 @@ from og_pointcloud_ros.frames import FrameAssembler
 from og_pointcloud_ros.messages import ros_messages, time_message
 from og_pointcloud_ros.node import QUIET_S, RETRY_S, latest_only, pose_at, run, told
 
-__all__ = ["MapNode", "main"]
-
 PARAMETERS = {"map": "", "target_frame": "map", "feature_space": "unknown", "max_age": 2.0}
 """With their defaults; config/map.yaml explains them."""
 INPUTS = {"depth": Image, "masks": Image, "color": Image, "features": PointCloud2, "info": CameraInfo}
