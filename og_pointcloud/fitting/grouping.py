@@ -157,7 +157,7 @@ class _Witnesses:
 def _witnesses(share: csr_array, container: csr_array, table: MaskTable, settings: GroupingSettings) -> _Witnesses:
     views = int(table.mask_view.max(initial=-1)) + 1
     speaks = (container @ indicator(table.mask_view, views).T).toarray().astype(np.float64)
-    hears, followed = speaks, csr_array(container.shape, dtype=np.float32)
+    hears, followed = speaks, indicator(np.full(len(speaks), -1, np.int32), len(speaks))  # no pair
     if table.mask_track is not None:
         track = np.unique(np.maximum(table.mask_track, -1), return_inverse=True)[1] - (table.mask_track < 0).any()
         tracks = indicator(track.astype(np.int32), int(track.max(initial=-1)) + 1)

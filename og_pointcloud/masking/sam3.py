@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,7 +65,7 @@ class FollowedWords:
         # As after a failed attempt: it would fetch code and run it.
         sys.modules[type(self._loaded.model).__module__].cv_utils_kernel = False  # pyright: ignore
         device, self._step = self._loaded.device, 0
-        self._session = transformers.Sam3VideoInferenceSession(
+        self._session: Any = transformers.Sam3VideoInferenceSession(
             inference_device=device, inference_state_device=device, video_storage_device=device, dtype=torch.float32
         )
         for word, tokens in zip(words, _tokens(self._loaded, words), strict=True):
