@@ -10,13 +10,11 @@ from numpy.typing import NDArray
 from og_pointcloud.cloud import FeatureSpace
 from og_pointcloud.errors import FeatureSpaceError, SceneError
 from og_pointcloud.formats.poses import in_local_frame
-from og_pointcloud.mapping.sight import AGREES, MeasuredView, view_of_depth
+from og_pointcloud.mapping.sight import AGREES, MeasuredView, states_of_points, view_of_depth
 from og_pointcloud.scene import Camera, View
 
 __all__ = ["Frame", "checked", "require_same_place"]
 
-COMPARED = 4000
-"""Points of the map, at most, by which a frame's depth is held against it."""
 FEWEST_COMPARED = 200
 """Fewer say nothing: the frame looks at a part of the place that the map does not know."""
 CELLS, FRONT = 16, 1.2
@@ -134,15 +132,14 @@ def _depth(frame: Frame, origin: NDArray[np.float64], camera: Camera, name: str)
     return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
 
 
-def require_same_place(stamp: float, view: MeasuredView, xyz: NDArray[np.float32], states: NDArray[np.int8]) -> None:
+def require_same_place(stamp: float, view: MeasuredView, xyz: NDArray[np.float32], tolerance: float) -> None:
     """SceneError where a frame's depth contradicts nearly all of the map's points before it: pose or unit are wrong.
 
-    xyz: (n, 3) points of the map that the frame might see, some of them hidden by others; states: what it says of them.
+    xyz: (n, 3) points of the map about the frame, some of them hidden by others. tolerance: as of `states_of_points`.
     What moves is a small part of a place; a pose that is off moves all of it. A frame that hardly meets the map is let
     through.
     """
-    step = 1 + len(xyz) // COMPARED
-    uv_px, z = view.camera.project(xyz[::step])
+    uv_px, z = view.camera.project(xyz)
     inside = view.camera.shows(uv_px)
     column, row = uv_px[inside].astype(np.intp).T
     measured, z = view.depth[row, column], z[inside]
@@ -153,7 +150,7 @@ def require_same_place(stamp: float, view: MeasuredView, xyz: NDArray[np.float32
     met = (measured > 0) & (z < FRONT * nearest[cell])
     if np.count_nonzero(met) < FEWEST_COMPARED:
         return
-    agreeing = float((states[::step][inside][met] == AGREES).mean())
+    agreeing = float((states_of_points(xyz[inside][met], tolerance, view) == AGREES).mean())
     if agreeing >= LEAST_AGREEING:
         return
     low, middle, high = np.percentile(measured[met] / z[met], [12.5, 50, 87.5])

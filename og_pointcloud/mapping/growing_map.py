@@ -15,9 +15,9 @@ from og_pointcloud.mapping.changes import SCATTER, TOLERANCE
 from og_pointcloud.mapping.frame import CheckedFrame
 from og_pointcloud.mapping.kept_views import KeptViews
 from og_pointcloud.mapping.presence import Presence
-from og_pointcloud.mapping.sight import AGREES, lens_of
+from og_pointcloud.mapping.sight import AGREES, THROUGH, MeasuredView, lens_of, states_in_packets
 from og_pointcloud.mapping.tracks import NO_TRACK, PointVotes, Tracks
-from og_pointcloud.mapping.voxels import VoxelPoints
+from og_pointcloud.mapping.voxels import BRICK, Packets, VoxelPoints
 from og_pointcloud.scene import Camera
 
 __all__ = ["GrowingMap"]
@@ -28,6 +28,8 @@ SLANT = 0.15
 """Cosine between ray and surface below which a reading is no point: edges of depth images fly."""
 MOST_ODDS = 3.0
 """Frames that history counts for at most."""
+COMPARED = 4000
+"""Points, about, by which a frame's depth is held against the map."""
 RECENT_FRAMES = 4096
 """Stamps of frames that are remembered: those that a journal still holds are not integrated twice."""
 
@@ -56,7 +58,9 @@ class GrowingMap:
     ) -> GrowingMap:  # fmt: skip
         """Without a point. grows: whether frames add some. scatter: standard deviation of points off their surface."""
         tolerance = max(TOLERANCE * spacing, SCATTER * scatter)
-        return cls(origin, space, VoxelPoints(spacing, grows), Presence(tolerance, MOST_ODDS))
+        return cls(
+            origin, space, VoxelPoints(spacing, grows, packets=Packets(BRICK * spacing)), Presence(tolerance, MOST_ODDS)
+        )
 
     def grow(self) -> None:
         """Room for what is known of each point."""
@@ -65,17 +69,25 @@ class GrowingMap:
 
     def in_view(self, camera: Camera, margin: float = 0.0) -> NDArray[np.int32]:
         """Rows of the points that are there and fall into an image, or within a share ``margin`` of it."""
-        pose, points = camera.world_to_camera, self.points
-        inside = _inside(points.xyz, points.alive, pose, lens_of(camera), margin, camera.width, camera.height)
-        return np.flatnonzero(inside).astype(np.int32)
+        packets = self.points.packets
+        chosen = packets.before(camera, self.points.edge, margin=margin)
+        rows, filled = packets.rows[chosen], packets.filled[chosen]
+        lens, size = lens_of(camera), (camera.width, camera.height)
+        inside = _inside(rows, filled, self.points.xyz, self.points.weight, camera.world_to_camera, lens, margin, *size)
+        return np.sort(rows[inside])
 
-    def judge(
-        self, rows: NDArray[np.int32], states: NDArray[np.int8], frame: CheckedFrame
-    ) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-        """Presence of points by a frame's states of them: rows of those that it measures, and that leave by it."""
-        presence = self.presence
-        presence.take(rows, self.points.xyz[rows], states, frame.camera.center, frame.stamp)
-        return rows[states == AGREES], rows[(presence.odds[rows] < -1) & (presence.refuted[rows] > 1)]
+    def compared(self, camera: Camera) -> NDArray[np.int32]:
+        """Rows of a few points about an image, by which a frame is held against the map."""
+        packets = self.points.packets
+        rows = packets.some(packets.before(camera, self.points.edge), COMPARED)
+        return rows[self.points.weight[rows] > 0]
+
+    def judge(self, view: MeasuredView, stamp: float) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+        """Presence by what a view measures: rows of points that it bears out, and of those that leave by it."""
+        rows, states = states_in_packets(self.points, self.presence.tolerance, view)
+        presence, through = self.presence, rows[states == THROUGH]
+        presence.take(rows, self.points.xyz, states, view.camera.center, stamp)
+        return rows[states == AGREES], through[(presence.odds[through] < -1) & (presence.refuted[through] > 1)]
 
     def add(self, frame: CheckedFrame) -> NDArray[np.int32]:
         """The readings of a frame, as dense as the map, but for those at a slant; rows of the new points."""
@@ -104,6 +116,13 @@ class GrowingMap:
         everyone = np.arange(self.points.n, dtype=np.int32)
         return np.where(self.points.alive, self.votes.best(everyone, self.tracks.root), NO_TRACK)
 
+    def rows_of(self, track: int) -> NDArray[np.int32]:
+        """Rows of the points of a track, ascending; only its surroundings are gone through."""
+        (low, high), edge = self.tracks.tracks[track].box, self.points.edge
+        rows = self.points.packets.within(low - edge, high + edge)
+        rows = rows[self.points.weight[rows] > 0]
+        return np.sort(rows[self.votes.best(rows, self.tracks.root) == track])
+
     def forget(self, rows: NDArray[np.int32]) -> None:
         """What was known of points that left, or whose thing did."""
         self.votes.track[rows], self.votes.weight[rows] = NO_TRACK, 0
@@ -130,7 +149,9 @@ class GrowingMap:
             if view.stamp in corrected:
                 camera = replace(view.camera, world_to_camera=corrected[view.stamp])
                 self.kept.views[index] = replace(view, camera=camera)
-        self.points.rehash()
+        self.points.refile()
+        for heaviest in self.votes.track[: self.points.n].T:
+            self.tracks.place(self.points.xyz, np.arange(self.points.n), heaviest)
         self.sequence += 1
 
     def count(self, stamp: float) -> None:
@@ -140,18 +161,20 @@ class GrowingMap:
 
 
 @njit(cache=True, parallel=True, nogil=True)
-def _inside(xyz, alive, pose, lens, margin, width, height):  # noqa: ANN001, ANN202
+def _inside(rows, filled, xyz, weight, pose, lens, margin, width, height):  # noqa: ANN001, ANN202
     fx, fy, cx, cy = lens
-    inside = np.zeros(len(xyz), np.bool_)
-    for i in prange(len(xyz)):
-        if alive[i]:
-            x, y, z = xyz[i, 0], xyz[i, 1], xyz[i, 2]
-            depth = pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] * z + pose[2, 3]
-            if depth > 0:
-                u = fx * (pose[0, 0] * x + pose[0, 1] * y + pose[0, 2] * z + pose[0, 3]) / depth + cx
-                v = fy * (pose[1, 0] * x + pose[1, 1] * y + pose[1, 2] * z + pose[1, 3]) / depth + cy
-                across, down = margin * width, margin * height
-                inside[i] = -across <= u < width + across and -down <= v < height + down
+    across, down = margin * width, margin * height
+    inside = np.zeros(rows.shape, np.bool_)
+    for packet in prange(len(rows)):
+        for k in range(filled[packet]):
+            i = rows[packet, k]
+            if weight[i] > 0:
+                x, y, z = xyz[i, 0], xyz[i, 1], xyz[i, 2]
+                depth = pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] * z + pose[2, 3]
+                if depth > 0:
+                    u = fx * (pose[0, 0] * x + pose[0, 1] * y + pose[0, 2] * z + pose[0, 3]) / depth + cx
+                    v = fy * (pose[1, 0] * x + pose[1, 1] * y + pose[1, 2] * z + pose[1, 3]) / depth + cy
+                    inside[packet, k] = -across <= u < width + across and -down <= v < height + down
     return inside
 
 

@@ -32,7 +32,7 @@ from og_pointcloud.mapping.kept_views import KeptView, KeptViews
 from og_pointcloud.mapping.likeness import Look
 from og_pointcloud.mapping.presence import Presence
 from og_pointcloud.mapping.tracks import Left, PointVotes, Track, Tracks
-from og_pointcloud.mapping.voxels import VoxelHash, VoxelPoints
+from og_pointcloud.mapping.voxels import Packets, VoxelHash, VoxelPoints
 from og_pointcloud.scene import Camera
 
 __all__ = ["MapJournal", "packed", "unpacked"]
@@ -40,8 +40,8 @@ __all__ = ["MapJournal", "packed", "unpacked"]
 KINDS = {
     kind.__name__: kind
     for kind in (
-        Camera, FeatureSpace, Frame, GrowingMap, KeptView, KeptViews, Left, Look, PointVotes, Presence, Track, Tracks,
-        VoxelHash, VoxelPoints,
+        Camera, FeatureSpace, Frame, GrowingMap, KeptView, KeptViews, Left, Look, Packets, PointVotes, Presence, Track,
+        Tracks, VoxelHash, VoxelPoints,
     )
 }  # fmt: skip
 """Records that a file may hold, by name."""

@@ -33,9 +33,9 @@ class MapObject:
 
 def objects_of(known: GrowingMap) -> list[MapObject]:
     """By id: objects that two frames or more have shown, and those that left."""
-    owners, found = known.owners(), []
+    found = []
     for id_, k in sorted(known.tracks.by_id().items()):
-        track, rows = known.tracks.tracks[k], np.flatnonzero(owners == k)
+        track, rows = known.tracks.tracks[k], known.rows_of(k)
         if track.left:
             place, size, state = track.left.place, track.left.size, "gone"
         elif len(rows):
@@ -69,7 +69,7 @@ def leave(known: GrowingMap, died: NDArray[np.int32], stamp: float) -> list[int]
 def _has_left(known: GrowingMap, k: int) -> bool:
     """Whether most of a track's visible points left; then the others leave too, but for what was measured since."""
     track = known.tracks.tracks[k]
-    rows = np.flatnonzero(known.owners() == k).astype(np.int32)
+    rows = known.rows_of(k)
     still = rows[known.presence.odds[rows] > 0]
     if len(track.lost) <= MOST * (len(track.lost) + len(still)):
         return False
@@ -87,14 +87,14 @@ def name(known: GrowingMap, new: list[int], gone: list[int]) -> tuple[tuple[int,
     if not new and not gone:
         return (), ()
     tracks, by_id = known.tracks.tracks, known.tracks.by_id()
-    owners = known.owners() if any(track.left for track in tracks) else None
+    anything_left = any(track.left for track in tracks)
     since = min((tracks[by_id[old]].last_seen for old in gone if old in by_id), default=np.inf)
     ids, moved = [], []
     for k in (*new, *(k for k in by_id.values() if tracks[k].named_at >= since)):
         track = tracks[k]
         if known.tracks.root[k] != k or track.left or (k in new and track.id >= 0):
             continue
-        rows = np.zeros(0, np.int64) if owners is None else np.flatnonzero(owners == k)
+        rows = known.rows_of(k) if anything_left else np.zeros(0, np.int32)
         old = _recognized(known, track, rows) if len(rows) >= FEWEST_POINTS else None
         if old is not None:
             moved.append(_returned(known, old, track, rows))
@@ -123,7 +123,7 @@ def _recognized(known: GrowingMap, track: Track, rows: NDArray[np.integer]) -> i
     return recognized(_look(known, track, rows), left, typical)
 
 
-def _returned(known: GrowingMap, old: int, track: Track, rows: NDArray[np.int64]) -> Moved:
+def _returned(known: GrowingMap, old: int, track: Track, rows: NDArray[np.int32]) -> Moved:
     """Give a track the id of what left."""
     gone = known.tracks.tracks[known.tracks.by_id()[old]]
     assert gone.left is not None

@@ -30,7 +30,7 @@ from og_pointcloud.mapping.map_objects import MapObject, leave, name, objects_of
 from og_pointcloud.mapping.map_record import MapRecord
 from og_pointcloud.mapping.merging import merge
 from og_pointcloud.mapping.seeing import drawn_points, measured_points, vote
-from og_pointcloud.mapping.sight import DiscSurface, states_of_points
+from og_pointcloud.mapping.sight import DiscSurface
 from og_pointcloud.mapping.tracks import Left, Track
 from og_pointcloud.rendering.geometry import Neighbourhood, neighbourhood
 from og_pointcloud.scene import Points, require_finite
@@ -99,6 +99,8 @@ class Mapper:
         self._base = None if start is None else as_scene(start).cloud
         self._map: GrowingMap | None = None
         self._around: Neighbourhood | None = None  # of a known cloud
+        self._rows = np.zeros(0, np.int64)  # of its points, in their order
+        self._spacing_by_row = np.zeros(0, np.float32)
         self._labelled: tuple[int, LabelledScene] | None = None
         self._changes: Changes | None = None
         if self._base is not None:
@@ -115,7 +117,8 @@ class Mapper:
         spacing = float(np.median(self._around.spacing)) if spacing is None else spacing
         scatter = DiscSurface(points.xyz, self._around).scatter if len(points) > 1 else 0.0
         self._map = GrowingMap.empty(points.origin, space, spacing, grows=grows, scatter=scatter)
-        self._map.points.add_known(points.xyz, points.rgb)
+        self._rows = self._map.points.add_known(points.xyz, points.rgb)
+        self._spacing_by_row = self._around.spacing[np.argsort(self._rows)]
         self._map.grow()
         return self._map
 
@@ -135,8 +138,10 @@ class Mapper:
         for k, entry in record.gone.items():
             place, size = np.array(entry.place), np.full(3, entry.length)
             known.tracks.tracks[k].left = Left(entry.look(table, k), place, size)
-        labelled_ = np.flatnonzero(base.instance_ids >= 0).astype(np.int32)
-        known.votes.add(labelled_, base.instance_ids[labelled_], np.full(len(labelled_), KNOWN_VOTES, np.float32))
+        of = base.instance_ids >= 0
+        rows, ids = self._rows[of], base.instance_ids[of]
+        known.votes.add(rows, ids, np.full(len(rows), KNOWN_VOTES, np.float32))
+        known.tracks.place(known.points.xyz, rows, ids)
 
     @property
     def _began_with(self) -> str:
@@ -176,19 +181,17 @@ class Mapper:
         """
         start = time.perf_counter()
         given, known = self._checked(frame)
-        rows = known.in_view(given.camera)
-        states = np.zeros(0, np.int8)
         if given.view is not None:
-            states = states_of_points(known.points.xyz[rows], known.presence.tolerance, given.view)
-            require_same_place(given.stamp, given.view, known.points.xyz[rows], states)
+            some = known.points.xyz[known.compared(given.camera)]
+            require_same_place(given.stamp, given.view, some, known.presence.tolerance)
         # From here on the map changes, and nothing is refused any more.
         self._map, known.stamp = known, max(known.stamp, given.stamp)
-        died, new, again = rows[:0], [], []
+        rows, died, new, again = np.zeros(0, np.int32), np.zeros(0, np.int32), [], []
         if given.view is not None:
-            measured, died = known.judge(rows, states, given)
+            measured, died = known.judge(given.view, given.stamp)
             rows = np.concatenate([measured, known.add(given)])
         if len(given.features):
-            drawn = None if given.view else drawn_points(given, known, self._around, self.settings.geometry)
+            drawn = None if given.view else drawn_points(given, known, self._spacing_by_row, self.settings.geometry)
             new, again = vote(given, known, drawn or measured_points(given, known, rows))
         gone = leave(known, died, given.stamp)
         new_ids, moved = name(known, new, gone)
@@ -260,10 +263,11 @@ class Mapper:
 
     def _label(self, known: GrowingMap) -> LabelledCloud:
         """The points that are there, labelled by the batch rule, with the ids that objects have."""
-        chosen = known.points.alive
+        chosen, around = known.points.alive, self._around
         if self._base is not None:
             chosen &= known.presence.seen_at[: known.points.n] > -np.inf
-        rows, around = np.flatnonzero(chosen), self._around
+        rows = np.concatenate([self._rows, np.arange(len(self._rows), known.points.n)])
+        rows = rows[chosen[rows]]
         if around is None or len(around.spacing) != len(rows):
             around = neighbourhood(known.points.xyz[rows], self.settings.geometry)
         visit = labelled(known, rows, around, self.settings)
@@ -278,10 +282,10 @@ class Mapper:
 
     def _folded(self, base: LabelledCloud, visit: LabelledCloud, known: GrowingMap) -> LabelledCloud:
         """The map that was gone on with, and this visit."""
-        n = len(base)
-        alive, odds = known.points.alive[:n], known.presence.odds[:n]
+        alive, presence = known.points.alive[self._rows], known.presence
+        again = alive & presence.present[self._rows], ~alive | presence.absent[self._rows]
         earlier, later = Visit(base), Visit(visit)
-        found = compare_visits(earlier, later, (alive & (odds > 0), ~alive | known.presence.absent[:n]))
+        found = compare_visits(earlier, later, again)
         updated = merge(earlier, later, found, "frames", known.stamp)
         self._changes = updated.changes
         return updated.cloud

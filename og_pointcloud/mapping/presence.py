@@ -58,8 +58,8 @@ class Presence(Columns):
         self, rows: NDArray[np.integer], xyz: NDArray[np.float32], states: NDArray[np.int8],
         center: NDArray[np.float64], stamp: float,
     ) -> None:  # fmt: skip
-        """Take in the states (m,) of some points, seen from a centre. What is older than a point's latest word is not
-        counted: a frame that comes late cannot bring back what has left since."""
+        """Take in the states (m,) of some rows of xyz (n, 3), seen from a centre. What is older than a point's
+        latest word is not counted: a frame that comes late cannot bring back what has left since."""
         self.hidden[rows[states == HIDDEN]] = True
         _count(rows, xyz, states, center, stamp, self.most, self.odds, self.refuted, self.seen_at, self.first)
 
@@ -86,7 +86,7 @@ def _count(rows, xyz, states, center, stamp, most, odds, refuted, seen_at, first
             continue
         odds[i] = max(odds[i] - 1, -most)
         if refuted[i] < 2:
-            x, y, z = center[0] - xyz[k, 0], center[1] - xyz[k, 1], center[2] - xyz[k, 2]
+            x, y, z = center[0] - xyz[i, 0], center[1] - xyz[i, 1], center[2] - xyz[i, 2]
             length = max(np.sqrt(x * x + y * y + z * z), 1e-12)
             x, y, z = x / length, y / length, z / length
             if refuted[i] == 0:

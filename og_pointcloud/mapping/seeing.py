@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from og_pointcloud.mapping.frame import CheckedFrame
 from og_pointcloud.mapping.growing_map import GrowingMap
 from og_pointcloud.mapping.kept_views import KeptView
-from og_pointcloud.rendering.geometry import Neighbourhood, isotropic
+from og_pointcloud.rendering.geometry import isotropic
 from og_pointcloud.rendering.sightings import Sightings, openness, sightings_of
 from og_pointcloud.rendering.splatting import NEAR_SHARE
 from og_pointcloud.rendering.surface import sight_thickness
@@ -46,15 +46,14 @@ def measured_points(frame: CheckedFrame, known: GrowingMap, rows: NDArray[np.int
 
 
 def drawn_points(
-    frame: CheckedFrame, known: GrowingMap, around: Neighbourhood | None, geometry: GeometrySettings
+    frame: CheckedFrame, known: GrowingMap, spacing: NDArray[np.float32], geometry: GeometrySettings
 ) -> Seen:
-    """The points that a frame without depth sees, by the map's own surface. around: of its points, if it is known."""
+    """The points that a frame without depth sees, by the map's own surface. spacing: of the first rows, those known
+    from the beginning."""
     camera, typical = frame.camera, known.points.edge
     rows = known.in_view(camera, MARGIN)
     xyz = known.points.xyz[rows]
-    spacing = np.full(len(rows), typical, np.float32)
-    if around is not None and len(around.spacing) == known.points.n:
-        spacing = around.spacing[rows]
+    spacing = np.append(spacing, np.float32(typical))[np.minimum(rows, len(spacing))]
     drawn = isotropic(Points(xyz, np.zeros(3)), spacing, geometry.middle_scale, geometry.opacity)
     depth = xyz @ camera.world_to_camera[2, :3] + camera.world_to_camera[2, 3]
     near = NEAR_SHARE * float(np.median(depth)) if len(depth) else 1e-6
@@ -84,4 +83,5 @@ def vote(frame: CheckedFrame, known: GrowingMap, seen: Seen) -> tuple[list[int],
     known.kept.offer(view, float(np.median(away)) if len(away) else 0.0)
     seen_at[points] = np.maximum(seen_at[points], frame.stamp)
     weight = seen.found.openness.data.astype(np.float32)
-    return known.tracks.observe(known.votes, points, seen.mask, weight, frame.features, (frame.stamp, known.sequence))
+    when = frame.stamp, known.sequence
+    return known.tracks.observe(known.votes, known.points.xyz, points, seen.mask, weight, frame.features, when)

@@ -15,8 +15,9 @@ does a table's edge before the table, at a slant. Absence is told by THROUGH alo
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +25,7 @@ from numpy.typing import NDArray
 from og_pointcloud.formats.capture import depth_files, read_poses
 from og_pointcloud.formats.poses import in_local_frame
 from og_pointcloud.kernels import njit, prange
+from og_pointcloud.mapping.voxels import VoxelPoints
 from og_pointcloud.rendering.geometry import Neighbourhood, neighbourhood
 from og_pointcloud.scene import Camera
 from og_pointcloud.settings import GeometrySettings
@@ -37,6 +39,7 @@ __all__ = [
     "MeasuredView",
     "depth_views",
     "lens_of",
+    "states_in_packets",
     "states_of_points",
     "view_of_depth",
 ]
@@ -74,11 +77,20 @@ class MeasuredView:
     depth: NDArray[np.float32]
     normal: NDArray[np.float32]
     noise: float
+    _asked: dict[float, tuple[Any, ...]] = field(default_factory=dict, repr=False, compare=False)
 
     @property
     def pixel(self) -> float:
         """Length that a pixel spans at the median depth; of a view that measures something."""
         return float(np.median(self.depth[self.depth > 0]) / np.sqrt(self.camera.fx * self.camera.fy))
+
+    def asked(self, tolerance: float) -> tuple[Any, ...]:
+        """What `_state_of` takes after the point. tolerance: beside the view's noise."""
+        if tolerance not in self._asked:
+            within, lens = float(np.hypot(tolerance, 3 * self.noise)), lens_of(self.camera)
+            planes = _planes_of(self.depth, self.normal, lens, within)
+            self._asked[tolerance] = within, self.camera.world_to_camera, lens, *planes
+        return self._asked[tolerance]
 
 
 class DiscSurface:
@@ -131,7 +143,11 @@ def view_of_depth(depth: NDArray[np.float32], camera: Camera) -> MeasuredView:
         lens = camera.fx / step, camera.fy / step, camera.cx / step, camera.cy / step
         camera = Camera(width, height, *lens, camera.world_to_camera)
         depth = np.where(np.isfinite(far), far, 0).astype(np.float32)
-    return MeasuredView(camera, depth, *_normals(depth, lens_of(camera)))
+    normal, second = _normals(depth, lens_of(camera))
+    second = second[np.isfinite(second)]
+    # A second difference of three readings of one noise has its deviation times the root of 6.
+    noise = 1.4826 * float(np.median(second)) / np.sqrt(6.0) if len(second) else 0.0
+    return MeasuredView(camera, depth, normal, noise)
 
 
 def depth_views(capture: str | Path, origin: NDArray[np.float64]) -> Iterator[MeasuredView] | None:
@@ -144,8 +160,20 @@ def depth_views(capture: str | Path, origin: NDArray[np.float64]) -> Iterator[Me
 
 def states_of_points(xyz: NDArray[np.float32], tolerance: float, view: MeasuredView) -> NDArray[np.int8]:
     """(n,) int8: NOTHING, AGREES, HIDDEN or THROUGH. tolerance: beside the view's noise, same unit as xyz (n, 3)."""
-    camera, tolerance = view.camera, float(np.hypot(tolerance, 3 * view.noise))
-    return _states(xyz, tolerance, camera.world_to_camera, lens_of(camera), view.depth, view.normal, SLANT)
+    return _states(xyz, *view.asked(tolerance))
+
+
+def states_in_packets(
+    points: VoxelPoints, tolerance: float, view: MeasuredView
+) -> tuple[NDArray[np.int32], NDArray[np.int8]]:
+    """Rows of the points that a view measures or sees through, and which of both: AGREES or THROUGH. As
+    `states_of_points` has it for all of them, but only those packets are gone through that its surfaces do not hide."""
+    asked, packets = view.asked(tolerance), points.packets
+    chosen = packets.before(view.camera, points.edge, asked[-1])
+    rows = packets.rows[chosen]
+    states = _states_of_rows(rows, packets.filled[chosen], points.xyz, points.weight, *asked)
+    told = (states == AGREES) | (states == THROUGH)
+    return rows[told], states[told]
 
 
 def lens_of(camera: Camera) -> NDArray[np.float64]:
@@ -214,15 +242,15 @@ def _draw_discs(xyz, normal, radius, pose, lens, height, width, near):  # noqa: 
     return depth, facing
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, parallel=True, nogil=True)
 def _normals(depth, lens):  # noqa: ANN001, ANN202
-    """(h, w, 3) normals of a depth image, towards the camera, and its noise: what second differences leave."""
+    """(h, w, 3) normals of a depth image, towards the camera; and of every fourth pixel along each axis the second
+    difference of its depths, NaN where one is missing."""
     fx, fy, cx, cy = lens
     height, width = depth.shape
     normal = np.zeros((height, width, 3), np.float32)
-    second = np.zeros((height // 4 + 1) * (width // 4 + 1))
-    count = 0
-    for row in range(height):
+    second = np.full((height // 4 + 1, width // 4 + 1), np.nan)
+    for row in prange(height):
         for column in range(width):
             z = depth[row, column]
             if z <= 0:
@@ -239,11 +267,8 @@ def _normals(depth, lens):  # noqa: ANN001, ANN202
             length = np.sqrt(a * a + b * b + c * c)
             normal[row, column] = a / length, b / length, c / length
             if row % 4 == 0 and column % 4 == 0 and before > 0 and after > 0:
-                second[count] = abs(before + after - 2 * z)
-                count += 1
-    # A second difference of three readings of one noise has its deviation times the root of 6.
-    noise = 1.4826 * np.median(second[:count]) / np.sqrt(6.0) if count else 0.0
-    return normal, noise
+                second[row // 4, column // 4] = abs(before + after - 2 * z)
+    return normal, second
 
 
 @njit(cache=True, nogil=True)
@@ -256,47 +281,83 @@ def _step(here, before, after):  # noqa: ANN001, ANN202
     return here - before
 
 
-@njit(cache=True, parallel=True, nogil=True)
-def _states(xyz, tolerance, pose, lens, depth, normal, slant):  # noqa: ANN001, ANN202
-    """The state of each point, by its distance from the surfaces in the 3 x 3 pixels around its own."""
+@njit(cache=True, parallel=True, nogil=True, error_model="numpy")
+def _planes_of(depth, normal, lens, tolerance):  # noqa: ANN001, ANN202
+    """(h, w, 5): normal, offset (normal . x of the plane) and depth of each pixel, together as they are read; and
+    (h, w) the depth behind which no surface in the 3 x 3 pixels can hold a point, 0 where nothing is measured."""
     fx, fy, cx, cy = lens
     height, width = depth.shape
-    states = np.zeros(len(xyz), np.int8)
+    planes, own, beyond = np.empty((height, width, 5), np.float32), np.zeros(depth.shape), np.zeros(depth.shape)
+    # Products of a normal and the rays to two points that are a pixel and a half apart differ by no more than this.
+    turn = 1.5 * np.sqrt(1 / fx**2 + 1 / fy**2)
+    for row in prange(height):
+        for column in range(width):
+            z, n = depth[row, column], normal[row, column]
+            slope = n[0] * (column + 0.5 - cx) / fx + n[1] * (row + 0.5 - cy) / fy + n[2]
+            planes[row, column, :3], planes[row, column, 3], planes[row, column, 4] = n, z * slope, z
+            if z > 0:
+                own[row, column] = max(z + tolerance, (tolerance + z * abs(slope)) / max(abs(slope) - turn, SLANT))
+    for row in prange(height):
+        for column in range(width):
+            for r in range(max(row - 1, 0), min(row + 2, height)):
+                for c in range(max(column - 1, 0), min(column + 2, width)):
+                    beyond[row, column] = max(beyond[row, column], own[r, c])
+    return planes, beyond
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _state_of(p, tolerance, pose, lens, planes, beyond):  # noqa: ANN001, ANN202
+    """The state of a point, by its distance from the surfaces in the 3 x 3 pixels around its own."""
+    x, y, z = _turned(pose, p)
+    x, y, z = x + pose[0, 3], y + pose[1, 3], z + pose[2, 3]
+    if z <= 0:
+        return NOTHING
+    u, v = lens[0] * x / z + lens[2], lens[1] * y / z + lens[3]
+    height, width = beyond.shape
+    if not (0 <= u < width and 0 <= v < height):
+        return NOTHING
+    column, row = int(u), int(v)
+    if z > beyond[row, column]:
+        return HIDDEN if beyond[row, column] > 0 else NOTHING
+    length = np.sqrt(x * x + y * y + z * z)
+    behind, before, unsure = 0, 0, 0
+    for k in range(9):  # its own pixel first: it mostly settles the matter
+        r, c = row - 1 + (k + 4) % 9 // 3, column - 1 + (k + 4) % 3
+        if not (0 <= r < height and 0 <= c < width) or planes[r, c, 4] <= 0:
+            continue
+        # How far the point lies before the pixel's plane; and before its surface, along the ray.
+        along = planes[r, c, 0] * x + planes[r, c, 1] * y + planes[r, c, 2] * z
+        across, deeper = along - planes[r, c, 3], planes[r, c, 4] - z
+        on_ray = abs(deeper) * length / z
+        slanted = abs(along) < SLANT * length
+        if abs(across) <= tolerance and (on_ray <= tolerance or not slanted):
+            return AGREES
+        if slanted and on_ray > tolerance:
+            unsure += deeper > 0
+            before += deeper < 0
+        elif across < 0:
+            before += 1
+        else:
+            behind += 1
+    if before > 0:
+        return HIDDEN
+    return THROUGH if behind >= 3 and unsure == 0 else NOTHING
+
+
+@njit(cache=True, parallel=True, nogil=True, error_model="numpy")
+def _states(xyz, tolerance, pose, lens, planes, beyond):  # noqa: ANN001, ANN202
+    states = np.empty(len(xyz), np.int8)
     for i in prange(len(xyz)):
-        x, y, z = _turned(pose, xyz[i])
-        x, y, z = x + pose[0, 3], y + pose[1, 3], z + pose[2, 3]
-        if z <= 0:
-            continue
-        u, v = np.floor(fx * x / z + cx), np.floor(fy * y / z + cy)
-        if not (0 <= u < width and 0 <= v < height):
-            continue
-        column, row = int(u), int(v)
-        length = np.sqrt(x * x + y * y + z * z)
-        behind, before, unsure = 0, 0, 0
-        agrees = False
-        for r in range(max(row - 1, 0), min(row + 2, height)):
-            for c in range(max(column - 1, 0), min(column + 2, width)):
-                if depth[r, c] <= 0:
-                    continue
-                nx, ny, nz = normal[r, c]
-                dx, dy = (c + 0.5 - cx) / fx, (r + 0.5 - cy) / fy
-                # How far the point lies before the pixel's plane; and before its surface, along the ray.
-                across = nx * x + ny * y + nz * z - depth[r, c] * (nx * dx + ny * dy + nz)
-                on_ray = abs(depth[r, c] - z) * np.sqrt(dx * dx + dy * dy + 1)
-                slanted = abs(nx * x + ny * y + nz * z) < slant * length
-                if abs(across) <= tolerance and (on_ray <= tolerance or not slanted):
-                    agrees = True
-                elif slanted and on_ray > tolerance:
-                    unsure += depth[r, c] > z
-                    before += depth[r, c] < z
-                elif across < 0:
-                    before += 1
-                else:
-                    behind += 1
-        if agrees:
-            states[i] = AGREES
-        elif before > 0:
-            states[i] = HIDDEN
-        elif behind >= 3 and unsure == 0:
-            states[i] = THROUGH
+        states[i] = _state_of((xyz[i, 0], xyz[i, 1], xyz[i, 2]), tolerance, pose, lens, planes, beyond)
+    return states
+
+
+@njit(cache=True, parallel=True, nogil=True, error_model="numpy")
+def _states_of_rows(rows, filled, xyz, weight, tolerance, pose, lens, planes, beyond):  # noqa: ANN001, ANN202
+    states = np.zeros(rows.shape, np.int8)
+    for packet in prange(len(rows)):
+        for k in range(filled[packet]):
+            i = rows[packet, k]
+            if weight[i] > 0:
+                states[packet, k] = _state_of((xyz[i, 0], xyz[i, 1], xyz[i, 2]), tolerance, pose, lens, planes, beyond)
     return states

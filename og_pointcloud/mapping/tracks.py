@@ -73,7 +73,8 @@ class Track:
     """total: (D,) sum of unit features by pixels; pixels: their sum; agreement: sum of cosines by pixels. views, masks:
     how many showed it; last_seen, sequence: the stamp and the number of the last frame that did, 0 for an earlier map.
     id: of the object, NO_TRACK while it is provisional; named_at: the stamp at which it got it. moved: it has been
-    elsewhere. lost: rows of its points that were seen through, losing_since: from that stamp on; left: when most were.
+    elsewhere. box: (2, 3) lowest and highest place of points that voted for it. lost: rows of its points that were seen
+    through, losing_since: from that stamp on; left: when most were.
     """
 
     total: NDArray[np.float64] | None = None
@@ -86,9 +87,14 @@ class Track:
     id: int = NO_TRACK
     named_at: float = -np.inf
     moved: bool = False
+    box: NDArray[np.float64] = field(default_factory=lambda: np.array([[np.inf] * 3, [-np.inf] * 3]))
     lost: list[int] = field(default_factory=list)
     losing_since: float = -np.inf
     left: Left | None = None
+
+    def reach(self, box: NDArray[np.float64]) -> None:
+        """Become as large as a box (2, 3)."""
+        self.box = np.stack([np.minimum(self.box[0], box[0]), np.maximum(self.box[1], box[1])])
 
     def take_in(self, other: Track) -> None:
         """Become both."""
@@ -97,6 +103,7 @@ class Track:
         for name in ("pixels", "agreement", "masks", "lost"):
             setattr(self, name, getattr(self, name) + getattr(other, name))
         self.moved |= other.moved
+        self.reach(other.box)
         for name in ("views", "last_seen", "sequence"):
             setattr(self, name, max(getattr(self, name), getattr(other, name)))
 
@@ -141,26 +148,35 @@ class Tracks:
         self.pairs = {(int(number[a]), int(number[b])): c for (a, b), c in self.pairs.items() if {a, b} <= among}
         self.tracks, self.root = [self.tracks[k] for k in kept], np.arange(len(kept), dtype=np.int32)
 
+    def place(self, xyz: NDArray[np.float32], points: NDArray[np.integer], track: NDArray[np.int32]) -> None:
+        """Let the boxes of tracks reach the points (m,), rows of xyz (n, 3), that voted for them (m,)."""
+        boxes = _boxes(xyz, points, track, len(self.tracks))
+        for k in np.flatnonzero(np.isfinite(boxes[:, 0, 0])):
+            self.tracks[self.root[k]].reach(boxes[k])
+
     def by_id(self) -> dict[int, int]:
         """Object id -> its track, of those that have not been joined into another."""
         return {track.id: k for k, track in enumerate(self.tracks) if track.id >= 0 and self.root[k] == k}
 
     def observe(
-        self, votes: PointVotes, points: NDArray[np.int32], mask: NDArray[np.int32], weight: NDArray[np.float32],
-        features: NDArray[np.float32], when: tuple[float, int],
+        self, votes: PointVotes, xyz: NDArray[np.float32], points: NDArray[np.int32], mask: NDArray[np.int32],
+        weight: NDArray[np.float32], features: NDArray[np.float32], when: tuple[float, int],
     ) -> tuple[list[int], list[int]]:  # fmt: skip
-        """Take in what a frame shows: points (m,), each in a mask or in -1, with a weight. features: (M, D).
-        when: its stamp and sequence.
+        """Take in what a frame shows: points (m,), rows of xyz (n, 3), each in a mask or in -1, with a weight.
+        features: (M, D). when: its stamp and sequence.
 
         Returns the tracks that are objects now and want an id, and those with one that were seen again.
         """
         own = votes.best(points, self.root)
         seen, place = np.unique(own, return_inverse=True)
-        shown = np.zeros((len(features) + 1, len(seen)))  # the last row: in no mask
-        np.add.at(shown, (mask, place), weight)
+        rows = np.where(mask < 0, len(features), mask)  # the last row: in no mask
+        shown = np.bincount(rows * len(seen) + place, weight, (len(features) + 1) * len(seen))
+        shown = shown.reshape(len(features) + 1, len(seen))
         of_tracks, seen = shown[:, seen >= 0], seen[seen >= 0]
         of_mask = self._belonging(of_tracks, shown.sum(axis=1), seen)
-        votes.add(points, np.append(of_mask, NO_TRACK).astype(np.int32)[mask], weight)
+        of_point = np.append(of_mask, NO_TRACK).astype(np.int32)[mask]
+        votes.add(points, of_point, weight)
+        self.place(xyz, points, of_point)
         self._witness(of_tracks[:-1], of_tracks.sum(axis=0), seen)
         return self._describe(of_mask, shown.sum(axis=1), features, when)
 
@@ -235,6 +251,19 @@ class Tracks:
             elif track.id >= 0:
                 again.append(k)
         return new, again
+
+
+@njit(cache=True, nogil=True)
+def _boxes(xyz, points, track, count):  # noqa: ANN001, ANN202
+    """(count, 2, 3): lowest and highest place of the points of each track, infinite without one."""
+    boxes = np.empty((count, 2, 3))
+    boxes[:, 0], boxes[:, 1] = np.inf, -np.inf
+    for i in range(len(points)):
+        if track[i] >= 0:
+            box = boxes[track[i]]
+            for a in range(3):
+                box[0, a], box[1, a] = min(box[0, a], xyz[points[i], a]), max(box[1, a], xyz[points[i], a])
+    return boxes
 
 
 @njit(cache=True, nogil=True)

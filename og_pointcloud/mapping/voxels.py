@@ -1,6 +1,7 @@
 """Points of a growing map: one a voxel of the map's spacing, in arrays that only grow, found by a hash of the voxel.
 
 What is measured again moves its point towards the mean. A point keeps its row for good: votes and evidence refer to it.
+Rows are also filed by place, in packets of neighbours, so that a frame looks through those before its camera alone.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.kernels import njit
+from og_pointcloud.scene import Camera
 
 __all__ = ["Columns", "VoxelHash", "VoxelPoints"]
 
@@ -20,6 +22,12 @@ ACROSS = 1 << 20
 MOST_WEIGHT = 32.0
 """Readings that a point's mean counts for at most, so that it follows."""
 EMPTY = np.int64(-1)
+BRICK = 16
+"""Voxels along each side of a brick, whose points share packets: at first. Bricks become larger while packets of 128
+rows are filled to less than LEAST_FILLED."""
+PACKET, LEAST_FILLED, MANY_PACKETS = 128, 0.25, 64
+TILE = 16
+"""Pixels along each side of the parts of an image by which packets are held against what hides them."""
 
 
 @dataclass
@@ -45,6 +53,67 @@ class VoxelHash:
     keys: NDArray[np.int64] = field(default_factory=lambda: np.full(4096, EMPTY))
     rows: NDArray[np.int32] = field(default_factory=lambda: np.zeros(4096, np.int32))
 
+    def reserve(self, count: int) -> None:
+        """Stay less than half full with so many keys."""
+        if 2 * count > len(self.keys):
+            size, before = 1 << int(2 * count - 1).bit_length(), (self.keys, self.rows)
+            self.keys, self.rows = np.full(size, EMPTY), np.zeros(size, np.int32)
+            _refill(*before, self.keys, self.rows)
+
+
+@dataclass
+class Packets(Columns):
+    """Rows of points, filed by brick. rows: (packets, PACKET) int32; filled: (packets,) int32, how many of them; low,
+    high: (packets, 3) float32, the box of their points when they were filed. side: of a brick.
+    filed: points so far; count: packets. open: the packet of each brick that has room."""
+
+    side: float
+    filed: int = 0
+    count: int = 0
+    open: VoxelHash = field(default_factory=VoxelHash)
+    rows: NDArray[np.int32] = field(default_factory=lambda: np.zeros((0, PACKET), np.int32))
+    filled: NDArray[np.int32] = field(default_factory=lambda: np.zeros(0, np.int32))
+    low: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 3), np.float32))
+    high: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 3), np.float32))
+
+    def file(self, xyz: NDArray[np.float32]) -> None:
+        """File the points (n, 3) that are not yet."""
+        while self.filed < len(xyz):
+            self.grow(self.count + 1 + (len(xyz) - self.filed) // PACKET)
+            self.open.reserve(len(self.rows))
+            packets = self.rows, self.filled, self.low, self.high
+            self.filed, self.count = _file(
+                xyz, self.side, self.open.keys, self.open.rows, *packets, self.filed, self.count
+            )
+            if self.count > MANY_PACKETS and self.filed < LEAST_FILLED * PACKET * self.count:
+                self.side, self.filed, self.count, self.open = 2 * self.side, 0, 0, VoxelHash()
+                self.filled[:] = 0
+
+    def before(
+        self, camera: Camera, edge: float, hidden_from: NDArray[np.floating] | None = None, margin: float = 0.0
+    ) -> NDArray[np.int64]:
+        """Packets that may have points in an image, or within a share ``margin`` of it. edge: how far points may have
+        moved since they were filed. hidden_from: (h, w) depth at and behind which nothing is asked for; None: nowhere.
+        """
+        farthest = np.zeros((0, 0)) if hidden_from is None else _tile_maxima(hidden_from)
+        lens, size = np.array([camera.fx, camera.fy, camera.cx, camera.cy]), (camera.width, camera.height)
+        boxes = self.low[: self.count], self.high[: self.count]
+        return np.flatnonzero(_before(*boxes, edge, camera.world_to_camera, lens, *size, margin, farthest))
+
+    def within(self, low: NDArray[np.floating], high: NDArray[np.floating]) -> NDArray[np.int32]:
+        """Rows of the packets that meet a box."""
+        meets = (self.low[: self.count] <= high).all(axis=1) & (self.high[: self.count] >= low).all(axis=1)
+        packets = np.flatnonzero(meets)
+        return self.rows[packets][np.arange(PACKET) < self.filled[packets, None]]
+
+    def some(self, packets: NDArray[np.int64], count: int) -> NDArray[np.int32]:
+        """About so many rows of some packets, evenly chosen; all where there are fewer."""
+        ends = np.cumsum(self.filled[packets])
+        total = int(ends[-1]) if len(ends) else 0
+        place = np.arange(0, total, 1 + total // count)
+        packet = np.searchsorted(ends, place, side="right")
+        return self.rows[packets[packet], place - (ends - self.filled[packets])[packet]]
+
 
 @dataclass
 class VoxelPoints(Columns):
@@ -55,6 +124,7 @@ class VoxelPoints(Columns):
     grows: bool
     n: int = 0
     hash: VoxelHash = field(default_factory=VoxelHash)
+    packets: Packets = field(default_factory=lambda: Packets(0.0))
     _xyz: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 3), np.float32))
     _rgb: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 3), np.float32))
     weight: NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
@@ -83,14 +153,17 @@ class VoxelPoints(Columns):
         """(n,) int32, the frame that a point was first seen by, -1 for points that no frame brought."""
         return self._anchor[: self.n]
 
-    def add_known(self, xyz: NDArray[np.float32], rgb: NDArray[np.uint8] | None) -> None:
-        """Points that are kept as they are, several in a voxel if they are so dense."""
+    def add_known(self, xyz: NDArray[np.float32], rgb: NDArray[np.uint8] | None) -> NDArray[np.int64]:
+        """Points that are kept as they are, several in a voxel if they are so dense. (n,) their rows: neighbours have
+        rows close to each other."""
+        order = np.argsort(_keys(xyz, self.packets.side), kind="stable")
         self._reserve(len(xyz))
         rows = slice(self.n, self.n + len(xyz))
-        self._xyz[rows], self.weight[rows], self._anchor[rows] = xyz, MOST_WEIGHT, -1
-        self._rgb[rows] = 128 if rgb is None else rgb
+        self._xyz[rows], self.weight[rows], self._anchor[rows] = xyz[order], MOST_WEIGHT, -1
+        self._rgb[rows] = 128 if rgb is None else rgb[order]
         self.n += len(xyz)
-        self.rehash()
+        self.refile()
+        return np.argsort(order) + rows.start
 
     def add(self, xyz: NDArray[np.float32], rgb: NDArray[np.uint8], anchor: int) -> None:
         """Take measured points (m, 3) in: into the mean of their voxel's point, or as a new one."""
@@ -98,20 +171,26 @@ class VoxelPoints(Columns):
             self._reserve(len(xyz))
             arrays = self._xyz, self._rgb, self.weight, self._anchor
             self.n = _insert(xyz, rgb, anchor, self.edge, self.hash.keys, self.hash.rows, *arrays, self.n)
+            self.packets.file(self.xyz)
 
-    def rehash(self) -> None:
+    def refile(self) -> None:
         """After points were moved."""
         self.hash.keys[:] = EMPTY
         _index(self.xyz, self.edge, self.hash.keys, self.hash.rows)
+        self.packets = Packets(self.packets.side)
+        self.packets.file(self.xyz)
 
     def _reserve(self, more: int) -> None:
-        """Room for so many more points; the hash stays less than half full."""
-        need = self.n + more
-        self.grow(need)
-        if 2 * need > len(self.hash.keys):
-            size = 1 << int(2 * need - 1).bit_length()
-            self.hash = VoxelHash(np.full(size, EMPTY), np.zeros(size, np.int32))
-            self.rehash()
+        """Room for so many more points."""
+        self.grow(self.n + more)
+        self.hash.reserve(self.n + more)
+
+
+def _tile_maxima(image: NDArray[np.floating]) -> NDArray[np.floating]:
+    """The largest value in each TILE x TILE part of an image without negative ones."""
+    height, width = image.shape
+    padded = np.pad(image, ((0, -height % TILE), (0, -width % TILE)))
+    return padded.reshape(-(-height // TILE), TILE, -1, TILE).max(axis=(1, 3))
 
 
 @njit(cache=True, nogil=True)
@@ -125,6 +204,14 @@ def _key(x, y, z, edge):  # noqa: ANN001, ANN202
 
 
 @njit(cache=True, nogil=True)
+def _keys(xyz, edge):  # noqa: ANN001, ANN202
+    keys = np.empty(len(xyz), np.int64)
+    for i in range(len(xyz)):
+        keys[i] = _key(xyz[i, 0], xyz[i, 1], xyz[i, 2], edge)
+    return keys
+
+
+@njit(cache=True, nogil=True)
 def _slot(key, keys):  # noqa: ANN001, ANN202
     """Where a key is, or would be put: linear probing from its hash."""
     mask = np.uint64(len(keys) - 1)
@@ -133,6 +220,73 @@ def _slot(key, keys):  # noqa: ANN001, ANN202
     while keys[slot] != key and keys[slot] != EMPTY:
         slot = (slot + np.uint64(1)) & mask
     return slot
+
+
+@njit(cache=True, nogil=True)
+def _refill(old_keys, old_rows, keys, rows):  # noqa: ANN001, ANN202
+    for k in range(len(old_keys)):
+        if old_keys[k] != EMPTY:
+            slot = _slot(old_keys[k], keys)
+            keys[slot], rows[slot] = old_keys[k], old_rows[k]
+
+
+@njit(cache=True, nogil=True)
+def _file(xyz, side, keys, open_, rows, filled, low, high, first, count):  # noqa: ANN001, ANN202
+    """Puts points from ``first`` on into the open packet of their brick. Returns how many points and packets there are
+    then: where packets run out, there are points left."""
+    for i in range(first, len(xyz)):
+        if count == len(rows):
+            return i, count
+        key = _key(xyz[i, 0], xyz[i, 1], xyz[i, 2], side)
+        slot = _slot(key, keys)
+        if keys[slot] == EMPTY or filled[open_[slot]] == PACKET:
+            keys[slot], open_[slot] = key, count
+            low[count] = high[count] = xyz[i]
+            count += 1
+        packet = open_[slot]
+        rows[packet, filled[packet]] = i
+        filled[packet] += 1
+        low[packet], high[packet] = np.minimum(low[packet], xyz[i]), np.maximum(high[packet], xyz[i])
+    return len(xyz), count
+
+
+@njit(cache=True, nogil=True)
+def _span(x, z, reach, focal, middle, tiles):  # noqa: ANN001, ANN202
+    """The first and the last tile that a sphere before the camera, or a pixel beside it, may lie in, along one axis."""
+    low = (x - reach) / (z - reach if x < reach else z + reach)
+    high = (x + reach) / (z - reach if x > -reach else z + reach)
+    first, last = (focal * low + middle - 1) // TILE, (focal * high + middle + 1) // TILE
+    return int(min(max(first, 0), tiles - 1)), int(min(max(last, 0), tiles - 1))
+
+
+@njit(cache=True, nogil=True)
+def _before(low, high, edge, pose, lens, width, height, margin, farthest):  # noqa: ANN001, ANN202
+    """(packets,) bool: whether the sphere around a box meets the frustum, before what hides it."""
+    fx, fy, cx, cy = lens
+    across, down = margin * width, margin * height
+    # The four sides of the frustum go through the camera; their normals point inwards.
+    sides = np.array([
+        (fx, 0.0, cx + across), (-fx, 0.0, width + across - cx), (0.0, fy, cy + down), (0.0, -fy, height + down - cy)
+    ])  # fmt: skip
+    for side in range(4):
+        sides[side] /= np.sqrt((sides[side] ** 2).sum())
+    meets = np.zeros(len(low), np.bool_)
+    for k in range(len(low)):
+        p, q, r = low[k, 0] + high[k, 0], low[k, 1] + high[k, 1], low[k, 2] + high[k, 2]
+        x = (pose[0, 0] * p + pose[0, 1] * q + pose[0, 2] * r) / 2 + pose[0, 3]
+        y = (pose[1, 0] * p + pose[1, 1] * q + pose[1, 2] * r) / 2 + pose[1, 3]
+        z = (pose[2, 0] * p + pose[2, 1] * q + pose[2, 2] * r) / 2 + pose[2, 3]
+        p, q, r = high[k, 0] - low[k, 0], high[k, 1] - low[k, 1], high[k, 2] - low[k, 2]
+        reach = 2 * edge + np.sqrt(p * p + q * q + r * r) / 2
+        inside = z > -reach
+        for side in range(4):
+            inside &= sides[side, 0] * x + sides[side, 1] * y + sides[side, 2] * z > -reach
+        if inside and len(farthest) and z > reach:
+            left, right = _span(x, z, reach, fx, cx, farthest.shape[1])
+            top, bottom = _span(y, z, reach, fy, cy, farthest.shape[0])
+            inside = farthest[top : bottom + 1, left : right + 1].max() > z - reach
+        meets[k] = inside
+    return meets
 
 
 @njit(cache=True, nogil=True)
