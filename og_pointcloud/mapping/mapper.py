@@ -140,7 +140,7 @@ class Mapper:
             known.tracks.tracks[k].left = Left(entry.look(table, k), place, size)
         of = base.instance_ids >= 0
         rows, ids = self._rows[of], base.instance_ids[of]
-        known.votes.add(rows, ids, np.full(len(rows), KNOWN_VOTES, np.float32))
+        known.votes.add(rows, ids, np.full(len(rows), KNOWN_VOTES, np.float32), np.zeros(len(table), np.bool_))
         known.tracks.place(known.points.xyz, rows, ids)
 
     @property

@@ -52,9 +52,13 @@ class PointVotes(Columns):
         """(m,) the track, after joins, with the most votes of each point; NO_TRACK without any."""
         return _best(points, self.track, self.weight, root)
 
-    def add(self, points: NDArray[np.integer], track: NDArray[np.int32], weight: NDArray[np.float32]) -> None:
-        """Votes of (m,) points for a track each; NO_TRACK takes from the heaviest: seen, and in no mask."""
-        _add(points, track, weight, self.track, self.weight)
+    def add(
+        self, points: NDArray[np.integer], track: NDArray[np.int32], weight: NDArray[np.float32],
+        masked: NDArray[np.bool_],
+    ) -> None:  # fmt: skip
+        """Votes of (m,) points for the track whose mask each lies in, NO_TRACK for none; and against those others that
+        have a mask in this frame too, (tracks,) bool. A track that the proposer missed gets no vote."""
+        _add(points, track, weight, masked, self.track, self.weight)
 
 
 @dataclass(frozen=True)
@@ -175,7 +179,8 @@ class Tracks:
         of_tracks, seen = shown[:, seen >= 0], seen[seen >= 0]
         of_mask = self._belonging(of_tracks, shown.sum(axis=1), seen)
         of_point = np.append(of_mask, NO_TRACK).astype(np.int32)[mask]
-        votes.add(points, of_point, weight)
+        masked = np.isin(self.root, self.root[of_mask[of_mask >= 0]])
+        votes.add(points, of_point, weight, masked)
         self.place(xyz, points, of_point)
         self._witness(of_tracks[:-1], of_tracks.sum(axis=0), seen)
         return self._describe(of_mask, shown.sum(axis=1), features, when)
@@ -286,22 +291,20 @@ def _best(points, track, weight, root):  # noqa: ANN001, ANN202
 
 
 @njit(cache=True, nogil=True)
-def _add(points, new, amount, track, weight):  # noqa: ANN001, ANN202
+def _add(points, new, amount, masked, track, weight):  # noqa: ANN001, ANN202
     for i in range(len(points)):
         p, t = points[i], new[i]
-        heaviest, lightest = 0, 0
-        place = -1
+        lightest, place = 0, -1
         for a in range(HEAVIEST):
-            if track[p, a] == t and t >= 0:
+            if track[p, a] == t:
                 place = a
-            if weight[p, a] > weight[p, heaviest]:
-                heaviest = a
+            elif track[p, a] >= 0 and masked[track[p, a]]:
+                weight[p, a] = max(weight[p, a] - amount[i], np.float32(0))
             if weight[p, a] < weight[p, lightest]:
                 lightest = a
         if t < 0:
-            # Seen in no mask: a proposer misses often, so it is a small word against.
-            weight[p, heaviest] = max(weight[p, heaviest] - np.float32(0.25) * amount[i], np.float32(0))
-        elif place >= 0:
+            continue
+        if place >= 0:
             weight[p, place] = min(weight[p, place] + amount[i], np.float32(MOST_VOTES))
         elif weight[p, lightest] <= amount[i]:
             track[p, lightest], weight[p, lightest] = t, amount[i]
