@@ -17,7 +17,7 @@ from og_pointcloud.mapping.kept_views import KeptViews
 from og_pointcloud.mapping.presence import Presence
 from og_pointcloud.mapping.sight import AGREES, THROUGH, MeasuredView, lens_of, states_in_packets
 from og_pointcloud.mapping.tracks import NO_TRACK, PointVotes, Tracks
-from og_pointcloud.mapping.voxels import BRICK, Packets, VoxelPoints
+from og_pointcloud.mapping.voxels import VoxelPoints
 from og_pointcloud.scene import Camera
 
 __all__ = ["GrowingMap"]
@@ -37,7 +37,8 @@ RECENT_FRAMES = 4096
 @dataclass
 class GrowingMap:
     """origin: (3,), world = local + origin. spacing: of points. anchors: stamp and pose of each frame that brought
-    points. sequence: frames so far; stamp: the latest of all; recent: those of the last ones."""
+    points. sequence: of the next frame; 0 stands for what was known before the first. stamp: the latest of all; recent:
+    those of the last ones."""
 
     origin: NDArray[np.float64]
     space: FeatureSpace
@@ -47,7 +48,7 @@ class GrowingMap:
     tracks: Tracks = field(default_factory=Tracks)
     kept: KeptViews = field(default_factory=KeptViews)
     anchors: list[tuple[float, NDArray[np.float64]]] = field(default_factory=list)
-    sequence: int = 0
+    sequence: int = 1
     stamp: float = -1.0
     recent: list[float] = field(default_factory=list)
 
@@ -58,9 +59,7 @@ class GrowingMap:
     ) -> GrowingMap:  # fmt: skip
         """Without a point. grows: whether frames add some. scatter: standard deviation of points off their surface."""
         tolerance = max(TOLERANCE * spacing, SCATTER * scatter)
-        return cls(
-            origin, space, VoxelPoints(spacing, grows, packets=Packets(BRICK * spacing)), Presence(tolerance, MOST_ODDS)
-        )
+        return cls(origin, space, VoxelPoints(spacing, grows), Presence(tolerance, MOST_ODDS))
 
     def grow(self) -> None:
         """Room for what is known of each point."""
@@ -152,12 +151,17 @@ class GrowingMap:
         self.points.refile()
         for heaviest in self.votes.track[: self.points.n].T:
             self.tracks.place(self.points.xyz, np.arange(self.points.n), heaviest)
-        self.sequence += 1
+        self.count(self.stamp)
 
     def count(self, stamp: float) -> None:
         """One more frame is in."""
         self.sequence += 1
         self.recent = [*self.recent[1 - RECENT_FRAMES :], stamp]
+
+    def stamp_of(self, sequence: int) -> float:
+        """When the frame of that number was, or the earliest that is remembered; -inf for what was known before."""
+        place = sequence - (self.sequence - len(self.recent))
+        return self.recent[max(place, 0)] if sequence > 0 else -np.inf
 
 
 @njit(cache=True, parallel=True, nogil=True)

@@ -12,7 +12,6 @@ and what was hidden change both.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,7 +25,6 @@ __all__ = [
     "Look",
     "descriptors_of",
     "likeness",
-    "recognized",
     "spread_of",
     "typical_cosine",
     "typical_of_table",
@@ -109,13 +107,6 @@ def likeness(one: Look, other: Look, typical: float) -> float:
         return -np.inf
     cosine = float((one.descriptors @ other.descriptors.T).max()) * np.sqrt((1 + one.spread) * (1 + other.spread))
     return (cosine - typical) / max(1 - typical, 1e-6)
-
-
-def recognized(look: Look, known: Mapping[int, Look], typical: float) -> int | None:
-    """The id of what looks most like it, of equals the lowest; None if nothing is ALIKE."""
-    alike = {old: likeness(of, look, typical) for old, of in known.items()}
-    best = max(alike, key=lambda old: (alike[old], -old), default=None)
-    return best if best is not None and alike[best] > ALIKE else None
 
 
 def spread_of(agreement: ArrayLike, masks: ArrayLike) -> NDArray[np.float64]:

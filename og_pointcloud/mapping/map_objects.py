@@ -7,10 +7,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud.mapping.changes import FEWEST_POINTS, MOST, Moved
+from og_pointcloud.mapping.changes import FEWEST_POINTS, FLAT_SHARE, MOST, Moved
 from og_pointcloud.mapping.growing_map import GrowingMap
-from og_pointcloud.mapping.likeness import Look, recognized, typical_cosine
-from og_pointcloud.mapping.tracks import Left, Track
+from og_pointcloud.mapping.likeness import ALIKE, Look, likeness, typical_cosine
+from og_pointcloud.mapping.tracks import NO_TRACK, Left, Track
 
 __all__ = ["MapObject", "leave", "name", "objects_of"]
 
@@ -19,7 +19,8 @@ __all__ = ["MapObject", "leave", "name", "objects_of"]
 class MapObject:
     """An object as it is known now. place: (3,) mean of its points, world coordinates; size: (3,) along the axes.
     state: "present"; "moved", present where it was not at first; "unseen", of an earlier map, where no frame has looked
-    since; or "gone", then where it was last. last_seen: the stamp."""
+    since; or "gone", then where it was last. since: the stamp from which on most of its points have been seen there,
+    -inf for those of an earlier map, inf for what left; last_seen: the stamp of the last frame that showed it."""
 
     id: int
     state: str
@@ -27,6 +28,7 @@ class MapObject:
     size: NDArray[np.float64]
     points: int
     views: int
+    since: float
     last_seen: float
     descriptor: NDArray[np.float64] | None = field(repr=False)
 
@@ -44,22 +46,24 @@ def objects_of(known: GrowingMap) -> list[MapObject]:
             state = "moved" if track.moved else "present" if looked_at else "unseen"
         else:
             continue
-        found.append(MapObject(id_, state, place, size, len(rows), track.views, track.last_seen, track.descriptor))
+        since = known.stamp_of(int(np.median(known.kept.born[rows]))) if len(rows) else np.inf
+        found.append(
+            MapObject(id_, state, place, size, len(rows), track.views, since, track.last_seen, track.descriptor)
+        )
     return found
 
 
 def leave(known: GrowingMap, died: NDArray[np.int32], stamp: float) -> list[int]:
     """Remove points that a frame of that stamp saw through; the ids of objects that left with most of theirs."""
-    if len(died) == 0:
-        return []
     owners = known.votes.best(died, known.tracks.root)
     known.points.weight[died] = 0
     gone = []
     for k in np.unique(owners[owners >= 0]).tolist():
         track = known.tracks.tracks[k]
-        if not track.lost:
-            track.losing_since = stamp
-        track.lost.extend(died[owners == k].tolist())
+        # What was measured again since is not lost: a reading that was off had removed it.
+        lost = [row for row in track.lost if known.points.weight[row] == 0]
+        track.losing_since = track.losing_since if lost else stamp
+        track.lost = lost + died[owners == k].tolist()
         if track.id >= 0 and len(track.lost) >= FEWEST_POINTS and _has_left(known, k):
             gone.append(track.id)
     known.forget(died)
@@ -68,40 +72,40 @@ def leave(known: GrowingMap, died: NDArray[np.int32], stamp: float) -> list[int]
 
 def _has_left(known: GrowingMap, k: int) -> bool:
     """Whether most of a track's visible points left; then the others leave too, but for what was measured since."""
-    track = known.tracks.tracks[k]
-    rows = known.rows_of(k)
+    track, rows = known.tracks.tracks[k], known.rows_of(k)
     still = rows[known.presence.odds[rows] > 0]
     if len(track.lost) <= MOST * (len(track.lost) + len(still)):
         return False
-    every = np.concatenate([np.array(track.lost, np.int32), rows])
-    size = np.ptp(known.points.xyz[every].astype(np.float64), axis=0)
-    track.left, track.lost = Left(_look(known, track, every), known.place_of(every), size, track.sequence), []
+    # What it stood before, and its masks held too, is still there: it looked as what left does.
+    lost = np.array(track.lost, np.int32)
+    size = np.ptp(known.points.xyz[lost].astype(np.float64), axis=0)
+    track.left, track.lost = Left(_look(known, track, lost), known.place_of(lost), size, track.sequence), []
     known.points.weight[np.setdiff1d(rows, still[known.presence.seen_at[still] >= track.losing_since])] = 0
     known.forget(rows)
     return True
 
 
-def name(known: GrowingMap, new: list[int], gone: list[int]) -> tuple[tuple[int, ...], tuple[Moved, ...]]:
-    """Ids for tracks that are objects now: of something that left, if it looks so, else the next one. And what left
-    just now may be an object already that was named since it was last seen where it stood."""
-    if not new and not gone:
-        return (), ()
-    tracks, by_id = known.tracks.tracks, known.tracks.by_id()
-    anything_left = any(track.left for track in tracks)
-    since = min((tracks[by_id[old]].last_seen for old in gone if old in by_id), default=np.inf)
-    ids, moved = [], []
-    for k in (*new, *(k for k in by_id.values() if tracks[k].named_at >= since)):
-        track = tracks[k]
-        if known.tracks.root[k] != k or track.left or (k in new and track.id >= 0):
-            continue
-        rows = known.rows_of(k) if anything_left else np.zeros(0, np.int32)
-        old = _recognized(known, track, rows) if len(rows) >= FEWEST_POINTS else None
-        if old is not None:
-            moved.append(_returned(known, old, track, rows))
-        elif track.id < 0:
-            track.id, track.named_at = known.tracks.next_id, known.stamp
-            known.tracks.next_id += 1
-            ids.append(track.id)
+def name(
+    known: GrowingMap, new: list[int], again: list[int], gone: list[int]
+) -> tuple[tuple[int, ...], tuple[Moved, ...]]:
+    """Ids for tracks that are objects now: of something that left, if it looks so, else the next one. What was named
+    before it was known that the other had left is asked again when that is, and each time its views have doubled."""
+    tracks, moved = known.tracks.tracks, []
+    asked = (
+        known.tracks.by_id().values() if gone else (k for k in again if tracks[k].views & (tracks[k].views - 1) == 0)
+    )
+    if any(track.left for track in tracks):
+        others = [track for track in tracks if track.id >= 0 and track.descriptor is not None]
+        descriptors, spread = np.array([t.descriptor for t in others]), np.array([t.spread for t in others])
+        typical = typical_cosine(descriptors, np.arange(len(others)), spread) if others else 0.0
+        for k in (*new, *asked):
+            if known.tracks.root[k] == k and not tracks[k].left:
+                moved += _returned(known, k, typical)
+    ids = []
+    for k in new:
+        if known.tracks.root[k] == k and tracks[k].id < 0:
+            tracks[k].id, known.tracks.next_id = known.tracks.next_id, known.tracks.next_id + 1
+            ids.append(tracks[k].id)
     return tuple(ids), tuple(moved)
 
 
@@ -112,21 +116,23 @@ def _look(known: GrowingMap, track: Track, rows: NDArray[np.integer]) -> Look:
     return Look.of_points(descriptor.astype(np.float32), track.spread, xyz, rgb)
 
 
-def _recognized(known: GrowingMap, track: Track, rows: NDArray[np.integer]) -> int | None:
-    """The id of what left and looks like a track of these points, if anything does. What stood here already when the
-    other was still seen there is not it."""
-    tracks = [t for t in known.tracks.tracks if t.id >= 0 and t.descriptor is not None]
-    descriptors, spread = np.array([t.descriptor for t in tracks]), np.array([t.spread for t in tracks])
-    typical = typical_cosine(descriptors, np.arange(len(tracks)), spread) if tracks else 0.0
-    came = float(np.median(known.kept.born[rows]))
-    left = {t.id: t.left.look for t in known.tracks.tracks if t.left and t.left.sequence < came}
-    return recognized(_look(known, track, rows), left, typical)
+def _returned(known: GrowingMap, k: int, typical: float) -> list[Moved]:
+    """Give a track the id of what left, if anything that left looks like it.
 
-
-def _returned(known: GrowingMap, old: int, track: Track, rows: NDArray[np.int32]) -> Moved:
-    """Give a track the id of what left."""
-    gone = known.tracks.tracks[known.tracks.by_id()[old]]
+    It looks as its points do that came after the other was last seen: a thing that has hardly any stood here already.
+    """
+    track, rows = known.tracks.tracks[k], known.rows_of(k)
+    came, alike = {}, {}
+    for old in known.tracks.tracks:
+        if old.left and old.id >= 0:
+            came[old.id] = rows[known.kept.born[rows] > old.left.sequence]
+            if len(came[old.id]) >= max(FEWEST_POINTS, FLAT_SHARE * len(rows)):
+                alike[old.id] = likeness(old.left.look, _look(known, track, came[old.id]), typical)
+    best = max(alike, key=lambda old: (alike[old], -old), default=None)
+    if best is None or alike[best] <= ALIKE:
+        return []
+    gone = known.tracks.tracks[known.tracks.by_id()[best]]
     assert gone.left is not None
-    before = gone.left.place
-    gone.id, gone.left, track.id, track.moved = -1, None, old, True
-    return Moved(old, before, known.place_of(rows), old)
+    moved = Moved(best, gone.left.place, known.place_of(came[best]), best)
+    gone.id, gone.left, track.id, track.moved = NO_TRACK, None, best, True
+    return [moved]

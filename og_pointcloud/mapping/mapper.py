@@ -194,7 +194,7 @@ class Mapper:
             drawn = None if given.view else drawn_points(given, known, self._spacing_by_row, self.settings.geometry)
             new, again = vote(given, known, drawn or measured_points(given, known, rows))
         gone = leave(known, died, given.stamp)
-        new_ids, moved = name(known, new, gone)
+        new_ids, moved = name(known, new, again, gone)
         updated = tuple(sorted(known.tracks.tracks[k].id for k in again))
         if known.sequence % PRUNED_EVERY == PRUNED_EVERY - 1:
             known.tracks.prune(known.votes, given.stamp)

@@ -76,10 +76,9 @@ class Left:
 class Track:
     """total: (D,) sum of unit features by pixels; pixels: their sum; agreement: sum of cosines by pixels. views, masks:
     how many showed it; last_seen, sequence: the stamp and the number of the last frame that did, 0 for an earlier map.
-    id: of the object, NO_TRACK while it is provisional; named_at: the stamp at which it got it. moved: it has been
-    elsewhere. box: (2, 3) lowest and highest place of points that voted for it. lost: rows of its points that were seen
-    through, losing_since: from that stamp on; left: when most were.
-    """
+    id: of the object, NO_TRACK while it is provisional. moved: it has been elsewhere. box: (2, 3) lowest and highest
+    place of points that voted for it. lost: rows of its points that were seen through, losing_since: from that stamp
+    on; left: when most were."""
 
     total: NDArray[np.float64] | None = None
     pixels: float = 0.0
@@ -89,7 +88,6 @@ class Track:
     last_seen: float = 0.0
     sequence: int = 0
     id: int = NO_TRACK
-    named_at: float = -np.inf
     moved: bool = False
     box: NDArray[np.float64] = field(default_factory=lambda: np.array([[np.inf] * 3, [-np.inf] * 3]))
     lost: list[int] = field(default_factory=list)

@@ -67,7 +67,7 @@ class Packets(Columns):
     high: (packets, 3) float32, the box of their points when they were filed. side: of a brick.
     filed: points so far; count: packets. open: the packet of each brick that has room."""
 
-    side: float
+    side: float = 0.0
     filed: int = 0
     count: int = 0
     open: VoxelHash = field(default_factory=VoxelHash)
@@ -124,11 +124,14 @@ class VoxelPoints(Columns):
     grows: bool
     n: int = 0
     hash: VoxelHash = field(default_factory=VoxelHash)
-    packets: Packets = field(default_factory=lambda: Packets(0.0))
+    packets: Packets = field(default_factory=Packets)
     _xyz: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 3), np.float32))
     _rgb: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 3), np.float32))
     weight: NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
     _anchor: NDArray[np.int32] = field(default_factory=lambda: np.zeros(0, np.int32))
+
+    def __post_init__(self) -> None:
+        self.packets.side = self.packets.side or BRICK * self.edge
 
     def __len__(self) -> int:
         return self.n
