@@ -38,7 +38,8 @@ RECENT_FRAMES = 4096
 class GrowingMap:
     """origin: (3,), world = local + origin. spacing: of points. anchors: stamp and pose of each frame that brought
     points. sequence: of the next frame; 0 stands for what was known before the first. stamp: the latest of all; recent:
-    those of the last ones."""
+    those of the last ones. spacing: of the first rows, points known from the beginning. scale: of points as frames
+    without depth see them, in spacings; None: not chosen yet; drawn: by how many such frames it was."""
 
     origin: NDArray[np.float64]
     space: FeatureSpace
@@ -51,6 +52,9 @@ class GrowingMap:
     sequence: int = 1
     stamp: float = -1.0
     recent: list[float] = field(default_factory=list)
+    spacing: NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
+    scale: float | None = None
+    drawn: int = 0
 
     @classmethod
     def empty(
@@ -74,6 +78,10 @@ class GrowingMap:
         lens, size = lens_of(camera), (camera.width, camera.height)
         inside = _inside(rows, filled, self.points.xyz, self.points.weight, camera.world_to_camera, lens, margin, *size)
         return np.sort(rows[inside])
+
+    def spacing_of(self, rows: NDArray[np.int32]) -> NDArray[np.float32]:
+        """(m,) of points; of those that frames brought the map's own."""
+        return np.append(self.spacing, np.float32(self.points.edge))[np.minimum(rows, len(self.spacing))]
 
     def compared(self, camera: Camera) -> NDArray[np.int32]:
         """Rows of a few points about an image, by which a frame is held against the map."""

@@ -6,6 +6,7 @@ second loop of the same path adds nothing. From these rows the batch rule (`fitt
 
 from __future__ import annotations
 
+import zlib
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -32,7 +33,8 @@ NEW_SHARE = 0.05
 @dataclass(frozen=True)
 class KeptView:
     """starts: (M + 2,) int32, columns, votes: rows of the masks, the last one of no mask, as in CSR; votes float16.
-    seen: (s,) int32 points, openness: (s,) float16. pixels: (M,) int32. features: (M, D) float32. sequence: when."""
+    seen: (s,) int32 points, openness: (s,) float16. pixels: (M,) int32. features: (M, D) float32. sequence: when.
+    packed: its mask image, compressed, if it had no depth: what it sees follows from how large points are drawn."""
 
     camera: Camera
     stamp: float
@@ -44,17 +46,24 @@ class KeptView:
     openness: NDArray[np.float16]
     pixels: NDArray[np.int32]
     features: NDArray[np.float32]
+    packed: NDArray[np.uint8]
 
     @classmethod
     def of(cls, frame: CheckedFrame, sequence: int, found: Sightings, rows: NDArray[np.int32]) -> KeptView:
         """What is found in a frame of the points ``rows``."""
         pixels = np.bincount(frame.ids.ravel() + 1, minlength=len(frame.features) + 1)[1:]
         masks, open_ = found.rows, found.openness
+        packed = zlib.compress(np.ascontiguousarray(frame.ids), 1) if frame.view is None else b""
         return cls(
             frame.camera, frame.stamp, sequence, masks.indptr.astype(np.int32), rows[masks.indices],
             masks.data.astype(np.float16), rows[open_.indices], open_.data.astype(np.float16), pixels.astype(np.int32),
-            frame.features,
+            frame.features, np.frombuffer(packed, np.uint8),
         )  # fmt: skip
+
+    @property
+    def masks(self) -> NDArray[np.int32]:
+        """(H, W) the mask image of a view that had no depth."""
+        return np.frombuffer(zlib.decompress(self.packed), np.int32).reshape(self.camera.height, self.camera.width)
 
     @property
     def nbytes(self) -> int:

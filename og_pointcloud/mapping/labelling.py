@@ -9,8 +9,10 @@ from numpy.typing import NDArray
 
 from og_pointcloud.cloud import InstanceTable, LabelledCloud
 from og_pointcloud.fitting.fit import Prepared, fit_prepared, front_surfaces
+from og_pointcloud.fitting.held_out import choose_scale
 from og_pointcloud.journal import Journal
 from og_pointcloud.mapping.growing_map import GrowingMap
+from og_pointcloud.mapping.seeing import seen_again
 from og_pointcloud.rendering.geometry import Neighbourhood, isotropic, near_plane
 from og_pointcloud.rendering.surface import Surface, sight_thickness
 from og_pointcloud.scene import Points, Scene, View
@@ -24,19 +26,35 @@ def labelled(known: GrowingMap, rows: NDArray[np.int64], around: Neighbourhood, 
     place = np.full(known.points.n, -1, np.int32)
     place[rows] = np.arange(len(rows), dtype=np.int32)
     points = Points(known.points.xyz[rows], known.origin, known.points.rgb[rows].astype(np.uint8))
+    settings, journal = replace(settings, mode="grouping"), Journal(progress=False)
+    _choose_scale(known, points, around.spacing, settings, journal)
     table = known.kept.table(place, len(rows))
     no_mask, width = np.zeros((0, 0), np.int32), table.mask_features.shape[1]
     no_feature = np.zeros((0, width), np.float32)
     views = tuple(View(str(k), view.camera, no_mask, no_feature) for k, view in enumerate(known.kept.views))
     scene, geometry = Scene(points, views, known.space.name, "map"), settings.geometry
-    drawn = isotropic(points, around.spacing, geometry.middle_scale, geometry.opacity)
+    drawn = isotropic(points, around.spacing, known.scale or geometry.middle_scale, geometry.opacity)
     thickness = sight_thickness(around.spacing, float(np.median(around.spacing)), geometry)
-    surface = Surface(
-        scene, None, around, drawn, near_plane(points.xyz, (view.camera for view in views)), thickness, 1, by_sight=True
-    )
-    settings, journal = replace(settings, mode="grouping"), Journal(progress=False)
+    near = near_plane(points.xyz, (view.camera for view in views))
+    surface = Surface(scene, None, around, drawn, near, thickness, 1, by_sight=True)
     table = front_surfaces(surface, table, settings, journal)
     return fit_prepared(Prepared(scene, surface, table), settings, journal)
+
+
+def _choose_scale(
+    known: GrowingMap, points: Points, spacing: NDArray[np.float32], settings: FitSettings, journal: Journal
+) -> None:
+    """Choose how large points are drawn, as `fit` does, by the kept views that had no depth, and see these anew."""
+    kept = known.kept.views
+    drawn = [k for k, view in enumerate(kept) if len(view.packed)]
+    if len(drawn) == known.drawn:
+        return
+    views = [View(f"{k:09d}", kept[k].camera, kept[k].masks, kept[k].features) for k in drawn]
+    near = near_plane(points.xyz, (view.camera for view in views))
+    scale = choose_scale(points, spacing, views, near, settings, journal).scale
+    known.drawn, before, known.scale = len(drawn), known.scale or settings.geometry.middle_scale, scale
+    for k in drawn if scale != before else ():
+        kept[k] = seen_again(kept[k], known, settings.geometry)
 
 
 def matched_ids(

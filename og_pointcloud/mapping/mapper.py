@@ -100,7 +100,6 @@ class Mapper:
         self._map: GrowingMap | None = None
         self._around: Neighbourhood | None = None  # of a known cloud
         self._rows = np.zeros(0, np.int64)  # of its points, in their order
-        self._spacing_by_row = np.zeros(0, np.float32)
         self._labelled: tuple[int, LabelledScene] | None = None
         self._changes: Changes | None = None
         if self._base is not None:
@@ -118,7 +117,7 @@ class Mapper:
         scatter = DiscSurface(points.xyz, self._around).scatter if len(points) > 1 else 0.0
         self._map = GrowingMap.empty(points.origin, space, spacing, grows=grows, scatter=scatter)
         self._rows = self._map.points.add_known(points.xyz, points.rgb)
-        self._spacing_by_row = self._around.spacing[np.argsort(self._rows)]
+        self._map.spacing = self._around.spacing[np.argsort(self._rows)]
         self._map.grow()
         return self._map
 
@@ -191,7 +190,7 @@ class Mapper:
             measured, died = known.judge(given.view, given.stamp)
             rows = np.concatenate([measured, known.add(given)])
         if len(given.features):
-            drawn = None if given.view else drawn_points(given, known, self._spacing_by_row, self.settings.geometry)
+            drawn = None if given.view else drawn_points(given, known, self.settings.geometry)
             new, again = vote(given, known, drawn or measured_points(given, known, rows))
         gone = leave(known, died, given.stamp)
         new_ids, moved = name(known, new, again, gone)

@@ -17,7 +17,7 @@ from og_pointcloud.rendering.surface import sight_thickness
 from og_pointcloud.scene import Points
 from og_pointcloud.settings import GeometrySettings
 
-__all__ = ["Seen", "drawn_points", "measured_points", "vote"]
+__all__ = ["Seen", "drawn_points", "measured_points", "seen_again", "vote"]
 
 MARGIN = 0.1
 """Share of an image beyond its border from which points are drawn, as they may hide others within."""
@@ -45,20 +45,22 @@ def measured_points(frame: CheckedFrame, known: GrowingMap, rows: NDArray[np.int
     return _seen(frame, rows[inside], np.ones(np.count_nonzero(inside), np.float32), uv_px[inside])
 
 
-def drawn_points(
-    frame: CheckedFrame, known: GrowingMap, spacing: NDArray[np.float32], geometry: GeometrySettings
-) -> Seen:
-    """The points that a frame without depth sees, by the map's own surface. spacing: of the first rows, those known
-    from the beginning."""
-    camera, typical = frame.camera, known.points.edge
-    rows = known.in_view(camera, MARGIN)
-    xyz = known.points.xyz[rows]
-    spacing = np.append(spacing, np.float32(typical))[np.minimum(rows, len(spacing))]
-    drawn = isotropic(Points(xyz, np.zeros(3)), spacing, geometry.middle_scale, geometry.opacity)
+def drawn_points(frame: CheckedFrame, known: GrowingMap, geometry: GeometrySettings) -> Seen:
+    """The points that a frame without depth sees, by the map's own surface."""
+    camera, rows = frame.camera, known.in_view(frame.camera, MARGIN)
+    xyz, spacing = known.points.xyz[rows], known.spacing_of(rows)
+    drawn = isotropic(Points(xyz, np.zeros(3)), spacing, known.scale or geometry.middle_scale, geometry.opacity)
     depth = xyz @ camera.world_to_camera[2, :3] + camera.world_to_camera[2, 3]
     near = NEAR_SHARE * float(np.median(depth)) if len(depth) else 1e-6
-    open_, u, v = openness(drawn, camera, near, sight_thickness(spacing, typical, geometry))
+    open_, u, v = openness(drawn, camera, near, sight_thickness(spacing, known.points.edge, geometry))
     return _seen(frame, rows, open_, np.stack([u, v], axis=1))
+
+
+def seen_again(view: KeptView, known: GrowingMap, geometry: GeometrySettings) -> KeptView:
+    """A kept view without depth, as points of the map's scale show it."""
+    frame = CheckedFrame(view.camera, view.masks, view.features, None, None, view.stamp)
+    seen = drawn_points(frame, known, geometry)
+    return KeptView.of(frame, view.sequence, seen.found, seen.rows)
 
 
 def _seen(
