@@ -88,7 +88,7 @@ changes = [mapper.integrate(frame) for frame in days.after]
 tuesday, after = mapper.snapshot(), {entry.id: entry for entry in mapper.objects()}
 moved = {entry.id: entry for change in changes for entry in change.moved if entry.id in before}
 gone = [k for k, entry in after.items() if entry.state == "gone" and k in before]
-new = [k for k, entry in after.items() if entry.state != "gone" and k not in before and entry.points >= 30]
+new = [k for k, entry in after.items() if k not in before and days.after[0].stamp <= entry.since < np.inf]
 
 left, after_ids = drawn(monday, tinted(monday, gone, COLORS["gone"])), tinted(tuesday, new, COLORS["new"])
 is_moved = np.isin(tuesday.instance_ids, [*moved])

@@ -6,6 +6,7 @@
     python examples/benchmark_maps.py speed CAPTURE               # ms a frame at 100,000 and 1,000,000 points
     python examples/benchmark_maps.py loops CAPTURE               # memory over two loops of the same path
     python examples/benchmark_maps.py pairs FOLDER...             # a/ and b/ with changes.json, two visits each
+    python examples/benchmark_maps.py days SEED...                # demo rooms: a map that goes on growing the next day
 
 A capture has gt.npz for its scores; its depth images, if it has any, make the map, else its own cloud is given. Times
 are of `integrate` alone, without the models'; CPU milliseconds stand beside them, as other programs slow the wall clock
@@ -21,7 +22,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from map_scores import PairScore, score_pair
+from map_scores import NEAR_M, PairScore, score_pair
 from scipy.spatial import cKDTree
 
 import og_pointcloud as og
@@ -36,9 +37,9 @@ SIZES = 100_000, 1_000_000
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run one of the four."""
+    """Run one of the five."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("frames", "speed", "loops", "pairs"))
+    parser.add_argument("what", choices=("frames", "speed", "loops", "pairs", "days"))
     parser.add_argument("folders", type=Path, nargs="+", metavar="FOLDER")
     parser.add_argument("--shuffle", action="store_true", help="frames in random order")
     parser.add_argument("--pose-noise", type=float, nargs=2, default=(0, 0), metavar=("M", "DEG"))
@@ -47,8 +48,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--tenths", type=int, default=TENTHS, metavar="N", help="rows of the table")
     parser.add_argument("--no-fit", action="store_true", help="without the fits of the same frames")
     options = parser.parse_args(arguments)
-    if options.what == "pairs":
-        pairs(options.folders)
+    if options.what in ("pairs", "days"):
+        {"pairs": pairs, "days": days}[options.what](options.folders)
         return
     for folder in options.folders:
         {"frames": growing, "speed": speed, "loops": loops}[options.what](folder, options)
@@ -185,6 +186,36 @@ def pairs(folders: list[Path]) -> None:
         for error in score.errors:
             print(f"    {error}")
     print("  ".join(f"{name} {value:.3f}" for name, value in total.figures.items()), f"({total.changes} changes)")
+
+
+def days(seeds: list[Path]) -> None:
+    """The demo room on two days, by one mapper: whether it knows what moved, left and came, and what it says beside."""
+    from og_pointcloud_room.second_visit import TwoDays
+
+    total, wrong = np.zeros(3, int), 0
+    print("seed  moved  gone  new  wrong  CPU ms")
+    for seed in seeds:
+        room = TwoDays(int(str(seed)))
+        mapper, start = og.Mapper(feature_space=room.feature_space), time.process_time()
+        for frame in room.before:
+            mapper.integrate(frame)
+        known = {entry.id for entry in mapper.objects()}
+        moves = [entry for frame in room.after for entry in mapper.integrate(frame).moved if entry.id in known]
+        spent = (time.process_time() - start) / (len(room.before) + len(room.after))
+        objects, place = mapper.objects(), room.places
+        moved = [_near(entry.before, place["from"]) and _near(entry.after, place["to"]) for entry in moves]
+        gone = [_near(entry.place, place["gone"]) for entry in objects if entry.state == "gone" and entry.id in known]
+        new = [_near(entry.place, place["new"]) for entry in objects
+               if entry.id not in known and room.after[0].stamp <= entry.since < np.inf]  # fmt: skip
+        right = np.array([any(told) for told in (moved, gone, new)])
+        errors = sum(told.count(False) for told in (moved, gone, new))
+        total, wrong = total + right, wrong + errors
+        print(f"{seed!s:>4}  {right[0]:5}  {right[1]:4}  {right[2]:3}  {errors:5}  {1e3 * spent:6.1f}", flush=True)
+    print(f"of {len(seeds)} each: {total[0]} moved, {total[1]} gone, {total[2]} new; {wrong} wrong entries")
+
+
+def _near(one: np.ndarray, other: np.ndarray) -> bool:
+    return bool(np.linalg.norm(one - other) < NEAR_M)
 
 
 if __name__ == "__main__":

@@ -13,11 +13,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.ndimage import binary_dilation
 from visits import BIN, CHEST, CRATE, PARCEL, SPACE, Thing, cameras, cast, frames, instance_of, moved, scene, surface
 
 import og_pointcloud as og
 from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError, SceneError
 from og_pointcloud.mapping.frame_queue import FrameQueue
+from og_pointcloud.mapping.sight import AGREES, NOTHING, THROUGH, states_in_packets, states_of_points, view_of_depth
+from og_pointcloud.mapping.tracks import NO_TRACK, PointVotes
 from og_pointcloud.mapping.voxels import VoxelPoints
 
 THINGS = [CHEST, BIN, CRATE]
@@ -352,3 +355,106 @@ def test_at_the_edge_of_images_nothing_is_gone():
     narrow = [replace(camera, width=60, cx=20.0) for camera in cameras(28)]
     changes = [mapper.integrate(frame) for frame in frames(THINGS, narrow, seed=1, first=50.0)]
     assert all(change.gone == () for change in changes)
+
+
+def test_votes_go_against_tracks_that_are_shown_beside_a_point_and_not_against_missed_ones():
+    votes = PointVotes()
+    votes.grow(3)
+    everyone, root = np.arange(3), np.arange(2, dtype=np.int32)
+    one = np.ones(3, np.float32)
+    votes.add(everyone, np.zeros(3, np.int32), 2 * one, np.array([True, False]))
+    # Track 0 is missed; then it has a mask, which holds the first point alone, while track 1 holds the second.
+    votes.add(everyone, np.full(3, NO_TRACK, np.int32), one, np.array([False, True]))
+    np.testing.assert_array_equal(votes.weight[:, 0], [2, 2, 2])
+    votes.add(everyone, np.array([0, 1, NO_TRACK], np.int32), one, np.array([True, True]))
+    np.testing.assert_array_equal(votes.weight[:, 0], [3, 1, 1])
+    votes.add(everyone, np.array([0, 1, NO_TRACK], np.int32), one, np.array([True, True]))
+    np.testing.assert_array_equal(votes.best(everyone, root), [0, 1, NO_TRACK])
+
+
+def wide(given, reach=6):
+    """The same frames, with masks of things so much too wide that they hold about as much of the floor, or of what
+    stands behind."""
+    made = []
+    for frame in given:
+        ids = frame.masks.copy()
+        for mask in np.argsort([-np.count_nonzero(ids == m) for m in range(len(frame.features))])[1:]:
+            ids[binary_dilation(frame.masks == mask, iterations=reach)] = mask
+        made.append(replace(frame, masks=ids))
+    return made
+
+
+def test_what_is_carried_elsewhere_is_followed_by_masks_that_are_too_wide():
+    mapper, _ = mapped(wide(frames(THINGS)))
+    crate = instance_of(mapper.snapshot().cloud, CRATE)
+    after = [CHEST, BIN, ELSEWHERE]
+    changes = [mapper.integrate(frame) for frame in wide(frames(after, seed=1, first=100.0))]
+    (followed,) = [entry for change in changes for entry in change.moved]
+    assert followed.id == crate
+    middle = np.array(ELSEWHERE.low) + np.array(ELSEWHERE.size) / 2
+    assert np.linalg.norm(followed.after - middle) < 0.15
+
+
+def test_what_was_named_elsewhere_before_its_place_was_seen_empty_gets_its_id_back():
+    mapper, _ = mapped(frames(THINGS))
+    crate, after = instance_of(mapper.snapshot().cloud, CRATE), [CHEST, BIN, ELSEWHERE]
+    given = frames(after, seed=1, first=100.0)
+    shown = [cast(after, frame.camera)[1] == 2 for frame in given]
+    alone = [replace(frame, depth=np.where(only, frame.depth, 0), masks=np.where(only, frame.masks, -1))
+             for frame, only in zip(given, shown, strict=True)]  # fmt: skip
+    changes = [mapper.integrate(frame) for frame in alone]
+    assert [k for change in changes for k in change.new] != []
+    later = [mapper.integrate(frame) for frame in frames(after, seed=2, first=200.0)]
+    assert [entry.id for change in later for entry in change.moved] == [crate]
+    (entry,) = [entry for entry in mapper.objects() if entry.state == "moved"]
+    assert entry.id == crate
+    assert entry.since >= 100
+
+
+def test_objects_know_since_when_they_stand_where_they_are():
+    mapper, _ = mapped(frames(THINGS))
+    for frame in frames([*THINGS, PARCEL], seed=1, first=100.0):
+        mapper.integrate(frame)
+    cloud, objects = mapper.finish().cloud, {entry.id: entry for entry in mapper.objects()}
+    assert all(objects[instance_of(cloud, thing)].since < 100 for thing in THINGS)
+    assert objects[instance_of(cloud, PARCEL)].since >= 100
+
+
+def test_finish_draws_points_as_large_as_a_fit_does():
+    capture, given = scene(THINGS), without_depth(frames(THINGS))
+    cloud = og.fit(capture, progress=False)
+    mapper, _ = mapped(given, cloud=capture.points)
+    mapper.finish()
+    known, scale = mapper._map, cloud.provenance["notes"]["gaussian_scale"]
+    geometry = og.FitSettings().geometry
+    assert known.scale == scale != geometry.middle_scale
+    fixed = og.FitSettings(geometry=replace(geometry, scales=(scale,)))
+    for one, other in zip(known.kept.views, mapped(given, cloud=capture.points, settings=fixed)[0]._map.kept.views,
+                          strict=True):  # fmt: skip
+        np.testing.assert_array_equal(one.columns, other.columns)
+        np.testing.assert_array_equal(one.votes, other.votes)
+
+
+@pytest.mark.parametrize("spacing", [0.02, 0.004])
+def test_points_are_judged_as_if_all_were_asked(spacing):
+    """Whatever packets leave out says nothing; bricks grow until they are filled."""
+    xyz = surface(THINGS, seed=3)[0].astype(np.float32)
+    points = VoxelPoints(spacing, grows=True)
+    rows = points.add_known(xyz[:6000], None)
+    np.testing.assert_array_equal(points.xyz[rows], xyz[:6000])
+    for part in np.array_split(xyz[6000:], 5):
+        points.add(part, np.zeros((len(part), 3), np.uint8), 0)
+    points.weight[::7] = 0
+    packets = points.packets
+    np.testing.assert_array_equal(np.sort(packets.members(np.arange(packets.count))), np.arange(len(points)))
+    assert packets.count < 64 or packets.count * 32 < len(points)
+    inside = og.Camera(90, 60, 40.0, 40.0, 45.0, 30.0, np.eye(4)[[0, 2, 1, 3]] * [[1], [-1], [1], [1]])
+    for camera in (*cameras(3), replace(cameras(1)[0], width=40, cx=70.0), inside):
+        depth = cast([CHEST, ELSEWHERE, PARCEL], camera)[0]
+        view = view_of_depth(depth + np.random.default_rng(0).normal(0, 0.003, depth.shape) * (depth > 0), camera)
+        states = np.where(points.alive, states_of_points(points.xyz, 0.01, view), NOTHING)
+        told = np.flatnonzero((states == AGREES) | (states == THROUGH))
+        found, of = states_in_packets(points, 0.01, view)
+        order = np.argsort(found)
+        np.testing.assert_array_equal(found[order], told)
+        np.testing.assert_array_equal(of[order], states[told])

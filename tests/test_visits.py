@@ -77,6 +77,50 @@ def test_states_of_points_are_those_along_each_ray():
     assert (fast[literal == AGREES] == AGREES).mean() > 0.97
 
 
+def rule_by_hand(xyz, tolerance, view):
+    """What `sight` says it does, for one point and one pixel at a time."""
+    camera, states = view.camera, []
+    within = np.hypot(tolerance, 3 * view.noise)
+    for p in xyz.astype(np.float64):
+        x = camera.world_to_camera[:3, :3] @ p + camera.world_to_camera[:3, 3]
+        u, v = camera.fx * x[0] / x[2] + camera.cx, camera.fy * x[1] / x[2] + camera.cy
+        said = []
+        for row in range(int(np.floor(v)) - 1, int(np.floor(v)) + 2):
+            for column in range(int(np.floor(u)) - 1, int(np.floor(u)) + 2):
+                inside = 0 <= row < camera.height and 0 <= column < camera.width
+                depth = float(view.depth[row, column]) if inside else 0.0
+                if depth == 0:
+                    continue
+                normal = view.normal[row, column].astype(np.float64)
+                ray = np.array([(column + 0.5 - camera.cx) / camera.fx, (row + 0.5 - camera.cy) / camera.fy, 1.0])
+                across, on_ray = normal @ (x - depth * ray), abs(depth - x[2]) * np.linalg.norm(x) / x[2]
+                slanted = abs(normal @ x) < 0.15 * np.linalg.norm(x)
+                if abs(across) <= within and (on_ray <= within or not slanted):
+                    said.append(AGREES)
+                elif slanted and on_ray > within:
+                    said.append(HIDDEN if depth < x[2] else NOTHING)
+                else:
+                    said.append(HIDDEN if across < 0 else THROUGH)
+        in_image = x[2] > 0 and 0 <= u < camera.width and 0 <= v < camera.height
+        states.append(
+            NOTHING if not in_image else AGREES if AGREES in said else HIDDEN if HIDDEN in said
+            else THROUGH if said.count(THROUGH) >= 3 and NOTHING not in said else NOTHING
+        )  # fmt: skip
+    return np.array(states)
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.01])
+def test_states_of_points_follow_the_rule_word_by_word(noise):
+    random = np.random.default_rng(5)
+    xyz = (surface(BEFORE, seed=3)[0] + random.normal(0, 0.02, (1, 3)))[::8].astype(np.float32)
+    for camera in (*cameras(2), replace(cameras(7)[3], width=50, cx=60.0)):
+        depth = cast(AFTER, camera)[0]
+        view = view_of_depth(depth + (noise * random.normal(size=depth.shape) * (depth > 0)).astype(np.float32), camera)
+        fast, literal = states_of_points(xyz, 0.02, view), rule_by_hand(xyz, 0.02, view)
+        assert {*fast.tolist()} == {NOTHING, AGREES, HIDDEN, THROUGH}
+        assert np.count_nonzero(fast != literal) <= 2  # of which a distance lies on the tolerance, in float32
+
+
 def test_a_cloud_is_seen_like_its_depth_image():
     camera = cameras()[2]
     xyz, _ = surface(AFTER, seed=4)

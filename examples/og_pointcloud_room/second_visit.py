@@ -33,7 +33,8 @@ class _Day:
 
 
 class TwoDays:
-    """before, after: frames, a walk each. model: the encoder; its texts are of NAMES."""
+    """before, after: frames, a walk each. model: the encoder; its texts are of NAMES. changed: what moved, left and
+    came, by name. places: (3,) middle of each, by "gone", "new", "from" and "to"."""
 
     feature_space = FEATURE_SPACE
 
@@ -46,10 +47,11 @@ class TwoDays:
         names = [item.name for item in room.objects]
         chair, bottle = names.index("chair"), next(k for k, name in enumerate(names) if name in ("bottle", "vase"))
         now, taken, surfaces = dict(enumerate(room.objects)), np.full((1, 2), np.inf), Surfaces(room.objects)
-        del now[bottle]
+        places = {"gone": _middle(now.pop(bottle)), "from": _middle(room.objects[chair])}
         for which, item in ((chair, centred(room.objects[chair])), (count, self._objects[-1])):
             place = free_floor(room, surfaces, path, taken)
             now[which], taken = item.moved((*place, 0.0)), np.concatenate([taken, place[None]])
+        self.places = {**places, "to": _middle(now[chair]), "new": _middle(now[count])}
         today = replace(room, objects=tuple(now.values()))
         self.before = self._walked(_Day(room, np.arange(count)), frames, rng, 0.0)
         self.after = self._walked(_Day(today, np.array([*now])), frames, rng, DAYS_APART_S)
@@ -74,6 +76,11 @@ class TwoDays:
             masks = ids.astype(np.int32) - 1
             made.append(og.Frame(camera, masks, rows, depth, rgb=seen.image, stamp=stamp + number / 3))
         return made
+
+
+def _middle(item: Item) -> np.ndarray:
+    corners = np.concatenate([part.vertices for part in item.parts])
+    return (corners.min(axis=0) + corners.max(axis=0)) / 2
 
 
 def _ball() -> Item:

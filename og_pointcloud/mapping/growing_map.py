@@ -10,12 +10,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from og_pointcloud.cloud import FeatureSpace
 from og_pointcloud.formats.poses import in_local_frame
-from og_pointcloud.kernels import njit, prange
 from og_pointcloud.mapping.changes import SCATTER, TOLERANCE
 from og_pointcloud.mapping.frame import CheckedFrame
 from og_pointcloud.mapping.kept_views import KeptViews
 from og_pointcloud.mapping.presence import Presence
-from og_pointcloud.mapping.sight import AGREES, THROUGH, MeasuredView, lens_of, states_in_packets
+from og_pointcloud.mapping.sight import AGREES, THROUGH, MeasuredView, states_in_packets
 from og_pointcloud.mapping.tracks import NO_TRACK, PointVotes, Tracks
 from og_pointcloud.mapping.voxels import VoxelPoints
 from og_pointcloud.scene import Camera
@@ -28,8 +27,6 @@ SLANT = 0.15
 """Cosine between ray and surface below which a reading is no point: edges of depth images fly."""
 MOST_ODDS = 3.0
 """Frames that history counts for at most."""
-COMPARED = 4000
-"""Points, about, by which a frame's depth is held against the map."""
 RECENT_FRAMES = 4096
 """Stamps of frames that are remembered: those that a journal still holds are not integrated twice."""
 
@@ -70,24 +67,19 @@ class GrowingMap:
         for columns in (self.presence, self.votes, self.kept):
             columns.grow(self.points.n)
 
-    def in_view(self, camera: Camera, margin: float = 0.0) -> NDArray[np.int32]:
-        """Rows of the points that are there and fall into an image, or within a share ``margin`` of it."""
+    def about(self, camera: Camera, margin: float = 0.0, most: int = 1 << 31) -> NDArray[np.int32]:
+        """Rows of the points that are there and may fall into an image, or within a share ``margin`` of it; of more
+        than ``most`` about so many, evenly chosen."""
         packets = self.points.packets
-        chosen = packets.before(camera, self.points.edge, margin=margin)
-        rows, filled = packets.rows[chosen], packets.filled[chosen]
-        lens, size = lens_of(camera), (camera.width, camera.height)
-        inside = _inside(rows, filled, self.points.xyz, self.points.weight, camera.world_to_camera, lens, margin, *size)
-        return np.sort(rows[inside])
+        rows = packets.members(packets.before(camera, self.points.edge, margin=margin))
+        return self._there(rows[:: 1 + len(rows) // most])
+
+    def _there(self, rows: NDArray[np.int32]) -> NDArray[np.int32]:
+        return np.sort(rows[self.points.weight[rows] > 0])
 
     def spacing_of(self, rows: NDArray[np.int32]) -> NDArray[np.float32]:
         """(m,) of points; of those that frames brought the map's own."""
         return np.append(self.spacing, np.float32(self.points.edge))[np.minimum(rows, len(self.spacing))]
-
-    def compared(self, camera: Camera) -> NDArray[np.int32]:
-        """Rows of a few points about an image, by which a frame is held against the map."""
-        packets = self.points.packets
-        rows = packets.some(packets.before(camera, self.points.edge), COMPARED)
-        return rows[self.points.weight[rows] > 0]
 
     def judge(self, view: MeasuredView, stamp: float) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
         """Presence by what a view measures: rows of points that it bears out, and of those that leave by it."""
@@ -103,7 +95,7 @@ class GrowingMap:
             return np.zeros(0, np.int32)
         camera = view.camera
         step = max(1, int(points.edge / view.pixel / READINGS_PER_SPACING))
-        xyz, pixel = _readings(view.depth, view.normal, camera.world_to_camera, lens_of(camera), step, step // 2, SLANT)
+        xyz, pixel = _readings(view, step)
         rgb = np.full((len(xyz), 3), 128, np.uint8)
         if frame.rgb is not None:
             scale = frame.rgb.shape[0] / camera.height, frame.rgb.shape[1] / camera.width
@@ -126,9 +118,8 @@ class GrowingMap:
     def rows_of(self, track: int) -> NDArray[np.int32]:
         """Rows of the points of a track, ascending; only its surroundings are gone through."""
         (low, high), edge = self.tracks.tracks[track].box, self.points.edge
-        rows = self.points.packets.within(low - edge, high + edge)
-        rows = rows[self.points.weight[rows] > 0]
-        return np.sort(rows[self.votes.best(rows, self.tracks.root) == track])
+        rows = self._there(self.points.packets.within(low - edge, high + edge))
+        return rows[self.votes.best(rows, self.tracks.root) == track]
 
     def forget(self, rows: NDArray[np.int32]) -> None:
         """What was known of points that left, or whose thing did."""
@@ -172,44 +163,16 @@ class GrowingMap:
         return self.recent[max(place, 0)] if sequence > 0 else -np.inf
 
 
-@njit(cache=True, parallel=True, nogil=True)
-def _inside(rows, filled, xyz, weight, pose, lens, margin, width, height):  # noqa: ANN001, ANN202
-    fx, fy, cx, cy = lens
-    across, down = margin * width, margin * height
-    inside = np.zeros(rows.shape, np.bool_)
-    for packet in prange(len(rows)):
-        for k in range(filled[packet]):
-            i = rows[packet, k]
-            if weight[i] > 0:
-                x, y, z = xyz[i, 0], xyz[i, 1], xyz[i, 2]
-                depth = pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] * z + pose[2, 3]
-                if depth > 0:
-                    u = fx * (pose[0, 0] * x + pose[0, 1] * y + pose[0, 2] * z + pose[0, 3]) / depth + cx
-                    v = fy * (pose[1, 0] * x + pose[1, 1] * y + pose[1, 2] * z + pose[1, 3]) / depth + cy
-                    inside[packet, k] = -across <= u < width + across and -down <= v < height + down
-    return inside
-
-
-@njit(cache=True, nogil=True)
-def _readings(depth, normal, pose, lens, step, first, slant):  # noqa: ANN001, ANN202
+def _readings(view: MeasuredView, step: int) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
     """(xyz (m, 3), flat pixel (m,)) of every step-th reading that is not at a slant."""
-    fx, fy, cx, cy = lens
-    height, width = depth.shape
-    xyz = np.empty((depth.size // (step * step) + height + width + 1, 3), np.float32)
-    pixel = np.empty(len(xyz), np.int64)
-    count = 0
-    for row in range(first, height, step):
-        for column in range(first, width, step):
-            z = depth[row, column]
-            if z <= 0:
-                continue
-            dx, dy = (column + 0.5 - cx) / fx, (row + 0.5 - cy) / fy
-            n = normal[row, column]
-            if -(n[0] * dx + n[1] * dy + n[2]) < slant * np.sqrt(dx * dx + dy * dy + 1):
-                continue
-            x, y, w = z * dx - pose[0, 3], z * dy - pose[1, 3], z - pose[2, 3]
-            for a in range(3):
-                xyz[count, a] = pose[0, a] * x + pose[1, a] * y + pose[2, a] * w
-            pixel[count] = row * width + column
-            count += 1
-    return xyz[:count], pixel[:count]
+    camera, every = view.camera, slice(step // 2, None, step)
+    row, column = np.mgrid[step // 2 : camera.height : step, step // 2 : camera.width : step]
+    ray = np.stack(
+        [(column + 0.5 - camera.cx) / camera.fx, (row + 0.5 - camera.cy) / camera.fy, np.ones(row.shape)], -1
+    )
+    facing = -np.einsum("rca,rca->rc", view.normal[every, every], ray)
+    depth = view.depth[every, every]
+    told = (depth > 0) & (facing >= SLANT * np.linalg.norm(ray, axis=-1))
+    pose = camera.world_to_camera
+    xyz = (depth[told, None] * ray[told] - pose[:3, 3]) @ pose[:3, :3]
+    return xyz.astype(np.float32), (row * camera.width + column)[told]

@@ -22,7 +22,7 @@ from og_pointcloud.ask.labelled_scene import LabelledScene, SceneLike, as_scene
 from og_pointcloud.cloud import UNKNOWN_SPACE, FeatureSpace, LabelledCloud
 from og_pointcloud.errors import SceneError
 from og_pointcloud.mapping.changes import Changes, Moved, Visit, compare_visits
-from og_pointcloud.mapping.frame import CheckedFrame, Frame, checked, require_same_place
+from og_pointcloud.mapping.frame import COMPARED, CheckedFrame, Frame, checked, require_same_place
 from og_pointcloud.mapping.growing_map import GrowingMap
 from og_pointcloud.mapping.labelling import labelled, matched_ids, with_ids
 from og_pointcloud.mapping.map_journal import MapJournal
@@ -181,8 +181,8 @@ class Mapper:
         start = time.perf_counter()
         given, known = self._checked(frame)
         if given.view is not None:
-            some = known.points.xyz[known.compared(given.camera)]
-            require_same_place(given.stamp, given.view, some, known.presence.tolerance)
+            about = known.points.xyz[known.about(given.camera, most=COMPARED)]
+            require_same_place(given.stamp, given.view, about, known.presence.tolerance)
         # From here on the map changes, and nothing is refused any more.
         self._map, known.stamp = known, max(known.stamp, given.stamp)
         rows, died, new, again = np.zeros(0, np.int32), np.zeros(0, np.int32), [], []

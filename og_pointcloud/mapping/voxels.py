@@ -103,16 +103,11 @@ class Packets(Columns):
     def within(self, low: NDArray[np.floating], high: NDArray[np.floating]) -> NDArray[np.int32]:
         """Rows of the packets that meet a box."""
         meets = (self.low[: self.count] <= high).all(axis=1) & (self.high[: self.count] >= low).all(axis=1)
-        packets = np.flatnonzero(meets)
-        return self.rows[packets][np.arange(PACKET) < self.filled[packets, None]]
+        return self.members(np.flatnonzero(meets))
 
-    def some(self, packets: NDArray[np.int64], count: int) -> NDArray[np.int32]:
-        """About so many rows of some packets, evenly chosen; all where there are fewer."""
-        ends = np.cumsum(self.filled[packets])
-        total = int(ends[-1]) if len(ends) else 0
-        place = np.arange(0, total, 1 + total // count)
-        packet = np.searchsorted(ends, place, side="right")
-        return self.rows[packets[packet], place - (ends - self.filled[packets])[packet]]
+    def members(self, packets: NDArray[np.int64]) -> NDArray[np.int32]:
+        """Rows of some packets."""
+        return self.rows[packets][np.arange(PACKET) < self.filled[packets, None]]
 
 
 @dataclass
