@@ -13,7 +13,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.ndimage import binary_dilation
 from visits import BIN, CHEST, CRATE, PARCEL, SPACE, Thing, cameras, cast, frames, instance_of, moved, scene, surface
 
 import og_pointcloud as og
@@ -370,29 +369,6 @@ def test_votes_go_against_tracks_that_are_shown_beside_a_point_and_not_against_m
     np.testing.assert_array_equal(votes.weight[:, 0], [3, 1, 1])
     votes.add(everyone, np.array([0, 1, NO_TRACK], np.int32), one, np.array([True, True]))
     np.testing.assert_array_equal(votes.best(everyone, root), [0, 1, NO_TRACK])
-
-
-def wide(given, reach=6):
-    """The same frames, with masks of things so much too wide that they hold about as much of the floor, or of what
-    stands behind."""
-    made = []
-    for frame in given:
-        ids = frame.masks.copy()
-        for mask in np.argsort([-np.count_nonzero(ids == m) for m in range(len(frame.features))])[1:]:
-            ids[binary_dilation(frame.masks == mask, iterations=reach)] = mask
-        made.append(replace(frame, masks=ids))
-    return made
-
-
-def test_what_is_carried_elsewhere_is_followed_by_masks_that_are_too_wide():
-    mapper, _ = mapped(wide(frames(THINGS)))
-    crate = instance_of(mapper.snapshot().cloud, CRATE)
-    after = [CHEST, BIN, ELSEWHERE]
-    changes = [mapper.integrate(frame) for frame in wide(frames(after, seed=1, first=100.0))]
-    (followed,) = [entry for change in changes for entry in change.moved]
-    assert followed.id == crate
-    middle = np.array(ELSEWHERE.low) + np.array(ELSEWHERE.size) / 2
-    assert np.linalg.norm(followed.after - middle) < 0.15
 
 
 def test_what_was_named_elsewhere_before_its_place_was_seen_empty_gets_its_id_back():
