@@ -33,7 +33,7 @@ RECENT_FRAMES = 4096
 
 @dataclass
 class GrowingMap:
-    """origin: (3,), world = local + origin. spacing: of points. anchors: stamp and pose of each frame that brought
+    """origin: (3,), world = local + origin. anchors: stamp and pose of each frame that brought
     points. sequence: of the next frame; 0 stands for what was known before the first. stamp: the latest of all; recent:
     those of the last ones. spacing: of the first rows, points known from the beginning. scale: of points as frames
     without depth see them, in spacings; None: not chosen yet; drawn: by how many such frames it was."""

@@ -3,7 +3,8 @@
 A track is what masks of several frames show as one thing. A mask belongs to the track that it has most of, if it also
 is most of what the frame shows of that track; else it founds a track of its own. So a cup that the first frames took
 for a part of the table gets a track when frames show it alone, and its points go over to it as votes outweigh the
-table's.
+table's: a frame that has a mask of a track votes for the points within and against those beside, as views do in
+`fitting.membership`; one that missed the track has no vote.
 
 Each frame is a witness for every two tracks that it shows within masks: one thing, if most of both lies in one mask,
 else two. Tracks are joined while a majority of their witnesses says one (`fitting.grouping` does the same for masks,

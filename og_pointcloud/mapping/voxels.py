@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from og_pointcloud.kernels import njit
 from og_pointcloud.scene import Camera
 
-__all__ = ["Columns", "VoxelHash", "VoxelPoints"]
+__all__ = ["Columns", "Packets", "VoxelHash", "VoxelPoints"]
 
 ACROSS = 1 << 20
 """Voxels to either side of the origin: three indices fit one 64-bit key."""
@@ -64,8 +64,8 @@ class VoxelHash:
 @dataclass
 class Packets(Columns):
     """Rows of points, filed by brick. rows: (packets, PACKET) int32; filled: (packets,) int32, how many of them; low,
-    high: (packets, 3) float32, the box of their points when they were filed. side: of a brick.
-    filed: points so far; count: packets. open: the packet of each brick that has room."""
+    high: (packets, 3) float32, the box of their points when they were filed. side: of a brick. filed: points so far;
+    count: packets. open: the packet of each brick that has room."""
 
     side: float = 0.0
     filed: int = 0
