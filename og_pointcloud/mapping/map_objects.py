@@ -91,14 +91,13 @@ def name(
     """Ids for tracks that are objects now: of something that left, if it looks so, else the next one. What was named
     before it was known that the other had left is asked again when that is, and each time its views have doubled."""
     tracks, moved = known.tracks.tracks, []
-    asked = (
-        known.tracks.by_id().values() if gone else (k for k in again if tracks[k].views & (tracks[k].views - 1) == 0)
-    )
-    if any(track.left for track in tracks):
+    doubled = (k for k in again if tracks[k].views & (tracks[k].views - 1) == 0)
+    asked = [*new, *(known.tracks.by_id().values() if gone else doubled)]
+    if asked and any(track.left for track in tracks):
         others = [track for track in tracks if track.id >= 0 and track.descriptor is not None]
         descriptors, spread = np.array([t.descriptor for t in others]), np.array([t.spread for t in others])
         typical = typical_cosine(descriptors, np.arange(len(others)), spread) if others else 0.0
-        for k in (*new, *asked):
+        for k in asked:
             if known.tracks.root[k] == k and not tracks[k].left:
                 moved += _returned(known, k, typical)
     ids = []
@@ -119,14 +118,16 @@ def _look(known: GrowingMap, track: Track, rows: NDArray[np.integer]) -> Look:
 def _returned(known: GrowingMap, k: int, typical: float) -> list[Moved]:
     """Give a track the id of what left, if anything that left looks like it.
 
-    It looks as its points do that came after the other was last seen: a thing that has hardly any stood here already.
+    It looks as its points do that came after the other was last seen. What has hardly any such points stood here
+    already; what masks had shown before must have most of its points so: it may only have been seen from behind since.
     """
     track, rows = known.tracks.tracks[k], known.rows_of(k)
     came, alike = {}, {}
     for old in known.tracks.tracks:
         if old.left and old.id >= 0:
             came[old.id] = rows[known.kept.born[rows] > old.left.sequence]
-            if len(came[old.id]) >= max(FEWEST_POINTS, FLAT_SHARE * len(rows)):
+            share = FLAT_SHARE if track.first > old.left.sequence else MOST
+            if len(came[old.id]) >= max(FEWEST_POINTS, share * len(rows)):
                 alike[old.id] = likeness(old.left.look, _look(known, track, came[old.id]), typical)
     best = max(alike, key=lambda old: (alike[old], -old), default=None)
     if best is None or alike[best] <= ALIKE:

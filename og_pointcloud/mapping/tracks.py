@@ -76,10 +76,10 @@ class Left:
 @dataclass
 class Track:
     """total: (D,) sum of unit features by pixels; pixels: their sum; agreement: sum of cosines by pixels. views, masks:
-    how many showed it; last_seen, sequence: the stamp and the number of the last frame that did, 0 for an earlier map.
-    id: of the object, NO_TRACK while it is provisional. moved: it has been elsewhere. box: (2, 3) lowest and highest
-    place of points that voted for it. lost: rows of its points that were seen through, losing_since: from that stamp
-    on; left: when most were."""
+    how many showed it; first, sequence: the numbers of the first and of the last frame that did, 0 for an earlier map;
+    last_seen: the stamp of the last. id: of the object, NO_TRACK while it is provisional. moved: it has been elsewhere.
+    box: (2, 3) lowest and highest place of points that voted for it. lost: rows of its points that were seen through,
+    losing_since: from that stamp on; left: when most were."""
 
     total: NDArray[np.float64] | None = None
     pixels: float = 0.0
@@ -88,6 +88,7 @@ class Track:
     masks: int = 0
     last_seen: float = 0.0
     sequence: int = 0
+    first: int = 0
     id: int = NO_TRACK
     moved: bool = False
     box: NDArray[np.float64] = field(default_factory=lambda: np.array([[np.inf] * 3, [-np.inf] * 3]))
@@ -105,7 +106,7 @@ class Track:
             self.total = other.total if self.total is None else self.total + other.total
         for name in ("pixels", "agreement", "masks", "lost"):
             setattr(self, name, getattr(self, name) + getattr(other, name))
-        self.moved |= other.moved
+        self.moved, self.first = self.moved or other.moved, min(self.first, other.first)
         self.reach(other.box)
         for name in ("views", "last_seen", "sequence"):
             setattr(self, name, max(getattr(self, name), getattr(other, name)))
@@ -249,6 +250,7 @@ class Tracks:
             track.pixels, track.masks = track.pixels + of_masks[m], track.masks + 1
             if k in again or k in new:
                 continue
+            track.first = track.first if track.masks > 1 else when[1]
             track.views, (track.last_seen, track.sequence) = track.views + 1, when
             if track.id < 0 and track.views >= CONFIRMED_VIEWS:
                 new.append(k)
