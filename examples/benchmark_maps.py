@@ -202,11 +202,11 @@ def days(seeds: list[Path]) -> None:
         known = {entry.id for entry in mapper.objects()}
         moves = [entry for frame in room.after for entry in mapper.integrate(frame).moved if entry.id in known]
         spent = (time.process_time() - start) / (len(room.before) + len(room.after))
-        objects, place = mapper.objects(), room.places
+        objects, place, days_apart = mapper.objects(), room.places, room.after[0].stamp or 0.0
         moved = [_near(entry.before, place["from"]) and _near(entry.after, place["to"]) for entry in moves]
         gone = [_near(entry.place, place["gone"]) for entry in objects if entry.state == "gone" and entry.id in known]
         new = [_near(entry.place, place["new"]) for entry in objects
-               if entry.id not in known and room.after[0].stamp <= entry.since < np.inf]  # fmt: skip
+               if entry.id not in known and days_apart <= entry.since < np.inf]  # fmt: skip
         right = np.array([any(told) for told in (moved, gone, new)])
         errors = sum(told.count(False) for told in (moved, gone, new))
         total, wrong = total + right, wrong + errors

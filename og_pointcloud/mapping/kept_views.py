@@ -53,7 +53,7 @@ class KeptView:
         """What is found in a frame of the points ``rows``."""
         pixels = np.bincount(frame.ids.ravel() + 1, minlength=len(frame.features) + 1)[1:]
         masks, open_ = found.rows, found.openness
-        packed = zlib.compress(np.ascontiguousarray(frame.ids), 1) if frame.view is None else b""
+        packed = zlib.compress(frame.ids.tobytes(), 1) if frame.view is None else b""
         return cls(
             frame.camera, frame.stamp, sequence, masks.indptr.astype(np.int32), rows[masks.indices],
             masks.data.astype(np.float16), rows[open_.indices], open_.data.astype(np.float16), pixels.astype(np.int32),
@@ -63,7 +63,9 @@ class KeptView:
     @property
     def masks(self) -> NDArray[np.int32]:
         """(H, W) the mask image of a view that had no depth."""
-        return np.frombuffer(zlib.decompress(self.packed), np.int32).reshape(self.camera.height, self.camera.width)
+        return np.frombuffer(zlib.decompress(self.packed.tobytes()), np.int32).reshape(
+            self.camera.height, self.camera.width
+        )
 
     @property
     def nbytes(self) -> int:

@@ -73,14 +73,16 @@ def leave(known: GrowingMap, died: NDArray[np.int32], stamp: float) -> list[int]
 def _has_left(known: GrowingMap, k: int) -> bool:
     """Whether most of a track's visible points left; then the others leave too, but for what was measured since."""
     track, rows = known.tracks.tracks[k], known.rows_of(k)
-    still = rows[known.presence.odds[rows] > 0]
-    if len(track.lost) <= MOST * (len(track.lost) + len(still)):
+    # What no frame has looked at since is no sign that it is still there; a small part of the whole none that it went.
+    still = rows[(known.presence.odds[rows] > 0) & (known.presence.seen_at[rows] >= track.losing_since)]
+    lost = len(track.lost)
+    if lost <= max(MOST * (lost + len(still)), FLAT_SHARE * (lost + len(rows))):
         return False
     # What it stood before, and its masks held too, is still there: it looked as what left does.
-    lost = np.array(track.lost, np.int32)
-    size = np.ptp(known.points.xyz[lost].astype(np.float64), axis=0)
-    track.left, track.lost = Left(_look(known, track, lost), known.place_of(lost), size, track.sequence), []
-    known.points.weight[np.setdiff1d(rows, still[known.presence.seen_at[still] >= track.losing_since])] = 0
+    went = np.array(track.lost, np.int32)
+    size = np.ptp(known.points.xyz[went].astype(np.float64), axis=0)
+    track.left, track.lost = Left(_look(known, track, went), known.place_of(went), size, track.sequence), []
+    known.points.weight[np.setdiff1d(rows, still)] = 0
     known.forget(rows)
     return True
 

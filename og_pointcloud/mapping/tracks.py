@@ -175,7 +175,7 @@ class Tracks:
         seen, place = np.unique(own, return_inverse=True)
         rows = np.where(mask < 0, len(features), mask)  # the last row: in no mask
         shown = np.bincount(rows * len(seen) + place, weight, (len(features) + 1) * len(seen))
-        shown = shown.reshape(len(features) + 1, len(seen))
+        shown = np.asarray(shown.reshape(len(features) + 1, len(seen)), np.float64)
         of_tracks, seen = shown[:, seen >= 0], seen[seen >= 0]
         of_mask = self._belonging(of_tracks, shown.sum(axis=1), seen)
         of_point = np.append(of_mask, NO_TRACK).astype(np.int32)[mask]
