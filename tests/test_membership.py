@@ -184,10 +184,10 @@ def dimly(shown: float, views: list[HandView]) -> list[int]:
 @pytest.mark.parametrize(("shown", "believed"), [(0.51, True), (0.49, False)])
 def test_what_no_view_sees_openly_is_as_its_neighbours_are(shown: float, believed: bool) -> None:
     """Twenty points that every view's mask holds, beside background: the floor under a car, seen through its roof. Of
-    those not seen openly the outermost are as the background that they adjoin, and nobody knows the rest."""
+    those not seen openly the outermost are as the background that they adjoin; nothing better is known of the rest."""
     ids = dimly(shown, [[(range(40, 60), ONE)]] * 4)
-    within = [0] * 20 if believed else [BACKGROUND] * 4 + [UNOBSERVED] * 12 + [BACKGROUND] * 4
-    assert ids == [BACKGROUND] * 40 + within + [BACKGROUND] * 40
+    edge = [0 if believed else BACKGROUND] * 4
+    assert ids == [BACKGROUND] * 40 + edge + [0] * 12 + edge + [BACKGROUND] * 40
 
 
 def test_what_no_view_sees_openly_joins_the_instance_that_it_adjoins() -> None:

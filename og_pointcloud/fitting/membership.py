@@ -16,8 +16,8 @@ Of several groups a point is of the one with the most votes; but proposers let l
 that group's own views contradict it and a smaller one is sure, the smaller one has the point.
 
 Votes of views none of which sees a point openly are hearsay: rays that slip through a surface agree about what lies
-behind it, and are wrong. Such a point is as its neighbours are. How openly is measured by the scene's other points, for
-of surfaces of several noisy layers little is seen anywhere.
+behind it, and are wrong. Such a point is as its neighbours are, if views know these better. How openly is measured by
+the scene's other points, for of surfaces of several noisy layers little is seen anywhere.
 """
 
 from __future__ import annotations
@@ -90,9 +90,14 @@ def assign_points(
     ids = np.where(agreed & ~hearsay, group, BACKGROUND).astype(np.int32)
     possible = (group >= 0) & (share > settings.possible_share)
     ids = _grow(ids, group, possible, around.index, around.adjoining, settings.growth_votes)
-    # What is seen through an instance is no part of it; what no view saw, or none openly, is as its neighbours are.
+    # What is known by hearsay alone is as its neighbours are; where none of them is known better, hearsay is believed.
+    ids = np.where((ids == BACKGROUND) & (total == 0), UNOBSERVED, ids)
+    hearsay &= ids == BACKGROUND
+    near = _fill_unobserved(np.where(hearsay, UNOBSERVED, ids), around)
+    ids = np.where(hearsay, np.where(near == UNOBSERVED, group, near), ids)
+    # What is seen through an instance is no part of it; what no view saw is as its neighbours are.
     ids = _without_islands(ids, share, instance_area(table, groups.group, ids), around, settings.island_share)
-    ids = _fill_unobserved(np.where((ids == BACKGROUND) & (hearsay | (total == 0)), UNOBSERVED, ids), around)
+    ids = _fill_unobserved(ids, around)
     ids = _settle_borders(ids, share, around.index, around.adjoining, *settings.border_shares, settings.own_vote)
     share_of_state = np.where((group >= 0) & (ids == group), share, 1 - share)
     certainty = np.where(total > 0, np.clip(share_of_state, 0, 1), 0) * _agreeing(ids, around.index, around.adjoining)

@@ -101,17 +101,26 @@ def membership(
         if not joins:
             break
         ids[joins] = best[joins]
-    ids = _without_islands(ids, share, weights, group, neighbours, settings.island_share)
-    ids[(ids == BACKGROUND) & (hearsay | (total == 0))] = UNOBSERVED
-    before = ids.copy()
-    for g in np.flatnonzero(ids == UNOBSERVED):
-        ids[g] = next((before[other] for other in neighbours[g] if before[other] != UNOBSERVED), UNOBSERVED)
+    ids[(ids == BACKGROUND) & (total == 0)] = UNOBSERVED
+    hearsay &= ids == BACKGROUND
+    near = _filled(np.where(hearsay, UNOBSERVED, ids), neighbours)
+    for g in np.flatnonzero(hearsay):
+        ids[g] = best[g] if near[g] == UNOBSERVED else near[g]
+    ids = _filled(_without_islands(ids, share, weights, group, neighbours, settings.island_share), neighbours)
     ids = _settled(ids, share, neighbours, settings)
     certainty = np.zeros(len(points))
     for g in points:
         alike = np.mean([ids[other] == ids[g] for other in neighbours[g]]) if neighbours[g] else 1.0
         certainty[g] = (share[g] if ids[g] == best[g] >= 0 else 1 - share[g]) * alike if total[g] > 0 else 0
     return ids, share, certainty
+
+
+def _filled(ids: NDArray[np.int32], neighbours: list[list[int]]) -> NDArray[np.int32]:
+    """Unobserved points as the nearest neighbour that is not."""
+    filled = ids.astype(np.int32)
+    for g in np.flatnonzero(ids == UNOBSERVED):
+        filled[g] = next((ids[other] for other in neighbours[g] if ids[other] != UNOBSERVED), UNOBSERVED)
+    return filled
 
 
 def _without_islands(
