@@ -88,7 +88,8 @@ changes = [mapper.integrate(frame) for frame in days.after]
 tuesday, after = mapper.snapshot(), {entry.id: entry for entry in mapper.objects()}
 moved = {entry.id: entry for change in changes for entry in change.moved if entry.id in before}
 gone = [k for k, entry in after.items() if entry.state == "gone" and k in before]
-new = [k for k, entry in after.items() if k not in before and days.after[0].stamp <= entry.since < np.inf]
+tuesday_s = days.after[0].stamp or 0.0
+new = [k for k, entry in after.items() if k not in before and tuesday_s <= entry.since < np.inf]
 
 left, after_ids = drawn(monday, tinted(monday, gone, COLORS["gone"])), tinted(tuesday, new, COLORS["new"])
 is_moved = np.isin(tuesday.instance_ids, [*moved])
