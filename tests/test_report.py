@@ -17,7 +17,6 @@ from scipy.sparse import csr_array
 from og_pointcloud.ask.labelled_scene import LabelledScene
 from og_pointcloud.cli import main
 from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError, SceneError
-from og_pointcloud.evaluate import knobs
 from og_pointcloud.evaluate import sweep as sweeping
 from og_pointcloud.evaluate.baselines import BASELINES, only_where_masked
 from og_pointcloud.evaluate.knobs import DEFAULT, FAST, KNOBS, Setting, settings_of
@@ -79,17 +78,6 @@ def test_only_the_knobs_asked_for_are_tried():
     ]  # fmt: skip
     with pytest.raises(OgPointcloudError, match="'colour' is no knob; expected one of views, mode"):
         settings_of(("colour",))
-
-
-@pytest.mark.parametrize("share", [None, 0.05])
-def test_every_row_of_the_paper_is_there(share):
-    rows = {(setting.knob, setting.value): setting.settings for setting in knobs.ablations(share)}
-    for table, published in knobs.ABLATIONS.items():
-        for name in published:
-            assert rows[table, name].mode == ("fast" if share is None else "paper")
-            assert rows[table, name].paper.schedule_share == (share or 1)
-    # What is literal is so in all three tables.
-    assert rows["losses", "both"] == rows["codebook", "two levels, xyz"] == rows["association", "both"]
 
 
 # Rows -----------------------------------------------------------------------------------------------------------
@@ -275,32 +263,9 @@ def test_the_command_writes_table_chart_and_report(folder, tmp_path, capsys):
     assert "sure share: 0.4" in (out / "report.md").read_text()
 
 
-def test_ablations_need_truth(tiny_capture, tmp_path, capsys):
-    assert main(["report", str(tiny_capture.folder), "--ablation", "-o", str(tmp_path / "r")]) == 2
-    assert "capture lacks gt.npz or text_features.npz" in capsys.readouterr().err
-    assert not (tmp_path / "r").exists()
-
-
-@pytest.mark.slow
-def test_the_ablations_are_written_by_the_same_command(folder, tmp_path, capsys):
-    assert main(["report", str(folder), "--ablation", "-o", str(tmp_path)]) == 0
-    rows = {(r["knob"], r["value"]): r for r in csv.DictReader((tmp_path / "ablation.csv").open())}
-    for table, named in knobs.ABLATIONS.items():
-        for name, (published, *_) in named.items():
-            assert float(rows[table, name]["published"]) == published
-            assert float(rows[table, name]["labelled_miou"]) > 0
-    assert float(rows["default", ""]["miou"]) > 0.8
-    assert rows["losses", "both"]["miou"] == rows["association", "both"]["miou"]
-    assert "losses: inter only" in capsys.readouterr().out
-
-
 def test_bad_use_is_one_error(tmp_path, capsys):
     one = str(tmp_path)
-    for options, text in (
-        ([one, "--paper"], "--paper is of --ablation"),
-        ([one, "--ablation", "--quick"], "--ablation has settings of its own"),
-        ([one, "--knob", "colour"], "'colour' is no knob"),
-    ):
+    for options, text in (([one, "--knob", "colour"], "'colour' is no knob"),):
         assert main(["report", *options]) == 2
         assert text in capsys.readouterr().err
     (tmp_path / "a" / "x").mkdir(parents=True)

@@ -1,4 +1,4 @@
-"""What a sweep tries: the settings that trade error for time, and the paper's ablations (Sec. 4.4).
+"""What a sweep tries: the settings that trade error for time.
 
 A knob is a list of named values; each value is a whole `FitSettings`, so that whatever a fit can be told can be a knob.
 """
@@ -10,19 +10,17 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from og_pointcloud.errors import OgPointcloudError
-from og_pointcloud.settings import CodebookSettings, FeatureSettings, FitSettings, MatchingSettings, PaperSettings
+from og_pointcloud.settings import FitSettings
 
 
 @dataclass(frozen=True)
 class Setting:
-    """One value of one knob. every: each every-th view of the capture is used, 1 for all. published: mIoU of this row
-    in the paper, if it is one of its tables' rows."""
+    """One value of one knob. every: each every-th view of the capture is used, 1 for all."""
 
     knob: str
     value: str
     settings: FitSettings = field(default_factory=FitSettings)
     every: int = 1
-    published: float | None = None
 
     @property
     def name(self) -> str:
@@ -105,60 +103,3 @@ def settings_of(knobs: tuple[str, ...] | None = None) -> list[Setting]:
     for value in [DEFAULT, *([FAST] if of_fast else []), *values]:
         tried.setdefault((value.settings, value.every), value)
     return list(tried.values())
-
-
-LITERAL = FitSettings(
-    mode="fast",
-    features=FeatureSettings(start="random"),
-    codebook=CodebookSettings(k1=64, k2=5, position_weight=2.0),
-    matching=MatchingSettings(threshold=0.02, settle=False),
-)
-"""The method as printed, from the mask table: each row changes one thing of it. A product is smaller than either
-factor: at the usual thresholds of 0.1 or 0.2 "both" would lose to them for that reason alone, so this one only keeps
-off what hardly touches. The published weight of positions is per metre (1.0 on ScanNet): about 5 per extent of a room,
-and no use for a table top."""
-
-
-def _one_level(k: int, positions: bool) -> tuple[Changes, Changes]:
-    paper = {"paper.k1": k, "paper.k2": 1} | ({} if positions else {"paper.position_weight": 0.0})
-    return {"codebook.levels": 1, "codebook.k2": None, "codebook.k1": k, "codebook.positions": positions}, paper
-
-
-ABLATIONS: Mapping[str, Mapping[str, tuple[float, Changes, Changes]]] = {
-    "losses": {
-        "inter only": (0.3524, {"features.intra": False}, {"paper.intra": False}),
-        "intra only": (0.2589, {"features.inter": False}, {"paper.inter": False}),
-        "both": (0.3829, {}, {}),
-    },
-    "codebook": {
-        "one level, k = 64": (0.2868, *_one_level(64, False)),
-        "one level, k = 320": (0.1461, *_one_level(320, False)),
-        "one level, k = 64, xyz": (0.3204, *_one_level(64, True)),
-        "one level, k = 320, xyz": (0.1520, *_one_level(320, True)),
-        "two levels": (0.3027, {"codebook.positions": False}, {"paper.position_weight": 0.0}),
-        "two levels, xyz": (0.3829, {}, {}),
-    },
-    "association": {
-        "IoU only": (0.3528, {"matching.score": "iou"}, {"paper.matching.score": "iou"}),
-        "feature only": (0.3401, {"matching.score": "feature"}, {"paper.matching.score": "feature"}),
-        "both": (0.3829, {}, {}),
-    },
-}
-"""Rows of the paper's tables: their mIoU there, on 10 classes of ScanNet (other data: compare the order, not the size);
-what the row changes of `LITERAL`; and of mode paper."""
-
-
-def ablations(schedule_share: float | None = None) -> list[Setting]:
-    """The default and mode fast, then the rows of the paper's three tables.
-
-    schedule_share: None takes the literal method from the mask table (mode fast); else as trained by rendering, with
-    this share of the published schedule.
-    """
-    paper = schedule_share is not None
-    base = FitSettings(mode="paper", paper=PaperSettings(schedule_share=schedule_share)) if paper else LITERAL
-    rows = [
-        Setting(table, row, _with(base, of_paper if paper else literal), published=published)
-        for table, values in ABLATIONS.items()
-        for row, (published, literal, of_paper) in values.items()
-    ]
-    return [DEFAULT, FAST, *rows]

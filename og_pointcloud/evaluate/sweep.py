@@ -73,8 +73,7 @@ class Row:
     miou, macc, unknown: over the points with a known class; background: the share of known background that was given a
     class. labelled_miou: mIoU with background left out, as published tables have it. None without truth.
     gain, gain_low, gain_high: mIoU less the default's, with its paired 95 % interval over blocks of space.
-    reliability: of the fit (`LabelledCloud.reliability`), None for other methods. published: the same row's mIoU in
-    the paper.
+    reliability: of the fit (`LabelledCloud.reliability`), None for other methods.
     left_out: what the fit left out and why, as its provenance has it.
     """
 
@@ -93,7 +92,6 @@ class Row:
     gain_high: float | None = None
     reliability: float | None = None
     instances: int | None = None
-    published: float | None = None
     left_out: tuple[dict[str, Any], ...] = field(default=(), repr=False)
 
     @property
@@ -196,7 +194,7 @@ class _Trial:
         key = setting.settings, setting.every
         if key not in self.rows:
             self.rows[key] = self._measured(setting)
-        return replace(self.rows[key], knob=setting.knob, value=setting.value, published=setting.published)
+        return replace(self.rows[key], knob=setting.knob, value=setting.value)
 
     def baselines(self) -> Iterator[Row]:
         """Other methods, as they are, and with points that masks mostly pass by left out; none without truth."""

@@ -13,7 +13,7 @@ from og_pointcloud.evaluate.sweep import BASELINE, Row, Sweep, front, machine
 from og_pointcloud.formats.atomic import replacing
 
 SHARES = {
-    "mIoU": "miou", "without background": "labelled_miou", "paper": "published", "mAcc": "macc", "unknown": "unknown",
+    "mIoU": "miou", "without background": "labelled_miou", "mAcc": "macc", "unknown": "unknown",
     "background called": "background", "reliability": "reliability",
 }  # fmt: skip
 """Column -> field of `Row`, after setting, seconds, error and gain."""
@@ -76,10 +76,10 @@ def error_name(rows: Sequence[Row]) -> str:
     return "1 - mIoU" if all(row.miou is not None for row in rows) else "1 - reliability (no truth)"
 
 
-def write_report(sweep: Sweep, path: Path, chart: Path, title: str = "Error against run time") -> Path:
+def write_report(sweep: Sweep, path: Path, chart: Path) -> Path:
     """The tables as Markdown, with the chart that lies beside it; written whole or not at all."""
     parts = [
-        f"# {title}",
+        "# Error against run time",
         f"Measured on {machine()}. Seconds are of a whole fit; compare them within one report; less than a tenth of "
         "them is noise. A gain whose interval holds 0 may be chance.",
         f"![error against seconds]({chart.name})",
