@@ -107,20 +107,12 @@ class _LossSettings:
 class FeatureSettings(_LossSettings):
     """Instance features from the mask table (learned/instance_features.py). As they are: within the unit ball."""
 
-    start: Literal["masks", "random"] = "masks"
-    """Each Gaussian starts at the mean of random directions of its masks, which groups it already; or at a random
-    direction of its own (nearly as the authors' code, from U(0, 1))."""
     closest: float = 0.035
     """Eq. 2 stops growing where two mask means are nearer than this; directions at right angles read 0.71 apart."""
     tolerance: float = 1e-3
     """Converged when the objective fell by less than this share in the last ten steps."""
     max_steps: int = 1000
     """Steps after which it ends without having converged."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.start not in ("masks", "random"):
-            raise OgPointcloudError(f'start is "{self.start}"; expected "masks" or "random"')
 
 
 @dataclass(frozen=True)
@@ -133,10 +125,9 @@ class CodebookSettings:
     """Coarse clusters; None: as many as there are things. The paper's 64 or 32 are its limitation 2."""
     k2: int | None = None
     """Fine clusters in each coarse one; None: as many as masks of one view fall into it."""
-    positions: bool = True
-    """Coarse clusters are of features and positions (Eq. 3), or of features alone."""
     position_weight: float = 2.0
-    """The scene's extent counts as much as this distance of features. (Published: per scene unit.)"""
+    """The scene's extent counts as much as this distance of features in coarse clusters (Eq. 3; published: per scene
+    unit). 0: clusters of features alone."""
     fair_share: float = 0.2
     """A mask counts in a cluster with this share of the mask, or of what its view shows of the cluster (the authors'
     code: overlap 0.2)."""

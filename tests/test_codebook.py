@@ -244,19 +244,18 @@ def test_fine_clusters_part_what_coarse_ones_hold_together() -> None:
 def test_without_positions_things_never_seen_together_fall_into_one() -> None:
     """The paper's first challenge of one codebook (Sec. 3.2)."""
     _, _, thing, _ = room()
-    codebook = build(CodebookSettings(positions=False, k1=4))
+    codebook = build(CodebookSettings(position_weight=0.0, k1=4))
     assert same_partition(codebook.leaf, thing % 4)
-    assert codebook.coarse_centres.shape == (4, 6)
 
 
 def test_centres_are_weighted_means() -> None:
-    features, xyz, thing, _ = room()
+    features, _, thing, _ = room()
     weight = np.random.default_rng(3).random(len(thing))
     codebook = build(weight=weight)
     for leaf in range(len(codebook.leaf_centres)):
         mine = codebook.leaf == leaf
-        expected = np.average(np.hstack([features, xyz])[mine].astype(np.float64), axis=0, weights=weight[mine])
-        np.testing.assert_allclose(codebook.leaf_centres[leaf], expected[:6], rtol=1e-5, atol=1e-6)
+        expected = np.average(features[mine].astype(np.float64), axis=0, weights=weight[mine])
+        np.testing.assert_allclose(codebook.leaf_centres[leaf], expected, rtol=1e-5, atol=1e-6)
         np.testing.assert_allclose(codebook.coarse_centres[codebook.leaf_coarse[leaf]], expected, rtol=1e-5, atol=1e-6)
 
 
@@ -285,7 +284,7 @@ def test_outliers_do_not_set_the_extent() -> None:
 
 
 @pytest.mark.parametrize("count", [0, 1, 3])
-@pytest.mark.parametrize("settings", [DEFAULTS, CodebookSettings(k1=64, k2=5), CodebookSettings(positions=False)])
+@pytest.mark.parametrize("settings", [DEFAULTS, CodebookSettings(k1=64, k2=5), CodebookSettings(position_weight=0.0)])
 def test_hardly_any_points_for_two_levels(count: int, settings: CodebookSettings) -> None:
     """Coincident points in one mask; with 0 of them, nothing takes part."""
     table = hand_table(3, [[(range(3), ONE)]] * 2)

@@ -440,24 +440,6 @@ def test_settings_are_checked():
         MaskSettings(every=0)
 
 
-# Models -----------------------------------------------------------------------------------------------------------
-
-
-def test_models_lists_and_downloads_nothing(tmp_path, capsys, monkeypatch):
-    monkeypatch.setenv("HF_HUB_CACHE", str(tmp_path / "hub"))
-    snapshot = tmp_path / "hub" / "models--facebook--sam-vit-base" / "snapshots" / f"{5:040}"
-    snapshot.mkdir(parents=True)
-    (snapshot / "config.json").write_text('{"model_type": "sam"}')
-    (snapshot / "model.safetensors").write_bytes(b"")
-    before = sorted(tmp_path.rglob("*"))
-    assert main(["models"]) == 0
-    out = capsys.readouterr().out
-    assert "facebook/sam-vit-base  proposer" in out
-    assert "hf download facebook/sam-vit-base" not in out
-    assert "hf download openai/clip-vit-base-patch16" in out
-    assert before == sorted(tmp_path.rglob("*"))
-
-
 def test_light_work_takes_a_thread_a_core_and_models_take_one(monkeypatch, tmp_path):
     monkeypatch.setattr(os, "cpu_count", lambda: 4)
     assert ALONE.threads == 4

@@ -521,7 +521,6 @@ def test_no_home(monkeypatch, bundle, capsys):
         monkeypatch.delenv(name, raising=False)
     assert main(["segment", str(bundle), "--labels", "foo"]) == 2
     assert "not among the 5 known words" in capsys.readouterr().err
-    assert main(["models"]) == 0
 
 
 def test_no_folder_for_compiled_code(monkeypatch):
@@ -597,7 +596,7 @@ def test_commands_open_no_connection_and_run_no_program(tiny_capture, tmp_path):
     for command in (
         f"fit {tiny_capture.folder} -o {scene}", f"info {scene}", f"instances {scene}",
         f"segment {scene} -o {tmp_path}/s.ply", f"view {scene} --html {tmp_path}/s.html",
-        f"index {tmp_path} -o {tmp_path}/atlas", "models",
+        f"index {tmp_path} -o {tmp_path}/atlas",
     ):  # fmt: skip
         ran = subprocess.run([sys.executable, "-c", WATCHED, *command.split()], capture_output=True, text=True)
         assert ran.returncode == 0, (command, ran.stderr)

@@ -27,7 +27,7 @@ from og_pointcloud.errors import MissingExtraError, OgPointcloudError, did_you_m
 __all__ = ["main"]
 
 COMMANDS = (
-    "poses", "masks", "models", "fit", "map", "update", "compare", "fuse", "repair", "import", "segment", "select",
+    "poses", "masks", "fit", "map", "update", "compare", "fuse", "repair", "import", "segment", "select",
     "pick", "instances", "index", "find", "edit", "view", "serve", "ros-bag", "info", "vocabulary", "export", "eval",
     "report", "demo",
 )  # fmt: skip

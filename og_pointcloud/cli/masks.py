@@ -55,7 +55,7 @@ def run(arguments: argparse.Namespace) -> None:
     if arguments.encoder == "demo":
         warnings.warn(
             "the demo encoder knows the demo room's furniture alone: words mean little on other photographs; take "
-            "a model's folder, --encoder FOLDER ('og-pointcloud models' lists them), or none",
+            "a model's folder, --encoder FOLDER ('hf cache ls' lists them), or none",
             stacklevel=1,
         )
     warn_of_poses(arguments.capture)

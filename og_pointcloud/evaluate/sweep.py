@@ -31,7 +31,6 @@ from og_pointcloud.cloud import FeatureSpace, LabelledCloud, Vocabulary
 from og_pointcloud.errors import MissingExtraError, OgPointcloudError, SceneError
 from og_pointcloud.evaluate.intervals import miou_interval
 from og_pointcloud.evaluate.knobs import DEFAULT, Setting
-from og_pointcloud.evaluate.metrics import score_labels
 from og_pointcloud.evaluate.truth import GT_NAME, Truth, read_truth
 from og_pointcloud.formats.atomic import replacing
 from og_pointcloud.formats.capture import read_capture
@@ -71,7 +70,7 @@ class Row:
 
     seconds: of a whole fit. error: 1 - mIoU, or where the truth is not known 1 - reliability.
     miou, macc, unknown: over the points with a known class; background: the share of known background that was given a
-    class. labelled_miou: mIoU with background left out, as published tables have it. None without truth.
+    class. None without truth.
     gain, gain_low, gain_high: mIoU less the default's, with its paired 95 % interval over blocks of space.
     reliability: of the fit (`LabelledCloud.reliability`), None for other methods.
     left_out: what the fit left out and why, as its provenance has it.
@@ -83,7 +82,6 @@ class Row:
     seconds: float
     error: float
     miou: float | None = None
-    labelled_miou: float | None = None
     macc: float | None = None
     unknown: float | None = None
     background: float | None = None
@@ -182,19 +180,11 @@ class _Trial:
                 " expected fewer: report on a part of the cloud"
             )
         self.warm: set[str] = set()
-        self.rows: dict[tuple[FitSettings, int], Row] = {}
         self.default_labels: Labels | None = None
         self._warm_up(DEFAULT.settings)
         start = time.perf_counter()
         self.prepared = prepare(subject.scene, journal=Journal(progress=False))
         self.prepared_seconds = time.perf_counter() - start
-
-    def row(self, setting: Setting) -> Row:
-        """The row of one setting; settings that several tables name are run once."""
-        key = setting.settings, setting.every
-        if key not in self.rows:
-            self.rows[key] = self._measured(setting)
-        return replace(self.rows[key], knob=setting.knob, value=setting.value)
 
     def baselines(self) -> Iterator[Row]:
         """Other methods, as they are, and with points that masks mostly pass by left out; none without truth."""
@@ -205,7 +195,8 @@ class _Trial:
             seconds += self.prepared_seconds
             yield Row(self.subject.name, BASELINE, name, seconds, 1 - scores["miou"], **scores)
 
-    def _measured(self, setting: Setting) -> Row:
+    def row(self, setting: Setting) -> Row:
+        """The row of one setting."""
         settings, scene = setting.settings, self.subject.scene
         scene = replace(scene, views=scene.views[:: setting.every])
         self._warm_up(settings)
@@ -256,7 +247,6 @@ class _Trial:
         score = truth.score(labels, vocabulary.names)
         found: dict[str, Any] = {
             "miou": score.miou,
-            "labelled_miou": score_labels(called, truth.cls, scored=truth.scored).miou,
             "macc": score.macc,
             "unknown": score.unknown_share,
             "background": score.background_called,

@@ -13,7 +13,7 @@ from og_pointcloud.evaluate.sweep import BASELINE, Row, Sweep, front, machine
 from og_pointcloud.formats.atomic import replacing
 
 SHARES = {
-    "mIoU": "miou", "without background": "labelled_miou", "mAcc": "macc", "unknown": "unknown",
+    "mIoU": "miou", "mAcc": "macc", "unknown": "unknown",
     "background called": "background", "reliability": "reliability",
 }  # fmt: skip
 """Column -> field of `Row`, after setting, seconds, error and gain."""

@@ -139,7 +139,7 @@ def learned_stages(table: MaskTable, xyz: NDArray[np.float32], seed: int = 0) ->
     learned = learn_features(table, None, seed)
     codebook = two_level_codebook(learned.features, xyz, learned.seen, table, CodebookSettings(), seed)
     width = learned.features.shape[1]
-    coarse, leaf = codebook.coarse_centres[:, :width], codebook.leaf_centres
+    coarse, leaf = codebook.coarse_centres, codebook.leaf_centres
     shown = (learned.seen > 0)[:, None]
     return {
         f"{width}-D features": np.where(shown, learned.features, np.float32(np.nan)),

@@ -31,9 +31,8 @@ STARTS = 4
 class Codebook:
     """Clusters of n Gaussians on two levels; the leaves are the finer ones, numbered by their coarse cluster.
 
-    coarse, leaf: (n,) int32, -1 for Gaussians without weight. coarse_centres: (k1, width + 3) float32, mean feature and
-    mean position (scene units; width columns alone where positions were left out). leaf_centres: (k, width) float32,
-    mean feature. leaf_coarse: (k,) int32, ascending. levels: 1 where each coarse cluster is one leaf.
+    coarse, leaf: (n,) int32, -1 for Gaussians without weight. coarse_centres (k1, width), leaf_centres (k, width)
+    float32, mean features. leaf_coarse: (k,) int32, ascending. levels: 1 where each coarse cluster is one leaf.
     No cluster is empty.
     """
 
@@ -62,9 +61,7 @@ def two_level_codebook(
     taking_part = np.flatnonzero(weight > 0)
     coarse, leaf = np.full(len(features), -1, np.int32), np.full(len(features), -1, np.int32)
     values, mass = np.ascontiguousarray(features[taking_part], np.float32), weight[taking_part].astype(np.float64)
-    placed = values
-    if settings.positions and len(taking_part):
-        placed = np.concatenate([values, _scaled_positions(xyz[taking_part], settings)], axis=1)
+    placed = np.concatenate([values, _scaled_positions(xyz[taking_part], settings)], axis=1)
     rng = np.random.default_rng(seed)
     k1 = settings.k1 or thing_count(table)
     coarse[taking_part], k1 = _clusters(placed, mass, k1, settings.rounds, rng)
@@ -79,11 +76,10 @@ def two_level_codebook(
         fine, k2 = _clusters(values[members], mass[members], int(parts[cluster]), settings.rounds, rng)
         leaf[taking_part[members]] = fine + len(leaf_coarse)
         leaf_coarse += [cluster] * k2
-    described = np.concatenate([values, xyz[taking_part]], axis=1) if settings.positions else values
     return Codebook(
         coarse,
         leaf,
-        _means(described, mass, coarse[taking_part], k1),
+        _means(values, mass, coarse[taking_part], k1),
         _means(values, mass, leaf[taking_part], len(leaf_coarse)),
         np.array(leaf_coarse, np.int32),
         2 if len(leaf_coarse) > k1 else 1,
@@ -223,6 +219,8 @@ def _clusters(
 
 def _scaled_positions(xyz: NDArray[np.float32], settings: CodebookSettings) -> NDArray[np.float32]:
     """Positions in units that compare with features. Outliers neither set the extent nor get clusters of their own."""
+    if len(xyz) == 0:
+        return xyz
     low, middle, high = np.quantile(xyz, [0.05, 0.5, 0.95], axis=0)
     extent = float(np.linalg.norm(high - low)) or float(np.linalg.norm(np.ptp(xyz, axis=0))) or 1.0
     return (settings.position_weight * np.clip((xyz - middle) / extent, -1, 1)).astype(np.float32)

@@ -101,8 +101,9 @@ def learn_features(
 ) -> LearnedFeatures:
     """Features that agree within masks and differ between the masks of a view, by L-BFGS on all views at once.
 
-    start: (n, width), not yet read; else `FeatureSettings.start` says where each Gaussian starts, seeded. Where two
-    means of a view have met, the gradient vanishes by symmetry: random directions of the masks then part them.
+    start: (n, width), not yet read; None: each Gaussian starts at the mean of random directions of its masks, seeded,
+    which groups it already. Where two means of a view have met, the gradient vanishes by symmetry: random directions of
+    the masks then part them.
 
     The same input and seed give the same features. Raises SceneError if no mask shows a Gaussian.
     """
@@ -111,8 +112,6 @@ def learn_features(
     rng = np.random.default_rng(seed)
     random = rng.normal(size=(problem.mask_count, settings.width))
     directions = problem.uplift((random / np.linalg.norm(random, axis=1, keepdims=True)).astype(np.float32))
-    if start is None and settings.start == "random":
-        start = rng.normal(size=(table.weights.shape[1], settings.width))
     if start is None:
         raw = directions / np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-6)
     else:
