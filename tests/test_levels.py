@@ -7,7 +7,7 @@ import pytest
 
 from og_pointcloud.errors import SceneError
 from og_pointcloud.masking.contracts import Proposals
-from og_pointcloud.masking.levels import INSIDE, PREFERENCE, SAME, VISIBLE, settle
+from og_pointcloud.masking.levels import INSIDE, PREFERENCE, SAME, VISIBLE, settled
 
 
 def rectangle(top, left, bottom, right, size=(24, 32)):
@@ -18,6 +18,10 @@ def rectangle(top, left, bottom, right, size=(24, 32)):
 
 def proposals(*pairs):
     return Proposals(np.array([mask for mask, _ in pairs]), np.array([score for _, score in pairs], np.float32))
+
+
+def settle(said: Proposals, level: str):
+    return settled(said, level)[0]
 
 
 def random_proposals(seed, count=25, size=(24, 32)):

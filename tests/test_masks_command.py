@@ -124,13 +124,13 @@ SLOWLY = """
 import sys, time
 from og_pointcloud.masking import worker as w
 from og_pointcloud.masking import make_masks as m
-settle = w.settle
+settled = w.settled
 def slow(*arguments):
     with open(sys.argv[2], "a") as log:
         log.write("x")
     time.sleep(float(sys.argv[3]))
-    return settle(*arguments)
-w.settle = slow
+    return settled(*arguments)
+w.settled = slow
 m.make_masks(sys.argv[1], m.MaskSettings(encoder=None))
 """
 

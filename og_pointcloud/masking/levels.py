@@ -27,13 +27,9 @@ VISIBLE = 0.3
 """A mask of which better ones leave less than this part is left out."""
 
 
-def settle(proposals: Proposals, level: str = "medium") -> NDArray[np.int32]:
-    """(H, W) int32: -1 outside every mask of this level of `PREFERENCE`, else 0..K-1, the best scored mask first."""
-    return settled(proposals, level)[0]
-
-
 def settled(proposals: Proposals, level: str) -> tuple[NDArray[np.int32], NDArray[np.intp]]:
-    """What `settle` gives, and (K,) the proposal that each id is."""
+    """(H, W) int32: -1 outside every mask of this level of `PREFERENCE`, else 0..K-1, the best scored mask first; and
+    (K,) the proposal that each id is."""
     atom_of_pixel, member, area_px = _atoms(proposals.masks)
     order = np.lexsort((member @ area_px, -proposals.scores.astype(np.float64)))  # the better, then the smaller
     member, scores = member[order], proposals.scores[order].astype(np.float64)
