@@ -1,4 +1,4 @@
-"""docs/gallery.md and its pictures: the numbered examples, run on the demo room, one on a kitchen too.
+"""docs/gallery.md and its pictures: the numbered examples, run on the demo room.
 
     python scripts/make_gallery.py [--scene out/demo/room.ogpc]     # without a scene the demo is run first
 
@@ -23,23 +23,21 @@ ROOT = Path(__file__).parents[1]
 GALLERY = ROOT / "docs" / "gallery"
 WIDTH = 1000
 QUALITY = 82
-KITCHEN = ROOT.parent / "shared" / "data" / "seven_redkitchen"
 
 
 @dataclass(frozen=True)
 class Exhibit:
     """An example, its arguments ({scene}, {capture}, {splats} and {out} are filled in), and the pictures of it that are
-    shown. needs: without this folder it is not run, and its pictures stay as they are."""
+    shown."""
 
     example: str
     arguments: tuple[str, ...]
     pictures: tuple[str, ...]
     seen: str
-    needs: Path | None = None
 
     def kept_as(self, picture: str) -> str:
         """The picture's file in the gallery."""
-        return f"{self.example[:2]}_{Path(picture.replace('/', '_')).stem}.jpg"
+        return f"{self.example[:2]}_{Path(picture).stem}.jpg"
 
 
 EXHIBITS = (
@@ -65,10 +63,6 @@ EXHIBITS = (
             "Mode paper in the made room: its features, the leaves of its codebook, and the default way's instances, "
             "in the same colors; gray is what no mask shows. Then a click on a chair: what it selects, what is left "
             "without that, and that painted, of mode paper and of the default way."),
-    Exhibit("11_paper_figures", (str(KITCHEN), "microwave", "-o", "{out}/kitchen"),
-            ("kitchen/features.png", "kitchen/objects.png"),
-            "The same of a real kitchen (7-Scenes), with a click on what its detector takes for a microwave.",
-            needs=KITCHEN),
 )  # fmt: skip
 
 
@@ -84,10 +78,8 @@ def main() -> None:
         # The edited room comes first: its splat file is what another example lights a word in.
         order = sorted(EXHIBITS, key=lambda exhibit: exhibit.example != "08_edit_a_scene")
         for exhibit in order:
-            missing = exhibit.needs is not None and not exhibit.needs.exists()
-            print(exhibit.example + (f": left out, {exhibit.needs} is not there" if missing else ""), flush=True)
-            if not missing:
-                run(exhibit, scene, work)
+            print(exhibit.example, flush=True)
+            run(exhibit, scene, work)
     (ROOT / "docs" / "gallery.md").write_text(page())
     print(f"wrote {ROOT / 'docs' / 'gallery.md'}")
 
