@@ -63,9 +63,9 @@ class KeptView:
     @property
     def masks(self) -> NDArray[np.int32]:
         """(H, W) the mask image of a view that had no depth."""
-        return np.frombuffer(zlib.decompress(self.packed.tobytes()), np.int32).reshape(
-            self.camera.height, self.camera.width
-        )
+        shape = self.camera.height, self.camera.width
+        ids = zlib.decompressobj().decompress(self.packed.tobytes(), 4 * shape[0] * shape[1])
+        return np.frombuffer(ids, np.int32).reshape(shape)
 
     @property
     def nbytes(self) -> int:
