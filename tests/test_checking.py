@@ -4,6 +4,7 @@ import json
 import warnings
 from collections import Counter
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -40,6 +41,7 @@ from og_pointcloud.formats.repairs import (
 from og_pointcloud.scene import Camera
 
 SMALL = {"views": 6, "points": 3000}
+TABLE = Path(__file__).resolve().parents[2] / "shared" / "data" / "ycb_0050"
 
 
 def parsed(text):
@@ -95,6 +97,14 @@ def test_a_pixel_of_a_small_smooth_image_is_no_fault(tiny_capture, views):
     """Where every number may change, or in few views, points move by more than the bound: no fault."""
     scene = og.read_capture(tiny_capture.folder)
     assert doubts(replace(scene, views=scene.views[views])) == {}
+
+
+@pytest.mark.skipif(not TABLE.exists(), reason="the capture ycb_0050 is not here")
+@pytest.mark.parametrize("views", [3, 4])
+def test_neighbouring_views_whose_photographs_are_nearly_alike_raise_no_doubt(views):
+    """A drawing fits its neighbours' photographs nearly as well as its own, which it fits as well as can be."""
+    scene = og.read_capture(TABLE)
+    assert not doubts(replace(scene, views=scene.views[:views]))
 
 
 def test_the_order_of_views_and_points_does_not_matter_for_a_right_room():

@@ -16,7 +16,7 @@ import numpy as np
 
 from og_pointcloud.checking.conversions import Repairs, best_conversion, best_mask_conversion
 from og_pointcloud.checking.masks import MaskMaps, read_mask_maps
-from og_pointcloud.checking.photographs import Photographs, read_photographs
+from og_pointcloud.checking.photographs import ALIKE, Photographs, read_photographs
 from og_pointcloud.checking.registration import GROUPS, MORE_POINTS, Registration, Small
 from og_pointcloud.checking.sample import Comparison, Sample, draw_sample, seen
 from og_pointcloud.cloud import BACKGROUND, UNKNOWN_SPACE, UNOBSERVED, LabelledCloud
@@ -155,7 +155,8 @@ def _poses(sample: Sample, maps: MaskMaps | None) -> tuple[list[Check], Photogra
     if photographs is None:
         return [_poses_by_masks(sample, maps)], None
     stated = photographs.fit(photographs.sample.cameras)
-    if stated.reaches(PHOTOGRAPHS_FIT) or (stated.share >= NEARLY_ALWAYS and stated.compared >= FEWEST_VOUCHING):
+    always = stated.share >= NEARLY_ALWAYS and stated.compared >= FEWEST_VOUCHING
+    if stated.reaches(PHOTOGRAPHS_FIT) or always or stated.own >= ALIKE:  # of a few views, others fit nearly as well
         return [Check("poses", "ok", f"drawings fit their own photographs best: {stated}")], photographs
     if photographs.points_are_painted:
         return [_poses_by_masks(sample, maps)], None
