@@ -157,13 +157,12 @@ class Collection:
             raise OgPointcloudError(f"the words are {names!r:.80}; expected at least one word or phrase")
         features = read_text_features(text_features) if isinstance(text_features, (str, os.PathLike)) else text_features
         box = None if within is None else _corners(within)
-        ids = self._ids(scenes)
-        asked = [group for group in self._groups if any(entry.id in ids for entry in group.entries)]
+        wanted = _Wanted(self._ids(scenes), box, top)
+        asked = [group for group in self._groups if wanted.among(group.entries)]
         vectors = [self._vectors(group.family, names, features) for group in asked]
         if not any(vectors):
             raise _unanswerable(names[0], [group.family for group in asked])
         with Atlas.reading(self.path) as atlas:
-            wanted = _Wanted(ids, box, top)
             found = [
                 pair
                 for group, known in zip(asked, vectors, strict=True)
@@ -174,17 +173,17 @@ class Collection:
         counts: Counter[tuple[str, str]] = Counter()
         for group, known in zip(asked, vectors, strict=True):
             for word in set(names) - known.keys():
-                counts[word, group.family.feature_space] += sum(entry.id in ids for entry in group.entries)
+                counts[word, group.family.feature_space] += len(wanted.among(group.entries))
         not_asked = tuple(
             f"{count} scenes of feature space '{space}' could not be asked for '{word}': no vector of theirs is known"
             for (word, space), count in sorted(counts.items())
         )
         return Findings((finding for _, finding in found[:top]), not_asked)
 
-    def _ids(self, scenes: str | Iterable[str] | None) -> set[int]:
-        """Ids of the scenes of these names or patterns; of all for None."""
+    def _ids(self, scenes: str | Iterable[str] | None) -> set[int] | None:
+        """Ids of the scenes of these names or patterns; None, for all, as it was given."""
         if scenes is None:
-            return {entry.id for entry in self.entries}
+            return None
         found: set[int] = set()
         for pattern in (scenes,) if isinstance(scenes, str) else scenes:
             fitting = {entry.id for entry in self.entries if pattern == entry.name or fnmatchcase(entry.name, pattern)}
@@ -221,7 +220,7 @@ class Collection:
         self, atlas: Atlas, group: Group, wanted: _Wanted, word: str, vector: NDArray[np.float32]
     ) -> list[tuple[float, Finding]]:
         """The best of a group for a word, with what they are ranked by."""
-        here = [entry for entry in group.entries if entry.id in wanted.ids]
+        here = wanted.among(group.entries)
         if not here:
             return []
         block, rows = self._candidates(atlas, group, here, wanted, vector)
@@ -231,7 +230,7 @@ class Collection:
         return [(key, _finding(block, row, word, float(share(key)))) for row, key in ranked]
 
     def _candidates(
-        self, atlas: Atlas, group: Group, here: list[SceneEntry], wanted: _Wanted, vector: NDArray[np.float32]
+        self, atlas: Atlas, group: Group, here: Sequence[SceneEntry], wanted: _Wanted, vector: NDArray[np.float32]
     ) -> tuple[Block, NDArray[np.intp]]:
         """A block, and which of its instances are asked: all of the scenes that meet the box, or what LanceDB
         proposes. All scenes are read once and kept, some of them each time."""
@@ -245,8 +244,10 @@ class Collection:
             block = load_block(atlas, atlas.side_by_side(near or here[:1]))
             if is_all:
                 self._blocks[group.name] = block
-        asked = np.array([entry.id in wanted.ids for entry in block.entries], bool)
-        return block, np.flatnonzero((asked & block.meets(wanted.box))[block.scene])
+        asked = block.meets(wanted.box)
+        if wanted.ids is not None:
+            asked &= np.array([entry.id in wanted.ids for entry in block.entries], bool)
+        return block, np.flatnonzero(asked[block.scene])
 
     def _proposed(
         self, atlas: Atlas, group: Group, near: list[SceneEntry], wanted: _Wanted, vector: NDArray[np.float32]
@@ -254,7 +255,7 @@ class Collection:
         """What LanceDB proposes of these scenes, read from the atlas."""
         assert self._lance is not None
         direction = load_block(atlas, near[:1]).direction(vector)
-        every = all(entry.id in wanted.ids for entry in group.entries)  # then the box says it all
+        every = len(wanted.among(group.entries)) == len(group.entries)  # then the box says it all
         some, part = None if every else [entry.id for entry in near], len(near) / len(group.entries)
         proposed = self._lance.propose(group.name, direction, wanted.box, some, wanted.top, part)
         block = load_block(atlas, [entry for entry in near if entry.id in proposed] or near[:1])
@@ -267,11 +268,16 @@ class Collection:
 
 @dataclass(frozen=True)
 class _Wanted:
-    """What may be found. ids: of its scene. box: (2, 3) corners about its middle, None for anywhere. top: how many."""
+    """What may be found. ids: of its scene, None for any. box: (2, 3) corners about its middle, None for anywhere. top:
+    how many."""
 
-    ids: set[int]
+    ids: set[int] | None
     box: NDArray[np.float64] | None
     top: int
+
+    def among(self, entries: Sequence[SceneEntry]) -> Sequence[SceneEntry]:
+        """Those scenes of some in which it may lie."""
+        return entries if self.ids is None else [entry for entry in entries if entry.id in self.ids]
 
 
 def _corners(within: Any) -> NDArray[np.float64]:
