@@ -37,8 +37,6 @@ from og_pointcloud.rendering.geometry import Neighbourhood, neighbourhood
 from og_pointcloud.scene import Camera
 from og_pointcloud.settings import GeometrySettings
 
-__all__ = ["Changes", "Evidence", "Moved", "Visit", "compare", "compare_visits"]
-
 TOLERANCE = 0.5
 """Spacings at right angles to a surface up to which a point is of it."""
 SCATTER = 2.0

@@ -13,8 +13,6 @@ from og_pointcloud.formats.poses import in_local_frame
 from og_pointcloud.mapping.sight import AGREES, MeasuredView, states_of_points, view_of_depth
 from og_pointcloud.scene import Camera, View
 
-__all__ = ["COMPARED", "Frame", "checked", "require_same_place"]
-
 COMPARED = 4000
 """Points of the map, about, by which a frame's depth is held against it."""
 FEWEST_COMPARED = 200

@@ -12,8 +12,6 @@ from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.mapping.frame import Frame
 from og_pointcloud.mapping.mapper import FrameChange, Mapper
 
-__all__ = ["FrameQueue"]
-
 
 class FrameQueue:
     """Feeds a mapper in a thread of its own, in the order in which frames come.

@@ -19,8 +19,6 @@ from og_pointcloud.mapping.tracks import NO_TRACK, PointVotes, Tracks
 from og_pointcloud.mapping.voxels import VoxelPoints
 from og_pointcloud.scene import Camera
 
-__all__ = ["GrowingMap"]
-
 READINGS_PER_SPACING = 1.5
 """Readings a spacing that a frame gives to the map, along each axis: more would only be averaged."""
 SLANT = 0.15

@@ -18,8 +18,6 @@ from og_pointcloud.mapping.voxels import Columns
 from og_pointcloud.rendering.sightings import Sightings
 from og_pointcloud.scene import Camera
 
-__all__ = ["KeptView", "KeptViews"]
-
 ENOUGH_VIEWS = 48
 """Kept views of a point beyond which another one says nothing new of it: 10 bytes each, a point."""
 FEW_VIEWS = 4

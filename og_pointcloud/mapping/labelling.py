@@ -18,8 +18,6 @@ from og_pointcloud.rendering.surface import Surface, sight_thickness
 from og_pointcloud.scene import Points, Scene, View
 from og_pointcloud.settings import FitSettings
 
-__all__ = ["labelled", "matched_ids", "with_ids"]
-
 
 def labelled(known: GrowingMap, rows: NDArray[np.int64], around: Neighbourhood, settings: FitSettings) -> LabelledCloud:
     """Some of a map's points, rows (n,), labelled as `fit` would from the views kept. around: their neighbourhood."""

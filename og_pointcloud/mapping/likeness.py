@@ -19,17 +19,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from og_pointcloud.cloud import InstanceTable
 
-__all__ = [
-    "ALIKE",
-    "SAME_COLOR",
-    "Look",
-    "descriptors_of",
-    "likeness",
-    "spread_of",
-    "typical_cosine",
-    "typical_of_table",
-]
-
 ALIKE = 0.5
 """From here on two are one thing: nearer to what one thing has than to what different things have."""
 OTHER_COLOR = 48.0

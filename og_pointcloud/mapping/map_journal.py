@@ -35,8 +35,6 @@ from og_pointcloud.mapping.tracks import Left, PointVotes, Track, Tracks
 from og_pointcloud.mapping.voxels import Packets, VoxelHash, VoxelPoints
 from og_pointcloud.scene import Camera
 
-__all__ = ["MapJournal", "packed", "unpacked"]
-
 KINDS = {
     kind.__name__: kind
     for kind in (

@@ -12,8 +12,6 @@ from og_pointcloud.mapping.growing_map import GrowingMap
 from og_pointcloud.mapping.likeness import ALIKE, Look, likeness, typical_cosine
 from og_pointcloud.mapping.tracks import NO_TRACK, Left, Track
 
-__all__ = ["MapObject", "leave", "name", "objects_of"]
-
 
 @dataclass(frozen=True)
 class MapObject:

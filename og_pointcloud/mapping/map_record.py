@@ -15,8 +15,6 @@ from og_pointcloud.cloud import InstanceTable, LabelledCloud
 from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.mapping.likeness import Look, descriptors_of
 
-__all__ = ["MapRecord", "Retired", "VisitEntry"]
-
 KEY = "map"
 
 

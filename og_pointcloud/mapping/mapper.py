@@ -36,8 +36,6 @@ from og_pointcloud.rendering.geometry import Neighbourhood, neighbourhood
 from og_pointcloud.scene import Points, require_finite
 from og_pointcloud.settings import FitSettings
 
-__all__ = ["FrameChange", "Mapper"]
-
 PIXELS_PER_SPACING = 4.0
 """Pixels of the first depth image, at its median depth, to a spacing of a map that starts empty."""
 PRUNED_EVERY = 64

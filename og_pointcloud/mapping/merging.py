@@ -23,8 +23,6 @@ from og_pointcloud.mapping.sight import MeasuredView
 from og_pointcloud.scene import Scene
 from og_pointcloud.settings import FitSettings
 
-__all__ = ["Updated", "joined", "merge", "update"]
-
 SAME_PLACE = 1.0
 """Spacings within which a point of the visit adds nothing to the map."""
 SAME_SURFACE = 1.5

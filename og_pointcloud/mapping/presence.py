@@ -19,8 +19,6 @@ from og_pointcloud.kernels import njit
 from og_pointcloud.mapping.sight import AGREES, HIDDEN, THROUGH, MeasuredView, states_of_points
 from og_pointcloud.mapping.voxels import Columns
 
-__all__ = ["Presence"]
-
 APART = 0.998
 """Cosine between two directions of sight, from the point, that are two places: 3.6 degrees."""
 

@@ -17,8 +17,6 @@ from og_pointcloud.rendering.surface import sight_thickness
 from og_pointcloud.scene import Points
 from og_pointcloud.settings import GeometrySettings
 
-__all__ = ["Seen", "drawn_points", "measured_points", "seen_again", "vote"]
-
 MARGIN = 0.1
 """Share of an image beyond its border from which points are drawn, as they may hide others within."""
 

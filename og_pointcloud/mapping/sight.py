@@ -30,20 +30,6 @@ from og_pointcloud.rendering.geometry import Neighbourhood, neighbourhood
 from og_pointcloud.scene import Camera
 from og_pointcloud.settings import GeometrySettings
 
-__all__ = [
-    "AGREES",
-    "HIDDEN",
-    "NOTHING",
-    "THROUGH",
-    "DiscSurface",
-    "MeasuredView",
-    "depth_views",
-    "lens_of",
-    "states_in_packets",
-    "states_of_points",
-    "view_of_depth",
-]
-
 NOTHING, AGREES, HIDDEN, THROUGH = 0, 1, 2, 3
 """States of a point."""
 

@@ -24,8 +24,6 @@ from og_pointcloud.kernels import njit
 from og_pointcloud.mapping.likeness import Look, spread_of
 from og_pointcloud.mapping.voxels import Columns
 
-__all__ = ["NO_TRACK", "Left", "PointVotes", "Track", "Tracks"]
-
 NO_TRACK = -1
 HEAVIEST = 4
 """Tracks that a point remembers votes for."""

@@ -15,8 +15,6 @@ from numpy.typing import NDArray
 from og_pointcloud.kernels import njit
 from og_pointcloud.scene import Camera
 
-__all__ = ["Columns", "Packets", "VoxelHash", "VoxelPoints"]
-
 ACROSS = 1 << 20
 """Voxels to either side of the origin: three indices fit one 64-bit key."""
 MOST_WEIGHT = 32.0
