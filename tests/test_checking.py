@@ -23,7 +23,8 @@ from og_pointcloud.checking.check import (
     warn_of_doubts,
 )
 from og_pointcloud.checking.masks import entropies
-from og_pointcloud.checking.sample import seen
+from og_pointcloud.checking.photographs import Photographs
+from og_pointcloud.checking.sample import Comparison, seen
 from og_pointcloud.cli import main
 from og_pointcloud.cloud import UNOBSERVED
 from og_pointcloud.errors import SceneError
@@ -97,6 +98,14 @@ def test_a_pixel_of_a_small_smooth_image_is_no_fault(tiny_capture, views):
     """Where every number may change, or in few views, points move by more than the bound: no fault."""
     scene = og.read_capture(tiny_capture.folder)
     assert doubts(replace(scene, views=scene.views[views])) == {}
+
+
+@pytest.mark.parametrize(("own", "verdict"), [(0.96, "ok"), (0.9, "doubt")])
+def test_a_drawing_as_like_its_photograph_as_photographs_of_the_same_is_right(own, verdict, monkeypatch):
+    """Whatever it loses against others: of views nearly alike a third of the comparisons go the other way."""
+    found = Comparison(0.62, own, 0.75, 0.1, 16, "correlation")
+    monkeypatch.setattr(Photographs, "fit", lambda self, cameras: found)
+    assert verdicts(check_poses(tiled_room(**SMALL)))["poses"] == verdict
 
 
 @pytest.mark.skipif(not TABLE.exists(), reason="the capture ycb_0050 is not here")

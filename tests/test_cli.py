@@ -115,6 +115,15 @@ def test_fit_reports_its_stages_and_next_command(tiny_capture, tmp_path, capsys)
     assert run(capsys, *shlex.split(command)[2:])[0] == 0, "the next command must work as printed"
 
 
+def test_without_words_the_next_command_needs_none(tiny_capture, tmp_path, capsys):
+    (tiny_capture.folder / "text_features.npz").unlink()
+    code, stdout, _ = run(capsys, "fit", tiny_capture.folder, "-o", tmp_path / "tiny.ogpc")
+    assert code == 0
+    assert "no words are known yet" in stdout
+    command = next(line for line in stdout.splitlines() if line.startswith("next: og-pointcloud "))
+    assert run(capsys, *shlex.split(command)[2:])[0] == 0, "the next command must work as printed"
+
+
 def test_info_tells_what_is_inside(fitted, capsys):
     capture, bundle = fitted
     assert "instances" in run(capsys, "info", bundle)[1]

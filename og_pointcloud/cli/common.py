@@ -190,7 +190,10 @@ def describe_fit(cloud: LabelledCloud, capture: Path, bundle: Path) -> dict[str,
 
 
 def print_fit(report: Mapping[str, Any], cloud: LabelledCloud) -> None:
-    """What ``fit`` closes with; ends in the next command."""
+    """What ``fit`` closes with; ends in a next command that works as it stands."""
+    from og_pointcloud.bundle.vocabulary import carried_encoder
+    from og_pointcloud.text.encoder import find_encoder
+
     print_provenance(cloud.provenance, report["capture"])
     total = report["points"]
     shares = [report[f"points_{state}"] / total for state in ("in_instances", "background", "unobserved")]
@@ -203,9 +206,13 @@ def print_fit(report: Mapping[str, Any], cloud: LabelledCloud) -> None:
     print(f"wrote {report['output']} ({report['bytes'] / 1e6:.1f} MB)")
     if not report["calibrated"]:
         print(f"no word bank: scores will be cosines. {calibration_hint(report['output'])}")
-    labels = cloud.vocabulary.names[:2] if cloud.vocabulary else ("chair", "table")
-    ply = Path(report["output"]).with_suffix(".ply")
-    print_next("segment", report["output"], "--labels", ",".join(labels), "-o", ply)
+    output = report["output"]
+    if cloud.vocabulary or find_encoder(cloud.feature_space, carried_encoder(output)):
+        labels = cloud.vocabulary.names[:2] if cloud.vocabulary else ("chair", "table")
+        print_next("segment", output, "--labels", ",".join(labels), "-o", Path(output).with_suffix(".ply"))
+    else:
+        print("no words are known yet: segment takes --text-features, or what export text makes of the masks' encoder")
+        print_next("instances", output)
 
 
 def write_fit(cloud: LabelledCloud, stages: list[dict[str, Any]], output: Path) -> LabelledCloud:
