@@ -24,7 +24,7 @@ from test_opengaussian import write_result
 from og_pointcloud.ask.labelled_scene import load
 from og_pointcloud.ask.segmentation import SAVED_AS
 from og_pointcloud.bundle.read import read_bundle
-from og_pointcloud.cli import main
+from og_pointcloud.cli import build_parser, main
 from og_pointcloud.cli import segment as cli_segment
 from og_pointcloud.formats.capture import read_capture
 
@@ -438,3 +438,12 @@ def test_the_published_schedule_can_be_shortened(tiny_capture, tmp_path, capsys)
     shortened = ("--mode", "paper", "--schedule-share", "0.0005", "--json", record)
     assert run(capsys, "fit", tiny_capture.folder, "-o", tmp_path / "s.ogpc", *shortened)[0] == 0
     assert [stage["steps"] for stage in json.loads(record.read_text())["notes"]["training"]] == [10, 10, 10]
+
+
+@pytest.mark.parametrize("words", [
+    "edit remove S.ogpc -o O.ply --xyz -1,0,5", "edit insert A.ply B.ply -o O.ply --at -0.4,0,0", "view S.ogpc --up -z",
+    "find ATLAS mug --within -1,-1,0,1,1,2", "instances S.ogpc --up -0.1,0,1", "pick S.ogpc --xyz -1,2,3",
+])  # fmt: skip
+def test_negative_coordinates_are_values_and_no_options(words):
+    arguments = build_parser().parse_args(words.split())
+    assert words.split()[-1] in vars(arguments).values()

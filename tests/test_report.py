@@ -19,7 +19,7 @@ from og_pointcloud.cli import main
 from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError, SceneError
 from og_pointcloud.evaluate import sweep as sweeping
 from og_pointcloud.evaluate.baselines import BASELINES, only_where_masked
-from og_pointcloud.evaluate.knobs import DEFAULT, FAST, KNOBS, Setting, settings_of
+from og_pointcloud.evaluate.knobs import DEFAULT, KNOBS, Setting, settings_of
 from og_pointcloud.evaluate.sweep import BASELINE, Row, Sweep, front, read_subject, sweep
 from og_pointcloud.evaluate.sweep_report import write_chart, write_report
 from og_pointcloud.fitting.fit import fit, prepare
@@ -61,8 +61,7 @@ def value_of(knob: str, value: str) -> Setting:
 
 def test_one_value_of_every_knob_is_its_default_and_no_setting_is_tried_twice():
     for name, values in KNOBS.items():
-        base = FitSettings(mode="fast") if values[0].settings.mode == "fast" else FitSettings()
-        stands = [value.settings == base and value.every == 1 for value in values]
+        stands = [value.settings == FitSettings() and value.every == 1 for value in values]
         assert stands.count(True) == 1, name
         assert len({value.value for value in values}) == len(values)
     tried = settings_of()
@@ -73,9 +72,10 @@ def test_one_value_of_every_knob_is_its_default_and_no_setting_is_tried_twice():
 
 def test_only_the_knobs_asked_for_are_tried():
     assert [setting.every for setting in settings_of(("views",))] == [1, 2, 4, 8]
-    assert [setting.name for setting in settings_of(("feature width",))] == [
-        "default", "mode: fast", "feature width: 3", "feature width: 12",
+    assert [setting.name for setting in settings_of(("mode", "neighbours", "mode"))] == [
+        "default", "mode: fast", "neighbours: 8", "neighbours: 32",
     ]  # fmt: skip
+    assert [setting.value for setting in settings_of(("grouping sample",))] == ["", "5,000", "20,000", "all"]
     with pytest.raises(OgPointcloudError, match="'colour' is no knob; expected one of views, mode"):
         settings_of(("colour",))
 
@@ -91,7 +91,7 @@ def test_rows_have_error_and_seconds_and_a_setting_that_fails_costs_no_other(sub
         return fit(scene, settings, progress=progress)
 
     monkeypatch.setattr(sweeping, "fit", fails)
-    tried = [DEFAULT, value_of("sure share", "0.4"), value_of("views", "one of 2"), FAST]
+    tried = [DEFAULT, value_of("sure share", "0.4"), value_of("views", "one of 2"), value_of("mode", "fast")]
     found = sweep([subject], tried, progress=False)
     assert found.failed == {"capture, sure share: 0.4": "ZeroDivisionError: division by zero"}
     rows = {(one.knob, one.value): one for one in found.rows}

@@ -76,6 +76,15 @@ def test_the_page_holds_what_segment_answers(bundle, tmp_path, capsys):
     assert np.abs(stored - scores)[known].max() < 1e-4
 
 
+def test_without_a_name_the_page_lies_beside_the_scene(bundle, tmp_path, capsys):
+    scene = tmp_path / "room.ogpc"
+    scene.write_bytes(bundle.read_bytes())
+    code, stdout, _ = run(capsys, "view", scene, "--up", "0,-2,0")
+    assert (code, sorted(path.name for path in tmp_path.iterdir())) == (0, ["room.html", "room.ogpc"])
+    assert f"wrote {tmp_path / 'room.html'}" in stdout
+    assert content(tmp_path / "room.html")["up"] == [0, -1, 0]
+
+
 def test_the_page_needs_nothing_from_elsewhere(bundle, tmp_path, capsys):
     page = tmp_path / "room.html"
     run(capsys, "view", bundle, "--html", page)
@@ -132,15 +141,12 @@ def test_nothing_found_is_said(bundle, tmp_path, capsys):
         (["--html", "x.png"], "expected a name that ends in .html or .htm"),
         (["--html", "x.html", "--cut", "1"], "--cut is 1.0; expected a share"),
         (["--html", "x.html", "--labels", "appel"], "did you mean 'apple'"),
-        ([], "there is no display for a window"),
+        (["--html", "x.html", "--up", "0,0,0"], "--up is '0,0,0'; expected a direction"),
+        (["--html", "x.html", "--up", "w"], "--up is 'w'; expected 3 numbers"),
     ],
 )
 def test_bad_use_is_refused_in_one_line(bundle, tmp_path, capsys, monkeypatch, options, said):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("sys.platform", "linux")
-    monkeypatch.delenv("DISPLAY", raising=False)
-    if not options:
-        pytest.importorskip("pyvista")
     code, _, stderr = run(capsys, "view", bundle, *options)
     assert code == 2
     assert said in stderr

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import os
+import re
 import shlex
 import tempfile
 import time
@@ -25,6 +27,7 @@ if TYPE_CHECKING:
 
 SHOWN = 12
 """Words, and instances, that a list shows before it ends in dots."""
+AXES = {"x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1), "-x": (-1, 0, 0), "-y": (0, -1, 0), "-z": (0, 0, -1)}
 LONGEST_CELL, LONGEST_NOTE = 60, 1000
 """Characters that are shown of a name in a table or list, and of a note."""
 
@@ -35,6 +38,7 @@ class Parser(argparse.ArgumentParser):
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         # Abbreviations would make `--mask` mean one thing today and another once an option is added.
         super().__init__(*args, allow_abbrev=False, formatter_class=argparse.RawDescriptionHelpFormatter, **kwargs)
+        self._negative_number_matcher = re.compile(r"-([\d.,-]+|[xyz])$")  # -1,2,3 and -z are values, no options
 
     def error(self, message: str) -> NoReturn:
         self.exit(2, f"error: {message} ('{self.prog} --help' explains)\n")
@@ -48,6 +52,10 @@ SHARED: dict[str, dict[str, Any]] = {
         "type": Path, "metavar": "F.npz",
         "help": "names and vectors, from the scene's encoder (default: the scene's own words)",
     },
+    "--gaussians": {"type": Path, "metavar": "F.ply", "help": "geometry, in place of the capture's own"},
+    "--cloud": {"type": Path, "metavar": "CLOUD", "help": "other points or splats of it (default: those fitted)"},
+    "--up": {"metavar": "AXIS", "help": "what points up: x, y, z, -x, -y, -z or X,Y,Z (in pictures z by default)"},
+    "--frame": {"default": "map", "metavar": "F", "help": "what tf calls the frame of the map (default: %(default)s)"},
     "--json": {"action": "store_true", "help": "print the result as JSON"},
 }  # fmt: skip
 """Options that mean the same in several commands."""
@@ -67,7 +75,7 @@ def add_shared(parser: Any, *names: str) -> None:
 
 
 def add_option(parser: Any, name: str, metavar: str | None, help: str, **settings: Any) -> None:
-    """An option or a position of one value."""
+    """An option or a position with values."""
     parser.add_argument(name, metavar=metavar, help=help, **settings)
 
 
@@ -273,6 +281,17 @@ def warn_of_poses(capture: Path, points: Points | None = None) -> None:
         scene = read_photographed(capture, points)
     if scene is not None:
         warn_of_doubts(check_poses(scene), shlex.quote(str(capture)))
+
+
+def direction(text: str | None) -> tuple[float, float, float] | None:
+    """The unit vector that --up names; None where it is not given."""
+    if text is None or text in AXES:
+        return AXES[text] if text else None
+    x, y, z = numbers(text, "--up", 3)
+    length = math.hypot(x, y, z)
+    if not 0 < length < math.inf:
+        raise OgPointcloudError(f"--up is '{text}'; expected a direction, such as z or 0,0,1")
+    return x / length, y / length, z / length
 
 
 def names_in(text: str | None) -> list[str] | None:

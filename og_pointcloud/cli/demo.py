@@ -13,7 +13,7 @@ from og_pointcloud.cli.common import Parser, add_option, require_room
 
 def add(parser: Parser) -> None:
     parser.add_argument("-o", "--output", type=Path, default=Path("out/demo"), metavar="DIR", help="folder to fill")
-    parser.add_argument("--seed", type=int, default=0, metavar="N", help="another room (default: %(default)s)")
+    add_option(parser, "--seed", "N", "another room (default: %(default)s)", type=int, default=0)
     add_option(parser, "--mask-noise", "X", "0 clean, 1 realistic (default: %(default)s)", type=float, default=1.0)
     alone = "also label the room from its images alone, without ready masks and features"
     parser.add_argument("--photographs", action=argparse.BooleanOptionalAction, default=True, help=alone)

@@ -58,7 +58,7 @@ def add(parser: Parser) -> None:
     add_path(lerf, "--gaussians", "G", splats, required=True)
     for data_set in (scannet, lerf):
         add_path(data_set, "--predictions", "P", "folder with <scene>.ogpc", required=True)
-        data_set.add_argument("--scenes", metavar="A,B", help="these scenes (default: all with labels in DIR)")
+        add_option(data_set, "--scenes", "A,B", "these scenes (default: all with labels in DIR)")
     for protocol in (capture, scannet, lerf):
         add_path(protocol, "--text-features", "F.npz", "words with vectors (default: the capture's, the scene's)")
         add_output(protocol, "--json", endings=(".json",), help="also write every score")

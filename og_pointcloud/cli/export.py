@@ -21,7 +21,7 @@ def add(parser: Parser) -> None:
     for half in (text, image):
         add_option(half, "model", "MODEL", "fetched OWNER/MODEL, or a folder of CLIP or SigLIP", type=Path)
         half.add_argument(
-            "-o", "--output", type=Path, metavar="DIR", help="default: in the cache, where scenes find it"
+            "-o", "--output", type=Path, metavar="DIR", help="default: where scenes find it by themselves"
         )
         add_option(half, "--feature-space", "OWNER/MODEL", "as scenes name it (default: what the model says)")
     template = "what a name is put into, such as 'a photo of a {}.'; several are averaged (default: {})"

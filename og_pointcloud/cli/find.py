@@ -7,31 +7,24 @@ from __future__ import annotations
 
 import argparse
 import sys
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from og_pointcloud.cli.common import Parser, add_output, add_shared, check_at_least, numbers, print_table
+from og_pointcloud.cli.common import Parser, add_option, add_output, add_shared, check_at_least, numbers, print_table
 
 if TYPE_CHECKING:
     from og_pointcloud.collection.collection import Finding
 
 
 def add(parser: Parser) -> None:
-    parser.add_argument("atlas", type=Path, metavar="ATLAS", help="what `index` wrote")
-    parser.add_argument("words", nargs="+", metavar="WORD", help="words or phrases")
-    parser.add_argument(
-        "--within",
-        metavar="X,Y,Z,X,Y,Z",
-        help="two corners of a box, the low one first: things with their middle in it",
-    )
-    parser.add_argument(
-        "--scene",
-        action="append",
-        metavar="NAME",
-        help="ask only this one, or those of a pattern: 'site3/*'; repeatable",
-    )
-    parser.add_argument("--top", type=int, default=20, metavar="N", help="how many (default: %(default)s)")
-    parser.add_argument("--lance", metavar="URI", help="search what `index --lance` wrote, not memory")
+    option = partial(add_option, parser)
+    option("atlas", "ATLAS", "what `index` wrote", type=Path)
+    option("words", "WORD", "words or phrases", nargs="+")
+    option("--within", "X,Y,Z,X,Y,Z", "two corners of a box, the low one first: things with their middle in it")
+    option("--scene", "NAME", "ask only this one, or those of a pattern: 'site3/*'; repeatable", action="append")
+    option("--top", "N", "how many (default: %(default)s)", type=int, default=20)
+    option("--lance", "URI", "search what `index --lance` wrote, not memory")
     add_output(parser, "--html", endings=(".html", ".htm"), help="also write a page with a picture of each")
     add_shared(parser, "--text-features", "--json")
 

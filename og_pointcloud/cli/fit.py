@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, get_args, get_type_hints
 
 import og_pointcloud as og
 from og_pointcloud.cli import common
-from og_pointcloud.cli.common import Parser, add_option, add_output, replaceable, timed, write_json
+from og_pointcloud.cli.common import Parser, add_option, add_output, add_shared, replaceable, timed, write_json
 from og_pointcloud.errors import MissingExtraError, OgPointcloudError
 from og_pointcloud.settings import FitSettings, PaperSettings
 
@@ -38,7 +38,7 @@ def add(parser: Parser) -> None:
     add_output(target, "-o", "--output", endings=(".ogpc",), help="the file to write")
     add_option(target, "--out", "DIR", "for DIR/NAME.ogpc of each capture, but those that are there", type=replaceable)
     option("--scheduler", "ADDRESS", "of a Dask cluster for captures, or tiles of one (default: this machine)")
-    option("--gaussians", "F.ply", "geometry, in place of the capture's own", type=Path)
+    add_shared(parser, "--gaussians")
     option("--mode", None, "how to find instances (default: %(default)s)", choices=MODES, default=MODES[0])
     option("--schedule-share", "X", "shorten the published schedule (mode paper; default: 1)", type=float)
     option("--mask-level", None, "of LangSplat masks (default: %(default)s)", choices=MASK_LEVELS, default="large")

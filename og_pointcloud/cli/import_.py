@@ -10,30 +10,20 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from og_pointcloud.cli.common import (
-    Parser,
-    add_output,
-    add_shared,
-    describe_fit,
-    print_fit,
-    print_next,
-    timed,
-    write_fit,
-)
+from og_pointcloud.cli import common
+from og_pointcloud.cli.common import Parser, add_option, timed
 from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.formats.atomic import replacing_folder
 
 
 def add(parser: Parser) -> None:
-    parser.add_argument("result", type=Path, metavar="RESULT", help="folder of the run, its point_cloud.ply; or .e57")
-    add_output(
-        parser, "-o", "--output", endings=(".ogpc", ""), required=True, help="the file to write; of an .e57 the folder"
-    )
-    parser.add_argument(
-        "--cluster-lang", type=Path, metavar="F.npz", help="features of the leaves (default: RESULT/cluster_lang.npz)"
-    )
-    parser.add_argument("--feature-space", metavar="NAME", help="their encoder (default: LangSplat's, if 512 wide)")
-    add_shared(parser, "--text-features")
+    add_option(parser, "result", "RESULT", "folder of the run, its point_cloud.ply; or .e57", type=Path)
+    output = "the file to write; of an .e57 the folder"
+    common.add_output(parser, "-o", "--output", endings=(".ogpc", ""), required=True, help=output)
+    features = "features of the leaves (default: RESULT/cluster_lang.npz)"
+    add_option(parser, "--cluster-lang", "F.npz", features, type=Path)
+    add_option(parser, "--feature-space", "NAME", "their encoder (default: LangSplat's, if 512 wide)")
+    common.add_shared(parser, "--text-features")
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -49,11 +39,11 @@ def run(arguments: argparse.Namespace) -> None:
     with timed(stages, "read result"):
         cloud = read_opengaussian(arguments.result, arguments.cluster_lang, feature_space=arguments.feature_space)
         cloud = scene_words(cloud.space, text_features=arguments.text_features).added_to(cloud)
-    cloud = write_fit(cloud, stages, arguments.output)
-    report = describe_fit(cloud, arguments.result, arguments.output)
+    cloud = common.write_fit(cloud, stages, arguments.output)
+    report = common.describe_fit(cloud, arguments.result, arguments.output)
     for file in report["files"].values():
         print(f"read {file}")
-    print_fit(report, cloud)
+    common.print_fit(report, cloud)
 
 
 def unpack(file: Path, folder: Path) -> None:
@@ -68,4 +58,4 @@ def unpack(file: Path, folder: Path) -> None:
     for line in unused:
         print(f"left out: {line}")
     print(f"wrote {folder}: {images} images with poses, and the cloud of all scans")
-    print_next("masks", folder)
+    common.print_next("masks", folder)

@@ -9,18 +9,14 @@ import argparse
 import sys
 from pathlib import Path
 
-from og_pointcloud.cli.common import Parser, print_next, replaceable
+from og_pointcloud.cli.common import Parser, add_option, print_next, replaceable
 
 
 def add(parser: Parser) -> None:
-    parser.add_argument("folder", type=Path, metavar="DIR", help="folder with .ogpc files, also in folders below it")
-    parser.add_argument(
-        "-o", "--output", type=replaceable, required=True, metavar="ATLAS",
-        help="the index, one file; where it is there, only what changed is read",
-    )  # fmt: skip
-    parser.add_argument(
-        "--lance", metavar="URI", help="also write it for LanceDB, to a folder or an object store (s3://...)"
-    )
+    add_option(parser, "folder", "DIR", "folder with .ogpc files, also in folders below it", type=Path)
+    index = "the index, one file; where it is there, only what changed is read"
+    parser.add_argument("-o", "--output", type=replaceable, required=True, metavar="ATLAS", help=index)
+    add_option(parser, "--lance", "URI", "also write it for LanceDB, to a folder or an object store (s3://...)")
 
 
 def run(arguments: argparse.Namespace) -> None:

@@ -8,20 +8,19 @@ from __future__ import annotations
 import argparse
 
 import og_pointcloud as og
-from og_pointcloud.cli.common import Parser, add_output, add_shared, check_at_least, numbers, print_next
+from og_pointcloud.cli.common import Parser, add_option, add_output, add_shared, check_at_least, direction, print_next
 
 
 def add(parser: Parser) -> None:
-    add_shared(parser, "bundle", "--text-features", "--json")
-    parser.add_argument("--words", type=int, default=3, metavar="N", help="words a row (default: %(default)s)")
-    parser.add_argument("--up", metavar="X,Y,Z", help="direction that oriented boxes stand upright on")
+    add_shared(parser, "bundle", "--text-features", "--up", "--json")
+    add_option(parser, "--words", "N", "words a row (default: %(default)s)", type=int, default=3)
     add_output(parser, "-o", "--output", endings=(".json", ".csv"), help="the whole table as .json or .csv")
 
 
 def run(arguments: argparse.Namespace) -> None:
     check_at_least("--words", arguments.words, 0)
-    up = None if arguments.up is None else numbers(arguments.up, "--up", 3)
-    table = og.instance_table(arguments.bundle, text_features=arguments.text_features, up=up, words=arguments.words)
+    options = {"text_features": arguments.text_features, "words": arguments.words}
+    table = og.instance_table(arguments.bundle, up=direction(arguments.up), **options)
     if arguments.output:
         write = table.to_csv if arguments.output.suffix == ".csv" else table.to_json
         write(arguments.output)

@@ -8,24 +8,22 @@ from __future__ import annotations
 import argparse
 import shutil
 import sys
+from functools import partial
 from pathlib import Path
 
-from og_pointcloud.cli.common import Parser, add_output, print_next, replaceable
+from og_pointcloud.cli.common import Parser, add_option, add_output, add_shared, print_next, replaceable
 from og_pointcloud.errors import OgPointcloudError
 
 
 def add(parser: Parser) -> None:
-    parser.add_argument("bag", type=Path, metavar="BAG", help="depth, masks with features, camera_info, tf (docs/maps)")
+    option = partial(add_option, parser)
+    option("bag", "BAG", "depth, masks with features, camera_info, tf (docs/maps)", type=Path)
     add_output(parser, "-o", "--output", endings=(".ogpc",), required=True, help="the map to write")
     parser.add_argument("--resume", action="store_true", help="go on where an interrupted run was")
-    parser.add_argument("--start", type=Path, metavar="MAP.ogpc", help="a map to go on with (default: an empty one)")
-    parser.add_argument("--frame", default="map", metavar="F", help="what tf calls the map (default: %(default)s)")
-    parser.add_argument(
-        "--feature-space", default="unknown", metavar="NAME", help="encoder of the features (default: %(default)s)"
-    )
-    parser.add_argument(
-        "--work", type=replaceable, metavar="DIR", help="where the map is kept while it grows (default: S.ogpc.map)"
-    )
+    option("--start", "MAP.ogpc", "a map to go on with (default: an empty one)", type=Path)
+    add_shared(parser, "--frame")
+    option("--feature-space", "NAME", "encoder of the features (default: %(default)s)", default="unknown")
+    option("--work", "DIR", "where the map is kept while it grows (default: S.ogpc.map)", type=replaceable)
 
 
 def run(arguments: argparse.Namespace) -> None:

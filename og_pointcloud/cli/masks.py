@@ -7,34 +7,27 @@ from __future__ import annotations
 
 import argparse
 import warnings
+from functools import partial
 from pathlib import Path
 
-from og_pointcloud.cli.common import Parser, add_shared, print_next, some_of, warn_of_poses
+from og_pointcloud.cli.common import Parser, add_option, add_shared, print_next, some_of, warn_of_poses
 
 
 def add(parser: Parser) -> None:
     add_shared(parser, "capture")
-    parser.add_argument(
-        "--proposer", default="opencv", metavar="P",
-        help="opencv (default, no weights), sam:FOLDER, sam:OWNER/MODEL,"
-        " python:MODULE:NAME (your own), or a folder of id PNGs or COCO .json files",
-    )  # fmt: skip
-    parser.add_argument(
-        "--encoder", default="demo", metavar="E",
-        help="demo (default; knows the demo room alone), a model's folder, OWNER/MODEL, or none: masks alone",
-    )  # fmt: skip
-    parser.add_argument(
-        "--features", default="crops", choices=("crops", "dense"),
-        help="crops: several runs of the encoder a mask (default); dense: one run an image, faster and coarser",
-    )  # fmt: skip
-    parser.add_argument("--words", nargs="+", default=(), metavar="WORD", help="mask these alone; needs SAM 3")
-    parser.add_argument(
-        "--tracks", action="store_true",
-        help="follow things from image to image: SAM 3's words; or a folder's ids mean the same in all its PNGs",
-    )  # fmt: skip
-    parser.add_argument("--level", default="medium", choices=("small", "medium", "large"), help="how much is one mask")
-    parser.add_argument("--every", type=int, default=1, metavar="N", help="use every N-th image; needs -o")
-    parser.add_argument("--longest-side", type=int, default=1024, metavar="PX", help="larger images are shrunk to this")
+    option = partial(add_option, parser)
+    proposers = "opencv (default, no weights), sam:FOLDER, sam:OWNER/MODEL, python:MODULE:NAME (your own), or a folder"
+    option("--proposer", "P", f"{proposers} of id PNGs or COCO .json files", default="opencv")
+    encoders = "demo (default; knows the demo room alone), a model's folder, OWNER/MODEL, or none: masks alone"
+    option("--encoder", "E", encoders, default="demo")
+    ways = "crops: several runs of the encoder a mask (default); dense: one run an image, faster and coarser"
+    option("--features", None, ways, default="crops", choices=("crops", "dense"))
+    option("--words", "WORD", "mask these alone; needs SAM 3", nargs="+", default=())
+    follow = "follow things from image to image: SAM 3's words; or a folder's ids mean the same in all its PNGs"
+    parser.add_argument("--tracks", action="store_true", help=follow)
+    option("--level", None, "how much is one mask", default="medium", choices=("small", "medium", "large"))
+    option("--every", "N", "use every N-th image; needs -o", type=int, default=1)
+    option("--longest-side", "PX", "larger images are shrunk to this", type=int, default=1024)
     parser.add_argument("--overwrite", action="store_true", help="replace masks of others, or make all again")
     parser.add_argument("-o", "--output", type=Path, metavar="DIR", help="a capture of its own (default: CAPTURE)")
 

@@ -6,7 +6,6 @@ og-pointcloud pick kitchen.ogpc --capture kitchen --view frame7 --pixel 320,240 
 from __future__ import annotations
 
 import argparse
-import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -20,12 +19,10 @@ from og_pointcloud.errors import OgPointcloudError, did_you_mean
 def add(parser: Parser) -> None:
     common.add_shared(parser, "bundle", "--text-features", "--json")
     click = parser.add_mutually_exclusive_group(required=True)
-    click.add_argument("--xyz", metavar="X,Y,Z", help="a place in world coordinates")
-    click.add_argument("--pixel", metavar="U,V", help="a pixel of the view, column and row")
-    # Else argparse takes -1,2,3 for an option.
-    parser._negative_number_matcher = re.compile(r"-[\d.,-]+$")
-    parser.add_argument("--capture", type=Path, metavar="CAPTURE", help="folder that the view is in")
-    parser.add_argument("--view", metavar="NAME", help="file stem of the view's image")
+    common.add_option(click, "--xyz", "X,Y,Z", "a place in world coordinates")
+    common.add_option(click, "--pixel", "U,V", "a pixel of the view, column and row")
+    common.add_option(parser, "--capture", "CAPTURE", "folder that the view is in", type=Path)
+    common.add_option(parser, "--view", "NAME", "file stem of the view's image")
     common.add_output(parser, "-o", "--output", endings=(".png",), help="the instance's mask in the view")
 
 

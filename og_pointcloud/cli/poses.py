@@ -9,21 +9,17 @@ import argparse
 import sys
 from pathlib import Path
 
-from og_pointcloud.cli.common import Parser, check_at_least, print_next, some_of
+from og_pointcloud.cli.common import Parser, add_option, check_at_least, print_next, some_of
 
 
 def add(parser: Parser) -> None:
-    parser.add_argument("photographs", type=Path, metavar="FOLDER", help="with the photographs, or with an images/")
-    parser.add_argument(
-        "-o", "--output", type=Path, metavar="CAPTURE", help="the folder to make (default: in FOLDER itself)"
-    )
-    parser.add_argument(
-        "--longest-side", type=int, default=1600, metavar="PX", help="larger images are shrunk to this (default: 1600)"
-    )
-    parser.add_argument(
-        "--threads", type=int, default=1, metavar="N",
-        help="more are faster, and may give a slightly different model each time (default: 1)",
-    )  # fmt: skip
+    add_option(parser, "photographs", "FOLDER", "with the photographs, or with an images/", type=Path)
+    folder = "the folder to make (default: in FOLDER itself)"
+    parser.add_argument("-o", "--output", type=Path, metavar="CAPTURE", help=folder)
+    size = "larger images are shrunk to this (default: %(default)s)"
+    add_option(parser, "--longest-side", "PX", size, type=int, default=1600)
+    threads = "more are faster, and may give a slightly different model each time (default: %(default)s)"
+    add_option(parser, "--threads", "N", threads, type=int, default=1)
 
 
 def run(arguments: argparse.Namespace) -> None:

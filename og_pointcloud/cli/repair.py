@@ -8,22 +8,17 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from og_pointcloud.cli.common import Parser, add_shared, print_next, write_json
+from og_pointcloud.cli.common import Parser, add_option, add_shared, print_next, write_json
 from og_pointcloud.errors import OgPointcloudError
 
 
 def add(parser: Parser) -> None:
     from og_pointcloud.formats import repairs
 
-    parser.epilog = (
-        f"{parser.epilog}\n\n{(repairs.__doc__ or '').partition('  axes=')[1]}"
-        + ((repairs.__doc__ or "").partition("  axes=")[2])
-    )
+    parser.epilog = f"{parser.epilog}\n\n{''.join((repairs.__doc__ or '').partition('  axes=')[1:])}"
     add_shared(parser, "capture")
-    parser.add_argument(
-        "repairs", nargs="*", metavar="NAME=VALUE",
-        help="applied in this order, behind those that the capture has; none: find them, by checking the capture",
-    )  # fmt: skip
+    order = "applied in this order, behind those that the capture has; none: find them, by checking the capture"
+    add_option(parser, "repairs", "NAME=VALUE", order, nargs="*")
     parser.add_argument("--only", action="store_true", help="in place of those that the capture has")
     parser.add_argument("--undo", action="store_true", help="remove all repairs of the capture")
 

@@ -21,12 +21,11 @@ SHOWN_REASONS = 3
 
 
 def add(parser: Parser) -> None:
-    parser.add_argument("bag", type=Path, metavar="IN", help="a bag's folder, or one .db3 or .mcap file")
+    add_option(parser, "bag", "IN", "a bag's folder, or one .db3 or .mcap file", type=Path)
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="OUT", help="the folder to make")
-    parser.add_argument("--scene", type=Path, required=True, metavar="S.ogpc", help="what `fit` wrote")
-    add_shared(parser, "--labels", "--text-features")
+    add_option(parser, "--scene", "S.ogpc", "what `fit` wrote", type=Path, required=True)
+    add_shared(parser, "--labels", "--text-features", "--frame")
     add_option(parser, "--topic", "T", "clouds to label, repeatable (default: every PointCloud2)", action="append")
-    parser.add_argument("--frame", default="map", metavar="F", help="the scene's frame (default: %(default)s)")
 
 
 def run(arguments: argparse.Namespace) -> None:

@@ -8,13 +8,13 @@ from __future__ import annotations
 import argparse
 
 import og_pointcloud as og
-from og_pointcloud.cli.common import Parser, add_shared, calibration_hint, names_in, print_next
+from og_pointcloud.cli.common import Parser, add_option, add_shared, calibration_hint, names_in, print_next
 
 
 def add(parser: Parser) -> None:
     add_shared(parser, "bundle", "--text-features", "--json")
-    parser.add_argument("text", metavar="WORD", help="a word or phrase")
-    parser.add_argument("--against", metavar="A,B,C", help="words that compete with it (default: all that are known)")
+    add_option(parser, "text", "WORD", "a word or phrase")
+    add_option(parser, "--against", "A,B,C", "words that compete with it (default: all that are known)")
 
 
 def run(arguments: argparse.Namespace) -> None:

@@ -6,11 +6,11 @@ og-pointcloud serve kitchen.ogpc office.ogpc
 from __future__ import annotations
 
 import argparse
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from og_pointcloud.cli.common import Parser, add_shared, names_in
-from og_pointcloud.cli.view import AXES
+from og_pointcloud.cli.common import Parser, add_option, add_shared, direction, names_in
 from og_pointcloud.errors import OgPointcloudError
 
 if TYPE_CHECKING:
@@ -19,21 +19,12 @@ if TYPE_CHECKING:
 
 
 def add(parser: Parser) -> None:
-    parser.add_argument("bundles", type=Path, nargs="+", metavar="S.ogpc", help="what `fit` wrote; several to choose")
-    add_shared(parser, "--labels", "--text-features")
-    parser.add_argument(
-        "--cloud", type=Path, metavar="CLOUD", help="points or splats to show of one scene (default: those fitted)"
-    )
-    parser.add_argument(
-        "--before", type=Path, metavar="A.ogpc", help="an earlier visit: show what is gone, new and moved since"
-    )
-    parser.add_argument("--up", choices=AXES, default="z", metavar="AXIS", help="as for `view` (default: z)")
-    parser.add_argument(
-        "--host", default="127.0.0.1", help="address to listen on; 0.0.0.0 lets others in (default: %(default)s)"
-    )
-    parser.add_argument(
-        "--port", type=int, default=8080, metavar="N", help="or the next one that is free (default: %(default)s)"
-    )
+    option = partial(add_option, parser)
+    option("bundles", "S.ogpc", "what `fit` wrote; several to choose", type=Path, nargs="+")
+    add_shared(parser, "--labels", "--text-features", "--cloud", "--up")
+    option("--before", "A.ogpc", "an earlier visit: show what is gone, new and moved since", type=Path)
+    option("--host", "H", "address to listen on; 0.0.0.0 lets others in (default: %(default)s)", default="127.0.0.1")
+    option("--port", "N", "or the next one that is free (default: %(default)s)", type=int, default=8080)
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -56,7 +47,7 @@ def run(arguments: argparse.Namespace) -> None:
     else:
         bundles = titles(arguments.bundles).items()
         scenes = {title: LiveScene(load(path), shown, *words) for title, path in bundles}
-    page = served.serve(scenes, served.ServeSettings(arguments.host, arguments.port, AXES[arguments.up]))
+    page = served.serve(scenes, served.ServeSettings(arguments.host, arguments.port, direction(arguments.up or "z")))
     try:
         print(f"{page.url}  (Ctrl-C ends it)", flush=True)
         if page.is_open:

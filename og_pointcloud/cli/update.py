@@ -8,15 +8,23 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from og_pointcloud.cli.common import Parser, add_output, add_shared, print_next, timed, write_fit, write_json
+from og_pointcloud.cli.common import (
+    Parser,
+    add_option,
+    add_output,
+    add_shared,
+    print_next,
+    timed,
+    write_fit,
+    write_json,
+)
 
 
 def add(parser: Parser) -> None:
-    parser.add_argument("map", type=Path, metavar="MAP.ogpc", help="the map so far: of `fit`, `map` or `update`")
-    add_shared(parser, "capture")
+    add_option(parser, "map", "MAP.ogpc", "the map so far: of `fit`, `map` or `update`", type=Path)
+    add_shared(parser, "capture", "--gaussians")
     add_output(parser, "-o", "--output", endings=(".ogpc",), required=True, help="the map after this visit")
     add_output(parser, "--json", endings=(".json",), help="also write what is gone, new, moved and unseen")
-    parser.add_argument("--gaussians", type=Path, metavar="F.ply", help="geometry, in place of the capture's own")
 
 
 def run(arguments: argparse.Namespace) -> None:

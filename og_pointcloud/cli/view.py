@@ -1,4 +1,4 @@
-"""Look at a scene labelled by words: in a window, as a stand-alone page or picture. Or at a capture's features.
+"""Look at a scene labelled by words, as a stand-alone page or a picture. Or at a capture's features.
 
 og-pointcloud view kitchen.ogpc --labels chair,table --html kitchen.html
   og-pointcloud view kitchen -o features.png
@@ -7,13 +7,21 @@ og-pointcloud view kitchen.ogpc --labels chair,table --html kitchen.html
 from __future__ import annotations
 
 import argparse
-import os
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import og_pointcloud as og
-from og_pointcloud.cli.common import Parser, add_output, add_shared, check_at_least, names_in, timed, warn_of_capture
+from og_pointcloud.cli.common import (
+    Parser,
+    add_option,
+    add_output,
+    add_shared,
+    check_at_least,
+    direction,
+    names_in,
+    timed,
+    warn_of_capture,
+)
 from og_pointcloud.errors import OgPointcloudError
 
 if TYPE_CHECKING:
@@ -22,25 +30,23 @@ if TYPE_CHECKING:
 
     from og_pointcloud.show.viewpoint import Viewpoint
 
-AXES = {"x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1), "-x": (-1, 0, 0), "-y": (0, -1, 0), "-z": (0, 0, -1)}
 OF_SCENE = ("labels", "text_features", "cloud", "html", "png", "boxes", "up", "cut", "instances")
 OF_CAPTURE = ("output", "columns")
 
 
 def add(parser: Parser) -> None:
-    parser.add_argument("source", type=Path, metavar="S.ogpc|CAPTURE", help="what `fit` wrote, or a capture folder")
-    scene = parser.add_argument_group("a scene (S.ogpc); without --html and --png it opens a window")
-    add_shared(scene, "--labels", "--text-features")
-    scene.add_argument("--cloud", type=Path, metavar="CLOUD", help="points to show (default: those fitted)")
-    add_output(scene, "--html", endings=(".html", ".htm"), help="a page that any browser opens, without a network")
+    add_option(parser, "source", "S.ogpc|CAPTURE", "what `fit` wrote, or a capture folder", type=Path)
+    scene = parser.add_argument_group("a scene (S.ogpc)")
+    add_shared(scene, "--labels", "--text-features", "--cloud", "--up")
+    page = "a page that any browser opens, without a network (default, without --png: S.html)"
+    add_output(scene, "--html", endings=(".html", ".htm"), help=page)
     add_output(scene, "--png", endings=(".png",), help="a picture")
     scene.add_argument("--boxes", action="store_true", help="boxes around what has a label")
-    scene.add_argument("--up", choices=AXES, metavar="AXIS", help="which of x, y, z, -x, -y, -z points up (default: z)")
-    scene.add_argument("--cut", type=float, metavar="SHARE", help="hide this share of the height, from the top")
+    add_option(scene, "--cut", "SHARE", "hide this share of the height, from the top", type=float)
     scene.add_argument("--instances", action="store_true", help="colours by instance")
     capture = parser.add_argument_group("a CAPTURE: features are learned and shown before and after clustering")
     add_output(capture, "-o", "--output", endings=(".png",), help="default: features.png")
-    capture.add_argument("--columns", type=int, metavar="N", help="views shown (default: 4)")
+    add_option(capture, "--columns", "N", "views shown (default: 4)", type=int)
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -71,39 +77,29 @@ def view_scene(arguments: argparse.Namespace) -> None:
         result = og.segment(points, names_in(arguments.labels), scene, text_features=arguments.text_features)
     rgb = scene.cloud.rgb if other is None else other.rgb
     shown, view = chosen_view(result, arguments)
-    outputs = [path for path in (arguments.html, arguments.png) if path]
     mode = "instances" if arguments.instances else "labels"
     look = Look((arguments.cloud or arguments.source).stem, mode, arguments.boxes, arguments.cut or 0.0)
-    if arguments.html and (left_out := write_page(arguments.html, scene, result, view, look, rgb)):
+    page = arguments.html or (None if arguments.png else arguments.source.with_suffix(".html"))
+    if page and (left_out := write_page(page, scene, result, view, look, rgb)):
         print(f"left out of the page: {left_out}")
-    plotter = None
-    if arguments.png or not outputs:
+    if arguments.png:
         draw = import_plugin("og_pointcloud_pyvista.screening", "pyvista").draw
-        plotter = draw(scene, result, rgb, shown, view, look, window=not outputs)
-        if arguments.png:
-            arguments.png.parent.mkdir(parents=True, exist_ok=True)
-            plotter.screenshot(arguments.png)
-    print_segmentation(describe_segmentation(result, stages, arguments.source, outputs[0] if outputs else None))
+        arguments.png.parent.mkdir(parents=True, exist_ok=True)
+        draw(scene, result, rgb, shown, view, look).screenshot(arguments.png)
+    outputs = [path for path in (page, arguments.png) if path]
+    print_segmentation(describe_segmentation(result, stages, arguments.source, outputs[0]))
     for path in outputs[1:]:
         print(f"wrote {path}")
-    if plotter is not None and not outputs:
-        plotter.show()
 
 
 def check_scene_options(arguments: argparse.Namespace) -> None:
     if arguments.cut is not None and not 0 <= arguments.cut < 1:
         raise OgPointcloudError(f"--cut is {arguments.cut}; expected a share of the height, from 0 to below 1")
-    if arguments.html is not None and arguments.png is None:
+    if arguments.png is None:
         return
     from og_pointcloud.ask.hosts import import_plugin
 
-    plugin = import_plugin("og_pointcloud_pyvista", "pyvista")
-    if arguments.png is None and sys.platform.startswith("linux") and not os.environ.get("DISPLAY"):
-        raise OgPointcloudError(
-            "there is no display for a window (DISPLAY is not set): write a page (--html P.html) or a picture (--png "
-            "P.png)"
-        )
-    if arguments.png is not None and not plugin.can_render():
+    if not import_plugin("og_pointcloud_pyvista", "pyvista").can_render():
         raise OgPointcloudError(
             "VTK cannot draw off-screen here, it finds neither EGL nor OSMesa: install one of them (Debian: apt-get "
             "install libegl1, or libosmesa6), or write a page (--html P.html), which needs neither"
@@ -116,7 +112,7 @@ def chosen_view(result: og.Segmentation, arguments: argparse.Namespace) -> tuple
 
     from og_pointcloud.show.viewpoint import choose_viewpoint
 
-    up = np.array(AXES[arguments.up or "z"], np.float64)
+    up = np.array(direction(arguments.up or "z"), np.float64)
     shown = np.logical_and.reduce(np.isfinite(result.xyz), axis=1)
     if not shown.any():
         raise OgPointcloudError(f"{arguments.cloud or arguments.source} has no point to show; expected at least one")

@@ -27,9 +27,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.ask.labelled_scene import LabelledScene
-from og_pointcloud.cloud import FeatureSpace, LabelledCloud, Vocabulary
+from og_pointcloud.cloud import FeatureSpace, Vocabulary
 from og_pointcloud.errors import MissingExtraError, OgPointcloudError, SceneError
-from og_pointcloud.evaluate.intervals import miou_interval
+from og_pointcloud.evaluate.captures import Answer, difference
 from og_pointcloud.evaluate.knobs import DEFAULT, Setting
 from og_pointcloud.evaluate.truth import GT_NAME, Truth, read_truth
 from og_pointcloud.formats.atomic import replacing
@@ -180,44 +180,50 @@ class _Trial:
                 " expected fewer: report on a part of the cloud"
             )
         self.warm: set[str] = set()
-        self.default_labels: Labels | None = None
-        self._warm_up(DEFAULT.settings)
-        start = time.perf_counter()
-        self.prepared = prepare(subject.scene, journal=Journal(progress=False))
-        self.prepared_seconds = time.perf_counter() - start
-
-    def baselines(self) -> Iterator[Row]:
-        """Other methods, as they are, and with points that masks mostly pass by left out; none without truth."""
-        if self.subject.truth is None or self.subject.vocabulary is None:
-            return
-        for name, labels, seconds in baseline_labels(self.prepared, self.subject.vocabulary.vectors):
-            scores = self._scores(labels)
-            seconds += self.prepared_seconds
-            yield Row(self.subject.name, BASELINE, name, seconds, 1 - scores["miou"], **scores)
+        self.default: Answer | None = None
 
     def row(self, setting: Setting) -> Row:
         """The row of one setting."""
-        settings, scene = setting.settings, self.subject.scene
-        scene = replace(scene, views=scene.views[:: setting.every])
-        self._warm_up(settings)
+        scene = replace(self.subject.scene, views=self.subject.scene.views[:: setting.every])
+        self._warm_up(setting.settings)
         start = time.perf_counter()
-        cloud = fit(scene, settings, progress=False)
+        cloud = fit(scene, setting.settings, progress=False)
         seconds = time.perf_counter() - start
-        labels = self._labels(cloud)
-        if setting == DEFAULT:
-            self.default_labels = labels
-        scores = self._scores(labels)
+        scores: dict[str, Any] = {}
+        if (words := self.subject.vocabulary) is not None:
+            labels = LabelledScene.from_cloud(cloud).chooser.choose(words.vectors).at(cloud.instance_ids)[0]
+            scores = self._scores(labels, cloud.spacing)
+        error = 1 - scores.get("miou", cloud.reliability or 0.0)
         return Row(
-            capture=self.subject.name,
-            knob=setting.knob,
-            value=setting.value,
-            seconds=seconds,
-            error=1 - scores.get("miou", cloud.reliability or 0.0),
-            reliability=cloud.reliability,
-            instances=len(cloud.instances),
-            left_out=tuple(cloud.provenance["left_out"]),
-            **scores,
-        )
+            self.subject.name, setting.knob, setting.value, seconds, error, reliability=cloud.reliability,
+            instances=len(cloud.instances), left_out=tuple(cloud.provenance["left_out"]), **scores,
+        )  # fmt: skip
+
+    def baselines(self) -> Iterator[Row]:
+        """Other methods, as they are, and with points that masks mostly pass by left out; none without truth."""
+        if self.subject.vocabulary is None or self.default is None:
+            return
+        start = time.perf_counter()
+        prepared = prepare(self.subject.scene, journal=Journal(progress=False))
+        preparing = time.perf_counter() - start
+        for name, labels, seconds in baseline_labels(prepared, self.subject.vocabulary.vectors):
+            scores = self._scores(labels, self.default.spacing)
+            yield Row(self.subject.name, BASELINE, name, preparing + seconds, 1 - scores["miou"], **scores)
+
+    def _scores(self, labels: Labels, spacing: float) -> dict[str, Any]:
+        """What `Row` says of labels that index the subject's words, -1 unknown; the first are the default's."""
+        truth, words = self.subject.truth, self.subject.vocabulary
+        assert truth is not None
+        assert words is not None
+        score = truth.score(labels, words.names)
+        answer = Answer(truth.class_of(labels, words.names), labels, self.subject.scene.points.xyz, spacing)
+        self.default = self.default or answer
+        found: dict[str, Any] = {"miou": score.miou, "macc": score.macc}
+        found |= {"unknown": score.unknown_share, "background": score.background_called}
+        if score.classes:
+            gain = difference(answer, self.default, truth)
+            found |= {"gain": gain.mean, "gain_low": gain.low, "gain_high": gain.high}
+        return found
 
     def _warm_up(self, settings: FitSettings) -> None:
         """Fit two views of a few points in this mode: what they are labelled does not matter."""
@@ -227,37 +233,8 @@ class _Trial:
         scene = self.subject.scene
         points = scene.points.take(np.arange(0, len(scene.points), 1 + len(scene.points) // WARM_UP_POINTS))
         views = tuple(view for view in scene.views if view.mask_count)[:2]
-        thin = replace(scene, points=points, views=views)
         with suppress(OgPointcloudError):  # two views may show nothing; the fit itself will tell
-            fit(thin, replace(settings, paper=replace(settings.paper, schedule_share=1e-4)), progress=False)
-
-    def _labels(self, cloud: LabelledCloud) -> Labels:
-        """(n,) the word of each point, -1 unknown; its instance where there are no words."""
-        vocabulary = self.subject.vocabulary
-        if vocabulary is None:
-            return cloud.instance_ids
-        return LabelledScene.from_cloud(cloud).chooser.choose(vocabulary.vectors).at(cloud.instance_ids)[0]
-
-    def _scores(self, labels: Labels) -> dict[str, Any]:
-        """mIoU, recall and shares, as Row has them; nothing where the capture does not know its classes."""
-        truth, vocabulary = self.subject.truth, self.subject.vocabulary
-        if truth is None or vocabulary is None:
-            return {}
-        called = truth.class_of(labels, vocabulary.names)
-        score = truth.score(labels, vocabulary.names)
-        found: dict[str, Any] = {
-            "miou": score.miou,
-            "macc": score.macc,
-            "unknown": score.unknown_share,
-            "background": score.background_called,
-        }
-        if self.default_labels is not None and score.classes:
-            default = truth.class_of(self.default_labels, vocabulary.names)
-            spacing = float(np.median(self.prepared.surface.neighbourhood.spacing))
-            xyz = self.subject.scene.points.xyz
-            gain = miou_interval(called, truth, xyz, spacing, score.classes, less=default)
-            found |= {"gain": gain.mean, "gain_low": gain.low, "gain_high": gain.high}
-        return found
+            fit(replace(scene, points=points, views=views), settings, progress=False)
 
 
 def front(rows: Sequence[Row]) -> list[Row]:

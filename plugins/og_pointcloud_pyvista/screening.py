@@ -1,4 +1,4 @@
-"""A whole scene at one look: what ``og-pointcloud view`` shows in its window and writes as a picture."""
+"""A whole scene at one look: what ``og-pointcloud view`` writes as a picture."""
 
 from __future__ import annotations
 
@@ -29,18 +29,17 @@ def draw(
     shown: NDArray[np.bool_],
     view: Viewpoint,
     look: Look,
-    window: bool = False,
 ) -> pv.Plotter:
-    """A plotter, ready to be shown, or, off-screen, to be photographed.
+    """An off-screen plotter, ready to be photographed; needs `can_render`.
 
     rgb: (N, 3) colours of the points, which shade those of the labels. shown: (N,) which points to draw. look: its mode
-    is "labels" or "instances". window: with clicks that are answered; else off-screen, which needs `can_render`.
+    is "labels" or "instances".
     """
     of_points = [field.name for field in fields(result) if isinstance(getattr(result, field.name), np.ndarray)]
     mesh = to_pyvista(replace(result, **{name: getattr(result, name)[shown] for name in of_points}))
     if rgb is not None:
         mesh.point_data[RGB] = rgb[shown]
-    plotter = pv.Plotter(off_screen=not window, window_size=list(PICTURE_SIZE), theme=pv.themes.DocumentTheme())
+    plotter = pv.Plotter(off_screen=True, window_size=list(PICTURE_SIZE), theme=pv.themes.DocumentTheme())
     distance = float(np.linalg.norm(view.eye - view.target))
     point_size = float(np.clip(CLOSED * scene.cloud.spacing * FOCAL * PICTURE_SIZE[1] / 2 / distance, 2, 12))
     plotter.og.add_segmentation(mesh, by=look.mode.removesuffix("s"), point_size=point_size)
@@ -49,6 +48,4 @@ def draw(
     plotter.og.look(view)
     plotter.camera.SetWindowCenter(ASIDE, 0)
     plotter.enable_anti_aliasing("ssaa")
-    if window:
-        plotter.og.enable_click_query(scene)
     return plotter

@@ -115,7 +115,7 @@ def label_bag(
     with open_bag(source) as reader:
         clouds, store = _cloud_topics(reader, topics), ros2_types()
         report = BagReport({topic: topic + LABELLED for topic in clouds})
-        tree = _transforms(reader, store)
+        tree = transforms_of(reader, store)
         labeller = CloudLabeller(segmenter, rosbags_messages(store), frame, minimum_points)
         with (
             replacing_folder(target) as folder,  # a bag names its files after its folder
@@ -123,7 +123,7 @@ def label_bag(
         ):
             outputs = _Outputs(bag, reader.connections, clouds, store)
             outputs.write_info(segmenter.names, reader.start_time)
-            for old, stamp, data in with_bar(_messages(reader), "messages", reader.message_count, progress):
+            for old, stamp, data in with_bar(messages_of(reader), "messages", reader.message_count, progress):
                 outputs.copy(old, stamp, data)
                 if old.topic in clouds and (labelled := _label(store, data, tree, frame, labeller, report)):
                     outputs.write(old.topic, stamp, labelled)
@@ -139,7 +139,7 @@ def _label(
     """One cloud's messages, or None where it was skipped; the report counts both."""
     start = time.perf_counter()
     try:
-        message = _decoded(store, data, CLOUD)
+        message = decoded(store, data, CLOUD)
         pose = tree.lookup(frame, message.header.frame_id, nanoseconds(message.header.stamp))
         labelled = labeller(message, pose)
     except Exception as error:  # one cloud, whatever is in it, does not cost the others
@@ -234,13 +234,13 @@ def _cloud_topics(reader: Reader, topics: Sequence[str] | None) -> list[str]:
     return wanted
 
 
-def _transforms(reader: Reader, store: Any) -> TransformTree:
+def transforms_of(reader: Reader, store: Any) -> TransformTree:
     """All of /tf and /tf_static; messages that make no sense are left out, with a warning."""
     tree, damaged = TransformTree(), Counter[str]()
     connections = [old for old in reader.connections if old.msgtype == TRANSFORMS]
-    for connection, _, data in _messages(reader, connections) if connections else ():
+    for connection, _, data in messages_of(reader, connections) if connections else ():
         try:
-            tree.add_message(_decoded(store, data, TRANSFORMS), static=connection.topic.endswith("tf_static"))
+            tree.add_message(decoded(store, data, TRANSFORMS), static=connection.topic.endswith("tf_static"))
         except Exception as error:  # decoded, but a nonsense still
             damaged[first_line(error)] += 1
     if damaged:
@@ -249,14 +249,16 @@ def _transforms(reader: Reader, store: Any) -> TransformTree:
     return tree
 
 
-def _messages(reader: Reader, connections: Sequence[Connection] = ()) -> Iterator[tuple[Connection, int, bytes]]:
+def messages_of(reader: Reader, connections: Sequence[Connection] = ()) -> Iterator[tuple[Connection, int, bytes]]:
+    """Topic, stamp in nanoseconds and bytes of each message, of these connections alone if any are named."""
     try:
         yield from reader.messages(connections)
     except Exception as error:  # of rosbags or of its databases
         raise SceneError(f"{reader.path} breaks off ({first_line(error)}): record or copy it again") from None
 
 
-def _decoded(store: Any, data: bytes, kind: str) -> Any:
+def decoded(store: Any, data: bytes, kind: str) -> Any:
+    """A message of this type; SceneError for bytes that are none."""
     try:
         return store.deserialize_cdr(data, kind)
     except Exception as error:  # a damaged message may end anywhere

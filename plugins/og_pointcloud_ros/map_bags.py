@@ -12,7 +12,7 @@ from functools import partial
 
 from og_pointcloud.errors import OgPointcloudError, SceneError
 from og_pointcloud.mapping.frame import Frame
-from og_pointcloud_ros.bags import _decoded, _messages, _transforms, open_bag, ros2_types
+from og_pointcloud_ros.bags import decoded, messages_of, open_bag, ros2_types, transforms_of
 from og_pointcloud_ros.frames import WHOLE, FrameAssembler
 from og_pointcloud_ros.transforms import TransformTree
 
@@ -35,11 +35,11 @@ class BagFrames:
     def __iter__(self) -> Iterator[Frame]:
         store, assembler = ros2_types(), FrameAssembler(role for role in WHOLE if role in self._roles.values())
         with open_bag(self.source) as reader:
-            tree = _transforms(reader, store)
-            for connection, _, data in _messages(reader, [c for c in reader.connections if c.topic in self._roles]):
+            tree = transforms_of(reader, store)
+            for connection, _, data in messages_of(reader, [c for c in reader.connections if c.topic in self._roles]):
                 role = self._roles[connection.topic]
                 try:
-                    assembler.add(role, _decoded(store, data, connection.msgtype))
+                    assembler.add(role, decoded(store, data, connection.msgtype))
                 except (OgPointcloudError, ValueError) as error:
                     self._drop(f"{role}: {error}")
                 ready = [*filter(assembler.is_whole, assembler.waiting)]

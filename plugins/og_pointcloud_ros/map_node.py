@@ -18,16 +18,10 @@ from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
-from rclpy.node import Node  # pyright: ignore[reportMissingImports]
-from rclpy.qos import (  # pyright: ignore[reportMissingImports]
-    QoSDurabilityPolicy,
-    QoSHistoryPolicy,
-    QoSProfile,
-    QoSReliabilityPolicy,
-)
+from rclpy.qos import QoSReliabilityPolicy  # pyright: ignore[reportMissingImports]
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2  # pyright: ignore[reportMissingImports]
 from std_srvs.srv import Trigger  # pyright: ignore[reportMissingImports]
-from tf2_ros import Buffer, TransformException, TransformListener  # pyright: ignore[reportMissingImports]
+from tf2_ros import TransformException  # pyright: ignore[reportMissingImports]
 from vision_msgs.msg import Detection3DArray  # pyright: ignore[reportMissingImports]
 
 from og_pointcloud.errors import OgPointcloudError
@@ -36,7 +30,7 @@ from og_pointcloud.mapping.mapper import FrameChange, Mapper
 from og_pointcloud_ros.detections import to_objects
 from og_pointcloud_ros.frames import FrameAssembler
 from og_pointcloud_ros.messages import ros_messages, time_message
-from og_pointcloud_ros.node import QUIET_S, RETRY_S, latest_only, pose_at, run, told
+from og_pointcloud_ros.node import PlacedNode, latest_only, run, told
 
 PARAMETERS = {"map": "", "target_frame": "map", "feature_space": "unknown", "max_age": 2.0}
 """With their defaults; config/map.yaml explains them."""
@@ -45,32 +39,20 @@ QUEUED = 10
 """Messages of a topic that may wait while a service answers."""
 
 
-class MapNode(Node):
+class MapNode(PlacedNode):
     """See the module."""
 
     def __init__(self, **options: Any) -> None:
-        super().__init__("og_pointcloud_map", **options)
-        for name, default in PARAMETERS.items():
-            self.declare_parameter(name, default)
-        self._target_frame, self._max_age = self._value("target_frame"), self._value("max_age")
+        super().__init__("og_pointcloud_map", PARAMETERS, **options)
         self._assembler, self._arrived = FrameAssembler(), dict[int, float]()
-        self._transforms = Buffer()
-        self._listener = TransformListener(self._transforms, self)
-        reliable = QoSReliabilityPolicy.RELIABLE
+        reliable, best_effort = QoSReliabilityPolicy.RELIABLE, QoSReliabilityPolicy.BEST_EFFORT
         self._objects = self.create_publisher(Detection3DArray, "~/objects", latest_only(reliable, latched=True))
         self._queue = FrameQueue(self._empty(), max_age=self._max_age, on_change=self._on_change, on_drop=self._warn)
-        quality = QoSProfile(
-            history=QoSHistoryPolicy.KEEP_LAST, depth=QUEUED, reliability=QoSReliabilityPolicy.BEST_EFFORT,
-            durability=QoSDurabilityPolicy.VOLATILE,
-        )  # fmt: skip
         for role, kind in INPUTS.items():
-            self.create_subscription(kind, f"~/input/{role}", partial(self._on_message, role), quality)
+            take = partial(self._on_message, role)
+            self.create_subscription(kind, f"~/input/{role}", take, latest_only(best_effort, depth=QUEUED))
         for name, serve in {"save": self._save, "load": self._load, "reset": self._reset}.items():
             self.create_service(Trigger, f"~/{name}", partial(self._serve, serve))
-        self.create_timer(RETRY_S, self._work)
-
-    def _value(self, name: str) -> Any:
-        return self.get_parameter(name).value
 
     def _empty(self) -> Mapper:
         return Mapper(feature_space=self._value("feature_space"))
@@ -103,7 +85,7 @@ class MapNode(Node):
 
     def _pose(self, frame_id: str, stamp: int) -> Any:
         head = SimpleNamespace(frame_id=frame_id, stamp=time_message(ros_messages, stamp))
-        return pose_at(self._transforms, self._target_frame, head)
+        return self._pose_at(head)
 
     def _on_change(self, change: FrameChange) -> None:
         for text, ids in (("gone", change.gone), ("moved", [moved.id for moved in change.moved])):
@@ -145,9 +127,6 @@ class MapNode(Node):
                 "the parameter 'map' is empty; expected a .ogpc file: --ros-args -p map:=/maps/room.ogpc"
             )
         return self._value("map")
-
-    def _warn(self, text: str) -> None:
-        self.get_logger().warning(text, throttle_duration_sec=QUIET_S)
 
     def destroy_node(self) -> None:
         """Ends the queue first."""

@@ -10,7 +10,7 @@ transform does not come in time. No message ends the node: what it cannot use is
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -55,17 +55,46 @@ QUIET_S = 5.0
 """Seconds between two warnings."""
 
 
-class SegmentNode(Node):
+class PlacedNode(Node):
+    """What both nodes do: they know their parameters, find where messages were taken, and see to what waits for that.
+
+    parameters: with their defaults, ``target_frame`` and ``max_age`` among them.
+    """
+
+    def __init__(self, name: str, parameters: Mapping[str, Any], **options: Any) -> None:
+        super().__init__(name, **options)
+        for parameter, default in parameters.items():
+            self.declare_parameter(parameter, default)
+        self._target_frame, self._max_age = self._value("target_frame"), self._value("max_age")
+        self._transforms = Buffer()
+        self._listener = TransformListener(self._transforms, self)
+        self.create_timer(RETRY_S, self._work)
+
+    def _value(self, name: str) -> Any:
+        return self.get_parameter(name).value
+
+    def _work(self) -> None:
+        """See to what waits."""
+        raise NotImplementedError
+
+    def _pose_at(self, head: Any) -> NDArray[np.float64]:
+        """(4, 4) from a header's frame to the target's at its time; tf2's TransformException without one."""
+        found = self._transforms.lookup_transform(self._target_frame, head.frame_id, Time.from_msg(head.stamp))
+        place, turn = found.transform.translation, found.transform.rotation
+        return rigid(rotation_matrix((turn.x, turn.y, turn.z, turn.w)), np.array([place.x, place.y, place.z]))
+
+    def _warn(self, text: str) -> None:
+        self.get_logger().warning(text, throttle_duration_sec=QUIET_S)
+
+
+class SegmentNode(PlacedNode):
     """See the module. The parameter ``labels`` may be set while it runs; the others are read at the start.
 
     SceneError, BundleError or FeatureSpaceError where the scene or the words cannot be used.
     """
 
     def __init__(self, **options: Any) -> None:
-        super().__init__("og_pointcloud", **options)
-        for name, default in PARAMETERS.items():
-            self.declare_parameter(name, default)
-        self._target_frame, self._max_age = self._value("target_frame"), self._value("max_age")
+        super().__init__("og_pointcloud", PARAMETERS, **options)
         self._scene = self._load()
         reliable, best_effort = QoSReliabilityPolicy.RELIABLE, QoSReliabilityPolicy.BEST_EFFORT
         self._points = self.create_publisher(PointCloud2, "~/output/points", latest_only(reliable))
@@ -77,10 +106,7 @@ class SegmentNode(Node):
         self._announce()
         self.add_on_set_parameters_callback(self._on_parameters)
         self._waiting: tuple[Any, float] | None = None
-        self._transforms = Buffer()
-        self._listener = TransformListener(self._transforms, self)
         self.create_subscription(PointCloud2, "~/input/points", self._on_cloud, latest_only(best_effort))
-        self.create_timer(RETRY_S, self._work)
 
     def _load(self) -> LabelledScene:
         path = self._value("scene")
@@ -95,9 +121,6 @@ class SegmentNode(Node):
             text_features=self._value("text_features") or None,
             max_distance=self._value("max_distance") or None,
         )
-
-    def _value(self, name: str) -> Any:
-        return self.get_parameter(name).value
 
     def _announce(self) -> None:
         names = self._labeller.segmenter.names
@@ -132,7 +155,7 @@ class SegmentNode(Node):
         message, arrived = self._waiting
         self._waiting = None
         try:
-            labelled = self._labeller(message, pose_at(self._transforms, self._target_frame, message.header))
+            labelled = self._labeller(message, self._pose_at(message.header))
         except TransformException as error:
             if time.monotonic() - arrived <= self._max_age:
                 self._waiting = message, arrived
@@ -144,26 +167,16 @@ class SegmentNode(Node):
             self._points.publish(labelled.points)
             self._detections.publish(labelled.detections)
 
-    def _warn(self, text: str) -> None:
-        self.get_logger().warning(text, throttle_duration_sec=QUIET_S)
-
-
-def pose_at(transforms: Buffer, target: str, head: Any) -> NDArray[np.float64]:
-    """(4, 4) from a message's frame to the target, at the message's time; tf2's TransformException without one."""
-    found = transforms.lookup_transform(target, head.frame_id, Time.from_msg(head.stamp))
-    place, turn = found.transform.translation, found.transform.rotation
-    return rigid(rotation_matrix((turn.x, turn.y, turn.z, turn.w)), np.array([place.x, place.y, place.z]))
-
 
 def told(error: Exception) -> str:
     """An error of ours says what is wrong and what helps; of another the kind is worth knowing."""
     return str(error) if isinstance(error, (OgPointcloudError, OSError)) else f"{type(error).__name__}: {error}"
 
 
-def latest_only(reliability: Any, latched: bool = False) -> Any:
-    """The newest message alone. A reliable publisher serves subscribers of both kinds."""
+def latest_only(reliability: Any, latched: bool = False, depth: int = 1) -> Any:
+    """The newest message alone, or the newest ``depth``. A reliable publisher serves subscribers of both kinds."""
     durability = QoSDurabilityPolicy.TRANSIENT_LOCAL if latched else QoSDurabilityPolicy.VOLATILE
-    return QoSProfile(history=QoSHistoryPolicy.KEEP_LAST, depth=1, reliability=reliability, durability=durability)
+    return QoSProfile(history=QoSHistoryPolicy.KEEP_LAST, depth=depth, reliability=reliability, durability=durability)
 
 
 def run(make: Callable[[], Node], arguments: Sequence[str] | None) -> int:
