@@ -226,6 +226,8 @@ class PaperSettings(_LossSettings):
     """Eq. 5 as the authors' code applies it on ScanNet."""
     cache_bytes: int = 4 << 30
     """Blending weights kept between steps; views beyond are rendered anew."""
+    device: str = "auto"
+    """Where torch trains: cpu, cuda, or auto, cuda where torch has it. (No GPU was to be had: cuda is untried.)"""
 
     @classmethod
     def of_authors(cls, dataset: Literal["scannet", "lerf"] = "scannet", **changes: Any) -> PaperSettings:

@@ -115,7 +115,32 @@ def test_blend_has_the_gradient_of_a_dense_product(balls: Balls) -> None:
     torch.testing.assert_close(gradient, dense.T @ pull)
 
 
+def test_all_tensors_lie_on_the_device_that_the_settings_name(balls: Balls) -> None:
+    """What is made without naming a device goes to another one here, where nothing can be computed with it."""
+    settings = replace(SHORT, device="cpu", fine_alone=True)
+    source = rendered_views.RenderedViews(balls.gaussians, balls.views, NEAR, settings, whole=False)
+    features = paper.train_features(source, settings)
+    book = paper.train_codebook(source, features.raw, settings)
+    with torch.device("meta"):
+        source = rendered_views.RenderedViews(balls.gaussians, balls.views, NEAR, settings, whole=False)
+        again = paper.train_features(source, settings)
+        same = paper.train_codebook(source, again.raw, settings)
+    np.testing.assert_array_equal(again.raw, features.raw)
+    np.testing.assert_array_equal(same.leaf, book.leaf)
+
+
+@pytest.mark.parametrize("name", ["cuda" if not torch.cuda.is_available() else "cuda:99", "meta", "the sun"])
+def test_a_device_that_is_not_there_is_refused(balls: Balls, name: str) -> None:
+    with pytest.raises(OgPointcloudError, match=f"device is '{name}', .* expected one of cpu, auto"):
+        rendered_views.RenderedViews(balls.gaussians, balls.views, NEAR, replace(SHORT, device=name), whole=False)
+    assert rendered_views.device_of("auto").type == ("cuda" if torch.cuda.is_available() else "cpu")
+
+
 def test_reading_has_the_gradient_of_plain_operations() -> None:
+    zero = torch.zeros((2, 6), dtype=torch.float64, requires_grad=True)
+    assert (paper._read(zero, normalise=True) == 0.5).all()
+    paper._read(zero, normalise=True).sum().backward()
+    assert (zero.grad == 0).all()
     raw = torch.rand((50, 6), dtype=torch.float64, requires_grad=True)
     pull = torch.rand((50, 6), dtype=torch.float64)
     plain = 0.5 + 0.5 * torch.nn.functional.normalize(raw, dim=1)
@@ -379,7 +404,7 @@ def test_missing_torch_names_the_extra() -> None:
 
 
 def cells_of(name: str, cell: str) -> Any:
-    return cell if name in ("schedule", "formula", "matching.score") else ast.literal_eval(cell)
+    return cell if name in ("schedule", "formula", "device", "matching.score") else ast.literal_eval(cell)
 
 
 def test_the_page_names_every_number_and_no_other() -> None:

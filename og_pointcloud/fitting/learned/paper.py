@@ -35,7 +35,6 @@ from scipy.sparse import csr_array
 from og_pointcloud.errors import MissingExtraError
 from og_pointcloud.fitting.grouping import indicator
 from og_pointcloud.fitting.learned.codebook import kmeans
-from og_pointcloud.fitting.learned.instance_features import raw_gradient, read_features
 from og_pointcloud.fitting.learned.matching import filled_masks
 from og_pointcloud.fitting.learned.rendered_views import RenderedView, RenderedViews
 from og_pointcloud.fitting.mask_table import view_fingerprint, weights_by_instance
@@ -151,7 +150,7 @@ def train_features(source: RenderedViews, settings: PaperSettings, run: Training
     """
     run = run or TrainingRun()
     random = np.random.default_rng(run.seed).random((len(source.gaussians), settings.width), np.float32)
-    trained = torch.from_numpy(random[source.known])
+    trained = torch.tensor(random[source.known], device=source.device)
     key = _training_key(source, settings, run)
     history = StageHistory("features", STEPS[settings.schedule][0])
     stage = _Stage(history, trained, settings.feature_rate)
@@ -167,8 +166,8 @@ def train_features(source: RenderedViews, settings: PaperSettings, run: Training
         stage.adam.step()
         history.loss.append(loss.item())
     raw, features = np.zeros_like(random), np.zeros_like(random)
-    raw[source.known] = trained.detach().numpy()
-    features[source.known] = _read(trained.detach(), settings.normalise).numpy()
+    raw[source.known] = _on_host(trained)
+    features[source.known] = _on_host(_read(trained.detach(), settings.normalise))
     return TrainedFeatures(raw, features, source.seen, history)
 
 
@@ -198,7 +197,7 @@ def _separation(means: torch.Tensor, formula: str, late: bool) -> torch.Tensor:
         return means.sum() * 0
     square = (means[:, None] - means[None]).square().sum(dim=2)
     near = 1 / (square + (1.0 if formula == "authors" else SMALLEST_DISTANCE**2))
-    near = near * (1 - torch.eye(m, dtype=means.dtype))
+    near = near * (1 - torch.eye(m, dtype=means.dtype, device=means.device))
     if formula == "authors":
         rank = near.detach().argsort(dim=1, stable=True).argsort(dim=1).to(means.dtype)
         weight = LEAST_WEIGHT + (1 - LEAST_WEIGHT) * rank / (m - 1)
@@ -220,8 +219,8 @@ def train_codebook(
     run = run or TrainingRun()
     rng = np.random.default_rng(run.seed)
     gaussians, known = source.gaussians, source.known
-    training = _CodebookTraining(source, torch.from_numpy(raw[known]), settings)
-    start = training.features.numpy()
+    training = _CodebookTraining(source, torch.tensor(raw[known], device=source.device), settings)
+    start = _on_host(training.features)
     key = _training_key(source, settings, run, raw)
 
     coarse = StageHistory("coarse codebook", STEPS[settings.schedule][1])
@@ -237,7 +236,7 @@ def train_codebook(
     held = _masks_held(source, own, len(centres))
     seeds = [rng.permutation(rows)[:count] for rows, count in zip(members, _fine_counts(held, settings), strict=True)]
     fine = StageHistory("fine codebook", STEPS[settings.schedule][2])
-    fine_centres = training.features.numpy()[np.concatenate(seeds)]
+    fine_centres = _on_host(training.features)[np.concatenate(seeds)]
     apart = _Parts(members, [len(rows) for rows in seeds], np.zeros((len(known), 0), np.float32), held)
     own_fine, fine_centres = training.train(fine, fine_centres, apart, run, key)
     # Leaf numbers leave room for k2 in every coarse cluster, as published.
@@ -245,7 +244,7 @@ def train_codebook(
     coarse_ids, leaf = np.full(len(gaussians), -1, np.int32), np.full(len(gaussians), -1, np.int32)
     coarse_ids[known], leaf[known] = own, leaf_of_centre[own_fine]
     table = np.zeros((k1 * settings.k2, raw.shape[1]), np.float32)
-    table[leaf_of_centre] = training.read(torch.from_numpy(fine_centres)).numpy()
+    table[leaf_of_centre] = training.read(torch.as_tensor(fine_centres, device="cpu")).numpy()
     return TrainedCodebook(coarse_ids, leaf, table, (coarse, fine))
 
 
@@ -303,21 +302,19 @@ class _CodebookTraining:
         stage = _Stage(history, features, rate, centres)
         for step, rng in stage.steps(settings, run, key):
             if step % interval == 0:
-                values = features.detach().numpy()
-                stage.own, stage.centres = parts.reassigned(values, stage.centres, settings.lloyd_rounds)
+                stage.reassign(parts, settings.lloyd_rounds)
             view, target, rows = self._draw(rng, parts)
-            own = torch.from_numpy(stage.own)
-            quantised = torch.from_numpy(stage.centres[:, :width].copy())[own].requires_grad_()
+            quantised = stage.centres[:, :width][stage.own].requires_grad_()
             # Eq. 4, and its gradient by the centres given to the features: straight through.
             error = view.render(self.read(quantised))[rows] - target
             loss = error.square().mean() if squared else error.abs().mean()
             (features.grad,) = torch.autograd.grad(loss, quantised)
             stage.adam.step()
-            stage.centres[:, :width] = _cluster_means(features.detach(), own, stage.centres[:, :width])
+            stage.centres[:, :width] = _cluster_means(features.detach(), stage.own, stage.centres[:, :width])
             history.loss.append(loss.item())
         features.requires_grad_(False)
-        own, centres = parts.reassigned(features.numpy(), stage.centres, settings.lloyd_rounds)
-        return own.astype(np.int32), centres[:, :width]
+        stage.reassign(parts, settings.lloyd_rounds)
+        return _on_host(stage.own).astype(np.int32), _on_host(stage.centres[:, :width])
 
     def _draw(self, rng: np.random.Generator, parts: _Parts) -> tuple[RenderedView, torch.Tensor, torch.Tensor | slice]:
         """A random view, perhaps with smaller Gaussians or one part alone; what its pixels should show, and which."""
@@ -327,15 +324,15 @@ class _CodebookTraining:
             return view, view.render(self.pseudo), slice(None)
         if index not in self.targets:
             image = view.render(self.pseudo)
-            means, kept = filled_masks(image.numpy(), view.mask.numpy(), len(view.mask_names))
-            self.targets[index] = torch.from_numpy(means.astype(np.float32)), torch.from_numpy(kept)
+            means, kept = filled_masks(_on_host(image), _on_host(view.mask), len(view.mask_names))
+            self.targets[index] = image.new_tensor(means), torch.tensor(kept, device=image.device)
         means, kept = self.targets[index]
         factor = (int(SIZES * rng.random()) + 0.5) / SIZES if rng.random() < self.settings.point_pressure else 1.0
         part, members = -1, None
         if self.settings.fine_alone and parts.held is not None and parts.held[index].any():
             choices = np.flatnonzero(parts.held[index].any(axis=0))
             part = int(choices[rng.integers(len(choices))])
-            members, kept = parts.rows[part], kept & torch.from_numpy(parts.held[index][:, part])
+            members, kept = parts.rows[part], kept & torch.tensor(parts.held[index][:, part], device=kept.device)
         drawn = self.source.drawn(index, factor, part, members)
         place = torch.searchsorted(view.mask_names, drawn.mask_names)[drawn.mask]
         if not kept[place].any():  # too little is left to cover a pixel of a target
@@ -344,18 +341,18 @@ class _CodebookTraining:
         return drawn, means[place][rows], rows
 
 
-def _cluster_means(features: torch.Tensor, own: torch.Tensor, centres: NDArray[np.float32]) -> NDArray[np.float32]:
+def _cluster_means(features: torch.Tensor, own: torch.Tensor, centres: torch.Tensor) -> torch.Tensor:
     """Means of the clusters' features; an empty cluster stays where it is."""
     points = torch.bincount(own, minlength=len(centres))[:, None]
-    sums = torch.zeros(centres.shape).index_add_(0, own, features)
-    return torch.where(points > 0, sums / points.clamp(min=1), torch.from_numpy(centres.copy())).numpy()
+    sums = torch.zeros_like(centres).index_add_(0, own, features)
+    return torch.where(points > 0, sums / points.clamp(min=1), centres)
 
 
 def _masks_held(source: RenderedViews, own: NDArray[np.int32], k1: int) -> list[NDArray[np.bool_]]:
     """Of each view (masks, k1): the masks that each coarse cluster holds."""
     held = []
     for view in source:
-        of_masks = csr_array(indicator(view.mask.numpy(), len(view.mask_names)) @ view.weights)
+        of_masks = csr_array(indicator(_on_host(view.mask), len(view.mask_names)) @ view.weights)
         held.append(weights_by_instance(of_masks, own, k1) > OWN_MASK_SHARE * of_masks.sum(axis=1)[:, None])
     return held
 
@@ -367,22 +364,31 @@ def _fine_counts(held: list[NDArray[np.bool_]], settings: PaperSettings) -> list
 
 
 class _Read(torch.autograd.Function):
-    """Directions mapped to [0, 1] (`features.read_features`); in plain torch their gradient is most of a step."""
+    """Directions mapped to [0, 1] (`instance_features.read_features`); torch's own gradient is most of a step."""
 
     @staticmethod
     def forward(ctx: Any, raw: torch.Tensor) -> torch.Tensor:
-        ctx.save_for_backward(raw)
-        return torch.from_numpy(read_features(raw.numpy(), normalise=True))
+        length = raw.norm(dim=1, keepdim=True)
+        length.masked_fill_(length == 0, torch.inf)  # a zero row reads 0.5, and nothing pulls at it
+        direction = raw / length
+        ctx.save_for_backward(direction, length)
+        return torch.add(0.5, direction, alpha=0.5)
 
     @staticmethod
     def backward(ctx: Any, gradient: torch.Tensor) -> torch.Tensor:  # pyright: ignore
-        (raw,) = ctx.saved_tensors
-        return torch.from_numpy(raw_gradient(raw.detach().numpy(), gradient.contiguous().numpy(), normalise=True))
+        direction, length = ctx.saved_tensors
+        along = (direction * gradient).sum(dim=1, keepdim=True)
+        return torch.addcmul(gradient, direction, along, value=-1).mul_(0.5 / length)
 
 
 def _read(raw: torch.Tensor, normalise: bool) -> torch.Tensor:
     """Features as rendered; raw ones are read as they are."""
     return _Read.apply(raw) if normalise else raw
+
+
+def _on_host(values: torch.Tensor) -> NDArray[Any]:
+    """For what is done in numpy, now and then."""
+    return values.detach().cpu().numpy()
 
 
 def _training_key(source: RenderedViews, settings: PaperSettings, run: TrainingRun, *more: Any) -> str:
@@ -399,7 +405,7 @@ class _Stage:
     """All that a stage of training changes: a checkpoint is all of it.
 
     features: (n, width) float32, moved in place by ``adam``. centres, own: of a codebook stage, (k, d) float32 and, for
-    each of ``known`` Gaussians, its row of them.
+    each of ``known`` Gaussians, its row of them, on the features' device.
     """
 
     def __init__(
@@ -411,8 +417,15 @@ class _Stage:
     ) -> None:
         self.history, self.features = history, features
         self.adam = torch.optim.Adam([features.requires_grad_()], lr=rate, eps=ADAM_EPSILON, fused=True)
-        self.centres = np.zeros((0, 0), np.float32) if centres is None else centres
-        self.own = np.zeros(len(features), np.int64)
+        centres = np.zeros((0, 0), np.float32) if centres is None else centres
+        self.centres = torch.tensor(centres, device=features.device)
+        self.own = torch.zeros(len(features), dtype=torch.int64, device=features.device)
+
+    def reassign(self, parts: _Parts, rounds: int) -> None:
+        """Own centres anew, by `_Parts.reassigned`, on the host."""
+        own, centres = parts.reassigned(_on_host(self.features), _on_host(self.centres), rounds)
+        device = self.features.device
+        self.own, self.centres = torch.as_tensor(own, device=device), torch.as_tensor(centres, device=device)
 
     def steps(self, settings: PaperSettings, run: TrainingRun, key: str) -> Iterator[tuple[int, np.random.Generator]]:
         """The numbers of the steps that are left, each with its own random numbers, which are the same whether or not
@@ -436,14 +449,15 @@ class _Stage:
     def _arrays(self) -> tuple[NDArray[Any], ...]:
         state, features = self.adam.state.get(self.features), self.features.detach()
         moments = (state["exp_avg"], state["exp_avg_sq"]) if state else (torch.zeros_like(features),) * 2
-        tensors = [tensor.numpy().copy() for tensor in (features, *moments)]
         losses = np.array([self.history.seconds, *self.history.loss])
-        return *tensors, self.centres.copy(), self.own.copy(), losses
+        return *(_on_host(tensor).copy() for tensor in (features, *moments, self.centres, self.own)), losses
 
     def _restore(self, arrays: tuple[NDArray[Any], ...]) -> None:
-        features, average, square, self.centres, self.own, losses = (np.array(array) for array in arrays)
-        self.features.data.copy_(torch.from_numpy(features))
+        *tensors, losses = arrays
+        device = self.features.device
+        features, average, square, self.centres, self.own = (torch.tensor(array, device=device) for array in tensors)
+        self.features.data.copy_(features)
         self.history.seconds, *self.history.loss = losses.tolist()
-        self.history.resumed_at = len(self.history.loss)
-        moments = {"exp_avg": torch.from_numpy(average), "exp_avg_sq": torch.from_numpy(square)}
-        self.adam.state[self.features] = {"step": torch.tensor(float(len(self.history.loss))), **moments}
+        done = self.history.resumed_at = len(self.history.loss)
+        steps = torch.tensor(float(done), device=device)
+        self.adam.state[self.features] = {"step": steps, "exp_avg": average, "exp_avg_sq": square}

@@ -1,21 +1,23 @@
 """Blending weights of the views that mode paper trains on: geometry is frozen, so each is composited once and kept.
 
-A pixel shows ``M = W F``, and a step of training is two products, ``W F`` and ``W' G`` of the gradient. What is
-composited anew where memory ends is the same to the bit. Gaussians that no mask shows have no column: they get neither
-feature nor cluster, and show nothing.
+A pixel shows ``M = W F``, and a step of training is two products, ``W F`` and ``W' G`` of the gradient, on the device
+that the settings name. What is composited anew where memory ends is the same to the bit. Gaussians that no mask shows
+have no column: they get neither feature nor cluster, and show nothing.
 """
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from og_pointcloud.errors import MissingExtraError, SceneError
+from og_pointcloud.errors import MissingExtraError, OgPointcloudError, SceneError
 from og_pointcloud.rendering.splatting import Gaussians, view_weights
 from og_pointcloud.scene import View
 from og_pointcloud.settings import PaperSettings
@@ -31,8 +33,8 @@ class RenderedView:
     """One view's blending weights.
 
     weights: (pixels, known) CSR float32, index int32, nearest first. mask: (pixels,) int64, a row of mask_names, -1
-    outside masks. mask_names: (m,) int64 ascending, the view's own mask ids. pixels: (pixels,) places in the image,
-    row by row.
+    outside masks. mask_names: (m,) int64 ascending, the view's own mask ids. Both tensors lie on the device that values
+    are to be rendered on. pixels: (pixels,) places in the image, row by row.
     """
 
     weights: csr_array
@@ -42,12 +44,18 @@ class RenderedView:
 
     def render(self, values: torch.Tensor) -> torch.Tensor:
         """(pixels, width) blended values of the known Gaussians (known, width)."""
-        return _Blend.apply(values, self.weights)
+        return _Blend.apply(values, *self._factors)
+
+    @cached_property
+    def _factors(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """W and W' in torch. Both are kept: torch's own gradient of a CSR product takes a hundred times longer."""
+        both = (self.weights, csr_array(self.weights.T.tocsr()))
+        return tuple(_in_torch(weights, self.mask.device) for weights in both)  # pyright: ignore
 
     @property
     def nbytes(self) -> int:
-        """What it holds in memory."""
-        return 8 * self.weights.nnz + 20 * len(self.mask)
+        """What it holds in memory, W' too."""
+        return 16 * self.weights.nnz + 20 * len(self.mask)
 
 
 class RenderedViews:
@@ -57,13 +65,15 @@ class RenderedViews:
     pixels, else those in masks that are covered enough. Raises SceneError where no mask has a pixel covered enough.
 
     seen: (n,) blending weight in masks. known:
-    rows of the Gaussians that have any. masked_pixels: pixels in masks of a view, on average.
+    rows of the Gaussians that have any. masked_pixels: pixels in masks of a view, on average. device: of the views'
+    tensors.
     """
 
     def __init__(
         self, gaussians: Gaussians, views: Sequence[View], near: float, settings: PaperSettings, *, whole: bool
     ) -> None:
         self.gaussians, self.near, self.settings, self.whole = gaussians, near, settings, whole
+        self.device = device_of(settings.device)
         self.seen = np.zeros(len(gaussians))
         self.views: list[View] = []
         self._kept: dict[tuple[int, float, int], RenderedView] = {}
@@ -72,7 +82,7 @@ class RenderedViews:
         pixels = 0
         for view in views:
             rendered = self._composited(gaussians, view, self._column)
-            inside = rendered.mask.numpy() >= 0
+            inside = rendered.mask.cpu().numpy() >= 0
             if not inside.any():
                 continue
             self.seen += rendered.weights[inside].sum(axis=0, dtype=np.float64)
@@ -113,7 +123,7 @@ class RenderedViews:
         if factor != 1.0:
             gaussians = replace(gaussians, scale=(gaussians.scale * np.float32(factor)).astype(np.float32))
         full = key == (index, 1.0, -1)
-        masks = None if full else self[index].mask_names.numpy()
+        masks = None if full else self[index].mask_names.cpu().numpy()
         column = self._column if rows is None else self._column[rows]
         rendered = self._composited(gaussians, self.views[index], column, masks)
         self._keep(key, rendered)
@@ -144,7 +154,20 @@ class RenderedViews:
         names = np.unique(ids[ids >= 0]).astype(np.int64)
         mask = np.where(ids >= 0, np.searchsorted(names, ids), -1)
         small = _with_columns(weights[rows], column, int(self._column.max(initial=-1)) + 1)
-        return RenderedView(small, torch.from_numpy(mask), torch.from_numpy(names), wanted[rows])
+        mask, names = (torch.as_tensor(ids, device=self.device) for ids in (mask, names))
+        return RenderedView(small, mask, names, wanted[rows])
+
+
+def device_of(name: str) -> torch.device:
+    """Where to train: a name of torch's, or "auto", the first GPU of CUDA there is. OgPointcloudError for others."""
+    gpus = [f"cuda:{index}" for index in range(torch.cuda.device_count())]
+    known = {"cpu": "cpu", "auto": gpus[0] if gpus else "cpu"} | {gpu: gpu for gpu in gpus}
+    known |= {"cuda": gpus[0]} if gpus else {}
+    if name not in known:
+        raise OgPointcloudError(
+            f"device is '{name:.40}', of which torch knows none here; expected one of {', '.join(known)}"
+        )
+    return torch.device(known[name])
 
 
 def _with_columns(weights: csr_array, column: NDArray[np.int32], count: int) -> csr_array:
@@ -157,15 +180,22 @@ def _with_columns(weights: csr_array, column: NDArray[np.int32], count: int) -> 
     return csr_array((data, indices, indptr.astype(np.int32)), shape=(weights.shape[0], count))
 
 
+def _in_torch(weights: csr_array, device: torch.device) -> torch.Tensor:
+    """The same matrix, and on a CPU the same memory."""
+    parts = (torch.as_tensor(part, device=device) for part in (weights.indptr, weights.indices, weights.data))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # torch calls its CSR tensors a beta
+        return torch.sparse_csr_tensor(*parts, size=weights.shape, device=device, check_invariants=False)
+
+
 class _Blend(torch.autograd.Function):
-    """W F with the gradient W' G, by scipy: as fast as a kernel of our own on one core. Torch's own gradient for CSR is
-    a hundred times slower, and its product would need a transposed copy."""
+    """W F with the gradient W' G. float64 values, as the tests have them, are blended in float64."""
 
     @staticmethod
-    def forward(ctx: Any, values: torch.Tensor, weights: csr_array) -> torch.Tensor:
-        ctx.weights = weights
-        return torch.from_numpy(weights @ values.numpy())
+    def forward(ctx: Any, values: torch.Tensor, weights: torch.Tensor, transposed: torch.Tensor) -> torch.Tensor:
+        ctx.transposed = transposed
+        return weights.to(values.dtype) @ values
 
     @staticmethod
-    def backward(ctx: Any, gradient: torch.Tensor) -> tuple[torch.Tensor, None]:  # pyright: ignore
-        return torch.from_numpy(ctx.weights.T @ gradient.contiguous().numpy()), None
+    def backward(ctx: Any, gradient: torch.Tensor) -> tuple[torch.Tensor, None, None]:  # pyright: ignore
+        return ctx.transposed.to(gradient.dtype) @ gradient.contiguous(), None, None
