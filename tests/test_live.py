@@ -11,7 +11,8 @@ from og_pointcloud.ask.picking import front_points
 from og_pointcloud.formats.colors import LUMINANCE, NO_LABEL, certainty_colors, label_colors
 from og_pointcloud.mapping.map_record import MapRecord, VisitEntry
 from og_pointcloud.scene import Points
-from og_pointcloud.show.live import CHANGES, LiveScene, look_along
+from og_pointcloud.show.live import CHANGES, LiveScene
+from og_pointcloud.show.viewpoint import Viewpoint
 
 
 def rainbow(count=3000):
@@ -135,7 +136,7 @@ def test_clicks_find_what_pick_finds(origin):
     scene = og.LabelledScene.from_cloud(cloud)
     live, center = LiveScene(scene), scene.xyz.mean(axis=0)
     eye = center + np.array([0.3, -0.6, 1.9])
-    camera = replace(look_along(eye, center - eye, 60.0), width=160, height=120, cx=80.0, cy=60.0)
+    camera = replace(Viewpoint(eye, center, np.eye(3)[0]).camera(33, 60.0), width=160, height=120, cx=80.0, cy=60.0)
     front = front_points(cloud, camera)
     seen = np.append(cloud.instance_ids, np.int32(og.TOO_FAR))[front]  # -1, no point, is the last
     clear = 0

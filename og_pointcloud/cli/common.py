@@ -9,17 +9,16 @@ import os
 import re
 import shlex
 import tempfile
-import time
 import warnings
 import zipfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from og_pointcloud.errors import MissingExtraError, OgPointcloudError, printable
+from og_pointcloud.journal import Journal
 
 if TYPE_CHECKING:
     from og_pointcloud.cloud import LabelledCloud
@@ -156,14 +155,6 @@ def write_json(path: Path, value: Mapping[str, Any]) -> None:
         file.write(json.dumps(value, indent=2, ensure_ascii=False).encode() + b"\n")
 
 
-@contextmanager
-def timed(stages: list[dict[str, Any]], name: str) -> Iterator[None]:
-    """Append {"name", "seconds"} for what runs inside."""
-    start = time.perf_counter()
-    yield
-    stages.append({"name": name, "seconds": round(time.perf_counter() - start, 4)})
-
-
 def require_room() -> None:
     # The room's modules import these as they please: whoever lacks one needs the whole extra.
     for module in ("numba", "scipy", "cv2", "onnx", "open3d", "pyvista"):
@@ -223,8 +214,9 @@ def print_fit(report: Mapping[str, Any], cloud: LabelledCloud) -> None:
         print_next("instances", output)
 
 
-def write_fit(cloud: LabelledCloud, stages: list[dict[str, Any]], output: Path) -> LabelledCloud:
-    """Write the .ogpc file; returns the cloud with the seconds of all stages, writing included, in its provenance.
+def write_fit(cloud: LabelledCloud, journal: Journal, output: Path) -> LabelledCloud:
+    """Write the .ogpc file; returns the cloud with the seconds of the journal's stages, writing included, behind those
+    that its provenance has.
 
     OgPointcloudError, which says where the cloud is kept, where that file cannot be written.
     """
@@ -232,8 +224,9 @@ def write_fit(cloud: LabelledCloud, stages: list[dict[str, Any]], output: Path) 
 
     from og_pointcloud.fitting.memory import scratch_root
 
+    stages = [*cloud.provenance.get("stages", []), *journal.stages]
     cloud = replace(cloud, provenance={**cloud.provenance, "stages": stages})
-    with timed(stages, "write file"):
+    with Journal(False, stages).stage("write file"):
         try:
             write_bundle(cloud, output)
         except OSError as error:

@@ -17,8 +17,9 @@ from typing import TYPE_CHECKING, Any, get_args, get_type_hints
 
 import og_pointcloud as og
 from og_pointcloud.cli import common
-from og_pointcloud.cli.common import Parser, add_option, add_output, add_shared, replaceable, timed, write_json
+from og_pointcloud.cli.common import Parser, add_option, add_output, add_shared, replaceable, write_json
 from og_pointcloud.errors import MissingExtraError, OgPointcloudError
+from og_pointcloud.journal import Journal
 from og_pointcloud.settings import FitSettings, PaperSettings
 
 if TYPE_CHECKING:
@@ -81,9 +82,9 @@ def fit_one(arguments: argparse.Namespace, options: FitOptions, executor: Execut
         if views := kept_files(work, "view"):
             print(f"{views} views are kept in '{work}': the same command goes on behind them", file=sys.stderr)
         raise
-    cloud = common.write_fit(cloud, cloud.provenance["stages"], arguments.output)
+    cloud = common.write_fit(cloud, Journal(False), arguments.output)
     if arguments.rerun:
-        with timed(cloud.provenance["stages"], "write rerun"):
+        with Journal(False, cloud.provenance["stages"]).stage("write rerun"):
             write_views(cloud, capture, options, arguments.rerun)
     if training := cloud.provenance["notes"].get("training"):
         with suppress(MissingExtraError):  # no picture without OpenCV

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
 
 from og_pointcloud.cli import common
-from og_pointcloud.cli.common import Parser, add_option, timed
+from og_pointcloud.cli.common import Parser, add_option
 from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.formats.atomic import replacing_folder
+from og_pointcloud.journal import Journal
 
 
 def add(parser: Parser) -> None:
@@ -35,11 +35,11 @@ def run(arguments: argparse.Namespace) -> None:
     from og_pointcloud.bundle.vocabulary import scene_words
     from og_pointcloud.fitting.opengaussian import read_opengaussian
 
-    stages: list[dict[str, Any]] = []
-    with timed(stages, "read result"):
+    journal = Journal(progress=False)
+    with journal.stage("read result"):
         cloud = read_opengaussian(arguments.result, arguments.cluster_lang, feature_space=arguments.feature_space)
         cloud = scene_words(cloud.space, text_features=arguments.text_features).added_to(cloud)
-    cloud = common.write_fit(cloud, stages, arguments.output)
+    cloud = common.write_fit(cloud, journal, arguments.output)
     report = common.describe_fit(cloud, arguments.result, arguments.output)
     for file in report["files"].values():
         print(f"read {file}")

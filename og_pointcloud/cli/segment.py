@@ -6,13 +6,14 @@ og-pointcloud segment kitchen.ogpc --labels chair,table -o labels.npz
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import og_pointcloud as og
 from og_pointcloud.cli import common
-from og_pointcloud.cli.common import Parser, timed
+from og_pointcloud.cli.common import Parser
+from og_pointcloud.journal import Journal
 
 SAVED_AS = (".npz", ".ply", ".las", ".laz", ".glb", ".spz")
 """As `og_pointcloud.ask.segmentation.SAVED_AS`; --help does not import numpy."""
@@ -26,22 +27,22 @@ def add(parser: Parser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    stages: list[dict[str, Any]] = []
-    with timed(stages, "load"):
+    journal = Journal(progress=False)
+    with journal.stage("load"):
         scene = og.load(arguments.bundle)
         points = og.read_points(arguments.points) if arguments.points else None
-    with timed(stages, "segment"):
+    with journal.stage("segment"):
         asked, labels = scene if points is None else points.xyz_world, common.names_in(arguments.labels)
         result = og.segment(asked, labels, scene, text_features=arguments.text_features)
     if arguments.output:
-        with timed(stages, "save"):
+        with journal.stage("save"):
             result.save(arguments.output, points if points is not None and points.scale is not None else None)
-    report = describe_segmentation(result, stages, arguments.bundle, arguments.output)
+    report = describe_segmentation(result, journal, arguments.bundle, arguments.output)
     common.print_result(arguments, report, print_segmentation)
 
 
 def describe_segmentation(
-    result: og.Segmentation, stages: Sequence[Mapping[str, Any]], bundle: Path, output: Path | None
+    result: og.Segmentation, journal: Journal, bundle: Path, output: Path | None
 ) -> dict[str, Any]:
     """What ``segment --json`` prints: points of each name, and why the others are unknown."""
     return {
@@ -52,7 +53,7 @@ def describe_segmentation(
         "unknown": int((result.labels < 0).sum()),
         "unknown_because": {str(reason): count for reason, count in result.unknown_because().items()},
         "calibrated": result.calibrated,
-        "seconds": {stage["name"]: stage["seconds"] for stage in stages},
+        "seconds": {stage["name"]: stage["seconds"] for stage in journal.stages},
     }
 
 

@@ -7,17 +7,16 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from og_pointcloud.cli.common import (
-    Parser,
-    add_option,
-    add_output,
-    add_shared,
-    print_next,
-    timed,
-    write_fit,
-    write_json,
-)
+from og_pointcloud.cli.common import Parser, add_option, add_output, add_shared, print_next, write_fit, write_json
+from og_pointcloud.journal import Journal
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from og_pointcloud.mapping.changes import Changes
 
 
 def add(parser: Parser) -> None:
@@ -34,12 +33,12 @@ def run(arguments: argparse.Namespace) -> None:
     from og_pointcloud.mapping.sight import depth_views
 
     before = load(arguments.map)
-    stages = []
-    with timed(stages, "read capture"):
+    journal = Journal(progress=False)
+    with journal.stage("read capture"):
         capture = read_capture(arguments.capture, gaussians=arguments.gaussians)
-    with timed(stages, "update"):
+    with journal.stage("update"):
         updated = update(before, capture, depth=depth_views(arguments.capture, before.cloud.origin))
-    write_fit(updated.cloud, [*updated.cloud.provenance.get("stages", []), *stages], arguments.output)
+    write_fit(updated.cloud, journal, arguments.output)
     if arguments.json:
         write_json(arguments.json, updated.changes.to_dict())
     print_changes(updated.changes)
@@ -47,7 +46,7 @@ def run(arguments: argparse.Namespace) -> None:
     print_next("compare", arguments.map, arguments.output, "--html", arguments.output.with_suffix(".html"))
 
 
-def print_changes(changes) -> None:  # noqa: ANN001
+def print_changes(changes: Changes) -> None:
     print(changes)
     for name in ("gone", "new", "unseen"):
         if ids := getattr(changes, name):
@@ -56,5 +55,5 @@ def print_changes(changes) -> None:  # noqa: ANN001
         print(f"moved: {moved.id} from {_place(moved.before)} to {_place(moved.after)}")
 
 
-def _place(xyz) -> str:  # noqa: ANN001
+def _place(xyz: NDArray[np.float64]) -> str:
     return "(" + ", ".join(f"{value:.2f}" for value in xyz) + ")"

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import og_pointcloud as og
 from og_pointcloud.cli.common import (
@@ -19,10 +19,10 @@ from og_pointcloud.cli.common import (
     check_at_least,
     direction,
     names_in,
-    timed,
     warn_of_capture,
 )
 from og_pointcloud.errors import OgPointcloudError
+from og_pointcloud.journal import Journal
 
 if TYPE_CHECKING:
     import numpy as np
@@ -68,11 +68,11 @@ def view_scene(arguments: argparse.Namespace) -> None:
     from og_pointcloud.cli.segment import describe_segmentation, print_segmentation
     from og_pointcloud.show.page import Look, write_page
 
-    stages: list[dict[str, Any]] = []
-    with timed(stages, "load"):
+    journal = Journal(progress=False)
+    with journal.stage("load"):
         scene = og.load(arguments.source)
         other = og.read_points(arguments.cloud) if arguments.cloud else None
-    with timed(stages, "segment"):
+    with journal.stage("segment"):
         points = scene if other is None else other.xyz_world
         result = og.segment(points, names_in(arguments.labels), scene, text_features=arguments.text_features)
     rgb = scene.cloud.rgb if other is None else other.rgb
@@ -87,7 +87,7 @@ def view_scene(arguments: argparse.Namespace) -> None:
         arguments.png.parent.mkdir(parents=True, exist_ok=True)
         draw(scene, result, rgb, shown, view, look).screenshot(arguments.png)
     outputs = [path for path in (page, arguments.png) if path]
-    print_segmentation(describe_segmentation(result, stages, arguments.source, outputs[0]))
+    print_segmentation(describe_segmentation(result, journal, arguments.source, outputs[0]))
     for path in outputs[1:]:
         print(f"wrote {path}")
 
@@ -125,7 +125,6 @@ def chosen_view(result: og.Segmentation, arguments: argparse.Namespace) -> tuple
 def view_capture(arguments: argparse.Namespace) -> None:
     check_at_least("--columns", arguments.columns, 1)
     from og_pointcloud.fitting.fit import prepare
-    from og_pointcloud.journal import Journal
     from og_pointcloud.show.fit_pictures import learned_stages
 
     output = arguments.output or Path("features.png")

@@ -7,25 +7,28 @@ import html
 import os
 import struct
 import zlib
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.ask.labelled_scene import as_scene
+from og_pointcloud.ask.picking import front_points
 from og_pointcloud.cloud import LabelledCloud
 from og_pointcloud.collection.collection import Collection, Finding, Findings
 from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.formats.atomic import replacing
+from og_pointcloud.show.viewpoint import Viewpoint
 
 SIDE_PX = 200
 AROUND = 0.35
 """How much of a thing's largest length is shown around it."""
 MOST_POINTS = 60_000
 """Points that a picture is drawn from."""
-LARGEST_PX = 4
-"""Half the side of a drawn point, at most."""
-EYE = np.array([1.0, -1.4, 1.1])
+EYE, UP = np.array([1.0, -1.4, 1.1]), np.array([0.0, 0.0, 1.0])
 """Where the eye is, as seen from the thing; z is up, as `og-pointcloud view` has it unless told."""
+FAR = 20.0
+"""How far away it is, in widths of the picture: hardly any perspective."""
 PAPER = 250
 FADED = 0.6
 """How far what is around a thing fades into the paper."""
@@ -71,7 +74,7 @@ def _card(rank: int, finding: Finding, collection: Collection) -> str:
 
 
 def picture(cloud: LabelledCloud, finding: Finding) -> bytes:
-    """A square PNG of an instance and what is around it, without perspective."""
+    """A square PNG of an instance and what is around it, seen from far above and aside."""
     half = np.array(finding.size) / 2
     reach = half + AROUND * max(2 * half.max(), 8 * cloud.spacing)
     local = cloud.xyz - (np.array(finding.center) - cloud.origin).astype(np.float32)
@@ -83,29 +86,12 @@ def picture(cloud: LabelledCloud, finding: Finding) -> bytes:
     else:
         colors = cloud.rgb[near].astype(float)
     colors[~is_it] += FADED * (PAPER - colors[~is_it])
-    return png_bytes(_drawn(local[near].astype(float), colors, 2 * float(np.linalg.norm(reach)), cloud.spacing))
-
-
-def _drawn(
-    points: NDArray[np.float64], colors: NDArray[np.float64], extent: float, spacing: float
-) -> NDArray[np.uint8]:
-    """(SIDE_PX, SIDE_PX, 3): the nearest point of each pixel. points: about the middle. extent: what a side shows."""
-    back = EYE / np.linalg.norm(EYE)
-    right = np.cross((0, 0, 1), back)
-    right /= np.linalg.norm(right)
-    axes = np.stack([right, -np.cross(back, right), back])
-    across, down, depth = axes @ points.T
-    half = int(np.clip(round(0.6 * spacing * SIDE_PX / extent), 1, LARGEST_PX))
-    square = np.arange(-half, half + 1)
-    steps = np.stack(np.meshgrid(square, square), axis=-1).reshape(-1, 2)
-    place = np.rint(np.stack([across, down], axis=-1) * (SIDE_PX / extent) + SIDE_PX / 2).astype(int)
-    order = np.argsort(depth, kind="stable")  # from behind: of what is drawn twice the last stays
-    pixels = (place[order, None] + steps).reshape(-1, 2)
-    inside = ((pixels >= 0) & (pixels < SIDE_PX)).all(axis=1)
-    shown = np.full((SIDE_PX, SIDE_PX, 3), PAPER, np.uint8)
-    x, y = pixels[inside].T
-    shown[y, x] = np.repeat(colors[order], len(steps), axis=0)[inside]
-    return shown
+    shown = replace(
+        cloud, xyz=local[near], origin=np.zeros(3), instance_ids=cloud.instance_ids[near], rgb=None, certainty=None
+    )
+    eye = FAR * 2 * np.linalg.norm(reach) * EYE / np.linalg.norm(EYE)
+    front = front_points(shown, Viewpoint(eye, np.zeros(3), UP).camera(SIDE_PX, FAR * SIDE_PX))
+    return png_bytes(np.append(colors, [[PAPER] * 3], axis=0).astype(np.uint8)[front])  # -1, no point, is the last
 
 
 def png_bytes(image: NDArray[np.uint8]) -> bytes:

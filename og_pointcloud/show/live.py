@@ -20,7 +20,8 @@ from og_pointcloud.cloud import LabelledCloud
 from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.formats.colors import LUMINANCE, NO_LABEL, certainty_colors, label_colors
 from og_pointcloud.mapping.map_record import MapRecord
-from og_pointcloud.scene import Camera, Points
+from og_pointcloud.scene import Points
+from og_pointcloud.show.viewpoint import Viewpoint
 from og_pointcloud.text.words import Labels, TextFeatures
 
 MODES = ("labels", "instances", "certainty", "changes", "photo")
@@ -206,7 +207,10 @@ class LiveScene:
 
         eye, direction: (3,), world. focal_px: of the window that was clicked in.
         """
-        hit = pick(self.scene, look_along(eye, direction, focal_px), (CLICK_PX / 2, CLICK_PX / 2))
+        view = Viewpoint(
+            eye, eye + direction, np.eye(3)[np.abs(direction).argmin()]
+        )  # whatever is up: a pixel is asked
+        hit = pick(self.scene, view.camera(CLICK_PX, focal_px), (CLICK_PX / 2, CLICK_PX / 2))
         if not hit.found:
             self.lit = None
             return Answer(str(hit), ("no instance",))
@@ -236,14 +240,3 @@ def _known_changes(cloud: LabelledCloud) -> NDArray[np.intp] | None:
 def meaning(calibrated: bool) -> str:
     """What scores are."""
     return "probability" if calibrated else "cosine: how similar, not how probable"
-
-
-def look_along(eye: NDArray[np.float64], direction: NDArray[np.float64], focal_px: float) -> Camera:
-    """A camera of a few pixels, whose middle one looks along the direction: all that a click needs."""
-    forward = direction / np.linalg.norm(direction)
-    right = np.cross(forward, np.eye(3)[np.abs(forward).argmin()])
-    right /= np.linalg.norm(right)
-    pose = np.eye(4)
-    pose[:3, :3] = [right, np.cross(forward, right), forward]
-    pose[:3, 3] = -pose[:3, :3] @ eye
-    return Camera(CLICK_PX, CLICK_PX, focal_px, focal_px, CLICK_PX / 2, CLICK_PX / 2, pose)

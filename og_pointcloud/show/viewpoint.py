@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from og_pointcloud.scene import Camera
+
 FOCAL = 1.7
 """Focal length in half heights of the picture: a view angle of 61 degrees."""
 ELEVATIONS_DEG = (30.0, 50.0)
@@ -30,6 +32,20 @@ class Viewpoint:
     target: NDArray[np.float64]
     up: NDArray[np.float64]
 
+    def axes(self) -> NDArray[np.float64]:
+        """(3, 3), rows right, up and forward of the picture."""
+        back = (self.eye - self.target) / np.linalg.norm(self.eye - self.target)
+        right = np.cross(self.up, back)
+        right /= np.linalg.norm(right)
+        return np.stack([right, np.cross(back, right), -back])
+
+    def camera(self, side_px: int, focal_px: float) -> Camera:
+        """One of world coordinates with a square image, whose middle shows the target."""
+        pose = np.eye(4)
+        pose[:3, :3] = self.axes() * [[1], [-1], [1]]  # cameras have y down
+        pose[:3, 3] = -pose[:3, :3] @ self.eye
+        return Camera(side_px, side_px, focal_px, focal_px, side_px / 2, side_px / 2, pose)
+
 
 def choose_viewpoint(xyz: NDArray[np.float64], labelled: NDArray[np.bool_], up: NDArray[np.float64]) -> Viewpoint:
     """xyz: (n, 3), n >= 1, finite. labelled: (n,), points that should be seen; all, if none is. up: (3,) unit."""
@@ -51,17 +67,9 @@ def choose_viewpoint(xyz: NDArray[np.float64], labelled: NDArray[np.bool_], up: 
     return _framed(points[inside], best)
 
 
-def _axes(view: Viewpoint) -> NDArray[np.float64]:
-    """(3, 3), rows right, up and forward of the picture."""
-    back = (view.eye - view.target) / np.linalg.norm(view.eye - view.target)
-    right = np.cross(view.up, back)
-    right /= np.linalg.norm(right)
-    return np.stack([right, np.cross(back, right), -back])
-
-
 def _framed(points: NDArray[np.float64], view: Viewpoint) -> Viewpoint:
     """The same direction and target, from as near as all points are in the picture."""
-    axes, distance = _axes(view), float(np.linalg.norm(view.eye - view.target))
+    axes, distance = view.axes(), float(np.linalg.norm(view.eye - view.target))
     x, y, behind = axes @ (points - view.target).T
     aside = np.maximum(np.abs(x) * CELLS[1] / CELLS[0], np.abs(y))
     nearest = float((FOCAL / FILLED * aside - behind).max())  # FOCAL aside / (distance + behind) <= FILLED
@@ -70,7 +78,7 @@ def _framed(points: NDArray[np.float64], view: Viewpoint) -> Viewpoint:
 
 def _in_sight(points: NDArray[np.float64], wanted: NDArray[np.bool_], view: Viewpoint) -> int:
     """Cells of a coarse picture whose nearest point is a wanted one."""
-    x, y, depth = _axes(view) @ (points - view.eye).T
+    x, y, depth = view.axes() @ (points - view.eye).T
     ahead = depth > 0
     half = CELLS[1] / 2
     column = (CELLS[0] / 2 + half * FOCAL * x[ahead] / depth[ahead]).astype(np.int64)
