@@ -65,12 +65,7 @@ stages = {
 up = -np.mean([view.camera.world_to_camera[1, :3] for view in scene.views], axis=0)
 viewpoint = choose_viewpoint(xyz.astype(np.float64), shown, up / np.linalg.norm(up))
 height, width = scene.views[0].camera.height, scene.views[0].camera.width
-back = (viewpoint.eye - viewpoint.target) / np.linalg.norm(viewpoint.eye - viewpoint.target)
-right = np.cross(viewpoint.up, back) / np.linalg.norm(np.cross(viewpoint.up, back))
-rotation = np.stack([right, np.cross(right, back), -back])
-pose = np.vstack([np.column_stack([rotation, -rotation @ viewpoint.eye]), [0, 0, 0, 1]])
-focal = FOCAL * height / 2
-camera = og.Camera(width, height, focal, focal, width / 2, height / 2, pose)
+camera = viewpoint.camera(width, height, FOCAL * height / 2)
 views = [scene.views[index] for index in np.linspace(0, len(scene.views) - 1, 4).astype(int)]
 from_above = View("from above", camera, np.full((height, width), -1, np.int32), np.zeros((0, 1), np.float32))
 # Points are drawn all alike: where strays lie far apart, the Gaussians of the method are as large as furniture.

@@ -29,6 +29,8 @@ LONGEST_SIDE = 1 << 17
 """Pixels; no camera has more."""
 NOT_SEEN = -2
 """In a mask map: a pixel that the lens did not see, which says nothing; -1 says that no mask is there."""
+RIGID = 1e-2
+"""A rotation's rows are of length one and upright to each other within this."""
 UNIT_TOLERANCE = 1e-3
 """A quaternion's length may differ from 1 by this much: it changes the size of a Gaussian by twice as much."""
 
@@ -61,11 +63,8 @@ class Camera:
         object.__setattr__(self, "world_to_camera", pose)
         if pose.shape != (4, 4) or not np.isfinite(pose).all():
             raise SceneError(f"camera pose is {pose.tolist()}; expected a finite 4x4 matrix: drop or repair this view")
-        rotation = pose[:3, :3]
-        with np.errstate(over="ignore", invalid="ignore"):
-            error = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
-            determinant = float(np.linalg.det(rotation))
-        if not error <= 1e-2 or determinant < 0:  # also where the error is NaN
+        error, determinant = rotation_error(pose[:3, :3])
+        if not error <= RIGID or determinant < 0:  # also where the error is NaN
             raise SceneError(
                 f"camera rotation is off a rotation matrix by {error:.3g} (det {determinant:.3g}); "
                 "expected a rigid right-handed pose: remove scale or mirroring from the pose file"
@@ -270,6 +269,12 @@ class Points:
     def xyz_world(self) -> DoubleArray:
         """World coordinates, (n, 3) float64."""
         return self.xyz.astype(np.float64) + self.origin
+
+
+def rotation_error(matrix: DoubleArray) -> tuple[float, float]:
+    """How far a matrix (3, 3) is from one of orthonormal rows, NaN where it overflows; and its determinant."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        return float(np.abs(matrix @ matrix.T - np.eye(3)).max()), float(np.linalg.det(matrix))
 
 
 def require_finite(xyz: NDArray[np.floating], cure: str = "remove them from the cloud first") -> None:

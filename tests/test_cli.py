@@ -164,7 +164,6 @@ def test_interrupt_leaves_nothing(tiny_capture, tmp_path, capsys, monkeypatch):
         (("pick", "s.ogpc", "--pixel", "3,4"), "--capture CAPTURE --view NAME"),
         (("pick", "s.ogpc", "--xyz", "1,2,3", "-o", "mask.png"), "--capture CAPTURE --view NAME"),
         (("pick", "s.ogpc", "--xyz", "1,2,3", "-o", "mask.jpg"), "ends in .png"),
-        (("view", "capture", "--columns", "0"), "--columns is 0"),
         (("fit", "capture", "-o", "s.ogpc", "--schedule-share", "0.1"), "--mode grouping, which has no schedule"),
         (("fit", "capture", "-o", "s.ogpc", "--mode", "paper", "--schedule-share", "-1"), "schedule_share is -1"),
         (("import", "absent", "-o", "s.ogpc"), "is not a file; expected a result folder"),

@@ -349,6 +349,25 @@ def test_properties_that_only_one_has_are_told(tmp_path):
     )
 
 
+@pytest.mark.parametrize("other", [
+    {"red": np.float32([1.0]), "green": np.float32([0.2]), "blue": np.float32([0])},
+    {"r": np.uint8([255]), "g": np.uint8([51]), "b": np.uint8([0])},
+    {"rgb": np.uint32([0xFF3300])},
+], ids=["floats", "other names", "packed"])  # fmt: skip
+@pytest.mark.parametrize("turned_about", [False, True])
+def test_colours_of_other_types_stay_what_they_are(tmp_path, other, turned_about):
+    ours = {name: np.uint8([value, value]) for name, value in zip(("red", "green", "blue"), (10, 20, 30), strict=True)}
+    two, one = (
+        plain_file(tmp_path / "a.ply", np.eye(2, 3), **ours),
+        plain_file(tmp_path / "b.ply", np.ones((1, 3)), **other),
+    )
+    base, added = (one, two) if turned_about else (two, one)
+    og.edit.insert(base, added, tmp_path / "c.ply")
+    expected = [[10, 20, 30], [10, 20, 30], [255, 51, 0]]
+    expected = expected[2:] + expected[:2] if turned_about else expected
+    np.testing.assert_array_equal(og.read_points(tmp_path / "c.ply").rgb, expected)
+
+
 def test_plain_points_and_splats_do_not_mix(tmp_path):
     plain, splats = plain_file(tmp_path / "plain.ply", np.eye(3)), tmp_path / "splats.ply"
     write_ply(splats, {"vertex": join_columns(gaussian_columns(np.eye(3)))})

@@ -136,7 +136,7 @@ def test_clicks_find_what_pick_finds(origin):
     scene = og.LabelledScene.from_cloud(cloud)
     live, center = LiveScene(scene), scene.xyz.mean(axis=0)
     eye = center + np.array([0.3, -0.6, 1.9])
-    camera = replace(Viewpoint(eye, center, np.eye(3)[0]).camera(33, 60.0), width=160, height=120, cx=80.0, cy=60.0)
+    camera = Viewpoint(eye, center, np.eye(3)[0]).camera(160, 120, 60.0)
     front = front_points(cloud, camera)
     seen = np.append(cloud.instance_ids, np.int32(og.TOO_FAR))[front]  # -1, no point, is the last
     clear = 0

@@ -301,7 +301,7 @@ def rude(bundle, tmp_path_factory):
 
 @pytest.mark.parametrize(
     "command",
-    [["info"], ["info", "--json"], ["instances"], ["segment"], ["segment", "--labels", "foo"], ["vocabulary", "list"]],
+    [["info"], ["info", "--json"], ["instances"], ["segment"], ["segment", "--labels", "foo"]],
     ids=" ".join,
 )
 def test_nothing_in_a_file_reaches_the_terminal_as_it_is(rude, capsys, command):
@@ -550,7 +550,7 @@ def program(*arguments, **environment):
 def test_output_of_few_characters(tmp_path, encoding):
     cloud = make_cloud(np.zeros((1, 3)), [0], words=("café", "日本", "😀"))
     path = write_bundle(cloud, tmp_path / "s.ogpc")
-    command, environment = program("vocabulary", "list", path, PYTHONIOENCODING=encoding)
+    command, environment = program("info", path, PYTHONIOENCODING=encoding)
     done = subprocess.run(command, env=environment, capture_output=True)
     assert done.returncode == 0, done.stderr
     assert b"\\u65e5\\u672c" in done.stdout

@@ -136,8 +136,7 @@ def test_nothing_found_is_said(bundle, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (["--columns", "3"], "--columns is for a capture, but"),
-        (["-o", "x.png"], "a picture is --png, a page --html"),
+        (["--columns", "3"], "'--columns' is unknown"),
         (["--html", "x.png"], "expected a name that ends in .html or .htm"),
         (["--html", "x.html", "--cut", "1"], "--cut is 1.0; expected a share"),
         (["--html", "x.html", "--labels", "appel"], "did you mean 'apple'"),
@@ -152,18 +151,6 @@ def test_bad_use_is_refused_in_one_line(bundle, tmp_path, capsys, monkeypatch, o
     assert said in stderr
     assert len(stderr.splitlines()) == 1
     assert list(tmp_path.iterdir()) == []
-
-
-def test_a_capture_is_told_from_a_scene(tmp_path, capsys):
-    (tmp_path / "capture").mkdir()
-    for options, said in [
-        (["--html", "x.html"], "--html is for a scene (.ogpc), but"),
-        (["--instances"], "--instances is for a scene (.ogpc), but"),
-        (["--columns", "0"], "--columns is 0"),
-    ]:
-        code, _, stderr = run(capsys, "view", tmp_path / "capture", *options)
-        assert code == 2
-        assert said in stderr
 
 
 def test_where_nothing_can_draw_the_cure_is_named(bundle, tmp_path, capsys, monkeypatch):

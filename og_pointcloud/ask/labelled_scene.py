@@ -27,14 +27,13 @@ from og_pointcloud.bundle.read import Bundle, read_bundle
 from og_pointcloud.bundle.vocabulary import carried_encoder
 from og_pointcloud.cloud import TOO_FAR, LabelledCloud, Vocabulary
 from og_pointcloud.errors import OgPointcloudError, SceneError
+from og_pointcloud.scene import RIGID, rotation_error
 from og_pointcloud.text.words import Labels, TextFeatures, resolve_labels
 
 SceneLike: TypeAlias = "LabelledScene | LabelledCloud | str | os.PathLike[str]"
 
 ELSEWHERE_SHARE = 1 / 3
 """Of the points asked: where more lie too far from the scene, the two may be in different frames."""
-RIGID = 1e-2
-"""A rotation's rows are of length one and upright to each other within this."""
 POINTS_PER_RUN = 1 << 20
 """What bounds the memory of the graph: about 150 MB."""
 
@@ -372,9 +371,7 @@ def _posed(points: NDArray[np.float64], pose: ArrayLike | None) -> NDArray[np.fl
     if pose is None:
         return points
     matrix = pose_matrix(pose)
-    with np.errstate(invalid="ignore", over="ignore"):
-        error = float(np.abs(matrix[:3, :3] @ matrix[:3, :3].T - np.eye(3)).max())
-        determinant = float(np.linalg.det(matrix[:3, :3]))
+    error, determinant = rotation_error(matrix[:3, :3])
     if not error <= RIGID or determinant < 0:  # also where the error is NaN
         raise SceneError(
             f"the rotation of pose is off a rotation matrix by {error:.3g} (det {determinant:.3g}); expected a rigid "

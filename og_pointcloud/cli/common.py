@@ -22,7 +22,7 @@ from og_pointcloud.journal import Journal
 
 if TYPE_CHECKING:
     from og_pointcloud.cloud import LabelledCloud
-    from og_pointcloud.scene import Points, Scene
+    from og_pointcloud.scene import Points
 
 SHOWN = 12
 """Words, and instances, that a list shows before it ends in dots."""
@@ -257,15 +257,9 @@ def print_checks(checks: Sequence[Mapping[str, str]], capture: Path | str) -> No
                 print(printable(f"try: {line}", LONGEST_NOTE))
 
 
-def warn_of_capture(scene: Scene, capture: Path) -> None:
-    """Warn of what does not fit together in a capture that a command is about to use."""
-    from og_pointcloud.checking.check import check_capture, warn_of_doubts
-
-    warn_of_doubts(check_capture(scene), shlex.quote(str(capture)))
-
-
 def warn_of_poses(capture: Path, points: Points | None = None) -> None:
-    """The part of it that needs no masks. points: those that the poses must fit; None: the capture's, if it has any."""
+    """Warn of what does not fit together in a capture without its masks. points: those that the poses must fit; None:
+    the capture's, if it has any."""
     from og_pointcloud.checking.check import check_poses, warn_of_doubts
     from og_pointcloud.formats.capture import read_photographed
 

@@ -29,15 +29,11 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from og_pointcloud.evaluate.captures import CaptureScore
-    from og_pointcloud.evaluate.intervals import BlockInterval, Interval
+    from og_pointcloud.evaluate.intervals import Interval
     from og_pointcloud.evaluate.lerf import PairScore
     from og_pointcloud.evaluate.metrics import Score
 
 SCANNET_LABELS = "_vh_clean_2.labels.ply"
-CAPTURE_HEADER = (
-    "", "mIoU", "95 %", "mAcc", "unknown", "background called", "answered", "share answered", "ARI",
-)  # fmt: skip
-
 TASK_MEANS = ("miou", "macc", "forced_miou", "unknown")
 
 
@@ -81,7 +77,8 @@ def run_capture(arguments: argparse.Namespace) -> None:
     score = score_capture(answer, truth)
     change = difference(answer, ask(arguments.against, truth, words), truth) if arguments.against else None
     name, interval = arguments.capture.resolve().name, score.interval
-    print_table(CAPTURE_HEADER + (("less the other",) if change else ()), [capture_cells(name, score, change)])
+    row = {"": name} | capture_cells(score) | ({"less the other": signed(change)} if change else {})
+    print_table(tuple(row), [tuple(row.values())])
     print(
         "unknown counts as wrong; 'answered' leaves it out. The 95 % are over cubes of the scene, not over points: "
         f"{interval.blocks} cubes of {interval.edge / answer.spacing:.0f} point spacings"
@@ -90,14 +87,19 @@ def run_capture(arguments: argparse.Namespace) -> None:
     write_scores(arguments, {name: {**asdict(score), "spacing": answer.spacing, "less_the_other": less}})
 
 
-def capture_cells(name: str, score: CaptureScore, change: BlockInterval | None) -> tuple[str, ...]:
+def capture_cells(score: CaptureScore) -> dict[str, str]:
+    """Column -> what stands there."""
     labels = score.labels
-    return (
-        name, percent(labels.miou), spread(score.interval), percent(labels.macc), percent(labels.unknown_share),
-        percent(labels.background_called), percent(score.answered.miou), percent(score.answered_share),
-        "-" if score.rand is None else f"{score.rand:.3f}",
-        *((signed(change),) if change else ()),
-    )  # fmt: skip
+    return {
+        "mIoU": percent(labels.miou),
+        "95 %": spread(score.interval),
+        "mAcc": percent(labels.macc),
+        "unknown": percent(labels.unknown_share),
+        "background called": percent(labels.background_called),
+        "answered": percent(score.answered.miou),
+        "share answered": percent(score.answered_share),
+        "ARI": "-" if score.rand is None else f"{score.rand:.3f}",
+    }
 
 
 # ScanNet --------------------------------------------------------------------------------------------------------

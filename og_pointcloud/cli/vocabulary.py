@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import og_pointcloud as og
-from og_pointcloud.cli.common import Parser, add_command, add_output, replaceable
+from og_pointcloud.cli.common import Parser, add_command, add_option, add_output, replaceable
 from og_pointcloud.errors import OgPointcloudError
 
 if TYPE_CHECKING:
@@ -19,21 +19,20 @@ if TYPE_CHECKING:
 
 def add(parser: Parser) -> None:
     actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
-    runs = (run_add, run_list, run_bank, run_carry)
-    add, listing, bank, carry = (
-        add_command(actions, run.__name__.removeprefix("run_"), run, run.__doc__) for run in runs
+    add, bank, carry = (
+        add_command(actions, run.__name__.removeprefix("run_"), run, run.__doc__)
+        for run in (run_add, run_bank, run_carry)
     )
-    for action in (add, listing, bank, carry):
-        action.add_argument("bundle", type=replaceable, metavar="S.ogpc", help="what `fit` wrote")
     for action in (add, bank, carry):
+        add_option(action, "bundle", "S.ogpc", "what `fit` wrote", type=replaceable)
         add_output(action, "-o", "--output", endings=(".ogpc",), help="another file (default: S.ogpc itself)")
     sources = add.add_mutually_exclusive_group(), bank.add_mutually_exclusive_group()
-    add.add_argument("words", type=Path, nargs="?", metavar="words.txt", help="one a line")
-    sources[0].add_argument("--text-features", type=Path, metavar="F.npz", help="or names with their vectors")
-    sources[1].add_argument("features", type=Path, nargs="?", metavar="F.npz", help="of at least 50 everyday words")
+    add_option(add, "words", "words.txt", "one a line", type=Path, nargs="?")
+    add_option(sources[0], "--text-features", "F.npz", "or names with their vectors", type=Path)
+    add_option(sources[1], "features", "F.npz", "of at least 50 everyday words", type=Path, nargs="?")
     for source in sources:
-        source.add_argument("--text-encoder", type=Path, metavar="DIR", help="default: the feature space's, if found")
-    carry.add_argument("encoder", type=Path, metavar="DIR", help="what `og-pointcloud export text` wrote")
+        add_option(source, "--text-encoder", "DIR", "default: the feature space's, if found", type=Path)
+    add_option(carry, "encoder", "DIR", "what `og-pointcloud export text` wrote", type=Path)
 
 
 def run_add(arguments: argparse.Namespace) -> None:
@@ -67,16 +66,6 @@ def scene_encoder(arguments: argparse.Namespace) -> TextEncoder:
     found = FeatureSpace(encoder.feature_space, encoder.width)
     FeatureSpace(own, 0).require(found, f"texts that {encoder.where} encodes")
     return encoder
-
-
-def run_list(arguments: argparse.Namespace) -> None:
-    """Print the words, one a line.
-
-    og-pointcloud vocabulary list kitchen.ogpc
-    """
-    vocabulary = og.read_bundle(arguments.bundle).cloud.vocabulary
-    for name in vocabulary.names if vocabulary else ():
-        print(name)
 
 
 def run_bank(arguments: argparse.Namespace) -> None:

@@ -56,7 +56,7 @@ def ask(scene: SceneLike, truth: Truth, text_features: Path | None = None) -> An
     return Answer(truth.class_of(result.labels, result.names), result.instances, cloud.xyz, cloud.spacing)
 
 
-def score_capture(answer: Answer, truth: Truth, seed: int = 0) -> CaptureScore:
+def score_capture(answer: Answer, truth: Truth) -> CaptureScore:
     """All scores of one answer. SceneError where no class of the truth has enough points to be scored."""
     labels = score_labels(answer.called, truth.cls, scored=truth.scored, background=truth.background)
     if not labels.classes:
@@ -65,17 +65,17 @@ def score_capture(answer: Answer, truth: Truth, seed: int = 0) -> CaptureScore:
     answered = answer.called >= 0
     return CaptureScore(
         labels=labels,
-        interval=miou_interval(answer.called, truth, answer.xyz, answer.spacing, labels.classes, seed),
+        interval=miou_interval(answer.called, truth, answer.xyz, answer.spacing, labels.classes),
         answered=score_labels(answer.called, truth.cls, scored=counted & answered, min_points=1),
         answered_share=float(answered[counted].mean()),
         rand=_rand_of_things(answer, truth),
     )
 
 
-def difference(first: Answer, second: Answer, truth: Truth, seed: int = 0) -> BlockInterval:
+def difference(first: Answer, second: Answer, truth: Truth) -> BlockInterval:
     """Of the mIoU of one answer less that of another, of the same points: paired, over the same blocks of space."""
     classes = score_labels(first.called, truth.cls, scored=truth.scored).classes
-    return miou_interval(first.called, truth, first.xyz, first.spacing, classes, seed, less=second.called)
+    return miou_interval(first.called, truth, first.xyz, first.spacing, classes, less=second.called)
 
 
 def _rand_of_things(answer: Answer, truth: Truth) -> float | None:

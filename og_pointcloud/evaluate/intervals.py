@@ -49,7 +49,7 @@ class BlockInterval(Interval):
     blocks: int
 
 
-def bootstrap(scores: NDArray[np.floating], seed: int = 0, draws: int = DRAWS) -> Interval:
+def bootstrap(scores: NDArray[np.floating]) -> Interval:
     """Of the mean of n items' scores (scenes, or frame-object pairs): items are drawn again, with replacement.
 
     A NaN item has no score and is left out before. One item alone has no spread; none at all is an error.
@@ -58,14 +58,14 @@ def bootstrap(scores: NDArray[np.floating], seed: int = 0, draws: int = DRAWS) -
     values = values[np.isfinite(values)]
     if values.ndim != 1 or len(values) == 0:
         raise OgPointcloudError("no finite score to draw from; expected one or more")
-    means = [values[drawn].mean(axis=1) for drawn in _draws(len(values), draws, seed)]
+    means = [values[drawn].mean(axis=1) for drawn in _draws(len(values), DRAWS)]
     low, high = np.percentile(np.concatenate(means), (2.5, 97.5))
     return Interval(float(values.mean()), float(low), float(high))
 
 
 def miou_interval(
     called: Integers, truth: Truth, xyz: NDArray[np.floating], spacing: float, classes: tuple[int, ...],
-    seed: int = 0, less: Integers | None = None,
+    less: Integers | None = None,
 ) -> BlockInterval:  # fmt: skip
     """Of the mean IoU that `score_labels` gives; or of its difference to another labelling's, ``called`` less ``less``:
     both are scored on the same draws, since what is hard is hard for both.
@@ -93,7 +93,7 @@ def miou_interval(
             present + _points_per_block(block, labels, classes) - hit
             for labels, hit in zip(labellings, hits, strict=True)
         ]
-        intervals.append(_interval(hits, unions, edge, seed))
+        intervals.append(_interval(hits, unions, edge))
         edge *= 2
 
 
@@ -111,7 +111,7 @@ def _points_per_block(block: NDArray[np.intp], ids: Integers, classes: tuple[int
     return counts
 
 
-def _interval(hits: list[Doubles], unions: list[Doubles], edge: float, seed: int) -> BlockInterval:
+def _interval(hits: list[Doubles], unions: list[Doubles], edge: float) -> BlockInterval:
     """Of the one mean IoU, or of the first less the second. hits, unions: of each labelling, (blocks, classes)."""
     blocks = len(hits[0])
 
@@ -125,7 +125,7 @@ def _interval(hits: list[Doubles], unions: list[Doubles], edge: float, seed: int
         return mious[0] if len(mious) == 1 else mious[0] - mious[1]
 
     drawn = []
-    for picked in _draws(blocks, BLOCK_DRAWS, seed):
+    for picked in _draws(blocks, BLOCK_DRAWS):
         rows = np.arange(len(picked))[:, None] * blocks + picked
         weights = np.bincount(rows.ravel(), minlength=picked.size).reshape(picked.shape)
         drawn.append(score(weights.astype(np.float64)))
@@ -133,9 +133,9 @@ def _interval(hits: list[Doubles], unions: list[Doubles], edge: float, seed: int
     return BlockInterval(float(score(np.ones((1, blocks)))[0]), float(low), float(high), edge, blocks)
 
 
-def _draws(items: int, draws: int, seed: int) -> Iterator[NDArray[np.int64]]:
-    """(some draws, items) rows of items drawn with replacement, in parts that fit into memory."""
-    random = np.random.default_rng(seed)
+def _draws(items: int, draws: int) -> Iterator[NDArray[np.int64]]:
+    """(some draws, items) rows of items drawn with replacement, in parts that fit into memory; always the same."""
+    random = np.random.default_rng(0)
     step = max(1, CHUNK // items)
     for start in range(0, draws, step):
         yield random.integers(0, items, (min(step, draws - start), items))

@@ -90,7 +90,7 @@ def picture(cloud: LabelledCloud, finding: Finding) -> bytes:
         cloud, xyz=local[near], origin=np.zeros(3), instance_ids=cloud.instance_ids[near], rgb=None, certainty=None
     )
     eye = FAR * 2 * np.linalg.norm(reach) * EYE / np.linalg.norm(EYE)
-    front = front_points(shown, Viewpoint(eye, np.zeros(3), UP).camera(SIDE_PX, FAR * SIDE_PX))
+    front = front_points(shown, Viewpoint(eye, np.zeros(3), UP).camera(SIDE_PX, SIDE_PX, FAR * SIDE_PX))
     return png_bytes(np.append(colors, [[PAPER] * 3], axis=0).astype(np.uint8)[front])  # -1, no point, is the last
 
 

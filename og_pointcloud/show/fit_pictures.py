@@ -18,12 +18,8 @@ from numpy.typing import NDArray
 from og_pointcloud.errors import MissingExtraError, SceneError
 from og_pointcloud.formats.images import require_cv2, write_png
 from og_pointcloud.scene import View
-from og_pointcloud.settings import CodebookSettings
 
 try:
-    from og_pointcloud.fitting.learned.codebook import two_level_codebook
-    from og_pointcloud.fitting.learned.instance_features import learn_features
-    from og_pointcloud.fitting.mask_table import MaskTable
     from og_pointcloud.rendering.splatting import Gaussians, render
 except ImportError as error:
     raise MissingExtraError("scipy and numba", "fit") from error
@@ -131,23 +127,6 @@ def feature_picture(
     return _write_grid(Path(path), shown, rows)
 
 
-def learned_stages(table: MaskTable, xyz: NDArray[np.float32], seed: int = 0) -> dict[str, NDArray[np.float32]]:
-    """Learn features, and discretise them on both levels: title -> (n, w), NaN rows where no mask shows the Gaussian.
-
-    table: of the Gaussians at xyz (n, 3). What `feature_picture` shows as the paper's figures do.
-    """
-    learned = learn_features(table, None, seed)
-    codebook = two_level_codebook(learned.features, xyz, learned.seen, table, CodebookSettings(), seed)
-    width = learned.features.shape[1]
-    coarse, leaf = codebook.coarse_centres, codebook.leaf_centres
-    shown = (learned.seen > 0)[:, None]
-    return {
-        f"{width}-D features": np.where(shown, learned.features, np.float32(np.nan)),
-        f"coarse: {len(coarse)} clusters": _centre_of_each(coarse, codebook.coarse),
-        f"fine: {len(leaf)} clusters": _centre_of_each(leaf, codebook.leaf),
-    }
-
-
 def training_picture(stages: Sequence[Mapping[str, Any]], path: str | os.PathLike[str]) -> Path:
     """Write a PNG of each stage's losses against its steps, side by side.
 
@@ -167,11 +146,6 @@ def training_picture(stages: Sequence[Mapping[str, Any]], path: str | os.PathLik
         _write_text(panel, f"{stage['steps']:,} of {stage['published_steps']:,} steps", MARGIN, PLOT_HEIGHT + 2 * STRIP)
         panels.append(panel)
     return write_png(Path(path), np.concatenate(panels, axis=1))
-
-
-def _centre_of_each(centres: NDArray[np.float32], cluster: NDArray[np.int32]) -> NDArray[np.float32]:
-    none = np.full((1, centres.shape[1]), np.nan, np.float32)
-    return np.concatenate([centres, none])[cluster]  # -1, no cluster, is the last row
 
 
 def _check(stages: Mapping[str, NDArray[Any]], points: int) -> None:

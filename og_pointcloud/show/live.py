@@ -210,7 +210,7 @@ class LiveScene:
         view = Viewpoint(
             eye, eye + direction, np.eye(3)[np.abs(direction).argmin()]
         )  # whatever is up: a pixel is asked
-        hit = pick(self.scene, view.camera(CLICK_PX, focal_px), (CLICK_PX / 2, CLICK_PX / 2))
+        hit = pick(self.scene, view.camera(CLICK_PX, CLICK_PX, focal_px), (CLICK_PX / 2, CLICK_PX / 2))
         if not hit.found:
             self.lit = None
             return Answer(str(hit), ("no instance",))

@@ -26,8 +26,8 @@ Columns: TypeAlias = dict[str, NDArray[Any]]
 
 NORMAL_COLUMNS = (("nx", "ny", "nz"), ("normal_x", "normal_y", "normal_z"))
 RGB = ("red", "green", "blue")
-OTHER_COLORS = ("r", "g", "b", "diffuse_red", "diffuse_green", "diffuse_blue", "rgb", "rgba")
-"""Further names of colour columns, which give way to RGB of type uchar."""
+COLORS = (*RGB, "r", "g", "b", "diffuse_red", "diffuse_green", "diffuse_blue", "rgb", "rgba")
+"""All names of colour columns, which give way to RGB of type uchar."""
 DARK = 0.05
 """Mean luminance below which an object's shading is too faint to be kept in a new colour."""
 MAX_DEGREE = 3
@@ -50,9 +50,7 @@ def recoloured(rows: Rows, chosen: NDArray[np.bool_], color: NDArray[np.float64]
     if rgb is not None:
         base = rgb[chosen] / 255
         rgb[chosen] = np.rint(255 * np.clip(base @ _color_map(base, color).T, 0, 1)).astype(np.uint8)
-        if not all(name in columns and columns[name].dtype == np.uint8 for name in RGB):
-            columns = {name: column for name, column in columns.items() if name not in RGB + OTHER_COLORS}
-        columns |= dict(zip(RGB, rgb.T, strict=True))
+        columns = _in_bytes(columns, rgb)
     return join_columns(columns)
 
 
@@ -79,9 +77,14 @@ def placed(
 
 
 def appended(base: Rows, added: Rows) -> tuple[Rows, tuple[str, ...]]:
-    """The rows of both, with the columns of the first; and what is to be told."""
+    """The rows of both, with the columns of the first; and what is to be told. Colours that the two have in different
+    types become bytes."""
     first, second = _columns(base), _columns(added)
     zeros, notes = np.zeros(len(added)), []
+    if (ours := colors(base)) is not None and (theirs := colors(added)) is not None:
+        types = [[(name, columns[name].dtype) for name in COLORS if name in columns] for columns in (first, second)]
+        if types[0] != types[1]:
+            first, second = _in_bytes(first, ours), _in_bytes(second, theirs)
     merged = {
         name: np.concatenate([column, second.get(name, zeros).astype(column.dtype)]) for name, column in first.items()
     }
@@ -90,6 +93,13 @@ def appended(base: Rows, added: Rows) -> tuple[Rows, tuple[str, ...]]:
     if dropped := [name for name in second if name not in first]:
         notes.append(f"{_listed(dropped)} of the inserted points are left out, which the cloud does not have")
     return join_columns(merged), tuple(notes)
+
+
+def _in_bytes(columns: Columns, rgb: NDArray[np.uint8]) -> Columns:
+    """The columns with colours (n, 3) as red, green, blue of one byte, in place of all that they were."""
+    if not all(name in columns and columns[name].dtype == np.uint8 for name in RGB):
+        columns = {name: column for name, column in columns.items() if name not in COLORS}
+    return columns | dict(zip(RGB, rgb.T, strict=True))
 
 
 def _color_map(base: NDArray[np.float64], color: NDArray[np.float64]) -> NDArray[np.float64]:

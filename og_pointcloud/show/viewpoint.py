@@ -39,12 +39,12 @@ class Viewpoint:
         right /= np.linalg.norm(right)
         return np.stack([right, np.cross(back, right), -back])
 
-    def camera(self, side_px: int, focal_px: float) -> Camera:
-        """One of world coordinates with a square image, whose middle shows the target."""
+    def camera(self, width: int, height: int, focal_px: float) -> Camera:
+        """A camera of world coordinates; the middle of its image shows the target."""
         pose = np.eye(4)
         pose[:3, :3] = self.axes() * [[1], [-1], [1]]  # cameras have y down
         pose[:3, 3] = -pose[:3, :3] @ self.eye
-        return Camera(side_px, side_px, focal_px, focal_px, side_px / 2, side_px / 2, pose)
+        return Camera(width, height, focal_px, focal_px, width / 2, height / 2, pose)
 
 
 def choose_viewpoint(xyz: NDArray[np.float64], labelled: NDArray[np.bool_], up: NDArray[np.float64]) -> Viewpoint:
