@@ -484,7 +484,6 @@ def png_with_header(width, height, bit_depth, color_type):
 @pytest.mark.parametrize(
     ("data", "message"),
     [
-        (png_with_header(WIDTH, HEIGHT, 8, 3), "is a palette PNG of 8 bit"),
         (png_with_header(WIDTH, HEIGHT, 4, 0), "is a grey PNG of 4 bit"),
         (png_with_header(2**31 - 1, 2**31 - 1, 8, 0), "expected at most 134217728 pixels"),
         (b"\xff\xd8\xff\xe0JFIF" * 10, "is not a PNG"),

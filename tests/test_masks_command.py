@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 import pytest
 from capture_files import BY_COLOR, HEIGHT, WIDTH, make_world, write_colmap_text, write_transforms
+from PIL import Image
 from scenes import write_image, write_ply
 
 from og_pointcloud.cli import main
@@ -296,17 +297,23 @@ def test_an_existing_folder_of_masks_as_proposer(tmp_path):
     assert sorted(np.bincount(ids.ravel())[1:].tolist()) == [80, 400]
 
 
-def test_ids_of_a_video_tracker_are_tracks_of_the_capture(tmp_path):
+@pytest.mark.parametrize(("thing", "with_palette"), [(700, False), (200, True)])
+def test_ids_of_a_video_tracker_are_tracks_of_the_capture(tmp_path, thing, with_palette):
     world = make_capture(tmp_path / "c", 3)
     for k, name in enumerate(world.names):
         ids = np.zeros((HEIGHT, WIDTH), np.uint16)
-        ids[10:30, 10 + k : 30 + k], ids[5:9, 40:60] = 700, 5
-        (tmp_path / f"{name}.png").write_bytes(cv2.imencode(".png", ids)[1].tobytes())
+        ids[10:30, 10 + k : 30 + k], ids[5:9, 40:60] = thing, 5
+        if with_palette:  # as trackers of DAVIS write them
+            image = Image.fromarray(ids.astype(np.uint8), "P")
+            image.putpalette(np.random.default_rng(0).integers(0, 256, 768).tolist())
+            image.save(tmp_path / f"{name}.png")
+        else:
+            write_image(tmp_path / f"{name}.png", ids)
     settings = MaskSettings(str(tmp_path), encoder=None, level="large", tracks=True)
     make_masks(tmp_path / "c", settings, progress=False)
     for k, view in enumerate(read_capture(tmp_path / "c").views):
         of_thing = view.mask_map()[20, 20 + k], view.mask_map()[6, 50]
-        assert [view.mask_tracks[mask] - 1 for mask in of_thing] == [698, 3]
+        assert [view.mask_tracks[mask] - 1 for mask in of_thing] == [thing - 2, 3]
     make_masks(tmp_path / "c", replace(settings, tracks=False), progress=False)
     assert all(view.mask_tracks is None for view in read_capture(tmp_path / "c").views)
 

@@ -43,6 +43,15 @@ def require_cv2() -> ModuleType:
     return cv2
 
 
+def require_pillow() -> ModuleType:
+    """Pillow's Image, or an error that names the extra."""
+    try:
+        from PIL import Image
+    except ImportError as error:
+        raise MissingExtraError("Pillow", "fit") from error
+    return Image
+
+
 def without_suffix(path: str) -> str:
     """``path`` without its image suffix. Only a known suffix goes: ``frame.0001`` is a name, not a ``.0001`` file."""
     suffix = PurePosixPath(path).suffix
@@ -162,10 +171,21 @@ def decoded(file: Path, flags: int) -> NDArray[np.generic]:
     except cv2.error:
         pixels = None
     if pixels is None:
-        raise SceneError(
-            f"{file} ({data.size} bytes) cannot be decoded as an image: it is damaged or truncated, copy it again"
-        )
+        raise _undecodable(file, data.size)
     return pixels
+
+
+def palette_indices(file: Path) -> NDArray[np.uint8]:
+    """(H, W) the entries of a PNG's palette, as video trackers write ids; OpenCV would give their colours."""
+    try:
+        with require_pillow().open(file, formats=("PNG",)) as image:
+            return np.asarray(image, np.uint8)
+    except (OSError, SyntaxError, ValueError):
+        raise _undecodable(file, file.stat().st_size) from None
+
+
+def _undecodable(file: Path, size: int) -> SceneError:
+    return SceneError(f"{file} ({size} bytes) cannot be decoded as an image: it is damaged or truncated, copy it again")
 
 
 def read_rgb(file: Path, size: tuple[int, int]) -> NDArray[np.uint8]:

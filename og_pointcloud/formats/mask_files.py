@@ -1,10 +1,10 @@
 """The project's own mask format: ``masks/<view name>.png`` and ``mask_features.npz``.
 
-A mask image is grey, 8 or 16 bit, 0 outside every mask, else an id 1..M that means something in this image only. The
-features file holds ``<view name>`` -> (M, D), any float type, where row i belongs to id i + 1, and ``feature_space``,
-the name of the encoder. A view without masks has an all-zero image and an empty (0, D) array. Masks that a tracker
-followed have ``<view name>.tracks`` -> (M,) whole numbers there: the same in all views for what it took for one thing,
--1 unknown.
+A mask image is grey, 8 or 16 bit, or has a palette, whose colours say nothing; it holds 0 outside every mask, else an
+id 1..M that means something in this image only. The features file holds ``<view name>`` -> (M, D), any float type, where
+row i belongs to id i + 1, and ``feature_space``, the name of the encoder. A view without masks has an all-zero image
+and an empty (0, D) array. Masks that a tracker followed have ``<view name>.tracks`` -> (M,) whole numbers there: the
+same in all views for what it took for one thing, -1 unknown.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from numpy.typing import NDArray
 
 from og_pointcloud.cloud import UNKNOWN_SPACE
 from og_pointcloud.errors import SceneError
-from og_pointcloud.formats.images import decoded, png_header, require_cv2
+from og_pointcloud.formats.images import PngHeader, decoded, palette_indices, png_header, require_cv2
 from og_pointcloud.formats.npy import arrays_from_npz
 
 MASKS_FOLDER = "masks"
 FEATURES_NAME = "mask_features.npz"
 TRACKS = ".tracks"
 MAX_FEATURE_BYTES = 1 << 32
-GREY = 0
+GREY, PALETTE = 0, 3
 PNG_COLOR_TYPES = {0: "grey", 2: "RGB (3 channels)", 3: "palette", 4: "grey with alpha", 6: "RGBA (4 channels)"}
 
 
@@ -54,9 +54,10 @@ def read_masks(capture: Path, names: Sequence[str]) -> tuple[list[MaskLayer], st
     files = [capture / MASKS_FOLDER / f"{name}.png" for name in names]
     require_all(files, "write an all-zero mask and an empty (0, D) feature array for an image without masks")
     features, tracks, feature_space = _read_features(capture / FEATURES_NAME, names)
+    headers = map(_id_header, files)
     layers = [
-        MaskLayer(_mask_size(file), features[name], partial(read_ids, file), tracks.get(name))
-        for name, file in zip(names, files, strict=True)
+        MaskLayer((header.width, header.height), features[name], partial(read_ids, file), tracks.get(name))
+        for name, file, header in zip(names, files, headers, strict=True)
     ]
     return layers, feature_space
 
@@ -73,20 +74,22 @@ def require_all(files: Sequence[Path], cure: str) -> None:
         )
 
 
-def _mask_size(file: Path) -> tuple[int, int]:
+def _id_header(file: Path) -> PngHeader:
     header = png_header(file)
-    if header is None or header.color_type != GREY or header.bit_depth not in (8, 16):
+    is_grey = header is not None and header.color_type == GREY and header.bit_depth in (8, 16)
+    if header is None or not (is_grey or header.color_type == PALETTE):
         found = f"a {PNG_COLOR_TYPES.get(header.color_type)} PNG of {header.bit_depth} bit" if header else "not a PNG"
         raise SceneError(
-            f"{file} is {found}; expected a grey PNG of 8 or 16 bit, whose values are mask ids (0 none, 1..M): write "
-            "ids instead of colours"
+            f"{file} is {found}; expected a grey PNG of 8 or 16 bit, or one with a palette, whose values are mask ids "
+            "(0 none, 1..M): write ids instead of colours"
         )
-    return header.width, header.height
+    return header
 
 
 def read_ids(file: Path) -> NDArray[np.int32]:
     """A mask image, (H, W) int32: -1 outside every mask, else the row of the features (the stored id less 1)."""
-    ids = decoded(file, require_cv2().IMREAD_UNCHANGED)
+    has_palette = _id_header(file).color_type == PALETTE
+    ids = palette_indices(file) if has_palette else decoded(file, require_cv2().IMREAD_UNCHANGED)
     if ids.ndim != 2:
         raise SceneError(f"{file} has shape {ids.shape}; expected one channel of mask ids")
     return ids.astype(np.int32) - 1

@@ -1,28 +1,18 @@
-"""CLIP and SigLIP through transformers, without its image processors and without torchvision.
-
-A folder is trusted with nothing but numbers: its config.json must name one of two model types, whose classes are
-transformers' own; weights are read from .safetensors only; nothing is fetched, and no code of the folder is run.
-"""
+"""CLIP and SigLIP through transformers, without its image processors and without torchvision."""
 
 from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud.errors import MissingExtraError, OgPointcloudError, first_line
-from og_pointcloud.formats.poses import read_json
+from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.masking.crops import WITH_CONTEXT, Crop, Preprocessing, Resample
+from og_pointcloud.masking.pretrained import Attention, best_device, load_pretrained, stated, torch
 from og_pointcloud.models import MODEL_NAME
-
-try:
-    import torch
-    import transformers
-except ImportError as error:
-    raise MissingExtraError("torch and transformers", "masks") from error
 
 CLASSES = {"clip": "CLIPModel", "siglip": "SiglipModel"}
 """config.json's model_type -> transformers' class of it."""
@@ -32,45 +22,9 @@ SIGLIP_COLOURS = (0.5, 0.5, 0.5), (0.5, 0.5, 0.5)
 PILLOW_RESAMPLE: dict[Any, Resample] = {2: "bilinear", 3: "bicubic"}
 
 
-def load_model(folder: str | os.PathLike[str], attention: Literal["eager", "sdpa"] = "sdpa") -> Any:
-    """A transformers folder of CLIP or SigLIP (SigLIP 2 of fixed size is one) -> the model in float32, for evaluation.
-
-    attention: how transformers computes it; "eager" is plain matrix products, which exports well.
-    OgPointcloudError where the folder is none of these, or its weights do not fit its configuration.
-    """
-    folder = Path(folder)
-    if not (folder / "config.json").is_file():
-        raise OgPointcloudError(
-            f"{folder} is no transformers folder: it has no config.json; expected CLIP's or SigLIP's (of an OpenCLIP "
-            "model, fetch the repository that holds it for transformers)"
-        )
-    config = read_json(folder / "config.json")
-    kind = config.get("model_type") if isinstance(config, dict) else None
-    if kind not in CLASSES or "quantization_config" in config:
-        raise OgPointcloudError(
-            f"{folder}: model_type is {kind!r:.40}{', quantised' if kind in CLASSES else ''}; expected "
-            f"{', '.join(CLASSES)}, in float32 or float16"
-        )
-    try:
-        model, report = getattr(transformers, CLASSES[kind]).from_pretrained(
-            folder,
-            local_files_only=True,
-            use_safetensors=True,
-            attn_implementation=attention,
-            dtype=torch.float32,
-            output_loading_info=True,
-        )
-    except Exception as error:  # of many types, some of safetensors' own
-        raise OgPointcloudError(
-            f"{folder} cannot be read ({type(error).__name__}: {first_line(error)}); expected a whole "
-            f"{CLASSES[kind]} with weights in .safetensors: fetch it again, or save it again with save_pretrained"
-        ) from None
-    if missing := sorted(report["missing_keys"]):
-        raise OgPointcloudError(
-            f"{folder} lacks {len(missing)} of the weights of a {CLASSES[kind]}, '{missing[0]}' first: name a folder "
-            "with the whole model"
-        )
-    return model.eval()
+def load_model(folder: str | os.PathLike[str], attention: Attention = "sdpa") -> Any:
+    """A CLIP or SigLIP (SigLIP 2 of fixed size is one) of `pretrained.load_pretrained`."""
+    return load_pretrained(Path(folder), CLASSES, attention)[0]
 
 
 class ImageTower(torch.nn.Module):
@@ -125,13 +79,13 @@ class TransformersModel:
         feature_space: str | None = None,
         *,
         crops: tuple[Crop, ...] = WITH_CONTEXT,
-        attention: Literal["eager", "sdpa"] = "sdpa",
+        attention: Attention = "sdpa",
     ) -> None:
         """feature_space: None for what the folder's configuration says. Errors: as ``load_model``."""
         self.feature_space = feature_space or published_name(folder)
         model = load_model(folder, attention)
         self.preprocessing, self.crops = preprocessing_of(folder, model.config), crops
-        self.device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+        self.device = best_device()
         self.tower = ImageTower(model).eval().to(self.device)
         self.patch_tower = PatchTower(model).eval().to(self.device)
         self.patch = self.patch_tower.patch
@@ -151,25 +105,22 @@ class TransformersModel:
 
 def preprocessing_of(folder: str | os.PathLike[str], config: Any) -> Preprocessing:
     """What preprocessor_config.json says, or what the family's published models do. config: the model's."""
-    vision, is_clip = config.vision_config, config.model_type == "clip"
-    file = Path(folder) / "preprocessor_config.json"
-    stated = read_json(file) if file.is_file() else {}
-    mean, std = CLIP_COLOURS if is_clip else SIGLIP_COLOURS
-    resample = PILLOW_RESAMPLE.get(stated.get("resample", 3))
-    if resample is None or stated.get("rescale_factor", 1 / 255) != 1 / 255:
+    size, is_clip = config.vision_config.image_size, config.model_type == "clip"
+    said = stated(Path(folder), "preprocessor_config.json")
+    number, factor = said.get("resample", 3), said.get("rescale_factor", 1 / 255)
+    if number not in tuple(PILLOW_RESAMPLE) or factor != 1 / 255:
         raise OgPointcloudError(
-            f"{file}: resample {stated.get('resample')!r:.20} or rescale_factor {stated.get('rescale_factor')!r:.20}; "
-            "expected 2 (bilinear) or 3 (bicubic), and 1/255"
+            f"{folder}, preprocessor_config.json: resample {number!r:.20} or rescale_factor {factor!r:.20}; expected "
+            "2 (bilinear) or 3 (bicubic), and 1/255"
         )
-    mean, std = tuple(stated.get("image_mean", mean)), tuple(stated.get("image_std", std))
-    return Preprocessing(vision.image_size, cast("Any", mean), cast("Any", std), resample, keeps_shape=is_clip)
+    mean, std = CLIP_COLOURS if is_clip else SIGLIP_COLOURS
+    mean, std = tuple(said.get("image_mean", mean)), tuple(said.get("image_std", std))
+    return Preprocessing(size, cast("Any", mean), cast("Any", std), PILLOW_RESAMPLE[number], keeps_shape=is_clip)
 
 
 def published_name(folder: str | os.PathLike[str]) -> str:
     """OWNER/MODEL as a model's configuration has it; OgPointcloudError where it says none."""
-    file = Path(folder) / "config.json"
-    config = read_json(file) if file.is_file() else {}
-    name = config.get("_name_or_path") if isinstance(config, dict) else None
+    name = stated(Path(folder), "config.json").get("_name_or_path")
     if not isinstance(name, str) or not MODEL_NAME.fullmatch(name):
         raise OgPointcloudError(
             f"{folder} does not say which model it is; pass --feature-space as your scenes name it (og-pointcloud info "

@@ -14,7 +14,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud.errors import MissingExtraError, OgPointcloudError, SceneError
+from og_pointcloud.errors import OgPointcloudError, SceneError
+from og_pointcloud.formats.images import require_pillow
 
 Resample = Literal["bilinear", "bicubic"]
 Colour = tuple[float, float, float]
@@ -110,7 +111,7 @@ def mask_crops(
             f"masks are {masks.dtype} {masks.shape}; expected bool (masks, {image.shape[0]}, {image.shape[1]}), as "
             "large as the image"
         )
-    pillow = _require_pillow()
+    pillow = require_pillow()
     faded = np.rint(crop.outside * image + (1 - crop.outside) * np.asarray(fill, np.float32)).astype(
         np.uint8
     )  # once, not for every mask
@@ -145,11 +146,3 @@ def _square(
     square = np.full((side, side, 3), fill, np.uint8)
     square[rows.start - top : rows.stop - top, columns.start - left : columns.stop - left] = shown
     return square
-
-
-def _require_pillow() -> Any:
-    try:
-        from PIL import Image
-    except ImportError as error:
-        raise MissingExtraError("Pillow", "fit") from error
-    return Image

@@ -12,8 +12,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud.errors import MissingExtraError, SceneError
-from og_pointcloud.formats.images import require_cv2
+from og_pointcloud.errors import SceneError
+from og_pointcloud.formats.images import require_cv2, require_pillow
 from og_pointcloud.masking.contracts import MaskEncoder
 from og_pointcloud.masking.crops import Preprocessing
 
@@ -60,15 +60,11 @@ class DenseEncoder(MaskEncoder):
 
     def _pixels(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
         """(1, 3, h, w) of whole patches, the image's shape but for rounding."""
-        try:
-            from PIL import Image
-        except ImportError as error:
-            raise MissingExtraError("Pillow", "fit") from error
-        before = self.model.preprocessing
+        before, pillow = self.model.preprocessing, require_pillow()
         scale = SHORTER_SIDE * before.size / min(image.shape[:2])
         height, width = (max(1, round(side * scale / self.model.patch)) * self.model.patch for side in image.shape[:2])
-        filter_ = Image.Resampling[before.resample.upper()]
-        return before.pixels(np.asarray(Image.fromarray(image).resize((width, height), filter_))[None])
+        resized = pillow.fromarray(image).resize((width, height), pillow.Resampling[before.resample.upper()])
+        return before.pixels(np.asarray(resized)[None])
 
 
 def _shares(mask: NDArray[np.bool_], width: int, height: int) -> NDArray[np.float32]:

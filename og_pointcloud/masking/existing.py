@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.errors import SceneError
-from og_pointcloud.formats.images import MAX_PIXELS, png_header, require_cv2, without_suffix
+from og_pointcloud.formats.images import MAX_PIXELS, require_cv2, without_suffix
 from og_pointcloud.formats.mask_files import read_ids
 from og_pointcloud.formats.poses import MAX_JSON_BYTES, read_json
 from og_pointcloud.masking.contracts import MaskProposer, Proposals
@@ -97,7 +97,7 @@ def own_proposer(place: str) -> MaskProposer:
 
 @dataclass(frozen=True)
 class ExistingMasks:
-    """A folder of masks by image name: ``<name>.png`` of ids (8 or 16 bit grey, 0 none), ``<name>.json`` (a list of RLE
+    """A folder of masks by image name: ``<name>.png`` of ids (as `read_ids`, 0 none), ``<name>.json`` (a list of RLE
     annotations, as segment-anything's script writes), or one COCO ``.json`` for all images.
 
     tracks: whether an id of a PNG means the same thing in all of them.
@@ -111,7 +111,7 @@ class ExistingMasks:
         """The masks of one image, resized to ``shape`` (H, W). SceneError where it has none."""
         png, single = self.folder / f"{image_name}.png", self.folder / f"{image_name}.json"
         if png.is_file():
-            return _resized(from_ids(_read_ids(png), none=-1, tracks=self.tracks), shape)
+            return _resized(from_ids(read_ids(png), none=-1, tracks=self.tracks), shape)
         if single.is_file():
             return _resized(_from_annotations(_annotations(read_json(single, MAX_JSON_BYTES)), str(single)), shape)
         stem = image_name.rsplit("/", 1)[-1]
@@ -236,13 +236,6 @@ def _polygons(polygons: list[Any], size: Any, source: str) -> NDArray[np.bool_]:
             raise SceneError(f"{source}: a polygon is {ring!r:.60}; expected x, y, x, y ... of three corners or more")
         require_cv2().fillPoly(drawn, [np.rint(corners).astype(np.int32)], 1)
     return drawn.astype(np.bool_)
-
-
-def _read_ids(file: Path) -> NDArray[np.int32]:
-    header = png_header(file)
-    if header is None or header.color_type not in (0, 3) or header.bit_depth not in (8, 16):
-        raise SceneError(f"{file} is no grey PNG of 8 or 16 bit; expected mask ids (0 none, 1..M)")
-    return read_ids(file)
 
 
 def _resized(proposals: Proposals | None, shape: tuple[int, int]) -> Proposals:

@@ -7,7 +7,6 @@ its tracker half; its words are in ``sam3``.
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -17,16 +16,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud.errors import MissingExtraError, SceneError, first_line
+from og_pointcloud.errors import SceneError
 from og_pointcloud.masking.automatic import AutomaticMasks
-
-try:
-    import torch
-    import transformers
-except ImportError as error:
-    raise MissingExtraError("torch and transformers", "masks") from error
-
-Tensor = torch.Tensor
+from og_pointcloud.masking.pretrained import best_device, load_pretrained, stated, torch
+from og_pointcloud.models import fetched_model
 
 CLASSES = {
     "sam": "SamModel",
@@ -62,11 +55,11 @@ def open_sam(name: str | os.PathLike[str]) -> AutomaticMasks:
 
 @dataclass(frozen=True)
 class LoadedModel:
-    """kind: its model_type. where: its folder, or OWNER/MODEL. device: a GPU where torch has one."""
+    """kind: its model_type. device: a GPU where torch has one."""
 
     model: Any
     kind: str
-    where: str
+    folder: Path
     device: torch.device
     preparation: Preparation
 
@@ -76,23 +69,16 @@ def load_sam(name: str | os.PathLike[str], classes: Mapping[str, str]) -> Loaded
 
     SceneError where there is none of these types, or it cannot be read.
     """
-    where = str(Path(name).expanduser()) if Path(name).expanduser().is_dir() else str(name)
-    try:
-        kind = _known_type(name, _read_json(where, "config.json"), classes)
-        # A known type is a class of transformers: no code of the folder's (auto_map) is looked at.
-        # Weights are read from .safetensors alone: other files are pickles.
-        model: Any = getattr(transformers, classes[kind]).from_pretrained(
-            where, local_files_only=True, trust_remote_code=False, attn_implementation="sdpa", use_safetensors=True
-        )
-    except SceneError:
-        raise
-    except Exception as error:  # of many types, some of safetensors' own
+    folder = Path(name).expanduser()
+    found = folder if folder.is_dir() else fetched_model(str(name))
+    if found is None:
         raise SceneError(
-            f"no SAM model '{name}' ({first_line(error):.120}); expected a transformers folder with "
-            "config.json and weights, or a fetched model: hf download OWNER/MODEL"
-        ) from None
-    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    return LoadedModel(model.eval().to(device), kind, where, device, _preparation(where, kind, model.config))
+            f"no SAM model '{name}'; expected a transformers folder with config.json and weights, or a fetched model: "
+            "hf download OWNER/MODEL"
+        )
+    model, kind = load_pretrained(found, classes)
+    device = best_device()
+    return LoadedModel(model.to(device), kind, found, device, _preparation(found, kind, model.config))
 
 
 class SamPredictor:
@@ -138,7 +124,7 @@ def scaled_size(size: tuple[int, int], preparation: Preparation) -> tuple[int, i
     return int(size[0] * scale + 0.5), int(size[1] * scale + 0.5)
 
 
-def prepared(image: NDArray[np.uint8], preparation: Preparation) -> Tensor:
+def prepared(image: NDArray[np.uint8], preparation: Preparation) -> torch.Tensor:
     """(H, W, 3) uint8 RGB -> (1, 3, side, side) float32 as transformers' own processors make it: bilinear with
     antialiasing, rounded to 8 bit, scaled to [0, 1], normalised, then padded with 0 to the right and below."""
     pixels = torch.from_numpy(np.ascontiguousarray(image)).permute(2, 0, 1)[None].float()
@@ -150,52 +136,16 @@ def prepared(image: NDArray[np.uint8], preparation: Preparation) -> Tensor:
     return torch.nn.functional.pad(pixels, (0, preparation.side - size[1], 0, preparation.side - size[0]))
 
 
-def _known_type(name: str | os.PathLike[str], config: dict[str, Any] | None, classes: Mapping[str, str]) -> str:
-    """The model_type of a config.json, if it is one of ``classes``."""
-    if config is None:
-        raise OSError("there is no config.json")
-    kind = str(config.get("model_type"))
-    if "quantization_config" in config:
-        raise SceneError(f"{name} is quantised; expected a model in float32 or float16, whose weights alone are read")
-    if kind not in classes or not hasattr(transformers, classes[kind]):
-        raise SceneError(
-            f"{name} is a model of type '{kind:.40}'; expected one of {', '.join(classes)} that the installed "
-            f"transformers {transformers.__version__} has"
-        )
-    return kind
-
-
-def _preparation(where: str, kind: str, config: Any) -> Preparation:
+def _preparation(folder: Path, kind: str, config: Any) -> Preparation:
     """Side from the vision configuration, colours from the preprocessor's file where the model has one."""
     side = config.vision_config.image_size if kind in PADDED else _square_side(config)
+    said = stated(folder, "preprocessor_config.json", "processor_config.json")
+    said = said.get("image_processor", said)
     mean, std = HALVES if kind.startswith("sam3") else IMAGENET
-    stated = _read_json(where, "preprocessor_config.json")
-    stated = stated or _read_json(where, "processor_config.json") or {}
-    stated = stated.get("image_processor", stated)
-    mean, std = stated.get("image_mean", mean), stated.get("image_std", std)
+    mean, std = said.get("image_mean", mean), said.get("image_std", std)
     return Preparation(int(side), kind in PADDED, tuple(map(float, mean)), tuple(map(float, std)))
 
 
 def _square_side(config: Any) -> int:
     side = getattr(config, "prompt_encoder_config", config).image_size
     return int(side[0] if isinstance(side, (list, tuple)) else side)
-
-
-def file_of(where: str, name: str) -> Path | None:
-    """A file of a model's folder, or of a fetched model; None where it has none."""
-    from transformers.utils.hub import cached_file
-
-    file = cached_file(
-        where, name, local_files_only=True, _raise_exceptions_for_missing_entries=False,
-        _raise_exceptions_for_connection_errors=False,
-    )  # fmt: skip
-    return None if file is None else Path(file)
-
-
-def _read_json(where: str, name: str) -> dict[str, Any] | None:
-    """A JSON file of the model, None where it has none. ValueError where it is not a JSON object."""
-    file = file_of(where, name)
-    content = json.loads(file.read_text(encoding="utf-8")) if file is not None else None
-    if content is not None and not isinstance(content, dict):
-        raise ValueError(f"{name} holds no JSON object")
-    return content

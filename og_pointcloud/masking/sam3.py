@@ -15,16 +15,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud.errors import MissingExtraError, SceneError
+from og_pointcloud.errors import SceneError
 from og_pointcloud.masking.contracts import Proposals
-from og_pointcloud.masking.sam import LoadedModel, file_of, load_sam, prepared
+from og_pointcloud.masking.pretrained import torch, transformers
+from og_pointcloud.masking.sam import LoadedModel, load_sam, prepared
 from og_pointcloud.text.tokenizer import open_tokenizer
-
-try:
-    import torch
-    import transformers
-except ImportError as error:
-    raise MissingExtraError("torch and transformers", "masks") from error
 
 LEAST_SCORE = 0.5
 """Below, a detection is none, as transformers' examples have it. Of a tracker its configuration says it."""
@@ -97,9 +92,9 @@ class FollowedWords:
 
 def _tokens(loaded: LoadedModel, words: Sequence[str]) -> list[torch.Tensor]:
     """(1, T) ids of each word."""
-    file = file_of(loaded.where, "tokenizer.json")
-    if file is None:
-        raise SceneError(f"{loaded.where} has no tokenizer.json, which words need: fetch the whole model again")
+    file = loaded.folder / "tokenizer.json"
+    if not file.is_file():
+        raise SceneError(f"{loaded.folder} has no tokenizer.json, which words need: fetch the whole model again")
     config = getattr(loaded.model.config, "detector_config", loaded.model.config).text_config
     try:
         tokenizer = open_tokenizer(file.read_bytes(), config.max_position_embeddings)
