@@ -1,0 +1,80 @@
+"""A folder of transformers -> its model, trusted with nothing but numbers.
+
+Its config.json must name a type that is asked for, whose class is transformers' own: no code of the folder's (auto_map)
+is looked at. Weights are read from .safetensors alone, as other files are pickles; nothing is fetched.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+from og_pointcloud.errors import MissingExtraError, SceneError, first_line
+from og_pointcloud.formats.poses import read_json
+
+try:
+    import torch
+    import transformers
+except ImportError as error:
+    raise MissingExtraError("torch and transformers", "masks") from error
+
+Attention = Literal["eager", "sdpa"]
+
+
+def load_pretrained(folder: Path, classes: Mapping[str, str], attention: Attention = "sdpa") -> tuple[Any, str]:
+    """The model in float32, for evaluation, and its model_type.
+
+    classes: model_type -> transformers' class to take. attention: how transformers computes it; "eager" is plain matrix
+    products, which exports well.
+    SceneError where the folder is of none of these types, or its weights are not whole.
+    """
+    kind = _model_type(folder, classes)
+    try:
+        model, report = getattr(transformers, classes[kind]).from_pretrained(
+            folder, local_files_only=True, trust_remote_code=False, use_safetensors=True,
+            attn_implementation=attention, dtype=torch.float32, output_loading_info=True,
+        )  # fmt: skip
+    except Exception as error:  # of many types, some of safetensors' own
+        raise SceneError(
+            f"{folder} cannot be read ({type(error).__name__}: {first_line(error)}); expected a whole {classes[kind]} "
+            "with weights in .safetensors: fetch it again, or save it again with save_pretrained"
+        ) from None
+    if missing := sorted(report["missing_keys"]):
+        raise SceneError(
+            f"{folder} lacks {len(missing)} of the weights of a {classes[kind]}, '{missing[0]}' first: name a folder "
+            "with the whole model"
+        )
+    return model.eval(), kind
+
+
+def best_device() -> torch.device:
+    """A GPU where torch has one."""
+    return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+
+
+def stated(folder: Path, *names: str) -> dict[str, Any]:
+    """The first of these JSON files that a folder has, empty where it has none. SceneError where it holds no object."""
+    file = next((folder / name for name in names if (folder / name).is_file()), None)
+    content = {} if file is None else read_json(file)
+    if not isinstance(content, dict):
+        raise SceneError(f"{file} holds no JSON object; expected one: fetch the model again")
+    return content
+
+
+def _model_type(folder: Path, classes: Mapping[str, str]) -> str:
+    if not (folder / "config.json").is_file():
+        raise SceneError(
+            f"{folder} is no transformers folder: it has no config.json; expected a model's (of an OpenCLIP model, "
+            "fetch the repository that holds it for transformers)"
+        )
+    config = stated(folder, "config.json")
+    kind = str(config.get("model_type"))
+    if kind not in classes or not hasattr(transformers, classes[kind]):
+        raise SceneError(
+            f"{folder}: model_type is {kind!r:.40}; expected {', '.join(classes)}, as far as the installed "
+            f"transformers {transformers.__version__} has them"
+        )
+    if "quantization_config" in config:
+        raise SceneError(f"{folder} is quantised; expected a model in float32 or float16, whose weights alone are read")
+    return kind
