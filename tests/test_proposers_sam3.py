@@ -19,6 +19,8 @@ transformers = pytest.importorskip("transformers")
 if not hasattr(transformers, "Sam3VideoModel"):
     pytest.skip("this transformers has no SAM 3", allow_module_level=True)
 
+from safetensors.torch import load_file  # noqa: E402
+
 from og_pointcloud.masking import sam3  # noqa: E402
 from og_pointcloud.masking.sam import SamPredictor, prepared  # noqa: E402
 
@@ -167,6 +169,10 @@ def test_nothing_is_fetched_while_following(folder, monkeypatch):
 
 def test_the_same_folder_answers_points(folder):
     predictor = SamPredictor(folder)
+    weights, published = predictor.model.state_dict(), load_file(folder / "model.safetensors")
+    answering = [name for name in weights if name.startswith("mask_decoder.")]
+    assert len(answering) > 50
+    assert all(torch.equal(weights[name], published[f"tracker_model.{name}"]) for name in answering)
     predictor.set_image(IMAGES[0])
     logits, iou = predictor.at_points(np.array([[10, 20]], np.float32))
     assert logits.shape[:2] == iou.shape == (1, 3)
@@ -174,7 +180,7 @@ def test_the_same_folder_answers_points(folder):
 
 @pytest.mark.parametrize(("change", "says"), [
     ("tokenizer", "has no tokenizer.json"), ("other tokenizer", "gives ids up to"), ("words", "words with SAM 3"),
-    ("other proposer", "words are asked of proposer 'opencv'"), ("kind", "expected one of sam3"),
+    ("other proposer", "words are asked of proposer 'opencv'"), ("kind", "model_type is 'bert'; expected sam3"),
 ])  # fmt: skip
 def test_what_is_missing_is_named(folder, tmp_path, change, says):
     model = tmp_path / "model"

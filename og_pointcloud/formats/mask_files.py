@@ -1,10 +1,10 @@
 """The project's own mask format: ``masks/<view name>.png`` and ``mask_features.npz``.
 
 A mask image is grey, 8 or 16 bit, or has a palette, whose colours say nothing; it holds 0 outside every mask, else an
-id 1..M that means something in this image only. The features file holds ``<view name>`` -> (M, D), any float type, where
-row i belongs to id i + 1, and ``feature_space``, the name of the encoder. A view without masks has an all-zero image
-and an empty (0, D) array. Masks that a tracker followed have ``<view name>.tracks`` -> (M,) whole numbers there: the
-same in all views for what it took for one thing, -1 unknown.
+id 1..M that means something in this image only. The features file holds ``<view name>`` -> (M, D), any float type,
+where row i belongs to id i + 1, and ``feature_space``, the name of the encoder. A view without masks has an all-zero
+image and an empty (0, D) array. Masks that a tracker followed have ``<view name>.tracks`` -> (M,) whole numbers there:
+the same in all views for what it took for one thing, -1 unknown.
 """
 
 from __future__ import annotations
