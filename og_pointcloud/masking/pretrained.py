@@ -20,9 +20,6 @@ except ImportError as error:
     raise MissingExtraError("torch and transformers", "masks") from error
 
 Attention = Literal["eager", "sdpa"]
-PREFIXES = {r"^tracker_model\.": ""}
-"""Of weights' names: SAM 3's points are answered by a part of the published model, and transformers 5.23 does not find
-that part's weights by itself."""
 
 
 def load_pretrained(folder: Path, classes: Mapping[str, str], attention: Attention = "sdpa") -> tuple[Any, str]:
@@ -37,7 +34,6 @@ def load_pretrained(folder: Path, classes: Mapping[str, str], attention: Attenti
         model, report = getattr(transformers, classes[kind]).from_pretrained(
             folder, local_files_only=True, trust_remote_code=False, use_safetensors=True,
             attn_implementation=attention, dtype=torch.float32, output_loading_info=True,
-            key_mapping=PREFIXES if classes[kind].startswith("Sam3Tracker") else None,
         )  # fmt: skip
     except Exception as error:  # of many types, some of safetensors' own
         raise SceneError(
