@@ -114,25 +114,22 @@ class Journal:
 
     @contextmanager
     def bars(self) -> Iterator[Callable[[str, int, int, float], None] | None]:
-        """A function to call with a stage's name, the step just done, the number of steps and the loss: a bar each."""
+        """A function to call with a stage's name, the step just done, the number of steps and the loss: a bar of it."""
         if not self.progress:
             yield None
             return
         from tqdm import tqdm
 
-        bars: dict[str, Any] = {}
+        with tqdm(leave=False, dynamic_ncols=True, disable=None) as bar:
 
-        def report(name: str, step: int, steps: int, loss: float) -> None:
-            if name not in bars:
-                bars[name] = tqdm(total=steps, desc=f"{name:<16}", leave=False, dynamic_ncols=True, disable=None)
-            bars[name].set_postfix(loss=f"{loss:.3g}", refresh=False)
-            bars[name].update(step - bars[name].n)
+            def report(name: str, step: int, steps: int, loss: float) -> None:
+                if bar.desc != (stage := f"{name:<16}: "):
+                    bar.reset(steps)
+                    bar.set_description_str(stage, refresh=False)
+                bar.set_postfix(loss=f"{loss:.3g}", refresh=False)
+                bar.update(step - bar.n)
 
-        try:
             yield report
-        finally:
-            for bar in bars.values():
-                bar.close()
 
     def provenance(self, settings: FitSettings) -> dict[str, Any]:
         """All of it, JSON-able, with the settings it was done with."""

@@ -323,13 +323,10 @@ def _message(value: memoryview | int) -> memoryview:
     return value
 
 
-def _last(message: memoryview | int, number: int) -> memoryview | int:
-    return ([value for found, value in message_fields(message) if found == number] or [memoryview(b"")])[-1]
-
-
 def text_of(message: memoryview | int, number: int) -> str:
     """The last of a message's fields of this number as text, "" without one."""
-    return bytes(_message(_last(message, number))).decode("utf-8", "replace")
+    fields = [value for found, value in message_fields(message) if found == number]
+    return bytes(_message(fields[-1])).decode("utf-8", "replace") if fields else ""
 
 
 def integers_of(value: memoryview | int) -> list[int]:

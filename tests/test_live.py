@@ -83,6 +83,16 @@ def test_colors_are_those_of_labels_and_instances(scene, mode, lit):
         assert np.abs(shown[point].astype(int) - expected).max() <= 1
 
 
+@pytest.mark.parametrize("mode", ["labels", "instances", "certainty", "photo"])
+def test_the_legend_shows_colors_only_where_points_have_them(scene, mode):
+    live = LiveScene(scene, labels=["plum", "apple"])
+    live.mode = mode
+    shown = {name: tuple(color) for name, color, _ in live.legend()}
+    by_label = dict(zip(["plum", "apple"], map(tuple, label_colors(np.arange(2)).tolist()), strict=True))
+    grey = dict.fromkeys(["plum", "apple"], tuple(NO_LABEL))
+    assert {name: shown[name] for name in by_label} == (by_label if mode == "labels" else grey)
+
+
 def test_photographs_and_certainty_are_shown_as_they_are(scene):
     live = LiveScene(scene)
     assert live.modes == ("labels", "instances", "certainty", "photo")
@@ -128,6 +138,16 @@ def test_a_word_that_nobody_knows_leaves_everything_lit(scene):
     answer = live.ask("appel")
     assert live.lit is None
     assert "did you mean 'apple'" in answer.lines[0]
+
+
+def test_a_word_whose_encoder_lacks_a_package_names_the_extra(scene, monkeypatch):
+    def lacking(*_):
+        raise og.MissingExtraError("tokenizers", "words")
+
+    live = LiveScene(scene)
+    monkeypatch.setattr(og.LabelledScene, "words", lacking)
+    assert "og-pointcloud[words]" in live.ask("unheard of").lines[0]
+    assert live.lit is None
 
 
 @pytest.mark.parametrize("origin", [(0, 0, 0), (4e5, -2e6, 100)])

@@ -1,5 +1,6 @@
 """The live page: who can reach it, what is refused, and a browser that types and clicks."""
 
+import json
 import shutil
 import signal
 import subprocess
@@ -255,6 +256,16 @@ def test_two_visits_are_served_by_one_command(visits_of_a_place, tmp_path, viser
     for more, says in (([friday], "--before is for one scene"), (["--cloud", "c.ply"], "expected one")):
         assert main(["serve", friday, *more, "--before", monday]) != 0
         assert says in capsys.readouterr().err
+
+
+def test_the_page_of_changes_calls_nothing_unknown_that_is_as_it_was(visits_of_a_place, tmp_path):
+    before, after, changes = visits_of_a_place
+    write_changes_page(tmp_path / "changes.html", before, after, changes, np.array([0.0, 0, 1]))
+    text = (tmp_path / "changes.html").read_text().split('type="application/json">')[1].split("</script>")[0]
+    data = json.loads(text)
+    both, change = both_visits(before, after, changes)
+    still = np.isin(both.instance_ids, np.flatnonzero(change < 4), invert=True)
+    assert (data["unlabelled"], data["unknown"]) == ("as it was, or not seen again", still.sum())
 
 
 @pytest.mark.slow

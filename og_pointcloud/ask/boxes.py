@@ -260,7 +260,8 @@ def _turned_about(local: DoubleArray, axes: DoubleArray) -> DoubleArray:
 
 def _connected(voxel: NDArray[np.int64]) -> NDArray[np.int64]:
     """(n,) number of the connected part that each voxel (n, 3) belongs to; those that touch are one."""
-    keys, which = np.unique(_voxel_keys(voxel), return_inverse=True)
+    # One number a voxel, 21 bits a coordinate, which lie within +-WIDEST.
+    keys, which = np.unique((voxel + (1 << 20)) @ np.array([1 << 42, 1 << 21, 1]), return_inverse=True)
     part = np.arange(len(keys))
     pairs = [_neighbours(keys, step) for step in _HALF_OF_26]
     first, second = (np.concatenate(ends) for ends in zip(*pairs, strict=True))
@@ -273,11 +274,6 @@ def _connected(voxel: NDArray[np.int64]) -> NDArray[np.int64]:
         np.minimum.at(part, np.maximum(a, b)[apart], np.minimum(a, b)[apart])
         while (part != part[part]).any():
             part = part[part]
-
-
-def _voxel_keys(voxel: NDArray[np.int64]) -> NDArray[np.int64]:
-    """(n,) one number a voxel (n, 3), 21 bits a coordinate, which lie within +-WIDEST."""
-    return (voxel + (1 << 20)) @ np.array([1 << 42, 1 << 21, 1])
 
 
 def _neighbours(keys: NDArray[np.int64], step: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

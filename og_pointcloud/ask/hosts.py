@@ -33,7 +33,9 @@ def world_points(pcd: Any) -> NDArray[np.float64]:
     MissingExtraError where reading needs a library that is not installed.
     """
     if isinstance(pcd, (str, os.PathLike)):
-        return _of_file(Path(pcd))
+        from og_pointcloud.formats.points import read_points
+
+        return read_points(Path(pcd)).xyz_world
     kind = type(pcd).__name__
     if kind.endswith("PointCloud2"):  # rclpy's type, and rosbags' sensor_msgs__msg__PointCloud2
         return _checked(import_plugin("og_pointcloud_ros", "ros").from_pointcloud2(pcd), kind)
@@ -96,12 +98,6 @@ def _host(pcd: Any) -> str | None:
         if root in _READERS:
             return root
     return None
-
-
-def _of_file(path: Path) -> NDArray[np.float64]:
-    from og_pointcloud.formats.points import read_points
-
-    return read_points(path).xyz_world
 
 
 def _of_open3d(cloud: Any) -> Any:

@@ -10,7 +10,7 @@ import csv
 import io
 import json
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -146,9 +146,6 @@ class Instances(Sequence[Instance]):
 
     def __len__(self) -> int:
         return len(self._rows)
-
-    def __iter__(self) -> Iterator[Instance]:
-        return iter(self._rows)
 
     @overload
     def __getitem__(self, index: int) -> Instance: ...

@@ -7,7 +7,7 @@ other words, and with the scene's word bank where it has one: an instance is sel
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any, overload
 
@@ -69,9 +69,6 @@ class Selection(Sequence[Match]):
 
     def __len__(self) -> int:
         return len(self.matches)
-
-    def __iter__(self) -> Iterator[Match]:
-        return iter(self.matches)
 
     @overload
     def __getitem__(self, index: int) -> Match: ...

@@ -135,7 +135,13 @@ def run_scannet(arguments: argparse.Namespace) -> None:
         print("no --gaussians: transparent points are not ignored")
     report = {}
     for task, (mean, interval) in means.items():
-        scenes = {scene: scene_entry(said) for scene, (said, _) in scores[task].items()}
+        scenes = {
+            scene: {
+                "miou": said.miou, "macc": said.macc, "unknown": said.unknown_share, "points": said.points,
+                "class_iou": dict(zip(map(str, said.classes), said.class_iou, strict=True)),
+            }
+            for scene, (said, _) in scores[task].items()
+        }  # fmt: skip
         spans = [interval.low, interval.high] if interval else None
         report[str(task)] = {**mean, "interval": spans, "scenes": scenes}
     write_scores(arguments, report)
@@ -152,13 +158,6 @@ def task_means(scores: Sequence[tuple[Score, Score]]) -> tuple[dict[str, float |
         return dict.fromkeys(TASK_MEANS), None
     table = np.array([(said.miou, said.macc, forced.miou, said.unknown_share) for said, forced in present])
     return dict(zip(TASK_MEANS, table.mean(axis=0).tolist(), strict=True)), bootstrap(table[:, 0])
-
-
-def scene_entry(score: Score) -> dict[str, Any]:
-    """One scene as JSON."""
-    class_iou = dict(zip(map(str, score.classes), score.class_iou, strict=True))
-    figures = {"miou": score.miou, "macc": score.macc, "unknown": score.unknown_share, "points": score.points}
-    return {**figures, "class_iou": class_iou}
 
 
 def scannet_truths(folder: Path, scenes: list[str] | None) -> dict[str, Path]:

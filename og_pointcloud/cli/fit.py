@@ -13,7 +13,7 @@ from contextlib import nullcontext, suppress
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, get_args, get_type_hints
+from typing import TYPE_CHECKING, get_args, get_type_hints
 
 import og_pointcloud as og
 from og_pointcloud.cli import common
@@ -25,11 +25,11 @@ from og_pointcloud.settings import FitSettings, PaperSettings
 if TYPE_CHECKING:
     from concurrent.futures import Executor
 
-    from og_pointcloud.cloud import LabelledCloud
     from og_pointcloud.collection.fit_many import FitOptions
 
 MODES = get_args(get_type_hints(FitSettings)["mode"])
 MASK_LEVELS = ("default", "small", "medium", "large")
+RERUN = "og_pointcloud.show.rerun_file"
 
 
 def add(parser: Parser) -> None:
@@ -59,9 +59,11 @@ def run(arguments: argparse.Namespace) -> None:
         raise OgPointcloudError(f"{len(arguments.capture)} captures and one output; expected --out DIR for so many")
     if arguments.out is not None and alone:
         raise OgPointcloudError(f"--{alone[0]} is for a single file; expected -o S.ogpc with it, or leave it out")
+    from og_pointcloud.ask.hosts import import_plugin
+
     settings = fit_settings(arguments)
     if arguments.rerun:
-        rerun_file()  # before the work, if it is missing
+        import_plugin(RERUN, "rerun")  # before the work, if it is missing
     from og_pointcloud.collection.fit_many import FitOptions
     from og_pointcloud.fitting.tasks import dask_executor
 
@@ -71,6 +73,7 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def fit_one(arguments: argparse.Namespace, options: FitOptions, executor: Executor | None) -> None:
+    from og_pointcloud.ask.hosts import import_plugin
     from og_pointcloud.collection.fit_many import fit_capture
     from og_pointcloud.fitting.work_folder import kept_files
 
@@ -85,7 +88,8 @@ def fit_one(arguments: argparse.Namespace, options: FitOptions, executor: Execut
     cloud = common.write_fit(cloud, Journal(False), arguments.output)
     if arguments.rerun:
         with Journal(False, cloud.provenance["stages"]).stage("write rerun"):
-            write_views(cloud, capture, options, arguments.rerun)
+            scene = og.read_capture(capture, gaussians=options.gaussians, mask_level=options.mask_level)
+            import_plugin(RERUN, "rerun").write_rerun(arguments.rerun, scene, cloud, progress=True)
     if training := cloud.provenance["notes"].get("training"):
         with suppress(MissingExtraError):  # no picture without OpenCV
             from og_pointcloud.show.fit_pictures import training_picture
@@ -133,16 +137,3 @@ def fit_settings(arguments: argparse.Namespace) -> FitSettings:
             "expected --mode paper: leave the option out, or take that mode"
         )
     return replace(settings, paper=PaperSettings(schedule_share=arguments.schedule_share))
-
-
-def write_views(cloud: LabelledCloud, capture: Path, options: FitOptions, path: Path) -> None:
-    """The capture's views with the instances that they show, for Rerun."""
-    scene = og.read_capture(capture, gaussians=options.gaussians, mask_level=options.mask_level)
-    rerun_file().write_rerun(path, scene, cloud, progress=True)
-
-
-def rerun_file() -> Any:
-    """The module that writes for Rerun; MissingExtraError without it."""
-    from og_pointcloud.ask.hosts import import_plugin
-
-    return import_plugin("og_pointcloud.show.rerun_file", "rerun")

@@ -48,12 +48,9 @@ def print_info(scene: og.LabelledScene, path: Path) -> None:
     origin = ", ".join(f"{value:g}" for value in cloud.origin)
     print(f"spacing {cloud.spacing:.4g}, reach {cloud.reach:.4g}, origin ({origin}), in the capture's unit")
     print(f"{len(words)} words: {common.some_of(words)}")
-    print(f"{describe_bank(scene, path)}\n")
+    if cloud.word_bank is None:
+        print(f"no word bank: scores are cosines. {common.calibration_hint(path)}\n")
+    else:
+        print(f"word bank of {len(cloud.word_bank.vectors)}: scores are probabilities\n")
     print(f"{scene.instances}\n")
     common.print_provenance(cloud.provenance)
-
-
-def describe_bank(scene: og.LabelledScene, path: Path) -> str:
-    if scene.cloud.word_bank is None:
-        return f"no word bank: scores are cosines. {common.calibration_hint(path)}"
-    return f"word bank of {len(scene.cloud.word_bank.vectors)}: scores are probabilities"

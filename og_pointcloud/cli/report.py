@@ -24,7 +24,10 @@ def add(parser: Parser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> None:
-    check_options(arguments)
+    names = [folder.absolute().name for folder in arguments.captures]
+    if len(set(names)) < len(names):
+        twice = max(names, key=names.count)
+        raise OgPointcloudError(f"two captures are in folders named '{twice}'; expected different names")
     text, rows, picture = (arguments.output / f"report{ending}" for ending in (".md", ".csv", ".png"))
     for path in (text, rows, picture):
         check_output("-o", path, arguments.captures)
@@ -46,10 +49,3 @@ def run(arguments: argparse.Namespace) -> None:
     for what, why in found.failed.items():
         print(f"warning: could not be run: {what}: {why}", file=sys.stderr)
     print(f"wrote {text}, {rows} and {picture}")
-
-
-def check_options(arguments: argparse.Namespace) -> None:
-    names = [folder.absolute().name for folder in arguments.captures]
-    if len(set(names)) < len(names):
-        twice = max(names, key=names.count)
-        raise OgPointcloudError(f"two captures are in folders named '{twice}'; expected different names")

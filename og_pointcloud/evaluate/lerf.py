@@ -186,11 +186,13 @@ def score_pairs(
     """
     cameras = [in_local_frame(camera, scene.cloud.origin) for camera in labels.cameras]
     near = near_plane(scene.cloud.xyz, cameras)
-    chosen = {name: _selected(scene, name, text_features) for name in labels.objects}
+    found = {name: select(scene, name, against=[], text_features=text_features) for name in labels.objects}
+    best = {name: () if one.best is None else (one.best.instance,) for name, one in found.items()}
+    chosen = {"best": best, "calibrated": {name: one.instances for name, one in found.items()}}
     scores = []
     for frame, camera in zip(labels.frames, cameras, strict=True):
         shown = partial(_alpha, gaussians, scene.instance_ids, camera, near)
-        ious = {way: pair_ious(frame, {name: shown(chosen[name][way]) for name in frame.objects}) for way in WAYS}
+        ious = {way: pair_ious(frame, {name: shown(chosen[way][name]) for name in frame.objects}) for way in WAYS}
         scores += [PairScore(frame.name, name, {way: of[name] for way, of in ious.items()}) for name in frame.objects]
     return scores
 
@@ -214,13 +216,6 @@ def score_scenes(ious: Mapping[str, NDArray[np.floating]]) -> tuple[float, float
     if not scenes:
         raise SceneError("no labelled object in any frame; expected at least one")
     return float(np.mean([scene.mean() for scene in scenes])), float(np.mean([(s > IOU_FOUND).mean() for s in scenes]))
-
-
-def _selected(scene: LabelledScene, text: str, text_features: TextFeatures) -> dict[str, tuple[int, ...]]:
-    """Instances that a text selects, by way."""
-    found = select(scene, text, against=[], text_features=text_features)
-    best = () if found.best is None else (found.best.instance,)
-    return {"best": best, "calibrated": found.instances}
 
 
 def _alpha(

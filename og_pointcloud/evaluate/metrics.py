@@ -87,11 +87,8 @@ def adjusted_rand_index(first: NDArray[np.integer], second: NDArray[np.integer])
         return float("nan")
     cells = np.unique(rows.astype(np.int64) * (columns.max() + 1) + columns, return_counts=True)[1]
     together = _pairs(cells)
-    in_first, in_second, all_pairs = (
-        _pairs(np.bincount(rows)),
-        _pairs(np.bincount(columns)),
-        _pairs(np.array([len(rows)])),
-    )
+    in_first, in_second = _pairs(np.bincount(rows)), _pairs(np.bincount(columns))
+    all_pairs = _pairs(np.array([len(rows)]))
     expected = in_first * in_second / all_pairs if all_pairs else 0.0
     largest = (in_first + in_second) / 2
     return 1.0 if largest == expected else (together - expected) / (largest - expected)

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from og_pointcloud.ask.choosing import Reason
 from og_pointcloud.ask.labelled_scene import LabelledScene
 from og_pointcloud.ask.segmentation import Segmentation
 from og_pointcloud.cloud import LabelledCloud
@@ -60,10 +61,13 @@ def write_changes_page(
     scene = LabelledScene.from_cloud(both)
     labels = np.where(both.instance_ids >= 0, change[both.instance_ids], len(STATES)).astype(np.int32)
     labels[labels >= len(STATES)] = -1
-    reasons = np.where(labels < 0, 4, 0).astype(np.int8)
+    reasons = np.where(labels < 0, Reason.NONE_FITS, Reason.LABELLED).astype(np.int8)
     result = Segmentation(
         scene.xyz, labels, (labels >= 0).astype(np.float32), both.instance_ids, reasons, STATES, scene.path
     )
     view = choose_viewpoint(scene.xyz, labels >= 0, up)
-    look = Look(f"What changed: {changes}", boxes=True, cut=0.2, colors=tuple(CHANGES[name] for name in STATES))
+    colors = tuple(CHANGES[name] for name in STATES)
+    look = Look(
+        f"What changed: {changes}", boxes=True, cut=0.2, colors=colors, unlabelled="as it was, or not seen again"
+    )
     write_page(path, scene, result, view, look, both.rgb)

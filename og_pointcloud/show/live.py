@@ -17,7 +17,7 @@ from og_pointcloud.ask.labelled_scene import LabelledScene, instance_table
 from og_pointcloud.ask.picking import pick
 from og_pointcloud.ask.selecting import Match, select
 from og_pointcloud.cloud import LabelledCloud
-from og_pointcloud.errors import OgPointcloudError
+from og_pointcloud.errors import MissingExtraError, OgPointcloudError
 from og_pointcloud.formats.colors import LUMINANCE, NO_LABEL, certainty_colors, label_colors
 from og_pointcloud.mapping.map_record import MapRecord
 from og_pointcloud.scene import Points
@@ -115,12 +115,14 @@ class LiveScene:
         return instance_table(self.scene, text_features=self._text_features, words=WORDS)
 
     def legend(self) -> list[tuple[str, Sequence[int], int]]:
-        """Names with their colors and numbers of points, the most frequent first; last what has no label."""
+        """Names with their colors, where these are shown, and numbers of points, the most frequent first; last what has
+        no label."""
         if self.mode == "changes" and self._change_of is not None:
             points = np.bincount(self._change_of[self.ids], minlength=len(CHANGES)).tolist()
             return [(name, color, count) for (name, color), count in zip(CHANGES.items(), points, strict=True) if count]
         counts = np.bincount(self.label_of[self.ids] + 1, minlength=len(self.names) + 1).tolist()
-        colors = label_colors(np.arange(len(self.names))).tolist()
+        by_label = label_colors(np.arange(len(self.names))).tolist()
+        colors = by_label if self.mode == "labels" else [NO_LABEL] * len(self.names)
         rows = [row for row in zip(self.names, colors, counts[1:], strict=True) if row[2]]
         return [*sorted(rows, key=lambda row: -row[2]), *([("unknown", NO_LABEL, counts[0])] if counts[0] else [])]
 
@@ -179,7 +181,7 @@ class LiveScene:
             return Answer("", (*stored, "click a thing to learn what it is"))
         try:
             found = select(self.scene, word, text_features=self._text_features)
-        except OgPointcloudError as error:
+        except (OgPointcloudError, MissingExtraError) as error:
             return Answer(f"“{word}”", (str(error),))
         self.lit = set(found.instances)
         fits = f"fits {len(self.lit)} of {len(found)} instances" if self.lit else "fits no instance; closest:"

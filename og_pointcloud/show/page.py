@@ -40,7 +40,8 @@ class Look:
     """How a page begins; a click changes all but the title.
 
     mode: what colours show, "labels", "instances" or "photo". boxes: whether they are shown. cut: share of the height
-    hidden from the top, 0 to 1. colors: RGB of each label; left out, by its number.
+    hidden from the top, 0 to 1. colors: RGB of each label; left out, by its number. unlabelled: what points without a
+    label are called.
     """
 
     title: str
@@ -48,6 +49,7 @@ class Look:
     boxes: bool = False
     cut: float = 0.0
     colors: tuple[tuple[int, int, int], ...] = ()
+    unlabelled: str = "unknown"
 
 
 def write_page(

@@ -59,9 +59,9 @@ class RerunSink:
         cloud = scene.cloud
         table = np.full((len(appeared) + 3, 3), NO_LABEL, np.uint8)  # ids below 0 index it from its end
         table[: len(appeared)][appeared] = label_colors(np.flatnonzero(appeared))
-        rows = [row for row in scene.instances if appeared[row.id]]
-        boxes = [(row, row.axis_aligned_box) for row in rows]
-        known = [(row, box) for row, box in boxes if box is not None]
+        known = [
+            (row, box) for row in scene.instances if appeared[row.id] and (box := row.axis_aligned_box) is not None
+        ]
         self._recording.set_time(TIMELINE, sequence=step)
         points = rerun.Points3D(cloud.xyz, colors=table[cloud.instance_ids], radii=0.7 * cloud.spacing)
         self._recording.log("world/points", points)

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 import viser
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from viser.transforms import SO3
 
 from og_pointcloud.errors import OgPointcloudError
@@ -75,12 +75,10 @@ def _check_address(host: str, port: int) -> None:
         raise OgPointcloudError(f"the port is {port}; expected a number from 0, for any that is free, to {PORTS - 1}")
 
 
-def show(scene: Any, labels: Any = None, *, text_features: Any = None, up: ArrayLike = (0, 0, 1)) -> LivePage:
+def show(scene: Any, labels: Any = None, *, text_features: Any = None) -> LivePage:
     """A page of one scene, on this machine; a notebook shows it in its cell. Arguments as for ``segment``."""
     title = scene.path.stem if scene.path else "scene"
-    live = LiveScene(scene, labels=labels, text_features=text_features)
-    x, y, z = np.asarray(up, np.float64).tolist()
-    return serve({title: live}, ServeSettings(up=(x, y, z)))
+    return serve({title: LiveScene(scene, labels=labels, text_features=text_features)})
 
 
 class LivePage:

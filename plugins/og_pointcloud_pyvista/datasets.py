@@ -81,10 +81,11 @@ class OgDataSet:
         found = find_scene(self._mesh, scene)
         selection = og.select(found, text, against=against, text_features=text_features)
         mesh = self._with_instances(found)
-        points = _extracted(mesh, selection.instances)
-        if points.n_points == 0:
-            _warn(f"no point of this dataset is selected: {selection}")
-            return points
+        if not (mesh.n_points and np.isin(mesh.point_data[INSTANCE], selection.instances).any()):
+            warnings.warn(f"no point of this dataset is selected: {selection}", stacklevel=2)
+            return pv.UnstructuredGrid()
+        chosen = list(selection.instances)
+        points = mesh.extract_values(chosen, scalars=INSTANCE, preference="point", adjacent_cells=False)
         ids = np.asarray(points.point_data[INSTANCE])
         score = {match.instance: match.score for match in selection.fitting}
         points.point_data[SCORE] = np.array([score[instance] for instance in ids.tolist()], np.float32)
@@ -100,7 +101,7 @@ class OgDataSet:
         mesh = self._with_instances(found)
         segmented = LABEL in mesh.point_data
         wanted = mesh.point_data[LABEL] >= 0 if segmented else np.ones(mesh.n_points, bool)
-        ids = _present(mesh.point_data[INSTANCE][wanted])
+        ids = [instance for instance in np.unique(mesh.point_data[INSTANCE][wanted]).tolist() if instance >= 0]
         colors = _instance_colors(mesh, ids) if segmented and COLOR in mesh.point_data else None
         return box_lines([og.instance_table(found, up=up)[instance] for instance in ids], colors)
 
@@ -163,22 +164,8 @@ def _attach(mesh: Any, result: Segmentation) -> None:
         mesh.field_data.remove(SCENE_FIELD)
 
 
-def _extracted(mesh: Any, ids: Sequence[int]) -> pv.UnstructuredGrid:
-    if not ids or mesh.n_points == 0:
-        return pv.UnstructuredGrid()
-    return mesh.extract_values(list(ids), scalars=INSTANCE, preference="point", adjacent_cells=False)
-
-
-def _present(ids: ArrayLike) -> list[int]:
-    return [instance for instance in np.unique(np.asarray(ids)).tolist() if instance >= 0]
-
-
 def _instance_colors(mesh: pv.DataSet, ids: Sequence[int]) -> dict[int, Sequence[int]]:
     """Of each instance the colour of its first point here; all have the same label."""
     present, first = np.unique(np.asarray(mesh.point_data[INSTANCE]), return_index=True)
     rows = first[np.searchsorted(present, ids)]
     return dict(zip(ids, np.asarray(mesh.point_data[COLOR])[rows].tolist(), strict=True))
-
-
-def _warn(text: str) -> None:
-    warnings.warn(text, stacklevel=3)

@@ -54,16 +54,11 @@ class CloudLabeller:
         xyz = from_pointcloud2(message)
         result = self.segmenter(xyz, pose)
         head = message.header
-        points = to_pointcloud2(
-            result, head.frame_id, head.stamp, xyz=xyz, double=_has_doubles(message), messages=self._messages
-        )
+        kind = read_fields(message).dtype
+        double = any(kind[axis].itemsize > 4 for axis in "xyz" if axis in (kind.names or ()))
+        points = to_pointcloud2(result, head.frame_id, head.stamp, xyz=xyz, double=double, messages=self._messages)
         detections = to_detections(
             self._instances, result, self._frame, head.stamp, minimum_points=self._minimum_points,
             messages=self._messages,
         )  # fmt: skip
         return LabelledMessages(result, points, detections)
-
-
-def _has_doubles(message: Any) -> bool:
-    kind = read_fields(message).dtype
-    return any(kind[axis].itemsize > 4 for axis in "xyz" if axis in (kind.names or ()))
