@@ -10,7 +10,6 @@ import re
 import shlex
 import tempfile
 import warnings
-import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from importlib.util import find_spec
@@ -164,11 +163,8 @@ def require_room() -> None:
 
 def describe_fit(cloud: LabelledCloud, capture: Path, bundle: Path) -> dict[str, Any]:
     """What ``fit --json`` writes: counts, the file, and the provenance (stages, settings, what was left out)."""
-    from og_pointcloud.bundle.format import BANK
     from og_pointcloud.cloud import BACKGROUND, UNOBSERVED
 
-    with zipfile.ZipFile(bundle) as archive:  # writing may have found a word bank
-        calibrated = BANK in archive.namelist()
     ids = cloud.instance_ids
     return {
         "capture": str(capture),
@@ -181,7 +177,7 @@ def describe_fit(cloud: LabelledCloud, capture: Path, bundle: Path) -> dict[str,
         "points_unobserved": int((ids == UNOBSERVED).sum()),
         "feature_space": cloud.feature_space,
         "vocabulary": len(cloud.vocabulary.names) if cloud.vocabulary else 0,
-        "calibrated": calibrated,
+        "calibrated": cloud.word_bank is not None,
         "reliability": cloud.reliability,
         "seconds": round(sum(stage["seconds"] for stage in cloud.provenance["stages"]), 3),
         **cloud.provenance,
