@@ -2,8 +2,7 @@
 
 Nothing is fetched here, and onnxruntime is imported nowhere else.
 
-What a stranger's ONNX graph may do, found out from its bytes before any runtime is given them.
-
+What a stranger's graph may do is found out from its bytes, before any runtime is given them (`check_graph`).
 onnxruntime reads whatever file of this machine a graph names as the place of its constants, and fills constants of any
 size that a header claims. So only graphs pass whose constants lie in their own bytes, at the length that their shape
 asks for, and whose nodes are standard operators: no other domain, no functions, no graphs inside nodes.

@@ -19,7 +19,7 @@ from og_pointcloud.formats.colors import LUMINANCE
 from og_pointcloud.formats.gaussian_ply import BASE_COLOR, LOG_SCALE, ROTATION, SH_CONSTANT
 from og_pointcloud.formats.ply import join_columns
 from og_pointcloud.formats.poses import quaternion_of
-from og_pointcloud.formats.tables import colors, positions
+from og_pointcloud.formats.tables import colors, positions, stack_columns
 
 Rows: TypeAlias = NDArray[np.void]
 Columns: TypeAlias = dict[str, NDArray[Any]]
@@ -41,10 +41,10 @@ def recoloured(rows: Rows, chosen: NDArray[np.bool_], color: NDArray[np.float64]
     is_splat = set(BASE_COLOR) <= set(columns)
     if is_splat:
         # Colour is linear in the coefficients, so what a linear map does to colours it does to them.
-        base = 0.5 + SH_CONSTANT * _stack(columns, BASE_COLOR)[chosen]
+        base = 0.5 + SH_CONSTANT * stack_columns(rows, BASE_COLOR, np.float64)[chosen]
         mapping = _color_map(np.clip(base, 0, 1), color)
         _set(columns, BASE_COLOR, (base @ mapping.T - 0.5) / SH_CONSTANT, chosen)
-        _set(columns, _rest_names(columns), np.einsum("dc,nck->ndk", mapping, _rest(columns)[chosen]), chosen)
+        _set(columns, _rest_names(rows), np.einsum("dc,nck->ndk", mapping, _rest(rows)[chosen]), chosen)
     elif rgb is None:
         rgb = np.full((len(rows), 3), 128, np.uint8)
     if rgb is not None:
@@ -65,13 +65,13 @@ def placed(
     columns |= dict(zip("xyz", (positions(rows) @ (scale * rotation).T + translation).T, strict=True))
     for normal in NORMAL_COLUMNS:
         if set(normal) <= set(columns):
-            _set(columns, normal, _stack(columns, normal) @ rotation.T)
+            _set(columns, normal, stack_columns(rows, normal, np.float64) @ rotation.T)
     if set(LOG_SCALE) <= set(columns):
-        _set(columns, LOG_SCALE, _stack(columns, LOG_SCALE) + np.log(scale))
+        _set(columns, LOG_SCALE, stack_columns(rows, LOG_SCALE, np.float64) + np.log(scale))
     if set(ROTATION) <= set(columns):
-        _set(columns, ROTATION, _turned(quaternion_of(rotation), _stack(columns, ROTATION)))
-    rest = _rest(columns)
-    _set(columns, _rest_names(columns), rotated_harmonics(rest, rotation))
+        _set(columns, ROTATION, _turned(quaternion_of(rotation), stack_columns(rows, ROTATION, np.float64)))
+    rest = _rest(rows)
+    _set(columns, _rest_names(rows), rotated_harmonics(rest, rotation))
     too_high = rest.shape[2] >= (MAX_DEGREE + 1) ** 2
     return join_columns(columns), (f"harmonics above degree {MAX_DEGREE} are not turned",) if too_high else ()
 
@@ -81,10 +81,9 @@ def appended(base: Rows, added: Rows) -> tuple[Rows, tuple[str, ...]]:
     types become bytes."""
     first, second = _columns(base), _columns(added)
     zeros, notes = np.zeros(len(added)), []
-    if (ours := colors(base)) is not None and (theirs := colors(added)) is not None:
-        types = [[(name, columns[name].dtype) for name in COLORS if name in columns] for columns in (first, second)]
-        if types[0] != types[1]:
-            first, second = _in_bytes(first, ours), _in_bytes(second, theirs)
+    types = [[(name, columns[name].dtype) for name in COLORS if name in columns] for columns in (first, second)]
+    if types[0] != types[1] and (ours := colors(base)) is not None and (theirs := colors(added)) is not None:
+        first, second = _in_bytes(first, ours), _in_bytes(second, theirs)
     merged = {
         name: np.concatenate([column, second.get(name, zeros).astype(column.dtype)]) for name, column in first.items()
     }
@@ -132,12 +131,6 @@ def _columns(rows: Rows) -> Columns:
     return {name: rows[name] for name in rows.dtype.names or ()}
 
 
-def _stack(columns: Columns, names: Sequence[str]) -> NDArray[np.float64]:
-    """(n, names) float64."""
-    values = [columns[name].astype(np.float64) for name in names]
-    return np.stack(values, axis=1) if values else np.zeros((len(columns["x"]), 0))
-
-
 def _set(
     columns: Columns,
     names: Sequence[str],
@@ -150,17 +143,18 @@ def _set(
         columns[name][chosen] = column
 
 
-def _rest_names(columns: Columns) -> list[str]:
+def _rest_names(rows: Rows) -> list[str]:
     """f_rest_0, f_rest_1, ..: all harmonics of red, then of green, then of blue."""
-    names = list(itertools.takewhile(columns.__contains__, map("f_rest_{}".format, itertools.count())))
+    present = set(rows.dtype.names or ())
+    names = list(itertools.takewhile(present.__contains__, map("f_rest_{}".format, itertools.count())))
     if len(names) % 3:
         raise SceneError(f"{len(names)} properties f_rest; expected three times as many as a channel has")
     return names
 
 
-def _rest(columns: Columns) -> NDArray[np.float64]:
+def _rest(rows: Rows) -> NDArray[np.float64]:
     """(n, 3, k) harmonics above the constant one; k is 0 where there are none."""
-    values = _stack(columns, _rest_names(columns))
+    values = stack_columns(rows, _rest_names(rows), np.float64)
     return values.reshape(len(values), 3, values.shape[1] // 3)
 
 
