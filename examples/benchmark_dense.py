@@ -1,9 +1,11 @@
-"""What describing an image's masks costs by crops and by dense pooling: a CLIP of B/16's size with random weights.
+"""What describing an image's masks costs by crops and by dense pooling, in torch and exported: a CLIP of B/16's size
+with random weights.
 
     python examples/benchmark_dense.py [--masks 4 16 64]
 
-Processor seconds of all cores together. Random weights say nothing of what the vectors mean; that both are the model's
-own parts is tested (tests/test_dense_features.py, test_encoders.py).
+Processor seconds of all cores together, and the largest difference of an entry of the unit vectors between torch and
+the exported graph. Random weights say nothing of what the vectors mean; that all are the model's own parts is tested
+(tests/test_dense_features.py, test_encoders.py).
 """
 
 from __future__ import annotations
@@ -17,11 +19,12 @@ import numpy as np
 import torch
 import transformers
 from numpy.typing import NDArray
+from og_pointcloud_export.encoders import export_image_encoder
 
 from og_pointcloud.masking.clip import TransformersModel
 from og_pointcloud.masking.contracts import MaskEncoder
 from og_pointcloud.masking.dense import DenseEncoder
-from og_pointcloud.masking.encode import CropEncoder
+from og_pointcloud.masking.encode import CropEncoder, OnnxModel
 
 SIZE = (480, 640)
 SPACE = "random/clip-vit-base-patch16"
@@ -36,12 +39,12 @@ def boxes(count: int) -> NDArray[np.bool_]:
     return masks
 
 
-def seconds(encoder: MaskEncoder, masks: NDArray[np.bool_]) -> float:
-    """Of the processor, for one image."""
+def run(encoder: MaskEncoder, masks: NDArray[np.bool_]) -> tuple[float, NDArray[np.float32]]:
+    """Seconds of the processor for one image, and the vectors."""
     image = np.random.default_rng(1).integers(0, 256, (*SIZE, 3), np.uint8)
     start = time.process_time()
-    encoder.embed(image, masks)
-    return time.process_time() - start
+    vectors = encoder.embed(image, masks)
+    return time.process_time() - start, vectors
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -54,13 +57,15 @@ def main(arguments: list[str] | None = None) -> None:
         vision = {"patch_size": 16}
         transformers.CLIPModel(transformers.CLIPConfig(vision_config=vision)).save_pretrained(Path(folder))
         model = TransformersModel(folder, SPACE)
-    crops, dense = CropEncoder(model, model.crops), DenseEncoder(model)
-    seconds(dense, boxes(1))  # which loads what is loaded once
-    print(f"{'masks':>6} {'crops s':>9} {'dense s':>9} {'ratio':>7}")
-    for count in options.masks:
-        masks = boxes(count)
-        slow, fast = seconds(crops, masks), seconds(dense, masks)
-        print(f"{count:6} {slow:9.2f} {fast:9.2f} {slow / fast:7.1f}", flush=True)
+        exported = OnnxModel(export_image_encoder(folder, Path(folder) / "onnx", feature_space=SPACE)[0])
+    print(f"{'masks':>6} {'features':<8} {'torch s':>9} {'exported s':>11} {'difference':>11}")
+    for name, make in (("crops", CropEncoder), ("dense", DenseEncoder)):
+        in_torch, light = make(model), make(exported)
+        run(in_torch, boxes(1)), run(light, boxes(1))  # which loads what is loaded once
+        for count in options.masks:
+            masks = boxes(count)
+            (slow, expected), (fast, found) = run(in_torch, masks), run(light, masks)
+            print(f"{count:6} {name:<8} {slow:9.2f} {fast:11.2f} {np.abs(found - expected).max():11.1e}", flush=True)
 
 
 if __name__ == "__main__":

@@ -103,14 +103,18 @@ def _bound_memory() -> None:
     ort.create_and_register_allocator(place, ort.OrtArenaCfg(MOST_GRAPH_BYTES, -1, -1, -1))  # pyright: ignore
 
 
-def run_bounded(session: InferenceSession, given: Mapping[str, NDArray[Any]]) -> list[Any]:
-    """All outputs, within LONGEST_RUN_S, else TimeoutError; Ctrl-C is heard meanwhile. Both stop between two nodes."""
+def run_bounded(
+    session: InferenceSession, given: Mapping[str, NDArray[Any]], outputs: Sequence[str] | None = None
+) -> list[Any]:
+    """Outputs, None: all, and only what they need, within LONGEST_RUN_S, else TimeoutError; Ctrl-C is heard meanwhile.
+    Both stop between two nodes."""
     import onnxruntime
 
     options: Any = onnxruntime.RunOptions()
     options.log_severity_level = ERRORS_ONLY + 1
+    options.only_execute_path_to_fetches = outputs is not None
     with ThreadPoolExecutor(1) as pool:
-        answer = pool.submit(session.run, None, dict(given), options)
+        answer = pool.submit(session.run, outputs, dict(given), options)
         try:
             return list(answer.result(LONGEST_RUN_S))
         except BaseException:
@@ -198,18 +202,24 @@ class EncoderFormat:
                     return candidate
         return None
 
-    def vectors(self, session: InferenceSession, given: NDArray[Any], width: int, where: str) -> NDArray[np.float32]:
-        """(B, width) float32: what the graph makes of its one input (B, ...). OgPointcloudError where it does not."""
+    def vectors(
+        self, session: InferenceSession, given: NDArray[Any], shape: tuple[int, ...], where: str, output: str = ""
+    ) -> NDArray[np.float32]:
+        """What the graph makes of its one input, float32 of that shape. output: its name, "" the first.
+
+        OgPointcloudError where it does not, and begins with ``where``.
+        """
         try:
-            vectors = np.asarray(run_bounded(session, {session.get_inputs()[0].name: given})[0])
+            outputs = [output or session.get_outputs()[0].name]
+            vectors = np.asarray(run_bounded(session, {session.get_inputs()[0].name: given}, outputs)[0])
         except Exception as error:  # onnxruntime raises types of its own
             raise OgPointcloudError(
                 f"{where}: {self.graph} does not run ({first_line(error)}): {self.remake}"
             ) from None
-        if vectors.dtype != np.float32 or vectors.shape != (len(given), width) or not np.isfinite(vectors).all():
+        if vectors.dtype != np.float32 or vectors.shape != shape or not np.isfinite(vectors).all():
             raise OgPointcloudError(
                 f"{where}: {self.graph} gives {vectors.dtype} {vectors.shape} or NaN; expected finite float32 "
-                f"({len(given)}, {width}): {self.remake}"
+                f"{shape}: {self.remake}"
             )
         return vectors
 

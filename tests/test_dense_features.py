@@ -2,23 +2,25 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 from capture_files import BY_COLOR
 from test_masks_command import make_capture
-from text_models import OUT, PATCH, SIZE, SPACE, write_model
+from text_models import OUT, PATCH, SIZE, SPACE, write_files, write_model
 
 from og_pointcloud.cli import main
 from og_pointcloud.errors import OgPointcloudError, SceneError
 from og_pointcloud.formats.capture import read_capture
 from og_pointcloud.masking.contracts import MaskSettings
-from og_pointcloud.masking.encode import open_mask_encoder
+from og_pointcloud.masking.encode import CropEncoder, open_mask_encoder
 from og_pointcloud.masking.make_masks import make_masks
 
 torch = pytest.importorskip("torch")
 pytest.importorskip("transformers")
 
-from og_pointcloud.masking.clip import ImageTower, PatchTower, TransformersModel, load_model  # noqa: E402
+from og_pointcloud.masking.clip import ImageTower, TransformersModel, load_model  # noqa: E402
 from og_pointcloud.masking.dense import DenseEncoder  # noqa: E402
 
 KINDS = ("clip", "siglip")
@@ -66,7 +68,7 @@ def test_patches_are_the_models_own_tokens_alone(folder, shape):
     model = load_model(folder, "eager")
     image = pixels(shape[0] * PATCH, shape[1] * PATCH)
     with torch.inference_mode():
-        found = PatchTower(model)(image).numpy()
+        (found,) = ImageTower(model)(image)[1].numpy()
     assert found.shape == (*shape, OUT if model.config.model_type == "clip" else 32)
     np.testing.assert_allclose(found.reshape(-1, found.shape[-1]), literal_patches(model, image), atol=2e-5)
 
@@ -77,8 +79,9 @@ def test_an_image_of_one_siglip_patch_is_that_patch(tmp_path):
     with torch.inference_mode():
         image = pixels(PATCH, PATCH)
         whole = model.get_image_features(pixel_values=image, interpolate_pos_encoding=True).pooler_output
-        np.testing.assert_allclose(PatchTower(model)(image)[0, 0], (whole / whole.norm())[0], atol=1e-5)
-        assert ImageTower(model)(pixels(SIZE, SIZE)).shape == (1, 32)
+        image_vector, patches = ImageTower(model)(image)
+        np.testing.assert_allclose(patches[0, 0, 0], (whole / whole.norm())[0], atol=1e-5)
+        np.testing.assert_allclose(image_vector, patches[0, 0], atol=1e-5)
 
 
 def test_a_masks_vector_is_the_mean_of_its_patches_by_what_it_covers(encoder):
@@ -118,7 +121,8 @@ def test_the_order_of_masks_does_not_matter(encoder):
     np.testing.assert_allclose(encoder.embed(image, masks)[::-1], encoder.embed(image, masks[::-1]), atol=1e-6)
 
 
-def test_masks_on_the_command_line(folder, tmp_path, monkeypatch, capsys):
+@pytest.mark.slow  # torch.onnx.export
+def test_masks_on_the_command_line(folder, exported, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("og_pointcloud.cli.masks.warn_of_poses", lambda _: None)
     monkeypatch.setattr("og_pointcloud.masking.clip.published_name", lambda _: SPACE)
     make_capture(tmp_path / "c", 2)
@@ -129,11 +133,52 @@ def test_masks_on_the_command_line(folder, tmp_path, monkeypatch, capsys):
         found.append(np.concatenate([view.mask_features for view in read_capture(tmp_path / "c").views]))
     assert found[0].shape == found[1].shape
     assert np.abs(found[0] - found[1]).max() > 1e-3, "the second run made other features"
+    command[-1] = str(exported)
+    assert main([*command, "--features", "dense"]) == 0, capsys.readouterr().err
+    light = np.concatenate([view.mask_features for view in read_capture(tmp_path / "c").views])
+    np.testing.assert_allclose(light, found[0], atol=1e-5)
+
+
+@pytest.fixture(scope="module")
+def exported(folder):
+    pytest.importorskip("onnxscript")
+    exporter = pytest.importorskip("og_pointcloud_export.encoders")
+    return exporter.export_image_encoder(folder, folder.parent / f"{folder.name}-onnx", feature_space=SPACE)[0]
+
+
+@pytest.mark.slow  # torch.onnx.export
+@pytest.mark.parametrize("shape", [(48, 48), (33, 40), (97, 31)])
+def test_an_exported_encoder_gives_masks_the_same_vectors(encoder, exported, shape):
+    random = np.random.default_rng(0)
+    image = random.integers(0, 256, (*shape, 3)).astype(np.uint8)
+    masks = random.uniform(size=(3, *shape)) < np.array([0.3, 0.05, 1.1])[:, None, None]
+    light = open_mask_encoder(exported, "dense")
+    assert isinstance(light, DenseEncoder)
+    np.testing.assert_allclose(light.embed(image, masks), encoder.embed(image, masks), atol=1e-5)
+    crops = open_mask_encoder(exported)
+    np.testing.assert_allclose(crops.embed(image, masks), CropEncoder(encoder.model).embed(image, masks), atol=1e-5)
+
+
+@pytest.mark.slow  # torch.onnx.export
+def test_an_export_without_patches_and_one_that_lies_about_them(exported, tmp_path):
+    def changed(patch):
+        manifest = json.loads((exported / "manifest.json").read_text())
+        files = {"image_encoder.onnx": (exported / "image_encoder.onnx").read_bytes()}
+        return write_files(tmp_path / f"p{patch}", {"manifest.json": json.dumps(manifest | patch).encode(), **files})
+
+    with pytest.raises(OgPointcloudError, match=r"whole squares alone; .*export image makes of it today"):
+        open_mask_encoder(changed({"patch": None}), "dense")
+    with pytest.raises(OgPointcloudError, match="patch is 0; expected a whole number up to 32"):
+        open_mask_encoder(changed({"patch": 0}), "dense")
+    with pytest.raises(OgPointcloudError, match=r"expected finite float32 \(1, 16, 16, "):
+        open_mask_encoder(changed({"patch": 4}), "dense").embed(
+            np.zeros((64, 64, 3), np.uint8), np.ones((1, 64, 64), bool)
+        )
 
 
 def test_a_model_without_patches_is_refused(tmp_path):
     make_capture(tmp_path / "c", 1)
-    with pytest.raises(OgPointcloudError, match=r"encoder 'demo' has vectors of whole squares alone; .*dense"):
+    with pytest.raises(OgPointcloudError, match=r"encoder 'demo' has vectors of whole squares alone; .*crops"):
         make_masks(tmp_path / "c", MaskSettings(features="dense"), progress=False)
     with pytest.raises(OgPointcloudError, match="features are 'thick'; expected one of crops, dense"):
         MaskSettings(features="thick")

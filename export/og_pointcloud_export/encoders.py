@@ -57,6 +57,10 @@ PARITY_TEXTS = (
 )  # fmt: skip
 """Labels and awkward texts, on which graph and torch are compared."""
 PARITY_IMAGES = 4
+PARITY_PATCHES = (4, 7)
+"""Rows and columns of patches of a further image, whose shape is not the one of training."""
+MOST_PATCHES = 1 << 10
+"""Along a side of an image that a graph takes."""
 
 
 def export_text_encoder(
@@ -103,7 +107,7 @@ def write_text_encoder(folder: Path, tower: Any, tokenizer: dict[str, Any], abou
     context, pad_id = about["context_length"], about["pad_id"]
     example = torch.zeros((2, min(context, 7) if pad_id is None else context), dtype=torch.int64)
     batch, length = torch.export.Dim("batch"), torch.export.Dim("length", min=1, max=context)
-    graph = _onnx_graph(tower, example, "tokens", "text", {0: batch, 1: length} if pad_id is None else {0: batch})
+    graph = _onnx_graph(tower, example, "tokens", ["text"], {0: batch, 1: length} if pad_id is None else {0: batch})
     with torch.no_grad():
         width = tower(example).shape[1]
     about = {**_heading(text_encoder.FORMAT, text_encoder.SCHEMA_VERSION), **about, "width": width, "precision": "fp32"}
@@ -130,7 +134,8 @@ def export_image_encoder(
     Raises OgPointcloudError, and MissingExtraError where a package of the 'export' extra is absent.
     """
     model = TransformersModel(source, feature_space, crops=tuple(crops), attention="eager")
-    about = {"model_type": model.tower.model.config.model_type}
+    model.device = torch.device("cpu")  # the tower is exported there, and compared
+    about = {"model_type": model.tower.model.config.model_type, "patch": model.patch}
     folder = Path(output) if output is not None else cache_folder() / f"{_folder_name(model.feature_space)}--image"
     return folder, write_image_encoder(folder, model, model.tower.cpu(), about)
 
@@ -138,15 +143,17 @@ def export_image_encoder(
 def write_image_encoder(folder: Path, model: encode.ImageModel, tower: Any, about: dict[str, Any]) -> dict[str, Any]:
     """Write a torch module as an image encoder if its graph gives the model's vectors. Returns the manifest.
 
-    model: what the graph must agree with. tower: the same as a torch module, pixels (B, 3, S, S) -> (B, D) unit rows;
-    or the bytes of its graph. about: more entries of the manifest.
+    model: what the graph must agree with. tower: the same as a torch module with patches (`clip.ImageTower`), or the
+    bytes of a graph of (B, 3, S, S) -> (B, D) without. about: more entries of the manifest; "patch": of a module.
     """
     preprocessing = model.preprocessing
     if isinstance(tower, bytes):
         graph = tower
     else:
-        example = torch.zeros((2, 3, preprocessing.size, preprocessing.size))
-        graph = _onnx_graph(tower, example, "pixels", "image", {0: torch.export.Dim("batch")})
+        patch = about["patch"]
+        sides = {axis: patch * torch.export.Dim(name, min=2, max=MOST_PATCHES) for axis, name in ((2, "h"), (3, "w"))}
+        example = torch.zeros((2, 3, 3 * patch, 5 * patch))
+        graph = _onnx_graph(tower, example, "pixels", ["image", "patches"], {0: torch.export.Dim("batch"), **sides})
     try:
         check_graph(graph, encode.OPERATORS)
     except ValueError as error:
@@ -178,13 +185,13 @@ class _TextTower(torch.nn.Module):
         return vectors / vectors.norm(dim=-1, keepdim=True)
 
 
-def _onnx_graph(tower: Any, example: torch.Tensor, given: str, answer: str, dimensions: dict[int, Any]) -> bytes:
+def _onnx_graph(tower: Any, example: torch.Tensor, given: str, answers: list[str], dimensions: dict[int, Any]) -> bytes:
     """The module as one file. OgPointcloudError where it would be larger than a graph in one file may be."""
     held = sum(tensor.numel() * tensor.element_size() for tensor in {id(p): p for p in tower.parameters()}.values())
     with _quietly(), torch.no_grad():
         program = torch.onnx.export(
             tower, (example,), dynamo=True, opset_version=OPSET, verbose=False,
-            input_names=[given], output_names=[answer], dynamic_shapes=(dimensions,),
+            input_names=[given], output_names=answers, dynamic_shapes=(dimensions,),
         )  # fmt: skip
     assert program is not None
     try:
@@ -274,13 +281,20 @@ def _text_parity(tower: Any, encoder: TextEncoder) -> dict[str, Any]:
 
 
 def _image_parity(graph: bytes, model: encode.ImageModel) -> dict[str, Any]:
-    """How far the graph is from the model, on images of noise and of even colours."""
+    """How far the graph is from the model, on images of noise and of even colours, and on patches if it has any."""
     size = model.preprocessing.size
     squares = np.random.default_rng(0).integers(0, 256, (PARITY_IMAGES, size, size, 3), np.uint8)
     squares[PARITY_IMAGES // 2 :] = squares[PARITY_IMAGES // 2 :, :1, :1]
     pixels = model.preprocessing.pixels(squares)
-    got = np.asarray(open_session(graph).run(["image"], {"pixels": pixels})[0])
-    return {"images": PARITY_IMAGES, **_difference(got, model(pixels))}
+    session = open_session(graph)
+    got, expected = np.asarray(session.run(["image"], {"pixels": pixels})[0]), model(pixels)
+    if isinstance(model, TransformersModel):
+        sides = (side * model.patch for side in PARITY_PATCHES)
+        wide = np.random.default_rng(1).normal(size=(1, 3, *sides)).astype(np.float32)
+        patches = np.asarray(session.run(["patches"], {"pixels": wide})[0])
+        got = np.concatenate([got, patches.reshape(-1, model.width)])
+        expected = np.concatenate([expected, model.patches(wide).reshape(-1, model.width)])
+    return {"images": PARITY_IMAGES, **_difference(got, expected)}
 
 
 def _difference(got: NDArray[np.float32], expected: NDArray[np.float32]) -> dict[str, Any]:

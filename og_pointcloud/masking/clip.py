@@ -28,25 +28,11 @@ def load_model(folder: str | os.PathLike[str], attention: Attention = "sdpa") ->
 
 
 class ImageTower(torch.nn.Module):
-    """Pixels (B, 3, S, S) float32 -> (B, D) unit rows."""
-
-    def __init__(self, model: Any) -> None:
-        """model: from ``load_model``."""
-        super().__init__()
-        self.model = model
-
-    def forward(self, pixels: torch.Tensor) -> torch.Tensor:
-        """See the class."""
-        found = self.model.get_image_features(pixel_values=pixels).pooler_output
-        return found / found.norm(dim=-1, keepdim=True)
-
-
-class PatchTower(torch.nn.Module):
-    """Pixels (1, 3, h * patch, w * patch) float32 -> (h, w, D) unit vectors, in the space of `ImageTower`.
+    """Pixels (B, 3, h * patch, w * patch) float32 -> unit vectors of images (B, D) and of their patches (B, h, w, D).
 
     A model makes one vector of an image where tokens attend to each other last: CLIP in its last layer, to the class
-    token; SigLIP in its head, to a probe. There each patch attends to itself alone, so that its own value comes out;
-    nothing is trained. MaskCLIP (Zhou, Loy and Dai, ECCV 2022), section 3.2.
+    token; SigLIP in its head, to a probe. There each patch attends to itself alone, so that its own value comes out, in
+    the same space; nothing is trained. MaskCLIP (Zhou, Loy and Dai, ECCV 2022), section 3.2.
     """
 
     def __init__(self, model: Any) -> None:
@@ -54,20 +40,26 @@ class PatchTower(torch.nn.Module):
         super().__init__()
         self.model, self.patch = model, int(model.config.vision_config.patch_size)
 
-    def forward(self, pixels: torch.Tensor) -> torch.Tensor:
+    def forward(self, pixels: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """See the class."""
         vision = self.model.vision_model
         seen = vision(pixel_values=pixels, interpolate_pos_encoding=True, output_hidden_states=True)
         if self.model.config.model_type == "clip":
-            last, tokens = vision.encoder.layers[-1], seen.hidden_states[-2][0, 1:]
+            image = self.model.visual_projection(seen.pooler_output)
+            last, tokens = vision.encoder.layers[-1], seen.hidden_states[-2][:, 1:]
             attention = last.self_attn
             tokens = tokens + attention.out_proj(attention.v_proj(last.layer_norm1(tokens)))
             tokens = tokens + last.mlp(last.layer_norm2(tokens))
             found = self.model.visual_projection(vision.post_layernorm(tokens))
         else:
-            found = vision.head(seen.last_hidden_state[0][:, None])  # each patch an image of one
-        found = found / found.norm(dim=-1, keepdim=True)
-        return found.reshape(pixels.shape[2] // self.patch, pixels.shape[3] // self.patch, -1)
+            image, tokens = seen.pooler_output, seen.last_hidden_state
+            found = vision.head(tokens.flatten(0, 1)[:, None])  # each patch an image of one
+        rows, columns = (side // self.patch for side in pixels.shape[2:])
+        return _unit(image), _unit(found).reshape(-1, rows, columns, image.shape[1])
+
+
+def _unit(vectors: torch.Tensor) -> torch.Tensor:
+    return vectors / vectors.norm(dim=-1, keepdim=True)
 
 
 class TransformersModel:
@@ -87,20 +79,20 @@ class TransformersModel:
         self.preprocessing, self.crops = preprocessing_of(folder, model.config), crops
         self.device = best_device()
         self.tower = ImageTower(model).eval().to(self.device)
-        self.patch_tower = PatchTower(model).eval().to(self.device)
-        self.patch = self.patch_tower.patch
+        self.patch = self.tower.patch
         size = self.preprocessing.size
         self.width: int = self(np.zeros((1, 3, size, size), np.float32)).shape[1]
 
     @torch.inference_mode()
     def __call__(self, pixels: NDArray[np.float32]) -> NDArray[np.float32]:
         """(B, width) float32 unit rows of pixels (B, 3, S, S)."""
-        return self.tower(torch.from_numpy(pixels).to(self.device)).cpu().numpy()
+        found = self.tower.model.get_image_features(pixel_values=torch.from_numpy(pixels).to(self.device))
+        return _unit(found.pooler_output).cpu().numpy()
 
     @torch.inference_mode()
     def patches(self, pixels: NDArray[np.float32]) -> NDArray[np.float32]:
         """(h, w, width) float32 unit vectors of pixels (1, 3, h * patch, w * patch)."""
-        return self.patch_tower(torch.from_numpy(pixels).to(self.device)).cpu().numpy()
+        return self.tower(torch.from_numpy(pixels).to(self.device))[1][0].cpu().numpy()
 
 
 def preprocessing_of(folder: str | os.PathLike[str], config: Any) -> Preprocessing:

@@ -2,7 +2,7 @@
 
 Crops show the encoder each mask by itself, several runs a mask. Here it sees the image once, and a mask's vector is the
 mean of the vectors of its patches, each weighted by how much of it the mask covers. What a patch is, rather than what
-the image is about, is read as MaskCLIP does it (Zhou, Loy and Dai, ECCV 2022): see `clip.PatchTower`.
+the image is about, is read as MaskCLIP does it (Zhou, Loy and Dai, ECCV 2022): see `clip.ImageTower`.
 """
 
 from __future__ import annotations

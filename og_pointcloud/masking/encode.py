@@ -6,7 +6,8 @@
 - folders that ``og-pointcloud export image`` wrote, run by onnxruntime:
     manifest.json       format, schema_version, feature_space, width, preprocessing, crops, bytes and checksums of the
                         graph, parity figures against torch
-    image_encoder.onnx  pixels (B, 3, S, S) float32 -> image (B, D) float32, unit rows
+    image_encoder.onnx  pixels (B, 3, S, S) float32 -> image (B, D) float32, unit rows; where the manifest has a patch,
+                        pixels (B, 3, h * patch, w * patch), and -> patches (B, h, w, D) float32, unit vectors, too
 - "demo", such a folder that comes with the library; it knows the things of the procedural room and nothing else.
 
 A folder is checked before it is run, since it may come from a stranger: nothing is unpickled, no code of it is run.
@@ -42,8 +43,8 @@ ENCODER_FILES = {MANIFEST: 1 << 20, GRAPH: (1 << 31) - 1}
 """The files of an encoder, and the bytes that each may have; a serialised graph cannot have more."""
 OPERATORS = frozenset({
     "Add", "Clip", "Concat", "Conv", "DequantizeLinear", "Div", "Erf", "Expand", "Gather", "Gemm", "GlobalAveragePool",
-    "LayerNormalization", "MatMul", "Max", "Mul", "Pow", "ReduceL2", "Relu", "Reshape", "Shape", "Sigmoid", "Softmax",
-    "Split", "Squeeze", "Tanh", "Tile", "Transpose", "Unsqueeze", "Where",
+    "LayerNormalization", "MatMul", "Max", "Mul", "Pow", "ReduceL2", "Relu", "Reshape", "Resize", "Shape", "Sigmoid",
+    "Slice", "Softmax", "Split", "Squeeze", "Tanh", "Tile", "Transpose", "Unsqueeze", "Where",
 })  # fmt: skip
 """All that an encoder's graph is made of: arithmetic without loops, random numbers, or graphs inside nodes."""
 ENCODER = EncoderFormat(FORMAT, SCHEMA_VERSION, ENCODER_FILES, GRAPH, OPERATORS, "og-pointcloud export image")
@@ -68,15 +69,15 @@ class ImageModel(Protocol):
 
 
 def open_mask_encoder(name: str | os.PathLike[str], features: str = "crops") -> MaskEncoder:
-    """An encoder as `open_encoder`; features "dense": one run an image (`dense.DenseEncoder`), for models of
-    transformers. OgPointcloudError where a model has no patches."""
+    """An encoder as `open_encoder`; features "dense": one run an image (`dense.DenseEncoder`). OgPointcloudError where
+    a model has no patches."""
     encoder = open_encoder(name)
     if features == "crops":
         return encoder
-    if not hasattr(encoder.model, "patches"):
+    if getattr(encoder.model, "patch", None) is None:
         raise OgPointcloudError(
-            f"the encoder '{name}' has vectors of whole squares alone; expected a transformers folder of CLIP or "
-            "SigLIP for --features dense: name one, or take crops"
+            f"the encoder '{name}' has vectors of whole squares alone; expected for --features dense CLIP or SigLIP, a "
+            "transformers folder or what og-pointcloud export image makes of it today: name one, or take crops"
         )
     from og_pointcloud.masking.dense import DenseEncoder
 
@@ -175,10 +176,19 @@ class OnnxModel:
         self.width: int = width
         self.preprocessing = Preprocessing.from_manifest(manifest["preprocessing"])
         self.crops = tuple(Crop(**entry) for entry in crops)
+        self.patch: int | None = manifest.get("patch")  # absent in exports that have no patches
+        if self.patch is not None and (type(self.patch) is not int or not 1 <= self.patch <= self.preprocessing.size):
+            raise ValueError(f"patch is {self.patch!r:.40}; expected a whole number up to {self.preprocessing.size}")
 
     def __call__(self, pixels: NDArray[np.float32]) -> NDArray[np.float32]:
         """(B, width) float32 unit rows of pixels (B, 3, S, S)."""
-        return ENCODER.vectors(self._session, pixels, self.width, self.where)
+        return ENCODER.vectors(self._session, pixels, (len(pixels), self.width), self.where)
+
+    def patches(self, pixels: NDArray[np.float32]) -> NDArray[np.float32]:
+        """(h, w, width) unit vectors of pixels (1, 3, h * patch, w * patch), of an encoder that has a patch."""
+        assert self.patch is not None
+        rows, columns = (side // self.patch for side in pixels.shape[2:])
+        return ENCODER.vectors(self._session, pixels, (1, rows, columns, self.width), self.where, "patches")[0]
 
     @cached_property
     def _session(self) -> InferenceSession:

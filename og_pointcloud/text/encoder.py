@@ -103,7 +103,7 @@ class TextEncoder:
         remembered = self._remembered if len(self._remembered) < VECTORS_REMEMBERED else {}
         missing = [text for text in dict.fromkeys(texts) if text not in remembered]
         for batch, tokens in self._batches(missing):
-            vectors = ENCODER.vectors(self._session, tokens, self.width, self.where)
+            vectors = ENCODER.vectors(self._session, tokens, (len(tokens), self.width), self.where)
             remembered.update(zip(batch, vectors, strict=True))
         self._remembered = remembered  # another thread's is never emptied, only replaced
         return np.array([remembered[text] for text in texts], np.float32).reshape(len(texts), self.width)
