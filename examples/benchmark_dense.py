@@ -22,9 +22,9 @@ from numpy.typing import NDArray
 from og_pointcloud_export.encoders import export_image_encoder
 
 from og_pointcloud.masking.clip import TransformersModel
-from og_pointcloud.masking.contracts import MaskEncoder
+from og_pointcloud.masking.contracts import FEATURES, MaskEncoder
 from og_pointcloud.masking.dense import DenseEncoder
-from og_pointcloud.masking.encode import CropEncoder, OnnxModel
+from og_pointcloud.masking.encode import CropEncoder, open_mask_encoder
 
 SIZE = (480, 640)
 SPACE = "random/clip-vit-base-patch16"
@@ -57,11 +57,12 @@ def main(arguments: list[str] | None = None) -> None:
         vision = {"patch_size": 16}
         transformers.CLIPModel(transformers.CLIPConfig(vision_config=vision)).save_pretrained(Path(folder))
         model = TransformersModel(folder, SPACE)
-        exported = OnnxModel(export_image_encoder(folder, Path(folder) / "onnx", feature_space=SPACE)[0])
+        exported, _ = export_image_encoder(folder, Path(folder) / "onnx", feature_space=SPACE)
+        light_ones = [open_mask_encoder(exported, features) for features in FEATURES]
     print(f"{'masks':>6} {'features':<8} {'torch s':>9} {'exported s':>11} {'difference':>11}")
-    for name, make in (("crops", CropEncoder), ("dense", DenseEncoder)):
-        in_torch, light = make(model), make(exported)
-        run(in_torch, boxes(1)), run(light, boxes(1))  # which loads what is loaded once
+    for name, in_torch, light in zip(FEATURES, (CropEncoder(model), DenseEncoder(model)), light_ones, strict=True):
+        for encoder in (in_torch, light):
+            run(encoder, boxes(1))  # which loads what is loaded once
         for count in options.masks:
             masks = boxes(count)
             (slow, expected), (fast, found) = run(in_torch, masks), run(light, masks)
