@@ -30,14 +30,13 @@ from og_pointcloud.cloud import UNOBSERVED
 from og_pointcloud.errors import SceneError
 from og_pointcloud.fitting.fit import fit_prepared, prepare
 from og_pointcloud.formats.mask_files import MaskLayer
-from og_pointcloud.formats.poses import in_local_frame
+from og_pointcloud.formats.poses import in_local_frame, rotation_of_vector
 from og_pointcloud.formats.repairs import (
     KINDS,
     Repair,
     read_repairs,
     repaired_cameras,
     repaired_layers,
-    rotation_of_vector,
 )
 from og_pointcloud.scene import Camera
 

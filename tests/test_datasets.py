@@ -195,6 +195,13 @@ def test_nerfstudios_depth_files_are_fused(tmp_path, keys):
     assert distance_to_surface(scene.points.xyz_world).max() < fuse_capture(tmp_path).survey.voxel / 2
 
 
+@pytest.mark.parametrize(("most", "fused"), [(COUNT + 1, COUNT), (COUNT, COUNT), (COUNT - 1, -(-COUNT // 2))])
+def test_as_many_depth_images_are_fused_as_may_be(tmp_path, monkeypatch, most, fused):
+    nerfstudio(tmp_path)
+    monkeypatch.setattr("og_pointcloud.formats.capture.FUSED_FRAMES", most)
+    assert fuse_capture(tmp_path).frames == fused
+
+
 def test_a_depth_file_outside_the_capture_is_not_opened(tmp_path):
     nerfstudio(tmp_path)
     content = json.loads((tmp_path / "transforms.json").read_text())

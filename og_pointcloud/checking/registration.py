@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from og_pointcloud.checking.photographs import LONGEST_PX, Floats, Photographs, centered, shrunk
 from og_pointcloud.checking.sample import seen
-from og_pointcloud.formats.repairs import Repair, rotation_of_vector
+from og_pointcloud.formats.poses import rotation_of_vector
+from og_pointcloud.formats.repairs import Repair
 from og_pointcloud.scene import Camera
 
 Doubles = NDArray[np.float64]

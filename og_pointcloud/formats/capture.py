@@ -232,23 +232,20 @@ def _has_mask(capture: Path, name: str) -> bool:
 
 def _layers(capture: Path, poses: CapturePoses, level: str) -> tuple[list[MaskLayer], str]:
     """The masks of each view, and the name of their feature space. Those of an image as it is are split with it."""
-    of_whole = [
-        image.face is not None and not (image.face.name and _has_mask(capture, name))
-        for name, image in zip(poses.names, poses.images, strict=True)
-    ]
-    called = [
-        posixpath.dirname(name) if whole and image.face is not None and image.face.name else name
-        for name, image, whole in zip(poses.names, poses.images, of_whole, strict=True)
+    faces = [image.face for image in poses.images]
+    called = [  # of a cube's face without masks of its own the image's name
+        posixpath.dirname(name) if face and face.name and not _has_mask(capture, name) else name
+        for name, face in zip(poses.names, faces, strict=True)
     ]
     distinct = list(dict.fromkeys(called))
     read, feature_space = _read_masks(capture, distinct, level)
     stored = dict(zip(distinct, read, strict=True))
     latest = lru_cache(maxsize=DECODED)(lambda name: stored[name].read())
     return [
-        _layer_of(image.face, replace(stored[name], read=partial(latest, name)), view)
-        if whole and image.face is not None
+        _layer_of(face, replace(stored[name], read=partial(latest, name)), view)
+        if face and (not face.name or name != view)
         else stored[name]
-        for view, name, image, whole in zip(poses.names, called, poses.images, of_whole, strict=True)
+        for view, name, face in zip(poses.names, called, faces, strict=True)
     ], feature_space
 
 
@@ -372,7 +369,7 @@ def _depth_frames(capture: Path, poses: CapturePoses) -> list[DepthFrame]:
     files = depth_files(capture, poses)
     images = dict(zip(poses.names, poses.images, strict=True))
     frames = []
-    for name in list(files)[:: 1 + len(files) // FUSED_FRAMES]:
+    for name in list(files)[:: max(1, -(-len(files) // FUSED_FRAMES))]:
         file = find_image(capture, images[name].path)
         colors = None if file is None else partial(_colors_at, file, images[name])
         frames.append(DepthFrame(name, files[name], colors))

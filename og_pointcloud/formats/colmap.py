@@ -8,20 +8,20 @@ Since 3.12 a model may have files of rigs and frames. They need not be read: the
 
 from __future__ import annotations
 
-import math
 import mmap
 import struct
 import warnings
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
-from typing import NamedTuple, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.lenses import SPHERICAL, Lens, lens_of, spherical_camera
-from og_pointcloud.formats.poses import PosedImage, rigid, rotation_of_quaternion
+from og_pointcloud.formats.poses import PosedImage, pose_of_quaternion
 from og_pointcloud.formats.tables import naming
 from og_pointcloud.scene import Camera
 
@@ -58,18 +58,6 @@ Records = TypeVar("Records")
 Number = TypeVar("Number", int, float)
 
 
-class _Sensor(NamedTuple):
-    width: int
-    height: int
-    intrinsics: tuple[float, float, float, float] | None
-    lens: Lens | None
-
-    def at(self, pose: NDArray[np.float64]) -> Camera:
-        if self.intrinsics is None:
-            return spherical_camera(self.width, self.height, pose)
-        return Camera(self.width, self.height, *self.intrinsics, pose)
-
-
 def find_model(capture: Path) -> Path | None:
     """The folder of the capture's sparse model, or None."""
     for folder in MODEL_FOLDERS:
@@ -81,21 +69,21 @@ def find_model(capture: Path) -> Path | None:
 
 def read_images(model: Path) -> tuple[PosedImage, ...]:
     """The posed images of a sparse model in the file's order. Raises SceneError naming file, place and cure."""
-    sensors = {
-        camera_id: _sensor(camera_model, size, values)
+    cameras = {
+        camera_id: _camera(camera_model, size, values)
         for camera_id, camera_model, size, values in _records(model, "cameras", _cameras_binary, _cameras_text)
     }
     images = []
     for pose, camera_id, name in _records(model, "images", _images_binary, _images_text):
-        sensor = sensors.get(camera_id)
-        if sensor is None:
+        if camera_id not in cameras:
             raise SceneError(
                 f"{model}: image '{name:.60}' has camera {camera_id}, but the cameras file has only "
-                f"{sorted(sensors)[:10]}; expected files of one reconstruction: export the model again"
+                f"{sorted(cameras)[:10]}; expected files of one reconstruction: export the model again"
             )
         with naming(f"{model}, image '{name:.60}'"):
-            camera = sensor.at(_pose(pose))
-        images.append(PosedImage(name.replace("\\", "/"), camera, sensor.lens))
+            camera_at, lens = cameras[camera_id]
+            camera = camera_at(pose_of_quaternion(pose[:4], pose[4:]))
+        images.append(PosedImage(name.replace("\\", "/"), camera, lens))
     if not images:
         raise SceneError(f"{model}: the images file lists 0 images; expected at least one registered image")
     return tuple(images)
@@ -128,22 +116,16 @@ def _parameters(file: Path, camera_id: int, camera_model: str) -> list[str]:
     return CAMERA_MODELS[camera_model][1].split()
 
 
-def _sensor(camera_model: str, size: tuple[int, int], values: dict[str, float]) -> _Sensor:
-    """values: by the names of the model's parameters."""
+def _camera(
+    camera_model: str, size: tuple[int, int], values: dict[str, float]
+) -> tuple[Callable[[NDArray[np.float64]], Camera], Lens | None]:
+    """What makes the camera of a pose (world to camera), and the lens. values: by the names of the parameters."""
     if camera_model == "EQUIRECTANGULAR":
-        return _Sensor(*size, None, SPHERICAL)
+        return partial(spherical_camera, *size), SPHERICAL
     fx, fy = (values.pop("f"),) * 2 if "f" in values else (values.pop("fx"), values.pop("fy"))
     intrinsics = (fx, fy, values.pop("cx"), values.pop("cy"))
     model = "fisheye" if camera_model.endswith("FISHEYE") else LENS_MODELS.get(camera_model, "perspective")
-    return _Sensor(*size, intrinsics, lens_of(model, values))
-
-
-def _pose(values: tuple[float, ...]) -> NDArray[np.float64]:
-    """(4, 4) from qw qx qy qz tx ty tz (Hamilton)."""
-    norm = math.hypot(*values[:4])
-    if not np.isfinite(values).all() or not 1e-8 < norm < math.inf:
-        raise SceneError(f"pose {values} has no rotation; expected a finite quaternion of length 1")
-    return rigid(rotation_of_quaternion(np.array(values[:4]) / norm), np.array(values[4:]))
+    return partial(Camera, *size, *intrinsics), lens_of(model, values)
 
 
 # Text files.

@@ -22,7 +22,7 @@ from og_pointcloud.errors import MissingExtraError, OgPointcloudError, SceneErro
 from og_pointcloud.formats.atomic import replacing
 from og_pointcloud.formats.images import MAX_PIXELS, require_cv2
 from og_pointcloud.formats.ply import plain_rows, write_ply
-from og_pointcloud.formats.poses import rigid, rotation_of_quaternion
+from og_pointcloud.formats.poses import pose_of_quaternion
 from og_pointcloud.formats.tables import naming
 from og_pointcloud.scene import Points
 
@@ -136,12 +136,8 @@ def _pose(node: Any) -> Doubles | None:
     if not node.isDefined("pose"):
         return None
     pose = node["pose"]
-    quaternion = np.array([_number(pose["rotation"], axis) for axis in "wxyz"])
-    length = float(np.linalg.norm(quaternion))
-    if not length > 1e-8:
-        raise SceneError(f"its rotation is {quaternion.tolist()}; expected a unit quaternion")
-    translation = np.array([_number(pose["translation"], axis) for axis in "xyz"])
-    return rigid(rotation_of_quaternion(quaternion / length), translation)
+    quaternion = [_number(pose["rotation"], axis) for axis in "wxyz"]
+    return pose_of_quaternion(quaternion, [_number(pose["translation"], axis) for axis in "xyz"])
 
 
 # Points -----------------------------------------------------------------------------------------------------------

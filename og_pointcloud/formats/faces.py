@@ -130,7 +130,7 @@ def _boxes(whole: Numbers, lens: Lens) -> dict[str, Box]:
     """By face, what is seen of it at depth 1. The one view is called "", and cut at whole pixels of the image."""
     width, height, fx, fy, cx, cy = whole
     telephoto = 2 * max(abs(cx), abs(width - cx), 1.0) / fx, 2 * max(abs(cy), abs(height - cy), 1.0) / fy
-    half = next(half for half in (max(telephoto), ONE_VIEW) if half <= ONE_VIEW)
+    half = min(max(telephoto), ONE_VIEW)
     one, _ = _seen_box("front", whole, lens, half)
     if one is None or max(map(abs, one)) >= half:
         half = ONE_VIEW

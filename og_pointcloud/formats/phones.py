@@ -20,7 +20,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from og_pointcloud.formats.depth import MILLIMETRE
 from og_pointcloud.formats.images import image_size
@@ -35,9 +34,9 @@ from og_pointcloud.formats.poses import (
     read_json,
     read_numbers,
     rigid,
+    rotation_of_vector,
 )
 
-Doubles = NDArray[np.float64]
 POLYCAM = (("corrected_images", "corrected_cameras"), ("images", "cameras"))
 POLYCAM_KEYS = ("width", "height", "fx", "fy", "cx", "cy")
 POSE_KEYS = [f"t_{row}{column}" for row in range(3) for column in range(4)]
@@ -100,18 +99,8 @@ def _arkit_scenes(folder: Path) -> Iterator[RecordedFrame]:
             continue
         width, height, fx, fy, cx, cy = named_numbers(read_numbers(lens, 6).ravel(), range(6), lens)
         sensor = _sensor(width, height, fx, fy, cx + 0.5, cy + 0.5)
-        pose = inverse(rigid(_rotation(nearest[1:4]), nearest[4:7]))
+        pose = inverse(rigid(rotation_of_vector(nearest[1:4]), nearest[4:7]))
         yield RecordedFrame(path, lens, pose, sensor, (sensor, folder / "lowres_depth" / file.name))
-
-
-def _rotation(vector: Doubles) -> Doubles:
-    """(3, 3) of a rotation vector (Rodrigues); not finite where the vector is not."""
-    angle = float(np.linalg.norm(vector))
-    if not 0 < angle < 1e6:
-        return np.eye(3) if angle == 0 else np.full((3, 3), np.nan)
-    x, y, z = vector / angle
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
 
 
 PHONE_LAYOUTS = ((_is_polycam, _polycam), (_is_scanner_app, _scanner_app), (_is_arkit_scenes, _arkit_scenes))

@@ -81,7 +81,9 @@ def _metashape(text: str, _: ImageSize) -> PosedFrames:
     except ElementTree.ParseError as error:
         raise SceneError(f"not valid XML ({error}): export the cameras again") from None
     chunks = [chunk for chunk in root.iter("chunk") if chunk.get("enabled") != "false" and _cameras(chunk)]
-    placed = [chunk for chunk in chunks if _world_of(chunk) is not None or chunk.find(".//component/transform")]
+    placed = [
+        chunk for chunk in chunks if _world_of(chunk) is not None or chunk.find(".//component/transform") is not None
+    ]
     if len(chunks) > 1 and len(placed) < len(chunks):
         labels = ", ".join(repr(chunk.get("label")) for chunk in chunks)
         raise SceneError(f"the chunks {labels:.200} have no common world; expected one chunk: align or disable chunks")

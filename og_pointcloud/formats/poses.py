@@ -4,6 +4,7 @@ share: lenses without a pose, recordings whose tracking gets lost, numbers in te
 from __future__ import annotations
 
 import json
+import math
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -150,6 +151,23 @@ def rotation_of_quaternion(wxyz: ArrayLike) -> NDArray[np.float64]:
             [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
         ]
     )
+
+
+def pose_of_quaternion(wxyz: ArrayLike, translation: ArrayLike) -> NDArray[np.float64]:
+    """(4, 4) of a quaternion w x y z of any length, and a translation (3,); SceneError where there is no rotation."""
+    quaternion, shift = np.asarray(wxyz, np.float64), np.asarray(translation, np.float64)
+    length = math.hypot(*quaternion)
+    if not 1e-8 < length < np.inf or not np.isfinite(shift).all():  # also where it is NaN
+        raise SceneError(f"the pose {quaternion} {shift} has no rotation; expected a finite quaternion of length 1")
+    return rigid(rotation_of_quaternion(quaternion / length), shift)
+
+
+def rotation_of_vector(radians: ArrayLike) -> NDArray[np.float64]:
+    """(3, 3) rotation about a vector (3,) by its length; NaN where that is not finite."""
+    half = np.asarray(radians, np.float64) / 2
+    with np.errstate(over="ignore", invalid="ignore"):
+        angle = np.linalg.norm(half)
+        return rotation_of_quaternion([np.cos(angle), *(np.sinc(angle / np.pi) * half)])
 
 
 def quaternion_of(rotation: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -37,7 +37,14 @@ from numpy.typing import NDArray
 
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.mask_files import MaskLayer
-from og_pointcloud.formats.poses import PosedImage, quaternion_of, read_json, rigid, rotation_of_quaternion
+from og_pointcloud.formats.poses import (
+    PosedImage,
+    quaternion_of,
+    read_json,
+    rigid,
+    rotation_of_quaternion,
+    rotation_of_vector,
+)
 from og_pointcloud.scene import Camera
 
 Doubles = NDArray[np.float64]
@@ -158,13 +165,6 @@ def repaired_layers(layers: Sequence[MaskLayer], repairs: Sequence[Repair]) -> l
 def _read_repaired(read: Callable[[], NDArray[np.int32]], value: str) -> NDArray[np.int32]:
     ids = read()
     return np.where(ids < 0, ids, ids + 1) if value == "from-zero" else np.ascontiguousarray(MASK_FLIPS[value](ids))
-
-
-def rotation_of_vector(radians: NDArray[np.floating]) -> Doubles:
-    """(3, 3) rotation about a vector (3,) by its length."""
-    half = np.asarray(radians, np.float64) / 2
-    angle = float(np.linalg.norm(half))
-    return rotation_of_quaternion([np.cos(angle), *(np.sinc(angle / np.pi) * half)])
 
 
 def _numbers(text: str) -> tuple[float, ...]:

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import os
 import tempfile
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -57,7 +56,7 @@ class PosesFound:
     points: int
     error_px: float
     left_out: tuple[str, ...]
-    seconds: tuple[float, float, float]
+    seconds: tuple[float, ...]
 
 
 def find_poses(
@@ -79,9 +78,9 @@ def find_poses(
     """
     source = Path(photographs)
     target = source if capture is None else Path(capture)
-    files = _photographs(source, target)
+    files, journal = _photographs(source, target), Journal(progress)
     with naming(target), tempfile.TemporaryDirectory(prefix="og-pointcloud-") as work:
-        model, seconds = _Run(files, Path(work), longest_side, threads, Journal(progress)).model()
+        model = _Run(files, Path(work), longest_side, threads, journal).model()
         _require_enough(model, files)
         placed = _put_back_names(model, files)
         _turn_upright(model)
@@ -92,6 +91,7 @@ def find_poses(
             (target / "images").symlink_to(files[0].parent.resolve(), target_is_directory=True)
     left_out = tuple(file.name for file in files if file.name not in placed)
     error_px = float(model.compute_mean_reprojection_error())
+    seconds = tuple(stage["seconds"] for stage in journal.stages)
     return PosesFound(target, len(placed), len(files), model.num_points3D(), error_px, left_out, seconds)
 
 
@@ -130,15 +130,14 @@ class _Run:
         for file, name in zip(files, self._names, strict=True):
             (self._folder / name).symlink_to(file.resolve())
 
-    def model(self) -> tuple[Any, tuple[float, float, float]]:
-        """The largest model, None where there is none, and the seconds of the steps."""
-        start = time.perf_counter()
-        self._find_features()
-        found = time.perf_counter()
-        self._match()
-        matched = time.perf_counter()
-        model = self._map()
-        return model, (found - start, matched - found, time.perf_counter() - matched)
+    def model(self) -> Any:
+        """The largest model, None where there is none."""
+        with self._journal.stage("features"):
+            self._find_features()
+        with self._journal.stage("matches"):
+            self._match()
+        with self._journal.stage("mapping"):
+            return self._map()
 
     def _find_features(self) -> None:
         colmap, camera_of_size = self._colmap, dict[tuple[int, int], int]()

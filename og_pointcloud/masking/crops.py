@@ -104,13 +104,7 @@ def mask_crops(
     image: (H, W, 3) uint8 RGB. masks: (M, H, W) bool; one without a pixel is an error. fill: the colour outside the
     mask and beyond the image's edge. SceneError for arrays that do not fit together.
     """
-    if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
-        raise SceneError(f"the image is {image.dtype} {image.shape}; expected uint8 (H, W, 3), red first")
-    if masks.shape[1:] != image.shape[:2] or masks.dtype != np.bool_:
-        raise SceneError(
-            f"masks are {masks.dtype} {masks.shape}; expected bool (masks, {image.shape[0]}, {image.shape[1]}), as "
-            "large as the image"
-        )
+    require_masks(image, masks)
     pillow = require_pillow()
     faded = np.rint(crop.outside * image + (1 - crop.outside) * np.asarray(fill, np.float32)).astype(
         np.uint8
@@ -122,6 +116,17 @@ def mask_crops(
         resized = pillow.fromarray(square).resize((size, size), pillow.Resampling[resample.upper()])
         crops[row] = np.asarray(resized)
     return crops
+
+
+def require_masks(image: NDArray[np.uint8], masks: NDArray[np.bool_]) -> None:
+    """SceneError where the image is not (H, W, 3) uint8, or the masks are not (M, H, W) bool."""
+    if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
+        raise SceneError(f"the image is {image.dtype} {image.shape}; expected uint8 (H, W, 3), red first")
+    if masks.shape[1:] != image.shape[:2] or masks.dtype != np.bool_:
+        raise SceneError(
+            f"masks are {masks.dtype} {masks.shape}; expected bool (masks, {image.shape[0]}, {image.shape[1]}), as "
+            "large as the image"
+        )
 
 
 def mask_box(mask: NDArray[np.bool_]) -> tuple[int, int, int, int]:

@@ -15,20 +15,18 @@ from numpy.typing import NDArray
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.images import require_cv2, require_pillow
 from og_pointcloud.masking.contracts import MaskEncoder
-from og_pointcloud.masking.crops import Preprocessing
+from og_pointcloud.masking.crops import require_masks
+from og_pointcloud.masking.encode import ImageModel
 
 SHORTER_SIDE = 2.0
 """The image's shorter side in sides of the square that the model was trained on: patches of CLIP B/16 are then 28 to a
 side, and positions in between are interpolated."""
 
 
-class PatchModel(Protocol):
+class PatchModel(ImageModel, Protocol):
     """An image model that has vectors of patches. patch: its side, pixels."""
 
-    feature_space: str
-    width: int
     patch: int
-    preprocessing: Preprocessing
 
     def patches(self, pixels: NDArray[np.float32]) -> NDArray[np.float32]:
         """(h, w, width) unit vectors of pixels (1, 3, h * patch, w * patch)."""
@@ -46,8 +44,7 @@ class DenseEncoder(MaskEncoder):
 
         SceneError for arrays that do not fit together, and for a mask without a pixel.
         """
-        if image.ndim != 3 or masks.shape[1:] != image.shape[:2] or masks.dtype != np.bool_:
-            raise SceneError(f"masks are {masks.dtype} {masks.shape}, their image {image.shape}; expected one (H, W)")
+        require_masks(image, masks)
         if len(masks) == 0:
             return np.zeros((0, self.width), np.float32)
         if not masks.any(axis=(1, 2)).all():

@@ -62,30 +62,20 @@ def read_photographs(capture: Path) -> tuple[Photograph, ...]:
             f"{capture}: {len(missing)} of {len(files)} posed images are not found, e.g. '{missing[0]}'; expected all: "
             "masks are made from images, so copy them there or take them out of the pose file"
         )
-    photographs = tuple(
-        _photograph(name, image, file)
-        for name, image, file in zip(poses.names, poses.images, files, strict=True)
-        if file is not None
-    )
-    for photograph in photographs:
-        _check_size(photograph)
-    return photographs
+    named = zip(poses.names, poses.images, files, strict=True)
+    return tuple(_photograph(name, image, file) for name, image, file in named if file is not None)
 
 
 def _photograph(name: str, image: PosedImage, file: Path) -> Photograph:
-    face = image.face
-    if face is not None and not face.name:
-        return Photograph(name, image.path, file, face.whole)
-    return Photograph(name, image.path, file, image.camera, face)
-
-
-def _check_size(photograph: Photograph) -> None:
-    camera = photograph.camera if photograph.face is None else photograph.face.whole
+    whole = image.camera if image.face is None else image.face.whole
     cure = (
         "fix the width and height of the pose file, or turn the image (EXIF orientation is ignored, poses are of the "
         "pixels as stored)"
     )
-    require_scaled(f"{photograph.file} is", image_size(photograph.file), (camera.width, camera.height), cure)
+    require_scaled(f"{file} is", image_size(file), (whole.width, whole.height), cure)
+    if image.face is None or not image.face.name:
+        return Photograph(name, image.path, file, whole)
+    return Photograph(name, image.path, file, image.camera, image.face)
 
 
 def write_contact_sheet(path: Path, pictures: Sequence[tuple[NDArray[np.uint8], NDArray[np.int32]]]) -> None:
