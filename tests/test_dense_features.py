@@ -110,7 +110,7 @@ def test_the_smallest_mask_and_none_at_all(encoder):
     assert encoder.embed(image, masks[:0]).shape == (0, encoder.width)
     with pytest.raises(SceneError, match="no pixel"):
         encoder.embed(image, np.zeros((1, 40, 33), bool))
-    with pytest.raises(SceneError, match="expected one"):
+    with pytest.raises(SceneError, match="as large as the image"):
         encoder.embed(image, masks[:, :20])
 
 

@@ -15,18 +15,20 @@ from numpy.typing import NDArray
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.images import require_cv2, require_pillow
 from og_pointcloud.masking.contracts import MaskEncoder
-from og_pointcloud.masking.crops import require_masks
-from og_pointcloud.masking.encode import ImageModel
+from og_pointcloud.masking.crops import Preprocessing, require_masks
 
 SHORTER_SIDE = 2.0
 """The image's shorter side in sides of the square that the model was trained on: patches of CLIP B/16 are then 28 to a
 side, and positions in between are interpolated."""
 
 
-class PatchModel(ImageModel, Protocol):
+class PatchModel(Protocol):
     """An image model that has vectors of patches. patch: its side, pixels."""
 
+    feature_space: str
+    width: int
     patch: int
+    preprocessing: Preprocessing
 
     def patches(self, pixels: NDArray[np.float32]) -> NDArray[np.float32]:
         """(h, w, width) unit vectors of pixels (1, 3, h * patch, w * patch)."""
