@@ -120,12 +120,14 @@ class Journal:
             return
         from tqdm import tqdm
 
+        begun: set[str] = set()
         with tqdm(leave=False, dynamic_ncols=True, disable=None) as bar:
 
             def report(name: str, step: int, steps: int, loss: float) -> None:
-                if bar.desc != (stage := f"{name:<16}: "):
+                if name not in begun:
+                    begun.add(name)
                     bar.reset(steps)
-                    bar.set_description_str(stage, refresh=False)
+                    bar.set_description_str(f"{name:<16}: ", refresh=False)
                 bar.set_postfix(loss=f"{loss:.3g}", refresh=False)
                 bar.update(step - bar.n)
 

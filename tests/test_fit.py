@@ -433,3 +433,11 @@ def test_fit_of_the_package_is_the_function() -> None:
     assert og.fit is fit
     assert callable(og.fit)
     assert og.FitSettings is FitSettings
+
+
+def test_progress_of_training_says_nothing_without_a_terminal(capsys):
+    with Journal(progress=True).bars() as report:
+        for name in ("features", "codebook"):
+            for step in (1, 2):
+                report(name, step, 2, 0.5)
+    assert capsys.readouterr() == ("", "")
