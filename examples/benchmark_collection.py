@@ -201,14 +201,14 @@ def search(descriptors: int, instances: int, encoder: MadeEncoder) -> None:
     some = rows[:: max(1, len(rows) // 2000)] @ unit_rows(bank.vectors - bank.mean).T
     rows /= some.std()
     block = Block(
-        entries=(), vectors=rows, shift=np.full(len(rows), -some.mean() / some.std(), np.float32),
+        entries=tuple(SceneEntry(number, f"s{number}") for number in range(scenes)), vectors=rows, shift=np.full(len(rows), -some.mean() / some.std(), np.float32),
         bounds=np.arange(len(rows) + 1), scene=scene, instance=np.tile(np.arange(instances, dtype=np.int32), scenes),
         points=np.ones(len(rows), np.int32), center=np.zeros((len(rows), 3)), size=np.zeros((len(rows), 3)), bank=bank,
         sharpness=np.full(scenes, 3.25),
     )  # fmt: skip
     nothing = np.zeros((0, rows.shape[1]), np.float32)
-    everything = np.arange(len(rows))
-    for name, chosen in (("exact, all", everything), ("exact, half of the scenes", np.flatnonzero(scene % 2 == 0))):
+    everything, half = np.ones(scenes, bool), np.arange(scenes) % 2 == 0
+    for name, chosen in (("exact, all", everything), ("exact, half of the scenes", half)):
         times = []
         for word in range(ASKED):
             text = encoder.words.vectors[word]

@@ -321,6 +321,19 @@ def test_readers_see_the_atlas_before_a_change_or_after_it(folder):
     assert og.Collection(folder.parent / "atlas").scenes == collection.scenes[1:]
 
 
+def test_an_open_collection_notices_a_changed_atlas(folder):
+    collection = indexed(folder, {"a": scene(["desk"]), "b": scene(["chair"], 1)})
+    assert collection.find("chair")[0].scene == "b"
+    (folder / "b.ogpc").unlink()
+    indexed(folder, {"c": scene(["lamp", "chair"], 2)})
+    assert collection.scenes == ("a", "b")
+    assert collection.find("chair")[0].scene == "c"
+    assert collection.scenes == ("a", "c")
+    collection.path.unlink()
+    with pytest.raises(OgPointcloudError, match="is not a file; expected an atlas"):
+        collection.find("chair")
+
+
 def test_commands(folder, capsys, tmp_path):
     for k, things in enumerate((["chair", "mug"], ["desk"])):
         og.write_bundle(scene(things, k), folder / f"room{k}.ogpc")

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import fnmatch
 import json
 import os
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
@@ -100,10 +100,21 @@ class Collection:
         self.path = Path(path)
         self._lance = None if lance is None else LanceTables(lance)
         self.changes: Changes | None = None
-        self._blocks: dict[str, Block] = {}
-        with Atlas.reading(path) as atlas:
+        self._stamp: tuple[int, ...] = ()
+        self._open()
+
+    def _open(self) -> None:
+        """Read what scenes there are, if the atlas is another one than when that was read."""
+        state = self.path.stat() if self.path.is_file() else None
+        stamp = (state.st_ino, state.st_size, state.st_mtime_ns) if state else ()
+        if stamp and stamp == self._stamp:
+            return
+        with Atlas.reading(self.path) as atlas:
             self.root, self.entries = atlas.root, atlas.entries()
             self._groups = [group for family in families(atlas, self.entries) for group in family.groups()]
+        self._by_name = {entry.name: entry for entry in self.entries}
+        self._blocks: dict[str, Block] = {}
+        self._stamp = stamp
 
     @classmethod
     def index(
@@ -157,23 +168,23 @@ class Collection:
             raise OgPointcloudError(f"the words are {names!r:.80}; expected at least one word or phrase")
         features = read_text_features(text_features) if isinstance(text_features, (str, os.PathLike)) else text_features
         box = None if within is None else _corners(within)
+        self._open()
         wanted = _Wanted(self._ids(scenes), box, top)
-        asked = [group for group in self._groups if wanted.among(group.entries)]
+        asked = [group for group in self._groups if wanted.among(group)]
         vectors = [self._vectors(group.family, names, features) for group in asked]
         if not any(vectors):
             raise _unanswerable(names[0], [group.family for group in asked])
-        with Atlas.reading(self.path) as atlas:
-            found = [
-                pair
-                for group, known in zip(asked, vectors, strict=True)
-                for word, vector in known.items()
-                for pair in self._best(atlas, group, wanted, word, vector)
-            ]
+        found = [
+            pair
+            for group, known in zip(asked, vectors, strict=True)
+            for word, vector in known.items()
+            for pair in self._best(group, wanted, word, vector)
+        ]
         found.sort(key=lambda pair: -pair[0])  # stable: of equals the first
         counts: Counter[tuple[str, str]] = Counter()
         for group, known in zip(asked, vectors, strict=True):
             for word in set(names) - known.keys():
-                counts[word, group.family.feature_space] += len(wanted.among(group.entries))
+                counts[word, group.family.feature_space] += len(wanted.among(group))
         not_asked = tuple(
             f"{count} scenes of feature space '{space}' could not be asked for '{word}': no vector of theirs is known"
             for (word, space), count in sorted(counts.items())
@@ -186,13 +197,13 @@ class Collection:
             return None
         found: set[int] = set()
         for pattern in (scenes,) if isinstance(scenes, str) else scenes:
-            fitting = {entry.id for entry in self.entries if pattern == entry.name or fnmatchcase(entry.name, pattern)}
-            if not fitting:  # a name may hold brackets, hence the comparison
+            fitting = [pattern] if pattern in self._by_name else fnmatch.filter(self._by_name, pattern)
+            if not fitting:
                 raise OgPointcloudError(
                     f"no scene is called '{pattern}'{did_you_mean(pattern, self.scenes)}; expected one of the "
                     f"{len(self.entries)} scenes of {self.path}"
                 )
-            found |= fitting
+            found.update(self._by_name[name].id for name in fitting)
         return found
 
     def _vectors(
@@ -217,53 +228,34 @@ class Collection:
         return find_encoder(family.feature_space) if len(kins) == 1 else None
 
     def _best(
-        self, atlas: Atlas, group: Group, wanted: _Wanted, word: str, vector: NDArray[np.float32]
+        self, group: Group, wanted: _Wanted, word: str, vector: NDArray[np.float32]
     ) -> list[tuple[float, Finding]]:
         """The best of a group for a word, with what they are ranked by."""
-        here = wanted.among(group.entries)
-        if not here:
-            return []
-        block, rows = self._candidates(atlas, group, here, wanted, vector)
+        block = self._blocks.get(group.name) or self._block(group, wanted, vector)
+        asked = np.ones(len(block.entries), bool) if wanted.ids is None else np.isin(block.ids, list(wanted.ids))
         words = np.array([*group.family.words.values()], np.float32).reshape(-1, len(vector))
         rivals = words[words @ vector < SAME_WORD]
-        ranked = zip(*block.rank(vector, rivals, rows, wanted.top, wanted.box), strict=True)
+        ranked = zip(*block.rank(vector, rivals, asked, wanted.top, wanted.box), strict=True)
         return [(key, _finding(block, row, word, float(share(key)))) for row, key in ranked]
 
-    def _candidates(
-        self, atlas: Atlas, group: Group, here: Sequence[SceneEntry], wanted: _Wanted, vector: NDArray[np.float32]
-    ) -> tuple[Block, NDArray[np.intp]]:
-        """A block, and which of its instances are asked: all of the scenes that meet the box, or what LanceDB
-        proposes. All scenes are read once and kept, some of them each time."""
-        block = self._blocks.get(group.name)
-        if block is None:
-            ids = {entry.id for entry in here} if wanted.box is None else atlas.within(*wanted.box)
-            near = [entry for entry in here if entry.id in ids]
+    def _block(self, group: Group, wanted: _Wanted, vector: NDArray[np.float32]) -> Block:
+        """A group's scenes that are asked and meet the box, or of them those that LanceDB proposes. All scenes are kept
+        when they were read once, some are read each time."""
+        here = wanted.among(group)
+        with Atlas.reading(self.path) as atlas:
+            ids = atlas.within(*wanted.box) if wanted.box is not None else {entry.id for entry in here}
+            near = [entry for entry in here if entry.id in ids] or here[:1]
             is_all = len(near) == len(group.entries)
             if self._lance is not None and (is_all or len(near) > FEW_SCENES):
-                return self._proposed(atlas, group, near, wanted, vector)
-            block = load_block(atlas, atlas.side_by_side(near or here[:1]))
-            if is_all:
-                self._blocks[group.name] = block
-        asked = block.meets(wanted.box)
-        if wanted.ids is not None:
-            asked &= np.array([entry.id in wanted.ids for entry in block.entries], bool)
-        return block, np.flatnonzero(asked[block.scene])
-
-    def _proposed(
-        self, atlas: Atlas, group: Group, near: list[SceneEntry], wanted: _Wanted, vector: NDArray[np.float32]
-    ) -> tuple[Block, NDArray[np.intp]]:
-        """What LanceDB proposes of these scenes, read from the atlas."""
-        assert self._lance is not None
-        direction = load_block(atlas, near[:1]).direction(vector)
-        every = len(wanted.among(group.entries)) == len(group.entries)  # then the box says it all
-        some, part = None if every else [entry.id for entry in near], len(near) / len(group.entries)
-        proposed = self._lance.propose(group.name, direction, wanted.box, some, wanted.top, part)
-        block = load_block(atlas, [entry for entry in near if entry.id in proposed] or near[:1])
-        chosen = [
-            instance in proposed.get(block.entries[scene].id, ())
-            for scene, instance in zip(block.scene.tolist(), block.instance.tolist(), strict=True)
-        ]
-        return block, np.flatnonzero(chosen)
+                direction = load_block(atlas, near[:1]).direction(vector)
+                every = len(here) == len(group.entries)  # then the box says it all
+                some, part = None if every else [entry.id for entry in near], len(near) / len(group.entries)
+                proposed = self._lance.propose(group.name, direction, wanted.box, some, wanted.top, part)
+                return load_block(atlas, [entry for entry in near if entry.id in proposed] or near[:1])
+            block = load_block(atlas, atlas.side_by_side(near))
+        if is_all:
+            self._blocks[group.name] = block
+        return block
 
 
 @dataclass(frozen=True)
@@ -275,9 +267,11 @@ class _Wanted:
     box: NDArray[np.float64] | None
     top: int
 
-    def among(self, entries: Sequence[SceneEntry]) -> Sequence[SceneEntry]:
-        """Those scenes of some in which it may lie."""
-        return entries if self.ids is None else [entry for entry in entries if entry.id in self.ids]
+    def among(self, group: Group) -> Sequence[SceneEntry]:
+        """Those scenes of a group in which it may lie."""
+        if self.ids is None:
+            return group.entries
+        return [group.by_id[id] for id in sorted(self.ids & group.by_id.keys())]
 
 
 def _corners(within: Any) -> NDArray[np.float64]:

@@ -13,6 +13,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from hashlib import blake2b
 from pathlib import Path
 
@@ -138,6 +139,11 @@ class Group:
 
     family: Family
     entries: list[SceneEntry]
+
+    @cached_property
+    def by_id(self) -> dict[int, SceneEntry]:
+        """The scenes by their ids."""
+        return {entry.id: entry for entry in self.entries}
 
     @property
     def name(self) -> str:

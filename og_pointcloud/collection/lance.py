@@ -64,11 +64,10 @@ def _columns(block: Block) -> list[Any]:
     import pyarrow as pa  # pyright: ignore[reportMissingImports]
 
     instance = np.repeat(np.arange(len(block)), np.diff(block.bounds))
-    ids = np.array([entry.id for entry in block.entries], np.int64)
     vectors = np.column_stack([block.vectors, block.shift]).astype(np.float16)
     rows = pa.FixedSizeListArray.from_arrays(pa.array(vectors.ravel()), vectors.shape[1])
     numbers = [
-        ids[block.scene[instance]],
+        block.ids[block.scene[instance]],
         block.instance[instance].astype(np.int32),
         *block.center[instance].T,
     ]
@@ -89,8 +88,8 @@ class LanceTables:
         scenes: Sequence[int] | None,
         top: int,
         share: float = 1.0,
-    ) -> dict[int, set[int]]:
-        """Scene id -> instances with the descriptors of most evidence for a direction (D,). name: of the group. box:
+    ) -> set[int]:
+        """Ids of the scenes with the descriptors of most evidence for a direction (D,). name: of the group. box:
         (2, 3) corners that hold the instances' middles. scenes: ids of those that are asked; None for all. share: of
         the rows that box and scenes leave, about: the best of fewer rows lie in more partitions.
         """
@@ -109,7 +108,4 @@ class LanceTables:
             conditions += [f"{axis} BETWEEN {low!r} AND {high!r}" for axis, low, high in corners]
         if conditions:
             query = query.where(" AND ".join(conditions), prefilter=True)
-        rows, found = query.select(["scene", "instance", "_distance"]).to_arrow(), {}
-        for scene, instance in zip(rows["scene"].to_pylist(), rows["instance"].to_pylist(), strict=True):
-            found.setdefault(scene, set()).add(instance)
-        return found
+        return set(query.select(["scene", "_distance"]).to_arrow()["scene"].to_pylist())

@@ -25,9 +25,7 @@ RELEVANCY_TEMPERATURE = 10.0
 """Factor of the cosines in LERF's relevancy (Kerr et al., Language Embedded Radiance Fields, ICCV 2023, Sec. 3.4):
 of its released code, the paper gives none."""
 ROWS_AT_ONCE = 512
-"""Descriptors that are put together before a product: so many stay in a core's cache."""
-LEAST_RUN = 16
-"""Mean length of runs of neighbours from which each run has a product of its own."""
+"""Instances whose descriptors are put together before a product: so many stay in a core's cache."""
 FIRST = 64
 """Instances scored to the end at first; then four times as many, as long as it takes."""
 
@@ -60,83 +58,108 @@ class Block:
         return len(self.instance)
 
     @cached_property
+    def ids(self) -> NDArray[np.int64]:
+        """(S,) of the scenes in their atlas."""
+        return np.array([entry.id for entry in self.entries], np.int64)
+
+    @cached_property
+    def _starts(self) -> NDArray[np.intp]:
+        """(S + 1,) where each scene's instances begin, and where the last one's end."""
+        return np.searchsorted(self.scene, np.arange(len(self.entries) + 1))
+
+    @cached_property
     def _reach(self) -> NDArray[np.float64]:
         """(S, 2, 3) low and high corner of where the middles of a scene's instances lie; of one without, nowhere."""
         reach = np.full((len(self.entries), 2, 3), np.inf)
-        first = np.flatnonzero(np.diff(self.scene, prepend=-1))
-        for corner, least in enumerate((np.minimum, np.maximum)):
-            reach[self.scene[first], corner] = least.reduceat(self.center, first)
+        held = np.flatnonzero(np.diff(self._starts))
+        for corner, least in enumerate((np.minimum, np.maximum) if len(held) else ()):
+            reach[held, corner] = least.reduceat(self.center, self._starts[held])
         return reach
 
-    def meets(self, box: NDArray[np.float64] | None) -> NDArray[np.bool_]:
-        """(S,) whether some of a scene may have its middle in a box (2, 3); None for anywhere."""
-        if box is None or len(self) == 0:
-            return np.ones(len(self.entries), bool)
-        return ((self._reach[:, 0] <= box[1]) & (self._reach[:, 1] >= box[0])).all(axis=1)
+    @cached_property
+    def _bound(self) -> NDArray[np.float64]:
+        """(2, I) factor and summand that make of an instance's evidence what the logit of its score does not exceed."""
+        if self.bank is None:  # no cosine of a rival is below -1
+            return np.full((2, len(self)), RELEVANCY_TEMPERATURE)
+        sharpness = self.sharpness[self.scene]
+        return np.stack([sharpness, -(sharpness**2) / 2 - np.log(ChoosingSettings().kinds)])
 
-    def _within(self, box: NDArray[np.float64], rows: NDArray[np.intp]) -> NDArray[np.bool_]:
-        """(n,) whether these instances have their middles in the box; asked of scenes that it cuts alone."""
-        is_cut = ((self._reach[:, 0] < box[0]) | (self._reach[:, 1] > box[1])).any(axis=1)
-        within, asked = np.ones(len(rows), bool), np.flatnonzero(is_cut[self.scene[rows]])
-        middle = self.center[rows[asked]]
-        within[asked] = ((middle >= box[0]) & (middle <= box[1])).all(axis=1)
-        return within
+    @cached_property
+    def _judges(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """(D,) what the words of the bank share, and (B, D) unit rows of what they do not."""
+        assert self.bank is not None
+        return self.bank.mean, unit_rows(self.bank.vectors - self.bank.mean)
+
+    def meets(self, box: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """(S,) whether some of a scene may have its middle in a box (2, 3)."""
+        return ((self._reach[:, 0] <= box[1]) & (self._reach[:, 1] >= box[0])).all(axis=1)
 
     def direction(self, text: NDArray[np.float32]) -> NDArray[np.float32]:
         """(D,) unit vector of a text (D,) whose products with the vectors say how it fits."""
-        return unit_rows(text if self.bank is None else unit_rows(text) - self.bank.mean).astype(np.float32)
+        return unit_rows(text if self.bank is None else unit_rows(text) - self._judges[0]).astype(np.float32)
 
     def evidence(self, rows: NDArray[np.intp], directions: NDArray[np.float32]) -> NDArray[np.float32]:
         """(n, L) of these instances for directions (L, D): of several descriptors the best."""
-        if len(rows) == 0:
-            return np.zeros((0, len(directions)), np.float32)
-        count = self.bounds[rows + 1] - self.bounds[rows]
-        ends = np.cumsum(count)
-        scores = np.empty((ends[-1], len(directions)), np.float32)
-        last = np.append(np.flatnonzero(np.diff(rows) != 1), len(rows) - 1)  # of each run of neighbours
-        if len(last) * LEAST_RUN <= len(rows):  # multiplied where they lie: nothing else is read, and nothing copied
-            begins = self.bounds[rows[np.append(0, last[:-1] + 1)]]
-            runs = zip(begins.tolist(), self.bounds[rows[last] + 1].tolist(), ends[last].tolist(), strict=True)
-            for begin, end, filled in runs:
-                part = scores[filled - (end - begin) : filled]
-                np.matmul(self.vectors[begin:end], directions.T, out=part)
-                part += self.shift[begin:end, None]
-        else:
-            where = np.arange(ends[-1]) + np.repeat(self.bounds[rows] - (ends - count), count)
-            for start in range(0, len(where), ROWS_AT_ONCE):
-                some = where[start : start + ROWS_AT_ONCE]
-                scores[start : start + ROWS_AT_ONCE] = self.vectors[some] @ directions.T + self.shift[some, None]
-        return np.maximum.reduceat(scores, ends - count, axis=0)
+        found = np.empty((len(rows), len(directions)), np.float32)
+        for start in range(0, len(rows), ROWS_AT_ONCE):
+            some = rows[start : start + ROWS_AT_ONCE]
+            begins, ends = self.bounds[some], self.bounds[some + 1]
+            first = np.cumsum(ends - begins) - (ends - begins)
+            found[start : start + ROWS_AT_ONCE] = self._best_of(_ranges(begins, ends), first, directions)
+        return found
+
+    def _best_of(
+        self, rows: slice | NDArray[np.intp], first: NDArray[np.intp], directions: NDArray[np.float32]
+    ) -> NDArray[np.float32]:
+        """(n, L) the most evidence of some descriptors, of which each of n instances has those from its first one."""
+        scores = self.vectors[rows] @ directions.T
+        scores += self.shift[rows, None]
+        return scores if len(first) == len(scores) else np.maximum.reduceat(scores, first, axis=0)
 
     def rank(
         self,
         text: NDArray[np.float32],
         rivals: NDArray[np.float32],
-        rows: NDArray[np.intp],
+        asked: NDArray[np.bool_],
         top: int,
         box: NDArray[np.float64] | None = None,
     ) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
-        """The best ``top`` of these instances for a text (D,), of equals the first, and the logit of their scores.
+        """The best ``top`` instances of some scenes for a text (D,), of equals the first, and the logit of their scores.
 
-        box: (2, 3) corners that hold the instances' middles. Give the rows of whole scenes: it is faster to multiply a
-        long run of neighbours and drop some than to pick those that are asked.
+        asked: (S,) scenes. box: (2, 3) corners that hold the instances' middles.
         With a judge the score is the probability that the instance is what the text says, as `og.select` has it
         against no other word. Without, it is LERF's relevancy against rivals (M, D), unit rows.
         """
+        if box is not None:
+            asked = asked & self.meets(box)
+        edges = np.flatnonzero(np.diff(asked, prepend=False, append=False))
+        runs = self._starts[edges].reshape(-1, 2)  # of neighbours: multiplied where they lie, nothing is copied
         direction = self.direction(text)[None]
-        evidence = self.evidence(rows, direction)[:, 0].astype(np.float64)
-        if box is not None and len(rows):
-            within = self._within(box, rows)
-            rows, evidence = rows[within], evidence[within]
-        if self.bank is None:
-            bound, key_of = RELEVANCY_TEMPERATURE * (evidence + 1), self._relevancy  # no cosine is below -1
-        else:
-            sharpness, key_of = self.sharpness[self.scene[rows]], self._log_odds
-            bound = sharpness * evidence - sharpness**2 / 2 - np.log(ChoosingSettings().kinds)
-            bank = unit_rows(self.bank.vectors - self.bank.mean)
-            rivals = bank[(bank @ direction[0]) < ChoosingSettings().synonym]
-        places, key = largest(bound, lambda places: key_of(rows[places], direction, rivals), top)
-        return rows[places], key
+        bound = np.concatenate([np.zeros(0), *(self._bounds_of(begin, end, direction) for begin, end in runs.tolist())])
+        places = _Places(runs)
+        if box is not None:
+            bound[places.of(self._outside(asked, box))] = -np.inf
+        key_of = self._relevancy
+        if self.bank is not None:
+            key_of = self._log_odds
+            _, rivals = self._judges
+            rivals = rivals[(rivals @ direction[0]) < ChoosingSettings().synonym]
+        best, key = largest(bound, lambda some: key_of(places.rows(some), direction, rivals), top)
+        return places.rows(best), key
+
+    def _bounds_of(self, begin: int, end: int, direction: NDArray[np.float32]) -> NDArray[np.float64]:
+        """(end - begin,) bounds of the scores of neighbouring instances for a direction (1, D)."""
+        rows = slice(*self.bounds[[begin, end]].tolist())
+        evidence = self._best_of(rows, self.bounds[begin:end] - rows.start, direction)[:, 0]
+        factor, summand = self._bound[:, begin:end]
+        return factor * evidence + summand
+
+    def _outside(self, asked: NDArray[np.bool_], box: NDArray[np.float64]) -> NDArray[np.intp]:
+        """The instances of scenes that have their middles outside of a box; only scenes that it cuts have any."""
+        is_cut = asked & ((self._reach[:, 0] < box[0]) | (self._reach[:, 1] > box[1])).any(axis=1)
+        rows = _ranges(self._starts[:-1][is_cut], self._starts[1:][is_cut])
+        middle = self.center[rows]
+        return rows[((middle < box[0]) | (middle > box[1])).any(axis=1)]
 
     def _relevancy(
         self, rows: NDArray[np.intp], direction: NDArray[np.float32], rivals: NDArray[np.float32]
@@ -154,19 +177,44 @@ class Block:
         return said[:, 0] - log_mean_likelihood(said[:, 1:], sharpness) - np.log(ChoosingSettings().kinds)
 
 
+class _Places:
+    """Where instances of runs (n, 2), from and to rows in ascending order, are when these lie behind each other."""
+
+    def __init__(self, runs: NDArray[np.intp]) -> None:
+        self._begins, counts = runs[:, 0], np.diff(runs, axis=1)[:, 0]
+        self._ends = np.cumsum(counts)
+        self._back = runs[:, 1] - self._ends
+        """What is added to places of a run."""
+
+    def of(self, rows: NDArray[np.intp]) -> NDArray[np.intp]:
+        """The places of rows."""
+        return rows - self._back[np.searchsorted(self._begins, rows, "right") - 1] if len(rows) else rows
+
+    def rows(self, places: NDArray[np.intp]) -> NDArray[np.intp]:
+        """The rows at places."""
+        return places + self._back[np.searchsorted(self._ends, places, "right")] if len(places) else places
+
+
+def _ranges(begins: NDArray[np.intp], ends: NDArray[np.intp]) -> NDArray[np.intp]:
+    """All numbers from each beginning to each end, behind each other."""
+    count = ends - begins
+    return np.arange(count.sum()) + np.repeat(begins - (np.cumsum(count) - count), count)
+
+
 def largest(
     bound: NDArray[np.float64], key_of: Callable[[NDArray[np.intp]], NDArray[np.float64]], top: int
 ) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
     """The ``top`` places with the largest keys, of equals the first, and their keys; few keys are asked for.
 
-    bound: (n,) what the keys do not exceed. key_of: the keys of some places.
+    bound: (n,) what the keys do not exceed; places of -inf are none. key_of: the keys of some places.
     """
     known, key, count = np.zeros(0, np.intp), np.zeros(0), FIRST + top
     while True:
         tried = np.argpartition(-bound, count)[:count] if count < len(bound) else np.arange(len(bound))
+        tried = tried[bound[tried] > -np.inf]
         new = np.setdiff1d(tried, known, assume_unique=True)
         known, key = np.append(known, new), np.append(key, key_of(new))
-        if len(tried) == len(bound) or np.partition(key, -top)[-top] >= bound[tried].min():
+        if len(tried) < count or np.partition(key, -top)[-top] >= bound[tried].min():
             order = np.lexsort((known, -key))[:top]
             return known[order], key[order]
         count *= 4
