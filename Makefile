@@ -1,5 +1,5 @@
 # `make demo` and `make test` do their whole set-up in .venv; a second run starts at once.
-.PHONY: help setup demo test test-all lint check bench zoo clean
+.PHONY: help setup demo test test-all soak lint check bench zoo clean
 .DEFAULT_GOAL := help
 # A process a core; tests of one file stay together, since they share what is slow to make.
 PARALLEL := -n auto --dist loadfile
@@ -7,6 +7,7 @@ PARALLEL := -n auto --dist loadfile
 help:
 	@echo "make demo    build a furnished room, label it and show it: pictures and scores in out/demo"
 	@echo "make test    run the fast tests; make test-all runs all, as CI does"
+	@echo "make soak    ten minutes of frames, as a robot's: is memory flat?"
 	@echo "make lint    ruff and pyright"
 	@echo "make check   stiff and extreme cases beside references: table, CSV and picture in out/check"
 	@echo "make bench   seconds and error of the main pieces of work, beside another revision (AGAINST=REV)"
@@ -25,6 +26,9 @@ test: setup
 
 test-all: setup
 	@.venv/bin/python -m pytest $(PARALLEL)
+
+soak: setup
+	@OG_POINTCLOUD_SOAK_S=600 .venv/bin/python -m pytest -s -q tests/test_trust.py -k test_soak
 
 lint: setup
 	@.venv/bin/ruff check

@@ -2,7 +2,7 @@
 
 All that `KINDS` of repairs lists are tried on few views and points, the best again on all that were read, and one is
 named only if it fits well and far better than what the files say. Numbers (a scale, a focal length) are searched on a
-grid, then more finely.
+grid, then more finely. Where none fits, all are tried again behind one of the commonest.
 """
 
 from __future__ import annotations
@@ -21,6 +21,8 @@ from og_pointcloud.formats.repairs import KINDS, MASK_FLIPS, MASK_SHIFTS, Repair
 
 Repairs = tuple[Repair, ...]
 
+COMMONEST = "axes=flipped", "direction=inverse", "scale=1000", "scale=0.001", "frames=1", "frames=-1"
+"""Mistakes of which another one comes beside."""
 FINALISTS = 8
 """So many of the best of few views and points are tried again on all."""
 PHOTOGRAPHS_FIT, MASKS_FIT = (0.8, 0.4), (0.9, 0.18)
@@ -39,17 +41,21 @@ CLOSE = 1.1
 
 def best_conversion(evidence: Photographs | MaskMaps) -> Repairs:
     """The repairs of cameras that make photographs or masks fit; () if none does."""
-    few = evidence.fewer()
-    finalists = sorted(_tried(), key=lambda repairs: -_fit(few, repairs).gap)[:FINALISTS]
-    best = max(finalists, key=lambda repairs: _fit(evidence, repairs).gap)
-    if isinstance(evidence, MaskMaps):
-        return best if _convinces(evidence, best) else ()
-    best = _polished(best, evidence)
-    if _convinces(evidence, best):
-        return best
+    found = _best_of(evidence, _tried())
+    if found or isinstance(evidence, MaskMaps):
+        return found
     registration = Registration(evidence, evidence.sample.cameras, MORE_POINTS)
     moved = registration.repair("aligned", registration.refined("aligned", registration.found("aligned")))
-    return moved if _convinces(evidence, moved) else ()
+    return moved if _convinces(evidence, moved) else _best_of(evidence, _pairs())
+
+
+def _best_of(evidence: Photographs | MaskMaps, tried: Iterable[Repairs]) -> Repairs:
+    """The best of some, if it convinces."""
+    few = evidence.fewer()
+    finalists = sorted(tried, key=lambda repairs: -_fit(few, repairs).gap)[:FINALISTS]
+    best = max(finalists, key=lambda repairs: _fit(evidence, repairs).gap)
+    best = _polished(best, evidence) if isinstance(evidence, Photographs) else best
+    return best if _convinces(evidence, best) else ()
 
 
 def best_mask_conversion(maps: MaskMaps) -> Repairs:
@@ -76,6 +82,12 @@ def _tried() -> Iterable[Repairs]:
     yield from map(_parsed, (f"{flipped} {inverse}", f"{inverse} {flipped}", f"{flipped} {inverse} {flipped}"))
 
 
+def _pairs() -> Iterable[Repairs]:
+    """Every repair behind one of the commonest; those of other kinds are the same in either order, near enough."""
+    for first in map(_parsed, COMMONEST):
+        yield from (first + repairs for repairs in _tried() if repairs[0].name != first[0].name)
+
+
 def _parsed(words: str) -> Repairs:
     return tuple(map(Repair.parse, words.split()))
 
@@ -89,13 +101,13 @@ def _fit(evidence: Photographs | MaskMaps, repairs: Repairs) -> Comparison:
 
 
 def _polished(repairs: Repairs, photographs: Photographs) -> Repairs:
-    """The number of a repair, searched more finely, and made a round one where that fits as well."""
-    repair = repairs[0]
+    """The number of the last repair, searched more finely, and made a round one where that fits as well."""
+    *before, repair = repairs
     if not KINDS[repair.name].doublings:
         return repairs
 
     def error(value: float) -> float:
-        return 1 - _fit(photographs, _parsed(f"{repair.name}={value:.6g}")).own
+        return 1 - _fit(photographs, (*before, *_parsed(f"{repair.name}={value:.6g}"))).own
 
     value = repair.numbers[0]
     for width, count in ((0.06, 6), (0.01, 5), (0.002, 4)):
@@ -104,7 +116,7 @@ def _polished(repairs: Repairs, photographs: Photographs) -> Repairs:
         if abs(value / round_one - 1) < ROUND and error(round_one) <= CLOSE * error(value):
             value = round_one
             break
-    return _parsed(f"{repair.name}={value:.5g}")
+    return (*before, *_parsed(f"{repair.name}={value:.5g}"))
 
 
 def _convinces(evidence: Photographs | MaskMaps, repairs: Repairs) -> bool:
