@@ -180,3 +180,30 @@ def test_truncated_empty_and_foreign_files_are_one_error_and_stay(tmp_path):
             read_points(tmp_path / "a.e57")
         with pytest.raises(OgPointcloudError, match=r"not a whole E57 file"):
             unpack_e57(tmp_path / "a.e57", tmp_path / "capture")
+
+
+def test_scans_that_together_claim_too_much(tmp_path, monkeypatch):
+    """They may all name the same bytes."""
+    write_e57(tmp_path / "a.e57", scans=3)
+    monkeypatch.setattr("og_pointcloud.formats.e57.CHUNK", 10)
+    monkeypatch.setattr("og_pointcloud.formats.e57.MOST_POINTS_PER_BYTE", 700 / (tmp_path / "a.e57").stat().st_size)
+    with pytest.raises(SceneError, match="claims 300 points, more than fit"):
+        read_points(tmp_path / "a.e57")
+
+
+def test_a_sphere_of_another_size_is_not_unpacked(tmp_path, monkeypatch):
+    """A small file may unpack to gigabytes."""
+    images = [("large", "spherical", spherical(64, 32), encoded(640, 320), pose_of())]
+    write_e57(tmp_path / "a.e57", images=[*images, ("b", "pinhole", PINHOLE, encoded(64, 48), pose_of())])
+    monkeypatch.setattr(cv2, "imdecode", None)
+    count, unused = unpack_e57(tmp_path / "a.e57", tmp_path / "made")
+    assert count == 1
+    assert "of another size" in unused[0]
+
+
+def test_nothing_is_unpacked_through_a_link(tmp_path):
+    write_e57(tmp_path / "a.e57", images=[("b", "pinhole", PINHOLE, encoded(64, 48), pose_of())])
+    (tmp_path / "made").mkdir()
+    (tmp_path / "made" / "images").symlink_to(tmp_path)
+    with pytest.raises(SceneError, match="nothing is written through links"):
+        unpack_e57(tmp_path / "a.e57", tmp_path / "made")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import gzip
 import importlib
 import itertools
 import json
@@ -15,6 +16,7 @@ import threading
 import time
 import tracemalloc
 import zipfile
+import zlib
 from pathlib import Path
 
 import benchmark_stream
@@ -35,7 +37,7 @@ from hostile_files import (
 )
 from labelled_clouds import SPACE, WORDS, make_cloud, room, tough_clouds
 from og_pointcloud_export import write_bundle
-from scenes import write_tiny_capture
+from scenes import write_image, write_tiny_capture
 from test_bundle import SCHEMA_2
 from text_models import OUT
 
@@ -44,12 +46,16 @@ from og_pointcloud.bundle.known_graph import KNOWN_GRAPHS, query_graph_digest
 from og_pointcloud.cli import main
 from og_pointcloud.cloud import TOO_FAR
 from og_pointcloud.errors import BundleError, FeatureSpaceError, OgPointcloudError, SceneError, printable
+from og_pointcloud.formats import spz
 from og_pointcloud.formats.atomic import LOCK, locked, replacing, replacing_folder
 from og_pointcloud.formats.images import image_size, read_rgb
 from og_pointcloud.formats.las import write_las
 from og_pointcloud.formats.nerfstudio import read_transforms
 from og_pointcloud.formats.npy import arrays_from_npz, npy_bytes
 from og_pointcloud.formats.points import read_points
+from og_pointcloud.formats.poses import numbered_images, read_numbers
+from og_pointcloud.formats.structure_from_motion import find_poses
+from og_pointcloud.mapping.map_journal import HEAD, MAGIC, MapJournal, packed
 from og_pointcloud.masking.make_masks import MaskSettings, make_masks
 from og_pointcloud.text.encoder import TextEncoder, check_templates
 
@@ -602,6 +608,78 @@ def test_commands_open_no_connection_and_run_no_program(tiny_capture, tmp_path):
     ):  # fmt: skip
         ran = subprocess.run([sys.executable, "-c", WATCHED, *command.split()], capture_output=True, text=True)
         assert ran.returncode == 0, (command, ran.stderr)
+
+
+# Files that are none, and folders of others -------------------------------------------------------------------------
+
+
+def test_pipes_and_devices_are_no_files(tmp_path):
+    """They never end."""
+    os.mkfifo(tmp_path / "1.png")
+    os.mkfifo(tmp_path / "poses.txt")
+    assert numbered_images(tmp_path) == []
+    for path in (tmp_path / "poses.txt", Path("/dev/null")):
+        with pytest.raises(SceneError, match="is no file; expected a text file"):
+            read_numbers(path, 17)
+    og.write_bundle(room(), tmp_path / "scans" / "a.ogpc")
+    os.mkfifo(tmp_path / "scans" / "b.ogpc")
+    changes = og.Collection.index(tmp_path / "scans", tmp_path / "atlas", progress=False).changes
+    assert changes is not None
+    assert changes.added == ("a",)
+    assert [name for name, _ in changes.left_out] == ["b"]
+
+
+def test_a_log_of_others_is_left_as_it_is(tmp_path):
+    """A torn record at the end of a map's log is cut off; so would be all of a file that is another's."""
+    (tmp_path / "frames.log").write_bytes(b"somebody's frames")
+    with pytest.raises(OgPointcloudError, match="was not written by a map"):
+        list(MapJournal(tmp_path, "nothing").frames())
+    assert (tmp_path / "frames.log").read_bytes() == b"somebody's frames"
+    (tmp_path / "link").mkdir()
+    (tmp_path / "own.log").write_bytes(MAGIC)
+    (tmp_path / "link" / "frames.log").symlink_to(tmp_path / "own.log")
+    with pytest.raises(OgPointcloudError, match="was not written by a map"):
+        list(MapJournal(tmp_path / "link", "nothing").frames())
+
+
+def test_a_state_that_holds_something_else(tmp_path):
+    for value in (3, ("a", "b"), ["a"]):
+        data = packed(value)
+        (tmp_path / "map.state").write_bytes(HEAD.pack(MAGIC, len(data), zlib.crc32(data)) + data)
+        with pytest.raises(OgPointcloudError, match="is damaged: remove the folder"):
+            MapJournal(tmp_path, "nothing").state()
+
+
+def test_links_to_nowhere_are_told_before_the_work(tmp_path):
+    for k in range(3):
+        write_image(tmp_path / f"photographs/{k}.png", np.zeros((20, 20, 3), np.uint8))
+    for name, cause in (("sparse", "sparse is there already"), ("images", "holds other images")):
+        target = tmp_path / f"with {name}"
+        target.mkdir()
+        (target / name).symlink_to(tmp_path / "nowhere")
+        with pytest.raises(SceneError, match=cause):
+            find_poses(tmp_path / "photographs", target)
+
+
+def test_names_of_files_are_printed_as_text(tmp_path, capsys):
+    """Nobody chooses the names of files in a folder that was downloaded."""
+    og.write_bundle(room(), tmp_path / "scans" / "a.ogpc")
+    (tmp_path / "scans" / f"{ESCAPE}.ogpc").write_text("no scene")
+    assert main(["index", str(tmp_path / "scans"), "-o", str(tmp_path / "atlas")]) == 0
+    captures = [tmp_path / f"{ESCAPE}{k}" for k in range(2)]
+    for capture in captures:
+        capture.mkdir()
+    assert main(["fit", *map(str, captures), "--out", str(tmp_path / "fitted")]) == 2
+    printed = "".join(capsys.readouterr())
+    assert printed.count("owned") >= 4
+    assert "\x1b" not in printed
+
+
+def test_splats_that_fill_memory(tmp_path):
+    raw = spz.HEADER.pack(spz.MAGIC, 3, 1_000_000, 0, 12, 0, 0) + bytes(20_000_000)
+    (tmp_path / "a.spz").write_bytes(gzip.compress(raw) + bytes(500_000))
+    with pytest.raises(SceneError, match="made to fill memory"):
+        read_points(tmp_path / "a.spz")
 
 
 # Streams --------------------------------------------------------------------------------------------------------------

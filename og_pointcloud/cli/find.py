@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from og_pointcloud.cli.common import Parser, add_option, add_output, add_shared, check_at_least, numbers, print_table
+from og_pointcloud.errors import printable
 
 if TYPE_CHECKING:
     from og_pointcloud.collection.collection import Finding
@@ -46,7 +47,7 @@ def run(arguments: argparse.Namespace) -> None:
     if arguments.html:
         write_findings(arguments.html, collection, findings, ", ".join(arguments.words))
     for note in findings.not_asked:
-        print(f"warning: {note}", file=sys.stderr)
+        print(f"warning: {printable(note)}", file=sys.stderr)
     if arguments.json:
         print(findings.to_json())
         return

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, get_args, get_type_hints
 import og_pointcloud as og
 from og_pointcloud.cli import common
 from og_pointcloud.cli.common import Parser, add_option, add_output, add_shared, replaceable, write_json
-from og_pointcloud.errors import MissingExtraError, OgPointcloudError
+from og_pointcloud.errors import MissingExtraError, OgPointcloudError, printable
 from og_pointcloud.journal import Journal
 from og_pointcloud.settings import FitSettings, PaperSettings
 
@@ -115,9 +115,11 @@ def fit_several(arguments: argparse.Namespace, options: FitOptions, executor: Ex
     print(f"{len(made)} fitted, {there} were there already, {len(failed)} failed, in {arguments.out}")
     for fit in made:
         if fit.doubts:
-            print(f"doubt: {fit.name}: {', '.join(fit.doubts)} (og-pointcloud info {shlex.quote(fit.output)} says why)")
+            doubts = ", ".join(fit.doubts)
+            why = printable(f"{fit.name}: {doubts} (og-pointcloud info {shlex.quote(fit.output)} says why)")
+            print(f"doubt: {why}")
     for fit in failed:
-        print(f"failed: {fit.capture}: {fit.cause}", file=sys.stderr)
+        print(f"failed: {printable(fit.capture)}: {printable(fit.cause)}", file=sys.stderr)
     if len(failed) < len(fits):
         common.print_next("index", arguments.out, "-o", arguments.out / "atlas")
     if failed:

@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 
 from og_pointcloud.cli.common import Parser, add_option, print_next, replaceable
+from og_pointcloud.errors import printable
 
 
 def add(parser: Parser) -> None:
@@ -26,7 +27,7 @@ def run(arguments: argparse.Namespace) -> None:
     changes = collection.changes
     assert changes is not None
     for name, cause in changes.left_out:
-        print(f"warning: {name} is left out: {cause}", file=sys.stderr)
+        print(f"warning: {printable(name, 200)} is left out: {cause}", file=sys.stderr)
     instances = sum(entry.instances for entry in collection.entries)
     print(f"{changes}: {len(collection.scenes):,} scenes with {instances:,} instances in {arguments.output}")
     if arguments.lance:

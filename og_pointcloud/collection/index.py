@@ -89,6 +89,8 @@ def _is_same(file: Path, entry: SceneEntry) -> bool:
 
 def _take(atlas: Atlas, name: str, file: Path, known: SceneEntry | None) -> bool:
     """Put a .ogpc file into the atlas; False where it has another date, but the content that is known."""
+    if not file.is_file():
+        raise OgPointcloudError(f"{file} is no file; expected one")  # a device or a pipe never ends
     state = file.stat()
     digest = blake2b(file.read_bytes(), digest_size=16).hexdigest()
     if known is not None and known.digest == digest:

@@ -124,7 +124,7 @@ class Block:
         top: int,
         box: NDArray[np.float64] | None = None,
     ) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
-        """The best ``top`` instances of some scenes for a text (D,), of equals the first, and the logit of their scores.
+        """The best ``top`` instances of scenes for a text (D,), of equals the first, and the logit of their scores.
 
         asked: (S,) scenes. box: (2, 3) corners that hold the instances' middles.
         With a judge the score is the probability that the instance is what the text says, as `og.select` has it

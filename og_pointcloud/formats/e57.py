@@ -7,6 +7,7 @@ show the place (visual references) cannot be used. Read by pye57's libE57 (MIT, 
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import re
@@ -20,7 +21,7 @@ from numpy.typing import NDArray
 
 from og_pointcloud.errors import MissingExtraError, OgPointcloudError, SceneError
 from og_pointcloud.formats.atomic import replacing
-from og_pointcloud.formats.images import MAX_PIXELS, require_cv2
+from og_pointcloud.formats.images import MAX_PIXELS, require_cv2, stated_size
 from og_pointcloud.formats.ply import plain_rows, write_ply
 from og_pointcloud.formats.poses import pose_of_quaternion
 from og_pointcloud.formats.tables import naming
@@ -54,7 +55,7 @@ def read_e57(path: str | os.PathLike[str]) -> Points:
         most = MOST_POINTS_PER_BYTE * path.stat().st_size
         for scan in _children(file.root(), "data3D"):
             parts += _scan(libe57, file, scan, most)
-            most -= sum(len(xyz) for xyz, _ in parts[-1:])
+            most -= scan["points"].childCount()  # several scans may name the same bytes
         if not parts:
             raise SceneError("it has no scan with points; expected one or more: export the scans with the images")
         xyz = np.concatenate([xyz for xyz, _ in parts])
@@ -69,6 +70,10 @@ def unpack_e57(path: str | os.PathLike[str], folder: str | os.PathLike[str]) -> 
     Returns the number of images, and of each one that cannot be used its name and why. SceneError where there is none.
     """
     path, folder = Path(path), Path(folder)
+    if (folder / "images").is_symlink():
+        raise SceneError(
+            f"{folder / 'images'} is a link; expected none, as nothing is written through links: remove it"
+        )
     points = read_e57(path)
     frames, unused = [], []
     with _opened(path) as (_, file):
@@ -237,8 +242,10 @@ def _whole_sphere(data: bytes, suffix: str, size: tuple[int, int], pixel: tuple[
         turn, rise = np.degrees([width * across, height * along])
         raise SceneError(f"it spans {turn:.0f} x {rise:.0f} degrees; expected 360 across, and 180 at most")
     cv2 = require_cv2()
-    pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-    if pixels is None or pixels.shape[:2] != (height, width):
+    pixels = None
+    if stated_size(io.BytesIO(data)) == size:  # a small file may unpack to gigabytes
+        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    if pixels is None:
         raise SceneError("its JPEG or PNG is damaged, or of another size than the file says")
     whole = width // 2 * 2, width // 2
     shown = min(whole[1], max(1, round(whole[1] * height * along / np.pi)))

@@ -89,7 +89,7 @@ def png_header(file: Path) -> PngHeader | None:
 def image_size(file: Path) -> tuple[int, int]:
     """(width, height) of an image file, as its header states it. SceneError beyond MAX_PIXELS."""
     with file.open("rb") as stream:
-        size = _stated_size(stream)
+        size = stated_size(stream)
     if size is None:  # of a kind that is not known here
         height, width = decoded(file, require_cv2().IMREAD_GRAYSCALE).shape[:2]
         return width, height
@@ -102,7 +102,7 @@ def _check_pixels(file: Path, width: int, height: int) -> None:
         raise SceneError(f"{file} says it is {width}x{height} pixels; expected at most {MAX_PIXELS} pixels")
 
 
-def _stated_size(stream: BinaryIO) -> tuple[int, int] | None:
+def stated_size(stream: BinaryIO) -> tuple[int, int] | None:
     """(width, height) as a PNG, JPEG, BMP, WebP or TIFF states it; None where the file is no such image."""
     head = stream.read(30)
     if head[:8] == b"\x89PNG\r\n\x1a\n" and head[12:16] == b"IHDR":
@@ -164,7 +164,7 @@ def decoded(file: Path, flags: int) -> NDArray[np.generic]:
     """The pixels as OpenCV gives them. EXIF orientation is ignored, as poses and masks ignore it."""
     cv2 = require_cv2()
     data = np.fromfile(file, np.uint8)
-    if stated := _stated_size(io.BytesIO(data.tobytes())):
+    if stated := stated_size(io.BytesIO(data.tobytes())):
         _check_pixels(file, *stated)
     try:
         pixels = cv2.imdecode(data, flags | cv2.IMREAD_IGNORE_ORIENTATION) if data.size else None

@@ -201,7 +201,8 @@ def numbered(files: Iterable[Path]) -> list[Path]:
 
 def numbered_images(folder: Path) -> list[Path]:
     """The images in a folder, as `numbered`; none where it is no folder."""
-    return numbered(file for file in folder.iterdir() if file.suffix in IMAGE_SUFFIXES) if folder.is_dir() else []
+    found = folder.iterdir() if folder.is_dir() else ()
+    return numbered(file for file in found if file.suffix in IMAGE_SUFFIXES and file.is_file())
 
 
 def read_json(file: Path, most: int = MAX_TEXT_BYTES) -> Any:
@@ -217,6 +218,8 @@ def read_json(file: Path, most: int = MAX_TEXT_BYTES) -> Any:
 def read_text(file: Path) -> str:
     """A text file of bounded size; SceneError where it is longer, or no text."""
     try:
+        if not file.is_file():
+            raise SceneError(f"{file} is no file; expected a text file of numbers")  # a device or a pipe never ends
         if (size := file.stat().st_size) > MAX_TEXT_BYTES:
             raise SceneError(f"{file} has {size} bytes; expected a text file of numbers, at most {MAX_TEXT_BYTES}")
         return file.read_text(encoding="utf-8")

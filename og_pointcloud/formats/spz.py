@@ -42,7 +42,7 @@ MAGNITUDE = 511
 """The largest of the nine bits that a part of a rotation has beside its sign."""
 TURNED = np.array([1.0, -1.0, -1.0])
 """Factors of x, y, z, of positions and of quaternions, from one convention of axes to the other."""
-MOST_RATIO, PLENTY = 60, 1 << 20
+MOST_RATIO, PLENTY = 20, 1 << 24
 """How many times its bytes a file may unpack to, and the bytes that any may: quantised noise shrinks to a half."""
 COARSEST = 1e-4
 """The step of positions, over the cloud's extent, up to which they may be rounded."""

@@ -100,10 +100,11 @@ def _photographs(source: Path, target: Path) -> list[Path]:
     files = numbered_images(source) or numbered_images(source / "images")
     if len(files) < FEWEST:
         raise SceneError(f"{source} has {len(files)} photographs; expected {FEWEST} or more, there or in its images/")
-    if (target / MODEL_FOLDER).exists():
+    if os.path.lexists(target / MODEL_FOLDER):
         raise SceneError(f"{target / MODEL_FOLDER} is there already; expected none: remove it, or name another folder")
     images = target / "images"
-    if target != source and images.exists() and not images.samefile(files[0].parent):
+    is_other = not images.exists() or not images.samefile(files[0].parent)
+    if target != source and os.path.lexists(images) and is_other:
         raise SceneError(f"{images} holds other images than {files[0].parent}; expected none: name another folder (-o)")
     return files
 

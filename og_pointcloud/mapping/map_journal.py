@@ -67,9 +67,10 @@ class MapJournal:
             return None
         with self._state.open("rb") as file:
             record = _next_record(file)
-        began_with, known = (None, None) if record is None else unpacked(record, str(self._state))
-        if not isinstance(known, GrowingMap):
+        content = None if record is None else unpacked(record, str(self._state))
+        if not (isinstance(content, tuple) and len(content) == 2 and isinstance(content[1], GrowingMap)):
             raise OgPointcloudError(f"{self._state} is damaged: remove the folder and map again")
+        began_with, known = content
         if began_with != self._origin:
             raise OgPointcloudError(
                 f"{self.folder} holds a map that began with {began_with}, not with {self._origin}: give that, or "
@@ -83,6 +84,10 @@ class MapJournal:
             return
         whole = 0
         with self._log.open("rb") as file:
+            if self._log.is_symlink() or file.peek(4)[:4] != MAGIC[: self._log.stat().st_size]:
+                raise OgPointcloudError(
+                    f"{self._log} was not written by a map: it is left as it is; give another folder"
+                )
             while record := _next_record(file):
                 whole = file.tell()
                 yield unpacked(record, str(self._log))
