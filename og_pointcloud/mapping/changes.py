@@ -29,7 +29,17 @@ from og_pointcloud.ask.labelled_scene import SceneLike, as_scene
 from og_pointcloud.cloud import LabelledCloud
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.poses import in_local_frame
-from og_pointcloud.mapping.likeness import ALIKE, Look, descriptors_of, likeness, typical_of_table
+from og_pointcloud.mapping.likeness import (
+    ALIKE,
+    FEWEST_SAME,
+    OTHER_COLOR,
+    Look,
+    Scale,
+    cosines,
+    descriptors_of,
+    spread_of,
+    typical_cosine,
+)
 from og_pointcloud.mapping.map_record import MapRecord
 from og_pointcloud.mapping.presence import Presence
 from og_pointcloud.mapping.sight import DiscSurface, MeasuredView
@@ -43,6 +53,10 @@ SCATTER = 2.0
 """Standard deviations of the points off their surface, where that is more: of dense and noisy clouds."""
 MOST = 0.5
 """Share of an instance's telling points that decides."""
+SAME_SURFACE = 1.5
+"""Spacings within which two visits' points are of one surface."""
+USUAL_COLORS = 3.0
+"""Times that the colour of one thing may differ more than that of the median thing which has not moved."""
 FEWEST_POINTS, LEAST_SHARE = 5, 0.05
 """Points of an instance, and share of those that show, that must be looked at before anything is said of it."""
 TELLING = 1.5
@@ -159,6 +173,26 @@ class Visit:
         order = np.argsort(ids, kind="stable")
         return np.split(order, np.searchsorted(ids[order], np.arange(len(self.cloud.instances) + 1)))[1:-1]
 
+    @cached_property
+    def described(self) -> NDArray[np.int64]:
+        """(instances,) how many descriptors each has."""
+        table = self.cloud.instances
+        return np.bincount(table.descriptor_instance, minlength=len(table))
+
+    @cached_property
+    def adjoining(self) -> NDArray[np.bool_]:
+        """(instances, instances): those with points that are neighbours of each other's; each adjoins itself."""
+        ids, found = self.cloud.instance_ids, np.eye(len(self.cloud.instances), dtype=bool)
+        for neighbour in self.around.index.T:
+            both = (ids >= 0) & (ids[neighbour] >= 0)
+            found[ids[both], ids[neighbour[both]]] = True
+        return found | found.T
+
+    def color_of(self, instance: int) -> NDArray[np.float64]:
+        """(3,) the median colour of an instance; of a cloud with colours."""
+        assert self.cloud.rgb is not None
+        return np.median(self.cloud.rgb[self.points_of(instance)], axis=0)
+
     def look(self, instance: int, rows: NDArray[np.int64]) -> Look:
         """The look of an instance, by some of its points."""
         cloud = self.cloud
@@ -219,12 +253,14 @@ class Evidence:
 
 @dataclass(frozen=True)
 class Comparison:
-    """changes, and what they rest on. of_earlier, of_later: the evidence about each visit's points. pieces: later id ->
-    the later id whose thing it is a piece of. gone_pieces: earlier id -> the moved thing that it was a piece of."""
+    """changes, and what they rest on. of_earlier, of_later: the evidence about each visit's points. nearest: of each
+    later point the row of the nearest earlier one, -1 where none is of its surface. pieces: later id -> the later id
+    whose thing it is a piece of. gone_pieces: earlier id -> the moved thing that it was a piece of."""
 
     changes: Changes
     of_earlier: Evidence
     of_later: Evidence
+    nearest: NDArray[np.int64]
     pieces: dict[int, int]
     gone_pieces: dict[int, int]
 
@@ -253,7 +289,8 @@ def compare_visits(
         again, shows = (asked.present, asked.absent), own.present
     of_earlier = Evidence(shown.present | (not a.cameras), *again, earlier.telling(tolerance))
     of_later = Evidence(shows, known.present, known.absent, later.telling(tolerance))
-    return _decide(earlier, later, of_earlier, of_later)
+    distance, nearest = map(np.asarray, cKDTree(a.xyz).query(b.xyz, workers=-1))
+    return _decide(earlier, later, of_earlier, of_later, np.where(distance <= SAME_SURFACE * a.spacing, nearest, -1))
 
 
 def _require_one_frame(asked: Presence) -> None:
@@ -279,19 +316,21 @@ class _Thing:
     points: int
 
 
-def _decide(earlier: Visit, later: Visit, of_earlier: Evidence, of_later: Evidence) -> Comparison:
+def _decide(
+    earlier: Visit, later: Visit, of_earlier: Evidence, of_later: Evidence, nearest: NDArray[np.int64]
+) -> Comparison:
     left, hardly = of_earlier.decided(earlier)
     came, _ = of_later.decided(later)
-    typical = typical_of_table(later.cloud.instances)
-    gone = _things(earlier, np.flatnonzero(left).tolist(), of_earlier.through, typical)
-    new = _things(later, np.flatnonzero(came).tolist(), of_later.through, typical)
+    scale = _scale(earlier, later, _unmoved(earlier, later, nearest, left, came))
+    gone = _things(earlier, np.flatnonzero(left).tolist(), of_earlier.through, scale)
+    new = _things(later, np.flatnonzero(came).tolist(), of_later.through, scale)
     retired = [  # what an earlier visit found gone, and may be back
         _Thing((k,), entry.look(earlier.cloud.instances, k), np.array(entry.place), 0)
         for k, entry in MapRecord.of(earlier.cloud).gone.items()
     ]
     unmatched, gone = set(range(len(gone))), [*gone, *retired]
-    pairs = _matched(gone, new, typical)
-    new = _with_scattered(gone, new, pairs, typical)
+    pairs = _matched(gone, new, scale)
+    new = _with_scattered(gone, new, pairs, scale)
     taken = set(pairs.values())
     changes = Changes(
         gone=tuple(sorted(k for g in unmatched - {*pairs} for k in gone[g].pieces)),
@@ -303,21 +342,58 @@ def _decide(earlier: Visit, later: Visit, of_earlier: Evidence, of_later: Eviden
     )
     pieces = {piece: thing.pieces[0] for thing in new for piece in thing.pieces}
     gone_pieces = {piece: gone[g].pieces[0] for g in pairs for piece in gone[g].pieces}
-    return Comparison(changes, of_earlier, of_later, pieces, gone_pieces)
+    return Comparison(changes, of_earlier, of_later, nearest, pieces, gone_pieces)
 
 
-def _things(visit: Visit, candidates: list[int], through: NDArray[np.bool_], typical: float) -> list[_Thing]:
+def _unmoved(
+    earlier: Visit, later: Visit, nearest: NDArray[np.int64], left: NDArray[np.bool_], came: NDArray[np.bool_]
+) -> NDArray[np.int64]:
+    """(m, 2) instances of both visits that share most of their surface with each other, and neither left nor came."""
+    ids, count = later.cloud.instance_ids, (len(left), len(came))
+    owners = np.where(nearest >= 0, earlier.cloud.instance_ids[nearest], -1)
+    both = (ids >= 0) & (owners >= 0)
+    shared = np.bincount(owners[both] * np.int64(count[1]) + ids[both], minlength=count[0] * count[1]).reshape(count)
+    shared[left], shared[:, came] = 0, 0
+    if not shared.size:
+        return np.zeros((0, 2), np.int64)
+    one = np.flatnonzero((shared.max(axis=1) >= FEWEST_POINTS) & (earlier.described > 0))
+    other = shared[one].argmax(axis=1)
+    mutual = (shared[:, other].argmax(axis=0) == one) & (later.described[other] > 0)
+    return np.stack([one, other], axis=1)[mutual]
+
+
+def _scale(earlier: Visit, later: Visit, unmoved: NDArray[np.int64]) -> Scale:
+    """What cosines and colours mean, by what has not moved, (m, 2): how alike the two visits show it, and how alike it
+    is to what is most like it of the rest."""
+    a, b = earlier.cloud.instances, later.cloud.instances
+    between = cosines(a, b)[np.ix_(*unmoved.T)]
+    others = np.where(later.adjoining[np.ix_(unmoved[:, 1], unmoved[:, 1])], -np.inf, between).max(
+        axis=1, initial=-np.inf
+    )
+    others = others[np.isfinite(others)]
+    if len(others) < FEWEST_SAME:
+        return Scale(other=typical_cosine(b.descriptors, spread_of(b.agreement, b.masks)[b.descriptor_instance]))
+    same, other = float(np.median(between.diagonal())), float(np.median(others))
+    if earlier.cloud.rgb is None or later.cloud.rgb is None:
+        return Scale(same, other)
+    off = np.array([later.color_of(k) - earlier.color_of(i) for i, k in unmoved.tolist()])
+    shift = np.median(off, axis=0)
+    usual = float(np.median(np.abs(off - shift).max(axis=1)))
+    return Scale(same, other, shift, max(OTHER_COLOR, USUAL_COLORS * usual))
+
+
+def _things(visit: Visit, candidates: list[int], through: NDArray[np.bool_], scale: Scale) -> list[_Thing]:
     """Candidates, those that adjoin and look alike together: pieces of one thing. Of a small piece, which few masks
     show, the colour is enough."""
     rows = {k: visit.points_of(k)[through[visit.points_of(k)]] for k in candidates}
     looks = {k: visit.look(k, of) for k, of in rows.items()}
     trees = {k: cKDTree(visit.cloud.xyz[of]) for k, of in rows.items()}
     group = {k: k for k in candidates}
-    reach = ADJOINING * visit.cloud.spacing
+    reach, within = ADJOINING * visit.cloud.spacing, replace(scale, shift=0.0)
     for index, one in enumerate(candidates):
         for other in candidates[index + 1 :]:
             small = SMALL_PIECE * max(len(rows[one]), len(rows[other])) > min(len(rows[one]), len(rows[other]))
-            alike = likeness(looks[one], looks[other], typical) > ALIKE
+            alike = within.likeness(looks[one], looks[other]) > ALIKE
             alike |= small and looks[one].has_color_of(looks[other])
             if alike and trees[one].count_neighbors(trees[other], reach):
                 group = {k: group[one] if of == group[other] else of for k, of in group.items()}
@@ -329,11 +405,11 @@ def _things(visit: Visit, candidates: list[int], through: NDArray[np.bool_], typ
     return things
 
 
-def _matched(gone: list[_Thing], new: list[_Thing], typical: float) -> dict[int, int]:
+def _matched(gone: list[_Thing], new: list[_Thing], scale: Scale) -> dict[int, int]:
     """Row of gone -> row of new, where the two look like one thing, best pairs first over all."""
     if not gone or not new:
         return {}
-    alike = np.array([[likeness(one.look, other.look, typical) for other in new] for one in gone])
+    alike = np.array([[scale.likeness(one.look, other.look) for other in new] for one in gone])
     lengths = [np.array([thing.look.length for thing in things]) for things in (gone, new)]
     as_long = np.minimum.outer(*lengths) / np.maximum(np.maximum.outer(*lengths), 1e-12)
     # Of several that are alike, pieces of one thing perhaps, the one that is as long.
@@ -341,7 +417,7 @@ def _matched(gone: list[_Thing], new: list[_Thing], typical: float) -> dict[int,
     return {int(g): int(n) for g, n in zip(rows, columns, strict=True) if alike[g, n] > ALIKE}
 
 
-def _with_scattered(gone: list[_Thing], new: list[_Thing], pairs: dict[int, int], typical: float) -> list[_Thing]:
+def _with_scattered(gone: list[_Thing], new: list[_Thing], pairs: dict[int, int], scale: Scale) -> list[_Thing]:
     """The new things, those that are more pieces of one that moved within it: they look like it, have its colour, and
     lie no farther off than it is long. What holds their pieces then has none of its own."""
     things = list(new)
@@ -350,7 +426,7 @@ def _with_scattered(gone: list[_Thing], new: list[_Thing], pairs: dict[int, int]
             if other in pairs.values() or not things[other].pieces:
                 continue
             near = np.linalg.norm(thing.place - new[n].place) < gone[g].look.length
-            if near and gone[g].look.has_color_of(thing.look) and likeness(gone[g].look, thing.look, typical) > ALIKE:
+            if near and gone[g].look.has_color_of(thing.look) and scale.likeness(gone[g].look, thing.look) > ALIKE:
                 one, count = things[n], things[n].points + thing.points
                 place = (one.points * one.place + thing.points * thing.place) / count
                 things[n] = replace(one, pieces=(*one.pieces, *thing.pieces), place=place, points=count)

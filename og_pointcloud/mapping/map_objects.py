@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from og_pointcloud.mapping.changes import FEWEST_POINTS, FLAT_SHARE, MOST, Moved
 from og_pointcloud.mapping.growing_map import GrowingMap
-from og_pointcloud.mapping.likeness import ALIKE, Look, likeness, typical_cosine
-from og_pointcloud.mapping.tracks import NO_TRACK, Left, Track
+from og_pointcloud.mapping.likeness import ALIKE, Look, Scale
+from og_pointcloud.mapping.tracks import NO_TRACK, Left
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ def _has_left(known: GrowingMap, k: int) -> bool:
     # What it stood before, and its masks held too, is still there: it looked as what left does.
     went = np.array(track.lost, np.int32)
     size = np.ptp(known.points.xyz[went].astype(np.float64), axis=0)
-    track.left, track.lost = Left(_look(known, track, went), known.place_of(went), size, track.sequence), []
+    track.left, track.lost = Left(_look(known, k, went), known.place_of(went), size, track.sequence), []
     known.points.weight[np.setdiff1d(rows, still)] = 0
     known.forget(rows)
     return True
@@ -94,12 +94,10 @@ def name(
     doubled = (k for k in again if tracks[k].views & (tracks[k].views - 1) == 0)
     asked = [*new, *(known.tracks.by_id().values() if gone else doubled)]
     if asked and any(track.left for track in tracks):
-        others = [track for track in tracks if track.id >= 0 and track.descriptor is not None]
-        descriptors, spread = np.array([t.descriptor for t in others]), np.array([t.spread for t in others])
-        typical = typical_cosine(descriptors, np.arange(len(others)), spread) if others else 0.0
+        scale = known.tracks.scale()
         for k in asked:
             if known.tracks.root[k] == k and not tracks[k].left:
-                moved += _returned(known, k, typical)
+                moved += _returned(known, k, scale)
     ids = []
     for k in new:
         if known.tracks.root[k] == k and tracks[k].id < 0:
@@ -108,14 +106,15 @@ def name(
     return tuple(ids), tuple(moved)
 
 
-def _look(known: GrowingMap, track: Track, rows: NDArray[np.integer]) -> Look:
+def _look(known: GrowingMap, k: int, rows: NDArray[np.integer]) -> Look:
     """How a track looks, by some of its points."""
-    descriptor = np.zeros((0, 1)) if track.descriptor is None else track.descriptor[None]
+    descriptor = known.tracks.tracks[k].descriptor
+    descriptor = np.zeros((0, 1)) if descriptor is None else descriptor[None]
     xyz, rgb = known.points.xyz[rows], known.points.rgb[rows]
-    return Look.of_points(descriptor.astype(np.float32), track.spread, xyz, rgb)
+    return Look.of_points(descriptor.astype(np.float32), float(known.tracks.spread()[k]), xyz, rgb)
 
 
-def _returned(known: GrowingMap, k: int, typical: float) -> list[Moved]:
+def _returned(known: GrowingMap, k: int, scale: Scale) -> list[Moved]:
     """Give a track the id of what left, if anything that left looks like it.
 
     It looks as its points do that came after the other was last seen. What has hardly any such points stood here
@@ -128,7 +127,7 @@ def _returned(known: GrowingMap, k: int, typical: float) -> list[Moved]:
             came[old.id] = rows[known.kept.born[rows] > old.left.sequence]
             share = FLAT_SHARE if track.first > old.left.sequence else MOST
             if len(came[old.id]) >= max(FEWEST_POINTS, share * len(rows)):
-                alike[old.id] = likeness(old.left.look, _look(known, track, came[old.id]), typical)
+                alike[old.id] = scale.likeness(old.left.look, _look(known, k, came[old.id]))
     best = max(alike, key=lambda old: (alike[old], -old), default=None)
     if best is None or alike[best] <= ALIKE:
         return []

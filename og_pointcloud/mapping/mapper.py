@@ -127,10 +127,12 @@ class Mapper:
         for k in range(len(table)):
             rows = table.descriptors[table.descriptor_instance == k].astype(np.float64)
             pixels = float(max(USUAL_SHARE * table.points[k] * table.masks[k], 1e-6))
-            total = rows.sum(axis=0) * pixels if len(rows) else None
+            mean = rows.sum(axis=0)
+            length = float(np.linalg.norm(mean))
+            total = mean * (float(table.agreement[k]) * pixels / length) if length else None
             seen = record.last_seen.get(k, 0.0)
             counts = int(table.views[k]), int(table.masks[k])
-            known.tracks.add(Track(total, pixels, float(table.agreement[k]) * pixels, *counts, seen, id=k))
+            known.tracks.add(Track(total, pixels, *counts, seen, id=k))
         known.tracks.next_id = len(table)
         for k, entry in record.gone.items():
             place, size = np.array(entry.place), np.full(3, entry.length)

@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 from og_pointcloud.ask.labelled_scene import SceneLike, as_scene
 from og_pointcloud.cloud import BACKGROUND, UNOBSERVED, FeatureSpace, InstanceTable, LabelledCloud
 from og_pointcloud.fitting.fit import fit
-from og_pointcloud.mapping.changes import FEWEST_POINTS, MOST, Changes, Comparison, Visit, compare_visits
+from og_pointcloud.mapping.changes import FEWEST_POINTS, MOST, SAME_SURFACE, Changes, Comparison, Visit, compare_visits
 from og_pointcloud.mapping.map_record import MapRecord, Retired, VisitEntry
 from og_pointcloud.mapping.sight import MeasuredView
 from og_pointcloud.scene import Scene
@@ -25,8 +25,6 @@ from og_pointcloud.settings import FitSettings
 
 SAME_PLACE = 1.0
 """Spacings within which a point of the visit adds nothing to the map."""
-SAME_SURFACE = 1.5
-"""Spacings within which two visits' points are of one surface."""
 MOST_CAMERAS = 2000
 """Cameras that a map remembers; older ones are thinned evenly."""
 
@@ -112,9 +110,8 @@ def _ids_of_later(earlier: Visit, later: Visit, stays: NDArray[np.bool_], found:
     a, b = earlier.cloud, later.cloud
     known, fresh = np.full(len(b.instances), -1, np.int64), len(a.instances)
     came = {moved.now: moved.id for moved in found.changes.moved}
-    distance, nearest = cKDTree(a.xyz).query(b.xyz, workers=-1)
-    owners = a.instance_ids[nearest]
-    on_map = (distance <= SAME_SURFACE * a.spacing) & stays[nearest] & (owners != UNOBSERVED)
+    owners = a.instance_ids[found.nearest]
+    on_map = (found.nearest >= 0) & stays[found.nearest] & (owners != UNOBSERVED)
     for k in range(len(b.instances)):
         thing = found.pieces.get(k)
         if thing is None:

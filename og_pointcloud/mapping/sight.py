@@ -35,6 +35,8 @@ NOTHING, AGREES, HIDDEN, THROUGH = 0, 1, 2, 3
 
 PLANE_POINTS = 12
 """Nearest points by which the plane of a surface is told."""
+SAME_SHEET = 0.5
+"""Half of these tell the plane if they lie less than this share as far off theirs: the others are of something else."""
 DISC_SPACINGS = 2.0
 """Radius of a disc: of randomly strewn points, one place in three hundred is then left open."""
 MOST_SHIFT = 2.5
@@ -174,12 +176,19 @@ def _planes(
     the standard deviation off it."""
     normal, height, off = (np.empty(shape, np.float32) for shape in ((len(xyz), 3), len(xyz), len(xyz)))
     for start in range(0, len(xyz), AT_ONCE):
-        part = slice(start, start + AT_ONCE)
-        about = np.concatenate([xyz[part, None], xyz[neighbours[part]]], axis=1).astype(np.float64)
-        about -= about.mean(axis=1, keepdims=True)
-        values, vectors = np.linalg.eigh(np.swapaxes(about, 1, 2) @ about / about.shape[1])
-        normal[part], off[part] = vectors[..., 0], np.sqrt(np.maximum(values[:, 0], 0))
-        height[part] = np.einsum("na,na->n", about[:, 0], vectors[..., 0])
+        part = np.arange(start, min(start + AT_ONCE, len(xyz)))
+        for count in (neighbours.shape[1], neighbours.shape[1] // 2):
+            about = np.concatenate([xyz[part, None], xyz[neighbours[part, :count]]], axis=1).astype(np.float64)
+            about -= about.mean(axis=1, keepdims=True)
+            # Three of the points fit any plane.
+            values, vectors = np.linalg.eigh(np.swapaxes(about, 1, 2) @ about / max(count - 2, 1))
+            deviation = np.sqrt(np.maximum(values[:, 0], 0))
+            if count < neighbours.shape[1]:
+                # Fewer neighbours, where more reach a surface behind or beyond an edge.
+                better = deviation < SAME_SHEET * off[part]
+                part, vectors, about, deviation = part[better], vectors[better], about[better], deviation[better]
+            normal[part], off[part] = vectors[..., 0], deviation
+            height[part] = np.einsum("na,na->n", about[:, 0], vectors[..., 0])
     return normal, height, off
 
 

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from og_pointcloud.fitting.association import directions
 from og_pointcloud.kernels import njit
-from og_pointcloud.mapping.likeness import Look, spread_of
+from og_pointcloud.mapping.likeness import Look, Scale, spread_of, typical_cosine
 from og_pointcloud.mapping.voxels import Columns
 
 NO_TRACK = -1
@@ -73,15 +73,14 @@ class Left:
 
 @dataclass
 class Track:
-    """total: (D,) sum of unit features by pixels; pixels: their sum; agreement: sum of cosines by pixels. views, masks:
-    how many showed it; first, sequence: the numbers of the first and of the last frame that did, 0 for an earlier map;
+    """total: (D,) sum of unit features by pixels; pixels: their sum. views, masks: how many
+    showed it; first, sequence: the numbers of the first and of the last frame that did, 0 for an earlier map;
     last_seen: the stamp of the last. id: of the object, NO_TRACK while it is provisional. moved: it has been elsewhere.
     box: (2, 3) lowest and highest place of points that voted for it. lost: rows of its points that were seen through,
     losing_since: from that stamp on; left: when most were."""
 
     total: NDArray[np.float64] | None = None
     pixels: float = 0.0
-    agreement: float = 0.0
     views: int = 0
     masks: int = 0
     last_seen: float = 0.0
@@ -102,7 +101,7 @@ class Track:
         """Become both."""
         if other.total is not None:
             self.total = other.total if self.total is None else self.total + other.total
-        for name in ("pixels", "agreement", "masks", "lost"):
+        for name in ("pixels", "masks", "lost"):
             setattr(self, name, getattr(self, name) + getattr(other, name))
         self.moved, self.first = self.moved or other.moved, min(self.first, other.first)
         self.reach(other.box)
@@ -116,9 +115,9 @@ class Track:
         return None if self.total is None or length < 1e-12 else self.total / length
 
     @property
-    def spread(self) -> float:
-        """The squared tangent that the descriptor is off by (`likeness`)."""
-        return float(spread_of(self.agreement / max(self.pixels, 1e-12), self.masks))
+    def agreement(self) -> float:
+        """Mean cosine of its features with their mean."""
+        return 0.0 if self.total is None else float(np.linalg.norm(self.total)) / max(self.pixels, 1e-12)
 
 
 @dataclass
@@ -155,6 +154,16 @@ class Tracks:
         boxes = _boxes(xyz, points, track, len(self.tracks))
         for k in np.flatnonzero(np.isfinite(boxes[:, 0, 0])):
             self.tracks[self.root[k]].reach(boxes[k])
+
+    def spread(self) -> NDArray[np.float64]:
+        """(tracks,) the squared tangent that descriptors are off by (`likeness`)."""
+        return spread_of([track.agreement for track in self.tracks], [track.masks for track in self.tracks])
+
+    def scale(self) -> Scale:
+        """What a cosine of two objects means."""
+        known = [k for k, track in enumerate(self.tracks) if track.id >= 0 and track.descriptor is not None]
+        rows = np.array([self.tracks[k].descriptor for k in known])
+        return Scale(other=typical_cosine(rows, self.spread()[known]) if known else 0.0)
 
     def by_id(self) -> dict[int, int]:
         """Object id -> its track, of those that have not been joined into another."""
@@ -242,8 +251,6 @@ class Tracks:
             k = int(self.root[of_mask[m]])
             track = self.tracks[k]
             if unit[m].any():
-                before = track.descriptor
-                track.agreement += of_masks[m] * (1.0 if before is None else float(before @ unit[m]))
                 track.total = of_masks[m] * unit[m] + (0 if track.total is None else track.total)
             track.pixels, track.masks = track.pixels + of_masks[m], track.masks + 1
             if k in again or k in new:
