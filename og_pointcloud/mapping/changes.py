@@ -315,6 +315,21 @@ class _Thing:
     place: NDArray[np.float64]
     points: int
 
+    def has(self, piece: _Thing, place: NDArray[np.float64], reach: float, scale: Scale) -> bool:
+        """Whether a thing looks like a piece of this one, which is at that place then and so long."""
+        near = np.linalg.norm(piece.place - place) < reach
+        return bool(near) and self.look.has_color_of(piece.look) and scale.cosine(self.look, piece.look) > ALIKE
+
+    def with_pieces(self, other: _Thing) -> _Thing:
+        """This one with the pieces of another."""
+        points = self.points + other.points
+        place = (self.points * self.place + other.points * other.place) / points
+        return replace(self, pieces=(*self.pieces, *other.pieces), place=place, points=points)
+
+    def without_pieces(self) -> _Thing:
+        """What is left of this one once another has its pieces."""
+        return replace(self, pieces=(), points=0)
+
 
 def _decide(
     earlier: Visit, later: Visit, of_earlier: Evidence, of_later: Evidence, nearest: NDArray[np.int64]
@@ -330,7 +345,7 @@ def _decide(
     ]
     unmatched, gone = set(range(len(gone))), [*gone, *retired]
     pairs = _matched(gone, new, scale)
-    new = _with_scattered(gone, new, pairs, scale)
+    gone, new, pairs = _gathered(gone, new, pairs, scale)
     taken = set(pairs.values())
     changes = Changes(
         gone=tuple(sorted(k for g in unmatched - {*pairs} for k in gone[g].pieces)),
@@ -417,18 +432,26 @@ def _matched(gone: list[_Thing], new: list[_Thing], scale: Scale) -> dict[int, i
     return {int(g): int(n) for g, n in zip(rows, columns, strict=True) if alike[g, n] > ALIKE}
 
 
-def _with_scattered(gone: list[_Thing], new: list[_Thing], pairs: dict[int, int], scale: Scale) -> list[_Thing]:
-    """The new things, those that are more pieces of one that moved within it: they look like it, have its colour, and
-    lie no farther off than it is long. What holds their pieces then has none of its own."""
-    things = list(new)
-    for g, n in pairs.items():
-        for other, thing in enumerate(new):
-            if other in pairs.values() or not things[other].pieces:
-                continue
-            near = np.linalg.norm(thing.place - new[n].place) < gone[g].look.length
-            if near and gone[g].look.has_color_of(thing.look) and scale.likeness(gone[g].look, thing.look) > ALIKE:
-                one, count = things[n], things[n].points + thing.points
-                place = (one.points * one.place + thing.points * thing.place) / count
-                things[n] = replace(one, pieces=(*one.pieces, *thing.pieces), place=place, points=count)
-                things[other] = replace(thing, pieces=())
-    return things
+def _gathered(
+    gone: list[_Thing], new: list[_Thing], pairs: dict[int, int], scale: Scale
+) -> tuple[list[_Thing], list[_Thing], dict[int, int]]:
+    """Gone, new and pairs with more pieces of what moved taken into it: they look like it, have its colour, and lie no
+    farther off than it is long. Of what left, small pieces alone: what stood beside it may have been another of its
+    kind. What holds such pieces then has none of its own."""
+    gone, new, pairs = list(gone), list(new), dict(pairs)
+    here = replace(scale, shift=0.0)
+    for g in sorted(pairs, key=lambda g: -gone[g].points):
+        if g not in pairs:
+            continue
+        n = pairs[g]
+        long = max(gone[g].look.length, new[n].look.length)
+        for h, piece in enumerate(gone):
+            small = h != g and 0 < piece.points < SMALL_PIECE * gone[g].points
+            came_too = h not in pairs or gone[g].has(new[pairs[h]], new[n].place, long, scale)
+            if small and came_too and gone[g].has(piece, gone[g].place, long, here):
+                gone[g], gone[h] = gone[g].with_pieces(piece), piece.without_pieces()
+                pairs.pop(h, None)
+        for k, piece in enumerate(new):
+            if k not in pairs.values() and piece.points and gone[g].has(piece, new[n].place, long, scale):
+                new[n], new[k] = new[n].with_pieces(piece), piece.without_pieces()
+    return gone, new, pairs

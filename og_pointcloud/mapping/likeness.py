@@ -80,10 +80,13 @@ class Scale:
     def likeness(self, one: Look, later: Look) -> float:
         """How far the two are one thing: about 1 for one, 0 for two different ones, -inf if forbidden."""
         longer, shorter = max(one.length, later.length), min(one.length, later.length)
-        if longer > OTHER_SIZE * shorter or not (len(one.descriptors) and len(later.descriptors)):
-            return -np.inf
         known = one.color is not None and later.color is not None
-        if known and np.abs(later.color - one.color - self.shift).max() > self.color:
+        other_color = known and np.abs(later.color - one.color - self.shift).max() > self.color
+        return -np.inf if longer > OTHER_SIZE * shorter or other_color else self.cosine(one, later)
+
+    def cosine(self, one: Look, later: Look) -> float:
+        """The same by their descriptors alone; -inf where one has none."""
+        if not (len(one.descriptors) and len(later.descriptors)):
             return -np.inf
         cosine = float((one.descriptors @ later.descriptors.T).max()) * np.sqrt((1 + one.spread) * (1 + later.spread))
         return (cosine - self.other) / max(self.same - self.other, 1e-6)
