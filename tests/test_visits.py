@@ -12,6 +12,7 @@ from visits import BIN, CHEST, CRATE, PARCEL, SPACE, Thing, cameras, cast, insta
 import og_pointcloud as og
 from og_pointcloud.cli import main
 from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError, SceneError
+from og_pointcloud.mapping.likeness import spread_of
 from og_pointcloud.mapping.map_record import MapRecord
 from og_pointcloud.mapping.sight import (
     AGREES,
@@ -152,6 +153,60 @@ def test_what_changed_is_told_by_id(monday, friday):
     np.testing.assert_allclose(followed.after - followed.before, AWAY, atol=0.05)
     assert json.loads(json.dumps(changes.to_dict())) == changes.to_dict()
     assert set(changes.to_dict()["moved"][0]) == {"id", "from", "to"}
+
+
+FOUR = [
+    Thing((-1.3, -1.3, 0.0), (0.4, 0.4, 0.4), (200, 60, 50), 1),
+    Thing((-1.3, 0.9, 0.0), (0.4, 0.4, 0.4), (200, 60, 50), 2),
+    Thing((0.9, -1.3, 0.0), (0.4, 0.4, 0.4), (200, 60, 50), 3),
+    Thing((0.9, 0.9, 0.0), (0.4, 0.4, 0.4), (200, 60, 50), 4),
+]
+"""Two of one kind, and two of another, that stay where they are."""
+
+
+def of_kinds(things, seed, own):
+    """A visit whose descriptors are a kind's, and a thing's own direction beside it: (kind, own direction) of each."""
+    cloud = og.fit(scene(things, seed=seed), progress=False)
+    rows = cloud.instances.descriptors.copy()
+    for thing, (kind, direction) in zip(things, own, strict=True):
+        row = np.zeros(rows.shape[1], np.float32)
+        row[kind], row[direction] = np.sqrt(0.9), np.sqrt(0.1)  # two of a kind have the cosine 0.9
+        rows[cloud.instances.descriptor_instance == instance_of(cloud, thing)] = row
+    return replace(cloud, instances=replace(cloud.instances, descriptors=rows))
+
+
+@pytest.mark.parametrize(("direction", "moves"), [(9, 1), (10, 0)], ids=["itself", "another of its kind"])
+def test_another_of_its_kind_is_not_the_same_thing(direction, moves):
+    stay, crate = [(1, 5), (1, 6), (2, 7), (2, 8)], Thing((-0.2, -0.2, 0.0), (0.4, 0.4, 0.4), (200, 60, 50), 5)
+    before = of_kinds([*FOUR, crate], 0, [*stay, (3, 9)])
+    after = of_kinds([*FOUR, moved(crate, (-0.6, 0.5, 0.0))], 1, [*stay, (3, direction)])
+    found = og.compare(before, after)
+    assert (len(found.moved), len(found.gone), len(found.new)) == (moves, 1 - moves, 1 - moves)
+
+
+def test_how_far_means_of_few_features_are_off_is_told_from_the_scene():
+    random, width = np.random.default_rng(0), 256
+    masks = np.repeat([1, 2, 3, 5, 12, 40], 60)
+    agreement, off = np.zeros(len(masks)), np.zeros(len(masks))
+    for k, count in enumerate(masks.tolist()):
+        rows = np.eye(width)[0] + 0.8 * random.normal(size=(count, width)) / np.sqrt(width)
+        rows /= np.linalg.norm(rows, axis=1, keepdims=True)
+        mean = rows.mean(axis=0) / np.linalg.norm(rows.mean(axis=0))
+        agreement[k], off[k] = (rows @ mean).mean(), mean[0] ** -2 - 1
+    told = spread_of(agreement, masks)
+    for count in np.unique(masks):
+        np.testing.assert_allclose(told[masks == count].mean(), off[masks == count].mean(), rtol=0.15)
+
+
+@pytest.mark.parametrize("apart", [2.0, 2.5, 3.0])
+def test_two_sheets_are_no_thick_one(apart):
+    """Both faces of a wall, a few spacings apart: planes lie in one of them, and points stay where they are."""
+    random, count = np.random.default_rng(0), 2000
+    height = np.repeat([0.0, apart / np.sqrt(count)], count)
+    sheets = np.c_[random.random((2 * count, 2)), height]
+    found = DiscSurface(sheets.astype(np.float32))
+    assert found.scatter < 0.1 * found.spacing
+    assert np.mean(np.abs(found.xyz[:, 2] - sheets[:, 2]) < 0.1 * found.spacing) > 0.85
 
 
 @pytest.mark.slow
