@@ -80,9 +80,12 @@ class Scale:
     def likeness(self, one: Look, later: Look) -> float:
         """How far the two are one thing: about 1 for one, 0 for two different ones, -inf if forbidden."""
         longer, shorter = max(one.length, later.length), min(one.length, later.length)
-        known = one.color is not None and later.color is not None
-        other_color = known and np.abs(later.color - one.color - self.shift).max() > self.color
-        return -np.inf if longer > OTHER_SIZE * shorter or other_color else self.cosine(one, later)
+        if longer > OTHER_SIZE * shorter or self._other_color(one.color, later.color):
+            return -np.inf
+        return self.cosine(one, later)
+
+    def _other_color(self, one: NDArray[np.float64] | None, later: NDArray[np.float64] | None) -> bool:
+        return one is not None and later is not None and bool(np.abs(later - one - self.shift).max() > self.color)
 
     def cosine(self, one: Look, later: Look) -> float:
         """The same by their descriptors alone; -inf where one has none."""
