@@ -389,18 +389,6 @@ def test_clicks_that_give_no_mask(fitted, tmp_path, capsys):
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.slow
-def test_pictures_of_features(fitted, tmp_path, capsys):
-    capture, _ = fitted
-    output = tmp_path / "new" / "p.png"
-    code, stdout, _ = run(capsys, "view", capture.folder, "-o", output, "--columns", "3")
-    assert code == 0
-    assert f"wrote {output}" in stdout
-    sheet = cv2.imread(str(output))
-    assert sheet.shape[0] > 4 * HEIGHT
-    assert 3 * WIDTH < sheet.shape[1] < 4 * WIDTH
-
-
 def test_results_of_opengaussian_can_be_asked(tmp_path, capsys):
     write_result(tmp_path / "run")
     words = tmp_path / "words.npz"
