@@ -136,16 +136,16 @@ class Block:
         runs = self._starts[edges].reshape(-1, 2)  # of neighbours: multiplied where they lie, nothing is copied
         direction = self.direction(text)[None]
         bound = np.concatenate([np.zeros(0), *(self._bounds_of(begin, end, direction) for begin, end in runs.tolist())])
-        places = _Places(runs)
+        rows = _ranges(*runs.T)
         if box is not None:
-            bound[places.of(self._outside(asked, box))] = -np.inf
+            bound[np.searchsorted(rows, self._outside(asked, box))] = -np.inf
         key_of = self._relevancy
         if self.bank is not None:
             key_of = self._log_odds
             _, rivals = self._judges
             rivals = rivals[(rivals @ direction[0]) < ChoosingSettings().synonym]
-        best, key = largest(bound, lambda some: key_of(places.rows(some), direction, rivals), top)
-        return places.rows(best), key
+        best, key = largest(bound, lambda places: key_of(rows[places], direction, rivals), top)
+        return rows[best], key
 
     def _bounds_of(self, begin: int, end: int, direction: NDArray[np.float32]) -> NDArray[np.float64]:
         """(end - begin,) bounds of the scores of neighbouring instances for a direction (1, D)."""
@@ -175,24 +175,6 @@ class Block:
         sharpness = self.sharpness[self.scene[rows]]
         said = sharpness[:, None] * self.evidence(rows, np.concatenate([direction, others]))
         return said[:, 0] - log_mean_likelihood(said[:, 1:], sharpness) - np.log(ChoosingSettings().kinds)
-
-
-class _Places:
-    """Where instances of runs (n, 2), from and to rows in ascending order, are when these lie behind each other."""
-
-    def __init__(self, runs: NDArray[np.intp]) -> None:
-        self._begins, counts = runs[:, 0], np.diff(runs, axis=1)[:, 0]
-        self._ends = np.cumsum(counts)
-        self._back = runs[:, 1] - self._ends
-        """What is added to places of a run."""
-
-    def of(self, rows: NDArray[np.intp]) -> NDArray[np.intp]:
-        """The places of rows."""
-        return rows - self._back[np.searchsorted(self._begins, rows, "right") - 1] if len(rows) else rows
-
-    def rows(self, places: NDArray[np.intp]) -> NDArray[np.intp]:
-        """The rows at places."""
-        return places + self._back[np.searchsorted(self._ends, places, "right")] if len(places) else places
 
 
 def _ranges(begins: NDArray[np.intp], ends: NDArray[np.intp]) -> NDArray[np.intp]:
