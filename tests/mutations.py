@@ -221,8 +221,13 @@ MUTATIONS = (
     ),
     Mutation(
         "what a box cuts off is found in it", "collection/scoring.py",
-        "rows, evidence = rows[within], evidence[within]", "pass",
+        "bound[np.searchsorted(rows, self._outside(asked, box))] = -np.inf", "pass",
         ("test_collection.py::test_box_and_scenes_restrict",),
+    ),
+    Mutation(
+        "an atlas that changed is not read again", "collection/collection.py",
+        "if stamp and stamp == self._stamp:", "if stamp and self._stamp:",
+        ("test_collection.py::test_an_open_collection_notices_a_changed_atlas",),
     ),
     Mutation(
         "ids between ids are believed", "checking/check.py",

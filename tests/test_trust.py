@@ -707,7 +707,7 @@ def test_memory_is_flat_over_frames_of_many_sizes(bundle):
 
 @pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="only Linux tells")
-@pytest.mark.filterwarnings("ignore:none of", "ignore:no point")
+@pytest.mark.filterwarnings("ignore::UserWarning")
 def test_soak(bundle):
     """Frames of any size, some with NaN, infinity or none, labels that change: memory ends where it began. For twenty
     seconds; `make soak` takes ten minutes, `examples/benchmark_stream.py` a million frames."""
