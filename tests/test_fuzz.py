@@ -309,6 +309,39 @@ def first_files(name: str, folder: Path) -> list[bytes]:
     return valid + made
 
 
+DOCUMENTED = {
+    "PLY": ["cloud.ply"], "PCD": ["cloud.pcd"], "E57": ["scan.e57"], "SPZ": ["splats.spz"],
+    "LAS, LAZ, COPC": ["cloud.las", "cloud.copc.laz"], "COLMAP's `.bin`": ["images.bin", "points3D.bin"],
+    "nerfstudio's, Polycam's, 3D Scanner App's JSON": ["transforms.json", "polycam.json", "scanner_app.json"],
+    "ARKitScenes' `.traj`, KITTI-360's poses": ["lowres_wide.traj", "cam0_to_world.txt"],
+    "KITTI-360's calibration": ["perspective.txt"], "Metashape's `.xml`": ["metashape.xml"],
+    "RealityScan's `.csv`": ["realityscan.csv"], "`.ogpc`": ["scene.ogpc"], "`text_features.npz`": ["words.npz"],
+}  # fmt: skip
+"""Rows of the table in docs/errors.md -> READERS."""
+
+
+def documented_messages() -> list[tuple[str, str, str]]:
+    """(reader, damage, message) of each cell of that table; "the same": as in the row above."""
+    page = (Path(__file__).parents[1] / "docs" / "errors.md").read_text()
+    found, above = [], [""] * 3
+    for line in page[page.index("| file | cut in the middle") :].split("\n\n")[0].splitlines()[2:]:
+        file, *cells = (cell.strip() for cell in line.strip("|").split("|"))
+        of_row = {"the same": above, "as when empty": cells[1:2] * 3, "as when cut": cells[:1] * 3}
+        above = [of_row[cell][column] if cell in of_row else cell for column, cell in enumerate(cells)]
+        damages = zip(("cut", "empty", "foreign"), (cell.split("`")[1] for cell in above), strict=True)
+        found += [(name, *damage) for damage in damages for name in DOCUMENTED[file]]
+    return found
+
+
+@pytest.mark.parametrize(("name", "damage", "says"), documented_messages())
+def test_damaged_files_get_the_message_of_the_docs(name: str, damage: str, says: str, folder: Path, tmp_path: Path):
+    valid = valid_files(name, folder)[0]
+    data = {"cut": valid[: len(valid) // 2], "empty": b"", "foreign": PICTURE}[damage]
+    heard = read_or_refused(name, tmp_path / name, data)
+    pattern = re.sub(r"\d+", r"\\d+", ".*".join(map(re.escape, says.split("..."))))  # sizes are of the file made here
+    assert re.search(pattern, heard, re.DOTALL), heard
+
+
 @pytest.mark.parametrize("name", [*SEEDS, "scene.ogpc"])
 def test_files_made_by_hand_are_read_or_refused(name: str, folder: Path, tmp_path: Path):
     for data in first_files(name, folder):
