@@ -205,17 +205,14 @@ def _onnx_graph(tower: Any, example: torch.Tensor, given: str, answers: list[str
 @contextmanager
 def _quietly() -> Any:
     """torch.onnx.export tells of its own insides, as warnings and log lines."""
-    names = ("torch.onnx", "onnxscript", "onnx_ir", "root")
-    loggers = {logging.getLogger(name): logging.getLogger(name).level for name in names}
+    before = logging.root.manager.disable
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        for logger in loggers:
-            logger.setLevel(logging.ERROR)
+        logging.disable(logging.WARNING)
         try:
             yield
         finally:
-            for logger, level in loggers.items():
-                logger.setLevel(level)
+            logging.disable(before)
 
 
 # Tokenizers
