@@ -248,7 +248,7 @@ def test_killed_at_any_moment_it_goes_on(tmp_path, monkeypatch):
                 os.kill(process.pid, signal.SIGKILL)
                 break
     torn = folder / "frames.log"
-    torn.write_bytes(torn.read_bytes() + b"OGF1half a frame")
+    torn.write_bytes(torn.read_bytes() + b"OGF2half a frame")
     mapper = og.Mapper(feature_space=SPACE, journal=folder)
     assert mapper.last_stamp >= done
     for frame in given:
