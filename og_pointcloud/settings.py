@@ -66,10 +66,8 @@ class MembershipSettings:
     """An instance detected less often than this share of the scene's typical rate is noise of the proposer."""
     island_share: float = 0.15
     """A separate piece whose points show less than this share of what the main piece's do was seen through it."""
-    border_shares: tuple[float, float] = (0.2, 0.9)
-    """Points with a share between these lie between states: their neighbours settle them."""
     own_vote: float = 3.0
-    """Votes of a point's own state, where a sure neighbour has one."""
+    """Votes of a point's own state, where a sure neighbour of which its color says nothing has one."""
     few_views: int = 3
     """Points seen by fewer views than this are checked by depth: no other view could contradict a mask."""
     gap_sizes: float = 2.0

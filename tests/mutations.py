@@ -83,7 +83,15 @@ MUTATIONS = (
     ),
     Mutation(
         "border votes unsquared", "fitting/membership.py",
-        "vote = share[other] ** 2 if", "vote = share[other] if", MEMBERSHIP,
+        "sureness[other] ** 2 * weights", "sureness[other] * weights", MEMBERSHIP,
+    ),
+    Mutation(
+        "neighbours heard whatever their color", "fitting/membership.py",
+        "sureness[other] ** 2 * weights[g, k]", "sureness[other] ** 2", (*MEMBERSHIP, "test_colors.py"),
+    ),
+    Mutation(
+        "colors of points that views are not sure of are asked", "fitting/colors.py",
+        "if adjoining[g, k] and sure[other]:", "if adjoining[g, k]:", ("test_colors.py",),
     ),
     Mutation(
         "a large group keeps what a smaller one is sure of", "fitting/membership.py",

@@ -176,7 +176,6 @@ def test_half_and_twice_stay_possible_values():
     assert values["membership.sure_share"] == (0.3, 0.8)  # 0.6: half of the way from there to 1
     assert values["membership.few_views"] == (1, 6)
     assert values["geometry.reach"] == (1.5, 6.0)
-    assert values["membership.border_shares"] == ((0.1, 0.45), (0.4, 0.95))
 
 
 def test_a_number_of_a_module_is_changed_for_a_while_in_compiled_code_too():

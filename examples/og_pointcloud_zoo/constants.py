@@ -42,6 +42,7 @@ SWEPT = ("geometry", "grouping", "membership")
 """Records of settings whose numbers all steer labels."""
 MODULES: dict[str, tuple[str, tuple[str, ...]]] = {
     "fitting.view_votes.OPENNESS_POWER": ("", ("_relative_exposure",)),
+    "fitting.colors.MOST": ("", ()),
     "fitting.looks.QUANTILE": ("", ()),
     "fitting.looks.LEAST_MASKS": ("", ()),
     "rendering.sightings.LEAST_OPEN": ("table", ("_see",)),
@@ -62,8 +63,8 @@ SOURCES: dict[str, tuple[str, ...]] = {
     "guessed": (
         "geometry.opacity", "geometry.sight_thickness", "geometry.neighbours", "geometry.reach",
         "grouping.witness_share", "membership.sure_share", "membership.open_share", "membership.possible_share",
-        "membership.growth_votes", "membership.rate_share", "membership.island_share", "membership.border_shares",
-        "membership.own_vote", "membership.gap_sizes", "membership.front_share", "fitting.view_votes.OPENNESS_POWER",
+        "membership.growth_votes", "membership.rate_share", "membership.island_share", "membership.own_vote",
+        "membership.gap_sizes", "membership.front_share", "fitting.colors.MOST", "fitting.view_votes.OPENNESS_POWER",
         "fitting.looks.QUANTILE", "fitting.looks.LEAST_MASKS", "rendering.sightings.LEAST_OPEN",
         "rendering.sightings.EDGE_PX", "rendering.sightings.RING_SHARE",
     ),

@@ -206,7 +206,8 @@ def _decided_by_views(
     coarse: (groups,) the coarse cluster of each group, if the groups are leaves of a codebook.
     """
     with journal.stage("membership"):
-        membership = assign_points(table, votes, groups, surface.neighbourhood, settings.membership)
+        rgb = surface.scene.points.rgb
+        membership = assign_points(table, votes, groups, surface.neighbourhood, settings.membership, rgb)
     if membership.dismissed.any():
         journal.leave_out(LeftOut.CONTRADICTED_GROUPS, count=int(membership.dismissed.sum()), total=groups.count)
     with journal.stage("association"):

@@ -9,8 +9,9 @@ A mask covers a point or it does not; what matters is what the *other* views say
 A view in which the proposer missed k has no vote about k; a view that has a mask of k and shows g outside it votes
 "not k". So a share near 1 means "k", near 0 "seen, and not k", however often the proposer misses. Rays that slip past
 an edge or through a thin surface leave low shares on what lies behind, in many views; torn mask edges leave middling
-shares on the rim of the object itself. The two are told apart by place: a middling share counts only where the
-point adjoins surely labelled points of the same instance (hysteresis, as in Canny's edges).
+shares on the rim of the object itself. The two are told apart by place and color: a middling share counts only where
+the point adjoins surely labelled points of the same instance (hysteresis, as in Canny's edges), and in the end every
+point hears those about it, each as far as their colors speak for one thing (colors.py).
 
 Of several groups a point is of the one with the most votes; but proposers let large things swallow small ones: where
 that group's own views contradict it and a smaller one is sure, the smaller one has the point.
@@ -32,6 +33,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
 from og_pointcloud.cloud import BACKGROUND, UNOBSERVED
+from og_pointcloud.fitting.colors import color_ratios, neighbour_weights
 from og_pointcloud.fitting.grouping import MaskGroups
 from og_pointcloud.fitting.mask_table import MaskTable, SparseRows
 from og_pointcloud.fitting.memory import in_file
@@ -64,14 +66,16 @@ def assign_points(
     table: MaskTable,
     votes: ViewVotes,
     groups: MaskGroups,
-    neighbourhood: Neighbourhood,
+    around: Neighbourhood,
     settings: MembershipSettings,
+    rgb: NDArray[np.uint8] | None = None,
     typical_openness: float | None = None,
 ) -> Membership:
     """Decide the state of every point. Groups keep their numbers, of which a later one is smaller; a dismissed group
     ends with no point.
 
-    typical_openness: as of `ViewVotes`, of a scene that these points are a part of; None: they are all of it.
+    rgb: (n, 3), or None: colors are not asked. typical_openness: as of `ViewVotes`, of a scene that these points are a
+    part of; None: they are all of it.
     """
     has_mask = np.zeros((groups.count, table.outside.shape[0]), np.bool_)
     grouped = groups.group >= 0
@@ -80,7 +84,7 @@ def assign_points(
     rate, dismissed = _contradicted(support, groups.count, settings)
     if dismissed.any():
         support = _support(votes, groups.group, has_mask, ~dismissed, settings.sure_share)
-    group, share, total, around = support.group, support.share, support.total, neighbourhood
+    group, share, total = support.group, support.share, support.total
 
     # Sure points, and possible ones that adjoin them. What no view sees openly is not sure, however its views agree:
     # all that look at a car see the same floor through its roof.
@@ -88,8 +92,10 @@ def assign_points(
     typical = votes.typical_openness if typical_openness is None else typical_openness
     hearsay = agreed & (votes.openness < settings.open_share * typical)
     ids = np.where(agreed & ~hearsay, group, BACKGROUND).astype(np.int32)
+    sure = support.of_state(ids) > settings.sure_share
+    weights = neighbour_weights(rgb, around, color_ratios(rgb, ids, sure, around))
     possible = (group >= 0) & (share > settings.possible_share)
-    ids = _grow(ids, group, possible, around.index, around.adjoining, settings.growth_votes)
+    ids = _grow(ids, group, possible, around.index, weights, settings.growth_votes)
     # What is known by hearsay alone is as its neighbours are; where none of them is known better, hearsay is believed.
     ids = np.where((ids == BACKGROUND) & (total == 0), UNOBSERVED, ids)
     hearsay &= ids == BACKGROUND
@@ -98,9 +104,8 @@ def assign_points(
     # What is seen through an instance is no part of it; what no view saw is as its neighbours are.
     ids = _without_islands(ids, share, instance_area(table, groups.group, ids), around, settings.island_share)
     ids = _fill_unobserved(ids, around)
-    ids = _settle_borders(ids, share, around.index, around.adjoining, *settings.border_shares, settings.own_vote)
-    share_of_state = np.where((group >= 0) & (ids == group), share, 1 - share)
-    certainty = np.where(total > 0, np.clip(share_of_state, 0, 1), 0) * _agreeing(ids, around.index, around.adjoining)
+    ids = _with_neighbours(ids, support.of_state(ids), around.index, weights, settings.own_vote)
+    certainty = support.of_state(ids) * _agreeing(ids, around.index, around.adjoining)
     return Membership(
         ids.astype(np.int32), share.astype(np.float32), certainty.astype(np.float32), rate.astype(np.float32), dismissed
     )
@@ -203,6 +208,11 @@ class _Support:
     def share(self) -> NDArray[np.float64]:
         """(n,) the part of the possible votes that the group has."""
         return self.votes / np.maximum(self.possible, 1e-12)
+
+    def of_state(self, ids: NDArray[np.int32]) -> NDArray[np.float64]:
+        """(n,) in [0, 1]: the part of the possible votes that is for each point's state; 0 where no view sees it."""
+        share = np.where((self.group >= 0) & (ids == self.group), self.share, 1 - self.share)
+        return np.where(self.total > 0, np.clip(share, 0, 1), 0)
 
 
 def _support(
@@ -320,8 +330,9 @@ def _contradicted(
 
 
 @njit(cache=True)
-def _grow(ids, best, possible, neighbours, adjoining, votes):  # noqa: ANN001, ANN202
-    """Hysteresis: possible points join their best group while a share ``votes`` of the adjoining points is in it.
+def _grow(ids, best, possible, neighbours, weights, votes):  # noqa: ANN001, ANN202
+    """Hysteresis: possible points join their best group while a share ``votes`` of the adjoining points, by weight, is
+    in it.
 
     Rounds, not a flood in index order: the result does not depend on how the points are ordered.
     """
@@ -330,11 +341,12 @@ def _grow(ids, best, possible, neighbours, adjoining, votes):  # noqa: ANN001, A
         joins = np.zeros(len(waiting), np.bool_)
         for i in range(len(waiting)):
             g = waiting[i]
-            count = 0
+            joined, total = 0.0, 0.0
             for k in range(neighbours.shape[1]):
-                if adjoining[g, k] and ids[neighbours[g, k]] == best[g]:
-                    count += 1
-            joins[i] = count > 0 and count >= votes * adjoining[g].sum()
+                total += weights[g, k]
+                if ids[neighbours[g, k]] == best[g]:
+                    joined += weights[g, k]
+            joins[i] = joined > 0 and joined >= votes * total
         if not joins.any():
             break
         for i in range(len(waiting)):
@@ -344,36 +356,35 @@ def _grow(ids, best, possible, neighbours, adjoining, votes):  # noqa: ANN001, A
     return ids
 
 
-@njit(cache=True)
-def _settle_borders(ids, share, neighbours, adjoining, low, high, own_vote):  # noqa: ANN001, ANN202
-    """Points between two states take the one that most of their adjoining points are in, counted by how sure these are.
+@njit(cache=True, parallel=True)
+def _with_neighbours(ids, sureness, neighbours, weights, own_vote):  # noqa: ANN001, ANN202
+    """Every point takes the state that most of its adjoining points are in, by weight and by how sure these are.
 
-    A neighbour votes for its instance with its squared share, for background with the square of the rest; the point's
-    own state has ``own_vote`` votes. A point of an instance may change to another, not to background: its own share
-    has decided that. All votes are on the states before this round (ties: the point's own, then the nearest's).
+    A neighbour votes for its state with its squared sureness, times its weight; the point's own state has ``own_vote``
+    votes. A point of an instance may change to another, not to background: masks are ragged, and what hysteresis
+    joined lies outside of most. All votes are on the states before (ties: the point's own, then the nearest's).
     """
     settled = ids.copy()
     width = neighbours.shape[1]
-    states = np.empty(width + 1, np.int64)
-    votes = np.empty(width + 1)
-    for g in range(len(ids)):
-        if not low < share[g] < high or ids[g] < BACKGROUND:
+    for g in prange(len(ids)):
+        if ids[g] < BACKGROUND:
             continue
         # The distinct states about the point, its own first, and the votes of each.
+        states = np.empty(width + 1, np.int64)
+        votes = np.empty(width + 1)
         states[0], votes[0], count = ids[g], own_vote, 1
         for k in range(width):
             other = neighbours[g, k]
             state = ids[other]
-            if not adjoining[g, k] or state < BACKGROUND or (state == BACKGROUND and ids[g] >= 0):
+            if weights[g, k] == 0 or state < BACKGROUND or (state == BACKGROUND and ids[g] >= 0):
                 continue
-            vote = share[other] ** 2 if state >= 0 else (1 - share[other]) ** 2
             place = 0
             while place < count and states[place] != state:
                 place += 1
             if place == count:
                 states[count], votes[count] = state, 0.0
                 count += 1
-            votes[place] += vote
+            votes[place] += sureness[other] ** 2 * weights[g, k]
         settled[g] = states[np.argmax(votes[:count])]
     return settled
 

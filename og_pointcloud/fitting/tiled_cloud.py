@@ -66,7 +66,7 @@ def split(xyz: NDArray[np.float32], most: int) -> Tiles:
 
 
 class TiledCloud:
-    """A cloud in the order of its tiles, without colours, read-only. Made by `TiledCloud.cut`.
+    """A cloud in the order of its tiles, read-only. Made by `TiledCloud.cut`.
 
     points, spacing (n,): the latter once ``spacing`` of the key is in the work folder. members: per tile, its points
     and those within its margin, ascending; int32 as there are many. margins: (tiles,) lengths. key: fingerprint of
@@ -75,14 +75,14 @@ class TiledCloud:
 
     def __init__(self, work: WorkFolder, key: str) -> None:
         self.work, self.key = work, key
-        order, start, self.margins, ends, members, xyz, origin, *gaussian = work.arrays("cloud", key, vanished)
-        self.tiles, self.points = Tiles(order, start), Points(xyz, origin, None, *gaussian)
+        order, start, self.margins, ends, members, xyz, origin, rgb, *gaussian = work.arrays("cloud", key, vanished)
+        self.tiles, self.points = Tiles(order, start), Points(xyz, origin, rgb if len(rgb) else None, *gaussian)
         self.members = tuple(members[first:last] for first, last in pairwise(ends.tolist()))
 
     @classmethod
     def cut(cls, points: Points, most: int, settings: FitSettings, work: WorkFolder) -> TiledCloud:
         """Tiles of at most so many points, and what lies about them."""
-        key = fingerprint(points.xyz, points.scale, points.rotation, points.opacity, settings, most, MARGIN)
+        key = fingerprint(points.xyz, points.rgb, points.scale, points.rotation, points.opacity, settings, most, MARGIN)
 
         def arrays() -> list[NDArray[Any]]:
             tiles = split(points.xyz, most)
@@ -92,7 +92,8 @@ class TiledCloud:
             members = [_within(ordered.xyz, part, margin) for part, margin in zip(parts, margins, strict=True)]
             ends, shape = np.cumsum([0, *map(len, members)]), (ordered.scale, ordered.rotation, ordered.opacity)
             known = [array for array in shape if array is not None]
-            cloud = (ordered.xyz, ordered.origin, *known)
+            rgb = np.zeros((0, 3), np.uint8) if ordered.rgb is None else ordered.rgb
+            cloud = (ordered.xyz, ordered.origin, rgb, *known)
             return [tiles.order, tiles.start, np.array(margins), ends, np.concatenate(members), *cloud]
 
         work.arrays("cloud", key, arrays)

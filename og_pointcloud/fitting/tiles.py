@@ -418,7 +418,9 @@ def _decide(
     # Which groups are noise was decided for all tiles.
     membership = replace(settings.membership, rate_share=0.0)
     votes, looks = view_votes(table), grouped.looks
-    state = assign_points(table, votes, grouped.groups, around, membership, grouped.typical_openness)
+    rgb = cloud.points.rgb
+    rgb = None if rgb is None else rgb[cloud.members[tile]]
+    state = assign_points(table, votes, grouped.groups, around, membership, rgb, grouped.typical_openness)
     ids = by_look(votes, state.instance_ids, looks)
     inner = cloud.inner(tile)
     inner_ids = np.full(len(ids), -1, np.int32)

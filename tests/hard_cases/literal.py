@@ -53,9 +53,10 @@ def view_votes(weights: Array, outside: Array, exposure: Array, mask_view: Seque
 
 def membership(
     votes: Votes, weights: Array, mask_view: Sequence[int], group: Sequence[int], neighbours: list[list[int]],
-    settings: MembershipSettings,
+    settings: MembershipSettings, rgb: NDArray[np.uint8] | None = None,
 ) -> tuple[Ids, Array, Array]:  # fmt: skip
-    """Ids, share and certainty of every point. weights: (masks, n) pixels; neighbours: of each point, nearest first."""
+    """Ids, share and certainty of every point. weights: (masks, n) pixels; neighbours: of each point, nearest first;
+    rgb: (n, 3)."""
     points, count = range(weights.shape[1]), 1 + max(group)
     own, asked = np.zeros((count, len(points))), np.zeros((count, len(points)))
     for k in range(count):
@@ -91,13 +92,20 @@ def membership(
     hidden = votes.openness < settings.open_share * typical
     hearsay = hidden & (best >= 0) & (share > settings.sure_share)
     ids = np.where((best >= 0) & (share > settings.sure_share) & ~hidden, best, BACKGROUND).astype(np.int32)
+
+    def sureness() -> Array:
+        """How much of the votes is for the state of each point."""
+        return np.where(total > 0, np.where((ids == best) & (best >= 0), share, 1 - share), 0)
+
+    alike = np.ones((len(points),) * 2)
+    if rgb is not None:
+        apart = np.linalg.norm(rgb[:, None].astype(float) - rgb, axis=2)
+        alike = color_ratios(rgb, ids, sureness() > settings.sure_share, neighbours)[np.rint(apart).astype(int)]
     possible = (best >= 0) & (share > settings.possible_share)
     while True:  # a middling share counts where it adjoins points that are in already
-        beside = [sum(ids[other] == best[g] for other in neighbours[g]) for g in points]
-        joins = [
-            g for g in points
-            if possible[g] and ids[g] < 0 and beside[g] and beside[g] >= settings.growth_votes * len(neighbours[g])
-        ]  # fmt: skip
+        beside = [sum(alike[g, other] for other in neighbours[g] if ids[other] == best[g]) for g in points]
+        needed = [settings.growth_votes * sum(alike[g, other] for other in neighbours[g]) for g in points]
+        joins = [g for g in points if possible[g] and ids[g] < 0 and beside[g] and beside[g] >= needed[g]]
         if not joins:
             break
         ids[joins] = best[joins]
@@ -107,12 +115,9 @@ def membership(
     for g in np.flatnonzero(hearsay):
         ids[g] = best[g] if near[g] == UNOBSERVED else near[g]
     ids = _filled(_without_islands(ids, share, weights, group, neighbours, settings.island_share), neighbours)
-    ids = _settled(ids, share, neighbours, settings)
-    certainty = np.zeros(len(points))
-    for g in points:
-        alike = np.mean([ids[other] == ids[g] for other in neighbours[g]]) if neighbours[g] else 1.0
-        certainty[g] = (share[g] if ids[g] == best[g] >= 0 else 1 - share[g]) * alike if total[g] > 0 else 0
-    return ids, share, certainty
+    ids = _with_neighbours(ids, sureness(), neighbours, alike, settings)
+    agreeing = [np.mean([ids[other] == ids[g] for other in neighbours[g]]) if neighbours[g] else 1.0 for g in points]
+    return ids, share, sureness() * agreeing
 
 
 def _filled(ids: NDArray[np.int32], neighbours: list[list[int]]) -> NDArray[np.int32]:
@@ -153,21 +158,47 @@ def _linked(g: int, other: int, piece: set[int], left: set[int], neighbours: lis
     return any(p in neighbours[other] or other in neighbours[p] for p in piece)
 
 
-def _settled(ids: Ids, share: Array, neighbours: list[list[int]], settings: MembershipSettings) -> NDArray[np.int32]:
-    """One round: points between two states take the one that their neighbours are in, by the square of their shares."""
-    low, high = settings.border_shares
+def _with_neighbours(
+    ids: Ids, sureness: Array, neighbours: list[list[int]], alike: Array, settings: MembershipSettings
+) -> NDArray[np.int32]:
+    """One round: points take the state that their neighbours are in, by the square of how sure these are."""
     after = ids.copy()
-    for g in range(len(ids)):
-        if ids[g] == UNOBSERVED or not low < share[g] < high:
-            continue
+    for g in np.flatnonzero(ids != UNOBSERVED):
         votes = {int(ids[g]): settings.own_vote}  # in order of nearness: ties are won by the first
         for other in neighbours[g]:
             state = int(ids[other])
             if state == UNOBSERVED or (state == BACKGROUND and ids[g] >= 0):
                 continue
-            votes[state] = votes.get(state, 0.0) + (share[other] if state >= 0 else 1 - share[other]) ** 2
+            votes[state] = votes.get(state, 0.0) + sureness[other] ** 2 * alike[g, other]
         after[g] = max(votes, key=lambda state: votes[state])
     return after
+
+
+def color_ratios(rgb: NDArray[np.uint8], ids: Ids, sure: NDArray[np.bool_], neighbours: list[list[int]]) -> Array:
+    """(443,) how many times likelier a difference of colors is within one state than between two, by Eq. of isotonic
+    regression: of all intervals about a difference, the least of the greatest means."""
+    count = np.zeros((2, 443))
+    for g in np.flatnonzero(sure):
+        for other in neighbours[g]:
+            if sure[other]:
+                apart = np.linalg.norm(rgb[g].astype(float) - rgb[other].astype(float))
+                count[int(ids[g] != ids[other]), round(apart)] += 1
+    if count.sum(axis=1).min() < 30:
+        return np.ones(443)
+    one, two = count / count.sum(axis=1, keepdims=True)
+    seen = np.flatnonzero(one + two)
+    chance = []
+    for place in range(len(seen)):
+        means = [
+            max(
+                one[seen[low : high + 1]].sum() / (one + two)[seen[low : high + 1]].sum()
+                for high in range(place, len(seen))
+            )
+            for low in range(place + 1)
+        ]
+        chance.append(min(means))
+    even = np.clip(np.interp(np.arange(443), seen, chance), 0.1, 0.9)
+    return even / (1 - even)
 
 
 # Matching, paper, Eq. 5 --------------------------------------------------------------------------------------------

@@ -81,9 +81,17 @@ def certainty_of_any_votes(seed: float) -> Answer:
 
 @agrees(0, "seed", tuple(range(4)))
 def borders(seed: float) -> Answer:
-    """Points whose share says little are settled by their neighbours' squared shares."""
-    settings = MembershipSettings(own_vote=0.4, border_shares=(0.1, 0.96))
-    ours, (ids, *_) = _both(int(seed), settings)
+    """Points hear their neighbours by the square of how sure these are."""
+    ours, (ids, *_) = _both(int(seed), MembershipSettings(own_vote=0.4))
+    return Answer(ours.instance_ids, ids)
+
+
+@agrees(0, "seed", tuple(range(4)))
+def borders_by_color(seed: float) -> Answer:
+    """The same, each neighbour as far as its color speaks for one thing."""
+    random = np.random.default_rng(int(seed))
+    rgb = np.clip(3 * np.arange(POINTS)[:, None] + random.normal(0, 9, (POINTS, 3)), 0, 255).astype(np.uint8)
+    ours, (ids, *_) = _both(int(seed), MembershipSettings(own_vote=0.4), rgb)
     return Answer(ours.instance_ids, ids)
 
 
@@ -93,7 +101,7 @@ def border_tie() -> Answer:
     share = np.array([[0.9, 0.5, 0.1, 0.9, 0.5, 0.0], [0.1, 0.4, 0.9, 0.1, 0.4, 1.0]])
     table = _made(share, 1 - share.sum(axis=0, keepdims=True), np.ones((1, 6)), [0, 0])
     neighbours = [[1], [0, 2], [1], [4], [3, 5, 5, 5], [4]]
-    settings = MembershipSettings(sure_share=0.45, own_vote=0.2, border_shares=(0.4, 0.6))
+    settings = MembershipSettings(sure_share=0.45, own_vote=0.3)
     ids = _assigned(table, [0, 1], neighbours, settings).instance_ids
     return Answer(ids, int32([0, 0, 1, 0, 1, 1]))
 
@@ -181,8 +189,9 @@ def _lone(count: int) -> list[list[int]]:
 
 
 def _assigned(
-    table: MaskTable, group: list[int], neighbours: list[list[int]], settings: MembershipSettings | None = None
-) -> Membership:
+    table: MaskTable, group: list[int], neighbours: list[list[int]], settings: MembershipSettings | None = None,
+    rgb: NDArray[np.uint8] | None = None,
+) -> Membership:  # fmt: skip
     """The library's answer; neighbours of each point, nearest first."""
     width = max(1, *map(len, neighbours))
     index, adjoining = np.zeros((len(neighbours), width), np.int32), np.zeros((len(neighbours), width), bool)
@@ -190,10 +199,12 @@ def _assigned(
         index[point, : len(near)], adjoining[point, : len(near)] = near, True
     around = Neighbourhood(np.ones(len(neighbours), np.float32), index, adjoining)
     groups = MaskGroups(int32(group), max(group) + 1, np.zeros(len(group), bool))
-    return assign_points(table, view_votes(table), groups, around, settings or MembershipSettings())
+    return assign_points(table, view_votes(table), groups, around, settings or MembershipSettings(), rgb)
 
 
-def _both(seed: int, settings: MembershipSettings) -> tuple[Membership, tuple[NDArray, NDArray, NDArray]]:
+def _both(
+    seed: int, settings: MembershipSettings, rgb: NDArray[np.uint8] | None = None
+) -> tuple[Membership, tuple[NDArray, NDArray, NDArray]]:
     """Membership of a torn table by the library and by the literal form. A fourth group is noise of a single mask."""
     table = _table(seed)
     group = [mask % 3 for mask in range(12)]
@@ -203,6 +214,6 @@ def _both(seed: int, settings: MembershipSettings) -> tuple[Membership, tuple[ND
         for g in range(POINTS)
     ]
     exact = literal.membership(
-        _literal(table), table.weights.toarray().astype(float), table.mask_view.tolist(), group, near, settings
+        _literal(table), table.weights.toarray().astype(float), table.mask_view.tolist(), group, near, settings, rgb
     )
-    return _assigned(table, group, near, settings), exact
+    return _assigned(table, group, near, settings, rgb), exact

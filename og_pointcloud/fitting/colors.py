@@ -1,0 +1,86 @@
+"""Colors of adjoining points -> how much likelier these are of one thing than of two, as this scene has it.
+
+Votes are torn along borders: rays slip past edges, masks are ragged, and noise puts a point of the wall before the
+lamp. A point's color is its own, wherever the noise put it. How much a difference of color says is for the scene to
+tell (textures, light, how well colors and points fit each other): of adjoining points whose states views are sure of,
+how often is there a difference as large within one state, and how often between two?
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import isotonic_regression
+
+from og_pointcloud.kernels import njit, prange
+from og_pointcloud.rendering.geometry import Neighbourhood
+
+DIFFERENCES = 443
+"""Rounded Euclidean distances of two 8-bit colors: 0 to 442."""
+LEAST_PAIRS = 30
+"""Pairs within one state, and between two, below which a scene's colors are not asked."""
+MOST = 9.0
+"""No difference counts as more times likelier within one thing than between two, or the other way round."""
+
+
+def color_ratios(
+    rgb: NDArray[np.uint8] | None, ids: NDArray[np.int32], sure: NDArray[np.bool_], around: Neighbourhood
+) -> NDArray[np.float32]:
+    """(443,) float32: how many times likelier each difference of color is between adjoining points of one state than of
+    two. It falls with the difference, from at most MOST to at least 1 / MOST; 1 throughout where colors say nothing.
+
+    rgb: (n, 3) or None. ids: (n,) the state of each point. sure: (n,) bool, the points that may be asked.
+    """
+    none = np.ones(DIFFERENCES, np.float32)
+    if rgb is None:
+        return none
+    one, two = _counted(np.ascontiguousarray(rgb), ids, sure, around.index, around.adjoining).astype(np.float64)
+    if min(one.sum(), two.sum()) < LEAST_PAIRS:
+        return none
+    # The chance of one state, if one and two were as frequent; a smaller difference never speaks less for one.
+    one, both = one / one.sum(), one / one.sum() + two / two.sum()
+    seen = np.flatnonzero(both)
+    chance = isotonic_regression(one[seen] / both[seen], weights=both[seen], increasing=False).x
+    chance = np.clip(np.interp(np.arange(DIFFERENCES), seen, chance), 1 / (1 + MOST), MOST / (1 + MOST))
+    return (chance / (1 - chance)).astype(np.float32)
+
+
+def neighbour_weights(
+    rgb: NDArray[np.uint8] | None, around: Neighbourhood, ratios: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    """(n, k) float32: the ratio of each point and its adjoining ones; 0 for neighbours that do not adjoin."""
+    if rgb is None or (ratios == 1).all():
+        return around.adjoining.astype(np.float32)
+    return _weights(np.ascontiguousarray(rgb), around.index, around.adjoining, ratios)
+
+
+@njit(cache=True)
+def _difference(a, b):  # noqa: ANN001, ANN202
+    total = 0.0
+    for channel in range(3):
+        total += (float(a[channel]) - float(b[channel])) ** 2
+    return int(np.rint(np.sqrt(total)))
+
+
+@njit(cache=True)
+def _counted(rgb, ids, sure, neighbours, adjoining):  # noqa: ANN001, ANN202
+    """(2, DIFFERENCES) int64: pairs of sure adjoining points by their difference, of one state and of two."""
+    count = np.zeros((2, DIFFERENCES), np.int64)
+    for g in range(len(ids)):
+        if not sure[g]:
+            continue
+        for k in range(neighbours.shape[1]):
+            other = neighbours[g, k]
+            if adjoining[g, k] and sure[other]:
+                count[int(ids[g] != ids[other]), _difference(rgb[g], rgb[other])] += 1
+    return count
+
+
+@njit(cache=True, parallel=True)
+def _weights(rgb, neighbours, adjoining, ratios):  # noqa: ANN001, ANN202
+    weights = np.zeros(neighbours.shape, np.float32)
+    for g in prange(len(neighbours)):
+        for k in range(neighbours.shape[1]):
+            if adjoining[g, k]:
+                weights[g, k] = ratios[_difference(rgb[g], rgb[neighbours[g, k]])]
+    return weights
