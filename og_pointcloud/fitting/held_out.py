@@ -109,11 +109,12 @@ def agreement(table: MaskTable, ids: NDArray[np.int32], count: int) -> float:
 def _labels(table: MaskTable, around: Neighbourhood, settings: FitSettings) -> tuple[NDArray[np.int32], int]:
     """The group of masks that each point is in, as mode grouping finds it, and how many groups there are.
 
-    By votes alone: a judge that sees hidden points by hearsay itself would hold it against labels that do not.
+    By votes alone: a judge that sees hidden points by hearsay itself would hold it against labels that do not, and what
+    neighbours mend is the same for all sizes.
     """
     votes = view_votes(table)
     groups = group_masks(table, votes, settings.grouping)
-    by_votes = replace(settings.membership, open_share=0.0)
+    by_votes = replace(settings.membership, open_share=0.0, own_vote=np.inf)
     return assign_points(table, votes, groups, around, by_votes).instance_ids, groups.count
 
 
