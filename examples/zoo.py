@@ -20,7 +20,7 @@ from pathlib import Path
 from og_pointcloud_zoo.constants import constants, page, tried
 from og_pointcloud_zoo.draws import draw, half_of, scene_names
 from og_pointcloud_zoo.make import made_scene
-from og_pointcloud_zoo.measure import Row, measure, parsed_settings, warm_up
+from og_pointcloud_zoo.measure import COLORS, Row, measure, parsed_settings, warm_up
 from og_pointcloud_zoo.report import HALVES, HEADER, line, summary, write_csv, write_picture
 
 from og_pointcloud.errors import OgPointcloudError
@@ -38,6 +38,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--only", nargs="+", default=[], metavar="NAME", help="scenes whose name begins so")
     parser.add_argument("--half", choices=tuple(HALVES), help="only this half")
     parser.add_argument("--set", nargs="+", default=[], metavar="PATH=VALUE", help="settings of the fit")
+    parser.add_argument("--colors", choices=COLORS, help="points' colors with noise, without hue too, or none")
     parser.add_argument("--quick", action="store_true", help="without baselines")
     parser.add_argument("--constants", type=Path, metavar="PAGE", help="write the page of constants (--only: of some)")
     parser.add_argument("--list", action="store_true", help="print the scenes as drawn, and make none")
@@ -80,7 +81,7 @@ def _rows(chosen: Sequence[Path], options: argparse.Namespace) -> list[Row]:
         folder = path if path in options.captures else made_scene(draw(path.name), options.output / "scenes")
         if not rows:
             warm_up(read_capture(folder))
-        rows.append(measure(folder, settings, baselines=not options.quick))
+        rows.append(measure(folder, settings, baselines=not options.quick, colors=options.colors))
         print(line(rows[-1]), flush=True)
         write_csv(rows, options.output / "zoo.csv")  # what is measured stays, should it be interrupted
     return rows

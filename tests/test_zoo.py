@@ -11,7 +11,7 @@ import zoo
 from og_pointcloud_zoo import constants as numbers
 from og_pointcloud_zoo import make
 from og_pointcloud_zoo.draws import ANY, KINDS, draw, half_of, scene_names
-from og_pointcloud_zoo.measure import Row, measure, parsed_settings
+from og_pointcloud_zoo.measure import COLOR_NOISE, COLORS, Row, _recolored, measure, parsed_settings
 from og_pointcloud_zoo.report import rank_correlation, summary
 
 import og_pointcloud as og
@@ -20,6 +20,7 @@ from og_pointcloud.evaluate.truth import read_truth
 from og_pointcloud.fitting import view_votes
 from og_pointcloud.formats.capture import read_capture
 from og_pointcloud.rendering import sightings
+from og_pointcloud.scene import Points, Scene, View
 
 TINY = replace(draw("boxes-0"), points=1500, views=6, width=96, height=72, outliers=0.01, floaters=0.01, hidden=0.2,
                all_masked=False)  # fmt: skip
@@ -228,3 +229,19 @@ def test_results_of_constants_are_kept(scenes, tmp_path, monkeypatch):
     assert (tmp_path / "again.md").read_text() == first
     error = 1 - measure(scenes[0], og.FitSettings(mode="grouping"), baselines=False).miou
     assert f"is {error:.4f} as they stand" in first
+
+
+def test_colors_that_say_less_leave_all_else_as_it_is():
+    rgb = np.random.default_rng(0).integers(0, 255, (4000, 3)).astype(np.uint8)
+    camera = og.Camera(8, 8, 8.0, 8.0, 4.0, 4.0, np.eye(4))
+    view = View("a", camera, np.ones((8, 8), np.int32), np.eye(1, dtype=np.float32))
+    scene = Scene(Points(np.zeros((4000, 3), np.float32), np.zeros(3), rgb), (view,), "none")
+    noisy, grey, none = (_recolored(scene, colors).points.rgb for colors in COLORS)
+    assert none is None
+    assert noisy is not None
+    assert grey is not None
+    inside = (rgb > 90) & (rgb < 165)
+    assert (noisy.astype(float) - rgb)[inside].std() == pytest.approx(COLOR_NOISE, rel=0.1)
+    assert np.abs(np.corrcoef(grey.astype(float) - rgb.mean(axis=1, keepdims=True), rowvar=False)[0, 1]) < 0.1
+    assert np.array_equal(noisy, _recolored(scene, "noisy").points.rgb)
+    assert _recolored(scene, None) is scene

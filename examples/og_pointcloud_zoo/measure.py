@@ -28,9 +28,13 @@ from og_pointcloud.settings import FitSettings
 from og_pointcloud.text.text_features import read_text_features
 from og_pointcloud_zoo.draws import half_of
 
-__all__ = ["Row", "answered", "measure", "parsed_settings", "warm_up"]
+__all__ = ["COLORS", "Row", "answered", "measure", "parsed_settings", "warm_up"]
 
 WORDS, BANK = "text_features.npz", "word_bank.npz"
+COLORS = ("noisy", "grey", "none")
+"""Colors with noise, the same without hue, and none."""
+COLOR_NOISE = 30.0
+"""Standard deviation of that noise, of 255 levels: made colors are cleaner than those of a scan."""
 
 
 @dataclass(frozen=True)
@@ -59,9 +63,14 @@ class Row:
     gain_high: float | None = None
 
 
-def measure(folder: Path, settings: FitSettings | None = None, baselines: bool = True) -> Row:
-    """Fit a capture with gt.npz and text_features.npz, score it; and the baselines on the same mask table."""
-    scene, truth = read_capture(folder), read_truth(folder)
+def measure(
+    folder: Path, settings: FitSettings | None = None, baselines: bool = True, colors: str | None = None
+) -> Row:
+    """Fit a capture with gt.npz and text_features.npz, score it; and the baselines on the same mask table.
+
+    colors: one of `COLORS`, None: as they are.
+    """
+    scene, truth = _recolored(read_capture(folder), colors), read_truth(folder)
     start, worked = time.perf_counter(), time.process_time()
     journal = Journal(progress=False)
     prepared = prepare(scene, settings, journal)
@@ -82,6 +91,19 @@ def measure(folder: Path, settings: FitSettings | None = None, baselines: bool =
         reliability=cloud.reliability,
     )
     return _beside_baselines(row, folder, prepared, answer, truth, score.classes) if baselines else row
+
+
+def _recolored(scene: Scene, colors: str | None) -> Scene:
+    """The scene with colors that say less; always the same."""
+    rgb = scene.points.rgb
+    if colors is None or rgb is None:
+        return scene
+    found = None
+    if colors != "none":
+        exact = rgb.astype(np.float64) if colors == "noisy" else np.repeat(rgb.mean(axis=1, keepdims=True), 3, axis=1)
+        noise = np.random.default_rng(0).normal(0, COLOR_NOISE, rgb.shape)
+        found = np.clip(exact + noise, 0, 255).astype(np.uint8)
+    return replace(scene, points=replace(scene.points, rgb=found))
 
 
 def answered(folder: Path, cloud: og.LabelledCloud, truth: Truth) -> Answer:
