@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 import og_pointcloud as og
 from og_pointcloud.formats.poses import in_local_frame
-from og_pointcloud.mapping.changes import Visit
+from og_pointcloud.mapping.presence import Visit
 from og_pointcloud.mapping.sight import AGREES, THROUGH, states_of_points
 
 FEWEST_POINTS = 20

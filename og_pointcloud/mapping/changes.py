@@ -15,9 +15,7 @@ table. What lies where the earlier visit never looked is neither new nor old: it
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -26,9 +24,8 @@ from scipy.optimize import linear_sum_assignment
 from scipy.spatial import cKDTree
 
 from og_pointcloud.ask.labelled_scene import SceneLike, as_scene
-from og_pointcloud.cloud import LabelledCloud
+from og_pointcloud.cloud import BACKGROUND
 from og_pointcloud.errors import SceneError
-from og_pointcloud.formats.poses import in_local_frame
 from og_pointcloud.mapping.likeness import (
     ALIKE,
     FEWEST_SAME,
@@ -36,33 +33,16 @@ from og_pointcloud.mapping.likeness import (
     Look,
     Scale,
     cosines,
-    descriptors_of,
     spread_of,
     typical_cosine,
 )
 from og_pointcloud.mapping.map_record import MapRecord
-from og_pointcloud.mapping.presence import Presence
-from og_pointcloud.mapping.sight import DiscSurface, MeasuredView
-from og_pointcloud.rendering.geometry import Neighbourhood, neighbourhood
-from og_pointcloud.scene import Camera
-from og_pointcloud.settings import GeometrySettings
+from og_pointcloud.mapping.presence import FEWEST_POINTS, Evidence, Presence, Visit, tolerance_of
 
-TOLERANCE = 0.5
-"""Spacings at right angles to a surface up to which a point is of it."""
-SCATTER = 2.0
-"""Standard deviations of the points off their surface, where that is more: of dense and noisy clouds."""
-MOST = 0.5
-"""Share of an instance's telling points that decides."""
 SAME_SURFACE = 1.5
 """Spacings within which two visits' points are of one surface."""
 USUAL_COLORS = 3.0
 """Times that the colour of one thing may differ more than that of the median thing which has not moved."""
-FEWEST_POINTS, LEAST_SHARE = 5, 0.05
-"""Points of an instance, and share of those that show, that must be looked at before anything is said of it."""
-TELLING = 1.5
-"""Tolerances that a point lies off every other surface about it, to tell of its own thing."""
-FLAT_SHARE = 0.25
-"""Share of what is looked at that must be seen through where most of a thing lies flat on something else."""
 ADJOINING = 3.0
 """Spacings up to which two instances adjoin, and may be pieces of one thing."""
 LEAST_STILL = 0.05
@@ -129,137 +109,13 @@ def compare(before: SceneLike, after: SceneLike) -> Changes:
 
 
 @dataclass(frozen=True)
-class Visit:
-    """A labelled cloud as it is compared. depth: what its views measured by depth images, in its local frame; None: its
-    own cloud, seen from its cameras."""
-
-    cloud: LabelledCloud
-    depth: Iterable[MeasuredView] | None = None
-
-    @classmethod
-    def in_frame_of(
-        cls, other: LabelledCloud, cloud: LabelledCloud, depth: Iterable[MeasuredView] | None = None
-    ) -> Visit:
-        """A visit in the local frame of another; depth: of its views, in that frame already."""
-        shift = cloud.origin - other.origin
-        cameras = tuple(in_local_frame(camera, -shift) for camera in cloud.cameras)
-        return cls(
-            replace(cloud, xyz=(cloud.xyz + shift).astype(np.float32), origin=other.origin, cameras=cameras), depth
-        )
-
-    @cached_property
-    def surface(self) -> DiscSurface:
-        """Its cloud, as it is seen."""
-        return DiscSurface(self.cloud.xyz, self.around)
-
-    @cached_property
-    def around(self) -> Neighbourhood:
-        """Neighbours of its points."""
-        return neighbourhood(self.cloud.xyz, GeometrySettings())
-
-    def measured(self, cameras: Sequence[Camera] | None = None) -> Iterable[MeasuredView]:
-        """What its views measured, or, of its cloud, what views from other places would have."""
-        if self.depth is not None and cameras is None:
-            return self.depth
-        return (self.surface.seen_from(camera) for camera in (self.cloud.cameras if cameras is None else cameras))
-
-    def points_of(self, instance: int) -> NDArray[np.int64]:
-        """(m,) rows of an instance's points, ascending."""
-        return self._by_instance[instance]
-
-    @cached_property
-    def _by_instance(self) -> list[NDArray[np.int64]]:
-        ids = self.cloud.instance_ids
-        order = np.argsort(ids, kind="stable")
-        return np.split(order, np.searchsorted(ids[order], np.arange(len(self.cloud.instances) + 1)))[1:-1]
-
-    @cached_property
-    def described(self) -> NDArray[np.int64]:
-        """(instances,) how many descriptors each has."""
-        table = self.cloud.instances
-        return np.bincount(table.descriptor_instance, minlength=len(table))
-
-    @cached_property
-    def adjoining(self) -> NDArray[np.bool_]:
-        """(instances, instances): those with points that are neighbours of each other's; each adjoins itself."""
-        ids, found = self.cloud.instance_ids, np.eye(len(self.cloud.instances), dtype=bool)
-        for neighbour in self.around.index.T:
-            both = (ids >= 0) & (ids[neighbour] >= 0)
-            found[ids[both], ids[neighbour[both]]] = True
-        return found | found.T
-
-    def color_of(self, instance: int) -> NDArray[np.float64]:
-        """(3,) the median colour of an instance; of a cloud with colours."""
-        assert self.cloud.rgb is not None
-        return np.median(self.cloud.rgb[self.points_of(instance)], axis=0)
-
-    def look(self, instance: int, rows: NDArray[np.int64]) -> Look:
-        """The look of an instance, by some of its points."""
-        cloud = self.cloud
-        rgb = None if cloud.rgb is None else cloud.rgb[rows]
-        return Look.of_points(*descriptors_of(cloud.instances, instance), cloud.xyz[rows], rgb)
-
-    def count(self, chosen: NDArray[np.bool_], sure: NDArray[np.floating] | None = None) -> NDArray[np.float64]:
-        """(instances,) how many of each instance's points are chosen, (n,) bool; sure: (n,) what each counts."""
-        ids, weight = self.cloud.instance_ids, np.ones(len(chosen)) if sure is None else sure
-        rows = np.flatnonzero(chosen & (ids >= 0))
-        return np.asarray(np.bincount(ids[rows], weight[rows], len(self.cloud.instances)), np.float64)
-
-    def telling(self, tolerance: float) -> NDArray[np.bool_]:
-        """(n,) bool: points that lie off the surfaces of all other instances about them."""
-        ids, surface = self.cloud.instance_ids, self.surface
-        tells = np.ones(len(ids), bool)
-        for neighbour in self.around.index.T:
-            off = np.abs(np.einsum("na,na->n", self.cloud.xyz - surface.xyz[neighbour], surface.normal[neighbour]))
-            tells &= (ids[neighbour] == ids) | (off > TELLING * tolerance)
-        return tells
-
-
-@dataclass(frozen=True)
-class Evidence:
-    """Of one visit's points, by another's views, (n,) bool each. shown: seen by their own visit. still, through: the
-    other visit measures them where they are, or sees through their places. telling: off all surfaces of other things.
-    """
-
-    shown: NDArray[np.bool_]
-    still: NDArray[np.bool_]
-    through: NDArray[np.bool_]
-    telling: NDArray[np.bool_]
-
-    def decided(self, visit: Visit) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """(instances,) bool each: those that are seen through; those hardly looked at.
-
-        Each point counts by how sure it is of its instance: a part of the table that a mask took for the book's stays
-        when the book leaves.
-        """
-        least = np.maximum(FEWEST_POINTS, LEAST_SHARE * visit.count(self.shown))
-        seen_through, looked_at = (visit.count(self.shown & of) for of in (self.through, self.through | self.still))
-        sure = None if visit.cloud.certainty is None else visit.cloud.certainty / 255
-        still, telling, through = (
-            visit.count(self.shown & of, sure) for of in (self.still, self.still & self.telling, self.through)
-        )
-        most = through > MOST * (through + still)
-        lies_flat = (through > MOST * (through + telling)) & (through > FLAT_SHARE * (through + still)) & ~most
-        for k in np.flatnonzero(lies_flat):
-            lies_flat[k] = self._of_one_color(visit, int(k))
-        return (seen_through >= least) & (most | lies_flat), looked_at < least
-
-    def _of_one_color(self, visit: Visit, instance: int) -> bool:
-        """Whether what is seen through is of the colour of the rest: else it is a part of something else."""
-        rows = visit.points_of(instance)
-        rows = rows[self.shown[rows]]
-        return visit.look(instance, rows[self.through[rows]]).has_color_of(visit.look(instance, rows[self.still[rows]]))
-
-
-@dataclass(frozen=True)
 class Comparison:
-    """changes, and what they rest on. of_earlier, of_later: the evidence about each visit's points. nearest: of each
-    later point the row of the nearest earlier one, -1 where none is of its surface. pieces: later id -> the later id
-    whose thing it is a piece of. gone_pieces: earlier id -> the moved thing that it was a piece of."""
+    """changes, and what they rest on. evidence: about the earlier visit's points. nearest: of each later point the row
+    of the nearest earlier one, -1 where none is of its surface. pieces: later id -> the later id whose thing it is a
+    piece of. gone_pieces: earlier id -> the moved thing that it was a piece of."""
 
     changes: Changes
-    of_earlier: Evidence
-    of_later: Evidence
+    evidence: Evidence
     nearest: NDArray[np.int64]
     pieces: dict[int, int]
     gone_pieces: dict[int, int]
@@ -278,7 +134,7 @@ def compare_visits(
     if not b.cameras and later.depth is None:
         raise SceneError("the later visit does not know its cameras, so not what it looked at: fit its capture again")
     scatter = max(earlier.surface.scatter, later.surface.scatter)
-    tolerance = max(TOLERANCE * max(a.spacing, b.spacing), SCATTER * scatter)
+    tolerance = tolerance_of(max(a.spacing, b.spacing), scatter)
     shown, known = Presence.by(earlier.measured(), tolerance, a.xyz, b.xyz)
     if not a.cameras:  # what the earlier visit saw is not known: it may have looked from the same places
         (known,) = Presence.by(earlier.measured(b.cameras), tolerance, b.xyz)
@@ -308,27 +164,26 @@ def _require_one_frame(asked: Presence) -> None:
 @dataclass(frozen=True)
 class _Thing:
     """Instances of one visit that are pieces of one thing that left or came, the largest first. look: by the points
-    that show so. place: (3,) their mean, world coordinates; points: how many."""
+    that show so, of which there are so many; its place is of all pieces."""
 
     pieces: tuple[int, ...]
     look: Look
-    place: NDArray[np.float64]
     points: int
 
     def has(self, piece: _Thing, place: NDArray[np.float64], reach: float, scale: Scale) -> bool:
         """Whether a thing looks like a piece of this one, which is at that place then and so long."""
-        near = np.linalg.norm(piece.place - place) < reach
+        near = np.linalg.norm(piece.look.place - place) < reach
         return bool(near) and self.look.has_color_of(piece.look) and scale.cosine(self.look, piece.look) > ALIKE
 
     def with_pieces(self, other: _Thing) -> _Thing:
         """This one with the pieces of another."""
         points = self.points + other.points
-        place = (self.points * self.place + other.points * other.place) / points
-        return replace(self, pieces=(*self.pieces, *other.pieces), place=place, points=points)
+        place = (self.points * self.look.place + other.points * other.look.place) / points
+        return _Thing((*self.pieces, *other.pieces), replace(self.look, place=place), points)
 
     def without_pieces(self) -> _Thing:
         """What is left of this one once another has its pieces."""
-        return replace(self, pieces=(), points=0)
+        return _Thing((), self.look, 0)
 
 
 def _decide(
@@ -339,41 +194,39 @@ def _decide(
     scale = _scale(earlier, later, _unmoved(earlier, later, nearest, left, came))
     gone = _things(earlier, np.flatnonzero(left).tolist(), of_earlier.through, scale)
     new = _things(later, np.flatnonzero(came).tolist(), of_later.through, scale)
-    retired = [  # what an earlier visit found gone, and may be back
-        _Thing((k,), entry.look(earlier.cloud.instances, k), np.array(entry.place), 0)
-        for k, entry in MapRecord.of(earlier.cloud).gone.items()
-    ]
-    unmatched, gone = set(range(len(gone))), [*gone, *retired]
-    pairs = _matched(gone, new, scale)
-    gone, new, pairs = _gathered(gone, new, pairs, scale)
+    count = len(gone)  # behind them: what an earlier visit found gone, and may be back
+    gone += [_Thing((k,), look, 0) for k, look in MapRecord.of(earlier.cloud).gone.items()]
+    gone, new, pairs = _gathered(gone, new, _matched(gone, new, scale), scale)
     taken = set(pairs.values())
     changes = Changes(
-        gone=tuple(sorted(k for g in unmatched - {*pairs} for k in gone[g].pieces)),
+        gone=tuple(sorted(k for g in range(count) if g not in pairs for k in gone[g].pieces)),
         new=tuple(thing.pieces[0] for n, thing in enumerate(new) if n not in taken and thing.pieces),
         moved=tuple(
-            Moved(gone[g].pieces[0], gone[g].place, new[n].place, new[n].pieces[0]) for g, n in sorted(pairs.items())
+            Moved(gone[g].pieces[0], gone[g].look.place, new[n].look.place, new[n].pieces[0])
+            for g, n in sorted(pairs.items())
         ),
         unseen=tuple(np.flatnonzero(hardly & (earlier.count(earlier.cloud.instance_ids >= 0) > 0) & ~left).tolist()),
     )
     pieces = {piece: thing.pieces[0] for thing in new for piece in thing.pieces}
     gone_pieces = {piece: gone[g].pieces[0] for g in pairs for piece in gone[g].pieces}
-    return Comparison(changes, of_earlier, of_later, nearest, pieces, gone_pieces)
+    return Comparison(changes, of_earlier, nearest, pieces, gone_pieces)
 
 
 def _unmoved(
     earlier: Visit, later: Visit, nearest: NDArray[np.int64], left: NDArray[np.bool_], came: NDArray[np.bool_]
 ) -> NDArray[np.int64]:
     """(m, 2) instances of both visits that share most of their surface with each other, and neither left nor came."""
-    ids, count = later.cloud.instance_ids, (len(left), len(came))
-    owners = np.where(nearest >= 0, earlier.cloud.instance_ids[nearest], -1)
-    both = (ids >= 0) & (owners >= 0)
-    shared = np.bincount(owners[both] * np.int64(count[1]) + ids[both], minlength=count[0] * count[1]).reshape(count)
-    shared[left], shared[:, came] = 0, 0
+    owners = np.where(nearest >= 0, earlier.cloud.instance_ids[nearest], BACKGROUND)
+    shared = later.shared(owners, len(left))[:, :-1].T
     if not shared.size:
         return np.zeros((0, 2), np.int64)
-    one = np.flatnonzero((shared.max(axis=1) >= FEWEST_POINTS) & (earlier.described > 0))
+    shared[left], shared[:, came] = 0, 0
+    described = [
+        np.isin(np.arange(len(v.cloud.instances)), v.cloud.instances.descriptor_instance) for v in (earlier, later)
+    ]
+    one = np.flatnonzero((shared.max(axis=1) >= FEWEST_POINTS) & described[0])
     other = shared[one].argmax(axis=1)
-    mutual = (shared[:, other].argmax(axis=0) == one) & (later.described[other] > 0)
+    mutual = (shared[:, other].argmax(axis=0) == one) & described[1][other]
     return np.stack([one, other], axis=1)[mutual]
 
 
@@ -391,7 +244,10 @@ def _scale(earlier: Visit, later: Visit, unmoved: NDArray[np.int64]) -> Scale:
     same, other = float(np.median(between.diagonal())), float(np.median(others))
     if earlier.cloud.rgb is None or later.cloud.rgb is None:
         return Scale(same, other)
-    off = np.array([later.color_of(k) - earlier.color_of(i) for i, k in unmoved.tolist()])
+    colors = [
+        [v.look(k, v.rows[k]).color for k in ids] for v, ids in ((earlier, unmoved[:, 0]), (later, unmoved[:, 1]))
+    ]
+    off = np.subtract(colors[1], colors[0])
     shift = np.median(off, axis=0)
     usual = float(np.median(np.abs(off - shift).max(axis=1)))
     return Scale(same, other, shift, max(OTHER_COLOR, USUAL_COLORS * usual))
@@ -400,7 +256,7 @@ def _scale(earlier: Visit, later: Visit, unmoved: NDArray[np.int64]) -> Scale:
 def _things(visit: Visit, candidates: list[int], through: NDArray[np.bool_], scale: Scale) -> list[_Thing]:
     """Candidates, those that adjoin and look alike together: pieces of one thing. Of a small piece, which few masks
     show, the colour is enough."""
-    rows = {k: visit.points_of(k)[through[visit.points_of(k)]] for k in candidates}
+    rows = {k: visit.rows[k][through[visit.rows[k]]] for k in candidates}
     looks = {k: visit.look(k, of) for k, of in rows.items()}
     trees = {k: cKDTree(visit.cloud.xyz[of]) for k, of in rows.items()}
     group = {k: k for k in candidates}
@@ -416,7 +272,7 @@ def _things(visit: Visit, candidates: list[int], through: NDArray[np.bool_], sca
     for first in dict.fromkeys(group.values()):
         pieces = sorted((k for k in candidates if group[k] == first), key=lambda k: (-len(rows[k]), k))
         xyz = visit.cloud.xyz_world[np.concatenate([rows[k] for k in pieces])]
-        things.append(_Thing(tuple(pieces), looks[pieces[0]], xyz.mean(axis=0), len(xyz)))
+        things.append(_Thing(tuple(pieces), replace(looks[pieces[0]], place=xyz.mean(axis=0)), len(xyz)))
     return things
 
 
@@ -447,11 +303,11 @@ def _gathered(
         long = max(gone[g].look.length, new[n].look.length)
         for h, piece in enumerate(gone):
             small = h != g and 0 < piece.points < SMALL_PIECE * gone[g].points
-            came_too = h not in pairs or gone[g].has(new[pairs[h]], new[n].place, long, scale)
-            if small and came_too and gone[g].has(piece, gone[g].place, long, here):
+            came_too = h not in pairs or gone[g].has(new[pairs[h]], new[n].look.place, long, scale)
+            if small and came_too and gone[g].has(piece, gone[g].look.place, long, here):
                 gone[g], gone[h] = gone[g].with_pieces(piece), piece.without_pieces()
                 pairs.pop(h, None)
         for k, piece in enumerate(new):
-            if k not in pairs.values() and piece.points and gone[g].has(piece, new[n].place, long, scale):
+            if k not in pairs.values() and piece.points and gone[g].has(piece, new[n].look.place, long, scale):
                 new[n], new[k] = new[n].with_pieces(piece), piece.without_pieces()
     return gone, new, pairs

@@ -10,10 +10,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from og_pointcloud.cloud import FeatureSpace
 from og_pointcloud.formats.poses import in_local_frame
-from og_pointcloud.mapping.changes import SCATTER, TOLERANCE
 from og_pointcloud.mapping.frame import CheckedFrame
 from og_pointcloud.mapping.kept_views import KeptViews
-from og_pointcloud.mapping.presence import Presence
+from og_pointcloud.mapping.presence import Presence, tolerance_of
 from og_pointcloud.mapping.sight import AGREES, THROUGH, MeasuredView, states_in_packets
 from og_pointcloud.mapping.tracks import NO_TRACK, PointVotes, Tracks
 from og_pointcloud.mapping.voxels import VoxelPoints
@@ -57,8 +56,8 @@ class GrowingMap:
         scatter: float = 0.0,
     ) -> GrowingMap:  # fmt: skip
         """Without a point. grows: whether frames add some. scatter: standard deviation of points off their surface."""
-        tolerance = max(TOLERANCE * spacing, SCATTER * scatter)
-        return cls(origin, space, VoxelPoints(spacing, grows), Presence(tolerance, MOST_ODDS))
+        presence = Presence(tolerance_of(spacing, scatter), MOST_ODDS)
+        return cls(origin, space, VoxelPoints(spacing, grows), presence)
 
     def grow(self) -> None:
         """Room for what is known of each point."""

@@ -40,12 +40,16 @@ MOST_ROWS = 1000
 
 @dataclass(frozen=True)
 class Look:
-    """descriptors: (r, D) float32 unit rows, r = 0 where no mask gave a feature. spread: the squared tangent that they
-    are off by. color: (3,) median, or None. length: of its longest side, along the axes, without outliers."""
+    """How a thing looked, and where, so that it is known when it comes back. descriptors: (r, D) float32 unit rows,
+    r = 0 where no mask gave a feature. spread: the squared tangent that they are off by. place: (3,) mean of its
+    points, world coordinates. color: (3,) median, or None. size: (3,) along the axes; length: of the longest side,
+    without outliers."""
 
     descriptors: NDArray[np.float32]
     spread: float
+    place: NDArray[np.float64]
     color: NDArray[np.float64] | None
+    size: NDArray[np.float64]
     length: float
 
     @classmethod
@@ -53,13 +57,15 @@ class Look:
         cls,
         descriptors: NDArray[np.float32],
         spread: float,
+        place: NDArray[np.float64],
         xyz: NDArray[np.float32],
         rgb: NDArray[np.uint8 | np.float32] | None,
     ) -> Look:
-        """Of points xyz (n, 3), at least one, with rgb (n, 3) or None."""
+        """Of points xyz (n, 3), at least one, in any frame of the world's axes, with rgb (n, 3) or None."""
         sides = np.ptp(np.percentile(xyz, [3, 97], axis=0), axis=0)
         color = None if rgb is None else np.median(rgb, axis=0).astype(np.float64)
-        return cls(descriptors, spread, color, float(sides.max()))
+        size = np.ptp(xyz.astype(np.float64), axis=0)
+        return cls(descriptors, spread, place, color, size, float(sides.max()))
 
     def has_color_of(self, other: Look, most: float = SAME_COLOR) -> bool:
         """Whether the two may be parts of one thing by their colours; True where these are not known."""

@@ -31,14 +31,14 @@ from og_pointcloud.mapping.growing_map import GrowingMap
 from og_pointcloud.mapping.kept_views import KeptView, KeptViews
 from og_pointcloud.mapping.likeness import Look
 from og_pointcloud.mapping.presence import Presence
-from og_pointcloud.mapping.tracks import Left, PointVotes, Track, Tracks
+from og_pointcloud.mapping.tracks import PointVotes, Track, Tracks
 from og_pointcloud.mapping.voxels import Packets, VoxelHash, VoxelPoints
 from og_pointcloud.scene import Camera
 
 KINDS = {
     kind.__name__: kind
     for kind in (
-        Camera, FeatureSpace, Frame, GrowingMap, KeptView, KeptViews, Left, Look, Packets, PointVotes, Presence, Track,
+        Camera, FeatureSpace, Frame, GrowingMap, KeptView, KeptViews, Look, Packets, PointVotes, Presence, Track,
         Tracks, VoxelHash, VoxelPoints,
     )
 }  # fmt: skip

@@ -7,10 +7,11 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud.mapping.changes import FEWEST_POINTS, FLAT_SHARE, MOST, Moved
+from og_pointcloud.mapping.changes import Moved
 from og_pointcloud.mapping.growing_map import GrowingMap
 from og_pointcloud.mapping.likeness import ALIKE, Look, Scale
-from og_pointcloud.mapping.tracks import NO_TRACK, Left
+from og_pointcloud.mapping.presence import FEWEST_POINTS, FLAT_SHARE, MOST
+from og_pointcloud.mapping.tracks import NO_TRACK
 
 
 @dataclass(frozen=True)
@@ -77,9 +78,8 @@ def _has_left(known: GrowingMap, k: int) -> bool:
     if lost <= max(MOST * (lost + len(still)), FLAT_SHARE * (lost + len(rows))):
         return False
     # What it stood before, and its masks held too, is still there: it looked as what left does.
-    went = np.array(track.lost, np.int32)
-    size = np.ptp(known.points.xyz[went].astype(np.float64), axis=0)
-    track.left, track.lost = Left(_look(known, k, went), known.place_of(went), size, track.sequence), []
+    track.left, track.left_at = _look(known, k, np.array(track.lost, np.int32)), track.sequence
+    track.lost = []
     known.points.weight[np.setdiff1d(rows, still)] = 0
     known.forget(rows)
     return True
@@ -111,7 +111,8 @@ def _look(known: GrowingMap, k: int, rows: NDArray[np.integer]) -> Look:
     descriptor = known.tracks.tracks[k].descriptor
     descriptor = np.zeros((0, 1)) if descriptor is None else descriptor[None]
     xyz, rgb = known.points.xyz[rows], known.points.rgb[rows]
-    return Look.of_points(descriptor.astype(np.float32), float(known.tracks.spread()[k]), xyz, rgb)
+    spread = float(known.tracks.spread()[k])
+    return Look.of_points(descriptor.astype(np.float32), spread, known.place_of(rows), xyz, rgb)
 
 
 def _returned(known: GrowingMap, k: int, scale: Scale) -> list[Moved]:
@@ -124,10 +125,10 @@ def _returned(known: GrowingMap, k: int, scale: Scale) -> list[Moved]:
     came, alike = {}, {}
     for old in known.tracks.tracks:
         if old.left and old.id >= 0:
-            came[old.id] = rows[known.kept.born[rows] > old.left.sequence]
-            share = FLAT_SHARE if track.first > old.left.sequence else MOST
+            came[old.id] = rows[known.kept.born[rows] > old.left_at]
+            share = FLAT_SHARE if track.first > old.left_at else MOST
             if len(came[old.id]) >= max(FEWEST_POINTS, share * len(rows)):
-                alike[old.id] = scale.likeness(old.left.look, _look(known, k, came[old.id]))
+                alike[old.id] = scale.likeness(old.left, _look(known, k, came[old.id]))
     best = max(alike, key=lambda old: (alike[old], -old), default=None)
     if best is None or alike[best] <= ALIKE:
         return []

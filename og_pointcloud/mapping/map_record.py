@@ -6,7 +6,7 @@ Ids are rows of the instance table and are never given twice: what left keeps it
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -27,30 +27,16 @@ class VisitEntry:
     views: int
 
 
-@dataclass(frozen=True)
-class Retired:
-    """How a thing that left looked, so that it is known when it comes back. place: (3,) where it was, world
-    coordinates. length: of its longest side. color: (3,) median, 0 to 255, or None."""
-
-    place: tuple[float, ...]
-    length: float
-    color: tuple[float, ...] | None
-
-    def look(self, table: InstanceTable, instance: int) -> Look:
-        """With the descriptors that its row of the table still has."""
-        color = None if self.color is None else np.array(self.color)
-        return Look(*descriptors_of(table, instance), color, self.length)
-
-
 @dataclass
 class MapRecord:
     """visits: in their order. last_seen: by id, the stamp of the visit that last looked at the instance. moved_from: by
-    id, where it was before it moved last. gone: by id, what left and has not come back."""
+    id, where it was before it moved last. gone: by id, how what left and has not come back looked: its descriptors are
+    those that its row of the table still has."""
 
     visits: list[VisitEntry] = field(default_factory=list)
     last_seen: dict[int, float] = field(default_factory=dict)
     moved_from: dict[int, tuple[float, ...]] = field(default_factory=dict)
-    gone: dict[int, Retired] = field(default_factory=dict)
+    gone: dict[int, Look] = field(default_factory=dict)
 
     @classmethod
     def of(cls, cloud: LabelledCloud) -> MapRecord:
@@ -67,10 +53,9 @@ class MapRecord:
                 [VisitEntry(str(v["name"]), float(v["stamp"]), int(v["views"])) for v in stored["visits"]],
                 {int(k): float(stamp) for k, stamp in stored["last_seen"].items()},
                 {int(k): _three(place) for k, place in stored["moved_from"].items()},
-                {int(k): Retired(_three(v["place"]), float(v["length"]), v["color"] and _three(v["color"]))
-                 for k, v in stored["gone"].items()},
-            )  # fmt: skip
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
+                {int(k): _look(entry, cloud.instances, int(k)) for k, entry in stored["gone"].items()},
+            )
+        except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
             raise OgPointcloudError(
                 f"the map's record of its visits is damaged ({error!r:.80}): fit it again"
             ) from None
@@ -79,13 +64,22 @@ class MapRecord:
             raise OgPointcloudError(f"the map's record names instance {max(ids)} of {count}: fit it again")
         return record
 
-    def state(self, instance: int) -> str:
-        """ "present" or "gone"."""
-        return "gone" if instance in self.gone else "present"
-
     def added_to(self, provenance: dict[str, Any]) -> dict[str, Any]:
         """The provenance with this record, JSON-able."""
-        return {**provenance, KEY: asdict(self)}
+        gone = {
+            k: {"place": look.place.tolist(), "length": look.length,
+                "color": None if look.color is None else look.color.tolist()}
+            for k, look in self.gone.items()
+        }  # fmt: skip
+        return {**provenance, KEY: {**asdict(replace(self, gone={})), "gone": gone}}
+
+
+def _look(entry: dict[str, Any], table: InstanceTable, instance: int) -> Look:
+    color, length = entry["color"], float(entry["length"])
+    return Look(
+        *descriptors_of(table, instance), np.array(_three(entry["place"])),
+        None if color is None else np.array(_three(color)), np.full(3, length), length,
+    )  # fmt: skip
 
 
 def _three(values: Any) -> tuple[float, ...]:

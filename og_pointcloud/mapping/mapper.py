@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 from og_pointcloud.ask.labelled_scene import LabelledScene, SceneLike, as_scene
 from og_pointcloud.cloud import UNKNOWN_SPACE, FeatureSpace, LabelledCloud
 from og_pointcloud.errors import SceneError
-from og_pointcloud.mapping.changes import Changes, Moved, Visit, compare_visits
+from og_pointcloud.mapping.changes import Changes, Moved, compare_visits
 from og_pointcloud.mapping.frame import COMPARED, CheckedFrame, Frame, checked, require_same_place
 from og_pointcloud.mapping.growing_map import GrowingMap
 from og_pointcloud.mapping.labelling import labelled, matched_ids, with_ids
@@ -29,9 +29,10 @@ from og_pointcloud.mapping.map_journal import MapJournal
 from og_pointcloud.mapping.map_objects import MapObject, leave, name, objects_of
 from og_pointcloud.mapping.map_record import MapRecord
 from og_pointcloud.mapping.merging import merge
+from og_pointcloud.mapping.presence import Visit
 from og_pointcloud.mapping.seeing import drawn_points, measured_points, vote
 from og_pointcloud.mapping.sight import DiscSurface
-from og_pointcloud.mapping.tracks import Left, Track
+from og_pointcloud.mapping.tracks import Track
 from og_pointcloud.rendering.geometry import Neighbourhood, neighbourhood
 from og_pointcloud.scene import Points, require_finite
 from og_pointcloud.settings import FitSettings
@@ -135,8 +136,7 @@ class Mapper:
             known.tracks.add(Track(total, pixels, *counts, seen, id=k))
         known.tracks.next_id = len(table)
         for k, entry in record.gone.items():
-            place, size = np.array(entry.place), np.full(3, entry.length)
-            known.tracks.tracks[k].left = Left(entry.look(table, k), place, size)
+            known.tracks.tracks[k].left = entry
         of = base.instance_ids >= 0
         rows, ids = self._rows[of], base.instance_ids[of]
         known.votes.add(rows, ids, np.full(len(rows), KNOWN_VOTES, np.float32), np.zeros(len(table), np.bool_))

@@ -17,8 +17,9 @@ from scipy.spatial import cKDTree
 from og_pointcloud.ask.labelled_scene import SceneLike, as_scene
 from og_pointcloud.cloud import BACKGROUND, UNOBSERVED, FeatureSpace, InstanceTable, LabelledCloud
 from og_pointcloud.fitting.fit import fit
-from og_pointcloud.mapping.changes import FEWEST_POINTS, MOST, SAME_SURFACE, Changes, Comparison, Visit, compare_visits
-from og_pointcloud.mapping.map_record import MapRecord, Retired, VisitEntry
+from og_pointcloud.mapping.changes import SAME_SURFACE, Changes, Comparison, compare_visits
+from og_pointcloud.mapping.map_record import MapRecord, VisitEntry
+from og_pointcloud.mapping.presence import FEWEST_POINTS, MOST, Visit
 from og_pointcloud.mapping.sight import MeasuredView
 from og_pointcloud.scene import Scene
 from og_pointcloud.settings import FitSettings
@@ -97,8 +98,8 @@ def _staying(a: LabelledCloud, found: Comparison) -> tuple[NDArray[np.bool_], ND
     """(n,) bool each of the map's points: those that stay, and those of them that have lost what they were part of."""
     left = np.zeros(len(a.instances) + 2, bool)  # rows -2 and -1: unobserved and background
     left[[*found.changes.gone, *found.gone_pieces]] = True
-    of_left, still = left[a.instance_ids], found.of_earlier.still
-    return ~found.of_earlier.through & (~of_left | still), of_left & still
+    of_left, still = left[a.instance_ids], found.evidence.still
+    return ~found.evidence.through & (~of_left | still), of_left & still
 
 
 def _ids_of_later(earlier: Visit, later: Visit, stays: NDArray[np.bool_], found: Comparison) -> NDArray[np.int64]:
@@ -107,25 +108,20 @@ def _ids_of_later(earlier: Visit, later: Visit, stays: NDArray[np.bool_], found:
     What moved has its old id, what came a fresh one, what was there the id that most of its surface has; what the map
     did not know a fresh one too.
     """
-    a, b = earlier.cloud, later.cloud
-    known, fresh = np.full(len(b.instances), -1, np.int64), len(a.instances)
-    came = {moved.now: moved.id for moved in found.changes.moved}
-    owners = a.instance_ids[found.nearest]
-    on_map = (found.nearest >= 0) & stays[found.nearest] & (owners != UNOBSERVED)
-    for k in range(len(b.instances)):
+    count = fresh = len(earlier.cloud.instances)
+    on_map = (found.nearest >= 0) & stays[found.nearest]
+    shared = later.shared(np.where(on_map, earlier.cloud.instance_ids[found.nearest], UNOBSERVED), count)
+    best, most = shared.argmax(axis=1), shared.max(axis=1)
+    was_there = (best < count) & (most >= FEWEST_POINTS) & (most > MOST * shared.sum(axis=1))
+    known, came = np.where(was_there, best, -1), {moved.now: moved.id for moved in found.changes.moved}
+    for k in range(len(known)):
         thing = found.pieces.get(k)
-        if thing is None:
-            rows = later.points_of(k)
-            votes = np.bincount(owners[rows[on_map[rows]]] + 1, minlength=1)  # place 0: background
-            best = int(votes.argmax())
-            if best > 0 and votes[best] >= FEWEST_POINTS and votes[best] > MOST * votes.sum():
-                known[k] = best - 1
-        elif thing in came:
-            known[k] = came[thing]
+        if thing is not None:
+            known[k] = came.get(thing, -1)
         if known[k] < 0:
             known[k], fresh = fresh, fresh + 1
-            if thing is not None:
-                came[thing] = int(known[k])
+        if thing is not None:
+            came[thing] = int(known[k])
     return known
 
 
@@ -193,7 +189,7 @@ def _note(
 ) -> None:
     """Write into the record what the visit saw: an instance that was not looked at keeps its time."""
     record.visits.append(entry)
-    looked_at = earlier.count(found.of_earlier.still) >= FEWEST_POINTS
+    looked_at = earlier.count(found.evidence.still) >= FEWEST_POINTS
     looked_at[list(found.changes.unseen)] = False
     for k in {*np.flatnonzero(looked_at).tolist(), *ids_of_later.tolist()}:
         record.last_seen[k] = entry.stamp
@@ -201,7 +197,4 @@ def _note(
         record.moved_from[moved.id] = tuple(moved.before.tolist())
         record.gone.pop(moved.id, None)
     for k in {*found.changes.gone, *(piece for piece, thing in found.gone_pieces.items() if piece != thing)}:
-        rows = earlier.points_of(k)
-        look, place = earlier.look(k, rows), earlier.cloud.xyz_world[rows].mean(axis=0)
-        color = None if look.color is None else tuple(look.color.tolist())
-        record.gone[k] = Retired(tuple(place.tolist()), look.length, color)
+        record.gone[k] = earlier.look(k, earlier.rows[k])

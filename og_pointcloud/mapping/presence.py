@@ -1,4 +1,4 @@
-"""Whether points of a map are still there, from all that later views measured: bounded odds by point.
+"""Whether points are still there, from all that views measured, and what that says of the instances of a visit.
 
 A view that measures a surface where a point lies speaks for it, one that looks through its place against it. Of a map
 that grows the sum is bounded, so that a long history cannot outvote what is seen today. One place alone refutes
@@ -8,28 +8,52 @@ no evidence at all.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from og_pointcloud.cloud import UNOBSERVED, LabelledCloud
+from og_pointcloud.formats.poses import in_local_frame
 from og_pointcloud.kernels import njit
-from og_pointcloud.mapping.sight import AGREES, HIDDEN, THROUGH, MeasuredView, states_of_points
+from og_pointcloud.mapping.likeness import Look, descriptors_of
+from og_pointcloud.mapping.sight import AGREES, HIDDEN, THROUGH, DiscSurface, MeasuredView, states_of_points
 from og_pointcloud.mapping.voxels import Columns
+from og_pointcloud.rendering.geometry import Neighbourhood, neighbourhood
+from og_pointcloud.scene import Camera
+from og_pointcloud.settings import GeometrySettings
 
 APART = 0.998
 """Cosine between two directions of sight, from the point, that are two places: 3.6 degrees."""
+TOLERANCE = 0.5
+"""Spacings at right angles to a surface up to which a point is of it."""
+SCATTER = 2.0
+"""Standard deviations of the points off their surface, where that is more: of dense and noisy clouds."""
+MOST = 0.5
+"""Share of an instance's telling points that decides."""
+FEWEST_POINTS, LEAST_SHARE = 5, 0.05
+"""Points of an instance, and share of those that show, that must be looked at before anything is said of it."""
+TELLING = 1.5
+"""Tolerances that a point lies off every other surface about it, to tell of its own thing."""
+FLAT_SHARE = 0.25
+"""Share of what is looked at that must be seen through where most of a thing lies flat on something else."""
+
+
+def tolerance_of(spacing: float, scatter: float) -> float:
+    """Distance from a surface, at right angles to it, up to which a point is of it. scatter: standard deviation of
+    points off their surface."""
+    return max(TOLERANCE * spacing, SCATTER * scatter)
 
 
 @dataclass
 class Presence(Columns):
-    """Evidence about n points. tolerance: distance from a surface, at right angles to it, up to which a point is of it.
-    most: what the odds are bounded by. odds: (n,) float32, views that bear a point out less those that see through it,
-    bounded. refuted: (n,) uint8, directions, up to two, from which it was seen through; first: (n, 3), the first of
-    them. seen_at: (n,) float64, the latest stamp of a view that measured it, or its place; -inf where none did.
-    hidden: (n,) bool, some view measured a surface before it."""
+    """Evidence about n points. tolerance: of `tolerance_of`. most: what the odds are bounded by. odds: (n,) float32,
+    views that bear a point out less those that see through it, bounded. refuted: (n,) uint8, directions, up to two,
+    from which it was seen through; first: (n, 3), the first of them. seen_at: (n,) float64, the latest stamp of a view
+    that measured it, or its place; -inf where none did. hidden: (n,) bool, some view measured a surface before it."""
 
     tolerance: float
     most: float = np.inf
@@ -70,6 +94,125 @@ class Presence(Columns):
     def absent(self) -> NDArray[np.bool_]:
         """(n,) bool: seen through by more views than bear it out, from two places."""
         return (self.odds < 0) & (self.refuted > 1)
+
+
+@dataclass(frozen=True)
+class Visit:
+    """A labelled cloud as it is compared. depth: what its views measured by depth images, in its local frame; None: its
+    own cloud, seen from its cameras."""
+
+    cloud: LabelledCloud
+    depth: Iterable[MeasuredView] | None = None
+
+    @classmethod
+    def in_frame_of(
+        cls, other: LabelledCloud, cloud: LabelledCloud, depth: Iterable[MeasuredView] | None = None
+    ) -> Visit:
+        """A visit in the local frame of another; depth: of its views, in that frame already."""
+        shift = cloud.origin - other.origin
+        cameras = tuple(in_local_frame(camera, -shift) for camera in cloud.cameras)
+        return cls(
+            replace(cloud, xyz=(cloud.xyz + shift).astype(np.float32), origin=other.origin, cameras=cameras), depth
+        )
+
+    @cached_property
+    def surface(self) -> DiscSurface:
+        """Its cloud, as it is seen."""
+        return DiscSurface(self.cloud.xyz, self.around)
+
+    @cached_property
+    def around(self) -> Neighbourhood:
+        """Neighbours of its points."""
+        return neighbourhood(self.cloud.xyz, GeometrySettings())
+
+    def measured(self, cameras: Sequence[Camera] | None = None) -> Iterable[MeasuredView]:
+        """What its views measured, or, of its cloud, what views from other places would have."""
+        if self.depth is not None and cameras is None:
+            return self.depth
+        return (self.surface.seen_from(camera) for camera in (self.cloud.cameras if cameras is None else cameras))
+
+    @cached_property
+    def rows(self) -> list[NDArray[np.int64]]:
+        """Rows of each instance's points, ascending."""
+        ids = self.cloud.instance_ids
+        order = np.argsort(ids, kind="stable")
+        return np.split(order, np.searchsorted(ids[order], np.arange(len(self.cloud.instances) + 1)))[1:-1]
+
+    @cached_property
+    def adjoining(self) -> NDArray[np.bool_]:
+        """(instances, instances): those with points that are neighbours of each other's; each adjoins itself."""
+        ids, found = self.cloud.instance_ids, np.eye(len(self.cloud.instances), dtype=bool)
+        for neighbour in self.around.index.T:
+            both = (ids >= 0) & (ids[neighbour] >= 0)
+            found[ids[both], ids[neighbour[both]]] = True
+        return found | found.T
+
+    def look(self, instance: int, rows: NDArray[np.int64]) -> Look:
+        """The look of an instance, by some of its points."""
+        cloud = self.cloud
+        place = (cloud.xyz[rows].astype(np.float64) + cloud.origin).mean(axis=0)
+        rgb = None if cloud.rgb is None else cloud.rgb[rows]
+        return Look.of_points(*descriptors_of(cloud.instances, instance), place, cloud.xyz[rows], rgb)
+
+    def count(self, chosen: NDArray[np.bool_], sure: NDArray[np.floating] | None = None) -> NDArray[np.float64]:
+        """(instances,) how many of each instance's points are chosen, (n,) bool; sure: (n,) what each counts."""
+        ids, weight = self.cloud.instance_ids, np.ones(len(chosen)) if sure is None else sure
+        rows = np.flatnonzero(chosen & (ids >= 0))
+        return np.asarray(np.bincount(ids[rows], weight[rows], len(self.cloud.instances)), np.float64)
+
+    def shared(self, owners: NDArray[np.integer], count: int) -> NDArray[np.int64]:
+        """(instances, count + 1) how many points each has on the surface of each of another's ``count`` instances; in
+        the last column on what is none. owners: (n,) the other's instance at each point, UNOBSERVED is not counted."""
+        ids = self.cloud.instance_ids
+        both = (ids >= 0) & (owners > UNOBSERVED)
+        cell = ids[both] * np.int64(count + 1) + owners[both] % (count + 1)
+        shape = len(self.cloud.instances), count + 1
+        return np.bincount(cell, minlength=shape[0] * shape[1]).reshape(shape)
+
+    def telling(self, tolerance: float) -> NDArray[np.bool_]:
+        """(n,) bool: points that lie off the surfaces of all other instances about them."""
+        ids, surface = self.cloud.instance_ids, self.surface
+        tells = np.ones(len(ids), bool)
+        for neighbour in self.around.index.T:
+            off = np.abs(np.einsum("na,na->n", self.cloud.xyz - surface.xyz[neighbour], surface.normal[neighbour]))
+            tells &= (ids[neighbour] == ids) | (off > TELLING * tolerance)
+        return tells
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Of one visit's points, by another's views, (n,) bool each. shown: seen by their own visit. still, through: the
+    other visit measures them where they are, or sees through their places. telling: off all surfaces of other things.
+    """
+
+    shown: NDArray[np.bool_]
+    still: NDArray[np.bool_]
+    through: NDArray[np.bool_]
+    telling: NDArray[np.bool_]
+
+    def decided(self, visit: Visit) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """(instances,) bool each: those that are seen through; those hardly looked at.
+
+        Each point counts by how sure it is of its instance: a part of the table that a mask took for the book's stays
+        when the book leaves.
+        """
+        least = np.maximum(FEWEST_POINTS, LEAST_SHARE * visit.count(self.shown))
+        seen_through, looked_at = (visit.count(self.shown & of) for of in (self.through, self.through | self.still))
+        sure = None if visit.cloud.certainty is None else visit.cloud.certainty / 255
+        still, telling, through = (
+            visit.count(self.shown & of, sure) for of in (self.still, self.still & self.telling, self.through)
+        )
+        most = through > MOST * (through + still)
+        lies_flat = (through > MOST * (through + telling)) & (through > FLAT_SHARE * (through + still)) & ~most
+        for k in np.flatnonzero(lies_flat):
+            lies_flat[k] = self._of_one_color(visit, int(k))
+        return (seen_through >= least) & (most | lies_flat), looked_at < least
+
+    def _of_one_color(self, visit: Visit, instance: int) -> bool:
+        """Whether what is seen through is of the colour of the rest: else it is a part of something else."""
+        rows = visit.rows[instance]
+        rows = rows[self.shown[rows]]
+        return visit.look(instance, rows[self.through[rows]]).has_color_of(visit.look(instance, rows[self.still[rows]]))
 
 
 @njit(cache=True, nogil=True)

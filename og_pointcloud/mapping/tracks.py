@@ -60,24 +60,14 @@ class PointVotes(Columns):
         _add(points, track, weight, masked, self.track, self.weight)
 
 
-@dataclass(frozen=True)
-class Left:
-    """How an object looked that left, and where it was last, (3,) world coordinates, for when it is found again.
-    sequence: of the frame that showed it last: what stood elsewhere by then is something else."""
-
-    look: Look
-    place: NDArray[np.float64]
-    size: NDArray[np.float64]
-    sequence: int = 0
-
-
 @dataclass
 class Track:
     """total: (D,) sum of unit features by pixels; pixels: their sum. views, masks: how many
     showed it; first, sequence: the numbers of the first and of the last frame that did, 0 for an earlier map;
     last_seen: the stamp of the last. id: of the object, NO_TRACK while it is provisional. moved: it has been elsewhere.
     box: (2, 3) lowest and highest place of points that voted for it. lost: rows of its points that were seen through,
-    losing_since: from that stamp on; left: when most were."""
+    losing_since: from that stamp on. left: when most were, how it looked; left_at: sequence then: what stood elsewhere
+    by then is something else."""
 
     total: NDArray[np.float64] | None = None
     pixels: float = 0.0
@@ -91,7 +81,8 @@ class Track:
     box: NDArray[np.float64] = field(default_factory=lambda: np.array([[np.inf] * 3, [-np.inf] * 3]))
     lost: list[int] = field(default_factory=list)
     losing_since: float = -np.inf
-    left: Left | None = None
+    left: Look | None = None
+    left_at: int = 0
 
     def reach(self, box: NDArray[np.float64]) -> None:
         """Become as large as a box (2, 3)."""
