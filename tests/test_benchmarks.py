@@ -102,3 +102,23 @@ def test_tables_of_the_paper_are_written_and_go_on_where_they_were(tiny_capture,
     monkeypatch.setattr(benchmark_paper, "append", None)
     benchmark_paper.main([*command, str(tmp_path / "out")])
     assert capsys.readouterr().out.count("| IoU only |") == 2
+
+
+def test_a_panorama_has_masks_of_things_as_few_pixels_large_as_a_photograph():
+    """Else the lens would be blamed for what the proposer leaves out: a share of a panorama is many more pixels."""
+    pytest.importorskip("open3d")
+    import benchmark_lenses as lenses
+    from og_pointcloud_room.capture import CaptureSettings, make_capture
+    from og_pointcloud_room.masks import MaskNoise
+
+    capture = make_capture(0, CaptureSettings(views=2))
+    perfect = MaskNoise().scaled(0)
+    least = perfect.smallest_share * capture.intrinsics.width * capture.intrinsics.height
+    photographed, _ = lenses.photographed(capture, lenses.lenses(capture, every=2)["spherical"], perfect, 0)
+    (frame,), (masks,) = photographed.frames, photographed.masks
+    shown = np.bincount(frame.owner[frame.owner >= 0])
+    masked = np.bincount(frame.owner[(masks > 0) & (frame.owner >= 0)], minlength=len(shown))
+    between = (shown >= least) & (shown < perfect.smallest_share * masks.size)
+    assert between.sum() >= 3
+    assert (masked[between] > 0).all()
+    assert not masked[shown < least].any()
