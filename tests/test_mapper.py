@@ -214,7 +214,7 @@ def test_voxel_points_are_means_of_their_voxels():
     means = np.array([xyz[owner == k].astype(np.float64).mean(axis=0) for k in range(len(keys))])
     few = np.bincount(owner) <= 32  # beyond, the mean follows
     found = points.xyz[np.lexsort(np.floor(points.xyz / 0.25).astype(int).T[::-1])]
-    assert len(points) == len(keys)
+    assert points.n == len(keys)
     np.testing.assert_allclose(found[few], means[few], atol=1e-5)
 
 

@@ -242,12 +242,11 @@ def _scale(earlier: Visit, later: Visit, unmoved: NDArray[np.int64]) -> Scale:
     if len(others) < FEWEST_SAME:
         return Scale(other=typical_cosine(b.descriptors, spread_of(b.agreement, b.masks)[b.descriptor_instance]))
     same, other = float(np.median(between.diagonal())), float(np.median(others))
-    if earlier.cloud.rgb is None or later.cloud.rgb is None:
+    one, two = earlier.cloud.rgb, later.cloud.rgb
+    if one is None or two is None:
         return Scale(same, other)
-    colors = [
-        [v.look(k, v.rows[k]).color for k in ids] for v, ids in ((earlier, unmoved[:, 0]), (later, unmoved[:, 1]))
-    ]
-    off = np.subtract(colors[1], colors[0])
+    pairs = ((one[earlier.rows[i]], two[later.rows[k]]) for i, k in unmoved.tolist())
+    off = np.array([np.median(now, axis=0) - np.median(was, axis=0) for was, now in pairs])
     shift = np.median(off, axis=0)
     usual = float(np.median(np.abs(off - shift).max(axis=1)))
     return Scale(same, other, shift, max(OTHER_COLOR, USUAL_COLORS * usual))

@@ -83,7 +83,8 @@ class Presence(Columns):
         """Take in the states (m,) of some rows of xyz (n, 3), seen from a centre. What is older than a point's
         latest word is not counted: a frame that comes late cannot bring back what has left since."""
         self.hidden[rows[states == HIDDEN]] = True
-        _count(rows, xyz, states, center, stamp, self.most, self.odds, self.refuted, self.seen_at, self.first)
+        evidence = self.odds, self.refuted, self.seen_at, self.first
+        _count(rows, xyz, states, center, stamp, self.most, evidence)
 
     @property
     def present(self) -> NDArray[np.bool_]:
@@ -216,7 +217,8 @@ class Evidence:
 
 
 @njit(cache=True, nogil=True)
-def _count(rows, xyz, states, center, stamp, most, odds, refuted, seen_at, first):  # noqa: ANN001, ANN202
+def _count(rows, xyz, states, center, stamp, most, evidence):  # noqa: ANN001, ANN202
+    odds, refuted, seen_at, first = evidence
     for k in range(len(states)):
         i = rows[k]
         if (states[k] != AGREES and states[k] != THROUGH) or stamp < seen_at[i]:

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from og_pointcloud.formats.capture import depth_files, read_poses
 from og_pointcloud.formats.poses import in_local_frame
 from og_pointcloud.kernels import njit, prange
-from og_pointcloud.mapping.voxels import VoxelPoints
+from og_pointcloud.mapping.voxels import VoxelPoints, in_camera, lens_of, turned
 from og_pointcloud.rendering.geometry import Neighbourhood, neighbourhood
 from og_pointcloud.scene import Camera
 from og_pointcloud.settings import GeometrySettings
@@ -73,7 +73,7 @@ class MeasuredView:
         return float(np.median(self.depth[self.depth > 0]) / np.sqrt(self.camera.fx * self.camera.fy))
 
     def asked(self, tolerance: float) -> tuple[Any, ...]:
-        """What `_state_of` takes after the point. tolerance: beside the view's noise."""
+        """What `_state_of` asks a view for. tolerance: beside the view's noise."""
         if tolerance not in self._asked:
             within, lens = float(np.hypot(tolerance, 3 * self.noise)), lens_of(self.camera)
             planes = _planes_of(self.depth, self.normal, lens, within)
@@ -109,10 +109,8 @@ class DiscSurface:
         share = min(1.0, PIXELS_PER_DISC / max(radius_px, 1e-12))
         size = max(8, round(camera.width * share)), max(8, round(camera.height * share))
         camera = camera.resized(*size) if share < 1 else camera
-        depth, normal = _draw_discs(
-            self.xyz, self.normal, self._radius, camera.world_to_camera, lens_of(camera), camera.height, camera.width,
-            NEAR_SHARE * typical,
-        )  # fmt: skip
+        discs, size = (self.xyz, self.normal, self._radius), (camera.height, camera.width)
+        depth, normal = _draw_discs(discs, camera.world_to_camera, lens_of(camera), size, NEAR_SHARE * typical)
         return MeasuredView(camera, depth, normal, self.noise)
 
 
@@ -148,7 +146,7 @@ def depth_views(capture: str | Path, origin: NDArray[np.float64]) -> Iterator[Me
 
 def states_of_points(xyz: NDArray[np.float32], tolerance: float, view: MeasuredView) -> NDArray[np.int8]:
     """(n,) int8: NOTHING, AGREES, HIDDEN or THROUGH. tolerance: beside the view's noise, same unit as xyz (n, 3)."""
-    return _states(xyz, *view.asked(tolerance))
+    return _states(xyz, view.asked(tolerance))
 
 
 def states_in_packets(
@@ -159,14 +157,9 @@ def states_in_packets(
     asked, packets = view.asked(tolerance), points.packets
     chosen = packets.before(view.camera, points.edge, asked[-1])
     rows = packets.rows[chosen]
-    states = _states_of_rows(rows, packets.filled[chosen], points.xyz, points.weight, *asked)
+    states = _states_of_rows(rows, packets.filled[chosen], points.xyz, points.weight, asked)
     told = (states == AGREES) | (states == THROUGH)
     return rows[told], states[told]
-
-
-def lens_of(camera: Camera) -> NDArray[np.float64]:
-    """(4,) fx, fy, cx, cy."""
-    return np.array([camera.fx, camera.fy, camera.cx, camera.cy])
 
 
 def _planes(
@@ -193,31 +186,20 @@ def _planes(
 
 
 @njit(cache=True, nogil=True)
-def _turned(pose, p):  # noqa: ANN001, ANN202
-    """A direction in the camera's frame."""
-    return (
-        pose[0, 0] * p[0] + pose[0, 1] * p[1] + pose[0, 2] * p[2],
-        pose[1, 0] * p[0] + pose[1, 1] * p[1] + pose[1, 2] * p[2],
-        pose[2, 0] * p[0] + pose[2, 1] * p[1] + pose[2, 2] * p[2],
-    )
-
-
-@njit(cache=True, nogil=True)
-def _draw_discs(xyz, normal, radius, pose, lens, height, width, near):  # noqa: ANN001, ANN202
+def _draw_discs(discs, pose, lens, size, near):  # noqa: ANN001, ANN202
     """(h, w) depth of the nearest disc in each pixel, 0 none, and (h, w, 3) its normal, towards the camera."""
-    fx, fy, cx, cy = lens
+    (xyz, normal, radius), (fx, fy, cx, cy), (height, width) = discs, lens, size
     depth = np.zeros((height, width), np.float32)
     facing = np.zeros((height, width, 3), np.float32)
     for i in range(len(xyz)):
-        x, y, z = _turned(pose, xyz[i])
-        x, y, z = x + pose[0, 3], y + pose[1, 3], z + pose[2, 3]
+        x, y, z = in_camera(pose, xyz[i])
         if z <= near:
             continue
         u, v = fx * x / z + cx, fy * y / z + cy
         reach = min(max(fx, fy) * radius[i] / z, WIDEST_DISC)
         if u < -reach or v < -reach or u > width + reach or v > height + reach:
             continue
-        nx, ny, nz = _turned(pose, normal[i])
+        nx, ny, nz = turned(pose, normal[i])
         along = nx * x + ny * y + nz * z
         if along > 0:
             nx, ny, nz, along = -nx, -ny, -nz, -along
@@ -301,10 +283,10 @@ def _planes_of(depth, normal, lens, tolerance):  # noqa: ANN001, ANN202
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _state_of(p, tolerance, pose, lens, planes, beyond):  # noqa: ANN001, ANN202
+def _state_of(p, asked):  # noqa: ANN001, ANN202
     """The state of a point, by its distance from the surfaces in the 3 x 3 pixels around its own."""
-    x, y, z = _turned(pose, p)
-    x, y, z = x + pose[0, 3], y + pose[1, 3], z + pose[2, 3]
+    tolerance, pose, lens, planes, beyond = asked
+    x, y, z = in_camera(pose, p)
     if z <= 0:
         return NOTHING
     u, v = lens[0] * x / z + lens[2], lens[1] * y / z + lens[3]
@@ -340,19 +322,19 @@ def _state_of(p, tolerance, pose, lens, planes, beyond):  # noqa: ANN001, ANN202
 
 
 @njit(cache=True, parallel=True, nogil=True, error_model="numpy")
-def _states(xyz, tolerance, pose, lens, planes, beyond):  # noqa: ANN001, ANN202
+def _states(xyz, asked):  # noqa: ANN001, ANN202
     states = np.empty(len(xyz), np.int8)
     for i in prange(len(xyz)):
-        states[i] = _state_of((xyz[i, 0], xyz[i, 1], xyz[i, 2]), tolerance, pose, lens, planes, beyond)
+        states[i] = _state_of((xyz[i, 0], xyz[i, 1], xyz[i, 2]), asked)
     return states
 
 
 @njit(cache=True, parallel=True, nogil=True, error_model="numpy")
-def _states_of_rows(rows, filled, xyz, weight, tolerance, pose, lens, planes, beyond):  # noqa: ANN001, ANN202
+def _states_of_rows(rows, filled, xyz, weight, asked):  # noqa: ANN001, ANN202
     states = np.zeros(rows.shape, np.int8)
     for packet in prange(len(rows)):
         for k in range(filled[packet]):
             i = rows[packet, k]
             if weight[i] > 0:
-                states[packet, k] = _state_of((xyz[i, 0], xyz[i, 1], xyz[i, 2]), tolerance, pose, lens, planes, beyond)
+                states[packet, k] = _state_of((xyz[i, 0], xyz[i, 1], xyz[i, 2]), asked)
     return states

@@ -79,10 +79,8 @@ class Packets(Columns):
         while self.filed < len(xyz):
             self.grow(self.count + 1 + (len(xyz) - self.filed) // PACKET)
             self.open.reserve(len(self.rows))
-            packets = self.rows, self.filled, self.low, self.high
-            self.filed, self.count = _file(
-                xyz, self.side, self.open.keys, self.open.rows, *packets, self.filed, self.count
-            )
+            bricks, packets = (self.open.keys, self.open.rows), (self.rows, self.filled, self.low, self.high)
+            self.filed, self.count = _file(xyz, self.side, bricks, packets, self.filed, self.count)
             if self.count > MANY_PACKETS and self.filed < LEAST_FILLED * PACKET * self.count:
                 self.side, self.filed, self.count, self.open = 2 * self.side, 0, 0, VoxelHash()
                 self.filled[:] = 0
@@ -94,9 +92,8 @@ class Packets(Columns):
         moved since they were filed. hidden_from: (h, w) depth at and behind which nothing is asked for; None: nowhere.
         """
         farthest = np.zeros((0, 0)) if hidden_from is None else _tile_maxima(hidden_from)
-        lens, size = np.array([camera.fx, camera.fy, camera.cx, camera.cy]), (camera.width, camera.height)
-        boxes = self.low[: self.count], self.high[: self.count]
-        return np.flatnonzero(_before(*boxes, edge, camera.world_to_camera, lens, *size, margin, farthest))
+        boxes, size = (self.low[: self.count], self.high[: self.count]), (camera.width, camera.height)
+        return np.flatnonzero(_before(boxes, edge, camera.world_to_camera, lens_of(camera), size, margin, farthest))
 
     def within(self, low: NDArray[np.floating], high: NDArray[np.floating]) -> NDArray[np.int32]:
         """Rows of the packets that meet a box."""
@@ -125,9 +122,6 @@ class VoxelPoints(Columns):
 
     def __post_init__(self) -> None:
         self.packets.side = self.packets.side or BRICK * self.edge
-
-    def __len__(self) -> int:
-        return self.n
 
     @property
     def xyz(self) -> NDArray[np.float32]:
@@ -165,8 +159,8 @@ class VoxelPoints(Columns):
         """Take measured points (m, 3) in: into the mean of their voxel's point, or as a new one."""
         if self.grows:
             self._reserve(len(xyz))
-            arrays = self._xyz, self._rgb, self.weight, self._anchor
-            self.n = _insert(xyz, rgb, anchor, self.edge, self.hash.keys, self.hash.rows, *arrays, self.n)
+            voxels, points = (self.hash.keys, self.hash.rows), (self._xyz, self._rgb, self.weight, self._anchor)
+            self.n = _insert(xyz, rgb, anchor, self.edge, voxels, points, self.n)
             self.packets.file(self.xyz)
 
     def refile(self) -> None:
@@ -180,6 +174,28 @@ class VoxelPoints(Columns):
         """Room for so many more points."""
         self.grow(self.n + more)
         self.hash.reserve(self.n + more)
+
+
+def lens_of(camera: Camera) -> NDArray[np.float64]:
+    """(4,) fx, fy, cx, cy."""
+    return np.array([camera.fx, camera.fy, camera.cx, camera.cy])
+
+
+@njit(cache=True, nogil=True)
+def turned(pose, p):  # noqa: ANN001, ANN201
+    """A direction in the camera's frame."""
+    return (
+        pose[0, 0] * p[0] + pose[0, 1] * p[1] + pose[0, 2] * p[2],
+        pose[1, 0] * p[0] + pose[1, 1] * p[1] + pose[1, 2] * p[2],
+        pose[2, 0] * p[0] + pose[2, 1] * p[1] + pose[2, 2] * p[2],
+    )
+
+
+@njit(cache=True, nogil=True)
+def in_camera(pose, p):  # noqa: ANN001, ANN201
+    """A point in the camera's frame."""
+    x, y, z = turned(pose, p)
+    return x + pose[0, 3], y + pose[1, 3], z + pose[2, 3]
 
 
 def _tile_maxima(image: NDArray[np.floating]) -> NDArray[np.floating]:
@@ -227,9 +243,10 @@ def _refill(old_keys, old_rows, keys, rows):  # noqa: ANN001, ANN202
 
 
 @njit(cache=True, nogil=True)
-def _file(xyz, side, keys, open_, rows, filled, low, high, first, count):  # noqa: ANN001, ANN202
+def _file(xyz, side, bricks, packets, first, count):  # noqa: ANN001, ANN202
     """Puts points from ``first`` on into the open packet of their brick. Returns how many points and packets there are
     then: where packets run out, there are points left."""
+    (keys, open_), (rows, filled, low, high) = bricks, packets
     for i in range(first, len(xyz)):
         if count == len(rows):
             return i, count
@@ -256,9 +273,9 @@ def _span(x, z, reach, focal, middle, tiles):  # noqa: ANN001, ANN202
 
 
 @njit(cache=True, nogil=True)
-def _before(low, high, edge, pose, lens, width, height, margin, farthest):  # noqa: ANN001, ANN202
+def _before(boxes, edge, pose, lens, size, margin, farthest):  # noqa: ANN001, ANN202
     """(packets,) bool: whether the sphere around a box meets the frustum, before what hides it."""
-    fx, fy, cx, cy = lens
+    (low, high), (fx, fy, cx, cy), (width, height) = boxes, lens, size
     across, down = margin * width, margin * height
     # The four sides of the frustum go through the camera; their normals point inwards.
     sides = np.array([
@@ -268,10 +285,9 @@ def _before(low, high, edge, pose, lens, width, height, margin, farthest):  # no
         sides[side] /= np.sqrt((sides[side] ** 2).sum())
     meets = np.zeros(len(low), np.bool_)
     for k in range(len(low)):
-        p, q, r = low[k, 0] + high[k, 0], low[k, 1] + high[k, 1], low[k, 2] + high[k, 2]
-        x = (pose[0, 0] * p + pose[0, 1] * q + pose[0, 2] * r) / 2 + pose[0, 3]
-        y = (pose[1, 0] * p + pose[1, 1] * q + pose[1, 2] * r) / 2 + pose[1, 3]
-        z = (pose[2, 0] * p + pose[2, 1] * q + pose[2, 2] * r) / 2 + pose[2, 3]
+        x, y, z = in_camera(
+            pose, ((low[k, 0] + high[k, 0]) / 2, (low[k, 1] + high[k, 1]) / 2, (low[k, 2] + high[k, 2]) / 2)
+        )
         p, q, r = high[k, 0] - low[k, 0], high[k, 1] - low[k, 1], high[k, 2] - low[k, 2]
         reach = 2 * edge + np.sqrt(p * p + q * q + r * r) / 2
         inside = z > -reach
@@ -295,9 +311,10 @@ def _index(xyz, edge, keys, rows):  # noqa: ANN001, ANN202
 
 
 @njit(cache=True, nogil=True)
-def _insert(new, color, frame, edge, keys, rows, xyz, rgb, weight, anchor, n):  # noqa: ANN001, ANN202
+def _insert(new, color, frame, edge, voxels, points, n):  # noqa: ANN001, ANN202
     """The number of points after the new ones are in. A point that moves out of its voxel keeps its place in the hash:
     it is the mean of what was measured there."""
+    (keys, rows), (xyz, rgb, weight, anchor) = voxels, points
     for i in range(len(new)):
         key = _key(new[i, 0], new[i, 1], new[i, 2], edge)
         slot = _slot(key, keys)
