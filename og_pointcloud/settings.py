@@ -25,7 +25,7 @@ class GeometrySettings:
     """Points by which scales are compared."""
     sight_thickness: float = 3.0
     """Points closer than this many spacings along a ray are of one surface and do not hide each other."""
-    neighbours: int = 16
+    neighbours: int = 24
     """Nearest points looked at."""
     reach: float = 3.0
     """Points within this many spacings adjoin; farther than this from the cloud is "too far"."""

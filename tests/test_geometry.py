@@ -7,7 +7,9 @@ import pytest
 from numpy.random import Generator
 from numpy.typing import NDArray
 
+from og_pointcloud.rendering import geometry
 from og_pointcloud.rendering.geometry import (
+    TAMED_BY,
     chance_of_place,
     near_plane,
     neighbourhood,
@@ -49,7 +51,7 @@ def test_neighbours_are_those_of_brute_force(random: Generator) -> None:
     np.testing.assert_array_equal(around.index, nearest)
     own = np.take_along_axis(apart, nearest, axis=1)
     three = own[:, :3].mean(axis=1)
-    expected = np.minimum(three, np.median(three[nearest], axis=1))
+    expected = np.minimum(three, np.median(three[nearest[:, :TAMED_BY]], axis=1))
     np.testing.assert_allclose(around.spacing, expected, rtol=1e-5)
     floor = np.maximum(around.spacing, np.median(three))
     np.testing.assert_array_equal(around.adjoining, own <= SETTINGS.reach * floor[:, None])
@@ -163,3 +165,13 @@ def test_chance_of_place_is_even_and_another_for_each_name() -> None:
     for chance in (first, second):
         np.testing.assert_allclose(np.histogram(chance, 10, (0, 1))[0], 800, atol=120)
     assert abs(np.corrcoef(first, second)[0, 1]) < 0.05
+
+
+def test_neighbours_looked_up_a_few_at_a_time_are_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    xyz = np.random.default_rng(5).random((300, 3)).astype(np.float32)
+    xyz[7] = xyz[200]  # a duplicate: the point itself is not always the first found
+    at_once = neighbourhood(xyz, GeometrySettings())
+    monkeypatch.setattr(geometry, "ROWS_AT_ONCE", 37)
+    few = neighbourhood(xyz, GeometrySettings())
+    for name in ("spacing", "index", "adjoining"):
+        np.testing.assert_array_equal(getattr(few, name), getattr(at_once, name))

@@ -43,6 +43,7 @@ SWEPT = ("geometry", "grouping", "membership")
 MODULES: dict[str, tuple[str, tuple[str, ...]]] = {
     "fitting.view_votes.OPENNESS_POWER": ("", ("_relative_exposure",)),
     "fitting.colors.MOST": ("", ()),
+    "rendering.geometry.TAMED_BY": ("table", ()),
     "fitting.looks.QUANTILE": ("", ()),
     "fitting.looks.LEAST_MASKS": ("", ()),
     "rendering.sightings.LEAST_OPEN": ("table", ("_see",)),
@@ -65,8 +66,8 @@ SOURCES: dict[str, tuple[str, ...]] = {
         "grouping.witness_share", "membership.sure_share", "membership.open_share", "membership.possible_share",
         "membership.growth_votes", "membership.rate_share", "membership.island_share", "membership.own_vote",
         "membership.gap_sizes", "membership.front_share", "fitting.colors.MOST", "fitting.view_votes.OPENNESS_POWER",
-        "fitting.looks.QUANTILE", "fitting.looks.LEAST_MASKS", "rendering.sightings.LEAST_OPEN",
-        "rendering.sightings.EDGE_PX", "rendering.sightings.RING_SHARE",
+        "fitting.looks.QUANTILE", "fitting.looks.LEAST_MASKS", "rendering.geometry.TAMED_BY",
+        "rendering.sightings.LEAST_OPEN", "rendering.sightings.EDGE_PX", "rendering.sightings.RING_SHARE",
     ),
 }  # fmt: skip
 """Where numbers are from. Enough: more gives the same and takes longer. Guessed: found by trying a few captures."""

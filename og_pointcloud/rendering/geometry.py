@@ -18,6 +18,12 @@ from og_pointcloud.scene import Camera, Points, View
 from og_pointcloud.settings import GeometrySettings
 
 
+TAMED_BY = 16
+"""Neighbours whose median spacing a point's own may not exceed."""
+ROWS_AT_ONCE = 1 << 18
+"""Points whose neighbours are looked up at once: what the look-up returns is three times what is kept."""
+
+
 @dataclass(frozen=True)
 class Neighbourhood:
     """spacing: (n,) float32, mean distance to the three nearest points, tamed for duplicates and floaters.
@@ -39,15 +45,18 @@ def neighbourhood(xyz: NDArray[np.float32], settings: GeometrySettings) -> Neigh
     k = min(settings.neighbours, n - 1)
     if k == 0:
         return Neighbourhood(np.ones(n, np.float32), np.zeros((n, 0), np.int32), np.zeros((n, 0), bool))
-    distance, index = map(np.asarray, cKDTree(xyz).query(xyz, k=k + 1, workers=-1))
-    # The point itself is usually first, but not always among duplicates.
-    itself = index == np.arange(n)[:, None]
-    itself[~itself.any(axis=1), -1] = True
-    distance, index = distance[~itself].reshape(n, k), index[~itself].reshape(n, k).astype(np.int32)
+    tree, index, distance = cKDTree(xyz), np.empty((n, k), np.int32), np.empty((n, k))
+    for low in range(0, n, ROWS_AT_ONCE):
+        rows = slice(low, min(n, low + ROWS_AT_ONCE))
+        away, near = map(np.asarray, tree.query(xyz[rows], k=k + 1, workers=-1))
+        # The point itself is usually first, but not always among duplicates.
+        itself = near == np.arange(n)[rows, None]
+        itself[~itself.any(axis=1), -1] = True
+        distance[rows], index[rows] = away[~itself].reshape(-1, k), near[~itself].reshape(-1, k)
     spacing = distance[:, :3].mean(axis=1)
     typical = float(np.median(spacing[spacing > 0])) if (spacing > 0).any() else 1.0
     spacing = np.where(spacing > 0, spacing, typical)
-    spacing = np.minimum(spacing, np.median(spacing[index], axis=1)).astype(np.float32)
+    spacing = np.minimum(spacing, np.median(spacing[index[:, :TAMED_BY]], axis=1)).astype(np.float32)
     adjoining = distance <= settings.reach * np.maximum(spacing, typical)[:, None]
     return Neighbourhood(spacing, index, adjoining)
 
