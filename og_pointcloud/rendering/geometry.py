@@ -17,7 +17,6 @@ from og_pointcloud.rendering.splatting import NEAR_SHARE, Gaussians
 from og_pointcloud.scene import Camera, Points, View
 from og_pointcloud.settings import GeometrySettings
 
-
 TAMED_BY = 16
 """Neighbours whose median spacing a point's own may not exceed."""
 ROWS_AT_ONCE = 1 << 18
