@@ -422,8 +422,8 @@ def test_points_are_judged_as_if_all_were_asked(spacing):
         points.add(part, np.zeros((len(part), 3), np.uint8), 0)
     points.weight[::7] = 0
     packets = points.packets
-    np.testing.assert_array_equal(np.sort(packets.members(np.arange(packets.count))), np.arange(len(points)))
-    assert packets.count < 64 or packets.count * 32 < len(points)
+    np.testing.assert_array_equal(np.sort(packets.members(np.arange(packets.count))), np.arange(points.n))
+    assert packets.count < 64 or packets.count * 32 < points.n
     inside = og.Camera(90, 60, 40.0, 40.0, 45.0, 30.0, np.eye(4)[[0, 2, 1, 3]] * [[1], [-1], [1], [1]])
     for camera in (*cameras(3), replace(cameras(1)[0], width=40, cx=70.0), inside):
         depth = cast([CHEST, ELSEWHERE, PARCEL], camera)[0]
