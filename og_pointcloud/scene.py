@@ -243,6 +243,8 @@ class Points:
             expected = (n,) if width is None else (n, width)
             if value is not None and value.shape != expected:
                 raise SceneError(f"{name} has shape {value.shape}; expected {expected}")
+        if self.rgb is not None and self.rgb.dtype != np.uint8:
+            raise SceneError(f"rgb is {self.rgb.dtype}; expected uint8: scale colors to 0..255 and convert them")
         given = [name for name in ("scale", "rotation", "opacity") if getattr(self, name) is not None]
         if given and len(given) < 3:
             raise SceneError(f"Gaussians need scale, rotation and opacity together; got only {', '.join(given)}")

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.poses import rigid, rotation_of_quaternion
-from og_pointcloud.scene import Camera
+from og_pointcloud.scene import Camera, Points
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -44,3 +45,9 @@ def test_no_points_are_projected_to_no_pixels():
 def test_rotation_of_a_quaternion(seed: int):
     turn = Rotation.random(rng=np.random.default_rng(seed))
     np.testing.assert_allclose(rotation_of_quaternion(np.roll(turn.as_quat(), 1)), turn.as_matrix(), atol=1e-15)
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.uint16, np.int64])
+def test_colors_that_are_no_bytes_are_refused(kind: type):
+    with pytest.raises(SceneError, match=f"rgb is {np.dtype(kind)}; expected uint8"):
+        Points(np.zeros((2, 3), np.float32), np.zeros(3), np.ones((2, 3), kind))
