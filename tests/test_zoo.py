@@ -8,10 +8,12 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 import zoo
+from og_pointcloud_room.raycast import Intrinsics
 from og_pointcloud_zoo import constants as numbers
 from og_pointcloud_zoo import make
 from og_pointcloud_zoo.draws import ANY, KINDS, draw, half_of, scene_names
 from og_pointcloud_zoo.measure import COLOR_NOISE, COLORS, Row, _recolored, measure, parsed_settings
+from og_pointcloud_zoo.outdoors import Matched, Scanner, street_room
 from og_pointcloud_zoo.report import rank_correlation, summary
 
 import og_pointcloud as og
@@ -158,6 +160,81 @@ def test_measuring_without_baselines_leaves_them_out(scenes):
     row = measure(scenes[0], og.FitSettings(mode="grouping"), baselines=False)
     assert row.baseline is None
     assert 0 < row.miou <= 1
+
+
+# Places outdoors, and what measures them -------------------------------------------------------------------------
+
+
+def small(name, **changes):
+    return make.drawn_capture(replace(draw(name), points=1500, views=6, width=96, height=72, **changes))
+
+
+def test_a_scanner_gives_rings_and_sees_what_no_camera_does():
+    room = street_room(np.random.default_rng(0))
+    eye = np.array([[0.0, -1.6, 2.0]])
+    scanner = Scanner(room, eye, np.zeros((1, 3)), 16, {"tree": 0.5}, colored=True, error_m=0.0)
+    raw = scanner(4000, np.random.default_rng(1))
+    ray = raw.xyz - eye
+    reached = np.linalg.norm(ray, axis=1)
+    beam = (np.degrees(np.arcsin(ray[:, 2] / reached)) - scanner.down) / (scanner.up - scanner.down) * 15
+    np.testing.assert_allclose(beam, np.rint(beam), atol=1e-6)
+    assert len(np.unique(np.rint(beam))) > 8
+    assert reached.max() < scanner.range_m
+    names = np.array([item.name for item in room.objects])[raw.owner]
+    assert "sky" not in names
+    # Into a crown, along the ray and not beyond it; on everything hard, nowhere.
+    deeper = np.linalg.norm(raw.offset, axis=1)
+    assert (deeper[names != "tree"] == 0).all()
+    assert deeper[names == "tree"].mean() > 0.1
+    np.testing.assert_allclose(np.cross(raw.offset, ray), 0, atol=1e-9)
+    made = small("lidar-0")
+    assert made.views is not None
+    assert 0.01 < (made.views[made.cls >= 0] == 0).mean() < 0.7
+
+
+def test_points_of_photographs_are_less_exact_far_away_and_lie_on_edges():
+    room = street_room(np.random.default_rng(0))
+    intrinsics = Intrinsics(96, 72, 80.0)
+    pose = make.PLACES["drive"](np.random.default_rng(0), 0).poses(1, None, np.random.default_rng(0))[0]
+    frame = make.RayCaster(room, np.random.default_rng(0)).look(intrinsics, pose)
+    raw = Matched(room, [frame], intrinsics)(5000, np.random.default_rng(2))
+    depth = (raw.xyz - pose[:3, 3]) @ pose[:3, 2]
+    error = np.linalg.norm(raw.offset, axis=1)
+    near, far = (depth < 8), (depth > 20)
+    assert np.median(error[far]) > 4 * np.median(error[near])
+    u, v = ((raw.xyz - pose[:3, 3]) @ pose[:3, :2] / depth[:, None] * 80 + (48, 36)).astype(int).T
+    edge = np.abs(np.gradient(frame.image.astype(float).mean(axis=2))).sum(axis=0)
+    assert edge[v, u].mean() > 2 * edge[frame.owner != len(room.objects) - 1].mean()
+
+
+def test_points_lie_within_soft_things_and_have_their_names():
+    made = small("offroad-0")
+    names = np.array(made.names)[made.cls]
+    soft = (made.cls >= 0) & np.isin(names, ["grass", "bush", "tree"])
+    items = [item for item in made.room.objects if item.name in ("grass", "bush", "tree")]
+    inside = make.Surfaces(items).distance_m(made.xyz[soft])
+    assert np.quantile(inside, 0.9) > 0.1
+    assert inside.max() < 1.5
+    hard = (made.cls >= 0) & np.isin(names, ["rock", "log", "pole"])
+    assert make.Surfaces(made.room.objects).distance_m(made.xyz[hard]).max() < 0.2  # range errors and drift
+
+
+def test_views_of_a_walk_are_close_and_inside_and_name_a_thing_differently():
+    made = small("walk-0", confused=0.3)
+    half = np.array(made.room.size) / 2
+    for frame in made.frames:
+        assert (np.abs(frame.camera_to_world[:2, 3]) < half[:2]).all()
+    one = draw("walk-0")
+    class_of = np.arange(len(made.names), dtype=np.int32)
+    named = make._named(one, class_of, made.names, 400)
+    wrong = (named != class_of).mean(axis=0)
+    confusable = [k for k, name in enumerate(made.names) if any(name in group for group in make.ALIKE)]
+    assert wrong[confusable].mean() == pytest.approx(one.confused, abs=0.12)
+    assert wrong.max() < 2 * one.confused + 0.08
+    for k in np.flatnonzero(wrong):
+        others = {made.names[other] for other in np.unique(named[:, k])} - {made.names[k]}
+        assert others <= {name for group in make.ALIKE if made.names[k] in group for name in group}
+    assert (make._named(replace(one, confused=0.0), class_of, made.names, 3) == class_of).all()
 
 
 # The page of constants ------------------------------------------------------------------------------------------

@@ -32,7 +32,9 @@ class Draw:
     all_masked: floor, walls and ceiling have masks and classes too; else they are known background.
     split, merge, miss, spurious, wrong_class, edge_px: how the proposer errs (`MaskNoise`). spans: so many things share
     their mask with a neighbour in all views. taken: so many things are gone in the second half of the views. levels:
-    each view comes three times, with masks of parts, of things, and of things with what stands on them.
+    each view comes three times, with masks of parts, of things, and of things with what stands on them. confused: mean
+    share of a thing's masks that are named as something alike (`places.ALIKE`); of each thing from none to twice that.
+    blurred: share of views whose masks are ragged and often missing, as of a camera that moves.
     """
 
     name: str
@@ -58,11 +60,16 @@ class Draw:
     spans: int = 0
     taken: int = 0
     levels: bool = False
+    confused: float = 0.0
+    blurred: float = 0.0
 
 
 Fixed = Mapping[str, Any]
 SFM: Fixed = {"points": (8_000, 20_000), "noise": (0.1, 0.4), "backdrop": (0.002, 0.008), "floaters": (0.005, 0.02),
               "hidden": (0, 0)}  # fmt: skip
+
+MEASURED: Fixed = {"all_masked": True, "noise": (0, 0), "uneven": (0, 0), "hidden": (1, 1), "merge": (0.0, 0.03)}
+"""Of places outdoors: their sensors bring noise and uneven density themselves, and see what no camera does."""
 
 KINDS: Mapping[str, Fixed] = {
     "room": {"place": "room", "all_masked": False},
@@ -100,6 +107,42 @@ KINDS: Mapping[str, Fixed] = {
     "levels": {"place": "desk", "levels": True, "views": (16, 24)},
     "spanning": {"place": "shelf", "spans": (3, 4)},
     "street": {"place": "street", "points": (40_000, 120_000), "views": (24, 40), "width": (480, 480)},
+    "walk": {
+        "place": "walk",
+        "all_masked": True,
+        "views": (90, 130),
+        "points": (60_000, 100_000),
+        "width": (320, 480),
+        "confused": (0.2, 0.35),
+        "blurred": (0.2, 0.4),
+    },
+    "drive": {
+        "place": "drive",
+        "points": (12_000, 30_000),
+        "views": (50, 80),
+        "width": (480, 640),
+        "floaters": (0.01, 0.03),
+        "confused": (0.05, 0.15),
+        **MEASURED,
+        "hidden": (0, 0),
+    },
+    "lidar": {
+        "place": "lidar",
+        "points": (30_000, 60_000),
+        "views": (6, 18),
+        "width": (480, 640),
+        "confused": (0.05, 0.15),
+        **MEASURED,
+    },
+    "offroad": {
+        "place": "country",
+        "points": (40_000, 80_000),
+        "views": (24, 40),
+        "width": (400, 560),
+        "edge_px": (1.5, 3.0),
+        "confused": (0.1, 0.25),
+        **MEASURED,
+    },
     "demo": {"place": "demo", "views": (30, 40), "width": (320, 480)},
 }
 """Name -> what is fixed of it: one value, or the range that it is drawn from."""
@@ -128,7 +171,7 @@ def draw(name: str) -> Draw:
     numbers: dict[str, Any] = {"all_masked": bool(rng.uniform() < 0.35)}
     for key, usual in ANY.items():  # in one order, whatever the kind fixes
         numbers[key] = _between(fixed.get(key, usual), rng.uniform())
-    for key in ("spans", "taken"):
+    for key in ("spans", "taken", "confused", "blurred"):
         if key in fixed:
             numbers[key] = _between(fixed[key], rng.uniform())
     numbers.update({key: fixed[key] for key in ("place", "all_masked", "levels") if key in fixed})

@@ -32,7 +32,8 @@ from og_pointcloud_room.room import Room
 from scipy.spatial import cKDTree
 
 from og_pointcloud_zoo.draws import Draw
-from og_pointcloud_zoo.places import GLASS, MIRROR, NAMES, PLACES
+from og_pointcloud_zoo.outdoors import Raw
+from og_pointcloud_zoo.places import ALIKE, GLASS, MIRROR, PLACES, Sensor
 
 __all__ = ["drawn_capture", "made_scene"]
 
@@ -87,23 +88,41 @@ def _place(draw: Draw) -> RoomCapture:
     poses = place.poses(draw.views, caster.surfaces, _stream(draw, PATH))
     sensed_frames = [caster.look(intrinsics, pose) for pose in poses]
     frames = _shown(draw, room, sensed, intrinsics, sensed_frames)
-    xyz, rgb, source, views = _cloud(draw, sensed, caster.surfaces, sensed_frames, intrinsics, rng)
+    sensor = place.sensor(sensed_frames, intrinsics) if place.sensor else _Sampler(sensed, draw.backdrop)
+    xyz, rgb, source, views = _cloud(draw, sensor, sensed, caster.surfaces, sensed_frames, intrinsics, rng)
     instance, background = ground_truth(sensed, caster.surfaces, xyz, source)
-    class_of = np.array([NAMES.index(item.name) for item in room.objects], np.int32)
+    within = np.append([item.name in place.soft for item in room.objects], [False, False])  # and FLYING, BACKGROUND
+    instance = np.where(within[source], source, instance)
+    names = place.names
+    class_of = np.array([names.index(item.name) for item in room.objects], np.int32)
     masked = _masked(draw, room, frames, intrinsics)
     feature_rng, word_rng = _stream(draw, FEATURES), _stream(draw, WORDS)
-    model = FeatureModel(len(NAMES), feature_rng)
+    model = FeatureModel(len(names), feature_rng)
     looks = np.stack([model.object_look(feature_rng) for _ in room.objects])
+    named = _named(draw, class_of, names, len(masked))
     features = tuple(
-        mask_features(ids, frame.owner, class_of, looks, model, draw.wrong_class, _stream(draw, FEATURES, view))
+        mask_features(ids, frame.owner, named[view], looks, model, draw.wrong_class, _stream(draw, FEATURES, view))
         for view, (frame, ids) in enumerate(masked)
     )
     cls = np.where(instance >= 0, class_of[instance], -1).astype(np.int32)
     return RoomCapture(
         room, intrinsics, tuple(frame for frame, _ in masked), tuple(ids for _, ids in masked), features, model.texts,
-        xyz, rgb, cls, instance, background & (views > 0), everyday_vectors(model, NAMES, word_rng),
-        model.words(50, word_rng), NAMES, views,
+        xyz, rgb, cls, instance, background & (views > 0), everyday_vectors(model, names, word_rng),
+        model.words(50, word_rng), names, views,
     )  # fmt: skip
+
+
+def _named(draw: Draw, class_of: Owners, names: tuple[str, ...], views: int) -> Owners:
+    """(views, objects) class that an encoder takes each object for: its own, or one alike."""
+    found = np.repeat(class_of[None], views, axis=0)
+    if draw.confused:
+        rng = _stream(draw, FEATURES, 0, 0)
+        for k, own in enumerate(class_of):
+            others = [name for group in ALIKE if names[own] in group for name in group if name in names]
+            others = [names.index(name) for name in others if name != names[own]] or [own]
+            wrong = rng.random(views) < 2 * draw.confused * rng.random()
+            found[wrong, k] = rng.choice(others, int(wrong.sum()))
+    return found
 
 
 def _without(room: Room, gone: list[int]) -> Room:
@@ -136,6 +155,9 @@ def _masked(
 ) -> list[tuple[Frame, NDArray[np.uint16]]]:
     """Frames with their masks; with levels each frame three times."""
     noise = MaskNoise(draw.split, draw.merge, draw.miss, draw.spurious, draw.wrong_class, draw.edge_px)
+    noises = [
+        noise if not blurred else _blurred(noise) for blurred in _stream(draw, MASKS).random(len(frames)) < draw.blurred
+    ]
     owners = [[_together(room, draw.spans)[frame.owner]] for frame in frames]
     if draw.levels:
         parts = [Item(item.name, (part,)) for item in room.objects for part in item.parts]
@@ -144,10 +166,15 @@ def _masked(
         for view, frame in enumerate(frames):
             owners[view] += [caster.look(intrinsics, frame.camera_to_world).owner, whole[frame.owner]]
     return [
-        (frame, propose_masks(owner, noise, _stream(draw, MASKS, view, level)))
+        (frame, propose_masks(owner, noises[view], _stream(draw, MASKS, view, level)))
         for view, (frame, levels) in enumerate(zip(frames, owners, strict=True))
         for level, owner in enumerate(levels)
     ]
+
+
+def _blurred(noise: MaskNoise) -> MaskNoise:
+    """Of a view taken in motion: edges wander four times as far, and more are missing or joined."""
+    return replace(noise, edge_px=4 * noise.edge_px, miss=noise.miss + 0.25, merge=noise.merge + 0.1)
 
 
 def _together(room: Room, spans: int) -> Owners:
@@ -165,16 +192,16 @@ def _together(room: Room, spans: int) -> Owners:
 
 
 def _cloud(
-    draw: Draw, room: Room, surfaces: Surfaces, frames: list[Frame], intrinsics: Intrinsics, rng: np.random.Generator
-) -> tuple[NDArray[np.float32], NDArray[np.uint8], Owners, Owners]:
+    draw: Draw, sensor: Sensor, room: Room, surfaces: Surfaces, frames: list[Frame], intrinsics: Intrinsics,
+    rng: np.random.Generator,
+) -> tuple[NDArray[np.float32], NDArray[np.uint8], Owners, Owners]:  # fmt: skip
     """xyz (n, 3), rgb (n, 3) uint8, the object that each point was sampled on, and how many frames see that place."""
-    surface = _Sampler(room, draw.backdrop)
     mirrors = np.flatnonzero([item.name == MIRROR for item in room.objects])
     shares = {"outliers": draw.outliers, "floaters": draw.floaters, "ghosts": GHOSTS if len(mirrors) else 0}
     extra = {name: int(share * draw.points) for name, share in shares.items()}
     wanted, kept = draw.points - sum(extra.values()), []
     for _ in range(200):
-        xyz, normal, owner, rgb = surface(max(draw.points, 10_000), rng)
+        xyz, normal, owner, rgb, offset = sensor(max(draw.points, 10_000), rng)
         half = np.array([room.size[0] / 2, room.size[1] / 2])
         inside = (np.abs(xyz[:, :2]) <= half + 1e-6).all(axis=1) & (xyz[:, 2] >= -1e-6) & (xyz[:, 2] <= room.size[2])
         thinning = np.exp(-draw.uneven * np.sqrt((xyz[:, :2] ** 2).sum(axis=1) / (half**2).sum()))
@@ -183,14 +210,14 @@ def _cloud(
         views = np.zeros(len(xyz), np.int32)
         views[keep] = _views(xyz[keep], frames, intrinsics, surfaces)
         keep &= (views > 0) | (chance[1] < draw.hidden)
-        kept.append([values[keep] for values in (xyz, normal, owner, rgb, views)])
+        kept.append([values[keep] for values in (xyz, normal, owner, rgb, offset, views)])
         if sum(len(part[0]) for part in kept) >= wanted:
             break
-    xyz, normal, owner, rgb, views = (np.concatenate(column)[:wanted] for column in zip(*kept, strict=True))
+    xyz, normal, owner, rgb, offset, views = (np.concatenate(column)[:wanted] for column in zip(*kept, strict=True))
     things = xyz[owner >= 0] if (owner >= 0).any() else xyz
     to_others: Doubles = np.asarray(cKDTree(things).query(things[:20_000], 4)[0])[:, 1:]
     spacing = float(np.median(to_others.mean(axis=1)))
-    xyz = xyz + draw.noise * spacing * rng.normal(size=(len(xyz), 1)) * normal
+    xyz = xyz + draw.noise * spacing * rng.normal(size=(len(xyz), 1)) * normal + offset
     anywhere = rng.uniform((-0.5, -0.5, 0), (0.5, 0.5, 1), (extra["outliers"], 3)) * room.size
     flying = np.concatenate([anywhere, _floaters(frames, intrinsics, extra["floaters"], rng),
                              _ghosts(room, frames, intrinsics, mirrors, extra["ghosts"], rng)])  # fmt: skip
@@ -223,10 +250,8 @@ class _Sampler:
         self.normal = across / np.maximum(length, 1e-12)[:, None]
         self.reach = np.cumsum(length * weights)
 
-    def __call__(
-        self, count: int, rng: np.random.Generator
-    ) -> tuple[Doubles, Doubles, NDArray[np.int64], NDArray[np.uint8]]:
-        """(xyz, normal, owner, rgb) of so many."""
+    def __call__(self, count: int, rng: np.random.Generator) -> Raw:
+        """So many, where they are."""
         triangle = np.minimum(np.searchsorted(self.reach, rng.random(count) * self.reach[-1]), len(self.reach) - 1)
         a, b = np.sqrt(rng.random(count)), rng.random(count)
         first, second, third = self.corners[triangle].transpose(1, 0, 2)
@@ -234,7 +259,7 @@ class _Sampler:
         blend = rng.random((count, 1))
         colour = self.colour[triangle]
         rgb = 255 * np.sqrt(0.6 * (blend * colour[:, 0] + (1 - blend) * colour[:, 1]))
-        return xyz, self.normal[triangle], self.owner[triangle], rgb.astype(np.uint8)
+        return Raw(xyz, self.normal[triangle], self.owner[triangle], rgb.astype(np.uint8), np.zeros_like(xyz))
 
 
 def _views(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -29,25 +29,53 @@ from og_pointcloud_room.furniture import (
     vase,
     wood,
 )
-from og_pointcloud_room.raycast import Surfaces
+from og_pointcloud_room.raycast import Frame, Intrinsics, Surfaces
 from og_pointcloud_room.room import Room, furnish, shell
 from og_pointcloud_room.shapes import box
 
-__all__ = ["GLASS", "MIRROR", "NAMES", "PLACES", "Place"]
+from og_pointcloud_zoo.outdoors import (
+    COUNTRY,
+    STREET,
+    Matched,
+    Raw,
+    Scanner,
+    country_room,
+    ground_at,
+    street_room,
+)
+
+__all__ = ["ALIKE", "GLASS", "MIRROR", "NAMES", "PLACES", "Place"]
 
 GLASS, MIRROR = "window", "mirror"
 """Names of what a depth sensor does not see: it looks through the one and into the other."""
 BOXES = ("box", "crate", "suitcase")
 NAMES = (*CLASS_NAMES, *BOXES, "rack", GLASS, MIRROR, "floor", "wall", "ceiling")
+ALIKE = (
+    ("sofa", "bed", "chair"), ("table", "desk", "cabinet", "shelf"), ("floor", "rug", "table"),
+    ("wall", "cabinet", "picture"), ("mug", "vase", "bottle"), ("monitor", "picture", "mirror"),
+    ("road", "sidewalk"), ("building", "fence"), ("pole", "tree", "person"), ("trail", "grass"), ("bush", "tree"),
+    ("rock", "log"),
+)  # fmt: skip
+"""Names that an encoder takes for one another."""
+ON_ROOF = np.array([0, 0, 0.3])
+"""Metres from a vehicle's cameras to its scanner."""
 Pose = NDArray[np.float64]
+Sensor = Callable[[int, Random], Raw]
 
 
 @dataclass(frozen=True)
 class Place:
-    """room: what stands where. poses(views, surfaces, rng): a camera's way through it, (4, 4) camera-to-world each."""
+    """room: what stands where. poses(views, surfaces, rng): a camera's way through it, (4, 4) camera-to-world each.
+
+    names: of the classes. sensor(frames, intrinsics): what measures the cloud; None: points lie evenly on surfaces.
+    soft: names of things that points lie within, not only upon.
+    """
 
     room: Room
     poses: Callable[[int, Surfaces, Random], list[Pose]]
+    names: tuple[str, ...] = NAMES
+    sensor: Callable[[Sequence[Frame], Intrinsics], Sensor] | None = None
+    soft: frozenset[str] = frozenset()
 
 
 @dataclass(frozen=True)
@@ -229,8 +257,99 @@ def wires(rng: Random, seed: int) -> Place:
     return Place(_in_shell(rng, items, (5, 5, 2.8)), _Arc((0, 0, 0.4), 6, (1.5, 2.1), (0.7, 1.6)))
 
 
+def head_worn(rng: Random, seed: int) -> Place:
+    """The flat by a camera on somebody's head, who goes from thing to thing and looks at each from close by."""
+    plain = flat(rng, seed)
+
+    def poses(views: int, surfaces: Surfaces, rng: Random) -> list[Pose]:
+        taken, half = [], np.array(plain.room.size[:2]) / 2 - 0.25
+        objects = plain.room.objects
+        while len(taken) < views:
+            item = objects[rng.integers(len(objects))]
+            middle = np.concatenate([part.vertices for part in item.parts]).mean(axis=0)
+            turn, height = rng.uniform(0, 2 * np.pi), rng.uniform(1.5, 1.7)
+            for near in np.linspace(2.0, rng.uniform(0.4, 0.9), rng.integers(3, 7)):  # a few steps towards it
+                turn += 0.15 * rng.normal()
+                eye = np.array([middle[0] + near * np.cos(turn), middle[1] + near * np.sin(turn), height])
+                bent = max(height - 0.5 * (2.0 - near), middle[2] + 0.3)
+                eye[2] = min(bent, height) + 0.02 * rng.normal()
+                if (np.abs(eye[:2]) < half).all() and surfaces.distance_m(eye[None])[0] > 0.25:
+                    taken.append(looking_at(eye, middle + 0.2 * rng.normal(size=3), 0.08 * rng.normal()))
+        return taken[:views]
+
+    return replace(plain, poses=poses)
+
+
+def _ahead(views: int, place: Callable[[float], np.ndarray], headings: Sequence[float], rng: Random) -> list[Pose]:
+    """A vehicle's cameras in stops along a way; headings: where those of one stop look, degrees left of ahead.
+    place(share): (3,) of the camera at that share of the way."""
+    poses, stops = [], -(-views // len(headings))
+    for step in range(views):
+        stop, heading = divmod(step, len(headings))
+        share = (stop + 0.5) / stops
+        eye, further = place(share), place(share + 0.02)
+        course = np.arctan2(*(further - eye)[1::-1]) + np.radians(headings[heading] + 1.5 * rng.normal())
+        ahead = np.array([np.cos(course), np.sin(course), -0.06 + 0.02 * rng.normal()])
+        poses.append(looking_at(eye, eye + ahead, 0.01 * rng.normal()))
+    return poses
+
+
+def _in_lane(share: float) -> Pose:
+    return np.array([-28 + 46 * share, -1.6 + 0.2 * np.sin(9 * share), 1.65])
+
+
+def drive(rng: Random, seed: int) -> Place:
+    """A street by one camera that looks ahead from a car, its points matched between photographs."""
+    room = street_room(rng)
+    return Place(
+        room, lambda views, surfaces, rng: _ahead(views, _in_lane, (0,), rng), STREET,
+        lambda frames, intrinsics: Matched(room, frames, intrinsics),
+    )  # fmt: skip
+
+
+def lidar(rng: Random, seed: int) -> Place:
+    """A street by a scanner of 32 beams on a car's roof and six cameras around it, that stand a few times."""
+    room = street_room(rng)
+    around = (0, 60, 120, 180, 240, 300)
+
+    def sensor(frames: Sequence[Frame], intrinsics: Intrinsics) -> Sensor:
+        places = np.stack([frame.camera_to_world[:3, 3] + ON_ROOF for frame in frames[:: len(around)]])
+        drift = rng.normal(0, 0.03, places.shape)
+        return Scanner(room, places, drift, 32, {"tree": 0.3}, colored=True)
+
+    def poses(views: int, surfaces: Surfaces, rng: Random) -> list[Pose]:
+        return _ahead(views, lambda share: _in_lane(0.4 + 0.25 * share), around, rng)
+
+    return Place(room, poses, STREET, sensor, frozenset({"tree"}))
+
+
+def country(rng: Random, seed: int) -> Place:
+    """Rough country by a robot's scanner and a camera that looks ahead, swaying."""
+    room = country_room(rng)
+    soft = {"grass": 0.15, "bush": 0.25, "tree": 0.3}
+
+    def place(share: float) -> Pose:
+        x, y = -25 + 40 * share, 0.8 * np.sin(7 * share)
+        return np.array([x, y, ground_at(room, x, y) + 1.1])
+
+    def poses(views: int, surfaces: Surfaces, rng: Random) -> list[Pose]:
+        ahead = _ahead(views, place, (0,), rng)
+        sway = [0.5 * rng.normal(size=3) for _ in ahead]
+        return [
+            looking_at(a[:3, 3], a[:3, 3] + 8 * a[:3, 2] + s, 0.05 * s[0]) for a, s in zip(ahead, sway, strict=True)
+        ]
+
+    def sensor(frames: Sequence[Frame], intrinsics: Intrinsics) -> Sensor:
+        places = np.stack([frame.camera_to_world[:3, 3] + ON_ROOF for frame in frames[::3]])
+        drift = rng.normal(0, 0.03, places.shape)
+        return Scanner(room, places, drift, 64, soft, colored=False)
+
+    return Place(room, poses, COUNTRY, sensor, frozenset(soft))
+
+
 PLACES: dict[str, Callable[[Random, int], Place]] = {
     "room": room, "flat": flat, "shelf": shelf, "bin": shelf_bin, "desk": desk, "glass": glass, "mirror": mirror,
     "table": table, "board": board, "still": still, "boxes": boxes, "plants": plants, "wires": wires,
+    "walk": head_worn, "drive": drive, "lidar": lidar, "country": country,
 }  # fmt: skip
 """By name; each is made from a random generator and the seed that it was made of."""
