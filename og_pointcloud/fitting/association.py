@@ -2,8 +2,9 @@
 
 Feature rows: what the encoder saw of each instance, over all views (paper, Sec. 3.3). The paper matches each instance
 with one mask per view by IoU and feature distance (Eq. 5) and averages. Here the masks of an instance are known from
-grouping, and how much each shows of it is a product with the mask table, with true visibility: a mask counts by the
-pixels it shows of the instance, and masks that disagree with the rest are left out.
+grouping, and how much each shows of it is a product with the mask table, with true visibility. A mask counts by the
+side of what it shows of the instance, the root of the pixels: by pixels, one close-up with a wrong name would outvote
+three views from twice as far. Masks that disagree with the rest are left out.
 
 Parts: a handle has masks of its own in some views, while most views show it within the mask of the mug. So, for
 instances a and b, over the views that see both and have a mask of b:
@@ -51,12 +52,13 @@ def describe_instances(
     agreement = np.zeros(count, np.float32)
     for instance in range(count):
         members = np.flatnonzero((group == instance) & (shown > 0) & features.any(axis=1))
-        row, kept, cosines = robust_mean(features[members], shown[members])
+        weight = np.sqrt(shown[members])
+        row, kept, cosines = robust_mean(features[members], weight)
         if row is None:
             continue
         rows.append(row)
         owners.append(instance)
-        agreement[instance] = np.average(cosines[kept], weights=shown[members][kept])
+        agreement[instance] = np.average(cosines[kept], weights=weight[kept])
     grouped = group >= 0
     pairs = np.unique(np.stack([group[grouped], table.mask_view[grouped]]), axis=1)
     return InstanceTable(
