@@ -263,6 +263,27 @@ def test_one_place_alone_refutes_nothing(monday):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("kept", [1.0, 0.2])
+def test_what_a_patchy_cloud_leaves_out_is_not_gone(monday, kept):
+    """Points of structure from motion lack in patches: a bin of which the visit has the foot alone is gone only if the
+    floor around it is not missing too."""
+    visit, random = scene(BEFORE, seed=2), np.random.default_rng(0)
+    xyz = visit.points.xyz
+    off = np.maximum(np.array(BIN.low) - xyz, xyz - np.add(BIN.low, BIN.size)).max(axis=1)
+    upper = (off < 0.01) & (xyz[:, 2] > 0.15)
+    patch = (off < 0.5) & (xyz[:, 2] < 0.01) & (random.random(len(xyz)) > kept)
+    visit = replace(visit, points=visit.points.take(np.flatnonzero(~(upper | patch))))
+    updated = og.update(monday, visit, progress=False)
+    told = [instance_of(monday, BIN)]
+    assert [*updated.changes.gone] == (told if kept == 1 else [])
+    assert [*updated.changes.unseen] == ([] if kept == 1 else told)
+    low, high = np.add(BIN.low, (0, 0, 0.3)), np.add(BIN.low, BIN.size)
+    upper = ((updated.cloud.xyz_world > low - 0.01) & (updated.cloud.xyz_world < high + 0.01)).all(axis=1)
+    stays = np.count_nonzero(upper & (updated.cloud.instance_ids == told[0]))
+    assert stays == pytest.approx(0 if kept == 1 else 400, abs=50)  # of four sides and the top
+
+
+@pytest.mark.slow
 def test_what_the_first_visit_never_looked_at_is_not_new(monday):
     """Monday only looked from one side; behind the chest stands something that it could not see."""
     side = [camera for camera in cameras(40) if camera.center[0] < -2.5]

@@ -7,7 +7,8 @@ through (was it)? By instance, over the points that show and that can tell:
     gone     most of them are seen through later, from two places
     new      most of them lie where the earlier visit had looked through, from two places
     moved    a new instance that looks like a gone one
-    unseen   so few of them are looked at later that nothing is known
+    unseen   so few of them are looked at later that nothing is known; or the later visit's cloud is so sparse that it
+             leaves out as much of what stands about them
 
 Points close to the surface of something else cannot tell: when a book is gone, its lower edge still agrees with the
 table. What lies where the earlier visit never looked is neither new nor old: it is added to a map, and not reported.
@@ -133,19 +134,22 @@ def compare_visits(
     a.space.require(b.space, "later descriptors")
     if not b.cameras and later.depth is None:
         raise SceneError("the later visit does not know its cameras, so not what it looked at: fit its capture again")
-    scatter = max(earlier.surface.scatter, later.surface.scatter)
-    tolerance = tolerance_of(max(a.spacing, b.spacing), scatter)
+    scatter, spacing = max(earlier.surface.scatter, later.surface.scatter), max(a.spacing, b.spacing)
+    tolerance = tolerance_of(spacing, scatter)
     shown, known = Presence.by(earlier.measured(), tolerance, a.xyz, b.xyz)
     if not a.cameras:  # what the earlier visit saw is not known: it may have looked from the same places
         (known,) = Presence.by(earlier.measured(b.cameras), tolerance, b.xyz)
     shows = np.ones(len(b), bool)
+    left_out = np.zeros(len(a), bool)  # depth images leave nothing out
     if again is None:
         asked, own = Presence.by(later.measured(), tolerance, a.xyz, b.xyz)
         _require_one_frame(asked)
         again, shows = (asked.present, asked.absent), own.present
-    of_earlier = Evidence(shown.present | (not a.cameras), *again, earlier.telling(tolerance))
-    of_later = Evidence(shows, known.present, known.absent, later.telling(tolerance))
+        if later.depth is None:
+            left_out = np.asarray(cKDTree(b.xyz).query(a.xyz, workers=-1)[0]) > spacing
     distance, nearest = map(np.asarray, cKDTree(a.xyz).query(b.xyz, workers=-1))
+    of_earlier = Evidence(shown.present | (not a.cameras), *again, earlier.telling(tolerance), left_out)
+    of_later = Evidence(shows, known.present, known.absent, later.telling(tolerance), distance > spacing)
     return _decide(earlier, later, of_earlier, of_later, np.where(distance <= SAME_SURFACE * a.spacing, nearest, -1))
 
 

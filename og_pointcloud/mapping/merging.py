@@ -66,7 +66,7 @@ def update(
 def merge(earlier: Visit, later: Visit, found: Comparison, name: str, stamp: float | None = None) -> Updated:
     """The map after a visit. stamp: of the visit; None: one more than the last one's."""
     a, b = earlier.cloud, later.cloud
-    stays, orphaned = _staying(a, found)
+    stays, orphaned = _staying(earlier, found)
     ids_of_later = _ids_of_later(earlier, later, stays, found)
     adds: NDArray[np.bool_] = np.ones(len(b), bool)
     if stays.any():
@@ -94,12 +94,14 @@ def merge(earlier: Visit, later: Visit, found: Comparison, name: str, stamp: flo
     return Updated(merged, changes)
 
 
-def _staying(a: LabelledCloud, found: Comparison) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+def _staying(earlier: Visit, found: Comparison) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """(n,) bool each of the map's points: those that stay, and those of them that have lost what they were part of."""
-    left = np.zeros(len(a.instances) + 2, bool)  # rows -2 and -1: unobserved and background
+    ids, still, through = earlier.cloud.instance_ids, found.evidence.still, found.evidence.through
+    left, unseen = np.zeros((2, len(earlier.cloud.instances) + 2), bool)  # rows -2 and -1: unobserved and background
     left[[*found.changes.gone, *found.gone_pieces]] = True
-    of_left, still = left[a.instance_ids], found.evidence.still
-    return ~found.evidence.through & (~of_left | still), of_left & still
+    unseen[list(found.changes.unseen)] = True
+    unseen[:-2] &= earlier.count(through) >= FEWEST_POINTS  # fewer are strays
+    return (~through | unseen[ids]) & (~left[ids] | still), left[ids] & still
 
 
 def _ids_of_later(earlier: Visit, later: Visit, stays: NDArray[np.bool_], found: Comparison) -> NDArray[np.int64]:

@@ -15,6 +15,7 @@ from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from og_pointcloud.cloud import UNOBSERVED, LabelledCloud
 from og_pointcloud.formats.poses import in_local_frame
@@ -40,6 +41,8 @@ TELLING = 1.5
 """Tolerances that a point lies off every other surface about it, to tell of its own thing."""
 FLAT_SHARE = 0.25
 """Share of what is looked at that must be seen through where most of a thing lies flat on something else."""
+ABOUT = 32
+"""Points that stand nearest to each point seen through, by which it is told how much a cloud leaves out there."""
 
 
 def tolerance_of(spacing: float, scatter: float) -> float:
@@ -184,15 +187,18 @@ class Visit:
 class Evidence:
     """Of one visit's points, by another's views, (n,) bool each. shown: seen by their own visit. still, through: the
     other visit measures them where they are, or sees through their places. telling: off all surfaces of other things.
+    left_out: the other visit's cloud, which is all that it measured, has no point there.
     """
 
     shown: NDArray[np.bool_]
     still: NDArray[np.bool_]
     through: NDArray[np.bool_]
     telling: NDArray[np.bool_]
+    left_out: NDArray[np.bool_]
 
     def decided(self, visit: Visit) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """(instances,) bool each: those that are seen through; those hardly looked at.
+        """(instances,) bool each: those that are seen through; those of which nothing is known: they are hardly looked
+        at, or the other visit leaves out as much of what stands about them as it sees through of them.
 
         Each point counts by how sure it is of its instance: a part of the table that a mask took for the book's stays
         when the book leaves.
@@ -207,7 +213,23 @@ class Evidence:
         lies_flat = (through > MOST * (through + telling)) & (through > FLAT_SHARE * (through + still)) & ~most
         for k in np.flatnonzero(lies_flat):
             lies_flat[k] = self._of_one_color(visit, int(k))
-        return (seen_through >= least) & (most | lies_flat), looked_at < least
+        left = (seen_through >= least) & (most | lies_flat)
+        unknown = left & (seen_through <= self._left_out_about(visit, left) * looked_at)
+        return left & ~unknown, unknown | (looked_at < least)
+
+    def _left_out_about(self, visit: Visit, left: NDArray[np.bool_]) -> NDArray[np.float64]:
+        """(instances,) of those that may have left, the share that the other visit's cloud leaves out of what stands
+        about their points that are seen through: so much of each would be missing if it stood there still."""
+        share, xyz = np.zeros(len(left)), visit.cloud.xyz
+        may_have_left = np.append(left, [False, False])[visit.cloud.instance_ids]  # unobserved and background do not
+        stands = np.flatnonzero(self.shown & ~self.through & ~may_have_left)
+        tree = cKDTree(xyz[stands])
+        for k in np.flatnonzero(left) if self.left_out.any() and len(stands) else ():
+            rows = visit.rows[k]
+            asked = xyz[rows[self.shown[rows] & self.through[rows]]]
+            about = np.unique(tree.query(asked, k=min(ABOUT, len(stands)), workers=-1)[1])
+            share[k] = self.left_out[stands[about]].mean()
+        return share
 
     def _of_one_color(self, visit: Visit, instance: int) -> bool:
         """Whether what is seen through is of the colour of the rest: else it is a part of something else."""
