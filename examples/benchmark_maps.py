@@ -6,6 +6,7 @@
     python examples/benchmark_maps.py speed CAPTURE               # ms a frame at 100,000 and 1,000,000 points
     python examples/benchmark_maps.py loops CAPTURE               # memory over two loops of the same path
     python examples/benchmark_maps.py pairs FOLDER...             # a/ and b/ with changes.json, two visits each
+    python examples/benchmark_maps.py pairs FOLDER... --sparse 5000   # the same as structure from motion has them
     python examples/benchmark_maps.py days SEED...                # demo rooms: a map that goes on growing the next day
 
 A capture has gt.npz for its scores; its depth images, if it has any, make the map, else its own cloud is given. Times
@@ -34,6 +35,12 @@ from og_pointcloud.scene import Camera, Scene
 
 TENTHS, WARM_UP = 10, 5
 SIZES = 100_000, 1_000_000
+TEXTURED, FALLS_OFF_M = 60, 0.35
+"""Places of a room that structure from motion finds, and the distance from them at which it finds a third as much."""
+OFF_M, STRAY, STRAY_M = 0.008, 0.01, 0.3
+"""Its points' noise; the share of its strays, and how far off these are."""
+SPARSE_POSES = 0.005, 0.1
+"""Its poses' noise: metres, degrees."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -47,9 +54,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--every", type=int, default=1, metavar="N", help="take each N-th frame")
     parser.add_argument("--tenths", type=int, default=TENTHS, metavar="N", help="rows of the table")
     parser.add_argument("--no-fit", action="store_true", help="without the fits of the same frames")
+    parser.add_argument("--sparse", type=int, default=0, metavar="N", help="pairs of N uneven points, without depth")
     options = parser.parse_args(arguments)
-    if options.what in ("pairs", "days"):
-        {"pairs": pairs, "days": days}[options.what](options.folders)
+    if options.what == "pairs":
+        pairs(options.folders, options.sparse)
+        return
+    if options.what == "days":
+        days(options.folders)
         return
     for folder in options.folders:
         {"frames": growing, "speed": speed, "loops": loops}[options.what](folder, options)
@@ -164,16 +175,31 @@ def loops(folder: Path, options: argparse.Namespace) -> None:
         print(f"{folder.name} loop {loop + 1}: {mapper.points:,} points, {mapper.nbytes / 1e6:.1f} MB kept of frames")
 
 
-def pairs(folders: list[Path]) -> None:
-    """Each pair's changes and errors, and the figures over all."""
+def as_sparse(capture: Scene, folder: Path, count: int) -> Scene:
+    """A capture as structure from motion has it: few uneven points of what three views see, noise, strays."""
+    random, xyz = np.random.default_rng(ord(folder.name[0])), capture.points.xyz
+    textured = xyz[random.integers(0, len(xyz), TEXTURED)]
+    likely = np.exp(-cKDTree(textured).query(xyz)[0] / FALLS_OFF_M) * (np.load(folder / "gt.npz")["views"] > 2)
+    points = capture.points.take(random.choice(len(xyz), count, replace=False, p=likely / likely.sum()))
+    off = random.normal(0, OFF_M, (count, 3))
+    stray = random.random(count) < STRAY
+    off[stray] += random.normal(0, STRAY_M, (np.count_nonzero(stray), 3))
+    views = tuple(replace(view, camera=_moved(view.camera, random, *SPARSE_POSES)) for view in capture.views)
+    return replace(capture, points=replace(points, xyz=(points.xyz + off).astype(np.float32)), views=views)
+
+
+def pairs(folders: list[Path], sparse: int = 0) -> None:
+    """Each pair's changes and errors, and the figures over all. sparse: points of each visit, 0 for all of them."""
     total = PairScore()
     print("pair      changes found  moved followed  reported right      s")
     for folder in folders:
-        first = read_capture(folder / "a")
+        first, second = (read_capture(folder / name) for name in "ab")
+        if sparse:
+            first, second = as_sparse(first, folder / "a", sparse), as_sparse(second, folder / "b", sparse)
         before = og.fit(first, progress=False)
-        second = read_capture(folder / "b")
         start = time.perf_counter()
-        updated = og.update(before, second, depth=depth_views(folder / "b", before.origin), progress=False)
+        depth = None if sparse else depth_views(folder / "b", before.origin)
+        updated = og.update(before, second, depth=depth, progress=False)
         seconds = time.perf_counter() - start
         visit = og.fit(second, progress=False)
         score = score_pair(folder, updated.changes.to_dict(), before, visit, updated.cloud)
