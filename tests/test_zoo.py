@@ -187,6 +187,9 @@ def test_a_scanner_gives_rings_and_sees_what_no_camera_does():
     assert (deeper[names != "tree"] == 0).all()
     assert deeper[names == "tree"].mean() > 0.1
     np.testing.assert_allclose(np.cross(raw.offset, ray), 0, atol=1e-9)
+    crown = names == "tree"
+    back = make.Surfaces(room.objects).cast(raw.xyz[crown] + raw.offset[crown], -ray[crown] / reached[crown, None])
+    np.testing.assert_allclose(back.distance, deeper[crown], atol=1e-3)
     made = small("lidar-0")
     assert made.views is not None
     assert 0.01 < (made.views[made.cls >= 0] == 0).mean() < 0.7
