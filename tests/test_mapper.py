@@ -98,6 +98,20 @@ def test_what_is_carried_elsewhere_keeps_its_id():
     assert instance_of(cloud, CRATE) == -1
 
 
+def test_what_left_is_said_to_have_stood_where_all_of_it_did():
+    """A thing twice as high as wide: its lower half is not seen through yet when most of what shows has left."""
+    high = replace(BIN, size=(0.4, 0.4, 1.2))
+    mapper, _ = mapped(frames([CHEST, high, CRATE]))
+    known = instance_of(mapper.snapshot().cloud, high)
+    (stood,) = (entry.place for entry in mapper.objects() if entry.id == known)
+    views = cameras()
+    for frame in frames([CHEST, CRATE], [*views[2:], *views[:2]][::3], seed=1, first=100.0):
+        mapper.integrate(frame)
+    (gone,) = (entry for entry in mapper.objects() if entry.state == "gone")
+    assert gone.id == known
+    assert np.linalg.norm(gone.place - stood) < 0.1
+
+
 def test_a_missed_detection_removes_nothing():
     mapper, _ = mapped(frames(THINGS))
     blind = [replace(frame, masks=None, features=None, stamp=50.0 + k) for k, frame in enumerate(frames(THINGS))]

@@ -78,9 +78,10 @@ def _has_left(known: GrowingMap, k: int) -> bool:
     if lost <= max(MOST * (lost + len(still)), FLAT_SHARE * (lost + len(rows))):
         return False
     # What it stood before, and its masks held too, is still there: it looked as what left does.
-    track.left, track.left_at = _look(known, k, np.array(track.lost, np.int32)), track.sequence
-    track.lost = []
-    known.points.weight[np.setdiff1d(rows, still)] = 0
+    leaving = np.setdiff1d(rows, still)
+    gone = np.append(np.array(track.lost, np.int32), leaving)
+    track.left, track.left_at, track.lost = _look(known, k, gone), track.sequence, []
+    known.points.weight[leaving] = 0
     known.forget(rows)
     return True
 
