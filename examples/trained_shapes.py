@@ -103,8 +103,9 @@ def shape_gradient(
     (splats, *_), _ = binned_splats(gaussians, camera, source.near, None, CUTOFFS)
     found = np.zeros((2, len(source.known)))
     sparse = view.weights.indptr, view.weights.indices, view.weights.data
-    shown = source.known
-    _add_gradient(sparse, view.pixels, camera.width, values, pull, splats[shown], gaussians.opacity[shown], found)
+    shown, place = source.known, np.zeros(len(gaussians), np.int64)
+    place[splats["gaussian"]] = np.arange(len(splats))
+    _add_gradient(sparse, view.pixels, camera.width, values, pull, splats[place[shown]], gaussians.opacity[shown], found)
     whole = np.zeros((2, len(gaussians)))
     whole[:, shown] = found
     return whole[0], whole[1]

@@ -65,16 +65,9 @@ def sightings_of(
 ) -> Sightings:
     """The masks that each point lies in, by what `openness` answers, or by a depth image that says which points it
     measured: 1 for these, 0 for the others."""
-    seen = np.flatnonzero(open_).astype(np.int32)
-    height, width = ids.shape
-    # Rounded to float32, a place just inside the image may lie on its border.
-    row, column = np.minimum(v[seen].astype(np.intp), height - 1), np.minimum(u[seen].astype(np.intp), width - 1)
-    seen = seen[ids[row, column] != NOT_SEEN]
-    rows, columns, votes = _votes(seen, open_, u, v, np.where(ids < 0, mask_count, ids), SAMPLES)
-    order = np.argsort(rows, kind="stable")
-    starts = np.searchsorted(rows[order], np.arange(mask_count + 2)).astype(np.int32)
+    starts, columns, votes, seen = _votes(open_, u, v, ids, mask_count, SAMPLES)
     return Sightings(
-        csr_array((votes[order], columns[order], starts), shape=(mask_count + 1, len(open_))),
+        csr_array((votes, columns, starts), shape=(mask_count + 1, len(open_))),
         csr_array((open_[seen], seen, [0, len(seen)]), shape=(1, len(open_))),
     )
 
@@ -134,23 +127,41 @@ def _see(binned, size, asked, log2_least, workers, seen):  # noqa: ANN001, ANN20
 
 
 @njit(cache=True, nogil=True)
-def _votes(seen, open_, u, v, masks, samples):  # noqa: ANN001, ANN202
-    """(rows, columns, votes): the openness of each seen point, shared among the masks at and around its pixel."""
-    height, width = masks.shape
-    rows = np.empty(len(seen) * len(samples), np.int32)
-    columns = np.empty(len(seen) * len(samples), np.int32)
-    votes = np.empty(len(seen) * len(samples), np.float32)
-    end = 0
-    for g in seen:
+def _votes(open_, u, v, ids, mask_count, samples):  # noqa: ANN001, ANN202
+    """The openness of each point, shared among the masks at and around its pixel: (starts, columns, votes) of sparse
+    rows (masks + 1, n); and the points that have a vote."""
+    height, width = ids.shape
+    most = np.count_nonzero(open_)
+    seen = np.empty(most, np.int32)
+    entries = np.empty((3, most * len(samples)), np.int32)
+    rows, columns, votes = entries[0], entries[1], entries[2].view(np.float32)
+    starts = np.zeros(mask_count + 2, np.int32)
+    points, end = 0, 0
+    for g in range(len(open_)):
+        # Rounded to float32, a place just inside the image may lie on its border.
+        if open_[g] == 0 or ids[min(int(v[g]), height - 1), min(int(u[g]), width - 1)] == NOT_SEEN:
+            continue
+        seen[points] = g
+        points += 1
         first = end
         for k in range(len(samples)):
             x = min(max(int(np.floor(u[g] + samples[k, 0])), 0), width - 1)
             y = min(max(int(np.floor(v[g] + samples[k, 1])), 0), height - 1)
-            mask, entry = masks[y, x], first
+            mask, entry = ids[y, x], first
+            if mask < 0:
+                mask = mask_count
             while entry < end and rows[entry] != mask:
                 entry += 1
             if entry == end:
                 rows[end], columns[end], votes[end] = mask, g, np.float32(0)
+                starts[mask + 1] += 1
                 end += 1
             votes[entry] += open_[g] * samples[k, 2]
-    return rows[:end], columns[:end], votes[:end]
+    # By row, points of a row in their order.
+    starts = np.cumsum(starts).astype(np.int32)
+    place = starts[:-1].copy()
+    sorted_columns, sorted_votes = np.empty(end, np.int32), np.empty(end, np.float32)
+    for e in range(end):
+        sorted_columns[place[rows[e]]], sorted_votes[place[rows[e]]] = columns[e], votes[e]
+        place[rows[e]] += 1
+    return starts, sorted_columns, sorted_votes, seen[:points]

@@ -176,29 +176,20 @@ def binned_splats(
     gaussians: Gaussians, camera: Camera, near: float, thickness: NDArray[np.float32] | None, cutoffs: Cutoffs
 ) -> tuple[Binned, NDArray[np.float64]]:
     """The splats of an image by tile, and the area of each Gaussian."""
-    pose, near = camera.world_to_camera, float(near)
+    n = len(gaussians)
+    thickness = np.full(n, np.inf, np.float32) if thickness is None else thickness
+    shapes = gaussians.xyz, gaussians.scale, gaussians.rotation, gaussians.opacity, thickness
     intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
-    size = (camera.width, camera.height)
-    splats, area = _records(len(gaussians)), np.zeros(len(gaussians))
-    keys = _project(
-        gaussians.xyz,
-        gaussians.scale,
-        gaussians.rotation,
-        gaussians.opacity,
-        np.full(len(gaussians), np.inf, np.float32) if thickness is None else thickness,
-        pose,
-        intrinsics,
-        size,
-        near,
-        cutoffs,
-        splats,
-        area,
-    )
+    seen_by = camera.world_to_camera, intrinsics, (camera.width, camera.height), float(near)
+    rows = np.flatnonzero(_may_show(shapes[:2], seen_by, cutoffs))
+    splats, area = _records(len(rows)), np.zeros(n)
+    keys = _project(rows, shapes, seen_by, cutoffs, splats, area)
     keys = np.sort(keys[keys != _CULLED])
-    order = (keys & np.uint64(0xFFFFFFFF)).astype(np.int32)
+    # In order of depth in memory too: those of a tile are then read from front to back.
+    splats = _in_order(splats, (keys & np.uint64(0xFFFFFFFF)).astype(np.int32), _records(len(keys)))
     columns = -(-camera.width // TILE)
     tiles = columns * -(-camera.height // TILE)
-    starts, members = _bin(splats, order, columns, tiles, cutoffs, get_num_threads())
+    starts, members = _bin(splats, columns, tiles, cutoffs, get_num_threads())
     return (splats, starts, members, columns), area
 
 
@@ -252,16 +243,48 @@ def linearised_at(tx, ty, intrinsics, size):  # noqa: ANN001, ANN201
 
 
 @njit(cache=True, parallel=True, nogil=True, error_model="numpy")
-def _project(xyz, scale, rotation, opacity, thickness, pose, intrinsics, size, near, cutoffs, splats, area):  # noqa: ANN001, ANN202
-    """EWA projection in float64: writes splats (n,) and area (n,), the weight in pixels if nothing were in front;
-    returns depth keys (n,) uint64.
+def _may_show(shapes, seen_by, cutoffs):  # noqa: ANN001, ANN202
+    """(n,) bool: not of splats before the near plane, and of those that a circle around their ellipse, larger than it,
+    puts beside the image: most of a cloud costs a few products a view, and no projection."""
+    (xyz, scale), (pose, intrinsics, size, near) = shapes, seen_by
+    fx, fy, cx, cy = intrinsics
+    low_x, low_y = linearised_at(-np.inf, -np.inf, intrinsics, size)
+    high_x, high_y = linearised_at(np.inf, np.inf, intrinsics, size)
+    # Standard deviations from the centre to where an opaque splat's alpha is the least; a tenth more for poses and
+    # quaternions that are not quite of length one. Times depth, the radius is own * longest axis + blur * depth.
+    reach = 1.1 * np.sqrt(-2 * np.log(cutoffs.alpha_min))
+    own_x = reach * fx * np.sqrt(1 + max(abs(low_x), abs(high_x)) ** 2)
+    own_y = reach * fy * np.sqrt(1 + max(abs(low_y), abs(high_y)) ** 2)
+    blur = reach * np.sqrt(LOW_PASS) + 1
+    may = np.ones(len(xyz), np.bool_)
+    for g in prange(len(xyz)):
+        x, y, z = np.float64(xyz[g, 0]), np.float64(xyz[g, 1]), np.float64(xyz[g, 2])
+        depth = pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] * z + pose[2, 3]
+        if not depth > near:
+            may[g] = False
+            continue
+        right = fx * (pose[0, 0] * x + pose[0, 1] * y + pose[0, 2] * z + pose[0, 3]) + cx * depth
+        down = fy * (pose[1, 0] * x + pose[1, 1] * y + pose[1, 2] * z + pose[1, 3]) + cy * depth
+        longest = np.float64(max(scale[g, 0], scale[g, 1], scale[g, 2]))
+        radius_x, radius_y = own_x * longest + blur * depth, own_y * longest + blur * depth
+        beside = right < -radius_x or right > size[0] * depth + radius_x
+        may[g] = not (beside or down < -radius_y or down > size[1] * depth + radius_y)
+    return may
 
-    A key is the float32 depth's bits above the Gaussian: sorting keys sorts by depth, ties by Gaussian. Those without a
+
+@njit(cache=True, parallel=True, nogil=True, error_model="numpy")
+def _project(rows, shapes, seen_by, cutoffs, splats, area):  # noqa: ANN001, ANN202
+    """EWA projection in float64 of the Gaussians ``rows``, ascending: writes their splats (rows,) and area (n,), the
+    weight in pixels if nothing were in front; returns depth keys (rows,) uint64.
+
+    A key is the float32 depth's bits above the splat: sorting keys sorts by depth, ties by Gaussian. Those without a
     pixel have the key _CULLED.
     """
-    keys = np.full(len(xyz), _CULLED)
+    keys = np.full(len(rows), _CULLED)
+    (xyz, scale, rotation, opacity, thickness), (pose, intrinsics, size, near) = shapes, seen_by
     fx, fy, cx, cy = intrinsics
-    for g in prange(len(xyz)):
+    for i in prange(len(rows)):
+        g = rows[i]
         depth, tx, ty = seen_from(np.float64(xyz[g, 0]), np.float64(xyz[g, 1]), np.float64(xyz[g, 2]), pose)
         if not depth > near or not opacity[g] > cutoffs.alpha_min:
             continue
@@ -276,14 +299,21 @@ def _project(xyz, scale, rotation, opacity, thickness, pose, intrinsics, size, n
         y0, y1 = max(np.ceil(v - ry - 0.5), 0.0), min(np.floor(v + ry - 0.5), size[1] - 1.0)
         if not (x0 <= x1 and y0 <= y1 and det < np.inf):
             continue
-        s = splats[g]
+        s = splats[i]
         s.u, s.v, s.shear = u, v, -sxy / syy
         s.across, s.down = np.sqrt(0.5 * LOG2_E * syy / det), 0.5 * LOG2_E / syy
         s.peak, s.depth, s.surface = peak, depth, depth - thickness[g]
         s.x0, s.x1, s.y0, s.y1, s.gaussian = int(x0), int(x1), int(y0), int(y1), g
         area[g] = 2 * np.pi * np.sqrt(det) * (sigma - cutoffs.alpha_min)  # the integral of alpha over that ellipse
-        keys[g] = (np.uint64(np.float32(depth).view(np.uint32)) << np.uint64(32)) | np.uint64(g)
+        keys[i] = (np.uint64(np.float32(depth).view(np.uint32)) << np.uint64(32)) | np.uint64(i)
     return keys
+
+
+@njit(cache=True, parallel=True, nogil=True)
+def _in_order(splats, order, ordered):  # noqa: ANN001, ANN202
+    for i in prange(len(order)):
+        ordered[i] = splats[order[i]]
+    return ordered
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -319,22 +349,22 @@ def _projected_axis(axis, length, pose, px, py, jx, jy):  # noqa: ANN001, ANN202
 
 
 @njit(cache=True, parallel=True, nogil=True, error_model="numpy")
-def _bin(splats, order, columns, tiles, cutoffs, bands):  # noqa: ANN001, ANN202
-    """Depth-ordered members of every tile: tile t holds members[starts[t]:starts[t + 1]]."""
+def _bin(splats, columns, tiles, cutoffs, bands):  # noqa: ANN001, ANN202
+    """Members of every tile, of splats in order of depth: tile t holds members[starts[t]:starts[t + 1]]."""
     tile_rows, log2_least = tiles // columns, np.log2(cutoffs.alpha_min)
     # The tile ranges side by side: every band reads all of them, twice.
-    ranges = np.empty((len(order), 4), np.int32)
-    for i in prange(len(order)):
-        s = splats[order[i]]
+    ranges = np.empty((len(splats), 4), np.int32)
+    for i in prange(len(splats)):
+        s = splats[i]
         ranges[i, 0], ranges[i, 1] = s.x0 // TILE, s.x1 // TILE + 1
         ranges[i, 2], ranges[i, 3] = s.y0 // TILE, s.y1 // TILE + 1
     # First pass: how many splats each tile has. A band of rows of tiles is one thread's, so none writes to another's.
     counts = np.zeros(tiles + 1, np.int64)
     for band in prange(bands):
         low, high = band * tile_rows // bands, (band + 1) * tile_rows // bands
-        for i in range(len(order)):
+        for i in range(len(splats)):
             for row in range(max(ranges[i, 2], low), min(ranges[i, 3], high)):
-                begin, end = _tiles_of_row(splats, order[i], row, ranges[i, 0], ranges[i, 1], log2_least)
+                begin, end = _tiles_of_row(splats, i, row, ranges[i, 0], ranges[i, 1], log2_least)
                 for column in range(begin, end):
                     counts[row * columns + column + 1] += 1
     # Second pass: the splats themselves, in order of depth as they come.
@@ -343,12 +373,12 @@ def _bin(splats, order, columns, tiles, cutoffs, bands):  # noqa: ANN001, ANN202
     fill = starts[:-1].copy()
     for band in prange(bands):
         low, high = band * tile_rows // bands, (band + 1) * tile_rows // bands
-        for i in range(len(order)):
+        for i in range(len(splats)):
             for row in range(max(ranges[i, 2], low), min(ranges[i, 3], high)):
-                begin, end = _tiles_of_row(splats, order[i], row, ranges[i, 0], ranges[i, 1], log2_least)
+                begin, end = _tiles_of_row(splats, i, row, ranges[i, 0], ranges[i, 1], log2_least)
                 for column in range(begin, end):
                     tile = row * columns + column
-                    members[fill[tile]] = order[i]
+                    members[fill[tile]] = i
                     fill[tile] += 1
     return starts, members
 
