@@ -111,6 +111,17 @@ class Camera:
 
 
 @dataclass(frozen=True)
+class CutMasks:
+    """Of a view that is one of several cut from a photograph: its masks are parts of those of the photograph.
+
+    photograph: its name. rows: (M,) int64, which of its masks each mask of the view is a part of.
+    """
+
+    photograph: str
+    rows: NDArray[np.int64]
+
+
+@dataclass(frozen=True)
 class View:
     """One posed image with its masks.
 
@@ -122,6 +133,7 @@ class View:
     image: (H, W, 3) uint8 RGB, or a function that reads it, or None where the capture has no images.
     mask_tracks: (M,) integers, which masks of other views a tracker took for the same thing: equal numbers, -1 unknown;
         None where there was no tracker.
+    cut_from: the photograph whose masks these are parts of; None where they are masks of this view.
     """
 
     name: str
@@ -130,6 +142,7 @@ class View:
     mask_features: FloatArray
     image: NDArray[np.uint8] | Callable[[], NDArray[np.uint8]] | None = None
     mask_tracks: NDArray[np.integer] | None = None
+    cut_from: CutMasks | None = None
 
     def __post_init__(self) -> None:
         features = self.mask_features

@@ -21,6 +21,7 @@ from scipy.sparse import csr_array
 
 from og_pointcloud.cloud import unit_rows
 from og_pointcloud.fitting.fit import Prepared
+from og_pointcloud.fitting.photographs import Photographs
 
 MOSTLY = 0.5
 """Share of a point's weight in masks from which it belongs to them."""
@@ -39,11 +40,12 @@ def centre_sampling(prepared: Prepared, words: Words) -> Labels:
     """Each point takes the word nearest to the mean of the mask features at its centre's pixel, by exposure."""
     table, views = prepared.table, prepared.surface.scene.views
     xyz = prepared.surface.gaussians.xyz
-    first = np.searchsorted(table.mask_view, np.arange(len(views)))
+    photographs = Photographs.of(views)
+    first = np.concatenate([[0], np.cumsum([view.mask_count for view in views])])
     similarity = table.unit_features @ unit_rows(words.astype(np.float64)).T
     scores, reached = np.zeros((len(xyz), len(words))), np.zeros(len(xyz), bool)
     for index, view in enumerate(views):
-        exposure = csr_array(table.exposure[[index]])
+        exposure = csr_array(table.exposure[[photographs.of_view[index]]])
         points, visible = exposure.indices, exposure.data
         uv_px, _ = view.camera.project(xyz[points])
         inside = view.camera.shows(uv_px)
@@ -51,7 +53,7 @@ def centre_sampling(prepared: Prepared, words: Words) -> Labels:
         mask = np.full(len(points), -1)
         mask[inside] = view.mask_map()[row, column]
         shown = mask >= 0
-        scores[points[shown]] += visible[shown, None] * similarity[first[index] + mask[shown]]
+        scores[points[shown]] += visible[shown, None] * similarity[photographs.of_mask[first[index] + mask[shown]]]
         reached[points[shown]] = True
     return np.where(reached, scores.argmax(axis=1), -1)
 

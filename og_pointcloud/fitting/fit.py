@@ -17,6 +17,7 @@ from og_pointcloud.fitting.labellers import LABELLERS, Labelling, paper
 from og_pointcloud.fitting.mask_table import MaskTable, mask_table, require_sight
 from og_pointcloud.fitting.membership import without_see_through
 from og_pointcloud.fitting.memory import in_file, memory_left
+from og_pointcloud.fitting.photographs import Photographs
 from og_pointcloud.fitting.reliability import likely_cause, split_half
 from og_pointcloud.fitting.tiles import fit_tiles, needs_tiles
 from og_pointcloud.fitting.work_folder import WorkFolder
@@ -93,7 +94,8 @@ class Prepared:
     """What the stages before labelling found; all modes but "paper", which draws points differently, share it.
 
     scene: as it was given. surface: how it is drawn. table: what every mask shows of every Gaussian of the surface;
-    what shows behind an object through its mask is in ``outside`` (membership.without_see_through).
+    what shows behind an object through its mask is in ``outside`` (membership.without_see_through). Its views are
+    photographs: those cut from one are one, but in mode "paper".
     """
 
     scene: Scene
@@ -208,7 +210,9 @@ def _mask_table(surface: Surface, settings: FitSettings, journal: Journal, work:
             )
         require_sight(table.exposure.nnz, table.weights.nnz, surface.scene)
         table = replace(table, mask_pixels=table.mask_pixels * surface.stride**2)
-        return front_surfaces(surface, table, settings, journal)
+        table = front_surfaces(surface, table, settings, journal)
+        # Mode paper draws views again, and asks for the masks of each.
+        return table if settings.mode == "paper" else Photographs.of(views).joined(table)
 
 
 def front_surfaces(surface: Surface, table: MaskTable, settings: FitSettings, journal: Journal) -> MaskTable:

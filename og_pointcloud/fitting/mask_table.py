@@ -44,7 +44,7 @@ class MaskTable:
         front, small behind other splats, and smaller still where it only shows through a surface.
     mask_view: (masks,) int32, the view of each mask. mask_pixels: (masks,) int32, area in pixels.
     mask_features: (masks, D) float32, as the encoder gave them.
-    mask_track: (masks,) int64 as `View.mask_tracks`; None where no view has tracks.
+    mask_track: (masks,) int64 as `View.mask_tracks`; None where no view has tracks. names: (views,), of the views.
     """
 
     weights: csr_array
@@ -54,6 +54,7 @@ class MaskTable:
     mask_pixels: NDArray[np.int32]
     mask_features: NDArray[np.float32]
     mask_track: NDArray[np.int64] | None = None
+    names: tuple[str, ...] = ()
 
     @property
     def unit_features(self) -> NDArray[np.float32]:
@@ -110,7 +111,7 @@ def mask_table(
         lengths, *_, exposed = work.arrays("view", key, make)
         sizes = np.array([lengths[:-1].sum(dtype=np.int64), lengths[-1], len(exposed)])
         pixels = np.bincount(ids[ids >= 0], minlength=view.mask_count).astype(np.int32)
-        return _ShownView(key, make, sizes, pixels, view.mask_features, view.mask_tracks)
+        return _ShownView(view.name, key, make, sizes, pixels, view.mask_features, view.mask_tracks)
 
     views_shown = list(_side_by_side(shown, views, side_by_side))
     matrices = _put_together(views_shown, len(gaussians), work, most_in_memory)
@@ -120,14 +121,16 @@ def mask_table(
         np.concatenate([view.pixels for view in views_shown]),
         _stacked([view.mask_features for view in views_shown]),
         stacked_tracks([(view.mask_tracks, len(view.pixels)) for view in views_shown]),
+        tuple(view.name for view in views_shown),
     )
 
 
 @dataclass(frozen=True)
 class _ShownView:
     """A view whose arrays (`_view_arrays`) a work folder keeps under ``key``. sizes: (3,) entries in masks, outside of
-    them, and of the exposure. pixels: (masks,) int32. mask_features, mask_tracks: as of `View`."""
+    them, and of the exposure. pixels: (masks,) int32. name, mask_features, mask_tracks: as of `View`."""
 
+    name: str
     key: str
     make: Callable[[], tuple[NDArray[Any], ...]]
     sizes: NDArray[np.int64]

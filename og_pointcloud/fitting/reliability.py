@@ -62,8 +62,7 @@ def split_half(table: MaskTable, surface: Surface, labelling: Labelling, setting
 
     table, surface: what it was made from. Clouds of more than ``geometry.held_out_points`` are judged by so many.
     """
-    views = surface.scene.views
-    masked = sorted(np.unique(table.mask_view).tolist(), key=lambda index: views[index].name)
+    masked = sorted(np.unique(table.mask_view).tolist(), key=lambda index: table.names[index])
     if len(masked) < FEWEST_VIEWS or not len(labelling.instances):
         return None
     sample = sample_of_points(surface.gaussians.xyz, settings.geometry.held_out_points)

@@ -36,6 +36,7 @@ from og_pointcloud.fitting.looks import Looks, by_look, looks_of_groups
 from og_pointcloud.fitting.mask_table import MaskTable, mask_table, require_sight, stacked_tracks, view_fingerprint
 from og_pointcloud.fitting.membership import assign_points, without_see_through
 from og_pointcloud.fitting.memory import memory_left
+from og_pointcloud.fitting.photographs import Photographs
 from og_pointcloud.fitting.tasks import Share, run_tasks, share_here
 from og_pointcloud.fitting.tiled_cloud import TiledCloud, vanished
 from og_pointcloud.fitting.view_votes import view_votes
@@ -207,16 +208,18 @@ def _drawing(views: Sequence[View], cloud: TiledCloud, settings: FitSettings, jo
 @dataclass(frozen=True)
 class _Shown:
     """What all views show. keys: of the array of ENTRY of each view in the cloud's work folder, sorted by point. first:
-    (views, tiles + 1), where each tile's points begin in it. mask_view, mask_features, mask_track: as `MaskTable`."""
+    (views, tiles + 1), where each tile's points begin in it. mask_view, mask_features, mask_track: as `MaskTable`, of
+    the views; ``photographs`` are these views."""
 
     keys: tuple[str, ...]
     first: Rows
     mask_view: NDArray[np.int32]
     mask_features: NDArray[np.float32]
     mask_track: NDArray[np.int64] | None
+    photographs: Photographs
 
     def table(self, cloud: TiledCloud, rows: NDArray[np.integer], few_views: int) -> MaskTable:
-        """The mask table of some points, given in ascending order.
+        """The mask table of some points, given in ascending order: of photographs, not of the views cut from them.
 
         Weight behind a mask's object counts as outside the mask where fewer views see the point than could contradict
         the mask (membership.without_see_through).
@@ -238,7 +241,8 @@ class _Shown:
         stacks = [_stacked(part, count, seldom) for part, count in zip(parts, masks.tolist(), strict=True)]
         weights, outside, exposure = (csr_array(vstack(blocks, format="csr")) for blocks in zip(*stacks, strict=True))
         no_pixels = np.zeros(len(self.mask_view), np.int32)  # asked only where what is behind an object is found
-        return MaskTable(weights, outside, exposure, self.mask_view, no_pixels, self.mask_features, self.mask_track)
+        masks_of_views = self.mask_view, no_pixels, self.mask_features, self.mask_track
+        return self.photographs.joined(MaskTable(weights, outside, exposure, *masks_of_views))
 
 
 def _stacked(entries: Entries, masks: int, seldom: NDArray[np.bool_]) -> tuple[csr_array, csr_array, csr_array]:
@@ -271,6 +275,7 @@ def _all_shown(scene: Scene, cloud: TiledCloud, looked: Sequence[_LookedAt], jou
         mask_view,
         np.concatenate(masks),
         stacked_tracks([(view.mask_tracks, view.mask_count) for view in scene.views]),
+        Photographs.of(scene.views),
     )
 
 
@@ -460,5 +465,6 @@ def _table_of_sums(ids: NDArray[np.int32], used: Rows, shown: _Shown, decided: S
 
     weights = at_first(sum((tile.in_masks for tile in decided[1:]), decided[0].in_masks))
     outside = at_first(sum((tile.outside for tile in decided[1:]), decided[0].outside))
-    no_pixels = np.zeros(len(shown.mask_view), np.int32)
-    return MaskTable(weights, outside, csr_array(outside.shape), shown.mask_view, no_pixels, shown.mask_features)
+    first, of_view = shown.photographs.first, shown.photographs.of_view
+    masks = of_view[shown.mask_view[first]], np.zeros(len(first), np.int32), shown.mask_features[first]
+    return MaskTable(weights, outside, csr_array(outside.shape), *masks)

@@ -50,7 +50,7 @@ from og_pointcloud.formats.points import read_points
 from og_pointcloud.formats.poses import PosedFrames, PosedImage, in_local_frame, in_pinholes
 from og_pointcloud.formats.repairs import Repair, read_repairs, repaired_images, repaired_layers
 from og_pointcloud.formats.rgbd import find_mesh, read_rgbd
-from og_pointcloud.scene import NOT_SEEN, Camera, Points, Scene, View
+from og_pointcloud.scene import NOT_SEEN, Camera, CutMasks, Points, Scene, View
 
 if TYPE_CHECKING:
     from og_pointcloud.formats.fusion import FusedCloud
@@ -267,7 +267,8 @@ def _layer_of(face: Face, layer: MaskLayer, view: str) -> MaskLayer:
     row_of_id[NOT_SEEN] = NOT_SEEN
     row_of_id[used] = np.arange(len(used), dtype=np.int32)
     tracks = None if layer.tracks is None else layer.tracks[used]
-    return MaskLayer(size, layer.features[used], lambda: row_of_id[scaled.mask_ids(layer.read())], tracks)
+    cut = CutMasks(posixpath.dirname(view), used.astype(np.int64))
+    return MaskLayer(size, layer.features[used], lambda: row_of_id[scaled.mask_ids(layer.read())], tracks, cut)
 
 
 def _read_masks(capture: Path, names: Sequence[str], level: str) -> tuple[list[MaskLayer], str]:
@@ -420,7 +421,7 @@ def _view(name: str, image: PosedImage, layer: MaskLayer, file: Path | None, ori
     _require_shape(name, layer, image.camera)
     camera = in_local_frame(image.camera.resized(*layer.size), origin)
     read_image = None if file is None else partial(read_photograph, file, camera, image.face)
-    return View(name, camera, layer.read, layer.features, read_image, layer.tracks)
+    return View(name, camera, layer.read, layer.features, read_image, layer.tracks, layer.cut_from)
 
 
 def read_photograph(file: Path, camera: Camera, face: Face | None) -> NDArray[np.uint8]:

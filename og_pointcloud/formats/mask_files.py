@@ -22,6 +22,7 @@ from og_pointcloud.cloud import UNKNOWN_SPACE
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.images import PngHeader, decoded, palette_indices, png_header, require_cv2
 from og_pointcloud.formats.npy import arrays_from_npz
+from og_pointcloud.scene import CutMasks
 
 MASKS_FOLDER = "masks"
 FEATURES_NAME = "mask_features.npz"
@@ -37,12 +38,14 @@ class MaskLayer:
 
     size: (width, height) of the mask map. features: (M, D) float32. tracks: as `View.mask_tracks`.
     read: gives the map, (height, width) int32, -1 outside every mask, else a row of ``features``.
+    cut_from: as of `View`.
     """
 
     size: tuple[int, int]
     features: NDArray[np.float32]
     read: Callable[[], NDArray[np.int32]]
     tracks: NDArray[np.integer] | None = None
+    cut_from: CutMasks | None = None
 
 
 def read_masks(capture: Path, names: Sequence[str]) -> tuple[list[MaskLayer], str]:
