@@ -1,0 +1,124 @@
+"""Views that were cut from one photograph are one view to a fit: cutting changes nothing but rims."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scenes import write_tiny_capture
+from scipy.sparse import csr_array
+
+import og_pointcloud as og
+from og_pointcloud.evaluate.baselines import centre_sampling
+from og_pointcloud.fitting.fit import fit, prepare
+from og_pointcloud.fitting.mask_table import MaskTable
+from og_pointcloud.fitting.photographs import Photographs
+from og_pointcloud.rendering.geometry import isotropic, neighbourhood
+from og_pointcloud.scene import CutMasks, Points, Scene, View
+from og_pointcloud.settings import FitSettings, GeometrySettings
+
+SETTINGS = FitSettings(geometry=GeometrySettings(scales=(0.5,)))
+TILED = replace(SETTINGS, tile_points=400)
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
+    return og.read_capture(write_tiny_capture(tmp_path_factory.mktemp("tiny") / "capture", 8).folder)
+
+
+@pytest.fixture(scope="module")
+def cut(scene: Scene) -> Scene:
+    """Every view in two, through the middle, but for the first, which stays whole."""
+    views = [part for view in scene.views[1:] for part in halves(view)]
+    return replace(scene, views=(scene.views[0], *views))
+
+
+def halves(view: View) -> list[View]:
+    ids, camera = view.mask_map(), view.camera
+    middle = camera.width // 2
+    parts = []
+    for name, columns in (("left", slice(0, middle)), ("right", slice(middle, camera.width))):
+        shown = ids[:, columns]
+        rows = np.unique(shown[shown >= 0])
+        number = np.full(view.mask_count + 1, -1, np.int32)
+        number[rows] = np.arange(len(rows))
+        half = replace(camera, width=shown.shape[1], cx=camera.cx - columns.start)
+        masks, features = np.ascontiguousarray(number[shown]), view.mask_features[rows]
+        cut_from = CutMasks(view.name, rows.astype(np.int64))
+        parts.append(View(f"{view.name}/{name}", half, masks, features, cut_from=cut_from))
+    return parts
+
+
+def as_gaussians(scene: Scene) -> Scene:
+    xyz = scene.points.xyz
+    splats = isotropic(scene.points, neighbourhood(xyz, GeometrySettings()).spacing, 0.7, 0.9)
+    points = Points(xyz, scene.points.origin, None, splats.scale, splats.rotation, splats.opacity)
+    return replace(scene, points=points)
+
+
+@pytest.mark.parametrize("kind", ["points", "gaussians"])
+def test_the_table_of_cut_views_is_that_of_the_photographs(scene: Scene, cut: Scene, kind: str):
+    if kind == "gaussians":
+        scene, cut = as_gaussians(scene), as_gaussians(cut)
+    whole, joined = prepare(scene, SETTINGS).table, prepare(cut, SETTINGS).table
+    assert joined.names == tuple(view.name for view in scene.views)
+    np.testing.assert_array_equal(joined.mask_view, whole.mask_view)
+    np.testing.assert_array_equal(joined.mask_features, whole.mask_features)
+    np.testing.assert_array_equal(joined.mask_pixels, whole.mask_pixels)
+    for name in ("weights", "outside", "exposure"):
+        found, expected = getattr(joined, name).toarray(), getattr(whole, name).toarray()
+        assert joined.exposure.data.max() <= 1
+        # A pixel beside the cut is asked about the masks of its own half alone, and that is all.
+        differs = np.abs(found - expected) > 1e-3 * np.maximum(1, expected)
+        assert differs.sum() <= 0.02 * (expected > 0).sum(), name
+
+
+@pytest.mark.parametrize("settings", [SETTINGS, TILED], ids=["whole", "tiles"])
+def test_cutting_changes_no_label(scene: Scene, cut: Scene, settings: FitSettings):
+    whole, of_cut = fit(scene, settings, progress=False), fit(cut, settings, progress=False)
+    assert len(whole.instances) == len(of_cut.instances) >= 2
+    assert (whole.instance_ids == of_cut.instance_ids).mean() > 0.995
+    np.testing.assert_array_equal(whole.instances.views, of_cut.instances.views)
+    np.testing.assert_array_equal(whole.instances.masks, of_cut.instances.masks)
+
+
+def test_baselines_find_the_masks_of_cut_views(scene: Scene, cut: Scene):
+    words = np.unique(np.concatenate([view.mask_features for view in scene.views]).round(3), axis=0)
+    whole, of_cut = (centre_sampling(prepare(views, SETTINGS), words) for views in (scene, cut))
+    assert (whole == of_cut).mean() > 0.995
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_joined_rows_are_the_sums_of_their_parts(seed: int):
+    random = np.random.default_rng(seed)
+    rows, counts, n = [[2, 0], [], [2], [0, 1, 3], [0, 1]], [2, 0, 1, 3, 2], 40
+    cut_from = ["a", "b", "a", "b", None]
+    views = [made_view(f"v{i}", *of) for i, of in enumerate(zip(counts, cut_from, rows, strict=True))]
+    dense = [random.random((height, n)) * (random.random((height, n)) < 0.4) for height in (8, 5, 5)]
+    weights, outside, exposure = (csr_array(matrix.astype(np.float32)) for matrix in dense)
+    features = np.concatenate([view.mask_features for view in views])
+    mask_view = np.repeat(np.arange(5, dtype=np.int32), counts)
+    table = MaskTable(weights, outside, exposure, mask_view, np.arange(8, dtype=np.int32), features, np.arange(8))
+    joined = Photographs.of(views).joined(table)
+    # Masks a0, a2, b0, b1, b3 and the two of the last view, by the rows that are their parts.
+    parts = [[1], [0, 2], [3], [4], [5], [6], [7]]
+    photographs = [[0, 2], [1, 3], [4]]
+    assert joined.names == ("a", "b", "v4")
+    np.testing.assert_allclose(joined.weights.toarray(), [dense[0][part].sum(axis=0) for part in parts], rtol=1e-6)
+    np.testing.assert_allclose(
+        joined.outside.toarray(), [dense[1][part].sum(axis=0) for part in photographs], rtol=1e-6
+    )
+    least = [np.minimum(1, dense[2][part].sum(axis=0)) for part in photographs]
+    np.testing.assert_allclose(joined.exposure.toarray(), least, rtol=1e-6)
+    np.testing.assert_array_equal(joined.mask_view, [0, 0, 1, 1, 1, 2, 2])
+    np.testing.assert_array_equal(joined.mask_pixels, [sum(part) for part in parts])
+    np.testing.assert_array_equal(joined.mask_track, [part[0] for part in parts])
+    np.testing.assert_array_equal(joined.mask_features, features[[part[0] for part in parts]])
+
+
+def made_view(name: str, count: int, photograph: str | None, rows: list[int]) -> View:
+    camera = og.Camera(4, 4, 4.0, 4.0, 2.0, 2.0, np.eye(4))
+    cut_from = None if photograph is None else CutMasks(photograph, np.array(rows, np.int64))
+    features = np.array(rows, np.float32).reshape(-1, 1) + np.arange(3, dtype=np.float32)
+    return View(name, camera, np.full((4, 4), -1, np.int32), features[:count], cut_from=cut_from)
