@@ -22,6 +22,7 @@ from scipy.sparse import csr_array
 from og_pointcloud.errors import SceneError
 from og_pointcloud.fitting.mask_table import mask_table
 from og_pointcloud.fitting.view_votes import view_votes
+from og_pointcloud.rendering import splatting
 from og_pointcloud.rendering.splatting import Cutoffs, Gaussians, render, view_weights
 from og_pointcloud.scene import Camera, Points, View
 
@@ -155,6 +156,28 @@ def assert_weights(actual: csr_array, expected: NDArray[np.float64]) -> None:
 
 def image_weights(gaussians: Gaussians, view: Camera, near: float = NEAR) -> NDArray[np.float32]:
     return view_weights(gaussians, view, patches(view), MASKS, near).rows.toarray()
+
+
+@pytest.mark.parametrize("off_axis", [0.0, 2.5, -40.0])
+def test_splats_that_are_passed_over_would_show_in_no_pixel(off_axis: float):
+    """Opaque splats of every size about the borders of an image: what is projected, and what that keeps."""
+    random = np.random.default_rng(0)
+    view, n = camera(cx=25 + 10 * off_axis), 20_000
+    scale = 10 ** random.uniform(-3, 0.3, (n, 3))
+    depth = random.uniform(0.1, 6, n)
+    pixel = random.uniform(-4, 5, (n, 2)) * [view.width, view.height]
+    xyz = np.column_stack([(pixel - [view.cx, view.cy]) / [view.fx, view.fy] * depth[:, None], depth])
+    quaternions = random.normal(size=(n, 4))
+    quaternions *= 1.001 / np.linalg.norm(quaternions, axis=1, keepdims=True)
+    shapes = (*(part.astype(np.float32) for part in (xyz, scale, quaternions)), *np.ones((2, n), np.float32))
+    intrinsics = np.array([view.fx, view.fy, view.cx, view.cy])
+    seen_by = view.world_to_camera, intrinsics, (view.width, view.height), NEAR
+    splats, area = splatting._records(n), np.zeros(n)
+    shows = splatting._project(np.arange(n), shapes, seen_by, Cutoffs(), splats, area) != splatting._CULLED
+    looked_at = splatting._may_show(shapes[:2], seen_by, Cutoffs())
+    assert shows.sum() > 500
+    assert looked_at[shows].all()
+    assert looked_at.sum() < shows.sum() + 0.5 * (~shows).sum()
 
 
 def test_weights_equal_the_reference(hard_scene: tuple[Gaussians, Camera]) -> None:
