@@ -121,4 +121,5 @@ class KeptViews(Columns):
             np.repeat(np.arange(len(self.views), dtype=np.int32), counts),
             np.concatenate([view.pixels for view in self.views]),
             np.concatenate([view.features for view in self.views]),
+            names=tuple(map(str, range(len(self.views)))),
         )

@@ -29,7 +29,8 @@ def labelled(known: GrowingMap, rows: NDArray[np.int64], around: Neighbourhood, 
     table = known.kept.table(place, len(rows))
     no_mask, width = np.zeros((0, 0), np.int32), table.mask_features.shape[1]
     no_feature = np.zeros((0, width), np.float32)
-    views = tuple(View(str(k), view.camera, no_mask, no_feature) for k, view in enumerate(known.kept.views))
+    kept = zip(table.names, known.kept.views, strict=True)
+    views = tuple(View(name, view.camera, no_mask, no_feature) for name, view in kept)
     scene, geometry = Scene(points, views, known.space.name, "map"), settings.geometry
     drawn = isotropic(points, around.spacing, known.scale or geometry.middle_scale, geometry.opacity)
     thickness = sight_thickness(around.spacing, float(np.median(around.spacing)), geometry)
