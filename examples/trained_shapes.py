@@ -105,7 +105,8 @@ def shape_gradient(
     sparse = view.weights.indptr, view.weights.indices, view.weights.data
     shown, place = source.known, np.zeros(len(gaussians), np.int64)
     place[splats["gaussian"]] = np.arange(len(splats))
-    _add_gradient(sparse, view.pixels, camera.width, values, pull, splats[place[shown]], gaussians.opacity[shown], found)
+    splats, opacity = splats[place[shown]], gaussians.opacity[shown]
+    _add_gradient(sparse, view.pixels, camera.width, values, pull, splats, opacity, found)
     whole = np.zeros((2, len(gaussians)))
     whole[:, shown] = found
     return whole[0], whole[1]

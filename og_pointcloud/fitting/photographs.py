@@ -7,7 +7,7 @@ points in the others that they are not of it, and a panorama is one witness inst
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -34,7 +34,7 @@ class Photographs:
     @classmethod
     def of(cls, views: Sequence[View]) -> Photographs:
         """Those of views, in their order; a view that was not cut is a photograph."""
-        number: dict[Hashable, int] = {}
+        number: dict[tuple[str, bool], int] = {}
         of_view, masks = [], []
         for view in views:
             cut = view.cut_from
