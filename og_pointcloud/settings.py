@@ -68,9 +68,7 @@ class MembershipSettings:
     """A separate piece whose points show less than this share of what the main piece's do was seen through it."""
     own_vote: float = 3.0
     """Votes of a point's own state, where a sure neighbour of which its color says nothing has one."""
-    few_views: int = 3
-    """Points seen by fewer views than this are checked by depth: no other view could contradict a mask."""
-    gap_sizes: float = 2.0
+    gap_sizes: float = 0.5
     """A gap in depth wider than this many times the mask's own size parts object and background."""
     front_share: float = 0.2
     """The nearest run of depths with this share of a mask's weight is its object."""

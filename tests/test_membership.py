@@ -356,45 +356,50 @@ def at_depths(depth: Sequence[float]) -> Gaussians:
 LOOKING_ALONG_Z = np.array([[0.0, 0, 1, 0]])
 
 
-def front_of(
-    depth: Sequence[float], views: int = 1, seen_once: Sequence[int] = ()
-) -> tuple[NDArray[np.float32], NDArray[np.float32], float]:
-    """A mask of n pixels, so sqrt(n) / 10 wide at depth 1 with a focal length of 10 px, over points at these depths."""
+def front_of(depth: Sequence[float], views: int = 1) -> tuple[MaskTable, MaskTable, float]:
+    """A mask of n pixels, so sqrt(n) / 10 wide at depth 1 with a focal length of 10 px, over points at these depths:
+    the table before, after, and the share taken."""
     n = len(depth)
-    table = hand_table(n, [[(range(n), ONE)]] * views, [(), *[seen_once] * (views - 1)])
+    table = hand_table(n, [[(range(n), ONE)]] * views)
     rows, focal = LOOKING_ALONG_Z.repeat(views, axis=0), np.full(views, 10.0)
-    kept, share = without_see_through(table, at_depths(depth), rows, focal, SETTINGS)
-    np.testing.assert_array_equal(kept.weights.sum(axis=0) + kept.outside.sum(axis=0), table.weights.sum(axis=0))
-    return kept.weights.toarray()[0], kept.outside.toarray()[0], share
+    return table, *without_see_through(table, at_depths(depth), rows, focal, SETTINGS)
 
 
-def test_what_lies_far_behind_the_object_is_taken_from_its_mask() -> None:
-    """Nine pixels: 0.3 wide at depth 1, so a gap of 0.6 times the depth parts object and background."""
-    weights, outside, share = front_of([1, 1.1, 1.2, 1.3, 1.4, 1.2, 5, 5, 6])
-    np.testing.assert_array_equal(weights, [1] * 6 + [0] * 3)
-    np.testing.assert_array_equal(outside, [0] * 6 + [1] * 3)
+@pytest.mark.parametrize("views", [1, 20])
+def test_to_what_lies_far_behind_the_object_its_view_is_blind(views: int) -> None:
+    """Nine pixels: 0.3 wide at depth 1, so a gap of 0.15 times the depth parts object and background."""
+    before, after, share = front_of([1, 1.1, 1.2, 1.3, 1.4, 1.2, 5, 5, 6], views)
+    seen = [1] * 6 + [0] * 3
+    np.testing.assert_array_equal(after.weights.toarray(), [seen] * views)
+    np.testing.assert_array_equal(after.exposure.toarray() > 0, np.array([seen] * views, bool))
+    assert (after.outside != before.outside).nnz == 0
     assert share == pytest.approx(3 / 9)
 
 
+def test_a_view_keeps_as_much_of_its_word_as_is_not_behind_an_object() -> None:
+    """Of two points behind, a quarter lies outside of the mask, or in a second mask, whose object is at their depth."""
+    depth, first = [1.0, 1, 1, 1, 5, 5], [1, 1, 1, 1, 0.75, 0.75]
+    table = hand_table(6, [[(range(6), ONE), ([5], ONE)]])
+    weights = np.array([first, [0, 0, 0, 0, 0, 0.25]], np.float32)
+    outside = np.array([[0, 0, 0, 0, 0.25, 0]], np.float32)
+    table = replace(table, weights=csr_array(weights), outside=csr_array(outside))
+    after, share = without_see_through(table, at_depths(depth), LOOKING_ALONG_Z, np.array([10.0]), SETTINGS)
+    assert share == pytest.approx(1.5 / 5.75)
+    np.testing.assert_allclose(after.weights.toarray(), [[1, 1, 1, 1, 0, 0], weights[1]])
+    np.testing.assert_allclose(after.exposure.toarray(), [[1, 1, 1, 1, 0.25, 0.25]])
+    np.testing.assert_array_equal(after.outside.toarray(), outside)
+
+
 def test_a_few_specks_in_front_are_not_the_object() -> None:
-    weights, _, share = front_of([1, 5, 5, 5, 5, 5, 5, 5.5, 30])
-    np.testing.assert_array_equal(weights[1:], [1] * 7 + [0])
+    _, after, share = front_of([1, 5, 5, 5, 5, 5, 5, 5.5, 30])
+    np.testing.assert_array_equal(after.weights.toarray()[0, 1:], [1] * 7 + [0])
     assert 0 < share < 0.3
 
 
 def test_an_object_in_one_piece_is_kept_whole() -> None:
-    weights, _, share = front_of([1, 1.3, 1.6, 1.9, 2.2, 2.5])
-    assert (weights == 1).all()
+    before, after, share = front_of([1, 1.1, 1.2, 1.3, 1.4, 1.5])
+    assert after is before
     assert share == 0
-
-
-def test_with_enough_views_depth_is_not_asked() -> None:
-    depth = [1, 1.1, 1.2, 1.3, 1.4, 1.2, 5, 5, 6]
-    weights, _, share = front_of(depth, views=SETTINGS.few_views)
-    assert (weights == 1).all()
-    assert share == 0
-    weights, _, _ = front_of(depth, views=SETTINGS.few_views, seen_once=[0, 7])
-    np.testing.assert_array_equal(weights, [1] * 7 + [0, 1])
 
 
 @pytest.mark.parametrize(("votes", "stays"), [(0.6, True), (0.4, False)])

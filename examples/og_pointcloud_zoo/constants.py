@@ -51,12 +51,12 @@ MODULES: dict[str, tuple[str, tuple[str, ...]]] = {
     "rendering.sightings.RING_SHARE": ("table", ()),
 }
 """Numbers that stand in modules: whether they change the mask table, and the compiled functions that know them."""
-TABLE = ("geometry", "membership.few_views", "membership.gap_sizes", "membership.front_share")
+TABLE = ("geometry", "membership.gap_sizes", "membership.front_share")
 """What the mask table depends on."""
 SOURCES: dict[str, tuple[str, ...]] = {
     "the scene chooses": ("geometry.scales",),
     "derived": (
-        "grouping.container_share", "grouping.join_majority", "membership.few_views",
+        "grouping.container_share", "grouping.join_majority",
     ),
     "enough": (
         "geometry.held_out_views", "geometry.held_out_points", "grouping.graph_points",

@@ -93,9 +93,9 @@ def fit(
 class Prepared:
     """What the stages before labelling found; all modes but "paper", which draws points differently, share it.
 
-    scene: as it was given. surface: how it is drawn. table: what every mask shows of every Gaussian of the surface;
-    what shows behind an object through its mask is in ``outside`` (membership.without_see_through). Its views are
-    photographs: those cut from one are one, but in mode "paper".
+    scene: as it was given. surface: how it is drawn. table: what every mask shows of every Gaussian of the surface,
+    but for what lies behind an object whose mask it is in (membership.without_see_through). Its views are photographs:
+    those cut from one are one, but in mode "paper".
     """
 
     scene: Scene

@@ -23,7 +23,6 @@ the scene's other points, for of surfaces of several noisy layers little is seen
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -118,59 +117,68 @@ def without_see_through(
     focal: NDArray[np.float64],
     settings: MembershipSettings,
 ) -> tuple[MaskTable, float]:
-    """Take from each mask what lies behind its object, where too few views see a point to contradict the mask.
+    """Take from each mask what lies behind its object; to that the view is blind, it neither is in the mask nor not.
 
-    A mask shows a front surface. Sorted by depth, its points fall into runs parted by gaps wider than the object
-    looks; the nearest run with a fair part of the mask's weight is the object, what lies behind it was seen through
-    windows, past edges, or, with a LiDAR that looks over a camera's foreground, not seen by the camera at all.
+    A mask shows a front surface. Sorted by depth, its points fall into runs parted by gaps wider than a part of what
+    the object looks; the nearest run with a fair part of the mask's weight is the object, what lies behind it was seen
+    through windows, past edges, between the sparse points of the object, or, with a LiDAR that looks over a camera's
+    foreground, not seen by the camera at all. Other views do not always contradict such a mask: those of a camera that
+    goes straight ahead, or stands still, look past the same edges.
 
     depth_rows: (views, 4) float64, third row of each world-to-camera matrix. focal: (views,) pixels.
-    Returns the table with those weights moved to ``outside``, and their share of all weight.
+    Returns the table without those weights, and with as much less exposure; and their share of all weight.
     """
-    weights, exposure = table.weights, table.exposure
-    witnesses = np.zeros(exposure.shape[1], np.int32)
-    for view in range(exposure.shape[0]):
-        witnesses[exposure.indices[exposure.indptr[view] : exposure.indptr[view + 1]]] += 1
-    few = witnesses < settings.few_views
-    moved: dict[int, list[NDArray[np.intp]]] = {}
+    weights = table.weights
+    behind = np.zeros(weights.nnz, np.bool_)
     for mask, view in enumerate(table.mask_view.tolist()):
-        entries = np.arange(weights.indptr[mask], weights.indptr[mask + 1])
-        points = weights.indices[entries]
-        if few[points].any():
-            depth = gaussians.xyz[points] @ depth_rows[view, :3] + depth_rows[view, 3]
-            size = np.sqrt(table.mask_pixels[mask]) / focal[view]
-            behind = _behind_front(depth, weights.data[entries], settings.gap_sizes * size, settings.front_share)
-            moved.setdefault(view, []).append(entries[behind & few[points]])
-    by_view = {view: np.concatenate(entries) for view, entries in moved.items()}
-    if not any(len(entries) for entries in by_view.values()):
+        entries = slice(weights.indptr[mask], weights.indptr[mask + 1])
+        depth = gaussians.xyz[weights.indices[entries]] @ depth_rows[view, :3] + depth_rows[view, 3]
+        gap_share = settings.gap_sizes * np.sqrt(table.mask_pixels[mask]) / focal[view]
+        behind[entries] = _behind_front(depth, weights.data[entries], gap_share, settings.front_share)
+    if not behind.any():
         return table, 0.0
-    taken = sum(float(weights.data[entries].sum(dtype=np.float64)) for entries in by_view.values())
-    share = taken / float(weights.data.sum(dtype=np.float64))
-    outside = _with_entries(table.outside, weights, by_view)
-    return replace(table, weights=_without_entries(weights, by_view.values()), outside=outside), share
+    share = float(weights.data[behind].sum(dtype=np.float64)) / float(weights.data.sum(dtype=np.float64))
+    left = _exposure_left(
+        np.searchsorted(table.mask_view, np.arange(table.exposure.shape[0] + 1)),
+        *((matrix.indptr, matrix.indices, matrix.data) for matrix in (weights, table.outside, table.exposure)),
+        behind,
+        weights.shape[1],
+    )
+    exposure = _scaled(table.exposure, left)
+    return replace(table, weights=_scaled(weights, ~behind), exposure=exposure), share
 
 
-def _without_entries(matrix: csr_array, dropped: Iterable[NDArray[np.intp]]) -> csr_array:
-    """The matrix without some of its entries, given by their places."""
-    kept = np.ones(matrix.nnz, np.bool_)
-    for entries in dropped:
-        kept[entries] = False
-    rows = SparseRows(int(np.count_nonzero(kept)), matrix.shape[1], in_file(matrix.data))
+@njit(cache=True)
+def _exposure_left(first_mask, weights, outside, exposure, behind, n):  # noqa: ANN001, ANN202
+    """(entries of exposure,) float32: the part of what a view shows of a point that is not behind its masks' objects;
+    0 exactly where all of it is."""
+    weight_start, weight_index, weight = weights
+    outside_start, outside_index, outside_weight = outside
+    start, index, _ = exposure
+    shown, hidden = np.zeros(n), np.zeros(n)
+    left = np.empty(len(index), np.float32)
+    for view in range(len(first_mask) - 1):
+        for e in range(weight_start[first_mask[view]], weight_start[first_mask[view + 1]]):
+            shown[weight_index[e]] += weight[e]
+            if behind[e]:
+                hidden[weight_index[e]] += weight[e]
+        for e in range(outside_start[view], outside_start[view + 1]):
+            shown[outside_index[e]] += outside_weight[e]
+        # All that a view shows it exposes: the sums are zero again for the next view.
+        for e in range(start[view], start[view + 1]):
+            g = index[e]
+            left[e] = 1 - hidden[g] / shown[g] if hidden[g] > 0 else 1
+            shown[g], hidden[g] = 0.0, 0.0
+    return left
+
+
+def _scaled(matrix: csr_array, factor: NDArray[np.floating] | NDArray[np.bool_]) -> csr_array:
+    """The matrix with each entry times its factor, without those that are 0 then."""
+    rows = SparseRows(int(np.count_nonzero(factor)), matrix.shape[1], in_file(matrix.data))
     for begin, end in pairwise(matrix.indptr.tolist()):
-        chosen = kept[begin:end]
-        rows.append(np.count_nonzero(chosen), matrix.indices[begin:end][chosen], matrix.data[begin:end][chosen])
-    return rows.matrix()
-
-
-def _with_entries(matrix: csr_array, source: csr_array, added: Mapping[int, NDArray[np.intp]]) -> csr_array:
-    """The matrix with entries of another added to its rows: row -> their places in the other."""
-    rows = SparseRows(matrix.nnz + sum(map(len, added.values())), matrix.shape[1], in_file(matrix.data))
-    for row in range(matrix.shape[0]):
-        entries = matrix[[row]]
-        if row in added:
-            data, indices = source.data[added[row]], source.indices[added[row]]
-            entries = csr_array(entries + csr_array((data, indices, [0, len(data)]), shape=entries.shape))
-        rows.append(entries.nnz, entries.indices, entries.data)
+        kept = factor[begin:end] > 0
+        data = matrix.data[begin:end][kept] * factor[begin:end][kept]
+        rows.append(np.count_nonzero(kept), matrix.indices[begin:end][kept], data)
     return rows.matrix()
 
 

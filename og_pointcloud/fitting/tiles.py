@@ -81,8 +81,7 @@ Result = TypeVar("Result")
 Rows = NDArray[np.integer]
 Entries = NDArray[np.void]
 ENTRY = np.dtype([("point", "<i4"), ("row", "<i4"), ("value", "<f4")])
-"""What a view with M masks shows of a point. Row below M: weight in that mask. M: weight in none. M + 1: exposure.
-M + 2 + mask: weight in that mask, but behind its object, which is believed where enough views see the point."""
+"""What a view with M masks shows of a point. Row below M: weight in that mask. M: weight in none. M + 1: exposure."""
 
 
 def needs_tiles(scene: Scene, settings: FitSettings) -> bool:
@@ -218,38 +217,28 @@ class _Shown:
     mask_track: NDArray[np.int64] | None
     photographs: Photographs
 
-    def table(self, cloud: TiledCloud, rows: NDArray[np.integer], few_views: int) -> MaskTable:
-        """The mask table of some points, given in ascending order: of photographs, not of the views cut from them.
-
-        Weight behind a mask's object counts as outside the mask where fewer views see the point than could contradict
-        the mask (membership.without_see_through).
-        """
+    def table(self, cloud: TiledCloud, rows: NDArray[np.integer]) -> MaskTable:
+        """The mask table of some points, given in ascending order: of photographs, not of the views cut from them."""
         place = np.full(len(cloud.points), -1, np.int32)
         place[rows] = np.arange(len(rows), dtype=np.int32)
         tiles = np.flatnonzero(np.diff(np.searchsorted(rows, cloud.tiles.start)))
         views, masks = len(self.keys), np.bincount(self.mask_view, minlength=len(self.keys))
-        witnesses = np.zeros(len(rows), np.int32)
-        parts = []
+        stacks = []
         for view in range(views):
             entries = cloud.work.arrays("view", self.keys[view], vanished)[0]
             pieces = [entries[self.first[view, tile] : self.first[view, tile + 1]] for tile in tiles]
             part = np.concatenate([piece[place[piece["point"]] >= 0] for piece in pieces])
             part["point"] = place[part["point"]]
-            witnesses[part["point"][part["row"] == masks[view] + 1]] += 1
-            parts.append(part)
-        seldom = witnesses < few_views
-        stacks = [_stacked(part, count, seldom) for part, count in zip(parts, masks.tolist(), strict=True)]
+            stacks.append(_stacked(part, int(masks[view]), len(rows)))
         weights, outside, exposure = (csr_array(vstack(blocks, format="csr")) for blocks in zip(*stacks, strict=True))
         no_pixels = np.zeros(len(self.mask_view), np.int32)  # asked only where what is behind an object is found
         masks_of_views = self.mask_view, no_pixels, self.mask_features, self.mask_track
         return self.photographs.joined(MaskTable(weights, outside, exposure, *masks_of_views))
 
 
-def _stacked(entries: Entries, masks: int, seldom: NDArray[np.bool_]) -> tuple[csr_array, csr_array, csr_array]:
+def _stacked(entries: Entries, masks: int, points: int) -> tuple[csr_array, csr_array, csr_array]:
     """Weights (masks, n), outside (1, n) and exposure (1, n) of one view."""
-    row, point = entries["row"], entries["point"]
-    row = np.where(row > masks + 1, np.where(seldom[point], masks, row - masks - 2), row)
-    matrix = csr_array((entries["value"], (row, point)), shape=(masks + 2, len(seldom)))
+    matrix = csr_array((entries["value"], (entries["row"], entries["point"])), shape=(masks + 2, points))
     return matrix[:masks], matrix[masks : masks + 1], matrix[masks + 1 :]
 
 
@@ -312,14 +301,11 @@ def _entries(
     thickness = surface_thickness(splats, apart, drawing.typical, settings.geometry, by_sight=by_sight)
     table = mask_table(splats, [view], drawing.near, thickness, by_sight=by_sight)
     camera = view.camera
-    # In a table of one view each point has too few of them to contradict a mask: all that is behind is found.
     front, _ = without_see_through(
         table, splats, camera.world_to_camera[2:3], np.sqrt([camera.fx * camera.fy]), settings.membership
     )
-    behind = csr_array(table.weights - front.weights)
-    behind.eliminate_zeros()
     masks = view.mask_count
-    blocks = [(front.weights, 0), (table.outside, masks), (table.exposure, masks + 1), (behind, masks + 2)]
+    blocks = [(front.weights, 0), (front.outside, masks), (front.exposure, masks + 1)]
     entries = np.empty(sum(block.nnz for block, _ in blocks), ENTRY)
     end = 0
     for block, first_row in blocks:
@@ -383,7 +369,7 @@ def _groups(cloud: TiledCloud, shown: _Shown, settings: FitSettings, journal: Jo
     """Masks grouped by a sample of all points."""
     count = max(settings.grouping.graph_points, len(cloud.points) // SAMPLE_STEP)
     sample = sample_of_points(cloud.points.xyz, count)
-    table = shown.table(cloud, sample, settings.membership.few_views)
+    table = shown.table(cloud, sample)
     votes = view_votes(table)
     groups = group_masks(table, votes, settings.grouping)
     if groups.spanning.any():
@@ -418,7 +404,7 @@ def _decide(
     tile: int,
 ) -> _Decided:
     """Decide the state of a tile's points."""
-    table = shown.table(cloud, cloud.members[tile], settings.membership.few_views)
+    table = shown.table(cloud, cloud.members[tile])
     around = cloud.neighbours(tile, settings.geometry)
     # Which groups are noise was decided for all tiles.
     membership = replace(settings.membership, rate_share=0.0)
