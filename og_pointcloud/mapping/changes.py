@@ -56,7 +56,7 @@ OTHER_FRAME = 0.5
 
 @dataclass(frozen=True)
 class Moved:
-    """id: in the earlier cloud. before, after: (3,) float64, where its points were and are on average, world
+    """id: in the earlier cloud. before, after: (3,) float64, the middle of its points then and now, world
     coordinates. now: its id in the later cloud.
 
     >>> og.Moved(3, np.zeros(3), np.array([1, 0, 2]), 5).to_dict()

@@ -125,8 +125,8 @@ class GrowingMap:
         self.kept.born[rows] = self.sequence
 
     def place_of(self, rows: NDArray[np.integer]) -> NDArray[np.float64]:
-        """(3,) mean of points, world coordinates."""
-        return self.points.xyz[rows].astype(np.float64).mean(axis=0) + self.origin
+        """(3,) middle of points, world coordinates: the median, as votes give a thing some points far off it."""
+        return np.median(self.points.xyz[rows].astype(np.float64), axis=0) + self.origin
 
     def correct(self, poses: Mapping[float, ArrayLike]) -> None:
         """Move what the frames of these stamps brought: stamp -> world_to_camera, from world coordinates."""

@@ -41,7 +41,7 @@ MOST_ROWS = 1000
 @dataclass(frozen=True)
 class Look:
     """How a thing looked, and where, so that it is known when it comes back. descriptors: (r, D) float32 unit rows,
-    r = 0 where no mask gave a feature. spread: the squared tangent that they are off by. place: (3,) mean of its
+    r = 0 where no mask gave a feature. spread: the squared tangent that they are off by. place: (3,) middle of its
     points, world coordinates. color: (3,) median, or None. size: (3,) along the axes; length: of the longest side,
     without outliers."""
 

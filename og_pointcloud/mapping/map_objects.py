@@ -16,7 +16,7 @@ from og_pointcloud.mapping.tracks import NO_TRACK
 
 @dataclass(frozen=True)
 class MapObject:
-    """An object as it is known now. place: (3,) mean of its points, world coordinates; size: (3,) along the axes.
+    """An object as it is known now. place: (3,) median of its points, world coordinates; size: (3,) along the axes.
     state: "present"; "moved", present where it was not at first; "unseen", of an earlier map, where no frame has looked
     since; or "gone", then where it was last. since: the stamp from which on most of its points have been seen there,
     -inf for those of an earlier map, inf for what left; last_seen: the stamp of the last frame that showed it."""
