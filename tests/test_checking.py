@@ -22,7 +22,7 @@ from og_pointcloud.checking.check import (
     check_words,
     warn_of_doubts,
 )
-from og_pointcloud.checking.masks import entropies
+from og_pointcloud.checking.masks import MaskMaps, entropies
 from og_pointcloud.checking.photographs import Photographs
 from og_pointcloud.checking.sample import Comparison, seen
 from og_pointcloud.cli import main
@@ -105,6 +105,31 @@ def test_a_drawing_as_like_its_photograph_as_photographs_of_the_same_is_right(ow
     found = Comparison(0.62, own, 0.75, 0.1, 16, "correlation")
     monkeypatch.setattr(Photographs, "fit", lambda self, cameras: found)
     assert verdicts(check_poses(tiled_room(**SMALL)))["poses"] == verdict
+
+
+@pytest.mark.parametrize(
+    ("share", "error", "verdict"),
+    [(0.7, 0.035, "unchecked"), (0.7, 0.01, "doubt"), (0.5, 0.035, "doubt"), (0.8, 0.01, "unchecked")],
+)
+def test_masks_too_ragged_to_tell_right_ones_from_wrong_ones_are_unchecked(share, error, verdict, monkeypatch):
+    """The first is what a right walk gives, whose masks miss the floor in one view and not in the next."""
+    found = Comparison(share, 0.23, 0.16, 0.07, 67, "information", error)
+    monkeypatch.setattr(MaskMaps, "fit", lambda self, cameras: found)
+    scene = tiled_room(**SMALL)
+    assert verdicts(check_capture(scene))["masks"] == verdict
+    assert verdicts(check_capture(without_colors(scene)))["poses"] == verdict
+
+
+def test_the_error_of_a_gap_counts_groups_and_not_comparisons():
+    random = np.random.default_rng(0)
+    groups = np.repeat(np.arange(400), 5)
+    own = random.normal(0.3, 0.1, 400)[groups]  # a group's comparisons are right or wrong together
+    found = Comparison.of([(value, 0.1) for value in own], "", groups=groups.tolist())
+    assert found.error == pytest.approx(0.1 / np.sqrt(400), rel=0.1)
+    order = random.permutation(len(own))
+    shuffled = Comparison.of([(value, 0.1) for value in own[order]], "", groups=(7 * groups[order]).tolist())
+    assert shuffled.error == pytest.approx(found.error)
+    assert Comparison.of([(0.5, 0.1), (0.6, 0.1)], "", groups=[3, 3]).error == np.inf
 
 
 @pytest.mark.skipif(not TABLE.exists(), reason="the capture ycb_0050 is not here")

@@ -32,6 +32,10 @@ NEARLY_ALWAYS = 0.95
 MASKS_AGREE, MASKS_VOUCH = (0.75, 0.12), (0.85, 0.15)
 """Masks of views agree where they see the same, better than other masks would; doubted where share and gap are missed;
 and where they vouch for poses that photographs doubt."""
+MASKS_CHANCE, MASKS_ERRORS = 0.6, 2.0
+"""Right masks that miss walls and floors in one view and not in the next agree little more than wrong ones do, and a
+few pairs of views cannot tell which they are: not doubted where the share is above this one, and the gap less than so
+many of its standard errors below its bound."""
 LEAST_FEATURE_SHARE, FEWEST_FEATURES = 0.6, 60
 """Features of masks that show the same are the more alike ones in so many of so many comparisons at least; in half of
 them by chance, and in two thirds where a detector names most things alike."""
@@ -182,11 +186,13 @@ def _poses_by_masks(sample: Sample, maps: MaskMaps | None) -> Check:
         says = f"the cameras of {blind} of {len(sample.cameras)} views see next to nothing of the cloud"
     elif agreement.compared < FEWEST:
         return Check("poses", "unchecked", "no photographs with coloured points; masks are missing or share too little")
-    elif _verdict(agreement) != "doubt":
+    elif _verdict(agreement) == "ok":
         return _agreed("poses", agreement)
     else:
         says = f"masks of different views agree no better than others' masks ({agreement})"
     repairs = (best_conversion(maps) or best_mask_conversion(maps)) if maps else ()
+    if blind <= MOST_BLIND * len(sample.cameras) and _verdict(agreement) == "unchecked" and not repairs:
+        return _agreed("poses", agreement)
     return _doubt("poses", f"{says}: {SUSPECTS}, or masks are of other images", repairs, "masks agree")
 
 
@@ -195,14 +201,18 @@ def _agreement(maps: MaskMaps | None) -> Comparison:
 
 
 def _agreed(name: str, found: Comparison) -> Check:
-    return Check(name, _verdict(found), f"masks of different views agree: {found}")
+    verdict = _verdict(found)
+    agree = "agree" if verdict == "ok" else "agree too little to tell that they are right, and too much for wrong ones"
+    return Check(name, verdict, f"masks of different views {agree}: {found}")
 
 
 def _verdict(found: Comparison) -> Verdict:
-    """By masks: "unchecked" between the two bounds."""
+    """By masks: "unchecked" between the two bounds, and where chance alone may keep the gap from its own."""
     if found.reaches(MASKS_AGREE):
         return "ok"
-    return "unchecked" if found.share >= MASKS_AGREE[0] or found.gap >= MASKS_AGREE[1] else "doubt"
+    least_share, least_gap = MASKS_AGREE
+    may_be = found.share >= MASKS_CHANCE and found.gap + MASKS_ERRORS * found.error >= least_gap
+    return "unchecked" if may_be or found.share >= least_share or found.gap >= least_gap else "doubt"
 
 
 def _alignment(photographs: Photographs | None) -> Check:

@@ -57,14 +57,15 @@ class MaskMaps:
 
     def fit(self, cameras: Sequence[Camera]) -> Comparison:
         """How much more masks say of each other where these cameras see the same points than elsewhere."""
-        found = []
+        found, groups = [], []
         for i, j, mine, theirs in self._pairs(cameras):
             a = _at(self.ids[i], mine)
             own = _information(a, _at(self.ids[j], theirs))
             if own is not None:
                 others = (_information(a, _at(rival, theirs)) for of, rival in self._rivals[j] if of != i)
                 found += [(own, other) for other in others if other is not None]
-        return Comparison.of(found, "information")
+                groups += [min(i, j) * len(cameras) + max(i, j)] * (len(found) - len(groups))  # either order: one `own`
+        return Comparison.of(found, "information", groups=groups)
 
     def features_alike(self, cameras: Sequence[Camera], shift: int = 0) -> Comparison:
         """How much more alike features are of masks that show the same points. shift: added to every mask's row."""

@@ -23,7 +23,8 @@ BEHIND = 1.1
 @dataclass(frozen=True)
 class Comparison:
     """What is right against rivals. share: of comparisons in which it wins; ties count half. own, other: means of
-    both. gap: how far it stands out. compared: number of comparisons. unit: what is compared, in a word."""
+    both. gap: how far it stands out. compared: number of comparisons. unit: what is compared, in a word. error:
+    standard error of the gap, 0 where nobody asked."""
 
     share: float
     own: float
@@ -31,16 +32,21 @@ class Comparison:
     gap: float
     compared: int
     unit: str
+    error: float = 0.0
 
     @classmethod
-    def of(cls, pairs: Sequence[tuple[float, float]], unit: str, *, of_rest: bool = False) -> Comparison:
-        """Of pairs of what is right and a rival. of_rest: the gap is a share of what the rivals leave up to 1."""
+    def of(
+        cls, pairs: Sequence[tuple[float, float]], unit: str, *, of_rest: bool = False, groups: Sequence[int] = ()
+    ) -> Comparison:
+        """Of pairs of what is right and a rival. of_rest: the gap is a share of what the rivals leave up to 1. groups:
+        a number a pair, the same for those that are right or wrong together, from which the gap's error is found."""
         if not pairs:
             return cls(0.0, 0.0, 0.0, 0.0, 0, unit)
         own, other = np.array(pairs).T
         won = (own > other + 1e-6) + 0.5 * (np.abs(own - other) <= 1e-6)
         gap = float(own.mean() - other.mean()) / (max(1 - float(other.mean()), 1e-6) if of_rest else 1)
-        return cls(float(won.mean()), float(own.mean()), float(other.mean()), gap, len(pairs), unit)
+        error = _clustered_error(own - other, groups) if len(groups) else 0.0
+        return cls(float(won.mean()), float(own.mean()), float(other.mean()), gap, len(pairs), unit, error)
 
     def reaches(self, bounds: tuple[float, float]) -> bool:
         """Whether share and gap are so large."""
@@ -48,6 +54,15 @@ class Comparison:
 
     def __str__(self) -> str:
         return f"{self.share:.0%} of {self.compared} comparisons, {self.unit} {self.own:.2f} against {self.other:.2f}"
+
+
+def _clustered_error(values: NDArray[np.float64], groups: Sequence[int]) -> float:
+    """Standard error of the mean of values (n,), of which those of one group are not independent (Liang and Zeger 1986:
+    residuals are summed in each group, then squared); infinite for one group."""
+    _, group = np.unique(groups, return_inverse=True)
+    sums = np.bincount(group, weights=values - values.mean())
+    count = len(sums)
+    return float(np.sqrt((sums**2).sum() * count / (count - 1))) / len(values) if count > 1 else float("inf")
 
 
 @dataclass(frozen=True)
