@@ -67,9 +67,12 @@ class Look:
         size = np.ptp(xyz.astype(np.float64), axis=0)
         return cls(descriptors, spread, place, color, size, float(sides.max()))
 
-    def has_color_of(self, other: Look, most: float = SAME_COLOR) -> bool:
-        """Whether the two may be parts of one thing by their colours; True where these are not known."""
-        return self.color is None or other.color is None or bool(np.abs(self.color - other.color).max() <= most)
+    def has_color_of(self, other: Look, most: float = SAME_COLOR, shift: NDArray[np.float64] | float = 0.0) -> bool:
+        """Whether the two may be of one thing by their colours; True where these are not known. shift: by how much the
+        other's colors differ all over."""
+        if self.color is None or other.color is None:
+            return True
+        return bool(np.abs(other.color - self.color - shift).max() <= most)
 
 
 @dataclass(frozen=True)
@@ -86,12 +89,9 @@ class Scale:
     def likeness(self, one: Look, later: Look) -> float:
         """How far the two are one thing: about 1 for one, 0 for two different ones, -inf if forbidden."""
         longer, shorter = max(one.length, later.length), min(one.length, later.length)
-        if longer > OTHER_SIZE * shorter or self._other_color(one.color, later.color):
+        if longer > OTHER_SIZE * shorter or not one.has_color_of(later, self.color, self.shift):
             return -np.inf
         return self.cosine(one, later)
-
-    def _other_color(self, one: NDArray[np.float64] | None, later: NDArray[np.float64] | None) -> bool:
-        return one is not None and later is not None and bool(np.abs(later - one - self.shift).max() > self.color)
 
     def cosine(self, one: Look, later: Look) -> float:
         """The same by their descriptors alone; -inf where one has none."""
