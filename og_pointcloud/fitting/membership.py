@@ -117,13 +117,15 @@ def without_see_through(
     focal: NDArray[np.float64],
     settings: MembershipSettings,
 ) -> tuple[MaskTable, float]:
-    """Take from each mask what lies behind its object; to that the view is blind, it neither is in the mask nor not.
+    """Take from each mask what does not lie at its object's depth, mostly behind it; to that the view is blind, it
+    neither is in the mask nor not.
 
     A mask shows a front surface. Sorted by depth, its points fall into runs parted by gaps wider than a part of what
     the object looks; the nearest run with a fair part of the mask's weight is the object, what lies behind it was seen
     through windows, past edges, between the sparse points of the object, or, with a LiDAR that looks over a camera's
     foreground, not seen by the camera at all. Other views do not always contradict such a mask: those of a camera that
-    goes straight ahead, or stands still, look past the same edges.
+    goes straight ahead, or stands still, look past the same edges. A smaller run before the object is the edge of a
+    thing that stands there.
 
     depth_rows: (views, 4) float64, third row of each world-to-camera matrix. focal: (views,) pixels.
     Returns the table without those weights, and with as much less exposure; and their share of all weight.
@@ -185,7 +187,7 @@ def _scaled(matrix: csr_array, factor: NDArray[np.floating] | NDArray[np.bool_])
 def _behind_front(
     depth: NDArray[np.float64], weight: NDArray[np.float32], gap_share: float, front_share: float
 ) -> NDArray[np.bool_]:
-    """Entries beyond the first run of depths that holds ``front_share`` of the weight.
+    """Entries outside the first run of depths that holds ``front_share`` of the weight: behind it, or crumbs before it.
 
     ``gap_share`` times the median depth is the gap that parts runs: the size of the mask at that depth.
     """
