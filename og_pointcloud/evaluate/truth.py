@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from og_pointcloud.errors import SceneError
 from og_pointcloud.evaluate.metrics import Score, score_labels
-from og_pointcloud.formats.npy import arrays_from_npz
+from og_pointcloud.formats.npy import read_npz
 
 GT_NAME = "gt.npz"
 MAX_UNPACKED_BYTES = 1 << 31
@@ -66,15 +66,7 @@ def read_truth(folder: str | os.PathLike[str]) -> Truth:
             f"{path} is not a file; a score needs it: 'cls' (n,) a class per point, -1 none, and 'names'. Without one, "
             "take a made room: og-pointcloud demo"
         )
-    try:
-        entries, held = arrays_from_npz(path, ("cls", "names", *OF_POINTS), MAX_UNPACKED_BYTES)
-    except ValueError as error:
-        raise SceneError(str(error)) from None
-    missing = [name for name in ("cls", "names") if name not in entries]
-    if missing:
-        raise SceneError(
-            f"{path} lacks '{missing[0]}' (it has {', '.join(held) or 'nothing':.120}); expected 'cls', 'names'"
-        )
+    entries = read_npz(path, ("cls", "names"), OF_POINTS, MAX_UNPACKED_BYTES, "'cls' (n,) and 'names' (L,)")
     cls, names = entries["cls"], entries["names"]
     if cls.ndim != 1 or cls.dtype.kind not in "iu" or names.dtype.kind != "U" or cls.max(initial=-1) >= len(names):
         raise SceneError(

@@ -15,8 +15,6 @@ the authors' own evaluation gives it class 0.
 from __future__ import annotations
 
 import os
-import zipfile
-import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -28,7 +26,7 @@ from og_pointcloud.cloud import UNKNOWN_SPACE, InstanceTable, LabelledCloud
 from og_pointcloud.errors import MissingExtraError, SceneError
 from og_pointcloud.formats.gaussian_ply import latest_iteration
 from og_pointcloud.formats.langsplat import LANGSPLAT_SPACE, LANGSPLAT_WIDTH
-from og_pointcloud.formats.npy import array_from_zip
+from og_pointcloud.formats.npy import read_npz
 from og_pointcloud.formats.points import read_points
 from og_pointcloud.formats.tables import naming
 from og_pointcloud.journal import LeftOut, left_out_entry
@@ -132,7 +130,7 @@ def _find_result(result: Path, cluster_lang: Path | None) -> tuple[Path, Path]:
 
 def _read_leaves(file: Path, gaussians: int) -> _Leaves:
     """The four arrays, each of plain numbers in its shape; SceneError for anything else."""
-    arrays = _arrays(file)
+    arrays = read_npz(file, ARRAYS, (), MAX_UNPACKED_BYTES, f"{', '.join(ARRAYS)}: name the file written last")
     features, score, views, of_gaussian = (arrays[name] for name in ARRAYS)
     if features.ndim != 2 or features.dtype.kind != "f":
         raise SceneError(f"leaf_feat is {features.dtype} {features.shape}; expected floats of shape (leaves, width)")
@@ -160,27 +158,6 @@ def _read_leaves(file: Path, gaussians: int) -> _Leaves:
         views.astype(np.int32).reshape(-1),
         of_gaussian.astype(np.int64).reshape(-1),
     )
-
-
-def _arrays(file: Path) -> dict[str, NDArray[Any]]:
-    """The four arrays by name. None is unpacked before its size is checked, none is unpickled."""
-    try:
-        with zipfile.ZipFile(file) as archive:
-            # Saved under names that end in .npy themselves, so that numpy's own ending may follow once more.
-            entries = {info.filename.split(".npy")[0]: info for info in archive.infolist()}
-            missing = [name for name in ARRAYS if name not in entries]
-            size = sum(entries[name].file_size for name in ARRAYS if name in entries)
-            if missing:
-                raise SceneError(f"no '{missing[0]}'; expected {', '.join(ARRAYS)}: name the file written last")
-            if size > MAX_UNPACKED_BYTES:
-                raise SceneError(f"its arrays unpack to {size} bytes; expected at most {MAX_UNPACKED_BYTES}")
-            return {name: array_from_zip(archive, entries[name]) for name in ARRAYS}
-    except SceneError:
-        raise
-    except (zipfile.BadZipFile, zlib.error, ValueError, EOFError, RuntimeError) as error:
-        raise SceneError(
-            f"cannot be read as an .npz of plain arrays ({error!s:.120}): associate again or copy it anew"
-        ) from None
 
 
 def _instances(leaves: _Leaves, used: NDArray[np.int64], ids: NDArray[np.intp]) -> InstanceTable:

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from og_pointcloud.cloud import UNKNOWN_SPACE
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.images import PngHeader, decoded, palette_indices, png_header, require_cv2
-from og_pointcloud.formats.npy import arrays_from_npz
+from og_pointcloud.formats.npy import read_npz
 from og_pointcloud.scene import CutMasks
 
 MASKS_FOLDER = "masks"
@@ -103,16 +103,8 @@ def _read_features(
 ) -> tuple[dict[str, NDArray[np.float32]], dict[str, NDArray[Any]], str]:
     """Features and tracks by view name, and the name of the features' space."""
     of_tracks = {name + TRACKS: name for name in names}
-    try:
-        arrays, held = arrays_from_npz(file, [*names, *of_tracks, "feature_space"], MAX_FEATURE_BYTES)
-    except ValueError as error:
-        raise SceneError(str(error)) from None
-    missing = [name for name in names if name not in arrays]
-    if missing:
-        raise SceneError(
-            f"{file} has no features for {len(missing)} of {len(names)} views, e.g. '{missing[0]}' (it has "
-            f"{', '.join(map(repr, held[:3])):.120}, ...); expected an array (masks, D) under each image's stem"
-        )
+    expected = "an array (masks, D) under each image's stem"
+    arrays = read_npz(file, names, [*of_tracks, "feature_space"], MAX_FEATURE_BYTES, expected)
     features = {name: _as_features(arrays[name], f"{file}, '{name}'") for name in names}
     tracks = {name: arrays[key] for key, name in of_tracks.items() if key in arrays}
     return features, tracks, str(arrays.get("feature_space", UNKNOWN_SPACE))

@@ -7,14 +7,14 @@ import mmap
 import tokenize
 import zipfile
 import zlib
-from collections.abc import Iterable
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud.errors import SceneError
+from og_pointcloud.errors import OgPointcloudError, SceneError
 
 LONGEST_HEADER = 1 << 17
 """Bytes in which a header ends; numpy reads none of more than 10,000 characters."""
@@ -61,29 +61,41 @@ def mapped_array(file: Path) -> NDArray[Any]:
         ) from None
 
 
-def arrays_from_npz(file: Path, names: Iterable[str], most_bytes: int) -> tuple[dict[str, NDArray[Any]], list[str]]:
-    """Those of these arrays that an .npz has, by name, and the names of all its arrays.
+def read_npz(
+    file: Path,
+    needed: Sequence[str],
+    optional: Sequence[str],
+    most_bytes: int,
+    expected: str,
+    kind: type[OgPointcloudError] = SceneError,
+) -> dict[str, NDArray[Any]]:
+    """The arrays of an .npz that are needed, and the optional ones that it has, by name; a name may end in .npy itself.
 
-    ValueError where it is none, unpacks to more than ``most_bytes``, is packed as numpy packs none, or claims to end
-    beyond the file. Nothing is unpickled, and nothing is unpacked before its size is checked.
+    An error of this kind, which begins with the file, where it is none, lacks what is ``expected``, unpacks to more
+    than ``most_bytes``, is packed as numpy packs none, or claims to end beyond the file. Nothing is unpickled, and
+    nothing is unpacked before its size is checked.
     """
     try:
         with zipfile.ZipFile(file) as archive:
-            infos = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
-            if (total := sum(info.file_size for info in infos.values())) > most_bytes:
+            held = {info.filename.removesuffix(".npy").removesuffix(".npy"): info for info in archive.infolist()}
+            if (total := sum(info.file_size for info in held.values())) > most_bytes:
                 raise ValueError(f"it unpacks to {total} bytes; expected at most {most_bytes}")
-            most_packed = max(PLENTY, MOST_RATIO * file.stat().st_size)
-            if total > most_packed:
+            if total > max(PLENTY, MOST_RATIO * file.stat().st_size):
                 raise ValueError(f"it unpacks to {total} bytes, {MOST_RATIO} times its own: it is made to fill memory")
-            return {name: array_from_zip(archive, infos[name]) for name in names if name in infos}, list(infos)
+            arrays = {name: _array_from_zip(archive, held[name]) for name in (*needed, *optional) if name in held}
     except (zipfile.BadZipFile, zlib.error, ValueError, OSError, EOFError, RuntimeError) as error:
-        raise ValueError(
-            f"{file} cannot be read as an .npz of plain arrays ({error!s:.120}): write it again with numpy.savez"
+        raise kind(
+            f"{file}: it cannot be read as an .npz of plain arrays ({error!s:.120}): write it again with numpy.savez"
         ) from None
+    if missing := [name for name in needed if name not in arrays]:
+        raise kind(
+            f"{file}: it lacks {len(missing)} of {len(needed)} arrays, '{missing[0]}' first (it has "
+            f"{', '.join(held) or 'nothing':.120}); expected {expected}"
+        )
+    return arrays
 
 
-def array_from_zip(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> NDArray[Any]:
-    """A member of an .npz; ValueError also where it is packed as numpy packs none, or claims to end beyond the file."""
+def _array_from_zip(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> NDArray[Any]:
     if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
         raise ValueError(f"a member is packed by method {info.compress_type}, which numpy does not use")
     if info.header_offset + info.compress_size > archive.start_dir:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from og_pointcloud.cloud import UNKNOWN_SPACE, Vocabulary
 from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError
-from og_pointcloud.formats.npy import arrays_from_npz
+from og_pointcloud.formats.npy import read_npz
 
 MAX_UNPACKED_BYTES = 1 << 30
 MAX_WORDS_BYTES = 1 << 24
@@ -41,16 +41,8 @@ def read_text_features(path: str | os.PathLike[str]) -> tuple[Vocabulary, str]:
     path = Path(path)
     if not path.is_file():
         raise FeatureSpaceError(f"{path} is not a file; expected an .npz with 'names', 'vectors' and 'feature_space'")
-    try:
-        entries, held = arrays_from_npz(path, ("names", "vectors", "feature_space"), MAX_UNPACKED_BYTES)
-    except ValueError as error:
-        raise FeatureSpaceError(str(error)) from None
-    missing = [name for name in ("names", "vectors") if name not in entries]
-    if missing:
-        raise FeatureSpaceError(
-            f"{path} lacks '{missing[0]}' (it has {', '.join(held) or 'nothing':.120}); expected 'names' (L,), "
-            "'vectors' (L, D) and 'feature_space': write it with numpy.savez"
-        )
+    layout = "'names' (L,), 'vectors' (L, D) and 'feature_space': write it with numpy.savez"
+    entries = read_npz(path, ("names", "vectors"), ("feature_space",), MAX_UNPACKED_BYTES, layout, FeatureSpaceError)
     names, vectors = entries["names"], entries["vectors"]
     if names.dtype.kind != "U" or names.ndim != 1:
         raise FeatureSpaceError(f"{path}: names are {names.dtype} {names.shape}; expected strings of shape (L,)")
