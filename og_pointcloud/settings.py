@@ -305,11 +305,9 @@ class ChoosingSettings:
     """Kinds of things that an instance may be, if fewer labels are asked: each label then has one share of so many."""
     synonym: float = 0.6
     """A bank word this close to a label (cosine, centred) means the same and does not speak against it: cup and mug."""
-    same_look: float = 0.95
-    """Descriptors this close (cosine) are of one look; CLIP images of different things have about 0.5."""
 
     def __post_init__(self) -> None:
-        for name in ("sharpness", "kinds", "synonym", "same_look"):
+        for name in ("sharpness", "kinds", "synonym"):
             value = getattr(self, name)
             if not value > 0:
                 raise OgPointcloudError(f"{name} is {value}; expected more than 0")

@@ -135,17 +135,38 @@ def test_an_irrelevant_label_barely_moves_the_others():
     np.testing.assert_allclose(more.table[:, :4], few.table, atol=0.02)
 
 
-def test_an_object_in_pieces_does_not_change_what_is_shared():
+def shared_by(made: Made, descriptors: np.ndarray) -> np.ndarray:
+    """What is taken off descriptors where the bank knows all texts but the last 60."""
+    directions = unit(made.texts[:-60] - made.texts[:-60].mean(axis=0))
+    return common_part(unit(descriptors), directions, ChoosingSettings().sharpness)
+
+
+def like_the_first(made: Made, count: int) -> np.ndarray:
+    """(count, WIDTH) descriptors of one kind, each with noise of its own: cosines of about 0.8."""
+    return unit(made.table.descriptors[0] + 0.5 * unit_rows(count, WIDTH, seed=9))
+
+
+def test_a_kind_counts_once_however_many_are_of_it():
     made = Made()
-    pieces = np.concatenate([made.table.descriptors, np.repeat(made.table.descriptors[:1], 5, axis=0)])
-    whole = common_part(made.table.descriptors, 0.95)
-    np.testing.assert_allclose(common_part(pieces, 0.95), whole, atol=1e-6)
+    whole = shared_by(made, made.table.descriptors)
     np.testing.assert_allclose(whole, 5 / 6 * made.table.descriptors.mean(axis=0), atol=1e-6)
+    pieces = np.concatenate([made.table.descriptors, np.repeat(made.table.descriptors[:1], 5, axis=0)])
+    np.testing.assert_allclose(shared_by(made, pieces), whole, atol=1e-6)
+    many = np.concatenate([like_the_first(made, 40), made.table.descriptors[1:]])
+    means = np.concatenate([like_the_first(made, 40).mean(axis=0, keepdims=True), made.table.descriptors[1:]])
+    np.testing.assert_allclose(shared_by(made, many), 5 / 6 * means.mean(axis=0), atol=1e-5)
 
 
-def test_one_look_alone_keeps_all_that_it_shows():
-    rows = unit_rows(1, WIDTH)
-    np.testing.assert_array_equal(common_part(np.repeat(rows, 4, axis=0), 0.95), np.zeros(WIDTH))
+def test_one_kind_alone_keeps_all_that_it_shows():
+    np.testing.assert_array_equal(shared_by(Made(), like_the_first(Made(), 4)), np.zeros(WIDTH))
+
+
+def test_what_no_word_fits_says_nothing_of_what_is_shared():
+    made = Made()
+    direction = made.texts[-1] - made.texts[:-60].mean(axis=0)  # of a word that the bank lacks
+    strange = unit(made.table.descriptors[:1] - made.texts[0] + 0.2 * direction)
+    whole = shared_by(made, made.table.descriptors)
+    np.testing.assert_array_equal(shared_by(made, np.concatenate([made.table.descriptors, strange])), whole)
 
 
 def test_a_synonym_in_the_bank_does_not_speak_against_a_label():
@@ -291,13 +312,6 @@ def test_choosing_needs_only_numpy():
     )
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert found.stdout.strip() == "[]"
-
-
-def test_descriptors_are_compared_in_parts(monkeypatch):
-    descriptors = np.concatenate([unit_rows(7, WIDTH), unit_rows(4, WIDTH), unit_rows(3, WIDTH)])  # some come again
-    whole = common_part(descriptors, 0.95)
-    monkeypatch.setattr("og_pointcloud.ask.choosing.ROWS_AT_ONCE", 3)
-    np.testing.assert_allclose(common_part(descriptors, 0.95), whole, atol=1e-7)
 
 
 def test_a_ranking_tells_saturated_probabilities_apart():

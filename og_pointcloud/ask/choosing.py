@@ -4,7 +4,7 @@ A cosine of an image with a text says little by itself. On real CLIP a fitting t
 texts have 0.74 among themselves and images 0.53: all images share one large direction, all texts another, and some
 words are close to every image. So a score is read against what it would be by chance, in three steps:
 
-1. Centre. What all descriptors of the scene share is taken off them, what all words share off the words.
+1. Centre. What all kinds of things in the scene share is taken off descriptors, what all words share off the words.
 2. Standardise. A bank of a few hundred everyday words (``WordBank``) shows how the words that do not fit score on this
    instance; a label's evidence is its distance from their mean, in their standard deviations.
 3. Weigh. An instance is one of the labels, or what another word of the bank says, or nothing that a word stands out
@@ -39,9 +39,6 @@ from og_pointcloud.cloud import (
     unit_rows,
 )  # fmt: skip
 from og_pointcloud.settings import ChoosingSettings
-
-ROWS_AT_ONCE = 2048
-"""Descriptors compared with all others at once."""
 
 
 class Reason(IntEnum):
@@ -188,9 +185,9 @@ class Chooser:
         if bank is None or len(self._descriptors) == 0:
             return
         self._require_width(bank.vectors, "word bank's vectors")
-        self._common = common_part(self._descriptors, self.settings.same_look)
-        self._centred = self._descriptors - self._common
         self._bank_directions = unit_rows(bank.vectors - bank.mean)
+        self._common = common_part(self._descriptors, self._bank_directions, self.settings.sharpness)
+        self._centred = self._descriptors - self._common
         scores = self._centred @ self._bank_directions.T
         self._middle, self._spread = _moments(scores)
         best = self._best_descriptor((scores - self._middle) / self._spread)
@@ -306,20 +303,28 @@ def log_mean_likelihood(exponents: NDArray[np.float64], sharpness: ArrayLike) ->
     return np.maximum(by_chance, np.logaddexp.reduce(exponents, axis=1) - np.log(exponents.shape[1]))
 
 
-def common_part(descriptors: NDArray[np.float32], same_look: float) -> NDArray[np.float32]:
-    """(D,) what is taken off each descriptor: the mean over different looks, times 1 - 1 / (number of looks).
+def common_part(
+    descriptors: NDArray[np.float32], bank_directions: NDArray[np.float32], sharpness: float
+) -> NDArray[np.float32]:
+    """(D,) what is taken off each descriptor: the mean over kinds of things, times 1 - 1 / (number of kinds).
 
-    Descriptors that are nearly one (cosine of ``same_look`` or more) count as one look together, so that an object in
-    pieces, or a hall of chairs, does not turn what makes a chair into what all things share. And one look alone does
-    not say what is shared: nothing is taken off; of two, half.
+    Each kind counts once, so that an object in pieces, or a hall of chairs, does not turn what makes a chair into what
+    all things share. Descriptors are of one kind that the same word of the bank fits best; those that no word stands
+    out for, by half of what fitting words do, are of no kind that is known and do not count. Words are read as the
+    descriptors are, then once more without what they then share. And one kind alone does not say what is shared:
+    nothing is taken off; of two, half.
     """
-    alike = np.ones(len(descriptors))
-    for start in range(0, len(descriptors), ROWS_AT_ONCE):
-        some = slice(start, start + ROWS_AT_ONCE)
-        alike[some] = (descriptors[some] @ descriptors.T >= same_look - 1e-6).sum(axis=1)
-    weight = 1 / np.maximum(alike, 1)
-    looks = weight.sum()
-    return ((1 - 1 / looks) * (weight / looks) @ descriptors).astype(np.float32)
+    common, number = np.zeros(descriptors.shape[1], np.float32), _distinct(bank_directions)[0]
+    for _ in range(2):
+        scores = (descriptors - common) @ bank_directions.T
+        middle, spread = _moments(scores)
+        kind = number[scores.argmax(axis=1)]
+        evidence = ((scores - middle) / spread).max(axis=1)
+        fits = evidence >= max(sharpness, np.quantile(evidence, 0.75)) / 2
+        weight = fits / np.maximum(np.bincount(kind, fits), 1)[kind]
+        kinds = max(weight.sum(), 1)
+        common = ((1 - 1 / kinds) * (weight / kinds) @ descriptors).astype(np.float32)
+    return common
 
 
 def _distinct(texts: NDArray[np.float32]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

@@ -228,11 +228,8 @@ def choice(
 ) -> tuple[Array, Array]:
     """(K, L) probability of each label and (K,) of none. owner: the instance of each descriptor, 0 to K - 1."""
     descriptors, texts, bank = _unit(descriptors), _unit(texts), _unit(bank)
-    looks = np.array(
-        [1 / sum(row @ other >= settings.same_look - 1e-6 for other in descriptors) for row in descriptors]
-    )
-    shared = (1 - 1 / looks.sum()) * (looks @ descriptors) / looks.sum()
     words, labels = _unit(bank - bank.mean(axis=0)), _unit(texts - bank.mean(axis=0))
+    shared = _shared(_shared(0 * descriptors[0], descriptors, words, settings), descriptors, words, settings)
     evidence, against = [], []
     for k in range(1 + max(owner)):
         of_words, of_labels = [], []
@@ -254,6 +251,20 @@ def choice(
         total = _log_sum(np.append(sharpness * evidence[k][first], no_label))
         table[k], none[k] = np.exp(sharpness * evidence[k] - total), np.exp(no_label - total)
     return table, none
+
+
+def _shared(shared: Array, descriptors: Array, words: Array, settings: ChoosingSettings) -> Array:
+    """(D,) what kinds of things share: the mean of their means, of those that a word of the bank fits."""
+    _, number = np.unique(np.round(words, 5), axis=0, return_inverse=True)  # words given twice are one
+    of_word: dict[int, list[Array]] = {}
+    standing = [words @ (row - shared) for row in descriptors]
+    evidence = [(scores.max() - scores.mean()) / scores.std() for scores in standing]
+    fitting = max(settings.sharpness, np.quantile(evidence, 0.75)) / 2
+    for row, scores, stands_out in zip(descriptors, standing, evidence, strict=True):
+        if stands_out >= fitting:
+            of_word.setdefault(int(number.reshape(-1)[scores.argmax()]), []).append(row)
+    means = [np.mean(rows, axis=0) for rows in of_word.values()]
+    return (1 - 1 / len(means)) * np.mean(means, axis=0) if means else 0 * shared
 
 
 def _unit(rows: Array) -> Array:
