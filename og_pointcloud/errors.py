@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 
 
 def printable(text: str, most: int | None = None) -> str:
@@ -88,3 +89,12 @@ class MissingExtraError(ImportError):
 
     def __init__(self, module: str, extra: str) -> None:
         super().__init__(f"this needs {module}, which is not installed: pip install 'og-pointcloud[{extra}]'")
+
+
+@contextmanager
+def naming_extra(module: str, extra: str) -> Iterator[None]:
+    """MissingExtraError, which names the extra, where what is imported inside is not installed."""
+    try:
+        yield
+    except ImportError as error:
+        raise MissingExtraError(module, extra) from error

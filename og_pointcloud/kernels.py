@@ -6,13 +6,11 @@ import os
 from collections.abc import Callable
 from typing import Any
 
-from og_pointcloud.errors import MissingExtraError
+from og_pointcloud.errors import naming_extra
 
-try:
+with naming_extra("numba", "fit"):
     import numba
     from numba import get_num_threads, prange
-except ImportError as error:
-    raise MissingExtraError("numba", "fit") from error
 
 __all__ = ["get_num_threads", "njit", "prange", "use_threads"]
 

@@ -8,7 +8,7 @@ import shutil
 import numpy as np
 import pytest
 
-from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError, SceneError
+from og_pointcloud.errors import OgPointcloudError, SceneError
 from og_pointcloud.masking.crops import Crop, Preprocessing, mask_crops
 from og_pointcloud.masking.encode import DEMO_FOLDER, CropEncoder, OnnxModel, open_encoder
 
@@ -97,13 +97,11 @@ def test_an_encoder_is_found_by_its_folder_and_its_name(tmp_path, monkeypatch):
     monkeypatch.setenv("HF_HUB_CACHE", str(tmp_path / "hub"))
     expected = open_encoder("demo").embed(IMAGE, MASKS)
     folder = exported(tmp_path / "models" / "room", feature_space="tests/room")
-    assert (open_encoder(folder, "tests/room").embed(IMAGE, MASKS) == expected).all()
+    assert (open_encoder(folder).embed(IMAGE, MASKS) == expected).all()
     with pytest.raises(OgPointcloudError, match="hf download tests/room"):
         open_encoder("tests/room")
     monkeypatch.setenv("OG_POINTCLOUD_MODELS", str(tmp_path / "models"))
     assert (open_encoder("tests/room").embed(IMAGE, MASKS) == expected).all()
-    with pytest.raises(FeatureSpaceError, match=r"tests/room.*openai/clip-vit-base-patch16"):
-        open_encoder(folder, "openai/clip-vit-base-patch16")
 
 
 def test_crops_are_the_exports():

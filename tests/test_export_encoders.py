@@ -241,9 +241,9 @@ def test_the_image_command(model_folder, tmp_path, capsys):
     arguments = ["export", "image", str(model_folder), "-o", str(tmp_path / "out"), "--feature-space", SPACE]
     assert main([*arguments, "--crops", "langsplat"]) == 0
     assert "differ by" in capsys.readouterr().out
-    assert open_encoder(tmp_path / "out", SPACE).crops == LANGSPLAT
+    assert open_encoder(tmp_path / "out").crops == LANGSPLAT
     assert main(arguments) == 0
-    assert open_encoder(tmp_path / "out", SPACE).crops == WITH_CONTEXT
+    assert open_encoder(tmp_path / "out").crops == WITH_CONTEXT
     assert main(["export", "image", str(tmp_path / "none")]) == 2
 
 

@@ -155,7 +155,7 @@ def test_positions_beyond_float32_are_stored_as_double(tmp_path):
 def test_a_labelled_cloud_may_be_empty_but_not_uneven(tmp_path):
     write_labelled_ply(tmp_path / "a.ply", np.zeros((0, 3)), RGB[:0], labels_of(0))
     assert len(read_ply(tmp_path / "a.ply")["vertex"]) == 0
-    with pytest.raises(SceneError, match=r"og_label has shape \(29,\); expected \(30,\)"):
+    with pytest.raises(SceneError, match="one-dimensional arrays of one length"):
         write_labelled_ply(tmp_path / "b.ply", XYZ, RGB, labels_of(30) | {"og_label": np.zeros(29, np.int32)})
     assert not (tmp_path / "b.ply").exists()
 

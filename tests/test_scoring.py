@@ -57,13 +57,6 @@ def test_absent_classes_do_not_dilute_and_classes_outside_the_task_are_ignored()
     assert (ten.classes, ten.class_iou) == ((WALL,), (1 / 2,))
 
 
-def test_wrong_input_is_told():
-    with pytest.raises(SceneError, match="the task is 20 classes"):
-        score_scene(ids((1, 1)), ids((1, 1)), 20)
-    with pytest.raises(SceneError, match=r"opacities have shape \(2,\)"):
-        score_scene(ids((1, 1)), ids((1, 1)), 19, np.ones(2))
-
-
 # Files --------------------------------------------------------------------------------------------------------
 
 

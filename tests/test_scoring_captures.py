@@ -9,7 +9,7 @@ import pytest
 from labelled_clouds import make_cloud, unit_rows
 
 from og_pointcloud.ask.labelled_scene import LabelledScene
-from og_pointcloud.errors import OgPointcloudError, SceneError
+from og_pointcloud.errors import SceneError
 from og_pointcloud.evaluate import intervals
 from og_pointcloud.evaluate.captures import Answer, ask, score_capture
 from og_pointcloud.evaluate.intervals import bootstrap, miou_interval
@@ -140,11 +140,9 @@ def test_draws_in_parts_are_draws(monkeypatch):
     whole = miou_interval(*arguments)
     monkeypatch.setattr(intervals, "CHUNK", 600)
     assert miou_interval(*arguments) == whole
-    with pytest.raises(OgPointcloudError, match="no class has enough points"):
-        miou_interval(*arguments[:-1], ())
 
 
-def test_points_in_one_place_are_one_block_and_a_length_of_zero_is_refused():
+def test_points_in_one_place_are_one_block():
     """Copies of one point say nothing new: no draw differs from another. Copied once each, all is as before."""
     rng = np.random.default_rng(5)
     called, truth = rng.integers(-1, 2, 400), truth_of(rng.integers(0, 2, 400))
@@ -157,9 +155,6 @@ def test_points_in_one_place_are_one_block_and_a_length_of_zero_is_refused():
     found = miou_interval(called, truth, xyz, 0.02, classes)
     twice = [np.tile(array, 2) for array in (called, truth.cls)]
     assert miou_interval(twice[0], truth_of(twice[1]), np.tile(xyz, (2, 1)), 0.02, classes) == found
-    for spacing in (0.0, np.nan, np.inf):
-        with pytest.raises(OgPointcloudError, match="expected a length above 0"):
-            miou_interval(called, truth, xyz, spacing, classes)
 
 
 def test_a_class_that_is_not_there_has_no_score_and_is_a_miss_where_it_is_said():

@@ -65,7 +65,7 @@ def unit(rows):
 def test_added_words_can_be_asked(path):
     done = add_words(path, NEW, SPACE)
     assert len(done.names) == len(WORDS) + 2
-    bundle = read_bundle(path, verify_sha256=True)
+    bundle = read_bundle(path)
     assert bundle.cloud.vocabulary.names == (*WORDS, *NEW.names)
     assert np.abs(bundle.cloud.vocabulary.vectors[-2:] - unit(NEW.vectors)).max() < 1e-3
     assert bundle.manifest["counts"]["words"] == len(WORDS) + 2
@@ -172,7 +172,7 @@ def test_a_stored_bank_is_the_scenes_and_all_else_stays(path, bundle_file, tmp_p
     assert read_bundle(path).cloud.word_bank is None
     store_bank(path, bank, SPACE, tmp_path / "t.ogpc")
     assert path.read_bytes() == bundle_file.read_bytes()
-    bundle = read_bundle(tmp_path / "t.ogpc", verify_sha256=True)
+    bundle = read_bundle(tmp_path / "t.ogpc")
     assert bundle.manifest["members"]["bank/vectors.npy"] | {"sha256": ""} == {
         "bytes": 128 + 80 * WIDTH * 2, "sha256": "", "dtype": "<f2", "shape": [80, WIDTH],
     }  # fmt: skip
@@ -327,7 +327,7 @@ def test_a_carried_encoder_answers_and_is_read_only_when_asked(
     monkeypatch.setattr("og_pointcloud.text.encoder.cache_folder", lambda: tmp_path / "none")
     assert read_carried_encoder(path) is None
     assert carry_encoder(path, encoder_folder).feature_space == SPACE
-    bundle = read_bundle(path, verify_sha256=True)
+    bundle = read_bundle(path)
     assert bundle.cloud.vocabulary.names == WORDS
     assert encoder_for(SPACE, carried_encoder(path)).where == f"{path}: text_encoder"
     assert encoder_for(SPACE, carried_encoder(path))(["cat"]).shape == (1, WIDTH)

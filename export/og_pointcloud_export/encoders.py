@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud.errors import MissingExtraError, OgPointcloudError
+from og_pointcloud.errors import MissingExtraError, OgPointcloudError, naming_extra
 from og_pointcloud.formats.npy import npy_bytes
 from og_pointcloud.formats.poses import read_json
 from og_pointcloud.masking import encode
@@ -35,12 +35,10 @@ from og_pointcloud.text.encoder import TextEncoder, cache_folder, check_template
 from og_pointcloud.text.text_features import everyday_words
 from og_pointcloud_export.writer import written_by
 
-try:
+with naming_extra("torch, transformers and onnx", "export"):
     import torch
 
     from og_pointcloud.masking.clip import TransformersModel, load_model, published_name
-except ImportError as error:
-    raise MissingExtraError("torch, transformers and onnx", "export") from error
 if find_spec("onnxscript") is None:  # torch.onnx.export imports it late, and says less
     raise MissingExtraError("onnxscript", "export")
 

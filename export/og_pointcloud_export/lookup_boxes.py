@@ -17,12 +17,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from og_pointcloud.errors import MissingExtraError
-
-try:
-    from og_pointcloud.kernels import njit, prange
-except ImportError as error:
-    raise MissingExtraError("numba", "fit") from error
+from og_pointcloud.kernels import njit, prange
 
 EDGE = 4
 """Children along the edge of a box that is split."""

@@ -23,15 +23,13 @@ from numpy.typing import NDArray
 from og_pointcloud.bundle.format import BEYOND, NEAR, ON_SURFACE
 from og_pointcloud.bundle.nearest import surface_distance
 from og_pointcloud.cloud import NO_EVIDENCE, InstanceTable, LabelledCloud
-from og_pointcloud.errors import MissingExtraError
+from og_pointcloud.errors import naming_extra
 from og_pointcloud_export.lookup_boxes import CHILDREN, EDGE, LONGEST_LIST, SHORT_LIST, TOO_FAR_CODE
 from og_pointcloud_export.lookup_grid import CODE_OFFSET, LookupGrid
 
-try:
+with naming_extra("onnx", "fit"):
     import onnx
     from onnx import TensorProto, helper, numpy_helper
-except ImportError as error:
-    raise MissingExtraError("onnx", "fit") from error
 
 LIST_LENGTHS = (SHORT_LIST, 20, LONGEST_LIST)
 """So many candidates are compared: of most lists the first number, of longer ones the next."""

@@ -108,17 +108,8 @@ class Instance:
     def to_dict(self) -> dict[str, Any]:
         """JSON-able: everything but the points themselves; of those, how many, and how many are strays."""
         columns = (
-            "id",
-            "state",
-            "points",
-            "views",
-            "masks",
-            "agreement",
-            "reliability",
-            "visible_area",
-            "part_of",
-            "coarse",
-        )
+            "id", "state", "points", "views", "masks", "agreement", "reliability", "visible_area", "part_of", "coarse",
+        )  # fmt: skip
         aligned, oriented = self.axis_aligned_box, self.oriented_box
         return {name: getattr(self, name) for name in columns} | {
             "strays": int((~self.main_part).sum()),
@@ -189,16 +180,9 @@ class Instances(Sequence[Instance]):
 
     def __repr__(self) -> str:
         header = (
-            "id",
-            "points",
-            "views",
-            "agreement",
-            "reliability",
-            "state",
-            "centroid",
-            "size along x, y, z",
+            "id", "points", "views", "agreement", "reliability", "state", "centroid", "size along x, y, z",
             "best words",
-        )
+        )  # fmt: skip
         shown = self.largest(SHOWN)
         rows = [header, *(_cells(row) for row in shown)]
         widths = [max(len(row[column]) for row in rows) for column in range(len(header))]

@@ -118,11 +118,7 @@ class Selection(Sequence[Match]):
 
 
 def select(
-    scene: SceneLike,
-    text: str | Mapping[str, ArrayLike],
-    *,
-    against: Labels = None,
-    text_features: TextFeatures = None,
+    scene: SceneLike, text: str | Mapping[str, ArrayLike], *, against: Labels = None, text_features: TextFeatures = None
 ) -> Selection:
     """Rank the instances of a scene by a text, and say which it fits.
 

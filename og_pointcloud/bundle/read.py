@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import zipfile
@@ -56,15 +55,15 @@ class Bundle:
     manifest: dict[str, Any]
 
 
-def read_bundle(path: str | os.PathLike[str], *, verify_sha256: bool = False) -> Bundle:
+def read_bundle(path: str | os.PathLike[str]) -> Bundle:
     """Read and check a .ogpc file; BundleError, beginning with the path, for any other or damaged file.
 
-    Each member's CRC-32 is always checked. verify_sha256 checks the manifest's digests too, which takes about as long
-    as the rest of reading; as anyone can write them, they show which file this is, not that it is to be trusted.
+    Each member's CRC-32 is checked. The manifest's digests are not: anyone can write them, so that they tell files
+    apart, but not whom to trust.
 
     >>> import pathlib, tempfile
     >>> path = og.write_bundle(cloud, pathlib.Path(tempfile.mkdtemp()) / "two.ogpc")  # of `LabelledCloud`'s example
-    >>> bundle = og.read_bundle(path, verify_sha256=True)
+    >>> bundle = og.read_bundle(path)
     >>> bundle.cloud.feature_space, bundle.manifest["counts"]["points"]
     ('two-words', 3)
     """
@@ -77,7 +76,7 @@ def read_bundle(path: str | os.PathLike[str], *, verify_sha256: bool = False) ->
         with path.open("rb") as file:
             members, carried = _members(file)
         manifest = _manifest(members)
-        _check_members(manifest, members, carried, verify_sha256)
+        _check_members(manifest, members, carried)
         return Bundle(path, _cloud(manifest, members), members["query.onnx"], manifest)
     except _Refused as error:
         raise BundleError(f"{path}: {error}") from None
@@ -159,9 +158,7 @@ def _json(members: dict[str, bytes], name: str, most: int) -> Any:
         raise _Refused(f"{name} is no JSON ({error}): {REBUILD}") from None
 
 
-def _check_members(
-    manifest: dict[str, Any], members: dict[str, bytes], carried: dict[str, int], verify_sha256: bool
-) -> None:
+def _check_members(manifest: dict[str, Any], members: dict[str, bytes], carried: dict[str, int]) -> None:
     declared = _field(manifest, "members", dict)
     sizes = {name: len(data) for name, data in members.items()} | carried
     if undeclared := sorted(set(sizes) - set(declared) - {"manifest.json"}):
@@ -172,10 +169,6 @@ def _check_members(
         length = _field(entry, "bytes", int, f"members/{name}/")
         if length != sizes[name]:
             raise _Refused(f"member '{name}' has {sizes[name]} bytes, the manifest says {length}: {REBUILD}")
-        if verify_sha256 and name in members:  # the encoder's own manifest holds its files' digests
-            digest = hashlib.sha256(members[name]).hexdigest()
-            if digest != _field(entry, "sha256", str, f"members/{name}/"):
-                raise _Refused(f"member '{name}' has sha256 {digest}, not the manifest's: it was changed; {REBUILD}")
     if "query.onnx" not in members:
         raise _Refused(f"member 'query.onnx' is missing: {REBUILD}")
 

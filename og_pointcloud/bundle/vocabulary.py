@@ -86,10 +86,7 @@ def bank_of_encoder(space: FeatureSpace, folder: str | os.PathLike[str] | None =
 
 
 def add_words(
-    path: str | os.PathLike[str],
-    words: Vocabulary,
-    feature_space: str,
-    output: str | os.PathLike[str] | None = None,
+    path: str | os.PathLike[str], words: Vocabulary, feature_space: str, output: str | os.PathLike[str] | None = None
 ) -> Vocabulary:
     """Store words with their vectors in a .ogpc file, behind those that it has; a word that it has gets the new vector.
     Returns all that it has now.
@@ -119,10 +116,7 @@ def read_bank(path: str | os.PathLike[str]) -> tuple[WordBank, str]:
 
 
 def store_bank(
-    path: str | os.PathLike[str],
-    bank: WordBank,
-    feature_space: str,
-    output: str | os.PathLike[str] | None = None,
+    path: str | os.PathLike[str], bank: WordBank, feature_space: str, output: str | os.PathLike[str] | None = None
 ) -> None:
     """Store a word bank in a .ogpc file, in place of one that it has; its answers are then calibrated.
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from og_pointcloud.collection.index import families
 from og_pointcloud.collection.scoring import Block, load_block
 from og_pointcloud.collection.store import Atlas
-from og_pointcloud.errors import MissingExtraError, OgPointcloudError
+from og_pointcloud.errors import OgPointcloudError, naming_extra
 
 INDEXED_FROM = 50_000
 """Rows from which a table has an index; fewer are all looked at."""
@@ -34,10 +34,8 @@ made descriptors the recall at 10 was 1.00, with 24 and 4 it was 0.97 (docs/scal
 
 
 def _database(uri: str) -> Any:
-    try:
+    with naming_extra("lancedb", "lance"):
         import lancedb  # pyright: ignore[reportMissingImports]
-    except ImportError:
-        raise MissingExtraError("lancedb", "lance") from None
     return lancedb.connect(uri)
 
 
@@ -66,11 +64,7 @@ def _columns(block: Block) -> list[Any]:
     instance = np.repeat(np.arange(len(block)), np.diff(block.bounds))
     vectors = np.column_stack([block.vectors, block.shift]).astype(np.float16)
     rows = pa.FixedSizeListArray.from_arrays(pa.array(vectors.ravel()), vectors.shape[1])
-    numbers = [
-        block.ids[block.scene[instance]],
-        block.instance[instance].astype(np.int32),
-        *block.center[instance].T,
-    ]
+    numbers = [block.ids[block.scene[instance]], block.instance[instance].astype(np.int32), *block.center[instance].T]
     return [*map(pa.array, numbers), rows]
 
 

@@ -71,12 +71,8 @@ def miou_interval(
     both are scored on the same draws, since what is hard is hard for both.
 
     called, less: (n,) classes of the truth, below 0 unknown (`Truth.class_of`). xyz: (n, 3). spacing: of its points,
-    same unit. classes: those that the score is a mean over. OgPointcloudError where there are none, or no spacing.
+    same unit. classes: those that the score is a mean over, one or more.
     """
-    if not classes:
-        raise OgPointcloudError("no class has enough points to be scored; expected one or more")
-    if not (np.isfinite(spacing) and spacing > 0):
-        raise OgPointcloudError(f"the point spacing is {spacing:g}; expected a length above 0, in the points' unit")
     evaluated = truth.scored & np.isin(truth.cls, classes)
     counted = evaluated if truth.background is None else evaluated | truth.background
     points, true = np.asarray(xyz, np.float64)[counted], np.where(evaluated, truth.cls, -1)[counted]

@@ -74,12 +74,6 @@ def score_scene(
     predicted: (n,) NYU40 ids, below 1 for unknown; an id outside the task is a wrong answer. truth: (n,) NYU40 ids.
     task: 19, 15 or 10. opacity: (n,) of each point's Gaussian; None counts all points.
     """
-    if task not in TASKS:
-        raise SceneError(f"the task is {task} classes; expected one of {', '.join(map(str, TASKS))}")
-    truth, predicted = np.asarray(truth), np.asarray(predicted)
-    for name, values in (("predictions", predicted), ("opacities", opacity)):
-        if values is not None and values.shape != truth.shape:
-            raise SceneError(f"{name} have shape {values.shape}, the labels {truth.shape}; expected one a point")
     of_task = np.where(np.isin(truth, TASKS[task]), truth, -1)
     opaque = np.ones(truth.shape, bool) if opacity is None else opacity >= OPACITY_COUNTED
     return score_labels(np.where(predicted > 0, predicted, -1), of_task, scored=opaque, min_points=1)

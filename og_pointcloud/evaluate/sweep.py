@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from og_pointcloud.ask.labelled_scene import LabelledScene
 from og_pointcloud.cloud import FeatureSpace, Vocabulary
-from og_pointcloud.errors import MissingExtraError, OgPointcloudError, SceneError
+from og_pointcloud.errors import OgPointcloudError, SceneError, naming_extra
 from og_pointcloud.evaluate.captures import Answer, difference
 from og_pointcloud.evaluate.knobs import DEFAULT, Setting
 from og_pointcloud.evaluate.truth import GT_NAME, Truth, read_truth
@@ -40,12 +40,10 @@ from og_pointcloud.scene import Scene
 from og_pointcloud.settings import FitSettings
 from og_pointcloud.text.text_features import read_text_features
 
-try:
+with naming_extra("scipy and numba", "fit"):
     from og_pointcloud.evaluate.baselines import baseline_labels
     from og_pointcloud.fitting.fit import fit, prepare
     from og_pointcloud.fitting.tiles import needs_tiles
-except ImportError as error:
-    raise MissingExtraError("scipy and numba", "fit") from error
 
 BASELINE = "baseline"
 """The knob of rows of other methods."""

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from og_pointcloud.errors import MissingExtraError
+from og_pointcloud.errors import naming_extra
 from og_pointcloud.evaluate.sweep import BASELINE, Row, Sweep, front, machine
 from og_pointcloud.formats.atomic import replacing
 
@@ -29,10 +29,8 @@ FRONT = " *"
 
 def require_matplotlib() -> Any:
     """The class matplotlib.figure.Figure; MissingExtraError where matplotlib is not installed."""
-    try:
+    with naming_extra("matplotlib", "report"):
         from matplotlib.figure import Figure
-    except ImportError as error:
-        raise MissingExtraError("matplotlib", "report") from error
     return Figure
 
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from multiprocessing import get_context
 from typing import Any, TypeVar
 
-from og_pointcloud.errors import MissingExtraError, OgPointcloudError
+from og_pointcloud.errors import OgPointcloudError, naming_extra
 from og_pointcloud.fitting.memory import free_memory
 from og_pointcloud.journal import Journal
 from og_pointcloud.kernels import use_threads
@@ -125,10 +125,8 @@ def dask_executor(address: str) -> Iterator[Executor]:
     Its workers see the same files by the same paths. MissingExtraError without the extra 'cluster'; OgPointcloudError
     where no scheduler answers, or it has no workers.
     """
-    try:
+    with naming_extra("distributed", "cluster"):
         from distributed import Client
-    except ImportError:
-        raise MissingExtraError("distributed", "cluster") from None
     try:
         client = Client(address, timeout=PATIENCE_S)
     except (OSError, ValueError) as error:

@@ -42,18 +42,9 @@ from og_pointcloud.fitting.tiled_cloud import TiledCloud, vanished
 from og_pointcloud.fitting.view_votes import view_votes
 from og_pointcloud.fitting.work_folder import WorkFolder, fingerprint
 from og_pointcloud.journal import Journal, LeftOut
-from og_pointcloud.rendering.geometry import (
-    chance_of_place,
-    isotropic,
-    near_plane,
-    neighbourhood,
-    sample_of_points,
-)
+from og_pointcloud.rendering.geometry import chance_of_place, isotropic, near_plane, neighbourhood, sample_of_points
 from og_pointcloud.rendering.splatting import ALPHA_MIN, FRUSTUM_MARGIN, LOW_PASS, Gaussians
-from og_pointcloud.rendering.surface import (
-    surface_thickness,
-    with_distinct_points,
-)
+from og_pointcloud.rendering.surface import surface_thickness, with_distinct_points
 from og_pointcloud.scene import Camera, Scene, View
 from og_pointcloud.settings import FitSettings
 
@@ -396,13 +387,7 @@ class _Decided:
     outside: csr_array
 
 
-def _decide(
-    cloud: TiledCloud,
-    shown: _Shown,
-    grouped: _Grouped,
-    settings: FitSettings,
-    tile: int,
-) -> _Decided:
+def _decide(cloud: TiledCloud, shown: _Shown, grouped: _Grouped, settings: FitSettings, tile: int) -> _Decided:
     """Decide the state of a tile's points."""
     table = shown.table(cloud, cloud.members[tile])
     around = cloud.neighbours(tile, settings.geometry)

@@ -35,7 +35,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.cloud import UNKNOWN_SPACE
-from og_pointcloud.errors import MissingExtraError, SceneError, printable
+from og_pointcloud.errors import SceneError, printable
 from og_pointcloud.formats import colmap
 from og_pointcloud.formats.depth import DepthFile, DepthFrame, find_depth, resampled
 from og_pointcloud.formats.faces import Face
@@ -378,11 +378,8 @@ def _depth_frames(capture: Path, poses: CapturePoses) -> list[DepthFrame]:
 
 
 def _fused(capture: Path, frames: Sequence[DepthFrame]) -> FusedCloud:
-    # The fusion brings numba, which whoever has a cloud need not load here.
-    try:
-        from og_pointcloud.formats.fusion import doubtful_depth, fuse
-    except ImportError as error:
-        raise MissingExtraError("numba", "fit") from error
+    from og_pointcloud.formats.fusion import doubtful_depth, fuse  # brings numba, which who has a cloud need not load
+
     fused = fuse(frames)
     empty = f"nothing is measured in {len(fused.empty)} of them, e.g. '{fused.empty[0]}'" if fused.empty else None
     for text in filter(None, (doubtful_depth(frames), empty)):

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud.errors import MissingExtraError, OgPointcloudError, SceneError
+from og_pointcloud.errors import OgPointcloudError, SceneError, naming_extra
 from og_pointcloud.formats.atomic import replacing
 from og_pointcloud.formats.images import MAX_PIXELS, require_cv2, stated_size
 from og_pointcloud.formats.ply import plain_rows, write_ply
@@ -95,10 +95,8 @@ def unpack_e57(path: str | os.PathLike[str], folder: str | os.PathLike[str]) -> 
 @contextmanager
 def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
     """libE57 and the open file; what libE57 raises inside is a SceneError."""
-    try:
+    with naming_extra("pye57", "e57"):
         from pye57 import libe57  # pyright: ignore[reportAttributeAccessIssue]
-    except ImportError as error:
-        raise MissingExtraError("pye57", "e57") from error
     with naming(path):
         path.stat()
         file = None

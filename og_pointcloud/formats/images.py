@@ -13,7 +13,7 @@ from typing import BinaryIO, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud.errors import MissingExtraError, SceneError
+from og_pointcloud.errors import SceneError, naming_extra
 from og_pointcloud.formats.atomic import replacing
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".PNG", ".JPEG", ".webp", ".tif", ".tiff", ".bmp")
@@ -36,19 +36,15 @@ class PngHeader(NamedTuple):
 def require_cv2() -> ModuleType:
     """OpenCV, or an error that names the extra."""
     os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(MAX_PIXELS))  # read when it is imported
-    try:
+    with naming_extra("opencv-contrib-python-headless", "fit"):
         import cv2
-    except ImportError as error:
-        raise MissingExtraError("opencv-contrib-python-headless", "fit") from error
     return cv2
 
 
 def require_pillow() -> ModuleType:
     """Pillow's Image, or an error that names the extra."""
-    try:
+    with naming_extra("Pillow", "fit"):
         from PIL import Image
-    except ImportError as error:
-        raise MissingExtraError("Pillow", "fit") from error
     return Image
 
 

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud.errors import MissingExtraError, SceneError
+from og_pointcloud.errors import SceneError, naming_extra
 from og_pointcloud.formats.atomic import replacing
 from og_pointcloud.formats.tables import LABEL_FINITE, naming
 from og_pointcloud.scene import Points, require_finite
@@ -137,10 +137,8 @@ def write_las(
 
 
 def _laspy() -> Any:
-    try:
+    with naming_extra("laspy", "las"):
         import laspy
-    except ImportError:
-        raise MissingExtraError("laspy", "las") from None
     return laspy
 
 

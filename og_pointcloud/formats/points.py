@@ -78,12 +78,6 @@ def write_labelled_ply(
     extent. rgb: (n, 3) uint8. attributes: name -> (n,): og_label, og_instance (int32), og_score (float32), og_reason
     (uint8). names: what og_label counts; a comment "og_names", JSON, unless they would not fit into a header.
     """
-    n = len(xyz_world)
-    shapes = {"rgb": (rgb, (n, 3)), "xyz_world": (xyz_world, (n, 3))}
-    shapes |= {name: (values, (n,)) for name, values in attributes.items()}
-    for name, (values, expected) in shapes.items():
-        if values.shape != expected:
-            raise SceneError(f"{path}: {name} has shape {values.shape}; expected {expected}")
     comment = f"og_names {json.dumps(list(names))}"
     fits = names and len(comment) < HEADER_LIMIT // 2
     write_ply(path, {"vertex": plain_rows(xyz_world, np.asarray(rgb, np.uint8), attributes)}, [comment] if fits else [])

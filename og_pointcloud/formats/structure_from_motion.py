@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud.errors import MissingExtraError, SceneError
+from og_pointcloud.errors import SceneError, naming_extra
 from og_pointcloud.formats.atomic import replacing_folder
 from og_pointcloud.formats.images import image_size
 from og_pointcloud.formats.poses import numbered_images
@@ -110,10 +110,8 @@ def _photographs(source: Path, target: Path) -> list[Path]:
 
 
 def _pycolmap() -> Any:
-    try:
+    with naming_extra("pycolmap", "poses"):
         import pycolmap  # pyright: ignore[reportMissingImports]
-    except ImportError as error:
-        raise MissingExtraError("pycolmap", "poses") from error
     pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL)  # what fails is said here
     return pycolmap
 

@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError, SceneError
+from og_pointcloud.errors import OgPointcloudError, SceneError
 from og_pointcloud.masking.contracts import MaskEncoder
 from og_pointcloud.masking.crops import WITH_CONTEXT, Crop, Preprocessing, mask_crops
 from og_pointcloud.models import EncoderFormat, fetched_model, open_session
@@ -84,35 +84,28 @@ def open_mask_encoder(name: str | os.PathLike[str], features: str = "crops") -> 
     return DenseEncoder(encoder.model)  # pyright: ignore[reportArgumentType]
 
 
-def open_encoder(name: str | os.PathLike[str], feature_space: str | None = None) -> CropEncoder:
+def open_encoder(name: str | os.PathLike[str]) -> CropEncoder:
     """Open an encoder; nothing is downloaded.
 
     name: "demo"; a folder that ``og-pointcloud export image`` wrote; a transformers folder of CLIP or SigLIP, which
         needs torch; or OWNER/MODEL, looked for in the folders of OG_POINTCLOUD_MODELS, in the user's cache, and among
         what Hugging Face's own tools have fetched.
-    feature_space: the one that is expected, as the text encoder and the capture name it; of a folder that does not say
-        its name, the one that it has.
-    Raises OgPointcloudError where there is no such encoder, FeatureSpaceError for one of another space.
+    Raises OgPointcloudError where there is no such encoder.
     """
-    model = _open_model(name, feature_space)
-    if feature_space is not None and model.feature_space != feature_space:
-        raise FeatureSpaceError(
-            f"{name} encodes to feature space '{model.feature_space}'; expected '{feature_space}': words and masks are "
-            "compared only within one model's space"
-        )
+    model = _open_model(name)
     return CropEncoder(model, model.crops)
 
 
-def _open_model(name: str | os.PathLike[str], feature_space: str | None) -> ImageModel:
+def _open_model(name: str | os.PathLike[str]) -> ImageModel:
     if name == "demo":
         return OnnxModel(DEMO_FOLDER / "image")
     path = Path(name).expanduser()
     if path.exists():
-        return OnnxModel(path) if ENCODER.feature_space(path) is not None else _transformers_model(path, feature_space)
+        return OnnxModel(path) if ENCODER.feature_space(path) is not None else _transformers_model(path)
     if exported := ENCODER.find(str(name), model_folders()):
         return OnnxModel(exported)
     if fetched := fetched_model(str(name)):
-        return _transformers_model(fetched, feature_space or str(name))
+        return _transformers_model(fetched, str(name))
     named = os.environ.get(MODELS_VARIABLE)
     raise OgPointcloudError(
         f"no encoder '{name}': it is no folder, none of that feature space is in {MODELS_VARIABLE} "
@@ -121,7 +114,7 @@ def _open_model(name: str | os.PathLike[str], feature_space: str | None) -> Imag
     )
 
 
-def _transformers_model(folder: Path, feature_space: str | None) -> ImageModel:
+def _transformers_model(folder: Path, feature_space: str | None = None) -> ImageModel:
     from og_pointcloud.masking.clip import TransformersModel  # torch
 
     return TransformersModel(folder, feature_space)

@@ -10,14 +10,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
-from og_pointcloud.errors import MissingExtraError, SceneError, first_line
+from og_pointcloud.errors import SceneError, first_line, naming_extra
 from og_pointcloud.formats.poses import read_json
 
-try:
+with naming_extra("torch and transformers", "masks"):
     import torch
     import transformers
-except ImportError as error:
-    raise MissingExtraError("torch and transformers", "masks") from error
 
 Attention = Literal["eager", "sdpa"]
 

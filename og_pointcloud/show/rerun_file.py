@@ -42,9 +42,7 @@ class RerunSink:
         from_camera = rerun.Transform3D(translation=camera.center, mat3x3=camera.world_to_camera[:3, :3].T)
         matrix = [[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]]
         lens = rerun.Pinhole(
-            image_from_camera=matrix,
-            resolution=[camera.width, camera.height],
-            camera_xyz=rerun.ViewCoordinates.RDF,
+            image_from_camera=matrix, resolution=[camera.width, camera.height], camera_xyz=rerun.ViewCoordinates.RDF
         )
         self._recording.log("world/camera", from_camera, lens)
         if image is not None:

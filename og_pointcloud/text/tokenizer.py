@@ -17,7 +17,7 @@ from functools import lru_cache
 from itertools import pairwise
 from typing import Any, Protocol
 
-from og_pointcloud.errors import MissingExtraError, OgPointcloudError
+from og_pointcloud.errors import OgPointcloudError, naming_extra
 
 WHITESPACE = "\t\n\v\f\r \x85\xa0\u1680\u2000-\u200a\u2028\u2029\u202f\u205f\u3000"
 """Unicode's White_Space, as the inside of a character class; Python's ``\\s`` has four control characters more."""
@@ -200,10 +200,8 @@ class OtherTokenizer:
 
     def __init__(self, data: bytes, context_length: int) -> None:
         """data: a tokenizer.json that ``_check_other`` let pass."""
-        try:
+        with naming_extra("tokenizers", "words"):
             import tokenizers
-        except ImportError as error:
-            raise MissingExtraError("tokenizers", "words") from error
         try:
             self._tokenizer = tokenizers.Tokenizer.from_str(data.decode())
             self._tokenizer.no_padding()

@@ -51,12 +51,7 @@ def read(path: str | os.PathLike[str]) -> Any:
 
 
 def segment(
-    pcd: Any,
-    labels: Labels = None,
-    scene: SceneLike | None = None,
-    *,
-    pose: ArrayLike | None = None,
-    **options: Any,
+    pcd: Any, labels: Labels = None, scene: SceneLike | None = None, *, pose: ArrayLike | None = None, **options: Any
 ) -> Segmented:
     """Label a cloud, or a mesh by its vertices, and paint a copy of it.
 

@@ -49,12 +49,7 @@ class OgDataSet:
         self._mesh = mesh
 
     def segment(
-        self,
-        labels: Labels = None,
-        scene: SceneLike | None = None,
-        *,
-        pose: ArrayLike | None = None,
-        **options: Any,
+        self, labels: Labels = None, scene: SceneLike | None = None, *, pose: ArrayLike | None = None, **options: Any
     ) -> Any:
         """Label every point; returns a copy of the dataset with the arrays that this module names.
 

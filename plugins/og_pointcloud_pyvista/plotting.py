@@ -100,13 +100,7 @@ class OgPlotter:
             self._scene = None
         return actor
 
-    def add_boxes(
-        self,
-        of: Any,
-        *,
-        up: ArrayLike | None = None,
-        **options: Any,
-    ) -> pv.Actor | None:
+    def add_boxes(self, of: Any, *, up: ArrayLike | None = None, **options: Any) -> pv.Actor | None:
         """Draw oriented boxes around the labelled instances of a segmented dataset, or around all of a scene.
 
         of: a dataset with og_instance, or a scene, a LabelledCloud or the path of a .ogpc file. up: (3,) direction

@@ -7,13 +7,7 @@ from __future__ import annotations
 
 from og_pointcloud_ros.detections import to_detections, to_label_info
 from og_pointcloud_ros.messages import MessageFactory, plain_messages, ros_messages
-from og_pointcloud_ros.pointcloud2 import (
-    UNLABELLED,
-    from_pointcloud2,
-    read_fields,
-    to_pointcloud2,
-    write_fields,
-)
+from og_pointcloud_ros.pointcloud2 import UNLABELLED, from_pointcloud2, read_fields, to_pointcloud2, write_fields
 from og_pointcloud_ros.transforms import TransformError, TransformTree
 
 __all__ = [

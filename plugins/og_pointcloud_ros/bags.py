@@ -17,7 +17,7 @@ from typing import Any
 
 from og_pointcloud.ask.choosing import Reason
 from og_pointcloud.ask.labelled_scene import Segmenter
-from og_pointcloud.errors import MissingExtraError, OgPointcloudError, SceneError, first_line, printable
+from og_pointcloud.errors import OgPointcloudError, SceneError, first_line, naming_extra, printable
 from og_pointcloud.formats.atomic import replacing_folder
 from og_pointcloud.journal import with_bar
 from og_pointcloud_ros.detections import to_label_info
@@ -25,13 +25,11 @@ from og_pointcloud_ros.labelling import MINIMUM_POINTS, CloudLabeller, LabelledM
 from og_pointcloud_ros.messages import MessageFactory, nanoseconds
 from og_pointcloud_ros.transforms import TransformTree
 
-try:
+with naming_extra("rosbags", "ros"):
     from rosbags.interfaces import Connection, Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
     from rosbags.rosbag2 import Reader, StoragePlugin, Writer
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
     from rosbags.typesys.store import Typestore
-except ImportError as error:
-    raise MissingExtraError("rosbags", "ros") from error
 
 CLOUD, TRANSFORMS = "sensor_msgs/msg/PointCloud2", "tf2_msgs/msg/TFMessage"
 DETECTION_ARRAY, INFO = "vision_msgs/msg/Detection3DArray", "vision_msgs/msg/LabelInfo"

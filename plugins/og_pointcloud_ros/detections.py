@@ -56,11 +56,7 @@ def to_detections(
 
 
 def to_label_info(
-    names: Sequence[str],
-    frame_id: str = "",
-    stamp: Any = None,
-    *,
-    messages: MessageFactory = plain_messages,
+    names: Sequence[str], frame_id: str = "", stamp: Any = None, *, messages: MessageFactory = plain_messages
 ) -> Any:
     """What the numbers in the field ``label`` mean, as vision_msgs/LabelInfo, to be published once, latched.
 

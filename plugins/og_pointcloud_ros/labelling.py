@@ -35,11 +35,7 @@ class CloudLabeller:
     """
 
     def __init__(
-        self,
-        segmenter: Segmenter,
-        messages: MessageFactory,
-        frame: str = "map",
-        minimum_points: int = MINIMUM_POINTS,
+        self, segmenter: Segmenter, messages: MessageFactory, frame: str = "map", minimum_points: int = MINIMUM_POINTS
     ) -> None:
         self.segmenter = segmenter
         self._messages, self._frame, self._minimum_points = messages, frame, minimum_points

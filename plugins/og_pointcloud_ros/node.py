@@ -20,12 +20,7 @@ import rclpy.logging  # pyright: ignore[reportMissingImports]
 from numpy.typing import NDArray
 from rcl_interfaces.msg import SetParametersResult  # pyright: ignore[reportMissingImports]
 from rclpy.node import Node  # pyright: ignore[reportMissingImports]
-from rclpy.qos import (  # pyright: ignore[reportMissingImports]
-    QoSDurabilityPolicy,
-    QoSHistoryPolicy,
-    QoSProfile,
-    QoSReliabilityPolicy,
-)
+from rclpy.qos import QoSDurabilityPolicy, QoSHistoryPolicy, QoSProfile, QoSReliabilityPolicy  # pyright: ignore[reportMissingImports]
 from rclpy.time import Time  # pyright: ignore[reportMissingImports]
 from sensor_msgs.msg import PointCloud2  # pyright: ignore[reportMissingImports]
 from tf2_ros import Buffer, TransformException, TransformListener  # pyright: ignore[reportMissingImports]

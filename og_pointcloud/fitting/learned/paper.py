@@ -32,7 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from og_pointcloud.errors import MissingExtraError
+from og_pointcloud.errors import naming_extra
 from og_pointcloud.fitting.grouping import indicator
 from og_pointcloud.fitting.learned.codebook import kmeans
 from og_pointcloud.fitting.learned.matching import filled_masks
@@ -41,10 +41,8 @@ from og_pointcloud.fitting.mask_table import view_fingerprint, weights_by_instan
 from og_pointcloud.fitting.work_folder import WorkFolder, fingerprint
 from og_pointcloud.settings import PaperSettings
 
-try:
+with naming_extra("torch", "learn"):
     import torch
-except ImportError as error:
-    raise MissingExtraError("torch", "learn") from error
 
 STEPS = {"scannet": (20_000, 20_000, 20_000), "lerf": (10_000, 10_000, 20_000)}
 """Steps of the features, the coarse and the fine codebook (the authors' code; the sums are the paper's)."""
@@ -409,11 +407,7 @@ class _Stage:
     """
 
     def __init__(
-        self,
-        history: StageHistory,
-        features: torch.Tensor,
-        rate: float,
-        centres: NDArray[np.float32] | None = None,
+        self, history: StageHistory, features: torch.Tensor, rate: float, centres: NDArray[np.float32] | None = None
     ) -> None:
         self.history, self.features = history, features
         self.adam = torch.optim.Adam([features.requires_grad_()], lr=rate, eps=ADAM_EPSILON, fused=True)

@@ -17,15 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from og_pointcloud.errors import MissingExtraError, OgPointcloudError, SceneError
+from og_pointcloud.errors import OgPointcloudError, SceneError, naming_extra
 from og_pointcloud.rendering.splatting import Gaussians, view_weights
 from og_pointcloud.scene import View
 from og_pointcloud.settings import PaperSettings
 
-try:
+with naming_extra("torch", "learn"):
     import torch
-except ImportError as error:
-    raise MissingExtraError("torch", "learn") from error
 
 
 @dataclass(frozen=True)
