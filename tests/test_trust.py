@@ -721,12 +721,11 @@ def test_soak(bundle):
 def test_turns_of_any_length():
     pytest.importorskip("rosbags")
     transforms_ = importlib.import_module("og_pointcloud_ros.transforms")
-    np.testing.assert_allclose(
-        transforms_.rotation_matrix((0, 0, 2, 2)), [[0, -1, 0], [1, 0, 0], [0, 0, 1]], atol=1e-12
-    )
+    turned = transforms_.pose_of((0, 0, 0), (0, 0, 2, 2))
+    np.testing.assert_allclose(turned[:3, :3], [[0, -1, 0], [1, 0, 0], [0, 0, 1]], atol=1e-12)
     for wrong in ((0, 0, 0, 0), (np.nan, 0, 0, 1)):
-        with pytest.raises(transforms_.TransformError, match="expected a quaternion of length 1"):
-            transforms_.rotation_matrix(wrong)
+        with pytest.raises(SceneError, match="expected a finite quaternion of length 1"):
+            transforms_.pose_of((0, 0, 0), wrong)
 
 
 def test_frames_that_hang_on_thousands_of_others():

@@ -35,9 +35,9 @@ class Finding:
     """An instance of some scene beside a word. center, size: of the axis-aligned box of its main part, (x, y, z) in its
     scene's world frame and unit.
 
-    score: where calibrated, the probability that it is what the word says; else between 0 and 1 how much better the
-    word fits than the other words that the scene's kin knows, or than nothing in common where they know no other
-    (LERF's relevancy, 0.5: as well). fits: whether the score is above one half.
+    score: where calibrated, the probability that it is what the word says; else LERF's relevancy, between 0 and 1: how
+    much better the word fits than the other words of the scene's encoder that are known here, or than a cosine of 0
+    where there are none; 0.5 is as well. fits: whether the score is above one half.
 
     >>> chair = og.Finding("office", 3, "chair", 0.9, (1.0, 2.0, 0.5), (0.5, 0.5, 1.0), 800, True, True)
     >>> list(chair.to_dict())
@@ -154,7 +154,7 @@ class Collection:
     ) -> Findings:
         """The instances that words fit best, of all scenes.
 
-        words: looked up in text_features, then in those of a scene's kin (scenes of the same feature space whose words
+        words: looked up in text_features, then in those of a scene's family (of the same feature space, and their words
         agree), else encoded, if there is an encoder. A scene that cannot be asked for a word is left out, and
         ``not_asked`` says so.
         within: two corners (3,); instances whose box has its center in between, in their scene's world.
@@ -220,12 +220,12 @@ class Collection:
         return vectors
 
     def _encoder(self, family: Family) -> TextEncoder | None:
-        """The encoder that a scene of the kin carries; or the one found for the space, where all its scenes are kin."""
+        """The encoder that a scene of the family carries; or the one found for the space, if that has one family."""
         for entry in family.entries:
             if entry.encoder and (encoder := carried_encoder(self.file(entry.name))()):
                 return encoder
-        kins = {id(group.family) for group in self._groups if group.family.feature_space == family.feature_space}
-        return find_encoder(family.feature_space) if len(kins) == 1 else None
+        of_space = {id(group.family) for group in self._groups if group.family.feature_space == family.feature_space}
+        return find_encoder(family.feature_space) if len(of_space) == 1 else None
 
     def _best(
         self, group: Group, wanted: _Wanted, word: str, vector: NDArray[np.float32]

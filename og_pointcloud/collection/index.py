@@ -1,11 +1,12 @@
-"""A folder of .ogpc files -> an atlas: only files that changed are read; then it is settled who judges whom.
+"""A folder of .ogpc files -> an atlas: only files that changed are read; then each scene gets the word bank that judges
+it, which makes its scores comparable with those of others.
 
 Cosines of two scenes cannot be compared: one has 0.3 where a word fits, another, whose features come from a detector's
-words, 0.8 where it does not. A word bank makes them comparable (`ask.choosing`), and where a scene brings none, its kin
-lends one: the bank of another scene of its feature space, else all words that the scenes of the space know together.
+words, 0.8 where it does not. A word bank makes them comparable (`ask.choosing`). A scene without one borrows that of
+another scene of its encoder, else all words that the scenes of its encoder know together.
 
-The name of a feature space is what somebody typed. Scenes that give the same words other vectors are no kin, whatever
-their spaces are called, and no word of one is ever asked of the other.
+Which scenes are of one encoder is not told by the name of their feature space, which is what somebody typed: scenes
+that give the same words other vectors are of two encoders (two families), and no word of one is asked of the other.
 """
 
 from __future__ import annotations
@@ -119,8 +120,8 @@ def _take(atlas: Atlas, name: str, file: Path, known: SceneEntry | None) -> bool
 
 @dataclass(frozen=True)
 class Family:
-    """Kin: scenes of one feature space and width whose words agree. words: all that they know together; of several
-    vectors of a word the first by scene names."""
+    """Scenes of one encoder: of one feature space and width, and their words agree. words: all that they know together;
+    of several vectors of a word the first by scene names."""
 
     feature_space: str
     width: int
@@ -137,7 +138,7 @@ class Family:
 
 @dataclass(frozen=True)
 class Group:
-    """Scenes of one kin that one bank judges, or none: they are asked alike."""
+    """Scenes of one family with the same bank, or all without: they are asked alike."""
 
     family: Family
     entries: list[SceneEntry]
@@ -154,17 +155,17 @@ class Group:
 
 
 def families(atlas: Atlas, entries: Iterable[SceneEntry]) -> list[Family]:
-    """The scenes of an atlas by kin.
+    """The scenes of an atlas by encoder.
 
-    A scene without words belongs to the kin of its space where there is only one. Scenes of a space that nobody named
-    have no kin.
+    A scene without words belongs to the family of its feature space where there is only one. Each scene of a space that
+    nobody named is a family of its own.
     """
     alike: dict[tuple[str, int, str, int], list[SceneEntry]] = {}
     for entry in entries:
         alone = entry.id if entry.feature_space == UNKNOWN_SPACE else 0
         alike.setdefault((entry.feature_space, entry.width, entry.vocabulary or "", alone), []).append(entry)
     found: list[Family] = []
-    # Those with words first: they say which kin there are.
+    # Those with words first: they say which families there are.
     for (space, width, digest, alone), members in sorted(
         alike.items(), key=lambda item: (not item[0][2], item[1][0].name)
     ):
@@ -210,7 +211,7 @@ def settle(atlas: Atlas) -> None:
 
 
 def _lent_bank(atlas: Atlas, family: Family) -> str | None:
-    """Digest of the bank for scenes that have none: what most of their kin have, else their pooled words."""
+    """Digest of the bank for scenes that have none: the one that most of their family have, else the family's words."""
     if banks := [entry.bank for entry in family.entries if entry.bank]:
         return max(sorted(set(banks)), key=banks.count)
     if len(family.words) < MIN_BANK or family.width == 0:

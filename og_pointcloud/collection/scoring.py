@@ -32,7 +32,7 @@ FIRST = 64
 
 @dataclass(frozen=True)
 class Block:
-    """Scenes that are asked alike: of one kin, with one vocabulary and one judge. Of I instances, those with a point
+    """Scenes that are asked alike: of one encoder, judged by one word bank, or none. Of I instances, those with a point
     and a descriptor; a scene's lie side by side.
 
     vectors: (R, D) float32, shift: (R,) float32; their product with a `direction`, plus the shift, is the evidence of a
@@ -208,7 +208,7 @@ def share(logit: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def load_block(atlas: Atlas, entries: Sequence[SceneEntry]) -> Block:
-    """Scenes of an atlas with one kin and judge; their arrays lie behind each other."""
+    """Scenes of an atlas of one encoder and word bank; their arrays lie behind each other."""
     parts: list[dict[str, NDArray[Any]]] = []
     width = entries[0].width
     vectors = np.empty((sum(entry.numbers for entry in entries) // width, width), np.float32)

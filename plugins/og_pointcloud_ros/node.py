@@ -28,11 +28,10 @@ from vision_msgs.msg import Detection3DArray, LabelInfo  # pyright: ignore[repor
 
 from og_pointcloud.ask.labelled_scene import LabelledScene, Segmenter, load
 from og_pointcloud.errors import OgPointcloudError
-from og_pointcloud.formats.poses import rigid
 from og_pointcloud_ros.detections import to_label_info
 from og_pointcloud_ros.labelling import MINIMUM_POINTS, CloudLabeller
 from og_pointcloud_ros.messages import ros_messages
-from og_pointcloud_ros.transforms import rotation_matrix
+from og_pointcloud_ros.transforms import pose_of
 
 PARAMETERS = {
     "scene": "",
@@ -76,7 +75,7 @@ class PlacedNode(Node):
         """(4, 4) from a header's frame to the target's at its time; tf2's TransformException without one."""
         found = self._transforms.lookup_transform(self._target_frame, head.frame_id, Time.from_msg(head.stamp))
         place, turn = found.transform.translation, found.transform.rotation
-        return rigid(rotation_matrix((turn.x, turn.y, turn.z, turn.w)), np.array([place.x, place.y, place.z]))
+        return pose_of((place.x, place.y, place.z), (turn.x, turn.y, turn.z, turn.w))
 
     def _warn(self, text: str) -> None:
         self.get_logger().warning(text, throttle_duration_sec=QUIET_S)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from og_pointcloud.errors import OgPointcloudError
-from og_pointcloud.formats.poses import rigid, rotation_of_quaternion
+from og_pointcloud.formats.poses import pose_of_quaternion
 from og_pointcloud_ros.messages import NANOSECONDS, nanoseconds
 
 LEAST_LENGTH = 1e-6
@@ -121,10 +121,10 @@ class TransformTree:
     def _pose(self, frame: str, stamp: int) -> NDArray[np.float64]:
         edge = self._edges[frame]
         if edge.static:
-            return _matrix(*edge.poses[-1])
+            return pose_of(*edge.poses[-1])
         after = bisect_left(edge.stamps, stamp)
         if after < len(edge.stamps) and edge.stamps[after] == stamp:
-            return _matrix(*edge.poses[after])
+            return pose_of(*edge.poses[after])
         if not 0 < after < len(edge.stamps):
             first, last, asked = (moment / NANOSECONDS for moment in (edge.stamps[0], edge.stamps[-1], stamp))
             raise TransformError(
@@ -133,7 +133,7 @@ class TransformTree:
         before = after - 1
         share = (stamp - edge.stamps[before]) / (edge.stamps[after] - edge.stamps[before])
         (place, turn), (next_place, next_turn) = edge.poses[before], edge.poses[after]
-        return _matrix(place + share * (next_place - place), slerp(turn, next_turn, share))
+        return pose_of(place + share * (next_place - place), slerp(turn, next_turn, share))
 
 
 def slerp(first: NDArray[np.float64], second: NDArray[np.float64], share: float) -> NDArray[np.float64]:
@@ -148,14 +148,6 @@ def slerp(first: NDArray[np.float64], second: NDArray[np.float64], share: float)
     return (np.sin((1 - share) * angle) * first + np.sin(share * angle) * second) / np.sin(angle)
 
 
-def rotation_matrix(xyzw: ArrayLike) -> NDArray[np.float64]:
-    """(3, 3) of a quaternion x y z w, ROS's order; of any length but 0, else TransformError."""
-    turn = np.asarray(xyzw, np.float64)
-    length = float(np.linalg.norm(turn))
-    if not (np.isfinite(length) and length > LEAST_LENGTH):
-        raise TransformError(f"a rotation is {turn.tolist()}; expected a quaternion of length 1")
-    return rotation_of_quaternion(np.roll(turn / length, 1))
-
-
-def _matrix(translation: NDArray[np.float64], xyzw: NDArray[np.float64]) -> NDArray[np.float64]:
-    return rigid(rotation_matrix(xyzw), translation)
+def pose_of(translation: ArrayLike, xyzw: ArrayLike) -> NDArray[np.float64]:
+    """(4, 4) of a translation (3,) and a quaternion x y z w, ROS's order, of any length but 0, else SceneError."""
+    return pose_of_quaternion(np.roll(np.asarray(xyzw, np.float64), 1), translation)
