@@ -24,7 +24,7 @@ from og_pointcloud_export.encoders import export_image_encoder
 from og_pointcloud.masking.clip import TransformersModel
 from og_pointcloud.masking.contracts import FEATURES, MaskEncoder
 from og_pointcloud.masking.dense import DenseEncoder
-from og_pointcloud.masking.encode import CropEncoder, open_mask_encoder
+from og_pointcloud.masking.encode import CropEncoder, open_encoder
 
 SIZE = (480, 640)
 SPACE = "random/clip-vit-base-patch16"
@@ -58,7 +58,7 @@ def main(arguments: list[str] | None = None) -> None:
         transformers.CLIPModel(transformers.CLIPConfig(vision_config=vision)).save_pretrained(Path(folder))
         model = TransformersModel(folder, SPACE)
         exported, _ = export_image_encoder(folder, Path(folder) / "onnx", feature_space=SPACE)
-        light_ones = [open_mask_encoder(exported, features) for features in FEATURES]
+        light_ones = [open_encoder(exported, features) for features in FEATURES]
     print(f"{'masks':>6} {'features':<8} {'torch s':>9} {'exported s':>11} {'difference':>11}")
     for name, in_torch, light in zip(FEATURES, (CropEncoder(model), DenseEncoder(model)), light_ones, strict=True):
         for encoder in (in_torch, light):

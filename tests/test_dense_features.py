@@ -14,7 +14,7 @@ from og_pointcloud.cli import main
 from og_pointcloud.errors import OgPointcloudError, SceneError
 from og_pointcloud.formats.capture import read_capture
 from og_pointcloud.masking.contracts import MaskSettings
-from og_pointcloud.masking.encode import CropEncoder, open_mask_encoder
+from og_pointcloud.masking.encode import CropEncoder, open_encoder
 from og_pointcloud.masking.make_masks import make_masks
 
 torch = pytest.importorskip("torch")
@@ -152,10 +152,10 @@ def test_an_exported_encoder_gives_masks_the_same_vectors(encoder, exported, sha
     random = np.random.default_rng(0)
     image = random.integers(0, 256, (*shape, 3)).astype(np.uint8)
     masks = random.uniform(size=(3, *shape)) < np.array([0.3, 0.05, 1.1])[:, None, None]
-    light = open_mask_encoder(exported, "dense")
+    light = open_encoder(exported, "dense")
     assert isinstance(light, DenseEncoder)
     np.testing.assert_allclose(light.embed(image, masks), encoder.embed(image, masks), atol=1e-5)
-    crops = open_mask_encoder(exported)
+    crops = open_encoder(exported)
     np.testing.assert_allclose(crops.embed(image, masks), CropEncoder(encoder.model).embed(image, masks), atol=1e-5)
 
 
@@ -167,13 +167,11 @@ def test_an_export_without_patches_and_one_that_lies_about_them(exported, tmp_pa
         return write_files(tmp_path / f"p{patch}", {"manifest.json": json.dumps(manifest | patch).encode(), **files})
 
     with pytest.raises(OgPointcloudError, match=r"whole squares alone; .*export image makes of it today"):
-        open_mask_encoder(changed({"patch": None}), "dense")
+        open_encoder(changed({"patch": None}), "dense")
     with pytest.raises(OgPointcloudError, match="patch is 0; expected a whole number up to 32"):
-        open_mask_encoder(changed({"patch": 0}), "dense")
+        open_encoder(changed({"patch": 0}), "dense")
     with pytest.raises(OgPointcloudError, match=r"expected finite float32 \(1, 16, 16, "):
-        open_mask_encoder(changed({"patch": 4}), "dense").embed(
-            np.zeros((64, 64, 3), np.uint8), np.ones((1, 64, 64), bool)
-        )
+        open_encoder(changed({"patch": 4}), "dense").embed(np.zeros((64, 64, 3), np.uint8), np.ones((1, 64, 64), bool))
 
 
 def test_a_model_without_patches_is_refused(tmp_path):
@@ -182,4 +180,4 @@ def test_a_model_without_patches_is_refused(tmp_path):
         make_masks(tmp_path / "c", MaskSettings(features="dense"), progress=False)
     with pytest.raises(OgPointcloudError, match="features are 'thick'; expected one of crops, dense"):
         MaskSettings(features="thick")
-    assert open_mask_encoder("demo").width
+    assert open_encoder("demo").width

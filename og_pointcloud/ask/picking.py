@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import overload
 
 import numpy as np
@@ -23,6 +23,7 @@ from og_pointcloud.ask.labelled_scene import LabelledScene, SceneLike, as_scene
 from og_pointcloud.bundle.nearest import NONE_WITHIN_REACH
 from og_pointcloud.cloud import BACKGROUND, TOO_FAR, UNOBSERVED, LabelledCloud
 from og_pointcloud.errors import OgPointcloudError
+from og_pointcloud.formats.poses import in_local_frame
 from og_pointcloud.scene import Camera
 from og_pointcloud.text.words import Labels, TextFeatures
 
@@ -143,9 +144,7 @@ def in_world(camera: Camera, origin: NDArray[np.float64]) -> Camera:
     >>> og.in_world(local, np.array([500.0, 0, 20])).center
     array([500.,   0.,  20.])
     """
-    pose = camera.world_to_camera.copy()
-    pose[:3, 3] -= pose[:3, :3] @ np.asarray(origin, np.float64)
-    return replace(camera, world_to_camera=pose)
+    return in_local_frame(camera, -np.asarray(origin, np.float64))
 
 
 def front_points(cloud: LabelledCloud, camera: Camera) -> NDArray[np.int64]:

@@ -68,32 +68,26 @@ class ImageModel(Protocol):
         ...
 
 
-def open_mask_encoder(name: str | os.PathLike[str], features: str = "crops") -> MaskEncoder:
-    """An encoder as `open_encoder`; features "dense": one run an image (`dense.DenseEncoder`). OgPointcloudError where
-    a model has no patches."""
-    encoder = open_encoder(name)
+def open_encoder(name: str | os.PathLike[str], features: str = "crops") -> MaskEncoder:
+    """Open an encoder; nothing is downloaded.
+
+    name: "demo"; a folder that ``og-pointcloud export image`` wrote; a transformers folder of CLIP or SigLIP, which
+        needs torch; or OWNER/MODEL, looked for in the folders of OG_POINTCLOUD_MODELS, in the user's cache, and among
+        what Hugging Face's own tools have fetched.
+    features: "crops", a few runs of the model a mask (`CropEncoder`), or "dense", one an image (`dense.DenseEncoder`).
+    Raises OgPointcloudError where there is no such encoder, and where a model has no patches, which "dense" needs.
+    """
+    model = _open_model(name)
     if features == "crops":
-        return encoder
-    if getattr(encoder.model, "patch", None) is None:
+        return CropEncoder(model, model.crops)
+    if getattr(model, "patch", None) is None:
         raise OgPointcloudError(
             f"the encoder '{name}' has vectors of whole squares alone; expected for --features dense CLIP or SigLIP, a "
             "transformers folder or what og-pointcloud export image makes of it today: name one, or take crops"
         )
     from og_pointcloud.masking.dense import DenseEncoder
 
-    return DenseEncoder(encoder.model)  # pyright: ignore[reportArgumentType]
-
-
-def open_encoder(name: str | os.PathLike[str]) -> CropEncoder:
-    """Open an encoder; nothing is downloaded.
-
-    name: "demo"; a folder that ``og-pointcloud export image`` wrote; a transformers folder of CLIP or SigLIP, which
-        needs torch; or OWNER/MODEL, looked for in the folders of OG_POINTCLOUD_MODELS, in the user's cache, and among
-        what Hugging Face's own tools have fetched.
-    Raises OgPointcloudError where there is no such encoder.
-    """
-    model = _open_model(name)
-    return CropEncoder(model, model.crops)
+    return DenseEncoder(model)  # pyright: ignore[reportArgumentType]
 
 
 def _open_model(name: str | os.PathLike[str]) -> ImageModel:

@@ -18,7 +18,7 @@ from og_pointcloud.cloud import UNKNOWN_SPACE
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.atomic import replacing
 from og_pointcloud.masking.contracts import MaskProposer, MaskSettings
-from og_pointcloud.masking.encode import open_mask_encoder
+from og_pointcloud.masking.encode import open_encoder
 from og_pointcloud.masking.existing import ExistingMasks, own_proposer
 from og_pointcloud.masking.levels import settled
 from og_pointcloud.masking.photographs import Photograph
@@ -42,7 +42,7 @@ class ImageWorker:
             self.proposer = ExistingMasks(folder, settings.tracks)
         else:
             self.proposer = open_proposer(settings.proposer, settings.words, done if settings.tracks else None)
-        self.encoder = open_mask_encoder(settings.encoder, settings.features) if settings.encoder is not None else None
+        self.encoder = open_encoder(settings.encoder, settings.features) if settings.encoder is not None else None
 
     def __call__(self, task: ImageTask) -> str | None:
         """Make the image's work file; what is wrong with the image, or None."""

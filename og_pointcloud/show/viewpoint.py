@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from og_pointcloud.formats.poses import rigid
 from og_pointcloud.scene import Camera
 
 FOCAL = 1.7
@@ -41,9 +42,8 @@ class Viewpoint:
 
     def camera(self, width: int, height: int, focal_px: float) -> Camera:
         """A camera of world coordinates; the middle of its image shows the target."""
-        pose = np.eye(4)
-        pose[:3, :3] = self.axes() * [[1], [-1], [1]]  # cameras have y down
-        pose[:3, 3] = -pose[:3, :3] @ self.eye
+        rotation = self.axes() * [[1], [-1], [1]]  # cameras have y down
+        pose = rigid(rotation, -rotation @ self.eye)
         return Camera(width, height, focal_px, focal_px, width / 2, height / 2, pose)
 
 
