@@ -169,7 +169,7 @@ def test_scenes_without_a_point_of_the_task_are_left_out(scannet, capsys):
     report = json.loads((scannet / "s.json").read_text())
     assert (report["19"]["miou"], report["10"]["miou"]) == (0.25, 0.5)  # bathtub 0 of 2; wall 1 of 2
     assert report["10"]["scenes"]["scene0000_00"] == {
-        "miou": None, "macc": None, "unknown": None, "points": 0, "class_iou": {},
+        "miou": None, "macc": None, "forced_miou": None, "unknown": None, "points": 0, "class_iou": {},
     }  # fmt: skip
     assert report["10"]["interval"] == [0.5, 0.5]
     capsys.readouterr()

@@ -92,7 +92,7 @@ def capture_cells(score: CaptureScore) -> dict[str, str]:
     labels = score.labels
     return {
         "mIoU": percent(labels.miou),
-        "95 %": spread(score.interval),
+        "95 %": spread((score.interval.low, score.interval.high)),
         "mAcc": percent(labels.macc),
         "unknown": percent(labels.unknown_share),
         "background called": percent(labels.background_called),
@@ -114,50 +114,46 @@ def run_scannet(arguments: argparse.Namespace) -> None:
 
     truths = scannet_truths(arguments.folder, names_in(arguments.scenes))
     files = {scene: prediction_file(arguments.predictions, scene) for scene in truths}
-    scores: dict[int, dict[str, tuple[Score, Score]]] = {task: {} for task in TASKS}
+    scores: dict[int, dict[str, dict[str, Any]]] = {task: {} for task in TASKS}
     for scene, file in truths.items():
         xyz, truth = read_truth(file)
         opacity = opacities(arguments.gaussians, scene, len(truth))
         for task, of_task in scores.items():
-            said, forced = (
-                score_scene(found, truth, task, opacity)
-                for found in ask(files[scene], xyz, task, arguments.text_features)
-            )
-            of_task[scene] = said, forced
+            asked = ask(files[scene], xyz, task, arguments.text_features)
+            of_task[scene] = scene_scores(*(score_scene(found, truth, task, opacity) for found in asked))
     means = {task: task_means(list(of_task.values())) for task, of_task in scores.items()}
     rows = [
-        (f"{task} classes", *map(percent, mean.values()), spread(interval)) for task, (mean, interval) in means.items()
+        (f"{task} classes", *(percent(mean[name]) for name in TASK_MEANS), spread(mean["interval"]))
+        for task, mean in means.items()
     ]
     print_table(("", "mIoU", "mAcc", "forced", "unknown", "95 % of mIoU"), rows)
     published = sum(scene in SCENES for scene in truths)
     print(f"{len(truths)} scenes, {published} of the {len(SCENES)} of the published table; intervals are over scenes")
     if arguments.gaussians is None:
         print("no --gaussians: transparent points are not ignored")
-    report = {}
-    for task, (mean, interval) in means.items():
-        scenes = {
-            scene: {
-                "miou": said.miou, "macc": said.macc, "unknown": said.unknown_share, "points": said.points,
-                "class_iou": dict(zip(map(str, said.classes), said.class_iou, strict=True)),
-            }
-            for scene, (said, _) in scores[task].items()
-        }  # fmt: skip
-        spans = [interval.low, interval.high] if interval else None
-        report[str(task)] = {**mean, "interval": spans, "scenes": scenes}
-    write_scores(arguments, report)
+    write_scores(arguments, {str(task): {**mean, "scenes": scores[task]} for task, mean in means.items()})
 
 
-def task_means(scores: Sequence[tuple[Score, Score]]) -> tuple[dict[str, float | None], Interval | None]:
-    """Means over the scenes that have a point of the task, as said and as forced; the interval of the mIoU."""
+def scene_scores(said: Score, forced: Score) -> dict[str, Any]:
+    """Of one scene and task. forced: where each instance takes its best class, however badly it fits."""
+    return {
+        "miou": said.miou, "macc": said.macc, "forced_miou": forced.miou, "unknown": said.unknown_share,
+        "points": said.points, "class_iou": dict(zip(map(str, said.classes), said.class_iou, strict=True)),
+    }  # fmt: skip
+
+
+def task_means(scenes: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Means over the scenes that have a point of the task, and the interval of the mIoU, low and high."""
     import numpy as np
 
     from og_pointcloud.evaluate.intervals import bootstrap
 
-    present = [(said, forced) for said, forced in scores if said.classes]
+    present = [scene for scene in scenes if scene["class_iou"]]
     if not present:
-        return dict.fromkeys(TASK_MEANS), None
-    table = np.array([(said.miou, said.macc, forced.miou, said.unknown_share) for said, forced in present])
-    return dict(zip(TASK_MEANS, table.mean(axis=0).tolist(), strict=True)), bootstrap(table[:, 0])
+        return dict.fromkeys((*TASK_MEANS, "interval"))
+    table = np.array([[scene[name] for name in TASK_MEANS] for scene in present])
+    found = bootstrap(table[:, 0])
+    return dict(zip(TASK_MEANS, table.mean(axis=0).tolist(), strict=True)) | {"interval": (found.low, found.high)}
 
 
 def scannet_truths(folder: Path, scenes: list[str] | None) -> dict[str, Path]:
@@ -227,7 +223,7 @@ def print_selections(scenes: Mapping[str, Sequence[PairScore]]) -> dict[str, dic
     rows.append(("mean", str(total), *(percent(value) for mean in means.values() for value in mean)))
     pooled = [np.concatenate(list(of_way.values())) for of_way in ious.values()]
     intervals = [bootstrap(column) for every in pooled for column in (every, (every > IOU_FOUND).astype(float))]
-    rows.append(("95 % over pairs", "", *map(spread, intervals)))
+    rows.append(("95 % over pairs", "", *(spread((found.low, found.high)) for found in intervals)))
     print_table(("", "pairs", *(f"{way} {what}" for way in WAYS for what in ("mIoU", "over 0.25"))), rows)
     print(f"{total} pairs of {len(scenes)} scenes; the published table has {PUBLISHED_PAIRS} of 4")
     return {way: {"miou": miou, "accuracy": found} for way, (miou, found) in means.items()}
@@ -284,8 +280,8 @@ def percent(value: float | None) -> str:
     return "-" if value is None or value != value else f"{100 * value:.1f}"
 
 
-def spread(interval: Interval | None) -> str:
-    return f"{percent(interval.low)} to {percent(interval.high)}" if interval else "-"
+def spread(interval: tuple[float, float] | None) -> str:
+    return " to ".join(map(percent, interval)) if interval else "-"
 
 
 def signed(interval: Interval) -> str:

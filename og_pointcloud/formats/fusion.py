@@ -217,23 +217,24 @@ def _judge(
         surface = np.where(on_surface(image, found.noise), image.depth, np.float32(0))
         # Looked through only if all pixels around did: a thin thing half a pixel off is still there.
         nearest = np.asarray(cv2.erode(image.depth, np.ones((3, 3), np.uint8)), np.float32)
-        lens = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
-        _add_votes(
-            xyz, camera.world_to_camera[:3, :3], camera.center - origin, lens, image.depth, surface, nearest,
-            found.tolerance, found.depth, votes, shift,
-        )  # fmt: skip
+        seen_from = camera.world_to_camera[:3, :3], camera.center - origin, (camera.fx, camera.fy, camera.cx, camera.cy)
+        depths, limits = (image.depth, surface, nearest), (found.tolerance, found.depth)
+        _add_votes(xyz, seen_from, depths, limits, votes, shift)
     confirmed, refuted, could_see = votes.T
     stays = (confirmed > refuted) & (confirmed >= np.where(could_see >= 3, 2, 1))
     return stays, xyz + shift[:, :3] / np.maximum(shift[:, 3:], np.finfo(np.float64).tiny)
 
 
 @njit(cache=True, parallel=True)
-def _add_votes(xyz, rotation, center, lens, depth, surface, nearest, tolerance, typical, votes, shift):  # noqa: ANN001, ANN202
+def _add_votes(xyz, seen_from, depths, limits, votes, shift):  # noqa: ANN001, ANN202
     """One view's votes on all points: confirmed, refuted, could see; and the weighted way to the surface it measured.
 
-    surface: depth without flying pixels. nearest: the smallest depth of 3x3 pixels, 0 if one of them is unmeasured.
+    seen_from: rotation to the camera, its centre, and fx, fy, cx, cy. depths: (H, W) as measured; the same without
+    flying pixels; the smallest of 3x3 pixels, 0 if one of them is unmeasured. limits: the tolerance, and the typical
+    depth that it is of.
     """
-    fx, fy, cx, cy = lens
+    rotation, center, (fx, fy, cx, cy) = seen_from
+    (depth, surface, nearest), (tolerance, typical) = depths, limits
     height, width = depth.shape
     for i in prange(len(xyz)):
         x, y, z = xyz[i, 0] - center[0], xyz[i, 1] - center[1], xyz[i, 2] - center[2]
