@@ -53,7 +53,7 @@ def test_a_cause_is_found_where_lenses_left_pixels_unseen(scene: Scene):
 
 
 def literally(scene: Scene):
-    """The same in dense arrays and loops: (again, named) of each instance."""
+    """The same in dense arrays and loops: (again, named, kept) of each instance."""
     prepared = prepare(scene, SETTINGS)
     table, surface = prepared.table, prepared.surface
     labelling = grouping(table, surface, SETTINGS, Journal(progress=False))
@@ -78,7 +78,8 @@ def literally(scene: Scene):
     def nearest(feature):
         return int(np.argmax([feature @ other for other in looks]))
 
-    shares = np.zeros((2, len(looks)))
+    shares, kept_shares = np.zeros((2, len(looks))), np.ones((2, len(looks)))
+    ids = labelling.instance_ids
     for number in (0, 1):
         kept = sorted(order[number::2])
         masks = [m for m in range(len(table.mask_view)) if table.mask_view[m] in kept]
@@ -91,18 +92,23 @@ def literally(scene: Scene):
             table.mask_features[masks],
         )
         found = grouping(half, surface, SETTINGS, Journal(progress=False))
+        name = [nearest(look(found.instances, k)) if k >= 0 else -1 for k in found.instance_ids]
+        weights, outside = half.weights.toarray(), half.outside.toarray()
+        seen = weights.sum(axis=0) + outside.sum(axis=0)
         for k in range(len(looks)):
-            own = np.flatnonzero(labelling.instance_ids == k)
-            same = 0
-            for point in own:
-                other = found.instance_ids[point]
-                same += other >= 0 and alike(k, nearest(look(found.instances, other)))
-            shares[number, k] = same / len(own)
+            own = np.flatnonzero(ids == k)
+            same = [point for point in own if name[point] >= 0 and alike(k, name[point])]
+            beyond = [p for p in range(len(ids)) if name[p] == k and not (ids[p] >= 0 and alike(k, ids[p]))]
+            shares[number, k] = 2 * len(same) / (len(own) + len(same) + len(beyond))
+            in_masks = weights[labelling.mask_instance[masks] == k].sum(axis=0)
+            mostly = [point for point in range(len(ids)) if in_masks[point] > seen[point] / 2]
+            if mostly:
+                kept_shares[number, k] = np.mean([ids[point] == k for point in mostly])
     named = [
         np.mean([alike(k, nearest(direction(features[m]))) for m in np.flatnonzero(labelling.mask_instance == k)])
         for k in range(len(looks))
     ]
-    return shares.mean(axis=0), np.array(named)
+    return shares.mean(axis=0), np.array(named), kept_shares.mean(axis=0)
 
 
 def noisy_features(scene: Scene, seed: int = 0) -> Scene:
@@ -118,10 +124,12 @@ def noisy_features(scene: Scene, seed: int = 0) -> Scene:
 def test_it_is_what_loops_say(scene: Scene, seed: int) -> None:
     noisy = noisy_features(scene, seed)
     found, _ = judged(noisy)
-    again, named = literally(noisy)
+    again, named, kept = literally(noisy)
     np.testing.assert_allclose(found.again, again, atol=1e-12)
     np.testing.assert_allclose(found.named, named, atol=1e-12)
+    np.testing.assert_allclose(found.kept, kept, atol=1e-12)
     assert found.named.min() < 1
+    assert found.kept.min() < 1
 
 
 def test_an_honest_capture_is_reliable_and_without_warning(scene: Scene) -> None:

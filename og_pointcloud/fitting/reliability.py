@@ -1,12 +1,15 @@
 """How good a fit is, without truth: its split-half reliability, for each instance and for the scene.
 
 Labels are made anew from either half of the views, every other one by name, from the rows of the mask table that there
-are already. An instance is as reliable as the product of two shares in [0, 1]:
+are already. An instance is as reliable as the product of three shares in [0, 1]:
 
-    again   of its points, those that a half gives the same look, mean of both halves. Few views, geometry that hides
-            the wrong things, wrong poses and masks that are cut otherwise in every view lower it
+    again   how far its points are those that a half gives its look (Dice: twice those that are both, over the sum of
+            both), mean of both halves. Few views, geometry that hides the wrong things, wrong poses and masks that are
+            cut otherwise in every view lower it
     named   of its masks, those whose own feature, alone, is nearest to the instance's look. An encoder that errs, and
             masks that span several things, lower it
+    kept    of the points that lie mostly in masks of it, those that it has. What all halves get wrong alike, since
+            rays slip through a surface in all views, or since masks hold more than the thing, still lowers this
 
 Instances are of one look where their descriptors are alike once what all masks have in common is taken away: two
 chairs are, and either may be found where the other was. What all views get wrong alike no half can tell. Over
@@ -23,6 +26,7 @@ from scipy.sparse import csr_array, vstack
 
 from og_pointcloud.cloud import InstanceTable, unit_rows
 from og_pointcloud.errors import SceneError
+from og_pointcloud.fitting.grouping import indicator
 from og_pointcloud.fitting.held_out import FEWEST_VIEWS
 from og_pointcloud.fitting.labellers import Labelling, grouping
 from og_pointcloud.fitting.mask_table import MaskTable
@@ -34,6 +38,8 @@ from og_pointcloud.settings import FitSettings
 SAME_LOOK = 0.5
 """Cosine of descriptors, without what all masks share, from which two instances are of one look. Unrelated things have
 about 0; 0.3 and 0.7 rank scenes of the zoo as well."""
+MOSTLY = 0.5
+"""Share of what is seen of a point from which it lies in the masks of one instance alone."""
 ROWS_AT_ONCE = 1 << 24
 """Cosines held at once."""
 ROWS = 16
@@ -44,17 +50,18 @@ Bools = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class Reliability:
-    """again, named: (K,) in [0, 1] as above; NaN where an instance has no feature or no point that was judged. alone:
-    share of the judged points in instances that one of the halves does not see."""
+    """again, named, kept: (K,) in [0, 1] as above; NaN where an instance has no feature or no point that was judged.
+    alone: share of the judged points in instances that one of the halves does not see."""
 
     again: NDArray[np.float64]
     named: NDArray[np.float64]
+    kept: NDArray[np.float64]
     alone: float
 
     @property
     def of_instance(self) -> NDArray[np.float32]:
         """(K,) their product."""
-        return (self.again * self.named).astype(np.float32)
+        return (self.again * self.named * self.kept).astype(np.float32)
 
 
 def split_half(table: MaskTable, surface: Surface, labelling: Labelling, settings: FitSettings) -> Reliability | None:
@@ -68,17 +75,18 @@ def split_half(table: MaskTable, surface: Surface, labelling: Labelling, setting
     sample = sample_of_points(surface.gaussians.xyz, settings.geometry.held_out_points)
     judged = _of_points(surface, sample, settings)
     ids = labelling.instance_ids[sample]
-    looks = _Looks(table, labelling.instances)
-    points = np.bincount(ids[ids >= 0], minlength=len(labelling.instances)).astype(np.float64)
-    again, unseen = np.zeros(len(points)), np.zeros(len(ids), bool)
+    looks, count = _Looks(table, labelling.instances), len(labelling.instances)
+    points = np.bincount(ids[ids >= 0], minlength=count)
+    again, kept, unseen = np.zeros(count), np.zeros(count), np.zeros(len(ids), bool)
     for half in (masked[0::2], masked[1::2]):
         part = _of_views(table, np.sort(half), sample)
         unseen |= np.asarray(part.exposure.sum(axis=0)).ravel() == 0
-        again += np.bincount(ids[_same(part, judged, ids, looks, settings)], minlength=len(points)) / 2
+        again += _again(ids, _named_by(part, judged, looks, settings), looks, points) / 2
+        kept += _kept(part, labelling.mask_instance[np.isin(table.mask_view, half)], ids, count) / 2
     known = looks.described & (points > 0)
-    share = np.divide(again, points, out=np.full(len(points), np.nan), where=known)
     alone = float(unseen[ids >= 0].mean()) if (ids >= 0).any() else 0.0
-    return Reliability(share, np.where(known, _named(table, labelling, looks), np.nan), alone)
+    again, named, kept = (np.where(known, share, np.nan) for share in (again, _named(table, labelling, looks), kept))
+    return Reliability(again, named, kept, alone)
 
 
 class _Looks:
@@ -121,18 +129,29 @@ class _Looks:
         return same[place.ravel()]
 
 
-def _same(table: MaskTable, surface: Surface, ids: NDArray[np.int32], looks: _Looks, settings: FitSettings) -> Bools:
-    """(n,) points of an instance that labels made from these views alone give the look of that instance."""
+def _again(
+    ids: NDArray[np.int32], name: NDArray[np.int64], looks: _Looks, points: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    """(K,) Dice coefficient of each instance with what a half gives its look. points: (K,) how many are of it.
+
+    name: (n,) the instance that a half names each point. What it gives a look beyond those of that look counts for the
+    one it names.
+    """
+    same = looks.alike(ids, name)
+    beyond = np.bincount(name[~same & (name >= 0)], minlength=len(points))
+    both = np.bincount(ids[same], minlength=len(points))
+    return 2 * both / np.maximum(points + both + beyond, 1)
+
+
+def _named_by(table: MaskTable, surface: Surface, looks: _Looks, settings: FitSettings) -> NDArray[np.int64]:
+    """(n,) the instance whose look is nearest to what labels made from these views alone give each point, -1 none."""
     try:
         found = grouping(table, surface, settings, Journal(progress=False))
     except SceneError:
-        return np.zeros(len(ids), bool)
+        return np.full(len(surface.gaussians), -1)
     directions, described = looks.of(found.instances)
-    name = np.where(described, looks.nearest(directions), -1)
-    labelled = np.flatnonzero((ids >= 0) & (found.instance_ids >= 0))
-    same = np.zeros(len(ids), bool)
-    same[labelled] = looks.alike(ids[labelled], name[found.instance_ids[labelled]])
-    return same
+    name = np.append(np.where(described, looks.nearest(directions), -1), -1)
+    return name[np.maximum(found.instance_ids, -1)]
 
 
 def _named(table: MaskTable, labelling: Labelling, looks: _Looks) -> NDArray[np.float64]:
@@ -143,6 +162,19 @@ def _named(table: MaskTable, labelling: Labelling, looks: _Looks) -> NDArray[np.
     count = len(labelling.instances)
     masks = np.bincount(owner[used], minlength=count)
     return np.divide(np.bincount(owner[used], right, count), masks, out=np.ones(count), where=masks > 0)
+
+
+def _kept(table: MaskTable, owner: NDArray[np.int32], ids: NDArray[np.int32], count: int) -> NDArray[np.float64]:
+    """(K,) of the points that lie mostly in masks of an instance, the share that it has; 1 where there is none.
+
+    owner: (masks,) the instance of each mask, -1 none.
+    """
+    by_instance = csr_array(indicator(owner, count) @ table.weights).tocoo()
+    mostly = by_instance.data > MOSTLY * table.seen[by_instance.col]
+    instance, point = by_instance.row[mostly], by_instance.col[mostly]
+    masked = np.bincount(instance, minlength=count)
+    kept = np.bincount(instance, ids[point] == instance, count)
+    return np.divide(kept, masked, out=np.ones(count), where=masked > 0)
 
 
 def _of_views(table: MaskTable, views: NDArray[np.int64], points: NDArray[np.int64]) -> MaskTable:
