@@ -59,7 +59,7 @@ of_default = np.full_like(features, np.nan)
 of_default[slice(None) if rows is None else rows] = means[np.maximum(instance, -1)]
 stages = {
     "mode paper: features": np.where(shown[:, None], features, np.nan),
-    "mode paper: leaves of the codebook": np.where(shown[:, None], book.centres[book.leaf], np.nan),
+    "mode paper: leaves of the codebook": np.where(shown[:, None], book.centers[book.leaf], np.nan),
     "default: instances, in the mean color of their points": of_default,
 }
 up = -np.mean([view.camera.world_to_camera[1, :3] for view in scene.views], axis=0)

@@ -207,10 +207,10 @@ class LabelledCloud:
     xyz: (n, 3) float32, local frame; origin: (3,) float64, world = xyz + origin.
     instance_ids: (n,) int32, >= 0 a row of ``instances``, else BACKGROUND or UNOBSERVED.
     feature_space: name of the encoder that mask features and text vectors share.
-    spacing: typical distance between neighbouring points, in the scene's unit.
+    spacing: typical distance between neighboring points, in the scene's unit.
     reach: distance from the cloud beyond which a query point is "too far from the map", same unit.
     rgb: (n, 3) uint8 or None.
-    certainty: (n,) uint8, in 255ths, how far views and neighbours bear out that a point is in its instance, or in none;
+    certainty: (n,) uint8, in 255ths, how far views and neighbors bear out that a point is in its instance, or in none;
     0 where no view saw it. None where that is not known, as in results of others.
     vocabulary: words that may be asked as strings. word_bank: everyday words of the same encoder, which labels are
     judged by; without one, answers are not calibrated.

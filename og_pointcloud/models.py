@@ -73,7 +73,7 @@ def fetched_model(name: str) -> Path | None:
 
 
 def open_session(model: bytes, *, bounded: bool = False) -> InferenceSession:
-    """A CPU session that leaves the cores idle between runs. model: a serialised ONNX graph.
+    """A CPU session that leaves the cores idle between runs. model: a serialized ONNX graph.
 
     bounded: for a stranger's graph. Nothing is computed on opening, and all that such graphs compute shares
     MOST_GRAPH_BYTES: what asks for more fails.

@@ -1,7 +1,7 @@
 """What training reads: points and views. This file is the only statement of frames and units.
 
 Frames. Cameras are OpenCV (x right, y down, z forward); ``world_to_camera`` maps local world coordinates to the
-camera. Pixel (row i, column j) has its centre at (j + 0.5, i + 0.5). World coordinates are ``local + origin``:
+camera. Pixel (row i, column j) has its center at (j + 0.5, i + 0.5). World coordinates are ``local + origin``:
 the origin (float64) takes map offsets of 1e6 away so that everything after reading works in float32 near zero.
 
 Units. Whatever the capture uses; no threshold of the library is a length, all are multiples of the point spacing
@@ -39,7 +39,7 @@ UNIT_TOLERANCE = 1e-3
 class Camera:
     """A pinhole camera without distortion.
 
-    width, height: pixels. fx, fy, cx, cy: pixels (pixel centres at +0.5).
+    width, height: pixels. fx, fy, cx, cy: pixels (pixel centers at +0.5).
     world_to_camera: (4, 4) float64 rigid transform from the scene's local frame, OpenCV axes.
 
     >>> import numpy as np
@@ -87,7 +87,7 @@ class Camera:
         return replace(self, width=width, height=height, fx=self.fx * x, fy=self.fy * y, cx=self.cx * x, cy=self.cy * y)
 
     def project(self, xyz: NDArray[np.floating]) -> tuple[DoubleArray, DoubleArray]:
-        """Where points appear: uv_px (n, 2) column and row, pixel centres at +0.5, and depth (n,) along the view axis.
+        """Where points appear: uv_px (n, 2) column and row, pixel centers at +0.5, and depth (n,) along the view axis.
 
         xyz: (n, 3) in the frame that ``world_to_camera`` starts from. Computed in float64. Points that are not before
         the camera (depth <= 0) have NaN for uv_px, which no comparison takes for a pixel; points beside the image have
@@ -105,7 +105,7 @@ class Camera:
 
     @property
     def center(self) -> DoubleArray:
-        """Camera centre in the local frame, (3,) float64."""
+        """Camera center in the local frame, (3,) float64."""
         rotation, translation = self.world_to_camera[:3, :3], self.world_to_camera[:3, 3]
         return -rotation.T @ translation
 
@@ -129,7 +129,7 @@ class View:
     masks: (H, W) int32, -1 outside every mask, NOT_SEEN where the photograph shows nothing (beyond a lens's rim), else
         a row of ``mask_features``; or a function that reads it, so that a long capture is streamed. H, W are the
         camera's.
-    mask_features: (M, D) float32, one row per mask, as the encoder gave it (not normalised).
+    mask_features: (M, D) float32, one row per mask, as the encoder gave it (not normalized).
     image: (H, W, 3) uint8 RGB, or a function that reads it, or None where the capture has no images.
     mask_tracks: (M,) integers, which masks of other views a tracker took for the same thing: equal numbers, -1 unknown;
         None where there was no tracker.

@@ -470,7 +470,7 @@ def test_features_of_another_kind(capture, values):
 def test_colour_masks_are_refused(capture, pixels, kind):
     folder, _ = capture
     write_image(folder / "masks/frame_01.png", pixels)
-    with pytest.raises(SceneError, match=rf"frame_01.png is a {kind}; expected a grey PNG of 8 or 16 bit"):
+    with pytest.raises(SceneError, match=rf"frame_01.png is a {kind}; expected a gray PNG of 8 or 16 bit"):
         read_capture(folder)
 
 
@@ -482,7 +482,7 @@ def png_with_header(width, height, bit_depth, color_type):
 @pytest.mark.parametrize(
     ("data", "message"),
     [
-        (png_with_header(WIDTH, HEIGHT, 4, 0), "is a grey PNG of 4 bit"),
+        (png_with_header(WIDTH, HEIGHT, 4, 0), "is a gray PNG of 4 bit"),
         (png_with_header(2**31 - 1, 2**31 - 1, 8, 0), "expected at most 134217728 pixels"),
         (b"\xff\xd8\xff\xe0JFIF" * 10, "is not a PNG"),
         (b"", "is not a PNG"),

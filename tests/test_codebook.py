@@ -12,7 +12,7 @@ from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.fitting.learned.codebook import (
     Codebook,
     kmeans,
-    seed_centres,
+    seed_centers,
     thing_count,
     things_together,
     two_level_codebook,
@@ -26,57 +26,57 @@ DEFAULTS = CodebookSettings()
 def blobs(count: int = 4000, places: int = 12, width: int = 9, seed: int = 0, spread: float = 0.05):
     """Points around places, the place of each, and weights of which some are 0."""
     random = np.random.default_rng(seed)
-    centres = random.normal(size=(places, width))
+    centers = random.normal(size=(places, width))
     place = random.integers(0, places, count)
-    values = (centres[place] + spread * random.normal(size=(count, width))).astype(np.float32)
+    values = (centers[place] + spread * random.normal(size=(count, width))).astype(np.float32)
     return values, place, random.random(count) * (random.random(count) > 0.1)
 
 
-def lloyd(values, weight, centres, rounds: int):
+def lloyd(values, weight, centers, rounds: int):
     """Weighted Lloyd as in a text book: every distance, in float64."""
-    values, centres = values.astype(np.float64), centres.astype(np.float64)
+    values, centers = values.astype(np.float64), centers.astype(np.float64)
 
     def nearest() -> NDArray[np.intp]:
-        return ((values[:, None] - centres[None]) ** 2).sum(axis=2).argmin(axis=1)
+        return ((values[:, None] - centers[None]) ** 2).sum(axis=2).argmin(axis=1)
 
     for _ in range(rounds):
         own = nearest()
-        for cluster in range(len(centres)):
+        for cluster in range(len(centers)):
             mine = weight * (own == cluster)
             if mine.sum() > 0:
-                centres[cluster] = mine @ values / mine.sum()
-    return nearest(), centres
+                centers[cluster] = mine @ values / mine.sum()
+    return nearest(), centers
 
 
-def spread(values, weight, own, centres) -> float:
-    return float(weight @ ((values.astype(np.float64) - centres[own]) ** 2).sum(axis=1))
+def spread(values, weight, own, centers) -> float:
+    return float(weight @ ((values.astype(np.float64) - centers[own]) ** 2).sum(axis=1))
 
 
 @pytest.mark.parametrize("rounds", [0, 1, 3, 25])
 def test_kmeans_is_lloyds(rounds: int) -> None:
     values, _, weight = blobs(spread=0.6)
     start = values[:15]
-    own, centres = kmeans(values, weight, start, rounds, reseed=False)
+    own, centers = kmeans(values, weight, start, rounds, reseed=False)
     expected_own, expected = lloyd(values, weight, start, rounds)
-    np.testing.assert_allclose(centres, expected, atol=2e-6)
+    np.testing.assert_allclose(centers, expected, atol=2e-6)
     assert (own != expected_own).mean() <= 1e-3  # a point halfway may fall to either side in float32
     assert own.dtype == np.int32
-    assert centres.dtype == np.float32
+    assert centers.dtype == np.float32
 
 
-def test_returned_centres_are_the_ones_assigned_to() -> None:
+def test_returned_centers_are_the_ones_assigned_to() -> None:
     values, _, weight = blobs(spread=0.8)
-    own, centres = kmeans(values, weight, values[:15], 4, reseed=True)
-    distance = ((values[:, None].astype(np.float64) - centres[None]) ** 2).sum(axis=2)
+    own, centers = kmeans(values, weight, values[:15], 4, reseed=True)
+    distance = ((values[:, None].astype(np.float64) - centers[None]) ** 2).sum(axis=2)
     assert (distance[np.arange(len(own)), own] <= distance.min(axis=1) + 1e-5).all()
 
 
 def test_kmeans_stops_where_nothing_changes() -> None:
     values, _, weight = blobs()
-    long, centres = kmeans(values, weight, values[:12], 500, reseed=True)
-    once_more, same = kmeans(values, weight, centres, 1, reseed=True)
+    long, centers = kmeans(values, weight, values[:12], 500, reseed=True)
+    once_more, same = kmeans(values, weight, centers, 1, reseed=True)
     np.testing.assert_array_equal(long, once_more)
-    np.testing.assert_allclose(centres, same, atol=1e-6)
+    np.testing.assert_allclose(centers, same, atol=1e-6)
 
 
 @pytest.mark.parametrize(("offset", "unit"), [(0.0, 2.0**-60), (0.0, 2.0**50), (4096.0, 1.0)])
@@ -84,10 +84,10 @@ def test_offset_and_unit_do_not_matter(offset: float, unit: float) -> None:
     values, _, weight = blobs()
     moved = (values * unit + offset).astype(np.float32)
     values = (moved.astype(np.float64) - offset).astype(np.float32)  # what is left of them at that offset
-    own, centres = kmeans(values, weight, values[:12], 20, reseed=True)
-    other, moved_centres = kmeans(moved, weight, moved[:12], 20, reseed=True)
+    own, centers = kmeans(values, weight, values[:12], 20, reseed=True)
+    other, moved_centers = kmeans(moved, weight, moved[:12], 20, reseed=True)
     np.testing.assert_array_equal(own, other)
-    np.testing.assert_allclose(moved_centres, centres + offset, rtol=1e-6)
+    np.testing.assert_allclose(moved_centers, centers + offset, rtol=1e-6)
 
 
 def test_threads_do_not_matter() -> None:
@@ -104,8 +104,8 @@ def test_threads_do_not_matter() -> None:
 
 def test_weights_pull_and_zero_weights_do_not() -> None:
     values = np.array([[0.0], [1.0], [100.0]], np.float32)
-    own, centres = kmeans(values, np.array([3.0, 1.0, 0.0]), np.array([[5.0]]), 9, reseed=True)
-    np.testing.assert_allclose(centres, [[0.25]])
+    own, centers = kmeans(values, np.array([3.0, 1.0, 0.0]), np.array([[5.0]]), 9, reseed=True)
+    np.testing.assert_allclose(centers, [[0.25]])
     np.testing.assert_array_equal(own, 0)
 
 
@@ -113,33 +113,33 @@ def test_empty_clusters_start_again_where_points_are_worst_represented() -> None
     values, _, weight = blobs(places=6)
     far = np.full((6, 9), 50.0, np.float32)
     far[0] = values.mean(axis=0)
-    own, centres = kmeans(values, weight, far, 50, reseed=True)
+    own, centers = kmeans(values, weight, far, 50, reseed=True)
     assert len(np.unique(own[weight > 0])) == 6
     stuck, still = kmeans(values, weight, far, 50, reseed=False)
     assert len(np.unique(stuck)) == 1
     np.testing.assert_array_equal(still[1:], far[1:])
-    assert spread(values, weight, own, centres) < 0.1 * spread(values, weight, stuck, still)
+    assert spread(values, weight, own, centers) < 0.1 * spread(values, weight, stuck, still)
 
 
-def test_more_centres_than_places() -> None:
+def test_more_centers_than_places() -> None:
     values = np.repeat(np.array([[1.0, 2.0], [3.0, 4.0]], np.float32), 5, axis=0)
-    own, centres = kmeans(values, np.ones(10), np.zeros((7, 2)), 20, reseed=True)
-    np.testing.assert_array_equal(centres[own], values)
-    assert np.isfinite(centres).all()
+    own, centers = kmeans(values, np.ones(10), np.zeros((7, 2)), 20, reseed=True)
+    np.testing.assert_array_equal(centers[own], values)
+    assert np.isfinite(centers).all()
 
 
 @pytest.mark.parametrize("count", [0, 1])
 def test_hardly_any_points(count: int) -> None:
     values = np.full((count, 3), 7, np.float32)
-    own, centres = kmeans(values, np.ones(count), np.zeros((2, 3)), 5, reseed=True)
+    own, centers = kmeans(values, np.ones(count), np.zeros((2, 3)), 5, reseed=True)
     assert own.shape == (count,)
-    assert centres.shape == (2, 3)
-    np.testing.assert_array_equal(centres[own], values)
+    assert centers.shape == (2, 3)
+    np.testing.assert_array_equal(centers[own], values)
 
 
 def test_bad_input_is_refused() -> None:
     values, weight = np.zeros((4, 3), np.float32), np.ones(4)
-    with pytest.raises(OgPointcloudError, match="0 centres"):
+    with pytest.raises(OgPointcloudError, match="0 centers"):
         kmeans(values, weight, np.zeros((0, 3)), 5, reseed=True)
     with pytest.raises(OgPointcloudError, match="do not fit"):
         kmeans(values, weight, np.zeros((2, 4)), 5, reseed=True)
@@ -150,7 +150,7 @@ def test_bad_input_is_refused() -> None:
 def test_seeds_lie_in_different_places() -> None:
     values, place, weight = blobs(places=12)
     for seed in range(5):
-        seeds = seed_centres(values, weight, 12, np.random.default_rng(seed))
+        seeds = seed_centers(values, weight, 12, np.random.default_rng(seed))
         rows = [int(np.flatnonzero((values == row).all(axis=1))[0]) for row in seeds]
         assert len(np.unique(place[rows])) >= 10
         assert (weight[rows] > 0).all()
@@ -159,9 +159,9 @@ def test_seeds_lie_in_different_places() -> None:
 def test_seeds_of_few_places_are_few() -> None:
     values = np.repeat(np.array([[1.0, 2.0], [3.0, 4.0]], np.float32), 5, axis=0)
     random = np.random.default_rng(0)
-    assert seed_centres(values, np.ones(10), 7, random).shape == (2, 2)
-    assert seed_centres(values, np.zeros(10), 7, random).shape == (0, 2)
-    assert seed_centres(values[:0], np.zeros(0), 7, random).shape == (0, 2)
+    assert seed_centers(values, np.ones(10), 7, random).shape == (2, 2)
+    assert seed_centers(values, np.zeros(10), 7, random).shape == (0, 2)
+    assert seed_centers(values[:0], np.zeros(0), 7, random).shape == (0, 2)
 
 
 def room(seed: int = 0, points_each: int = 120, views: int = 6):
@@ -236,7 +236,7 @@ def test_fine_clusters_part_what_coarse_ones_hold_together() -> None:
     np.testing.assert_array_equal(codebook.leaf_coarse[codebook.leaf], codebook.coarse)
     assert (np.diff(codebook.leaf_coarse) >= 0).all()
     alone = build(CodebookSettings(k1=2, position_weight=5.0, levels=1))
-    assert len(alone.leaf_centres) == 2
+    assert len(alone.leaf_centers) == 2
     at_most_three = build(CodebookSettings(k1=2, position_weight=5.0, k2=3))
     np.testing.assert_array_equal(at_most_three.leaf_coarse, [0, 0, 0, 1, 1, 1])
 
@@ -248,15 +248,15 @@ def test_without_positions_things_never_seen_together_fall_into_one() -> None:
     assert same_partition(codebook.leaf, thing % 4)
 
 
-def test_centres_are_weighted_means() -> None:
+def test_centers_are_weighted_means() -> None:
     features, _, thing, _ = room()
     weight = np.random.default_rng(3).random(len(thing))
     codebook = build(weight=weight)
-    for leaf in range(len(codebook.leaf_centres)):
+    for leaf in range(len(codebook.leaf_centers)):
         mine = codebook.leaf == leaf
         expected = np.average(features[mine].astype(np.float64), axis=0, weights=weight[mine])
-        np.testing.assert_allclose(codebook.leaf_centres[leaf], expected, rtol=1e-5, atol=1e-6)
-        np.testing.assert_allclose(codebook.coarse_centres[codebook.leaf_coarse[leaf]], expected, rtol=1e-5, atol=1e-6)
+        np.testing.assert_allclose(codebook.leaf_centers[leaf], expected, rtol=1e-5, atol=1e-6)
+        np.testing.assert_allclose(codebook.coarse_centers[codebook.leaf_coarse[leaf]], expected, rtol=1e-5, atol=1e-6)
 
 
 def test_points_without_weight_have_no_cluster() -> None:
@@ -291,7 +291,7 @@ def test_hardly_any_points_for_two_levels(count: int, settings: CodebookSettings
     weight = (np.arange(3) < count).astype(np.float64)
     codebook = two_level_codebook(np.ones((3, 6), np.float32), np.ones((3, 3), np.float32), weight, table, settings)
     np.testing.assert_array_equal(codebook.leaf, np.where(weight > 0, 0, -1))
-    assert len(codebook.leaf_centres) == len(codebook.coarse_centres) == min(count, 1)
+    assert len(codebook.leaf_centers) == len(codebook.coarse_centers) == min(count, 1)
     assert codebook.levels == 1
 
 

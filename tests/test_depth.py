@@ -93,7 +93,7 @@ def test_damaged_files_name_the_cure(tmp_path, name, content, said):
 
 def test_pictures_of_depth_and_objects_are_refused(tmp_path):
     cv2.imwrite(str(tmp_path / "grey.png"), np.zeros((HEIGHT, WIDTH), np.uint8))
-    with pytest.raises(SceneError, match="grey of 16 bit"):
+    with pytest.raises(SceneError, match="gray of 16 bit"):
         read(tmp_path / "grey.png")
     np.save(tmp_path / "o.npy", np.array([{"a": 1}], object), allow_pickle=True)
     with pytest.raises(SceneError, match="cannot be read"):

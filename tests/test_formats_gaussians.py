@@ -115,7 +115,7 @@ def test_extreme_but_finite_gaussians_stay_finite(tmp_path):
         ("rot_2", np.nan, "rotation"),
         ("rot_2", np.inf, "rotation"),
         ("opacity", np.nan, "opacity"),
-        ("f_dc_1", np.nan, "colour"),
+        ("f_dc_1", np.nan, "color"),
     ],
 )
 def test_gaussians_that_are_not_finite_are_one_clear_error(tmp_path, name, value, part):

@@ -54,7 +54,7 @@ def test_colours_of_every_name_and_type(tmp_path, names, values):
 def test_colours_out_of_range_are_refused(tmp_path, bad):
     values = RGB.astype("f4")
     values[3, 1] = bad
-    with pytest.raises(SceneError, match=r"a\.ply: colours red, green, blue span .*; expected 0\.\.1 or 0\.\.255"):
+    with pytest.raises(SceneError, match=r"a\.ply: colors red, green, blue span .*; expected 0\.\.1 or 0\.\.255"):
         read_points(write_cloud(tmp_path / "a.ply", **named(("red", "green", "blue"), values)))
 
 

@@ -108,7 +108,7 @@ def test_leaves_are_decided_on_largest_first_whatever_their_numbers(monkeypatch:
         order = np.random.default_rng(len(books)).permutation(len(book.leaf_coarse))
         number = np.append(np.argsort(order), -1).astype(np.int32)
         books.append(replace(
-            book, leaf=number[book.leaf], leaf_centres=book.leaf_centres[order], leaf_coarse=book.leaf_coarse[order]
+            book, leaf=number[book.leaf], leaf_centers=book.leaf_centers[order], leaf_coarse=book.leaf_coarse[order]
         ))  # fmt: skip
         return books[-1]
 

@@ -199,13 +199,13 @@ def test_both_stages_part_the_balls(balls: Balls, settings: PaperSettings) -> No
     book = train_codebook(balls.gaussians, balls.views, trained.raw, settings)
     assert ((book.leaf // settings.k2 == book.coarse) | (book.leaf < 0)).all()
     np.testing.assert_array_equal(book.leaf >= 0, trained.seen > 0)
-    assert book.centres.shape == (24, 6)
+    assert book.centers.shape == (24, 6)
     sure = seen & (balls.object_ids >= 0)
     members = np.zeros((24, 2))
     np.add.at(members, (book.leaf[sure], balls.object_ids[sure]), 1)
     assert members.max(axis=1).sum() > 0.9 * sure.sum()
-    for leaf in np.unique(book.leaf[book.leaf >= 0]):  # centres are where their features are
-        assert np.abs(book.centres[leaf] - np.median(trained.features[book.leaf == leaf], axis=0)).max() < 0.5
+    for leaf in np.unique(book.leaf[book.leaf >= 0]):  # centers are where their features are
+        assert np.abs(book.centers[leaf] - np.median(trained.features[book.leaf == leaf], axis=0)).max() < 0.5
     assert [stage.steps for stage in (trained.history, *book.histories)] == [100, 100, 100]
     assert [stage.published_steps for stage in (trained.history, *book.histories)] == [20_000] * 3
     assert np.mean(trained.history.loss[-20:]) < np.mean(trained.history.loss[:20])
@@ -223,7 +223,7 @@ def test_training_is_repeatable_and_does_not_depend_on_what_is_kept(balls: Balls
         for each in (settings, replace(settings, cache_bytes=0))
     ]
     np.testing.assert_array_equal(books[0].leaf, books[1].leaf)
-    np.testing.assert_array_equal(books[0].centres, books[1].centres)
+    np.testing.assert_array_equal(books[0].centers, books[1].centers)
 
 
 def test_gaussians_that_no_mask_shows_get_neither_feature_nor_cluster(balls: Balls) -> None:
@@ -249,8 +249,8 @@ def test_fine_clusters_are_at_most_the_masks_held_and_one(balls: Balls) -> None:
     assert len(np.unique(fixed.leaf[fixed.leaf >= 0])) == 5
 
 
-def test_a_codebook_step_moves_features_by_the_gradient_of_their_centres(balls: Balls) -> None:
-    """Straight through: Adam's first step is the rate against the sign of W' sign(W c - W f), c the centres' rows."""
+def test_a_codebook_step_moves_features_by_the_gradient_of_their_centers(balls: Balls) -> None:
+    """Straight through: Adam's first step is the rate against the sign of W' sign(W c - W f), c the centers' rows."""
     settings = replace(SHORT, formula="paper", normalise=False, k1=4, schedule_share=1 / 20_000)
     features = np.random.default_rng(0).random((len(balls.gaussians), 6), np.float32)
     source = rendered_views.RenderedViews(balls.gaussians, balls.views[:1], NEAR, settings, whole=True)
@@ -259,10 +259,10 @@ def test_a_codebook_step_moves_features_by_the_gradient_of_their_centres(balls: 
     history = paper.StageHistory("coarse codebook", 20_000)
     parts = paper._Parts([np.arange(len(features))], [4], np.zeros((len(features), 0), np.float32))
     start = features[:4]
-    own, centres = paper.kmeans(features, np.ones(len(features)), start, settings.lloyd_rounds, reseed=True)
+    own, centers = paper.kmeans(features, np.ones(len(features)), start, settings.lloyd_rounds, reseed=True)
     training.train(history, start, parts, paper.TrainingRun(), "")
 
-    weights, quantised = source[0].weights.astype(np.float64), centres[own].astype(np.float64)
+    weights, quantised = source[0].weights.astype(np.float64), centers[own].astype(np.float64)
     image = weights @ quantised - weights @ features.astype(np.float64)
     gradient = weights.T @ np.sign(image)
     clear = np.abs(gradient) > 1e-3
@@ -301,7 +301,7 @@ def test_more_clusters_than_gaussians(balls: Balls) -> None:
     trained = train_features(few, balls.views, settings)
     book = train_codebook(few, balls.views, trained.raw, settings)
     assert (book.leaf[trained.seen > 0] >= 0).all()
-    assert book.centres.shape == (64 * 3, 6)
+    assert book.centers.shape == (64 * 3, 6)
 
 
 class Killed(Exception):
@@ -351,7 +351,7 @@ def test_a_killed_training_continues_and_ends_with_the_same_bits(
     assert all(stages[name].loss == stage.loss for name, stage in expected_stages.items())
     np.testing.assert_array_equal(resumed.features, expected.features)
     np.testing.assert_array_equal(book.leaf, expected_book.leaf)
-    np.testing.assert_array_equal(book.centres, expected_book.centres)
+    np.testing.assert_array_equal(book.centers, expected_book.centers)
     assert not (tmp_path / "work").exists()
 
 

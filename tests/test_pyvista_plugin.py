@@ -222,7 +222,7 @@ def test_what_cannot_be_drawn_is_said(plotter, scene):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         unknown = pv.PolyData(scene.xyz + 50).og.segment(["plum"], scene)
-    with pytest.warns(UserWarning, match="has a label: all are drawn grey"):
+    with pytest.warns(UserWarning, match="has a label: all are drawn gray"):
         plotter.og.add_segmentation(unknown)
     with pytest.warns(UserWarning, match="no instance with points to draw a box around"):
         assert plotter.og.add_boxes(unknown) is None

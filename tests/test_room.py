@@ -393,7 +393,7 @@ def test_label_picture_shows_the_colours_of_its_classes(capture, tmp_path):
     truth = og.segment(cloud, list(CLASS_NAMES), scene=scene)
     nothing = replace(truth, labels=np.full_like(truth.labels, -1))
     path, white = tmp_path / "labels.png", np.full_like(capture.rgb, 255)
-    with pytest.warns(UserWarning, match="drawn grey"):
+    with pytest.warns(UserWarning, match="drawn gray"):
         pictures.draw_clouds(path, scene, {"truth": truth, "nothing": nothing}, white)
     picture = cv2.imread(str(path))[:, :, ::-1]
     sofa = label_colors(np.array([CLASS_NAMES.index("sofa")]))[0].astype(int)

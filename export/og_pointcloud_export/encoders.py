@@ -276,7 +276,7 @@ def _text_parity(tower: Any, encoder: TextEncoder) -> dict[str, Any]:
 
 
 def _image_parity(graph: bytes, model: encode.ImageModel) -> dict[str, Any]:
-    """How far the graph is from the model, on images of noise and of even colours, and on patches if it has any."""
+    """How far the graph is from the model, on images of noise and of even colors, and on patches if it has any."""
     size = model.preprocessing.size
     squares = np.random.default_rng(0).integers(0, 256, (PARITY_IMAGES, size, size, 3), np.uint8)
     squares[PARITY_IMAGES // 2 :] = squares[PARITY_IMAGES // 2 :, :1, :1]

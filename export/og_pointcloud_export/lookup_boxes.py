@@ -1,6 +1,6 @@
 """The kernel that builds the lookup grid: what is the nearest point's answer in each of a box's 4^3 children?
 
-Every test is of a child, a cube, against points. Seen from its centre, a point p is farther than a point q at all u of
+Every test is of a child, a cube, against points. Seen from its center, a point p is farther than a point q at all u of
 the cube if |u - p|^2 > |u - q|^2 everywhere. The difference is linear in u, so that its least value lies at a corner:
 
     |p|^2 - |q|^2 - 2 half |p - q|_1 > 0        (|.|_1: the sum of absolute coordinates)
@@ -48,7 +48,7 @@ _helper = njit(no_cpython_wrapper=True, no_cfunc_wrapper=True)  # pyright: ignor
 def answer_children(corners, level, limits, points, filled):  # noqa: ANN001, ANN201
     """Answer the children of each box; corners (m, 3): its low corner. Fills these four, in C order of the children:
 
-    answers (m, 64): code of the answer, if certain; else that at the child's centre, plus the number of codes.
+    answers (m, 64): code of the answer, if certain; else that at the child's center, plus the number of codes.
     child (m, 64): number of the list that settles the child, or NOTHING, or SPLIT.
     lengths (m, 64), lists (m, 64, LONGEST_LIST): the box's lists, of points' numbers, ascending; length 0: no list.
     """
@@ -131,9 +131,9 @@ def _points_about(corner, size, rounding, reach, points):  # noqa: ANN001, ANN20
 
 @_helper
 def _answer_child(center, half, last, limits, near, squared, rows):  # noqa: ANN001, ANN202
-    """(code of the answer at the centre, whether it is all the child's, count of candidates, the first of ``rows``)."""
+    """(code of the answer at the center, whether it is all the child's, count of candidates, the first of ``rows``)."""
     reach = limits[0]
-    # The point nearest to the centre. None within reach of the cube's circumscribed sphere: too far.
+    # The point nearest to the center. None within reach of the cube's circumscribed sphere: too far.
     best, best_squared = -1, np.inf
     for row in range(len(squared)):
         seen = _seen_from(center, near, row)
@@ -232,14 +232,14 @@ def _grown(reach):  # noqa: ANN001, ANN202
 
 @_helper
 def _gap_squared(seen, half):  # noqa: ANN001, ANN202
-    """Squared distance of a point, seen from a cube's centre, to the cube."""
+    """Squared distance of a point, seen from a cube's center, to the cube."""
     gap_x, gap_y, gap_z = max(abs(seen[0]) - half, 0.0), max(abs(seen[1]) - half, 0.0), max(abs(seen[2]) - half, 0.0)
     return gap_x * gap_x + gap_y * gap_y + gap_z * gap_z
 
 
 @_helper
 def _all_within_reach(seen, half, reach):  # noqa: ANN001, ANN202
-    """Whether a point, seen from a cube's centre, is within reach of all of the cube."""
+    """Whether a point, seen from a cube's center, is within reach of all of the cube."""
     far_x, far_y, far_z = abs(seen[0]) + half, abs(seen[1]) + half, abs(seen[2]) + half
     return far_x * far_x + far_y * far_y + far_z * far_z <= reach * reach * (1 - 1e-9)
 

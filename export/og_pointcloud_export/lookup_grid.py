@@ -14,7 +14,7 @@
 One rule decides at every level (``lookup_boxes``): certain if all of the box has one answer; else split if it holds
 cloud points, as queries come where the cloud is, or has too many candidates for a list; else the list, which boxes
 beside it share where few candidates do for several. Answers are exact, most queries compare no distances, and a street
-with little in it costs little. What a budget leaves out is marked open, with the answer at the box's centre:
+with little in it costs little. What a budget leaves out is marked open, with the answer at the box's center:
 ``bundle.nearest`` settles queries there. Cells are 1.5 point spacings wide.
 """
 
@@ -68,7 +68,7 @@ class LookupGrid:
     bricks: (rows, 64) unsigned, C order within the block. A *reference*: below ``len(nodes)`` the row of ``nodes`` of a
         brick that is split; from there on, less that number, the child whose list settles the brick.
     nodes: (rows, 64) unsigned, the boxes that are split; C order within the box. A value below ``codes`` is a certain
-        answer; one below ``2 codes`` is open, and ``value - codes`` the answer at the centre; any other is the box's
+        answer; one below ``2 codes`` is open, and ``value - codes`` the answer at the center; any other is the box's
         child ``value - 2 codes``. The last row stands for references to lists: all 2 codes.
     first_child: (rows,) int32, number of the box's first child; -1 in the last row.
     child_length: (children,) unsigned, candidates in the child's list; 0: the child is split.

@@ -136,11 +136,11 @@ def oriented_box(points: ArrayLike, up: ArrayLike | None = None) -> Box:
 def main_part(points: ArrayLike, spacing: float) -> NDArray[np.bool_]:
     """(n,) bool, the points (n, 3) of an object that are not strays; at least nine tenths of them.
 
-    Points are linked through neighbouring voxels, and a connected part counts where it holds a twentieth of the points.
+    Points are linked through neighboring voxels, and a connected part counts where it holds a twentieth of the points.
     If such parts hold less than nine tenths, points lie wider apart than thought, and voxels twice as large are tried.
     What floats alone is thus left out, and so is a speck of another object; fewer than 20 points all count.
 
-    spacing: typical distance between neighbouring points.
+    spacing: typical distance between neighboring points.
     """
     xyz = _checked(points)
     distinct, which = _distinct(xyz)
@@ -263,7 +263,7 @@ def _connected(voxel: NDArray[np.int64]) -> NDArray[np.int64]:
     # One number a voxel, 21 bits a coordinate, which lie within +-WIDEST.
     keys, which = np.unique((voxel + (1 << 20)) @ np.array([1 << 42, 1 << 21, 1]), return_inverse=True)
     part = np.arange(len(keys))
-    pairs = [_neighbours(keys, step) for step in _HALF_OF_26]
+    pairs = [_neighbors(keys, step) for step in _HALF_OF_26]
     first, second = (np.concatenate(ends) for ends in zip(*pairs, strict=True))
     while True:
         a, b = part[first], part[second]
@@ -276,7 +276,7 @@ def _connected(voxel: NDArray[np.int64]) -> NDArray[np.int64]:
             part = part[part]
 
 
-def _neighbours(keys: NDArray[np.int64], step: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _neighbors(keys: NDArray[np.int64], step: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Places in sorted keys of every pair that lies ``step`` apart."""
     place = np.minimum(np.searchsorted(keys, keys + step), len(keys) - 1)
     there = np.flatnonzero(keys[place] == keys + step)
@@ -286,4 +286,4 @@ def _neighbours(keys: NDArray[np.int64], step: int) -> tuple[NDArray[np.int64], 
 _HALF_OF_26 = [
     (x << 42) + (y << 21) + z for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if (x, y, z) > (0, 0, 0)
 ]
-"""Key differences of neighbouring voxels, one of each opposite pair."""
+"""Key differences of neighboring voxels, one of each opposite pair."""

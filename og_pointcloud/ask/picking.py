@@ -112,7 +112,7 @@ def pick(scene: SceneLike, where: Camera | ArrayLike, uv_px: ArrayLike | None = 
     """Select the instance at a pixel of a camera, or at a place.
 
     scene: a loaded scene, a LabelledCloud or the path of a .ogpc file.
-    where: a camera that maps from world coordinates (`in_world`), with uv_px, (2,) pixels (column, row; pixel centres
+    where: a camera that maps from world coordinates (`in_world`), with uv_px, (2,) pixels (column, row; pixel centers
         at +0.5); or a place, (3,) world coordinates: the nearest point counts, if within the scene's reach.
 
     A miss is a Pick too: its ``instance`` says which kind, ``str(pick)`` in words. Raises OgPointcloudError for a pixel

@@ -26,7 +26,7 @@ Places are looked up plainly, in time that grows with the cloud."""
 class QueryGraph:
     """The look-up of a .ogpc file. Several threads may ask it at once.
 
-    onnx: the serialised graph. path: its file, for errors. cloud: what the file's arrays say.
+    onnx: the serialized graph. path: its file, for errors. cloud: what the file's arrays say.
     BundleError for a graph that does not run or answers otherwise than the arrays; also of later calls, where it
     answers what no graph of ours would.
     """

@@ -62,7 +62,7 @@ class Segmentation:
 
     @cached_property
     def certainty(self) -> NDArray[np.float32] | None:
-        """(N,) float32 in [0, 1]: how far views and neighbours bear out that a point is in its instance, or in none, as
+        """(N,) float32 in [0, 1]: how far views and neighbors bear out that a point is in its instance, or in none, as
         the scene's nearest point has it; 0 where no view saw it or the scene is too far.
 
         ``scores`` say whether the instance is what the word means, this whether the point is part of it: low at
@@ -89,7 +89,7 @@ class Segmentation:
 
     @property
     def colors(self) -> NDArray[np.uint8]:
-        """(N, 3) uint8 RGB: a colour a label, grey where unknown."""
+        """(N, 3) uint8 RGB: a color a label, gray where unknown."""
         return label_colors(self.labels)
 
     @property
@@ -110,7 +110,7 @@ class Segmentation:
         return import_plugin("og_pointcloud_open3d", "open3d").to_open3d(self)
 
     def to_pyvista(self) -> Any:
-        """A PyVista PolyData with the `attributes`, colours, names and scene. Needs the extra 'pyvista'."""
+        """A PyVista PolyData with the `attributes`, colors, names and scene. Needs the extra 'pyvista'."""
         return import_plugin("og_pointcloud_pyvista", "pyvista").to_pyvista(self)
 
     def to_pointcloud2(self, frame_id: str = "map", stamp: Any = None) -> Any:
@@ -121,9 +121,9 @@ class Segmentation:
         """Write the result, whole or not at all, as what the path's ending says.
 
         .npz: labels, scores, instances, reasons, names and calibrated, and certainty if it is known.
-        .ply: a coloured cloud with the `attributes`.
-        .las, .laz: with colours, classification and the attributes as extra bytes (needs the extra 'las').
-        .glb: coloured points, or splats, with feature ids and names.
+        .ply: a colored cloud with the `attributes`.
+        .las, .laz: with colors, classification and the attributes as extra bytes (needs the extra 'las').
+        .glb: colored points, or splats, with feature ids and names.
         .spz: splats in the labels' colors; the format has no place for labels.
         splats: Gaussians, if the points asked about are some, row by row: `read_points` of their file.
         OgPointcloudError for another ending; SceneError where the format cannot hold the points: .las and .glb have no

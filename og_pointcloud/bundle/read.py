@@ -45,7 +45,7 @@ ZIP_ERRORS = (zipfile.BadZipFile, EOFError, RuntimeError, NotImplementedError, O
 class Bundle:
     """What a .ogpc holds.
 
-    path, query_onnx: the file, and its serialised graph; None for a cloud that was never a file. manifest: as read;
+    path, query_onnx: the file, and its serialized graph; None for a cloud that was never a file. manifest: as read;
     what this library uses of it is checked.
     """
 

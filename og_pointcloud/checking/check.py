@@ -171,7 +171,7 @@ def _poses(sample: Sample, maps: MaskMaps | None) -> tuple[list[Check], Photogra
     agreement = _agreement(maps)
     if agreement.compared >= FEWEST_VOUCHING and agreement.reaches(MASKS_VOUCH):
         says = (
-            f"they fit the points' colours no better than other photographs ({stated}), though masks do: they are "
+            f"they fit the points' colors no better than other photographs ({stated}), though masks do: they are "
             "turned, of another place or in another order (labels do not depend on them), or poses are off a little"
         )
         return [_agreed("poses", agreement), _doubt("photographs", says)], None
@@ -218,7 +218,7 @@ def _verdict(found: Comparison) -> Verdict:
 def _alignment(photographs: Photographs | None) -> Check:
     """Small faults: a shift, a turn, a scale or calibration that is a little off."""
     if photographs is None or len(photographs.images) < FEWEST_ALIGNED:
-        says = f"it takes {FEWEST_ALIGNED} photographs or more that fit the points' colours"
+        says = f"it takes {FEWEST_ALIGNED} photographs or more that fit the points' colors"
         return Check("alignment", "unchecked", says)
     registration = Registration(photographs, photographs.sample.cameras)
     change = registration.found("everything")
@@ -260,7 +260,7 @@ def _masks(maps: MaskMaps, *, is_doubted: bool) -> Check:
     if (blended := float(np.median(maps.blended))) > MOST_BLENDED:
         says = (
             f"{blended:.0%} of the borders hold an id between those of both sides: masks were resized with "
-            "interpolation, or stored with losses; expected ids as they were given: nearest neighbour, PNG"
+            "interpolation, or stored with losses; expected ids as they were given: nearest neighbor, PNG"
         )
         return Check("masks", "doubt", says)
     if is_doubted:

@@ -1,4 +1,4 @@
-"""Which of the usual conversions makes a capture fit: axes, direction, units, scale, intrinsics, neighbouring frames.
+"""Which of the usual conversions makes a capture fit: axes, direction, units, scale, intrinsics, neighboring frames.
 
 All that `KINDS` of repairs lists are tried on few views and points, the best again on all that were read, and one is
 named only if it fits well and far better than what the files say. Numbers (a scale, a focal length) are searched on a
@@ -64,7 +64,7 @@ def best_mask_conversion(maps: MaskMaps) -> Repairs:
     found: dict[Repairs, Comparison] = {}
     for value, flip in MASK_FLIPS.items():
         found[_parsed(f"masks={value}")] = replace(maps, ids=[flip(ids) for ids in maps.ids]).fit(cameras)
-    for value, by in MASK_SHIFTS.items():  # with the neighbour's camera, these masks tell the same
+    for value, by in MASK_SHIFTS.items():  # with the neighbor's camera, these masks tell the same
         found[_parsed(f"masks={value}")] = _fit(maps, _parsed(f"frames={-by}"))
     best = max(found, key=lambda repairs: found[repairs].gap)
     better = found[best].gap > maps.fit(cameras).gap + BETTER / 2

@@ -1,6 +1,6 @@
 """Does the drawing of view i fit photograph i better than other photographs?
 
-The points' colours, drawn where the poses say, on a grid of some dozen cells, are correlated with the photographs on
+The points' colors, drawn where the poses say, on a grid of some dozen cells, are correlated with the photographs on
 that grid: what is left of a photograph there is where things are, which wrong poses get wrong. Another exposure, noise
 and hidden points change little. Nothing else of the capture is asked.
 """
@@ -28,14 +28,14 @@ FEWEST_CELLS = 30
 SOME_BLACK = 0.02
 """A pixel of a small image shows nothing where so much of it is black, as beyond a lens's rim."""
 FLAT = 3.0
-"""Standard deviation of colours, of 255, below which there is nothing to compare."""
+"""Standard deviation of colors, of 255, below which there is nothing to compare."""
 ALIKE = 0.95
 """Photographs that correlate more than this show the same: neither need fit the other's drawing less."""
 FEWEST_COMPARED = 3
 GREY = 3.0
-"""Mean difference between the channels, of 255, up to which colours are no colours: a LiDAR's intensity, say."""
+"""Mean difference between the channels, of 255, up to which colors are no colors: a LiDAR's intensity, say."""
 FEW_COLORS = 64
-"""A cloud coloured by classes has no more."""
+"""A cloud colored by classes has no more."""
 
 
 @dataclass(frozen=True)
@@ -66,8 +66,8 @@ class Photographs:
 
     @property
     def points_are_painted(self) -> bool:
-        """Whether the points' colours may say something else than photographs do: shades of grey where those are not
-        grey, or a few colours, as of classes."""
+        """Whether the points' colors may say something else than photographs do: shades of gray where those are not
+        gray, or a few colors, as of classes."""
         rgb = self.sample.rgb
         if rgb is None or len(np.unique(rgb, axis=0)) <= FEW_COLORS:
             return True
@@ -75,7 +75,7 @@ class Photographs:
 
 
 def read_photographs(sample: Sample) -> Photographs | None:
-    """None where there is nothing to compare: no photographs, no colours, or a few photographs of the same."""
+    """None where there is nothing to compare: no photographs, no colors, or a few photographs of the same."""
     if sample.rgb is None or float(sample.rgb.std(axis=0).max()) < FLAT:
         return None
     found = {row: image for row, view in enumerate(sample.views) if (image := _small_image(view)) is not None}
@@ -117,7 +117,7 @@ def _small_image(view: View) -> Floats | None:
 
 
 def _drawing(points: Seen, rgb: Floats) -> tuple[Floats, NDArray[np.intp]]:
-    """(c, 3) mean colour of the cells that hold a point, and (c,) which cells these are, ascending."""
+    """(c, 3) mean color of the cells that hold a point, and (c,) which cells these are, ascending."""
     size = points.shape[0] * points.shape[1]
     count = np.bincount(points.cells, minlength=size)
     held = np.flatnonzero(count)
@@ -134,7 +134,7 @@ def _with_rivals(grid: Floats, grids: list[Floats]) -> Floats:
 
 
 def _correlations(drawing: Floats, photographs: Floats) -> Floats:
-    """(k,) of colours (c, 3) with photographs (k, c, 3), all channels together, each less its mean; 0 where too little
+    """(k,) of colors (c, 3) with photographs (k, c, 3), all channels together, each less its mean; 0 where too little
     is shown."""
     shown = np.asarray(np.isfinite(photographs).all(axis=2, keepdims=True))
     a, b = centered(drawing[None], shown), centered(np.where(shown, photographs, 0), shown)
@@ -143,7 +143,7 @@ def _correlations(drawing: Floats, photographs: Floats) -> Floats:
 
 
 def centered(colors: NDArray[Any], shown: NDArray[np.bool_]) -> NDArray[Any]:
-    """Colours (..., n, 3) less the mean of those that are shown (..., n, 1); 0 where they are not."""
+    """Colors (..., n, 3) less the mean of those that are shown (..., n, 1); 0 where they are not."""
     mean = (colors * shown).sum(axis=-2, keepdims=True) / np.maximum(shown.sum(axis=-2, keepdims=True), 1)
     return (colors - mean) * shown
 

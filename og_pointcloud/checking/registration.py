@@ -1,8 +1,8 @@
 """Would the photographs fit better if the cameras were moved, turned, scaled or calibrated a little otherwise?
 
-Points' colours against photographs at the points' pixels, by Gauss-Newton over an image pyramid, all views sharing one
+Points' colors against photographs at the points' pixels, by Gauss-Newton over an image pyramid, all views sharing one
 small change: a similarity of the cloud, focal length, principal point and two terms of a lens. Photometric alignment as
-in direct visual odometry, with frozen geometry; both sides are normalised, so exposure does not matter.
+in direct visual odometry, with frozen geometry; both sides are normalized, so exposure does not matter.
 """
 
 from __future__ import annotations
@@ -161,7 +161,7 @@ class Registration:
         return (bent * (camera.fx, camera.fy) + (camera.cx, camera.cy)) / size + numbers[CENTER]
 
     def _residual(self, image: Floats, rows: NDArray[np.intp], places: Doubles) -> tuple[Doubles, Doubles]:
-        """(points, 3) photograph less colours, each less its mean and of length one; the photograph's slopes there, of
+        """(points, 3) photograph less colors, each less its mean and of length one; the photograph's slopes there, of
         the same scale, (points, 2, 3). Both are 0 where the photograph shows nothing."""
         sampled = _sampled(image, places)
         shown = np.asarray(np.isfinite(sampled).all(axis=1, keepdims=True))
@@ -203,13 +203,13 @@ class Registration:
 
 
 def _with_slopes(image: Floats) -> Floats:
-    """(H, W, 9): the colours, how they change to the right and down, per width and height of the image."""
+    """(H, W, 9): the colors, how they change to the right and down, per width and height of the image."""
     height, width = image.shape[:2]
     return np.concatenate([image, np.gradient(image, axis=1) * width, np.gradient(image, axis=0) * height], axis=2)
 
 
 def _sampled(image: Floats, places: Doubles) -> Doubles:
-    """(points, channels) of an image (H, W, channels) between pixel centres; outside, the nearest pixel's."""
+    """(points, channels) of an image (H, W, channels) between pixel centers; outside, the nearest pixel's."""
     height, width = image.shape[:2]
     u = np.clip(places[:, 0] * width - 0.5, 0, width - 1.001)
     v = np.clip(places[:, 1] * height - 0.5, 0, height - 1.001)

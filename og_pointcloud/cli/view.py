@@ -27,7 +27,7 @@ def add(parser: Parser) -> None:
     add_output(parser, "--png", endings=(".png",), help="a picture")
     parser.add_argument("--boxes", action="store_true", help="boxes around what has a label")
     add_option(parser, "--cut", "SHARE", "hide this share of the height, from the top", type=float, default=0.0)
-    parser.add_argument("--instances", action="store_true", help="colours by instance")
+    parser.add_argument("--instances", action="store_true", help="colors by instance")
 
 
 def run(arguments: argparse.Namespace) -> None:

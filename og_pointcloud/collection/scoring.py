@@ -133,7 +133,7 @@ class Block:
         if box is not None:
             asked = asked & self.meets(box)
         edges = np.flatnonzero(np.diff(asked, prepend=False, append=False))
-        runs = self._starts[edges].reshape(-1, 2)  # of neighbours: multiplied where they lie, nothing is copied
+        runs = self._starts[edges].reshape(-1, 2)  # of neighbors: multiplied where they lie, nothing is copied
         direction = self.direction(text)[None]
         bound = np.concatenate([np.zeros(0), *(self._bounds_of(begin, end, direction) for begin, end in runs.tolist())])
         rows = _ranges(*runs.T)
@@ -148,7 +148,7 @@ class Block:
         return rows[best], key
 
     def _bounds_of(self, begin: int, end: int, direction: NDArray[np.float32]) -> NDArray[np.float64]:
-        """(end - begin,) bounds of the scores of neighbouring instances for a direction (1, D)."""
+        """(end - begin,) bounds of the scores of neighboring instances for a direction (1, D)."""
         rows = slice(*self.bounds[[begin, end]].tolist())
         evidence = self._best_of(rows, self.bounds[begin:end] - rows.start, direction)[:, 0]
         factor, summand = self._bound[:, begin:end]

@@ -199,7 +199,7 @@ class Atlas:
         return {row[0] for row in self._run(f"SELECT id FROM boxes WHERE {meets}", (x0, x1, y0, y1, z0, z1))}
 
     def side_by_side(self, entries: Sequence[SceneEntry]) -> list[SceneEntry]:
-        """The scenes in another order, that of a Z-curve (Morton 1966): a box then finds few runs of neighbours."""
+        """The scenes in another order, that of a Z-curve (Morton 1966): a box then finds few runs of neighbors."""
         rows = self._run("SELECT id, x0 + x1, y0 + y1, z0 + z1 FROM boxes").fetchall()
         places = {id: place for id, *place in rows}
         twice = np.array([places.get(entry.id, [0, 0, 0]) for entry in entries], float).reshape(-1, 3)

@@ -17,7 +17,7 @@ SHARES = {
     "background called": "background", "reliability": "reliability",
 }  # fmt: skip
 """Column -> field of `Row`, after setting, seconds, error and gain."""
-COLOURS, MARKERS = [f"C{number}" for number in range(10)], "osD^vPX*<>hpd"
+COLORS, MARKERS = [f"C{number}" for number in range(10)], "osD^vPX*<>hpd"
 """Together they tell 130 knobs apart: their numbers have no divisor in common."""
 WIDTH, PANEL_HEIGHT = 11.0, 5.2
 LINEAR_BELOW = 0.01
@@ -50,12 +50,12 @@ def write_chart(sweep: Sweep, path: Path) -> Path:
 
 
 def _panel(axes: Any, rows: Sequence[Row]) -> None:
-    looks = zip(itertools.cycle(COLOURS), itertools.cycle(MARKERS))
+    looks = zip(itertools.cycle(COLORS), itertools.cycle(MARKERS))
     for knob in dict.fromkeys(row.knob for row in rows if not row.is_default):
-        colour, marker = ("0.45", "x") if knob == BASELINE else next(looks)
+        color, marker = ("0.45", "x") if knob == BASELINE else next(looks)
         own = [row for row in rows if row.knob == knob]
         seconds, errors = [row.seconds for row in own], [row.error for row in own]
-        axes.scatter(seconds, errors, s=34, label=knob, zorder=3, color=colour, marker=marker)
+        axes.scatter(seconds, errors, s=34, label=knob, zorder=3, color=color, marker=marker)
     for row in rows:
         if row.is_default:
             axes.plot(row.seconds, row.error, "o", ms=13, mfc="none", mew=2, color="black", label="the default")

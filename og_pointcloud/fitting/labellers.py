@@ -89,10 +89,10 @@ def fast(table: MaskTable, surface: Surface, settings: FitSettings, journal: Jou
         if book.levels == 1:
             journal.leave_out(LeftOut.SECOND_LEVEL)
     journal.notes["feature_steps"], journal.notes["features_converged"] = learned.steps, learned.converged
-    journal.notes["clusters"] = [len(book.coarse_centres), len(book.leaf_centres)]
+    journal.notes["clusters"] = [len(book.coarse_centers), len(book.leaf_centers)]
     with journal.stage("matching"):
         shown = mask_means(table, learned.features)
-        evidence = visible_evidence(table, book.leaf, book.leaf_centres, shown)
+        evidence = visible_evidence(table, book.leaf, book.leaf_centers, shown)
         matching = match_masks(table, book.leaf, evidence, settings.matching)
     if not settings.matching.settle:
         return _leaves_as_instances(table, book.leaf, book.leaf_coarse, matching)
@@ -153,11 +153,11 @@ def leaves_of_training(
     ids[book.leaf >= 0] = leaf
     with journal.stage("matching"):
         shown, pure = rendered_masks(gaussians, views, near, features, options.covered_share)
-        centres = book.centres[used]
+        centers = book.centers[used]
         if options.matching.visible:
-            evidence = visible_evidence(table, ids, centres, shown)
+            evidence = visible_evidence(table, ids, centers, shown)
         else:
-            evidence = alone_evidence(gaussians, views, near, ids, centres, shown, options.alone_share)
+            evidence = alone_evidence(gaussians, views, near, ids, centers, shown, options.alone_share)
         if options.formula == "authors":
             evidence = evidence.of_masks(pure)
         matching = match_masks(table, ids, evidence, options.matching)

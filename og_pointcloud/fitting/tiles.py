@@ -65,7 +65,7 @@ TILE_BYTES = 1_500
 FIT_BYTES = 1_000
 """Bytes that one fit of a whole cloud takes, per point."""
 CLOUD_BYTES = 120
-"""Bytes that every point takes, whatever the tiles: positions, colours, spacings, ids, order."""
+"""Bytes that every point takes, whatever the tiles: positions, colors, spacings, ids, order."""
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")

@@ -59,7 +59,7 @@ CLOUD_NAMES = ("points.ply", "point_cloud.ply", "scans/mesh_aligned_0.05.ply")
 DECODED = 4
 """Mask maps of images with several faces that are kept: faces come one after the other, some side by side."""
 FUSED_FRAMES = 300
-"""Depth images that are fused at most, evenly spread over a recording, whose neighbours show almost the same."""
+"""Depth images that are fused at most, evenly spread over a recording, whose neighbors show almost the same."""
 
 
 @dataclass(frozen=True)
@@ -388,7 +388,7 @@ def _fused(capture: Path, frames: Sequence[DepthFrame]) -> FusedCloud:
 
 
 def _colors_at(file: Path, image: PosedImage, camera: Camera) -> NDArray[np.uint8]:
-    """(H, W, 3): the photograph's colours at the pixels of the depth camera, averaged down to its resolution first."""
+    """(H, W, 3): the photograph's colors at the pixels of the depth camera, averaged down to its resolution first."""
     scale = min(1.0, camera.fx / image.camera.fx)
     size = max(1, round(image.camera.width * scale)), max(1, round(image.camera.height * scale))
     photographed = image.camera.resized(*size)
@@ -403,7 +403,7 @@ def find_images(capture: Path, images: Sequence[PosedImage]) -> list[Path | None
         warnings.warn(
             f"{capture}: {len(missing)} of {len(images)} images are listed but not found, e.g. "
             f"'{printable(missing[0], 80)}'; "
-            "their views have masks but no colours",
+            "their views have masks but no colors",
             stacklevel=3,
         )
     return files

@@ -1,4 +1,4 @@
-"""COLMAP sparse models, .bin and .txt: world-to-camera poses, OpenCV axes, pixel centres at +0.5 as in the scene.
+"""COLMAP sparse models, .bin and .txt: world-to-camera poses, OpenCV axes, pixel centers at +0.5 as in the scene.
 
 Layout: https://colmap.github.io/format.html. Binary files are little endian: a count (uint64), then the records. Text
 files have a record a line, ``#`` for comments. Where both are present the binary files are read, as COLMAP does.
@@ -90,7 +90,7 @@ def read_images(model: Path) -> tuple[PosedImage, ...]:
 
 
 def read_points3d(model: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
-    """World coordinates (n, 3) float64 and colours (n, 3) uint8 of the triangulated points."""
+    """World coordinates (n, 3) float64 and colors (n, 3) uint8 of the triangulated points."""
     return _records(model, "points3D", _points_binary, _points_text)
 
 
@@ -274,5 +274,5 @@ def _points_text(path: Path) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
         raise SceneError(
             f"{path}: {error!s:.120}; expected lines of id x y z r g b and more: export it again"
         ) from None
-    with np.errstate(invalid="ignore"):  # a colour that is no number is black
+    with np.errstate(invalid="ignore"):  # a color that is no number is black
         return values[:, :3].copy(), np.clip(np.nan_to_num(values[:, 3:]), 0, 255).astype(np.uint8)

@@ -1,4 +1,4 @@
-"""One colour a label, the same in every file, window and page."""
+"""One color a label, the same in every file, window and page."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ UNKNOWN_COLOR = (128, 128, 128)
 NO_LABEL = (222, 224, 228)
 """Of points without a label on pages: lighter than in files, as most of a scene may have none."""
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
-"""Weights of red, green and blue in how light a colour is, ITU-R BT.709."""
+"""Weights of red, green and blue in how light a color is, ITU-R BT.709."""
 GOLDEN_RATIO = 0.618033988749895
 VIRIDIS = np.array([
     (68, 1, 84), (71, 44, 122), (59, 82, 139), (44, 113, 142), (33, 145, 140), (39, 173, 129), (94, 201, 98),
     (170, 220, 50), (253, 231, 37),
 ])  # fmt: skip
-"""Evenly spaced colours of the map of that name (Smith and van der Walt, 2015, CC0), from dark to bright."""
+"""Evenly spaced colors of the map of that name (Smith and van der Walt, 2015, CC0), from dark to bright."""
 
 
 def label_colors(labels: NDArray[np.integer]) -> NDArray[np.uint8]:
-    """(N, 3) uint8 RGB. The colour of a label depends on its number alone; neighbours in number differ in hue."""
+    """(N, 3) uint8 RGB. The color of a label depends on its number alone; neighbors in number differ in hue."""
     count = int(labels.max(initial=UNKNOWN)) + 1
     palette = np.array([UNKNOWN_COLOR, *(_color(label) for label in range(count))], np.uint8)
     return palette[np.maximum(labels, UNKNOWN) + 1]

@@ -1,7 +1,7 @@
 """Depth images: each pixel's distance along the optical axis (z, not the length of the ray), 0 where none was measured.
 
-16-bit grey PNG and TIFF, float TIFF, ``.npy``. Stored whole numbers are
-millimetres in a world of metres unless the data set says otherwise, stored floats are lengths of the world.
+16-bit gray PNG and TIFF, float TIFF, ``.npy``. Stored whole numbers are
+millimeters in a world of meters unless the data set says otherwise, stored floats are lengths of the world.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class DepthFile:
     """A depth image that is read on demand.
 
     camera: the depth sensor's, from world coordinates; a file of another size scales it. unit: world lengths of a
-    stored step, None for the rule by type (whole numbers: millimetres of a world in metres; floats: as they are).
+    stored step, None for the rule by type (whole numbers: millimeters of a world in meters; floats: as they are).
     invalid: a stored value that means "not measured", beside 0, negative numbers, NaN and infinity.
     """
 
@@ -74,7 +74,7 @@ class DepthFile:
 
 @dataclass(frozen=True)
 class DepthFrame:
-    """A depth image with the colours of its view.
+    """A depth image with the colors of its view.
 
     colors: gives them at the pixels of a camera with the view's pose, (H, W, 3) uint8; None where there is no image.
     """
@@ -93,7 +93,7 @@ def find_depth(capture: Path, name: str) -> Path | None:
 def resampled(values: NDArray, source: Camera, target: Camera) -> NDArray:
     """(H, W, ...) pixels of one camera at the pixels of another with the same pose; 0 where it does not look.
 
-    Two pinholes with one centre and one orientation see a ray in columns and rows that depend on nothing but column
+    Two pinholes with one center and one orientation see a ray in columns and rows that depend on nothing but column
     and row, so whole lines are picked, by nearest pixel: depths must not be blended over an edge.
     """
     columns = _positions(target.width, target.fx, target.cx, source.fx, source.cx)
@@ -127,8 +127,8 @@ def _stored(file: Path) -> NDArray:
         header = png_header(file)
         if header is not None and (header.bit_depth != 16 or header.color_type != 0):
             raise SceneError(
-                f"{file} is a PNG of {header.bit_depth} bit and colour type {header.color_type}; expected grey of 16 "
-                "bit: pictures of depth in colours or 8 bit have lost the lengths"
+                f"{file} is a PNG of {header.bit_depth} bit and color type {header.color_type}; expected gray of 16 "
+                "bit: pictures of depth in colors or 8 bit have lost the lengths"
             )
         values = decoded(file, require_cv2().IMREAD_UNCHANGED)
     if values.ndim == 3 and values.shape[-1] == 1:

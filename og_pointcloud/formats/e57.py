@@ -147,7 +147,7 @@ def _pose(node: Any) -> Doubles | None:
 
 
 def _scan(libe57: Any, file: Any, scan: Any, most: int) -> list[tuple[Doubles, NDArray[np.uint8] | None]]:
-    """Chunks of points in the file's world, and their colours."""
+    """Chunks of points in the file's world, and their colors."""
     vector = scan["points"]
     prototype = libe57.StructureNode(vector.prototype())
     fields = {prototype.get(index).elementName() for index in range(prototype.childCount())}

@@ -52,7 +52,7 @@ VOXELS_ACROSS = 1 << 21
 COMPARED = 12
 """Views, spread evenly, that the check of the unit reads."""
 UNITS = (1e-3, 1e-2, 0.1, 0.2, 0.25, 4.0, 5.0, 10.0, 100.0, 1e3)
-"""Factors between units in use: metres, centimetres, millimetres, 1/4000 and 1/5000 m against 1/1000 m."""
+"""Factors between units in use: meters, centimeters, millimeters, 1/4000 and 1/5000 m against 1/1000 m."""
 LEAST_AGREEING, LEAST_COMPARABLE = 0.2, 0.35
 """Shares of depths that agree, and that differ little enough for one surface, below which images are no depths of one
 place: right ones agree in about half of the places, the rest is hidden in one view."""
@@ -82,7 +82,7 @@ class Survey:
 
 @dataclass(frozen=True)
 class FusedCloud:
-    """points: with colours where every frame has them. frames: fused. refused: voxels that other views looked through
+    """points: with colors where every frame has them. frames: fused. refused: voxels that other views looked through
     or that one alone saw. empty: names of frames in which nothing was measured."""
 
     points: Points
@@ -153,7 +153,7 @@ def evenly(items: Sequence[Any], count: int) -> list[Any]:
 
 
 def on_surface(image: DepthImage, noise: float) -> NDArray[np.bool_]:
-    """(H, W) bool: measured, and in each image direction on one surface with at least one neighbour."""
+    """(H, W) bool: measured, and in each image direction on one surface with at least one neighbor."""
     depth = image.depth
     kept = depth > 0
     for axis, focal in ((0, image.camera.fy), (1, image.camera.fx)):
@@ -163,10 +163,10 @@ def on_surface(image: DepthImage, noise: float) -> NDArray[np.bool_]:
         nearer = np.minimum(along[1:], along[:-1])
         step = nearer * np.float32(GRAZING / focal) + np.float32(NOISE_TOLERANCE * noise)
         joined = (nearer > 0) & (np.abs(np.diff(along, axis=0)) <= step)
-        has_neighbour = np.zeros(along.shape, bool)
-        has_neighbour[1:] |= joined
-        has_neighbour[:-1] |= joined
-        kept &= np.moveaxis(has_neighbour, 0, axis)
+        has_neighbor = np.zeros(along.shape, bool)
+        has_neighbor[1:] |= joined
+        has_neighbor[:-1] |= joined
+        kept &= np.moveaxis(has_neighbor, 0, axis)
     return kept
 
 
@@ -229,7 +229,7 @@ def _judge(
 def _add_votes(xyz, seen_from, depths, limits, votes, shift):  # noqa: ANN001, ANN202
     """One view's votes on all points: confirmed, refuted, could see; and the weighted way to the surface it measured.
 
-    seen_from: rotation to the camera, its centre, and fx, fy, cx, cy. depths: (H, W) as measured; the same without
+    seen_from: rotation to the camera, its center, and fx, fy, cx, cy. depths: (H, W) as measured; the same without
     flying pixels; the smallest of 3x3 pixels, 0 if one of them is unmeasured. limits: the tolerance, and the typical
     depth that it is of.
     """
@@ -261,7 +261,7 @@ def _add_votes(xyz, seen_from, depths, limits, votes, shift):  # noqa: ANN001, A
 
 
 class _Voxels:
-    """Mean position and colour by voxel: sums by key, ascending, and the points that wait to be added to them."""
+    """Mean position and color by voxel: sums by key, ascending, and the points that wait to be added to them."""
 
     def __init__(self, edge: float) -> None:
         self._edge = edge
@@ -284,7 +284,7 @@ class _Voxels:
             self._merge()
 
     def means(self) -> tuple[Doubles, Doubles]:
-        """(n, 3) positions and (n, 3) colours, in the order of the voxels."""
+        """(n, 3) positions and (n, 3) colors, in the order of the voxels."""
         self._merge()
         sums = self._merged[1]
         means = sums[:, :6] / sums[:, 6:]

@@ -1,9 +1,9 @@
-"""3D Gaussian splatting PLY files -> Points: scales linear, rotations unit wxyz, opacities in [0, 1], base colour.
+"""3D Gaussian splatting PLY files -> Points: scales linear, rotations unit wxyz, opacities in [0, 1], base color.
 
 Two layouts. *Trained* (Inria, gsplat, nerfstudio, OpenGaussian): a float property each, before activation: log scale,
-logit opacity, any quaternion, colour as the constant spherical harmonic. *Compressed* (SuperSplat): an element
+logit opacity, any quaternion, color as the constant spherical harmonic. *Compressed* (SuperSplat): an element
 ``chunk`` with the bounds of 256 splats each, and four packed 32-bit words per splat. Harmonics above the constant one,
-instance features and normals are not read: nothing here renders colour by direction.
+instance features and normals are not read: nothing here renders color by direction.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from og_pointcloud.formats.tables import colors, positions, stack_columns, stora
 from og_pointcloud.scene import Points
 
 SH_CONSTANT = 0.28209479177387814
-"""The spherical harmonic of degree 0, 1 / (2 sqrt(pi)): colour = 0.5 + SH_CONSTANT * f_dc."""
+"""The spherical harmonic of degree 0, 1 / (2 sqrt(pi)): color = 0.5 + SH_CONSTANT * f_dc."""
 SPLATS_PER_CHUNK = 256
 
 BASE_COLOR = ("f_dc_0", "f_dc_1", "f_dc_2")
@@ -45,7 +45,7 @@ def gaussian_rows(points: Points) -> NDArray[np.void]:
     """(n,) records in the trained layout of degree 0, world coordinates, for the element "vertex" of a 3DGS file.
 
     Positions are float64 where float32 would lose more than 1e-6 of the extent. Scale 0 and opacities 0 and 1 become
-    the nearest finite logarithm and logit, so that any reader survives them. Without rgb the splats are mid-grey.
+    the nearest finite logarithm and logit, so that any reader survives them. Without rgb the splats are mid-gray.
     """
     if points.scale is None or points.rotation is None or points.opacity is None:
         raise SceneError("the points have no scale, rotation and opacity; expected Gaussians")
@@ -97,7 +97,7 @@ def _trained(vertex: NDArray[np.void]) -> Points:
     opacity = 0.5 + 0.5 * np.tanh(0.5 * stack_columns(vertex, ("opacity",), np.float64)[:, 0])
     if "f_dc_0" in (vertex.dtype.names or ()):
         color = 0.5 + SH_CONSTANT * stack_columns(vertex, BASE_COLOR, np.float64)
-    else:  # nerfstudio's exporter writes red, green, blue instead where it is asked for colours
+    else:  # nerfstudio's exporter writes red, green, blue instead where it is asked for colors
         rgb = colors(vertex)
         color = None if rgb is None else rgb / 255
     return activated(positions(vertex), scale, stack_columns(vertex, ROTATION, np.float64), opacity, color)
@@ -126,7 +126,7 @@ def _compressed(elements: Elements) -> Points:
     )
     rgba = _unpack(words["packed_color"], bits=(8, 8, 8, 8))
     color = rgba[:, :3]
-    if "min_r" in (chunk.dtype.names or ()):  # since SuperSplat 2; before it, colours have no bounds
+    if "min_r" in (chunk.dtype.names or ()):  # since SuperSplat 2; before it, colors have no bounds
         color = _between(chunk, ("min_r", "min_g", "min_b"), ("max_r", "max_g", "max_b"), color)
     with np.errstate(over="ignore"):
         scale = np.exp(log_scale).astype(np.float32)
@@ -172,10 +172,10 @@ def activated(
     opacity: NDArray[np.float64],
     color: NDArray[np.float64] | None,
 ) -> Points:
-    """Points from activated values, quaternions (n, 4) of any length, and colours around [0, 1]; finite or an error."""
+    """Points from activated values, quaternions (n, 4) of any length, and colors around [0, 1]; finite or an error."""
     parts = {"position": xyz, "scale": scale, "rotation": rotation, "opacity": opacity[:, None]}
     if color is not None:
-        parts["colour"] = color
+        parts["color"] = color
     if not all(np.isfinite(values).all() for values in parts.values()):
         raise _not_finite(parts)
     length = np.linalg.norm(rotation, axis=1, keepdims=True)

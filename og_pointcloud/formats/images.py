@@ -25,7 +25,7 @@ MOST_SEGMENTS = 1000
 
 
 class PngHeader(NamedTuple):
-    """The first chunk of a PNG. color_type: 0 grey, 2 RGB, 3 palette, 4 grey with alpha, 6 RGBA."""
+    """The first chunk of a PNG. color_type: 0 gray, 2 RGB, 3 palette, 4 gray with alpha, 6 RGBA."""
 
     width: int
     height: int
@@ -172,7 +172,7 @@ def decoded(file: Path, flags: int) -> NDArray[np.generic]:
 
 
 def palette_indices(file: Path) -> NDArray[np.uint8]:
-    """(H, W) the entries of a PNG's palette, as video trackers write ids; OpenCV would give their colours."""
+    """(H, W) the entries of a PNG's palette, as video trackers write ids; OpenCV would give their colors."""
     try:
         with require_pillow().open(file, formats=("PNG",)) as image:
             return np.asarray(image, np.uint8)

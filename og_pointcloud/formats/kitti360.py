@@ -2,7 +2,7 @@
 
 calibration/perspective.txt                      ``S_rect_00: 1408 376``, ``P_rect_00:`` 12 numbers, row by row
 data_poses/DRIVE/cam0_to_world.txt               a frame's number, then 16: the rectified left camera to the world,
-                                                 OpenCV axes, metres; keyframes alone
+                                                 OpenCV axes, meters; keyframes alone
 data_2d_raw/DRIVE/image_00/data_rect/*.png       and image_01, the right camera: named by the frame, ten digits
 data_3d_semantics/*/DRIVE/static/FIRST_LAST.ply  a cloud of these frames: the capture's geometry, if there is one file
 

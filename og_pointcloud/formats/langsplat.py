@@ -6,7 +6,7 @@ OpenGaussian trains on one level, the large one.
 
 One level is read. Its rows are compacted (rows that no pixel of the level shows are left out), and a view whose level
 holds no mask stays a view without masks: other levels never stand in for it, since one view's small masks
-would contradict its neighbours' large ones.
+would contradict its neighbors' large ones.
 """
 
 from __future__ import annotations

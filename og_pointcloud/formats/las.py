@@ -39,9 +39,9 @@ UNLABELLED = 1
 FIRST_FREE_CLASS, LAST_CLASS = 64, 255
 """Classes that the format leaves to its users: label k is class 64 + k."""
 STEPS_PER_EXTENT = 1e8
-"""Coordinates are stored as 32-bit counts of a step: ten nanometres in a room, 10 micrometres in a city block."""
+"""Coordinates are stored as 32-bit counts of a step: ten nanometers in a room, 10 micrometers in a city block."""
 FULL_RANGE = 257
-"""An 8-bit colour times this spans the format's 16 bits."""
+"""An 8-bit color times this spans the format's 16 bits."""
 RECORD_OWNER, NAMES_RECORD = "og_pointcloud", 1
 LONGEST_RECORD = 65_535
 SMALLEST_HEADER, RECORD_HEADER = 227, 54
@@ -53,7 +53,7 @@ EXTRA_BYTES = 14
 
 
 def read_las(path: str | os.PathLike[str]) -> Points:
-    """Positions, and colours where the point format has some.
+    """Positions, and colors where the point format has some.
 
     SceneError, beginning with the path, for a file that is damaged or has no points; MissingExtraError without laspy.
     """
@@ -195,7 +195,7 @@ def _check_chunks(data: mmap.mmap, layers: int, first_point: int, point_size: in
 
 
 def _eight_bits(rgb: NDArray[np.uint16]) -> NDArray[np.uint8]:
-    """Colours span 16 bits, but many writers leave them at 8."""
+    """Colors span 16 bits, but many writers leave them at 8."""
     return (rgb if rgb.max(initial=0) <= 255 else np.rint(rgb / FULL_RANGE)).astype(np.uint8)
 
 

@@ -1,6 +1,6 @@
 """The project's own mask format: ``masks/<view name>.png`` and ``mask_features.npz``.
 
-A mask image is grey, 8 or 16 bit, or has a palette, whose colours say nothing; it holds 0 outside every mask, else an
+A mask image is gray, 8 or 16 bit, or has a palette, whose colors say nothing; it holds 0 outside every mask, else an
 id 1..M that means something in this image only. The features file holds ``<view name>`` -> (M, D), any float type,
 where row i belongs to id i + 1, and ``feature_space``, the name of the encoder. A view without masks has an all-zero
 image and an empty (0, D) array. Masks that a tracker followed have ``<view name>.tracks`` -> (M,) whole numbers there:
@@ -28,8 +28,8 @@ MASKS_FOLDER = "masks"
 FEATURES_NAME = "mask_features.npz"
 TRACKS = ".tracks"
 MAX_FEATURE_BYTES = 1 << 32
-GREY, PALETTE = 0, 3
-PNG_COLOR_TYPES = {0: "grey", 2: "RGB (3 channels)", 3: "palette", 4: "grey with alpha", 6: "RGBA (4 channels)"}
+GRAY, PALETTE = 0, 3
+PNG_COLOR_TYPES = {0: "gray", 2: "RGB (3 channels)", 3: "palette", 4: "gray with alpha", 6: "RGBA (4 channels)"}
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ def read_masks(capture: Path, names: Sequence[str]) -> tuple[list[MaskLayer], st
     """The masks of these views and the name of their feature space (``unknown`` where the file names none).
 
     Features are read, of the images only the headers; each image is decoded when its layer's ``read`` is called. Raises
-    SceneError where a view has no mask image or no features, or an image is not grey.
+    SceneError where a view has no mask image or no features, or an image is not gray.
     """
     files = [capture / MASKS_FOLDER / f"{name}.png" for name in names]
     require_all(files, "write an all-zero mask and an empty (0, D) feature array for an image without masks")
@@ -79,12 +79,12 @@ def require_all(files: Sequence[Path], cure: str) -> None:
 
 def _id_header(file: Path) -> PngHeader:
     header = png_header(file)
-    is_grey = header is not None and header.color_type == GREY and header.bit_depth in (8, 16)
-    if header is None or not (is_grey or header.color_type == PALETTE):
+    is_gray = header is not None and header.color_type == GRAY and header.bit_depth in (8, 16)
+    if header is None or not (is_gray or header.color_type == PALETTE):
         found = f"a {PNG_COLOR_TYPES.get(header.color_type)} PNG of {header.bit_depth} bit" if header else "not a PNG"
         raise SceneError(
-            f"{file} is {found}; expected a grey PNG of 8 or 16 bit, or one with a palette, whose values are mask ids "
-            "(0 none, 1..M): write ids instead of colours"
+            f"{file} is {found}; expected a gray PNG of 8 or 16 bit, or one with a palette, whose values are mask ids "
+            "(0 none, 1..M): write ids instead of colors"
         )
     return header
 

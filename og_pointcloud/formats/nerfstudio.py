@@ -5,7 +5,7 @@ Intrinsics stand at the top or in a frame, which then overrides the top: ``fl_x 
 Blender writes, ``transforms_train.json`` is read. ``aabb_scale``, ``scale``, ``offset`` and the like concern the
 rendering box of instant-ngp and not the poses; they are ignored.
 
-A frame's ``depth_file_path`` names its depth image inside the capture folder; a stored whole number is a millimetre
+A frame's ``depth_file_path`` names its depth image inside the capture folder; a stored whole number is a millimeter
 unless ``integer_depth_scale`` (instant-ngp) or ``depth_unit_scale_factor`` says what it is.
 
 ``applied_transform`` (nerfstudio: from COLMAP's world to the world of this file) is *not* applied to

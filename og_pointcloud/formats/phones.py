@@ -2,14 +2,14 @@
 
 Polycam         ``keyframes/corrected_images`` (or ``images``) with ``corrected_cameras`` (``cameras``): a JSON an
                 image, ``fx fy cx cy width height`` and ``t_00`` ... ``t_23``, camera to world, ARKit's axes (y up, z
-                back); ``depth`` of 256 x 192, millimetres.
+                back); ``depth`` of 256 x 192, millimeters.
 3D Scanner App  ``frame_00000.jpg`` with ``frame_00000.json``: ``cameraPoseARFrame``, 16 numbers row by row, and
-                ``intrinsics``, 9 numbers; ``depth_00000.png``, millimetres. Most poses have no image.
+                ``intrinsics``, 9 numbers; ``depth_00000.png``, millimeters. Most poses have no image.
 ARKitScenes     ``lowres_wide/<video>_<time>.png``, ``lowres_depth``, ``lowres_wide_intrinsics/*.pincam`` (width height
                 fx fy cx cy) and ``lowres_wide.traj``: time, rotation vector, translation, world to camera, OpenCV's
                 axes. An image takes the pose whose time is nearest, if that is within 10 ms.
 
-Images and depth images are of different sizes and one lens. Worlds are in metres and kept, so clouds that the apps
+Images and depth images are of different sizes and one lens. Worlds are in meters and kept, so clouds that the apps
 export (y up) fit. Images are as the sensor gave them, in landscape, however the phone was held.
 """
 

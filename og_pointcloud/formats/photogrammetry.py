@@ -6,7 +6,7 @@ Metashape    File > Export > Export Cameras, Agisoft XML. Poses are camera-to-ch
              k4 is of r^8.
 RealityScan  Registration, "Internal/External camera parameters": a line an image, ``#name,x,y,alt,heading,pitch,roll,
              f,px,py,k1,k2,k3,k4,t1,t2``. At angles of 0 a camera looks down with north on top. Focal length and
-             principal point are millimetres of a frame whose longer side is 36.
+             principal point are millimeters of a frame whose longer side is 36.
 
 Images are called by name alone; they are looked for in the folder and its image folders.
 """

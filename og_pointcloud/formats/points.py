@@ -25,7 +25,7 @@ from og_pointcloud.scene import Points
 def read_points(path: str | os.PathLike[str]) -> Points:
     """A plain cloud (PLY, PCD, LAS, LAZ, COPC, E57) or Gaussians (PLY, SuperSplat's, SPZ), whatever the file's name.
 
-    World coordinates are read as float64; their median becomes the origin. Colours come as uint8 RGB, None where the
+    World coordinates are read as float64; their median becomes the origin. Colors come as uint8 RGB, None where the
     file has none.
     SceneError, beginning with the path, for what cannot be read, has no points, or holds NaN. LAS and LAZ need the
     extra 'las', E57 'e57', the newest SPZ 'spz'.

@@ -58,7 +58,7 @@ class PosedFrames:
 
 @dataclass(frozen=True)
 class Sensor:
-    """A pinhole camera without its pose: pixels, pixel centres at +0.5. unit, invalid: of depth, as `DepthFile`."""
+    """A pinhole camera without its pose: pixels, pixel centers at +0.5. unit, invalid: of depth, as `DepthFile`."""
 
     size: tuple[int, int]
     fx: float
@@ -70,7 +70,7 @@ class Sensor:
 
     @classmethod
     def from_matrix(cls, size: tuple[int, int], matrix: NDArray[np.float64]) -> Sensor:
-        """From intrinsics (3 or 4, 3 or 4) that count pixel centres at whole numbers, as most RGB-D sets do."""
+        """From intrinsics (3 or 4, 3 or 4) that count pixel centers at whole numbers, as most RGB-D sets do."""
         return cls(size, matrix[0, 0].item(), matrix[1, 1].item(), matrix[0, 2].item() + 0.5, matrix[1, 2].item() + 0.5)
 
     def at(self, camera_to_world: NDArray[np.float64]) -> Camera:

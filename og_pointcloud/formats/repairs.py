@@ -11,7 +11,7 @@ table, `KINDS`, to find out what a capture means.
   world=x,z,-y          the poses' world has other axes: its x, y, z are these of the cloud
   scale=2.5             the poses' lengths, times this, are the cloud's
   aligned=tx,ty,tz,rx,ry,rz,s   cameras moved as a whole: by t, in the cloud's unit, turned by the rotation vector r
-                        (degrees) and scaled by s about their mean centre
+                        (degrees) and scaled by s about their mean center
   frames=1              image i has the pose that is listed for image i + 1 (-1: i - 1)
   intrinsics=2          fx, fy, cx, cy are of an image that is smaller by this factor
   focal=1.5             fx and fy times this
@@ -202,7 +202,7 @@ def _with_axes(pose: Doubles, repair: Repair) -> Doubles:
 
 
 def _aligned(cameras: list[Camera], repair: Repair) -> list[Camera]:
-    """Cameras' centres c about their mean m become m + s R (c - m) + t, their rotations W become W R'."""
+    """Cameras' centers c about their mean m become m + s R (c - m) + t, their rotations W become W R'."""
     move, turn, size = repair.numbers[:3], rotation_of_vector(np.deg2rad(repair.numbers[3:6])), repair.numbers[6]
     mean = np.mean([camera.center for camera in cameras], axis=0)
     aligned = []
@@ -213,7 +213,7 @@ def _aligned(cameras: list[Camera], repair: Repair) -> list[Camera]:
     return aligned
 
 
-def _neighbours(cameras: list[Camera], repair: Repair) -> list[Camera]:
+def _neighbors(cameras: list[Camera], repair: Repair) -> list[Camera]:
     by = int(repair.value) % len(cameras)
     poses = [camera.world_to_camera for camera in cameras[by:] + cameras[:by]]
     return [replace(camera, world_to_camera=pose) for camera, pose in zip(cameras, poses, strict=True)]
@@ -248,7 +248,7 @@ KINDS = {
     "direction": Kind(_each_pose(lambda pose, repair: np.asarray(np.linalg.inv(pose), np.float64)), ("inverse",)),
     "quaternions": Kind(_each_pose(_with_xyzw), ("xyzw",)),
     "world": Kind(_each_pose(_with_axes), WORLDS),
-    "frames": Kind(_neighbours, ("1", "-1"), of_all=True),
+    "frames": Kind(_neighbors, ("1", "-1"), of_all=True),
     "center": Kind(_each(_centered), ("swapped", "middle")),
     "scale": Kind(
         _each_pose(lambda pose, repair: rigid(pose[:3, :3], pose[:3, 3] * repair.numbers[0])), numbers=1, doublings=11

@@ -1,18 +1,18 @@
 """Folders of RGB-D data sets: ScanNet, 7-Scenes and Replica, each as its exporter writes it.
 
 ScanNet   ``color/0.jpg``, ``depth/0.png``, ``pose/0.txt``, ``intrinsic/`` (or, in the 25k-frame subset,
-          ``intrinsics_color.txt`` beside the folders). Depth is 16-bit millimetres with intrinsics of its own. A pose
-          is all ``-inf`` where tracking was lost. Colour and depth share a pose: the extrinsics are the identity.
+          ``intrinsics_color.txt`` beside the folders). Depth is 16-bit millimeters with intrinsics of its own. A pose
+          is all ``-inf`` where tracking was lost. Color and depth share a pose: the extrinsics are the identity.
 7-Scenes  ``frame-000000.color.png``, ``.depth.png``, ``.pose.txt``, in the folder or in ``seq-01/``, ``seq-02/``, ...
-          Depth is 16-bit millimetres, 65535 (and 0) unmeasured. The Kinect was never calibrated: the data set's authors
-          used, and the poses belong to, a depth camera of focal length 585 pixels about the image's middle; colour has
+          Depth is 16-bit millimeters, 65535 (and 0) unmeasured. The Kinect was never calibrated: the data set's authors
+          used, and the poses belong to, a depth camera of focal length 585 pixels about the image's middle; color has
           the wider lens of 525 pixels that the sensor's driver states. ``camera-intrinsics.txt`` (3x3, as TSDF-fusion's
-          copies have, where colour and depth are registered) replaces both.
+          copies have, where color and depth are registered) replaces both.
 Replica   as NICE-SLAM renders it: ``results/frame000000.jpg``, ``results/depth000000.png``; line i of ``traj.txt`` is
           the pose of frame i, 16 numbers. ``cam_params.json`` lies in the folder or beside it: ``{"camera": {"w", "h",
-          "fx", "fy", "cx", "cy", "scale"}}``; a stored depth of ``scale`` is a metre.
+          "fx", "fy", "cx", "cy", "scale"}}``; a stored depth of ``scale`` is a meter.
 
-Poses are camera-to-world with OpenCV axes. Pixel centres are counted at whole numbers; the scene has them at +0.5.
+Poses are camera-to-world with OpenCV axes. Pixel centers are counted at whole numbers; the scene has them at +0.5.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ def _in_or_above(folder: Path, name: str) -> Path | None:
 def _scannet(folder: Path) -> Iterator[RecordedFrame]:
     images = numbered_images(folder / "color")
     if not images:
-        raise SceneError(f"{folder / 'color'} has no image; expected 0.jpg, 1.jpg, ...: export the colour frames")
+        raise SceneError(f"{folder / 'color'} has no image; expected 0.jpg, 1.jpg, ...: export the color frames")
     color = _scannet_lens(folder, "color", images[0])
     some_depth = next((folder / "depth").glob("*.png"), None)
     depth = replace(_scannet_lens(folder, "depth", some_depth) if some_depth else color, unit=MILLIMETRE)
@@ -122,7 +122,7 @@ def _seven_scenes(folder: Path) -> Iterator[RecordedFrame]:
         for file in numbered(file for names in SEVEN_SCENES_IMAGES for file in sequence.glob(names))
     ]
     if not images:
-        raise SceneError(f"{folder} has poses but no frame-*.color.png or .color.jpg: add the colour images")
+        raise SceneError(f"{folder} has poses but no frame-*.color.png or .color.jpg: add the color images")
     color, depth = _seven_scenes_lenses(folder, image_size(images[0]))
     depth = replace(depth, unit=MILLIMETRE, invalid=SEVEN_SCENES_INVALID)
     for file in images:
@@ -137,7 +137,7 @@ def _sequences(folder: Path) -> list[Path]:
 
 
 def _seven_scenes_lenses(folder: Path, size: tuple[int, int]) -> tuple[Sensor, Sensor]:
-    """The lenses of colour and of depth."""
+    """The lenses of color and of depth."""
     file = _in_or_above(folder, SEVEN_SCENES_INTRINSICS)
     if file is not None:
         both = Sensor.from_matrix(size, _matrix_in(file, 3))

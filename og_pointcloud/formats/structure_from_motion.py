@@ -1,7 +1,7 @@
 """Photographs without poses -> a COLMAP model with poses and points, through pycolmap (extra 'poses').
 
 SIFT features, matches of pairs, incremental mapping, as COLMAP does them; here are the choices: photographs of one size
-share a lens, every photograph is compared with every other, or, of more than `ALL_PAIRS`, with its neighbours and some
+share a lens, every photograph is compared with every other, or, of more than `ALL_PAIRS`, with its neighbors and some
 of all; the largest model is kept, turned so that z is up as the photographer stood. Its scale is free. Seeds are fixed.
 
 Structure from motion fails on bare walls, mirrors, or photographs taken from one spot: it says so, and makes no

@@ -1,4 +1,4 @@
-"""What the geometry formats share: rows of text, columns that become positions and colours, errors' paths."""
+"""What the geometry formats share: rows of text, columns that become positions and colors, errors' paths."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def positions(rows: NDArray[np.void]) -> NDArray[np.float64]:
 
 
 def colors(rows: NDArray[np.void]) -> NDArray[np.uint8] | None:
-    """(n, 3) uint8 RGB, or None without colour columns.
+    """(n, 3) uint8 RGB, or None without color columns.
 
     Takes uint8; uint16 (full range); other numbers in 0..1 or 0..255, told apart by their maximum; and PCL's packed
     ``rgb``/``rgba``, 0xAARRGGBB in four bytes, also where the file calls these bytes a float.
@@ -108,7 +108,7 @@ def colors(rows: NDArray[np.void]) -> NDArray[np.uint8] | None:
         values /= 257.0
     elif not (low >= 0 and high <= 255):
         raise SceneError(
-            f"colours {', '.join(names)} span {low:.6g}..{high:.6g}; expected 0..1 or 0..255: rescale or drop them"
+            f"colors {', '.join(names)} span {low:.6g}..{high:.6g}; expected 0..1 or 0..255: rescale or drop them"
         )
     elif high <= 1 and rows.dtype[names[0]].kind == "f":
         values *= 255.0

@@ -16,8 +16,8 @@ from og_pointcloud.models import MODEL_NAME
 
 CLASSES = {"clip": "CLIPModel", "siglip": "SiglipModel"}
 """config.json's model_type -> transformers' class of it."""
-CLIP_COLOURS = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)
-SIGLIP_COLOURS = (0.5, 0.5, 0.5), (0.5, 0.5, 0.5)
+CLIP_COLORS = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)
+SIGLIP_COLORS = (0.5, 0.5, 0.5), (0.5, 0.5, 0.5)
 """Means and standard deviations that the published models were trained with."""
 PILLOW_RESAMPLE: dict[Any, Resample] = {2: "bilinear", 3: "bicubic"}
 
@@ -105,7 +105,7 @@ def preprocessing_of(folder: str | os.PathLike[str], config: Any) -> Preprocessi
             f"{folder}, preprocessor_config.json: resample {number!r:.20} or rescale_factor {factor!r:.20}; expected "
             "2 (bilinear) or 3 (bicubic), and 1/255"
         )
-    mean, std = CLIP_COLOURS if is_clip else SIGLIP_COLOURS
+    mean, std = CLIP_COLORS if is_clip else SIGLIP_COLORS
     mean, std = tuple(said.get("image_mean", mean)), tuple(said.get("image_std", std))
     return Preprocessing(size, cast("Any", mean), cast("Any", std), PILLOW_RESAMPLE[number], keeps_shape=is_clip)
 

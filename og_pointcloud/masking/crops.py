@@ -1,7 +1,7 @@
 """Square cut-outs of an image, one a mask, and the numbers that an image encoder takes for their pixels.
 
 LangSplat's: the mask's tight box with black outside the mask, padded to a square. Better ones show where the thing
-stands: a larger window, and outside the mask a blend of the image with an even colour, so that the encoder sees a
+stands: a larger window, and outside the mask a blend of the image with an even color, so that the encoder sees a
 table's chairs, and still which of them is meant. Several are weighted into one vector by the encoder.
 """
 
@@ -18,7 +18,7 @@ from og_pointcloud.errors import OgPointcloudError, SceneError
 from og_pointcloud.formats.images import require_pillow
 
 Resample = Literal["bilinear", "bicubic"]
-Colour = tuple[float, float, float]
+Color = tuple[float, float, float]
 
 MAX_SIZE = 4096
 
@@ -54,8 +54,8 @@ class Preprocessing:
     """
 
     size: int
-    mean: Colour
-    std: Colour
+    mean: Color
+    std: Color
     resample: Resample = "bicubic"
     keeps_shape: bool = True
 
@@ -80,7 +80,7 @@ class Preprocessing:
 
     @property
     def fill(self) -> tuple[int, int, int]:
-        """The colour that becomes zero, or nearly: what says nothing to the model."""
+        """The color that becomes zero, or nearly: what says nothing to the model."""
         red, green, blue = (round(255 * value) for value in self.mean)
         return red, green, blue
 
@@ -101,7 +101,7 @@ def mask_crops(
 ) -> NDArray[np.uint8]:
     """(M, size, size, 3) uint8 RGB.
 
-    image: (H, W, 3) uint8 RGB. masks: (M, H, W) bool; one without a pixel is an error. fill: the colour outside the
+    image: (H, W, 3) uint8 RGB. masks: (M, H, W) bool; one without a pixel is an error. fill: the color outside the
     mask and beyond the image's edge. SceneError for arrays that do not fit together.
     """
     require_masks(image, masks)

@@ -42,7 +42,7 @@ class DenseEncoder(MaskEncoder):
         self.model, self.feature_space, self.width = model, model.feature_space, model.width
 
     def embed(self, image: NDArray[np.uint8], masks: NDArray[np.bool_]) -> NDArray[np.float32]:
-        """image (H, W, 3) uint8 RGB, masks (M, H, W) bool -> (M, width) float32, L2-normalised rows.
+        """image (H, W, 3) uint8 RGB, masks (M, H, W) bool -> (M, width) float32, L2-normalized rows.
 
         SceneError for arrays that do not fit together, and for a mask without a pixel.
         """

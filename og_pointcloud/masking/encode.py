@@ -40,7 +40,7 @@ DEMO_FOLDER = Path(__file__).parent / "demo_encoder"
 FORMAT, SCHEMA_VERSION = "og-image-encoder", 1
 MANIFEST, GRAPH = "manifest.json", "image_encoder.onnx"
 ENCODER_FILES = {MANIFEST: 1 << 20, GRAPH: (1 << 31) - 1}
-"""The files of an encoder, and the bytes that each may have; a serialised graph cannot have more."""
+"""The files of an encoder, and the bytes that each may have; a serialized graph cannot have more."""
 OPERATORS = frozenset({
     "Add", "Clip", "Concat", "Conv", "DequantizeLinear", "Div", "Erf", "Expand", "Gather", "Gemm", "GlobalAveragePool",
     "LayerNormalization", "MatMul", "Max", "Mul", "Pow", "ReduceL2", "Relu", "Reshape", "Resize", "Shape", "Sigmoid",
@@ -125,7 +125,7 @@ class CropEncoder(MaskEncoder):
         self.feature_space, self.width = model.feature_space, model.width
 
     def embed(self, image: NDArray[np.uint8], masks: NDArray[np.bool_]) -> NDArray[np.float32]:
-        """image (H, W, 3) uint8 RGB, masks (M, H, W) bool -> (M, width) float32, L2-normalised rows.
+        """image (H, W, 3) uint8 RGB, masks (M, H, W) bool -> (M, width) float32, L2-normalized rows.
 
         SceneError for arrays that do not fit together, and for a mask without a pixel.
         """
@@ -138,7 +138,7 @@ class CropEncoder(MaskEncoder):
 
     def _vectors(self, image: NDArray[np.uint8], masks: NDArray[np.bool_], crop: Crop) -> NDArray[np.float32]:
         before = self.model.preprocessing
-        # Black outside, as LangSplat has it, is a colour to the model; what a blend goes to should be none.
+        # Black outside, as LangSplat has it, is a color to the model; what a blend goes to should be none.
         fill = before.fill if crop.outside else (0, 0, 0)
         return self.model(before.pixels(mask_crops(image, masks, crop, before.size, fill, before.resample)))
 

@@ -72,7 +72,7 @@ def own_proposer(place: str) -> MaskProposer:
     is called without arguments. SceneError where it is not there.
 
     MODULE is the file ``MODULE.py`` in the working directory (dots are folders), else a module that Python finds. The
-    import path stays as it is: a file that imports its neighbours needs their folder in PYTHONPATH.
+    import path stays as it is: a file that imports its neighbors needs their folder in PYTHONPATH.
     """
     module, _, name = place.partition(":")
     if not name or not all(part.isidentifier() for part in module.split(".")):

@@ -1,10 +1,10 @@
-"""Masks without a model: superpixels merged by colour and contrast into a region tree.
+"""Masks without a model: superpixels merged by color and contrast into a region tree.
 
 1. Superpixels: graph segmentation (Felzenszwalb and Huttenlocher, 2004) cut by compact SLIC cells, so that none runs
-   from one surface into another of its colour.
-2. Merging: in every round, pairs of neighbours that are each other's nearest become one region. How far apart two
-   are follows from their mean colours and the contrast along their common border. Small regions are near to all their
-   neighbours, and texture brings regions nearer.
+   from one surface into another of its color.
+2. Merging: in every round, pairs of neighbors that are each other's nearest become one region. How far apart two
+   are follows from their mean colors and the contrast along their common border. Small regions are near to all their
+   neighbors, and texture brings regions nearer.
 3. Proposals: the regions that lasted: the distance at which a region was merged away against that at which it
    was made is its score. They overlap only by containing one another; `levels` settles which to use.
 
@@ -37,13 +37,13 @@ SMALLEST_SUPERPIXEL = 1e-4
 CELL_SHARE = 1 / 40
 """Side of a SLIC cell, of the image's longer side."""
 LIGHTNESS = 0.5
-"""Weight of lightness beside the two colour channels: shading and shadows change lightness first."""
+"""Weight of lightness beside the two color channels: shading and shadows change lightness first."""
 TEXTURE = 0.03
 """Per unit of the standard deviation inside both regions, distances count so much less."""
 REACH_PX = 2
 """Borders are compared so many pixels to either side: the border itself is blurred."""
 SMALL_REGION = 4e-3
-"""Share of the image: a region of this size is nearer to its neighbours by the root of 2 than a large one."""
+"""Share of the image: a region of this size is nearer to its neighbors by the root of 2 than a large one."""
 NOISE = 5.0
 """Distances below this say nothing: it is added to both sides of the score's ratio."""
 SMALLEST_SHARE, LARGEST_SHARE = 4e-4, 0.6
@@ -205,7 +205,7 @@ class _Regions:
 
 @dataclass(frozen=True)
 class _Borders:
-    """Neighbours a < b, (e,), and sums over the pixel pairs of their border: how many, contrast."""
+    """Neighbors a < b, (e,), and sums over the pixel pairs of their border: how many, contrast."""
 
     a: NDArray[np.integer]
     b: NDArray[np.integer]
@@ -237,7 +237,7 @@ def _sums(labels: NDArray[np.integer], values: Floats) -> Floats:
 
 
 def _pixel_pairs(labels: Labels, lab: NDArray[np.float32]) -> Pairs:
-    """Pixels whose right neighbour is another region, p of them: both regions, and the contrast there, each (p,)."""
+    """Pixels whose right neighbor is another region, p of them: both regions, and the contrast there, each (p,)."""
     row, column = np.nonzero(labels[:, :-1] != labels[:, 1:])
     left, right = np.maximum(column + 1 - REACH_PX, 0), np.minimum(column + REACH_PX, labels.shape[1] - 1)
     contrast = np.linalg.norm(lab[row, left] - lab[row, right], axis=1).astype(np.float64)

@@ -37,7 +37,7 @@ class Photograph:
     face: Face | None = None
 
     def read(self, longest_side: int) -> NDArray[np.uint8]:
-        """(h, w, 3) uint8 RGB, shrunk so that neither side is longer. Grey, 16-bit and alpha become RGB of 8 bit; EXIF
+        """(h, w, 3) uint8 RGB, shrunk so that neither side is longer. Gray, 16-bit and alpha become RGB of 8 bit; EXIF
         orientation is ignored, as poses ignore it."""
         width, height = image_size(self.file)
         if self.face is not None:

@@ -126,7 +126,7 @@ def scaled_size(size: tuple[int, int], preparation: Preparation) -> tuple[int, i
 
 def prepared(image: NDArray[np.uint8], preparation: Preparation) -> torch.Tensor:
     """(H, W, 3) uint8 RGB -> (1, 3, side, side) float32 as transformers' own processors make it: bilinear with
-    antialiasing, rounded to 8 bit, scaled to [0, 1], normalised, then padded with 0 to the right and below."""
+    antialiasing, rounded to 8 bit, scaled to [0, 1], normalized, then padded with 0 to the right and below."""
     pixels = torch.from_numpy(np.ascontiguousarray(image)).permute(2, 0, 1)[None].float()
     size = scaled_size((image.shape[0], image.shape[1]), preparation)
     pixels = torch.nn.functional.interpolate(pixels, size, mode="bilinear", align_corners=False, antialias=True)
@@ -137,7 +137,7 @@ def prepared(image: NDArray[np.uint8], preparation: Preparation) -> torch.Tensor
 
 
 def _preparation(folder: Path, kind: str, config: Any) -> Preparation:
-    """Side from the vision configuration, colours from the preprocessor's file where the model has one."""
+    """Side from the vision configuration, colors from the preprocessor's file where the model has one."""
     side = config.vision_config.image_size if kind in PADDED else _square_side(config)
     said = stated(folder, "preprocessor_config.json", "processor_config.json")
     said = said.get("image_processor", said)

@@ -53,7 +53,7 @@ RIGID = 1e-4
 
 
 class EditOptions(TypedDict, total=False):
-    """cloud: the plain cloud or 3DGS file to edit (PLY, PCD); None for the scene's own points and colours.
+    """cloud: the plain cloud or 3DGS file to edit (PLY, PCD); None for the scene's own points and colors.
     halo: points of no instance that lie this near to the object, in spacings, go with it: what surrounds an object in
         a 3DGS file often has no label; default 0. text_features: as for ``segment``.
     """
@@ -99,9 +99,9 @@ def extract(scene: SceneLike, what: What, output: str | os.PathLike[str], **opti
 def recolour(
     scene: SceneLike, what: What, output: str | os.PathLike[str], color: ArrayLike, **options: Unpack[EditOptions]
 ) -> Edit:
-    """Write the cloud with some instances in another colour.
+    """Write the cloud with some instances in another color.
 
-    color: (3,) RGB, 0 to 255. The object keeps its light and dark, whose mean becomes the colour, and Gaussians also
+    color: (3,) RGB, 0 to 255. The object keeps its light and dark, whose mean becomes the color, and Gaussians also
     how theirs changes with direction. Other arguments and errors as for `remove`.
     """
     rgb = np.asarray(color, np.float64)
@@ -265,7 +265,7 @@ def _read(path: Path) -> _Cloud:
             return _Cloud(
                 {"vertex": gaussian_rows(points)}, (f"{path}: harmonics above the constant one are left out",)
             )
-        columns = f"{path}: only positions and colours are kept, as a PLY"
+        columns = f"{path}: only positions and colors are kept, as a PLY"
         return _Cloud({"vertex": plain_rows(points.xyz_world, points.rgb)}, (columns,))
     with naming(path):
         elements = read_ply(path)

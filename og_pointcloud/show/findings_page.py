@@ -33,7 +33,7 @@ PAPER = 250
 FADED = 0.6
 """How far what is around a thing fades into the paper."""
 HIGHLIGHT = (214, 90, 40)
-"""Colour of things in clouds without colours."""
+"""Color of things in clouds without colors."""
 
 PAGE = """<!doctype html><html><head><meta charset="utf-8"><title>{title}</title><style>
 body {{ font: 15px/1.4 system-ui, sans-serif; margin: 2em; color: #222; background: #fff }}

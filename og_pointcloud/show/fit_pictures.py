@@ -1,7 +1,7 @@
 """Pictures of features, as in the paper's figures: rendered over several views, stage below stage.
 
-Features become colours by one linear map, fitted once and used for every stage, so that equal colours mean equal
-features before and after discretisation. The colours are rendered with the blending weights of the renderer.
+Features become colors by one linear map, fitted once and used for every stage, so that equal colors mean equal
+features before and after discretization. The colors are rendered with the blending weights of the renderer.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ with naming_extra("scipy and numba", "fit"):
 GREY = (128, 128, 128)
 """A point without a feature, because no view sees it."""
 SPREAD = 1.5
-"""Standard deviations to either side of the mean that a colour channel shows."""
+"""Standard deviations to either side of the mean that a color channel shows."""
 LEAST_RANGE = 0.25
 """A channel is stretched no further than to show this part of the widest one's range: the rest may be noise."""
 OPAQUE = 0.5
@@ -53,7 +53,7 @@ class FeatureColors:
         """The three main directions of the features become red, green and blue.
 
         features: (n, w); rows with NaN are left out. weight: (n,), how much each counts: its visibility. Each direction
-        points to where its largest component is positive, so that the same features always have the same colours.
+        points to where its largest component is positive, so that the same features always have the same colors.
         """
         used = _known(features) & (weight > 0)
         rows, mass = features[used].astype(np.float64), weight[used].astype(np.float64)
@@ -71,18 +71,18 @@ class FeatureColors:
         return cls(center, axes)
 
     def __call__(self, features: NDArray[np.floating]) -> Colors:
-        """(n, 3) uint8 RGB of features (n, w), grey where they are NaN."""
+        """(n, 3) uint8 RGB of features (n, w), gray where they are NaN."""
         share = 0.5 + (features.astype(np.float64) - self.center) @ self.axes
         known = _known(features)[:, None]
         return np.where(known, np.rint(255 * np.clip(np.where(known, share, 0), 0, 1)), GREY).astype(np.uint8)
 
 
 def feature_colors(features: NDArray[np.floating], weight: NDArray[np.floating]) -> Colors:
-    """(n, 3) uint8 RGB of features (n, w), grey for points without weight (n,), which no view sees, and for NaN.
+    """(n, 3) uint8 RGB of features (n, w), gray for points without weight (n,), which no view sees, and for NaN.
 
     >>> import numpy as np
     >>> import og_pointcloud as og
-    >>> og.feature_colors(np.array([[0.0], [1.0], [np.nan]]), np.ones(3))[:, 0]  # red; without a feature, grey
+    >>> og.feature_colors(np.array([[0.0], [1.0], [np.nan]]), np.ones(3))[:, 0]  # red; without a feature, gray
     array([ 43, 212, 128], dtype=uint8)
     """
     colors = FeatureColors.fit(features, weight)(features)
@@ -101,7 +101,7 @@ def feature_picture(
     """Write a PNG of features over several views: a row of photographs, where there are any, then a row a stage.
 
     near: depth of the near plane (`geometry.near_plane`). stages: title -> (n, w) features, NaN rows for points without
-    one; colours are fitted to the first stage. columns: views shown, evenly spread.
+    one; colors are fitted to the first stage. columns: views shown, evenly spread.
     SceneError where the stages do not fit the Gaussians.
 
     >>> import pathlib, tempfile
@@ -154,7 +154,7 @@ def _check(stages: Mapping[str, NDArray[Any]], points: int) -> None:
             raise SceneError(f"stage '{title}' has shape {values.shape}; expected {points} rows, one a Gaussian")
     if len({values.shape for values in stages.values()}) > 1:
         shapes = ", ".join(f"{title} {values.shape}" for title, values in stages.items())
-        raise SceneError(f"the stages differ in shape ({shapes}); expected one, since they share their colours")
+        raise SceneError(f"the stages differ in shape ({shapes}); expected one, since they share their colors")
 
 
 def _known(features: NDArray[np.floating]) -> NDArray[np.bool_]:
@@ -180,7 +180,7 @@ def _shrunk(view: View) -> View:
 
 
 def _rendered(gaussians: Gaussians, rgb: NDArray[np.float32], view: View, near: float) -> NDArray:
-    """(H, W, 3) mean colours of the points that show, fading to white where little covers a pixel."""
+    """(H, W, 3) mean colors of the points that show, fading to white where little covers a pixel."""
     image, covered = render(gaussians, rgb, view.camera, near)
     opacity = np.minimum(covered / OPAQUE, 1)[:, :, None]
     return opacity * image / np.maximum(covered, 1e-12)[:, :, None] + (1 - opacity) * 255

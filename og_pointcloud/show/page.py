@@ -39,7 +39,7 @@ LEVELS = 65535
 class Look:
     """How a page begins; a click changes all but the title.
 
-    mode: what colours show, "labels", "instances" or "photo". boxes: whether they are shown. cut: share of the height
+    mode: what colors show, "labels", "instances" or "photo". boxes: whether they are shown. cut: share of the height
     hidden from the top, 0 to 1. colors: RGB of each label; left out, by its number. unlabelled: what points without a
     label are called.
     """
@@ -62,7 +62,7 @@ def write_page(
 ) -> str:
     """Write the page, whole or not at all; returns what it leaves out, in words, empty if nothing.
 
-    result: of ``scene``, at least one finite point. rgb: (N, 3) colours of its points.
+    result: of ``scene``, at least one finite point. rgb: (N, 3) colors of its points.
     """
     finite = np.flatnonzero(np.isfinite(result.xyz).all(axis=1))
     if len(finite) == 0:

@@ -1,8 +1,8 @@
 """Columns of a cloud or 3DGS file that an edit changes: recoloured, moved into another frame, put behind others.
 
-A splat's colour seen along a direction d is 0.5 + sum_k c_k Y_k(d), Y_k real spherical harmonics with the
+A splat's color seen along a direction d is 0.5 + sum_k c_k Y_k(d), Y_k real spherical harmonics with the
 Condon-Shortley sign, in the order l = 0, 1, .., m = -l .. l. Turning a splat mixes the coefficients of each degree
-among themselves: the colour that was seen along d is then seen along R d.
+among themselves: the color that was seen along d is then seen along R d.
 """
 
 from __future__ import annotations
@@ -27,20 +27,20 @@ Columns: TypeAlias = dict[str, NDArray[Any]]
 NORMAL_COLUMNS = (("nx", "ny", "nz"), ("normal_x", "normal_y", "normal_z"))
 RGB = ("red", "green", "blue")
 COLORS = (*RGB, "r", "g", "b", "diffuse_red", "diffuse_green", "diffuse_blue", "rgb", "rgba")
-"""All names of colour columns, which give way to RGB of type uchar."""
+"""All names of color columns, which give way to RGB of type uchar."""
 DARK = 0.05
-"""Mean luminance below which an object's shading is too faint to be kept in a new colour."""
+"""Mean luminance below which an object's shading is too faint to be kept in a new color."""
 MAX_DEGREE = 3
 """Highest degree of the harmonics that files have."""
 
 
 def recoloured(rows: Rows, chosen: NDArray[np.bool_], color: NDArray[np.float64]) -> Rows:
-    """The rows with those chosen in another colour, as harmonics, as red green blue, or both; a plain cloud without
-    colours becomes grey. color: (3,), 0 to 1; the mean of the object becomes that colour, its light and dark stay."""
+    """The rows with those chosen in another color, as harmonics, as red green blue, or both; a plain cloud without
+    colors becomes gray. color: (3,), 0 to 1; the mean of the object becomes that color, its light and dark stay."""
     columns, rgb = _columns(rows), colors(rows)
     is_splat = set(BASE_COLOR) <= set(columns)
     if is_splat:
-        # Colour is linear in the coefficients, so what a linear map does to colours it does to them.
+        # Color is linear in the coefficients, so what a linear map does to colors it does to them.
         base = 0.5 + SH_CONSTANT * stack_columns(rows, BASE_COLOR, np.float64)[chosen]
         mapping = _color_map(np.clip(base, 0, 1), color)
         _set(columns, BASE_COLOR, (base @ mapping.T - 0.5) / SH_CONSTANT, chosen)
@@ -77,7 +77,7 @@ def placed(
 
 
 def appended(base: Rows, added: Rows) -> tuple[Rows, tuple[str, ...]]:
-    """The rows of both, with the columns of the first; and what is to be told. Colours that the two have in different
+    """The rows of both, with the columns of the first; and what is to be told. Colors that the two have in different
     types become bytes."""
     first, second = _columns(base), _columns(added)
     zeros, notes = np.zeros(len(added)), []
@@ -95,15 +95,15 @@ def appended(base: Rows, added: Rows) -> tuple[Rows, tuple[str, ...]]:
 
 
 def _in_bytes(columns: Columns, rgb: NDArray[np.uint8]) -> Columns:
-    """The columns with colours (n, 3) as red, green, blue of one byte, in place of all that they were."""
+    """The columns with colors (n, 3) as red, green, blue of one byte, in place of all that they were."""
     if not all(name in columns and columns[name].dtype == np.uint8 for name in RGB):
         columns = {name: column for name, column in columns.items() if name not in COLORS}
     return columns | dict(zip(RGB, rgb.T, strict=True))
 
 
 def _color_map(base: NDArray[np.float64], color: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(3, 3) what colours (n, 3) are multiplied by: their luminance times the new colour, so that their mean becomes
-    that colour."""
+    """(3, 3) what colors (n, 3) are multiplied by: their luminance times the new color, so that their mean becomes
+    that color."""
     return np.outer(color, LUMINANCE) / max(float((base @ LUMINANCE).mean()), DARK)
 
 

@@ -39,7 +39,7 @@ MODELS_VARIABLE = "OG_POINTCLOUD_MODELS"
 """Environment variable: folders, parted as in PATH, that are encoders or hold some."""
 MANIFEST, GRAPH, TOKENIZER, WORD_BANK = "manifest.json", "text_encoder.onnx", "tokenizer.json", "word_bank.npy"
 ENCODER_FILES = {MANIFEST: 1 << 20, GRAPH: (1 << 31) - 1, TOKENIZER: 1 << 26, WORD_BANK: 1 << 26}
-"""The files of an encoder, and the bytes that each may have; a serialised graph cannot have more. One without a word
+"""The files of an encoder, and the bytes that each may have; a serialized graph cannot have more. One without a word
 bank is an encoder too."""
 OPERATORS = frozenset({
     "Add", "ArgMax", "Cast", "Clip", "Concat", "DequantizeLinear", "Div", "DynamicQuantizeLinear", "Equal", "Erf",

@@ -56,7 +56,7 @@ def segment(
     """Label a cloud, or a mesh by its vertices, and paint a copy of it.
 
     pcd: Open3D's PointCloud or TriangleMesh, legacy or tensor, on any device, in the scene's world coordinates. What
-    comes back is of the same kind with all its attributes; its colours are the labels', grey where unknown. A tensor
+    comes back is of the same kind with all its attributes; its colors are the labels', gray where unknown. A tensor
     geometry has og_label, og_instance (int32), og_score (float32) and og_reason (uint8) too, (N, 1) each, as Open3D's
     own filters want them.
     Other arguments: as for ``og_pointcloud.segment``. Raises as that, and SceneError for an empty cloud.
@@ -81,7 +81,7 @@ def to_open3d(result: Segmentation) -> Any:
 
 
 def _painted(pcd: Any, result: Segmentation) -> Any:
-    """A copy of any of the four kinds, with the result's colours, and its attributes where they can be kept."""
+    """A copy of any of the four kinds, with the result's colors, and its attributes where they can be kept."""
     host = open3d()
     colors = result.colors / 255
     if isinstance(pcd, host.geometry.PointCloud):

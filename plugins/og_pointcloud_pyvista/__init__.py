@@ -7,7 +7,7 @@
     mesh.og.select("mug"), mesh.og.boxes()
 
     plotter = pv.Plotter()
-    plotter.og.add_segmentation(mesh)                     # colours, legend with counts, names on the instances
+    plotter.og.add_segmentation(mesh)                     # colors, legend with counts, names on the instances
     plotter.og.add_boxes(mesh)
     plotter.og.enable_click_query()                       # click: the instance, its best words and scores
     plotter.show()

@@ -89,7 +89,7 @@ class OgDataSet:
     def boxes(self, scene: SceneLike | None = None, *, up: ArrayLike | None = None) -> pv.PolyData:
         """Oriented boxes of the scene's instances that have points here, as lines: 12 cells each.
 
-        Of a segmented dataset, only labelled instances, in their label's colour. Cell arrays: og_instance, og_color.
+        Of a segmented dataset, only labelled instances, in their label's color. Cell arrays: og_instance, og_color.
         up: (3,) direction that boxes stand upright on, where it is known.
         """
         found = find_scene(self._mesh, scene)
@@ -160,7 +160,7 @@ def _attach(mesh: Any, result: Segmentation) -> None:
 
 
 def _instance_colors(mesh: pv.DataSet, ids: Sequence[int]) -> dict[int, Sequence[int]]:
-    """Of each instance the colour of its first point here; all have the same label."""
+    """Of each instance the color of its first point here; all have the same label."""
     present, first = np.unique(np.asarray(mesh.point_data[INSTANCE]), return_index=True)
     rows = first[np.searchsorted(present, ids)]
     return dict(zip(ids, np.asarray(mesh.point_data[COLOR])[rows].tolist(), strict=True))

@@ -9,11 +9,11 @@ from og_pointcloud.ask.labelled_scene import as_scene
 from og_pointcloud_pyvista.datasets import INSTANCE, set_strings
 
 RGB = "RGB"
-"""Point array of the scene's own colours, as PyVista's reader of .ply names it."""
+"""Point array of the scene's own colors, as PyVista's reader of .ply names it."""
 
 
 def read_ogpc(path: str) -> pv.PolyData:
-    """The points of a scene, world coordinates, float64, with og_instance, and RGB where it has colours.
+    """The points of a scene, world coordinates, float64, with og_instance, and RGB where it has colors.
 
     The dataset remembers its file, so that ``mesh.og.segment(["chair"])`` needs no scene. BundleError for any other
     file, also where PyVista would say that it cannot read it.

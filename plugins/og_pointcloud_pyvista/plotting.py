@@ -30,7 +30,7 @@ LEGEND_ENTRIES = 20
 LEGEND_MARGIN = 0.015
 HIGHLIGHT = "magenta"
 SHADE = 0.5
-"""How much darker a label's colour may become where the dataset's own colours are dark: keeps shape and shadow."""
+"""How much darker a label's color may become where the dataset's own colors are dark: keeps shape and shadow."""
 PROBE = "import pyvista as pv; pv.Plotter(off_screen=True, window_size=(32, 32)).screenshot(return_img=True)"
 TEXT_SIZE = 11
 
@@ -68,11 +68,11 @@ class OgPlotter:
         name: str = "og_segmentation",
         **options: Any,
     ) -> pv.Actor:
-        """Draw a segmented dataset: a colour a label, or ``by="instance"``, light grey where there is none.
+        """Draw a segmented dataset: a color a label, or ``by="instance"``, light gray where there is none.
 
         legend: the labels with their numbers of points. names: a label's name on each of its instances; names that
         would cover others are left out, those of large instances go first. point_size: pixels, for datasets of points.
-        options: of ``add_mesh``. Where the dataset has its own colours (RGB), they shade those of the labels.
+        options: of ``add_mesh``. Where the dataset has its own colors (RGB), they shade those of the labels.
 
         Returns the actor. Warns where no point has a label; OgPointcloudError for a dataset without points or labels.
         """
@@ -82,7 +82,7 @@ class OgPlotter:
         words = label_names(mesh)
         labels = np.asarray(mesh.point_data[LABEL])
         if (labels < 0).all():
-            warnings.warn(f"none of {mesh.n_points:,} points has a label: all are drawn grey", stacklevel=2)
+            warnings.warn(f"none of {mesh.n_points:,} points has a label: all are drawn gray", stacklevel=2)
         colors = _colors(np.asarray(mesh.point_data[INSTANCE]) if by == "instance" else labels)
         kind = {"style": "points", "point_size": point_size} if _is_cloud(mesh) else {}
         self._point_size = point_size
@@ -210,7 +210,7 @@ class OgPlotter:
         )  # fmt: skip
         legend.SetPosition(1 - size[0] - LEGEND_MARGIN, 1 - size[1] - LEGEND_MARGIN)  # `loc` leaves wide legends inside
         legend.SetPosition2(*size)
-        # Words in the text's colour beside a swatch: VTK by itself gives both the colour of the swatch.
+        # Words in the text's color beside a swatch: VTK by itself gives both the color of the swatch.
         for index, (_, color) in enumerate(entries if colored else []):
             legend.SetEntryIcon(index, _swatch(color))
 

@@ -32,7 +32,7 @@ def draw(
 ) -> pv.Plotter:
     """An off-screen plotter, ready to be photographed; needs `can_render`.
 
-    rgb: (N, 3) colours of the points, which shade those of the labels. shown: (N,) which points to draw. look: its mode
+    rgb: (N, 3) colors of the points, which shade those of the labels. shown: (N,) which points to draw. look: its mode
     is "labels" or "instances".
     """
     of_points = [field.name for field in fields(result) if isinstance(getattr(result, field.name), np.ndarray)]

@@ -1,6 +1,6 @@
-"""Messages of one stamp -> a frame of a map: depth and colour images, masks with features, the camera.
+"""Messages of one stamp -> a frame of a map: depth and color images, masks with features, the camera.
 
-Depth is 16UC1 in millimetres or 32FC1 in metres. Masks are 16UC1 or 32SC1: 0 none, else a number from 1 that means
+Depth is 16UC1 in millimeters or 32FC1 in meters. Masks are 16UC1 or 32SC1: 0 none, else a number from 1 that means
 something in this image alone. A PointCloud2 with a field ``feature`` has a row a mask: what the encoder saw of masks 1,
 2, ... CameraInfo is of rectified images.
 """
@@ -26,7 +26,7 @@ ENCODINGS = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4", "32SC1": "i4", "rgb8"
 
 
 def image_array(message: Any) -> NDArray[Any]:
-    """(H, W) or (H, W, 3) pixels of a sensor_msgs/Image, colours as RGB. SceneError for an encoding that is unknown."""
+    """(H, W) or (H, W, 3) pixels of a sensor_msgs/Image, colors as RGB. SceneError for an encoding that is unknown."""
     encoding = str(message.encoding)
     if encoding not in ENCODINGS:
         raise SceneError(f"image encoding is '{encoding}'; expected one of {', '.join(ENCODINGS)}")

@@ -1,7 +1,7 @@
-"""Frames of a map from a ROS 2 bag, without ROS: depth and colour images, masks with features, poses from tf.
+"""Frames of a map from a ROS 2 bag, without ROS: depth and color images, masks with features, poses from tf.
 
-Topics are told by type and name. Images whose name has "depth" are depth, those with "mask" are masks, other colour
-ones are colour; a PointCloud2 whose name has "feature" brings features (`frames`). Messages of one stamp are one frame.
+Topics are told by type and name. Images whose name has "depth" are depth, those with "mask" are masks, other color
+ones are color; a PointCloud2 whose name has "feature" brings features (`frames`). Messages of one stamp are one frame.
 """
 
 from __future__ import annotations

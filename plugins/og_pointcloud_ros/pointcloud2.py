@@ -27,7 +27,7 @@ DATATYPES = {np.dtype(code): number for number, code in TYPE_CODES.items()}
 
 
 def from_pointcloud2(message: Any) -> NDArray[np.float64]:
-    """(N, 3) float64, the x y z of every point, row by row for an organised cloud, in the message's own frame.
+    """(N, 3) float64, the x y z of every point, row by row for an organized cloud, in the message's own frame.
 
     N is height * width: invalid points stay, as NaN or infinity, so that row i is point i of the message. x, y and z
     may be of any of the eight types, in any order, at any offset. SceneError where they are absent, or sizes disagree.
@@ -92,7 +92,7 @@ def to_pointcloud2(
     """A labelled cloud as sensor_msgs/PointCloud2: fields x y z rgb label instance score, 28 bytes a point.
 
     label: uint32, row of ``result.names``, 65535 unlabelled (``to_label_info`` tells the names). instance: int32, -1
-    background, -2 unobserved, -3 too far. score: float32. rgb: a colour a label, packed as PCL packs it.
+    background, -2 unobserved, -3 too far. score: float32. rgb: a color a label, packed as PCL packs it.
     stamp: a Time message, or nanoseconds since the epoch. messages: the library whose message is made.
     xyz: (N, 3) coordinates in frame_id, where that is not the scene's world: the cloud as the sensor gave it.
     double: write x y z as float64, which few viewers read; for coordinates, like a map's, that float32 would round.
@@ -101,15 +101,15 @@ def to_pointcloud2(
     if xyz.shape != (len(result), 3):
         raise SceneError(f"xyz has shape {xyz.shape}; expected ({len(result)}, 3), a row a label")
     place = "<f8" if double else "<f4"
-    colours = [("rgb", "<f4"), ("label", "<u4"), ("instance", "<i4"), ("score", "<f4")]
-    rows = np.empty(len(result), [("xyz", place, 3), *colours])
+    colors = [("rgb", "<f4"), ("label", "<u4"), ("instance", "<i4"), ("score", "<f4")]
+    rows = np.empty(len(result), [("xyz", place, 3), *colors])
     with np.errstate(over="ignore"):  # what leaves float32 is infinitely far
         rows["xyz"] = xyz
     rows["rgb"] = _packed_colors(len(result.names))[result.labels]
     rows["label"] = np.where(result.labels < 0, UNLABELLED, result.labels)
     rows["instance"] = result.instances
     rows["score"] = result.scores
-    return write_fields(rows.view([*((axis, place) for axis in "xyz"), *colours]), frame_id, stamp, messages=messages)
+    return write_fields(rows.view([*((axis, place) for axis in "xyz"), *colors]), frame_id, stamp, messages=messages)
 
 
 def write_fields(
@@ -179,6 +179,6 @@ def _bytes_of(data: Any) -> NDArray[np.uint8]:
 
 
 def _packed_colors(names: int) -> NDArray[np.float32]:
-    """(names + 1,) float32 whose bits are 0x00RRGGBB: a colour a label, then unknown's, where label -1 finds it."""
+    """(names + 1,) float32 whose bits are 0x00RRGGBB: a color a label, then unknown's, where label -1 finds it."""
     red, green, blue = label_colors(np.append(np.arange(names), UNKNOWN)).astype(np.uint32).T
     return (red << 16 | green << 8 | blue).view(np.float32)

@@ -105,12 +105,12 @@ def more_clusters_than_points() -> Answer:
     features, xyz = unit_rows(5, 6), unit_rows(5, 3, seed=1)
     settings = CodebookSettings(k1=100, k2=10)
     book = two_level_codebook(features, xyz, np.ones(5), mask_table_of(np.ones((2, 5)), [0, 0]), settings)
-    return Answer(np.r_[len(np.unique(book.leaf)), len(book.leaf_centres)], np.array([5, 5]))
+    return Answer(np.r_[len(np.unique(book.leaf)), len(book.leaf_centers)], np.array([5, 5]))
 
 
 @agrees(0)
 def empty_clusters() -> Answer:
-    """Five groups of points, five centres in one place: the empty clusters start again where points are far off."""
+    """Five groups of points, five centers in one place: the empty clusters start again where points are far off."""
     groups = np.repeat(np.arange(5), 20)
     values = (10 * np.eye(5)[groups] + 0.1 * np.random.default_rng(0).normal(size=(100, 5))).astype(np.float32)
     own, _ = kmeans(values, np.ones(100), np.tile(values[:1], (5, 1)), 30, reseed=True)
@@ -122,10 +122,10 @@ def kmeans_offset(offset: float) -> Answer:
     """k-means of values far from zero; naive: distances as |x|^2 - 2 x c + |c|^2."""
     random = np.random.default_rng(0)
     values = (offset + random.normal(size=(400, 3))).astype(np.float32)
-    centres = values[:8].copy()
-    exact = np.square(values.astype(float)[:, None] - centres.astype(float)).sum(axis=2).argmin(axis=1)
-    own, _ = kmeans(values, np.ones(400), centres, 0, reseed=False)
-    return Answer(own.astype(np.int64), exact, lambda: naive.nearest_centre(values, centres))
+    centers = values[:8].copy()
+    exact = np.square(values.astype(float)[:, None] - centers.astype(float)).sum(axis=2).argmin(axis=1)
+    own, _ = kmeans(values, np.ones(400), centers, 0, reseed=False)
+    return Answer(own.astype(np.int64), exact, lambda: naive.nearest_centre(values, centers))
 
 
 @agrees(0)
@@ -207,7 +207,7 @@ def paper_codebook_with_empty_clusters() -> Answer:
         RenderedViews(solid(scene.points.xyz), scene.views, NEAR, still, whole=False), features, still
     )
     known = np.flatnonzero(book.leaf >= 0)
-    return Answer(np.r_[book.centres[book.leaf[known]].ravel(), len(known) > 40], np.r_[features[known].ravel(), 1])
+    return Answer(np.r_[book.centers[book.leaf[known]].ravel(), len(known) > 40], np.r_[features[known].ravel(), 1])
 
 
 def _losses(image: NDArray[np.float64], mask: NDArray[np.int64]) -> Answer:

@@ -132,7 +132,7 @@ def read_features(raw: NDArray[np.floating], normalise: bool) -> NDArray[np.floa
     """What the losses see of a raw feature (n, width): its direction mapped to [0, 1], or itself within the unit ball.
 
     The ball: with raw features Eq. 2 alone, and with Eq. 1 wherever masks share no Gaussian, is smallest at infinity.
-    A zero row has no direction; normalised, it reads 0.5.
+    A zero row has no direction; normalized, it reads 0.5.
     """
     return _read(raw, normalise, _columns(raw))
 
@@ -164,7 +164,7 @@ class FeatureObjective:
                 "poses and cloud share one frame"
             )
         self._weights = _int32(table.weights[kept][:, self.shown])
-        self._weights.sort_indices()  # neighbouring rows of the features are then read one after another
+        self._weights.sort_indices()  # neighboring rows of the features are then read one after another
         self._transposed = _int32(csr_array(self._weights.T))
         self._first = np.flatnonzero(np.diff(table.mask_view[kept], prepend=-1, append=-2))
         self._size = weight[kept]

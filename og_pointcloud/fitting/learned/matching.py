@@ -218,7 +218,7 @@ def _accepted(
 
 
 def _in_image(gaussians: Gaussians, camera: Camera, near: float) -> bool:
-    """Whether any centre lies before the camera and in the image, or within the margin that splats reach in from."""
+    """Whether any center lies before the camera and in the image, or within the margin that splats reach in from."""
     uv_px, depth = camera.project(gaussians.xyz)
     size = np.array([camera.width, camera.height])
     reach = (0.5 + 0.5 * FRUSTUM_MARGIN) * size

@@ -8,15 +8,15 @@ lets Adam move all features. ``formula`` chooses between the printed equations a
              authors: distances not squared, mean over a mask's pixels, then over masks.
     Eq. 2    paper: mean of 1 / d^2. authors: 1 / (d^2 + 1), each row weighted 0.1 to 1 by rank of nearness; after
              LATE_STEP only the nearest tenth keeps its weight, the others the least.
-    Eq. 4    paper: L1 between the map of cluster centres and that of the features of stage 1, over the image.
+    Eq. 4    paper: L1 between the map of cluster centers and that of the features of stage 1, over the image.
              authors: the target is each mask's mean painted back, L1 in the coarse stage, squares in the fine one;
              masks of mixed features are left out, here and in the association; in some steps all Gaussians are drawn
              smaller, so that hidden ones show and features become right per point, not only per blend; the fine stage
              draws one coarse cluster a step, by itself.
     Eq. 3    paper: clusters of features as read. authors: of the raw vectors, whose length positions compare with.
 
-docs/paper.md has all numbers of both beside ours. Where published behaviour is a defect this does it right: centres
-follow their clusters at every step, not only when points are reassigned; fine centres start inside their coarse
+docs/paper.md has all numbers of both beside ours. Where published behavior is a defect this does it right: centers
+follow their clusters at every step, not only when points are reassigned; fine centers start inside their coarse
 cluster, and empty ones again elsewhere in it; pixels without a mask are no target; points that no mask shows get no
 cluster.
 """
@@ -133,11 +133,11 @@ class TrainedFeatures:
 @dataclass(frozen=True)
 class TrainedCodebook:
     """coarse: (n,) int32 in 0..k1-1. leaf: (n,) int32, ``coarse * k2 + fine``; both -1 where no mask shows the point.
-    centres: (k1 k2, width) float32; rows of leaves without Gaussians are zero. histories: coarse and fine stage."""
+    centers: (k1 k2, width) float32; rows of leaves without Gaussians are zero. histories: coarse and fine stage."""
 
     coarse: NDArray[np.int32]
     leaf: NDArray[np.int32]
-    centres: NDArray[np.float32]
+    centers: NDArray[np.float32]
     histories: tuple[StageHistory, StageHistory]
 
 
@@ -211,7 +211,7 @@ def train_codebook(
     """Stage 2: a coarse codebook of features and positions, then a fine one of features inside each coarse cluster.
 
     source: only pixels in masks, or all (formula "paper"). raw: (n, width), of stage 1, not yet read. A step renders
-    cluster centres in place of features, takes Eq. 4, and moves each feature by the gradient of its centre (straight
+    cluster centers in place of features, takes Eq. 4, and moves each feature by the gradient of its center (straight
     through). Positions count in scene units, as published.
     """
     run = run or TrainingRun()
@@ -226,23 +226,23 @@ def train_codebook(
     assert settings.k1 is not None, "the number of coarse clusters is the caller's to find"
     k1 = settings.k1
     first = rng.permutation(len(known))[:k1]
-    centres = np.concatenate([start[first], places[first]], axis=1)
-    together = _Parts([np.arange(len(known))], [len(centres)], places)
-    own, _ = training.train(coarse, centres, together, run, key)
+    centers = np.concatenate([start[first], places[first]], axis=1)
+    together = _Parts([np.arange(len(known))], [len(centers)], places)
+    own, _ = training.train(coarse, centers, together, run, key)
 
-    members = [np.flatnonzero(own == cluster) for cluster in range(len(centres))]
-    held = _masks_held(source, own, len(centres))
+    members = [np.flatnonzero(own == cluster) for cluster in range(len(centers))]
+    held = _masks_held(source, own, len(centers))
     seeds = [rng.permutation(rows)[:count] for rows, count in zip(members, _fine_counts(held, settings), strict=True)]
     fine = StageHistory("fine codebook", STEPS[settings.schedule][2])
-    fine_centres = _on_host(training.features)[np.concatenate(seeds)]
+    fine_centers = _on_host(training.features)[np.concatenate(seeds)]
     apart = _Parts(members, [len(rows) for rows in seeds], np.zeros((len(known), 0), np.float32), held)
-    own_fine, fine_centres = training.train(fine, fine_centres, apart, run, key)
+    own_fine, fine_centers = training.train(fine, fine_centers, apart, run, key)
     # Leaf numbers leave room for k2 in every coarse cluster, as published.
     leaf_of_centre = np.concatenate([c * settings.k2 + np.arange(len(rows)) for c, rows in enumerate(seeds)])
     coarse_ids, leaf = np.full(len(gaussians), -1, np.int32), np.full(len(gaussians), -1, np.int32)
     coarse_ids[known], leaf[known] = own, leaf_of_centre[own_fine]
     table = np.zeros((k1 * settings.k2, raw.shape[1]), np.float32)
-    table[leaf_of_centre] = training.read(torch.as_tensor(fine_centres, device="cpu")).numpy()
+    table[leaf_of_centre] = training.read(torch.as_tensor(fine_centers, device="cpu")).numpy()
     return TrainedCodebook(coarse_ids, leaf, table, (coarse, fine))
 
 
@@ -260,59 +260,59 @@ class _Parts:
     held: list[NDArray[np.bool_]] | None = None
 
     def reassigned(
-        self, features: NDArray[np.float32], centres: NDArray[np.float32], rounds: int
+        self, features: NDArray[np.float32], centers: NDArray[np.float32], rounds: int
     ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-        """Every point's nearest centre of its part after a few rounds of Lloyd's algorithm, and the centres."""
+        """Every point's nearest center of its part after a few rounds of Lloyd's algorithm, and the centers."""
         values = np.concatenate([features, self.places], axis=1)
-        own, centres, first = np.zeros(len(values), np.int64), centres.copy(), 0
+        own, centers, first = np.zeros(len(values), np.int64), centers.copy(), 0
         for rows, count in zip(self.rows, self.counts, strict=True):
             if count:
                 mine = slice(first, first + count)
-                found, centres[mine] = kmeans(values[rows], np.ones(len(rows)), centres[mine], rounds, reseed=True)
+                found, centers[mine] = kmeans(values[rows], np.ones(len(rows)), centers[mine], rounds, reseed=True)
                 own[rows] = first + found
             first += count
-        return own, centres
+        return own, centers
 
 
 class _CodebookTraining:
-    """Features that move behind their cluster centres; both codebook stages are runs of it."""
+    """Features that move behind their cluster centers; both codebook stages are runs of it."""
 
     def __init__(self, source: RenderedViews, raw: torch.Tensor, settings: PaperSettings) -> None:
         self.source, self.settings = source, settings
         self.pseudo = _read(raw, settings.normalise)  # of stage 1: never changed
-        self.reads_centres = settings.normalise and settings.cluster_raw
-        self.features = raw if self.reads_centres else self.pseudo.clone()
+        self.reads_centers = settings.normalise and settings.cluster_raw
+        self.features = raw if self.reads_centers else self.pseudo.clone()
         self.targets: dict[int, tuple[torch.Tensor, torch.Tensor]] = {}
 
     def read(self, values: torch.Tensor) -> torch.Tensor:
-        """What is rendered of features or centres."""
-        return _read(values, self.reads_centres)
+        """What is rendered of features or centers."""
+        return _read(values, self.reads_centers)
 
     def train(
-        self, history: StageHistory, centres: NDArray[np.float32], parts: _Parts, run: TrainingRun, key: str
+        self, history: StageHistory, centers: NDArray[np.float32], parts: _Parts, run: TrainingRun, key: str
     ) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
-        """Train until the stage's steps are done; own centre of each known Gaussian and the centres (k, width)."""
+        """Train until the stage's steps are done; own center of each known Gaussian and the centers (k, width)."""
         settings, features, width = self.settings, self.features, self.features.shape[1]
         is_fine = parts.held is not None
         interval = settings.fine_interval if is_fine else settings.coarse_interval
         rate = settings.fine_rate if is_fine else settings.coarse_rate
         squared = is_fine and settings.formula == "authors"
-        stage = _Stage(history, features, rate, centres)
+        stage = _Stage(history, features, rate, centers)
         for step, rng in stage.steps(settings, run, key):
             if step % interval == 0:
                 stage.reassign(parts, settings.lloyd_rounds)
             view, target, rows = self._draw(rng, parts)
-            quantised = stage.centres[:, :width][stage.own].requires_grad_()
-            # Eq. 4, and its gradient by the centres given to the features: straight through.
+            quantised = stage.centers[:, :width][stage.own].requires_grad_()
+            # Eq. 4, and its gradient by the centers given to the features: straight through.
             error = view.render(self.read(quantised))[rows] - target
             loss = error.square().mean() if squared else error.abs().mean()
             (features.grad,) = torch.autograd.grad(loss, quantised)
             stage.adam.step()
-            stage.centres[:, :width] = _cluster_means(features.detach(), stage.own, stage.centres[:, :width])
+            stage.centers[:, :width] = _cluster_means(features.detach(), stage.own, stage.centers[:, :width])
             history.loss.append(loss.item())
         features.requires_grad_(False)
         stage.reassign(parts, settings.lloyd_rounds)
-        return _on_host(stage.own).astype(np.int32), _on_host(stage.centres[:, :width])
+        return _on_host(stage.own).astype(np.int32), _on_host(stage.centers[:, :width])
 
     def _draw(self, rng: np.random.Generator, parts: _Parts) -> tuple[RenderedView, torch.Tensor, torch.Tensor | slice]:
         """A random view, perhaps with smaller Gaussians or one part alone; what its pixels should show, and which."""
@@ -339,11 +339,11 @@ class _CodebookTraining:
         return drawn, means[place][rows], rows
 
 
-def _cluster_means(features: torch.Tensor, own: torch.Tensor, centres: torch.Tensor) -> torch.Tensor:
+def _cluster_means(features: torch.Tensor, own: torch.Tensor, centers: torch.Tensor) -> torch.Tensor:
     """Means of the clusters' features; an empty cluster stays where it is."""
-    points = torch.bincount(own, minlength=len(centres))[:, None]
-    sums = torch.zeros_like(centres).index_add_(0, own, features)
-    return torch.where(points > 0, sums / points.clamp(min=1), centres)
+    points = torch.bincount(own, minlength=len(centers))[:, None]
+    sums = torch.zeros_like(centers).index_add_(0, own, features)
+    return torch.where(points > 0, sums / points.clamp(min=1), centers)
 
 
 def _masks_held(source: RenderedViews, own: NDArray[np.int32], k1: int) -> list[NDArray[np.bool_]]:
@@ -402,24 +402,24 @@ def _training_key(source: RenderedViews, settings: PaperSettings, run: TrainingR
 class _Stage:
     """All that a stage of training changes: a checkpoint is all of it.
 
-    features: (n, width) float32, moved in place by ``adam``. centres, own: of a codebook stage, (k, d) float32 and, for
+    features: (n, width) float32, moved in place by ``adam``. centers, own: of a codebook stage, (k, d) float32 and, for
     each of ``known`` Gaussians, its row of them, on the features' device.
     """
 
     def __init__(
-        self, history: StageHistory, features: torch.Tensor, rate: float, centres: NDArray[np.float32] | None = None
+        self, history: StageHistory, features: torch.Tensor, rate: float, centers: NDArray[np.float32] | None = None
     ) -> None:
         self.history, self.features = history, features
         self.adam = torch.optim.Adam([features.requires_grad_()], lr=rate, eps=ADAM_EPSILON, fused=True)
-        centres = np.zeros((0, 0), np.float32) if centres is None else centres
-        self.centres = torch.tensor(centres, device=features.device)
+        centers = np.zeros((0, 0), np.float32) if centers is None else centers
+        self.centers = torch.tensor(centers, device=features.device)
         self.own = torch.zeros(len(features), dtype=torch.int64, device=features.device)
 
     def reassign(self, parts: _Parts, rounds: int) -> None:
-        """Own centres anew, by `_Parts.reassigned`, on the host."""
-        own, centres = parts.reassigned(_on_host(self.features), _on_host(self.centres), rounds)
+        """Own centers anew, by `_Parts.reassigned`, on the host."""
+        own, centers = parts.reassigned(_on_host(self.features), _on_host(self.centers), rounds)
         device = self.features.device
-        self.own, self.centres = torch.as_tensor(own, device=device), torch.as_tensor(centres, device=device)
+        self.own, self.centers = torch.as_tensor(own, device=device), torch.as_tensor(centers, device=device)
 
     def steps(self, settings: PaperSettings, run: TrainingRun, key: str) -> Iterator[tuple[int, np.random.Generator]]:
         """The numbers of the steps that are left, each with its own random numbers, which are the same whether or not
@@ -444,12 +444,12 @@ class _Stage:
         state, features = self.adam.state.get(self.features), self.features.detach()
         moments = (state["exp_avg"], state["exp_avg_sq"]) if state else (torch.zeros_like(features),) * 2
         losses = np.array([self.history.seconds, *self.history.loss])
-        return *(_on_host(tensor).copy() for tensor in (features, *moments, self.centres, self.own)), losses
+        return *(_on_host(tensor).copy() for tensor in (features, *moments, self.centers, self.own)), losses
 
     def _restore(self, arrays: tuple[NDArray[Any], ...]) -> None:
         *tensors, losses = arrays
         device = self.features.device
-        features, average, square, self.centres, self.own = (torch.tensor(array, device=device) for array in tensors)
+        features, average, square, self.centers, self.own = (torch.tensor(array, device=device) for array in tensors)
         self.features.data.copy_(features)
         self.history.seconds, *self.history.loss = losses.tolist()
         done = self.history.resumed_at = len(self.history.loss)
