@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from og_pointcloud.cloud import FeatureSpace
+from og_pointcloud.formats.depth import DepthImage
+from og_pointcloud.formats.fusion import on_surface, to_world
 from og_pointcloud.formats.poses import in_local_frame
 from og_pointcloud.mapping.frame import CheckedFrame
 from og_pointcloud.mapping.kept_views import KeptViews
@@ -20,8 +22,6 @@ from og_pointcloud.scene import Camera
 
 READINGS_PER_SPACING = 1.5
 """Readings a spacing that a frame gives to the map, along each axis: more would only be averaged."""
-SLANT = 0.15
-"""Cosine between ray and surface below which a reading is no point: edges of depth images fly."""
 MOST_ODDS = 3.0
 """Frames that history counts for at most."""
 RECENT_FRAMES = 4096
@@ -86,7 +86,7 @@ class GrowingMap:
         return rows[states == AGREES], through[(presence.odds[through] < -1) & (presence.refuted[through] > 1)]
 
     def add(self, frame: CheckedFrame) -> NDArray[np.int32]:
-        """The readings of a frame, as dense as the map, but for those at a slant; rows of the new points."""
+        """The readings of a frame, as dense as the map, but for those between two surfaces; rows of the new points."""
         points, view, before = self.points, frame.view, self.points.n
         if view is None or not points.grows:
             return np.zeros(0, np.int32)
@@ -98,7 +98,7 @@ class GrowingMap:
             scale = frame.rgb.shape[0] / camera.height, frame.rgb.shape[1] / camera.width
             row, column = pixel // camera.width, pixel % camera.width
             rgb = frame.rgb[(row * scale[0]).astype(np.intp), (column * scale[1]).astype(np.intp)]
-        points.add(xyz, rgb, len(self.anchors))
+        points.add(xyz.astype(np.float32), rgb, len(self.anchors))
         added = np.arange(before, points.n, dtype=np.int32)
         if len(added):
             self.anchors.append((frame.stamp, frame.camera.world_to_camera))
@@ -160,16 +160,10 @@ class GrowingMap:
         return self.recent[max(place, 0)] if sequence > 0 else -np.inf
 
 
-def _readings(view: MeasuredView, step: int) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-    """(xyz (m, 3), flat pixel (m,)) of every step-th reading that is not at a slant."""
-    camera, every = view.camera, slice(step // 2, None, step)
-    row, column = np.mgrid[step // 2 : camera.height : step, step // 2 : camera.width : step]
-    ray = np.stack(
-        [(column + 0.5 - camera.cx) / camera.fx, (row + 0.5 - camera.cy) / camera.fy, np.ones(row.shape)], -1
-    )
-    facing = -np.einsum("rca,rca->rc", view.normal[every, every], ray)
-    depth = view.depth[every, every]
-    told = (depth > 0) & (facing >= SLANT * np.linalg.norm(ray, axis=-1))
-    pose = camera.world_to_camera
-    xyz = (depth[told, None] * ray[told] - pose[:3, 3]) @ pose[:3, :3]
-    return xyz.astype(np.float32), (row * camera.width + column)[told]
+def _readings(view: MeasuredView, step: int) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """(xyz (m, 3), flat pixel (m,)) of every step-th reading that lies on a surface, along each axis."""
+    image = DepthImage(view.depth, view.camera)
+    chosen = np.zeros(view.depth.shape, np.bool_)
+    every = slice(step // 2, None, step)
+    chosen[every, every] = on_surface(image, view.noise)[every, every]
+    return to_world(image, chosen), np.flatnonzero(chosen)
