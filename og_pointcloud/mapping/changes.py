@@ -173,6 +173,7 @@ class _Thing:
     pieces: tuple[int, ...]
     look: Look
     points: int
+    surely: bool
 
     def has(self, piece: _Thing, place: NDArray[np.float64], reach: float, scale: Scale) -> bool:
         """Whether a thing looks like a piece of this one, which is at that place then and so long."""
@@ -183,36 +184,42 @@ class _Thing:
         """This one with the pieces of another."""
         points = self.points + other.points
         place = (self.points * self.look.place + other.points * other.look.place) / points
-        return _Thing((*self.pieces, *other.pieces), replace(self.look, place=place), points)
+        return _Thing((*self.pieces, *other.pieces), replace(self.look, place=place), points, self.surely or other.surely)
 
     def without_pieces(self) -> _Thing:
         """What is left of this one once another has its pieces."""
-        return _Thing((), self.look, 0)
+        return _Thing((), self.look, 0, False)
 
 
 def _decide(
     earlier: Visit, later: Visit, of_earlier: Evidence, of_later: Evidence, nearest: NDArray[np.int64]
 ) -> Comparison:
-    left, hardly = of_earlier.decided(earlier)
-    came, _ = of_later.decided(later)
+    left, left_surely, hardly = of_earlier.decided(earlier)
+    came, came_surely, _ = of_later.decided(later)
     scale = _scale(earlier, later, _unmoved(earlier, later, nearest, left, came))
-    gone = _things(earlier, np.flatnonzero(left).tolist(), of_earlier.through, scale)
-    new = _things(later, np.flatnonzero(came).tolist(), of_later.through, scale)
+    gone = _things(earlier, left, left_surely, of_earlier.through, scale)
+    new = _things(later, came, came_surely, of_later.through, scale)
     count = len(gone)  # behind them: what an earlier visit found gone, and may be back
-    gone += [_Thing((k,), look, 0) for k, look in MapRecord.of(earlier.cloud).gone.items()]
+    gone += [_Thing((k,), look, 0, True) for k, look in MapRecord.of(earlier.cloud).gone.items()]
     gone, new, pairs = _gathered(gone, new, _matched(gone, new, scale), scale)
-    taken = set(pairs.values())
+    # What may be missing by chance has left, or come, if it looks like what surely came, or left.
+    pairs = {g: n for g, n in pairs.items() if gone[g].surely or new[n].surely}
+    gone_alone = [thing for g, thing in enumerate(gone[:count]) if g not in pairs and thing.surely]
+    new_alone = [thing for n, thing in enumerate(new) if n not in pairs.values() and thing.surely and thing.pieces]
+    gone_pieces = {piece: gone[g].pieces[0] for g in pairs for piece in gone[g].pieces}
+    hardly |= left
+    hardly[[piece for thing in gone_alone for piece in thing.pieces] + list(gone_pieces)] = False
     changes = Changes(
-        gone=tuple(sorted(k for g in range(count) if g not in pairs for k in gone[g].pieces)),
-        new=tuple(thing.pieces[0] for n, thing in enumerate(new) if n not in taken and thing.pieces),
+        gone=tuple(sorted(piece for thing in gone_alone for piece in thing.pieces)),
+        new=tuple(thing.pieces[0] for thing in new_alone),
         moved=tuple(
             Moved(gone[g].pieces[0], gone[g].look.place, new[n].look.place, new[n].pieces[0])
             for g, n in sorted(pairs.items())
         ),
-        unseen=tuple(np.flatnonzero(hardly & (earlier.count(earlier.cloud.instance_ids >= 0) > 0) & ~left).tolist()),
+        unseen=tuple(np.flatnonzero(hardly & (earlier.count(earlier.cloud.instance_ids >= 0) > 0)).tolist()),
     )
-    pieces = {piece: thing.pieces[0] for thing in new for piece in thing.pieces}
-    gone_pieces = {piece: gone[g].pieces[0] for g in pairs for piece in gone[g].pieces}
+    come = [*new_alone, *(new[n] for n in pairs.values())]
+    pieces = {piece: thing.pieces[0] for thing in come for piece in thing.pieces}
     return Comparison(changes, of_earlier, nearest, pieces, gone_pieces)
 
 
@@ -256,9 +263,12 @@ def _scale(earlier: Visit, later: Visit, unmoved: NDArray[np.int64]) -> Scale:
     return Scale(same, other, shift, max(OTHER_COLOR, USUAL_COLORS * usual))
 
 
-def _things(visit: Visit, candidates: list[int], through: NDArray[np.bool_], scale: Scale) -> list[_Thing]:
-    """Candidates, those that adjoin and look alike together: pieces of one thing. Of a small piece, which few masks
-    show, the colour is enough."""
+def _things(
+    visit: Visit, chosen: NDArray[np.bool_], surely: NDArray[np.bool_], through: NDArray[np.bool_], scale: Scale
+) -> list[_Thing]:
+    """Chosen instances, those that adjoin and look alike together: pieces of one thing. Of a small piece, which few
+    masks show, the colour is enough."""
+    candidates = np.flatnonzero(chosen).tolist()
     rows = {k: visit.rows[k][through[visit.rows[k]]] for k in candidates}
     looks = {k: visit.look(k, of) for k, of in rows.items()}
     trees = {k: cKDTree(visit.cloud.xyz[of]) for k, of in rows.items()}
@@ -275,7 +285,7 @@ def _things(visit: Visit, candidates: list[int], through: NDArray[np.bool_], sca
     for first in dict.fromkeys(group.values()):
         pieces = sorted((k for k in candidates if group[k] == first), key=lambda k: (-len(rows[k]), k))
         xyz = visit.cloud.xyz_world[np.concatenate([rows[k] for k in pieces])]
-        things.append(_Thing(tuple(pieces), replace(looks[pieces[0]], place=xyz.mean(axis=0)), len(xyz)))
+        things.append(_Thing(tuple(pieces), replace(looks[pieces[0]], place=xyz.mean(axis=0)), len(xyz), surely[pieces].any()))
     return things
 
 

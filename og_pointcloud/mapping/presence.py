@@ -16,6 +16,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
+from scipy.special import bdtrc
 
 from og_pointcloud.cloud import UNOBSERVED, LabelledCloud
 from og_pointcloud.formats.poses import in_local_frame
@@ -43,6 +44,9 @@ FLAT_SHARE = 0.25
 """Share of what is looked at that must be seen through where most of a thing lies flat on something else."""
 ABOUT = 32
 """Points that stand nearest to each point seen through, by which it is told how much a cloud leaves out there."""
+
+CHANCE = 0.05
+"""Chance up to which points that a cloud lacks are no accident: the usual level of a test."""
 
 
 def tolerance_of(spacing: float, scatter: float) -> float:
@@ -196,9 +200,9 @@ class Evidence:
     telling: NDArray[np.bool_]
     left_out: NDArray[np.bool_]
 
-    def decided(self, visit: Visit) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """(instances,) bool each: those that are seen through; those of which nothing is known: they are hardly looked
-        at, or the other visit leaves out as much of what stands about them as it sees through of them.
+    def decided(self, visit: Visit) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.bool_]]:
+        """(instances,) bool each: those that are seen through; those of them of which that is no accident, as the other
+        visit leaves out so much of what stands about them; and those that are hardly looked at.
 
         Each point counts by how sure it is of its instance: a part of the table that a mask took for the book's stays
         when the book leaves.
@@ -214,8 +218,10 @@ class Evidence:
         for k in np.flatnonzero(lies_flat):
             lies_flat[k] = self._of_one_color(visit, int(k))
         left = (seen_through >= least) & (most | lies_flat)
-        unknown = left & (seen_through <= self._left_out_about(visit, left) * looked_at)
-        return left & ~unknown, unknown | (looked_at < least)
+        share = self._left_out_about(visit, left)
+        left &= seen_through > share * looked_at
+        # So many of its points might be missing by chance, were it there still.
+        return left, left & (bdtrc(seen_through - 1, looked_at, share) < CHANCE), looked_at < least
 
     def _left_out_about(self, visit: Visit, left: NDArray[np.bool_]) -> NDArray[np.float64]:
         """(instances,) of those that may have left, the share that the other visit's cloud leaves out of what stands
