@@ -216,6 +216,19 @@ def test_sparse_depth_makes_a_map():
     assert len({instance_of(cloud, thing) for thing in THINGS} - {-1}) == 3
 
 
+def test_readings_between_two_surfaces_are_no_points():
+    camera = og.Camera(64, 48, 60.0, 60.0, 32.0, 24.0, np.eye(4))
+    depth = np.where(np.arange(64) < 32, 2.0, 3.0)[None].repeat(48, axis=0)
+    without, flying = depth.copy(), depth.copy()
+    without[::5, 32], flying[::5, 32] = 0, 2.5
+    counts = []
+    for image in (without, flying, depth):
+        mapper = og.Mapper(spacing=0.02)
+        mapper.integrate(og.Frame(camera, depth=image))
+        counts.append(mapper.points)
+    assert counts[0] == counts[1] < counts[2]
+
+
 def test_voxel_points_are_means_of_their_voxels():
     random = np.random.default_rng(0)
     xyz = random.uniform(-1, 1, (3000, 3)).astype(np.float32)

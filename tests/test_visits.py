@@ -14,6 +14,7 @@ from og_pointcloud.cli import main
 from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError, SceneError
 from og_pointcloud.mapping.likeness import spread_of
 from og_pointcloud.mapping.map_record import MapRecord
+from og_pointcloud.mapping.presence import Evidence, Visit
 from og_pointcloud.mapping.sight import (
     AGREES,
     HIDDEN,
@@ -281,6 +282,25 @@ def test_what_a_patchy_cloud_leaves_out_is_not_gone(monday, kept):
     upper = ((updated.cloud.xyz_world > low - 0.01) & (updated.cloud.xyz_world < high + 0.01)).all(axis=1)
     stays = np.count_nonzero(upper & (updated.cloud.instance_ids == told[0]))
     assert stays == pytest.approx(0 if kept == 1 else 400, abs=50)  # of four sides and the top
+
+
+@pytest.mark.parametrize(
+    ("through", "lacking", "surely"),
+    [(18, 1.0, True), (12, 1.0, False), (12, np.nan, True)],
+    ids=["more than chance", "no more than chance", "what is hidden is not left out"],
+)
+def test_points_that_may_be_missing_by_chance_prove_nothing(monday, through, lacking, surely):
+    """Of 20 points of the bin that are looked at so many are seen through; of all others half lack, or are hidden."""
+    visit, random = Visit(monday), np.random.default_rng(0)
+    asked = visit.rows[instance_of(monday, BIN)][:20]
+    still, seen_through = np.ones(len(monday), bool), np.zeros(len(monday), bool)
+    still[visit.rows[instance_of(monday, BIN)]] = False
+    still[asked[through:]], seen_through[asked[:through]] = True, True
+    left_out = np.where(random.random(len(monday)) < 0.5, lacking, 0.0)
+    shown = still | seen_through
+    left, sure, _ = Evidence(shown, still, seen_through, np.ones(len(monday), bool), left_out).decided(visit)
+    assert np.flatnonzero(left).tolist() == [instance_of(monday, BIN)]
+    assert np.flatnonzero(sure).tolist() == np.flatnonzero(left & surely).tolist()
 
 
 @pytest.mark.slow

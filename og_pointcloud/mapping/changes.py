@@ -140,16 +140,17 @@ def compare_visits(
     if not a.cameras:  # what the earlier visit saw is not known: it may have looked from the same places
         (known,) = Presence.by(earlier.measured(b.cameras), tolerance, b.xyz)
     shows = np.ones(len(b), bool)
-    left_out = np.zeros(len(a), bool)  # depth images leave nothing out
+    left_out = np.zeros(len(a))  # depth images leave nothing out
     if again is None:
         asked, own = Presence.by(later.measured(), tolerance, a.xyz, b.xyz)
         _require_one_frame(asked)
         again, shows = (asked.present, asked.absent), own.present
         if later.depth is None:
-            left_out = np.asarray(cKDTree(b.xyz).query(a.xyz, workers=-1)[0]) > spacing
+            left_out = asked.left_out(np.asarray(cKDTree(b.xyz).query(a.xyz, workers=-1)[0]) > spacing)
     distance, nearest = map(np.asarray, cKDTree(a.xyz).query(b.xyz, workers=-1))
     of_earlier = Evidence(shown.present | (not a.cameras), *again, earlier.telling(tolerance), left_out)
-    of_later = Evidence(shows, known.present, known.absent, later.telling(tolerance), distance > spacing)
+    not_there = known.left_out(distance > spacing)
+    of_later = Evidence(shows, known.present, known.absent, later.telling(tolerance), not_there)
     return _decide(earlier, later, of_earlier, of_later, np.where(distance <= SAME_SURFACE * a.spacing, nearest, -1))
 
 
@@ -184,7 +185,9 @@ class _Thing:
         """This one with the pieces of another."""
         points = self.points + other.points
         place = (self.points * self.look.place + other.points * other.look.place) / points
-        return _Thing((*self.pieces, *other.pieces), replace(self.look, place=place), points, self.surely or other.surely)
+        return _Thing(
+            (*self.pieces, *other.pieces), replace(self.look, place=place), points, self.surely or other.surely
+        )
 
     def without_pieces(self) -> _Thing:
         """What is left of this one once another has its pieces."""
@@ -285,7 +288,9 @@ def _things(
     for first in dict.fromkeys(group.values()):
         pieces = sorted((k for k in candidates if group[k] == first), key=lambda k: (-len(rows[k]), k))
         xyz = visit.cloud.xyz_world[np.concatenate([rows[k] for k in pieces])]
-        things.append(_Thing(tuple(pieces), replace(looks[pieces[0]], place=xyz.mean(axis=0)), len(xyz), surely[pieces].any()))
+        things.append(
+            _Thing(tuple(pieces), replace(looks[pieces[0]], place=xyz.mean(axis=0)), len(xyz), surely[pieces].any())
+        )
     return things
 
 

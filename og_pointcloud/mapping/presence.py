@@ -93,6 +93,11 @@ class Presence(Columns):
         evidence = self.odds, self.refuted, self.seen_at, self.first
         _count(rows, xyz, states, center, stamp, self.most, evidence)
 
+    def left_out(self, lacks: NDArray[np.bool_]) -> NDArray[np.float64]:
+        """(n,) 1 where the views' cloud lacks a point, 0 where it has one, NaN where they measured nothing but what
+        lies before it."""
+        return np.where(self.hidden & (self.odds == 0), np.nan, lacks)
+
     @property
     def present(self) -> NDArray[np.bool_]:
         """(n,) bool: borne out by more views than see through."""
@@ -189,20 +194,22 @@ class Visit:
 
 @dataclass(frozen=True)
 class Evidence:
-    """Of one visit's points, by another's views, (n,) bool each. shown: seen by their own visit. still, through: the
+    """Of one visit's points, by another's views, (n,) each, bool. shown: seen by their own visit. still, through: the
     other visit measures them where they are, or sees through their places. telling: off all surfaces of other things.
-    left_out: the other visit's cloud, which is all that it measured, has no point there.
+    left_out: float64, 1 where the other visit's cloud, which is all that it measured, has no point, NaN where it could
+    not.
     """
 
     shown: NDArray[np.bool_]
     still: NDArray[np.bool_]
     through: NDArray[np.bool_]
     telling: NDArray[np.bool_]
-    left_out: NDArray[np.bool_]
+    left_out: NDArray[np.float64]
 
     def decided(self, visit: Visit) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.bool_]]:
-        """(instances,) bool each: those that are seen through; those of them of which that is no accident, as the other
-        visit leaves out so much of what stands about them; and those that are hardly looked at.
+        """(instances,) bool each: those that are seen through, more than the other visit leaves out of what stands
+        about them; those of them of which that is no accident; and those of which nothing is known: hardly looked at,
+        or left out no more than all about them.
 
         Each point counts by how sure it is of its instance: a part of the table that a mask took for the book's stays
         when the book leaves.
@@ -219,16 +226,17 @@ class Evidence:
             lies_flat[k] = self._of_one_color(visit, int(k))
         left = (seen_through >= least) & (most | lies_flat)
         share = self._left_out_about(visit, left)
-        left &= seen_through > share * looked_at
+        likely = left & (seen_through > share * looked_at)
         # So many of its points might be missing by chance, were it there still.
-        return left, left & (bdtrc(seen_through - 1, looked_at, share) < CHANCE), looked_at < least
+        surely = likely & (bdtrc(seen_through - 1, looked_at.astype(int), share) < CHANCE)
+        return likely, surely, (looked_at < least) | (left & ~likely)
 
     def _left_out_about(self, visit: Visit, left: NDArray[np.bool_]) -> NDArray[np.float64]:
         """(instances,) of those that may have left, the share that the other visit's cloud leaves out of what stands
         about their points that are seen through: so much of each would be missing if it stood there still."""
         share, xyz = np.zeros(len(left)), visit.cloud.xyz
         may_have_left = np.append(left, [False, False])[visit.cloud.instance_ids]  # unobserved and background do not
-        stands = np.flatnonzero(self.shown & ~self.through & ~may_have_left)
+        stands = np.flatnonzero(self.shown & ~self.through & ~may_have_left & ~np.isnan(self.left_out))
         tree = cKDTree(xyz[stands])
         for k in np.flatnonzero(left) if self.left_out.any() and len(stands) else ():
             rows = visit.rows[k]
