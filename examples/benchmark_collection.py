@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 import og_pointcloud as og
 from og_pointcloud.cloud import unit_rows
-from og_pointcloud.collection.index import settle
+from og_pointcloud.collection.index import judge_scenes
 from og_pointcloud.collection.scoring import Block
 from og_pointcloud.collection.store import Atlas, SceneEntry
 from og_pointcloud.fitting.memory import memory_in_use, peak_memory
@@ -260,7 +260,7 @@ def write_atlas(path: Path, descriptors: int, instances: int, encoder: MadeEncod
         for number, (table, boxes) in enumerate(made_scenes(descriptors, instances, encoder)):
             width = table.descriptors.shape[1]
             atlas.add(SceneEntry(0, f"s{number:06d}", f"{number}", SPACE, width=width, vocabulary=words), table, boxes)
-        settle(atlas)
+        judge_scenes(atlas)
 
 
 def made_scenes(

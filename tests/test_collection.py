@@ -238,7 +238,7 @@ def test_a_change_that_fails_leaves_the_atlas_as_it_was(folder, monkeypatch):
     before = collection.find("chair", top=100).to_json()
     content = (folder.parent / "atlas").read_bytes()
     og.write_bundle(scene(["chair"], 50), folder / "late.ogpc")
-    monkeypatch.setattr("og_pointcloud.collection.index.settle", lambda atlas: 1 / 0)
+    monkeypatch.setattr("og_pointcloud.collection.index.judge_scenes", lambda atlas: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         index(folder, folder.parent / "atlas", progress=False)
     with pytest.raises(ZeroDivisionError):

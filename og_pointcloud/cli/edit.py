@@ -55,7 +55,8 @@ def run(arguments: argparse.Namespace) -> None:
     options = {"cloud": arguments.cloud, "halo": arguments.halo, "text_features": arguments.text_features}
     if arguments.operation == "recolour":
         options["color"] = numbers(arguments.color, "--color", 3)
-    report(getattr(og.edit, arguments.operation)(scene, meant(arguments), arguments.output, **options), arguments)
+    edit, what = getattr(og.edit, arguments.operation), what_to_edit(arguments)
+    report(edit(scene, what, arguments.output, **options), arguments)
 
 
 def run_insert(arguments: argparse.Namespace) -> None:
@@ -74,7 +75,7 @@ def run_insert(arguments: argparse.Namespace) -> None:
     report(og.edit.insert(arguments.cloud, arguments.other, arguments.output, pose), arguments)
 
 
-def meant(arguments: argparse.Namespace) -> What:
+def what_to_edit(arguments: argparse.Namespace) -> What:
     if arguments.word is not None:
         return arguments.word
     if arguments.xyz is not None:

@@ -77,7 +77,7 @@ def index(folder: str | os.PathLike[str], path: str | os.PathLike[str], *, progr
         removed = sorted(set(known) - set(files))
         for name in removed:
             atlas.remove(name)
-        settle(atlas)
+        judge_scenes(atlas)
     unchanged = len(files) - len(added) - len(replaced) - len(left_out)
     return Changes(tuple(added), tuple(replaced), tuple(removed), tuple(left_out), unchanged)
 
@@ -192,8 +192,8 @@ def _agree(first: Mapping[str, NDArray[np.float32]], second: Mapping[str, NDArra
     return not shared or float(np.mean([first[name] @ second[name] for name in shared])) > SAME_ENCODER
 
 
-def settle(atlas: Atlas) -> None:
-    """Settle whose words judge the instances of each scene, and judge those for whom that is new."""
+def judge_scenes(atlas: Atlas) -> None:
+    """Choose the word bank that judges each scene, and judge the scenes for which it is another than before."""
     for family in families(atlas, atlas.entries()):
         lent = _lent_bank(atlas, family)
         banks: dict[str, WordBank] = {}

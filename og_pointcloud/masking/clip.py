@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.masking.crops import WITH_CONTEXT, Crop, Preprocessing, Resample
-from og_pointcloud.masking.pretrained import Attention, best_device, load_pretrained, stated, torch
+from og_pointcloud.masking.pretrained import Attention, best_device, load_pretrained, read_config, torch
 from og_pointcloud.models import MODEL_NAME
 
 CLASSES = {"clip": "CLIPModel", "siglip": "SiglipModel"}
@@ -98,21 +98,21 @@ class TransformersModel:
 def preprocessing_of(folder: str | os.PathLike[str], config: Any) -> Preprocessing:
     """What preprocessor_config.json says, or what the family's published models do. config: the model's."""
     size, is_clip = config.vision_config.image_size, config.model_type == "clip"
-    said = stated(Path(folder), "preprocessor_config.json")
-    number, factor = said.get("resample", 3), said.get("rescale_factor", 1 / 255)
+    stated = read_config(Path(folder), "preprocessor_config.json")
+    number, factor = stated.get("resample", 3), stated.get("rescale_factor", 1 / 255)
     if number not in tuple(PILLOW_RESAMPLE) or factor != 1 / 255:
         raise OgPointcloudError(
             f"{folder}, preprocessor_config.json: resample {number!r:.20} or rescale_factor {factor!r:.20}; expected "
             "2 (bilinear) or 3 (bicubic), and 1/255"
         )
     mean, std = CLIP_COLORS if is_clip else SIGLIP_COLORS
-    mean, std = tuple(said.get("image_mean", mean)), tuple(said.get("image_std", std))
+    mean, std = tuple(stated.get("image_mean", mean)), tuple(stated.get("image_std", std))
     return Preprocessing(size, cast("Any", mean), cast("Any", std), PILLOW_RESAMPLE[number], keeps_shape=is_clip)
 
 
 def published_name(folder: str | os.PathLike[str]) -> str:
     """OWNER/MODEL as a model's configuration has it; OgPointcloudError where it says none."""
-    name = stated(Path(folder), "config.json").get("_name_or_path")
+    name = read_config(Path(folder), "config.json").get("_name_or_path")
     if not isinstance(name, str) or not MODEL_NAME.fullmatch(name):
         raise OgPointcloudError(
             f"{folder} does not say which model it is; pass --feature-space as your scenes name it (og-pointcloud info "

@@ -51,7 +51,7 @@ def best_device() -> torch.device:
     return torch.device("cuda" if torch.cuda.is_available() else "cpu")
 
 
-def stated(folder: Path, *names: str) -> dict[str, Any]:
+def read_config(folder: Path, *names: str) -> dict[str, Any]:
     """The first of these JSON files that a folder has, empty where it has none. SceneError where it holds no object."""
     file = next((folder / name for name in names if (folder / name).is_file()), None)
     content = {} if file is None else read_json(file)
@@ -66,7 +66,7 @@ def _model_type(folder: Path, classes: Mapping[str, str]) -> str:
             f"{folder} is no transformers folder: it has no config.json; expected a model's (of an OpenCLIP model, "
             "fetch the repository that holds it for transformers)"
         )
-    config = stated(folder, "config.json")
+    config = read_config(folder, "config.json")
     kind = str(config.get("model_type"))
     if kind not in classes or not hasattr(transformers, classes[kind]):
         raise SceneError(

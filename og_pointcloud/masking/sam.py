@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from og_pointcloud.errors import SceneError
 from og_pointcloud.masking.automatic import AutomaticMasks
-from og_pointcloud.masking.pretrained import best_device, load_pretrained, stated, torch
+from og_pointcloud.masking.pretrained import best_device, load_pretrained, read_config, torch
 from og_pointcloud.models import fetched_model
 
 CLASSES = {
@@ -139,10 +139,10 @@ def prepared(image: NDArray[np.uint8], preparation: Preparation) -> torch.Tensor
 def _preparation(folder: Path, kind: str, config: Any) -> Preparation:
     """Side from the vision configuration, colors from the preprocessor's file where the model has one."""
     side = config.vision_config.image_size if kind in PADDED else _square_side(config)
-    said = stated(folder, "preprocessor_config.json", "processor_config.json")
-    said = said.get("image_processor", said)
+    stated = read_config(folder, "preprocessor_config.json", "processor_config.json")
+    stated = stated.get("image_processor", stated)
     mean, std = HALVES if kind.startswith("sam3") else IMAGENET
-    mean, std = said.get("image_mean", mean), said.get("image_std", std)
+    mean, std = stated.get("image_mean", mean), stated.get("image_std", std)
     return Preparation(int(side), kind in PADDED, tuple(map(float, mean)), tuple(map(float, std)))
 
 

@@ -30,7 +30,7 @@ from og_pointcloud.mapping.mapper import FrameChange, Mapper
 from og_pointcloud_ros.detections import to_objects
 from og_pointcloud_ros.frames import FrameAssembler
 from og_pointcloud_ros.messages import ros_messages, time_message
-from og_pointcloud_ros.node import PlacedNode, latest_only, run, told
+from og_pointcloud_ros.node import PlacedNode, error_text, latest_only, run
 
 PARAMETERS = {"map": "", "target_frame": "map", "feature_space": "unknown", "max_age": 2.0}
 """With their defaults; config/map.yaml explains them."""
@@ -61,7 +61,7 @@ class MapNode(PlacedNode):
         try:
             self._assembler.add(role, message)
         except Exception as error:  # whatever a message holds, the node goes on
-            self._warn(f"{role} was dropped: {told(error)}")
+            self._warn(f"{role} was dropped: {error_text(error)}")
         self._work()
 
     def _work(self) -> None:
@@ -80,7 +80,7 @@ class MapNode(PlacedNode):
                     continue
                 self._warn(f"a frame was dropped, its transform did not come within {self._max_age} s: {error}")
             except Exception as error:
-                self._warn(f"a frame was dropped: {told(error)}")
+                self._warn(f"a frame was dropped: {error_text(error)}")
             self._assembler.forget(stamp)
 
     def _pose(self, frame_id: str, stamp: int) -> Any:
@@ -105,7 +105,7 @@ class MapNode(PlacedNode):
             with self._queue.lock:
                 response.success, response.message = True, serve()
         except Exception as error:  # a full disk or a foreign file must not end the map
-            response.success, response.message = False, told(error)
+            response.success, response.message = False, error_text(error)
         return response
 
     def _save(self) -> str:

@@ -131,7 +131,7 @@ class SegmentNode(PlacedNode):
             try:
                 self._labeller.segmenter = self._segmenter(labels or [])
             except Exception as error:  # words come from outside, and a robot goes on with those that it had
-                return SetParametersResult(successful=False, reason=told(error))
+                return SetParametersResult(successful=False, reason=error_text(error))
             self._announce()
         return SetParametersResult(successful=True)
 
@@ -156,13 +156,13 @@ class SegmentNode(PlacedNode):
             else:
                 self._warn(f"a cloud was dropped, its transform did not come within {self._max_age} s: {error}")
         except Exception as error:  # whatever a message holds, the node goes on
-            self._warn(f"a cloud was dropped: {told(error)}")
+            self._warn(f"a cloud was dropped: {error_text(error)}")
         else:
             self._points.publish(labelled.points)
             self._detections.publish(labelled.detections)
 
 
-def told(error: Exception) -> str:
+def error_text(error: Exception) -> str:
     """An error of ours says what is wrong and what helps; of another the kind is worth knowing."""
     return str(error) if isinstance(error, (OgPointcloudError, OSError)) else f"{type(error).__name__}: {error}"
 
