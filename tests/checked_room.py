@@ -1,4 +1,4 @@
-"""A room of coloured tiles seen from inside, by closed formulas: small, without symmetry, right in every part."""
+"""A room of colored tiles seen from inside, by closed formulas: small, without symmetry, right in every part."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ FEATURES = 24
 
 @lru_cache
 def tiled_room(seed=0, views=10, points=9000, origin=(0.0, 0.0, 0.0), scale=1.0):
-    """A right scene: photographs, masks, features and coloured points of the room's six sides."""
+    """A right scene: photographs, masks, features and colored points of the room's six sides."""
     random = np.random.default_rng(seed)
     xyz, side = _surface(random, points)
     rgb = _colors(xyz, side, seed)

@@ -138,7 +138,7 @@ def test_folders_that_are_refused(model_folder, tmp_path, monkeypatch):
 
     refused(tmp_path, "has no config.json")
     refused(changed(model_type="blip"), "model_type is 'blip'; expected clip, siglip")
-    refused(changed(quantization_config={"quant_method": "gptq"}), "quantised")
+    refused(changed(quantization_config={"quant_method": "gptq"}), "quantized")
     refused(changed(text_config=3), "cannot be read")
     refused(changed(), "pass --feature-space as your scenes name it", feature_space=None)
     folder = changed(auto_map={"AutoModel": "evil.Model"})

@@ -203,7 +203,7 @@ def test_a_folder_does_not_say_how_attention_is_computed(folders, tmp_path, plac
 
 @pytest.mark.parametrize(
     ("change", "says"),
-    [("pickle", "weights in .safetensors"), ("quantised", "is quantised"), ("missing", "lacks 1 of the weights")],
+    [("pickle", "weights in .safetensors"), ("quantized", "is quantized"), ("missing", "lacks 1 of the weights")],
 )
 def test_weights_are_plain_numbers_and_all_there(folders, tmp_path, change, says):
     folder = tmp_path / "model"

@@ -185,7 +185,7 @@ def _poses_by_masks(sample: Sample, maps: MaskMaps | None) -> Check:
     if blind > MOST_BLIND * len(sample.cameras):
         says = f"the cameras of {blind} of {len(sample.cameras)} views see next to nothing of the cloud"
     elif agreement.compared < FEWEST:
-        return Check("poses", "unchecked", "no photographs with coloured points; masks are missing or share too little")
+        return Check("poses", "unchecked", "no photographs with colored points; masks are missing or share too little")
     elif _verdict(agreement) == "ok":
         return _agreed("poses", agreement)
     else:

@@ -52,4 +52,4 @@ def print_report(report: BagReport, output: Path, seconds: float) -> None:
     print(f"wrote {output}: {', '.join(report.topics.values())}")
     shown = next(iter(report.topics.values()))
     play = shlex.join(["ros2", "bag", "play", str(output)])
-    print(f"next: {play}, and in RViz a PointCloud2 of {shown}, coloured by rgb")
+    print(f"next: {play}, and in RViz a PointCloud2 of {shown}, colored by rgb")

@@ -22,7 +22,7 @@ SAVED_AS = (".npz", ".ply", ".las", ".laz", ".glb", ".spz")
 def add(parser: Parser) -> None:
     common.add_shared(parser, "bundle", "--labels", "--text-features", "--json")
     common.add_option(parser, "--points", "CLOUD", "points to label (default: those fitted)", type=Path)
-    files = "labels as .npz, or a coloured .ply, .las, .laz or .glb; of splats .glb or .spz"
+    files = "labels as .npz, or a colored .ply, .las, .laz or .glb; of splats .glb or .spz"
     common.add_output(parser, "-o", "--output", endings=SAVED_AS, metavar="OUT", help=files)
 
 

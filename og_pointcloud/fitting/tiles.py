@@ -1,6 +1,6 @@
 """Clouds beyond memory: one fit, tile by tile.
 
-What outgrows memory is the work per point: neighbours, splats, and what every view shows of every point. What an
+What outgrows memory is the work per point: neighbors, splats, and what every view shows of every point. What an
 instance is does not: masks are joined by how they overlap, and a sample of the points says that. So nothing is
 labelled tile by tile and sewn together afterwards:
 
@@ -9,7 +9,7 @@ labelled tile by tile and sewn together afterwards:
     views       each is rendered once, with all that is in it, whatever tile it lies in: what stands in front hides what
                 is behind. Points finer than its pixels are thinned. What it shows goes to a file, in order of tiles
     instances   masks are grouped once, by a sample of all points, and groups that the views contradict dismissed once
-    points      tile by tile: the state of each, from all views that see it and from its neighbours
+    points      tile by tile: the state of each, from all views that see it and from its neighbors
     evidence    features, areas and parts of the instances, from sums over the tiles
 
 An object that crosses ten tiles is one instance because its masks are one group. No border can contradict another, and
@@ -326,7 +326,7 @@ def _in_image(camera: Camera, cloud: TiledCloud, part: slice, drawing: _Drawing)
     """Rows of a tile's points that may show in a pixel, and their spacing in pixels where they are.
 
     A splat reaches as many standard deviations, its own and the pixels' low-pass (splatting.py), as an opaque one needs
-    to fall to ALPHA_MIN. The projection is linearised within a margin of the image: there a round one is widened.
+    to fall to ALPHA_MIN. The projection is linearized within a margin of the image: there a round one is widened.
     """
     points, spacing = cloud.points, cloud.spacing[part]
     widest = spacing * (drawing.scale or 0) if points.scale is None else points.scale[part].max(axis=1)

@@ -74,5 +74,5 @@ def _model_type(folder: Path, classes: Mapping[str, str]) -> str:
             f"transformers {transformers.__version__} has them"
         )
     if "quantization_config" in config:
-        raise SceneError(f"{folder} is quantised; expected a model in float32 or float16, whose weights alone are read")
+        raise SceneError(f"{folder} is quantized; expected a model in float32 or float16, whose weights alone are read")
     return kind

@@ -238,11 +238,11 @@ def train_codebook(
     apart = _Parts(members, [len(rows) for rows in seeds], np.zeros((len(known), 0), np.float32), held)
     own_fine, fine_centers = training.train(fine, fine_centers, apart, run, key)
     # Leaf numbers leave room for k2 in every coarse cluster, as published.
-    leaf_of_centre = np.concatenate([c * settings.k2 + np.arange(len(rows)) for c, rows in enumerate(seeds)])
+    leaf_of_center = np.concatenate([c * settings.k2 + np.arange(len(rows)) for c, rows in enumerate(seeds)])
     coarse_ids, leaf = np.full(len(gaussians), -1, np.int32), np.full(len(gaussians), -1, np.int32)
-    coarse_ids[known], leaf[known] = own, leaf_of_centre[own_fine]
+    coarse_ids[known], leaf[known] = own, leaf_of_center[own_fine]
     table = np.zeros((k1 * settings.k2, raw.shape[1]), np.float32)
-    table[leaf_of_centre] = training.read(torch.as_tensor(fine_centers, device="cpu")).numpy()
+    table[leaf_of_center] = training.read(torch.as_tensor(fine_centers, device="cpu")).numpy()
     return TrainedCodebook(coarse_ids, leaf, table, (coarse, fine))
 
 
@@ -302,11 +302,11 @@ class _CodebookTraining:
             if step % interval == 0:
                 stage.reassign(parts, settings.lloyd_rounds)
             view, target, rows = self._draw(rng, parts)
-            quantised = stage.centers[:, :width][stage.own].requires_grad_()
+            quantized = stage.centers[:, :width][stage.own].requires_grad_()
             # Eq. 4, and its gradient by the centers given to the features: straight through.
-            error = view.render(self.read(quantised))[rows] - target
+            error = view.render(self.read(quantized))[rows] - target
             loss = error.square().mean() if squared else error.abs().mean()
-            (features.grad,) = torch.autograd.grad(loss, quantised)
+            (features.grad,) = torch.autograd.grad(loss, quantized)
             stage.adam.step()
             stage.centers[:, :width] = _cluster_means(features.detach(), stage.own, stage.centers[:, :width])
             history.loss.append(loss.item())
