@@ -28,7 +28,11 @@ from scipy.sparse import csr_array
 
 from og_pointcloud.fitting.mask_table import MaskTable
 from og_pointcloud.fitting.view_votes import ViewVotes
+from og_pointcloud.kernels import njit
 from og_pointcloud.settings import GroupingSettings
+
+UNKNOWN_LIKENESS = 0.25
+"""Of features of which nothing is known: the expected square of a uniform share lies near a quarter."""
 
 
 @dataclass(frozen=True)
@@ -188,90 +192,105 @@ def _agglomerate(
     Of pairs that agree alike the one with more witnesses comes first, then the one with more alike features: the order
     of views and masks does not matter.
     """
-    likeness = _Likeness(features, mask_view)
-    links = _link_table(witnesses, usable)
-    speaks, hears = witnesses.speaks.copy(), witnesses.hears.copy()
-    group = np.where(usable, np.arange(len(usable)), -1)
-    version = [0] * len(usable)
-    heap: list[tuple[float, float, float, int, int, int, int]] = []
+    w, count = witnesses, len(usable)
+    kept = np.flatnonzero(usable[w.rows] & usable[w.cols])
+    kept = kept[np.argsort(w.rows[kept], kind="stable")]
+    start = np.searchsorted(w.rows[kept], np.arange(count + 1))
+    links = start, w.cols[kept].astype(np.int64), w.one[kept], w.same_extent[kept]
+    group = np.where(usable, np.arange(count), -1)
+    total = features.astype(np.float64)
+    said = w.speaks.copy(), w.hears.copy(), total, np.linalg.norm(total, axis=1)
+    _join(group, links, said, _cosines_of_different(features, mask_view), settings.join_majority)
+    return _roots(group)
 
-    def offer(a: int, others: list[int]) -> None:
-        """Put the pairs of a group and others on the heap, with their agreement."""
-        cosine, alike = likeness(a, others)
-        asked = speaks[others] @ hears[a]
-        one, same_extent = np.array([links[a][b] for b in others]).T
-        agreement = (same_extent + (one - same_extent) * alike) / asked
-        for b, *order in zip(others, (-agreement).tolist(), (-asked).tolist(), (-cosine).tolist(), strict=True):
-            if -order[0] > settings.join_majority:
-                low, high = min(a, b), max(a, b)
-                heapq.heappush(heap, (order[0], order[1], order[2], low, high, version[low], version[high]))
 
-    for a in links:
-        later = [b for b in links[a] if b > a]
-        if later:
-            offer(a, later)
-    while heap:
+def _cosines_of_different(features: NDArray[np.float32], mask_view: NDArray[np.int32]) -> NDArray[np.float64]:
+    """Cosines of the features of two masks of one view, ascending. These are mostly different things, whatever the
+    encoder: they calibrate its cosines."""
+    cosines = [np.zeros(0)]
+    for view in np.unique(mask_view):
+        rows = features[mask_view == view][:200]
+        cosines.append((rows @ rows.T)[np.triu_indices(len(rows), 1)])
+    return np.sort(np.concatenate(cosines))
+
+
+@njit(cache=True)
+def _join(group, links, said, different, majority):  # noqa: ANN001, ANN202
+    """Writes to ``group``, at first each mask's own number or -1, which lower one it was joined with.
+
+    links: sparse rows of masks: (start, other masks, one, same extent). said: (speaks, hears, features, their length)
+    of each mask; here they become those of groups. different: as of `_cosines_of_different`.
+    """
+    start, others, one, same_extent = links
+    speaks, hears, features, length = said
+    linked = [(others[i:j], one[i:j], same_extent[i:j]) for i, j in zip(start[:-1], start[1:])]  # noqa: B905
+    version, place = np.zeros(len(group), np.int64), np.full(len(group), -1)
+    # Of pairs of groups, the best on top: minus agreement, witnesses and cosine, the two, and their versions then.
+    heap = [(0.0, 0.0, 0.0, 0, 0, 0, 0) for _ in range(0)]
+    for a in range(len(group)):
+        _offer(heap, a, a, linked[a], said, version, different, majority)
+    while len(heap):
         _, _, _, a, b, seen_a, seen_b = heapq.heappop(heap)
         if version[a] != seen_a or version[b] != seen_b or group[a] != a or group[b] != b:
             continue
         group[b] = a
         version[a] += 1
-        likeness.join(a, b)
         speaks[a] += speaks[b]
         hears[a] += hears[b]
-        del links[a][b], links[b][a]
-        for c, more in links.pop(b).items():
-            del links[c][b]
-            have = links[a].get(c, (0.0, 0.0))
-            links[a][c] = links[c][a] = (have[0] + more[0], have[1] + more[1])
-        if links[a]:
-            offer(a, list(links[a]))
-    return _roots(group)
+        features[a] += features[b]
+        length[a] = np.sqrt(np.dot(features[a], features[a]))
+        linked[a] = _pooled(linked[a], linked[b], a, group, place)
+        linked[b] = others[:0], one[:0], same_extent[:0]
+        _offer(heap, a, -1, linked[a], said, version, different, majority)
 
 
-class _Likeness:
-    """How alike the features of two groups are: their cosine, and the share of different masks of one view that are
-    less alike, squared.
+@njit(cache=True)
+def _offer(heap, a, above, links, said, version, different, majority):  # noqa: ANN001, ANN202
+    """Puts on the heap the pairs of group a and those linked to it, of numbers above one, that most witnesses join."""
+    speaks, hears, features, length = said
+    for b, one, same_extent in zip(*links):  # noqa: B905
+        asked = np.dot(speaks[b], hears[a])
+        if b <= above or one / asked <= majority:  # whatever their features
+            continue
+        both = length[a] * length[b]
+        cosine = np.dot(features[a], features[b]) / both if both > 0 else 0.0
+        alike = _likeness(cosine, different) if both > 0 else UNKNOWN_LIKENESS
+        agreement = (same_extent + (one - same_extent) * alike) / asked
+        if agreement > majority:
+            low, high = min(a, b), max(a, b)
+            heapq.heappush(heap, (-agreement, -asked, -cosine, low, high, version[low], version[high]))
 
-    Masks of one view are mostly different things, whatever the encoder: they calibrate its cosines.
+
+@njit(cache=True)
+def _likeness(cosine, different):  # noqa: ANN001, ANN202
+    """The share of different things that are less alike, squared."""
+    if not len(different):
+        return UNKNOWN_LIKENESS
+    below = np.searchsorted(different, cosine - 1e-6, "left") + np.searchsorted(different, cosine + 1e-6, "right")
+    return (0.5 * below / len(different)) ** 2
+
+
+@njit(cache=True)
+def _pooled(first, second, a, group, place):  # noqa: ANN001, ANN202
+    """The links of group a, of those that both parts of it had before, each other group once.
+
+    place: (masks,) all -1, and so again in the end.
     """
-
-    def __init__(self, features: NDArray[np.float32], mask_view: NDArray[np.int32]) -> None:
-        self.total = features.astype(np.float64)
-        self.length = np.linalg.norm(self.total, axis=1)
-        cosines = [np.zeros(0)]
-        for view in np.unique(mask_view):
-            rows = features[mask_view == view][:200]
-            cosines.append((rows @ rows.T)[np.triu_indices(len(rows), 1)])
-        self.different = np.sort(np.concatenate(cosines))
-
-    def __call__(self, a: int, others: list[int]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """(cosines, likenesses) of a group and others."""
-        length = self.length[others] * self.length[a]
-        known = length > 0
-        cosine = np.where(known, self.total[others] @ self.total[a] / np.where(known, length, 1), 0.0)
-        if not len(self.different):
-            known[:] = False
-        below = np.searchsorted(self.different, cosine - 1e-6, "left")
-        below += np.searchsorted(self.different, cosine + 1e-6, "right")
-        # Nothing known: the expected square of a uniform share lies near a quarter.
-        alike = np.where(known, (0.5 * below / max(len(self.different), 1)) ** 2, 0.25)
-        return cosine, alike
-
-    def join(self, a: int, b: int) -> None:
-        self.total[a] += self.total[b]
-        self.length[a] = np.linalg.norm(self.total[a])
-
-
-def _link_table(witnesses: _Witnesses, usable: NDArray[np.bool_]) -> dict[int, dict[int, tuple[float, float]]]:
-    """links[a][b] = (one, same_extent) of the usable masks, both ways."""
-    w = witnesses
-    links: dict[int, dict[int, tuple[float, float]]] = {int(a): {} for a in np.flatnonzero(usable)}
-    keep = usable[w.rows] & usable[w.cols]
-    columns = (column[keep].tolist() for column in (w.rows, w.cols, w.one, w.same_extent))
-    for a, b, one, same_extent in zip(*columns, strict=True):
-        links[a][b] = (one, same_extent)
-    return links
+    most = len(first[0]) + len(second[0])
+    others, one, same_extent = np.empty(most, np.int64), np.zeros(most), np.zeros(most)
+    count = 0
+    for links in (first, second):
+        for b, of_one, of_same_extent in zip(*links):  # noqa: B905
+            while group[b] != b:  # which joined another since
+                b = group[b]
+            if b == a:
+                continue
+            if place[b] < 0:
+                place[b], others[count], count = count, b, count + 1
+            one[place[b]] += of_one
+            same_extent[place[b]] += of_same_extent
+    place[others[:count]] = -1
+    return others[:count], one[:count], same_extent[:count]
 
 
 def _roots(group: NDArray[np.int64]) -> NDArray[np.int64]:
