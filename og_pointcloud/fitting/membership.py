@@ -24,7 +24,6 @@ the scene's other points, for of surfaces of several noisy layers little is seen
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,8 +33,8 @@ from scipy.sparse.csgraph import connected_components
 from og_pointcloud.cloud import BACKGROUND, UNOBSERVED
 from og_pointcloud.fitting.colors import color_ratios, neighbour_weights
 from og_pointcloud.fitting.grouping import MaskGroups
-from og_pointcloud.fitting.mask_table import MaskTable, SparseRows
-from og_pointcloud.fitting.memory import in_file
+from og_pointcloud.fitting.mask_table import MaskTable
+from og_pointcloud.fitting.memory import scratch_like
 from og_pointcloud.fitting.view_votes import ViewVotes
 from og_pointcloud.kernels import njit, prange
 from og_pointcloud.rendering.geometry import Neighbourhood
@@ -147,7 +146,7 @@ def without_see_through(
         weights.shape[1],
     )
     exposure = _scaled(table.exposure, left)
-    return replace(table, weights=_scaled(weights, ~behind), exposure=exposure), share
+    return replace(table, weights=_scaled(weights, (~behind).astype(np.float32)), exposure=exposure), share
 
 
 @njit(cache=True)
@@ -174,14 +173,26 @@ def _exposure_left(first_mask, weights, outside, exposure, behind, n):  # noqa: 
     return left
 
 
-def _scaled(matrix: csr_array, factor: NDArray[np.floating] | NDArray[np.bool_]) -> csr_array:
+def _scaled(matrix: csr_array, factor: NDArray[np.float32]) -> csr_array:
     """The matrix with each entry times its factor, without those that are 0 then."""
-    rows = SparseRows(int(np.count_nonzero(factor)), matrix.shape[1], in_file(matrix.data))
-    for begin, end in pairwise(matrix.indptr.tolist()):
-        kept = factor[begin:end] > 0
-        data = matrix.data[begin:end][kept] * factor[begin:end][kept]
-        rows.append(np.count_nonzero(kept), matrix.indices[begin:end][kept], data)
-    return rows.matrix()
+    columns, values = scratch_like(matrix.indices, np.int32), scratch_like(matrix.data, np.float32)
+    starts = _scale((matrix.indptr, matrix.indices, matrix.data), factor, columns, values)
+    return csr_array((values[: starts[-1]], columns[: starts[-1]], starts), shape=matrix.shape)
+
+
+@njit(cache=True)
+def _scale(matrix, factor, columns, values):  # noqa: ANN001, ANN202
+    """Writes the entries that are left; where rows begin."""
+    indptr, indices, data = matrix
+    starts = np.zeros(len(indptr), np.int32)
+    end = 0
+    for row in range(len(indptr) - 1):
+        for e in range(indptr[row], indptr[row + 1]):
+            if factor[e] > 0:
+                columns[end], values[end] = indices[e], data[e] * factor[e]
+                end += 1
+        starts[row + 1] = end
+    return starts
 
 
 def _behind_front(
@@ -193,7 +204,7 @@ def _behind_front(
     """
     if len(depth) == 0:
         return np.zeros(0, bool)
-    order = np.argsort(depth, kind="stable")
+    order = np.argsort(depth)  # equal depths are of one run, whichever comes first
     reached = np.cumsum(weight[order], dtype=np.float64)
     middle = depth[order[np.searchsorted(reached, 0.5 * reached[-1])]]
     run = np.concatenate([[0], np.cumsum(np.diff(depth[order]) > gap_share * middle)])
