@@ -34,7 +34,6 @@ from og_pointcloud.cloud import BACKGROUND, UNOBSERVED
 from og_pointcloud.fitting.colors import color_ratios, neighbour_weights
 from og_pointcloud.fitting.grouping import MaskGroups
 from og_pointcloud.fitting.mask_table import MaskTable
-from og_pointcloud.fitting.memory import scratch_like
 from og_pointcloud.fitting.view_votes import ViewVotes
 from og_pointcloud.kernels import njit, prange
 from og_pointcloud.rendering.geometry import Neighbourhood
@@ -127,7 +126,8 @@ def without_see_through(
     thing that stands there.
 
     depth_rows: (views, 4) float64, third row of each world-to-camera matrix. focal: (views,) pixels.
-    Returns the table without those weights, and with as much less exposure; and their share of all weight.
+    Returns the table without those weights, and with as much less exposure; and their share of all weight. It takes
+    the place of the given one, whose weights and exposure are written over.
     """
     weights = table.weights
     behind = np.zeros(weights.nnz, np.bool_)
@@ -174,22 +174,21 @@ def _exposure_left(first_mask, weights, outside, exposure, behind, n):  # noqa: 
 
 
 def _scaled(matrix: csr_array, factor: NDArray[np.float32]) -> csr_array:
-    """The matrix with each entry times its factor, without those that are 0 then."""
-    columns, values = scratch_like(matrix.indices, np.int32), scratch_like(matrix.data, np.float32)
-    starts = _scale((matrix.indptr, matrix.indices, matrix.data), factor, columns, values)
+    """The matrix with each entry times its factor, without those that are 0 then; in the same memory."""
+    columns, values = matrix.indices, matrix.data
+    starts = _scale(matrix.indptr, columns, values, factor)
     return csr_array((values[: starts[-1]], columns[: starts[-1]], starts), shape=matrix.shape)
 
 
 @njit(cache=True)
-def _scale(matrix, factor, columns, values):  # noqa: ANN001, ANN202
-    """Writes the entries that are left; where rows begin."""
-    indptr, indices, data = matrix
+def _scale(indptr, columns, values, factor):  # noqa: ANN001, ANN202
+    """Moves the entries that are left to the front; where rows begin."""
     starts = np.zeros(len(indptr), np.int32)
     end = 0
     for row in range(len(indptr) - 1):
         for e in range(indptr[row], indptr[row + 1]):
             if factor[e] > 0:
-                columns[end], values[end] = indices[e], data[e] * factor[e]
+                columns[end], values[end] = columns[e], values[e] * factor[e]
                 end += 1
         starts[row + 1] = end
     return starts

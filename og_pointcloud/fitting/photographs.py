@@ -46,7 +46,7 @@ class Photographs:
         return cls(tuple(name for name, _ in number), np.array(of_view, np.int32), of_mask, first)
 
     def joined(self, table: MaskTable) -> MaskTable:
-        """The table of the views, as one of the photographs."""
+        """The table of the views, as one of the photographs, in whose place it is: that may be written over."""
         if len(self.names) == len(self.of_view):
             return table
         exposure = _summed(table.exposure, self.of_view, len(self.names))
@@ -68,7 +68,9 @@ def _summed(matrix: csr_array, whole: NDArray[np.integer], count: int) -> csr_ar
     """(count, n) sparse: the sums of the rows that are parts of each whole."""
     parts = np.argsort(whole, kind="stable")
     first = np.searchsorted(whole[parts], np.arange(count + 1))
-    columns, values = scratch_like(matrix.indices, np.int32), scratch_like(matrix.data, np.float32)
+    columns, values = matrix.indices, matrix.data
+    if (np.diff(parts) < 0).any():  # else sums come to lie before what is still to be read
+        columns, values = scratch_like(columns, np.int32), scratch_like(values, np.float32)
     starts = _add_rows((matrix.indptr, matrix.indices, matrix.data), parts, first, matrix.shape[1], columns, values)
     return csr_array((values[: starts[-1]], columns[: starts[-1]], starts), shape=(count, matrix.shape[1]))
 
