@@ -145,10 +145,11 @@ def _containers(
 
 @dataclass(frozen=True)
 class _Witnesses:
-    """Per pair of masks (rows, cols, both ways) that any view, or the tracker, shows as one thing: how many do, and how
-    many of these whatever the features say: all if the two masks have the same extent, else the tracker alone. speaks,
-    hears: (masks, views + tracks), of which speaks[i] @ hears[j] is how many witnesses say anything of a pair: views in
-    which both have a container, and the tracker where both tracks are the same or were in one image."""
+    """Per pair of masks (rows, ascending, and cols, both ways) that any view, or the tracker, shows as one thing: how
+    many do, and how many of these whatever the features say: all if the two masks have the same extent, else the
+    tracker alone. speaks, hears: (masks, views + tracks), of which speaks[i] @ hears[j] is how many witnesses say
+    anything of a pair: views in which both have a container, and the tracker where both tracks are the same or were in
+    one image."""
 
     rows: NDArray[np.int32]
     cols: NDArray[np.int32]
@@ -192,13 +193,10 @@ def _agglomerate(
     Of pairs that agree alike the one with more witnesses comes first, then the one with more alike features: the order
     of views and masks does not matter.
     """
-    w, count = witnesses, len(usable)
+    w, everyone = witnesses, np.arange(len(usable) + 1)
     kept = np.flatnonzero(usable[w.rows] & usable[w.cols])
-    kept = kept[np.argsort(w.rows[kept], kind="stable")]
-    start = np.searchsorted(w.rows[kept], np.arange(count + 1))
-    links = start, w.cols[kept].astype(np.int64), w.one[kept], w.same_extent[kept]
-    group = np.where(usable, np.arange(count), -1)
-    total = features.astype(np.float64)
+    links = np.searchsorted(w.rows[kept], everyone), w.cols[kept].astype(np.int64), w.one[kept], w.same_extent[kept]
+    group, total = np.where(usable, everyone[:-1], -1), features.astype(np.float64)
     said = w.speaks.copy(), w.hears.copy(), total, np.linalg.norm(total, axis=1)
     _join(group, links, said, _cosines_of_different(features, mask_view), settings.join_majority)
     return _roots(group)
@@ -223,7 +221,8 @@ def _join(group, links, said, different, majority):  # noqa: ANN001, ANN202
     """
     start, others, one, same_extent = links
     speaks, hears, features, length = said
-    linked = [(others[i:j], one[i:j], same_extent[i:j]) for i, j in zip(start[:-1], start[1:])]  # noqa: B905
+    rows = [slice(start[a], start[a + 1]) for a in range(len(group))]
+    linked = [(others[row], one[row], same_extent[row]) for row in rows]
     version, place = np.zeros(len(group), np.int64), np.full(len(group), -1)
     # Of pairs of groups, the best on top: minus agreement, witnesses and cosine, the two, and their versions then.
     heap = [(0.0, 0.0, 0.0, 0, 0, 0, 0) for _ in range(0)]
