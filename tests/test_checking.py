@@ -31,13 +31,7 @@ from og_pointcloud.errors import SceneError
 from og_pointcloud.fitting.fit import fit_prepared, prepare
 from og_pointcloud.formats.mask_files import MaskLayer
 from og_pointcloud.formats.poses import in_local_frame, rotation_of_vector
-from og_pointcloud.formats.repairs import (
-    KINDS,
-    Repair,
-    read_repairs,
-    repaired_cameras,
-    repaired_layers,
-)
+from og_pointcloud.formats.repairs import KINDS, Repair, read_repairs, repaired_cameras, repaired_layers
 from og_pointcloud.scene import Camera
 
 SMALL = {"views": 6, "points": 3000}
@@ -255,8 +249,7 @@ def test_poses_in_random_order_are_told_and_nothing_is_named():
 
 
 @pytest.mark.parametrize(
-    "fault",
-    ["aligned=0,0,0,0,0,5,1", *slow("aligned=0.2,0,0,0,0,0,1", "aligned=0,0,0,0,0,0,1.1", "shifted=0.05,0.03")],
+    "fault", ["aligned=0,0,0,0,0,5,1", *slow("aligned=0.2,0,0,0,0,0,1", "aligned=0,0,0,0,0,0,1.1", "shifted=0.05,0.03")]
 )
 def test_a_small_fault_is_told_with_a_repair_that_takes_it_back(fault):
     scene = faulty(fault)

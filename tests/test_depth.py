@@ -3,17 +3,7 @@
 import cv2
 import numpy as np
 import pytest
-from scenes import (
-    CRATE,
-    ROOM_SIZE,
-    THING,
-    camera,
-    distance_to_surface,
-    look,
-    room_poses,
-    write_depth,
-    write_frames,
-)
+from scenes import CRATE, ROOM_SIZE, THING, camera, distance_to_surface, look, room_poses, write_depth, write_frames
 
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.depth import DepthFile, DepthFrame, DepthImage, resampled

@@ -187,14 +187,7 @@ def test_product_equals_scipy() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "settings",
-    [
-        FeatureSettings(),
-        FeatureSettings(normalise=False),
-        FeatureSettings(width=2),
-    ],
-)
+@pytest.mark.parametrize("settings", [FeatureSettings(), FeatureSettings(normalise=False), FeatureSettings(width=2)])
 def test_objects_come_apart_and_keep_together(
     tiny: Rendered, tiny_capture: TinyCapture, settings: FeatureSettings
 ) -> None:

@@ -375,9 +375,7 @@ def test_views_of_another_geometry_are_not_taken(
 ) -> None:
     interrupted(tmp_path, gaussians)
     counts = rendered(monkeypatch)
-    options = {
-        "thickness": {"thickness": np.full(len(gaussians), 0.1, np.float32)},
-    }
+    options = {"thickness": {"thickness": np.full(len(gaussians), 0.1, np.float32)}}
     if change in ("xyz", "opacity"):
         gaussians = replace(gaussians, **{change: getattr(gaussians, change) * np.float32(0.9)})
     with WorkFolder.open(tmp_path) as work:

@@ -9,13 +9,7 @@ import numpy as np
 import pytest
 
 from og_pointcloud.errors import SceneError
-from og_pointcloud.masking.automatic import (
-    AutomaticMasks,
-    best_of_alike,
-    grid,
-    stability,
-    without_specks,
-)
+from og_pointcloud.masking.automatic import AutomaticMasks, best_of_alike, grid, stability, without_specks
 from og_pointcloud.masking.contracts import Proposals
 from og_pointcloud.masking.existing import CallableProposer, ExistingMasks, as_proposals, decode_rle, from_ids
 from og_pointcloud.masking.opencv import OpenCVProposer, region_tree

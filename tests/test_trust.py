@@ -308,9 +308,7 @@ def rude(bundle, tmp_path_factory):
 
 
 @pytest.mark.parametrize(
-    "command",
-    [["info"], ["info", "--json"], ["instances"], ["segment"], ["segment", "--labels", "foo"]],
-    ids=" ".join,
+    "command", [["info"], ["info", "--json"], ["instances"], ["segment"], ["segment", "--labels", "foo"]], ids=" ".join
 )
 def test_nothing_in_a_file_reaches_the_terminal_as_it_is(rude, capsys, command):
     main([*command, str(rude)] if "--labels" not in command else ["segment", str(rude), *command[1:]])

@@ -15,15 +15,7 @@ from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError, SceneErro
 from og_pointcloud.mapping.likeness import spread_of
 from og_pointcloud.mapping.map_record import MapRecord
 from og_pointcloud.mapping.presence import Evidence, Visit
-from og_pointcloud.mapping.sight import (
-    AGREES,
-    HIDDEN,
-    NOTHING,
-    THROUGH,
-    DiscSurface,
-    states_of_points,
-    view_of_depth,
-)
+from og_pointcloud.mapping.sight import AGREES, HIDDEN, NOTHING, THROUGH, DiscSurface, states_of_points, view_of_depth
 from og_pointcloud.scene import Camera
 
 AWAY = (-0.9, 0.5, 0.0)

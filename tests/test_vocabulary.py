@@ -16,12 +16,7 @@ from text_models import encoder_files, write_files
 
 import og_pointcloud as og
 from og_pointcloud.bundle.read import read_bundle, read_carried_encoder
-from og_pointcloud.bundle.vocabulary import (
-    add_words,
-    carried_encoder,
-    carry_encoder,
-    store_bank,
-)
+from og_pointcloud.bundle.vocabulary import add_words, carried_encoder, carry_encoder, store_bank
 from og_pointcloud.cli import main
 from og_pointcloud.cloud import Vocabulary, WordBank
 from og_pointcloud.errors import BundleError, FeatureSpaceError, OgPointcloudError
