@@ -289,7 +289,9 @@ def _things(
         pieces = sorted((k for k in candidates if group[k] == first), key=lambda k: (-len(rows[k]), k))
         xyz = visit.cloud.xyz_world[np.concatenate([rows[k] for k in pieces])]
         things.append(
-            _Thing(tuple(pieces), replace(looks[pieces[0]], place=xyz.mean(axis=0)), len(xyz), surely[pieces].any())
+            _Thing(
+                tuple(pieces), replace(looks[pieces[0]], place=xyz.mean(axis=0)), len(xyz), bool(surely[pieces].any())
+            )
         )
     return things
 

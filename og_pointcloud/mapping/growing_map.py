@@ -15,7 +15,7 @@ from og_pointcloud.formats.poses import in_local_frame
 from og_pointcloud.mapping.frame import CheckedFrame
 from og_pointcloud.mapping.kept_views import KeptViews
 from og_pointcloud.mapping.presence import Presence, tolerance_of
-from og_pointcloud.mapping.sight import AGREES, THROUGH, MeasuredView, states_in_packets
+from og_pointcloud.mapping.sight import AGREES, THROUGH, MeasuredView, states_of_points
 from og_pointcloud.mapping.tracks import NO_TRACK, PointVotes, Tracks
 from og_pointcloud.mapping.voxels import VoxelPoints
 from og_pointcloud.scene import Camera
@@ -67,8 +67,7 @@ class GrowingMap:
     def about(self, camera: Camera, margin: float = 0.0, most: int = 1 << 31) -> NDArray[np.int32]:
         """Rows of the points that are there and may fall into an image, or within a share ``margin`` of it; of more
         than ``most`` about so many, evenly chosen."""
-        packets = self.points.packets
-        rows = packets.members(packets.before(camera, self.points.edge, margin=margin))
+        rows = self.points.packets.before(camera, self.points.edge, margin=margin)
         return self._there(rows[:: 1 + len(rows) // most])
 
     def _there(self, rows: NDArray[np.int32]) -> NDArray[np.int32]:
@@ -80,9 +79,13 @@ class GrowingMap:
 
     def judge(self, view: MeasuredView, stamp: float) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
         """Presence by what a view measures: rows of points that it bears out, and of those that leave by it."""
-        rows, states = states_in_packets(self.points, self.presence.tolerance, view)
-        presence, through = self.presence, rows[states == THROUGH]
-        presence.take(rows, self.points.xyz, states, view.camera.center, stamp)
+        presence, points = self.presence, self.points
+        # What lies behind all that is measured about its pixel is not asked.
+        rows = points.packets.before(view.camera, points.edge, view.asked(presence.tolerance)[-1])
+        rows = rows[points.weight[rows] > 0]
+        states = states_of_points(points.xyz[rows], presence.tolerance, view)
+        presence.take(rows, points.xyz, states, view.camera.center, stamp)
+        through = rows[states == THROUGH]
         return rows[states == AGREES], through[(presence.odds[through] < -1) & (presence.refuted[through] > 1)]
 
     def add(self, frame: CheckedFrame) -> NDArray[np.int32]:

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from og_pointcloud.formats.capture import depth_files, read_poses
 from og_pointcloud.formats.poses import in_local_frame
 from og_pointcloud.kernels import njit, prange
-from og_pointcloud.mapping.voxels import VoxelPoints, in_camera, lens_of, turned
+from og_pointcloud.mapping.voxels import in_camera, lens_of, turned
 from og_pointcloud.rendering.geometry import Neighbourhood, neighbourhood
 from og_pointcloud.scene import Camera
 from og_pointcloud.settings import GeometrySettings
@@ -147,19 +147,6 @@ def depth_views(capture: str | Path, origin: NDArray[np.float64]) -> Iterator[Me
 def states_of_points(xyz: NDArray[np.float32], tolerance: float, view: MeasuredView) -> NDArray[np.int8]:
     """(n,) int8: NOTHING, AGREES, HIDDEN or THROUGH. tolerance: beside the view's noise, same unit as xyz (n, 3)."""
     return _states(xyz, view.asked(tolerance))
-
-
-def states_in_packets(
-    points: VoxelPoints, tolerance: float, view: MeasuredView
-) -> tuple[NDArray[np.int32], NDArray[np.int8]]:
-    """Rows of the points that a view measures or sees through, and which of both: AGREES or THROUGH. As
-    `states_of_points` has it for all of them, but only those packets are gone through that its surfaces do not hide."""
-    asked, packets = view.asked(tolerance), points.packets
-    chosen = packets.before(view.camera, points.edge, asked[-1])
-    rows = packets.rows[chosen]
-    states = _states_of_rows(rows, packets.filled[chosen], points.xyz, points.weight, asked)
-    told = (states == AGREES) | (states == THROUGH)
-    return rows[told], states[told]
 
 
 def _planes(
@@ -326,15 +313,4 @@ def _states(xyz, asked):  # noqa: ANN001, ANN202
     states = np.empty(len(xyz), np.int8)
     for i in prange(len(xyz)):
         states[i] = _state_of((xyz[i, 0], xyz[i, 1], xyz[i, 2]), asked)
-    return states
-
-
-@njit(cache=True, parallel=True, nogil=True, error_model="numpy")
-def _states_of_rows(rows, filled, xyz, weight, asked):  # noqa: ANN001, ANN202
-    states = np.zeros(rows.shape, np.int8)
-    for packet in prange(len(rows)):
-        for k in range(filled[packet]):
-            i = rows[packet, k]
-            if weight[i] > 0:
-                states[packet, k] = _state_of((xyz[i, 0], xyz[i, 1], xyz[i, 2]), asked)
     return states

@@ -21,9 +21,11 @@ MOST_WEIGHT = 32.0
 """Readings that a point's mean counts for at most, so that it follows."""
 EMPTY = np.int64(-1)
 BRICK = 16
-"""Voxels along each side of a brick, whose points share packets: at first. Bricks become larger while packets of 128
-rows are filled to less than LEAST_FILLED."""
-PACKET, LEAST_FILLED, MANY_PACKETS = 128, 0.25, 64
+"""Voxels along each side of a brick, by which rows are put in order of place."""
+PACKET = 128
+"""Rows of a packet, the last one of those that came together may have fewer."""
+REFILED = 1.25
+"""Times as many points as when all were filed last, from which on they are filed anew."""
 TILE = 16
 """Pixels along each side of the parts of an image by which packets are held against what hides them."""
 
@@ -60,49 +62,47 @@ class VoxelHash:
 
 
 @dataclass
-class Packets(Columns):
-    """Rows of points, filed by brick. rows: (packets, PACKET) int32; filled: (packets,) int32, how many of them; low,
-    high: (packets, 3) float32, the box of their points when they were filed. side: of a brick. filed: points so far;
-    count: packets. open: the packet of each brick that has room."""
+class Packets:
+    """Rows of points by place. order: (n,) int32; starts: (packets + 1,) int32, where each packet begins in it. low,
+    high: (packets, 3) float32, the box of its points when they were filed. settled: points when all were filed last."""
 
-    side: float = 0.0
-    filed: int = 0
-    count: int = 0
-    open: VoxelHash = field(default_factory=VoxelHash)
-    rows: NDArray[np.int32] = field(default_factory=lambda: np.zeros((0, PACKET), np.int32))
-    filled: NDArray[np.int32] = field(default_factory=lambda: np.zeros(0, np.int32))
+    side: float
+    settled: int = 0
+    order: NDArray[np.int32] = field(default_factory=lambda: np.zeros(0, np.int32))
+    starts: NDArray[np.int32] = field(default_factory=lambda: np.zeros(1, np.int32))
     low: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 3), np.float32))
     high: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 3), np.float32))
 
     def file(self, xyz: NDArray[np.float32]) -> None:
         """File the points (n, 3) that are not yet."""
-        while self.filed < len(xyz):
-            self.grow(self.count + 1 + (len(xyz) - self.filed) // PACKET)
-            self.open.reserve(len(self.rows))
-            bricks, packets = (self.open.keys, self.open.rows), (self.rows, self.filled, self.low, self.high)
-            self.filed, self.count = _file(xyz, self.side, bricks, packets, self.filed, self.count)
-            if self.count > MANY_PACKETS and self.filed < LEAST_FILLED * PACKET * self.count:
-                self.side, self.filed, self.count, self.open = 2 * self.side, 0, 0, VoxelHash()
-                self.filled[:] = 0
+        first, n = len(self.order), len(xyz)
+        if n == first:
+            return
+        if n > REFILED * self.settled:
+            first, self.settled, self.starts, self.low, self.high = 0, n, self.starts[:1], self.low[:0], self.high[:0]
+        order = first + np.argsort(_keys(xyz[first:], self.side), kind="stable").astype(np.int32)
+        begins = np.arange(0, n - first, PACKET)
+        self.order = np.concatenate([self.order[:first], order])
+        self.starts = np.concatenate([self.starts[:-1], first + begins, [n]]).astype(np.int32)
+        self.low = np.concatenate([self.low, np.minimum.reduceat(xyz[order], begins)])
+        self.high = np.concatenate([self.high, np.maximum.reduceat(xyz[order], begins)])
 
     def before(
         self, camera: Camera, edge: float, hidden_from: NDArray[np.floating] | None = None, margin: float = 0.0
-    ) -> NDArray[np.int64]:
-        """Packets that may have points in an image, or within a share ``margin`` of it. edge: how far points may have
-        moved since they were filed. hidden_from: (h, w) depth at and behind which nothing is asked for; None: nowhere.
-        """
+    ) -> NDArray[np.int32]:
+        """Rows of packets that may have points in an image, or within a share ``margin`` of it. edge: how far points
+        may have moved since they were filed. hidden_from: (h, w) depth at and behind which nothing is asked for; None:
+        nowhere."""
         farthest = np.zeros((0, 0)) if hidden_from is None else _tile_maxima(hidden_from)
-        boxes, size = (self.low[: self.count], self.high[: self.count]), (camera.width, camera.height)
-        return np.flatnonzero(_before(boxes, edge, camera.world_to_camera, lens_of(camera), size, margin, farthest))
+        boxes, size = (self.low, self.high), (camera.width, camera.height)
+        return self._rows(_before(boxes, edge, camera.world_to_camera, lens_of(camera), size, margin, farthest))
 
     def within(self, low: NDArray[np.floating], high: NDArray[np.floating]) -> NDArray[np.int32]:
         """Rows of the packets that meet a box."""
-        meets = (self.low[: self.count] <= high).all(axis=1) & (self.high[: self.count] >= low).all(axis=1)
-        return self.members(np.flatnonzero(meets))
+        return self._rows((self.low <= high).all(axis=1) & (self.high >= low).all(axis=1))
 
-    def members(self, packets: NDArray[np.int64]) -> NDArray[np.int32]:
-        """Rows of some packets."""
-        return self.rows[packets][np.arange(PACKET) < self.filled[packets, None]]
+    def _rows(self, chosen: NDArray[np.bool_]) -> NDArray[np.int32]:
+        return self.order[np.repeat(chosen, np.diff(self.starts))]
 
 
 @dataclass
@@ -114,7 +114,7 @@ class VoxelPoints(Columns):
     grows: bool
     n: int = 0
     hash: VoxelHash = field(default_factory=VoxelHash)
-    packets: Packets = field(default_factory=Packets)
+    packets: Packets = field(default_factory=lambda: Packets(0.0))
     _xyz: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 3), np.float32))
     _rgb: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 3), np.float32))
     weight: NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
@@ -240,27 +240,6 @@ def _refill(old_keys, old_rows, keys, rows):  # noqa: ANN001, ANN202
         if old_keys[k] != EMPTY:
             slot = _slot(old_keys[k], keys)
             keys[slot], rows[slot] = old_keys[k], old_rows[k]
-
-
-@njit(cache=True, nogil=True)
-def _file(xyz, side, bricks, packets, first, count):  # noqa: ANN001, ANN202
-    """Puts points from ``first`` on into the open packet of their brick. Returns how many points and packets there are
-    then: where packets run out, there are points left."""
-    (keys, open_), (rows, filled, low, high) = bricks, packets
-    for i in range(first, len(xyz)):
-        if count == len(rows):
-            return i, count
-        key = _key(xyz[i, 0], xyz[i, 1], xyz[i, 2], side)
-        slot = _slot(key, keys)
-        if keys[slot] == EMPTY or filled[open_[slot]] == PACKET:
-            keys[slot], open_[slot] = key, count
-            low[count] = high[count] = xyz[i]
-            count += 1
-        packet = open_[slot]
-        rows[packet, filled[packet]] = i
-        filled[packet] += 1
-        low[packet], high[packet] = np.minimum(low[packet], xyz[i]), np.maximum(high[packet], xyz[i])
-    return len(xyz), count
 
 
 @njit(cache=True, nogil=True)
