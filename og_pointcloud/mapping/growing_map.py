@@ -71,7 +71,7 @@ class GrowingMap:
         return self._there(rows[:: 1 + len(rows) // most])
 
     def _there(self, rows: NDArray[np.int32]) -> NDArray[np.int32]:
-        return np.sort(rows[self.points.weight[rows] > 0])
+        return rows[self.points.weight[rows] > 0]
 
     def spacing_of(self, rows: NDArray[np.int32]) -> NDArray[np.float32]:
         """(m,) of points; of those that frames brought the map's own."""
@@ -80,9 +80,7 @@ class GrowingMap:
     def judge(self, view: MeasuredView, stamp: float) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
         """Presence by what a view measures: rows of points that it bears out, and of those that leave by it."""
         presence, points = self.presence, self.points
-        # What lies behind all that is measured about its pixel is not asked.
-        rows = points.packets.before(view.camera, points.edge, view.asked(presence.tolerance)[-1])
-        rows = rows[points.weight[rows] > 0]
+        rows = self.about(view.camera)
         states = states_of_points(points.xyz[rows], presence.tolerance, view)
         presence.take(rows, points.xyz, states, view.camera.center, stamp)
         through = rows[states == THROUGH]
@@ -116,7 +114,7 @@ class GrowingMap:
         return np.where(self.points.alive, self.votes.best(everyone, self.tracks.root), NO_TRACK)
 
     def rows_of(self, track: int) -> NDArray[np.int32]:
-        """Rows of the points of a track, ascending; only its surroundings are gone through."""
+        """Rows of the points of a track; only its surroundings are gone through."""
         (low, high), edge = self.tracks.tracks[track].box, self.points.edge
         rows = self._there(self.points.packets.within(low - edge, high + edge))
         return rows[self.votes.best(rows, self.tracks.root) == track]

@@ -45,7 +45,7 @@ def measured_points(frame: CheckedFrame, known: GrowingMap, rows: NDArray[np.int
 
 def drawn_points(frame: CheckedFrame, known: GrowingMap, geometry: GeometrySettings) -> Seen:
     """The points that a frame without depth sees, by the map's own surface."""
-    camera, rows = frame.camera, known.about(frame.camera, MARGIN)
+    camera, rows = frame.camera, np.sort(known.about(frame.camera, MARGIN))
     xyz, spacing = known.points.xyz[rows], known.spacing_of(rows)
     drawn = isotropic(Points(xyz, np.zeros(3)), spacing, known.scale or geometry.middle_scale, geometry.opacity)
     depth = xyz @ camera.world_to_camera[2, :3] + camera.world_to_camera[2, 3]

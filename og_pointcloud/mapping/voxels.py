@@ -26,8 +26,6 @@ PACKET = 128
 """Rows of a packet, the last one of those that came together may have fewer."""
 REFILED = 1.25
 """Times as many points as when all were filed last, from which on they are filed anew."""
-TILE = 16
-"""Pixels along each side of the parts of an image by which packets are held against what hides them."""
 
 
 @dataclass
@@ -87,15 +85,11 @@ class Packets:
         self.low = np.concatenate([self.low, np.minimum.reduceat(xyz[order], begins)])
         self.high = np.concatenate([self.high, np.maximum.reduceat(xyz[order], begins)])
 
-    def before(
-        self, camera: Camera, edge: float, hidden_from: NDArray[np.floating] | None = None, margin: float = 0.0
-    ) -> NDArray[np.int32]:
+    def before(self, camera: Camera, edge: float, margin: float = 0.0) -> NDArray[np.int32]:
         """Rows of packets that may have points in an image, or within a share ``margin`` of it. edge: how far points
-        may have moved since they were filed. hidden_from: (h, w) depth at and behind which nothing is asked for; None:
-        nowhere."""
-        farthest = np.zeros((0, 0)) if hidden_from is None else _tile_maxima(hidden_from)
+        may have moved since they were filed."""
         boxes, size = (self.low, self.high), (camera.width, camera.height)
-        return self._rows(_before(boxes, edge, camera.world_to_camera, lens_of(camera), size, margin, farthest))
+        return self._rows(_before(boxes, edge, camera.world_to_camera, lens_of(camera), size, margin))
 
     def within(self, low: NDArray[np.floating], high: NDArray[np.floating]) -> NDArray[np.int32]:
         """Rows of the packets that meet a box."""
@@ -198,13 +192,6 @@ def in_camera(pose, p):  # noqa: ANN001, ANN201
     return x + pose[0, 3], y + pose[1, 3], z + pose[2, 3]
 
 
-def _tile_maxima(image: NDArray[np.floating]) -> NDArray[np.floating]:
-    """The largest value in each TILE x TILE part of an image without negative ones."""
-    height, width = image.shape
-    padded = np.pad(image, ((0, -height % TILE), (0, -width % TILE)))
-    return padded.reshape(-(-height // TILE), TILE, -1, TILE).max(axis=(1, 3))
-
-
 @njit(cache=True, nogil=True)
 def _key(x, y, z, edge):  # noqa: ANN001, ANN202
     """The voxel as one number; beyond ACROSS voxels they share one, at the border."""
@@ -243,17 +230,8 @@ def _refill(old_keys, old_rows, keys, rows):  # noqa: ANN001, ANN202
 
 
 @njit(cache=True, nogil=True)
-def _span(x, z, reach, focal, middle, tiles):  # noqa: ANN001, ANN202
-    """The first and the last tile that a sphere before the camera, or a pixel beside it, may lie in, along one axis."""
-    low = (x - reach) / (z - reach if x < reach else z + reach)
-    high = (x + reach) / (z - reach if x > -reach else z + reach)
-    first, last = (focal * low + middle - 1) // TILE, (focal * high + middle + 1) // TILE
-    return int(min(max(first, 0), tiles - 1)), int(min(max(last, 0), tiles - 1))
-
-
-@njit(cache=True, nogil=True)
-def _before(boxes, edge, pose, lens, size, margin, farthest):  # noqa: ANN001, ANN202
-    """(packets,) bool: whether the sphere around a box meets the frustum, before what hides it."""
+def _before(boxes, edge, pose, lens, size, margin):  # noqa: ANN001, ANN202
+    """(packets,) bool: whether the sphere around a box meets the frustum."""
     (low, high), (fx, fy, cx, cy), (width, height) = boxes, lens, size
     across, down = margin * width, margin * height
     # The four sides of the frustum go through the camera; their normals point inwards.
@@ -272,10 +250,6 @@ def _before(boxes, edge, pose, lens, size, margin, farthest):  # noqa: ANN001, A
         inside = z > -reach
         for side in range(4):
             inside &= sides[side, 0] * x + sides[side, 1] * y + sides[side, 2] * z > -reach
-        if inside and len(farthest) and z > reach:
-            left, right = _span(x, z, reach, fx, cx, farthest.shape[1])
-            top, bottom = _span(y, z, reach, fy, cy, farthest.shape[0])
-            inside = farthest[top : bottom + 1, left : right + 1].max() > z - reach
         meets[k] = inside
     return meets
 
