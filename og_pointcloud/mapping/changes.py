@@ -44,8 +44,6 @@ SAME_SURFACE = 1.5
 """Spacings within which two visits' points are of one surface."""
 USUAL_COLORS = 3.0
 """Times that the colour of one thing may differ more than that of the median thing which has not moved."""
-ADJOINING = 3.0
-"""Spacings up to which two instances adjoin, and may be pieces of one thing."""
 LEAST_STILL = 0.05
 """Share of all points looked at, hidden ones among them, that are where they were."""
 SMALL_PIECE = 0.5
@@ -200,8 +198,8 @@ def _decide(
     left, left_surely, hardly = of_earlier.decided(earlier)
     came, came_surely, _ = of_later.decided(later)
     scale = _scale(earlier, later, _unmoved(earlier, later, nearest, left, came))
-    gone = _things(earlier, left, left_surely, of_earlier.through, scale)
-    new = _things(later, came, came_surely, of_later.through, scale)
+    gone = _things(earlier, left, left_surely, of_earlier.through)
+    new = _things(later, came, came_surely, of_later.through)
     count = len(gone)  # behind them: what an earlier visit found gone, and may be back
     gone += [_Thing((k,), look, 0, True) for k, look in MapRecord.of(earlier.cloud).gone.items()]
     gone, new, pairs = _gathered(gone, new, _matched(gone, new, scale), scale)
@@ -267,33 +265,11 @@ def _scale(earlier: Visit, later: Visit, unmoved: NDArray[np.int64]) -> Scale:
 
 
 def _things(
-    visit: Visit, chosen: NDArray[np.bool_], surely: NDArray[np.bool_], through: NDArray[np.bool_], scale: Scale
+    visit: Visit, chosen: NDArray[np.bool_], surely: NDArray[np.bool_], through: NDArray[np.bool_]
 ) -> list[_Thing]:
-    """Chosen instances, those that adjoin and look alike together: pieces of one thing. Of a small piece, which few
-    masks show, the colour is enough."""
-    candidates = np.flatnonzero(chosen).tolist()
-    rows = {k: visit.rows[k][through[visit.rows[k]]] for k in candidates}
-    looks = {k: visit.look(k, of) for k, of in rows.items()}
-    trees = {k: cKDTree(visit.cloud.xyz[of]) for k, of in rows.items()}
-    group = {k: k for k in candidates}
-    reach, within = ADJOINING * visit.cloud.spacing, replace(scale, shift=0.0)
-    for index, one in enumerate(candidates):
-        for other in candidates[index + 1 :]:
-            small = SMALL_PIECE * max(len(rows[one]), len(rows[other])) > min(len(rows[one]), len(rows[other]))
-            alike = within.likeness(looks[one], looks[other]) > ALIKE
-            alike |= small and looks[one].has_color_of(looks[other])
-            if alike and trees[one].count_neighbors(trees[other], reach):
-                group = {k: group[one] if of == group[other] else of for k, of in group.items()}
-    things = []
-    for first in dict.fromkeys(group.values()):
-        pieces = sorted((k for k in candidates if group[k] == first), key=lambda k: (-len(rows[k]), k))
-        xyz = visit.cloud.xyz_world[np.concatenate([rows[k] for k in pieces])]
-        things.append(
-            _Thing(
-                tuple(pieces), replace(looks[pieces[0]], place=xyz.mean(axis=0)), len(xyz), bool(surely[pieces].any())
-            )
-        )
-    return things
+    """Chosen instances, as they look by their points that left, or came."""
+    rows = {k: visit.rows[k][through[visit.rows[k]]] for k in np.flatnonzero(chosen).tolist()}
+    return [_Thing((k,), visit.look(k, of), len(of), bool(surely[k])) for k, of in rows.items()]
 
 
 def _matched(gone: list[_Thing], new: list[_Thing], scale: Scale) -> dict[int, int]:
