@@ -11,8 +11,7 @@ from og_pointcloud.cloud import InstanceTable, LabelledCloud
 from og_pointcloud.fitting.fit import Prepared, fit_prepared, front_surfaces
 from og_pointcloud.fitting.held_out import choose_scale
 from og_pointcloud.journal import Journal
-from og_pointcloud.mapping.growing_map import GrowingMap
-from og_pointcloud.mapping.seeing import seen_again
+from og_pointcloud.mapping.growing_map import GrowingMap, seen_again
 from og_pointcloud.rendering.geometry import Neighbourhood, isotropic, near_plane
 from og_pointcloud.rendering.surface import Surface, sight_thickness
 from og_pointcloud.scene import Points, Scene, View

@@ -23,14 +23,13 @@ from og_pointcloud.cloud import UNKNOWN_SPACE, FeatureSpace, LabelledCloud
 from og_pointcloud.errors import SceneError
 from og_pointcloud.mapping.changes import Changes, Moved, compare_visits
 from og_pointcloud.mapping.frame import COMPARED, CheckedFrame, Frame, checked, require_same_place
-from og_pointcloud.mapping.growing_map import GrowingMap
+from og_pointcloud.mapping.growing_map import GrowingMap, drawn_points, measured_points, vote
 from og_pointcloud.mapping.labelling import labelled, matched_ids, with_ids
 from og_pointcloud.mapping.map_journal import MapJournal
 from og_pointcloud.mapping.map_objects import MapObject, leave, name, objects_of
 from og_pointcloud.mapping.map_record import MapRecord
 from og_pointcloud.mapping.merging import merge
 from og_pointcloud.mapping.presence import Visit
-from og_pointcloud.mapping.seeing import drawn_points, measured_points, vote
 from og_pointcloud.mapping.sight import DiscSurface
 from og_pointcloud.mapping.tracks import Track
 from og_pointcloud.rendering.geometry import Neighbourhood, neighbourhood
