@@ -93,7 +93,7 @@ class Packets:
 
     def within(self, low: NDArray[np.floating], high: NDArray[np.floating]) -> NDArray[np.int32]:
         """Rows of the packets that meet a box."""
-        return self._rows((self.low <= high).all(axis=1) & (self.high >= low).all(axis=1))
+        return self._rows(np.asarray(((self.low <= high) & (self.high >= low)).all(axis=1)))
 
     def _rows(self, chosen: NDArray[np.bool_]) -> NDArray[np.int32]:
         return self.order[np.repeat(chosen, np.diff(self.starts))]
