@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -42,14 +44,28 @@ def test_points_take_the_look_that_more_of_their_votes_are_for(seed: int) -> Non
 def test_noise_and_few_wrong_masks_are_no_second_look(seed: int) -> None:
     """Features spread evenly, and three masks of twelve that say something else."""
     random = np.random.default_rng(seed)
-    spread: list[HandView] = [[([0, 1], (random.normal(size=8) + 2 * ONE).astype(np.float32))] for _ in range(12)]
-    wrong: list[HandView] = [[([0, 1], noisy(OTHER if view < 3 else ONE, random))] for view in range(12)]
+    even = random.normal(size=(12, 128)) + np.tile(2 * ONE, 16)  # noise in few numbers is not even
+    wrong = np.stack([noisy(OTHER if view < 3 else ONE, random) for view in range(12)])
     ids = np.zeros(2, np.int32)
-    for views in (spread, wrong):
-        table = hand_table(2, views)
+    for features in (even, wrong):
+        table = replace(hand_table(2, [[([0, 1], ONE)]] * 12), mask_features=features.astype(np.float32))
         looks = looks_of_groups(table, np.zeros(12, np.int32), ids, 1)
         np.testing.assert_array_equal(looks.group, [0])
         np.testing.assert_array_equal(by_look(view_votes(table), ids, looks), ids)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_two_sides_of_a_thing_are_one_look_unless_all_things_are_as_alike(seed: int) -> None:
+    """Six masks of the front, six of the back, of cosine 0.8; beside them, in each view, a mask of something else."""
+    random = np.random.default_rng(seed)
+    back = (0.8 * ONE + 0.6 * OTHER).astype(np.float32)
+    for beside, count in ((np.roll(ONE, 2), 1), (back, 2)):
+        views: list[HandView] = [
+            [([0, 1], noisy(ONE if view < 6 else back, random)), ([2, 3], beside)] for view in range(12)
+        ]
+        group = np.tile(np.array([0, -1], np.int32), 12)
+        looks = looks_of_groups(hand_table(4, views), group, np.array([0, 0, -1, -1], np.int32), 1)
+        assert len(looks.group) == count
 
 
 def test_masks_of_no_group_and_without_a_feature_keep_what_they_have() -> None:

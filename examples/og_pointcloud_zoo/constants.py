@@ -44,7 +44,6 @@ MODULES: dict[str, tuple[str, tuple[str, ...]]] = {
     "fitting.view_votes.OPENNESS_POWER": ("", ("_relative_exposure",)),
     "fitting.colors.MOST": ("", ()),
     "rendering.geometry.TAMED_BY": ("table", ()),
-    "fitting.looks.QUANTILE": ("", ()),
     "fitting.looks.LEAST_MASKS": ("", ()),
     "rendering.sightings.LEAST_OPEN": ("table", ("_see",)),
     "rendering.sightings.EDGE_PX": ("table", ()),
@@ -66,7 +65,7 @@ SOURCES: dict[str, tuple[str, ...]] = {
         "grouping.witness_share", "membership.sure_share", "membership.open_share", "membership.possible_share",
         "membership.growth_votes", "membership.rate_share", "membership.island_share", "membership.own_vote",
         "membership.gap_sizes", "membership.front_share", "fitting.colors.MOST", "fitting.view_votes.OPENNESS_POWER",
-        "fitting.looks.QUANTILE", "fitting.looks.LEAST_MASKS", "rendering.geometry.TAMED_BY",
+        "fitting.looks.LEAST_MASKS", "rendering.geometry.TAMED_BY",
         "rendering.sightings.LEAST_OPEN", "rendering.sightings.EDGE_PX", "rendering.sightings.RING_SHARE",
     ),
 }  # fmt: skip

@@ -198,11 +198,11 @@ def _agglomerate(
     links = np.searchsorted(w.rows[kept], everyone), w.cols[kept].astype(np.int64), w.one[kept], w.same_extent[kept]
     group, total = np.where(usable, everyone[:-1], -1), features.astype(np.float64)
     said = w.speaks.copy(), w.hears.copy(), total, np.linalg.norm(total, axis=1)
-    _join(group, links, said, _cosines_of_different(features, mask_view), settings.join_majority)
+    _join(group, links, said, cosines_of_different(features, mask_view), settings.join_majority)
     return _roots(group)
 
 
-def _cosines_of_different(features: NDArray[np.float32], mask_view: NDArray[np.int32]) -> NDArray[np.float64]:
+def cosines_of_different(features: NDArray[np.float32], mask_view: NDArray[np.int32]) -> NDArray[np.float64]:
     """Cosines of the features of two masks of one view, ascending. These are mostly different things, whatever the
     encoder: they calibrate its cosines."""
     cosines = [np.zeros(0)]
@@ -217,7 +217,7 @@ def _join(group, links, said, different, majority):  # noqa: ANN001, ANN202
     """Writes to ``group``, at first each mask's own number or -1, which lower one it was joined with.
 
     links: sparse rows of masks: (start, other masks, one, same extent). said: (speaks, hears, features, their length)
-    of each mask; here they become those of groups. different: as of `_cosines_of_different`.
+    of each mask; here they become those of groups. different: as of `cosines_of_different`.
     """
     start, others, one, same_extent = links
     speaks, hears, features, length = said

@@ -14,13 +14,12 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from og_pointcloud.fitting.association import directions, shown_of_instance
+from og_pointcloud.fitting.grouping import cosines_of_different
 from og_pointcloud.fitting.mask_table import MaskTable
 from og_pointcloud.fitting.view_votes import ViewVotes
 
 LEAST_MASKS = 4
 """Masks that a look has at least: fewer are apart by chance, or are wrong."""
-QUANTILE = 0.1
-"""Two kinds are separate though this share of the pairs of masks says otherwise: single masks are of other things."""
 
 
 @dataclass(frozen=True)
@@ -39,14 +38,17 @@ def looks_of_groups(table: MaskTable, group: NDArray[np.int32], ids: NDArray[np.
     """
     shown = shown_of_instance(table, group, ids)
     features = directions(table.mask_features)
-    usable = (group >= 0) & (shown > 0) & features.any(axis=1)
+    described = features.any(axis=1)
+    usable = (group >= 0) & (shown > 0) & described
+    cosines = cosines_of_different(features[described], table.mask_view[described])
+    unlike = float(np.median(cosines)) if len(cosines) else 0.0
     look, owner = group.copy(), list(range(count))
     for index in range(count):
         waiting = [np.flatnonzero(usable & (group == index))]
         kinds: list[NDArray[np.intp]] = []
         while waiting:
             masks = waiting.pop()
-            second = _second_look(features[masks], shown[masks])
+            second = _second_look(features[masks], shown[masks], unlike)
             if second is None:
                 kinds.append(masks)
             else:
@@ -74,13 +76,12 @@ def by_look(votes: ViewVotes, ids: NDArray[np.int32], looks: Looks) -> NDArray[n
     return found
 
 
-def _second_look(features: NDArray[np.float64], weight: NDArray[np.float64]) -> NDArray[np.bool_] | None:
+def _second_look(features: NDArray[np.float64], weight: NDArray[np.float64], unlike: float) -> NDArray[np.bool_] | None:
     """(masks,) bool, those of the second of two clearly separate kinds of masks; None, as for most, where there is one.
 
-    2-means on the sphere from the least alike pair. The kinds are separate when masks of one kind are more alike (all
-    but a tenth of their pairs) than masks of different kinds (all but a tenth): a comparison of ranks, so that it holds
-    for any encoder's cosines. Noise spreads features evenly and fails it; fewer than LEAST_MASKS wrong masks are
-    outliers, not a second look.
+    2-means on the sphere from the least alike pair. The kinds are separate when masks of different kinds are nearer to
+    what masks of different things are (cosine ``unlike``) than to what masks of one kind are. All by medians of pairs:
+    single masks are of other things. Fewer than LEAST_MASKS wrong masks are outliers, not a second look.
     """
     if len(features) < 2 * LEAST_MASKS:
         return None
@@ -95,6 +96,5 @@ def _second_look(features: NDArray[np.float64], weight: NDArray[np.float64]) -> 
     if min(second.sum(), (~second).sum()) < LEAST_MASKS:
         return None
     same = second[:, None] == second
-    within = cosines[same & ~np.eye(len(features), dtype=bool)]
-    separate = np.quantile(within, QUANTILE) > np.quantile(cosines[~same], 1 - QUANTILE)
-    return second if separate else None
+    within, across = np.median(cosines[same & ~np.eye(len(features), dtype=bool)]), np.median(cosines[~same])
+    return second if across < (within + unlike) / 2 else None
