@@ -202,7 +202,7 @@ def _agglomerate(
     return _roots(group)
 
 
-def cosines_of_different(features: NDArray[np.float32], mask_view: NDArray[np.int32]) -> NDArray[np.float64]:
+def cosines_of_different(features: NDArray[np.floating], mask_view: NDArray[np.int32]) -> NDArray[np.float64]:
     """Cosines of the features of two masks of one view, ascending. These are mostly different things, whatever the
     encoder: they calibrate its cosines."""
     cosines = [np.zeros(0)]
