@@ -114,7 +114,12 @@ def __getattr__(name: str) -> Any:
         return importlib.import_module(_MODULES[name])
     if name not in _HOME_OF:
         raise AttributeError(f"module 'og_pointcloud' has no attribute '{name}'")
-    value = getattr(importlib.import_module(_HOME_OF[name]), name)
+    try:
+        value = getattr(importlib.import_module(_HOME_OF[name]), name)
+    except ModuleNotFoundError as error:
+        from og_pointcloud.errors import missing_extra
+
+        raise missing_extra(error) or error from None
     globals()[name] = value
     return value
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError
-from og_pointcloud.scene import Camera
+from og_pointcloud.scene import Camera, brief
 
 BACKGROUND = -1
 """Instance id of a point that views saw, but outside every mask more often than missed masks explain."""
@@ -90,6 +90,8 @@ class InstanceTable:
     part_of: NDArray[np.int32] = field(default_factory=lambda: np.zeros(0, np.int32))
     reliability: NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
 
+    __repr__ = brief
+
     def __post_init__(self) -> None:
         count = len(self.points)
         for name, unknown in (("coarse", np.int32(-1)), ("part_of", np.int32(-1)), ("reliability", np.float32("nan"))):
@@ -162,6 +164,8 @@ class Vocabulary:
     names: tuple[str, ...]
     vectors: NDArray[np.float32]
 
+    __repr__ = brief
+
     def __post_init__(self) -> None:
         if self.vectors.ndim != 2 or len(self.vectors) != len(self.names):
             raise OgPointcloudError(
@@ -185,6 +189,8 @@ class WordBank:
     """
 
     vectors: NDArray[np.float32]
+
+    __repr__ = brief
 
     def __post_init__(self) -> None:
         vectors = finite_rows(self.vectors, "word bank")
@@ -250,6 +256,8 @@ class LabelledCloud:
     provenance: dict[str, Any] = field(default_factory=dict)
     word_bank: WordBank | None = None
     cameras: tuple[Camera, ...] = ()
+
+    __repr__ = brief
 
     def __post_init__(self) -> None:
         n = len(self.xyz)

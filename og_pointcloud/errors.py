@@ -91,6 +91,16 @@ class MissingExtraError(ImportError):
         super().__init__(f"this needs {module}, which is not installed: pip install 'og-pointcloud[{extra}]'")
 
 
+NEEDED_FOR_FITS = ("numba", "scipy", "cv2", "PIL", "tqdm", "onnx")
+"""Modules that stages of a fit or a map import at their top: the extra 'fit'."""
+
+
+def missing_extra(error: Exception) -> MissingExtraError | None:
+    """What to say where a stage of a fit or a map was asked for on an install that only asks; None of other errors."""
+    module = (error.name or "").partition(".")[0] if isinstance(error, ModuleNotFoundError) else ""
+    return MissingExtraError(module, "fit") if module in NEEDED_FOR_FITS else None
+
+
 @contextmanager
 def naming_extra(module: str, extra: str) -> Iterator[None]:
     """MissingExtraError, which names the extra, where what is imported inside is not installed."""

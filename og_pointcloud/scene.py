@@ -11,7 +11,7 @@ or shares of the scene extent.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -29,10 +29,33 @@ LONGEST_SIDE = 1 << 17
 """Pixels; no camera has more."""
 NOT_SEEN = -2
 """In a mask map: a pixel that the lens did not see, which says nothing; -1 says that no mask is there."""
+FEW = 12
+"""Values that a record shows as they are."""
 RIGID = 1e-2
 """A rotation's rows are of length one and upright to each other within this."""
 UNIT_TOLERANCE = 1e-3
 """A quaternion's length may differ from 1 by this much: it changes the size of a Gaussian by twice as much."""
+
+
+def brief(record: Any) -> str:
+    """The repr of a dataclass whose fields would fill pages: arrays by type and shape, of what is long its length.
+
+    >>> import numpy as np
+    >>> from og_pointcloud.scene import Points
+    >>> Points(np.zeros((7000, 3), np.float32), np.zeros(3))
+    Points(xyz=<float32 (7000, 3)>, origin=array([0., 0., 0.]))
+    """
+    values = {each.name: getattr(record, each.name) for each in fields(record)}
+    shown = (f"{name}={_brief(value)}" for name, value in values.items() if value is not None)
+    return f"{type(record).__name__}({', '.join(shown)})"
+
+
+def _brief(value: Any) -> str:
+    if isinstance(value, np.ndarray) and value.size > FEW:
+        return f"<{value.dtype} {value.shape}>"
+    if isinstance(value, dict) or (isinstance(value, tuple) and (len(value) > FEW or any(map(is_dataclass, value)))):
+        return f"<{len(value)}>"
+    return "<read when asked for>" if callable(value) else repr(value)
 
 
 @dataclass(frozen=True)
@@ -144,6 +167,8 @@ class View:
     mask_tracks: NDArray[np.integer] | None = None
     cut_from: CutMasks | None = None
 
+    __repr__ = brief
+
     def __post_init__(self) -> None:
         features = self.mask_features
         if features.ndim != 2 or features.dtype != np.float32:
@@ -221,6 +246,8 @@ class Points:
     scale: FloatArray | None = None
     rotation: FloatArray | None = None
     opacity: FloatArray | None = None
+
+    __repr__ = brief
 
     @classmethod
     def from_world(
@@ -327,6 +354,8 @@ class Scene:
     views: tuple[View, ...]
     feature_space: str
     name: str = "scene"
+
+    __repr__ = brief
 
     def __post_init__(self) -> None:
         if not self.views:

@@ -90,6 +90,32 @@ for ask in (
     ]
 
 
+@pytest.mark.parametrize("module", ["scipy", "numba"])
+@pytest.mark.parametrize(
+    "name", ["fit", "Mapper", "compare", "update", "fit_many", "read_opengaussian", "feature_picture"]
+)
+def test_what_makes_scenes_names_its_extra(module, name):
+    code = f"""import sys
+sys.modules["{module}"] = None
+import og_pointcloud as og
+try:
+    og.{name}
+except og.MissingExtraError as error:
+    print(error)
+"""
+    assert run(code).strip() == f"this needs {module}, which is not installed: pip install 'og-pointcloud[fit]'"
+
+
+@pytest.mark.parametrize("command", ["fit CAPTURE -o x.ogpc", "compare SCENE SCENE", "report CAPTURE -o report"])
+def test_commands_that_make_scenes_name_their_extra(command, bundle_file, tmp_path):
+    words = command.replace("SCENE", str(bundle_file)).replace("CAPTURE", str(tmp_path)).split()
+    code = f"import sys; sys.modules['scipy'] = None\nfrom og_pointcloud.cli import main\nsys.exit(main({words}))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, cwd=tmp_path)
+    assert done.returncode == 2
+    assert "pip install 'og-pointcloud[fit]'" in done.stderr
+    assert "report it" not in done.stderr
+
+
 def test_asking_writes_nothing_into_the_home_folder(bundle_file, tmp_path):
     home, out = tmp_path / "home", tmp_path / "out"
     home.mkdir()

@@ -427,6 +427,22 @@ def test_result_masks_counts_and_refusals(scene, tmp_path):
         result.save(tmp_path / "out.txt")
 
 
+def test_what_is_printed_fits_on_a_screen(scene):
+    points = np.concatenate([scene.xyz, [[99, 99, 99]]])
+    result = quietly(points, ["apple", "pear"], scene)
+    lines = repr(result).splitlines()
+    assert lines[0] == f"{len(points):,} points"
+    assert lines[-1].split("  ")[0] == "unknown, too far from the scene"
+    counted = [int(line.rsplit(maxsplit=1)[1].replace(",", "")) for line in lines[1:]]
+    assert sum(counted) == len(points)
+    for shown in (scene, scene.cloud, scene.cloud.instances, scene.cloud.vocabulary, og.select(scene, "apple")):
+        assert len(repr(shown)) < 2000
+    assert f"{len(scene.xyz):,} points" in repr(scene)
+    many = [f"word {k}" for k in range(40)]
+    directions = np.eye(scene.vocabulary.vectors.shape[1])[np.arange(40) % scene.vocabulary.vectors.shape[1]]
+    assert len(repr(quietly(points, dict(zip(many, directions, strict=True)), scene)).splitlines()) < 22
+
+
 def test_result_is_saved_as_npz_and_ply(scene, tmp_path):
     result = og.segment(scene, ["café", "pear"])
     saved = np.load(result.save(tmp_path / "out.npz"), allow_pickle=False)

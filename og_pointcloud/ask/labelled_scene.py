@@ -59,6 +59,14 @@ class LabelledScene:
         self.instance_ids = cloud.instance_ids
         self.vocabulary, self.feature_space = cloud.vocabulary, cloud.feature_space
 
+    def __repr__(self) -> str:
+        words = f"{len(self.vocabulary.names):,} words" if self.vocabulary else "no words of its own"
+        place = "in memory" if self.path is None else f"'{self.path}'"
+        return (
+            f"LabelledScene({place}: {len(self.instance_ids):,} points, "
+            f"{len(self.cloud.instances):,} instances, {words}, feature space '{self.feature_space}')"
+        )
+
     @classmethod
     def from_cloud(cls, cloud: LabelledCloud) -> LabelledScene:
         """A scene of a cloud that was never written. It answers as its file would, the first time without delay, many

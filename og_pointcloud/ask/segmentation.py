@@ -20,6 +20,8 @@ from og_pointcloud.formats.atomic import replacing
 from og_pointcloud.formats.colors import label_colors
 from og_pointcloud.scene import Points
 
+SHOWN = 12
+"""Labels that a printed result names."""
 SAVED_AS = (".npz", ".ply", ".las", ".laz", ".glb", ".spz")
 """Endings of the files that a result is written to."""
 
@@ -59,6 +61,17 @@ class Segmentation:
 
     def __len__(self) -> int:
         return len(self.labels)
+
+    def __repr__(self) -> str:
+        """How many points have each label, the most frequent first, and why the others have none."""
+        found = sorted(((count, name) for name, count in self.counts().items() if count), key=lambda of: -of[0])
+        rows = [(name, f"{count:,}") for count, name in found[:SHOWN]]
+        if found[SHOWN:]:
+            rows.append((f"{len(found) - SHOWN} more labels", f"{sum(count for count, _ in found[SHOWN:]):,}"))
+        rows += [(f"unknown, {reason}", f"{count:,}") for reason, count in self.unknown_because().items()]
+        name_width, width = (max(map(len, column), default=0) for column in zip(*rows, strict=True)) if rows else (0, 0)
+        lines = (f"{name:<{name_width}}  {count:>{width}}" for name, count in rows)
+        return "\n".join([f"{len(self):,} points", *lines])
 
     @cached_property
     def certainty(self) -> NDArray[np.float32] | None:

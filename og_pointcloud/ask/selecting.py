@@ -104,7 +104,7 @@ class Selection(Sequence[Match]):
         record = {name: getattr(self, name) for name in names} | {"matches": [match.to_dict() for match in self]}
         return json.dumps(record, indent=2, ensure_ascii=False)
 
-    def __str__(self) -> str:
+    def __repr__(self) -> str:
         lines = [f"'{self.query}' fits {len(self.fitting)} of {len(self)} instances"]
         for match in self[:SHOWN]:
             mark = "*" if match.fits else " "

@@ -22,7 +22,7 @@ from typing import Any
 
 import og_pointcloud as og
 from og_pointcloud.cli.common import Parser, add_command, check_outputs
-from og_pointcloud.errors import MissingExtraError, OgPointcloudError, did_you_mean, printable
+from og_pointcloud.errors import MissingExtraError, OgPointcloudError, did_you_mean, missing_extra, printable
 
 __all__ = ["main"]
 
@@ -83,6 +83,7 @@ class Plain:
 
 def describe_error(error: Exception) -> str:
     """One line: what our own errors say, a path and what the system says of it, else the kind of error too."""
+    error = missing_extra(error) or error
     if isinstance(error, MemoryError):
         return "out of memory"
     if isinstance(error, OSError) and error.strerror:

@@ -30,17 +30,15 @@ from numpy.typing import NDArray
 from og_pointcloud.ask.labelled_scene import LabelledScene
 from og_pointcloud.ask.selecting import select
 from og_pointcloud.cloud import LabelledCloud
-from og_pointcloud.errors import SceneError, naming_extra
+from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.colmap import find_model, read_images
 from og_pointcloud.formats.images import MAX_PIXELS, require_cv2, same_shape
 from og_pointcloud.formats.points import read_points
 from og_pointcloud.formats.poses import in_local_frame
+from og_pointcloud.rendering.geometry import near_plane
+from og_pointcloud.rendering.splatting import Gaussians, render
 from og_pointcloud.scene import Camera
 from og_pointcloud.text.words import TextFeatures
-
-with naming_extra("scipy and numba", "fit"):
-    from og_pointcloud.rendering.geometry import near_plane
-    from og_pointcloud.rendering.splatting import Gaussians, render
 
 ALPHA_SHOWN, IOU_FOUND = 0.7, 0.25
 PUBLISHED_PAIRS = 208

@@ -28,10 +28,13 @@ from numpy.typing import NDArray
 
 from og_pointcloud.ask.labelled_scene import LabelledScene
 from og_pointcloud.cloud import FeatureSpace, Vocabulary
-from og_pointcloud.errors import OgPointcloudError, SceneError, naming_extra
+from og_pointcloud.errors import OgPointcloudError, SceneError
+from og_pointcloud.evaluate.baselines import baseline_labels
 from og_pointcloud.evaluate.captures import Answer, difference
 from og_pointcloud.evaluate.knobs import DEFAULT, Setting
 from og_pointcloud.evaluate.truth import GT_NAME, Truth, read_truth
+from og_pointcloud.fitting.fit import fit, prepare
+from og_pointcloud.fitting.tiles import needs_tiles
 from og_pointcloud.formats.atomic import replacing
 from og_pointcloud.formats.capture import read_capture
 from og_pointcloud.formats.tables import as_cell
@@ -39,11 +42,6 @@ from og_pointcloud.journal import Journal
 from og_pointcloud.scene import Scene
 from og_pointcloud.settings import FitSettings
 from og_pointcloud.text.text_features import read_text_features
-
-with naming_extra("scipy and numba", "fit"):
-    from og_pointcloud.evaluate.baselines import baseline_labels
-    from og_pointcloud.fitting.fit import fit, prepare
-    from og_pointcloud.fitting.tiles import needs_tiles
 
 BASELINE = "baseline"
 """The knob of rows of other methods."""

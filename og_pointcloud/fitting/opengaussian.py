@@ -23,18 +23,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.cloud import UNKNOWN_SPACE, InstanceTable, LabelledCloud
-from og_pointcloud.errors import SceneError, naming_extra
+from og_pointcloud.errors import SceneError
+from og_pointcloud.fitting.association import directions
 from og_pointcloud.formats.gaussian_ply import latest_iteration
 from og_pointcloud.formats.langsplat import LANGSPLAT_SPACE, LANGSPLAT_WIDTH
 from og_pointcloud.formats.npy import read_npz
 from og_pointcloud.formats.points import read_points
 from og_pointcloud.formats.tables import naming
 from og_pointcloud.journal import LeftOut, left_out_entry
+from og_pointcloud.rendering.geometry import neighbourhood
 from og_pointcloud.settings import GeometrySettings
-
-with naming_extra("scipy and numba", "fit"):
-    from og_pointcloud.fitting.association import directions
-    from og_pointcloud.rendering.geometry import neighbourhood
 
 MIN_OPACITY = 0.1
 """Gaussians less opaque cannot be seen; the authors' ScanNet evaluation leaves out the same ones."""

@@ -15,12 +15,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud.errors import SceneError, naming_extra
+from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.images import require_cv2, write_png
+from og_pointcloud.rendering.splatting import Gaussians, render
 from og_pointcloud.scene import View
-
-with naming_extra("scipy and numba", "fit"):
-    from og_pointcloud.rendering.splatting import Gaussians, render
 
 GREY = (128, 128, 128)
 """A point without a feature, because no view sees it."""
