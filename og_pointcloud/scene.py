@@ -37,7 +37,7 @@ UNIT_TOLERANCE = 1e-3
 """A quaternion's length may differ from 1 by this much: it changes the size of a Gaussian by twice as much."""
 
 
-def brief(record: Any) -> str:
+def brief(self: Any) -> str:
     """The repr of a dataclass whose fields would fill pages: arrays by type and shape, of what is long its length.
 
     >>> import numpy as np
@@ -45,9 +45,9 @@ def brief(record: Any) -> str:
     >>> Points(np.zeros((7000, 3), np.float32), np.zeros(3))
     Points(xyz=<float32 (7000, 3)>, origin=array([0., 0., 0.]))
     """
-    values = {each.name: getattr(record, each.name) for each in fields(record)}
+    values = {each.name: getattr(self, each.name) for each in fields(self)}
     shown = (f"{name}={_brief(value)}" for name, value in values.items() if value is not None)
-    return f"{type(record).__name__}({', '.join(shown)})"
+    return f"{type(self).__name__}({', '.join(shown)})"
 
 
 def _brief(value: Any) -> str:

@@ -45,13 +45,13 @@ def run(arguments: argparse.Namespace) -> None:
         words=tuple(arguments.words),
         tracks=arguments.tracks,
     )
+    warn_of_poses(arguments.capture)
     if arguments.encoder == "demo":
         warnings.warn(
             "the demo encoder knows the demo room's furniture alone: words mean little on other photographs; take "
             "a model's folder, --encoder FOLDER ('hf cache ls' lists them), or none",
             stacklevel=1,
         )
-    warn_of_poses(arguments.capture)
     made = make_masks(arguments.capture, settings, arguments.output, overwrite=arguments.overwrite)
     if made.left_out:
         print(f"left out: {len(made.left_out)} of {made.images + len(made.left_out)} images: {some_of(made.left_out)}")

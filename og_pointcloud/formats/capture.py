@@ -98,8 +98,6 @@ def read_capture(
     og_pointcloud.errors.SceneError: no_such_folder is not a folder; expected a capture folder with poses, ...
     """
     capture = Path(folder)
-    if not capture.is_dir():
-        raise SceneError(f"{capture} is not a folder; expected a capture folder with poses, masks and points")
     applied = read_repairs(capture) if repairs is None else tuple(map(Repair.parse, repairs))
     poses = read_poses(capture, applied)
     shown = _with_masks(capture, poses) if poses.is_recording else poses
@@ -141,6 +139,8 @@ def read_poses(capture: Path, repairs: Sequence[Repair] | None = None) -> Captur
 
     repairs: None for those of the folder's ``repairs.json``.
     """
+    if not capture.is_dir():
+        raise SceneError(f"{capture} is not a folder; expected a capture folder with poses, images, masks and points")
     repairs = read_repairs(capture) if repairs is None else repairs
     poses = _stated_poses(capture)
     names, images = [], []

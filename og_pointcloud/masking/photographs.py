@@ -52,8 +52,6 @@ class Photograph:
 
 def read_photographs(capture: Path) -> tuple[Photograph, ...]:
     """All posed images of a capture, checked by their headers. SceneError where one is missing or cannot be used."""
-    if not capture.is_dir():
-        raise SceneError(f"{capture} is not a folder; expected a capture folder with images and poses")
     poses = read_poses(capture)
     files = find_images(capture, poses.images)
     missing = [image.path for image, file in zip(poses.images, files, strict=True) if file is None]
