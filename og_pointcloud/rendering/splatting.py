@@ -322,6 +322,11 @@ def _covariance(scale, rotation, pose, px, py, jx, jy):  # noqa: ANN001, ANN202
 
     The projected axes are the columns of J R_camera R_gaussian S, a 2x3 matrix V; the covariance is V V' + c I.
     """
+    if scale[0] == scale[1] == scale[2]:  # round, as those of a plain cloud are: no rotation changes it
+        lx, ly = px * np.float64(scale[0]), py * np.float64(scale[0])
+        sxx, sxy, syy = lx * lx * (1 + jx * jx), lx * ly * jx * jy, ly * ly * (1 + jy * jy)
+        det = lx * lx * ly * ly * (1 + jx * jx + jy * jy) + LOW_PASS * (sxx + syy) + LOW_PASS * LOW_PASS
+        return sxx + LOW_PASS, sxy, syy + LOW_PASS, det
     qw, qx = np.float64(rotation[0]), np.float64(rotation[1])
     qy, qz = np.float64(rotation[2]), np.float64(rotation[3])
     axis = (1 - 2 * (qy * qy + qz * qz), 2 * (qx * qy + qw * qz), 2 * (qx * qz - qw * qy))
