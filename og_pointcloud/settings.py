@@ -72,6 +72,8 @@ class MembershipSettings:
     """A gap in depth wider than this many times the mask's own size parts object and background."""
     front_share: float = 0.2
     """The nearest run of depths with this share of a mask's weight is its object."""
+    hole_sizes: float = 0.25
+    """What lies behind points that surround it, by more than this times the mask's own size, shows through a hole."""
 
 
 @dataclass(frozen=True)

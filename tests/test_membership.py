@@ -353,7 +353,7 @@ def at_depths(depth: Sequence[float]) -> Gaussians:
     return Gaussians(xyz, np.ones_like(xyz), np.ones((len(xyz), 4), np.float32), np.ones(len(xyz), np.float32))
 
 
-LOOKING_ALONG_Z = np.array([[0.0, 0, 1, 0]])
+LOOKING_ALONG_Z = np.eye(4)[None]
 
 
 def front_of(depth: Sequence[float], views: int = 1) -> tuple[MaskTable, MaskTable, float]:
@@ -361,8 +361,8 @@ def front_of(depth: Sequence[float], views: int = 1) -> tuple[MaskTable, MaskTab
     the table before, after, and the share taken."""
     n = len(depth)
     table = hand_table(n, [[(range(n), ONE)]] * views)
-    rows, focal = LOOKING_ALONG_Z.repeat(views, axis=0), np.full(views, 10.0)
-    return table, *without_see_through(table, at_depths(depth), rows, focal, SETTINGS)
+    poses, focal = LOOKING_ALONG_Z.repeat(views, axis=0), np.full(views, 10.0)
+    return table, *without_see_through(table, at_depths(depth), poses, focal, SETTINGS)
 
 
 @pytest.mark.parametrize("views", [1, 20])

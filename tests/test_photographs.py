@@ -69,9 +69,10 @@ def test_the_table_of_cut_views_is_that_of_the_photographs(scene: Scene, cut: Sc
     for name in ("weights", "outside", "exposure"):
         found, expected = getattr(joined, name).toarray(), getattr(whole, name).toarray()
         assert joined.exposure.data.max() <= 1
-        # A pixel beside the cut is asked about the masks of its own half alone, and that is all.
+        # A pixel beside the cut is asked about the masks of its own half alone, and holes are looked for in each half's
+        # own windows.
         differs = np.abs(found - expected) > 1e-3 * np.maximum(1, expected)
-        assert differs.sum() <= 0.02 * (expected > 0).sum(), name
+        assert differs.sum() <= 0.04 * (expected > 0).sum(), name
 
 
 @pytest.mark.parametrize("settings", [SETTINGS, TILED], ids=["whole", "tiles"])
@@ -86,7 +87,7 @@ def test_cutting_changes_no_label(scene: Scene, cut: Scene, settings: FitSetting
 def test_baselines_find_the_masks_of_cut_views(scene: Scene, cut: Scene):
     words = np.unique(np.concatenate([view.mask_features for view in scene.views]).round(3), axis=0)
     whole, of_cut = (centre_sampling(prepare(views, SETTINGS), words) for views in (scene, cut))
-    assert (whole == of_cut).mean() > 0.995
+    assert (whole == of_cut).mean() > 0.98
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -50,7 +50,7 @@ MODULES: dict[str, tuple[str, tuple[str, ...]]] = {
     "rendering.sightings.RING_SHARE": ("table", ()),
 }
 """Numbers that stand in modules: whether they change the mask table, and the compiled functions that know them."""
-TABLE = ("geometry", "membership.gap_sizes", "membership.front_share")
+TABLE = ("geometry", "membership.gap_sizes", "membership.front_share", "membership.hole_sizes")
 """What the mask table depends on."""
 SOURCES: dict[str, tuple[str, ...]] = {
     "the scene chooses": ("geometry.scales",),
@@ -64,9 +64,10 @@ SOURCES: dict[str, tuple[str, ...]] = {
         "geometry.opacity", "geometry.sight_thickness", "geometry.neighbours", "geometry.reach",
         "grouping.witness_share", "membership.sure_share", "membership.open_share", "membership.possible_share",
         "membership.growth_votes", "membership.rate_share", "membership.island_share", "membership.own_vote",
-        "membership.gap_sizes", "membership.front_share", "fitting.colors.MOST", "fitting.view_votes.OPENNESS_POWER",
-        "fitting.looks.LEAST_MASKS", "rendering.geometry.TAMED_BY",
-        "rendering.sightings.LEAST_OPEN", "rendering.sightings.EDGE_PX", "rendering.sightings.RING_SHARE",
+        "membership.gap_sizes", "membership.front_share", "membership.hole_sizes", "fitting.colors.MOST",
+        "fitting.view_votes.OPENNESS_POWER", "fitting.looks.LEAST_MASKS",
+        "rendering.geometry.TAMED_BY", "rendering.sightings.LEAST_OPEN", "rendering.sightings.EDGE_PX",
+        "rendering.sightings.RING_SHARE",
     ),
 }  # fmt: skip
 """Where numbers are from. Enough: more gives the same and takes longer. Guessed: found by trying a few captures."""

@@ -33,7 +33,8 @@ from scipy.sparse.csgraph import connected_components
 from og_pointcloud.cloud import BACKGROUND, UNOBSERVED
 from og_pointcloud.fitting.colors import color_ratios, neighbour_weights
 from og_pointcloud.fitting.grouping import MaskGroups
-from og_pointcloud.fitting.mask_table import MaskTable
+from og_pointcloud.fitting.holes import seen_through_holes
+from og_pointcloud.fitting.mask_table import SEEN_THROUGH, MaskTable
 from og_pointcloud.fitting.view_votes import ViewVotes
 from og_pointcloud.kernels import njit, prange
 from og_pointcloud.rendering.geometry import Neighbourhood
@@ -111,12 +112,12 @@ def assign_points(
 def without_see_through(
     table: MaskTable,
     gaussians: Gaussians,
-    depth_rows: NDArray[np.float64],
+    world_to_camera: NDArray[np.float64],
     focal: NDArray[np.float64],
     settings: MembershipSettings,
 ) -> tuple[MaskTable, float]:
     """Take from each mask what does not lie at its object's depth, mostly behind it; to that the view is blind, it
-    neither is in the mask nor not.
+    neither is in the mask nor not. What shows through holes of the object keeps SEEN_THROUGH of its weight (holes.py).
 
     A mask shows a front surface. Sorted by depth, its points fall into runs parted by gaps wider than a part of what
     the object looks; the nearest run with a fair part of the mask's weight is the object, what lies behind it was seen
@@ -125,32 +126,47 @@ def without_see_through(
     goes straight ahead, or stands still, look past the same edges. A smaller run before the object is the edge of a
     thing that stands there.
 
-    depth_rows: (views, 4) float64, third row of each world-to-camera matrix. focal: (views,) pixels.
+    world_to_camera: (views, 4, 4) float64. focal: (views,) pixels.
     Returns the table without those weights, and with as much less exposure; and their share of all weight. It takes
     the place of the given one, whose weights and exposure are written over.
     """
     weights = table.weights
-    behind = np.zeros(weights.nnz, np.bool_)
+    kept, lost = np.ones(weights.nnz, np.float32), 0.0
     for mask, view in enumerate(table.mask_view.tolist()):
         entries = slice(weights.indptr[mask], weights.indptr[mask + 1])
-        depth = gaussians.xyz[weights.indices[entries]] @ depth_rows[view, :3] + depth_rows[view, 3]
-        gap_share = settings.gap_sizes * np.sqrt(table.mask_pixels[mask]) / focal[view]
-        behind[entries] = _behind_front(depth, weights.data[entries], gap_share, settings.front_share)
-    if not behind.any():
+        pose, area = world_to_camera[view], table.mask_pixels[mask] / focal[view] ** 2
+        xyz = gaussians.xyz[weights.indices[entries]] @ pose[:3, :3].T + pose[:3, 3]
+        kept[entries] = _at_front(xyz, weights.data[entries], area, settings)
+        lost += float(((1 - kept[entries]) * weights.data[entries]).sum(dtype=np.float64))
+    if lost == 0:
         return table, 0.0
-    share = float(weights.data[behind].sum(dtype=np.float64)) / float(weights.data.sum(dtype=np.float64))
+    share = lost / float(weights.data.sum(dtype=np.float64))
     left = _exposure_left(
         np.searchsorted(table.mask_view, np.arange(table.exposure.shape[0] + 1)),
         *((matrix.indptr, matrix.indices, matrix.data) for matrix in (weights, table.outside, table.exposure)),
-        behind,
+        kept,
         weights.shape[1],
     )
-    exposure = _scaled(table.exposure, left)
-    return replace(table, weights=_scaled(weights, (~behind).astype(np.float32)), exposure=exposure), share
+    return replace(table, weights=_scaled(weights, kept), exposure=_scaled(table.exposure, left)), share
+
+
+def _at_front(
+    xyz: NDArray[np.float64], weight: NDArray[np.float32], area: float, settings: MembershipSettings
+) -> NDArray[np.float32]:
+    """(n,) float32, how much of each point's weight in a mask counts. xyz: (n, 3) in the camera's frame. area: of the
+    mask, in an image at depth 1."""
+    kept, depth, size = np.ones(len(xyz), np.float32), xyz[:, 2], np.sqrt(area)
+    kept[_behind_front(depth, weight, settings.gap_sizes * size, settings.front_share)] = 0
+    front = np.flatnonzero(kept)
+    if len(front):
+        xy, depth, weight = xyz[front, :2] / depth[front, None], depth[front], weight[front]
+        gap = settings.hole_sizes * size * float(np.median(depth))
+        kept[front[seen_through_holes(xy, depth, weight, area, gap, settings.front_share)]] = SEEN_THROUGH
+    return kept
 
 
 @njit(cache=True)
-def _exposure_left(first_mask, weights, outside, exposure, behind, n):  # noqa: ANN001, ANN202
+def _exposure_left(first_mask, weights, outside, exposure, kept, n):  # noqa: ANN001, ANN202
     """(entries of exposure,) float32: the part of what a view shows of a point that is not behind its masks' objects;
     0 exactly where all of it is."""
     weight_start, weight_index, weight = weights
@@ -161,8 +177,7 @@ def _exposure_left(first_mask, weights, outside, exposure, behind, n):  # noqa: 
     for view in range(len(first_mask) - 1):
         for e in range(weight_start[first_mask[view]], weight_start[first_mask[view + 1]]):
             shown[weight_index[e]] += weight[e]
-            if behind[e]:
-                hidden[weight_index[e]] += weight[e]
+            hidden[weight_index[e]] += weight[e] * (1 - kept[e])
         for e in range(outside_start[view], outside_start[view + 1]):
             shown[outside_index[e]] += outside_weight[e]
         # All that a view shows it exposes: the sums are zero again for the next view.

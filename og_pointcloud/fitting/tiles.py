@@ -293,7 +293,7 @@ def _entries(
     table = mask_table(splats, [view], drawing.near, thickness, by_sight=by_sight)
     camera = view.camera
     front, _ = without_see_through(
-        table, splats, camera.world_to_camera[2:3], np.sqrt([camera.fx * camera.fy]), settings.membership
+        table, splats, camera.world_to_camera[None], np.sqrt([camera.fx * camera.fy]), settings.membership
     )
     masks = view.mask_count
     blocks = [(front.weights, 0), (front.outside, masks), (front.exposure, masks + 1)]

@@ -1,0 +1,103 @@
+"""What a mask shows through holes between the points of its own object.
+
+A table top of few points lets the floor through, all over, and seen at a slant it reaches as deep as the floor begins:
+no gap in depth parts the two over the mask as a whole. Around each point it does.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from og_pointcloud.kernels import njit
+
+WINDOW = 24
+"""Points looked at around one, about: as many as adjoin."""
+STRAIGHT_EDGE = 2 / np.pi
+"""Length of the mean direction to points that are spread evenly over one side of a straight line."""
+
+
+@njit(cache=True, nogil=True)
+def seen_through_holes(xy, depth, weight, area, gap, front_share):  # noqa: ANN001, ANN201
+    """(n,) bool, the points of one mask that lie behind others of it which surround them in the image.
+
+    xy: (n, 2) float64, places in the image at depth 1; area: of the mask, there. depth, weight: (n,). gap: a step in
+    depth wider than this parts the points about a place, if it is no less than that place is wide: so deep is a slanted
+    surface. The nearest part with front_share of their weight is the surface there. What lies behind its rim is not
+    surrounded: rims of masks, and what a depth sensor puts there, are uncertain, and other rules judge of them.
+    """
+    n = len(depth)
+    hidden = np.zeros(n, np.bool_)
+    if n == 0 or depth.max() - depth.min() <= gap:
+        return hidden
+    # Three by three cells are the window that the points of the middle one are looked at in.
+    low, span = np.array([xy[:, 0].min(), xy[:, 1].min()]), np.array([np.ptp(xy[:, 0]), np.ptp(xy[:, 1])])
+    cell = np.sqrt(max(area * WINDOW / 9, span[0] * span[1] / 4) / n)
+    cell = max(cell, span.sum() / (4 * n), 1e-12)
+    columns, rows = int(span[0] / cell) + 1, int(span[1] / cell) + 1
+    start, members = _by_cell(xy - low, cell, columns, rows)
+    window = np.empty(n, np.int64)
+    for middle in range(columns * rows):
+        inside = members[start[middle] : start[middle + 1]]
+        if not len(inside):
+            continue
+        about = _about(middle, start, members, columns, rows, window)
+        nearest = depth[about].min()
+        step = max(gap, 3 * cell * nearest)
+        if depth[about].max() - nearest <= step:
+            continue
+        about = about[np.argsort(depth[about])]
+        begin, end = _front(depth[about], weight[about], step, front_share)
+        for point in inside:
+            if end < len(about) and depth[point] >= depth[about[end]]:
+                hidden[point] = _surrounded(xy, point, about[begin:end])
+    return hidden
+
+
+@njit(cache=True, nogil=True)
+def _by_cell(xy, cell, columns, rows):  # noqa: ANN001, ANN202
+    """(start, members): the points by the cell of a grid that they lie in, row by row."""
+    place = np.empty(len(xy), np.int64)
+    start = np.zeros(columns * rows + 1, np.int64)
+    for i in range(len(xy)):
+        place[i] = int(xy[i, 1] / cell) * columns + int(xy[i, 0] / cell)
+        start[place[i] + 1] += 1
+    return np.cumsum(start), np.argsort(place, kind="mergesort")
+
+
+@njit(cache=True, nogil=True)
+def _about(middle, start, members, columns, rows, window):  # noqa: ANN001, ANN202
+    """The points of a cell and of those around it, written to ``window``."""
+    row, column = divmod(middle, columns)
+    count = 0
+    for other in range(max(row - 1, 0), min(row + 2, rows)):
+        first = start[other * columns + max(column - 1, 0)]
+        last = start[other * columns + min(column + 1, columns - 1) + 1]
+        window[count : count + last - first] = members[first:last]
+        count += last - first
+    return window[:count]
+
+
+@njit(cache=True, nogil=True)
+def _front(depth, weight, gap, front_share):  # noqa: ANN001, ANN202
+    """(begin, end) of the nearest run of ascending depths, parted by gaps, with this share of all weight; (0, n) where
+    there is none."""
+    begin, mass, least = 0, weight[0], front_share * weight.sum()
+    for k in range(1, len(depth)):
+        if depth[k] - depth[k - 1] > gap:
+            if mass >= least:
+                return begin, k
+            begin, mass = k, 0.0
+        mass += weight[k]
+    return 0, len(depth)
+
+
+@njit(cache=True, nogil=True)
+def _surrounded(xy, point, others):  # noqa: ANN001, ANN202
+    """Whether the others lie about a point in the image, not all to one side of it: by the mean direction to them."""
+    x, y, count = 0.0, 0.0, 0
+    for other in others:
+        across, down = xy[other, 0] - xy[point, 0], xy[other, 1] - xy[point, 1]
+        length = np.sqrt(across**2 + down**2)
+        if length > 0:
+            x, y, count = x + across / length, y + down / length, count + 1
+    return np.sqrt(x**2 + y**2) < STRAIGHT_EDGE * count
