@@ -7,8 +7,8 @@ through (was it)? By instance, over the points that show and that can tell:
     gone     most of them are seen through later, from two places
     new      most of them lie where the earlier visit had looked through, from two places
     moved    a new instance that looks like a gone one
-    unseen   so few of them are looked at later that nothing is known; or the later visit's cloud is so sparse that it
-             leaves out as much of what stands about them
+    unseen   so few of them are looked at later that nothing is known; or the later visit's cloud leaves out so much
+             of what stands about them that it may have left them out by chance
 
 Points close to the surface of something else cannot tell: when a book is gone, its lower edge still agrees with the
 table. What lies where the earlier visit never looked is neither new nor old: it is added to a map, and not reported.
@@ -167,7 +167,7 @@ def _require_one_frame(asked: Presence) -> None:
 @dataclass(frozen=True)
 class _Thing:
     """Instances of one visit that are pieces of one thing that left or came, the largest first. look: by the points
-    that show so, of which there are so many; its place is of all pieces."""
+    that show so, of which there are so many; its place is of all pieces. surely: that they show so is no accident."""
 
     pieces: tuple[int, ...]
     look: Look
