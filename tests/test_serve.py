@@ -307,3 +307,38 @@ def test_a_browser_shows_what_is_gone_and_new(visits_of_a_place, tmp_path, kind)
     finally:
         if served is not None:
             served.stop()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["points", "splats"])
+def test_three_js_draws_a_labelled_gltf(viser, tmp_path, kind):
+    """In the page of viser, whose loader of glTF is that of three.js: it knows no splats, and draws their points."""
+    from test_carriers import segmentation
+    from test_formats_spz import splats
+
+    browser = shutil.which("chromium") or shutil.which("google-chrome")
+    if browser is None:
+        pytest.skip("no Chromium here")
+    playwright = pytest.importorskip("playwright.sync_api")
+    points = replace(splats(20_000, center=(3, -4, 5)), opacity=np.ones(20_000, np.float32))
+    result = segmentation(np.arange(20_000) % 3, ["a", "b", "c"], points.xyz_world)
+    path = result.save(tmp_path / "out.glb", points if kind == "splats" else None)
+    server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
+    try:
+        server.scene.add_glb("/labelled", path.read_bytes())
+        server.initial_camera.position, server.initial_camera.look_at = (3, -4, 11), (3, -4, 5)
+        with playwright.sync_playwright() as play:
+            window = play.chromium.launch(executable_path=browser, args=BROWSER).new_page(
+                viewport={"width": 900, "height": 600}
+            )
+            window.goto(f"http://127.0.0.1:{server.get_port()}")
+
+            def pixels(color):
+                """Of a label's color, as far as a point covers them on the white page, beside its panels."""
+                cover = 255 - picture_of(window.screenshot())[200:, :500]
+                most, hue = cover.max(axis=2, keepdims=True), (255 - color.astype(int)) / (255 - color).max()
+                return ((np.abs(cover / np.maximum(most, 1) - hue).max(axis=2) < 0.2) & (most[..., 0] > 60)).sum()
+
+            until(lambda: all(pixels(color) > 100 for color in np.unique(result.colors, axis=0)), 90)
+    finally:
+        server.stop()
