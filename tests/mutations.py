@@ -116,7 +116,7 @@ MUTATIONS = (
     # Grouping, association.
     Mutation(
         "groups join without a majority", "fitting/grouping.py",
-        "if -order[0] > settings.join_majority:", "if -order[0] > 0:", ("test_grouping.py",),
+        ", settings.join_majority)", ", 0.0)", ("test_grouping.py",),
     ),
     Mutation(
         "masks that span objects take part", "fitting/grouping.py",
