@@ -168,8 +168,13 @@ MUTATIONS = (
         CHOOSING,
     ),
     Mutation(
-        "a look counts for each of its descriptors", "ask/choosing.py",
-        "weight = 1 / np.maximum(alike, 1)", "weight = np.ones(len(alike))", ("test_choosing.py",),
+        "what lies behind a rim shows through a hole", "fitting/holes.py",
+        "return np.sqrt(x**2 + y**2) < STRAIGHT_EDGE * count", "return count > 0", ("test_holes.py",),
+    ),
+    Mutation(
+        "a kind counts for each of its descriptors", "ask/choosing.py",
+        "weight = fits / np.maximum(np.bincount(kind, fits), 1)[kind]", "weight = fits.astype(float)",
+        ("test_choosing.py",),
     ),
     # Lookup, scores, files.
     Mutation(
@@ -302,7 +307,8 @@ MUTATIONS = (
     ),
     Mutation(
         "archives of any ratio", "formats/npy.py",
-        "if total > most_packed:", "if total < 0:", trust("a_small_file_does_not_unpack_to_a_large_one"),
+        "if total > max(PLENTY, MOST_RATIO * file.stat().st_size):", "if total < 0:",
+        trust("a_small_file_does_not_unpack_to_a_large_one"),
     ),
     Mutation(
         "masks through links", "masking/make_masks.py",

@@ -47,7 +47,7 @@ def print_info(scene: og.LabelledScene, path: Path) -> None:
     print(f"{len(cloud):,} points, {len(cloud.instances)} instances, feature space '{cloud.feature_space}'")
     origin = ", ".join(f"{value:g}" for value in cloud.origin)
     print(f"spacing {cloud.spacing:.4g}, reach {cloud.reach:.4g}, origin ({origin}), in the capture's unit")
-    print(f"{len(words)} words: {common.some_of(words)}")
+    print(f"{len(words)} words: {common.some_of(words)}" if words else "no words of its own")
     if cloud.word_bank is None:
         print(f"no word bank: scores are cosines. {common.calibration_hint(path)}\n")
     else:
