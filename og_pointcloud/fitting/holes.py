@@ -35,19 +35,18 @@ def seen_through_holes(xy, depth, weight, area, gap, front_share):  # noqa: ANN0
     cell = max(cell, span.sum() / (4 * n), 1e-12)
     columns, rows = int(span[0] / cell) + 1, int(span[1] / cell) + 1
     start, members = _by_cell(xy - low, cell, columns, rows)
+    nearest, farthest = _depths_by_cell(depth, start, members)
     window = np.empty(n, np.int64)
     for middle in range(columns * rows):
-        inside = members[start[middle] : start[middle + 1]]
-        if not len(inside):
+        near = _least_about(nearest, middle, columns, rows)
+        step = max(gap, 3 * cell * near)
+        # What is hidden lies a step behind the nearest point or more: in most cells nothing does.
+        if not farthest[middle] - near > step:
             continue
         about = _about(middle, start, members, columns, rows, window)
-        nearest = depth[about].min()
-        step = max(gap, 3 * cell * nearest)
-        if depth[about].max() - nearest <= step:
-            continue
         about = about[np.argsort(depth[about])]
         begin, end = _front(depth[about], weight[about], step, front_share)
-        for point in inside:
+        for point in members[start[middle] : start[middle + 1]]:
             if end < len(about) and depth[point] >= depth[about[end]]:
                 hidden[point] = _surrounded(xy, point, about[begin:end])
     return hidden
@@ -62,6 +61,28 @@ def _by_cell(xy, cell, columns, rows):  # noqa: ANN001, ANN202
         place[i] = int(xy[i, 1] / cell) * columns + int(xy[i, 0] / cell)
         start[place[i] + 1] += 1
     return np.cumsum(start), np.argsort(place, kind="mergesort")
+
+
+@njit(cache=True, nogil=True)
+def _depths_by_cell(depth, start, members):  # noqa: ANN001, ANN202
+    """(nearest, farthest): the least and the greatest depth in each cell; inf and -inf where it is empty."""
+    nearest, farthest = np.full(len(start) - 1, np.inf), np.full(len(start) - 1, -np.inf)
+    for cell in range(len(start) - 1):
+        for point in members[start[cell] : start[cell + 1]]:
+            nearest[cell] = min(nearest[cell], depth[point])
+            farthest[cell] = max(farthest[cell], depth[point])
+    return nearest, farthest
+
+
+@njit(cache=True, nogil=True)
+def _least_about(values, middle, columns, rows):  # noqa: ANN001, ANN202
+    """The least of a cell's value and those of the cells around it."""
+    row, column = divmod(middle, columns)
+    least = np.inf
+    for other in range(max(row - 1, 0), min(row + 2, rows)):
+        for beside in range(max(column - 1, 0), min(column + 2, columns)):
+            least = min(least, values[other * columns + beside])
+    return least
 
 
 @njit(cache=True, nogil=True)
