@@ -60,7 +60,12 @@ def _by_cell(xy, cell, columns, rows):  # noqa: ANN001, ANN202
     for i in range(len(xy)):
         place[i] = int(xy[i, 1] / cell) * columns + int(xy[i, 0] / cell)
         start[place[i] + 1] += 1
-    return np.cumsum(start), np.argsort(place, kind="mergesort")
+    start = np.cumsum(start)
+    end, members = start[:-1].copy(), np.empty(len(xy), np.int64)
+    for i in range(len(xy)):
+        members[end[place[i]]] = i
+        end[place[i]] += 1
+    return start, members
 
 
 @njit(cache=True, nogil=True)
