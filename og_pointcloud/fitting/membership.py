@@ -323,13 +323,15 @@ def _best_group(masks, views, group, has_mask, allowed, sure_share):  # noqa: AN
             if k < 0 or not allowed[k]:
                 continue
             # A point lies in few masks: the votes of all masks of a group are added up at the first of them.
-            of_group, first = 0.0, e
-            for other in range(begin, end):
+            before = begin
+            while before < e and group[mask_index[before]] != k:
+                before += 1
+            if before < e:
+                continue
+            of_group = 0.0
+            for other in range(e, end):
                 if group[mask_index[other]] == k:
                     of_group += mask_vote[other]
-                    first = min(first, other)
-            if first < e:
-                continue
             # Of the views, those that have a mask of the group could have voted for it.
             asked = 0.0
             for view in range(view_start[g], view_start[g + 1]):
