@@ -65,6 +65,23 @@ def test_whole_commands_are_understood(page):
                 assert build_parser().parse_known_args(words)[1] == [], line
 
 
+def test_figures_of_the_readme_are_those_of_the_pages_it_links():
+    """Every row: one row of results.md or scores.md has its mIoU, baseline, background and seconds."""
+    section = (ROOT / "README.md").read_text().split("## How good")[1].split("\n## ")[0]
+    pages = "".join((ROOT / "docs" / name).read_text() for name in ("results.md", "scores.md"))
+    measured = [set(re.findall(r"\d+\.\d+", line)) for line in pages.splitlines() if line.startswith("|")]
+    rows = [row.strip("|").split("|")[1:5] for row in section.splitlines() if re.match(r"\| .*\d\.\d", row)]
+    assert len(rows) >= 5
+    for miou, baseline, background, seconds in rows:
+        figures = {figure.strip() for figure in (miou, baseline, seconds)} - {"-"}
+        shares = {re.sub(r"[^\d.]", "", background), *_as_share(background)} - {""}
+        assert any(figures <= row and (not shares or shares & row) for row in measured), (miou, baseline, seconds)
+
+
+def _as_share(percent):
+    return [f"{float(number) / 100:.3f}" for number in re.findall(r"\d+\.\d+", percent)]
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_links_lead_somewhere(page):
     for target in re.findall(r"\]\(([^)#]+?)(?:#[^)]*)?\)", page.read_text()):
