@@ -68,6 +68,15 @@ def assert_same_box(one, other, tolerance):
     assert other.contains(one.corners, tolerance).all()
 
 
+@pytest.mark.parametrize("margin", [0.0, 0.3])
+def test_a_box_holds_what_lies_before_its_faces_and_no_more(margin):
+    box = oriented_box(turned_box()[0])
+    for axis, length in zip(box.axes, box.size, strict=True):
+        face = box.center + np.outer([-1, 1], (length / 2 + margin) * axis)
+        assert box.contains(face - 1e-9 * np.outer([-1, 1], axis), margin).all()
+        assert not box.contains(face + 1e-9 * np.outer([-1, 1], axis), margin).any()
+
+
 @pytest.mark.parametrize(("count", "seed"), RANDOM_SHAPES)
 def test_volume_is_near_that_of_a_slow_search(count, seed):
     """Within a tenth, not exact: a few scattered points have no faces that a box could lie flush with."""
