@@ -123,6 +123,10 @@ MUTATIONS = (
         "usable = ~spanning & (shown > 0)", "usable = shown > 0", ("test_grouping.py",),
     ),
     Mutation(
+        "masks compared by what holes leave of them", "fitting/grouping.py",
+        "view_votes(table.with_holes())", "view_votes(table)", ("test_grouping.py",),
+    ),
+    Mutation(
         "groups numbered by the smallest first", "fitting/grouping.py",
         "np.lexsort((roots, -mass))", "np.lexsort((roots, mass))", ("test_grouping.py",),
     ),

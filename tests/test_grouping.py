@@ -51,7 +51,7 @@ def hand_table(n: int, views: Sequence[HandView], unseen: Sequence[Iterable[int]
 
 
 def groups_of(table: MaskTable, settings: GroupingSettings = SETTINGS) -> NDArray[np.int32]:
-    groups = group_masks(table, view_votes(table), settings)
+    groups = group_masks(table, settings)
     assert groups.group.dtype == np.int32
     assert set(groups.group) - {-1} == set(range(groups.count))
     assert (groups.group[groups.spanning] == -1).all()
@@ -103,7 +103,7 @@ def test_masks_that_span_two_objects_in_a_minority_of_views_do_not_weld_them(spa
 def test_a_mask_that_spans_many_things_is_left_out() -> None:
     thirds = [(range(start, start + 30), ONE) for start in (0, 30, 60)]
     table = hand_table(90, [[(range(90), ONE)], thirds, thirds])
-    groups = group_masks(table, view_votes(table), SETTINGS)
+    groups = group_masks(table, SETTINGS)
     np.testing.assert_array_equal(groups.spanning, [True] + [False] * 6)
     np.testing.assert_array_equal(groups.group, [-1, 0, 1, 2, 0, 1, 2])
 
@@ -163,7 +163,7 @@ def test_a_view_that_saw_a_sliver_is_no_witness() -> None:
     views = [[(range(100), ONE)], [(A, ONE), (B, OTHER)], [(A, ONE), (B, OTHER)]]
     hidden = [[*range(45), *range(55, 100)]]
     table = hand_table(100, views, hidden)
-    share = mask_shares(view_votes(table), table.mask_view, replace(SETTINGS, witness_share=0.2)).toarray()
+    share = mask_shares(table, replace(SETTINGS, witness_share=0.2)).toarray()
     assert (share[1:, 0] == 0).all()
     assert (share[0, 1:] > 0).all()
     group = groups_of(table)
@@ -177,7 +177,7 @@ def test_masks_without_common_points_are_groups_of_their_own() -> None:
 
 def test_no_mask_at_all() -> None:
     table = hand_table(10, [[], []])
-    groups = group_masks(table, view_votes(table), SETTINGS)
+    groups = group_masks(table, SETTINGS)
     assert groups.count == len(groups.group) == len(groups.spanning) == 0
 
 
@@ -302,11 +302,26 @@ def test_order_of_points_does_not_matter() -> None:
 
 def test_a_sample_of_the_points_gives_the_same_groups() -> None:
     table = hand_table(1000, [[(range(500), ONE), (range(500, 1000), OTHER)], [(range(1000), ONE)]] * 3)
-    sampled = group_masks(table, view_votes(table), SETTINGS, np.arange(0, 1000, 20))
+    sampled = group_masks(table, SETTINGS, np.arange(0, 1000, 20))
     np.testing.assert_array_equal(sampled.group, groups_of(table))
     # It is the sample that is looked at: of one object alone, the other's masks share nothing.
-    half = group_masks(table, view_votes(table), SETTINGS, np.arange(500))
+    half = group_masks(table, SETTINGS, np.arange(500))
     assert not np.array_equal(half.group, sampled.group)
+
+
+def test_what_shows_through_holes_says_which_masks_hold_the_same() -> None:
+    """A vase whose one mask another view's plant just fails to hold, where what it sees through leaves counts."""
+    plant, vase = range(100), range(100, 200)
+    views = [[(plant, ONE), (vase, OTHER)], [(range(145), ONE), (range(145, 200), OTHER)]]
+    table = hand_table(200, views)
+    seen = table.exposure.toarray()
+    openly, through = seen.copy(), np.zeros_like(seen)
+    openly[1, 150:], through[1, 150:] = 0.1, 0.9
+    holed = replace(table, exposure=csr_array(openly), through=csr_array(through))
+    np.testing.assert_array_equal(groups_of(holed), groups_of(table))
+    np.testing.assert_array_equal(groups_of(table), [0, 1, 0, 1])
+    # Without it, what is left of the vase in that view is mostly the plant's.
+    assert not np.array_equal(groups_of(replace(holed, through=None)), groups_of(table))
 
 
 # The literal reference: the module's formulas with dense arrays and loops over pairs.

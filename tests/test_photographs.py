@@ -96,12 +96,12 @@ def test_joined_rows_are_the_sums_of_their_parts(seed: int):
     rows, counts, n = [[2, 0], [], [2], [0, 1, 3], [0, 1]], [2, 0, 1, 3, 2], 40
     cut_from = ["a", "b", "a", "b", None]
     views = [made_view(f"v{i}", *of) for i, of in enumerate(zip(counts, cut_from, rows, strict=True))]
-    dense = [random.random((height, n)) * (random.random((height, n)) < 0.4) for height in (8, 5, 5)]
-    weights, outside, exposure = (csr_array(matrix.astype(np.float32)) for matrix in dense)
+    dense = [random.random((height, n)) * (random.random((height, n)) < 0.4) for height in (8, 5, 5, 5)]
+    weights, outside, exposure, through = (csr_array(matrix.astype(np.float32)) for matrix in dense)
     features = np.concatenate([view.mask_features for view in views])
     mask_view = np.repeat(np.arange(5, dtype=np.int32), counts)
     table = MaskTable(weights, outside, exposure, mask_view, np.arange(8, dtype=np.int32), features, np.arange(8))
-    joined = Photographs.of(views).joined(table)
+    joined = Photographs.of(views).joined(replace(table, through=through))
     # Masks a0, a2, b0, b1, b3 and the two of the last view, by the rows that are their parts.
     parts = [[1], [0, 2], [3], [4], [5], [6], [7]]
     photographs = [[0, 2], [1, 3], [4]]
@@ -109,6 +109,10 @@ def test_joined_rows_are_the_sums_of_their_parts(seed: int):
     np.testing.assert_allclose(joined.weights.toarray(), [dense[0][part].sum(axis=0) for part in parts], rtol=1e-6)
     np.testing.assert_allclose(
         joined.outside.toarray(), [dense[1][part].sum(axis=0) for part in photographs], rtol=1e-6
+    )
+    assert joined.through is not None
+    np.testing.assert_allclose(
+        joined.through.toarray(), [dense[3][part].sum(axis=0) for part in photographs], rtol=1e-6
     )
     least = [np.minimum(1, dense[2][part].sum(axis=0)) for part in photographs]
     np.testing.assert_allclose(joined.exposure.toarray(), least, rtol=1e-6)

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from og_pointcloud.fitting.mask_table import MaskTable
-from og_pointcloud.fitting.view_votes import ViewVotes
+from og_pointcloud.fitting.view_votes import view_votes
 from og_pointcloud.kernels import njit
 from og_pointcloud.settings import GroupingSettings
 
@@ -45,14 +45,12 @@ class MaskGroups:
     spanning: NDArray[np.bool_]
 
 
-def group_masks(
-    table: MaskTable, votes: ViewVotes, settings: GroupingSettings, sample: NDArray[np.int64] | None = None
-) -> MaskGroups:
+def group_masks(table: MaskTable, settings: GroupingSettings, sample: NDArray[np.int64] | None = None) -> MaskGroups:
     """Group the masks of a table. Ids are ordered by shown mass, largest first, and do not depend on chance.
 
     sample: columns that overlaps are measured on: means over thousands of points need no more. None: all.
     """
-    share = mask_shares(votes, table.mask_view, settings, sample)
+    share = mask_shares(table if sample is None else table.of_points(sample), settings)
     spanning = _spanning_masks(share, table.mask_view, settings)
     container = _containers(share, table.mask_view, spanning, settings)
     witnesses = _witnesses(share, container, table, settings)
@@ -62,21 +60,19 @@ def group_masks(
     return MaskGroups(*_ordered(group, shown), spanning)
 
 
-def mask_shares(
-    votes: ViewVotes,
-    mask_view: NDArray[np.int32],
-    settings: GroupingSettings,
-    sample: NDArray[np.int64] | None = None,
-) -> csr_array:
-    """(masks, masks) sparse: entry (i, j) is the share of what mask i shows, and j's view sees, that lies in j."""
+def mask_shares(table: MaskTable, settings: GroupingSettings) -> csr_array:
+    """(masks, masks) sparse: entry (i, j) is the share of what mask i shows, and j's view sees, that lies in j.
+
+    Holes take nothing from these votes: what shows through a plant's leaves is in its masks alike, and says as well as
+    the leaves do how far two masks hold the same.
+    """
+    votes = view_votes(table.with_holes())
     weights, seen = votes.in_mask, votes.vote
-    if sample is not None and len(sample) < weights.shape[1]:
-        weights, seen = csr_array(weights[:, sample]), csr_array(seen[:, sample])
     together = (weights @ weights.T).tocoo()
     visible = (weights @ seen.T).toarray()
     own = np.asarray(weights.multiply(weights).sum(axis=1)).ravel()
     rows, cols = together.row, together.col
-    base = visible[rows, mask_view[cols]]
+    base = visible[rows, table.mask_view[cols]]
     # A view that sees only a sliver of a mask is no witness of it.
     enough = base > settings.witness_share * own[rows]
     value = together.data[enough] / base[enough]

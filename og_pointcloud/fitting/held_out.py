@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
 
 from og_pointcloud.fitting.grouping import group_masks
 from og_pointcloud.fitting.mask_table import MaskTable, mask_table, weights_by_instance
@@ -71,7 +70,7 @@ def choose_scale(
         halves = (
             mask_table(gaussians, chosen[half::2], near, thickness, by_sight=True, asked=asked) for half in (0, 1)
         )
-        tables.append([_of_points(table, sample) for table in halves])
+        tables.append([table.of_points(sample) for table in halves])
     agreements = np.zeros(len(geometry.scales))
     for half in (0, 1):
         for index in range(len(geometry.scales)):
@@ -112,14 +111,6 @@ def _labels(table: MaskTable, around: Neighbourhood, settings: FitSettings) -> t
     By votes alone: a judge that sees hidden points by hearsay itself would hold it against labels that do not, and what
     neighbours mend is the same for all sizes.
     """
-    votes = view_votes(table)
-    groups = group_masks(table, votes, settings.grouping)
+    groups = group_masks(table, settings.grouping)
     by_votes = replace(settings.membership, open_share=0.0, own_vote=np.inf)
-    return assign_points(table, votes, groups, around, by_votes).instance_ids, groups.count
-
-
-def _of_points(table: MaskTable, rows: NDArray[np.int64]) -> MaskTable:
-    """The table of some of its points."""
-    matrices = (csr_array(matrix[:, rows]) for matrix in (table.weights, table.outside, table.exposure))
-    weights, outside, exposure = matrices
-    return replace(table, weights=weights, outside=outside, exposure=exposure)
+    return assign_points(table, view_votes(table), groups, around, by_votes).instance_ids, groups.count

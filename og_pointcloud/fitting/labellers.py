@@ -71,9 +71,9 @@ Labeller = Callable[[MaskTable, Surface, FitSettings, Journal], Labelling]
 def grouping(table: MaskTable, surface: Surface, settings: FitSettings, journal: Journal) -> Labelling:
     """Masks joined by the Gaussians they share; no training."""
     with journal.stage("grouping"):
-        votes = view_votes(table)
         sample = sample_of_points(surface.gaussians.xyz, settings.grouping.graph_points)
-        groups = group_masks(table, votes, settings.grouping, sample)
+        groups = group_masks(table, settings.grouping, sample)
+        votes = view_votes(table)
     if groups.spanning.any():
         journal.leave_out(LeftOut.SPANNING_MASKS, count=int(groups.spanning.sum()))
     return _decided_by_views(table, votes, groups, surface, settings, journal)

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 from typing import Any, TypeVar
 
@@ -45,6 +45,8 @@ class MaskTable:
     mask_view: (masks,) int32, the view of each mask. mask_pixels: (masks,) int32, area in pixels.
     mask_features: (masks, D) float32, as the encoder gave them.
     mask_track: (masks,) int64 as `View.mask_tracks`; None where no view has tracks. names: (views,), of the views.
+    through: (views, n) sparse float32, exposure beside the above that comes through holes of an object: it says what
+        masks have in common, not what a point is. None: none.
     """
 
     weights: csr_array
@@ -55,6 +57,7 @@ class MaskTable:
     mask_features: NDArray[np.float32]
     mask_track: NDArray[np.int64] | None = None
     names: tuple[str, ...] = ()
+    through: csr_array | None = None
 
     @property
     def unit_features(self) -> NDArray[np.float32]:
@@ -67,6 +70,22 @@ class MaskTable:
     def seen(self) -> NDArray[np.float64]:
         """(n,) float64: pixels' worth of blending weight of each Gaussian over all views, masked or not."""
         return np.asarray(self.weights.sum(axis=0) + self.outside.sum(axis=0), np.float64)
+
+    def of_points(self, rows: NDArray[np.int64]) -> MaskTable:
+        """The table of some of its points, in ascending order."""
+        if len(rows) == self.exposure.shape[1]:
+            return self
+        matrices = (self.weights, self.outside, self.exposure, self.through)
+        weights, outside, exposure, through = (m if m is None else csr_array(m[:, rows]) for m in matrices)
+        return replace(self, weights=weights, outside=outside, exposure=exposure, through=through)
+
+    def with_holes(self) -> MaskTable:
+        """The table as if objects had no holes: what shows through them is exposed as openly as it is seen."""
+        if self.through is None:
+            return self
+        exposure = csr_array(self.exposure + self.through)
+        np.minimum(exposure.data, 1, out=exposure.data)
+        return replace(self, exposure=exposure, through=None)
 
 
 def mask_table(

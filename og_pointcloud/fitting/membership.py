@@ -127,8 +127,8 @@ def without_see_through(
     thing that stands there.
 
     world_to_camera: (views, 4, 4) float64. focal: (views,) pixels.
-    Returns the table without those weights, and with as much less exposure; and their share of all weight. It takes
-    the place of the given one, whose weights and exposure are written over.
+    Returns the table without those weights, and with as much less exposure, of which it keeps what came through holes;
+    and their share of all weight. It takes the place of the given one, whose weights and exposure are written over.
     """
     weights = table.weights
     kept, lost = np.ones(weights.nnz, np.float32), 0.0
@@ -141,13 +141,15 @@ def without_see_through(
     if lost == 0:
         return table, 0.0
     share = lost / float(weights.data.sum(dtype=np.float64))
-    left = _exposure_left(
+    left, through = _exposure_left(
         np.searchsorted(table.mask_view, np.arange(table.exposure.shape[0] + 1)),
         *((matrix.indptr, matrix.indices, matrix.data) for matrix in (weights, table.outside, table.exposure)),
         kept,
         weights.shape[1],
     )
-    return replace(table, weights=_scaled(weights, kept), exposure=_scaled(table.exposure, left)), share
+    exposure = _scaled(table.exposure, left)
+    through = csr_array(through, shape=exposure.shape)
+    return replace(table, weights=_scaled(weights, kept), exposure=exposure, through=through), share
 
 
 def _at_front(
@@ -168,24 +170,33 @@ def _at_front(
 @njit(cache=True)
 def _exposure_left(first_mask, weights, outside, exposure, kept, n):  # noqa: ANN001, ANN202
     """(entries of exposure,) float32: the part of what a view shows of a point that is not behind its masks' objects;
-    0 exactly where all of it is."""
+    0 exactly where all of it is. And what exposure its masks' holes take away, as data, columns and where rows begin of
+    a sparse matrix."""
     weight_start, weight_index, weight = weights
     outside_start, outside_index, outside_weight = outside
-    start, index, _ = exposure
-    shown, hidden = np.zeros(n), np.zeros(n)
+    start, index, exposed = exposure
+    shown, hidden, behind_hole = np.zeros(n), np.zeros(n), np.zeros(n)
     left = np.empty(len(index), np.float32)
+    most, end = np.sum((kept > 0) & (kept < 1)), 0
+    through, through_index, through_start = np.empty(most, np.float32), np.empty(most, np.int32), start.copy()
     for view in range(len(first_mask) - 1):
         for e in range(weight_start[first_mask[view]], weight_start[first_mask[view + 1]]):
             shown[weight_index[e]] += weight[e]
-            hidden[weight_index[e]] += weight[e] * (1 - kept[e])
+            lost = weight[e] * (1 - kept[e])
+            hidden[weight_index[e]] += lost
+            behind_hole[weight_index[e]] += lost if kept[e] > 0 else 0
         for e in range(outside_start[view], outside_start[view + 1]):
             shown[outside_index[e]] += outside_weight[e]
         # All that a view shows it exposes: the sums are zero again for the next view.
         for e in range(start[view], start[view + 1]):
             g = index[e]
             left[e] = 1 - hidden[g] / shown[g] if hidden[g] > 0 else 1
-            shown[g], hidden[g] = 0.0, 0.0
-    return left
+            if behind_hole[g] > 0:
+                through[end], through_index[end] = exposed[e] * behind_hole[g] / shown[g], g
+                end += 1
+            shown[g], hidden[g], behind_hole[g] = 0.0, 0.0, 0.0
+        through_start[view + 1] = end
+    return left, (through[:end], through_index[:end], through_start)
 
 
 def _scaled(matrix: csr_array, factor: NDArray[np.float32]) -> csr_array:

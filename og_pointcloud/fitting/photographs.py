@@ -49,13 +49,15 @@ class Photographs:
         """The table of the views, as one of the photographs, in whose place it is: that may be written over."""
         if len(self.names) == len(self.of_view):
             return table
-        exposure = _summed(table.exposure, self.of_view, len(self.names))
+        views = self.of_view, len(self.names)
+        exposure = _summed(table.exposure, *views)
         np.minimum(exposure.data, 1, out=exposure.data)  # a splat across a border is open in both faces
         return replace(
             table,
             weights=_summed(table.weights, self.of_mask, len(self.first)),
-            outside=_summed(table.outside, self.of_view, len(self.names)),
+            outside=_summed(table.outside, *views),
             exposure=exposure,
+            through=None if table.through is None else _summed(table.through, *views),
             names=self.names,
             mask_view=self.of_view[table.mask_view[self.first]],
             mask_pixels=np.bincount(self.of_mask, table.mask_pixels, len(self.first)).astype(np.int32),

@@ -72,7 +72,8 @@ Result = TypeVar("Result")
 Rows = NDArray[np.integer]
 Entries = NDArray[np.void]
 ENTRY = np.dtype([("point", "<i4"), ("row", "<i4"), ("value", "<f4")])
-"""What a view with M masks shows of a point. Row below M: weight in that mask. M: weight in none. M + 1: exposure."""
+"""What a view with M masks shows of a point. Row below M: weight in that mask. M: weight in none. M + 1: exposure.
+M + 2: exposure through holes."""
 
 
 def needs_tiles(scene: Scene, settings: FitSettings) -> bool:
@@ -221,16 +222,17 @@ class _Shown:
             part = np.concatenate([piece[place[piece["point"]] >= 0] for piece in pieces])
             part["point"] = place[part["point"]]
             stacks.append(_stacked(part, int(masks[view]), len(rows)))
-        weights, outside, exposure = (csr_array(vstack(blocks, format="csr")) for blocks in zip(*stacks, strict=True))
+        of_views = (csr_array(vstack(blocks, format="csr")) for blocks in zip(*stacks, strict=True))
+        weights, outside, exposure, through = of_views
         no_pixels = np.zeros(len(self.mask_view), np.int32)  # asked only where what is behind an object is found
         masks_of_views = self.mask_view, no_pixels, self.mask_features, self.mask_track
-        return self.photographs.joined(MaskTable(weights, outside, exposure, *masks_of_views))
+        return self.photographs.joined(MaskTable(weights, outside, exposure, *masks_of_views, through=through))
 
 
-def _stacked(entries: Entries, masks: int, points: int) -> tuple[csr_array, csr_array, csr_array]:
-    """Weights (masks, n), outside (1, n) and exposure (1, n) of one view."""
-    matrix = csr_array((entries["value"], (entries["row"], entries["point"])), shape=(masks + 2, points))
-    return matrix[:masks], matrix[masks : masks + 1], matrix[masks + 1 :]
+def _stacked(entries: Entries, masks: int, points: int) -> tuple[csr_array, ...]:
+    """Weights (masks, n), outside, exposure and that through holes (1, n) of one view."""
+    matrix = csr_array((entries["value"], (entries["row"], entries["point"])), shape=(masks + 3, points))
+    return matrix[:masks], *(matrix[row : row + 1] for row in range(masks, masks + 3))
 
 
 def _all_shown(scene: Scene, cloud: TiledCloud, looked: Sequence[_LookedAt], journal: Journal) -> _Shown:
@@ -297,6 +299,7 @@ def _entries(
     )
     masks = view.mask_count
     blocks = [(front.weights, 0), (front.outside, masks), (front.exposure, masks + 1)]
+    blocks += [] if front.through is None else [(front.through, masks + 2)]
     entries = np.empty(sum(block.nnz for block, _ in blocks), ENTRY)
     end = 0
     for block, first_row in blocks:
@@ -362,7 +365,7 @@ def _groups(cloud: TiledCloud, shown: _Shown, settings: FitSettings, journal: Jo
     sample = sample_of_points(cloud.points.xyz, count)
     table = shown.table(cloud, sample)
     votes = view_votes(table)
-    groups = group_masks(table, votes, settings.grouping)
+    groups = group_masks(table, settings.grouping)
     if groups.spanning.any():
         journal.leave_out(LeftOut.SPANNING_MASKS, count=int(groups.spanning.sum()))
     around = neighbourhood(cloud.points.xyz[sample], settings.geometry)
