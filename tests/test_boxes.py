@@ -5,11 +5,13 @@ from functools import partial
 
 import numpy as np
 import pytest
+from labelled_clouds import room
 from scipy.spatial import ConvexHull, cKDTree
 from scipy.spatial.transform import Rotation
 
 from og_pointcloud.ask import boxes
 from og_pointcloud.ask.boxes import Box, axis_aligned_box, main_part, oriented_box
+from og_pointcloud.ask.labelled_scene import instance_table
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.poses import quaternion_of
 
@@ -209,10 +211,12 @@ def test_points_without_a_box_are_refused(points):
             make(points)
 
 
-@pytest.mark.parametrize("up", [(0, 0, 0), (1, 0), (np.nan, 0, 1)])
+@pytest.mark.parametrize("up", [(0, 0, 0), (1, 0), (np.nan, 0, 1), "z"])
 def test_an_up_without_direction_is_refused(up):
     with pytest.raises(SceneError, match="up is"):
         oriented_box(np.eye(3), up)
+    with pytest.raises(SceneError, match="up is"):
+        instance_table(room(), up=up)
 
 
 @pytest.mark.parametrize("seed", range(6))

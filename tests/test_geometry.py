@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import signal
+import threading
+import time
+
 import numpy as np
 import pytest
 from numpy.random import Generator
@@ -12,6 +16,7 @@ from og_pointcloud.rendering.geometry import (
     TAMED_BY,
     chance_of_place,
     near_plane,
+    nearest_in,
     neighbourhood,
     pixels_per_spacing,
     sample_of_points,
@@ -165,6 +170,22 @@ def test_chance_of_place_is_even_and_another_for_each_name() -> None:
     for chance in (first, second):
         np.testing.assert_allclose(np.histogram(chance, 10, (0, 1))[0], 800, atol=120)
     assert abs(np.corrcoef(first, second)[0, 1]) < 0.05
+
+
+def test_ctrl_c_waits_for_threads_that_are_looking_up_neighbours() -> None:
+    class Tree:
+        ended = False
+
+        def query(self, xyz: NDArray[np.floating], k: int, workers: int) -> tuple[NDArray, NDArray]:
+            signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
+            time.sleep(0.1)
+            self.ended = True
+            return np.zeros(len(xyz)), np.zeros(len(xyz), int)
+
+    tree = Tree()
+    with pytest.raises(KeyboardInterrupt):
+        nearest_in(tree, grid(2))  # pyright: ignore[reportArgumentType]
+    assert tree.ended  # else scipy's threads would go on in memory that is gone, and end the process
 
 
 def test_neighbours_looked_up_a_few_at_a_time_are_the_same(monkeypatch: pytest.MonkeyPatch) -> None:

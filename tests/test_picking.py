@@ -203,6 +203,8 @@ def test_places_find_what_query_points_find(tmp_path):
     ("where", "uv", "text"),
     [
         ((0, 0), None, "three finite world coordinates"),
+        ("abc", None, "three finite world coordinates"),
+        ([[0], [0, 0]], None, "three finite world coordinates"),
         ((0, 0, np.inf), None, "three finite world coordinates"),
         ((0, 0, 0), (3, 4), "expected it with a Camera"),
     ],

@@ -175,8 +175,11 @@ def test_what_is_no_scene(tmp_path):
         og.segment(np.zeros((1, 3)), ["apple"], 3)
     with pytest.raises(BundleError, match=r"nowhere.ogpc is not a file"):
         og.segment(np.zeros((1, 3)), ["apple"], tmp_path / "nowhere.ogpc")
-    with pytest.raises(BundleError, match=r"nowhere.ogpc is not a file"):
-        og.load(tmp_path / "nowhere.ogpc")
+    for path in (tmp_path / "nowhere.ogpc", tmp_path, "a\0.ogpc", "a" * 5000, "\ud800.ogpc"):
+        with pytest.raises(BundleError, match=r"is not a file; expected a \.ogpc file"):
+            og.load(path)
+        with pytest.raises(BundleError, match=r"is not a file; expected a \.ogpc file"):
+            og.segment(np.zeros((1, 3)), ["apple"], path)
 
 
 def test_a_graph_that_is_not_ours_is_refused(scene):
@@ -382,6 +385,8 @@ def test_a_files_words_come_before_the_scenes(scene):
         ({}, OgPointcloudError, "0 labels"),
         (["apple", "pear", "apple"], OgPointcloudError, "'apple' is given twice"),
         ([1], OgPointcloudError, "label 1 is a int"),
+        (5, OgPointcloudError, "label 5 is a int"),
+        (b"apple", OgPointcloudError, "label b'apple' is a bytes"),
         ({"a": np.ones(WIDTH - 1)}, FeatureSpaceError, rf"\(width {WIDTH - 1}\); expected .*\(width {WIDTH}\)"),
         ({"a": np.ones(WIDTH), "b": np.ones(3)}, FeatureSpaceError, r"'b' is float64 \(3,\)"),
         ({"a": np.ones((1, WIDTH))}, FeatureSpaceError, r"'a' is float64 \(1, 16\)"),
@@ -399,7 +404,7 @@ def test_words_without_any_vocabulary():
     bare = replace(CLOUDS["room"], vocabulary=None)
     with pytest.raises(OgPointcloudError, match="'chair' is not among the 0 known words: pass"):
         og.segment(bare, ["chair"])
-    with pytest.raises(OgPointcloudError, match="no labels are given"):
+    with pytest.raises(OgPointcloudError, match=r"no labels are given, .*--labels chair,table does; pass"):
         og.segment(bare)
 
 
@@ -533,6 +538,7 @@ def test_a_pose_takes_the_cloud_to_the_scenes_world(scene):
         (np.full((4, 4), np.nan), "finite 4x4"),
         (POSE.T, "expected 0 0 0 1"),
         (np.eye(4, dtype=complex), "complex128"),
+        ([[1, 0], [1]], "expected a finite 4x4"),
     ],
 )
 def test_poses_that_are_none(scene, pose, says):
@@ -610,7 +616,7 @@ def test_a_shorter_reach_is_exact(scene):
         result = og.segment(points, words, scene, max_distance=limit)
         assert ((result.instances == TOO_FAR) == (true > limit)).all()
         assert (result.instances == scene.instances_at(points))[true <= limit].all()
-    for limit in (0, -1, 0.16, float("nan")):
+    for limit in (0, -1, 0.16, float("nan"), "0.1", [0.1]):
         with pytest.raises(OgPointcloudError, match=r"max_distance is .*reach, 0.15"):
             og.segment(points, words, scene, max_distance=limit)
 

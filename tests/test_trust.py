@@ -44,6 +44,7 @@ from text_models import OUT
 import og_pointcloud as og
 from og_pointcloud.bundle.known_graph import KNOWN_GRAPHS, query_graph_digest
 from og_pointcloud.cli import main
+from og_pointcloud.cli.common import write_json
 from og_pointcloud.cloud import TOO_FAR
 from og_pointcloud.errors import BundleError, FeatureSpaceError, OgPointcloudError, SceneError, printable
 from og_pointcloud.formats import spz
@@ -568,6 +569,37 @@ def test_a_reader_that_goes_away(bundle):
     process.stdout.close()
     assert process.wait() == 141
     assert process.stderr.read() == b""
+
+
+def test_nobody_listens(bundle):
+    """Standard output is closed, as by a daemon."""
+    command, environment = program("info", bundle)
+    closed = ["sh", "-c", 'exec "$@" >&-', "sh", *command]
+    done = subprocess.run(closed, env=environment, stderr=subprocess.PIPE)
+    assert (done.returncode, done.stderr) == (0, b"")
+
+
+def test_ctrl_c_before_the_work_is_one_line(capsys, monkeypatch):
+    def interrupted():
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("og_pointcloud.cli.build_parser", interrupted)
+    assert main(["info", "s.ogpc"]) == 130
+    assert capsys.readouterr().err.startswith("interrupted: ")
+
+
+@pytest.mark.skipif(sys.platform == "darwin", reason="names of files are UTF-8 there")
+def test_names_of_files_that_are_no_utf8(bundle, tmp_path, capsys):
+    scene = tmp_path / os.fsdecode(b"k\xfcche.ogpc")
+    shutil.copy(bundle, scene)
+    for command in (f"view {scene} --html {tmp_path}/s.html", f"segment {scene} -o {tmp_path}/s.ply", f"info {scene}"):
+        assert main(command.split()) == 0, capsys.readouterr().err
+    assert "k\\udcfcche" in (tmp_path / "s.html").read_text()
+    write_json(tmp_path / "s.json", {"file": str(scene)})
+    assert json.loads((tmp_path / "s.json").read_text()) == {"file": str(scene)}
+    capsys.readouterr()
+    assert main(["index", str(tmp_path), "-o", str(tmp_path / "atlas")]) == 2
+    assert "k\\udcfcche' holds bytes that are no UTF-8: rename the file or folder" in capsys.readouterr().err
 
 
 def test_an_error_nobody_foresaw_is_one_line(bundle, capsys, monkeypatch):

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from og_pointcloud.ask.hosts import numbers_of
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.poses import quaternion_of
 
@@ -122,7 +123,7 @@ def oriented_box(points: ArrayLike, up: ArrayLike | None = None) -> Box:
     xyz, _ = _distinct(_checked(points))
     middle = xyz.min(axis=0) + np.ptp(xyz, axis=0) / 2
     local = xyz - middle
-    axes = _least_volume(local) if up is None else _upright(local, _unit(up))
+    axes = _least_volume(local) if up is None else _upright(local, unit_up(up))
     along = local @ axes.T
     low, high = along.min(axis=0), along.max(axis=0)
     if up is None:
@@ -170,9 +171,11 @@ def _checked(points: ArrayLike) -> DoubleArray:
     return xyz
 
 
-def _unit(up: ArrayLike) -> DoubleArray:
-    direction = np.asarray(up, np.float64)
-    if direction.shape != (3,) or not np.isfinite(direction).all() or not direction.any():
+def unit_up(up: ArrayLike) -> DoubleArray:
+    """An upward direction (3,) at unit length. SceneError where it is none."""
+    direction = numbers_of(up)
+    is_vector = direction.shape == (3,) and direction.dtype.kind in "fiu"
+    if not is_vector or not np.isfinite(direction).all() or not direction.any():
         raise SceneError(f"up is {up}; expected a direction of three numbers, not all 0, e.g. (0, 0, 1)")
     direction = direction / np.abs(direction).max()
     return direction / np.linalg.norm(direction)

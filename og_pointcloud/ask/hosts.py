@@ -48,6 +48,14 @@ def world_points(pcd: Any) -> NDArray[np.float64]:
     return _checked(values, kind)
 
 
+def numbers_of(value: Any) -> NDArray[Any]:
+    """As np.asarray, of torch's tensors too; what is no array, such as rows of different lengths, fits no shape."""
+    try:
+        return np.asarray(_READERS["torch"](value) if _host(value) == "torch" else value)
+    except ValueError:
+        return np.array(None)
+
+
 _NAMED: dict[str, Path] = {}
 """Files that datasets of this process came from, by what the datasets call them."""
 

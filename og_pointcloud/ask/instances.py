@@ -19,7 +19,7 @@ from typing import Any, overload
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from og_pointcloud.ask.boxes import Box, axis_aligned_box, main_part, oriented_box
+from og_pointcloud.ask.boxes import Box, axis_aligned_box, main_part, oriented_box, unit_up
 from og_pointcloud.ask.choosing import Chooser
 from og_pointcloud.cloud import LabelledCloud, Vocabulary
 from og_pointcloud.errors import printable
@@ -205,6 +205,8 @@ def list_instances(
     chooser: of the same cloud. labels: the words to choose among, None for none. up: (3,) direction that the oriented
     boxes stand upright on, where it is known. words: how many a row names.
     """
+    if up is not None:
+        unit_up(up)  # said now, not at the first box
     table, order = cloud.instances, np.argsort(cloud.instance_ids, kind="stable")
     bounds = np.searchsorted(cloud.instance_ids[order], np.arange(len(table) + 1))
     described = np.zeros(len(table), bool)

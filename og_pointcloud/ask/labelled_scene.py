@@ -11,6 +11,7 @@ from __future__ import annotations
 import os
 import warnings
 from functools import cached_property, lru_cache
+from numbers import Real
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -18,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from og_pointcloud.ask.choosing import Chooser, Reason
-from og_pointcloud.ask.hosts import carried_scene, import_plugin, world_points
+from og_pointcloud.ask.hosts import carried_scene, import_plugin, numbers_of, world_points
 from og_pointcloud.ask.instances import WORDS, Instances, list_instances
 from og_pointcloud.ask.query_graph import QueryGraph
 from og_pointcloud.ask.segmentation import Segmentation
@@ -138,7 +139,7 @@ class LabelledScene:
 
     def check_distance(self, max_distance: float | None) -> None:
         """OgPointcloudError for a distance that is none, or beyond the reach, within which points are looked up."""
-        if max_distance is not None and not 0 < max_distance <= self.cloud.reach:
+        if max_distance is not None and not (isinstance(max_distance, Real) and 0 < max_distance <= self.cloud.reach):
             raise OgPointcloudError(
                 f"max_distance is {max_distance}; expected a length up to the scene's reach, {self.cloud.reach:.4g}: "
                 "points farther than that have no label"
@@ -340,9 +341,9 @@ def as_scene(source: SceneLike) -> LabelledScene:
     if isinstance(source, LabelledCloud):
         return _scene_once(source)
     if isinstance(source, (str, os.PathLike)):
-        path = Path(source).resolve()
-        if not path.is_file():
+        if not os.path.isfile(source):
             return load(source)  # which says what is wrong
+        path = Path(source).resolve()
         state = path.stat()
         return _load_once(path, state.st_mtime_ns, state.st_size)
     raise OgPointcloudError(
@@ -364,7 +365,7 @@ def _scene_once(cloud: LabelledCloud) -> LabelledScene:
 
 def pose_matrix(pose: ArrayLike) -> NDArray[np.float64]:
     """A pose (4, 4) as float64. SceneError for numbers that are not finite and a last row other than 0 0 0 1."""
-    matrix = np.asarray(pose)
+    matrix = numbers_of(pose)
     if matrix.shape != (4, 4) or matrix.dtype.kind not in "fiu" or not np.isfinite(matrix).all():
         raise SceneError(f"pose is {matrix.dtype} {matrix.shape}; expected a finite 4x4 matrix, cloud to world")
     if np.abs(matrix[3] - [0, 0, 0, 1]).max() > 1e-6:

@@ -19,6 +19,7 @@ from typing import overload
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from og_pointcloud.ask.hosts import numbers_of
 from og_pointcloud.ask.labelled_scene import LabelledScene, SceneLike, as_scene
 from og_pointcloud.bundle.nearest import NONE_WITHIN_REACH
 from og_pointcloud.cloud import BACKGROUND, TOO_FAR, UNOBSERVED, LabelledCloud
@@ -165,8 +166,8 @@ def front_points(cloud: LabelledCloud, camera: Camera) -> NDArray[np.int64]:
 
 def _point_at_pixel(cloud: LabelledCloud, camera: Camera, uv_px: ArrayLike | None) -> int:
     """What `front_points` has at the pixel that holds uv_px."""
-    uv = np.asarray(uv_px, np.float64) if uv_px is not None else np.full(2, np.nan)
-    if uv.shape != (2,) or not ((uv >= 0) & (uv < [camera.width, camera.height])).all():
+    uv = numbers_of(uv_px)
+    if uv.dtype.kind not in "fiu" or uv.shape != (2,) or not ((uv >= 0) & (uv < [camera.width, camera.height])).all():
         raise OgPointcloudError(
             f"uv_px is {uv_px}; expected a pixel (column, row) of the camera's image, 0 to {camera.width} and 0 to "
             f"{camera.height}, both less than the end"
@@ -176,10 +177,10 @@ def _point_at_pixel(cloud: LabelledCloud, camera: Camera, uv_px: ArrayLike | Non
 
 def _nearest_point(scene: LabelledScene, place: ArrayLike) -> int:
     """Index of the nearest point within the scene's reach, the same that a query point would find, else NO_POINT."""
-    world = np.asarray(place, np.float64)
-    if world.shape != (3,) or not np.isfinite(world).all():
+    world = numbers_of(place)
+    if world.dtype.kind not in "fiu" or world.shape != (3,) or not np.isfinite(world).all():
         raise OgPointcloudError(f"the place is {place}; expected three finite world coordinates x, y, z")
-    return int(scene.nearest.query((world - scene.cloud.origin).astype(np.float32)[None])[0])
+    return int(scene.nearest.query(scene._local(world[None]))[0])
 
 
 @dataclass(frozen=True)

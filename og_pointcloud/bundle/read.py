@@ -68,7 +68,7 @@ def read_bundle(path: str | os.PathLike[str]) -> Bundle:
     ('two-words', 3)
     """
     path = Path(path)
-    if not path.is_file():
+    if not os.path.isfile(path):
         raise BundleError(
             f"{path} is not a file; expected a .ogpc file: check the name, or make it (og-pointcloud fit)"
         )

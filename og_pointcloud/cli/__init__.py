@@ -21,7 +21,7 @@ from importlib import import_module
 from typing import Any
 
 import og_pointcloud as og
-from og_pointcloud.cli.common import Parser, add_command, check_outputs
+from og_pointcloud.cli.common import LONGEST_CELL, Parser, add_command, check_outputs
 from og_pointcloud.errors import MissingExtraError, OgPointcloudError, did_you_mean, missing_extra, printable
 
 __all__ = ["main"]
@@ -39,16 +39,16 @@ LONGEST_UNFORESEEN = 300
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; argv without the program's name, None for the process's own. Returns the exit code."""
-    parser = build_parser()
-    arguments, unknown = parser.parse_known_args(argv)
+    arguments = argparse.Namespace(debug=True)
     for stream in (sys.stdout, sys.stderr):  # which may know few characters, and file names hold any bytes
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
     try:
+        arguments, unknown = build_parser().parse_known_args(argv)
         if unknown:
             raise OgPointcloudError(describe_unknown_option(unknown[0], arguments))
         check_outputs(arguments)
-        with warnings.catch_warnings(), redirect_stdout(Plain(sys.stdout)):  # pyright: ignore
+        with warnings.catch_warnings(), redirect_stdout(Plain(sys.stdout or io.StringIO())):  # pyright: ignore
             warnings.simplefilter("ignore")  # what libraries tell programmers
             warnings.simplefilter("always", UserWarning)
             warnings.showwarning = print_warning
@@ -86,6 +86,9 @@ def describe_error(error: Exception) -> str:
     error = missing_extra(error) or error
     if isinstance(error, MemoryError):
         return "out of memory"
+    if isinstance(error, UnicodeEncodeError):  # of bytes in a file's name, which Python keeps as half characters
+        name = error.object[max(0, error.start - LONGEST_CELL // 2) :]
+        return f"'{printable(name, LONGEST_CELL)}' holds bytes that are no UTF-8: rename the file or folder"
     if isinstance(error, OSError) and error.strerror:
         return printable(f"'{error.filename}': {error.strerror}" if error.filename else error.strerror)
     text = printable(str(error), None if isinstance(error, OgPointcloudError) else LONGEST_UNFORESEEN)

@@ -14,6 +14,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
+from textwrap import indent
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from og_pointcloud.errors import MissingExtraError, OgPointcloudError, printable
@@ -62,7 +63,8 @@ SHARED: dict[str, dict[str, Any]] = {
 def add_command(commands: Any, name: str, run: Any, text: str | None) -> Parser:
     """text: what the command does in a line, and an example behind an empty line."""
     summary, _, example = (text or "").strip().partition("\n\n")
-    parser = commands.add_parser(name, help=summary, description=summary, epilog=f"example:\n  {example.strip()}")
+    example = "example:\n" + indent(example.strip(), "  ")
+    parser = commands.add_parser(name, help=summary, description=summary, epilog=example)
     parser.set_defaults(run=run, parser=parser)
     return parser
 
@@ -151,7 +153,7 @@ def write_json(path: Path, value: Mapping[str, Any]) -> None:
     from og_pointcloud.formats.atomic import replacing
 
     with replacing(path) as file:
-        file.write(json.dumps(value, indent=2, ensure_ascii=False).encode() + b"\n")
+        file.write(json.dumps(value, indent=2, ensure_ascii=False).encode(errors="backslashreplace") + b"\n")
 
 
 def require_room() -> None:

@@ -12,7 +12,8 @@ from og_pointcloud.cli.common import Parser, add_option, require_room
 
 
 def add(parser: Parser) -> None:
-    parser.add_argument("-o", "--output", type=Path, default=Path("out/demo"), metavar="DIR", help="folder to fill")
+    folder = "folder to fill (default: %(default)s)"
+    parser.add_argument("-o", "--output", type=Path, default=Path("out/demo"), metavar="DIR", help=folder)
     add_option(parser, "--seed", "N", "another room (default: %(default)s)", type=int, default=0)
     add_option(parser, "--mask-noise", "X", "0 clean, 1 realistic (default: %(default)s)", type=float, default=1.0)
     alone = "also label the room from its images alone, without ready masks and features"

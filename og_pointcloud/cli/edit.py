@@ -36,7 +36,8 @@ def add(parser: Parser) -> None:
         add_option(what, "--word", "WORD", "every instance that it fits better than other words do")
         add_option(what, "--id", "K,L", "instances by their ids (`og-pointcloud instances` lists them)")
         add_option(what, "--xyz", "X,Y,Z", "the instance at a place in world coordinates")
-        add_option(operation, "--halo", "N", "also unlabelled points so near, in spacings", type=float, default=0.0)
+        near = "also unlabelled points so near, in spacings (default: 0)"
+        add_option(operation, "--halo", "N", near, type=float, default=0.0)
     add_option(operations.choices["recolour"], "--color", "R,G,B", "0 to 255 each", required=True)
     insert = add_command(operations, "insert", run_insert, run_insert.__doc__)
     add_option(insert, "cloud", "CLOUD", "plain cloud or 3DGS file", type=Path)

@@ -25,9 +25,10 @@ def add(parser: Parser) -> None:
     option("--words", "WORD", "mask these alone; needs SAM 3", nargs="+", default=())
     follow = "follow things from image to image: SAM 3's words; or a folder's ids mean the same in all its PNGs"
     parser.add_argument("--tracks", action="store_true", help=follow)
-    option("--level", None, "how much is one mask", default="medium", choices=("small", "medium", "large"))
-    option("--every", "N", "use every N-th image; needs -o", type=int, default=1)
-    option("--longest-side", "PX", "larger images are shrunk to this", type=int, default=1024)
+    level = "how much is one mask (default: %(default)s)"
+    option("--level", None, level, default="medium", choices=("small", "medium", "large"))
+    option("--every", "N", "use every N-th image; needs -o (default: all)", type=int, default=1)
+    option("--longest-side", "PX", "larger images are shrunk to this (default: %(default)s)", type=int, default=1024)
     parser.add_argument("--overwrite", action="store_true", help="replace masks of others, or make all again")
     parser.add_argument("-o", "--output", type=Path, metavar="DIR", help="a capture of its own (default: CAPTURE)")
 

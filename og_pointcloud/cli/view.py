@@ -26,7 +26,8 @@ def add(parser: Parser) -> None:
     add_output(parser, "--html", endings=(".html", ".htm"), help=page)
     add_output(parser, "--png", endings=(".png",), help="a picture")
     parser.add_argument("--boxes", action="store_true", help="boxes around what has a label")
-    add_option(parser, "--cut", "SHARE", "hide this share of the height, from the top", type=float, default=0.0)
+    cut = "hide this share of the height, from the top (default: 0)"
+    add_option(parser, "--cut", "SHARE", cut, type=float, default=0.0)
     parser.add_argument("--instances", action="store_true", help="colors by instance")
 
 

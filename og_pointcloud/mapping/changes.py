@@ -39,6 +39,7 @@ from og_pointcloud.mapping.likeness import (
 )
 from og_pointcloud.mapping.map_record import MapRecord
 from og_pointcloud.mapping.presence import FEWEST_POINTS, Evidence, Presence, Visit, tolerance_of
+from og_pointcloud.rendering.geometry import nearest_in
 
 SAME_SURFACE = 1.5
 """Spacings within which two visits' points are of one surface."""
@@ -144,8 +145,8 @@ def compare_visits(
         _require_one_frame(asked)
         again, shows = (asked.present, asked.absent), own.present
         if later.depth is None:
-            left_out = asked.left_out(np.asarray(cKDTree(b.xyz).query(a.xyz, workers=-1)[0]) > spacing)
-    distance, nearest = map(np.asarray, cKDTree(a.xyz).query(b.xyz, workers=-1))
+            left_out = asked.left_out(nearest_in(cKDTree(b.xyz), a.xyz)[0] > spacing)
+    distance, nearest = nearest_in(cKDTree(a.xyz), b.xyz)
     of_earlier = Evidence(shown.present | (not a.cameras), *again, earlier.telling(tolerance), left_out)
     not_there = known.left_out(distance > spacing)
     of_later = Evidence(shows, known.present, known.absent, later.telling(tolerance), not_there)

@@ -21,6 +21,7 @@ from og_pointcloud.mapping.changes import SAME_SURFACE, Changes, Comparison, com
 from og_pointcloud.mapping.map_record import MapRecord, VisitEntry
 from og_pointcloud.mapping.presence import FEWEST_POINTS, MOST, Visit
 from og_pointcloud.mapping.sight import MeasuredView
+from og_pointcloud.rendering.geometry import nearest_in
 from og_pointcloud.scene import Scene
 from og_pointcloud.settings import FitSettings
 
@@ -70,7 +71,7 @@ def merge(earlier: Visit, later: Visit, found: Comparison, name: str, stamp: flo
     ids_of_later = _ids_of_later(earlier, later, stays, found)
     adds: NDArray[np.bool_] = np.ones(len(b), bool)
     if stays.any():
-        adds = np.asarray(cKDTree(a.xyz[stays]).query(b.xyz, workers=-1)[0]) > SAME_PLACE * a.spacing
+        adds = nearest_in(cKDTree(a.xyz[stays]), b.xyz)[0] > SAME_PLACE * a.spacing
     states = np.append(ids_of_later, [UNOBSERVED, BACKGROUND])  # -2 and -1 index the last two
     ids = np.concatenate([_relabelled(a, b, orphaned, states)[stays], states[b.instance_ids[adds]]]).astype(np.int32)
     changes = replace(found.changes, new=tuple(sorted({int(ids_of_later[k]) for k in found.changes.new})))
@@ -133,7 +134,7 @@ def _relabelled(
     """(n,) ids of the map's points: what lost its instance, or had never been seen, is what the visit says of it."""
     ids = np.where(orphaned, BACKGROUND, a.instance_ids).astype(np.int64)
     asked = np.flatnonzero(orphaned | (ids == UNOBSERVED))
-    distance, nearest = map(np.asarray, cKDTree(b.xyz).query(a.xyz[asked], workers=-1))
+    distance, nearest = nearest_in(cKDTree(b.xyz), a.xyz[asked])
     near = distance <= SAME_SURFACE * a.spacing
     ids[asked[near]] = states[b.instance_ids[nearest[near]]]
     return ids

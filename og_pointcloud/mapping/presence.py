@@ -24,7 +24,7 @@ from og_pointcloud.kernels import njit
 from og_pointcloud.mapping.likeness import Look, descriptors_of
 from og_pointcloud.mapping.sight import AGREES, HIDDEN, THROUGH, DiscSurface, MeasuredView, states_of_points
 from og_pointcloud.mapping.voxels import Columns
-from og_pointcloud.rendering.geometry import Neighbourhood, neighbourhood
+from og_pointcloud.rendering.geometry import Neighbourhood, nearest_in, neighbourhood
 from og_pointcloud.scene import Camera
 from og_pointcloud.settings import GeometrySettings
 
@@ -241,7 +241,7 @@ class Evidence:
         for k in np.flatnonzero(left) if self.left_out.any() and len(stands) else ():
             rows = visit.rows[k]
             asked = xyz[rows[self.shown[rows] & self.through[rows]]]
-            about = np.unique(tree.query(asked, k=min(ABOUT, len(stands)), workers=-1)[1])
+            about = np.unique(nearest_in(tree, asked, min(ABOUT, len(stands)))[1])
             share[k] = self.left_out[stands[about]].mean()
         return share
 

@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +36,17 @@ class Neighbourhood:
     adjoining: NDArray[np.bool_]
 
 
+def nearest_in(tree: cKDTree, xyz: NDArray[np.floating], k: int = 1) -> tuple[NDArray[np.float64], NDArray[Any]]:
+    """Distance and index of the k points of a tree nearest to each, on all cores: (N,), or (N, k) of several.
+
+    Asked in a thread of its own, which Ctrl-C waits for: those that scipy starts would go on in memory that is gone.
+    """
+    with ThreadPoolExecutor(1) as pool:
+        pool.submit(int).result()  # from now on there is a thread to wait for
+        distance, index = pool.submit(tree.query, xyz, k=k, workers=-1).result()
+    return np.asarray(distance), np.asarray(index)
+
+
 def neighbourhood(xyz: NDArray[np.float32], settings: GeometrySettings) -> Neighbourhood:
     """Spacing and neighbours of every point.
 
@@ -47,7 +60,7 @@ def neighbourhood(xyz: NDArray[np.float32], settings: GeometrySettings) -> Neigh
     tree, index, distance = cKDTree(xyz), np.empty((n, k), np.int32), np.empty((n, k))
     for low in range(0, n, ROWS_AT_ONCE):
         rows = slice(low, min(n, low + ROWS_AT_ONCE))
-        away, near = map(np.asarray, tree.query(xyz[rows], k=k + 1, workers=-1))
+        away, near = nearest_in(tree, xyz[rows], k + 1)
         # The point itself is usually first, but not always among duplicates.
         itself = near == np.arange(n)[rows, None]
         itself[~itself.any(axis=1), -1] = True

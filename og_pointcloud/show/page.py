@@ -98,7 +98,7 @@ def write_page(
     # Names come from files: no text of theirs may end the element that holds it.
     text = json.dumps(data, ensure_ascii=False, allow_nan=False).replace("<", "\\u003c")
     with replacing(path) as file:
-        file.write(TEMPLATE.read_text(encoding="utf-8").replace("/*SCENE*/", text).encode())
+        file.write(TEMPLATE.read_text(encoding="utf-8").replace("/*SCENE*/", text).encode(errors="backslashreplace"))
     return " and ".join(left_out)
 
 

@@ -38,13 +38,16 @@ def resolve_labels(
     sources = [source for source in (_of_space(text_features, feature_space), own_words) if source is not None]
     if labels is None:
         if not sources:
-            raise OgPointcloudError(f"no labels are given, and the scene has no words: {_ways(feature_space)}")
+            how = "" if find_encoder(feature_space, carried) else f"; {_ways(feature_space)}"
+            raise OgPointcloudError(
+                f"no labels are given, and the scene has no words: name some, as --labels chair,table does{how}"
+            )
         labels = sources[0]
     if isinstance(labels, Vocabulary):
         return _checked(labels.names, labels.vectors)
     if isinstance(labels, Mapping):
         return _checked([str(name) for name in labels], _stacked(labels))
-    words = (labels,) if isinstance(labels, str) else tuple(labels)
+    words = tuple(labels) if isinstance(labels, Iterable) and not isinstance(labels, (str, bytes)) else (labels,)
     for word in words:
         if not isinstance(word, str):
             raise OgPointcloudError(f"label {word!r:.60} is a {type(word).__name__}; expected words, or name -> vector")
