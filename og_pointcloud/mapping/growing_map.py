@@ -13,14 +13,15 @@ from numpy.typing import ArrayLike, NDArray
 
 from og_pointcloud.cloud import FeatureSpace
 from og_pointcloud.formats.depth import DepthImage
-from og_pointcloud.formats.fusion import on_surface, to_world
+from og_pointcloud.formats.fusion import GRAZING, NOISE_TOLERANCE, to_world
 from og_pointcloud.formats.poses import in_local_frame
+from og_pointcloud.kernels import njit
 from og_pointcloud.mapping.frame import CheckedFrame
 from og_pointcloud.mapping.kept_views import KeptView, KeptViews
 from og_pointcloud.mapping.presence import Presence, tolerance_of
 from og_pointcloud.mapping.sight import AGREES, THROUGH, MeasuredView, states_of_points
 from og_pointcloud.mapping.tracks import NO_TRACK, PointVotes, Tracks
-from og_pointcloud.mapping.voxels import VoxelPoints
+from og_pointcloud.mapping.voxels import VoxelPoints, lens_of
 from og_pointcloud.rendering.geometry import isotropic
 from og_pointcloud.rendering.sightings import Sightings, openness, sightings_of
 from og_pointcloud.rendering.splatting import NEAR_SHARE
@@ -32,6 +33,9 @@ MARGIN = 0.1
 """Share of an image beyond its border from which points are drawn, as they may hide others within."""
 READINGS_PER_SPACING = 1.5
 """Readings a spacing that a frame gives to the map, along each axis: more would only be averaged."""
+STRAIGHT, BEND = 4, 0.25
+"""Readings in a row that are of one surface, however slanted, if their inverse depths change by the same, to this share:
+it is of a plane."""
 MOST_ODDS = 3.0
 """Frames that history counts for at most."""
 RECENT_FRAMES = 4096
@@ -173,11 +177,45 @@ class GrowingMap:
 
 def _readings(view: MeasuredView, step: int) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """(xyz (m, 3), flat pixel (m,)) of every step-th reading that lies on a surface, along each axis."""
-    image = DepthImage(view.depth, view.camera)
     chosen = np.zeros(view.depth.shape, np.bool_)
     every = slice(step // 2, None, step)
-    chosen[every, every] = on_surface(image, view.noise)[every, every]
-    return to_world(image, chosen), np.flatnonzero(chosen)
+    chosen[every, every] = _on_surface(view.depth, step, lens_of(view.camera), view.noise)
+    return to_world(DepthImage(view.depth, view.camera), chosen), np.flatnonzero(chosen)
+
+
+@njit(cache=True, nogil=True)
+def _on_surface(depth, step, lens, noise):  # noqa: ANN001, ANN202
+    """Of every step-th reading along each axis, whether it is of one surface with others beside it and above or below
+    it."""
+    rows, columns = np.arange(step // 2, depth.shape[0], step), np.arange(step // 2, depth.shape[1], step)
+    kept = np.zeros((len(rows), len(columns)), np.bool_)
+    for i in range(len(rows)):
+        for j in range(len(columns)):
+            row, column = rows[i], columns[j]
+            if depth[row, column] > 0:
+                across = _joined(depth[row], column, lens[0], noise)
+                kept[i, j] = across and _joined(depth[:, column], row, lens[1], noise)
+    return kept
+
+
+@njit(cache=True, nogil=True)
+def _joined(line, k, focal, noise):  # noqa: ANN001, ANN202
+    """Whether reading k of a row or column is of one surface with a neighbor: as `fusion.on_surface` has it, or, where
+    the surface is seen at more of a slant, as one of STRAIGHT readings on a line. On a plane the inverse of depth is
+    linear in the image; a reading between two surfaces lies anywhere."""
+    n = len(line)
+    for other in (k - 1, k + 1):
+        if 0 <= other < n and line[other] > 0:
+            nearer = min(line[other], line[k])
+            if abs(line[other] - line[k]) <= nearer * GRAZING / focal + NOISE_TOLERANCE * noise:
+                return True
+    for first in range(max(k - STRAIGHT + 1, 0), min(k, n - STRAIGHT) + 1):
+        part = line[first : first + STRAIGHT]
+        if part.min() > 0:
+            slope = np.diff(1 / part)
+            if np.ptp(slope) <= BEND * np.abs(slope).min():
+                return True
+    return n == 1
 
 
 @dataclass(frozen=True)
