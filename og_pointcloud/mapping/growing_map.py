@@ -34,8 +34,7 @@ MARGIN = 0.1
 READINGS_PER_SPACING = 1.5
 """Readings a spacing that a frame gives to the map, along each axis: more would only be averaged."""
 STRAIGHT, BEND = 4, 0.25
-"""Readings in a row that are of one surface, however slanted, if their inverse depths change by the same, to this share:
-it is of a plane."""
+"""Readings in a row that are of one surface, however slanted, if their inverse depths change evenly, to this share."""
 MOST_ODDS = 3.0
 """Frames that history counts for at most."""
 RECENT_FRAMES = 4096
@@ -107,7 +106,8 @@ class GrowingMap:
             return np.zeros(0, np.int32)
         camera = view.camera
         step = max(1, int(points.edge / view.pixel / READINGS_PER_SPACING))
-        xyz, pixel = _readings(view, step)
+        chosen = _on_surface(view.depth, step, lens_of(camera), view.noise)
+        xyz, pixel = to_world(DepthImage(view.depth, camera), chosen), np.flatnonzero(chosen)
         rgb = np.full((len(xyz), 3), 128, np.uint8)
         if frame.rgb is not None:
             scale = frame.rgb.shape[0] / camera.height, frame.rgb.shape[1] / camera.width
@@ -175,34 +175,23 @@ class GrowingMap:
         return self.recent[max(place, 0)] if sequence > 0 else -np.inf
 
 
-def _readings(view: MeasuredView, step: int) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """(xyz (m, 3), flat pixel (m,)) of every step-th reading that lies on a surface, along each axis."""
-    chosen = np.zeros(view.depth.shape, np.bool_)
-    every = slice(step // 2, None, step)
-    chosen[every, every] = _on_surface(view.depth, step, lens_of(view.camera), view.noise)
-    return to_world(DepthImage(view.depth, view.camera), chosen), np.flatnonzero(chosen)
-
-
 @njit(cache=True, nogil=True)
 def _on_surface(depth, step, lens, noise):  # noqa: ANN001, ANN202
-    """Of every step-th reading along each axis, whether it is of one surface with others beside it and above or below
-    it."""
-    rows, columns = np.arange(step // 2, depth.shape[0], step), np.arange(step // 2, depth.shape[1], step)
-    kept = np.zeros((len(rows), len(columns)), np.bool_)
-    for i in range(len(rows)):
-        for j in range(len(columns)):
-            row, column = rows[i], columns[j]
-            if depth[row, column] > 0:
-                across = _joined(depth[row], column, lens[0], noise)
-                kept[i, j] = across and _joined(depth[:, column], row, lens[1], noise)
-    return kept
+    """(H, W) bool: every step-th reading along each axis that is of one surface with others beside it, and above or
+    below it."""
+    chosen = np.zeros(depth.shape, np.bool_)
+    for row in range(step // 2, depth.shape[0], step):
+        for column in range(step // 2, depth.shape[1], step):
+            if depth[row, column] > 0 and _joined(depth[row], column, lens[0], noise):
+                chosen[row, column] = _joined(depth[:, column], row, lens[1], noise)
+    return chosen
 
 
 @njit(cache=True, nogil=True)
 def _joined(line, k, focal, noise):  # noqa: ANN001, ANN202
-    """Whether reading k of a row or column is of one surface with a neighbor: as `fusion.on_surface` has it, or, where
-    the surface is seen at more of a slant, as one of STRAIGHT readings on a line. On a plane the inverse of depth is
-    linear in the image; a reading between two surfaces lies anywhere."""
+    """Whether reading k of a row or column is of one surface with its neighbors: as `fusion.on_surface` has it, or, at
+    more of a slant, on a line with them. Inverse depths of a plane are linear in the image; those of readings between
+    two surfaces lie anywhere."""
     n = len(line)
     for other in (k - 1, k + 1):
         if 0 <= other < n and line[other] > 0:
@@ -249,13 +238,6 @@ def drawn_points(frame: CheckedFrame, known: GrowingMap, geometry: GeometrySetti
     near = NEAR_SHARE * float(np.median(depth)) if len(depth) else 1e-6
     open_, u, v = openness(drawn, camera, near, sight_thickness(spacing, known.points.edge, geometry))
     return _seen(frame, rows, open_, np.stack([u, v], axis=1))
-
-
-def seen_again(view: KeptView, known: GrowingMap, geometry: GeometrySettings) -> KeptView:
-    """A kept view without depth, as points of the map's scale show it."""
-    frame = CheckedFrame(view.camera, view.masks, view.features, None, None, view.stamp)
-    seen = drawn_points(frame, known, geometry)
-    return KeptView.of(frame, view.sequence, seen.found, seen.rows)
 
 
 def _seen(

@@ -11,7 +11,9 @@ from og_pointcloud.cloud import InstanceTable, LabelledCloud
 from og_pointcloud.fitting.fit import Prepared, fit_prepared, front_surfaces
 from og_pointcloud.fitting.held_out import choose_scale
 from og_pointcloud.journal import Journal
-from og_pointcloud.mapping.growing_map import GrowingMap, seen_again
+from og_pointcloud.mapping.frame import CheckedFrame
+from og_pointcloud.mapping.growing_map import GrowingMap, drawn_points
+from og_pointcloud.mapping.kept_views import KeptView
 from og_pointcloud.rendering.geometry import Neighbourhood, isotropic, near_plane
 from og_pointcloud.rendering.surface import Surface, sight_thickness
 from og_pointcloud.scene import Points, Scene, View
@@ -52,7 +54,10 @@ def _choose_scale(
     scale = choose_scale(points, spacing, views, near, settings, journal).scale
     known.drawn, before, known.scale = len(drawn), known.scale or settings.geometry.middle_scale, scale
     for k in drawn if scale != before else ():
-        kept[k] = seen_again(kept[k], known, settings.geometry)
+        view = kept[k]
+        frame = CheckedFrame(view.camera, view.masks, view.features, None, None, view.stamp)
+        seen = drawn_points(frame, known, settings.geometry)
+        kept[k] = KeptView.of(frame, view.sequence, seen.found, seen.rows)
 
 
 def matched_ids(

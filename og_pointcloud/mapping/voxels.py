@@ -56,7 +56,7 @@ class VoxelHash:
         if 2 * count > len(self.keys):
             size, before = 1 << int(2 * count - 1).bit_length(), (self.keys, self.rows)
             self.keys, self.rows = np.full(size, EMPTY), np.zeros(size, np.int32)
-            _refill(*before, self.keys, self.rows)
+            _index(*before, self.keys, self.rows)
 
 
 @dataclass
@@ -86,10 +86,17 @@ class Packets:
         self.high = np.concatenate([self.high, np.maximum.reduceat(xyz[order], begins)])
 
     def before(self, camera: Camera, edge: float, margin: float = 0.0) -> NDArray[np.int32]:
-        """Rows of packets that may have points in an image, or within a share ``margin`` of it. edge: how far points
-        may have moved since they were filed."""
-        boxes, size = (self.low, self.high), (camera.width, camera.height)
-        return self._rows(_before(boxes, edge, camera.world_to_camera, lens_of(camera), size, margin))
+        """Rows of packets that may have points in an image, or within a share ``margin`` of it: the sphere around their
+        box meets the frustum. edge: how far points may have moved since they were filed."""
+        fx, fy, cx, cy = lens_of(camera)
+        across, down = margin * camera.width, margin * camera.height
+        # All sides but the near one go through the camera; their normals point inwards.
+        left, right = (fx, 0, cx + across), (-fx, 0, camera.width + across - cx)
+        sides = np.array([(0, 0, 1), left, right, (0, fy, cy + down), (0, -fy, camera.height + down - cy)])
+        sides /= np.linalg.norm(sides, axis=1, keepdims=True)
+        low, high, pose = self.low.astype(np.float64), self.high.astype(np.float64), camera.world_to_camera
+        inside = ((low + high) / 2 @ pose[:3, :3].T + pose[:3, 3]) @ sides.T
+        return self._rows(inside.min(axis=1) > -2 * edge - np.linalg.norm(high - low, axis=1) / 2)
 
     def within(self, low: NDArray[np.floating], high: NDArray[np.floating]) -> NDArray[np.int32]:
         """Rows of the packets that meet a box."""
@@ -160,7 +167,7 @@ class VoxelPoints(Columns):
     def refile(self) -> None:
         """After points were moved."""
         self.hash.keys[:] = EMPTY
-        _index(self.xyz, self.edge, self.hash.keys, self.hash.rows)
+        _index(_keys(self.xyz, self.edge), np.arange(self.n), self.hash.keys, self.hash.rows)
         self.packets = Packets(self.packets.side)
         self.packets.file(self.xyz)
 
@@ -222,45 +229,12 @@ def _slot(key, keys):  # noqa: ANN001, ANN202
 
 
 @njit(cache=True, nogil=True)
-def _refill(old_keys, old_rows, keys, rows):  # noqa: ANN001, ANN202
-    for k in range(len(old_keys)):
-        if old_keys[k] != EMPTY:
-            slot = _slot(old_keys[k], keys)
-            keys[slot], rows[slot] = old_keys[k], old_rows[k]
-
-
-@njit(cache=True, nogil=True)
-def _before(boxes, edge, pose, lens, size, margin):  # noqa: ANN001, ANN202
-    """(packets,) bool: whether the sphere around a box meets the frustum."""
-    (low, high), (fx, fy, cx, cy), (width, height) = boxes, lens, size
-    across, down = margin * width, margin * height
-    # The four sides of the frustum go through the camera; their normals point inwards.
-    sides = np.array([
-        (fx, 0.0, cx + across), (-fx, 0.0, width + across - cx), (0.0, fy, cy + down), (0.0, -fy, height + down - cy)
-    ])  # fmt: skip
-    for side in range(4):
-        sides[side] /= np.sqrt((sides[side] ** 2).sum())
-    meets = np.zeros(len(low), np.bool_)
-    for k in range(len(low)):
-        x, y, z = in_camera(
-            pose, ((low[k, 0] + high[k, 0]) / 2, (low[k, 1] + high[k, 1]) / 2, (low[k, 2] + high[k, 2]) / 2)
-        )
-        p, q, r = high[k, 0] - low[k, 0], high[k, 1] - low[k, 1], high[k, 2] - low[k, 2]
-        reach = 2 * edge + np.sqrt(p * p + q * q + r * r) / 2
-        inside = z > -reach
-        for side in range(4):
-            inside &= sides[side, 0] * x + sides[side, 1] * y + sides[side, 2] * z > -reach
-        meets[k] = inside
-    return meets
-
-
-@njit(cache=True, nogil=True)
-def _index(xyz, edge, keys, rows):  # noqa: ANN001, ANN202
-    for i in range(len(xyz)):
-        key = _key(xyz[i, 0], xyz[i, 1], xyz[i, 2], edge)
-        slot = _slot(key, keys)
-        if keys[slot] == EMPTY:
-            keys[slot], rows[slot] = key, i
+def _index(new_keys, new_rows, keys, rows):  # noqa: ANN001, ANN202
+    """Put in what is not there yet; EMPTY keys are passed over."""
+    for k in range(len(new_keys)):
+        slot = _slot(new_keys[k], keys)
+        if new_keys[k] != EMPTY and keys[slot] == EMPTY:
+            keys[slot], rows[slot] = new_keys[k], new_rows[k]
 
 
 @njit(cache=True, nogil=True)
