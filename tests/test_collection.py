@@ -129,11 +129,12 @@ def test_a_word_is_never_asked_in_the_space_of_another_encoder(folder):
         "other name": scene(["chair"], encoder=impostor, words=["desk"], space="another/encoder"),
         "nobody's": scene(["chair"], encoder=impostor, words=["desk"], space="unknown"),
         "nobody's too": scene(["chair"], encoder=impostor, words=[], space="unknown"),
+        "of one of two": scene(["lamp"], words=[]),
     }
     collection = indexed(folder, clouds)
     found = collection.find("lamp", top=100)
     assert {finding.scene for finding in found} == {"ours"}
-    assert len(found.not_asked) == 3
+    assert len(found.not_asked) == 4
     found = collection.find("chair", top=100)
     assert {finding.scene for finding in found} == {"ours", "same name"}
     best = {finding.scene: finding.instance for finding in reversed(found)}
