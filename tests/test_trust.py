@@ -8,6 +8,7 @@ import importlib
 import itertools
 import json
 import os
+import re
 import shutil
 import struct
 import subprocess
@@ -392,6 +393,21 @@ def test_what_killed_runs_left_is_removed_and_what_others_write_is_not(tmp_path)
 def test_a_full_disk_is_told_with_the_path(tmp_path):
     with pytest.raises(OSError, match=r"No space left.*s\.ply"), replacing(tmp_path / "s.ply"):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("command", ["segment -o s.ply", pytest.param("view --png s.png", marks=pytest.mark.slow)])
+def test_a_disk_that_is_full_while_a_command_writes(bundle, tmp_path, capsys, monkeypatch, command):
+    resource = pytest.importorskip("resource")
+    monkeypatch.chdir(tmp_path)
+    name, *rest = command.split()
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4096, limits[1]))
+    try:
+        assert main([name, str(bundle), *rest]) == 2
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert re.fullmatch(rf"error: '?{rest[1]}'?: File too large, it was not written.*\n", capsys.readouterr().err)
     assert list(tmp_path.iterdir()) == []
 
 

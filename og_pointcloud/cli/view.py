@@ -35,6 +35,8 @@ def run(arguments: argparse.Namespace) -> None:
     check_scene_options(arguments)
     from og_pointcloud.ask.hosts import import_plugin
     from og_pointcloud.cli.segment import describe_segmentation, print_segmentation
+    from og_pointcloud.formats.atomic import replacing
+    from og_pointcloud.show.findings_page import png_bytes
     from og_pointcloud.show.page import Look, write_page
 
     journal = Journal(progress=False)
@@ -53,8 +55,9 @@ def run(arguments: argparse.Namespace) -> None:
         print(f"left out of the page: {left_out}")
     if arguments.png:
         draw = import_plugin("og_pointcloud_pyvista.screening", "pyvista").draw
-        arguments.png.parent.mkdir(parents=True, exist_ok=True)
-        draw(scene, result, rgb, shown, view, look).screenshot(arguments.png)
+        picture = draw(scene, result, rgb, shown, view, look).screenshot(return_img=True)
+        with replacing(arguments.png) as file:
+            file.write(png_bytes(picture))
     outputs = [path for path in (page, arguments.png) if path]
     print_segmentation(describe_segmentation(result, journal, arguments.bundle, outputs[0]))
     for path in outputs[1:]:

@@ -90,7 +90,7 @@ def write_ply(
         with replacing(path) as file:
             file.write("\n".join([*header, "end_header", ""]).encode())
             for rows in packed.values():
-                rows.tofile(file)
+                file.write(rows.data)
 
 
 def join_columns(columns: Mapping[str, NDArray]) -> NDArray[np.void]:
