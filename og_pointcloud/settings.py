@@ -289,6 +289,8 @@ class FitSettings:
     paper: PaperSettings = field(default_factory=PaperSettings)
 
     def __post_init__(self) -> None:
+        if self.seed < 0:
+            raise OgPointcloudError(f"seed is {self.seed}; expected 0 or more")
         if self.memory is not None and not self.memory > 0:
             raise OgPointcloudError(f"memory is {self.memory} bytes; expected more than 0, or None")
         if self.tile_points is not None and self.tile_points < 1:

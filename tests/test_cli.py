@@ -112,6 +112,7 @@ def test_fit_reports_its_stages_and_next_command(tiny_capture, tmp_path, capsys)
     assert report["seconds"] == pytest.approx(sum(stage["seconds"] for stage in report["stages"]), abs=0.01)
     command = next(line for line in stdout.splitlines() if line.startswith("next: og-pointcloud "))
     assert ",".join(NAMES) in command
+    assert command.endswith("tiny_labels.ply"), "tiny.ply may be the cloud that was fitted"
     assert run(capsys, *shlex.split(command)[2:])[0] == 0, "the next command must work as printed"
 
 

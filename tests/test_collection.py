@@ -289,6 +289,7 @@ def test_hostile_atlases_are_refused(judged, tmp_path, change, cause):
     with pytest.raises(OgPointcloudError, match=cause) as caught:
         og.Collection(path).find("chair")
     assert str(caught.value).startswith(f"{path} is no atlas that can be used")
+    assert "remove" not in str(caught.value)  # it may be another file of the user's
 
 
 def test_damaged_bytes_are_refused_or_answered(judged, tmp_path):
@@ -404,5 +405,9 @@ def test_lance_proposes_what_the_exact_search_finds(folder, tmp_path, capsys, mo
     capsys.readouterr()
     assert main(["find", atlas, "bed", "--lance", uri, "--json", "--top", "1"]) == 0
     assert len(json.loads(capsys.readouterr().out)) == 1
+    with pytest.raises(OgPointcloudError, match="is no folder; expected what og-pointcloud index --lance wrote"):
+        og.Collection(atlas, lance=str(tmp_path / "other")).find("bed")
+    assert not (tmp_path / "other").exists()
+    (tmp_path / "other").mkdir()
     with pytest.raises(OgPointcloudError, match="has no table for these scenes"):
         og.Collection(atlas, lance=str(tmp_path / "other")).find("bed")

@@ -286,6 +286,8 @@ def test_bad_use_is_told_at_the_door():
         fit(behind, FitSettings(tile_points=1600), progress=False)
     with pytest.raises(OgPointcloudError, match="tile_points is 0; expected at least 1"):
         FitSettings(tile_points=0)
+    with pytest.raises(OgPointcloudError, match="seed is -1"):
+        FitSettings(seed=-1)
 
 
 def test_a_fit_is_in_tiles_where_memory_is_short_and_they_help(monkeypatch):

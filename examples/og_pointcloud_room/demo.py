@@ -78,10 +78,10 @@ def run_demo(
     Prints one line per stage and a table.
     """
     seconds: dict[str, float] = {}
+    settings = FitSettings(seed=seed)
     with stage("make the room", seconds):
         capture = make_capture(seed, CaptureSettings(mask_noise=mask_noise))
         folder = write_capture(capture, output / "capture")
-    settings = FitSettings(seed=seed)
     with stage("read the capture", seconds):
         scene = read_capture(folder)
     with stage("render the masks", seconds):

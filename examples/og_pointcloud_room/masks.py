@@ -12,6 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
+from og_pointcloud.errors import OgPointcloudError
+
 __all__ = ["MaskNoise", "propose_masks"]
 
 Random = np.random.Generator
@@ -38,7 +40,7 @@ class MaskNoise:
     def scaled(self, level: float) -> MaskNoise:
         """The same proposer with every chance and the edges' wandering times ``level`` (0: perfect masks)."""
         if not level >= 0:
-            raise ValueError(f"mask noise is {level}; expected 0 (perfect masks) or more (1: the default noise)")
+            raise OgPointcloudError(f"mask noise is {level}; expected 0 (perfect masks) or more (1: the default noise)")
         names = ("split", "merge", "miss", "spurious", "wrong_class")
         chances = {name: min(level * getattr(self, name), 1.0) for name in names}
         return replace(self, edge_px=level * self.edge_px, **chances)

@@ -206,7 +206,7 @@ def print_fit(report: Mapping[str, Any], cloud: LabelledCloud) -> None:
     output = report["output"]
     if cloud.vocabulary or find_encoder(cloud.feature_space, carried_encoder(output)):
         labels = cloud.vocabulary.names[:2] if cloud.vocabulary else ("chair", "table")
-        print_next("segment", output, "--labels", ",".join(labels), "-o", Path(output).with_suffix(".ply"))
+        print_next("segment", output, "--labels", ",".join(labels), "-o", labels_file(output))
     else:
         print("no words are known yet: segment takes --text-features, or what export text makes of the masks' encoder")
         print_next("instances", output)
@@ -296,6 +296,11 @@ def numbers(text: str, option: str, count: int) -> list[float]:
 
 def some_of(words: Sequence[str]) -> str:
     return ", ".join(printable(word, LONGEST_CELL) for word in words[:SHOWN]) + (", ..." if len(words) > SHOWN else "")
+
+
+def labels_file(bundle: Path | str) -> Path:
+    """Where labels are advised to go: never S.ply, which may be the cloud that was fitted."""
+    return Path(bundle).with_name(f"{Path(bundle).stem}_labels.ply")
 
 
 def calibration_hint(bundle: Path | str) -> str:

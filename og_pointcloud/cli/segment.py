@@ -6,6 +6,7 @@ og-pointcloud segment kitchen.ogpc --labels chair,table -o labels.npz
 from __future__ import annotations
 
 import argparse
+import shlex
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -72,5 +73,5 @@ def print_segmentation(report: Mapping[str, Any]) -> None:
     if report["output"]:
         print(f"wrote {report['output']}")
     else:
-        ply = Path(report["bundle"]).with_suffix(".ply")
-        common.print_next("segment", report["bundle"], "-o", ply, hint="keep the labels with -o, e.g. ")
+        file = shlex.quote(str(common.labels_file(report["bundle"])))
+        print(f"next: the same command with -o {file} keeps the labels")

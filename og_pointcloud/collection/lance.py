@@ -72,6 +72,8 @@ class LanceTables:
     """The tables that `write_lance` wrote."""
 
     def __init__(self, uri: str) -> None:
+        if "://" not in uri and not os.path.isdir(uri):
+            raise OgPointcloudError(f"'{uri}' is no folder; expected what og-pointcloud index --lance wrote")
         self._uri, self._database = uri, _database(uri)
 
     def propose(

@@ -286,5 +286,5 @@ def _explained(path: Path, reason: str) -> OgPointcloudError:
 
 
 def _refused(path: Path, reason: str) -> OgPointcloudError:
-    again = "remove it and make it again with og-pointcloud index"
+    again = "give an atlas, or a new name, to og-pointcloud index"
     return OgPointcloudError(f"{path} is no atlas that can be used ({reason:.120}): {again}")
