@@ -20,45 +20,48 @@ STRAIGHT_EDGE = 2 / np.pi
 def seen_through_holes(xy, depth, weight, area, gap, front_share):  # noqa: ANN001, ANN201
     """(n,) bool, the points of one mask that lie behind others of it which surround them in the image.
 
-    xy: (n, 2) float64, places in the image at depth 1; area: of the mask, there. depth, weight: (n,). gap: a step in
-    depth wider than this parts the points about a place, if it is no less than that place is wide: so deep is a slanted
-    surface. The nearest part with front_share of their weight is the surface there. What lies behind its rim is not
-    surrounded: rims of masks, and what a depth sensor puts there, are uncertain, and other rules judge of them.
+    xy: (n, 2) float64, places in the image at depth 1; area: of the mask, there. depth, weight: (n,), depths ascending.
+    gap: a step in depth wider than this parts the points about a place, if it is no less than that place is wide: so
+    deep is a slanted surface. The nearest part with front_share of their weight is the surface there. What lies behind
+    its rim is not surrounded: rims of masks, and what a depth sensor puts there, are uncertain, and other rules judge
+    of them.
     """
     n = len(depth)
     hidden = np.zeros(n, np.bool_)
-    if n == 0 or depth.max() - depth.min() <= gap:
+    if n == 0 or depth[-1] - depth[0] <= gap:
         return hidden
     # Three by three cells are the window that the points of the middle one are looked at in.
     low, span = np.array([xy[:, 0].min(), xy[:, 1].min()]), np.array([np.ptp(xy[:, 0]), np.ptp(xy[:, 1])])
     cell = np.sqrt(max(area * WINDOW / 9, span[0] * span[1] / 4) / n)
     cell = max(cell, span.sum() / (4 * n), 1e-12)
     columns, rows = int(span[0] / cell) + 1, int(span[1] / cell) + 1
-    start, members = _by_cell(xy - low, cell, columns, rows)
-    nearest, farthest = _depths_by_cell(depth, start, members)
+    start, members = _by_cell(xy, low, cell, columns, rows)
     window = np.empty(n, np.int64)
     for middle in range(columns * rows):
-        near = _least_about(nearest, middle, columns, rows)
-        step = max(gap, 3 * cell * near)
-        # What is hidden lies a step behind the nearest point or more: in most cells nothing does.
-        if not farthest[middle] - near > step:
+        inside = members[start[middle] : start[middle + 1]]  # numbers of points ascend as their depths do
+        if len(inside) == 0 or depth[inside[-1]] - depth[0] <= gap:
             continue
         about = _about(middle, start, members, columns, rows, window)
-        about = about[np.argsort(depth[about])]
-        begin, end = _front(depth[about], weight[about], step, front_share)
-        for point in members[start[middle] : start[middle + 1]]:
-            if end < len(about) and depth[point] >= depth[about[end]]:
+        near = depth[about.min()]
+        step = max(gap, 3 * cell * near)
+        # What is hidden lies a step behind the nearest point or more: in most cells nothing does.
+        if not depth[inside[-1]] - near > step:
+            continue
+        _sort(about)
+        begin, end = _front(depth, weight, about, step, front_share)
+        for point in inside:
+            if end < len(about) and point >= about[end]:
                 hidden[point] = _surrounded(xy, point, about[begin:end])
     return hidden
 
 
 @njit(cache=True, nogil=True)
-def _by_cell(xy, cell, columns, rows):  # noqa: ANN001, ANN202
-    """(start, members): the points by the cell of a grid that they lie in, row by row."""
+def _by_cell(xy, low, cell, columns, rows):  # noqa: ANN001, ANN202
+    """(start, members): the points by the cell of a grid that they lie in, row by row; of a cell, as they come."""
     place = np.empty(len(xy), np.int64)
     start = np.zeros(columns * rows + 1, np.int64)
     for i in range(len(xy)):
-        place[i] = int(xy[i, 1] / cell) * columns + int(xy[i, 0] / cell)
+        place[i] = int((xy[i, 1] - low[1]) / cell) * columns + int((xy[i, 0] - low[0]) / cell)
         start[place[i] + 1] += 1
     start = np.cumsum(start)
     end, members = start[:-1].copy(), np.empty(len(xy), np.int64)
@@ -66,28 +69,6 @@ def _by_cell(xy, cell, columns, rows):  # noqa: ANN001, ANN202
         members[end[place[i]]] = i
         end[place[i]] += 1
     return start, members
-
-
-@njit(cache=True, nogil=True)
-def _depths_by_cell(depth, start, members):  # noqa: ANN001, ANN202
-    """(nearest, farthest): the least and the greatest depth in each cell; inf and -inf where it is empty."""
-    nearest, farthest = np.full(len(start) - 1, np.inf), np.full(len(start) - 1, -np.inf)
-    for cell in range(len(start) - 1):
-        for point in members[start[cell] : start[cell + 1]]:
-            nearest[cell] = min(nearest[cell], depth[point])
-            farthest[cell] = max(farthest[cell], depth[point])
-    return nearest, farthest
-
-
-@njit(cache=True, nogil=True)
-def _least_about(values, middle, columns, rows):  # noqa: ANN001, ANN202
-    """The least of a cell's value and those of the cells around it."""
-    row, column = divmod(middle, columns)
-    least = np.inf
-    for other in range(max(row - 1, 0), min(row + 2, rows)):
-        for beside in range(max(column - 1, 0), min(column + 2, columns)):
-            least = min(least, values[other * columns + beside])
-    return least
 
 
 @njit(cache=True, nogil=True)
@@ -104,17 +85,32 @@ def _about(middle, start, members, columns, rows, window):  # noqa: ANN001, ANN2
 
 
 @njit(cache=True, nogil=True)
-def _front(depth, weight, gap, front_share):  # noqa: ANN001, ANN202
-    """(begin, end) of the nearest run of ascending depths, parted by gaps, with this share of all weight; (0, n) where
-    there is none."""
-    begin, mass, least = 0, weight[0], front_share * weight.sum()
-    for k in range(1, len(depth)):
-        if depth[k] - depth[k - 1] > gap:
+def _sort(numbers):  # noqa: ANN001, ANN202
+    """Sorts in place; a few runs that ascend already by insertion."""
+    if len(numbers) > 4 * WINDOW:
+        numbers.sort()
+    for k in range(1, len(numbers)):
+        number, place = numbers[k], k
+        while place > 0 and numbers[place - 1] > number:
+            numbers[place] = numbers[place - 1]
+            place -= 1
+        numbers[place] = number
+
+
+@njit(cache=True, nogil=True)
+def _front(depth, weight, points, gap, front_share):  # noqa: ANN001, ANN202
+    """(begin, end) of the nearest run of points, in ascending order of depth, parted by gaps, with this share of all
+    their weight; (0, n) where there is none."""
+    least, mass, begin = 0.0, 0.0, 0
+    for point in points:
+        least += front_share * weight[point]
+    for k in range(len(points)):
+        if k and depth[points[k]] - depth[points[k - 1]] > gap:
             if mass >= least:
                 return begin, k
             begin, mass = k, 0.0
-        mass += weight[k]
-    return 0, len(depth)
+        mass += weight[points[k]]
+    return 0, len(points)
 
 
 @njit(cache=True, nogil=True)

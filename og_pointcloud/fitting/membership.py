@@ -38,7 +38,7 @@ from og_pointcloud.fitting.mask_table import SEEN_THROUGH, MaskTable
 from og_pointcloud.fitting.view_votes import ViewVotes
 from og_pointcloud.kernels import njit, prange
 from og_pointcloud.rendering.geometry import Neighbourhood
-from og_pointcloud.rendering.splatting import Gaussians
+from og_pointcloud.rendering.splatting import Gaussians, seen_from
 from og_pointcloud.settings import MembershipSettings
 
 ENTRIES_AT_ONCE = 1 << 26
@@ -134,9 +134,8 @@ def without_see_through(
     kept, lost = np.ones(weights.nnz, np.float32), 0.0
     for mask, view in enumerate(table.mask_view.tolist()):
         entries = slice(weights.indptr[mask], weights.indptr[mask + 1])
-        pose, area = world_to_camera[view], table.mask_pixels[mask] / focal[view] ** 2
-        xyz = gaussians.xyz[weights.indices[entries]] @ pose[:3, :3].T + pose[:3, 3]
-        kept[entries] = _at_front(xyz, weights.data[entries], area, settings)
+        rays = _rays(gaussians.xyz, weights.indices[entries], world_to_camera[view])
+        kept[entries] = _at_front(*rays, weights.data[entries], table.mask_pixels[mask] / focal[view] ** 2, settings)
         lost += float(((1 - kept[entries]) * weights.data[entries]).sum(dtype=np.float64))
     if lost == 0:
         return table, 0.0
@@ -152,19 +151,53 @@ def without_see_through(
     return replace(table, weights=_scaled(weights, kept), exposure=exposure, through=through), share
 
 
+@njit(cache=True, error_model="numpy")
+def _rays(xyz, points, pose):  # noqa: ANN001, ANN202
+    """Of these points (n,) depth, and (n, 2) place in the image at depth 1."""
+    depth, xy = np.empty(len(points)), np.empty((len(points), 2))
+    for i, g in enumerate(points):
+        depth[i], xy[i, 0], xy[i, 1] = seen_from(xyz[g, 0], xyz[g, 1], xyz[g, 2], pose)
+    return depth, xy
+
+
 def _at_front(
-    xyz: NDArray[np.float64], weight: NDArray[np.float32], area: float, settings: MembershipSettings
+    depth: NDArray[np.float64],
+    xy: NDArray[np.float64],
+    weight: NDArray[np.float32],
+    area: float,
+    settings: MembershipSettings,
 ) -> NDArray[np.float32]:
-    """(n,) float32, how much of each point's weight in a mask counts. xyz: (n, 3) in the camera's frame. area: of the
-    mask, in an image at depth 1."""
-    kept, depth, size = np.ones(len(xyz), np.float32), xyz[:, 2], np.sqrt(area)
-    kept[_behind_front(depth, weight, settings.gap_sizes * size, settings.front_share)] = 0
-    front = np.flatnonzero(kept)
-    if len(front):
-        xy, depth, weight = xyz[front, :2] / depth[front, None], depth[front], weight[front]
-        gap = settings.hole_sizes * size * float(np.median(depth))
-        kept[front[seen_through_holes(xy, depth, weight, area, gap, settings.front_share)]] = SEEN_THROUGH
+    """(n,) float32, how much of each point's weight in a mask counts. depth, xy: as of `_rays`. area: of the mask, in
+    an image at depth 1."""
+    kept, size, share = np.zeros(len(depth), np.float32), np.sqrt(area), settings.front_share
+    if len(depth):
+        order = np.argsort(depth)
+        depth, weight = depth[order], weight[order]
+        front = slice(*_object(depth, weight, settings.gap_sizes * size, share))
+        order, depth, weight = order[front], depth[front], weight[front]
+        gap = settings.hole_sizes * size * (depth[(len(depth) - 1) // 2] + depth[len(depth) // 2]) / 2  # the median's
+        kept[order] = 1
+        kept[order[seen_through_holes(xy[order], depth, weight, area, gap, share)]] = SEEN_THROUGH
     return kept
+
+
+@njit(cache=True)
+def _object(depth, weight, gap_share, front_share):  # noqa: ANN001, ANN202
+    """(begin, end) of the first run of ascending depths with ``front_share`` of the weight, else of the first of all.
+
+    What is left out lies behind it, or is crumbs before it. ``gap_share`` times the median depth is the gap that parts
+    runs: the size of the mask at that depth.
+    """
+    reached = np.cumsum(weight.astype(np.float64))
+    gap = gap_share * depth[np.searchsorted(reached, 0.5 * reached[-1])]
+    first, begin, before = len(depth), 0, 0.0
+    for k in range(1, len(depth) + 1):
+        if k < len(depth) and not depth[k] - depth[k - 1] > gap:
+            continue
+        if reached[k - 1] - before >= front_share * reached[-1]:
+            return begin, k
+        first, begin, before = min(first, k), k, reached[k - 1]
+    return 0, first
 
 
 @njit(cache=True)
@@ -218,25 +251,6 @@ def _scale(indptr, columns, values, factor):  # noqa: ANN001, ANN202
                 end += 1
         starts[row + 1] = end
     return starts
-
-
-def _behind_front(
-    depth: NDArray[np.float64], weight: NDArray[np.float32], gap_share: float, front_share: float
-) -> NDArray[np.bool_]:
-    """Entries outside the first run of depths that holds ``front_share`` of the weight: behind it, or crumbs before it.
-
-    ``gap_share`` times the median depth is the gap that parts runs: the size of the mask at that depth.
-    """
-    if len(depth) == 0:
-        return np.zeros(0, bool)
-    order = np.argsort(depth)  # equal depths are of one run, whichever comes first
-    reached = np.cumsum(weight[order], dtype=np.float64)
-    middle = depth[order[np.searchsorted(reached, 0.5 * reached[-1])]]
-    run = np.concatenate([[0], np.cumsum(np.diff(depth[order]) > gap_share * middle)])
-    mass = np.bincount(run, weight[order])
-    behind = np.empty(len(depth), bool)
-    behind[order] = run != np.argmax(mass >= front_share * mass.sum())
-    return behind
 
 
 @dataclass(frozen=True)
