@@ -19,6 +19,7 @@ from og_pointcloud.fitting.membership import (
     Membership,
     _best_group,
     _by_point,
+    _object,
     _without_islands,
     assign_points,
     instance_area,
@@ -354,6 +355,23 @@ def at_depths(depth: Sequence[float]) -> Gaussians:
 
 
 LOOKING_ALONG_Z = np.eye(4)[None]
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_the_object_of_a_mask_is_that_of_the_literal_reference(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    depth = np.sort(rng.integers(1, 6, 60) + 0.5 * rng.random(60))
+    weight = rng.random(60).astype(np.float32)
+    gap_share, front_share = float(rng.uniform(0.02, 0.08)), float(rng.uniform(0.05, 0.9))
+    reached = np.cumsum(weight, dtype=np.float64)
+    middle = depth[np.searchsorted(reached, 0.5 * reached[-1])]
+    run = np.concatenate([[0], np.cumsum(np.diff(depth) > gap_share * middle)])
+    mass = np.bincount(run, weight)
+    assert len(mass) > 1
+    begin, end = _object(depth, weight, gap_share, front_share)
+    np.testing.assert_array_equal(
+        np.flatnonzero(run == np.argmax(mass >= front_share * mass.sum())), np.arange(begin, end)
+    )
 
 
 def front_of(depth: Sequence[float], views: int = 1) -> tuple[MaskTable, MaskTable, float]:

@@ -38,18 +38,22 @@ def seen_through_holes(xy, depth, weight, area, gap, front_share):  # noqa: ANN0
     start, members = _by_cell(xy, low, cell, columns, rows)
     window = np.empty(n, np.int64)
     for middle in range(columns * rows):
-        inside = members[start[middle] : start[middle + 1]]  # numbers of points ascend as their depths do
-        if len(inside) == 0 or depth[inside[-1]] - depth[0] <= gap:
+        if start[middle] == start[middle + 1]:
             continue
-        about = _about(middle, start, members, columns, rows, window)
-        near = depth[about.min()]
+        deepest = depth[members[start[middle + 1] - 1]]  # members of a cell ascend
+        if deepest - depth[0] <= gap:
+            continue
+        row = middle // columns
+        column = middle - row * columns
+        around = max(row - 1, 0), min(row + 2, rows), max(column - 1, 0), min(column + 2, columns)
+        near = depth[_nearest(around, start, members, columns, n)]
         step = max(gap, 3 * cell * near)
         # What is hidden lies a step behind the nearest point or more: in most cells nothing does.
-        if not depth[inside[-1]] - near > step:
+        if not deepest - near > step:
             continue
-        _sort(about)
+        about = _about(around, start, members, columns, window)
         begin, end = _front(depth, weight, about, step, front_share)
-        for point in inside:
+        for point in members[start[middle] : start[middle + 1]]:
             if end < len(about) and point >= about[end]:
                 hidden[point] = _surrounded(xy, point, about[begin:end])
     return hidden
@@ -72,29 +76,34 @@ def _by_cell(xy, low, cell, columns, rows):  # noqa: ANN001, ANN202
 
 
 @njit(cache=True, nogil=True)
-def _about(middle, start, members, columns, rows, window):  # noqa: ANN001, ANN202
-    """The points of a cell and of those around it, written to ``window``."""
-    row, column = divmod(middle, columns)
-    count = 0
-    for other in range(max(row - 1, 0), min(row + 2, rows)):
-        first = start[other * columns + max(column - 1, 0)]
-        last = start[other * columns + min(column + 1, columns - 1) + 1]
-        window[count : count + last - first] = members[first:last]
-        count += last - first
-    return window[:count]
+def _nearest(around, start, members, columns, n):  # noqa: ANN001, ANN202
+    """The first of n points in these cells: (first row, end of rows, first column, end of columns)."""
+    nearest = n
+    for row in range(around[0], around[1]):
+        for cell in range(row * columns + around[2], row * columns + around[3]):
+            if start[cell] < start[cell + 1]:
+                nearest = min(nearest, members[start[cell]])
+    return nearest
 
 
 @njit(cache=True, nogil=True)
-def _sort(numbers):  # noqa: ANN001, ANN202
-    """Sorts in place; a few runs that ascend already by insertion."""
-    if len(numbers) > 4 * WINDOW:
-        numbers.sort()
-    for k in range(1, len(numbers)):
-        number, place = numbers[k], k
-        while place > 0 and numbers[place - 1] > number:
-            numbers[place] = numbers[place - 1]
+def _about(around, start, members, columns, window):  # noqa: ANN001, ANN202
+    """The points of these cells, ascending, written to ``window``."""
+    count = 0
+    for row in range(around[0], around[1]):
+        for k in range(start[row * columns + around[2]], start[row * columns + around[3]]):
+            window[count] = members[k]
+            count += 1
+    about = window[:count]
+    if count > 4 * WINDOW:
+        about.sort()
+    for k in range(1, count):  # by insertion: few points, in runs that ascend already
+        point, place = about[k], k
+        while place > 0 and about[place - 1] > point:
+            about[place] = about[place - 1]
             place -= 1
-        numbers[place] = number
+        about[place] = point
+    return about
 
 
 @njit(cache=True, nogil=True)
