@@ -23,7 +23,9 @@ the scene's other points, for of surfaces of several noisy layers little is seen
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cache, partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,6 +45,7 @@ from og_pointcloud.settings import MembershipSettings
 
 ENTRIES_AT_ONCE = 1 << 26
 """Entries of the votes that are sorted by point at once: half a gigabyte."""
+_ByPoint = tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float32]]
 
 
 @dataclass(frozen=True)
@@ -78,10 +81,12 @@ def assign_points(
     has_mask = np.zeros((groups.count, table.outside.shape[0]), np.bool_)
     grouped = groups.group >= 0
     has_mask[groups.group[grouped], table.mask_view[grouped]] = True
-    support = _support(votes, groups.group, has_mask, np.ones(groups.count, np.bool_), settings.sure_share)
+    of_points = _of_points(votes)
+    support = _support(of_points, groups.group, has_mask, np.ones(groups.count, np.bool_), settings.sure_share)
     rate, dismissed = _contradicted(support, groups.count, settings)
     if dismissed.any():
-        support = _support(votes, groups.group, has_mask, ~dismissed, settings.sure_share)
+        support = _support(of_points, groups.group, has_mask, ~dismissed, settings.sure_share)
+    del of_points
     group, share, total = support.group, support.share, support.total
 
     # Sure points, and possible ones that adjoin them. What no view sees openly is not sure, however its views agree:
@@ -275,32 +280,32 @@ class _Support:
         return np.where(self.total > 0, np.clip(share, 0, 1), 0)
 
 
+def _of_points(votes: ViewVotes) -> Sequence[Callable[[], tuple[_ByPoint, _ByPoint]]]:
+    """The votes, in masks and all, of so many points at a time that they fit into memory; kept where that is all."""
+    in_mask, vote = votes.in_mask, votes.vote
+    n, runs = in_mask.shape[1], 1 + (in_mask.nnz + vote.nnz) // ENTRIES_AT_ONCE
+    bounds = [(n * run // runs, n * (run + 1) // runs) for run in range(runs)]
+    sort = [partial(lambda low, high: (_by_point(in_mask, low, high), _by_point(vote, low, high)), *b) for b in bounds]
+    return sort if runs > 1 else [cache(sort[0])]
+
+
 def _support(
-    votes: ViewVotes,
+    of_points: Sequence[Callable[[], tuple[_ByPoint, _ByPoint]]],
     group: NDArray[np.int32],
     has_mask: NDArray[np.bool_],
     allowed: NDArray[np.bool_],
     sure_share: float,
 ) -> _Support:
-    """The support of all points, so many at a time that their votes, sorted by point, fit into memory.
+    """The support of all points. of_points: as `_of_points` answers.
 
     group: (masks,) the group of each mask, groups by what they show, largest first. has_mask: (groups, views).
     allowed: (groups,) those that may be chosen.
     """
-    in_mask, vote = votes.in_mask, votes.vote
-    n = in_mask.shape[1]
-    runs = 1 + (in_mask.nnz + vote.nnz) // ENTRIES_AT_ONCE
-    found = []
-    for run in range(runs):
-        low, high = n * run // runs, n * (run + 1) // runs
-        of_points = _by_point(in_mask, low, high), _by_point(vote, low, high)
-        found.append(_best_group(*of_points, group, has_mask, allowed, sure_share))
+    found = [_best_group(*some(), group, has_mask, allowed, sure_share) for some in of_points]
     return _Support(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
 
 
-def _by_point(
-    matrix: csr_array, low: int = 0, high: int | None = None
-) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float32]]:
+def _by_point(matrix: csr_array, low: int = 0, high: int | None = None) -> _ByPoint:
     """Columns low to high of a matrix: (start, rows, data), rows ascending."""
     high = matrix.shape[1] if high is None else high
     return _columns(matrix.indptr, matrix.indices, matrix.data, low, high)
