@@ -257,7 +257,7 @@ def test_readings_on_a_surface_are_as_in_words(seed):
         near = [line[j] for j in (k - 1, k + 1) if 0 <= j < len(line) and line[j] > 0]
         if any(abs(z - line[k]) <= min(z, line[k]) * GRAZING / focal + NOISE_TOLERANCE * noise for z in near):
             return True
-        runs = (line[j : j + 4] for j in range(k - 3, k + 1) if 0 <= j <= len(line) - 4)
+        runs = (line[j : j + 5] for j in range(k - 4, k + 1) if 0 <= j <= len(line) - 5)
         slopes = [np.diff(1 / run) for run in runs if (run > 0).all()]
         return any(slope.max() - slope.min() <= 0.25 * np.abs(slope).min() for slope in slopes)
 

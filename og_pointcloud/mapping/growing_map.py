@@ -33,8 +33,8 @@ MARGIN = 0.1
 """Share of an image beyond its border from which points are drawn, as they may hide others within."""
 READINGS_PER_SPACING = 1.5
 """Readings a spacing that a frame gives to the map, along each axis: more would only be averaged."""
-STRAIGHT, BEND = 4, 0.25
-"""Readings in a row that are of one surface, however slanted, if their inverse depths change evenly, to this share."""
+STRAIGHT, BEND = 5, 0.25
+"""Readings in a row, more than sensors put between surfaces, that are of one if their inverse depths change evenly."""
 MOST_ODDS = 3.0
 """Frames that history counts for at most."""
 RECENT_FRAMES = 4096
@@ -81,9 +81,7 @@ class GrowingMap:
         """Rows of the points that are there and may fall into an image, or within a share ``margin`` of it; of more
         than ``most`` about so many, evenly chosen."""
         rows = self.points.packets.before(camera, self.points.edge, margin=margin)
-        return self._there(rows[:: 1 + len(rows) // most])
-
-    def _there(self, rows: NDArray[np.int32]) -> NDArray[np.int32]:
+        rows = rows[:: 1 + len(rows) // most]
         return rows[self.points.weight[rows] > 0]
 
     def spacing_of(self, rows: NDArray[np.int32]) -> NDArray[np.float32]:
@@ -130,8 +128,8 @@ class GrowingMap:
     def rows_of(self, track: int) -> NDArray[np.int32]:
         """Rows of the points of a track; only its surroundings are gone through."""
         (low, high), edge = self.tracks.tracks[track].box, self.points.edge
-        rows = self._there(self.points.packets.within(low - edge, high + edge))
-        return rows[self.votes.best(rows, self.tracks.root) == track]
+        rows = self.points.packets.within(low - edge, high + edge)
+        return rows[(self.points.weight[rows] > 0) & (self.votes.best(rows, self.tracks.root) == track)]
 
     def forget(self, rows: NDArray[np.int32]) -> None:
         """What was known of points that left, or whose thing did."""

@@ -94,9 +94,9 @@ class Packets:
         left, right = (fx, 0, cx + across), (-fx, 0, camera.width + across - cx)
         sides = np.array([(0, 0, 1), left, right, (0, fy, cy + down), (0, -fy, camera.height + down - cy)])
         sides /= np.linalg.norm(sides, axis=1, keepdims=True)
-        low, high, pose = self.low.astype(np.float64), self.high.astype(np.float64), camera.world_to_camera
-        inside = ((low + high) / 2 @ pose[:3, :3].T + pose[:3, 3]) @ sides.T
-        return self._rows(inside.min(axis=1) > -2 * edge - np.linalg.norm(high - low, axis=1) / 2)
+        pose, reach = camera.world_to_camera, 2 * edge + np.linalg.norm(self.high - self.low, axis=1) / 2
+        inside = (self.low + self.high) / 2 @ (sides @ pose[:3, :3]).T + sides @ pose[:3, 3]
+        return self._rows((inside > -reach[:, None]).all(axis=1))
 
     def within(self, low: NDArray[np.floating], high: NDArray[np.floating]) -> NDArray[np.int32]:
         """Rows of the packets that meet a box."""
