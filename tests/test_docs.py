@@ -101,6 +101,22 @@ def test_python_in_pages_is_python_and_imports_what_exists(page):
                 assert hasattr(og, node.attr), f"og.{node.attr}"
 
 
+def test_the_six_lines_of_the_readme(tmp_path, monkeypatch):
+    """They run, and each expression of them has a value."""
+    monkeypatch.chdir(tmp_path)
+    cloud = make_cloud([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [0, 1, 2], words=("chair", "table", "red mug"))
+    og.write_bundle(cloud, "kitchen.ogpc")
+    (block, *_), names = blocks(ROOT / "README.md", "python"), {"pcd": cloud.xyz_world}
+    for statement in ast.parse(block).body:
+        code = ast.get_source_segment(block, statement)
+        assert code is not None
+        if isinstance(statement, ast.Expr):
+            value = eval(code, names)
+            assert all(one is not None for one in (value if isinstance(value, tuple) else (value,))), code
+        else:
+            exec(code, names)
+
+
 def section(page, title):
     """The text between a heading of the second level and the next."""
     return re.search(rf"^## {title}\n(.*?)(?=^## |\Z)", (ROOT / page).read_text(), re.S | re.M).group(1)

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any, overload
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from og_pointcloud.ask.boxes import Box
 from og_pointcloud.ask.choosing import Choice, Reason
 from og_pointcloud.ask.instances import SHOWN
 from og_pointcloud.ask.labelled_scene import LabelledScene, SceneLike, as_scene
@@ -42,10 +43,17 @@ class Match:
     rival: str | None
     rival_score: float
     points: int
+    _scene: LabelledScene = field(repr=False, compare=False)
+
+    @property
+    def oriented_box(self) -> Box | None:
+        """Where it is: `Instance.oriented_box` of its row in the scene's table of instances."""
+        return self._scene.instances[self.instance].oriented_box
 
     def to_dict(self) -> dict[str, Any]:
         """JSON-able."""
-        return asdict(self) | {"rival_score": None if self.rival is None else self.rival_score}
+        shown = {each.name: getattr(self, each.name) for each in fields(self) if each.repr}
+        return shown | {"rival_score": None if self.rival is None else self.rival_score}
 
 
 @dataclass(frozen=True)
@@ -146,7 +154,7 @@ def select(
     fitting = set(np.flatnonzero(choice.labels == 0).tolist() if rivals or choice.calibrated else ranked[:1])
     return Selection(
         query=query.names[0],
-        matches=tuple(_match(k, choice, k in fitting, rivals, int(points[k])) for k in ranked),
+        matches=tuple(_match(scene, k, choice, k in fitting, rivals, int(points[k])) for k in ranked),
         rivals=len(rivals.names) if rivals else 0,
         unknown=int(((points > 0) & ~known).sum()),
         calibrated=choice.calibrated,
@@ -154,13 +162,16 @@ def select(
     )
 
 
-def _match(instance: int, choice: Choice, fits: bool, rivals: Vocabulary | None, points: int) -> Match:
+def _match(
+    scene: LabelledScene, instance: int, choice: Choice, fits: bool, rivals: Vocabulary | None, points: int
+) -> Match:
     """choice: of the query, label 0, and the rivals behind it."""
     score = float(choice.scores[instance, 0])
     if rivals is None:
-        return Match(instance, score, fits, None, NO_EVIDENCE, points)
+        return Match(instance, score, fits, None, NO_EVIDENCE, points, scene)
     best = int(choice.evidence[instance, 1:].argmax())
-    return Match(instance, score, fits, rivals.names[best], float(choice.scores[instance, 1 + best]), points)
+    rival_score = float(choice.scores[instance, 1 + best])
+    return Match(instance, score, fits, rivals.names[best], rival_score, points, scene)
 
 
 def _together(query: Vocabulary, rivals: Vocabulary | None, space: str) -> NDArray[np.float32]:
