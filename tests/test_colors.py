@@ -20,14 +20,14 @@ SIDE = 24
 DARK, LIGHT = (40, 30, 30), (90, 120, 60)
 
 
-def grid(random: Generator) -> tuple[Neighbourhood, NDArray[np.int32], NDArray[np.bool_]]:
-    """The neighbourhood of a square of points, half of them of state 0, half of state 1, most of them sure."""
+def grid(random: Generator) -> tuple[Neighbourhood, NDArray[np.int32], NDArray[np.float64]]:
+    """The neighbourhood of a square of points, half of them of state 0, half of state 1, most of them sure in part."""
     x, y = np.meshgrid(np.arange(SIDE), np.arange(SIDE))
     xyz = np.stack([x, y, 0 * x], axis=-1).reshape(-1, 3) + random.normal(0, 0.05, (SIDE**2, 3))
     return (
         neighbourhood(xyz.astype(np.float32), GeometrySettings()),
         (x.ravel() >= SIDE // 2).astype(np.int32),
-        (random.random(SIDE**2) < 0.8),
+        np.where(random.random(SIDE**2) < 0.8, random.uniform(0.6, 1, SIDE**2), 0),
     )
 
 

@@ -2,8 +2,8 @@
 
 Votes are torn along borders: rays slip past edges, masks are ragged, and noise puts a point of the wall before the
 lamp. A point's color is its own, wherever the noise put it. How much a difference of color says is for the scene to
-tell (textures, light, how well colors and points fit each other): of adjoining points whose states views are sure of,
-how often is there a difference as large within one state, and how often between two?
+tell (textures, light, how well colors and points fit each other): of adjoining points, by how sure views are of their
+states, how often is there a difference as large within one state, and how often between two?
 """
 
 from __future__ import annotations
@@ -18,23 +18,26 @@ from og_pointcloud.rendering.geometry import Neighbourhood
 DIFFERENCES = 443
 """Rounded Euclidean distances of two 8-bit colors: 0 to 442."""
 LEAST_PAIRS = 30
-"""Pairs within one state, and between two, below which a scene's colors are not asked."""
+"""Sure pairs within one state, and between two, below which a scene's colors are not asked."""
+SURENESS_POWER = 4
+"""A pair of points counts by this power of the sureness of both: borders that views disagree about lie elsewhere."""
 MOST = 9.0
 """No difference counts as more times likelier within one thing than between two, or the other way round."""
 
 
 def color_ratios(
-    rgb: NDArray[np.uint8] | None, ids: NDArray[np.int32], sure: NDArray[np.bool_], around: Neighbourhood
+    rgb: NDArray[np.uint8] | None, ids: NDArray[np.int32], sureness: NDArray[np.float64], around: Neighbourhood
 ) -> NDArray[np.float32]:
     """(443,) float32: how many times likelier each difference of color is between adjoining points of one state than of
     two. It falls with the difference, from at most MOST to at least 1 / MOST; 1 throughout where colors say nothing.
 
-    rgb: (n, 3) or None. ids: (n,) the state of each point. sure: (n,) bool, the points that may be asked.
+    rgb: (n, 3) or None. ids: (n,) the state of each point. sureness: (n,) in [0, 1], how sure views are of it.
     """
     none = np.ones(DIFFERENCES, np.float32)
     if rgb is None:
         return none
-    one, two = _counted(np.ascontiguousarray(rgb), ids, sure, around.index, around.adjoining).astype(np.float64)
+    voice = np.rint(256 * sureness**SURENESS_POWER) / 256  # in such steps sums are exact, whatever the order of points
+    one, two = _counted(np.ascontiguousarray(rgb), ids, voice, around.index, around.adjoining)
     if min(one.sum(), two.sum()) < LEAST_PAIRS:
         return none
     # The chance of one state, if one and two were as frequent; a smaller difference never speaks less for one.
@@ -63,16 +66,16 @@ def _difference(a, b):  # noqa: ANN001, ANN202
 
 
 @njit(cache=True)
-def _counted(rgb, ids, sure, neighbours, adjoining):  # noqa: ANN001, ANN202
-    """(2, DIFFERENCES) int64: pairs of sure adjoining points by their difference, of one state and of two."""
-    count = np.zeros((2, DIFFERENCES), np.int64)
+def _counted(rgb, ids, voice, neighbours, adjoining):  # noqa: ANN001, ANN202
+    """(2, DIFFERENCES): pairs of adjoining points by their difference, of one state and of two, by both voices."""
+    count = np.zeros((2, DIFFERENCES))
     for g in range(len(ids)):
-        if not sure[g]:
+        if voice[g] == 0:
             continue
         for k in range(neighbours.shape[1]):
             other = neighbours[g, k]
-            if adjoining[g, k] and sure[other]:
-                count[int(ids[g] != ids[other]), _difference(rgb[g], rgb[other])] += 1
+            if adjoining[g, k] and voice[other] > 0:
+                count[int(ids[g] != ids[other]), _difference(rgb[g], rgb[other])] += voice[g] * voice[other]
     return count
 
 

@@ -93,21 +93,25 @@ def assign_points(
     # all that look at a car see the same floor through its roof.
     agreed = (group >= 0) & (share > settings.sure_share)
     typical = votes.typical_openness if typical_openness is None else typical_openness
-    hearsay = agreed & (votes.openness < settings.open_share * typical)
+    least_open = max(settings.open_share * typical, np.finfo(np.float32).tiny)
+    hearsay = agreed & (votes.openness < least_open)
     ids = np.where(agreed & ~hearsay, group, BACKGROUND).astype(np.int32)
-    sure = support.of_state(ids) > settings.sure_share
-    weights = neighbour_weights(rgb, around, color_ratios(rgb, ids, sure, around))
+    weights = neighbour_weights(rgb, around, color_ratios(rgb, ids, support.of_state(ids), around))
     possible = (group >= 0) & (share > settings.possible_share)
     ids = _grow(ids, group, possible, around.index, weights, settings.growth_votes)
-    # What is known by hearsay alone is as its neighbours are; where none of them is known better, hearsay is believed.
+    # What is known by hearsay alone is as its neighbours are; where few of them are known better, hearsay is believed,
+    # the more so the more openly the point is seen.
     ids = np.where((ids == BACKGROUND) & (total == 0), UNOBSERVED, ids)
     hearsay &= ids == BACKGROUND
-    near = _fill_unobserved(np.where(hearsay, UNOBSERVED, ids), around)
-    ids = np.where(hearsay, np.where(near == UNOBSERVED, group, near), ids)
+    ids[hearsay] = group[hearsay]
+    believed = np.full(len(ids), np.inf)
+    believed[hearsay] = (share * votes.openness / least_open * weights.sum(axis=1))[hearsay]
+    ids = _with_neighbours(ids, 1.0 - hearsay, around.index, weights, believed, True)
     # What is seen through an instance is no part of it; what no view saw is as its neighbours are.
     ids = _without_islands(ids, share, instance_area(table, groups.group, ids), around, settings.island_share)
     ids = _fill_unobserved(ids, around)
-    ids = _with_neighbours(ids, support.of_state(ids), around.index, weights, settings.own_vote)
+    own_vote = np.full(len(ids), settings.own_vote)
+    ids = _with_neighbours(ids, support.of_state(ids) ** 2, around.index, weights, own_vote, False)
     certainty = support.of_state(ids) * _agreeing(ids, around.index, around.adjoining)
     return Membership(
         ids.astype(np.int32), share.astype(np.float32), certainty.astype(np.float32), rate.astype(np.float32), dismissed
@@ -424,26 +428,26 @@ def _grow(ids, best, possible, neighbours, weights, votes):  # noqa: ANN001, ANN
 
 
 @njit(cache=True, parallel=True)
-def _with_neighbours(ids, sureness, neighbours, weights, own_vote):  # noqa: ANN001, ANN202
-    """Every point takes the state that most of its adjoining points are in, by weight and by how sure these are.
+def _with_neighbours(ids, voice, neighbours, weights, own_vote, leaves):  # noqa: ANN001, ANN202
+    """Every point takes the state that most of its adjoining points are in, by their weight and their ``voice``.
 
-    A neighbour votes for its state with its squared sureness, times its weight; the point's own state has ``own_vote``
-    votes. A point of an instance may change to another, not to background: masks are ragged, and what hysteresis
-    joined lies outside of most. All votes are on the states before (ties: the point's own, then the nearest's).
+    The point's own state has ``own_vote`` votes. Unless it ``leaves``, a point of an instance may change to another,
+    not to background: masks are ragged, and what hysteresis joined lies outside of most. All votes are on the states
+    before (ties: the point's own, then the nearest's).
     """
     settled = ids.copy()
     width = neighbours.shape[1]
     for g in prange(len(ids)):
-        if ids[g] < BACKGROUND:
+        if ids[g] < BACKGROUND or own_vote[g] == np.inf:
             continue
         # The distinct states about the point, its own first, and the votes of each.
         states = np.empty(width + 1, np.int64)
         votes = np.empty(width + 1)
-        states[0], votes[0], count = ids[g], own_vote, 1
+        states[0], votes[0], count = ids[g], own_vote[g], 1
         for k in range(width):
             other = neighbours[g, k]
             state = ids[other]
-            if weights[g, k] == 0 or state < BACKGROUND or (state == BACKGROUND and ids[g] >= 0):
+            if weights[g, k] == 0 or state < BACKGROUND or (state == BACKGROUND and ids[g] >= 0 and not leaves):
                 continue
             place = 0
             while place < count and states[place] != state:
@@ -451,7 +455,7 @@ def _with_neighbours(ids, sureness, neighbours, weights, own_vote):  # noqa: ANN
             if place == count:
                 states[count], votes[count] = state, 0.0
                 count += 1
-            votes[place] += sureness[other] ** 2 * weights[g, k]
+            votes[place] += voice[other] * weights[g, k]
         settled[g] = states[np.argmax(votes[:count])]
     return settled
 

@@ -100,7 +100,7 @@ def membership(
     alike = np.ones((len(points),) * 2)
     if rgb is not None:
         apart = np.linalg.norm(rgb[:, None].astype(float) - rgb, axis=2)
-        alike = color_ratios(rgb, ids, sureness() > settings.sure_share, neighbours)[np.rint(apart).astype(int)]
+        alike = color_ratios(rgb, ids, sureness(), neighbours)[np.rint(apart).astype(int)]
     possible = (best >= 0) & (share > settings.possible_share)
     while True:  # a middling share counts where it adjoins points that are in already
         beside = [sum(alike[g, other] for other in neighbours[g] if ids[other] == best[g]) for g in points]
@@ -111,9 +111,14 @@ def membership(
         ids[joins] = best[joins]
     ids[(ids == BACKGROUND) & (total == 0)] = UNOBSERVED
     hearsay &= ids == BACKGROUND
-    near = _filled(np.where(hearsay, UNOBSERVED, ids), neighbours)
-    for g in np.flatnonzero(hearsay):
-        ids[g] = best[g] if near[g] == UNOBSERVED else near[g]
+    known = ids.copy()
+    for g in np.flatnonzero(hearsay):  # hearsay counts as its neighbours do, as far as the point is seen openly
+        weight = sum(alike[g, other] for other in neighbours[g])
+        said = {int(best[g]): share[g] * votes.openness[g] / (settings.open_share * typical) * weight}
+        for other in neighbours[g]:
+            if not hearsay[other] and known[other] != UNOBSERVED:
+                said[int(known[other])] = said.get(int(known[other]), 0.0) + alike[g, other]
+        ids[g] = max(said, key=lambda state: said[state])
     ids = _filled(_without_islands(ids, share, weights, group, neighbours, settings.island_share), neighbours)
     ids = _with_neighbours(ids, sureness(), neighbours, alike, settings)
     agreeing = [np.mean([ids[other] == ids[g] for other in neighbours[g]]) if neighbours[g] else 1.0 for g in points]
@@ -174,15 +179,15 @@ def _with_neighbours(
     return after
 
 
-def color_ratios(rgb: NDArray[np.uint8], ids: Ids, sure: NDArray[np.bool_], neighbours: list[list[int]]) -> Array:
+def color_ratios(rgb: NDArray[np.uint8], ids: Ids, sureness: Array, neighbours: list[list[int]]) -> Array:
     """(443,) how many times likelier a difference of colors is within one state than between two, by Eq. of isotonic
     regression: of all intervals about a difference, the least of the greatest means."""
     count = np.zeros((2, 443))
+    sure = np.rint(256 * sureness**4) / 256
     for g in np.flatnonzero(sure):
         for other in neighbours[g]:
-            if sure[other]:
-                apart = np.linalg.norm(rgb[g].astype(float) - rgb[other].astype(float))
-                count[int(ids[g] != ids[other]), round(apart)] += 1
+            apart = np.linalg.norm(rgb[g].astype(float) - rgb[other].astype(float))
+            count[int(ids[g] != ids[other]), round(apart)] += sure[g] * sure[other]
     if count.sum(axis=1).min() < 30:
         return np.ones(443)
     one, two = count / count.sum(axis=1, keepdims=True)
