@@ -57,7 +57,7 @@ class MembershipSettings:
     sure_share: float = 0.6
     """A point is surely of an instance when this share of the weight asked lies in its masks."""
     open_share: float = 0.5
-    """A point that is nowhere seen this share as openly as the scene's other points is as its neighbours are."""
+    """A point seen less than this share as openly as the scene's others is as its neighbours are, the more the less."""
     possible_share: float = 0.2
     """A point may be of an instance from this share on, if it adjoins sure ones."""
     growth_votes: float = 0.25

@@ -83,15 +83,19 @@ MUTATIONS = (
     ),
     Mutation(
         "border votes unsquared", "fitting/membership.py",
-        "sureness[other] ** 2 * weights", "sureness[other] * weights", MEMBERSHIP,
+        "support.of_state(ids) ** 2, around", "support.of_state(ids), around", MEMBERSHIP,
     ),
     Mutation(
         "neighbours heard whatever their color", "fitting/membership.py",
-        "sureness[other] ** 2 * weights[g, k]", "sureness[other] ** 2", (*MEMBERSHIP, "test_colors.py"),
+        "voice[other] * weights[g, k]", "voice[other]", (*MEMBERSHIP, "test_colors.py"),
+    ),
+    Mutation(
+        "hearsay never believed", "fitting/membership.py",
+        "(share * votes.openness)[hearsay]", "0 * (share * votes.openness)[hearsay]", MEMBERSHIP,
     ),
     Mutation(
         "colors of points that views are not sure of are asked", "fitting/colors.py",
-        "if adjoining[g, k] and sure[other]:", "if adjoining[g, k]:", ("test_colors.py",),
+        "sureness**SURENESS_POWER", "np.ones_like(sureness)", ("test_colors.py",),
     ),
     Mutation(
         "a large group keeps what a smaller one is sure of", "fitting/membership.py",

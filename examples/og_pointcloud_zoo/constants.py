@@ -43,6 +43,7 @@ SWEPT = ("geometry", "grouping", "membership")
 MODULES: dict[str, tuple[str, tuple[str, ...]]] = {
     "fitting.view_votes.OPENNESS_POWER": ("", ("_relative_exposure",)),
     "fitting.colors.MOST": ("", ()),
+    "fitting.colors.SURENESS_POWER": ("", ()),
     "rendering.geometry.TAMED_BY": ("table", ()),
     "fitting.looks.LEAST_MASKS": ("", ()),
     "rendering.sightings.LEAST_OPEN": ("table", ("_see",)),
@@ -65,7 +66,7 @@ SOURCES: dict[str, tuple[str, ...]] = {
         "grouping.witness_share", "membership.sure_share", "membership.open_share", "membership.possible_share",
         "membership.growth_votes", "membership.rate_share", "membership.island_share", "membership.own_vote",
         "membership.gap_sizes", "membership.front_share", "membership.hole_sizes", "fitting.colors.MOST",
-        "fitting.view_votes.OPENNESS_POWER", "fitting.looks.LEAST_MASKS",
+        "fitting.colors.SURENESS_POWER", "fitting.view_votes.OPENNESS_POWER", "fitting.looks.LEAST_MASKS",
         "rendering.geometry.TAMED_BY", "rendering.sightings.LEAST_OPEN", "rendering.sightings.EDGE_PX",
         "rendering.sightings.RING_SHARE",
     ),

@@ -17,8 +17,9 @@ Of several groups a point is of the one with the most votes; but proposers let l
 that group's own views contradict it and a smaller one is sure, the smaller one has the point.
 
 Votes of views none of which sees a point openly are hearsay: rays that slip through a surface agree about what lies
-behind it, and are wrong. Such a point is as its neighbours are, if views know these better. How openly is measured by
-the scene's other points, for of surfaces of several noisy layers little is seen anywhere.
+behind it, and are wrong. Such a point is as its neighbours are, if views know these better, unless it is seen nearly as
+openly as others. How openly is measured by the scene's other points, for of surfaces of several noisy layers little is
+seen anywhere.
 """
 
 from __future__ import annotations
@@ -93,24 +94,23 @@ def assign_points(
     # all that look at a car see the same floor through its roof.
     agreed = (group >= 0) & (share > settings.sure_share)
     typical = votes.typical_openness if typical_openness is None else typical_openness
-    least_open = max(settings.open_share * typical, np.finfo(np.float32).tiny)
+    least_open = settings.open_share * typical
     hearsay = agreed & (votes.openness < least_open)
     ids = np.where(agreed & ~hearsay, group, BACKGROUND).astype(np.int32)
     weights = neighbour_weights(rgb, around, color_ratios(rgb, ids, support.of_state(ids), around))
     possible = (group >= 0) & (share > settings.possible_share)
     ids = _grow(ids, group, possible, around.index, weights, settings.growth_votes)
-    # What is known by hearsay alone is as its neighbours are; where few of them are known better, hearsay is believed,
-    # the more so the more openly the point is seen.
+    # Of what is known by hearsay alone, neighbours that are known better are asked; it is believed against so many of
+    # them as the point is seen openly.
     ids = np.where((ids == BACKGROUND) & (total == 0), UNOBSERVED, ids)
     hearsay &= ids == BACKGROUND
-    ids[hearsay] = group[hearsay]
-    believed = np.full(len(ids), np.inf)
-    believed[hearsay] = (share * votes.openness / least_open * weights.sum(axis=1))[hearsay]
-    ids = _with_neighbours(ids, 1.0 - hearsay, around.index, weights, believed, True)
+    ids[hearsay], own_vote = group[hearsay], np.full(len(ids), np.inf)
+    own_vote[hearsay] = (share * votes.openness)[hearsay] / least_open * weights[hearsay].sum(axis=1)
+    ids = _with_neighbours(ids, 1.0 - hearsay, around.index, weights, own_vote, True)
     # What is seen through an instance is no part of it; what no view saw is as its neighbours are.
     ids = _without_islands(ids, share, instance_area(table, groups.group, ids), around, settings.island_share)
     ids = _fill_unobserved(ids, around)
-    own_vote = np.full(len(ids), settings.own_vote)
+    own_vote[:] = settings.own_vote
     ids = _with_neighbours(ids, support.of_state(ids) ** 2, around.index, weights, own_vote, False)
     certainty = support.of_state(ids) * _agreeing(ids, around.index, around.adjoining)
     return Membership(
