@@ -357,6 +357,9 @@ def test_commands(folder, capsys, tmp_path):
     assert "room1" in capsys.readouterr().out
     assert main(["find", atlas, "mug", "--within", "5,5,5,6,6,6"]) == 0
     assert "nothing was found" in capsys.readouterr().out
+    for scenes, says in (("room0", False), ("room1", True)):  # the latter has a desk alone
+        assert main(["find", atlas, "mug", "--scene", scenes]) == 0
+        assert ("nothing fits what was asked" in capsys.readouterr().out) is says
     (folder / "room0.ogpc").unlink()
     assert main(["find", atlas, "<b>mug", "--html", str(page)]) == 2
     assert main(["find", atlas, "mug", "--html", str(page)]) == 0

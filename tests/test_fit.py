@@ -134,6 +134,11 @@ def labelled(known: Known) -> LabelledCloud:
     return fit(known.scene, progress=False)
 
 
+def test_a_folder_is_no_scene() -> None:
+    with pytest.raises(SceneError, match=r"scene is a str; expected a Scene, as og\.read_capture\(FOLDER\) makes one"):
+        fit("kitchen")  # pyright: ignore[reportArgumentType]
+
+
 def test_boxes_are_found(known: Known, labelled: LabelledCloud) -> None:
     assert len(labelled.instances) == BOXES
     assert share_right(labelled, known.truth) > 0.95

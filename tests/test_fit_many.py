@@ -22,7 +22,7 @@ from scenes import write_tiny_capture
 import og_pointcloud as og
 from og_pointcloud.cli import main
 from og_pointcloud.collection import fit_many as module
-from og_pointcloud.errors import MissingExtraError, OgPointcloudError
+from og_pointcloud.errors import MissingExtraError, OgPointcloudError, SceneError
 from og_pointcloud.fitting.tasks import LocalWorkers, Share, dask_executor, share_here
 from og_pointcloud.journal import Journal, LeftOut
 from og_pointcloud.settings import FitSettings
@@ -42,6 +42,12 @@ def captures(tmp_path_factory) -> list[Path]:
     """Of 3 and 4 views, so that every file is another."""
     folder = tmp_path_factory.mktemp("captures")
     return [write_tiny_capture(folder / f"capture{views}", views).folder for views in (3, 4)]
+
+
+def test_the_output_is_a_folder(captures, tmp_path):
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(SceneError, match="file: File exists: check the path"):
+        og.fit_many(captures, tmp_path / "file", Inline(), progress=False)
 
 
 @pytest.fixture(scope="module")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 import sys
 import tracemalloc
 import types
@@ -632,6 +633,17 @@ def test_points_that_the_table_leaves_open_are_settled_exactly(monkeypatch, tmp_
     assert (instances == instances_plainly(cloud, points)).all()
     still_open = ~scene._graph.look_up(points)[1] & (instances != TOO_FAR)
     assert still_open.sum() > 20
+
+
+def test_scenes_and_answers_go_to_other_processes(scene, bundle_file):
+    points = queries(scene.cloud, 200).astype(np.float64)
+    ask = og.Segmenter(og.load(bundle_file), ["apple", "pear"])
+    answer = ask(points)
+    sent = pickle.loads(pickle.dumps((ask, answer, og.select(ask.scene, "apple"))))
+    assert same(sent[1], answer)
+    assert same(sent[0](points), answer)
+    np.testing.assert_array_equal(sent[1].certainty, answer.certainty)
+    assert sent[2].to_json() == og.select(scene, "apple").to_json()
 
 
 def test_threads_share_a_segmenter(scene):

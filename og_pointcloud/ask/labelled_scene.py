@@ -68,6 +68,10 @@ class LabelledScene:
             f"{len(self.cloud.instances):,} instances, {words}, feature space '{self.feature_space}')"
         )
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """To other processes goes what the file holds, and no runtime."""
+        return LabelledScene, (self._bundle,)
+
     @classmethod
     def from_cloud(cls, cloud: LabelledCloud) -> LabelledScene:
         """A scene of a cloud that was never written. It answers as its file would, the first time without delay, many

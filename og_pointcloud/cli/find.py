@@ -53,6 +53,8 @@ def run(arguments: argparse.Namespace) -> None:
         return
     if findings:
         print_table(("scene", "instance", "word", "score", "center", "size"), [cells(finding) for finding in findings])
+        if not any(finding.fits for finding in findings):
+            print("nothing fits what was asked: no score is above one half")
     else:
         print("nothing was found there: no instance with a feature has its middle in the box")
     if not all(finding.calibrated for finding in findings):

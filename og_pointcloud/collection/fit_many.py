@@ -22,6 +22,7 @@ from og_pointcloud.fitting.fit import fit
 from og_pointcloud.fitting.memory import peak_memory
 from og_pointcloud.fitting.tasks import LocalWorkers, Share, share_here
 from og_pointcloud.formats.capture import read_capture
+from og_pointcloud.formats.tables import naming
 from og_pointcloud.journal import LeftOut, with_bar
 from og_pointcloud.kernels import use_threads
 from og_pointcloud.settings import FitSettings
@@ -101,7 +102,8 @@ def fit_many(
     }
     todo = {capture: path for capture, path in jobs.items() if capture not in fits}
     if todo:
-        out.mkdir(parents=True, exist_ok=True)
+        with naming(out):
+            out.mkdir(parents=True, exist_ok=True)
         with LocalWorkers(len(todo)) if executor is None else nullcontext(executor) as workers:
             fits |= _fit_all(workers, todo, options, progress)
     return tuple(fits[capture] for capture in jobs)

@@ -71,6 +71,8 @@ def fit(
     >>> wall.instances.points
     array([800, 800], dtype=int32)
     """
+    if not isinstance(scene, Scene):
+        raise SceneError(f"scene is a {type(scene).__name__}; expected a Scene, as og.read_capture(FOLDER) makes one")
     settings = settings or FitSettings()
     journal = Journal(progress)
     with journal.stage("checks"):
