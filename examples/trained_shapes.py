@@ -100,7 +100,7 @@ def shape_gradient(
     view: of a source of this one view. Cut-offs of the blending have no gradient.
     """
     gaussians, camera = source.gaussians, source.views[0].camera
-    (splats, *_), _ = binned_splats(gaussians, camera, source.near, None, CUTOFFS)
+    splats, *_ = binned_splats(gaussians, camera, source.near, None, CUTOFFS)
     found = np.zeros((2, len(source.known)))
     sparse = view.weights.indptr, view.weights.indices, view.weights.data
     shown, place = source.known, np.zeros(len(gaussians), np.int64)

@@ -110,15 +110,14 @@ def _spanning_masks(share: csr_array, mask_view: NDArray[np.int32], settings: Gr
 
 def _lookup(matrix: csr_array, rows: NDArray[np.int32], cols: NDArray[np.int32]) -> NDArray[np.float64]:
     """Entries of a sparse matrix, 0 where it has none."""
+    matrix.sort_indices()  # as those of shares are
     entries = matrix.tocoo()
     width = np.int64(matrix.shape[1])
     keys = entries.row * width + entries.col
-    order = np.argsort(keys)
     wanted = rows * width + cols
-    place = np.minimum(np.searchsorted(keys[order], wanted), len(keys) - 1)
+    found = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
     if len(keys) == 0:
         return np.zeros(len(wanted))
-    found = order[place]
     return np.where(keys[found] == wanted, entries.data[found], 0.0)
 
 

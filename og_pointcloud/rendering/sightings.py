@@ -31,6 +31,10 @@ RING_SHARE = 0.5
 RING = [(EDGE_PX * np.cos(angle), EDGE_PX * np.sin(angle)) for angle in np.arange(8) * np.pi / 4]
 SAMPLES = np.array([(0.0, 0.0, 1 - RING_SHARE), *((x, y, RING_SHARE / len(RING)) for x, y in RING)])
 """Right and down of a point, in pixels, and the share of its vote there."""
+REACH_PX = int(np.ceil(EDGE_PX))
+"""A sample lies in a pixel at most so far from the point's own."""
+BLOCK = 8
+"""Pixels along the side of a block that lies within one mask as a whole, or is looked at point by point."""
 
 
 @dataclass(frozen=True)
@@ -81,7 +85,7 @@ def openness(
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
     """(n,) float32 each: openness, 0 where a point is hidden, outside the image or not asked; and where it is seen, in
     pixels (u, v). Light is followed through the centres of pixels."""
-    binned, _ = binned_splats(gaussians, camera, near, thickness, CUTOFFS)
+    binned = binned_splats(gaussians, camera, near, thickness, CUTOFFS)
     n = len(gaussians)
     asked = np.ones(n, np.bool_) if asked is None else asked
     open_, u, v = (np.zeros(n, np.float32) for _ in range(3))
@@ -131,6 +135,7 @@ def _votes(open_, u, v, ids, mask_count, samples):  # noqa: ANN001, ANN202
     """The openness of each point, shared among the masks at and around its pixel: (starts, columns, votes) of sparse
     rows (masks + 1, n); and the points that have a vote."""
     height, width = ids.shape
+    inside = _within_masks(ids)
     most = np.count_nonzero(open_)
     seen = np.empty(most, np.int32)
     entries = np.empty((3, most * len(samples)), np.int32)
@@ -138,11 +143,20 @@ def _votes(open_, u, v, ids, mask_count, samples):  # noqa: ANN001, ANN202
     starts = np.zeros(mask_count + 2, np.int32)
     points, end = 0, 0
     for g in range(len(open_)):
+        if open_[g] == 0:
+            continue
         # Rounded to float32, a place just inside the image may lie on its border.
-        if open_[g] == 0 or ids[min(int(v[g]), height - 1), min(int(u[g]), width - 1)] == NOT_SEEN:
+        column, row = min(int(u[g]), width - 1), min(int(v[g]), height - 1)
+        if ids[row, column] == NOT_SEEN:
             continue
         seen[points] = g
         points += 1
+        if inside[row // BLOCK, column // BLOCK]:
+            mask = ids[row, column] if ids[row, column] >= 0 else mask_count
+            rows[end], columns[end], votes[end] = mask, g, _whole_vote(open_[g], samples)
+            starts[mask + 1] += 1
+            end += 1
+            continue
         first = end
         for k in range(len(samples)):
             x = min(max(int(np.floor(u[g] + samples[k, 0])), 0), width - 1)
@@ -165,3 +179,32 @@ def _votes(open_, u, v, ids, mask_count, samples):  # noqa: ANN001, ANN202
         sorted_columns[place[rows[e]]], sorted_votes[place[rows[e]]] = columns[e], votes[e]
         place[rows[e]] += 1
     return starts, sorted_columns, sorted_votes, seen[:points]
+
+
+@njit(cache=True, nogil=True)
+def _whole_vote(open_, samples):  # noqa: ANN001, ANN202
+    """The shares of a vote added up: to the last bit what they add up to where they are looked at one by one."""
+    vote = np.float32(0)
+    for k in range(len(samples)):
+        vote = np.float32(vote + open_ * samples[k, 2])
+    return vote
+
+
+@njit(cache=True, nogil=True)
+def _within_masks(ids):  # noqa: ANN001, ANN202
+    """(blocks, blocks) bool: the blocks of pixels about which there is one mask, or none, as far as any sample of a
+    point in them."""
+    height, width = ids.shape
+    one = np.ones((-(-height // BLOCK), -(-width // BLOCK)), np.bool_)
+    for row in range(one.shape[0]):
+        for column in range(one.shape[1]):
+            top, left = max(row * BLOCK - REACH_PX, 0), max(column * BLOCK - REACH_PX, 0)
+            mask = max(ids[top, left], -1)
+            for y in range(top, min((row + 1) * BLOCK + REACH_PX, height)):
+                same = True
+                for x in range(left, min((column + 1) * BLOCK + REACH_PX, width)):
+                    same &= max(ids[y, x], -1) == mask
+                if not same:
+                    one[row, column] = False
+                    break
+    return one

@@ -164,7 +164,8 @@ def _entries(
 ) -> tuple[tuple[NDArray[Any], ...], NDArray[np.float64]]:
     """What `view_weights` adds up, tile by tile: (rows, cols, weights, first, counts), tile t's entries being
     first[t] : first[t] + counts[t]; and the area of each splat."""
-    binned, area = binned_splats(gaussians, camera, near, thickness, cutoffs)
+    area = np.zeros(len(gaussians))
+    binned = binned_splats(gaussians, camera, near, thickness, cutoffs, area)
     masks = np.where(ids < 0, id_count, ids).astype(np.int32)
     bounds = _entry_bounds(binned, masks, id_count)
     first = np.concatenate([[0], np.cumsum(bounds)])
@@ -173,16 +174,21 @@ def _entries(
 
 
 def binned_splats(
-    gaussians: Gaussians, camera: Camera, near: float, thickness: NDArray[np.float32] | None, cutoffs: Cutoffs
-) -> tuple[Binned, NDArray[np.float64]]:
-    """The splats of an image by tile, and the area of each Gaussian."""
-    n = len(gaussians)
+    gaussians: Gaussians,
+    camera: Camera,
+    near: float,
+    thickness: NDArray[np.float32] | None,
+    cutoffs: Cutoffs,
+    area: NDArray[np.float64] | None = None,
+) -> Binned:
+    """The splats of an image by tile. area: (n,), where those of Gaussians with a splat are written; None: nowhere."""
+    n, area = len(gaussians), np.empty(0) if area is None else area
     thickness = np.full(n, np.inf, np.float32) if thickness is None else thickness
     shapes = gaussians.xyz, gaussians.scale, gaussians.rotation, gaussians.opacity, thickness
     intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
     seen_by = camera.world_to_camera, intrinsics, (camera.width, camera.height), float(near)
     rows = np.flatnonzero(_may_show(shapes[:2], seen_by, cutoffs))
-    splats, area = _records(len(rows)), np.zeros(n)
+    splats = _records(len(rows))
     keys = _project(rows, shapes, seen_by, cutoffs, splats, area)
     keys = np.sort(keys[keys != _CULLED])
     # In order of depth in memory too: those of a tile are then read from front to back.
@@ -190,7 +196,7 @@ def binned_splats(
     columns = -(-camera.width // TILE)
     tiles = columns * -(-camera.height // TILE)
     starts, members = _bin(splats, columns, tiles, cutoffs, get_num_threads())
-    return (splats, starts, members, columns), area
+    return splats, starts, members, columns
 
 
 def _records(count: int) -> NDArray[Any]:
@@ -275,7 +281,7 @@ def _may_show(shapes, seen_by, cutoffs):  # noqa: ANN001, ANN202
 @njit(cache=True, parallel=True, nogil=True, error_model="numpy")
 def _project(rows, shapes, seen_by, cutoffs, splats, area):  # noqa: ANN001, ANN202
     """EWA projection in float64 of the Gaussians ``rows``, ascending: writes their splats (rows,) and area (n,), the
-    weight in pixels if nothing were in front; returns depth keys (rows,) uint64.
+    weight in pixels if nothing were in front, or (0,) if it is not asked for; returns depth keys (rows,) uint64.
 
     A key is the float32 depth's bits above the splat: sorting keys sorts by depth, ties by Gaussian. Those without a
     pixel have the key _CULLED.
@@ -304,7 +310,8 @@ def _project(rows, shapes, seen_by, cutoffs, splats, area):  # noqa: ANN001, ANN
         s.across, s.down = np.sqrt(0.5 * LOG2_E * syy / det), 0.5 * LOG2_E / syy
         s.peak, s.depth, s.surface = peak, depth, depth - thickness[g]
         s.x0, s.x1, s.y0, s.y1, s.gaussian = int(x0), int(x1), int(y0), int(y1), g
-        area[g] = 2 * np.pi * np.sqrt(det) * (sigma - cutoffs.alpha_min)  # the integral of alpha over that ellipse
+        if len(area):
+            area[g] = 2 * np.pi * np.sqrt(det) * (sigma - cutoffs.alpha_min)  # the integral of alpha over that ellipse
         keys[i] = (np.uint64(np.float32(depth).view(np.uint32)) << np.uint64(32)) | np.uint64(i)
     return keys
 
