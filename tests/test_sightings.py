@@ -9,9 +9,17 @@ import pytest
 from numpy.typing import NDArray
 from reference_splatting import in_camera, reference_alpha
 
-from og_pointcloud.rendering.sightings import EDGE_PX, LEAST_OPEN, RING_SHARE, openness, sightings
+from og_pointcloud.rendering.sightings import (
+    EDGE_PX,
+    LEAST_OPEN,
+    RING_SHARE,
+    SAMPLES,
+    openness,
+    sightings,
+    sightings_of,
+)
 from og_pointcloud.rendering.splatting import Gaussians
-from og_pointcloud.scene import Camera
+from og_pointcloud.scene import NOT_SEEN, Camera
 
 CAMERA = Camera(48, 40, 60, 60, 24, 20, np.eye(4))
 NEAR = 0.1
@@ -124,9 +132,29 @@ def test_nothing_in_the_image_is_no_error() -> None:
 
 def test_a_point_on_the_border_of_the_image_is_in_its_last_pixel():
     """A place of 7.9999999 pixels is 8 in float32."""
-    from og_pointcloud.rendering.sightings import sightings_of
-
     border = np.array([8.0], np.float32)
     found = sightings_of(np.ones(1, np.float32), border, border, np.zeros((8, 8), np.int32), 1)
     assert found.openness.nnz == 1
     assert found.rows[[0]].sum() == pytest.approx(1)
+
+
+@pytest.mark.parametrize("size", [(40, 48), (17, 5), (1, 1)])
+def test_votes_are_those_of_every_sample_one_by_one(size: tuple[int, int]) -> None:
+    """Masks of random rectangles, some pixels not photographed: blocks within one mask, and blocks at their edges."""
+    random = np.random.default_rng(size[0])
+    ids = np.full(size, -1, np.int32)
+    for mask in (0, 1, 2, NOT_SEEN):
+        top, left = random.integers(0, size[0]), random.integers(0, size[1])
+        ids[top : top + 22, left : left + 22] = mask
+    n = 500
+    open_ = (random.random(n) * (random.random(n) < 0.7)).astype(np.float32)
+    u, v = (random.uniform(0, side, n).astype(np.float32) for side in (size[1], size[0]))
+    expected = np.zeros((4, n), np.float32)
+    for g in np.flatnonzero(open_):
+        if ids[min(int(v[g]), size[0] - 1), min(int(u[g]), size[1] - 1)] == NOT_SEEN:
+            continue
+        for right, down, share in SAMPLES:
+            x = int(np.clip(np.floor(u[g] + right), 0, size[1] - 1))
+            y = int(np.clip(np.floor(v[g] + down), 0, size[0] - 1))
+            expected[max(ids[y, x], -1), g] += np.float64(open_[g]) * share
+    np.testing.assert_array_equal(sightings_of(open_, u, v, ids, 3).rows.toarray(), expected)
