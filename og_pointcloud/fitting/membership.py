@@ -143,8 +143,9 @@ def without_see_through(
     kept, lost = np.ones(weights.nnz, np.float32), 0.0
     for mask, view in enumerate(table.mask_view.tolist()):
         entries = slice(weights.indptr[mask], weights.indptr[mask + 1])
-        rays = _rays(gaussians.xyz, weights.indices[entries], world_to_camera[view])
-        kept[entries] = _at_front(*rays, weights.data[entries], table.mask_pixels[mask] / focal[view] ** 2, settings)
+        depth, xy = _rays(gaussians.xyz, weights.indices[entries], world_to_camera[view])
+        area = table.mask_pixels[mask] / focal[view] ** 2
+        kept[entries] = _at_front(depth, xy, weights.data[entries], area, settings)
         lost += float(((1 - kept[entries]) * weights.data[entries]).sum(dtype=np.float64))
     if lost == 0:
         return table, 0.0
