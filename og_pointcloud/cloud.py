@@ -54,7 +54,7 @@ class FeatureSpace:
             raise FeatureSpaceError(f"the {what} are of {other}; expected {self}: encode them with that encoder")
 
     def __str__(self) -> str:
-        return f"feature space '{self.name}' (width {self.width})"
+        return f"feature space '{self.name}'" + (f" (width {self.width})" if self.width else "")
 
 
 @dataclass(frozen=True)

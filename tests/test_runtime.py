@@ -411,7 +411,7 @@ def test_words_without_any_vocabulary():
 
 def test_text_features_of_another_space_are_refused(scene, tmp_path):
     np.savez(tmp_path / "t.npz", names=np.array(["a"]), vectors=np.ones((1, WIDTH)), feature_space=np.array("other"))
-    with pytest.raises(FeatureSpaceError, match=r"t.npz are of feature space 'other' .*expected .*'tiny-test-space'"):
+    with pytest.raises(FeatureSpaceError, match=r"t.npz are of feature space 'other' .*expected .*'tiny-test-space':"):
         og.segment(scene, ["a"], text_features=tmp_path / "t.npz")
     np.savez(tmp_path / "t.npz", names=np.array(["a"]), vectors=np.ones((1, WIDTH)))
     assert len(og.segment(scene, ["a"], text_features=tmp_path / "t.npz"))
