@@ -91,7 +91,7 @@ MUTATIONS = (
     ),
     Mutation(
         "hearsay never believed", "fitting/membership.py",
-        "(share * votes.openness)[hearsay]", "0 * (share * votes.openness)[hearsay]", MEMBERSHIP,
+        "(share * votes.openness)[hearsay]", "0 * (share * votes.openness)[hearsay]", ("test_membership.py",),
     ),
     Mutation(
         "colors of points that views are not sure of are asked", "fitting/colors.py",
