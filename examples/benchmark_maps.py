@@ -120,10 +120,12 @@ def miou(cloud: og.LabelledCloud, folder: Path, xyz: np.ndarray) -> float:
 def with_fused_points(capture: Scene, folder: Path) -> Scene:
     """The same views, with the points that `og-pointcloud fuse` makes of their depth images."""
     files, origin = depth_files(folder, read_poses(folder)), capture.points.origin
-    points = fuse([
-        DepthFrame(view.name, files[view.name], partial(resampled, view.image_rgb(), view.camera))
-        for view in capture.views
-    ]).points  # fmt: skip
+    frames = []
+    for view in capture.views:
+        rgb = view.image_rgb()
+        colors = None if rgb is None else partial(resampled, rgb, view.camera)
+        frames.append(DepthFrame(view.name, files[view.name], colors))
+    points = fuse(frames).points
     return replace(capture, points=Points((points.xyz_world - origin).astype(np.float32), origin, points.rgb))
 
 
