@@ -183,8 +183,12 @@ def test_ctrl_c_waits_for_threads_that_are_looking_up_neighbours() -> None:
             return np.zeros(len(xyz)), np.zeros(len(xyz), int)
 
     tree = Tree()
-    with pytest.raises(KeyboardInterrupt):
-        nearest_in(tree, grid(2))  # pyright: ignore[reportArgumentType]
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore Ctrl-C
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            nearest_in(tree, grid(2))  # pyright: ignore[reportArgumentType]
+    finally:
+        signal.signal(signal.SIGINT, before)
     assert tree.ended  # else scipy's threads would go on in memory that is gone, and end the process
 
 
