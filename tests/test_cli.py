@@ -429,7 +429,7 @@ def test_the_published_schedule_can_be_shortened(tiny_capture, tmp_path, capsys)
 
 
 @pytest.mark.parametrize("words", [
-    "edit remove S.ogpc -o O.ply --xyz -1,0,5", "edit insert A.ply B.ply -o O.ply --at -0.4,0,0", "view S.ogpc --up -z",
+    "edit remove S.ogpc -o O.ply --xyz -1,0,5", "view S.ogpc --up -z",
     "find ATLAS mug --within -1,-1,0,1,1,2", "instances S.ogpc --up -0.1,0,1", "pick S.ogpc --xyz -1,2,3",
 ])  # fmt: skip
 def test_negative_coordinates_are_values_and_no_options(words):

@@ -323,6 +323,19 @@ def test_readers_see_the_atlas_before_a_change_or_after_it(folder):
     assert og.Collection(folder.parent / "atlas").scenes == collection.scenes[1:]
 
 
+def test_a_full_disk_leaves_nothing_of_a_new_atlas(folder, tmp_path):
+    resource = pytest.importorskip("resource")
+    og.write_bundle(scene(["chair"]), folder / "a.ogpc")
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, limits[1]))
+    try:
+        with pytest.raises(OgPointcloudError, match="stays as it was"):
+            og.Collection.index(folder, tmp_path / "new" / "atlas", progress=False)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert list((tmp_path / "new").iterdir()) == []
+
+
 def test_an_open_collection_notices_a_changed_atlas(folder):
     collection = indexed(folder, {"a": scene(["desk"]), "b": scene(["chair"], 1)})
     assert collection.find("chair")[0].scene == "b"

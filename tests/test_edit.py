@@ -430,13 +430,6 @@ def test_commands(scene, splats, tmp_path, capsys):
     ]
     brightness = recoloured.mean(axis=0) / [90, 80, 70]  # of a nearly black object: the hue is the new one, in the dark
     np.testing.assert_allclose(brightness, brightness.mean(), rtol=0.03)
-    (tmp_path / "pose.txt").write_text("\n".join(" ".join(map(str, row)) for row in similarity()))
-    capsys.readouterr()
-    assert edit("insert", out, tmp_path / "two.ply", "--pose", tmp_path / "pose.txt", "-o", tmp_path / "i.ply") == 0
-    assert "points inserted" in capsys.readouterr().out
-    assert edit("insert", out, tmp_path / "two.ply", "--at=-1,0,0", "-o", tmp_path / "i.ply") == 0
-    moved = og.read_points(tmp_path / "i.ply").xyz_world[len(vertices(out)) :]
-    np.testing.assert_allclose(moved, scene.xyz[scene.instance_ids == 2] - [1, 0, 0], atol=1e-3)
 
 
 def test_objects_go_in_and_out_as_spz(scene, splats, tmp_path, capsys):
@@ -463,11 +456,9 @@ def test_objects_go_in_and_out_as_spz(scene, splats, tmp_path, capsys):
 def test_wrong_commands_name_what_is_wrong(scene, splats, tmp_path, capsys):
     bundle = og.write_bundle(make_cloud([[0, 0, 0], [1, 0, 0]], [0, 1]), tmp_path / "two.ogpc")
     out = str(tmp_path / "out.ply")
-    (tmp_path / "pose.txt").write_text("1 2 three")
     for words, message in (
         (["remove", str(bundle), "--id", "one", "-o", out], "--id is 'one'"),
         (["remove", str(bundle), "--id", "0", "--cloud", str(splats), "-o", str(splats)], "a file that is read"),
-        (["insert", str(splats), str(splats), "--pose", str(tmp_path / "pose.txt"), "-o", out], "16 numbers"),
         (["recolour", str(bundle), "--id", "0", "--color", "1,2", "-o", out], "--color"),
     ):
         assert main(["edit", *words]) == 2

@@ -200,6 +200,7 @@ def test_command(captures, one_by_one, tmp_path, capsys, monkeypatch):
     said = capsys.readouterr()
     assert "1 fitted, 0 were there already, 1 failed" in said.out
     assert f"failed: {broken}" in said.err
+    assert said.err.count(str(broken)) == 1
     assert "1 of 2 captures failed" in said.err
     assert [fit["state"] for fit in json.loads(report.read_text())["fits"]] == ["fitted", "failed"]
     assert contents(out) == {"capture3.ogpc": one_by_one["capture3.ogpc"]}

@@ -396,7 +396,7 @@ def test_a_full_disk_is_told_with_the_path(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("command", ["segment -o s.ply", pytest.param("view --png s.png", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("command", ["segment -o s.ply", "view --html s.html"])
 def test_a_disk_that_is_full_while_a_command_writes(bundle, tmp_path, capsys, monkeypatch, command):
     resource = pytest.importorskip("resource")
     monkeypatch.chdir(tmp_path)

@@ -1,11 +1,10 @@
-"""`og-pointcloud view` of a scene: what the page holds, what the picture shows, and what is refused."""
+"""`og-pointcloud view` of a scene: what the page holds, and what is refused."""
 
 import base64
 import json
 import re
 import shutil
 import subprocess
-import sys
 import zlib
 from dataclasses import replace
 
@@ -18,7 +17,6 @@ from scenes import write_ply
 import og_pointcloud as og
 from og_pointcloud.cli import main
 from og_pointcloud.cloud import Vocabulary
-from og_pointcloud.formats.colors import label_colors
 from og_pointcloud.show.page import Look, write_page
 from og_pointcloud.show.viewpoint import FOCAL, Viewpoint, choose_viewpoint
 
@@ -153,35 +151,14 @@ def test_bad_use_is_refused_in_one_line(bundle, tmp_path, capsys, monkeypatch, o
     assert list(tmp_path.iterdir()) == []
 
 
-def test_where_nothing_can_draw_the_cure_is_named(bundle, tmp_path, capsys, monkeypatch):
-    plugin = pytest.importorskip("og_pointcloud_pyvista")
-    monkeypatch.setattr(plugin, "can_render", lambda: False)
-    code, _, stderr = run(capsys, "view", bundle, "--png", tmp_path / "room.png")
-    assert code == 2
-    assert "apt-get install libegl1, or libosmesa6), or write a page (--html" in stderr
-    monkeypatch.setitem(sys.modules, "og_pointcloud_pyvista", None)
-    assert "og-pointcloud[pyvista]" in run(capsys, "view", bundle, "--png", tmp_path / "room.png")[2]
-    assert run(capsys, "view", bundle, "--html", tmp_path / "room.html")[0] == 0, "a page needs no PyVista"
-
-
-@pytest.mark.slow
-def test_a_picture_shows_the_labels(bundle, tmp_path, capsys):
-    plugin = pytest.importorskip("og_pointcloud_pyvista")
-    if not plugin.can_render():
-        pytest.skip("VTK cannot draw off-screen here")
-    import cv2
-
-    code, stdout, _ = run(capsys, "view", bundle, "--labels", "plum,apple", "--boxes", "--png", tmp_path / "room.png")
-    assert code == 0
-    assert f"wrote {tmp_path / 'room.png'}" in stdout
-    picture = cv2.imread(str(tmp_path / "room.png"))[..., ::-1].astype(int)
-    assert picture.shape == (1000, 1600, 3)
-    assert 0.05 < (picture < 250).any(axis=-1).mean() < 0.9
-    hue_of = label_colors(np.arange(2)).astype(float)
-    colored = picture[np.ptp(picture, axis=-1) > 40]
-    direction = colored / np.linalg.norm(colored, axis=1, keepdims=True)
-    for color in hue_of:  # shaded by the cloud's own colours: the same hue, darker
-        assert (direction @ (color / np.linalg.norm(color)) > 0.999).mean() > 0.05
+def test_instances_are_shown_without_any_words(bundle, tmp_path, capsys):
+    wordless = write_bundle(replace(og.load(bundle).cloud, vocabulary=None), tmp_path / "wordless.ogpc")
+    code, _, stderr = run(capsys, "view", wordless, "--instances")
+    assert (code, stderr) == (0, "")
+    data = content(tmp_path / "wordless.html")
+    assert (data["mode"], data["names"]) == ("instances", [])
+    assert np.array_equal(data["instance"], og.load(bundle).instance_ids)
+    assert "the scene has no words" in run(capsys, "view", wordless)[2]
 
 
 def test_the_view_is_from_where_labelled_points_are_in_sight():

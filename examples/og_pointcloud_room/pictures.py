@@ -1,4 +1,4 @@
-"""Pictures of the demo: input views with their masks, and the cloud by instance or label as `og-pointcloud view` draws.
+"""Pictures of the demo: input views with their masks, and the cloud by instance or label.
 
 A picture of the cloud looks into the room: the ceiling and the walls on the eye's side are cut away.
 """
@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from og_pointcloud.ask.labelled_scene import LabelledScene
 from og_pointcloud.ask.segmentation import Segmentation
 from og_pointcloud.formats.colors import label_colors
-from og_pointcloud.show.page import Look
-from og_pointcloud.show.viewpoint import Viewpoint, choose_viewpoint
+from og_pointcloud.show.viewpoint import FOCAL, Viewpoint, choose_viewpoint
 
 __all__ = ["draw_clouds", "draw_views"]
 
@@ -27,7 +26,12 @@ WALL_M = 0.15
 """What lies nearer than this to the end of the room is a wall, or hangs on one."""
 STEP_BACK = 1.4
 """Of the eye, so that walls and what hangs on them are in the picture too."""
-PICTURE_WIDTH = 1000
+DRAWN_SIZE, PICTURE_WIDTH = (1600, 1000), 1000
+"""Pixels as drawn; and across, as shown."""
+CLOSED = 3.0
+"""Width of a point in point spacings, so that surfaces close; smoothing halves it."""
+ASIDE = 0.12
+"""How far the scene is moved to the left, in half widths: the legend is on the right."""
 
 Colours = NDArray[np.uint8]
 
@@ -61,13 +65,23 @@ def draw_clouds(
     rgb: (N, 3) colours of the points, which shade those of the labels. known: (N,) points to draw; all if left out.
     by: "label" or "instance".
     """
-    from og_pointcloud_pyvista.screening import draw
+    import pyvista as pv
+    from og_pointcloud_pyvista import to_pyvista
+    from og_pointcloud_pyvista.files import RGB
 
-    first = next(iter(results.values()))
-    shown, view = _look_into_room(first)
+    shown, view = _look_into_room(next(iter(results.values())))
+    shown = shown if known is None else shown & known
+    distance = float(np.linalg.norm(view.eye - view.target))
+    point_size = float(np.clip(CLOSED * scene.cloud.spacing * FOCAL * DRAWN_SIZE[1] / 2 / distance, 2, 12))
     panels = []
     for title, result in results.items():
-        plotter = draw(scene, result, rgb, shown if known is None else shown & known, view, Look(title, f"{by}s"))
+        mesh = to_pyvista(result).extract_points(shown, adjacent_cells=False)
+        mesh.point_data[RGB] = rgb[shown]
+        plotter = pv.Plotter(off_screen=True, window_size=list(DRAWN_SIZE), theme=pv.themes.DocumentTheme())
+        plotter.og.add_segmentation(mesh, by=by, point_size=point_size)
+        plotter.og.look(view)
+        plotter.camera.SetWindowCenter(ASIDE, 0)
+        plotter.enable_anti_aliasing("ssaa")
         plotter.add_text(title, position="upper_left", font_size=14, color="black", font="arial")
         picture = np.asarray(plotter.screenshot(return_img=True))
         plotter.close()

@@ -115,11 +115,12 @@ class LabelledScene:
         encoder = carried_encoder(self.path)
         return resolve_labels(labels, text_features, self.vocabulary, self.feature_space, encoder)
 
-    def words_or_none(self, labels: Labels = None, text_features: TextFeatures = None) -> Vocabulary | None:
-        """The same, but None where none are given and the scene has none."""
-        own = self.vocabulary
+    def known_words(self, labels: Labels = None, text_features: TextFeatures = None) -> Vocabulary:
+        """The same, but no words where none are given and the scene has none."""
         given = labels is not None or text_features is not None
-        return self.words(labels, text_features) if given or (own and own.names) else None
+        if given or (self.vocabulary and self.vocabulary.names):
+            return self.words(labels, text_features)
+        return Vocabulary((), np.zeros((0, self.cloud.space.width), np.float32))
 
     def instances_at(self, points: NDArray[np.floating], *, max_distance: float | None = None) -> NDArray[np.int32]:
         """(N,) int32: instance id of the scene's point nearest to each, -1, -2, or -3 where none is within reach.
@@ -319,7 +320,7 @@ def instance_table(
     [(0, 2, (('chair', 1.0),)), (1, 1, (('desk', 1.0),))]
     """
     scene = as_scene(scene)
-    return list_instances(scene.cloud, scene.chooser, scene.words_or_none(labels, text_features), up=up, words=words)
+    return list_instances(scene.cloud, scene.chooser, scene.known_words(labels, text_features), up=up, words=words)
 
 
 def _is_scene(pcd: Any) -> bool:
@@ -406,7 +407,7 @@ def _why_few(result: Segmentation, scene: LabelledScene) -> str | None:
             f"the points span {_box(result.xyz[finite])}, the scene {_box(scene.xyz)}, its reach is "
             f"{scene.cloud.reach:.4g}: bring them into the scene's frame and unit"
         )
-    if result.reasons.all():  # Reason.LABELLED is 0
+    if result.names and result.reasons.all():  # Reason.LABELLED is 0
         parts = [f"{count} are {reason}" for reason, count in result.unknown_because().items()]
         return f"none of {len(result)} points has a label: {', '.join(parts)}{f'; {place}' if place else ''}"
     return (

@@ -146,16 +146,16 @@ def select(
         shown = list(text) if isinstance(text, Mapping) else text
         raise OgPointcloudError(f"the text is {shown!r:.80}; expected one word or phrase, or one name -> vector")
     query = scene.words(text, text_features)
-    rivals = _rivals(scene, query.names[0], against, text_features)
-    choice = scene.chooser.choose(_together(query, rivals, scene.feature_space))
+    rivals = _rivals(scene, query, against, text_features)
+    choice = scene.chooser.choose(np.concatenate([query.vectors, rivals.vectors]))
     points = np.bincount(scene.instance_ids[scene.instance_ids >= 0], minlength=len(choice.labels))
     known = (points > 0) & (choice.reasons != Reason.NOT_DESCRIBED)
     ranked = [int(k) for k in choice.ranking(0) if known[k]]
-    fitting = set(np.flatnonzero(choice.labels == 0).tolist() if rivals or choice.calibrated else ranked[:1])
+    fitting = set(np.flatnonzero(choice.labels == 0).tolist() if rivals.names or choice.calibrated else ranked[:1])
     return Selection(
         query=query.names[0],
-        matches=tuple(_match(scene, k, choice, k in fitting, rivals, int(points[k])) for k in ranked),
-        rivals=len(rivals.names) if rivals else 0,
+        matches=tuple(_match(scene, k, choice, k in fitting, rivals.names, int(points[k])) for k in ranked),
+        rivals=len(rivals.names),
         unknown=int(((points > 0) & ~known).sum()),
         calibrated=choice.calibrated,
         scene=scene,
@@ -163,31 +163,23 @@ def select(
 
 
 def _match(
-    scene: LabelledScene, instance: int, choice: Choice, fits: bool, rivals: Vocabulary | None, points: int
+    scene: LabelledScene, instance: int, choice: Choice, fits: bool, rivals: Sequence[str], points: int
 ) -> Match:
     """choice: of the query, label 0, and the rivals behind it."""
-    score = float(choice.scores[instance, 0])
-    if rivals is None:
-        return Match(instance, score, fits, None, NO_EVIDENCE, points, scene)
-    best = int(choice.evidence[instance, 1:].argmax())
-    rival_score = float(choice.scores[instance, 1 + best])
-    return Match(instance, score, fits, rivals.names[best], rival_score, points, scene)
+    score, rival, rival_score = float(choice.scores[instance, 0]), None, NO_EVIDENCE
+    if rivals:
+        best = int(choice.evidence[instance, 1:].argmax())
+        rival, rival_score = rivals[best], float(choice.scores[instance, 1 + best])
+    return Match(instance, score, fits, rival, rival_score, points, scene)
 
 
-def _together(query: Vocabulary, rivals: Vocabulary | None, space: str) -> NDArray[np.float32]:
-    """(1 + rivals, D) vectors, the query's first."""
-    if rivals is None:
-        return query.vectors
-    query_space, rival_space = (FeatureSpace(space, words.vectors.shape[1]) for words in (query, rivals))
-    query_space.require(rival_space, f"words that compete with '{query.names[0]}'")
-    return np.concatenate([query.vectors, rivals.vectors])
-
-
-def _rivals(scene: LabelledScene, query: str, against: Labels, text_features: TextFeatures) -> Vocabulary | None:
-    """The words that compete with the query, without itself; None without any."""
+def _rivals(scene: LabelledScene, query: Vocabulary, against: Labels, text_features: TextFeatures) -> Vocabulary:
+    """The words that compete with the query, without itself."""
     none_wanted = isinstance(against, Sequence) and not len(against)
-    words = None if none_wanted else scene.words_or_none(against, text_features)
-    if words is None:
-        return None
-    others = [index for index, name in enumerate(words.names) if name != query]
-    return Vocabulary(tuple(words.names[index] for index in others), words.vectors[others]) if others else None
+    words = query if none_wanted else scene.known_words(against, text_features)
+    others = [index for index, name in enumerate(words.names) if name != query.names[0]]
+    if not others:
+        return Vocabulary((), query.vectors[:0])
+    query_space, space = (FeatureSpace(scene.feature_space, of.vectors.shape[1]) for of in (query, words))
+    query_space.require(space, f"words that compete with '{query.names[0]}'")
+    return Vocabulary(tuple(words.names[index] for index in others), words.vectors[others])

@@ -69,6 +69,12 @@ def add_command(commands: Any, name: str, run: Any, text: str | None) -> Parser:
     return parser
 
 
+def add_commands(parser: Parser, what: str, *runs: Callable[[argparse.Namespace], None]) -> list[Parser]:
+    """A command below a command for each ``run_NAME``, whose docstring is its text. what: they are."""
+    below = parser.add_subparsers(dest=what, required=True, metavar=what.upper(), parser_class=Parser)
+    return [add_command(below, run.__name__.removeprefix("run_"), run, run.__doc__) for run in runs]
+
+
 def add_shared(parser: Any, *names: str) -> None:
     for name in names:
         parser.add_argument(name, **SHARED[name])

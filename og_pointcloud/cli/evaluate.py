@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from og_pointcloud.cli.common import (
     Parser,
-    add_command,
+    add_commands,
     add_option,
     add_output,
     names_in,
@@ -39,11 +39,7 @@ TASK_MEANS = ("miou", "macc", "forced_miou", "unknown")
 
 def add(parser: Parser) -> None:
     add_path = partial(add_option, type=replaceable)
-    protocols = parser.add_subparsers(dest="protocol", required=True, metavar="PROTOCOL", parser_class=Parser)
-    capture, scannet, lerf = (
-        add_command(protocols, run.__name__.removeprefix("run_"), run, run.__doc__)
-        for run in (run_capture, run_scannet, run_lerf)
-    )
+    capture, scannet, lerf = add_commands(parser, "protocol", run_capture, run_scannet, run_lerf)
     add_path(capture, "capture", "CAPTURE", "folder with gt.npz")
     add_path(capture, "bundle", "S.ogpc", "what `fit` wrote of it")
     add_path(capture, "--against", "OTHER.ogpc", "another: also the difference, less OTHER, paired")

@@ -10,19 +10,16 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from og_pointcloud.cli.common import Parser, add_command, add_option
+from og_pointcloud.cli.common import Parser, add_commands, add_option
 from og_pointcloud.errors import OgPointcloudError
 
 
 def add(parser: Parser) -> None:
-    halves = parser.add_subparsers(dest="half", required=True, metavar="HALF")
-    text = add_command(halves, "text", run_text, run_text.__doc__)
-    image = add_command(halves, "image", run_image, run_image.__doc__)
+    text, image = add_commands(parser, "half", run_text, run_image)
     for half in (text, image):
         add_option(half, "model", "MODEL", "fetched OWNER/MODEL, or a folder of CLIP or SigLIP", type=Path)
-        half.add_argument(
-            "-o", "--output", type=Path, metavar="DIR", help="default: where scenes find it by themselves"
-        )
+        where = "default: where scenes find it by themselves"
+        half.add_argument("-o", "--output", type=Path, metavar="DIR", help=where)
         add_option(half, "--feature-space", "OWNER/MODEL", "as scenes name it (default: what the model says)")
     template = "what a name is put into, such as 'a photo of a {}.'; several are averaged (default: {})"
     add_option(text, "--template", "TEXT", template, action="append")

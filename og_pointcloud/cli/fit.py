@@ -119,7 +119,8 @@ def fit_several(arguments: argparse.Namespace, options: FitOptions, executor: Ex
             why = printable(f"{fit.name}: {doubts} (og-pointcloud info {shlex.quote(fit.output)} says why)")
             print(f"doubt: {why}")
     for fit in failed:
-        print(f"failed: {printable(fit.capture)}: {printable(fit.cause)}", file=sys.stderr)
+        cause = fit.cause if fit.capture in fit.cause else f"{fit.capture}: {fit.cause}"
+        print(f"failed: {printable(cause)}", file=sys.stderr)
     if len(failed) < len(fits):
         common.print_next("index", arguments.out, "-o", arguments.out / "atlas")
     if failed:

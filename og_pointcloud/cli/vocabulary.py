@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import og_pointcloud as og
-from og_pointcloud.cli.common import Parser, add_command, add_option, add_output, replaceable
+from og_pointcloud.cli.common import Parser, add_commands, add_option, add_output, replaceable
 from og_pointcloud.errors import OgPointcloudError
 
 if TYPE_CHECKING:
@@ -18,11 +18,7 @@ if TYPE_CHECKING:
 
 
 def add(parser: Parser) -> None:
-    actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
-    add, bank, carry = (
-        add_command(actions, run.__name__.removeprefix("run_"), run, run.__doc__)
-        for run in (run_add, run_bank, run_carry)
-    )
+    add, bank, carry = add_commands(parser, "action", run_add, run_bank, run_carry)
     for action in (add, bank, carry):
         add_option(action, "bundle", "S.ogpc", "what `fit` wrote", type=replaceable)
         add_output(action, "-o", "--output", endings=(".ogpc",), help="another file (default: S.ogpc itself)")

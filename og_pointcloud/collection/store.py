@@ -117,8 +117,8 @@ class Atlas:
                 yield atlas
                 atlas._run("COMMIT")
         except BaseException:
-            if is_new:
-                path.unlink(missing_ok=True)
+            for file in (path, path.with_name(f"{path.name}-journal")) if is_new else ():
+                file.unlink(missing_ok=True)
             raise
 
     @classmethod

@@ -79,10 +79,9 @@ class LiveScene:
         self.rgb = scene.cloud.rgb if shown is None else shown.rgb
         self.ids = scene.instance_ids if shown is None else scene.instances_at(self.xyz)
         """(N,) instance of each point shown; ids below 0 index tables by id from their end."""
-        words = scene.words_or_none(labels, text_features)
-        self.names: tuple[str, ...] = words.names if words else ()
-        vectors = words.vectors if words else np.zeros((0, scene.cloud.space.width), np.float32)
-        self.label_of, self.score_of, self.reason_of = scene.chooser.choose(vectors).by_id
+        words = scene.known_words(labels, text_features)
+        self.names = words.names
+        self.label_of = scene.chooser.choose(words.vectors).by_id[0]
         known = _known_changes(scene.cloud) if changes is None else changes
         others = np.full(len(self.label_of) - len(scene.cloud.instances), len(CHANGES) - 1)  # ids below 0
         self._change_of = None if known is None else np.concatenate([known, others])

@@ -29,7 +29,8 @@ def resolve_labels(
     """Names, all different, with a finite vector each that is not zero.
 
     labels: words, looked up in text_features and then in own_words (None: every word of the first that there is), and
-    encoded where both lack them, if there is an encoder; or name -> vector (D,); or a Vocabulary, taken as it is.
+    encoded where both lack them, if there is an encoder; or name -> vector (D,); or a Vocabulary, taken as it is, also
+    without words.
     text_features: a text-features file, or what ``read_text_features`` returned. own_words, feature_space: the scene's.
     carried: gives the encoder in the scene's file, if it has one.
     Raises OgPointcloudError for a word without vector or given twice, FeatureSpaceError for text_features of another
@@ -44,7 +45,7 @@ def resolve_labels(
             )
         labels = sources[0]
     if isinstance(labels, Vocabulary):
-        return _checked(labels.names, labels.vectors)
+        return _checked(labels.names, labels.vectors) if labels.names else labels
     if isinstance(labels, Mapping):
         return _checked([str(name) for name in labels], _stacked(labels))
     words = tuple(labels) if isinstance(labels, Iterable) and not isinstance(labels, (str, bytes)) else (labels,)
