@@ -323,17 +323,16 @@ def test_readers_see_the_atlas_before_a_change_or_after_it(folder):
     assert og.Collection(folder.parent / "atlas").scenes == collection.scenes[1:]
 
 
-def test_a_full_disk_leaves_nothing_of_a_new_atlas(folder, tmp_path):
+def test_a_full_disk_leaves_nothing_of_a_new_atlas(tmp_path):
     resource = pytest.importorskip("resource")
-    og.write_bundle(scene(["chair"]), folder / "a.ogpc")
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, limits[1]))
+    resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, limits[1]))
     try:
-        with pytest.raises(OgPointcloudError, match="stays as it was"):
-            og.Collection.index(folder, tmp_path / "new" / "atlas", progress=False)
+        with pytest.raises(OgPointcloudError, match="stays as it was"), Atlas.writing(tmp_path / "atlas") as atlas:
+            atlas.add_words(("",) * 2000, np.ones((2000, 1024), np.float32))
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-    assert list((tmp_path / "new").iterdir()) == []
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_an_open_collection_notices_a_changed_atlas(folder):
