@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import mmap
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -235,6 +236,24 @@ def test_fingerprints_tell_arrays_and_numbers_apart() -> None:
     different = [one, 2 * one, one[:2], one.reshape(2, 2), one.astype(np.int32), 1.0, 1, None, "1", FitSettings()]
     assert len({fingerprint(value) for value in different}) == len(different)
     assert fingerprint(one, 2) == fingerprint(one.copy(), 2) != fingerprint(2, one)
+
+
+def test_what_other_code_kept_is_not_taken_up(tmp_path: Path) -> None:
+    """An upgrade may lay arrays out in another way."""
+    package = Path(og.__file__).parent
+    shutil.copytree(package, tmp_path / "og_pointcloud", ignore=shutil.ignore_patterns("__pycache__", "demo_encoder"))
+    code = "from og_pointcloud.fitting.work_folder import fingerprint; print(fingerprint(1))"
+
+    def answer() -> str:
+        environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
+        return subprocess.run(
+            [sys.executable, "-c", code], env=environment, cwd=tmp_path, capture_output=True, text=True, check=True
+        ).stdout
+
+    assert answer().strip() == fingerprint(1)
+    with (tmp_path / "og_pointcloud" / "rendering" / "sightings.py").open("a") as file:
+        file.write("# newer\n")
+    assert answer().strip() != fingerprint(1)
 
 
 # A table of views ------------------------------------------------------------------------------------------------

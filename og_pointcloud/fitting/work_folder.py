@@ -17,6 +17,7 @@ import time
 import zlib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext, suppress
+from functools import lru_cache
 from hashlib import blake2b
 from pathlib import Path
 from typing import IO, Any
@@ -39,8 +40,9 @@ Arrays = tuple[NDArray[Any], ...]
 
 
 def fingerprint(*parts: Any) -> str:
-    """24 hexadecimal digits that tell values apart: arrays by their bytes, all else (None too) by how it is written."""
-    digest = blake2b(digest_size=12)
+    """24 hexadecimal digits that tell values apart: arrays by their bytes, all else (None too) by how it is written.
+    Other code gives others: after an upgrade nothing is taken up that an older version laid out."""
+    digest = _of_code().copy()
     for part in parts:
         if isinstance(part, np.ndarray):
             digest.update(f"{part.dtype.str} {part.shape}".encode())
@@ -48,6 +50,15 @@ def fingerprint(*parts: Any) -> str:
         else:
             digest.update(repr(part).encode())
     return digest.hexdigest()
+
+
+@lru_cache(maxsize=1)
+def _of_code() -> blake2b:
+    """Begun with the source of all that makes what is kept."""
+    digest, package = blake2b(digest_size=12), Path(__file__).parents[1]
+    for file in sorted([*package.glob("fitting/**/*.py"), *package.glob("rendering/*.py")]):
+        digest.update(file.read_bytes())
+    return digest
 
 
 def kept_files(folder: Path, name: str = "") -> int:
