@@ -174,7 +174,7 @@ class View:
         if features.ndim != 2 or features.dtype != np.float32:
             raise SceneError(
                 f"view '{self.name}': mask features are {features.dtype} {features.shape}; "
-                "expected float32 (masks, width)"
+                "expected float32 (masks, width): pass features.astype(np.float32)"
             )
         if features.shape[1] == 0 and len(features):
             raise SceneError(

@@ -210,6 +210,7 @@ def test_missing_file(tmp_path):
 def test_no_zip(tmp_path, content):
     (tmp_path / "s.ogpc").write_bytes(content)
     refuse(tmp_path / "s.ogpc", "not a .ogpc file, or damaged")
+    refuse(tmp_path / "s.ogpc", "a cloud or splat alone is no scene")
 
 
 def test_a_zip_of_something_else(tmp_path):

@@ -120,7 +120,7 @@ def test_a_full_disk_is_said_and_leaves_no_half_file(captures, tmp_path, monkeyp
     monkeypatch.setattr(module, "import_plugin", lambda *_: type("exporter", (), {"write_bundle": staticmethod(write)}))
     fits = og.fit_many(captures, tmp_path, Inline(), progress=False)
     assert [fit.state for fit in fits] == ["fitted", "failed"]
-    assert "No space left" in fits[1].cause
+    assert fits[1].cause == f"'{tmp_path / 'capture4.ogpc'}': No space left on device"
     assert sorted(contents(tmp_path)) == ["capture3.ogpc"]
 
 

@@ -126,7 +126,7 @@ def _members(file: BinaryIO) -> tuple[dict[str, bytes], dict[str, int]]:
     except ZIP_ERRORS as error:
         raise _Refused(
             f"not a .ogpc file, or damaged ({error!s:.120}); expected a zip of stored members: copy it again or "
-            f"{REBUILD}"
+            f"{REBUILD}; a cloud or splat alone is no scene, og-pointcloud fit makes one of a capture"
         ) from None
 
 

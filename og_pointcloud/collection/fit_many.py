@@ -166,6 +166,8 @@ def _try_fit(capture: str, output: str, options: FitOptions, share: Share) -> Ca
     except Exception as error:
         expected = isinstance(error, (OgPointcloudError, OSError, ImportError))
         cause = str(error) if expected and str(error) else f"{type(error).__name__}: {error}"
+        if isinstance(error, OSError) and error.filename:
+            cause = f"'{error.filename}': {error.strerror}"
         result = CaptureFit(capture, output, "failed", cause)
     else:
         doubts = tuple(check["name"] for check in cloud.provenance["checks"] if check["verdict"] == "doubt")
