@@ -12,6 +12,7 @@ import numpy as np
 import og_pointcloud as og
 from og_pointcloud.formats.colors import LUMINANCE
 from og_pointcloud.rendering.splatting import Gaussians, render
+from og_pointcloud.show.viewpoint import Viewpoint
 
 
 def numbers(text: str) -> np.ndarray:
@@ -38,11 +39,8 @@ rgb = np.asarray(splats.rgb, np.float32)
 pale = 150 + 0.35 * (rgb @ LUMINANCE)[:, None].repeat(3, axis=1)
 colors = np.where(found[:, None], 0.4 * rgb + 0.6 * np.array([230, 40, 60]), pale).astype(np.float32)
 
-forward = (arguments.target - arguments.eye) / np.linalg.norm(arguments.target - arguments.eye)
-right = np.cross(forward, [0, 0, 1]) / np.linalg.norm(forward[:2])
-rotation = np.stack([right, np.cross(forward, right), forward])
-world_to_camera = np.vstack([np.column_stack([rotation, -rotation @ arguments.eye]), [0, 0, 0, 1]])
-camera = og.in_world(og.Camera(640, 480, 420, 420, 320, 240, world_to_camera), -splats.origin)
+view = Viewpoint(arguments.eye, arguments.target, np.array([0.0, 0, 1]))
+camera = og.in_world(view.camera(640, 480, 420), -splats.origin)
 image, covered = render(Gaussians.from_points(splats), colors, camera, near=0.1)
 picture = np.clip(image + 255 * (1 - covered[..., None]), 0, 255).astype(np.uint8)
 cv2.imwrite(str(arguments.output), picture[:, :, ::-1])

@@ -16,6 +16,7 @@ from og_pointcloud.formats.ply import write_ply
 from og_pointcloud.rendering.geometry import isotropic
 from og_pointcloud.rendering.splatting import Gaussians, render
 from og_pointcloud.scene import Points
+from og_pointcloud.show.viewpoint import Viewpoint
 
 parser = argparse.ArgumentParser(description="Scene editing by words.")
 parser.add_argument("scene", type=Path, metavar="S.ogpc", help="what `og-pointcloud demo` wrote")
@@ -43,12 +44,7 @@ pose[:2, 3] = sofa - pose[:2, :2] @ chair
 og.edit.insert(recoloured, out / "chair.ply", inserted, pose)
 
 eye = np.append(table + 1.6 * (table - sofa) / np.linalg.norm(table - sofa), 2.2)
-forward = np.append(sofa, 0.4) - eye
-forward /= np.linalg.norm(forward)
-right = np.cross(forward, [0, 0, 1]) / np.linalg.norm(forward[:2])
-rotation = np.stack([right, np.cross(forward, right), forward])
-world_to_camera = np.vstack([np.column_stack([rotation, -rotation @ eye]), [0, 0, 0, 1]])
-camera = og.Camera(640, 480, 420, 420, 320, 240, world_to_camera)
+camera = Viewpoint(eye, np.append(sofa, 0.4), np.array([0.0, 0, 1])).camera(640, 480, 420)
 pictures = []
 for path in files:
     splat = og.read_points(path)

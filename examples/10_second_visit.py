@@ -15,6 +15,7 @@ from og_pointcloud.mapping.map_objects import MapObject
 from og_pointcloud.rendering.geometry import isotropic
 from og_pointcloud.rendering.splatting import render
 from og_pointcloud.scene import Points
+from og_pointcloud.show.viewpoint import Viewpoint
 
 SIZE, STRIP, FONT = (800, 640), (400, 320), cv2.FONT_HERSHEY_SIMPLEX
 COLORS = {"gone": (200, 60, 50), "new": (40, 150, 70), "moved": (40, 90, 200)}
@@ -27,12 +28,8 @@ out = arguments.output
 out.mkdir(parents=True, exist_ok=True)
 days = TwoDays(frames=arguments.frames)
 
-eye, target = np.array([-0.3, -0.75, 1.75]) * days.room.size, np.array([0, 0, 0.2])
-forward = (target - eye) / np.linalg.norm(target - eye)
-right = np.cross(forward, [0, 0, 1]) / np.linalg.norm(forward[:2])
-rotation = np.stack([right, np.cross(forward, right), forward])
-camera = og.Camera(*SIZE, 800, 800, SIZE[0] / 2, SIZE[1] / 2,
-                   np.vstack([np.column_stack([rotation, -rotation @ eye]), [0, 0, 0, 1]]))  # fmt: skip
+eye, up = np.array([-0.3, -0.75, 1.75]) * days.room.size, np.array([0.0, 0, 1])
+camera = Viewpoint(eye, 0.2 * up, up).camera(*SIZE, 800)
 
 
 def drawn(scene: og.LabelledScene, colors: np.ndarray, size: tuple[int, int] = SIZE) -> np.ndarray:

@@ -2,7 +2,6 @@
 
     python examples/benchmark_collection.py                     # 1,000 scenes as files, then 1,000,000 descriptors
     python examples/benchmark_collection.py --descriptors 0     # only the files
-    python examples/benchmark_collection.py --files 0 --in-memory   # the search alone, of arrays that were never a file
     python examples/benchmark_collection.py --files 0 --lance   # LanceDB beside the exact search, recall at 10
     python examples/benchmark_collection.py --captures CAPTURE...   # the right scene first?
 
@@ -27,7 +26,6 @@ from numpy.typing import NDArray
 import og_pointcloud as og
 from og_pointcloud.cloud import unit_rows
 from og_pointcloud.collection.index import judge_scenes
-from og_pointcloud.collection.scoring import Block
 from og_pointcloud.collection.store import Atlas, SceneEntry
 from og_pointcloud.fitting.memory import memory_in_use, peak_memory
 
@@ -65,7 +63,6 @@ def main() -> None:
     parser.add_argument("--descriptors", type=int, default=1_000_000)
     parser.add_argument("--width", type=int, default=512)
     parser.add_argument("--a-scene", type=int, default=100, help="instances a scene")
-    parser.add_argument("--in-memory", action="store_true", help="time the search alone, without an atlas")
     parser.add_argument("--lance", action="store_true", help="also LanceDB (extra 'lance')")
     parser.add_argument(
         "--captures", nargs="+", type=Path, help="folders with gt.npz: fit them and ask for their words"
@@ -79,9 +76,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory(dir=os.environ.get("TMPDIR", "/var/tmp")) as folder:
         if arguments.files:
             files(Path(folder), arguments.files, arguments.a_scene, encoder)
-        if arguments.descriptors and arguments.in_memory:
-            search(arguments.descriptors, arguments.a_scene, encoder)
-        elif arguments.descriptors:
+        if arguments.descriptors:
             large(Path(folder), arguments.descriptors, arguments.a_scene, encoder, arguments.lance)
 
 
@@ -194,42 +189,6 @@ def lance_rows(path: Path, folder: Path) -> list[Row]:
     size = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
     print(f"LanceDB: written and indexed in {seconds:.0f} s, CPU {cpu_seconds:.0f} s, {size / 1e9:.2f} GB")
     return rows_of("LanceDB", lambda: og.Collection(path, lance=str(folder)))
-
-
-def search(descriptors: int, instances: int, encoder: MadeEncoder) -> None:
-    """The exact search of arrays in memory, and of half of their scenes, as a box chooses; beside plain products."""
-    scenes = descriptors // instances
-    scene = np.repeat(np.arange(scenes, dtype=np.int32), instances)
-    rows = np.concatenate(
-        [encoder.descriptors(encoder.rng.integers(0, WORDS, 10_000)) for _ in range(descriptors // 10_000)]
-    )
-    bank = og.WordBank(encoder.words.vectors)
-    some = rows[:: max(1, len(rows) // 2000)] @ unit_rows(bank.vectors - bank.mean).T
-    rows /= some.std()
-    block = Block(
-        entries=tuple(SceneEntry(number, f"s{number}") for number in range(scenes)),
-        vectors=rows, shift=np.full(len(rows), -some.mean() / some.std(), np.float32),
-        bounds=np.arange(len(rows) + 1), scene=scene, instance=np.tile(np.arange(instances, dtype=np.int32), scenes),
-        points=np.ones(len(rows), np.int32), center=np.zeros((len(rows), 3)), size=np.zeros((len(rows), 3)), bank=bank,
-        sharpness=np.full(scenes, 3.25),
-    )  # fmt: skip
-    nothing = np.zeros((0, rows.shape[1]), np.float32)
-    everything, half = np.ones(scenes, bool), np.arange(scenes) % 2 == 0
-    for name, chosen in (("exact, all", everything), ("exact, half of the scenes", half)):
-        times = []
-        for word in range(ASKED):
-            text = encoder.words.vectors[word]
-            seconds, found = timed(lambda text=text, chosen=chosen: block.rank(text, nothing, chosen, RECALL_AT))
-            times.append((seconds, cpu_seconds))
-            if word < 3 and chosen is everything:
-                evidence = rows @ block.direction(text)  # all judged alike here: the most evidence is the best
-                assert set(found[0][:1]) <= set(np.argsort(-evidence)[:RECALL_AT])
-        least, middle = np.min(times, axis=0), np.median(times, axis=0)
-        print(
-            f"{name}, {len(rows):,} x {rows.shape[1]}: least {least[0]:.3f} s, median {middle[0]:.3f} s, "
-            f"CPU median {middle[1]:.3f} s, least {least[1]:.3f} s"
-        )
-    print(f"peak memory {peak_memory() / 1e9:.2f} GB")
 
 
 def right_scenes(captures: list[Path], fitted: Path) -> None:

@@ -114,7 +114,8 @@ def miou(cloud: og.LabelledCloud, folder: Path, xyz: np.ndarray) -> float:
     labels = result.labels
     if len(cloud) != len(xyz):
         labels = labels[cKDTree(cloud.xyz_world).query(xyz, workers=-1)[1]]
-    return read_truth(folder).score(labels, result.names).miou
+    truth = read_truth(folder)
+    return truth.score(truth.class_of(labels, result.names)).miou
 
 
 def with_fused_points(capture: Scene, folder: Path) -> Scene:

@@ -34,7 +34,7 @@ from og_pointcloud.fitting.fit import Prepared, prepare
 from og_pointcloud.fitting.labellers import Labelling, fast, leaves_of_training, trained_by_rendering
 from og_pointcloud.fitting.learned.paper import TrainingRun, train_codebook
 from og_pointcloud.fitting.learned.rendered_views import RenderedViews
-from og_pointcloud.formats.atomic import replacing
+from og_pointcloud.formats.atomic import write_file
 from og_pointcloud.journal import Journal
 from og_pointcloud.rendering.surface import Surface
 from og_pointcloud.settings import FitSettings, MatchingSettings, PaperSettings
@@ -140,8 +140,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for name, table in chosen.items():
         text = "\n".join(lines(table, names, range(options.seeds), done))
         print(f"\n{name}\n\n{text}")
-        with replacing(options.output / f"{name}.md") as page:
-            page.write(f"{text}\n".encode())
+        write_file(options.output / f"{name}.md", f"{text}\n".encode())
 
 
 def measure(capture: Path, base: FitSettings, rows: Sequence[Mapping[str, Any]], seeds: int, file: Path) -> None:
@@ -233,7 +232,7 @@ class Trial:
             reach=3 * spacing,
         )
         words = LabelledScene.from_cloud(cloud).chooser.choose(subject.vocabulary.vectors).at(cloud.instance_ids)[0]
-        score = subject.truth.score(words, subject.vocabulary.names)
+        score = subject.truth.score(subject.truth.class_of(words, subject.vocabulary.names))
         return round(score.miou, 4), round(score.unknown_share, 4)
 
 

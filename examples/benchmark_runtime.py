@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 import og_pointcloud as og
 
 SIZES = (10_000, 100_000, 300_000, 1_000_000)
+PROCESSES = 5
 HEAVY = ("torch", "open3d", "pyvista", "cv2", "numba", "scipy")
 FIRST_ANSWER = """
 import sys, time
@@ -99,10 +100,10 @@ def timed(ask: Callable[[], Any]) -> float:
     return time.perf_counter() - start
 
 
-def print_footprint(scene: Path, processes: int = 5) -> None:
+def print_footprint(scene: Path) -> None:
     """Fresh processes, the fastest of each; the heavy libraries they loaded; the installed size of what is needed."""
     runs = []
-    for _ in range(processes):
+    for _ in range(PROCESSES):
         command = [sys.executable, "-c", FIRST_ANSWER, str(scene), *HEAVY]
         runs.append(subprocess.run(command, capture_output=True, text=True, check=True).stdout.split())
     imported, answered, peak = (min(float(run[column]) for run in runs) for column in range(3))

@@ -124,10 +124,10 @@ def errors(window: Case) -> tuple[float, float]:
     return float(error.max() / reference.max()), float(error.sum() / reference.sum())
 
 
-def fastest(work: Callable[[], ViewWeights], runs: int = RUNS) -> tuple[float, ViewWeights]:
+def fastest(work: Callable[[], ViewWeights]) -> tuple[float, ViewWeights]:
     """Seconds of the processor, the least of several runs after a discarded one; and the result."""
     result, taken = work(), []
-    for _ in range(runs):
+    for _ in range(RUNS):
         start = time.process_time()
         result = work()
         taken.append(time.process_time() - start)

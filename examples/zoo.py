@@ -24,10 +24,8 @@ from og_pointcloud_zoo.measure import COLORS, Row, measure, parsed_settings, war
 from og_pointcloud_zoo.report import HALVES, HEADER, line, summary, write_csv, write_picture
 
 from og_pointcloud.errors import OgPointcloudError
-from og_pointcloud.formats.atomic import replacing
+from og_pointcloud.formats.atomic import write_file
 from og_pointcloud.formats.capture import read_capture
-
-__all__ = ["main"]
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -69,9 +67,7 @@ def _write_constants(options: argparse.Namespace) -> None:
 
     chosen = [one for one in constants() if not options.only or one.path.startswith(tuple(options.only))]
     results = list(tqdm(tried(chosen, options.output), "constants", len(chosen), disable=None))
-    with replacing(options.constants) as file:
-        file.write(page(results).encode())
-    print(options.constants)
+    print(write_file(options.constants, page(results).encode()))
 
 
 def _rows(chosen: Sequence[Path], options: argparse.Namespace) -> list[Row]:

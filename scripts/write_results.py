@@ -88,10 +88,10 @@ def measure(folder: Path, runs: int = 1) -> Result:
         answer = ask(og.load(bundle), truth, words)
     vocabulary, prepared = read_text_features(words)[0], prepare(scene)
     baselines = {
-        name: truth.score(labels, vocabulary.names).miou
+        name: truth.score(truth.class_of(labels, vocabulary.names)).miou
         for name, labels, _ in baseline_labels(prepared, vocabulary.vectors)
     }
-    score = truth.score(answer.called, [*truth.names, "a word that the truth lacks"])
+    score = truth.score(answer.called)
     return Result(
         scene=f"{folder.absolute().name}, {len(scene.views)} views, {len(scene.points):,} points",
         miou=miou_interval(answer.called, truth, answer.xyz, answer.spacing, score.classes),

@@ -259,7 +259,7 @@ def test_a_codebook_step_moves_features_by_the_gradient_of_their_centers(balls: 
     history = paper.StageHistory("coarse codebook", 20_000)
     parts = paper._Parts([np.arange(len(features))], [4], np.zeros((len(features), 0), np.float32))
     start = features[:4]
-    own, centers = paper.kmeans(features, np.ones(len(features)), start, settings.lloyd_rounds, reseed=True)
+    own, centers = paper.kmeans(features, np.ones(len(features)), start, settings.lloyd_rounds)
     training.train(history, start, parts, paper.TrainingRun(), "")
 
     weights, quantised = source[0].weights.astype(np.float64), centers[own].astype(np.float64)

@@ -35,11 +35,11 @@ def far_apart(count):
 def test_a_word_that_the_truth_lacks_is_a_wrong_answer():
     truth = truth_of([0] * 30 + [1] * 30)
     labels = np.repeat([0, 1, -1], [30, 15, 15])  # of the words pot and lamp: all cups are called pots
-    score = truth.score(labels, ("pot", "lamp"))
+    score = truth.score(truth.class_of(labels, ("pot", "lamp")))
     assert score.class_iou == (0.0, 0.0)
     assert score.unknown_share == 15 / 60
     with pytest.raises(SceneError, match=r"gt\.npz has 60 points, the labels are 59"):
-        truth.score(labels[:-1], ("pot", "lamp"))
+        truth.score(labels[:-1])
 
 
 def test_instances_of_the_truth_are_read_and_checked(tmp_path):

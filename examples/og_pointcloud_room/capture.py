@@ -27,11 +27,6 @@ from og_pointcloud_room.raycast import BACKGROUND, Frame, Intrinsics, RayCaster,
 from og_pointcloud_room.room import Room, furnish
 from og_pointcloud_room.shapes import rotated
 
-__all__ = [
-    "CaptureSettings", "RoomCapture", "everyday_vectors", "ground_truth", "looking_at", "make_capture",
-    "mask_features", "walk", "write_capture",
-]  # fmt: skip
-
 Random = np.random.Generator
 FLYING = -2
 """Source of a sample that lies on no surface: interpolated across a depth edge, or an outlier."""

@@ -28,8 +28,6 @@ from og_pointcloud_room.photographs import ABSENT, FromPhotographs, label_from_p
 from og_pointcloud_room.pictures import draw_clouds, draw_views
 from og_pointcloud_room.stages import stage
 
-__all__ = ["DemoResult", "MethodScore", "ceiling", "run_demo"]
-
 SHOWN_VIEWS = (0.0, 0.2, 0.62, 0.82)
 """Where along the path the views of the contact sheet lie."""
 

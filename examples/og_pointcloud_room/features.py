@@ -18,8 +18,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["FEATURE_SPACE", "FeatureModel"]
-
 FEATURE_SPACE = "simulated-clip-512"
 WIDTH = 512
 TEXT_TEXT, IMAGE_IMAGE, MATCHED, UNMATCHED = 0.74, 0.53, 0.33, 0.18

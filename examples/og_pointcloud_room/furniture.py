@@ -16,12 +16,6 @@ from numpy.typing import ArrayLike
 
 from og_pointcloud_room.shapes import Material, Part, box, cushion_shape, lathe, rotation_about
 
-__all__ = [
-    "CLASS_NAMES", "METAL", "Group", "Item", "Random", "arranged", "bed_group", "bottle", "cabinet_group", "desk_group",
-    "dining_group", "floor_lamp", "floor_plant", "lying_book", "mug", "paint", "picture", "shelf_group", "small_plant",
-    "sofa_group", "table_of", "vase", "wood",
-]  # fmt: skip
-
 CLASS_NAMES = (
     "bed", "book", "bottle", "cabinet", "chair", "cushion", "desk", "lamp", "monitor", "mug", "picture",
     "potted plant", "rug", "shelf", "sofa", "table", "vase",

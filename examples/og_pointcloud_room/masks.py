@@ -14,8 +14,6 @@ from scipy.ndimage import distance_transform_edt
 
 from og_pointcloud.errors import OgPointcloudError
 
-__all__ = ["MaskNoise", "propose_masks"]
-
 Random = np.random.Generator
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import sys
 import warnings
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from og_pointcloud_export import write_bundle
@@ -23,8 +23,6 @@ from og_pointcloud.settings import FitSettings
 from og_pointcloud.text.encoder import DEMO_ENCODER
 from og_pointcloud_room.furniture import CLASS_NAMES
 from og_pointcloud_room.stages import stage
-
-__all__ = ["ABSENT", "FromPhotographs", "label_from_photographs"]
 
 ABSENT = (
     "anvil", "armadillo", "bagpipes", "bobsled", "boomerang", "catapult", "chainsaw", "geyser", "gondola", "harpoon",
@@ -49,23 +47,17 @@ class FromPhotographs:
     seconds: dict[str, float]
 
 
-def label_from_photographs(
-    capture: Path, output: Path, proposer: str = "opencv", seed: int = 0,
-    level: str | None = None,
-) -> FromPhotographs:  # fmt: skip
+def label_from_photographs(capture: Path, output: Path, proposer: str = "opencv", seed: int = 0) -> FromPhotographs:
     """Label a room's capture, as ``write_capture`` wrote it, by the names of its classes as someone types them.
 
     Of the capture only images, poses, points and the truth are used; ``output`` becomes a capture of its own, with the
     masks made here, and gets ``room.ogpc``, which carries the words' encoder. proposer: as of `og-pointcloud masks`; or
-    the capture's own ``masks`` folder for those of the demo's simulated proposer. level: of the
-    masks; None: that command's own.
+    the capture's own ``masks`` folder for those of the demo's simulated proposer.
     """
     seconds: dict[str, float] = {}
     output.mkdir(parents=True, exist_ok=True)
-    settings = MaskSettings(proposer=proposer, encoder="demo")
-    settings = settings if level is None else replace(settings, level=level)
     with stage("masks and features", seconds):
-        made = make_masks(capture, settings, output, overwrite=True)
+        made = make_masks(capture, MaskSettings(proposer=proposer, encoder="demo"), output, overwrite=True)
     with stage("read the capture", seconds):
         scene = read_capture(output)
     with stage("fit", seconds):

@@ -18,8 +18,6 @@ from og_pointcloud.ask.segmentation import Segmentation
 from og_pointcloud.formats.colors import label_colors
 from og_pointcloud.show.viewpoint import FOCAL, Viewpoint, choose_viewpoint
 
-__all__ = ["draw_clouds", "draw_views"]
-
 CUT_M = 2.3
 """Points above are cut away, so that one sees into the room; metres above the floor."""
 WALL_M = 0.15
@@ -36,12 +34,12 @@ ASIDE = 0.12
 Colours = NDArray[np.uint8]
 
 
-def draw_views(path: Path, images: Sequence[Colours], masks: Sequence[NDArray[np.integer]], *, seed: int = 0) -> None:
+def draw_views(path: Path, images: Sequence[Colours], masks: Sequence[NDArray[np.integer]]) -> None:
     """Views side by side, and under each the same with its masks in random colours.
 
     images: (H, W, 3) uint8 RGB each. masks: (H, W) each, 0 or less outside every mask.
     """
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     columns = []
     for image, ids in zip(images, masks, strict=True):
         colours = np.concatenate([[(255, 255, 255)], label_colors(rng.permutation(max(int(ids.max()), 1)))])

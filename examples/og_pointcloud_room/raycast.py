@@ -25,8 +25,6 @@ try:
 except ImportError as error:
     raise MissingExtraError("open3d", "demo") from error
 
-__all__ = ["Frame", "Hits", "Intrinsics", "RayCaster", "Surfaces", "o3d", "tensor"]
-
 Points = NDArray[np.float64]
 BACKGROUND = -1
 NOISE_SIDE, NOISE_STEPS = 128, 8

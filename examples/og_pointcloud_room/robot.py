@@ -16,16 +16,11 @@ from og_pointcloud_room.raycast import Surfaces
 from og_pointcloud_room.room import Room, furnish
 from og_pointcloud_room.shapes import Material, box, lathe, rotated, rotation_about
 
-__all__ = [
-    "BACKGROUND", "MOVED", "NEW", "NO_RETURN", "ChangedRoom", "Drive", "Lidar", "LidarFrame", "centred", "free_floor",
-    "ring",
-]  # fmt: skip
-
 Points = NDArray[np.float64]
 BACKGROUND, NEW, MOVED, NO_RETURN = -1, -2, -3, -4
 """What a ray hits, where it is no object that stands as it was mapped (a row of CLASS_NAMES)."""
 SENSOR_HEIGHT_M, SPEED_M_S = 0.9, 0.4
-FLOOR_STEP_M = 0.06
+FLOOR_STEP_M, RING_STEPS = 0.06, 90
 CLEAR_OF_FURNITURE_M, CLEAR_OF_PATH_M, APART_M = 0.35, 0.6, 0.8
 """What the middle of a thing that was brought in keeps free around it, where there is so much room."""
 
@@ -163,13 +158,13 @@ def free_floor(room: Room, surfaces: Surfaces, path: Points, taken: Points) -> P
     return floor[np.where(free >= min(1.0, free.max()), from_path, np.inf).argmin()]
 
 
-def ring(room: Room, steps: int = 90) -> Points:
-    """(steps, 2) a closed path around the middle, each step where the furniture leaves most room; smoothed."""
-    surfaces, angle = Surfaces([*room.objects, *room.shell]), 2 * np.pi * np.arange(steps) / steps
+def ring(room: Room) -> Points:
+    """(RING_STEPS, 2) a closed path around the middle, each step where the furniture leaves most room; smoothed."""
+    surfaces, angle = Surfaces([*room.objects, *room.shell]), 2 * np.pi * np.arange(RING_STEPS) / RING_STEPS
     around = np.stack([np.cos(angle), np.sin(angle)], axis=1) * np.array(room.size[:2]) / 2
     shares = np.linspace(0.3, 0.85, 23)
     places = around[:, None] * shares[None, :, None]
-    clearance = _clearance(surfaces, places.reshape(-1, 2)).reshape(steps, -1)
+    clearance = _clearance(surfaces, places.reshape(-1, 2)).reshape(RING_STEPS, -1)
     best = shares[clearance.argmax(axis=1)]
     window = np.hanning(17)[1:-1]
     smooth = np.asarray(np.convolve(np.concatenate([best[-7:], best, best[:7]]), window / window.sum(), "valid"), float)

@@ -18,8 +18,6 @@ from og_pointcloud_room.robot import BACKGROUND, MOVED, NEW, NO_RETURN, Drive, L
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["DriveLog", "draw_drive", "write_drive"]
-
 KEPT_PER_FRAME = 1200
 CEILING_M = 2.3
 SEEN_OFTEN = 0.1

@@ -25,8 +25,6 @@ from og_pointcloud_room.furniture import (
 )
 from og_pointcloud_room.shapes import Material, box
 
-__all__ = ["Room", "furnish", "shell"]
-
 WALL_GAP = 0.02
 CORNER = 0.5
 """Side of the square kept free in each corner, for a floor lamp or a plant."""

@@ -16,8 +16,6 @@ from og_pointcloud_room.robot import centred, free_floor, ring
 from og_pointcloud_room.room import Room, furnish
 from og_pointcloud_room.shapes import Material, lathe
 
-__all__ = ["NAMES", "TwoDays"]
-
 NAMES = (*CLASS_NAMES, "ball")
 BALL_RADIUS_M = 0.2
 INTRINSICS = Intrinsics(320, 240, 230.0)

@@ -12,8 +12,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["Material", "Part", "box", "cushion_shape", "lathe", "rotated", "rotation_about"]
-
 SEGMENTS = 28
 """Facets around a turned or cushioned shape: round to the eye at two metres."""
 GRID = 2.0**-20

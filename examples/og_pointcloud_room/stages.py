@@ -6,8 +6,6 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-__all__ = ["stage"]
-
 
 @contextmanager
 def stage(name: str, seconds: dict[str, float]) -> Iterator[None]:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-__all__ = ["RELATED", "SYNONYMS"]
-
 
 def _listed(text: str) -> tuple[str, ...]:
     return tuple(word.strip() for word in text.replace("\n", " ").split(","))

@@ -25,14 +25,12 @@ from og_pointcloud import settings as records
 from og_pointcloud.evaluate.knobs import changed
 from og_pointcloud.evaluate.truth import read_truth
 from og_pointcloud.fitting.fit import fit_prepared, prepare
-from og_pointcloud.formats.atomic import replacing
+from og_pointcloud.formats.atomic import write_file
 from og_pointcloud.formats.capture import read_capture
 from og_pointcloud.settings import FitSettings
 from og_pointcloud_zoo.draws import draw
 from og_pointcloud_zoo.make import made_scene
 from og_pointcloud_zoo.measure import answered
-
-__all__ = ["SCENES", "SOURCES", "Constant", "Tried", "constants", "page", "tried"]
 
 SCENES = (
     "room-0", "room-noisy-0", "room-sparse-0", "detector-0", "shelf-0", "bin-0", "board-0", "plants-0", "glass-0",
@@ -189,10 +187,7 @@ def tried(chosen: Sequence[Constant], output: Path) -> Iterator[Tried]:
             key = "default.json" if name == "default" else f"{constant.path}-{name}.json"
             file = kept / key
             if not file.is_file():
-                file.parent.mkdir(parents=True, exist_ok=True)
-                measured = bench.errors(constant, value)
-                with replacing(file) as target:
-                    target.write(json.dumps(measured).encode())
+                write_file(file, json.dumps(bench.errors(constant, value)).encode())
             errors[name] = tuple(json.loads(file.read_text()))
         yield Tried(constant, **errors)
 
@@ -224,7 +219,7 @@ class _Bench:
         prepared = prepare(self._prepared[folder].scene, settings) if anew else self._prepared[folder]
         truth = read_truth(folder)
         answer = answered(folder, fit_prepared(prepared, settings), truth)
-        return 1 - truth.score(answer.called, [*truth.names, "a word that the truth lacks"]).miou
+        return 1 - truth.score(answer.called).miou
 
 
 def _module(path: str) -> tuple[Any, str]:

@@ -15,8 +15,6 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["KINDS", "Draw", "draw", "half_of", "scene_names"]
-
 SETTLED = ("seven_redkitchen", "apc_shelf_B", "ycb_0050", "nuscenes_frame")
 """Captures that constants were chosen on before there was a zoo."""
 

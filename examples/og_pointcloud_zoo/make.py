@@ -35,8 +35,6 @@ from og_pointcloud_zoo.draws import Draw
 from og_pointcloud_zoo.outdoors import Raw
 from og_pointcloud_zoo.places import ALIKE, GLASS, MIRROR, PLACES, Sensor
 
-__all__ = ["drawn_capture", "made_scene"]
-
 TESTS = str(Path(__file__).parents[2] / "tests")
 SHELL = ("floor", "wall", "ceiling")
 GHOSTS = 0.05

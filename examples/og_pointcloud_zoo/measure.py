@@ -28,8 +28,6 @@ from og_pointcloud.settings import FitSettings
 from og_pointcloud.text.text_features import read_text_features
 from og_pointcloud_zoo.draws import half_of
 
-__all__ = ["COLORS", "Row", "answered", "measure", "parsed_settings", "warm_up"]
-
 WORDS, BANK = "text_features.npz", "word_bank.npz"
 COLORS = ("noisy", "grey", "none")
 """Colors with noise, the same without hue, and none."""
@@ -77,7 +75,7 @@ def measure(
     cloud = fit_prepared(prepared, settings, journal)
     seconds, worked = time.perf_counter() - start, time.process_time() - worked
     answer = answered(folder, cloud, truth)
-    score = truth.score(answer.called, [*truth.names, "a word that the truth lacks"])
+    score = truth.score(answer.called)
     row = Row(
         scene=folder.name,
         half=half_of(folder.name),
@@ -120,9 +118,10 @@ def _beside_baselines(
     vocabulary = read_text_features(folder / WORDS)[0]
     best: tuple[float, str, NDArray[np.integer]] | None = None
     for name, labels, _ in baseline_labels(prepared, vocabulary.vectors):
-        miou = truth.score(labels, vocabulary.names).miou
+        called = truth.class_of(labels, vocabulary.names)
+        miou = truth.score(called).miou
         if best is None or miou > best[0]:
-            best = miou, name, truth.class_of(labels, vocabulary.names)
+            best = miou, name, called
     assert best is not None
     gain = miou_interval(answer.called, truth, answer.xyz, answer.spacing, classes, less=best[2])
     return replace(row, baseline=best[1], baseline_miou=best[0], gain=gain.mean, gain_low=gain.low, gain_high=gain.high)
@@ -135,9 +134,9 @@ def warm_up(scene: Scene) -> None:
         og.fit(replace(scene, points=few, views=scene.views[:6]), progress=False)
 
 
-def parsed_settings(changes: Iterable[str], settings: FitSettings | None = None) -> FitSettings:
+def parsed_settings(changes: Iterable[str]) -> FitSettings:
     """Settings with numbers changed by ``path=value``, as "membership.sure_share=0.5" or "mode=grouping"."""
-    found = settings or FitSettings()
+    found = FitSettings()
     for change in changes:
         path, _, text = change.partition("=")
         value: Any = text

@@ -18,8 +18,6 @@ from og_pointcloud_room.room import Room
 from og_pointcloud_room.shapes import Material, Part, box, cushion_shape, lathe, rotated
 from scipy.ndimage import zoom
 
-__all__ = ["COUNTRY", "SKY", "STREET", "Matched", "Raw", "Scanner", "country_room", "ground_at", "street_room"]
-
 SKY = "sky"
 STREET = ("road", "sidewalk", "building", "car", "pole", "tree", "person", "fence", SKY)
 COUNTRY = ("trail", "grass", "bush", "tree", "rock", "log", "pole", SKY)

@@ -44,8 +44,6 @@ from og_pointcloud_zoo.outdoors import (
     street_room,
 )
 
-__all__ = ["ALIKE", "GLASS", "MIRROR", "NAMES", "PLACES", "Place"]
-
 GLASS, MIRROR = "window", "mirror"
 """Names of what a depth sensor does not see: it looks through the one and into the other."""
 BOXES = ("box", "crate", "suitcase")

@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Sequence
-from dataclasses import asdict, fields
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
 
 from og_pointcloud.evaluate.sweep_report import require_matplotlib
-from og_pointcloud.formats.atomic import replacing
+from og_pointcloud.formats.atomic import replacing, write_file
+from og_pointcloud.formats.tables import csv_text
 from og_pointcloud_zoo.measure import Row
-
-__all__ = ["HALVES", "line", "rank_correlation", "summary", "write_csv", "write_picture"]
 
 HALVES = {"choose": "for choosing", "judge": "for judging alone"}
 COLOURS = {"choose": "tab:blue", "judge": "tab:orange"}
@@ -85,13 +82,7 @@ def rank_correlation(first: Sequence[float], second: Sequence[float]) -> float:
 
 def write_csv(rows: Sequence[Row], path: Path) -> Path:
     """A line a scene; written whole or not at all."""
-    text = io.StringIO()
-    lines = csv.DictWriter(text, [one.name for one in fields(Row)], lineterminator="\n")
-    lines.writeheader()
-    lines.writerows(asdict(row) for row in rows)
-    with replacing(path) as file:
-        file.write(text.getvalue().encode())
-    return path
+    return write_file(path, csv_text([asdict(row) for row in rows]).encode())
 
 
 def write_picture(rows: Sequence[Row], path: Path) -> Path:

@@ -217,27 +217,21 @@ class Chooser:
             cosines = self._best_descriptor(self._descriptors @ unit_rows(texts).T)
             nothing = np.full(cosines.shape, np.nan)
             return self._answer(cosines, nothing, nothing[:, 0])
-        evidence = self._evidence(texts)
-        return self._answer(evidence, *self._posterior(evidence, texts))
+        directions = unit_rows(unit_rows(texts) - self.bank.mean)
+        scores = (self._centred @ directions.T - self._middle) / self._spread
+        evidence = (self._best_descriptor(scores) - self._best_middle) / self._best_spread  # several: as for the bank
+        evidence[:, ~texts.any(axis=1)] = -np.inf
+        return self._answer(evidence, *self._posterior(evidence, texts, directions))
 
     def _require_width(self, vectors: NDArray[np.floating], what: str) -> None:
         self._space.require(FeatureSpace(UNKNOWN_SPACE, vectors.shape[1]), what)
-
-    def _evidence(self, texts: NDArray[np.float32]) -> NDArray[np.floating]:
-        """(described, T) standard deviations above the bank; of several descriptors the best, as for the bank."""
-        assert self.bank is not None
-        directions = unit_rows(unit_rows(texts) - self.bank.mean)
-        scores = (self._centred @ directions.T - self._middle) / self._spread
-        evidence = (self._best_descriptor(scores) - self._best_middle) / self._best_spread
-        evidence[:, ~texts.any(axis=1)] = -np.inf
-        return evidence
 
     def _best_descriptor(self, scores: NDArray[np.floating]) -> NDArray[np.floating]:
         """(described, ...) of the scores of all descriptors, the best of each instance."""
         return best_of_rows(scores, np.searchsorted(self._described, self._owner), len(self._described))
 
     def _posterior(
-        self, evidence: NDArray[np.floating], texts: NDArray[np.float32]
+        self, evidence: NDArray[np.floating], texts: NDArray[np.float32], directions: NDArray[np.floating]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Probability of each label and of none, (described, L) and (described,), float64.
 
@@ -249,19 +243,13 @@ class Chooser:
         hypothesis, first = _distinct(texts)
         log_words = np.log(max(len(first), self.settings.kinds))
         log_label = sharpness * evidence[:, first].astype(np.float64)
-        log_none = self._log_none(texts) + log_words
+        # The mean likelihood that a word of the bank other than the labels gives.
+        other = (self._bank_directions @ directions.T).max(axis=1) < self.settings.synonym
+        log_none = log_words + log_mean_likelihood(sharpness * self._bank_evidence[:, other].astype(float), sharpness)
         top = np.maximum(log_none, log_label.max(axis=1))
         weight, none = np.exp(log_label - top[:, None]), np.exp(log_none - top)
         total = weight.sum(axis=1) + none
         return (weight / total[:, None])[:, hypothesis], none / total
-
-    def _log_none(self, texts: NDArray[np.float32]) -> NDArray[np.float64]:
-        """(described,) log of the mean likelihood that a word of the bank other than the labels gives."""
-        assert self.bank is not None
-        directions = unit_rows(unit_rows(texts) - self.bank.mean)
-        other = (self._bank_directions @ directions.T).max(axis=1) < self.settings.synonym
-        exponents = self.sharpness * self._bank_evidence[:, other].astype(np.float64)
-        return log_mean_likelihood(exponents, self.sharpness)
 
     def _answer(
         self, evidence: NDArray[np.floating], table: NDArray[np.floating], unknown: NDArray[np.floating]

@@ -6,14 +6,11 @@ it is first asked, so that a table costs nothing until then.
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from pathlib import Path
 from typing import Any, overload
 
 import numpy as np
@@ -23,8 +20,8 @@ from og_pointcloud.ask.boxes import Box, axis_aligned_box, main_part, oriented_b
 from og_pointcloud.ask.choosing import Chooser
 from og_pointcloud.cloud import LabelledCloud, Vocabulary
 from og_pointcloud.errors import printable
-from og_pointcloud.formats.atomic import replacing
-from og_pointcloud.formats.tables import as_cell
+from og_pointcloud.formats.atomic import write_file
+from og_pointcloud.formats.tables import csv_text
 
 LABELLED = "labelled"
 """State of an instance that words can be compared with."""
@@ -169,14 +166,9 @@ class Instances(Sequence[Instance]):
 
     def to_csv(self, path: str | os.PathLike[str] | None = None) -> str:
         """The records as CSV text, a column a number; also written to path, whole or not at all."""
-        records = [_flat(record) for record in self.to_records()]
-        text = io.StringIO()
-        # The longest row names all columns: one without points or words has fewer.
-        writer = csv.DictWriter(text, dict.fromkeys(name for record in records for name in record), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows({name: as_cell(value) for name, value in record.items()} for record in records)
-        _write(path, text.getvalue())
-        return text.getvalue()
+        text = csv_text([_flat(record) for record in self.to_records()])
+        _write(path, text)
+        return text
 
     def __repr__(self) -> str:
         header = (
@@ -258,5 +250,4 @@ def _flat(value: Any, name: str = "") -> dict[str, Any]:
 
 def _write(path: str | os.PathLike[str] | None, text: str) -> None:
     if path is not None:
-        with replacing(Path(path)) as file:
-            file.write(text.encode())
+        write_file(path, text.encode())

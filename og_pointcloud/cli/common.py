@@ -156,10 +156,9 @@ def check_at_least(option: str, value: float | None, least: float) -> None:
 
 
 def write_json(path: Path, value: Mapping[str, Any]) -> None:
-    from og_pointcloud.formats.atomic import replacing
+    from og_pointcloud.formats.atomic import write_file
 
-    with replacing(path) as file:
-        file.write(json.dumps(value, indent=2, ensure_ascii=False).encode(errors="backslashreplace") + b"\n")
+    write_file(path, json.dumps(value, indent=2, ensure_ascii=False).encode(errors="backslashreplace") + b"\n")
 
 
 def require_room() -> None:

@@ -58,7 +58,7 @@ def ask(scene: SceneLike, truth: Truth, text_features: Path | None = None) -> An
 
 def score_capture(answer: Answer, truth: Truth) -> CaptureScore:
     """All scores of one answer. SceneError where no class of the truth has enough points to be scored."""
-    labels = score_labels(answer.called, truth.cls, scored=truth.scored, background=truth.background)
+    labels = truth.score(answer.called)
     if not labels.classes:
         raise SceneError("no class of the truth has 30 points that can be scored; expected one or more")
     counted = truth.scored & np.isin(truth.cls, labels.classes)
@@ -74,7 +74,7 @@ def score_capture(answer: Answer, truth: Truth) -> CaptureScore:
 
 def difference(first: Answer, second: Answer, truth: Truth) -> BlockInterval:
     """Of the mIoU of one answer less that of another, of the same points: paired, over the same blocks of space."""
-    classes = score_labels(first.called, truth.cls, scored=truth.scored).classes
+    classes = truth.score(first.called).classes
     return miou_interval(first.called, truth, first.xyz, first.spacing, classes, less=second.called)
 
 

@@ -10,15 +10,13 @@ stand other methods on the default's mask table (`baselines`).
 
 from __future__ import annotations
 
-import csv
-import io
 import os
 import platform
 import re
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -35,9 +33,9 @@ from og_pointcloud.evaluate.knobs import DEFAULT, Setting
 from og_pointcloud.evaluate.truth import GT_NAME, Truth, read_truth
 from og_pointcloud.fitting.fit import fit, prepare
 from og_pointcloud.fitting.tiles import needs_tiles
-from og_pointcloud.formats.atomic import replacing
+from og_pointcloud.formats.atomic import write_file
 from og_pointcloud.formats.capture import read_capture
-from og_pointcloud.formats.tables import as_cell
+from og_pointcloud.formats.tables import csv_text
 from og_pointcloud.journal import Journal
 from og_pointcloud.scene import Scene
 from og_pointcloud.settings import FitSettings
@@ -211,8 +209,8 @@ class _Trial:
         truth, words = self.subject.truth, self.subject.vocabulary
         assert truth is not None
         assert words is not None
-        score = truth.score(labels, words.names)
         answer = Answer(truth.class_of(labels, words.names), labels, self.subject.scene.points.xyz, spacing)
+        score = truth.score(answer.called)
         self.default = self.default or answer
         found: dict[str, Any] = {"miou": score.miou, "macc": score.macc}
         found |= {"unknown": score.unknown_share, "background": score.background_called}
@@ -244,16 +242,11 @@ def front(rows: Sequence[Row]) -> list[Row]:
 
 def write_rows(rows: Iterable[Row], path: Path) -> Path:
     """A CSV with a line a row, the machine and the versions in each; written whole or not at all."""
-    text, where = io.StringIO(), {"machine": machine()}
-    lines = csv.DictWriter(text, [*(one.name for one in fields(Row)), *where], lineterminator="\n")
-    lines.writeheader()
+    where, records = machine(), []
     for row in rows:
         left_out = "; ".join(str(entry["what"]) for entry in row.left_out)
-        record = asdict(row) | {"left_out": left_out} | where
-        lines.writerow({name: as_cell(value) for name, value in record.items()})
-    with replacing(path) as file:
-        file.write(text.getvalue().encode())
-    return path
+        records.append(asdict(row) | {"left_out": left_out, "machine": where})
+    return write_file(path, csv_text(records).encode())
 
 
 def machine() -> str:

@@ -10,7 +10,7 @@ from typing import Any
 
 from og_pointcloud.errors import naming_extra
 from og_pointcloud.evaluate.sweep import BASELINE, Row, Sweep, front, machine
-from og_pointcloud.formats.atomic import replacing
+from og_pointcloud.formats.atomic import write_file
 
 SHARES = {
     "mIoU": "miou", "mAcc": "macc", "unknown": "unknown",
@@ -44,9 +44,7 @@ def write_chart(sweep: Sweep, path: Path) -> Path:
         axes.set_title(capture, fontsize=11, fontweight="bold", loc="left")
     data = io.BytesIO()
     figure.savefig(data, format="png", dpi=110)
-    with replacing(path) as file:
-        file.write(data.getvalue())
-    return path
+    return write_file(path, data.getvalue())
 
 
 def _panel(axes: Any, rows: Sequence[Row]) -> None:
@@ -91,9 +89,7 @@ def write_report(sweep: Sweep, path: Path, chart: Path) -> Path:
                 parts += _list("Left out by the default", (f"{one['what']}: {one['why']}" for one in row.left_out))
         header, *lines = table(rows)
         parts.append("\n".join(map(_markdown, [header, ["---", *["---:"] * (len(header) - 1)], *lines])))
-    with replacing(path) as file:
-        file.write("\n\n".join(parts).encode() + b"\n")
-    return path
+    return write_file(path, "\n\n".join(parts).encode() + b"\n")
 
 
 def _list(heading: str, entries: Iterable[str]) -> list[str]:

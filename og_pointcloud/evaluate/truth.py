@@ -45,11 +45,10 @@ class Truth:
         number = np.array([*(numbers.get(word, len(numbers)) for word in words), -1])
         return number[np.maximum(labels, -1)]
 
-    def score(self, labels: NDArray[np.integer], words: Sequence[str]) -> Score:
-        """Labels that index ``words``, -1 unknown, scored; SceneError where they are not one each point."""
-        if len(labels) != len(self.cls):
-            raise SceneError(f"{GT_NAME} has {len(self.cls)} points, the labels are {len(labels)}; expected one each")
-        called = self.class_of(labels, words)
+    def score(self, called: NDArray[np.integer]) -> Score:
+        """Classes (n,) that points are called, as of `class_of`, scored; SceneError where they are not one each."""
+        if len(called) != len(self.cls):
+            raise SceneError(f"{GT_NAME} has {len(self.cls)} points, the labels are {len(called)}; expected one each")
         return score_labels(called, self.cls, scored=self.scored, background=self.background)
 
 

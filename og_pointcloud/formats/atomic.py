@@ -59,6 +59,13 @@ def replacing(path: str | os.PathLike[str], *, durable: bool = True) -> Iterator
         raise
 
 
+def write_file(path: str | os.PathLike[str], data: bytes) -> Path:
+    """Write a file whole or not at all, as `replacing` does; returns its path."""
+    with replacing(path) as file:
+        file.write(data)
+    return Path(path)
+
+
 @contextmanager
 def replacing_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
     """A folder of the same name, to make and to fill, that becomes ``path``, which must not exist, when, and only when,

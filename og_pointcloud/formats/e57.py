@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.errors import OgPointcloudError, SceneError, naming_extra
-from og_pointcloud.formats.atomic import replacing
+from og_pointcloud.formats.atomic import write_file
 from og_pointcloud.formats.images import MAX_PIXELS, require_cv2, stated_size
 from og_pointcloud.formats.ply import plain_rows, write_ply
 from og_pointcloud.formats.poses import pose_of_quaternion
@@ -87,8 +87,8 @@ def unpack_e57(path: str | os.PathLike[str], folder: str | os.PathLike[str]) -> 
             why = unused[0] if unused else "the file has no images"
             raise SceneError(f"no image of it can be used ({why}); expected pinhole or spherical ones with poses")
     write_ply(folder / "points.ply", {"vertex": plain_rows(points.xyz_world, points.rgb)})
-    with replacing(folder / "transforms.json") as stream:
-        stream.write(json.dumps({"ply_file_path": "points.ply", "frames": frames}, indent=1).encode())
+    content = {"ply_file_path": "points.ply", "frames": frames}
+    write_file(folder / "transforms.json", json.dumps(content, indent=1).encode())
     return len(frames), unused
 
 
@@ -215,8 +215,7 @@ def _unpack_image(image: Any, folder: Path, name: str, most: int) -> dict[str, A
         data = _whole_sphere(data, suffix, (width, height), (across, along))
         pose[:3, :3] = pose[:3, :3] @ FROM_ALONG_X
         keys |= {"camera_model": "EQUIRECTANGULAR", "h": width // 2, "w": width // 2 * 2}
-    with replacing(folder / "images" / f"{name}{suffix}") as stream:
-        stream.write(data)
+    write_file(folder / "images" / f"{name}{suffix}", data)
     return {"file_path": f"images/{name}{suffix}", "transform_matrix": pose.tolist(), **keys}
 
 

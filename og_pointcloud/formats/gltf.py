@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.errors import SceneError
-from og_pointcloud.formats.atomic import replacing
+from og_pointcloud.formats.atomic import write_file
 from og_pointcloud.formats.gaussian_ply import SH_CONSTANT
 from og_pointcloud.formats.tables import LABEL_FINITE, naming
 from og_pointcloud.scene import Points, require_finite
@@ -97,8 +97,7 @@ def write_gltf(
         document, binary = _document(columns, origin, extensions, names)
         tables = {"og_label": list(names), "og_instance": _instance_names(attributes, names)}
         binary += _add_names(document, len(binary), tables, feature_sets)
-        with replacing(path) as file:
-            file.write(_as_glb(document, binary))
+        write_file(path, _as_glb(document, binary))
 
 
 def _splat_columns(splats: Points, rgb: NDArray[np.uint8]) -> dict[str, NDArray[np.float32]]:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.errors import SceneError, naming_extra
-from og_pointcloud.formats.atomic import replacing
+from og_pointcloud.formats.atomic import write_file
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".JPG", ".PNG", ".JPEG", ".webp", ".tif", ".tiff", ".bmp")
 IMAGE_FOLDERS = ("images", "images_2", "images_4", "images_8", "color", "rgb", "dslr/resized_images")
@@ -216,6 +216,4 @@ def write_png(path: Path, pixels: NDArray[np.generic]) -> Path:
     written, png = require_cv2().imencode(".png", pixels[:, :, ::-1] if pixels.ndim == 3 else pixels)
     if not written:
         raise SceneError(f"{path}: OpenCV cannot write a PNG of {pixels.shape[1]}x{pixels.shape[0]} pixels")
-    with replacing(path) as file:
-        file.write(png.tobytes())
-    return path
+    return write_file(path, png.tobytes())

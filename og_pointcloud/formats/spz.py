@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.errors import MissingExtraError, SceneError
-from og_pointcloud.formats.atomic import replacing
+from og_pointcloud.formats.atomic import write_file
 from og_pointcloud.formats.gaussian_ply import SH_CONSTANT, activated
 from og_pointcloud.formats.tables import naming
 from og_pointcloud.scene import Points
@@ -95,8 +95,7 @@ def write_spz(path: str | os.PathLike[str], points: Points, rgb: Bytes | None = 
             _packed_rotation(points.rotation.astype(np.float64)),
         )
         header = HEADER.pack(MAGIC, 3, len(points.xyz), 0, bits, 0, 0)
-        with replacing(path) as file:
-            file.write(gzip.compress(b"".join([header, *(column.tobytes() for column in columns)]), mtime=0))
+        write_file(path, gzip.compress(b"".join([header, *(column.tobytes() for column in columns)]), mtime=0))
 
 
 # Files -------------------------------------------------------------------------------------------------------------

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import csv
+import io
 import warnings
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from itertools import chain, islice
 from pathlib import Path
@@ -19,8 +21,17 @@ LABEL_FINITE = "label the finite points alone, points[np.isfinite(points).all(ax
 PACKED_COLOR_COLUMNS = ("rgb", "rgba")
 
 
-def as_cell(value: object) -> object:
-    """A value for a CSV: text that a spreadsheet would take for a formula gets a quote mark before it."""
+def csv_text(rows: Sequence[Mapping[str, object]]) -> str:
+    """Rows as CSV under the names that any of them has; text that a spreadsheet would take for a formula gets a quote
+    mark before it."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, dict.fromkeys(name for row in rows for name in row), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows({name: _as_cell(value) for name, value in row.items()} for row in rows)
+    return text.getvalue()
+
+
+def _as_cell(value: object) -> object:
     return f"'{value}" if isinstance(value, str) and value[:1] in ("=", "+", "-", "@", "\t", "\r") else value
 
 

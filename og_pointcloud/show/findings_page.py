@@ -17,7 +17,7 @@ from og_pointcloud.ask.picking import front_points
 from og_pointcloud.cloud import LabelledCloud
 from og_pointcloud.collection.collection import Collection, Finding, Findings
 from og_pointcloud.errors import OgPointcloudError
-from og_pointcloud.formats.atomic import replacing
+from og_pointcloud.formats.atomic import write_file
 from og_pointcloud.show.viewpoint import Viewpoint
 
 SIDE_PX = 200
@@ -54,8 +54,7 @@ def write_findings(path: str | os.PathLike[str], collection: Collection, finding
         notes="<br>".join(map(html.escape, findings.not_asked)),
         cards="\n".join(_card(rank, finding, collection) for rank, finding in enumerate(findings, 1)),
     )
-    with replacing(path) as file:
-        file.write(text.encode())
+    write_file(path, text.encode())
 
 
 def _card(rank: int, finding: Finding, collection: Collection) -> str:

@@ -21,7 +21,7 @@ from og_pointcloud.ask.choosing import Reason
 from og_pointcloud.ask.labelled_scene import LabelledScene, instance_table
 from og_pointcloud.ask.segmentation import Segmentation
 from og_pointcloud.errors import OgPointcloudError
-from og_pointcloud.formats.atomic import replacing
+from og_pointcloud.formats.atomic import write_file
 from og_pointcloud.formats.colors import NO_LABEL, label_colors
 from og_pointcloud.show.live import WORDS, meaning
 from og_pointcloud.show.viewpoint import Viewpoint
@@ -97,8 +97,8 @@ def write_page(
     }  # fmt: skip
     # Names come from files: no text of theirs may end the element that holds it.
     text = json.dumps(data, ensure_ascii=False, allow_nan=False).replace("<", "\\u003c")
-    with replacing(path) as file:
-        file.write(TEMPLATE.read_text(encoding="utf-8").replace("/*SCENE*/", text).encode(errors="backslashreplace"))
+    page = TEMPLATE.read_text(encoding="utf-8").replace("/*SCENE*/", text)
+    write_file(path, page.encode(errors="backslashreplace"))
     return " and ".join(left_out)
 
 
@@ -122,16 +122,16 @@ def _instances(
     middle: NDArray[np.float64],
     choice: NDArray[np.integer],
 ) -> list[dict[str, Any]]:
-    present, first = np.unique(result.instances, return_index=True)
-    label = dict(zip(present.tolist(), result.labels[first].tolist(), strict=True))
-    points = dict(zip(*(part.tolist() for part in np.unique(result.instances, return_counts=True)), strict=True))
+    present, first, counts = np.unique(result.instances, return_index=True, return_counts=True)
+    shown = dict(zip(present.tolist(), zip(result.labels[first].tolist(), counts.tolist(), strict=True), strict=True))
     rows = []
     for row in instance_table(scene, up=up, words=WORDS):
+        label, points = shown.get(row.id, (-1, 0))
         record: dict[str, Any] = {
-            "id": row.id, "label": label.get(row.id, -1), "points": points.get(row.id, 0), "views": row.views,
-            "words": row.words, "choice": int(choice[row.id]),
+            "id": row.id, "label": label, "points": points, "views": row.views, "words": row.words,
+            "choice": int(choice[row.id]),
         }  # fmt: skip
-        if row.id in label and row.oriented_box is not None and row.centroid is not None:
+        if points and row.oriented_box is not None and row.centroid is not None:
             record |= {
                 "box": (row.oriented_box.corners - middle).tolist(), "extent": row.oriented_box.size.tolist(),
                 "center": (row.centroid - middle).tolist(), "world": row.centroid.tolist(),

@@ -78,12 +78,9 @@ def _framed(points: NDArray[np.float64], view: Viewpoint) -> Viewpoint:
 
 def _in_sight(points: NDArray[np.float64], wanted: NDArray[np.bool_], view: Viewpoint) -> int:
     """Cells of a coarse picture whose nearest point is a wanted one."""
-    x, y, depth = view.axes() @ (points - view.eye).T
-    ahead = depth > 0
-    half = CELLS[1] / 2
-    column = (CELLS[0] / 2 + half * FOCAL * x[ahead] / depth[ahead]).astype(np.int64)
-    row = (half + half * FOCAL * y[ahead] / depth[ahead]).astype(np.int64)
-    inside = (column >= 0) & (column < CELLS[0]) & (row >= 0) & (row < CELLS[1])
-    nearest_first = np.argsort(depth[ahead][inside], kind="stable")
-    cell = (row * CELLS[0] + column)[inside][nearest_first]
-    return int(wanted[ahead][inside][nearest_first][np.unique(cell, return_index=True)[1]].sum())
+    camera = view.camera(*CELLS, FOCAL * CELLS[1] / 2)
+    uv_px, depth = camera.project(points)
+    seen = np.flatnonzero(camera.shows(uv_px))
+    seen = seen[np.argsort(depth[seen], kind="stable")]  # the nearest first
+    column, row = uv_px[seen].astype(np.int64).T
+    return int(wanted[seen][np.unique(row * CELLS[0] + column, return_index=True)[1]].sum())

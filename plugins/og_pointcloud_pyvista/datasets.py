@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 import og_pointcloud as og
 from og_pointcloud.ask.hosts import NAMES_FIELD, SCENE_FIELD, scene_name
 from og_pointcloud.ask.instances import Instance
-from og_pointcloud.ask.labelled_scene import SceneLike, find_scene
+from og_pointcloud.ask.labelled_scene import LabelledScene, SceneLike, find_scene
 from og_pointcloud.ask.segmentation import Segmentation
 from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.formats.colors import label_colors
@@ -100,14 +100,13 @@ class OgDataSet:
         colors = _instance_colors(mesh, ids) if segmented and COLOR in mesh.point_data else None
         return box_lines([og.instance_table(found, up=up)[instance] for instance in ids], colors)
 
-    def _with_instances(self, scene: SceneLike | None) -> Any:
+    def _with_instances(self, scene: LabelledScene) -> Any:
         """This dataset, or, where it has no instance ids, a shallow copy with the scene's."""
         if INSTANCE in self._mesh.point_data:
             return self._mesh
         mesh = self._mesh.copy(deep=False)
         if mesh.n_points:
-            points = np.asarray(self._mesh.points)
-            mesh.point_data[INSTANCE] = find_scene(self._mesh, scene).instances_at(points)
+            mesh.point_data[INSTANCE] = scene.instances_at(np.asarray(self._mesh.points))
         return mesh
 
 
@@ -123,12 +122,11 @@ def label_names(mesh: pv.DataSet) -> tuple[str, ...]:
 
 def box_lines(rows: Iterable[Instance], colors: Mapping[int, Sequence[int]] | None = None) -> pv.PolyData:
     """Oriented boxes as lines, those of instances without points left out. colors: instance id -> RGB, else by id."""
-    shown = [row for row in rows if row.oriented_box is not None]
-    if not shown:
+    boxes = {row.id: box for row in rows if (box := row.oriented_box) is not None}
+    if not boxes:
         return pv.PolyData()
-    ids = np.array([row.id for row in shown], np.int32)
-    corners = np.concatenate([row.oriented_box.corners for row in shown if row.oriented_box is not None])
-    edges = (np.array(BOX_EDGES) + 8 * np.arange(len(shown))[:, None, None]).reshape(-1, 2)
+    ids, corners = np.array([*boxes], np.int32), np.concatenate([box.corners for box in boxes.values()])
+    edges = (np.array(BOX_EDGES) + 8 * np.arange(len(ids))[:, None, None]).reshape(-1, 2)
     lines = pv.PolyData(corners, lines=np.insert(edges, 0, 2, axis=1).ravel())
     rgb = label_colors(ids) if colors is None else np.array([colors[instance] for instance in ids.tolist()], np.uint8)
     lines.cell_data[INSTANCE] = np.repeat(ids, len(BOX_EDGES))

@@ -113,7 +113,7 @@ def empty_clusters() -> Answer:
     """Five groups of points, five centers in one place: the empty clusters start again where points are far off."""
     groups = np.repeat(np.arange(5), 20)
     values = (10 * np.eye(5)[groups] + 0.1 * np.random.default_rng(0).normal(size=(100, 5))).astype(np.float32)
-    own, _ = kmeans(values, np.ones(100), np.tile(values[:1], (5, 1)), 30, reseed=True)
+    own, _ = kmeans(values, np.ones(100), np.tile(values[:1], (5, 1)), 30)
     return Answer(np.r_[[len(np.unique(own[groups == g])) for g in range(5)], len(np.unique(own))], np.r_[[1] * 5, 5])
 
 
@@ -124,14 +124,14 @@ def kmeans_offset(offset: float) -> Answer:
     values = (offset + random.normal(size=(400, 3))).astype(np.float32)
     centers = values[:8].copy()
     exact = np.square(values.astype(float)[:, None] - centers.astype(float)).sum(axis=2).argmin(axis=1)
-    own, _ = kmeans(values, np.ones(400), centers, 0, reseed=False)
+    own, _ = kmeans(values, np.ones(400), centers, 0)
     return Answer(own.astype(np.int64), exact, lambda: naive.nearest_centre(values, centers))
 
 
 @agrees(0)
 def identical_values() -> Answer:
     """k-means of points that are all the same: one cluster, whatever k."""
-    own, _ = kmeans(np.ones((50, 3), "f4"), np.ones(50), np.ones((4, 3), "f4"), 30, reseed=True)
+    own, _ = kmeans(np.ones((50, 3), "f4"), np.ones(50), np.ones((4, 3), "f4"), 30)
     return Answer(own, np.zeros(50, np.int32))
 
 
@@ -140,7 +140,7 @@ def identical_values() -> Answer:
 )
 def values_not_a_number() -> object:
     """k-means of NaN."""
-    return kmeans(np.full((5, 2), np.nan, "f4"), np.ones(5), np.zeros((1, 2), "f4"), 3, reseed=False)
+    return kmeans(np.full((5, 2), np.nan, "f4"), np.ones(5), np.zeros((1, 2), "f4"), 3)
 
 
 @agrees(0, "points", (1, 2, 3, 30))

@@ -131,14 +131,12 @@ def kmeans(
     weight: NDArray[np.floating],
     centers: NDArray[np.floating],
     rounds: int,
-    *,
-    reseed: bool,
 ) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
     """Lloyd's weighted k-means from the given centers, until nothing changes or ``rounds`` updates are done.
 
     values: (n, d) finite. weight: (n,) not negative; points of weight 0 are assigned but move no center.
-    centers: (k, d). reseed: a cluster without weight starts again at the point that is farthest from its own center,
-    distance squared times weight; it stays where it is where no point is off its center, or without ``reseed``.
+    centers: (k, d). A cluster without weight starts again at the point that is farthest from its own center, distance
+    squared times weight; it stays where it is where no point is off its center.
 
     Returns (n,) int32, the nearest of the returned centers (lowest of equals), and those centers (k, d) float32.
     The same input gives the same answer on any number of threads. Distances are taken about the middle of the values,
@@ -165,7 +163,7 @@ def kmeans(
         filled = mass > 0
         moved = moving.copy()
         moved[filled] = sums[filled] / mass[filled, None]
-        if reseed and not filled.all():
+        if not filled.all():
             moved = _reseeded(points, weight, own, moved, np.flatnonzero(~filled))
         if np.array_equal(moved.astype(np.float32), moving.astype(np.float32)):
             break
@@ -208,11 +206,11 @@ def _clusters(
     least, best = np.inf, values[:0]
     for _ in range(STARTS):
         start = seed_centers(values[sample], weight[sample], k, rng)
-        own, centers = kmeans(values[sample], weight[sample], start, rounds, reseed=True)
+        own, centers = kmeans(values[sample], weight[sample], start, rounds)
         spread = float(weight[sample] @ ((values[sample] - centers[own]) ** 2).sum(axis=1))
         if spread < least:
             least, best = spread, centers
-    own, _ = kmeans(values, weight, best, rounds, reseed=True)
+    own, _ = kmeans(values, weight, best, rounds)
     used, own = np.unique(own, return_inverse=True)
     return own.astype(np.int32), len(used)
 

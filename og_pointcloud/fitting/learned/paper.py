@@ -268,7 +268,7 @@ class _Parts:
         for rows, count in zip(self.rows, self.counts, strict=True):
             if count:
                 mine = slice(first, first + count)
-                found, centers[mine] = kmeans(values[rows], np.ones(len(rows)), centers[mine], rounds, reseed=True)
+                found, centers[mine] = kmeans(values[rows], np.ones(len(rows)), centers[mine], rounds)
                 own[rows] = first + found
             first += count
         return own, centers
