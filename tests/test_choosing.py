@@ -184,7 +184,9 @@ def test_other_words_that_fit_equally_well_mean_as_much_however_many_pass_for_sy
     for synonym in (0.01, 0.1, 1.01):
         chooser = Chooser(made.table, made.bank, ChoosingSettings(synonym=synonym))
         chooser._bank_evidence[:] = chooser.sharpness
-        np.testing.assert_allclose(chooser._log_none(made.texts[:2]), chooser.sharpness**2, rtol=1e-6)
+        choice = chooser.choose(made.texts[:2])
+        odds = np.log(max(2, chooser.settings.kinds)) + chooser.sharpness**2 - chooser.sharpness * choice.evidence
+        np.testing.assert_allclose(np.log(choice.unknown[:, None] / choice.table), odds, rtol=1e-4)
 
 
 def test_the_best_of_several_descriptors_counts_for_labels_and_bank_alike():
