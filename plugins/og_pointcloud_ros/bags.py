@@ -33,8 +33,9 @@ with naming_extra("rosbags", "ros"):
 
 CLOUD, TRANSFORMS = "sensor_msgs/msg/PointCloud2", "tf2_msgs/msg/TFMessage"
 DETECTION_ARRAY, INFO = "vision_msgs/msg/Detection3DArray", "vision_msgs/msg/LabelInfo"
-LABELLED, DETECTIONS = "/labelled", "/detections"
-"""What an output's topic adds to that of its cloud."""
+LABELLED = "/labelled"
+OUTPUTS = {LABELLED: CLOUD, "/detections": DETECTION_ARRAY}
+"""What an output's topic adds to that of its cloud, and its type; in the order of `LabelledMessages`."""
 LABEL_INFO = "/og_pointcloud/label_info"
 BAG_VERSION = 8
 """Of rosbag2's metadata: read by Humble and by all later releases."""
@@ -114,17 +115,26 @@ def label_bag(
         clouds, store = _cloud_topics(reader, topics), ros2_types()
         report = BagReport({topic: topic + LABELLED for topic in clouds})
         tree = transforms_of(reader, store)
-        labeller = CloudLabeller(segmenter, rosbags_messages(store), frame, minimum_points)
+        messages = rosbags_messages(store)
+        labeller = CloudLabeller(segmenter, messages, frame, minimum_points)
         with (
             replacing_folder(target) as folder,  # a bag names its files after its folder
             Writer(folder, version=BAG_VERSION, storage_plugin=_storage(source)) as bag,
         ):
-            outputs = _Outputs(bag, reader.connections, clouds, store)
-            outputs.write_info(segmenter.names, reader.start_time)
+            by_key = {(old.topic, old.msgtype): old for old in reader.connections}  # those that differ in QoS are one
+            copies = {key: _copied(bag, old, store) for key, old in by_key.items()}
+            info = bag.add_connection(LABEL_INFO, INFO, typestore=store, offered_qos_profiles=[LATCHED])
+            names = to_label_info(segmenter.names, stamp=reader.start_time, messages=messages)
+            bag.write(info, reader.start_time, store.serialize_cdr(names, INFO))
+            ours = {
+                topic: [bag.add_connection(topic + ending, kind, typestore=store) for ending, kind in OUTPUTS.items()]
+                for topic in clouds
+            }
             for old, stamp, data in with_bar(messages_of(reader), "messages", reader.message_count, progress):
-                outputs.copy(old, stamp, data)
+                bag.write(copies[old.topic, old.msgtype], stamp, data)
                 if old.topic in clouds and (labelled := _label(store, data, tree, frame, labeller, report)):
-                    outputs.write(old.topic, stamp, labelled)
+                    for new, message in zip(ours[old.topic], labelled[1:], strict=True):
+                        bag.write(new, stamp, store.serialize_cdr(message, new.msgtype))
             if not report.clouds:
                 reason = next(iter(report.skipped), "its topics have no message")
                 raise SceneError(f"{source}: no cloud can be labelled: {reason}")
@@ -177,41 +187,16 @@ def open_bag(source: str | os.PathLike[str]) -> Iterator[Reader]:
         reader.close()
 
 
-class _Outputs:
-    """The topics of the new bag: copies of all old ones, and ours."""
-
-    def __init__(self, bag: Writer, connections: Sequence[Connection], clouds: Sequence[str], store: Any) -> None:
-        self._bag, self._store = bag, store
-        by_key = {(old.topic, old.msgtype): old for old in connections}  # publishers that differ in QoS are one topic
-        self._copies = {key: self._copy(old) for key, old in by_key.items()}
-        self._info = bag.add_connection(LABEL_INFO, INFO, typestore=store, offered_qos_profiles=[LATCHED])
-        self._ours = {topic: (self._new(topic + LABELLED, CLOUD), self._new(topic + DETECTIONS, DETECTION_ARRAY))
-                      for topic in clouds}  # fmt: skip
-
-    def _new(self, topic: str, kind: str) -> Connection:
-        return self._bag.add_connection(topic, kind, typestore=self._store)
-
-    def _copy(self, old: Connection) -> Connection:
-        ext: Any = old.ext
-        definition: dict[str, Any] = {"msgdef": old.msgdef.data, "rihs01": old.digest or NO_HASH}
-        if not (old.msgdef.data and old.digest) and old.msgtype in self._store.types:
-            definition = {"typestore": self._store}
-        return self._bag.add_connection(
-            old.topic, old.msgtype, **definition, serialization_format=ext.serialization_format,
-            offered_qos_profiles=ext.offered_qos_profiles,
-        )  # fmt: skip
-
-    def copy(self, old: Connection, stamp: int, data: bytes) -> None:
-        self._bag.write(self._copies[old.topic, old.msgtype], stamp, data)
-
-    def write_info(self, names: Sequence[str], stamp: int) -> None:
-        info = to_label_info(names, stamp=stamp, messages=rosbags_messages(self._store))
-        self._bag.write(self._info, stamp, self._store.serialize_cdr(info, INFO))
-
-    def write(self, topic: str, stamp: int, labelled: LabelledMessages) -> None:
-        points, detections = self._ours[topic]
-        self._bag.write(points, stamp, self._store.serialize_cdr(labelled.points, CLOUD))
-        self._bag.write(detections, stamp, self._store.serialize_cdr(labelled.detections, DETECTION_ARRAY))
+def _copied(bag: Writer, old: Connection, store: Any) -> Connection:
+    """A topic of the old bag in the new one."""
+    ext: Any = old.ext
+    definition: dict[str, Any] = {"msgdef": old.msgdef.data, "rihs01": old.digest or NO_HASH}
+    if not (old.msgdef.data and old.digest) and old.msgtype in store.types:
+        definition = {"typestore": store}
+    return bag.add_connection(
+        old.topic, old.msgtype, **definition, serialization_format=ext.serialization_format,
+        offered_qos_profiles=ext.offered_qos_profiles,
+    )  # fmt: skip
 
 
 def _cloud_topics(reader: Reader, topics: Sequence[str] | None) -> list[str]:
@@ -224,7 +209,7 @@ def _cloud_topics(reader: Reader, topics: Sequence[str] | None) -> list[str]:
         if types.get(topic) != CLOUD:
             what = f"carries {types[topic]}" if topic in types else "is not in the bag"
             raise SceneError(f"topic '{topic}' {what}; expected one of {CLOUD}: {known}")
-    taken = [name for topic in wanted for name in (topic + LABELLED, topic + DETECTIONS) if name in types]
+    taken = [name for topic in wanted for name in (topic + ending for ending in OUTPUTS) if name in types]
     if taken or LABEL_INFO in types:
         raise SceneError(f"the bag has a topic '{[*taken, LABEL_INFO][0]}' already; expected one without labels")
     if not wanted:
