@@ -29,6 +29,18 @@ def viser():
 
 
 @pytest.fixture
+def window():
+    """An empty page of a browser."""
+    browser = shutil.which("chromium") or shutil.which("google-chrome")
+    if browser is None:
+        pytest.skip("no Chromium here")
+    playwright = pytest.importorskip("playwright.sync_api")
+    with playwright.sync_playwright() as play:
+        started = play.chromium.launch(executable_path=browser, args=BROWSER)
+        yield started.new_page(viewport={"width": 900, "height": 600})
+
+
+@pytest.fixture
 def bundle(tmp_path):
     return write_bundle(room(500), tmp_path / "room.ogpc")
 
@@ -162,11 +174,7 @@ def until(true, seconds=60):
 
 
 @pytest.mark.slow
-def test_a_browser_types_a_word_sees_the_points_lit_and_clicks_them(viser):
-    browser = shutil.which("chromium") or shutil.which("google-chrome")
-    if browser is None:
-        pytest.skip("no Chromium here")
-    playwright = pytest.importorskip("playwright.sync_api")
+def test_a_browser_types_a_word_sees_the_points_lit_and_clicks_them(viser, window):
     from og_pointcloud.show.serve import ServeSettings, serve
 
     # Two plates, one above the other in the picture, each an instance of its own and of one color.
@@ -178,39 +186,35 @@ def test_a_browser_types_a_word_sees_the_points_lit_and_clicks_them(viser):
     assert len({tuple(value) for value in color.values()}) == 2
     served = serve({"plates": live}, ServeSettings(port=0))
     try:
-        with playwright.sync_playwright() as play:
-            window = play.chromium.launch(executable_path=browser, args=BROWSER).new_page(
-                viewport={"width": 900, "height": 600}
-            )
-            window.goto(served.url)
-            shown = {
-                name: lambda name=name: np.abs(picture_of(window.screenshot()) - color[name]).max(axis=2) <= 3
-                for name in color
-            }
-            until(lambda: shown["left"]().sum() > 2000 and shown["right"]().sum() > 2000, 90)
-            places = {name: np.argwhere(shown[name]()[:, :450]).mean(axis=0) for name in color}
+        window.goto(served.url)
+        shown = {
+            name: lambda name=name: np.abs(picture_of(window.screenshot()) - color[name]).max(axis=2) <= 3
+            for name in color
+        }
+        until(lambda: shown["left"]().sum() > 2000 and shown["right"]().sum() > 2000, 90)
+        places = {name: np.argwhere(shown[name]()[:, :450]).mean(axis=0) for name in color}
 
-            window.locator("form input").fill("right")
-            until(lambda: shown["left"]().sum() < 50)
-            assert shown["right"]().sum() > 2000
-            assert live.lit == {1}
-            assert "fits 1 of 2 instances" in window.inner_text("body")
+        window.locator("form input").fill("right")
+        until(lambda: shown["left"]().sum() < 50)
+        assert shown["right"]().sum() > 2000
+        assert live.lit == {1}
+        assert "fits 1 of 2 instances" in window.inner_text("body")
 
-            row, column = places["left"]
-            window.mouse.click(column, row)
-            until(lambda: live.lit == {0})
-            until(lambda: "instance 0 ·" in window.inner_text("body"))
-            until(lambda: shown["right"]().sum() < 50)
-            assert shown["left"]().sum() > 2000
+        row, column = places["left"]
+        window.mouse.click(column, row)
+        until(lambda: live.lit == {0})
+        until(lambda: "instance 0 ·" in window.inner_text("body"))
+        until(lambda: shown["right"]().sum() < 50)
+        assert shown["left"]().sum() > 2000
 
-            window.locator("form input").fill("lef")
-            window.keyboard.press("Enter")
-            until(lambda: "did you mean" in window.inner_text("body"))
-            until(lambda: shown["right"]().sum() > 2000)
-            with window.expect_download() as download:
-                window.get_by_role("button", name="picture").click()
-            saved = picture_of(download.value.path().read_bytes())
-            assert (np.abs(saved - color["left"]).max(axis=2) <= 20).sum() > 2000
+        window.locator("form input").fill("lef")
+        window.keyboard.press("Enter")
+        until(lambda: "did you mean" in window.inner_text("body"))
+        until(lambda: shown["right"]().sum() > 2000)
+        with window.expect_download() as download:
+            window.get_by_role("button", name="picture").click()
+        saved = picture_of(download.value.path().read_bytes())
+        assert (np.abs(saved - color["left"]).max(axis=2) <= 20).sum() > 2000
     finally:
         served.stop()
 
@@ -270,11 +274,7 @@ def test_the_page_of_changes_calls_nothing_unknown_that_is_as_it_was(visits_of_a
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["serve", "page"])
-def test_a_browser_shows_what_is_gone_and_new(visits_of_a_place, tmp_path, kind):
-    browser = shutil.which("chromium") or shutil.which("google-chrome")
-    if browser is None:
-        pytest.skip("no Chromium here")
-    playwright = pytest.importorskip("playwright.sync_api")
+def test_a_browser_shows_what_is_gone_and_new(visits_of_a_place, tmp_path, window, kind):
     before, after, changes = visits_of_a_place
     served = None
     if kind == "serve":
@@ -287,23 +287,17 @@ def test_a_browser_shows_what_is_gone_and_new(visits_of_a_place, tmp_path, kind)
         write_changes_page(tmp_path / "changes.html", before, after, changes, np.array([0.0, 0, 1]))
         url = (tmp_path / "changes.html").as_uri()
     try:
-        with playwright.sync_playwright() as play:
-            window = play.chromium.launch(executable_path=browser, args=BROWSER).new_page(
-                viewport={"width": 900, "height": 600}
-            )
-            window.goto(url)
+        window.goto(url)
 
-            def pixels(name):
-                """Of the hue of a state, however light or dark."""
-                picture = (
-                    picture_of(window.screenshot())[:, :500] if served else picture_of(window.screenshot())[:, 310:]
-                )
-                hue, value = np.array(CHANGES[name]) / max(CHANGES[name]), picture.max(axis=2, keepdims=True)
-                return ((np.abs(picture / np.maximum(value, 1) - hue).max(axis=2) < 0.04) & (value[..., 0] > 60)).sum()
+        def pixels(name):
+            """Of the hue of a state, however light or dark."""
+            picture = picture_of(window.screenshot())[:, :500] if served else picture_of(window.screenshot())[:, 310:]
+            hue, value = np.array(CHANGES[name]) / max(CHANGES[name]), picture.max(axis=2, keepdims=True)
+            return ((np.abs(picture / np.maximum(value, 1) - hue).max(axis=2) < 0.04) & (value[..., 0] > 60)).sum()
 
-            states = ("gone", "new", "moved from here", "moved to here")
-            until(lambda: all(pixels(name) > 150 for name in states), 90)
-            assert all(name in window.inner_text("body") for name in states)
+        states = ("gone", "new", "moved from here", "moved to here")
+        until(lambda: all(pixels(name) > 150 for name in states), 90)
+        assert all(name in window.inner_text("body") for name in states)
     finally:
         if served is not None:
             served.stop()
@@ -311,15 +305,11 @@ def test_a_browser_shows_what_is_gone_and_new(visits_of_a_place, tmp_path, kind)
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["points", "splats"])
-def test_three_js_draws_a_labelled_gltf(viser, tmp_path, kind):
+def test_three_js_draws_a_labelled_gltf(viser, tmp_path, window, kind):
     """In the page of viser, whose loader of glTF is that of three.js: it knows no splats, and draws their points."""
     from test_carriers import segmentation
     from test_formats_spz import splats
 
-    browser = shutil.which("chromium") or shutil.which("google-chrome")
-    if browser is None:
-        pytest.skip("no Chromium here")
-    playwright = pytest.importorskip("playwright.sync_api")
     points = replace(splats(20_000, center=(3, -4, 5)), opacity=np.ones(20_000, np.float32))
     result = segmentation(np.arange(20_000) % 3, ["a", "b", "c"], points.xyz_world)
     path = result.save(tmp_path / "out.glb", points if kind == "splats" else None)
@@ -327,18 +317,14 @@ def test_three_js_draws_a_labelled_gltf(viser, tmp_path, kind):
     try:
         server.scene.add_glb("/labelled", path.read_bytes())
         server.initial_camera.position, server.initial_camera.look_at = (3, -4, 11), (3, -4, 5)
-        with playwright.sync_playwright() as play:
-            window = play.chromium.launch(executable_path=browser, args=BROWSER).new_page(
-                viewport={"width": 900, "height": 600}
-            )
-            window.goto(f"http://127.0.0.1:{server.get_port()}")
+        window.goto(f"http://127.0.0.1:{server.get_port()}")
 
-            def pixels(color):
-                """Of a label's color, as far as a point covers them on the white page, beside its panels."""
-                cover = 255 - picture_of(window.screenshot())[200:, :500]
-                most, hue = cover.max(axis=2, keepdims=True), (255 - color.astype(int)) / (255 - color).max()
-                return ((np.abs(cover / np.maximum(most, 1) - hue).max(axis=2) < 0.2) & (most[..., 0] > 60)).sum()
+        def pixels(color):
+            """Of a label's color, as far as a point covers them on the white page, beside its panels."""
+            cover = 255 - picture_of(window.screenshot())[200:, :500]
+            most, hue = cover.max(axis=2, keepdims=True), (255 - color.astype(int)) / (255 - color).max()
+            return ((np.abs(cover / np.maximum(most, 1) - hue).max(axis=2) < 0.2) & (most[..., 0] > 60)).sum()
 
-            until(lambda: all(pixels(color) > 100 for color in np.unique(result.colors, axis=0)), 90)
+        until(lambda: all(pixels(color) > 100 for color in np.unique(result.colors, axis=0)), 90)
     finally:
         server.stop()
