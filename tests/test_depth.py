@@ -7,7 +7,17 @@ from scenes import CRATE, ROOM_SIZE, THING, camera, distance_to_surface, look, r
 
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.depth import DepthFile, DepthFrame, DepthImage, resampled
-from og_pointcloud.formats.fusion import _Voxels, doubtful_depth, evenly, fuse, on_surface, survey, to_world
+from og_pointcloud.formats.fusion import (
+    GRAZING,
+    NOISE_TOLERANCE,
+    _Voxels,
+    doubtful_depth,
+    evenly,
+    fuse,
+    on_surface,
+    survey,
+    to_world,
+)
 from og_pointcloud.formats.lenses import lens_of
 
 WIDTH, HEIGHT = ROOM_SIZE
@@ -230,6 +240,40 @@ def test_a_pixel_between_two_surfaces_is_none_and_a_slanted_surface_is_one():
     assert kept.sum() == 34
     slanted = np.broadcast_to(2 + 0.1 * np.arange(7, dtype=np.float32), (5, 7))  # 79 degrees: 0.1 a pixel of 0.02
     assert on_surface(DepthImage(slanted, camera(POSE, (7, 5), (100.0, 100.0, 3.5, 2.5))), 0.0)[:, 1:].all()
+
+
+@pytest.mark.parametrize(("step", "slanted"), [(1, False), (1, True), (2, True)])
+@pytest.mark.parametrize("seed", range(4))
+def test_readings_on_a_surface_are_as_in_words(seed, step, slanted):
+    random = np.random.default_rng(seed)
+    inverse = 0.2 + 0.08 * np.arange(12)[:, None] + random.normal(0, 0.004, (12, 12))
+    inverse = inverse.T if seed % 2 else inverse
+    depth = np.where(random.random((12, 12)) < 0.05, 0, 1 / inverse).astype(np.float32)
+    noise = 0.002
+
+    def joined(line, k, focal):
+        near = [line[j] for j in (k - 1, k + 1) if 0 <= j < len(line) and line[j] > 0]
+        if any(abs(z - line[k]) <= min(z, line[k]) * GRAZING / focal + NOISE_TOLERANCE * noise for z in near):
+            return True
+        runs = (line[j : j + 5] for j in range(k - 4, k + 1) if 0 <= j <= len(line) - 5)
+        slopes = [np.diff(1 / run) for run in runs if (run > 0).all()]
+        return slanted and any(np.ptp(slope) <= 0.25 * np.abs(slope).min() for slope in slopes)
+
+    expected = np.zeros(depth.shape, bool)
+    for row, column in np.argwhere(depth > 0):
+        if row % step == step // 2 == column % step:
+            across = joined(depth[row].astype(float), column, 90.0)
+            expected[row, column] = across and joined(depth[:, column].astype(float), row, 70.0)
+    assert 0 < expected.sum() < np.count_nonzero(depth[step // 2 :: step, step // 2 :: step])
+    image = DepthImage(depth, camera(POSE, (12, 12), (90.0, 70.0, 6.0, 6.0)))
+    np.testing.assert_array_equal(on_surface(image, noise, step, slanted=slanted), expected)
+
+
+def test_images_of_one_row_or_column_are_surfaces_along_the_other():
+    depth = np.array([[2.0, 2.01, 2.5, 3.0]], np.float32)
+    row = on_surface(DepthImage(depth, camera(POSE, (4, 1), (100.0, 100.0, 2.0, 0.5))), 0.0)
+    column = on_surface(DepthImage(depth.T, camera(POSE, (1, 4), (100.0, 100.0, 0.5, 2.0))), 0.0)
+    assert row[0].tolist() == column[:, 0].tolist() == [True, True, False, False]
 
 
 def test_evenly_takes_first_and_last():

@@ -17,9 +17,7 @@ from visits import BIN, CHEST, CRATE, PARCEL, SPACE, Thing, cameras, cast, frame
 
 import og_pointcloud as og
 from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError, SceneError
-from og_pointcloud.formats.fusion import GRAZING, NOISE_TOLERANCE
 from og_pointcloud.mapping.frame_queue import FrameQueue
-from og_pointcloud.mapping.growing_map import _on_surface
 from og_pointcloud.mapping.sight import AGREES, NOTHING, THROUGH, states_of_points, view_of_depth
 from og_pointcloud.mapping.tracks import NO_TRACK, PointVotes
 from og_pointcloud.mapping.voxels import VoxelPoints
@@ -244,29 +242,6 @@ def test_a_shelf_seen_at_a_slant_alone_becomes_points():
     top = (np.abs(y - 0.08) < 0.005) & (z > 1.52) & (z < 2.2)
     assert len({*np.round(z[top], 2)}) >= 4  # of its eight rows every second is read
     assert (top | (np.abs(z - 1.5) < 0.02) | (np.abs(z - 3) < 0.02)).all()
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_readings_on_a_surface_are_as_in_words(seed):
-    random = np.random.default_rng(seed)
-    inverse = 0.2 + 0.08 * np.arange(12)[:, None] + random.normal(0, 0.004, (12, 10))
-    depth = np.where(random.random((12, 10)) < 0.05, 0, 1 / inverse)
-    lens, noise = np.array([90.0, 70.0, 5.0, 6.0]), 0.002
-
-    def joined(line, k, focal):
-        near = [line[j] for j in (k - 1, k + 1) if 0 <= j < len(line) and line[j] > 0]
-        if any(abs(z - line[k]) <= min(z, line[k]) * GRAZING / focal + NOISE_TOLERANCE * noise for z in near):
-            return True
-        runs = (line[j : j + 5] for j in range(k - 4, k + 1) if 0 <= j <= len(line) - 5)
-        slopes = [np.diff(1 / run) for run in runs if (run > 0).all()]
-        return any(slope.max() - slope.min() <= 0.25 * np.abs(slope).min() for slope in slopes)
-
-    expected = np.zeros(depth.shape, bool)
-    for row, column in np.argwhere(depth > 0):
-        if row % 2 and column % 2:
-            expected[row, column] = joined(depth[row], column, 90.0) and joined(depth[:, column], row, 70.0)
-    assert 0 < expected.sum() < np.count_nonzero(depth[1::2, 1::2])
-    np.testing.assert_array_equal(_on_surface(depth, 2, lens, noise), expected)
 
 
 def test_voxel_points_are_means_of_their_voxels():

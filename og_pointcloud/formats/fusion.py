@@ -43,6 +43,8 @@ AGREEING = 0.02
 PIXELS_PER_VOXEL, NOISE_PER_VOXEL = 2.0, 1.0
 GRAZING = 5.7
 """A surface's depth changes by at most so many pixel widths a pixel: it is seen 80 degrees off its normal (tan 80)."""
+STRAIGHT, BEND = 5, 0.25
+"""Readings in a row, more than sensors put between surfaces, that are of one if their inverse depths change evenly."""
 VOXEL_TOLERANCE, NOISE_TOLERANCE = 1.5, 3.0
 """A point and a measured depth of its surface may lie so many voxels, or deviations of the noise, apart."""
 ROUNDS = 2
@@ -152,22 +154,55 @@ def evenly(items: Sequence[Any], count: int) -> list[Any]:
     return [items[row] for row in rows]
 
 
-def on_surface(image: DepthImage, noise: float) -> NDArray[np.bool_]:
-    """(H, W) bool: measured, and in each image direction on one surface with at least one neighbor."""
-    depth = image.depth
-    kept = depth > 0
-    for axis, focal in ((0, image.camera.fy), (1, image.camera.fx)):
-        if depth.shape[axis] == 1:
-            continue
-        along = np.moveaxis(depth, axis, 0)
-        nearer = np.minimum(along[1:], along[:-1])
-        step = nearer * np.float32(GRAZING / focal) + np.float32(NOISE_TOLERANCE * noise)
-        joined = (nearer > 0) & (np.abs(np.diff(along, axis=0)) <= step)
-        has_neighbor = np.zeros(along.shape, bool)
-        has_neighbor[1:] |= joined
-        has_neighbor[:-1] |= joined
-        kept &= np.moveaxis(has_neighbor, 0, axis)
-    return kept
+def on_surface(image: DepthImage, noise: float, step: int = 1, *, slanted: bool = False) -> NDArray[np.bool_]:
+    """(H, W) bool: every ``step``-th reading along each axis that is, in its row and in its column, of one surface with
+    a neighbor; slanted: or, at more of a slant, with STRAIGHT readings that it is one of."""
+    steepest = GRAZING / image.camera.fx, GRAZING / image.camera.fy
+    return _on_surface(image.depth, step, steepest, NOISE_TOLERANCE * noise, slanted)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _on_surface(depth, step, steepest, slack, slanted):  # noqa: ANN001, ANN202
+    height, width = depth.shape
+    chosen, none = np.zeros(depth.shape, np.bool_), np.float32(0)
+    for row in range(step // 2, height, step):
+        for column in range(step // 2, width, step):
+            z = depth[row, column]
+            if z <= 0:
+                continue
+            left = depth[row, column - 1] if column > 0 else none
+            right = depth[row, column + 1] if column < width - 1 else none
+            across = width == 1 or _near(z, left, steepest[0], slack) or _near(z, right, steepest[0], slack)
+            if not (across or (slanted and _straight(depth[row], column))):
+                continue
+            above = depth[row - 1, column] if row > 0 else none
+            below = depth[row + 1, column] if row < height - 1 else none
+            down = height == 1 or _near(z, above, steepest[1], slack) or _near(z, below, steepest[1], slack)
+            chosen[row, column] = down or (slanted and _straight(depth[:, column], row))
+    return chosen
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _near(z, other, steepest, slack):  # noqa: ANN001, ANN202
+    """Whether two depths side by side, 0 unmeasured, are of one surface."""
+    return other > 0 and abs(other - z) <= min(other, z) * steepest + slack
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _straight(line, k):  # noqa: ANN001, ANN202
+    """Whether reading k of a row or column is one of STRAIGHT on a line. Inverse depths of a plane are linear in the
+    image; those of readings between two surfaces lie anywhere."""
+    for first in range(max(k - STRAIGHT + 1, 0), min(k, len(line) - STRAIGHT) + 1):
+        low, high = np.inf, -np.inf
+        for j in range(first, first + STRAIGHT - 1):
+            if line[j] <= 0 or line[j + 1] <= 0:
+                break
+            change = 1 / line[j + 1] - 1 / line[j]
+            low, high = min(low, change), max(high, change)
+        else:
+            if high - low <= BEND * max(low, -high):
+                return True
+    return False
 
 
 def to_world(image: DepthImage, chosen: NDArray[np.bool_], factor: float = 1.0) -> Doubles:

@@ -13,15 +13,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from og_pointcloud.cloud import FeatureSpace
 from og_pointcloud.formats.depth import DepthImage
-from og_pointcloud.formats.fusion import GRAZING, NOISE_TOLERANCE, to_world
+from og_pointcloud.formats.fusion import on_surface, to_world
 from og_pointcloud.formats.poses import in_local_frame
-from og_pointcloud.kernels import njit
 from og_pointcloud.mapping.frame import CheckedFrame
 from og_pointcloud.mapping.kept_views import KeptView, KeptViews
 from og_pointcloud.mapping.presence import Presence, tolerance_of
 from og_pointcloud.mapping.sight import AGREES, THROUGH, MeasuredView, states_of_points
 from og_pointcloud.mapping.tracks import NO_TRACK, PointVotes, Tracks
-from og_pointcloud.mapping.voxels import VoxelPoints, lens_of
+from og_pointcloud.mapping.voxels import VoxelPoints
 from og_pointcloud.rendering.geometry import isotropic
 from og_pointcloud.rendering.sightings import Sightings, openness, sightings_of
 from og_pointcloud.rendering.splatting import NEAR_SHARE
@@ -33,8 +32,6 @@ MARGIN = 0.1
 """Share of an image beyond its border from which points are drawn, as they may hide others within."""
 READINGS_PER_SPACING = 1.5
 """Readings a spacing that a frame gives to the map, along each axis: more would only be averaged."""
-STRAIGHT, BEND = 5, 0.25
-"""Readings in a row, more than sensors put between surfaces, that are of one if their inverse depths change evenly."""
 MOST_ODDS = 3.0
 """Frames that history counts for at most."""
 RECENT_FRAMES = 4096
@@ -102,10 +99,10 @@ class GrowingMap:
         points, view, before = self.points, frame.view, self.points.n
         if view is None or not points.grows:
             return np.zeros(0, np.int32)
-        camera = view.camera
+        image, camera = DepthImage(view.depth, view.camera), view.camera
         step = max(1, int(points.edge / view.pixel / READINGS_PER_SPACING))
-        chosen = _on_surface(view.depth, step, lens_of(camera), view.noise)
-        xyz, pixel = to_world(DepthImage(view.depth, camera), chosen), np.flatnonzero(chosen)
+        chosen = on_surface(image, view.noise, step, slanted=True)
+        xyz, pixel = to_world(image, chosen), np.flatnonzero(chosen)
         rgb = np.full((len(xyz), 3), 128, np.uint8)
         if frame.rgb is not None:
             scale = frame.rgb.shape[0] / camera.height, frame.rgb.shape[1] / camera.width
@@ -171,38 +168,6 @@ class GrowingMap:
         """When the frame of that number was, or the earliest that is remembered; -inf for what was known before."""
         place = sequence - (self.sequence - len(self.recent))
         return self.recent[max(place, 0)] if sequence > 0 else -np.inf
-
-
-@njit(cache=True, nogil=True)
-def _on_surface(depth, step, lens, noise):  # noqa: ANN001, ANN202
-    """(H, W) bool: every step-th reading along each axis that is of one surface with others beside it, and above or
-    below it."""
-    chosen = np.zeros(depth.shape, np.bool_)
-    for row in range(step // 2, depth.shape[0], step):
-        for column in range(step // 2, depth.shape[1], step):
-            if depth[row, column] > 0 and _joined(depth[row], column, lens[0], noise):
-                chosen[row, column] = _joined(depth[:, column], row, lens[1], noise)
-    return chosen
-
-
-@njit(cache=True, nogil=True)
-def _joined(line, k, focal, noise):  # noqa: ANN001, ANN202
-    """Whether reading k of a row or column is of one surface with its neighbors: as `fusion.on_surface` has it, or, at
-    more of a slant, on a line with them. Inverse depths of a plane are linear in the image; those of readings between
-    two surfaces lie anywhere."""
-    n = len(line)
-    for other in (k - 1, k + 1):
-        if 0 <= other < n and line[other] > 0:
-            nearer = min(line[other], line[k])
-            if abs(line[other] - line[k]) <= nearer * GRAZING / focal + NOISE_TOLERANCE * noise:
-                return True
-    for first in range(max(k - STRAIGHT + 1, 0), min(k, n - STRAIGHT) + 1):
-        part = line[first : first + STRAIGHT]
-        if part.min() > 0:
-            slope = np.diff(1 / part)
-            if np.ptp(slope) <= BEND * np.abs(slope).min():
-                return True
-    return n == 1
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.formats.capture import depth_files, read_poses
+from og_pointcloud.formats.images import require_cv2
 from og_pointcloud.formats.poses import in_local_frame
 from og_pointcloud.kernels import njit, prange
 from og_pointcloud.mapping.voxels import in_camera, lens_of, turned
@@ -76,8 +77,9 @@ class MeasuredView:
         """What `_state_of` asks a view for. tolerance: beside the view's noise."""
         if tolerance not in self._asked:
             within, lens = float(np.hypot(tolerance, 3 * self.noise)), lens_of(self.camera)
-            planes = _planes_of(self.depth, self.normal, lens, within)
-            self._asked[tolerance] = within, self.camera.world_to_camera, lens, *planes
+            planes, own = _planes_of(self.depth, self.normal, lens, within)
+            beyond = require_cv2().dilate(own, np.ones((3, 3), np.uint8))
+            self._asked[tolerance] = within, self.camera.world_to_camera, lens, planes, beyond
         return self._asked[tolerance]
 
 
@@ -248,10 +250,10 @@ def _step(here, before, after):  # noqa: ANN001, ANN202
 @njit(cache=True, parallel=True, nogil=True, error_model="numpy")
 def _planes_of(depth, normal, lens, tolerance):  # noqa: ANN001, ANN202
     """(h, w, 5): normal, offset (normal . x of the plane) and depth of each pixel, together as they are read; and
-    (h, w) the depth behind which no surface in the 3 x 3 pixels can hold a point, 0 where nothing is measured."""
+    (h, w) the depth behind which its surface can hold no point, 0 where nothing is measured."""
     fx, fy, cx, cy = lens
     height, width = depth.shape
-    planes, own, beyond = np.empty((height, width, 5), np.float32), np.zeros(depth.shape), np.zeros(depth.shape)
+    planes, own = np.empty((height, width, 5), np.float32), np.zeros(depth.shape)
     # Products of a normal and the rays to two points that are a pixel and a half apart differ by no more than this.
     turn = 1.5 * np.sqrt(1 / fx**2 + 1 / fy**2)
     for row in prange(height):
@@ -261,18 +263,13 @@ def _planes_of(depth, normal, lens, tolerance):  # noqa: ANN001, ANN202
             planes[row, column, :3], planes[row, column, 3], planes[row, column, 4] = n, z * slope, z
             if z > 0:
                 own[row, column] = max(z + tolerance, (tolerance + z * abs(slope)) / max(abs(slope) - turn, SLANT))
-    for row in prange(height):
-        for column in range(width):
-            for r in range(max(row - 1, 0), min(row + 2, height)):
-                for c in range(max(column - 1, 0), min(column + 2, width)):
-                    beyond[row, column] = max(beyond[row, column], own[r, c])
-    return planes, beyond
+    return planes, own
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _state_of(p, asked):  # noqa: ANN001, ANN202
     """The state of a point, by its distance from the surfaces in the 3 x 3 pixels around its own."""
-    tolerance, pose, lens, planes, beyond = asked
+    tolerance, pose, lens, planes, beyond = asked  # beyond: the depth behind which none of the 3 x 3 holds a point
     x, y, z = in_camera(pose, p)
     if z <= 0:
         return NOTHING
