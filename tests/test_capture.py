@@ -579,11 +579,6 @@ def test_blender_without_images_says_what_is_missing(capture):
         read_capture(folder)
 
 
-def test_one_view_is_enough(tmp_path):
-    make_capture(tmp_path, make_world(count=1))
-    assert len(read_capture(tmp_path).views) == 1
-
-
 def test_without_opencv_the_extra_is_named(capture, monkeypatch):
     folder, _ = capture
     monkeypatch.setitem(sys.modules, "cv2", None)
