@@ -208,12 +208,13 @@ def _draw_discs(discs, pose, lens, size, near):  # noqa: ANN001, ANN202
     return depth, facing
 
 
-@njit(cache=True, parallel=True, nogil=True)
+@njit(cache=True, parallel=True, nogil=True, error_model="numpy")
 def _normals(depth, lens):  # noqa: ANN001, ANN202
     """(h, w, 3) normals of a depth image, towards the camera; and of every fourth pixel along each axis the second
     difference of its depths, NaN where one is missing."""
     fx, fy, cx, cy = lens
     height, width = depth.shape
+    x, y = (np.arange(width) + 0.5 - cx) / fx, (np.arange(height) + 0.5 - cy) / fy
     normal = np.zeros((height, width, 3), np.float32)
     second = np.full((height // 4 + 1, width // 4 + 1), np.nan)
     for row in prange(height):
@@ -229,9 +230,9 @@ def _normals(depth, lens):  # noqa: ANN001, ANN202
             right, down = _step(z, before, after), _step(z, above, below)
             # Two tangents are d(z ray)/du and d(z ray)/dv; this is their cross product, up to its length.
             a, b = right * fx / z, down * fy / z
-            c = -1 - a * (column + 0.5 - cx) / fx - b * (row + 0.5 - cy) / fy
-            length = np.sqrt(a * a + b * b + c * c)
-            normal[row, column] = a / length, b / length, c / length
+            c = -1 - a * x[column] - b * y[row]
+            unit = 1 / np.sqrt(a * a + b * b + c * c)
+            normal[row, column] = a * unit, b * unit, c * unit
             if row % 4 == 0 and column % 4 == 0 and before > 0 and after > 0:
                 second[row // 4, column // 4] = abs(before + after - 2 * z)
     return normal, second
@@ -253,13 +254,14 @@ def _planes_of(depth, normal, lens, tolerance):  # noqa: ANN001, ANN202
     (h, w) the depth behind which its surface can hold no point, 0 where nothing is measured."""
     fx, fy, cx, cy = lens
     height, width = depth.shape
+    x, y = (np.arange(width) + 0.5 - cx) / fx, (np.arange(height) + 0.5 - cy) / fy
     planes, own = np.empty((height, width, 5), np.float32), np.zeros(depth.shape)
     # Products of a normal and the rays to two points that are a pixel and a half apart differ by no more than this.
     turn = 1.5 * np.sqrt(1 / fx**2 + 1 / fy**2)
     for row in prange(height):
         for column in range(width):
             z, n = depth[row, column], normal[row, column]
-            slope = n[0] * (column + 0.5 - cx) / fx + n[1] * (row + 0.5 - cy) / fy + n[2]
+            slope = n[0] * x[column] + n[1] * y[row] + n[2]
             planes[row, column, :3], planes[row, column, 3], planes[row, column, 4] = n, z * slope, z
             if z > 0:
                 own[row, column] = max(z + tolerance, (tolerance + z * abs(slope)) / max(abs(slope) - turn, SLANT))

@@ -170,7 +170,8 @@ class Tracks:
         Returns the tracks that are objects now and want an id, and those with one that were seen again.
         """
         own = votes.best(points, self.root)
-        seen, place = np.unique(own, return_inverse=True)
+        held = np.bincount(own + 1, minlength=len(self.root) + 1) > 0  # first: NO_TRACK
+        seen, place = np.flatnonzero(held) - 1, (np.cumsum(held) - 1)[own + 1]
         rows = np.where(mask < 0, len(features), mask)  # the last row: in no mask
         shown = np.bincount(rows * len(seen) + place, weight, (len(features) + 1) * len(seen))
         shown = np.asarray(shown.reshape(len(features) + 1, len(seen)), np.float64)
@@ -184,7 +185,7 @@ class Tracks:
         return self._describe(of_mask, shown.sum(axis=1), features, when)
 
     def _belonging(
-        self, of_tracks: NDArray[np.float64], of_masks: NDArray[np.float64], seen: NDArray[np.int32]
+        self, of_tracks: NDArray[np.float64], of_masks: NDArray[np.float64], seen: NDArray[np.intp]
     ) -> NDArray[np.int64]:
         """(M,) the track of each mask, a fresh one where none fits; NO_TRACK for masks that show next to nothing."""
         of_mask = np.full(len(of_tracks) - 1, NO_TRACK)
@@ -198,7 +199,7 @@ class Tracks:
                 of_mask[m] = self.add(Track())
         return of_mask
 
-    def _witness(self, shown: NDArray[np.float64], visible: NDArray[np.float64], seen: NDArray[np.int32]) -> None:
+    def _witness(self, shown: NDArray[np.float64], visible: NDArray[np.float64], seen: NDArray[np.intp]) -> None:
         """Count this frame's word on every two tracks that masks hold, and join those that most frames call one."""
         # A frame that shows little of a track, its foot when the rest has gone, is no witness of it.
         usual = np.array([self.tracks[k].pixels / max(self.tracks[k].masks, 1) for k in seen.tolist()])
