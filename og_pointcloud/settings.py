@@ -68,6 +68,9 @@ class MembershipSettings:
     """A separate piece whose points show less than this share of what the main piece's do was seen through it."""
     own_vote: float = 3.0
     """Votes of a point's own state, where a sure neighbour of which its color says nothing has one."""
+    crossing: float = 2.0
+    """Between background and an instance it takes so many times more: background's own votes are so many times as many,
+    and to a point of an instance its neighbours of background count so many times less."""
     gap_sizes: float = 0.5
     """A gap in depth wider than this many times the mask's own size parts object and background."""
     front_share: float = 0.2

@@ -82,12 +82,25 @@ MUTATIONS = (
         "OPENNESS_POWER = 2", "OPENNESS_POWER = 1", hard("votes-exposure"),
     ),
     Mutation(
-        "border votes unsquared", "fitting/membership.py",
-        "support.of_state(ids) ** 2, around", "support.of_state(ids), around", MEMBERSHIP,
+        "border votes whether sure or not", "fitting/membership.py",
+        "support.of_state(ids), around", "np.ones(len(ids)), around", MEMBERSHIP,
+    ),
+    Mutation(
+        "background heard by instances as instances are", "fitting/membership.py",
+        "vote * of_background if", "vote if", MEMBERSHIP,
+    ),
+    Mutation(
+        "neighbours heard once", "fitting/membership.py",
+        "ROUNDS = 2", "ROUNDS = 1", MEMBERSHIP,
+    ),
+    Mutation(
+        "points of an instance never become background", "fitting/membership.py",
+        "state < BACKGROUND:", "state < BACKGROUND or (state == BACKGROUND and ids[g] >= 0):",
+        (*MEMBERSHIP, "test_membership.py"),
     ),
     Mutation(
         "neighbours heard whatever their color", "fitting/membership.py",
-        "voice[other] * weights[g, k]", "voice[other]", (*MEMBERSHIP, "test_colors.py"),
+        "vote = voice[other] * weights[g, k]", "vote = voice[other]", (*MEMBERSHIP, "test_colors.py"),
     ),
     Mutation(
         "hearsay never believed", "fitting/membership.py",

@@ -31,6 +31,8 @@ from og_pointcloud.rendering.splatting import Gaussians
 from og_pointcloud.settings import GeometrySettings, MembershipSettings
 
 SETTINGS = MembershipSettings()
+STUBBORN = replace(SETTINGS, own_vote=16.0)
+"""Of random votes neighbours would leave little but background."""
 N = 100
 OBJECT = range(50)
 
@@ -45,10 +47,15 @@ def groups(numbers: Sequence[int]) -> MaskGroups:
     return MaskGroups(number, int(number.max(initial=-1)) + 1, np.zeros(len(number), bool))
 
 
-def decide(table: MaskTable, numbers: Sequence[int], xyz: NDArray[np.float32] | None = None) -> Membership:
+def decide(
+    table: MaskTable,
+    numbers: Sequence[int],
+    xyz: NDArray[np.float32] | None = None,
+    settings: MembershipSettings = SETTINGS,
+) -> Membership:
     xyz = on_a_line(table.weights.shape[1]) if xyz is None else xyz
     around = neighbourhood(xyz, GeometrySettings())
-    result = assign_points(table, view_votes(table), groups(numbers), around, SETTINGS)
+    result = assign_points(table, view_votes(table), groups(numbers), around, settings)
     assert result.instance_ids.dtype == np.int32
     assert result.share.dtype == result.detection_rate.dtype == np.float32
     assert result.instance_ids.shape == result.share.shape == result.certainty.shape == (len(xyz),)
@@ -88,6 +95,12 @@ def test_a_torn_rim_joins_the_instance_it_adjoins() -> None:
     """Two views of four cut five points off the end of the object."""
     torn = [(range(45), ONE)]
     assert ids_of([torn, torn, [(OBJECT, ONE)], [(OBJECT, ONE)]], [0] * 4) == [0] * 50 + [BACKGROUND] * 50
+
+
+def test_a_point_amid_background_is_let_go() -> None:
+    """Rays that slip past the object show one point behind it in every mask, and its eight neighbours in none."""
+    ids = ids_of([[([*OBJECT, 80], ONE)]] * 4, [0] * 4)
+    assert ids == [0] * 50 + [BACKGROUND] * 50
 
 
 def test_growth_follows_the_surface_but_not_into_less_likely_points() -> None:
@@ -214,7 +227,7 @@ def test_order_of_points_does_not_matter() -> None:
         outside=csr_array(table.outside[:, order]),
         exposure=csr_array(table.exposure[:, order]),
     )
-    plain, moved = decide(table, numbers, xyz), decide(shuffled, numbers, xyz[order])
+    plain, moved = decide(table, numbers, xyz, STUBBORN), decide(shuffled, numbers, xyz[order], STUBBORN)
     np.testing.assert_array_equal(moved.instance_ids, plain.instance_ids[order])
     np.testing.assert_allclose(moved.share, plain.share[order], rtol=1e-6)
     assert len(set(plain.instance_ids)) > 4
@@ -226,7 +239,7 @@ def test_certainty_is_what_views_say_times_how_far_neighbours_agree(seed: int) -
     table, numbers = random_case(random)
     xyz = random.uniform(0, 8, (200, 3)).astype(np.float32)
     around, votes = neighbourhood(xyz, GeometrySettings()), view_votes(table)
-    result = assign_points(table, votes, groups(numbers), around, replace(SETTINGS, rate_share=0.0))
+    result = assign_points(table, votes, groups(numbers), around, replace(STUBBORN, rate_share=0.0))
     in_mask, vote = votes.in_mask.toarray().astype(float), votes.vote.toarray().astype(float)
     group, said = np.array(numbers), []
     for point, state in enumerate(result.instance_ids):

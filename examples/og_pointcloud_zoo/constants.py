@@ -63,10 +63,10 @@ SOURCES: dict[str, tuple[str, ...]] = {
         "geometry.opacity", "geometry.sight_thickness", "geometry.neighbours", "geometry.reach",
         "grouping.witness_share", "membership.sure_share", "membership.open_share", "membership.possible_share",
         "membership.growth_votes", "membership.rate_share", "membership.island_share", "membership.own_vote",
-        "membership.gap_sizes", "membership.front_share", "membership.hole_sizes", "fitting.colors.MOST",
-        "fitting.colors.SURENESS_POWER", "fitting.view_votes.OPENNESS_POWER", "fitting.looks.LEAST_MASKS",
-        "rendering.geometry.TAMED_BY", "rendering.sightings.LEAST_OPEN", "rendering.sightings.EDGE_PX",
-        "rendering.sightings.RING_SHARE",
+        "membership.crossing", "membership.gap_sizes", "membership.front_share", "membership.hole_sizes",
+        "fitting.colors.MOST", "fitting.colors.SURENESS_POWER", "fitting.view_votes.OPENNESS_POWER",
+        "fitting.looks.LEAST_MASKS", "rendering.geometry.TAMED_BY", "rendering.sightings.LEAST_OPEN",
+        "rendering.sightings.EDGE_PX", "rendering.sightings.RING_SHARE",
     ),
 }  # fmt: skip
 """Where numbers are from. Enough: more gives the same and takes longer. Guessed: found by trying a few captures."""

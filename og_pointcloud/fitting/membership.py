@@ -11,7 +11,7 @@ A view in which the proposer missed k has no vote about k; a view that has a mas
 an edge or through a thin surface leave low shares on what lies behind, in many views; torn mask edges leave middling
 shares on the rim of the object itself. The two are told apart by place and color: a middling share counts only where
 the point adjoins surely labelled points of the same instance (hysteresis, as in Canny's edges), and in the end every
-point hears those about it, each as far as their colors speak for one thing (colors.py).
+point hears those about it, twice, each as far as it is sure and their colors speak for one thing (colors.py).
 
 Of several groups a point is of the one with the most votes; but proposers let large things swallow small ones: where
 that group's own views contradict it and a smaller one is sure, the smaller one has the point.
@@ -46,6 +46,8 @@ from og_pointcloud.settings import MembershipSettings
 
 ENTRIES_AT_ONCE = 1 << 26
 """Entries of the votes that are sorted by point at once: half a gigabyte."""
+ROUNDS = 2
+"""Times that points hear their neighbours: what one round settles, the next hears. Further ones change little."""
 _ByPoint = tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float32]]
 
 
@@ -106,12 +108,13 @@ def assign_points(
     hearsay &= ids == BACKGROUND
     ids[hearsay], own_vote = group[hearsay], np.full(len(ids), np.inf)
     own_vote[hearsay] = (share * votes.openness)[hearsay] / least_open * weights[hearsay].sum(axis=1)
-    ids = _with_neighbours(ids, 1.0 - hearsay, around.index, weights, own_vote, True)
+    ids = _with_neighbours(ids, 1.0 - hearsay, around.index, weights, own_vote, 1.0)
     # What is seen through an instance is no part of it; what no view saw is as its neighbours are.
     ids = _without_islands(ids, share, instance_area(table, groups.group, ids), around, settings.island_share)
     ids = _fill_unobserved(ids, around)
-    own_vote[:] = settings.own_vote
-    ids = _with_neighbours(ids, support.of_state(ids) ** 2, around.index, weights, own_vote, False)
+    for _ in range(ROUNDS):
+        own_vote = np.where(ids == BACKGROUND, settings.crossing, 1.0) * settings.own_vote
+        ids = _with_neighbours(ids, support.of_state(ids), around.index, weights, own_vote, 1 / settings.crossing)
     certainty = support.of_state(ids) * _agreeing(ids, around.index, around.adjoining)
     return Membership(
         ids.astype(np.int32), share.astype(np.float32), certainty.astype(np.float32), rate.astype(np.float32), dismissed
@@ -429,12 +432,11 @@ def _grow(ids, best, possible, neighbours, weights, votes):  # noqa: ANN001, ANN
 
 
 @njit(cache=True, parallel=True)
-def _with_neighbours(ids, voice, neighbours, weights, own_vote, leaves):  # noqa: ANN001, ANN202
+def _with_neighbours(ids, voice, neighbours, weights, own_vote, of_background):  # noqa: ANN001, ANN202
     """Every point takes the state that most of its adjoining points are in, by their weight and their ``voice``.
 
-    The point's own state has ``own_vote`` votes. Unless it ``leaves``, a point of an instance may change to another,
-    not to background: masks are ragged, and what hysteresis joined lies outside of most. All votes are on the states
-    before (ties: the point's own, then the nearest's).
+    The point's own state has ``own_vote`` votes; to a point of an instance background's votes count ``of_background``.
+    All votes are on the states before (ties: the point's own, then the nearest's).
     """
     settled = ids.copy()
     width = neighbours.shape[1]
@@ -448,7 +450,7 @@ def _with_neighbours(ids, voice, neighbours, weights, own_vote, leaves):  # noqa
         for k in range(width):
             other = neighbours[g, k]
             state = ids[other]
-            if weights[g, k] == 0 or state < BACKGROUND or (state == BACKGROUND and ids[g] >= 0 and not leaves):
+            if weights[g, k] == 0 or state < BACKGROUND:
                 continue
             place = 0
             while place < count and states[place] != state:
@@ -456,7 +458,8 @@ def _with_neighbours(ids, voice, neighbours, weights, own_vote, leaves):  # noqa
             if place == count:
                 states[count], votes[count] = state, 0.0
                 count += 1
-            votes[place] += voice[other] * weights[g, k]
+            vote = voice[other] * weights[g, k]
+            votes[place] += vote * of_background if state == BACKGROUND and ids[g] >= 0 else vote
         settled[g] = states[np.argmax(votes[:count])]
     return settled
 

@@ -120,7 +120,8 @@ def membership(
                 said[int(known[other])] = said.get(int(known[other]), 0.0) + alike[g, other]
         ids[g] = max(said, key=lambda state: said[state])
     ids = _filled(_without_islands(ids, share, weights, group, neighbours, settings.island_share), neighbours)
-    ids = _with_neighbours(ids, sureness(), neighbours, alike, settings)
+    for _ in range(2):
+        ids = _with_neighbours(ids, sureness(), neighbours, alike, settings)
     agreeing = [np.mean([ids[other] == ids[g] for other in neighbours[g]]) if neighbours[g] else 1.0 for g in points]
     return ids, share, sureness() * agreeing
 
@@ -166,15 +167,16 @@ def _linked(g: int, other: int, piece: set[int], left: set[int], neighbours: lis
 def _with_neighbours(
     ids: Ids, sureness: Array, neighbours: list[list[int]], alike: Array, settings: MembershipSettings
 ) -> NDArray[np.int32]:
-    """One round: points take the state that their neighbours are in, by the square of how sure these are."""
+    """One round: points take the state that their neighbours are in, by how sure these are."""
     after = ids.copy()
     for g in np.flatnonzero(ids != UNOBSERVED):
-        votes = {int(ids[g]): settings.own_vote}  # in order of nearness: ties are won by the first
+        own = settings.own_vote * (settings.crossing if ids[g] == BACKGROUND else 1)
+        votes = {int(ids[g]): own}  # in order of nearness: ties are won by the first
         for other in neighbours[g]:
             state = int(ids[other])
-            if state == UNOBSERVED or (state == BACKGROUND and ids[g] >= 0):
-                continue
-            votes[state] = votes.get(state, 0.0) + sureness[other] ** 2 * alike[g, other]
+            if state != UNOBSERVED:
+                heard = 1 / settings.crossing if state == BACKGROUND and ids[g] >= 0 else 1
+                votes[state] = votes.get(state, 0.0) + heard * sureness[other] * alike[g, other]
         after[g] = max(votes, key=lambda state: votes[state])
     return after
 

@@ -81,7 +81,7 @@ def certainty_of_any_votes(seed: float) -> Answer:
 
 @agrees(0, "seed", tuple(range(4)))
 def borders(seed: float) -> Answer:
-    """Points hear their neighbours by the square of how sure these are."""
+    """Points hear their neighbours by how sure these are, twice."""
     ours, (ids, *_) = _both(int(seed), MembershipSettings(own_vote=0.4))
     return Answer(ours.instance_ids, ids)
 
@@ -101,7 +101,7 @@ def border_tie() -> Answer:
     share = np.array([[0.9, 0.5, 0.1, 0.9, 0.5, 0.0], [0.1, 0.4, 0.9, 0.1, 0.4, 1.0]])
     table = _made(share, 1 - share.sum(axis=0, keepdims=True), np.ones((1, 6)), [0, 0])
     neighbours = [[1], [0, 2], [1], [4], [3, 5, 5, 5], [4]]
-    settings = MembershipSettings(sure_share=0.45, own_vote=0.3)
+    settings = MembershipSettings(sure_share=0.45, own_vote=0.6)
     ids = _assigned(table, [0, 1], neighbours, settings).instance_ids
     return Answer(ids, int32([0, 0, 1, 0, 1, 1]))
 
