@@ -335,6 +335,23 @@ def test_a_full_disk_leaves_nothing_of_a_new_atlas(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_of_two_who_make_an_atlas_at_a_time_neither_removes_it(tmp_path, monkeypatch):
+    monkeypatch.setattr("og_pointcloud.collection.store.PATIENCE_S", 0.1)
+    path, journal = tmp_path / "atlas", tmp_path / "atlas-journal"
+    journal.write_bytes(bytes(600))  # of an atlas that was removed
+    with Atlas.writing(path) as first:
+        first.set_root(tmp_path / "a")
+        with Atlas.writing(path) as second:
+            second.set_root(tmp_path / "b")
+        with pytest.raises(ZeroDivisionError), Atlas.writing(path) as third:
+            third.set_root(tmp_path / str(1 // 0))
+        with Atlas.reading(path) as atlas:
+            assert atlas.root == tmp_path / "b"
+    with Atlas.reading(path) as atlas:
+        assert atlas.root == tmp_path / "a"
+    assert [file.name for file in tmp_path.iterdir()] == ["atlas"]
+
+
 def test_an_open_collection_notices_a_changed_atlas(folder):
     collection = indexed(folder, {"a": scene(["desk"]), "b": scene(["chair"], 1)})
     assert collection.find("chair")[0].scene == "b"

@@ -27,6 +27,7 @@ from numpy.typing import ArrayLike, NDArray
 from og_pointcloud.ask.choosing import Standard
 from og_pointcloud.cloud import InstanceTable, Vocabulary, WordBank
 from og_pointcloud.errors import OgPointcloudError
+from og_pointcloud.formats.atomic import replacing
 
 APPLICATION, VERSION = 0x4F474154, 2
 """SQLite's application_id and user_version of an atlas; the second is raised when older ones cannot be read."""
@@ -103,28 +104,29 @@ class Atlas:
     @classmethod
     @contextmanager
     def writing(cls, path: str | os.PathLike[str]) -> Iterator[Atlas]:
-        """For one change, which is made when the block ends without an error; a missing file is made too."""
+        """For one change, which is made when the block ends without an error; a missing file is made too, of which
+        nobody sees anything before: of two who make it at a time, the one who ends last has made it."""
         path = Path(path)
-        is_new = not path.exists() or (path.is_file() and path.stat().st_size == 0)  # 0: a first index was killed
-        path.parent.mkdir(parents=True, exist_ok=True)
-        marks = (f"PRAGMA application_id = {APPLICATION}", f"PRAGMA user_version = {VERSION}")
-        try:
-            with cls._connected(path, "rwc") as atlas:
+        if path.exists() and not (path.is_file() and path.stat().st_size == 0):
+            with cls._connected(path, "rw") as atlas:
                 atlas._run("BEGIN IMMEDIATE")
-                for statement in (*SCHEMA, *marks) if is_new else ():
-                    atlas._run(statement)
                 atlas._check()
                 yield atlas
                 atlas._run("COMMIT")
-        except BaseException:
-            for file in (path, path.with_name(f"{path.name}-journal")) if is_new else ():
-                file.unlink(missing_ok=True)
-            raise
+            return
+        marks = (f"PRAGMA application_id = {APPLICATION}", f"PRAGMA user_version = {VERSION}")
+        with replacing(path) as file, cls._connected(path, "rw", Path(file.name)) as atlas:
+            path.with_name(f"{path.name}-journal").unlink(missing_ok=True)  # of one that is no more: it would be undone
+            for statement in ("PRAGMA journal_mode = MEMORY", "BEGIN IMMEDIATE", *SCHEMA, *marks):
+                atlas._run(statement)
+            yield atlas
+            atlas._run("COMMIT")
 
     @classmethod
     @contextmanager
-    def _connected(cls, path: Path, mode: str) -> Iterator[Atlas]:
-        uri = f"{path.resolve().as_uri()}?mode={mode}"
+    def _connected(cls, path: Path, mode: str, file: Path | None = None) -> Iterator[Atlas]:
+        """file: where it lies for now, before it takes its place."""
+        uri = f"{(file or path).resolve().as_uri()}?mode={mode}"
         try:
             with closing(sqlite3.connect(uri, uri=True, timeout=PATIENCE_S, isolation_level=None)) as connection:
                 connection.execute("PRAGMA trusted_schema = OFF")
