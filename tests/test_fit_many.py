@@ -6,6 +6,8 @@ import errno
 import json
 import os
 import signal
+import subprocess
+import sys
 import threading
 import time
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
@@ -180,6 +182,22 @@ def test_a_fit_whose_worker_dies_is_tried_once_more(captures, tmp_path, times, s
     (fit,) = og.fit_many(captures[:1], tmp_path, workers, progress=False)
     assert (fit.state, workers.left) == (state, 0)
     assert ("its worker died (BrokenProcessPool" in fit.cause) == (state == "failed")
+
+
+def test_processes_end_with_the_one_that_started_them():
+    """Also where it had no time to say so."""
+    code = (
+        "import os, signal\nfrom og_pointcloud.fitting.tasks import LocalWorkers\nif __name__ == '__main__':\n"
+        "    workers = LocalWorkers(1)\n    print(workers.submit(os.getpid).result(), flush=True)\n"
+        "    os.kill(os.getpid(), signal.SIGKILL)\n"
+    )
+    started = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+    worker = int(started.stdout.readline())
+    try:
+        started.communicate(timeout=60)  # the end of what the worker may write to, too
+    except subprocess.TimeoutExpired:
+        os.kill(worker, signal.SIGKILL)
+        raise
 
 
 def test_shares():

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
-from multiprocessing import get_context
+from multiprocessing import get_context, parent_process
 from typing import Any, TypeVar
 
 from og_pointcloud.errors import OgPointcloudError, naming_extra
@@ -84,6 +84,17 @@ def _with_share(function: Callable[[Item], Result], item: Item) -> Result:
     return function(item)
 
 
+def _end_with_parent() -> None:
+    """A process whose parent was killed would wait for tasks for good: it ends, and so do its locks."""
+
+    def watch() -> None:
+        if (parent := parent_process()) is not None:
+            parent.join()
+            os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
 class LocalWorkers(ThreadPoolExecutor):
     """Processes of this machine, each with its share of cores and memory, and a thread that waits for what it does.
 
@@ -105,7 +116,8 @@ class LocalWorkers(ThreadPoolExecutor):
         return super().submit(self._in_process, fn, *args, **kwargs)
 
     def _in_process(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Any:
-        process = getattr(self._process_of, "thread", None) or ProcessPoolExecutor(1, get_context("spawn"))
+        process = getattr(self._process_of, "thread", None)
+        process = process or ProcessPoolExecutor(1, get_context("spawn"), _end_with_parent)
         self._process_of.thread = None  # if this fails, the next task begins with a new one
         result = process.submit(fn, *args, **kwargs).result()
         self._process_of.thread = process
