@@ -142,7 +142,7 @@ def test_interrupt_leaves_nothing(tiny_capture, tmp_path, capsys, monkeypatch):
     out.mkdir()
     code, _, stderr = run(capsys, "fit", tiny_capture.folder, "-o", out / "s.ogpc", "--json", out / "run.json")
     assert code == 130
-    assert stderr.splitlines()[-1].startswith("interrupted")
+    assert stderr.splitlines()[-1].startswith("interrupted: what was not done")
     assert list(out.iterdir()) == []
 
 

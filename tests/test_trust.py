@@ -216,7 +216,7 @@ def test_sizes_come_from_headers_and_are_bounded(tmp_path, kind):
     assert image_size(small) == (57, 31)
     large.write_bytes(huge_image(kind))
     for read in (image_size, lambda file: read_rgb(file, (60_000, 17_000))):
-        with pytest.raises(SceneError, match="60000x17000 pixels; expected at most"):
+        with pytest.raises(SceneError, match=r"60000x17000 pixels; expected at most .*: scale it down"):
             read(large)
 
 
@@ -234,7 +234,7 @@ def test_a_small_file_does_not_unpack_to_a_large_one(tmp_path):
     ("content", "says"),
     [
         (transforms(transform_matrix=[[10**400] * 4] * 4), "expected 4 rows of 4 numbers"),
-        (b" " * (1 << 26) + transforms(), "expected at most 67108864"),
+        (b" " * (1 << 26) + transforms(), "expected at most 67108864: split it"),
     ],
 )
 def test_pose_files_that_are_none(tmp_path, content, says):

@@ -90,6 +90,19 @@ def test_the_page_needs_nothing_from_elsewhere(bundle, tmp_path, capsys):
     assert not re.search(r"https?:|src=|href=|import\(|fetch\(|@import|url\(", text)
 
 
+def test_what_is_gone_is_no_instance_of_a_page(tmp_path):
+    cloud = room(300)
+    kept = cloud.instance_ids != 0
+    points = np.where(np.arange(len(cloud.instances)) == 0, 0, cloud.instances.points).astype(np.int32)
+    cloud = replace(
+        cloud, xyz=cloud.xyz[kept], instance_ids=cloud.instance_ids[kept], rgb=None, certainty=None,
+        instances=replace(cloud.instances, points=points),
+    )  # fmt: skip
+    scene = og.LabelledScene.from_cloud(cloud)
+    write_page(tmp_path / "p.html", scene, og.segment(scene), Viewpoint(np.ones(3), np.zeros(3), Z_UP), Look("room"))
+    assert content(tmp_path / "p.html")["subtitle"].endswith(f" {len(cloud.instances) - 1} instances")
+
+
 def test_names_cannot_break_out_of_the_page(tmp_path):
     name = "</script><script>alert(1)</script><!--"
     cloud = room(300)

@@ -55,7 +55,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             arguments.run(arguments)
             sys.stdout.flush()
     except KeyboardInterrupt:
-        print("interrupted: the files of this command were not written", file=sys.stderr)
+        print("interrupted: what was not done is not written; the same command does the rest", file=sys.stderr)
         return 130
     except BrokenPipeError:  # as `| head` does; nothing is left to be said, not even on leaving
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

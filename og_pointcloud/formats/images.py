@@ -95,7 +95,9 @@ def image_size(file: Path) -> tuple[int, int]:
 
 def _check_pixels(file: Path, width: int, height: int) -> None:
     if width * height > MAX_PIXELS:
-        raise SceneError(f"{file} says it is {width}x{height} pixels; expected at most {MAX_PIXELS} pixels")
+        raise SceneError(
+            f"{file} says it is {width}x{height} pixels; expected at most {MAX_PIXELS} pixels: scale it down"
+        )
 
 
 def stated_size(stream: BinaryIO) -> tuple[int, int] | None:

@@ -54,7 +54,7 @@ def read_photogrammetry(file: Path, image_size: ImageSize) -> PosedFrames:
     if reader is None:
         raise SceneError(f"{file} is neither Metashape's XML of cameras nor RealityScan's CSV: export it again")
     if (size := file.stat().st_size) > MAX_BYTES:
-        raise SceneError(f"{file} has {size} bytes; expected at most {MAX_BYTES}")
+        raise SceneError(f"{file} has {size} bytes; expected at most {MAX_BYTES}: split it")
     with naming(file):
         frames = reader(file.read_text(encoding="utf-8-sig", errors="replace"), image_size)
         if not frames.images:

@@ -208,7 +208,7 @@ def numbered_images(folder: Path) -> list[Path]:
 def read_json(file: Path, most: int = MAX_TEXT_BYTES) -> Any:
     """What a JSON file of bounded size holds, which takes up to twenty times its bytes. SceneError where it is none."""
     if (size := file.stat().st_size) > most:
-        raise SceneError(f"{file} has {size} bytes; expected at most {most}")
+        raise SceneError(f"{file} has {size} bytes; expected at most {most}: split it")
     try:
         return json.loads(file.read_text(encoding="utf-8-sig"))  # editors of Windows put a mark before it
     except (ValueError, RecursionError) as error:

@@ -78,7 +78,7 @@ def write_page(
     low, high = xyz.min(axis=0), xyz.max(axis=0)
     middle = low + (high - low) / 2
     data = {
-        "subtitle": f"{len(shown):,} points · {len(scene.instances)} instances",
+        "subtitle": f"{len(shown):,} points · {(scene.cloud.instances.points > 0).sum()} instances",
         **asdict(look), "meaning": meaning(result.calibrated),
         "grey": NO_LABEL, "hues": label_colors(np.arange(len(scene.instances))).tolist(),
         "spacing": scene.cloud.spacing * (len(finite) / len(shown)) ** 0.5,
