@@ -289,8 +289,8 @@ class Points:
         if given and len(given) < 3:
             raise SceneError(f"Gaussians need scale, rotation and opacity together; got only {', '.join(given)}")
         require_finite(self.xyz)
-        if self.scale is not None and self.rotation is not None and self.opacity is not None:
-            _check_gaussians(self.scale, self.rotation, self.opacity)
+        if given:
+            _check_gaussians(*self.gaussians)
 
     def __len__(self) -> int:
         return len(self.xyz)
@@ -306,6 +306,13 @@ class Points:
     def are_gaussians(self) -> bool:
         """Whether scale, rotation and opacity are known."""
         return self.scale is not None
+
+    @property
+    def gaussians(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Scale, rotation and opacity of every point; SceneError for a plain cloud."""
+        if self.scale is None or self.rotation is None or self.opacity is None:
+            raise SceneError("the points have no scale, rotation and opacity; expected Gaussians, as a 3DGS file has")
+        return self.scale, self.rotation, self.opacity
 
     @property
     def xyz_world(self) -> DoubleArray:

@@ -348,7 +348,7 @@ def test_glb_of_splats_adds_their_shape(tmp_path):
     assert document["names"]["og_label"] == ["a", "b", "c"]
     labels = arrays["_FEATURE_ID_0"][:, 0]
     assert np.array_equal(np.where(labels == 3, -1, labels), result.labels)
-    with pytest.raises(SceneError, match="40 points for 39 labels"):
+    with pytest.raises(SceneError, match="40 Gaussians for 39 labels"):
         segmentation([0] * 39, ["a"], points.xyz_world[:39]).save(tmp_path / "out.glb", points)
 
 

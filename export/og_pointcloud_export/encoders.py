@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from og_pointcloud.errors import MissingExtraError, OgPointcloudError, naming_extra
 from og_pointcloud.formats.npy import npy_bytes
-from og_pointcloud.formats.poses import read_json
+from og_pointcloud.formats.poses import read_json_object
 from og_pointcloud.masking import encode
 from og_pointcloud.masking.crops import WITH_CONTEXT, Crop
 from og_pointcloud.models import check_graph, open_session
@@ -39,6 +39,7 @@ with naming_extra("torch, transformers and onnx", "export"):
     import torch
 
     from og_pointcloud.masking.clip import TransformersModel, load_model, published_name
+    from og_pointcloud.masking.pretrained import read_config
 if find_spec("onnxscript") is None:  # torch.onnx.export imports it late, and says less
     raise MissingExtraError("onnxscript", "export")
 
@@ -219,7 +220,7 @@ def _quietly() -> Any:
 def _tokenizer_of(source: Path, is_causal: bool) -> dict[str, Any]:
     """tokenizer.json beside the weights or, for CLIP, what transformers makes of vocab.json and merges.txt."""
     if (source / text_encoder.TOKENIZER).is_file():
-        description = read_json(source / text_encoder.TOKENIZER)
+        description = read_json_object(source / text_encoder.TOKENIZER)
         return description if is_causal else _lower_casing(description)
     if is_causal and (source / "vocab.json").is_file() and (source / "merges.txt").is_file():
         from transformers import CLIPTokenizer
@@ -245,8 +246,7 @@ def _lower_casing(description: dict[str, Any]) -> dict[str, Any]:
 
 def _pad_id(source: Path, description: dict[str, Any]) -> int:
     """What fills a text up to the context, where every token sees it and it must be the one of training."""
-    file = source / "tokenizer_config.json"
-    config = read_json(file) if file.is_file() else {}
+    file, config = source / "tokenizer_config.json", read_config(source, "tokenizer_config.json")
     named = config.get("pad_token")
     token = named.get("content") if isinstance(named, dict) else named
     added = {entry["content"]: entry["id"] for entry in description.get("added_tokens") or []}

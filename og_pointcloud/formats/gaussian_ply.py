@@ -47,19 +47,18 @@ def gaussian_rows(points: Points) -> NDArray[np.void]:
     Positions are float64 where float32 would lose more than 1e-6 of the extent. Scale 0 and opacities 0 and 1 become
     the nearest finite logarithm and logit, so that any reader survives them. Without rgb the splats are mid-gray.
     """
-    if points.scale is None or points.rotation is None or points.opacity is None:
-        raise SceneError("the points have no scale, rotation and opacity; expected Gaussians")
+    scale, rotation, opacity = points.gaussians
     smallest = np.finfo(np.float32).smallest_normal
     # 2^-24 below 1 is the last opacity under 1 that float32 knows.
-    opacity = np.clip(points.opacity.astype(np.float64), 2.0**-24, 1 - 2.0**-24)
+    opacity = np.clip(opacity.astype(np.float64), 2.0**-24, 1 - 2.0**-24)
     rgb = np.full(points.xyz.shape, 127.5) if points.rgb is None else points.rgb
     groups = {
         ("x", "y", "z"): storable_positions(points.xyz_world),
         ("nx", "ny", "nz"): np.zeros_like(points.xyz),
         BASE_COLOR: ((rgb / 255 - 0.5) / SH_CONSTANT).astype(np.float32),
         ("opacity",): np.log(opacity / (1 - opacity)).astype(np.float32)[:, None],
-        LOG_SCALE: np.log(np.maximum(points.scale, smallest)),
-        ROTATION: points.rotation,
+        LOG_SCALE: np.log(np.maximum(scale, smallest)),
+        ROTATION: rotation,
     }
     return join_columns({name: values[:, i] for names, values in groups.items() for i, name in enumerate(names)})
 
@@ -92,15 +91,15 @@ def _names(elements: Elements) -> tuple[str, ...]:
 
 def _trained(vertex: NDArray[np.void]) -> Points:
     with np.errstate(over="ignore"):
-        scale = np.exp(stack_columns(vertex, LOG_SCALE, np.float64)).astype(np.float32)
+        scale = np.exp(stack_columns(vertex, LOG_SCALE)).astype(np.float32)
     # The logistic function as tanh, which cannot overflow.
-    opacity = 0.5 + 0.5 * np.tanh(0.5 * stack_columns(vertex, ("opacity",), np.float64)[:, 0])
+    opacity = 0.5 + 0.5 * np.tanh(0.5 * stack_columns(vertex, ("opacity",))[:, 0])
     if "f_dc_0" in (vertex.dtype.names or ()):
-        color = 0.5 + SH_CONSTANT * stack_columns(vertex, BASE_COLOR, np.float64)
+        color = 0.5 + SH_CONSTANT * stack_columns(vertex, BASE_COLOR)
     else:  # nerfstudio's exporter writes red, green, blue instead where it is asked for colors
         rgb = colors(vertex)
         color = None if rgb is None else rgb / 255
-    return activated(positions(vertex), scale, stack_columns(vertex, ROTATION, np.float64), opacity, color)
+    return activated(positions(vertex), scale, stack_columns(vertex, ROTATION), opacity, color)
 
 
 def _compressed(elements: Elements) -> Points:
@@ -117,17 +116,12 @@ def _compressed(elements: Elements) -> Points:
             raise SceneError(f"element 'vertex' has no property '{name}' of type uint; expected a SuperSplat file")
         words[name] = np.ascontiguousarray(vertex[name])
 
-    xyz = _between(chunk, ("min_x", "min_y", "min_z"), ("max_x", "max_y", "max_z"), _unpack(words["packed_position"]))
-    log_scale = _between(
-        chunk,
-        ("min_scale_x", "min_scale_y", "min_scale_z"),
-        ("max_scale_x", "max_scale_y", "max_scale_z"),
-        _unpack(words["packed_scale"]),
-    )
+    xyz = _between(chunk, ("x", "y", "z"), _unpack(words["packed_position"]))
+    log_scale = _between(chunk, ("scale_x", "scale_y", "scale_z"), _unpack(words["packed_scale"]))
     rgba = _unpack(words["packed_color"], bits=(8, 8, 8, 8))
     color = rgba[:, :3]
     if "min_r" in (chunk.dtype.names or ()):  # since SuperSplat 2; before it, colors have no bounds
-        color = _between(chunk, ("min_r", "min_g", "min_b"), ("max_r", "max_g", "max_b"), color)
+        color = _between(chunk, ("r", "g", "b"), color)
     with np.errstate(over="ignore"):
         scale = np.exp(log_scale).astype(np.float32)
     return activated(xyz, scale, _unpack_rotation(words["packed_rotation"]), rgba[:, 3], color)
@@ -144,11 +138,9 @@ def _unpack(words: NDArray[np.uint32], bits: tuple[int, ...] = (11, 10, 11)) -> 
     return shares
 
 
-def _between(
-    chunk: NDArray[np.void], low: tuple[str, ...], high: tuple[str, ...], share: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _between(chunk: NDArray[np.void], names: tuple[str, ...], share: NDArray[np.float64]) -> NDArray[np.float64]:
     """``share`` of the way from each splat's chunk minimum to its maximum."""
-    minimum, maximum = stack_columns(chunk, low, np.float64), stack_columns(chunk, high, np.float64)
+    minimum, maximum = (stack_columns(chunk, [f"{end}_{name}" for name in names]) for end in ("min", "max"))
     of_splat = np.arange(len(share)) // SPLATS_PER_CHUNK
     with np.errstate(invalid="ignore"):  # infinite bounds give NaN, which is reported as such
         return minimum[of_splat] + (maximum - minimum)[of_splat] * share
@@ -177,22 +169,18 @@ def activated(
     if color is not None:
         parts["color"] = color
     if not all(np.isfinite(values).all() for values in parts.values()):
-        raise _not_finite(parts)
+        finite = {name: np.isfinite(values).all(axis=1) for name, values in parts.items()}
+        usable = np.logical_and.reduce(list(finite.values()))
+        first = int(np.argmin(usable))
+        blamed = next(name for name in finite if not finite[name][first])
+        raise SceneError(
+            f"{int((~usable).sum())} of {len(usable)} Gaussians are not finite (the first is row {first}, in its "
+            f"{blamed}); expected finite values, and log scales below 88.7: remove these Gaussians first"
+        )
     length = np.linalg.norm(rotation, axis=1, keepdims=True)
     # A zero quaternion put into the rotation matrix formula gives the identity, so that is how such files are rendered.
     unit = np.divide(rotation, length, out=np.tile([1.0, 0.0, 0.0, 0.0], (len(rotation), 1)), where=length > 0)
     rgb = None if color is None else np.rint(np.clip(color, 0, 1) * 255).astype(np.uint8)
     return Points.from_world(
         xyz, rgb=rgb, scale=scale, rotation=unit.astype(np.float32), opacity=opacity.astype(np.float32)
-    )
-
-
-def _not_finite(parts: Mapping[str, NDArray[np.floating]]) -> SceneError:
-    finite = {name: np.logical_and.reduce(np.isfinite(values), axis=1) for name, values in parts.items()}
-    usable = np.logical_and.reduce(list(finite.values()))
-    first = int(np.argmin(usable))
-    blamed = next(name for name in finite if not finite[name][first])
-    return SceneError(
-        f"{int((~usable).sum())} of {len(usable)} Gaussians are not finite (the first is row {first}, in its "
-        f"{blamed}); expected finite values, and log scales below 88.7: remove these Gaussians first"
     )

@@ -102,12 +102,13 @@ def write_gltf(
 
 def _splat_columns(splats: Points, rgb: NDArray[np.uint8]) -> dict[str, NDArray[np.float32]]:
     """Attributes of KHR_gaussian_splatting: quaternions x y z w, linear scales, opacity, the constant harmonic."""
-    if splats.rotation is None or splats.scale is None or splats.opacity is None or len(splats.xyz) != len(rgb):
-        raise SceneError(f"{len(splats.xyz)} points for {len(rgb)} labels; expected as many Gaussians")
+    scale, rotation, opacity = splats.gaussians
+    if len(splats) != len(rgb):
+        raise SceneError(f"{len(splats)} Gaussians for {len(rgb)} labels; expected as many")
     columns = {
-        "ROTATION": splats.rotation[:, [1, 2, 3, 0]],
-        "SCALE": splats.scale,
-        "OPACITY": splats.opacity,
+        "ROTATION": rotation[:, [1, 2, 3, 0]],
+        "SCALE": scale,
+        "OPACITY": opacity,
         "SH_DEGREE_0_COEF_0": ((rgb / 255 - 0.5) / SH_CONSTANT).astype(np.float32),
     }
     return {f"{SPLATS}:{name}": column for name, column in columns.items()}

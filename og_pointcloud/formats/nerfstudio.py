@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.depth import DepthFile
 from og_pointcloud.formats.lenses import SPHERICAL, Lens, lens_of, spherical_camera
-from og_pointcloud.formats.poses import OPENGL, PosedFrames, PosedImage, inverse, read_json
+from og_pointcloud.formats.poses import OPENGL, PosedFrames, PosedImage, inverse, read_json_object
 from og_pointcloud.formats.tables import naming
 from og_pointcloud.scene import Camera
 
@@ -44,8 +44,8 @@ def read_transforms(file: Path, image_size: Callable[[str], tuple[int, int]]) ->
 
     Raises SceneError for anything that is not such a file, naming the frame and the key.
     """
-    content = read_json(file)
-    frames = content.get("frames") if isinstance(content, dict) else None
+    content = read_json_object(file)
+    frames = content.get("frames")
     if not isinstance(frames, list) or not frames:
         raise SceneError(
             f"{file} has no list 'frames' with at least one frame; expected nerfstudio's or instant-ngp's layout"

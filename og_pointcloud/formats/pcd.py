@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import os
 import re
-import struct
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
@@ -16,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.errors import SceneError
-from og_pointcloud.formats.tables import naming, read_text_rows
+from og_pointcloud.formats.tables import naming, read_binary_rows, read_text_rows
 
 HEADER_LIMIT = 1 << 16
 POINT_SIZE_LIMIT = 1 << 20
@@ -53,11 +52,9 @@ def read_pcd(path: str | os.PathLike[str]) -> NDArray[np.void]:
         file.seek(header.data_offset)
         if header.encoding == "ascii":
             return read_text_rows(file, header.dtype, header.points, "PCD data")
-        left = os.fstat(file.fileno()).st_size - header.data_offset
         if header.encoding == "binary":
-            _require_bytes("points", header.points * header.dtype.itemsize, left)
-            return np.fromfile(file, header.dtype, header.points)
-        return _read_compressed(file, header, left)
+            return read_binary_rows(file, header.dtype, header.points, "PCD data")
+        return _read_compressed(file, header)
 
 
 def _parse_header(head: bytes) -> _Header:
@@ -117,25 +114,18 @@ def _whole_numbers(entries: dict[str, list[str]], keyword: str, expected: int) -
     return [int(value) for value in values]
 
 
-def _require_bytes(what: str, expected: int, left: int) -> None:
-    if expected > left:
-        raise SceneError(
-            f"PCD {what}: expected {expected} bytes, the file has {left}: it is truncated; copy or write it again"
-        )
-
-
-def _read_compressed(file: BinaryIO, header: _Header, left: int) -> NDArray[np.void]:
+def _read_compressed(file: BinaryIO, header: _Header) -> NDArray[np.void]:
     """Compressed data is column by column: all values of the first field, then all of the second."""
-    _require_bytes("sizes of the compressed data", 8, left)
-    compressed_size, size = struct.unpack("<II", file.read(8))
-    _require_bytes("compressed data", compressed_size, left - 8)
+    sizes = read_binary_rows(file, np.dtype("<u4"), 2, "sizes of the compressed PCD data")
+    compressed_size, size = sizes.tolist()
+    compressed = read_binary_rows(file, np.dtype("u1"), compressed_size, "compressed PCD data").tobytes()
     expected = header.points * header.dtype.itemsize
     if size != expected:
         raise SceneError(
             f"PCD data claims to unpack to {size} bytes; the header's {header.points} points need {expected}: the file "
             "is damaged"
         )
-    data = _lzf_decompress(file.read(compressed_size), size)
+    data = _lzf_decompress(compressed, size)
     rows = np.empty(header.points, header.dtype)
     at = 0
     for name in header.dtype.names or ():

@@ -31,7 +31,7 @@ from og_pointcloud.formats.poses import (
     named_numbers,
     numbered,
     numbered_images,
-    read_json,
+    read_json_object,
     read_numbers,
     rigid,
     rotation_of_vector,
@@ -59,7 +59,7 @@ def _polycam(folder: Path) -> Iterator[RecordedFrame]:
         if not source.is_file():
             yield RecordedFrame(path, source)
             continue
-        content = read_json(source)
+        content = read_json_object(source)
         sensor = _sensor(*named_numbers(content, POLYCAM_KEYS, source))
         pose = np.reshape(named_numbers(content, POSE_KEYS, source), (3, 4)) * OPENGL
         yield RecordedFrame(path, source, pose, sensor, (sensor, keyframes / "depth" / f"{file.stem}.png"))
@@ -75,8 +75,7 @@ def _scanner_app(folder: Path) -> Iterator[RecordedFrame]:
         if not source.is_file():
             yield RecordedFrame(file.name, source)
             continue
-        content = read_json(source)
-        content = content if isinstance(content, dict) else {}
+        content = read_json_object(source)
         pose = np.reshape(named_numbers(content.get("cameraPoseARFrame"), range(16), source), (4, 4)) * OPENGL
         fx, _, cx, _, fy, cy, *_ = named_numbers(content.get("intrinsics"), range(9), source)
         sensor = _sensor(*image_size(file), fx, fy, cx + 0.5, cy + 0.5)

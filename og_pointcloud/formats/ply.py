@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.atomic import replacing
-from og_pointcloud.formats.tables import naming, read_text_rows, storable_positions
+from og_pointcloud.formats.tables import naming, read_binary_rows, read_text_rows, storable_positions
 
 HEADER_LIMIT = 1 << 18
 """Bytes in which a header must end; the longest known (a 3DGS file with its training record) has 4 kB."""
@@ -168,17 +168,11 @@ def _add_property(element: _Element, words: list[str], number: int) -> None:
 
 def _rows(file: BinaryIO, element: _Element, byte_order: str) -> NDArray[np.void]:
     """The rows of an element without lists, which begin where the file stands."""
+    what = f"element '{element.name}'"
     if not byte_order:
-        return read_text_rows(file, element.dtype("="), element.count, f"element '{element.name}'")
-    dtype = element.dtype(byte_order)
-    left = os.fstat(file.fileno()).st_size - file.tell()
-    if element.count * dtype.itemsize > left:
-        raise SceneError(
-            f"element '{element.name}': expected {element.count} rows of {dtype.itemsize} bytes "
-            f"({element.count * dtype.itemsize} bytes), the file has {left // dtype.itemsize} rows ({left} bytes): "
-            "it is truncated; copy or write it again"
-        )
-    return np.fromfile(file, dtype, element.count).astype(dtype.newbyteorder("="), copy=False)
+        return read_text_rows(file, element.dtype("="), element.count, what)
+    rows = read_binary_rows(file, element.dtype(byte_order), element.count, what)
+    return rows.astype(rows.dtype.newbyteorder("="), copy=False)
 
 
 def _packed(element: str, rows: NDArray[np.void]) -> NDArray[np.void]:

@@ -207,22 +207,29 @@ def numbered_images(folder: Path) -> list[Path]:
 
 def read_json(file: Path, most: int = MAX_TEXT_BYTES) -> Any:
     """What a JSON file of bounded size holds, which takes up to twenty times its bytes. SceneError where it is none."""
-    if (size := file.stat().st_size) > most:
-        raise SceneError(f"{file} has {size} bytes; expected at most {most}: split it")
+    text = read_text(file, most)
     try:
-        return json.loads(file.read_text(encoding="utf-8-sig"))  # editors of Windows put a mark before it
+        return json.loads(text)
     except (ValueError, RecursionError) as error:
         raise SceneError(f"{file} is not valid JSON ({error}): export it again") from None
 
 
-def read_text(file: Path) -> str:
-    """A text file of bounded size; SceneError where it is longer, or no text."""
+def read_json_object(file: Path) -> dict[str, Any]:
+    """As `read_json`, of a file that holds one object."""
+    content = read_json(file)
+    if not isinstance(content, dict):
+        raise SceneError(f"{file} holds {content!r:.40}; expected a JSON object: export or fetch it again")
+    return content
+
+
+def read_text(file: Path, most: int = MAX_TEXT_BYTES) -> str:
+    """A text file of bounded size, in UTF-8; SceneError where it is longer, or no text."""
     try:
         if not file.is_file():
-            raise SceneError(f"{file} is no file; expected a text file of numbers")  # a device or a pipe never ends
-        if (size := file.stat().st_size) > MAX_TEXT_BYTES:
-            raise SceneError(f"{file} has {size} bytes; expected a text file of numbers, at most {MAX_TEXT_BYTES}")
-        return file.read_text(encoding="utf-8")
+            raise SceneError(f"{file} is no file; expected a text file")  # a device or a pipe never ends
+        if (size := file.stat().st_size) > most:
+            raise SceneError(f"{file} has {size} bytes; expected at most {most}: split it")
+        return file.read_text(encoding="utf-8-sig")  # editors of Windows put a mark before it
     except (UnicodeDecodeError, OSError) as error:
         raise SceneError(f"{file} cannot be read as text ({error!s:.80}): export it again") from None
 

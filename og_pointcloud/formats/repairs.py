@@ -40,7 +40,7 @@ from og_pointcloud.formats.mask_files import MaskLayer
 from og_pointcloud.formats.poses import (
     PosedImage,
     quaternion_of,
-    read_json,
+    read_json_object,
     rigid,
     rotation_of_quaternion,
     rotation_of_vector,
@@ -120,8 +120,7 @@ def read_repairs(capture: Path) -> tuple[Repair, ...]:
     file = capture / REPAIRS_NAME
     if not file.is_file():
         return ()
-    content = read_json(file)
-    listed = content.get("repairs") if isinstance(content, dict) else None
+    listed = read_json_object(file).get("repairs")
     if not isinstance(listed, list) or len(listed) > MOST_REPAIRS or not all(isinstance(text, str) for text in listed):
         raise SceneError(
             f'{file} is not {{"repairs": [texts]}} with at most {MOST_REPAIRS} of them: write it again with '

@@ -36,7 +36,7 @@ from og_pointcloud.formats.poses import (
     named_numbers,
     numbered,
     numbered_images,
-    read_json,
+    read_json_object,
     read_numbers,
     recorded,
 )
@@ -171,8 +171,7 @@ def _replica_parameters(folder: Path) -> list[float]:
         raise SceneError(
             f"{folder} has no {REPLICA_PARAMETERS}, nor has the folder above; expected it with w h fx fy cx cy scale"
         )
-    content = read_json(file)
-    values = named_numbers(content.get("camera") if isinstance(content, dict) else None, REPLICA_KEYS, file)
+    values = named_numbers(read_json_object(file).get("camera"), REPLICA_KEYS, file)
     if min(values[0], values[1], values[-1]) <= 0 or max(values[:2]) > 1 << 16:
         raise SceneError(f"{file}: {', '.join(REPLICA_KEYS)} are {values}; expected positive sizes and scale")
     return values

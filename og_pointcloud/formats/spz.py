@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud.errors import MissingExtraError, SceneError
+from og_pointcloud.errors import SceneError, naming_extra
 from og_pointcloud.formats.atomic import write_file
 from og_pointcloud.formats.gaussian_ply import SH_CONSTANT, activated
 from og_pointcloud.formats.tables import naming
@@ -80,19 +80,18 @@ def write_spz(path: str | os.PathLike[str], points: Points, rgb: Bytes | None = 
     """
     path = Path(path)
     with naming(path):
-        if points.scale is None or points.rotation is None or points.opacity is None:
-            raise SceneError("the points have no scale, rotation and opacity; expected Gaussians: SPZ holds no others")
+        scale, rotation, opacity = points.gaussians
         positions, bits = _as_fixed_point(points.xyz_world * TURNED)
         color = points.rgb if rgb is None else rgb
         base = (np.full(points.xyz.shape, 127.5) if color is None else color) / 255 - 0.5
         with np.errstate(divide="ignore"):  # a scale of 0 becomes the smallest
-            steps = (np.log(points.scale.astype(np.float64)) - LOG_SCALE_LEAST) * LOG_SCALE_STEPS
+            steps = (np.log(scale.astype(np.float64)) - LOG_SCALE_LEAST) * LOG_SCALE_STEPS
         columns = (
             positions,
-            _byte(255 * points.opacity),
+            _byte(255 * opacity),
             _byte(255 * (base / SH_CONSTANT * COLOR_SCALE + 0.5)),
             _byte(steps),
-            _packed_rotation(points.rotation.astype(np.float64)),
+            _packed_rotation(rotation.astype(np.float64)),
         )
         header = HEADER.pack(MAGIC, 3, len(points.xyz), 0, bits, 0, 0)
         write_file(path, gzip.compress(b"".join([header, *(column.tobytes() for column in columns)]), mtime=0))
@@ -137,10 +136,8 @@ def _unpacked(data: bytes) -> tuple[int, int, list[Bytes]]:
 
 def _columns(data: bytes) -> tuple[int, int, list[Bytes]]:
     """The same of version 4: a table of bytes packed and bytes, 64 bits each, then the columns."""
-    try:
+    with naming_extra("zstandard", "spz"):
         import zstandard
-    except ImportError as error:
-        raise MissingExtraError("zstandard", "spz") from error
     if len(data) < HEADER.size + 4:
         raise SceneError(f"its header ends after {len(data)} bytes: copy or export it again")
     magic, version, count, degree, bits, _, streams = HEADER.unpack_from(data)

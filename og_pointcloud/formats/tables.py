@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import csv
 import io
+import os
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from itertools import chain, islice
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,16 +56,13 @@ def read_text_rows(lines: Iterable[bytes], dtype: np.dtype, count: int, what: st
 
     Takes no line beyond its last row. SceneError where a value does not fit its type, or rows are missing.
     """
-    if count == 0:
-        return np.empty(0, dtype)
     rows_text = islice((line for line in lines if not line.isspace()), count)
-    first = next(rows_text, None)
-    if first is None:
-        raise SceneError(f"{what}: expected {count} rows, the file has 0: it is truncated; copy or write it again")
+    rows, first = np.empty(0, dtype), next(rows_text, None)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", DeprecationWarning)  # numpy before 2.3 would store 300 as a byte, as 44
-            rows = np.loadtxt(chain([first], rows_text), dtype, comments=None, ndmin=1)
+            if first is not None:
+                rows = np.loadtxt(chain([first], rows_text), dtype, comments=None, ndmin=1)
     except DeprecationWarning as error:
         raise SceneError(f"{what}: a value is no whole number of the type that the header says") from error
     except ValueError as error:
@@ -77,15 +76,26 @@ def read_text_rows(lines: Iterable[bytes], dtype: np.dtype, count: int, what: st
     return rows
 
 
-def stack_columns(rows: NDArray[np.void], names: Sequence[str], dtype: type[np.floating]) -> NDArray:
-    """Columns side by side: (n, len(names)) of ``dtype``. SceneError names the columns that are not there."""
+def read_binary_rows(file: BinaryIO, dtype: np.dtype, count: int, what: str) -> NDArray:
+    """The next ``count`` values of ``dtype`` of a binary file; SceneError, before room is made, where it has fewer."""
+    left = os.fstat(file.fileno()).st_size - file.tell()
+    if count * dtype.itemsize > left:
+        raise SceneError(
+            f"{what}: expected {count} rows of {dtype.itemsize} bytes ({count * dtype.itemsize} bytes), the file has "
+            f"{left // dtype.itemsize} rows ({left} bytes): it is truncated; copy or write it again"
+        )
+    return np.fromfile(file, dtype, count)
+
+
+def stack_columns(rows: NDArray[np.void], names: Sequence[str]) -> NDArray[np.float64]:
+    """Columns side by side: (n, len(names)) float64. SceneError names the columns that are not there."""
     scalar = [name for name in rows.dtype.names or () if rows.dtype[name].shape == ()]
     missing = [name for name in names if name not in scalar]
     if missing:
         raise SceneError(
             f"no column {', '.join(missing)}; expected {', '.join(names)}, the file has {', '.join(scalar):.60}"
         )
-    stacked = np.empty((len(rows), len(names)), dtype)
+    stacked = np.empty((len(rows), len(names)))
     with np.errstate(invalid="ignore"):  # widening a signalling NaN warns; NaN is for the caller to judge
         for column, name in enumerate(names):
             stacked[:, column] = rows[name]
@@ -94,7 +104,7 @@ def stack_columns(rows: NDArray[np.void], names: Sequence[str], dtype: type[np.f
 
 def positions(rows: NDArray[np.void]) -> NDArray[np.float64]:
     """(n, 3) float64 of columns x, y, z."""
-    return stack_columns(rows, ("x", "y", "z"), np.float64)
+    return stack_columns(rows, ("x", "y", "z"))
 
 
 def colors(rows: NDArray[np.void]) -> NDArray[np.uint8] | None:
@@ -113,7 +123,7 @@ def colors(rows: NDArray[np.void]) -> NDArray[np.uint8] | None:
     types = {rows.dtype[name] for name in names}
     if types == {np.dtype(np.uint8)}:
         return np.stack([rows[name] for name in names], axis=1)
-    values = stack_columns(rows, names, np.float64)
+    values = stack_columns(rows, names)
     low, high = values.min(initial=0.0), values.max(initial=0.0)
     if types == {np.dtype(np.uint16)}:
         values /= 257.0

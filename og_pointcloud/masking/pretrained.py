@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from og_pointcloud.errors import SceneError, first_line, naming_extra
-from og_pointcloud.formats.poses import read_json
+from og_pointcloud.formats.poses import read_json_object
 
 with naming_extra("torch and transformers", "masks"):
     import torch
@@ -54,10 +54,7 @@ def best_device() -> torch.device:
 def read_config(folder: Path, *names: str) -> dict[str, Any]:
     """The first of these JSON files that a folder has, empty where it has none. SceneError where it holds no object."""
     file = next((folder / name for name in names if (folder / name).is_file()), None)
-    content = {} if file is None else read_json(file)
-    if not isinstance(content, dict):
-        raise SceneError(f"{file} holds no JSON object; expected one: fetch the model again")
-    return content
+    return {} if file is None else read_json_object(file)
 
 
 def _model_type(folder: Path, classes: Mapping[str, str]) -> str:

@@ -41,7 +41,7 @@ def recoloured(rows: Rows, chosen: NDArray[np.bool_], color: NDArray[np.float64]
     is_splat = set(BASE_COLOR) <= set(columns)
     if is_splat:
         # Color is linear in the coefficients, so what a linear map does to colors it does to them.
-        base = 0.5 + SH_CONSTANT * stack_columns(rows, BASE_COLOR, np.float64)[chosen]
+        base = 0.5 + SH_CONSTANT * stack_columns(rows, BASE_COLOR)[chosen]
         mapping = _color_map(np.clip(base, 0, 1), color)
         _set(columns, BASE_COLOR, (base @ mapping.T - 0.5) / SH_CONSTANT, chosen)
         _set(columns, _rest_names(rows), np.einsum("dc,nck->ndk", mapping, _rest(rows)[chosen]), chosen)
@@ -65,11 +65,11 @@ def placed(
     columns |= dict(zip("xyz", (positions(rows) @ (scale * rotation).T + translation).T, strict=True))
     for normal in NORMAL_COLUMNS:
         if set(normal) <= set(columns):
-            _set(columns, normal, stack_columns(rows, normal, np.float64) @ rotation.T)
+            _set(columns, normal, stack_columns(rows, normal) @ rotation.T)
     if set(LOG_SCALE) <= set(columns):
-        _set(columns, LOG_SCALE, stack_columns(rows, LOG_SCALE, np.float64) + np.log(scale))
+        _set(columns, LOG_SCALE, stack_columns(rows, LOG_SCALE) + np.log(scale))
     if set(ROTATION) <= set(columns):
-        _set(columns, ROTATION, _turned(quaternion_of(rotation), stack_columns(rows, ROTATION, np.float64)))
+        _set(columns, ROTATION, _turned(quaternion_of(rotation), stack_columns(rows, ROTATION)))
     rest = _rest(rows)
     _set(columns, _rest_names(rows), rotated_harmonics(rest, rotation))
     too_high = rest.shape[2] >= (MAX_DEGREE + 1) ** 2
@@ -154,7 +154,7 @@ def _rest_names(rows: Rows) -> list[str]:
 
 def _rest(rows: Rows) -> NDArray[np.float64]:
     """(n, 3, k) harmonics above the constant one; k is 0 where there are none."""
-    values = stack_columns(rows, _rest_names(rows), np.float64)
+    values = stack_columns(rows, _rest_names(rows))
     return values.reshape(len(values), 3, values.shape[1] // 3)
 
 
