@@ -19,10 +19,10 @@ import re
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -126,18 +126,23 @@ def run_bounded(
 class EncoderFormat:
     """A kind of folder that ``og-pointcloud export`` writes; it may come from a stranger.
 
-    name, version: ``format`` and ``schema_version`` of its manifest.json. files: theirs, and the bytes that each may
-    have. graph: which of them is the ONNX graph, and operators, all that it is made of. optional: a file that may be
-    absent. command: what makes such a folder.
+    name, version: ``format`` and ``schema_version`` of its manifest.json. graph: the ONNX graph's file, and operators,
+    all that it is made of. command: what makes such a folder. more: further files, and the bytes that each may have.
+    optional: one of them that may be absent.
     """
 
     name: str
     version: int
-    files: Mapping[str, int]
     graph: str
     operators: frozenset[str]
     command: str
+    more: Mapping[str, int] = field(default_factory=dict)
     optional: str = ""
+
+    @property
+    def files(self) -> dict[str, int]:
+        """All files, and the bytes that each may have; a serialized graph cannot have more."""
+        return {MANIFEST: 1 << 20, self.graph: (1 << 31) - 1, **self.more}
 
     @property
     def remake(self) -> str:
@@ -234,21 +239,16 @@ def check_graph(model: bytes, operators: frozenset[str] | None = None) -> None:
             raise ValueError("it defines functions of its own")
         if number == 8 and (domain := text_of(value, 1)) not in STANDARD_DOMAINS:
             raise ValueError(f"it uses operators of {domain!r:.40}, not of the standard")
-        if number == 7:
-            _check_contents(_message(value), operators)
+        for inner, part in message_fields(value) if number == 7 else ():
+            if inner == 1:
+                _check_node(part, operators)
+            elif inner == 5:
+                constant_of(part)
+            elif inner == 15:
+                raise ValueError("it holds sparse constants")
 
 
-def _check_contents(graph: memoryview, operators: frozenset[str] | None) -> None:
-    for number, value in message_fields(graph):
-        if number == 1:
-            _check_node(_message(value), operators)
-        elif number == 5:
-            _check_tensor(_message(value))
-        elif number == 15:
-            raise ValueError("it holds sparse constants")
-
-
-def _check_node(node: memoryview, operators: frozenset[str] | None) -> None:
+def _check_node(node: memoryview | int, operators: frozenset[str] | None) -> None:
     operator, domain = text_of(node, 4), text_of(node, 7)
     if domain not in STANDARD_DOMAINS:
         raise ValueError(f"it uses the operator {operator!r:.40} of {domain!r:.40}, not of the standard")
@@ -257,18 +257,27 @@ def _check_node(node: memoryview, operators: frozenset[str] | None) -> None:
     for number, attribute in message_fields(node):
         if number != 5:
             continue
-        for kind, value in message_fields(_message(attribute)):
+        for kind, value in message_fields(attribute):
             if kind in (6, 11):
                 raise ValueError(f"its node {operator!r:.40} holds a graph of its own")
             if kind in (10, 22, 23):
                 raise ValueError(f"its node {operator!r:.40} holds lists of constants")
             if kind == 5:
-                _check_tensor(_message(value))
+                constant_of(value)
 
 
-def _check_tensor(tensor: memoryview) -> None:
+class Constant(NamedTuple):
+    """A tensor in a graph's own bytes. kind: its TensorProto.DataType. data: not copied."""
+
+    kind: int
+    shape: tuple[int, ...]
+    data: memoryview
+
+
+def constant_of(tensor: memoryview | int) -> Constant:
+    """A TensorProto; ValueError unless it is stored as plain bytes, at the length that its shape asks for."""
     shape: list[int] = []
-    kind, held, typed = 0, 0, False
+    kind, data, typed = 0, memoryview(b""), False
     for number, value in message_fields(tensor):
         if number == 13 or (number == 14 and value):
             raise ValueError("it asks for other files of this machine")
@@ -277,13 +286,14 @@ def _check_tensor(tensor: memoryview) -> None:
         elif number == 2:
             kind = value
         elif number == 9:
-            held = len(_message(value))
+            data = _message(value)
         elif number in (4, 5, 6, 7, 10, 11):
             typed = True
-    if typed or kind not in TYPE_BYTES:
+    if typed or not isinstance(kind, int) or kind not in TYPE_BYTES:
         raise ValueError(f"it holds a constant of type {kind} that is not stored as plain bytes")
-    if any(length < 0 for length in shape) or math.prod(shape) * TYPE_BYTES[int(kind)] != held:
-        raise ValueError(f"a constant of shape {shape} and type {kind} has {held} bytes")
+    if any(length < 0 for length in shape) or math.prod(shape) * TYPE_BYTES[kind] != len(data):
+        raise ValueError(f"a constant of shape {shape} and type {kind} has {len(data)} bytes")
+    return Constant(kind, tuple(shape), data)
 
 
 def message_fields(message: memoryview | int) -> Iterator[tuple[int, memoryview | int]]:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
+import os
 import shutil
-from pathlib import Path
 
 import numpy as np
 import onnx
@@ -33,7 +33,7 @@ from og_pointcloud.cli import main
 from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.masking.crops import LANGSPLAT, WITH_CONTEXT
 from og_pointcloud.masking.encode import OnnxModel, open_encoder
-from og_pointcloud.text.encoder import TextEncoder, encoder_for, read_text_encoder
+from og_pointcloud.text.encoder import ENCODER, GRAPH, TextEncoder, encoder_for, read_text_encoder
 from og_pointcloud.text.text_features import everyday_words
 
 torch = pytest.importorskip("torch")
@@ -266,16 +266,14 @@ def test_a_fetched_model_is_found_by_its_name(model_folder, tmp_path, capsys, mo
 def test_a_folder_that_cannot_be_replaced_stays(tmp_path, monkeypatch):
     from og_pointcloud_export.encoders import _write_folder
 
-    folder, rename = tmp_path / "encoder", Path.rename
-    _write_folder(folder, {"model.onnx": b"old"}, {"model.onnx"})
+    folder = tmp_path / "encoder"
+    _write_folder(folder, {GRAPH: b"old"}, ENCODER)
 
     def fail(path, target):
-        if path.name == "new":
-            raise OSError("the disk is gone")
-        return rename(path, target)
+        raise OSError("the disk is gone")
 
-    monkeypatch.setattr(Path, "rename", fail)
+    monkeypatch.setattr(os, "replace", fail)
     with pytest.raises(OSError, match="the disk is gone"):
-        _write_folder(folder, {"model.onnx": b"new"}, {"model.onnx"})
-    assert (folder / "model.onnx").read_bytes() == b"old"
+        _write_folder(folder, {GRAPH: b"new"}, ENCODER)
+    assert (folder / GRAPH).read_bytes() == b"old"
     assert list(tmp_path.iterdir()) == [folder]

@@ -103,14 +103,14 @@ def test_loads_and_answers_as_the_model_itself(folders, image, kind):
     logits, iou = predictor.at_points(points)
     assert logits.shape[:2] == iou.shape == (3, 3)
     reloaded = predictor.model
-    height, width = scaled_size((36, 60), predictor.preparation)
+    height, width = scaled_size((36, 60), predictor.loaded.preparation)
     scaled = torch.tensor(points * np.array([width / 60, height / 36], np.float32))[None, :, None]
     with torch.inference_mode():
-        said = reloaded(pixel_values=prepared(image, predictor.preparation), input_points=scaled)
+        said = reloaded(pixel_values=prepared(image, predictor.loaded.preparation), input_points=scaled)
     rows, columns = logits.shape[2:]
     assert np.allclose(logits, said.pred_masks[0, :, :, :rows, :columns].numpy(), atol=1e-4)
     assert np.allclose(iou, said.iou_scores[0].numpy(), atol=1e-5)
-    padded = predictor.preparation.padded
+    padded = predictor.loaded.preparation.padded
     assert (rows, columns) == ((10, 16) if padded else (16, 16))
 
 
@@ -121,7 +121,7 @@ def test_preparation_is_what_transformers_own_sam_processor_does(folders, shape)
     own = SamImageProcessorPil(size={"longest_edge": 64}, pad_size={"height": 64, "width": 64})
     image = np.random.default_rng(1).integers(0, 256, (*shape, 3)).astype(np.uint8)
     expected = own(image, return_tensors="np")["pixel_values"]
-    ours = prepared(image, SamPredictor(folders["sam"]).preparation).numpy()
+    ours = prepared(image, SamPredictor(folders["sam"]).loaded.preparation).numpy()
     one_step = 1 / 255 / 0.224
     assert ours.shape == expected.shape
     assert np.abs(ours - expected).max() < 1.01 * one_step
@@ -134,7 +134,7 @@ def test_squares_are_resized_as_pillow_does_and_colours_come_from_the_models_fil
 
     said = folders[kind] / "preprocessor_config.json"
     said.write_text(json.dumps({"image_mean": [0.1, 0.2, 0.3], "image_std": [0.5, 0.6, 0.7]}))
-    preparation = SamPredictor(folders[kind]).preparation
+    preparation = SamPredictor(folders[kind]).loaded.preparation
     said.unlink()
     side = preparation.side
     resized = np.asarray(Image.fromarray(image).resize((side, side), Image.Resampling.BILINEAR), np.float32) / 255
@@ -144,8 +144,8 @@ def test_squares_are_resized_as_pillow_does_and_colours_come_from_the_models_fil
 
 
 def test_colours_without_a_file_are_the_familys(folders):
-    assert SamPredictor(folders["sam2"]).preparation.mean[0] == 0.485
-    assert SamPredictor(folders["sam3"]).preparation.mean[0] == 0.5
+    assert SamPredictor(folders["sam2"]).loaded.preparation.mean[0] == 0.485
+    assert SamPredictor(folders["sam3"]).loaded.preparation.mean[0] == 0.5
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -238,7 +238,7 @@ def test_files_that_are_damaged_or_too_large(encoder_folder, tmp_path, monkeypat
         (folder / name).unlink()
         with pytest.raises(OgPointcloudError, match=f"{name}"):
             read_text_encoder(folder)
-    monkeypatch.setitem(read_text_encoder.__globals__["ENCODER_FILES"], "tokenizer.json", 10)
+    monkeypatch.setitem(read_text_encoder.__globals__["ENCODER"].more, "tokenizer.json", 10)
     with pytest.raises(OgPointcloudError, match="more than 10 bytes"):
         read_text_encoder(altered(encoder_folder, tmp_path / "large"))
 

@@ -11,10 +11,9 @@ import json
 import logging
 import os
 import re
-import tempfile
 import warnings
 import zlib
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
 from importlib.util import find_spec
@@ -25,11 +24,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.errors import MissingExtraError, OgPointcloudError, naming_extra
+from og_pointcloud.formats.atomic import replacing_folder
 from og_pointcloud.formats.npy import npy_bytes
 from og_pointcloud.formats.poses import read_json_object
 from og_pointcloud.masking import encode
 from og_pointcloud.masking.crops import WITH_CONTEXT, Crop
-from og_pointcloud.models import check_graph, open_session
+from og_pointcloud.models import MANIFEST, EncoderFormat, check_graph, open_session
 from og_pointcloud.text import encoder as text_encoder
 from og_pointcloud.text.encoder import TextEncoder, cache_folder, check_templates
 from og_pointcloud.text.text_features import everyday_words
@@ -109,14 +109,14 @@ def write_text_encoder(folder: Path, tower: Any, tokenizer: dict[str, Any], abou
     graph = _onnx_graph(tower, example, "tokens", ["text"], {0: batch, 1: length} if pad_id is None else {0: batch})
     with torch.no_grad():
         width = tower(example).shape[1]
-    about = {**_heading(text_encoder.FORMAT, text_encoder.SCHEMA_VERSION), **about, "width": width, "precision": "fp32"}
+    about = {**_heading(text_encoder.ENCODER), **about, "width": width, "precision": "fp32"}
     held = {text_encoder.GRAPH: graph, text_encoder.TOKENIZER: json.dumps(tokenizer, ensure_ascii=False).encode()}
     encoder = TextEncoder(_with_manifest(about, held), str(folder))
     parity = _text_parity(tower, encoder)
     held[text_encoder.WORD_BANK] = npy_bytes(encoder(everyday_words()).astype(np.float16))
     files = _with_manifest({**about, "parity": parity}, held)
-    _write_folder(folder, files, known=text_encoder.ENCODER_FILES)
-    return json.loads(files[text_encoder.MANIFEST])
+    _write_folder(folder, files, text_encoder.ENCODER)
+    return json.loads(files[MANIFEST])
 
 
 def export_image_encoder(
@@ -160,7 +160,7 @@ def write_image_encoder(folder: Path, model: encode.ImageModel, tower: Any, abou
             f"the graph that torch {torch.__version__} wrote cannot be used ({error}): please report this model"
         ) from None
     manifest = {
-        **_heading(encode.FORMAT, encode.SCHEMA_VERSION),
+        **_heading(encode.ENCODER),
         "feature_space": model.feature_space,
         "width": model.width,
         "preprocessing": preprocessing.as_manifest(),
@@ -168,7 +168,7 @@ def write_image_encoder(folder: Path, model: encode.ImageModel, tower: Any, abou
         **about,
         "parity": _image_parity(graph, model),
     }
-    _write_folder(folder, _with_manifest(manifest, {encode.GRAPH: graph}), known=encode.ENCODER_FILES)
+    _write_folder(folder, _with_manifest(manifest, {encode.GRAPH: graph}), encode.ENCODER)
     return encode.OnnxModel(folder).manifest
 
 
@@ -307,8 +307,8 @@ def _difference(got: NDArray[np.float32], expected: NDArray[np.float32]) -> dict
 # Files
 
 
-def _heading(format: str, schema_version: int) -> dict[str, Any]:
-    return {"format": format, "schema_version": schema_version, "written_by": written_by()}
+def _heading(encoder: EncoderFormat) -> dict[str, Any]:
+    return {"format": encoder.name, "schema_version": encoder.version, "written_by": written_by()}
 
 
 def _with_manifest(manifest: dict[str, Any], held: dict[str, bytes]) -> dict[str, bytes]:
@@ -318,29 +318,18 @@ def _with_manifest(manifest: dict[str, Any], held: dict[str, bytes]) -> dict[str
         for name, data in held.items()
     }
     text = json.dumps({**manifest, "files": described}, indent=1, ensure_ascii=False)
-    return {text_encoder.MANIFEST: text.encode(), **held}
+    return {MANIFEST: text.encode(), **held}
 
 
 def _folder_name(feature_space: str) -> str:
     return re.sub(r"[^\w.-]+", "--", feature_space)
 
 
-def _write_folder(folder: Path, files: Mapping[str, bytes], known: Collection[str]) -> None:
-    """Put a complete folder in place; one that is there already must hold known names only, which it replaces."""
-    if folder.exists() and (not folder.is_dir() or {path.name for path in folder.iterdir()} - set(known)):
+def _write_folder(folder: Path, files: Mapping[str, bytes], encoder: EncoderFormat) -> None:
+    """Put a complete folder in place of an encoder, or of nothing; one that holds anything else stays."""
+    if folder.exists() and (not folder.is_dir() or {path.name for path in folder.iterdir()} - encoder.files.keys()):
         raise OgPointcloudError(f"{folder} holds other things than an encoder; expected a new or an encoder's folder")
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent) as temporary:
-        new = Path(temporary) / "new"
+    with replacing_folder(folder, overwrite=True) as new:
         new.mkdir()
         for name, data in files.items():
             (new / name).write_bytes(data)
-        old = Path(temporary) / "old"
-        if folder.exists():
-            folder.rename(old)
-        try:
-            new.rename(folder)
-        except BaseException:
-            if old.exists():  # else it would go with the temporary folder
-                old.rename(folder)
-            raise

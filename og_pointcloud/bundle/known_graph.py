@@ -8,12 +8,11 @@ takes is bounded by its own bytes and by the question. Whether it tells the trut
 from __future__ import annotations
 
 from hashlib import blake2b
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud.models import check_graph, integers_of, message_fields, text_of
+from og_pointcloud.models import Constant, check_graph, constant_of, message_fields, text_of
 
 KNOWN_GRAPHS = frozenset({
     "0931f16d57ab1db72ec826a2b787e5f5", "278a9debe4359bb24c880b918dd953e8", "cd2b6be498a00464ad55884c286e2033",
@@ -54,19 +53,13 @@ def query_graph_digest(onnx: bytes) -> str:
     return _parsed(onnx)[0]
 
 
-class _Constant(NamedTuple):
-    kind: int
-    shape: tuple[int, ...]
-    data: memoryview
-
-
-def _parsed(onnx: bytes) -> tuple[str, dict[str, _Constant], _Constant]:
+def _parsed(onnx: bytes) -> tuple[str, dict[str, Constant], Constant]:
     """The digest, all constants by name, and the number of answer codes."""
     model = list(message_fields(memoryview(onnx)))
     graph = [field for number, value in model if number == 7 for field in message_fields(value)]
     if {number for number, _ in model} - MODEL_FIELDS or {number for number, _ in graph} - GRAPH_FIELDS:
         raise ValueError("it holds what no graph of ours does")
-    named = [(text_of(value, 8), _constant(value)) for number, value in graph if number == 5]
+    named = [(text_of(value, 8), constant_of(value)) for number, value in graph if number == 5]
     constants = dict(named)
     nodes = [_Node(value) for number, value in graph if number == 1]
     # The first Concat makes the shape (answer codes, texts) of the table of scores.
@@ -89,31 +82,22 @@ class _Node:
         self.outputs = [_text(value) for number, value in fields if number == 2]
         self.attributes = [_hex(value) for number, value in fields if number == 5]
 
-    def line(self, constants: dict[str, _Constant]) -> str:
+    def line(self, constants: dict[str, Constant]) -> str:
         """All that the node does: its inputs are values, tables by name, and numbers by value where they may not
         differ."""
         inputs = [self._input(name, constants[name]) if name in constants else repr(name) for name in self.inputs]
         return f"{self.operator} {inputs} {self.outputs} {self.attributes}"
 
-    def _input(self, name: str, constant: _Constant) -> str:
+    def _input(self, name: str, constant: Constant) -> str:
         if name in TABLES:
             return repr(name)
         is_free = not constant.shape and self.operator in FREE_OPERATORS.get(constant.kind, ())
         return f"{constant.kind} {constant.shape} {'any' if is_free else constant.data.hex()}"
 
 
-def _kind(table: _Constant) -> str:
+def _kind(table: Constant) -> str:
     """Type and rank. Whole numbers from 0 take the smallest type that holds them."""
     return f"{'unsigned' if table.kind in UNSIGNED else table.kind} {len(table.shape)}"
-
-
-def _constant(message: memoryview | int) -> _Constant:
-    """What `check_graph` has found to be stored as plain bytes."""
-    fields = list(message_fields(message))
-    shape = [length for number, value in fields if number == 1 for length in integers_of(value)]
-    kinds = [value for number, value in fields if number == 2 and isinstance(value, int)]
-    data = [value for number, value in fields if number == 9 and isinstance(value, memoryview)]
-    return _Constant(kinds[-1] if kinds else 0, tuple(shape), data[-1] if data else memoryview(b""))
 
 
 def _text(value: memoryview | int) -> str:

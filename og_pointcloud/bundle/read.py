@@ -12,25 +12,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud.bundle.format import (
-    BANK,
-    CAMERAS,
-    CARRIED_ENCODER,
-    CERTAINTY,
-    FLOATS,
-    FORMAT,
-    INSTANCE_MEMBERS,
-    INTEGERS,
-    LATER_COLUMNS,
-    MAX_MANIFEST_BYTES,
-    MAX_MEMBERS,
-    MAX_NAMES_BYTES,
-    REBUILD,
-    RGB,
-    SAFE_NAME,
-    SCHEMA_VERSION,
-    cameras_of_rows,
-)
+from og_pointcloud.bundle import format as ogpc
 from og_pointcloud.bundle.known_graph import query_tables
 from og_pointcloud.cloud import TOO_FAR, InstanceTable, LabelledCloud, Vocabulary, WordBank
 from og_pointcloud.errors import BundleError, OgPointcloudError
@@ -89,11 +71,11 @@ def read_carried_encoder(path: str | os.PathLike[str]) -> dict[str, bytes] | Non
         with path.open("rb") as file:
             _, carried = _members(file)
             archive = zipfile.ZipFile(file)
-            return {name.removeprefix(CARRIED_ENCODER): archive.read(name) for name in carried} or None
+            return {name.removeprefix(ogpc.CARRIED_ENCODER): archive.read(name) for name in carried} or None
     except _Refused as error:
         raise BundleError(f"{path}: {error}") from None
     except ZIP_ERRORS as error:
-        raise BundleError(f"{path}: the text encoder in it is damaged ({error!s:.120}): {REBUILD}") from None
+        raise BundleError(f"{path}: the text encoder in it is damaged ({error!s:.120}): {ogpc.REBUILD}") from None
 
 
 class _Refused(Exception):
@@ -110,23 +92,23 @@ def _members(file: BinaryIO) -> tuple[dict[str, bytes], dict[str, int]]:
         archive = zipfile.ZipFile(file)
         infos = archive.infolist()
         for info in infos:
-            if not SAFE_NAME.fullmatch(info.filename):
+            if not ogpc.SAFE_NAME.fullmatch(info.filename):
                 raise _Refused(f"member name {info.filename!r:.80} is no plain relative path: it is not to be trusted")
             if info.compress_type != zipfile.ZIP_STORED or info.compress_size != info.file_size:
-                raise _Refused(f"member '{info.filename:.80}' is compressed; expected stored members: {REBUILD}")
+                raise _Refused(f"member '{info.filename:.80}' is compressed; expected stored members: {ogpc.REBUILD}")
         names = {info.filename for info in infos}
         total = sum(info.file_size for info in infos)
-        if len(names) != len(infos) or len(infos) > MAX_MEMBERS or total > size:
+        if len(names) != len(infos) or len(infos) > ogpc.MAX_MEMBERS or total > size:
             raise _Refused(
                 f"{len(infos)} members of {len(names)} names claim {total} bytes in a file of {size}; expected unique "
-                f"names, at most {MAX_MEMBERS}, that fit: the file is not to be trusted"
+                f"names, at most {ogpc.MAX_MEMBERS}, that fit: the file is not to be trusted"
             )
-        carried = {info.filename: info.file_size for info in infos if info.filename.startswith(CARRIED_ENCODER)}
+        carried = {info.filename: info.file_size for info in infos if info.filename.startswith(ogpc.CARRIED_ENCODER)}
         return {info.filename: archive.read(info) for info in infos if info.filename not in carried}, carried
     except ZIP_ERRORS as error:
         raise _Refused(
             f"not a .ogpc file, or damaged ({error!s:.120}); expected a zip of stored members: copy it again or "
-            f"{REBUILD}; a cloud or splat alone is no scene, og-pointcloud fit makes one of a capture"
+            f"{ogpc.REBUILD}; a cloud or splat alone is no scene, og-pointcloud fit makes one of a capture"
         ) from None
 
 
@@ -134,43 +116,45 @@ def _manifest(members: dict[str, bytes]) -> dict[str, Any]:
     if "manifest.json" not in members:
         found = ", ".join(list(members)[:3]) or "nothing"
         raise _Refused(f"a zip without manifest.json (it holds {found}): not a .ogpc file; give the one that fit wrote")
-    manifest = _json(members, "manifest.json", MAX_MANIFEST_BYTES)
-    if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
+    manifest = _json(members, "manifest.json", ogpc.MAX_MANIFEST_BYTES)
+    if not isinstance(manifest, dict) or manifest.get("format") != ogpc.FORMAT:
         seen = manifest.get("format") if isinstance(manifest, dict) else type(manifest).__name__
-        raise _Refused(f"its manifest says format {seen!r}; expected {FORMAT!r}: give the file that fit wrote")
+        raise _Refused(f"its manifest says format {seen!r}; expected {ogpc.FORMAT!r}: give the file that fit wrote")
     schema = manifest.get("schema_version")
     if not isinstance(schema, int) or schema < 1:
-        raise _Refused(f"schema_version is {schema!r}; expected a whole number from 1: {REBUILD}")
-    if schema != SCHEMA_VERSION:
+        raise _Refused(f"schema_version is {schema!r}; expected a whole number from 1: {ogpc.REBUILD}")
+    if schema != ogpc.SCHEMA_VERSION:
         older = "older", "fit the capture again (og-pointcloud fit CAPTURE -o S.ogpc)"
-        age, cure = older if schema < SCHEMA_VERSION else ("newer", "pip install --upgrade og-pointcloud")
-        raise _Refused(f"schema_version is {schema}, {age} than the {SCHEMA_VERSION} that this library reads: {cure}")
+        age, cure = older if schema < ogpc.SCHEMA_VERSION else ("newer", "pip install --upgrade og-pointcloud")
+        raise _Refused(
+            f"schema_version is {schema}, {age} than the {ogpc.SCHEMA_VERSION} that this library reads: {cure}"
+        )
     return manifest
 
 
 def _json(members: dict[str, bytes], name: str, most: int) -> Any:
     data = members[name]
     if len(data) > most:
-        raise _Refused(f"{name} has {len(data)} bytes; expected at most {most}: {REBUILD}")
+        raise _Refused(f"{name} has {len(data)} bytes; expected at most {most}: {ogpc.REBUILD}")
     try:
         return json.loads(data)
     except (ValueError, RecursionError) as error:
-        raise _Refused(f"{name} is no JSON ({error}): {REBUILD}") from None
+        raise _Refused(f"{name} is no JSON ({error}): {ogpc.REBUILD}") from None
 
 
 def _check_members(manifest: dict[str, Any], members: dict[str, bytes], carried: dict[str, int]) -> None:
     declared = _field(manifest, "members", dict)
     sizes = {name: len(data) for name, data in members.items()} | carried
     if undeclared := sorted(set(sizes) - set(declared) - {"manifest.json"}):
-        raise _Refused(f"member '{undeclared[0]:.80}' is not in the manifest: the file was changed; {REBUILD}")
+        raise _Refused(f"member '{undeclared[0]:.80}' is not in the manifest: the file was changed; {ogpc.REBUILD}")
     for name, entry in declared.items():
         if name not in sizes:
-            raise _Refused(f"member '{name:.80}' of the manifest is missing: {REBUILD}")
+            raise _Refused(f"member '{name:.80}' of the manifest is missing: {ogpc.REBUILD}")
         length = _field(entry, "bytes", int, f"members/{name}/")
         if length != sizes[name]:
-            raise _Refused(f"member '{name}' has {sizes[name]} bytes, the manifest says {length}: {REBUILD}")
+            raise _Refused(f"member '{name}' has {sizes[name]} bytes, the manifest says {length}: {ogpc.REBUILD}")
     if "query.onnx" not in members:
-        raise _Refused(f"member 'query.onnx' is missing: {REBUILD}")
+        raise _Refused(f"member 'query.onnx' is missing: {ogpc.REBUILD}")
 
 
 def _cloud(manifest: dict[str, Any], members: dict[str, bytes]) -> LabelledCloud:
@@ -178,11 +162,11 @@ def _cloud(manifest: dict[str, Any], members: dict[str, bytes]) -> LabelledCloud
     points, instances = _field(counts, "points", int, "counts/"), _field(counts, "instances", int, "counts/")
     xyz = _array(members, "arrays/xyz.npy", ("<f4",), (points, 3))
     if not np.isfinite(xyz).all():
-        raise _Refused(f"arrays/xyz.npy holds NaN or infinity; expected finite coordinates: {REBUILD}")
-    ids = _array(members, "arrays/instance_ids.npy", INTEGERS, (points,)).astype(np.int32)
-    rgb = _array(members, RGB, ("|u1",), (points, 3)) if RGB in members else None
-    certainty = _array(members, CERTAINTY, ("|u1",), (points,)) if CERTAINTY in members else None
-    cameras = _array(members, CAMERAS, ("<f8",), (None, 18)) if CAMERAS in members else np.zeros((0, 18))
+        raise _Refused(f"arrays/xyz.npy holds NaN or infinity; expected finite coordinates: {ogpc.REBUILD}")
+    ids = _array(members, "arrays/instance_ids.npy", ogpc.INTEGERS, (points,)).astype(np.int32)
+    rgb = _array(members, ogpc.RGB, ("|u1",), (points, 3)) if ogpc.RGB in members else None
+    certainty = _array(members, ogpc.CERTAINTY, ("|u1",), (points,)) if ogpc.CERTAINTY in members else None
+    cameras = _array(members, ogpc.CAMERAS, ("<f8",), (None, 18)) if ogpc.CAMERAS in members else np.zeros((0, 18))
     try:
         origin = np.array(_field(frame, "origin", list, "frame/"), np.float64)
         if origin.shape != (3,):
@@ -198,20 +182,20 @@ def _cloud(manifest: dict[str, Any], members: dict[str, bytes]) -> LabelledCloud
             rgb=rgb,
             certainty=certainty,
             vocabulary=_vocabulary(manifest, members),
-            word_bank=WordBank(_array(members, BANK, ("<f2",), (None, None))) if BANK in members else None,
+            word_bank=WordBank(_array(members, ogpc.BANK, ("<f2",), (None, None))) if ogpc.BANK in members else None,
             provenance=_field(manifest, "provenance", dict),
-            cameras=cameras_of_rows(cameras),
+            cameras=ogpc.cameras_of_rows(cameras),
         )
     except (OgPointcloudError, ValueError, TypeError, OverflowError) as error:
-        raise _Refused(f"its parts do not fit together ({error}): {REBUILD}") from None
+        raise _Refused(f"its parts do not fit together ({error}): {ogpc.REBUILD}") from None
 
 
 def _instances(manifest: dict[str, Any], members: dict[str, bytes], count: int) -> InstanceTable:
     descriptors = _descriptors(_field(manifest, "descriptors", dict), members)
     columns: dict[str, NDArray[Any]] = {}
     for field in fields(InstanceTable):
-        member = f"arrays/instances/{INSTANCE_MEMBERS.get(field.name, field.name)}.npy"
-        if field.name == "descriptors" or (field.name in LATER_COLUMNS and member not in members):
+        member = f"arrays/instances/{ogpc.INSTANCE_MEMBERS.get(field.name, field.name)}.npy"
+        if field.name == "descriptors" or (field.name in ogpc.LATER_COLUMNS and member not in members):
             continue
         dtype = "<f4" if field.name in ("agreement", "visible_area", "reliability") else "<i4"
         length = len(descriptors) if field.name == "descriptor_instance" else count
@@ -247,23 +231,23 @@ def _descriptors(place: dict[str, Any], members: dict[str, bytes]) -> NDArray[np
     offset, shape = _field(place, "offset", int, "descriptors/"), _field(place, "shape", list, "descriptors/")
     sizes_fit = len(shape) == 2 and all(isinstance(length, int) and length >= 0 for length in shape)
     if not sizes_fit or not 0 <= offset <= len(graph) - 4 * shape[0] * shape[1]:
-        raise _Refused(f"descriptors of shape {shape} at byte {offset} lie outside query.onnx: {REBUILD}")
+        raise _Refused(f"descriptors of shape {shape} at byte {offset} lie outside query.onnx: {ogpc.REBUILD}")
     return np.frombuffer(graph, "<f4", shape[0] * shape[1], offset).reshape(shape)
 
 
 def _vocabulary(manifest: dict[str, Any], members: dict[str, bytes]) -> Vocabulary | None:
     if "vocabulary/names.json" not in members:
         return None
-    names = _json(members, "vocabulary/names.json", MAX_NAMES_BYTES)
+    names = _json(members, "vocabulary/names.json", ogpc.MAX_NAMES_BYTES)
     words = _field(_field(manifest, "counts", dict), "words", int, "counts/")
     are_words = isinstance(names, list) and all(isinstance(name, str) and name.strip() for name in names)
     if not are_words or len(set(names)) != len(names) or len(names) != words:
-        raise _Refused(f"vocabulary/names.json is not a list of {words} different words: {REBUILD}")
+        raise _Refused(f"vocabulary/names.json is not a list of {words} different words: {ogpc.REBUILD}")
     try:
         check_names(names)
     except OgPointcloudError as error:
         raise _Refused(f"vocabulary/names.json: {error}") from None
-    vectors = _array(members, "vocabulary/vectors.npy", FLOATS, (words, None))
+    vectors = _array(members, "vocabulary/vectors.npy", ogpc.FLOATS, (words, None))
     return Vocabulary(tuple(names), vectors.astype(np.float32))
 
 
@@ -272,21 +256,20 @@ def _array(
 ) -> NDArray[Any]:
     """A read-only array over a member's bytes, of one of these types and this shape (None: any length)."""
     if name not in members:
-        raise _Refused(f"member '{name}' is missing: {REBUILD}")
+        raise _Refused(f"member '{name}' is missing: {ogpc.REBUILD}")
     try:
         array = array_from_npy(members[name])
     except ValueError as error:
-        raise _Refused(f"member '{name}' is no .npy that can be read ({error}): {REBUILD}") from None
+        raise _Refused(f"member '{name}' is no .npy that can be read ({error}): {ogpc.REBUILD}") from None
     fits = array.ndim == len(shape) and all(want in (None, have) for want, have in zip(shape, array.shape, strict=True))
     if array.dtype.str not in dtypes or not fits:
-        raise _Refused(
-            f"member '{name}' is {array.dtype.str} {array.shape}; expected {' or '.join(dtypes)} {shape}: {REBUILD}"
-        )
+        expected = f"{' or '.join(dtypes)} {shape}"
+        raise _Refused(f"member '{name}' is {array.dtype.str} {array.shape}; expected {expected}: {ogpc.REBUILD}")
     return array
 
 
 def _field(record: Any, name: str, kind: type | tuple[type, ...], where: str = "") -> Any:
     value = record.get(name) if isinstance(record, dict) else None
     if not isinstance(value, kind) or isinstance(value, bool):
-        raise _Refused(f"manifest field '{where}{name}' is {value!r:.60}; {REBUILD}")
+        raise _Refused(f"manifest field '{where}{name}' is {value!r:.60}; {ogpc.REBUILD}")
     return value

@@ -67,9 +67,9 @@ def write_file(path: str | os.PathLike[str], data: bytes) -> Path:
 
 
 @contextmanager
-def replacing_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """A folder of the same name, to make and to fill, that becomes ``path``, which must not exist, when, and only when,
-    the block ends without an error."""
+def replacing_folder(path: str | os.PathLike[str], *, overwrite: bool = False) -> Iterator[Path]:
+    """A folder of the same name, to make and to fill, that becomes ``path`` when, and only when, the block ends without
+    an error. overwrite: in place of a folder that is there; else there must be none."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     for old in path.parent.glob(f".{_glob_name(path)}.*.tmp"):
@@ -81,7 +81,13 @@ def replacing_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
     try:
         with locked(temporary):
             yield temporary / path.name
-            os.replace(temporary / path.name, path)
+            moved = [path.rename(temporary / f"{path.name}.before")] if overwrite and path.exists() else []
+            try:
+                os.replace(temporary / path.name, path)
+            except BaseException:
+                for old in moved:  # else it would go with the temporary folder
+                    old.rename(path)
+                raise
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
 

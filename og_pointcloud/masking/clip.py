@@ -63,7 +63,7 @@ def _unit(vectors: torch.Tensor) -> torch.Tensor:
 
 
 class TransformersModel:
-    """A CLIP or SigLIP as an `encode.ImageModel` and a `dense.PatchModel`; on a GPU where torch has one."""
+    """A CLIP or SigLIP as an `encode.ImageModel`; on a GPU where torch has one."""
 
     def __init__(
         self,
@@ -79,7 +79,7 @@ class TransformersModel:
         self.preprocessing, self.crops = preprocessing_of(folder, model.config), crops
         self.device = best_device()
         self.tower = ImageTower(model).eval().to(self.device)
-        self.patch = self.tower.patch
+        self.patch: int | None = self.tower.patch
         size = self.preprocessing.size
         self.width: int = self(np.zeros((1, 3, size, size), np.float32)).shape[1]
 

@@ -7,7 +7,7 @@ the image is about, is read as MaskCLIP does it (Zhou, Loy and Dai, ECCV 2022): 
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,31 +15,23 @@ from numpy.typing import NDArray
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.images import require_cv2, require_pillow
 from og_pointcloud.masking.contracts import MaskEncoder
-from og_pointcloud.masking.crops import Preprocessing, require_masks
+from og_pointcloud.masking.crops import require_masks
+
+if TYPE_CHECKING:
+    from og_pointcloud.masking.encode import ImageModel
 
 SHORTER_SIDE = 2.0
 """The image's shorter side in sides of the square that the model was trained on: patches of CLIP B/16 are then 28 to a
 side, and positions in between are interpolated."""
 
 
-class PatchModel(Protocol):
-    """An image model that has vectors of patches. patch: its side, pixels."""
-
-    feature_space: str
-    width: int
-    patch: int
-    preprocessing: Preprocessing
-
-    def patches(self, pixels: NDArray[np.float32]) -> NDArray[np.float32]:
-        """(h, w, width) unit vectors of pixels (1, 3, h * patch, w * patch)."""
-        ...
-
-
 class DenseEncoder(MaskEncoder):
     """A `contracts.MaskEncoder` around a model with patches."""
 
-    def __init__(self, model: PatchModel) -> None:
-        self.model, self.feature_space, self.width = model, model.feature_space, model.width
+    def __init__(self, model: ImageModel) -> None:
+        """model: one with a ``patch``."""
+        assert model.patch is not None
+        self.model, self.feature_space, self.width, self.patch = model, model.feature_space, model.width, model.patch
 
     def embed(self, image: NDArray[np.uint8], masks: NDArray[np.bool_]) -> NDArray[np.float32]:
         """image (H, W, 3) uint8 RGB, masks (M, H, W) bool -> (M, width) float32, L2-normalized rows.
@@ -61,7 +53,7 @@ class DenseEncoder(MaskEncoder):
         """(1, 3, h, w) of whole patches, the image's shape but for rounding."""
         before, pillow = self.model.preprocessing, require_pillow()
         scale = SHORTER_SIDE * before.size / min(image.shape[:2])
-        height, width = (max(1, round(side * scale / self.model.patch)) * self.model.patch for side in image.shape[:2])
+        height, width = (max(1, round(side * scale / self.patch)) * self.patch for side in image.shape[:2])
         resized = pillow.fromarray(image).resize((width, height), pillow.Resampling[before.resample.upper()])
         return before.pixels(np.asarray(resized)[None])
 

@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from og_pointcloud.errors import OgPointcloudError, SceneError
 from og_pointcloud.masking.contracts import MaskEncoder
 from og_pointcloud.masking.crops import WITH_CONTEXT, Crop, Preprocessing, mask_crops
+from og_pointcloud.masking.dense import DenseEncoder
 from og_pointcloud.models import EncoderFormat, fetched_model, open_session
 from og_pointcloud.text.encoder import MODELS_VARIABLE, model_folders
 
@@ -37,17 +38,14 @@ DEMO_SPACE = "og_pointcloud/demo-room-encoder"
 """Feature space of the demo encoder, which knows the procedural room's things and nothing else of the world."""
 DEMO_FOLDER = Path(__file__).parent / "demo_encoder"
 """Its two halves: ``image`` and ``text``."""
-FORMAT, SCHEMA_VERSION = "og-image-encoder", 1
-MANIFEST, GRAPH = "manifest.json", "image_encoder.onnx"
-ENCODER_FILES = {MANIFEST: 1 << 20, GRAPH: (1 << 31) - 1}
-"""The files of an encoder, and the bytes that each may have; a serialized graph cannot have more."""
+GRAPH = "image_encoder.onnx"
 OPERATORS = frozenset({
     "Add", "Clip", "Concat", "Conv", "DequantizeLinear", "Div", "Erf", "Expand", "Gather", "Gemm", "GlobalAveragePool",
     "LayerNormalization", "MatMul", "Max", "Mul", "Pow", "ReduceL2", "Relu", "Reshape", "Resize", "Shape", "Sigmoid",
     "Slice", "Softmax", "Split", "Squeeze", "Tanh", "Tile", "Transpose", "Unsqueeze", "Where",
 })  # fmt: skip
 """All that an encoder's graph is made of: arithmetic without loops, random numbers, or graphs inside nodes."""
-ENCODER = EncoderFormat(FORMAT, SCHEMA_VERSION, ENCODER_FILES, GRAPH, OPERATORS, "og-pointcloud export image")
+ENCODER = EncoderFormat("og-image-encoder", 1, GRAPH, OPERATORS, "og-pointcloud export image")
 CROPS_PER_RUN = 16
 """Bounds memory: a run of a large model holds some 100 MB a crop."""
 
@@ -55,16 +53,22 @@ CROPS_PER_RUN = 16
 class ImageModel(Protocol):
     """Squares of pixels -> vectors.
 
-    feature_space: the text encoder's. width: of a vector. crops: how masks are best cut out for it.
+    feature_space: the text encoder's. width: of a vector. crops: how masks are best cut out for it. patch: side of the
+    patches that it has vectors of, too, pixels; None without.
     """
 
     feature_space: str
     width: int
     preprocessing: Preprocessing
     crops: tuple[Crop, ...]
+    patch: int | None
 
     def __call__(self, pixels: NDArray[np.float32]) -> NDArray[np.float32]:
         """(B, width) float32 unit rows of pixels (B, 3, S, S) float32."""
+        ...
+
+    def patches(self, pixels: NDArray[np.float32]) -> NDArray[np.float32]:
+        """(h, w, width) unit vectors of pixels (1, 3, h * patch, w * patch), of a model with a patch."""
         ...
 
 
@@ -80,14 +84,12 @@ def open_encoder(name: str | os.PathLike[str], features: str = "crops") -> MaskE
     model = _open_model(name)
     if features == "crops":
         return CropEncoder(model, model.crops)
-    if getattr(model, "patch", None) is None:
+    if model.patch is None:
         raise OgPointcloudError(
             f"the encoder '{name}' has vectors of whole squares alone; expected for --features dense CLIP or SigLIP, a "
             "transformers folder or what og-pointcloud export image makes of it today: name one, or take crops"
         )
-    from og_pointcloud.masking.dense import DenseEncoder
-
-    return DenseEncoder(model)  # pyright: ignore[reportArgumentType]
+    return DenseEncoder(model)
 
 
 def _open_model(name: str | os.PathLike[str]) -> ImageModel:

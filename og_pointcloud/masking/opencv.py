@@ -78,11 +78,9 @@ class OpenCVProposer:
         small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
         tree = region_tree(small)
         chosen, scores = tree.lasting()
-        place, runs = tree.runs()
-        rank = place[tree.superpixels]
         masks = np.zeros((len(chosen), height, width), np.bool_)
-        for mask, (first, end) in zip(masks, runs[chosen], strict=True):
-            drawn = ((rank >= first) & (rank < end)).astype(np.uint8) * 255
+        for mask, members in zip(masks, tree.members()[chosen], strict=True):
+            drawn = members[tree.superpixels]
             mask[:] = cv2.resize(drawn, (width, height), interpolation=cv2.INTER_LINEAR) >= 128
         return Proposals(masks, scores)
 
@@ -102,20 +100,15 @@ class RegionTree:
     gone: Floats
     area: Floats
 
-    def runs(self) -> tuple[Labels, Labels]:
-        """Superpixels in an order in which every region is a run: (n,) the place of each, (m, 2) first and end."""
+    def members(self) -> NDArray[np.uint8]:
+        """(m, n): 255 for the superpixels that each region is made of, else 0."""
         leaves = int(self.superpixels.max()) + 1
-        size = np.concatenate([np.ones(leaves, np.int32), np.zeros(len(self.parent) - leaves, np.int32)])
+        members = np.zeros((len(self.parent), leaves), np.uint8)
+        np.fill_diagonal(members, 255)
         for region, above in enumerate(self.parent.tolist()):
             if above >= 0:
-                size[above] += size[region]
-        first = np.zeros(len(size), np.int32)
-        free = np.zeros(len(size) + 1, np.int32)  # the last entry serves roots, whose parent is -1
-        for region in range(len(size) - 1, -1, -1):
-            above = self.parent[region]
-            first[region] = free[region] = free[above]
-            free[above] += size[region]
-        return first[:leaves], np.stack([first, first + size], axis=1)
+                members[above] |= members[region]
+        return members
 
     def lasting(self) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
         """Regions worth a proposal, best first, and their scores in [0, 1)."""

@@ -63,6 +63,10 @@ class LoadedModel:
     device: torch.device
     preparation: Preparation
 
+    def pixels(self, image: NDArray[np.uint8]) -> torch.Tensor:
+        """(H, W, 3) uint8 RGB as the model takes it, `prepared`, on its device."""
+        return prepared(image, self.preparation).to(self.device)
+
 
 def load_sam(name: str | os.PathLike[str], classes: Mapping[str, str]) -> LoadedModel:
     """A model's folder or a fetched OWNER/MODEL, for evaluation. classes: model_type -> transformers' class to take.
@@ -85,9 +89,7 @@ class SamPredictor:
     """A `PointPredictor` on any of the four."""
 
     def __init__(self, name: str | os.PathLike[str]) -> None:
-        loaded = load_sam(name, CLASSES)
-        self.model, self.kind, self.device = loaded.model, loaded.kind, loaded.device
-        self.preparation = loaded.preparation
+        self.loaded = load_sam(name, CLASSES)
         self.size = (0, 0)
         self.encoded: dict[str, Any] = {}
 
@@ -95,24 +97,25 @@ class SamPredictor:
     def set_image(self, image: NDArray[np.uint8]) -> None:
         """image: (H, W, 3) uint8 RGB."""
         self.size = image.shape[0], image.shape[1]
-        pixels = prepared(image, self.preparation).to(self.device)
-        if self.kind == "sam_hq":
-            embeddings, intermediate = self.model.get_image_embeddings(pixels)
+        embeddings = self.loaded.model.get_image_embeddings(self.loaded.pixels(image))
+        if self.loaded.kind == "sam_hq":
+            embeddings, intermediate = embeddings
             self.encoded = {"image_embeddings": embeddings, "intermediate_embeddings": intermediate}
         else:
-            self.encoded = {"image_embeddings": self.model.get_image_embeddings(pixels)}
+            self.encoded = {"image_embeddings": embeddings}
 
     @torch.inference_mode()
     def at_points(self, points: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """points: (k, 2) pixels of the image. Logits (k, 3, h, w) that cover the image, and predicted IoU (k, 3)."""
-        height, width = scaled_size(self.size, self.preparation)
+        preparation, device = self.loaded.preparation, self.loaded.device
+        height, width = scaled_size(self.size, preparation)
         scale = np.array([width / self.size[1], height / self.size[0]], np.float32)
-        asked = torch.from_numpy(points * scale)[None, :, None].to(self.device)
-        labels = torch.ones(asked.shape[:3], dtype=torch.int32, device=self.device)
-        answer = self.model(input_points=asked, input_labels=labels, multimask_output=True, **self.encoded)
+        asked = torch.from_numpy(points * scale)[None, :, None].to(device)
+        labels = torch.ones(asked.shape[:3], dtype=torch.int32, device=device)
+        answer = self.loaded.model(input_points=asked, input_labels=labels, multimask_output=True, **self.encoded)
         logits = answer.pred_masks[0].float()
-        rows = max(1, round(logits.shape[-2] * height / self.preparation.side))
-        columns = max(1, round(logits.shape[-1] * width / self.preparation.side))
+        rows = max(1, round(logits.shape[-2] * height / preparation.side))
+        columns = max(1, round(logits.shape[-1] * width / preparation.side))
         return logits[..., :rows, :columns].cpu().numpy(), answer.iou_scores[0].float().cpu().numpy()
 
 

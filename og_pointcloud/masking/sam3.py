@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from og_pointcloud.errors import SceneError
 from og_pointcloud.masking.contracts import Proposals
 from og_pointcloud.masking.pretrained import torch, transformers
-from og_pointcloud.masking.sam import LoadedModel, load_sam, prepared
+from og_pointcloud.masking.sam import LoadedModel, load_sam
 from og_pointcloud.text.tokenizer import open_tokenizer
 
 LEAST_SCORE = 0.5
@@ -39,7 +39,7 @@ class NamedThings:
     def propose(self, image: NDArray[np.uint8]) -> Proposals:
         """image: (H, W, 3) uint8 RGB."""
         model, masks, scores = self._loaded.model, [], []
-        seen = model.get_vision_features(pixel_values=_pixels(self._loaded, image))
+        seen = model.get_vision_features(pixel_values=self._loaded.pixels(image))
         for tokens in self._tokens:
             found = model(vision_embeds=seen, input_ids=tokens, attention_mask=torch.ones_like(tokens))
             score = (found.pred_logits.sigmoid() * found.presence_logits.sigmoid())[0]
@@ -71,7 +71,7 @@ class FollowedWords:
     @torch.inference_mode()
     def propose(self, image: NDArray[np.uint8]) -> Proposals:
         """image: (H, W, 3) uint8 RGB, the next one."""
-        pixels = _pixels(self._loaded, image)
+        pixels = self._loaded.pixels(image)
         seen = self._loaded.model(inference_session=self._session, frame=pixels, frame_idx=self._step)
         self._forget()
         self._step += 1
@@ -105,10 +105,6 @@ def _tokens(loaded: LoadedModel, words: Sequence[str]) -> list[torch.Tensor]:
             f"{file} gives ids up to {tokenizer.highest_id}, the model has {config.vocab_size}: fetch both"
         )
     return [torch.tensor([tokenizer(word)], device=loaded.device) for word in words]
-
-
-def _pixels(loaded: LoadedModel, image: NDArray[np.uint8]) -> torch.Tensor:
-    return prepared(image, loaded.preparation).to(loaded.device)
 
 
 def _proposals(

@@ -28,19 +28,15 @@ from numpy.typing import NDArray
 from og_pointcloud.cloud import WordBank
 from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError
 from og_pointcloud.formats.npy import array_from_npy
-from og_pointcloud.models import MODEL_NAME, EncoderFormat, home_folder, open_session
+from og_pointcloud.models import MANIFEST, MODEL_NAME, EncoderFormat, home_folder, open_session
 from og_pointcloud.text.tokenizer import MOST_CHARACTERS, open_tokenizer
 
 if TYPE_CHECKING:
     from onnxruntime import InferenceSession
 
-FORMAT, SCHEMA_VERSION = "og-text-encoder", 1
 MODELS_VARIABLE = "OG_POINTCLOUD_MODELS"
 """Environment variable: folders, parted as in PATH, that are encoders or hold some."""
-MANIFEST, GRAPH, TOKENIZER, WORD_BANK = "manifest.json", "text_encoder.onnx", "tokenizer.json", "word_bank.npy"
-ENCODER_FILES = {MANIFEST: 1 << 20, GRAPH: (1 << 31) - 1, TOKENIZER: 1 << 26, WORD_BANK: 1 << 26}
-"""The files of an encoder, and the bytes that each may have; a serialized graph cannot have more. One without a word
-bank is an encoder too."""
+GRAPH, TOKENIZER, WORD_BANK = "text_encoder.onnx", "tokenizer.json", "word_bank.npy"
 OPERATORS = frozenset({
     "Add", "ArgMax", "Cast", "Clip", "Concat", "DequantizeLinear", "Div", "DynamicQuantizeLinear", "Equal", "Erf",
     "Expand", "Gather", "GatherND", "Gemm", "LayerNormalization", "LessOrEqual", "MatMul", "MatMulInteger", "Max",
@@ -56,8 +52,10 @@ MOST_TEMPLATES, LONGEST_TEMPLATE = 128, 400
 """CLIP was published with 80."""
 VECTORS_REMEMBERED = 1 << 14
 ENCODER = EncoderFormat(
-    FORMAT, SCHEMA_VERSION, ENCODER_FILES, GRAPH, OPERATORS, "og-pointcloud export text", optional=WORD_BANK
-)
+    "og-text-encoder", 1, GRAPH, OPERATORS, "og-pointcloud export text", {TOKENIZER: 1 << 26, WORD_BANK: 1 << 26},
+    optional=WORD_BANK,
+)  # fmt: skip
+"""One without a word bank is an encoder too."""
 
 
 class TextEncoder:
@@ -67,7 +65,7 @@ class TextEncoder:
     """
 
     def __init__(self, files: Mapping[str, bytes], where: str) -> None:
-        """files: the bytes of ENCODER_FILES. where: what errors begin with, a path. OgPointcloudError if damaged.
+        """files: the bytes of ENCODER's files. where: what errors begin with, a path. OgPointcloudError if damaged.
 
         ``word_bank``: everyday words as this encoder has them, None for one that was made without.
         """
@@ -95,8 +93,7 @@ class TextEncoder:
         """(len(names), D) float32, unit rows: of each name the mean over the manifest's templates."""
         texts = [template.replace("{}", name[:MOST_CHARACTERS]) for name in names for template in self.templates]
         vectors = self.encode(texts).reshape(len(names), len(self.templates), self.width).mean(axis=1)
-        length = np.linalg.norm(vectors, axis=1, keepdims=True)
-        return vectors / np.maximum(length, np.finfo(np.float32).tiny)
+        return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), np.finfo(np.float32).tiny)
 
     def encode(self, texts: Sequence[str]) -> NDArray[np.float32]:
         """(len(texts), D) float32, unit rows: the texts as they stand."""
@@ -142,7 +139,7 @@ def read_text_encoder(folder: str | os.PathLike[str]) -> TextEncoder:
     path = Path(folder).resolve()
     if not (path / MANIFEST).is_file():
         raise OgPointcloudError(f"{folder} has no {MANIFEST}; expected a folder that og-pointcloud export text wrote")
-    states = [(path / name).stat() for name in ENCODER_FILES if (path / name).is_file()]
+    states = [(path / name).stat() for name in ENCODER.files if (path / name).is_file()]
     return _read_once(path, tuple((state.st_mtime_ns, state.st_size) for state in states))
 
 
