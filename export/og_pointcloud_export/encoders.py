@@ -283,8 +283,9 @@ def _image_parity(graph: bytes, model: encode.ImageModel) -> dict[str, Any]:
     pixels = model.preprocessing.pixels(squares)
     session = open_session(graph)
     got, expected = np.asarray(session.run(["image"], {"pixels": pixels})[0]), model(pixels)
-    if isinstance(model, TransformersModel):
-        sides = (side * model.patch for side in PARITY_PATCHES)
+    patch = model.patch if isinstance(model, TransformersModel) else None
+    if patch is not None:
+        sides = (side * patch for side in PARITY_PATCHES)
         wide = np.random.default_rng(1).normal(size=(1, 3, *sides)).astype(np.float32)
         patches = np.asarray(session.run(["patches"], {"pixels": wide})[0])
         got = np.concatenate([got, patches.reshape(-1, model.width)])
