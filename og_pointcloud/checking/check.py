@@ -88,7 +88,8 @@ class Check:
 def check_capture(scene: Scene) -> list[Check]:
     """Whether poses, photographs, masks, features and cloud fit together; takes half a second, more where they do not.
 
-    Some views and points are asked. Raises SceneError where masks cannot be read.
+    Some views and points are asked; of a scene without masks poses and photographs alone. Raises SceneError where masks
+    cannot be read.
     """
     sample = draw_sample(scene)
     maps = read_mask_maps(sample) if any(view.mask_count for view in scene.views) else None
@@ -98,13 +99,6 @@ def check_capture(scene: Scene) -> list[Check]:
         checks.append(_masks(maps, is_doubted=_doubted(checks, "poses")))
         checks.append(_features(maps, is_doubted=_doubted(checks, "poses", "masks")))
     return checks
-
-
-def check_poses(scene: Scene) -> list[Check]:
-    """The part of `check_capture` that needs no masks: for commands that only look at a capture."""
-    sample = draw_sample(scene)
-    checks, photographs = _poses(sample, None)
-    return [*checks, _alignment(photographs)]
 
 
 def check_cloud(cloud: LabelledCloud, before: Sequence[Check] = ()) -> list[Check]:
@@ -220,18 +214,17 @@ def _alignment(photographs: Photographs | None) -> Check:
     if photographs is None or len(photographs.images) < FEWEST_ALIGNED:
         says = f"it takes {FEWEST_ALIGNED} photographs or more that fit the points' colors"
         return Check("alignment", "unchecked", says)
-    registration = Registration(photographs, photographs.sample.cameras)
-    change = registration.found("everything")
-    if _is_fault(change, registration.start.error):
+    registration, name = Registration(photographs, photographs.sample.cameras), "everything"
+    change = registration.found(name)
+    if suspicious := _is_fault(change, registration.start.error):
         registration = Registration(photographs, photographs.sample.cameras, MORE_POINTS)
         name, change = _simplest(registration)
         change = registration.refined(name, change)
-        less = 1 - change.error / max(registration.start.error, 1e-9)
-        if _is_fault(change, registration.start.error):
-            off = f"points lie {change.shift:.1%} of the width off"
-            says = f"photographs fit {less:.0%} better with {GROUPS[name].says}: {off}"
-            return Check("alignment", "doubt", says, " ".join(map(str, registration.repair(name, change))))
     less = 1 - change.error / max(registration.start.error, 1e-9)
+    if suspicious and _is_fault(change, registration.start.error):
+        off = f"points lie {change.shift:.1%} of the width off"
+        says = f"photographs fit {less:.0%} better with {GROUPS[name].says}: {off}"
+        return Check("alignment", "doubt", says, " ".join(map(str, registration.repair(name, change))))
     says = f"no small change of poses or calibration fits much better ({less:.0%}, {change.shift:.1%} of the width)"
     return Check("alignment", "ok", says)
 

@@ -263,14 +263,14 @@ def print_checks(checks: Sequence[Mapping[str, str]], capture: Path | str) -> No
 def warn_of_poses(capture: Path, points: Points | None = None) -> None:
     """Warn of what does not fit together in a capture without its masks. points: those that the poses must fit; None:
     the capture's, if it has any."""
-    from og_pointcloud.checking.check import check_poses, warn_of_doubts
+    from og_pointcloud.checking.check import check_capture, warn_of_doubts
     from og_pointcloud.formats.capture import read_photographed
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # what is missing there is said by the command itself
         scene = read_photographed(capture, points)
     if scene is not None:
-        warn_of_doubts(check_poses(scene), shlex.quote(str(capture)))
+        warn_of_doubts(check_capture(scene), shlex.quote(str(capture)))
 
 
 def direction(text: str | None) -> tuple[float, float, float] | None:

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from og_pointcloud.cloud import UNKNOWN_SPACE
 from og_pointcloud.errors import SceneError, printable
-from og_pointcloud.formats.mask_files import MaskLayer, as_float32, require_all
+from og_pointcloud.formats.mask_files import MaskLayer, as_features, require_all
 from og_pointcloud.formats.npy import mapped_array
 
 LANGUAGE_FEATURES_FOLDER = "language_features"
@@ -62,11 +62,7 @@ def read_language_features(capture: Path, names: Sequence[str], level: str) -> t
 
 def _layer(id_file: Path, feature_file: Path, level: str) -> MaskLayer:
     ids = _level_ids(id_file, level)
-    features = mapped_array(feature_file)
-    if features.ndim != 2 or not np.issubdtype(features.dtype, np.floating):
-        raise SceneError(
-            f"{feature_file} is {features.dtype} {features.shape}; expected floats of shape (masks, width)"
-        )
+    features = as_features(mapped_array(feature_file), f"{feature_file}:")
     highest = int(ids.max(initial=-1))
     if highest >= len(features):
         raise SceneError(
@@ -77,7 +73,7 @@ def _layer(id_file: Path, feature_file: Path, level: str) -> MaskLayer:
     row_of_id = np.full(highest + 2, -1, np.int32)  # the last entry serves id -1
     row_of_id[used] = np.arange(len(used), dtype=np.int32)
     height, width = ids.shape
-    return MaskLayer((width, height), as_float32(features[used]), partial(_rows, id_file, level, row_of_id))
+    return MaskLayer((width, height), features[used], partial(_rows, id_file, level, row_of_id))
 
 
 def _rows(id_file: Path, level: str, row_of_id: NDArray[np.int32]) -> NDArray[np.int32]:

@@ -105,22 +105,19 @@ def _read_features(
     of_tracks = {name + TRACKS: name for name in names}
     expected = "an array (masks, D) under each image's stem"
     arrays = read_npz(file, names, [*of_tracks, "feature_space"], MAX_FEATURE_BYTES, expected)
-    features = {name: _as_features(arrays[name], f"{file}, '{name}'") for name in names}
+    features = {name: as_features(arrays[name], f"{file}, '{name}':") for name in names}
     tracks = {name: arrays[key] for key, name in of_tracks.items() if key in arrays}
     return features, tracks, str(arrays.get("feature_space", UNKNOWN_SPACE))
 
 
-def _as_features(values: NDArray[Any], source: str) -> NDArray[np.float32]:
+def as_features(values: NDArray[Any], source: str) -> NDArray[np.float32]:
+    """(masks, width) of a file; what overflows becomes infinite, which the scene reports by mask. SceneError, which
+    begins with ``source``, for anything but floats of that shape."""
     if values.size == 0:
         return np.zeros((0, values.shape[-1] if values.ndim == 2 else 0), np.float32)
     if values.ndim != 2 or not np.issubdtype(values.dtype, np.floating):
         raise SceneError(
-            f"{source}: features are {values.dtype} {values.shape}; expected floats of shape (masks, width)"
+            f"{source} features are {values.dtype} {values.shape}; expected floats of shape (masks, width)"
         )
-    return as_float32(values)
-
-
-def as_float32(values: NDArray[np.floating]) -> NDArray[np.float32]:
-    """The features in single precision; what overflows becomes infinite, which the scene reports by mask."""
     with np.errstate(over="ignore"):
         return values.astype(np.float32)
