@@ -213,7 +213,7 @@ MUTATIONS = (
     ),
     Mutation(
         "a failed write leaves what it wrote", "formats/atomic.py",
-        "temporary.unlink(missing_ok=True)\n        raise", "os.replace(temporary, path)\n        raise",
+        "temporary.unlink(missing_ok=True)", "temporary.exists() and os.replace(temporary, path)",
         ("test_bundle.py",),
     ),
     # Strangers' files, and files that are written.

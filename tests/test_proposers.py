@@ -52,21 +52,22 @@ def test_opencv_is_deterministic():
     assert np.array_equal(first.scores, second.scores)
 
 
-def test_the_tree_is_a_tree_and_its_regions_are_what_was_merged():
+def test_the_tree_is_a_tree_and_runs_are_its_regions():
     tree = region_tree(painted()[0])
     n, m = int(tree.superpixels.max()) + 1, len(tree.parent)
     assert m == 2 * n - 1
     assert (tree.parent < 0).sum() == 1
     assert (tree.parent[:-1] > np.arange(m - 1)).all()
     assert (tree.gone >= tree.made).all()
-    members = tree.members()
+    place, runs = tree.runs()
+    rank = place[tree.superpixels]
     inside: list[set[int]] = [{k} for k in range(n)] + [set() for _ in range(m - n)]
     for child, above in enumerate(tree.parent.tolist()):
         if above >= 0:
             inside[above] |= inside[child]
     for region in range(m):
         literal = np.isin(tree.superpixels, list(inside[region]))
-        assert np.array_equal(members[region][tree.superpixels] == 255, literal)
+        assert np.array_equal((rank >= runs[region, 0]) & (rank < runs[region, 1]), literal)
         assert tree.area[region] == literal.sum()
 
 

@@ -145,7 +145,6 @@ def write_image_encoder(folder: Path, model: encode.ImageModel, tower: Any, abou
     model: what the graph must agree with. tower: the same as a torch module with patches (`clip.ImageTower`), or the
     bytes of a graph of (B, 3, S, S) -> (B, D) without. about: more entries of the manifest; "patch": of a module.
     """
-    preprocessing = model.preprocessing
     if isinstance(tower, bytes):
         graph = tower
     else:
@@ -163,7 +162,7 @@ def write_image_encoder(folder: Path, model: encode.ImageModel, tower: Any, abou
         **_heading(encode.ENCODER),
         "feature_space": model.feature_space,
         "width": model.width,
-        "preprocessing": preprocessing.as_manifest(),
+        "preprocessing": asdict(model.preprocessing),
         "crops": [asdict(crop) for crop in model.crops],
         **about,
         "parity": _image_parity(graph, model),

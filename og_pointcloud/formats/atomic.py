@@ -50,13 +50,11 @@ def replacing(path: str | os.PathLike[str], *, durable: bool = True) -> Iterator
         if durable:
             _sync_folder(path.parent)
     except OSError as error:
-        temporary.unlink(missing_ok=True)
         if error.filename is None and error.errno is not None:
             raise OSError(error.errno, f"{error.strerror}, it was not written", str(path)) from error
         raise
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
+    finally:
+        temporary.unlink(missing_ok=True)  # where it has not taken its place
 
 
 def write_file(path: str | os.PathLike[str], data: bytes) -> Path:

@@ -126,12 +126,9 @@ def read_photographed(folder: str | Path, points: Points | None = None) -> Scene
     for name, image in zip(poses.names, poses.images, strict=True):
         camera, file = in_local_frame(image.camera, points.origin), find_image(capture, image.path)
         photograph = None if file is None else partial(read_photograph, file, camera, image.face)
-        views.append(View(name, camera, partial(_no_masks, camera), np.zeros((0, 0), np.float32), photograph))
+        no_masks = partial(np.full, (camera.height, camera.width), -1, np.int32)
+        views.append(View(name, camera, no_masks, np.zeros((0, 0), np.float32), photograph))
     return Scene(points, tuple(views), UNKNOWN_SPACE, name=capture.resolve().name)
-
-
-def _no_masks(camera: Camera) -> NDArray[np.int32]:
-    return np.full((camera.height, camera.width), -1, np.int32)
 
 
 def read_poses(capture: Path, repairs: Sequence[Repair] | None = None) -> CapturePoses:

@@ -201,9 +201,10 @@ class _Binary:
     """Fields of a .bin file, one after the other; asking for more than the file holds is one clear error."""
 
     def __init__(self, path: Path) -> None:
-        self.path = path
-        self.data = _mapped(path)
-        self.offset = 0
+        self.path, self.offset = path, 0
+        with path.open("rb") as stream:
+            # Most of a model is 2-D observations, which are never read. An empty file cannot be mapped.
+            self.data = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) if path.stat().st_size else b""
 
     def count(self, minimum_bytes: int) -> int:
         """A number of records, checked against the bytes that are left before anything is made of it."""
@@ -231,12 +232,6 @@ class _Binary:
         name = self.data[self.offset : end].decode("utf-8", errors="replace")
         self.offset = end + 1
         return name
-
-
-def _mapped(path: Path) -> mmap.mmap | bytes:
-    """The file's bytes, mapped: most of a model is 2-D observations, which are never read. An empty file cannot be."""
-    with path.open("rb") as stream:
-        return mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) if path.stat().st_size else b""
 
 
 # Points: millions of records, so no record objects.

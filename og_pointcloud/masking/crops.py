@@ -8,7 +8,7 @@ table's chairs, and still which of them is meant. Several are weighted into one 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -71,12 +71,8 @@ class Preprocessing:
 
     @classmethod
     def from_manifest(cls, entry: Mapping[str, Any]) -> Preprocessing:
-        """Read back what ``as_manifest`` gave; TypeError for other fields."""
+        """From the fields as JSON has them; TypeError for others."""
         return cls(**{**entry, "mean": tuple(entry["mean"]), "std": tuple(entry["std"])})
-
-    def as_manifest(self) -> dict[str, Any]:
-        """The fields, as JSON has them."""
-        return asdict(self)
 
     @property
     def fill(self) -> tuple[int, int, int]:

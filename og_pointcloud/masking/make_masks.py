@@ -88,7 +88,11 @@ def make_masks(
         with locked(target / WORK_FOLDER):
             work.mkdir(parents=True, exist_ok=True)
             done_before = sum(task.work_file.exists() for task in tasks)
-            made = _make(target, settings, tasks, key, progress)
+            _work_through(settings, tasks, target, progress)
+            masks, space = _assemble(target, settings, tasks)
+            made = {"key": key, "masks": masks, "feature_space": space}
+            _write_made(target, settings, tasks, **made)
+            shutil.rmtree(target / WORK_FOLDER)
     if separate:
         _make_capture_of(capture, target, chosen)  # poses may be new
     space = str(made.get("feature_space", UNKNOWN_SPACE))
@@ -135,16 +139,6 @@ def _digest(value: list[Any]) -> str:
 # The work -----------------------------------------------------------------------------------------------------------
 
 
-def _make(target: Path, settings: MaskSettings, tasks: Sequence[ImageTask], key: str, progress: bool) -> dict[str, Any]:
-    """Masks of all images, and what the record says of them."""
-    _work_through(settings, tasks, target, progress)
-    masks, space = _assemble(target, settings, tasks)
-    made = {"key": key, "masks": masks, "feature_space": space}
-    _write_made(target, settings, tasks, **made)
-    shutil.rmtree(target / WORK_FOLDER)
-    return made
-
-
 def _work_through(settings: MaskSettings, tasks: Sequence[ImageTask], target: Path, progress: bool) -> None:
     """Do what is not done yet, with a preview after the first images."""
     waiting = [task for task in tasks if not task.work_file.exists()]
@@ -155,18 +149,14 @@ def _work_through(settings: MaskSettings, tasks: Sequence[ImageTask], target: Pa
             warnings.warn(wrong, stacklevel=4)
         done = [] if previewed else [task for task in tasks if task.work_file.exists()]
         if len(done) >= min(PREVIEW_IMAGES, len(tasks)):
-            _write_preview(target, settings, done[:PREVIEW_IMAGES])
+            shown = [(task.photograph.read(settings.longest_side), task.work_file) for task in done[:PREVIEW_IMAGES]]
+            write_contact_sheet(target / PREVIEW_NAME, [(image, read_work(file)["ids"]) for image, file in shown])
             previewed = True
     if broken:
         raise SceneError(
             f"{len(broken)} of {len(tasks)} images cannot be used, the first: {broken[0]}; the others are kept in "
             f"'{target / WORK_FOLDER}': repair or remove these, and the same command goes on"
         )
-
-
-def _write_preview(target: Path, settings: MaskSettings, tasks: Sequence[ImageTask]) -> None:
-    pictures = [(task.photograph.read(settings.longest_side), read_work(task.work_file)["ids"]) for task in tasks]
-    write_contact_sheet(target / PREVIEW_NAME, pictures)
 
 
 # The files that masks end in, and the record by which the next run knows them -------------------------------------

@@ -78,9 +78,11 @@ class OpenCVProposer:
         small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
         tree = region_tree(small)
         chosen, scores = tree.lasting()
+        place, runs = tree.runs()
+        rank = place[tree.superpixels]
         masks = np.zeros((len(chosen), height, width), np.bool_)
-        for mask, members in zip(masks, tree.members()[chosen], strict=True):
-            drawn = members[tree.superpixels]
+        for mask, (first, end) in zip(masks, runs[chosen], strict=True):
+            drawn = ((rank >= first) & (rank < end)).astype(np.uint8) * 255
             mask[:] = cv2.resize(drawn, (width, height), interpolation=cv2.INTER_LINEAR) >= 128
         return Proposals(masks, scores)
 
@@ -100,15 +102,20 @@ class RegionTree:
     gone: Floats
     area: Floats
 
-    def members(self) -> NDArray[np.uint8]:
-        """(m, n): 255 for the superpixels that each region is made of, else 0."""
+    def runs(self) -> tuple[Labels, Labels]:
+        """Superpixels in an order in which every region is a run: (n,) the place of each, (m, 2) first and end."""
         leaves = int(self.superpixels.max()) + 1
-        members = np.zeros((len(self.parent), leaves), np.uint8)
-        np.fill_diagonal(members, 255)
+        size = np.concatenate([np.ones(leaves, np.int32), np.zeros(len(self.parent) - leaves, np.int32)])
         for region, above in enumerate(self.parent.tolist()):
             if above >= 0:
-                members[above] |= members[region]
-        return members
+                size[above] += size[region]
+        first = np.zeros(len(size), np.int32)
+        free = np.zeros(len(size) + 1, np.int32)  # the last entry serves roots, whose parent is -1
+        for region in range(len(size) - 1, -1, -1):
+            above = self.parent[region]
+            first[region] = free[region] = free[above]
+            free[above] += size[region]
+        return first[:leaves], np.stack([first, first + size], axis=1)
 
     def lasting(self) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
         """Regions worth a proposal, best first, and their scores in [0, 1)."""
@@ -134,27 +141,30 @@ def region_tree(image: NDArray[np.uint8]) -> RegionTree:
     lab = cv2.cvtColor(cv2.bilateralFilter(image, 5, 20, 5), cv2.COLOR_RGB2LAB).astype(np.float32)
     lab[:, :, 0] *= LIGHTNESS
     superpixels = _superpixels(lab)
-    regions, borders = _Regions.of(superpixels, lab), _Borders.of(superpixels, lab)
-    count = len(regions.area)
+    pixels = lab.reshape(-1, 3).astype(np.float64)
+    # Sums over the pixels of each region, so that a merger is an addition: how many, colors, their squares.
+    regions = _sums(superpixels.ravel(), np.column_stack([np.ones(len(pixels)), pixels, pixels**2]))
+    borders = _Borders.of(superpixels, lab)
+    count = len(regions)
     number, made = np.arange(count), np.zeros(2 * count - 1)
     parent, area = np.full(2 * count - 1, -1, np.int32), np.zeros(2 * count - 1)
-    area[:count] = regions.area
+    area[:count] = regions[:, 0]
     while len(borders.a):
         distance = _distances(regions, borders, superpixels.size)
-        pairs = _nearest_pairs(borders, distance, len(regions.area))
+        pairs = _nearest_pairs(borders, distance, len(regions))
         a, b = borders.a[pairs], borders.b[pairs]
         new = np.arange(count, count + len(pairs))
         parent[number[a]] = parent[number[b]] = new
         # What two regions became lies at least as far up as they: nested regions have nested heights.
         made[new] = np.maximum(distance[pairs], np.maximum(made[number[a]], made[number[b]]))
-        area[new] = regions.area[a] + regions.area[b]
+        area[new] = regions[a, 0] + regions[b, 0]
         count += len(pairs)
         number[a] = new
         into = np.arange(len(number))
         into[b] = a
         left, into = np.unique(into, return_inverse=True)
         number = number[left]
-        regions, borders = regions.gathered(into, len(left)), borders.gathered(into)
+        regions, borders = _sums(into, regions), borders.gathered(into)
     parent, made, area = parent[:count], made[:count], area[:count]
     return RegionTree(superpixels, parent, made, np.where(parent >= 0, made[parent], np.inf), area)
 
@@ -175,28 +185,6 @@ def _superpixels(lab: NDArray[np.float32]) -> Labels:
 
 
 @dataclass(frozen=True)
-class _Regions:
-    """Sums over the pixels of each region, so that a merger is an addition. area: (n,). lab, lab_squared: (n, 3)."""
-
-    area: Floats
-    lab: Floats
-    lab_squared: Floats
-
-    @classmethod
-    def of(cls, labels: Labels, lab: NDArray[np.float32]) -> _Regions:
-        flat, pixels = labels.ravel(), lab.reshape(-1, 3).astype(np.float64)
-        ones = np.ones((len(flat), 1))
-        return cls(_sums(flat, ones)[:, 0], _sums(flat, pixels), _sums(flat, pixels**2))
-
-    def gathered(self, into: NDArray[np.intp], count: int) -> _Regions:
-        """Regions with the same number in ``into`` become one."""
-        sums = [np.zeros((count, *values.shape[1:])) for values in (self.area, self.lab, self.lab_squared)]
-        for total, values in zip(sums, (self.area, self.lab, self.lab_squared), strict=True):
-            np.add.at(total, into, values)
-        return _Regions(*sums)
-
-
-@dataclass(frozen=True)
 class _Borders:
     """Neighbors a < b, (e,), and sums over the pixel pairs of their border: how many, contrast."""
 
@@ -207,9 +195,8 @@ class _Borders:
 
     @classmethod
     def of(cls, labels: Labels, lab: NDArray[np.float32]) -> _Borders:
-        across, down = _pixel_pairs(labels, lab), _pixel_pairs(labels.T, lab.transpose(1, 0, 2))
-        a, b = np.concatenate([across[0], down[0]]), np.concatenate([across[1], down[1]])
-        contrast = np.concatenate([across[2], down[2]])
+        pairs = _pixel_pairs(labels, lab), _pixel_pairs(labels.T, lab.transpose(1, 0, 2))  # across, and down
+        a, b, contrast = (np.concatenate(parts) for parts in zip(*pairs, strict=True))
         return cls(a, b, np.ones(len(a)), contrast).gathered(np.arange(int(labels.max()) + 1))
 
     def gathered(self, into: NDArray[np.intp]) -> _Borders:
@@ -237,14 +224,14 @@ def _pixel_pairs(labels: Labels, lab: NDArray[np.float32]) -> Pairs:
     return labels[row, column], labels[row, column + 1], contrast
 
 
-def _distances(regions: _Regions, borders: _Borders, pixels: int) -> Floats:
-    """(e,): how far apart the two regions of each border are."""
-    a, b = borders.a, borders.b
-    mean = regions.lab / regions.area[:, None]
-    texture = np.sqrt(np.maximum(regions.lab_squared / regions.area[:, None] - mean**2, 0).sum(axis=1))
+def _distances(regions: Floats, borders: _Borders, pixels: int) -> Floats:
+    """(e,): how far apart the two regions of each border are. regions: (n, 7) sums of pixels, colors, their squares."""
+    a, b, area = borders.a, borders.b, regions[:, 0]
+    mean, mean_squared = regions[:, 1:4] / area[:, None], regions[:, 4:] / area[:, None]
+    texture = np.sqrt(np.maximum(mean_squared - mean**2, 0).sum(axis=1))
     color = np.linalg.norm(mean[a] - mean[b], axis=1)
     color = (color + borders.contrast / borders.length) / 2 / (1 + TEXTURE * np.minimum(texture[a], texture[b]))
-    share = np.minimum(regions.area[a], regions.area[b]) / pixels
+    share = np.minimum(area[a], area[b]) / pixels
     return color * np.sqrt(share / (share + SMALL_REGION))
 
 

@@ -141,14 +141,10 @@ def prepared(image: NDArray[np.uint8], preparation: Preparation) -> torch.Tensor
 
 def _preparation(folder: Path, kind: str, config: Any) -> Preparation:
     """Side from the vision configuration, colors from the preprocessor's file where the model has one."""
-    side = config.vision_config.image_size if kind in PADDED else _square_side(config)
+    sized = config.vision_config if kind in PADDED else getattr(config, "prompt_encoder_config", config)
+    side = sized.image_size[0] if isinstance(sized.image_size, (list, tuple)) else sized.image_size
     stated = read_config(folder, "preprocessor_config.json", "processor_config.json")
     stated = stated.get("image_processor", stated)
     mean, std = HALVES if kind.startswith("sam3") else IMAGENET
     mean, std = stated.get("image_mean", mean), stated.get("image_std", std)
     return Preparation(int(side), kind in PADDED, tuple(map(float, mean)), tuple(map(float, std)))
-
-
-def _square_side(config: Any) -> int:
-    side = getattr(config, "prompt_encoder_config", config).image_size
-    return int(side[0] if isinstance(side, (list, tuple)) else side)
