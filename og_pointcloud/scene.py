@@ -367,12 +367,11 @@ class Scene:
     def __post_init__(self) -> None:
         if not self.views:
             raise SceneError("the scene has 0 views; expected at least one posed image with a mask")
-        widths = {view.mask_features.shape[1] for view in self.views if view.mask_count}
+        widths = {view.mask_features.shape[1]: view.name for view in self.views if view.mask_count}
         if len(widths) > 1:
-            by_view = {view.name: view.mask_features.shape[1] for view in self.views if view.mask_count}
-            odd = [f"{name}: {width}" for name, width in by_view.items() if width != next(iter(by_view.values()))]
+            odd = next(f"{name}: {width}" for width, name in widths.items() if width != self.feature_width)
             raise SceneError(
-                f"mask features have {len(widths)} widths {sorted(widths)} (e.g. {odd[0]}); expected one width: "
+                f"mask features have {len(widths)} widths {sorted(widths)} (e.g. {odd}); expected one width: "
                 "encode all masks with the same model"
             )
         names = [view.name for view in self.views]

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import zipfile
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -113,15 +113,8 @@ def open_proposer(text: str, words: Sequence[str] = (), followed: int | None = N
 
 
 def results(settings: MaskSettings, tasks: Sequence[ImageTask], done: int = 0) -> Iterator[str | None]:
-    """What is wrong with each task's image (None: nothing), as they are done. No task is no work, and no error.
+    """What is wrong with each task's image (None: nothing), in their order. No task is no work, and no error.
     done: images that earlier runs have done."""
-    if not tasks:
-        return
-    work = ImageWorker(settings, done)
-    pool = ThreadPoolExecutor(settings.threads)
-    waiting = [pool.submit(work, task) for task in tasks]
-    try:
-        for future in as_completed(waiting):
-            yield future.result()
-    finally:
-        pool.shutdown(cancel_futures=True)  # after the images that are being made
+    if tasks:
+        with ThreadPoolExecutor(settings.threads) as pool:  # left early, it ends after the images that are being made
+            yield from pool.map(ImageWorker(settings, done), tasks)
