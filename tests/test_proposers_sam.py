@@ -102,7 +102,7 @@ def test_loads_and_answers_as_the_model_itself(folders, image, kind):
     points = np.array([[10, 20], [50, 5], [0, 0]], np.float32)
     logits, iou = predictor.at_points(points)
     assert logits.shape[:2] == iou.shape == (3, 3)
-    reloaded = predictor.model
+    reloaded = predictor.loaded.model
     height, width = scaled_size((36, 60), predictor.loaded.preparation)
     scaled = torch.tensor(points * np.array([width / 60, height / 36], np.float32))[None, :, None]
     with torch.inference_mode():
@@ -197,7 +197,7 @@ def test_a_folder_does_not_say_how_attention_is_computed(folders, tmp_path, plac
     config = json.loads(file.read_text())
     vision = {**config["vision_config"], place: "stranger/kernels"}
     file.write_text(json.dumps({**config, place: "stranger/kernels", "vision_config": vision}))
-    model = SamPredictor(tmp_path / "model").model
+    model = SamPredictor(tmp_path / "model").loaded.model
     assert model.config._attn_implementation == model.vision_encoder.config._attn_implementation == "sdpa"
 
 

@@ -173,7 +173,7 @@ def test_nothing_is_fetched_while_following(folder, monkeypatch):
 
 def test_the_same_folder_answers_points(folder):
     predictor = SamPredictor(folder)
-    weights, published = predictor.model.state_dict(), load_file(folder / "model.safetensors")
+    weights, published = predictor.loaded.model.state_dict(), load_file(folder / "model.safetensors")
     answering = [name for name in weights if name.startswith("mask_decoder.")]
     assert len(answering) > 50
     assert all(torch.equal(weights[name], published[f"tracker_model.{name}"]) for name in answering)

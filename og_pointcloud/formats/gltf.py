@@ -36,7 +36,7 @@ SPLATS = "KHR_gaussian_splatting"
 SPLATS_AS = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
 """How splats are trained: sRGB colors as they are shown."""
 ALIGNMENT = 8
-"""Of the buffers of property tables; columns need 4."""
+"""Of all that lies in the buffer: property tables need it, columns half of it."""
 NAME = "name"
 """The property of both tables: a label's name, and the name of an instance's label."""
 
@@ -67,37 +67,33 @@ def write_gltf(
         require_finite(xyz_world, LABEL_FINITE)
         of_splats = {} if splats is None else _splat_columns(splats, rgb)
         origin = np.median(np.asarray(xyz_world, np.float64), axis=0)
-        instances = attributes["og_instance"]
-        features = {
-            "og_label": (attributes["og_label"], len(names)),
-            "og_instance": (instances, int(instances.max(initial=-1)) + 1),
-        }
-        columns = {
-            "POSITION": (xyz_world - origin).astype(np.float32),
-            "COLOR_0": _linear_colors(rgb, splats),
-            **{
-                f"_FEATURE_ID_{index}": np.where(ids >= 0, ids, none).astype(np.float32)
-                for index, (ids, none) in enumerate(features.values())
-            },
-            "_OG_SCORE": attributes["og_score"].astype(np.float32),
-            "_OG_REASON": attributes["og_reason"].astype(np.float32),
-            **of_splats,
-        }
-        feature_sets = [
-            # featureCount: at least 1, as the schema has it
-            {
-                "featureCount": max(len(np.unique(ids[ids >= 0])), 1),
-                "nullFeatureId": none,
-                "attribute": index,
-                "label": label,
-            }
-            for index, (label, (ids, none)) in enumerate(features.items())
-        ]
-        extensions = {FEATURES: {"featureIds": feature_sets}} | ({} if splats is None else {SPLATS: SPLATS_AS})
-        document, binary = _document(columns, origin, extensions, names)
+        columns = {"POSITION": (xyz_world - origin).astype(np.float32), "COLOR_0": _linear_colors(rgb, splats)}
         tables = {"og_label": list(names), "og_instance": _instance_names(attributes, names)}
-        binary += _add_names(document, len(binary), tables, feature_sets)
-        write_file(path, _as_glb(document, binary))
+        for index, (name, texts) in enumerate(tables.items()):
+            ids = attributes[name]
+            columns[f"_FEATURE_ID_{index}"] = np.where(ids >= 0, ids, len(texts)).astype(np.float32)
+        columns["_OG_SCORE"] = attributes["og_score"].astype(np.float32)
+        columns["_OG_REASON"] = attributes["og_reason"].astype(np.float32)
+        extensions: dict[str, Any] = {FEATURES: {}} | ({SPLATS: SPLATS_AS} if of_splats else {})
+        buffer = _Buffer()
+        document = _document(columns | of_splats, origin, extensions, names, buffer)
+        extensions[FEATURES]["featureIds"] = _feature_sets(attributes, tables, document, buffer)
+        write_file(path, _as_glb(document, buffer))
+
+
+class _Buffer:
+    """The bytes behind a document, and its views of them."""
+
+    def __init__(self) -> None:
+        self.data = bytearray()
+        self.views: list[dict[str, int]] = []
+
+    def add(self, data: bytes, **more: int) -> int:
+        """The number of the view of this data. more: what else it says."""
+        self.data += bytes(-len(self.data) % ALIGNMENT)
+        self.views.append({"buffer": 0, "byteOffset": len(self.data), "byteLength": len(data), **more})
+        self.data += data
+        return len(self.views) - 1
 
 
 def _splat_columns(splats: Points, rgb: NDArray[np.uint8]) -> dict[str, NDArray[np.float32]]:
@@ -124,21 +120,17 @@ def _linear_colors(rgb: NDArray[np.uint8], splats: Points | None) -> NDArray[np.
 
 
 def _document(
-    columns: Mapping[str, NDArray], origin: NDArray[np.float64], extensions: Mapping[str, Any], names: Sequence[str]
-) -> tuple[dict[str, Any], bytes]:
-    """The JSON document, its buffer without a place, and the buffer's bytes: one column behind the other."""
-    views, accessors, start = [], [], 0
-    for name, column in columns.items():
-        size = column.nbytes  # a multiple of 4 throughout, as alignment asks
-        views.append({"buffer": 0, "byteOffset": start, "byteLength": size, "target": ARRAY_BUFFER})
-        accessors.append(_accessor(len(views) - 1, column, with_bounds=name == "POSITION"))
-        start += size
-    primitive = {
-        "attributes": {name: index for index, name in enumerate(columns)},
-        "mode": POINTS_MODE,
-        "extensions": dict(extensions),
-    }
-    document = {
+    columns: Mapping[str, NDArray],
+    origin: NDArray[np.float64],
+    extensions: dict[str, Any],
+    names: Sequence[str],
+    buffer: _Buffer,
+) -> dict[str, Any]:
+    """The JSON document of one mesh, whose columns go into the buffer."""
+    accessors = [_accessor(buffer, column, with_bounds=name == "POSITION") for name, column in columns.items()]
+    attributes = {name: index for index, name in enumerate(columns)}
+    primitive = {"attributes": attributes, "mode": POINTS_MODE, "extensions": extensions}
+    return {
         "asset": {"version": "2.0", "generator": "og-pointcloud"},
         "extensionsUsed": list(extensions),
         "scene": 0,
@@ -146,11 +138,7 @@ def _document(
         "nodes": [{"mesh": 0, "translation": origin.tolist()}],
         "meshes": [{"primitives": [primitive], "extras": {"og_names": list(names)}}],
         "accessors": accessors,
-        "bufferViews": views,
-        "buffers": [{"byteLength": start}],
     }
-    little_endian = (column.astype(column.dtype.newbyteorder("<"), copy=False) for column in columns.values())
-    return document, b"".join(column.tobytes() for column in little_endian)
 
 
 def _instance_names(attributes: Mapping[str, NDArray], names: Sequence[str]) -> list[str]:
@@ -164,45 +152,41 @@ def _instance_names(attributes: Mapping[str, NDArray], names: Sequence[str]) -> 
     return named
 
 
-def _add_names(
-    document: dict[str, Any], start: int, tables: Mapping[str, Sequence[str]], feature_sets: list[dict[str, Any]]
-) -> bytes:
-    """Put property tables into a document, one a feature set, and return the bytes that go behind its ``start`` bytes.
+def _feature_sets(
+    attributes: Mapping[str, NDArray], tables: Mapping[str, Sequence[str]], document: dict[str, Any], buffer: _Buffer
+) -> list[dict[str, Any]]:
+    """The feature sets of a primitive, by tables of their names, which become the document's property tables.
 
     Strings are one UTF-8 text, with the offsets of their starts and the end. A table without any text is left out: a
     buffer cannot be empty.
     """
-    binary, classes, made = b"", {}, []
-    for feature_set, (name, texts) in zip(feature_sets, tables.items(), strict=True):
+    feature_sets, classes, made = [], {}, []
+    for index, (name, texts) in enumerate(tables.items()):
+        ids = attributes[name]
+        count = max(len(np.unique(ids[ids >= 0])), 1)  # at least 1, as the schema has it
+        feature_sets.append({"featureCount": count, "nullFeatureId": len(texts), "attribute": index, "label": name})
         encoded = [text.encode() for text in texts]
-        if not any(encoded):
-            continue
-        offsets = np.cumsum([0, *map(len, encoded)]).astype("<u4").tobytes()
-        places = {}
-        for role, data in (("values", b"".join(encoded)), ("stringOffsets", offsets)):
-            binary += b"\0" * (-(start + len(binary)) % ALIGNMENT)
-            places[role] = len(document["bufferViews"])
-            document["bufferViews"].append({"buffer": 0, "byteOffset": start + len(binary), "byteLength": len(data)})
-            binary += data
-        classes[name] = {"properties": {NAME: {"type": "STRING"}}}
-        feature_set["propertyTable"] = len(made)
-        made.append({"name": name, "class": name, "count": len(texts), "properties": {NAME: places}})
+        if any(encoded):
+            offsets = np.cumsum([0, *map(len, encoded)]).astype("<u4").tobytes()
+            places = {"values": buffer.add(b"".join(encoded)), "stringOffsets": buffer.add(offsets)}
+            classes[name] = {"properties": {NAME: {"type": "STRING"}}}
+            feature_sets[-1]["propertyTable"] = len(made)
+            made.append({"name": name, "class": name, "count": len(texts), "properties": {NAME: places}})
     if made:
         document["extensionsUsed"].append(METADATA)
         schema = {"id": "og_pointcloud", "classes": classes}
         document["extensions"] = {METADATA: {"schema": schema, "propertyTables": made}}
-    binary += b"\0" * (-(start + len(binary)) % 4)
-    document["buffers"][0]["byteLength"] += len(binary)
-    return binary
+    return feature_sets
 
 
-def _accessor(view: int, column: NDArray, *, with_bounds: bool) -> dict[str, Any]:
-    width = column.shape[1] if column.ndim == 2 else 1
+def _accessor(buffer: _Buffer, column: NDArray, *, with_bounds: bool) -> dict[str, Any]:
+    """What a document says of a column, which goes into the buffer."""
+    little_endian = column.astype(column.dtype.newbyteorder("<"), copy=False)
     accessor: dict[str, Any] = {
-        "bufferView": view,
+        "bufferView": buffer.add(little_endian.tobytes(), target=ARRAY_BUFFER),
         "componentType": COMPONENT_TYPES[column.dtype.char],
         "count": len(column),
-        "type": VECTOR_TYPES[width],
+        "type": VECTOR_TYPES[column.shape[1] if column.ndim == 2 else 1],
     }
     if column.dtype == np.uint16:
         accessor["normalized"] = True
@@ -211,8 +195,10 @@ def _accessor(view: int, column: NDArray, *, with_bounds: bool) -> dict[str, Any
     return accessor
 
 
-def _as_glb(document: Mapping[str, Any], binary: bytes) -> bytes:
-    text = json.dumps(document, separators=(",", ":")).encode()
+def _as_glb(document: Mapping[str, Any], buffer: _Buffer) -> bytes:
+    binary = bytes(buffer.data) + bytes(-len(buffer.data) % 4)
+    whole = {**document, "bufferViews": buffer.views, "buffers": [{"byteLength": len(binary)}]}
+    text = json.dumps(whole, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)
     chunks = [
         struct.pack("<I4s", len(data), kind) + data for kind, data in ((JSON_CHUNK, text), (BINARY_CHUNK, binary))

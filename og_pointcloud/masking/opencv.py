@@ -195,8 +195,9 @@ class _Borders:
 
     @classmethod
     def of(cls, labels: Labels, lab: NDArray[np.float32]) -> _Borders:
-        pairs = _pixel_pairs(labels, lab), _pixel_pairs(labels.T, lab.transpose(1, 0, 2))  # across, and down
-        a, b, contrast = (np.concatenate(parts) for parts in zip(*pairs, strict=True))
+        across, down = _pixel_pairs(labels, lab), _pixel_pairs(labels.T, lab.transpose(1, 0, 2))
+        a, b = np.concatenate([across[0], down[0]]), np.concatenate([across[1], down[1]])
+        contrast = np.concatenate([across[2], down[2]])
         return cls(a, b, np.ones(len(a)), contrast).gathered(np.arange(int(labels.max()) + 1))
 
     def gathered(self, into: NDArray[np.intp]) -> _Borders:
