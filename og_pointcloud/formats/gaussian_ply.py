@@ -124,7 +124,10 @@ def _compressed(elements: Elements) -> Points:
         color = _between(chunk, ("r", "g", "b"), color)
     with np.errstate(over="ignore"):
         scale = np.exp(log_scale).astype(np.float32)
-    return activated(xyz, scale, _unpack_rotation(words["packed_rotation"]), rgba[:, 3], color)
+    # Two bits name the largest of w, x, y, z; the others have ten each, of +-1/sqrt(2).
+    others = (_unpack(words["packed_rotation"], bits=(2, 10, 10, 10))[:, 1:] - 0.5) * np.sqrt(2)
+    rotation = from_smallest_three(words["packed_rotation"] >> 30, others)
+    return activated(xyz, scale, rotation, rgba[:, 3], color)
 
 
 def _unpack(words: NDArray[np.uint32], bits: tuple[int, ...] = (11, 10, 11)) -> NDArray[np.float64]:
@@ -146,14 +149,11 @@ def _between(chunk: NDArray[np.void], names: tuple[str, ...], share: NDArray[np.
         return minimum[of_splat] + (maximum - minimum)[of_splat] * share
 
 
-def _unpack_rotation(words: NDArray[np.uint32]) -> NDArray[np.float64]:
-    """Smallest three: two bits name the largest of w, x, y, z; ten each the others, in order, in +-1/sqrt(2)."""
-    others = (_unpack(words, bits=(2, 10, 10, 10))[:, 1:] - 0.5) * np.sqrt(2)
-    largest = (words >> 30).astype(np.intp)
-    quaternions = np.empty((len(words), 4))
-    mask = np.arange(4) == largest[:, None]
-    quaternions[mask] = np.sqrt(np.maximum(0.0, 1 - np.square(others).sum(axis=1)))
-    quaternions[~mask] = others.ravel()
+def from_smallest_three(largest: NDArray[np.integer], others: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(n, 4) unit quaternions. largest: (n,) place of the largest part, which is positive; others: (n, 3), in order."""
+    quaternions, is_largest = np.empty((len(others), 4)), np.arange(4) == largest[:, None]
+    quaternions[is_largest] = np.sqrt(np.maximum(0.0, 1 - np.square(others).sum(axis=1)))
+    quaternions[~is_largest] = others.ravel()
     return quaternions
 
 

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from og_pointcloud.errors import SceneError, naming_extra
 from og_pointcloud.formats.atomic import write_file
-from og_pointcloud.formats.gaussian_ply import SH_CONSTANT, activated
+from og_pointcloud.formats.gaussian_ply import SH_CONSTANT, activated, from_smallest_three
 from og_pointcloud.formats.tables import naming
 from og_pointcloud.scene import Points
 
@@ -40,6 +40,8 @@ FIXED_POINT = 1 << 23
 MOST_FRACTION_BITS = 23
 MAGNITUDE = 511
 """The largest of the nine bits that a part of a rotation has beside its sign."""
+PLACES = np.array([20, 10, 0], np.uint32)
+"""Bits by which the three smaller parts are shifted, in order."""
 TURNED = np.array([1.0, -1.0, -1.0])
 """Factors of x, y, z, of positions and of quaternions, from one convention of axes to the other."""
 MOST_RATIO, PLENTY = 20, 1 << 24
@@ -198,15 +200,9 @@ def _three_bytes(rotation: Bytes) -> Doubles:
 def _smallest_three(words: NDArray[np.uint32]) -> Doubles:
     """(n, 4) quaternions x y z w: two bits name the largest, which is positive; the others have nine bits and a sign
     each, of +-1/sqrt(2), the last one lowest."""
-    largest, rest, parts = words >> 30, words.copy(), np.zeros((len(words), 4))
-    for part in (3, 2, 1, 0):
-        here = largest != part
-        value = (rest & MAGNITUDE) / MAGNITUDE * np.sqrt(0.5)
-        parts[here, part] = np.where(rest >> 9 & 1, -value, value)[here]
-        rest = np.where(here, rest >> 10, rest)
-    missing = np.sqrt(np.maximum(0.0, 1 - np.square(parts).sum(axis=1)))
-    parts[np.arange(len(parts)), largest] = missing
-    return parts
+    fields = words[:, None] >> PLACES
+    size = (fields & MAGNITUDE) / MAGNITUDE * np.sqrt(0.5)
+    return from_smallest_three(words >> 30, np.where(fields >> 9 & 1, -size, size))
 
 
 def _packed_rotation(wxyz: Doubles) -> NDArray[np.uint32]:
@@ -214,9 +210,7 @@ def _packed_rotation(wxyz: Doubles) -> NDArray[np.uint32]:
     xyzw = np.column_stack([wxyz[:, 1:] * TURNED, wxyz[:, 0]])
     largest = np.abs(xyzw).argmax(axis=1)
     xyzw *= np.where(np.take_along_axis(xyzw, largest[:, None], axis=1) < 0, -1.0, 1.0)  # -q turns as q does
-    words = largest.astype(np.uint32)
-    for part in range(4):
-        size = np.minimum(np.rint(np.abs(xyzw[:, part]) * np.sqrt(2) * MAGNITUDE), MAGNITUDE).astype(np.uint32)
-        field = size | (xyzw[:, part] < 0).astype(np.uint32) << 9
-        words = np.where(largest == part, words, words << 10 | field)
-    return words.astype("<u4")
+    others = xyzw[np.arange(4) != largest[:, None]].reshape(-1, 3)
+    size = np.minimum(np.rint(np.abs(others) * np.sqrt(2) * MAGNITUDE), MAGNITUDE).astype(np.uint32)
+    fields = (size | (others < 0).astype(np.uint32) << 9) << PLACES
+    return (np.bitwise_or.reduce(fields, axis=1) | largest.astype(np.uint32) << 30).astype("<u4")
