@@ -28,6 +28,7 @@ from og_pointcloud.formats.atomic import replacing_folder
 from og_pointcloud.formats.npy import npy_bytes
 from og_pointcloud.formats.poses import read_json_object
 from og_pointcloud.masking import encode
+from og_pointcloud.masking.contracts import ImageModel
 from og_pointcloud.masking.crops import WITH_CONTEXT, Crop
 from og_pointcloud.models import MANIFEST, EncoderFormat, check_graph, open_session
 from og_pointcloud.text import encoder as text_encoder
@@ -139,7 +140,7 @@ def export_image_encoder(
     return folder, write_image_encoder(folder, model, model.tower.cpu(), about)
 
 
-def write_image_encoder(folder: Path, model: encode.ImageModel, tower: Any, about: dict[str, Any]) -> dict[str, Any]:
+def write_image_encoder(folder: Path, model: ImageModel, tower: Any, about: dict[str, Any]) -> dict[str, Any]:
     """Write a torch module as an image encoder if its graph gives the model's vectors. Returns the manifest.
 
     model: what the graph must agree with. tower: the same as a torch module with patches (`clip.ImageTower`), or the
@@ -274,7 +275,7 @@ def _text_parity(tower: Any, encoder: TextEncoder) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _image_parity(graph: bytes, model: encode.ImageModel) -> dict[str, Any]:
+def _image_parity(graph: bytes, model: ImageModel) -> dict[str, Any]:
     """How far the graph is from the model, on images of noise and of even colors, and on patches if it has any."""
     size = model.preprocessing.size
     squares = np.random.default_rng(0).integers(0, 256, (PARITY_IMAGES, size, size, 3), np.uint8)

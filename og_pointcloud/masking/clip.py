@@ -63,7 +63,7 @@ def _unit(vectors: torch.Tensor) -> torch.Tensor:
 
 
 class TransformersModel:
-    """A CLIP or SigLIP as an `encode.ImageModel`; on a GPU where torch has one."""
+    """A CLIP or SigLIP as an `contracts.ImageModel`; on a GPU where torch has one."""
 
     def __init__(
         self,

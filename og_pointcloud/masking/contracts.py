@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.errors import OgPointcloudError, SceneError
+from og_pointcloud.masking.crops import Crop, Preprocessing
 
 FEATURES = ("crops", "dense")
 """How the encoder is shown a mask."""
@@ -68,6 +69,28 @@ class MaskEncoder(Protocol):
 
     def embed(self, image: NDArray[np.uint8], masks: NDArray[np.bool_]) -> NDArray[np.float32]:
         """image (H, W, 3) uint8 RGB, masks (M, H, W) bool -> (M, width) float32, L2-normalized rows."""
+        ...
+
+
+class ImageModel(Protocol):
+    """Squares of pixels -> vectors.
+
+    feature_space: the text encoder's. width: of a vector. crops: how masks are best cut out for it. patch: side of the
+    patches that it has vectors of, too, pixels; None without.
+    """
+
+    feature_space: str
+    width: int
+    preprocessing: Preprocessing
+    crops: tuple[Crop, ...]
+    patch: int | None
+
+    def __call__(self, pixels: NDArray[np.float32]) -> NDArray[np.float32]:
+        """(B, width) float32 unit rows of pixels (B, 3, S, S) float32."""
+        ...
+
+    def patches(self, pixels: NDArray[np.float32]) -> NDArray[np.float32]:
+        """(h, w, width) unit vectors of pixels (1, 3, h * patch, w * patch), of a model with a patch."""
         ...
 
 

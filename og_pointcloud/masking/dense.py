@@ -7,18 +7,13 @@ the image is about, is read as MaskCLIP does it (Zhou, Loy and Dai, ECCV 2022): 
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.errors import SceneError
 from og_pointcloud.formats.images import require_cv2, require_pillow
-from og_pointcloud.masking.contracts import MaskEncoder
+from og_pointcloud.masking.contracts import ImageModel, MaskEncoder
 from og_pointcloud.masking.crops import require_masks
-
-if TYPE_CHECKING:
-    from og_pointcloud.masking.encode import ImageModel
 
 SHORTER_SIDE = 2.0
 """The image's shorter side in sides of the square that the model was trained on: patches of CLIP B/16 are then 28 to a

@@ -19,13 +19,13 @@ import os
 from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from og_pointcloud.errors import OgPointcloudError, SceneError
-from og_pointcloud.masking.contracts import MaskEncoder
+from og_pointcloud.masking.contracts import ImageModel, MaskEncoder
 from og_pointcloud.masking.crops import WITH_CONTEXT, Crop, Preprocessing, mask_crops
 from og_pointcloud.masking.dense import DenseEncoder
 from og_pointcloud.models import EncoderFormat, fetched_model, open_session
@@ -48,28 +48,6 @@ OPERATORS = frozenset({
 ENCODER = EncoderFormat("og-image-encoder", 1, GRAPH, OPERATORS, "og-pointcloud export image")
 CROPS_PER_RUN = 16
 """Bounds memory: a run of a large model holds some 100 MB a crop."""
-
-
-class ImageModel(Protocol):
-    """Squares of pixels -> vectors.
-
-    feature_space: the text encoder's. width: of a vector. crops: how masks are best cut out for it. patch: side of the
-    patches that it has vectors of, too, pixels; None without.
-    """
-
-    feature_space: str
-    width: int
-    preprocessing: Preprocessing
-    crops: tuple[Crop, ...]
-    patch: int | None
-
-    def __call__(self, pixels: NDArray[np.float32]) -> NDArray[np.float32]:
-        """(B, width) float32 unit rows of pixels (B, 3, S, S) float32."""
-        ...
-
-    def patches(self, pixels: NDArray[np.float32]) -> NDArray[np.float32]:
-        """(h, w, width) unit vectors of pixels (1, 3, h * patch, w * patch), of a model with a patch."""
-        ...
 
 
 def open_encoder(name: str | os.PathLike[str], features: str = "crops") -> MaskEncoder:
