@@ -51,6 +51,11 @@ def capture(tmp_path):
     return folder, world
 
 
+def refused(folder, says):
+    with pytest.raises(SceneError, match=says):
+        read_capture(folder)
+
+
 def edit(folder, change):
     content = json.loads((folder / "transforms.json").read_text())
     change(content)
@@ -220,8 +225,7 @@ def test_a_small_image_beside_full_masks_is_enlarged(capture):
 def test_masks_of_another_shape_are_refused(capture):
     folder, world = capture
     write_masks(folder, world.names, size=(HEIGHT, WIDTH))
-    with pytest.raises(SceneError, match=r"view 'frame_00': the masks are 48x64 pixels, its camera 64x48; expected"):
-        read_capture(folder)
+    refused(folder, r"view 'frame_00': the masks are 48x64 pixels, its camera 64x48; expected")
 
 
 def test_an_image_of_another_shape_is_refused_when_read(capture):
@@ -267,8 +271,7 @@ def test_equal_stems_in_two_folders_are_told_apart_by_folder(tmp_path):
 def test_an_image_listed_twice_is_refused(capture):
     folder, _ = capture
     edit(folder, lambda content: content["frames"].append(content["frames"][0]))
-    with pytest.raises(SceneError, match="two views are called 'frame_00'"):
-        read_capture(folder)
+    refused(folder, "two views are called 'frame_00'")
 
 
 def test_dots_in_names_are_no_suffix(capture):
@@ -354,8 +357,7 @@ def test_points_of_colmap_go_with_its_own_poses_alone(tmp_path):
     (tmp_path / "points.ply").unlink()
     write_colmap_binary(tmp_path / "sparse/0", world)
     write_transforms(tmp_path, world)
-    with pytest.raises(SceneError, match=r"points3D may be another .* remove transforms.json, so that COLMAP's poses"):
-        read_capture(tmp_path)
+    refused(tmp_path, r"points3D may be another .* remove transforms.json, so that COLMAP's poses")
     (tmp_path / "transforms.json").unlink()
     np.testing.assert_allclose(read_capture(tmp_path).points.xyz_world, world.xyz, atol=1e-5)
 
@@ -366,8 +368,7 @@ def test_several_pcds_are_ambiguous(capture):
     write_transforms(folder, world)
     (folder / "a.pcd").touch()
     (folder / "b.pcd").touch()
-    with pytest.raises(SceneError, match=r"has 2 .pcd files \(a.pcd, b.pcd, ...\); expected one: name the one"):
-        read_capture(folder)
+    refused(folder, r"has 2 .pcd files \(a.pcd, b.pcd, ...\); expected one: name the one")
 
 
 @pytest.mark.parametrize("path", ["../points.ply", "/tmp/points.ply", "sub/../../points.ply", "absent.ply"])
@@ -375,18 +376,14 @@ def test_ply_file_path_stays_inside(capture, path):
     folder, _ = capture
     shutil.copy(folder / "points.ply", folder.parent / "points.ply")
     edit(folder, lambda content: content.update(ply_file_path=path))
-    with pytest.raises(
-        SceneError, match=r"ply_file_path is '.*', which is no file inside the capture folder; .*--gaussians"
-    ):
-        read_capture(folder)
+    refused(folder, r"ply_file_path is '.*', which is no file inside the capture folder; .*--gaussians")
 
 
 def test_no_geometry_names_all_ways(capture):
     folder, world = capture
     (folder / "points.ply").unlink()
     write_transforms(folder, world)
-    with pytest.raises(SceneError, match=r"no geometry; expected points.ply .*points3D.*--gaussians"):
-        read_capture(folder)
+    refused(folder, r"no geometry; expected points.ply .*points3D.*--gaussians")
 
 
 # Errors at the door.
@@ -400,34 +397,27 @@ def test_no_folder(tmp_path):
 def test_no_pose_file(capture):
     folder, _ = capture
     (folder / "transforms.json").unlink()
-    with pytest.raises(SceneError, match=r"has no pose file; expected transforms.json .* sparse/0"):
-        read_capture(folder)
+    refused(folder, r"has no pose file; expected transforms.json .* sparse/0")
 
 
 def test_no_masks_at_all(capture):
     folder, _ = capture
     (folder / "mask_features.npz").unlink()
-    with pytest.raises(SceneError, match=r"has masks/ but no mask_features.npz; expected"):
-        read_capture(folder)
+    refused(folder, r"has masks/ but no mask_features.npz; expected")
     shutil.rmtree(folder / "masks")
-    with pytest.raises(SceneError, match=r"has no masks at all; expected masks/<image stem>.png .*language_features"):
-        read_capture(folder)
+    refused(folder, r"has no masks at all; expected masks/<image stem>.png .*language_features")
 
 
 def test_image_without_mask(capture):
     folder, _ = capture
     (folder / "masks/frame_01.png").unlink()
-    with pytest.raises(
-        SceneError, match=r"1 of 3 posed images have no mask: .*masks lacks frame_01.png; .*all-zero mask"
-    ):
-        read_capture(folder)
+    refused(folder, r"1 of 3 posed images have no mask: .*masks lacks frame_01.png; .*all-zero mask")
 
 
 def test_image_without_features(capture):
     folder, world = capture
     write_features(folder, {name: np.ones((2, 8)) for name in world.names[:2]})
-    with pytest.raises(SceneError, match=r"lacks 1 of 3 arrays, 'frame_02' first \(it has frame_00, frame_01"):
-        read_capture(folder)
+    refused(folder, r"lacks 1 of 3 arrays, 'frame_02' first \(it has frame_00, frame_01")
 
 
 def test_mask_id_without_feature_row(capture):
@@ -441,23 +431,20 @@ def test_mask_id_without_feature_row(capture):
 def test_features_of_two_widths(capture):
     folder, world = capture
     write_masks(folder, world.names, replaced={world.names[2]: np.ones((2, 9))})
-    with pytest.raises(SceneError, match=r"2 widths \[8, 9\] \(e.g. frame_02: 9\)"):
-        read_capture(folder)
+    refused(folder, r"2 widths \[8, 9\] \(e.g. frame_02: 9\)")
 
 
 def test_nan_features(capture):
     folder, world = capture
     write_masks(folder, world.names, replaced={world.names[2]: np.full((2, 8), np.nan)})
-    with pytest.raises(SceneError, match="view 'frame_02': the feature of mask 1 holds NaN"):
-        read_capture(folder)
+    refused(folder, "view 'frame_02': the feature of mask 1 holds NaN")
 
 
 @pytest.mark.parametrize("values", [np.ones(8), np.ones((2, 2, 2)), np.ones((2, 8), int)])
 def test_features_of_another_kind(capture, values):
     folder, world = capture
     write_masks(folder, world.names, replaced={world.names[2]: values})
-    with pytest.raises(SceneError, match=r"'frame_02': features are .*; expected floats of shape \(masks, width\)"):
-        read_capture(folder)
+    refused(folder, r"'frame_02': features are .*; expected floats of shape \(masks, width\)")
 
 
 @pytest.mark.parametrize(
@@ -470,8 +457,7 @@ def test_features_of_another_kind(capture, values):
 def test_colour_masks_are_refused(capture, pixels, kind):
     folder, _ = capture
     write_image(folder / "masks/frame_01.png", pixels)
-    with pytest.raises(SceneError, match=rf"frame_01.png is a {kind}; expected a gray PNG of 8 or 16 bit"):
-        read_capture(folder)
+    refused(folder, rf"frame_01.png is a {kind}; expected a gray PNG of 8 or 16 bit")
 
 
 def png_with_header(width, height, bit_depth, color_type):
@@ -546,8 +532,7 @@ def test_damaged_features_are_refused(capture):
     broken = bytearray(whole)
     broken[200] ^= 0xFF
     file.write_bytes(bytes(broken))
-    with pytest.raises(SceneError, match=r"cannot be read as an .npz of plain arrays .*CRC"):
-        read_capture(folder)
+    refused(folder, r"cannot be read as an .npz of plain arrays .*CRC")
 
 
 def test_damaged_compressed_features_are_refused(capture):
@@ -560,23 +545,20 @@ def test_damaged_compressed_features_are_refused(capture):
     broken = bytearray(file.read_bytes())
     broken[60:300] = b"\xff" * 240
     file.write_bytes(bytes(broken))
-    with pytest.raises(SceneError, match=r"cannot be read as an .npz of plain arrays .*decompressing"):
-        read_capture(folder)
+    refused(folder, r"cannot be read as an .npz of plain arrays .*decompressing")
 
 
 def test_a_features_bomb_is_refused(capture, monkeypatch):
     folder, _ = capture
     monkeypatch.setattr("og_pointcloud.formats.mask_files.MAX_FEATURE_BYTES", 500)
-    with pytest.raises(SceneError, match=r"unpacks to \d+ bytes; expected at most 500"):
-        read_capture(folder)
+    refused(folder, r"unpacks to \d+ bytes; expected at most 500")
 
 
 def test_blender_without_images_says_what_is_missing(capture):
     folder, _ = capture
     shutil.rmtree(folder / "images")
     edit(folder, lambda content: [content.pop(key) for key in ("w", "h")])
-    with pytest.raises(SceneError, match=r"image 'images/frame_00.png' is not found, and the pose file has no w and h"):
-        read_capture(folder)
+    refused(folder, r"image 'images/frame_00.png' is not found, and the pose file has no w and h")
 
 
 def test_without_opencv_the_extra_is_named(capture, monkeypatch):
