@@ -362,7 +362,7 @@ def train(crops: Crops, words: Words, steps: int, seed: int) -> tuple[TextEncode
     """Both encoders. A mask's vector is in training what it is in use, the mean of its crops' vectors."""
     torch.manual_seed(seed)
     rng = np.random.default_rng([seed, 1])
-    text = TextEncoder(open_tokenizer(json.dumps(tokenizer_json(words.merges)).encode(), CONTEXT))
+    text = TextEncoder(open_tokenizer(json.dumps(tokenizer_json(words.merges)).encode(), CONTEXT, 1 << 16))
     image = ImageEncoder().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     optimizer = torch.optim.AdamW([*text.parameters(), *image.parameters()], weight_decay=0.02)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, LEARNING_RATE, total_steps=steps, pct_start=0.1)

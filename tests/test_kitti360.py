@@ -99,7 +99,7 @@ def test_several_drives_and_several_clouds_are_refused(tmp_path):
     write_kitti360(tmp_path)
     static = tmp_path / f"data_3d_semantics/train/{DRIVE}/static"
     (static / "000254_000400.ply").write_bytes((static / "000250_000253.ply").read_bytes())
-    with pytest.raises(SceneError, match=r"2 static clouds .*name the one to use"):
+    with pytest.raises(SceneError, match=r"2 static clouds, .*name the one to use"):
         read_geometry(tmp_path, read_poses(tmp_path))
     write_kitti360(tmp_path, drive="2013_05_28_drive_0002_sync")
     with pytest.raises(SceneError, match=r"images of 2 drives with poses .*expected one"):

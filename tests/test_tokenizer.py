@@ -29,7 +29,7 @@ NASTY = [
 
 
 def tokenizer_of(description, context_length=10**6):
-    return open_tokenizer(json.dumps(description).encode(), context_length)
+    return open_tokenizer(json.dumps(description).encode(), context_length, 1 << 20)
 
 
 @pytest.fixture(scope="module")
@@ -214,7 +214,7 @@ def test_what_tokenizers_does_not_read_is_a_plain_error(change):
 @pytest.mark.parametrize("data", [b"", b"[]", b"[" * 100_000, b'{"model": 3}', b"\xff\xfe"])
 def test_bytes_that_are_no_description(data):
     with pytest.raises(ValueError, match=r".+"):
-        open_tokenizer(data, 77)
+        open_tokenizer(data, 77, 1 << 20)
 
 
 # Against the libraries

@@ -47,7 +47,7 @@ from og_pointcloud.formats.mask_files import FEATURES_NAME, MASKS_FOLDER, MaskLa
 from og_pointcloud.formats.nerfstudio import TRANSFORMS_NAMES, read_transforms
 from og_pointcloud.formats.photogrammetry import find_photogrammetry, read_photogrammetry
 from og_pointcloud.formats.points import read_points
-from og_pointcloud.formats.poses import PosedFrames, PosedImage, in_local_frame, in_pinholes
+from og_pointcloud.formats.poses import PosedFrames, PosedImage, in_local_frame, in_pinholes, the_only
 from og_pointcloud.formats.repairs import Repair, read_repairs, repaired_images, repaired_layers
 from og_pointcloud.formats.rgbd import find_mesh, read_rgbd
 from og_pointcloud.scene import NOT_SEEN, Camera, CutMasks, Points, Scene, View
@@ -325,15 +325,8 @@ def _find_cloud(capture: Path) -> Path | None:
     for name in CLOUD_NAMES:
         if (capture / name).is_file():
             return capture / name
-    pcds = sorted(capture.glob("*.pcd"))
-    if len(pcds) > 1:
-        raise SceneError(
-            f"{capture} has {len(pcds)} .pcd files ({pcds[0].name}, {pcds[1].name}, ...); expected one: name the one "
-            "to use (--gaussians)"
-        )
-    if pcds:
-        return pcds[0]
-    return latest_iteration(capture) or find_mesh(capture) or find_static_cloud(capture)
+    pcd = the_only(capture, "*.pcd", ".pcd files")
+    return pcd or latest_iteration(capture) or find_mesh(capture) or find_static_cloud(capture)
 
 
 def fuse_capture(folder: str | Path, depth_unit: float | None = None) -> FusedCloud:

@@ -27,6 +27,7 @@ from og_pointcloud.formats.poses import (
     read_numbers,
     read_text,
     rigid,
+    the_only,
 )
 
 CALIBRATION = Path("calibration/perspective.txt")
@@ -54,13 +55,7 @@ def read_kitti360(folder: Path) -> Iterator[RecordedFrame]:
 
 def find_static_cloud(folder: Path) -> Path | None:
     """The accumulated cloud, None where there is none; SceneError for several, of which each has some of the frames."""
-    clouds = sorted(folder.glob("data_3d_semantics/*/*/static/*.ply"))
-    if len(clouds) > 1:
-        raise SceneError(
-            f"{folder} has {len(clouds)} static clouds ({clouds[0].name}, {clouds[1].name}, ...), each of some frames; "
-            "expected one: name the one to use (--gaussians)"
-        )
-    return clouds[0] if clouds else None
+    return the_only(folder, "data_3d_semantics/*/*/static/*.ply", "static clouds, each of some frames,")
 
 
 def _images_folder(folder: Path, drive: str, camera: str) -> Path:

@@ -205,6 +205,18 @@ def numbered_images(folder: Path) -> list[Path]:
     return numbered(file for file in found if file.suffix in IMAGE_SUFFIXES and file.is_file())
 
 
+def the_only(folder: Path, pattern: str, what: str) -> Path | None:
+    """The one file of a folder that fits the pattern, None without any; SceneError, which calls them ``what``, for
+    several."""
+    files = sorted(folder.glob(pattern))
+    if len(files) > 1:
+        raise SceneError(
+            f"{folder} has {len(files)} {what} ({files[0].name}, {files[1].name}, ...); expected one: name the one to "
+            "use (--gaussians)"
+        )
+    return next(iter(files), None)
+
+
 def read_json(file: Path, most: int = MAX_TEXT_BYTES) -> Any:
     """What a JSON file of bounded size holds, which takes up to twenty times its bytes. SceneError where it is none."""
     text = read_text(file, most)

@@ -97,13 +97,9 @@ def _tokens(loaded: LoadedModel, words: Sequence[str]) -> list[torch.Tensor]:
         raise SceneError(f"{loaded.folder} has no tokenizer.json, which words need: fetch the whole model again")
     config = getattr(loaded.model.config, "detector_config", loaded.model.config).text_config
     try:
-        tokenizer = open_tokenizer(file.read_bytes(), config.max_position_embeddings)
+        tokenizer = open_tokenizer(file.read_bytes(), config.max_position_embeddings, config.vocab_size)
     except ValueError as error:
         raise SceneError(f"{file} cannot be used ({error}): fetch the model again") from None
-    if tokenizer.highest_id >= config.vocab_size:
-        raise SceneError(
-            f"{file} gives ids up to {tokenizer.highest_id}, the model has {config.vocab_size}: fetch both"
-        )
     return [torch.tensor([tokenizer(word)], device=loaded.device) for word in words]
 
 

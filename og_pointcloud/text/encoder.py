@@ -79,14 +79,9 @@ class TextEncoder:
         self.word_bank = _word_bank(files[WORD_BANK], self.width, where) if WORD_BANK in files else None
         self._graph = files[GRAPH]
         try:
-            self._tokenizer = open_tokenizer(files[TOKENIZER], self.context_length)
+            self._tokenizer = open_tokenizer(files[TOKENIZER], self.context_length, self.manifest["vocabulary"])
         except ValueError as error:
             raise OgPointcloudError(f"{where}: {TOKENIZER} cannot be used ({error}): {ENCODER.remake}") from None
-        if self._tokenizer.highest_id >= self.manifest["vocabulary"]:
-            raise OgPointcloudError(
-                f"{where}: {TOKENIZER} gives ids up to {self._tokenizer.highest_id}, the encoder has "
-                f"{self.manifest['vocabulary']} tokens: they do not belong together; {ENCODER.remake}"
-            )
         self._remembered: dict[str, NDArray[np.float32]] = {}
 
     def __call__(self, names: Sequence[str]) -> NDArray[np.float32]:

@@ -59,20 +59,26 @@ class Tokenizer(Protocol):
         ...
 
 
-def open_tokenizer(data: bytes, context_length: int) -> Tokenizer:
+def open_tokenizer(data: bytes, context_length: int, vocabulary: int) -> Tokenizer:
     """A tokenizer.json that may come from anywhere. ValueError says what is damaged or refused.
 
-    MissingExtraError where it is not CLIP's and the ``tokenizers`` package is absent.
+    vocabulary: tokens of the model that takes its ids. MissingExtraError where it is not CLIP's and the ``tokenizers``
+    package is absent.
     """
     try:
         description = json.loads(data)
-        if _is_clip(description):
-            return ClipTokenizer(description, context_length)
-        _check_other(description)
+        tokenizer = ClipTokenizer(description, context_length) if _is_clip(description) else None
+        if tokenizer is None:
+            _check_other(description)
     except (KeyError, TypeError, AttributeError, IndexError, RecursionError) as error:
         what = f"{type(error).__name__}: {error!s:.80}"
         raise ValueError(f"it is not in the form of a tokenizer.json ({what})") from None
-    return OtherTokenizer(data, context_length)
+    tokenizer = tokenizer or OtherTokenizer(data, context_length)
+    if tokenizer.highest_id >= vocabulary:
+        raise ValueError(
+            f"it gives ids up to {tokenizer.highest_id}, the model has {vocabulary} tokens: they do not belong together"
+        )
+    return tokenizer
 
 
 def _is_clip(description: dict[str, Any]) -> bool:
