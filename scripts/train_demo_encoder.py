@@ -42,7 +42,7 @@ from onnx import TensorProto, helper, numpy_helper
 from torch import nn
 from transformers import CLIPTokenizer
 
-from og_pointcloud.masking.contracts import LEVELS
+from og_pointcloud.masking.contracts import LEVELS, ImageModel
 from og_pointcloud.masking.crops import Crop, Preprocessing, mask_crops
 from og_pointcloud.masking.encode import DEMO_FOLDER, DEMO_SPACE, open_encoder
 from og_pointcloud.masking.levels import settled
@@ -459,10 +459,10 @@ def export(text: TextEncoder, image: ImageEncoder, words: Words, folder: Path) -
     write_image_encoder(folder / "image", rounded, rounded.graph(), about)
 
 
-class RoundedImageModel:
+class RoundedImageModel(ImageModel):
     """The image encoder as it is stored: norms folded into the convolutions, these in 8 bits, a scale a channel."""
 
-    feature_space, width, preprocessing, crops = DEMO_SPACE, WIDTH, PREPROCESSING, CROPS
+    feature_space, width, preprocessing, crops, patch = DEMO_SPACE, WIDTH, PREPROCESSING, CROPS, None
 
     def __init__(self, image: ImageEncoder) -> None:
         self.layers: list[tuple[NDArray[np.int8], NDArray[np.float32], NDArray[np.float32]]] = []
@@ -474,6 +474,10 @@ class RoundedImageModel:
             scale = (np.abs(weight).max(axis=(1, 2, 3)) / 127).astype(np.float32)
             self.layers.append((np.rint(weight / scale[:, None, None, None]).astype(np.int8), scale, offset))
         self.head = image.head.weight.detach().numpy().T, image.head.bias.detach().numpy()
+
+    def patches(self, pixels: NDArray[np.float32]) -> NDArray[np.float32]:
+        """It has none."""
+        raise NotImplementedError
 
     @torch.no_grad()
     def __call__(self, pixels: NDArray[np.float32]) -> NDArray[np.float32]:
