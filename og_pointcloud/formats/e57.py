@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from og_pointcloud.errors import OgPointcloudError, SceneError, naming_extra
+from og_pointcloud.errors import OgPointcloudError, SceneError, first_line, naming_extra
 from og_pointcloud.formats.atomic import write_file
 from og_pointcloud.formats.images import MAX_PIXELS, require_cv2, stated_size
 from og_pointcloud.formats.ply import plain_rows, write_ply
@@ -106,8 +106,7 @@ def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
         except (OgPointcloudError, OSError, MemoryError):
             raise
         except Exception as error:  # libE57's own, and those of its bindings
-            what = (str(error).splitlines() or [""])[0]
-            raise SceneError(f"not a whole E57 file ({what:.200}): copy or export it again") from None
+            raise SceneError(f"not a whole E57 file ({first_line(error)}): copy or export it again") from None
         finally:
             if file is not None:
                 file.close()

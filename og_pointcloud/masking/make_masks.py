@@ -22,7 +22,7 @@ import numpy as np
 
 from og_pointcloud.cloud import UNKNOWN_SPACE
 from og_pointcloud.errors import OgPointcloudError, SceneError
-from og_pointcloud.formats.atomic import locked, replacing
+from og_pointcloud.formats.atomic import locked, replacing, write_file
 from og_pointcloud.formats.images import write_png
 from og_pointcloud.formats.langsplat import LANGUAGE_FEATURES_FOLDER
 from og_pointcloud.formats.mask_files import FEATURES_NAME, MASKS_FOLDER, TRACKS
@@ -243,5 +243,4 @@ def _make_capture_of(capture: Path, target: Path, chosen: Sequence[Photograph]) 
 
 
 def _write_json(path: Path, value: dict[str, Any]) -> None:
-    with replacing(path) as file:
-        file.write(json.dumps(value, indent=1).encode() + b"\n")
+    write_file(path, json.dumps(value, indent=1).encode() + b"\n")
