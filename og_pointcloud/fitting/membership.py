@@ -25,6 +25,7 @@ seen anywhere.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cache, partial
 
@@ -38,8 +39,9 @@ from og_pointcloud.fitting.colors import color_ratios, neighbour_weights
 from og_pointcloud.fitting.grouping import MaskGroups
 from og_pointcloud.fitting.holes import seen_through_holes
 from og_pointcloud.fitting.mask_table import SEEN_THROUGH, MaskTable
+from og_pointcloud.fitting.memory import scratch_like
 from og_pointcloud.fitting.view_votes import ViewVotes
-from og_pointcloud.kernels import njit, prange
+from og_pointcloud.kernels import get_num_threads, njit, prange
 from og_pointcloud.rendering.geometry import Neighbourhood
 from og_pointcloud.rendering.splatting import Gaussians, seen_from
 from og_pointcloud.settings import MembershipSettings
@@ -142,29 +144,38 @@ def without_see_through(
     Returns the table without those weights, and with as much less exposure, of which it keeps what came through holes;
     and their share of all weight. It takes the place of the given one, whose weights and exposure are written over.
     """
-    weights = table.weights
-    kept, lost = np.ones(weights.nnz, np.float32), 0.0
-    for mask, view in enumerate(table.mask_view.tolist()):
-        entries = slice(weights.indptr[mask], weights.indptr[mask + 1])
-        depth, xy = _rays(gaussians.xyz, weights.indices[entries], world_to_camera[view])
-        area = table.mask_pixels[mask] / focal[view] ** 2
-        kept[entries] = _at_front(depth, xy, weights.data[entries], area, settings)
-        lost += float(((1 - kept[entries]) * weights.data[entries]).sum(dtype=np.float64))
+    weights, views = table.weights, len(world_to_camera)
+    first_mask, kept = np.searchsorted(table.mask_view, np.arange(views + 1)), np.ones(weights.nnz, np.float32)
+
+    def lost_in(view: int) -> float:
+        lost = 0.0
+        for mask in range(first_mask[view], first_mask[view + 1]):
+            entries = slice(weights.indptr[mask], weights.indptr[mask + 1])
+            depth, xy = _rays(gaussians.xyz, weights.indices[entries], world_to_camera[view])
+            area = table.mask_pixels[mask] / focal[view] ** 2
+            kept[entries] = _at_front(depth, xy, weights.data[entries], area, settings)
+            lost += float(((1 - kept[entries]) * weights.data[entries]).sum(dtype=np.float64))
+        return lost
+
+    with ThreadPoolExecutor(get_num_threads()) as pool:
+        lost = sum(pool.map(lost_in, range(views)))
     if lost == 0:
         return table, 0.0
     share = lost / float(weights.data.sum(dtype=np.float64))
-    left, through = _exposure_left(
-        np.searchsorted(table.mask_view, np.arange(table.exposure.shape[0] + 1)),
+    left = scratch_like(table.exposure.data, np.float32)
+    through = _exposure_left(
+        first_mask,
         *((matrix.indptr, matrix.indices, matrix.data) for matrix in (weights, table.outside, table.exposure)),
         kept,
         weights.shape[1],
+        left,
     )
     exposure = _scaled(table.exposure, left)
     through = csr_array(through, shape=exposure.shape)
     return replace(table, weights=_scaled(weights, kept), exposure=exposure, through=through), share
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def _rays(xyz, points, pose):  # noqa: ANN001, ANN202
     """Of these points (n,) depth, and (n, 2) place in the image at depth 1."""
     depth, xy = np.empty(len(points)), np.empty((len(points), 2))
@@ -194,7 +205,7 @@ def _at_front(
     return kept
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _object(depth, weight, gap_share, front_share):  # noqa: ANN001, ANN202
     """(begin, end) of the first run of ascending depths with ``front_share`` of the weight, else of the first of all.
 
@@ -214,15 +225,14 @@ def _object(depth, weight, gap_share, front_share):  # noqa: ANN001, ANN202
 
 
 @njit(cache=True)
-def _exposure_left(first_mask, weights, outside, exposure, kept, n):  # noqa: ANN001, ANN202
-    """(entries of exposure,) float32: the part of what a view shows of a point that is not behind its masks' objects;
-    0 exactly where all of it is. And what exposure its masks' holes take away, as data, columns and where rows begin of
-    a sparse matrix."""
+def _exposure_left(first_mask, weights, outside, exposure, kept, n, left):  # noqa: ANN001, ANN202
+    """Writes to ``left`` (entries of exposure,) the part of what a view shows of a point that is not behind its masks'
+    objects, 0 exactly where all of it is. Returns what exposure its masks' holes take away, as data, columns and where
+    rows begin of a sparse matrix."""
     weight_start, weight_index, weight = weights
     outside_start, outside_index, outside_weight = outside
     start, index, exposed = exposure
     shown, hidden, behind_hole = np.zeros(n), np.zeros(n), np.zeros(n)
-    left = np.empty(len(index), np.float32)
     most, end = np.sum((kept > 0) & (kept < 1)), 0
     through, through_index, through_start = np.empty(most, np.float32), np.empty(most, np.int32), start.copy()
     for view in range(len(first_mask) - 1):
@@ -242,7 +252,7 @@ def _exposure_left(first_mask, weights, outside, exposure, kept, n):  # noqa: AN
                 end += 1
             shown[g], hidden[g], behind_hole[g] = 0.0, 0.0, 0.0
         through_start[view + 1] = end
-    return left, (through[:end], through_index[:end], through_start)
+    return through[:end], through_index[:end], through_start
 
 
 def _scaled(matrix: csr_array, factor: NDArray[np.float32]) -> csr_array:
@@ -316,25 +326,30 @@ def _support(
 def _by_point(matrix: csr_array, low: int = 0, high: int | None = None) -> _ByPoint:
     """Columns low to high of a matrix: (start, rows, data), rows ascending."""
     high = matrix.shape[1] if high is None else high
-    return _columns(matrix.indptr, matrix.indices, matrix.data, low, high)
+    start = _column_starts(matrix.indices, low, high)
+    rows, values = np.empty(start[-1], np.int32), np.empty(start[-1], np.float32)
+    _fill_columns(matrix.indptr, matrix.indices, matrix.data, low, high, start[:-1].copy(), rows, values)
+    return start, rows, values
 
 
 @njit(cache=True)
-def _columns(indptr, indices, data, low, high):  # noqa: ANN001, ANN202
+def _column_starts(indices, low, high):  # noqa: ANN001, ANN202
     start = np.zeros(high - low + 1, np.int64)
     for e in range(len(indices)):
         if low <= indices[e] < high:
             start[indices[e] - low + 1] += 1
-    start = np.cumsum(start)
-    place = start[:-1].copy()
-    rows, values = np.empty(start[-1], np.int32), np.empty(start[-1], np.float32)
+    return np.cumsum(start)
+
+
+@njit(cache=True)
+def _fill_columns(indptr, indices, data, low, high, place, rows, values):  # noqa: ANN001, ANN202
+    """Writes to ``rows`` and ``values``, column by column. place: where each column begins, changed meanwhile."""
     for row in range(len(indptr) - 1):
         for e in range(indptr[row], indptr[row + 1]):
             if low <= indices[e] < high:
                 p = place[indices[e] - low]
                 rows[p], values[p] = row, data[e]
                 place[indices[e] - low] = p + 1
-    return start, rows, values
 
 
 @njit(cache=True, parallel=True)

@@ -33,8 +33,8 @@ SUFFIX = ".kept.npy"
 """Ends the names of all files of a work folder, so that files of others are left alone."""
 ALIGNED = 64
 """Arrays begin at multiples of so many bytes of a file."""
-OWN_PAGES = 1 << 17
-"""Bytes from which an array that is held gets memory of its own from the system."""
+BLOCK = 1 << 25
+"""Bytes of memory that arrays which are held are packed into: the system's own, however many of them there are."""
 
 Arrays = tuple[NDArray[Any], ...]
 
@@ -78,6 +78,7 @@ class WorkFolder:
         self._pending: dict[str, Arrays] | None = None
         self._bytes_pending, self._most_pending, self._pending_until = 0, 0.0, 0.0
         self._sound: set[str] = set()
+        self._room = np.empty(0, np.uint8)
         self._guard = threading.Lock()
 
     @classmethod
@@ -149,7 +150,7 @@ class WorkFolder:
         with self._guard:
             if self._pending is not None:
                 self._bytes_pending -= sum(array.nbytes for array in self._pending.get(label, ()))
-                self._pending[label] = arrays = tuple(map(_on_own_pages, arrays))
+                self._pending[label] = arrays = tuple(map(self._packed, arrays))
                 self._bytes_pending += sum(array.nbytes for array in arrays)
                 if time.monotonic() > self._pending_until or self._bytes_pending > self._most_pending:
                     for waiting, held in self._pending.items():
@@ -159,11 +160,23 @@ class WorkFolder:
         self._write(label, arrays)
         return arrays
 
+    def _packed(self, array: NDArray[Any]) -> NDArray[Any]:
+        """A copy in a block of memory that goes back to the system once all arrays in it are let go: pieces of the heap
+        would not, and a table put together from such pieces would be in memory twice."""
+        if array.nbytes > len(self._room):
+            self._room = np.empty(max(BLOCK, array.nbytes), np.uint8)
+        copy = self._room[: array.nbytes].view(array.dtype).reshape(array.shape)
+        self._room = self._room[array.nbytes + -array.nbytes % ALIGNED :]
+        copy[...] = array
+        return copy
+
     def forget(self, name: str, key: str) -> None:
         """Let go of arrays that are held in memory; those in a file stay."""
         with self._guard:
             if self._pending:
                 self._pending.pop(f"{name}-{key}{SUFFIX}", None)
+            if not self._pending:
+                self._room = np.empty(0, np.uint8)
 
     def place(self) -> Path:
         """The folder itself, also where it is a temporary one."""
@@ -199,17 +212,6 @@ class WorkFolder:
             self._sound.add(label)
             self.found += 1
         return arrays
-
-
-def _on_own_pages(array: NDArray[Any]) -> NDArray[Any]:
-    """A copy of a large array whose memory goes back to the system when it is let go: pieces of the heap would not, and
-    a table put together from such pieces would be in memory twice."""
-    if array.nbytes < OWN_PAGES:
-        return array
-    private = {"flags": mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS} if hasattr(mmap, "MAP_PRIVATE") else {}
-    copy = np.frombuffer(mmap.mmap(-1, array.nbytes, **private), array.dtype).reshape(array.shape)
-    copy[...] = array
-    return copy
 
 
 class _Summed:

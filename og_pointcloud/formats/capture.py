@@ -253,18 +253,18 @@ def _layer_of(face: Face, layer: MaskLayer, view: str) -> MaskLayer:
     size = scaled.camera.width, scaled.camera.height
     if not face.name:
         return MaskLayer(size, layer.features, lambda: scaled.mask_ids(layer.read()), layer.tracks)
-    used = np.unique(scaled.mask_ids(layer.read()))
-    used = used[used >= 0]
-    if len(used) and used[-1] >= len(layer.features):
+    ids = scaled.mask_ids(layer.read())
+    if (last := ids.max(initial=-1)) >= len(layer.features):
         raise SceneError(
-            f"view '{view}': mask id {used[-1] + 1} has no feature row (the features file has {len(layer.features)}): "
+            f"view '{view}': mask id {last + 1} has no feature row (the features file has {len(layer.features)}): "
             "write one feature row per mask id"
         )
+    used = np.flatnonzero(np.bincount(ids[ids >= 0]))
     row_of_id = np.full(len(layer.features) + 2, -1, np.int32)  # the last two serve NOT_SEEN and -1
     row_of_id[NOT_SEEN] = NOT_SEEN
     row_of_id[used] = np.arange(len(used), dtype=np.int32)
     tracks = None if layer.tracks is None else layer.tracks[used]
-    cut = CutMasks(posixpath.dirname(view), used.astype(np.int64))
+    cut = CutMasks(posixpath.dirname(view), used)
     return MaskLayer(size, layer.features[used], lambda: row_of_id[scaled.mask_ids(layer.read())], tracks, cut)
 
 

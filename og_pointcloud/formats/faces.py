@@ -78,8 +78,8 @@ class Face:
         expected = (self.whole.height, self.whole.width)
         if values.shape != expected:
             raise SceneError(f"the map is {values.shape}; expected the camera's {expected} (rows, columns)")
-        nearest = _nearest(self._key)
-        return np.where(nearest < 0, values.dtype.type(otherwise), values.reshape(-1)[nearest])
+        # Where there is none, -1: the last.
+        return np.append(values, values.dtype.type(otherwise)).take(_nearest(self._key), mode="wrap")
 
     def image(self, rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """(H, W, 3) uint8 of this view, linear, black where the lens saw nothing. rgb: (h, w, 3), the whole image."""

@@ -75,7 +75,8 @@ def neighbourhood(xyz: NDArray[np.float32], settings: GeometrySettings) -> Neigh
 
 def near_plane(xyz: NDArray[np.float32], cameras: Iterable[Camera]) -> float:
     """Depth of the near plane: a share of the median depth at which cameras see the cloud. Never 0."""
-    depths = [_depths(xyz[:: 1 + len(xyz) // 20_000], camera) for camera in cameras]
+    sample = xyz[:: 1 + len(xyz) // 20_000].astype(np.float64)  # once for all cameras
+    depths = [_depths(sample, camera) for camera in cameras]
     front = np.concatenate([depth[depth > 0] for depth in depths])
     return NEAR_SHARE * float(np.median(front)) if len(front) else 1e-6
 
@@ -161,5 +162,5 @@ def isotropic(points: Points, spacing: NDArray[np.float32], scale: float, opacit
     return Gaussians(points.xyz, size, rotation, np.full(n, opacity, np.float32))
 
 
-def _depths(xyz: NDArray[np.float32], camera: Camera) -> NDArray[np.float64]:
+def _depths(xyz: NDArray[np.floating], camera: Camera) -> NDArray[np.float64]:
     return xyz @ camera.world_to_camera[2, :3] + camera.world_to_camera[2, 3]

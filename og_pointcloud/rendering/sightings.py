@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from og_pointcloud.kernels import get_num_threads, njit, prange
-from og_pointcloud.rendering.splatting import CUTOFFS, TILE, Gaussians, binned_splats, dim, tile_buffer
+from og_pointcloud.rendering.splatting import BATCH, CUTOFFS, SPLAT, TILE, Gaussians, binned_splats, dim, tile_buffer
 from og_pointcloud.scene import NOT_SEEN, Camera
 
 LEAST_OPEN = 0.02
@@ -103,31 +103,53 @@ def _see(binned, size, asked, log2_least, workers, seen):  # noqa: ANN001, ANN20
     has been drawn: so points are taken by the depth of their surface, splats by their own.
     """
     (splats, starts, members, columns), (open_, u, v) = binned, seen
-    tiles, deepest = len(starts) - 1, 0
-    for tile in range(tiles):
-        deepest = max(deepest, starts[tile + 1] - starts[tile])
+    tiles = len(starts) - 1
+    first, points = _centres(splats, size, columns, tiles, asked)
     for worker in prange(workers):
-        light = tile_buffer()
-        surface, point = np.empty(deepest, np.float32), np.empty(deepest, np.int32)
+        light, batch = tile_buffer(), np.empty(BATCH, SPLAT)
         for tile in range(worker, tiles, workers):
             left, top = tile % columns * TILE, tile // columns * TILE
-            count = 0
-            for k in range(starts[tile], starts[tile + 1]):
-                s = splats[members[k]]
-                inside = left <= s.u < min(left + TILE, size[0]) and top <= s.v < min(top + TILE, size[1])
-                if inside and asked[s.gaussian]:
-                    surface[count], point[count] = s.surface, members[k]
-                    count += 1
+            of_tile = points[first[tile] : first[tile + 1]]
+            surface = np.empty(len(of_tile), np.float32)
+            for k in range(len(of_tile)):
+                surface[k] = splats[of_tile[k]].surface
             light[:] = np.float32(1)
-            drawn = starts[tile]
-            for q in np.argsort(surface[:count]):
-                while drawn < starts[tile + 1] and splats[members[drawn]].depth < surface[q]:
-                    dim(splats[members[drawn]], left, top, log2_least, light)
+            drawn = fetched = starts[tile]
+            for q in np.argsort(surface):
+                while drawn < starts[tile + 1]:
+                    if drawn == fetched:  # they lie all over memory: fetched at once, they do not wait for each other
+                        fetched = min(drawn + BATCH, starts[tile + 1])
+                        for k in range(drawn, fetched):
+                            batch[k % BATCH] = splats[members[k]]
+                    if not batch[drawn % BATCH]["depth"] < surface[q]:
+                        break
+                    dim(batch[drawn % BATCH], left, top, log2_least, light)
                     drawn += 1
-                s = splats[point[q]]
+                s = splats[of_tile[q]]
                 g = s.gaussian
                 reaches = light[(int(s.v) - top) * TILE + int(s.u) - left]
                 open_[g], u[g], v[g] = reaches if reaches >= LEAST_OPEN else np.float32(0), s.u, s.v
+
+
+@njit(cache=True, nogil=True)
+def _centres(splats, size, columns, tiles, asked):  # noqa: ANN001, ANN202
+    """(first, rows): of splats whose points are asked, those with their centre in tile t are rows[first[t] :
+    first[t + 1]], in their order."""
+    tile_of = np.empty(len(splats), np.int32)
+    first = np.zeros(tiles + 1, np.int64)
+    for i in range(len(splats)):
+        s = splats[i]
+        inside = 0 <= s.u < size[0] and 0 <= s.v < size[1] and asked[s.gaussian]
+        tile_of[i] = int(s.v) // TILE * columns + int(s.u) // TILE if inside else -1
+        if inside:
+            first[tile_of[i] + 1] += 1
+    first = np.cumsum(first)
+    fill, rows = first[:-1].copy(), np.empty(first[-1], np.int32)
+    for i in range(len(splats)):
+        if tile_of[i] >= 0:
+            rows[fill[tile_of[i]]] = i
+            fill[tile_of[i]] += 1
+    return first, rows
 
 
 @njit(cache=True, nogil=True)

@@ -189,10 +189,9 @@ def binned_splats(
     seen_by = camera.world_to_camera, intrinsics, (camera.width, camera.height), float(near)
     rows = np.flatnonzero(_may_show(shapes[:2], seen_by, cutoffs))
     splats = _records(len(rows))
-    keys = _project(rows, shapes, seen_by, cutoffs, splats, area)
-    keys = np.sort(keys[keys != _CULLED])
+    order = _ascending(_project(rows, shapes, seen_by, cutoffs, splats, area))
     # In order of depth in memory too: those of a tile are then read from front to back.
-    splats = _in_order(splats, (keys & np.uint64(0xFFFFFFFF)).astype(np.int32), _records(len(keys)))
+    splats = _in_order(splats, order, _records(len(order)))
     columns = -(-camera.width // TILE)
     tiles = columns * -(-camera.height // TILE)
     starts, members = _bin(splats, columns, tiles, cutoffs, get_num_threads())
@@ -206,7 +205,7 @@ def _records(count: int) -> NDArray[Any]:
     return room[ahead : ahead + count * SPLAT.itemsize].view(SPLAT)
 
 
-_CULLED = np.uint64(0xFFFFFFFFFFFFFFFF)
+_CULLED = np.uint32(0xFFFFFFFF)
 SPLAT = np.dtype(
     [
         ("u", np.float64),  # centre, px
@@ -281,10 +280,8 @@ def _may_show(shapes, seen_by, cutoffs):  # noqa: ANN001, ANN202
 @njit(cache=True, parallel=True, nogil=True, error_model="numpy")
 def _project(rows, shapes, seen_by, cutoffs, splats, area):  # noqa: ANN001, ANN202
     """EWA projection in float64 of the Gaussians ``rows``, ascending: writes their splats (rows,) and area (n,), the
-    weight in pixels if nothing were in front, or (0,) if it is not asked for; returns depth keys (rows,) uint64.
-
-    A key is the float32 depth's bits above the splat: sorting keys sorts by depth, ties by Gaussian. Those without a
-    pixel have the key _CULLED.
+    weight in pixels if nothing were in front, or (0,) if it is not asked for; returns keys (rows,) uint32: the bits of
+    the float32 depth, which is positive, and so in its order; _CULLED of those without a pixel.
     """
     keys = np.full(len(rows), _CULLED)
     (xyz, scale, rotation, opacity, thickness), (pose, intrinsics, size, near) = shapes, seen_by
@@ -312,8 +309,26 @@ def _project(rows, shapes, seen_by, cutoffs, splats, area):  # noqa: ANN001, ANN
         s.x0, s.x1, s.y0, s.y1, s.gaussian = int(x0), int(x1), int(y0), int(y1), g
         if len(area):
             area[g] = 2 * np.pi * np.sqrt(det) * (sigma - cutoffs.alpha_min)  # the integral of alpha over that ellipse
-        keys[i] = (np.uint64(np.float32(depth).view(np.uint32)) << np.uint64(32)) | np.uint64(i)
+        keys[i] = np.float32(depth).view(np.uint32)
     return keys
+
+
+@njit(cache=True, nogil=True)
+def _ascending(keys):  # noqa: ANN001, ANN202
+    """Rows of keys from the least up, equal ones as they come, without _CULLED: by 11 bits at a time, the last first,
+    a quarter of the time of a sort by comparison."""
+    order = np.flatnonzero(keys != _CULLED).astype(np.int32)
+    for shift in (0, 11, 22):
+        place = np.zeros(2049, np.int64)
+        for i in order:
+            place[(keys[i] >> shift & 2047) + 1] += 1
+        place, before = np.cumsum(place), order
+        order = np.empty_like(before)
+        for i in before:
+            digit = keys[i] >> shift & 2047
+            order[place[digit]] = i
+            place[digit] += 1
+    return order
 
 
 @njit(cache=True, parallel=True, nogil=True)
