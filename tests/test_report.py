@@ -248,6 +248,18 @@ def test_the_report_names_what_is_left_out_and_what_failed(tmp_path):
     assert alone.read_bytes().startswith(PNG)
 
 
+def test_seconds_of_the_chart_are_plain_numbers(tmp_path, monkeypatch):
+    ticks = []
+
+    def keep(figure, *_, **__):
+        figure.canvas.draw()
+        ticks.extend(label.get_text() for label in figure.axes[0].get_xticklabels(which="both"))
+
+    monkeypatch.setattr("matplotlib.figure.Figure.savefig", keep)
+    write_chart(Sweep((row(2.0, 0.1, "default", ""), row(20.0, 0.1, "views", "all")), {}), tmp_path / "r.png")
+    assert {"2", "10", "20"} <= set(ticks)
+
+
 @pytest.mark.slow
 def test_the_command_writes_table_chart_and_report(folder, tmp_path, capsys):
     out = tmp_path / "r"

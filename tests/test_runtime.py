@@ -536,7 +536,7 @@ def test_a_pose_takes_the_cloud_to_the_scenes_world(scene):
     ("pose", "says"),
     [
         (np.eye(3), r"pose is float64 \(3, 3\)"),
-        (np.full((4, 4), np.nan), "finite 4x4"),
+        (np.full((4, 4), np.nan), r"nan.* expected a finite 4x4"),
         (POSE.T, "expected 0 0 0 1"),
         (np.eye(4, dtype=complex), "complex128"),
         ([[1, 0], [1]], "expected a finite 4x4"),

@@ -372,7 +372,8 @@ def pose_matrix(pose: ArrayLike) -> NDArray[np.float64]:
     """A pose (4, 4) as float64. SceneError for numbers that are not finite and a last row other than 0 0 0 1."""
     matrix = numbers_of(pose)
     if matrix.shape != (4, 4) or matrix.dtype.kind not in "fiu" or not np.isfinite(matrix).all():
-        raise SceneError(f"pose is {matrix.dtype} {matrix.shape}; expected a finite 4x4 matrix, cloud to world")
+        seen = f"{matrix.dtype} {matrix.shape}, {matrix.tolist()!s:.60}"
+        raise SceneError(f"pose is {seen}; expected a finite 4x4 matrix, cloud to world")
     if np.abs(matrix[3] - [0, 0, 0, 1]).max() > 1e-6:
         raise SceneError(
             f"the last row of pose is {matrix[3].tolist()}; expected 0 0 0 1: give the matrix whose last column is the "

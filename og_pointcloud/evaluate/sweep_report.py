@@ -48,6 +48,8 @@ def write_chart(sweep: Sweep, path: Path) -> Path:
 
 
 def _panel(axes: Any, rows: Sequence[Row]) -> None:
+    from matplotlib.ticker import LogFormatter
+
     looks = zip(itertools.cycle(COLORS), itertools.cycle(MARKERS))
     for knob in dict.fromkeys(row.knob for row in rows if not row.is_default):
         color, marker = ("0.45", "x") if knob == BASELINE else next(looks)
@@ -60,6 +62,8 @@ def _panel(axes: Any, rows: Sequence[Row]) -> None:
     best = front(rows)
     axes.step([row.seconds for row in best], [row.error for row in best], where="post", color="0.7", label="front")
     axes.set_xscale("log")
+    for set_formatter in (axes.xaxis.set_major_formatter, axes.xaxis.set_minor_formatter):
+        set_formatter(LogFormatter())  # 20, not 2 x 10^1
     axes.set_yscale("symlog", linthresh=LINEAR_BELOW)
     axes.set_yticks(TICKS, [f"{tick:g}" for tick in TICKS])
     axes.set(xlabel="seconds of the whole fit (log)", ylabel=f"error, {error_name(rows)}")
