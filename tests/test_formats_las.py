@@ -100,3 +100,36 @@ def test_copc_is_read_like_any_laz(tmp_path):
     (tmp_path / "cut.copc.laz").write_bytes(whole[: len(whole) // 2])
     with pytest.raises(SceneError, match=r"cut\.copc\.laz: .* damaged or truncated"):
         read_points(tmp_path / "cut.copc.laz")
+
+
+@pytest.mark.parametrize("point_format", [0, 1, 2, 3, 6, 8])
+def test_a_survey_keeps_all_that_it_says(tmp_path, point_format):
+    laspy = pytest.importorskip("laspy")
+    header = laspy.LasHeader(point_format=point_format, version="1.4")
+    header.scales, header.offsets = np.full(3, 0.001), np.array([5e5, 4e6, 100])
+    header.add_extra_dims([laspy.ExtraBytesParams("height", np.float32)])
+    header.vlrs.append(laspy.VLR("LASF_Projection", 2112, "", b'PROJCS["site"]\0'))
+    survey, count = laspy.LasData(header), 12
+    survey.xyz = np.random.default_rng(0).uniform(0, 9, (count, 3)) + header.offsets
+    survey.intensity, survey["height"] = np.arange(count), np.arange(count) / 2
+    survey.classification = np.where(np.arange(count) < 9, 2, 30)
+    for field in {"gps_time", "red", "nir"} & set(survey.point_format.dimension_names):
+        survey[field] = np.arange(count) * 300
+    survey.write(tmp_path / "survey.laz")
+    label = np.where(np.arange(count) < 5, 0, -1).astype(np.int32)
+    attributes = {"og_label": label, "og_instance": label, "og_score": np.ones(count, np.float32)}
+    attributes["og_reason"] = (label < 0).astype(np.uint8)
+    points, gray, path = read_points(tmp_path / "survey.laz"), np.zeros((count, 3), np.uint8), tmp_path / "labelled.laz"
+    for source in (tmp_path / "survey.laz", path):  # a second run replaces the labels of the first
+        write_las(path, points.xyz_world, gray, attributes, ("bush",), source)
+    found = laspy.read(path)
+    for field in survey.point_format.dimension_names:
+        if field in ("X", "Y", "Z", "intensity", "gps_time", "red", "green", "nir", "height"):
+            assert np.array_equal(found[field], survey[field]), field
+    assert found.classification.tolist() == [64] * 5 + [2] * 4 + [30] * 3
+    assert found.og_label.tolist() == label.tolist()
+    assert [record.user_id for record in found.vlrs].count("og_pointcloud") == 1
+    assert found.vlrs.get_by_id("LASF_Projection")[0].record_data_bytes() == b'PROJCS["site"]\0'
+    fewer = {name: values[1:] for name, values in attributes.items()}
+    with pytest.raises(SceneError, match=r"survey\.laz: it has 12 points, 11 were labelled"):
+        write_las(path, points.xyz_world[1:], gray[1:], fewer, ("bush",), tmp_path / "survey.laz")

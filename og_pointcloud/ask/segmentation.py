@@ -130,7 +130,12 @@ class Segmentation:
         """A sensor_msgs/PointCloud2 message with the labels in its fields. Needs the extra 'ros'."""
         return import_plugin("og_pointcloud_ros", "ros").to_pointcloud2(self, frame_id=frame_id, stamp=stamp)
 
-    def save(self, path: str | os.PathLike[str], splats: Points | None = None) -> Path:
+    def save(
+        self,
+        path: str | os.PathLike[str],
+        splats: Points | None = None,
+        source: str | os.PathLike[str] | None = None,
+    ) -> Path:
         """Write the result, whole or not at all, as what the path's ending says.
 
         .npz: labels, scores, instances, reasons, names and calibrated, and certainty if it is known.
@@ -139,6 +144,8 @@ class Segmentation:
         .glb: colored points, or splats, with feature ids and names.
         .spz: splats in the labels' colors; the format has no place for labels.
         splats: Gaussians, if the points asked about are some, row by row: `read_points` of their file.
+        source: the file that was asked about. From .las and .laz to .las and .laz, all that it says of its points
+            stays, and so does its coordinate system; only labels are added.
         OgPointcloudError for another ending; SceneError where the format cannot hold the points: .las and .glb have no
         room for NaN, .glb none for an empty cloud.
         """
@@ -150,8 +157,8 @@ class Segmentation:
         elif path.suffix == ".spz":
             self._save_spz(path, splats)
         else:
-            more = {"splats": splats} if path.suffix == ".glb" else {}
-            _writer(path.suffix)(path, self.xyz, self.colors, self.attributes, self.names, **more)
+            more = {".glb": {"splats": splats}, ".las": {"source": source}, ".laz": {"source": source}}
+            _writer(path.suffix)(path, self.xyz, self.colors, self.attributes, self.names, **more.get(path.suffix, {}))
         return path
 
     def _save_spz(self, path: Path, splats: Points | None) -> None:

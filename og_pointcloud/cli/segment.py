@@ -37,7 +37,8 @@ def run(arguments: argparse.Namespace) -> None:
         result = og.segment(asked, labels, scene, text_features=arguments.text_features)
     if arguments.output:
         with journal.stage("save"):
-            result.save(arguments.output, points if points is not None and points.scale is not None else None)
+            splats = points if points is not None and points.scale is not None else None
+            result.save(arguments.output, splats, arguments.points)
     report = describe_segmentation(result, journal, arguments.bundle, arguments.output)
     common.print_result(arguments, report, print_segmentation)
 

@@ -1,7 +1,8 @@
 """LAS and LAZ in and out, through laspy (extra 'las').
 
-Out: LAS 1.4, point format 7, with labels where each kind of reader looks for them: ``classification`` for viewers, and
-extra bytes og_label, og_instance, og_score, og_reason for programs. Names are JSON in a record of user og_pointcloud.
+Out: LAS 1.4, with labels where each kind of reader looks for them: ``classification`` for viewers, and extra bytes
+og_label, og_instance, og_score, og_reason for programs. Names are JSON in a record of user og_pointcloud. Points of a
+file keep all that it says of them, and its coordinate system; others are of point format 7.
 
 Before a file is read, what its header counts is held against its size: laspy reads as many records as the header says,
 if need be four billion empty ones, and lazrs makes room for every chunk and layer that a LAZ file announces, and ends
@@ -42,6 +43,9 @@ STEPS_PER_EXTENT = 1e8
 """Coordinates are stored as 32-bit counts of a step: ten nanometers in a room, 10 micrometers in a city block."""
 FULL_RANGE = 257
 """An 8-bit color times this spans the format's 16 bits."""
+EIGHT_BIT_CLASSES = {0: 6, 1: 6, 2: 7, 3: 7, 4: 9, 5: 10}
+"""Point formats before LAS 1.4 have 32 classes; the formats that hold all that they do."""
+OWN_DIMENSIONS = ("og_label", "og_instance", "og_score", "og_reason")
 RECORD_OWNER, NAMES_RECORD = "og_pointcloud", 1
 LONGEST_RECORD = 65_535
 SMALLEST_HEADER, RECORD_HEADER = 227, 54
@@ -85,36 +89,13 @@ def read_las(path: str | os.PathLike[str]) -> Points:
     return Points.from_world(np.concatenate(xyz), rgb=_eight_bits(np.concatenate(rgb)) if rgb else None)
 
 
-def _labelled(
-    xyz_world: NDArray[np.floating], rgb: NDArray[np.uint8], attributes: Mapping[str, NDArray], names: Sequence[str]
-) -> LasData:
-    """A laspy LasData of a labelled cloud."""
-    laspy = _laspy()
-    require_finite(xyz_world, LABEL_FINITE)
-    header = laspy.LasHeader(point_format=7, version="1.4")
-    header.offsets, header.scales = _grid(xyz_world)
-    header.add_extra_dims([laspy.ExtraBytesParams(name, values.dtype) for name, values in attributes.items()])
-    las = laspy.LasData(header)
-    las.xyz = np.asarray(xyz_world, np.float64)
-    for channel, values in zip(("red", "green", "blue"), np.asarray(rgb, np.uint16).T, strict=True):
-        las[channel] = values * FULL_RANGE
-    for name, values in attributes.items():
-        las[name] = values
-    las.classification = _classes(attributes["og_label"])
-    las.user_data = attributes["og_reason"]
-    record = json.dumps(list(names)).encode()
-    if len(record) > LONGEST_RECORD:
-        raise SceneError(f"{len(names)} names take {len(record)} bytes; LAS holds {LONGEST_RECORD}: ask for fewer")
-    las.header.vlrs.append(laspy.VLR(RECORD_OWNER, NAMES_RECORD, "og_names", record))
-    return las
-
-
 def write_las(
     path: str | os.PathLike[str],
     xyz_world: NDArray[np.floating],
     rgb: NDArray[np.uint8],
     attributes: Mapping[str, NDArray],
     names: Sequence[str],
+    source: str | os.PathLike[str] | None = None,
 ) -> None:
     """Write a labelled cloud, compressed where the path ends in .laz; whole or not at all.
 
@@ -122,11 +103,16 @@ def write_las(
     attributes: og_label, og_instance (n,) int32, og_score (n,) float32, og_reason (n,) uint8: as they are in extra
         bytes; og_label + 64 also as the classification, 1 without a label or beyond 255; og_reason also as user data.
     names: what og_label counts; JSON, in a record.
-    SceneError where a coordinate is not finite or the names are too long; MissingExtraError without laspy.
+    source: the file that the points are of, in its order. If it is LAS, places, colors, intensity, returns, times, its
+        own extra bytes and its coordinate system stay as they are, and so do the classes of points without a label.
+    SceneError where a coordinate is not finite, the names are too long or the source has another number of points;
+    MissingExtraError without laspy.
     """
     path = Path(path)
     with naming(path):
-        las = _labelled(xyz_world, rgb, attributes, names)
+        survey = None if source is None or not _is_las(source) else _points_of(Path(source), len(xyz_world))
+        las = _new(xyz_world, rgb) if survey is None else survey
+        _add_labels(las, attributes, names, keep_classes=survey is not None)
         with replacing(path) as file:
             try:
                 las.write(file, do_compress=path.suffix == ".laz")
@@ -134,6 +120,54 @@ def write_las(
                 raise
             except Exception as error:  # a full disk, as lazrs has it
                 raise SceneError(f"it cannot be written ({error!s:.120}): is there room?") from error
+
+
+def _is_las(path: str | os.PathLike[str]) -> bool:
+    with open(path, "rb") as file:
+        return file.read(len(SIGNATURE)) == SIGNATURE
+
+
+def _new(xyz_world: NDArray[np.floating], rgb: NDArray[np.uint8]) -> LasData:
+    laspy = _laspy()
+    require_finite(xyz_world, LABEL_FINITE)
+    header = laspy.LasHeader(point_format=7, version="1.4")
+    header.offsets, header.scales = _grid(xyz_world)
+    las = laspy.LasData(header)
+    las.xyz = np.asarray(xyz_world, np.float64)
+    for channel, values in zip(("red", "green", "blue"), np.asarray(rgb, np.uint16).T, strict=True):
+        las[channel] = values * FULL_RANGE
+    return las
+
+
+def _points_of(source: Path, count: int) -> LasData:
+    """A file's points as a point format whose classes have 8 bits, without labels that an earlier run put there."""
+    laspy = _laspy()
+    with naming(source):
+        _check_counts(source)
+        with laspy.open(source, laz_backend=laspy.LazBackend.Lazrs, read_evlrs=False) as reader:
+            las = reader.read()
+        if len(las.points) != count:
+            raise SceneError(f"it has {len(las.points)} points, {count} were labelled; expected the file asked about")
+    las = laspy.convert(las, point_format_id=EIGHT_BIT_CLASSES.get(las.point_format.id, las.point_format.id))
+    las.remove_extra_dims([name for name in las.point_format.extra_dimension_names if name in OWN_DIMENSIONS])
+    las.vlrs[:] = [record for record in las.vlrs if record.user_id != RECORD_OWNER]
+    return las
+
+
+def _add_labels(las: LasData, attributes: Mapping[str, NDArray], names: Sequence[str], keep_classes: bool) -> None:
+    laspy = _laspy()
+    record = json.dumps(list(names)).encode()
+    if len(record) > LONGEST_RECORD:
+        raise SceneError(f"{len(names)} names take {len(record)} bytes; LAS holds {LONGEST_RECORD}: ask for fewer")
+    las.vlrs.append(laspy.VLR(RECORD_OWNER, NAMES_RECORD, "og_names", record))
+    las.add_extra_dims([laspy.ExtraBytesParams(name, values.dtype) for name, values in attributes.items()])
+    for name, values in attributes.items():
+        las[name] = values
+    classes = _classes(attributes["og_label"])
+    if keep_classes:
+        classes = np.where(classes == UNLABELLED, np.asarray(las["classification"]), classes)
+    las.classification = classes
+    las.user_data = attributes["og_reason"]
 
 
 def _laspy() -> Any:
