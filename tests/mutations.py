@@ -52,7 +52,7 @@ MUTATIONS = (
     ),
     Mutation(
         "layers of one surface hide each other", "rendering/sightings.py",
-        "depth < surface[q]", "depth < splats[point[q]].depth", ("test_sightings.py",),
+        "surface[k] = splats[of_tile[k]].surface", "surface[k] = splats[of_tile[k]].depth", ("test_sightings.py",),
     ),
     Mutation(
         "labels judged by the views that they were made from", "fitting/held_out.py",
@@ -83,11 +83,11 @@ MUTATIONS = (
     ),
     Mutation(
         "border votes whether sure or not", "fitting/membership.py",
-        "support.of_state(ids), around", "np.ones(len(ids)), around", MEMBERSHIP,
+        "support.of_state(ids), around.index", "np.ones(len(ids)), around.index", MEMBERSHIP,
     ),
     Mutation(
         "background heard by instances as instances are", "fitting/membership.py",
-        "vote * of_background if", "vote if", MEMBERSHIP,
+        "vote * of_background if", "vote if", ("test_membership.py",),
     ),
     Mutation(
         "neighbours heard once", "fitting/membership.py",

@@ -103,6 +103,12 @@ def test_a_point_amid_background_is_let_go() -> None:
     assert ids == [0] * 50 + [BACKGROUND] * 50
 
 
+def test_two_points_amid_background_hold_together() -> None:
+    """To points of an instance background counts half: the two keep each other."""
+    ids = ids_of([[([*OBJECT, 80, 81], ONE)]] * 4, [0] * 4)
+    assert ids == [0] * 50 + [BACKGROUND] * 30 + [0] * 2 + [BACKGROUND] * 18
+
+
 def test_growth_follows_the_surface_but_not_into_less_likely_points() -> None:
     """Forty points at share 0.5 in a row are reached from the sure ones; those at 0.17 behind them are not."""
     long, short = [(range(90), ONE)], [(OBJECT, ONE)]
