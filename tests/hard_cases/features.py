@@ -116,9 +116,9 @@ def feature_not_a_number() -> object:
 @refuses(SceneError, "of mask 1 holds NaN or infinity", "expected finite", "encode this mask again or remove it")
 def feature_beyond_float32() -> object:
     """A feature of 1e40, as float64 files may hold it."""
-    from og_pointcloud.formats.mask_files import as_float32
+    from og_pointcloud.formats.mask_files import as_features
 
-    return _one_view(as_float32(np.full((1, 8), 1e40)))
+    return _one_view(as_features(np.full((1, 8), 1e40), "1e40:"))
 
 
 @refuses(SceneError, "features of its 2 masks have width 0", "expected 1 or more", "encode the masks")
