@@ -112,7 +112,7 @@ def test_a_survey_keeps_all_that_it_says(tmp_path, point_format):
     survey, count = laspy.LasData(header), 12
     survey.xyz = np.random.default_rng(0).uniform(0, 9, (count, 3)) + header.offsets
     survey.intensity, survey["height"] = np.arange(count), np.arange(count) / 2
-    survey.classification = np.where(np.arange(count) < 9, 2, 30)
+    survey.classification, survey.user_data = np.where(np.arange(count) < 9, 2, 30), np.arange(count)
     for field in {"gps_time", "red", "nir"} & set(survey.point_format.dimension_names):
         survey[field] = np.arange(count) * 300
     survey.write(tmp_path / "survey.laz")
@@ -120,16 +120,23 @@ def test_a_survey_keeps_all_that_it_says(tmp_path, point_format):
     attributes = {"og_label": label, "og_instance": label, "og_score": np.ones(count, np.float32)}
     attributes["og_reason"] = (label < 0).astype(np.uint8)
     points, gray, path = read_points(tmp_path / "survey.laz"), np.zeros((count, 3), np.uint8), tmp_path / "labelled.laz"
-    for source in (tmp_path / "survey.laz", path):  # a second run replaces the labels of the first
-        write_las(path, points.xyz_world, gray, attributes, ("bush",), source)
+    write_las(path, points.xyz_world, gray, attributes, ("bush",), tmp_path / "survey.laz")
     found = laspy.read(path)
     for field in survey.point_format.dimension_names:
-        if field in ("X", "Y", "Z", "intensity", "gps_time", "red", "green", "nir", "height"):
+        if field in ("X", "Y", "Z", "intensity", "gps_time", "red", "green", "nir", "height", "user_data"):
             assert np.array_equal(found[field], survey[field]), field
     assert found.classification.tolist() == [64] * 5 + [2] * 4 + [30] * 3
     assert found.og_label.tolist() == label.tolist()
     assert [record.user_id for record in found.vlrs].count("og_pointcloud") == 1
     assert found.vlrs.get_by_id("LASF_Projection")[0].record_data_bytes() == b'PROJCS["site"]\0'
+    nothing = {
+        name: np.full_like(values, -1 if name in ("og_label", "og_instance") else 1)
+        for name, values in attributes.items()
+    }
+    write_las(path, points.xyz_world, gray, nothing, ("tree",), path)  # no bush of the first run is a tree
+    again = laspy.read(path)
+    assert again.classification.tolist() == [1] * 5 + [2] * 4 + [30] * 3
+    assert [record.user_id for record in again.vlrs].count("og_pointcloud") == 1
     fewer = {name: values[1:] for name, values in attributes.items()}
     with pytest.raises(SceneError, match=r"survey\.laz: it has 12 points, 11 were labelled"):
         write_las(path, points.xyz_world[1:], gray[1:], fewer, ("bush",), tmp_path / "survey.laz")

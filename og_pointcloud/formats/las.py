@@ -17,7 +17,8 @@ import json
 import mmap
 import os
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -61,26 +62,17 @@ def read_las(path: str | os.PathLike[str]) -> Points:
 
     SceneError, beginning with the path, for a file that is damaged or has no points; MissingExtraError without laspy.
     """
-    path, laspy = Path(path), _laspy()
     xyz: list[NDArray[np.float64]] = []
     rgb: list[NDArray[np.uint16]] = []
-    with naming(path):
-        try:
-            _check_counts(path)
-            # Of the two backends this one makes no room for points that a chunk only claims to have.
-            with laspy.open(path, laz_backend=laspy.LazBackend.Lazrs, read_evlrs=False) as reader:
-                promised, scales = reader.header.point_count, np.asarray(reader.header.scales)
-                if not (scales > 0).all():  # 0 puts all points into one place, a negative one mirrors them
-                    raise SceneError(f"its scale factors are {scales.tolist()}; expected 3 above 0: export it again")
-                has_colors = "red" in reader.header.point_format.dimension_names
-                for chunk in reader.chunk_iterator(POINTS_PER_CHUNK):
-                    xyz.append(np.column_stack([chunk.x, chunk.y, chunk.z]))
-                    if has_colors:
-                        rgb.append(np.column_stack([chunk.red, chunk.green, chunk.blue]))
-        except (SceneError, OSError, KeyboardInterrupt, SystemExit):
-            raise
-        except BaseException as error:  # laspy raises types of its own; a panic of lazrs is no Exception
-            raise SceneError(f"cannot be read as LAS ({error!s:.120}): copy or write it again") from error
+    with _opened(Path(path)) as reader:
+        promised, scales = reader.header.point_count, np.asarray(reader.header.scales)
+        if not (scales > 0).all():  # 0 puts all points into one place, a negative one mirrors them
+            raise SceneError(f"its scale factors are {scales.tolist()}; expected 3 above 0: export it again")
+        has_colors = "red" in reader.header.point_format.dimension_names
+        for chunk in reader.chunk_iterator(POINTS_PER_CHUNK):
+            xyz.append(np.column_stack([chunk.x, chunk.y, chunk.z]))
+            if has_colors:
+                rgb.append(np.column_stack([chunk.red, chunk.green, chunk.blue]))
         count = sum(map(len, xyz))
         if count != promised or not count:
             raise SceneError(
@@ -104,14 +96,15 @@ def write_las(
         bytes; og_label + 64 also as the classification, 1 without a label or beyond 255; og_reason also as user data.
     names: what og_label counts; JSON, in a record.
     source: the file that the points are of, in its order. If it is LAS, places, colors, intensity, returns, times, its
-        own extra bytes and its coordinate system stay as they are, and so do the classes of points without a label.
+        own extra bytes and its coordinate system stay as they are, and so do user data and the classes of points
+        without a label (of those that an earlier run labelled: 1).
     SceneError where a coordinate is not finite, the names are too long or the source has another number of points;
     MissingExtraError without laspy.
     """
     path = Path(path)
     with naming(path):
         survey = None if source is None or not _is_las(source) else _points_of(Path(source), len(xyz_world))
-        las = _new(xyz_world, rgb) if survey is None else survey
+        las = _new(xyz_world, rgb, attributes["og_reason"]) if survey is None else survey
         _add_labels(las, attributes, names, keep_classes=survey is not None)
         with replacing(path) as file:
             try:
@@ -127,7 +120,7 @@ def _is_las(path: str | os.PathLike[str]) -> bool:
         return file.read(len(SIGNATURE)) == SIGNATURE
 
 
-def _new(xyz_world: NDArray[np.floating], rgb: NDArray[np.uint8]) -> LasData:
+def _new(xyz_world: NDArray[np.floating], rgb: NDArray[np.uint8], reason: NDArray[np.uint8]) -> LasData:
     laspy = _laspy()
     require_finite(xyz_world, LABEL_FINITE)
     header = laspy.LasHeader(point_format=7, version="1.4")
@@ -136,22 +129,39 @@ def _new(xyz_world: NDArray[np.floating], rgb: NDArray[np.uint8]) -> LasData:
     las.xyz = np.asarray(xyz_world, np.float64)
     for channel, values in zip(("red", "green", "blue"), np.asarray(rgb, np.uint16).T, strict=True):
         las[channel] = values * FULL_RANGE
+    las.user_data = reason
     return las
 
 
 def _points_of(source: Path, count: int) -> LasData:
     """A file's points as a point format whose classes have 8 bits, without labels that an earlier run put there."""
-    laspy = _laspy()
-    with naming(source):
-        _check_counts(source)
-        with laspy.open(source, laz_backend=laspy.LazBackend.Lazrs, read_evlrs=False) as reader:
-            las = reader.read()
+    with _opened(source) as reader:
+        las = reader.read()
         if len(las.points) != count:
             raise SceneError(f"it has {len(las.points)} points, {count} were labelled; expected the file asked about")
-    las = laspy.convert(las, point_format_id=EIGHT_BIT_CLASSES.get(las.point_format.id, las.point_format.id))
-    las.remove_extra_dims([name for name in las.point_format.extra_dimension_names if name in OWN_DIMENSIONS])
+    las = _laspy().convert(las, point_format_id=EIGHT_BIT_CLASSES.get(las.point_format.id, las.point_format.id))
+    own = [name for name in las.point_format.extra_dimension_names if name in OWN_DIMENSIONS]
+    if "og_label" in own:  # its class would be taken for one of the new labels
+        las.classification = np.where(np.asarray(las["og_label"]) >= 0, UNLABELLED, np.asarray(las["classification"]))
+    las.remove_extra_dims(own)
     las.vlrs[:] = [record for record in las.vlrs if record.user_id != RECORD_OWNER]
     return las
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    """A laspy reader of a file whose counts fit it. SceneError, beginning with the path, for what cannot be read."""
+    laspy = _laspy()
+    with naming(path):
+        try:
+            _check_counts(path)
+            # Of the two backends this one makes no room for points that a chunk only claims to have.
+            with laspy.open(path, laz_backend=laspy.LazBackend.Lazrs, read_evlrs=False) as reader:
+                yield reader
+        except (SceneError, OSError, KeyboardInterrupt, SystemExit):
+            raise
+        except BaseException as error:  # laspy raises types of its own; a panic of lazrs is no Exception
+            raise SceneError(f"cannot be read as LAS ({error!s:.120}): copy or write it again") from error
 
 
 def _add_labels(las: LasData, attributes: Mapping[str, NDArray], names: Sequence[str], keep_classes: bool) -> None:
@@ -167,7 +177,6 @@ def _add_labels(las: LasData, attributes: Mapping[str, NDArray], names: Sequence
     if keep_classes:
         classes = np.where(classes == UNLABELLED, np.asarray(las["classification"]), classes)
     las.classification = classes
-    las.user_data = attributes["og_reason"]
 
 
 def _laspy() -> Any:
