@@ -130,6 +130,39 @@ def test_points_of_no_instance_and_instances_without_points() -> None:
     assert part_of(table, np.full(14, -1, np.int32), np.full(200, -1, np.int32), 0).shape == (0,)
 
 
+def test_in_a_crowd_as_by_looping_over_pairs() -> None:
+    """The definition at the head of association.py, an instance, a view and a mask at a time."""
+    random = np.random.default_rng(0)
+    ids = np.repeat(np.arange(12), random.integers(3, 9, 12)).astype(np.int32)
+    views, owners = [], []
+    for _ in range(40):
+        starts = np.flatnonzero(random.random(12) < 0.2).tolist()  # a mask covers one instance, or two or three
+        masks = [np.flatnonzero((ids >= k) & (ids <= k + random.integers(3))).tolist() for k in starts]
+        views.append([(mask, ONE) for mask in masks if mask])
+        owners += [k for k, mask in zip(starts, masks) if mask]
+    table = hand_table(len(ids), views)
+    shown = np.stack([table.weights.toarray()[:, ids == k].sum(axis=1) for k in range(12)], axis=1)
+    seen = np.stack([shown[table.mask_view == v].sum(axis=0) for v in range(40)])
+    seen += np.stack([table.outside.toarray()[:, ids == k].sum(axis=1) for k in range(12)], axis=1)
+    typical = [np.median(column[column > 0]) if column.any() else 0 for column in seen.T]
+    sees, size, expected = seen > 0.1 * np.array(typical), np.bincount(ids), []
+    for part in range(12):
+        own, found = False, []
+        held = {whole: 0 for whole in range(12)}
+        for mask, (view, whole) in enumerate(zip(table.mask_view, owners, strict=True)):
+            if sees[view, part] and sees[view, whole] and shown[mask, part] > 0.5 * seen[view, part]:
+                own |= whole == part
+                held[whole] += 1
+        for whole in range(12):
+            of_whole = {view for view, owner in zip(table.mask_view, owners) if owner == whole}
+            possible = sum(sees[v, part] and sees[v, whole] for v in of_whole)
+            if size[whole] > size[part] and held[whole] >= 2 and held[whole] > 0.5 * possible:
+                found.append((-held[whole] / possible, size[whole], whole))
+        expected.append(min(found)[2] if own and found else -1)
+    assert part_of(table, np.array(owners, np.int32), ids, 12).tolist() == expected
+    assert len({*expected} - {-1}) > 1
+
+
 def instances(coarse: list[int] | None = None, whole: list[int] | None = None, count: int = 3) -> InstanceTable:
     extra = {
         name: np.array(value, np.int32) for name, value in (("coarse", coarse), ("part_of", whole)) if value is not None

@@ -24,6 +24,8 @@ DoubleArray = NDArray[np.float64]
 
 DIRECTIONS = 180
 """Directions around a circle whose extreme points are the corners of an outline."""
+PRODUCTS_AT_ONCE = 1 << 20
+"""Products of directions and points worked out side by side, which bounds the memory."""
 THIN = 1e-6
 """Thickness, as a share of the diagonal, that flat things are given while volumes are compared: 0 x 2 x 3 is less than
 0 x 4 x 5."""
@@ -219,7 +221,7 @@ def _least_volume(local: DoubleArray) -> DoubleArray:
 
     least = volume(axes)
     for _ in range(TURNS):
-        turned = [_turned_about(local, np.roll(axes, shift, axis=0)) for shift in range(3)]
+        turned = [_turned_about(local, axes[[-shift, 1 - shift, 2 - shift]]) for shift in range(3)]
         volumes = [volume(rows) for rows in turned]
         best = int(np.argmin(volumes))
         # A box that is no smaller is not worth an odd orientation.
@@ -242,15 +244,14 @@ def _turned_about(local: DoubleArray, axes: DoubleArray) -> DoubleArray:
     flat = local @ axes[:2].T
     # The farthest points along directions in order are corners of the convex hull in order.
     # No direction is normal to a side that is flush already, whose ends would be told apart by rounding alone.
-    angle = (np.arange(DIRECTIONS) + 0.5) * 2 * np.pi / DIRECTIONS
-    directions = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    parts = np.array_split(directions, 12)  # which bounds the memory
+    at_once = max(1, PRODUCTS_AT_ONCE // len(flat))
+    parts = (_AROUND[start : start + at_once] for start in range(0, DIRECTIONS, at_once))
     corners = flat[np.concatenate([(part @ flat.T).argmax(axis=1) for part in parts])]
-    sides = np.roll(corners, -1, axis=0) - corners
+    sides = np.diff(corners, axis=0, append=corners[:1])
     lengths = np.hypot(sides[:, 0], sides[:, 1])
     if not lengths.any():
         return axes
-    along = sides[lengths > 0] / lengths[lengths > 0, None]
+    corners, along = corners[lengths > 0], sides[lengths > 0] / lengths[lengths > 0, None]
     across = np.stack([-along[:, 1], along[:, 0]], axis=1)
     thickness = THIN * float(np.linalg.norm(np.ptp(corners, axis=0)))
     areas = (np.ptp(along @ corners.T, axis=1) + thickness) * (np.ptp(across @ corners.T, axis=1) + thickness)
@@ -286,6 +287,9 @@ def _neighbors(keys: NDArray[np.int64], step: int) -> tuple[NDArray[np.int64], N
     return there, place[there]
 
 
+_ANGLES = (np.arange(DIRECTIONS) + 0.5) * 2 * np.pi / DIRECTIONS
+_AROUND = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=1)
+"""(DIRECTIONS, 2) unit vectors."""
 _HALF_OF_26 = [
     (x << 42) + (y << 21) + z for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if (x, y, z) > (0, 0, 0)
 ]

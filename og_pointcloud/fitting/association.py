@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from og_pointcloud.cloud import InstanceTable
-from og_pointcloud.fitting.mask_table import MaskTable, weights_by_instance
+from og_pointcloud.fitting.mask_table import MaskTable
 
 MOSTLY = 0.5
 """A part lies mostly in one mask of its parent: more than this share of what a view shows of it, in more than this
@@ -50,8 +50,7 @@ def describe_instances(
     features = directions(table.mask_features)
     rows, owners = [], []
     agreement = np.zeros(count, np.float32)
-    for instance in range(count):
-        members = np.flatnonzero((group == instance) & (shown > 0) & features.any(axis=1))
+    for instance, members in enumerate(members_of(np.where((shown > 0) & features.any(axis=1), group, -1), count)):
         weight = np.sqrt(shown[members])
         row, kept, cosines = robust_mean(features[members], weight)
         if row is None:
@@ -83,6 +82,12 @@ def shown_of_instance(
         own = instance_ids[weights.indices[part]] == group[mask]
         shown[mask] = weights.data[part][own].sum(dtype=np.float64)
     return shown
+
+
+def members_of(group: NDArray[np.int32], count: int) -> list[NDArray[np.intp]]:
+    """The masks of each of ``count`` groups, ascending. group: (masks,) int32, the group of each mask, -1 none."""
+    order = np.argsort(group, kind="stable")
+    return np.split(order, np.searchsorted(group[order], np.arange(count + 1)))[1:-1]
 
 
 def directions(rows: NDArray[np.floating]) -> NDArray[np.float64]:
@@ -125,31 +130,32 @@ def part_of(
     none. instance_ids: (n,) int32, below 0 none. Of several parents the one that holds the part in most of the views is
     taken, of equal ones the smallest: a handle is a part of the mug before it is one of the table.
     """
-    shown = weights_by_instance(table.weights, instance_ids, count)
-    seen = weights_by_instance(table.outside, instance_ids, count)
-    np.add.at(seen, table.mask_view, shown)  # (views, count): all that each view shows of each instance
+    rows, masks = np.flatnonzero(instance_ids >= 0), len(mask_instance)
+    of_instance = csr_array((np.ones(len(rows)), (rows, instance_ids[rows])), shape=(len(instance_ids), count))
+    of_view = csr_array((np.ones(masks), (table.mask_view, np.arange(masks))), shape=(table.outside.shape[0], masks))
+    shown = (table.weights @ of_instance).tocoo()  # (masks, count), sparse: of ten thousand instances gigabytes
+    seen = (table.outside @ of_instance + of_view @ shown).toarray()  # (views, count), in masks and outside
     sees = seen > SEEN_SHARE * _typical(seen)
-    has_mask = np.zeros((count, len(seen)), bool)  # instance, view
-    has_mask[mask_instance[mask_instance >= 0], table.mask_view[mask_instance >= 0]] = True
+    owned = np.flatnonzero(mask_instance >= 0)
+    has_mask = np.zeros(seen.shape, bool)  # view, instance
+    has_mask[table.mask_view[owned], mask_instance[owned]] = True
 
-    within = (shown > MOSTLY * seen[table.mask_view]) & sees[table.mask_view]
-    masks, parts = np.nonzero(within)
-    owners = mask_instance[masks]
+    mask, part = shown.row, shown.col
+    view, whole = table.mask_view[mask], mask_instance[mask]
+    within = (shown.data > MOSTLY * seen[view, part]) & sees[view, part]
     has_own_mask = np.zeros(count, bool)
-    has_own_mask[parts[owners == parts]] = True
-    other = (owners >= 0) & (owners != parts)
-    other &= sees[table.mask_view[masks], owners]
-    held = np.zeros((count, count))  # part, parent
-    np.add.at(held, (parts[other], owners[other]), 1)
-    possible = sees.T.astype(np.float64) @ (has_mask.T & sees)
+    has_own_mask[part[within & (whole == part)]] = True
+    size = np.bincount(instance_ids[rows], minlength=count)
+    holds = within & (whole >= 0) & sees[view, whole] & has_own_mask[part] & (size[whole] > size[part])
+    pairs, held = np.unique(np.stack([part[holds], whole[holds]]), axis=1, return_counts=True)
+    part, whole = pairs[:, held >= FEWEST_VIEWS]
+    possible = [np.count_nonzero(sees[:, a] & sees[:, b] & has_mask[:, b]) for a, b in zip(part, whole, strict=True)]
+    share = held[held >= FEWEST_VIEWS] / np.array(possible)
 
-    size = np.bincount(instance_ids[instance_ids >= 0], minlength=count)
-    share = held / np.maximum(possible, 1)
-    candidate = (share > MOSTLY) & (held >= FEWEST_VIEWS) & has_own_mask[:, None] & (size[None] > size[:, None])
+    best = np.lexsort((whole, size[whole], -share, part))
+    best = best[share[best] > MOSTLY]
     parent = np.full(count, -1, np.int32)
-    for part in np.flatnonzero(candidate.any(axis=1)):
-        parents = np.flatnonzero(candidate[part])
-        parent[part] = parents[np.lexsort((parents, size[parents], -share[part, parents]))[0]]
+    parent[part[best[::-1]]] = whole[best[::-1]]  # of several wholes, the first is written last
     return parent
 
 

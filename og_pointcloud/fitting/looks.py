@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from og_pointcloud.fitting.association import directions, shown_of_instance
+from og_pointcloud.fitting.association import directions, members_of, shown_of_instance
 from og_pointcloud.fitting.grouping import cosines_of_different
 from og_pointcloud.fitting.mask_table import MaskTable
 from og_pointcloud.fitting.view_votes import ViewVotes
@@ -43,8 +43,8 @@ def looks_of_groups(table: MaskTable, group: NDArray[np.int32], ids: NDArray[np.
     cosines = cosines_of_different(features[described], table.mask_view[described])
     unlike = float(np.median(cosines)) if len(cosines) else 0.0
     look, owner = group.copy(), list(range(count))
-    for index in range(count):
-        waiting = [np.flatnonzero(usable & (group == index))]
+    for index, members in enumerate(members_of(np.where(usable, group, -1), count)):
+        waiting = [members]
         kinds: list[NDArray[np.intp]] = []
         while waiting:
             masks = waiting.pop()
