@@ -1,10 +1,10 @@
-"""Boxes around points, axis-aligned and oriented, and which points are strays that no box should reach for. numpy only.
+"""Boxes around points, axis-aligned and oriented, and which points are strays that no box should include. numpy only.
 
-An upright box has one side flush with the points' outline seen from above (rotating calipers: Toussaint, 1983). A free
-one starts at the principal axes and is turned so about the axis that gains most, a few times over.
+The least upright box has one side flush with the points' outline seen from above (rotating calipers: Toussaint, 1983).
+A free box starts at the principal axes; the same step is then taken about whichever of its axes gains most, repeatedly.
 
-Every result depends on the set of points alone: not on their order, nor on how often one is given. Work is done in
-float64 around the points' middle, so map coordinates of 1e6 cost nothing but their own rounding.
+Every result depends on the set of points alone, not on their order or on how often one is repeated. Work is done in
+float64 around the points' middle, so map coordinates of 1e6 cost no more than their own rounding.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from og_pointcloud.formats.poses import quaternion_of
 DoubleArray = NDArray[np.float64]
 
 DIRECTIONS = 180
-"""Directions around a circle whose extreme points are the corners of an outline."""
+"""Directions around a circle along which the extreme points are taken as the corners of an outline."""
 PRODUCTS_AT_ONCE = 1 << 20
 """Products of directions and points worked out side by side, which bounds the memory."""
 THIN = 1e-6
-"""Thickness, as a share of the diagonal, that flat things are given while volumes are compared: 0 x 2 x 3 is less than
-0 x 4 x 5."""
+"""Thickness, as a share of the diagonal, added to every side while volumes are compared: of two flat boxes, 0 x 2 x 3
+is then smaller than 0 x 4 x 5."""
 GAIN = 1e-9
-"""Relative gain below which a turned box is not better."""
+"""A turned box counts as better only when it is smaller by more than this share."""
 TURNS = 6
 """Turns of a free box at most."""
 
@@ -39,9 +39,9 @@ LINK = 2.0
 MAIN_PART = 0.05
 """Share of the points that a connected part needs to be no stray."""
 MOST = 0.9
-"""Share of the points that main parts must hold, or the points are taken to be sparse and linked more widely."""
+"""Share of the points that the main parts must hold; below it the points are taken to be sparse, and linked farther."""
 WIDEST = 1 << 19
-"""Voxels to either side of the origin."""
+"""Most voxels on either side of the origin: a coordinate then fits the 21 bits that `_connected` gives it."""
 
 
 @dataclass(frozen=True)
@@ -132,6 +132,7 @@ def oriented_box(points: ArrayLike, up: ArrayLike | None = None) -> Box:
         order = np.argsort(-(high - low), kind="stable")
         axes, low, high = axes[order], low[order], high[order]
     axes = _right_handed(axes, keep_third=up is not None)
+    # A reversed axis keeps the length along it, but not where it begins.
     center = (local @ axes.T).min(axis=0) + (high - low) / 2
     return Box(middle + center @ axes, high - low, axes)
 
@@ -147,13 +148,15 @@ def main_part(points: ArrayLike, spacing: float) -> NDArray[np.bool_]:
     """
     xyz = _checked(points)
     distinct, which = _distinct(xyz)
+    # Among so few points a single one is already MAIN_PART of them.
     if MAIN_PART * len(distinct) <= 1:
         return np.ones(len(xyz), bool)
     local = distinct - distinct.mean(axis=0)
-    # In the frame of the principal axes, so that a turned object loses the same points.
+    # Voxels lie along the principal axes, so that a turned object loses the same points.
     local = local @ _principal_axes(local).T
     extent = float(np.ptp(local, axis=0).max())
     edge = LINK * spacing
+    # Voxels as large as the whole all touch: nothing is a stray then.
     while edge < extent:
         part = _connected(np.floor(local / max(edge, extent / WIDEST)).astype(np.int64))
         held = np.bincount(part)
@@ -179,12 +182,13 @@ def unit_up(up: ArrayLike) -> DoubleArray:
     is_vector = direction.shape == (3,) and direction.dtype.kind in "fiu"
     if not is_vector or not np.isfinite(direction).all() or not direction.any():
         raise SceneError(f"up is {up}; expected a direction of three numbers, not all 0, e.g. (0, 0, 1)")
+    # By the largest part first: its square neither underflows nor overflows.
     direction = direction / np.abs(direction).max()
     return direction / np.linalg.norm(direction)
 
 
 def _distinct(xyz: DoubleArray) -> tuple[DoubleArray, NDArray[np.int64]]:
-    """Each place once, in a fixed order, so that sums do not depend on the order given; and (n,) which one each was."""
+    """Each place once, sorted, so that sums do not depend on the order given; and (n,) which place each point has."""
     order = np.lexsort(xyz.T)
     rows = xyz[order]
     new = np.append(True, (rows[1:] != rows[:-1]).any(axis=1))
@@ -196,13 +200,14 @@ def _distinct(xyz: DoubleArray) -> tuple[DoubleArray, NDArray[np.int64]]:
 def _principal_axes(local: DoubleArray) -> DoubleArray:
     """(3, 3) orthonormal rows, the widest direction first; signs by the third moment, so that they turn with points."""
     centered = local - local.mean(axis=0)
+    # eigh sorts by rising eigenvalue and leaves each sign to chance.
     axes = np.asarray(np.linalg.eigh(centered.T @ centered)[1], np.float64).T[::-1]
     skew = ((centered @ axes.T) ** 3).sum(axis=0)
     return np.where(skew < 0, -1.0, 1.0)[:, None] * axes
 
 
 def _right_handed(axes: DoubleArray, keep_third: bool) -> DoubleArray:
-    """The first axis with its largest part positive, and the third one unless it is kept; the second follows."""
+    """First and third axis, unless that is kept, with their largest component positive; the second is their product."""
     signs = np.sign(axes[np.arange(3), np.abs(axes).argmax(axis=1)])
     first, third = signs[0] * axes[0], axes[2] * (1 if keep_third else signs[2])
     return np.asarray([first, np.cross(third, first), third], np.float64)
@@ -233,6 +238,7 @@ def _least_volume(local: DoubleArray) -> DoubleArray:
 
 def _upright(local: DoubleArray, up: DoubleArray) -> DoubleArray:
     """Axes of the least box whose third axis is up."""
+    # Any direction across up begins; the coordinate axis least along up gives a product far from zero.
     aside = np.cross(up, np.eye(3)[np.abs(up).argmin()])
     aside /= np.linalg.norm(aside)
     axes: DoubleArray = np.asarray([aside, np.cross(up, aside), up], np.float64)
@@ -243,7 +249,7 @@ def _turned_about(local: DoubleArray, axes: DoubleArray) -> DoubleArray:
     """The axes, turned about the third one so that their rectangle around the points has the least area."""
     flat = local @ axes[:2].T
     # The farthest points along directions in order are corners of the convex hull in order.
-    # No direction is normal to a side that is flush already, whose ends would be told apart by rounding alone.
+    # They lie half a step off the axes: of a side that is flush already rounding alone would say which end is farthest.
     at_once = max(1, PRODUCTS_AT_ONCE // len(flat))
     parts = (_AROUND[start : start + at_once] for start in range(0, DIRECTIONS, at_once))
     corners = flat[np.concatenate([(part @ flat.T).argmax(axis=1) for part in parts])]
@@ -251,6 +257,7 @@ def _turned_about(local: DoubleArray, axes: DoubleArray) -> DoubleArray:
     lengths = np.hypot(sides[:, 0], sides[:, 1])
     if not lengths.any():
         return axes
+    # The least rectangle is flush with a side of the hull (Toussaint): one candidate a side.
     corners, along = corners[lengths > 0], sides[lengths > 0] / lengths[lengths > 0, None]
     across = np.stack([-along[:, 1], along[:, 0]], axis=1)
     thickness = THIN * float(np.linalg.norm(np.ptp(corners, axis=0)))
@@ -263,10 +270,10 @@ def _turned_about(local: DoubleArray, axes: DoubleArray) -> DoubleArray:
 
 
 def _connected(voxel: NDArray[np.int64]) -> NDArray[np.int64]:
-    """(n,) number of the connected part that each voxel (n, 3) belongs to; those that touch are one."""
-    # One number a voxel, 21 bits a coordinate, which lie within +-WIDEST.
+    """(n,) number of the connected part that each voxel (n, 3) belongs to; touching at a corner connects."""
+    # One number a voxel, 21 bits a coordinate: coordinates lie within +-WIDEST, and 1 << 20 makes them positive.
     keys, which = np.unique((voxel + (1 << 20)) @ np.array([1 << 42, 1 << 21, 1]), return_inverse=True)
-    part = np.arange(len(keys))
+    part = np.arange(len(keys))  # a forest: each voxel points at one of its part, a root at itself
     pairs = [_neighbors(keys, step) for step in _HALF_OF_26]
     first, second = (np.concatenate(ends) for ends in zip(*pairs, strict=True))
     while True:
@@ -274,14 +281,14 @@ def _connected(voxel: NDArray[np.int64]) -> NDArray[np.int64]:
         apart = a != b
         if not apart.any():
             return np.unique(part, return_inverse=True)[1].ravel()[which.ravel()]
-        # Each larger root is hung below a smaller one; then every voxel is moved up to its root.
+        # Union-find on all pairs at once: each larger root is hung below a smaller one, then all move up to their root.
         np.minimum.at(part, np.maximum(a, b)[apart], np.minimum(a, b)[apart])
         while (part != part[part]).any():
             part = part[part]
 
 
 def _neighbors(keys: NDArray[np.int64], step: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Places in sorted keys of every pair that lies ``step`` apart."""
+    """Rows in the sorted keys of every pair of keys that differ by ``step``."""
     place = np.minimum(np.searchsorted(keys, keys + step), len(keys) - 1)
     there = np.flatnonzero(keys[place] == keys + step)
     return there, place[there]

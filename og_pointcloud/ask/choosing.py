@@ -185,20 +185,25 @@ class Chooser:
         if bank is None or len(self._descriptors) == 0:
             return
         self._require_width(bank.vectors, "word bank's vectors")
+        # Step 1, centre: words without what all words share, descriptors without what all kinds of things share.
         self._bank_directions = unit_rows(bank.vectors - bank.mean)
         self._common = common_part(self._descriptors, self._bank_directions, self.settings.sharpness)
         self._centred = self._descriptors - self._common
+        # Step 2, standardise: how the bank's words score on each descriptor is its null distribution.
         scores = self._centred @ self._bank_directions.T
         self._middle, self._spread = _moments(scores)
+        # The best of several descriptors scores higher by chance alone, so instances are standardised once more.
         best = self._best_descriptor((scores - self._middle) / self._spread)
         self._best_middle, self._best_spread = _moments(best)
         self._bank_evidence = (best - self._best_middle) / self._best_spread
+        # How far a fitting word stands out in this scene: as far as the bank's best one on a quarter of the instances.
         self.sharpness = float(max(self.settings.sharpness, np.quantile(self._bank_evidence.max(axis=1), 0.75)))
 
     def standard(self) -> Standard:
-        """Steps 1 and 2 as arrays; of a scene with a word bank and at least one descriptor."""
+        """Steps 1 and 2 as arrays. Only for a scene with a word bank and at least one descriptor."""
         of_instance = np.searchsorted(self._described, self._owner)
         middle, spread = self._best_middle[of_instance], self._best_spread[of_instance]
+        # Both standardisations, ((score - middle) / spread - best middle) / best spread, as one scale and one shift.
         scale, shift = 1 / (self._spread * spread), -(self._middle / self._spread + middle) / spread
         columns = scale[:, 0].astype(np.float32), shift[:, 0].astype(np.float32)
         return Standard(self._common, *columns, self.sharpness)
@@ -219,15 +224,15 @@ class Chooser:
             return self._answer(cosines, nothing, nothing[:, 0])
         directions = unit_rows(unit_rows(texts) - self.bank.mean)
         scores = (self._centred @ directions.T - self._middle) / self._spread
-        evidence = (self._best_descriptor(scores) - self._best_middle) / self._best_spread  # several: as for the bank
-        evidence[:, ~texts.any(axis=1)] = -np.inf
+        evidence = (self._best_descriptor(scores) - self._best_middle) / self._best_spread  # as the bank's words were
+        evidence[:, ~texts.any(axis=1)] = -np.inf  # a zero row: less the bank's mean it would point somewhere
         return self._answer(evidence, *self._posterior(evidence, texts, directions))
 
     def _require_width(self, vectors: NDArray[np.floating], what: str) -> None:
         self._space.require(FeatureSpace(UNKNOWN_SPACE, vectors.shape[1]), what)
 
     def _best_descriptor(self, scores: NDArray[np.floating]) -> NDArray[np.floating]:
-        """(described, ...) of the scores of all descriptors, the best of each instance."""
+        """(described, ...) each instance's best score, from the scores of all descriptors (R, ...)."""
         return best_of_rows(scores, np.searchsorted(self._described, self._owner), len(self._described))
 
     def _posterior(
@@ -240,12 +245,15 @@ class Chooser:
         fitting words stand out is seen in the scene: the best words of the bank, at the upper quartile of instances.
         """
         sharpness = self.sharpness
+        # Logarithms of likelihood times prior, with exp(-sharpness^2 / 2) and the prior of one kind left out of all.
+        # Labels of the same vector are one hypothesis: two spellings of a word do not double its prior.
         hypothesis, first = _distinct(texts)
         log_words = np.log(max(len(first), self.settings.kinds))
         log_label = sharpness * evidence[:, first].astype(np.float64)
-        # The mean likelihood that a word of the bank other than the labels gives.
+        # "None" has the prior of all kinds together, and the mean likelihood of the bank's words other than the labels.
         other = (self._bank_directions @ directions.T).max(axis=1) < self.settings.synonym
         log_none = log_words + log_mean_likelihood(sharpness * self._bank_evidence[:, other].astype(float), sharpness)
+        # The largest exponent is taken off before exp, which would overflow beyond 709.
         top = np.maximum(log_none, log_label.max(axis=1))
         weight, none = np.exp(log_label - top[:, None]), np.exp(log_none - top)
         total = weight.sum(axis=1) + none
@@ -254,9 +262,10 @@ class Chooser:
     def _answer(
         self, evidence: NDArray[np.floating], table: NDArray[np.floating], unknown: NDArray[np.floating]
     ) -> Choice:
-        """Spread what is known of described instances over all of them."""
+        """The choice for all K instances, from arrays (described, ...) of those with a descriptor."""
         answer = self._nothing(evidence.shape[1])
         best = (evidence if self.bank is None else table).argmax(axis=1)
+        # Not "unknown <= 0.5": without a bank it is NaN, and the best label is answered.
         fits = ~(unknown > 0.5) & (evidence[np.arange(len(best)), best] > -np.inf)
         rows = self._described
         answer.labels[rows] = np.where(fits, best, UNKNOWN)
@@ -285,6 +294,7 @@ class Chooser:
 def log_mean_likelihood(exponents: NDArray[np.float64], sharpness: ArrayLike) -> NDArray[np.float64]:
     """(n,) log of the mean likelihood that words give, at least that of a word that fits by chance. exponents: (n, W)
     sharpness times evidence. sharpness: (n,), or one for all."""
+    # The mean of exp(sharpness * e) over standard normal evidence e is exp(sharpness^2 / 2).
     by_chance = np.broadcast_to(np.square(sharpness) / 2, len(exponents))
     if exponents.shape[1] == 0:
         return by_chance
@@ -297,19 +307,20 @@ def common_part(
     """(D,) what is taken off each descriptor: the mean over kinds of things, times 1 - 1 / (number of kinds).
 
     Each kind counts once, so that an object in pieces, or a hall of chairs, does not turn what makes a chair into what
-    all things share. Descriptors are of one kind that the same word of the bank fits best; those that no word stands
-    out for, by half of what fitting words do, are of no kind that is known and do not count. Words are read as the
-    descriptors are, then once more without what they then share. And one kind alone does not say what is shared:
-    nothing is taken off; of two, half.
+    all things share. Descriptors are of one kind when the same word of the bank fits them best. Where no word stands
+    out by at least half of what fitting words do, the kind is not known and the descriptor does not count. One kind
+    alone does not say what is shared: nothing is taken off; of two kinds, half of their mean.
     """
-    common, number = np.zeros(descriptors.shape[1], np.float32), _distinct(bank_directions)[0]
+    common, word_number = np.zeros(descriptors.shape[1], np.float32), _distinct(bank_directions)[0]
+    # Kinds are found on the descriptors as they are, then once more without what those kinds share; more rounds
+    # change next to nothing.
     for _ in range(2):
         scores = (descriptors - common) @ bank_directions.T
         middle, spread = _moments(scores)
-        kind = number[scores.argmax(axis=1)]
+        kind = word_number[scores.argmax(axis=1)]
         evidence = ((scores - middle) / spread).max(axis=1)
         fits = evidence >= max(sharpness, np.quantile(evidence, 0.75)) / 2
-        weight = fits / np.maximum(np.bincount(kind, fits), 1)[kind]
+        weight = fits / np.maximum(np.bincount(kind, fits), 1)[kind]  # adds up to one over each kind
         kinds = max(weight.sum(), 1)
         common = ((1 - 1 / kinds) * (weight / kinds) @ descriptors).astype(np.float32)
     return common
@@ -317,6 +328,7 @@ def common_part(
 
 def _distinct(texts: NDArray[np.float32]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """(T,) number of each text among the different ones, and (different,) where each comes first."""
+    # Five digits: the same text is the same vector again, whatever length it was given at.
     rounded = np.round(unit_rows(texts), 5) + 0.0  # -0 becomes 0
     _, first, number = np.unique(rounded, axis=0, return_index=True, return_inverse=True)
     return number.reshape(-1), first
@@ -324,5 +336,5 @@ def _distinct(texts: NDArray[np.float32]) -> tuple[NDArray[np.intp], NDArray[np.
 
 def _moments(scores: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Mean and standard deviation of each row, as columns; a row without spread gets no evidence at all."""
-    spread = scores.std(axis=1, keepdims=True)
+    spread = scores.std(axis=1, keepdims=True)  # 1e-7 is float32's rounding of a cosine: no spread at all
     return scores.mean(axis=1, keepdims=True), np.where(spread > 1e-7, spread, np.float32(np.inf))

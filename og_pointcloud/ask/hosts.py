@@ -1,7 +1,7 @@
 """Point clouds of other libraries -> an array of points, without importing any of them.
 
-A cloud is told by the module of its type: whoever has such an object has imported its library already. Rows stay rows:
-row i of what is answered belongs to row i of the cloud, also where it holds NaN.
+A cloud is recognised by the module of its type: whoever holds such an object has imported its library already. No row
+is dropped, not even one with NaN: row i of the answer belongs to row i of the cloud.
 """
 
 from __future__ import annotations

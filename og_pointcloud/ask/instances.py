@@ -89,6 +89,7 @@ class Instance:
         """(3,) mean of its main part; None without points."""
         if not self.points:
             return None
+        # Relative to one of its points: sums of map coordinates of 1e6 would lose digits.
         main = self.xyz[self.main_part]
         return main[0] + (main - main[0]).mean(axis=0)
 
@@ -199,6 +200,8 @@ def list_instances(
     """
     if up is not None:
         unit_up(up)  # said now, not at the first box
+    # Points sorted by id, those of one id in their own order: each instance's points are one slice. Negative ids come
+    # before the first.
     table, order = cloud.instances, np.argsort(cloud.instance_ids, kind="stable")
     bounds = np.searchsorted(cloud.instance_ids[order], np.arange(len(table) + 1))
     described = np.zeros(len(table), bool)
@@ -242,10 +245,17 @@ def _cells(row: Instance) -> tuple[str, ...]:
 
 
 def _flat(value: Any, name: str = "") -> dict[str, Any]:
-    """A record without nesting: a column a number, e.g. centroid_0. What is not known has none."""
-    parts = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
-    flat = {column: leaf for key, part in parts for column, leaf in _flat(part, f"{name}_{key}".strip("_")).items()}
-    return flat if isinstance(value, (dict, list)) or value is None else {name: value}
+    """A record without nesting: one column a number, e.g. centroid_0, and none for what is not known."""
+    if isinstance(value, dict):
+        parts = value.items()
+    elif isinstance(value, list):
+        parts = enumerate(value)
+    else:
+        return {} if value is None else {name: value}
+    flat: dict[str, Any] = {}
+    for key, part in parts:
+        flat |= _flat(part, f"{name}_{key}".strip("_"))
+    return flat
 
 
 def _write(path: str | os.PathLike[str] | None, text: str) -> None:

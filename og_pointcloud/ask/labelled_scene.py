@@ -2,8 +2,8 @@
 
 ``segment`` is one statement a step: which scene, which words, which instance each point belongs to, which word fits
 each instance, if any. Words are judged by ``choosing``, against the scene's word bank if it has one. Points are looked
-up by query.onnx; the few close to a border, where its table does not promise the answer, are settled exactly by
-``nearest``. A scene in memory has no graph: all its points are settled so, with the same answers.
+up by query.onnx. For the few close to a border, where its table does not promise the answer, ``nearest`` searches the
+cloud. A scene in memory has no graph: every point is searched for, with the same answers.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ from og_pointcloud.text.words import Labels, TextFeatures, resolve_labels
 SceneLike: TypeAlias = "LabelledScene | LabelledCloud | str | os.PathLike[str]"
 
 ELSEWHERE_SHARE = 1 / 3
-"""Of the points asked: where more lie too far from the scene, the two may be in different frames."""
+"""Where more than this share of the points asked lies too far from the scene, the two may be in different frames."""
 POINTS_PER_RUN = 1 << 20
-"""What bounds the memory of the graph: about 150 MB."""
+"""Points given to the graph at once, which keeps its memory to about 150 MB."""
 
 
 class LabelledScene:
@@ -69,13 +69,13 @@ class LabelledScene:
         )
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """To other processes goes what the file holds, and no runtime."""
+        """Other processes are sent what the file holds, not the open session: each opens its own."""
         return LabelledScene, (self._bundle,)
 
     @classmethod
     def from_cloud(cls, cloud: LabelledCloud) -> LabelledScene:
-        """A scene of a cloud that was never written. It answers as its file would, the first time without delay, many
-        points at a time more slowly: every point is searched for."""
+        """A scene of a cloud that was never written. It answers as its file would. The first answer comes sooner, as no
+        graph is opened; many points take longer, as each is searched for."""
         return cls(Bundle(None, cloud, None, {}))
 
     @cached_property
@@ -159,7 +159,7 @@ class LabelledScene:
         certainty = np.zeros(len(points), np.float32)
         local = self._local(points)
         finite = np.isfinite(local).all(axis=1)
-        certainty[finite] = of_points[self.nearest.query(local[finite])]  # NONE_WITHIN_REACH is the last
+        certainty[finite] = of_points[self.nearest.query(local[finite])]  # NONE_WITHIN_REACH, -1, reads the added 0
         return certainty
 
     def _local(self, points: NDArray[np.floating]) -> NDArray[np.float32]:
@@ -172,7 +172,7 @@ class LabelledScene:
         return local
 
     def _look_up(self, local: NDArray[np.float32]) -> NDArray[np.int32]:
-        """Instance of each point: the graph's where it is certain, else by exact search."""
+        """(N,) instance of each point: the graph's answer where it is certain, else by exact search. local: (N, 3)."""
         if self._graph is None:
             instances, still_open = np.full(len(local), TOO_FAR, np.int32), np.arange(len(local))
         else:
@@ -181,6 +181,7 @@ class LabelledScene:
                 return instances
             still_open = np.flatnonzero(~certain)
         still_open = still_open[np.isfinite(local[still_open]).all(axis=1)]  # the others are too far already
+        # One value more than points: NONE_WITHIN_REACH is -1 and reads TOO_FAR.
         nearest = self.nearest.query(local[still_open])
         instances[still_open] = np.append(self.instance_ids, np.int32(TOO_FAR))[nearest]
         return instances
@@ -285,7 +286,8 @@ class Segmenter:
         return self._answer(points, pose)
 
     def _answer(self, pcd: Any, pose: ArrayLike | None) -> Segmentation:
-        scene, own = self.scene, as_scene(pcd) if _is_scene(pcd) else None
+        scene = self.scene
+        own = as_scene(pcd) if _is_scene(pcd) else None
         if own is not None and own.cloud is scene.cloud and pose is None:  # its own points need no look-up
             points, instances = scene.xyz, scene.instance_ids
         else:

@@ -1,9 +1,8 @@
 """A click selects an instance (Sec. 4.3): a pixel of a camera, or a place, -> instance, its points, its mask anywhere.
 
-numpy only. Points are squares in the image, a spacing to each side; at each pixel the front surface wins, and on it the
-point that lies nearest to the pixel. One rule answers a click and makes a mask, so a picked instance's mask contains
-the pixel that was clicked. Images much finer than the cloud are made coarser and enlarged: their pixels see nothing new
-of it.
+numpy only. Points are drawn as squares; at each pixel the front surface wins, and on it the point that lies nearest to
+the pixel. One rule answers a click and makes a mask, so a picked instance's mask contains the pixel that was clicked.
+An image much finer than the cloud is drawn coarser and enlarged: its pixels show nothing more of the cloud.
 
 Frames. Everything here is in world coordinates, like ``scene.xyz``; a camera's ``world_to_camera`` maps from them.
 Views of a capture map from its local frame: ``in_world(view.camera, capture.points.origin)`` is the camera to pass.
@@ -31,11 +30,11 @@ from og_pointcloud.text.words import Labels, TextFeatures
 NEAR = 1.0
 """Depth of the near plane in point spacings: nearer points would cover half the image each."""
 HALF_WIDTH = 0.7
-"""Pixels so many spacings around a point are its own: few gaps, and edges hardly fatter than what they show."""
+"""Half the side of a point's square, in point spacings: few gaps, and edges hardly fatter than what they show."""
 PIXELS_PER_SPACING = 2.0
-"""Pixels a point spacing that are looked at, at most; as many as the fit looks at."""
+"""Pixels drawn for a point spacing, at most: as many as the fit looks at."""
 WIDEST = 8
-"""Pixels that a point covers to each side at most: those much nearer than the others leave gaps."""
+"""Most pixels that a square has on each side of its middle: points much nearer than the others then leave gaps."""
 NO_POINT = NONE_WITHIN_REACH
 
 _NOTHING_PICKED = {
@@ -158,6 +157,7 @@ def front_points(cloud: LabelledCloud, camera: Camera) -> NDArray[np.int64]:
     nearest wins, of equally near ones the rightmost, then the lowest; in one pixel the one nearest to the camera.
     """
     squares, drawn = _squares(cloud, camera)
+    # Each pixel of the camera shows the drawn pixel that its center falls into.
     front = _in_front(squares, drawn.width, drawn.height, cloud.reach)
     rows = ((np.arange(camera.height) + 0.5) * drawn.height / camera.height).astype(np.intp)
     columns = ((np.arange(camera.width) + 0.5) * drawn.width / camera.width).astype(np.intp)
@@ -185,10 +185,10 @@ def _nearest_point(scene: LabelledScene, place: ArrayLike) -> int:
 
 @dataclass(frozen=True)
 class _Squares:
-    """Points as squares of pixels, from far to near, of equals the lowest index last.
+    """Points as squares of pixels, from far to near; of those equally far, the lowest index last.
 
-    index: (m,) in the cloud. pixel: (m, 2) column and row of the middle one. depth: (m,). half: (m,) pixels that are
-    covered to each side of the middle one.
+    index: (m,) in the cloud. pixel: (m, 2) column and row of the middle pixel. depth: (m,), in the scene's unit. half:
+    (m,) pixels covered on each side of the middle one.
     """
 
     index: NDArray[np.int64]
@@ -198,17 +198,19 @@ class _Squares:
 
 
 def _squares(cloud: LabelledCloud, camera: Camera) -> tuple[_Squares, Camera]:
-    """The squares that may touch the image, and the camera that they are drawn by: coarser where the cloud is."""
+    """The squares that may touch the image, and the camera that they are drawn by, coarser for a coarse cloud."""
     uv_px, depth = in_world(camera, -cloud.origin).project(cloud.xyz.astype(np.float64))
     before = depth > NEAR * cloud.spacing
     spacing_px = np.sqrt(camera.fx * camera.fy) * cloud.spacing / np.where(before, depth, np.inf)
     inside = before & camera.shows(uv_px)
+    # The image is reduced until the median point in it has PIXELS_PER_SPACING pixels to a spacing.
     shrink = max(1.0, float(np.median(spacing_px[inside])) / PIXELS_PER_SPACING) if inside.any() else 1.0
     drawn = camera.resized(max(1, round(camera.width / shrink)), max(1, round(camera.height / shrink)))
     size = np.array([drawn.width, drawn.height])
     scale = size / [camera.width, camera.height]
     half = np.minimum(np.rint(HALF_WIDTH * spacing_px * np.sqrt(scale.prod())), WIDEST)
     uv_px = uv_px * scale
+    # A point beyond the border counts where its square may reach over it, with a pixel to spare.
     index = np.flatnonzero(before & ((uv_px >= -half[:, None] - 1) & (uv_px <= size + half[:, None] + 1)).all(axis=1))
     index = index[np.lexsort((-index, -depth[index]))]
     return _Squares(index, np.floor(uv_px[index]).astype(np.int64), depth[index], half[index].astype(np.int64)), drawn
@@ -217,11 +219,13 @@ def _squares(cloud: LabelledCloud, camera: Camera) -> tuple[_Squares, Camera]:
 def _in_front(squares: _Squares, width: int, height: int, reach: float) -> NDArray[np.int64]:
     """(height, width) the point that each pixel shows."""
     nearest, shown = np.full(width * height, -1), np.full(width * height, NO_POINT)
+    # First pass, where the front surface begins: squares go from far to near, so the largest number is the nearest.
     for square, pixel in _covered(squares, width, height):
         ranks = np.full(width * height, -1)
         ranks[pixel] = square  # of several writes the last one stays: the nearest
         np.maximum(nearest, ranks, out=nearest)
-    surface = np.append(squares.depth, np.inf)[nearest] + reach
+    surface = np.append(squares.depth, np.inf)[nearest] + reach  # -1, no square, reads infinity
+    # Second pass, who is shown: squares come by how far their middle is from the pixel, and the first one stays.
     for square, pixel in _covered(squares, width, height):
         wins = (shown[pixel] == NO_POINT) & (squares.depth[square] <= surface[pixel])
         shown[pixel[wins]] = squares.index[square[wins]]
@@ -229,7 +233,7 @@ def _in_front(squares: _Squares, width: int, height: int, reach: float) -> NDArr
 
 
 def _covered(squares: _Squares, width: int, height: int) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
-    """Squares with a pixel (row-major) that each covers, its middle one first, then farther and farther ones."""
+    """Squares and a pixel (row-major) that each covers: first each one's middle, then pixels ever farther from it."""
     widest = int(squares.half.max(initial=-1))
     steps = np.arange(-widest, widest + 1)
     for right, down in sorted(itertools.product(steps, steps), key=lambda step: step[0] ** 2 + step[1] ** 2):

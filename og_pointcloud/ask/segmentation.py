@@ -64,13 +64,14 @@ class Segmentation:
 
     def __repr__(self) -> str:
         """How many points have each label, the most frequent first, and why the others have none."""
-        found = sorted(((count, name) for name, count in self.counts().items() if count), key=lambda of: -of[0])
-        rows = [(name, f"{count:,}") for count, name in found[:SHOWN]]
-        if found[SHOWN:]:
-            rows.append((f"{len(found) - SHOWN} more labels", f"{sum(count for count, _ in found[SHOWN:]):,}"))
+        frequent = sorted(((name, count) for name, count in self.counts().items() if count), key=lambda row: -row[1])
+        rows = [(name, f"{count:,}") for name, count in frequent[:SHOWN]]
+        if rest := frequent[SHOWN:]:
+            rows.append((f"{len(rest)} more labels", f"{sum(count for _, count in rest):,}"))
         rows += [(f"unknown, {reason}", f"{count:,}") for reason, count in self.unknown_because().items()]
-        name_width, width = (max(map(len, column), default=0) for column in zip(*rows, strict=True)) if rows else (0, 0)
-        lines = (f"{name:<{name_width}}  {count:>{width}}" for name, count in rows)
+        name_width = max((len(name) for name, _ in rows), default=0)
+        count_width = max((len(count) for _, count in rows), default=0)
+        lines = (f"{name:<{name_width}}  {count:>{count_width}}" for name, count in rows)
         return "\n".join([f"{len(self):,} points", *lines])
 
     @cached_property
@@ -81,8 +82,9 @@ class Segmentation:
         ``scores`` say whether the instance is what the word means, this whether the point is part of it: low at
         borders, and where masks disagree. None where the scene does not know it.
         """
-        found = self.certainty_at(self.xyz)
-        return None if found is None else np.where(self.instances == TOO_FAR, np.float32(0), found)
+        certainty = self.certainty_at(self.xyz)
+        # A shorter reach may have been asked for than the one that certainty is looked up by.
+        return None if certainty is None else np.where(self.instances == TOO_FAR, np.float32(0), certainty)
 
     def mask(self, name: str) -> NDArray[np.bool_]:
         """(N,) bool, the points with this label."""

@@ -147,10 +147,11 @@ def select(
         raise OgPointcloudError(f"the text is {shown!r:.80}; expected one word or phrase, or one name -> vector")
     query = scene.words(text, text_features)
     rivals = _rivals(scene, query, against, text_features)
-    choice = scene.chooser.choose(np.concatenate([query.vectors, rivals.vectors]))
+    choice = scene.chooser.choose(np.concatenate([query.vectors, rivals.vectors]))  # label 0 is the query
     points = np.bincount(scene.instance_ids[scene.instance_ids >= 0], minlength=len(choice.labels))
     known = (points > 0) & (choice.reasons != Reason.NOT_DESCRIBED)
     ranked = [int(k) for k in choice.ranking(0) if known[k]]
+    # With neither rivals nor bank label 0 would fit every instance; the best one alone is then said to fit.
     fitting = set(np.flatnonzero(choice.labels == 0).tolist() if rivals.names or choice.calibrated else ranked[:1])
     return Selection(
         query=query.names[0],
@@ -175,7 +176,7 @@ def _match(
 
 def _rivals(scene: LabelledScene, query: Vocabulary, against: Labels, text_features: TextFeatures) -> Vocabulary:
     """The words that compete with the query, without itself."""
-    none_wanted = isinstance(against, Sequence) and not len(against)
+    none_wanted = isinstance(against, Sequence) and not len(against)  # []; None asks for all known words
     words = query if none_wanted else scene.known_words(against, text_features)
     others = [index for index, name in enumerate(words.names) if name != query.names[0]]
     if not others:
