@@ -5,14 +5,56 @@ None of them is a length: distances are in point spacings, weights in pixels, th
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
-from typing import Any, Literal, get_args, get_type_hints
+from dataclasses import MISSING, dataclass, field, fields, replace
+from numbers import Integral, Real
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from og_pointcloud.errors import OgPointcloudError
 
+ABOVE_ZERO = {
+    "coarse_interval", "crossing", "fine_interval", "graph_points", "held_out_points", "image_pixels", "k1", "k2",
+    "kinds", "lloyd_rounds", "memory", "neighbours", "opacity", "reach", "rounds", "scale", "scales", "schedule_share",
+    "sharpness", "synonym", "tile_points", "width",
+}  # fmt: skip
+"""Numbers that 0 would make meaningless; none may be negative."""
+AT_MOST_ONE = {"opacity", "view_quantile"}
+
+
+class _Checked:
+    """Settings that are held against their types when they are made: OgPointcloudError says which one is not right."""
+
+    def __post_init__(self) -> None:
+        hints = get_type_hints(type(self))
+        for setting in fields(self):  # pyright: ignore[reportArgumentType]
+            value = getattr(self, setting.name)
+            if expected := _unlike(hints[setting.name], setting.name, value):
+                default = "" if setting.default is MISSING else f", by default {setting.default!r}"
+                kind = type(self).__name__
+                raise OgPointcloudError(f"{setting.name} is {value!r}; expected {expected}{default} ({kind})")
+
+
+def _unlike(hint: Any, name: str, value: Any) -> str:
+    """What is expected of a setting of this type and name; "" where the value is that."""
+    kinds = get_args(hint)
+    if get_origin(hint) is Literal:
+        return "" if value in kinds else f"one of {', '.join(map(repr, kinds))}"
+    if type(None) in kinds:
+        return "" if value is None else _unlike(kinds[0], name, value)
+    if get_origin(hint) is tuple:
+        right = isinstance(value, (tuple, list)) and value and not any(_unlike(kinds[0], name, each) for each in value)
+        return "" if right else "a tuple of numbers above 0"
+    if hint not in (int, float):
+        return "" if isinstance(value, hint) else f"a {hint.__name__}"
+    least, most = name in ABOVE_ZERO, name in AT_MOST_ONE
+    if isinstance(value, Integral if hint is int else Real) and not isinstance(value, bool):
+        number = float(value)
+        if number >= 0 and not (number == 0 and least) and not (number > 1 and most):
+            return ""
+    return ("a whole number" if hint is int else "a number") + (" above 0" if least else " from 0") + " to 1" * most
+
 
 @dataclass(frozen=True)
-class GeometrySettings:
+class GeometrySettings(_Checked):
     """Gaussians of a plain cloud (geometry.py)."""
 
     scales: tuple[float, ...] = (0.25, 0.35, 0.5, 0.7)
@@ -37,7 +79,7 @@ class GeometrySettings:
 
 
 @dataclass(frozen=True)
-class GroupingSettings:
+class GroupingSettings(_Checked):
     """Training-free grouping of masks (grouping.py)."""
 
     graph_points: int = 60_000
@@ -51,7 +93,7 @@ class GroupingSettings:
 
 
 @dataclass(frozen=True)
-class MembershipSettings:
+class MembershipSettings(_Checked):
     """States of points (membership.py)."""
 
     sure_share: float = 0.6
@@ -80,7 +122,7 @@ class MembershipSettings:
 
 
 @dataclass(frozen=True)
-class _LossSettings:
+class _LossSettings(_Checked):
     """Features and the losses that they are learned by (paper, Sec. 3.1, Eq. 1 and 2)."""
 
     width: int = 6
@@ -96,12 +138,9 @@ class _LossSettings:
     smaller than the authors', which they weigh 0.1."""
 
     def __post_init__(self) -> None:
-        if self.width < 1:
-            raise OgPointcloudError(f"the width of features is {self.width}; expected at least 1, 6 as published")
+        super().__post_init__()
         if not (self.intra or self.inter):
             raise OgPointcloudError("both losses are off; features need intra (Eq. 1), inter (Eq. 2), or both")
-        if not self.cohesion_weight >= 0:
-            raise OgPointcloudError(f"cohesion_weight is {self.cohesion_weight}; expected 0 or more")
 
 
 @dataclass(frozen=True)
@@ -117,7 +156,7 @@ class FeatureSettings(_LossSettings):
 
 
 @dataclass(frozen=True)
-class CodebookSettings:
+class CodebookSettings(_Checked):
     """Two-level codebook without rendering (learned/codebook.py; paper, Sec. 3.2, Eq. 3)."""
 
     levels: Literal[1, 2] = 2
@@ -137,15 +176,9 @@ class CodebookSettings:
     rounds: int = 30
     """Rounds of k-means at most."""
 
-    def __post_init__(self) -> None:
-        for name in ("levels", "k1", "k2"):
-            value = getattr(self, name)
-            if value is not None and (value < 1 or (name == "levels" and value > 2)):
-                raise OgPointcloudError(f"{name} is {value}; expected {'1 or 2' if name == 'levels' else 'at least 1'}")
-
 
 @dataclass(frozen=True)
-class MatchingSettings:
+class MatchingSettings(_Checked):
     """Masks of instances that a codebook made (learned/matching.py; paper, Sec. 3.3, Eq. 5)."""
 
     score: Literal["both", "iou", "feature", "within"] = "both"
@@ -162,11 +195,6 @@ class MatchingSettings:
     """
     settle: bool = True
     """All views settle which instance a point is of (membership.py); else it keeps its leaf, as published."""
-
-    def __post_init__(self) -> None:
-        scores = get_args(get_type_hints(type(self))["score"])
-        if self.score not in scores:
-            raise OgPointcloudError(f'score is "{self.score}"; expected one of {", ".join(scores)}')
 
 
 LITERAL_MATCHING = MatchingSettings(threshold=0.2, min_views=2, visible=False, settle=False)
@@ -239,18 +267,9 @@ class PaperSettings(_LossSettings):
             own |= {"schedule": "lerf", "k2": 10, "position_weight": 0.5, "matching": matching}
         return cls(**(own | changes))
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        for name in ("k1", "k2", "coarse_interval", "fine_interval", "lloyd_rounds", "image_pixels"):
-            value = getattr(self, name)
-            if value is not None and value < 1:
-                raise OgPointcloudError(f"{name} is {value}; expected at least 1")
-        if not self.schedule_share > 0:
-            raise OgPointcloudError(f"schedule_share is {self.schedule_share}; expected more than 0, 1 as published")
-
 
 @dataclass(frozen=True)
-class VisibilitySettings:
+class VisibilitySettings(_Checked):
     """Where the mask table is kept while it grows (mask_table.py, work_folder.py)."""
 
     table_share: float = 0.4
@@ -262,7 +281,7 @@ class VisibilitySettings:
 
 
 @dataclass(frozen=True)
-class FitSettings:
+class FitSettings(_Checked):
     """Settings of `fit`. The defaults are meant for every scene; none needs tuning.
 
     >>> import og_pointcloud as og
@@ -291,17 +310,9 @@ class FitSettings:
     matching: MatchingSettings = field(default_factory=MatchingSettings)
     paper: PaperSettings = field(default_factory=PaperSettings)
 
-    def __post_init__(self) -> None:
-        if self.seed < 0:
-            raise OgPointcloudError(f"seed is {self.seed}; expected 0 or more")
-        if self.memory is not None and not self.memory > 0:
-            raise OgPointcloudError(f"memory is {self.memory} bytes; expected more than 0, or None")
-        if self.tile_points is not None and self.tile_points < 1:
-            raise OgPointcloudError(f"tile_points is {self.tile_points}; expected at least 1, or None")
-
 
 @dataclass(frozen=True)
-class ChoosingSettings:
+class ChoosingSettings(_Checked):
     """From text vectors and descriptors to a label or "unknown" (choosing.py). Evidence is in standard deviations of
     how unrelated words score on an instance."""
 
@@ -312,9 +323,3 @@ class ChoosingSettings:
     """Kinds of things that an instance may be, if fewer labels are asked: each label then has one share of so many."""
     synonym: float = 0.6
     """A bank word this close to a label (cosine, centred) means the same and does not speak against it: cup and mug."""
-
-    def __post_init__(self) -> None:
-        for name in ("sharpness", "kinds", "synonym"):
-            value = getattr(self, name)
-            if not value > 0:
-                raise OgPointcloudError(f"{name} is {value}; expected more than 0")

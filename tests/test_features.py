@@ -282,7 +282,7 @@ def test_masks_that_show_nothing_are_refused() -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"width": 0}, "width of features is 0"),
+        ({"width": 0}, "width is 0"),
         ({"intra": False, "inter": False}, "both losses are off"),
         ({"cohesion_weight": -1.0}, "cohesion_weight is -1"),
     ],

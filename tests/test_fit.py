@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -12,11 +13,18 @@ from numpy.typing import NDArray
 
 import og_pointcloud as og
 from og_pointcloud.cloud import BACKGROUND, UNOBSERVED, LabelledCloud
-from og_pointcloud.errors import SceneError
+from og_pointcloud.errors import OgPointcloudError, SceneError
 from og_pointcloud.fitting.fit import fit, prepare
 from og_pointcloud.journal import Journal, LeftOut
 from og_pointcloud.scene import Camera, Points, Scene, View
-from og_pointcloud.settings import FitSettings, MembershipSettings, PaperSettings
+from og_pointcloud.settings import (
+    FitSettings,
+    GeometrySettings,
+    GroupingSettings,
+    MatchingSettings,
+    MembershipSettings,
+    PaperSettings,
+)
 
 WIDTH, HEIGHT, FOCAL_PX = 96, 72, 90.0
 LOWER = np.array([[-1.0, -0.9, 0], [0.2, -1.0, 0], [-0.9, 0.3, 0], [0.4, 0.3, 0]])
@@ -404,6 +412,26 @@ def test_pixels_beyond_those_that_mode_paper_renders_are_left_out() -> None:
 def test_masks_that_show_no_point_are_refused(mode: str) -> None:
     with pytest.raises(SceneError, match=r"none of the \d+ masks shows a Gaussian; expected at least one: make masks"):
         fit(tiny_scene(5, masked=False), FitSettings(mode=mode), progress=False)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        (lambda: MembershipSettings(crossing=0), "crossing is 0; expected a number above 0, by default 2.0"),
+        (lambda: MembershipSettings(gap_sizes=float("nan")), "gap_sizes is nan; expected a number from 0, by"),
+        (lambda: GeometrySettings(scales=()), r"scales is \(\); expected a tuple of numbers above 0"),
+        (lambda: GeometrySettings(opacity=1.5), "opacity is 1.5; expected a number above 0 to 1"),
+        (lambda: GroupingSettings(graph_points=0.5), "graph_points is 0.5; expected a whole number above 0"),  # type: ignore[arg-type]
+        (lambda: FitSettings(mode="quick"), "mode is 'quick'; expected one of 'grouping', 'fast', 'paper', 'auto'"),  # type: ignore[arg-type]
+        (lambda: FitSettings(memory="4GB"), "memory is '4GB'; expected a whole number above 0"),  # type: ignore[arg-type]
+        (lambda: FitSettings(seed=True), "seed is True; expected a whole number from 0"),
+        (lambda: FitSettings(membership=None), r"membership is None; expected a MembershipSettings \(FitSettings\)"),  # type: ignore[arg-type]
+        (lambda: MatchingSettings(relative="no"), "relative is 'no'; expected a bool, by default False"),  # type: ignore[arg-type]
+    ],
+)  # fmt: skip
+def test_settings_that_mean_nothing_are_refused(settings: Callable[[], object], message: str) -> None:
+    with pytest.raises(OgPointcloudError, match=message):
+        settings()
 
 
 def test_a_fit_without_an_instance_says_so() -> None:

@@ -139,7 +139,7 @@ def test_in_a_crowd_as_by_looping_over_pairs() -> None:
         starts = np.flatnonzero(random.random(12) < 0.2).tolist()  # a mask covers one instance, or two or three
         masks = [np.flatnonzero((ids >= k) & (ids <= k + random.integers(3))).tolist() for k in starts]
         views.append([(mask, ONE) for mask in masks if mask])
-        owners += [k for k, mask in zip(starts, masks) if mask]
+        owners += [k for k, mask in zip(starts, masks, strict=True) if mask]
     table = hand_table(len(ids), views)
     shown = np.stack([table.weights.toarray()[:, ids == k].sum(axis=1) for k in range(12)], axis=1)
     seen = np.stack([shown[table.mask_view == v].sum(axis=0) for v in range(40)])
@@ -148,13 +148,13 @@ def test_in_a_crowd_as_by_looping_over_pairs() -> None:
     sees, size, expected = seen > 0.1 * np.array(typical), np.bincount(ids), []
     for part in range(12):
         own, found = False, []
-        held = {whole: 0 for whole in range(12)}
+        held = dict.fromkeys(range(12), 0)
         for mask, (view, whole) in enumerate(zip(table.mask_view, owners, strict=True)):
             if sees[view, part] and sees[view, whole] and shown[mask, part] > 0.5 * seen[view, part]:
                 own |= whole == part
                 held[whole] += 1
         for whole in range(12):
-            of_whole = {view for view, owner in zip(table.mask_view, owners) if owner == whole}
+            of_whole = {view for view, owner in zip(table.mask_view, owners, strict=True) if owner == whole}
             possible = sum(sees[v, part] and sees[v, whole] for v in of_whole)
             if size[whole] > size[part] and held[whole] >= 2 and held[whole] > 0.5 * possible:
                 found.append((-held[whole] / possible, size[whole], whole))

@@ -443,7 +443,7 @@ def test_points_decided_a_few_at_a_time_are_decided_alike(monkeypatch: pytest.Mo
 @pytest.mark.slow
 def test_a_fit_goes_on_from_its_work_folder_and_removes_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     scene = boxes_on_a_table().scene
-    settings = FitSettings(visibility=VisibilitySettings(keep_after_s=-1))
+    settings = FitSettings(visibility=VisibilitySettings(keep_after_s=0))
     with killed_run(tmp_path / "work") as work:
         prepare(scene, settings, work=work)
     assert kept_files(tmp_path / "work", "view") == len(scene.views)
@@ -498,5 +498,5 @@ def test_a_fit_killed_in_the_middle_goes_on_and_gives_the_same_bits(tiny_capture
 def test_memory_of_a_fit_is_refused_before_any_work(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["fit", str(tmp_path), "-o", str(tmp_path / "a.ogpc"), "--memory", "4"]) == 2
     assert "expected a size of at least 64MB" in capsys.readouterr().err
-    with pytest.raises(OgPointcloudError, match="memory is 0 bytes"):
+    with pytest.raises(OgPointcloudError, match="memory is 0; expected a whole number above 0"):
         FitSettings(memory=0)

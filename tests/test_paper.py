@@ -390,7 +390,7 @@ def test_a_view_with_one_mask_has_no_separation() -> None:
 
 @pytest.mark.parametrize(
     ("options", "message"),
-    [({"k1": 0}, "k1 is 0"), ({"schedule_share": 0.0}, "schedule_share is 0"), ({"width": -1}, "width of features")],
+    [({"k1": 0}, "k1 is 0"), ({"schedule_share": 0.0}, "schedule_share is 0"), ({"width": -1}, "width is -1")],
 )
 def test_settings_that_mean_nothing_are_refused(options: dict, message: str) -> None:
     with pytest.raises(OgPointcloudError, match=message):

@@ -284,7 +284,7 @@ def test_bad_use_is_told_at_the_door():
     behind = replace(scene, points=Points(-scene.points.xyz, np.zeros(3)))
     with pytest.raises(SceneError, match="no camera sees the cloud"):
         fit(behind, FitSettings(tile_points=1600), progress=False)
-    with pytest.raises(OgPointcloudError, match="tile_points is 0; expected at least 1"):
+    with pytest.raises(OgPointcloudError, match="tile_points is 0; expected a whole number above 0"):
         FitSettings(tile_points=0)
     with pytest.raises(OgPointcloudError, match="seed is -1"):
         FitSettings(seed=-1)
