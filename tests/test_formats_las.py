@@ -29,7 +29,7 @@ def las_header(data, **numbers):
     first = struct.unpack_from("<I", edit, 96)[0]
     laszip = edit.find(struct.pack("<16sH", b"laszip encoded", 22204)) + 52
     table = struct.unpack_from("<q", edit, first)[0] if laszip > 52 else 0
-    places = {"records": (100, "<I"), "points": (247, "<Q")}
+    places = {"records": (100, "<I"), "points": (247, "<Q"), "last_records": (243, "<I")}
     places["chunk_points"] = (laszip + 12, "<I")
     places |= {"table": (first, "<q"), "table_chunks": (table + 4, "<I"), "layer": (first + 8 + 49 + 4, "<I")}
     for name, number in numbers.items():
@@ -41,6 +41,7 @@ def las_header(data, **numbers):
     ("suffix", "numbers", "says"),
     [
         (".las", {"records": 2**32 - 1}, "4294967295 records before the points"),
+        (".las", {"last_records": 2**32 - 1}, "of 4294967295 behind the points"),  # once read one by one
         (".las", {"points": 10**12}, "1000000000000 points of 49 bytes"),
         (".las", {"points": 13}, "13 points of 49 bytes"),
         (".laz", {"points": 13}, "cannot be read as LAS|expected 13 points"),
@@ -96,6 +97,16 @@ def test_copc_is_read_like_any_laz(tmp_path):
     points = read_points(tmp_path / "a.copc.laz")
     np.testing.assert_allclose(points.xyz_world, xyz, atol=1e-4)
     np.testing.assert_array_equal(points.rgb, rgb)
+    label = np.zeros(900, np.int32)
+    labels = {
+        "og_label": label,
+        "og_instance": label,
+        "og_score": label + np.float32(1),
+        "og_reason": label.astype("u1"),
+    }
+    write_las(tmp_path / "labelled.laz", points.xyz_world, rgb, labels, ("bush",), tmp_path / "a.copc.laz")
+    found = laspy.read(tmp_path / "labelled.laz")  # an octree of chunks that are elsewhere now would be read
+    assert "copc" not in {record.user_id for record in (*found.vlrs, *(found.evlrs or ()))}
     whole = (tmp_path / "a.copc.laz").read_bytes()
     (tmp_path / "cut.copc.laz").write_bytes(whole[: len(whole) // 2])
     with pytest.raises(SceneError, match=r"cut\.copc\.laz: .* damaged or truncated"):
@@ -109,6 +120,7 @@ def test_a_survey_keeps_all_that_it_says(tmp_path, point_format):
     header.scales, header.offsets = np.full(3, 0.001), np.array([5e5, 4e6, 100])
     header.add_extra_dims([laspy.ExtraBytesParams("height", np.float32)])
     header.vlrs.append(laspy.VLR("LASF_Projection", 2112, "", b'PROJCS["site"]\0'))
+    header.evlrs = laspy.vlrs.vlrlist.VLRList([laspy.VLR("surveyor", 7, "", b"a" * 70_000)])
     survey, count = laspy.LasData(header), 12
     survey.xyz = np.random.default_rng(0).uniform(0, 9, (count, 3)) + header.offsets
     survey.intensity, survey["height"] = np.arange(count), np.arange(count) / 2
@@ -129,6 +141,7 @@ def test_a_survey_keeps_all_that_it_says(tmp_path, point_format):
     assert found.og_label.tolist() == label.tolist()
     assert [record.user_id for record in found.vlrs].count("og_pointcloud") == 1
     assert found.vlrs.get_by_id("LASF_Projection")[0].record_data_bytes() == b'PROJCS["site"]\0'
+    assert found.evlrs.get_by_id("surveyor")[0].record_data_bytes() == b"a" * 70_000
     nothing = {
         name: np.full_like(values, -1 if name in ("og_label", "og_instance") else 1)
         for name, values in attributes.items()

@@ -49,7 +49,7 @@ EIGHT_BIT_CLASSES = {0: 6, 1: 6, 2: 7, 3: 7, 4: 9, 5: 10}
 OWN_DIMENSIONS = ("og_label", "og_instance", "og_score", "og_reason")
 RECORD_OWNER, NAMES_RECORD = "og_pointcloud", 1
 LONGEST_RECORD = 65_535
-SMALLEST_HEADER, RECORD_HEADER = 227, 54
+SMALLEST_HEADER, RECORD_HEADER, LAST_RECORD_HEADER = 227, 54, 60
 LAYERED = 3
 """LASzip's compressor whose chunks hold each field as a layer of its own."""
 LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}
@@ -144,7 +144,8 @@ def _points_of(source: Path, count: int) -> LasData:
     if "og_label" in own:  # its class would be taken for one of the new labels
         las.classification = np.where(np.asarray(las["og_label"]) >= 0, UNLABELLED, np.asarray(las["classification"]))
     las.remove_extra_dims(own)
-    las.vlrs[:] = [record for record in las.vlrs if record.user_id != RECORD_OWNER]
+    for records in (las.vlrs, las.evlrs or []):  # COPC's say where its chunks are, which is nowhere the same
+        records[:] = [record for record in records if record.user_id not in (RECORD_OWNER, "copc")]
     return las
 
 
@@ -193,6 +194,7 @@ def _check_counts(path: Path) -> None:
         header_size, first_point, records, _, point_size = struct.unpack_from("<HIIBH", data, 94)
         _require(header_size + RECORD_HEADER * records <= first_point <= size, f"{records} records before the points")
         header = _laspy().LasHeader.read_from(file)
+        _check_last_records(data, header.start_of_first_evlr, header.number_of_evlrs)
         if header.are_points_compressed:
             _check_chunks(data, _layers(header.vlrs.get("LasZipVlr")), first_point, point_size)
         else:
@@ -215,6 +217,14 @@ def _layers(laszip_records: Sequence[Any]) -> int:
     kinds = [struct.unpack_from("<HH", content, 34 + 6 * item) for item in range(items)]
     layers = sum(size if kind == EXTRA_BYTES else LAYERS.get(kind, 0) for kind, size in kinds)
     return layers if compressor == LAYERED else 0
+
+
+def _check_last_records(data: mmap.mmap, at: int, records: int) -> None:
+    """The records behind the points, each of a header that holds its length, lie within the file."""
+    for record in range(records):
+        length = struct.unpack_from("<Q", data, at + 20)[0] if at + LAST_RECORD_HEADER <= len(data) else 0
+        at += LAST_RECORD_HEADER + length
+        _require(at <= len(data), f"record {record} of {records} behind the points")
 
 
 def _check_chunks(data: mmap.mmap, layers: int, first_point: int, point_size: int) -> None:
