@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 import ast
+import signal
 import statistics
 import subprocess
 import sys
@@ -147,4 +148,5 @@ def _count(paths: Iterator[Path] | list[Path]) -> int:
 
 
 if __name__ == "__main__":
+    signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # as `| head` does: nobody reads on
     main()

@@ -2,6 +2,7 @@
 
 import json
 import shlex
+import shutil
 
 import cv2
 import numpy as np
@@ -121,6 +122,28 @@ def test_without_words_the_next_command_needs_none(tiny_capture, tmp_path, capsy
     assert "no words are known yet" in stdout
     command = next(line for line in stdout.splitlines() if line.startswith("next: og-pointcloud "))
     assert run(capsys, *shlex.split(command)[2:])[0] == 0, "the next command must work as printed"
+
+
+def test_what_wrote_a_file_says_what_to_type_next(fitted, tmp_path, capsys):
+    capture, scene = fitted
+    bundle = shutil.copy(scene, tmp_path / "it's.ogpc")
+    words, cloud = ("--text-features", capture.text_features), capture.folder / "points.ply"
+    assert run(capsys, "index", tmp_path, "-o", tmp_path / "atlas")[0] == 0
+    for command in (
+        ("segment", bundle, *words, "--points", cloud),
+        ("segment", bundle, *words, "--labels", "red ball, blue ball", "--points", cloud, "-o", tmp_path / "a.ply"),
+        ("view", bundle, *words, "--html", tmp_path / "a.html"),
+        ("edit", "extract", bundle, "--word", "red ball", *words, "--cloud", cloud, "-o", tmp_path / "b.ply"),
+        ("instances", bundle, "-o", tmp_path / "a.csv"),
+        ("find", tmp_path / "atlas", "red ball", "--html", tmp_path / "found.html"),
+    ):
+        code, stdout, _ = run(capsys, *command)
+        assert code == 0
+        *_, last = stdout.splitlines()
+        assert last.startswith("next: "), command
+        assert run(capsys, *shlex.split(last[last.index("og-pointcloud ") :])[1:])[0] == 0, last
+        if command[0] != "view":
+            assert "next: " not in run(capsys, *command, "--json")[1]
 
 
 def test_info_tells_what_is_inside(fitted, capsys):

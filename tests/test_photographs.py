@@ -10,7 +10,7 @@ from scenes import write_tiny_capture
 from scipy.sparse import csr_array
 
 import og_pointcloud as og
-from og_pointcloud.evaluate.baselines import centre_sampling
+from og_pointcloud.evaluate.baselines import center_sampling
 from og_pointcloud.fitting.fit import fit, prepare
 from og_pointcloud.fitting.mask_table import MaskTable
 from og_pointcloud.fitting.photographs import Photographs
@@ -86,7 +86,7 @@ def test_cutting_changes_no_label(scene: Scene, cut: Scene, settings: FitSetting
 
 def test_baselines_find_the_masks_of_cut_views(scene: Scene, cut: Scene):
     words = np.unique(np.concatenate([view.mask_features for view in scene.views]).round(3), axis=0)
-    whole, of_cut = (centre_sampling(prepare(views, SETTINGS), words) for views in (scene, cut))
+    whole, of_cut = (center_sampling(prepare(views, SETTINGS), words) for views in (scene, cut))
     assert (whole == of_cut).mean() > 0.98
 
 

@@ -200,9 +200,9 @@ def test_direct_uplift_is_the_weighted_mean_word_by_word(subject, prepared):
     np.testing.assert_array_equal(BASELINES["direct uplift"](prepared, words), literal)
 
 
-def test_centre_sampling_reads_the_pixel_of_each_centre(subject, prepared):
+def test_center_sampling_reads_the_pixel_of_each_centre(subject, prepared):
     scene, table, words = subject.scene, prepared.table, subject.vocabulary.vectors
-    labels = BASELINES["centre sampling"](prepared, words)
+    labels = BASELINES["center sampling"](prepared, words)
     exposure, similarity = table.exposure.toarray(), table.unit_features @ words.T
     first = np.searchsorted(table.mask_view, np.arange(len(scene.views)))
     maps = [view.mask_map() for view in scene.views]

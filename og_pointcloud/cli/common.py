@@ -150,6 +150,12 @@ def print_next(*words: object, hint: str = "") -> None:
     print(f"next: {hint}{shlex.join(['og-pointcloud', *map(str, words)])}")
 
 
+def as_given(arguments: argparse.Namespace, *options: str) -> list[str]:
+    """Those of these options that were given, with their values, to be typed again."""
+    values = {option: getattr(arguments, option.removeprefix("--").replace("-", "_")) for option in options}
+    return [str(word) for option, value in values.items() if value is not None for word in (option, value)]
+
+
 def check_at_least(option: str, value: float | None, least: float) -> None:
     if value is not None and not value >= least:
         raise OgPointcloudError(f"{option} is {value}; expected at least {least}")

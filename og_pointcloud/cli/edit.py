@@ -10,7 +10,17 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import og_pointcloud as og
-from og_pointcloud.cli.common import Parser, add_command, add_option, add_output, add_shared, numbers, print_result
+from og_pointcloud.cli.common import (
+    Parser,
+    add_command,
+    add_option,
+    add_output,
+    add_shared,
+    as_given,
+    numbers,
+    print_next,
+    print_result,
+)
 from og_pointcloud.errors import OgPointcloudError
 
 if TYPE_CHECKING:
@@ -51,6 +61,9 @@ def run(arguments: argparse.Namespace) -> None:
     record: dict[str, Any] = {"output": str(done.path), "operation": arguments.operation, "points": done.points}
     record |= {"changed": done.changed, "instances": list(done.instances), "notes": list(done.notes)}
     print_result(arguments, record, print_edit)
+    if not arguments.json:
+        given = as_given(arguments, "--text-features")
+        print_next("view", arguments.bundle, "--cloud", done.path, *given, "--html", done.path.with_suffix(".html"))
 
 
 def what_to_edit(arguments: argparse.Namespace) -> What:

@@ -11,7 +11,17 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from og_pointcloud.cli.common import Parser, add_option, add_output, add_shared, check_at_least, numbers, print_table
+from og_pointcloud.cli.common import (
+    Parser,
+    add_option,
+    add_output,
+    add_shared,
+    as_given,
+    check_at_least,
+    numbers,
+    print_next,
+    print_table,
+)
 from og_pointcloud.errors import printable
 
 if TYPE_CHECKING:
@@ -61,6 +71,9 @@ def run(arguments: argparse.Namespace) -> None:
         print("scores of scenes without a judge say how much better the word fits than other known words do")
     if arguments.html:
         print(f"wrote {arguments.html}")
+    if findings:
+        best, given = findings[0], as_given(arguments, "--text-features")
+        print_next("view", collection.file(best.scene), "--labels", best.word, *given)
 
 
 def cells(finding: Finding) -> tuple[str, ...]:

@@ -30,6 +30,11 @@ def run(arguments: argparse.Namespace) -> None:
     print(table)
     if arguments.output:
         print(f"wrote {arguments.output}")
+        if largest := table.largest(1):
+            file = arguments.output.with_name(f"instance_{largest[0].id}.ply")
+            print_next(
+                "edit", "extract", arguments.bundle, "--id", largest[0].id, "-o", file, hint="the largest alone: "
+            )
     else:
         csv = arguments.bundle.with_suffix(".csv")
         print_next("instances", arguments.bundle, "-o", csv, hint="all rows, with oriented boxes: ")

@@ -6,7 +6,6 @@ og-pointcloud segment kitchen.ogpc --labels chair,table -o labels.npz
 from __future__ import annotations
 
 import argparse
-import shlex
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -41,6 +40,15 @@ def run(arguments: argparse.Namespace) -> None:
             result.save(arguments.output, splats, arguments.points)
     report = describe_segmentation(result, journal, arguments.bundle, arguments.output)
     common.print_result(arguments, report, print_segmentation)
+    if arguments.json:
+        return
+    words = common.as_given(arguments, "--labels", "--text-features")
+    if arguments.output is None:
+        words += [*common.as_given(arguments, "--points"), "-o", common.labels_file(arguments.bundle)]
+        common.print_next("segment", arguments.bundle, *words, hint="to keep the labels: ")
+    else:
+        cloud = [] if arguments.points is None else ["--cloud", arguments.points]
+        common.print_next("view", arguments.bundle, *words, *cloud)
 
 
 def describe_segmentation(
@@ -73,6 +81,3 @@ def print_segmentation(report: Mapping[str, Any]) -> None:
     print(", ".join(f"{name} {seconds:.2f} s" for name, seconds in report["seconds"].items()))
     if report["output"]:
         print(f"wrote {report['output']}")
-    else:
-        file = shlex.quote(str(common.labels_file(report["bundle"])))
-        print(f"next: the same command with -o {file} keeps the labels")

@@ -8,7 +8,16 @@ from __future__ import annotations
 import argparse
 
 import og_pointcloud as og
-from og_pointcloud.cli.common import Parser, add_option, add_output, add_shared, direction, names_in
+from og_pointcloud.cli.common import (
+    Parser,
+    add_option,
+    add_output,
+    add_shared,
+    as_given,
+    direction,
+    names_in,
+    print_next,
+)
 from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.journal import Journal
 
@@ -53,3 +62,5 @@ def run(arguments: argparse.Namespace) -> None:
     if left_out := write_page(page, scene, result, view, look, rgb):
         print(f"left out of the page: {left_out}")
     print_segmentation(describe_segmentation(result, journal, arguments.bundle, page))
+    given = as_given(arguments, "--text-features", "--up")
+    print_next("instances", arguments.bundle, *given, hint="what each instance is, and where: ")

@@ -6,7 +6,7 @@ of the surface, (n,) int, -1 where it has none. None knows background: a point t
 none.
 
     direct uplift      every point the mean feature of the masks that show it, by blending weight
-    centre sampling    the feature of the mask at the pixel of its centre, mean over views by how visible it is there
+    center sampling    the feature of the mask at the pixel of its centre, mean over views by how visible it is there
                        (the idea of Occam's LGS)
 """
 
@@ -36,7 +36,7 @@ def direct_uplift(prepared: Prepared, words: Words) -> Labels:
     return uplift(prepared.table.weights, prepared.table.unit_features, words)
 
 
-def centre_sampling(prepared: Prepared, words: Words) -> Labels:
+def center_sampling(prepared: Prepared, words: Words) -> Labels:
     """Each point takes the word nearest to the mean of the mask features at its centre's pixel, by exposure."""
     table, views = prepared.table, prepared.surface.scene.views
     xyz = prepared.surface.gaussians.xyz
@@ -58,7 +58,7 @@ def centre_sampling(prepared: Prepared, words: Words) -> Labels:
     return np.where(reached, scores.argmax(axis=1), -1)
 
 
-BASELINES: dict[str, Baseline] = {"direct uplift": direct_uplift, "centre sampling": centre_sampling}
+BASELINES: dict[str, Baseline] = {"direct uplift": direct_uplift, "center sampling": center_sampling}
 
 
 def baseline_labels(prepared: Prepared, words: Words) -> Iterator[tuple[str, Labels, float]]:
