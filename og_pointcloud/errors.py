@@ -54,7 +54,7 @@ class SceneError(OgPointcloudError):
     >>> og.axis_aligned_box([])
     Traceback (most recent call last):
         ...
-    og_pointcloud.errors.SceneError: points are of shape (0,); expected (n, 3) with at least one point for a box
+    og_pointcloud.errors.SceneError: points are of shape (0,); expected numbers (n, 3), at least one point, for a box
     """
 
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields, is_dataclass, replace
+from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -82,10 +83,14 @@ class Camera:
     world_to_camera: DoubleArray
 
     def __post_init__(self) -> None:
-        pose = np.asarray(self.world_to_camera, np.float64)
-        object.__setattr__(self, "world_to_camera", pose)
-        if pose.shape != (4, 4) or not np.isfinite(pose).all():
+        pose = np.asarray(self.world_to_camera)
+        if pose.shape != (4, 4) or pose.dtype.kind not in "fiu" or not np.isfinite(pose).all():
             raise SceneError(f"camera pose is {pose.tolist()}; expected a finite 4x4 matrix: drop or repair this view")
+        pose = pose.astype(np.float64)
+        object.__setattr__(self, "world_to_camera", pose)
+        numbers = (self.width, self.height, self.fx, self.fy, self.cx, self.cy)
+        if not all(isinstance(number, Real) for number in numbers):
+            raise SceneError(f"a camera's width, height, fx, fy, cx, cy are {numbers}; expected numbers of pixels")
         error, determinant = rotation_error(pose[:3, :3])
         if not error <= RIGID or determinant < 0:  # also where the error is NaN
             raise SceneError(
@@ -260,9 +265,10 @@ class Points:
         opacity: FloatArray | None = None,
     ) -> Points:
         """Points from world coordinates (n, 3) of any float type; the median becomes the origin."""
-        world = np.asarray(xyz, np.float64)
-        if world.ndim != 2 or world.shape[1] != 3:
-            raise SceneError(f"points are an array of shape {world.shape}; expected (points, 3)")
+        world = np.asarray(xyz)
+        if world.ndim != 2 or world.shape[1] != 3 or world.dtype.kind not in "fiu":
+            raise SceneError(f"points are an array of {world.dtype} {world.shape}; expected numbers (points, 3)")
+        world = world.astype(np.float64)
         if len(world) == 0:
             raise SceneError("the cloud has 0 points; expected at least one: check the geometry file")
         require_finite(world)

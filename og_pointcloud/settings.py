@@ -311,6 +311,13 @@ class FitSettings(_Checked):
     paper: PaperSettings = field(default_factory=PaperSettings)
 
 
+def fit_settings(settings: FitSettings | None) -> FitSettings:
+    """These, or the defaults; OgPointcloudError for what is none."""
+    if not isinstance(settings, FitSettings | None):
+        raise OgPointcloudError(f"settings is a {type(settings).__name__}; expected an og.FitSettings")
+    return settings or FitSettings()
+
+
 @dataclass(frozen=True)
 class ChoosingSettings(_Checked):
     """From text vectors and descriptors to a label or "unknown" (choosing.py). Evidence is in standard deviations of

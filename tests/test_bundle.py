@@ -81,7 +81,7 @@ def refuse(path, says, **options):
 @pytest.mark.parametrize("name", CLOUDS)
 def test_tough_clouds_come_back_as_they_went(tmp_path, name):
     cloud = CLOUDS[name]
-    back = read_bundle(write_bundle(cloud, tmp_path / "s.ogpc")).cloud
+    back = read_bundle(write_bundle(og.LabelledScene.from_cloud(cloud), tmp_path / "s.ogpc")).cloud
     for key in ("xyz", "origin", "instance_ids", "rgb"):
         assert (getattr(back, key) == getattr(cloud, key)).all()
         assert getattr(back, key).dtype == getattr(cloud, key).dtype

@@ -153,6 +153,8 @@ def test_a_loop_closure_moves_what_its_frames_brought():
     )
     with pytest.raises(SceneError, match="rotation"):
         mapper.correct({0.0: 2 * np.eye(4)})
+    with pytest.raises(SceneError, match="poses are a list; expected a dict"):
+        mapper.correct([np.eye(4)])
 
 
 def bad_frames():
@@ -171,7 +173,13 @@ def bad_frames():
         "masks are float64": replace(frame, masks=frame.masks.astype(float)),
         "depth is float32": replace(frame, depth=frame.depth[1:]),
         "both depth and a cloud": replace(frame, cloud=np.zeros((3, 3))),
-        "cloud has shape": replace(frame, depth=None, cloud=np.zeros(3)),
+        "points are a ndarray of float64": replace(frame, depth=None, cloud=np.zeros(3)),
+        "is not a geometry file|No such file": replace(frame, depth=None, cloud="none.ply"),
+        "the mask map holds -5": replace(frame, masks=np.minimum(frame.masks, -5)),
+        r"masks are int64 \(4,\)": replace(frame, masks=[1, 2, 3, 4]),
+        "its camera is a ndarray": replace(frame, camera=np.eye(4)),
+        "a frame is a str; expected an og.Frame": "x",
+        "rgb is <U1": replace(frame, rgb="x"),
         "rgb is": replace(frame, rgb=frame.rgb[..., :2]),
         "stamp is nan": replace(frame, stamp=np.nan),
     }
@@ -196,6 +204,18 @@ def test_a_camera_close_to_a_wall_is_of_the_place():
     og.Mapper(cloud=np.concatenate(walls)).integrate(og.Frame(camera, depth=depth))
     with pytest.raises(SceneError, match="confirms 0% of"):
         og.Mapper(cloud=np.concatenate(walls)).integrate(og.Frame(camera, depth=5 * depth))
+
+
+def test_what_is_no_scene_no_cloud_and_no_settings_is_refused(tmp_path):
+    with pytest.raises(OgPointcloudError, match="settings is a str; expected an og.FitSettings"):
+        og.Mapper(settings="grouping")
+    with pytest.raises(SceneError, match=r"points are a list of <U1 \(1, 3\)"):
+        og.Mapper(cloud=[["a", "b", "c"]])
+    with pytest.raises(SceneError, match="spacing is '1'"):
+        og.Mapper(spacing="1")
+    np.save(tmp_path / "cloud.npy", np.zeros((3, 3)))
+    with pytest.raises(SceneError, match=r"cloud\.npy: not a geometry file"):
+        og.Mapper(cloud=tmp_path / "cloud.npy")
 
 
 def test_masks_without_any_geometry_are_refused():

@@ -369,6 +369,8 @@ def test_another_encoder_is_refused(monday):
     other = replace(scene(AFTER), feature_space="another-space")
     with pytest.raises(FeatureSpaceError, match=f"expected feature space '{SPACE}'"):
         og.update(monday, other, progress=False)
+    with pytest.raises(SceneError, match="capture is a str; expected a Scene"):
+        og.update(monday, "capture", progress=False)
 
 
 def test_a_damaged_record_is_refused(monday):

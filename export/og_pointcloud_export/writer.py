@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from og_pointcloud.ask.labelled_scene import SceneLike, as_scene
 from og_pointcloud.bundle.format import FORMAT, INSTANCE_MEMBERS, SCHEMA_VERSION, describe_member, rows_of_cameras
 from og_pointcloud.bundle.nearest import NONE_WITHIN_REACH, NearestPoint
 from og_pointcloud.bundle.vocabulary import bank_members, bank_of_encoder, encoder_members, vocabulary_members
@@ -38,9 +39,9 @@ class QueryModel:
 
 
 def write_bundle(
-    cloud: LabelledCloud, path: str | os.PathLike[str], *, text_encoder: str | os.PathLike[str] | None = None
+    cloud: SceneLike, path: str | os.PathLike[str], *, text_encoder: str | os.PathLike[str] | None = None
 ) -> Path:
-    """Write a cloud as .ogpc, whole or not at all, the same bytes for the same cloud. Returns the path.
+    """Write a cloud, or a scene, as .ogpc, whole or not at all, the same bytes for the same cloud. Returns the path.
 
     text_encoder: the folder of an encoder for the file to carry. A cloud without a word bank gets that of this encoder,
     or of the one that is found for its feature space (`og_pointcloud.text.encoder.find_encoder`), if there is any.
@@ -52,7 +53,7 @@ def write_bundle(
     >>> og.segment(path, ["chair"]).counts()
     {'chair': 3}
     """
-    path = Path(path)
+    path, cloud = Path(path), cloud if isinstance(cloud, LabelledCloud) else as_scene(cloud).cloud
     if cloud.word_bank is None:
         cloud = replace(cloud, word_bank=bank_of_encoder(cloud.space, text_encoder))
     model = query_model(cloud)

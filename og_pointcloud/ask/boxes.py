@@ -168,9 +168,10 @@ def main_part(points: ArrayLike, spacing: float) -> NDArray[np.bool_]:
 
 
 def _checked(points: ArrayLike) -> DoubleArray:
-    xyz = np.asarray(points, np.float64)
-    if xyz.ndim != 2 or xyz.shape[1] != 3 or len(xyz) == 0:
-        raise SceneError(f"points are of shape {xyz.shape}; expected (n, 3) with at least one point for a box")
+    given = numbers_of(points)
+    if given.ndim != 2 or given.shape[1] != 3 or len(given) == 0 or given.dtype.kind not in "fiu":
+        raise SceneError(f"points are of shape {given.shape}; expected numbers (n, 3), at least one point, for a box")
+    xyz = given.astype(np.float64)
     if not np.isfinite(xyz).all():
         raise SceneError("points hold NaN or infinity; expected finite coordinates: leave those points out")
     return xyz

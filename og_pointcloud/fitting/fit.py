@@ -27,7 +27,7 @@ from og_pointcloud.rendering.geometry import isotropic, thinned
 from og_pointcloud.rendering.splatting import working_memory
 from og_pointcloud.rendering.surface import Surface, reconstruct_surface
 from og_pointcloud.scene import Scene
-from og_pointcloud.settings import FitSettings
+from og_pointcloud.settings import FitSettings, fit_settings
 
 
 def fit(
@@ -73,7 +73,7 @@ def fit(
     """
     if not isinstance(scene, Scene):
         raise SceneError(f"scene is a {type(scene).__name__}; expected a Scene, as og.read_capture(FOLDER) makes one")
-    settings = settings or FitSettings()
+    settings = fit_settings(settings)
     journal = Journal(progress)
     with journal.stage("checks"):
         checks = check_capture(scene)

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from numbers import Real
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from og_pointcloud.ask.hosts import numbers_of, world_points
 from og_pointcloud.cloud import FeatureSpace
 from og_pointcloud.errors import FeatureSpaceError, SceneError
 from og_pointcloud.formats.poses import in_local_frame
+from og_pointcloud.formats.tables import naming
 from og_pointcloud.mapping.sight import AGREES, MeasuredView, states_of_points, view_of_depth
 from og_pointcloud.scene import Camera, View
 
@@ -33,10 +37,11 @@ class Frame:
 
     camera: world_to_camera from world coordinates (not a scene's local ones). None is refused: without a pose nothing
     can be placed.
-    masks: (H, W) int, -1 or below outside of masks, else a row of features; H, W the camera's.
+    masks: (H, W) int, -1 outside of masks (or NOT_SEEN, as of `View`), else a row of features; H, W the camera's.
     features: (M, D) float, one row a mask, as the encoder gave it.
     depth: (H, W) float, along the optical axis, world lengths, 0 or NaN where nothing was measured; as sparse as it is.
-    cloud: (n, 3) float, world coordinates, measured from this camera's place, in place of depth.
+    cloud: (n, 3) float, world coordinates, or any cloud that `og.segment` takes, measured from this camera's place, in
+    place of depth.
     rgb: (H, W, 3) uint8. stamp: seconds, or any count that grows with time; None: one more than the last frame's.
     feature_space: name of the features' encoder, which must be the map's; None: it is not said.
 
@@ -48,7 +53,7 @@ class Frame:
     masks: NDArray[np.integer] | None = None
     features: NDArray[np.floating] | None = None
     depth: NDArray[np.floating] | None = None
-    cloud: NDArray[np.floating] | None = None
+    cloud: Any = None
     rgb: NDArray[np.uint8] | None = None
     stamp: float | None = None
     feature_space: str | None = None
@@ -72,12 +77,16 @@ def checked(frame: Frame, origin: NDArray[np.float64], space: FeatureSpace, stam
 
     space: of the map's descriptors, width 0 while it has none. stamp: for a frame without one.
     """
+    if not isinstance(frame, Frame):
+        raise SceneError(f"a frame is a {type(frame).__name__}; expected an og.Frame")
     stamp = stamp if frame.stamp is None else frame.stamp
-    if not isinstance(stamp, (int, float)) or not np.isfinite(stamp):
+    if not isinstance(stamp, Real) or not np.isfinite(stamp):
         raise SceneError(f"frame stamp is {stamp!r}; expected a finite number: seconds, or a count")
     name = f"frame {stamp:g}"
     if frame.camera is None:
         raise SceneError(f"{name} has no camera; expected an og.Camera with its pose: drop frames that lost track")
+    if not isinstance(frame.camera, Camera):
+        raise SceneError(f"{name}: its camera is a {type(frame.camera).__name__}; expected an og.Camera")
     camera = in_local_frame(frame.camera, origin)
     if frame.depth is not None and frame.cloud is not None:
         raise SceneError(f"{name} has both depth and a cloud; expected one of them: leave out the sparser one")
@@ -86,14 +95,14 @@ def checked(frame: Frame, origin: NDArray[np.float64], space: FeatureSpace, stam
         encoder = space.name if frame.feature_space is None else frame.feature_space
         space.require(FeatureSpace(encoder, features.shape[1]), f"mask features of {name}")
     depth = _depth(frame, origin, camera, name)
-    rgb = frame.rgb
+    rgb = None if frame.rgb is None else numbers_of(frame.rgb)
     if rgb is not None and (rgb.shape != (camera.height, camera.width, 3) or rgb.dtype != np.uint8):
         raise SceneError(f"{name}: rgb is {rgb.dtype} {rgb.shape}; expected uint8 ({camera.height}, {camera.width}, 3)")
     return CheckedFrame(camera, ids, features, view_of_depth(depth, camera) if depth.any() else None, rgb, float(stamp))
 
 
 def _masks(frame: Frame, camera: Camera, name: str) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
-    features = np.zeros((0, 0), np.float32) if frame.features is None else np.asarray(frame.features)
+    features = np.zeros((0, 0), np.float32) if frame.features is None else numbers_of(frame.features)
     if features.dtype.kind not in "fiu" or features.ndim != 2:
         raise FeatureSpaceError(
             f"{name}: mask features are {features.dtype} {features.shape}; expected numbers (masks, width)"
@@ -103,17 +112,19 @@ def _masks(frame: Frame, camera: Camera, name: str) -> tuple[NDArray[np.int32], 
     if frame.masks is None:
         ids = np.full((camera.height, camera.width), -1, np.int32)
     else:
-        ids = np.asarray(frame.masks)
-        if ids.dtype.kind not in "iu":
-            raise SceneError(f"{name}: masks are {ids.dtype}; expected whole numbers, rows of features or -1")
-        ids = np.maximum(ids.astype(np.int64), -1).clip(-1, 1 << 30).astype(np.int32)
+        ids = numbers_of(frame.masks)
+        if ids.dtype.kind not in "iu" or ids.ndim != 2:
+            raise SceneError(
+                f"{name}: masks are {ids.dtype} {ids.shape}; expected whole numbers ({camera.height}, {camera.width}): "
+                "rows of features, -1 outside of masks"
+            )
     view = View(name, camera, ids, features)  # which checks sizes, ids and finite rows
-    return view.mask_map(), features
+    return np.maximum(view.mask_map(), -1), features
 
 
 def _depth(frame: Frame, origin: NDArray[np.float64], camera: Camera, name: str) -> NDArray[np.float32]:
     """(H, W), 0 where nothing was measured; of a cloud the nearest point in each pixel."""
-    depth = np.zeros((camera.height, camera.width), np.float32) if frame.depth is None else np.asarray(frame.depth)
+    depth = np.zeros((camera.height, camera.width), np.float32) if frame.depth is None else numbers_of(frame.depth)
     if depth.shape != (camera.height, camera.width) or depth.dtype.kind not in "fiu":
         raise SceneError(
             f"{name}: depth is {depth.dtype} {depth.shape}; expected numbers ({camera.height}, {camera.width})"
@@ -121,9 +132,8 @@ def _depth(frame: Frame, origin: NDArray[np.float64], camera: Camera, name: str)
     with np.errstate(over="ignore"):
         depth = depth.astype(np.float32)
     if frame.cloud is not None:
-        cloud = np.asarray(frame.cloud, np.float64)
-        if cloud.ndim != 2 or cloud.shape[1] != 3:
-            raise SceneError(f"{name}: its cloud has shape {cloud.shape}; expected (points, 3), world coordinates")
+        with naming(name):
+            cloud = world_points(frame.cloud)
         uv_px, z = camera.project(cloud[np.isfinite(cloud).all(axis=1)] - origin)
         inside = camera.shows(uv_px)
         column, row = uv_px[inside].astype(np.intp).T

@@ -142,7 +142,7 @@ class GrowingMap:
         """Move what the frames of these stamps brought: stamp -> world_to_camera, from world coordinates."""
         corrected = {}
         for stamp, pose in poses.items():
-            camera = Camera(1, 1, 1.0, 1.0, 0.5, 0.5, np.asarray(pose, np.float64))
+            camera = Camera(1, 1, 1.0, 1.0, 0.5, 0.5, np.asarray(pose))
             corrected[float(stamp)] = in_local_frame(camera, self.origin).world_to_camera
         for index, (stamp, old) in enumerate(self.anchors):
             if stamp in corrected:

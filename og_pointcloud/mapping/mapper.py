@@ -13,11 +13,14 @@ import time
 import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from numbers import Real
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from og_pointcloud.ask.hosts import world_points
 from og_pointcloud.ask.labelled_scene import LabelledScene, SceneLike, as_scene
 from og_pointcloud.cloud import UNKNOWN_SPACE, FeatureSpace, LabelledCloud
 from og_pointcloud.errors import SceneError
@@ -34,7 +37,7 @@ from og_pointcloud.mapping.sight import DiscSurface
 from og_pointcloud.mapping.tracks import Track
 from og_pointcloud.rendering.geometry import Neighbourhood, neighbourhood
 from og_pointcloud.scene import Points, require_finite
-from og_pointcloud.settings import FitSettings
+from og_pointcloud.settings import FitSettings, fit_settings
 
 PIXELS_PER_SPACING = 4.0
 """Pixels of the first depth image, at its median depth, to a spacing of a map that starts empty."""
@@ -61,10 +64,11 @@ class FrameChange:
 class Mapper:
     """See the module.
 
-    start: a map (.ogpc, scene or cloud) to go on with; None: an empty one, which grows by depth. cloud: (N, 3) world
-    coordinates, or `Points`, whose geometry is known, so that frames need bring masks alone. spacing: of a map that
-    starts empty, world lengths; None: by the first depth image. feature_space: the name of the masks' encoder. journal:
-    a folder that holds the map while it grows (`map_journal`); one that holds it already is gone on with.
+    start: a map (.ogpc, scene or cloud) to go on with; None: an empty one, which grows by depth. cloud: whose geometry
+    is known, so that frames need bring masks alone: (N, 3) world coordinates, `Points`, or whatever `og.segment` takes.
+    spacing: of a map that starts empty, world lengths; None: by the first depth image. feature_space: the name of the
+    masks' encoder. journal: a folder that holds the map while it grows (`map_journal`); one that holds it already is
+    gone on with.
 
     >>> import numpy as np
     >>> import og_pointcloud as og
@@ -82,7 +86,7 @@ class Mapper:
         self,
         start: SceneLike | None = None,
         *,
-        cloud: ArrayLike | Points | None = None,
+        cloud: Any = None,
         spacing: float | None = None,
         feature_space: str = UNKNOWN_SPACE,
         settings: FitSettings | None = None,
@@ -90,9 +94,9 @@ class Mapper:
     ) -> None:
         if start is not None and cloud is not None:
             raise SceneError("both a map and a cloud are given; expected one of them: the map has points of its own")
-        if spacing is not None and not (np.isfinite(spacing) and spacing > 0):
-            raise SceneError(f"spacing is {spacing}; expected a positive length, or None")
-        self.settings = settings or FitSettings()
+        if spacing is not None and not (isinstance(spacing, Real) and 0 < spacing < np.inf):
+            raise SceneError(f"spacing is {spacing!r}; expected a positive length, or None")
+        self.settings = fit_settings(settings)
         self._space, self._spacing = FeatureSpace(feature_space, 0), spacing
         self._base = None if start is None else as_scene(start).cloud
         self._map: GrowingMap | None = None
@@ -103,7 +107,7 @@ class Mapper:
         if self._base is not None:
             self._go_on(self._base)
         elif cloud is not None:
-            points = cloud if isinstance(cloud, Points) else Points.from_world(np.asarray(cloud, np.float64))
+            points = cloud if isinstance(cloud, Points) else Points.from_world(world_points(cloud))
             self._know(points, self._space, None, grows=False)
         self._journal = None if journal is None else self._resumed(MapJournal(journal, self._began_with))
 
@@ -236,6 +240,8 @@ class Mapper:
         Points move with the frame that brought them, kept views with theirs; the points of a known cloud stay.
         SceneError for what is no pose; then nothing moves.
         """
+        if not isinstance(poses, Mapping):
+            raise SceneError(f"poses are a {type(poses).__name__}; expected a dict, stamp -> world_to_camera (4, 4)")
         if self._map is not None:
             self._map.correct(poses)
             self._around = None

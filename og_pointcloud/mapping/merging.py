@@ -16,6 +16,7 @@ from scipy.spatial import cKDTree
 
 from og_pointcloud.ask.labelled_scene import SceneLike, as_scene
 from og_pointcloud.cloud import BACKGROUND, UNOBSERVED, FeatureSpace, InstanceTable, LabelledCloud
+from og_pointcloud.errors import SceneError
 from og_pointcloud.fitting.fit import fit
 from og_pointcloud.mapping.changes import SAME_SURFACE, Changes, Comparison, compare_visits
 from og_pointcloud.mapping.map_record import MapRecord, VisitEntry
@@ -57,6 +58,10 @@ def update(
     >>> print(og.update(wall, scene, progress=False).changes)  # of `fit`'s example
     0 gone, 0 new, 0 moved, 0 not seen again
     """
+    if not isinstance(capture, Scene):
+        raise SceneError(
+            f"capture is a {type(capture).__name__}; expected a Scene, as og.read_capture(FOLDER) makes one"
+        )
     cloud = as_scene(before).cloud
     cloud.space.require(FeatureSpace(capture.feature_space, capture.feature_width), "masks of the capture")
     visit = fit(capture, settings, progress=progress)

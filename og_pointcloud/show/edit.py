@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, TypeAlias, TypedDict
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from og_pointcloud.ask.hosts import numbers_of
 from og_pointcloud.ask.labelled_scene import LabelledScene, SceneLike, as_scene, pose_matrix
 from og_pointcloud.ask.picking import Pick
 from og_pointcloud.ask.selecting import Match, Selection, select
@@ -104,8 +105,8 @@ def recolour(
     color: (3,) RGB, 0 to 255. The object keeps its light and dark, whose mean becomes the color, and Gaussians also
     how theirs changes with direction. Other arguments and errors as for `remove`.
     """
-    rgb = np.asarray(color, np.float64)
-    if rgb.shape != (3,) or not ((rgb >= 0) & (rgb <= 255)).all():
+    rgb = numbers_of(color)
+    if rgb.shape != (3,) or rgb.dtype.kind not in "fiu" or not ((rgb >= 0) & (rgb <= 255)).all():
         raise OgPointcloudError(f"color is {color}; expected three numbers from 0 to 255: red, green, blue")
     subject = _subject(scene, what, output, **options)
     return subject.write(output, recoloured(subject.rows, subject.chosen, rgb / 255), "recoloured")
