@@ -30,13 +30,13 @@ from og_pointcloud.scene import Camera
 
 FORMAT = "ogpc"
 SCHEMA_VERSION = 2
-"""Raised when files of before cannot be asked any more: 2 is the graph that settles points at borders itself."""
+"""Raised when older files can no longer be asked. In version 2 the graph itself settles points at borders."""
 ON_SURFACE, NEAR, BEYOND = 0, 1, 2
 """How far a query point is from the cloud: within about 1.5 spacings, within reach, or too far."""
 
 MAX_MEMBERS = 256
 MAX_MANIFEST_BYTES, MAX_NAMES_BYTES = 1 << 21, 1 << 23
-"""What JSON takes in memory is up to twenty times its bytes."""
+"""Small, as parsed JSON takes up to twenty times its bytes in memory."""
 SAFE_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]*(/[A-Za-z0-9_][A-Za-z0-9_.-]*)*")
 INTEGERS, FLOATS = ("|i1", "<i2", "<i4"), ("<f2", "<f4")
 REBUILD = "write the file again with write_bundle"
@@ -60,6 +60,7 @@ def cameras_of_rows(rows: NDArray[np.float64]) -> tuple[Camera, ...]:
     """The cameras of `rows_of_cameras`; SceneError for a row that is none."""
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
     poses[:, :3] = rows[:, 6:].reshape(-1, 3, 4)
+    # NaN and infinity have no integer: they become sizes that Camera refuses.
     sizes = np.nan_to_num(rows[:, :2]).clip(0, 1 << 30).astype(int).tolist()
     return tuple(
         Camera(width, height, fx, fy, cx, cy, pose)

@@ -1,8 +1,9 @@
 """The query.onnx that files of this schema version have, node for node: nothing else is ever run.
 
-What the nodes do is settled by a digest; what differs from file to file are tables, whose names, types and ranks are
-settled too, and numbers that nodes add, compare or multiply with. None of these can make an array larger: what a graph
-takes is bounded by its own bytes and by the question. Whether it tells the truth ``ask.query_graph`` finds out.
+A digest settles what the nodes do. What differs from file to file is the contents of tables, whose names, types and
+ranks are settled too, and single numbers that nodes add, compare or multiply with. None of these can make an array
+larger: memory is bounded by the file's own bytes and by the question. Whether the graph tells the truth is found out by
+``ask.query_graph``.
 """
 
 from __future__ import annotations
@@ -18,12 +19,13 @@ KNOWN_GRAPHS = frozenset({
     "0931f16d57ab1db72ec826a2b787e5f5", "278a9debe4359bb24c880b918dd953e8", "cd2b6be498a00464ad55884c286e2033",
     "5125ba60d69c8c34932f1c6f484a6e08", "d6b9de5009bf92436051be07f7985c7a", "b9731a6b2aa1345740ee322b1720fe8f",
 })  # fmt: skip
-"""`query_graph_digest` of the graph that `og_pointcloud_export.query_graph` builds, first, and of those that it has
-built since schema version 2. A change of that graph adds its digest here, and takes none away."""
+"""`query_graph_digest` of the graph that `og_pointcloud_export.query_graph` builds, first, then of those that it built
+before, since schema version 2. A change of that graph adds its digest here, and removes none."""
 MODEL_FIELDS, GRAPH_FIELDS = {1, 2, 7, 8}, {1, 2, 5, 10, 11, 12}
-"""Fields of onnx.proto3 that our graphs have: of a model its versions, its maker, the graph; of a graph nodes, name,
-constants, text, inputs and outputs."""
+"""Fields of onnx.proto3 that our graphs have. ModelProto: ir_version, producer_name, graph, opset_import. GraphProto:
+node, name, initializer, doc_string, input, output."""
 COUNT = "(answer codes)"
+"""Stands in the digest for the name of the constant that holds their number."""
 TABLES = frozenset({
     "axis_places", "block_shifts", "brick_values", "candidate_answer", "candidate_x", "candidate_y", "candidate_z",
     "candidates", "candidates_high", "candidates_low", "cell_values", "child_length", "child_start", "descriptor_code",
@@ -32,9 +34,11 @@ TABLES = frozenset({
 })  # fmt: skip
 """Constants that differ from file to file; all others are numbers."""
 DTYPES = {1: "<f4", 2: "|u1", 3: "|i1", 4: "<u2", 6: "<i4", 7: "<i8", 11: "<f8", 12: "<u4"}
+"""numpy's types by TensorProto.DataType."""
 UNSIGNED = (2, 4, 12)
 FREE_OPERATORS = {6: ("Add", "Sub", "Less", "GreaterOrEqual", "Min", "Max"), 1: ("Mul",), 11: ("LessOrEqual",)}
-"""By type of a single number: where it may be any, as no other number comes of it than of another table."""
+"""By TensorProto.DataType of a single number: operators in which it may be any. Its effect is one that other contents
+of a table could have as well, so nothing would be gained by settling it."""
 
 
 def query_tables(onnx: bytes) -> dict[str, NDArray[np.generic]]:
@@ -55,6 +59,8 @@ def query_graph_digest(onnx: bytes) -> str:
 
 def _parsed(onnx: bytes) -> tuple[str, dict[str, Constant], Constant]:
     """The digest, all constants by name, and the number of answer codes."""
+    # Field numbers, of ModelProto: 1 ir_version, 7 graph, 8 opset_import; of GraphProto: 1 node, 5 initializer, 11
+    # input, 12 output; of TensorProto: 8 name; of ValueInfoProto: 1 name.
     model = list(message_fields(memoryview(onnx)))
     graph = [field for number, value in model if number == 7 for field in message_fields(value)]
     if {number for number, _ in model} - MODEL_FIELDS or {number for number, _ in graph} - GRAPH_FIELDS:
@@ -64,9 +70,11 @@ def _parsed(onnx: bytes) -> tuple[str, dict[str, Constant], Constant]:
     nodes = [_Node(value) for number, value in graph if number == 1]
     # The first Concat makes the shape (answer codes, texts) of the table of scores.
     counting = next((node for node in nodes if node.operator == "Concat" and node.inputs), None)
+    # Two constants of one name, or one called COUNT, could stand in for one another in the digest.
     if len(constants) != len(named) or COUNT in constants or counting is None or counting.inputs[0] not in constants:
         raise ValueError("it does not count as graphs of ours do")
-    lines = [f"{number} {_hex(value)}" for number, value in model if number in (1, 8)]  # of the format, of operators
+    # What the digest is of: versions, tables by kind, inputs and outputs by name, and every node in order.
+    lines = [f"{number} {_hex(value)}" for number, value in model if number in (1, 8)]
     lines += sorted(f"{name} {_kind(constant)}" for name, constant in constants.items() if name in TABLES)
     lines += [f"{number} {text_of(value, 1)!r}" for number, value in graph if number in (11, 12)]
     codes, counting.inputs[0] = constants[counting.inputs[0]], COUNT
@@ -76,15 +84,15 @@ def _parsed(onnx: bytes) -> tuple[str, dict[str, Constant], Constant]:
 
 class _Node:
     def __init__(self, message: memoryview | int) -> None:
-        fields = list(message_fields(message))
+        fields = list(message_fields(message))  # of NodeProto: 1 input, 2 output, 4 op_type, 5 attribute
         self.operator = text_of(message, 4)
         self.inputs = [_text(value) for number, value in fields if number == 1]
         self.outputs = [_text(value) for number, value in fields if number == 2]
         self.attributes = [_hex(value) for number, value in fields if number == 5]
 
     def line(self, constants: dict[str, Constant]) -> str:
-        """All that the node does: its inputs are values, tables by name, and numbers by value where they may not
-        differ."""
+        """All that the node does, as text. Inputs are named, but for constants that are no tables: those stand by their
+        value, or as "any" where it may differ."""
         inputs = [self._input(name, constants[name]) if name in constants else repr(name) for name in self.inputs]
         return f"{self.operator} {inputs} {self.outputs} {self.attributes}"
 
@@ -96,7 +104,7 @@ class _Node:
 
 
 def _kind(table: Constant) -> str:
-    """Type and rank. Whole numbers from 0 take the smallest type that holds them."""
+    """Type and rank. Unsigned types count as one: whole numbers are stored in the smallest that holds them."""
     return f"{'unsigned' if table.kind in UNSIGNED else table.kind} {len(table.shape)}"
 
 

@@ -14,11 +14,13 @@ SURFACE_PER_SPACING, SURFACE_PER_REACH = 1.5, 1 / 3
 
 QUERIES_PER_CHUNK = 8192
 CANDIDATES_PER_CHUNK = 1_000_000
-"""What bounds the memory of a search: about 60 MB."""
+"""Queries, and points compared with them, at once: they bound the memory of a search to about 60 MB."""
 LEVEL_FACTOR = 1.5
 """How much wider each next search is. Most queries lie within one spacing of the cloud and need only the first."""
 EDGE_SLACK = 1e-6
-"""Voxels are that much wider than the radius: rounding must not put a point at that distance two voxels away."""
+"""Voxels are wider than the radius by this share: rounding must not put a point at that distance two voxels away."""
+HASH_X, HASH_Y = 73856093, 19349663
+"""Primes of Teschner et al. 2003, "Optimized Spatial Hashing"; along z we count by 1, so that buckets follow."""
 
 
 def surface_distance(spacing: float, reach: float) -> float:
@@ -27,16 +29,16 @@ def surface_distance(spacing: float, reach: float) -> float:
 
 
 class VoxelBuckets:
-    """Points sorted by a hash of their voxel, voxels that follow one another along z in buckets that follow too.
+    """Points sorted by a hash of their voxel; neighboring voxels along z are in neighboring buckets.
 
     Voxels that share a bucket by accident do no harm: their points are farther away, and distances are true ones.
 
-    xyz: (n, 3) float32. edge: of a voxel.
+    xyz: (n, 3) float32. edge: of a voxel, in the same unit.
     """
 
     def __init__(self, xyz: NDArray[np.float32], edge: float) -> None:
         self.edge = edge
-        self.mask = (1 << max(6, (2 * len(xyz)).bit_length())) - 1
+        self.mask = (1 << max(6, (2 * len(xyz)).bit_length())) - 1  # a power of two, at least two buckets a point
         bucket = self.bucket(self.voxel(xyz.astype(np.float64)))
         order = np.argsort(bucket, kind="stable")  # stable: equal distances are settled for the lowest index
         starts = np.zeros(self.mask + 2, np.int64)
@@ -54,7 +56,7 @@ class VoxelBuckets:
 
     def bucket(self, voxel: NDArray[np.int64]) -> NDArray[np.int64]:
         """Bucket of each voxel; integers wrap, which is a hash too."""
-        return (voxel[..., 0] * 73856093 + voxel[..., 1] * 19349663 + voxel[..., 2]) & self.mask
+        return (voxel[..., 0] * HASH_X + voxel[..., 1] * HASH_Y + voxel[..., 2]) & self.mask
 
 
 class NearestPoint:
@@ -69,6 +71,8 @@ class NearestPoint:
     def __init__(self, xyz: NDArray[np.float32], spacing: float, reach: float) -> None:
         self._xyz = xyz
         self._reach = reach
+        # Radii grow from one spacing to the reach. The first at which any point is found settles a query: all points
+        # within that radius were compared.
         count = max(0, int(np.ceil(np.log(reach / spacing) / np.log(LEVEL_FACTOR))))
         self._radii = [spacing * LEVEL_FACTOR**level for level in range(count)] + [reach]
         self._levels: dict[float, VoxelBuckets] = {}
@@ -112,6 +116,7 @@ def _nearest_within(buckets: VoxelBuckets, points: NDArray[np.float64], radius: 
         bucket = buckets.bucket(voxel)
         start = buckets.starts[bucket]
         count = buckets.starts[bucket + 3] - start
+        # Queries are cut into runs of about CANDIDATES_PER_CHUNK points to compare: some lie amid far more than others.
         candidates = np.cumsum(count.sum(axis=1))
         parts = np.searchsorted(candidates, np.arange(CANDIDATES_PER_CHUNK, candidates[-1], CANDIDATES_PER_CHUNK))
         edges = np.unique(np.concatenate([[0], parts, [len(chunk)]]))
@@ -130,12 +135,14 @@ def _settle(
 ) -> NDArray[np.int64]:
     """Nearest of each point's candidates: sorted points start..start + count of each of its columns, (m, 9) both."""
     nearest = np.full(len(points), NONE_WITHIN_REACH, np.int64)
+    # The ranges start..start + count of all columns, written out one after the other: a row for each candidate.
     per_query = count.sum(axis=1)
     per_column = count.ravel()
     end = np.cumsum(per_column)
     if end[-1] == 0:
         return nearest
     candidate = np.arange(end[-1]) + np.repeat(start.ravel() - end + per_column, per_column)
+    # One coordinate at a time, in place: a fraction of the memory of (candidates, 3).
     squared = np.zeros(len(candidate))
     for axis, coordinate in enumerate((buckets.x, buckets.y, buckets.z)):
         difference = coordinate[candidate]
@@ -143,12 +150,14 @@ def _settle(
         difference *= difference
         squared += difference
 
+    # The least distance of each query that has candidates. reduceat takes no empty groups.
     asked = np.flatnonzero(per_query)
     first = (np.cumsum(per_query) - per_query)[asked]
     smallest = np.minimum.reduceat(squared, first)
+    # All candidates at that distance, none (-1) beyond the radius; of equals the lowest index in the cloud wins.
     hit = np.flatnonzero(squared == np.repeat(np.where(smallest <= radius * radius, smallest, -1.0), per_query[asked]))
     if len(hit):
         owner = asked[np.searchsorted(first, hit, side="right") - 1]
-        ties = np.flatnonzero(np.diff(owner, prepend=-1))
-        nearest[owner[ties]] = np.minimum.reduceat(buckets.point[candidate[hit]], ties)
+        begins = np.flatnonzero(np.diff(owner, prepend=-1))
+        nearest[owner[begins]] = np.minimum.reduceat(buckets.point[candidate[hit]], begins)
     return nearest

@@ -20,7 +20,7 @@ from og_pointcloud.formats.npy import array_from_npy
 from og_pointcloud.text.text_features import check_names
 
 ZIP_ERRORS = (zipfile.BadZipFile, EOFError, RuntimeError, NotImplementedError, OSError, ValueError)
-"""All that zipfile raises for damaged archives, encrypted ones, and those of methods that it lacks."""
+"""All that zipfile raises for archives that are damaged, encrypted, or compressed in a way that it does not know."""
 
 
 @dataclass(frozen=True)
@@ -40,8 +40,8 @@ class Bundle:
 def read_bundle(path: str | os.PathLike[str]) -> Bundle:
     """Read and check a .ogpc file; BundleError, beginning with the path, for any other or damaged file.
 
-    Each member's CRC-32 is checked. The manifest's digests are not: anyone can write them, so that they tell files
-    apart, but not whom to trust.
+    Each member's CRC-32 is checked. The manifest's sha256 digests are not: anyone can write them, so they tell files
+    apart but not whom to trust.
 
     >>> import pathlib, tempfile
     >>> path = og.write_bundle(cloud, pathlib.Path(tempfile.mkdtemp()) / "two.ogpc")  # of `LabelledCloud`'s example
@@ -83,9 +83,10 @@ class _Refused(Exception):
 
 
 def _members(file: BinaryIO) -> tuple[dict[str, bytes], dict[str, int]]:
-    """All members by name, but of a carried encoder the sizes only: most who open a file never ask it.
+    """All members by name, but of a carried encoder the sizes only: most who open a file never need it.
 
-    Stored, apart and inside the file: together they cannot be larger than it is.
+    Members must be stored uncompressed and fit into the file together: reading them takes no more memory than it has
+    bytes.
     """
     size = file.seek(0, os.SEEK_END)
     try:
@@ -143,6 +144,7 @@ def _json(members: dict[str, bytes], name: str, most: int) -> Any:
 
 
 def _check_members(manifest: dict[str, Any], members: dict[str, bytes], carried: dict[str, int]) -> None:
+    # What zip says and what the manifest says are two lists of the same things: neither may have more.
     declared = _field(manifest, "members", dict)
     sizes = {name: len(data) for name, data in members.items()} | carried
     if undeclared := sorted(set(sizes) - set(declared) - {"manifest.json"}):
@@ -200,6 +202,7 @@ def _instances(manifest: dict[str, Any], members: dict[str, bytes], count: int) 
         dtype = "<f4" if field.name in ("agreement", "visible_area", "reliability") else "<i4"
         length = len(descriptors) if field.name == "descriptor_instance" else count
         columns[field.name] = _array(members, member, (dtype,), (length,))
+    # The columns that `segment` reads and the tables that the graph answers by must be the same numbers.
     _check_graph(members["query.onnx"], descriptors, columns["descriptor_instance"], count)
     return InstanceTable(descriptors, **columns)
 
@@ -226,7 +229,7 @@ def _check_graph(
 
 
 def _descriptors(place: dict[str, Any], members: dict[str, bytes]) -> NDArray[np.float32]:
-    """(R, D) float32, a view into the constants of the graph."""
+    """(R, D) float32, a view into the constants of the graph: they are stored once."""
     graph = members["query.onnx"]
     offset, shape = _field(place, "offset", int, "descriptors/"), _field(place, "shape", list, "descriptors/")
     sizes_fit = len(shape) == 2 and all(isinstance(length, int) and length >= 0 for length in shape)

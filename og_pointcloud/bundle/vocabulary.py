@@ -61,6 +61,7 @@ def scene_words(
     FeatureSpaceError where a file cannot be read, or one that was asked for is of another space or width.
     """
     vocabulary, left_out = None, ()
+    # A file that was named must fit; one that merely lies in the capture's folder is left out, and provenance says so.
     if text_features is not None:
         vocabulary, name = read_text_features(text_features)
         space.require(FeatureSpace(name, vocabulary.vectors.shape[1]), f"names of {text_features}")
@@ -98,7 +99,7 @@ def add_words(
     cloud = bundle.cloud
     cloud.space.require(FeatureSpace(feature_space, words.vectors.shape[1]), "words")
     old = cloud.vocabulary or Vocabulary((), np.zeros((0, words.vectors.shape[1]), np.float32))
-    vectors = dict(zip(old.names, unit_rows(old.vectors), strict=True))
+    vectors = dict(zip(old.names, unit_rows(old.vectors), strict=True))  # of a word in both, the later vector stays
     vectors |= dict(zip(words.names, unit_rows(words.vectors), strict=True))
     together = Vocabulary(tuple(vectors), np.array(list(vectors.values()), np.float32))
     counts = {**bundle.manifest["counts"], "words": len(together.names)}
@@ -194,6 +195,6 @@ def _rewrite(
     members = manifest["members"] | {name: describe_member(name, data) for name, data in changes.items()}
     text = json.dumps({**manifest, "members": members}, indent=1, ensure_ascii=False).encode()
     with zipfile.ZipFile(path) as source, replacing(output or path) as file, zipfile.ZipFile(file, "w") as target:
-        target.writestr(zipfile.ZipInfo("manifest.json"), text)  # a ZipInfo of its own: the date stays 1980
+        target.writestr(zipfile.ZipInfo("manifest.json"), text)  # by ZipInfo, dated 1980: equal contents, equal bytes
         for name in members:
             target.writestr(zipfile.ZipInfo(name), changes[name] if name in changes else source.read(name))

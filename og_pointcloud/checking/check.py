@@ -1,8 +1,8 @@
 """check_capture(scene) -> what fits together, what does not, and the repair that would help: before a fit is believed.
 
-Nothing here changes a label. A check that cannot be made says so; one that fails names its suspects. The bounds lie
-where right captures of every sensor at hand are far on the one side and gross faults on the other
-(examples/benchmark_checks.py); between them the benefit of the doubt is the capture's.
+Nothing here changes a label. A check that cannot be made says so; one that fails names its suspects. Each bound lies
+between right captures of every sensor at hand, far on the one side, and gross faults on the other
+(examples/benchmark_checks.py). Where two bounds leave a gap, the capture has the benefit of the doubt.
 """
 
 from __future__ import annotations
@@ -26,42 +26,44 @@ from og_pointcloud.scene import Scene
 Verdict = Literal["ok", "doubt", "unchecked"]
 
 PHOTOGRAPHS_FIT = (0.7, 0.25)
-"""Share and gap: drawings fit their own photographs in so many comparisons at least, and stand out so far."""
+"""Least share and gap (`Comparison`) by which drawings must fit their own photographs better than others."""
 NEARLY_ALWAYS = 0.95
-"""A share from which they need not stand out: a mirror, or another light, takes of the gap but not of the share."""
+"""From this share on no gap is asked for: a mirror, or other light, reduces the gap but not the share."""
 MASKS_AGREE, MASKS_VOUCH = (0.75, 0.12), (0.85, 0.15)
-"""Masks of views agree where they see the same, better than other masks would; doubted where share and gap are missed;
-and where they vouch for poses that photographs doubt."""
+"""Share and gap by which masks of different views agree better than with other masks: from the first on they are right,
+and they are doubted only where both are missed; from the second on they vouch for poses that photographs doubt."""
 MASKS_CHANCE, MASKS_ERRORS = 0.6, 2.0
-"""Right masks that miss walls and floors in one view and not in the next agree little more than wrong ones do, and a
-few pairs of views cannot tell which they are: not doubted where the share is above this one, and the gap less than so
-many of its standard errors below its bound."""
+"""Right masks that miss walls and floors in one view but not in the next agree little more than wrong ones do, and a
+few pairs of views cannot tell the two apart: masks are not doubted where the share is at least this, and the gap at
+most so many of its standard errors below its bound."""
 LEAST_FEATURE_SHARE, FEWEST_FEATURES = 0.6, 60
-"""Features of masks that show the same are the more alike ones in so many of so many comparisons at least; in half of
-them by chance, and in two thirds where a detector names most things alike."""
+"""Least share of comparisons, and fewest of them, in which masks that show the same thing must have the more similar
+features. By chance it is a half; where a detector names most things alike, two thirds."""
 LESS_ERROR, LEAST_GAIN, LEAST_SHIFT = 0.8, 0.085, 0.01
-"""A small change that leaves less than this share of the error, takes more than this of it (in correlation) and moves
-points by more than this share of the image's width, is a fault of the capture; real calibrations leave more and move
-less, and smooth images, which a change fits by chance, hardly gain."""
+"""A small change is a fault of the capture when it leaves less than this share of the error, takes more than this off
+it (in correlation), and moves points by more than this share of the image's width. Real calibrations leave more and
+move less; smooth images, which a change fits by chance, hardly gain."""
 FEWEST_ALIGNED = 4
-"""Views below this number can be fitted by a change that is none."""
+"""Fewer views than this can be fitted by a change that is none."""
 AS_GOOD, HALF = 0.1, 0.5
-"""A change of fewer numbers is preferred that leaves this share of what more numbers gain; one of everything, for which
-there is no repair, only where no other gains half as much."""
+"""Of two changes the one with fewer numbers is preferred if it misses no more than this share of the other's gain. A
+change of everything, which no repair can undo, is named only where no other gains half as much."""
 FEWEST = 10
-"""Points, comparisons, rows or instances below this number say nothing."""
+"""Fewer points, comparisons, rows or instances than this say nothing."""
 FEWEST_VOUCHING = 30
-"""Comparisons that vouch for poses."""
+"""Fewer comparisons than this do not vouch for poses."""
 MOST_BLIND = 0.7
-"""Views that see nothing, of those asked, from which no part of a larger map explains it."""
+"""Share of the views asked that may see nothing because they belong to another part of a larger map."""
 MOST_UNSHOWN, MOST_ZERO, WHOLE_IMAGE = 0.3, 0.5, 0.95
+"""Most feature rows that no pixel shows, most rows that are zero, and most of an image that one mask covers; shares."""
 MOST_BLENDED = 0.02
-"""Share of mask borders, in half of the views, with an id between those of both sides: 0 in right captures, whose views
-have none beyond chance, 0.03 to 0.08 in masks that were stored with losses, 0.18 and more in interpolated ones."""
+"""Share of mask borders, by the median view, with an id between those of both sides. It is 0 in right captures, which
+have none beyond chance, 0.03 to 0.08 in masks stored with losses, and 0.18 or more in interpolated ones."""
 NEARLY_ALL, MOST_UNOBSERVED = 0.95, 0.5
+"""Most of the points that one instance may have, and most that no view may see; shares."""
 LEAST_COSINE = 2.5
-"""Standard deviations of random directions' cosines: the best word of an instance lies farther out where both share a
-space, and less far for another encoder's, if words are few (of a thousand random ones the best one is at 3.2)."""
+"""How far an instance's best word stands out, in standard deviations of random directions' cosines: farther than this
+where both are of one encoder, less far where they are not and words are few (the best of 1000 random ones: 3.2)."""
 SUSPECTS = "poses (axes, direction, order), units, intrinsics or the cloud's frame are wrong"
 
 
@@ -156,12 +158,14 @@ def _poses(sample: Sample, maps: MaskMaps | None) -> tuple[list[Check], Photogra
     always = stated.share >= NEARLY_ALWAYS and stated.compared >= FEWEST_VOUCHING
     if stated.reaches(PHOTOGRAPHS_FIT) or always or stated.own >= ALIKE:  # of a few views, others fit nearly as well
         return [Check("poses", "ok", f"drawings fit their own photographs best: {stated}")], photographs
+    # Colors that were not taken from photographs say nothing against poses: masks have to.
     if photographs.points_are_painted:
         return [_poses_by_masks(sample, maps)], None
     misfit = f"drawn where the poses say, the cloud fits its own photographs no better than others ({stated})"
     if repairs := best_conversion(photographs):
-        found = photographs.fit(photographs.sample.repaired(repairs))
-        return [_doubt("poses", f"{misfit}: {SUSPECTS}", repairs, f"it does ({found})")], None
+        repaired = photographs.fit(photographs.sample.repaired(repairs))
+        return [_doubt("poses", f"{misfit}: {SUSPECTS}", repairs, f"it does ({repaired})")], None
+    # Where masks fit the poses well, it is the photographs that are wrong; the fit does not read them.
     agreement = _agreement(maps)
     if agreement.compared >= FEWEST_VOUCHING and agreement.reaches(MASKS_VOUCH):
         says = (
@@ -173,7 +177,7 @@ def _poses(sample: Sample, maps: MaskMaps | None) -> tuple[list[Check], Photogra
 
 
 def _poses_by_masks(sample: Sample, maps: MaskMaps | None) -> Check:
-    enough = min(FEWEST, len(sample.xyz) / 2)
+    enough = min(FEWEST, len(sample.xyz) / 2)  # of a cloud of a few points a view need not see ten
     blind = sum(len(seen(sample.xyz, camera).rows) < enough for camera in sample.cameras)
     agreement = _agreement(maps)
     if blind > MOST_BLIND * len(sample.cameras):
@@ -185,6 +189,7 @@ def _poses_by_masks(sample: Sample, maps: MaskMaps | None) -> Check:
     else:
         says = f"masks of different views agree no better than others' masks ({agreement})"
     repairs = (best_conversion(maps) or best_mask_conversion(maps)) if maps else ()
+    # Neither right nor wrong by their bounds, and no conversion helps: not doubted.
     if blind <= MOST_BLIND * len(sample.cameras) and _verdict(agreement) == "unchecked" and not repairs:
         return _agreed("poses", agreement)
     return _doubt("poses", f"{says}: {SUSPECTS}, or masks are of other images", repairs, "masks agree")
@@ -201,7 +206,7 @@ def _agreed(name: str, found: Comparison) -> Check:
 
 
 def _verdict(found: Comparison) -> Verdict:
-    """By masks: "unchecked" between the two bounds, and where chance alone may keep the gap from its own."""
+    """By masks: "unchecked" where only one of share and gap is missed, or the gap may be missed by chance."""
     if found.reaches(MASKS_AGREE):
         return "ok"
     least_share, least_gap = MASKS_AGREE
@@ -216,6 +221,7 @@ def _alignment(photographs: Photographs | None) -> Check:
         return Check("alignment", "unchecked", says)
     registration, name = Registration(photographs, photographs.sample.cameras), "everything"
     change = registration.found(name)
+    # Few points tell whether anything is wrong at all; more of them then tell what, and how much.
     if suspicious := _is_fault(change, registration.start.error):
         registration = Registration(photographs, photographs.sample.cameras, MORE_POINTS)
         name, change = _simplest(registration)
@@ -241,7 +247,7 @@ def _simplest(registration: Registration) -> tuple[str, Small]:
 
 
 def _is_fault(change: Small, start: float) -> bool:
-    """Whether a change is that of a fault. start: the error without it."""
+    """Whether a change corrects a fault of the capture. start: the error without it."""
     return change.error <= min(LESS_ERROR * start, start - LEAST_GAIN) and change.shift >= LEAST_SHIFT
 
 
@@ -284,6 +290,7 @@ def _features(maps: MaskMaps, *, is_doubted: bool) -> Check:
     says = f"masks that show the same have the more similar ones in {alike}"
     if alike.share >= LEAST_FEATURE_SHARE:
         return Check("features", "ok", says)
+    # The same with ids moved by one: files that count masks from 0 name each mask's neighbor's row.
     shifted = maps.features_alike(maps.sample.cameras, shift=1).share
     if shifted > max(LEAST_FEATURE_SHARE, alike.share + 0.1):
         return Check("features", "doubt", f"{says}: ids seem to count from 0", "masks=from-zero")
@@ -306,6 +313,7 @@ def _odd_rows(maps: MaskMaps) -> Check | None:
 def _unshown(maps: MaskMaps) -> Check | None:
     """A doubt where many rows belong to no pixel, or the last one never does."""
     shown = [rows for rows in maps.shown if len(rows)]
+    # Ids that count from 0 leave the last row unused: it is missing in every view while most other rows are shown.
     many = [rows for rows in shown if len(rows) > 1]
     others = float(np.mean([rows[:-1].mean() for rows in many])) if many else 0.0
     if len(many) >= 4 and not any(rows[-1] for rows in many) and others > 1 - MOST_UNSHOWN:

@@ -1,8 +1,8 @@
 """Which of the usual conversions makes a capture fit: axes, direction, units, scale, intrinsics, neighboring frames.
 
-All that `KINDS` of repairs lists are tried on few views and points, the best again on all that were read, and one is
-named only if it fits well and far better than what the files say. Numbers (a scale, a focal length) are searched on a
-grid, then more finely. Where none fits, all are tried again behind one of the commonest.
+All repairs that `KINDS` lists are tried on few views and points, and the best of them again on all that were read. One
+is named only if it fits well, and far better than what the files say. Numbers (a scale, a focal length) are searched on
+a grid, then more finely. Where none fits, each is tried again after one of the commonest mistakes was repaired.
 """
 
 from __future__ import annotations
@@ -22,21 +22,23 @@ from og_pointcloud.formats.repairs import KINDS, MASK_FLIPS, MASK_SHIFTS, Repair
 Repairs = tuple[Repair, ...]
 
 COMMONEST = "axes=flipped", "direction=inverse", "scale=1000", "scale=0.001", "frames=1", "frames=-1"
-"""Mistakes of which another one comes beside."""
+"""Mistakes that are made together with a second one."""
 FINALISTS = 8
-"""So many of the best of few views and points are tried again on all."""
+"""How many of the best on few views and points are tried again on all."""
 PHOTOGRAPHS_FIT, MASKS_FIT = (0.8, 0.4), (0.9, 0.18)
-"""Share and gap from which a conversion fits."""
+"""Share and gap (`Comparison`) from which a conversion fits."""
 FEWEST_COMPARED = 30
+"""Fewer comparisons of masks than this convince nobody."""
 BETTER = 0.1
-"""Its gap is so much larger than that of what the files say."""
+"""By how much a conversion's gap must exceed that of what the files say."""
 STEPS_PER_DOUBLING = 8
 """A grid this fine brings the drawing to within a cell or two."""
 ROUND_NUMBERS = (1000, 100, 10, 8, 4, 3, 2, 1.5, 1 / 0.3048, 2.54, 1)
+"""Factors that units (millimetres, centimetres, feet, inches) and reduced images are off by."""
 ROUND = 0.015
 """A number within this share of a round one, or of its reciprocal, is the round one, if that fits as well."""
 CLOSE = 1.1
-"""Errors up to so many times the least one are as good."""
+"""Up to this many times the least error counts as fitting as well."""
 
 
 def best_conversion(evidence: Photographs | MaskMaps) -> Repairs:
@@ -44,13 +46,14 @@ def best_conversion(evidence: Photographs | MaskMaps) -> Repairs:
     found = _best_of(evidence, _tried())
     if found or isinstance(evidence, MaskMaps):
         return found
+    # Neither a word nor one number: first a small motion of all cameras, then two mistakes at once.
     registration = Registration(evidence, evidence.sample.cameras, MORE_POINTS)
     moved = registration.repair("aligned", registration.refined("aligned", registration.found("aligned")))
     return moved if _convinces(evidence, moved) else _best_of(evidence, _pairs())
 
 
 def _best_of(evidence: Photographs | MaskMaps, tried: Iterable[Repairs]) -> Repairs:
-    """The best of some, if it convinces."""
+    """The best of the tried repairs, if it convinces; else ()."""
     few = evidence.fewer()
     finalists = sorted(tried, key=lambda repairs: -_fit(few, repairs).gap)[:FINALISTS]
     best = max(finalists, key=lambda repairs: _fit(evidence, repairs).gap)
@@ -67,7 +70,7 @@ def best_mask_conversion(maps: MaskMaps) -> Repairs:
     for value, by in MASK_SHIFTS.items():  # with the neighbor's camera, these masks tell the same
         found[_parsed(f"masks={value}")] = _fit(maps, _parsed(f"frames={-by}"))
     best = max(found, key=lambda repairs: found[repairs].gap)
-    better = found[best].gap > maps.fit(cameras).gap + BETTER / 2
+    better = found[best].gap > maps.fit(cameras).gap + BETTER / 2  # masks stand out half as far: MASKS_FIT
     return best if better and found[best].compared >= FEWEST_COMPARED and found[best].reaches(MASKS_FIT) else ()
 
 
@@ -83,7 +86,7 @@ def _tried() -> Iterable[Repairs]:
 
 
 def _pairs() -> Iterable[Repairs]:
-    """Every repair behind one of the commonest; those of other kinds are the same in either order, near enough."""
+    """Every repair after one of the commonest. Two of different kinds are nearly the same in either order."""
     for first in map(_parsed, COMMONEST):
         yield from (first + repairs for repairs in _tried() if repairs[0].name != first[0].name)
 
@@ -110,6 +113,7 @@ def _polished(repairs: Repairs, photographs: Photographs) -> Repairs:
         return 1 - _fit(photographs, (*before, *_parsed(f"{repair.name}={value:.6g}"))).own
 
     value = repair.numbers[0]
+    # Thrice around the best so far, from the grid's step (9%) down to a twentieth of a percent.
     for width, count in ((0.06, 6), (0.01, 5), (0.002, 4)):
         value = float(min(value * (1 + width * np.linspace(-1, 1, 2 * count + 1)), key=error))
     for round_one in (number**sign for number in ROUND_NUMBERS for sign in (1, -1)):

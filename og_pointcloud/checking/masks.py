@@ -1,8 +1,8 @@
 """Do masks of different views agree where they show the same points, better than masks of other images would?
 
-Two views give each point that both see a mask each; how much one says of the other is their mutual information. It is
-compared with what the other view's mask map says when it is mirrored, or another image's. Of masks that show the same
-points, the features should be more alike than those of other masks.
+Each point that two views see lies in a mask of either; how much one mask tells of the other is their mutual
+information. It is compared with that of rivals: the other view's mask map mirrored, and mask maps of other images. And
+masks that show the same points should have features more alike than other masks have.
 """
 
 from __future__ import annotations
@@ -22,32 +22,36 @@ Ids = NDArray[np.integer]
 Places = NDArray[np.float64]
 
 LONGEST_PX = 320
+"""Longer side of the mask maps that are kept, pixels."""
 CELLS = 32
 POINTS = 8000
 FEW_VIEWS, FEW_POINTS = 5, 3000
 RIVALS = 3
 """Other images' masks that a pair of views is compared with, beside the mirrored one."""
 ALIKE = 0.7
-"""Mask maps with more mutual information than this, pixel by pixel, are no rivals: the camera hardly moved."""
+"""Mask maps with more mutual information than this, pixel by pixel, are no rivals: the camera hardly moved between."""
 GRID = np.stack(np.meshgrid(np.arange(64) + 0.5, np.arange(64) + 0.5), axis=-1).reshape(-1, 2) / 64
 """Places all over an image, as shares of its size."""
 FEWEST_SHARED = 40
 SHARED_SHARE = 0.15
-"""Views of which the one that sees less shares less than this with the other see each other's points through walls."""
+"""Of two views, the share of the fewer points that both must see; with less they see each other's through walls."""
 LEAST_ENTROPY = 0.05
-"""A view nearly all in one mask says nothing."""
+"""In nats; a view nearly all in one mask has less, and says nothing."""
 SAME_IOU = 0.5
 """Masks of two views show the same where they share more than this of their points, and are each other's best."""
 FEWEST_POINTS = 15
 CHANCE = 0.5
-"""A third, and some room."""
+"""How often the middle one of three ids is between the others: in a third of the cases by chance, and some room."""
 
 
 @dataclass(frozen=True)
 class MaskMaps:
-    """sample: of the scene. ids: (H, W) integers a view, at most LONGEST_PX long, 0 outside of all masks, else row + 1.
-    features: (masks, D) unit rows a view. shown: (masks,) bool a view, whether any pixel shows the row. blended: the
-    share of a view's borders in whose middle lies an id between those of both sides."""
+    """What is kept of the masks of a sample's views, a list entry a view.
+
+    ids: (H, W) integers, at most about LONGEST_PX long, 0 outside of all masks, else row + 1. features: (masks, D) unit
+    rows. shown: (masks,) bool, whether any pixel shows the row. blended: share of the borders that have an id between
+    those of both sides (`_blended`).
+    """
 
     sample: Sample
     ids: list[Ids]
@@ -64,11 +68,12 @@ class MaskMaps:
             if own is not None:
                 others = (_information(a, _at(rival, theirs)) for of, rival in self._rivals[j] if of != i)
                 found += [(own, other) for other in others if other is not None]
-                groups += [min(i, j) * len(cameras) + max(i, j)] * (len(found) - len(groups))  # either order: one `own`
+                # (i, j) and (j, i) share their `own`, so they are one group: their errors are not independent.
+                groups += [min(i, j) * len(cameras) + max(i, j)] * (len(found) - len(groups))
         return Comparison.of(found, "information", groups=groups)
 
     def features_alike(self, cameras: Sequence[Camera], shift: int = 0) -> Comparison:
-        """How much more alike features are of masks that show the same points. shift: added to every mask's row."""
+        """How much more alike the features of masks are that show the same points. shift: added to every mask's row."""
         found = []
         for i, j, mine, theirs in self._pairs(cameras):
             sizes = len(self.features[i]), len(self.features[j])
@@ -81,7 +86,7 @@ class MaskMaps:
         return Comparison.of(found, "cosine")
 
     def fewer(self) -> MaskMaps:
-        """Of fewer points and of a few views that lie together, for what is asked often."""
+        """Of fewer points and views, for what is asked often: the first views, as neighbors share points."""
         few = slice(FEW_VIEWS)
         sample = self.sample.thinned(FEW_POINTS).of_views(range(len(self.ids))[few])
         return MaskMaps(sample, self.ids[few], self.features[few], self.shown[few], self.blended[few])
@@ -99,10 +104,11 @@ class MaskMaps:
 
     @cached_property
     def _rivals(self) -> list[list[tuple[int, Ids]]]:
-        """Of each view mask maps in place of its own, and whose they are: other views', and its own mirrored; none that
-        says nearly the same of the image."""
+        """For each view, (whose, mask map) to compare its own with: other views' maps and its own mirrored, but none
+        that says nearly the same of the image."""
         found, count = [], len(self.ids)
         for view, ids in enumerate(self.ids):
+            # Evenly spread over the capture: neighbors show nearly the same.
             others = sorted({(view + step * count // (RIVALS + 1)) % count for step in range(1, RIVALS + 1)} - {view})
             maps = [*((other, self.ids[other]) for other in others), (view, ids[:, ::-1])]
             own = _at(ids, GRID)
@@ -124,23 +130,23 @@ def read_mask_maps(sample: Sample) -> MaskMaps:
 
 
 def _blended(ids: Ids) -> float:
-    """Along some rows, of steps from one id to another those to one between it and the next pixel's: a picture of ids
-    that was resized, or stored with losses, has them at its borders; where masks leave a gap, or touch, there are none.
-    0 for no more than chance gives: of masks some pixels wide one in so many is of one pixel, and a third of ids lies
-    between two others.
+    """Share of the steps from one id to the next, along some rows, that lead to an id between it and the following
+    pixel's. A map of ids that was resized with interpolation, or stored with losses, has such ids at its borders; where
+    right masks touch, or leave a gap, there are none. 0 where there are no more than chance gives.
     """
     rows = ids[:: max(1, len(ids) // LONGEST_PX)]
     left, middle, right = rows[:, :-2], rows[:, 1:-1], rows[:, 2:]
     between = ((left < middle) & (middle < right)) | ((left > middle) & (middle > right))
     steps = max(int((left != middle).sum()), 1)
     share = float(between.sum() / steps)
+    # By chance: the next pixel is a step again as often as any pixel is, and CHANCE of such ids lie between.
     return share if share > CHANCE * steps / max(middle.size, 1) else 0.0
 
 
 def entropies(a: Ids, b: Ids) -> tuple[float, float, float]:
     """Of two labels a point, (n,) integers from 0: entropies of the first, the second and both together, in nats. Their
     mutual information is the sum of the first two less the third."""
-    columns = int(b.max(initial=0)) + 1
+    columns = int(b.max(initial=0)) + 1  # the pair (a, b) as one number: a histogram of pairs in one pass
     joint = np.bincount(a * columns + b, minlength=(int(a.max(initial=0)) + 1) * columns).reshape(-1, columns)
     return _entropy(joint.sum(axis=1)), _entropy(joint.sum(axis=0)), _entropy(joint.reshape(-1))
 

@@ -1,8 +1,8 @@
 """Does the drawing of view i fit photograph i better than other photographs?
 
-The points' colors, drawn where the poses say, on a grid of some dozen cells, are correlated with the photographs on
-that grid: what is left of a photograph there is where things are, which wrong poses get wrong. Another exposure, noise
-and hidden points change little. Nothing else of the capture is asked.
+The points' colors are drawn where the poses say, on a grid of some dozen cells a side, and correlated with the
+photographs on that grid. So coarse a photograph tells little but where things are, which wrong poses get wrong; another
+exposure, noise and hidden points change little. Nothing else of the capture is used.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ FEW_VIEWS, FEW_POINTS = 4, 3000
 FEWEST_CELLS = 30
 """A drawing of fewer cells says nothing."""
 SOME_BLACK = 0.02
-"""A pixel of a small image shows nothing where so much of it is black, as beyond a lens's rim."""
+"""A pixel of a reduced image shows nothing when more than this share of it is black, as beyond a lens's rim."""
 FLAT = 3.0
 """Standard deviation of colors, of 255, below which there is nothing to compare."""
 ALIKE = 0.95
-"""Photographs that correlate more than this show the same: neither need fit the other's drawing less."""
+"""Photographs that correlate at least this much show the same: either may fit the other's drawing as well."""
 FEWEST_COMPARED = 3
 GREY = 3.0
 """Mean difference between the channels, of 255, up to which colors are no colors: a LiDAR's intensity, say."""
@@ -40,16 +40,16 @@ FEW_COLORS = 64
 
 @dataclass(frozen=True)
 class Photographs:
-    """sample: of the scene, views with photographs. images: (H, W, 3) each, LONGEST_PX along the longer side, NaN where
-    nothing is shown. grids: of each view (1 + rivals, cells, 3), the photograph on the grid of `seen`, and
-    those that its drawing is compared with too: others that do not show the same, and its own mirrored."""
+    """sample: the views of the scene that have photographs. images: (H, W, 3) each, LONGEST_PX along the longer side,
+    NaN where nothing is shown. grids: for each view (1 + rivals, cells, 3), its photograph on the grid of `seen`, then
+    the rivals on the same grid: its own mirrored, and others that do not show the same."""
 
     sample: Sample
     images: list[Floats]
     grids: list[Floats]
 
     def fit(self, cameras: Sequence[Camera]) -> Comparison:
-        """How well the photographs fit what these cameras see."""
+        """How much better each drawing by these cameras fits its own photograph than the rivals."""
         assert self.sample.rgb is not None
         found = []
         for camera, grid in zip(cameras, self.grids, strict=True):
@@ -66,8 +66,8 @@ class Photographs:
 
     @property
     def points_are_painted(self) -> bool:
-        """Whether the points' colors may say something else than photographs do: shades of gray where those are not
-        gray, or a few colors, as of classes."""
+        """Whether the points' colors may be none of photographs: gray where the photographs are not, or only a few
+        different ones, as of classes."""
         rgb = self.sample.rgb
         if rgb is None or len(np.unique(rgb, axis=0)) <= FEW_COLORS:
             return True
@@ -90,7 +90,7 @@ def read_photographs(sample: Sample) -> Photographs | None:
 
 
 def shrunk(image: NDArray[np.generic], side: int) -> Floats:
-    """The image with its longer side that long at most, averaged."""
+    """The image (H, W, ...) reduced by averaging until its longer side has at most so many pixels."""
     scale = min(1.0, side / max(image.shape[:2]))
     return _resized(image, *(max(1, round(scale * length)) for length in image.shape[1::-1]))
 
@@ -126,6 +126,7 @@ def _drawing(points: Seen, rgb: Floats) -> tuple[Floats, NDArray[np.intp]]:
 
 
 def _with_rivals(grid: Floats, grids: list[Floats]) -> Floats:
+    """(1 + rivals, cells, 3): the grid itself, its mirror image, and other views' grids, none that shows the same."""
     rows, columns = grid.shape[:2]
     others = [require_cv2().resize(other, (columns, rows)) for other in grids if other is not grid]
     found = np.stack([grid, grid[:, ::-1], *others]).reshape(-1, rows * columns, 3)

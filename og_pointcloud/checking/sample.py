@@ -15,16 +15,19 @@ from og_pointcloud.scene import Camera, Scene, View
 VIEWS = 12
 POINTS = 20_000
 CELLS = 48
-"""Cells along an image's longer side: of each, what is nearest is seen. A few points must fall into one."""
+"""Cells along an image's longer side; the nearest point of each hides those behind it. A few must fall into each."""
 BEHIND = 1.1
-"""Points up to so many times as deep as the nearest one of their cell are seen."""
+"""Points at most so many times as deep as the nearest one of their cell are seen."""
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """What is right against rivals. share: of comparisons in which it wins; ties count half. own, other: means of
-    both. gap: how far it stands out. compared: number of comparisons. unit: what is compared, in a word. error:
-    standard error of the gap, 0 where nobody asked."""
+    """What should fit, against rivals that should not.
+
+    share: of the comparisons, those that it wins; ties count half. own, other: mean of its own values and of the
+    rivals'. gap: how far it stands out, own - other or as a share of 1 - other. compared: number of comparisons. unit:
+    what is compared, in a word. error: standard error of the gap, 0 where no groups were given.
+    """
 
     share: float
     own: float
@@ -38,8 +41,8 @@ class Comparison:
     def of(
         cls, pairs: Sequence[tuple[float, float]], unit: str, *, of_rest: bool = False, groups: Sequence[int] = ()
     ) -> Comparison:
-        """Of pairs of what is right and a rival. of_rest: the gap is a share of what the rivals leave up to 1. groups:
-        a number a pair, the same for those that are right or wrong together, from which the gap's error is found."""
+        """pairs: (own value, rival's value). of_rest: the gap is a share of 1 - other, what the rivals leave. groups: a
+        number a pair, equal for pairs that are not independent; the gap's error is worked out from them."""
         if not pairs:
             return cls(0.0, 0.0, 0.0, 0.0, 0, unit)
         own, other = np.array(pairs).T
@@ -57,8 +60,8 @@ class Comparison:
 
 
 def _clustered_error(values: NDArray[np.float64], groups: Sequence[int]) -> float:
-    """Standard error of the mean of values (n,), of which those of one group are not independent (Liang and Zeger 1986:
-    residuals are summed in each group, then squared); infinite for one group."""
+    """Standard error of the mean of values (n,), those of one group not being independent (Liang and Zeger 1986:
+    residuals are summed in each group, then squared); infinite for a single group."""
     _, group = np.unique(groups, return_inverse=True)
     sums = np.bincount(group, weights=values - values.mean())
     count = len(sums)
@@ -84,6 +87,7 @@ class Sample:
 
     def repaired(self, repairs: Sequence[Repair]) -> list[Camera]:
         """The cameras of the views as the repairs mean them; a matrix or lengths without sense raise SceneError."""
+        # Some repairs depend on all cameras of the scene, as a change of neighboring frames or about their mean does.
         of_all = any(KINDS[repair.name].of_all for repair in repairs)
         asked = range(len(self.listed)) if of_all else self.places
         world = [in_local_frame(self.listed[place], -self.origin) for place in asked]
@@ -139,6 +143,7 @@ def seen(xyz: NDArray[np.float64], camera: Camera, cells: int = CELLS) -> Seen:
     places = uv_px[inside] / (camera.width, camera.height)
     column, row = (np.minimum(places, 1 - 1e-9) * (columns, rows)).astype(np.intp).T
     cell = row * columns + column
+    # A coarse z-buffer: a hidden point would be compared with what hides it.
     nearest = np.full(columns * rows, np.inf)
     np.minimum.at(nearest, cell, depth[inside])
     front = depth[inside] <= BEHIND * nearest[cell]

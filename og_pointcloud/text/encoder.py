@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from onnxruntime import InferenceSession
 
 MODELS_VARIABLE = "OG_POINTCLOUD_MODELS"
-"""Environment variable: folders, parted as in PATH, that are encoders or hold some."""
+"""Environment variable: folders, separated as in PATH, that are encoders or hold some."""
 GRAPH, TOKENIZER, WORD_BANK = "text_encoder.onnx", "tokenizer.json", "word_bank.npy"
 OPERATORS = frozenset({
     "Add", "ArgMax", "Cast", "Clip", "Concat", "DequantizeLinear", "Div", "DynamicQuantizeLinear", "Equal", "Erf",
@@ -49,13 +49,13 @@ DEMO_ENCODER = Path(__file__).parents[1] / "masking" / "demo_encoder"
 CarriedEncoder: TypeAlias = "Callable[[], TextEncoder | None]"
 TEXTS_PER_RUN = 64
 MOST_TEMPLATES, LONGEST_TEMPLATE = 128, 400
-"""CLIP was published with 80."""
+"""Templates an encoder may have, and characters of one. CLIP was published with 80 templates for ImageNet."""
 VECTORS_REMEMBERED = 1 << 14
 ENCODER = EncoderFormat(
     "og-text-encoder", 1, GRAPH, OPERATORS, "og-pointcloud export text", {TOKENIZER: 1 << 26, WORD_BANK: 1 << 26},
     optional=WORD_BANK,
 )  # fmt: skip
-"""One without a word bank is an encoder too."""
+"""The files of an encoder; the word bank may be absent."""
 
 
 class TextEncoder:
@@ -86,6 +86,7 @@ class TextEncoder:
 
     def __call__(self, names: Sequence[str]) -> NDArray[np.float32]:
         """(len(names), D) float32, unit rows: of each name the mean over the manifest's templates."""
+        # The ensemble of prompts of CLIP (Radford et al. 2021): unit vectors are averaged, their mean made unit again.
         texts = [template.replace("{}", name[:MOST_CHARACTERS]) for name in names for template in self.templates]
         vectors = self.encode(texts).reshape(len(names), len(self.templates), self.width).mean(axis=1)
         return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), np.finfo(np.float32).tiny)
@@ -97,7 +98,7 @@ class TextEncoder:
         for batch, tokens in self._batches(missing):
             vectors = ENCODER.vectors(self._session, tokens, (len(tokens), self.width), self.where)
             remembered.update(zip(batch, vectors, strict=True))
-        self._remembered = remembered  # another thread's is never emptied, only replaced
+        self._remembered = remembered  # replaced, never emptied: another thread may be reading the old one
         return np.array([remembered[text] for text in texts], np.float32).reshape(len(texts), self.width)
 
     def tokens(self, text: str) -> list[int]:
@@ -107,9 +108,10 @@ class TextEncoder:
         return ids if pad is None else ids + [pad] * (self.context_length - len(ids))
 
     def _batches(self, texts: Iterable[str]) -> Iterator[tuple[list[str], NDArray[np.int64]]]:
-        """Texts of one number of tokens together: none is padded for another's sake.
+        """Batches of texts with equally many tokens, so that none is padded for another's sake.
 
-        Activations of int8 graphs share one scale a run: a text then runs alone, so that its vector is always the same.
+        An int8 graph scales the activations of a whole run alike: there each text runs alone, so that its vector does
+        not depend on its neighbors.
         """
         by_length: dict[int, list[tuple[str, list[int]]]] = {}
         for text in texts:

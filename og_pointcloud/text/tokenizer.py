@@ -1,6 +1,6 @@
 """Words -> token ids, as a ``tokenizer.json`` says.
 
-CLIP's byte pairs are read here, so that the base install answers typed words; any other file (SigLIP's unigrams,
+CLIP's byte pairs are implemented here, so that the base install answers typed words; any other file (SigLIP's unigrams,
 Gemma's byte pairs of SigLIP 2) goes through the ``tokenizers`` package. Both may come from a stranger: what could run
 for very long, or give other ids on another run, is refused.
 """
@@ -32,20 +32,20 @@ CLIP_NORMALIZER = {
     ],
 }
 SIGN = "[!-/:-@\\[-`{-~ ]"
-"""ASCII's punctuation, and space."""
+"""One character of ASCII's punctuation, or a space."""
 LINEAR_PATTERN = re.compile(rf"(?:\\s| |\[(?:\\{SIGN}|(?![\[\\\]]){SIGN})+\])(?:\+|\{{2,\}})?")
 """Regular expressions that no text makes slow: one character class, once or repeated."""
 MOST_CHARACTERS = 4096
 """A longer text is cut here before anything else; contexts hold 77 tokens or fewer."""
 LONGEST_PIECE, MOST_ADDED = 256, 1 << 12
-"""Characters of a piece, and pieces beside the vocabulary. Unigrams take time by the square of a piece's length."""
+"""Characters of a piece, and pieces added to the vocabulary. Unigrams take time by the square of a piece's length."""
 MOST_GROWTH = 256
-"""How many times longer a text may become before it is cut into pieces."""
+"""How many times longer a normalizer may make a text."""
 GROWTH = {
     "NFC": 3, "NFD": 4, "NFKC": 18, "NFKD": 18, "Lowercase": 3, "Strip": 1, "StripAccents": 1, "Nmt": 1,
     "BertNormalizer": 4, "ByteLevel": 4, "Prepend": 2,
 }  # fmt: skip
-"""The same of each step of a normalizer, at worst, by Unicode's own tables."""
+"""How many times longer each step of a normalizer makes a text at worst, by Unicode's own tables."""
 PIECES_REMEMBERED = 1 << 14
 
 
@@ -100,7 +100,8 @@ def _is_clip(description: dict[str, Any]) -> bool:
 
 
 def _byte_characters() -> tuple[str, ...]:
-    """A printable character for each byte: itself where Latin-1 prints it, else the next from U+0100 on."""
+    """GPT-2's printable character for each byte: itself where Latin-1 prints it, else the next from U+0100 on."""
+    # Without space (32), the no-break space (160) and the soft hyphen (173), which print nothing.
     printable = {*range(33, 127), *range(161, 173), *range(174, 256)}
     others = iter(range(256, 512))
     return tuple(chr(byte if byte in printable else next(others)) for byte in range(256))
@@ -142,7 +143,8 @@ def _cleaned(text: str) -> str:
 
 
 def _words(text: str) -> Iterator[str]:
-    """CLIP_WORDS without a library that knows \\p{L}: the text is spelled by kind, and runs are looked for in that."""
+    """CLIP_WORDS without a library that knows \\p{L}: a second text holds the kind of each character, and runs of
+    letters and the like are matched in that."""
     kinds = "".join(map(_kind, text))
     endings, runs = re.compile("'s|'t|'re|'ve|'m|'ll|'d"), re.compile("L+|N|O+")
     position = 0
@@ -164,7 +166,8 @@ def _kind(character: str) -> str:
 
 
 class BytePairs:
-    """Byte-pair encoding of words: begins with single bytes and joins, again and again, the pair learnt first."""
+    """Byte-pair encoding of words (Sennrich et al. 2016): from single bytes on, the pair learnt first is joined, again
+    and again."""
 
     def __init__(self, vocabulary: Mapping[str, int], merges: list[str | list[str]]) -> None:
         self.vocabulary = {token: _id(id) for token, id in vocabulary.items()}
@@ -179,9 +182,11 @@ class BytePairs:
 
     def __call__(self, word: str) -> list[int]:
         """Ids of a word, spelled in BYTE_CHARACTERS."""
+        # The last byte carries the mark of a word's end: "at" in "cat" is another token than "at" in "cats".
         ids = [self.vocabulary[character] for character in word[:-1]] + [self.vocabulary[f"{word[-1]}</w>"]]
         while known := [(*self._merges[pair], pair) for pair in pairwise(ids) if pair in self._merges]:
             _, joined, first_learnt = min(known)
+            # Every occurrence at once, from the left: of three equal ids the first two are joined.
             merged: list[int] = []
             position = 0
             while position < len(ids):
@@ -256,6 +261,7 @@ def _growth(step: dict[str, Any]) -> float:
     if kind == "Replace":
         return len(step["content"]) / max(1, len(step["pattern"].get("String", "")))
     if kind == "Precompiled":
+        # SentencePiece's map: the trie's length in 4 bytes, the trie, then all replacements, each ended by a zero byte.
         table = base64.b64decode(step["precompiled_charsmap"] or "")
         trie = 4 + int.from_bytes(table[:4], "little")
         return max(map(len, table[trie:].split(b"\0")))

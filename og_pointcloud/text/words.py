@@ -96,7 +96,7 @@ def _stacked(labels: Mapping[str, Any]) -> NDArray[Any]:
 def _looked_up(
     words: tuple[str, ...], sources: list[Vocabulary], feature_space: str, carried: CarriedEncoder | None
 ) -> NDArray[np.float32]:
-    vectors: dict[str, np.ndarray] = {}
+    vectors: dict[str, np.ndarray] = {}  # the first source is entered last, and wins
     for source in reversed(sources):
         vectors |= dict(zip(source.names, source.vectors, strict=True))
     missing = [word for word in words if word not in vectors]
