@@ -135,13 +135,16 @@ def test_reading_refuses_what_open3d_reads_as_nothing(scene, tmp_path):
 # Open3D itself
 
 
-def test_missing_system_libraries_are_one_sentence(monkeypatch):
+@pytest.mark.parametrize(
+    ("says", "shown"), [("libusb-1.0.so.0: cannot open shared object file\nNo such file", "libusb"), ("", "OSError")]
+)
+def test_missing_system_libraries_are_one_sentence(says, shown, monkeypatch):
     def fail(name):
-        raise OSError("libusb-1.0.so.0: cannot open shared object file: No such file or directory")
+        raise OSError(says)
 
     monkeypatch.setattr(convert.importlib, "import_module", fail)
     with pytest.raises(
-        OgPointcloudError, match=r"does not load \(libusb.*apt-get install libusb-1.0-0 libgl1"
+        OgPointcloudError, match=rf"does not load \({shown}.*apt-get install libusb-1.0-0 libgl1"
     ) as caught:
         convert.open3d()
     assert "\n" not in str(caught.value)

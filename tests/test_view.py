@@ -188,8 +188,14 @@ def test_the_view_is_from_where_labelled_points_are_in_sight():
         x, y, depth = np.stack([right, np.cross(back, right), -back]) @ (xyz - view.eye).T
         assert np.mean((np.abs(FOCAL * y / depth) < 1) & (np.abs(FOCAL * x / depth) < 1.6)) > 0.97
         assert np.abs(FOCAL * y / depth).max() > 0.7, "it fills the picture"
-    one = choose_viewpoint(np.ones((1, 3)), np.zeros(1, bool), Z_UP)
-    assert np.isfinite(one.eye).all()
+
+
+@pytest.mark.parametrize("xyz", [[[1, 1, 1]], [[0, 0, 0], [1, 1, 1]], [[0, 0, 1], [1, 0, 0], [0, 1, 0]]])
+def test_a_handful_of_points_is_in_the_picture(xyz):
+    xyz = np.array(xyz, np.float64)
+    view = choose_viewpoint(xyz, np.zeros(len(xyz), bool), Z_UP)
+    uv_px, _ = view.camera(320, 200, FOCAL * 100).project(xyz)
+    assert ((uv_px >= 0) & (uv_px <= [320, 200])).all()
 
 
 @pytest.mark.slow

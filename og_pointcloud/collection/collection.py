@@ -26,6 +26,7 @@ from og_pointcloud.text.text_features import read_text_features
 from og_pointcloud.text.words import TextFeatures
 
 TOP = 20
+"""Findings that are answered unless told otherwise."""
 SAME_WORD = 0.95
 """Cosine from which two names are one word, which does not compete with itself: "mug" and "a mug"."""
 
@@ -81,8 +82,8 @@ class Findings(tuple[Finding, ...]):
 
 
 class Collection:
-    """The scenes of an atlas (`Collection.index` makes one). Descriptors are read when they are first asked and then
-    kept, those of single scenes or of a box alone where only they are asked.
+    """The scenes of an atlas (`Collection.index` makes one). Descriptors are read when they are first asked, and kept;
+    where only some scenes or a box are asked, only those are read.
 
     >>> import pathlib, tempfile
     >>> folder = pathlib.Path(tempfile.mkdtemp())
@@ -154,10 +155,9 @@ class Collection:
     ) -> Findings:
         """The instances that words fit best, of all scenes.
 
-        words: looked up in text_features, then in those of a scene's family (of the same feature space, and their words
-        agree), else encoded, if there is an encoder. A scene that cannot be asked for a word is left out, and
-        ``not_asked`` says so.
-        within: two corners (3,); instances whose box has its center in between, in their scene's world.
+        words: looked up in text_features, then among the words of a scene's family (scenes of one encoder), else
+        encoded, if there is an encoder. A scene that cannot be asked for a word is left out, and ``not_asked`` says so.
+        within: two corners (3,); only instances whose box has its center between them, in their scene's world.
         scenes: names, or patterns such as "site3/*". top: how many.
         Raises OgPointcloudError where no scene can be asked, or there is none of a name.
         """
@@ -174,6 +174,7 @@ class Collection:
         vectors = [self._vectors(group.family, names, features) for group in asked]
         if not any(vectors):
             raise _unanswerable(names[0], [group.family for group in asked])
+        # The best of each group and word, then the best of all: (what it is ranked by, finding).
         found = [
             pair
             for group, known in zip(asked, vectors, strict=True)
@@ -220,7 +221,8 @@ class Collection:
         return vectors
 
     def _encoder(self, family: Family) -> TextEncoder | None:
-        """The encoder that a scene of the family carries; or the one found for the space, if that has one family."""
+        """The encoder that a scene of the family carries, else the one found for the feature space. That one is used
+        only where the space has one family here: of several it is not known which it is of."""
         for entry in family.entries:
             if entry.encoder and (encoder := carried_encoder(self.file(entry.name))()):
                 return encoder
@@ -233,14 +235,14 @@ class Collection:
         """The best of a group for a word, with what they are ranked by."""
         block = self._blocks.get(group.name) or self._block(group, wanted, vector)
         asked = np.ones(len(block.entries), bool) if wanted.ids is None else np.isin(block.ids, list(wanted.ids))
-        words = np.array([*group.family.words.values()], np.float32).reshape(-1, len(vector))
+        words = np.array([*group.family.words.values()], np.float32).reshape(-1, len(vector))  # unit vectors
         rivals = words[words @ vector < SAME_WORD]
         ranked = zip(*block.rank(vector, rivals, asked, wanted.top, wanted.box), strict=True)
         return [(key, _finding(block, row, word, float(share(key)))) for row, key in ranked]
 
     def _block(self, group: Group, wanted: _Wanted, vector: NDArray[np.float32]) -> Block:
-        """A group's scenes that are asked and meet the box, or of them those that LanceDB proposes. All scenes are kept
-        when they were read once, some are read each time."""
+        """The scenes of a group that are asked and meet the box; of these only those that LanceDB proposes, if it is
+        used. A block of the whole group is kept for later questions, one of some scenes is read each time."""
         here = wanted.among(group)
         with Atlas.reading(self.path) as atlas:
             ids = atlas.within(*wanted.box) if wanted.box is not None else {entry.id for entry in here}
@@ -248,9 +250,10 @@ class Collection:
             is_all = len(near) == len(group.entries)
             if self._lance is not None and (is_all or len(near) > FEW_SCENES):
                 direction = load_block(atlas, near[:1]).direction(vector)
-                every = len(here) == len(group.entries)  # then the box says it all
-                some, part = None if every else [entry.id for entry in near], len(near) / len(group.entries)
-                proposed = self._lance.propose(group.name, direction, wanted.box, some, wanted.top, part)
+                # Where all scenes are asked, the box alone is the condition: no list of ids is needed.
+                ids_asked = None if len(here) == len(group.entries) else [entry.id for entry in near]
+                part = len(near) / len(group.entries)
+                proposed = self._lance.propose(group.name, direction, wanted.box, ids_asked, wanted.top, part)
                 return load_block(atlas, [entry for entry in near if entry.id in proposed] or near[:1])
             block = load_block(atlas, atlas.side_by_side(near))
         if is_all:
@@ -260,8 +263,8 @@ class Collection:
 
 @dataclass(frozen=True)
 class _Wanted:
-    """What may be found. ids: of its scene, None for any. box: (2, 3) corners about its middle, None for anywhere. top:
-    how many."""
+    """What may be found. ids: of the scenes asked, None for all. box: (2, 3) corners that the instance's middle must
+    lie between, None for anywhere. top: how many."""
 
     ids: set[int] | None
     box: NDArray[np.float64] | None

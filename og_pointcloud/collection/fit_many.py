@@ -28,7 +28,7 @@ from og_pointcloud.kernels import use_threads
 from og_pointcloud.settings import FitSettings
 
 LOST = "lost"
-"""The worker of a fit that no worker brought to an end."""
+"""`CaptureFit.worker` of a fit whose worker died."""
 
 
 @dataclass(frozen=True)
@@ -87,9 +87,9 @@ def fit_many(
     ``dask.distributed.Client(address).get_executor(pure=False)``: captures and ``out`` lie where its workers see them.
     A task takes its share of the worker's memory and cores; `FitSettings.memory` is the most for each.
 
-    Files that are there and whole are left as they are; fits that were killed go on behind the views that they kept.
+    Files that are there and whole are left as they are; fits that were killed resume after the views that they kept.
     Returns what became of each, in the order given; nothing is raised for a capture that fails. The files do not depend
-    on where and in what order they were made; so they hold no times, which are in what is returned.
+    on where and in what order they were made: they hold no times, which are in the returned records.
     OgPointcloudError, before any work, for two captures of one name.
 
     >>> og.fit_many([], "out")
@@ -113,7 +113,8 @@ def _fit_all(
     workers: Executor, todo: Mapping[Path, Path], options: FitOptions, progress: bool
 ) -> dict[Path, CaptureFit]:
     """Fit captures to their files. Those whose workers die are tried once more at the end, when there is more room."""
-    at_once = getattr(workers, "_max_workers", None)  # of pools of the standard library, and those made like them
+    # Pools of the standard library share this machine; of any other executor the machines are not known.
+    at_once = getattr(workers, "_max_workers", None)
     share = Share() if at_once is None else Share.of_machine(at_once)
     fits: dict[Path, CaptureFit] = {}
     for attempt in ("fit", "fit again"):
@@ -178,6 +179,7 @@ def _try_fit(capture: str, output: str, options: FitOptions, share: Share) -> Ca
 def _fit(capture: Path, output: Path, options: FitOptions, share: Share) -> LabelledCloud:
     if share.threads is not None:
         use_threads(share.threads)
+    # The user's limit or this task's share of the machine, whichever is less.
     limits = [limit for limit in (options.settings.memory, share.memory) if limit is not None]
     settings = replace(options.settings, memory=min(limits, default=None))
     work = output.with_name(f"{output.name}.work")
@@ -202,7 +204,7 @@ def fit_capture(
 
 
 def _without_circumstances(provenance: dict[str, Any], settings: FitSettings) -> dict[str, Any]:
-    """Provenance without what depends on where, when and beside what a fit ran."""
+    """Provenance without what depends on where, when and beside what a fit ran: files are equal byte for byte."""
     return {
         **provenance,
         "settings": {**provenance["settings"], "memory": settings.memory},

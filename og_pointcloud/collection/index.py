@@ -5,8 +5,8 @@ Cosines of two scenes cannot be compared: one has 0.3 where a word fits, another
 words, 0.8 where it does not. A word bank makes them comparable (`ask.choosing`). A scene without one borrows that of
 another scene of its encoder, else all words that the scenes of its encoder know together.
 
-Which scenes are of one encoder is not told by the name of their feature space, which is what somebody typed: scenes
-that give the same words other vectors are of two encoders (two families), and no word of one is asked of the other.
+The name of a feature space does not tell which scenes are of one encoder: somebody typed it. Scenes that give the same
+words different vectors are of two encoders (two families), and words of one are never asked of the other.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ has about 0.9, in another encoder's space about 0."""
 
 @dataclass(frozen=True)
 class Changes:
-    """What an index took: names of scenes. left_out: name and cause of each file that cannot be read; what the atlas
-    held of it is gone."""
+    """What indexing changed, by names of scenes. left_out: name and cause of each file that cannot be read; what the
+    atlas held of it before is removed."""
 
     added: tuple[str, ...]
     replaced: tuple[str, ...]
@@ -83,13 +83,13 @@ def index(folder: str | os.PathLike[str], path: str | os.PathLike[str], *, progr
 
 
 def _is_same(file: Path, entry: SceneEntry) -> bool:
-    """Whether a file has the size and date that it had: then it is not even opened."""
+    """Whether a file has the size and date that it had when it was indexed: then it is not even opened."""
     state = file.stat()
     return (state.st_size, state.st_mtime_ns) == (entry.bytes, entry.modified)
 
 
 def _take(atlas: Atlas, name: str, file: Path, known: SceneEntry | None) -> bool:
-    """Put a .ogpc file into the atlas; False where it has another date, but the content that is known."""
+    """Put a .ogpc file into the atlas; False where only its date is new, not its content."""
     if not file.is_file():
         raise OgPointcloudError(f"{file} is no file; expected one")  # a device or a pipe never ends
     state = file.stat()
@@ -120,8 +120,8 @@ def _take(atlas: Atlas, name: str, file: Path, known: SceneEntry | None) -> bool
 
 @dataclass(frozen=True)
 class Family:
-    """Scenes of one encoder: of one feature space and width, and their words agree. words: all that they know together;
-    of several vectors of a word the first by scene names."""
+    """Scenes of one encoder: their feature space and width are the same, and their words agree. words: all that they
+    know together, (D,) unit vectors; of a word that several know, the vector of the first scene by name."""
 
     feature_space: str
     width: int
@@ -170,13 +170,15 @@ def families(atlas: Atlas, entries: Iterable[SceneEntry]) -> list[Family]:
         alike.items(), key=lambda item: (not item[0][2], item[1][0].name)
     ):
         own = _words(atlas, digest, width)
-        near = [] if alone else [family for family in found if (family.feature_space, family.width) == (space, width)]
-        fitting = [family for family in near if _agree(own, family.words)]
-        if not fitting or (not own and len(near) > 1):
+        of_space = [] if alone else [each for each in found if (each.feature_space, each.width) == (space, width)]
+        fitting = [family for family in of_space if _agree(own, family.words)]
+        # Scenes without words agree with any family: where there are several, they are none of them for sure.
+        if not fitting or (not own and len(of_space) > 1):
             fitting = [Family(space, width)]
             found += fitting
-        fitting[0].entries.extend(members)
-        fitting[0].words.update({**own, **fitting[0].words})
+        family = fitting[0]
+        family.entries.extend(members)
+        family.words.update({**own, **family.words})
     return found
 
 
@@ -197,13 +199,14 @@ def judge_scenes(atlas: Atlas) -> None:
     for family in families(atlas, atlas.entries()):
         lent = _lent_bank(atlas, family)
         banks: dict[str, WordBank] = {}
+        # Scenes of one bank one after the other: it is read once, and only one is held at a time.
         for entry in sorted(family.entries, key=lambda entry: entry.bank or ""):
             judge = (entry.bank or lent) if family.width else None
             if judge == entry.judge:
                 continue
             made = None
             if judge is not None:
-                if judge not in banks:  # one at a time: each scene may have its own
+                if judge not in banks:
                     banks = {judge: atlas.bank(judge, family.width)}
                 made = Chooser(atlas.instances(entry)[0], banks[judge]).standard()
             atlas.judge(entry, judge, made)
@@ -216,4 +219,5 @@ def _lent_bank(atlas: Atlas, family: Family) -> str | None:
         return max(sorted(set(banks)), key=banks.count)
     if len(family.words) < MIN_BANK or family.width == 0:
         return None
+    # In order of the words, so that the same words have the same digest whichever scene came first.
     return atlas.add_words(("",) * len(family.words), np.array([family.words[name] for name in sorted(family.words)]))

@@ -1,9 +1,9 @@
 """LanceDB beside an atlas (extra 'lance'): for more descriptors than memory holds, in a folder or an object store.
 
-A table has a row for each descriptor, put so that its inner product with (direction, 1) is the evidence itself
-(`choosing.Standard`): then the largest products are the best instances, also of scenes that are judged differently.
-LanceDB only proposes: what it finds is scored from the atlas, so that an answer may lack an instance, but never says
-anything of one that the exact search would not say.
+A table has a row for each descriptor: its vector and shift (`scoring.Block`), whose inner product with (direction, 1)
+is the evidence itself. The largest products are therefore the best instances, also among scenes that are judged
+differently. LanceDB only proposes: what it finds is scored from the atlas. An answer may lack an instance, but what it
+says of one is what the exact search says.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ from og_pointcloud.collection.store import Atlas
 from og_pointcloud.errors import OgPointcloudError, naming_extra
 
 INDEXED_FROM = 50_000
-"""Rows from which a table has an index; fewer are all looked at."""
+"""Rows from which a table has an index; of fewer every one is compared."""
 ROWS_A_PARTITION = 4_000
 SCENES_AT_ONCE = FEW_SCENES = 200
-"""So many are written at once; so few are asked of the atlas, exactly: their rows lie in all partitions."""
+"""Scenes written at once; and scenes up to which the atlas is asked, exactly: their rows lie in all partitions."""
 PROPOSED = 50
-"""Rows that are asked for, for each that is wanted: a row's rank by evidence is not yet its rank by probability."""
+"""Rows proposed for each instance wanted: a row's rank by evidence is not yet its rank by probability."""
 PROBES, REFINE = 64, 8
-"""Partitions that are searched, and times as many rows read in full as are asked for: recall against time. On 200,000
-made descriptors the recall at 10 was 1.00, with 24 and 4 it was 0.97 (docs/scale.md)."""
+"""Partitions that are searched, and how many times the rows asked for are compared in full precision: recall against
+time. On 200,000 made descriptors the recall at 10 was 1.00; with 24 and 4 it was 0.97 (docs/scale.md)."""
 
 
 def _database(uri: str) -> Any:
@@ -50,7 +50,8 @@ def write_lance(atlas: str | os.PathLike[str], uri: str) -> None:
             vector = pa.list_(pa.float16(), group.family.width + 1)
             schema = pa.schema([*numbers.items(), ("vector", vector)])
             table = database.create_table(group.name, schema=schema, mode="overwrite")
-            for start in range(0, len(group.entries), SCENES_AT_ONCE):  # a generator it would read in another thread
+            # Added in parts, not as a generator: LanceDB would read that in another thread, where SQLite refuses.
+            for start in range(0, len(group.entries), SCENES_AT_ONCE):
                 block = load_block(opened, group.entries[start : start + SCENES_AT_ONCE])
                 table.add(pa.Table.from_arrays(_columns(block), schema=schema))
             if (count := table.count_rows()) >= INDEXED_FROM:
@@ -85,9 +86,11 @@ class LanceTables:
         top: int,
         share: float = 1.0,
     ) -> set[int]:
-        """Ids of the scenes with the descriptors of most evidence for a direction (D,). name: of the group. box:
-        (2, 3) corners that hold the instances' middles. scenes: ids of those that are asked; None for all. share: of
-        the rows that box and scenes leave, about: the best of fewer rows lie in more partitions.
+        """Ids of the scenes whose descriptors have the most evidence for a direction (D,).
+
+        name: of the group. box: (2, 3) corners that hold the instances' middles. scenes: ids of those that are asked;
+        None for all. share: roughly what share of the rows box and scenes leave: the fewer they are, the more
+        partitions must be searched for the best of them.
         """
         try:
             table = self._database.open_table(name)

@@ -1,9 +1,9 @@
 """The instances of many scenes against one text: the best of them, exactly, without scoring each to the end.
 
-An instance's evidence is one inner product a descriptor and a line (`choosing.Standard`), so all of it takes one pass
-over the descriptors. Its probability also depends on what other words of the bank say, which is a hundred times the
-work; but evidence alone bounds it from above. So instances are taken by their bounds, best first, until no other can
-reach the places that are asked for.
+An instance's evidence is one inner product for each descriptor, scaled and shifted (`choosing.Standard`), so one pass
+over the descriptors gives all of it. Its probability also depends on what other words of the bank say, which is a
+hundred times the work; but evidence alone bounds it from above. So instances are scored in the order of their bounds,
+until no other can reach the places that are asked for.
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ from og_pointcloud.collection.store import Atlas, SceneEntry
 from og_pointcloud.settings import ChoosingSettings
 
 RELEVANCY_TEMPERATURE = 10.0
-"""Factor of the cosines in LERF's relevancy (Kerr et al., Language Embedded Radiance Fields, ICCV 2023, Sec. 3.4):
-of its released code, the paper gives none."""
+"""Factor of the cosines in LERF's relevancy (Kerr et al., Language Embedded Radiance Fields, ICCV 2023, Sec. 3.4), as
+in its released code; the paper gives none."""
 ROWS_AT_ONCE = 512
-"""Instances whose descriptors are put together before a product: so many stay in a core's cache."""
+"""Instances whose descriptors are gathered for one product: few enough to stay in a core's cache."""
 FIRST = 64
-"""Instances scored to the end at first; then four times as many, as long as it takes."""
+"""Instances scored to the end at first; then four times as many again and again, until it is enough."""
 
 
 @dataclass(frozen=True)
 class Block:
-    """Scenes that are asked alike: of one encoder, judged by one word bank, or none. Of I instances, those with a point
-    and a descriptor; a scene's lie side by side.
+    """S scenes that are asked alike: of one encoder, and judged by one word bank or by none. I instances, those with a
+    point and a descriptor, scene after scene.
 
     vectors: (R, D) float32, shift: (R,) float32; their product with a `direction`, plus the shift, is the evidence of a
     descriptor in standard deviations of the judge's words; without a judge the cosine. bounds: (I + 1,) where each
@@ -69,7 +69,8 @@ class Block:
 
     @cached_property
     def _reach(self) -> NDArray[np.float64]:
-        """(S, 2, 3) low and high corner of where the middles of a scene's instances lie; of one without, nowhere."""
+        """(S, 2, 3) low and high corner of where the middles of a scene's instances lie; infinite, which meets no box,
+        for a scene without any."""
         reach = np.full((len(self.entries), 2, 3), np.inf)
         held = np.flatnonzero(np.diff(self._starts))
         for corner, least in enumerate((np.minimum, np.maximum) if len(held) else ()):
@@ -78,8 +79,9 @@ class Block:
 
     @cached_property
     def _bound(self) -> NDArray[np.float64]:
-        """(2, I) factor and summand that make of an instance's evidence what the logit of its score does not exceed."""
-        if self.bank is None:  # no cosine of a rival is below -1
+        """(2, I) factor and summand: the logit of an instance's score is at most factor * evidence + summand."""
+        # `_relevancy` and `_log_odds` with the least that rivals can say: a cosine of -1, and what chance gives.
+        if self.bank is None:
             return np.full((2, len(self)), RELEVANCY_TEMPERATURE)
         sharpness = self.sharpness[self.scene]
         return np.stack([sharpness, -(sharpness**2) / 2 - np.log(ChoosingSettings().kinds)])
@@ -91,7 +93,7 @@ class Block:
         return self.bank.mean, unit_rows(self.bank.vectors - self.bank.mean)
 
     def meets(self, box: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """(S,) whether some of a scene may have its middle in a box (2, 3)."""
+        """(S,) whether a scene may have an instance with its middle in a box (2, 3)."""
         return ((self._reach[:, 0] <= box[1]) & (self._reach[:, 1] >= box[0])).all(axis=1)
 
     def direction(self, text: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -102,8 +104,8 @@ class Block:
         """(n, L) of these instances for directions (L, D): of several descriptors the best."""
         found = np.empty((len(rows), len(directions)), np.float32)
         for start in range(0, len(rows), ROWS_AT_ONCE):
-            some = rows[start : start + ROWS_AT_ONCE]
-            begins, ends = self.bounds[some], self.bounds[some + 1]
+            part = rows[start : start + ROWS_AT_ONCE]
+            begins, ends = self.bounds[part], self.bounds[part + 1]
             first = np.cumsum(ends - begins) - (ends - begins)
             found[start : start + ROWS_AT_ONCE] = self._best_of(_ranges(begins, ends), first, directions)
         return found
@@ -111,7 +113,8 @@ class Block:
     def _best_of(
         self, rows: slice | NDArray[np.intp], first: NDArray[np.intp], directions: NDArray[np.float32]
     ) -> NDArray[np.float32]:
-        """(n, L) the most evidence of some descriptors, of which each of n instances has those from its first one."""
+        """(n, L) each instance's most evidence. rows: of descriptors, instance after instance; first: (n,) where each
+        instance's begin among them."""
         scores = self.vectors[rows] @ directions.T
         scores += self.shift[rows, None]
         return scores if len(first) == len(scores) else np.maximum.reduceat(scores, first, axis=0)
@@ -132,8 +135,9 @@ class Block:
         """
         if box is not None:
             asked = asked & self.meets(box)
+        # Runs of neighboring scenes, as (begin, end) of instances: their descriptors are multiplied in place, uncopied.
         edges = np.flatnonzero(np.diff(asked, prepend=False, append=False))
-        runs = self._starts[edges].reshape(-1, 2)  # of neighbors: multiplied where they lie, nothing is copied
+        runs = self._starts[edges].reshape(-1, 2)
         direction = self.direction(text)[None]
         bound = np.concatenate([np.zeros(0), *(self._bounds_of(begin, end, direction) for begin, end in runs.tolist())])
         rows = _ranges(*runs.T)
@@ -143,7 +147,7 @@ class Block:
         if self.bank is not None:
             key_of = self._log_odds
             _, rivals = self._judges
-            rivals = rivals[(rivals @ direction[0]) < ChoosingSettings().synonym]
+            rivals = rivals[(rivals @ direction[0]) < ChoosingSettings().synonym]  # words of another meaning
         best, key = largest(bound, lambda places: key_of(rows[places], direction, rivals), top)
         return rows[best], key
 
@@ -178,7 +182,7 @@ class Block:
 
 
 def _ranges(begins: NDArray[np.intp], ends: NDArray[np.intp]) -> NDArray[np.intp]:
-    """All numbers from each beginning to each end, behind each other."""
+    """The integers begins[0]..ends[0] - 1, begins[1]..ends[1] - 1, and so on, in one array."""
     count = ends - begins
     return np.arange(count.sum()) + np.repeat(begins - (np.cumsum(count) - count), count)
 
@@ -196,6 +200,7 @@ def largest(
         tried = tried[bound[tried] > -np.inf]
         new = np.setdiff1d(tried, known, assume_unique=True)
         known, key = np.append(known, new), np.append(key, key_of(new))
+        # Done when all were tried, or no bound that is left can beat the last key that is wanted.
         if len(tried) < count or np.partition(key, -top)[-top] >= bound[tried].min():
             order = np.lexsort((known, -key))[:top]
             return known[order], key[order]
@@ -208,7 +213,7 @@ def share(logit: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def load_block(atlas: Atlas, entries: Sequence[SceneEntry]) -> Block:
-    """Scenes of an atlas of one encoder and word bank; their arrays lie behind each other."""
+    """A block of some scenes of an atlas, all of one encoder and word bank."""
     parts: list[dict[str, NDArray[Any]]] = []
     width = entries[0].width
     vectors = np.empty((sum(entry.numbers for entry in entries) // width, width), np.float32)
@@ -216,9 +221,10 @@ def load_block(atlas: Atlas, entries: Sequence[SceneEntry]) -> Block:
     for number, entry in enumerate(entries):
         table, boxes = atlas.instances(entry)
         owner = table.descriptor_instance
-        shown = np.flatnonzero(table.points[owner] > 0)
+        shown = np.flatnonzero(table.points[owner] > 0)  # an instance without points cannot be found
         rows, shift = table.descriptors[shown], np.zeros(len(shown), np.float32)
         if entry.judge is not None:
+            # Evidence is scale * ((descriptor - common) @ direction) + shift: all but the direction is done here.
             standard = atlas.judgement(entry, len(owner))
             rows, shift = standard.scale[shown, None] * (rows - standard.common), standard.shift[shown]
             sharpness.append(standard.sharpness)

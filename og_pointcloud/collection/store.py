@@ -30,7 +30,7 @@ from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.formats.atomic import replacing
 
 APPLICATION, VERSION = 0x4F474154, 2
-"""SQLite's application_id and user_version of an atlas; the second is raised when older ones cannot be read."""
+"""SQLite's application_id ("OGAT") and user_version; the second is raised when older atlases cannot be read."""
 SCHEMA = (
     "CREATE TABLE about(name TEXT PRIMARY KEY, value TEXT NOT NULL)",
     "CREATE TABLE scenes(id INTEGER PRIMARY KEY, name TEXT NOT NULL UNIQUE, digest TEXT NOT NULL, "
@@ -104,8 +104,8 @@ class Atlas:
     @classmethod
     @contextmanager
     def writing(cls, path: str | os.PathLike[str]) -> Iterator[Atlas]:
-        """For one change, which is made when the block ends without an error; a missing file is made too, of which
-        nobody sees anything before: of two who make it at a time, the one who ends last has made it."""
+        """For one change, which takes effect when the block ends without an error. A missing file is made beside its
+        place and moved there at the end: of two processes that make it at a time, the last to end has made it."""
         path = Path(path)
         if path.exists() and not (path.is_file() and path.stat().st_size == 0):
             with cls._connected(path, "rw") as atlas:
@@ -125,10 +125,11 @@ class Atlas:
     @classmethod
     @contextmanager
     def _connected(cls, path: Path, mode: str, file: Path | None = None) -> Iterator[Atlas]:
-        """file: where it lies for now, before it takes its place."""
+        """file: where it lies until it takes its place."""
         uri = f"{(file or path).resolve().as_uri()}?mode={mode}"
         try:
             with closing(sqlite3.connect(uri, uri=True, timeout=PATIENCE_S, isolation_level=None)) as connection:
+                # What SQLite advises for a file that may be hostile (sqlite.org/security.html).
                 connection.execute("PRAGMA trusted_schema = OFF")
                 connection.execute("PRAGMA cell_size_check = ON")
                 yield cls(path, connection)  # what is not committed when it is closed is undone
@@ -140,7 +141,8 @@ class Atlas:
         found = tuple(self._run(f"PRAGMA {name}").fetchone()[0] for name in ("application_id", "user_version"))
         if found != (APPLICATION, VERSION):
             raise _refused(self.path, f"its application and version are {found}; expected {(APPLICATION, VERSION)}")
-        # SQLite keeps the text of each statement; indices that it makes by itself have none, the R*Tree tables of its.
+        # SQLite keeps the text of each CREATE. Indices that it makes by itself have none; the R*Tree's own tables,
+        # boxes_*, have texts of its own.
         query = "SELECT sql FROM sqlite_master WHERE sql <> '' AND NOT (type = 'table' AND name GLOB 'boxes_*')"
         if others := {row[0] for row in self._run(query)} ^ set(SCHEMA):
             raise _refused(self.path, f"its schema has, or lacks, {min(map(str, others)):.80}")
@@ -172,7 +174,7 @@ class Atlas:
             return table, _finite(rows["box"])
 
     def judgement(self, entry: SceneEntry, rows: int) -> Standard:
-        """What its judge makes of a scene's descriptors, of which it has so many."""
+        """What its judge makes of a scene's descriptors. rows: how many it has."""
         statement = "SELECT sharpness, standard FROM judgements WHERE scene = ?"
         with self._distrust(f"the judgement of '{entry.name}'"):
             sharpness, blob = self._run(statement, (entry.id,)).fetchone()
@@ -180,7 +182,7 @@ class Atlas:
             return Standard(*parts, sharpness=float(_finite(np.float64(sharpness))))
 
     def words(self, digest: str) -> Vocabulary:
-        """A vocabulary, or a bank, whose words have names of no meaning."""
+        """A vocabulary, or a bank, whose names are empty."""
         with self._distrust(f"the words {digest!r:.40}"):
             row = self._run("SELECT names, width, vectors FROM words WHERE digest = ?", (digest,)).fetchone()
             names = tuple(str(name) for name in json.loads(row[0]))
@@ -195,17 +197,18 @@ class Atlas:
             return WordBank(vectors)
 
     def within(self, low: ArrayLike, high: ArrayLike) -> set[int]:
-        """Ids of the scenes whose things' boxes, all together, meet this one. low, high: (3,)."""
+        """Ids of the scenes whose box around all their instances meets this one. low, high: (3,)."""
         (x0, y0, z0), (x1, y1, z1) = np.asarray(low, float).tolist(), np.asarray(high, float).tolist()
         meets = "x1 >= ? AND x0 <= ? AND y1 >= ? AND y0 <= ? AND z1 >= ? AND z0 <= ?"
         return {row[0] for row in self._run(f"SELECT id FROM boxes WHERE {meets}", (x0, x1, y0, y1, z0, z1))}
 
     def side_by_side(self, entries: Sequence[SceneEntry]) -> list[SceneEntry]:
-        """The scenes in another order, that of a Z-curve (Morton 1966): a box then finds few runs of neighbors."""
+        """The scenes ordered along a Z-curve (Morton 1966), so that those in a box form few runs of neighbors."""
         rows = self._run("SELECT id, x0 + x1, y0 + y1, z0 + z1 FROM boxes").fetchall()
         places = {id: place for id, *place in rows}
         twice = np.array([places.get(entry.id, [0, 0, 0]) for entry in entries], float).reshape(-1, 3)
         extent = np.ptp(twice, axis=0).max(initial=0) or 1.0
+        # Middles (twice them: only the order counts) in 2^10 cells a side; the bits of x, y and z take turns.
         cells = ((twice - twice.min(axis=0)) / extent * (2**10 - 1)).astype(np.int64)
         code = sum((cells[:, axis] >> bit & 1) << 3 * bit + axis for bit in range(10) for axis in range(3))
         return [entries[row] for row in np.argsort(code, kind="stable")]
@@ -261,7 +264,7 @@ class Atlas:
             self._run("INSERT INTO judgements VALUES (?, ?, ?, ?)", (entry.id, judge, made.sharpness, blob))
 
     def forget_unused_words(self) -> None:
-        """Words that no scene needs any more go."""
+        """Remove words that no scene needs any more."""
         used = "SELECT vocabulary FROM scenes UNION SELECT bank FROM scenes UNION SELECT judge FROM judgements"
         self._run(f"DELETE FROM words WHERE digest IN (SELECT digest FROM words EXCEPT SELECT * FROM ({used}))")
 

@@ -1,8 +1,8 @@
 """Other ways from masks to labelled points, on the same mask table: what the whole method is worth beside them.
 
-Each takes what the stages that all share have prepared, and vectors of words (L, D); it returns a word for each point
-of the surface, (n,) int, -1 where it has none. None knows background: a point that a mask's rays reach gets a word.
-`only_where_masked` is the plain remedy, and is reported beside each: points that views show mostly outside of masks get
+Each takes what the shared stages have prepared, and vectors of words (L, D); it returns a word for each point of the
+surface, (n,) int, -1 where it has none. None of them knows background: every point that a mask's rays reach gets a
+word. `only_where_masked` is the plain remedy, reported beside each: points that views show mostly outside of masks get
 none.
 
     direct uplift      every point the mean feature of the masks that show it, by blending weight
@@ -24,7 +24,7 @@ from og_pointcloud.fitting.fit import Prepared
 from og_pointcloud.fitting.photographs import Photographs
 
 MOSTLY = 0.5
-"""Share of a point's weight in masks from which it belongs to them."""
+"""Share of a point's visible weight that must lie in masks, or it belongs to none."""
 
 Words = NDArray[np.floating]
 Labels = NDArray[np.integer]
@@ -45,6 +45,7 @@ def center_sampling(prepared: Prepared, words: Words) -> Labels:
     similarity = table.unit_features @ unit_rows(words.astype(np.float64)).T
     scores, reached = np.zeros((len(xyz), len(words))), np.zeros(len(xyz), bool)
     for index, view in enumerate(views):
+        # Visibility is kept by photograph, of which this view may be a part.
         exposure = csr_array(table.exposure[[photographs.of_view[index]]])
         points, visible = exposure.indices, exposure.data
         uv_px, _ = view.camera.project(xyz[points])
@@ -72,7 +73,7 @@ def baseline_labels(prepared: Prepared, words: Words) -> Iterator[tuple[str, Lab
 
 
 def only_where_masked(labels: Labels, prepared: Prepared) -> Labels:
-    """The labels without those of points of whose visible weight less than MOSTLY lies in masks."""
+    """The labels, -1 for points that have at most MOSTLY of their visible weight in masks."""
     table = prepared.table
     inside, outside = (np.asarray(part.sum(axis=0), np.float64).ravel() for part in (table.weights, table.outside))
     return np.where(inside > MOSTLY * (inside + outside), labels, -1)

@@ -26,10 +26,11 @@ Integers = NDArray[np.integer]
 
 DRAWS, BLOCK_DRAWS = 10_000, 2_000
 CHUNK = 1 << 21
-"""Numbers drawn at once."""
+"""Numbers drawn at once, which bounds the memory."""
 SMALLEST_EDGE = 8.0
-"""Of a cube, in point spacings."""
+"""Edge of the smallest cubes tried, in point spacings."""
 FEWEST_BLOCKS = 20
+"""Cubes that the median class must lie in, or cubes are too large."""
 
 
 @dataclass(frozen=True)
@@ -82,8 +83,10 @@ def miou_interval(
     while True:
         block = _cubes(points, edge)
         present = _points_per_block(block, true, classes)
+        # Too large by now: of the edges tried, the widest interval is the answer. The smallest edge always counts.
         if intervals and np.median((present > 0).sum(axis=0)) < FEWEST_BLOCKS:
             return max(intervals, key=lambda interval: interval.high - interval.low)
+        # IoU of a draw needs only sums over its blocks, of intersections and of unions, (blocks, classes) each.
         hits = [_points_per_block(block, np.where(labels == true, true, -1), classes) for labels in labellings]
         unions = [
             present + _points_per_block(block, labels, classes) - hit
@@ -95,6 +98,7 @@ def miou_interval(
 
 def _cubes(xyz: Doubles, edge: float) -> NDArray[np.intp]:
     """(n,) the cube that each point lies in, numbered from 0."""
+    # 21 bits a coordinate; what lies farther out than 2^20 cubes shares the last one.
     cube = np.floor(np.minimum((xyz - xyz.min(axis=0)) / edge, 1 << 20)).astype(np.int64)
     return np.unique((cube[:, 0] << 42) | (cube[:, 1] << 21) | cube[:, 2], return_inverse=True)[1]
 
@@ -122,6 +126,7 @@ def _interval(hits: list[Doubles], unions: list[Doubles], edge: float) -> BlockI
 
     drawn = []
     for picked in _draws(blocks, BLOCK_DRAWS):
+        # How often each draw has each block: one histogram of the pairs (draw, block).
         rows = np.arange(len(picked))[:, None] * blocks + picked
         weights = np.bincount(rows.ravel(), minlength=picked.size).reshape(picked.shape)
         drawn.append(score(weights.astype(np.float64)))

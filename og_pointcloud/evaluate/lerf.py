@@ -41,6 +41,7 @@ from og_pointcloud.scene import Camera
 from og_pointcloud.text.words import TextFeatures
 
 ALPHA_SHOWN, IOU_FOUND = 0.7, 0.25
+"""The protocol's bounds, see above: of a rendered pixel's alpha, and of a pair's IoU for accuracy."""
 PUBLISHED_PAIRS = 208
 """(frame, object) pairs of the published table, in four scenes."""
 WAYS = ("best", "calibrated")
@@ -151,7 +152,7 @@ def _filled(outline: Any, shape: tuple[int, int], source: str) -> NDArray[np.boo
     if corners.ndim != 2 or corners.shape[1] != 2 or len(corners) < 3 or not np.isfinite(corners).all():
         raise SceneError(f"{source}: the outline is {outline!r:.60}; expected at least three [x, y]")
     mask = np.zeros(shape, np.uint8)
-    limit = 1 << 20  # OpenCV takes 32-bit integers; what lies that far outside is cut either way
+    limit = 1 << 20  # OpenCV takes 32-bit integers; what lies this far outside the image is cut off either way
     require_cv2().fillPoly(mask, [np.clip(np.rint(corners), -limit, limit).astype(np.int32)], 1)
     return mask.astype(bool)
 
@@ -182,9 +183,10 @@ def score_pairs(
     """
     cameras = [in_local_frame(camera, scene.cloud.origin) for camera in labels.cameras]
     near = near_plane(scene.cloud.xyz, cameras)
-    found = {name: select(scene, name, against=[], text_features=text_features) for name in labels.objects}
-    best = {name: () if one.best is None else (one.best.instance,) for name, one in found.items()}
-    chosen = {"best": best, "calibrated": {name: one.instances for name, one in found.items()}}
+    # Each object by itself, as the protocol asks for them: other objects' names are no rivals.
+    selected = {name: select(scene, name, against=[], text_features=text_features) for name in labels.objects}
+    best = {name: () if one.best is None else (one.best.instance,) for name, one in selected.items()}
+    chosen = {"best": best, "calibrated": {name: one.instances for name, one in selected.items()}}
     scores = []
     for frame, camera in zip(labels.frames, cameras, strict=True):
         shown = partial(_alpha, gaussians, scene.instance_ids, camera, near)
@@ -217,6 +219,6 @@ def score_scenes(ious: Mapping[str, NDArray[np.floating]]) -> tuple[float, float
 def _alpha(
     gaussians: Gaussians, ids: NDArray[np.int32], camera: Camera, near: float, instances: Sequence[int]
 ) -> NDArray[np.float32]:
-    """(H, W) what the points of some instances cover of a view, nothing else being there."""
+    """(H, W) alpha of a view of some instances' points alone, with nothing before them."""
     alone = gaussians.take(np.flatnonzero(np.isin(ids, instances)))
     return render(alone, np.zeros((len(alone), 0), np.float32), camera, near)[1]

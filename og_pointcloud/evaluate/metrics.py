@@ -53,6 +53,7 @@ def score_labels(
     ids, counts = np.unique(truth[evaluated], return_counts=True)
     classes = ids[counts >= min_points]
     evaluated &= np.isin(truth, classes)
+    # A class called on background is in its union, and a false alarm; recall is over the class's own points.
     counted = evaluated if background is None else evaluated | background
     ious, accuracies = [], []
     for class_id in classes:
@@ -85,6 +86,7 @@ def adjusted_rand_index(first: NDArray[np.integer], second: NDArray[np.integer])
     _, columns = np.unique(second, return_inverse=True)
     if len(rows) == 0:
         return float("nan")
+    # Sizes of the parts' intersections, the entries of the contingency table that are not 0.
     cells = np.unique(rows.astype(np.int64) * (columns.max() + 1) + columns, return_counts=True)[1]
     together = _pairs(cells)
     in_first, in_second = _pairs(np.bincount(rows)), _pairs(np.bincount(columns))
@@ -95,7 +97,7 @@ def adjusted_rand_index(first: NDArray[np.integer], second: NDArray[np.integer])
 
 
 def _pairs(counts: NDArray[np.integer]) -> float:
-    """Pairs of points that share a part, from the parts' sizes; in float64, as a large cloud's overflow 64 bits."""
+    """Pairs of points that share a part, from the parts' sizes; in float64, as their products may overflow int64."""
     sizes = counts.astype(np.float64)
     return float((sizes * (sizes - 1) / 2).sum())
 

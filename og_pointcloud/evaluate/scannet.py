@@ -35,6 +35,7 @@ TASKS: Mapping[int, tuple[int, ...]] = {
 SCENES = tuple(f"scene{number:04}_00" for number in (0, 62, 70, 97, 140, 200, 347, 400, 590, 645))
 """The ten scenes of the table."""
 OPACITY_COUNTED = 0.1
+"""Points of fainter Gaussians are ignored, see above."""
 NYU40_LARGEST = 40
 
 

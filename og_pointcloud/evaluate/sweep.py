@@ -1,7 +1,7 @@
 """Error against run time: settings x captures -> one table, with error and seconds in the same row.
 
-A fit of a few points comes first in each mode and is discarded, so that compiled code is loaded. Beside the settings
-stand other methods on the default's mask table (`baselines`).
+Each mode first fits a few points, and the result is discarded: compiled code is loaded before seconds count. Beside the
+settings stand other methods on the default's mask table (`baselines`).
 
     with gt.npz and text_features.npz      error = 1 - mIoU; a point without a label is a miss, a class called on known
                                            background a false alarm

@@ -39,7 +39,7 @@ def both_visits(
     change[[entry.now for entry in changes.moved]] = names.index("moved to here")
     change[count + np.array(gone, np.intp)] = names.index("gone")
     change[count + np.array(moved, np.intp)] = names.index("moved from here")
-    shift = before.origin - after.origin
+    shift = before.origin - after.origin  # each visit has a local frame of its own
     colored = before.rgb is not None and after.rgb is not None
     ids = np.concatenate([after.instance_ids, before.instance_ids[rows] + count]).astype(np.int32)
     both = replace(

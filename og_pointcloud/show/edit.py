@@ -9,8 +9,8 @@ Results are PLY files of the layout that the cloud had, which any viewer opens, 
 an edit does not concern keep every property and value they had: spherical harmonics, normals, whatever a trainer added.
 Originals stay.
 
-Which points an object has is decided by the .ogpc file. Where the cloud is the one it was made from, point by point,
-their ids count; else each point of the cloud takes the id of the nearest one of the scene, within its reach.
+Which points an object has is decided by the .ogpc file. Where the cloud is the one it was made from, row i has the id
+of the scene's point i; else each point of the cloud takes the id of the scene's nearest point within its reach.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ Rows = NDArray[np.void]
 SAME_PLACE = 1e-3
 """Distance in spacings up to which a point of the cloud is the scene's: .ogpc files hold float32."""
 RIGID = 1e-4
-"""How far a pose may be off a rotation with one scale."""
+"""How far a pose may be off a rotation times one scale, in any entry of R R' - 1."""
 
 
 class EditOptions(TypedDict, total=False):
@@ -284,7 +284,7 @@ def _similarity(pose: ArrayLike | None) -> tuple[NDArray[np.float64], float, NDA
     """Rotation (3, 3), scale and translation (3,) of a pose."""
     matrix = pose_matrix(np.eye(4) if pose is None else pose)
     determinant = float(np.linalg.det(matrix[:3, :3]))
-    scale = np.cbrt(determinant)
+    scale = np.cbrt(determinant)  # det(s R) = s^3
     rotation = matrix[:3, :3] / (scale if scale > 0 else 1)
     if scale <= 0 or np.abs(rotation @ rotation.T - np.eye(3)).max() > RIGID:
         raise SceneError(

@@ -76,6 +76,7 @@ def picture(cloud: LabelledCloud, finding: Finding) -> bytes:
     """A square PNG of an instance and what is around it, seen from far above and aside."""
     half = np.array(finding.size) / 2
     reach = half + AROUND * max(2 * half.max(), 8 * cloud.spacing)
+    # The thing's middle is the picture's origin.
     local = cloud.xyz - (np.array(finding.center) - cloud.origin).astype(np.float32)
     near = np.flatnonzero((np.abs(local) <= reach).all(axis=1))
     near = near[:: 1 + len(near) // MOST_POINTS]

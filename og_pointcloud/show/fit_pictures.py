@@ -25,9 +25,9 @@ GREY = (128, 128, 128)
 SPREAD = 1.5
 """Standard deviations to either side of the mean that a color channel shows."""
 LEAST_RANGE = 0.25
-"""A channel is stretched no further than to show this part of the widest one's range: the rest may be noise."""
+"""Least range that a channel shows, as a share of the widest one's: less may be noise, and is not stretched."""
 OPAQUE = 0.5
-"""Pixels that are covered this much show their value alone, emptier ones fade to white."""
+"""Pixels that are covered at least this much show their value alone, emptier ones fade to white."""
 CELL_WIDTH = 360
 """Pixels; views that are narrower keep their size."""
 GAP, STRIP, MARGIN = 6, 26, 10
@@ -48,7 +48,7 @@ class FeatureColors:
 
     @classmethod
     def fit(cls, features: NDArray[np.floating], weight: NDArray[np.floating]) -> FeatureColors:
-        """The three main directions of the features become red, green and blue.
+        """The three principal directions of the features become red, green and blue.
 
         features: (n, w); rows with NaN are left out. weight: (n,), how much each counts: its visibility. Each direction
         points to where its largest component is positive, so that the same features always have the same colors.
@@ -60,10 +60,12 @@ class FeatureColors:
             return cls(axes[:, 0], axes)
         mass /= mass.sum()
         center = rows[0] + mass @ (rows - rows[0])  # exact where all are equal
+        # Weighted principal components; eigh sorts by rising variance.
         centered = rows - center
         variances, directions = np.linalg.eigh((centered * mass[:, None]).T @ centered)
         variances, directions = variances[::-1][:3], directions[:, ::-1][:, :3]
         directions *= np.sign(directions[np.abs(directions).argmax(axis=0), np.arange(directions.shape[1])])
+        # SPREAD standard deviations to either side of 0.5 fill a channel; equal features, without any, stay at 0.5.
         deviations = np.sqrt(np.maximum(variances, LEAST_RANGE**2 * variances[0]))
         axes[:, : directions.shape[1]] = directions / np.where(deviations > 0, 2 * SPREAD * deviations, np.inf)
         return cls(center, axes)

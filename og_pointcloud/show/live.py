@@ -39,7 +39,7 @@ HINTED = 8
 DARKEST, LIGHTEST = 0.55, 1.10
 """What a label's color is multiplied by where the point itself is black, and white: keeps shape and shadow."""
 FADED = (0.72, 237)
-"""What is not lit: so much of this light grey in its own grey."""
+"""What is not lit becomes its own grey, mixed with this share of this light grey."""
 CLICK_PX = 33
 """Side of the square around a click in which points are looked for."""
 
@@ -100,7 +100,12 @@ class LiveScene:
 
     def colors(self) -> NDArray[np.uint8]:
         """(N, 3) uint8 RGB of the points shown: as the mode has it, in grey what is not lit."""
-        base = self._photo if self.mode == "photo" else self._sure if self.mode == "certainty" else self._painted()
+        if self.mode == "photo":
+            base = self._photo
+        elif self.mode == "certainty":
+            base = self._certainty_colors
+        else:
+            base = self._painted()
         if self.lit is None:
             return base
         share, grey = FADED
@@ -114,8 +119,8 @@ class LiveScene:
         return instance_table(self.scene, text_features=self._text_features, words=WORDS)
 
     def legend(self) -> list[tuple[str, Sequence[int], int]]:
-        """Names with their colors, where these are shown, and numbers of points, the most frequent first; last what has
-        no label."""
+        """(name, RGB, points), the most frequent first and what has no label last; colors are gray where the mode does
+        not show labels."""
         if self.mode == "changes" and self._change_of is not None:
             points = np.bincount(self._change_of[self.ids], minlength=len(CHANGES)).tolist()
             return [(name, color, count) for (name, color), count in zip(CHANGES.items(), points, strict=True) if count]
@@ -160,7 +165,7 @@ class LiveScene:
         return np.full(self.xyz.shape, 200, np.uint8) if self.rgb is None else self.rgb
 
     @cached_property
-    def _sure(self) -> NDArray[np.uint8]:
+    def _certainty_colors(self) -> NDArray[np.uint8]:
         certainty = self.scene.certainty_at(self.xyz)
         return certainty_colors(np.zeros(len(self.xyz)) if certainty is None else certainty)
 
@@ -208,9 +213,8 @@ class LiveScene:
 
         eye, direction: (3,), world. focal_px: of the window that was clicked in.
         """
-        view = Viewpoint(
-            eye, eye + direction, np.eye(3)[np.abs(direction).argmin()]
-        )  # whatever is up: a pixel is asked
+        # A small camera along the click; which way is up does not matter to its middle pixel.
+        view = Viewpoint(eye, eye + direction, np.eye(3)[np.abs(direction).argmin()])
         hit = pick(self.scene, view.camera(CLICK_PX, CLICK_PX, focal_px), (CLICK_PX / 2, CLICK_PX / 2))
         if not hit.found:
             self.lit = None
@@ -232,9 +236,13 @@ def _known_changes(cloud: LabelledCloud) -> NDArray[np.intp] | None:
     record = MapRecord.of(cloud)
     if len(record.visits) < 2:
         return None
-    change = np.full(len(cloud.instances), len(CHANGES) - 1)
-    change[[k for k, stamp in record.last_seen.items() if stamp < record.visits[-1].stamp]] = len(CHANGES) - 2
-    change[list(record.moved_from)] = [*CHANGES].index("moved to here")
+    names = list(CHANGES)
+    last_visit = record.visits[-1].stamp
+    change = np.full(len(cloud.instances), names.index("as it was"))
+    change[[k for k, stamp in record.last_seen.items() if stamp < last_visit]] = names.index(
+        "not seen at the last visit"
+    )
+    change[list(record.moved_from)] = names.index("moved to here")
     return change
 
 

@@ -32,7 +32,7 @@ MOST_POINTS = 2_000_000
 MOST_SCORES = 4_000_000
 """Scores of words on instances that a page holds; beyond, it has no words to search for."""
 LEVELS = 65535
-"""Steps of 16-bit coordinates and scores: a place is right to 1/131,000 of the cloud's extent."""
+"""Steps of 16-bit coordinates and scores: a place is off by at most half a step, 1/131,000 of the cloud's extent."""
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ def write_page(
         "subtitle": f"{len(shown):,} points · {(scene.cloud.instances.points > 0).sum()} instances",
         **asdict(look), "meaning": meaning(result.calibrated),
         "grey": NO_LABEL, "hues": label_colors(np.arange(len(scene.instances))).tolist(),
-        "spacing": scene.cloud.spacing * (len(finite) / len(shown)) ** 0.5,
+        "spacing": scene.cloud.spacing * (len(finite) / len(shown)) ** 0.5,  # points lie on surfaces: two dimensions
         "low": (low - middle).tolist(), "size": (high - low).tolist(),
         "corners": axis_aligned_box([low - middle, high - middle]).corners.tolist(),
         "extent": float(np.linalg.norm(high - low)) or 1.0,
@@ -122,6 +122,7 @@ def _instances(
     middle: NDArray[np.float64],
     choice: NDArray[np.integer],
 ) -> list[dict[str, Any]]:
+    # All points of an instance have one label: that of its first one.
     present, first, counts = np.unique(result.instances, return_index=True, return_counts=True)
     shown = dict(zip(present.tolist(), zip(result.labels[first].tolist(), counts.tolist(), strict=True), strict=True))
     rows = []

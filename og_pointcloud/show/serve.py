@@ -24,7 +24,7 @@ from og_pointcloud.show.viewpoint import FOCAL, choose_viewpoint
 
 LOOPBACK, PORT, PORTS = "127.0.0.1", 8080, 1 << 16
 POINT_SIZE = 0.95
-"""Radius of a point in spacings: surfaces close."""
+"""Radius of a point in spacings: large enough that surfaces look closed."""
 HEIGHT_PX = 640
 """Of the page in a notebook."""
 LISTED = 300
@@ -231,6 +231,7 @@ class LivePage:
                 "/scene", xyz, live.colors(), point_size=radius, point_shape="circle", precision="float32",
                 point_shading="flat",
             )  # fmt: skip
+        # Covariance R S S R' of each splat, S its standard deviations along its axes (3DGS).
         axes = SO3(shown.rotation).as_matrix() * shown.scale[:, None, :]
         covariances = axes @ axes.transpose(0, 2, 1)
         return scene.add_gaussian_splats("/scene", xyz, covariances, live.colors() / 255, shown.opacity[:, None])

@@ -40,7 +40,7 @@ def recoloured(rows: Rows, chosen: NDArray[np.bool_], color: NDArray[np.float64]
     columns, rgb = _columns(rows), colors(rows)
     is_splat = set(BASE_COLOR) <= set(columns)
     if is_splat:
-        # Color is linear in the coefficients, so what a linear map does to colors it does to them.
+        # Color is linear in the coefficients, so a linear map of colors acts on the coefficients too.
         base = 0.5 + SH_CONSTANT * stack_columns(rows, BASE_COLOR)[chosen]
         mapping = _color_map(np.clip(base, 0, 1), color)
         _set(columns, BASE_COLOR, (base @ mapping.T - 0.5) / SH_CONSTANT, chosen)
@@ -77,8 +77,8 @@ def placed(
 
 
 def appended(base: Rows, added: Rows) -> tuple[Rows, tuple[str, ...]]:
-    """The rows of both, with the columns of the first; and what is to be told. Colors that the two have in different
-    types become bytes."""
+    """The rows of both, with the columns of the first; and notes of what was lost. Where the two hold colors in
+    different columns or types, both become bytes."""
     first, second = _columns(base), _columns(added)
     zeros, notes = np.zeros(len(added)), []
     types = [[(name, columns[name].dtype) for name in COLORS if name in columns] for columns in (first, second)]
@@ -108,7 +108,7 @@ def _color_map(base: NDArray[np.float64], color: NDArray[np.float64]) -> NDArray
 
 
 def _turned(turn: NDArray[np.float64], quaternions: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(n, 4) quaternions wxyz after another turn; their lengths, which mean nothing, stay."""
+    """(n, 4) quaternions wxyz times a turn from the left (Hamilton); their lengths, which mean nothing, stay."""
     quaternions[~quaternions.any(axis=1), 0] = 1.0  # a zero quaternion is no rotation
     (a, b, c, d), (w, x, y, z) = turn, quaternions.T
     product = [
@@ -137,7 +137,8 @@ def _set(
     values: NDArray[np.floating],
     chosen: NDArray[np.bool_] | slice = slice(None),
 ) -> None:
-    """Give some rows of the columns other values (rows, ..), a name each, in the columns' types; the arrays stay."""
+    """Give the chosen rows other values (rows, ..), one column a name, in the columns' types; arrays are not changed in
+    place."""
     for name, column in zip(names, values.reshape(len(values), len(names)).T, strict=True):
         columns[name] = columns[name].copy()
         columns[name][chosen] = column

@@ -1,4 +1,4 @@
-"""Where to look from: the view, from obliquely above, in which the most labelled points are in sight."""
+"""Where to look from: the view from obliquely above that shows the most labelled points."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ SAMPLE = 20_000
 TRIM = (3.0, 97.0)
 """Percentiles between which points count for the frame: strays should not make everything small."""
 DISTANCE = 1.6
-"""Of the eye while directions are compared, in half diagonals of the points."""
+"""Distance of the eye while directions are compared, in half diagonals of the points."""
 FILLED = 0.9
-"""Share of the picture that the points fill at last."""
+"""Share of the picture's height or width that the points fill in the end."""
 
 
 @dataclass(frozen=True)
@@ -49,11 +49,12 @@ class Viewpoint:
 
 def choose_viewpoint(xyz: NDArray[np.float64], labelled: NDArray[np.bool_], up: NDArray[np.float64]) -> Viewpoint:
     """xyz: (n, 3), n >= 1, finite. labelled: (n,), points that should be seen; all, if none is. up: (3,) unit."""
-    some = np.linspace(0, len(xyz) - 1, min(len(xyz), SAMPLE)).astype(np.int64)
-    points, wanted = xyz[some], labelled[some] if labelled.any() else np.ones(len(some), bool)
+    sample = np.linspace(0, len(xyz) - 1, min(len(xyz), SAMPLE)).astype(np.int64)
+    points, wanted = xyz[sample], labelled[sample] if labelled.any() else np.ones(len(sample), bool)
     low, high = np.percentile(points, TRIM, axis=0)
     target = low + (high - low) / 2
     distance = DISTANCE * max(float(np.linalg.norm(high - low)) / 2, 1e-9)
+    # Candidates all around at two heights; side is any direction across up.
     side = np.cross(up, np.eye(3)[np.abs(up).argmin()])
     side /= np.linalg.norm(side)
     directions = [
@@ -64,7 +65,8 @@ def choose_viewpoint(xyz: NDArray[np.float64], labelled: NDArray[np.bool_], up: 
     views = [Viewpoint(target + distance * direction, target, up) for direction in directions]
     best = max(views, key=lambda view: _in_sight(points, wanted, view))
     inside = ((points >= low) & (points <= high)).all(axis=1)
-    return _framed(points[inside], best)
+    # Of a handful of points each may be the outermost along some axis: then all count.
+    return _framed(points[inside] if inside.any() else points, best)
 
 
 def _framed(points: NDArray[np.float64], view: Viewpoint) -> Viewpoint:

@@ -15,7 +15,7 @@ import og_pointcloud as og
 from og_pointcloud.ask.hosts import world_points
 from og_pointcloud.ask.labelled_scene import SceneLike
 from og_pointcloud.ask.segmentation import Segmentation
-from og_pointcloud.errors import MissingExtraError, OgPointcloudError, SceneError
+from og_pointcloud.errors import MissingExtraError, OgPointcloudError, SceneError, first_line
 from og_pointcloud.text.words import Labels
 
 OLDEST = (0, 19)
@@ -122,7 +122,7 @@ def open3d() -> Any:
         raise MissingExtraError(error.name or "open3d", "open3d") from None
     except (ImportError, OSError) as error:
         raise OgPointcloudError(
-            f"Open3D is installed but does not load ({str(error).splitlines()[0]}): install the system libraries it "
+            f"Open3D is installed but does not load ({first_line(error)}): install the system libraries it "
             f"needs, on Debian and Ubuntu: apt-get install {DEBIAN_LIBRARIES}"
         ) from None
     if tuple(map(int, re.findall(r"\d+", module.__version__)[:2])) < OLDEST:
