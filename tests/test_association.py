@@ -21,15 +21,15 @@ def unit(vector: NDArray[np.float64]) -> NDArray[np.float64]:
     return vector / np.linalg.norm(vector)
 
 
-def test_a_row_is_the_mean_weighted_by_the_side_of_what_masks_show_of_the_instance() -> None:
+def test_a_row_is_the_mean_weighted_by_the_cube_root_of_what_masks_show_of_the_instance() -> None:
     """Masks show 3 and 1 of the instance's points: the roots of these count, nothing else that they cover, nor a
     feature's length."""
     views: list[HandView] = [[([0, 1, 2], 5 * ONE)], [([2, 3, 4, 5], 0.1 * OTHER)]]
     result = describe(views, [0, 0], [0, 0, 0, BACKGROUND, BACKGROUND, UNOBSERVED])
-    side = np.sqrt(3)
-    np.testing.assert_allclose(result.descriptors, [unit(side * ONE + OTHER)], rtol=1e-6)
+    root = np.cbrt(3)
+    np.testing.assert_allclose(result.descriptors, [unit(root * ONE + OTHER)], rtol=1e-6)
     assert result.descriptors.dtype == np.float32
-    np.testing.assert_allclose(result.agreement, (side * side + 1) / (side + 1) / np.sqrt(side**2 + 1), rtol=1e-6)
+    np.testing.assert_allclose(result.agreement, (root * root + 1) / (root + 1) / np.sqrt(root**2 + 1), rtol=1e-6)
 
 
 def test_evidence_is_counted() -> None:
