@@ -104,6 +104,7 @@ _HOMES = {
     "og_pointcloud.text.text_features": ("read_text_features",),
     "og_pointcloud_export": ("write_bundle",),
 }  # fmt: skip
+"""Module -> the public names that it defines; the imports above say the same to type checkers and editors."""
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 _MODULES = {"edit": "og_pointcloud.show.edit"}
 """Modules used as they are: og.edit.remove."""
@@ -120,7 +121,7 @@ def __getattr__(name: str) -> Any:
         from og_pointcloud.errors import missing_extra
 
         raise missing_extra(error) or error from None
-    globals()[name] = value
+    globals()[name] = value  # found at once from now on: Python asks __getattr__ only for what is not there
     return value
 
 

@@ -25,11 +25,11 @@ UNKNOWN_SPACE = "unknown"
 NO_EVIDENCE = -2.0
 """Cosine of an instance without a descriptor: below every true one."""
 LENGTHS = (1e-30, 1e30)
-"""Shortest and longest length of a scene: those whose squares and ratios are numbers."""
+"""Shortest and longest spacing or reach of a scene: their squares and ratios are still finite in float64."""
 FARTHEST = 1e15
 """Largest coordinate of a scene's origin, in its unit: beyond, float64 has no digits left for the points."""
 MIN_BANK = 50
-"""Words that a null distribution takes at least: fewer give no standard deviation worth the name."""
+"""Fewest words of a bank: of fewer the standard deviation is too uncertain to measure evidence in."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class FeatureSpace:
         return same_encoder and (self.width == other.width or 0 in (self.width, other.width))
 
     def require(self, other: FeatureSpace, what: str) -> None:
-        """FeatureSpaceError, which calls the other space's vectors ``what``, unless the two can be compared."""
+        """FeatureSpaceError unless the two can be compared; it calls the other space's vectors ``what``."""
         if not self.accepts(other):
             raise FeatureSpaceError(f"the {what} are of {other}; expected {self}: encode them with that encoder")
 
@@ -94,6 +94,7 @@ class InstanceTable:
 
     def __post_init__(self) -> None:
         count = len(self.points)
+        # Frozen, so by object.__setattr__: what was left empty becomes "unknown" in every row.
         for name, unknown in (("coarse", np.int32(-1)), ("part_of", np.int32(-1)), ("reliability", np.float32("nan"))):
             if len(getattr(self, name)) == 0:
                 object.__setattr__(self, name, np.full(count, unknown))
@@ -104,7 +105,7 @@ class InstanceTable:
             raise OgPointcloudError(
                 f"descriptors {self.descriptors.shape} and their instances {self.descriptor_instance.shape} differ"
             )
-        owner = self.descriptor_instance
+        owner = self.descriptor_instance  # ascending, so that each instance's descriptors are one slice
         if owner.size and (owner.min() < 0 or owner.max() >= count or (np.diff(owner) < 0).any()):
             raise OgPointcloudError(f"descriptor instances must ascend within 0..{count - 1}")
         if not np.isfinite(self.descriptors).all():
@@ -124,7 +125,7 @@ class InstanceTable:
         return float(np.average(self.reliability[known].astype(np.float64), weights=np.sqrt(self.points[known])))
 
     def cosines(self, vectors: NDArray[np.floating]) -> NDArray[np.floating]:
-        """(K, L) best cosine of an instance's descriptors with each of vectors (L, D), -2 for one without a descriptor.
+        """(K, L) best cosine of each instance's descriptors with each of vectors (L, D); -2 where it has no descriptor.
 
         In the vectors' precision, at least float32. A zero vector has cosine 0 with everything.
         """
@@ -309,7 +310,7 @@ class LabelledCloud:
 def unit_rows(vectors: NDArray[np.floating]) -> NDArray[np.floating]:
     """Rows of length one, in the vectors' precision, at least float32; a zero row stays zero."""
     vectors = vectors.astype(np.result_type(vectors, np.float32), copy=False)
-    # In two steps, so that neither tiny nor huge vectors leave the float type.
+    # By the largest component first: squares of tiny or huge ones would leave the float type.
     largest = np.abs(vectors).max(axis=-1, keepdims=True, initial=0)
     scaled = vectors / np.where(largest > 0, largest, 1)
     length = np.linalg.norm(scaled, axis=-1, keepdims=True)

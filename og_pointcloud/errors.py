@@ -7,8 +7,8 @@ from contextlib import contextmanager
 
 
 def printable(text: str, most: int | None = None) -> str:
-    """Foreign text as it may be shown: what would move the cursor, turn the text about or is half a character becomes
-    an escape; of more than ``most`` characters the end is left out.
+    """Foreign text as it may be shown: what would move the cursor or reverse the text, and halves of characters, become
+    escapes; beyond ``most`` characters the end is left out.
 
     >>> from og_pointcloud.errors import printable
     >>> printable("mug" + chr(27) + "[2J"), printable("chair" * 9, 12)
@@ -25,7 +25,7 @@ def first_line(error: BaseException) -> str:
 
 
 def did_you_mean(word: str, known: Iterable[str], then: str = "") -> str:
-    """What may have been meant by a word, as a part of a message; "" where no known word is like it."""
+    """Part of a message that names known words like this one, followed by ``then``; "" where there are none."""
     import difflib  # only when something went wrong
 
     by_lower = {name.lower(): name for name in known}

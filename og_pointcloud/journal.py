@@ -80,6 +80,7 @@ def with_bar(items: Iterable[Item], name: str, total: int, shown: bool) -> Itera
         return items
     from tqdm import tqdm
 
+    # disable=None: tqdm finds out whether stderr is a terminal.
     return tqdm(items, desc=f"{name:<12}", total=total, leave=False, dynamic_ncols=True, disable=None)
 
 
@@ -124,7 +125,7 @@ class Journal:
         with tqdm(leave=False, dynamic_ncols=True, disable=None) as bar:
 
             def report(name: str, step: int, steps: int, loss: float) -> None:
-                if name not in begun:
+                if name not in begun:  # one bar, which each stage begins anew
                     begun.add(name)
                     bar.reset(steps)
                     bar.set_description_str(f"{name:<16}: ", refresh=False)

@@ -14,9 +14,9 @@ with naming_extra("numba", "fit"):
 
 __all__ = ["get_num_threads", "njit", "prange", "use_threads"]
 
-# OpenMP first: numba else tries TBB, and warns where it finds an old one. A user's own choice is kept.
-# Threads that wait sleep: spinning ones double the time of a fit wherever another program has a core.
+# Waiting threads sleep: spinning ones double the time of a fit wherever another program has a core.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+# OpenMP first: else numba tries TBB, and warns where it finds an old one. A user's own choice is kept.
 if "NUMBA_THREADING_LAYER_PRIORITY" not in os.environ:
     numba.config.THREADING_LAYER_PRIORITY = ["omp", "tbb", "workqueue"]  # pyright: ignore
 

@@ -4,10 +4,10 @@ Nothing is fetched here, and onnxruntime is imported nowhere else.
 
 What a stranger's graph may do is found out from its bytes, before any runtime is given them (`check_graph`).
 onnxruntime reads whatever file of this machine a graph names as the place of its constants, and fills constants of any
-size that a header claims. So only graphs pass whose constants lie in their own bytes, at the length that their shape
-asks for, and whose nodes are standard operators: no other domain, no functions, no graphs inside nodes.
+size that a header claims. So a graph passes only if its constants lie in its own bytes, at the length that their shape
+asks for, and its nodes are standard operators: no other domain, no functions, no graphs inside nodes.
 
-Field numbers are those of onnx.proto3; the file is walked over, not copied.
+Field numbers are those of onnx.proto3, as comments name them; messages are walked over, not copied.
 """
 
 from __future__ import annotations
@@ -36,12 +36,13 @@ MANIFEST = "manifest.json"
 MODEL_NAME = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*", re.ASCII)
 REVISION = re.compile(r"[0-9a-f]{40}")
 ERRORS_ONLY = 3
-"""Severity of onnxruntime's log."""
+"""Least severity that onnxruntime logs."""
 MOST_GRAPH_BYTES, LONGEST_RUN_S = 3 << 30, 120.0
-"""Of weights and all that is computed from them; the largest text encoders take half of it, and a second."""
+"""Most memory for weights and all that is computed from them, and longest run, seconds; the largest text encoders take
+half of the one, and a second of the other."""
 STANDARD_DOMAINS = ("", "ai.onnx")
 TYPE_BYTES = {1: 4, 2: 1, 3: 1, 4: 2, 5: 2, 6: 4, 7: 8, 9: 1, 10: 2, 11: 8, 12: 4, 13: 8, 16: 2}
-"""Bytes an element, by TensorProto.DataType."""
+"""Bytes an element, by TensorProto.DataType; strings (8), which have no fixed length, are not among them."""
 VARINT, FIXED_64, BYTES, FIXED_32 = 0, 1, 2, 5
 
 
@@ -54,7 +55,7 @@ def hub_cache() -> Path:
 
 
 def home_folder() -> Path:
-    """The user's; one that does not exist for a user without any, as in containers that are run by a bare number."""
+    """The user's home; a path that does not exist for users without one, as in containers run under a bare user id."""
     try:
         return Path.home()
     except RuntimeError:
@@ -62,10 +63,11 @@ def home_folder() -> Path:
 
 
 def fetched_model(name: str) -> Path | None:
-    """The folder of OWNER/MODEL as it was last fetched; None where it was not, or the name is none of that kind."""
+    """The folder of OWNER/MODEL as it was last fetched; None where it was not, or the name has another form."""
     if not MODEL_NAME.fullmatch(name):
         return None
     model = hub_cache() / f"models--{name.replace('/', '--')}"
+    # The layout of Hugging Face's cache: refs/main holds the revision, snapshots/REVISION the files.
     main = model / "refs" / "main"
     revision = main.read_text(encoding="utf-8", errors="replace").strip()[:64] if main.is_file() else ""
     folder = model / "snapshots" / revision
@@ -89,13 +91,13 @@ def open_session(model: bytes, *, bounded: bool = False) -> InferenceSession:
     if bounded:
         _bound_memory()
         options.add_session_config_entry("session.use_env_allocators", "1")
-    without = ["ConstantFolding"] if bounded else []
+    without = ["ConstantFolding"] if bounded else []  # it would compute on opening, before run_bounded's time counts
     return onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"], disabled_optimizers=without)
 
 
 @cache
 def _bound_memory() -> None:
-    """Make the allocator that sessions share which ask for one: there can be one in a process."""
+    """Make the bounded allocator that all sessions with ``session.use_env_allocators`` share; a process has one."""
     import onnxruntime as ort
 
     kind, usual = (ort.OrtAllocatorType.ORT_ARENA_ALLOCATOR, ort.OrtMemType.DEFAULT)  # pyright: ignore
@@ -106,13 +108,14 @@ def _bound_memory() -> None:
 def run_bounded(
     session: InferenceSession, given: Mapping[str, NDArray[Any]], outputs: Sequence[str] | None = None
 ) -> list[Any]:
-    """Outputs, None: all, and only what they need, within LONGEST_RUN_S, else TimeoutError; Ctrl-C is heard meanwhile.
-    Both stop between two nodes."""
+    """The outputs that are named, computing only what they need; None: all. TimeoutError after LONGEST_RUN_S. That, or
+    Ctrl-C, stops the run between two nodes."""
     import onnxruntime
 
     options: Any = onnxruntime.RunOptions()
     options.log_severity_level = ERRORS_ONLY + 1
     options.only_execute_path_to_fetches = outputs is not None
+    # In a thread of its own: this one can then stop waiting, and set `terminate`, which onnxruntime looks at.
     with ThreadPoolExecutor(1) as pool:
         answer = pool.submit(session.run, outputs, dict(given), options)
         try:
@@ -178,7 +181,7 @@ class EncoderFormat:
                 raise ValueError(f"its format is {found!r:.60}; expected {self.name!r} {self.version}")
             needed = {*self.files} - {self.optional}
             for name in sorted((needed | {*files, *manifest["files"]}) - {MANIFEST}):
-                # Not the sha256 beside it: eight times as slow, and it proves no more to one who trusts neither.
+                # Not the sha256 beside it: eight times as slow, and who can change a file can change its manifest.
                 if manifest["files"][name]["crc32"] != zlib.crc32(files[name]):
                     raise ValueError(f"{name} has not the manifest's checksum: it is damaged or was changed")
             check_graph(files[self.graph], self.operators)
@@ -190,7 +193,7 @@ class EncoderFormat:
         return manifest
 
     def feature_space(self, folder: Path) -> str | None:
-        """What a folder's manifest says, None where there is none or it cannot be read: others may lie here too."""
+        """What a folder's manifest says; None where it has none that can be read, as other folders may lie here too."""
         try:
             manifest = json.loads(self._bounded(folder / MANIFEST))
         except (OgPointcloudError, OSError, ValueError, RecursionError):
@@ -235,34 +238,39 @@ def check_graph(model: bytes, operators: frozenset[str] | None = None) -> None:
     operators: those that it may use; None for any of the standard.
     """
     for number, value in message_fields(memoryview(model)):
-        if number == 25:
+        if number == 25:  # ModelProto.functions
             raise ValueError("it defines functions of its own")
-        if number == 8 and (domain := text_of(value, 1)) not in STANDARD_DOMAINS:
+        if number == 8 and (domain := text_of(value, 1)) not in STANDARD_DOMAINS:  # ModelProto.opset_import.domain
             raise ValueError(f"it uses operators of {domain!r:.40}, not of the standard")
-        for inner, part in message_fields(value) if number == 7 else ():
-            if inner == 1:
-                _check_node(part, operators)
-            elif inner == 5:
-                constant_of(part)
-            elif inner == 15:
-                raise ValueError("it holds sparse constants")
+        if number == 7:  # ModelProto.graph
+            _check_parts(value, operators)
+
+
+def _check_parts(graph: memoryview | int, operators: frozenset[str] | None) -> None:
+    for number, part in message_fields(graph):
+        if number == 1:  # GraphProto.node
+            _check_node(part, operators)
+        elif number == 5:  # GraphProto.initializer
+            constant_of(part)
+        elif number == 15:  # GraphProto.sparse_initializer
+            raise ValueError("it holds sparse constants")
 
 
 def _check_node(node: memoryview | int, operators: frozenset[str] | None) -> None:
-    operator, domain = text_of(node, 4), text_of(node, 7)
+    operator, domain = text_of(node, 4), text_of(node, 7)  # NodeProto.op_type and .domain
     if domain not in STANDARD_DOMAINS:
         raise ValueError(f"it uses the operator {operator!r:.40} of {domain!r:.40}, not of the standard")
     if operators is not None and operator not in operators:
         raise ValueError(f"it uses the operator {operator!r:.40}, which it has no need of")
     for number, attribute in message_fields(node):
-        if number != 5:
+        if number != 5:  # NodeProto.attribute
             continue
         for kind, value in message_fields(attribute):
-            if kind in (6, 11):
+            if kind in (6, 11):  # AttributeProto.g, .graphs
                 raise ValueError(f"its node {operator!r:.40} holds a graph of its own")
-            if kind in (10, 22, 23):
+            if kind in (10, 22, 23):  # AttributeProto.tensors, .sparse_tensor, .sparse_tensors
                 raise ValueError(f"its node {operator!r:.40} holds lists of constants")
-            if kind == 5:
+            if kind == 5:  # AttributeProto.t
                 constant_of(value)
 
 
@@ -279,15 +287,15 @@ def constant_of(tensor: memoryview | int) -> Constant:
     shape: list[int] = []
     kind, data, typed = 0, memoryview(b""), False
     for number, value in message_fields(tensor):
-        if number == 13 or (number == 14 and value):
+        if number == 13 or (number == 14 and value):  # TensorProto.external_data; .data_location, 1 is EXTERNAL
             raise ValueError("it asks for other files of this machine")
-        if number == 1:
+        if number == 1:  # TensorProto.dims
             shape += integers_of(value)
-        elif number == 2:
+        elif number == 2:  # TensorProto.data_type
             kind = value
-        elif number == 9:
+        elif number == 9:  # TensorProto.raw_data
             data = _message(value)
-        elif number in (4, 5, 6, 7, 10, 11):
+        elif number in (4, 5, 6, 7, 10, 11):  # float_data, int32_data and so on: numbers one by one
             typed = True
     if typed or not isinstance(kind, int) or kind not in TYPE_BYTES:
         raise ValueError(f"it holds a constant of type {kind} that is not stored as plain bytes")
@@ -302,7 +310,7 @@ def message_fields(message: memoryview | int) -> Iterator[tuple[int, memoryview 
     position, end = 0, len(message)
     while position < end:
         key, position = _varint(message, position)
-        number, wire = key >> 3, key & 7
+        number, wire = key >> 3, key & 7  # protobuf's tag: field number, wire type in the last three bits
         if not 0 < number < 1 << 29:
             raise ValueError(f"it is damaged: field number {number}")
         if wire == VARINT:
@@ -322,10 +330,11 @@ def message_fields(message: memoryview | int) -> Iterator[tuple[int, memoryview 
 
 
 def _varint(data: memoryview, position: int) -> tuple[int, int]:
-    if position < len(data) and data[position] < 0x80:  # nearly all
+    """Base-128 varint at a position, least significant group first, and the position after it."""
+    if position < len(data) and data[position] < 0x80:  # nearly all are one byte
         return data[position], position + 1
     value = 0
-    for shift in range(0, 70, 7):
+    for shift in range(0, 70, 7):  # ten groups of seven bits hold 64
         if position >= len(data):
             break
         byte = data[position]
@@ -343,7 +352,7 @@ def _message(value: memoryview | int) -> memoryview:
 
 
 def text_of(message: memoryview | int, number: int) -> str:
-    """The last of a message's fields of this number as text, "" without one."""
+    """A message's field of this number as text, "" without one; of several the last counts, as in protobuf."""
     fields = [value for found, value in message_fields(message) if found == number]
     return bytes(_message(fields[-1])).decode("utf-8", "replace") if fields else ""
 
@@ -360,4 +369,5 @@ def integers_of(value: memoryview | int) -> list[int]:
 
 
 def _signed(value: int) -> int:
+    """protobuf writes a negative int64 as its two's complement of 64 bits."""
     return value - (1 << 64) if value >> 63 else value

@@ -31,15 +31,15 @@ LONGEST_SIDE = 1 << 17
 NOT_SEEN = -2
 """In a mask map: a pixel that the lens did not see, which says nothing; -1 says that no mask is there."""
 FEW = 12
-"""Values that a record shows as they are."""
+"""Arrays and tuples of up to so many values are shown whole by a record's repr."""
 RIGID = 1e-2
-"""A rotation's rows are of length one and upright to each other within this."""
+"""How far a rotation's rows may be from length one and from right angles, in any entry of R R' - 1."""
 UNIT_TOLERANCE = 1e-3
-"""A quaternion's length may differ from 1 by this much: it changes the size of a Gaussian by twice as much."""
+"""A quaternion's length may differ from 1 by this much; it scales a Gaussian by its square, twice as much."""
 
 
 def brief(self: Any) -> str:
-    """The repr of a dataclass whose fields would fill pages: arrays by type and shape, of what is long its length.
+    """The repr of a dataclass whose fields would fill pages: arrays as type and shape, long tuples as their length.
 
     >>> import numpy as np
     >>> from og_pointcloud.scene import Points
@@ -123,6 +123,7 @@ class Camera:
         """
         in_camera = xyz @ self.world_to_camera[:3, :3].T + self.world_to_camera[:3, 3]
         x, y, depth = in_camera.T
+        # NaN, not a division by a depth <= 0, which would mirror what is behind the camera into the image.
         in_front = np.where(depth > 0, depth, np.nan)
         return np.stack([self.fx * x / in_front + self.cx, self.fy * y / in_front + self.cy], axis=1), depth
 
@@ -140,7 +141,7 @@ class Camera:
 
 @dataclass(frozen=True)
 class CutMasks:
-    """Of a view that is one of several cut from a photograph: its masks are parts of those of the photograph.
+    """For a view that is one of several cut from a photograph: its masks are parts of the photograph's.
 
     photograph: its name. rows: (M,) int64, which of its masks each mask of the view is a part of.
     """
@@ -205,7 +206,7 @@ class View:
         return len(self.mask_features)
 
     def mask_map(self) -> IntArray:
-        """(H, W) int32: NOT_SEEN, -1 or a row of ``mask_features``. Read and checked on every call; keep it at need."""
+        """(H, W) int32: NOT_SEEN, -1 or a row of ``mask_features``. Read and checked anew on every call."""
         ids = self.masks() if callable(self.masks) else self.masks
         expected = (self.camera.height, self.camera.width)
         if ids.shape != expected:
@@ -272,7 +273,7 @@ class Points:
         if len(world) == 0:
             raise SceneError("the cloud has 0 points; expected at least one: check the geometry file")
         require_finite(world)
-        origin = np.median(world, axis=0)
+        origin = np.median(world, axis=0)  # where the points are: a few far ones do not move it, and cost no digits
         extent = float(np.abs(world - origin).max())
         if extent > float(np.finfo(np.float32).max):
             raise SceneError(
@@ -327,7 +328,7 @@ class Points:
 
 
 def rotation_error(matrix: DoubleArray) -> tuple[float, float]:
-    """How far a matrix (3, 3) is from one of orthonormal rows, NaN where it overflows; and its determinant."""
+    """Largest entry of R R' - 1 for a matrix (3, 3), 0 for orthonormal rows, NaN where it overflows; and det R."""
     with np.errstate(over="ignore", invalid="ignore"):
         return float(np.abs(matrix @ matrix.T - np.eye(3)).max()), float(np.linalg.det(matrix))
 
@@ -343,7 +344,7 @@ def require_finite(xyz: NDArray[np.floating], cure: str = "remove them from the 
 
 
 def _check_gaussians(scale: FloatArray, rotation: FloatArray, opacity: FloatArray) -> None:
-    """Files are activated and made unit by their readers; what is made by hand is drawn as it is."""
+    """Readers of files activate scales and opacities and normalize quaternions; here what others made is checked."""
     fits = np.logical_and.reduce((scale >= 0) & (scale < np.inf), axis=1)
     _require(fits, scale, "scale", "finite standard deviations, at least 0: take the exponential of logarithms")
     fits = np.logical_and(opacity >= 0, opacity <= 1)

@@ -35,7 +35,7 @@ class _Checked:
 
 def _unlike(hint: Any, name: str, value: Any) -> str:
     """What is expected of a setting of this type and name; "" where the value is that."""
-    kinds = get_args(hint)
+    kinds = get_args(hint)  # the choices of a Literal, the types in a tuple or union; a union here is "int or None"
     if get_origin(hint) is Literal:
         return "" if value in kinds else f"one of {', '.join(map(repr, kinds))}"
     if type(None) in kinds:
@@ -43,8 +43,9 @@ def _unlike(hint: Any, name: str, value: Any) -> str:
     if get_origin(hint) is tuple:
         right = isinstance(value, (tuple, list)) and value and not any(_unlike(kinds[0], name, each) for each in value)
         return "" if right else "a tuple of numbers above 0"
-    if hint not in (int, float):
+    if hint not in (int, float):  # a bool, or settings within settings
         return "" if isinstance(value, hint) else f"a {hint.__name__}"
+    # Numbers of numpy's types pass too; True, which Python counts as 1, and NaN, which is not >= 0, do not.
     least, most = name in ABOVE_ZERO, name in AT_MOST_ONE
     if isinstance(value, Integral if hint is int else Real) and not isinstance(value, bool):
         number = float(value)
@@ -68,7 +69,7 @@ class GeometrySettings(_Checked):
     sight_thickness: float = 3.0
     """Points closer than this many spacings along a ray are of one surface and do not hide each other."""
     neighbours: int = 24
-    """Nearest points looked at."""
+    """Nearest points of each point among which its neighbours are looked for."""
     reach: float = 3.0
     """Points within this many spacings adjoin; farther than this from the cloud is "too far"."""
 
@@ -99,20 +100,22 @@ class MembershipSettings(_Checked):
     sure_share: float = 0.6
     """A point is surely of an instance when this share of the weight asked lies in its masks."""
     open_share: float = 0.5
-    """A point seen less than this share as openly as the scene's others is as its neighbours are, the more the less."""
+    """A point that is seen less than this share as openly as the scene's others follows its neighbours, the more so the
+    less openly it is seen."""
     possible_share: float = 0.2
     """A point may be of an instance from this share on, if it adjoins sure ones."""
     growth_votes: float = 0.25
-    """This share of the adjoining points must be of the instance already."""
+    """Such a point becomes one of the instance's when this share of the adjoining points are so already."""
     rate_share: float = 0.15
     """An instance detected less often than this share of the scene's typical rate is noise of the proposer."""
     island_share: float = 0.15
-    """A separate piece whose points show less than this share of what the main piece's do was seen through it."""
+    """A separate piece whose points show less than this share of what the main piece's do was seen through the main
+    piece, and is not part of it."""
     own_vote: float = 3.0
-    """Votes of a point's own state, where a sure neighbour of which its color says nothing has one."""
+    """Votes of a point for its own state; a sure neighbour has one, if colors say nothing of the two."""
     crossing: float = 2.0
-    """Between background and an instance it takes so many times more: background's own votes are so many times as many,
-    and to a point of an instance its neighbours of background count so many times less."""
+    """It takes so many times more votes to cross between background and an instance: a background point has so many
+    times the votes for its own state, and to an instance's point background neighbours count so many times less."""
     gap_sizes: float = 0.5
     """A gap in depth wider than this many times the mask's own size parts object and background."""
     front_share: float = 0.2

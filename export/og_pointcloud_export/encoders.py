@@ -46,7 +46,7 @@ if find_spec("onnxscript") is None:  # torch.onnx.export imports it late, and sa
 
 OPSET = 18
 TOLERANCE = 1e-5
-"""Largest difference of a unit vector's entry from torch that is let through; float32 reaches about 1e-6."""
+"""Largest difference from torch, in any entry of a unit vector, that is accepted; float32 reaches about 1e-6."""
 PARITY_TEXTS = (
     "", " ", "a", "chair", "a photo of a chair.", "red mug", "object", "things", "stuff", "texture",
     "fire extinguisher", "kitchen counter", "a wooden table with four legs, seen from above", "traffic light",
@@ -105,6 +105,7 @@ def write_text_encoder(folder: Path, tower: Any, tokenizer: dict[str, Any], abou
         about["pad_id"] is set. tokenizer: as in a tokenizer.json. about: the manifest's entries on the model.
     """
     context, pad_id = about["context_length"], about["pad_id"]
+    # No size of the example is 1, which torch.export would take for a constant.
     example = torch.zeros((2, min(context, 7) if pad_id is None else context), dtype=torch.int64)
     batch, length = torch.export.Dim("batch"), torch.export.Dim("length", min=1, max=context)
     graph = _onnx_graph(tower, example, "tokens", ["text"], {0: batch, 1: length} if pad_id is None else {0: batch})
@@ -114,6 +115,7 @@ def write_text_encoder(folder: Path, tower: Any, tokenizer: dict[str, Any], abou
     held = {text_encoder.GRAPH: graph, text_encoder.TOKENIZER: json.dumps(tokenizer, ensure_ascii=False).encode()}
     encoder = TextEncoder(_with_manifest(about, held), str(folder))
     parity = _text_parity(tower, encoder)
+    # The bank is encoded by the graph itself, as labels will be.
     held[text_encoder.WORD_BANK] = npy_bytes(encoder(everyday_words()).astype(np.float16))
     files = _with_manifest({**about, "parity": parity}, held)
     _write_folder(folder, files, text_encoder.ENCODER)
@@ -279,7 +281,7 @@ def _image_parity(graph: bytes, model: ImageModel) -> dict[str, Any]:
     """How far the graph is from the model, on images of noise and of even colors, and on patches if it has any."""
     size = model.preprocessing.size
     squares = np.random.default_rng(0).integers(0, 256, (PARITY_IMAGES, size, size, 3), np.uint8)
-    squares[PARITY_IMAGES // 2 :] = squares[PARITY_IMAGES // 2 :, :1, :1]
+    squares[PARITY_IMAGES // 2 :] = squares[PARITY_IMAGES // 2 :, :1, :1]  # the second half: even colors
     pixels = model.preprocessing.pixels(squares)
     session = open_session(graph)
     got, expected = np.asarray(session.run(["image"], {"pixels": pixels})[0]), model(pixels)

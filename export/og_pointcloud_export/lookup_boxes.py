@@ -5,8 +5,8 @@ the cube if |u - p|^2 > |u - q|^2 everywhere. The difference is linear in u, so 
 
     |p|^2 - |q|^2 - 2 half |p - q|_1 > 0        (|.|_1: the sum of absolute coordinates)
 
-A point that loses so to another, or that is out of reach of the cube, can be nearest nowhere in it. If all that are
-left have one answer, and the cube lies within reach of one of them, the child is certain. If not, they are the
+A point that loses to another in this way, or is out of reach of the cube, is nearest nowhere in it. If all points that
+are left have one answer, and the cube lies within reach of one of them, the child is certain. If not, they are the
 candidates among which a query in the child finds its nearest point; or the child is split into 4^3 children of its own.
 
 Cubes are inflated by ``rounding``, the most that float32 can move a query's cell, so that a query is always inside the
@@ -23,15 +23,15 @@ EDGE = 4
 """Children along the edge of a box that is split."""
 CHILDREN = EDGE**3
 SHORT_LIST = 8
-"""So many candidates are compared at once: children share a list up to this length, as it costs no time."""
+"""The graph compares so many candidates at once, so children share a list up to this length: it costs no time."""
 LONGEST_LIST = 64
-"""Candidates of a child; one with more, as where points almost coincide, is left to the exact search."""
+"""Most candidates of a child; one with more, as where points almost coincide, is left to the exact search."""
 TOO_FAR_CODE = 0
 """Answer code of a query with no cloud point within reach."""
 NOTHING, SPLIT = -1, CHILDREN
 """What a child has instead of the number of a list: nothing, as its answer is certain or left open; or its own box."""
 MANY_RIVALS = 4 * LONGEST_LIST
-"""Above so many, a child is split without comparing each with each."""
+"""With more candidates than this, a child is split without comparing each with each."""
 
 # Helpers are called by kernels alone: without wrappers of their own they compile sooner.
 _helper = njit(no_cpython_wrapper=True, no_cfunc_wrapper=True)  # pyright: ignore[reportCallIssue]
@@ -79,6 +79,7 @@ def _answer_box(box, corner, level, limits, points, filled):  # noqa: ANN001, AN
         if not last and (holds[number] or count > longest):
             child[number] = SPLIT
         elif count <= LONGEST_LIST:  # else left open
+            # Candidates that are not in the shared list yet are added; lists hold the cloud's numbers of points.
             chosen = _list_to_share(rows[:count], lists_of, lengths[:made])
             for row in rows[:count]:
                 bit = np.uint64(1) << np.uint64(chosen)
@@ -96,7 +97,7 @@ def _answer_box(box, corner, level, limits, points, filled):  # noqa: ANN001, AN
 def _points_about(corner, size, rounding, reach, points):  # noqa: ANN001, ANN202
     """The points within reach of the box, and (64,) bool, which of its children hold points."""
     low, edge, block_row, start, x, y, z, answer, number = points
-    half = EDGE * size / 2 + rounding
+    half = EDGE * size / 2 + rounding  # of the whole box, inflated as its children are
     middle = (corner[0] + EDGE * size / 2, corner[1] + EDGE * size / 2, corner[2] + EDGE * size / 2)
     first, last = np.empty(3, np.int64), np.empty(3, np.int64)  # bricks along each axis that are within reach
     for axis in range(3):
@@ -109,18 +110,18 @@ def _points_about(corner, size, rounding, reach, points):  # noqa: ANN001, ANN20
         for j in range(first[1], last[1] + 1):
             for k in range(first[2], last[2] + 1):
                 row = block_row[i // EDGE, j // EDGE, k // EDGE]
-                if row < 0:
+                if row < 0:  # the block holds no point and is near none
                     continue
                 slot = row * CHILDREN + (i % EDGE * EDGE + j % EDGE) * EDGE + k % EDGE
                 for point in range(start[slot], start[slot + 1]):
                     gap = _gap_squared((x[point] - middle[0], y[point] - middle[1], z[point] - middle[2]), half)
                     if gap > _grown(reach):
                         continue
-                    if count == len(chosen):
+                    if count == len(chosen):  # full: twice the room
                         chosen = np.append(chosen, np.empty(count, np.int32))
                     chosen[count] = point
                     count += 1
-                    if gap == 0:
+                    if gap == 0:  # inside the inflated box: the child it lies in, the nearest where it is just outside
                         child_x = min(max(int((x[point] - corner[0]) / size), 0), EDGE - 1)
                         child_y = min(max(int((y[point] - corner[1]) / size), 0), EDGE - 1)
                         child_z = min(max(int((z[point] - corner[2]) / size), 0), EDGE - 1)
@@ -145,7 +146,8 @@ def _answer_child(center, half, last, limits, near, squared, rows):  # noqa: ANN
         return TOO_FAR_CODE, True, 0
     # Candidates: what does not lose to that point, and is within reach of the cube.
     nearest = _seen_from(center, near, best)
-    limit = (np.sqrt(best_squared) + 2 * diagonal) ** 2  # farther points always lose: the test itself costs more
+    # By the triangle inequality points beyond this always lose; the test by corners would say so at greater cost.
+    limit = (np.sqrt(best_squared) + 2 * diagonal) ** 2
     count = 0
     for row in range(len(squared)):
         if squared[row] <= limit:
@@ -170,7 +172,8 @@ def _answer_child(center, half, last, limits, near, squared, rows):  # noqa: ANN
 
 @_helper
 def _winners(center, half, near, squared, rows, count):  # noqa: ANN001, ANN202
-    """Keep the rows that do not lose to another; how many. (What loses to a loser, loses to the other's winner too.)"""
+    """Move the rows that lose to no other to the front, and count them. Losers may be dropped at once: what loses to
+    one also loses to the point that it loses to."""
     row = 0
     while row < count:
         rival, rival_squared, lost = _seen_from(center, near, rows[row]), squared[rows[row]], False
@@ -180,7 +183,7 @@ def _winners(center, half, near, squared, rows, count):  # noqa: ANN001, ANN202
             ):
                 lost = True
                 break
-        if lost:
+        if lost:  # the last row takes its place, and is looked at next
             count -= 1
             rows[row] = rows[count]
         else:
@@ -217,7 +220,7 @@ def _seen_from(center, near, row):  # noqa: ANN001, ANN202
 
 @_helper
 def _code(answer, squared, limits):  # noqa: ANN001, ANN202
-    """Code of an answer at that distance: too far, near, or on the surface."""
+    """Code of an answer at that squared distance: too far, near, or on the surface (`CODE_OFFSET` in lookup_grid)."""
     reach, surface, codes = limits
     if squared > reach * reach:
         return TOO_FAR_CODE
@@ -226,7 +229,7 @@ def _code(answer, squared, limits):  # noqa: ANN001, ANN202
 
 @_helper
 def _grown(reach):  # noqa: ANN001, ANN202
-    """The squared reach, and a little more for rounding."""
+    """The squared reach, and a little more: rounding must not lose a point at exactly that distance."""
     return reach * reach * (1 + 1e-9)
 
 

@@ -11,10 +11,10 @@
     |far|far|far|far|      | # | # | # | # |      |L1 |L1 | b | b |        #           split: read the next level
     +---+---+---+---+      +---+---+---+---+      +---+---+---+---+
 
-One rule decides at every level (``lookup_boxes``): certain if all of the box has one answer; else split if it holds
-cloud points, as queries come where the cloud is, or has too many candidates for a list; else the list, which boxes
-beside it share where few candidates do for several. Answers are exact, most queries compare no distances, and a street
-with little in it costs little. What a budget leaves out is marked open, with the answer at the box's center:
+One rule decides at every level (``lookup_boxes``). A box is certain if all of it has one answer. Else it is split if it
+holds cloud points, as queries come where the cloud is, or if it has too many candidates for a list. Else it has a list,
+which boxes beside it share where few candidates do for several. Answers are exact, most queries compare no distances,
+and empty space costs little. What the budget has no room for is marked open, with the answer at the box's center:
 ``bundle.nearest`` settles queries there. Cells are 1.5 point spacings wide.
 """
 
@@ -43,7 +43,7 @@ from og_pointcloud_export.lookup_boxes import (
 CODE_OFFSET = 1 - UNOBSERVED
 """Answer code of instance id + CODE_OFFSET on the surface; (instances + CODE_OFFSET - 1) more near it."""
 CELL_PER_SPACING = 1.5
-"""Size of a cell. Smaller ones need lists less often, and cost file size with the second to third power."""
+"""Size of a cell. Smaller ones need lists less often, but file size grows with the second to third power."""
 CELLS_PER_REACH = 3.0
 """A far reach makes cells larger, so that the layer of cells around a surface stays at most about eight deep."""
 BLOCKS_PER_POINT, BLOCKS_AT_LEAST, BLOCKS_AT_MOST = 16, 1 << 15, 1 << 18  # times 64^2, and as much again, fits int32
@@ -129,6 +129,7 @@ def _grid_frame(cloud: LabelledCloud) -> _Frame:
         return _Frame(np.zeros(3), cell_size, (3, 3, 3), True)
     allowed = min(max(BLOCKS_PER_POINT * len(cloud), BLOCKS_AT_LEAST), BLOCKS_AT_MOST)
     border = cloud.reach + cell_size  # the cell more takes up all rounding
+    # The least share of outliers, on each side of each axis, without which the grid is small enough.
     for left_out in (0.0, 1e-4, 1e-3, 1e-2, 0.05, 0.2, 0.4):
         ends = np.quantile(cloud.xyz, [left_out, 1 - left_out], axis=0, method="nearest").astype(np.float64)
         shape = np.ceil((ends[1] - ends[0] + 2 * border) / (cell_size * EDGE)) + 2
@@ -160,11 +161,13 @@ def _points_by_brick(cloud: LabelledCloud, frame: _Frame) -> tuple[tuple, NDArra
     blocks = np.argwhere(in_reach)
     block_row = np.full(frame.blocks, -1, np.int32)
 
+    # The fullest blocks first: where the budget of nodes and lists ends, the most points have been served.
     brick = position.astype(np.int64)
     count = np.zeros(frame.blocks, np.int64)
     np.add.at(count, tuple((brick // EDGE).T), 1)
     blocks = blocks[np.argsort(-count[in_reach], kind="stable")]
     block_row[tuple(blocks.T)] = np.arange(len(blocks))
+    # Points sorted by brick, block after block: `start` holds where each brick's begin.
     slot = block_row[tuple((brick // EDGE).T)] * CHILDREN + brick % EDGE @ np.array([EDGE**2, EDGE, 1])
     start = np.append(0, np.cumsum(np.bincount(slot, minlength=len(blocks) * CHILDREN)))
     number = number[np.argsort(slot, kind="stable")]
@@ -175,6 +178,7 @@ def _points_by_brick(cloud: LabelledCloud, frame: _Frame) -> tuple[tuple, NDArra
 
 def _first_of_equal(xyz: NDArray[np.float32]) -> NDArray[np.bool_]:
     """(n,) bool: False where a point before it has the same coordinates, and so answers for both."""
+    # By a 64-bit hash of each row, as np.unique by rows is slow; the last line tells rows apart that share one.
     bits = (xyz + np.float32(0)).view(np.uint32).astype(np.uint64)  # -0 becomes 0
     key = (bits * np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)).sum(axis=1)
     _, first, same = np.unique(key, return_index=True, return_inverse=True)
@@ -230,7 +234,7 @@ class _Table:
             lists = np.empty((*child.shape, LONGEST_LIST), np.int32)
             level = (size, self._rounding, longest, last)
             answer_children(corners, level, self._limits, self._points, (answers, child, lengths, lists))
-            if self._lists_made >= self._lists_allowed:
+            if self._lists_made >= self._lists_allowed:  # no more lists: what would have one is open
                 child[child != SPLIT], lengths[:] = NOTHING, 0
             split = child == SPLIT
             split &= self._rows_promised + np.cumsum(split).reshape(split.shape) <= self._nodes_allowed
@@ -244,6 +248,7 @@ class _Table:
     ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
         """Number the children of boxes: of each one its lists, then its splits. What ``_Boxes`` says of them."""
         listed = lengths > 0
+        # Where each box's children begin, and the number of each child: that of its list, or behind all lists.
         count_lists, count_splits = listed.sum(axis=1), split.sum(axis=1)
         first_child = self._children_made + np.cumsum(count_lists + count_splits) - (count_lists + count_splits)
         in_box = np.where(split, count_lists[:, None] + np.cumsum(split, axis=1) - 1, child)
@@ -262,7 +267,7 @@ class _Table:
 
     def grid(self, blocks: NDArray[np.int64], references: NDArray[np.int64]) -> LookupGrid:
         """All that was added, with the references of the bricks in these blocks."""
-        listed = np.full((1, CHILDREN), 2 * self._codes, np.int32)
+        listed = np.full((1, CHILDREN), 2 * self._codes, np.int32)  # the last row, see `nodes`
         nodes = _compact(np.concatenate([*self._nodes, listed]))
         bricks = np.where(references < 0, len(nodes) - 1 - references, references)
         block_row = np.full(self._frame.blocks, _FAR, np.int64)

@@ -26,7 +26,7 @@ from og_pointcloud_export.lookup_grid import build_lookup_grid
 from og_pointcloud_export.query_graph import OPSET, build_query_graph
 
 SCORE_TOLERANCE = 1e-5
-"""Largest cosine error of the graph against float64 that is let through; float32 sums of 512 terms reach 1e-6."""
+"""Largest cosine error of the graph against float64 that is accepted; float32 sums of 512 terms reach 1e-6."""
 PARITY_TEXTS, PARITY_POINTS = 64, 4096
 
 
@@ -69,7 +69,7 @@ def write_bundle(
     manifest = _manifest(cloud, model, members)
     with replacing(path) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
         for name, data in {"manifest.json": manifest, **members}.items():
-            archive.writestr(zipfile.ZipInfo(name), data)  # a ZipInfo of its own: the date stays 1980, the bytes too
+            archive.writestr(zipfile.ZipInfo(name), data)  # by ZipInfo, dated 1980: equal contents, equal bytes
     return path
 
 
@@ -108,7 +108,7 @@ def _smallest_signed(ids: NDArray[np.int32]) -> NDArray[np.signedinteger]:
 
 
 def _parity(cloud: LabelledCloud, onnx: bytes) -> dict[str, Any]:
-    """Run the graph on the cloud's words and random vectors, on its points and on points about them."""
+    """Run the graph on the cloud's words and random vectors, and on its points, moved by 0, 0.5 or 2 spacings."""
     session = open_session(onnx)
     random = np.random.default_rng(0)
     width = session.get_inputs()[1].shape[1]
@@ -121,6 +121,7 @@ def _parity(cloud: LabelledCloud, onnx: bytes) -> dict[str, Any]:
 
     names = ["instance_scores", "instance", "certain"]
     scores, instance, certain = (np.asarray(out) for out in session.run(names, {"points": points, "text": text}))
+    # What the graph is certain of must be what the exact search says; what it leaves open is counted.
     nearest = NearestPoint(cloud.xyz, cloud.spacing, cloud.reach).query(points)
     exact = np.full(len(points), TOO_FAR, np.int32)
     exact[nearest != NONE_WITHIN_REACH] = cloud.instance_ids[nearest[nearest != NONE_WITHIN_REACH]]

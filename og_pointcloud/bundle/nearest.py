@@ -86,7 +86,7 @@ class NearestPoint:
         for radius in self._radii:
             if len(pending) == 0:
                 break
-            if radius not in self._levels:
+            if radius not in self._levels:  # wider ones are made when first needed: often never
                 self._levels[radius] = VoxelBuckets(self._xyz, radius * (1 + EDGE_SLACK))
             found = _nearest_within(self._levels[radius], points[pending].astype(np.float64), radius)
             nearest[pending] = found

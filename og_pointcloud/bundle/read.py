@@ -97,6 +97,7 @@ def _members(file: BinaryIO) -> tuple[dict[str, bytes], dict[str, int]]:
                 raise _Refused(f"member name {info.filename!r:.80} is no plain relative path: it is not to be trusted")
             if info.compress_type != zipfile.ZIP_STORED or info.compress_size != info.file_size:
                 raise _Refused(f"member '{info.filename:.80}' is compressed; expected stored members: {ogpc.REBUILD}")
+        # Two members of one name, or overlapping ones, could say one thing to us and another to other readers.
         names = {info.filename for info in infos}
         total = sum(info.file_size for info in infos)
         if len(names) != len(infos) or len(infos) > ogpc.MAX_MEMBERS or total > size:

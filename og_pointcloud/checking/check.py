@@ -262,7 +262,7 @@ def _masks(maps: MaskMaps, *, is_doubted: bool) -> Check:
             "interpolation, or stored with losses; expected ids as they were given: nearest neighbor, PNG"
         )
         return Check("masks", "doubt", says)
-    if is_doubted:
+    if is_doubted:  # with wrong poses, right masks disagree too
         return Check("masks", "unchecked", "poses come first")
     found = _agreement(maps)
     if found.compared < FEWEST:

@@ -40,7 +40,8 @@ LONGEST_UNFORESEEN = 300
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; argv without the program's name, None for the process's own. Returns the exit code."""
     arguments = argparse.Namespace(debug=True)
-    for stream in (sys.stdout, sys.stderr):  # which may know few characters, and file names hold any bytes
+    # Terminals may know few characters, and file names may hold any bytes: both are escaped, not an error.
+    for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
     try:
@@ -50,7 +51,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         check_outputs(arguments)
         with warnings.catch_warnings(), redirect_stdout(Plain(sys.stdout or io.StringIO())):  # pyright: ignore
             warnings.simplefilter("ignore")  # what libraries tell programmers
-            warnings.simplefilter("always", UserWarning)
+            warnings.simplefilter("always", UserWarning)  # what this library tells users
             warnings.showwarning = print_warning
             arguments.run(arguments)
             sys.stdout.flush()

@@ -92,7 +92,7 @@ def add_output(parser: Any, *flags: str, endings: Sequence[str], help: str, **se
 
 
 def replaceable(text: str) -> Path:
-    """The type of a path that is read, and that an output may replace, or something in it."""
+    """Type of a path that is read, but that an output may replace or lie in (`check_outputs` guards those of Path)."""
     return Path(text)
 
 
@@ -123,8 +123,8 @@ def outputs_of(action: argparse.Action) -> Sequence[str]:
 
 
 def check_output(option: str, path: Path, inputs: Sequence[Path]) -> None:
-    """Refuse a folder, an input, what lies in a folder that is read already (.ogpc are no part of captures), and what
-    cannot be written."""
+    """Refuse a folder, an input, an existing file in a folder that is read (but .ogpc files, which are no part of a
+    capture), and what cannot be written."""
     resolved, sources = path.resolve(), [source.resolve() for source in inputs]
     if path.is_dir():
         raise OgPointcloudError(f"{option} is '{path}', which is a folder; expected a file name")
@@ -139,6 +139,7 @@ def check_output(option: str, path: Path, inputs: Sequence[Path]) -> None:
 def print_result(arguments: argparse.Namespace, result: Mapping[str, Any], show: Callable[[Any], None]) -> None:
     """As JSON where --json was given, else as ``show`` prints it."""
     if arguments.json:
+        # Readable as it stands; only what a terminal would act on is escaped, as JSON escapes it.
         text = json.dumps(result, indent=2, ensure_ascii=False)
         print("".join(sign if sign.isprintable() or sign == "\n" else json.dumps(sign)[1:-1] for sign in text))
     else:
@@ -239,6 +240,7 @@ def write_fit(cloud: LabelledCloud, journal: Journal, output: Path) -> LabelledC
         try:
             write_bundle(cloud, output)
         except OSError as error:
+            # A fit may have taken hours: it is kept where there is room, if anywhere.
             kept = Path(tempfile.mkdtemp(prefix="og-pointcloud-", dir=scratch_root())) / output.name
             try:
                 write_bundle(cloud, kept)

@@ -203,7 +203,7 @@ def run_lerf(arguments: argparse.Namespace) -> None:
 
 
 def print_selections(scenes: Mapping[str, Sequence[PairScore]]) -> dict[str, dict[str, float]]:
-    """A table with a row a scene, the means of scenes, and the interval over all pairs; the means as JSON, by way."""
+    """Print a row for each scene, the means over scenes, and the intervals over all pairs; returns the means by way."""
     import numpy as np
 
     from og_pointcloud.evaluate.intervals import bootstrap
@@ -213,6 +213,7 @@ def print_selections(scenes: Mapping[str, Sequence[PairScore]]) -> dict[str, dic
     means = {way: score_scenes(of_way) for way, of_way in ious.items()}
     rows = []
     for name, pairs in scenes.items():
+        # A scene whose labels name no object has no pair, and no mean.
         cells = [(of[name].mean(), (of[name] > IOU_FOUND).mean()) if pairs else (None, None) for of in ious.values()]
         rows.append((name, str(len(pairs)), *(percent(value) for cell in cells for value in cell)))
     total = sum(map(len, scenes.values()))

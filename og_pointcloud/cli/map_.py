@@ -39,7 +39,7 @@ def run(arguments: argparse.Namespace) -> None:
     mapper = Mapper(arguments.start, feature_space=arguments.feature_space, journal=work)
     resumed, refused, taken = mapper.last_stamp, {}, 0
     for frame in tqdm(frames, desc="frames", disable=None, leave=False):
-        if arguments.resume and frame.stamp is not None and frame.stamp <= resumed:
+        if arguments.resume and frame.stamp is not None and frame.stamp <= resumed:  # the map holds it already
             continue
         try:
             mapper.integrate(frame)

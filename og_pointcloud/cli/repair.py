@@ -40,13 +40,14 @@ def run(arguments: argparse.Namespace) -> None:
     had = () if arguments.only else read_repairs(capture)
     stated = [str(repair) for repair in had]
     new = [str(Repair.parse(text)) for text in arguments.repairs]
-    if not new:
+    if not new:  # what the checks would do about the first doubt that they know a repair for
         checks = check_capture(read_capture(capture, repairs=stated))
         new = next((check.repair.split() for check in checks if check.verdict == "doubt" and check.repair), [])
         if not new:
             print_checks([check.as_dict() for check in checks], capture)
             print("no repair is known that would help")
             return
+    # Read with the repairs before they are written: those that make no sense of the capture are refused here.
     checks = check_capture(read_capture(capture, repairs=[*stated, *new]))
     write_json(file, {"repairs": [*stated, *new]})
     print_checks([check.as_dict() for check in checks], capture)

@@ -53,7 +53,7 @@ def run(arguments: argparse.Namespace) -> None:
     shown = np.logical_and.reduce(np.isfinite(result.xyz), axis=1)
     if not shown.any():
         raise OgPointcloudError(f"{arguments.cloud or arguments.bundle} has no point to show; expected at least one")
-    height = result.xyz[shown] @ up
+    height = result.xyz[shown] @ up  # the view is chosen for what --cut leaves, as the page begins
     shown[shown] = height <= height.max() - arguments.cut * np.ptp(height)
     view = choose_viewpoint(result.xyz[shown], result.labels[shown] >= 0, up)
     mode = "instances" if arguments.instances else "labels"

@@ -165,6 +165,7 @@ def _try_fit(capture: str, output: str, options: FitOptions, share: Share) -> Ca
     try:
         cloud = _fit(Path(capture), Path(output), options, share_here(share))
     except Exception as error:
+        # Our own errors, the system's and missing extras say what is wrong; of any other the kind is told too.
         expected = isinstance(error, (OgPointcloudError, OSError, ImportError))
         cause = str(error) if expected and str(error) else f"{type(error).__name__}: {error}"
         if isinstance(error, OSError) and error.filename:

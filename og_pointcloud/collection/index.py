@@ -71,13 +71,13 @@ def index(folder: str | os.PathLike[str], path: str | os.PathLike[str], *, progr
             try:
                 if _take(atlas, name, files[name], known.get(name)):
                     (replaced if name in known else added).append(name)
-            except (OgPointcloudError, OSError) as error:
+            except (OgPointcloudError, OSError) as error:  # one bad file does not cost the others
                 left_out.append((name, str(error)))
                 atlas.remove(name)
         removed = sorted(set(known) - set(files))
         for name in removed:
             atlas.remove(name)
-        judge_scenes(atlas)
+        judge_scenes(atlas)  # new words may be a better judge for scenes that did not change
     unchanged = len(files) - len(added) - len(replaced) - len(left_out)
     return Changes(tuple(added), tuple(replaced), tuple(removed), tuple(left_out), unchanged)
 

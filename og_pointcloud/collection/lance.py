@@ -106,5 +106,5 @@ class LanceTables:
             corners = zip("xyz", *box.tolist(), strict=True)
             conditions += [f"{axis} BETWEEN {low!r} AND {high!r}" for axis, low, high in corners]
         if conditions:
-            query = query.where(" AND ".join(conditions), prefilter=True)
+            query = query.where(" AND ".join(conditions), prefilter=True)  # else it would filter the best of all rows
         return set(query.select(["scene", "_distance"]).to_arrow()["scene"].to_pylist())

@@ -139,6 +139,7 @@ def read_frame(file: str | Path) -> LabelledFrame:
         raise SceneError(f"{file} is of an image of {width}x{height} pixels; expected 1 to {MAX_PIXELS}")
     masks: dict[str, NDArray[np.bool_]] = {}
     for category, outline in outlines:
+        # Outlines of one category are one object: their union.
         mask = _filled(outline, (height, width), f"{file}, object '{category}'")
         masks[category] = masks[category] | mask if category in masks else mask
     return LabelledFrame(Path(name).stem, width, height, masks)

@@ -19,7 +19,7 @@ MAX_UNPACKED_BYTES = 1 << 31
 OF_POINTS = ("background", "views", "ratio", "votes", "instance")
 """What may stand beside the classes, one a point."""
 AGREED, VOTES = 0.5, 2
-"""Of a class found by votes: the share that agreed on it, and how many there were, at least."""
+"""Least share of the votes that must agree on a class, and fewest votes, where classes were found by votes."""
 
 
 @dataclass(frozen=True)
@@ -79,6 +79,7 @@ def read_truth(folder: str | os.PathLike[str]) -> Truth:
     if instance is not None and instance.dtype.kind not in "iu":
         raise SceneError(f"{path}: instance is {instance.dtype}; expected whole numbers, below 0 for none")
     scored = np.ones(len(cls), bool)
+    # A file may say how each point got its class: by votes of labelled images, which may be few or divided.
     if "views" in entries:
         scored &= entries["views"] > 0
     if "ratio" in entries and "votes" in entries:

@@ -192,6 +192,7 @@ def _subject(
 
 def _instances_meant(scene: LabelledScene, what: What, text_features: TextFeatures) -> tuple[int, ...]:
     count = len(scene.cloud.instances)
+    # Step by step from what is meant to ids: a text becomes a selection, that its instances, a single one its id.
     if isinstance(what, str):
         what = select(scene, what, text_features=text_features)
     if isinstance(what, Selection) and not what.fitting:
@@ -258,6 +259,7 @@ def _check_output(output: str | os.PathLike[str], inputs: Iterable[str | os.Path
 
 def _read(path: Path) -> _Cloud:
     """A cloud's elements: those of a PLY as they are, anything else as a PLY would hold it."""
+    # The header alone tells a PLY, and whether it has lists, which are not read.
     with naming(path), path.open("rb") as file:
         head = file.read(HEADER_LIMIT).partition(b"end_header")[0]
     if not head.startswith(b"ply"):
@@ -272,7 +274,7 @@ def _read(path: Path) -> _Cloud:
         elements = read_ply(path)
         if len(elements.get("vertex", ())) == 0:
             raise SceneError("no points; expected an element 'vertex' of plain properties")
-        if "packed_position" in (elements["vertex"].dtype.names or ()):
+        if "packed_position" in (elements["vertex"].dtype.names or ()):  # SuperSplat's compressed splats
             rows = gaussian_rows(gaussians_from_ply(elements))
             return _Cloud({"vertex": rows}, (f"{path}: unpacked; harmonics above the constant one are left out",))
         if not np.isfinite(positions(elements["vertex"])).all():

@@ -193,6 +193,7 @@ def _write_grid(path: Path, views: Sequence[View], rows: Mapping[str, Sequence[N
         white = [np.full((view.camera.height, view.camera.width, 3), 255, np.uint8) for view in views]
         photos = [blank if image is None else image for image, blank in zip(photographs, white, strict=True)]
         rows = {"photograph": photos, **rows}
+    # Left edge of each column, and, last, of what is behind them; rows are as high as the highest view.
     lefts = np.cumsum([MARGIN, *(view.camera.width + GAP for view in views)])
     height = max(view.camera.height for view in views)
     sheet = np.full((STRIP + len(rows) * (STRIP + height + GAP), int(lefts[-1]) + MARGIN - GAP, 3), 255, np.uint8)

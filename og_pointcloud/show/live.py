@@ -187,6 +187,7 @@ class LiveScene:
             found = select(self.scene, word, text_features=self._text_features)
         except (OgPointcloudError, MissingExtraError) as error:
             return Answer(f"“{word}”", (str(error),))
+        # Where nothing fits the set is empty: all is faded, and the closest ones are listed.
         self.lit = set(found.instances)
         fits = f"fits {len(self.lit)} of {len(found)} instances" if self.lit else "fits no instance; closest:"
         shown = found[: min(max(len(self.lit), 5), MATCHES)]

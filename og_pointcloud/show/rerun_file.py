@@ -103,6 +103,7 @@ def write_rerun(path: str | os.PathLike[str], capture: Scene, cloud: LabelledClo
         sink.instances(0, scene, appeared)
         for step, view in enumerate(Journal(progress).steps(capture.views, "rerun")):
             sink.frame(step, view.camera, view.image_rgb(), view.mask_map())
+            # An instance appears with the first view in which a point of it is in front.
             front = front_points(cloud, in_world(view.camera, capture.points.origin))
             seen = np.unique(cloud.instance_ids[front[front != NO_POINT]])
             new = seen[seen >= 0]

@@ -203,7 +203,7 @@ class LivePage:
         """Put the scene's points, camera and lists into the page."""
         live = self._live
         low, high = live.xyz.min(axis=0), live.xyz.max(axis=0)
-        self._middle = low + (high - low) / 2
+        self._middle = low + (high - low) / 2  # the page's origin: browsers draw in float32
         up = np.array(self._settings.up, np.float64)
         view = choose_viewpoint(live.xyz, live.label_of[live.ids] >= 0, up / np.linalg.norm(up))
         camera = self._server.initial_camera

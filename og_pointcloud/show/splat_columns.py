@@ -66,7 +66,7 @@ def placed(
     for normal in NORMAL_COLUMNS:
         if set(normal) <= set(columns):
             _set(columns, normal, stack_columns(rows, normal) @ rotation.T)
-    if set(LOG_SCALE) <= set(columns):
+    if set(LOG_SCALE) <= set(columns):  # 3DGS stores logarithms of standard deviations
         _set(columns, LOG_SCALE, stack_columns(rows, LOG_SCALE) + np.log(scale))
     if set(ROTATION) <= set(columns):
         _set(columns, ROTATION, _turned(quaternion_of(rotation), stack_columns(rows, ROTATION)))

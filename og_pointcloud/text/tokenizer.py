@@ -82,6 +82,7 @@ def open_tokenizer(data: bytes, context_length: int, vocabulary: int) -> Tokeniz
 
 
 def _is_clip(description: dict[str, Any]) -> bool:
+    # The pattern is found in two forms, with and without the names of the special tokens.
     splits = [
         {"type": "Split", "pattern": {"Regex": pattern}, "behavior": "Removed", "invert": True}
         for pattern in (CLIP_WORDS, CLIP_SPECIALS + CLIP_WORDS)

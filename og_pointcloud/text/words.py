@@ -36,6 +36,7 @@ def resolve_labels(
     Raises OgPointcloudError for a word without vector or given twice, FeatureSpaceError for text_features of another
     space and for vectors that cannot be compared.
     """
+    # In the order in which they are looked up: what the caller gives comes before what the scene stores.
     sources = [source for source in (_of_space(text_features, feature_space), own_words) if source is not None]
     if labels is None:
         if not sources:
