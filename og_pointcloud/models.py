@@ -176,9 +176,9 @@ class EncoderFormat:
                 if len(data) > self.files[name]:
                     raise ValueError(f"{name} has {len(data)} bytes; expected at most {self.files[name]}")
             manifest = json.loads(files[MANIFEST])
-            found = manifest["format"], manifest["schema_version"]
-            if found != (self.name, self.version):
-                raise ValueError(f"its format is {found!r:.60}; expected {self.name!r} {self.version}")
+            stated = manifest["format"], manifest["schema_version"]
+            if stated != (self.name, self.version):
+                raise ValueError(f"its format is {stated!r:.60}; expected {self.name!r} {self.version}")
             needed = {*self.files} - {self.optional}
             for name in sorted((needed | {*files, *manifest["files"]}) - {MANIFEST}):
                 # Not the sha256 beside it: eight times as slow, and who can change a file can change its manifest.

@@ -63,7 +63,7 @@ def _answer_box(box, corner, level, limits, points, filled):  # noqa: ANN001, AN
     near, holds = _points_about(corner, size, rounding, limits[0], points)
     squared, rows = np.empty(len(near[0])), np.empty(len(near[0]), np.int32)  # scratch of each child
     lists_of = np.zeros(len(near[0]), np.uint64)  # bit k of a point: it is in list k
-    lengths[:], made = 0, 0
+    lengths[:], list_count = 0, 0
     for number in range(CHILDREN):
         center = (
             corner[0] + (number // EDGE**2 + 0.5) * size,
@@ -80,16 +80,16 @@ def _answer_box(box, corner, level, limits, points, filled):  # noqa: ANN001, AN
             child[number] = SPLIT
         elif count <= LONGEST_LIST:  # else left open
             # Candidates that are not in the shared list yet are added; lists hold the cloud's numbers of points.
-            chosen = _list_to_share(rows[:count], lists_of, lengths[:made])
+            chosen = _list_to_share(rows[:count], lists_of, lengths[:list_count])
             for row in rows[:count]:
                 bit = np.uint64(1) << np.uint64(chosen)
                 if lists_of[row] & bit == 0:
                     lists_of[row] |= bit
                     lists[chosen, lengths[chosen]] = near[4][row]
                     lengths[chosen] += 1
-            made = max(made, chosen + 1)
+            list_count = max(list_count, chosen + 1)
             child[number] = chosen
-    for number in range(made):
+    for number in range(list_count):
         lists[number, : lengths[number]].sort()
 
 

@@ -55,10 +55,10 @@ def build_query_graph(cloud: LabelledCloud, grid: LookupGrid) -> bytes:
         [helper.make_tensor_value_info(name, kind, shape) for name, kind, shape in values]
         for values in (inputs, outputs)
     ]
-    made = helper.make_graph(
+    query_head = helper.make_graph(
         graph.nodes, "query_head", declared[0], declared[1], graph.initializers, doc_string=__doc__
     )
-    model = helper.make_model(made, opset_imports=[helper.make_opsetid("", OPSET)], producer_name="og_pointcloud")
+    model = helper.make_model(query_head, opset_imports=[helper.make_opsetid("", OPSET)], producer_name="og_pointcloud")
     model.ir_version = IR_VERSION
     onnx.checker.check_model(model)
     return model.SerializeToString()
@@ -297,8 +297,8 @@ class _Lookup:
         candidate = graph("Add", low, graph("Mul", high, np.int32(1 << 16)))
         squares = []
         for axis, asked in zip("xyz", points, strict=True):
-            found = graph("Reshape", graph.double(graph.at(f"candidate_{axis}", candidate)), shape)
-            difference = graph("Sub", found, graph("Unsqueeze", graph.double(asked), LAST_AXIS))
+            coordinate = graph("Reshape", graph.double(graph.at(f"candidate_{axis}", candidate)), shape)
+            difference = graph("Sub", coordinate, graph("Unsqueeze", graph.double(asked), LAST_AXIS))
             squares.append(graph("Mul", difference, difference))
         squared = graph("Add", graph("Add", squares[0], squares[1]), squares[2])
         # Lists ascend by point number, so the first of equals is the lowest.

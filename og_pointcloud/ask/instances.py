@@ -206,6 +206,7 @@ def list_instances(
     bounds = np.searchsorted(cloud.instance_ids[order], np.arange(len(table) + 1))
     described = np.zeros(len(table), bool)
     described[table.descriptor_instance] = True
+    states = np.where(np.diff(bounds) == 0, EMPTY, np.where(described, LABELLED, NO_FEATURE)).tolist()
     choice = None if labels is None else chooser.choose(labels.vectors)
     return Instances(
         [
@@ -219,7 +220,7 @@ def list_instances(
                 visible_area=float(table.visible_area[k]),
                 part_of=int(table.part_of[k]),
                 coarse=int(table.coarse[k]),
-                state=EMPTY if bounds[k] == bounds[k + 1] else LABELLED if described[k] else NO_FEATURE,
+                state=states[k],
                 words=tuple(choice.words(k, labels.names, words)) if choice and labels else (),
                 _cloud=cloud,
                 _up=up,

@@ -52,10 +52,10 @@ class QueryGraph:
     def look_up(self, local: NDArray[np.float32]) -> tuple[NDArray[np.int32], NDArray[np.bool_]]:
         """Instance id, and whether it is certain, (N,) each. local: (N, 3), the cloud's frame."""
         try:
-            found = self._session.run(list(OUTPUTS), {"points": local, "text": self._no_text})
+            answers = self._session.run(list(OUTPUTS), {"points": local, "text": self._no_text})
         except Exception as error:  # onnxruntime raises types of its own
             raise self._refused(f"fails ({first_line(error)})") from None
-        instances, certain = (np.asarray(values) for values in found)
+        instances, certain = (np.asarray(values) for values in answers)
         for values, dtype in zip((instances, certain), OUTPUTS.values(), strict=True):
             if values.shape != (len(local),) or values.dtype != dtype:
                 raise self._refused(f"answers {values.dtype} {values.shape} for {len(local)} points")

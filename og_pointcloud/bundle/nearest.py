@@ -88,17 +88,17 @@ class NearestPoint:
                 break
             if radius not in self._levels:  # wider ones are made when first needed: often never
                 self._levels[radius] = VoxelBuckets(self._xyz, radius * (1 + EDGE_SLACK))
-            found = _nearest_within(self._levels[radius], points[pending].astype(np.float64), radius)
-            nearest[pending] = found
-            pending = pending[found == NONE_WITHIN_REACH]
+            index = _nearest_within(self._levels[radius], points[pending].astype(np.float64), radius)
+            nearest[pending] = index
+            pending = pending[index == NONE_WITHIN_REACH]
         return nearest
 
     def distance(self, points: NDArray[np.float32], nearest: NDArray[np.int64]) -> NDArray[np.float64]:
         """(m,) from each query to the cloud point that ``query`` found; infinity where it found none."""
-        found = nearest != NONE_WITHIN_REACH
+        has_nearest = nearest != NONE_WITHIN_REACH
         distance = np.full(len(points), np.inf)
-        difference = points[found].astype(np.float64) - self._xyz[nearest[found]]
-        distance[found] = np.sqrt((difference * difference).sum(axis=1))
+        difference = points[has_nearest].astype(np.float64) - self._xyz[nearest[has_nearest]]
+        distance[has_nearest] = np.sqrt((difference * difference).sum(axis=1))
         return distance
 
 

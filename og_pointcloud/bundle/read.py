@@ -116,8 +116,8 @@ def _members(file: BinaryIO) -> tuple[dict[str, bytes], dict[str, int]]:
 
 def _manifest(members: dict[str, bytes]) -> dict[str, Any]:
     if "manifest.json" not in members:
-        found = ", ".join(list(members)[:3]) or "nothing"
-        raise _Refused(f"a zip without manifest.json (it holds {found}): not a .ogpc file; give the one that fit wrote")
+        holds = ", ".join(list(members)[:3]) or "nothing"
+        raise _Refused(f"a zip without manifest.json (it holds {holds}): not a .ogpc file; give the one that fit wrote")
     manifest = _json(members, "manifest.json", ogpc.MAX_MANIFEST_BYTES)
     if not isinstance(manifest, dict) or manifest.get("format") != ogpc.FORMAT:
         seen = manifest.get("format") if isinstance(manifest, dict) else type(manifest).__name__

@@ -238,12 +238,12 @@ def _alignment(photographs: Photographs | None) -> Check:
 def _simplest(registration: Registration) -> tuple[str, Small]:
     """The group of fewest numbers whose best change is as good as others', and that change."""
     start = registration.start.error
-    found = {name: registration.found(name) for name in GROUPS}
-    everything = found.pop("everything")
-    least = min(change.error for change in found.values())
+    changes = {name: registration.found(name) for name in GROUPS}
+    everything = changes.pop("everything")
+    least = min(change.error for change in changes.values())
     if start - least < HALF * (start - everything.error):
         return "everything", everything
-    return next(item for item in found.items() if item[1].error <= least + AS_GOOD * (start - least))
+    return next(item for item in changes.items() if item[1].error <= least + AS_GOOD * (start - least))
 
 
 def _is_fault(change: Small, start: float) -> bool:
@@ -264,15 +264,15 @@ def _masks(maps: MaskMaps, *, is_doubted: bool) -> Check:
         return Check("masks", "doubt", says)
     if is_doubted:  # with wrong poses, right masks disagree too
         return Check("masks", "unchecked", "poses come first")
-    found = _agreement(maps)
-    if found.compared < FEWEST:
+    agreement = _agreement(maps)
+    if agreement.compared < FEWEST:
         return Check("masks", "unchecked", "too few points are seen by two views with masks")
-    repairs = () if _verdict(found) == "ok" else best_mask_conversion(maps)
-    if _verdict(found) != "doubt" and not repairs:
-        return _agreed("masks", found)
+    repairs = () if _verdict(agreement) == "ok" else best_mask_conversion(maps)
+    if _verdict(agreement) != "doubt" and not repairs:
+        return _agreed("masks", agreement)
     says = (
-        f"where views see the same points, masks agree no better than others' ({found}): they are mirrored, turned, or "
-        "of other images"
+        f"where views see the same points, masks agree no better than others' ({agreement}): they are mirrored, "
+        "turned, or of other images"
     )
     return _doubt("masks", says, repairs, "they agree")
 

@@ -43,9 +43,9 @@ CLOSE = 1.1
 
 def best_conversion(evidence: Photographs | MaskMaps) -> Repairs:
     """The repairs of cameras that make photographs or masks fit; () if none does."""
-    found = _best_of(evidence, _tried())
-    if found or isinstance(evidence, MaskMaps):
-        return found
+    single = _best_of(evidence, _tried())
+    if single or isinstance(evidence, MaskMaps):
+        return single
     # Neither a word nor one number: first a small motion of all cameras, then two mistakes at once.
     registration = Registration(evidence, evidence.sample.cameras, MORE_POINTS)
     moved = registration.repair("aligned", registration.refined("aligned", registration.found("aligned")))
@@ -64,14 +64,14 @@ def _best_of(evidence: Photographs | MaskMaps, tried: Iterable[Repairs]) -> Repa
 def best_mask_conversion(maps: MaskMaps) -> Repairs:
     """The repair of masks that makes them agree; () if none does."""
     cameras = maps.sample.cameras
-    found: dict[Repairs, Comparison] = {}
+    fits: dict[Repairs, Comparison] = {}
     for value, flip in MASK_FLIPS.items():
-        found[_parsed(f"masks={value}")] = replace(maps, ids=[flip(ids) for ids in maps.ids]).fit(cameras)
+        fits[_parsed(f"masks={value}")] = replace(maps, ids=[flip(ids) for ids in maps.ids]).fit(cameras)
     for value, by in MASK_SHIFTS.items():  # with the neighbor's camera, these masks tell the same
-        found[_parsed(f"masks={value}")] = _fit(maps, _parsed(f"frames={-by}"))
-    best = max(found, key=lambda repairs: found[repairs].gap)
-    better = found[best].gap > maps.fit(cameras).gap + BETTER / 2  # masks stand out half as far: MASKS_FIT
-    return best if better and found[best].compared >= FEWEST_COMPARED and found[best].reaches(MASKS_FIT) else ()
+        fits[_parsed(f"masks={value}")] = _fit(maps, _parsed(f"frames={-by}"))
+    best = max(fits, key=lambda repairs: fits[repairs].gap)
+    better = fits[best].gap > maps.fit(cameras).gap + BETTER / 2  # masks stand out half as far: MASKS_FIT
+    return best if better and fits[best].compared >= FEWEST_COMPARED and fits[best].reaches(MASKS_FIT) else ()
 
 
 def _tried() -> Iterable[Repairs]:

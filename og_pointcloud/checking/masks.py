@@ -61,20 +61,20 @@ class MaskMaps:
 
     def fit(self, cameras: Sequence[Camera]) -> Comparison:
         """How much more masks say of each other where these cameras see the same points than elsewhere."""
-        found, groups = [], []
+        pairs, groups = [], []
         for i, j, mine, theirs in self._pairs(cameras):
             a = _at(self.ids[i], mine)
             own = _information(a, _at(self.ids[j], theirs))
             if own is not None:
                 others = (_information(a, _at(rival, theirs)) for of, rival in self._rivals[j] if of != i)
-                found += [(own, other) for other in others if other is not None]
+                pairs += [(own, other) for other in others if other is not None]
                 # (i, j) and (j, i) share their `own`, so they are one group: their errors are not independent.
-                groups += [min(i, j) * len(cameras) + max(i, j)] * (len(found) - len(groups))
-        return Comparison.of(found, "information", groups=groups)
+                groups += [min(i, j) * len(cameras) + max(i, j)] * (len(pairs) - len(groups))
+        return Comparison.of(pairs, "information", groups=groups)
 
     def features_alike(self, cameras: Sequence[Camera], shift: int = 0) -> Comparison:
         """How much more alike the features of masks are that show the same points. shift: added to every mask's row."""
-        found = []
+        pairs = []
         for i, j, mine, theirs in self._pairs(cameras):
             sizes = len(self.features[i]), len(self.features[j])
             if not all(sizes):  # a view without masks may be of any width
@@ -82,8 +82,8 @@ class MaskMaps:
             counts = _shared(_at(self.ids[i], mine) - 1, _at(self.ids[j], theirs) - 1, sizes, shift)
             cosines = self.features[i] @ self.features[j].T
             for row, same in _same_things(counts):
-                found += [(float(cosines[row, same]), float(other)) for other in np.delete(cosines[row], same)]
-        return Comparison.of(found, "cosine")
+                pairs += [(float(cosines[row, same]), float(other)) for other in np.delete(cosines[row], same)]
+        return Comparison.of(pairs, "cosine")
 
     def fewer(self) -> MaskMaps:
         """Of fewer points and views, for what is asked often: the first views, as neighbors share points."""
@@ -106,14 +106,14 @@ class MaskMaps:
     def _rivals(self) -> list[list[tuple[int, Ids]]]:
         """For each view, (whose, mask map) to compare its own with: other views' maps and its own mirrored, but none
         that says nearly the same of the image."""
-        found, count = [], len(self.ids)
+        rivals, count = [], len(self.ids)
         for view, ids in enumerate(self.ids):
             # Evenly spread over the capture: neighbors show nearly the same.
             others = sorted({(view + step * count // (RIVALS + 1)) % count for step in range(1, RIVALS + 1)} - {view})
             maps = [*((other, self.ids[other]) for other in others), (view, ids[:, ::-1])]
             own = _at(ids, GRID)
-            found.append([item for item in maps if (_information(own, _at(item[1], GRID)) or 0.0) < ALIKE])
-        return found
+            rivals.append([item for item in maps if (_information(own, _at(item[1], GRID)) or 0.0) < ALIKE])
+        return rivals
 
 
 def read_mask_maps(sample: Sample) -> MaskMaps:

@@ -51,12 +51,12 @@ class Photographs:
     def fit(self, cameras: Sequence[Camera]) -> Comparison:
         """How much better each drawing by these cameras fits its own photograph than the rivals."""
         assert self.sample.rgb is not None
-        found = []
+        pairs = []
         for camera, grid in zip(cameras, self.grids, strict=True):
             drawing, cells = _drawing(seen(self.sample.xyz, camera), self.sample.rgb)
             own, *others = _correlations(drawing, grid[:, cells])
-            found += [(own, other) for other in others]
-        return Comparison.of(found, "correlation", of_rest=True)
+            pairs += [(own, other) for other in others]
+        return Comparison.of(pairs, "correlation", of_rest=True)
 
     def fewer(self) -> Photographs:
         """Of fewer views and points, for what is asked often."""
@@ -78,9 +78,9 @@ def read_photographs(sample: Sample) -> Photographs | None:
     """None where there is nothing to compare: no photographs, no colors, or a few photographs of the same."""
     if sample.rgb is None or float(sample.rgb.std(axis=0).max()) < FLAT:
         return None
-    found = {row: image for row, view in enumerate(sample.views) if (image := _small_image(view)) is not None}
-    images = list(found.values())
-    sample = sample.of_views(list(found))
+    readable = {row: image for row, view in enumerate(sample.views) if (image := _small_image(view)) is not None}
+    images = list(readable.values())
+    sample = sample.of_views(list(readable))
     shapes = [grid_shape(camera) for camera in sample.cameras]
     small = [_resized(image, columns, rows) for image, (rows, columns) in zip(images, shapes, strict=True)]
     grids = [_with_rivals(grid, small) for grid in small]
@@ -129,9 +129,9 @@ def _with_rivals(grid: Floats, grids: list[Floats]) -> Floats:
     """(1 + rivals, cells, 3): the grid itself, its mirror image, and other views' grids, none that shows the same."""
     rows, columns = grid.shape[:2]
     others = [require_cv2().resize(other, (columns, rows)) for other in grids if other is not grid]
-    found = np.stack([grid, grid[:, ::-1], *others]).reshape(-1, rows * columns, 3)
-    alike = _correlations(found[0], found) >= ALIKE
-    return found[np.r_[True, ~alike[1:]]]
+    candidates = np.stack([grid, grid[:, ::-1], *others]).reshape(-1, rows * columns, 3)
+    alike = _correlations(candidates[0], candidates) >= ALIKE
+    return candidates[np.r_[True, ~alike[1:]]]
 
 
 def _correlations(drawing: Floats, photographs: Floats) -> Floats:

@@ -149,8 +149,8 @@ class Registration:
     def _seen(self, numbers: Doubles) -> list[NDArray[np.intp]]:
         """For each view the rows of the points to compare. Which are hidden is decided on the changed cloud."""
         cloud = self._moved(self.xyz, numbers)
-        found = [seen(cloud, camera).rows for camera in self.cameras]
-        return [rows[:: 1 + len(rows) // self.points] for rows in found]
+        visible = [seen(cloud, camera).rows for camera in self.cameras]
+        return [rows[:: 1 + len(rows) // self.points] for rows in visible]
 
     def _moved(self, xyz: Doubles, numbers: Doubles) -> Doubles:
         turned = (xyz - self.middle) @ rotation_of_vector(numbers[TURN]).T

@@ -346,8 +346,8 @@ def print_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
 def print_shares(counts: Mapping[str, int], unknown: int, unknown_because: Mapping[Any, int]) -> None:
     """Points and share of each label that was found and of the unknown ones, and why these are unknown."""
     total = max(sum(counts.values()) + unknown, 1)
-    found = [(name, count) for name, count in counts.items() if count]
-    rows = [(name, f"{count:,}", f"{count / total:.1%}") for name, count in [*found, ("unknown", unknown)]]
+    present = [(name, count) for name, count in counts.items() if count]
+    rows = [(name, f"{count:,}", f"{count / total:.1%}") for name, count in [*present, ("unknown", unknown)]]
     print_table(("label", "points", "share"), rows)
     if unknown_because:
         print(f"unknown: {', '.join(f'{count:,} {reason}' for reason, count in unknown_because.items())}")

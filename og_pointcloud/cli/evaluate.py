@@ -148,17 +148,17 @@ def task_means(scenes: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     if not present:
         return dict.fromkeys((*TASK_MEANS, "interval"))
     table = np.array([[scene[name] for name in TASK_MEANS] for scene in present])
-    found = bootstrap(table[:, 0])
-    return dict(zip(TASK_MEANS, table.mean(axis=0).tolist(), strict=True)) | {"interval": (found.low, found.high)}
+    miou = bootstrap(table[:, 0])
+    return dict(zip(TASK_MEANS, table.mean(axis=0).tolist(), strict=True)) | {"interval": (miou.low, miou.high)}
 
 
 def scannet_truths(folder: Path, scenes: list[str] | None) -> dict[str, Path]:
     """Scene name -> its labels, in the folder or in the scene's own folder below it."""
     files = (*folder.glob(f"*{SCANNET_LABELS}"), *folder.glob(f"*/*{SCANNET_LABELS}"))
-    found = {file.name.removesuffix(SCANNET_LABELS): file for file in files}
-    if not found:
+    labels_of = {file.name.removesuffix(SCANNET_LABELS): file for file in files}
+    if not labels_of:
         raise OgPointcloudError(f"{folder} has no <scene>/<scene>{SCANNET_LABELS}; expected ScanNet's folder of scenes")
-    return {scene: found[scene] for scene in known_scenes(folder, sorted(found), scenes)}
+    return {scene: labels_of[scene] for scene in known_scenes(folder, sorted(labels_of), scenes)}
 
 
 def opacities(folder: Path | None, scene: str, count: int) -> NDArray[np.floating] | None:
@@ -229,14 +229,14 @@ def print_selections(scenes: Mapping[str, Sequence[PairScore]]) -> dict[str, dic
 def gaussians_file(folder: Path, scene: str) -> Path:
     from og_pointcloud.formats.gaussian_ply import latest_iteration
 
-    file = folder / f"{scene}.ply"
-    found = file if file.is_file() else latest_iteration(folder / scene)
-    if found is None:
+    named = folder / f"{scene}.ply"
+    file = named if named.is_file() else latest_iteration(folder / scene)
+    if file is None:
         raise OgPointcloudError(
             f"{folder} has neither {scene}.ply nor {scene}/point_cloud/iteration_*/point_cloud.ply; expected the "
             "Gaussians that the scene was fitted from"
         )
-    return found
+    return file
 
 
 # What the protocols share ---------------------------------------------------------------------------------------

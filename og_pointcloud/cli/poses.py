@@ -27,17 +27,17 @@ def run(arguments: argparse.Namespace) -> None:
     check_at_least("--threads", arguments.threads, 1)
     from og_pointcloud.formats.structure_from_motion import find_poses
 
-    found = find_poses(
+    poses = find_poses(
         arguments.photographs, arguments.output, longest_side=arguments.longest_side, threads=arguments.threads,
         progress=True,
     )  # fmt: skip
-    features, matches, mapping = found.seconds
-    if found.left_out:
-        count = len(found.left_out)
-        print(f"warning: {count} photographs found no place: {some_of(found.left_out)}", file=sys.stderr)
+    features, matches, mapping = poses.seconds
+    if poses.left_out:
+        count = len(poses.left_out)
+        print(f"warning: {count} photographs found no place: {some_of(poses.left_out)}", file=sys.stderr)
     print(
-        f"{found.registered} of {found.of} photographs have poses, {found.points:,} points, mean error "
-        f"{found.error_px:.2f} px (features {features:.0f} s, matches {matches:.0f} s, mapping {mapping:.0f} s)"
+        f"{poses.registered} of {poses.of} photographs have poses, {poses.points:,} points, mean error "
+        f"{poses.error_px:.2f} px (features {features:.0f} s, matches {matches:.0f} s, mapping {mapping:.0f} s)"
     )
-    print(f"wrote {found.capture / 'sparse'}; its scale is free")
-    print_next("masks", found.capture)
+    print(f"wrote {poses.capture / 'sparse'}; its scale is free")
+    print_next("masks", poses.capture)

@@ -37,8 +37,7 @@ def run(arguments: argparse.Namespace) -> None:
         file.unlink(missing_ok=True)
         print(f"{capture} is read as its files are")
         return
-    had = () if arguments.only else read_repairs(capture)
-    stated = [str(repair) for repair in had]
+    stated = [] if arguments.only else [str(repair) for repair in read_repairs(capture)]
     new = [str(Repair.parse(text)) for text in arguments.repairs]
     if not new:  # what the checks would do about the first doubt that they know a repair for
         checks = check_capture(read_capture(capture, repairs=stated))

@@ -36,16 +36,17 @@ def run(arguments: argparse.Namespace) -> None:
     from og_pointcloud.evaluate.sweep_report import require_matplotlib, table, write_chart, write_report
 
     require_matplotlib()
-    settings = settings_of(tuple(arguments.knob) if arguments.knob else QUICK if arguments.quick else None)
+    few = QUICK if arguments.quick else None
+    settings = settings_of(tuple(arguments.knob) if arguments.knob else few)
     # All are read before the first is worked on: what is missing in the last is told at once.
     subjects = [read_subject(folder) for folder in arguments.captures]
-    found = sweep(subjects, settings)
-    write_rows(found.rows, rows)
-    write_chart(found, picture)
-    write_report(found, text, picture)
-    for capture in found.captures:
-        (_, *header), *lines = table([row for row in found.rows if row.capture == capture])
+    swept = sweep(subjects, settings)
+    write_rows(swept.rows, rows)
+    write_chart(swept, picture)
+    write_report(swept, text, picture)
+    for capture in swept.captures:
+        (_, *header), *lines = table([row for row in swept.rows if row.capture == capture])
         print_table((capture, *header), lines)
-    for what, why in found.failed.items():
+    for what, why in swept.failed.items():
         print(f"warning: could not be run: {what}: {why}", file=sys.stderr)
     print(f"wrote {text}, {rows} and {picture}")

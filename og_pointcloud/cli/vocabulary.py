@@ -59,8 +59,8 @@ def scene_encoder(arguments: argparse.Namespace) -> TextEncoder:
     own = og.read_bundle(arguments.bundle).cloud.feature_space
     folder = arguments.text_encoder
     encoder = read_text_encoder(folder) if folder else encoder_for(own, carried_encoder(arguments.bundle))
-    found = FeatureSpace(encoder.feature_space, encoder.width)
-    FeatureSpace(own, 0).require(found, f"texts that {encoder.where} encodes")
+    encoded = FeatureSpace(encoder.feature_space, encoder.width)
+    FeatureSpace(own, 0).require(encoded, f"texts that {encoder.where} encodes")
     return encoder
 
 

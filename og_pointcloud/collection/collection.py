@@ -175,13 +175,13 @@ class Collection:
         if not any(vectors):
             raise _unanswerable(names[0], [group.family for group in asked])
         # The best of each group and word, then the best of all: (what it is ranked by, finding).
-        found = [
+        ranked = [
             pair
             for group, known in zip(asked, vectors, strict=True)
             for word, vector in known.items()
             for pair in self._best(group, wanted, word, vector)
         ]
-        found.sort(key=lambda pair: -pair[0])  # stable: of equals the first
+        ranked.sort(key=lambda pair: -pair[0])  # stable: of equals the first
         counts: Counter[tuple[str, str]] = Counter()
         for group, known in zip(asked, vectors, strict=True):
             for word in set(names) - known.keys():
@@ -190,13 +190,13 @@ class Collection:
             f"{count} scenes of feature space '{space}' could not be asked for '{word}': no vector of theirs is known"
             for (word, space), count in sorted(counts.items())
         )
-        return Findings((finding for _, finding in found[:top]), not_asked)
+        return Findings((finding for _, finding in ranked[:top]), not_asked)
 
     def _ids(self, scenes: str | Iterable[str] | None) -> set[int] | None:
         """Ids of the scenes of these names or patterns; None, for all, as it was given."""
         if scenes is None:
             return None
-        found: set[int] = set()
+        ids: set[int] = set()
         for pattern in (scenes,) if isinstance(scenes, str) else scenes:
             fitting = [pattern] if pattern in self._by_name else fnmatch.filter(self._by_name, pattern)
             if not fitting:
@@ -204,8 +204,8 @@ class Collection:
                     f"no scene is called '{pattern}'{did_you_mean(pattern, self.scenes)}; expected one of the "
                     f"{len(self.entries)} scenes of {self.path}"
                 )
-            found.update(self._by_name[name].id for name in fitting)
-        return found
+            ids.update(self._by_name[name].id for name in fitting)
+        return ids
 
     def _vectors(
         self, family: Family, names: Iterable[str], features: tuple[Vocabulary, str] | None

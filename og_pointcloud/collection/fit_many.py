@@ -118,9 +118,9 @@ def _fit_all(
     share = Share() if at_once is None else Share.of_machine(at_once)
     fits: dict[Path, CaptureFit] = {}
     for attempt in ("fit", "fit again"):
-        left = [capture for capture in todo if capture not in fits or fits[capture].worker == LOST]
+        pending = [capture for capture in todo if capture not in fits or fits[capture].worker == LOST]
         futures = {
-            workers.submit(_try_fit, str(capture), str(todo[capture]), options, share): capture for capture in left
+            workers.submit(_try_fit, str(capture), str(todo[capture]), options, share): capture for capture in pending
         }
         try:
             for future in with_bar(as_completed(futures), attempt, len(futures), progress and len(futures) > 0):

@@ -164,22 +164,22 @@ def families(atlas: Atlas, entries: Iterable[SceneEntry]) -> list[Family]:
     for entry in entries:
         alone = entry.id if entry.feature_space == UNKNOWN_SPACE else 0
         alike.setdefault((entry.feature_space, entry.width, entry.vocabulary or "", alone), []).append(entry)
-    found: list[Family] = []
+    known: list[Family] = []
     # Those with words first: they say which families there are.
     for (space, width, digest, alone), members in sorted(
         alike.items(), key=lambda item: (not item[0][2], item[1][0].name)
     ):
         own = _words(atlas, digest, width)
-        of_space = [] if alone else [each for each in found if (each.feature_space, each.width) == (space, width)]
+        of_space = [] if alone else [each for each in known if (each.feature_space, each.width) == (space, width)]
         fitting = [family for family in of_space if _agree(own, family.words)]
         # Scenes without words agree with any family: where there are several, they are none of them for sure.
         if not fitting or (not own and len(of_space) > 1):
             fitting = [Family(space, width)]
-            found += fitting
+            known += fitting
         family = fitting[0]
         family.entries.extend(members)
         family.words.update({**own, **family.words})
-    return found
+    return known
 
 
 def _words(atlas: Atlas, digest: str, width: int) -> dict[str, NDArray[np.float32]]:
@@ -204,12 +204,12 @@ def judge_scenes(atlas: Atlas) -> None:
             judge = (entry.bank or lent) if family.width else None
             if judge == entry.judge:
                 continue
-            made = None
+            standard = None
             if judge is not None:
                 if judge not in banks:
                     banks = {judge: atlas.bank(judge, family.width)}
-                made = Chooser(atlas.instances(entry)[0], banks[judge]).standard()
-            atlas.judge(entry, judge, made)
+                standard = Chooser(atlas.instances(entry)[0], banks[judge]).standard()
+            atlas.judge(entry, judge, standard)
     atlas.forget_unused_words()
 
 

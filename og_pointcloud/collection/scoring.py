@@ -102,13 +102,13 @@ class Block:
 
     def evidence(self, rows: NDArray[np.intp], directions: NDArray[np.float32]) -> NDArray[np.float32]:
         """(n, L) of these instances for directions (L, D): of several descriptors the best."""
-        found = np.empty((len(rows), len(directions)), np.float32)
+        best = np.empty((len(rows), len(directions)), np.float32)
         for start in range(0, len(rows), ROWS_AT_ONCE):
             part = rows[start : start + ROWS_AT_ONCE]
             begins, ends = self.bounds[part], self.bounds[part + 1]
             first = np.cumsum(ends - begins) - (ends - begins)
-            found[start : start + ROWS_AT_ONCE] = self._best_of(_ranges(begins, ends), first, directions)
-        return found
+            best[start : start + ROWS_AT_ONCE] = self._best_of(_ranges(begins, ends), first, directions)
+        return best
 
     def _best_of(
         self, rows: slice | NDArray[np.intp], first: NDArray[np.intp], directions: NDArray[np.float32]
@@ -177,8 +177,8 @@ class Block:
     ) -> NDArray[np.float64]:
         """Logit of the probability (`choosing.Chooser`) of a direction (1, D) against the bank's other words."""
         sharpness = self.sharpness[self.scene[rows]]
-        said = sharpness[:, None] * self.evidence(rows, np.concatenate([direction, others]))
-        return said[:, 0] - log_mean_likelihood(said[:, 1:], sharpness) - np.log(ChoosingSettings().kinds)
+        exponents = sharpness[:, None] * self.evidence(rows, np.concatenate([direction, others]))
+        return exponents[:, 0] - log_mean_likelihood(exponents[:, 1:], sharpness) - np.log(ChoosingSettings().kinds)
 
 
 def _ranges(begins: NDArray[np.intp], ends: NDArray[np.intp]) -> NDArray[np.intp]:

@@ -138,9 +138,9 @@ class Atlas:
 
     def _check(self) -> None:
         """Refuse other databases, and those with views, triggers or columns that none of ours has."""
-        found = tuple(self._run(f"PRAGMA {name}").fetchone()[0] for name in ("application_id", "user_version"))
-        if found != (APPLICATION, VERSION):
-            raise _refused(self.path, f"its application and version are {found}; expected {(APPLICATION, VERSION)}")
+        marks = tuple(self._run(f"PRAGMA {name}").fetchone()[0] for name in ("application_id", "user_version"))
+        if marks != (APPLICATION, VERSION):
+            raise _refused(self.path, f"its application and version are {marks}; expected {(APPLICATION, VERSION)}")
         # SQLite keeps the text of each CREATE. Indices that it makes by itself have none; the R*Tree's own tables,
         # boxes_*, have texts of its own.
         query = "SELECT sql FROM sqlite_master WHERE sql <> '' AND NOT (type = 'table' AND name GLOB 'boxes_*')"

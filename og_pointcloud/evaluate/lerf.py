@@ -162,13 +162,13 @@ def gaussians_of(cloud: LabelledCloud, file: Path) -> Gaussians:
     """The cloud's points as splats, in its local frame: those of the file that it was fitted from. SceneError where the
     file is another cloud's."""
     points = read_points(file)
-    found = Gaussians.from_points(points)
+    gaussians = Gaussians.from_points(points)
     if len(points) != len(cloud):
         raise SceneError(f"{file} has {len(points)} Gaussians, the scene {len(cloud)} points; expected one each")
     apart = float(np.abs(points.xyz_world - cloud.xyz_world).max(initial=0))
     if apart > SAME_PLACE * cloud.spacing:
         raise SceneError(f"{file}: Gaussians lie up to {apart:.3g} from the scene's points; expected those it is of")
-    return Gaussians(cloud.xyz, found.scale, found.rotation, found.opacity)
+    return Gaussians(cloud.xyz, gaussians.scale, gaussians.rotation, gaussians.opacity)
 
 
 # Scoring --------------------------------------------------------------------------------------------------------
@@ -198,12 +198,12 @@ def score_pairs(
 
 def pair_ious(frame: LabelledFrame, alphas: Mapping[str, Alpha]) -> dict[str, float]:
     """IoU of each object of a frame. alphas: category -> (H, W) alpha of its selection's render."""
-    found = {}
+    ious = {}
     for category, truth in frame.objects.items():
         shown = alphas[category] > ALPHA_SHOWN
         union = int((shown | truth).sum())
-        found[category] = int((shown & truth).sum()) / union if union else 0.0
-    return found
+        ious[category] = int((shown & truth).sum()) / union if union else 0.0
+    return ious
 
 
 def score_scenes(ious: Mapping[str, NDArray[np.floating]]) -> tuple[float, float]:

@@ -212,12 +212,12 @@ class _Trial:
         answer = Answer(truth.class_of(labels, words.names), labels, self.subject.scene.points.xyz, spacing)
         score = truth.score(answer.called)
         self.default = self.default or answer
-        found: dict[str, Any] = {"miou": score.miou, "macc": score.macc}
-        found |= {"unknown": score.unknown_share, "background": score.background_called}
+        figures: dict[str, Any] = {"miou": score.miou, "macc": score.macc}
+        figures |= {"unknown": score.unknown_share, "background": score.background_called}
         if score.classes:
             gain = difference(answer, self.default, truth)
-            found |= {"gain": gain.mean, "gain_low": gain.low, "gain_high": gain.high}
-        return found
+            figures |= {"gain": gain.mean, "gain_low": gain.low, "gain_high": gain.high}
+        return figures
 
     def _warm_up(self, settings: FitSettings) -> None:
         """Fit two views of a few points in this mode: what they are labelled does not matter."""

@@ -237,9 +237,9 @@ def _halo(
     local = (xyz - scene.cloud.origin).astype(np.float32)
     loose = np.flatnonzero((ids < 0) & np.isfinite(local).all(axis=1))
     spacing = scene.cloud.spacing
-    found = NearestPoint(local[chosen], spacing, halo * spacing).query(local[loose])
+    nearest = NearestPoint(local[chosen], spacing, halo * spacing).query(local[loose])
     near = np.zeros(len(xyz), bool)
-    near[loose[found >= 0]] = True
+    near[loose[nearest >= 0]] = True
     return near
 
 

@@ -181,18 +181,19 @@ class LiveScene:
         word, self.lit = text.strip(), None
         if not word:
             own = self.scene.vocabulary.names if self.scene.vocabulary else ()
-            stored = [f"stored words: {', '.join(own[:HINTED])}{', ...' if len(own) > HINTED else ''}"] if own else []
+            examples = ", ".join([*own[:HINTED], "..."] if len(own) > HINTED else own)
+            stored = [f"stored words: {examples}"] if own else []
             return Answer("", (*stored, "click a thing to learn what it is"))
         try:
-            found = select(self.scene, word, text_features=self._text_features)
+            selection = select(self.scene, word, text_features=self._text_features)
         except (OgPointcloudError, MissingExtraError) as error:
             return Answer(f"“{word}”", (str(error),))
         # Where nothing fits the set is empty: all is faded, and the closest ones are listed.
-        self.lit = set(found.instances)
-        fits = f"fits {len(self.lit)} of {len(found)} instances" if self.lit else "fits no instance; closest:"
-        shown = found[: min(max(len(self.lit), 5), MATCHES)]
+        self.lit = set(selection.instances)
+        fits = f"fits {len(self.lit)} of {len(selection)} instances" if self.lit else "fits no instance; closest:"
+        shown = selection[: min(max(len(self.lit), 5), MATCHES)]
         bars = tuple((self._beside(match), match.score) for match in shown)
-        return Answer(word, (fits,), bars, meaning(found.calibrated))
+        return Answer(word, (fits,), bars, meaning(selection.calibrated))
 
     def choose(self, instance: int) -> Answer:
         """Light one instance and tell what it is."""
