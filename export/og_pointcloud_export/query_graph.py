@@ -32,7 +32,7 @@ with naming_extra("onnx", "fit"):
     from onnx import TensorProto, helper, numpy_helper
 
 LIST_LENGTHS = (SHORT_LIST, 20, LONGEST_LIST)
-"""So many candidates are compared: of most lists the first number, of longer ones the next."""
+"""Candidates compared at once: the first number of every list, the next of lists that are longer, and so on."""
 OPSET, IR_VERSION = 18, 8
 """The oldest that has everything needed (ScatterElements with max), so that onnxruntime 1.17 and later run it."""
 
@@ -65,8 +65,8 @@ def build_query_graph(cloud: LabelledCloud, grid: LookupGrid) -> bytes:
 
 
 class _Graph:
-    """A graph in the making. A call adds a node and gives the name of its output, which other nodes take as an input;
-    they also take numpy arrays and scalars, which become constants."""
+    """A graph in the making. A call adds a node and returns the name of its output, which other nodes take as input.
+    Inputs that are numpy arrays or scalars become constants."""
 
     def __init__(self) -> None:
         self.nodes: list[onnx.NodeProto] = []
@@ -165,11 +165,11 @@ def _score_labels(graph: _Graph, instances: InstanceTable) -> tuple[str, str]:
 
 
 class _Lookup:
-    """points -> answer code, by the tables of ``LookupGrid`` and, for the few points in boxes that have one, by their
-    list -> the outputs.
+    """points -> outputs: by the tables of ``LookupGrid``, and for the few points in boxes with a list by comparing
+    their distances to its candidates.
 
-    Coordinates are laid out as three rows of N: several times as fast as N rows of three, and, unlike a product with
-    the strides, exact in integers wherever it runs.
+    Coordinates are laid out as three rows of N: several times as fast as N rows of three, and sums of rows are exact in
+    integers wherever they run, which a matrix product with the strides is not.
     """
 
     def __init__(self, graph: _Graph, cloud: LabelledCloud, grid: LookupGrid) -> None:
@@ -227,6 +227,7 @@ class _Lookup:
     def _outputs(self, value: str, code_label: str, code_score: str) -> None:
         """Value -> outputs: certain, or open with the answer at the centre."""
         graph, codes, near_codes = self.graph, self.grid.codes, self.grid.codes // 2
+        # Small tables over all values below 2 codes: from codes on a value is open, and its code counts from there.
         code = np.arange(2 * codes) % codes
         code_answer = np.where(code > near_codes, code - near_codes, code)
         distance = np.where(code == TOO_FAR_CODE, BEYOND, np.where(code > near_codes, NEAR, ON_SURFACE))
@@ -260,8 +261,11 @@ class _Lookup:
         return value, graph("Max", self._child(reference, value), zero)
 
     def _child(self, reference: str, value: str) -> str:
-        """A box's reference, and the value in it -> number of the child: first of the row + value - 2 codes, or, of a
-        reference to a list, for which the last row says -1 and 2 codes, how far it lies beyond that row."""
+        """A box's reference, and the value in it -> number of the child that settles it.
+
+        Of a row of nodes it is first_child + value - 2 codes. A reference to a list lies behind the last row by the
+        child's number + 1; that row has first_child -1 and the value 2 codes, so that one sum does for both.
+        """
         graph = self.graph
         row = graph("Min", reference, self.last_row)
         of_row = graph("Add", graph.at("first_child", row), graph("Sub", value, self.first_child_value))
@@ -270,7 +274,7 @@ class _Lookup:
     def _nearest_in_list(self, points: list[str], part_value: str, child: str) -> str:
         """The code of the nearest candidate of points (x, y, z) with a list; of the others their part's value.
 
-        As many entries are read of every list: LIST_LENGTHS' first, then, of longer lists, all again up to the next.
+        Arrays need one length for all lists: the first of LIST_LENGTHS; longer lists are read again up to the next.
         """
         graph = self.graph
         start, length = graph.at("child_start", child), graph.int32(graph.at("child_length", child))
@@ -287,7 +291,7 @@ class _Lookup:
     def _search(self, points: list[str], start: str, entries: int) -> str:
         """The code of the nearest of some entries from the start of each point's list, decided in float64.
 
-        Of a shorter list it runs on into the next: farther points, or the same ones again.
+        Of a shorter list the entries run on into the next list: points that are farther, or the same ones again.
         """
         graph, cloud = self.graph, self.cloud
         steps = np.arange(entries, dtype=np.int32)[None]

@@ -70,8 +70,8 @@ def scene_name(path: str | os.PathLike[str]) -> str:
 
 
 def carried_scene(pcd: Any) -> Path | None:
-    """The .ogpc file that a cloud says its labels came from, if it says so: one that this process has opened for it,
-    else a file of that name in the working folder. A dataset may be a stranger's, so it names no other place.
+    """The .ogpc file that a cloud says its labels came from, if it does: the one that this process named so, else a
+    file of that name in the working folder. A dataset may be a stranger's, so it can name no other place.
 
     OgPointcloudError where there is no such file.
     """

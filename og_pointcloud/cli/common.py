@@ -102,6 +102,7 @@ def check_outputs(arguments: argparse.Namespace) -> None:
     Options of `add_output` are outputs, all other options of type Path inputs.
     """
     actions = [(action, getattr(arguments, action.dest)) for action in arguments.parser._actions if action.type is Path]
+    # Outputs carry their endings, see `add_output`; an input may be several paths.
     values = [value if isinstance(value, list) else [value] for action, value in actions if not outputs_of(action)]
     inputs = [path for several in values for path in several if isinstance(path, Path)]
     taken: dict[Path, str] = {}

@@ -187,7 +187,7 @@ def run_lerf(arguments: argparse.Namespace) -> None:
     from og_pointcloud.ask.labelled_scene import load
     from og_pointcloud.evaluate.lerf import gaussians_of, read_scene, scene_names, score_pairs
 
-    # Everything is looked for before anything is rendered: what the last scene lacks is named at once.
+    # Everything is looked up before anything is rendered, so that what the last scene lacks is named at once.
     wanted = known_scenes(arguments.folder, scene_names(arguments.folder), names_in(arguments.scenes))
     labels = [read_scene(arguments.folder, name) for name in wanted]
     files = [prediction_file(arguments.predictions, name) for name in wanted]

@@ -24,7 +24,7 @@ def run(arguments: argparse.Namespace) -> None:
     described = describe_bundle(scene, arguments.bundle)
     try:
         common.print_result(arguments, described, lambda _: print_info(scene, arguments.bundle))
-    except (KeyError, TypeError, ValueError):  # the one part of a file that reading it does not check
+    except (KeyError, TypeError, ValueError):  # provenance is the one part of a file that `load` does not check
         raise BundleError(f"{arguments.bundle}: its provenance is not as fit writes it; see --json") from None
 
 

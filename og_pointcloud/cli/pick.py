@@ -35,6 +35,7 @@ def run(arguments: argparse.Namespace) -> None:
         raise OgPointcloudError("--pixel and -o need a camera: name it with --capture CAPTURE --view NAME")
     scene = og.load(arguments.bundle)
     camera = world_camera(arguments.capture, arguments.view) if uses_view else None
+    # A click is as good as the camera's pose: it is checked against the fitted cloud.
     if camera is not None:
         common.warn_of_poses(arguments.capture, Points(scene.cloud.xyz, scene.cloud.origin, scene.cloud.rgb))
     if arguments.pixel is not None and camera is not None:

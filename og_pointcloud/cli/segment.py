@@ -36,6 +36,7 @@ def run(arguments: argparse.Namespace) -> None:
         result = og.segment(asked, labels, scene, text_features=arguments.text_features)
     if arguments.output:
         with journal.stage("save"):
+            # Formats of splats are written as splats, where the points asked about are some.
             splats = points if points is not None and points.scale is not None else None
             result.save(arguments.output, splats, arguments.points)
     report = describe_segmentation(result, journal, arguments.bundle, arguments.output)
