@@ -182,6 +182,7 @@ class Collection:
             for pair in self._best(group, wanted, word, vector)
         ]
         ranked.sort(key=lambda pair: -pair[0])  # stable: of equals the first
+        # Scenes that could not be asked for a word, by word and feature space.
         counts: Counter[tuple[str, str]] = Counter()
         for group, known in zip(asked, vectors, strict=True):
             for word in set(names) - known.keys():

@@ -102,7 +102,7 @@ def _take(atlas: Atlas, name: str, file: Path, known: SceneEntry | None) -> bool
     instances = list_instances(cloud, Chooser(cloud.instances))
     boxes = [instance.axis_aligned_box for instance in instances]
     corners = np.array([(box.low, box.high) if box else np.zeros((2, 3)) for box in boxes]).reshape(-1, 2, 3)
-    points = np.array([instance.points for instance in instances], np.int32)
+    points = np.array([instance.points for instance in instances], np.int32)  # by the ids, whatever its table says
     table = replace(cloud.instances, descriptors=unit_rows(cloud.instances.descriptors), points=points)
     entry = SceneEntry(
         0, name, digest, cloud.feature_space, state.st_size, state.st_mtime_ns,

@@ -72,7 +72,7 @@ class Block:
         """(S, 2, 3) low and high corner of where the middles of a scene's instances lie; infinite, which meets no box,
         for a scene without any."""
         reach = np.full((len(self.entries), 2, 3), np.inf)
-        held = np.flatnonzero(np.diff(self._starts))
+        held = np.flatnonzero(np.diff(self._starts))  # reduceat takes no empty runs
         for corner, least in enumerate((np.minimum, np.maximum) if len(held) else ()):
             reach[held, corner] = least.reduceat(self.center, self._starts[held])
         return reach

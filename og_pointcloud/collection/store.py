@@ -158,6 +158,7 @@ class Atlas:
     def entries(self) -> list[SceneEntry]:
         """All scenes, by name."""
         rows = self._run(f"SELECT {ENTRY} FROM scenes LEFT JOIN judgements ON scene = id ORDER BY name")
+        # The last two columns are lengths of blobs in bytes: of records of instances, and of float32 numbers.
         counted = ((row[:-2], row[-2] // EVIDENCE.itemsize, row[-1] // 4) for row in rows)
         return [SceneEntry(*row, instances=size, numbers=numbers) for row, size, numbers in counted]
 

@@ -54,6 +54,7 @@ def center_sampling(prepared: Prepared, words: Words) -> Labels:
         mask = np.full(len(points), -1)
         mask[inside] = view.mask_map()[row, column]
         shown = mask >= 0
+        # A mask of a cut view is part of one of the photograph, which has the row in the table.
         scores[points[shown]] += visible[shown, None] * similarity[photographs.of_mask[first[index] + mask[shown]]]
         reached[points[shown]] = True
     return np.where(reached, scores.argmax(axis=1), -1)

@@ -150,14 +150,14 @@ def sweep(subjects: Sequence[Subject], settings: Sequence[Setting], *, progress:
                     try:
                         rows.append(trial.row(setting))
                     except Exception as error:  # one setting must not cost the report, which names it
-                        if setting == DEFAULT:
+                        if setting == DEFAULT:  # what all others are compared with
                             raise
                         failed[f"{subject.name}, {setting.name}"] = f"{type(error).__name__}: {error}"
                     bar.update()
                 rows += trial.baselines()
             except OgPointcloudError as error:
                 failed[subject.name] = str(error)
-            bar.update((number + 1) * len(settings) - bar.n)
+            bar.update((number + 1) * len(settings) - bar.n)  # past what a capture that failed did not try
     if not rows:
         raise OgPointcloudError(f"no capture could be fitted: {next(iter(failed.values()), 'none was given')}")
     return Sweep(tuple(rows), failed)

@@ -83,7 +83,8 @@ class LiveScene:
         self.names = words.names
         self.label_of = scene.chooser.choose(words.vectors).by_id[0]
         known = _known_changes(scene.cloud) if changes is None else changes
-        others = np.full(len(self.label_of) - len(scene.cloud.instances), len(CHANGES) - 1)  # ids below 0
+        # Ids below 0 read the table's end: "as it was", the last of CHANGES.
+        others = np.full(len(self.label_of) - len(scene.cloud.instances), len(CHANGES) - 1)
         self._change_of = None if known is None else np.concatenate([known, others])
         has = {
             "labels": self.names,
@@ -109,7 +110,7 @@ class LiveScene:
         if self.lit is None:
             return base
         share, grey = FADED
-        total = base[:, 0] + base[:, 1].astype(np.uint16) + base[:, 2]
+        total = base[:, 0] + base[:, 1].astype(np.uint16) + base[:, 2]  # three bytes do not fit into one
         faded = (np.float32(share * grey) + np.float32((1 - share) / 3) * total).astype(np.uint8)
         return np.where(self._is_lit[self.ids][:, None], base, faded[:, None])
 

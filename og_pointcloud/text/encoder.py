@@ -93,7 +93,7 @@ class TextEncoder:
 
     def encode(self, texts: Sequence[str]) -> NDArray[np.float32]:
         """(len(texts), D) float32, unit rows: the texts as they stand."""
-        remembered = self._remembered if len(self._remembered) < VECTORS_REMEMBERED else {}
+        remembered = self._remembered if len(self._remembered) < VECTORS_REMEMBERED else {}  # full: begun anew
         missing = [text for text in dict.fromkeys(texts) if text not in remembered]
         for batch, tokens in self._batches(missing):
             vectors = ENCODER.vectors(self._session, tokens, (len(tokens), self.width), self.where)
