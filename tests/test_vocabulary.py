@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from labelled_clouds import SPACE, WIDTH, WORDS, instance_table, reference_scores, room, unit_rows
+from labelled_clouds import SPACE, WIDTH, WORDS, instance_table, make_cloud, reference_scores, room, unit_rows
 from og_pointcloud_export import write_bundle
 from scenes import write_tiny_capture
 from text_models import encoder_files, write_files
@@ -101,6 +101,15 @@ def test_words_of_another_space_or_width_change_nothing(path, bundle_file):
         add_words(path, Vocabulary(("a",), unit_rows(1, 8)), SPACE)
     assert path.read_bytes() == bundle_file.read_bytes()
     assert add_words(path, NEW, "unknown").names[-2:] == NEW.names
+
+
+def test_words_of_another_width_change_nothing_where_no_instance_is_described(tmp_path):
+    described = instance_table(1)
+    bare = replace(described, descriptors=np.zeros((0, 0), np.float32), descriptor_instance=np.zeros(0, np.int32))
+    path = write_bundle(make_cloud(np.zeros((1, 3)), [0], instances=bare), tmp_path / "bare.ogpc")
+    with pytest.raises(FeatureSpaceError, match=r"the words are of .*\(width 8\); expected .*\(width"):
+        add_words(path, Vocabulary(("a",), unit_rows(1, 8)), SPACE)
+    assert og.load(path).vocabulary.names == tuple(WORDS)
 
 
 def test_best_cosines_are_those_of_the_graphs_reference():

@@ -97,8 +97,11 @@ def add_words(
     """
     bundle = read_bundle(path)
     cloud = bundle.cloud
-    cloud.space.require(FeatureSpace(feature_space, words.vectors.shape[1]), "words")
-    old = cloud.vocabulary or Vocabulary((), np.zeros((0, words.vectors.shape[1]), np.float32))
+    added = FeatureSpace(feature_space, words.vectors.shape[1])
+    cloud.space.require(added, "words")
+    old = cloud.vocabulary or Vocabulary((), np.zeros((0, added.width), np.float32))
+    if old.names:  # where no instance has a descriptor, they alone say how wide the space is
+        FeatureSpace(cloud.feature_space, old.vectors.shape[1]).require(added, "words")
     vectors = dict(zip(old.names, unit_rows(old.vectors), strict=True))  # of a word in both, the later vector stays
     vectors |= dict(zip(words.names, unit_rows(words.vectors), strict=True))
     together = Vocabulary(tuple(vectors), np.array(list(vectors.values()), np.float32))
