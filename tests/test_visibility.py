@@ -173,7 +173,7 @@ def test_splats_that_are_passed_over_would_show_in_no_pixel(off_axis: float):
     intrinsics = np.array([view.fx, view.fy, view.cx, view.cy])
     seen_by = view.world_to_camera, intrinsics, (view.width, view.height), NEAR
     splats, area = splatting._records(n), np.zeros(n)
-    shows = splatting._project(np.arange(n), shapes, seen_by, Cutoffs(), splats, area) != splatting._CULLED
+    shows = splatting._project(np.arange(n), shapes, seen_by, Cutoffs(), splats, area) != splatting.CULLED
     looked_at = splatting._may_show(shapes[:2], seen_by, Cutoffs())
     assert shows.sum() > 500
     assert looked_at[shows].all()

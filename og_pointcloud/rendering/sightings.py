@@ -20,7 +20,18 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from og_pointcloud.kernels import get_num_threads, njit, prange
-from og_pointcloud.rendering.splatting import BATCH, CUTOFFS, SPLAT, TILE, Gaussians, binned_splats, dim, tile_buffer
+from og_pointcloud.rendering.splatting import (
+    BATCH,
+    CULLED,
+    CUTOFFS,
+    SPLAT,
+    TILE,
+    Gaussians,
+    ascending,
+    binned_splats,
+    dim,
+    tile_buffer,
+)
 from og_pointcloud.scene import NOT_SEEN, Camera
 
 LEAST_OPEN = 0.02
@@ -115,7 +126,7 @@ def _see(binned, size, asked, log2_least, workers, seen):  # noqa: ANN001, ANN20
                 surface[k] = splats[of_tile[k]].surface
             light[:] = np.float32(1)
             drawn = fetched = starts[tile]
-            for q in np.argsort(surface):
+            for q in range(len(of_tile)):
                 while drawn < starts[tile + 1]:
                     if drawn == fetched:  # they lie all over memory: fetched at once, they do not wait for each other
                         fetched = min(drawn + BATCH, starts[tile + 1])
@@ -126,29 +137,28 @@ def _see(binned, size, asked, log2_least, workers, seen):  # noqa: ANN001, ANN20
                     dim(batch[drawn % BATCH], left, top, log2_least, light)
                     drawn += 1
                 s = splats[of_tile[q]]
-                g = s.gaussian
                 reaches = light[(int(s.v) - top) * TILE + int(s.u) - left]
-                open_[g], u[g], v[g] = reaches if reaches >= LEAST_OPEN else np.float32(0), s.u, s.v
+                if reaches >= LEAST_OPEN:
+                    open_[s.gaussian], u[s.gaussian], v[s.gaussian] = reaches, s.u, s.v
 
 
 @njit(cache=True, nogil=True)
 def _centres(splats, size, columns, tiles, asked):  # noqa: ANN001, ANN202
     """(first, rows): of splats whose points are asked, those with their centre in tile t are rows[first[t] :
-    first[t + 1]], in their order."""
-    tile_of = np.empty(len(splats), np.int32)
+    first[t + 1]], by the depth of their surface."""
+    tile_of, keys = np.empty(len(splats), np.int32), np.full(len(splats), CULLED)
     first = np.zeros(tiles + 1, np.int64)
     for i in range(len(splats)):
         s = splats[i]
-        inside = 0 <= s.u < size[0] and 0 <= s.v < size[1] and asked[s.gaussian]
-        tile_of[i] = int(s.v) // TILE * columns + int(s.u) // TILE if inside else -1
-        if inside:
+        if 0 <= s.u < size[0] and 0 <= s.v < size[1] and asked[s.gaussian]:
+            tile_of[i] = int(s.v) // TILE * columns + int(s.u) // TILE
+            keys[i] = np.float32(max(s.surface, 0)).view(np.uint32)  # nothing is drawn before a depth of 0
             first[tile_of[i] + 1] += 1
     first = np.cumsum(first)
     fill, rows = first[:-1].copy(), np.empty(first[-1], np.int32)
-    for i in range(len(splats)):
-        if tile_of[i] >= 0:
-            rows[fill[tile_of[i]]] = i
-            fill[tile_of[i]] += 1
+    for i in ascending(keys):
+        rows[fill[tile_of[i]]] = i
+        fill[tile_of[i]] += 1
     return first, rows
 
 

@@ -189,7 +189,7 @@ def binned_splats(
     seen_by = camera.world_to_camera, intrinsics, (camera.width, camera.height), float(near)
     rows = np.flatnonzero(_may_show(shapes[:2], seen_by, cutoffs))
     splats = _records(len(rows))
-    order = _ascending(_project(rows, shapes, seen_by, cutoffs, splats, area))
+    order = ascending(_project(rows, shapes, seen_by, cutoffs, splats, area))
     # In order of depth in memory too: those of a tile are then read from front to back.
     splats = _in_order(splats, order, _records(len(order)))
     columns = -(-camera.width // TILE)
@@ -205,7 +205,8 @@ def _records(count: int) -> NDArray[Any]:
     return room[ahead : ahead + count * SPLAT.itemsize].view(SPLAT)
 
 
-_CULLED = np.uint32(0xFFFFFFFF)
+CULLED = np.uint32(0xFFFFFFFF)
+"""A key of what has no place in an order: above those of all depths."""
 SPLAT = np.dtype(
     [
         ("u", np.float64),  # centre, px
@@ -281,9 +282,9 @@ def _may_show(shapes, seen_by, cutoffs):  # noqa: ANN001, ANN202
 def _project(rows, shapes, seen_by, cutoffs, splats, area):  # noqa: ANN001, ANN202
     """EWA projection in float64 of the Gaussians ``rows``, ascending: writes their splats (rows,) and area (n,), the
     weight in pixels if nothing were in front, or (0,) if it is not asked for; returns keys (rows,) uint32: the bits of
-    the float32 depth, which is positive, and so in its order; _CULLED of those without a pixel.
+    the float32 depth, which is positive, and so in its order; CULLED of those without a pixel.
     """
-    keys = np.full(len(rows), _CULLED)
+    keys = np.full(len(rows), CULLED)
     (xyz, scale, rotation, opacity, thickness), (pose, intrinsics, size, near) = shapes, seen_by
     fx, fy, cx, cy = intrinsics
     for i in prange(len(rows)):
@@ -314,10 +315,10 @@ def _project(rows, shapes, seen_by, cutoffs, splats, area):  # noqa: ANN001, ANN
 
 
 @njit(cache=True, nogil=True)
-def _ascending(keys):  # noqa: ANN001, ANN202
-    """Rows of keys from the least up, equal ones as they come, without _CULLED: by 11 bits at a time, the last first,
-    a quarter of the time of a sort by comparison."""
-    order = np.flatnonzero(keys != _CULLED).astype(np.int32)
+def ascending(keys):  # noqa: ANN001, ANN201
+    """Rows of uint32 keys from the least up, equal ones as they come, without CULLED: by 11 bits at a time, the last
+    first, a quarter of the time of a sort by comparison."""
+    order = np.flatnonzero(keys != CULLED).astype(np.int32)
     for shift in (0, 11, 22):
         place = np.zeros(2049, np.int64)
         for i in order:
@@ -391,7 +392,9 @@ def _bin(splats, columns, tiles, cutoffs, bands):  # noqa: ANN001, ANN202
         low, high = band * tile_rows // bands, (band + 1) * tile_rows // bands
         for i in range(len(splats)):
             for row in range(max(ranges[i, 2], low), min(ranges[i, 3], high)):
-                begin, end = _tiles_of_row(splats, i, row, ranges[i, 0], ranges[i, 1], log2_least)
+                begin, end = ranges[i, 0], ranges[i, 1]
+                if end - begin > 2:  # of fewer, its box is the answer
+                    begin, end = _tiles_of_row(splats, i, row, begin, end, log2_least)
                 for column in range(begin, end):
                     counts[row * columns + column + 1] += 1
     # Second pass: the splats themselves, in order of depth as they come.
@@ -402,7 +405,9 @@ def _bin(splats, columns, tiles, cutoffs, bands):  # noqa: ANN001, ANN202
         low, high = band * tile_rows // bands, (band + 1) * tile_rows // bands
         for i in range(len(splats)):
             for row in range(max(ranges[i, 2], low), min(ranges[i, 3], high)):
-                begin, end = _tiles_of_row(splats, i, row, ranges[i, 0], ranges[i, 1], log2_least)
+                begin, end = ranges[i, 0], ranges[i, 1]
+                if end - begin > 2:
+                    begin, end = _tiles_of_row(splats, i, row, begin, end, log2_least)
                 for column in range(begin, end):
                     tile = row * columns + column
                     members[fill[tile]] = i
@@ -413,8 +418,6 @@ def _bin(splats, columns, tiles, cutoffs, bands):  # noqa: ANN001, ANN202
 @njit(cache=True, nogil=True, error_model="numpy")
 def _tiles_of_row(splats, place, row, begin, end, log2_least):  # noqa: ANN001, ANN202
     """The columns of tiles that a splat's ellipse touches in a row of tiles, of those that its box does."""
-    if end - begin <= 2:
-        return begin, end
     s = splats[place]
     # Along dy, the ellipse's right end lies at u - shear dy + sqrt(room - down dy^2) / across: farthest out at `far`,
     # within the row of tiles where it comes nearest to that; its left end is the mirror image.
