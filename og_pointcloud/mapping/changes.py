@@ -1,17 +1,17 @@
 """Two visits of a place: what is gone, what is new, what moved, and what nobody looked at again.
 
-Both visits are clouds with the cameras that saw them. Each point of the earlier one is asked of the views of the later
-one, and each of the later one of the views of the earlier: is it still (was it already) there, or is its place seen
-through (was it)? By instance, over the points that show and that can tell:
+Both visits are clouds with the cameras that saw them. For each point of the earlier visit, the later one's views tell
+whether it is still there or whether they see through its place; for each point of the later visit, the earlier one's
+views tell whether it was there already. By instance, over the points that show and that can tell:
 
     gone     most of them are seen through later, from two places
     new      most of them lie where the earlier visit had looked through, from two places
     moved    a new instance that looks like a gone one
     unseen   so few of them are looked at later that nothing is known; or the later visit's cloud leaves out so much
-             of what stands about them that it may have left them out by chance
+             of what stands near them that it may have left them out by chance
 
 Points close to the surface of something else cannot tell: when a book is gone, its lower edge still agrees with the
-table. What lies where the earlier visit never looked is neither new nor old: it is added to a map, and not reported.
+table. Whatever lies where the earlier visit never looked is neither new nor old: it is added to a map, not reported.
 """
 
 from __future__ import annotations
@@ -44,19 +44,19 @@ from og_pointcloud.rendering.geometry import nearest_in
 SAME_SURFACE = 1.5
 """Spacings within which two visits' points are of one surface."""
 USUAL_COLORS = 3.0
-"""Times that the colour of one thing may differ more than that of the median thing which has not moved."""
+"""The colour of one thing may differ by so many times as much as that of the median thing which has not moved."""
 LEAST_STILL = 0.05
-"""Share of all points looked at, hidden ones among them, that are where they were."""
+"""Share of all points looked at, hidden ones among them, that must be where they were: else it is another frame."""
 SMALL_PIECE = 0.5
 """A piece of less than this share of another's points is small."""
 OTHER_FRAME = 0.5
-"""Share of all points looked at that are seen through, above which the two do not lie in one frame."""
+"""Share of points measured again or seen through; if more are seen through, the two do not lie in one frame."""
 
 
 @dataclass(frozen=True)
 class Moved:
-    """id: in the earlier cloud. before, after: (3,) float64, the middle of its points then and now, world
-    coordinates. now: its id in the later cloud.
+    """An instance that stands elsewhere. id: in the earlier cloud. before, after: (3,) float64, the middle of its
+    points then and now, world coordinates. now: its id in the later cloud.
 
     >>> og.Moved(3, np.zeros(3), np.array([1, 0, 2]), 5).to_dict()
     {'id': 3, 'from': [0.0, 0.0, 0.0], 'to': [1, 0, 2]}
@@ -96,7 +96,7 @@ class Changes:
 
 
 def compare(before: SceneLike, after: SceneLike) -> Changes:
-    """What changed between two visits of one place, of which each is a labelled cloud that `fit` or a mapper made.
+    """What changed between two visits to one place, each a labelled cloud as `fit` or a mapper makes it.
 
     Both lie in one world frame. SceneError where they do not seem to, where the later one does not know its cameras
     (a file of an older version: fit it again), and FeatureSpaceError where their descriptors cannot be compared.
@@ -110,9 +110,10 @@ def compare(before: SceneLike, after: SceneLike) -> Changes:
 
 @dataclass(frozen=True)
 class Comparison:
-    """changes, and what they rest on. evidence: about the earlier visit's points. nearest: of each later point the row
-    of the nearest earlier one, -1 where none is of its surface. pieces: later id -> the later id whose thing it is a
-    piece of. gone_pieces: earlier id -> the moved thing that it was a piece of."""
+    """changes, and what they rest on. evidence: about the earlier visit's points. nearest: for each later point the row
+    of the nearest earlier one, -1 where none lies on its surface. pieces: for instances that came or moved, later id ->
+    later id of the thing that it is a piece of (itself, for one in one piece); gone_pieces: the same by earlier ids,
+    for what moved."""
 
     changes: Changes
     evidence: Evidence
@@ -124,10 +125,10 @@ class Comparison:
 def compare_visits(
     earlier: Visit, later: Visit, again: tuple[NDArray[np.bool_], NDArray[np.bool_]] | None = None
 ) -> Comparison:
-    """What changed, with the evidence. Both in the frame of the earlier one. Errors as `compare`.
+    """What changed, with the evidence. Both visits lie in the local frame of the earlier one. Errors as `compare`.
 
-    again: (n,) bool each, which of the earlier points the later visit measured again, or saw through, where that is
-    known already; the later visit's points are then all taken to be seen.
+    again: (n,) bool each, which of the earlier points the later visit measured again and which it saw through, if that
+    is known already; then all points of the later visit count as seen.
     """
     a, b = earlier.cloud, later.cloud
     a.space.require(b.space, "later descriptors")
@@ -135,11 +136,13 @@ def compare_visits(
         raise SceneError("the later visit does not know its cameras, so not what it looked at: fit its capture again")
     scatter, spacing = max(earlier.surface.scatter, later.surface.scatter), max(a.spacing, b.spacing)
     tolerance = tolerance_of(spacing, scatter)
+    # What the earlier views say of both visits' points.
     shown, known = Presence.by(earlier.measured(), tolerance, a.xyz, b.xyz)
     if not a.cameras:  # what the earlier visit saw is not known: it may have looked from the same places
         (known,) = Presence.by(earlier.measured(b.cameras), tolerance, b.xyz)
     shows = np.ones(len(b), bool)
     left_out = np.zeros(len(a))  # depth images leave nothing out
+    # What the later views say of both; where frames were judged one by one, the map has counted it already.
     if again is None:
         asked, own = Presence.by(later.measured(), tolerance, a.xyz, b.xyz)
         _require_one_frame(asked)
@@ -154,7 +157,7 @@ def compare_visits(
 
 
 def _require_one_frame(asked: Presence) -> None:
-    """SceneError where hardly a point that is looked at again is where it was."""
+    """SceneError where hardly any point that is looked at again is where it was."""
     still, through = np.count_nonzero(asked.present), np.count_nonzero(asked.odds < 0)
     met = np.count_nonzero(asked.hidden | (asked.odds != 0))
     if through > OTHER_FRAME * (still + through) or still < LEAST_STILL * met:
@@ -167,8 +170,8 @@ def _require_one_frame(asked: Presence) -> None:
 
 @dataclass(frozen=True)
 class _Thing:
-    """Instances of one visit that are pieces of one thing that left or came, the largest first. look: by the points
-    that show so, of which there are so many; its place is of all pieces. surely: that they show so is no accident."""
+    """One thing that left, or came, as one visit shows it. pieces: its instances, the largest first. look: by those of
+    its points that left, or came; place: of all pieces. points: how many these are. surely: this is no accident."""
 
     pieces: tuple[int, ...]
     look: Look
@@ -176,7 +179,7 @@ class _Thing:
     surely: bool
 
     def has(self, piece: _Thing, place: NDArray[np.float64], reach: float, scale: Scale) -> bool:
-        """Whether a thing looks like a piece of this one, which is at that place then and so long."""
+        """Whether another looks like a piece of this one, which then is at that place and so long."""
         near = np.linalg.norm(piece.look.place - place) < reach
         return bool(near) and self.look.has_color_of(piece.look) and scale.cosine(self.look, piece.look) > ALIKE
 
@@ -189,15 +192,17 @@ class _Thing:
         )
 
     def without_pieces(self) -> _Thing:
-        """What is left of this one once another has its pieces."""
+        """This one emptied, once another has its pieces; it keeps its place in the list."""
         return _Thing((), self.look, 0, False)
 
 
 def _decide(
     earlier: Visit, later: Visit, of_earlier: Evidence, of_later: Evidence, nearest: NDArray[np.int64]
 ) -> Comparison:
-    left, left_surely, hardly = of_earlier.decided(earlier)
+    """The changes by the evidence of either visit. nearest: as in `Comparison`."""
+    left, left_surely, unseen = of_earlier.decided(earlier)
     came, came_surely, _ = of_later.decided(later)
+    # How alike one thing looks in both visits is learned from what stayed.
     scale = _scale(earlier, later, _unmoved(earlier, later, nearest, left, came))
     gone = _things(earlier, left, left_surely, of_earlier.through)
     new = _things(later, came, came_surely, of_later.through)
@@ -209,8 +214,9 @@ def _decide(
     gone_alone = [thing for g, thing in enumerate(gone[:count]) if g not in pairs and thing.surely]
     new_alone = [thing for n, thing in enumerate(new) if n not in pairs.values() and thing.surely and thing.pieces]
     gone_pieces = {piece: gone[g].pieces[0] for g in pairs for piece in gone[g].pieces}
-    hardly |= left
-    hardly[[piece for thing in gone_alone for piece in thing.pieces] + list(gone_pieces)] = False
+    # What only likely left, and looks like nothing that came, may be missing by chance: nothing is known of it.
+    unseen |= left
+    unseen[[piece for thing in gone_alone for piece in thing.pieces] + list(gone_pieces)] = False
     changes = Changes(
         gone=tuple(sorted(piece for thing in gone_alone for piece in thing.pieces)),
         new=tuple(thing.pieces[0] for thing in new_alone),
@@ -218,8 +224,8 @@ def _decide(
             Moved(gone[g].pieces[0], gone[g].look.place, new[n].look.place, new[n].pieces[0])
             for g, n in sorted(pairs.items())
         ),
-        unseen=tuple(np.flatnonzero(hardly & (earlier.count(earlier.cloud.instance_ids >= 0) > 0)).tolist()),
-    )
+        unseen=tuple(np.flatnonzero(unseen & (earlier.count(earlier.cloud.instance_ids >= 0) > 0)).tolist()),
+    )  # of what left in earlier visits the table has rows without points: these are not unseen
     come = [*new_alone, *(new[n] for n in pairs.values())]
     pieces = {piece: thing.pieces[0] for thing in come for piece in thing.pieces}
     return Comparison(changes, of_earlier, nearest, pieces, gone_pieces)
@@ -228,15 +234,17 @@ def _decide(
 def _unmoved(
     earlier: Visit, later: Visit, nearest: NDArray[np.int64], left: NDArray[np.bool_], came: NDArray[np.bool_]
 ) -> NDArray[np.int64]:
-    """(m, 2) instances of both visits that share most of their surface with each other, and neither left nor came."""
+    """(m, 2) instances of both visits that share most of their surface with each other, neither left nor came, and have
+    descriptors."""
     owners = np.where(nearest >= 0, earlier.cloud.instance_ids[nearest], BACKGROUND)
-    shared = later.shared(owners, len(left))[:, :-1].T
+    shared = later.shared(owners, len(left))[:, :-1].T  # (earlier, later) points, without those on no instance
     if not shared.size:
         return np.zeros((0, 2), np.int64)
     shared[left], shared[:, came] = 0, 0
     described = [
         np.isin(np.arange(len(v.cloud.instances)), v.cloud.instances.descriptor_instance) for v in (earlier, later)
     ]
+    # Best partners of each other.
     one = np.flatnonzero((shared.max(axis=1) >= FEWEST_POINTS) & described[0])
     other = shared[one].argmax(axis=1)
     mutual = (shared[:, other].argmax(axis=0) == one) & described[1][other]
@@ -244,13 +252,13 @@ def _unmoved(
 
 
 def _scale(earlier: Visit, later: Visit, unmoved: NDArray[np.int64]) -> Scale:
-    """What cosines and colours mean, by what has not moved, (m, 2): how alike the two visits show it, and how alike it
-    is to what is most like it of the rest."""
+    """What cosines and colours mean, by what has not moved, (m, 2): how alike the two visits show each thing, and how
+    alike it is to the other thing that is most like it."""
     a, b = earlier.cloud.instances, later.cloud.instances
-    between = cosines(a, b)[np.ix_(*unmoved.T)]
-    others = np.where(later.adjoining[np.ix_(unmoved[:, 1], unmoved[:, 1])], -np.inf, between).max(
-        axis=1, initial=-np.inf
-    )
+    between = cosines(a, b)[np.ix_(*unmoved.T)]  # on the diagonal, each thing with itself
+    # Adjoining instances may be parts of one thing: they are no other things.
+    adjoining = later.adjoining[np.ix_(unmoved[:, 1], unmoved[:, 1])]
+    others = np.where(adjoining, -np.inf, between).max(axis=1, initial=-np.inf)
     others = others[np.isfinite(others)]
     if len(others) < FEWEST_SAME:
         return Scale(other=typical_cosine(b.descriptors, spread_of(b.agreement, b.masks)[b.descriptor_instance]))
@@ -258,6 +266,7 @@ def _scale(earlier: Visit, later: Visit, unmoved: NDArray[np.int64]) -> Scale:
     one, two = earlier.cloud.rgb, later.cloud.rgb
     if one is None or two is None:
         return Scale(same, other)
+    # Other light shifts all colours alike; what is left differs from thing to thing.
     pairs = ((one[earlier.rows[i]], two[later.rows[k]]) for i, k in unmoved.tolist())
     off = np.array([np.median(now, axis=0) - np.median(was, axis=0) for was, now in pairs])
     shift = np.median(off, axis=0)
@@ -268,19 +277,20 @@ def _scale(earlier: Visit, later: Visit, unmoved: NDArray[np.int64]) -> Scale:
 def _things(
     visit: Visit, chosen: NDArray[np.bool_], surely: NDArray[np.bool_], through: NDArray[np.bool_]
 ) -> list[_Thing]:
-    """Chosen instances, as they look by their points that left, or came."""
+    """Chosen instances as things of one piece, each as it looks by its points that left, or came: ``through``."""
     rows = {k: visit.rows[k][through[visit.rows[k]]] for k in np.flatnonzero(chosen).tolist()}
     return [_Thing((k,), visit.look(k, of), len(of), bool(surely[k])) for k, of in rows.items()]
 
 
 def _matched(gone: list[_Thing], new: list[_Thing], scale: Scale) -> dict[int, int]:
-    """Row of gone -> row of new, where the two look like one thing, best pairs first over all."""
+    """Row of gone -> row of new, where the two look like one thing: the assignment that is best as a whole."""
     if not gone or not new:
         return {}
     alike = np.array([[scale.likeness(one.look, other.look) for other in new] for one in gone])
     lengths = [np.array([thing.look.length for thing in things]) for things in (gone, new)]
     as_long = np.minimum.outer(*lengths) / np.maximum(np.maximum.outer(*lengths), 1e-12)
-    # Of several that are alike, pieces of one thing perhaps, the one that is as long.
+    # Likeness weighs more, and counts no further once it is as of one thing; among several as alike, which may be
+    # pieces of one thing, the one of the same length is taken.
     rows, columns = linear_sum_assignment(-np.where(alike > ALIKE, 2 * np.minimum(alike, 1) + as_long, 0))
     return {int(g): int(n) for g, n in zip(rows, columns, strict=True) if alike[g, n] > ALIKE}
 
@@ -288,20 +298,21 @@ def _matched(gone: list[_Thing], new: list[_Thing], scale: Scale) -> dict[int, i
 def _gathered(
     gone: list[_Thing], new: list[_Thing], pairs: dict[int, int], scale: Scale
 ) -> tuple[list[_Thing], list[_Thing], dict[int, int]]:
-    """Gone, new and pairs with more pieces of what moved taken into it: they look like it, have its colour, and lie no
-    farther off than it is long. Of what left, small pieces alone: what stood beside it may have been another of its
-    kind. What holds such pieces then has none of its own."""
+    """Gone, new and pairs after what moved has taken in its other pieces: instances that look like it, have its colour,
+    and lie no farther off than it is long. Of those that left, only small ones: a large one that stood beside it may
+    have been another of its kind. Things whose pieces were taken stay in the lists, empty."""
     gone, new, pairs = list(gone), list(new), dict(pairs)
-    here = replace(scale, shift=0.0)
+    within_visit = replace(scale, shift=0.0)
     for g in sorted(pairs, key=lambda g: -gone[g].points):
-        if g not in pairs:
+        if g not in pairs:  # taken in by a larger one
             continue
         n = pairs[g]
         long = max(gone[g].look.length, new[n].look.length)
         for h, piece in enumerate(gone):
+            # Where the piece is matched itself, its counterpart must be a piece at the new place.
             small = h != g and 0 < piece.points < SMALL_PIECE * gone[g].points
             came_too = h not in pairs or gone[g].has(new[pairs[h]], new[n].look.place, long, scale)
-            if small and came_too and gone[g].has(piece, gone[g].look.place, long, here):
+            if small and came_too and gone[g].has(piece, gone[g].look.place, long, within_visit):
                 gone[g], gone[h] = gone[g].with_pieces(piece), piece.without_pieces()
                 pairs.pop(h, None)
         for k, piece in enumerate(new):

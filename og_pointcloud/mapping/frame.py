@@ -18,17 +18,18 @@ from og_pointcloud.mapping.sight import AGREES, MeasuredView, states_of_points, 
 from og_pointcloud.scene import Camera, View
 
 COMPARED = 4000
-"""Points of the map, about, by which a frame's depth is held against it."""
+"""About how many points of the map a frame's depth is compared with."""
 FEWEST_COMPARED = 200
 """Fewer say nothing: the frame looks at a part of the place that the map does not know."""
 CELLS, FRONT = 16, 1.2
-"""Parts of an image along each side; points farther than so often the nearest of their part may be hidden by it."""
+"""Cells of an image along each side; a point more than FRONT times as far as the nearest one of its cell may be hidden
+by it."""
 LEAST_AGREEING = 0.25
 """Share of the map's points in front of a camera whose depth it must confirm: what moved is a small part of a place."""
 OTHER_UNIT = 2.5
-"""Factor from which on it is another unit of length: feet are 3.3 to a metre."""
+"""Factor between measured and expected depths from which on it is another unit of length: feet are 3.3 to a metre."""
 UNIT_SPREAD = 1.2
-"""Depths in another unit are all off by one factor: three quarters of the places span less than this share of it."""
+"""In another unit all depths are off by one factor: three quarters of the ratios span less than this times it."""
 
 
 @dataclass(frozen=True)
@@ -61,8 +62,8 @@ class Frame:
 
 @dataclass(frozen=True)
 class CheckedFrame:
-    """A frame without surprises. camera: from the map's local frame. ids: (H, W) int32, -1 none. features: (M, D)
-    float32. view: what its depth measures, None without any. rgb: (H, W, 3) uint8 or None."""
+    """A frame that passed all checks. camera: its pose from the map's local frame. ids: (H, W) int32 mask image, -1
+    none. features: (M, D) float32. view: what its depth measures, None without any. rgb: (H, W, 3) uint8 or None."""
 
     camera: Camera
     ids: NDArray[np.int32]
@@ -107,7 +108,7 @@ def _masks(frame: Frame, camera: Camera, name: str) -> tuple[NDArray[np.int32], 
         raise FeatureSpaceError(
             f"{name}: mask features are {features.dtype} {features.shape}; expected numbers (masks, width)"
         )
-    with np.errstate(over="ignore"):
+    with np.errstate(over="ignore"):  # what float32 cannot hold becomes inf, which View refuses
         features = features.astype(np.float32)
     if frame.masks is None:
         ids = np.full((camera.height, camera.width), -1, np.int32)
@@ -145,7 +146,7 @@ def _depth(frame: Frame, origin: NDArray[np.float64], camera: Camera, name: str)
 def require_same_place(stamp: float, view: MeasuredView, xyz: NDArray[np.float32], tolerance: float) -> None:
     """SceneError where a frame's depth contradicts nearly all of the map's points before it: pose or unit are wrong.
 
-    xyz: (n, 3) points of the map about the frame, some of them hidden by others. tolerance: as of `states_of_points`.
+    xyz: (n, 3) points of the map near the frame, some of them hidden by others. tolerance: as of `states_of_points`.
     What moves is a small part of a place; a pose that is off moves all of it. A frame that hardly meets the map is let
     through.
     """
@@ -153,7 +154,7 @@ def require_same_place(stamp: float, view: MeasuredView, xyz: NDArray[np.float32
     inside = view.camera.shows(uv_px)
     column, row = uv_px[inside].astype(np.intp).T
     measured, z = view.depth[row, column], z[inside]
-    # What the map itself hides says nothing: a camera close to a wall has most of the place behind it.
+    # Points that the map itself hides say nothing: before a camera close to a wall, most of the place is behind it.
     cell = row * CELLS // view.camera.height * CELLS + column * CELLS // view.camera.width
     nearest = np.full(CELLS**2, np.inf)
     np.minimum.at(nearest, cell, z)
@@ -163,13 +164,15 @@ def require_same_place(stamp: float, view: MeasuredView, xyz: NDArray[np.float32
     agreeing = float((states_of_points(xyz[inside][met], tolerance, view) == AGREES).mean())
     if agreeing >= LEAST_AGREEING:
         return
+    # One factor off nearly everywhere is another unit of length; anything else cannot be told apart.
     low, middle, high = np.percentile(measured[met] / z[met], [12.5, 50, 87.5])
-    what = (
-        "its pose is off, it is of another place, or something stands before the camera: check these, or correct the "
-    )
-    what += "map after a loop closure"
     if high - low < UNIT_SPREAD * middle and max(middle, 1 / middle) > OTHER_UNIT:
         what = f"its depths are about {middle:.3g} times what the map expects: give them in the map's unit"
+    else:
+        what = (
+            "its pose is off, it is of another place, or something stands before the camera: check these, or correct "
+            "the map after a loop closure"
+        )
     raise SceneError(
         f"frame {stamp:g} confirms {agreeing:.0%} of the {np.count_nonzero(met)} points of the map before it; expected "
         f"at least {LEAST_AGREEING:.0%}: {what}"

@@ -1,4 +1,4 @@
-"""Frames from a sensor that waits for nobody: put never blocks, and what gets too old is dropped, and said to be."""
+"""Frames from a sensor that waits for nobody: put never blocks; frames that get too old are dropped, and reported."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class FrameQueue:
     """Feeds a mapper in a thread of its own, in the order in which frames come.
 
     max_age: seconds that a frame may wait. on_change: called, in that thread, with each frame's change. on_drop: called
-    with what is said of a frame that was dropped, for its age or because it was refused; None: a warning. lock: held
+    with a message for each frame that was dropped, for its age or because it was refused; None: a warning. lock: held
     while a frame goes in; hold it to use the mapper, or to put another in its place.
     """
 
@@ -52,7 +52,7 @@ class FrameQueue:
         self._thread.join()
 
     def _work(self) -> None:
-        while (waiting := self._waiting.get()) is not None:
+        while (waiting := self._waiting.get()) is not None:  # None: `close` asks for the end
             self._take(*waiting)
             self._done += 1
 
@@ -66,5 +66,5 @@ class FrameQueue:
                 self._on_change(self.mapper.integrate(frame))
         except OgPointcloudError as error:
             self._on_drop(f"a frame was refused: {error}")
-        except Exception as error:  # of a listener, say: the next frame goes in all the same
+        except Exception as error:  # of a listener, say; the thread lives on, and the next frame goes in
             self._on_drop(f"a frame failed: {type(error).__name__}: {error}")

@@ -1,6 +1,7 @@
 """All that a growing map holds: its points, whether they are still there, what they voted for, what views showed.
 
-What a frame shows of the points, and in which of its masks, is told by its depth, or else by the map's own surface.
+Which points a frame shows, and in which of its masks, follows from its depth or, without one, from the map's own
+surface: points that lie behind it are hidden.
 """
 
 from __future__ import annotations
@@ -29,21 +30,22 @@ from og_pointcloud.scene import Camera, Points
 from og_pointcloud.settings import GeometrySettings
 
 MARGIN = 0.1
-"""Share of an image beyond its border from which points are drawn, as they may hide others within."""
+"""Points are drawn up to this share of the image beyond its border, as they may hide others within."""
 READINGS_PER_SPACING = 1.5
-"""Readings a spacing that a frame gives to the map, along each axis: more would only be averaged."""
+"""Readings that a frame gives to the map per spacing, along each image axis: more would only be averaged."""
 MOST_ODDS = 3.0
-"""Frames that history counts for at most."""
+"""Frames that a point's history counts for at most, for it or against it."""
 RECENT_FRAMES = 4096
-"""Stamps of frames that are remembered: those that a journal still holds are not integrated twice."""
+"""Stamps of frames that are remembered, so that frames that a journal still holds are not integrated twice."""
 
 
 @dataclass
 class GrowingMap:
-    """origin: (3,), world = local + origin. anchors: stamp and pose of each frame that brought
-    points. sequence: of the next frame; 0 stands for what was known before the first. stamp: the latest of all; recent:
-    those of the last ones. spacing: of the first rows, points known from the beginning. scale: of points as frames
-    without depth see them, in spacings; None: not chosen yet; drawn: by how many such frames it was."""
+    """origin: (3,), world = local + origin. anchors: stamp and pose of each frame that brought points. sequence: number
+    of the next frame; 0 stands for what was known before the first. stamp: the latest of all frames; recent: those of
+    the last RECENT_FRAMES, in the order of their coming. spacing: of each of the first rows, the points known from the
+    beginning. scale: how large points are drawn for frames without depth, in spacings; None: not chosen yet. drawn: how
+    many such frames were kept when it was chosen."""
 
     origin: NDArray[np.float64]
     space: FeatureSpace
@@ -65,37 +67,41 @@ class GrowingMap:
         cls, origin: NDArray[np.float64], space: FeatureSpace, spacing: float, *, grows: bool = True,
         scatter: float = 0.0,
     ) -> GrowingMap:  # fmt: skip
-        """Without a point. grows: whether frames add some. scatter: standard deviation of points off their surface."""
+        """A map without points. grows: whether frames add some. scatter: standard deviation of points off their
+        surface."""
         presence = Presence(tolerance_of(spacing, scatter), MOST_ODDS)
         return cls(origin, space, VoxelPoints(spacing, grows), presence)
 
     def grow(self) -> None:
-        """Room for what is known of each point."""
+        """Make room for what is known of each point."""
         for columns in (self.presence, self.votes, self.kept):
             columns.grow(self.points.n)
 
     def about(self, camera: Camera, margin: float = 0.0, most: int = 1 << 31) -> NDArray[np.int32]:
-        """Rows of the points that are there and may fall into an image, or within a share ``margin`` of it; of more
-        than ``most`` about so many, evenly chosen."""
+        """Rows of the points that are there and may fall into an image, or within a share ``margin`` beyond its border.
+        Where these are more than ``most``, at most so many of them, evenly chosen."""
         rows = self.points.packets.before(camera, self.points.edge, margin=margin)
         rows = rows[:: 1 + len(rows) // most]
         return rows[self.points.weight[rows] > 0]
 
     def spacing_of(self, rows: NDArray[np.int32]) -> NDArray[np.float32]:
-        """(m,) of points; of those that frames brought the map's own."""
+        """(m,) spacing of points; for those that frames brought it is the edge of a voxel."""
         return np.append(self.spacing, np.float32(self.points.edge))[np.minimum(rows, len(self.spacing))]
 
     def judge(self, view: MeasuredView, stamp: float) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-        """Presence by what a view measures: rows of points that it bears out, and of those that leave by it."""
+        """Count what a view measures for and against points; rows of those that it confirms, and of those that must
+        leave after it."""
         presence, points = self.presence, self.points
         rows = self.about(view.camera)
         states = states_of_points(points.xyz[rows], presence.tolerance, view)
         presence.take(rows, points.xyz, states, view.camera.center, stamp)
+        # Two frames more see through a point than confirm it, and they look from two places: one alone removes nothing.
         through = rows[states == THROUGH]
         return rows[states == AGREES], through[(presence.odds[through] < -1) & (presence.refuted[through] > 1)]
 
     def add(self, frame: CheckedFrame) -> NDArray[np.int32]:
-        """The readings of a frame, as dense as the map, but for those between two surfaces; rows of the new points."""
+        """Add the readings of a frame, thinned to the map's density and without flying pixels, which lie between two
+        surfaces. Returns the rows of the new points."""
         points, view, before = self.points, frame.view, self.points.n
         if view is None or not points.grows:
             return np.zeros(0, np.int32)
@@ -105,6 +111,7 @@ class GrowingMap:
         xyz, pixel = to_world(image, chosen), np.flatnonzero(chosen)
         rgb = np.full((len(xyz), 3), 128, np.uint8)
         if frame.rgb is not None:
+            # The image has more pixels than the view where its depth was sparse (`view_of_depth`).
             scale = frame.rgb.shape[0] / camera.height, frame.rgb.shape[1] / camera.width
             row, column = pixel // camera.width, pixel % camera.width
             rgb = frame.rgb[(row * scale[0]).astype(np.intp), (column * scale[1]).astype(np.intp)]
@@ -123,29 +130,31 @@ class GrowingMap:
         return np.where(self.points.alive, self.votes.best(everyone, self.tracks.root), NO_TRACK)
 
     def rows_of(self, track: int) -> NDArray[np.int32]:
-        """Rows of the points of a track; only its surroundings are gone through."""
+        """Rows of the points of a track; only packets about the track's box are gone through."""
         (low, high), edge = self.tracks.tracks[track].box, self.points.edge
         rows = self.points.packets.within(low - edge, high + edge)
         return rows[(self.points.weight[rows] > 0) & (self.votes.best(rows, self.tracks.root) == track)]
 
     def forget(self, rows: NDArray[np.int32]) -> None:
-        """What was known of points that left, or whose thing did."""
+        """Forget the votes and the evidence of points that left, or whose object left; from this frame on they may
+        belong to something else."""
         self.votes.track[rows], self.votes.weight[rows] = NO_TRACK, 0
         self.presence.odds[rows], self.presence.refuted[rows] = 0, 0
         self.kept.born[rows] = self.sequence
 
     def place_of(self, rows: NDArray[np.integer]) -> NDArray[np.float64]:
-        """(3,) middle of points, world coordinates: the median, as votes give a thing some points far off it."""
+        """(3,) middle of points, world coordinates: the median, as votes give an object some points far off it."""
         return np.median(self.points.xyz[rows].astype(np.float64), axis=0) + self.origin
 
     def correct(self, poses: Mapping[float, ArrayLike]) -> None:
-        """Move what the frames of these stamps brought: stamp -> world_to_camera, from world coordinates."""
+        """Move what the frames of these stamps brought: stamp -> corrected world_to_camera, from world coordinates."""
         corrected = {}
         for stamp, pose in poses.items():
             camera = Camera(1, 1, 1.0, 1.0, 0.5, 0.5, np.asarray(pose))
             corrected[float(stamp)] = in_local_frame(camera, self.origin).world_to_camera
         for index, (stamp, old) in enumerate(self.anchors):
             if stamp in corrected:
+                # A point keeps its place in the frame of its camera: out of the old pose, into the corrected one.
                 rows = np.flatnonzero(self.points.anchor == index)
                 motion = np.linalg.inv(corrected[stamp]) @ old
                 self.points.xyz[rows] = self.points.xyz[rows] @ motion[:3, :3].T + motion[:3, 3]
@@ -157,6 +166,7 @@ class GrowingMap:
         self.points.refile()
         for heaviest in self.votes.track[: self.points.n].T:
             self.tracks.place(self.points.xyz, np.arange(self.points.n), heaviest)
+        # Snapshots are remembered by the sequence: they are made anew after a correction.
         self.count(self.stamp)
 
     def count(self, stamp: float) -> None:
@@ -165,15 +175,16 @@ class GrowingMap:
         self.recent = [*self.recent[1 - RECENT_FRAMES :], stamp]
 
     def stamp_of(self, sequence: int) -> float:
-        """When the frame of that number was, or the earliest that is remembered; -inf for what was known before."""
-        place = sequence - (self.sequence - len(self.recent))
+        """The stamp of the frame of that number, or of the earliest that is remembered; -inf for what was known before
+        all frames."""
+        place = sequence - (self.sequence - len(self.recent))  # the last of recent is number sequence - 1
         return self.recent[max(place, 0)] if sequence > 0 else -np.inf
 
 
 @dataclass(frozen=True)
 class Seen:
-    """rows: (m,) int32 of the points that were looked for. found: what is seen of these. mask: that of the pixel of
-    each seen one, -1 none."""
+    """Points in one frame. rows: (m,) int32 of the points that were looked for. found: which of these are seen, by
+    place in ``rows``. mask: (s,) id at the pixel of each seen one, -1 none."""
 
     rows: NDArray[np.int32]
     found: Sightings
@@ -186,14 +197,14 @@ class Seen:
 
 
 def measured_points(frame: CheckedFrame, known: GrowingMap, rows: NDArray[np.int32]) -> Seen:
-    """Of points that the depth of a frame measures, those in its image."""
+    """Of the points that a frame's depth measured, those in its image; all are fully open, as they were measured."""
     uv_px, _ = frame.camera.project(known.points.xyz[rows])
     inside = frame.camera.shows(uv_px)
     return _seen(frame, rows[inside], np.ones(np.count_nonzero(inside), np.float32), uv_px[inside])
 
 
 def drawn_points(frame: CheckedFrame, known: GrowingMap, geometry: GeometrySettings) -> Seen:
-    """The points that a frame without depth sees, by the map's own surface."""
+    """The points that a frame without depth sees: those that the map's own points, drawn as `fit` does, do not hide."""
     camera, rows = frame.camera, np.sort(known.about(frame.camera, MARGIN))
     xyz, spacing = known.points.xyz[rows], known.spacing_of(rows)
     drawn = isotropic(Points(xyz, np.zeros(3)), spacing, known.scale or geometry.middle_scale, geometry.opacity)
@@ -214,11 +225,12 @@ def _seen(
 
 
 def vote(frame: CheckedFrame, known: GrowingMap, seen: Seen) -> tuple[list[int], list[int]]:
-    """The frame's masks: votes of points and witnesses of tracks now, rows of the mask table for later.
+    """Take in the frame's masks: for now as votes of points and witnesses of tracks, for later as rows of the mask
+    table.
 
     Returns the tracks that are objects now and want an id, and those with one that were seen again.
     """
-    known.space = replace(known.space, width=frame.features.shape[1])
+    known.space = replace(known.space, width=frame.features.shape[1])  # not known before the first mask
     points, seen_at = seen.points, known.presence.seen_at
     away = np.linalg.norm(known.points.xyz[points] - frame.camera.center, axis=1)
     view = KeptView.of(frame, known.sequence, seen.found, seen.rows)

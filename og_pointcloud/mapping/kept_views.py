@@ -1,7 +1,7 @@
-"""The rows of the mask table that a map keeps: what each frame's masks showed, without the frames.
+"""The rows of the mask table that a map keeps: which points each frame's masks showed, without the images.
 
-A frame is kept while it shows places that few kept ones have shown: so memory follows the map and not the time, and a
-second loop of the same path adds nothing. From these rows the batch rule (`fitting`) finds the instances.
+A frame is kept only if it shows places that few kept ones have shown. So memory grows with the map and not with time: a
+second loop along the same path adds nothing. From these rows the batch rule (`fitting`) finds the instances.
 """
 
 from __future__ import annotations
@@ -19,20 +19,23 @@ from og_pointcloud.rendering.sightings import Sightings
 from og_pointcloud.scene import Camera
 
 ENOUGH_VIEWS = 48
-"""Kept views of a point beyond which another one says nothing new of it: 10 bytes each, a point."""
+"""Kept views of a point beyond which another one says nothing new of it. Each costs about 10 bytes a point."""
 FEW_VIEWS = 4
-"""The same for a frame from where another kept one stood."""
+"""The same for a frame that looks from where another kept one did."""
 SAME_PLACE, SAME_DIRECTION = 0.02, 0.9994
-"""Share of the distance to what is seen, and cosine (2 degrees), within which two frames stand alike."""
+"""Two frames look from one place if they stand within this share of the distance to what they see, and their optical
+axes differ by less than this cosine (2 degrees)."""
 NEW_SHARE = 0.05
-"""A frame is kept if more than this share of what it shows has not been shown often enough."""
+"""A frame is kept if more than this share of the points it shows have not been shown often enough."""
 
 
 @dataclass(frozen=True)
 class KeptView:
-    """starts: (M + 2,) int32, columns, votes: rows of the masks, the last one of no mask, as in CSR; votes float16.
-    seen: (s,) int32 points, openness: (s,) float16. pixels: (M,) int32. features: (M, D) float32. sequence: when.
-    packed: its mask image, compressed, if it had no depth: what it sees follows from how large points are drawn."""
+    """What one frame's M masks showed. starts: (M + 2,) int32, columns, votes (float16): a sparse matrix in CSR layout,
+    a row for each mask and a last one for what is in no mask; columns are rows of the map's points. seen: (s,) int32
+    points that it sees, openness: (s,) float16, how openly. pixels: (M,) int32. features: (M, D) float32. sequence: the
+    frame's number. packed: its mask image, compressed, if it had no depth: what it sees then depends on how large
+    points are drawn, and is found again when that changes."""
 
     camera: Camera
     stamp: float
@@ -48,8 +51,8 @@ class KeptView:
 
     @classmethod
     def of(cls, frame: CheckedFrame, sequence: int, found: Sightings, rows: NDArray[np.int32]) -> KeptView:
-        """What is found in a frame of the points ``rows``."""
-        pixels = np.bincount(frame.ids.ravel() + 1, minlength=len(frame.features) + 1)[1:]
+        """The view of a frame. found: what it sees of the points ``rows`` of the map, by place in ``rows``."""
+        pixels = np.bincount(frame.ids.ravel() + 1, minlength=len(frame.features) + 1)[1:]  # without those of id -1
         masks, open_ = found.rows, found.openness
         packed = zlib.compress(frame.ids.tobytes(), 1) if frame.view is None else b""
         return cls(
@@ -62,6 +65,7 @@ class KeptView:
     def masks(self) -> NDArray[np.int32]:
         """(H, W) the mask image of a view that had no depth."""
         shape = self.camera.height, self.camera.width
+        # It never unpacks to more than the image holds, whatever a damaged journal says.
         ids = zlib.decompressobj().decompress(self.packed.tobytes(), 4 * shape[0] * shape[1])
         return np.frombuffer(ids, np.int32).reshape(shape)
 
@@ -80,7 +84,7 @@ class KeptView:
 @dataclass
 class KeptViews(Columns):
     """views: in the order in which they came. shown: (n,) uint8, how many of them show each point. born: (n,) int32,
-    views of an earlier sequence show something else that was there."""
+    the frame that brought what is there now: views of an earlier sequence show something else at that point."""
 
     views: list[KeptView] = field(default_factory=list)
     shown: NDArray[np.uint8] = field(default_factory=lambda: np.zeros(0, np.uint8))
@@ -92,7 +96,7 @@ class KeptViews(Columns):
             return
         enough = FEW_VIEWS if any(view.stands_like(other, distance) for other in self.views) else ENOUGH_VIEWS
         if (self.shown[view.seen] < enough).mean() > NEW_SHARE:
-            self.shown[view.seen] = np.minimum(self.shown[view.seen], 254) + 1
+            self.shown[view.seen] = np.minimum(self.shown[view.seen], 254) + 1  # stays at the largest uint8
             self.views.append(view)
 
     @property
@@ -106,7 +110,9 @@ class KeptViews(Columns):
         entries, points = (sum(len(getattr(view, name)) for view in self.views) for name in ("columns", "seen"))
         weights, outside, exposure = (SparseRows(most, n, False) for most in (entries, entries, points))
         for view in self.views:
+            # What stood at a point before what is there now does not speak for it.
             kept = (place[view.columns] >= 0) & (self.born[view.columns] <= view.sequence)
+            # How many entries of each CSR row are kept; the last row (in no mask) begins at the border.
             lengths = np.diff(np.append(0, np.cumsum(kept))[view.starts])
             columns, votes, border = place[view.columns][kept], view.votes[kept].astype(np.float32), lengths[:-1].sum()
             weights.append(lengths[:-1], columns[:border], votes[:border])

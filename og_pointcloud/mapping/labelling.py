@@ -1,4 +1,4 @@
-"""What a map kept -> a labelled cloud, by the rule of `fit` in mode grouping: the same masks, witnesses and votes."""
+"""Kept views of a map -> a labelled cloud, by the rule of `fit` in mode grouping: the same masks, witnesses, votes."""
 
 from __future__ import annotations
 
@@ -22,12 +22,15 @@ from og_pointcloud.settings import FitSettings
 
 def labelled(known: GrowingMap, rows: NDArray[np.int64], around: Neighbourhood, settings: FitSettings) -> LabelledCloud:
     """Some of a map's points, rows (n,), labelled as `fit` would from the views kept. around: their neighbourhood."""
+    # Where each of the map's rows stands among the points to label, -1 for those that are left out.
     place = np.full(known.points.n, -1, np.int32)
     place[rows] = np.arange(len(rows), dtype=np.int32)
     points = Points(known.points.xyz[rows], known.origin, known.points.rgb[rows].astype(np.uint8))
     settings, journal = replace(settings, mode="grouping"), Journal(progress=False)
+    # First, as it may see the frames without depth anew: the table is made of what they see.
     _choose_scale(known, points, around.spacing, settings, journal)
     table = known.kept.table(place, len(rows))
+    # The table holds all that the masks say; the scene's views are there for their cameras.
     no_mask, width = np.zeros((0, 0), np.int32), table.mask_features.shape[1]
     no_feature = np.zeros((0, width), np.float32)
     kept = zip(table.names, known.kept.views, strict=True)
@@ -44,10 +47,11 @@ def labelled(known: GrowingMap, rows: NDArray[np.int64], around: Neighbourhood, 
 def _choose_scale(
     known: GrowingMap, points: Points, spacing: NDArray[np.float32], settings: FitSettings, journal: Journal
 ) -> None:
-    """Choose how large points are drawn, as `fit` does, by the kept views that had no depth, and see these anew."""
+    """Choose how large points are drawn, as `fit` does, by the kept views that had no depth; where that is another size
+    than before, find anew what these see."""
     kept = known.kept.views
     drawn = [k for k, view in enumerate(kept) if len(view.packed)]
-    if len(drawn) == known.drawn:
+    if len(drawn) == known.drawn:  # no view more than last time
         return
     views = [View(f"{k:09d}", kept[k].camera, kept[k].masks, kept[k].features) for k in drawn]
     near = near_plane(points.xyz, (view.camera for view in views))
@@ -63,12 +67,13 @@ def _choose_scale(
 def matched_ids(
     ids: NDArray[np.int32], count: int, known: NDArray[np.int32], known_count: int
 ) -> tuple[NDArray[np.int64], int]:
-    """(count,) the id that each instance gets, and how many ids there are then: that of the known object with which it
-    shares most points, each given once; then fresh ones from known_count on.
+    """(count,) the id that each instance gets, and how many ids there are then: the id of the known object with which
+    it shares most points, each given once; the others get fresh ones from known_count on.
 
     ids, known: (n,) instance and known object of each point, below 0 none.
     """
     wanted = np.full(count, -1, np.int64)
+    # Pairs as one number each, the largest overlap first.
     both = (ids >= 0) & (known >= 0)
     pairs, shared = np.unique(ids[both].astype(np.int64) * known_count + known[both], return_counts=True)
     for pair in pairs[np.lexsort((pairs, -shared))].tolist():
@@ -84,12 +89,13 @@ def with_ids(cloud: LabelledCloud, wanted: NDArray[np.int64], count: int) -> Lab
     """The cloud with instance k called wanted[k], in a table of ``count`` rows; rows without an instance are empty."""
     table, empty = cloud.instances, {"coarse": -1, "part_of": -1, "reliability": np.nan}
     columns = {}
-    for entry in fields(InstanceTable)[2:]:
+    for entry in fields(InstanceTable)[2:]:  # all but the descriptors and whose they are
         rows = getattr(table, entry.name)
         columns[entry.name] = np.full(count, empty.get(entry.name, 0), rows.dtype)
         columns[entry.name][wanted] = rows
     number = np.append(wanted, [-2, -1])  # states -2 and -1 index the last two
     columns["part_of"][wanted] = np.where(table.part_of >= 0, number[table.part_of], -1)
+    # Rows of descriptors stay in the order of the instances they are of.
     owner = wanted[table.descriptor_instance]
     order = np.argsort(owner, kind="stable")
     renamed = InstanceTable(table.descriptors[order], owner[order].astype(np.int32), **columns)

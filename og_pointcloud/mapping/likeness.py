@@ -1,14 +1,14 @@
 """Whether two instances, of two visits, are the same thing: by descriptor, colour and size.
 
-A descriptor is the mean of m mask features, each of which has the cosine a with what endless views would give: it is
-off by a tangent of about sqrt(s), s = (1 - a^2) / (a^2 m). So two descriptors of one thing do not reach the cosine 1,
-but
+A descriptor is the mean of m mask features. Let each of them have the cosine a with the mean over infinitely many
+views: then the descriptor deviates from that mean by an angle whose tangent is about sqrt(s), s = (1 - a^2) / (a^2 m).
+So two descriptors of one thing do not reach the cosine 1, but
 
     c = 1 / sqrt((1 + s) (1 + s'))
 
-and a cosine divided by c is what endless views would give. What it means the scene itself tells: how alike the two
-visits show what has not moved, and how alike it is to what else stands there. Colour and size only forbid: exposure,
-shade and what was hidden change both.
+and a cosine divided by c is what infinitely many views would give. What such a cosine means is learned from the scene
+itself: how alike the two visits show what has not moved, and how alike that is to other things that stand there. Colour
+and size can only rule a match out: exposure, shade and what was hidden change both.
 """
 
 from __future__ import annotations
@@ -21,27 +21,27 @@ from numpy.typing import ArrayLike, NDArray
 from og_pointcloud.cloud import InstanceTable
 
 ALIKE = 0.5
-"""From here on two are one thing: nearer to what one thing has than to what different things have."""
+"""Likeness from which on two are one thing: halfway between 0, as of different things, and 1, as of one thing."""
 OTHER_COLOR = 48.0
-"""Levels of 255 in some channel by which the medians of one thing do not differ."""
+"""Levels of 255 in any channel; if median colours differ by more, it is another thing."""
 SAME_COLOR = 24.0
 """Levels up to which two adjoining parts may be of one thing."""
 OTHER_SIZE = 5.0
-"""Times that one is longer than the other: a part that shows may be a third of the whole."""
+"""Ratio of lengths above which it is another thing: the part of it that shows may be a third of the whole."""
 LEAST_AGREEMENT = 0.05
-"""Squared cosines of mask features with what endless views would give, below which they tell no spread."""
+"""Floor of a^2: below it the spread would grow without bound."""
 USUAL_MASKS = 4.0
-"""Masks for which the agreement that is usual in the scene counts, beside an instance's own."""
+"""The agreement usual in the scene counts as so many masks beside an instance's own."""
 FEWEST_SAME = 3
-"""Things that have not moved, of which fewer tell nothing."""
+"""Fewer things that have not moved say nothing of the scene's cosines."""
 MOST_ROWS = 1000
-"""Descriptors that are compared with each other."""
+"""At most so many descriptors are compared with each other."""
 
 
 @dataclass(frozen=True)
 class Look:
-    """How a thing looked, and where, so that it is known when it comes back. descriptors: (r, D) float32 unit rows,
-    r = 0 where no mask gave a feature. spread: the squared tangent that they are off by. place: (3,) middle of its
+    """How a thing looked, and where, so that it is recognized when it comes back. descriptors: (r, D) float32 unit
+    rows, r = 0 where no mask gave a feature. spread: their s, as in the module's text. place: (3,) middle of its
     points, world coordinates. color: (3,) median, or None. size: (3,) along the axes; length: of the longest side,
     without outliers."""
 
@@ -61,15 +61,15 @@ class Look:
         xyz: NDArray[np.float32],
         rgb: NDArray[np.uint8 | np.float32] | None,
     ) -> Look:
-        """Of points xyz (n, 3), at least one, in any frame of the world's axes, with rgb (n, 3) or None."""
-        sides = np.ptp(np.percentile(xyz, [3, 97], axis=0), axis=0)
+        """The look of points xyz (n, 3), at least one, in any frame that has the world's axes; rgb (n, 3) or None."""
+        sides = np.ptp(np.percentile(xyz, [3, 97], axis=0), axis=0)  # votes give a thing some points far off it
         color = None if rgb is None else np.median(rgb, axis=0).astype(np.float64)
         size = np.ptp(xyz.astype(np.float64), axis=0)
         return cls(descriptors, spread, place, color, size, float(sides.max()))
 
     def has_color_of(self, other: Look, most: float = SAME_COLOR, shift: NDArray[np.float64] | float = 0.0) -> bool:
-        """Whether the two may be of one thing by their colours; True where these are not known. shift: by how much the
-        other's colors differ all over."""
+        """Whether the two may be of one thing by their colours; True where these are not known. shift: difference that
+        all colours of the other's visit have, as under other light."""
         if self.color is None or other.color is None:
             return True
         return bool(np.abs(other.color - self.color - shift).max() <= most)
@@ -77,9 +77,9 @@ class Look:
 
 @dataclass(frozen=True)
 class Scale:
-    """What cosines mean in a scene, as endless views would give them. same: of one thing, seen twice. other: of
-    different things. shift: (3,) by how much later colours differ; color: levels beside it by which one thing's do not.
-    """
+    """What cosines mean in a scene; all are corrected for spread, as in the module's text. same: typical cosine of one
+    thing in two visits. other: of different things. shift: (3,) by how much all later colours differ; color: levels,
+    beyond that shift, up to which two colours may be of one thing."""
 
     same: float = 1.0
     other: float = 0.0
@@ -87,14 +87,15 @@ class Scale:
     color: float = OTHER_COLOR
 
     def likeness(self, one: Look, later: Look) -> float:
-        """How far the two are one thing: about 1 for one, 0 for two different ones, -inf if forbidden."""
+        """How likely the two are one thing: about 1 for one, 0 for two different ones, -inf where size or colour rule
+        it out."""
         longer, shorter = max(one.length, later.length), min(one.length, later.length)
         if longer > OTHER_SIZE * shorter or not one.has_color_of(later, self.color, self.shift):
             return -np.inf
         return self.cosine(one, later)
 
     def cosine(self, one: Look, later: Look) -> float:
-        """The same by their descriptors alone; -inf where one has none."""
+        """The same by descriptors alone; -inf where one has none."""
         if not (len(one.descriptors) and len(later.descriptors)):
             return -np.inf
         cosine = float((one.descriptors @ later.descriptors.T).max()) * np.sqrt((1 + one.spread) * (1 + later.spread))
@@ -108,31 +109,32 @@ def descriptors_of(table: InstanceTable, instance: int) -> tuple[NDArray[np.floa
 
 
 def cosines(one: InstanceTable, other: InstanceTable) -> NDArray[np.float64]:
-    """(len(one), len(other)) cosines as endless views would give them, of the nearest descriptors; -inf without."""
-    wide = [np.sqrt(1 + spread_of(table.agreement, table.masks))[table.descriptor_instance] for table in (one, other)]
-    found = np.full((len(one), len(other)), -np.inf)
+    """(len(one), len(other)) cosines of the two nearest descriptors, corrected for spread; -inf without any."""
+    factors = [np.sqrt(1 + spread_of(t.agreement, t.masks))[t.descriptor_instance] for t in (one, other)]
+    nearest = np.full((len(one), len(other)), -np.inf)
     rows = np.ix_(one.descriptor_instance, other.descriptor_instance)
-    np.maximum.at(found, rows, (one.descriptors @ other.descriptors.T) * np.outer(*wide))
-    return found
+    np.maximum.at(nearest, rows, (one.descriptors @ other.descriptors.T) * np.outer(*factors))
+    return nearest
 
 
 def typical_cosine(rows: NDArray[np.floating], spread: NDArray[np.float64]) -> float:
-    """The median cosine of two of some descriptors (r, D), each of another thing and off by a squared tangent (r,), as
-    endless views would give it; 0 where there are no two."""
-    rows, wide = rows[:MOST_ROWS], np.sqrt(1 + spread[:MOST_ROWS])
-    between = ((rows @ rows.T) * np.outer(wide, wide))[np.triu_indices(len(rows), 1)]
+    """The median cosine of any two of the descriptors (r, D), each of another thing, corrected for their spread (r,); 0
+    where there are no two."""
+    rows, factors = rows[:MOST_ROWS], np.sqrt(1 + spread[:MOST_ROWS])
+    between = ((rows @ rows.T) * np.outer(factors, factors))[np.triu_indices(len(rows), 1)]
     return float(np.median(between)) if len(between) else 0.0
 
 
 def spread_of(agreement: ArrayLike, masks: ArrayLike) -> NDArray[np.float64]:
-    """(n,) the squared tangent that means of mask features are off by.
+    """(n,) the spread s of means of mask features, as in the module's text.
 
-    agreement: (n,) mean cosine of the features with their own mean; masks: (n,) how many there are. As each is in the
-    mean, the agreement's square is expected to be a^2 + (1 - a^2) / m. Few masks tell little: they are taken to agree
-    as is usual in the scene.
+    agreement: (n,) mean cosine of the features with their own mean; masks: (n,) how many there are, m. As each feature
+    is part of the mean, the square of their agreement is expected to be a^2 + (1 - a^2) / m. Few masks say little of a:
+    they are taken to agree as is usual in the scene.
     """
     masks = np.asarray(masks, np.float64)
-    others, told = np.maximum(masks - 1, 0), np.maximum(masks * np.asarray(agreement, np.float64) ** 2 - 1, 0)
-    usual = told.sum() / max(others.sum(), 1e-12)
-    square = np.clip((told + USUAL_MASKS * usual) / (others + USUAL_MASKS), LEAST_AGREEMENT, 1)
+    # Solved for a^2, that is (m agreement^2 - 1) / (m - 1): numerator and denominator add up over instances.
+    excess, others = np.maximum(masks * np.asarray(agreement, np.float64) ** 2 - 1, 0), np.maximum(masks - 1, 0)
+    usual = excess.sum() / max(others.sum(), 1e-12)
+    square = np.clip((excess + USUAL_MASKS * usual) / (others + USUAL_MASKS), LEAST_AGREEMENT, 1)
     return (1 - square) / square / np.maximum(masks, 1)

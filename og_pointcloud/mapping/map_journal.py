@@ -1,10 +1,10 @@
-"""A map on disk while it grows: kill -9 at any moment loses at most the frame in work.
+"""A map on disk while it grows: a kill -9 at any moment loses at most the frame being integrated.
 
-A folder with two files of records, each with its length and checksum. ``frames.log`` is append-only: each integrated
-frame; a torn last one is cut off. ``map.state`` is the whole map at some frame, replaced in one step; the log then
-begins anew. A start with the folder reads the state and integrates the frames of the log again: the map is the one that
-was left, and disk follows the map and not the time. Nothing is pickled: a record is a tree of plain values and of
-records named in KINDS, as JSON, and the arrays in it, as .npy.
+The folder holds two files of records, each record with its length and checksum. To ``frames.log`` each integrated frame
+is appended; a torn last one is cut off. ``map.state`` is the whole map at some frame, replaced in one step; the log
+then begins anew. A mapper that is started with the folder reads the state and integrates the frames of the log again:
+this gives the very map that was left, and the space on disk grows with the map, not with time. Nothing is pickled: a
+record is a tree of plain values and of the dataclasses named in KINDS, as JSON, and the arrays in it, as .npy.
 """
 
 from __future__ import annotations
@@ -42,8 +42,9 @@ KINDS = {
         Tracks, VoxelHash, VoxelPoints,
     )
 }  # fmt: skip
-"""Records that a file may hold, by name."""
+"""Dataclasses that a record may hold, by name: nothing else is ever made from a file."""
 HEAD = struct.Struct("<4sQI")
+"""Of a record: MAGIC, bytes that follow, and their CRC-32."""
 MAGIC = b"OGF2"
 LOG_BYTES = 1 << 27
 """Bytes of frames after which the whole map is written and the log begins anew."""
@@ -79,11 +80,13 @@ class MapJournal:
         return known
 
     def frames(self) -> Iterator[Frame]:
-        """The frames since then, in their order. A torn one at the end is cut off, and work goes on behind it."""
+        """The frames since that map, in their order. A torn one at the end is cut off, so that new ones follow whole
+        ones."""
         if not self._log.is_file():
             return
         whole = 0
         with self._log.open("rb") as file:
+            # It is about to be cut and written to: not through a link, and not if it is a file of something else.
             if self._log.is_symlink() or file.peek(4)[:4] != MAGIC[: self._log.stat().st_size]:
                 raise OgPointcloudError(
                     f"{self._log} was not written by a map: it is left as it is; give another folder"
@@ -95,10 +98,11 @@ class MapJournal:
             os.truncate(self._log, whole)
 
     def append(self, frame: Frame, known: GrowingMap) -> None:
-        """Write a frame behind the others; once the log is long, the map that it led to, and the log begins anew. A
-        kill in between leaves frames that the map has already: their stamps are among its recent ones."""
-        if frame.masks is not None and frame.masks.max(initial=0) < 1 << 15:
-            frame = replace(frame, masks=frame.masks.astype(np.int16))
+        """Write a frame behind the others; once the log is long, write the map that it led to and begin the log anew. A
+        kill between these two leaves frames that the map has already: their stamps are among its recent ones."""
+        if frame.masks is not None:
+            masks = np.maximum(np.asarray(frame.masks, np.int64), -1)  # below -1 is outside too, but may not fit 16 bits
+            frame = replace(frame, masks=masks.astype(np.int16 if masks.max(initial=0) < 1 << 15 else np.int32))
         self._file = self._file or self._log.open("ab")
         self._file.write(_record(frame))
         self._file.flush()
@@ -115,7 +119,7 @@ def _record(value: Any) -> bytes:
 
 
 def _next_record(file: io.BufferedReader) -> bytes | None:
-    """A whole record, None at the end or where the rest is torn."""
+    """The bytes of the next whole record; None at the end, or where the rest is torn."""
     head = file.read(HEAD.size)
     if len(head) < HEAD.size:
         return None
@@ -127,7 +131,12 @@ def _next_record(file: io.BufferedReader) -> bytes | None:
 
 
 def packed(value: Any) -> bytes:
-    """A tree of plain values, lists, tuples, dictionaries, arrays and records of KINDS as bytes."""
+    """A tree of plain values, lists, tuples, dictionaries, arrays and dataclasses of KINDS as bytes: parts, each behind
+    its length (8 bytes), the first the tree as JSON, the others its arrays.
+
+    In the JSON only lists and plain values stand for themselves. Everything else is an object with one entry, which
+    names the kind: {"array": its number}, {"tuple": [...]}, {"dict": [[key, value], ...]}, {"Camera": [its fields]}.
+    """
     arrays: list[NDArray[Any]] = []
 
     def tree(value: Any) -> Any:
@@ -142,13 +151,13 @@ def packed(value: Any) -> bytes:
             return {"tuple": [tree(entry) for entry in value]}
         return [tree(entry) for entry in value] if isinstance(value, list) else value
 
-    text = json.dumps(tree(value), default=lambda number: number.item()).encode()
+    text = json.dumps(tree(value), default=lambda number: number.item()).encode()  # numpy scalars
     parts = [text, *map(npy_bytes, arrays)]
     return b"".join(piece for part in parts for piece in (struct.pack("<Q", len(part)), part))
 
 
 def unpacked(data: bytes, source: str) -> Any:
-    """What was `packed`. OgPointcloudError, which names the source, for anything else."""
+    """The value that was `packed`. OgPointcloudError, which names the source, for bytes that are anything else."""
     parts, at = [], 0
 
     def value(tree: Any) -> Any:
@@ -158,7 +167,7 @@ def unpacked(data: bytes, source: str) -> Any:
             return tree
         ((kind, of),) = tree.items()
         if kind == "array":
-            return array_from_npy(parts[1 + of]).copy()
+            return array_from_npy(parts[1 + of]).copy()  # writable: the map goes on growing
         entries = [value(entry) for entry in of]
         return dict(entries) if kind == "dict" else tuple(entries) if kind == "tuple" else KINDS[kind](*entries)
 

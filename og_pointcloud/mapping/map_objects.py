@@ -1,4 +1,4 @@
-"""Objects of a growing map: tracks that get an id, leave with most of their points, and are known when they return."""
+"""Objects of a growing map: tracks that get an id, leave with most of their points, and keep it when they come back."""
 
 from __future__ import annotations
 
@@ -17,9 +17,10 @@ from og_pointcloud.mapping.tracks import NO_TRACK
 @dataclass(frozen=True)
 class MapObject:
     """An object as it is known now. place: (3,) median of its points, world coordinates; size: (3,) along the axes.
-    state: "present"; "moved", present where it was not at first; "unseen", of an earlier map, where no frame has looked
-    since; or "gone", then where it was last. since: the stamp from which on most of its points have been seen there,
-    -inf for those of an earlier map, inf for what left; last_seen: the stamp of the last frame that showed it."""
+    state: "present"; "moved": present, but not where it was at first; "unseen": part of an earlier map, where no frame
+    has looked since; "gone": place and size are those it had last. since: the stamp from which on most of its points
+    have been seen there, -inf for those of an earlier map, inf for what left; last_seen: the stamp of the last frame
+    that showed it."""
 
     id: int
     state: str
@@ -33,8 +34,8 @@ class MapObject:
 
 
 def objects_of(known: GrowingMap) -> list[MapObject]:
-    """By id: objects that two frames or more have shown, and those that left."""
-    found = []
+    """In the order of ids: objects that two frames or more have shown, and those that left."""
+    objects = []
     for id_, k in sorted(known.tracks.by_id().items()):
         track, rows = known.tracks.tracks[k], known.rows_of(k)
         if track.left:
@@ -46,20 +47,21 @@ def objects_of(known: GrowingMap) -> list[MapObject]:
         else:
             continue
         since = known.stamp_of(int(np.median(known.kept.born[rows]))) if len(rows) else np.inf
-        found.append(
+        objects.append(
             MapObject(id_, state, place, size, len(rows), track.views, since, track.last_seen, track.descriptor)
         )
-    return found
+    return objects
 
 
 def leave(known: GrowingMap, died: NDArray[np.int32], stamp: float) -> list[int]:
-    """Remove points that a frame of that stamp saw through; the ids of objects that left with most of theirs."""
+    """Remove points that must leave after a frame of that stamp. Returns the ids of objects that left with them, as
+    most of their points did."""
     owners = known.votes.best(died, known.tracks.root)
     known.points.weight[died] = 0
     gone = []
     for k in np.unique(owners[owners >= 0]).tolist():
         track = known.tracks.tracks[k]
-        # What was measured again since is not lost: a reading that was off had removed it.
+        # Points that were measured again since then are not lost: readings that were off had removed them.
         lost = [row for row in track.lost if known.points.weight[row] == 0]
         track.losing_since = track.losing_since if lost else stamp
         track.lost = lost + died[owners == k].tolist()
@@ -70,14 +72,16 @@ def leave(known: GrowingMap, died: NDArray[np.int32], stamp: float) -> list[int]
 
 
 def _has_left(known: GrowingMap, k: int) -> bool:
-    """Whether most of a track's visible points left; then the others leave too, but for what was measured since."""
+    """Whether most of a track's visible points left; then its others leave too, but for those measured since."""
     track, rows = known.tracks.tracks[k], known.rows_of(k)
-    # What no frame has looked at since is no sign that it is still there; a small part of the whole none that it went.
+    # Lost must be most of what was looked at since the first point was lost: what no frame has looked at since is no
+    # sign that the object is still there. And it must be a fair share of all its points: a small part is not the whole.
     still = rows[(known.presence.odds[rows] > 0) & (known.presence.seen_at[rows] >= track.losing_since)]
     lost = len(track.lost)
     if lost <= max(MOST * (lost + len(still)), FLAT_SHARE * (lost + len(rows))):
         return False
-    # What it stood before, and its masks held too, is still there: it looked as what left does.
+    # Points that are still measured lie on what it stood before and its masks had covered too: they stay, without
+    # votes, and how the object looked is told by the others.
     leaving = np.setdiff1d(rows, still)
     gone = np.append(np.array(track.lost, np.int32), leaving)
     track.left, track.left_at, track.lost = _look(known, k, gone), track.sequence, []
@@ -89,15 +93,19 @@ def _has_left(known: GrowingMap, k: int) -> bool:
 def name(
     known: GrowingMap, new: list[int], again: list[int], gone: list[int]
 ) -> tuple[tuple[int, ...], tuple[Moved, ...]]:
-    """Ids for tracks that are objects now: of something that left, if it looks so, else the next one. What was named
-    before it was known that the other had left is asked again when that is, and each time its views have doubled."""
+    """Give ids to tracks that are objects now: the id of something that left, if it looks like that, else the next one.
+    Returns fresh ids, and what moved.
+
+    An object may be seen at its new place, and be named, before it is seen to be gone from the old one. So all objects
+    are compared again when one leaves, and each one again whenever its number of views has doubled.
+    """
     tracks, moved = known.tracks.tracks, []
-    doubled = (k for k in again if tracks[k].views & (tracks[k].views - 1) == 0)
+    doubled = (k for k in again if tracks[k].views & (tracks[k].views - 1) == 0)  # a power of two
     asked = [*new, *(known.tracks.by_id().values() if gone else doubled)]
     if asked and any(track.left for track in tracks):
         scale = known.tracks.scale()
         for k in asked:
-            if known.tracks.root[k] == k and not tracks[k].left:
+            if known.tracks.root[k] == k and not tracks[k].left:  # by now it may be joined into another, or have left
                 moved += _returned(known, k, scale)
     ids = []
     for k in new:
@@ -119,8 +127,9 @@ def _look(known: GrowingMap, k: int, rows: NDArray[np.integer]) -> Look:
 def _returned(known: GrowingMap, k: int, scale: Scale) -> list[Moved]:
     """Give a track the id of what left, if anything that left looks like it.
 
-    It looks as its points do that came after the other was last seen. What has hardly any such points stood here
-    already; what masks had shown before must have most of its points so: it may only have been seen from behind since.
+    Only its points that came after the other was last seen are compared. A track with hardly any such points stood here
+    already. If masks had shown it before, most of its points must be such: else it may only have been seen from another
+    side since.
     """
     track, rows = known.tracks.tracks[k], known.rows_of(k)
     came, alike = {}, {}
@@ -136,5 +145,6 @@ def _returned(known: GrowingMap, k: int, scale: Scale) -> list[Moved]:
     gone = known.tracks.tracks[known.tracks.by_id()[best]]
     assert gone.left is not None
     moved = Moved(best, gone.left.place, known.place_of(came[best]), best)
+    # The id goes over to this track; the old one, without points, is let go at the next pruning.
     gone.id, gone.left, track.id, track.moved = NO_TRACK, None, best, True
     return [moved]

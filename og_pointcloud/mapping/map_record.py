@@ -1,7 +1,8 @@
 """What a map knows of its instances beyond one visit: when each was last seen, and what became of it.
 
-It is kept in the cloud's provenance under "map", as plain JSON, so that files of before are maps too: all is present.
-Ids are rows of the instance table and are never given twice: what left keeps its row, without points.
+It is kept in the cloud's provenance under "map", as plain JSON. A file without it, as `fit` writes, is a map too: of
+one visit, in which all was present. Ids are rows of the instance table and are never given twice: an instance that left
+keeps its row, without points.
 """
 
 from __future__ import annotations
@@ -30,8 +31,8 @@ class VisitEntry:
 @dataclass
 class MapRecord:
     """visits: in their order. last_seen: by id, the stamp of the visit that last looked at the instance. moved_from: by
-    id, where it was before it moved last. gone: by id, how what left and has not come back looked: its descriptors are
-    those that its row of the table still has."""
+    id, where it was before it moved last. gone: by id, for instances that left and have not come back, how they looked;
+    their descriptors are not stored twice, as the table still has them."""
 
     visits: list[VisitEntry] = field(default_factory=list)
     last_seen: dict[int, float] = field(default_factory=dict)
@@ -40,7 +41,7 @@ class MapRecord:
 
     @classmethod
     def of(cls, cloud: LabelledCloud) -> MapRecord:
-        """The record of a map; of a cloud that a fit made, one visit that saw every instance.
+        """The record of a map; of a cloud as a fit makes it, one visit that saw every instance.
 
         OgPointcloudError where a file holds something else under that name.
         """

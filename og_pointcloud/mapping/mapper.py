@@ -1,9 +1,10 @@
 """A map that grows with every frame, and knows what came, went and moved.
 
-A frame is checked, then judged: which points of the map it measures again, sees through, cannot see. Its depth adds
-points; its masks vote (`tracks`); what it shows is kept as rows of the mask table (`kept_views`), and the frame itself
-is let go. Points seen through from two places leave, and an object leaves with most of its visible points. All of that
-touches only what the frame sees. `snapshot` and `finish` then label every point by the batch rule from the rows kept.
+A frame is checked, then compared with the map: which points it measures again, which it sees through, which it cannot
+see. Its depth adds points; its masks vote (`tracks`); what it shows is kept as rows of the mask table (`kept_views`),
+and the frame itself is let go. Points seen through from two places leave, and an object leaves with most of its visible
+points. All of this touches only what the frame sees. `snapshot` and `finish` then label every point by the batch rule
+from the rows kept.
 """
 
 from __future__ import annotations
@@ -40,19 +41,20 @@ from og_pointcloud.scene import Points, require_finite
 from og_pointcloud.settings import FitSettings, fit_settings
 
 PIXELS_PER_SPACING = 4.0
-"""Pixels of the first depth image, at its median depth, to a spacing of a map that starts empty."""
+"""The spacing of a map that starts empty, in pixels of the first depth image at its median depth."""
 PRUNED_EVERY = 64
 """Frames after which tracks that came to nothing are let go."""
 USUAL_SHARE = 0.3
-"""Part of an object's points that a usual frame shows."""
+"""Share of an object's points that a frame usually shows: an earlier map does not say it."""
 KNOWN_VOTES = 8.0
-"""Votes that a point of an earlier map has for its instance."""
+"""Votes that a point of an earlier map has for its instance; frames can outvote them."""
 
 
 @dataclass(frozen=True)
 class FrameChange:
-    """What a frame changed, by object ids. new: objects seen for the first time often enough; updated: seen again;
-    gone: most of their visible points were seen through; moved: where they were and are. seconds: it took."""
+    """What a frame changed, by object ids. new: objects that enough frames have shown now; updated: objects seen again;
+    gone: objects of which most visible points were seen through; moved: where they were and are. seconds: time taken.
+    """
 
     new: tuple[int, ...] = ()
     updated: tuple[int, ...] = ()
@@ -64,8 +66,8 @@ class FrameChange:
 class Mapper:
     """See the module.
 
-    start: a map (.ogpc, scene or cloud) to go on with; None: an empty one, which grows by depth. cloud: whose geometry
-    is known, so that frames need bring masks alone: (N, 3) world coordinates, `Points`, or whatever `og.segment` takes.
+    start: a map (.ogpc, scene or cloud) to go on with; None: an empty one, which grows by depth. cloud: geometry that is
+    known, so that frames need only bring masks: (N, 3) world coordinates, `Points`, or whatever `og.segment` takes.
     spacing: of a map that starts empty, world lengths; None: by the first depth image. feature_space: the name of the
     masks' encoder. journal: a folder that holds the map while it grows (`map_journal`); one that holds it already is
     gone on with.
@@ -131,6 +133,7 @@ class Mapper:
         for k in range(len(table)):
             rows = table.descriptors[table.descriptor_instance == k].astype(np.float64)
             pixels = float(max(USUAL_SHARE * table.points[k] * table.masks[k], 1e-6))
+            # The sum of features that gives the track the descriptor's direction and the table's agreement.
             mean = rows.sum(axis=0)
             length = float(np.linalg.norm(mean))
             total = mean * (float(table.agreement[k]) * pixels / length) if length else None
@@ -153,9 +156,9 @@ class Mapper:
         return f"{len(xyz)} points (checksum {zlib.crc32(np.ascontiguousarray(xyz).tobytes())})"
 
     def _resumed(self, journal: MapJournal) -> MapJournal:
-        """Take up what a journal holds."""
+        """Go on from what a journal holds."""
         self._map = journal.state() or self._map
-        self._journal = None
+        self._journal = None  # frames of the journal are not written to it again
         for frame in journal.frames():
             if self._map is None or frame.stamp not in self._map.recent:
                 self.integrate(frame)
@@ -173,7 +176,7 @@ class Mapper:
 
     @property
     def nbytes(self) -> int:
-        """Bytes of what is kept of the frames; points and votes take about 150 bytes a point beside."""
+        """Bytes of what is kept of the frames; points and votes take about 150 bytes a point on top of that."""
         return 0 if self._map is None else self._map.kept.nbytes
 
     def integrate(self, frame: Frame) -> FrameChange:
@@ -212,7 +215,8 @@ class Mapper:
     def snapshot(self) -> LabelledScene:
         """The map as a scene like any other, by the batch rule over what was kept; made once while nothing changes.
 
-        Of a map that was gone on with: with this visit folded in, as `og.update` does. SceneError while it has no mask.
+        If the mapper went on with a map, this is that map with the visit folded in, as by `og.update`. SceneError while
+        it has no mask.
         """
         known = self._map
         if known is None or not known.kept.views:
@@ -225,7 +229,8 @@ class Mapper:
 
     @property
     def changes(self) -> Changes | None:
-        """What the latest snapshot found changed since the map that was gone on with; None where there was none."""
+        """What the latest snapshot found changed since the map that the mapper went on with; None where there is
+        none."""
         return self._changes
 
     def save(self, path: str | os.PathLike[str]) -> Path:
@@ -235,7 +240,8 @@ class Mapper:
         return import_module("og_pointcloud_export").write_bundle(self.snapshot().cloud, path)
 
     def correct(self, poses: Mapping[float, ArrayLike]) -> None:
-        """After a loop closure: stamp -> corrected world_to_camera (4, 4) of that frame, from world coordinates.
+        """Move the map after a loop closure. poses: stamp -> corrected world_to_camera (4, 4) of that frame, from world
+        coordinates.
 
         Points move with the frame that brought them, kept views with theirs; the points of a known cloud stay.
         SceneError for what is no pose; then nothing moves.
@@ -247,7 +253,7 @@ class Mapper:
             self._around = None
 
     def _checked(self, frame: Frame) -> tuple[CheckedFrame, GrowingMap]:
-        """The frame, and the map that it goes into, which it begins where there is none."""
+        """The frame, and the map that it goes into: an empty one where there is none yet."""
         known = self._map
         if known is not None:
             given = checked(frame, known.origin, known.space, known.stamp + 1)
@@ -259,7 +265,7 @@ class Mapper:
                     f"frame {given.stamp:g} has no depth, and the map has no points yet; expected depth or a cloud: "
                     "start with Mapper(cloud=points), or with a map, where frames have masks alone"
                 )
-            # A sparse depth image is looked at with larger pixels than it has; many frames fill the map between them.
+            # By the image's own pixels: a sparse one is read with larger ones, but many frames fill the map in between.
             pixel = given.view.pixel * given.view.camera.fx / given.camera.fx
             spacing = self._spacing or max(PIXELS_PER_SPACING * pixel, given.view.pixel)
             known = GrowingMap.empty(origin, self._space, spacing)
@@ -268,8 +274,9 @@ class Mapper:
     def _label(self, known: GrowingMap) -> LabelledCloud:
         """The points that are there, labelled by the batch rule, with the ids that objects have."""
         chosen, around = known.points.alive, self._around
-        if self._base is not None:
+        if self._base is not None:  # this visit is what its frames have looked at
             chosen &= known.presence.seen_at[: known.points.n] > -np.inf
+        # Points that were given at the start in the order in which they were given, then those that frames brought.
         rows = np.concatenate([self._rows, np.arange(len(self._rows), known.points.n)])
         rows = rows[chosen[rows]]
         if around is None or len(around.spacing) != len(rows):
@@ -285,9 +292,9 @@ class Mapper:
         return with_ids(visit, wanted, count)
 
     def _folded(self, base: LabelledCloud, visit: LabelledCloud, known: GrowingMap) -> LabelledCloud:
-        """The map that was gone on with, and this visit."""
+        """The map that the mapper went on with, and this visit."""
         alive, presence = known.points.alive[self._rows], known.presence
-        again = alive & presence.present[self._rows], ~alive | presence.absent[self._rows]
+        again = alive & presence.present[self._rows], ~alive | presence.absent[self._rows]  # measured; seen through
         earlier, later = Visit(base), Visit(visit)
         found = compare_visits(earlier, later, again)
         updated = merge(earlier, later, found, "frames", known.stamp)

@@ -1,7 +1,8 @@
 """A later visit folded into a map: what left is taken out, what came is added, what moved keeps its id.
 
-Points of the map that are seen through are removed, and all points of what left, but for those that are still measured:
-the floor below it. Points of the visit are added where the map has none. What was not looked at stays as it was.
+Points of the map that are seen through are removed, and so are all points of what left, except those that are still
+measured, as of the floor below it. Points of the visit are added where the map has none. What was not looked at stays
+as it was.
 """
 
 from __future__ import annotations
@@ -34,8 +35,8 @@ MOST_CAMERAS = 2000
 
 @dataclass(frozen=True)
 class Updated:
-    """cloud: the map after the visit. changes: gone and unseen by their ids of before, new and moved by those of the
-    new map; ids that both have mean the same thing."""
+    """cloud: the map after the visit. changes: gone and unseen by ids of the map before it, new and moved by ids of the
+    map after it; an id that both have means the same thing in both."""
 
     cloud: LabelledCloud
     changes: Changes
@@ -52,8 +53,8 @@ def update(
     """Fold a later capture of the same place, or of a part of it, into a map.
 
     capture: in the map's world frame, with points of its own. depth: what its views measured, in the map's local frame
-    (`sight.view_of_depth`); None: as its points show it. FeatureSpaceError for masks of another encoder, SceneError for
-    a capture that does not lie where the map does; the map is never changed.
+    (`sight.view_of_depth`); None: what its points show. FeatureSpaceError for masks of another encoder, SceneError for
+    a capture that does not lie where the map does. The map that is given stays as it is: the new one is a copy.
 
     >>> print(og.update(wall, scene, progress=False).changes)  # of `fit`'s example
     0 gone, 0 new, 0 moved, 0 not seen again
@@ -74,6 +75,7 @@ def merge(earlier: Visit, later: Visit, found: Comparison, name: str, stamp: flo
     a, b = earlier.cloud, later.cloud
     stays, orphaned = _staying(earlier, found)
     ids_of_later = _ids_of_later(earlier, later, stays, found)
+    # Of the visit, only what lies where the map has nothing (left) is added: the map does not get denser by visits.
     adds: NDArray[np.bool_] = np.ones(len(b), bool)
     if stays.any():
         adds = nearest_in(cKDTree(a.xyz[stays]), b.xyz)[0] > SAME_PLACE * a.spacing
@@ -101,42 +103,44 @@ def merge(earlier: Visit, later: Visit, found: Comparison, name: str, stamp: flo
 
 
 def _staying(earlier: Visit, found: Comparison) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """(n,) bool each of the map's points: those that stay, and those of them that have lost what they were part of."""
+    """(n,) bool each of the map's points: those that stay; and those that stay though their instance left."""
     ids, still, through = earlier.cloud.instance_ids, found.evidence.still, found.evidence.through
     left, unseen = np.zeros((2, len(earlier.cloud.instances) + 2), bool)  # rows -2 and -1: unobserved and background
     left[[*found.changes.gone, *found.gone_pieces]] = True
     unseen[list(found.changes.unseen)] = True
-    unseen[:-2] &= earlier.count(through) >= FEWEST_POINTS  # fewer are strays
+    # An instance of which it is not known whether it left keeps even the points that were seen through, unless these
+    # are a few strays.
+    unseen[:-2] &= earlier.count(through) >= FEWEST_POINTS
     return (~through | unseen[ids]) & (~left[ids] | still), left[ids] & still
 
 
 def _ids_of_later(earlier: Visit, later: Visit, stays: NDArray[np.bool_], found: Comparison) -> NDArray[np.int64]:
-    """(later instances,) their ids in the map.
-
-    What moved has its old id, what came a fresh one, what was there the id that most of its surface has; what the map
-    did not know a fresh one too.
+    """(later instances,) their ids in the map: its old id for what moved, a fresh one for what came, for what was there
+    already the id that most of its surface has, and a fresh one too for what the map did not know.
     """
     count = fresh = len(earlier.cloud.instances)
     on_map = (found.nearest >= 0) & stays[found.nearest]
     shared = later.shared(np.where(on_map, earlier.cloud.instance_ids[found.nearest], UNOBSERVED), count)
     best, most = shared.argmax(axis=1), shared.max(axis=1)
-    was_there = (best < count) & (most >= FEWEST_POINTS) & (most > MOST * shared.sum(axis=1))
-    known, came = np.where(was_there, best, -1), {moved.now: moved.id for moved in found.changes.moved}
-    for k in range(len(known)):
+    was_there = (best < count) & (most >= FEWEST_POINTS) & (most > MOST * shared.sum(axis=1))  # column count: on none
+    map_ids, came = np.where(was_there, best, -1), {moved.now: moved.id for moved in found.changes.moved}
+    for k in range(len(map_ids)):
+        # All pieces of a thing that came get one id: the one it had, if it moved, else the first piece's fresh one.
         thing = found.pieces.get(k)
         if thing is not None:
-            known[k] = came.get(thing, -1)
-        if known[k] < 0:
-            known[k], fresh = fresh, fresh + 1
+            map_ids[k] = came.get(thing, -1)
+        if map_ids[k] < 0:
+            map_ids[k], fresh = fresh, fresh + 1
         if thing is not None:
-            came[thing] = int(known[k])
-    return known
+            came[thing] = int(map_ids[k])
+    return map_ids
 
 
 def _relabelled(
     a: LabelledCloud, b: LabelledCloud, orphaned: NDArray[np.bool_], states: NDArray[np.int64]
 ) -> NDArray[np.int64]:
-    """(n,) ids of the map's points: what lost its instance, or had never been seen, is what the visit says of it."""
+    """(n,) ids of the map's points. Points that lost their instance, or had never been seen, take the id of the visit's
+    nearest point on the same surface."""
     ids = np.where(orphaned, BACKGROUND, a.instance_ids).astype(np.int64)
     asked = np.flatnonzero(orphaned | (ids == UNOBSERVED))
     distance, nearest = nearest_in(cKDTree(b.xyz), a.xyz[asked])
@@ -148,7 +152,7 @@ def _relabelled(
 def joined(
     a: InstanceTable, b: InstanceTable, ids_of_b: NDArray[np.integer], ids: NDArray[np.integer]
 ) -> InstanceTable:
-    """One table of both: evidence of one id adds up, and its descriptors count by their masks.
+    """One table of both: counts under one id add up, means are weighted by the number of masks.
 
     ids_of_b: (len(b),) the id that each instance of b gets; those of a keep theirs. ids: (n,) of all points.
     """
@@ -176,26 +180,28 @@ def joined(
 def _descriptors(
     a: InstanceTable, b: InstanceTable, ids_of_b: NDArray[np.integer], count: int
 ) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-    """Rows of one id with one descriptor in each visit become their mean; others stay as the map, or the visit, has."""
+    """Descriptors of each id, and the id of each. One descriptor in the map and one in the visit become their mean,
+    weighted by masks. Where either has several, which of them belong together is not known: the map's stay, or the
+    visit's where the map has none."""
     nothing = np.zeros((0, max(a.descriptors.shape[1], b.descriptors.shape[1])))
-    own, weight = [nothing] * count, np.zeros(count)
+    of_id, weight = [nothing] * count, np.zeros(count)
     for table, ids in ((a, np.arange(len(a))), (b, ids_of_b)):
         for k, target in enumerate(ids.tolist()):
             rows = table.descriptors[table.descriptor_instance == k].astype(np.float64)
-            if len(own[target]) == 0:
-                own[target] = rows
-            elif len(own[target]) == len(rows) == 1:
-                mean = weight[target] * own[target] + table.masks[k] * rows
-                own[target] = mean / max(float(np.linalg.norm(mean)), 1e-12)
+            if len(of_id[target]) == 0:
+                of_id[target] = rows
+            elif len(of_id[target]) == len(rows) == 1:
+                mean = weight[target] * of_id[target] + table.masks[k] * rows
+                of_id[target] = mean / max(float(np.linalg.norm(mean)), 1e-12)
             weight[target] += table.masks[k]
-    owners = np.repeat(np.arange(count, dtype=np.int32), [len(rows) for rows in own])
-    return np.concatenate([nothing, *(rows for rows in own if len(rows))]).astype(np.float32), owners
+    owners = np.repeat(np.arange(count, dtype=np.int32), [len(rows) for rows in of_id])
+    return np.concatenate([nothing, *(rows for rows in of_id if len(rows))]).astype(np.float32), owners
 
 
 def _note(
     record: MapRecord, earlier: Visit, found: Comparison, ids_of_later: NDArray[np.int64], entry: VisitEntry
 ) -> None:
-    """Write into the record what the visit saw: an instance that was not looked at keeps its time."""
+    """Write into the record what the visit saw; an instance that it did not look at keeps the time it was last seen."""
     record.visits.append(entry)
     looked_at = earlier.count(found.evidence.still) >= FEWEST_POINTS
     looked_at[list(found.changes.unseen)] = False
@@ -204,5 +210,6 @@ def _note(
     for moved in found.changes.moved:
         record.moved_from[moved.id] = tuple(moved.before.tolist())
         record.gone.pop(moved.id, None)
+    # Smaller pieces of what moved are rows without points too: the thing goes on under the id of its largest piece.
     for k in {*found.changes.gone, *(piece for piece, thing in found.gone_pieces.items() if piece != thing)}:
         record.gone[k] = earlier.look(k, earlier.rows[k])

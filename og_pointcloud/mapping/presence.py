@@ -1,9 +1,9 @@
 """Whether points are still there, from all that views measured, and what that says of the instances of a visit.
 
-A view that measures a surface where a point lies speaks for it, one that looks through its place against it. Of a map
-that grows the sum is bounded, so that a long history cannot outvote what is seen today. One place alone refutes
-nothing: a point is absent only where it was seen through from two directions. A view in which no mask shows a thing is
-no evidence at all.
+A view that measures a surface where a point lies speaks for it, one that looks through its place speaks against it. In
+a map that grows the sum is bounded, so that a long history cannot outvote what is seen today. Views from one place
+alone refute nothing: a point is absent only if it was seen through from two directions. A view in which no mask shows
+an object is no evidence that it is absent: proposers miss things.
 """
 
 from __future__ import annotations
@@ -29,38 +29,39 @@ from og_pointcloud.scene import Camera
 from og_pointcloud.settings import GeometrySettings
 
 APART = 0.998
-"""Cosine between two directions of sight, from the point, that are two places: 3.6 degrees."""
+"""Cosine between two directions of sight, from the point, below which they count as two: 3.6 degrees."""
 TOLERANCE = 0.5
-"""Spacings at right angles to a surface up to which a point is of it."""
+"""Distance in spacings, at right angles to a surface, up to which a point lies on it."""
 SCATTER = 2.0
-"""Standard deviations of the points off their surface, where that is more: of dense and noisy clouds."""
+"""The same in standard deviations of points off their surface; the larger of the two holds, this one in dense and noisy
+clouds."""
 MOST = 0.5
-"""Share of an instance's telling points that decides."""
+"""Share of an instance's points above which they decide for it."""
 FEWEST_POINTS, LEAST_SHARE = 5, 0.05
 """Points of an instance, and share of those that show, that must be looked at before anything is said of it."""
 TELLING = 1.5
-"""Tolerances that a point lies off every other surface about it, to tell of its own thing."""
+"""Tolerances that a point must lie off every other surface near it to be evidence for its own instance alone."""
 FLAT_SHARE = 0.25
-"""Share of what is looked at that must be seen through where most of a thing lies flat on something else."""
+"""Share of what is looked at that must be seen through where most of an object lies flat on something else."""
 ABOUT = 32
-"""Points that stand nearest to each point seen through, by which it is told how much a cloud leaves out there."""
-
+"""Neighbours of each point seen through by which it is estimated how much the other cloud leaves out there."""
 CHANCE = 0.05
-"""Chance up to which points that a cloud lacks are no accident: the usual level of a test."""
+"""Probability below which it is no accident that a cloud lacks points: the usual level of a test."""
 
 
 def tolerance_of(spacing: float, scatter: float) -> float:
-    """Distance from a surface, at right angles to it, up to which a point is of it. scatter: standard deviation of
+    """Distance from a surface, at right angles to it, up to which a point lies on it. scatter: standard deviation of
     points off their surface."""
     return max(TOLERANCE * spacing, SCATTER * scatter)
 
 
 @dataclass
 class Presence(Columns):
-    """Evidence about n points. tolerance: of `tolerance_of`. most: what the odds are bounded by. odds: (n,) float32,
-    views that bear a point out less those that see through it, bounded. refuted: (n,) uint8, directions, up to two,
-    from which it was seen through; first: (n, 3), the first of them. seen_at: (n,) float64, the latest stamp of a view
-    that measured it, or its place; -inf where none did. hidden: (n,) bool, some view measured a surface before it."""
+    """Evidence about n points. tolerance: of `tolerance_of`. most: bound of the odds. odds: (n,) float32, the number of
+    views that confirm a point less those that see through it, within the bound. refuted: (n,) uint8, directions, up to
+    two, from which it was seen through; first: (n, 3), the first of them. seen_at: (n,) float64, the latest stamp of a
+    view that measured it, or its place; -inf where none did. hidden: (n,) bool, some view measured a surface in front
+    of it."""
 
     tolerance: float
     most: float = np.inf
@@ -73,46 +74,47 @@ class Presence(Columns):
 
     @staticmethod
     def by(views: Iterable[MeasuredView], tolerance: float, *clouds: NDArray[np.float32]) -> list[Presence]:
-        """What views say of all points of clouds, each (n, 3)."""
-        found = [Presence(tolerance) for _ in clouds]
-        for presence, xyz in zip(found, clouds, strict=True):
+        """What views say of all points of each cloud (n, 3). Views are gone through once, as each may be read or drawn
+        only then."""
+        presences = [Presence(tolerance) for _ in clouds]
+        for presence, xyz in zip(presences, clouds, strict=True):
             presence.grow(len(xyz))
         for view in views:
-            for presence, xyz in zip(found, clouds, strict=True):
+            for presence, xyz in zip(presences, clouds, strict=True):
                 states = states_of_points(xyz, tolerance, view)
                 presence.take(np.arange(len(xyz)), xyz, states, view.camera.center, 0.0)
-        return found
+        return presences
 
     def take(
         self, rows: NDArray[np.integer], xyz: NDArray[np.float32], states: NDArray[np.int8],
         center: NDArray[np.float64], stamp: float,
     ) -> None:  # fmt: skip
-        """Take in the states (m,) of some rows of xyz (n, 3), seen from a centre. What is older than a point's
-        latest word is not counted: a frame that comes late cannot bring back what has left since."""
+        """Take in the states (m,) of some rows of xyz (n, 3), seen from a camera centre. A state older than the latest
+        counted for its point is left out: a frame that comes late cannot bring back what has left since."""
         self.hidden[rows[states == HIDDEN]] = True
         evidence = self.odds, self.refuted, self.seen_at, self.first
         _count(rows, xyz, states, center, stamp, self.most, evidence)
 
     def left_out(self, lacks: NDArray[np.bool_]) -> NDArray[np.float64]:
-        """(n,) 1 where the views' cloud lacks a point, 0 where it has one, NaN where they measured nothing but what
-        lies before it."""
+        """(n,) float64: ``lacks``, 1 where the views' cloud lacks a point and 0 where it has one; NaN where the views
+        measured only what lies in front of it, and so could not have it."""
         return np.where(self.hidden & (self.odds == 0), np.nan, lacks)
 
     @property
     def present(self) -> NDArray[np.bool_]:
-        """(n,) bool: borne out by more views than see through."""
+        """(n,) bool: confirmed by more views than see through."""
         return self.odds > 0
 
     @property
     def absent(self) -> NDArray[np.bool_]:
-        """(n,) bool: seen through by more views than bear it out, from two places."""
+        """(n,) bool: seen through by more views than confirm it, and from two places."""
         return (self.odds < 0) & (self.refuted > 1)
 
 
 @dataclass(frozen=True)
 class Visit:
-    """A labelled cloud as it is compared. depth: what its views measured by depth images, in its local frame; None: its
-    own cloud, seen from its cameras."""
+    """A labelled cloud as it is compared. depth: what its views measured by depth images, in its local frame; None:
+    what its own cloud shows from its cameras."""
 
     cloud: LabelledCloud
     depth: Iterable[MeasuredView] | None = None
@@ -130,7 +132,7 @@ class Visit:
 
     @cached_property
     def surface(self) -> DiscSurface:
-        """Its cloud, as it is seen."""
+        """Its cloud as a surface that hides what lies behind it."""
         return DiscSurface(self.cloud.xyz, self.around)
 
     @cached_property
@@ -139,7 +141,7 @@ class Visit:
         return neighbourhood(self.cloud.xyz, GeometrySettings())
 
     def measured(self, cameras: Sequence[Camera] | None = None) -> Iterable[MeasuredView]:
-        """What its views measured, or, of its cloud, what views from other places would have."""
+        """What its views measured; or, with cameras, what views from there would measure of its cloud."""
         if self.depth is not None and cameras is None:
             return self.depth
         return (self.surface.seen_from(camera) for camera in (self.cloud.cameras if cameras is None else cameras))
@@ -153,37 +155,40 @@ class Visit:
 
     @cached_property
     def adjoining(self) -> NDArray[np.bool_]:
-        """(instances, instances): those with points that are neighbours of each other's; each adjoins itself."""
-        ids, found = self.cloud.instance_ids, np.eye(len(self.cloud.instances), dtype=bool)
+        """(instances, instances): whether some points of the two are neighbours; each adjoins itself."""
+        ids, touching = self.cloud.instance_ids, np.eye(len(self.cloud.instances), dtype=bool)
         for neighbour in self.around.index.T:
             both = (ids >= 0) & (ids[neighbour] >= 0)
-            found[ids[both], ids[neighbour[both]]] = True
-        return found | found.T
+            touching[ids[both], ids[neighbour[both]]] = True
+        return touching | touching.T
 
     def look(self, instance: int, rows: NDArray[np.int64]) -> Look:
-        """The look of an instance, by some of its points."""
+        """How an instance looks, by some of its points."""
         cloud = self.cloud
         place = (cloud.xyz[rows].astype(np.float64) + cloud.origin).mean(axis=0)
         rgb = None if cloud.rgb is None else cloud.rgb[rows]
         return Look.of_points(*descriptors_of(cloud.instances, instance), place, cloud.xyz[rows], rgb)
 
     def count(self, chosen: NDArray[np.bool_], sure: NDArray[np.floating] | None = None) -> NDArray[np.float64]:
-        """(instances,) how many of each instance's points are chosen, (n,) bool; sure: (n,) what each counts."""
+        """(instances,) how many points of each instance are chosen. chosen: (n,) bool. sure: (n,) what a point counts;
+        None: 1."""
         ids, weight = self.cloud.instance_ids, np.ones(len(chosen)) if sure is None else sure
         rows = np.flatnonzero(chosen & (ids >= 0))
         return np.asarray(np.bincount(ids[rows], weight[rows], len(self.cloud.instances)), np.float64)
 
     def shared(self, owners: NDArray[np.integer], count: int) -> NDArray[np.int64]:
-        """(instances, count + 1) how many points each has on the surface of each of another's ``count`` instances; in
-        the last column on what is none. owners: (n,) the other's instance at each point, UNOBSERVED is not counted."""
+        """(instances, count + 1) how many points of each instance lie on each of another visit's ``count`` instances;
+        in the last column those on background. owners: (n,) the other's instance at each point; UNOBSERVED is not
+        counted."""
         ids = self.cloud.instance_ids
         both = (ids >= 0) & (owners > UNOBSERVED)
-        cell = ids[both] * np.int64(count + 1) + owners[both] % (count + 1)
+        cell = ids[both] * np.int64(count + 1) + owners[both] % (count + 1)  # BACKGROUND, -1, is the last column
         shape = len(self.cloud.instances), count + 1
         return np.bincount(cell, minlength=shape[0] * shape[1]).reshape(shape)
 
     def telling(self, tolerance: float) -> NDArray[np.bool_]:
-        """(n,) bool: points that lie off the surfaces of all other instances about them."""
+        """(n,) bool: points that lie off the surfaces of all other instances near them: something measured there is of
+        their own instance."""
         ids, surface = self.cloud.instance_ids, self.surface
         tells = np.ones(len(ids), bool)
         for neighbour in self.around.index.T:
@@ -194,10 +199,10 @@ class Visit:
 
 @dataclass(frozen=True)
 class Evidence:
-    """Of one visit's points, by another's views, (n,) each, bool. shown: seen by their own visit. still, through: the
-    other visit measures them where they are, or sees through their places. telling: off all surfaces of other things.
-    left_out: float64, 1 where the other visit's cloud, which is all that it measured, has no point, NaN where it could
-    not.
+    """What another visit's views say of one visit's points, (n,) bool each. shown: seen by their own visit. still: the
+    other visit measures them where they are; through: it sees through their places. telling: off all surfaces of other
+    instances. left_out: float64, of a visit without depth images: 1 where its cloud has no point there, NaN where it
+    could have none, being hidden.
     """
 
     shown: NDArray[np.bool_]
@@ -207,33 +212,37 @@ class Evidence:
     left_out: NDArray[np.float64]
 
     def decided(self, visit: Visit) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.bool_]]:
-        """(instances,) bool each: those that are seen through, more than the other visit leaves out of what stands
-        about them; those of them of which that is no accident; and those of which nothing is known: hardly looked at,
-        or left out no more than all about them.
+        """(instances,) bool each: those that likely left, being seen through, and by more than the other cloud leaves
+        out of all that stands near them; those of them that surely did, as this is no accident; and those of which
+        nothing is known: hardly looked at, or left out no more than all near them.
 
-        Each point counts by how sure it is of its instance: a part of the table that a mask took for the book's stays
-        when the book leaves.
+        Each point counts by how sure it is of its instance: a part of the table that masks took for the book's must not
+        keep the book there when it leaves.
         """
         least = np.maximum(FEWEST_POINTS, LEAST_SHARE * visit.count(self.shown))
         seen_through, looked_at = (visit.count(self.shown & of) for of in (self.through, self.through | self.still))
-        sure = None if visit.cloud.certainty is None else visit.cloud.certainty / 255
+        sure = None if visit.cloud.certainty is None else visit.cloud.certainty / 255  # uint8
         still, telling, through = (
             visit.count(self.shown & of, sure) for of in (self.still, self.still & self.telling, self.through)
         )
         most = through > MOST * (through + still)
+        # The underside of what lies flat agrees with the table below when it is gone: there, only points off the table
+        # count against those seen through. Without that majority, these must be a fair share, and of the rest's colour.
         lies_flat = (through > MOST * (through + telling)) & (through > FLAT_SHARE * (through + still)) & ~most
         for k in np.flatnonzero(lies_flat):
             lies_flat[k] = self._of_one_color(visit, int(k))
         left = (seen_through >= least) & (most | lies_flat)
+        # A sparse cloud lacks this share of what stands near by. Were the instance still there, each of its points
+        # would be missing with that probability: at least seen_through of looked_at by the tail of a binomial
+        # distribution.
         share = self._left_out_about(visit, left)
         likely = left & (seen_through > share * looked_at)
-        # So many of its points might be missing by chance, were it there still.
         surely = likely & (bdtrc(seen_through - 1, looked_at.astype(int), share) < CHANCE)
         return likely, surely, (looked_at < least) | (left & ~likely)
 
     def _left_out_about(self, visit: Visit, left: NDArray[np.bool_]) -> NDArray[np.float64]:
-        """(instances,) of those that may have left, the share that the other visit's cloud leaves out of what stands
-        about their points that are seen through: so much of each would be missing if it stood there still."""
+        """(instances,) for those that may have left, the share that the other visit's cloud leaves out of what still
+        stands near their points that are seen through; 0 for the others."""
         share, xyz = np.zeros(len(left)), visit.cloud.xyz
         may_have_left = np.append(left, [False, False])[visit.cloud.instance_ids]  # unobserved and background do not
         stands = np.flatnonzero(self.shown & ~self.through & ~may_have_left & ~np.isnan(self.left_out))
@@ -246,7 +255,7 @@ class Evidence:
         return share
 
     def _of_one_color(self, visit: Visit, instance: int) -> bool:
-        """Whether what is seen through is of the colour of the rest: else it is a part of something else."""
+        """Whether the points seen through have the colour of the rest: else they are a part of something else."""
         rows = visit.rows[instance]
         rows = rows[self.shown[rows]]
         return visit.look(instance, rows[self.through[rows]]).has_color_of(visit.look(instance, rows[self.still[rows]]))
@@ -254,9 +263,11 @@ class Evidence:
 
 @njit(cache=True, nogil=True)
 def _count(rows, xyz, states, center, stamp, most, evidence):  # noqa: ANN001, ANN202
+    """Add the states (m,) of points ``rows`` to the evidence: odds, refuted, seen_at and first of `Presence`."""
     odds, refuted, seen_at, first = evidence
     for k in range(len(states)):
         i = rows[k]
+        # Hidden, or nothing measured: no evidence either way.
         if (states[k] != AGREES and states[k] != THROUGH) or stamp < seen_at[i]:
             continue
         seen_at[i] = stamp
@@ -264,6 +275,7 @@ def _count(rows, xyz, states, center, stamp, most, evidence):  # noqa: ANN001, A
             odds[i] = min(odds[i] + 1, most)
             continue
         odds[i] = max(odds[i] - 1, -most)
+        # Directions to the camera: the first is remembered, the second is any that differs enough from it.
         if refuted[i] < 2:
             x, y, z = center[0] - xyz[i, 0], center[1] - xyz[i, 1], center[2] - xyz[i, 2]
             length = max(np.sqrt(x * x + y * y + z * z), 1e-12)

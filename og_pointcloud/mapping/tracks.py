@@ -1,14 +1,14 @@
-"""Things as they are found frame by frame: votes by point that later frames can overturn, and witnesses that join.
+"""Objects as they are found frame by frame: points vote for tracks, and later frames can overturn the votes.
 
-A track is what masks of several frames show as one thing. A mask belongs to the track that it has most of, if it also
-is most of what the frame shows of that track; else it founds a track of its own. So a cup that the first frames took
-for a part of the table gets a track when frames show it alone, and its points go over to it as votes outweigh the
-table's: a frame that has a mask of a track votes for the points within and against those beside, as views do in
-`fitting.membership`; one that missed the track has no vote.
+A track is what masks of several frames show as one thing. A mask belongs to the track that most of its points are of,
+if the mask also covers most of what the frame shows of that track; else it founds a track of its own. So a cup that the
+first frames took for a part of the table gets a track when frames show it alone, and its points go over to it once its
+votes outweigh the table's. A frame with a mask of a track votes for it at the points within the mask and against it at
+those beside, as views do in `fitting.membership`; a frame that missed the track has no vote.
 
-Each frame is a witness for every two tracks that it shows within masks: one thing, if most of both lies in one mask,
-else two. Tracks are joined while a majority of their witnesses says one (`fitting.grouping` does the same for masks,
-over all views at once; `Mapper.finish` runs that rule). Only tracks that a frame sees are touched.
+Each frame is a witness for every two tracks that masks show in it: that they are one thing, if most of both lies in one
+mask, else that they are two. Tracks are joined when a majority of their witnesses says one (`fitting.grouping` does the
+same for masks, over all views at once; `Mapper.finish` runs that rule). A frame touches only the tracks that it sees.
 """
 
 from __future__ import annotations
@@ -30,11 +30,15 @@ HEAVIEST = 4
 MOST_VOTES = 24.0
 """Votes for one track that a point counts at most, so that the present can overturn a long history."""
 CONFIRMED_VIEWS = 2
-"""Frames that show a track before it is an object with an id."""
+"""Frames that must show a track before it is an object with an id."""
 MOSTLY = 0.5
+"""Share above which a mask is mostly of a track, or what shows of a track lies mostly in a mask."""
+LEAST_TRACKED = 0.25
+"""Share of a mask's points that tracks must have, for the mask to belong to one of them."""
 WITNESS_SHARE = 0.3
-"""Share of what a usual frame shows of a track, below which a frame says nothing of it."""
+"""A frame that shows less than this share of what frames usually show of a track says nothing of it."""
 JOIN_MAJORITY, FEWEST_WITNESSES = 0.5, 2
+"""Two tracks are joined if more than this share of their witnesses, and so many, say that they are one."""
 LEAST_POINTS = 3.0
 """Points of a track, or of a mask, that a frame must show to say anything of it."""
 
@@ -55,19 +59,19 @@ class PointVotes(Columns):
         self, points: NDArray[np.integer], track: NDArray[np.int32], weight: NDArray[np.float32],
         masked: NDArray[np.bool_],
     ) -> None:  # fmt: skip
-        """Votes of (m,) points for the track whose mask each lies in, NO_TRACK for none; and against those others that
-        have a mask in this frame too, (tracks,) bool. A track that the proposer missed gets no vote."""
+        """Vote at points (m,) for the track of the mask that each lies in, NO_TRACK for none, and against all other
+        tracks that have a mask in this frame: masked, (tracks,) bool. A track that the proposer missed gets no vote."""
         _add(points, track, weight, masked, self.track, self.weight)
 
 
 @dataclass
 class Track:
-    """total: (D,) sum of unit features by pixels; pixels: their sum. views, masks: how many
-    showed it; first, sequence: the numbers of the first and of the last frame that did, 0 for an earlier map;
-    last_seen: the stamp of the last. id: of the object, NO_TRACK while it is provisional. moved: it has been elsewhere.
-    box: (2, 3) lowest and highest place of points that voted for it. lost: rows of its points that were seen through,
-    losing_since: from that stamp on. left: when most were, how it looked; left_at: sequence then: what stood elsewhere
-    by then is something else."""
+    """total: (D,) sum of its masks' unit features, each by the points that the mask shows; pixels: sum of these
+    weights. views, masks: how many showed it; first, sequence: the numbers of the first and of the last frame that did,
+    0 for an earlier map; last_seen: the stamp of the last. id: of the object, NO_TRACK while it is provisional. moved:
+    it has been elsewhere. box: (2, 3) lowest and highest place of points that voted for it. lost: rows of its points
+    that were removed as seen through, losing_since: the stamp of the first of these. left: how it looked, once most
+    were; left_at: the frame that last showed it: what stood elsewhere by then is something else."""
 
     total: NDArray[np.float64] | None = None
     pixels: float = 0.0
@@ -85,11 +89,12 @@ class Track:
     left_at: int = 0
 
     def reach(self, box: NDArray[np.float64]) -> None:
-        """Become as large as a box (2, 3)."""
+        """Enlarge the box to hold another (2, 3)."""
         self.box = np.stack([np.minimum(self.box[0], box[0]), np.maximum(self.box[1], box[1])])
 
     def take_in(self, other: Track) -> None:
-        """Become both."""
+        """Add all that is known of another track, which is of the same object. Views and stamps are not added: frames
+        may have shown both."""
         if other.total is not None:
             self.total = other.total if self.total is None else self.total + other.total
         for name in ("pixels", "masks", "lost"):
@@ -128,54 +133,58 @@ class Tracks:
         return len(self.root) - 1
 
     def prune(self, votes: PointVotes, before: float) -> None:
-        """Let go of tracks that were joined into others, and of those that one frame showed before that stamp, and
-        number the others anew: memory follows the objects, and not the frames."""
+        """Let go of tracks that were joined into others, and of those without an id that no frame has shown since that
+        stamp, and number the others anew: memory grows with the objects, not with the frames."""
         kept = [k for k, t in enumerate(self.tracks) if self.root[k] == k and (t.id >= 0 or t.last_seen >= before)]
-        number = np.full(len(self.tracks) + 1, NO_TRACK, np.int32)  # the last: of NO_TRACK
+        # Old number -> new one. The extra last entry is NO_TRACK's own, which indexes it as -1.
+        number = np.full(len(self.tracks) + 1, NO_TRACK, np.int32)
         number[kept] = np.arange(len(kept))
         number[:-1] = number[self.root]
         votes.track[:] = number[votes.track]
         votes.weight[votes.track == NO_TRACK] = 0
-        among = {*kept}
-        self.pairs = {(int(number[a]), int(number[b])): c for (a, b), c in self.pairs.items() if {a, b} <= among}
+        kept_set = {*kept}
+        self.pairs = {(int(number[a]), int(number[b])): c for (a, b), c in self.pairs.items() if {a, b} <= kept_set}
         self.tracks, self.root = [self.tracks[k] for k in kept], np.arange(len(kept), dtype=np.int32)
 
     def place(self, xyz: NDArray[np.float32], points: NDArray[np.integer], track: NDArray[np.int32]) -> None:
-        """Let the boxes of tracks reach the points (m,), rows of xyz (n, 3), that voted for them (m,)."""
+        """Enlarge the boxes of tracks to hold the points (m,), rows of xyz (n, 3), that voted for them: track, (m,)."""
         boxes = _boxes(xyz, points, track, len(self.tracks))
         for k in np.flatnonzero(np.isfinite(boxes[:, 0, 0])):
             self.tracks[self.root[k]].reach(boxes[k])
 
     def spread(self) -> NDArray[np.float64]:
-        """(tracks,) the squared tangent that descriptors are off by (`likeness`)."""
+        """(tracks,) spread s of their descriptors (`likeness`)."""
         return spread_of([track.agreement for track in self.tracks], [track.masks for track in self.tracks])
 
     def scale(self) -> Scale:
-        """What a cosine of two objects means."""
+        """What a cosine of two objects means in this map, by its own objects."""
         known = [k for k, track in enumerate(self.tracks) if track.id >= 0 and track.descriptor is not None]
         rows = np.array([self.tracks[k].descriptor for k in known])
         return Scale(other=typical_cosine(rows, self.spread()[known]) if known else 0.0)
 
     def by_id(self) -> dict[int, int]:
-        """Object id -> its track, of those that have not been joined into another."""
+        """Object id -> number of its track, for tracks that have not been joined into another."""
         return {track.id: k for k, track in enumerate(self.tracks) if track.id >= 0 and self.root[k] == k}
 
     def observe(
         self, votes: PointVotes, xyz: NDArray[np.float32], points: NDArray[np.int32], mask: NDArray[np.int32],
         weight: NDArray[np.float32], features: NDArray[np.float32], when: tuple[float, int],
     ) -> tuple[list[int], list[int]]:  # fmt: skip
-        """Take in what a frame shows: points (m,), rows of xyz (n, 3), each in a mask or in -1, with a weight.
-        features: (M, D). when: its stamp and sequence.
+        """Take in what a frame shows: points (m,), rows of xyz (n, 3), each with its mask (-1 none) and a weight.
+        features: (M, D) of the masks. when: the frame's stamp and sequence.
 
         Returns the tracks that are objects now and want an id, and those with one that were seen again.
         """
+        # Tracks that the frame shows, NO_TRACK (-1) first if it is among them, and where each point's one stands there.
         own = votes.best(points, self.root)
-        held = np.bincount(own + 1, minlength=len(self.root) + 1) > 0  # first: NO_TRACK
+        held = np.bincount(own + 1, minlength=len(self.root) + 1) > 0
         seen, place = np.flatnonzero(held) - 1, (np.cumsum(held) - 1)[own + 1]
-        rows = np.where(mask < 0, len(features), mask)  # the last row: in no mask
+        # (masks + 1, tracks seen) weight that each mask, and the last row: no mask, shows of each of these.
+        rows = np.where(mask < 0, len(features), mask)
         shown = np.bincount(rows * len(seen) + place, weight, (len(features) + 1) * len(seen))
         shown = np.asarray(shown.reshape(len(features) + 1, len(seen)), np.float64)
         of_tracks, seen = shown[:, seen >= 0], seen[seen >= 0]
+        # Each mask's track, then votes by it, then which tracks are one: each step uses what the last one decided.
         of_mask = self._belonging(of_tracks, shown.sum(axis=1), seen)
         of_point = np.append(of_mask, NO_TRACK).astype(np.int32)[mask]
         masked = np.isin(self.root, self.root[of_mask[of_mask >= 0]])
@@ -187,21 +196,32 @@ class Tracks:
     def _belonging(
         self, of_tracks: NDArray[np.float64], of_masks: NDArray[np.float64], seen: NDArray[np.intp]
     ) -> NDArray[np.int64]:
-        """(M,) the track of each mask, a fresh one where none fits; NO_TRACK for masks that show next to nothing."""
+        """(M,) the track of each mask, a fresh one where none fits; NO_TRACK for masks that show next to nothing.
+
+        of_tracks: (M + 1, tracks) weight that each mask shows of each track in ``seen``; of_masks: (M + 1,) of all.
+        """
         of_mask = np.full(len(of_tracks) - 1, NO_TRACK)
         visible = of_tracks.sum(axis=0)
         for m in np.flatnonzero(of_masks[:-1] >= LEAST_POINTS):
             best = int(of_tracks[m].argmax()) if len(seen) else -1
-            fits = best >= 0 and of_tracks[m, best] > MOSTLY * max(of_tracks[m].sum(), 1e-9)
-            if fits and of_tracks[m, best] > MOSTLY * visible[best] and of_tracks[m].sum() > 0.25 * of_masks[m]:
-                of_mask[m] = seen[best]
-            else:
-                of_mask[m] = self.add(Track())
+            # Most of the mask's points with a track are of this one, most of what shows of this one lies in the mask,
+            # and the mask is not nearly all new points.
+            tracked = of_tracks[m].sum()
+            fits = (
+                best >= 0
+                and of_tracks[m, best] > MOSTLY * max(tracked, 1e-9)
+                and of_tracks[m, best] > MOSTLY * visible[best]
+                and tracked > LEAST_TRACKED * of_masks[m]
+            )
+            of_mask[m] = seen[best] if fits else self.add(Track())
         return of_mask
 
     def _witness(self, shown: NDArray[np.float64], visible: NDArray[np.float64], seen: NDArray[np.intp]) -> None:
-        """Count this frame's word on every two tracks that masks hold, and join those that most frames call one."""
-        # A frame that shows little of a track, its foot when the rest has gone, is no witness of it.
+        """Count for every two tracks in masks whether this frame shows them as one, and join those that most frames do.
+
+        shown: (M, tracks) weight that each mask shows of each track in ``seen``; visible: (tracks,) with that in none.
+        """
+        # A frame that shows little of a track, only its foot after the rest has left, say, is no witness of it.
         usual = np.array([self.tracks[k].pixels / max(self.tracks[k].masks, 1) for k in seen.tolist()])
         enough = visible >= np.maximum(WITNESS_SHARE * usual, LEAST_POINTS)
         holds = enough & (shown.max(axis=0, initial=0) > MOSTLY * visible)
@@ -211,6 +231,7 @@ class Tracks:
             for b in held[index + 1 :]:
                 pair = int(seen[a]), int(seen[b])
                 same = container[a] == container[b]
+                # Pairs are counted once a frame has shown them as one: most never are, and need no memory.
                 if same or pair in self.pairs:
                     counts = self.pairs.setdefault(pair, [0, 0])
                     counts[0 if same else 1] += 1
@@ -219,12 +240,11 @@ class Tracks:
                         self._join(*pair)
 
     def _join(self, a: int, b: int) -> None:
-        """Make one of two tracks: the one with the lower id, or else the lower number, stays."""
+        """Make one of two tracks: the one with the lower id, or without ids the one with the lower number, stays."""
         a, b = int(self.root[a]), int(self.root[b])
         if a == b:
             return
-        key = [(self.tracks[k].id < 0, self.tracks[k].id, k) for k in (a, b)]
-        a, b = (a, b) if key[0] < key[1] else (b, a)
+        a, b = sorted((a, b), key=lambda k: (self.tracks[k].id < 0, self.tracks[k].id, k))
         self.tracks[a].take_in(self.tracks[b])
         self.tracks[b].total = None
         self.root[self.root == b] = a
@@ -237,7 +257,8 @@ class Tracks:
         features: NDArray[np.float32],
         when: tuple[float, int],
     ) -> tuple[list[int], list[int]]:
-        unit = directions(features)
+        """Add the masks (M,) to what is known of their tracks; see `observe` for the rest."""
+        unit = directions(features)  # zeros where a feature has no direction
         new, again = [], []
         for m in np.flatnonzero(of_mask >= 0):
             k = int(self.root[of_mask[m]])
@@ -245,7 +266,7 @@ class Tracks:
             if unit[m].any():
                 track.total = of_masks[m] * unit[m] + (0 if track.total is None else track.total)
             track.pixels, track.masks = track.pixels + of_masks[m], track.masks + 1
-            if k in again or k in new:
+            if k in again or k in new:  # a second mask of the same frame: by a join, it is no further view
                 continue
             track.first = track.first if track.masks > 1 else when[1]
             track.views, (track.last_seen, track.sequence) = track.views + 1, when
@@ -271,6 +292,7 @@ def _boxes(xyz, points, track, count):  # noqa: ANN001, ANN202
 
 @njit(cache=True, nogil=True)
 def _best(points, track, weight, root):  # noqa: ANN001, ANN202
+    """(m,) see `PointVotes.best`; of two equal sums, the lower number."""
     best = np.full(len(points), NO_TRACK, np.int32)
     for i in range(len(points)):
         p = points[i]
@@ -278,7 +300,7 @@ def _best(points, track, weight, root):  # noqa: ANN001, ANN202
         for a in range(HEAVIEST):
             if track[p, a] < 0:
                 continue
-            # Tracks that were joined since then count together.
+            # Tracks that were joined after the votes were given count together.
             own, together = root[track[p, a]], np.float32(0)
             for b in range(HEAVIEST):
                 if track[p, b] >= 0 and root[track[p, b]] == own:
@@ -290,8 +312,10 @@ def _best(points, track, weight, root):  # noqa: ANN001, ANN202
 
 @njit(cache=True, nogil=True)
 def _add(points, new, amount, masked, track, weight):  # noqa: ANN001, ANN202
+    """See `PointVotes.add`. Changes track and weight, (n, HEAVIEST), in place."""
     for i in range(len(points)):
         p, t = points[i], new[i]
+        # Votes against the other tracks that this frame has masks of; its own place, and the one to give up for it.
         lightest, place = 0, -1
         for a in range(HEAVIEST):
             if track[p, a] == t:
@@ -302,6 +326,7 @@ def _add(points, new, amount, masked, track, weight):  # noqa: ANN001, ANN202
                 lightest = a
         if t < 0:
             continue
+        # A newcomer takes the lightest place if it outweighs it, else it wears it down: one that keeps coming gets in.
         if place >= 0:
             weight[p, place] = min(weight[p, place] + amount[i], np.float32(MOST_VOTES))
         elif weight[p, lightest] <= amount[i]:

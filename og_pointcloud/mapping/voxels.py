@@ -1,7 +1,8 @@
-"""Points of a growing map: one a voxel of the map's spacing, in arrays that only grow, found by a hash of the voxel.
+"""Points of a growing map: one for each voxel of the map's spacing, in arrays that only grow, found by a voxel hash.
 
-What is measured again moves its point towards the mean. A point keeps its row for good: votes and evidence refer to it.
-Rows are also filed by place, in packets of neighbours, so that a frame looks through those before its camera alone.
+A place that is measured again moves its point towards the mean of all readings. A point keeps its row for good, as
+votes and evidence refer to it. Rows are also filed by place, in packets of neighbours, so that a frame goes only
+through the packets before its camera.
 """
 
 from __future__ import annotations
@@ -16,22 +17,23 @@ from og_pointcloud.kernels import njit
 from og_pointcloud.scene import Camera
 
 ACROSS = 1 << 20
-"""Voxels to either side of the origin: three indices fit one 64-bit key."""
+"""Voxels to either side of the origin: three indices of 21 bits fit one 64-bit key, which is never negative."""
 MOST_WEIGHT = 32.0
-"""Readings that a point's mean counts for at most, so that it follows."""
+"""Readings that a point's mean counts for at most, so that it follows what is measured now."""
 EMPTY = np.int64(-1)
+"""Key of a free slot of the hash."""
 BRICK = 16
 """Voxels along each side of a brick, by which rows are put in order of place."""
 PACKET = 128
-"""Rows of a packet, the last one of those that came together may have fewer."""
+"""Rows of a packet; the last packet of each batch of new points may have fewer."""
 REFILED = 1.25
-"""Times as many points as when all were filed last, from which on they are filed anew."""
+"""All points are filed anew once there are this many times as many as when that was done last."""
 
 
 @dataclass
 class Columns:
-    """Arrays with a row a point, that grow together in steps of half. SPARE: what rows of a name hold at first, if not
-    0."""
+    """Arrays with one row a point that grow together, by half of their length at least. SPARE: by name, what new rows
+    hold, if not 0."""
 
     SPARE: ClassVar[dict[str, float]] = {}
 
@@ -46,13 +48,14 @@ class Columns:
 
 @dataclass
 class VoxelHash:
-    """Open addressing. keys: (slots,) int64 of voxels, EMPTY where there is none; rows: (slots,) of their points."""
+    """Voxel -> row of its point, by open addressing. keys: (slots,) int64 of voxels, EMPTY where there is none; rows:
+    (slots,) of their points. The number of slots is a power of two."""
 
     keys: NDArray[np.int64] = field(default_factory=lambda: np.full(4096, EMPTY))
     rows: NDArray[np.int32] = field(default_factory=lambda: np.zeros(4096, np.int32))
 
     def reserve(self, count: int) -> None:
-        """Stay less than half full with so many keys."""
+        """Stay at most half full with so many keys: linear probing slows down beyond."""
         if 2 * count > len(self.keys):
             size, before = 1 << int(2 * count - 1).bit_length(), (self.keys, self.rows)
             self.keys, self.rows = np.full(size, EMPTY), np.zeros(size, np.int32)
@@ -61,8 +64,9 @@ class VoxelHash:
 
 @dataclass
 class Packets:
-    """Rows of points by place. order: (n,) int32; starts: (packets + 1,) int32, where each packet begins in it. low,
-    high: (packets, 3) float32, the box of its points when they were filed. settled: points when all were filed last."""
+    """Rows of points by place. side: edge of a brick. order: (n,) int32, rows packet by packet; starts: (packets + 1,)
+    int32, where each packet begins in it. low, high: (packets, 3) float32, the box of its points when they were filed.
+    settled: how many points there were when all were filed last."""
 
     side: float
     settled: int = 0
@@ -72,10 +76,12 @@ class Packets:
     high: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 3), np.float32))
 
     def file(self, xyz: NDArray[np.float32]) -> None:
-        """File the points (n, 3) that are not yet."""
+        """File those of the points (n, 3) that are not filed yet."""
         first, n = len(self.order), len(xyz)
         if n == first:
             return
+        # Packets of new points lie between older ones in space, and their boxes overlap: from time to time, as the map
+        # grows, all are filed from the start. Growth by a constant factor keeps the cost a point constant.
         if n > REFILED * self.settled:
             first, self.settled, self.starts, self.low, self.high = 0, n, self.starts[:1], self.low[:0], self.high[:0]
         order = first + np.argsort(_keys(xyz[first:], self.side), kind="stable").astype(np.int32)
@@ -86,15 +92,18 @@ class Packets:
         self.high = np.concatenate([self.high, np.maximum.reduceat(xyz[order], begins)])
 
     def before(self, camera: Camera, edge: float, margin: float = 0.0) -> NDArray[np.int32]:
-        """Rows of packets that may have points in an image, or within a share ``margin`` of it: the sphere around their
-        box meets the frustum. edge: how far points may have moved since they were filed."""
+        """Rows of packets that may have points in an image, or within a share ``margin`` beyond its border: the sphere
+        around the packet's box meets the frustum. edge: of a voxel; no point has moved by two since it was filed, as it
+        stays in its voxel."""
         fx, fy, cx, cy = lens_of(camera)
         across, down = margin * camera.width, margin * camera.height
-        # All sides but the near one go through the camera; their normals point inwards.
+        # The frustum is where all five products are positive: u > 0, for one, is fx x + cx z > 0. Its planes go through
+        # the camera, so that each is a normal alone, in the camera's frame, pointing inwards; the first is z = 0.
         left, right = (fx, 0, cx + across), (-fx, 0, camera.width + across - cx)
         sides = np.array([(0, 0, 1), left, right, (0, fy, cy + down), (0, -fy, camera.height + down - cy)])
         sides /= np.linalg.norm(sides, axis=1, keepdims=True)
         pose, reach = camera.world_to_camera, 2 * edge + np.linalg.norm(self.high - self.low, axis=1) / 2
+        # (packets, 5) how far inside of each plane the middle of the box lies, by the normals turned into the map.
         inside = (self.low + self.high) / 2 @ (sides @ pose[:3, :3]).T + sides @ pose[:3, 3]
         return self._rows((inside > -reach[:, None]).all(axis=1))
 
@@ -108,8 +117,8 @@ class Packets:
 
 @dataclass
 class VoxelPoints(Columns):
-    """n points. edge: of a voxel. grows: whether measured points are added. weight: (n,) float32 readings, 0 for a
-    point that left: it keeps its row, for what may come to its voxel."""
+    """n points; the arrays are longer, for those to come. edge: of a voxel. grows: whether measured points are added.
+    weight: float32 readings in the mean of each, 0 for a point that left: it keeps its row, for what may come there."""
 
     edge: float
     grows: bool
@@ -145,8 +154,8 @@ class VoxelPoints(Columns):
         return self._anchor[: self.n]
 
     def add_known(self, xyz: NDArray[np.float32], rgb: NDArray[np.uint8] | None) -> NDArray[np.int64]:
-        """Points that are kept as they are, several in a voxel if they are so dense. (n,) their rows: neighbours have
-        rows close to each other."""
+        """Add points that are kept as they are, several in a voxel if they are so dense. Returns (n,) their rows."""
+        # By bricks, so that neighbours have rows close to each other.
         order = np.argsort(_keys(xyz, self.packets.side), kind="stable")
         self._reserve(len(xyz))
         rows = slice(self.n, self.n + len(xyz))
@@ -157,7 +166,8 @@ class VoxelPoints(Columns):
         return np.argsort(order) + rows.start
 
     def add(self, xyz: NDArray[np.float32], rgb: NDArray[np.uint8], anchor: int) -> None:
-        """Take measured points (m, 3) in: into the mean of their voxel's point, or as a new one."""
+        """Take in measured points (m, 3) of the frame ``anchor``: into the mean of their voxel's point, or as new
+        ones."""
         if self.grows:
             self._reserve(len(xyz))
             voxels, points = (self.hash.keys, self.hash.rows), (self._xyz, self._rgb, self.weight, self._anchor)
@@ -165,7 +175,7 @@ class VoxelPoints(Columns):
             self.packets.file(self.xyz)
 
     def refile(self) -> None:
-        """After points were moved."""
+        """Find all points by their places again, after they were moved."""
         self.hash.keys[:] = EMPTY
         _index(_keys(self.xyz, self.edge), np.arange(self.n), self.hash.keys, self.hash.rows)
         self.packets = Packets(self.packets.side)
@@ -201,7 +211,7 @@ def in_camera(pose, p):  # noqa: ANN001, ANN201
 
 @njit(cache=True, nogil=True)
 def _key(x, y, z, edge):  # noqa: ANN001, ANN202
-    """The voxel as one number; beyond ACROSS voxels they share one, at the border."""
+    """The voxel as one number, 21 bits an axis; all beyond ACROSS voxels are clamped to the one at the border."""
     key = np.int64(0)
     for value in (x, y, z):
         index = min(max(np.floor(value / edge), -ACROSS), ACROSS - 1)
@@ -220,6 +230,8 @@ def _keys(xyz, edge):  # noqa: ANN001, ANN202
 @njit(cache=True, nogil=True)
 def _slot(key, keys):  # noqa: ANN001, ANN202
     """Where a key is, or would be put: linear probing from its hash."""
+    # Times 2^64 over the golden ratio (Knuth, The Art of Computer Programming, 6.4), so that neighbouring voxels differ
+    # in the upper bits; the shift brings these down to the lower ones, which the mask keeps.
     mask = np.uint64(len(keys) - 1)
     mixed = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)
     slot = (mixed ^ (mixed >> np.uint64(32))) & mask
@@ -239,8 +251,8 @@ def _index(new_keys, new_rows, keys, rows):  # noqa: ANN001, ANN202
 
 @njit(cache=True, nogil=True)
 def _insert(new, color, frame, edge, voxels, points, n):  # noqa: ANN001, ANN202
-    """The number of points after the new ones are in. A point that moves out of its voxel keeps its place in the hash:
-    it is the mean of what was measured there."""
+    """The number of points after the new ones are in. All readings of a point lie in its voxel, and so does their mean:
+    its key stays what it is."""
     (keys, rows), (xyz, rgb, weight, anchor) = voxels, points
     for i in range(len(new)):
         key = _key(new[i, 0], new[i, 1], new[i, 2], edge)
@@ -250,10 +262,12 @@ def _insert(new, color, frame, edge, voxels, points, n):  # noqa: ANN001, ANN202
             xyz[n], rgb[n], weight[n], anchor[n] = new[i], color[i], 1, frame
             n += 1
             continue
+        # A running mean; with the weight bounded it becomes a moving one. Weight 1 is a point that had left (0 before):
+        # it begins anew at the reading.
         row = rows[slot]
         weight[row] = min(weight[row] + 1, MOST_WEIGHT)
         for a in range(3):
-            if anchor[row] >= 0 or weight[row] == 1:  # known points stay where they are
+            if anchor[row] >= 0 or weight[row] == 1:  # points that were known from the start stay where they are
                 xyz[row, a] += (new[i, a] - xyz[row, a]) / weight[row]
             rgb[row, a] += (color[i, a] - rgb[row, a]) / weight[row]
     return n
