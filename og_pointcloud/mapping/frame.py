@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from numbers import Real
 from typing import Any
 
@@ -100,6 +100,13 @@ def checked(frame: Frame, origin: NDArray[np.float64], space: FeatureSpace, stam
     if rgb is not None and (rgb.shape != (camera.height, camera.width, 3) or rgb.dtype != np.uint8):
         raise SceneError(f"{name}: rgb is {rgb.dtype} {rgb.shape}; expected uint8 ({camera.height}, {camera.width}, 3)")
     return CheckedFrame(camera, ids, features, view_of_depth(depth, camera) if depth.any() else None, rgb, float(stamp))
+
+
+def in_arrays(frame: Frame) -> Frame:
+    """A frame that passed all checks, with plain arrays for whatever it was given as: tensors, lists, clouds."""
+    given = {name: getattr(frame, name) for name in ("masks", "features", "depth", "rgb")}
+    arrays = {name: numbers_of(value) for name, value in given.items() if value is not None}
+    return replace(frame, **arrays, cloud=None if frame.cloud is None else world_points(frame.cloud))
 
 
 def _masks(frame: Frame, camera: Camera, name: str) -> tuple[NDArray[np.int32], NDArray[np.float32]]:

@@ -26,7 +26,7 @@ from og_pointcloud.cloud import FeatureSpace
 from og_pointcloud.errors import OgPointcloudError
 from og_pointcloud.formats.atomic import replacing
 from og_pointcloud.formats.npy import array_from_npy, npy_bytes
-from og_pointcloud.mapping.frame import Frame
+from og_pointcloud.mapping.frame import Frame, in_arrays
 from og_pointcloud.mapping.growing_map import GrowingMap
 from og_pointcloud.mapping.kept_views import KeptView, KeptViews
 from og_pointcloud.mapping.likeness import Look
@@ -100,9 +100,9 @@ class MapJournal:
     def append(self, frame: Frame, known: GrowingMap) -> None:
         """Write a frame behind the others; once the log is long, write the map that it led to and begin the log anew. A
         kill between these two leaves frames that the map has already: their stamps are among its recent ones."""
-        if frame.masks is not None:
-            masks = np.maximum(np.asarray(frame.masks, np.int64), -1)  # below -1 is outside too, but may not fit 16 bits
-            frame = replace(frame, masks=masks.astype(np.int16 if masks.max(initial=0) < 1 << 15 else np.int32))
+        frame = in_arrays(frame)
+        if frame.masks is not None and frame.masks.max(initial=0) < 1 << 15:
+            frame = replace(frame, masks=frame.masks.astype(np.int16))
         self._file = self._file or self._log.open("ab")
         self._file.write(_record(frame))
         self._file.flush()

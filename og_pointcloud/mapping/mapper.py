@@ -66,8 +66,8 @@ class FrameChange:
 class Mapper:
     """See the module.
 
-    start: a map (.ogpc, scene or cloud) to go on with; None: an empty one, which grows by depth. cloud: geometry that is
-    known, so that frames need only bring masks: (N, 3) world coordinates, `Points`, or whatever `og.segment` takes.
+    start: a map (.ogpc, scene or cloud) to go on with; None: an empty one, which grows by depth. cloud: known geometry,
+    so that frames need only bring masks: (N, 3) world coordinates, `Points`, or whatever `og.segment` takes.
     spacing: of a map that starts empty, world lengths; None: by the first depth image. feature_space: the name of the
     masks' encoder. journal: a folder that holds the map while it grows (`map_journal`); one that holds it already is
     gone on with.
