@@ -20,7 +20,7 @@ def printable(text: str, most: int | None = None) -> str:
 
 
 def first_line(error: BaseException) -> str:
-    """What another library's error says, in one line of at most 200 characters; its kind where it says nothing."""
+    """First line of another library's error, at most 200 characters; its type's name where it says nothing."""
     return (str(error).strip() or type(error).__name__).splitlines()[0][:200]
 
 
@@ -96,7 +96,7 @@ NEEDED_FOR_FITS = ("numba", "scipy", "cv2", "PIL", "tqdm", "onnx")
 
 
 def missing_extra(error: Exception) -> MissingExtraError | None:
-    """What to say where a stage of a fit or a map was asked for on an install that only asks; None of other errors."""
+    """The error to raise where a base install lacks a module that fits or maps need; None for any other error."""
     module = (error.name or "").partition(".")[0] if isinstance(error, ModuleNotFoundError) else ""
     return MissingExtraError(module, "fit") if module in NEEDED_FOR_FITS else None
 

@@ -213,9 +213,9 @@ class EncoderFormat:
     def vectors(
         self, session: InferenceSession, given: NDArray[Any], shape: tuple[int, ...], where: str, output: str = ""
     ) -> NDArray[np.float32]:
-        """What the graph makes of its one input, float32 of that shape. output: its name, "" the first.
+        """The graph's output for its one input: finite float32 of that shape. output: its name, "" for the first.
 
-        OgPointcloudError where it does not, and begins with ``where``.
+        OgPointcloudError, which begins with ``where``, for a graph that fails or answers anything else.
         """
         try:
             outputs = [output or session.get_outputs()[0].name]

@@ -34,7 +34,7 @@ class _Checked:
 
 
 def _unlike(hint: Any, name: str, value: Any) -> str:
-    """What is expected of a setting of this type and name; "" where the value is that."""
+    """What a setting of this type and name must be, in words; "" where the value is that."""
     kinds = get_args(hint)  # the choices of a Literal, the types in a tuple or union; a union here is "int or None"
     if get_origin(hint) is Literal:
         return "" if value in kinds else f"one of {', '.join(map(repr, kinds))}"

@@ -247,7 +247,7 @@ def _lower_casing(description: dict[str, Any]) -> dict[str, Any]:
 
 
 def _pad_id(source: Path, description: dict[str, Any]) -> int:
-    """What fills a text up to the context, where every token sees it and it must be the one of training."""
+    """Id of the token that texts are filled up to the context with; models that attend to it need that of training."""
     file, config = source / "tokenizer_config.json", read_config(source, "tokenizer_config.json")
     named = config.get("pad_token")
     token = named.get("content") if isinstance(named, dict) else named

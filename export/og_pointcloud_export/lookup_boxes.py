@@ -29,7 +29,7 @@ LONGEST_LIST = 64
 TOO_FAR_CODE = 0
 """Answer code of a query with no cloud point within reach."""
 NOTHING, SPLIT = -1, CHILDREN
-"""What a child has instead of the number of a list: nothing, as its answer is certain or left open; or its own box."""
+"""In place of a list's number: the child has none, as its answer is certain or left open; or it is split further."""
 MANY_RIVALS = 4 * LONGEST_LIST
 """With more candidates than this, a child is split without comparing each with each."""
 

@@ -49,7 +49,7 @@ CELLS_PER_REACH = 3.0
 BLOCKS_PER_POINT, BLOCKS_AT_LEAST, BLOCKS_AT_MOST = 16, 1 << 15, 1 << 18  # times 64^2, and as much again, fits int32
 NODES_PER_POINT, NODES_AT_LEAST = 1, 1 << 13
 LISTS_PER_POINT, LISTS_AT_LEAST = 4, 1 << 16
-"""What bounds the table whatever the extent of the scene: the rest is left to the exact search."""
+"""Most blocks, nodes and lists: they bound the table whatever the scene's extent; the rest is for the exact search."""
 BRICKS_PER_AXIS = 1 << 13
 """So long a grid still has its cell indices right to half a cell in float32, and a short table of them per axis."""
 BOXES_PER_CHUNK = 256

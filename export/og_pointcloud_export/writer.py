@@ -87,7 +87,7 @@ def query_model(cloud: LabelledCloud) -> QueryModel:
 
 
 def _arrays(cloud: LabelledCloud) -> dict[str, NDArray[Any]]:
-    """What lies under arrays/; the descriptors lie in query.onnx alone, where the manifest says."""
+    """Members below arrays/, by name. The descriptors are stored in query.onnx alone, where the manifest says."""
     columns = [field.name for field in fields(InstanceTable) if field.name != "descriptors"]
     table = {INSTANCE_MEMBERS.get(name, name): getattr(cloud.instances, name) for name in columns}
     if not np.isfinite(table["reliability"]).any():
@@ -169,7 +169,7 @@ def _manifest(cloud: LabelledCloud, model: QueryModel, members: dict[str, bytes]
 
 
 def written_by() -> str:
-    """What a manifest names as its maker."""
+    """Name and version of this library, as manifests hold them."""
     try:
         return f"og-pointcloud {version('og-pointcloud')}"
     except PackageNotFoundError:

@@ -62,7 +62,7 @@ class Reason(IntEnum):
     """No point of the map within reach."""
 
     def __str__(self) -> str:
-        """What is said of points, as in "12 are ..."."""
+        """The reason as part of a sentence on points: "12 are ..."."""
         return _IN_WORDS[self]
 
 
@@ -150,7 +150,7 @@ class Choice:
 
 @dataclass(frozen=True)
 class Standard:
-    """What turns the cosines of a scene's R descriptors into evidence, for those who ask many scenes at once.
+    """Numbers that turn the cosines of a scene's R descriptors into evidence, for asking many scenes at once.
 
     An instance's evidence is the largest, over its descriptors, of ``scale * ((descriptor - common) @ direction) +
     shift``, where ``direction`` is the text's unit vector without the bank's mean, of length one again.

@@ -49,7 +49,8 @@ def world_points(pcd: Any) -> NDArray[np.float64]:
 
 
 def numbers_of(value: Any) -> NDArray[Any]:
-    """As np.asarray, of torch's tensors too; what is no array, such as rows of different lengths, fits no shape."""
+    """np.asarray that takes torch's tensors too; of no array, such as rows of different lengths, a scalar None, which
+    fits no expected shape."""
     try:
         return np.asarray(_READERS["torch"](value) if _host(value) == "torch" else value)
     except ValueError:
@@ -61,8 +62,8 @@ _NAMED: dict[str, Path] = {}
 
 
 def scene_name(path: str | os.PathLike[str]) -> str:
-    """What a dataset says of the .ogpc file that it came from: its name, and digits that tell it from others of that
-    name. Not its path: datasets are saved, and passed on."""
+    """How a dataset names the .ogpc file that its labels came from: by the file's name, and digits that tell it from
+    others of that name. Not by its path, since datasets are saved and passed on."""
     path = Path(path).resolve()
     name = f"{path.name}#{blake2b(os.fsencode(path), digest_size=4).hexdigest()}"
     _NAMED[name] = path

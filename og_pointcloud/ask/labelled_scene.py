@@ -107,7 +107,7 @@ class LabelledScene:
 
     @cached_property
     def chooser(self) -> Chooser:
-        """What tells which label fits each instance, if any; calibrated if the scene has a word bank."""
+        """Decides which label fits each instance, if any; calibrated where the scene has a word bank."""
         return Chooser(self.cloud.instances, self.cloud.word_bank, feature_space=self.feature_space)
 
     def words(self, labels: Labels = None, text_features: TextFeatures = None) -> Vocabulary:

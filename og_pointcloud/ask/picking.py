@@ -165,7 +165,7 @@ def front_points(cloud: LabelledCloud, camera: Camera) -> NDArray[np.int64]:
 
 
 def _point_at_pixel(cloud: LabelledCloud, camera: Camera, uv_px: ArrayLike | None) -> int:
-    """What `front_points` has at the pixel that holds uv_px."""
+    """The point that `front_points` shows at the pixel that holds uv_px, or NO_POINT."""
     uv = numbers_of(uv_px)
     if uv.dtype.kind not in "fiu" or uv.shape != (2,) or not ((uv >= 0) & (uv < [camera.width, camera.height])).all():
         raise OgPointcloudError(

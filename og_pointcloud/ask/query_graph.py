@@ -18,7 +18,7 @@ from og_pointcloud.errors import BundleError, first_line
 from og_pointcloud.models import open_session
 
 OUTPUTS = {"instance": np.int32, "certain": np.bool_}
-"""What is asked of the graph: one value a point each."""
+"""The graph's outputs that are used, one value a point each, and their types."""
 OWN_POINTS, PLACES = 4096, 8
 """Points and places compared on opening. 4,096 random points miss a wrong thousandth of the cloud once in 60 openings,
 0.999^4096. Places are few: what they should answer is found by every distance, in time that grows with the cloud."""

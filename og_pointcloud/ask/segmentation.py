@@ -109,9 +109,9 @@ class Segmentation:
 
     @property
     def attributes(self) -> dict[str, NDArray[Any]]:
-        """What hosts and files keep of each point, (N,) arrays by the names that they have everywhere.
+        """What hosts and files keep of each point: (N,) arrays, by the same names in all of them.
 
-        og_label, og_instance int32, og_score float32, og_reason uint8, which more of them can hold than int8.
+        og_label, og_instance int32, og_score float32, og_reason uint8, as some of them have no int8.
         """
         return {
             "og_label": self.labels,
@@ -186,7 +186,7 @@ class Segmentation:
 
 
 def _writer(ending: str) -> Callable[..., None]:
-    """What writes a labelled cloud of that ending."""
+    """The function that writes a labelled cloud to a file of that ending."""
     if ending == ".ply":
         from og_pointcloud.formats.points import write_labelled_ply as write
     elif ending in (".las", ".laz"):

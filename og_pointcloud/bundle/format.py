@@ -47,7 +47,7 @@ LATER_COLUMNS = ("reliability",)
 """Columns of the instance table that the first files of schema 2 lack."""
 RGB, CERTAINTY, CAMERAS = "arrays/rgb.npy", "arrays/certainty.npy", "arrays/cameras.npy"
 CARRIED_ENCODER = "text_encoder/"
-"""What the names of a carried text encoder's members begin with."""
+"""Prefix of the names of a carried text encoder's members."""
 
 
 def rows_of_cameras(cameras: Sequence[Camera]) -> NDArray[np.float64]:
@@ -69,7 +69,7 @@ def cameras_of_rows(rows: NDArray[np.float64]) -> tuple[Camera, ...]:
 
 
 def describe_member(name: str, data: bytes) -> dict[str, Any]:
-    """What the manifest says of a member: bytes, sha256 and, of an array, its type and shape."""
+    """The manifest's entry for a member: bytes, sha256 and, for an array, its type and shape."""
     entry: dict[str, Any] = {"bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}
     if name.endswith(".npy"):
         array = np.load(io.BytesIO(data), allow_pickle=False)

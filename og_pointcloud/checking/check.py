@@ -82,7 +82,7 @@ class Check:
     repair: str = ""
 
     def as_dict(self) -> dict[str, str]:
-        """What reports and manifests hold."""
+        """JSON-able, as reports and manifests hold it."""
         entry = {"name": self.name, "verdict": self.verdict, "says": self.says}
         return {**entry, "repair": self.repair} if self.repair else entry
 

@@ -86,7 +86,7 @@ class MaskMaps:
         return Comparison.of(pairs, "cosine")
 
     def fewer(self) -> MaskMaps:
-        """Of fewer points and views, for what is asked often: the first views, as neighbors share points."""
+        """The same with fewer points and only the first views, which as neighbors share points; for searches."""
         few = slice(FEW_VIEWS)
         sample = self.sample.thinned(FEW_POINTS).of_views(range(len(self.ids))[few])
         return MaskMaps(sample, self.ids[few], self.features[few], self.shown[few], self.blended[few])
@@ -144,8 +144,8 @@ def _blended(ids: Ids) -> float:
 
 
 def entropies(a: Ids, b: Ids) -> tuple[float, float, float]:
-    """Of two labels a point, (n,) integers from 0: entropies of the first, the second and both together, in nats. Their
-    mutual information is the sum of the first two less the third."""
+    """Entropies, in nats, of a first labelling, a second, and both together; a, b: (n,) integers from 0. The mutual
+    information of the two is the sum of the first two entropies less the third."""
     columns = int(b.max(initial=0)) + 1  # the pair (a, b) as one number: a histogram of pairs in one pass
     joint = np.bincount(a * columns + b, minlength=(int(a.max(initial=0)) + 1) * columns).reshape(-1, columns)
     return _entropy(joint.sum(axis=1)), _entropy(joint.sum(axis=0)), _entropy(joint.reshape(-1))

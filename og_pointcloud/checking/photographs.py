@@ -59,7 +59,7 @@ class Photographs:
         return Comparison.of(pairs, "correlation", of_rest=True)
 
     def fewer(self) -> Photographs:
-        """Of fewer views and points, for what is asked often."""
+        """The same with fewer views and points, for searches that compare many cameras."""
         rows = list(range(0, len(self.images), 1 + (len(self.images) - 1) // FEW_VIEWS))
         sample = self.sample.thinned(FEW_POINTS).of_views(rows)
         return Photographs(sample, [self.images[row] for row in rows], [self.grids[row] for row in rows])

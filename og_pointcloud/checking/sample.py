@@ -52,7 +52,7 @@ class Comparison:
         return cls(float(won.mean()), float(own.mean()), float(other.mean()), gap, len(pairs), unit, error)
 
     def reaches(self, bounds: tuple[float, float]) -> bool:
-        """Whether share and gap are so large."""
+        """Whether both share and gap are at least these bounds."""
         return self.share >= bounds[0] and self.gap >= bounds[1]
 
     def __str__(self) -> str:
@@ -95,12 +95,12 @@ class Sample:
         return [repaired[place] for place in self.places] if of_all else repaired
 
     def thinned(self, points: int) -> Sample:
-        """With about so many points at most, for what is asked often."""
+        """The sample with about so many points at most, evenly thinned."""
         step = 1 + (len(self.xyz) - 1) // points
         return replace(self, xyz=self.xyz[::step], rgb=None if self.rgb is None else self.rgb[::step])
 
     def of_views(self, rows: Sequence[int]) -> Sample:
-        """With these of its views."""
+        """The sample with only these of its views."""
         return replace(
             self, views=tuple(self.views[row] for row in rows), places=tuple(self.places[row] for row in rows)
         )

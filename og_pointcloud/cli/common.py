@@ -138,7 +138,7 @@ def check_output(option: str, path: Path, inputs: Sequence[Path]) -> None:
 
 
 def print_result(arguments: argparse.Namespace, result: Mapping[str, Any], show: Callable[[Any], None]) -> None:
-    """As JSON where --json was given, else as ``show`` prints it."""
+    """Print a result as JSON where --json was given, else by ``show``."""
     if arguments.json:
         # Readable as it stands; only what a terminal would act on is escaped, as JSON escapes it.
         text = json.dumps(result, indent=2, ensure_ascii=False)
@@ -200,7 +200,7 @@ def describe_fit(cloud: LabelledCloud, capture: Path, bundle: Path) -> dict[str,
 
 
 def print_fit(report: Mapping[str, Any], cloud: LabelledCloud) -> None:
-    """What ``fit`` closes with; ends in a next command that works as it stands."""
+    """Print the summary of a fit; it ends in a next command that works as it stands."""
     from og_pointcloud.bundle.vocabulary import carried_encoder
     from og_pointcloud.text.encoder import find_encoder
 
@@ -256,7 +256,7 @@ def write_fit(cloud: LabelledCloud, journal: Journal, output: Path) -> LabelledC
 
 
 def print_checks(checks: Sequence[Mapping[str, str]], capture: Path | str) -> None:
-    """What fits together in a line, what could not be checked in another, and each doubt with the line to type."""
+    """Print the passed checks in one line, the unchecked in another, and each doubt with the command to try."""
     for verdict, word in (("ok", "checked"), ("unchecked", "unchecked")):
         names = [check["name"] for check in checks if check["verdict"] == verdict]
         if names:

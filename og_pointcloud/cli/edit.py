@@ -78,7 +78,7 @@ def what_to_edit(arguments: argparse.Namespace) -> What:
 
 
 def print_edit(record: Mapping[str, Any]) -> None:
-    """What was changed, what could not be kept, and the file."""
+    """Print what was changed, what could not be kept, and the file."""
     instances = ", ".join(map(str, record["instances"]))
     print(f"{record['changed']:,} points {VERBS[record['operation']]} (instance {instances})")
     for note in record["notes"]:

@@ -131,7 +131,8 @@ def run_scannet(arguments: argparse.Namespace) -> None:
 
 
 def scene_scores(said: Score, forced: Score) -> dict[str, Any]:
-    """Of one scene and task. forced: where each instance takes its best class, however badly it fits."""
+    """Scores of one scene and task, JSON-able. said: as the scene answers. forced: where each instance takes its best
+    class, however badly it fits."""
     return {
         "miou": said.miou, "macc": said.macc, "forced_miou": forced.miou, "unknown": said.unknown_share,
         "points": said.points, "class_iou": dict(zip(map(str, said.classes), said.class_iou, strict=True)),

@@ -74,7 +74,7 @@ def found_model(model: Path, feature_space: str | None) -> tuple[Path, str | Non
 
 
 def print_export(folder: Path, manifest: Mapping[str, Any], compared: str) -> None:
-    """What was made, and how far it is from torch. compared: the name of the manifest's count, 'texts' or 'images'."""
+    """Print what was made, and how far it is from torch. compared: the manifest's count of it, 'texts' or 'images'."""
     parity = manifest["parity"]
     print(f"feature space '{manifest['feature_space']}': width {manifest['width']}")
     print(f"onnxruntime and torch differ by {parity['max_abs_error']:.1e} at most, over {parity[compared]} {compared}")

@@ -81,7 +81,7 @@ def describe_pick(
 
 
 def print_pick(report: Mapping[str, Any]) -> None:
-    """What was hit and where, the words that fit it best, and the mask."""
+    """Print what was hit and where, the words that fit it best, and the mask's file."""
     print(report["what"])
     if report["xyz_world"]:
         print(f"hit at {', '.join(f'{value:.6g}' for value in report['xyz_world'])} (point {report['point']})")

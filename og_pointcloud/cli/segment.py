@@ -16,7 +16,7 @@ from og_pointcloud.cli.common import Parser
 from og_pointcloud.journal import Journal
 
 SAVED_AS = (".npz", ".ply", ".las", ".laz", ".glb", ".spz")
-"""As `og_pointcloud.ask.segmentation.SAVED_AS`; --help does not import numpy."""
+"""The same as `og_pointcloud.ask.segmentation.SAVED_AS`, repeated here since --help does not import numpy."""
 
 
 def add(parser: Parser) -> None:

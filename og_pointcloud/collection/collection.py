@@ -62,7 +62,7 @@ class Finding:
 
 
 class Findings(tuple[Finding, ...]):
-    """What was found, best first. not_asked: why which scenes could not be asked for which words, in words.
+    """What was found, best first. not_asked: sentences on scenes that could not be asked for some word, and why.
 
     >>> og.Findings().to_json()
     '[]'

@@ -69,7 +69,7 @@ class CaptureFit:
 
     @property
     def name(self) -> str:
-        """Of the capture: the last part of its path."""
+        """The capture's name: the last part of its path."""
         return Path(self.capture).name
 
 

@@ -46,7 +46,7 @@ ENTRY = (
     "id, CAST(name AS TEXT), CAST(digest AS TEXT), CAST(feature_space AS TEXT), bytes, modified, "
     "max(0, CAST(width AS INTEGER)), encoder, vocabulary, bank, judge, length(instances), length(descriptors)"
 )
-"""What makes a `SceneEntry`; cast, since SQLite holds no column to its type."""
+"""Columns of a `SceneEntry`; cast, since SQLite does not hold columns to their types."""
 EVIDENCE = np.dtype([
     ("points", "<i4"), ("views", "<i4"), ("masks", "<i4"), ("part_of", "<i4"), ("agreement", "<f4"),
     ("visible_area", "<f4"), ("box", "<f8", (2, 3)),
@@ -281,7 +281,7 @@ def _finite(values: Any) -> Any:
 
 
 def _explained(path: Path, reason: str) -> OgPointcloudError:
-    """What an error of SQLite means."""
+    """An error of SQLite in words that say what to do."""
     if "locked" in reason:
         return OgPointcloudError(f"{path} is being changed by another process; wait for it, then try again")
     if "unable to open" in reason:

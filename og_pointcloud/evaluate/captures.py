@@ -22,8 +22,8 @@ from og_pointcloud.evaluate.truth import Truth
 
 @dataclass(frozen=True)
 class Answer:
-    """What a scene says of each of its points. called: (n,) classes of the truth, -1 unknown, len(names) a word that
-    the truth lacks. instances: (n,), below 0 none. xyz: (n, 3); spacing: of the points."""
+    """A scene's answer for each of its points. called: (n,) classes of the truth, -1 unknown, len(names) a word that
+    the truth lacks. instances: (n,), below 0 none. xyz: (n, 3). spacing: of the points, in their unit."""
 
     called: NDArray[np.integer]
     instances: NDArray[np.integer]
@@ -73,7 +73,7 @@ def score_capture(answer: Answer, truth: Truth) -> CaptureScore:
 
 
 def difference(first: Answer, second: Answer, truth: Truth) -> BlockInterval:
-    """Of the mIoU of one answer less that of another, of the same points: paired, over the same blocks of space."""
+    """Interval of one answer's mIoU minus another's, for the same points: paired, over the same blocks of space."""
     classes = truth.score(first.called).classes
     return miou_interval(first.called, truth, first.xyz, first.spacing, classes, less=second.called)
 

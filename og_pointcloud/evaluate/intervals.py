@@ -51,9 +51,9 @@ class BlockInterval(Interval):
 
 
 def bootstrap(scores: NDArray[np.floating]) -> Interval:
-    """Of the mean of n items' scores (scenes, or frame-object pairs): items are drawn again, with replacement.
+    """Interval of the mean of n items' scores (scenes, or frame-object pairs): items are redrawn with replacement.
 
-    A NaN item has no score and is left out before. One item alone has no spread; none at all is an error.
+    An item with NaN has no score and is left out first. One item alone has no spread; none at all is an error.
     """
     values = np.asarray(scores, np.float64)
     values = values[np.isfinite(values)]
@@ -68,8 +68,8 @@ def miou_interval(
     called: Integers, truth: Truth, xyz: NDArray[np.floating], spacing: float, classes: tuple[int, ...],
     less: Integers | None = None,
 ) -> BlockInterval:  # fmt: skip
-    """Of the mean IoU that `score_labels` gives; or of its difference to another labelling's, ``called`` less ``less``:
-    both are scored on the same draws, since what is hard is hard for both.
+    """Interval of the mean IoU that `score_labels` gives; or of its difference, ``called`` minus ``less``, to another
+    labelling's. Both are then scored on the same draws, since what is hard for one is hard for the other.
 
     called, less: (n,) classes of the truth, below 0 unknown (`Truth.class_of`). xyz: (n, 3). spacing: of its points,
     same unit. classes: those that the score is a mean over, one or more.
@@ -112,7 +112,7 @@ def _points_per_block(block: NDArray[np.intp], ids: Integers, classes: tuple[int
 
 
 def _interval(hits: list[Doubles], unions: list[Doubles], edge: float) -> BlockInterval:
-    """Of the one mean IoU, or of the first less the second. hits, unions: of each labelling, (blocks, classes)."""
+    """Interval of one labelling's mean IoU, or of the first's minus the second's. hits, unions: (blocks, classes)."""
     blocks = len(hits[0])
 
     def score(weights: Doubles) -> Doubles:

@@ -57,7 +57,7 @@ def read_truth(file: str | Path) -> tuple[NDArray[np.float64], NDArray[np.int32]
 def ask(
     file: Path, xyz: NDArray[np.float64], task: int, text_features: Path | None = None
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """What a .ogpc file calls a scene's vertices: (n,) NYU40 ids, 0 unknown; and the same where every instance with a
+    """(n,) NYU40 ids that a .ogpc file gives a scene's vertices, 0 unknown; and those where every instance with a
     feature takes its best class, however badly it fits. xyz: (n, 3) world coordinates. task: 19, 15 or 10."""
     scene, ids = as_scene(file), np.array([*TASKS[task], 0])  # the last is what label -1 takes: unknown
     names = [NAMES[class_id] for class_id in TASKS[task]]

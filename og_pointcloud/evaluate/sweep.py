@@ -205,7 +205,8 @@ class _Trial:
             yield Row(self.subject.name, BASELINE, name, preparing + seconds, 1 - scores["miou"], **scores)
 
     def _scores(self, labels: Labels, spacing: float) -> dict[str, Any]:
-        """What `Row` says of labels that index the subject's words, -1 unknown; the first are the default's."""
+        """Fields of `Row` for labels that index the subject's words, -1 unknown. The first call is the default's, with
+        which later ones are compared."""
         truth, words = self.subject.truth, self.subject.vocabulary
         assert truth is not None
         assert words is not None
@@ -250,7 +251,7 @@ def write_rows(rows: Iterable[Row], path: Path) -> Path:
 
 
 def machine() -> str:
-    """What seconds are of: processor, cores, system, and the versions of what computes."""
+    """Where seconds were measured: processor, cores, system, and the versions of Python and the libraries."""
     information = Path("/proc/cpuinfo")
     models = re.findall(r"^model name\s*: (.*)", information.read_text(), re.M) if information.is_file() else []
     processor = models[0] if models else platform.processor() or platform.machine()

@@ -72,7 +72,7 @@ def _panel(axes: Any, rows: Sequence[Row]) -> None:
 
 
 def error_name(rows: Sequence[Row]) -> str:
-    """What the error of these rows is."""
+    """How tables and charts name the error of these rows."""
     return "1 - mIoU" if all(row.miou is not None for row in rows) else "1 - reliability (no truth)"
 
 

@@ -17,7 +17,7 @@ from og_pointcloud.formats.npy import read_npz
 GT_NAME = "gt.npz"
 MAX_UNPACKED_BYTES = 1 << 31
 OF_POINTS = ("background", "views", "ratio", "votes", "instance")
-"""What may stand beside the classes, one a point."""
+"""Optional arrays of gt.npz, one value a point."""
 AGREED, VOTES = 0.5, 2
 """Least share of the votes that must agree on a class, and fewest votes, where classes were found by votes."""
 

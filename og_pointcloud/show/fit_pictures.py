@@ -34,7 +34,7 @@ GAP, STRIP, MARGIN = 6, 26, 10
 TEXT_SCALE, LETTER = 0.5, 11
 """Size of letters, and pixels that the widest takes: of long names the end is shown, where they differ."""
 PLOT_HEIGHT, CURVE = 200, (31, 119, 180)
-"""Of a stage's curve of losses: pixels, and RGB."""
+"""Height of a plot of losses, pixels, and RGB of its curve."""
 
 Colors = NDArray[np.uint8]
 

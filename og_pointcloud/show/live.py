@@ -37,7 +37,7 @@ MATCHES = 12
 HINTED = 8
 """Stored words that are named as examples."""
 DARKEST, LIGHTEST = 0.55, 1.10
-"""What a label's color is multiplied by where the point itself is black, and white: keeps shape and shadow."""
+"""Factors of a label's color where the point's own is black and where it is white: shapes and shadows stay visible."""
 FADED = (0.72, 237)
 """What is not lit becomes its own grey, mixed with this share of this light grey."""
 CLICK_PX = 33
@@ -46,7 +46,7 @@ CLICK_PX = 33
 
 @dataclass(frozen=True)
 class Answer:
-    """What is told: a title, lines of text, words or instances with their scores, and what the scores mean."""
+    """A text for the page: title, lines, words or instances with their scores, and what the scores mean."""
 
     title: str
     lines: tuple[str, ...] = ()
@@ -250,5 +250,5 @@ def _known_changes(cloud: LabelledCloud) -> NDArray[np.intp] | None:
 
 
 def meaning(calibrated: bool) -> str:
-    """What scores are."""
+    """How the page explains its scores."""
     return "probability" if calibrated else "cosine: how similar, not how probable"

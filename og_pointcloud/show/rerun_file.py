@@ -29,7 +29,7 @@ JPEG_QUALITY = 80
 
 
 class RerunSink:
-    """What is logged to a file; get one from `rerun_sink`. Steps are numbers that rise."""
+    """Logs views and instances to a file; `rerun_sink` makes one. Steps are integers that rise."""
 
     def __init__(self, recording: Any) -> None:
         self._recording = recording

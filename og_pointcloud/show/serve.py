@@ -26,7 +26,7 @@ LOOPBACK, PORT, PORTS = "127.0.0.1", 8080, 1 << 16
 POINT_SIZE = 0.95
 """Radius of a point in spacings: large enough that surfaces look closed."""
 HEIGHT_PX = 640
-"""Of the page in a notebook."""
+"""Height of the page in a notebook."""
 LISTED = 300
 """Instances in the list, the largest ones."""
 EVERYTHING = "all"
@@ -145,7 +145,7 @@ class LivePage:
         self._legend = gui.add_html("")
 
     def _guarded(self, act: Callable[[], None]) -> Callable[[Any], None]:
-        """What viser calls: one at a time, and only for what a person did, not for what the page set itself."""
+        """A handler for viser: runs one at a time, and only for what a person did, not for what the page set itself."""
 
         def called(event: Any) -> None:
             if event.client is not None:
@@ -250,7 +250,7 @@ class LivePage:
 
 
 def answer_html(answer: Answer) -> str:
-    """As HTML; names come from files, so no text of theirs is taken for HTML."""
+    """The answer as HTML. Names come from files, so their text is escaped."""
     title, *lines, note = map(html.escape, (answer.title, *answer.lines, answer.note))
     bars = [BAR.format(html.escape(name), score, score) for name, score in answer.bars]
     return CARD.format("".join([f"<b>{title}</b>", *map(GREY.format, lines), *bars, GREY.format(note)]))

@@ -70,7 +70,7 @@ def choose_viewpoint(xyz: NDArray[np.float64], labelled: NDArray[np.bool_], up: 
 
 
 def _framed(points: NDArray[np.float64], view: Viewpoint) -> Viewpoint:
-    """The same direction and target, from as near as all points are in the picture."""
+    """The same direction and target from as near as possible with all points still in the picture."""
     axes, distance = view.axes(), float(np.linalg.norm(view.eye - view.target))
     x, y, behind = axes @ (points - view.target).T
     aside = np.maximum(np.abs(x) * CELLS[1] / CELLS[0], np.abs(y))

@@ -146,7 +146,7 @@ def _read_once(folder: Path, _state: tuple[tuple[int, int], ...]) -> TextEncoder
 
 
 def encoder_for(feature_space: str, carried: CarriedEncoder | None = None) -> TextEncoder:
-    """As ``find_encoder``, but OgPointcloudError, with the command that makes one, where there is none."""
+    """``find_encoder``, but with an OgPointcloudError, which names the command that makes one, where there is none."""
     if encoder := find_encoder(feature_space, carried):
         return encoder
     named = os.environ.get(MODELS_VARIABLE)
