@@ -118,6 +118,7 @@ def check_words(cloud: LabelledCloud) -> Check:
     if vocabulary is None or len(descriptors) < FEWEST or len(vocabulary.names) < 2:
         return Check("words", "unchecked", "no words to compare, or too few instances")
     best = cloud.instances.cosines(vocabulary.vectors).max(axis=1)
+    # Cosines below -1 are of instances without a descriptor; the rest in units of 1 / sqrt(width).
     typical = float(np.median(best[best >= -1])) * float(np.sqrt(descriptors.shape[1]))
     says = f"an instance's best word stands {typical:.1f} standard deviations of random vectors from chance"
     if typical < LEAST_COSINE:

@@ -54,6 +54,7 @@ def best_conversion(evidence: Photographs | MaskMaps) -> Repairs:
 
 def _best_of(evidence: Photographs | MaskMaps, tried: Iterable[Repairs]) -> Repairs:
     """The best of the tried repairs, if it convinces; else ()."""
+    # Hundreds are tried, so first on a small part of the evidence; by the gap, as several may win every comparison.
     few = evidence.fewer()
     finalists = sorted(tried, key=lambda repairs: -_fit(few, repairs).gap)[:FINALISTS]
     best = max(finalists, key=lambda repairs: _fit(evidence, repairs).gap)

@@ -183,5 +183,6 @@ def _same_things(counts: Ids) -> list[tuple[int, int]]:
     iou = counts / np.maximum(union, 1)
     best, back = iou.argmax(axis=1), iou.argmax(axis=0)
     rows = np.arange(len(counts))
+    # Mutual best matches above SAME_IOU: a part and its whole are not the same thing.
     fits = (iou[rows, best] > SAME_IOU) & (counts[rows, best] >= FEWEST_POINTS) & (back[best] == rows)
     return [(int(row), int(best[row])) for row in np.flatnonzero(fits)]

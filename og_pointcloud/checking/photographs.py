@@ -54,7 +54,7 @@ class Photographs:
         pairs = []
         for camera, grid in zip(cameras, self.grids, strict=True):
             drawing, cells = _drawing(seen(self.sample.xyz, camera), self.sample.rgb)
-            own, *others = _correlations(drawing, grid[:, cells])
+            own, *others = _correlations(drawing, grid[:, cells])  # all over the same cells, which the drawing has
             pairs += [(own, other) for other in others]
         return Comparison.of(pairs, "correlation", of_rest=True)
 
@@ -139,6 +139,7 @@ def _correlations(drawing: Floats, photographs: Floats) -> Floats:
     is shown."""
     shown = np.asarray(np.isfinite(photographs).all(axis=2, keepdims=True))
     a, b = centered(drawing[None], shown), centered(np.where(shown, photographs, 0), shown)
+    # 1e-6 keeps an even drawing or photograph, which has no length, from dividing by 0.
     size = np.sqrt((a * a).sum(axis=(1, 2)) * (b * b).sum(axis=(1, 2)) + 1e-6)
     return np.where(shown.sum(axis=(1, 2)) < FEWEST_CELLS, 0, (a * b).sum(axis=(1, 2)) / size)
 

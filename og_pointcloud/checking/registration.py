@@ -84,6 +84,7 @@ class Registration:
         self.photographs, self.cameras, self.points = photographs, cameras, points
         self.xyz, self.rgb = photographs.sample.xyz, photographs.sample.rgb.astype(np.float64)
         self.middle = np.median(self.xyz, axis=0)
+        # The median depth is the unit of translations, so that limits hold in every scene.
         depths = np.concatenate([camera.project(self.xyz[::10])[1] for camera in cameras])
         self.depth = float(np.median(depths[depths > 0])) if (depths > 0).any() else 1.0
         self.finest = [_with_slopes(image) for image in photographs.images]

@@ -183,7 +183,7 @@ def score_pairs(
     scene's own words and text encoder.
     """
     cameras = [in_local_frame(camera, scene.cloud.origin) for camera in labels.cameras]
-    near = near_plane(scene.cloud.xyz, cameras)
+    near = near_plane(scene.cloud.xyz, cameras)  # one for all frames, as in the fit
     # Each object by itself, as the protocol asks for them: other objects' names are no rivals.
     selected = {name: select(scene, name, against=[], text_features=text_features) for name in labels.objects}
     best = {name: () if one.best is None else (one.best.instance,) for name, one in selected.items()}

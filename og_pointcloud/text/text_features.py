@@ -62,6 +62,7 @@ def read_text_features(path: str | os.PathLike[str]) -> tuple[Vocabulary, str]:
 def check_names(names: Sequence[str]) -> None:
     """OgPointcloudError for a name in a file that is longer than any word, or holds half a character."""
     for name in names:
+        # Lone surrogates, halves of a character, cannot be written as UTF-8.
         if len(name) > LONGEST_NAME or any("\ud800" <= sign <= "\udfff" for sign in name):
             raise OgPointcloudError(
                 f"the name {name!r:.60} has {len(name)} characters; expected whole ones, at most {LONGEST_NAME}"

@@ -150,6 +150,7 @@ def _words(text: str) -> Iterator[str]:
     endings, runs = re.compile("'s|'t|'re|'ve|'m|'ll|'d"), re.compile("L+|N|O+")
     position = 0
     while position < len(text):
+        # Endings before runs: in the pattern 's comes before letters and before other signs.
         if match := endings.match(text, position) or runs.match(kinds, position):
             yield text[position : match.end()]
             position = match.end()
