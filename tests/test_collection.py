@@ -182,6 +182,8 @@ def test_box_and_scenes_restrict(folder):
     assert not collection.find("lamp", within=([500, 0, 0], [501, 1, 1]))
     with pytest.raises(OgPointcloudError, match="no scene is called 'room9'"):
         collection.find("lamp", scenes="room9")
+    with pytest.raises(OgPointcloudError, match="no scene is named"):
+        collection.find("lamp", scenes=[])
     with pytest.raises(OgPointcloudError, match="the low one first"):
         collection.find("lamp", within=(high, low))
 

@@ -206,6 +206,8 @@ class Collection:
                     f"{len(self.entries)} scenes of {self.path}"
                 )
             ids.update(self._by_name[name].id for name in fitting)
+        if not ids:
+            raise OgPointcloudError("no scene is named; expected at least one name or pattern, or None for all scenes")
         return ids
 
     def _vectors(
