@@ -187,7 +187,7 @@ def test_a_proposer_of_ones_own(tiny_capture, monkeypatch, capsys):
     folder = tiny_capture.folder.rename(tiny_capture.folder.with_name("kitchen"))
     known = {view.name: view.mask_map() >= 0 for view in og.read_capture(folder).views}
     monkeypatch.chdir(folder.parent)
-    exec(extending("A mask proposer"), {})
+    (folder.parent / "my_masks.py").write_text(extending("A mask proposer"))
     command = re.search(r"```bash\nog-pointcloud (.*?)\n", section("docs/extending.md", "A mask proposer")).group(1)
     words = command.replace("openai/clip-vit-base-patch16", "none").split()
     assert main([*words, "--overwrite"]) == 0, capsys.readouterr().err
