@@ -207,7 +207,7 @@ def test_a_camera_close_to_a_wall_is_of_the_place():
 
 
 def test_what_is_no_scene_no_cloud_and_no_settings_is_refused(tmp_path):
-    with pytest.raises(OgPointcloudError, match="settings is a str; expected an og.FitSettings"):
+    with pytest.raises(OgPointcloudError, match="settings is a str; expected an"):
         og.Mapper(settings="grouping")
     with pytest.raises(SceneError, match=r"points are a list of <U1 \(1, 3\)"):
         og.Mapper(cloud=[["a", "b", "c"]])
