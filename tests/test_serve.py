@@ -54,7 +54,7 @@ def listens_at(port):
 
 
 @pytest.mark.skipif(not Path("/proc/net/tcp").exists(), reason="only Linux tells who listens")
-def test_it_listens_on_this_machine_alone_unless_told_otherwise(viser):
+def test_it_listens_on_this_machine_alone_unless_told_otherwise(viser, capsys):
     from og_pointcloud.show.serve import ServeSettings, serve
 
     scene = LiveScene(og.LabelledScene.from_cloud(room(300)))
@@ -66,6 +66,13 @@ def test_it_listens_on_this_machine_alone_unless_told_otherwise(viser):
             assert listens_at(int(page.url.rsplit(":", 1)[1])) == {address}
         finally:
             page.stop()
+    assert capsys.readouterr().out == ""
+
+
+def test_a_word_of_any_length_is_answered_in_a_few_lines(viser):
+    answer = LiveScene(og.LabelledScene.from_cloud(room(300))).ask("chair" * 2000)
+    assert len(answer.title) < 100
+    assert all("is not among the" in line and len(line) < 1000 for line in answer.lines)
 
 
 def test_a_notebook_shows_the_page_in_its_cell(viser):

@@ -17,12 +17,12 @@ from og_pointcloud.ask.labelled_scene import LabelledScene, instance_table
 from og_pointcloud.ask.picking import pick
 from og_pointcloud.ask.selecting import Match, select
 from og_pointcloud.cloud import LabelledCloud
-from og_pointcloud.errors import MissingExtraError, OgPointcloudError
+from og_pointcloud.errors import MissingExtraError, OgPointcloudError, printable
 from og_pointcloud.formats.colors import LUMINANCE, NO_LABEL, certainty_colors, label_colors
 from og_pointcloud.mapping.map_record import MapRecord
 from og_pointcloud.scene import Points
 from og_pointcloud.show.viewpoint import Viewpoint
-from og_pointcloud.text.words import Labels, TextFeatures
+from og_pointcloud.text.words import LONGEST_WORD, Labels, TextFeatures
 
 MODES = ("labels", "instances", "certainty", "changes", "photo")
 CHANGES = {
@@ -188,7 +188,7 @@ class LiveScene:
         try:
             selection = select(self.scene, word, text_features=self._text_features)
         except (OgPointcloudError, MissingExtraError) as error:
-            return Answer(f"“{word}”", (str(error),))
+            return Answer(f"“{printable(word, LONGEST_WORD)}”", (str(error),))
         # Where nothing fits the set is empty: all is faded, and the closest ones are listed.
         self.lit = set(selection.instances)
         fits = f"fits {len(self.lit)} of {len(selection)} instances" if self.lit else "fits no instance; closest:"

@@ -7,9 +7,11 @@ It is served on this machine alone unless told otherwise: there is no password.
 from __future__ import annotations
 
 import html
+import io
 import socket
 import threading
 from collections.abc import Callable, Mapping
+from contextlib import redirect_stdout
 from dataclasses import dataclass
 from typing import Any
 
@@ -87,7 +89,8 @@ class LivePage:
     def __init__(self, scenes: Mapping[str, LiveScene], settings: ServeSettings) -> None:
         self._scenes, self._settings = dict(scenes), settings
         self._lock = threading.RLock()  # viser calls from several threads
-        self._server = viser.ViserServer(settings.host, settings.port, TITLE, verbose=False)
+        with redirect_stdout(io.StringIO()):  # a box with the addresses, even where it is to be silent
+            self._server = viser.ViserServer(settings.host, settings.port, TITLE, verbose=False)
         self._live = next(iter(self._scenes.values()))
         self._server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="large")
         self._server.gui.main_panel.dock_right()
@@ -118,7 +121,8 @@ class LivePage:
 
     def stop(self) -> None:
         """End the page; browsers say that it is gone."""
-        self._server.stop()
+        with redirect_stdout(io.StringIO()):
+            self._server.stop()
 
     def _repr_html_(self) -> str:
         return f'<iframe src="{self.url}" width="100%" height="{HEIGHT_PX}" style="border:0"></iframe>'

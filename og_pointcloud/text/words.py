@@ -11,12 +11,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from og_pointcloud.cloud import FeatureSpace, Vocabulary
-from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError, did_you_mean
+from og_pointcloud.errors import FeatureSpaceError, OgPointcloudError, did_you_mean, printable
 from og_pointcloud.text.encoder import CarriedEncoder, export_command, find_encoder
 from og_pointcloud.text.text_features import checked_vocabulary, read_text_features
 
 Labels: TypeAlias = "str | Iterable[str] | Mapping[str, ArrayLike] | Vocabulary | None"
 TextFeatures: TypeAlias = "str | os.PathLike[str] | tuple[Vocabulary, str] | None"
+LONGEST_WORD = 60
+"""Characters of a word that is not known that are said again."""
 
 
 def resolve_labels(
@@ -106,8 +108,9 @@ def _looked_up(
     elif missing:
         others = f", nor are {len(missing) - 1} more of the labels" if len(missing) > 1 else ""
         hint = did_you_mean(missing[0], vectors, " If not")
+        first = printable(missing[0], LONGEST_WORD)
         raise OgPointcloudError(
-            f"'{missing[0]}' is not among the {len(vectors)} known words{others}{hint}: {_ways(feature_space)}"
+            f"'{first}' is not among the {len(vectors)} known words{others}{hint}: {_ways(feature_space)}"
         )
     _check_one_width(words, vectors)
     return np.array([vectors[word] for word in words], np.float32)
