@@ -37,7 +37,7 @@ class FeatureSpace:
     """What makes vectors comparable: the encoder that they come from, and their width.
 
     name: of the encoder, e.g. "openai/clip-vit-base-patch16"; UNKNOWN_SPACE where nobody named it, which fits any.
-    width: numbers a vector; 0 where there is none yet, which fits any.
+    width: length of the vectors; 0 where there is none yet, which fits any.
     """
 
     name: str

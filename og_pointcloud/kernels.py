@@ -22,7 +22,7 @@ if "NUMBA_THREADING_LAYER_PRIORITY" not in os.environ:
 
 
 def use_threads(count: int) -> None:
-    """Run the kernels that this Python thread calls on so many threads, or as many as numba was started with."""
+    """Run the kernels that this Python thread calls on ``count`` threads, at most as many as numba was started with."""
     numba.set_num_threads(max(1, min(count, numba.config.NUMBA_NUM_THREADS)))  # pyright: ignore
 
 

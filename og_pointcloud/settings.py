@@ -315,7 +315,7 @@ class FitSettings(_Checked):
 
 
 def fit_settings(settings: FitSettings | None) -> FitSettings:
-    """These, or the defaults; OgPointcloudError for what is none."""
+    """The settings given, or the defaults for None; OgPointcloudError for anything else."""
     if not isinstance(settings, FitSettings | None):
         raise OgPointcloudError(f"settings is a {type(settings).__name__}; expected an og.FitSettings")
     return settings or FitSettings()

@@ -158,7 +158,7 @@ def _answer_child(center, half, last, limits, near, squared, rows):  # noqa: ANN
                 count += 1
     if count == 0:
         return TOO_FAR_CODE, True, 0
-    # One answer for all of it, as far as any is within reach? That needs the reach of one point to hold the cube.
+    # Certain if all candidates have one answer and the whole cube is within reach of one point.
     code = _code(near[3][best], best_squared, limits)
     within = _all_within_reach(nearest, half, reach)
     if within and _alike(near[3], rows[:count]):

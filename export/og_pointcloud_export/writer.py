@@ -74,7 +74,7 @@ def write_bundle(
 
 
 def query_model(cloud: LabelledCloud) -> QueryModel:
-    """Build a cloud's query.onnx and hold it against numpy in float64; OgPointcloudError if they differ."""
+    """Build a cloud's query.onnx and compare it with numpy in float64; OgPointcloudError if they differ."""
     onnx = build_query_graph(cloud, build_lookup_grid(cloud))
     parity = _parity(cloud, onnx)
     if parity["instance_score_error"] > SCORE_TOLERANCE or parity["certain_points_wrong"]:

@@ -178,7 +178,7 @@ def _checked(points: ArrayLike) -> DoubleArray:
 
 
 def unit_up(up: ArrayLike) -> DoubleArray:
-    """An upward direction (3,) at unit length. SceneError where it is none."""
+    """An upward direction (3,) at unit length. SceneError for anything but three finite numbers that are not all 0."""
     direction = numbers_of(up)
     is_vector = direction.shape == (3,) and direction.dtype.kind in "fiu"
     if not is_vector or not np.isfinite(direction).all() or not direction.any():

@@ -126,7 +126,7 @@ class Choice:
 
     @cached_property
     def by_id(self) -> tuple[NDArray[np.int32], NDArray[np.float32], NDArray[np.int8]]:
-        """Label, score and reason by instance id, (K + 3,) each: behind the last instance those of ids -3, -2 and -1.
+        """Label, score and reason by instance id, (K + 3,) each: after the last instance those of ids -3, -2 and -1.
 
         The score is that of a point with the id. Where calibrated: its instance's probability times the membership, as
         both must be right; else the cosine. 0 where unknown.

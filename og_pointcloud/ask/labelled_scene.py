@@ -143,7 +143,7 @@ class LabelledScene:
         return instances
 
     def check_distance(self, max_distance: float | None) -> None:
-        """OgPointcloudError for a distance that is none, or beyond the reach, within which points are looked up."""
+        """OgPointcloudError unless the distance is a length above 0, and at most the scene's reach."""
         if max_distance is not None and not (isinstance(max_distance, Real) and 0 < max_distance <= self.cloud.reach):
             raise OgPointcloudError(
                 f"max_distance is {max_distance}; expected a length up to the scene's reach, {self.cloud.reach:.4g}: "
@@ -360,13 +360,13 @@ def as_scene(source: SceneLike) -> LabelledScene:
 
 @lru_cache(maxsize=2)
 def _load_once(path: Path, modified: int, size: int) -> LabelledScene:
-    """The scene of a file that has not changed since: naming it again and again costs nothing."""
+    """The scene of a file, read once as long as the file is unchanged."""
     return load(path)
 
 
 @lru_cache(maxsize=2)
 def _scene_once(cloud: LabelledCloud) -> LabelledScene:
-    """The scene of a cloud in memory: asking it again is quick."""
+    """The scene of a cloud in memory, made once: what it prepared for one question serves the next."""
     return LabelledScene.from_cloud(cloud)
 
 

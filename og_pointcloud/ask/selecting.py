@@ -166,7 +166,7 @@ def select(
 def _match(
     scene: LabelledScene, instance: int, choice: Choice, fits: bool, rivals: Sequence[str], points: int
 ) -> Match:
-    """choice: of the query, label 0, and the rivals behind it."""
+    """choice: among the query, label 0, and its rivals, the labels after it."""
     score, rival, rival_score = float(choice.scores[instance, 0]), None, NO_EVIDENCE
     if rivals:
         best = int(choice.evidence[instance, 1:].argmax())

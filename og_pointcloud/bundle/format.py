@@ -57,7 +57,7 @@ def rows_of_cameras(cameras: Sequence[Camera]) -> NDArray[np.float64]:
 
 
 def cameras_of_rows(rows: NDArray[np.float64]) -> tuple[Camera, ...]:
-    """The cameras of `rows_of_cameras`; SceneError for a row that is none."""
+    """The cameras of `rows_of_cameras`; SceneError for a row that makes no valid camera."""
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
     poses[:, :3] = rows[:, 6:].reshape(-1, 3, 4)
     # NaN and infinity have no integer: they become sizes that Camera refuses.

@@ -89,7 +89,7 @@ def bank_of_encoder(space: FeatureSpace, folder: str | os.PathLike[str] | None =
 def add_words(
     path: str | os.PathLike[str], words: Vocabulary, feature_space: str, output: str | os.PathLike[str] | None = None
 ) -> Vocabulary:
-    """Store words with their vectors in a .ogpc file, behind those that it has; a word that it has gets the new vector.
+    """Store words with their vectors in a .ogpc file, after those that it has; a word that it has gets the new vector.
     Returns all that it has now.
 
     feature_space: of the vectors. output: another file to write; None: the same one, replaced whole or not at all.
@@ -148,10 +148,10 @@ def carry_encoder(
 
 
 def carried_encoder(path: str | os.PathLike[str] | None) -> CarriedEncoder:
-    """A function that opens the text encoder in a .ogpc file: most who ask a scene never need it.
+    """A function that opens the text encoder in a .ogpc file, when it is first needed: for most questions it never is.
 
-    It gives None where the file carries none, or there is no file (any more); of an unchanged file always the same
-    encoder. OgPointcloudError where it cannot be used.
+    It returns None where the file carries no encoder or is no longer there, and the same encoder again for an unchanged
+    file. OgPointcloudError where the encoder cannot be used.
     """
     return partial(_carried, path)
 

@@ -44,7 +44,7 @@ LESS_ERROR, LEAST_GAIN, LEAST_SHIFT = 0.8, 0.085, 0.01
 it (in correlation), and moves points by more than this share of the image's width. Real calibrations leave more and
 move less; smooth images, which a change fits by chance, hardly gain."""
 FEWEST_ALIGNED = 4
-"""Fewer views than this can be fitted by a change that is none."""
+"""Fewer views than this can be fitted by a change although nothing is wrong."""
 AS_GOOD, HALF = 0.1, 0.5
 """Of two changes the one with fewer numbers is preferred if it misses no more than this share of the other's gain. A
 change of everything, which no repair can undo, is named only where no other gains half as much."""
@@ -95,6 +95,7 @@ def check_capture(scene: Scene) -> list[Check]:
     """
     sample = draw_sample(scene)
     maps = read_mask_maps(sample) if any(view.mask_count for view in scene.views) else None
+    # In this order, as one fault looks like the next: wrong poses make masks disagree, wrong masks mix up features.
     checks, photographs = _poses(sample, maps)
     checks.append(_alignment(photographs))
     if maps is not None:
@@ -135,7 +136,7 @@ def warn_of_doubts(checks: Sequence[Check], capture: str = "CAPTURE", stacklevel
 
 
 def with_checks(cloud: LabelledCloud, checks: Sequence[Check]) -> LabelledCloud:
-    """The cloud with these checks behind those that its provenance has."""
+    """The cloud with these checks added to those in its provenance."""
     entries = [*cloud.provenance.get("checks", []), *(check.as_dict() for check in checks)]
     return replace(cloud, provenance={**cloud.provenance, "checks": entries})
 

@@ -90,7 +90,7 @@ def read_photographs(sample: Sample) -> Photographs | None:
 
 
 def shrunk(image: NDArray[np.generic], side: int) -> Floats:
-    """The image (H, W, ...) reduced by averaging until its longer side has at most so many pixels."""
+    """The image (H, W, ...) reduced by averaging until its longer side has at most ``side`` pixels."""
     scale = min(1.0, side / max(image.shape[:2]))
     return _resized(image, *(max(1, round(scale * length)) for length in image.shape[1::-1]))
 

@@ -77,7 +77,8 @@ class Small:
 
 
 class Registration:
-    """A search about these cameras of the photographs, by so many points of each view. start: no change."""
+    """A search for small changes of these cameras, which the photographs are seen from, by ``points`` points of each
+    view. start: no change."""
 
     def __init__(self, photographs: Photographs, cameras: Sequence[Camera], points: int = POINTS) -> None:
         assert photographs.sample.rgb is not None

@@ -95,7 +95,7 @@ class Sample:
         return [repaired[place] for place in self.places] if of_all else repaired
 
     def thinned(self, points: int) -> Sample:
-        """The sample with about so many points at most, evenly thinned."""
+        """The sample evenly thinned, to at most about this many points."""
         step = 1 + (len(self.xyz) - 1) // points
         return replace(self, xyz=self.xyz[::step], rgb=None if self.rgb is None else self.rgb[::step])
 
@@ -130,7 +130,7 @@ def draw_sample(scene: Scene) -> Sample:
 
 
 def grid_shape(camera: Camera, cells: int = CELLS) -> tuple[int, int]:
-    """Rows and columns of a grid over the image with so many cells along the longer side."""
+    """Rows and columns of a grid over the image with ``cells`` cells along the longer side."""
     longest = max(camera.width, camera.height)
     return max(1, round(cells * camera.height / longest)), max(1, round(cells * camera.width / longest))
 

@@ -61,7 +61,7 @@ SHARED: dict[str, dict[str, Any]] = {
 
 
 def add_command(commands: Any, name: str, run: Any, text: str | None) -> Parser:
-    """text: what the command does in a line, and an example behind an empty line."""
+    """text: what the command does in a line, an empty line, and an example."""
     summary, _, example = (text or "").strip().partition("\n\n")
     example = "example:\n" + indent(example.strip(), "  ")
     parser = commands.add_parser(name, help=summary, description=summary, epilog=example)
@@ -226,8 +226,7 @@ def print_fit(report: Mapping[str, Any], cloud: LabelledCloud) -> None:
 
 
 def write_fit(cloud: LabelledCloud, journal: Journal, output: Path) -> LabelledCloud:
-    """Write the .ogpc file; returns the cloud with the seconds of the journal's stages, writing included, behind those
-    that its provenance has.
+    """Write the .ogpc file; returns the cloud with the journal's stages and that of writing added to its provenance.
 
     OgPointcloudError, which says where the cloud is kept, where that file cannot be written.
     """

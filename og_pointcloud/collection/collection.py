@@ -96,7 +96,7 @@ class Collection:
     """
 
     def __init__(self, path: str | os.PathLike[str], *, lance: str | None = None) -> None:
-        """path: of an atlas; OgPointcloudError where it is none, or damaged. lance: folder or URI of what
+        """path: of an atlas; OgPointcloudError for any other or damaged file. lance: folder or URI of what
         `lance.write_lance` made of it, which is then searched in place of memory (extra 'lance')."""
         self.path = Path(path)
         self._lance = None if lance is None else LanceTables(lance)
@@ -159,7 +159,7 @@ class Collection:
         encoded, if there is an encoder. A scene that cannot be asked for a word is left out, and ``not_asked`` says so.
         within: two corners (3,); only instances whose box has its center between them, in their scene's world.
         scenes: names, or patterns such as "site3/*". top: how many.
-        Raises OgPointcloudError where no scene can be asked, or there is none of a name.
+        Raises OgPointcloudError where no scene can be asked, or a name or pattern fits none.
         """
         if top < 1:
             raise OgPointcloudError(f"top is {top}; expected at least 1")

@@ -27,7 +27,7 @@ in its released code; the paper gives none."""
 ROWS_AT_ONCE = 512
 """Instances whose descriptors are gathered for one product: few enough to stay in a core's cache."""
 FIRST = 64
-"""Instances scored to the end at first; then four times as many again and again, until it is enough."""
+"""Instances scored to the end at first; then four times as many each time, until it is enough."""
 
 
 @dataclass(frozen=True)

@@ -59,7 +59,7 @@ KNOBS = {"views": tuple(Setting("views", f"one of {n}" if n > 1 else "all", ever
     name: tuple(Setting(name, _label(value), changed(FitSettings(), path, value)) for value in values)
     for name, (path, values) in NUMBERS.items()
 }
-"""Name -> values, of which one is what stands by default."""
+"""Name -> values, one of which is the default."""
 QUICK = ("mode", "views", "grouping sample")
 """Knobs of a report in a hurry."""
 

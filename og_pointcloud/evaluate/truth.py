@@ -46,7 +46,7 @@ class Truth:
         return number[np.maximum(labels, -1)]
 
     def score(self, called: NDArray[np.integer]) -> Score:
-        """Classes (n,) that points are called, as of `class_of`, scored; SceneError where they are not one each."""
+        """The score of classes (n,) that points are called, as `class_of` gives them; SceneError for another length."""
         if len(called) != len(self.cls):
             raise SceneError(f"{GT_NAME} has {len(self.cls)} points, the labels are {len(called)}; expected one each")
         return score_labels(called, self.cls, scored=self.scored, background=self.background)

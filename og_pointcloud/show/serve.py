@@ -67,7 +67,7 @@ def serve(scenes: Mapping[str, LiveScene], settings: ServeSettings | None = None
 
 
 def _check_address(host: str, port: int) -> None:
-    """viser would try port after port at an address that is none, and never say so."""
+    """Refuse an address that is not this machine's: viser would try port after port there, and never say so."""
     try:
         socket.create_server((host, 0), family=socket.AF_INET6 if ":" in host else socket.AF_INET).close()
     except OSError as error:
