@@ -2,7 +2,7 @@
 
 Blending is linear: with the weights ``W`` of a view and features ``F`` a pixel shows ``M = W F``, and a mask's mean is
 a row of ``diag(1 / N) A F``, where ``A`` (mask_table.py) sums W over the mask's pixels. So both losses of all views
-follow from two sparse products, ``A F`` for the value and ``A' G`` for the gradient; nothing is rendered meanwhile.
+follow from two sparse products, ``A F`` for the value and ``A' G`` for the gradient; nothing is rendered.
 
     objective = mean over views of L_c  +  cohesion_weight * L_s
 
@@ -11,14 +11,14 @@ follow from two sparse products, ``A F`` for the value and ``A' G`` for the grad
     A view without two masks has none. The printed form has e = 0 and is infinite where two means meet; here e is
     `FeatureSettings.closest`, after rounds with e = COARSE_BOUNDS.
 ``L_s``, intra-mask smoothness (Eq. 1), asked of every Gaussian that shows in a mask instead of the rendered pixels:
-    squares ``|f_g - Mbar_i|^2`` weighted by A_ig, over P:
-    ``sum_g c_g |f_g|^2 - sum_i N_i |Mbar_i|^2`` with ``c = A' 1``.
+    the sum of ``A_ig |f_g - Mbar_i|^2``, which is ``sum_g c_g |f_g|^2 - sum_i N_i |Mbar_i|^2`` with ``c = A' 1``,
+    divided by P.
     N_i is a mask's *blended weight*, the sum of row i of A, so that coverage does not look like feature; P the sum of
     all N_i. By Jensen's inequality it bounds the sum over pixels of ``|M_p - a_p Mbar_i|^2``, a_p the pixel's coverage,
     which is the printed loss where a_p = 1; it asks for more: each Gaussian agrees, not only each blend.
 
-Dividing Eq. 1 by P makes its weight mean the same at any image size; it is else the paper's sum over a random view.
-With raw features the weight sets the features' scale only: Eq. 1 grows as its square, Eq. 2 falls as its square.
+Divided by P, Eq. 1 weighs the same at any image size; otherwise it is the paper's sum over a random view. With raw
+features its weight only sets their scale: Eq. 1 grows as the scale's square, Eq. 2 falls as its square.
 """
 
 from __future__ import annotations
@@ -36,25 +36,26 @@ from og_pointcloud.kernels import njit, prange
 from og_pointcloud.settings import FeatureSettings
 
 COARSE_BOUNDS = (0.71, 0.57, 0.14)
-"""Of Eq. 2 in the rounds before the last, which have fewer local minima; directions at right angles read 0.71 apart."""
+"""The bound e of Eq. 2 in the rounds before the last: wider ones have fewer local minima. Directions at right angles
+read 0.71 apart."""
 COARSE_TOLERANCE = 10.0
-"""Rounds before the last need not converge as far, by this factor."""
+"""Rounds before the last end at this many times the tolerance: the next one moves the features anyway."""
 WINDOW = 10
 """Steps over which the fall of the objective is measured."""
 LEVEL = 0.01
-"""The fall is relative to the objective, but to no less than this share of its first value: it may tend to zero."""
+"""The fall is relative to the objective, but at least to this share of its first value: the objective may tend to 0."""
 MEMORY = 6
 """Steps remembered by L-BFGS (Nocedal & Wright 2006, Sec. 7.2; 3 to 20 are usual)."""
 DOT_PART = 8192
 """Length of the partial sums of dot products, each in float32."""
 FIRST_REACH = 0.5
-"""How far the first step, of which nothing is known, moves the feature that it moves most."""
+"""How far the first step moves the feature that it moves most: no curvature is known yet that would tell."""
 SUFFICIENT = 1e-4
 """Armijo's share of the fall that the slope promises (Nocedal & Wright, Eq. 3.4)."""
 HALVINGS = 20
-"""A step is halved at most so often."""
+"""Lengths of a step that are tried, each half of the one before."""
 KICK = 0.1
-"""Where two means have met, mask-wise random directions of this length are added."""
+"""Where two means have met, a random direction of this length for each mask is added to its Gaussians."""
 MET = 1e-3
 """Means nearer than this have met. (Features lie on, or in, the unit ball.)"""
 
@@ -101,23 +102,25 @@ def learn_features(
 ) -> LearnedFeatures:
     """Features that agree within masks and differ between the masks of a view, by L-BFGS on all views at once.
 
-    start: (n, width), not yet read; None: each Gaussian starts at the mean of random directions of its masks, seeded,
-    which groups it already. Where two means of a view have met, the gradient vanishes by symmetry: random directions of
-    the masks then part them.
+    start: (n, width), raw; None: each mask draws a random direction from the seed and each Gaussian starts at the mean
+    of its masks', so that Gaussians of the same masks start together. Where two means of a view have met in the given
+    start, the gradient vanishes by symmetry: random directions of the masks then part them.
 
     The same input and seed give the same features. Raises SceneError if no mask shows a Gaussian.
     """
     settings = settings or FeatureSettings()
     problem = FeatureObjective(table, settings)
     rng = np.random.default_rng(seed)
+    # A normal vector of unit length has every direction with the same chance.
     random = rng.normal(size=(problem.mask_count, settings.width))
     directions = problem.uplift((random / np.linalg.norm(random, axis=1, keepdims=True)).astype(np.float32))
     if start is None:
-        raw = directions / np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-6)
+        raw = directions / np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-6)  # masks may cancel
     else:
         raw = np.array(start, np.float32)[problem.shown]
         if settings.inter and problem.have_met(read_features(raw, settings.normalise)):
             raw += KICK * directions
+    # From a smooth objective to the one that is wanted; all rounds share one budget of steps.
     objective, steps, converged = [0.0], 0, False
     for closest in (*COARSE_BOUNDS, settings.closest):
         tolerance = settings.tolerance * (1 if closest == settings.closest else COARSE_TOLERANCE)
@@ -131,14 +134,14 @@ def learn_features(
 def read_features(raw: NDArray[np.floating], normalise: bool) -> NDArray[np.floating]:
     """What the losses see of a raw feature (n, width): its direction mapped to [0, 1], or itself within the unit ball.
 
-    The ball: with raw features Eq. 2 alone, and with Eq. 1 wherever masks share no Gaussian, is smallest at infinity.
-    A zero row has no direction; normalized, it reads 0.5.
+    Without the ball, raw features would grow without end: Eq. 2 alone is smallest at infinity, and Eq. 1 holds it back
+    only where masks share Gaussians. A zero row has no direction; normalized, it reads 0.5.
     """
     return _read(raw, normalise, _columns(raw))
 
 
 def raw_gradient(raw: NDArray[np.floating], gradient: NDArray[np.floating], normalise: bool) -> NDArray[np.floating]:
-    """The gradient by raw features (n, width), of the one by what `read_features` makes of them."""
+    """The gradient by raw features (n, width), given the gradient by what `read_features` makes of them."""
     return _raw_gradient(raw, gradient, normalise, _columns(raw))
 
 
@@ -155,6 +158,7 @@ class FeatureObjective:
         # In float64: where features agree, Eq. 1 is a small difference of large sums. (scipy's own sums stay float32.)
         weight = table.weights @ np.ones(table.weights.shape[1])
         self.seen = np.bincount(table.weights.indices, table.weights.data, table.weights.shape[1]).astype(np.float64)
+        # What no mask shows has no gradient: it takes no part. Masks without a Gaussian have no mean.
         self.shown = np.flatnonzero(self.seen > 0)
         self.weight = self.seen[self.shown, None].astype(np.float32)
         kept = np.flatnonzero(weight > 0)
@@ -166,6 +170,7 @@ class FeatureObjective:
         self._weights = _int32(table.weights[kept][:, self.shown])
         self._weights.sort_indices()  # neighboring rows of the features are then read one after another
         self._transposed = _int32(csr_array(self._weights.T))
+        # Masks are stacked view by view; where each view's begin, and after the last one the number of masks.
         self._first = np.flatnonzero(np.diff(table.mask_view[kept], prepend=-1, append=-2))
         self._size = weight[kept]
 
@@ -191,12 +196,15 @@ class FeatureObjective:
         settings, views = self.settings, len(self._first) - 1
         features = np.ascontiguousarray(features)
         means = self.mask_means(features)
+        # Eq. 2 depends on the means alone; pull is the gradient by them.
         separation, pull = _separation(means, self._first, closest**2)
         separation, pull = float(separation) / views, pull * (settings.inter / views)
+        # Eq. 1 as the difference of the two sums above: one depends on features, one on means.
         factor, total = settings.intra * settings.cohesion_weight, self._size.sum()
         blended = self.seen[self.shown, None] * features
         spread = float((features * blended).sum() - (self._size[:, None] * means**2).sum())
         cohesion = float(spread / total)
+        # Chain rule: means are diag(1 / N) A F, so their gradient comes back to the features by A' diag(1 / N).
         pull = (pull + factor * (-2 / total * self._size[:, None] * means)) / self._size[:, None]
         gradient = _product(*_arrays(self._transposed), pull, _columns(pull)) + factor * (2 / total * blended)
         objective = settings.inter * separation + factor * cohesion
@@ -211,9 +219,9 @@ def _minimise(
     Limited-memory BFGS with backtracking, preconditioned by each Gaussian's visible weight.
     """
 
-    # scipy's L-BFGS-B, in the same variables, gets to the same minimum (objective within 0.1 %, mIoU of mode fast
-    # within 0.005) in 4 to 11 times the processor time: 11.6 s for 3.0 s in a room of 260,000 points, 2.9 s for 0.26 s
-    # on a table of 103,000. It holds all in float64, and its sums depend on the number of threads.
+    # scipy's L-BFGS-B, in the same variables, reaches the same minimum (objective within 0.1 %, mIoU of mode fast
+    # within 0.005) in 4 to 11 times the processor time: 11.6 s against 3.0 s in a room of 260,000 points, 2.9 s against
+    # 0.26 s on a table of 103,000. It holds all in float64, and its sums depend on the number of threads.
     def evaluate(raw: NDArray[np.float32]) -> tuple[float, NDArray[np.float32]]:
         normalise = problem.settings.normalise
         terms = problem.terms(read_features(raw, normalise), closest)
@@ -223,6 +231,8 @@ def _minimise(
     value, gradient = evaluate(raw)
     values = [value]
     while len(values) <= max_steps:
+        # A Gaussian that shows more has a larger gradient and a larger curvature, both about in proportion to what
+        # shows of it: divided by that, steps are alike for all.
         step = -gradient / problem.weight
         if pairs:
             step = _two_loops(gradient, pairs, np.float32(1) / problem.weight)
@@ -239,7 +249,7 @@ def _minimise(
         raw, gradient = new_raw, new_gradient
         values.append(value)
         least = tolerance * max(value, LEVEL * values[0])
-        if len(values) > WINDOW and values[-1 - WINDOW] - value < least:
+        if len(values) > WINDOW and values[-1 - WINDOW] - value < least:  # it hardly falls any more
             return raw, values, True
     return raw, values, False
 
@@ -260,12 +270,16 @@ def _backtracked(
 def _two_loops(
     gradient: NDArray[np.float32], pairs: list[Pair], preconditioner: NDArray[np.float32]
 ) -> NDArray[np.float32]:
-    """Minus the remembered inverse Hessian times the gradient (Nocedal & Wright, Algorithm 7.4)."""
+    """Minus the remembered inverse Hessian times the gradient (Nocedal & Wright, Algorithm 7.4).
+
+    There moved is s, turned y, curvature 1 / rho, and shares are alpha.
+    """
     direction = -gradient
     shares = []
     for moved, turned, curvature in reversed(pairs):
         shares.append(_dot(moved, direction) / curvature)
         direction -= np.float32(shares[-1]) * turned
+    # Where nothing is remembered: the preconditioner, scaled to the curvature along the last step (Eq. 7.20).
     _, turned, curvature = pairs[-1]
     direction *= preconditioner * np.float32(curvature / _dot(turned, turned * preconditioner))
     for (moved, turned, curvature), share in zip(pairs, reversed(shares), strict=True):
@@ -276,6 +290,7 @@ def _two_loops(
 def _remember(pairs: list[Pair], moved: NDArray[np.float32], turned: NDArray[np.float32]) -> None:
     """Keep a step and its change of gradient, unless the objective curved downward or hardly at all along it."""
     curvature = _dot(moved, turned)
+    # By the cosine of the two, which has no unit; below 1e-6 it is no more than rounding in float32.
     if curvature > 1e-6 * np.sqrt(_dot(moved, moved) * _dot(turned, turned)):
         pairs.append((moved, turned, curvature))
         del pairs[:-MEMORY]
@@ -288,6 +303,7 @@ def _dot(a: NDArray[np.float32], b: NDArray[np.float32]) -> float:
 
 
 def _int32(matrix: csr_array) -> csr_array:
+    """The same matrix with indices of one type, whichever scipy chose: kernels are compiled for it once."""
     index = (matrix.indices.astype(np.int32), matrix.indptr.astype(np.int64))
     return csr_array((matrix.data, *index), shape=matrix.shape)
 
@@ -315,6 +331,7 @@ def _product(indptr, indices, data, dense, columns):  # noqa: ANN001, ANN202
 
 @njit(cache=True, parallel=True)
 def _read(raw, normalise, columns):  # noqa: ANN001, ANN202
+    """As `read_features`: x -> 1/2 + x / (2 |x|), or x / max(|x|, 1)."""
     read = np.empty_like(raw)
     for g in prange(len(raw)):
         square = 0.0
@@ -331,6 +348,7 @@ def _read(raw, normalise, columns):  # noqa: ANN001, ANN202
 
 @njit(cache=True, parallel=True)
 def _raw_gradient(raw, gradient, normalise, columns):  # noqa: ANN001, ANN202
+    """As `raw_gradient`: the derivative of x / |x| keeps what of the gradient is across x, divided by |x|."""
     pulled = np.empty_like(raw)
     for g in prange(len(raw)):
         square, along = 0.0, 0.0
@@ -349,7 +367,7 @@ def _raw_gradient(raw, gradient, normalise, columns):  # noqa: ANN001, ANN202
 
 @njit(cache=True)
 def _nearest_pair(means, first):  # noqa: ANN001, ANN202
-    """The smallest squared distance between two means of one view."""
+    """The smallest squared distance between two means of one view; infinite where no view has two."""
     nearest = np.inf
     for view in range(len(first) - 1):
         for i in range(first[view], first[view + 1]):
@@ -369,11 +387,14 @@ def _separation(means, first, bound):  # noqa: ANN001, ANN202
             continue
         near = np.zeros(count)
         for i in range(begin, begin + count):
+            # 1 / (d_ij^2 + bound) of all others j; a mask with itself is no pair.
             for j in range(begin, begin + count):
                 square = 0.0
                 for c in range(means.shape[1]):
                     square += (means[i, c] - means[j, c]) ** 2
                 near[j - begin] = 1.0 / (square + bound) if j != i else 0.0
+            # Both orders of a pair are summed, as printed, and each moves both means. The derivative by d^2 is
+            # -1 / (d^2 + bound)^2, that of d^2 by a mean twice the difference.
             for j in range(begin, begin + count):
                 part = near[j - begin] * (1.0 / (count * (count - 1)))
                 total += part

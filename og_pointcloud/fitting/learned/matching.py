@@ -2,10 +2,11 @@
 
     S_ij = IoU(pi(M_i), B_j) * (1 - |M_i - P_j|_1)
 
-of the map M_i of instance i, binarised by pi, and mask j of a view, B_j, filled with its feature, P_j. The paper
-renders each instance by itself in every view (`alone_evidence`). What an instance shows among the others, with true
-occlusion, is a product with the mask table and needs no rendering at all (`visible_evidence`). Per view the mask with
-the best score is accepted, if that is good enough; the encoder's features of accepted masks describe the instance.
+M_i is the map of instance i, binarised by pi; B_j is mask j of a view, and P_j that mask filled with its mean feature.
+The paper renders each instance by itself in every view (`alone_evidence`). What an instance shows among the others,
+with true occlusion, is a product with the mask table and needs no rendering at all (`visible_evidence`). Per view the
+mask with the best score is accepted, if that is good enough; the encoder's features of accepted masks describe the
+instance.
 """
 
 from __future__ import annotations
@@ -25,9 +26,10 @@ from og_pointcloud.scene import Camera, View
 from og_pointcloud.settings import MatchingSettings
 
 MIXED_VARIANCE = 0.006
-"""A mask whose features vary more is no target of Eq. 4, nor accepted by Eq. 5 (the authors' code), unless large."""
+"""A mask whose features vary more (variance, mean of the channels) is no target of Eq. 4, nor accepted by Eq. 5, unless
+it is large (the authors' code)."""
 LARGE_SHARE = 0.8
-"""Masks of this share of the largest's pixels or more count all the same (the authors' code)."""
+"""A mask with at least this share of the largest mask's pixels is large (the authors' code)."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +47,7 @@ class Evidence:
     distance: NDArray[np.float64]
 
     def of_masks(self, kept: NDArray[np.bool_]) -> Evidence:
-        """The same without the other masks: they have nothing in common with any instance."""
+        """The same, in which all masks but those kept have nothing in common with any instance."""
         distance = np.where(kept[:, None], self.distance, np.inf)
         return replace(self, shared=self.shared * kept[:, None], distance=distance)
 
@@ -74,8 +76,10 @@ def visible_evidence(
     """
     count = len(instance_features)
     shared = weights_by_instance(table.weights, instance_ids, count)
+    # What a view shows of an instance lies in its masks or outside all of them.
     instance_area = weights_by_instance(table.outside, instance_ids, count)
     np.add.at(instance_area, table.mask_view, shared)
+    # A channel at a time: differences of all at once would be (masks, K, width).
     distance = np.zeros_like(shared)
     for of_masks, of_instances in zip(mask_features.T, instance_features.T, strict=True):
         distance += np.abs(of_masks[:, None].astype(np.float64) - of_instances)
@@ -88,10 +92,12 @@ def filled_masks(
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """The mean feature of each mask, P of Eq. 5, (count, width), and whether the mask is of one feature, or large.
 
-    image: (pixels, width) rendered features; mask: (pixels,) the mask of each, 0..count-1. One without a pixel is zero.
+    image: (pixels, width) rendered features; mask: (pixels,) the mask of each, 0..count-1. The mean of a mask without a
+    pixel is zero.
     """
     pixels = np.bincount(mask, minlength=count)
     own = csr_array((np.ones(len(mask)), (mask, np.arange(len(mask)))), shape=(count, len(mask)))
+    # The variance about the mean, in a second pass: of squares less the mean's square, rounding would leave little.
     means = (own @ image) / np.maximum(pixels, 1)[:, None]
     variance = np.mean(np.asarray(own @ (image - means[mask]) ** 2), axis=1) / np.maximum(pixels, 1)
     pure = (variance <= MIXED_VARIANCE) | (pixels >= LARGE_SHARE * pixels.max(initial=0))
@@ -106,6 +112,7 @@ def rendered_masks(
     for view in views:
         image, alpha = render(gaussians, features, view.camera, near)
         ids = view.mask_map()
+        # A pixel that is covered less shows a feature too small by that much.
         inside = (ids >= 0) & (alpha >= covered_share)
         found.append(filled_masks(image[inside], ids[inside], view.mask_count))
     means, pure = zip(*found, strict=True)
@@ -123,11 +130,12 @@ def alone_evidence(
 ) -> Evidence:
     """The paper's evidence: each instance rendered by itself in every view, as if nothing stood before it.
 
-    Its pixels are those it covers by more than ``covered_share`` (pi); the distance is the mean over those of them that
-    lie in the mask. Instances without a Gaussian before the camera are not rendered.
+    An instance's pixels are those it covers by more than ``covered_share`` (pi); the distance is the mean over those of
+    them that lie in the mask. Instances without a Gaussian in the image are not rendered.
     One rendering per instance and view: slow. near: depth of the near plane; the rest as in `visible_evidence`.
     """
     count = len(instance_features)
+    # Masks of all views are numbered one after another; here each view's begin.
     first = np.cumsum([0, *(view.mask_count for view in views)])
     shared = np.zeros((first[-1], count))
     distance = np.full((first[-1], count), np.inf)
@@ -141,9 +149,11 @@ def alone_evidence(
         for instance, own in enumerate(members):
             if not _in_image(own, view.camera, near):
                 continue
+            # All Gaussians of an instance have its one feature, so its map is that times the coverage: no channels.
             alpha = render(own, np.zeros((len(own), 0), np.float32), view.camera, near)[1].ravel().astype(np.float64)
             covered = alpha > covered_share
             instance_area[index, instance] = covered.sum()
+            # |M_i - P_j| of Eq. 5 at each pixel that the instance shares with a mask, then its mean by mask.
             both = covered & (ids >= 0)
             common = np.bincount(ids[both], minlength=view.mask_count)
             rendered = alpha[both, None] * instance_features[instance]
@@ -156,6 +166,7 @@ def alone_evidence(
 
 def eq5_scores(evidence: Evidence, mask_view: NDArray[np.int32], settings: MatchingSettings) -> NDArray[np.float64]:
     """(masks, K) float64 in [0, 1]: S_ij of Eq. 5, or one of its factors alone."""
+    # The distance sums over channels, and is infinite without a common pixel: as printed, scores would be negative.
     area, likeness = evidence.instance_area[mask_view], np.maximum(1 - evidence.distance, 0)
     if settings.score == "feature":
         return likeness
@@ -169,9 +180,9 @@ def match_masks(
 ) -> Matching:
     """Accept masks for instances and describe these by what the encoder saw in their masks.
 
-    In every view an instance takes the mask with its best score, if that exceeds the threshold; with fewer than
-    ``min_views`` of them it has none. Its descriptor is the mean direction of their features, all alike. Masks without
-    a feature (zero rows) are evidence, but in no descriptor.
+    In every view an instance takes the mask with its best score, if that exceeds the threshold; where fewer than
+    ``min_views`` do, it takes none at all. Its descriptor is the mean direction of its masks' features, each of the
+    same weight. Masks without a feature (zero rows) are evidence, but in no descriptor.
     """
     scores = eq5_scores(evidence, table.mask_view, settings)
     masks, owners = _accepted(scores, table.mask_view, settings)
@@ -180,20 +191,21 @@ def match_masks(
     features = directions(table.mask_features)
     total = np.zeros((count, features.shape[1]))
     np.add.at(total, owners, features[masks])
-    described = np.flatnonzero(np.linalg.norm(total, axis=1) > 1e-12)
+    described = np.flatnonzero(np.linalg.norm(total, axis=1) > 1e-12)  # opposite features may cancel
+    # Agreement: the mean cosine of an instance's masks with its descriptor, of those that have a feature.
     with_feature = np.bincount(owners[features[masks].any(axis=1)], minlength=count)
     cosines = np.bincount(owners, (features[masks] * directions(total)[owners]).sum(axis=1), count)
     instances = InstanceTable(
         descriptors=directions(total[described]).astype(np.float32),
         descriptor_instance=described.astype(np.int32),
         points=np.bincount(instance_ids[instance_ids >= 0], minlength=count).astype(np.int32),
-        views=accepted,
+        views=accepted,  # at most one mask of each
         masks=accepted.copy(),
         agreement=(cosines / np.maximum(with_feature, 1)).astype(np.float32),
         visible_area=np.bincount(owners, evidence.shared[masks, owners], count).astype(np.float32),
     )
     owner = np.full(len(scores), -1, np.int32)
-    by_score = np.argsort(scores[masks, owners], kind="stable")
+    by_score = np.argsort(scores[masks, owners], kind="stable")  # of several writes the last stays: the best
     owner[masks[by_score]] = owners[by_score]
     return Matching(instances, owner)
 
@@ -201,7 +213,7 @@ def match_masks(
 def _accepted(
     scores: NDArray[np.float64], mask_view: NDArray[np.int32], settings: MatchingSettings
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Pairs (mask, instance), at most one for each view and instance, by instance and view."""
+    """Pairs (mask, instance), at most one for each view and instance, sorted by instance, then view."""
     best = []
     for view in np.unique(mask_view):
         rows = np.flatnonzero(mask_view == view)
@@ -210,6 +222,7 @@ def _accepted(
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
     masks = np.stack(best, axis=1)  # (K, views that have masks)
     reached = np.take_along_axis(scores.T, masks, axis=1)
+    # A relative threshold counts in best scores: what the scene's typical instance reaches in its best view.
     best_of_instance = reached.max(axis=1)
     unit = np.median(best_of_instance[best_of_instance > 0]) if settings.relative and best_of_instance.any() else 1.0
     good = reached > settings.threshold * unit
@@ -218,8 +231,9 @@ def _accepted(
 
 
 def _in_image(gaussians: Gaussians, camera: Camera, near: float) -> bool:
-    """Whether any center lies before the camera and in the image, or within the margin that splats reach in from."""
+    """Whether any center lies before the camera and in the image, or within the margin from which splats reach in."""
     uv_px, depth = camera.project(gaussians.xyz)
     size = np.array([camera.width, camera.height])
+    # From the middle: half the image, and the share of that half by which the projection goes beyond.
     reach = (0.5 + 0.5 * FRUSTUM_MARGIN) * size
     return bool((np.abs(uv_px[depth > near] - 0.5 * size) < reach).all(axis=1).any())

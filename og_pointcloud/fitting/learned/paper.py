@@ -1,10 +1,10 @@
 """OpenGaussian as published (paper, Sec. 3.1 and 3.2): features and codebook trained by rendering, one view a step.
 
-The reference that the fast forms (features.py, codebook.py) are held against, in error and in time. A step draws a
-view, renders the feature map ``M = W F`` with the view's frozen blending weights, takes the losses on its pixels, and
-lets Adam move all features. ``formula`` chooses between the printed equations and what the authors' code computes:
+The reference for the fast forms (instance_features.py, codebook.py), in error and in time. A step draws a view, renders
+the feature map ``M = W F`` with the view's frozen blending weights, takes the losses on its pixels, and lets Adam move
+all features. ``formula`` chooses between the printed equations and what the authors' code computes:
 
-    Eq. 1    paper: squares summed over the pixels of all masks, over the pixels that a view's masks have on average.
+    Eq. 1    paper: squares summed over the pixels of all masks, divided by the pixels in a view's masks on average.
              authors: distances not squared, mean over a mask's pixels, then over masks.
     Eq. 2    paper: mean of 1 / d^2. authors: 1 / (d^2 + 1), each row weighted 0.1 to 1 by rank of nearness; after
              LATE_STEP only the nearest tenth keeps its weight, the others the least.
@@ -15,10 +15,9 @@ lets Adam move all features. ``formula`` chooses between the printed equations a
              draws one coarse cluster a step, by itself.
     Eq. 3    paper: clusters of features as read. authors: of the raw vectors, whose length positions compare with.
 
-docs/paper.md has all numbers of both beside ours. Where published behavior is a defect this does it right: centers
-follow their clusters at every step, not only when points are reassigned; fine centers start inside their coarse
-cluster, and empty ones again elsewhere in it; pixels without a mask are no target; points that no mask shows get no
-cluster.
+docs/paper.md has all numbers of both beside ours. Defects of the published code are mended: centers follow their
+clusters at every step, not only when points are reassigned; fine centers start inside their coarse cluster, and empty
+ones start again elsewhere in it; pixels without a mask are no target; points that no mask shows get no cluster.
 """
 
 from __future__ import annotations
@@ -49,23 +48,24 @@ STEPS = {"scannet": (20_000, 20_000, 20_000), "lerf": (10_000, 10_000, 20_000)}
 LATE_STEP = 5_000
 """From this step on, times schedule_share, the authors' Eq. 2 is about the nearest pairs."""
 LEAST_WEIGHT = 0.1
-"""Weight of a row's farthest pair in the authors' Eq. 2; the nearest weighs 1."""
+"""Weight of a mask's farthest pair in the authors' Eq. 2; the nearest weighs 1."""
 LATE_RANK = 0.9
-"""Pairs that weigh less than this weigh LEAST_WEIGHT late in training."""
+"""Late in training, pairs that weigh less than this weigh LEAST_WEIGHT."""
 SMALLEST_DISTANCE = 1e-4
 """Added in quadrature to the distances of the printed Eq. 2: two equal means would give infinity."""
 ROUNDING = 1e-3
-"""Distances are rounded off below this where they are not squared: sqrt(d^2 + ROUNDING^2)."""
+"""Where distances are not squared, their cone is rounded off at this radius: sqrt(d^2 + ROUNDING^2)."""
 ADAM_EPSILON = 1e-15
-"""As in 3DGS: gradients of one Gaussian, of a mean over pixels, are small beside the usual 1e-8."""
+"""As in 3DGS: one Gaussian's share of the gradient of a mean over pixels is small beside the usual 1e-8."""
 OWN_MASK_SHARE = 0.2
 """A coarse cluster holds a mask when it has more than this share of the mask's blended weight."""
 SIZES = 8
-"""Smaller Gaussians are drawn in so many sizes, evenly spread over 0 to 1 (the authors: any), which can be kept."""
+"""Smaller Gaussians are drawn in one of so many sizes, evenly spread over 0 to 1 (the authors: any size): few enough
+that the weights of each can be kept."""
 CURVE_POINTS = 200
 """Points of a stage's curve of losses in the provenance."""
 RECENT = 100
-"""The loss that is reported is the mean of so many steps: each sees another view."""
+"""The loss that is reported is the mean of the last so many steps: each sees another view."""
 CHECKPOINT_SECONDS = 60.0
 """The state of the training is written to the work folder this often."""
 
@@ -75,8 +75,9 @@ class TrainingRun:
     """How the stages run. seed: of the start and of the views drawn.
 
     progress: called after every step with the stage's name, the step's number, the number of steps, and the mean of the
-    last losses. work: a training that was killed and is started again with the same folder, scene, settings and seed
-    continues from its last checkpoint, and ends with the same bits as one that was not. None: nothing is kept.
+    last losses. work: keeps checkpoints. A training that was killed and is started again with the same folder, scene,
+    settings and seed continues from the last one, and ends with the same bits as if nothing had happened. None: nothing
+    is kept.
     """
 
     seed: int = 0
@@ -157,6 +158,7 @@ def train_features(source: RenderedViews, settings: PaperSettings, run: Training
         view = source[int(rng.integers(len(source)))]
         image = view.render(_read(trained, settings.normalise))
         separation, cohesion = view_losses(image, view.mask, settings, late=step >= late)
+        # The printed Eq. 1 is a sum over pixels: its weight is to mean the same at any image size.
         scale = 1 if settings.formula == "authors" else 1 / source.masked_pixels
         loss = settings.inter * separation + settings.intra * settings.cohesion_weight * scale * cohesion
         stage.adam.zero_grad(set_to_none=True)
@@ -186,17 +188,20 @@ def view_losses(
 
 
 def _mask_means(values: torch.Tensor, mask: torch.Tensor, pixels: torch.Tensor) -> torch.Tensor:
+    """(masks, width) means of values (pixels, width). pixels: (masks,) how many each mask has."""
     return values.new_zeros((len(pixels), values.shape[1])).index_add(0, mask, values) / pixels[:, None]
 
 
 def _separation(means: torch.Tensor, formula: str, late: bool) -> torch.Tensor:
+    """Eq. 2 of one view from the means of its masks (m, width)."""
     m = len(means)
     if m < 2:
-        return means.sum() * 0
+        return means.sum() * 0  # not a plain 0: it is differentiated
     square = (means[:, None] - means[None]).square().sum(dim=2)
     near = 1 / (square + (1.0 if formula == "authors" else SMALLEST_DISTANCE**2))
     near = near * (1 - torch.eye(m, dtype=means.dtype, device=means.device))
     if formula == "authors":
+        # Rank of nearness within a row, by argsort twice: a mask itself has 0, the farthest other 1, the nearest m - 1.
         rank = near.detach().argsort(dim=1, stable=True).argsort(dim=1).to(means.dtype)
         weight = LEAST_WEIGHT + (1 - LEAST_WEIGHT) * rank / (m - 1)
         if late:
@@ -210,9 +215,9 @@ def train_codebook(
 ) -> TrainedCodebook:
     """Stage 2: a coarse codebook of features and positions, then a fine one of features inside each coarse cluster.
 
-    source: only pixels in masks, or all (formula "paper"). raw: (n, width), of stage 1, not yet read. A step renders
-    cluster centers in place of features, takes Eq. 4, and moves each feature by the gradient of its center (straight
-    through). Positions count in scene units, as published.
+    source: all pixels with formula "paper", else only those in masks. raw: (n, width), of stage 1, not yet read. A step
+    renders cluster centers in place of features, takes Eq. 4, and moves each feature by the gradient of its center (a
+    straight-through estimate). Positions count in scene units, as published.
     """
     run = run or TrainingRun()
     rng = np.random.default_rng(run.seed)
@@ -221,6 +226,7 @@ def train_codebook(
     start = _on_host(training.features)
     key = _training_key(source, settings, run, raw)
 
+    # Coarse: all known Gaussians as one part, clustered by features and positions from k1 of them at random.
     coarse = StageHistory("coarse codebook", STEPS[settings.schedule][1])
     places = settings.position_weight * gaussians.xyz[known]
     assert settings.k1 is not None, "the number of coarse clusters is the caller's to find"
@@ -230,6 +236,7 @@ def train_codebook(
     together = _Parts([np.arange(len(known))], [len(centers)], places)
     own, _ = training.train(coarse, centers, together, run, key)
 
+    # Fine: each coarse cluster is a part of its own, clustered by features alone from some of its own Gaussians.
     members = [np.flatnonzero(own == cluster) for cluster in range(len(centers))]
     held = _masks_held(source, own, len(centers))
     seeds = [rng.permutation(rows)[:count] for rows, count in zip(members, _fine_counts(held, settings), strict=True)]
@@ -248,10 +255,11 @@ def train_codebook(
 
 @dataclass(frozen=True)
 class _Parts:
-    """Rows of the known Gaussians that are clustered apart from each other, each part into so many ``counts``.
+    """Parts of the known Gaussians that are clustered each by itself.
 
-    places: (known, 3 or 0), clustered with the features but not rendered. held: of each view (masks, parts) bool, the
-    masks that a part holds; None: of parts that are not drawn by themselves.
+    rows, counts: of each part, its rows of the known Gaussians and its number of clusters. places: (known, 3 or 0),
+    clustered with the features but not rendered. held: of each view (masks, parts) bool, the masks that a part holds;
+    None in the coarse stage, whose one part is never drawn by itself.
     """
 
     rows: list[NDArray[np.int64]]
@@ -263,6 +271,7 @@ class _Parts:
         self, features: NDArray[np.float32], centers: NDArray[np.float32], rounds: int
     ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
         """Every point's nearest center of its part after a few rounds of Lloyd's algorithm, and the centers."""
+        # Centers of all parts stand in one array, part by part; ``first`` is where a part's begin.
         values = np.concatenate([features, self.places], axis=1)
         own, centers, first = np.zeros(len(values), np.int64), centers.copy(), 0
         for rows, count in zip(self.rows, self.counts, strict=True):
@@ -279,10 +288,12 @@ class _CodebookTraining:
 
     def __init__(self, source: RenderedViews, raw: torch.Tensor, settings: PaperSettings) -> None:
         self.source, self.settings = source, settings
-        self.pseudo = _read(raw, settings.normalise)  # of stage 1: never changed
+        # What stage 1 shows is the target of Eq. 4 (the paper's pseudo features): it never changes.
+        self.pseudo = _read(raw, settings.normalise)
+        # Clusters of raw vectors have raw centers, which are read when they are rendered; else all is read once, here.
         self.reads_centers = settings.normalise and settings.cluster_raw
         self.features = raw if self.reads_centers else self.pseudo.clone()
-        self.targets: dict[int, tuple[torch.Tensor, torch.Tensor]] = {}
+        self.targets: dict[int, tuple[torch.Tensor, torch.Tensor]] = {}  # by view, as they are asked for
 
     def read(self, values: torch.Tensor) -> torch.Tensor:
         """What is rendered of features or centers."""
@@ -308,6 +319,7 @@ class _CodebookTraining:
             loss = error.square().mean() if squared else error.abs().mean()
             (features.grad,) = torch.autograd.grad(loss, quantized)
             stage.adam.step()
+            # The published code moves centers at reassignments only; here they follow their features at every step.
             stage.centers[:, :width] = _cluster_means(features.detach(), stage.own, stage.centers[:, :width])
             history.loss.append(loss.item())
         features.requires_grad_(False)
@@ -315,16 +327,19 @@ class _CodebookTraining:
         return _on_host(stage.own).astype(np.int32), _on_host(stage.centers[:, :width])
 
     def _draw(self, rng: np.random.Generator, parts: _Parts) -> tuple[RenderedView, torch.Tensor, torch.Tensor | slice]:
-        """A random view, perhaps with smaller Gaussians or one part alone; what its pixels should show, and which."""
+        """A random view, perhaps with smaller Gaussians or one part alone; what its pixels should show, and which of
+        its pixels are asked."""
         index = int(rng.integers(len(self.source)))
         view = self.source[index]
         if self.settings.formula == "paper":
             return view, view.render(self.pseudo), slice(None)
+        # The authors' target: each mask painted with its mean. Targets do not change, so they are kept.
         if index not in self.targets:
             image = view.render(self.pseudo)
             means, kept = filled_masks(_on_host(image), _on_host(view.mask), len(view.mask_names))
             self.targets[index] = image.new_tensor(means), torch.tensor(kept, device=image.device)
         means, kept = self.targets[index]
+        # The middle of one of SIZES equal stretches of 0 to 1.
         factor = (int(SIZES * rng.random()) + 0.5) / SIZES if rng.random() < self.settings.point_pressure else 1.0
         part, members = -1, None
         if self.settings.fine_alone and parts.held is not None and parts.held[index].any():
@@ -332,6 +347,7 @@ class _CodebookTraining:
             part = int(choices[rng.integers(len(choices))])
             members, kept = parts.rows[part], kept & torch.tensor(parts.held[index][:, part], device=kept.device)
         drawn = self.source.drawn(index, factor, part, members)
+        # Of the masks of the full view, the one that each pixel drawn is in: fewer masks may be left.
         place = torch.searchsorted(view.mask_names, drawn.mask_names)[drawn.mask]
         if not kept[place].any():  # too little is left to cover a pixel of a target
             drawn, place, kept = view, view.mask, self.targets[index][1]
@@ -356,13 +372,14 @@ def _masks_held(source: RenderedViews, own: NDArray[np.int32], k1: int) -> list[
 
 
 def _fine_counts(held: list[NDArray[np.bool_]], settings: PaperSettings) -> list[int]:
-    """Fine clusters of each coarse one: k2, or one more than the masks of a view that it holds, if that is fewer."""
+    """Fine clusters of each coarse one: k2; by formula "authors" at most one more than it holds masks of any view."""
     most = np.max([of_view.sum(axis=0) for of_view in held], axis=0)
     return [settings.k2 if settings.formula == "paper" else int(min(count + 1, settings.k2)) for count in most]
 
 
 class _Read(torch.autograd.Function):
-    """Directions mapped to [0, 1] (`instance_features.read_features`); torch's own gradient is most of a step."""
+    """Directions mapped to [0, 1] (`instance_features.read_features`). torch's own gradient of it would take most of a
+    step's time."""
 
     @staticmethod
     def forward(ctx: Any, raw: torch.Tensor) -> torch.Tensor:
@@ -375,6 +392,7 @@ class _Read(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, gradient: torch.Tensor) -> torch.Tensor:  # pyright: ignore
         direction, length = ctx.saved_tensors
+        # The derivative of x / |x| keeps what of the gradient is across x, divided by |x|.
         along = (direction * gradient).sum(dim=1, keepdim=True)
         return torch.addcmul(gradient, direction, along, value=-1).mul_(0.5 / length)
 
@@ -385,12 +403,12 @@ def _read(raw: torch.Tensor, normalise: bool) -> torch.Tensor:
 
 
 def _on_host(values: torch.Tensor) -> NDArray[Any]:
-    """For what is done in numpy, now and then."""
+    """The values in numpy; on a CPU the same memory."""
     return values.detach().cpu().numpy()
 
 
 def _training_key(source: RenderedViews, settings: PaperSettings, run: TrainingRun, *more: Any) -> str:
-    """Of all that the outcome of a stage depends on; empty where nothing is kept."""
+    """A fingerprint of all that the outcome of a stage depends on; empty where nothing is kept."""
     if run.work is None:
         return ""
     drawn = source.gaussians
@@ -400,10 +418,10 @@ def _training_key(source: RenderedViews, settings: PaperSettings, run: TrainingR
 
 
 class _Stage:
-    """All that a stage of training changes: a checkpoint is all of it.
+    """All that a stage of training changes, and so all that a checkpoint holds.
 
-    features: (n, width) float32, moved in place by ``adam``. centers, own: of a codebook stage, (k, d) float32 and, for
-    each of ``known`` Gaussians, its row of them, on the features' device.
+    features: (known, width) float32, moved in place by ``adam``. centers, own: of a codebook stage, (k, d) float32 and
+    (known,) int64, the row of centers that each Gaussian has, on the features' device.
     """
 
     def __init__(
@@ -422,8 +440,9 @@ class _Stage:
         self.own, self.centers = torch.as_tensor(own, device=device), torch.as_tensor(centers, device=device)
 
     def steps(self, settings: PaperSettings, run: TrainingRun, key: str) -> Iterator[tuple[int, np.random.Generator]]:
-        """The numbers of the steps that are left, each with its own random numbers, which are the same whether or not
-        the steps before it were done in this run. Timed, reported, and kept under the key now and then."""
+        """The numbers of the steps that are left, each with random numbers of its own: seeded by step and stage, they
+        are the same whether or not this run did the steps before. Times and reports each step, and keeps the state
+        under the key now and then."""
         history = self.history
         count = max(1, round(history.published_steps * settings.schedule_share))
         name, kept_at = history.name.replace(" ", "-"), time.monotonic()
@@ -441,12 +460,14 @@ class _Stage:
                 run.progress(history.name, step + 1, count, float(np.mean(history.loss[-RECENT:])))
 
     def _arrays(self) -> tuple[NDArray[Any], ...]:
+        """A checkpoint: features, Adam's two moments, centers, own; then the seconds followed by the losses."""
         state, features = self.adam.state.get(self.features), self.features.detach()
         moments = (state["exp_avg"], state["exp_avg_sq"]) if state else (torch.zeros_like(features),) * 2
         losses = np.array([self.history.seconds, *self.history.loss])
         return *(_on_host(tensor).copy() for tensor in (features, *moments, self.centers, self.own)), losses
 
     def _restore(self, arrays: tuple[NDArray[Any], ...]) -> None:
+        """Go on from a checkpoint (`_arrays`). Adam's count of steps is the number of losses."""
         *tensors, losses = arrays
         device = self.features.device
         features, average, square, self.centers, self.own = (torch.tensor(array, device=device) for array in tensors)

@@ -1,8 +1,8 @@
-"""Blending weights of the views that mode paper trains on: geometry is frozen, so each is composited once and kept.
+"""Blending weights of the views that mode paper trains on: geometry is frozen, so each view is composited once.
 
 A pixel shows ``M = W F``, and a step of training is two products, ``W F`` and ``W' G`` of the gradient, on the device
-that the settings name. What is composited anew where memory ends is the same to the bit. Gaussians that no mask shows
-have no column: they get neither feature nor cluster, and show nothing.
+that the settings name. Weights are kept as far as memory goes; those of other views are composited anew at every use,
+with the same bits. Gaussians that no mask shows have no column: they get neither feature nor cluster, and show nothing.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ with naming_extra("torch", "learn"):
 class RenderedView:
     """One view's blending weights.
 
-    weights: (pixels, known) CSR float32, index int32, nearest first. mask: (pixels,) int64, a row of mask_names, -1
-    outside masks. mask_names: (m,) int64 ascending, the view's own mask ids. Both tensors lie on the device that values
-    are to be rendered on. pixels: (pixels,) places in the image, row by row.
+    weights: (pixels, known) CSR float32 with int32 indices, a pixel's nearest Gaussian first. mask: (pixels,) int64, a
+    row of mask_names, -1 outside masks. mask_names: (m,) int64 ascending, the view's own mask ids. Both tensors lie on
+    the device that values are rendered on. pixels: (pixels,) places in the image, row by row.
     """
 
     weights: csr_array
@@ -52,7 +52,8 @@ class RenderedView:
 
     @property
     def nbytes(self) -> int:
-        """What it holds in memory, W' too."""
+        """Bytes that it holds in memory, W' too."""
+        # An entry: index and value of 4 bytes each, in W and in W'. A pixel: start of its row 4, mask 8, place 8.
         return 16 * self.weights.nnz + 20 * len(self.mask)
 
 
@@ -62,9 +63,8 @@ class RenderedViews:
     views: thinned to the resolution that is to be rendered. near: depth of the near plane, scene units. whole: with all
     pixels, else those in masks that are covered enough. Raises SceneError where no mask has a pixel covered enough.
 
-    seen: (n,) blending weight in masks. known:
-    rows of the Gaussians that have any. masked_pixels: pixels in masks of a view, on average. device: of the views'
-    tensors.
+    seen: (n,) blending weight in masks. known: rows of the Gaussians that have any. masked_pixels: pixels in masks of a
+    view, on average. device: of the views' tensors.
     """
 
     def __init__(
@@ -76,6 +76,7 @@ class RenderedViews:
         self.views: list[View] = []
         self._kept: dict[tuple[int, float, int], RenderedView] = {}
         self._room = settings.cache_bytes
+        # Which Gaussians masks show is known after all views: until then each has a column.
         self._column = np.arange(len(gaussians), dtype=np.int32)
         pixels = 0
         for view in views:
@@ -111,7 +112,8 @@ class RenderedViews:
         """A view with all Gaussians' standard deviations times ``factor``, and only these ``members`` (rows of the
         known Gaussians; None: all); its masks are among those at full size.
 
-        cluster: a number of the members, at least 0: the same always stands for the same.
+        cluster: at least 0, names the members: the view is kept under this number, so the same number must always come
+        with the same members.
         """
         key = index, factor, cluster
         if key in self._kept:
@@ -121,6 +123,7 @@ class RenderedViews:
         if factor != 1.0:
             gaussians = replace(gaussians, scale=(gaussians.scale * np.float32(factor)).astype(np.float32))
         full = key == (index, 1.0, -1)
+        # Targets are made at full size: a mask that shows only when Gaussians are smaller has none.
         masks = None if full else self[index].mask_names.cpu().numpy()
         column = self._column if rows is None else self._column[rows]
         rendered = self._composited(gaussians, self.views[index], column, masks)
@@ -139,6 +142,7 @@ class RenderedViews:
         ids = np.maximum(view.mask_map().ravel(), -1)
         if masks is not None:
             ids = np.where(np.isin(ids, masks), ids, -1)
+        # Every wanted pixel is an id of its own; the last row, of all other pixels, is dropped.
         wanted = np.arange(len(ids)) if self.whole else np.flatnonzero(ids >= 0)
         number = np.full(len(ids), -1, np.int32)
         number[wanted] = np.arange(len(wanted))
@@ -149,6 +153,7 @@ class RenderedViews:
         inside = (ids >= 0) & shown[ids + 1] & (coverage >= self.settings.covered_share)
         rows = np.flatnonzero(inside | (coverage > 0)) if self.whole else np.flatnonzero(inside)
         ids = np.where(inside, ids, -1)[rows]
+        # Masks that are left, numbered without gaps: means over them are never of no pixel.
         names = np.unique(ids[ids >= 0]).astype(np.int64)
         mask = np.where(ids >= 0, np.searchsorted(names, ids), -1)
         small = _with_columns(weights[rows], column, int(self._column.max(initial=-1)) + 1)
@@ -173,6 +178,7 @@ def _with_columns(weights: csr_array, column: NDArray[np.int32], count: int) -> 
     indices, indptr, data = column[weights.indices], weights.indptr, weights.data
     if (indices < 0).any():
         kept = indices >= 0
+        # A row now begins after as many entries as are kept of those before it.
         indptr = np.concatenate([[0], np.cumsum(kept)])[indptr]
         indices, data = indices[kept], data[kept]
     return csr_array((data, indices, indptr.astype(np.int32)), shape=(weights.shape[0], count))
